@@ -1,0 +1,146 @@
+"""The controller: everything that a digital implementation needs, and its control law, stated once.
+
+                     v_ff, v0(z)
+                         |            w
+  p*, xi* --> [ law ] ---+--> v --> [ current loops ] --> [ plant ] --+--> p
+                ^                                                     |
+                +------------------------ y = p + noise <-------------+
+
+At every sample:
+  1. y = measured outputs;                      e += Ts (p* - y), frozen on the axes that saturated last
+  2. xi_hat = xi_pred + L (y - Cd xi_pred)                                     (steady-state Kalman filter)
+  3. v_fb = K (xi* - xi_hat) + Ki e             with xi* = (P(z*)^-1 p*, its derivative)
+  4. v = saturate(v_fb + v_ff + v0(z)),         v_ff = m z*'' on the thrust, z the measured position
+  5. currents = v / force constants
+  6. xi_pred = Ad xi_hat + Bd (v - v0(z))
+The ten mechanical states stand first in xi. Where the design models a delay of d samples, the forces v - v0 of the
+last d samples follow, the oldest first; their reference is the feedforward that was commanded then.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, NamedTuple
+
+import casadi as ca
+import numpy as np
+
+from malta.plant import Parameters, Signal, readonly
+
+if TYPE_CHECKING:
+    from malta.plant import FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Feedforward:
+    """v_ff = mass z*'' on the thrust; v0(z), linear between the grid points, constant beyond them."""
+
+    mass: float  # kg
+    z_grid: FloatArray  # m, g points
+    v0: FloatArray  # N, g x m
+
+
+@dataclass(frozen=True)
+class CurrentLoop:
+    """PI controller of the current in each axis, u = Kp e + Ki integral of e."""
+
+    Kp: float  # V/A
+    Ki: float  # V/(A s)
+    sample_time: float  # s
+
+
+@dataclass(frozen=True, eq=False)
+class Limits:
+    """Of each input axis."""
+
+    current: FloatArray  # A
+    voltage: FloatArray  # V
+    force: FloatArray  # N
+
+
+@dataclass(frozen=True, eq=False)
+class Controller:
+    """Gains, models and limits of one controller; n states, m forces, p measurements."""
+
+    name: str
+    spec_sha256: str
+    parameters: Parameters  # of the machine that it was designed for
+    operating_point: tuple[FloatArray, FloatArray]  # x (the mechanical states), u
+    sample_time: float  # s
+    states: tuple[Signal, ...]  # n
+    forces: tuple[Signal, ...]  # m
+    measurements: tuple[Signal, ...]  # p
+    A: FloatArray  # continuous, mechanical states only
+    B: FloatArray
+    C: FloatArray
+    Ad: FloatArray  # n x n
+    Bd: FloatArray  # n x m
+    Cd: FloatArray  # p x n
+    K: FloatArray  # m x n
+    Ki: FloatArray  # m x p
+    L: FloatArray  # n x p, filter form
+    feedforward: Feedforward
+    current_loop: CurrentLoop
+    limits: Limits
+
+    def __post_init__(self) -> None:
+        for f in fields(self):
+            value = getattr(self, f.name)
+            if isinstance(value, np.ndarray):
+                object.__setattr__(self, f.name, readonly(value))
+
+    @property
+    def delay(self) -> int:
+        """Samples of delay in the design model."""
+        return (len(self.Ad) - len(self.A)) // len(self.forces)
+
+
+class LinearLaw(NamedTuple):
+    """The law without saturation: s+ = A s + B_y y + B_r r, v = C s + D_y y + D_r r.
+
+    s = (xi_pred, e), r = (p*, xi*, v_ff, v0).
+    """
+
+    A: FloatArray
+    B_y: FloatArray
+    B_r: FloatArray
+    C: FloatArray
+    D_y: FloatArray
+    D_r: FloatArray
+
+
+def law(c: Controller) -> ca.Function:
+    """The control law of one sample as a CasADi function.
+
+    (xi_pred, e, frozen, y, p_ref, xi_ref, v_ff, v0) -> (xi_pred, e, frozen, v, xi_hat)
+    """
+    n, m, p = len(c.states), len(c.forces), len(c.measurements)
+    sizes = {"xi_pred": n, "e": p, "frozen": p, "y": p, "p_ref": p, "xi_ref": n, "v_ff": m, "v0": m}
+    args = {name: ca.SX.sym(name, size) for name, size in sizes.items()}
+    a = args
+    e = a["e"] + c.sample_time * (1 - a["frozen"]) * (a["p_ref"] - a["y"])
+    xi_hat = a["xi_pred"] + _sparse(c.L) @ (a["y"] - _sparse(c.Cd) @ a["xi_pred"])
+    v_fb = _sparse(c.K) @ (a["xi_ref"] - xi_hat) + _sparse(c.Ki) @ e
+    wanted = v_fb + a["v_ff"] + a["v0"]
+    v = ca.fmax(ca.fmin(wanted, c.limits.force), -c.limits.force)
+    xi_pred = _sparse(c.Ad) @ xi_hat + _sparse(c.Bd) @ (v - a["v0"])
+    outputs = {"xi_pred_next": xi_pred, "e_next": e, "frozen_next": v != wanted, "v": v, "xi_hat": xi_hat}
+    return ca.Function("law", list(args.values()), list(outputs.values()), list(args), list(outputs))
+
+
+def linear_law(c: Controller) -> LinearLaw:
+    """The control law linearized where no axis saturates: exact, by differentiating `law`."""
+    step = law(c)
+    args = [ca.SX.sym(step.name_in(i), *step.size_in(i)) for i in range(step.n_in())]
+    named = dict(zip(step.name_in(), args, strict=True))
+    out = dict(zip(step.name_out(), step(*args), strict=True))
+    s = ca.vertcat(named["xi_pred"], named["e"])
+    r = ca.vertcat(*(named[name] for name in ("p_ref", "xi_ref", "v_ff", "v0")))
+    s_next = ca.vertcat(out["xi_pred_next"], out["e_next"])
+    blocks = [ca.jacobian(of, by) for of in (s_next, out["v"]) for by in (s, named["y"], r)]
+    return LinearLaw(*(np.array(M) for M in ca.Function("linear", args, blocks)(*[0] * len(args))))
+
+
+def _sparse(M: FloatArray) -> ca.DM:
+    """Exact zeros cost nothing at run time."""
+    return ca.sparsify(ca.DM(M))

@@ -1,0 +1,207 @@
+"""Machine data: TOML files into parameter records, in SI units, each value with its source.
+
+    data/tubular.toml -> read() -> plants.tubular.Parameters
+
+A parameter stands in the file as `{ value = 0.360, unit = "kg", tag = "printed", source = "Table IV" }`.
+`tag` says how far to trust it: printed (in the source), computed (from what is printed) or assumed
+(ours). The unit may be any of the right dimension; this module is the one place that converts to SI.
+"""
+
+from __future__ import annotations
+
+import importlib
+import math
+import tomllib
+from dataclasses import MISSING, Field, field, fields
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
+
+from pydantic import BaseModel, ConfigDict, StrictStr, ValidationError
+from pydantic import Field as Checked
+
+from malta.errors import InputError
+
+if TYPE_CHECKING:
+    from malta.plant import Parameters, Plant
+
+MACHINES = ("tubular",)  # the modules of malta/plants/
+
+_Model = TypeVar("_Model", bound=BaseModel)
+Finite = Annotated[float, Checked(strict=True, allow_inf_nan=False)]
+
+
+class Record(BaseModel):
+    """A table of a file that malta reads: no unknown keys, no silent conversions, immutable."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Quantity(Record):
+    """A number with its unit, as it stands in a file."""
+
+    value: Finite
+    unit: StrictStr
+
+
+class Sourced(Quantity):
+    """A quantity that says where it comes from."""
+
+    tag: Literal["printed", "computed", "assumed"]
+    source: StrictStr
+
+
+class _MachineFile(Record):
+    machine: Literal[MACHINES]
+    default_preset: StrictStr
+    parameters: dict[str, Sourced]
+    presets: dict[str, dict[str, Sourced]]
+
+
+def si(unit: str, *, above: float | None = None, at_least: float | None = None) -> Any:
+    """Declare a parameter: `m: float = si("kg", above=0)  # mover with magnets, Table IV`."""
+    return field(metadata={"unit": unit, "above": above, "at_least": at_least})
+
+
+def units_of(record: type[Parameters] | Parameters) -> dict[str, str]:
+    """The SI unit of every physical field of a parameter record."""
+    return {f.name: f.metadata["unit"] for f in fields(record) if "unit" in f.metadata}
+
+
+def check_parameters(record: Parameters, where: str | Path = "parameters") -> None:
+    """Refuse values that no machine has (NaN, a negative mass): InputError names the field."""
+    for f in fields(record):
+        if "unit" in f.metadata:
+            _check_range(f, getattr(record, f.name), where)
+
+
+def _check_range(f: Field[Any], value: object, where: str | Path) -> None:
+    unit, above, least = f.metadata["unit"], f.metadata["above"], f.metadata["at_least"]
+    low = f" above {above:g}" if above is not None else ""
+    low = f" of at least {least:g}" if least is not None else low
+    good = isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+    if good and above is not None:
+        good = value > above  # type: ignore[operator]
+    if good and least is not None:
+        good = value >= least  # type: ignore[operator]
+    if not good:
+        raise InputError(where, f.name, f"{value} {unit}", f"a finite number{low} in {unit}")
+
+
+@cache
+def _units() -> Any:
+    import pint  # here, because `malta --help` must not wait for it
+
+    return pint.UnitRegistry()
+
+
+def to_si(value: float, unit: str, si_unit: str, where: str | Path, name: str) -> float:
+    """Convert to `si_unit` ("kg", "m/s", "N m", ...).
+
+    Hz where rad/s is expected is refused: unit libraries take a radian for 1 and err by 2 pi.
+
+    Raises InputError that names `where` and `name` when the unit is unknown or of another kind.
+    """
+    registry = _units()
+    expected = f"a unit of {si_unit}"
+    try:
+        factor, found_root = registry.get_root_units(registry.parse_units(unit))
+    except Exception as error:  # pint raises many kinds, tokenizer errors among them
+        raise InputError(where, f"{name}.unit", repr(unit), expected) from error
+    si_factor, si_root = registry.get_root_units(registry.parse_units(si_unit))
+    if found_root != si_root:
+        raise InputError(where, f"{name}.unit", repr(unit), expected)
+    ratio = float(factor) / float(si_factor)
+    whole = round(1 / ratio) if ratio < 1 else 0
+    # Dividing by a power of ten is exact where multiplying is not: 50 us is 5e-05, not 4.9999...e-05.
+    return value / whole if whole and abs(whole * ratio - 1) < 1e-12 else value * ratio
+
+
+def load_toml(path: str | Path) -> dict[str, Any]:
+    """Read a TOML file; InputError when it is missing, unreadable, not text or not TOML."""
+    try:
+        text = Path(path).read_text(encoding="utf-8")
+    except FileNotFoundError as error:
+        raise InputError(path, "", "no such file", "a TOML file") from error
+    except UnicodeDecodeError as error:
+        raise InputError(path, "", "bytes that are not UTF-8 text", "a TOML file") from error
+    except OSError as error:
+        raise InputError(path, "", error.strerror or str(error), "a readable TOML file") from error
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(path, "", f"a TOML error ({error})", "a complete TOML file") from error
+
+
+def validated(model: type[_Model], content: object, where: str | Path) -> _Model:
+    """Check `content` against a pydantic model; InputError gives the first fault in one sentence."""
+    try:
+        return model.model_validate(content)
+    except ValidationError as error:
+        raise explain(error, where) from error
+
+
+def explain(error: ValidationError, where: str | Path) -> InputError:
+    """One sentence for pydantic's first complaint."""
+    first = error.errors(include_url=False)[0]
+    name = ".".join(str(part) for part in first["loc"] if not str(part).startswith("function-"))
+    kind, message = first["type"], first["msg"]
+    if kind == "missing":
+        return InputError(where, name, "nothing", "this key")
+    if kind == "extra_forbidden":
+        return InputError(where, name, "an unknown key", "only the keys of its format")
+    found = repr(first["input"])
+    expected = message.removeprefix("Value error, ").removeprefix("Input should be ")
+    return InputError(where, name, found if len(found) <= 60 else found[:57] + "...", expected)
+
+
+def read(path: str | Path, preset: str | None = None) -> Parameters:
+    """Read a machine's data file into the Parameters record of its module in malta/plants/.
+
+    Parameters
+    ----------
+    path : a file as data/tubular.toml
+    preset : a table of its `presets`, laid over `parameters`; the file's default_preset if None
+
+    Raises InputError, naming file and field: a missing, unknown or doubled key, an unknown preset, a
+    wrong unit, NaN, a value out of range.
+    """
+    content = validated(_MachineFile, load_toml(path), path)
+    name = content.default_preset if preset is None else preset
+    if name not in content.presets:
+        raise InputError(path, "presets", f"no preset {name!r}", "one of " + ", ".join(content.presets))
+    record: type[Parameters] = machine_module(content.machine).Parameters
+    known = {f.name: f for f in fields(record) if "unit" in f.metadata}
+    tables = {"parameters": content.parameters} | {f"presets.{k}": v for k, v in content.presets.items()}
+    values: dict[str, float] = {}
+    for table, entries in tables.items():  # every preset is checked, the chosen one is used
+        for key, entry in entries.items():
+            if key not in known:
+                raise InputError(path, f"{table}.{key}", "an unknown parameter", ", ".join(known))
+            unit = known[key].metadata["unit"]
+            value = to_si(entry.value, entry.unit, unit, path, f"{table}.{key}")
+            _check_range(known[key], value, path)
+            if table in ("parameters", f"presets.{name}"):
+                values[key] = value
+    for key, f in known.items():
+        if key not in values and f.default is MISSING:
+            unit = f.metadata["unit"]
+            raise InputError(path, f"parameters.{key}", "nothing", f"a value in {unit}")
+    return record(**values, preset=name)  # type: ignore[call-arg]
+
+
+def machine_module(machine: str) -> Any:
+    """The module of malta/plants/ that models a machine: it has Parameters and plant()."""
+    return importlib.import_module(f"malta.plants.{machine}")
+
+
+def plant_of(parameters: Parameters) -> Plant:
+    """The plant that these parameters describe."""
+    plant: Plant = machine_module(type(parameters).__module__.rpartition(".")[2]).plant(parameters)
+    return plant
+
+
+def published(machine_file: str | Path) -> dict[str, Any]:
+    """What the source paper prints: published/NAME.toml beside the machine's data file NAME.toml."""
+    path = Path(machine_file)
+    return load_toml(path.parent / "published" / path.name)

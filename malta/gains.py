@@ -1,0 +1,469 @@
+"""The gain file, version 1: everything that a digital implementation needs, as .json, .npz or .mat.
+
+The JSON is the specification: nested tables, matrices row by row with round-trip precision, no time stamp, so the same
+inputs give the same file. The .npz has the same names joined by dots ("gains.K"), the .mat the same names as
+nested structs; in both a list of signals is two lists, name and unit, and null is an empty array.
+`sha256` is of the content, so a damaged or edited file is refused rather than flown.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import os
+import platform
+import re
+import tempfile
+import zipfile
+from collections.abc import Mapping
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import numpy as np
+from pydantic import BeforeValidator, Field, StrictInt, StrictStr
+
+from malta.controller import Controller, CurrentLoop, Feedforward, Limits
+from malta.data import MACHINES, Finite, Quantity, Record, machine_module, plant_of, units_of, validated
+from malta.errors import InputError
+from malta.plant import Signal
+from malta.verify import own_poles
+
+if TYPE_CHECKING:
+    from malta.plant import FloatArray, Parameters
+    from malta.verify import ComplexArray, Margins
+
+SCHEMA, VERSION = "malta-gains", 1
+SUFFIXES = (".json", ".npz", ".mat")
+
+Vector = list[Finite]
+Matrix = list[list[Finite]]
+
+
+def _rows(value: Any) -> Any:
+    """Signals as the binary files hold them, two columns, back to a list of rows."""
+    if isinstance(value, dict) and set(value) == {"name", "unit"}:
+        return [{"name": n, "unit": u} for n, u in zip(value["name"], value["unit"], strict=True)]
+    return value
+
+
+class _Signal(Record):
+    name: StrictStr
+    unit: StrictStr
+
+
+_Signals = Annotated[list[_Signal], BeforeValidator(_rows)]
+
+
+class _Design(Record):
+    name: StrictStr
+    spec_sha256: StrictStr
+
+
+class _Plant(Record):
+    name: Literal[MACHINES]
+    preset: StrictStr
+    parameters: dict[StrictStr, Quantity]
+
+
+class _OperatingPoint(Record):
+    x: Vector
+    u: Vector
+
+
+class _SignalTable(Record):
+    states: _Signals
+    forces: _Signals
+    measurements: _Signals
+
+
+class _Model(Record):
+    A: Matrix
+    B: Matrix
+    C: Matrix
+    Ad: Matrix
+    Bd: Matrix
+    Cd: Matrix
+
+
+class _Gains(Record):
+    K: Matrix
+    Ki: Matrix
+    L: Matrix
+
+
+class _Feedforward(Record):
+    mass: Finite
+    z_grid: Vector
+    v0: Matrix
+
+
+class _CurrentLoop(Record):
+    Kp: Finite
+    Ki: Finite
+    sample_time: Annotated[Finite, Field(gt=0)]
+
+
+class _Limits(Record):
+    current: Vector
+    voltage: Vector
+    force: Vector
+
+
+class _Poles(Record):
+    open_loop: Matrix
+    regulator: Matrix
+    filter: Matrix
+    closed_loop: Matrix
+
+
+class _Verification(Record):
+    poles: _Poles
+    bandwidth: dict[StrictStr, Finite]
+    peak_sensitivity: dict[StrictStr, Finite]
+
+
+class _Provenance(Record):
+    malta: StrictStr
+    python: StrictStr
+    numpy: StrictStr
+    scipy: StrictStr
+    control: StrictStr
+    casadi: StrictStr
+
+
+class GainFile(Record):
+    """The document that a gain file holds."""
+
+    schema_: Annotated[Literal[SCHEMA], Field(alias="schema")]
+    version: Annotated[StrictInt, Field(ge=VERSION, le=VERSION)]
+    design: _Design
+    plant: _Plant
+    operating_point: _OperatingPoint
+    sample_time: Annotated[Finite, Field(gt=0)]
+    signals: _SignalTable
+    model: _Model
+    gains: _Gains
+    feedforward: _Feedforward
+    current_loop: _CurrentLoop
+    limits: _Limits
+    verification: _Verification
+    provenance: _Provenance
+    sha256: StrictStr
+
+
+def document(controller: Controller, margins: Margins) -> dict[str, Any]:
+    """The content of the gain file of a controller, as plain tables, lists and numbers."""
+    c = controller
+    units = units_of(c.parameters)
+    tables: dict[str, Any] = {
+        "schema": SCHEMA,
+        "version": VERSION,
+        "design": {"name": c.name, "spec_sha256": c.spec_sha256},
+        "plant": {
+            "name": plant_of(c.parameters).name,
+            "preset": c.parameters.preset,
+            "parameters": {k: {"value": getattr(c.parameters, k), "unit": u} for k, u in units.items()},
+        },
+        "operating_point": {"x": c.operating_point[0], "u": c.operating_point[1]},
+        "sample_time": c.sample_time,
+        "signals": {
+            key: [s._asdict() for s in getattr(c, key)] for key in ("states", "forces", "measurements")
+        },
+        "model": {key: getattr(c, key) for key in ("A", "B", "C", "Ad", "Bd", "Cd")},
+        "gains": {key: getattr(c, key) for key in ("K", "Ki", "L")},
+        "feedforward": {key: getattr(c.feedforward, key) for key in ("mass", "z_grid", "v0")},
+        "current_loop": {key: getattr(c.current_loop, key) for key in ("Kp", "Ki", "sample_time")},
+        "limits": {key: getattr(c.limits, key) for key in ("current", "voltage", "force")},
+        "verification": {
+            "poles": {
+                key: _pairs(getattr(margins.poles, key))
+                for key in ("open_loop", "regulator", "filter", "closed_loop")
+            },
+            "bandwidth": dict(margins.bandwidth),
+            "peak_sensitivity": dict(margins.peak_sensitivity),
+        },
+        "provenance": {"malta": version("malta"), "python": platform.python_version()}
+        | {name: version(name) for name in ("numpy", "scipy", "control", "casadi")},
+    }
+    plain: dict[str, Any] = _plain(tables)
+    plain["sha256"] = _content_sha256(plain)
+    return plain
+
+
+def write(controller: Controller, margins: Margins, *paths: str | Path) -> None:
+    """Write a controller to gain files; the suffix (.json, .npz, .mat) says which form.
+
+    All files are completed beside their targets before any is renamed into place, so a failure leaves the old ones.
+
+    Raises InputError for an unknown suffix or a folder that cannot be written to.
+    """
+    content = document(controller, margins)
+    staged: list[tuple[str, Path]] = []
+    try:
+        for path in map(Path, paths):
+            data = _encode(content, path)
+            try:
+                path.parent.mkdir(parents=True, exist_ok=True)
+                with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}.", delete=False) as file:
+                    staged.append((file.name, path))
+                    file.write(data)
+                    os.fchmod(file.fileno(), 0o644)
+            except OSError as error:
+                raise InputError(path, "", error.strerror or str(error), "a folder to write to") from error
+        for name, path in staged:
+            os.replace(name, path)
+    finally:
+        for name, _ in staged:
+            Path(name).unlink(missing_ok=True)
+
+
+def read(path: str | Path) -> Controller:
+    """Read a gain file (.json, .npz or .mat) and check it.
+
+    Raises InputError, naming file and field: not such a file, another schema or version, a missing or extra entry, a
+    wrong shape, NaN or infinity, a non-positive sample time, content that does not match its sha256, gains that do not
+    stabilize the file's own model.
+    """
+    content = _decode(path)
+    for key, wanted in (("schema", SCHEMA), ("version", VERSION)):
+        if content.get(key) != wanted:
+            raise InputError(path, key, repr(content.get(key)), repr(wanted))
+    file = validated(GainFile, content, path)
+    plain = file.model_dump(by_alias=True)
+    if _content_sha256(plain) != file.sha256:
+        raise InputError(path, "sha256", "content that was changed or damaged", "the content that was written")
+    controller = _controller(file, path)
+    regulator, observer = own_poles(controller)
+    for field, poles in (("gains.K", regulator), ("gains.L", observer)):
+        radius = float(np.abs(poles).max())
+        if not radius < 1:
+            raise InputError(
+                path, field, f"a pole of the file's own model at |lambda| = {radius:.6f}", "gains that stabilize it"
+            )
+    return controller
+
+
+def _controller(file: GainFile, path: str | Path) -> Controller:
+    par = _parameters(file.plant, path)
+    plant = plant_of(par)
+    states, forces, measurements = (
+        tuple(Signal(s.name, s.unit) for s in getattr(file.signals, key))
+        for key in ("states", "forces", "measurements")
+    )
+    mechanical = plant.design_states
+    for key, found, wanted in (
+        ("states", states[: len(mechanical)], mechanical),
+        ("forces", forces, plant.inputs),
+        ("measurements", measurements, plant.outputs),
+    ):
+        if found != wanted:
+            raise InputError(path, f"signals.{key}", _names(found), f"{_names(wanted)} of the {plant.name}")
+    n, n0, m, p, g = len(states), len(mechanical), len(forces), len(measurements), len(file.feedforward.z_grid)
+    if (n - n0) % m:
+        raise InputError(path, "signals.states", f"{n} states", f"{n0} and a multiple of {m} stored forces")
+    shapes = {
+        "model": {"A": (n0, n0), "B": (n0, m), "C": (p, n0), "Ad": (n, n), "Bd": (n, m), "Cd": (p, n)},
+        "gains": {"K": (m, n), "Ki": (m, p), "L": (n, p)},
+        "operating_point": {"x": (n0,), "u": (m,)},
+        "feedforward": {"z_grid": (g,), "v0": (g, m)},
+        "limits": {"current": (m,), "voltage": (m,), "force": (m,)},
+    }
+    arrays = {
+        table: {key: _array(getattr(getattr(file, table), key), shape, path, f"{table}.{key}") for key, shape in keys.items()}
+        for table, keys in shapes.items()
+    }
+    z_grid = arrays["feedforward"]["z_grid"]
+    if g < 2 or not (np.diff(z_grid) > 0).all():
+        raise InputError(path, "feedforward.z_grid", "values that do not rise", "at least two rising positions")
+    for key, limit in arrays["limits"].items():
+        if not (limit > 0).all():
+            raise InputError(path, f"limits.{key}", str(limit.tolist()), "limits above 0")
+    return Controller(
+        name=file.design.name,
+        spec_sha256=file.design.spec_sha256,
+        parameters=par,
+        operating_point=(arrays["operating_point"]["x"], arrays["operating_point"]["u"]),
+        sample_time=file.sample_time,
+        states=states,
+        forces=forces,
+        measurements=measurements,
+        **arrays["model"],
+        **arrays["gains"],
+        feedforward=Feedforward(file.feedforward.mass, z_grid, arrays["feedforward"]["v0"]),
+        current_loop=CurrentLoop(file.current_loop.Kp, file.current_loop.Ki, file.current_loop.sample_time),
+        limits=Limits(**arrays["limits"]),
+    )
+
+
+def _parameters(plant: _Plant, path: str | Path) -> Parameters:
+    record: type[Parameters] = machine_module(plant.name).Parameters
+    units = units_of(record)
+    if set(plant.parameters) != set(units):
+        odd = sorted(set(plant.parameters) ^ set(units))
+        raise InputError(path, "plant.parameters", f"{odd[0]} missing or unknown", " ".join(units))
+    for key, q in plant.parameters.items():
+        if q.unit != units[key]:
+            raise InputError(path, f"plant.parameters.{key}.unit", repr(q.unit), repr(units[key]))
+    try:
+        return record(**{k: q.value for k, q in plant.parameters.items()}, preset=plant.preset)  # type: ignore[call-arg]
+    except InputError as error:
+        raise InputError(path, f"plant.parameters.{error.field}", error.found, error.expected) from error
+
+
+def _array(value: list[Any], shape: tuple[int, ...], path: str | Path, field: str) -> FloatArray:
+    rows = {len(row) for row in value} if len(shape) == 2 else set()
+    found = (len(value), *rows) if len(rows) <= 1 else None
+    if found != shape:
+        text = "rows of unequal length" if found is None else f"shape {found}"
+        raise InputError(path, field, text, f"shape {shape}")
+    return np.array(value, dtype=float)
+
+
+def _names(signals: tuple[Signal, ...]) -> str:
+    return " ".join(s.name for s in signals)
+
+
+def _pairs(poles: ComplexArray) -> list[list[float]]:
+    return [[float(p.real), float(p.imag)] for p in poles]
+
+
+def _plain(value: Any) -> Any:
+    """Tables, lists and numbers only; no negative zeros, which JSON readers of other languages may lose."""
+    if isinstance(value, Mapping):
+        return {key: _plain(entry) for key, entry in value.items()}
+    if isinstance(value, np.ndarray):
+        return _plain(value.tolist())
+    if isinstance(value, list):
+        return [_plain(entry) for entry in value]
+    return value + 0.0 if isinstance(value, float) else value
+
+
+def _content_sha256(content: Mapping[str, Any]) -> str:
+    rest = {key: value for key, value in content.items() if key != "sha256"}
+    return hashlib.sha256(json.dumps(rest, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+
+
+# --- the three forms ---
+
+
+def _encode(content: Mapping[str, Any], path: Path) -> bytes:
+    if path.suffix == ".json":
+        text = json.dumps(content, indent=1, allow_nan=False)
+        # One matrix row a line: innermost lists are joined.
+        return re.sub(r"\[\s*([^][{}]*?)\s*\]", lambda m: f"[{' '.join(m[1].split())}]", text).encode() + b"\n"
+    if path.suffix == ".npz":
+        buffer = io.BytesIO()
+        with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
+            for name, value in _flat(_columns(content)).items():
+                entry = io.BytesIO()
+                np.lib.format.write_array(entry, np.array(value), allow_pickle=False)
+                info = zipfile.ZipInfo(f"{name}.npy")  # the fixed date of 1980: no time stamp
+                info.compress_type = zipfile.ZIP_DEFLATED
+                archive.writestr(info, entry.getvalue())
+        return buffer.getvalue()
+    if path.suffix == ".mat":
+        from scipy.io import savemat
+
+        buffer = io.BytesIO()
+        savemat(buffer, _cells(_columns(content)), long_field_names=True, oned_as="row")
+        header = b"MATLAB 5.0 MAT-file, malta gain file, version 1".ljust(116)  # instead of date and platform
+        return header + buffer.getvalue()[116:]
+    raise InputError(path, "", f"suffix {path.suffix!r}", "one of " + ", ".join(SUFFIXES))
+
+
+def _decode(path: str | Path) -> dict[str, Any]:
+    path = Path(path)
+    if path.suffix not in SUFFIXES:
+        raise InputError(path, "", f"suffix {path.suffix!r}", "one of " + ", ".join(SUFFIXES))
+    try:
+        data = path.read_bytes()
+    except FileNotFoundError as error:
+        raise InputError(path, "", "no such file", "a gain file") from error
+    except OSError as error:
+        raise InputError(path, "", error.strerror or str(error), "a readable gain file") from error
+    try:
+        content = {".json": _from_json, ".npz": _from_npz, ".mat": _from_mat}[path.suffix](data)
+    except Exception as error:  # a damaged archive makes its reader raise nearly anything
+        raise InputError(
+            path, "", f"a damaged or foreign file ({error})", f"a complete {path.suffix} gain file"
+        ) from error
+    if not isinstance(content, dict):
+        raise InputError(path, "", f"a {type(content).__name__}", "the tables of a gain file")
+    return content
+
+
+def _from_json(data: bytes) -> Any:
+    def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        table = dict(pairs)
+        if len(table) < len(pairs):
+            keys = [key for key, _ in pairs]
+            raise ValueError(f"{next(k for k in keys if keys.count(k) > 1)} stands twice")
+        return table
+
+    return json.loads(data.decode("utf-8"), object_pairs_hook=unique)
+
+
+def _from_npz(data: bytes) -> dict[str, Any]:
+    tree: dict[str, Any] = {}
+    with np.load(io.BytesIO(data), allow_pickle=False) as archive:
+        for name in archive.files:
+            *tables, key = name.split(".")
+            table = tree
+            for part in tables:
+                table = table.setdefault(part, {})
+            table[key] = archive[name].tolist()
+    return tree
+
+
+def _from_mat(data: bytes) -> dict[str, Any]:
+    from scipy.io import loadmat
+
+    content = loadmat(io.BytesIO(data), struct_as_record=True, squeeze_me=False)
+    tree: dict[str, Any] = {k: _uncell(v, k) for k, v in content.items() if not k.startswith("__")}
+    return tree
+
+
+def _columns(content: Mapping[str, Any]) -> dict[str, Any]:
+    """Signals as two lists, name and unit."""
+    signals = {
+        key: {column: [row[column] for row in rows] for column in ("name", "unit")}
+        for key, rows in content["signals"].items()
+    }
+    return {**content, "signals": signals}
+
+
+def _flat(tables: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for key, value in tables.items():
+        flat |= _flat(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
+    return flat
+
+
+def _cells(value: Any) -> Any:
+    """Lists of text as MATLAB cell arrays, lists of numbers as arrays."""
+    if isinstance(value, Mapping):
+        return {key: _cells(entry) for key, entry in value.items()}
+    if isinstance(value, list):
+        return np.array(value, dtype=object if isinstance(value[0], str) else float)
+    return value
+
+
+MATRICES = ("model.", "gains.", "feedforward.v0", "verification.poles.")
+VECTORS = ("operating_point.", "feedforward.z_grid", "limits.")
+
+
+def _uncell(value: Any, name: str) -> Any:
+    """MATLAB holds everything as a matrix: tables, texts, vectors and numbers are told apart by their names."""
+    if value.dtype.names:
+        return {key: _uncell(value[key][0, 0], f"{name}.{key}") for key in value.dtype.names}
+    if value.dtype == object:
+        return [str(cell[0]) for cell in value.ravel()]
+    if value.dtype.kind == "U":
+        return str(value[0]) if value.size else ""
+    if name.startswith(MATRICES):
+        return value.tolist()
+    if name.startswith(VECTORS):
+        return value.ravel().tolist()
+    return value.item()

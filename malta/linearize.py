@@ -1,0 +1,88 @@
+"""Plant at an operating point -> linear model, by CasADi's exact derivatives.
+
+    xi' = A xi + B v,   p = C xi          eq. (19), xi = (q, q'), the uncontrolled states dropped
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import casadi as ca
+import numpy as np
+
+from malta.errors import CheckError, InputError
+from malta.plant import OperatingPoint, Plant, readonly
+
+if TYPE_CHECKING:
+    from malta.plant import FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class LinearModel:
+    """xi' = A xi + B v, p = C xi, about `operating_point`. A is n x n, B n x m, C p x n."""
+
+    plant: Plant
+    operating_point: OperatingPoint
+    A: FloatArray
+    B: FloatArray
+    C: FloatArray
+
+    def __post_init__(self) -> None:
+        for name in "ABC":
+            object.__setattr__(self, name, readonly(getattr(self, name)))
+
+    @cached_property
+    def sys(self) -> Any:
+        """The model as a control.StateSpace with named states, inputs and outputs."""
+        import control  # imports matplotlib and takes a second: only where it is used
+
+        return control.ss(
+            self.A,
+            self.B,
+            self.C,
+            np.zeros((self.C.shape[0], self.B.shape[1])),
+            name=self.plant.name,
+            states=[s.name for s in self.plant.design_states],
+            inputs=[s.name for s in self.plant.inputs],
+            outputs=[s.name for s in self.plant.outputs],
+        )
+
+    @property
+    def stiffness(self) -> FloatArray:
+        """q'' per q: the lower left block of A, 1/s2. M^-1 S in the paper's letters."""
+        n = len(self.A) // 2
+        return self.A[n:, :n]
+
+    @property
+    def force_map(self) -> FloatArray:
+        """q'' per v: the lower half of B. M^-1 V in the paper's letters."""
+        return self.B[len(self.A) // 2 :]
+
+
+def linearize(plant: Plant, point: OperatingPoint) -> LinearModel:
+    """Linearize x' = f(x, u, w), y = h(x, u) at an operating point.
+
+    At `plant.at(z=...)` the loads are left out, as v0(z) cancels them; at `trim(plant, z=...)` they act, which
+    adds the slope of the load and of its balance (for MALTA: m g / Ixx from z into alpha'').
+
+    Raises InputError when the point has the wrong size, CheckError when the Jacobian is not finite.
+    """
+    n, m = len(plant.states), len(plant.inputs)
+    if point.x.shape != (n,) or point.u.shape != (m,):
+        raise InputError(
+            plant.name, "operating point", f"x {point.x.shape}, u {point.u.shape}", f"x ({n},), u ({m},)"
+        )
+    x, u = ca.SX.sym("x", n), ca.SX.sym("u", m)
+    w = plant.load(x) if point.loaded else ca.SX.zeros(len(plant.disturbances))
+    rate, y = plant.f(x, u, w), plant.h(x, u)
+    derivatives = ca.Function(
+        "derivatives", [x, u], [ca.jacobian(rate, x), ca.jacobian(rate, u), ca.jacobian(y, x)]
+    )
+    A, B, C = (np.array(value) for value in derivatives(point.x, point.u))
+    keep = list(plant.controlled)
+    A, B, C = A[np.ix_(keep, keep)], B[keep], C[:, keep]
+    if not all(np.isfinite(M).all() for M in (A, B, C)):
+        raise CheckError(f"{plant.name}: the linear model is not finite at x = {point.x.tolist()}")
+    return LinearModel(plant, point, A, B, C)

@@ -1,0 +1,174 @@
+"""The records of a machine: signals, plant, operating point; and trim().
+
+A plant is x' = f(x, u, w), y = h(x, u). w is an external force and torque. The known static loads of the
+machine (gravity, cogging) are kept apart in load(x), because the controller's feedforward v0(z) cancels
+them: the machine moves by f(x, u, w + load(x)), and the controller is designed on f(x, u, 0).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Protocol
+
+import casadi as ca
+import numpy as np
+
+from malta.errors import CheckError, InputError
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike, NDArray
+
+    FloatArray = NDArray[np.float64]
+
+CasadiFn = Callable[..., Any]  # takes and returns casadi SX, MX or DM
+
+
+class Parameters(Protocol):
+    """A frozen dataclass whose physical fields are declared with data.si(unit)."""
+
+    __dataclass_fields__: ClassVar[dict[str, Any]]
+
+    @property
+    def preset(self) -> str: ...
+
+
+class Signal(NamedTuple):
+    """A named scalar with its SI unit."""
+
+    name: str
+    unit: str
+
+
+@dataclass(frozen=True)
+class Actuator:
+    """What turns a commanded input into a force: a current loop per input, with limits.
+
+    The current loop is a PI controller on 1 / (L s + R), designed for `crossover` and `phase_margin`.
+    """
+
+    force_constant: tuple[float, ...]  # N/A, per input
+    current_limit: float  # A
+    voltage_limit: float  # V
+    R: float  # ohm
+    L: float  # H
+    crossover: float  # rad/s
+    phase_margin: float  # rad
+    sample_time: float  # s
+    dead_time: float  # s
+
+    @property
+    def force_limit(self) -> FloatArray:
+        """Largest force of each input, N."""
+        return self.current_limit * np.array(self.force_constant)
+
+
+@dataclass(frozen=True, eq=False)
+class Plant:
+    """A machine: equations of motion that CasADi can trace, and the names and units of its signals.
+
+    `states` are positions, then their rates in the same order. `uncontrolled` are states that no input
+    reaches (the rotation of a tubular mover): simulated, but left out of the design.
+    """
+
+    name: str
+    parameters: Parameters
+    states: tuple[Signal, ...]
+    inputs: tuple[Signal, ...]
+    outputs: tuple[Signal, ...]
+    disturbances: tuple[Signal, ...]
+    uncontrolled: tuple[str, ...]
+    f: CasadiFn  # (x, u, w) -> x'
+    h: CasadiFn  # (x, u) -> y
+    load: CasadiFn  # x -> w of gravity and cogging
+    position_of: CasadiFn  # y -> controlled positions; the inverse of h at rest
+    actuator: Actuator
+    contacts: tuple[str, ...]  # what the moving part may touch
+    contact: CasadiFn  # x -> share of each clearance that is used up; 1 at contact
+    noise: tuple[float, ...]  # of each sensor, rms of a sample, in the unit of each output
+    resolution: tuple[float, ...]  # of each sensor; 0 where it has none to speak of
+    mass: float  # moved by the `thrust` input, for the feedforward m z''
+    thrust: str  # the input that drives the stroke
+    stroke: str  # the output that the stroke moves
+    travel: float  # of that output, either way, m
+
+    @property
+    def controlled(self) -> tuple[int, ...]:
+        """Indices of the states of the design model."""
+        return tuple(i for i, s in enumerate(self.states) if s.name not in self.uncontrolled)
+
+    @property
+    def design_states(self) -> tuple[Signal, ...]:
+        """The states of the design model."""
+        return tuple(self.states[i] for i in self.controlled)
+
+    def at(self, **positions: float) -> OperatingPoint:
+        """The operating point at these states (SI), the others zero, without preload.
+
+        The loads are taken as cancelled at every position, as v0(z) does. `plant.at(z=5e-3)`
+        """
+        return OperatingPoint(self._state(positions), np.zeros(len(self.inputs)), loaded=False)
+
+    def _state(self, values: Mapping[str, float]) -> FloatArray:
+        names = [s.name for s in self.states]
+        x = np.zeros(len(names))
+        for name, value in values.items():
+            if name not in names:
+                raise InputError(self.name, name, "an unknown state", "one of " + " ".join(names))
+            if not np.isfinite(value):
+                raise InputError(self.name, name, str(value), "a finite number")
+            x[names.index(name)] = value
+        return x
+
+
+@dataclass(frozen=True, eq=False)
+class OperatingPoint:
+    """State and input to linearize at. `loaded`: the loads act and u balances them (trim)."""
+
+    x: FloatArray
+    u: FloatArray
+    loaded: bool
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "x", readonly(self.x))
+        object.__setattr__(self, "u", readonly(self.u))
+
+
+def readonly(array: ArrayLike) -> FloatArray:
+    """A private copy that cannot be written to."""
+    copy = np.array(array, dtype=float)
+    copy.flags.writeable = False
+    return copy
+
+
+def trim(plant: Plant, **positions: float) -> OperatingPoint:
+    """The inputs that hold the machine at rest at these states (SI) against its loads.
+
+    Solves 0 = f(x, u, load(x)) for u, in the least-squares sense, by Newton's method.
+
+    Raises CheckError when no input holds the machine there.
+    """
+    x = plant.at(**positions).x
+    return OperatingPoint(x, _hold(plant, x[None, :])[0], loaded=True)
+
+
+def trims(plant: Plant, name: str, values: ArrayLike) -> FloatArray:
+    """The inputs of `trim` along one state, one row for each value."""
+    return _hold(plant, np.array([plant.at(**{name: value}).x for value in np.asarray(values)]))
+
+
+def _hold(plant: Plant, states: FloatArray) -> FloatArray:
+    x, u = ca.SX.sym("x", len(plant.states)), ca.SX.sym("u", len(plant.inputs))
+    rate = plant.f(x, u, plant.load(x))
+    residual = ca.Function("residual", [x, u], [rate, ca.jacobian(rate, u)])
+    held = np.zeros((len(states), len(plant.inputs)))
+    for i, state in enumerate(states):
+        for _ in range(2):  # f is affine in the inputs of every machine here: the second step only polishes
+            r, J = (np.array(value) for value in residual(state, held[i]))
+            held[i] -= np.linalg.lstsq(J, r, rcond=None)[0].ravel()
+        left = float(np.abs(np.array(residual(state, held[i])[0])).max())
+        if not left <= 1e-9:  # m/s2 or rad/s2
+            raise CheckError(
+                f"{plant.name}: no input holds the state {state.tolist()}: an acceleration of {left:.3g} is left"
+            )
+    return held

@@ -1,0 +1,185 @@
+"""MALTA: a magnetically levitated tubular actuator with two stator modules.
+
+Source: S. Miric et al., IEEE Trans. Ind. Electron. 68(1), 2021; equation and table numbers are its own.
+State: x y z, the Cardan angles alpha beta gamma, and their rates. The mover's axis is z, gravity is along -y.
+Two modules act at z = -l_B and z = +l_B, two radial sensor planes sit at z = -l_S and z = +l_S.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+
+from malta.data import check_parameters, si
+from malta.plant import Actuator, Plant, Signal
+from malta.rigidbody import EXACT, SMALL_ANGLE, Trig, acceleration, principal, rate_map, rotation
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """Physical parameters, SI; where each comes from is said in data/tubular.toml."""
+
+    m: float = si("kg", above=0)  # mover with magnets
+    I_xx: float = si("kg m^2", above=0)  # moments of inertia in frame R
+    I_yy: float = si("kg m^2", above=0)
+    I_zz: float = si("kg m^2", above=0)
+    K_A: float = si("N/m", at_least=0)  # attraction per module (a negative stiffness)
+    K_B: float = si("N/A", above=0)  # bearing force per module
+    K_D: float = si("N/A", above=0)  # drive force per module
+    l_B: float = si("m", above=0)  # origin to bearing plane
+    l_S: float = si("m", above=0)  # origin to sensor plane
+    L_p: float = si("m", above=0)  # pole size
+    g: float = si("m/s^2", at_least=0)
+    F_c: float = si("N", at_least=0)  # cogging amplitude
+    phi_c: float = si("rad")  # cogging phase
+    R: float = si("ohm", above=0)  # phase winding
+    L: float = si("H", above=0)
+    Psi: float = si("Wb", above=0)  # flux linkage
+    K_ind: float = si("V s/m", above=0)  # induced voltage
+    V_dc: float = si("V", above=0)  # DC link
+    C_dc: float = si("F", above=0)
+    V_max: float = si("V", above=0)  # phase-voltage limit
+    I_max: float = si("A", above=0)  # current limit per dq axis
+    f_pwm: float = si("Hz", above=0)
+    T_cc: float = si("s", above=0)  # period of the current controllers
+    w_cc: float = si("rad/s", above=0)  # crossover of the current loops
+    pm_cc: float = si("rad", above=0)  # their phase margin
+    T_d: float = si("s", at_least=0)  # dead time of computation and hold
+    z_max: float = si("m", above=0)  # axial travel, either way
+    r_max: float = si("m", above=0)  # radial travel, either way: touchdown
+    s_r: float = si("m", at_least=0)  # radial sensor noise, rms of a sample
+    s_z: float = si("m", at_least=0)  # axial sensor noise, rms of a sample
+    dp: float = si("m", at_least=0)  # radial sensor resolution
+    preset: str = "custom"
+
+    def __post_init__(self) -> None:
+        check_parameters(self, "tubular.Parameters")
+
+
+POSITIONS = tuple(Signal(n, "m") for n in "xyz") + tuple(Signal(n, "rad") for n in ("alpha", "beta", "gamma"))
+RATES = tuple(Signal(f"{s.name}_dot", f"{s.unit}/s") for s in POSITIONS)
+INPUTS = tuple(Signal(n, "N") for n in ("fx_B1", "fy_B1", "fx_B2", "fy_B2", "f_D"))
+OUTPUTS = tuple(Signal(n, "m") for n in ("x1", "y1", "x2", "y2", "z"))
+WRENCH = tuple(Signal(f"F_{a}", "N") for a in "xyz") + tuple(Signal(f"T_{a}", "N m") for a in "xyz")
+
+
+def plant(par: Parameters, *, small_angle: bool = False) -> Plant:
+    """The nonlinear mover, six degrees of freedom, exact trigonometry.
+
+    small_angle: the paper's own equations (sin a = a, cos a = 1; attraction without an axial part).
+    """
+    x, u, w = ca.SX.sym("x", 12), ca.SX.sym("u", 5), ca.SX.sym("w", 6)
+    trig = SMALL_ANGLE if small_angle else EXACT
+    inertia = (par.I_xx, par.I_yy, par.I_zz)
+    R_BI = rotation(principal(x[3:6], inertia), trig)
+    F_I, T_B = _wrench(par, x, u, R_BI, conservative=not small_angle)
+    q_t_ddot, q_r_ddot = acceleration(
+        par.m, inertia, x[3:6], x[9:12], F_I + w[:3], T_B + R_BI @ w[3:], trig
+    )
+    f = ca.Function("f", [x, u, w], [ca.cse(ca.vertcat(x[6:], q_t_ddot, q_r_ddot))])
+    return Plant(
+        name="tubular",
+        parameters=par,
+        states=POSITIONS + RATES,
+        inputs=INPUTS,
+        outputs=OUTPUTS,
+        disturbances=WRENCH,
+        uncontrolled=("gamma", "gamma_dot"),
+        f=f,
+        h=lambda x, u: measured(par, x, trig),
+        load=lambda x: load(par, x),
+        position_of=lambda p: position_of(par, p),
+        actuator=Actuator(
+            force_constant=(par.K_B, par.K_B, par.K_B, par.K_B, 2 * par.K_D),  # f_D = f_D1 + f_D2, eq. (17)
+            current_limit=par.I_max,
+            voltage_limit=par.V_max,
+            R=par.R,
+            L=par.L,
+            crossover=par.w_cc,
+            phase_margin=par.pm_cc,
+            sample_time=par.T_cc,
+            dead_time=par.T_d,
+        ),
+        contacts=("touchdown at sensor plane 1", "touchdown at sensor plane 2", "axial end stop"),
+        contact=lambda x: contact(par, x, trig),
+        travel=par.z_max,
+        noise=(par.s_r, par.s_r, par.s_r, par.s_r, par.s_z),
+        resolution=(par.dp, par.dp, par.dp, par.dp, 0.0),
+        mass=par.m,
+        thrust="f_D",
+        stroke="z",
+    )
+
+
+def _wrench(par: Parameters, x: Any, u: Any, R_BI: Any, *, conservative: bool) -> tuple[Any, Any]:
+    """Force in frame I and torque about the centre of gravity in frame B: eqs (5)-(14).
+
+    F_i = (fx_i, fy_i, f_D / 2) + K_A P_i,xy acts at P_i = O + l_i n, n the mover's axis, which is e_z in frame B:
+    T_B = sum of l_i e_z x R_BI F_i.
+    NOTE: eq. (12) prints (l_B + z) in the second lever arm; eq. (5) gives (l_B - z), and only with that is the
+    linearized stiffness symmetric.
+    """
+    n = R_BI[2, :].T
+    F_I, moment = ca.SX.zeros(3), ca.SX.zeros(3)
+    for l_i, f_xy in ((-(par.l_B + x[2]), u[0:2]), (par.l_B - x[2], u[2:4])):
+        F_A = par.K_A * (x[0:2] + l_i * n[0:2])
+        F_i = ca.vertcat(f_xy + F_A, u[4] / 2)
+        F_I += F_i
+        moment += l_i * F_i
+        if conservative:
+            # The potential -K_A |P_i,xy|^2 / 2 has an axial slope too, because l_i falls as z grows. The
+            # paper's (9), (10) leave it out: second order, absent from every linearization, but without
+            # it a moving mover does not conserve energy.
+            F_I[2] -= ca.dot(F_A, n[0:2])
+    return F_I, ca.cross(ca.SX([0, 0, 1]), R_BI @ moment)
+
+
+def load(par: Parameters, x: Any) -> Any:
+    """Gravity (missing from eq. (6)) and cogging, as a wrench at the centre of gravity."""
+    cogging = par.F_c * ca.sin(2 * math.pi / par.L_p * x[2] + par.phi_c)
+    return ca.vertcat(0, -par.m * par.g, cogging, 0, 0, 0)
+
+
+def measured(par: Parameters, x: Any, trig: Trig = EXACT) -> Any:
+    """p = (x1, y1, x2, y2, z): where the mover's axis pierces the planes z = -l_S and z = +l_S.
+
+    With small angles this is p = P_0(z) q, eq. (15).
+    """
+    n = rotation(x[3:6], trig)[2, :].T
+    slope = n[0:2] / n[2]
+    return ca.vertcat(
+        x[0:2] - (par.l_S + x[2]) * slope, x[0:2] + (par.l_S - x[2]) * slope, x[2]
+    )
+
+
+def contact(par: Parameters, x: Any, trig: Trig = EXACT) -> Any:
+    """Share of the clearance that is used up, 1 at contact; the touchdown bearings are taken at the sensor planes."""
+    p = measured(par, x, trig)
+    radii = [ca.sqrt(p[i] ** 2 + p[i + 1] ** 2) / par.r_max for i in (0, 2)]
+    return ca.vertcat(*radii, ca.fabs(p[4]) / par.z_max)
+
+
+def position_of(par: Parameters, p: Any) -> Any:
+    """q = (x, y, z, alpha, beta) = P(z)^-1 p. det P = (2 l_S)^2 for every z, so it always exists.
+
+    NOTE: the paper calls P_0 not invertible: that holds for the 5 x 6 matrix with gamma only.
+    """
+    alpha, beta = (p[1] - p[3]) / (2 * par.l_S), (p[2] - p[0]) / (2 * par.l_S)
+    return ca.vertcat(
+        (p[0] + p[2]) / 2 + p[4] * beta, (p[1] + p[3]) / 2 - p[4] * alpha, p[4], alpha, beta
+    )
+
+
+def energy(par: Parameters, x: Any) -> Any:
+    """Kinetic plus potential energy, J: constant without inputs and disturbances."""
+    n = rotation(x[3:6])[2, :].T
+    omega = rate_map(x[3:6]) @ x[9:12]
+    kinetic = par.m / 2 * ca.sumsqr(x[6:9]) + ca.dot(ca.vertcat(par.I_xx, par.I_yy, par.I_zz), omega**2) / 2
+    wave = 2 * math.pi / par.L_p
+    potential = par.m * par.g * x[1] + par.F_c / wave * ca.cos(wave * x[2] + par.phi_c)
+    for l_i in (-(par.l_B + x[2]), par.l_B - x[2]):
+        potential -= par.K_A / 2 * ca.sumsqr(x[0:2] + l_i * n[0:2])
+    return kinetic + potential

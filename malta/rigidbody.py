@@ -1,0 +1,83 @@
+"""Newton–Euler equations of a free rigid body with Cardan angles, in CasADi.
+
+Frames: I is fixed to the stator, R to the mover. q_r = (alpha, beta, gamma) turn I into R about x, y', z'':
+
+    R_RI = R_z(gamma) R_y(beta) R_x(alpha)          a_R = R_RI a_I
+    omega_R = (0, 0, gamma') + R_z (0, beta', 0) + R_z R_y (alpha', 0, 0)                      eq. (4)
+    m q_t'' = F_I          I omega_R' + omega_R x I omega_R = T_R                              eq. (3)
+
+`rotation`, `rate_map` and `cardan_rates` take the angles of whichever frame is wanted.
+
+NOTE: eq. (4) writes the Cardan rates as components of an angular velocity in frame I; they are not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import casadi as ca
+
+
+class Trig(NamedTuple):
+    """Sine and cosine, exact or by the paper's small-angle approximation."""
+
+    sin: Callable[[Any], Any]
+    cos: Callable[[Any], Any]
+
+
+EXACT = Trig(ca.sin, ca.cos)
+SMALL_ANGLE = Trig(lambda angle: angle, lambda angle: 1)
+
+
+def rotation(q_r: Any, trig: Trig = EXACT) -> Any:
+    """R_RI, 3 x 3: turns components in I into components in R."""
+    (sa, sb, sg), (ca_, cb, cg) = ([fn(q_r[i]) for i in range(3)] for fn in trig)
+    R_x = _matrix([[1, 0, 0], [0, ca_, sa], [0, -sa, ca_]])
+    R_y = _matrix([[cb, 0, -sb], [0, 1, 0], [sb, 0, cb]])
+    R_z = _matrix([[cg, sg, 0], [-sg, cg, 0], [0, 0, 1]])
+    return R_z @ R_y @ R_x
+
+
+def rate_map(q_r: Any, trig: Trig = EXACT) -> Any:
+    """E, 3 x 3, of eq. (4): omega_R = E(q_r) q_r'."""
+    sb, cb, sg, cg = trig.sin(q_r[1]), trig.cos(q_r[1]), trig.sin(q_r[2]), trig.cos(q_r[2])
+    return _matrix([[cg * cb, sg, 0], [-sg * cb, cg, 0], [sb, 0, 1]])
+
+
+def principal(q_r: Any, inertia: Sequence[float]) -> Any:
+    """Cardan angles of the frame B that the equations are written in: R, or R before gamma.
+
+    Every axis across a body with Ixx = Iyy is a principal one, so its equations need no gamma.
+    """
+    return ca.vertcat(q_r[:2], 0) if inertia[0] == inertia[1] else q_r
+
+
+def cardan_rates(q_r: Any, omega: Any, trig: Trig = EXACT) -> Any:
+    """q_r' = E(q_r)^-1 omega_R. Singular at beta = +-90 degrees, far beyond any air gap."""
+    sb, cb, sg, cg = trig.sin(q_r[1]), trig.cos(q_r[1]), trig.sin(q_r[2]), trig.cos(q_r[2])
+    if trig is SMALL_ANGLE:  # E's own inverse: with these sines and cosines it is not the exact one
+        return ca.solve(rate_map(q_r, trig), omega)
+    dalpha = (cg * omega[0] - sg * omega[1]) / cb
+    return ca.vertcat(dalpha, sg * omega[0] + cg * omega[1], omega[2] - sb * dalpha)
+
+
+def acceleration(
+    m: float, inertia: Sequence[float], q_r: Any, dq_r: Any, F_I: Any, T_B: Any, trig: Trig = EXACT
+) -> tuple[Any, Any]:
+    """q_t'' and q_r'' under the force F_I (N) and the torque T_B about the centre of gravity (N m).
+
+    B is the frame with the angles principal(q_r, inertia); `q_r` and `dq_r` are CasADi SX symbols; inertia is
+    (Ixx, Iyy, Izz) in kg m2. With Omega the angular velocity of B and omega that of the body, both in B:
+    I omega' + Omega x I omega = T_B and omega' = E q_r'' + (d omega / d q_r) q_r'.
+    """
+    q_B = principal(q_r, inertia)
+    omega = rate_map(q_B, trig) @ dq_r
+    spin = ca.vertcat(0, 0, dq_r[2] if inertia[0] == inertia[1] else 0)
+    I_m = ca.SX(list(inertia))
+    domega = (T_B - ca.cross(omega - spin, I_m * omega)) / I_m
+    return F_I / m, cardan_rates(q_B, domega - ca.jtimes(omega, q_r, dq_r), trig)
+
+
+def _matrix(rows: list[list[Any]]) -> Any:
+    return ca.vertcat(*(ca.horzcat(*row) for row in rows))

@@ -1,0 +1,277 @@
+"""Linear model + weights -> controller: LQR, LQR with integrals, steady-state Kalman filter, sampling.
+
+    minimize  integral of  xi' Q xi + e' Q_i e + v' R v      subject to  xi' = A xi + B v,  e' = -C xi
+    v = K (xi* - xi) + Ki e
+
+Three ways to a sampled controller:
+  backward-euler   continuous gains; the observer's equation by backward Euler (the paper's way)
+  zoh              gains of the exactly sampled model; weights and noise taken once a sample
+  sampled-data     gains of the exactly sampled model; weights and noise integrated over the sample (Van Loan),
+                   what MATLAB calls lqrd and kalmd
+The integrals are the controller's own sums, e+ = e + Ts (p* - y), so their weight is a sum in both sampled ways.
+Noise is given for one sample; held over it (forces) or spread over it (intensity = variance x Ts).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy import linalg
+
+from malta.controller import Controller, CurrentLoop, Feedforward, Limits
+from malta.errors import CheckError, InputError
+from malta.linearize import LinearModel
+from malta.plant import Actuator, Plant, Signal, trims
+from malta.riccati import care, dare, delay_inputs, sample, sample_cost, sample_noise
+from malta.spec import Discretization, Spec, Weights
+
+if TYPE_CHECKING:
+    from malta.plant import FloatArray
+
+V0_STEP = 0.25e-3  # m, grid of v0(z): interpolation errs less than 0.1 % of the cogging amplitude
+
+
+def lqr(model: LinearModel, weights: Weights) -> FloatArray:
+    """Continuous LQR gain K, m x n: v = -K xi minimizes the integral of xi'Q xi + v'R v."""
+    _check_sizes(model, weights)
+    return care(model.A, model.B, weights.Q, weights.R, "LQR").K
+
+
+def lqi(model: LinearModel, weights: Weights) -> tuple[FloatArray, FloatArray]:
+    """Continuous LQR with the integrals of the measured errors: K (m x n) and Ki (m x p).
+
+    v = K (xi* - xi) + Ki e, e' = p* - p. A new state integrates; the sign of Ki follows.
+    """
+    _check_sizes(model, weights)
+    n, p = len(model.A), len(model.C)
+    A = np.block([[model.A, np.zeros((n, p))], [-model.C, np.zeros((p, p))]])
+    B = np.vstack([model.B, np.zeros((p, model.B.shape[1]))])
+    gain = care(A, B, linalg.block_diag(weights.Q, weights.Q_i), weights.R, "LQI").K
+    return gain[:, :n], -gain[:, n:]
+
+
+def kalman(model: LinearModel, weights: Weights) -> FloatArray:
+    """Continuous steady-state Kalman gain L, n x p: xi_hat' = A xi_hat + B v + L (y - C xi_hat).
+
+    Only the ratio of process to sensor noise matters, so variances of a sample serve as intensities.
+    """
+    _check_sizes(model, weights)
+    W = model.B * weights.process_variance @ model.B.T
+    return care(model.A.T, model.C.T, W, np.diag(weights.sensor_variance), "Kalman filter").K.T
+
+
+def sampled_model(model: LinearModel, Ts: float, delay: int = 0) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Ad, Bd, Cd under a zero-order hold, with the forces of the last `delay` samples as states."""
+    Ad, Bd = delay_inputs(*sample(model.A, model.B, Ts), delay)
+    return Ad, Bd, np.hstack([model.C, np.zeros((len(model.C), len(Ad) - len(model.A)))])
+
+
+def lqg(
+    model: LinearModel,
+    weights: Weights,
+    Ts: float,
+    discretization: Discretization = "sampled-data",
+    delay: int = 0,
+    *,
+    name: str = "lqg",
+    current_loop_delay: bool = True,
+) -> Controller:
+    """Design the controller: LQR with integrals, steady-state Kalman filter, feedforward, current loop.
+
+    Parameters
+    ----------
+    Ts : sample time, s
+    delay : samples between measurement and force in the design model (not with backward-euler)
+    current_loop_delay : design the current loop with the machine's dead time
+
+    Raises InputError for arguments that do not fit, CheckError when an equation has no sound solution.
+    """
+    if not (math.isfinite(Ts) and Ts > 0):
+        raise InputError("lqg", "Ts", f"{Ts} s", "a sample time above 0 s")
+    if delay < 0 or (delay and discretization == "backward-euler"):
+        raise InputError("lqg", "delay", f"{delay} with {discretization}", "0, or more with zoh or sampled-data")
+    _check_sizes(model, weights)
+    if discretization == "backward-euler":
+        Ad, Bd, Cd, K, Ki, L = _backward_euler(model, weights, Ts)
+    else:
+        Ad, Bd, Cd = sampled_model(model, Ts, delay)
+        K, Ki = _sampled_regulator(model, weights, Ts, delay, integrated=discretization == "sampled-data")
+        L = _sampled_filter(model, weights, Ts, delay, integrated=discretization == "sampled-data")
+    plant, n = model.plant, len(model.A)
+    past = tuple(
+        Signal(f"{s.name}[k-{age}]", s.unit) for age in range(delay, 0, -1) for s in plant.inputs
+    )
+    axes = len(plant.inputs)
+    actuator = plant.actuator
+    Kp, Ki_current = pi_current_loop(actuator, actuator.dead_time if current_loop_delay else 0.0)
+    return Controller(
+        name=name,
+        spec_sha256="",
+        parameters=plant.parameters,
+        operating_point=(model.operating_point.x[list(plant.controlled)], model.operating_point.u),
+        sample_time=Ts,
+        states=plant.design_states + past,
+        forces=plant.inputs,
+        measurements=plant.outputs,
+        A=model.A,
+        B=model.B,
+        C=model.C,
+        Ad=Ad,
+        Bd=Bd,
+        Cd=Cd,
+        K=K,
+        Ki=Ki,
+        L=L,
+        feedforward=static_feedforward(plant),
+        current_loop=CurrentLoop(Kp, Ki_current, actuator.sample_time),
+        limits=Limits(
+            current=np.full(axes, actuator.current_limit),
+            voltage=np.full(axes, actuator.voltage_limit),
+            force=actuator.force_limit,
+        ),
+    )
+
+
+def synthesize(spec: Spec, model: LinearModel) -> Controller:
+    """The controller that a design file asks for."""
+    controller = lqg(
+        model,
+        spec.weights,
+        spec.sample_time,
+        spec.discretization,
+        spec.delay,
+        name=spec.name,
+        current_loop_delay=spec.current_loop_delay,
+    )
+    return replace(controller, spec_sha256=spec.sha256)
+
+
+def calibrate(
+    model: LinearModel,
+    weights: Weights,
+    stiffness_ratio: float,
+    axial_ratio: float = 1.0,
+    integral_time: float = 1.0,
+) -> Weights:
+    """Bases on which the LQR has the stiffness K1 = stiffness_ratio k in every unstable mode.
+
+    Where the modes decouple, q'' = k q + u with input weight 1/g gives K1 = k + sqrt(k^2 + q g / base^2), so the
+    base follows. The natural frequency is then w_n = sqrt((stiffness_ratio - 1) k). Modes without stiffness get
+    axial_ratio times the w_n of the first mode. A rate's base is w_n times its position's, an error integral's is
+    `integral_time` (s) times that of the first position (radial) or of its own (modes without stiffness).
+
+    Raises InputError when stiffness_ratio <= 2 (2 is reached at zero weight), or the modes couple.
+    """
+    k, G = model.stiffness, model.force_map
+    n = len(k)
+    coupling = k - np.diag(np.diag(k))
+    if np.abs(coupling).max() > 1e-9 * np.abs(k).max():
+        raise InputError("calibrate", "model", "coupled modes", "decoupled ones: z_ss = 0, zero preload")
+    if not stiffness_ratio > 2:
+        raise InputError("calibrate", "stiffness_ratio", f"{stiffness_ratio:g}", "more than 2")
+    stiffness = np.diag(k)
+    g = np.diag(G * (weights.r_base**2 / weights.r) @ G.T)
+    free = stiffness == 0
+    w_n = np.sqrt((stiffness_ratio - 1) * np.where(free, stiffness[0] * axial_ratio**2, stiffness))
+    K1 = w_n**2 + stiffness
+    base = np.sqrt(weights.q[:n] * g / ((K1 - stiffness) ** 2 - stiffness**2))
+    own = {s.name: i for i, s in enumerate(model.plant.design_states[:n])}
+    integral_base = [base[own.get(s.name, 0)] * integral_time for s in model.plant.outputs]
+    return replace(weights, q_base=np.concatenate([base, base * w_n]), q_i_base=np.array(integral_base))
+
+
+def pi_current_loop(actuator: Actuator, delay: float = 0.0) -> tuple[float, float]:
+    """Kp (V/A) and Ki (V/(A s)) that give 1/(L s + R) e^(-s delay) its crossover and phase margin, exactly.
+
+    |C G| = 1 and arg C G = margin - pi at s = j crossover. Cancelling the winding's pole instead would give 90
+    degrees, which is not the paper's design.
+    """
+    w = actuator.crossover
+    gain = abs(actuator.R + 1j * w * actuator.L)
+    phase = actuator.phase_margin - math.pi + w * delay + math.atan2(w * actuator.L, actuator.R)
+    Kp, Ki = gain * math.cos(phase), -w * gain * math.sin(phase)
+    if not (Kp > 0 and Ki > 0):
+        raise CheckError(
+            f"current loop: no PI controller reaches a phase margin of {math.degrees(actuator.phase_margin):.0f} deg "
+            f"at {w:.0f} rad/s with {delay * 1e6:.0f} us of delay"
+        )
+    return Kp, Ki
+
+
+def static_feedforward(plant: Plant) -> Feedforward:
+    """v0(z): the forces that hold the machine at each point of its travel against gravity and cogging."""
+    half = round(plant.travel / V0_STEP)
+    z_grid = np.linspace(-plant.travel, plant.travel, 2 * half + 1)
+    return Feedforward(plant.mass, z_grid, trims(plant, plant.stroke, z_grid))
+
+
+def _backward_euler(
+    model: LinearModel, weights: Weights, Ts: float
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Continuous gains; xi_hat' = A xi_hat + B v + L (y - C xi_hat) by backward Euler, in filter form.
+
+    (I - Ts A) xi_pred = xi_hat + Ts B v, and the correction is (I - Ts (A - L C))^-1 Ts L (y - C xi_pred).
+    """
+    K, Ki = lqi(model, weights)
+    Lc = kalman(model, weights)
+    eye = np.eye(len(model.A))
+    Ad = np.linalg.inv(eye - Ts * model.A)
+    L = np.linalg.solve(eye - Ts * (model.A - Lc @ model.C), Ts * Lc)
+    return Ad, Ts * Ad @ model.B, model.C, K, Ki, L
+
+
+def _sampled_regulator(
+    model: LinearModel, weights: Weights, Ts: float, delay: int, *, integrated: bool
+) -> tuple[FloatArray, FloatArray]:
+    """K, Ki of the sampled model. With delay, a force acts on the states d samples after it is commanded.
+
+    Its own weight may be charged at either time, which shifts a sum and changes no optimum; half at each keeps
+    the weight of states and stored forces positive semidefinite beside the cross term N.
+    """
+    n, m, p, d = len(model.A), model.B.shape[1], len(model.C), delay
+    if integrated:
+        Q, N, R = sample_cost(model.A, model.B, weights.Q, weights.R, Ts)
+    else:
+        Q, N, R = weights.Q * Ts, np.zeros((n, m)), weights.R * Ts
+    Ad, Bd, Cd = sampled_model(model, Ts, d)
+    if d:
+        rest = m * (d - 1)
+        Q = linalg.block_diag(np.block([[Q, N], [N.T, R / 2]]), np.zeros((rest, rest)))
+        N, R = np.zeros((n + m * d, m)), R / 2
+    A = np.block([[Ad, np.zeros((n + m * d, p))], [-Ts * Cd @ Ad, np.eye(p)]])
+    B = np.vstack([Bd, -Ts * Cd @ Bd])
+    gain = dare(
+        A, B, linalg.block_diag(Q, weights.Q_i * Ts), R, np.vstack([N, np.zeros((p, m))]), "sampled LQI"
+    ).K
+    return gain[:, : n + m * d], -gain[:, n + m * d :]
+
+
+def _sampled_filter(
+    model: LinearModel, weights: Weights, Ts: float, delay: int, *, integrated: bool
+) -> FloatArray:
+    """Filter-form Kalman gain. The stored forces are known, so their rows are zero.
+
+    L = P C' (C P C' + V)^-1 with the covariance P of the prediction.
+    """
+    V = np.diag(weights.sensor_variance)
+    Ad, Bd = sample(model.A, model.B, Ts)
+    if integrated:
+        W = sample_noise(model.A, model.B * (weights.process_variance * Ts) @ model.B.T, Ts)
+    else:
+        W = Bd * weights.process_variance @ Bd.T
+    P = dare(Ad.T, model.C.T, W, V, what="sampled Kalman filter").X
+    L = np.linalg.solve(model.C @ P @ model.C.T + V, model.C @ P).T
+    return np.vstack([L, np.zeros((delay * model.B.shape[1], len(V)))])
+
+
+def _check_sizes(model: LinearModel, weights: Weights) -> None:
+    n, m, p = len(model.A), model.B.shape[1], len(model.C)
+    for field, what, size in (("q", "states", n), ("r", "inputs", m), ("q_i", "measured signals", p)):
+        if len(getattr(weights, field)) != size:
+            raise InputError("Weights", field, f"{len(getattr(weights, field))} entries", f"{size}, one for each of the {what}")
+    for field, size in (("process_variance", m), ("sensor_variance", p)):
+        if len(getattr(weights, field)) != size:
+            raise InputError("Weights", field, f"{len(getattr(weights, field))} entries", f"{size}")

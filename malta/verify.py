@@ -1,0 +1,261 @@
+"""Linear verification of a controller on a machine: poles, sensitivities, bandwidths, stage by stage.
+
+The loop is the block diagram of controller.py, sampled: P is the machine from forces to measurements under a
+zero-order hold, exactly; F the control law from measurements to forces (v = F y). At the sensors
+    S = (I - P F)^-1,   T = I - S,   L = -P F.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy import linalg
+
+from malta.controller import Controller, LinearLaw, linear_law
+from malta.errors import CheckError
+from malta.linearize import LinearModel
+from malta.plant import readonly
+from malta.riccati import delay_inputs, sample
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from malta.plant import FloatArray
+    from numpy.typing import NDArray
+
+    ComplexArray = NDArray[np.complex128]
+
+ZONES = ((3.0, "A"), (4.0, "B"), (5.0, "C"), (np.inf, "D"))  # ISO 14839-3, upper limits of the peak sensitivity
+
+
+@dataclass(frozen=True, eq=False)
+class Poles:
+    """Poles in rad/s; of sampled systems ln(lambda) / Ts, poles of pure delay left out."""
+
+    open_loop: ComplexArray  # of the continuous model
+    regulator: ComplexArray  # of the file's own sampled model with K, Ki
+    filter: ComplexArray  # of the file's own sampled observer
+    closed_loop: ComplexArray  # of the machine: hold, delay, current loops, controller
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One loop, from the ideal one to the machine's: what it costs in sensitivity."""
+
+    name: str
+    peak_sensitivity: Mapping[str, float]  # by sensor, and sigma_max of all
+    peak_frequency: float  # rad/s, of sigma_max
+    spectral_radius: float  # of the closed loop; stable below 1
+
+    @property
+    def stable(self) -> bool:
+        return self.spectral_radius < 1
+
+
+@dataclass(frozen=True, eq=False)
+class Margins:
+    """What verify found. The last stage is the machine; bandwidths are of that loop."""
+
+    poles: Poles
+    stages: tuple[Stage, ...]
+    bandwidth: Mapping[str, float]  # rad/s, by definition
+
+    @property
+    def stable(self) -> bool:
+        """The machine's loop is stable."""
+        return self.stages[-1].stable
+
+    @property
+    def peak_sensitivity(self) -> Mapping[str, float]:
+        """Of the machine's loop, by sensor and as sigma_max."""
+        return self.stages[-1].peak_sensitivity
+
+    def __str__(self) -> str:
+        lines = [f"{'stable' if self.stable else 'UNSTABLE'} with hold, delay and current loops"]
+        for stage in self.stages:
+            peaks = "  ".join(f"{k} {v:.2f} ({zone(v)})" for k, v in stage.peak_sensitivity.items() if k != "sigma_max")
+            lines.append(f"peak sensitivity, {stage.name}: {peaks}  all {stage.peak_sensitivity['sigma_max']:.2f}")
+        for key, value in self.bandwidth.items():
+            lines.append(f"bandwidth, {BANDWIDTHS[key]}: {value:.1f} rad/s ({value / (2 * np.pi):.2f} Hz)")
+        return "\n".join(lines)
+
+
+BANDWIDTHS = {
+    "sigma_max_T": "last -3 dB of sigma_max(T)",
+    "sigma_min_T": "first -3 dB of sigma_min(T)",
+    "crossover_max": "last 0 dB of sigma_max(L)",
+    "w_n_max": "regulator's fastest natural frequency",
+    "w_n_min": "regulator's slowest natural frequency",
+}
+
+
+def zone(peak: float) -> str:
+    """ISO 14839-3 zone of a peak sensitivity: A below 3 (9.5 dB), B below 4, C below 5, D above."""
+    return next(name for limit, name in ZONES if peak < limit or limit == np.inf)
+
+
+@dataclass(frozen=True, eq=False)
+class Loop:
+    """Sampled machine x+ = Ad x + Bd v, y = Cd x, closed by the linear control law v = F y."""
+
+    Ad: FloatArray
+    Bd: FloatArray
+    Cd: FloatArray
+    control: LinearLaw
+    sample_time: float  # s
+
+    @property
+    def closed(self) -> FloatArray:
+        """State matrix of the closed loop, states of the machine first."""
+        c = self.control
+        return np.block(
+            [
+                [self.Ad + self.Bd @ c.D_y @ self.Cd, self.Bd @ c.C],
+                [c.B_y @ self.Cd, c.A],
+            ]
+        )
+
+    def loop_gain(self, w: FloatArray) -> ComplexArray:
+        """L = -P F at the frequencies w (rad/s): k x p x p."""
+        z = np.exp(1j * np.asarray(w) * self.sample_time)[:, None, None]
+        P = self.Cd @ np.linalg.solve(z * np.eye(len(self.Ad)) - self.Ad, self.Bd)
+        c = self.control
+        F = c.C @ np.linalg.solve(z * np.eye(len(c.A)) - c.A, c.B_y) + c.D_y
+        gain: ComplexArray = -P @ F
+        return gain
+
+    def sensitivity(self, w: FloatArray) -> ComplexArray:
+        """S = (I + L)^-1 at the sensors, k x p x p: also what noise becomes of in y."""
+        S: ComplexArray = np.linalg.inv(np.eye(len(self.Cd)) + self.loop_gain(w))
+        return S
+
+
+def loop(
+    model: LinearModel, controller: Controller, *, delay: int = 0, current_loops: bool = False
+) -> Loop:
+    """The sampled loop of a machine and a controller.
+
+    delay : samples between measurement and force
+    current_loops : forces follow their commands as a first-order lag at the loops' crossover
+    """
+    A, B, C = model.A, model.B, model.C
+    if current_loops:
+        m, w_c = B.shape[1], model.plant.actuator.crossover
+        A = np.block([[A, B], [np.zeros((m, len(A))), -w_c * np.eye(m)]])
+        B = np.vstack([np.zeros_like(model.B), w_c * np.eye(m)])
+    Ad, Bd = delay_inputs(*sample(A, B, controller.sample_time), delay)
+    Cd = np.hstack([C, np.zeros((len(C), len(Ad) - C.shape[1]))])
+    return Loop(Ad, Bd, Cd, linear_law(controller), controller.sample_time)
+
+
+def own_poles(c: Controller) -> tuple[ComplexArray, ComplexArray]:
+    """Eigenvalues in z of regulator and filter on the controller's own model (separation principle)."""
+    p = len(c.Cd)
+    A = np.block([[c.Ad, np.zeros((len(c.Ad), p))], [-c.sample_time * c.Cd @ c.Ad, np.eye(p)]])
+    B = np.vstack([c.Bd, -c.sample_time * c.Cd @ c.Bd])
+    regulator = np.linalg.eigvals(A - B @ np.hstack([c.K, -c.Ki]))
+    return regulator, np.linalg.eigvals((np.eye(len(c.Ad)) - c.L @ c.Cd) @ c.Ad)
+
+
+def verify(model: LinearModel, controller: Controller) -> Margins:
+    """Poles, peak sensitivities and bandwidths of a controller on a machine's linear model.
+
+    Stages: the sampled loop as designed; with the current loops; with at least one sample of delay as well, which is
+    the machine. An unstable loop is reported, not raised; its sensitivities are NaN.
+    """
+    late = max(1, controller.delay)
+    loops = {
+        "sampled": loop(model, controller, delay=controller.delay),
+        "+ current loops": loop(model, controller, delay=controller.delay, current_loops=True),
+        f"+ delay of {late} sample{'s'[: late > 1]}": loop(model, controller, delay=late, current_loops=True),
+    }
+    names = [s.name for s in controller.measurements]
+    stages = tuple(_stage(name, stage, names) for name, stage in loops.items())
+    machine = loop(model, controller, delay=late, current_loops=True)
+    regulator, observer = own_poles(controller)
+    poles = Poles(
+        open_loop=_sorted(np.linalg.eigvals(model.A)),
+        regulator=_continuous(regulator, controller.sample_time),
+        filter=_continuous(observer, controller.sample_time),
+        closed_loop=_continuous(np.linalg.eigvals(machine.closed), controller.sample_time),
+    )
+    return Margins(poles, stages, _bandwidths(model, controller, machine, stable=stages[-1].stable))
+
+
+def require_stable(margins: Margins, name: str) -> None:
+    """Raise CheckError when the machine's loop is unstable: such gains are not to be written."""
+    for stage in margins.stages:
+        if not stage.stable:
+            raise CheckError(f"{name}: the loop ({stage.name}) is unstable, |lambda| = {stage.spectral_radius:.6f}")
+
+
+def _grid(Ts: float) -> FloatArray:
+    return np.geomspace(1e-2, np.pi / Ts, 400)
+
+
+def _stage(name: str, stage: Loop, sensors: list[str]) -> Stage:
+    radius = float(np.abs(np.linalg.eigvals(stage.closed)).max())
+    if radius >= 1:
+        return Stage(name, dict.fromkeys([*sensors, "sigma_max"], np.nan), np.nan, radius)
+
+    def sizes(w: FloatArray) -> FloatArray:
+        S = stage.sensitivity(w)
+        return np.column_stack([np.abs(np.einsum("kii->ki", S)), linalg.svdvals(S)[:, 0]])
+
+    w = _grid(stage.sample_time)
+    found = sizes(w)
+    peaks = {}
+    for i, sensor in enumerate([*sensors, "sigma_max"]):
+        around, values = w, found[:, i]
+        for _ in range(3):  # zoom in on the largest value
+            k = int(values.argmax())
+            at = float(around[k])
+            around = np.geomspace(around[max(k - 1, 0)], around[min(k + 1, len(around) - 1)], 21)
+            values = sizes(around)[:, i]
+        peaks[sensor] = float(max(values.max(), found[:, i].max()))
+    return Stage(name, peaks, at, radius)
+
+
+def _bandwidths(model: LinearModel, controller: Controller, machine: Loop, *, stable: bool) -> dict[str, float]:
+    n = len(model.A) // 2
+    closed = model.force_map @ controller.K[:, :n] - model.stiffness
+    w_n = np.sqrt(np.maximum(np.linalg.eigvals(closed).real, 0))
+    natural = {"w_n_max": float(w_n.max()), "w_n_min": float(w_n.min())}
+    if not stable:
+        return {**dict.fromkeys(BANDWIDTHS, np.nan), **natural}
+    w = _grid(machine.sample_time)
+    L = machine.loop_gain(w)
+    S = machine.sensitivity(w)
+    T = linalg.svdvals(np.eye(len(machine.Cd)) - S)
+    half = np.sqrt(0.5)
+    return {
+        "sigma_max_T": _crossing(w, T[:, 0], half, last=True),
+        "sigma_min_T": _crossing(w, T[:, -1], half, last=False),
+        "crossover_max": _crossing(w, linalg.svdvals(L)[:, 0], 1.0, last=True),
+        **natural,
+    }
+
+
+def _crossing(w: FloatArray, size: FloatArray, level: float, *, last: bool) -> float:
+    """Where size falls below level for the first or last time, between grid points on a log-log line."""
+    falls = np.flatnonzero((size[:-1] >= level) & (size[1:] < level))
+    if not len(falls):
+        return float(w[-1] if size[-1] >= level else w[0])
+    k = falls[-1 if last else 0]
+    (a, b), (wa, wb) = np.log(size[k : k + 2] / level), np.log(w[k : k + 2])
+    return float(np.exp(wa + (wb - wa) * a / (a - b)))
+
+
+def _continuous(eigenvalues: ComplexArray, Ts: float) -> ComplexArray:
+    kept = eigenvalues[np.abs(eigenvalues) > 1e-6].astype(complex)
+    return _sorted(np.log(kept) / Ts)
+
+
+def _sorted(poles: ComplexArray) -> ComplexArray:
+    poles = np.asarray(poles, dtype=complex)
+    order = np.lexsort((poles.imag.round(6), poles.real.round(6)))
+    frozen: ComplexArray = poles[order]
+    frozen.flags.writeable = False
+    return frozen
