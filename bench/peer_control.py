@@ -13,7 +13,6 @@ from typing import Any
 import control
 import numpy as np
 
-from malta import references
 from malta.controller import Controller
 from malta.plants.tubular import Parameters
 
@@ -73,7 +72,9 @@ def plant_system(par: Parameters, Ts: float) -> Any:
         return np.concatenate([s[:2] - (par.l_S + s[2]) * slope, s[:2] + (par.l_S - s[2]) * slope, s[2:3]])
 
     names = [f"y[{i}]" for i in range(5)]
-    return control.nlsys(update, output, inputs=[f"v[{i}]" for i in range(5)], outputs=names, states=17, dt=Ts, name="mover")
+    return control.nlsys(
+        update, output, inputs=[f"v[{i}]" for i in range(5)], outputs=names, states=17, dt=Ts, name="mover"
+    )
 
 
 def controller_system(c: Controller) -> Any:
@@ -98,5 +99,11 @@ def controller_system(c: Controller) -> Any:
 
     inputs = [f"y[{i}]" for i in range(5)] + [f"r[{i}]" for i in range(20)]
     return control.nlsys(
-        update, output, inputs=inputs, outputs=[f"v[{i}]" for i in range(5)], states=20, dt=c.sample_time, name="law"
+        update,
+        output,
+        inputs=inputs,
+        outputs=[f"v[{i}]" for i in range(5)],
+        states=20,
+        dt=c.sample_time,
+        name="law",
     )

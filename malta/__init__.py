@@ -10,80 +10,53 @@ from importlib import import_module
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-if TYPE_CHECKING:
-    from malta import gains, plants, references, report
-    from malta.controller import Controller
-    from malta.data import plant_of, read
-    from malta.errors import CheckError, InputError
-    from malta.linearize import LinearModel, linearize
-    from malta.plant import OperatingPoint, Plant, Signal, trim
-    from malta.simulate import Scenario, Trajectory, simulate, stroke_figures
-    from malta.spec import Spec, Weights, read_design
-    from malta.synthesize import calibrate, kalman, lqg, lqi, lqr, synthesize
-    from malta.verify import Margins, verify
+if TYPE_CHECKING:  # the contents page, as type checkers and readers see it
+    from malta import gains as gains
+    from malta import plants as plants
+    from malta import references as references
+    from malta import report as report
+    from malta.controller import Controller as Controller
+    from malta.data import plant_of as plant_of
+    from malta.data import read as read
+    from malta.errors import CheckError as CheckError
+    from malta.errors import InputError as InputError
+    from malta.linearize import LinearModel as LinearModel
+    from malta.linearize import linearize as linearize
+    from malta.plant import OperatingPoint as OperatingPoint
+    from malta.plant import Plant as Plant
+    from malta.plant import Signal as Signal
+    from malta.plant import trim as trim
+    from malta.simulate import Scenario as Scenario
+    from malta.simulate import Trajectory as Trajectory
+    from malta.simulate import simulate as simulate
+    from malta.simulate import stroke_figures as stroke_figures
+    from malta.spec import Spec as Spec
+    from malta.spec import Weights as Weights
+    from malta.spec import read_design as read_design
+    from malta.synthesize import calibrate as calibrate
+    from malta.synthesize import kalman as kalman
+    from malta.synthesize import lqg as lqg
+    from malta.synthesize import lqi as lqi
+    from malta.synthesize import lqr as lqr
+    from malta.synthesize import synthesize as synthesize
+    from malta.verify import Margins as Margins
+    from malta.verify import verify as verify
 
-_MODULE_OF = {
-    "read": "data",
-    "plant_of": "data",
-    "InputError": "errors",
-    "CheckError": "errors",
-    "Signal": "plant",
-    "Plant": "plant",
-    "OperatingPoint": "plant",
-    "trim": "plant",
-    "read_design": "spec",
-    "Spec": "spec",
-    "Weights": "spec",
-    "linearize": "linearize",
-    "LinearModel": "linearize",
-    "lqr": "synthesize",
-    "lqi": "synthesize",
-    "kalman": "synthesize",
-    "lqg": "synthesize",
-    "synthesize": "synthesize",
-    "calibrate": "synthesize",
-    "Controller": "controller",
-    "verify": "verify",
-    "Margins": "verify",
-    "simulate": "simulate",
-    "Scenario": "simulate",
-    "Trajectory": "simulate",
-    "stroke_figures": "simulate",
+_NAMES = {  # the same, for the first use of each name
+    "controller": ("Controller",),
+    "data": ("plant_of", "read"),
+    "errors": ("CheckError", "InputError"),
+    "linearize": ("LinearModel", "linearize"),
+    "plant": ("OperatingPoint", "Plant", "Signal", "trim"),
+    "simulate": ("Scenario", "Trajectory", "simulate", "stroke_figures"),
+    "spec": ("Spec", "Weights", "read_design"),
+    "synthesize": ("calibrate", "kalman", "lqg", "lqi", "lqr", "synthesize"),
+    "verify": ("Margins", "verify"),
 }
 _MODULES = ("gains", "plants", "references", "report")
+_MODULE_OF = {name: module for module, names in _NAMES.items() for name in names}
 
-__all__ = [
-    "CheckError",
-    "Controller",
-    "InputError",
-    "LinearModel",
-    "Margins",
-    "OperatingPoint",
-    "Plant",
-    "Scenario",
-    "Signal",
-    "Spec",
-    "Trajectory",
-    "Weights",
-    "calibrate",
-    "gains",
-    "kalman",
-    "linearize",
-    "lqg",
-    "lqi",
-    "lqr",
-    "plant_of",
-    "plants",
-    "read",
-    "read_design",
-    "references",
-    "report",
-    "simulate",
-    "stroke_figures",
-    "synthesize",
-    "trim",
-    "verify",
-]
+__all__ = [*_MODULE_OF, *_MODULES]
 
 
 class _Contents(ModuleType):
@@ -113,4 +86,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return __all__
+    return sorted(__all__)

@@ -25,7 +25,7 @@ from malta.errors import InputError
 if TYPE_CHECKING:
     from malta.plant import Parameters, Plant
 
-MACHINES = ("tubular",)  # the modules of malta/plants/
+Machine = Literal["tubular"]  # the modules of malta/plants/
 
 _Model = TypeVar("_Model", bound=BaseModel)
 Finite = Annotated[float, Checked(strict=True, allow_inf_nan=False)]
@@ -52,7 +52,7 @@ class Sourced(Quantity):
 
 
 class _MachineFile(Record):
-    machine: Literal[MACHINES]
+    machine: Machine
     default_preset: StrictStr
     parameters: dict[str, Sourced]
     presets: dict[str, dict[str, Sourced]]
@@ -79,12 +79,9 @@ def _check_range(f: Field[Any], value: object, where: str | Path) -> None:
     unit, above, least = f.metadata["unit"], f.metadata["above"], f.metadata["at_least"]
     low = f" above {above:g}" if above is not None else ""
     low = f" of at least {least:g}" if least is not None else low
-    good = isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
-    if good and above is not None:
-        good = value > above  # type: ignore[operator]
-    if good and least is not None:
-        good = value >= least  # type: ignore[operator]
-    if not good:
+    number = float(value) if isinstance(value, (int, float)) and not isinstance(value, bool) else math.nan
+    inside = (above is None or number > above) and (least is None or number >= least)
+    if not (math.isfinite(number) and inside):
         raise InputError(where, f.name, f"{value} {unit}", f"a finite number{low} in {unit}")
 
 

@@ -11,10 +11,8 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-import os
 import platform
 import re
-import tempfile
 import zipfile
 from collections.abc import Mapping
 from importlib.metadata import version
@@ -25,14 +23,15 @@ import numpy as np
 from pydantic import BeforeValidator, Field, StrictInt, StrictStr
 
 from malta.controller import Controller, CurrentLoop, Feedforward, Limits
-from malta.data import MACHINES, Finite, Quantity, Record, machine_module, plant_of, units_of, validated
+from malta.data import Finite, Machine, Quantity, Record, machine_module, plant_of, units_of, validated
 from malta.errors import InputError
+from malta.files import replace_files
 from malta.plant import Signal
 from malta.verify import own_poles
 
 if TYPE_CHECKING:
-    from malta.plant import FloatArray, Parameters
-    from malta.verify import ComplexArray, Margins
+    from malta.plant import ComplexArray, FloatArray, Parameters
+    from malta.verify import Margins
 
 SCHEMA, VERSION = "malta-gains", 1
 SUFFIXES = (".json", ".npz", ".mat")
@@ -62,7 +61,7 @@ class _Design(Record):
 
 
 class _Plant(Record):
-    name: Literal[MACHINES]
+    name: Machine
     preset: StrictStr
     parameters: dict[StrictStr, Quantity]
 
@@ -136,7 +135,7 @@ class _Provenance(Record):
 class GainFile(Record):
     """The document that a gain file holds."""
 
-    schema_: Annotated[Literal[SCHEMA], Field(alias="schema")]
+    schema_: Annotated[Literal["malta-gains"], Field(alias="schema")]
     version: Annotated[StrictInt, Field(ge=VERSION, le=VERSION)]
     design: _Design
     plant: _Plant
@@ -200,23 +199,7 @@ def write(controller: Controller, margins: Margins, *paths: str | Path) -> None:
     Raises InputError for an unknown suffix or a folder that cannot be written to.
     """
     content = document(controller, margins)
-    staged: list[tuple[str, Path]] = []
-    try:
-        for path in map(Path, paths):
-            data = _encode(content, path)
-            try:
-                path.parent.mkdir(parents=True, exist_ok=True)
-                with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}.", delete=False) as file:
-                    staged.append((file.name, path))
-                    file.write(data)
-                    os.fchmod(file.fileno(), 0o644)
-            except OSError as error:
-                raise InputError(path, "", error.strerror or str(error), "a folder to write to") from error
-        for name, path in staged:
-            os.replace(name, path)
-    finally:
-        for name, _ in staged:
-            Path(name).unlink(missing_ok=True)
+    replace_files({Path(path): _encode(content, Path(path)) for path in paths})
 
 
 def read(path: str | Path) -> Controller:
@@ -233,14 +216,19 @@ def read(path: str | Path) -> Controller:
     file = validated(GainFile, content, path)
     plain = file.model_dump(by_alias=True)
     if _content_sha256(plain) != file.sha256:
-        raise InputError(path, "sha256", "content that was changed or damaged", "the content that was written")
+        raise InputError(
+            path, "sha256", "content that was changed or damaged", "the content that was written"
+        )
     controller = _controller(file, path)
     regulator, observer = own_poles(controller)
     for field, poles in (("gains.K", regulator), ("gains.L", observer)):
         radius = float(np.abs(poles).max())
         if not radius < 1:
             raise InputError(
-                path, field, f"a pole of the file's own model at |lambda| = {radius:.6f}", "gains that stabilize it"
+                path,
+                field,
+                f"a pole of the file's own model at |lambda| = {radius:.6f}",
+                "gains that stabilize it",
             )
     return controller
 
@@ -260,10 +248,16 @@ def _controller(file: GainFile, path: str | Path) -> Controller:
     ):
         if found != wanted:
             raise InputError(path, f"signals.{key}", _names(found), f"{_names(wanted)} of the {plant.name}")
-    n, n0, m, p, g = len(states), len(mechanical), len(forces), len(measurements), len(file.feedforward.z_grid)
+    n, n0, m, p, g = (
+        len(states),
+        len(mechanical),
+        len(forces),
+        len(measurements),
+        len(file.feedforward.z_grid),
+    )
     if (n - n0) % m:
         raise InputError(path, "signals.states", f"{n} states", f"{n0} and a multiple of {m} stored forces")
-    shapes = {
+    shapes: dict[str, dict[str, tuple[int, ...]]] = {
         "model": {"A": (n0, n0), "B": (n0, m), "C": (p, n0), "Ad": (n, n), "Bd": (n, m), "Cd": (p, n)},
         "gains": {"K": (m, n), "Ki": (m, p), "L": (n, p)},
         "operating_point": {"x": (n0,), "u": (m,)},
@@ -271,12 +265,17 @@ def _controller(file: GainFile, path: str | Path) -> Controller:
         "limits": {"current": (m,), "voltage": (m,), "force": (m,)},
     }
     arrays = {
-        table: {key: _array(getattr(getattr(file, table), key), shape, path, f"{table}.{key}") for key, shape in keys.items()}
+        table: {
+            key: _array(getattr(getattr(file, table), key), shape, path, f"{table}.{key}")
+            for key, shape in keys.items()
+        }
         for table, keys in shapes.items()
     }
     z_grid = arrays["feedforward"]["z_grid"]
     if g < 2 or not (np.diff(z_grid) > 0).all():
-        raise InputError(path, "feedforward.z_grid", "values that do not rise", "at least two rising positions")
+        raise InputError(
+            path, "feedforward.z_grid", "values that do not rise", "at least two rising positions"
+        )
     for key, limit in arrays["limits"].items():
         if not (limit > 0).all():
             raise InputError(path, f"limits.{key}", str(limit.tolist()), "limits above 0")
@@ -351,26 +350,34 @@ def _content_sha256(content: Mapping[str, Any]) -> str:
 def _encode(content: Mapping[str, Any], path: Path) -> bytes:
     if path.suffix == ".json":
         text = json.dumps(content, indent=1, allow_nan=False)
-        # One matrix row a line: innermost lists are joined.
-        return re.sub(r"\[\s*([^][{}]*?)\s*\]", lambda m: f"[{' '.join(m[1].split())}]", text).encode() + b"\n"
+        return _INNERMOST.sub(_joined, text).encode() + b"\n"
     if path.suffix == ".npz":
-        buffer = io.BytesIO()
-        with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
+        archived = io.BytesIO()
+        with zipfile.ZipFile(archived, "w", zipfile.ZIP_DEFLATED) as archive:
             for name, value in _flat(_columns(content)).items():
                 entry = io.BytesIO()
                 np.lib.format.write_array(entry, np.array(value), allow_pickle=False)
                 info = zipfile.ZipInfo(f"{name}.npy")  # the fixed date of 1980: no time stamp
                 info.compress_type = zipfile.ZIP_DEFLATED
                 archive.writestr(info, entry.getvalue())
-        return buffer.getvalue()
+        return archived.getvalue()
     if path.suffix == ".mat":
         from scipy.io import savemat
 
-        buffer = io.BytesIO()
+        buffer: Any = io.BytesIO()  # any: scipy's stubs know only file names
         savemat(buffer, _cells(_columns(content)), long_field_names=True, oned_as="row")
         header = b"MATLAB 5.0 MAT-file, malta gain file, version 1".ljust(116)  # instead of date and platform
-        return header + buffer.getvalue()[116:]
+        return header + bytes(buffer.getvalue())[116:]
     raise InputError(path, "", f"suffix {path.suffix!r}", "one of " + ", ".join(SUFFIXES))
+
+
+_INNERMOST = re.compile(r"([\[{])\s*([^][{}]*?)\s*([\]}])")
+
+
+def _joined(innermost: re.Match[str]) -> str:
+    """A matrix row or a small table on one line."""
+    line = f"{innermost[1]}{' '.join(innermost[2].split())}{innermost[3]}"
+    return line if innermost[1] == "[" or len(line) <= 80 else innermost[0]
 
 
 def _decode(path: str | Path) -> dict[str, Any]:
@@ -420,7 +427,8 @@ def _from_npz(data: bytes) -> dict[str, Any]:
 def _from_mat(data: bytes) -> dict[str, Any]:
     from scipy.io import loadmat
 
-    content = loadmat(io.BytesIO(data), struct_as_record=True, squeeze_me=False)
+    buffer: Any = io.BytesIO(data)  # any: scipy's stubs know only file names
+    content = loadmat(buffer, struct_as_record=True, squeeze_me=False)
     tree: dict[str, Any] = {k: _uncell(v, k) for k, v in content.items() if not k.startswith("__")}
     return tree
 

@@ -1,6 +1,6 @@
 """Plant at an operating point -> linear model, by CasADi's exact derivatives.
 
-    xi' = A xi + B v,   p = C xi          eq. (19), xi = (q, q'), the uncontrolled states dropped
+xi' = A xi + B v,   p = C xi          eq. (19), xi = (q, q'), the uncontrolled states dropped
 """
 
 from __future__ import annotations

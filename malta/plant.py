@@ -19,7 +19,8 @@ from malta.errors import CheckError, InputError
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
-    FloatArray = NDArray[np.float64]
+    FloatArray = NDArray[np.floating[Any]]
+    ComplexArray = NDArray[np.complexfloating[Any, Any]]
 
 CasadiFn = Callable[..., Any]  # takes and returns casadi SX, MX or DM
 

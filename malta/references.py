@@ -70,7 +70,9 @@ def stroke(
     axis = [s.name for s in plant.outputs].index(plant.stroke)
     for name, value in (("start", start), ("end", end)):
         if not abs(value) <= plant.travel:
-            raise InputError("stroke", name, f"{value} m", f"a position within the travel of +-{plant.travel} m")
+            raise InputError(
+                "stroke", name, f"{value} m", f"a position within the travel of +-{plant.travel} m"
+            )
 
     def at(t: FloatArray) -> Motion:
         scales = PROFILES[profile](np.asarray(t) - centre, rise)

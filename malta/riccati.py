@@ -16,8 +16,9 @@ from scipy import linalg, sparse
 from malta.errors import CheckError, InputError
 
 if TYPE_CHECKING:
-    from malta.plant import FloatArray
     from numpy.typing import NDArray
+
+    from malta.plant import ComplexArray, FloatArray
 
 RESIDUAL = 1e-9  # largest accepted relative residual of a Riccati equation
 
@@ -89,9 +90,7 @@ def dare(
     return Solution(X, K, residual)
 
 
-def _dare(
-    A: FloatArray, B: FloatArray, Q: FloatArray, R: FloatArray, N: FloatArray, what: str
-) -> Solution:
+def _dare(A: FloatArray, B: FloatArray, Q: FloatArray, R: FloatArray, N: FloatArray, what: str) -> Solution:
     import control
 
     U, B1 = _normalize(B, R)
@@ -180,6 +179,11 @@ def _check(terms: list[FloatArray], X: FloatArray, instability: float, what: str
 
 def _first_sentence(error: Exception) -> str:
     return str(error).split(";")[0].split(". ")[0].rstrip(".")
+
+
+def eigenvalues(M: FloatArray) -> ComplexArray:
+    """Eigenvalues, complex even where they all are real."""
+    return np.asarray(np.linalg.eigvals(M), dtype=complex)
 
 
 def sample(A: FloatArray, B: FloatArray, Ts: float) -> tuple[FloatArray, FloatArray]:

@@ -27,7 +27,7 @@ class Trig(NamedTuple):
 
 
 EXACT = Trig(ca.sin, ca.cos)
-SMALL_ANGLE = Trig(lambda angle: angle, lambda angle: 1)
+SMALL_ANGLE = Trig(lambda angle: angle, lambda _: 1)
 
 
 def rotation(q_r: Any, trig: Trig = EXACT) -> Any:

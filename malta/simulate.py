@@ -1,17 +1,19 @@
 """Nonlinear machine + gain file + scenario -> trajectory.
 
-The plant is integrated by Runge–Kutta steps between samples, with its forces following their commands as first-order
-lags (exactly); at every sample the control law of controller.py runs. Both are CasADi functions, chained into one
-call for a block of samples. The controller is known only by its gain file's record; the plant may have other parameters.
+The plant is integrated by Runge–Kutta steps between samples, its forces following their commands as first-order lags
+(exactly); at every sample the control law of controller.py runs. Both are CasADi functions, chained into one call for a
+block of samples. The controller is known only by its gain file's record; the plant may have other parameters.
 """
 
 from __future__ import annotations
 
+import io
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache, partial
-from typing import TYPE_CHECKING, NamedTuple
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -20,6 +22,7 @@ from malta import references
 from malta.controller import Controller, law
 from malta.data import plant_of
 from malta.errors import InputError
+from malta.files import replace_files
 from malta.plant import Plant, readonly
 from malta.references import Profile, Reference
 
@@ -37,8 +40,12 @@ class Scenario:
     name: str
     duration: float  # s
     reference: Callable[[Plant], Reference]
-    start: Mapping[str, float] = field(default_factory=dict)  # states (SI) that differ from the reference's first
-    disturbance: Callable[[FloatArray], FloatArray] | None = None  # t (k,) -> external wrench, k x 6, N and N m
+    start: Mapping[str, float] = field(
+        default_factory=dict
+    )  # states (SI) that differ from the reference's first
+    disturbance: Callable[[FloatArray], FloatArray] | None = (
+        None  # t (k,) -> external wrench, k x 6, N and N m
+    )
     noise: float = 0.0  # sensor noise in multiples of the plant's
     quantize: bool = False  # sensors resolve what the plant's do
     seed: int = 0
@@ -50,7 +57,9 @@ class Scenario:
             value = getattr(self, name)
             low = 0 if name in ("noise", "delay") else 1e-12
             if value is not None and not (math.isfinite(value) and value >= low):
-                raise InputError(f"scenario {self.name}", name, str(value), "a number above 0" if low else "0 or more")
+                raise InputError(
+                    f"scenario {self.name}", name, str(value), "a number above 0" if low else "0 or more"
+                )
 
     @classmethod
     def stroke(
@@ -67,7 +76,12 @@ class Scenario:
     ) -> Scenario:
         """Move by `distance` (m), symmetrically about the middle, in `rise` (s, 10-90 %). Figs 12 and 13."""
         reference = partial(
-            references.stroke, start=-distance / 2, end=distance / 2, rise=rise, centre=duration / 2, profile=profile
+            references.stroke,
+            start=-distance / 2,
+            end=distance / 2,
+            rise=rise,
+            centre=duration / 2,
+            profile=profile,
         )
         return cls("stroke", duration, reference, noise=noise, quantize=quantize, seed=seed, delay=delay)
 
@@ -108,7 +122,7 @@ class Trajectory:
     @property
     def current(self) -> FloatArray:
         """Commanded currents, A, k x m: v over the force constants that the controller believes in."""
-        return self.v / np.array(plant_of(self.controller.parameters).actuator.force_constant)
+        return np.asarray(self.v / np.array(plant_of(self.controller.parameters).actuator.force_constant))
 
 
 def simulate(plant: Plant, controller: Controller, scenario: Scenario) -> Trajectory:
@@ -123,7 +137,9 @@ def simulate(plant: Plant, controller: Controller, scenario: Scenario) -> Trajec
     samples = max(1, round(scenario.duration / controller.sample_time))
     t = np.arange(samples) * controller.sample_time
     motion = scenario.reference(plant)(t)
-    inputs = np.hstack([motion.p, *_references(believed, controller, motion), *_surroundings(plant, scenario, t)])
+    inputs = np.hstack(
+        [motion.p, *_references(believed, controller, motion), *_surroundings(plant, scenario, t)]
+    )
     chain = _chain(
         plant,
         controller,
@@ -170,9 +186,9 @@ def _run(chain: ca.Function, state: FloatArray, given: FloatArray, table: FloatA
     states = np.empty((block, len(state)))
     buffer, evaluate = chain.buffer()  # numpy's own memory: a tenth of the time of conversion to DM
     for i, array in enumerate((np.ascontiguousarray(state), np.ascontiguousarray(given))):
-        buffer.set_arg(i, memoryview(array))
+        buffer.set_arg(i, array.data)
     for i, array in enumerate((states, rows)):
-        buffer.set_res(i, memoryview(array))
+        buffer.set_res(i, array.data)
     evaluate()
     if rows is not table:
         table[:] = rows[: len(table)]
@@ -198,9 +214,13 @@ def _columns(plant: Plant, controller: Controller) -> list[tuple[str, int]]:
 def _motion(plant: Plant, Ts: float, substeps: int, *, disturbed: bool) -> ca.Function:
     """One sample of the machine: (x, force, v, w) -> (x, force), v held.
 
-    The forces' lag is solved exactly: force = v + (force_0 - v) e^(-w_c t). The mover takes `substeps` Runge–Kutta steps.
+    The forces' lag is solved exactly, force = v + (force_0 - v) e^(-w_c t); the mover takes `substeps` Runge–Kutta
+    steps.
     """
-    x0, force, v = (ca.SX.sym(name, size) for name, size in (("x", len(plant.states)), ("force", len(plant.inputs)), ("v", len(plant.inputs))))
+    x0, force, v = (
+        ca.SX.sym(name, size)
+        for name, size in (("x", len(plant.states)), ("force", len(plant.inputs)), ("v", len(plant.inputs)))
+    )
     w = ca.SX.sym("w", len(plant.disturbances) if disturbed else 0)
     outside = w if disturbed else ca.SX(len(plant.disturbances), 1)  # structural zeros cost nothing
 
@@ -286,7 +306,9 @@ def _surroundings(plant: Plant, scenario: Scenario, t: FloatArray) -> list[Float
     wrench = np.asarray(scenario.disturbance(t), dtype=float)
     shape = (len(t), len(plant.disturbances))
     if wrench.shape != shape or not np.isfinite(wrench).all():
-        raise InputError(f"scenario {scenario.name}", "disturbance", f"shape {wrench.shape}", f"finite, shape {shape}")
+        raise InputError(
+            f"scenario {scenario.name}", "disturbance", f"shape {wrench.shape}", f"finite, shape {shape}"
+        )
     return [noise, wrench]
 
 
@@ -310,7 +332,7 @@ def _start(
 def _first_stop(plant: Plant, part: FloatArray) -> tuple[int, str] | None:
     """The first sample of a block at which the machine touches something or its state is no number."""
     contact = part[:, -len(plant.contacts) :]
-    lost = ~np.isfinite(part).all(axis=1)
+    lost = np.atleast_1d(~np.isfinite(part).all(axis=1))
     stopped = np.flatnonzero(lost | (contact >= 1).any(axis=1))
     if not len(stopped):
         return None
@@ -350,7 +372,30 @@ def stroke_figures(run: Trajectory) -> StrokeFigures:
 
 
 def _reached(t: FloatArray, share: FloatArray, level: float) -> float:
-    k = int(np.argmax(share >= level))
+    k = int(np.argmax(np.asarray(share) >= level))
     if k == 0:
         return math.nan
     return float(np.interp(level, share[k - 1 : k + 1], t[k - 1 : k + 1]))
+
+
+def save(run: Trajectory, path: str | Path) -> Path:
+    """Write the time series as .npz: t, and a named array for every kind of signal with the names of its columns."""
+    path = Path(path)
+    columns = {
+        "reference": run.plant.outputs,
+        "p": run.plant.outputs,
+        "y": run.plant.outputs,
+        "x": run.plant.states,
+        "xi_hat": run.controller.states,
+        "v": run.plant.inputs,
+        "force": run.plant.inputs,
+        "saturated": run.plant.inputs,
+    }
+    arrays: dict[str, Any] = {"t": run.t, "verdict": np.array([run.verdict.name])}
+    for name, signals in columns.items():
+        arrays[name] = getattr(run, name)
+        arrays[f"{name}_columns"] = np.array([f"{s.name} [{s.unit}]" for s in signals])
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **arrays)
+    replace_files({path: buffer.getvalue()})
+    return path

@@ -60,12 +60,21 @@ class Weights:
         for name in self.__dataclass_fields__:
             value = readonly(getattr(self, name))
             zero_allowed = name in ("q", "q_i")
-            if value.ndim != 1 or not (np.isfinite(value) & ((value > 0) | (zero_allowed & (value == 0)))).all():
+            if (
+                value.ndim != 1
+                or not (np.isfinite(value) & ((value > 0) | (zero_allowed & (value == 0)))).all()
+            ):
                 wanted = "finite and not negative" if zero_allowed else "finite and above 0"
                 raise InputError("Weights", name, str(value.tolist()), f"a vector of numbers, {wanted}")
             object.__setattr__(self, name, value)
-        if len(self.q) != len(self.q_base) or len(self.r) != len(self.r_base) or len(self.q_i) != len(self.q_i_base):
-            raise InputError("Weights", "bases", "another length than the weights'", "one base for each weight")
+        if (
+            len(self.q) != len(self.q_base)
+            or len(self.r) != len(self.r_base)
+            or len(self.q_i) != len(self.q_i_base)
+        ):
+            raise InputError(
+                "Weights", "bases", "another length than the weights'", "one base for each weight"
+            )
 
     @property
     def Q(self) -> FloatArray:
@@ -90,6 +99,7 @@ class Spec:
     name: str
     summary: str
     path: Path
+    machine_file: Path
     sha256: str  # of everything in the file that shapes the design, published references resolved
     parameters: Parameters
     operating_point: Mapping[str, float]
@@ -173,6 +183,7 @@ def read_design(path: str | Path) -> Spec:
         name=content.name,
         summary=content.summary,
         path=path,
+        machine_file=machine_file,
         sha256=hashlib.sha256(json.dumps(content.model_dump(), sort_keys=True).encode()).hexdigest(),
         parameters=par,
         operating_point=MappingProxyType(_operating_point(content.operating_point, plant, path)),
@@ -249,7 +260,9 @@ def _bases(
         return np.ones(len(signals))
     return np.array(
         [
-            _positive(to_si(q.value, q.unit, s.unit, where, f"{field}.{s.name}"), where, f"{field}.{s.name}", s.unit)
+            _positive(
+                to_si(q.value, q.unit, s.unit, where, f"{field}.{s.name}"), where, f"{field}.{s.name}", s.unit
+            )
             for q, s in zip(_ordered(entries, signals, where, field, what), signals, strict=True)
         ]
     )
@@ -288,6 +301,8 @@ def _operating_point(entries: Mapping[str, Quantity], plant: Plant, where: Path)
     values = {}
     for name, q in entries.items():
         if name not in units:
-            raise InputError(where, f"operating_point.{name}", "an unknown state", "one of " + " ".join(units))
+            raise InputError(
+                where, f"operating_point.{name}", "an unknown state", "one of " + " ".join(units)
+            )
         values[name] = to_si(q.value, q.unit, units[name], where, f"operating_point.{name}")
     return values

@@ -25,11 +25,11 @@ from malta.controller import Controller, CurrentLoop, Feedforward, Limits
 from malta.errors import CheckError, InputError
 from malta.linearize import LinearModel
 from malta.plant import Actuator, Plant, Signal, trims
-from malta.riccati import care, dare, delay_inputs, sample, sample_cost, sample_noise
+from malta.riccati import care, dare, delay_inputs, eigenvalues, sample, sample_cost, sample_noise
 from malta.spec import Discretization, Spec, Weights
 
 if TYPE_CHECKING:
-    from malta.plant import FloatArray
+    from malta.plant import ComplexArray, FloatArray
 
 V0_STEP = 0.25e-3  # m, grid of v0(z): interpolation errs less than 0.1 % of the cogging amplitude
 
@@ -63,6 +63,19 @@ def kalman(model: LinearModel, weights: Weights) -> FloatArray:
     return care(model.A.T, model.C.T, W, np.diag(weights.sensor_variance), "Kalman filter").K.T
 
 
+def continuous_poles(model: LinearModel, weights: Weights) -> dict[str, ComplexArray]:
+    """Poles of the continuous LQR, LQI and Kalman filter, rad/s: what the weights ask for, before sampling."""
+    p = len(model.C)
+    K, Ki = lqi(model, weights)
+    integrating = np.block([[model.A - model.B @ K, model.B @ Ki], [-model.C, np.zeros((p, p))]])
+    poles = {
+        "LQR": eigenvalues(model.A - model.B @ lqr(model, weights)),
+        "LQR with integrals": eigenvalues(integrating),
+        "Kalman filter": eigenvalues(model.A - kalman(model, weights) @ model.C),
+    }
+    return {name: np.sort_complex(values) for name, values in poles.items()}
+
+
 def sampled_model(model: LinearModel, Ts: float, delay: int = 0) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Ad, Bd, Cd under a zero-order hold, with the forces of the last `delay` samples as states."""
     Ad, Bd = delay_inputs(*sample(model.A, model.B, Ts), delay)
@@ -92,7 +105,9 @@ def lqg(
     if not (math.isfinite(Ts) and Ts > 0):
         raise InputError("lqg", "Ts", f"{Ts} s", "a sample time above 0 s")
     if delay < 0 or (delay and discretization == "backward-euler"):
-        raise InputError("lqg", "delay", f"{delay} with {discretization}", "0, or more with zoh or sampled-data")
+        raise InputError(
+            "lqg", "delay", f"{delay} with {discretization}", "0, or more with zoh or sampled-data"
+        )
     _check_sizes(model, weights)
     if discretization == "backward-euler":
         Ad, Bd, Cd, K, Ki, L = _backward_euler(model, weights, Ts)
@@ -100,10 +115,8 @@ def lqg(
         Ad, Bd, Cd = sampled_model(model, Ts, delay)
         K, Ki = _sampled_regulator(model, weights, Ts, delay, integrated=discretization == "sampled-data")
         L = _sampled_filter(model, weights, Ts, delay, integrated=discretization == "sampled-data")
-    plant, n = model.plant, len(model.A)
-    past = tuple(
-        Signal(f"{s.name}[k-{age}]", s.unit) for age in range(delay, 0, -1) for s in plant.inputs
-    )
+    plant = model.plant
+    past = tuple(Signal(f"{s.name}[k-{age}]", s.unit) for age in range(delay, 0, -1) for s in plant.inputs)
     axes = len(plant.inputs)
     actuator = plant.actuator
     Kp, Ki_current = pi_current_loop(actuator, actuator.dead_time if current_loop_delay else 0.0)
@@ -271,7 +284,12 @@ def _check_sizes(model: LinearModel, weights: Weights) -> None:
     n, m, p = len(model.A), model.B.shape[1], len(model.C)
     for field, what, size in (("q", "states", n), ("r", "inputs", m), ("q_i", "measured signals", p)):
         if len(getattr(weights, field)) != size:
-            raise InputError("Weights", field, f"{len(getattr(weights, field))} entries", f"{size}, one for each of the {what}")
+            raise InputError(
+                "Weights",
+                field,
+                f"{len(getattr(weights, field))} entries",
+                f"{size}, one for each of the {what}",
+            )
     for field, size in (("process_variance", m), ("sensor_variance", p)):
         if len(getattr(weights, field)) != size:
             raise InputError("Weights", field, f"{len(getattr(weights, field))} entries", f"{size}")

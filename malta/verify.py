@@ -16,18 +16,19 @@ from scipy import linalg
 from malta.controller import Controller, LinearLaw, linear_law
 from malta.errors import CheckError
 from malta.linearize import LinearModel
-from malta.plant import readonly
-from malta.riccati import delay_inputs, sample
+from malta.riccati import delay_inputs, eigenvalues, sample
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from malta.plant import FloatArray
-    from numpy.typing import NDArray
+    from malta.plant import ComplexArray, FloatArray
 
-    ComplexArray = NDArray[np.complex128]
-
-ZONES = ((3.0, "A"), (4.0, "B"), (5.0, "C"), (np.inf, "D"))  # ISO 14839-3, upper limits of the peak sensitivity
+ZONES = (
+    (3.0, "A"),
+    (4.0, "B"),
+    (5.0, "C"),
+    (np.inf, "D"),
+)  # ISO 14839-3, upper limits of the peak sensitivity
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,8 +76,12 @@ class Margins:
     def __str__(self) -> str:
         lines = [f"{'stable' if self.stable else 'UNSTABLE'} with hold, delay and current loops"]
         for stage in self.stages:
-            peaks = "  ".join(f"{k} {v:.2f} ({zone(v)})" for k, v in stage.peak_sensitivity.items() if k != "sigma_max")
-            lines.append(f"peak sensitivity, {stage.name}: {peaks}  all {stage.peak_sensitivity['sigma_max']:.2f}")
+            peaks = "  ".join(
+                f"{k} {v:.2f} ({zone(v)})" for k, v in stage.peak_sensitivity.items() if k != "sigma_max"
+            )
+            lines.append(
+                f"peak sensitivity, {stage.name}: {peaks}  all {stage.peak_sensitivity['sigma_max']:.2f}"
+            )
         for key, value in self.bandwidth.items():
             lines.append(f"bandwidth, {BANDWIDTHS[key]}: {value:.1f} rad/s ({value / (2 * np.pi):.2f} Hz)")
         return "\n".join(lines)
@@ -123,18 +128,14 @@ class Loop:
         P = self.Cd @ np.linalg.solve(z * np.eye(len(self.Ad)) - self.Ad, self.Bd)
         c = self.control
         F = c.C @ np.linalg.solve(z * np.eye(len(c.A)) - c.A, c.B_y) + c.D_y
-        gain: ComplexArray = -P @ F
-        return gain
+        return np.asarray(-P @ F)
 
     def sensitivity(self, w: FloatArray) -> ComplexArray:
         """S = (I + L)^-1 at the sensors, k x p x p: also what noise becomes of in y."""
-        S: ComplexArray = np.linalg.inv(np.eye(len(self.Cd)) + self.loop_gain(w))
-        return S
+        return np.asarray(np.linalg.inv(np.eye(len(self.Cd)) + self.loop_gain(w)))
 
 
-def loop(
-    model: LinearModel, controller: Controller, *, delay: int = 0, current_loops: bool = False
-) -> Loop:
+def loop(model: LinearModel, controller: Controller, *, delay: int = 0, current_loops: bool = False) -> Loop:
     """The sampled loop of a machine and a controller.
 
     delay : samples between measurement and force
@@ -155,8 +156,8 @@ def own_poles(c: Controller) -> tuple[ComplexArray, ComplexArray]:
     p = len(c.Cd)
     A = np.block([[c.Ad, np.zeros((len(c.Ad), p))], [-c.sample_time * c.Cd @ c.Ad, np.eye(p)]])
     B = np.vstack([c.Bd, -c.sample_time * c.Cd @ c.Bd])
-    regulator = np.linalg.eigvals(A - B @ np.hstack([c.K, -c.Ki]))
-    return regulator, np.linalg.eigvals((np.eye(len(c.Ad)) - c.L @ c.Cd) @ c.Ad)
+    regulator = eigenvalues(A - B @ np.hstack([c.K, -c.Ki]))
+    return regulator, eigenvalues((np.eye(len(c.Ad)) - c.L @ c.Cd) @ c.Ad)
 
 
 def verify(model: LinearModel, controller: Controller) -> Margins:
@@ -176,10 +177,10 @@ def verify(model: LinearModel, controller: Controller) -> Margins:
     machine = loop(model, controller, delay=late, current_loops=True)
     regulator, observer = own_poles(controller)
     poles = Poles(
-        open_loop=_sorted(np.linalg.eigvals(model.A)),
+        open_loop=_sorted(eigenvalues(model.A)),
         regulator=_continuous(regulator, controller.sample_time),
         filter=_continuous(observer, controller.sample_time),
-        closed_loop=_continuous(np.linalg.eigvals(machine.closed), controller.sample_time),
+        closed_loop=_continuous(eigenvalues(machine.closed), controller.sample_time),
     )
     return Margins(poles, stages, _bandwidths(model, controller, machine, stable=stages[-1].stable))
 
@@ -188,7 +189,9 @@ def require_stable(margins: Margins, name: str) -> None:
     """Raise CheckError when the machine's loop is unstable: such gains are not to be written."""
     for stage in margins.stages:
         if not stage.stable:
-            raise CheckError(f"{name}: the loop ({stage.name}) is unstable, |lambda| = {stage.spectral_radius:.6f}")
+            raise CheckError(
+                f"{name}: the loop ({stage.name}) is unstable, |lambda| = {stage.spectral_radius:.6f}"
+            )
 
 
 def _grid(Ts: float) -> FloatArray:
@@ -196,7 +199,7 @@ def _grid(Ts: float) -> FloatArray:
 
 
 def _stage(name: str, stage: Loop, sensors: list[str]) -> Stage:
-    radius = float(np.abs(np.linalg.eigvals(stage.closed)).max())
+    radius = float(np.abs(eigenvalues(stage.closed)).max())
     if radius >= 1:
         return Stage(name, dict.fromkeys([*sensors, "sigma_max"], np.nan), np.nan, radius)
 
@@ -218,10 +221,12 @@ def _stage(name: str, stage: Loop, sensors: list[str]) -> Stage:
     return Stage(name, peaks, at, radius)
 
 
-def _bandwidths(model: LinearModel, controller: Controller, machine: Loop, *, stable: bool) -> dict[str, float]:
+def _bandwidths(
+    model: LinearModel, controller: Controller, machine: Loop, *, stable: bool
+) -> dict[str, float]:
     n = len(model.A) // 2
     closed = model.force_map @ controller.K[:, :n] - model.stiffness
-    w_n = np.sqrt(np.maximum(np.linalg.eigvals(closed).real, 0))
+    w_n = np.sqrt(np.maximum(eigenvalues(closed).real, 0))
     natural = {"w_n_max": float(w_n.max()), "w_n_min": float(w_n.min())}
     if not stable:
         return {**dict.fromkeys(BANDWIDTHS, np.nan), **natural}

@@ -76,9 +76,7 @@ def plant(par: Parameters, *, small_angle: bool = False) -> Plant:
     inertia = (par.I_xx, par.I_yy, par.I_zz)
     R_BI = rotation(principal(x[3:6], inertia), trig)
     F_I, T_B = _wrench(par, x, u, R_BI, conservative=not small_angle)
-    q_t_ddot, q_r_ddot = acceleration(
-        par.m, inertia, x[3:6], x[9:12], F_I + w[:3], T_B + R_BI @ w[3:], trig
-    )
+    q_t_ddot, q_r_ddot = acceleration(par.m, inertia, x[3:6], x[9:12], F_I + w[:3], T_B + R_BI @ w[3:], trig)
     f = ca.Function("f", [x, u, w], [ca.cse(ca.vertcat(x[6:], q_t_ddot, q_r_ddot))])
     return Plant(
         name="tubular",
@@ -89,7 +87,7 @@ def plant(par: Parameters, *, small_angle: bool = False) -> Plant:
         disturbances=WRENCH,
         uncontrolled=("gamma", "gamma_dot"),
         f=f,
-        h=lambda x, u: measured(par, x, trig),
+        h=lambda x, _: measured(par, x, trig),
         load=lambda x: load(par, x),
         position_of=lambda p: position_of(par, p),
         actuator=Actuator(
@@ -150,9 +148,7 @@ def measured(par: Parameters, x: Any, trig: Trig = EXACT) -> Any:
     """
     n = rotation(x[3:6], trig)[2, :].T
     slope = n[0:2] / n[2]
-    return ca.vertcat(
-        x[0:2] - (par.l_S + x[2]) * slope, x[0:2] + (par.l_S - x[2]) * slope, x[2]
-    )
+    return ca.vertcat(x[0:2] - (par.l_S + x[2]) * slope, x[0:2] + (par.l_S - x[2]) * slope, x[2])
 
 
 def contact(par: Parameters, x: Any, trig: Trig = EXACT) -> Any:
@@ -168,9 +164,7 @@ def position_of(par: Parameters, p: Any) -> Any:
     NOTE: the paper calls P_0 not invertible: that holds for the 5 x 6 matrix with gamma only.
     """
     alpha, beta = (p[1] - p[3]) / (2 * par.l_S), (p[2] - p[0]) / (2 * par.l_S)
-    return ca.vertcat(
-        (p[0] + p[2]) / 2 + p[4] * beta, (p[1] + p[3]) / 2 - p[4] * alpha, p[4], alpha, beta
-    )
+    return ca.vertcat((p[0] + p[2]) / 2 + p[4] * beta, (p[1] + p[3]) / 2 - p[4] * alpha, p[4], alpha, beta)
 
 
 def energy(par: Parameters, x: Any) -> Any:

@@ -1,0 +1,81 @@
+"""Shared records: the machine, its linear model, and the shipped designs, each made once."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import pytest
+
+import malta
+from malta.data import published as read_published
+from malta.plants import tubular
+
+if TYPE_CHECKING:
+    from malta.controller import Controller
+    from malta.linearize import LinearModel
+    from malta.plant import Plant
+    from malta.spec import Spec
+    from malta.verify import Margins
+
+ROOT = Path(__file__).parents[1]
+DESIGNS = ("table2", "calibrated")
+
+
+class Design(NamedTuple):
+    """One shipped design, all the way from its file."""
+
+    spec: Spec
+    plant: Plant
+    model: LinearModel
+    controller: Controller
+    margins: Margins
+
+
+@pytest.fixture(autouse=True)
+def _in_the_root(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Tests name files as a user in the project's root does: data/tubular.toml."""
+    monkeypatch.chdir(ROOT)
+
+
+@pytest.fixture(scope="session")
+def par() -> tubular.Parameters:
+    """MALTA's parameters, preset table1."""
+    return malta.read(ROOT / "data" / "tubular.toml")  # type: ignore[return-value]
+
+
+@pytest.fixture(scope="session")
+def plant(par: tubular.Parameters) -> Plant:
+    """The nonlinear mover, preset table1."""
+    return tubular.plant(par)
+
+
+@pytest.fixture(scope="session")
+def model(plant: Plant) -> LinearModel:
+    """The linear model at z_ss = 0 without preload."""
+    return malta.linearize(plant, plant.at(z=0.0))
+
+
+@pytest.fixture(scope="session")
+def published() -> dict[str, Any]:
+    """What the paper prints."""
+    return read_published(ROOT / "data" / "tubular.toml")
+
+
+@pytest.fixture(scope="session")
+def designs() -> dict[str, Design]:
+    """The shipped designs by name."""
+    made = {}
+    for name in DESIGNS:
+        spec = malta.read_design(ROOT / "design" / f"{name}.toml")
+        plant = spec.plant
+        model = malta.linearize(plant, plant.at(**spec.operating_point))
+        controller = malta.synthesize(spec, model)
+        made[name] = Design(spec, plant, model, controller, malta.verify(model, controller))
+    return made
+
+
+@pytest.fixture(params=DESIGNS)
+def design(request: pytest.FixtureRequest, designs: dict[str, Design]) -> Design:
+    """Each shipped design in turn."""
+    return designs[request.param]
