@@ -330,3 +330,7 @@ def _progress(files: list[Path], what: str, *, quiet: bool) -> Any:
 def _complain(error: InputError | CheckError) -> int:
     print(f"malta: {error}", file=sys.stderr)
     return 2 if isinstance(error, InputError) else 1
+
+
+if __name__ == "__main__":
+    main()

@@ -85,17 +85,49 @@ def _check_range(f: Field[Any], value: object, where: str | Path) -> None:
         raise InputError(where, f.name, f"{value} {unit}", f"a finite number{low} in {unit}")
 
 
+# What a machine is measured in. Angle is a dimension of its own here: taken as 1, as most unit libraries do, it
+# lets Hz pass for rad/s and errs by 2 pi.
+UNITS = """
+nano- = 1e-9 = n-
+micro- = 1e-6 = u- = µ-
+milli- = 1e-3 = m-
+centi- = 1e-2 = c-
+kilo- = 1e3 = k-
+mega- = 1e6 = M-
+gram = [mass] = g
+meter = [length] = m = metre
+second = [time] = s
+ampere = [current] = A
+radian = [angle] = rad
+degree = 0.017453292519943295 * radian = deg
+turn = 6.283185307179586 * radian = revolution
+inch = 0.0254 * meter
+minute = 60 * second = min
+hertz = 1 / second = Hz
+newton = kilogram * meter / second ** 2 = N
+joule = newton * meter = J
+watt = joule / second = W
+volt = watt / ampere = V
+ohm = volt / ampere
+henry = volt * second / ampere = H
+farad = ampere * second / volt = F
+weber = volt * second = Wb
+tesla = weber / meter ** 2 = T
+percent = 0.01
+"""
+
+
 @cache
 def _units() -> Any:
     import pint  # here, because `malta --help` must not wait for it
 
-    return pint.UnitRegistry()
+    registry: Any = pint.UnitRegistry(None)
+    registry.load_definitions(UNITS.strip().splitlines())
+    return registry
 
 
 def to_si(value: float, unit: str, si_unit: str, where: str | Path, name: str) -> float:
     """Convert to `si_unit` ("kg", "m/s", "N m", ...).
-
-    Hz where rad/s is expected is refused: unit libraries take a radian for 1 and err by 2 pi.
 
     Raises InputError that names `where` and `name` when the unit is unknown or of another kind.
     """

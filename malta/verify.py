@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy import linalg
 
 from malta.controller import Controller, LinearLaw, linear_law
 from malta.errors import CheckError
@@ -205,20 +204,20 @@ def _stage(name: str, stage: Loop, sensors: list[str]) -> Stage:
 
     def sizes(w: FloatArray) -> FloatArray:
         S = stage.sensitivity(w)
-        return np.column_stack([np.abs(np.einsum("kii->ki", S)), linalg.svdvals(S)[:, 0]])
+        return np.column_stack([np.abs(np.einsum("kii->ki", S)), _singular_values(S)[:, 0]])
 
     w = _grid(stage.sample_time)
-    found = sizes(w)
-    peaks = {}
-    for i, sensor in enumerate([*sensors, "sigma_max"]):
-        around, values = w, found[:, i]
-        for _ in range(3):  # zoom in on the largest value
-            k = int(values.argmax())
-            at = float(around[k])
-            around = np.geomspace(around[max(k - 1, 0)], around[min(k + 1, len(around) - 1)], 21)
-            values = sizes(around)[:, i]
-        peaks[sensor] = float(max(values.max(), found[:, i].max()))
-    return Stage(name, peaks, at, radius)
+    around, values = np.tile(w, (len(sensors) + 1, 1)), sizes(w).T  # one row for each peak
+    for _ in range(3):  # zoom in on the largest values
+        k = values.argmax(axis=1)
+        rows = np.arange(len(k))
+        low, high = around[rows, np.maximum(k - 1, 0)], around[rows, np.minimum(k + 1, around.shape[1] - 1)]
+        around = np.geomspace(low, high, 17, axis=1)
+        found = sizes(around.ravel()).reshape(*around.shape, -1)
+        values = found[rows, :, rows]
+    peaks = values.max(axis=1)
+    at = float(around[-1, values[-1].argmax()])
+    return Stage(name, dict(zip([*sensors, "sigma_max"], peaks.tolist(), strict=True)), at, radius)
 
 
 def _bandwidths(
@@ -233,14 +232,18 @@ def _bandwidths(
     w = _grid(machine.sample_time)
     L = machine.loop_gain(w)
     S = machine.sensitivity(w)
-    T = linalg.svdvals(np.eye(len(machine.Cd)) - S)
+    T = _singular_values(np.eye(len(machine.Cd)) - S)
     half = np.sqrt(0.5)
     return {
         "sigma_max_T": _crossing(w, T[:, 0], half, last=True),
         "sigma_min_T": _crossing(w, T[:, -1], half, last=False),
-        "crossover_max": _crossing(w, linalg.svdvals(L)[:, 0], 1.0, last=True),
+        "crossover_max": _crossing(w, _singular_values(L)[:, 0], 1.0, last=True),
         **natural,
     }
+
+
+def _singular_values(G: ComplexArray) -> FloatArray:
+    return np.asarray(np.linalg.svd(G, compute_uv=False))
 
 
 def _crossing(w: FloatArray, size: FloatArray, level: float, *, last: bool) -> float:
