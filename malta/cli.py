@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import sys
 from pathlib import Path
@@ -194,6 +195,9 @@ def simulate(
 
 def main() -> None:
     """Entry point: errors become one sentence and an exit code."""
+    gc.set_threshold(
+        200_000, 50, 50
+    )  # numeric libraries make many lasting objects; going through them costs a sixth
     try:
         app()
     except (InputError, CheckError) as error:

@@ -174,7 +174,7 @@ def stroke_figure(run: Trajectory, published: Published | None = None) -> Figure
     """Axial position, tracking error, radial deviation and currents of a stroke, published bounds drawn in."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(9.0, 6.0))
+    figure = Figure(figsize=(9.0, 6.0), dpi=120)
     figure.subplots_adjust(left=0.085, right=0.985, bottom=0.085, top=0.93, wspace=0.24, hspace=0.16)
     (position, radial), (error, current) = figure.subplots(2, 2, sharex=True)
     names = [s.name for s in run.plant.outputs]
@@ -244,14 +244,19 @@ def _widest_currents(run: Trajectory) -> list[tuple[str, int, int]]:
 def save(figure: Figure, path: str | Path) -> Path:
     """Write a figure as .png or .svg, whole or not at all; the same figure gives the same bytes."""
     import matplotlib
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     path = Path(path)
     if path.suffix not in (".png", ".svg"):
         raise InputError(path, "", f"suffix {path.suffix!r}", "one of .png, .svg")
     buffer = io.BytesIO()
     with matplotlib.rc_context({"svg.hashsalt": "malta", "svg.fonttype": "none"}):
-        metadata = {"Date": None} if path.suffix == ".svg" else {"Software": None}
-        figure.savefig(buffer, format=path.suffix[1:], dpi=150, metadata=metadata)
+        if path.suffix == ".svg":
+            figure.savefig(buffer, format="svg", metadata={"Date": None})
+        else:
+            # Figure.savefig lays everything out in a draw of its own first, which only tight boxes need.
+            canvas: Any = FigureCanvasAgg(figure)
+            canvas.print_png(buffer, metadata={"Software": None}, pil_kwargs={"compress_level": 1})
     replace_files({path: buffer.getvalue()})
     return path
 

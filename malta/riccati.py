@@ -60,10 +60,10 @@ def _care(A: FloatArray, B: FloatArray, Q: FloatArray, R: FloatArray, what: str)
     except (ValueError, np.linalg.LinAlgError, control.ControlArgument) as error:
         raise CheckError(f"{what}: no stabilizing solution ({_first_sentence(error)})") from error
     X = (X + X.T) / 2
-    terms = [A1.T @ X, X @ A1, -X @ B1 @ B1.T @ X, Q1]
     K1 = B1.T @ X
-    closed = np.linalg.eigvals(A1 - B1 @ K1)
-    residual = _check(terms, X, closed.real.max() / rate, what)
+    closed = A1 - B1 @ K1
+    terms = [A1.T @ X, X @ A1, -K1.T @ K1, Q1]
+    residual = _check(terms, X, eigenvalues(closed).real.max() / rate, what)
     return Solution(X / np.outer(t, t), linalg.solve_triangular(U.T, K1 / t, lower=False), residual)
 
 
@@ -105,11 +105,10 @@ def _dare(A: FloatArray, B: FloatArray, Q: FloatArray, R: FloatArray, N: FloatAr
     except (ValueError, np.linalg.LinAlgError, control.ControlArgument) as error:
         raise CheckError(f"{what}: no stabilizing solution ({_first_sentence(error)})") from error
     X = (X + X.T) / 2
-    M = R1 + B1.T @ X @ B1
-    K1 = np.linalg.solve(M, B1.T @ X @ A1)
+    K1 = np.linalg.solve(R1 + B1.T @ X @ B1, B1.T @ X @ A1)
+    closed = A1 - B1 @ K1
     terms = [A1.T @ X @ A1, -X, -(A1.T @ X @ B1) @ K1, Q1]
-    closed = np.linalg.eigvals(A1 - B1 @ K1)
-    residual = _check(terms, X, np.abs(closed).max() - 1, what)
+    residual = _check(terms, X, np.abs(eigenvalues(closed)).max() - 1, what)
     K = linalg.solve_triangular(U.T, K1 / t + S.T, lower=False)
     return Solution(X * size / np.outer(t, t), K, residual)
 
@@ -157,11 +156,12 @@ def _balance(A: FloatArray, G: FloatArray, Q: FloatArray) -> FloatArray:
     """
     t = np.ones(len(A))
     A = A - np.diag(np.diag(A))
-    for _ in range(30):
+    for _ in range(100):
         a, g, q = (A * t / t[:, None]) ** 2, (G / np.outer(t, t)) ** 2, (Q * np.outer(t, t)) ** 2
         falls, grows = a.sum(1) + g.sum(1), a.sum(0) + q.sum(0)  # with t
         both = (falls > 0) & (grows > 0)
-        t = t * np.where(both, falls / np.where(both, grows, 1), 1) ** 0.25
+        # G_ii and Q_ii change with t_i^2, squared here: with the fourth root of off-diagonal entries they oscillate.
+        t = t * np.where(both, falls / np.where(both, grows, 1), 1) ** 0.125
     return np.exp2(np.round(np.log2(t)))  # powers of two: scaling adds no rounding
 
 

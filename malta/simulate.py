@@ -315,7 +315,7 @@ def _surroundings(plant: Plant, scenario: Scenario, t: FloatArray) -> list[Float
 def _start(
     plant: Plant, believed: Plant, c: Controller, scenario: Scenario, first: FloatArray, delay: int
 ) -> FloatArray:
-    """At rest on the reference (or where the scenario says), the observer knowing it, v0 acting."""
+    """On the reference and moving with it, or as the scenario says; the observer knows it, and v0 acts."""
     p, n = len(plant.outputs), len(c.states)
     design = [s.name for s in plant.design_states]
     rest = dict(zip(design, first[p : p + len(design)], strict=True)) | dict(scenario.start)

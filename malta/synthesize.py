@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, get_args
 
 import numpy as np
 from scipy import linalg
@@ -104,6 +104,10 @@ def lqg(
     """
     if not (math.isfinite(Ts) and Ts > 0):
         raise InputError("lqg", "Ts", f"{Ts} s", "a sample time above 0 s")
+    if discretization not in get_args(Discretization):
+        raise InputError(
+            "lqg", "discretization", repr(discretization), "one of " + ", ".join(get_args(Discretization))
+        )
     if delay < 0 or (delay and discretization == "backward-euler"):
         raise InputError(
             "lqg", "delay", f"{delay} with {discretization}", "0, or more with zoh or sampled-data"

@@ -194,7 +194,7 @@ def require_stable(margins: Margins, name: str) -> None:
 
 
 def _grid(Ts: float) -> FloatArray:
-    return np.geomspace(1e-2, np.pi / Ts, 400)
+    return np.geomspace(1e-2, np.pi / Ts, 240)
 
 
 def _stage(name: str, stage: Loop, sensors: list[str]) -> Stage:

@@ -1,0 +1,344 @@
+"""Machine data: what the shipped file holds, how units convert, and what a wrong file is told."""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from contextlib import suppress
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+import malta
+from malta.data import load_toml, to_si, units_of
+from malta.data import published as read_published
+from malta.plants import tubular
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+DATA = Path("data/tubular.toml")
+ASSUMED = {"l_S", "g", "F_c", "phi_c", "V_max", "I_max", "T_d", "s_r", "s_z"}  # where the paper is silent
+TRUNCATION_STEP = 7  # bytes
+
+L_S = '{ value = 93.75,     unit = "mm", '
+M = 'm      = { value = 0.360,     unit = "kg",      tag = "printed",  source = "Table IV" }'
+W_CC = 'value = 3000,      unit = "rad/s"'
+I_XX = "I_xx   ="
+K_A4 = "K_A    = { value = 8330,"
+
+
+def file_values() -> dict[str, Any]:
+    return tomllib.loads(DATA.read_text(encoding="utf-8"))
+
+
+def edited(folder: Path, *changes: tuple[str, str]) -> Path:
+    """A copy of the machine's file with texts replaced; each must stand there once."""
+    text = DATA.read_text(encoding="utf-8")
+    for old, new in changes:
+        assert text.count(old) == 1, old
+        text = text.replace(old, new)
+    path = folder / "machine.toml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def refusal(read: Callable[[], object], path: Path) -> malta.InputError:
+    """The error that reading raises: one printable sentence that names the file."""
+    with pytest.raises(malta.InputError) as caught:
+        read()
+    error = caught.value
+    assert error.where == str(path)
+    assert str(error).isprintable()
+    assert str(error).startswith(f"{path}: ")
+    assert f"found {error.found}, expected {error.expected}" in str(error)
+    return error
+
+
+# --- what is shipped ---
+
+
+def test_default_preset_is_table1() -> None:
+    assert malta.read(DATA) == malta.read(DATA, preset="table1")
+    assert malta.read(DATA).preset == "table1"
+
+
+def test_presets_differ_in_attraction_and_bearing_distance_only() -> None:
+    table1: Any = malta.read(DATA, "table1")
+    table4: Any = malta.read(DATA, "table4")
+    assert (table4.K_A, table4.l_B, table4.preset) == (8330.0, 45.347e-3, "table4")
+    assert replace(table4, K_A=8626.7, l_B=44.560e-3, preset="table1") == table1
+
+
+def test_every_value_has_unit_tag_and_source() -> None:
+    content = file_values()
+    tables = [content["parameters"], *content["presets"].values()]
+    for table in tables:
+        for name, entry in table.items():
+            assert set(entry) == {"value", "unit", "tag", "source"}, name
+            assert entry["tag"] in ("printed", "computed", "assumed"), name
+            assert entry["unit"], name
+            assert len(entry["source"]) >= len("Table IV"), name
+    names = {name for table in tables for name in table}
+    assert names == set(units_of(tubular.Parameters))
+
+
+def test_assumptions_are_tagged_assumed() -> None:
+    content = file_values()
+    tables = [content["parameters"], *content["presets"].values()]
+    assumed = {name for table in tables for name, entry in table.items() if entry["tag"] == "assumed"}
+    assert assumed == ASSUMED
+
+
+def test_shipped_values_in_SI(par: tubular.Parameters) -> None:
+    expected = {"l_S": 0.09375, "L_p": 0.015, "L": 2.8e-3, "Psi": 8.3e-3, "C_dc": 0.088, "f_pwm": 1e5}
+    expected |= {"T_cc": 5e-5, "T_d": 7.5e-5, "r_max": 6e-4, "s_r": 5e-7, "dp": 1e-6, "l_B": 0.04456}
+    assert {name: getattr(par, name) for name in expected} == expected
+    assert par.pm_cc == pytest.approx(math.pi / 3, rel=1e-15)
+
+
+def test_every_physical_field_is_a_float(par: tubular.Parameters) -> None:
+    assert {type(getattr(par, f.name)) for f in fields(par) if f.name != "preset"} == {float}
+
+
+# --- what the paper prints, and what follows from it ---
+
+
+def test_preset_table1_meets_the_poles_of_table_I(par: tubular.Parameters, published: dict[str, Any]) -> None:
+    poles, digits = published["table_I"]["poles"], published["table_I"]["digits"]
+    assert round(math.sqrt(2 * par.K_A / par.m), digits) == poles["x"] == 218.92
+    assert round(par.l_B * math.sqrt(2 * par.K_A / par.I_xx), digits) == poles["alpha"] == 157.53
+    assert round(poles["x"] ** 2 * par.m / 2, 1) == par.K_A
+    assert par.l_B == pytest.approx(poles["alpha"] * math.sqrt(par.I_xx / (2 * par.K_A)), abs=0.5e-6)
+
+
+def test_preset_table4_keeps_the_tilt_poles_only() -> None:
+    par: Any = malta.read(DATA, "table4")
+    assert round(math.sqrt(2 * par.K_A / par.m), 2) == 215.12
+    assert round(par.l_B * math.sqrt(2 * par.K_A / par.I_xx), 2) == 157.53
+
+
+def test_induced_voltage_constant_is_pi_psi_over_pole_size(par: tubular.Parameters) -> None:
+    assert round(math.pi * par.Psi / par.L_p, 2) == par.K_ind
+
+
+def test_kinetic_energy_raises_the_dc_link_as_published(
+    par: tubular.Parameters, published: dict[str, Any]
+) -> None:
+    speed, rise = published["dc_link"]["speed"], published["dc_link"]["rise"]
+    assert (speed["unit"], rise["unit"]) == ("m/s", "V")
+    fed_back = math.sqrt(par.V_dc**2 + par.m * speed["value"] ** 2 / par.C_dc) - par.V_dc
+    assert round(fed_back, 2) == rise["value"]
+
+
+def test_table_IV_is_printed_and_whole_in_preset_table4(published: dict[str, Any]) -> None:
+    content, table = file_values(), published["table_IV"]
+    entries = content["parameters"] | content["presets"][table["preset"]]
+    assert table["preset"] == "table4"
+    assert {name: entries[name]["tag"] for name in table["parameters"]} == dict.fromkeys(
+        table["parameters"], "printed"
+    )
+    assert {name for name, e in entries.items() if e["source"].startswith("Table IV")} == set(
+        table["parameters"]
+    )
+
+
+def test_current_controller_as_published(par: tubular.Parameters, published: dict[str, Any]) -> None:
+    table = published["current_controller"]
+    crossover, margin = table["crossover"], table["phase_margin"]
+    assert to_si(crossover["value"], crossover["unit"], "rad/s", "published", "crossover") == par.w_cc
+    assert to_si(margin["value"], margin["unit"], "rad", "published", "phase_margin") == par.pm_cc
+
+
+def test_travel_and_resolution_as_published(par: tubular.Parameters, published: dict[str, Any]) -> None:
+    assert to_si(**published["travel"]["z_ss"], si_unit="m", where="published", name="z_ss") == par.z_max
+    assert published["figure_14"]["resolution"]["value"] * 1e-6 == par.dp
+
+
+# --- units ---
+
+
+@pytest.mark.parametrize(
+    ("value", "unit", "si_unit", "expected"),
+    [
+        (93.75, "mm", "m", 0.09375),
+        (360.0, "g", "kg", 0.36),
+        (180.0, "deg", "rad", math.pi),
+        (100.0, "kHz", "Hz", 1e5),
+        (50.0, "us", "s", 5e-5),
+        (75.0, "µs", "s", 7.5e-5),
+        (2.8, "mH", "H", 2.8e-3),
+        (8.3, "mWb", "Wb", 8.3e-3),
+        (88.0, "mF", "F", 0.088),
+        (1.7, "V / (m/s)", "V s/m", 1.7),
+        (3.0, "J", "N m", 3.0),
+        (1.3805, "g m^2", "kg m^2", 1.3805e-3),
+        (687.259, "mrad/s", "rad/s", 0.687259),
+        (7.06, "um^2", "m^2", 7.06e-12),
+        (2.0, "inch", "m", 0.0508),
+        (1.0, "turn/s", "rad/s", 2 * math.pi),
+        (-4.0, "mm", "m", -4e-3),
+        (0.0, "mm", "m", 0.0),
+    ],
+)
+def test_units_convert(value: float, unit: str, si_unit: str, expected: float) -> None:
+    assert to_si(value, unit, si_unit, "file", "name") == pytest.approx(expected, rel=1e-15)
+
+
+@pytest.mark.parametrize("value", [93.75, 52.2441, 0.6, 15.0, 44.56, 0.1, 1e-9])
+def test_decimal_prefixes_convert_exactly(value: float) -> None:
+    assert to_si(value, "mm", "m", "file", "name") == value / 1000
+    assert to_si(value, "um", "m", "file", "name") == value / 1000000
+    assert to_si(value, "m", "m", "file", "name") == value
+    assert to_si(value, "km", "m", "file", "name") == value * 1000
+
+
+@pytest.mark.parametrize(
+    ("unit", "si_unit"),
+    [
+        ("kg", "m"),
+        ("Hz", "rad/s"),
+        ("1/s", "rad/s"),
+        ("rad/s", "Hz"),
+        ("rad", "percent"),
+        ("", "m"),
+        ("mmm", "m"),
+        ("furlongs per fortnight", "m/s"),
+        ("3 mm", "m"),
+        ("mm*", "m"),
+        ("(m", "m"),
+        ("N", "N m"),
+        ("N/m", "N"),
+        ("__import__('os')", "m"),
+    ],
+)
+def test_unit_of_another_kind_is_refused(unit: str, si_unit: str) -> None:
+    error = refusal(lambda: to_si(1.0, unit, si_unit, "file.toml", "name"), Path("file.toml"))
+    assert (error.field, error.found, error.expected) == ("name.unit", repr(unit), f"a unit of {si_unit}")
+
+
+# --- files that are wrong ---
+
+
+FAULTS = {  # old text, new text; field, found, expected
+    "kg for m": (L_S, L_S.replace("mm", "kg"), "parameters.l_S.unit", "'kg'", "unit of m"),
+    "Hz": (W_CC, W_CC.replace("rad/s", "Hz"), "parameters.w_cc.unit", "'Hz'", "rad/s"),
+    "no unit": (L_S, L_S.replace("mm", "xx"), "parameters.l_S.unit", "'xx'", "unit of m"),
+    "unit left out": (L_S, "{ value = 93.75, ", "parameters.l_S.unit", "nothing", "key"),
+    "missing parameter": (M, "", "parameters.m", "nothing", "kg"),
+    "unknown parameter": (
+        M, f"{M}\nq = {{ value = 1, unit = 'kg', tag = 'assumed', source = 'x' }}", "parameters.q",
+        "unknown", "I_xx",
+    ),
+    "unknown key": (M, M.replace("unit", "colour = 3, unit"), "parameters.m.colour", "unknown", "keys"),
+    "unknown tag": (M, M.replace("printed", "guess"), "parameters.m.tag", "'guess'", "printed"),
+    "bare number": (M, "m = 0.36", "parameters.m", "0.36", ""),
+    "NaN": (L_S, L_S.replace("93.75", "nan"), "parameters.l_S.value", "nan", "finite"),
+    "-inf": (L_S, L_S.replace("93.75", "-inf"), "parameters.l_S.value", "-inf", "finite"),
+    "1e999": (L_S, L_S.replace("93.75", "1e999"), "parameters.l_S.value", "inf", "finite"),
+    "text": (L_S, L_S.replace("93.75", '"93.75"'), "parameters.l_S.value", "'93.75'", "number"),
+    "bool": (L_S, L_S.replace("93.75", "true"), "parameters.l_S.value", "True", "number"),
+    "list": (L_S, L_S.replace("93.75", "[1]"), "parameters.l_S.value", "[1]", "number"),
+    "unknown in preset": (K_A4, K_A4.replace("K_A", "K_Z"), "presets.table4.K_Z", "unknown", "K_A"),
+    "unknown machine": ('"tubular"', '"planar9"', "machine", "'planar9'", "'tubular'"),
+    "no machine": ('machine = "tubular"', "", "machine", "nothing", "key"),
+    "unknown default": ('= "table1"', '= "table9"', "presets", "'table9'", "table1, table4"),
+    "no default": ('default_preset = "table1"', "", "default_preset", "nothing", "key"),
+    "doubled key": (I_XX, "m =", "", "TOML error", "TOML file"),
+    "malformed number": ("0.360,", "0.360.1,", "", "TOML error", "TOML file"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("old", "new", "field", "found", "expected"), FAULTS.values(), ids=FAULTS)
+def test_wrong_machine_file_is_refused(
+    tmp_path: Path, old: str, new: str, field: str, found: str, expected: str
+) -> None:
+    path = edited(tmp_path, (old, new))
+    error = refusal(lambda: malta.read(path), path)
+    assert error.field == field
+    assert found in error.found
+    assert expected in error.expected
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "name", "found", "expected"),
+    [
+        (M, M.replace("0.360", "-0.360"), "m", "-0.36 kg", "a finite number above 0 in kg"),
+        (M, M.replace("0.360", "0"), "m", "0.0 kg", "a finite number above 0 in kg"),
+        (L_S, '{ value = 1e308, unit = "km", ', "l_S", "inf m", "a finite number above 0 in m"),
+        (K_A4, K_A4.replace("8330", "-1"), "K_A", "-1.0 N/m", "a finite number of at least 0 in N/m"),
+    ],
+    ids=["negative", "zero", "infinite in SI", "negative in the other preset"],
+)
+def test_value_that_no_machine_has_is_refused(
+    tmp_path: Path, old: str, new: str, name: str, found: str, expected: str
+) -> None:
+    path = edited(tmp_path, (old, new))
+    error = refusal(lambda: malta.read(path), path)
+    assert error.field.rpartition(".")[2] == name
+    assert (error.found, error.expected) == (found, expected)
+
+
+def test_malformed_file_says_the_line(tmp_path: Path) -> None:
+    path = edited(tmp_path, (I_XX, "m ="))
+    assert "at line 12" in refusal(lambda: malta.read(path), path).found
+
+
+def test_unknown_preset_lists_the_known_ones() -> None:
+    error = refusal(lambda: malta.read(DATA, preset="table9"), DATA)
+    assert (error.field, error.found) == ("presets", "no preset 'table9'")
+    assert error.expected == "one of table1, table4"
+
+
+def test_preset_that_leaves_a_value_open_is_refused(tmp_path: Path) -> None:
+    path = edited(
+        tmp_path,
+        ("K_A    = { value = 8330,", "K_D    = { value = 8330,"),
+        ('"N/m", tag = "p', '"N/A", tag = "p'),
+    )
+    assert malta.read(path) == malta.read(DATA)
+    error = refusal(lambda: malta.read(path, preset="table4"), path)
+    assert (error.field, error.expected) == ("parameters.K_A", "a value in N/m")
+
+
+@pytest.mark.parametrize(
+    ("content", "found"),
+    [
+        (b"", "nothing"),
+        (b"\n# only a comment\n", "nothing"),
+        (b"\xff\xfe\x00m", "not UTF-8"),
+        (b"\x00", "TOML error"),
+    ],
+)
+def test_empty_or_foreign_file_is_refused(tmp_path: Path, content: bytes, found: str) -> None:
+    path = tmp_path / "machine.toml"
+    path.write_bytes(content)
+    assert found in refusal(lambda: malta.read(path), path).found
+
+
+def test_missing_file_folder_and_path_through_a_file_are_refused(tmp_path: Path) -> None:
+    missing, through = tmp_path / "nothing.toml", DATA / "machine.toml"
+    assert refusal(lambda: malta.read(missing), missing).found == "no such file"
+    assert refusal(lambda: malta.read(tmp_path), tmp_path).found == "Is a directory"
+    assert refusal(lambda: malta.read(through), through).found == "Not a directory"
+
+
+def test_truncated_file_is_refused_or_complete(tmp_path: Path) -> None:
+    content, path, whole = DATA.read_bytes(), tmp_path / "machine.toml", malta.read(DATA)
+    accepted = []
+    for length in range(0, len(content), TRUNCATION_STEP):
+        path.write_bytes(content[:length])
+        with suppress(malta.InputError):
+            assert malta.read(path) == whole
+            accepted.append(length)
+    complete = content.index(b'"', content.index(b"2 K_A l_B^2 / I_xx")) + len('" }')  # all that table1 needs
+    assert complete <= min(accepted)
+
+
+def test_missing_published_data_is_refused(tmp_path: Path) -> None:
+    path = edited(tmp_path)
+    beside = tmp_path / "published" / "machine.toml"
+    assert refusal(lambda: read_published(path), beside).found == "no such file"
+    assert load_toml("data/published/tubular.toml") == read_published(DATA)

@@ -1,0 +1,107 @@
+"""Writing files: all or none, nothing half-written, nothing left behind."""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+
+import pytest
+
+import malta
+from malta.files import replace_files
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def test_files_are_written_and_replaced(tmp_path: Path) -> None:
+    old, new = tmp_path / "old.bin", tmp_path / "new.bin"
+    old.write_bytes(b"a longer content than the new one")
+    replace_files({old: b"\x00\xff", new: b""})
+    assert (old.read_bytes(), new.read_bytes()) == (b"\x00\xff", b"")
+    assert names(tmp_path) == ["new.bin", "old.bin"]
+
+
+def test_nothing_to_write_writes_nothing(tmp_path: Path) -> None:
+    replace_files({})
+    assert names(tmp_path) == []
+
+
+def test_folders_are_made(tmp_path: Path) -> None:
+    replace_files({tmp_path / "a" / "b" / "x.bin": b"1", tmp_path / "a" / "y.bin": b"2"})
+    assert (tmp_path / "a" / "b" / "x.bin").read_bytes() == b"1"
+    assert names(tmp_path / "a") == ["b", "y.bin"]
+    assert names(tmp_path / "a" / "b") == ["x.bin"]
+
+
+def test_relative_paths_are_of_the_working_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    replace_files({Path("x.bin"): b"1", Path("folder/y.bin"): b"2"})
+    assert (tmp_path / "x.bin").read_bytes() + (tmp_path / "folder" / "y.bin").read_bytes() == b"12"
+
+
+def test_files_may_be_read_by_everyone(tmp_path: Path) -> None:
+    path = tmp_path / "x.bin"
+    replace_files({path: b"1"})
+    assert path.stat().st_mode & 0o777 == 0o644
+
+
+@pytest.mark.parametrize("place", [0, 1, 2])
+def test_one_place_that_cannot_be_written_to_leaves_all(tmp_path: Path, place: int) -> None:
+    (tmp_path / "file").write_bytes(b"not a folder")
+    old = tmp_path / "old.bin"
+    old.write_bytes(b"old")
+    paths = [old, tmp_path / "new.bin"]
+    blocked = tmp_path / "file" / "x.bin"
+    paths.insert(place, blocked)
+    with pytest.raises(malta.InputError) as caught:
+        replace_files(dict.fromkeys(paths, b"new"))
+    assert str(caught.value).startswith(f"{blocked}: found ")
+    assert caught.value.expected == "a place to write the file to"
+    assert old.read_bytes() == b"old"
+    assert names(tmp_path) == ["file", "old.bin"]
+    assert (tmp_path / "file").read_bytes() == b"not a folder"
+
+
+def test_folder_in_the_place_of_a_file_leaves_all(tmp_path: Path) -> None:
+    old, folder = tmp_path / "old.bin", tmp_path / "folder.bin"
+    old.write_bytes(b"old")
+    folder.mkdir()
+    with pytest.raises(malta.InputError, match=re.escape(f"{folder}: found a folder of that name, expected")):
+        replace_files({old: b"new", folder: b"new"})
+    assert old.read_bytes() == b"old"
+    assert names(tmp_path) == ["folder.bin", "old.bin"]
+
+
+def test_name_that_is_too_long_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(malta.InputError, match=r"found File name too long, expected a place to write"):
+        replace_files({tmp_path / "a.bin": b"1", tmp_path / ("b" * 300): b"2"})
+    assert names(tmp_path) == []
+
+
+def test_failure_while_writing_leaves_old_files_and_no_temporary_ones(tmp_path: Path) -> None:
+    old = tmp_path / "old.bin"
+    old.write_bytes(b"old")
+    contents: dict[Path, bytes] = {old: b"new", tmp_path / "new.bin": "no bytes"}  # type: ignore[dict-item]
+    with pytest.raises(TypeError, match="bytes-like"):
+        replace_files(contents)
+    assert old.read_bytes() == b"old"
+    assert names(tmp_path) == ["old.bin"]
+
+
+def test_full_disk_leaves_old_files_and_no_temporary_ones(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(handle: int, _: str) -> None:
+        os.close(handle)
+        raise OSError(28, "No space left on device")
+
+    old = tmp_path / "old.bin"
+    old.write_bytes(b"old")
+    monkeypatch.setattr("os.fdopen", full)
+    with pytest.raises(malta.InputError, match=r"old\.bin: found No space left on device, expected a place"):
+        replace_files({old: b"new"})
+    assert old.read_bytes() == b"old"
+    assert names(tmp_path) == ["old.bin"]

@@ -1,0 +1,133 @@
+"""The records of a machine: immutable, named in every refusal, and held only where something can hold it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import FrozenInstanceError
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import malta
+from malta.plant import OperatingPoint, trims
+from malta.plants import tubular
+
+if TYPE_CHECKING:
+    from malta.plant import Plant
+
+
+def test_records_are_frozen(par: tubular.Parameters, plant: Plant) -> None:
+    """No field of a parameter record, a plant, its actuator or an operating point can be set."""
+    records: list[tuple[Any, str]] = [
+        (par, "m"),
+        (plant, "mass"),
+        (plant.actuator, "R"),
+        (plant.at(z=0.0), "x"),
+    ]
+    for record, name in records:
+        with pytest.raises(FrozenInstanceError):
+            setattr(record, name, 1.0)
+
+
+def test_an_operating_point_is_a_private_read_only_copy(plant: Plant) -> None:
+    """Neither the point's arrays nor those it was made from change it afterwards."""
+    x, u = np.zeros(12), np.zeros(5)
+    point = OperatingPoint(x, u, loaded=False)
+    x[2], u[4] = 1.0, 1.0
+    assert point.x[2] == 0
+    assert point.u[4] == 0
+    for array in (point.x, point.u, malta.trim(plant, z=0.0).u):
+        with pytest.raises(ValueError, match="read-only"):
+            array[0] = 1.0
+
+
+def test_signals_are_twelve_five_five_and_six(plant: Plant) -> None:
+    """Positions, then rates in the same order; units follow; the design has everything but gamma."""
+    names = [s.name for s in plant.states]
+    assert names[:6] == ["x", "y", "z", "alpha", "beta", "gamma"]
+    assert names[6:] == [f"{name}_dot" for name in names[:6]]
+    assert [s.unit for s in plant.states] == ["m"] * 3 + ["rad"] * 3 + ["m/s"] * 3 + ["rad/s"] * 3
+    assert [s.name for s in plant.design_states] == [n for n in names if not n.startswith("gamma")]
+    assert plant.controlled == (0, 1, 2, 3, 4, 6, 7, 8, 9, 10)
+    assert (len(plant.inputs), len(plant.outputs), len(plant.disturbances)) == (5, 5, 6)
+    assert len(plant.noise) == len(plant.resolution) == len(plant.outputs)
+    assert plant.thrust in {s.name for s in plant.inputs}
+    assert plant.stroke in {s.name for s in plant.outputs}
+
+
+def test_at_sets_the_named_states_and_no_other(plant: Plant) -> None:
+    """`at` leaves out the loads and has no preload."""
+    point = plant.at(z=5e-3, beta_dot=2.0)
+    assert point.x.tolist() == [0, 0, 5e-3, 0, 0, 0, 0, 0, 0, 0, 2.0, 0]
+    assert point.u.tolist() == [0, 0, 0, 0, 0]
+    assert not point.loaded
+    assert malta.trim(plant, z=5e-3).loaded
+
+
+@settings(deadline=None)
+@given(
+    name=st.sampled_from([s.name for s in tubular.POSITIONS + tubular.RATES]),
+    value=st.sampled_from([math.nan, math.inf, -math.inf]),
+)
+def test_a_state_is_finite(plant: Plant, name: str, value: float) -> None:
+    """NaN or infinity is refused with the state's name, by `at` and by `trim`."""
+    for make in (plant.at, lambda **states: malta.trim(plant, **states)):
+        with pytest.raises(malta.InputError, match="finite") as caught:
+            make(**{name: value})
+        assert (caught.value.where, caught.value.field) == ("tubular", name)
+
+
+@settings(deadline=None)
+@given(
+    name=st.text().filter(
+        lambda n: n not in {s.name for s in tubular.POSITIONS + tubular.RATES} | {"self", "plant"}
+    )
+)
+def test_an_unknown_state_is_refused_and_the_known_ones_are_listed(plant: Plant, name: str) -> None:
+    """A misspelt state is never a zero."""
+    for make in (plant.at, lambda **states: malta.trim(plant, **states)):
+        with pytest.raises(malta.InputError, match="x y z alpha beta gamma x_dot") as caught:
+            make(**{name: 1e-3})
+        assert caught.value.field == name
+
+
+@pytest.mark.parametrize(
+    "states",
+    [{"z_dot": 0.1}, {"x_dot": -1e-6}, {"alpha_dot": 1.0}, {"gamma_dot": 5.0}, {"x": 1e-4, "beta_dot": 1e-3}],
+)
+def test_a_moving_mover_is_not_held(plant: Plant, states: dict[str, float]) -> None:
+    """No force makes a rate vanish: trim says so instead of returning its best attempt."""
+    with pytest.raises(malta.CheckError, match="no input holds"):
+        malta.trim(plant, **states)
+
+
+@pytest.mark.parametrize(
+    "states",
+    [
+        {},
+        {"z": 15e-3},
+        {"x": 1e-4},
+        {"y": -6e-4, "z": -15e-3},
+        {"alpha": 6e-3, "beta": -6e-3, "z": 5e-3},
+        {"gamma": 1.0},
+    ],
+)
+def test_every_pose_in_the_gap_is_held(plant: Plant, states: dict[str, float]) -> None:
+    """Five inputs hold five degrees of freedom; about its own axis nothing turns the mover."""
+    point = malta.trim(plant, **states)
+    left = np.array(plant.f(point.x, point.u, plant.load(point.x))).ravel()
+    assert abs(left).max() < 1e-9  # m/s2, rad/s2
+
+
+def test_trims_are_the_trims_one_by_one(plant: Plant) -> None:
+    """A row for each value."""
+    stroke = np.linspace(-15e-3, 15e-3, 7)
+    rows = trims(plant, "z", stroke)
+    assert rows.shape == (7, 5)
+    for z, row in zip(stroke, rows, strict=True):
+        np.testing.assert_array_equal(row, malta.trim(plant, z=z).u)
+    with pytest.raises(malta.InputError, match="finite"):
+        trims(plant, "z", [0.0, math.nan])

@@ -1,0 +1,140 @@
+"""Verification: poles, sensitivities and bandwidths against loops whose figures are known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import control
+import numpy as np
+import pytest
+
+import malta
+from malta.riccati import eigenvalues
+from malta.verify import BANDWIDTHS, loop, require_stable, zone
+
+if TYPE_CHECKING:
+    from conftest import Design
+
+
+def test_stages_cost_sensitivity(design: Design) -> None:
+    """Current loops and delay only make it worse."""
+    peaks = [stage.peak_sensitivity["sigma_max"] for stage in design.margins.stages]
+    assert peaks == sorted(peaks)
+    assert [stage.name for stage in design.margins.stages] == [
+        "sampled",
+        "+ current loops",
+        "+ delay of 1 sample",
+    ]
+
+
+def test_calibrated_stays_in_zone_A(designs: dict[str, Design]) -> None:
+    margins = designs["calibrated"].margins
+    assert {zone(value) for value in margins.peak_sensitivity.values()} == {"A"}
+
+
+@pytest.mark.parametrize(
+    ("peak", "name"), [(1.0, "A"), (2.999, "A"), (3.0, "B"), (4.0, "C"), (5.0, "D"), (90.0, "D")]
+)
+def test_zones_of_iso_14839_3(peak: float, name: str) -> None:
+    assert zone(peak) == name
+
+
+def test_the_peak_is_the_h_infinity_norm(design: Design) -> None:
+    """The zoomed grid against a frequency sweep a hundred times as dense."""
+    stage = loop(design.model, design.controller, delay=1, current_loops=True)
+    w = np.geomspace(1e-2, np.pi / 50e-6, 24_000)
+    S = stage.sensitivity(w)
+    dense = np.linalg.svd(S, compute_uv=False)[:, 0].max()
+    assert design.margins.peak_sensitivity["sigma_max"] == pytest.approx(dense, rel=1e-5)
+    for i, sensor in enumerate(("x1", "y1", "x2", "y2", "z")):
+        assert design.margins.peak_sensitivity[sensor] == pytest.approx(np.abs(S[:, i, i]).max(), rel=1e-5)
+
+
+def test_the_sampled_machine_is_python_controls(design: Design) -> None:
+    """Hold and current loops by control.c2d, delay by powers of z: the same frequency response and poles."""
+    A, B, C = design.model.A, design.model.B, design.model.C
+    w_c = design.plant.actuator.crossover
+    machine = control.ss(A, B, C, np.zeros((5, 5))) * control.ss(
+        -w_c * np.eye(5), w_c * np.eye(5), np.eye(5), 0 * np.eye(5)
+    )
+    sampled = control.c2d(machine, 50e-6, "zoh")
+    stage = loop(design.model, design.controller, delay=2, current_loops=True)
+    law = stage.control
+    controller = control.ss(law.A, law.B_y, law.C, law.D_y, 50e-6)
+    for w in (10.0, 300.0, 4000.0):
+        z = np.exp(1j * w * 50e-6)
+        expected = -sampled(z) @ controller(z) / z**2
+        assert stage.loop_gain(np.array([w]))[0] == pytest.approx(expected, rel=1e-6, abs=1e-7)
+    for delay in (0, 1):
+        plain = loop(design.model, design.controller, delay=delay)
+        # S = (I + L)^-1 has the closed-loop poles as its own: the determinant vanishes there
+        pole = max(eigenvalues(plain.closed), key=lambda p: abs(p.imag))
+        P = plain.Cd @ np.linalg.solve(pole * np.eye(len(plain.Ad)) - plain.Ad, plain.Bd)
+        F = plain.control.C @ np.linalg.solve(
+            pole * np.eye(len(plain.control.A)) - plain.control.A, plain.control.B_y
+        )
+        F = F + plain.control.D_y
+        assert abs(np.linalg.det(np.eye(5) - P @ F)) < 1e-6
+
+
+def test_bandwidths_have_definitions_and_order(design: Design) -> None:
+    found = design.margins.bandwidth
+    assert set(found) == set(BANDWIDTHS)
+    assert found["sigma_min_T"] < found["sigma_max_T"]
+    assert found["w_n_min"] < found["w_n_max"]
+    stage = loop(design.model, design.controller, delay=1, current_loops=True)
+    T = np.eye(5) - stage.sensitivity(np.array([found["sigma_max_T"], found["sigma_min_T"]]))
+    sizes = np.linalg.svd(T, compute_uv=False)
+    assert sizes[0, 0] == pytest.approx(np.sqrt(0.5), rel=2e-3)
+    assert sizes[1, -1] == pytest.approx(np.sqrt(0.5), rel=2e-3)
+    L = stage.loop_gain(np.array([found["crossover_max"]]))
+    assert np.linalg.svd(L, compute_uv=False)[0, 0] == pytest.approx(1, rel=2e-3)
+
+
+def test_an_unstable_loop_is_reported_and_refused(designs: dict[str, Design]) -> None:
+    design = designs["table2"]
+    stiff = malta.plant_of(replace(design.spec.parameters, K_A=3 * 8626.7))
+    margins = malta.verify(malta.linearize(stiff, stiff.at()), design.controller)
+    assert not margins.stable
+    assert np.isnan(margins.peak_sensitivity["sigma_max"])
+    assert margins.poles.closed_loop.real.max() > 0
+    assert str(margins).startswith("UNSTABLE")
+    with pytest.raises(malta.CheckError, match=r"table2: the loop \(sampled\) is unstable"):
+        require_stable(margins, "table2")
+
+
+def test_table2_tolerates_a_third_of_the_published_uncertainty_with_its_observer(
+    designs: dict[str, Design],
+) -> None:
+    """The 20 % box is left at about 33 % of it (K_A up, K_B down), where the LQR alone would reach 167 %."""
+    design = designs["table2"]
+
+    def stable(share: float) -> bool:
+        par = design.spec.parameters
+        worst = replace(par, K_A=8626.7 * (1 + 0.2 * share), K_B=5.2 * (1 - 0.2 * share))
+        # K_B scales what the controller believes to be forces
+        plant = malta.plant_of(worst)
+        model = malta.linearize(plant, plant.at())
+        scaled = replace(model, B=model.B * np.array([1 - 0.2 * share] * 4 + [1]))
+        return bool(np.abs(eigenvalues(loop(scaled, design.controller).closed)).max() < 1)
+
+    assert stable(0.32)
+    assert not stable(0.35)
+
+
+def test_margins_print_in_engineers_units(designs: dict[str, Design]) -> None:
+    text = str(designs["calibrated"].margins)
+    assert text.startswith("stable with hold, delay and current loops")
+    assert "rad/s (" in text
+    assert " Hz)" in text
+    assert max(map(len, text.splitlines())) <= 120
+
+
+def test_poles_are_sorted_and_read_only(design: Design) -> None:
+    poles = design.margins.poles
+    for name in ("open_loop", "regulator", "filter", "closed_loop"):
+        values = getattr(poles, name)
+        assert (np.diff(values.real) >= -1e-6).all()
+        with pytest.raises(ValueError, match="read-only"):
+            values[0] = 0
