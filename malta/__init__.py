@@ -17,6 +17,7 @@ if TYPE_CHECKING:  # the contents page, as type checkers and readers see it
     from malta import report as report
     from malta.controller import Controller as Controller
     from malta.data import plant_of as plant_of
+    from malta.data import published as published
     from malta.data import read as read
     from malta.errors import CheckError as CheckError
     from malta.errors import InputError as InputError
@@ -44,7 +45,7 @@ if TYPE_CHECKING:  # the contents page, as type checkers and readers see it
 
 _NAMES = {  # the same, for the first use of each name
     "controller": ("Controller",),
-    "data": ("plant_of", "read"),
+    "data": ("plant_of", "published", "read"),
     "errors": ("CheckError", "InputError"),
     "linearize": ("LinearModel", "linearize"),
     "plant": ("OperatingPoint", "Plant", "Signal", "trim"),

@@ -14,6 +14,7 @@ import math
 import tomllib
 from dataclasses import MISSING, Field, field, fields
 from functools import cache
+from numbers import Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
@@ -79,10 +80,15 @@ def _check_range(f: Field[Any], value: object, where: str | Path) -> None:
     unit, above, least = f.metadata["unit"], f.metadata["above"], f.metadata["at_least"]
     low = f" above {above:g}" if above is not None else ""
     low = f" of at least {least:g}" if least is not None else low
-    number = float(value) if isinstance(value, (int, float)) and not isinstance(value, bool) else math.nan
+    real = isinstance(value, Real) and not isinstance(value, bool)
+    try:
+        number = float(value) if real else math.nan  # type: ignore[arg-type]
+    except OverflowError:  # an integer beyond any float
+        number = math.inf
     inside = (above is None or number > above) and (least is None or number >= least)
     if not (math.isfinite(number) and inside):
-        raise InputError(where, f.name, f"{value} {unit}", f"a finite number{low} in {unit}")
+        found = f"{number:g} {unit}" if real else repr(value)
+        raise InputError(where, f.name, found, f"a finite number{low} in {unit}")
 
 
 # What a machine is measured in. Angle is a dimension of its own here: taken as 1, as most unit libraries do, it
@@ -184,8 +190,10 @@ def explain(error: ValidationError, where: str | Path) -> InputError:
     return InputError(where, name, found if len(found) <= 60 else found[:57] + "...", expected)
 
 
-def read(path: str | Path, preset: str | None = None) -> Parameters:
+def read(path: str | Path, preset: str | None = None) -> Any:
     """Read a machine's data file into the Parameters record of its module in malta/plants/.
+
+    Which record that is, the file says (`machine = "tubular"` gives plants.tubular.Parameters).
 
     Parameters
     ----------

@@ -65,7 +65,8 @@ def linearize(plant: Plant, point: OperatingPoint) -> LinearModel:
     """Linearize x' = f(x, u, w), y = h(x, u) at an operating point.
 
     At `plant.at(z=...)` the loads are left out, as v0(z) cancels them; at `trim(plant, z=...)` they act, which
-    adds the slope of the load and of its balance (for MALTA: m g / Ixx from z into alpha'').
+    adds the slopes of the loads and of their balance (for MALTA: m g / Ixx from z into alpha'', the cogging's slope in
+    z'', and off the centre z f_D / Ixx in alpha'' and beta'').
 
     Raises InputError when the point has the wrong size, CheckError when the Jacobian is not finite.
     """

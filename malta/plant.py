@@ -103,7 +103,7 @@ class Plant:
         """The states of the design model."""
         return tuple(self.states[i] for i in self.controlled)
 
-    def at(self, **positions: float) -> OperatingPoint:
+    def at(self, /, **positions: float) -> OperatingPoint:
         """The operating point at these states (SI), the others zero, without preload.
 
         The loads are taken as cancelled at every position, as v0(z) does. `plant.at(z=5e-3)`
@@ -116,9 +116,12 @@ class Plant:
         for name, value in values.items():
             if name not in names:
                 raise InputError(self.name, name, "an unknown state", "one of " + " ".join(names))
-            if not np.isfinite(value):
-                raise InputError(self.name, name, str(value), "a finite number")
-            x[names.index(name)] = value
+            try:
+                x[names.index(name)] = value
+            except (TypeError, ValueError, OverflowError):
+                x[names.index(name)] = np.nan
+            if not np.isfinite(x[names.index(name)]):
+                raise InputError(self.name, name, repr(value), "a finite number")
         return x
 
 
@@ -142,7 +145,7 @@ def readonly(array: ArrayLike) -> FloatArray:
     return copy
 
 
-def trim(plant: Plant, **positions: float) -> OperatingPoint:
+def trim(plant: Plant, /, **positions: float) -> OperatingPoint:
     """The inputs that hold the machine at rest at these states (SI) against its loads.
 
     Solves 0 = f(x, u, load(x)) for u, in the least-squares sense, by Newton's method.
@@ -168,8 +171,8 @@ def _hold(plant: Plant, states: FloatArray) -> FloatArray:
             r, J = (np.array(value) for value in residual(state, held[i]))
             held[i] -= np.linalg.lstsq(J, r, rcond=None)[0].ravel()
         left = float(np.abs(np.array(residual(state, held[i])[0])).max())
-        if not left <= 1e-9:  # m/s2 or rad/s2
+        if not left <= 1e-9:  # m/s, rad/s, m/s2 or rad/s2
             raise CheckError(
-                f"{plant.name}: no input holds the state {state.tolist()}: an acceleration of {left:.3g} is left"
+                f"{plant.name}: no input holds the state {state.tolist()}: it changes at up to {left:.3g} (SI) a second"
             )
     return held

@@ -41,7 +41,8 @@ def _in_the_root(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture(scope="session")
 def par() -> tubular.Parameters:
     """MALTA's parameters, preset table1."""
-    return malta.read(ROOT / "data" / "tubular.toml")  # type: ignore[return-value]
+    parameters: tubular.Parameters = malta.read(ROOT / "data" / "tubular.toml")
+    return parameters
 
 
 @pytest.fixture(scope="session")

@@ -380,7 +380,7 @@ def faults() -> dict[str, tuple[Edit, str, str, str]]:
         "parameter in grams": (put(m, {"value": 360.0, "unit": "g"}), f"{m}.unit", "'g'", "'kg'"),
         "parameter without unit": (drop(f"{m}.unit"), f"{m}.unit", "nothing", "this key"),
         "negative mass": (put(f"{m}.value", -0.36), m, "-0.36 kg", "above 0"),
-        "no mass": (put(f"{m}.value", 0.0), m, "0.0 kg", "above 0"),
+        "no mass": (put(f"{m}.value", 0.0), m, "0", "above 0"),
         "mass as text": (put(f"{m}.value", "0.36"), f"{m}.value", "'0.36'", "number"),
         "mass of NaN": (put(f"{m}.value", float("nan")), f"{m}.value", "nan", "finite"),
         "unknown plant": (put("plant.name", "planar9"), "plant.name", "'planar9'", "'tubular'"),

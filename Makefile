@@ -1,0 +1,57 @@
+# make design   set up ./.venv and run the main job: every design, verified, exported, simulated, reported
+# make test     set up ./.venv and run the tests
+# make check    what CI runs: lint, format, types, tests
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check
+
+.PHONY: design test check lint types notebooks bench figures clean
+
+design: $(VENV)/runtime
+	$(BIN)/malta design
+
+test: $(VENV)/dev
+	$(BIN)/python -m pytest -n 2
+
+check: lint types test
+
+lint: $(VENV)/dev
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+types: $(VENV)/dev
+	$(BIN)/mypy
+
+notebooks: $(VENV)/dev
+	mkdir -p build
+	for source in notebooks/*.py; do \
+	  name=build/$$(basename $$source .py); \
+	  $(BIN)/jupytext --quiet --to ipynb --execute --run-path . --output $$name.ipynb $$source && \
+	  $(BIN)/jupyter nbconvert --log-level=WARN --to html $$name.ipynb || exit 1; \
+	done
+	@ls build/*.html
+
+bench: $(VENV)/dev
+	$(BIN)/python bench/run.py
+
+figures: $(VENV)/runtime  # the picture of the README
+	$(BIN)/python -c "import malta; c = malta.gains.read('design/gains/calibrated.json'); \
+	  run = malta.simulate(malta.plant_of(c.parameters), c, malta.Scenario.stroke()); \
+	  malta.report.stroke(run, 'design/figures/stroke.svg', malta.published('data/tubular.toml'))"
+
+$(BIN)/python:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
+	  || { echo "malta needs Python 3.11 or newer; name one with: make PYTHON=python3.12"; exit 2; }
+	$(PYTHON) -m venv $(VENV)
+
+$(VENV)/runtime: $(BIN)/python pyproject.toml constraints.txt
+	$(PIP) install --quiet --constraint constraints.txt --editable .
+	touch $@
+
+$(VENV)/dev: $(BIN)/python pyproject.toml constraints.txt
+	$(PIP) install --quiet --constraint constraints.txt --editable '.[dev]'
+	touch $@ $(VENV)/runtime
+
+clean:
+	rm -rf $(VENV) build *.egg-info
