@@ -176,8 +176,8 @@ def test_design_prints_table_I_beside_ours(designed: tuple[Path, str]) -> None:
 
 def test_design_prints_bandwidths_sensitivities_and_stroke(designed: tuple[Path, str]) -> None:
     _, printed = designed
-    for title in ("Bandwidth by definition", "Peak sensitivity (ISO 14839-3", "Stroke", "overshoot [%]"):
-        assert printed.count(f"\n{title}") == 2, title
+    for title in ("Bandwidth by definition", "Peak sensitivity (ISO 14839-3", "\nStroke ", "overshoot [%]"):
+        assert printed.count(title) == 2, title
     assert "calibrated: Table II's weights on bases" in printed
 
 
@@ -347,8 +347,7 @@ def test_touchdown_as_json_is_said_in_the_verdict(run: Run) -> None:
 
 
 def test_simulate_writes_figure_and_time_series(run: Run, tmp_path: Path) -> None:
-    code, out, _ = run("simulate", CALIBRATED, "--out", tmp_path / "new" / "folder")
-    assert code == 0
+    assert run("simulate", CALIBRATED, "--out", tmp_path / "new" / "folder")[::2] == (0, "")
     folder = tmp_path / "new" / "folder"
     assert sorted(path.name for path in folder.iterdir()) == [
         "calibrated_stroke.npz",
