@@ -223,7 +223,7 @@ def _design(file: Path, out: Path, figures: Path, *, quiet: bool) -> dict[str, A
     plant = spec.plant
     model = linearize(plant, plant.at(**spec.operating_point))
     controller = synthesize(spec, model)
-    margins = verified(model, controller)
+    margins = verified(model, controller, spec.uncertainty)
     require_stable(margins, str(file))
     with (
         tempfile.TemporaryDirectory() as scratch

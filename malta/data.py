@@ -87,7 +87,7 @@ def _check_range(f: Field[Any], value: object, where: str | Path) -> None:
         number = math.inf
     inside = (above is None or number > above) and (least is None or number >= least)
     if not (math.isfinite(number) and inside):
-        found = f"{number:g} {unit}" if real else repr(value)
+        found = f"{number} {unit}" if real else repr(value)
         raise InputError(where, f.name, found, f"a finite number{low} in {unit}")
 
 

@@ -117,10 +117,18 @@ class _Poles(Record):
     closed_loop: Matrix
 
 
+class _Robust(Record):
+    uncertainty: dict[StrictStr, Finite]
+    lower: Finite | None
+    upper: Finite | None
+    witness: dict[StrictStr, Finite] | None
+
+
 class _Verification(Record):
     poles: _Poles
     bandwidth: dict[StrictStr, Finite]
     peak_sensitivity: dict[StrictStr, Finite]
+    robust: _Robust | None
 
 
 class _Provenance(Record):
@@ -182,6 +190,15 @@ def document(controller: Controller, margins: Margins) -> dict[str, Any]:
             },
             "bandwidth": dict(margins.bandwidth),
             "peak_sensitivity": dict(margins.peak_sensitivity),
+            # The box that the design names; null: no bound is proven, no witness known.
+            "robust": {
+                "uncertainty": dict(margins.uncertainty),
+                "lower": None,
+                "upper": None,
+                "witness": None,
+            }
+            if margins.uncertainty
+            else None,
         },
         "provenance": {"malta": version("malta"), "python": platform.python_version()}
         | {name: version(name) for name in ("numpy", "scipy", "control", "casadi")},
@@ -356,7 +373,8 @@ def _encode(content: Mapping[str, Any], path: Path) -> bytes:
         with zipfile.ZipFile(archived, "w", zipfile.ZIP_DEFLATED) as archive:
             for name, value in _flat(_columns(content)).items():
                 entry = io.BytesIO()
-                np.lib.format.write_array(entry, np.array(value), allow_pickle=False)
+                array = np.zeros(0) if value is None else np.array(value)
+                np.lib.format.write_array(entry, array, allow_pickle=False)
                 info = zipfile.ZipInfo(f"{name}.npy")  # the fixed date of 1980: no time stamp
                 info.compress_type = zipfile.ZIP_DEFLATED
                 archive.writestr(info, entry.getvalue())
@@ -420,7 +438,7 @@ def _from_npz(data: bytes) -> dict[str, Any]:
             table = tree
             for part in tables:
                 table = table.setdefault(part, {})
-            table[key] = archive[name].tolist()
+            table[key] = archive[name].tolist() if archive[name].size else None
     return tree
 
 
@@ -455,7 +473,7 @@ def _cells(value: Any) -> Any:
         return {key: _cells(entry) for key, entry in value.items()}
     if isinstance(value, list):
         return np.array(value, dtype=object if isinstance(value[0], str) else float)
-    return value
+    return np.zeros((0, 0)) if value is None else value
 
 
 MATRICES = ("model.", "gains.", "feedforward.v0", "verification.poles.")
@@ -470,6 +488,8 @@ def _uncell(value: Any, name: str) -> Any:
         return [str(cell[0]) for cell in value.ravel()]
     if value.dtype.kind == "U":
         return str(value[0]) if value.size else ""
+    if not value.size:
+        return None
     if name.startswith(MATRICES):
         return value.tolist()
     if name.startswith(VECTORS):

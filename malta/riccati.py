@@ -51,14 +51,18 @@ def care(A: FloatArray, B: FloatArray, Q: FloatArray, R: FloatArray, what: str =
 def _care(A: FloatArray, B: FloatArray, Q: FloatArray, R: FloatArray, what: str) -> Solution:
     import control
 
-    U, B1 = _normalize(B, R)
-    t = _balance(A, B1 @ B1.T, Q)
-    A1, B1, Q1 = A * t / t[:, None], B1 / t[:, None], (Q + Q.T) / 2 * np.outer(t, t)
-    rate = np.abs(A1).max() or 1.0
-    try:
-        X, _, _ = control.care(A1 / rate, B1 / np.sqrt(rate), Q1 / rate, np.eye(B.shape[1]), method="scipy")
-    except (ValueError, np.linalg.LinAlgError, control.ControlArgument) as error:
-        raise CheckError(f"{what}: no stabilizing solution ({_first_sentence(error)})") from error
+    U, B0 = _normalize(B, R)
+    t = _balance(A, B0 @ B0.T, Q)
+    for last in (False, True):
+        A1, B1, Q1 = A * t / t[:, None], B0 / t[:, None], (Q + Q.T) / 2 * np.outer(t, t)
+        rate = np.abs(A1).max() or 1.0
+        try:
+            X, _, _ = control.care(
+                A1 / rate, B1 / np.sqrt(rate), Q1 / rate, np.eye(B.shape[1]), method="scipy"
+            )
+        except (ValueError, np.linalg.LinAlgError, control.ControlArgument) as error:
+            raise CheckError(f"{what}: no stabilizing solution ({_first_sentence(error)})") from error
+        t = t if last else _unit_diagonal(t, X)
     X = (X + X.T) / 2
     K1 = B1.T @ X
     closed = A1 - B1 @ K1
@@ -93,21 +97,23 @@ def dare(
 def _dare(A: FloatArray, B: FloatArray, Q: FloatArray, R: FloatArray, N: FloatArray, what: str) -> Solution:
     import control
 
-    U, B1 = _normalize(B, R)
+    U, B0 = _normalize(B, R)
     S = linalg.solve_triangular(U, N.T, lower=True).T
-    A0, Q0 = A - B1 @ S.T, Q - S @ S.T  # the cross term, absorbed into u + S'x
-    t = _balance(A0 - np.eye(len(A)), B1 @ B1.T, Q0)
-    A1, B1, Q1 = A0 * t / t[:, None], B1 / t[:, None], Q0 * np.outer(t, t)
-    size = np.abs(Q1).max() or 1.0  # X counts in units of Q
-    Q1, R1 = (Q1 + Q1.T) / (2 * size), np.eye(B.shape[1]) / size  # Q - SS' is unsymmetric by rounding
-    try:
-        X, _, _ = control.dare(A1, B1, Q1, R1, method="scipy")
-    except (ValueError, np.linalg.LinAlgError, control.ControlArgument) as error:
-        raise CheckError(f"{what}: no stabilizing solution ({_first_sentence(error)})") from error
+    A0, Q0 = A - B0 @ S.T, Q - S @ S.T  # the cross term, absorbed into u + S'x
+    t = _balance(A0 - np.eye(len(A)), B0 @ B0.T, Q0)
+    for last in (False, True):
+        A1, B1, Q1 = A0 * t / t[:, None], B0 / t[:, None], (Q0 + Q0.T) / 2 * np.outer(t, t)
+        size = np.abs(Q1).max() or 1.0  # X counts in units of Q
+        R1 = np.eye(B.shape[1]) / size
+        try:
+            X, _, _ = control.dare(A1, B1, Q1 / size, R1, method="scipy")
+        except (ValueError, np.linalg.LinAlgError, control.ControlArgument) as error:
+            raise CheckError(f"{what}: no stabilizing solution ({_first_sentence(error)})") from error
+        t = t if last else _unit_diagonal(t, X * size)
     X = (X + X.T) / 2
     K1 = np.linalg.solve(R1 + B1.T @ X @ B1, B1.T @ X @ A1)
     closed = A1 - B1 @ K1
-    terms = [A1.T @ X @ A1, -X, -(A1.T @ X @ B1) @ K1, Q1]
+    terms = [A1.T @ X @ A1, -X, -(A1.T @ X @ B1) @ K1, Q1 / size]
     residual = _check(terms, X, np.abs(eigenvalues(closed)).max() - 1, what)
     K = linalg.solve_triangular(U.T, K1 / t + S.T, lower=False)
     return Solution(X * size / np.outer(t, t), K, residual)
@@ -162,7 +168,20 @@ def _balance(A: FloatArray, G: FloatArray, Q: FloatArray) -> FloatArray:
         both = (falls > 0) & (grows > 0)
         # G_ii and Q_ii change with t_i^2, squared here: with the fourth root of off-diagonal entries they oscillate.
         t = t * np.where(both, falls / np.where(both, grows, 1), 1) ** 0.125
-    return np.exp2(np.round(np.log2(t)))  # powers of two: scaling adds no rounding
+    return _powers_of_two(t)
+
+
+def _unit_diagonal(t: FloatArray, X: FloatArray) -> FloatArray:
+    """Scales on which X, solved on the scales t, has a diagonal of ones: it is then found to most digits.
+
+    Balance alone leaves X large where weights are weak and the regulator only mirrors the unstable poles.
+    """
+    diagonal = np.diag(X)
+    return _powers_of_two(t / np.sqrt(np.where(diagonal > 0, diagonal, 1)))
+
+
+def _powers_of_two(t: FloatArray) -> FloatArray:
+    return np.asarray(np.exp2(np.round(np.log2(t))))  # scaling by them adds no rounding
 
 
 def _check(terms: list[FloatArray], X: FloatArray, instability: float, what: str) -> float:

@@ -8,6 +8,7 @@ zero-order hold, exactly; F the control law from measurements to forces (v = F y
 from __future__ import annotations
 
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -61,6 +62,7 @@ class Margins:
     poles: Poles
     stages: tuple[Stage, ...]
     bandwidth: Mapping[str, float]  # rad/s, by definition
+    uncertainty: Mapping[str, float]  # the relative box, by parameter, that the design is meant for
 
     @property
     def stable(self) -> bool:
@@ -159,11 +161,14 @@ def own_poles(c: Controller) -> tuple[ComplexArray, ComplexArray]:
     return regulator, eigenvalues((np.eye(len(c.Ad)) - c.L @ c.Cd) @ c.Ad)
 
 
-def verify(model: LinearModel, controller: Controller) -> Margins:
+def verify(
+    model: LinearModel, controller: Controller, uncertainty: Mapping[str, float] | None = None
+) -> Margins:
     """Poles, peak sensitivities and bandwidths of a controller on a machine's linear model.
 
     Stages: the sampled loop as designed; with the current loops; with at least one sample of delay as well, which is
-    the machine. An unstable loop is reported, not raised; its sensitivities are NaN.
+    the machine. An unstable loop is reported, not raised; its sensitivities are NaN. `uncertainty` is kept
+    for the record.
     """
     late = max(1, controller.delay)
     loops = {
@@ -181,7 +186,8 @@ def verify(model: LinearModel, controller: Controller) -> Margins:
         filter=_continuous(observer, controller.sample_time),
         closed_loop=_continuous(eigenvalues(machine.closed), controller.sample_time),
     )
-    return Margins(poles, stages, _bandwidths(model, controller, machine, stable=stages[-1].stable))
+    bandwidths = _bandwidths(model, controller, machine, stable=stages[-1].stable)
+    return Margins(poles, stages, bandwidths, MappingProxyType(dict(uncertainty or {})))
 
 
 def require_stable(margins: Margins, name: str) -> None:

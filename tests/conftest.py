@@ -72,7 +72,7 @@ def designs() -> dict[str, Design]:
         plant = spec.plant
         model = malta.linearize(plant, plant.at(**spec.operating_point))
         controller = malta.synthesize(spec, model)
-        made[name] = Design(spec, plant, model, controller, malta.verify(model, controller))
+        made[name] = Design(spec, plant, model, controller, malta.verify(model, controller, spec.uncertainty))
     return made
 
 
