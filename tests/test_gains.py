@@ -295,7 +295,7 @@ import malta
 spec = malta.read_design("design/calibrated.toml")
 model = malta.linearize(spec.plant, spec.plant.at(**spec.operating_point))
 controller = malta.synthesize(spec, model)
-malta.gains.write(controller, malta.verify(model, controller), *sys.argv[1:])
+malta.gains.write(controller, malta.verify(model, controller, spec.uncertainty), *sys.argv[1:])
 """
     here, there = ([tmp_path / where / f"a{suffix}" for suffix in SUFFIXES] for where in ("here", "there"))
     subprocess.run([sys.executable, "-c", program, *map(str, there)], check=True, timeout=60)
