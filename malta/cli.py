@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import io
 import json
 import sys
 from pathlib import Path
@@ -63,10 +64,11 @@ def design(
             "design", "", "no design files (*.toml) here", "a folder design/ with some, or their names"
         )
     results: list[dict[str, Any]] = []
+    made: dict[Path, Path] = {}  # which design file wrote which gain file in this run
     worst = 0
     for file in _progress(chosen, "designing", quiet=as_json):
         try:
-            results.append(_design(file, out or file.parent / "gains", figures, quiet=as_json))
+            results.append(_design(file, out or file.parent / "gains", figures, made, quiet=as_json))
         except (InputError, CheckError) as error:
             worst = max(worst, _complain(error))
     if as_json:
@@ -124,14 +126,12 @@ def simulate(
         float | None, typer.Option(help="Rise of the reference, 10-90 % [ms]. [the published 16.2]")
     ] = None,
     profile: Annotated[str, typer.Option(help="Reference: logistic or quintic.")] = "logistic",
-    noise: Annotated[
-        float, typer.Option(min=0.0, help="Sensor noise in multiples of the machine's; 0: none.")
-    ] = 0.0,
+    noise: Annotated[float, typer.Option(help="Sensor noise in multiples of the machine's; 0: none.")] = 0.0,
     quantize: Annotated[bool, typer.Option(help="Sensors with the machine's resolution.")] = False,
     delay: Annotated[
-        int | None, typer.Option(min=0, help="Samples of delay. [as many as the design models]")
+        int | None, typer.Option(help="Samples of delay. [as many as the design models]")
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the noise.")] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of the noise.")] = 0,
     out: Annotated[
         Path | None, typer.Option(help="Folder for the figure (.png) and the time series (.npz).")
     ] = None,
@@ -188,7 +188,7 @@ def simulate(
         )
         console.print(report.stroke_table(figures, published))
         for file in files:
-            console.print(f"wrote {file}")
+            console.print(f"wrote {file}", soft_wrap=True)
     if not run.verdict.completed:
         raise CheckError(f"{gains}: {scenario}: {run.verdict.name} at {run.verdict.time:.4g} s")
 
@@ -198,13 +198,18 @@ def main() -> None:
     gc.set_threshold(
         200_000, 50, 50
     )  # numeric libraries make many lasting objects; going through them costs a sixth
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")  # a terminal without Greek letters shows ? and goes on
     try:
         app()
     except (InputError, CheckError) as error:
         sys.exit(_complain(error))
+    except ArithmeticError as error:
+        sys.exit(_complain(CheckError(f"numbers beyond what can be computed ({error})")))
 
 
-def _design(file: Path, out: Path, figures: Path, *, quiet: bool) -> dict[str, Any]:
+def _design(file: Path, out: Path, figures: Path, made: dict[Path, Path], *, quiet: bool) -> dict[str, Any]:
     """The main job for one design file."""
     import tempfile
 
@@ -220,6 +225,10 @@ def _design(file: Path, out: Path, figures: Path, *, quiet: bool) -> dict[str, A
     from malta.verify import verify as verified
 
     spec = read_design(file)
+    target = out / f"{spec.name}.json"
+    if target in made:
+        raise InputError(file, "name", repr(spec.name), f"another name than that of {made[target]}")
+    made[target] = file
     plant = spec.plant
     model = linearize(plant, plant.at(**spec.operating_point))
     controller = synthesize(spec, model)
@@ -236,14 +245,16 @@ def _design(file: Path, out: Path, figures: Path, *, quiet: bool) -> dict[str, A
             f"{file}: the stroke ends at {run.verdict.time:.4g} s: {run.verdict.name}; gain files unchanged"
         )
     published = published_of(spec.machine_file)
-    paths = [out / f"{spec.name}{suffix}" for suffix in gain_files.SUFFIXES]
-    gain_files.write(controller, margins, *paths)
     picture = report.stroke(run, figures / f"{spec.name}_stroke.png", published)
+    paths = [out / f"{spec.name}{suffix}" for suffix in gain_files.SUFFIXES]
+    gain_files.write(controller, margins, *paths)  # last: whatever fails before leaves the old files
     stroke = stroke_figures(run)
     if not quiet:
         console = _console()
         console.print(report.design_page(spec, model, margins, stroke, published))
-        console.print(f"wrote {', '.join(map(str, paths))}, {picture}\n", soft_wrap=True)
+        for path in (*paths, picture):
+            console.print(f"wrote {path}", soft_wrap=True)
+        console.print()
     return (
         {"design": spec.name, "files": [str(p) for p in (*paths, picture)]}
         | _margins(margins)
@@ -315,7 +326,7 @@ def _print_json(content: Any) -> None:
 def _console() -> Console:
     from rich.console import Console
 
-    console = Console(highlight=False, markup=False)
+    console = Console(highlight=False, markup=False, emoji=False)
     if not console.is_terminal or console.width > 100:
         console.width = 100
     return console

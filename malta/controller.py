@@ -109,6 +109,11 @@ class LinearLaw(NamedTuple):
     D_r: FloatArray
 
 
+def stored_forces(inputs: tuple[Signal, ...], delay: int) -> tuple[Signal, ...]:
+    """The states that hold the forces of the last `delay` samples, the oldest first."""
+    return tuple(Signal(f"{s.name}[k-{age}]", s.unit) for age in range(delay, 0, -1) for s in inputs)
+
+
 def law(c: Controller) -> ca.Function:
     """The control law of one sample as a CasADi function.
 

@@ -13,7 +13,7 @@ import importlib
 import math
 import tomllib
 from dataclasses import MISSING, Field, field, fields
-from functools import cache
+from functools import cache, lru_cache
 from numbers import Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
@@ -73,10 +73,10 @@ def check_parameters(record: Parameters, where: str | Path = "parameters") -> No
     """Refuse values that no machine has (NaN, a negative mass): InputError names the field."""
     for f in fields(record):
         if "unit" in f.metadata:
-            _check_range(f, getattr(record, f.name), where)
+            _check_range(f, getattr(record, f.name), where, f.name)
 
 
-def _check_range(f: Field[Any], value: object, where: str | Path) -> None:
+def _check_range(f: Field[Any], value: object, where: str | Path, name: str) -> None:
     unit, above, least = f.metadata["unit"], f.metadata["above"], f.metadata["at_least"]
     low = f" above {above:g}" if above is not None else ""
     low = f" of at least {least:g}" if least is not None else low
@@ -88,14 +88,14 @@ def _check_range(f: Field[Any], value: object, where: str | Path) -> None:
     inside = (above is None or number > above) and (least is None or number >= least)
     if not (math.isfinite(number) and inside):
         found = f"{number} {unit}" if real else repr(value)
-        raise InputError(where, f.name, found, f"a finite number{low} in {unit}")
+        raise InputError(where, name, found, f"a finite number{low} in {unit}")
 
 
 # What a machine is measured in. Angle is a dimension of its own here: taken as 1, as most unit libraries do, it
 # lets Hz pass for rad/s and errs by 2 pi.
 UNITS = """
 nano- = 1e-9 = n-
-micro- = 1e-6 = u- = µ-
+micro- = 1e-6 = u- = µ- = μ-
 milli- = 1e-3 = m-
 centi- = 1e-2 = c-
 kilo- = 1e3 = k-
@@ -109,6 +109,7 @@ degree = 0.017453292519943295 * radian = deg
 turn = 6.283185307179586 * radian = revolution
 inch = 0.0254 * meter
 minute = 60 * second = min
+rpm = turn / minute
 hertz = 1 / second = Hz
 newton = kilogram * meter / second ** 2 = N
 joule = newton * meter = J
@@ -160,11 +161,13 @@ def load_toml(path: str | Path) -> dict[str, Any]:
         raise InputError(path, "", "no such file", "a TOML file") from error
     except UnicodeDecodeError as error:
         raise InputError(path, "", "bytes that are not UTF-8 text", "a TOML file") from error
-    except OSError as error:
-        raise InputError(path, "", error.strerror or str(error), "a readable TOML file") from error
+    except (OSError, ValueError) as error:  # ValueError: a null byte in the name
+        raise InputError(
+            path, "", getattr(error, "strerror", None) or str(error), "a readable TOML file"
+        ) from error
     try:
         return tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+    except (ValueError, RecursionError) as error:  # TOMLDecodeError, endless digits, endless nesting
         raise InputError(path, "", f"a TOML error ({error})", "a complete TOML file") from error
 
 
@@ -185,6 +188,10 @@ def explain(error: ValidationError, where: str | Path) -> InputError:
         return InputError(where, name, "nothing", "this key")
     if kind == "extra_forbidden":
         return InputError(where, name, "an unknown key", "only the keys of its format")
+    if kind in ("model_type", "model_attributes_type", "dict_type"):
+        message = "a table"
+    if kind == "string_pattern_mismatch":
+        message = "a name of letters, digits, - and _"
     found = repr(first["input"])
     expected = message.removeprefix("Value error, ").removeprefix("Input should be ")
     return InputError(where, name, found if len(found) <= 60 else found[:57] + "...", expected)
@@ -217,7 +224,7 @@ def read(path: str | Path, preset: str | None = None) -> Any:
                 raise InputError(path, f"{table}.{key}", "an unknown parameter", ", ".join(known))
             unit = known[key].metadata["unit"]
             value = to_si(entry.value, entry.unit, unit, path, f"{table}.{key}")
-            _check_range(known[key], value, path)
+            _check_range(known[key], value, path, f"{table}.{key}")
             if table in ("parameters", f"presets.{name}"):
                 values[key] = value
     for key, f in known.items():
@@ -234,6 +241,11 @@ def machine_module(machine: str) -> Any:
 
 def plant_of(parameters: Parameters) -> Plant:
     """The plant that these parameters describe."""
+    return _plant_of(parameters)
+
+
+@lru_cache(maxsize=64)  # records are immutable; building one takes longer than much that is done with it
+def _plant_of(parameters: Any) -> Plant:
     plant: Plant = machine_module(type(parameters).__module__.rpartition(".")[2]).plant(parameters)
     return plant
 

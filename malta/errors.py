@@ -14,7 +14,8 @@ class InputError(ValueError):
     def __init__(self, where: str | Path, field: str, found: str, expected: str) -> None:
         self.where, self.field, self.found, self.expected = str(where), field, found, expected
         subject = f"{where}: {field}" if field else str(where)
-        super().__init__(f"{subject}: found {found}, expected {expected}")
+        # One line, whatever a key or a library's message holds.
+        super().__init__(" ".join(f"{subject}: found {found}, expected {expected}".split()))
 
 
 class CheckError(ArithmeticError):

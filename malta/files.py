@@ -26,13 +26,19 @@ def replace_files(contents: Mapping[Path, bytes]) -> None:
                     file.write(data)
                 Path(name).chmod(0o644)
                 if path.is_dir():
-                    raise IsADirectoryError(0, "a folder of that name")
-            except OSError as error:
-                raise InputError(
-                    path, "", error.strerror or str(error), "a place to write the file to"
-                ) from error
+                    raise IsADirectoryError(0, "a folder of that name", str(path))
+            except (OSError, ValueError) as error:
+                raise _refused(path, error) from error
         for temporary, path in staged:
-            temporary.replace(path)
+            try:
+                temporary.replace(path)
+            except OSError as error:
+                raise _refused(path, error) from error
     finally:
         for temporary, _ in staged:
             temporary.unlink(missing_ok=True)
+
+
+def _refused(path: Path, error: OSError | ValueError) -> InputError:
+    reason = f"{error.strerror} ({error.filename})" if isinstance(error, OSError) else str(error)
+    return InputError(path, "", reason, "a place to write the file to")

@@ -22,9 +22,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 from pydantic import BeforeValidator, Field, StrictInt, StrictStr
 
-from malta.controller import Controller, CurrentLoop, Feedforward, Limits
+from malta.controller import Controller, CurrentLoop, Feedforward, Limits, stored_forces
 from malta.data import Finite, Machine, Quantity, Record, machine_module, plant_of, units_of, validated
-from malta.errors import InputError
+from malta.errors import CheckError, InputError
 from malta.files import replace_files
 from malta.plant import Signal
 from malta.verify import own_poles
@@ -43,7 +43,9 @@ Matrix = list[list[Finite]]
 def _rows(value: Any) -> Any:
     """Signals as the binary files hold them, two columns, back to a list of rows."""
     if isinstance(value, dict) and set(value) == {"name", "unit"}:
-        return [{"name": n, "unit": u} for n, u in zip(value["name"], value["unit"], strict=True)]
+        names, units = value["name"], value["unit"]
+        if isinstance(names, list) and isinstance(units, list) and len(names) == len(units):
+            return [{"name": n, "unit": u} for n, u in zip(names, units, strict=True)]
     return value
 
 
@@ -93,14 +95,14 @@ class _Gains(Record):
 
 
 class _Feedforward(Record):
-    mass: Finite
+    mass: Annotated[Finite, Field(gt=0)]
     z_grid: Vector
     v0: Matrix
 
 
 class _CurrentLoop(Record):
-    Kp: Finite
-    Ki: Finite
+    Kp: Annotated[Finite, Field(gt=0)]
+    Ki: Annotated[Finite, Field(gt=0)]
     sample_time: Annotated[Finite, Field(gt=0)]
 
 
@@ -237,7 +239,11 @@ def read(path: str | Path) -> Controller:
             path, "sha256", "content that was changed or damaged", "the content that was written"
         )
     controller = _controller(file, path)
-    regulator, observer = own_poles(controller)
+    try:
+        with np.errstate(all="ignore"):
+            regulator, observer = own_poles(controller)
+    except CheckError as error:
+        raise InputError(path, "model", str(error), "a model whose numbers can be multiplied") from error
     for field, poles in (("gains.K", regulator), ("gains.L", observer)):
         radius = float(np.abs(poles).max())
         if not radius < 1:
@@ -272,8 +278,9 @@ def _controller(file: GainFile, path: str | Path) -> Controller:
         len(measurements),
         len(file.feedforward.z_grid),
     )
-    if (n - n0) % m:
-        raise InputError(path, "signals.states", f"{n} states", f"{n0} and a multiple of {m} stored forces")
+    stored = stored_forces(forces, (n - n0) // m)
+    if states[n0:] != stored:
+        raise InputError(path, "signals.states", _names(states[n0:]), f"stored forces, as {_names(stored)}")
     shapes: dict[str, dict[str, tuple[int, ...]]] = {
         "model": {"A": (n0, n0), "B": (n0, m), "C": (p, n0), "Ad": (n, n), "Bd": (n, m), "Cd": (p, n)},
         "gains": {"K": (m, n), "Ki": (m, p), "L": (n, p)},
@@ -338,7 +345,7 @@ def _array(value: list[Any], shape: tuple[int, ...], path: str | Path, field: st
 
 
 def _names(signals: tuple[Signal, ...]) -> str:
-    return " ".join(s.name for s in signals)
+    return " ".join(f"{s.name} [{s.unit}]" for s in signals) or "nothing"
 
 
 def _pairs(poles: ComplexArray) -> list[list[float]]:
@@ -370,22 +377,22 @@ def _encode(content: Mapping[str, Any], path: Path) -> bytes:
         return _INNERMOST.sub(_joined, text).encode() + b"\n"
     if path.suffix == ".npz":
         archived = io.BytesIO()
-        with zipfile.ZipFile(archived, "w", zipfile.ZIP_DEFLATED) as archive:
+        with zipfile.ZipFile(archived, "w") as archive:  # stored: compressors differ in their bytes
             for name, value in _flat(_columns(content)).items():
                 entry = io.BytesIO()
                 array = np.zeros(0) if value is None else np.array(value)
                 np.lib.format.write_array(entry, array, allow_pickle=False)
-                info = zipfile.ZipInfo(f"{name}.npy")  # the fixed date of 1980: no time stamp
-                info.compress_type = zipfile.ZIP_DEFLATED
-                archive.writestr(info, entry.getvalue())
+                archive.writestr(
+                    zipfile.ZipInfo(f"{name}.npy"), entry.getvalue()
+                )  # dated 1980: no time stamp
         return archived.getvalue()
     if path.suffix == ".mat":
         from scipy.io import savemat
 
         buffer: Any = io.BytesIO()  # any: scipy's stubs know only file names
         savemat(buffer, _cells(_columns(content)), long_field_names=True, oned_as="row")
-        header = b"MATLAB 5.0 MAT-file, malta gain file, version 1".ljust(116)  # instead of date and platform
-        return header + bytes(buffer.getvalue())[116:]
+        body = bytes(buffer.getvalue())[MAT_HEADER:]
+        return _mat_header(body) + body
     raise InputError(path, "", f"suffix {path.suffix!r}", "one of " + ", ".join(SUFFIXES))
 
 
@@ -406,14 +413,15 @@ def _decode(path: str | Path) -> dict[str, Any]:
         data = path.read_bytes()
     except FileNotFoundError as error:
         raise InputError(path, "", "no such file", "a gain file") from error
-    except OSError as error:
-        raise InputError(path, "", error.strerror or str(error), "a readable gain file") from error
+    except (OSError, ValueError) as error:  # ValueError: a null byte in the name
+        raise InputError(
+            path, "", getattr(error, "strerror", None) or str(error), "a readable gain file"
+        ) from error
     try:
         content = {".json": _from_json, ".npz": _from_npz, ".mat": _from_mat}[path.suffix](data)
     except Exception as error:  # a damaged archive makes its reader raise nearly anything
-        raise InputError(
-            path, "", f"a damaged or foreign file ({error})", f"a complete {path.suffix} gain file"
-        ) from error
+        found = f"a damaged or foreign file ({str(error)[:120]})"
+        raise InputError(path, "", found, f"a complete {path.suffix} gain file") from error
     if not isinstance(content, dict):
         raise InputError(path, "", f"a {type(content).__name__}", "the tables of a gain file")
     return content
@@ -442,9 +450,22 @@ def _from_npz(data: bytes) -> dict[str, Any]:
     return tree
 
 
+MAT_HEADER = 116  # bytes of descriptive text that open a MAT-file
+
+
+def _mat_header(body: bytes) -> bytes:
+    """In the place of date and platform, the sha256 of what follows."""
+    return f"MATLAB 5.0 MAT-file, malta gain file, sha256 {hashlib.sha256(body).hexdigest()}".encode().ljust(
+        MAT_HEADER
+    )
+
+
 def _from_mat(data: bytes) -> dict[str, Any]:
     from scipy.io import loadmat
 
+    body = data[MAT_HEADER:]
+    if data[:MAT_HEADER] != _mat_header(body):  # before loadmat, which a damaged file can crash
+        raise ValueError("its header does not hold the sha256 of its content")
     buffer: Any = io.BytesIO(data)  # any: scipy's stubs know only file names
     content = loadmat(buffer, struct_as_record=True, squeeze_me=False)
     tree: dict[str, Any] = {k: _uncell(v, k) for k, v in content.items() if not k.startswith("__")}

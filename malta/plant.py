@@ -30,6 +30,8 @@ class Parameters(Protocol):
 
     __dataclass_fields__: ClassVar[dict[str, Any]]
 
+    def __hash__(self) -> int: ...
+
     @property
     def preset(self) -> str: ...
 

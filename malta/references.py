@@ -65,8 +65,8 @@ def stroke(
     """The stroke axis from `start` to `end` (m), half-way at `centre` (s), the other outputs held at zero."""
     if profile not in PROFILES:
         raise InputError("stroke", "profile", repr(profile), "one of " + ", ".join(PROFILES))
-    if not (math.isfinite(rise) and rise > 0):
-        raise InputError("stroke", "rise", f"{rise} s", "a time above 0 s")
+    if not 1e-6 <= rise <= 1e6:
+        raise InputError("stroke", "rise", f"{rise} s", "a time from 1e-6 to 1e6 s")
     axis = [s.name for s in plant.outputs].index(plant.stroke)
     for name, value in (("start", start), ("end", end)):
         if not abs(value) <= plant.travel:

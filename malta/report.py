@@ -42,9 +42,9 @@ def poles_table(model: LinearModel, published: Published | None) -> Table:
     table.add_row("ours, +-", *(f"{value:.2f}" for value in values))
     at_centre = not np.any(model.operating_point.x)
     if published is not None and at_centre:
-        printed = published["table_I"]
-        digits = printed["digits"]
-        table.add_row("Table I, +-", *(f"{printed['poles'][name]:.{digits}f}" for name in names))
+        digits = _entry(published, "table_I.digits")
+        printed = [_entry(published, f"table_I.poles.{name}") for name in names]
+        table.add_row("Table I, +-", *(f"{value:.{digits}f}" for value in printed))
     return table
 
 
@@ -153,10 +153,17 @@ def _pole_text(poles: ComplexArray) -> str:
 
 def _si(published: Published, key: str, unit: str) -> float:
     """A published quantity in the unit asked for."""
+    value, given = (_entry(published, f"{key}.{part}") for part in ("value", "unit"))
+    return to_si(value, given, unit, "data/published", key)
+
+
+def _entry(published: Published, key: str) -> Any:
     entry: Any = published
     for part in key.split("."):
+        if not isinstance(entry, Mapping) or part not in entry:
+            raise InputError("data/published", key, "nothing", "what the paper prints")
         entry = entry[part]
-    return to_si(entry["value"], entry["unit"], unit, "published", key)
+    return entry
 
 
 # --- figures ---

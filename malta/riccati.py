@@ -201,14 +201,16 @@ def _first_sentence(error: Exception) -> str:
 
 
 def eigenvalues(M: FloatArray) -> ComplexArray:
-    """Eigenvalues, complex even where they all are real."""
+    """Eigenvalues, complex even where they all are real. CheckError where numbers have overflowed."""
+    if not np.isfinite(M).all():
+        raise CheckError("the model's numbers overflow")
     return np.asarray(np.linalg.eigvals(M), dtype=complex)
 
 
 def sample(A: FloatArray, B: FloatArray, Ts: float) -> tuple[FloatArray, FloatArray]:
     """Zero-order hold: Ad = e^(A Ts), Bd = integral of e^(A s) B over one sample."""
     n, m = B.shape
-    E = linalg.expm(np.block([[A, B], [np.zeros((m, n + m))]]) * Ts)
+    E = _exponential(np.block([[A, B], [np.zeros((m, n + m))]]) * Ts)
     return E[:n, :n], E[:n, n:]
 
 
@@ -235,7 +237,7 @@ def sample_cost(
     F = np.zeros((n + m, n + m))
     F[:n, :n], F[:n, n:] = A, B
     W = linalg.block_diag(Q, R)
-    E = linalg.expm(np.block([[-F.T, W], [np.zeros_like(F), F]]) * Ts)
+    E = _exponential(np.block([[-F.T, W], [np.zeros_like(F), F]]) * Ts)
     Wd = E[n + m :, n + m :].T @ E[: n + m, n + m :]
     Wd = (Wd + Wd.T) / 2
     return Wd[:n, :n], Wd[:n, n:], Wd[n:, n:]
@@ -244,6 +246,14 @@ def sample_cost(
 def sample_noise(A: FloatArray, W: FloatArray, Ts: float) -> FloatArray:
     """Covariance that white noise of intensity W leaves in x after one sample (Van Loan)."""
     n = len(A)
-    E = linalg.expm(np.block([[-A, W], [np.zeros((n, n)), A.T]]) * Ts)
+    E = _exponential(np.block([[-A, W], [np.zeros((n, n)), A.T]]) * Ts)
     Wd = E[n:, n:].T @ E[:n, n:]
     return (Wd + Wd.T) / 2
+
+
+def _exponential(M: FloatArray) -> FloatArray:
+    with np.errstate(all="ignore"):
+        E = linalg.expm(M) if np.abs(M).max() < 1e8 else np.array([np.inf])  # e^710 is past the largest float
+    if not np.isfinite(E).all():
+        raise CheckError("the sampled model's numbers overflow: the sample time is too long for this machine")
+    return np.asarray(E)

@@ -53,9 +53,9 @@ class Scenario:
     substeps: int = 4  # Runge–Kutta steps a sample
 
     def __post_init__(self) -> None:
-        for name in ("duration", "noise", "substeps", "delay"):
+        for name in ("duration", "noise", "substeps", "delay", "seed"):
             value = getattr(self, name)
-            low = 0 if name in ("noise", "delay") else 1e-12
+            low = 1e-12 if name in ("duration", "substeps") else 0
             if value is not None and not (math.isfinite(value) and value >= low):
                 raise InputError(
                     f"scenario {self.name}", name, str(value), "a number above 0" if low else "0 or more"
@@ -75,6 +75,8 @@ class Scenario:
         delay: int | None = None,
     ) -> Scenario:
         """Move by `distance` (m), symmetrically about the middle, in `rise` (s, 10-90 %). Figs 12 and 13."""
+        if not (math.isfinite(distance) and distance != 0):
+            raise InputError("stroke", "distance", f"{distance} m", "a distance other than 0 m")
         reference = partial(
             references.stroke,
             start=-distance / 2,

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -75,6 +76,11 @@ class Weights:
             raise InputError(
                 "Weights", "bases", "another length than the weights'", "one base for each weight"
             )
+        with np.errstate(all="ignore"):
+            for weight, base in ((self.q, self.q_base), (self.r, self.r_base), (self.q_i, self.q_i_base)):
+                size = weight / base**2
+                if not (np.isfinite(size) & ((size > 0) | (weight == 0))).all():
+                    raise InputError("Weights", "bases", str(base.tolist()), "bases whose square is a number")
 
     @property
     def Q(self) -> FloatArray:
@@ -116,7 +122,13 @@ class Spec:
         return plant_of(self.parameters)
 
 
-_Bases = Annotated[dict[StrictStr, Quantity] | None, BeforeValidator(lambda v: None if v == "SI" else v)]
+def _table_or_SI(value: Any) -> Any:
+    if isinstance(value, str) and value != "SI":
+        raise ValueError('a table of quantities, or "SI"')
+    return None if value == "SI" else value
+
+
+_Bases = Annotated[dict[StrictStr, Quantity] | None, BeforeValidator(_table_or_SI)]
 
 
 class _WeightsTable(Record):
@@ -168,10 +180,11 @@ def read_design(path: str | Path) -> Spec:
     plant = plant_of(par)
     states, inputs, outputs = plant.design_states, plant.inputs, plant.outputs
     integrals = [Signal(s.name, f"{s.unit} s") for s in outputs]
-    weights, bases, noise = content.weights, content.bases, content.noise
+    q, bases, noise = content.weights, content.bases, content.noise
     for name in content.uncertainty:
         if name not in units_of(par):
             raise InputError(path, f"uncertainty.{name}", "an unknown parameter", ", ".join(units_of(par)))
+    shaping = json.dumps(content.model_dump(exclude={"summary", "machine"}), sort_keys=True)
     Ts = to_si(content.sample_time.value, content.sample_time.unit, "s", path, "sample_time")
     if not Ts > 0:
         raise InputError(path, "sample_time", f"{Ts:g} s", "more than 0 s")
@@ -179,28 +192,32 @@ def read_design(path: str | Path) -> Spec:
         raise InputError(
             path, "delay", f"{content.delay} with backward-euler, which has none", "0, or zoh or sampled-data"
         )
+    try:
+        weights = Weights(
+            q=_numbers(q.state, states, path, "weights.state", "states"),
+            q_base=_bases(bases.state, states, path, "bases.state", "states"),
+            r=_numbers(q.input, inputs, path, "weights.input", "inputs", above=True),
+            r_base=_bases(bases.input, inputs, path, "bases.input", "inputs"),
+            q_i=_numbers(q.integral, outputs, path, "weights.integral", "measured signals"),
+            q_i_base=_bases(bases.integral, integrals, path, "bases.integral", "measured signals"),
+            process_variance=_variances(noise.process, inputs, path, "noise.process", "inputs"),
+            sensor_variance=_variances(noise.sensor, outputs, path, "noise.sensor", "measured signals"),
+        )
+    except InputError as error:  # the record does not know the file
+        raise InputError(path, error.field, error.found, error.expected) from error
     return Spec(
         name=content.name,
         summary=content.summary,
         path=path,
         machine_file=machine_file,
-        sha256=hashlib.sha256(json.dumps(content.model_dump(), sort_keys=True).encode()).hexdigest(),
+        sha256=hashlib.sha256(shaping.encode()).hexdigest(),
         parameters=par,
         operating_point=MappingProxyType(_operating_point(content.operating_point, plant, path)),
         sample_time=Ts,
         discretization=content.discretization,
         delay=content.delay,
         current_loop_delay=content.current_loop_delay,
-        weights=Weights(
-            q=_numbers(weights.state, states, path, "weights.state", "states"),
-            q_base=_bases(bases.state, states, path, "bases.state", "states"),
-            r=_numbers(weights.input, inputs, path, "weights.input", "inputs", above=True),
-            r_base=_bases(bases.input, inputs, path, "bases.input", "inputs"),
-            q_i=_numbers(weights.integral, outputs, path, "weights.integral", "measured signals"),
-            q_i_base=_bases(bases.integral, integrals, path, "bases.integral", "measured signals"),
-            process_variance=_variances(noise.process, inputs, path, "noise.process", "inputs"),
-            sensor_variance=_variances(noise.sensor, outputs, path, "noise.sensor", "measured signals"),
-        ),
+        weights=weights,
         uncertainty=MappingProxyType(dict(content.uncertainty)),
     )
 
@@ -276,7 +293,8 @@ def _variances(
     for q, s in zip(_ordered(entries, signals, where, field, what), signals, strict=True):
         name = f"{field}.{s.name}"
         try:
-            variances.append(_positive(to_si(q.value, q.unit, s.unit, where, name), where, name, s.unit) ** 2)
+            deviation = _positive(to_si(q.value, q.unit, s.unit, where, name), where, name, s.unit)
+            variances.append(_positive(deviation * deviation, where, name, f"({s.unit})^2"))
         except InputError as error:
             if not error.field.endswith(".unit"):
                 raise
@@ -291,8 +309,8 @@ def _variances(
 
 
 def _positive(value: float, where: Path, field: str, unit: str) -> float:
-    if not value > 0:
-        raise InputError(where, field, f"{value:g} {unit}", f"more than 0 {unit}")
+    if not 0 < value < math.inf:
+        raise InputError(where, field, f"{value:g} {unit}", f"a finite number above 0 {unit}")
     return value
 
 
@@ -305,4 +323,6 @@ def _operating_point(entries: Mapping[str, Quantity], plant: Plant, where: Path)
                 where, f"operating_point.{name}", "an unknown state", "one of " + " ".join(units)
             )
         values[name] = to_si(q.value, q.unit, units[name], where, f"operating_point.{name}")
+        if not math.isfinite(values[name]):
+            raise InputError(where, f"operating_point.{name}", str(values[name]), "a finite number")
     return values

@@ -21,10 +21,10 @@ from typing import TYPE_CHECKING, get_args
 import numpy as np
 from scipy import linalg
 
-from malta.controller import Controller, CurrentLoop, Feedforward, Limits
+from malta.controller import Controller, CurrentLoop, Feedforward, Limits, stored_forces
 from malta.errors import CheckError, InputError
 from malta.linearize import LinearModel
-from malta.plant import Actuator, Plant, Signal, trims
+from malta.plant import Actuator, Plant, trims
 from malta.riccati import care, dare, delay_inputs, eigenvalues, sample, sample_cost, sample_noise
 from malta.spec import Discretization, Spec, Weights
 
@@ -120,7 +120,6 @@ def lqg(
         K, Ki = _sampled_regulator(model, weights, Ts, delay, integrated=discretization == "sampled-data")
         L = _sampled_filter(model, weights, Ts, delay, integrated=discretization == "sampled-data")
     plant = model.plant
-    past = tuple(Signal(f"{s.name}[k-{age}]", s.unit) for age in range(delay, 0, -1) for s in plant.inputs)
     axes = len(plant.inputs)
     actuator = plant.actuator
     Kp, Ki_current = pi_current_loop(actuator, actuator.dead_time if current_loop_delay else 0.0)
@@ -130,7 +129,7 @@ def lqg(
         parameters=plant.parameters,
         operating_point=(model.operating_point.x[list(plant.controlled)], model.operating_point.u),
         sample_time=Ts,
-        states=plant.design_states + past,
+        states=plant.design_states + stored_forces(plant.inputs, delay),
         forces=plant.inputs,
         measurements=plant.outputs,
         A=model.A,
@@ -153,16 +152,21 @@ def lqg(
 
 
 def synthesize(spec: Spec, model: LinearModel) -> Controller:
-    """The controller that a design file asks for."""
-    controller = lqg(
-        model,
-        spec.weights,
-        spec.sample_time,
-        spec.discretization,
-        spec.delay,
-        name=spec.name,
-        current_loop_delay=spec.current_loop_delay,
-    )
+    """The controller that a design file asks for. Errors name the file."""
+    try:
+        controller = lqg(
+            model,
+            spec.weights,
+            spec.sample_time,
+            spec.discretization,
+            spec.delay,
+            name=spec.name,
+            current_loop_delay=spec.current_loop_delay,
+        )
+    except InputError as error:
+        raise InputError(spec.path, f"{error.where}: {error.field}", error.found, error.expected) from error
+    except CheckError as error:
+        raise CheckError(f"{spec.path}: {error}") from error
     return replace(controller, spec_sha256=spec.sha256)
 
 

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from malta.controller import Controller, LinearLaw, linear_law
+from malta.data import plant_of
 from malta.errors import CheckError
 from malta.linearize import LinearModel
 from malta.riccati import delay_inputs, eigenvalues, sample
@@ -141,12 +142,15 @@ def loop(model: LinearModel, controller: Controller, *, delay: int = 0, current_
 
     delay : samples between measurement and force
     current_loops : forces follow their commands as a first-order lag at the loops' crossover
+
+    The controller divides forces by the force constants that it believes in, the machine multiplies by its own.
     """
-    A, B, C = model.A, model.B, model.C
+    believed = plant_of(controller.parameters).actuator.force_constant
+    A, B, C = model.A, model.B * (np.array(model.plant.actuator.force_constant) / believed), model.C
     if current_loops:
         m, w_c = B.shape[1], model.plant.actuator.crossover
         A = np.block([[A, B], [np.zeros((m, len(A))), -w_c * np.eye(m)]])
-        B = np.vstack([np.zeros_like(model.B), w_c * np.eye(m)])
+        B = np.vstack([np.zeros_like(B), w_c * np.eye(m)])
     Ad, Bd = delay_inputs(*sample(A, B, controller.sample_time), delay)
     Cd = np.hstack([C, np.zeros((len(C), len(Ad) - C.shape[1]))])
     return Loop(Ad, Bd, Cd, linear_law(controller), controller.sample_time)
@@ -170,6 +174,14 @@ def verify(
     the machine. An unstable loop is reported, not raised; its sensitivities are NaN. `uncertainty` is kept
     for the record.
     """
+    try:
+        with np.errstate(over="ignore", invalid="ignore"):
+            return _verify(model, controller, MappingProxyType(dict(uncertainty or {})))
+    except np.linalg.LinAlgError as error:
+        raise CheckError(f"{controller.name}: the loop cannot be computed ({error})") from error
+
+
+def _verify(model: LinearModel, controller: Controller, uncertainty: Mapping[str, float]) -> Margins:
     late = max(1, controller.delay)
     loops = {
         "sampled": loop(model, controller, delay=controller.delay),
@@ -187,7 +199,7 @@ def verify(
         closed_loop=_continuous(eigenvalues(machine.closed), controller.sample_time),
     )
     bandwidths = _bandwidths(model, controller, machine, stable=stages[-1].stable)
-    return Margins(poles, stages, bandwidths, MappingProxyType(dict(uncertainty or {})))
+    return Margins(poles, stages, bandwidths, uncertainty)
 
 
 def require_stable(margins: Margins, name: str) -> None:
