@@ -27,7 +27,9 @@ notebooks: $(VENV)/dev
 	mkdir -p build
 	for source in notebooks/*.py; do \
 	  name=build/$$(basename $$source .py); \
-	  $(BIN)/jupytext --quiet --to ipynb --execute --run-path . --output $$name.ipynb $$source && \
+	  $(BIN)/jupytext --quiet --to ipynb --output $$name.ipynb $$source && \
+	  $(BIN)/jupyter nbconvert --log-level=WARN --to notebook --execute --inplace \
+	    --ExecutePreprocessor.kernel_name=python3 $$name.ipynb && \
 	  $(BIN)/jupyter nbconvert --log-level=WARN --to html $$name.ipynb || exit 1; \
 	done
 	@ls build/*.html
