@@ -28,9 +28,9 @@ notebooks: $(VENV)/dev
 	for source in notebooks/*.py; do \
 	  name=build/$$(basename $$source .py); \
 	  $(BIN)/jupytext --quiet --to ipynb --output $$name.ipynb $$source && \
-	  $(BIN)/jupyter nbconvert --log-level=WARN --to notebook --execute --inplace \
+	  $(BIN)/jupyter nbconvert --log-level=ERROR --to notebook --execute --inplace \
 	    --ExecutePreprocessor.kernel_name=python3 $$name.ipynb && \
-	  $(BIN)/jupyter nbconvert --log-level=WARN --to html $$name.ipynb || exit 1; \
+	  $(BIN)/jupyter nbconvert --log-level=ERROR --to html $$name.ipynb || exit 1; \
 	done
 	@ls build/*.html
 

@@ -194,10 +194,10 @@ def stroke_figure(run: Trajectory, published: Published | None = None) -> Figure
     error.set_ylabel("axial error z* - z [mm]")
     for i, style in zip((k for k in range(len(names)) if k != axis), (1, 0, 3, 2), strict=False):
         radial.plot(ms, (run.p[:, i] - run.reference[:, i]) * 1e6, label=names[i], **STYLES[style])
-    radial.set_ylabel("radial deviation [um]")
+    radial.set_ylabel("radial deviation [µm]")
     for name, style, i in _widest_currents(run):
         current.plot(ms, run.current[:, i], label=name, **STYLES[style])
-    current.set_ylabel("current a module [A]")
+    current.set_ylabel("current per module [A]")
     if published is not None:
         for axes, key, unit in (
             (error, "figure_12.axial_error", "mm"),
@@ -217,7 +217,8 @@ def stroke_figure(run: Trajectory, published: Published | None = None) -> Figure
             )
             axes.set_ylim(-1.25 * bound, 1.25 * bound)
     for axes in (position, radial, current):
-        axes.legend(frameon=False, fontsize=8, ncols=2 if axes is radial else 1)
+        below_bound = {"loc": "upper left", "bbox_to_anchor": (0, 0.89), "ncols": 2} if axes is radial else {}
+        axes.legend(frameon=False, fontsize=8, **below_bound)
     for axes in (error, current):
         axes.set_xlabel("time [ms]")
     for axes in (position, radial, error, current):
@@ -229,7 +230,7 @@ def stroke_figure(run: Trajectory, published: Published | None = None) -> Figure
     figure.suptitle(
         f"{run.controller.name}: stroke of {(run.reference[-1, axis] - run.reference[0, axis]) * 1e3:.0f} mm, "
         f"rise {f.rise * 1e3:.1f} ms, overshoot {f.overshoot * 100:.1f} %, axial error {f.axial_error * 1e3:.2f} mm, "
-        f"radial {max(f.radial.values()) * 1e6:.1f} um"
+        f"radial {max(f.radial.values()) * 1e6:.1f} µm"
         + ("" if run.verdict.completed else f" ({run.verdict.name})"),
         fontsize=10,
     )
