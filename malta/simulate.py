@@ -181,21 +181,24 @@ def _chain(
 
 def _run(chain: ca.Function, state: FloatArray, given: FloatArray, table: FloatArray) -> FloatArray:
     """Run a block and fill its rows of the table; the state after it. A short last block is padded."""
-    block = chain.size2_in(1)
-    if len(given) < block:
-        given = np.vstack([given, np.repeat(given[-1:], block - len(given), axis=0)])
-    rows = table if len(table) == block else np.empty((block, table.shape[1]))
-    states = np.empty((block, len(state)))
-    buffer, evaluate = chain.buffer()  # numpy's own memory: a tenth of the time of conversion to DM
-    for i, array in enumerate((np.ascontiguousarray(state), np.ascontiguousarray(given))):
-        buffer.set_arg(i, array.data)
-    for i, array in enumerate((states, rows)):
-        buffer.set_res(i, array.data)
-    evaluate()
-    if rows is not table:
-        table[:] = rows[: len(table)]
+    padding = chain.size2_in(1) - len(given)
+    states, rows = _evaluate(chain, state, np.vstack([given, np.repeat(given[-1:], padding, axis=0)]))
+    table[:] = rows[: len(table)]
     last: FloatArray = states[len(table) - 1]
     return last
+
+
+def _evaluate(function: ca.Function, *arguments: FloatArray) -> list[FloatArray]:
+    """Call a dense CasADi function on numpy's own memory, a row for each of its columns: no conversion to DM."""
+    results = [np.empty(function.size_out(i)[::-1]) for i in range(function.n_out())]
+    buffer, evaluate = function.buffer()
+    inputs = [np.ascontiguousarray(array, dtype=float) for array in arguments]
+    for i, array in enumerate(inputs):
+        buffer.set_arg(i, array.data)
+    for i, array in enumerate(results):
+        buffer.set_res(i, array.data)
+    evaluate()
+    return results
 
 
 def _columns(plant: Plant, controller: Controller) -> list[tuple[str, int]]:
@@ -252,37 +255,35 @@ def _step(
     """
     m, p, n = len(plant.inputs), len(plant.outputs), len(c.states)
     x, force, xi_pred, e, frozen, under_way = (
-        ca.MX.sym("s", size) for size in (len(plant.states), m, n, p, p, m * delay)
+        ca.SX.sym("s", size) for size in (len(plant.states), m, n, p, p, m * delay)
     )
     p_ref, xi_ref, v_ff, noise, w = (
-        ca.MX.sym("u", size) for size in (p, n, m, p, len(plant.disturbances) if disturbed else 0)
+        ca.SX.sym("u", size) for size in (p, n, m, p, len(plant.disturbances) if disturbed else 0)
     )
-    sx = ca.SX.sym("x", len(plant.states))
-    sensors = ca.Function("sensors", [sx], [plant.h(sx, 0), plant.contact(sx)])
-    true, contact = sensors(x)
+    v0 = ca.SX.sym("v0", m)
+    true = plant.h(x, force)
     y = _quantized(true + noise, plant.resolution) if quantize else true + noise
-    grid = c.feedforward.z_grid
-    v0_at = ca.interpolant("v0_at", "linear", [grid], c.feedforward.v0.ravel())
-    position = y[[s.name for s in plant.outputs].index(plant.stroke)]
-    v0 = v0_at(ca.fmax(ca.fmin(position, grid[-1]), grid[0]))
     xi_pred_next, e_next, frozen_next, v, xi_hat = law(c)(xi_pred, e, frozen, y, p_ref, xi_ref, v_ff, v0)
     # The gain file's force constants turn forces into currents, the machine's turn currents into forces.
     believed = plant_of(c.parameters).actuator.force_constant
     commanded = v * (np.array(plant.actuator.force_constant) / np.array(believed))
     queue = ca.vertcat(under_way, commanded)
-    motion = _motion(plant, c.sample_time, substeps, disturbed=disturbed)
-    x_next, force_next = motion(x, force, queue[:m], w)
-    return ca.Function(
-        "step",
-        [ca.vertcat(x, force, xi_pred, e, frozen, under_way), ca.vertcat(p_ref, xi_ref, v_ff, noise, w)],
-        [
-            ca.vertcat(x_next, force_next, xi_pred_next, e_next, frozen_next, queue[m:]),
-            ca.vertcat(x, true, y, xi_hat, v, force, frozen_next, contact),
-        ],
-    )
+    x_next, force_next = _motion(plant, c.sample_time, substeps, disturbed=disturbed)(x, force, queue[:m], w)
+    state = ca.vertcat(x, force, xi_pred, e, frozen, under_way)
+    given = ca.vertcat(p_ref, xi_ref, v_ff, noise, w)
+    state_next = ca.vertcat(x_next, force_next, xi_pred_next, e_next, frozen_next, queue[m:])
+    row = ca.vertcat(x, true, y, xi_hat, v, force, frozen_next, plant.contact(x))
+    rest = ca.Function("rest", [state, given, v0], [state_next, row])
+    # v0(z) is a table, which scalar expressions cannot look up: only the look-up is left outside of them.
+    grid = c.feedforward.z_grid
+    position = y[[s.name for s in plant.outputs].index(plant.stroke)]
+    where = ca.Function("where", [state, given], [ca.fmax(ca.fmin(position, grid[-1]), grid[0])])
+    table = ca.interpolant("table", "linear", [grid], c.feedforward.v0.ravel())
+    S, U = ca.MX.sym("state", state.numel()), ca.MX.sym("given", given.numel())
+    return ca.Function("step", [S, U], rest(S, U, table(where(S, U))))
 
 
-def _quantized(y: ca.MX, resolution: tuple[float, ...]) -> ca.MX:
+def _quantized(y: ca.SX, resolution: tuple[float, ...]) -> ca.SX:
     return ca.vertcat(*(r * ca.floor(y[i] / r + 0.5) if r else y[i] for i, r in enumerate(resolution)))
 
 
@@ -290,13 +291,14 @@ def _references(believed: Plant, c: Controller, motion: references.Motion) -> tu
     """xi* = (P(z*)^-1 p*, its derivative, the stored feedforward) and v_ff = mass z*'' on the thrust."""
     p, dp = ca.SX.sym("p", len(c.measurements)), ca.SX.sym("dp", len(c.measurements))
     q = believed.position_of(p)
-    inverse = ca.Function("inverse", [p, dp], [ca.vertcat(q, ca.jtimes(q, p, dp))]).map(len(motion.p))
+    inverse = ca.Function("inverse", [p, dp], [ca.densify(ca.vertcat(q, ca.jtimes(q, p, dp)))])
+    (xi_ref,) = _evaluate(inverse.map(len(motion.p)), motion.p, motion.dp)
     v_ff = np.zeros((len(motion.p), len(c.forces)))
     thrust = [s.name for s in c.forces].index(believed.thrust)
     stroke = [s.name for s in c.measurements].index(believed.stroke)
     v_ff[:, thrust] = c.feedforward.mass * motion.ddp[:, stroke]
     past = [np.vstack([np.repeat(v_ff[:1], age, axis=0), v_ff[:-age]]) for age in range(c.delay, 0, -1)]
-    return np.hstack([np.array(inverse(motion.p.T, motion.dp.T)).T, *past]), v_ff
+    return np.hstack([xi_ref, *past]), v_ff
 
 
 def _surroundings(plant: Plant, scenario: Scenario, t: FloatArray) -> list[FloatArray]:
