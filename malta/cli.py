@@ -70,7 +70,7 @@ def design(
         try:
             results.append(_design(file, out or file.parent / "gains", figures, made, quiet=as_json))
         except (InputError, CheckError) as error:
-            worst = max(worst, _complain(error))
+            worst = max(worst, _complain(error, file))
     if as_json:
         _print_json(results)
     raise typer.Exit(worst)
@@ -95,7 +95,10 @@ def verify(gains: GainFile, change: Changes = None, as_json: AsJson = False) -> 
     names = [s.name for s in plant.design_states]
     point = plant.at(**dict(zip(names, controller.operating_point[0].tolist(), strict=True)))
     model = linearize(plant, point)
-    margins = verified(model, controller)
+    try:
+        margins = verified(model, controller)
+    except CheckError as error:
+        raise CheckError(f"{gains}: {error}") from error
     if as_json:
         _print_json({"gains": str(gains), "design": controller.name} | _margins(margins))
     else:
@@ -225,10 +228,10 @@ def _design(file: Path, out: Path, figures: Path, made: dict[Path, Path], *, qui
     from malta.verify import verify as verified
 
     spec = read_design(file)
-    target = out / f"{spec.name}.json"
-    if target in made:
-        raise InputError(file, "name", repr(spec.name), f"another name than that of {made[target]}")
-    made[target] = file
+    picture = figures / f"{spec.name}_stroke.png"
+    for target in (out / f"{spec.name}.json", picture):
+        if made.setdefault(target, file) != file:
+            raise InputError(file, "name", repr(spec.name), f"another name than that of {made[target]}")
     plant = spec.plant
     model = linearize(plant, plant.at(**spec.operating_point))
     controller = synthesize(spec, model)
@@ -245,13 +248,14 @@ def _design(file: Path, out: Path, figures: Path, made: dict[Path, Path], *, qui
             f"{file}: the stroke ends at {run.verdict.time:.4g} s: {run.verdict.name}; gain files unchanged"
         )
     published = published_of(spec.machine_file)
-    picture = report.stroke(run, figures / f"{spec.name}_stroke.png", published)
+    stroke = stroke_figures(run)
+    page = report.design_page(spec, model, margins, stroke, published)
+    report.stroke(run, picture, published)
     paths = [out / f"{spec.name}{suffix}" for suffix in gain_files.SUFFIXES]
     gain_files.write(controller, margins, *paths)  # last: whatever fails before leaves the old files
-    stroke = stroke_figures(run)
     if not quiet:
         console = _console()
-        console.print(report.design_page(spec, model, margins, stroke, published))
+        console.print(page)
         for path in (*paths, picture):
             console.print(f"wrote {path}", soft_wrap=True)
         console.print()
@@ -342,8 +346,10 @@ def _progress(files: list[Path], what: str, *, quiet: bool) -> Any:
     return track(files, what, console=Console(stderr=True), transient=True)
 
 
-def _complain(error: InputError | CheckError) -> int:
-    print(f"malta: {error}", file=sys.stderr)
+def _complain(error: InputError | CheckError, file: Path | None = None) -> int:
+    """Print one line that names the file; the exit code."""
+    text = str(error)
+    print(f"malta: {text if file is None or str(file) in text else f'{file}: {text}'}", file=sys.stderr)
     return 2 if isinstance(error, InputError) else 1
 
 

@@ -15,7 +15,8 @@ class InputError(ValueError):
         self.where, self.field, self.found, self.expected = str(where), field, found, expected
         subject = f"{where}: {field}" if field else str(where)
         # One line, whatever a key or a library's message holds.
-        super().__init__(" ".join(f"{subject}: found {found}, expected {expected}".split()))
+        line = " ".join(f"{subject}: found {found}, expected {expected}".split())
+        super().__init__("".join(c if c.isprintable() else repr(c)[1:-1] for c in line))
 
 
 class CheckError(ArithmeticError):

@@ -29,16 +29,25 @@ def replace_files(contents: Mapping[Path, bytes]) -> None:
                     raise IsADirectoryError(0, "a folder of that name", str(path))
             except (OSError, ValueError) as error:
                 raise _refused(path, error) from error
+        before = {path: path.read_bytes() if path.exists() else None for _, path in staged}
+        replaced: list[Path] = []
         for temporary, path in staged:
             try:
                 temporary.replace(path)
             except OSError as error:
+                for other in replaced:
+                    old = before[other]
+                    other.unlink() if old is None else other.write_bytes(old)
                 raise _refused(path, error) from error
+            replaced.append(path)
     finally:
         for temporary, _ in staged:
             temporary.unlink(missing_ok=True)
 
 
 def _refused(path: Path, error: OSError | ValueError) -> InputError:
-    reason = f"{error.strerror} ({error.filename})" if isinstance(error, OSError) else str(error)
+    reason = getattr(error, "strerror", None) or str(error)
+    blamed = getattr(error, "filename", None)
+    if blamed and Path(blamed) in path.parents:
+        reason += f" ({blamed})"
     return InputError(path, "", reason, "a place to write the file to")

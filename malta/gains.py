@@ -250,7 +250,7 @@ def read(path: str | Path) -> Controller:
             raise InputError(
                 path,
                 field,
-                f"a pole of the file's own model at |lambda| = {radius:.6f}",
+                f"a pole of the file's own model at |lambda| = {radius:.7g}",
                 "gains that stabilize it",
             )
     return controller
@@ -278,6 +278,8 @@ def _controller(file: GainFile, path: str | Path) -> Controller:
         len(measurements),
         len(file.feedforward.z_grid),
     )
+    if (n - n0) % m:
+        raise InputError(path, "signals.states", f"{n} states", f"{n0} and a multiple of {m} stored forces")
     stored = stored_forces(forces, (n - n0) // m)
     if states[n0:] != stored:
         raise InputError(path, "signals.states", _names(states[n0:]), f"stored forces, as {_names(stored)}")

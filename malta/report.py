@@ -42,7 +42,7 @@ def poles_table(model: LinearModel, published: Published | None) -> Table:
     table.add_row("ours, +-", *(f"{value:.2f}" for value in values))
     at_centre = not np.any(model.operating_point.x)
     if published is not None and at_centre:
-        digits = _entry(published, "table_I.digits")
+        digits = _entry(published, "table_I.digits", int)
         printed = [_entry(published, f"table_I.poles.{name}") for name in names]
         table.add_row("Table I, +-", *(f"{value:.{digits}f}" for value in printed))
     return table
@@ -153,16 +153,18 @@ def _pole_text(poles: ComplexArray) -> str:
 
 def _si(published: Published, key: str, unit: str) -> float:
     """A published quantity in the unit asked for."""
-    value, given = (_entry(published, f"{key}.{part}") for part in ("value", "unit"))
+    value, given = _entry(published, f"{key}.value"), _entry(published, f"{key}.unit", str)
     return to_si(value, given, unit, "data/published", key)
 
 
-def _entry(published: Published, key: str) -> Any:
+def _entry(published: Published, key: str, kind: Any = (int, float)) -> Any:
     entry: Any = published
     for part in key.split("."):
         if not isinstance(entry, Mapping) or part not in entry:
             raise InputError("data/published", key, "nothing", "what the paper prints")
         entry = entry[part]
+    if isinstance(entry, bool) or not isinstance(entry, kind):
+        raise InputError("data/published", key, repr(entry), "a text" if kind is str else "a number")
     return entry
 
 

@@ -31,6 +31,7 @@ class Solution(NamedTuple):
     residual: float
 
 
+@np.errstate(all="ignore")  # what overflows fails its check below
 def care(A: FloatArray, B: FloatArray, Q: FloatArray, R: FloatArray, what: str = "CARE") -> Solution:
     """Solve A'X + XA - X B R^-1 B' X + Q = 0 for the stabilizing X >= 0; K = R^-1 B' X.
 
@@ -71,6 +72,7 @@ def _care(A: FloatArray, B: FloatArray, Q: FloatArray, R: FloatArray, what: str)
     return Solution(X / np.outer(t, t), linalg.solve_triangular(U.T, K1 / t, lower=False), residual)
 
 
+@np.errstate(all="ignore")
 def dare(
     A: FloatArray,
     B: FloatArray,
@@ -255,5 +257,7 @@ def _exponential(M: FloatArray) -> FloatArray:
     with np.errstate(all="ignore"):
         E = linalg.expm(M) if np.abs(M).max() < 1e8 else np.array([np.inf])  # e^710 is past the largest float
     if not np.isfinite(E).all():
-        raise CheckError("the sampled model's numbers overflow: the sample time is too long for this machine")
+        raise CheckError(
+            "the sampled model's numbers overflow: no sample time of this length for so fast a machine"
+        )
     return np.asarray(E)

@@ -29,6 +29,7 @@ from malta.references import Profile, Reference
 if TYPE_CHECKING:
     from malta.plant import FloatArray
 
+LONGEST = 4_000_000  # samples: 200 s at 20 kHz, 2 GB of trajectory
 BLOCK = 250  # samples in one call of the chained function
 RISE = 16.2e-3  # s, 10-90 %: the published stroke, Fig. 12
 
@@ -76,7 +77,7 @@ class Scenario:
     ) -> Scenario:
         """Move by `distance` (m), symmetrically about the middle, in `rise` (s, 10-90 %). Figs 12 and 13."""
         if not (math.isfinite(distance) and distance != 0):
-            raise InputError("stroke", "distance", f"{distance} m", "a distance other than 0 m")
+            raise InputError("stroke", "distance", f"{distance} m", "a finite distance other than 0 m")
         reference = partial(
             references.stroke,
             start=-distance / 2,
@@ -137,6 +138,8 @@ def simulate(plant: Plant, controller: Controller, scenario: Scenario) -> Trajec
         raise InputError("simulate", "controller", f"gains of a {believed.name}", f"gains of a {plant.name}")
     delay = controller.delay if scenario.delay is None else scenario.delay
     samples = max(1, round(scenario.duration / controller.sample_time))
+    if samples > LONGEST:
+        raise InputError(f"scenario {scenario.name}", "duration", f"{samples} samples", f"at most {LONGEST}")
     t = np.arange(samples) * controller.sample_time
     motion = scenario.reference(plant)(t)
     inputs = np.hstack(

@@ -15,6 +15,7 @@ Noise is given for one sample; held over it (forces) or spread over it (intensit
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from dataclasses import replace
 from typing import TYPE_CHECKING, get_args
 
@@ -68,8 +69,10 @@ def continuous_poles(model: LinearModel, weights: Weights) -> dict[str, ComplexA
     p = len(model.C)
     K, Ki = lqi(model, weights)
     integrating = np.block([[model.A - model.B @ K, model.B @ Ki], [-model.C, np.zeros((p, p))]])
-    poles = {
-        "LQR": eigenvalues(model.A - model.B @ lqr(model, weights)),
+    poles = {}
+    with suppress(CheckError):  # weights on the integrals alone stabilize the LQI only
+        poles["LQR"] = eigenvalues(model.A - model.B @ lqr(model, weights))
+    poles |= {
         "LQR with integrals": eigenvalues(integrating),
         "Kalman filter": eigenvalues(model.A - kalman(model, weights) @ model.C),
     }
@@ -82,6 +85,7 @@ def sampled_model(model: LinearModel, Ts: float, delay: int = 0) -> tuple[FloatA
     return Ad, Bd, np.hstack([model.C, np.zeros((len(model.C), len(Ad) - len(model.A)))])
 
 
+@np.errstate(all="ignore")  # what overflows is found at the end
 def lqg(
     model: LinearModel,
     weights: Weights,
@@ -119,6 +123,8 @@ def lqg(
         Ad, Bd, Cd = sampled_model(model, Ts, delay)
         K, Ki = _sampled_regulator(model, weights, Ts, delay, integrated=discretization == "sampled-data")
         L = _sampled_filter(model, weights, Ts, delay, integrated=discretization == "sampled-data")
+    if not all(np.isfinite(M).all() for M in (Ad, Bd, K, Ki, L)):
+        raise CheckError("lqg: the gains overflow")
     plant = model.plant
     axes = len(plant.inputs)
     actuator = plant.actuator

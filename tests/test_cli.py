@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import re
 import shutil
 import subprocess
@@ -25,8 +26,14 @@ HEAVY = ("casadi", "control", "matplotlib", "numpy", "pint", "scipy")
 NAMES = ("table2.json", "table2.mat", "table2.npz")
 
 TS = 'sample_time = { value = 50, unit = "us" }'
+INPUT_BASES = 'input = "SI"'
+PROCESS = 'process = { published = "table_II.process_noise" }'
+STATE = 'state = { published = "table_II.state" }'
+SUMMARY = 'summary = "'
 INTEGRAL = 'integral = { published = "table_II.integral" }'
 R_MAX = "r_max  = { value = 0.6,"
+
+FORCES = ("fx_B1", "fy_B1", "fx_B2", "fy_B2", "f_D")
 
 Run = Callable[..., tuple[int, str, str]]
 
@@ -47,15 +54,22 @@ def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> 
     return runs
 
 
-def project(folder: Path, design: tuple[str, str], machine: tuple[str, str] = ("", "")) -> Path:
-    """A project with the machine's data and design table2, a text replaced in each; the design file."""
+def project(
+    folder: Path, design: tuple[str, str], machine: tuple[str, str] = ("", ""), base: str = "table2"
+) -> Path:
+    """A project with the machine's data and a shipped design, a text replaced in each; the design file."""
     (folder / "design").mkdir()
     shutil.copytree(ROOT / "data", folder / "data")
-    for name, (old, new) in (("design/table2.toml", design), ("data/tubular.toml", machine)):
+    for name, (old, new) in ((f"design/{base}.toml", design), ("data/tubular.toml", machine)):
         text = (ROOT / name).read_text(encoding="utf-8")
         assert old in text
         (folder / name).write_text(text.replace(old, new) if old else text, encoding="utf-8")
-    return folder / "design" / "table2.toml"
+    return folder / "design" / f"{base}.toml"
+
+
+def forces(value: str) -> str:
+    """An inline table of newtons, one for each force."""
+    return "{ " + ", ".join(f'{name} = {{ value = {value}, unit = "N" }}' for name in FORCES) + " }"
 
 
 def old_gains(folder: Path) -> dict[Path, bytes]:
@@ -187,6 +201,25 @@ def test_design_prints_at_most_100_columns(designed: tuple[Path, str]) -> None:
     assert max(map(len, lines)) <= WIDTH
 
 
+def test_design_names_each_file_on_a_line_of_its_own(designed: tuple[Path, str]) -> None:
+    folder, printed = designed
+    wrote = [line.removeprefix("wrote ") for line in printed.splitlines() if line.startswith("wrote ")]
+    assert sorted(wrote) == sorted(str(path) for path in folder.rglob("*") if path.is_file())
+
+
+@pytest.mark.parametrize("summary", ["word " * 60, "w" * 250])
+def test_long_texts_are_wrapped_and_paths_are_not(run: Run, tmp_path: Path, summary: str) -> None:
+    file = project(tmp_path, (SUMMARY, f"{SUMMARY}{summary}"))
+    out = tmp_path / ("o" * WIDTH)
+    code, printed, err = run("design", file, "--out", out, "--figures", out)
+    assert (code, err) == (0, "")
+    lines = printed.splitlines()
+    wrote = [line for line in lines if line.startswith("wrote ")]
+    files = [*(out / f"table2.{form}" for form in ("json", "npz", "mat")), out / "table2_stroke.png"]
+    assert wrote == [f"wrote {path}" for path in files]
+    assert max(len(line) for line in lines if line not in wrote) <= WIDTH
+
+
 def test_design_as_json_holds_finite_numbers(run: Run, tmp_path: Path) -> None:
     code, out, err = run(
         "design", "design/calibrated.toml", "--json", "--out", tmp_path / "g", "--figures", tmp_path / "f"
@@ -214,6 +247,33 @@ def test_design_without_names_takes_the_folder(
     assert "wrote design/gains/table2.json" in out
 
 
+@pytest.mark.parametrize("base", ["table2", "calibrated"])
+@pytest.mark.parametrize(
+    ("design", "code", "found"),
+    [
+        ((TS, 'sample_time = { value = 10, unit = "s" }'), 1, "overflow"),
+        ((PROCESS, f"process = {forces('1e200')}"), 2, "noise.process.fx_B1: found inf"),
+        ((PROCESS, f"process = {forces('1e-200')}"), 2, "noise.process.fx_B1: found 0"),
+        ((INTEGRAL, "integral = { x1 = 0, y1 = 0, x2 = 0, y2 = 0, z = 0 }"), 1, "LQI: "),
+        ((INPUT_BASES, f"input = {forces('1e200')}"), 2, "bases: found [1e+200, "),
+        ((INPUT_BASES, f"input = {forces('1e-200')}"), 2, "bases: found [1e-200, "),
+        ((INPUT_BASES, 'input = "metric"'), 2, "bases.input: found 'metric'"),
+        (("delay = 0 ", 'delay = 0\n"a\\nb" = 3 '), 2, "a b: found an unknown key"),
+    ],
+    ids=["10 s", "loud", "silent", "no integrals", "large bases", "small bases", "metric", "two lines"],
+)
+def test_design_that_cannot_be_computed_names_its_file(
+    run: Run, tmp_path: Path, base: str, design: tuple[str, str], code: int, found: str
+) -> None:
+    file = project(tmp_path, design, base=base)
+    found_code, out, err = run("design", file, "--figures", tmp_path / "figures")
+    assert (found_code, out) == (code, "")
+    sentence = one_sentence(err)
+    assert sentence.startswith(f"{file}: ")
+    assert found in sentence
+    assert not (tmp_path / "design" / "gains").exists()
+
+
 @pytest.mark.parametrize(
     ("design", "machine", "found"),
     [
@@ -234,10 +294,44 @@ def test_failing_design_leaves_old_gains(
     old = old_gains(tmp_path / "gains")
     code, out, err = run("design", file, "--out", tmp_path / "gains", "--figures", tmp_path / "figures")
     assert (code, out) == (1, "")
+    assert one_sentence(err).startswith(f"{file}: ")
     assert found in one_sentence(err)
     assert {path: path.read_bytes() for path in old} == old
     assert sorted(path.name for path in (tmp_path / "gains").iterdir()) == list(NAMES)
     assert not (tmp_path / "figures").exists()
+
+
+def test_figures_that_cannot_be_written_leave_old_gains(run: Run, tmp_path: Path) -> None:
+    old = old_gains(tmp_path / "gains")
+    (tmp_path / "file").write_bytes(b"not a folder")
+    blocked = tmp_path / "file" / "figures"
+    code, out, err = run("design", "design/table2.toml", "--out", tmp_path / "gains", "--figures", blocked)
+    assert (code, out) == (2, "")
+    assert one_sentence(err).startswith(f"{blocked}/table2_stroke.png: found ")
+    assert {path: path.read_bytes() for path in old} == old
+    assert sorted(path.name for path in (tmp_path / "gains").iterdir()) == list(NAMES)
+
+
+def test_gains_are_replaced_by_a_design_that_ends_well_and_by_no_other(run: Run, tmp_path: Path) -> None:
+    """The regulator without integrals, of which the page prints the poles, has no solution here."""
+    names = ("x", "y", "z", "alpha", "beta")
+    zeros = ", ".join(f"{name} = 0" for name in (*names, *(f"{name}_dot" for name in names)))
+    file = project(tmp_path, (STATE, f"state = {{ {zeros} }}"))
+    old = old_gains(tmp_path / "gains")
+    code, _, _ = run("design", file, "--out", tmp_path / "gains", "--figures", tmp_path / "figures")
+    replaced = [path.read_bytes() != content for path, content in old.items()]
+    assert (code, replaced) in ((0, [True] * 3), (1, [False] * 3))
+
+
+def test_two_designs_of_one_name_do_not_overwrite_each_other(run: Run, tmp_path: Path) -> None:
+    first = project(tmp_path, ("", ""))
+    second = first.with_name("second.toml")
+    second.write_text(first.read_text(encoding="utf-8").replace("value = 50,", "value = 40,"))
+    code, out, err = run("design", first, second, "--json", "--figures", tmp_path / "figures")
+    assert code == 2
+    assert one_sentence(err) == f"{second}: name: found 'table2', expected another name than that of {first}"
+    assert [result["design"] for result in json.loads(out)] == ["table2"]
+    assert gains.read(tmp_path / "design" / "gains" / "table2.json").sample_time == 50e-6
 
 
 def test_bad_design_file_does_not_stop_the_others(run: Run, tmp_path: Path) -> None:
@@ -301,6 +395,46 @@ def test_verify_of_an_unstable_machine_fails_after_printing(run: Run) -> None:
     assert all(math.isfinite(number) for number in numbers(result["poles"]))
 
 
+def test_verify_counts_the_force_constants_of_the_machine(run: Run) -> None:
+    code, out, err = run("verify", TABLE2, "--set", "K_B=2.6")
+    assert code == 1
+    assert re.fullmatch(
+        rf"{TABLE2}: the loop \(sampled\) is unstable, \|lambda\| = 1\.0\d+", one_sentence(err)
+    )
+    assert "Peak sensitivity" in out
+    peaks = []
+    for change in ("K_B=5.2", "K_B=5.0"):
+        code, out, _ = run("verify", CALIBRATED, "--json", "--set", change)
+        assert code == 0
+        peaks.append(json.loads(out)["peak_sensitivity"]["sampled"]["x1"])
+    assert peaks[0] != pytest.approx(peaks[1], rel=1e-3)
+
+
+@pytest.mark.parametrize("change", ["m=1e-300", "K_A=1e300", "w_cc=1e300", "K_B=1e300", "l_B=1e200"])
+def test_verify_of_a_machine_beyond_computing_is_one_sentence(run: Run, change: str) -> None:
+    code, out, err = run("verify", TABLE2, "--set", change)
+    assert (code, out) == (1, "")
+    assert re.search("overflow|not finite", one_sentence(err))
+
+
+@pytest.mark.parametrize("arguments", [("verify", ROOT / TABLE2), ("design", "design/table2.toml")])
+def test_published_data_without_a_table_names_it(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: tuple[str | Path, ...]
+) -> None:
+    project(tmp_path, ("", ""))
+    file = tmp_path / "data" / "published" / "tubular.toml"
+    text, count = re.subn(
+        r"(?m)^\[table_I\].*\n(?:[^\n\[]*\n)+?\n", "", file.read_text(encoding="utf-8"), count=1
+    )
+    assert count == 1
+    file.write_text(text, encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    code, _, err = run(*arguments)
+    assert code == 2
+    assert "published: table_I.digits: found nothing, expected " in one_sentence(err)
+    assert not (tmp_path / "design" / "gains").exists()
+
+
 def test_verify_of_a_changed_machine_says_so(run: Run) -> None:
     code, out, _ = run("verify", CALIBRATED, "--set", "m=0.56", "--set", "l_B=45mm")
     assert code == 0
@@ -318,6 +452,18 @@ def test_simulate_prints_the_stroke_beside_the_published_one(run: Run) -> None:
     assert ["rise,", "10-90", "%", "[ms]", "16.18", "16.2"] in rows
     assert out.startswith(f"{TABLE2}: stroke -> completed at 0.1 s\n")
     assert max(map(len, out.splitlines())) <= WIDTH
+
+
+def test_simulate_wraps_long_texts_and_keeps_paths(run: Run, tmp_path: Path) -> None:
+    path = tmp_path / f"{'w' * 120}.json"
+    shutil.copy(ROOT / TABLE2, path)
+    out = tmp_path / ("o" * WIDTH)
+    code, printed, err = run("simulate", path, "--set", "m=0.36", "--out", out)
+    assert (code, err) == (0, "")
+    lines = printed.splitlines()
+    wrote = [line for line in lines if line.startswith("wrote ")]
+    assert wrote == [f"wrote {out}/table2_stroke.{form}" for form in ("npz", "png")]
+    assert max(len(line) for line in lines if line not in wrote) <= WIDTH
 
 
 def test_simulate_as_json_holds_finite_numbers(run: Run) -> None:
@@ -418,11 +564,18 @@ def test_options_of_the_stroke_are_taken(run: Run) -> None:
         ("simulate TABLE2 --set m=0", "--set: m: found 0", "a finite number above 0 in kg"),
         ("simulate TABLE2 --set m=1e999", "--set: m: found inf kg", "a finite number above 0 in kg"),
         ("simulate TABLE2 --profile cubic", "profile: found 'cubic'", "one of logistic, quintic"),
-        ("simulate TABLE2 --rise 0", "rise: found 0.0 s", "a time above 0 s"),
-        ("simulate TABLE2 --rise nan", "rise: found nan s", "a time above 0 s"),
+        ("simulate TABLE2 --rise 0", "rise: found 0.0 s", "a time from 1e-6 to 1e6 s"),
+        ("simulate TABLE2 --rise nan", "rise: found nan s", "a time from 1e-6 to 1e6 s"),
+        ("simulate TABLE2 --rise 1e-300", "rise: found 1.0", "a time from 1e-6 to 1e6 s"),
+        ("simulate TABLE2 --rise 1e300", "rise: found 1e+297 s", "a time from 1e-6 to 1e6 s"),
+        ("simulate TABLE2 --rise -16.2", "rise: found -0.0162 s", "a time from 1e-6 to 1e6 s"),
         ("simulate TABLE2 --distance 40", "start: found -0.02 m", "travel of +-0.015 m"),
-        ("simulate TABLE2 --distance nan", "start: found nan m", "travel of +-0.015 m"),
+        ("simulate TABLE2 --distance nan", "distance: found nan m", "a distance other than 0 m"),
+        ("simulate TABLE2 --distance 0", "distance: found 0.0 m", "a distance other than 0 m"),
         ("simulate TABLE2 --noise inf", "noise: found inf", "0 or more"),
+        ("simulate TABLE2 --noise -1", "noise: found -1.0", "0 or more"),
+        ("simulate TABLE2 --delay -1", "delay: found -1", "0 or more"),
+        ("simulate TABLE2 --seed -1", "seed: found -1", "0 or more"),
         ("simulate TABLE2 --set z_max=1mm", "start: found -0.005 m", "travel of +-0.001 m"),
         ("simulate TABLE2 --out pyproject.toml/x", "pyproject.toml/x/table2_stroke.npz: found", "a place"),
     ],
@@ -467,7 +620,9 @@ def test_design_that_cannot_be_written_leaves_old_gains(run: Run, tmp_path: Path
         "design", "design/table2.toml", "--out", tmp_path / "gains", "--figures", tmp_path / "f"
     )
     assert (code, out) == (2, "")
-    assert one_sentence(err).startswith(f"{blocked}: found a folder of that name, expected a place")
+    assert one_sentence(err).startswith(
+        f"{blocked}: found a folder of that name ({blocked}), expected a place"
+    )
     assert {path: path.read_bytes() for path in old} == old
     assert sorted(path.name for path in (tmp_path / "gains").iterdir()) == list(NAMES)
 
@@ -483,10 +638,9 @@ def test_no_design_files_at_all(run: Run, tmp_path: Path, monkeypatch: pytest.Mo
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
-        ("simulate TABLE2 --noise -1", "'--noise'"),
-        ("simulate TABLE2 --seed -1", "'--seed'"),
+        ("simulate TABLE2 --noise loud", "'--noise'"),
         ("simulate TABLE2 --seed one", "'--seed'"),
-        ("simulate TABLE2 --delay -1", "'--delay'"),
+        ("simulate TABLE2 --delay 1.5", "'--delay'"),
         ("simulate TABLE2 --speed 3", "--speed"),
         ("simulate TABLE2 --set", "--set"),
         ("verify", "GAINS"),
@@ -517,3 +671,15 @@ def test_program_ends_with_the_exit_code(arguments: list[str], code: int, lines:
     assert done.returncode == code
     assert len(done.stderr.splitlines()) == lines
     assert max(map(len, done.stdout.splitlines()), default=0) <= WIDTH
+
+
+def test_terminal_without_greek_letters_shows_the_page(tmp_path: Path) -> None:
+    file = project(tmp_path, (SUMMARY, f"{SUMMARY}weights α and Σ, "))
+    command = [sys.executable, "-W", "error", "-c", "from malta.cli import main; main()", "design", str(file)]
+    environment = os.environ | {"PYTHONIOENCODING": "ascii"}
+    done = subprocess.run(
+        command, cwd=tmp_path, env=environment, capture_output=True, timeout=60, check=False
+    )
+    assert (done.returncode, done.stderr) == (0, b"")
+    assert b"table2: weights ? and ?, the paper's weights" in done.stdout
+    assert (tmp_path / "design" / "gains" / "table2.json").is_file()

@@ -168,7 +168,8 @@ def test_travel_and_resolution_as_published(par: tubular.Parameters, published: 
         (180.0, "deg", "rad", math.pi),
         (100.0, "kHz", "Hz", 1e5),
         (50.0, "us", "s", 5e-5),
-        (75.0, "µs", "s", 7.5e-5),
+        (75.0, "\u00b5s", "s", 7.5e-5),  # the micro sign
+        (75.0, "\u03bcs", "s", 7.5e-5),  # the Greek letter
         (2.8, "mH", "H", 2.8e-3),
         (8.3, "mWb", "Wb", 8.3e-3),
         (88.0, "mF", "F", 0.088),
@@ -179,6 +180,7 @@ def test_travel_and_resolution_as_published(par: tubular.Parameters, published: 
         (7.06, "um^2", "m^2", 7.06e-12),
         (2.0, "inch", "m", 0.0508),
         (1.0, "turn/s", "rad/s", 2 * math.pi),
+        (3000.0, "rpm", "rad/s", 100 * math.pi),
         (-4.0, "mm", "m", -4e-3),
         (0.0, "mm", "m", 0.0),
     ],
@@ -265,10 +267,16 @@ def test_wrong_machine_file_is_refused(
 @pytest.mark.parametrize(
     ("old", "new", "name", "found", "expected"),
     [
-        (M, M.replace("0.360", "-0.360"), "m", -0.36, "a finite number above 0 in kg"),
-        (M, M.replace("0.360", "0"), "m", 0.0, "a finite number above 0 in kg"),
-        (L_S, '{ value = 1e308, unit = "km", ', "l_S", math.inf, "a finite number above 0 in m"),
-        (K_A4, K_A4.replace("8330", "-1"), "K_A", -1.0, "a finite number of at least 0 in N/m"),
+        (M, M.replace("0.360", "-0.360"), "parameters.m", -0.36, "a finite number above 0 in kg"),
+        (M, M.replace("0.360", "0"), "parameters.m", 0.0, "a finite number above 0 in kg"),
+        (L_S, '{ value = 1e308, unit = "km", ', "parameters.l_S", math.inf, "a finite number above 0 in m"),
+        (
+            K_A4,
+            K_A4.replace("8330", "-1"),
+            "presets.table4.K_A",
+            -1.0,
+            "a finite number of at least 0 in N/m",
+        ),
     ],
     ids=["negative", "zero", "infinite in SI", "negative in the other preset"],
 )
@@ -277,7 +285,7 @@ def test_value_that_no_machine_has_is_refused(
 ) -> None:
     path = edited(tmp_path, (old, new))
     error = refusal(lambda: malta.read(path), path)
-    assert error.field.rpartition(".")[2] == name
+    assert error.field == name
     assert float(error.found.split()[0]) == found
     assert error.expected == expected
 
@@ -311,6 +319,9 @@ def test_preset_that_leaves_a_value_open_is_refused(tmp_path: Path) -> None:
         (b"\n# only a comment\n", "nothing"),
         (b"\xff\xfe\x00m", "not UTF-8"),
         (b"\x00", "TOML error"),
+        (b"a = " + b"[" * 5000, "TOML error"),
+        (b"a = " + b"1" * 5000, "TOML error"),
+        (b'machine = "a\\u0000b"', "'a\\x00b'"),
     ],
 )
 def test_empty_or_foreign_file_is_refused(tmp_path: Path, content: bytes, found: str) -> None:
@@ -324,6 +335,18 @@ def test_missing_file_folder_and_path_through_a_file_are_refused(tmp_path: Path)
     assert refusal(lambda: malta.read(missing), missing).found == "no such file"
     assert refusal(lambda: malta.read(tmp_path), tmp_path).found == "Is a directory"
     assert refusal(lambda: malta.read(through), through).found == "Not a directory"
+
+
+def test_name_with_a_null_byte_is_refused(tmp_path: Path) -> None:
+    expected = r"found embedded null byte, expected a readable TOML file$"
+    for read in (malta.read, malta.read_design):
+        with pytest.raises(malta.InputError, match=expected):
+            read("a\0b")
+    design = tmp_path / "design.toml"
+    text = Path("design/table2.toml").read_text(encoding="utf-8")
+    design.write_text(text.replace("../data/tubular.toml", "a\\u0000b"), encoding="utf-8")
+    with pytest.raises(malta.InputError):
+        malta.read_design(design)
 
 
 def test_truncated_file_is_refused_or_complete(tmp_path: Path) -> None:

@@ -69,14 +69,15 @@ def test_folder_in_the_place_of_a_file_leaves_all(tmp_path: Path) -> None:
     old, folder = tmp_path / "old.bin", tmp_path / "folder.bin"
     old.write_bytes(b"old")
     folder.mkdir()
-    with pytest.raises(malta.InputError, match=re.escape(f"{folder}: found a folder of that name, expected")):
+    message = re.escape(f"{folder}: found a folder of that name ({folder}), expected a place")
+    with pytest.raises(malta.InputError, match=message):
         replace_files({old: b"new", folder: b"new"})
     assert old.read_bytes() == b"old"
     assert names(tmp_path) == ["folder.bin", "old.bin"]
 
 
 def test_name_that_is_too_long_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(malta.InputError, match=r"found File name too long, expected a place to write"):
+    with pytest.raises(malta.InputError, match=r"found File name too long \(.*\), expected a place to write"):
         replace_files({tmp_path / "a.bin": b"1", tmp_path / ("b" * 300): b"2"})
     assert names(tmp_path) == []
 
@@ -105,3 +106,26 @@ def test_full_disk_leaves_old_files_and_no_temporary_ones(
         replace_files({old: b"new"})
     assert old.read_bytes() == b"old"
     assert names(tmp_path) == ["old.bin"]
+
+
+@pytest.mark.parametrize("failing", ["a.bin", "b.bin", "c.bin"])
+def test_rename_that_fails_leaves_no_temporary_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failing: str
+) -> None:
+    rename = Path.replace
+
+    def refused(self: Path, target: Path) -> Path:
+        if target.name == failing:
+            raise PermissionError(13, "Permission denied", str(target))
+        return rename(self, target)
+
+    paths = [tmp_path / name for name in ("a.bin", "b.bin", "c.bin")]
+    for path in paths:
+        path.write_bytes(b"old")
+    monkeypatch.setattr(Path, "replace", refused)
+    blocked = tmp_path / failing
+    with pytest.raises(malta.InputError, match=re.escape(f"{blocked}: found Permission denied")) as caught:
+        replace_files(dict.fromkeys(paths, b"new"))
+    assert caught.value.where == str(blocked)
+    assert blocked.read_bytes() == b"old"
+    assert names(tmp_path) == ["a.bin", "b.bin", "c.bin"]

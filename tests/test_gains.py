@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.io import loadmat
+from scipy.io import loadmat, savemat
 
 import malta
 from malta import gains
@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 
 COMMITTED = Path("design/gains")
 SUFFIXES = (".json", ".npz", ".mat")
+FORCES = ("fx_B1", "fy_B1", "fx_B2", "fy_B2", "f_D")
 ROUNDING = 1e-9  # of the largest entry: what another processor may compute differently
 
 LAYOUT: dict[str, set[str]] = {  # the gain file, version 1
@@ -408,22 +409,50 @@ def faults() -> dict[str, tuple[Edit, str, str, str]]:
         "number for a matrix": (put("gains.K", 1.0), "gains.K", "1.0", "list"),
         "text for a name": (put("design.name", 7), "design.name", "7", "string"),
         "state of another name": (
-            put("signals.states", [{"name": "x_1", "unit": "m"}]), "signals.states", "x_1", "x y z alpha beta",
+            put("signals.states", [{"name": "x_1", "unit": "m"}]), "signals.states", "x_1 [m]",
+            "x [m] y [m] z [m] alpha [rad] beta [rad] x_dot [m/s]",
         ),
-        "states turned": (change("signals.states", lambda s: s[::-1]), "signals.states", "beta_dot", "x y z alpha"),
-        "forces turned": (change("signals.forces", lambda s: s[::-1]), "signals.forces", "f_D fy_B2", "fx_B1 fy_B1"),
+        "states turned": (
+            change("signals.states", lambda s: s[::-1]), "signals.states", "beta_dot [rad/s] alpha_dot [rad/s]",
+            "x [m] y [m] z [m] alpha [rad]",
+        ),
+        "forces turned": (
+            change("signals.forces", lambda s: s[::-1]), "signals.forces", "f_D [N] fy_B2 [N]",
+            "fx_B1 [N] fy_B1 [N]",
+        ),
         "measurements turned": (
-            change("signals.measurements", lambda s: s[::-1]), "signals.measurements", "z y2", "x1 y1 x2 y2 z",
+            change("signals.measurements", lambda s: s[::-1]), "signals.measurements", "z [m] y2 [m]",
+            "x1 [m] y1 [m] x2 [m] y2 [m] z [m]",
+        ),
+        "forces in kN": (
+            change("signals.forces", lambda s: [{**row, "unit": "kN"} for row in s]), "signals.forces",
+            "fx_B1 [kN] fy_B1 [kN]", "fx_B1 [N] fy_B1 [N]",
+        ),
+        "signals in columns of numbers": (
+            put("signals.states", {"name": 1, "unit": 2}), "signals.states", "{'name': 1, 'unit': 2}", "list",
+        ),
+        "signals in columns of unequal length": (
+            put("signals.states", {"name": ["x"], "unit": []}), "signals.states", "{'name': ['x']", "list",
         ),
         "one force less": (change("signals.forces", lambda s: s[:4]), "signals.forces", "fx_B1", "f_D"),
         "half a sample of delay": (
             change("signals.states", lambda s: [*s, {"name": "fx_B1[k-1]", "unit": "N"}]),
-            "signals.states", "11 states", "10 and a multiple of 5",
+            "signals.states", "fx_B1[k-1] [N]", "stored forces",
+        ),
+        "states of no kind": (
+            change("signals.states", lambda s: [*s, *({"name": f"u{i}", "unit": "N"} for i in range(5))]),
+            "signals.states", "u0 [N] u1 [N]", "stored forces, as fx_B1[k-1] [N] fy_B1[k-1] [N]",
         ),
         "state without matrices": (
-            change("signals.states", lambda s: [*s, *({"name": f"u{i}", "unit": "N"} for i in range(5))]),
+            change("signals.states", lambda s: [*s, *({"name": f"{f}[k-1]", "unit": "N"} for f in FORCES)]),
             "model.Ad", "shape (10, 10)", "shape (15, 15)",
         ),
+        "model beyond all floats": (
+            change("model.Ad", lambda rows: [[1e308] * len(rows)] * len(rows)), "model", "overflow", "multiplied",
+        ),
+        "negative moving mass": (put("feedforward.mass", -0.36), "feedforward.mass", "-0.36", "greater than 0"),
+        "negative current gain": (put("current_loop.Kp", -8.0), "current_loop.Kp", "-8.0", "greater than 0"),
+        "no current integral": (put("current_loop.Ki", 0.0), "current_loop.Ki", "0.0", "greater than 0"),
         "signal without unit": (
             change("signals.forces", lambda s: [{"name": "fx_B1"}, *s[1:]]), "signals.forces.0.unit", "nothing", "key",
         ),
@@ -453,6 +482,27 @@ def test_wrong_document_is_refused(tmp_path: Path, sound: dict[str, Any], fault:
     assert error.field == field
     assert found in error.found
     assert expected in error.expected
+
+
+@pytest.mark.parametrize(
+    ("edit", "found"),
+    [
+        (lambda rows: [{**rows[0], "name": "fx_B1[k-1]"}, *rows[1:]], "fx_B1[k-1] [N] fy_B1[k-2] [N]"),
+        (lambda rows: [*rows[5:], *rows[:5]], "fx_B1[k-1] [N] fy_B1[k-1] [N]"),
+        (lambda rows: [{**rows[0], "unit": "kN"}, *rows[1:]], "fx_B1[k-2] [kN] fy_B1[k-2] [N]"),
+    ],
+    ids=["name", "newest first", "unit"],
+)
+def test_stored_force_of_another_name_is_refused(
+    tmp_path: Path, delayed: Design, edit: Callable[[list[Any]], list[Any]], found: str
+) -> None:
+    document = gains.document(delayed.controller, delayed.margins)
+    states = document["signals"]["states"]
+    states[10:] = edit(states[10:])
+    error = refusal(json_file(tmp_path, document))
+    assert error.field == "signals.states"
+    assert error.found.startswith(found)
+    assert error.expected.startswith("stored forces, as fx_B1[k-2] [N] fy_B1[k-2] [N]")
 
 
 @pytest.mark.parametrize("name", SHAPES)
@@ -596,6 +646,11 @@ def test_missing_file_and_folder_are_refused(tmp_path: Path, suffix: str) -> Non
     assert refusal(folder).found == "Is a directory"
 
 
+def test_name_with_a_null_byte_is_refused() -> None:
+    with pytest.raises(malta.InputError, match=r"found embedded null byte, expected a readable gain file$"):
+        gains.read("a\0.json")
+
+
 @pytest.mark.parametrize("name", ["gains.txt", "gains", "gains.JSON", "gains.json.gz"])
 def test_unknown_suffix_is_refused(tmp_path: Path, design: Design, name: str) -> None:
     (tmp_path / name).write_bytes((COMMITTED / "table2.json").read_bytes())
@@ -646,9 +701,55 @@ def test_array_of_another_kind_is_refused_in_npz(tmp_path: Path) -> None:
     assert refusal(tmp_path / "gains.npz").field == "gains.K.0.0"
 
 
+def test_mat_of_another_program_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "gains.mat"
+    savemat(path, {"schema": "malta-gains", "version": 1, "gains": {"K": np.eye(5)}})
+    assert "does not hold the sha256" in refusal(path).found
+    path.write_bytes((COMMITTED / "table2.mat").read_bytes())
+    content = {key: value for key, value in loadmat(path).items() if not key.startswith("__")}
+    savemat(path, content, long_field_names=True)  # the same content, saved anew
+    assert "does not hold the sha256" in refusal(path).found
+
+
+def test_damaged_mat_does_not_reach_its_reader(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "gains.mat"
+    content = bytearray((COMMITTED / "table2.mat").read_bytes())
+    assert gains._mat_header(bytes(content[116:])) == content[:116]
+    read: list[object] = []
+    monkeypatch.setattr("scipy.io.loadmat", lambda *arguments, **_: read.append(arguments))
+    for at in (0, 50, 115, 116, 127, 184, len(content) - 1):
+        path.write_bytes(content[:at] + bytes([content[at] ^ 0x80]) + content[at + 1 :])
+        assert "does not hold the sha256" in refusal(path).found
+    assert read == []
+
+
+def test_mat_that_crashes_its_reader_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "gains.mat"
+    content = bytearray((COMMITTED / "table2.mat").read_bytes())
+    content[184] ^= 1 << 7
+    path.write_bytes(content)
+    program = """
+import sys
+import malta
+try:
+    malta.gains.read(sys.argv[1])
+except malta.InputError as error:
+    print(error)
+"""
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", program, str(path)],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.startswith(f"{path}: found a damaged or foreign file (")
+    assert done.stdout.endswith(", expected a complete .mat gain file\n")
+
+
 # --- files that are damaged at random ---
 
-DAMAGED = (".json", ".npz")
 Damage = list[tuple[str, float, int]]
 damage: st.SearchStrategy[Damage] = st.lists(
     st.tuples(
@@ -678,7 +779,7 @@ def damaged(content: bytes, changes: Damage) -> bytes:
     return bytes(data)
 
 
-@pytest.mark.parametrize("suffix", DAMAGED)
+@pytest.mark.parametrize("suffix", SUFFIXES)
 @settings(max_examples=500, deadline=None, derandomize=True)
 @given(changes=damage)
 def test_damaged_file_is_refused_or_the_same_controller(suffix: str, changes: Damage) -> None:

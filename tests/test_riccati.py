@@ -212,3 +212,23 @@ def test_no_stabilizing_solution_is_a_failed_check(solve: type) -> None:
     A, B = np.diag([2.0, 0.5]), np.array([[0.0], [1.0]])
     with pytest.raises(malta.CheckError):
         solve(A, B, np.eye(2), np.eye(1))
+
+
+@pytest.mark.parametrize("Ts", [10.0, 1e300])
+def test_sampling_that_overflows_is_a_failed_check(model: LinearModel, Ts: float) -> None:
+    A, B = model.A, model.B
+    for sampled in (
+        lambda: sample(A, B, Ts),
+        lambda: sample_cost(A, B, np.eye(10), np.eye(5), Ts),
+        lambda: sample_noise(A, np.eye(10), Ts),
+    ):
+        with pytest.raises(malta.CheckError, match="the sample time is too long for this machine"):
+            sampled()
+
+
+@pytest.mark.parametrize("matrix", [np.array([[math.inf]]), np.array([[math.nan]])])
+def test_eigenvalues_beyond_all_floats_are_a_failed_check(
+    matrix: np.ndarray[tuple[int, int], np.dtype[np.float64]],
+) -> None:
+    with pytest.raises(malta.CheckError, match="overflow"):
+        eigenvalues(matrix)

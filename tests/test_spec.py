@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -140,6 +141,16 @@ def test_sha256_takes_published_references_for_their_numbers(tmp_path: Path) -> 
     assert malta.read_design(edited(tmp_path, (INPUT, INPUT_WEIGHTS))).sha256 == sha256
 
 
+def test_sha256_does_not_change_with_words_and_the_spelling_of_paths(tmp_path: Path) -> None:
+    plain = malta.read_design(edited(tmp_path))
+    reworded = malta.read_design(edited(tmp_path, ('summary = "', 'summary = "other words: ')))
+    assert reworded.summary == f"other words: {plain.summary}"
+    assert reworded.sha256 == plain.sha256
+    for spelling in (os.path.relpath(DATA, tmp_path), f"{DATA.parent.as_posix()}/../data/./tubular.toml"):
+        spec = malta.read_design(edited(tmp_path, (f'"{DATA.as_posix()}"', f'"{spelling}"')))
+        assert (spec.sha256, spec.parameters) == (plain.sha256, plain.parameters)
+
+
 @pytest.mark.parametrize(
     ("old", "new"),
     [
@@ -241,13 +252,15 @@ FAULTS = {  # old text, new text; field, found, expected
     "infinite weight": (INPUT, INPUT_WEIGHTS.replace("0.1", "inf"), "weights.input.f_D", "inf", "finite"),
     "text weight": (INPUT, INPUT_WEIGHTS.replace("0.1", '"a"'), "weights.input.f_D", "'a'", "number"),
     "bool weight": (INPUT, INPUT_WEIGHTS.replace("0.1", "true"), "weights.input.f_D", "True", "number"),
-    "zero base": (BASE_X, BASE_X.replace("52.2441", "0"), "bases.state.x", "0 m", "more than 0 m"),
-    "negative base": (BASE_X, BASE_X.replace("52.2441", "-1"), "bases.state.x", "-1e-06 m", "more than 0"),
+    "zero base": (BASE_X, BASE_X.replace("52.2441", "0"), "bases.state.x", "0 m", "a finite number above 0 m"),
+    "negative base": (
+        BASE_X, BASE_X.replace("52.2441", "-1"), "bases.state.x", "-1e-06 m", "a finite number above 0 m",
+    ),
     "unit of a base": (BASE_X, BASE_X.replace("um", "um/s"), "bases.state.x.unit", "'um/s'", "unit of m"),
     "kg of a base": (BASE_X, BASE_X.replace("um", "kg"), "bases.state.x.unit", "'kg'", "unit of m"),
     "NaN base": (BASE_X, BASE_X.replace("52.2441", "nan"), "bases.state.x.value", "nan", "finite"),
     "base left out": (BASE_X, "", "bases.state", "9 entries (y", "10 states (x y z"),
-    "bases of no kind": ('input = "SI"', 'input = "metric"', "bases.input", "'metric'", ""),
+    "bases of no kind": ('input = "SI"', 'input = "metric"', "bases.input", "'metric'", '"SI"'),
     "no bases": ('input = "SI"', "", "bases.input", "nothing", "key"),
     "noise of other signals": (
         SENSOR, 'sensor = { published = "table_II.process_noise" }', "noise.sensor", "(fx_B1",
@@ -259,12 +272,27 @@ FAULTS = {  # old text, new text; field, found, expected
     ),
     "no noise": (
         PROCESS, "process = " + quantities(dict.fromkeys(FORCES, 0.0), "N"),
-        "noise.process.fx_B1", "0 N", "more than 0 N",
+        "noise.process.fx_B1", "0 N", "a finite number above 0 N",
     ),
     "negative variance": (
         PROCESS, "process = " + quantities(dict.fromkeys(FORCES, -1.0), "N^2"),
-        "noise.process.fx_B1", "-1", "more than 0",
+        "noise.process.fx_B1", "-1", "a finite number above 0",
     ),
+    "noise whose square is infinite": (
+        PROCESS, "process = " + quantities(dict.fromkeys(FORCES, 1e200), "N"),
+        "noise.process.fx_B1", "inf (N)^2", "a finite number above 0",
+    ),
+    "noise whose square is 0": (
+        PROCESS, "process = " + quantities(dict.fromkeys(FORCES, 1e-200), "N"),
+        "noise.process.fx_B1", "0 (N)^2", "a finite number above 0",
+    ),
+    "base whose square is infinite": (
+        BASE_X, BASE_X.replace("52.2441", "1e206"), "bases", "[1e+200, 5.22441", "square is a number",
+    ),
+    "base whose square is 0": (
+        BASE_X, BASE_X.replace("52.2441", "1e-194"), "bases", "[1e-200, 5.22441", "square is a number",
+    ),
+    "key of two lines": (DELAY, 'delay = 0\n"a\\nb" = 3 ', "a\nb", "an unknown key", "keys"),
     "discretization": (SAMPLED, '"tustin" ', "discretization", "'tustin'", "'backward-euler', 'zoh'"),
     "delay of -1": (DELAY, "delay = -1 ", "delay", "-1", "greater than or equal to 0"),
     "delay of 11": (DELAY, "delay = 11 ", "delay", "11", "less than or equal to 10"),
