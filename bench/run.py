@@ -23,7 +23,7 @@ from rich.table import Table
 
 import malta
 from malta.plants import tubular
-from malta.simulate import _chain, _references
+from malta.simulate import chain_of, state_references
 
 ROOT = Path(__file__).parents[1]
 IMPORTS = "import numpy, scipy, control, casadi"
@@ -65,7 +65,7 @@ def stroke(runs: int) -> list[tuple[str, float, str, float, str]]:
     scenario = malta.Scenario.stroke()
     t = np.arange(2000) * controller.sample_time
     motion = scenario.reference(plant)(t)
-    xi_ref, v_ff = _references(plant, controller, motion)
+    xi_ref, v_ff = state_references(plant, controller, motion)
     start = malta.simulate(plant, controller, scenario)
     peers = {lean: closed_loop(par, controller, lean=lean) for lean in (False, True)}
     inputs = np.hstack([motion.p, xi_ref, v_ff]).T
@@ -80,7 +80,7 @@ def stroke(runs: int) -> list[tuple[str, float, str, float, str]]:
         assert difference < 1e-9, f"peer and malta differ by {difference} m"
 
     def anew() -> object:
-        _chain.cache_clear()
+        chain_of.cache_clear()
         return malta.simulate(plant, controller, scenario)
 
     ours, built, documented, floats = medians(

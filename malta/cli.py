@@ -31,6 +31,24 @@ app = typer.Typer(
     Exit codes: 0 fine; 1 a check failed (unstable, touched down), old gain files stand; 2 bad input.""",
 )
 
+
+def _version(asked: bool) -> None:
+    if asked:
+        from importlib.metadata import version
+
+        print(f"malta {version('malta')}")
+        raise typer.Exit
+
+
+@app.callback()
+def options(
+    version: Annotated[
+        bool, typer.Option("--version", is_eager=True, callback=_version, help="Show it.")
+    ] = False,
+) -> None:
+    pass
+
+
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON document instead of tables.")]
 Changes = Annotated[
     list[str] | None,
@@ -131,9 +149,7 @@ def simulate(
     profile: Annotated[str, typer.Option(help="Reference: logistic or quintic.")] = "logistic",
     noise: Annotated[float, typer.Option(help="Sensor noise in multiples of the machine's; 0: none.")] = 0.0,
     quantize: Annotated[bool, typer.Option(help="Sensors with the machine's resolution.")] = False,
-    delay: Annotated[
-        int | None, typer.Option(help="Samples of delay. [as many as the design models]")
-    ] = None,
+    delay: Annotated[int | None, typer.Option(help="Samples of delay. [the machine's]")] = None,
     seed: Annotated[int, typer.Option(help="Seed of the noise.")] = 0,
     out: Annotated[
         Path | None, typer.Option(help="Folder for the figure (.png) and the time series (.npz).")
@@ -167,7 +183,7 @@ def simulate(
     )
     run = simulated(plant, controller, asked)
     figures = stroke_figures(run)
-    published = _published(plant.name)
+    published = _published(plant.name) if distance == 10.0 and rise is None else None  # of that stroke
     files: list[Path] = []
     if out is not None:
         from malta import report
@@ -284,7 +300,8 @@ def _changed(parameters: Parameters, changes: list[str] | None) -> Parameters:
             raise InputError("--set", name, "an unknown parameter", "one of " + " ".join(units))
         values[name] = to_si(float(number), unit or units[name], units[name], "--set", name)
     try:
-        return replace(parameters, **values)
+        preset = f"{parameters.preset}, changed" if values else parameters.preset
+        return replace(parameters, **values, preset=preset)
     except InputError as error:
         raise InputError("--set", error.field, error.found, error.expected) from error
 
@@ -347,10 +364,13 @@ def _progress(files: list[Path], what: str, *, quiet: bool) -> Any:
 
 
 def _complain(error: InputError | CheckError, file: Path | None = None) -> int:
-    """Print one line that names the file; the exit code."""
-    text = str(error)
-    print(f"malta: {text if file is None or str(file) in text else f'{file}: {text}'}", file=sys.stderr)
-    return 2 if isinstance(error, InputError) else 1
+    """Print one line, naming the file of a failed check; the exit code."""
+    failed, text = isinstance(error, CheckError), str(error)
+    print(
+        f"malta: {file}: {text}" if failed and file and str(file) not in text else f"malta: {text}",
+        file=sys.stderr,
+    )
+    return 1 if failed else 2
 
 
 if __name__ == "__main__":

@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import casadi as ca
 import numpy as np
 
+from malta.errors import InputError
 from malta.plant import Parameters, Signal, readonly
 
 if TYPE_CHECKING:
@@ -38,6 +39,21 @@ class Feedforward:
     mass: float  # kg
     z_grid: FloatArray  # m, g points
     v0: FloatArray  # N, g x m
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "z_grid", readonly(self.z_grid))
+        object.__setattr__(self, "v0", readonly(self.v0))
+
+    def at(self, z: float) -> FloatArray:
+        """v0(z), N, m forces."""
+        return np.array([np.interp(z, self.z_grid, column) for column in self.v0.T])
+
+    def slope(self, z: float) -> FloatArray:
+        """dv0/dz, N/m, m forces, across the grid interval about z; zero beyond the grid."""
+        if not self.z_grid[0] < z < self.z_grid[-1]:
+            return np.zeros(self.v0.shape[1])
+        k = min(int(np.searchsorted(self.z_grid, z, side="right")), len(self.z_grid) - 1)
+        return np.asarray((self.v0[k] - self.v0[k - 1]) / (self.z_grid[k] - self.z_grid[k - 1]))
 
 
 @dataclass(frozen=True)
@@ -57,10 +73,17 @@ class Limits:
     voltage: FloatArray  # V
     force: FloatArray  # N
 
+    def __post_init__(self) -> None:
+        for name in ("current", "voltage", "force"):
+            object.__setattr__(self, name, readonly(getattr(self, name)))
 
-@dataclass(frozen=True, eq=False)
+
+@dataclass(frozen=True, eq=False, repr=False)
 class Controller:
-    """Gains, models and limits of one controller; n states, m forces, p measurements."""
+    """Gains, models and limits of one controller; n states, m forces, p = m measurements.
+
+    Force i and measurement i are of the same axis: when force i saturates, error integral i waits.
+    """
 
     name: str
     spec_sha256: str
@@ -88,6 +111,17 @@ class Controller:
             value = getattr(self, f.name)
             if isinstance(value, np.ndarray):
                 object.__setattr__(self, f.name, readonly(value))
+        x, u = self.operating_point
+        object.__setattr__(self, "operating_point", (readonly(x), readonly(u)))
+        if len(self.forces) != len(self.measurements):
+            found = f"{len(self.forces)} forces and {len(self.measurements)} measurements"
+            raise InputError("Controller", "forces", found, "as many of one as of the other")
+
+    def __repr__(self) -> str:
+        return (
+            f"Controller({self.name!r}, preset {self.parameters.preset!r}, {len(self.states)} states, "
+            f"{len(self.forces)} forces, {1e-3 / self.sample_time:g} kHz, delay {self.delay})"
+        )
 
     @property
     def delay(self) -> int:

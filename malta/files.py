@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import os
-import tempfile
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 
 from malta.errors import InputError
@@ -20,11 +20,10 @@ def replace_files(contents: Mapping[Path, bytes]) -> None:
         for path, data in contents.items():
             try:
                 path.parent.mkdir(parents=True, exist_ok=True)
-                handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-                staged.append((Path(name), path))
-                with os.fdopen(handle, "wb") as file:
+                temporary = path.with_name(f".{path.name}.{os.getpid()}")
+                staged.append((temporary, path))
+                with temporary.open("xb") as file:
                     file.write(data)
-                Path(name).chmod(0o644)
                 if path.is_dir():
                     raise IsADirectoryError(0, "a folder of that name", str(path))
             except (OSError, ValueError) as error:
@@ -42,7 +41,8 @@ def replace_files(contents: Mapping[Path, bytes]) -> None:
             replaced.append(path)
     finally:
         for temporary, _ in staged:
-            temporary.unlink(missing_ok=True)
+            with suppress(OSError):
+                temporary.unlink(missing_ok=True)
 
 
 def _refused(path: Path, error: OSError | ValueError) -> InputError:

@@ -1,9 +1,29 @@
 """The gain file, version 1: everything that a digital implementation needs, as .json, .npz or .mat.
 
-The JSON is the specification: nested tables, matrices row by row with round-trip precision, no time stamp, so the same
-inputs give the same file. The .npz has the same names joined by dots ("gains.K"), the .mat the same names as
-nested structs; in both a list of signals is two lists, name and unit, and null is an empty array.
-`sha256` is of the content, so a damaged or edited file is refused rather than flown.
+    schema "malta-gains", version 1
+    design           name, spec_sha256
+    plant            name, preset, parameters {name: {value, unit}}
+    operating_point  x [n0], u [m]
+    sample_time      s
+    signals          states [n], forces [m], measurements [p]: {name, unit} each, SI
+    model            A n0 x n0, B n0 x m, C p x n0 (continuous, n0 mechanical states); Ad n x n, Bd n x m, Cd p x n
+    gains            K m x n, Ki m x p, L n x p (filter form)
+    feedforward      mass [kg], z_grid [g] [m], v0 g x m [N]
+    current_loop     Kp [V/A], Ki [V/(A s)], sample_time [s]
+    limits           current [A], voltage [V], force [N]: m each
+    verification     poles {open_loop, regulator, filter, closed_loop} as rows [re, im] in rad/s, bandwidth [rad/s],
+                     peak_sensitivity, robust {uncertainty, lower, upper, witness} or null; null bounds are not proven
+    provenance       versions of malta, python, numpy, scipy, control, casadi
+    sha256           of the rest as compact JSON with sorted keys
+
+n = n0 + m d where the design models a delay of d samples: the mechanical states first, then stored forces. The control
+law is in controller.py. Current loops and voltage limits are for the implementation: the linear loop and the harness
+here take first-order lags in their place.
+
+The JSON is the specification: matrices row by row with round-trip precision, no time stamp, so the same inputs give the
+same file. The .npz has the same names joined by dots ("gains.K"), the .mat the same names as nested structs; in both a
+list of signals is two lists, name and unit, and null is an empty array. The sha256 has a damaged or edited file refused
+rather than flown; a .mat holds one of its bytes in its header too.
 """
 
 from __future__ import annotations
@@ -27,7 +47,7 @@ from malta.data import Finite, Machine, Quantity, Record, machine_module, plant_
 from malta.errors import CheckError, InputError
 from malta.files import replace_files
 from malta.plant import Signal
-from malta.verify import own_poles
+from malta.verify import own_poles, require_stable
 
 if TYPE_CHECKING:
     from malta.plant import ComplexArray, FloatArray, Parameters
@@ -163,7 +183,11 @@ class GainFile(Record):
 
 
 def document(controller: Controller, margins: Margins) -> dict[str, Any]:
-    """The content of the gain file of a controller, as plain tables, lists and numbers."""
+    """The content of the gain file of a controller, as plain tables, lists and numbers.
+
+    Raises CheckError when the loop is not stable: such gains are for no file.
+    """
+    require_stable(margins, controller.name)
     c = controller
     units = units_of(c.parameters)
     tables: dict[str, Any] = {

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from malta.plant import FloatArray
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class LinearModel:
     """xi' = A xi + B v, p = C xi, about `operating_point`. A is n x n, B n x m, C p x n."""
 
@@ -32,6 +32,13 @@ class LinearModel:
     def __post_init__(self) -> None:
         for name in "ABC":
             object.__setattr__(self, name, readonly(getattr(self, name)))
+
+    def __repr__(self) -> str:
+        where = {
+            s.name: v for s, v in zip(self.plant.states, self.operating_point.x.tolist(), strict=True) if v
+        }
+        kind = "trim" if self.operating_point.loaded else "no preload"
+        return f"LinearModel({self.plant.name!r} at {where or 'the centre'}, {kind}, {len(self.A)} states)"
 
     @cached_property
     def sys(self) -> Any:

@@ -60,6 +60,10 @@ class Actuator:
     sample_time: float  # s
     dead_time: float  # s
 
+    def delay(self, Ts: float) -> int:
+        """Whole samples between measurement and force: the dead time less the half sample that a hold takes."""
+        return max(0, round(self.dead_time / Ts - 0.5))
+
     @property
     def force_limit(self) -> FloatArray:
         """Largest force of each input, N."""

@@ -65,8 +65,7 @@ def stroke(
     """The stroke axis from `start` to `end` (m), half-way at `centre` (s), the other outputs held at zero."""
     if profile not in PROFILES:
         raise InputError("stroke", "profile", repr(profile), "one of " + ", ".join(PROFILES))
-    if not 1e-6 <= rise <= 1e6:
-        raise InputError("stroke", "rise", f"{rise} s", "a time from 1e-6 to 1e6 s")
+    check_rise(rise)
     axis = [s.name for s in plant.outputs].index(plant.stroke)
     for name, value in (("start", start), ("end", end)):
         if not abs(value) <= plant.travel:
@@ -82,6 +81,12 @@ def stroke(
         return Motion(*motion)
 
     return at
+
+
+def check_rise(rise: float) -> None:
+    """InputError unless `rise` is a time that a stroke may take."""
+    if not 1e-6 <= rise <= 1e6:
+        raise InputError("stroke", "rise", f"{rise} s", "a time from 1e-6 to 1e6 s")
 
 
 def hold(plant: Plant, **outputs: float) -> Reference:

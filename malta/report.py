@@ -217,7 +217,10 @@ def stroke_figure(run: Trajectory, published: Published | None = None) -> Figure
                 fontsize=8,
                 color="#6a6a6a",
             )
-            axes.set_ylim(-1.25 * bound, 1.25 * bound)
+            reach = max(
+                abs(value) for line in axes.lines for value in np.asarray(line.get_ydata(), dtype=float)
+            )
+            axes.set_ylim(-max(1.25 * bound, 1.1 * reach), max(1.25 * bound, 1.1 * reach))
     for axes in (position, radial, current):
         below_bound = {"loc": "upper left", "bbox_to_anchor": (0, 0.89), "ncols": 2} if axes is radial else {}
         axes.legend(frameon=False, fontsize=8, **below_bound)
@@ -271,6 +274,7 @@ def save(figure: Figure, path: str | Path) -> Path:
     return path
 
 
-def stroke(run: Trajectory, path: str | Path, published: Published | None = None) -> Path:
-    """Draw a stroke and save it."""
-    return save(stroke_figure(run, published), path)
+def stroke(run: Trajectory, path: str | Path | None = None, published: Published | None = None) -> Path:
+    """Draw a stroke and save it, as build/NAME_SCENARIO.png if no path is given."""
+    default = Path("build") / f"{run.controller.name}_{run.scenario.name}.png"
+    return save(stroke_figure(run, published), default if path is None else path)

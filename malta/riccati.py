@@ -228,6 +228,13 @@ def delay_inputs(Ad: FloatArray, Bd: FloatArray, delay: int) -> tuple[FloatArray
     return A, np.vstack([np.zeros((n + stored - m, m)), np.eye(m)])
 
 
+def add_integrals(Ad: FloatArray, Bd: FloatArray, Cd: FloatArray, Ts: float) -> tuple[FloatArray, FloatArray]:
+    """The sampled system with e+ = e - Ts y+ appended, the controller's own sums of the measured errors."""
+    p = len(Cd)
+    A = np.block([[Ad, np.zeros((len(Ad), p))], [-Ts * Cd @ Ad, np.eye(p)]])
+    return A, np.vstack([Bd, -Ts * Cd @ Bd])
+
+
 def sample_cost(
     A: FloatArray, B: FloatArray, Q: FloatArray, R: FloatArray, Ts: float
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -238,19 +245,21 @@ def sample_cost(
     n, m = B.shape
     F = np.zeros((n + m, n + m))
     F[:n, :n], F[:n, n:] = A, B
-    W = linalg.block_diag(Q, R)
-    E = _exponential(np.block([[-F.T, W], [np.zeros_like(F), F]]) * Ts)
-    Wd = E[n + m :, n + m :].T @ E[: n + m, n + m :]
-    Wd = (Wd + Wd.T) / 2
+    Wd = _gramian(F.T, linalg.block_diag(Q, R), Ts)
     return Wd[:n, :n], Wd[:n, n:], Wd[n:, n:]
 
 
 def sample_noise(A: FloatArray, W: FloatArray, Ts: float) -> FloatArray:
     """Covariance that white noise of intensity W leaves in x after one sample (Van Loan)."""
-    n = len(A)
-    E = _exponential(np.block([[-A, W], [np.zeros((n, n)), A.T]]) * Ts)
-    Wd = E[n:, n:].T @ E[:n, n:]
-    return (Wd + Wd.T) / 2
+    return _gramian(A, W, Ts)
+
+
+def _gramian(A: FloatArray, W: FloatArray, Ts: float) -> FloatArray:
+    """Integral of e^(A s) W e^(A' s) over a sample, from one exponential; W counts in its largest entry."""
+    n, size = len(A), np.abs(W).max() or 1.0
+    E = _exponential(np.block([[-A, W / size], [np.zeros((n, n)), A.T]]) * Ts)
+    G = E[n:, n:].T @ E[:n, n:] * size
+    return np.asarray((G + G.T) / 2)
 
 
 def _exponential(M: FloatArray) -> FloatArray:

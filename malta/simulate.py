@@ -50,13 +50,16 @@ class Scenario:
     noise: float = 0.0  # sensor noise in multiples of the plant's
     quantize: bool = False  # sensors resolve what the plant's do
     seed: int = 0
-    delay: int | None = None  # samples between measurement and force; None: as many as the controller models
+    delay: int | None = None  # samples between measurement and force; None: the machine's own
     substeps: int = 4  # Runge–Kutta steps a sample
 
     def __post_init__(self) -> None:
         for name in ("duration", "noise", "substeps", "delay", "seed"):
             value = getattr(self, name)
             low = 1e-12 if name in ("duration", "substeps") else 0
+            whole = name in ("delay", "seed", "substeps")
+            if whole and value is not None and not isinstance(value, int):
+                raise InputError(f"scenario {self.name}", name, repr(value), "a whole number")
             if value is not None and not (math.isfinite(value) and value >= low):
                 raise InputError(
                     f"scenario {self.name}", name, str(value), "a number above 0" if low else "0 or more"
@@ -69,13 +72,18 @@ class Scenario:
         *,
         rise: float = RISE,
         profile: Profile = "logistic",
-        duration: float = 0.1,
+        duration: float | None = None,
         noise: float = 0.0,
         quantize: bool = False,
         seed: int = 0,
         delay: int | None = None,
     ) -> Scenario:
-        """Move by `distance` (m), symmetrically about the middle, in `rise` (s, 10-90 %). Figs 12 and 13."""
+        """Move by `distance` (m), symmetrically about the middle, in `rise` (s, 10-90 %). Figs 12 and 13.
+
+        duration : s; None gives six times the rise, at least 0.1 s, so that the move is whole
+        """
+        references.check_rise(rise)
+        duration = max(0.1, 6 * rise) if duration is None else duration
         if not (math.isfinite(distance) and distance != 0):
             raise InputError("stroke", "distance", f"{distance} m", "a finite distance other than 0 m")
         reference = partial(
@@ -136,16 +144,16 @@ def simulate(plant: Plant, controller: Controller, scenario: Scenario) -> Trajec
     believed = plant_of(controller.parameters)
     if (plant.inputs, plant.outputs) != (believed.inputs, believed.outputs):
         raise InputError("simulate", "controller", f"gains of a {believed.name}", f"gains of a {plant.name}")
-    delay = controller.delay if scenario.delay is None else scenario.delay
+    delay = plant.actuator.delay(controller.sample_time) if scenario.delay is None else scenario.delay
     samples = max(1, round(scenario.duration / controller.sample_time))
     if samples > LONGEST:
         raise InputError(f"scenario {scenario.name}", "duration", f"{samples} samples", f"at most {LONGEST}")
     t = np.arange(samples) * controller.sample_time
     motion = scenario.reference(plant)(t)
     inputs = np.hstack(
-        [motion.p, *_references(believed, controller, motion), *_surroundings(plant, scenario, t)]
+        [motion.p, *state_references(believed, controller, motion), *_surroundings(plant, scenario, t)]
     )
-    chain = _chain(
+    chain = chain_of(
         plant,
         controller,
         delay,
@@ -175,7 +183,7 @@ def simulate(plant: Plant, controller: Controller, scenario: Scenario) -> Trajec
 
 
 @lru_cache(maxsize=8)  # building takes as long as a run; records compare by identity, so no hit is stale
-def _chain(
+def chain_of(
     plant: Plant, c: Controller, delay: int, substeps: int, block: int, *, quantize: bool, disturbed: bool
 ) -> ca.Function:
     """`_step` chained over a block of samples: (state, inputs) -> (states, rows)."""
@@ -267,9 +275,10 @@ def _step(
     true = plant.h(x, force)
     y = _quantized(true + noise, plant.resolution) if quantize else true + noise
     xi_pred_next, e_next, frozen_next, v, xi_hat = law(c)(xi_pred, e, frozen, y, p_ref, xi_ref, v_ff, v0)
-    # The gain file's force constants turn forces into currents, the machine's turn currents into forces.
-    believed = plant_of(c.parameters).actuator.force_constant
-    commanded = v * (np.array(plant.actuator.force_constant) / np.array(believed))
+    # The gain file's force constants turn forces into currents, the machine limits those and makes its own forces.
+    current = v / np.array(plant_of(c.parameters).actuator.force_constant)
+    limit = plant.actuator.current_limit
+    commanded = ca.fmax(ca.fmin(current, limit), -limit) * np.array(plant.actuator.force_constant)
     queue = ca.vertcat(under_way, commanded)
     x_next, force_next = _motion(plant, c.sample_time, substeps, disturbed=disturbed)(x, force, queue[:m], w)
     state = ca.vertcat(x, force, xi_pred, e, frozen, under_way)
@@ -290,7 +299,9 @@ def _quantized(y: ca.SX, resolution: tuple[float, ...]) -> ca.SX:
     return ca.vertcat(*(r * ca.floor(y[i] / r + 0.5) if r else y[i] for i, r in enumerate(resolution)))
 
 
-def _references(believed: Plant, c: Controller, motion: references.Motion) -> tuple[FloatArray, FloatArray]:
+def state_references(
+    believed: Plant, c: Controller, motion: references.Motion
+) -> tuple[FloatArray, FloatArray]:
     """xi* = (P(z*)^-1 p*, its derivative, the stored feedforward) and v_ff = mass z*'' on the thrust."""
     p, dp = ca.SX.sym("p", len(c.measurements)), ca.SX.sym("dp", len(c.measurements))
     q = believed.position_of(p)
@@ -332,7 +343,7 @@ def _start(
     stroke = [s.name for s in plant.outputs].index(plant.stroke)
     position = float(np.array(plant.h(ca.DM(x), 0))[stroke, 0])
     ratio = np.array(plant.actuator.force_constant) / np.array(believed.actuator.force_constant)
-    v0 = ratio * [np.interp(position, c.feedforward.z_grid, column) for column in c.feedforward.v0.T]
+    v0 = ratio * c.feedforward.at(position)
     return np.concatenate([x, v0, xi_pred, np.zeros(2 * p), np.tile(v0, delay)])
 
 

@@ -14,7 +14,6 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
@@ -212,13 +211,13 @@ def read_design(path: str | Path) -> Spec:
         machine_file=machine_file,
         sha256=hashlib.sha256(shaping.encode()).hexdigest(),
         parameters=par,
-        operating_point=MappingProxyType(_operating_point(content.operating_point, plant, path)),
+        operating_point=_operating_point(content.operating_point, plant, path),
         sample_time=Ts,
         discretization=content.discretization,
         delay=content.delay,
         current_loop_delay=content.current_loop_delay,
         weights=weights,
-        uncertainty=MappingProxyType(dict(content.uncertainty)),
+        uncertainty=dict(content.uncertainty),
     )
 
 
@@ -315,12 +314,13 @@ def _positive(value: float, where: Path, field: str, unit: str) -> float:
 
 
 def _operating_point(entries: Mapping[str, Quantity], plant: Plant, where: Path) -> dict[str, float]:
-    units = {s.name: s.unit for s in plant.design_states}
+    """Along the stroke only: elsewhere the attraction leaves no equilibrium that v0(z) could hold."""
+    units = {s.name: s.unit for s in plant.design_states if s.name == plant.stroke}
     values = {}
     for name, q in entries.items():
         if name not in units:
             raise InputError(
-                where, f"operating_point.{name}", "an unknown state", "one of " + " ".join(units)
+                where, f"operating_point.{name}", "another state", f"{plant.stroke}, the stroke, alone"
             )
         values[name] = to_si(q.value, q.unit, units[name], where, f"operating_point.{name}")
         if not math.isfinite(values[name]):

@@ -26,13 +26,22 @@ from malta.controller import Controller, CurrentLoop, Feedforward, Limits, store
 from malta.errors import CheckError, InputError
 from malta.linearize import LinearModel
 from malta.plant import Actuator, Plant, trims
-from malta.riccati import care, dare, delay_inputs, eigenvalues, sample, sample_cost, sample_noise
+from malta.riccati import (
+    add_integrals,
+    care,
+    dare,
+    delay_inputs,
+    eigenvalues,
+    sample,
+    sample_cost,
+    sample_noise,
+)
 from malta.spec import Discretization, Spec, Weights
 
 if TYPE_CHECKING:
     from malta.plant import ComplexArray, FloatArray
 
-V0_STEP = 0.25e-3  # m, grid of v0(z): interpolation errs less than 0.1 % of the cogging amplitude
+V0_STEP = 0.25e-3  # m, grid of v0(z): interpolation errs by 0.14 % of the cogging amplitude
 
 
 def lqr(model: LinearModel, weights: Weights) -> FloatArray:
@@ -44,7 +53,8 @@ def lqr(model: LinearModel, weights: Weights) -> FloatArray:
 def lqi(model: LinearModel, weights: Weights) -> tuple[FloatArray, FloatArray]:
     """Continuous LQR with the integrals of the measured errors: K (m x n) and Ki (m x p).
 
-    v = K (xi* - xi) + Ki e, e' = p* - p. A new state integrates; the sign of Ki follows.
+    v = K (xi* - xi) + Ki e, e' = p* - p. The Riccati gain on e acts as -K_e e, so Ki = -K_e.
+    Raises InputError and CheckError as riccati.care.
     """
     _check_sizes(model, weights)
     n, p = len(model.A), len(model.C)
@@ -108,6 +118,12 @@ def lqg(
     """
     if not (math.isfinite(Ts) and Ts > 0):
         raise InputError("lqg", "Ts", f"{Ts} s", "a sample time above 0 s")
+    if model.operating_point.loaded:
+        raise InputError(
+            "lqg", "model", "a model at its trim", "one at plant.at(...): v0(z) cancels the loads"
+        )
+    if not isinstance(delay, int):
+        raise InputError("lqg", "delay", repr(delay), "a whole number of samples")
     if discretization not in get_args(Discretization):
         raise InputError(
             "lqg", "discretization", repr(discretization), "one of " + ", ".join(get_args(Discretization))
@@ -183,14 +199,16 @@ def calibrate(
     axial_ratio: float = 1.0,
     integral_time: float = 1.0,
 ) -> Weights:
-    """Bases on which the LQR has the stiffness K1 = stiffness_ratio k in every unstable mode.
+    """Bases on which the LQR (without integrals) has the stiffness K1 = stiffness_ratio k in every unstable mode.
 
     Where the modes decouple, q'' = k q + u with input weight 1/g gives K1 = k + sqrt(k^2 + q g / base^2), so the
     base follows. The natural frequency is then w_n = sqrt((stiffness_ratio - 1) k). Modes without stiffness get
     axial_ratio times the w_n of the first mode. A rate's base is w_n times its position's, an error integral's is
     `integral_time` (s) times that of the first position (radial) or of its own (modes without stiffness).
 
-    Raises InputError when stiffness_ratio <= 2 (2 is reached at zero weight), or the modes couple.
+    k, K1 and g are per unit of mass or inertia (1/s2). Integral action makes the exported controller a little stiffer.
+    Raises InputError when stiffness_ratio <= 2 (2 is reached at zero weight), axial_ratio or integral_time <= 0, the
+    first mode has no stiffness, or the modes couple.
     """
     k, G = model.stiffness, model.force_map
     n = len(k)
@@ -199,7 +217,12 @@ def calibrate(
         raise InputError("calibrate", "model", "coupled modes", "decoupled ones: z_ss = 0, zero preload")
     if not stiffness_ratio > 2:
         raise InputError("calibrate", "stiffness_ratio", f"{stiffness_ratio:g}", "more than 2")
+    for name, value in (("axial_ratio", axial_ratio), ("integral_time", integral_time)):
+        if not value > 0:
+            raise InputError("calibrate", name, f"{value:g}", "more than 0")
     stiffness = np.diag(k)
+    if not (stiffness[0] > 0 and (stiffness >= 0).all()):
+        raise InputError("calibrate", "model", f"stiffness {stiffness[0]:g} 1/s2", "an unstable first mode")
     g = np.diag(G * (weights.r_base**2 / weights.r) @ G.T)
     free = stiffness == 0
     w_n = np.sqrt((stiffness_ratio - 1) * np.where(free, stiffness[0] * axial_ratio**2, stiffness))
@@ -255,8 +278,8 @@ def _sampled_regulator(
 ) -> tuple[FloatArray, FloatArray]:
     """K, Ki of the sampled model. With delay, a force acts on the states d samples after it is commanded.
 
-    Its own weight may be charged at either time, which shifts a sum and changes no optimum; half at each keeps
-    the weight of states and stored forces positive semidefinite beside the cross term N.
+    Its own weight R Ts may be charged when it is commanded, which shifts a sum and changes no optimum. What is left
+    beside the oldest stored force, Van Loan's integral with R = 0, is positive semidefinite.
     """
     n, m, p, d = len(model.A), model.B.shape[1], len(model.C), delay
     if integrated:
@@ -266,10 +289,10 @@ def _sampled_regulator(
     Ad, Bd, Cd = sampled_model(model, Ts, d)
     if d:
         rest = m * (d - 1)
-        Q = linalg.block_diag(np.block([[Q, N], [N.T, R / 2]]), np.zeros((rest, rest)))
-        N, R = np.zeros((n + m * d, m)), R / 2
-    A = np.block([[Ad, np.zeros((n + m * d, p))], [-Ts * Cd @ Ad, np.eye(p)]])
-    B = np.vstack([Bd, -Ts * Cd @ Bd])
+        commanded = weights.R * Ts
+        Q = linalg.block_diag(np.block([[Q, N], [N.T, R - commanded]]), np.zeros((rest, rest)))
+        N, R = np.zeros((n + m * d, m)), commanded
+    A, B = add_integrals(Ad, Bd, Cd, Ts)
     gain = dare(
         A, B, linalg.block_diag(Q, weights.Q_i * Ts), R, np.vstack([N, np.zeros((p, m))]), "sampled LQI"
     ).K

@@ -8,7 +8,6 @@ zero-order hold, exactly; F the control law from measurements to forces (v = F y
 from __future__ import annotations
 
 from dataclasses import dataclass
-from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,8 +15,9 @@ import numpy as np
 from malta.controller import Controller, LinearLaw, linear_law
 from malta.data import plant_of
 from malta.errors import CheckError
-from malta.linearize import LinearModel
-from malta.riccati import delay_inputs, eigenvalues, sample
+from malta.linearize import LinearModel, linearize
+from malta.plant import Plant, trim
+from malta.riccati import add_integrals, delay_inputs, eigenvalues, sample
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -81,11 +81,15 @@ class Margins:
             peaks = "  ".join(
                 f"{k} {v:.2f} ({zone(v)})" for k, v in stage.peak_sensitivity.items() if k != "sigma_max"
             )
+            largest = stage.peak_sensitivity["sigma_max"]
             lines.append(
-                f"peak sensitivity, {stage.name}: {peaks}  all {stage.peak_sensitivity['sigma_max']:.2f}"
+                f"peak sensitivity, {stage.name}: {peaks}  sigma_max {largest:.2f} ({20 * np.log10(largest):.1f} dB)"
             )
         for key, value in self.bandwidth.items():
             lines.append(f"bandwidth, {BANDWIDTHS[key]}: {value:.1f} rad/s ({value / (2 * np.pi):.2f} Hz)")
+        if self.uncertainty:
+            box = "  ".join(f"{name} +-{share * 100:g} %" for name, share in self.uncertainty.items())
+            lines.append(f"uncertainty: {box}: no bound proven")
         return "\n".join(lines)
 
 
@@ -137,30 +141,66 @@ class Loop:
         return np.asarray(np.linalg.inv(np.eye(len(self.Cd)) + self.loop_gain(w)))
 
 
-def loop(model: LinearModel, controller: Controller, *, delay: int = 0, current_loops: bool = False) -> Loop:
+def loop(
+    model: LinearModel,
+    controller: Controller,
+    *,
+    delay: int = 0,
+    current_loops: bool = False,
+    feedforward: bool = False,
+) -> Loop:
     """The sampled loop of a machine and a controller.
 
     delay : samples between measurement and force
     current_loops : forces follow their commands as a first-order lag at the loops' crossover
+    feedforward : v0(z) acts by its slope; for models at their trim, where the loads act by theirs
 
     The controller divides forces by the force constants that it believes in, the machine multiplies by its own.
     """
-    believed = plant_of(controller.parameters).actuator.force_constant
-    A, B, C = model.A, model.B * (np.array(model.plant.actuator.force_constant) / believed), model.C
+    A, B, C = model.A, _force_map(model, controller), model.C
     if current_loops:
         m, w_c = B.shape[1], model.plant.actuator.crossover
         A = np.block([[A, B], [np.zeros((m, len(A))), -w_c * np.eye(m)]])
         B = np.vstack([np.zeros_like(B), w_c * np.eye(m)])
     Ad, Bd = delay_inputs(*sample(A, B, controller.sample_time), delay)
     Cd = np.hstack([C, np.zeros((len(C), len(Ad) - C.shape[1]))])
-    return Loop(Ad, Bd, Cd, linear_law(controller), controller.sample_time)
+    law = linear_law(controller)
+    if feedforward:
+        stroke = [s.name for s in controller.measurements].index(model.plant.stroke)
+        slope = np.zeros((len(controller.forces), len(C)))
+        slope[:, stroke] = controller.feedforward.slope(
+            float(model.operating_point.x[_stroke_state(model.plant)])
+        )
+        m = len(controller.forces)
+        law = law._replace(B_y=law.B_y + law.B_r[:, -m:] @ slope, D_y=law.D_y + law.D_r[:, -m:] @ slope)
+    return Loop(Ad, Bd, Cd, law, controller.sample_time)
+
+
+def machine_loop(model: LinearModel, controller: Controller) -> Loop:
+    """The loop as the machine runs it: hold, its own delay, current loops, loads against v0(z) at the trim.
+
+    Raises CheckError when no input holds the machine at the model's operating point.
+    """
+    plant = model.plant
+    position = float(model.operating_point.x[_stroke_state(plant)])
+    loaded = linearize(plant, trim(plant, **{plant.stroke: position}))
+    delay = plant.actuator.delay(controller.sample_time)
+    return loop(loaded, controller, delay=delay, current_loops=True, feedforward=True)
+
+
+def _force_map(model: LinearModel, controller: Controller) -> FloatArray:
+    """B for commanded forces: the machine's force constants over those that the controller believes in."""
+    believed = plant_of(controller.parameters).actuator.force_constant
+    return np.asarray(model.B * (np.array(model.plant.actuator.force_constant) / np.array(believed)))
+
+
+def _stroke_state(plant: Plant) -> int:
+    return [s.name for s in plant.states].index(plant.stroke)
 
 
 def own_poles(c: Controller) -> tuple[ComplexArray, ComplexArray]:
     """Eigenvalues in z of regulator and filter on the controller's own model (separation principle)."""
-    p = len(c.Cd)
-    A = np.block([[c.Ad, np.zeros((len(c.Ad), p))], [-c.sample_time * c.Cd @ c.Ad, np.eye(p)]])
-    B = np.vstack([c.Bd, -c.sample_time * c.Cd @ c.Bd])
+    A, B = add_integrals(c.Ad, c.Bd, c.Cd, c.sample_time)
     regulator = eigenvalues(A - B @ np.hstack([c.K, -c.Ki]))
     return regulator, eigenvalues((np.eye(len(c.Ad)) - c.L @ c.Cd) @ c.Ad)
 
@@ -170,27 +210,26 @@ def verify(
 ) -> Margins:
     """Poles, peak sensitivities and bandwidths of a controller on a machine's linear model.
 
-    Stages: the sampled loop as designed; with the current loops; with at least one sample of delay as well, which is
-    the machine. An unstable loop is reported, not raised; its sensitivities are NaN. `uncertainty` is kept
-    for the record.
+    Stages: the sampled loop as designed; with the current loops; the machine (`machine_loop`). An unstable loop is
+    reported, not raised; its sensitivities are NaN. `uncertainty` is kept for the record.
+    Raises CheckError where numbers overflow or no input holds the machine.
     """
     try:
         with np.errstate(over="ignore", invalid="ignore"):
-            return _verify(model, controller, MappingProxyType(dict(uncertainty or {})))
+            return _verify(model, controller, dict(uncertainty or {}))
     except np.linalg.LinAlgError as error:
         raise CheckError(f"{controller.name}: the loop cannot be computed ({error})") from error
 
 
 def _verify(model: LinearModel, controller: Controller, uncertainty: Mapping[str, float]) -> Margins:
-    late = max(1, controller.delay)
+    machine = machine_loop(model, controller)
     loops = {
         "sampled": loop(model, controller, delay=controller.delay),
         "+ current loops": loop(model, controller, delay=controller.delay, current_loops=True),
-        f"+ delay of {late} sample{'s'[: late > 1]}": loop(model, controller, delay=late, current_loops=True),
+        "machine": machine,
     }
     names = [s.name for s in controller.measurements]
     stages = tuple(_stage(name, stage, names) for name, stage in loops.items())
-    machine = loop(model, controller, delay=late, current_loops=True)
     regulator, observer = own_poles(controller)
     poles = Poles(
         open_loop=_sorted(eigenvalues(model.A)),
@@ -242,7 +281,7 @@ def _bandwidths(
     model: LinearModel, controller: Controller, machine: Loop, *, stable: bool
 ) -> dict[str, float]:
     n = len(model.A) // 2
-    closed = model.force_map @ controller.K[:, :n] - model.stiffness
+    closed = _force_map(model, controller)[n:] @ controller.K[:, :n] - model.stiffness
     w_n = np.sqrt(np.maximum(eigenvalues(closed).real, 0))
     natural = {"w_n_max": float(w_n.max()), "w_n_min": float(w_n.min())}
     if not stable:
@@ -265,10 +304,13 @@ def _singular_values(G: ComplexArray) -> FloatArray:
 
 
 def _crossing(w: FloatArray, size: FloatArray, level: float, *, last: bool) -> float:
-    """Where size falls below level for the first or last time, between grid points on a log-log line."""
+    """Where size falls below level for the first or last time, between grid points on a log-log line.
+
+    Zero where it never reaches the level, the Nyquist frequency where it never falls below.
+    """
     falls = np.flatnonzero((size[:-1] >= level) & (size[1:] < level))
     if not len(falls):
-        return float(w[-1] if size[-1] >= level else w[0])
+        return float(w[-1] if size[-1] >= level else 0.0)
     k = falls[-1 if last else 0]
     (a, b), (wa, wb) = np.log(size[k : k + 2] / level), np.log(w[k : k + 2])
     return float(np.exp(wa + (wb - wa) * a / (a - b)))

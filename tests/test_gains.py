@@ -437,7 +437,7 @@ def faults() -> dict[str, tuple[Edit, str, str, str]]:
         "one force less": (change("signals.forces", lambda s: s[:4]), "signals.forces", "fx_B1", "f_D"),
         "half a sample of delay": (
             change("signals.states", lambda s: [*s, {"name": "fx_B1[k-1]", "unit": "N"}]),
-            "signals.states", "fx_B1[k-1] [N]", "stored forces",
+            "signals.states", "11 states", "10 and a multiple of 5 stored forces",
         ),
         "states of no kind": (
             change("signals.states", lambda s: [*s, *({"name": f"u{i}", "unit": "N"} for i in range(5))]),

@@ -15,7 +15,7 @@ from scipy.integrate import solve_ivp
 import malta
 from malta import references
 from malta.controller import linear_law
-from malta.simulate import Scenario, _references, save, stroke_figures
+from malta.simulate import Scenario, save, state_references, stroke_figures
 from malta.verify import loop
 
 if TYPE_CHECKING:
@@ -89,7 +89,7 @@ def _independent_stroke(plant: Plant, design: Design, samples: int, delay: int) 
     output = ca.Function("output", [x_], [plant.h(x_, u_)])
     t = np.arange(samples) * c.sample_time
     motion = references.stroke(plant, -5e-3, 5e-3, 16.2e-3, 0.05)(t)
-    xi_ref, v_ff = _references(plant, c, motion)
+    xi_ref, v_ff = state_references(plant, c, motion)
     start = plant.at(z=motion.p[0, 4], z_dot=motion.dp[0, 4]).x
 
     def v0_at(z: float) -> FloatArray:
@@ -220,7 +220,7 @@ def test_currents_are_what_the_controller_believes_and_forces_what_the_machine_m
 ) -> None:
     design = designs["calibrated"]
     stronger = malta.plant_of(replace(design.spec.parameters, K_D=5.2 * 1.1))
-    run = malta.simulate(stronger, design.controller, Scenario.stroke(10e-3))
+    run = malta.simulate(stronger, design.controller, Scenario.stroke(10e-3, delay=0))
     assert run.current[:, 4] == pytest.approx(run.v[:, 4] / 10.4)
     lagged = 1 - math.exp(-3000 * 50e-6)
     expected = run.force[:-1, 4] + lagged * (1.1 * run.v[:-1, 4] - run.force[:-1, 4])

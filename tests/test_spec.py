@@ -195,12 +195,12 @@ def test_units_of_bases_and_operating_point_convert(tmp_path: Path) -> None:
     path = edited(
         tmp_path,
         (BASE_X, 'x         = { value = 0.0522441, unit = "mm" }'),
-        (OPERATING_POINT, 'z = { value = -5, unit = "mm" }\nalpha = { value = 180, unit = "mrad" }'),
+        (OPERATING_POINT, 'z = { value = -0.5, unit = "cm" }'),
         (TS_UNIT, 'sample_time = { value = 0.1, unit = "ms" }'),
     )
     spec = malta.read_design(path)
     assert spec.weights.q_base[0] == pytest.approx(52.2441e-6, rel=1e-15)
-    assert dict(spec.operating_point) == {"z": -0.005, "alpha": 0.18}
+    assert dict(spec.operating_point) == {"z": -0.005}
     assert spec.sample_time == 1e-4
 
 
@@ -304,9 +304,9 @@ FAULTS = {  # old text, new text; field, found, expected
     "sample time in m": (TS_UNIT, TS_UNIT.replace("us", "m"), "sample_time.unit", "'m'", "unit of s"),
     "sample time in Hz": (TS_UNIT, TS_UNIT.replace("us", "kHz"), "sample_time.unit", "'kHz'", "unit of s"),
     "sample time without unit": (TS_UNIT, "sample_time = 50e-6", "sample_time", "5e-05", ""),
-    "uncontrolled state": (
-        OPERATING_POINT, 'gamma = { value = 0, unit = "rad" }', "operating_point.gamma", "unknown",
-        "x y z alpha beta",
+    "a state off the stroke": (
+        OPERATING_POINT, 'alpha = { value = 0, unit = "rad" }', "operating_point.alpha", "another state",
+        "z, the stroke, alone",
     ),
     "unit of the operating point": (
         OPERATING_POINT, OPERATING_POINT.replace("mm", "rad"), "operating_point.z.unit", "'rad'",

@@ -11,7 +11,7 @@ import pytest
 
 import malta
 from malta.riccati import eigenvalues
-from malta.verify import BANDWIDTHS, loop, require_stable, zone
+from malta.verify import BANDWIDTHS, loop, machine_loop, require_stable, zone
 
 if TYPE_CHECKING:
     from conftest import Design
@@ -21,11 +21,7 @@ def test_stages_cost_sensitivity(design: Design) -> None:
     """Current loops and delay only make it worse."""
     peaks = [stage.peak_sensitivity["sigma_max"] for stage in design.margins.stages]
     assert peaks == sorted(peaks)
-    assert [stage.name for stage in design.margins.stages] == [
-        "sampled",
-        "+ current loops",
-        "+ delay of 1 sample",
-    ]
+    assert [stage.name for stage in design.margins.stages] == ["sampled", "+ current loops", "machine"]
 
 
 def test_calibrated_stays_in_zone_A(designs: dict[str, Design]) -> None:
@@ -42,7 +38,7 @@ def test_zones_of_iso_14839_3(peak: float, name: str) -> None:
 
 def test_the_peak_is_the_h_infinity_norm(design: Design) -> None:
     """The zoomed grid against a frequency sweep a hundred times as dense."""
-    stage = loop(design.model, design.controller, delay=1, current_loops=True)
+    stage = machine_loop(design.model, design.controller)
     w = np.geomspace(1e-2, np.pi / 50e-6, 24_000)
     S = stage.sensitivity(w)
     dense = np.linalg.svd(S, compute_uv=False)[:, 0].max()
@@ -83,7 +79,7 @@ def test_bandwidths_have_definitions_and_order(design: Design) -> None:
     assert set(found) == set(BANDWIDTHS)
     assert found["sigma_min_T"] < found["sigma_max_T"]
     assert found["w_n_min"] < found["w_n_max"]
-    stage = loop(design.model, design.controller, delay=1, current_loops=True)
+    stage = machine_loop(design.model, design.controller)
     T = np.eye(5) - stage.sensitivity(np.array([found["sigma_max_T"], found["sigma_min_T"]]))
     sizes = np.linalg.svd(T, compute_uv=False)
     assert sizes[0, 0] == pytest.approx(np.sqrt(0.5), rel=2e-3)
