@@ -79,11 +79,11 @@ class Margins:
         lines = [f"{'stable' if self.stable else 'UNSTABLE'} with hold, delay and current loops"]
         for stage in self.stages:
             peaks = "  ".join(
-                f"{k} {v:.2f} ({zone(v)})" for k, v in stage.peak_sensitivity.items() if k != "sigma_max"
+                f"{k} {v:.2f} {zone(v)}" for k, v in stage.peak_sensitivity.items() if k != "sigma_max"
             )
             largest = stage.peak_sensitivity["sigma_max"]
             lines.append(
-                f"peak sensitivity, {stage.name}: {peaks}  sigma_max {largest:.2f} ({20 * np.log10(largest):.1f} dB)"
+                f"peak |S|, {stage.name}: {peaks}  all {largest:.2f} ({20 * np.log10(largest):.1f} dB)"
             )
         for key, value in self.bandwidth.items():
             lines.append(f"bandwidth, {BANDWIDTHS[key]}: {value:.1f} rad/s ({value / (2 * np.pi):.2f} Hz)")
