@@ -62,7 +62,7 @@ def stroke(runs: int) -> list[tuple[str, float, str, float, str]]:
     par = controller.parameters
     assert isinstance(par, tubular.Parameters)
     plant = tubular.plant(par)
-    scenario = malta.Scenario.stroke()
+    scenario = malta.Scenario.stroke(delay=0)  # as the peer
     t = np.arange(2000) * controller.sample_time
     motion = scenario.reference(plant)(t)
     xi_ref, v_ff = state_references(plant, controller, motion)

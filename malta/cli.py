@@ -98,7 +98,8 @@ def design(
 def verify(gains: GainFile, change: Changes = None, as_json: AsJson = False) -> None:
     """Verify a gain file on the machine: poles, bandwidths, peak sensitivities stage by stage.
 
-    The machine is the one in the file, with the changes given by --set.
+    The machine is the one in the file, with the changes given by --set (m, K_A, K_B, l_B, F_c, T_d, ... as far as
+    they shape the linear loop; windings and DC link do not).
 
     Example:  malta verify design/gains/calibrated.json --set m=0.56
     """
@@ -226,6 +227,8 @@ def main() -> None:
         sys.exit(_complain(error))
     except ArithmeticError as error:
         sys.exit(_complain(CheckError(f"numbers beyond what can be computed ({error})")))
+    finally:
+        gc.freeze()  # the process ends: no last walk through what the system takes back at once
 
 
 def _design(file: Path, out: Path, figures: Path, made: dict[Path, Path], *, quiet: bool) -> dict[str, Any]:
@@ -311,7 +314,11 @@ def _published(machine: str) -> dict[str, Any] | None:
     from malta.data import published
 
     file = Path("data") / f"{machine}.toml"
-    return published(file) if (file.parent / "published" / file.name).exists() else None
+    printed = file.parent / "published" / file.name
+    if printed.exists():
+        return published(file)
+    print(f"malta: no {printed} here: published figures are left out", file=sys.stderr)
+    return None
 
 
 def _margins(margins: Margins) -> dict[str, Any]:

@@ -10,6 +10,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -682,3 +683,18 @@ def test_terminal_without_greek_letters_shows_the_page(tmp_path: Path) -> None:
     assert (done.returncode, done.stderr) == (0, b"")
     assert b"table2: weights ? and ?, the paper's weights" in done.stdout
     assert (tmp_path / "design" / "gains" / "table2.json").is_file()
+
+
+def test_version(run: Run) -> None:
+    assert run("--version") == (0, f"malta {version('malta')}\n", "")
+
+
+def test_away_from_the_data_the_published_column_is_empty_and_said_so(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gains = Path("design/gains/calibrated.json").resolve()
+    monkeypatch.chdir(tmp_path)
+    code, out, err = run("simulate", gains)
+    assert code == 0
+    assert "<=" not in out
+    assert "no data/published/tubular.toml here: published figures are left out" in err
