@@ -87,3 +87,18 @@ def test_unknown_kinds_of_figures_are_refused(design: Design, tmp_path: Path) ->
     with pytest.raises(malta.InputError, match=r"suffix '\.gif', expected one of \.png, \.svg"):
         report.stroke(run, tmp_path / "a.gif")
     assert not list(tmp_path.iterdir())
+
+
+def test_a_stroke_is_drawn_whole_and_saved_by_default_in_build(
+    designs: dict[str, Design], published: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With a payload the error leaves the published bounds; the axes grow with it."""
+    design = designs["calibrated"]
+    heavy = malta.plant_of(replace(design.spec.parameters, m=0.56))
+    run = malta.simulate(heavy, design.controller, Scenario.stroke())
+    figure = report.stroke_figure(run, published)
+    assert figure.axes[2].get_ylim()[1] > 1.8
+    assert figure.axes[1].get_ylim()[1] > 145
+    monkeypatch.chdir(tmp_path)
+    assert str(malta.report.stroke(run)) == "build/calibrated_stroke.png"
+    assert [p.name for p in (tmp_path / "build").iterdir()] == ["calibrated_stroke.png"]

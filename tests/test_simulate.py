@@ -314,3 +314,25 @@ def test_the_saved_series_read_back(designs: dict[str, Design], tmp_path: Path) 
         assert np.array_equal(archive["p"], run.p)
         assert archive["p_columns"].tolist() == ["x1 [m]", "y1 [m]", "x2 [m]", "y2 [m]", "z [m]"]
         assert archive["verdict"].tolist() == ["completed"]
+
+
+def test_the_machine_limits_its_own_currents(designs: dict[str, Design]) -> None:
+    design = designs["calibrated"]
+    weak = malta.plant_of(replace(design.spec.parameters, I_max=2.0))
+    run = malta.simulate(weak, design.controller, Scenario.stroke(10e-3))
+    assert np.abs(run.v[:, 4]).max() > 2 * 10.4
+    assert np.abs(run.force[:, 4]).max() <= 2 * 10.4
+
+
+def test_a_slow_stroke_is_given_its_time(designs: dict[str, Design]) -> None:
+    design = designs["calibrated"]
+    run = malta.simulate(design.plant, design.controller, Scenario.stroke(10e-3, rise=0.05))
+    assert run.t[-1] == pytest.approx(0.3, abs=1e-4)
+    assert run.reference[[0, -1], 4] == pytest.approx([-5e-3, 5e-3], abs=1e-7)
+    assert stroke_figures(run).rise == pytest.approx(0.05, rel=0.02)
+
+
+def test_a_run_beyond_all_memory_is_refused(designs: dict[str, Design]) -> None:
+    design = designs["calibrated"]
+    with pytest.raises(malta.InputError, match="duration: found 20000000 samples, expected at most 4000000"):
+        malta.simulate(design.plant, design.controller, replace(Scenario.stroke(10e-3), duration=1000.0))

@@ -10,6 +10,7 @@ import pytest
 
 import malta
 from malta.synthesize import pi_current_loop, sampled_model, static_feedforward
+from malta.verify import own_poles
 
 if TYPE_CHECKING:
     from conftest import Design
@@ -146,3 +147,57 @@ def test_any_operating_point_can_be_designed_for(plant: Plant, designs: dict[str
         assert margins.stable
         assert margins.peak_sensitivity["sigma_max"] < 3
         assert controller.operating_point[0][2] == z
+
+
+def test_bases_of_a_tenth_of_a_micrometre_are_no_overflow(designs: dict[str, Design]) -> None:
+    """Weights of 1e14 beside a sample of 50 us: integrated in units of their largest."""
+    design = designs["calibrated"]
+    fine = replace(design.spec.weights, q_base=design.spec.weights.q_base / 500)
+    sharp = malta.lqg(design.model, fine, 50e-6)
+    near = malta.lqg(design.model, fine, 50e-6, "zoh")
+    assert np.abs(sharp.K).max() > 10 * np.abs(design.controller.K).max()
+    assert np.abs(sharp.K - near.K).max() < 0.35 * np.abs(near.K).max()
+
+
+@pytest.mark.parametrize(("Ts", "scale"), [(4e-3, 1.0), (5e-4, 0.1)])
+def test_delay_can_be_designed_for_at_any_sample_time(
+    designs: dict[str, Design], Ts: float, scale: float
+) -> None:
+    """What Van Loan's integral leaves beside the stored force stays positive semidefinite."""
+    design = designs["calibrated"]
+    weights = replace(design.spec.weights, q_base=design.spec.weights.q_base * scale)
+    regulator, observer = own_poles(malta.lqg(design.model, weights, Ts, "sampled-data", 1))
+    assert np.abs(regulator).max() < 1
+    assert np.abs(observer).max() < 1
+
+
+def test_a_model_with_its_loads_is_not_designed_on(plant: Plant, designs: dict[str, Design]) -> None:
+    """v0(z) cancels them already."""
+    loaded = malta.linearize(plant, malta.trim(plant, z=0.0))
+    with pytest.raises(malta.InputError, match="model: found a model at its trim"):
+        malta.lqg(loaded, designs["calibrated"].spec.weights, 50e-6)
+
+
+def test_calibrate_needs_an_unstable_first_mode(plant: Plant, designs: dict[str, Design]) -> None:
+    free = malta.plant_of(replace(plant.parameters, K_A=0.0))
+    with pytest.raises(malta.InputError, match="an unstable first mode"):
+        malta.calibrate(malta.linearize(free, free.at()), designs["table2"].spec.weights, 4.0)
+    with pytest.raises(malta.InputError, match="axial_ratio: found -1, expected more than 0"):
+        malta.calibrate(designs["table2"].model, designs["table2"].spec.weights, 4.0, -1.0)
+
+
+def test_arrays_of_a_controller_are_read_only(designs: dict[str, Design]) -> None:
+    c = designs["calibrated"].controller
+    for array in (c.K, c.limits.force, c.feedforward.v0, c.feedforward.z_grid, c.operating_point[0]):
+        with pytest.raises(ValueError, match="read-only"):
+            array[...] = 0
+    assert repr(c) == "Controller('calibrated', preset 'table1', 10 states, 5 forces, 20 kHz, delay 0)"
+
+
+def test_feedforward_between_and_beyond_its_points(designs: dict[str, Design]) -> None:
+    ff = designs["calibrated"].controller.feedforward
+    assert ff.at(0.0) == pytest.approx(ff.v0[60])
+    assert ff.at(1.0) == pytest.approx(ff.v0[-1])
+    step = 0.1e-3
+    assert ff.slope(0.1e-3) == pytest.approx((ff.at(0.2e-3) - ff.at(0.2e-3 - step)) / step)
+    assert not ff.slope(16e-3).any()

@@ -14,6 +14,8 @@ from malta.riccati import eigenvalues
 from malta.verify import BANDWIDTHS, loop, machine_loop, require_stable, zone
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from conftest import Design
 
 
@@ -134,3 +136,44 @@ def test_poles_are_sorted_and_read_only(design: Design) -> None:
         assert (np.diff(values.real) >= -1e-6).all()
         with pytest.raises(ValueError, match="read-only"):
             values[0] = 0
+
+
+def test_the_machine_has_its_own_delay(designs: dict[str, Design]) -> None:
+    """T_d counts the hold's half sample: 75 us at 20 kHz is one whole sample more; a slower machine has more."""
+    design = designs["calibrated"]
+    assert design.plant.actuator.delay(50e-6) == 1
+    assert [design.plant.actuator.delay(Ts) for Ts in (75e-6, 150e-6, 25e-6)] == [0, 0, 2]
+    slow = malta.plant_of(replace(design.spec.parameters, T_d=475e-6))
+    margins = malta.verify(malta.linearize(slow, slow.at()), design.controller)
+    assert margins.peak_sensitivity["sigma_max"] > 1.5 * design.margins.peak_sensitivity["sigma_max"]
+    run = malta.simulate(slow, design.controller, malta.Scenario.stroke())
+    late = malta.simulate(design.plant, design.controller, malta.Scenario.stroke(delay=9))
+    assert run.p == pytest.approx(late.p, abs=1e-12)
+
+
+def test_cogging_that_v0_does_not_cancel_shows(designs: dict[str, Design]) -> None:
+    """Ten times the assumed cogging: more slope than table2's axial loop can hold, little to the calibrated one."""
+    stable = {}
+    for name, design in designs.items():
+        rough = malta.plant_of(replace(design.spec.parameters, F_c=5.0))
+        stable[name] = malta.verify(malta.linearize(rough, rough.at()), design.controller).stable
+    assert stable == {"table2": False, "calibrated": True}
+
+
+def test_force_constants_shape_the_natural_frequency(designs: dict[str, Design]) -> None:
+    design = designs["calibrated"]
+    stronger = malta.plant_of(replace(design.spec.parameters, K_B=8.0))
+    model = malta.linearize(stronger, stronger.at())
+    closed = (model.force_map * np.array([8 / 5.2] * 4 + [1])) @ design.controller.K[:, :5] - model.stiffness
+    expected = np.sqrt(np.linalg.eigvals(closed).real.max())
+    assert malta.verify(model, design.controller).bandwidth["w_n_max"] == pytest.approx(expected, rel=1e-9)
+
+
+def test_an_unstable_design_is_for_no_file(designs: dict[str, Design], tmp_path: Path) -> None:
+    design = designs["table2"]
+    stiff = malta.plant_of(replace(design.spec.parameters, K_A=3 * 8626.7))
+    margins = malta.verify(malta.linearize(stiff, stiff.at()), design.controller)
+    for suffix in malta.gains.SUFFIXES:
+        with pytest.raises(malta.CheckError, match="unstable"):
+            malta.gains.write(design.controller, margins, tmp_path / f"a{suffix}")
+    assert not list(tmp_path.iterdir())
