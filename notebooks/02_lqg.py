@@ -88,7 +88,7 @@ left.annotate("zone A ends", (1.2, 3.15), fontsize=8, color="0.4")
 right.axvline(published["position_controller"]["bandwidth"]["value"], color="0.7", linewidth=0.8)
 right.annotate("published bandwidth", (420, 0.0025), rotation=90, fontsize=8, color="0.4")
 left.set(xlabel="frequency [rad/s]", ylabel="sigma_max(S) [1]", ylim=(1e-2, 60))
-right.set(xlabel="frequency [rad/s]", ylabel="sigma_max(T) [1]", ylim=(1e-3, 20))
+right.set(xlabel="frequency [rad/s]", ylabel="sigma_max(T) [1]", ylim=(1e-3, 60))
 for axes in (left, right):
     axes.grid(color="0.9", which="major")
     axes.legend(frameon=False)
