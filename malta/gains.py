@@ -28,12 +28,7 @@ rather than flown; a .mat holds one of its bytes in its header too.
 
 from __future__ import annotations
 
-import hashlib
-import io
-import json
 import platform
-import re
-import zipfile
 from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
@@ -44,6 +39,8 @@ from pydantic import BeforeValidator, Field, StrictInt, StrictStr
 
 from malta.controller import Controller, CurrentLoop, Feedforward, Limits, stored_forces
 from malta.data import Finite, Machine, Quantity, Record, machine_module, plant_of, units_of, validated
+from malta.encodings import SUFFIXES as SUFFIXES
+from malta.encodings import content_sha256, decode, encode
 from malta.errors import CheckError, InputError
 from malta.files import replace_files
 from malta.plant import Signal
@@ -54,7 +51,6 @@ if TYPE_CHECKING:
     from malta.verify import Margins
 
 SCHEMA, VERSION = "malta-gains", 1
-SUFFIXES = (".json", ".npz", ".mat")
 
 Vector = list[Finite]
 Matrix = list[list[Finite]]
@@ -230,7 +226,7 @@ def document(controller: Controller, margins: Margins) -> dict[str, Any]:
         | {name: version(name) for name in ("numpy", "scipy", "control", "casadi")},
     }
     plain: dict[str, Any] = _plain(tables)
-    plain["sha256"] = _content_sha256(plain)
+    plain["sha256"] = content_sha256(plain)
     return plain
 
 
@@ -242,7 +238,7 @@ def write(controller: Controller, margins: Margins, *paths: str | Path) -> None:
     Raises InputError for an unknown suffix or a folder that cannot be written to.
     """
     content = document(controller, margins)
-    replace_files({Path(path): _encode(content, Path(path)) for path in paths})
+    replace_files({Path(path): encode(content, Path(path)) for path in paths})
 
 
 def read(path: str | Path) -> Controller:
@@ -252,13 +248,13 @@ def read(path: str | Path) -> Controller:
     wrong shape, NaN or infinity, a non-positive sample time, content that does not match its sha256, gains that do not
     stabilize the file's own model.
     """
-    content = _decode(path)
+    content = decode(Path(path))
     for key, wanted in (("schema", SCHEMA), ("version", VERSION)):
         if content.get(key) != wanted:
             raise InputError(path, key, repr(content.get(key)), repr(wanted))
     file = validated(GainFile, content, path)
     plain = file.model_dump(by_alias=True)
-    if _content_sha256(plain) != file.sha256:
+    if content_sha256(plain) != file.sha256:
         raise InputError(
             path, "sha256", "content that was changed or damaged", "the content that was written"
         )
@@ -387,158 +383,3 @@ def _plain(value: Any) -> Any:
     if isinstance(value, list):
         return [_plain(entry) for entry in value]
     return value + 0.0 if isinstance(value, float) else value
-
-
-def _content_sha256(content: Mapping[str, Any]) -> str:
-    rest = {key: value for key, value in content.items() if key != "sha256"}
-    return hashlib.sha256(json.dumps(rest, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
-
-
-# --- the three forms ---
-
-
-def _encode(content: Mapping[str, Any], path: Path) -> bytes:
-    if path.suffix == ".json":
-        text = json.dumps(content, indent=1, allow_nan=False)
-        return _INNERMOST.sub(_joined, text).encode() + b"\n"
-    if path.suffix == ".npz":
-        archived = io.BytesIO()
-        with zipfile.ZipFile(archived, "w") as archive:  # stored: compressors differ in their bytes
-            for name, value in _flat(_columns(content)).items():
-                entry = io.BytesIO()
-                array = np.zeros(0) if value is None else np.array(value)
-                np.lib.format.write_array(entry, array, allow_pickle=False)
-                archive.writestr(
-                    zipfile.ZipInfo(f"{name}.npy"), entry.getvalue()
-                )  # dated 1980: no time stamp
-        return archived.getvalue()
-    if path.suffix == ".mat":
-        from scipy.io import savemat
-
-        buffer: Any = io.BytesIO()  # any: scipy's stubs know only file names
-        savemat(buffer, _cells(_columns(content)), long_field_names=True, oned_as="row")
-        body = bytes(buffer.getvalue())[MAT_HEADER:]
-        return _mat_header(body) + body
-    raise InputError(path, "", f"suffix {path.suffix!r}", "one of " + ", ".join(SUFFIXES))
-
-
-_INNERMOST = re.compile(r"([\[{])\s*([^][{}]*?)\s*([\]}])")
-
-
-def _joined(innermost: re.Match[str]) -> str:
-    """A matrix row or a small table on one line."""
-    line = f"{innermost[1]}{' '.join(innermost[2].split())}{innermost[3]}"
-    return line if innermost[1] == "[" or len(line) <= 80 else innermost[0]
-
-
-def _decode(path: str | Path) -> dict[str, Any]:
-    path = Path(path)
-    if path.suffix not in SUFFIXES:
-        raise InputError(path, "", f"suffix {path.suffix!r}", "one of " + ", ".join(SUFFIXES))
-    try:
-        data = path.read_bytes()
-    except FileNotFoundError as error:
-        raise InputError(path, "", "no such file", "a gain file") from error
-    except (OSError, ValueError) as error:  # ValueError: a null byte in the name
-        raise InputError(
-            path, "", getattr(error, "strerror", None) or str(error), "a readable gain file"
-        ) from error
-    try:
-        content = {".json": _from_json, ".npz": _from_npz, ".mat": _from_mat}[path.suffix](data)
-    except Exception as error:  # a damaged archive makes its reader raise nearly anything
-        found = f"a damaged or foreign file ({str(error)[:120]})"
-        raise InputError(path, "", found, f"a complete {path.suffix} gain file") from error
-    if not isinstance(content, dict):
-        raise InputError(path, "", f"a {type(content).__name__}", "the tables of a gain file")
-    return content
-
-
-def _from_json(data: bytes) -> Any:
-    def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        table = dict(pairs)
-        if len(table) < len(pairs):
-            keys = [key for key, _ in pairs]
-            raise ValueError(f"{next(k for k in keys if keys.count(k) > 1)} stands twice")
-        return table
-
-    return json.loads(data.decode("utf-8"), object_pairs_hook=unique)
-
-
-def _from_npz(data: bytes) -> dict[str, Any]:
-    tree: dict[str, Any] = {}
-    with np.load(io.BytesIO(data), allow_pickle=False) as archive:
-        for name in archive.files:
-            *tables, key = name.split(".")
-            table = tree
-            for part in tables:
-                table = table.setdefault(part, {})
-            table[key] = archive[name].tolist() if archive[name].size else None
-    return tree
-
-
-MAT_HEADER = 116  # bytes of descriptive text that open a MAT-file
-
-
-def _mat_header(body: bytes) -> bytes:
-    """In the place of date and platform, the sha256 of what follows."""
-    return f"MATLAB 5.0 MAT-file, malta gain file, sha256 {hashlib.sha256(body).hexdigest()}".encode().ljust(
-        MAT_HEADER
-    )
-
-
-def _from_mat(data: bytes) -> dict[str, Any]:
-    from scipy.io import loadmat
-
-    body = data[MAT_HEADER:]
-    if data[:MAT_HEADER] != _mat_header(body):  # before loadmat, which a damaged file can crash
-        raise ValueError("its header does not hold the sha256 of its content")
-    buffer: Any = io.BytesIO(data)  # any: scipy's stubs know only file names
-    content = loadmat(buffer, struct_as_record=True, squeeze_me=False)
-    tree: dict[str, Any] = {k: _uncell(v, k) for k, v in content.items() if not k.startswith("__")}
-    return tree
-
-
-def _columns(content: Mapping[str, Any]) -> dict[str, Any]:
-    """Signals as two lists, name and unit."""
-    signals = {
-        key: {column: [row[column] for row in rows] for column in ("name", "unit")}
-        for key, rows in content["signals"].items()
-    }
-    return {**content, "signals": signals}
-
-
-def _flat(tables: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for key, value in tables.items():
-        flat |= _flat(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
-    return flat
-
-
-def _cells(value: Any) -> Any:
-    """Lists of text as MATLAB cell arrays, lists of numbers as arrays."""
-    if isinstance(value, Mapping):
-        return {key: _cells(entry) for key, entry in value.items()}
-    if isinstance(value, list):
-        return np.array(value, dtype=object if isinstance(value[0], str) else float)
-    return np.zeros((0, 0)) if value is None else value
-
-
-MATRICES = ("model.", "gains.", "feedforward.v0", "verification.poles.")
-VECTORS = ("operating_point.", "feedforward.z_grid", "limits.")
-
-
-def _uncell(value: Any, name: str) -> Any:
-    """MATLAB holds everything as a matrix: tables, texts, vectors and numbers are told apart by their names."""
-    if value.dtype.names:
-        return {key: _uncell(value[key][0, 0], f"{name}.{key}") for key in value.dtype.names}
-    if value.dtype == object:
-        return [str(cell[0]) for cell in value.ravel()]
-    if value.dtype.kind == "U":
-        return str(value[0]) if value.size else ""
-    if not value.size:
-        return None
-    if name.startswith(MATRICES):
-        return value.tolist()
-    if name.startswith(VECTORS):
-        return value.ravel().tolist()
-    return value.item()

@@ -41,12 +41,8 @@ class Scenario:
     name: str
     duration: float  # s
     reference: Callable[[Plant], Reference]
-    start: Mapping[str, float] = field(
-        default_factory=dict
-    )  # states (SI) that differ from the reference's first
-    disturbance: Callable[[FloatArray], FloatArray] | None = (
-        None  # t (k,) -> external wrench, k x 6, N and N m
-    )
+    start: Mapping[str, float] = field(default_factory=dict)  # states (SI) unlike the reference's first
+    disturbance: Callable[[FloatArray], FloatArray] | None = None  # t (k,) -> wrench, k x 6, N and N m
     noise: float = 0.0  # sensor noise in multiples of the plant's
     quantize: bool = False  # sensors resolve what the plant's do
     seed: int = 0

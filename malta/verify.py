@@ -24,12 +24,8 @@ if TYPE_CHECKING:
 
     from malta.plant import ComplexArray, FloatArray
 
-ZONES = (
-    (3.0, "A"),
-    (4.0, "B"),
-    (5.0, "C"),
-    (np.inf, "D"),
-)  # ISO 14839-3, upper limits of the peak sensitivity
+# ISO 14839-3: upper limits of the peak sensitivity
+ZONES = ((3.0, "A"), (4.0, "B"), (5.0, "C"), (np.inf, "D"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -316,9 +312,8 @@ def _crossing(w: FloatArray, size: FloatArray, level: float, *, last: bool) -> f
     return float(np.exp(wa + (wb - wa) * a / (a - b)))
 
 
-def _continuous(eigenvalues: ComplexArray, Ts: float) -> ComplexArray:
-    kept = eigenvalues[np.abs(eigenvalues) > 1e-6].astype(complex)
-    return _sorted(np.log(kept) / Ts)
+def _continuous(sampled: ComplexArray, Ts: float) -> ComplexArray:
+    return _sorted(np.asarray(np.log(sampled[np.abs(sampled) > 1e-6].astype(complex)) / Ts))
 
 
 def _sorted(poles: ComplexArray) -> ComplexArray:

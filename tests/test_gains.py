@@ -22,7 +22,7 @@ from hypothesis import strategies as st
 from scipy.io import loadmat, savemat
 
 import malta
-from malta import gains
+from malta import encodings, gains
 from malta.plant import Signal
 
 if TYPE_CHECKING:
@@ -106,7 +106,7 @@ def _equal(a: Any, b: Any) -> bool:
 def json_file(folder: Path, document: dict[str, Any], *, sign: bool = True) -> Path:
     """The document as a .json gain file, signed again so that the named check is the one that fires."""
     if sign:
-        document["sha256"] = gains._content_sha256(document)
+        document["sha256"] = encodings.content_sha256(document)
     path = folder / "edited.json"
     path.write_text(json.dumps(document))
     return path
@@ -714,7 +714,7 @@ def test_mat_of_another_program_is_refused(tmp_path: Path) -> None:
 def test_damaged_mat_does_not_reach_its_reader(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "gains.mat"
     content = bytearray((COMMITTED / "table2.mat").read_bytes())
-    assert gains._mat_header(bytes(content[116:])) == content[:116]
+    assert encodings.mat_header(bytes(content[116:])) == content[:116]
     read: list[object] = []
     monkeypatch.setattr("scipy.io.loadmat", lambda *arguments, **_: read.append(arguments))
     for at in (0, 50, 115, 116, 127, 184, len(content) - 1):

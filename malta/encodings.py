@@ -1,0 +1,191 @@
+"""The three forms of a gain file: .json, .npz and .mat, all holding the same tables.
+
+A document is nested tables of lists, numbers, texts and nulls. What comes back from a file has been taken apart, not
+checked: that is gains.py's part.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import re
+import zipfile
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from malta.errors import InputError
+
+MAT_HEADER = 116  # bytes of descriptive text that open a MAT-file
+MATRICES = ("model.", "gains.", "feedforward.v0", "verification.poles.")
+VECTORS = ("operating_point.", "feedforward.z_grid", "limits.")
+
+_Form = tuple[Callable[[Mapping[str, Any]], bytes], Callable[[bytes], Any]]
+
+
+def encode(content: Mapping[str, Any], path: Path) -> bytes:
+    """The bytes of a document in the form that the suffix names; the same document gives the same bytes."""
+    write, _ = _form(path)
+    return write(content)
+
+
+def decode(path: Path) -> dict[str, Any]:
+    """The document in a file. InputError when it is missing, unreadable, damaged or of another kind."""
+    _, read = _form(path)
+    try:
+        data = path.read_bytes()
+    except FileNotFoundError as error:
+        raise InputError(path, "", "no such file", "a gain file") from error
+    except (OSError, ValueError) as error:  # ValueError: a null byte in the name
+        raise InputError(
+            path, "", getattr(error, "strerror", None) or str(error), "a readable gain file"
+        ) from error
+    try:
+        content = read(data)
+    except Exception as error:  # a damaged archive makes its reader raise nearly anything
+        found = f"a damaged or foreign file ({str(error)[:120]})"
+        raise InputError(path, "", found, f"a complete {path.suffix} gain file") from error
+    if not isinstance(content, dict):
+        raise InputError(path, "", f"a {type(content).__name__}", "the tables of a gain file")
+    return content
+
+
+def content_sha256(content: Mapping[str, Any]) -> str:
+    """sha256 of a document without its own "sha256": compact JSON, keys sorted."""
+    rest = {key: value for key, value in content.items() if key != "sha256"}
+    return hashlib.sha256(json.dumps(rest, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+
+
+def _to_json(content: Mapping[str, Any]) -> bytes:
+    text = json.dumps(content, indent=1, allow_nan=False)
+    return _INNERMOST.sub(_joined, text).encode() + b"\n"
+
+
+_INNERMOST = re.compile(r"([\[{])\s*([^][{}]*?)\s*([\]}])")
+
+
+def _joined(innermost: re.Match[str]) -> str:
+    """A matrix row or a small table on one line."""
+    line = f"{innermost[1]}{' '.join(innermost[2].split())}{innermost[3]}"
+    return line if innermost[1] == "[" or len(line) <= 80 else innermost[0]
+
+
+def _from_json(data: bytes) -> Any:
+    def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        table = dict(pairs)
+        if len(table) < len(pairs):
+            keys = [key for key, _ in pairs]
+            raise ValueError(f"{next(k for k in keys if keys.count(k) > 1)} stands twice")
+        return table
+
+    return json.loads(data.decode("utf-8"), object_pairs_hook=unique)
+
+
+def _to_npz(content: Mapping[str, Any]) -> bytes:
+    archived = io.BytesIO()
+    with zipfile.ZipFile(archived, "w") as archive:  # stored: compressors differ in their bytes
+        for name, value in _flat(_columns(content)).items():
+            entry = io.BytesIO()
+            array = np.zeros(0) if value is None else np.array(value)
+            np.lib.format.write_array(entry, array, allow_pickle=False)
+            archive.writestr(zipfile.ZipInfo(f"{name}.npy"), entry.getvalue())  # dated 1980: no time stamp
+    return archived.getvalue()
+
+
+def _from_npz(data: bytes) -> dict[str, Any]:
+    tree: dict[str, Any] = {}
+    with np.load(io.BytesIO(data), allow_pickle=False) as archive:
+        for name in archive.files:
+            *tables, key = name.split(".")
+            table = tree
+            for part in tables:
+                table = table.setdefault(part, {})
+            table[key] = archive[name].tolist() if archive[name].size else None
+    return tree
+
+
+def _to_mat(content: Mapping[str, Any]) -> bytes:
+    from scipy.io import savemat
+
+    buffer: Any = io.BytesIO()  # any: scipy's stubs know only file names
+    savemat(buffer, _cells(_columns(content)), long_field_names=True, oned_as="row")
+    body = bytes(buffer.getvalue())[MAT_HEADER:]
+    return mat_header(body) + body
+
+
+def mat_header(body: bytes) -> bytes:
+    """In the place of date and platform, the sha256 of what follows."""
+    return f"MATLAB 5.0 MAT-file, malta gain file, sha256 {hashlib.sha256(body).hexdigest()}".encode().ljust(
+        MAT_HEADER
+    )
+
+
+def _from_mat(data: bytes) -> dict[str, Any]:
+    from scipy.io import loadmat
+
+    body = data[MAT_HEADER:]
+    if data[:MAT_HEADER] != mat_header(body):  # before loadmat, which a damaged file can crash
+        raise ValueError("its header does not hold the sha256 of its content")
+    buffer: Any = io.BytesIO(data)  # any: scipy's stubs know only file names
+    content = loadmat(buffer, struct_as_record=True, squeeze_me=False)
+    tree: dict[str, Any] = {k: _uncell(v, k) for k, v in content.items() if not k.startswith("__")}
+    return tree
+
+
+def _columns(content: Mapping[str, Any]) -> dict[str, Any]:
+    """Signals as two lists, name and unit."""
+    signals = {
+        key: {column: [row[column] for row in rows] for column in ("name", "unit")}
+        for key, rows in content["signals"].items()
+    }
+    return {**content, "signals": signals}
+
+
+def _flat(tables: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for key, value in tables.items():
+        flat |= _flat(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
+    return flat
+
+
+def _cells(value: Any) -> Any:
+    """Lists of text as MATLAB cell arrays, lists of numbers as arrays."""
+    if isinstance(value, Mapping):
+        return {key: _cells(entry) for key, entry in value.items()}
+    if isinstance(value, list):
+        return np.array(value, dtype=object if isinstance(value[0], str) else float)
+    return np.zeros((0, 0)) if value is None else value
+
+
+def _uncell(value: Any, name: str) -> Any:
+    """MATLAB holds everything as a matrix: tables, texts, vectors and numbers are told apart by their names."""
+    if value.dtype.names:
+        return {key: _uncell(value[key][0, 0], f"{name}.{key}") for key in value.dtype.names}
+    if value.dtype == object:
+        return [str(cell[0]) for cell in value.ravel()]
+    if value.dtype.kind == "U":
+        return str(value[0]) if value.size else ""
+    if not value.size:
+        return None
+    if name.startswith(MATRICES):
+        return value.tolist()
+    if name.startswith(VECTORS):
+        return value.ravel().tolist()
+    return value.item()
+
+
+_FORMS: dict[str, _Form] = {
+    ".json": (_to_json, _from_json),
+    ".npz": (_to_npz, _from_npz),
+    ".mat": (_to_mat, _from_mat),
+}
+SUFFIXES = tuple(_FORMS)
+
+
+def _form(path: Path) -> _Form:
+    if path.suffix not in _FORMS:
+        raise InputError(path, "", f"suffix {path.suffix!r}", "one of " + ", ".join(SUFFIXES))
+    return _FORMS[path.suffix]
