@@ -43,7 +43,7 @@ def _version(asked: bool) -> None:
 @app.callback()
 def options(
     version: Annotated[
-        bool, typer.Option("--version", is_eager=True, callback=_version, help="Show it.")
+        bool, typer.Option("--version", is_eager=True, callback=_version, help="Show the version.")
     ] = False,
 ) -> None:
     pass
@@ -70,10 +70,11 @@ def design(
     figures: Annotated[Path, typer.Option(help="Folder of the figures.")] = Path("build"),
     as_json: AsJson = False,
 ) -> None:
-    """Design controllers and export them: linearize, synthesize, verify, simulate the stroke, write gain files.
+    """Design controllers: synthesize, verify, simulate, write gain files.
 
     Gain files are replaced only by a design that is stable on the machine and completes the stroke.
 
+    \b
     Example:  malta design design/table2.toml
     """
     chosen = files or sorted(Path("design").glob("*.toml"))
@@ -96,11 +97,14 @@ def design(
 
 @app.command()
 def verify(gains: GainFile, change: Changes = None, as_json: AsJson = False) -> None:
-    """Verify a gain file on the machine: poles, bandwidths, peak sensitivities stage by stage.
+    """Verify a gain file on the machine, stage by stage.
+
+    Poles, bandwidths by definition, peak sensitivities with their ISO 14839-3 zones.
 
     The machine is the one in the file, with the changes given by --set (m, K_A, K_B, l_B, F_c, T_d, ... as far as
     they shape the linear loop; windings and DC link do not).
 
+    \b
     Example:  malta verify design/gains/calibrated.json --set m=0.56
     """
     from malta import gains as gain_files
@@ -161,6 +165,7 @@ def simulate(
 
     The machine is the one in the file, with the changes given by --set; the controller does not learn of them.
 
+    \b
     Example:  malta simulate design/gains/calibrated.json --scenario stroke --set m=0.56 --noise 1 --out build
     """
     from malta import gains as gain_files

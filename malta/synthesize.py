@@ -187,7 +187,7 @@ def synthesize(spec: Spec, model: LinearModel) -> Controller:
         )
     except InputError as error:
         raise InputError(spec.path, f"{error.where}: {error.field}", error.found, error.expected) from error
-    except CheckError as error:
+    except (CheckError, np.linalg.LinAlgError) as error:
         raise CheckError(f"{spec.path}: {error}") from error
     return replace(controller, spec_sha256=spec.sha256)
 
