@@ -12,6 +12,8 @@ from malta.data import published as read_published
 from malta.plants import tubular
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from malta.controller import Controller
     from malta.linearize import LinearModel
     from malta.plant import Plant
@@ -30,6 +32,18 @@ class Design(NamedTuple):
     model: LinearModel
     controller: Controller
     margins: Margins
+
+
+def refusal(read: Callable[[], object], where: Path) -> malta.InputError:
+    """The error that reading raises: one printable sentence that names the file."""
+    with pytest.raises(malta.InputError) as caught:
+        read()
+    error = caught.value
+    assert error.where == str(where)
+    assert str(error).isprintable()
+    assert str(error).startswith(f"{where}: ")
+    assert f"found {error.found}, expected {error.expected}" in str(error)
+    return error
 
 
 @pytest.fixture(autouse=True)

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from conftest import refusal
 
 import malta
 from malta.data import load_toml, to_si, units_of
@@ -17,7 +18,7 @@ from malta.data import published as read_published
 from malta.plants import tubular
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    pass
 
 DATA = Path("data/tubular.toml")
 ASSUMED = {"l_S", "g", "F_c", "phi_c", "V_max", "I_max", "T_d", "s_r", "s_z"}  # where the paper is silent
@@ -43,18 +44,6 @@ def edited(folder: Path, *changes: tuple[str, str]) -> Path:
     path = folder / "machine.toml"
     path.write_text(text, encoding="utf-8")
     return path
-
-
-def refusal(read: Callable[[], object], path: Path) -> malta.InputError:
-    """The error that reading raises: one printable sentence that names the file."""
-    with pytest.raises(malta.InputError) as caught:
-        read()
-    error = caught.value
-    assert error.where == str(path)
-    assert str(error).isprintable()
-    assert str(error).startswith(f"{path}: ")
-    assert f"found {error.found}, expected {error.expected}" in str(error)
-    return error
 
 
 # --- what is shipped ---

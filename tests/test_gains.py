@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from conftest import refusal
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.io import loadmat, savemat
@@ -112,16 +113,8 @@ def json_file(folder: Path, document: dict[str, Any], *, sign: bool = True) -> P
     return path
 
 
-def refusal(path: Path) -> malta.InputError:
-    """The error that reading raises: one printable sentence that names the file."""
-    with pytest.raises(malta.InputError) as caught:
-        gains.read(path)
-    error = caught.value
-    assert error.where == str(path)
-    assert str(error).isprintable()
-    assert str(error).startswith(f"{path}: ")
-    assert f"found {error.found}, expected {error.expected}" in str(error)
-    return error
+def refused(path: Path) -> malta.InputError:
+    return refusal(lambda: gains.read(path), path)
 
 
 def node(document: dict[str, Any], name: str) -> tuple[Any, str]:
@@ -478,7 +471,7 @@ def test_wrong_document_is_refused(tmp_path: Path, sound: dict[str, Any], fault:
     edit, field, found, expected = faults()[fault]
     document = copy.deepcopy(sound)
     edit(document)
-    error = refusal(json_file(tmp_path, document))
+    error = refused(json_file(tmp_path, document))
     assert error.field == field
     assert found in error.found
     assert expected in error.expected
@@ -499,7 +492,7 @@ def test_stored_force_of_another_name_is_refused(
     document = gains.document(delayed.controller, delayed.margins)
     states = document["signals"]["states"]
     states[10:] = edit(states[10:])
-    error = refusal(json_file(tmp_path, document))
+    error = refused(json_file(tmp_path, document))
     assert error.field == "signals.states"
     assert error.found.startswith(found)
     assert error.expected.startswith("stored forces, as fx_B1[k-2] [N] fy_B1[k-2] [N]")
@@ -512,7 +505,7 @@ def test_number_that_is_not_finite_is_refused(
 ) -> None:
     document = copy.deepcopy(sound)
     change(name, poked(value))(document)
-    error = refusal(json_file(tmp_path, document))
+    error = refused(json_file(tmp_path, document))
     assert error.field == f"{name}.0.0" if len(SHAPES[name]) == 2 else f"{name}.0"
     assert (error.found, error.expected) == (repr(value), "a finite number")
 
@@ -523,7 +516,7 @@ def test_number_beyond_all_floats_is_refused(tmp_path: Path, sound: dict[str, An
     path.write_text(
         path.read_text().replace('"sample_time": 5e-05, "signals"', f'"sample_time": {number}, "signals"')
     )
-    error = refusal(path)
+    error = refused(path)
     assert error.field == "sample_time"
     assert error.found in ("inf", "-inf", "nan")
 
@@ -532,7 +525,7 @@ def test_number_beyond_all_floats_is_refused(tmp_path: Path, sound: dict[str, An
 def test_matrix_with_a_row_less_is_refused(tmp_path: Path, sound: dict[str, Any], name: str) -> None:
     document = copy.deepcopy(sound)
     change(name, lambda rows: rows[:-1])(document)
-    error = refusal(json_file(tmp_path, document))
+    error = refused(json_file(tmp_path, document))
     rows, *columns = SHAPES[name]
     if name == "feedforward.z_grid":  # the grid gives the length
         assert (error.field, error.found, error.expected) == (
@@ -549,7 +542,7 @@ def test_matrix_with_a_row_less_is_refused(tmp_path: Path, sound: dict[str, Any]
 def test_matrix_with_a_column_less_is_refused(tmp_path: Path, sound: dict[str, Any], name: str) -> None:
     document = copy.deepcopy(sound)
     change(name, lambda rows: [row[:-1] for row in rows])(document)
-    error = refusal(json_file(tmp_path, document))
+    error = refused(json_file(tmp_path, document))
     rows, columns = SHAPES[name]
     assert (error.field, error.found) == (name, f"shape {(rows, columns - 1)}")
 
@@ -558,7 +551,7 @@ def test_matrix_with_a_column_less_is_refused(tmp_path: Path, sound: dict[str, A
 def test_ragged_matrix_is_refused(tmp_path: Path, sound: dict[str, Any], name: str) -> None:
     document = copy.deepcopy(sound)
     change(name, lambda rows: [rows[0][:-1], *rows[1:]])(document)
-    error = refusal(json_file(tmp_path, document))
+    error = refused(json_file(tmp_path, document))
     assert (error.field, error.found) == (name, "rows of unequal length")
 
 
@@ -578,14 +571,14 @@ def test_ragged_matrix_is_refused(tmp_path: Path, sound: dict[str, Any], name: s
 def test_edit_without_a_new_signature_is_refused(tmp_path: Path, sound: dict[str, Any], edit: Edit) -> None:
     document = copy.deepcopy(sound)
     edit(document)
-    error = refusal(json_file(tmp_path, document, sign=False))
+    error = refused(json_file(tmp_path, document, sign=False))
     assert (error.field, error.found) == ("sha256", "content that was changed or damaged")
 
 
 def test_document_without_signature_is_refused(tmp_path: Path, sound: dict[str, Any]) -> None:
     document = copy.deepcopy(sound)
     del document["sha256"]
-    error = refusal(json_file(tmp_path, document, sign=False))
+    error = refused(json_file(tmp_path, document, sign=False))
     assert (error.field, error.found) == ("sha256", "nothing")
 
 
@@ -597,7 +590,7 @@ def test_document_without_signature_is_refused(tmp_path: Path, sound: dict[str, 
 def test_empty_file_and_garbage_are_refused(tmp_path: Path, suffix: str, content: bytes) -> None:
     path = tmp_path / f"gains{suffix}"
     path.write_bytes(content)
-    error = refusal(path)
+    error = refused(path)
     assert error.found.startswith("a damaged or foreign file (")
     assert error.expected == f"a complete {suffix} gain file"
 
@@ -608,7 +601,7 @@ def test_truncated_file_is_refused(tmp_path: Path, suffix: str) -> None:
     end = len(content.rstrip(b"\n"))
     for length in [*range(0, end, 331), *range(end - 20, end)]:
         path.write_bytes(content[:length])
-        assert refusal(path).expected == f"a complete {suffix} gain file"
+        assert refused(path).expected == f"a complete {suffix} gain file"
 
 
 @pytest.mark.parametrize(
@@ -626,7 +619,7 @@ def test_truncated_file_is_refused(tmp_path: Path, suffix: str) -> None:
 def test_json_that_is_no_document_is_refused(tmp_path: Path, text: str, found: str) -> None:
     path = tmp_path / "gains.json"
     path.write_text(text)
-    assert found in refusal(path).found
+    assert found in refused(path).found
 
 
 @pytest.mark.parametrize("key", ["version", "sample_time", "K"])
@@ -635,15 +628,15 @@ def test_key_that_stands_twice_is_refused(tmp_path: Path, sound: dict[str, Any],
     text = path.read_text()
     start = text.index(f'"{key}": ')
     path.write_text(text[:start] + f'"{key}": 1, ' + text[start:])
-    assert f"{key} stands twice" in refusal(path).found
+    assert f"{key} stands twice" in refused(path).found
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
 def test_missing_file_and_folder_are_refused(tmp_path: Path, suffix: str) -> None:
-    assert refusal(tmp_path / f"nothing{suffix}").found == "no such file"
+    assert refused(tmp_path / f"nothing{suffix}").found == "no such file"
     folder = tmp_path / f"folder{suffix}"
     folder.mkdir()
-    assert refusal(folder).found == "Is a directory"
+    assert refused(folder).found == "Is a directory"
 
 
 def test_name_with_a_null_byte_is_refused() -> None:
@@ -654,7 +647,7 @@ def test_name_with_a_null_byte_is_refused() -> None:
 @pytest.mark.parametrize("name", ["gains.txt", "gains", "gains.JSON", "gains.json.gz"])
 def test_unknown_suffix_is_refused(tmp_path: Path, design: Design, name: str) -> None:
     (tmp_path / name).write_bytes((COMMITTED / "table2.json").read_bytes())
-    assert refusal(tmp_path / name).expected == "one of .json, .npz, .mat"
+    assert refused(tmp_path / name).expected == "one of .json, .npz, .mat"
     with pytest.raises(malta.InputError, match=r"found suffix '.*', expected one of \.json, \.npz, \.mat$"):
         gains.write(design.controller, design.margins, tmp_path / name)
 
@@ -664,7 +657,7 @@ def test_one_form_under_the_suffix_of_another_is_refused(tmp_path: Path) -> None
         for other in set(SUFFIXES) - {suffix}:
             path = tmp_path / f"gains{suffix}"
             path.write_bytes((COMMITTED / f"table2{other}").read_bytes())
-            assert refusal(path).expected == f"a complete {suffix} gain file"
+            assert refused(path).expected == f"a complete {suffix} gain file"
 
 
 def test_pickle_is_not_executed(tmp_path: Path) -> None:
@@ -679,9 +672,9 @@ def test_pickle_is_not_executed(tmp_path: Path) -> None:
         archive.writestr(
             "schema.npy", b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header + harmful
         )
-    assert "allow_pickle=False" in refusal(path).found
+    assert "allow_pickle=False" in refused(path).found
     path.write_bytes(harmful)
-    assert "pickle" in refusal(path).found
+    assert "pickle" in refused(path).found
     assert not trap.exists()
 
 
@@ -690,7 +683,7 @@ def test_table_in_the_place_of_a_number_is_refused_in_npz(tmp_path: Path) -> Non
         entries: dict[str, Any] = dict(archive)
     entries["sample_time.value"] = entries["sample_time"]
     np.savez(tmp_path / "gains.npz", **entries)
-    assert refusal(tmp_path / "gains.npz").found.startswith("a damaged or foreign file")
+    assert refused(tmp_path / "gains.npz").found.startswith("a damaged or foreign file")
 
 
 def test_array_of_another_kind_is_refused_in_npz(tmp_path: Path) -> None:
@@ -698,17 +691,17 @@ def test_array_of_another_kind_is_refused_in_npz(tmp_path: Path) -> None:
         entries: dict[str, Any] = dict(archive)
     entries["gains.K"] = entries["gains.K"].astype(complex)
     np.savez(tmp_path / "gains.npz", **entries)
-    assert refusal(tmp_path / "gains.npz").field == "gains.K.0.0"
+    assert refused(tmp_path / "gains.npz").field == "gains.K.0.0"
 
 
 def test_mat_of_another_program_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "gains.mat"
     savemat(path, {"schema": "malta-gains", "version": 1, "gains": {"K": np.eye(5)}})
-    assert "does not hold the sha256" in refusal(path).found
+    assert "does not hold the sha256" in refused(path).found
     path.write_bytes((COMMITTED / "table2.mat").read_bytes())
     content = {key: value for key, value in loadmat(path).items() if not key.startswith("__")}
     savemat(path, content, long_field_names=True)  # the same content, saved anew
-    assert "does not hold the sha256" in refusal(path).found
+    assert "does not hold the sha256" in refused(path).found
 
 
 def test_damaged_mat_does_not_reach_its_reader(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -719,7 +712,7 @@ def test_damaged_mat_does_not_reach_its_reader(tmp_path: Path, monkeypatch: pyte
     monkeypatch.setattr("scipy.io.loadmat", lambda *arguments, **_: read.append(arguments))
     for at in (0, 50, 115, 116, 127, 184, len(content) - 1):
         path.write_bytes(content[:at] + bytes([content[at] ^ 0x80]) + content[at + 1 :])
-        assert "does not hold the sha256" in refusal(path).found
+        assert "does not hold the sha256" in refused(path).found
     assert read == []
 
 

@@ -9,12 +9,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from conftest import refusal
 
 import malta
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from conftest import Design
 
 DATA = Path(__file__).parents[1] / "data" / "tubular.toml"
@@ -44,18 +43,6 @@ def edited(folder: Path, *changes: tuple[str, str], base: str = "calibrated") ->
     path = folder / "design.toml"
     path.write_text(text, encoding="utf-8")
     return path
-
-
-def refusal(read: Callable[[], object], where: Path) -> malta.InputError:
-    """The error that reading raises: one printable sentence that names the file."""
-    with pytest.raises(malta.InputError) as caught:
-        read()
-    error = caught.value
-    assert error.where == str(where)
-    assert str(error).isprintable()
-    assert str(error).startswith(f"{where}: ")
-    assert f"found {error.found}, expected {error.expected}" in str(error)
-    return error
 
 
 def quantities(values: dict[str, float], unit: str) -> str:
