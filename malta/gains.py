@@ -251,7 +251,7 @@ def read(path: str | Path) -> Controller:
     content = decode(Path(path))
     for key, wanted in (("schema", SCHEMA), ("version", VERSION)):
         if content.get(key) != wanted:
-            raise InputError(path, key, repr(content.get(key)), repr(wanted))
+            raise InputError(path, key, repr(content[key]) if key in content else "nothing", repr(wanted))
     file = validated(GainFile, content, path)
     plain = file.model_dump(by_alias=True)
     if content_sha256(plain) != file.sha256:

@@ -172,7 +172,8 @@ def read_design(path: str | Path) -> Spec:
     raw = load_toml(path)
     machine = raw.get("machine")
     if not isinstance(machine, str):
-        raise InputError(path, "machine", repr(machine), "the path of the machine's data file")
+        found = "nothing" if machine is None else repr(machine)
+        raise InputError(path, "machine", found, "the path of the machine's data file")
     machine_file = Path(os.path.normpath(path.parent / machine))
     content = validated(_DesignFile, _resolve(raw, machine_file, path), path)
     par = read(machine_file, content.preset)

@@ -357,12 +357,12 @@ def faults() -> dict[str, tuple[Edit, str, str, str]]:
     m = "plant.parameters.m"
     return {
         "another schema": (put("schema", "other-gains"), "schema", "'other-gains'", "'malta-gains'"),
-        "no schema": (drop("schema"), "schema", "None", "'malta-gains'"),
+        "no schema": (drop("schema"), "schema", "nothing", "'malta-gains'"),
         "version 2": (put("version", 2), "version", "2", "1"),
         "version 0": (put("version", 0), "version", "0", "1"),
         "version as text": (put("version", "1"), "version", "'1'", "1"),
         "version as fraction": (put("version", 1.5), "version", "1.5", "1"),
-        "no version": (drop("version"), "version", "None", "1"),
+        "no version": (drop("version"), "version", "nothing", "1"),
         "no matrix K": (drop("gains.K"), "gains.K", "nothing", "this key"),
         "no matrix Ad": (drop("model.Ad"), "model.Ad", "nothing", "this key"),
         "no table of gains": (drop("gains"), "gains", "nothing", "this key"),
