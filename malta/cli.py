@@ -220,9 +220,8 @@ def simulate(
 
 def main() -> None:
     """Entry point: errors become one sentence and an exit code."""
-    gc.set_threshold(
-        200_000, 50, 50
-    )  # numeric libraries make many lasting objects; going through them costs a sixth
+    # Numeric libraries make many lasting objects; going through them again and again costs a sixth of the time.
+    gc.set_threshold(200_000, 50, 50)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # a terminal without Greek letters shows ? and goes on
@@ -261,9 +260,8 @@ def _design(file: Path, out: Path, figures: Path, made: dict[Path, Path], *, qui
     controller = synthesize(spec, model)
     margins = verified(model, controller, spec.uncertainty)
     require_stable(margins, str(file))
-    with (
-        tempfile.TemporaryDirectory() as scratch
-    ):  # the harness consumes the file, before it replaces a good one
+    # The harness consumes the gain file before it replaces a good one.
+    with tempfile.TemporaryDirectory() as scratch:
         trial = Path(scratch) / f"{spec.name}.json"
         gain_files.write(controller, margins, trial)
         run = simulated(plant, gain_files.read(trial), Scenario.stroke())
@@ -327,13 +325,9 @@ def _published(machine: str) -> dict[str, Any] | None:
 
 
 def _margins(margins: Margins) -> dict[str, Any]:
-    poles = {
-        key: [[p.real, p.imag] for p in getattr(margins.poles, key)]
-        for key in ("open_loop", "regulator", "filter", "closed_loop")
-    }
     return {
         "stable": margins.stable,
-        "poles": poles,
+        "poles": margins.poles.pairs(),
         "bandwidth": dict(margins.bandwidth),
         "peak_sensitivity": {stage.name: dict(stage.peak_sensitivity) for stage in margins.stages},
     }

@@ -20,6 +20,7 @@ last d samples follow, the oldest first; their reference is the feedforward that
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from functools import lru_cache
 from typing import TYPE_CHECKING, NamedTuple
 
 import casadi as ca
@@ -167,6 +168,9 @@ def law(c: Controller) -> ca.Function:
     return ca.Function("law", list(args.values()), list(outputs.values()), list(args), list(outputs))
 
 
+@lru_cache(
+    maxsize=8
+)  # every loop of a controller asks for it; records compare by identity, so no hit is stale
 def linear_law(c: Controller) -> LinearLaw:
     """The control law linearized where no axis saturates: exact, by differentiating `law`."""
     step = law(c)
@@ -177,7 +181,7 @@ def linear_law(c: Controller) -> LinearLaw:
     r = ca.vertcat(*(named[name] for name in ("p_ref", "xi_ref", "v_ff", "v0")))
     s_next = ca.vertcat(out["xi_pred_next"], out["e_next"])
     blocks = [ca.jacobian(of, by) for of in (s_next, out["v"]) for by in (s, named["y"], r)]
-    return LinearLaw(*(np.array(M) for M in ca.Function("linear", args, blocks)(*[0] * len(args))))
+    return LinearLaw(*(readonly(np.array(M)) for M in ca.Function("linear", args, blocks)(*[0] * len(args))))
 
 
 def _sparse(M: FloatArray) -> ca.DM:

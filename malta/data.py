@@ -22,6 +22,7 @@ from pydantic import BaseModel, ConfigDict, StrictStr, ValidationError
 from pydantic import Field as Checked
 
 from malta.errors import InputError
+from malta.files import read_file
 
 if TYPE_CHECKING:
     from malta.plant import Parameters, Plant
@@ -155,16 +156,7 @@ def to_si(value: float, unit: str, si_unit: str, where: str | Path, name: str) -
 
 def load_toml(path: str | Path) -> dict[str, Any]:
     """Read a TOML file; InputError when it is missing, unreadable, not text or not TOML."""
-    try:
-        text = Path(path).read_text(encoding="utf-8")
-    except FileNotFoundError as error:
-        raise InputError(path, "", "no such file", "a TOML file") from error
-    except UnicodeDecodeError as error:
-        raise InputError(path, "", "bytes that are not UTF-8 text", "a TOML file") from error
-    except (OSError, ValueError) as error:  # ValueError: a null byte in the name
-        raise InputError(
-            path, "", getattr(error, "strerror", None) or str(error), "a readable TOML file"
-        ) from error
+    text = read_file(Path(path), "TOML file", lambda p: p.read_text(encoding="utf-8"))
     try:
         return tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # TOMLDecodeError, endless digits, endless nesting

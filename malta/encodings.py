@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from malta.errors import InputError
+from malta.files import read_file
 
 MAT_HEADER = 116  # bytes of descriptive text that open a MAT-file
 MATRICES = ("model.", "gains.", "feedforward.v0", "verification.poles.")
@@ -35,14 +36,7 @@ def encode(content: Mapping[str, Any], path: Path) -> bytes:
 def decode(path: Path) -> dict[str, Any]:
     """The document in a file. InputError when it is missing, unreadable, damaged or of another kind."""
     _, read = _form(path)
-    try:
-        data = path.read_bytes()
-    except FileNotFoundError as error:
-        raise InputError(path, "", "no such file", "a gain file") from error
-    except (OSError, ValueError) as error:  # ValueError: a null byte in the name
-        raise InputError(
-            path, "", getattr(error, "strerror", None) or str(error), "a readable gain file"
-        ) from error
+    data = read_file(path, "gain file", Path.read_bytes)
     try:
         content = read(data)
     except Exception as error:  # a damaged archive makes its reader raise nearly anything

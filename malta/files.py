@@ -1,13 +1,16 @@
-"""Writing files so that nothing is lost or half-written."""
+"""Reading files with a sentence for every refusal; writing them so that nothing is lost or half-written."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
+from typing import TypeVar
 
 from malta.errors import InputError
+
+_Content = TypeVar("_Content", str, bytes)
 
 
 def replace_files(contents: Mapping[Path, bytes]) -> None:
@@ -43,6 +46,19 @@ def replace_files(contents: Mapping[Path, bytes]) -> None:
         for temporary, _ in staged:
             with suppress(OSError):
                 temporary.unlink(missing_ok=True)
+
+
+def read_file(path: Path, kind: str, read: Callable[[Path], _Content]) -> _Content:
+    """What `read` makes of a file; InputError when it is missing or unreadable. `kind` as "TOML file"."""
+    try:
+        return read(path)
+    except FileNotFoundError as error:
+        raise InputError(path, "", "no such file", f"a {kind}") from error
+    except UnicodeDecodeError as error:
+        raise InputError(path, "", "bytes that are not UTF-8 text", f"a {kind}") from error
+    except (OSError, ValueError) as error:  # ValueError: a null byte in the name
+        found = getattr(error, "strerror", None) or str(error)
+        raise InputError(path, "", found, f"a readable {kind}") from error
 
 
 def _refused(path: Path, error: OSError | ValueError) -> InputError:

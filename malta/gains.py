@@ -47,7 +47,7 @@ from malta.plant import Signal
 from malta.verify import own_poles, require_stable
 
 if TYPE_CHECKING:
-    from malta.plant import ComplexArray, FloatArray, Parameters
+    from malta.plant import FloatArray, Parameters
     from malta.verify import Margins
 
 SCHEMA, VERSION = "malta-gains", 1
@@ -206,10 +206,7 @@ def document(controller: Controller, margins: Margins) -> dict[str, Any]:
         "current_loop": {key: getattr(c.current_loop, key) for key in ("Kp", "Ki", "sample_time")},
         "limits": {key: getattr(c.limits, key) for key in ("current", "voltage", "force")},
         "verification": {
-            "poles": {
-                key: _pairs(getattr(margins.poles, key))
-                for key in ("open_loop", "regulator", "filter", "closed_loop")
-            },
+            "poles": margins.poles.pairs(),
             "bandwidth": dict(margins.bandwidth),
             "peak_sensitivity": dict(margins.peak_sensitivity),
             # The box that the design names; null: no bound is proven, no witness known.
@@ -291,13 +288,8 @@ def _controller(file: GainFile, path: str | Path) -> Controller:
     ):
         if found != wanted:
             raise InputError(path, f"signals.{key}", _names(found), f"{_names(wanted)} of the {plant.name}")
-    n, n0, m, p, g = (
-        len(states),
-        len(mechanical),
-        len(forces),
-        len(measurements),
-        len(file.feedforward.z_grid),
-    )
+    n, n0, m, p = len(states), len(mechanical), len(forces), len(measurements)
+    g = len(file.feedforward.z_grid)
     if (n - n0) % m:
         raise InputError(path, "signals.states", f"{n} states", f"{n0} and a multiple of {m} stored forces")
     stored = stored_forces(forces, (n - n0) // m)
@@ -368,10 +360,6 @@ def _array(value: list[Any], shape: tuple[int, ...], path: str | Path, field: st
 
 def _names(signals: tuple[Signal, ...]) -> str:
     return " ".join(f"{s.name} [{s.unit}]" for s in signals) or "nothing"
-
-
-def _pairs(poles: ComplexArray) -> list[list[float]]:
-    return [[float(p.real), float(p.imag)] for p in poles]
 
 
 def _plain(value: Any) -> Any:

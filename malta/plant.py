@@ -109,6 +109,21 @@ class Plant:
         """The states of the design model."""
         return tuple(self.states[i] for i in self.controlled)
 
+    @property
+    def stroke_output(self) -> int:
+        """Index of the output that the stroke moves."""
+        return [s.name for s in self.outputs].index(self.stroke)
+
+    @property
+    def stroke_state(self) -> int:
+        """Index of the state that the stroke moves."""
+        return [s.name for s in self.states].index(self.stroke)
+
+    @property
+    def thrust_input(self) -> int:
+        """Index of the input that drives the stroke."""
+        return [s.name for s in self.inputs].index(self.thrust)
+
     def at(self, /, **positions: float) -> OperatingPoint:
         """The operating point at these states (SI), the others zero, without preload.
 

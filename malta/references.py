@@ -66,7 +66,7 @@ def stroke(
     if profile not in PROFILES:
         raise InputError("stroke", "profile", repr(profile), "one of " + ", ".join(PROFILES))
     check_rise(rise)
-    axis = [s.name for s in plant.outputs].index(plant.stroke)
+    axis = plant.stroke_output
     for name, value in (("start", start), ("end", end)):
         if not abs(value) <= plant.travel:
             raise InputError(

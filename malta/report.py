@@ -187,7 +187,7 @@ def stroke_figure(run: Trajectory, published: Published | None = None) -> Figure
     figure.subplots_adjust(left=0.085, right=0.985, bottom=0.085, top=0.93, wspace=0.24, hspace=0.16)
     (position, radial), (error, current) = figure.subplots(2, 2, sharex=True)
     names = [s.name for s in run.plant.outputs]
-    axis = names.index(run.plant.stroke)
+    axis = run.plant.stroke_output
     ms = run.t * 1e3
     position.plot(ms, run.reference[:, axis] * 1e3, label="reference", **STYLES[2])
     position.plot(ms, run.p[:, axis] * 1e3, label="position", **STYLES[0])
@@ -245,13 +245,10 @@ def stroke_figure(run: Trajectory, published: Published | None = None) -> Figure
 def _widest_currents(run: Trajectory) -> list[tuple[str, int, int]]:
     """The thrust current and the two bearing currents that carry the weight: label, style, index."""
     inputs = [s.name for s in run.plant.inputs]
-    thrust = inputs.index(run.plant.thrust)
-    others = sorted((i for i in range(len(inputs)) if i != thrust), key=lambda i: -np.abs(run.v[:, i]).max())[
-        :2
-    ]
-    return [(inputs[thrust], 0, thrust)] + [
-        (inputs[i], style, i) for i, style in zip(sorted(others), (1, 2), strict=True)
-    ]
+    thrust = run.plant.thrust_input
+    widest = np.argsort(-np.abs(run.v).max(axis=0), kind="stable")
+    others = sorted(int(i) for i in widest[widest != thrust][:2])
+    return [(inputs[i], style, i) for style, i in enumerate([thrust, *others])]
 
 
 def save(figure: Figure, path: str | Path) -> Path:

@@ -50,10 +50,14 @@ class Scenario:
     substeps: int = 4  # Runge–Kutta steps a sample
 
     def __post_init__(self) -> None:
-        for name in ("duration", "noise", "substeps", "delay", "seed"):
+        for name, low, whole in (
+            ("duration", 1e-12, False),
+            ("noise", 0, False),
+            ("substeps", 1, True),
+            ("delay", 0, True),
+            ("seed", 0, True),
+        ):
             value = getattr(self, name)
-            low = 1e-12 if name in ("duration", "substeps") else 0
-            whole = name in ("delay", "seed", "substeps")
             if whole and value is not None and not isinstance(value, int):
                 raise InputError(f"scenario {self.name}", name, repr(value), "a whole number")
             if value is not None and not (math.isfinite(value) and value >= low):
@@ -284,7 +288,7 @@ def _step(
     rest = ca.Function("rest", [state, given, v0], [state_next, row])
     # v0(z) is a table, which scalar expressions cannot look up: only the look-up is left outside of them.
     grid = c.feedforward.z_grid
-    position = y[[s.name for s in plant.outputs].index(plant.stroke)]
+    position = y[plant.stroke_output]
     where = ca.Function("where", [state, given], [ca.fmax(ca.fmin(position, grid[-1]), grid[0])])
     table = ca.interpolant("table", "linear", [grid], c.feedforward.v0.ravel())
     S, U = ca.MX.sym("state", state.numel()), ca.MX.sym("given", given.numel())
@@ -304,9 +308,7 @@ def state_references(
     inverse = ca.Function("inverse", [p, dp], [ca.densify(ca.vertcat(q, ca.jtimes(q, p, dp)))])
     (xi_ref,) = _evaluate(inverse.map(len(motion.p)), motion.p, motion.dp)
     v_ff = np.zeros((len(motion.p), len(c.forces)))
-    thrust = [s.name for s in c.forces].index(believed.thrust)
-    stroke = [s.name for s in c.measurements].index(believed.stroke)
-    v_ff[:, thrust] = c.feedforward.mass * motion.ddp[:, stroke]
+    v_ff[:, believed.thrust_input] = c.feedforward.mass * motion.ddp[:, believed.stroke_output]
     past = [np.vstack([np.repeat(v_ff[:1], age, axis=0), v_ff[:-age]]) for age in range(c.delay, 0, -1)]
     return np.hstack([xi_ref, *past]), v_ff
 
@@ -336,8 +338,7 @@ def _start(
     x = plant.at(**rest).x
     xi_pred = np.zeros(n)
     xi_pred[: len(design)] = x[list(plant.controlled)]
-    stroke = [s.name for s in plant.outputs].index(plant.stroke)
-    position = float(np.array(plant.h(ca.DM(x), 0))[stroke, 0])
+    position = float(np.array(plant.h(ca.DM(x), 0))[plant.stroke_output, 0])
     ratio = np.array(plant.actuator.force_constant) / np.array(believed.actuator.force_constant)
     v0 = ratio * c.feedforward.at(position)
     return np.concatenate([x, v0, xi_pred, np.zeros(2 * p), np.tile(v0, delay)])
@@ -369,7 +370,7 @@ class StrokeFigures:
 def stroke_figures(run: Trajectory) -> StrokeFigures:
     """Rise, overshoot, tracking error and radial deviation of a stroke."""
     names = [s.name for s in run.plant.outputs]
-    axis = names.index(run.plant.stroke)
+    axis = run.plant.stroke_output
     z, z_ref = run.p[:, axis], run.reference[:, axis]
     start, end = z_ref[0], z_ref[-1]
     share = (z - start) / (end - start)
@@ -380,7 +381,7 @@ def stroke_figures(run: Trajectory) -> StrokeFigures:
         overshoot=max(float(share.max()) - 1, 0.0),
         axial_error=float(error[:, axis].max()),
         radial={name: float(error[:, i].max()) for i, name in enumerate(names) if i != axis},
-        force=float(np.abs(run.v[:, [s.name for s in run.plant.inputs].index(run.plant.thrust)]).max()),
+        force=float(np.abs(run.v[:, run.plant.thrust_input]).max()),
         current=float(np.abs(run.current).max()),
     )
 

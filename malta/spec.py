@@ -11,8 +11,9 @@ import hashlib
 import json
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -175,7 +176,8 @@ def read_design(path: str | Path) -> Spec:
         found = "nothing" if machine is None else repr(machine)
         raise InputError(path, "machine", found, "the path of the machine's data file")
     machine_file = Path(os.path.normpath(path.parent / machine))
-    content = validated(_DesignFile, _resolve(raw, machine_file, path), path)
+    printed = cache(partial(published, machine_file))  # read once, and only where something refers to it
+    content = validated(_DesignFile, _resolve(raw, printed, machine_file, path), path)
     par = read(machine_file, content.preset)
     plant = plant_of(par)
     states, inputs, outputs = plant.design_states, plant.inputs, plant.outputs
@@ -222,18 +224,22 @@ def read_design(path: str | Path) -> Spec:
     )
 
 
-def _resolve(node: Any, machine_file: Path, where: Path, field: str = "") -> Any:
+def _resolve(
+    node: Any, printed: Callable[[], dict[str, Any]], machine_file: Path, where: Path, field: str = ""
+) -> Any:
     """Put the published numbers in the place of every `{ published = "..." }`."""
     if isinstance(node, dict):
         if set(node) == {"published"}:
-            found: Any = published(machine_file)
+            found: Any = printed()
             for key in str(node["published"]).split("."):
                 if not isinstance(found, dict) or key not in found:
                     source = machine_file.parent / "published" / machine_file.name
                     raise InputError(where, field, repr(node["published"]), f"a table of {source}")
                 found = found[key]
             return found
-        return {k: _resolve(v, machine_file, where, f"{field}.{k}".lstrip(".")) for k, v in node.items()}
+        return {
+            k: _resolve(v, printed, machine_file, where, f"{field}.{k}".lstrip(".")) for k, v in node.items()
+        }
     return node
 
 

@@ -7,7 +7,7 @@ zero-order hold, exactly; F the control law from measurements to forces (v = F y
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,7 +16,7 @@ from malta.controller import Controller, LinearLaw, linear_law
 from malta.data import plant_of
 from malta.errors import CheckError
 from malta.linearize import LinearModel, linearize
-from malta.plant import Plant, trim
+from malta.plant import trim
 from malta.riccati import add_integrals, delay_inputs, eigenvalues, sample
 
 if TYPE_CHECKING:
@@ -36,6 +36,10 @@ class Poles:
     regulator: ComplexArray  # of the file's own sampled model with K, Ki
     filter: ComplexArray  # of the file's own sampled observer
     closed_loop: ComplexArray  # of the machine: hold, delay, current loops, controller
+
+    def pairs(self) -> dict[str, list[list[float]]]:
+        """Each set as rows [re, im]."""
+        return {f.name: [[float(p.real), float(p.imag)] for p in getattr(self, f.name)] for f in fields(self)}
 
 
 @dataclass(frozen=True)
@@ -162,12 +166,10 @@ def loop(
     Cd = np.hstack([C, np.zeros((len(C), len(Ad) - C.shape[1]))])
     law = linear_law(controller)
     if feedforward:
-        stroke = [s.name for s in controller.measurements].index(model.plant.stroke)
-        slope = np.zeros((len(controller.forces), len(C)))
-        slope[:, stroke] = controller.feedforward.slope(
-            float(model.operating_point.x[_stroke_state(model.plant)])
-        )
-        m = len(controller.forces)
+        m, plant = len(controller.forces), model.plant
+        slope = np.zeros((m, len(C)))
+        position = float(model.operating_point.x[plant.stroke_state])
+        slope[:, plant.stroke_output] = controller.feedforward.slope(position)
         law = law._replace(B_y=law.B_y + law.B_r[:, -m:] @ slope, D_y=law.D_y + law.D_r[:, -m:] @ slope)
     return Loop(Ad, Bd, Cd, law, controller.sample_time)
 
@@ -178,7 +180,7 @@ def machine_loop(model: LinearModel, controller: Controller) -> Loop:
     Raises CheckError when no input holds the machine at the model's operating point.
     """
     plant = model.plant
-    position = float(model.operating_point.x[_stroke_state(plant)])
+    position = float(model.operating_point.x[plant.stroke_state])
     loaded = linearize(plant, trim(plant, **{plant.stroke: position}))
     delay = plant.actuator.delay(controller.sample_time)
     return loop(loaded, controller, delay=delay, current_loops=True, feedforward=True)
@@ -188,10 +190,6 @@ def _force_map(model: LinearModel, controller: Controller) -> FloatArray:
     """B for commanded forces: the machine's force constants over those that the controller believes in."""
     believed = plant_of(controller.parameters).actuator.force_constant
     return np.asarray(model.B * (np.array(model.plant.actuator.force_constant) / np.array(believed)))
-
-
-def _stroke_state(plant: Plant) -> int:
-    return [s.name for s in plant.states].index(plant.stroke)
 
 
 def own_poles(c: Controller) -> tuple[ComplexArray, ComplexArray]:
