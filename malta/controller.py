@@ -19,9 +19,10 @@ last d samples follow, the oldest first; their reference is the feedforward that
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from functools import lru_cache
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -79,6 +80,18 @@ class Limits:
             object.__setattr__(self, name, readonly(getattr(self, name)))
 
 
+@dataclass(frozen=True, eq=False)
+class Noise:
+    """Variances that the filter was designed for: white over a sample."""
+
+    process: FloatArray  # N^2, m forces
+    sensor: FloatArray  # m^2, p measurements
+
+    def __post_init__(self) -> None:
+        for name in ("process", "sensor"):
+            object.__setattr__(self, name, readonly(getattr(self, name)))
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class Controller:
     """Gains, models and limits of one controller; n states, m forces, p = m measurements.
@@ -103,6 +116,7 @@ class Controller:
     K: FloatArray  # m x n
     Ki: FloatArray  # m x p
     L: FloatArray  # n x p, filter form
+    noise: Noise
     feedforward: Feedforward
     current_loop: CurrentLoop
     limits: Limits
@@ -149,6 +163,35 @@ def stored_forces(inputs: tuple[Signal, ...], delay: int) -> tuple[Signal, ...]:
     return tuple(Signal(f"{s.name}[k-{age}]", s.unit) for age in range(delay, 0, -1) for s in inputs)
 
 
+def gains_of(c: Controller) -> dict[str, ca.DM]:
+    """What the law computes with, sparse: exact zeros cost nothing at run time."""
+    matrices = {name: ca.sparsify(ca.DM(getattr(c, name))) for name in ("Ad", "Bd", "Cd", "K", "Ki", "L")}
+    return matrices | {"force_limit": ca.DM(c.limits.force), "control_time": ca.DM(c.sample_time)}
+
+
+def estimated(g: Mapping[str, Any], xi_pred: Any, y: Any, C: Any = None) -> Any:
+    """Step 2, the filter: xi_hat. C: in place of Cd where it is scheduled."""
+    return xi_pred + g["L"] @ (y - (g["Cd"] if C is None else C) @ xi_pred)
+
+
+def commanded(
+    g: Mapping[str, Any],
+    xi_hat: Any,
+    e: Any,
+    frozen: Any,
+    y: Any,
+    p_ref: Any,
+    xi_ref: Any,
+    v_ff: Any,
+    v0: Any,
+) -> tuple[Any, Any, Any, Any]:
+    """Steps 1, 3, 4 and 6: (xi_pred, e, frozen, v) from the estimate."""
+    e = e + g["control_time"] * (1 - frozen) * (p_ref - y)
+    wanted = g["K"] @ (xi_ref - xi_hat) + g["Ki"] @ e + v_ff + v0
+    v = ca.fmax(ca.fmin(wanted, g["force_limit"]), -g["force_limit"])
+    return g["Ad"] @ xi_hat + g["Bd"] @ (v - v0), e, v != wanted, v
+
+
 def law(c: Controller) -> ca.Function:
     """The control law of one sample as a CasADi function.
 
@@ -157,14 +200,17 @@ def law(c: Controller) -> ca.Function:
     n, m, p = len(c.states), len(c.forces), len(c.measurements)
     sizes = {"xi_pred": n, "e": p, "frozen": p, "y": p, "p_ref": p, "xi_ref": n, "v_ff": m, "v0": m}
     args = {name: ca.SX.sym(name, size) for name, size in sizes.items()}
-    a = args
-    e = a["e"] + c.sample_time * (1 - a["frozen"]) * (a["p_ref"] - a["y"])
-    xi_hat = a["xi_pred"] + _sparse(c.L) @ (a["y"] - _sparse(c.Cd) @ a["xi_pred"])
-    v_fb = _sparse(c.K) @ (a["xi_ref"] - xi_hat) + _sparse(c.Ki) @ e
-    wanted = v_fb + a["v_ff"] + a["v0"]
-    v = ca.fmax(ca.fmin(wanted, c.limits.force), -c.limits.force)
-    xi_pred = _sparse(c.Ad) @ xi_hat + _sparse(c.Bd) @ (v - a["v0"])
-    outputs = {"xi_pred_next": xi_pred, "e_next": e, "frozen_next": v != wanted, "v": v, "xi_hat": xi_hat}
+    xi_pred, e, frozen, *given = args.values()
+    g = gains_of(c)
+    xi_hat = estimated(g, xi_pred, args["y"])
+    xi_pred_next, e_next, frozen_next, v = commanded(g, xi_hat, e, frozen, *given)
+    outputs = {
+        "xi_pred_next": xi_pred_next,
+        "e_next": e_next,
+        "frozen_next": frozen_next,
+        "v": v,
+        "xi_hat": xi_hat,
+    }
     return ca.Function("law", list(args.values()), list(outputs.values()), list(args), list(outputs))
 
 
@@ -182,8 +228,3 @@ def linear_law(c: Controller) -> LinearLaw:
     s_next = ca.vertcat(out["xi_pred_next"], out["e_next"])
     blocks = [ca.jacobian(of, by) for of in (s_next, out["v"]) for by in (s, named["y"], r)]
     return LinearLaw(*(readonly(np.array(M)) for M in ca.Function("linear", args, blocks)(*[0] * len(args))))
-
-
-def _sparse(M: FloatArray) -> ca.DM:
-    """Exact zeros cost nothing at run time."""
-    return ca.sparsify(ca.DM(M))

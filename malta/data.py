@@ -60,9 +60,14 @@ class _MachineFile(Record):
     presets: dict[str, dict[str, Sourced]]
 
 
-def si(unit: str, *, above: float | None = None, at_least: float | None = None) -> Any:
-    """Declare a parameter: `m: float = si("kg", above=0)  # mover with magnets, Table IV`."""
-    return field(metadata={"unit": unit, "above": above, "at_least": at_least})
+def si(
+    unit: str, *, above: float | None = None, at_least: float | None = None, twin: str | None = None
+) -> Any:
+    """Declare a parameter: `m: float = si("kg", above=0)  # mover with magnets, Table IV`.
+
+    twin: another parameter; where both are equal, symbolic models hold one symbol for them.
+    """
+    return field(metadata={"unit": unit, "above": above, "at_least": at_least, "twin": twin})
 
 
 def units_of(record: type[Parameters] | Parameters) -> dict[str, str]:

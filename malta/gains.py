@@ -8,6 +8,7 @@
     signals          states [n], forces [m], measurements [p]: {name, unit} each, SI
     model            A n0 x n0, B n0 x m, C p x n0 (continuous, n0 mechanical states); Ad n x n, Bd n x m, Cd p x n
     gains            K m x n, Ki m x p, L n x p (filter form)
+    noise            process [N^2] m, sensor [m^2] p: variances that the filter was designed for
     feedforward      mass [kg], z_grid [g] [m], v0 g x m [N]
     current_loop     Kp [V/A], Ki [V/(A s)], sample_time [s]
     limits           current [A], voltage [V], force [N]: m each
@@ -37,7 +38,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 from pydantic import BeforeValidator, Field, StrictInt, StrictStr
 
-from malta.controller import Controller, CurrentLoop, Feedforward, Limits, stored_forces
+from malta.controller import Controller, CurrentLoop, Feedforward, Limits, Noise, stored_forces
 from malta.data import Finite, Machine, Quantity, Record, machine_module, plant_of, units_of, validated
 from malta.encodings import SUFFIXES as SUFFIXES
 from malta.encodings import content_sha256, decode, encode
@@ -110,6 +111,11 @@ class _Gains(Record):
     L: Matrix
 
 
+class _Noise(Record):
+    process: Vector
+    sensor: Vector
+
+
 class _Feedforward(Record):
     mass: Annotated[Finite, Field(gt=0)]
     z_grid: Vector
@@ -170,6 +176,7 @@ class GainFile(Record):
     signals: _SignalTable
     model: _Model
     gains: _Gains
+    noise: _Noise
     feedforward: _Feedforward
     current_loop: _CurrentLoop
     limits: _Limits
@@ -202,6 +209,7 @@ def document(controller: Controller, margins: Margins) -> dict[str, Any]:
         },
         "model": {key: getattr(c, key) for key in ("A", "B", "C", "Ad", "Bd", "Cd")},
         "gains": {key: getattr(c, key) for key in ("K", "Ki", "L")},
+        "noise": {"process": c.noise.process, "sensor": c.noise.sensor},
         "feedforward": {key: getattr(c.feedforward, key) for key in ("mass", "z_grid", "v0")},
         "current_loop": {key: getattr(c.current_loop, key) for key in ("Kp", "Ki", "sample_time")},
         "limits": {key: getattr(c.limits, key) for key in ("current", "voltage", "force")},
@@ -301,6 +309,7 @@ def _controller(file: GainFile, path: str | Path) -> Controller:
         "operating_point": {"x": (n0,), "u": (m,)},
         "feedforward": {"z_grid": (g,), "v0": (g, m)},
         "limits": {"current": (m,), "voltage": (m,), "force": (m,)},
+        "noise": {"process": (m,), "sensor": (p,)},
     }
     arrays = {
         table: {
@@ -317,6 +326,9 @@ def _controller(file: GainFile, path: str | Path) -> Controller:
     for key, limit in arrays["limits"].items():
         if not (limit > 0).all():
             raise InputError(path, f"limits.{key}", str(limit.tolist()), "limits above 0")
+    for key, variance in arrays["noise"].items():
+        if not (variance > 0).all():
+            raise InputError(path, f"noise.{key}", str(variance.tolist()), "variances above 0")
     return Controller(
         name=file.design.name,
         spec_sha256=file.design.spec_sha256,
@@ -328,6 +340,7 @@ def _controller(file: GainFile, path: str | Path) -> Controller:
         measurements=measurements,
         **arrays["model"],
         **arrays["gains"],
+        noise=Noise(**arrays["noise"]),
         feedforward=Feedforward(file.feedforward.mass, z_grid, arrays["feedforward"]["v0"]),
         current_loop=CurrentLoop(file.current_loop.Kp, file.current_loop.Ki, file.current_loop.sample_time),
         limits=Limits(**arrays["limits"]),

@@ -8,7 +8,7 @@ them: the machine moves by f(x, u, w + load(x)), and the controller is designed 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Protocol
 
 import casadi as ca
@@ -71,6 +71,33 @@ class Actuator:
 
 
 @dataclass(frozen=True, eq=False)
+class Drive:
+    """The windings behind the inputs: in the axes of their transformation, and as phases on an inverter.
+
+    In every axis u = R i + L (i' - coupling(x, i)) + emf(x), with R and L of the actuator. T(x), phases x axes, turns
+    axis quantities into phase quantities; its pseudo-inverse turns them back.
+    """
+
+    axes: tuple[Signal, ...]  # currents, A
+    phases: tuple[Signal, ...]  # currents, A
+    command: CasadiFn  # currents of the inputs, A -> currents of the axes, A
+    force: CasadiFn  # currents of the axes, A -> inputs
+    emf: CasadiFn  # x -> induced voltages of the axes, V
+    coupling: CasadiFn  # (x, i) -> what moving axes add to i', A/s
+    to_phases: CasadiFn  # x -> T(x)
+    to_axes: CasadiFn  # x -> T(x)^+
+    peak: CasadiFn  # axis quantities -> largest phase quantity of each group of axes
+    groups: tuple[tuple[int, ...], ...]  # axes that share phases
+    stars: tuple[tuple[int, ...], ...]  # phases that share a star point
+    weight: tuple[float, ...]  # power = sum of weight u i over the axes
+    link_voltage: float  # V, of the supply
+    link_capacitance: float  # F
+    supply_resistance: float  # ohm
+    pwm_step: float  # smallest change of a duty cycle
+    dead_share: float  # share of a PWM period that dead time takes
+
+
+@dataclass(frozen=True, eq=False)
 class Plant:
     """A machine: equations of motion that CasADi can trace, and the names and units of its signals.
 
@@ -90,14 +117,20 @@ class Plant:
     load: CasadiFn  # x -> w of gravity and cogging
     position_of: CasadiFn  # y -> controlled positions; the inverse of h at rest
     actuator: Actuator
+    drive: Drive
     contacts: tuple[str, ...]  # what the moving part may touch
     contact: CasadiFn  # x -> share of each clearance that is used up; 1 at contact
+    cushioned: tuple[bool, ...]  # which contacts the touchdown bearings hold
+    bearing: CasadiFn  # x -> w of the touchdown bearings; zero without contact
+    sense: CasadiFn  # (x, errors) -> y as the sensors' own signals give it, before noise
+    sensor_errors: tuple[Signal, ...]
     noise: tuple[float, ...]  # of each sensor, rms of a sample, in the unit of each output
     resolution: tuple[float, ...]  # of each sensor; 0 where it has none to speak of
     mass: float  # moved by the `thrust` input, for the feedforward m z''
     thrust: str  # the input that drives the stroke
     stroke: str  # the output that the stroke moves
     travel: float  # of that output, either way, m
+    variant: Callable[[Any], Plant]  # the same machine with other parameters
 
     @property
     def controlled(self) -> tuple[int, ...]:
@@ -164,6 +197,23 @@ def readonly(array: ArrayLike) -> FloatArray:
     copy = np.array(array, dtype=float)
     copy.flags.writeable = False
     return copy
+
+
+def traced(name: str, arguments: list[Any], expression: Any) -> CasadiFn:
+    """A CasADi function, called with its arguments alone, of an expression that may hold symbols of parameters."""
+    body = ca.cse(expression)
+    known = {symbol.__hash__() for a in arguments for symbol in ca.symvar(a)}
+    free = [symbol for symbol in ca.symvar(body) if symbol.__hash__() not in known]
+    function = ca.Function(name, [*arguments, *free], [body])
+    return lambda *given: function(*given, *free)
+
+
+def symbolic(parameters: Any, symbols: Mapping[str, Any]) -> Any:
+    """The record with CasADi symbols in place of numbers; its checks do not apply to them."""
+    record = object.__new__(type(parameters))
+    for f in fields(parameters):
+        object.__setattr__(record, f.name, symbols.get(f.name, getattr(parameters, f.name)))
+    return record
 
 
 def trim(plant: Plant, /, **positions: float) -> OperatingPoint:

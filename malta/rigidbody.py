@@ -50,7 +50,12 @@ def principal(q_r: Any, inertia: Sequence[float]) -> Any:
 
     Every axis across a body with Ixx = Iyy is a principal one, so its equations need no gamma.
     """
-    return ca.vertcat(q_r[:2], 0) if inertia[0] == inertia[1] else q_r
+    return ca.vertcat(q_r[:2], 0) if round_body(inertia) else q_r
+
+
+def round_body(inertia: Sequence[Any]) -> bool:
+    """Whether Ixx = Iyy, as numbers or as one symbol."""
+    return bool(ca.is_equal(ca.SX(inertia[0]), ca.SX(inertia[1])))
 
 
 def cardan_rates(q_r: Any, omega: Any, trig: Trig = EXACT) -> Any:
@@ -73,8 +78,8 @@ def acceleration(
     """
     q_B = principal(q_r, inertia)
     omega = rate_map(q_B, trig) @ dq_r
-    spin = ca.vertcat(0, 0, dq_r[2] if inertia[0] == inertia[1] else 0)
-    I_m = ca.SX(list(inertia))
+    spin = ca.vertcat(0, 0, dq_r[2] if round_body(inertia) else 0)
+    I_m = ca.vertcat(*inertia)
     domega = (T_B - ca.cross(omega - spin, I_m * omega)) / I_m
     return F_I / m, cardan_rates(q_B, domega - ca.jtimes(omega, q_r, dq_r), trig)
 

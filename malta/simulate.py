@@ -1,8 +1,8 @@
 """Nonlinear machine + gain file + scenario -> trajectory.
 
-The plant is integrated by Runge–Kutta steps between samples, its forces following their commands as first-order lags
-(exactly); at every sample the control law of controller.py runs. Both are CasADi functions, chained into one call for a
-block of samples. The controller is known only by its gain file's record; the plant may have other parameters.
+At every sample the control law of controller.py runs on what the sensors say; between samples the machine moves by
+Runge–Kutta steps. Both are the functions of machine.py, run by engine.py. The controller is known only by its gain
+file's record; the machine may have other parameters.
 """
 
 from __future__ import annotations
@@ -10,28 +10,58 @@ from __future__ import annotations
 import io
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import casadi as ca
 import numpy as np
 
-from malta import references
-from malta.controller import Controller, law
-from malta.data import plant_of
+from malta import machine, references
+from malta.controller import Controller, gains_of
+from malta.data import plant_of, units_of
+from malta.engine import Engine, compiled_engine, evaluate, feedforward_table, library, source, virtual_engine
 from malta.errors import InputError
 from malta.files import replace_files
-from malta.plant import Plant, readonly
+from malta.machine import FIDELITIES, Fidelity, Parts, Setup
+from malta.noise import keys, normals
+from malta.plant import Plant, Signal, readonly
 from malta.references import Profile, Reference
 
 if TYPE_CHECKING:
     from malta.plant import FloatArray
 
 LONGEST = 4_000_000  # samples: 200 s at 20 kHz, 2 GB of trajectory
-BLOCK = 250  # samples in one call of the chained function
+BLOCK = 250  # samples in one call of the virtual machine's chain
+PORTION = 20_000  # samples between looks at how the run goes
 RISE = 16.2e-3  # s, 10-90 %: the published stroke, Fig. 12
+
+Estimator = Literal["steady-state", "kalman", "extended"]
+ESTIMATORS: tuple[Estimator, ...] = ("steady-state", "kalman", "extended")
+EngineChoice = Literal["auto", "compiled", "virtual machine"]
+FaultKind = Literal[
+    "lost sample", "stuck sensor", "biased sensor", "noisy sensor", "open phase", "link sag", "missed step"
+]
+
+
+class Correction(NamedTuple):
+    """An outer loop, slower than the controller, that moves its reference: (t, true outputs) -> added to p*."""
+
+    every: float  # s
+    update: Callable[[float, FloatArray], FloatArray]
+
+
+class Fault(NamedTuple):
+    """Something that breaks at `at` (s) and is whole again at `until` (s)."""
+
+    kind: FaultKind
+    at: float  # s
+    until: float = math.inf  # s
+    what: str = ""  # the sensor (an output's name) or the phase that it concerns
+    size: float = (
+        0.0  # bias, in the output's unit; factor of the noise; share of the link voltage that is missing
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,28 +72,46 @@ class Scenario:
     duration: float  # s
     reference: Callable[[Plant], Reference]
     start: Mapping[str, float] = field(default_factory=dict)  # states (SI) unlike the reference's first
+    cold: bool = False  # starts without current, and with an observer that takes the machine to be at zero
     disturbance: Callable[[FloatArray], FloatArray] | None = None  # t (k,) -> wrench, k x 6, N and N m
     noise: float = 0.0  # sensor noise in multiples of the plant's
     quantize: bool = False  # sensors resolve what the plant's do
+    sensor_errors: Mapping[str, float] | None = None  # of the sensors' own signals; None: y = p exactly
     seed: int = 0
+    run: int = 0  # of a campaign: its noise depends on seed and run alone
     delay: int | None = None  # samples between measurement and force; None: the machine's own
     substeps: int = 4  # Runge–Kutta steps a sample
+    fidelity: Fidelity = "dq"  # what makes the forces, see machine.py
+    real_pwm: bool = False  # duty cycles in steps, dead time (fidelity phase)
+    bearing: bool = False  # touchdown bearings push back; without, a touchdown ends the run
+    estimator: Estimator = "steady-state"
+    scheduled: bool = False  # C(z) of the measured z in the steady-state filter
+    faults: tuple[Fault, ...] = ()
+    correction: Correction | None = None
+    changes: tuple[
+        tuple[float, Mapping[str, float]], ...
+    ] = ()  # s: parameters of the machine (SI) from then on
 
     def __post_init__(self) -> None:
+        where = f"scenario {self.name}"
         for name, low, whole in (
             ("duration", 1e-12, False),
             ("noise", 0, False),
             ("substeps", 1, True),
             ("delay", 0, True),
             ("seed", 0, True),
+            ("run", 0, True),
         ):
             value = getattr(self, name)
             if whole and value is not None and not isinstance(value, int):
-                raise InputError(f"scenario {self.name}", name, repr(value), "a whole number")
+                raise InputError(where, name, repr(value), "a whole number")
             if value is not None and not (math.isfinite(value) and value >= low):
-                raise InputError(
-                    f"scenario {self.name}", name, str(value), "a number above 0" if low else "0 or more"
-                )
+                raise InputError(where, name, str(value), "a number above 0" if low else "0 or more")
+        for name, known in (("fidelity", FIDELITIES), ("estimator", ESTIMATORS)):
+            if getattr(self, name) not in known:
+                raise InputError(where, name, repr(getattr(self, name)), "one of " + ", ".join(known))
+        if self.real_pwm and self.fidelity != "phase":
+            raise InputError(where, "real_pwm", f"fidelity {self.fidelity}", "fidelity phase")
 
     @classmethod
     def stroke(
@@ -73,14 +121,12 @@ class Scenario:
         rise: float = RISE,
         profile: Profile = "logistic",
         duration: float | None = None,
-        noise: float = 0.0,
-        quantize: bool = False,
-        seed: int = 0,
-        delay: int | None = None,
+        **options: Any,
     ) -> Scenario:
         """Move by `distance` (m), symmetrically about the middle, in `rise` (s, 10-90 %). Figs 12 and 13.
 
         duration : s; None gives six times the rise, at least 0.1 s, so that the move is whole
+        options : fields of the scenario, as noise=1.0
         """
         references.check_rise(rise)
         duration = max(0.1, 6 * rise) if duration is None else duration
@@ -94,7 +140,7 @@ class Scenario:
             centre=duration / 2,
             profile=profile,
         )
-        return cls("stroke", duration, reference, noise=noise, quantize=quantize, seed=seed, delay=delay)
+        return cls("stroke", duration, reference, **options)
 
 
 class Verdict(NamedTuple):
@@ -110,12 +156,16 @@ class Verdict(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """Labelled time series, one row a sample, up to the verdict. SI."""
+    """Labelled time series, one row a sample, up to the verdict. SI.
+
+    Axis currents, their voltages and the link voltage are empty in fidelity `force`; phases in all but `phase`.
+    """
 
     plant: Plant
     controller: Controller
     scenario: Scenario
     verdict: Verdict
+    engine: str  # what ran it: "compiled" or "virtual machine"
     t: FloatArray  # k
     reference: FloatArray  # k x p
     p: FloatArray  # k x p, true outputs
@@ -125,9 +175,15 @@ class Trajectory:
     v: FloatArray  # k x m, commanded forces, N
     force: FloatArray  # k x m, acting forces, N
     saturated: FloatArray  # k x m, 1 where the command was limited
+    contact: FloatArray  # k x contacts, share of each clearance that is used up
+    i: FloatArray  # k x axes, A
+    u: FloatArray  # k x axes, V
+    link: FloatArray  # k x 1, V
+    i_phase: FloatArray  # k x phases, A
+    duty: FloatArray  # k x phases, 0 to 1
 
     def __post_init__(self) -> None:
-        for name in ("t", "reference", "p", "y", "x", "xi_hat", "v", "force", "saturated"):
+        for name in ("t", "reference", *SERIES):
             object.__setattr__(self, name, readonly(getattr(self, name)))
 
     @property
@@ -135,224 +191,385 @@ class Trajectory:
         """Commanded currents, A, k x m: v over the force constants that the controller believes in."""
         return np.asarray(self.v / np.array(plant_of(self.controller.parameters).actuator.force_constant))
 
+    @property
+    def copper_loss(self) -> FloatArray:
+        """Heat in the windings, W, k: sum of R i^2 over phases or, with its weights, over axes."""
+        if self.i_phase.size:
+            return np.asarray(self.plant.actuator.R * (self.i_phase**2).sum(axis=1))
+        return np.asarray(self.plant.actuator.R * self.axis_currents**2 @ np.array(self.plant.drive.weight))
 
-def simulate(plant: Plant, controller: Controller, scenario: Scenario) -> Trajectory:
+    @property
+    def electrical_power(self) -> FloatArray:
+        """Power into the windings, W, k; empty in fidelity `force`."""
+        return (
+            np.asarray((self.u * self.i) @ np.array(self.plant.drive.weight)) if self.i.size else self.i[:, 0]
+        )
+
+    @property
+    def axis_currents(self) -> FloatArray:
+        """Currents of the transformation's axes, A, k x axes; in fidelity `force` what the forces take."""
+        if self.i.size:
+            return self.i
+        drive, constants = self.plant.drive, np.array(self.plant.actuator.force_constant)
+        symbol = ca.SX.sym("i", len(constants))
+        axes = ca.Function("axes", [symbol], [ca.densify(drive.command(symbol))])
+        return evaluate(axes.map(len(self.force)), self.force / constants)[0]
+
+
+SERIES = tuple(
+    ["p", "y", "x", "xi_hat", "v", "force", "saturated", "contact", "i", "u", "link", "i_phase", "duty"]
+)
+
+
+def simulate(
+    plant: Plant,
+    controller: Controller,
+    scenario: Scenario,
+    *,
+    engine: EngineChoice = "auto",
+    progress: Callable[[float], None] | None = None,
+) -> Trajectory:
     """Run a scenario. Touchdown and divergence end it early and are named in the verdict, not raised.
+
+    engine : "auto" compiles where there is a C compiler
+    progress : told the share that is done, now and then; Ctrl-C ends the run there and keeps what was computed
 
     Raises InputError when plant and controller do not belong together or the scenario does not fit the plant.
     """
     believed = plant_of(controller.parameters)
     if (plant.inputs, plant.outputs) != (believed.inputs, believed.outputs):
         raise InputError("simulate", "controller", f"gains of a {believed.name}", f"gains of a {plant.name}")
-    delay = plant.actuator.delay(controller.sample_time) if scenario.delay is None else scenario.delay
-    samples = max(1, round(scenario.duration / controller.sample_time))
-    if samples > LONGEST:
-        raise InputError(f"scenario {scenario.name}", "duration", f"{samples} samples", f"at most {LONGEST}")
-    t = np.arange(samples) * controller.sample_time
-    motion = scenario.reference(plant)(t)
-    inputs = np.hstack(
-        [motion.p, *state_references(believed, controller, motion), *_surroundings(plant, scenario, t)]
-    )
-    chain = chain_of(
+    setup = setup_of(plant, controller, scenario)
+    t, motion, given = sampled(plant, controller, scenario, setup)
+    samples = len(t)
+    noise = _noise(plant, scenario, t)
+    x, xi_pred, current = beginning(plant, controller, scenario, given[0])
+    first = machine.initial(plant, controller, setup, ca.DM(x), ca.DM(xi_pred), ca.DM(current))
+    state = np.array(ca.evalf(first)).ravel()
+    observer = _observer(plant, controller, scenario, setup) if setup.outside else None
+    stages = _stages(plant, scenario, controller.sample_time)
+    stops = _stops(scenario, controller.sample_time, samples, [first for first, _ in stages])
+    parts: list[FloatArray] = []
+    verdict, kind, done = None, "", 0
+    try:
+        for stop in stops:
+            now = next(p for first, p in reversed(stages) if first <= done)
+            run = engine_of(now, controller, setup, scenario.substeps, _errors(scenario), engine)
+            part = given[done:stop]
+            if observer is None:
+                state, rows = run.run(state, part, noise[done:stop])
+            else:
+                state, rows = observer(run, state, part, noise[done:stop])
+            rows, verdict = _judged(plant, controller, setup, rows, t[done:stop])
+            parts.append(rows)
+            kind, done = run.kind, done + len(rows)
+            if verdict is not None:
+                break
+            if progress is not None:
+                progress(done / samples)
+            if scenario.correction is not None and done < samples:
+                offset = scenario.correction.update(
+                    float(t[done]), _outputs(plant, setup, controller, rows[-1])
+                )
+                shifted = motion._replace(p=motion.p + offset)
+                given[done:] = _given(plant, controller, scenario, setup, shifted, t)[done:]
+    except KeyboardInterrupt:
+        if not parts:
+            raise
+        verdict = Verdict("interrupted", float(t[done - 1]))
+    table = np.concatenate(parts) if len(parts) > 1 else parts[0]
+    sizes = machine.layout(plant, controller, setup).row
+    columns = dict(zip(sizes, np.split(table, np.cumsum([*sizes.values()])[:-1], axis=1), strict=True))
+    if verdict is None and setup.bearing:
+        verdict = _touched(plant, columns["contact"], t)
+    return Trajectory(
         plant,
         controller,
-        delay,
-        scenario.substeps,
-        min(BLOCK, samples),
-        quantize=scenario.quantize,
-        disturbed=scenario.disturbance is not None,
+        scenario,
+        verdict or Verdict("completed", scenario.duration),
+        kind,
+        t=t[:done],
+        reference=given[:done, : len(plant.outputs)],
+        **{name: columns.get(name, np.empty((done, 0))) for name in SERIES},
     )
-    block = chain.size2_in(1)
-    state = _start(plant, believed, controller, scenario, inputs[0], delay)
-    layout = _columns(plant, controller)
-    table = np.empty((samples, sum(size for _, size in layout)))
-    verdict = Verdict("completed", scenario.duration)
-    done = 0
-    while done < samples:
-        count = min(block, samples - done)
-        state = _run(chain, state, inputs[done : done + count], table[done : done + count])
-        end = _first_stop(plant, table[done : done + count])
-        if end is not None:
-            done += end[0] + 1
-            verdict = Verdict(end[1], float(t[done - 1]))
-            break
-        done += count
-    columns = np.split(table[:done], np.cumsum([size for _, size in layout]), axis=1)
-    named = {name: column for (name, _), column in zip(layout, columns, strict=False) if name != "contact"}
-    return Trajectory(plant, controller, scenario, verdict, t=t[:done], reference=motion.p[:done], **named)
 
 
-@lru_cache(maxsize=8)  # building takes as long as a run; records compare by identity, so no hit is stale
-def chain_of(
-    plant: Plant, c: Controller, delay: int, substeps: int, block: int, *, quantize: bool, disturbed: bool
-) -> ca.Function:
-    """`_step` chained over a block of samples: (state, inputs) -> (states, rows)."""
-    return _step(plant, c, delay, substeps, quantize=quantize, disturbed=disturbed).mapaccum("chain", block)
+def sampled(
+    plant: Plant, c: Controller, scenario: Scenario, setup: Setup
+) -> tuple[FloatArray, references.Motion, FloatArray]:
+    """Times of the samples, the motion that is asked for, and what every sample is given."""
+    samples = max(1, round(scenario.duration / c.sample_time))
+    if samples > LONGEST:
+        raise InputError(f"scenario {scenario.name}", "duration", f"{samples} samples", f"at most {LONGEST}")
+    t = np.arange(samples) * c.sample_time
+    motion = scenario.reference(plant)(t)
+    return t, motion, _given(plant, c, scenario, setup, motion, t)
 
 
-def _run(chain: ca.Function, state: FloatArray, given: FloatArray, table: FloatArray) -> FloatArray:
-    """Run a block and fill its rows of the table; the state after it. A short last block is padded."""
-    padding = chain.size2_in(1) - len(given)
-    states, rows = _evaluate(chain, state, np.vstack([given, np.repeat(given[-1:], padding, axis=0)]))
-    table[:] = rows[: len(table)]
-    last: FloatArray = states[len(table) - 1]
-    return last
-
-
-def _evaluate(function: ca.Function, *arguments: FloatArray) -> list[FloatArray]:
-    """Call a dense CasADi function on numpy's own memory, a row for each of its columns: no conversion to DM."""
-    results = [np.empty(function.size_out(i)[::-1]) for i in range(function.n_out())]
-    buffer, evaluate = function.buffer()
-    inputs = [np.ascontiguousarray(array, dtype=float) for array in arguments]
-    for i, array in enumerate(inputs):
-        buffer.set_arg(i, array.data)
-    for i, array in enumerate(results):
-        buffer.set_res(i, array.data)
-    evaluate()
-    return results
-
-
-def _columns(plant: Plant, controller: Controller) -> list[tuple[str, int]]:
-    """What one sample leaves behind, in order."""
-    m, p = len(plant.inputs), len(plant.outputs)
-    return [
-        ("x", len(plant.states)),
-        ("p", p),
-        ("y", p),
-        ("xi_hat", len(controller.states)),
-        ("v", m),
-        ("force", m),
-        ("saturated", m),
-        ("contact", len(plant.contacts)),
-    ]
-
-
-def _motion(plant: Plant, Ts: float, substeps: int, *, disturbed: bool) -> ca.Function:
-    """One sample of the machine: (x, force, v, w) -> (x, force), v held.
-
-    The forces' lag is solved exactly, force = v + (force_0 - v) e^(-w_c t); the mover takes `substeps` Runge–Kutta
-    steps.
-    """
-    x0, force, v = (
-        ca.SX.sym(name, size)
-        for name, size in (("x", len(plant.states)), ("force", len(plant.inputs)), ("v", len(plant.inputs)))
+def setup_of(plant: Plant, c: Controller, s: Scenario) -> Setup:
+    """What of a scenario shapes the simulated functions."""
+    kinds = {fault.kind for fault in s.faults}
+    if "open phase" in kinds and s.fidelity != "phase":
+        found = f"an open phase at fidelity {s.fidelity}"
+        raise InputError(f"scenario {s.name}", "faults", found, "fidelity phase")
+    return Setup(
+        fidelity=s.fidelity,
+        delay=plant.actuator.delay(c.sample_time) if s.delay is None else s.delay,
+        quantize=s.quantize,
+        disturbed=s.disturbance is not None,
+        bearing=s.bearing,
+        sensed=s.sensor_errors is not None,
+        faulty=bool(kinds - {"biased sensor", "noisy sensor"}),
+        scheduled=s.scheduled,
+        real_pwm=s.real_pwm,
+        outside=s.estimator != "steady-state",
     )
-    w = ca.SX.sym("w", len(plant.disturbances) if disturbed else 0)
-    outside = w if disturbed else ca.SX(len(plant.disturbances), 1)  # structural zeros cost nothing
-
-    def rate(x: ca.SX, f: ca.SX) -> ca.SX:
-        return plant.f(x, f, plant.load(x) + outside)
-
-    h = Ts / substeps
-    decay = math.exp(-plant.actuator.crossover * h / 2)
-    x, lag = x0, force - v
-    for _ in range(substeps):
-        f0, f1, f2 = v + lag, v + decay * lag, v + decay**2 * lag
-        k1 = rate(x, f0)
-        k2 = rate(x + h / 2 * k1, f1)
-        k3 = rate(x + h / 2 * k2, f1)
-        k4 = rate(x + h * k3, f2)
-        x, lag = x + h / 6 * (k1 + 2 * (k2 + k3) + k4), decay**2 * lag
-    return ca.Function("motion", [x0, force, v, w], [x, v + lag])
 
 
-def _step(
-    plant: Plant, c: Controller, delay: int, substeps: int, *, quantize: bool, disturbed: bool
-) -> ca.Function:
-    """(state, inputs) -> (state after a sample, row of `_columns`), for mapaccum.
+def _errors(scenario: Scenario) -> tuple[tuple[str, float], ...]:
+    return tuple(sorted((scenario.sensor_errors or {}).items()))
 
-    state = x, force, xi_pred, e, frozen, forces under way (the oldest first)
-    inputs = p*, xi*, v_ff, noise, wrench
-    """
-    m, p, n = len(plant.inputs), len(plant.outputs), len(c.states)
-    x, force, xi_pred, e, frozen, under_way = (
-        ca.SX.sym("s", size) for size in (len(plant.states), m, n, p, p, m * delay)
+
+@dataclass(frozen=True)
+class _Shape:
+    """A plant and controller, equal to another one where the same compiled text serves both."""
+
+    key: tuple[Any, ...]
+    plant: Plant = field(compare=False)
+    controller: Controller = field(compare=False)
+    setup: Setup
+
+
+def shape_of(plant: Plant, c: Controller, setup: Setup) -> _Shape:
+    """What the compiled functions of a plant and a controller depend on, beside numbers that they are given."""
+    variant, par = plant.variant, plant.parameters
+    kin = (variant.func, *sorted(variant.keywords.items())) if isinstance(variant, partial) else (variant,)
+    twins = tuple(
+        getattr(par, name) == getattr(par, f.metadata["twin"])
+        for name, f in par.__dataclass_fields__.items()
+        if f.metadata.get("twin")
     )
-    p_ref, xi_ref, v_ff, noise, w = (
-        ca.SX.sym("u", size) for size in (p, n, m, p, len(plant.disturbances) if disturbed else 0)
+    patterns = tuple(
+        (m.shape, *m.sparsity().get_triplet()[0], *m.sparsity().get_triplet()[1])
+        for m in gains_of(c).values()
     )
-    v0 = ca.SX.sym("v0", m)
-    true = plant.h(x, force)
-    y = _quantized(true + noise, plant.resolution) if quantize else true + noise
-    xi_pred_next, e_next, frozen_next, v, xi_hat = law(c)(xi_pred, e, frozen, y, p_ref, xi_ref, v_ff, v0)
-    # The gain file's force constants turn forces into currents, the machine limits those and makes its own forces.
-    current = v / np.array(plant_of(c.parameters).actuator.force_constant)
-    limit = plant.actuator.current_limit
-    commanded = ca.fmax(ca.fmin(current, limit), -limit) * np.array(plant.actuator.force_constant)
-    queue = ca.vertcat(under_way, commanded)
-    x_next, force_next = _motion(plant, c.sample_time, substeps, disturbed=disturbed)(x, force, queue[:m], w)
-    state = ca.vertcat(x, force, xi_pred, e, frozen, under_way)
-    given = ca.vertcat(p_ref, xi_ref, v_ff, noise, w)
-    state_next = ca.vertcat(x_next, force_next, xi_pred_next, e_next, frozen_next, queue[m:])
-    row = ca.vertcat(x, true, y, xi_hat, v, force, frozen_next, plant.contact(x))
-    rest = ca.Function("rest", [state, given, v0], [state_next, row])
-    # v0(z) is a table, which scalar expressions cannot look up: only the look-up is left outside of them.
-    grid = c.feedforward.z_grid
-    position = y[plant.stroke_output]
-    where = ca.Function("where", [state, given], [ca.fmax(ca.fmin(position, grid[-1]), grid[0])])
-    table = ca.interpolant("table", "linear", [grid], c.feedforward.v0.ravel())
-    S, U = ca.MX.sym("state", state.numel()), ca.MX.sym("given", given.numel())
-    return ca.Function("step", [S, U], rest(S, U, table(where(S, U))))
+    return _Shape((kin, twins, patterns, c.parameters), plant, c, setup)
 
 
-def _quantized(y: ca.SX, resolution: tuple[float, ...]) -> ca.SX:
-    return ca.vertcat(*(r * ca.floor(y[i] / r + 0.5) if r else y[i] for i, r in enumerate(resolution)))
+@lru_cache(maxsize=32)
+def compiled_shape(
+    shape: _Shape, lanes: int = 1, digest: ca.Function | None = None
+) -> tuple[Any, Parts] | None:
+    """The library for a shape; None where it cannot be compiled."""
+    c = shape.controller
+    p = machine.parts(shape.plant, c, shape.setup, machine.numbers(shape.plant, c, 1), constant=False)
+    lib = library(source(p, digest), lanes)
+    return None if lib is None else (lib, p)
 
 
-def state_references(
-    believed: Plant, c: Controller, motion: references.Motion
-) -> tuple[FloatArray, FloatArray]:
-    """xi* = (P(z*)^-1 p*, its derivative, the stored feedforward) and v_ff = mass z*'' on the thrust."""
-    p, dp = ca.SX.sym("p", len(c.measurements)), ca.SX.sym("dp", len(c.measurements))
-    q = believed.position_of(p)
-    inverse = ca.Function("inverse", [p, dp], [ca.densify(ca.vertcat(q, ca.jtimes(q, p, dp)))])
-    (xi_ref,) = _evaluate(inverse.map(len(motion.p)), motion.p, motion.dp)
+@lru_cache(maxsize=32)  # building takes as long as a run; records compare by identity, so no hit is stale
+def engine_of(
+    plant: Plant,
+    c: Controller,
+    setup: Setup,
+    substeps: int,
+    errors: tuple[tuple[str, float], ...] = (),
+    choice: EngineChoice = "auto",
+) -> Engine:
+    """What runs the control periods of this machine: compiled where possible, else CasADi's virtual machine."""
+    values = machine.numbers(plant, c, substeps, dict(errors))
+    if choice != "virtual machine":
+        found = compiled_shape(shape_of(plant, c, setup))
+        if found is not None:
+            lib, p = found
+            ff = c.feedforward
+            table = feedforward_table(ff.z_grid, ff.v0)
+            return compiled_engine(lib.run, p, machine.flat(values), substeps, table)
+        if choice == "compiled":
+            raise InputError("simulate", "engine", "no C compiler that works", "cc, gcc or clang, or $CC")
+    p = machine.parts(plant, c, setup, values, constant=True)
+    return virtual_engine(machine.chained(p, c, substeps, 1 if setup.outside else BLOCK))
+
+
+def _observer(plant: Plant, c: Controller, scenario: Scenario, setup: Setup) -> Any:
+    from malta.estimate import observer  # filterpy takes a while to import
+
+    return observer(plant, c, setup, scenario.estimator, scenario.substeps, scenario.sensor_errors)
+
+
+def _stages(plant: Plant, scenario: Scenario, Ts: float) -> list[tuple[int, Plant]]:
+    """From which sample on which machine is simulated."""
+    stages = [(0, plant)]
+    for at, values in sorted(scenario.changes, key=lambda change: change[0]):
+        known = units_of(plant.parameters)
+        for name in values:
+            if name not in known:
+                raise InputError(
+                    f"scenario {scenario.name}", f"changes.{name}", "an unknown parameter", " ".join(known)
+                )
+        before = stages[-1][1]
+        par: Any = replace(before.parameters, **values)
+        stages.append((max(0, round(at / Ts)), before.variant(par)))
+    return stages
+
+
+def _stops(scenario: Scenario, Ts: float, samples: int, changes: list[int]) -> list[int]:
+    """Samples at which the run pauses: to look, to correct the reference, to change the machine."""
+    every = PORTION if scenario.correction is None else max(1, round(scenario.correction.every / Ts))
+    marks = set(range(every, samples, every)) | set(range(PORTION, samples, PORTION)) | {samples}
+    return sorted(marks | {k for k in changes if 0 < k < samples})
+
+
+def _judged(
+    plant: Plant, c: Controller, setup: Setup, rows: FloatArray, t: FloatArray
+) -> tuple[FloatArray, Verdict | None]:
+    """The rows up to the first at which the machine touches something or its state is no number."""
+    contact = _columns(plant, c, setup, rows, "contact")
+    lost = np.atleast_1d(~np.isfinite(rows).all(axis=1))
+    touching = contact >= 1
+    if setup.bearing:  # the touchdown bearings hold it: only what has no bearing ends the run
+        touching = touching & ~np.array(plant.cushioned)
+    stopped = np.flatnonzero(lost | touching.any(axis=1))
+    if not len(stopped):
+        return rows, None
+    k = int(stopped[0])
+    name = "diverged" if lost[k] else plant.contacts[int(np.where(touching[k], contact[k], 0).argmax())]
+    return rows[: k + 1], Verdict(name, float(t[k]))
+
+
+def _touched(plant: Plant, contact: FloatArray, t: FloatArray) -> Verdict | None:
+    """With touchdown bearings: None where the mover stayed off them, or lifted off and is free at the end."""
+    touching = contact >= 1
+    if not touching.any():
+        return None
+    if touching[0].any():  # a lift-off
+        if not touching[-1].any():
+            return None
+        return Verdict("not lifted", float(t[len(contact) - 1]))
+    k = int(touching.any(axis=1).argmax())
+    return Verdict(plant.contacts[int(contact[k].argmax())], float(t[k]))
+
+
+def _columns(plant: Plant, c: Controller, setup: Setup, rows: FloatArray, name: str) -> FloatArray:
+    sizes = machine.layout(plant, c, setup).row
+    first = sum(size for key, size in list(sizes.items())[: list(sizes).index(name)])
+    return rows[..., first : first + sizes[name]]
+
+
+def _outputs(plant: Plant, setup: Setup, c: Controller, row: FloatArray) -> FloatArray:
+    return _columns(plant, c, setup, row, "p")
+
+
+def _given(
+    plant: Plant,
+    c: Controller,
+    scenario: Scenario,
+    setup: Setup,
+    motion: references.Motion,
+    t: FloatArray,
+) -> FloatArray:
+    """What every sample is given, in the order of machine.layout."""
+    v_ff = feedforward(c, motion)
+    past = [np.vstack([np.repeat(v_ff[:1], age, axis=0), v_ff[:-age]]) for age in range(c.delay, 0, -1)]
+    parts = {"p_ref": motion.p, "dp_ref": motion.dp, "v_ff": v_ff}
+    if past:
+        parts["v_past"] = np.hstack(past)
+    sizes = machine.layout(plant, c, setup).given
+    if scenario.disturbance is not None:
+        parts["w"] = _wrench(plant, scenario, t)
+    if setup.faulty:
+        parts |= _fault_flags(plant, scenario, sizes, t)
+    parts |= {name: np.zeros((len(t), size)) for name, size in sizes.items() if name not in parts}
+    return np.hstack([parts[name] for name in sizes])
+
+
+def feedforward(c: Controller, motion: references.Motion) -> FloatArray:
+    """v_ff = mass z*'' on the thrust, N, k x m."""
+    believed = plant_of(c.parameters)
     v_ff = np.zeros((len(motion.p), len(c.forces)))
     v_ff[:, believed.thrust_input] = c.feedforward.mass * motion.ddp[:, believed.stroke_output]
-    past = [np.vstack([np.repeat(v_ff[:1], age, axis=0), v_ff[:-age]]) for age in range(c.delay, 0, -1)]
-    return np.hstack([xi_ref, *past]), v_ff
+    return v_ff
 
 
-def _surroundings(plant: Plant, scenario: Scenario, t: FloatArray) -> list[FloatArray]:
-    """Sensor noise, and the external wrench if there is one."""
-    rng = np.random.default_rng(scenario.seed)
-    noise = scenario.noise * np.array(plant.noise) * rng.standard_normal((len(t), len(plant.outputs)))
-    if scenario.disturbance is None:
-        return [noise]
+def _wrench(plant: Plant, scenario: Scenario, t: FloatArray) -> FloatArray:
+    assert scenario.disturbance is not None
     wrench = np.asarray(scenario.disturbance(t), dtype=float)
     shape = (len(t), len(plant.disturbances))
     if wrench.shape != shape or not np.isfinite(wrench).all():
-        raise InputError(
-            f"scenario {scenario.name}", "disturbance", f"shape {wrench.shape}", f"finite, shape {shape}"
-        )
-    return [noise, wrench]
+        found = f"shape {wrench.shape}"
+        raise InputError(f"scenario {scenario.name}", "disturbance", found, f"finite, shape {shape}")
+    return wrench
 
 
-def _start(
-    plant: Plant, believed: Plant, c: Controller, scenario: Scenario, first: FloatArray, delay: int
-) -> FloatArray:
-    """On the reference and moving with it, or as the scenario says; the observer knows it, and v0 acts."""
+def _during(fault: Fault, t: FloatArray) -> FloatArray:
+    return np.asarray((t >= fault.at) & (t < fault.until))
+
+
+def _index(scenario: Scenario, kind: str, name: str, known: tuple[Any, ...]) -> int:
+    names = [signal.name for signal in known]
+    if name not in names:
+        raise InputError(f"scenario {scenario.name}", kind, repr(name), "one of " + " ".join(names))
+    return names.index(name)
+
+
+def _fault_flags(
+    plant: Plant, scenario: Scenario, sizes: Mapping[str, int], t: FloatArray
+) -> dict[str, FloatArray]:
+    flags: dict[str, FloatArray] = {
+        name: np.zeros((len(t), sizes[name])) for name in ("stuck", "missed", "sag", "open")
+    }
+    for fault in scenario.faults:
+        during = _during(fault, t)
+        if fault.kind == "lost sample":
+            flags["stuck"][during] = 1
+        elif fault.kind == "stuck sensor":
+            flags["stuck"][during, _index(scenario, fault.kind, fault.what, plant.outputs)] = 1
+        elif fault.kind == "missed step":
+            flags["missed"][during] = 1
+        elif fault.kind == "link sag":
+            if not 0 <= fault.size < 1:
+                raise InputError(
+                    f"scenario {scenario.name}", fault.kind, f"{fault.size:g}", "a share from 0 to 1"
+                )
+            flags["sag"][during] = fault.size
+        elif fault.kind == "open phase":
+            flags["open"][during, _index(scenario, fault.kind, fault.what, plant.drive.phases)] = 1
+    return flags
+
+
+def _noise(plant: Plant, scenario: Scenario, t: FloatArray) -> FloatArray:
+    """Sensor noise, with what faults add to it."""
+    scale = scenario.noise * np.array(plant.noise)
+    drawn = np.zeros((len(t), len(plant.outputs)))
+    if scale.any():
+        drawn = scale * normals(keys(scenario.seed, np.array([scenario.run]))[0], len(t), len(scale))
+    for fault in scenario.faults:
+        if fault.kind in ("biased sensor", "noisy sensor"):
+            column = _index(scenario, fault.kind, fault.what, plant.outputs)
+            during = _during(fault, t)
+            if fault.kind == "noisy sensor":
+                drawn[during, column] *= fault.size
+            else:
+                drawn[during, column] += fault.size
+    return drawn
+
+
+def beginning(plant: Plant, c: Controller, scenario: Scenario, first: FloatArray) -> tuple[FloatArray, ...]:
+    """x, xi_pred and the currents of the inputs (A) at the start.
+
+    On the reference and moving with it, or as the scenario says; the observer knows it, and v0 acts, unless it is cold.
+    """
     p, n = len(plant.outputs), len(c.states)
+    believed = plant_of(c.parameters)
     design = [s.name for s in plant.design_states]
-    rest = dict(zip(design, first[p : p + len(design)], strict=True)) | dict(scenario.start)
-    x = plant.at(**rest).x
-    xi_pred = np.zeros(n)
-    xi_pred[: len(design)] = x[list(plant.controlled)]
-    position = float(np.array(plant.h(ca.DM(x), 0))[plant.stroke_output, 0])
-    ratio = np.array(plant.actuator.force_constant) / np.array(believed.actuator.force_constant)
-    v0 = ratio * c.feedforward.at(position)
-    return np.concatenate([x, v0, xi_pred, np.zeros(2 * p), np.tile(v0, delay)])
-
-
-def _first_stop(plant: Plant, part: FloatArray) -> tuple[int, str] | None:
-    """The first sample of a block at which the machine touches something or its state is no number."""
-    contact = part[:, -len(plant.contacts) :]
-    lost = np.atleast_1d(~np.isfinite(part).all(axis=1))
-    stopped = np.flatnonzero(lost | (contact >= 1).any(axis=1))
-    if not len(stopped):
-        return None
-    k = int(stopped[0])
-    return k, "diverged" if lost[k] else plant.contacts[int(contact[k].argmax())]
+    moving = machine.state_reference(believed, ca.DM(first[:p]), ca.DM(first[p : 2 * p]))
+    x = plant.at(**(dict(zip(design, np.array(moving).ravel(), strict=True)) | dict(scenario.start))).x
+    xi_pred, current = np.zeros(n), np.zeros(len(plant.inputs))
+    if not scenario.cold:
+        xi_pred[: len(design)] = x[list(plant.controlled)]
+        position = float(np.array(plant.h(ca.DM(x), 0))[plant.stroke_output, 0])
+        current = c.feedforward.at(position) / np.array(believed.actuator.force_constant)
+    return x, xi_pred, current
 
 
 @dataclass(frozen=True)
@@ -405,9 +622,16 @@ def save(run: Trajectory, path: str | Path) -> Path:
         "v": run.plant.inputs,
         "force": run.plant.inputs,
         "saturated": run.plant.inputs,
+        "i": run.plant.drive.axes,
+        "u": tuple(Signal(s.name.replace("i_", "u_"), "V") for s in run.plant.drive.axes),
+        "link": (Signal("V_link", "V"),),
+        "i_phase": run.plant.drive.phases,
+        "duty": tuple(Signal(s.name.replace("i_", "d_"), "1") for s in run.plant.drive.phases),
     }
     arrays: dict[str, Any] = {"t": run.t, "verdict": np.array([run.verdict.name])}
     for name, signals in columns.items():
+        if not getattr(run, name).shape[1]:
+            continue  # not simulated at this fidelity
         arrays[name] = getattr(run, name)
         arrays[f"{name}_columns"] = np.array([f"{s.name} [{s.unit}]" for s in signals])
     buffer = io.BytesIO()

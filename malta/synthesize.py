@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, get_args
 import numpy as np
 from scipy import linalg
 
-from malta.controller import Controller, CurrentLoop, Feedforward, Limits, stored_forces
+from malta.controller import Controller, CurrentLoop, Feedforward, Limits, Noise, stored_forces
 from malta.errors import CheckError, InputError
 from malta.linearize import LinearModel
 from malta.plant import Actuator, Plant, trims
@@ -164,6 +164,7 @@ def lqg(
         Ki=Ki,
         L=L,
         feedforward=static_feedforward(plant),
+        noise=Noise(weights.process_variance, weights.sensor_variance),
         current_loop=CurrentLoop(Kp, Ki_current, actuator.sample_time),
         limits=Limits(
             current=np.full(axes, actuator.current_limit),

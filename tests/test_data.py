@@ -21,7 +21,9 @@ if TYPE_CHECKING:
     pass
 
 DATA = Path("data/tubular.toml")
-ASSUMED = {"l_S", "g", "F_c", "phi_c", "V_max", "I_max", "T_d", "s_r", "s_z"}  # where the paper is silent
+ASSUMED = {"l_S", "g", "F_c", "phi_c", "V_max", "I_max", "T_d", "s_r", "s_z"} | {  # where the paper is silent
+    "k_t", "d_t", "R_dc", "f_clk", "t_dead"
+}  # fmt: skip
 TRUNCATION_STEP = 7  # bytes
 
 L_S = '{ value = 93.75,     unit = "mm", '

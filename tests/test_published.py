@@ -136,7 +136,9 @@ def test_stroke_of_table2_agrees_with_an_independent_simulation(designs: dict[st
     """16.2 ms, 0.24 mm, below 1 % overshoot and 10 um were found by a simulation independent of this project."""
     design = designs["table2"]
     figures = malta.stroke_figures(
-        malta.simulate(design.plant, design.controller, malta.Scenario.stroke(10e-3, delay=0))
+        malta.simulate(
+            design.plant, design.controller, malta.Scenario.stroke(10e-3, delay=0, fidelity="force")
+        )
     )
     assert figures.rise == pytest.approx(16.2e-3, abs=0.05e-3)
     assert figures.axial_error == pytest.approx(0.24e-3, abs=0.005e-3)

@@ -15,7 +15,8 @@ from scipy.integrate import solve_ivp
 import malta
 from malta import references
 from malta.controller import linear_law
-from malta.simulate import Scenario, save, state_references, stroke_figures
+from malta.machine import state_reference
+from malta.simulate import Scenario, feedforward, save, stroke_figures
 from malta.verify import loop
 
 if TYPE_CHECKING:
@@ -29,7 +30,15 @@ SP1 = {"x1": 1e-6, "y1": -0.7e-6, "x2": 0.4e-6, "y2": 0.9e-6}
 
 
 def _held(name: str, samples: int, start: dict[str, float] | None = None, **outputs: float) -> Scenario:
-    return Scenario(name, samples * 50e-6, lambda plant: references.hold(plant, **outputs), start or {})
+    duration = samples * 50e-6
+    return Scenario(
+        name, duration, lambda plant: references.hold(plant, **outputs), start or {}, fidelity="force"
+    )
+
+
+def _stroke(distance: float = 10e-3, **options: Any) -> Scenario:
+    """The stroke on first-order current loops: what linear theory and independent integrators are compared with."""
+    return Scenario.stroke(distance, **{"fidelity": "force"} | options)
 
 
 def _linear_response(design: Design, moved: dict[str, float], samples: int, delay: int) -> FloatArray:
@@ -89,7 +98,10 @@ def _independent_stroke(plant: Plant, design: Design, samples: int, delay: int) 
     output = ca.Function("output", [x_], [plant.h(x_, u_)])
     t = np.arange(samples) * c.sample_time
     motion = references.stroke(plant, -5e-3, 5e-3, 16.2e-3, 0.05)(t)
-    xi_ref, v_ff = state_references(plant, c, motion)
+    v_ff = feedforward(c, motion)
+    xi_ref = np.array(
+        [np.array(state_reference(plant, p, dp)).ravel() for p, dp in zip(*motion[:2], strict=True)]
+    )
     start = plant.at(z=motion.p[0, 4], z_dot=motion.dp[0, 4]).x
 
     def v0_at(z: float) -> FloatArray:
@@ -125,7 +137,7 @@ def _independent_stroke(plant: Plant, design: Design, samples: int, delay: int) 
 @pytest.mark.parametrize("delay", [0, 1])
 def test_a_stroke_equals_an_independent_integration(designs: dict[str, Design], delay: int) -> None:
     design = designs["calibrated"]
-    run = malta.simulate(design.plant, design.controller, replace(Scenario.stroke(10e-3), delay=delay))
+    run = malta.simulate(design.plant, design.controller, replace(_stroke(10e-3), delay=delay))
     samples = 1500  # past the stroke
     trace = _independent_stroke(design.plant, design, samples, delay)
     assert np.abs(run.x[:samples, :3] - trace[:, :3]).max() < 1e-9
@@ -137,9 +149,7 @@ def test_the_integrator_has_fourth_order(designs: dict[str, Design]) -> None:
     """One Runge–Kutta step a sample errs by less than 0.1 nm; each halving divides the error by about 16."""
     design = designs["calibrated"]
     runs = {
-        n: malta.simulate(design.plant, design.controller, replace(Scenario.stroke(10e-3), substeps=n)).x[
-            :, :5
-        ]
+        n: malta.simulate(design.plant, design.controller, replace(_stroke(10e-3), substeps=n)).x[:, :5]
         for n in (1, 2, 16)
     }
     first, second = (np.abs(runs[n] - runs[16]).max() for n in (1, 2))
@@ -153,7 +163,7 @@ def test_a_design_with_delay_tracks_on_a_machine_with_that_delay(
 ) -> None:
     design = designs["calibrated"]
     c = malta.lqg(design.model, design.spec.weights, 50e-6, "sampled-data", delay)
-    run = malta.simulate(design.plant, c, Scenario.stroke(10e-3))
+    run = malta.simulate(design.plant, c, _stroke(10e-3))
     figures = stroke_figures(run)
     assert run.verdict.completed
     assert run.xi_hat.shape == (2000, 10 + 5 * delay)
@@ -196,7 +206,7 @@ def test_the_noise_of_a_hold_is_what_the_linear_loop_predicts(designs: dict[str,
 
 def test_radial_sensors_resolve_one_micrometre(designs: dict[str, Design]) -> None:
     design = designs["calibrated"]
-    run = malta.simulate(design.plant, design.controller, Scenario.stroke(10e-3, noise=1.0, quantize=True))
+    run = malta.simulate(design.plant, design.controller, _stroke(10e-3, noise=1.0, quantize=True))
     steps = run.y[:, :4] / 1e-6
     assert np.abs(steps - np.round(steps)).max() < 1e-9
     assert run.verdict.completed
@@ -207,7 +217,7 @@ def test_forces_are_limited_and_the_integrals_wait(designs: dict[str, Design]) -
     design = designs["calibrated"]
     c = design.controller
     weak = replace(c, limits=replace(c.limits, force=np.array([26.0, 26, 26, 26, 18])))
-    run = malta.simulate(design.plant, weak, Scenario.stroke(10e-3, duration=0.4))
+    run = malta.simulate(design.plant, weak, _stroke(10e-3, duration=0.4))
     assert run.saturated[:, 4].any()
     assert np.abs(run.v[:, 4]).max() == 18
     assert run.verdict.completed
@@ -220,7 +230,7 @@ def test_currents_are_what_the_controller_believes_and_forces_what_the_machine_m
 ) -> None:
     design = designs["calibrated"]
     stronger = malta.plant_of(replace(design.spec.parameters, K_D=5.2 * 1.1))
-    run = malta.simulate(stronger, design.controller, Scenario.stroke(10e-3, delay=0))
+    run = malta.simulate(stronger, design.controller, _stroke(10e-3, delay=0))
     assert run.current[:, 4] == pytest.approx(run.v[:, 4] / 10.4)
     lagged = 1 - math.exp(-3000 * 50e-6)
     expected = run.force[:-1, 4] + lagged * (1.1 * run.v[:-1, 4] - run.force[:-1, 4])
@@ -248,7 +258,7 @@ def test_a_force_step_is_held_off(designs: dict[str, Design]) -> None:
 def test_touchdown_ends_the_run_with_its_name_and_time(designs: dict[str, Design]) -> None:
     design = designs["table2"]
     heavy = malta.plant_of(replace(design.spec.parameters, m=0.56))
-    run = malta.simulate(heavy, design.controller, Scenario.stroke(10e-3))
+    run = malta.simulate(heavy, design.controller, _stroke(10e-3))
     assert run.verdict.name == "touchdown at sensor plane 1"
     assert run.verdict.time == run.t[-1] < 0.1
     reach = np.hypot(run.p[:, 0], run.p[:, 1])
@@ -280,10 +290,10 @@ def test_divergence_has_a_name(designs: dict[str, Design]) -> None:
 
 def test_a_run_that_is_no_multiple_of_a_block(designs: dict[str, Design]) -> None:
     design = designs["calibrated"]
-    whole = malta.simulate(design.plant, design.controller, Scenario.stroke(10e-3))
+    whole = malta.simulate(design.plant, design.controller, _stroke(10e-3))
     for samples in (1, 7, 251, 1999):
         part = malta.simulate(
-            design.plant, design.controller, replace(Scenario.stroke(10e-3), duration=samples * 50e-6)
+            design.plant, design.controller, replace(_stroke(10e-3), duration=samples * 50e-6)
         )
         assert len(part.t) == samples
         assert np.array_equal(part.x, whole.x[:samples])
@@ -292,13 +302,13 @@ def test_a_run_that_is_no_multiple_of_a_block(designs: dict[str, Design]) -> Non
 def test_scenarios_that_do_not_fit_are_refused(designs: dict[str, Design]) -> None:
     design = designs["table2"]
     with pytest.raises(malta.InputError, match="duration"):
-        Scenario.stroke(duration=-1.0)
+        _stroke(duration=-1.0)
     with pytest.raises(malta.InputError, match="noise"):
-        Scenario.stroke(noise=math.nan)
+        _stroke(noise=math.nan)
     with pytest.raises(malta.InputError, match="delay"):
-        Scenario.stroke(delay=-1)
+        _stroke(delay=-1)
     with pytest.raises(malta.InputError, match=r"start: found -0\.02 m"):
-        malta.simulate(design.plant, design.controller, Scenario.stroke(40e-3))
+        malta.simulate(design.plant, design.controller, _stroke(40e-3))
     wrong = replace(_held("push", 10), disturbance=lambda t: np.zeros((len(t), 3)))
     with pytest.raises(malta.InputError, match=r"disturbance: found shape \(10, 3\)"):
         malta.simulate(design.plant, design.controller, wrong)
@@ -308,7 +318,7 @@ def test_scenarios_that_do_not_fit_are_refused(designs: dict[str, Design]) -> No
 
 def test_the_saved_series_read_back(designs: dict[str, Design], tmp_path: Path) -> None:
     design = designs["calibrated"]
-    run = malta.simulate(design.plant, design.controller, Scenario.stroke(10e-3, duration=0.01))
+    run = malta.simulate(design.plant, design.controller, _stroke(10e-3, duration=0.01))
     path = save(run, tmp_path / "deep" / "run.npz")
     with np.load(path) as archive:
         assert np.array_equal(archive["p"], run.p)
@@ -319,14 +329,14 @@ def test_the_saved_series_read_back(designs: dict[str, Design], tmp_path: Path) 
 def test_the_machine_limits_its_own_currents(designs: dict[str, Design]) -> None:
     design = designs["calibrated"]
     weak = malta.plant_of(replace(design.spec.parameters, I_max=2.0))
-    run = malta.simulate(weak, design.controller, Scenario.stroke(10e-3))
+    run = malta.simulate(weak, design.controller, _stroke(10e-3))
     assert np.abs(run.v[:, 4]).max() > 2 * 10.4
     assert np.abs(run.force[:, 4]).max() <= 2 * 10.4
 
 
 def test_a_slow_stroke_is_given_its_time(designs: dict[str, Design]) -> None:
     design = designs["calibrated"]
-    run = malta.simulate(design.plant, design.controller, Scenario.stroke(10e-3, rise=0.05))
+    run = malta.simulate(design.plant, design.controller, _stroke(10e-3, rise=0.05))
     assert run.t[-1] == pytest.approx(0.3, abs=1e-4)
     assert run.reference[[0, -1], 4] == pytest.approx([-5e-3, 5e-3], abs=1e-7)
     assert stroke_figures(run).rise == pytest.approx(0.05, rel=0.02)
@@ -335,4 +345,4 @@ def test_a_slow_stroke_is_given_its_time(designs: dict[str, Design]) -> None:
 def test_a_run_beyond_all_memory_is_refused(designs: dict[str, Design]) -> None:
     design = designs["calibrated"]
     with pytest.raises(malta.InputError, match="duration: found 20000000 samples, expected at most 4000000"):
-        malta.simulate(design.plant, design.controller, replace(Scenario.stroke(10e-3), duration=1000.0))
+        malta.simulate(design.plant, design.controller, replace(_stroke(10e-3), duration=1000.0))

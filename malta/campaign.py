@@ -1,0 +1,306 @@
+"""Many machines at once: the same scenario and controller on plants that all differ, each with its own noise.
+
+Compiled, eight machines share a SIMD register and the cores share the rest; only a digest of each run is kept. Run i of
+a seed draws the same noise wherever and with whatever company it runs; `replayed` gives it back as a scenario.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any
+
+import casadi as ca
+import numpy as np
+
+from malta import machine
+from malta.controller import Controller
+from malta.data import units_of
+from malta.engine import LANES, evaluate, feedforward_table, run_many
+from malta.errors import InputError
+from malta.machine import Setup
+from malta.noise import keys
+from malta.plant import Plant, readonly
+from malta.simulate import (
+    Scenario,
+    beginning,
+    compiled_shape,
+    sampled,
+    setup_of,
+    shape_of,
+    simulate,
+    stroke_figures,
+)
+
+if TYPE_CHECKING:
+    from malta.plant import FloatArray
+
+LEVELS = (0.1, 0.9)  # of a stroke: its rise is between them
+
+
+@dataclass(frozen=True, eq=False)
+class Batch:
+    """What became of each run. SI; a row for each run."""
+
+    duration: FloatArray  # s, until the end or until something was touched
+    completed: FloatArray  # 1 or 0
+    deviation: FloatArray  # runs x outputs, largest |p - p*|
+    rms: FloatArray  # runs x outputs, root mean square of p - p*
+    force: FloatArray  # runs x inputs, N, largest |v|
+    contact: FloatArray  # runs x contacts, largest share of each clearance that was used up
+    rise: FloatArray  # s, 10-90 % of the stroke; NaN when it was not reached
+    overshoot: FloatArray  # beyond the end, as a share of the stroke
+
+    def __post_init__(self) -> None:
+        for name in self.__dataclass_fields__:
+            object.__setattr__(self, name, readonly(getattr(self, name)))
+
+
+def simulate_many(
+    plant: Plant,
+    controller: Controller,
+    scenario: Scenario,
+    changes: Mapping[str, FloatArray],
+    *,
+    first: int = 0,
+    workers: int | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> Batch:
+    """Run a scenario on many machines.
+
+    changes : parameters of the machine by name, SI, a value for each run
+    first : index of the first run; noise depends on scenario.seed and on the index
+    workers : threads; None: one for each core
+
+    Raises InputError for an unknown parameter, values of different number, or a scenario with faults, changes, another
+    estimator or an outer loop, which are for `simulate`.
+    """
+    where = f"scenario {scenario.name}"
+    for name in ("faults", "changes", "correction"):
+        if getattr(scenario, name):
+            raise InputError(where, name, "some", "none in a campaign")
+    setup = setup_of(plant, controller, scenario)
+    if setup.outside:
+        raise InputError(where, "estimator", scenario.estimator, "steady-state in a campaign")
+    runs = _count(plant, changes)
+    shape = shape_of(plant, controller, setup)
+    digest = _digest(shape)
+    compiled = compiled_shape(shape, LANES, digest)
+    if compiled is None:
+        return _one_by_one(plant, controller, scenario, changes, first, runs, progress)
+    lib, _ = compiled
+    values = machine.numbers(plant, controller, scenario.substeps, scenario.sensor_errors)
+    theta = _thetas(plant, values, changes, runs)
+    t, motion, given = sampled(plant, controller, scenario, setup)
+    begin = _starts(plant, controller, setup, values, *beginning(plant, controller, scenario, given[0]))
+    (states,) = evaluate(begin.map(runs), theta)
+    axis = plant.stroke_output
+    sizes = _digest_sizes(plant)
+    kept = np.zeros((runs, sum(sizes.values())))
+    start, end = motion.p[0, axis], motion.p[-1, axis]
+    kept[:, :3] = [1, start, 1 / (end - start) if end != start else 0]
+    kept[:, 4 : 4 + len(LEVELS)] = -1
+    sigma = np.ascontiguousarray(scenario.noise * np.array(plant.noise), dtype=float)
+    streams = keys(scenario.seed, first + np.arange(runs))
+    ff = controller.feedforward
+    table = feedforward_table(ff.z_grid, ff.v0)
+    done = 0
+
+    def group(k: int) -> tuple[int, FloatArray]:
+        chosen = np.minimum(np.arange(k, k + LANES), runs - 1)  # the last machine fills the last register
+        ours = [np.ascontiguousarray(a[chosen].T) for a in (theta, states, kept)]
+        run_many(
+            lib,
+            first=0,
+            substeps=scenario.substeps,
+            theta=ours[0],
+            table=table,
+            states=ours[1],
+            given=given,
+            sigma=sigma,
+            keys=np.ascontiguousarray(streams[chosen]),
+            digests=ours[2],
+        )
+        return k, ours[2].T
+
+    with ThreadPoolExecutor(workers or os.cpu_count()) as pool:
+        try:
+            for k, rows in pool.map(group, range(0, runs, LANES)):
+                kept[k : k + LANES] = rows[: runs - k]
+                done = min(k + LANES, runs)
+                if progress is not None:
+                    progress(done / runs)
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
+    return _batch(kept, len(t), controller.sample_time, sizes)
+
+
+def replayed(
+    plant: Plant, scenario: Scenario, changes: Mapping[str, FloatArray], index: int, first: int = 0
+) -> tuple[Plant, Scenario]:
+    """Machine and scenario of one run of `simulate_many`, for `simulate`."""
+    par: Any = replace(
+        plant.parameters, **{name: float(values[index - first]) for name, values in changes.items()}
+    )
+    return plant.variant(par), replace(scenario, run=index)
+
+
+def _count(plant: Plant, changes: Mapping[str, FloatArray]) -> int:
+    known = units_of(plant.parameters)
+    sizes = {name: len(np.atleast_1d(values)) for name, values in changes.items()}
+    for name in changes:
+        if name not in known:
+            raise InputError("campaign", name, "an unknown parameter", "one of " + " ".join(known))
+    if len(set(sizes.values())) != 1:
+        raise InputError("campaign", "changes", f"{sizes or 'nothing'}", "as many values of each parameter")
+    return next(iter(sizes.values()))
+
+
+def _thetas(
+    plant: Plant, values: Mapping[str, ca.DM], changes: Mapping[str, FloatArray], runs: int
+) -> FloatArray:
+    """theta of every run, a row each. Every record is checked as one that is read from a file."""
+    place, k = {}, 0
+    for name, value in values.items():
+        place[name] = k
+        k += value.nnz()
+    theta = np.tile(machine.flat(values), (runs, 1))
+    for name, column in changes.items():
+        column = np.asarray(column, dtype=float)
+        for extreme in (column.min(), column.max()):  # NaN comes out of both
+            replace(plant.parameters, **{name: float(extreme)})
+        theta[:, place[f"machine.{name}"]] = column
+    for name, f in plant.parameters.__dataclass_fields__.items():
+        twin = f.metadata.get("twin")
+        if twin and getattr(plant.parameters, name) == getattr(plant.parameters, twin):
+            pair = theta[:, place[f"machine.{name}"]], theta[:, place[f"machine.{twin}"]]
+            if not np.array_equal(*pair):
+                raise InputError("campaign", name, f"values unlike {twin}", f"the same, as in {plant.name}")
+    return theta
+
+
+def _starts(
+    plant: Plant,
+    c: Controller,
+    setup: Setup,
+    values: Mapping[str, ca.DM],
+    x: FloatArray,
+    xi_pred: FloatArray,
+    current: FloatArray,
+) -> ca.Function:
+    """theta -> the state in which a machine starts."""
+    symbolic, _, theta = machine.numbered(plant, values)
+    first = machine.initial(symbolic, c, setup, ca.DM(x), ca.DM(xi_pred), ca.DM(current))
+    return ca.Function("start", [theta], [first])
+
+
+def _digest_sizes(plant: Plant) -> dict[str, int]:
+    p, m = len(plant.outputs), len(plant.inputs)
+    return {
+        "alive": 1,
+        "start": 1,  # of the stroke, and 1 / its length or 0: constant
+        "scale": 1,
+        "samples": 1,
+        "reached": len(LEVELS),  # sample at which each level was reached, -1 before
+        "below": len(LEVELS),  # share of the stroke one sample before
+        "above": len(LEVELS),  # and then
+        "share": 1,
+        "largest_share": 1,
+        "deviation": p,
+        "squares": p,
+        "force": m,
+        "contact": len(plant.contacts),
+    }
+
+
+@lru_cache(maxsize=16)
+def _digest(shape: Any) -> ca.Function:
+    """(kept, row, given, theta) -> kept: what a run leaves behind, sample by sample, until something is touched."""
+    plant, c, setup = shape.plant, shape.controller, shape.setup
+    sizes = machine.layout(plant, c, setup)
+    kept = {name: ca.SX.sym(name, size) for name, size in _digest_sizes(plant).items()}
+    row = {name: ca.SX.sym(name, size) for name, size in sizes.row.items()}
+    given = {name: ca.SX.sym(name, size) for name, size in sizes.given.items()}
+    theta = ca.SX.sym("theta", len(machine.flat(machine.numbers(plant, c, 1))))
+    error = row["p"] - given["p_ref"]
+    share = (row["p"][plant.stroke_output] - kept["start"]) * kept["scale"]
+    k = kept["samples"]
+    now = ca.logic_and(kept["reached"] < 0, share >= ca.DM(LEVELS))
+    largest = ca.fmax(kept["contact"], row["contact"])
+    after = {
+        "alive": ca.logic_and(kept["alive"], ca.mmax(largest) < 1),
+        "start": kept["start"],
+        "scale": kept["scale"],
+        "samples": k + 1,
+        "reached": ca.if_else(now, k, kept["reached"]),
+        "below": ca.if_else(now, kept["share"], kept["below"]),
+        "above": ca.if_else(now, share, kept["above"]),
+        "share": share,
+        "largest_share": ca.fmax(kept["largest_share"], share),
+        "deviation": ca.fmax(kept["deviation"], ca.fabs(error)),
+        "squares": kept["squares"] + error**2,
+        "force": ca.fmax(kept["force"], ca.fabs(row["v"])),
+        "contact": largest,
+    }
+    result = ca.vertcat(*(ca.if_else(kept["alive"], after[name], kept[name]) for name in kept))
+    arguments = [ca.vertcat(*part.values()) for part in (kept, row, given)]
+    return ca.Function("digest", [*arguments, theta], [ca.densify(result)])
+
+
+def _batch(kept: FloatArray, samples: int, Ts: float, sizes: Mapping[str, int]) -> Batch:
+    columns = dict(zip(sizes, np.split(kept, np.cumsum([*sizes.values()])[:-1], axis=1), strict=True))
+    count = columns["samples"][:, 0]
+    completed = (columns["alive"][:, 0] == 1) & np.isfinite(kept).all(axis=1) & (count == samples)
+    reached, below, above = (columns[name] for name in ("reached", "below", "above"))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        first, last = np.where(
+            reached > 0, reached - 1 + (np.array(LEVELS) - below) / (above - below), np.nan
+        ).T
+    return Batch(
+        duration=np.where(completed, samples, np.maximum(count - 1, 0)) * Ts,
+        completed=completed,
+        deviation=columns["deviation"],
+        rms=np.sqrt(columns["squares"] / np.maximum(count, 1)[:, None]),
+        force=columns["force"],
+        contact=columns["contact"],
+        rise=np.where(completed, (last - first) * Ts, np.nan),
+        overshoot=np.maximum(columns["largest_share"][:, 0] - 1, 0),
+    )
+
+
+def _one_by_one(
+    plant: Plant,
+    controller: Controller,
+    scenario: Scenario,
+    changes: Mapping[str, FloatArray],
+    first: int,
+    runs: int,
+    progress: Callable[[float], None] | None,
+) -> Batch:
+    """The same without a C compiler."""
+    figures: dict[str, list[Any]] = {name: [] for name in Batch.__dataclass_fields__}
+    for k in range(runs):
+        machine_k, scenario_k = replayed(plant, scenario, changes, first + k, first)
+        run = simulate(machine_k, controller, scenario_k, engine="virtual machine")
+        stroke = stroke_figures(run)
+        error = run.p - run.reference
+        moved = bool(run.reference[-1, plant.stroke_output] != run.reference[0, plant.stroke_output])
+        row = {
+            "duration": run.verdict.time,
+            "completed": run.verdict.completed,
+            "deviation": np.abs(error).max(axis=0),
+            "rms": np.sqrt((error**2).mean(axis=0)),
+            "force": np.abs(run.v).max(axis=0),
+            "contact": run.contact.max(axis=0),
+            "rise": stroke.rise if moved else np.nan,
+            "overshoot": stroke.overshoot if moved else 0.0,
+        }
+        for name, value in row.items():
+            figures[name].append(value)
+        if progress is not None:
+            progress((k + 1) / runs)
+    return Batch(**{name: np.array(column) for name, column in figures.items()})

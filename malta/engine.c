@@ -1,0 +1,219 @@
+/* The loop around one control period of machine and controller: the frame of every compiled engine.
+
+   The functions `prepare`, `sense`, `decide`, `substep` and `digest` are generated from the CasADi expressions of
+   machine.py and stand at the mark below; the sizes are #defines before it. LANES machines run side by side, one in
+   each lane of a SIMD register; with LANES 1 a `real` is a double and the rows of every sample are kept.           */
+
+#include <math.h>
+#include <stdint.h>
+#include <string.h>
+#if LANES > 1 && defined(__AVX512DQ__)
+#include <immintrin.h>
+#endif
+
+#if LANES == 1
+typedef double real;
+typedef int64_t whole;
+#define LANE(x, i) (x)
+#define truth(m) ((real)(m))
+static inline whole bits(real x) { whole b; memcpy(&b, &x, 8); return b; }
+static inline real value(whole b) { real x; memcpy(&x, &b, 8); return x; }
+static inline real where(real c, real x) { return c != 0 ? x : 0; }
+static inline real larger(real a, real b) { return a > b ? a : b; }
+static inline real smaller(real a, real b) { return a < b ? a : b; }
+#else
+typedef double real __attribute__((vector_size(8 * LANES)));
+typedef int64_t whole __attribute__((vector_size(8 * LANES)));
+#define LANE(x, i) ((x)[i])
+#define truth(m) value((whole)(m) & bits(K(1.0)))
+static inline whole bits(real x) { return (whole)x; }
+static inline real value(whole b) { return (real)b; }
+static inline real pick(whole m, real a, real b) { return value((m & bits(a)) | (~m & bits(b))); }
+static inline real where(real c, real x) { return value((whole)(c != 0) & bits(x)); }
+static inline real larger(real a, real b) { return pick((whole)(a > b), a, b); }
+static inline real smaller(real a, real b) { return pick((whole)(a < b), a, b); }
+#endif
+#define K(x) ((x) - (real){0}) /* a constant in every lane */
+#define EACH(name, call) /* through an array: compilers make one instruction of sqrt, floor and fabs */ \
+  static inline real name(real x) { \
+    double a[LANES]; \
+    memcpy(a, &x, sizeof a); \
+    for (int i = 0; i < LANES; i++) a[i] = call(a[i]); \
+    memcpy(&x, a, sizeof a); \
+    return x; \
+  }
+#define PAIR(name, call) \
+  static inline real name(real x, real y) { \
+    double a[LANES], b[LANES]; \
+    memcpy(a, &x, sizeof a); \
+    memcpy(b, &y, sizeof b); \
+    for (int i = 0; i < LANES; i++) a[i] = call(a[i], b[i]); \
+    memcpy(&x, a, sizeof a); \
+    return x; \
+  }
+
+static inline double one_sign(double x) { return (x > 0) - (x < 0); }
+EACH(each_sqrt, sqrt) EACH(each_fabs, fabs) EACH(each_floor, floor) EACH(each_ceil, ceil) EACH(each_exp, exp)
+EACH(each_log, log) EACH(each_tan, tan) EACH(each_tanh, tanh) EACH(each_asin, asin) EACH(each_acos, acos)
+EACH(each_atan, atan) EACH(each_sinh, sinh) EACH(each_cosh, cosh) EACH(each_sign, one_sign)
+PAIR(each_pow, pow) PAIR(each_atan2, atan2) PAIR(each_hypot, hypot) PAIR(each_fmod, fmod)
+
+/* sin and cos: Cody-Waite reduction by pi/2 in three parts, then the minimax polynomials of fdlibm; below 1e5 in
+   size the error is at most 2 units in the last place. The compiler shares the reduction between the two.          */
+static inline void reduced(real x, whole *quadrant, real *r) {
+  const double shift = 6755399441055744.0; /* 1.5 * 2^52: its last bits are the nearest whole number */
+  real t = x * 0.63661977236758134308 + shift, n = t - shift;
+  *quadrant = bits(t);
+  *r = ((x - n * 1.57079632673412561417e+00) - n * 6.07710050630396597660e-11) - n * 2.02226624879595063154e-21;
+}
+/* Terms in pairs (Estrin): a chain of fewer operations, each of which waits for the one before. */
+static inline real sin_near(real r) {
+  real z = r * r, w = z * z;
+  real low = -1.66666666666666324348e-01 + z * 8.33333333332248946124e-03;
+  real mid = -1.98412698298579493134e-04 + z * 2.75573137070700676789e-06;
+  real top = -2.50507602534068634195e-08 + z * 1.58969099521155010221e-10;
+  return r + r * z * (low + w * (mid + w * top));
+}
+static inline real cos_near(real r) {
+  real z = r * r, w = z * z;
+  real low = 4.16666666666666019037e-02 + z * -1.38888888888741095749e-03;
+  real mid = 2.48015872894767294178e-05 + z * -2.75573143513906633035e-07;
+  real top = 2.08757232129817482790e-09 + z * -1.13596475577881948265e-11;
+  return (1.0 - 0.5 * z) + w * (low + w * (mid + w * top));
+}
+static inline real turned(whole q, real s, real c) { /* s, c, -s, -c in quadrants 0 to 3 */
+  whole odd = -(q & 1);
+  return value(((bits(c) & odd) | (bits(s) & ~odd)) ^ ((q & 2) << 62));
+}
+#if LANES == 1
+#define SMALL(x) __builtin_expect(fabs(x) < 0.785, 1) /* a mover in its air gap tilts by milliradians */
+#else
+#define SMALL(x) __builtin_expect(nowhere((x) * (x) > 0.616), 1)
+static inline int nowhere(whole m) { /* whether no lane is true */
+#if LANES == 8 && defined(__AVX512DQ__)
+  return _mm512_movepi64_mask((__m512i)m) == 0;
+#else
+  int64_t any = 0;
+  for (int i = 0; i < LANES; i++) any |= m[i];
+  return any == 0;
+#endif
+}
+#endif
+static inline real sine(real x) {
+  whole q;
+  real r;
+  if (SMALL(x)) return sin_near(x); /* what the rest gives there too, to the bit */
+  reduced(x, &q, &r);
+  return turned(q, sin_near(r), cos_near(r));
+}
+static inline real cosine(real x) {
+  whole q;
+  real r;
+  if (SMALL(x)) return cos_near(x);
+  reduced(x, &q, &r);
+  return turned(q + 1, sin_near(r), cos_near(r));
+}
+
+/*MODEL*/
+
+/* v0(z), linear between the points of the grid: rows of `table` are z, v0 and dv0/dz. `hint` is each lane's interval. */
+static inline void look_up(long n, const double *table, long *hint, real at, real *v) {
+  enum { WIDTH = 1 + 2 * FORCES };
+  double found[FORCES][LANES];
+  for (int i = 0; i < LANES; i++) {
+    double a = LANE(at, i);
+    long k = hint[i];
+    while (k > 0 && !(a >= table[k * WIDTH])) k--;
+    while (k < n - 2 && a > table[(k + 1) * WIDTH]) k++;
+    hint[i] = k;
+    const double *row = table + k * WIDTH;
+    for (int j = 0; j < FORCES; j++) found[j][i] = row[1 + j] + (a - row[0]) * row[1 + FORCES + j];
+  }
+  memcpy(v, found, sizeof found);
+}
+
+#if LANES == 1
+/* Rows of `samples` control periods; `state` is taken and left behind. */
+void run(long samples, long substeps, const double *theta, long grid, const double *table,
+         double *state, const double *given, const double *noise, double *rows) {
+  double c[CONSTANTS + 1], y[OUTPUTS], v[FORCES], held[HELD], next[STATES], moved[MACHINE];
+  long hint = 0;
+  prepare(theta, c);
+  for (long k = 0; k < samples; k++, given += GIVEN, noise += OUTPUTS, rows += ROW) {
+    double at;
+    sense(c, state, given, noise, y, &at);
+    look_up(grid, table, &hint, at, v);
+    decide(c, state, given, y, v, next + MACHINE, held, rows);
+    for (long i = 0; i < substeps; i++) {
+      substep(c, state, held, given, moved);
+      memcpy(state, moved, sizeof moved);
+    }
+    memcpy(state + MACHINE, next + MACHINE, (STATES - MACHINE) * sizeof *state);
+  }
+}
+#else
+/* Noise: SplitMix64 of a lane's key and a counter, 32 bits for the radius and 32 for the angle of Box-Muller. The
+   same numbers as noise.py, whatever the lane.                                                                     */
+typedef uint64_t bits64 __attribute__((vector_size(8 * LANES)));
+static inline real logarithm(real x) { /* of 2^-33 < x < 1; fdlibm's */
+  whole b = bits(x) - 0x3fe6a09e667f3bcdLL; /* from sqrt(1/2) on */
+  whole e = b >> 52;
+  real f = value((b & 0xfffffffffffffLL) + 0x3fe6a09e667f3bcdLL) - 1.0;
+  real s = f / (2.0 + f), z = s * s, half = 0.5 * f * f;
+  real tail = z * (6.666666666666735130e-01 + z * (3.999999999940941908e-01 + z * (2.857142874366239149e-01
+    + z * (2.222219843214978396e-01 + z * (1.818357216161805012e-01 + z * (1.531383769920937332e-01
+    + z * 1.479819860511658591e-01))))));
+  real n = __builtin_convertvector(e, real);
+  return n * 6.93147180369123816490e-01 - ((half - (s * (half + tail) + n * 1.90821492927058770002e-10)) - f);
+}
+static inline void two_normals(bits64 key, uint64_t count, real *a, real *b) {
+  bits64 x = key + count * 0x9e3779b97f4a7c15ULL;
+  x = (x ^ (x >> 30)) * 0xbf58476d1ce4e5b9ULL;
+  x = (x ^ (x >> 27)) * 0x94d049bb133111ebULL;
+  x = x ^ (x >> 31);
+  const double unit = 1.0 / 4294967296.0;
+  real u = (__builtin_convertvector((whole)(x >> 32), real) + 0.5) * unit;
+  real angle = (__builtin_convertvector((whole)(x & 0xffffffffULL), real) + 0.5) * (unit * 6.28318530717958647693);
+  real radius = each_sqrt(-2.0 * logarithm(u));
+  *a = radius * cosine(angle);
+  *b = radius * sine(angle);
+}
+
+/* LANES machines at once: only digests are kept. `first` is the sample at which this call starts, always even. */
+void run_many(long first, long samples, long substeps, const double *theta, long grid,
+              const double *table, double *states, const double *given, const double *sigma, const uint64_t *keys,
+              double *digests) {
+  real t[THETA + 1], c[CONSTANTS + 1], state[STATES], next[STATES], moved[MACHINE], y[OUTPUTS], v[FORCES], held[HELD];
+  real row[ROW], kept[DIGEST], kept_next[DIGEST], noise[2 * OUTPUTS];
+  long hint[LANES] = {0};
+  bits64 key;
+  memcpy(&key, keys, sizeof key);
+  memcpy(t, theta, sizeof(real) * THETA);
+  memcpy(state, states, sizeof state);
+  memcpy(kept, digests, sizeof kept);
+  prepare(t, c);
+  int noisy = 0;
+  for (int j = 0; j < OUTPUTS; j++) noisy |= sigma[j] != 0;
+  memset(noise, 0, sizeof noise);
+  for (long k = 0; k < samples; k++, given += GIVEN) {
+    real at;
+    if (noisy && k % 2 == 0) {
+      for (int j = 0; j < OUTPUTS; j++)
+        two_normals(key, (uint64_t)((first + k) / 2 * OUTPUTS + j), noise + 2 * j, noise + 2 * j + 1);
+      for (int j = 0; j < 2 * OUTPUTS; j++) noise[j] = noise[j] * sigma[j % OUTPUTS];
+    }
+    sense(c, state, given, noise + k % 2 * OUTPUTS, y, &at);
+    look_up(grid, table, hint, at, v);
+    decide(c, state, given, y, v, next + MACHINE, held, row);
+    digest(c, kept, row, given, kept_next);
+    memcpy(kept, kept_next, sizeof kept);
+    for (long i = 0; i < substeps; i++) {
+      substep(c, state, held, given, moved);
+      memcpy(state, moved, sizeof moved);
+    }
+    memcpy(state + MACHINE, next + MACHINE, (STATES - MACHINE) * sizeof *state);
+  }
+  memcpy(states, state, sizeof state);
+  memcpy(digests, kept, sizeof kept);
+}
+#endif

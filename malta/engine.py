@@ -1,0 +1,372 @@
+"""Control periods by the thousand: CasADi's functions as C, compiled once, or on CasADi's virtual machine.
+
+The functions of machine.py are straight lines of scalar operations. Here they become C inside the loop of engine.c,
+with every number of machine and controller an argument: one compilation serves all machines and gain files of a shape.
+What depends on those numbers alone is computed once a run (`prepare`). For many machines the same text is compiled with
+one machine in each lane of a SIMD register.
+
+Compiled engines stay in the user's cache folder under the SHA-256 of their text, the compiler, its options and the
+processor; two processes that compile at once write the same file, each under a name of its own first. Without a C
+compiler CasADi's virtual machine runs the same functions.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import hashlib
+import os
+import platform
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cache
+from importlib.resources import files
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import casadi as ca
+import numpy as np
+import platformdirs
+
+from malta.errors import CheckError
+from malta.machine import Parts
+
+if TYPE_CHECKING:
+    from malta.plant import FloatArray
+
+LANES = 8
+FLAGS = (
+    "-std=gnu11",
+    "-O3",
+    "-ffp-contract=fast",
+    "-fno-math-errno",
+    "-fno-trapping-math",
+    "-fPIC",
+    "-shared",
+)
+
+_BINARY = {"ADD": "+", "SUB": "-", "MUL": "*", "DIV": "/"}
+_TRUTH = {"LT": "<", "LE": "<=", "EQ": "==", "NE": "!="}
+_EACH = [
+    "sqrt",
+    "fabs",
+    "floor",
+    "ceil",
+    "exp",
+    "log",
+    "tan",
+    "tanh",
+    "asin",
+    "acos",
+    "atan",
+    "sinh",
+    "cosh",
+    "sign",
+]
+_FORMS = (
+    {f"OP_{name}": f"{{0}} {sign} {{1}}" for name, sign in _BINARY.items()}
+    | {f"OP_{name}": f"truth({{0}} {sign} {{1}})" for name, sign in _TRUTH.items()}
+    | {f"OP_{name.upper()}": f"each_{name}({{0}})" for name in _EACH}
+    | {f"OP_{name.upper()}": f"each_{name}({{0}}, {{1}})" for name in ("pow", "atan2", "hypot", "fmod")}
+    | {
+        "OP_ASSIGN": "{0}",
+        "OP_NEG": "-{0}",
+        "OP_SQ": "{0} * {0}",
+        "OP_TWICE": "{0} + {0}",
+        "OP_INV": "1.0 / {0}",
+        "OP_SIN": "sine({0})",
+        "OP_COS": "cosine({0})",
+        "OP_FMIN": "smaller({0}, {1})",
+        "OP_FMAX": "larger({0}, {1})",
+        "OP_CONSTPOW": "each_pow({0}, {1})",
+        "OP_NOT": "truth({0} == 0.0)",
+        "OP_AND": "truth(({0} != 0.0) & ({1} != 0.0))",
+        "OP_OR": "truth(({0} != 0.0) | ({1} != 0.0))",
+        "OP_IF_ELSE_ZERO": "where({0}, {1})",
+    }
+)
+_NAMES = {getattr(ca, name): name for name in dir(ca) if name.startswith("OP_")}
+
+
+class _Node(NamedTuple):
+    """A scalar of the straight line: C expression over earlier nodes, or what it reads."""
+
+    form: str
+    arguments: tuple[int, ...]
+    fixed: bool  # depends on theta and constants alone
+    plain: bool  # is read or written out where it is used
+
+
+def translate(f: ca.Function, shared: Sequence[int], first_constant: int) -> tuple[str, str, int]:
+    """C of an SX function whose last argument is theta: lines of `prepare`, the function, and how many constants.
+
+    shared : arguments that are the same in every lane.
+
+    Raises CheckError for an operation that has no C form here.
+    """
+    theta = f.n_in() - 1
+    nodes: list[_Node] = []
+    slot: dict[int, int] = {}  # of CasADi's work vector: the node it holds
+    outputs: list[tuple[int, int, int]] = []
+    for k in range(f.n_instructions()):
+        op, reads, writes = f.instruction_id(k), f.instruction_input(k), f.instruction_output(k)
+        if op == ca.OP_OUTPUT:
+            outputs.append((writes[0], writes[1], slot[reads[0]]))
+            continue
+        if op == ca.OP_INPUT:
+            i, j = reads
+            text = f"theta[{j}]" if i == theta else f"a{i}[{j}]"
+            node = _Node(f"K({text})" if i in shared else text, (), i == theta, True)
+        elif op == ca.OP_CONST:
+            node = _Node(f"K({f.instruction_constant(k)!r})", (), True, True)
+        else:
+            name = _NAMES[op]
+            if name not in _FORMS:
+                raise CheckError(f"the compiled engine has no {name}")
+            arguments = tuple(slot[r] for r in reads)
+            if (
+                op == ca.OP_DIV and nodes[arguments[1]].fixed
+            ):  # one reciprocal a run instead of a division each
+                nodes.append(_Node(_FORMS["OP_INV"], arguments[1:], True, False))
+                name, arguments = "OP_MUL", (arguments[0], len(nodes) - 1)
+            node = _Node(_FORMS[name], arguments, all(nodes[a].fixed for a in arguments), False)
+        slot[writes[0]] = len(nodes)
+        nodes.append(node)
+    return _written(f.name(), f.n_in() - 1, f.n_out(), nodes, outputs, shared, first_constant)
+
+
+def _written(
+    name: str,
+    arguments: int,
+    results: int,
+    nodes: list[_Node],
+    outputs: list[tuple[int, int, int]],
+    shared: Sequence[int],
+    first_constant: int,
+) -> tuple[str, str, int]:
+    def is_number(k: int) -> bool:
+        return nodes[k].plain and nodes[k].form.startswith("K(") and nodes[k].fixed
+
+    # What the moving part reads of the fixed part goes through the array c.
+    read = {a for node in nodes if not node.fixed for a in node.arguments} | {k for *_, k in outputs}
+    kept = [k for k in sorted(read) if nodes[k].fixed and not is_number(k)]
+    place = {k: first_constant + index for index, k in enumerate(kept)}
+
+    def text(k: int, *, moving: bool) -> str:
+        if moving and k in place:
+            return f"c[{place[k]}]"
+        return nodes[k].form if nodes[k].plain else f"t{k}"
+
+    prepare: list[str] = []
+    lines: list[str] = []
+    for k, node in enumerate(nodes):
+        if not node.plain:
+            value = node.form.format(*(text(a, moving=not node.fixed) for a in node.arguments))
+            (prepare if node.fixed else lines).append(f"  const real t{k} = {value};")
+    prepare += [f"  c[{place[k]}] = {text(k, moving=False)};" for k in kept]
+    lines += [f"  r{i}[{j}] = {text(k, moving=True)};" for i, j, k in outputs]
+    kinds = ["double" if i in shared else "real" for i in range(arguments)]
+    head = ", ".join(
+        ["const real *restrict c", *(f"const {kind} *restrict a{i}" for i, kind in enumerate(kinds))]
+        + [f"real *restrict r{i}" for i in range(results)]
+    )
+    body = "\n".join(lines)
+    return (
+        "\n".join(["  {", *prepare, "  }"]),
+        f"static inline __attribute__((always_inline)) void {name}({head}) {{\n{body}\n}}\n",
+        len(kept),
+    )
+
+
+def source(p: Parts, digest: ca.Function | None) -> str:
+    """The whole C text, but for the number of lanes."""
+    prepares, functions, count = [], [], 0
+    given = {"sense": [1], "decide": [1], "substep": [2], "digest": [2]}
+    for f in (p.sense, p.decide, p.substep, *([digest] if digest else [])):
+        prepare, function, more = translate(f, given[f.name()], count)
+        prepares.append(prepare)
+        functions.append(function)
+        count += more
+    sizes = {
+        "THETA": len(p.theta),
+        "CONSTANTS": count,
+        "STATES": p.sense.size1_in(0),
+        "MACHINE": p.substep.size1_in(0),
+        "GIVEN": p.sense.size1_in(1),
+        "OUTPUTS": p.sense.size1_in(2),
+        "FORCES": p.decide.size1_in(3),
+        "HELD": p.substep.size1_in(1),
+        "ROW": p.decide.size1_out(2),
+        "DIGEST": digest.size1_in(0) if digest else 0,
+    }
+    defines = "".join(f"#define {name} {value}\n" for name, value in sizes.items())
+    prepare = "static void prepare(const real *theta, real *c) {\n" + "\n".join(prepares) + "\n}\n"
+    frame = files("malta").joinpath("engine.c").read_text(encoding="utf-8")
+    return defines + frame.replace("/*MODEL*/", prepare + "".join(functions))
+
+
+@cache
+def compiler() -> str | None:
+    """Path of the system's C compiler: $CC, or the first of cc, gcc and clang."""
+    names = [os.environ["CC"]] if os.environ.get("CC") else ["cc", "gcc", "clang"]
+    return next((path for path in map(shutil.which, names) if path), None)
+
+
+@cache
+def _processor() -> str:
+    """What `-march=native` depends on."""
+    with suppress(OSError):
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+        return "".join(sorted({x for x in lines if x.startswith(("flags", "model name", "Features"))}))
+    return platform.processor() + platform.machine()
+
+
+@cache
+def _version(cc: str) -> str:
+    return subprocess.run([cc, "--version"], capture_output=True, text=True, check=False).stdout
+
+
+def library(text: str, lanes: int, folder: Path | None = None) -> ctypes.CDLL | None:
+    """The compiled text, from the cache folder or compiled now; None where no compiler can do it."""
+    cc = compiler()
+    if cc is None:
+        return None
+    key = "\n".join([text, str(lanes), *FLAGS, cc, _version(cc), _processor(), platform.platform()])
+    name = f"{hashlib.sha256(key.encode()).hexdigest()}.so"
+    for place in (folder or cache_folder(), Path(tempfile.gettempdir()) / f"malta-{os.getuid()}"):
+        path = place / name
+        try:
+            place.mkdir(parents=True, exist_ok=True, mode=0o700)
+            if place.stat().st_uid != os.getuid():
+                continue  # code is loaded from here: nobody else's
+            if not path.exists() and not _compiled(cc, text, lanes, path):
+                return None
+            return ctypes.CDLL(str(path))
+        except OSError:
+            with suppress(OSError):
+                path.unlink()  # damaged: it cannot be loaded
+    return None
+
+
+def cache_folder() -> Path:
+    """Where compiled engines stay; deleting it costs a second of compilation."""
+    return platformdirs.user_cache_path("malta")
+
+
+def _compiled(cc: str, text: str, lanes: int, path: Path) -> bool:
+    """Compile to `path`, whole or not at all."""
+    with tempfile.TemporaryDirectory(dir=path.parent) as scratch:
+        c, so = Path(scratch) / "engine.c", Path(scratch) / "engine.so"
+        c.write_text(text, encoding="utf-8")
+        for native in (["-march=native"], []):
+            command = [cc, *FLAGS, *native, f"-DLANES={lanes}", str(c), "-o", str(so), "-lm"]
+            if subprocess.run(command, capture_output=True, check=False).returncode == 0:
+                so.replace(path)
+                return True
+    return False
+
+
+@dataclass(frozen=True, eq=False)
+class Engine:
+    """Runs control periods of one machine: (state, inputs) -> (state, rows)."""
+
+    kind: str  # "compiled" or "virtual machine"
+    run: Callable[[FloatArray, FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
+
+
+def _address(array: Any) -> ctypes.c_void_p:
+    return ctypes.c_void_p(array.ctypes.data)
+
+
+def compiled_engine(run: Any, p: Parts, theta: FloatArray, substeps: int, table: FloatArray) -> Engine:
+    """`run` of a library with one lane. Rows per call are limited by memory alone."""
+    width = p.decide.size1_out(2)
+    theta, table = (np.ascontiguousarray(a, dtype=float) for a in (theta, table))
+
+    def call(state: FloatArray, given: FloatArray, noise: FloatArray) -> tuple[FloatArray, FloatArray]:
+        after = np.array(state, dtype=float)
+        given, noise = np.ascontiguousarray(given), np.ascontiguousarray(noise)
+        rows = np.empty((len(given), width))
+        run(
+            ctypes.c_long(len(given)),
+            ctypes.c_long(substeps),
+            _address(theta),
+            ctypes.c_long(len(table)),
+            _address(table),
+            _address(after),
+            _address(given),
+            _address(noise),
+            _address(rows),
+        )
+        return after, rows
+
+    return Engine("compiled", call)
+
+
+def feedforward_table(z_grid: FloatArray, v0: FloatArray) -> FloatArray:
+    """Rows of z, v0(z) and its slope up to the next row."""
+    slope = np.diff(v0, axis=0) / np.diff(z_grid)[:, None]
+    return np.ascontiguousarray(np.hstack([z_grid[:, None], v0, np.vstack([slope, slope[-1:]])]))
+
+
+def virtual_engine(chain: ca.Function) -> Engine:
+    """The chained functions of machine.py on CasADi's virtual machine; a short last block is padded."""
+    block = chain.size2_in(1)
+
+    def call(state: FloatArray, given: FloatArray, noise: FloatArray) -> tuple[FloatArray, FloatArray]:
+        inputs = np.hstack([given, noise])
+        parts = []
+        for k in range(0, len(inputs), block):
+            part = inputs[k : k + block]
+            padded = np.vstack([part, np.repeat(part[-1:], block - len(part), axis=0)])
+            states, rows = evaluate(chain, state, padded)
+            state = states[len(part) - 1]
+            parts.append(rows[: len(part)])
+        return state, np.concatenate(parts)
+
+    return Engine("virtual machine", call)
+
+
+def evaluate(function: ca.Function, *arguments: FloatArray) -> list[FloatArray]:
+    """Call a dense CasADi function on numpy's own memory, a row for each of its columns: no conversion to DM."""
+    results = [np.empty(function.size_out(i)[::-1]) for i in range(function.n_out())]
+    buffer, run = function.buffer()
+    inputs = [np.ascontiguousarray(array, dtype=float) for array in arguments]
+    for i, array in enumerate(inputs):
+        buffer.set_arg(i, array.data)
+    for i, array in enumerate(results):
+        buffer.set_res(i, array.data)
+    run()
+    return results
+
+
+def run_many(
+    lib: Any,
+    *,
+    first: int,
+    substeps: int,
+    theta: FloatArray,
+    table: FloatArray,
+    states: FloatArray,
+    given: FloatArray,
+    sigma: FloatArray,
+    keys: Any,
+    digests: FloatArray,
+) -> None:
+    """LANES machines through the samples of `given`; states and digests (a row for each number) are changed."""
+    lib.run_many(
+        ctypes.c_long(first),
+        ctypes.c_long(len(given)),
+        ctypes.c_long(substeps),
+        _address(theta),
+        ctypes.c_long(len(table)),
+        _address(table),
+        _address(states),
+        _address(given),
+        _address(sigma),
+        _address(keys),
+        _address(digests),
+    )

@@ -1,0 +1,150 @@
+"""Kalman filters for a start that the steady-state filter knows nothing of: filterpy's, on the machine's CasADi model.
+
+    kalman     time-varying: the gain file's model, the gain still large while nothing is known
+    extended   the nonlinear machine as the controller believes it to be: gravity, cogging, touchdown bearings; so it
+               knows what holds a mover that rests on its bearing
+
+Both start from the first measurement: positions as measured, rates zero with the variance that the difference of two
+measurements would have. Covariances of forces and sensors are those of the filter in the gain file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import casadi as ca
+import numpy as np
+from filterpy.kalman import ExtendedKalmanFilter
+
+from malta import machine
+from malta.controller import Controller
+from malta.data import plant_of
+from malta.engine import Engine
+from malta.machine import Setup
+from malta.plant import Plant
+
+if TYPE_CHECKING:
+    from malta.plant import FloatArray
+
+Observer = Callable[[Engine, "FloatArray", "FloatArray", "FloatArray"], tuple["FloatArray", "FloatArray"]]
+
+
+def observer(plant: Plant, c: Controller, setup: Setup, kind: str, substeps: int, errors: Any) -> Observer:
+    """Runs control periods one by one with an estimate of its own: (engine, state, given, noise) -> (state, rows)."""
+    filter_ = _filter(c)
+    predict = _nonlinear(c) if kind == "extended" else _linear(c)
+    jacobian, output = _measurement(c)
+    sense = machine.parts(plant, c, setup, machine.numbers(plant, c, substeps, errors), constant=True).sense
+    sizes = machine.layout(plant, c, setup).row
+    edges = dict(zip(sizes, np.cumsum([0, *sizes.values()]), strict=False))
+    commands = slice(edges["v"], edges["v"] + sizes["v"])
+    stroke = plant_of(c.parameters).stroke_output
+    n = len(c.A)
+    sent: list[FloatArray] = [
+        np.zeros(len(c.forces))
+    ] * c.delay  # v - v0 of the last samples, the oldest first
+    loads: list[FloatArray] = []
+    started = False
+
+    def run(
+        engine: Engine, state: FloatArray, given: FloatArray, noise: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        nonlocal started
+        rows = []
+        for k in range(len(given)):
+            y = np.array(sense(state, given[k], noise[k], [])[0]).ravel()
+            if not started:
+                _begin(filter_, c, y)
+                started = True
+            filter_.update(y, jacobian, output)
+            now = given[k : k + 1].copy()
+            now[0, -len(c.states) :] = np.concatenate([filter_.x, *sent])
+            state, row = engine.run(state, now, noise[k : k + 1])
+            rows.append(row)
+            v0 = c.feedforward.at(y[stroke])
+            sent.append(row[0, commands] - v0)
+            loads.append(v0)
+            filter_.x, filter_.F = predict(
+                filter_.x, sent.pop(0), loads.pop(0) if len(loads) > c.delay else v0
+            )
+            filter_.P = filter_.F @ filter_.P @ filter_.F.T + filter_.Q
+            if not np.isfinite(filter_.x).all():
+                break
+        return state, np.concatenate(rows)
+
+    assert n == filter_.dim_x
+    return run
+
+
+def _filter(c: Controller) -> Any:
+    n, p = len(c.A), len(c.measurements)
+    kalman = ExtendedKalmanFilter(dim_x=n, dim_z=p, dim_u=len(c.forces))
+    B = (c.Ad[:n, n : n + len(c.forces)] if c.delay else c.Bd)[:n]
+    kalman.Q = B * c.noise.process @ B.T
+    kalman.R = np.diag(c.noise.sensor)
+    kalman.x = np.zeros(n)
+    return kalman
+
+
+def _begin(kalman: Any, c: Controller, y: FloatArray) -> None:
+    """One measurement: positions P^-1 y with its covariance, rates zero +- sqrt(2) of that a sample."""
+    believed = plant_of(c.parameters)
+    symbol = ca.SX.sym("y", len(y))
+    q = believed.position_of(symbol)
+    values = ca.Function("q", [symbol], [q, ca.jacobian(q, symbol)])(y)
+    position, J = np.array(values[0]).ravel(), np.array(values[1])
+    half = len(position)
+    kalman.x = np.concatenate([position, np.zeros(len(c.A) - half)])
+    spread = J @ kalman.R @ J.T
+    kalman.P = np.zeros((len(c.A), len(c.A)))
+    kalman.P[:half, :half] = spread
+    kalman.P[half:, half:] = 2 * np.diag(np.diag(spread)) / c.sample_time**2
+
+
+def _linear(c: Controller) -> Callable[..., tuple[FloatArray, FloatArray]]:
+    n, m = len(c.A), len(c.forces)
+    A = c.Ad[:n, :n]
+    B = c.Ad[:n, n : n + m] if c.delay else c.Bd
+    return lambda x, v, _: (A @ x + B @ v, A)
+
+
+def _nonlinear(c: Controller) -> Callable[..., tuple[FloatArray, FloatArray]]:
+    """One Runge–Kutta step of the believed machine under v + v0, with its loads and bearings, and its Jacobian."""
+    believed = plant_of(c.parameters)
+    x, u = ca.SX.sym("x", len(believed.states)), ca.SX.sym("u", len(c.forces))
+    h = c.sample_time / 4
+
+    def rate(z: Any) -> Any:
+        return believed.f(z, u, believed.load(z) + believed.bearing(z))
+
+    z = x
+    for _ in range(4):
+        k1 = rate(z)
+        k2 = rate(z + h / 2 * k1)
+        k3 = rate(z + h / 2 * k2)
+        k4 = rate(z + h * k3)
+        z = z + h / 6 * (k1 + 2 * (k2 + k3) + k4)
+    chosen = list(believed.controlled)
+    step = ca.Function("step", [x, u], [z[chosen], ca.jacobian(z, x)[chosen, chosen]])
+
+    def predict(estimate: FloatArray, v: FloatArray, v0: FloatArray) -> tuple[FloatArray, FloatArray]:
+        full = np.zeros(len(believed.states))
+        full[chosen] = estimate
+        after, F = step(full, v + v0)
+        return np.array(after).ravel(), np.array(F)
+
+    return predict
+
+
+def _measurement(c: Controller) -> tuple[Callable[..., FloatArray], Callable[..., FloatArray]]:
+    believed = plant_of(c.parameters)
+    x = ca.SX.sym("x", len(c.A))
+    full = ca.SX.zeros(len(believed.states))
+    full[list(believed.controlled)] = x
+    y = believed.h(full, 0)
+    function = ca.Function("h", [x], [y, ca.jacobian(y, x)])
+    return (
+        lambda estimate: np.array(function(estimate)[1]),
+        lambda estimate: np.array(function(estimate)[0]).ravel(),
+    )

@@ -1,0 +1,442 @@
+"""One control period of machine and controller, as CasADi functions: everything that simulates is made of them.
+
+    given, noise --> [ sense ] --> y --> [ decide ] --> commands held --> [ substep ] x n --> machine
+                        ^                 ^  |  ^                                                |
+                        |        v0(z) ---+  |  +-- controller <--                               |
+                        +--------------------|---------------------------------------------------+
+
+The state is (machine, controller). What stands in them depends on the fidelity, i.e. on what makes the forces:
+
+    force   forces follow their commands as first-order lags at the current loops' crossover, exactly
+    dq      PI loops and windings in the axes of the transformation; voltage limit of the half-bridges, induced
+            voltage and its feedforward, DC link
+    phase   the same controllers, on every winding: phase currents, duty cycles, star points
+
+    machine     x; then forces | axis currents, link voltage | phase currents, link voltage
+    controller  xi_pred, e, frozen; PI integrals and their limits; last y and held commands (faults); commands under way
+
+The one sample of delay stands between the control law and the forces in `force`, and between the current
+controllers and the windings in `dq` and `phase`, where computation really takes its time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+import casadi as ca
+import numpy as np
+
+from malta import electric
+from malta.controller import Controller, commanded, estimated, gains_of
+from malta.data import plant_of, units_of
+from malta.plant import Plant, symbolic
+
+if TYPE_CHECKING:
+    from malta.plant import FloatArray
+
+Fidelity = Literal["force", "dq", "phase"]
+FIDELITIES: tuple[Fidelity, ...] = ("force", "dq", "phase")
+
+
+@dataclass(frozen=True)
+class Setup:
+    """What shapes the functions of a simulation; all else are numbers."""
+
+    fidelity: Fidelity
+    delay: int  # samples between measurement and command
+    quantize: bool = False  # sensors in steps
+    disturbed: bool = False  # an external wrench
+    bearing: bool = False  # touchdown bearings push back
+    sensed: bool = False  # sensors with their own errors, Hall sensors for the stroke
+    faulty: bool = False  # held measurements, missed steps, open phases, sagging link
+    scheduled: bool = False  # C(z) of the measured z in the filter
+    real_pwm: bool = False  # duty cycles in steps, dead time
+    outside: bool = False  # the estimate comes from outside
+
+
+class Layout(NamedTuple):
+    """Names and sizes, in order."""
+
+    machine: dict[str, int]
+    controller: dict[str, int]
+    given: dict[str, int]  # per sample, the same for every machine
+    row: dict[str, int]  # what one sample leaves behind
+
+
+class Parts(NamedTuple):
+    """The functions of one control period; theta is empty where all numbers are constants."""
+
+    sense: ca.Function  # (state, given, noise, theta) -> y, position for v0(z)
+    decide: ca.Function  # (state, given, y, v0, theta) -> controller, held, row
+    substep: ca.Function  # (machine, held, given, theta) -> machine
+    theta: tuple[str, ...]  # names of the numbers, an entry for each
+
+
+def layout(plant: Plant, c: Controller, s: Setup) -> Layout:
+    """What stands where."""
+    n, m, p = len(c.states), len(c.forces), len(c.measurements)
+    axes, phases = len(plant.drive.axes), len(plant.drive.phases)
+    electric_state = {
+        "force": {"force": m},
+        "dq": {"i": axes, "link": 1},
+        "phase": {"i_phase": phases, "link": 1},
+    }[s.fidelity]
+    held = {"force": m, "dq": axes, "phase": phases}[s.fidelity]
+    controller = {"xi_pred": n, "e": p, "frozen": p}
+    if s.fidelity != "force":
+        controller |= {"u_integral": axes, "u_limited": axes}
+    if s.faulty:
+        controller |= {"y_last": p, "command": held}
+    controller |= {"under_way": held * s.delay}
+    given = {"p_ref": p, "dp_ref": p, "v_ff": m, "v_past": n - len(c.A)}
+    if s.disturbed:
+        given |= {"w": len(plant.disturbances)}
+    if s.faulty:
+        given |= {"stuck": p, "missed": 1, "sag": 1, "open": phases if s.fidelity == "phase" else 0}
+    if s.outside:
+        given |= {"xi_hat": n}
+    row = {"x": len(plant.states), "p": p, "y": p, "xi_hat": n, "v": m, "force": m, "saturated": p}
+    row |= {"contact": len(plant.contacts)}
+    if s.fidelity != "force":
+        row |= {"i": axes, "u": axes, "link": 1}
+    if s.fidelity == "phase":
+        row |= {"i_phase": phases, "duty": phases}
+    return Layout({"x": len(plant.states)} | electric_state, controller, given, row)
+
+
+def numbers(
+    plant: Plant, c: Controller, substeps: int, errors: Mapping[str, float] | None = None
+) -> dict[str, ca.DM]:
+    """Every number of machine, controller and sensors, by name."""
+    believed = plant_of(c.parameters).actuator
+    machine = {name: ca.DM(getattr(plant.parameters, name)) for name in units_of(plant.parameters)}
+    known = dict.fromkeys((signal.name for signal in plant.sensor_errors), 0.0) | dict(errors or {})
+    return {
+        **{f"machine.{name}": ca.DM(value) for name, value in machine.items()},
+        **gains_of(c),
+        "believed": ca.DM(list(believed.force_constant)),
+        "Kp": ca.DM(c.current_loop.Kp),
+        "Ki_current": ca.DM(c.current_loop.Ki),
+        "current_time": ca.DM(c.current_loop.sample_time),
+        "grid_ends": ca.DM([c.feedforward.z_grid[0], c.feedforward.z_grid[-1]]),
+        "substep": ca.DM(c.sample_time / substeps),
+        "errors": ca.DM(list(known.values())),
+    }
+
+
+def flat(values: Mapping[str, ca.DM]) -> FloatArray:
+    """The nonzeros of every number, in order: theta."""
+    return np.concatenate([np.array(value.nonzeros(), dtype=float) for value in values.values()])
+
+
+def parts(plant: Plant, c: Controller, s: Setup, values: Mapping[str, ca.DM], *, constant: bool) -> Parts:
+    """The functions of one control period.
+
+    constant: with the numbers in them, which is faster on CasADi's virtual machine; otherwise they are arguments, and
+    one set of functions serves every machine and controller of the same shape.
+    """
+    g: dict[str, Any] = {name: ca.SX(value) for name, value in values.items()}
+    theta: Any = ca.SX(0, 1)
+    names: tuple[str, ...] = ()
+    if not constant:
+        plant, g, theta = numbered(plant, values)
+        names = tuple(name for name, symbol in g.items() for _ in range(symbol.nnz()))
+    sizes = layout(plant, c, s)
+    machine, controller, given = (_symbols(part) for part in sizes[:3])
+    state = ca.vertcat(*machine.values(), *controller.values())
+    around = ca.vertcat(*given.values())
+    noise, y = ca.SX.sym("noise", len(plant.outputs)), ca.SX.sym("y", len(plant.outputs))
+    v0, held = ca.SX.sym("v0", len(plant.inputs)), ca.SX.sym("held", _held(plant, s))
+    x = machine["x"]
+
+    measured = _measured(plant, s, g, x, noise)
+    if s.faulty:
+        measured = ca.if_else(given["stuck"], controller["y_last"], measured)
+    first, last = g["grid_ends"][0], g["grid_ends"][1]
+    at = ca.fmax(ca.fmin(measured[plant.stroke_output], last), first)
+    sense = ca.Function("sense", [state, around, noise, theta], [measured, at])
+
+    after, command, row = _decided(plant, c, s, g, machine, controller, given, y, v0)
+    row = {"x": x, "p": plant.h(x, 0), "y": y, "contact": plant.contact(x)} | row
+    decide = ca.Function(
+        "decide",
+        [state, around, y, v0, theta],
+        [
+            ca.vertcat(*(after[name] for name in sizes.controller)),
+            command,
+            ca.vertcat(*(row[name] for name in sizes.row)),
+        ],
+    )
+    moved = _moved(plant, s, g, machine, given, held)
+    substep = ca.Function("substep", [ca.vertcat(*machine.values()), held, around, theta], [moved])
+    return Parts(sense, decide, substep, names)
+
+
+def numbered(plant: Plant, values: Mapping[str, ca.DM]) -> tuple[Plant, dict[str, Any], Any]:
+    """The machine with a symbol for every number, the symbols by name, and all of them: theta."""
+    g = {name: ca.SX.sym(name, value.sparsity()) for name, value in values.items()}
+    theta = ca.vertcat(*(ca.vertcat(*symbol.nonzeros()) for symbol in g.values()))
+    return plant.variant(_symbolic_parameters(plant, g)), g, theta
+
+
+def initial(plant: Plant, c: Controller, s: Setup, x: Any, xi_pred: Any, current: Any) -> Any:
+    """State with the machine at x, these currents of the inputs (A) flowing, and the observer at xi_pred."""
+    drive, actuator = plant.drive, plant.actuator
+    force = ca.SX(current) * ca.vertcat(*actuator.force_constant)
+    values: dict[str, Any] = {"x": x, "force": force, "link": drive.link_voltage, "xi_pred": xi_pred}
+    values |= {"y_last": plant.h(ca.SX(x), 0), "command": force}
+    if s.fidelity != "force":
+        i, e, T = drive.command(ca.SX(current)), drive.emf(ca.SX(x)), drive.to_phases(ca.SX(x))
+        share = (actuator.R * i + e) / drive.link_voltage
+        values |= {"i": i, "i_phase": T @ i, "u_integral": actuator.R * i}
+        values["command"] = share if s.fidelity == "dq" else 0.5 + T @ share
+    values["under_way"] = ca.repmat(values["command"], s.delay, 1)
+    sizes = layout(plant, c, s)
+    state = {**sizes.machine, **sizes.controller}
+    return ca.densify(ca.vertcat(*(values.get(name, ca.SX.zeros(size)) for name, size in state.items())))
+
+
+def chained(p: Parts, c: Controller, substeps: int, block: int) -> ca.Function:
+    """A block of samples on CasADi's virtual machine: (state, inputs) -> (states, rows); inputs = given, noise."""
+    state, given = ca.SX.sym("state", p.sense.size1_in(0)), ca.SX.sym("given", p.sense.size1_in(1))
+    noise = ca.SX.sym("noise", p.sense.size1_in(2))
+    y, v0 = ca.SX.sym("y", p.decide.size1_in(2)), ca.SX.sym("v0", p.decide.size1_in(3))
+    controller, held, row = p.decide(state, given, y, v0, ca.SX(0, 1))
+    machine = state[: p.substep.size1_in(0)]
+    for _ in range(substeps):
+        machine = p.substep(machine, held, given, ca.SX(0, 1))
+    inputs = ca.vertcat(given, noise)
+    before = ca.Function("before", [state, inputs], p.sense(state, given, noise, ca.SX(0, 1)))
+    rest = ca.Function("rest", [state, inputs, y, v0], [ca.vertcat(machine, controller), ca.densify(row)])
+    # v0(z) is a table, which scalar expressions cannot look up.
+    table = ca.interpolant("table", "linear", [c.feedforward.z_grid], c.feedforward.v0.ravel())
+    S, U = ca.MX.sym("state", state.numel()), ca.MX.sym("inputs", inputs.numel())
+    measured, at = before(S, U)
+    return ca.Function("step", [S, U], rest(S, U, measured, table(at))).mapaccum("chain", block)
+
+
+def _symbols(sizes: Mapping[str, int]) -> dict[str, Any]:
+    return {name: ca.SX.sym(name, size) for name, size in sizes.items()}
+
+
+def _symbolic_parameters(plant: Plant, g: Mapping[str, Any]) -> Any:
+    par = plant.parameters
+    symbols = {name: g[f"machine.{name}"] for name in units_of(par)}
+    for name in symbols:
+        twin = par.__dataclass_fields__[name].metadata["twin"]
+        if twin is not None and getattr(par, name) == getattr(par, twin):
+            symbols[name] = symbols[twin]
+    return symbolic(par, symbols)
+
+
+def _held(plant: Plant, s: Setup) -> int:
+    sizes = {"force": plant.inputs, "dq": plant.drive.axes, "phase": plant.drive.phases}
+    return len(sizes[s.fidelity])
+
+
+def _measured(plant: Plant, s: Setup, g: Mapping[str, Any], x: Any, noise: Any) -> Any:
+    y = (plant.sense(x, g["errors"]) if s.sensed else plant.h(x, 0)) + noise
+    if not s.quantize:
+        return y
+    steps = plant.resolution
+    return ca.vertcat(
+        *(
+            y[i] if _is_zero(step) else ca.if_else(step > 0, step * ca.floor(y[i] / step + 0.5), y[i])
+            for i, step in enumerate(steps)
+        )
+    )
+
+
+def _is_zero(step: Any) -> bool:
+    return isinstance(step, float | int) and step == 0
+
+
+def _decided(
+    plant: Plant,
+    c: Controller,
+    s: Setup,
+    g: Mapping[str, Any],
+    machine: Mapping[str, Any],
+    controller: Mapping[str, Any],
+    given: Mapping[str, Any],
+    y: Any,
+    v0: Any,
+) -> tuple[dict[str, Any], Any, dict[str, Any]]:
+    """The control law and the current controllers: controller state after, commands to hold, their part of the row."""
+    C = _scheduled_C(c, y) if s.scheduled else None
+    xi_hat = given["xi_hat"] if s.outside else estimated(g, controller["xi_pred"], y, C)
+    p_ref, dp_ref, v_ff = (given[name] for name in ("p_ref", "dp_ref", "v_ff"))
+    xi_ref = ca.vertcat(state_reference(plant_of(c.parameters), p_ref, dp_ref), given["v_past"])
+    e_now, frozen_now = controller["e"], controller["frozen"]
+    xi_pred, e, frozen, v = commanded(g, xi_hat, e_now, frozen_now, y, p_ref, xi_ref, v_ff, v0)
+    after: dict[str, Any] = {"xi_pred": xi_pred, "e": e, "frozen": frozen}
+    # The gain file's force constants turn forces into currents, the machine limits those and makes its own forces.
+    limit = plant.actuator.current_limit
+    current = ca.fmax(ca.fmin(v / g["believed"], limit), -limit)
+    row: dict[str, Any] = {"xi_hat": xi_hat, "v": v, "saturated": frozen}
+    if s.fidelity == "force":
+        command = current * ca.vertcat(*plant.actuator.force_constant)
+        row["force"] = machine["force"]
+    else:
+        command, electrics, more = _current_control(
+            plant, c, s, g, machine, controller, given, current, xi_hat
+        )
+        after |= electrics
+        row |= more
+    if s.faulty:
+        missed = given["missed"]
+        after["y_last"] = y
+        command = ca.if_else(missed, controller["command"], command)
+        after["command"] = command
+        for name in after:
+            if name not in ("y_last", "command"):
+                after[name] = ca.if_else(missed, controller[name], after[name])
+    queue = ca.vertcat(controller["under_way"], command)
+    size = command.numel()
+    after["under_way"] = queue[size:]
+    return after, queue[:size], row
+
+
+def state_reference(believed: Plant, p_ref: Any, dp_ref: Any) -> Any:
+    """(P(z*)^-1 p*, its derivative): what the mechanical states should be."""
+    p, dp = ca.SX.sym("p", len(believed.outputs)), ca.SX.sym("dp", len(believed.outputs))
+    q = believed.position_of(p)
+    return ca.Function("q", [p, dp], [ca.vertcat(q, ca.jtimes(q, p, dp))])(p_ref, dp_ref)
+
+
+def _scheduled_C(c: Controller, y: Any) -> Any:
+    """C at the measured stroke position, on the believed machine at rest there."""
+    believed = plant_of(c.parameters)
+    x = ca.SX.sym("x", len(believed.states))
+    rest = ca.SX.zeros(len(believed.states))
+    rest[believed.stroke_state] = y[believed.stroke_output]
+    C = ca.jacobian(believed.h(x, 0), x)[:, list(believed.controlled)]
+    at = ca.substitute(C, x, rest)
+    return ca.horzcat(at, ca.SX(at.shape[0], len(c.states) - at.shape[1]))
+
+
+def _current_control(
+    plant: Plant,
+    c: Controller,
+    s: Setup,
+    g: Mapping[str, Any],
+    machine: Mapping[str, Any],
+    controller: Mapping[str, Any],
+    given: Mapping[str, Any],
+    current: Any,
+    xi_hat: Any,
+) -> tuple[Any, dict[str, Any], dict[str, Any]]:
+    """PI controllers of the axes, integrals by backward Euler, waiting where the half-bridges are at their limit."""
+    believed, drive = plant_of(c.parameters), plant.drive
+    estimate = ca.SX.zeros(len(believed.states))  # where the controller takes the machine to be
+    for k, index in enumerate(believed.controlled):
+        estimate[index] = xi_hat[k]
+    V = machine["link"] * (1 - given["sag"] if s.faulty else 1)
+    if s.fidelity == "dq":
+        i, i_phase = machine["i"], None
+    else:
+        i_phase = machine["i_phase"]
+        i = believed.drive.to_axes(estimate) @ i_phase
+    error = believed.drive.command(current) - i
+    integral = (
+        controller["u_integral"] + g["Ki_current"] * g["current_time"] * (1 - controller["u_limited"]) * error
+    )
+    u = g["Kp"] * error + integral + believed.drive.emf(estimate)
+    row: dict[str, Any] = {"link": machine["link"], "i": i}
+    if s.fidelity == "dq":
+        command, limited = electric.modulation(drive, u, V)
+        row |= {"u": command * V, "force": drive.force(i)}
+    else:
+        u_phase = believed.drive.to_phases(estimate) @ u
+        command, limits = electric.duty_cycles(drive, u_phase, V, i_phase, real_pwm=s.real_pwm)
+        limited = ca.vertcat(*_axes_limited(drive, limits))
+        true = drive.to_axes(machine["x"]) @ i_phase
+        applied = believed.drive.to_axes(estimate) @ ((command - 0.5) * V)
+        row |= {"u": applied, "force": drive.force(true), "i": true, "i_phase": i_phase, "duty": command}
+    return command, {"u_integral": integral, "u_limited": limited}, row
+
+
+def _axes_limited(drive: Any, limits: Any) -> list[Any]:
+    """An axis waits when any phase of its group is limited."""
+    share = len(drive.phases) // len(drive.groups)
+    flags: list[Any] = [0] * len(drive.axes)
+    for k, group in enumerate(drive.groups):
+        anyone = ca.mmax(limits[k * share : (k + 1) * share])
+        for axis in group:
+            flags[axis] = anyone
+    return flags
+
+
+def _moved(
+    plant: Plant,
+    s: Setup,
+    g: Mapping[str, Any],
+    machine: Mapping[str, Any],
+    given: Mapping[str, Any],
+    held: Any,
+) -> Any:
+    """One Runge–Kutta step of the machine under held commands."""
+    h = g["substep"]
+    outside = (
+        given["w"] if s.disturbed else ca.SX(len(plant.disturbances), 1)
+    )  # structural zeros cost nothing
+
+    def motion(x: Any, inputs: Any) -> Any:
+        w = plant.load(x) + outside
+        return plant.f(x, inputs, w + plant.bearing(x) if s.bearing else w)
+
+    x = machine["x"]
+    if s.fidelity == "force":  # the lag is solved exactly: force = v + (force_0 - v) e^(-w_c t)
+        lag = machine["force"] - held
+        decay = ca.exp(-plant.actuator.crossover * h / 2)
+        forces = [held + lag, held + decay * lag, held + decay**2 * lag]
+        k1 = motion(x, forces[0])
+        k2 = motion(x + h / 2 * k1, forces[1])
+        k3 = motion(x + h / 2 * k2, forces[1])
+        k4 = motion(x + h * k3, forces[2])
+        return ca.vertcat(x + h / 6 * (k1 + 2 * (k2 + k3) + k4), forces[2])
+    n, count = len(plant.states), machine["i" if s.fidelity == "dq" else "i_phase"].numel()
+    slope = _axis_slope if s.fidelity == "dq" else _phase_slope
+
+    def rate(z: Any) -> Any:
+        x, i, V = z[:n], z[n : n + count], z[n + count]
+        forces, electrics = slope(plant, s, given, x, i, V, held)
+        return ca.vertcat(motion(x, forces), electrics)
+
+    z = ca.vertcat(*machine.values())
+    k1 = rate(z)
+    k2 = rate(z + h / 2 * k1)
+    k3 = rate(z + h / 2 * k2)
+    k4 = rate(z + h * k3)
+    return z + h / 6 * (k1 + 2 * (k2 + k3) + k4)
+
+
+def _axis_slope(
+    plant: Plant, s: Setup, given: Mapping[str, Any], x: Any, i: Any, V: Any, m: Any
+) -> tuple[Any, Any]:
+    """Forces, and the slopes of axis currents and link voltage."""
+    drive, actuator = plant.drive, plant.actuator
+    u = m * V * (1 - given["sag"] if s.faulty else 1)
+    di = (u - actuator.R * i - drive.emf(x)) / actuator.L + drive.coupling(x, i)
+    power = ca.dot(ca.DM(list(drive.weight)), u * i)
+    return drive.force(i), ca.vertcat(di, electric.link_slope(drive, V, power))
+
+
+def _phase_slope(
+    plant: Plant, s: Setup, given: Mapping[str, Any], x: Any, i: Any, V: Any, d: Any
+) -> tuple[Any, Any]:
+    """Forces, and the slopes of phase currents and link voltage. Phase-wise u = (d - 1/2) V."""
+    drive, actuator = plant.drive, plant.actuator
+    u = (d - 0.5) * V * (1 - given["sag"] if s.faulty else 1)
+    closed = 1 - given["open"] if s.faulty else ca.SX.ones(len(drive.phases))
+    flowing = closed * i
+    net = electric.phase_voltages(drive, u - actuator.R * flowing - drive.to_phases(x) @ drive.emf(x), closed)
+    # An open phase loses its current within a sample: the arc is short.
+    di = net / actuator.L - (1 - closed) * i / OPENING
+    power = ca.dot(u, flowing)
+    return drive.force(drive.to_axes(x) @ flowing), ca.vertcat(di, electric.link_slope(drive, V, power))
+
+
+OPENING = 20e-6  # s, time constant with which the current of an opened phase dies
