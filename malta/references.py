@@ -102,3 +102,19 @@ def hold(plant: Plant, **outputs: float) -> Reference:
         return Motion(zeros + p, zeros, zeros)
 
     return at
+
+
+def circle(plant: Plant, radius: float, frequency: float) -> Reference:
+    """Eq. (21): the first two outputs on a circle of `radius` (m) at `frequency` (Hz), the others at zero."""
+    w = 2 * math.pi * frequency
+
+    def at(t: FloatArray) -> Motion:
+        c, s = np.cos(w * np.asarray(t)), np.sin(w * np.asarray(t))
+        motion = [np.zeros((len(c), len(plant.outputs))) for _ in range(3)]
+        for columns, (along_x, along_y) in zip(
+            motion, ((c, s), (-w * s, w * c), (-(w**2) * c, -(w**2) * s)), strict=True
+        ):
+            columns[:, 0], columns[:, 1] = radius * along_x, radius * along_y
+        return Motion(*motion)
+
+    return at

@@ -39,6 +39,8 @@ RISE = 16.2e-3  # s, 10-90 %: the published stroke, Fig. 12
 
 Estimator = Literal["steady-state", "kalman", "extended"]
 ESTIMATORS: tuple[Estimator, ...] = ("steady-state", "kalman", "extended")
+FeedforwardChoice = Literal["axial", "attraction"]
+FEEDFORWARDS: tuple[FeedforwardChoice, ...] = ("axial", "attraction")
 EngineChoice = Literal["auto", "compiled", "virtual machine"]
 FaultKind = Literal[
     "lost sample", "stuck sensor", "biased sensor", "noisy sensor", "open phase", "link sag", "missed step"
@@ -85,6 +87,9 @@ class Scenario:
     real_pwm: bool = False  # duty cycles in steps, dead time (fidelity phase)
     bearing: bool = False  # touchdown bearings push back; without, a touchdown ends the run
     estimator: Estimator = "steady-state"
+    feedforward: FeedforwardChoice = (
+        "axial"  # "attraction" adds what holds the mover off centre, see `feedforward`
+    )
     scheduled: bool = False  # C(z) of the measured z in the steady-state filter
     faults: tuple[Fault, ...] = ()
     correction: Correction | None = None
@@ -107,7 +112,11 @@ class Scenario:
                 raise InputError(where, name, repr(value), "a whole number")
             if value is not None and not (math.isfinite(value) and value >= low):
                 raise InputError(where, name, str(value), "a number above 0" if low else "0 or more")
-        for name, known in (("fidelity", FIDELITIES), ("estimator", ESTIMATORS)):
+        for name, known in (
+            ("fidelity", FIDELITIES),
+            ("estimator", ESTIMATORS),
+            ("feedforward", FEEDFORWARDS),
+        ):
             if getattr(self, name) not in known:
                 raise InputError(where, name, repr(getattr(self, name)), "one of " + ", ".join(known))
         if self.real_pwm and self.fidelity != "phase":
@@ -216,9 +225,7 @@ class Trajectory:
         return evaluate(axes.map(len(self.force)), self.force / constants)[0]
 
 
-SERIES = tuple(
-    ["p", "y", "x", "xi_hat", "v", "force", "saturated", "contact", "i", "u", "link", "i_phase", "duty"]
-)
+SERIES = ("p", "y", "x", "xi_hat", "v", "force", "saturated", "contact", "i", "u", "link", "i_phase", "duty")
 
 
 def simulate(
@@ -469,7 +476,7 @@ def _given(
     t: FloatArray,
 ) -> FloatArray:
     """What every sample is given, in the order of machine.layout."""
-    v_ff = feedforward(c, motion)
+    v_ff = feedforward(c, motion, scenario.feedforward)
     past = [np.vstack([np.repeat(v_ff[:1], age, axis=0), v_ff[:-age]]) for age in range(c.delay, 0, -1)]
     parts = {"p_ref": motion.p, "dp_ref": motion.dp, "v_ff": v_ff}
     if past:
@@ -483,11 +490,22 @@ def _given(
     return np.hstack([parts[name] for name in sizes])
 
 
-def feedforward(c: Controller, motion: references.Motion) -> FloatArray:
-    """v_ff = mass z*'' on the thrust, N, k x m."""
+def feedforward(c: Controller, motion: references.Motion, choice: FeedforwardChoice = "axial") -> FloatArray:
+    """v_ff, N, k x m: mass z*'' on the thrust, as the paper; "attraction" adds the forces that hold the mover at q*.
+
+    With state feedback alone a mover that is pulled with stiffness k and held with K1 goes to K1 / (K1 - k) of what is
+    asked, until the integrals have taken it back: twice as far at K1 = 2 k. From the file's own model q'' = k q + G v,
+    these forces are -G^-1 k q*.
+    """
     believed = plant_of(c.parameters)
     v_ff = np.zeros((len(motion.p), len(c.forces)))
     v_ff[:, believed.thrust_input] = c.feedforward.mass * motion.ddp[:, believed.stroke_output]
+    if choice == "attraction":
+        half = len(c.A) // 2
+        hold = -np.linalg.lstsq(c.B[half:], c.A[half:, :half], rcond=None)[0]
+        p = ca.SX.sym("p", len(c.measurements))
+        positions = ca.Function("q", [p], [ca.densify(believed.position_of(p))]).map(len(motion.p))
+        v_ff += evaluate(positions, motion.p)[0] @ hold.T
     return v_ff
 
 
