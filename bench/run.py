@@ -23,8 +23,8 @@ from rich.progress import track
 from rich.table import Table
 
 import malta
-from malta.plants import tubular
 from malta.machine import state_reference
+from malta.plants import tubular
 from malta.simulate import compiled_shape, engine_of, feedforward
 
 ROOT = Path(__file__).parents[1]

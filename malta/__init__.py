@@ -15,18 +15,27 @@ if TYPE_CHECKING:  # the contents page, as type checkers and readers see it
     from malta import plants as plants
     from malta import references as references
     from malta import report as report
+    from malta.campaign import Batch as Batch
+    from malta.campaign import replayed as replayed
+    from malta.campaign import simulate_many as simulate_many
+    from malta.claims import ledger as ledger
     from malta.controller import Controller as Controller
+    from malta.data import in_unit as in_unit
     from malta.data import plant_of as plant_of
     from malta.data import published as published
     from malta.data import read as read
     from malta.errors import CheckError as CheckError
     from malta.errors import InputError as InputError
+    from malta.experiments import Experiment as Experiment
+    from malta.experiments import experiment as experiment
+    from malta.fastest import fastest_stroke as fastest_stroke
     from malta.linearize import LinearModel as LinearModel
     from malta.linearize import linearize as linearize
     from malta.plant import OperatingPoint as OperatingPoint
     from malta.plant import Plant as Plant
     from malta.plant import Signal as Signal
     from malta.plant import trim as trim
+    from malta.simulate import Fault as Fault
     from malta.simulate import Scenario as Scenario
     from malta.simulate import Trajectory as Trajectory
     from malta.simulate import simulate as simulate
@@ -44,12 +53,16 @@ if TYPE_CHECKING:  # the contents page, as type checkers and readers see it
     from malta.verify import verify as verify
 
 _NAMES = {  # the same, for the first use of each name
+    "campaign": ("Batch", "replayed", "simulate_many"),
+    "claims": ("ledger",),
     "controller": ("Controller",),
-    "data": ("plant_of", "published", "read"),
+    "data": ("in_unit", "plant_of", "published", "read"),
     "errors": ("CheckError", "InputError"),
+    "experiments": ("Experiment", "experiment"),
+    "fastest": ("fastest_stroke",),
     "linearize": ("LinearModel", "linearize"),
     "plant": ("OperatingPoint", "Plant", "Signal", "trim"),
-    "simulate": ("Scenario", "Trajectory", "simulate", "stroke_figures"),
+    "simulate": ("Fault", "Scenario", "Trajectory", "simulate", "stroke_figures"),
     "spec": ("Spec", "Weights", "read_design"),
     "synthesize": ("calibrate", "kalman", "lqg", "lqi", "lqr", "synthesize"),
     "verify": ("Margins", "verify"),

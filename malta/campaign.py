@@ -19,12 +19,13 @@ import numpy as np
 from malta import machine
 from malta.controller import Controller
 from malta.data import units_of
-from malta.engine import LANES, evaluate, feedforward_table, run_many
+from malta.engine import LANES, evaluate, feedforward_table, in_lanes, run_many
 from malta.errors import InputError
 from malta.machine import Setup
 from malta.noise import keys
 from malta.plant import Plant, readonly
 from malta.simulate import (
+    BLOCK,
     Scenario,
     beginning,
     compiled_shape,
@@ -96,7 +97,9 @@ def simulate_many(
     theta = _thetas(plant, values, changes, runs)
     t, motion, given = sampled(plant, controller, scenario, setup)
     begin = _starts(plant, controller, setup, values, *beginning(plant, controller, scenario, given[0]))
-    (states,) = evaluate(begin.map(runs), theta)
+    states = np.vstack(
+        [evaluate(begin.map(len(part)), part)[0] for part in np.array_split(theta, -(-runs // BLOCK))]
+    )
     axis = plant.stroke_output
     sizes = _digest_sizes(plant)
     kept = np.zeros((runs, sum(sizes.values())))
@@ -104,39 +107,39 @@ def simulate_many(
     kept[:, :3] = [1, start, 1 / (end - start) if end != start else 0]
     kept[:, 4 : 4 + len(LEVELS)] = -1
     sigma = np.ascontiguousarray(scenario.noise * np.array(plant.noise), dtype=float)
-    streams = keys(scenario.seed, first + np.arange(runs))
     ff = controller.feedforward
     table = feedforward_table(ff.z_grid, ff.v0)
-    done = 0
+    groups = -(-runs // LANES)
+    lanes = {
+        name: in_lanes(a, groups) for name, a in (("theta", theta), ("states", states), ("digests", kept))
+    }
+    streams = keys(scenario.seed, first + np.minimum(np.arange(groups * LANES), runs - 1))
+    step = max(
+        1, min(16, groups // (4 * (workers or os.cpu_count() or 1)))
+    )  # groups in one call, for the progress bar
 
-    def group(k: int) -> tuple[int, FloatArray]:
-        chosen = np.minimum(np.arange(k, k + LANES), runs - 1)  # the last machine fills the last register
-        ours = [np.ascontiguousarray(a[chosen].T) for a in (theta, states, kept)]
+    def fly(k: int) -> None:
         run_many(
             lib,
-            first=0,
+            slice(k, min(k + step, groups)),
             substeps=scenario.substeps,
-            theta=ours[0],
             table=table,
-            states=ours[1],
             given=given,
             sigma=sigma,
-            keys=np.ascontiguousarray(streams[chosen]),
-            digests=ours[2],
+            keys=streams.reshape(groups, LANES),
+            **lanes,
         )
-        return k, ours[2].T
 
     with ThreadPoolExecutor(workers or os.cpu_count()) as pool:
         try:
-            for k, rows in pool.map(group, range(0, runs, LANES)):
-                kept[k : k + LANES] = rows[: runs - k]
-                done = min(k + LANES, runs)
+            for done, _ in enumerate(pool.map(fly, range(0, groups, step))):
                 if progress is not None:
-                    progress(done / runs)
+                    progress(min(1.0, (done + 1) * step / groups))
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise
-    return _batch(kept, len(t), controller.sample_time, sizes)
+    ends = lanes["digests"].swapaxes(1, 2).reshape(groups * LANES, -1)[:runs]
+    return _batch(ends, len(t), controller.sample_time, sizes)
 
 
 def replayed(
@@ -226,27 +229,27 @@ def _digest(shape: Any) -> ca.Function:
     row = {name: ca.SX.sym(name, size) for name, size in sizes.row.items()}
     given = {name: ca.SX.sym(name, size) for name, size in sizes.given.items()}
     theta = ca.SX.sym("theta", len(machine.flat(machine.numbers(plant, c, 1))))
-    error = row["p"] - given["p_ref"]
-    share = (row["p"][plant.stroke_output] - kept["start"]) * kept["scale"]
-    k = kept["samples"]
-    now = ca.logic_and(kept["reached"] < 0, share >= ca.DM(LEVELS))
     largest = ca.fmax(kept["contact"], row["contact"])
+    alive = kept["alive"]  # what follows adds nothing once it is 0
+    error = ca.if_else(alive, row["p"] - given["p_ref"], 0)
+    share = (row["p"][plant.stroke_output] - kept["start"]) * kept["scale"]
+    now = ca.logic_and(ca.logic_and(alive, kept["reached"] < 0), share >= ca.DM(LEVELS))
     after = {
-        "alive": ca.logic_and(kept["alive"], ca.mmax(largest) < 1),
+        "alive": ca.logic_and(alive, ca.mmax(largest) < 1),
         "start": kept["start"],
         "scale": kept["scale"],
-        "samples": k + 1,
-        "reached": ca.if_else(now, k, kept["reached"]),
+        "samples": kept["samples"] + alive,
+        "reached": ca.if_else(now, kept["samples"], kept["reached"]),
         "below": ca.if_else(now, kept["share"], kept["below"]),
         "above": ca.if_else(now, share, kept["above"]),
         "share": share,
-        "largest_share": ca.fmax(kept["largest_share"], share),
+        "largest_share": ca.if_else(alive, ca.fmax(kept["largest_share"], share), kept["largest_share"]),
         "deviation": ca.fmax(kept["deviation"], ca.fabs(error)),
         "squares": kept["squares"] + error**2,
-        "force": ca.fmax(kept["force"], ca.fabs(row["v"])),
-        "contact": largest,
+        "force": ca.fmax(kept["force"], ca.if_else(alive, ca.fabs(row["v"]), 0)),
+        "contact": ca.if_else(alive, largest, kept["contact"]),
     }
-    result = ca.vertcat(*(ca.if_else(kept["alive"], after[name], kept[name]) for name in kept))
+    result = ca.vertcat(*(after[name] for name in kept))
     arguments = [ca.vertcat(*part.values()) for part in (kept, row, given)]
     return ca.Function("digest", [*arguments, theta], [ca.densify(result)])
 

@@ -6,6 +6,8 @@ import gc
 import io
 import json
 import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -16,6 +18,7 @@ from malta.errors import CheckError, InputError
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from malta.experiments import Experiment
     from malta.plant import Parameters
     from malta.simulate import StrokeFigures, Trajectory
     from malta.verify import Margins
@@ -56,6 +59,9 @@ Changes = Annotated[
         "--set", metavar="NAME=VALUE", help="Change a parameter of the machine: m=0.56 (SI) or l_B=45mm."
     ),
 ]
+SCENARIOS = (
+    "What to simulate: stroke, hold, tilt, lift-off, payload, thermal, disturbance, faults, drive-limits."
+)
 GainFile = Annotated[Path, typer.Argument(metavar="GAINS", help="A gain file: .json, .npz or .mat.")]
 
 
@@ -145,23 +151,56 @@ def verify(gains: GainFile, change: Changes = None, as_json: AsJson = False) -> 
 @app.command()
 def simulate(
     gains: GainFile,
-    scenario: Annotated[str, typer.Option(help="What to simulate: stroke.")] = "stroke",
+    scenario: Annotated[str, typer.Option(help=SCENARIOS)] = "stroke",
     change: Changes = None,
-    distance: Annotated[float, typer.Option(help="Stroke [mm].")] = 10.0,
+    distance: Annotated[float | None, typer.Option(help="stroke, drive-limits: length [mm]. [10]")] = None,
     rise: Annotated[
-        float | None, typer.Option(help="Rise of the reference, 10-90 % [ms]. [the published 16.2]")
+        float | None, typer.Option(help="stroke: rise of the reference, 10-90 % [ms]. [the published 16.2]")
     ] = None,
-    profile: Annotated[str, typer.Option(help="Reference: logistic or quintic.")] = "logistic",
-    noise: Annotated[float, typer.Option(help="Sensor noise in multiples of the machine's; 0: none.")] = 0.0,
-    quantize: Annotated[bool, typer.Option(help="Sensors with the machine's resolution.")] = False,
-    delay: Annotated[int | None, typer.Option(help="Samples of delay. [the machine's]")] = None,
-    seed: Annotated[int, typer.Option(help="Seed of the noise.")] = 0,
+    profile: Annotated[
+        str | None, typer.Option(help="stroke: logistic or quintic reference. [logistic]")
+    ] = None,
+    fidelity: Annotated[
+        str | None,
+        typer.Option(help="What makes the forces: force (first-order lags), dq (PI loops), phase. [dq]"),
+    ] = None,
+    noise: Annotated[
+        float | None, typer.Option(help="Sensor noise in multiples of the machine's. [the scenario's]")
+    ] = None,
+    quantize: Annotated[
+        bool | None, typer.Option(help="Sensors with the machine's resolution. [the scenario's]")
+    ] = None,
+    estimator: Annotated[
+        str | None, typer.Option(help="steady-state, kalman (time-varying) or extended. [steady-state]")
+    ] = None,
+    scheduled: Annotated[bool | None, typer.Option(help="C(z) of the measured z in the filter.")] = None,
+    feedforward: Annotated[
+        str | None,
+        typer.Option(help="axial, as printed, or attraction: also what holds it off centre. [axial]"),
+    ] = None,
+    bearing_axes: Annotated[
+        str | None,
+        typer.Option(
+            help="dq, phase: current controllers in fixed axes, or turning with the force as printed. [fixed]"
+        ),
+    ] = None,
+    real_pwm: Annotated[
+        bool | None, typer.Option(help="phase: duty cycles in steps, dead time of the half-bridges.")
+    ] = None,
+    delay: Annotated[
+        int | None, typer.Option(help="Samples between measurement and command. [the machine's]")
+    ] = None,
+    substeps: Annotated[
+        int | None, typer.Option(help="Runge-Kutta steps a sample; the error is estimated. [4]")
+    ] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of the noise. [0]")] = None,
+    engine: Annotated[str, typer.Option(help="auto, compiled or virtual-machine.")] = "auto",
     out: Annotated[
         Path | None, typer.Option(help="Folder for the figure (.png) and the time series (.npz).")
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Simulate the nonlinear machine with a gain file.
+    """Simulate the nonlinear machine and its drive with a gain file.
 
     The machine is the one in the file, with the changes given by --set; the controller does not learn of them.
 
@@ -170,52 +209,102 @@ def simulate(
     """
     from malta import gains as gain_files
     from malta.data import plant_of
-    from malta.simulate import RISE, Scenario, stroke_figures
-    from malta.simulate import save as save_series
-    from malta.simulate import simulate as simulated
+    from malta.experiments import experiment
 
-    if scenario != "stroke":
-        raise InputError("simulate", "--scenario", repr(scenario), "stroke")
     controller = gain_files.read(gains)
     plant = plant_of(_changed(controller.parameters, change))
-    asked = Scenario.stroke(
-        distance * 1e-3,
-        rise=RISE if rise is None else rise * 1e-3,
-        profile=profile,  # type: ignore[arg-type]  # checked by references.stroke, with a sentence
-        noise=noise,
-        quantize=quantize,
-        delay=delay,
-        seed=seed,
-    )
-    run = simulated(plant, controller, asked)
-    figures = stroke_figures(run)
-    published = _published(plant.name) if distance == 10.0 and rise is None else None  # of that stroke
-    files: list[Path] = []
-    if out is not None:
-        from malta import report
-
-        stem = out / f"{controller.name}_{scenario}"
-        files = [
-            save_series(run, stem.with_suffix(".npz")),
-            report.stroke(run, stem.with_suffix(".png"), published),
-        ]
+    options = {
+        "distance": None if distance is None else distance * 1e-3,
+        "rise": None if rise is None else rise * 1e-3,
+        "profile": profile,
+        "fidelity": fidelity,
+        "noise": noise,
+        "quantize": quantize,
+        "estimator": estimator,
+        "scheduled": scheduled,
+        "feedforward": feedforward,
+        "bearing_axes": bearing_axes,
+        "real_pwm": real_pwm,
+        "delay": delay,
+        "substeps": substeps,
+        "seed": seed,
+    }
+    given = {name: value for name, value in options.items() if value is not None}
+    with _bar(scenario, quiet=as_json) as progress:
+        found = experiment(
+            scenario, plant, controller, progress=progress, engine=engine.replace("-", " "), **given
+        )
+    published = _published(plant.name)
+    files = [] if out is None else _kept(found, out, published)
     if as_json:
         _print_json(
-            {"gains": str(gains), "scenario": scenario, "files": [str(f) for f in files]}
-            | _stroke(run, figures)
+            {"gains": str(gains), "scenario": scenario, "files": [str(f) for f in files]} | _found(found)
         )
     else:
         from malta import report
 
         console = _console()
+        run = found.run
         console.print(
-            f"{gains}: {scenario}", *(change or ()), f"-> {run.verdict.name} at {run.verdict.time:.4g} s"
+            f"{gains}: {scenario}, fidelity {run.scenario.fidelity}", *(change or ()), f"-> {found.outcome}"
         )
-        console.print(report.stroke_table(figures, published))
+        console.print(report.experiment_table(found, published))
+        if substeps is not None:
+            from malta.simulate import integration_error
+
+            console.print(f"integration error, estimated: {integration_error(run):.1g} m")
         for file in files:
             console.print(f"wrote {file}", soft_wrap=True)
-    if not run.verdict.completed:
-        raise CheckError(f"{gains}: {scenario}: {run.verdict.name} at {run.verdict.time:.4g} s")
+    if found.run.engine == "virtual machine" and engine == "auto":
+        print(
+            "malta: no C compiler: simulated on CasADi's virtual machine, some ten times slower",
+            file=sys.stderr,
+        )
+    if found.interrupted:
+        print(f"malta: interrupted: {found.outcome}; what was computed is shown", file=sys.stderr)
+        raise typer.Exit(130)
+    if found.failed:
+        raise CheckError(f"{gains}: {scenario}: {found.outcome}")
+
+
+@app.command()
+def claims(
+    designs: Annotated[
+        list[Path] | None,
+        typer.Argument(help="Design files; table2 and calibrated of design/ if none is named."),
+    ] = None,
+    markdown: Annotated[
+        bool, typer.Option("--markdown", help="Print the table as the README holds it.")
+    ] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Print the ledger: every number that the paper publishes, ours for each design, and a verdict.
+
+    All of it is computed now: models, gains, margins, experiments on the simulated drive.
+
+    \b
+    Example:  malta claims design/table2.toml
+    """
+    from malta.claims import ledger
+    from malta.data import published
+    from malta.spec import read_design
+
+    chosen = designs or sorted(Path("design").glob("*.toml"), reverse=True)
+    if not chosen:
+        raise InputError(
+            "claims", "", "no design files (*.toml) here", "a folder design/ with some, or their names"
+        )
+    specs = [read_design(file) for file in chosen]
+    with _bar("claims", quiet=as_json) as progress:
+        found = ledger(specs, published(specs[0].machine_file), progress)
+    if as_json:
+        _print_json({"designs": list(found.designs), "claims": [claim._asdict() for claim in found.claims]})
+    elif markdown:
+        print(found.markdown(), end="")
+    else:
+        from malta import report
+
+        _console().print(report.claims_table(found))
 
 
 def main() -> None:
@@ -324,6 +413,46 @@ def _published(machine: str) -> dict[str, Any] | None:
     return None
 
 
+def _kept(found: Experiment, out: Path, published: Any) -> list[Path]:
+    """Write the figure, and the time series of every run."""
+    from malta import report
+    from malta.simulate import save as save_series
+
+    stem = f"{found.run.controller.name}_{found.name}"
+    names = [stem] if len(found.cases) == 1 else [f"{stem}_{_slug(case.label)}" for case in found.cases]
+    series = [
+        save_series(case.run, out / f"{name}.npz") for name, case in zip(names, found.cases, strict=True)
+    ]
+    return [*series, report.experiment(found, out / f"{stem}.png", published)]
+
+
+def _slug(label: str) -> str:
+    return "_".join("".join(c if c.isalnum() else " " for c in label).split())
+
+
+def _found(found: Experiment) -> dict[str, Any]:
+    """An experiment as plain tables; SI, with the unit that a report would show."""
+    content: dict[str, Any] = {
+        "engine": found.run.engine,
+        "fidelity": found.run.scenario.fidelity,
+        "verdict": found.run.verdict._asdict(),
+        "merits": {merit.label: merit.value for merit in found.merits},
+        "cases": [
+            {
+                "label": case.label,
+                "verdict": case.run.verdict._asdict(),
+                "merits": {merit.label: merit.value for merit in case.merits},
+            }
+            for case in found.cases
+        ],
+    }
+    if found.name == "stroke":
+        from malta.simulate import stroke_figures
+
+        content |= _stroke(found.run, stroke_figures(found.run))
+    return content
+
+
 def _margins(margins: Margins) -> dict[str, Any]:
     return {
         "stable": margins.stable,
@@ -367,6 +496,21 @@ def _progress(files: list[Path], what: str, *, quiet: bool) -> Any:
     from rich.progress import track
 
     return track(files, what, console=Console(stderr=True), transient=True)
+
+
+@contextmanager
+def _bar(what: str, *, quiet: bool) -> Iterator[Callable[[float], None] | None]:
+    """A progress bar with the time left on a terminal's standard error, gone when the work is done."""
+    if quiet or not sys.stderr.isatty():
+        yield None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task(what, total=1.0)
+        yield lambda share: bar.update(task, completed=share)
 
 
 def _complain(error: InputError | CheckError, file: Path | None = None) -> int:

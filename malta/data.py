@@ -12,6 +12,7 @@ from __future__ import annotations
 import importlib
 import math
 import tomllib
+from collections.abc import Mapping
 from dataclasses import MISSING, Field, field, fields
 from functools import cache, lru_cache
 from numbers import Real
@@ -251,3 +252,40 @@ def published(machine_file: str | Path) -> dict[str, Any]:
     """What the source paper prints: published/NAME.toml beside the machine's data file NAME.toml."""
     path = Path(machine_file)
     return load_toml(path.parent / "published" / path.name)
+
+
+def published_value(content: Mapping[str, Any], key: str) -> float:
+    """A published quantity by its dotted key, in SI units: `{ value, unit }`, or a number in a table with a unit.
+
+    Raises InputError when it is not there, no number, or of an unknown unit.
+    """
+    where, unit = "data/published", None
+    entry: Any = content
+    for part in key.split("."):
+        if not isinstance(entry, Mapping) or part not in entry:
+            raise InputError(where, key, "nothing", "what the paper prints")
+        unit = entry.get("unit", unit)
+        entry = entry[part]
+    if isinstance(entry, Mapping):
+        unit, entry = entry.get("unit"), entry.get("value")
+    if isinstance(entry, bool) or not isinstance(entry, int | float) or not isinstance(unit, str):
+        raise InputError(where, key, f"{entry!r} in {unit}", "a number with a unit")
+    return float(entry) * _scale(unit, f"{key}.unit")
+
+
+def in_unit(value: float, unit: str) -> float:
+    """An SI value in a unit to show it in: 16.2e-3 in "ms" is 16.2."""
+    return value / _scale(unit, unit)
+
+
+@cache
+def _scale(unit: str, name: str) -> float:
+    """SI units in one of `unit`."""
+    registry = _units()
+    try:
+        factor, root = registry.get_root_units(registry.parse_units("" if unit == "1" else unit))
+    except Exception as error:  # pint raises many kinds, tokenizer errors among them
+        raise InputError("data", name, repr(unit), "a unit") from error
+    grams = registry.get_dimensionality(root).get("[mass]", 0)  # pint's root of mass is the gram
+    scale: float = float(factor) / 1000.0 ** float(grams)
+    return scale

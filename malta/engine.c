@@ -13,26 +13,26 @@
 
 #if LANES == 1
 typedef double real;
-typedef int64_t whole;
+typedef int64_t whole; /* as a truth: -1 or 0 */
 #define LANE(x, i) (x)
-#define truth(m) ((real)(m))
 static inline whole bits(real x) { whole b; memcpy(&b, &x, 8); return b; }
 static inline real value(whole b) { real x; memcpy(&x, &b, 8); return x; }
-static inline real where(real c, real x) { return c != 0 ? x : 0; }
-static inline real larger(real a, real b) { return a > b ? a : b; }
-static inline real smaller(real a, real b) { return a < b ? a : b; }
+#define MASK(m) (-(whole)(m))
+static inline real pick(whole m, real a, real b) { return m ? a : b; }
 #else
 typedef double real __attribute__((vector_size(8 * LANES)));
 typedef int64_t whole __attribute__((vector_size(8 * LANES)));
 #define LANE(x, i) ((x)[i])
-#define truth(m) value((whole)(m) & bits(K(1.0)))
 static inline whole bits(real x) { return (whole)x; }
 static inline real value(whole b) { return (real)b; }
+#define MASK(m) ((whole)(m))
 static inline real pick(whole m, real a, real b) { return value((m & bits(a)) | (~m & bits(b))); }
-static inline real where(real c, real x) { return value((whole)(c != 0) & bits(x)); }
-static inline real larger(real a, real b) { return pick((whole)(a > b), a, b); }
-static inline real smaller(real a, real b) { return pick((whole)(a < b), a, b); }
 #endif
+static inline real truth(whole m) { return value(m & bits((real){0} + 1.0)); }
+static inline real where(whole m, real x) { return value(m & bits(x)); }
+static inline real larger(real a, real b) { return pick(MASK(a > b), a, b); }
+static inline real smaller(real a, real b) { return pick(MASK(a < b), a, b); }
+static inline real size(real x) { return value(bits(x) & 0x7fffffffffffffffLL); }
 #define K(x) ((x) - (real){0}) /* a constant in every lane */
 #define EACH(name, call) /* through an array: compilers make one instruction of sqrt, floor and fabs */ \
   static inline real name(real x) { \
@@ -53,20 +53,39 @@ static inline real smaller(real a, real b) { return pick((whole)(a < b), a, b); 
   }
 
 static inline double one_sign(double x) { return (x > 0) - (x < 0); }
-EACH(each_sqrt, sqrt) EACH(each_fabs, fabs) EACH(each_floor, floor) EACH(each_ceil, ceil) EACH(each_exp, exp)
+EACH(each_sqrt, sqrt) EACH(each_floor, floor) EACH(each_ceil, ceil) EACH(each_exp, exp)
 EACH(each_log, log) EACH(each_tan, tan) EACH(each_tanh, tanh) EACH(each_asin, asin) EACH(each_acos, acos)
 EACH(each_atan, atan) EACH(each_sinh, sinh) EACH(each_cosh, cosh) EACH(each_sign, one_sign)
 PAIR(each_pow, pow) PAIR(each_atan2, atan2) PAIR(each_hypot, hypot) PAIR(each_fmod, fmod)
 
-/* sin and cos: Cody-Waite reduction by pi/2 in three parts, then the minimax polynomials of fdlibm; below 1e5 in
-   size the error is at most 2 units in the last place. The compiler shares the reduction between the two.          */
-static inline void reduced(real x, whole *quadrant, real *r) {
-  const double shift = 6755399441055744.0; /* 1.5 * 2^52: its last bits are the nearest whole number */
-  real t = x * 0.63661977236758134308 + shift, n = t - shift;
-  *quadrant = bits(t);
-  *r = ((x - n * 1.57079632673412561417e+00) - n * 6.07710050630396597660e-11) - n * 2.02226624879595063154e-21;
+#if LANES == 8 && defined(__AVX512DQ__)
+static inline int nowhere(whole m) { return _mm512_movepi64_mask((__m512i)m) == 0; }
+static inline real inverse(real x) { /* 14 bits, doubled twice: a division takes several times as long */
+  real r = (real)_mm512_rcp14_pd((__m512d)x);
+  r = r + r * (1.0 - x * r);
+  return r + r * (1.0 - x * r);
 }
-/* Terms in pairs (Estrin): a chain of fewer operations, each of which waits for the one before. */
+#else
+static inline int nowhere(whole m) {
+  int64_t any = 0;
+  for (int i = 0; i < LANES; i++) any |= LANE(m, i);
+  return any == 0;
+}
+static inline real inverse(real x) { return 1.0 / x; }
+#endif
+
+/* sin(x) = (-1)^n sin(x - n pi) with the nearest n, cos(x) = sin(x + pi/2); between the zeros an odd polynomial of degree
+   15, whose terms stand in pairs (Estrin): chains of operations that wait for each other stay short. Near zero, where a
+   mover in its air gap tilts, shorter ones of fdlibm. Absolute error below 1e-15 up to 100 rad.                       */
+#define NEAR(x) __builtin_expect(nowhere(MASK((x) * (x) > 0.6)), 1)
+static inline real sine_of_part(real x, real half) { /* sin of x + half pi */
+  const double shift = 6755399441055744.0; /* 1.5 * 2^52: its last bits are the nearest whole number */
+  real counted = x * 0.31830988618379067154 + half + shift, n = counted - shift - half;
+  real r = (x - n * 3.14159265358979311600) - n * 1.22464679914735317723e-16;
+  real t = r * r, t2 = t * t, t4 = t2 * t2;
+  real a = 0.9999999999999998 + t * -0.16666666666666075, b = 0.00833333333328281 + t * -0.00019841269824874834, c = 2.755731661057137e-06 + t * -2.505188203572492e-08, d = 1.6048170941500553e-10 + t * -7.37441787774225e-13;
+  return value(bits(r * ((a + t2 * b) + t4 * (c + t2 * d))) ^ (bits(counted) << 63));
+}
 static inline real sin_near(real r) {
   real z = r * r, w = z * z;
   real low = -1.66666666666666324348e-01 + z * 8.33333333332248946124e-03;
@@ -81,38 +100,8 @@ static inline real cos_near(real r) {
   real top = 2.08757232129817482790e-09 + z * -1.13596475577881948265e-11;
   return (1.0 - 0.5 * z) + w * (low + w * (mid + w * top));
 }
-static inline real turned(whole q, real s, real c) { /* s, c, -s, -c in quadrants 0 to 3 */
-  whole odd = -(q & 1);
-  return value(((bits(c) & odd) | (bits(s) & ~odd)) ^ ((q & 2) << 62));
-}
-#if LANES == 1
-#define SMALL(x) __builtin_expect(fabs(x) < 0.785, 1) /* a mover in its air gap tilts by milliradians */
-#else
-#define SMALL(x) __builtin_expect(nowhere((x) * (x) > 0.616), 1)
-static inline int nowhere(whole m) { /* whether no lane is true */
-#if LANES == 8 && defined(__AVX512DQ__)
-  return _mm512_movepi64_mask((__m512i)m) == 0;
-#else
-  int64_t any = 0;
-  for (int i = 0; i < LANES; i++) any |= m[i];
-  return any == 0;
-#endif
-}
-#endif
-static inline real sine(real x) {
-  whole q;
-  real r;
-  if (SMALL(x)) return sin_near(x); /* what the rest gives there too, to the bit */
-  reduced(x, &q, &r);
-  return turned(q, sin_near(r), cos_near(r));
-}
-static inline real cosine(real x) {
-  whole q;
-  real r;
-  if (SMALL(x)) return cos_near(x);
-  reduced(x, &q, &r);
-  return turned(q + 1, sin_near(r), cos_near(r));
-}
+static inline real sine(real x) { return NEAR(x) ? sin_near(x) : sine_of_part(x, (real){0}); }
+static inline real cosine(real x) { return NEAR(x) ? cos_near(x) : sine_of_part(x, (real){0} + 0.5); }
 
 /*MODEL*/
 
@@ -159,7 +148,7 @@ static inline real logarithm(real x) { /* of 2^-33 < x < 1; fdlibm's */
   whole b = bits(x) - 0x3fe6a09e667f3bcdLL; /* from sqrt(1/2) on */
   whole e = b >> 52;
   real f = value((b & 0xfffffffffffffLL) + 0x3fe6a09e667f3bcdLL) - 1.0;
-  real s = f / (2.0 + f), z = s * s, half = 0.5 * f * f;
+  real s = f * inverse(2.0 + f), z = s * s, half = 0.5 * f * f;
   real tail = z * (6.666666666666735130e-01 + z * (3.999999999940941908e-01 + z * (2.857142874366239149e-01
     + z * (2.222219843214978396e-01 + z * (1.818357216161805012e-01 + z * (1.531383769920937332e-01
     + z * 1.479819860511658591e-01))))));
@@ -171,18 +160,21 @@ static inline void two_normals(bits64 key, uint64_t count, real *a, real *b) {
   x = (x ^ (x >> 30)) * 0xbf58476d1ce4e5b9ULL;
   x = (x ^ (x >> 27)) * 0x94d049bb133111ebULL;
   x = x ^ (x >> 31);
-  const double unit = 1.0 / 4294967296.0;
+  const double unit = 1.0 / 4294967296.0, quarter = 1.57079632679489661923 / 1073741824.0;
   real u = (__builtin_convertvector((whole)(x >> 32), real) + 0.5) * unit;
-  real angle = (__builtin_convertvector((whole)(x & 0xffffffffULL), real) + 0.5) * (unit * 6.28318530717958647693);
-  real radius = each_sqrt(-2.0 * logarithm(u));
-  *a = radius * cosine(angle);
-  *b = radius * sine(angle);
+  /* The angle: a quadrant, and 30 bits within it about its middle. */
+  whole q = (whole)((x >> 30) & 3);
+  real r = (__builtin_convertvector((whole)(x & 0x3fffffff), real) - 536870911.5) * quarter;
+  real radius = each_sqrt(-2.0 * logarithm(u)), s = sin_near(r) * radius, c = cos_near(r) * radius;
+  whole odd = -(q & 1);
+  *a = value(((bits(s) & odd) | (bits(c) & ~odd)) ^ (((q + 1) & 2) << 62));
+  *b = value(((bits(c) & odd) | (bits(s) & ~odd)) ^ ((q & 2) << 62));
 }
 
-/* LANES machines at once: only digests are kept. `first` is the sample at which this call starts, always even. */
-void run_many(long first, long samples, long substeps, const double *theta, long grid,
-              const double *table, double *states, const double *given, const double *sigma, const uint64_t *keys,
-              double *digests) {
+/* LANES machines at once: only digests are kept. */
+static void run_group(long samples, long substeps, const double *theta, long grid, const double *table,
+                      double *states, const double *given, const double *sigma, const uint64_t *keys,
+                      double *digests) {
   real t[THETA + 1], c[CONSTANTS + 1], state[STATES], next[STATES], moved[MACHINE], y[OUTPUTS], v[FORCES], held[HELD];
   real row[ROW], kept[DIGEST], kept_next[DIGEST], noise[2 * OUTPUTS];
   long hint[LANES] = {0};
@@ -199,7 +191,7 @@ void run_many(long first, long samples, long substeps, const double *theta, long
     real at;
     if (noisy && k % 2 == 0) {
       for (int j = 0; j < OUTPUTS; j++)
-        two_normals(key, (uint64_t)((first + k) / 2 * OUTPUTS + j), noise + 2 * j, noise + 2 * j + 1);
+        two_normals(key, (uint64_t)(k / 2 * OUTPUTS + j), noise + 2 * j, noise + 2 * j + 1);
       for (int j = 0; j < 2 * OUTPUTS; j++) noise[j] = noise[j] * sigma[j % OUTPUTS];
     }
     sense(c, state, given, noise + k % 2 * OUTPUTS, y, &at);
@@ -215,5 +207,13 @@ void run_many(long first, long samples, long substeps, const double *theta, long
   }
   memcpy(states, state, sizeof state);
   memcpy(digests, kept, sizeof kept);
+}
+
+/* Groups of LANES machines, one after the other; states and digests are taken and left behind. */
+void run_many(long groups, long samples, long substeps, const double *theta, long grid, const double *table,
+              double *states, const double *given, const double *sigma, const uint64_t *keys, double *digests) {
+  for (long g = 0; g < groups; g++)
+    run_group(samples, substeps, theta + g * THETA * LANES, grid, table, states + g * STATES * LANES, given, sigma,
+              keys + g * LANES, digests + g * DIGEST * LANES);
 }
 #endif

@@ -48,11 +48,10 @@ FLAGS = (
     "-shared",
 )
 
-_BINARY = {"ADD": "+", "SUB": "-", "MUL": "*", "DIV": "/"}
+_BINARY = {"ADD": "+", "SUB": "-", "MUL": "*"}
 _TRUTH = {"LT": "<", "LE": "<=", "EQ": "==", "NE": "!="}
 _EACH = [
     "sqrt",
-    "fabs",
     "floor",
     "ceil",
     "exp",
@@ -68,7 +67,6 @@ _EACH = [
 ]
 _FORMS = (
     {f"OP_{name}": f"{{0}} {sign} {{1}}" for name, sign in _BINARY.items()}
-    | {f"OP_{name}": f"truth({{0}} {sign} {{1}})" for name, sign in _TRUTH.items()}
     | {f"OP_{name.upper()}": f"each_{name}({{0}})" for name in _EACH}
     | {f"OP_{name.upper()}": f"each_{name}({{0}}, {{1}})" for name in ("pow", "atan2", "hypot", "fmod")}
     | {
@@ -76,28 +74,34 @@ _FORMS = (
         "OP_NEG": "-{0}",
         "OP_SQ": "{0} * {0}",
         "OP_TWICE": "{0} + {0}",
-        "OP_INV": "1.0 / {0}",
+        "OP_DIV": "{0} * inverse({1})",
+        "OP_INV": "inverse({0})",
+        "OP_FABS": "size({0})",
         "OP_SIN": "sine({0})",
         "OP_COS": "cosine({0})",
         "OP_FMIN": "smaller({0}, {1})",
         "OP_FMAX": "larger({0}, {1})",
         "OP_CONSTPOW": "each_pow({0}, {1})",
-        "OP_NOT": "truth({0} == 0.0)",
-        "OP_AND": "truth(({0} != 0.0) & ({1} != 0.0))",
-        "OP_OR": "truth(({0} != 0.0) | ({1} != 0.0))",
-        "OP_IF_ELSE_ZERO": "where({0}, {1})",
+        "OP_IF_ELSE_ZERO": "where({0}, {1})",  # the first as a mask
+        "PICK": "pick({0}, {1}, {2})",  # likewise
     }
 )
+# Truths are masks; they become 1 and 0 where they are calculated with.
+_MASKS = {f"OP_{name}": f"MASK({{0}} {sign} {{1}})" for name, sign in _TRUTH.items()} | {
+    "OP_NOT": "~{0}",
+    "OP_AND": "{0} & {1}",
+    "OP_OR": "{0} | {1}",
+}
 _NAMES = {getattr(ca, name): name for name in dir(ca) if name.startswith("OP_")}
 
 
 class _Node(NamedTuple):
-    """A scalar of the straight line: C expression over earlier nodes, or what it reads."""
+    """A scalar of the straight line: what it does with earlier nodes, or what it reads."""
 
+    op: str  # "" where `form` is read or written out in place
     form: str
     arguments: tuple[int, ...]
     fixed: bool  # depends on theta and constants alone
-    plain: bool  # is read or written out where it is used
 
 
 def translate(f: ca.Function, shared: Sequence[int], first_constant: int) -> tuple[str, str, int]:
@@ -107,6 +111,46 @@ def translate(f: ca.Function, shared: Sequence[int], first_constant: int) -> tup
 
     Raises CheckError for an operation that has no C form here.
     """
+    nodes, outputs = _read(f, shared)
+    used = _reached(nodes, [k for *_, k in outputs])
+    fixed = [k for k in used if nodes[k].fixed]
+    # What the moving part reads of the fixed part goes through the array c.
+    read = {a for k in used if not nodes[k].fixed for a in nodes[k].arguments} | {k for *_, k in outputs}
+    kept = [k for k in fixed if k in read and nodes[k].op]
+    place = {k: first_constant + index for index, k in enumerate(kept)}
+
+    def text(k: int, *, moving: bool, mask: bool = False) -> str:
+        node = nodes[k]
+        if moving and k in place:
+            plain, is_mask = f"c[{place[k]}]", False
+        else:
+            plain, is_mask = (f"t{k}" if node.op else node.form), node.op in _MASKS
+        if mask:
+            return plain if is_mask else f"MASK({plain} != 0.0)"
+        return f"truth({plain})" if is_mask else plain
+
+    def line(k: int) -> str:
+        node, moving = nodes[k], not nodes[k].fixed
+        masks = _mask_arguments(node)
+        values = [text(a, moving=moving, mask=i in masks) for i, a in enumerate(node.arguments)]
+        kind = "whole" if node.op in _MASKS else "real"
+        return f"  const {kind} t{k} = {node.form.format(*values)};"
+
+    prepare = [line(k) for k in fixed if nodes[k].op]
+    prepare += [f"  c[{place[k]}] = {text(k, moving=False)};" for k in kept]
+    lines = [line(k) for k in used if nodes[k].op and not nodes[k].fixed]
+    lines += [f"  r{i}[{j}] = {text(k, moving=True)};" for i, j, k in outputs]
+    kinds = ["double" if i in shared else "real" for i in range(f.n_in() - 1)]
+    head = ", ".join(
+        ["const real *restrict c", *(f"const {kind} *restrict a{i}" for i, kind in enumerate(kinds))]
+        + [f"real *restrict r{i}" for i in range(f.n_out())]
+    )
+    function = [f"static inline __attribute__((always_inline)) void {f.name()}({head}) {{", *lines, "}", ""]
+    return "\n".join(["  {", *prepare, "  }"]), "\n".join(function), len(kept)
+
+
+def _read(f: ca.Function, shared: Sequence[int]) -> tuple[list[_Node], list[tuple[int, int, int]]]:
+    """The instructions of an SX function, and which node is which entry of which result."""
     theta = f.n_in() - 1
     nodes: list[_Node] = []
     slot: dict[int, int] = {}  # of CasADi's work vector: the node it holds
@@ -119,66 +163,55 @@ def translate(f: ca.Function, shared: Sequence[int], first_constant: int) -> tup
         if op == ca.OP_INPUT:
             i, j = reads
             text = f"theta[{j}]" if i == theta else f"a{i}[{j}]"
-            node = _Node(f"K({text})" if i in shared else text, (), i == theta, True)
+            nodes.append(
+                _Node("" if i != theta else "INPUT", f"K({text})" if i in shared else text, (), i == theta)
+            )
         elif op == ca.OP_CONST:
-            node = _Node(f"K({f.instruction_constant(k)!r})", (), True, True)
+            nodes.append(_Node("", f"K({f.instruction_constant(k)!r})", (), True))
         else:
             name = _NAMES[op]
-            if name not in _FORMS:
+            if name not in _FORMS and name not in _MASKS:
                 raise CheckError(f"the compiled engine has no {name}")
-            arguments = tuple(slot[r] for r in reads)
-            if (
-                op == ca.OP_DIV and nodes[arguments[1]].fixed
-            ):  # one reciprocal a run instead of a division each
-                nodes.append(_Node(_FORMS["OP_INV"], arguments[1:], True, False))
-                name, arguments = "OP_MUL", (arguments[0], len(nodes) - 1)
-            node = _Node(_FORMS[name], arguments, all(nodes[a].fixed for a in arguments), False)
-        slot[writes[0]] = len(nodes)
-        nodes.append(node)
-    return _written(f.name(), f.n_in() - 1, f.n_out(), nodes, outputs, shared, first_constant)
+            _append(nodes, name, tuple(slot[r] for r in reads))
+        slot[writes[0]] = len(nodes) - 1
+    return nodes, outputs
 
 
-def _written(
-    name: str,
-    arguments: int,
-    results: int,
-    nodes: list[_Node],
-    outputs: list[tuple[int, int, int]],
-    shared: Sequence[int],
-    first_constant: int,
-) -> tuple[str, str, int]:
-    def is_number(k: int) -> bool:
-        return nodes[k].plain and nodes[k].form.startswith("K(") and nodes[k].fixed
+def _append(nodes: list[_Node], name: str, arguments: tuple[int, ...]) -> None:
+    """Add an operation, in the form that costs least."""
+    if name == "OP_DIV" and nodes[arguments[1]].fixed:  # one reciprocal a run instead of a division each
+        nodes.append(_Node("OP_INV", "1.0 / {0}", arguments[1:], True))
+        name, arguments = "OP_MUL", (arguments[0], len(nodes) - 1)
+    if name == "OP_ADD":  # if_else(c, x, y) comes as (c ? x : 0) + (not c ? y : 0)
+        one, other = (nodes[a] for a in arguments)
+        if one.op == other.op == "OP_IF_ELSE_ZERO" and nodes[other.arguments[0]] == _not(
+            one.arguments[0], nodes
+        ):
+            name, arguments = "PICK", (*one.arguments, other.arguments[1])
+    form = _MASKS.get(name) or _FORMS[name]
+    nodes.append(_Node(name, form, arguments, all(nodes[a].fixed for a in arguments)))
 
-    # What the moving part reads of the fixed part goes through the array c.
-    read = {a for node in nodes if not node.fixed for a in node.arguments} | {k for *_, k in outputs}
-    kept = [k for k in sorted(read) if nodes[k].fixed and not is_number(k)]
-    place = {k: first_constant + index for index, k in enumerate(kept)}
 
-    def text(k: int, *, moving: bool) -> str:
-        if moving and k in place:
-            return f"c[{place[k]}]"
-        return nodes[k].form if nodes[k].plain else f"t{k}"
+def _not(k: int, nodes: list[_Node]) -> _Node:
+    return _Node("OP_NOT", _MASKS["OP_NOT"], (k,), nodes[k].fixed)
 
-    prepare: list[str] = []
-    lines: list[str] = []
-    for k, node in enumerate(nodes):
-        if not node.plain:
-            value = node.form.format(*(text(a, moving=not node.fixed) for a in node.arguments))
-            (prepare if node.fixed else lines).append(f"  const real t{k} = {value};")
-    prepare += [f"  c[{place[k]}] = {text(k, moving=False)};" for k in kept]
-    lines += [f"  r{i}[{j}] = {text(k, moving=True)};" for i, j, k in outputs]
-    kinds = ["double" if i in shared else "real" for i in range(arguments)]
-    head = ", ".join(
-        ["const real *restrict c", *(f"const {kind} *restrict a{i}" for i, kind in enumerate(kinds))]
-        + [f"real *restrict r{i}" for i in range(results)]
-    )
-    body = "\n".join(lines)
-    return (
-        "\n".join(["  {", *prepare, "  }"]),
-        f"static inline __attribute__((always_inline)) void {name}({head}) {{\n{body}\n}}\n",
-        len(kept),
-    )
+
+def _mask_arguments(node: _Node) -> range:
+    """Which arguments a node takes as masks."""
+    if node.op in ("OP_IF_ELSE_ZERO", "PICK"):
+        return range(1)
+    return range(2) if node.op in ("OP_NOT", "OP_AND", "OP_OR") else range(0)
+
+
+def _reached(nodes: list[_Node], roots: list[int]) -> list[int]:
+    """The nodes that the roots need, in order."""
+    needed, waiting = set(), list(roots)
+    while waiting:
+        k = waiting.pop()
+        if k not in needed:
+            needed.add(k)
+            waiting += nodes[k].arguments
+    return sorted(needed)
 
 
 def source(p: Parts, digest: ca.Function | None) -> str:
@@ -343,10 +376,16 @@ def evaluate(function: ca.Function, *arguments: FloatArray) -> list[FloatArray]:
     return results
 
 
+def in_lanes(rows: FloatArray, groups: int) -> FloatArray:
+    """Rows of machines as groups x numbers x LANES; the last machine fills what is left of the last group."""
+    filled = np.concatenate([rows, np.repeat(rows[-1:], groups * LANES - len(rows), axis=0)])
+    return np.ascontiguousarray(filled.reshape(groups, LANES, -1).swapaxes(1, 2))
+
+
 def run_many(
     lib: Any,
+    chosen: slice,
     *,
-    first: int,
     substeps: int,
     theta: FloatArray,
     table: FloatArray,
@@ -356,17 +395,17 @@ def run_many(
     keys: Any,
     digests: FloatArray,
 ) -> None:
-    """LANES machines through the samples of `given`; states and digests (a row for each number) are changed."""
+    """Some groups of LANES machines (the first axis) through all samples of `given`; states and digests are changed."""
     lib.run_many(
-        ctypes.c_long(first),
+        ctypes.c_long(len(range(*chosen.indices(len(theta))))),
         ctypes.c_long(len(given)),
         ctypes.c_long(substeps),
-        _address(theta),
+        _address(theta[chosen]),
         ctypes.c_long(len(table)),
         _address(table),
-        _address(states),
+        _address(states[chosen]),
         _address(given),
         _address(sigma),
-        _address(keys),
-        _address(digests),
+        _address(keys[chosen]),
+        _address(digests[chosen]),
     )

@@ -16,9 +16,10 @@ replace the experiment's own (fidelity, noise, seed, estimator, ...), and those 
 
 from __future__ import annotations
 
+import inspect
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -28,12 +29,13 @@ from scipy.optimize import brentq
 
 from malta import references
 from malta.controller import Controller
+from malta.data import in_unit
 from malta.errors import InputError
 from malta.fastest import FastestStroke, SigmoidStroke, fastest_stroke, sigmoid_at_peak_current
 from malta.linearize import linearize
 from malta.noise import keys, normals
 from malta.plant import Plant
-from malta.references import Motion, Reference
+from malta.references import Motion, Profile, Reference
 from malta.simulate import (
     ESTIMATORS,
     FEEDFORWARDS,
@@ -51,6 +53,8 @@ if TYPE_CHECKING:
     from malta.plant import FloatArray
 
 Progress = Callable[[float], None]
+DISTANCE = 10e-3  # m, the published stroke, Fig. 12
+FINDINGS = ("payload", "disturbance", "faults")  # experiments that ask where it ends
 REAL: dict[str, Any] = {
     "noise": 1.0,
     "quantize": True,
@@ -67,6 +71,10 @@ class Merit(NamedTuple):
     unit: str
     published: str = ""  # key of data/published/
     relation: str = "about"  # of ours to the published: "about" or "at most"
+
+    def __str__(self) -> str:
+        unit = "%" if self.unit == "percent" else self.unit
+        return f"{self.label} {in_unit(self.value, self.unit):.3g} {unit}"
 
 
 class Case(NamedTuple):
@@ -93,18 +101,43 @@ class Experiment:
         return self.cases[0].run
 
     @property
-    def completed(self) -> bool:
-        """Whether every run came to its end."""
-        return all(case.run.verdict.completed for case in self.cases)
+    def failed(self) -> bool:
+        """Whether a run ended that should not have; where touchdown is a finding, it is none."""
+        return self.name not in FINDINGS and not all(case.run.verdict.completed for case in self.cases)
+
+    @property
+    def interrupted(self) -> bool:
+        """Whether Ctrl-C ended it."""
+        return any(case.run.verdict.name == "interrupted" for case in self.cases)
+
+    @property
+    def outcome(self) -> str:
+        """How its runs ended, in words."""
+        ends = [case for case in self.cases if not case.run.verdict.completed]
+        if not ends:
+            return f"completed at {self.run.verdict.time:.4g} s"
+        verdicts = [f"{case.run.verdict.name} at {case.run.verdict.time:.4g} s" for case in ends]
+        if len(self.cases) == 1:
+            return verdicts[0]
+        return f"{len(ends)} of {len(self.cases)} runs not completed ({ends[0].label}: {verdicts[0]})"
 
 
 def stroke(
-    plant: Plant, controller: Controller, *, progress: Progress | None = None, **options: Any
+    plant: Plant,
+    controller: Controller,
+    *,
+    distance: float = DISTANCE,
+    rise: float = RISE,
+    profile: Profile = "logistic",
+    progress: Progress | None = None,
+    **options: Any,
 ) -> Experiment:
     """The published stroke: tracking, radial deviation, currents, and K_D as the ratio of force and current."""
-    run = simulate(plant, controller, Scenario.stroke(**options), progress=progress)
-    merits = stroke_merits(run)
-    return Experiment("stroke", "Does it follow the stroke?", (Case("stroke", run, merits),), merits)
+    asked = {name: value for name, value in options.items() if name != "engine"}
+    scenario = Scenario.stroke(distance, rise=rise, profile=profile, **asked)
+    merits = partial(stroke_merits, published=distance == DISTANCE and rise == RISE)
+    cases = _flown(plant, controller, [("stroke", scenario, merits)], progress, options)
+    return Experiment("stroke", "Does it follow the stroke?", cases, cases[0].merits)
 
 
 def stroke_merits(run: Trajectory, *, published: bool = True) -> tuple[Merit, ...]:
@@ -155,42 +188,30 @@ def hold(
     plant: Plant, controller: Controller, *, progress: Progress | None = None, **options: Any
 ) -> Experiment:
     """Rest at the middle with sensor noise: statistics of the last 2000 measured samples, and the true motion."""
-    samples, settle = 2000, 6000
-    duration = (samples + settle) * controller.sample_time
-    run = simulate(
-        plant, controller, _scenario("hold", duration, references.hold, options), progress=progress
+    scenario = _scenario("hold", (RESTING + 6000) * controller.sample_time, references.hold, options)
+    cases = _flown(plant, controller, [("hold", scenario, _rest_merits)], progress, options)
+    return Experiment("hold", "How still does it stand?", cases, cases[0].merits)
+
+
+RESTING = 2000  # samples, Table III
+
+
+def _rest_merits(run: Trajectory) -> tuple[Merit, ...]:
+    plant, y, p, v = run.plant, run.y[-RESTING:], run.p[-RESTING:], run.v[-RESTING:]
+    names = [signal.name for signal in plant.outputs]
+    bearings = [k for k in range(len(plant.inputs)) if k != plant.thrust_input]
+    return (
+        *(
+            Merit(f"measured {n}, std", float(y[:, k].std()), "um", f"table_III.std.{n}")
+            for k, n in enumerate(names)
+        ),
+        *(
+            Merit(f"measured {n}, mean", float(y[:, k].mean()), "um", f"table_III.mean.{n}")
+            for k, n in enumerate(names)
+        ),
+        *(Merit(f"true {n}, rms", _rms(p[:, k]), "um") for k, n in enumerate(names)),
+        Merit("bearing force, rms about its mean", _rms((v - v.mean(axis=0))[:, bearings]), "N"),
     )
-    last_y, last_p = run.y[-samples:], run.p[-samples:]
-    merits = []
-    for k, signal in enumerate(plant.outputs):
-        merits.append(
-            Merit(
-                f"measured {signal.name}, std",
-                float(last_y[:, k].std()),
-                "um",
-                f"table_III.std.{signal.name}",
-            )
-        )
-    for k, signal in enumerate(plant.outputs):
-        merits.append(
-            Merit(
-                f"measured {signal.name}, mean",
-                float(last_y[:, k].mean()),
-                "um",
-                f"table_III.mean.{signal.name}",
-            )
-        )
-    for k, signal in enumerate(plant.outputs):
-        merits.append(Merit(f"true {signal.name}, rms", _rms(last_p[:, k]), "um"))
-    radial = [k for k in range(len(plant.inputs)) if k != plant.thrust_input]
-    merits.append(
-        Merit(
-            "bearing force, rms about its mean",
-            _rms(run.v[-samples:, radial] - run.v[-samples:, radial].mean(axis=0)),
-            "N",
-        )
-    )
-    return Experiment("hold", "How still does it stand?", (Case("hold", run, tuple(merits)),), tuple(merits))
 
 
 def tilt(
@@ -206,27 +227,33 @@ def tilt(
 
     As the paper, and with the attraction at the reference fed forward.
     """
-    kinds = [options.pop("feedforward")] if "feedforward" in options else list(FEEDFORWARDS)
-    duration = 2 / frequency
+    kinds = [options["feedforward"]] if "feedforward" in options else list(FEEDFORWARDS)
     reference = partial(references.circle, radius=radius, frequency=frequency)
-    cases = []
-    for n, kind in enumerate(kinds):
-        scenario = _scenario("tilt", duration, reference, {"start": AT_REST, "feedforward": kind} | options)
-        run = simulate(plant, controller, scenario, progress=_share(progress, n, len(kinds)))
-        settled = run.t >= min(duration / 2, run.t[-1])
-        error = (run.p - run.reference)[settled]
-        bound = ("um", "figure_16.deviation", "at most")
-        merits = (
-            Merit("SP2: largest deviation, true", float(np.hypot(error[:, 2], error[:, 3]).max()), *bound),
-            Merit("SP2: largest deviation, measured", float(np.abs(run.y[settled][:, 2:4]).max()), *bound),
-            Merit("SP1: largest tracking error, true", float(np.hypot(error[:, 0], error[:, 1]).max()), "um"),
-            Merit("largest bearing force", float(np.abs(run.v[:, :4]).max()), "N"),
+    merits = partial(_tilt_merits, settled=1 / frequency)
+    wanted = [
+        (
+            f"feedforward {kind}",
+            _scenario("tilt", 2 / frequency, reference, {"start": AT_REST} | options | {"feedforward": kind}),
+            merits,
         )
-        cases.append(Case(f"feedforward {kind}", run, merits))
-    return Experiment("tilt", "Does it tilt about sensor plane 2?", tuple(cases), ())
+        for kind in kinds
+    ]
+    cases = _flown(plant, controller, wanted, progress, options)
+    return Experiment("tilt", "Does it tilt about sensor plane 2?", cases, ())
 
 
 AT_REST = dict.fromkeys(("x", "y", "alpha", "beta", "x_dot", "y_dot", "alpha_dot", "beta_dot"), 0.0)
+
+
+def _tilt_merits(run: Trajectory, settled: float) -> tuple[Merit, ...]:
+    late = run.t >= min(settled, run.t[-1])
+    error, bound = (run.p - run.reference)[late], ("um", "figure_16.deviation", "at most")
+    return (
+        Merit("SP2: largest deviation, true", float(np.hypot(error[:, 2], error[:, 3]).max()), *bound),
+        Merit("SP2: largest deviation, measured", float(np.abs(run.y[late][:, 2:4]).max()), *bound),
+        Merit("SP1: largest tracking error, true", float(np.hypot(error[:, 0], error[:, 1]).max()), "um"),
+        Merit("largest bearing force", float(np.abs(run.v[:, :4]).max()), "N"),
+    )
 
 
 def lift_off(
@@ -237,16 +264,16 @@ def lift_off(
     One run for each start-up estimator, or the one that options name.
     """
     resting = rest_on_bearing(plant)
-    kinds = [options.pop("estimator")] if "estimator" in options else list(ESTIMATORS)
-    needed = break_away_current(plant, resting)
-    cases = []
-    for n, kind in enumerate(kinds):
-        own = {"start": resting, "cold": True, "bearing": True, "estimator": kind}
-        scenario = _scenario("lift-off", 0.15, partial(rise_from, start=resting), own | options)
-        run = simulate(plant, controller, scenario, progress=_share(progress, n, len(kinds)))
-        cases.append(Case(kind, run, _lift_merits(run)))
-    merits = (Merit("current per module that lifts it, statics", needed, "A"),)
-    return Experiment("lift-off", "Does it rise from its bearing?", tuple(cases), merits)
+    kinds = [options["estimator"]] if "estimator" in options else list(ESTIMATORS)
+    own = {"start": resting, "cold": True, "bearing": True}
+    reference = partial(rise_from, start=resting)
+    wanted = [
+        (kind, _scenario("lift-off", 0.15, reference, own | options | {"estimator": kind}), _lift_merits)
+        for kind in kinds
+    ]
+    cases = _flown(plant, controller, wanted, progress, options)
+    needed = Merit("current per module that lifts it, statics", break_away_current(plant, resting), "A")
+    return Experiment("lift-off", "Does it rise from its bearing?", cases, (needed,))
 
 
 def rise_from(plant: Plant, start: Mapping[str, float], duration: float = 30e-3) -> Reference:
@@ -321,30 +348,33 @@ def payload(
 
     The controller does not learn of it. The integrals have 0.45 s before the stroke begins.
     """
-    cases = []
-    wait, picked = 0.5, 0.05
-    for n, extra in enumerate(masses):
-        change = ((picked, {"m": plant.mass + extra}),)
-        reference = partial(late_stroke, wait=wait)
-        scenario = _scenario(
-            "payload", wait + 0.15, reference, {"changes": change, "bearing": True} | options
-        )
-        run = simulate(plant, controller, scenario, progress=_share(progress, n, len(masses)))
-        error = np.abs(run.p - run.reference)
-        carrying, moving = (run.t >= picked) & (run.t < wait), run.t >= wait
-        merits = [Merit("largest sag after the pick", float(error[carrying][:, :4].max(initial=0.0)), "um")]
-        if moving.any():
-            merits += [
-                Merit("stroke: axial error", float(error[moving][:, plant.stroke_output].max()), "mm"),
-                Merit("stroke: radial deviation", float(error[moving][:, :4].max()), "um"),
-            ]
-        cases.append(Case(f"{extra * 1e3:.0f} g", run, tuple(merits)))
-    carried = max((m for m, c in zip(masses, cases, strict=True) if c.run.verdict.completed), default=0.0)
-    merits_all = (Merit("largest of these carried and moved", carried, "kg", "position_controller.payload"),)
-    return Experiment("payload", "What can it pick and move?", tuple(cases), merits_all)
+    reference = partial(late_stroke, wait=WAIT)
+    wanted = []
+    for extra in masses:
+        own = {"changes": ((PICKED, {"m": plant.mass + extra}),), "bearing": True}
+        scenario = _scenario("payload", WAIT + 0.15, reference, own | options)
+        wanted.append((f"{extra * 1e3:.0f} g", scenario, _payload_merits))
+    cases = _flown(plant, controller, wanted, progress, options)
+    carried = max((m for m, c in zip(masses, cases, strict=False) if c.run.verdict.completed), default=0.0)
+    merit = Merit("largest of these carried and moved", carried, "kg", "position_controller.payload")
+    return Experiment("payload", "What can it pick and move?", cases, (merit,))
 
 
-def late_stroke(plant: Plant, wait: float, distance: float = 10e-3) -> Reference:
+PICKED, WAIT = 0.05, 0.5  # s: the mass is picked, the stroke begins
+
+
+def _payload_merits(run: Trajectory) -> tuple[Merit, ...]:
+    error, axis = np.abs(run.p - run.reference), run.plant.stroke_output
+    carrying, moving = (run.t >= PICKED) & (run.t < WAIT), run.t >= WAIT
+    radial = [k for k in range(error.shape[1]) if k != axis]
+    return (
+        Merit("largest sag after the pick", float(error[carrying][:, radial].max(initial=0.0)), "um"),
+        Merit("stroke: axial error", float(error[moving][:, axis].max(initial=0.0)), "mm"),
+        Merit("stroke: radial deviation", float(error[moving][:, radial].max(initial=0.0)), "um"),
+    )
+
+
+def late_stroke(plant: Plant, wait: float, distance: float = DISTANCE) -> Reference:
     """Held at the start of the published stroke, which is half-way 50 ms after `wait` (s)."""
     return references.stroke(plant, -distance / 2, distance / 2, RISE, wait + 0.05)
 
@@ -364,27 +394,33 @@ def thermal(
     A laser on a support of its own reads the mover in sensor plane 2 every 10 ms with 0.1 um of noise; half of what it
     reads is taken off the reference of both planes.
     """
-    duration = minute / faster
-    cases = []
+    duration, every, gain = minute / faster, 10e-3, 0.5
     moved = partial(_drift, drift=drift, duration=duration)
-    for n, (label, gain) in enumerate((("compensated", 0.5), ("not compensated", 0.0))):
-        laser = _Laser(moved, gain, [k for k in range(4) if k % 2 == 0], len(plant.outputs))
+    merits = partial(_thermal_merits, moved=moved, late=duration / 10)
+    wanted = []
+    for label, share in (("compensated", gain), ("not compensated", 0.0)):
+        laser = _Laser(moved, share, [0, 2], len(plant.outputs))
         scenario = _scenario(
-            "thermal", duration, references.hold, {"correction": Correction(10e-3, laser)} | options
+            "thermal", duration, references.hold, {"correction": Correction(every, laser)} | options
         )
-        run = simulate(plant, controller, scenario, progress=_share(progress, n, 2))
-        outside = run.p[:, 2] + moved(run.t)
-        late = run.t > duration / 10
-        merit = Merit("largest deviation in space", float(np.abs(outside[late]).max()), "um")
-        cases.append(Case(label, run, (merit, Merit("rms deviation in space", _rms(outside[late]), "um"))))
-    lag = drift / duration * 10e-3 / 0.5
-    merits = (
-        Merit("drift of the support", drift, "um"),
+        wanted.append((label, scenario, merits))
+    cases = _flown(plant, controller, wanted, progress, options)
+    lag = drift / duration * every / gain
+    found = (
+        Merit("drift of the support", drift, "um", "thermal.drift"),
         Merit("lag of the outer loop at this speed", lag, "um"),
         Merit("lag of the outer loop at the true speed", lag / faster, "um"),
     )
     return Experiment(
-        "thermal", "Does it hold its place in space?", tuple(cases), merits, {"drift": moved(cases[0].run.t)}
+        "thermal", "Does it hold its place in space?", cases, found, {"drift": moved(cases[0].run.t)}
+    )
+
+
+def _thermal_merits(run: Trajectory, moved: Callable[[Any], Any], late: float) -> tuple[Merit, ...]:
+    outside = (run.p[:, 2] + moved(run.t))[run.t >= min(late, run.t[-1])]
+    return (
+        Merit("largest deviation in space", float(np.abs(outside).max()), "um"),
+        Merit("rms deviation in space", _rms(outside), "um"),
     )
 
 
@@ -409,58 +445,37 @@ class _Laser:
 def disturbance(
     plant: Plant, controller: Controller, *, progress: Progress | None = None, **options: Any
 ) -> Experiment:
-    """Steps of force and torque, sines of force, vibration of the housing; the linear loop's compliance beside them."""
-    steps = {"F_x": 1.0, "F_z": 1.0, "T_y": 0.05}
-    tones = (5.0, 20.0, 60.0, 150.0, 400.0)
-    total, done = len(steps) + len(tones) + 1, 0
+    """Steps of force and torque, vibration of the housing, sines of force; the linear loop's compliance beside them."""
     names = [s.name for s in plant.disturbances]
-    seen = {"F_x": 0, "F_z": plant.stroke_output, "T_y": 0}
-    cases = []
-    for name, size in steps.items():
+    outputs = [s.name for s in plant.outputs]
+    wanted = []
+    for name, size, seen in (("F_x", 1.0, "x1"), ("F_z", 1.0, plant.stroke), ("T_y", 0.05, "x1")):
         push = partial(_step_wrench, column=names.index(name), size=size, at=0.02, width=len(names))
-        scenario = _scenario(
-            "disturbance",
-            0.4,
-            references.hold,
-            QUIET | {"disturbance": push} | options,
-        )
-        run = simulate(plant, controller, scenario, progress=_share(progress, done, total))
-        error = np.abs(run.p[:, seen[name]])
+        scenario = _scenario("disturbance", 0.4, references.hold, QUIET | {"disturbance": push} | options)
         unit = plant.disturbances[names.index(name)].unit
-        merits = (
-            Merit(f"largest deflection of {plant.outputs[seen[name]].name}", float(error.max()), "um"),
-            Merit("left after 0.38 s", float(error[-1]), "um"),
+        wanted.append(
+            (f"step of {size:g} {unit} {name}", scenario, partial(_step_merits, output=outputs.index(seen)))
         )
-        cases.append(Case(f"step of {size:g} {unit} {name}", run, merits))
-        done += 1
-    found = []
-    for f in tones:
-        push = partial(_sine_wrench, column=names.index("F_x"), size=0.5, frequency=f, width=len(names))
-        length = max(0.1, 4 / f) + max(0.1, 4 / f)
-        scenario = _scenario("sine", length, references.hold, QUIET | {"disturbance": push} | options)
-        run = simulate(plant, controller, scenario, progress=_share(progress, done, total))
-        found.append(_amplitude(run, 0, f) / 0.5)
-        done += 1
     shake = partial(
-        _sine_wrench, column=names.index("F_y"), size=plant.mass * 1.0, frequency=50.0, width=len(names)
+        _sine_wrench, column=names.index("F_y"), size=plant.mass, frequency=50.0, width=len(names)
     )
-    run = simulate(
-        plant,
-        controller,
-        _scenario(
-            "vibration",
-            0.3,
-            references.hold,
-            QUIET | {"disturbance": shake} | options,
-        ),
-        progress=_share(progress, done, total),
-    )
-    vibration = Merit("amplitude of y1", _amplitude(run, 1, 50.0), "um")
-    cases.append(Case("housing shaken by 1 m/s2 at 50 Hz along y", run, (vibration,)))
+    vibration = _scenario("vibration", 0.3, references.hold, QUIET | {"disturbance": shake} | options)
+    shaken = partial(_sine_merits, output=outputs.index("y1"), frequency=50.0)
+    wanted.append(("housing shaken by 1 m/s2 at 50 Hz along y", vibration, shaken))
+    for f in TONES:
+        push = partial(
+            _sine_wrench, column=names.index("F_x"), size=TONE_FORCE, frequency=f, width=len(names)
+        )
+        scenario = _scenario(
+            "sine", 2 * max(0.1, 4 / f), references.hold, QUIET | {"disturbance": push} | options
+        )
+        wanted.append((f"{f:g} Hz", scenario, partial(_sine_merits, output=outputs.index("x1"), frequency=f)))
+    cases = _flown(plant, controller, wanted, progress, options)
+    steps, sines = cases[:4], cases[4:]
     w = np.geomspace(0.01, 2000, 600) * 2 * math.pi
     curve = compliance(plant, controller, w)
     worst = int(curve.argmax())
-    merits_all = (
+    found = (
         Merit("largest compliance, x1 to F_x", float(curve[worst]), "um/N"),
         Merit("at", float(w[worst] / (2 * math.pi)), "Hz"),
         Merit("smallest dynamic stiffness", float(1 / curve[worst]), "N/um"),
@@ -468,10 +483,27 @@ def disturbance(
     curves = {
         "frequency": w / (2 * math.pi),
         "compliance": curve,
-        "tones": np.array(tones),
-        "simulated": np.array(found),
+        "tones": np.array(TONES[: len(sines)]),
+        "simulated": np.array([case.merits[0].value / TONE_FORCE for case in sines]),
     }
-    return Experiment("disturbance", "How stiff is it?", tuple(cases), merits_all, curves)
+    return Experiment("disturbance", "How stiff is it?", steps, found, curves)
+
+
+TONES, TONE_FORCE = (5.0, 20.0, 60.0, 150.0, 400.0), 0.5  # Hz, N
+
+
+def _step_merits(run: Trajectory, output: int) -> tuple[Merit, ...]:
+    error = np.abs(run.p[:, output])
+    return (
+        Merit(f"largest deflection of {run.plant.outputs[output].name}", float(error.max()), "um"),
+        Merit("left at the end", float(error[-1]), "um"),
+    )
+
+
+def _sine_merits(run: Trajectory, output: int, frequency: float) -> tuple[Merit, ...]:
+    return (
+        Merit(f"amplitude of {run.plant.outputs[output].name}", _amplitude(run, output, frequency), "um"),
+    )
 
 
 def compliance(
@@ -556,30 +588,30 @@ def faults(
         "DC link sags by 50 % for 50 ms": (Fault("link sag", at, at + 50e-3, size=0.5),),
         "DC link sags by 90 % for 50 ms": (Fault("link sag", at, at + 50e-3, size=0.9),),
     }
-    cases = []
-    for n, (label, struck) in enumerate(listed.items()):
+    wanted = []
+    for label, struck in listed.items():
         own: dict[str, Any] = {"faults": struck, "bearing": True} | options
         if any(fault.kind == "open phase" for fault in struck):
             own["fidelity"] = "phase"
-        run = simulate(
-            plant,
-            controller,
-            _scenario("faults", 0.3, references.hold, own),
-            progress=_share(progress, n, len(listed)),
-        )
-        after = run.t >= at
-        merits = (
-            Merit("largest deviation", float(np.abs(run.p[after][:, :4]).max()), "um"),
-            Merit("touchdown after", run.verdict.time - at if not run.verdict.completed else math.nan, "ms"),
-            Merit("deviation at the end", float(np.abs(run.p[-1, :4]).max()), "um"),
-        )
-        cases.append(Case(label, run, merits))
-    survived = sum(case.run.verdict.completed for case in cases)
+        wanted.append((label, _scenario("faults", 0.3, references.hold, own), partial(_fault_merits, at=at)))
+    cases = _flown(plant, controller, wanted, progress, options)
+    survived = float(sum(case.run.verdict.completed for case in cases))
     return Experiment(
-        "faults",
-        "What does it survive?",
-        tuple(cases),
-        (Merit(f"survived, of {len(cases)}", float(survived), "1"),),
+        "faults", "What does it survive?", cases, (Merit(f"survived, of {len(cases)}", survived, "1"),)
+    )
+
+
+def _fault_merits(run: Trajectory, at: float) -> tuple[Merit, ...]:
+    radial = np.abs(
+        run.p[run.t >= min(at, run.t[-1])][
+            :, [k for k in range(run.p.shape[1]) if k != run.plant.stroke_output]
+        ]
+    )
+    touched = math.nan if run.verdict.completed else run.verdict.time - at
+    return (
+        Merit("largest deviation", float(radial.max()), "um"),
+        Merit("touchdown after", touched, "ms"),
+        Merit("deviation at the end", float(radial[-1].max()), "um"),
     )
 
 
@@ -587,7 +619,7 @@ def drive_limits(
     plant: Plant,
     controller: Controller,
     *,
-    distance: float = 10e-3,
+    distance: float = DISTANCE,
     current_share: float = 0.8,
     voltage_share: float = 0.9,
     progress: Progress | None = None,
@@ -602,15 +634,12 @@ def drive_limits(
     duration = max(0.1, 6 * sigmoid.rise)
     ends: dict[str, Any] = {"start": -distance / 2, "end": distance / 2}
     logistic = partial(references.stroke, **ends, rise=sigmoid.rise, centre=duration / 2)
-    wanted: dict[str, tuple[Callable[[Plant], Reference], tuple[Merit, ...]]] = {
-        "fastest": (partial(best.reference, centre=duration / 2), _travel(best)),
-        "sigmoid": (logistic, _travel(sigmoid)),
-    }
-    cases = []
-    for n, (label, (reference, merits)) in enumerate(wanted.items()):
+    fast = partial(best.reference, centre=duration / 2)
+    wanted = []
+    for label, reference, found in (("fastest", fast, best), ("sigmoid", logistic, sigmoid)):
         scenario = _scenario("drive-limits", duration, reference, QUIET | options)
-        run = simulate(plant, controller, scenario, progress=_share(progress, n, 2))
-        cases.append(Case(label, run, (*merits, *stroke_merits(run, published=False))))
+        wanted.append((label, scenario, partial(_limit_merits, found=found)))
+    cases = _flown(plant, controller, wanted, progress, options)
     merits = (
         Merit("current limit used", current_share * plant.actuator.current_limit, "A"),
         Merit("voltage limit used", voltage_share * plant.actuator.voltage_limit, "V"),
@@ -619,13 +648,14 @@ def drive_limits(
         Merit("travel, sigmoid over fastest", sigmoid.travel_time(1e-3) / best.travel_time(1e-3), "1"),
     )
     curves = {"t": best.t, "z": best.z, "u": best.u, "i": best.i}
-    return Experiment("drive-limits", "How fast could it be?", tuple(cases), merits, curves)
+    return Experiment("drive-limits", "How fast could it be?", cases, merits, curves)
 
 
-def _travel(found: FastestStroke | SigmoidStroke) -> tuple[Merit, ...]:
+def _limit_merits(run: Trajectory, found: FastestStroke | SigmoidStroke) -> tuple[Merit, ...]:
     return (
         Merit("reference: rise, 10-90 %", found.rise, "ms"),
         Merit("reference: 0.1 to 99.9 % of travel", found.travel_time(1e-3), "ms"),
+        *stroke_merits(run, published=False),
     )
 
 
@@ -639,11 +669,30 @@ def _scenario(
     name: str, duration: float, reference: Callable[[Plant], Reference], options: Mapping[str, Any]
 ) -> Scenario:
     """An experiment's scenario: real sensors unless the options say otherwise."""
-    return replace(Scenario(name, duration, reference), **(REAL | dict(options)))
+    fields = REAL | {key: value for key, value in options.items() if key != "engine"}
+    return replace(Scenario(name, duration, reference), **fields)
 
 
-def _share(progress: Progress | None, done: int, total: int) -> Progress | None:
-    return None if progress is None else lambda share: progress((done + share) / total)
+def _flown(
+    plant: Plant,
+    controller: Controller,
+    wanted: Sequence[tuple[str, Scenario, Callable[[Trajectory], tuple[Merit, ...]]]],
+    progress: Progress | None,
+    options: Mapping[str, Any],
+) -> tuple[Case, ...]:
+    """Run scenarios one after the other; Ctrl-C ends the series with what there is."""
+    cases: list[Case] = []
+    for n, (label, scenario, merits) in enumerate(wanted):
+        share = None if progress is None else partial(_overall, progress, n, len(wanted))
+        run = simulate(plant, controller, scenario, engine=options.get("engine", "auto"), progress=share)
+        cases.append(Case(label, run, merits(run)))
+        if run.verdict.name == "interrupted":
+            break
+    return tuple(cases)
+
+
+def _overall(progress: Progress, done: int, total: int, share: float) -> None:
+    progress((done + share) / total)
 
 
 def _rms(values: FloatArray) -> float:
@@ -669,4 +718,12 @@ def experiment(
     """Run an experiment by name. Raises InputError for an unknown one, or an option that it does not take."""
     if name not in EXPERIMENTS:
         raise InputError("simulate", "scenario", repr(name), "one of " + ", ".join(EXPERIMENTS))
+    own = {
+        p.name for p in inspect.signature(EXPERIMENTS[name]).parameters.values() if p.kind is p.KEYWORD_ONLY
+    }
+    known = own | {f.name for f in fields(Scenario)} | {"engine"}
+    for option in options:
+        if option not in known:
+            taken = " ".join(sorted(own - {"progress"})) or "none of its own"
+            raise InputError("simulate", f"{name}: {option}", "an option of another scenario", taken)
     return EXPERIMENTS[name](plant, controller, progress=progress, **options)

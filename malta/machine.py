@@ -53,6 +53,7 @@ class Setup:
     faulty: bool = False  # held measurements, missed steps, open phases, sagging link
     scheduled: bool = False  # C(z) of the measured z in the filter
     real_pwm: bool = False  # duty cycles in steps, dead time
+    turning: bool = False  # current controllers in axes that turn with the forces, as printed
     outside: bool = False  # the estimate comes from outside
 
 
@@ -156,20 +157,17 @@ def parts(plant: Plant, c: Controller, s: Setup, values: Mapping[str, ca.DM], *,
         measured = ca.if_else(given["stuck"], controller["y_last"], measured)
     first, last = g["grid_ends"][0], g["grid_ends"][1]
     at = ca.fmax(ca.fmin(measured[plant.stroke_output], last), first)
-    sense = ca.Function("sense", [state, around, noise, theta], [measured, at])
+    sense = ca.Function("sense", [state, around, noise, theta], ca.cse([measured, at]))
 
     after, command, row = _decided(plant, c, s, g, machine, controller, given, y, v0)
     row = {"x": x, "p": plant.h(x, 0), "y": y, "contact": plant.contact(x)} | row
-    decide = ca.Function(
-        "decide",
-        [state, around, y, v0, theta],
-        [
-            ca.vertcat(*(after[name] for name in sizes.controller)),
-            command,
-            ca.vertcat(*(row[name] for name in sizes.row)),
-        ],
-    )
-    moved = _moved(plant, s, g, machine, given, held)
+    decided = [
+        ca.vertcat(*(after[name] for name in sizes.controller)),
+        command,
+        ca.vertcat(*(row[name] for name in sizes.row)),
+    ]
+    decide = ca.Function("decide", [state, around, y, v0, theta], ca.cse(decided))
+    moved = ca.cse(_moved(plant, s, g, machine, given, held))
     substep = ca.Function("substep", [ca.vertcat(*machine.values()), held, around, theta], [moved])
     return Parts(sense, decide, substep, names)
 
@@ -191,6 +189,10 @@ def initial(plant: Plant, c: Controller, s: Setup, x: Any, xi_pred: Any, current
         i, e, T = drive.command(ca.SX(current)), drive.emf(ca.SX(x)), drive.to_phases(ca.SX(x))
         share = (actuator.R * i + e) / drive.link_voltage
         values |= {"i": i, "i_phase": T @ i, "u_integral": actuator.R * i}
+        if s.turning:
+            believed = plant_of(c.parameters)
+            Q = believed.drive.turned(ca.SX(current) * ca.DM(list(believed.actuator.force_constant)))
+            values["u_integral"] = Q @ values["u_integral"]
         values["command"] = share if s.fidelity == "dq" else 0.5 + T @ share
     values["under_way"] = ca.repmat(values["command"], s.delay, 1)
     sizes = layout(plant, c, s)
@@ -340,10 +342,10 @@ def _current_control(
         i_phase = machine["i_phase"]
         i = believed.drive.to_axes(estimate) @ i_phase
     error = believed.drive.command(current) - i
-    integral = (
-        controller["u_integral"] + g["Ki_current"] * g["current_time"] * (1 - controller["u_limited"]) * error
-    )
-    u = g["Kp"] * error + integral + believed.drive.emf(estimate)
+    Q = believed.drive.turned(current * g["believed"]) if s.turning else ca.SX.eye(len(drive.axes))
+    waiting = controller["u_limited"]
+    integral = controller["u_integral"] + g["Ki_current"] * g["current_time"] * (1 - waiting) * (Q @ error)
+    u = g["Kp"] * error + Q.T @ integral + believed.drive.emf(estimate)
     row: dict[str, Any] = {"link": machine["link"], "i": i}
     if s.fidelity == "dq":
         command, limited = electric.modulation(drive, u, V)

@@ -86,6 +86,7 @@ class Drive:
     coupling: CasadiFn  # (x, i) -> what moving axes add to i', A/s
     to_phases: CasadiFn  # x -> T(x)
     to_axes: CasadiFn  # x -> T(x)^+
+    turned: CasadiFn  # inputs -> Q: Q i are the currents in axes that turn with the forces, as the paper commands them
     peak: CasadiFn  # axis quantities -> largest phase quantity of each group of axes
     groups: tuple[tuple[int, ...], ...]  # axes that share phases
     stars: tuple[tuple[int, ...], ...]  # phases that share a star point

@@ -1,12 +1,11 @@
-"""Records -> figures and pages. The only module that imports matplotlib."""
+"""Records -> pages: tables for a terminal of 100 columns, and the figures of figures.py, saved."""
 
 from __future__ import annotations
 
-import io
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from rich import box
@@ -15,21 +14,22 @@ from rich.table import Table
 from rich.text import Text
 from scipy.optimize import linear_sum_assignment
 
-from malta.data import to_si
-from malta.errors import InputError
-from malta.files import replace_files
+from malta.data import in_unit, published_value
+from malta.figures import STYLES as STYLES
+from malta.figures import Published, number, read_out
+from malta.figures import experiment_figure as experiment_figure
+from malta.figures import save as save
+from malta.figures import stroke_figure as stroke_figure
 from malta.linearize import LinearModel
-from malta.simulate import StrokeFigures, Trajectory, stroke_figures
+from malta.simulate import StrokeFigures, Trajectory
 from malta.spec import Spec
 from malta.synthesize import continuous_poles
 from malta.verify import BANDWIDTHS, Margins, zone
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
+    from malta.claims import Ledger
+    from malta.experiments import Experiment, Merit
     from malta.plant import ComplexArray, FloatArray
-
-Published = Mapping[str, Any]  # a file of data/published/
 
 
 # --- pages ---
@@ -39,12 +39,12 @@ def poles_table(model: LinearModel, published: Published | None) -> Table:
     """Open-loop poles by mode, beside Table I where it applies."""
     names, values = _modes(model)
     table = _table("Open-loop poles [rad/s]", "mode", *names)
-    table.add_row("ours, +-", *(f"{value:.2f}" for value in values))
+    _row(table, "ours, +-", *(f"{value:.2f}" for value in values))
     at_centre = not np.any(model.operating_point.x)
     if published is not None and at_centre:
-        digits = _entry(published, "table_I.digits", int)
-        printed = [_entry(published, f"table_I.poles.{name}") for name in names]
-        table.add_row("Table I, +-", *(f"{value:.{digits}f}" for value in printed))
+        printed = [published_value(published, f"table_I.poles.{name}") for name in names]
+        digits = published["table_I"]["digits"]
+        _row(table, "Table I, +-", *(f"{value:.{digits}f}" for value in printed))
     return table
 
 
@@ -52,13 +52,13 @@ def loop_poles_table(margins: Margins, continuous: Mapping[str, ComplexArray] | 
     """Poles of the continuous design, if given, and of the sampled loop as s-plane values."""
     table = _table("Poles [rad/s]; of sampled systems ln(lambda) / Ts", "of", "poles")
     for what, poles in (continuous or {}).items():
-        table.add_row(what, _pole_text(poles))
+        _row(table, what, _pole_text(poles))
     for what, key in (
         ("sampled regulator, with integrals", "regulator"),
         ("sampled Kalman filter", "filter"),
         ("closed loop of the machine", "closed_loop"),
     ):
-        table.add_row(what, _pole_text(getattr(margins.poles, key)))
+        _row(table, what, _pole_text(getattr(margins.poles, key)))
     return table
 
 
@@ -67,10 +67,10 @@ def bandwidth_table(margins: Margins, published: Published | None) -> Table:
     table = _table("Bandwidth by definition", "definition", "rad/s", "Hz")
     for key, meaning in BANDWIDTHS.items():
         value = margins.bandwidth[key]
-        table.add_row(meaning, f"{value:.1f}", f"{value / (2 * math.pi):.2f}")
+        _row(table, meaning, f"{value:.1f}", f"{value / (2 * math.pi):.2f}")
     if published is not None:
-        value = _si(published, "position_controller.bandwidth", "rad/s")
-        table.add_row("published, without a definition", f"about {value:.0f}", f"{value / (2 * math.pi):.0f}")
+        value = read_out(published, "position_controller.bandwidth", "rad/s")
+        _row(table, "published, without a definition", f"about {value:.0f}", f"{value / (2 * math.pi):.0f}")
     return table
 
 
@@ -82,8 +82,12 @@ def sensitivity_table(margins: Margins) -> Table:
     )
     for stage in margins.stages:
         peaks = [f"{stage.peak_sensitivity[s]:.2f} {zone(stage.peak_sensitivity[s])}" for s in sensors]
-        table.add_row(
-            stage.name, *peaks, f"{stage.peak_sensitivity['sigma_max']:.2f}", f"{stage.peak_frequency:.3g}"
+        _row(
+            table,
+            stage.name,
+            *peaks,
+            f"{stage.peak_sensitivity['sigma_max']:.2f}",
+            f"{stage.peak_frequency:.3g}",
         )
     return table
 
@@ -99,10 +103,10 @@ def stroke_table(figures: StrokeFigures, published: Published | None) -> Table:
     rows += [(f"deviation {name} [um]", value * 1e6, *radial) for name, value in figures.radial.items()]
     table = _table("Stroke", "figure", "ours", "published")
     for label, value, key, unit, digits, form in rows:
-        printed = "" if published is None else form.format(_si(published, key, unit))
-        table.add_row(label, f"{value:.{digits}f}", printed)
-    table.add_row("largest thrust [N]", f"{figures.force:.1f}", "")
-    table.add_row("largest current [A]", f"{figures.current:.2f}", "")
+        printed = "" if published is None else form.format(read_out(published, key, unit))
+        _row(table, label, f"{value:.{digits}f}", printed)
+    _row(table, "largest thrust [N]", f"{figures.force:.1f}", "")
+    _row(table, "largest current [A]", f"{figures.current:.2f}", "")
     return table
 
 
@@ -123,11 +127,113 @@ def design_page(
     )
 
 
-def _table(title: str, *columns: str) -> Table:
-    table = Table(title=title, title_justify="left", title_style="", box=box.SIMPLE_HEAD, pad_edge=False)
-    for i, column in enumerate(columns):
-        table.add_column(column, justify="left" if i == 0 or column == "poles" else "right")
+def experiment_table(e: Experiment, published: Published | None = None) -> Group:
+    """What an experiment found: its cases, and its figures of merit beside the published ones."""
+    tables = []
+    if [merit.label for merit in e.merits] != [merit.label for merit in e.cases[0].merits]:
+        tables.append(_cases_table(e, published))
+    if e.merits:
+        tables.append(_merits_table("" if tables else e.question, e.merits, published))
+    return Group(*tables)
+
+
+def _merits_table(title: str, merits: Sequence[Merit], published: Published | None) -> Table:
+    """A row for each figure."""
+    if published is None or not any(merit.published for merit in merits):
+        table = _table(title, "figure", "ours")
+        for merit in merits:
+            _row(table, _named(merit), _shown(merit))
+        return table
+    table = _table(title, "figure", "ours", "published")
+    for merit in merits:
+        _row(table, _named(merit), _shown(merit), _printed(merit, published))
     return table
+
+
+def _cases_table(e: Experiment, published: Published | None) -> Table:
+    """A row for each case, or a column where there are many figures; one below the other where they differ."""
+    fullest = max((case.merits for case in e.cases), key=len)
+    labels = [merit.label for merit in fullest]
+    if any(merit.label not in labels for case in e.cases for merit in case.merits):
+        return _listed(e)
+    if len(labels) > COLUMNS:
+        return _transposed(e, fullest)
+    table = _table(e.question, "case", "verdict", "at [ms]", *map(_named, fullest))
+    table.columns[0].no_wrap = True
+    table.columns[1].justify = "left"
+    for case in e.cases:
+        end, found = case.run.verdict, {merit.label: _shown(merit) for merit in case.merits}
+        _row(
+            table, case.label, end.name, f"{end.time * 1e3:.1f}", *(found.get(label, "-") for label in labels)
+        )
+    if published is not None and any(merit.published for merit in fullest):
+        table.add_section()
+        _row(table, "published", "", "", *(_printed(merit, published) for merit in fullest))
+    return table
+
+
+COLUMNS = 6  # figures of merit beside each other, at most
+
+
+def _transposed(e: Experiment, fullest: Sequence[Merit]) -> Table:
+    table = _table(e.question, "figure", *(case.label for case in e.cases))
+    found = [{merit.label: _shown(merit) for merit in case.merits} for case in e.cases]
+    ends = [case.run.verdict for case in e.cases]
+    _row(table, "verdict", *(end.name for end in ends))
+    _row(table, "at [ms]", *(f"{end.time * 1e3:.1f}" for end in ends))
+    for merit in fullest:
+        _row(table, _named(merit), *(values.get(merit.label, "-") for values in found))
+    return table
+
+
+def _listed(e: Experiment) -> Table:
+    table = _table(e.question, "case", "figure", "ours")
+    table.columns[0].no_wrap = table.columns[1].no_wrap = True
+    table.columns[1].justify = "left"
+    for case in e.cases:
+        end = case.run.verdict
+        _row(table, case.label, "verdict", f"{end.name} at {end.time * 1e3:.1f} ms")
+        for merit in case.merits:
+            _row(table, "", _named(merit), _shown(merit))
+    return table
+
+
+def claims_table(ledger: Ledger) -> Table:
+    """The ledger of published numbers."""
+    table = _table("Published numbers and ours", "claim", "published", *ledger.designs, "verdict")
+    table.columns[-1].justify = "left"
+    for claim in ledger.claims:
+        _row(table, claim.subject, claim.published, *claim.ours, claim.verdict)
+    return table
+
+
+def _named(merit: Merit) -> str:
+    unit = {"percent": "%", "1": ""}.get(merit.unit, merit.unit)
+    return f"{merit.label} [{unit}]" if unit else merit.label
+
+
+def _shown(merit: Merit) -> str:
+    count = merit.unit == "1" and merit.value.is_integer()
+    return f"{merit.value:.0f}" if count else number(in_unit(merit.value, merit.unit))
+
+
+def _printed(merit: Merit, published: Published) -> str:
+    if not merit.published:
+        return ""
+    value = f"{read_out(published, merit.published, merit.unit):.6g}"
+    return f"<= {value}" if merit.relation == "at most" else value
+
+
+def _table(title: str, *columns: str) -> Table:
+    heading = Text(title)  # a Text, because [ms] is markup to rich
+    table = Table(title=heading, title_justify="left", title_style="", box=box.SIMPLE_HEAD, pad_edge=False)
+    for i, column in enumerate(columns):
+        table.add_column(Text(column), justify="left" if i == 0 or column == "poles" else "right")
+    return table
+
+
+def _row(table: Table, *cells: str) -> None:
+    table.add_row(*map(Text, cells))
 
 
 def _modes(model: LinearModel) -> tuple[list[str], FloatArray]:
@@ -151,127 +257,18 @@ def _pole_text(poles: ComplexArray) -> str:
     return "  ".join(text if count == 1 else f"{text} (x{count})" for text, count in counted.items())
 
 
-def _si(published: Published, key: str, unit: str) -> float:
-    """A published quantity in the unit asked for."""
-    value, given = _entry(published, f"{key}.value"), _entry(published, f"{key}.unit", str)
-    return to_si(value, given, unit, "data/published", key)
-
-
-def _entry(published: Published, key: str, kind: Any = (int, float)) -> Any:
-    entry: Any = published
-    for part in key.split("."):
-        if not isinstance(entry, Mapping) or part not in entry:
-            raise InputError("data/published", key, "nothing", "what the paper prints")
-        entry = entry[part]
-    if isinstance(entry, bool) or not isinstance(entry, kind):
-        raise InputError("data/published", key, repr(entry), "a text" if kind is str else "a number")
-    return entry
-
-
-# --- figures ---
-
-STYLES: Sequence[dict[str, Any]] = (  # told apart without colour: by darkness and by dash
-    {"color": "#000000", "linestyle": "-", "linewidth": 1.6},
-    {"color": "#c1440e", "linestyle": "-", "linewidth": 1.4},
-    {"color": "#1f77b4", "linestyle": (0, (5, 2)), "linewidth": 1.4},
-    {"color": "#8a8a8a", "linestyle": (0, (1.5, 1.5)), "linewidth": 1.6},
-)
-BOUND = {"color": "#9a9a9a", "linestyle": (0, (8, 3)), "linewidth": 0.9}
-
-
-def stroke_figure(run: Trajectory, published: Published | None = None) -> Figure:
-    """Axial position, tracking error, radial deviation and currents of a stroke, published bounds drawn in."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(9.0, 6.0), dpi=120)
-    figure.subplots_adjust(left=0.085, right=0.985, bottom=0.085, top=0.93, wspace=0.24, hspace=0.16)
-    (position, radial), (error, current) = figure.subplots(2, 2, sharex=True)
-    names = [s.name for s in run.plant.outputs]
-    axis = run.plant.stroke_output
-    ms = run.t * 1e3
-    position.plot(ms, run.reference[:, axis] * 1e3, label="reference", **STYLES[2])
-    position.plot(ms, run.p[:, axis] * 1e3, label="position", **STYLES[0])
-    position.set_ylabel("axial position z [mm]")
-    error.plot(ms, (run.reference[:, axis] - run.p[:, axis]) * 1e3, **STYLES[0])
-    error.set_ylabel("axial error z* - z [mm]")
-    for i, style in zip((k for k in range(len(names)) if k != axis), (1, 0, 3, 2), strict=False):
-        radial.plot(ms, (run.p[:, i] - run.reference[:, i]) * 1e6, label=names[i], **STYLES[style])
-    radial.set_ylabel("radial deviation [µm]")
-    for name, style, i in _widest_currents(run):
-        current.plot(ms, run.current[:, i], label=name, **STYLES[style])
-    current.set_ylabel("current per module [A]")
-    if published is not None:
-        for axes, key, unit in (
-            (error, "figure_12.axial_error", "mm"),
-            (radial, "figure_13.radial_deviation", "um"),
-        ):
-            bound = _si(published, key, unit)
-            for sign in (-1, 1):
-                axes.axhline(sign * bound, **BOUND)
-            axes.annotate(
-                "published bound",
-                (0.985, bound),
-                xycoords=("axes fraction", "data"),
-                ha="right",
-                va="bottom",
-                fontsize=8,
-                color="#6a6a6a",
-            )
-            reach = max(
-                abs(value) for line in axes.lines for value in np.asarray(line.get_ydata(), dtype=float)
-            )
-            axes.set_ylim(-max(1.25 * bound, 1.1 * reach), max(1.25 * bound, 1.1 * reach))
-    for axes in (position, radial, current):
-        below_bound = {"loc": "upper left", "bbox_to_anchor": (0, 0.89), "ncols": 2} if axes is radial else {}
-        axes.legend(frameon=False, fontsize=8, **below_bound)
-    for axes in (error, current):
-        axes.set_xlabel("time [ms]")
-    for axes in (position, radial, error, current):
-        axes.grid(color="#e4e4e4", linewidth=0.6)
-        axes.margins(x=0)
-        for side in ("top", "right"):
-            axes.spines[side].set_visible(False)
-    f = stroke_figures(run)
-    figure.suptitle(
-        f"{run.controller.name}: stroke of {(run.reference[-1, axis] - run.reference[0, axis]) * 1e3:.0f} mm, "
-        f"rise {f.rise * 1e3:.1f} ms, overshoot {f.overshoot * 100:.1f} %, axial error {f.axial_error * 1e3:.2f} mm, "
-        f"radial {max(f.radial.values()) * 1e6:.1f} µm"
-        + ("" if run.verdict.completed else f" ({run.verdict.name})"),
-        fontsize=10,
-    )
-    return figure
-
-
-def _widest_currents(run: Trajectory) -> list[tuple[str, int, int]]:
-    """The thrust current and the two bearing currents that carry the weight: label, style, index."""
-    inputs = [s.name for s in run.plant.inputs]
-    thrust = run.plant.thrust_input
-    widest = np.argsort(-np.abs(run.v).max(axis=0), kind="stable")
-    others = sorted(int(i) for i in widest[widest != thrust][:2])
-    return [(inputs[i], style, i) for style, i in enumerate([thrust, *others])]
-
-
-def save(figure: Figure, path: str | Path) -> Path:
-    """Write a figure as .png or .svg, whole or not at all; the same figure gives the same bytes."""
-    import matplotlib
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-
-    path = Path(path)
-    if path.suffix not in (".png", ".svg"):
-        raise InputError(path, "", f"suffix {path.suffix!r}", "one of .png, .svg")
-    buffer = io.BytesIO()
-    with matplotlib.rc_context({"svg.hashsalt": "malta", "svg.fonttype": "none"}):
-        if path.suffix == ".svg":
-            figure.savefig(buffer, format="svg", metadata={"Date": None})
-        else:
-            # Figure.savefig lays everything out in a draw of its own first, which only tight boxes need.
-            canvas: Any = FigureCanvasAgg(figure)
-            canvas.print_png(buffer, metadata={"Software": None}, pil_kwargs={"compress_level": 1})
-    replace_files({path: buffer.getvalue()})
-    return path
+# --- saved figures ---
 
 
 def stroke(run: Trajectory, path: str | Path | None = None, published: Published | None = None) -> Path:
     """Draw a stroke and save it, as build/NAME_SCENARIO.png if no path is given."""
-    default = Path("build") / f"{run.controller.name}_{run.scenario.name}.png"
-    return save(stroke_figure(run, published), default if path is None else path)
+    return save(stroke_figure(run, published), _default(run, run.scenario.name) if path is None else path)
+
+
+def experiment(e: Experiment, path: str | Path | None = None, published: Published | None = None) -> Path:
+    """Draw an experiment and save it, as build/NAME_EXPERIMENT.png if no path is given."""
+    return save(experiment_figure(e, published), _default(e.run, e.name) if path is None else path)
+
+
+def _default(run: Trajectory, name: str) -> Path:
+    return Path("build") / f"{run.controller.name}_{name}.png"

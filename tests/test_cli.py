@@ -432,7 +432,7 @@ def test_published_data_without_a_table_names_it(
     monkeypatch.chdir(tmp_path)
     code, _, err = run(*arguments)
     assert code == 2
-    assert "published: table_I.digits: found nothing, expected " in one_sentence(err)
+    assert "published: table_I.poles.x: found nothing, expected " in one_sentence(err)
     assert not (tmp_path / "design" / "gains").exists()
 
 
@@ -451,7 +451,7 @@ def test_simulate_prints_the_stroke_beside_the_published_one(run: Run) -> None:
     assert (code, err) == (0, "")
     rows = [line.split() for line in out.splitlines()]
     assert ["rise,", "10-90", "%", "[ms]", "16.13", "16.2"] in rows
-    assert out.startswith(f"{TABLE2}: stroke -> completed at 0.1 s\n")
+    assert out.startswith(f"{TABLE2}: stroke, fidelity dq -> completed at 0.1 s\n")
     assert max(map(len, out.splitlines())) <= WIDTH
 
 
@@ -472,7 +472,8 @@ def test_simulate_as_json_holds_finite_numbers(run: Run) -> None:
     assert (code, err) == (0, "")
     result = json.loads(out)
     found = numbers(result)
-    assert len(found) == 10  # of the stroke, and when it ended
+    assert len(found) > 30  # merits of experiment and case, the stroke, and when it ended
+    assert (result["engine"], result["fidelity"]) == ("compiled", "dq")
     assert all(map(math.isfinite, found))
     assert result["verdict"] == {"name": "completed", "time": 0.1}
     assert result["files"] == []
@@ -553,7 +554,14 @@ def test_options_of_the_stroke_are_taken(run: Run) -> None:
         ("verify pyproject.toml", "pyproject.toml: found suffix '.toml'", "one of .json, .npz, .mat"),
         ("verify TABLE2 --set K_A=-1", "--set: K_A: found -1", "a finite number of at least 0 in N/m"),
         ("simulate nothing.json", "nothing.json: found no such file", "a gain file"),
-        ("simulate TABLE2 --scenario orbit", "--scenario: found 'orbit'", "stroke"),
+        ("simulate TABLE2 --scenario orbit", "scenario: found 'orbit'", "one of stroke, hold, tilt"),
+        ("simulate TABLE2 --scenario hold --rise 3", "hold: rise: found an option of another scenario", "none"),
+        ("simulate TABLE2 --fidelity exact", "fidelity: found 'exact'", "one of force, dq, phase"),
+        ("simulate TABLE2 --estimator ukf", "estimator: found 'ukf'", "one of steady-state, kalman, extended"),
+        ("simulate TABLE2 --engine jit", "engine: found 'jit'", "one of auto, compiled, virtual machine"),
+        ("simulate TABLE2 --real-pwm", "real_pwm: found fidelity dq", "fidelity phase"),
+        ("simulate TABLE2 --substeps 0", "substeps: found 0", "a number above 0"),
+        ("claims nothing.toml", "nothing.toml: found no such file", "a TOML file"),
         ("simulate TABLE2 --set q=1", "--set: q: found an unknown parameter", "one of m I_xx I_yy"),
         ("simulate TABLE2 --set preset=1", "--set: preset: found an unknown parameter", "one of m I_xx I_yy"),
         ("simulate TABLE2 --set m=abc", "--set: found 'm=abc'", "NAME=VALUE, as m=0.56"),

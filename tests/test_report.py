@@ -3,7 +3,12 @@
 from __future__ import annotations
 
 import io
+import math
+import subprocess
+import sys
 from dataclasses import replace
+from functools import cache
+from itertools import combinations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,22 +16,81 @@ import pytest
 from rich.console import Console
 
 import malta
-from malta import report
-from malta.simulate import Scenario, stroke_figures
+from malta import figures, report
+from malta.claims import Claim, Ledger
+from malta.experiments import EXPERIMENTS, Case, Experiment, Merit
+from malta.simulate import Scenario, Verdict, stroke_figures
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from pathlib import Path
 
     from conftest import Design
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    Flown = Callable[[str, str], Experiment]
+    Pictured = Callable[[str, str], tuple[Figure, bytes]]
+
+
+SHORT: dict[str, dict[str, Any]] = {"lift-off": {"duration": 0.06}, "thermal": {"faster": 100.0}}
+
+
+@pytest.fixture(scope="session")
+def flown(designs: dict[str, Design]) -> Flown:
+    """Experiments of a design by name, each made once."""
+
+    @cache
+    def made(design: str, name: str) -> Experiment:
+        return malta.experiment(
+            name, designs[design].plant, designs[design].controller, **SHORT.get(name, {})
+        )
+
+    return made
+
+
+@pytest.fixture(scope="session")
+def pictured(flown: Flown, published: dict[str, Any], tmp_path_factory: pytest.TempPathFactory) -> Pictured:
+    """Their figures, each drawn once, with the bytes of the picture."""
+    folder = tmp_path_factory.mktemp("figures")
+
+    @cache
+    def made(design: str, name: str) -> tuple[Figure, bytes]:
+        figure = report.experiment_figure(flown(design, name), published)
+        return figure, drawn(figure, folder)
+
+    return made
+
+
+def printed(renderable: object) -> str:
+    """As a terminal of 100 columns shows it; nothing is cut off."""
+    buffer = io.StringIO()
+    Console(file=buffer, width=100, markup=False, highlight=False, emoji=False).print(renderable)
+    text = buffer.getvalue()
+    assert max(len(line.rstrip()) for line in text.splitlines()) <= 100
+    assert "…" not in text
+    return text
+
+
+def drawn(figure: Figure, folder: Path) -> bytes:
+    return figures.save(figure, folder / "figure.png").read_bytes()
+
+
+def levels(axes: Axes) -> set[float]:
+    """Where lines run from side to side."""
+    ys = [np.asarray(line.get_ydata(), dtype=float) for line in axes.lines]
+    return {round(float(y[0]), 6) for y in ys if len(y) == 2 and y[0] == y[1]}
+
+
+def words(figure: Figure) -> list[str]:
+    return [text.get_text() for axes in figure.axes for text in axes.texts]
 
 
 def test_the_page_of_a_design_fits_and_names_its_figures(design: Design, published: dict[str, Any]) -> None:
     run = malta.simulate(design.plant, design.controller, Scenario.stroke())
-    page = report.design_page(design.spec, design.model, design.margins, stroke_figures(run), published)
-    buffer = io.StringIO()
-    Console(file=buffer, width=100, markup=False, highlight=False).print(page)
-    text = buffer.getvalue()
-    assert max(len(line.rstrip()) for line in text.splitlines()) <= 100
+    text = printed(
+        report.design_page(design.spec, design.model, design.margins, stroke_figures(run), published)
+    )
     for wanted in (
         "218.92",
         "157.53",
@@ -45,9 +109,7 @@ def test_the_page_of_a_design_fits_and_names_its_figures(design: Design, publish
 def test_modes_keep_their_names_off_the_centre(design: Design) -> None:
     """At z_ss = 15 mm y and alpha mix; each pole still stands under the mode that it grows from."""
     model = malta.linearize(design.plant, design.plant.at(z=15e-3))
-    buffer = io.StringIO()
-    Console(file=buffer, width=100).print(report.poles_table(model, None))
-    row = next(line for line in buffer.getvalue().splitlines() if "ours" in line)
+    row = next(line for line in printed(report.poles_table(model, None)).splitlines() if "ours" in line)
     assert row.split()[2:] == ["230.64", "230.64", "0.00", "149.52", "149.52"]
 
 
@@ -60,18 +122,37 @@ def test_the_stroke_figure_has_labelled_axes_and_the_published_bounds(
     for axes in figure.axes:
         assert axes.get_ylabel().endswith("]")
     assert [axes.get_xlabel() for axes in figure.axes[2:]] == ["time [ms]", "time [ms]"]
-    lines = [np.asarray(line.get_ydata(), dtype=float) for axes in figure.axes for line in axes.lines]
-    bounds = {round(float(y[0]), 6) for y in lines if len(y) == 2}
-    assert bounds == {-20.0, 20.0, -0.6, 0.6}
-    title = figure.get_suptitle()
-    assert title.startswith(f"{design.spec.name}: stroke of 10 mm, rise 1")
+    assert [levels(axes) for axes in figure.axes] == [set(), {-20.0, 20.0}, {-0.6, 0.6}, set()]
+    assert words(figure) == ["published bound", "published bound"]
+    assert figure.get_suptitle() == f"{design.spec.name}, fidelity dq: stroke of 10 mm"
+    assert figure.texts[-1].get_text().startswith("rise 1")
+    force = replace(Scenario.stroke(), fidelity="force")
+    coarse = report.stroke_figure(malta.simulate(design.plant, design.controller, force))
+    assert coarse.get_suptitle() == f"{design.spec.name}, fidelity force: stroke of 10 mm"
+    assert not any(levels(axes) for axes in coarse.axes)
+
+
+def test_the_stroke_figure_reads_currents_as_thrust(design: Design, tmp_path: Path) -> None:
+    """Two modules of 5.2 N/A each, as Fig. 12(d)."""
+    run = malta.simulate(design.plant, design.controller, Scenario.stroke())
+    figure = report.stroke_figure(run)
+    drawn(figure, tmp_path)
+    current = figure.axes[3]
+    (thrust,) = current.child_axes
+    assert thrust.get_ylabel() == "thrust [N]"
+    assert np.allclose(thrust.get_ylim(), 10.4 * np.array(current.get_ylim()))
 
 
 def test_a_figure_of_a_failed_run_says_so(designs: dict[str, Design]) -> None:
     design = designs["table2"]
     heavy = malta.plant_of(replace(design.spec.parameters, m=0.56))
     run = malta.simulate(heavy, design.controller, Scenario.stroke())
-    assert "touchdown at sensor plane 1" in report.stroke_figure(run).get_suptitle()
+    figure = report.stroke_figure(run)
+    assert "touchdown at sensor plane 1 at" in figure.get_suptitle()
+    assert "stroke of 10 mm" in figure.get_suptitle()  # the one asked for
+    assert "rise" not in figure.texts[-1].get_text()
+    low, high = figure.axes[0].get_ylim()
+    assert low < -5 < 5 < high
 
 
 @pytest.mark.parametrize("suffix", [".png", ".svg"])
@@ -102,3 +183,307 @@ def test_a_stroke_is_drawn_whole_and_saved_by_default_in_build(
     monkeypatch.chdir(tmp_path)
     assert str(malta.report.stroke(run)) == "build/calibrated_stroke.png"
     assert [p.name for p in (tmp_path / "build").iterdir()] == ["calibrated_stroke.png"]
+
+
+# --- experiments ---
+
+
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_every_experiment_has_a_figure_that_says_what_drew_it(
+    name: str, flown: Flown, pictured: Pictured, published: dict[str, Any], tmp_path: Path
+) -> None:
+    figure, content = pictured("calibrated", name)
+    assert content == drawn(report.experiment_figure(flown("calibrated", name), published), tmp_path)
+    fidelity = "dq and phase" if name == "faults" else "dq"  # an open phase is none of dq
+    assert figure.get_suptitle().startswith(f"calibrated, fidelity {fidelity}: ")
+    for axes in figure.axes:
+        for label in (axes.get_xlabel(), axes.get_ylabel()):
+            assert label == "" or label.endswith("]")
+        assert axes.has_data()
+    shown = [axes for axes in figure.axes if axes.get_xlabel()]
+    assert len(shown) >= len(figure.axes) / 2
+    assert sum(not axes.get_ylabel() for axes in figure.axes) == (name == "faults")  # its bars have names
+
+
+@pytest.mark.parametrize("design", ["table2", "calibrated"])
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_nothing_in_a_figure_overlaps_or_is_cut_off(name: str, design: str, pictured: Pictured) -> None:
+    """Panels, axis labels, titles and legends: none lies on another, none leaves the page."""
+    figure, _ = pictured(design, name)
+    texts = [*figure.texts, *figure.legends]
+    boxes: list[tuple[str, int | None, Any]] = [(str(text), None, text.get_window_extent()) for text in texts]
+    for n, axes in enumerate(figure.axes):
+        boxes.append((f"panel {n}", n, axes.get_window_extent()))
+        for side in (axes.xaxis, axes.yaxis, *(child.yaxis for child in axes.child_axes)):
+            box = side.get_tightbbox()
+            boxes += [(f"{side} of panel {n}", n, box)] if box is not None else []
+        legend = axes.get_legend()
+        if legend is not None:
+            boxes.append((f"legend of panel {n}", None, legend.get_window_extent()))
+    page = figure.bbox
+    for what, _, box in boxes:
+        assert box.x0 >= page.x0 - 1, what
+        assert box.y0 >= page.y0 - 1, what
+        assert box.x1 <= page.x1 + 1, what
+        assert box.y1 <= page.y1 + 1, what
+    for (what, panel, one), (that, other_panel, other) in combinations(boxes, 2):
+        wide = min(one.x1, other.x1) - max(one.x0, other.x0)
+        high = min(one.y1, other.y1) - max(one.y0, other.y0)
+        if panel is None or panel != other_panel:  # a panel meets its own axes
+            assert min(wide, high) < 2, f"{what} lies on {that}"
+
+
+def test_figures_hold_what_the_paper_prints(flown: Flown, published: dict[str, Any]) -> None:
+    def of(name: str) -> Figure:
+        return report.experiment_figure(flown("calibrated", name), published)
+
+    assert [levels(axes) for axes in of("stroke").axes] == [set(), {-20.0, 20.0}, {-0.6, 0.6}, set()]
+    tilt = of("tilt")
+    assert [levels(axes) for axes in tilt.axes] == [set(), set(), set(), {4.0}]
+    ring = tilt.axes[2].lines[-1]
+    assert np.allclose(np.hypot(ring.get_xdata(), ring.get_ydata()), 4.0)
+    assert words(tilt) == ["published bound", "published bound"]
+    sag, axial, largest, radial = of("payload").axes
+    assert (levels(axial), levels(radial)) == ({-0.6, 0.6}, {20.0})
+    assert (levels(sag), levels(largest)) == ({-600.0}, {600.0})  # the clearance of the machine
+    assert 200.0 in {float(np.asarray(line.get_xdata())[0]) for line in largest.lines}
+    assert levels(of("thermal").axes[1]) == {-1.0, 1.0}
+    for name in EXPERIMENTS:  # and without it there is nothing to say
+        assert not any(
+            "published" in text for text in words(report.experiment_figure(flown("calibrated", name)))
+        )
+
+
+def test_the_histograms_stand_below_the_published_spread(flown: Flown, published: dict[str, Any]) -> None:
+    e = flown("calibrated", "hold")
+    figure = report.experiment_figure(e, published)
+    for axes, merit, signal in zip(figure.axes, e.merits, e.run.plant.outputs, strict=False):
+        lines: list[Any] = list(axes.lines)
+        ours, theirs = (line.get_xdata() for line in lines)
+        mean, std = (published["table_III"][what][signal.name]["value"] for what in ("mean", "std"))
+        assert np.allclose(theirs, [mean - std, mean, mean + std])
+        assert np.isclose((ours[2] - ours[0]) / 2, merit.value * 1e6)
+        bars: list[Any] = list(axes.patches)
+        measured, true = (patch.get_data() for patch in bars)
+        for shares, edges, _ in (measured, true):
+            assert np.isclose(shares.sum(), 100)
+            assert np.allclose(np.diff(edges), edges[1] - edges[0])
+        width = 1.0 if signal.name != "z" else 5.0  # the resolution; of the Hall sensors a third of the noise
+        assert np.isclose(measured.edges[1] - measured.edges[0], width)
+        heights = [line.get_ydata()[0] for line in lines]
+        assert min(heights) > max(measured.values.max(), true.values.max())
+        assert axes.get_ylim()[1] > max(heights)
+
+
+def test_figures_hold_the_limits_of_the_machine(flown: Flown) -> None:
+    lift = report.experiment_figure(flown("calibrated", "lift-off"))
+    need = flown("calibrated", "lift-off").merits[0].value
+    assert [levels(axes) for axes in lift.axes] == 2 * [{-600.0}] + 2 * [{round(need, 6)}]
+    _, current, _, voltage = report.experiment_figure(flown("calibrated", "drive-limits")).axes
+    assert levels(current) == {-5.0, -4.0, 4.0, 5.0}
+    assert levels(voltage) == {-22.5, -20.25, 20.25, 22.5}
+    bars, traces = report.experiment_figure(flown("calibrated", "faults")).axes
+    assert levels(traces) == {600.0}
+    assert [label.get_text() for label in bars.get_yticklabels()][7] == "y1 stuck"
+    assert bars.texts[7].get_text().startswith("touchdown after")
+    assert len(bars.patches) == 13
+
+
+def test_touchdowns_are_marked(flown: Flown, published: dict[str, Any]) -> None:
+    """table2 carries 100 g; an axial push takes it to the end stop, a torque to the touchdown bearing."""
+    payload = report.experiment_figure(flown("table2", "payload"), published)
+    crosses = [[line for line in axes.lines if line.get_marker() == "X"] for axes in payload.axes]
+    assert [len(found) for found in crosses] == [2, 0, 2, 0]
+    assert [text.get_text() for text in payload.legends[0].get_texts()][-1] == "touchdown"
+    pushed = report.experiment_figure(flown("table2", "disturbance"))
+    legends = [axes.get_legend() for axes in pushed.axes]
+    marked = [text.get_text() for legend in legends if legend for text in legend.get_texts()]
+    assert {"touchdown", "axial end stop"} <= set(marked)
+
+
+@pytest.mark.parametrize("name", [name for name in EXPERIMENTS if name != "drive-limits"])
+def test_runs_that_end_early_are_drawn(
+    name: str, designs: dict[str, Design], published: dict[str, Any], tmp_path: Path
+) -> None:
+    """A mover of 0.56 kg falls onto its bearing within 25 ms; where estimators are compared, one is enough."""
+    design = designs["table2"]
+    heavy = malta.plant_of(replace(design.spec.parameters, m=0.56))
+    options: dict[str, Any] = {"estimator": "steady-state"} if name == "lift-off" else {}
+    e = malta.experiment(name, heavy, design.controller, **options)
+    assert not all(case.run.verdict.completed for case in e.cases)
+    assert len(drawn(report.experiment_figure(e, published), tmp_path)) > 10_000
+    printed(report.experiment_table(e, published))
+
+
+def test_one_case_is_an_experiment_too(flown: Flown, published: dict[str, Any], tmp_path: Path) -> None:
+    """As after Ctrl-C, or where an option leaves one choice."""
+    for name in EXPERIMENTS:
+        e = flown("calibrated", name)
+        first = replace(e, cases=e.cases[:1])
+        drawn(report.experiment_figure(first, published), tmp_path)
+        assert first.cases[0].merits[0].label.split()[0] in printed(report.experiment_table(first, published))
+
+
+def test_long_lines_keep_their_peaks(flown: Flown) -> None:
+    e = flown("calibrated", "thermal")
+    space = report.experiment_figure(e).axes[0]
+    line = next(line for line in space.lines if "not compensated" in str(line.get_label()))
+    whole = (e.cases[1].run.p[:, 2] + e.curves["drift"]) * 1e6
+    y = np.asarray(line.get_ydata(), dtype=float)
+    assert len(y) <= figures.POINTS + 2 < len(whole)
+    assert (y.min(), y.max(), y[-1]) == (whole.min(), whole.max(), whole[-1])
+
+
+def test_experiments_are_saved_by_name(flown: Flown, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert str(report.experiment(flown("table2", "lift-off"))) == "build/table2_lift-off.png"
+    svg = report.experiment(flown("table2", "hold"), tmp_path / "a.svg").read_text()
+    assert svg == report.experiment(flown("table2", "hold"), tmp_path / "b.svg").read_text()
+    assert ">2000 samples" in svg or "2000 samples at rest" in svg
+    unknown = replace(flown("table2", "hold"), name="lunch")
+    with pytest.raises(malta.InputError, match="'lunch', expected one of stroke, hold, tilt"):
+        report.experiment(unknown)
+
+
+def test_importing_the_report_does_not_wait_for_matplotlib() -> None:
+    code = "import sys, malta.report; sys.exit('matplotlib' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+@pytest.mark.parametrize("design", ["table2", "calibrated"])
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_the_table_of_an_experiment_fits_and_names_its_merits(
+    name: str, design: str, flown: Flown, published: dict[str, Any]
+) -> None:
+    e = flown(design, name)
+    text = printed(report.experiment_table(e, published))
+    assert e.question in text
+    assert "nan" not in text
+    flat = " ".join(text.split())
+    for merit in e.merits:
+        unit = {"percent": "%", "1": ""}.get(merit.unit, merit.unit)
+        assert (f"{merit.label} [{unit}]" if unit else merit.label) in flat
+    if len(e.cases) > 1:
+        for case in e.cases:
+            assert case.label in flat
+            assert f"{case.run.verdict.time * 1e3:.1f}" in flat
+    assert ("published" in text) == any(m.published for m in (*e.merits, *e.cases[0].merits))
+    assert "published" not in printed(report.experiment_table(e))
+
+
+def test_tables_show_what_the_paper_prints(flown: Flown, published: dict[str, Any]) -> None:
+    def rows(name: str) -> dict[str, list[str]]:
+        lines = printed(report.experiment_table(flown("calibrated", name), published)).splitlines()
+        return {line.split("]")[0].strip(): line.split("]")[-1].split() for line in lines}
+
+    stroke = rows("stroke")
+    assert stroke["rise, 10-90 % [ms"] == ["15.76", "16.2"]
+    assert stroke["overshoot [%"] == ["0", "<=", "1.5"]
+    assert stroke["deviation y1 [um"][1:] == ["<=", "20"]
+    assert stroke["deviation x1 [um"] == ["0", "<=", "20"]  # 1e-36 m
+    assert stroke["drive constant per module, f / i [N/A"] == ["5.200", "5"]
+    assert rows("hold")["measured x1, std [um"][1] == "0.3883"
+    assert rows("payload")["largest of these carried and moved [kg"] == ["0.2000", "0.2"]
+    tilt = printed(report.experiment_table(flown("calibrated", "tilt"), published)).splitlines()
+    assert next(line for line in tilt if "published" in line).split() == ["published", "<=", "4", "<=", "4"]
+
+
+def test_tables_of_cases(flown: Flown, published: dict[str, Any]) -> None:
+    """A row for each, a column for each where there is much to say, a list where they are asked different things."""
+    faults = printed(report.experiment_table(flown("table2", "faults"), published))
+    whole = next(line for line in faults.splitlines() if "one sample lost" in line)
+    assert whole.split()[3:5] == ["completed", "300.0"]
+    assert whole.split()[-2] == "-"  # no touchdown
+    assert next(line for line in faults.splitlines() if "survived, of 13" in line).split()[-1] == "11"
+    limits = printed(report.experiment_table(flown("table2", "drive-limits"), published)).splitlines()
+    assert next(line for line in limits if "fastest " in line).split() == ["figure", "fastest", "sigmoid"]
+    pushes = printed(report.experiment_table(flown("table2", "disturbance"), published))
+    assert "axial end stop at 130" in " ".join(pushes.split())
+
+
+def test_units_and_missing_figures(flown: Flown, published: dict[str, Any]) -> None:
+    merits = (
+        Merit("never reached", math.nan, "ms", "figure_12.rise_time"),
+        Merit("compliance", 52.2e-6, "um/N"),
+        Merit("stiffness", 19.1e3, "N/um"),
+        Merit("mass", 0.15, "kg"),
+        Merit("share", 0.0123, "percent", "figure_12.overshoot", "at most"),
+        Merit("ratio", 1.2315, "1"),
+        Merit("count", 11.0, "1"),
+        Merit("beyond", math.inf, "ms"),
+    )
+    run = flown("table2", "hold").run
+    e = Experiment("hold", "What?", (Case("hold", run, merits),), merits)
+    text = printed(report.experiment_table(e, published))
+    found = [line.split() for line in text.splitlines()[4:] if line.strip()]
+    assert found == [
+        ["never", "reached", "[ms]", "-", "16.2"],
+        ["compliance", "[um/N]", "52.20"],
+        ["stiffness", "[N/um]", "0.01910"],
+        ["mass", "[kg]", "0.1500"],
+        ["share", "[%]", "1.230", "<=", "1.5"],
+        ["ratio", "1.232"],
+        ["count", "11"],
+        ["beyond", "[ms]", "inf"],
+    ]
+    wrong = Experiment("hold", "What?", e.cases, (Merit("a", 1.0, "m", "figure_99.nothing"),))
+    with pytest.raises(malta.InputError, match=r"figure_99\.nothing: found nothing, expected what the paper"):
+        report.experiment_table(wrong, published)
+
+
+def test_units_survive_a_console_with_markup(flown: Flown, published: dict[str, Any], design: Design) -> None:
+    """To rich, [ms] is a style; notebooks print with its defaults."""
+    buffer = io.StringIO()
+    console = Console(file=buffer, width=100)
+    console.print(report.experiment_table(flown("table2", "stroke"), published))
+    console.print(report.experiment_table(flown("table2", "payload"), published))
+    console.print(report.poles_table(design.model, published))
+    text = buffer.getvalue()
+    for wanted in ("[ms]", "[%]", "[N/A]", "[kg]", "[rad/s]"):
+        assert wanted in text
+
+
+def test_cases_that_broke_off_leave_gaps(flown: Flown) -> None:
+    """The shorter of two cases says nothing of the stroke that it did not see."""
+    e = flown("calibrated", "payload")
+    short = e.cases[0]._replace(
+        run=replace(e.run, verdict=Verdict("interrupted", 0.1)), merits=e.cases[0].merits[:1]
+    )
+    lines = printed(report.experiment_table(replace(e, cases=(short, *e.cases[1:])))).splitlines()
+    row = next(line for line in lines if "interrupted" in line).split()
+    assert row[:4] == ["50", "g", "interrupted", "100.0"]
+    assert row[-2:] == ["-", "-"]
+
+
+@pytest.mark.parametrize(
+    ("value", "digits", "text"),
+    [
+        (16.1326, 4, "16.13"),
+        (399.04, 4, "399.0"),
+        (15001.2, 4, "15001"),
+        (0.08292, 4, "0.08292"),
+        (0.0022113, 4, "0.00221"),
+        (-0.0045, 4, "-0.00450"),
+        (2.5e-29, 4, "0"),
+        (0.0, 3, "0"),
+        (math.nan, 4, "-"),
+        (-math.inf, 4, "-inf"),
+    ],
+)
+def test_numbers_are_written_without_exponents(value: float, digits: int, text: str) -> None:
+    assert figures.number(value, digits) == text
+
+
+def test_the_ledger_fits() -> None:
+    claims = (
+        Claim(
+            "poles of x, y [rad/s]",
+            "±218.92",
+            ("±218.92", "±218.92"),
+            "reproduced; " + "said at length, " * 9,
+        ),
+        Claim("a claim whose subject takes more than one line of the table", "–", ("1", "2"), "ours"),
+    )
+    text = printed(report.claims_table(Ledger(("table2", "calibrated"), claims)))
+    assert "±218.92" in text
+    assert "calibrated" in text

@@ -18,7 +18,7 @@ import casadi as ca
 from malta.data import check_parameters, si
 from malta.electric import AXES, WEIGHT, hall_position, to_axes, to_phases
 from malta.plant import Actuator, Drive, Plant, Signal, traced
-from malta.rigidbody import EXACT, SMALL_ANGLE, Trig, acceleration, principal, rate_map, rotation
+from malta.rigidbody import EXACT, SMALL_ANGLE, Trig, acceleration, principal, rate_map, rotation, turned
 
 
 @dataclass(frozen=True)
@@ -89,9 +89,11 @@ def plant(par: Parameters, *, small_angle: bool = False) -> Plant:
     x, u, w = ca.SX.sym("x", 12), ca.SX.sym("u", 5), ca.SX.sym("w", 6)
     trig = SMALL_ANGLE if small_angle else EXACT
     inertia = (par.I_xx, par.I_yy, par.I_zz)
-    R_BI = rotation(principal(x[3:6], inertia), trig)
-    F_I, T_B = _wrench(par, x, u, R_BI, conservative=not small_angle)
-    q_t_ddot, q_r_ddot = acceleration(par.m, inertia, x[3:6], x[9:12], F_I + w[:3], T_B + R_BI @ w[3:], trig)
+    q_B = principal(x[3:6], inertia)
+    F_I, M_I = _wrench(par, x, u, rotation(x[3:6], trig)[2, :2].T, conservative=not small_angle)
+    # The points of force lie on the mover's axis: T_B = sum of l_i e_z x F_i, in frame B, from the moment sum l_i F_i.
+    T_B = ca.cross(ca.SX([0, 0, 1]), turned(q_B, M_I, trig)) + turned(q_B, w[3:], trig)
+    q_t_ddot, q_r_ddot = acceleration(par.m, inertia, x[3:6], x[9:12], F_I + w[:3], T_B, trig)
     return Plant(
         name="tubular",
         parameters=par,
@@ -132,27 +134,23 @@ def plant(par: Parameters, *, small_angle: bool = False) -> Plant:
     )
 
 
-def _wrench(par: Parameters, x: Any, u: Any, R_BI: Any, *, conservative: bool) -> tuple[Any, Any]:
-    """Force in frame I and torque about the centre of gravity in frame B: eqs (5)-(14).
+def _wrench(par: Parameters, x: Any, u: Any, n: Any, *, conservative: bool) -> tuple[Any, Any]:
+    """Sums of F_i and of l_i F_i over the modules, in frame I: eqs (5)-(14). n: x and y of the mover's axis.
 
-    F_i = (fx_i, fy_i, f_D / 2) + K_A P_i,xy acts at P_i = O + l_i n, n the mover's axis, which is e_z in frame B:
-    T_B = sum of l_i e_z x R_BI F_i.
+    F_i = (fx_i, fy_i, f_D / 2) + K_A P_i,xy acts at P_i = O + l_i n with l_1 = -(l_B + z), l_2 = l_B - z. As
+    l_1 + l_2 = -2 z and l_1^2 + l_2^2 = 2 (l_B^2 + z^2), the attraction sums up to F_A = 2 K_A (O - z n) and its moment
+    to 2 K_A l_B^2 n - z F_A.
     NOTE: eq. (12) prints (l_B + z) in the second lever arm; eq. (5) gives (l_B - z), and only with that is the
     linearized stiffness symmetric.
     """
-    n = R_BI[2, :].T
-    F_I, moment = ca.SX.zeros(3), ca.SX.zeros(3)
-    for l_i, f_xy in ((-(par.l_B + x[2]), u[0:2]), (par.l_B - x[2], u[2:4])):
-        F_A = par.K_A * (x[0:2] + l_i * n[0:2])
-        F_i = ca.vertcat(f_xy + F_A, u[4] / 2)
-        F_I += F_i
-        moment += l_i * F_i
-        if conservative:
-            # The potential -K_A |P_i,xy|^2 / 2 has an axial slope too, because l_i falls as z grows. The
-            # paper's (9), (10) leave it out: second order, absent from every linearization, but without
-            # it a moving mover does not conserve energy.
-            F_I[2] -= ca.dot(F_A, n[0:2])
-    return F_I, ca.cross(ca.SX([0, 0, 1]), R_BI @ moment)
+    z, f_1, f_2, f_D = x[2], u[0:2], u[2:4], u[4]
+    F_A = 2 * par.K_A * (x[0:2] - z * n)
+    F_xy = f_1 + f_2 + F_A
+    M_xy = par.l_B * (f_2 - f_1) + 2 * par.K_A * (par.l_B * par.l_B) * n - z * F_xy
+    # The potential -K_A |P_i,xy|^2 / 2 has an axial slope too, because l_i falls as z grows. The paper's (9), (10)
+    # leave it out: second order, absent from every linearization, but without it a moving mover loses or wins energy.
+    F_z = f_D - ca.dot(F_A, n) if conservative else f_D
+    return ca.vertcat(F_xy, F_z), ca.vertcat(M_xy, -z * f_D)
 
 
 def load(par: Parameters, x: Any) -> Any:
@@ -234,6 +232,15 @@ def drive(par: Parameters) -> Drive:
         turned = [part for d in range(0, 12, 2) for part in (i[d + 1], -i[d])]
         return math.pi / par.L_p * x[8] * ca.vertcat(*turned)
 
+    def turned(v: Any) -> Any:
+        """Bearing axes at phi = atan2(f_y, f_x) of each module: (18), with its atan2 of two arguments."""
+        blocks = []
+        for f_x, f_y in ((v[0], v[1]), (v[2], v[3])):
+            phi = ca.atan2(f_y, f_x)
+            c, s = ca.cos(phi) * ca.SX.eye(2), ca.sin(phi) * ca.SX.eye(2)
+            blocks += [ca.SX.eye(2), ca.vertcat(ca.horzcat(c, s), ca.horzcat(-s, c))]
+        return ca.diagcat(*blocks)
+
     def peak(u: Any) -> Any:
         """Largest phase quantity at any position: amplitude along the machine, summed over its sequences."""
         sizes = []
@@ -252,6 +259,7 @@ def drive(par: Parameters) -> Drive:
         coupling=coupling,
         to_phases=lambda x: modules(to_phases, x),
         to_axes=lambda x: modules(to_axes, x),
+        turned=turned,
         peak=peak,
         groups=(tuple(range(6)), tuple(range(6, 12))),
         stars=tuple(tuple(range(k, k + 3)) for k in range(0, 18, 3)),

@@ -1,0 +1,182 @@
+# %% [markdown]
+# # Experiments: the paper's Figs 12 to 16 beside ours
+#
+# The gain files fly on the whole drive: exact mover, PI current loops on the windings, half-bridges at 45 V,
+# sensors with noise and 1 µm steps. Source: Miric et al., Sec. V and VI.
+#
+# **Question:** which of the published measurements does this machine show, and where does it differ?
+
+# %%
+import os
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import numpy as np
+
+import malta
+
+# The project's root, wherever Jupyter was started.
+os.chdir(next(p for p in (Path.cwd(), *Path.cwd().parents) if (p / "design").is_dir()))
+Path("build").mkdir(exist_ok=True)
+
+# %% [markdown]
+# ## Parameters
+# Two gain files: the printed weights as plain SI numbers, and the same weights on bases that the claims ask for.
+
+# %%
+controllers = {name: malta.gains.read(f"design/gains/{name}.json") for name in ("table2", "calibrated")}
+published = malta.published("data/tubular.toml")
+plants = {name: malta.plant_of(c.parameters) for name, c in controllers.items()}
+
+# %% [markdown]
+# ## Figs 12 and 13: the stroke
+# The first-order lag that linear models put in place of the current loops costs 0.2 mm of tracking error; PI loops
+# follow a ramp better, and less than 0.1 mm is left. The paper measures up to 0.6 mm, with a cogging that its look-
+# up table met only on average.
+
+# %%
+strokes = {}
+for key, controller in controllers.items():
+    e = strokes[key] = malta.experiment("stroke", plants[key], controller)
+    malta.report.experiment(e, f"build/03_{key}_stroke.png", published)
+    print(f"{key}: {e.outcome}")
+    for case in e.cases:
+        print("  " + "; ".join([case.label, *(str(merit) for merit in case.merits)]))
+lagged = malta.experiment("stroke", plants["calibrated"], controllers["calibrated"], fidelity="force")
+figures = malta.stroke_figures(lagged.run)
+print(f"with first-order lags: axial error {figures.axial_error * 1e3:.2f} mm")
+for e in strokes.values():
+    f = malta.stroke_figures(e.run)
+    assert f.overshoot < 0.015
+    assert f.axial_error < 0.6e-3
+    assert max(f.radial.values()) < 20e-6
+    assert max(f.radial["x1"], f.radial["x2"]) < 1e-12  # as in the paper's simulation
+
+# %% [markdown]
+# **Judgement.** All bounds of Figs 12 and 13 are met. x1 and x2 do not move at all, as in the paper's own
+# simulation: what it measured there is of the prototype's tolerances, which no model of Table IV can show. The
+# weight stands on module 2 at z = +5 mm, the nearer one; the text of Fig. 13 has it the other way round.
+
+# %% [markdown]
+# ## Fig. 14 and Table III: 2000 samples at rest
+
+# %%
+rests = {}
+for key, controller in controllers.items():
+    e = rests[key] = malta.experiment("hold", plants[key], controller)
+    malta.report.experiment(e, f"build/03_{key}_hold.png", published)
+    print(f"{key}: {e.outcome}")
+    for case in e.cases:
+        print("  " + "; ".join([case.label, *(str(merit) for merit in case.merits)]))
+for e in rests.values():
+    measured = e.run.y[-2000:, :4].std(axis=0) * 1e6
+    true = e.run.p[-2000:, :4].std(axis=0) * 1e6
+    print("measured", measured.round(2), "true", true.round(2), "µm")
+    assert (measured > 0.4).all()
+    assert (measured < 0.8).all()
+    assert (true < 0.5 * measured).all()
+
+# %% [markdown]
+# **Judgement.** The measured statistics have the size of Table III because noise of that size was put in; what the
+# table cannot say, and the simulation can, is how still the mover really stands: four to six times stiller than its
+# sensors say.
+
+# %% [markdown]
+# ## Fig. 15: a drifting support, compensated
+# 65 µm in a minute, run thirty times as fast.
+
+# %%
+drifts = {}
+for key, controller in controllers.items():
+    e = drifts[key] = malta.experiment("thermal", plants[key], controller)
+    malta.report.experiment(e, f"build/03_{key}_thermal.png", published)
+    print(f"{key}: {e.outcome}")
+    for case in e.cases:
+        print("  " + "; ".join([case.label, *(str(merit) for merit in case.merits)]))
+for e in drifts.values():
+    left, raw = (case.merits[0].value for case in e.cases)
+    assert left < 2e-6 < 60e-6 < raw
+
+# %% [markdown]
+# **Judgement.** The concept holds. What is left is the lag of the outer loop, which at the true speed is 0.02 µm.
+
+# %% [markdown]
+# ## Fig. 16: tilting about sensor plane 2
+
+# %%
+tilts = {}
+for key, controller in controllers.items():
+    e = tilts[key] = malta.experiment("tilt", plants[key], controller)
+    malta.report.experiment(e, f"build/03_{key}_tilt.png", published)
+    print(f"{key}: {e.outcome}")
+    for case in e.cases:
+        print("  " + "; ".join([case.label, *(str(merit) for merit in case.merits)]))
+for key, e in tilts.items():
+    as_printed, held = (case.merits[0].value * 1e6 for case in e.cases)
+    print(
+        f"{key}: SP2 deviates by {as_printed:.1f} µm as printed, {held:.2f} µm with the attraction fed forward"
+    )
+    assert held < 1.0 < 4.0 < as_printed
+
+# %% [markdown]
+# **Judgement.** With the control law as printed the state feedback pulls a mover that the attraction pulls too: it
+# goes to K1 / (K1 - k) of what is asked, twice as far with the printed weights, and the slow integrals take it back
+# only in part. 4 µm are missed by a little. The law's own feedforward, which the paper keeps for "known radial
+# disturbances", mends it: the attraction at the reference is known.
+
+# %% [markdown]
+# ## Lift-off, payload, faults
+# Not shown in the paper, or only in words.
+
+# %%
+for name in ("lift-off", "payload", "faults"):
+    for key, controller in controllers.items():
+        e = malta.experiment(name, plants[key], controller)
+        malta.report.experiment(e, f"build/03_{key}_{name}.png", published)
+        print(f"{key}, {name}: {e.outcome}")
+        for case in e.cases:
+            print("  " + "; ".join([case.label, *(str(merit) for merit in case.merits)]))
+
+# %% [markdown]
+# **Judgement.** Every estimator lifts the mover; a filter that knows it lies on its bearing does so with hardly
+# more than the 1.34 A that statics ask for. 0.2 kg are carried by the calibrated design and dropped by the printed
+# weights. Both survive 2.5 ms without samples or control steps; a stuck radial sensor or an open phase ends in the
+# touchdown bearing within some 50 to 120 ms.
+
+# %% [markdown]
+# ## How stiff, how fast
+# The paper leaves disturbance rejection to future work, and says nothing of the drive's limits.
+
+# %%
+stiff = {}
+for key, controller in controllers.items():
+    e = stiff[key] = malta.experiment("disturbance", plants[key], controller)
+    malta.report.experiment(e, f"build/03_{key}_disturbance.png", published)
+    print(f"{key}: {e.outcome}")
+    for case in e.cases:
+        print("  " + "; ".join([case.label, *(str(merit) for merit in case.merits)]))
+limits = {}
+for key, controller in controllers.items():
+    e = limits[key] = malta.experiment("drive-limits", plants[key], controller)
+    malta.report.experiment(e, f"build/03_{key}_drive-limits.png", published)
+    print(f"{key}: {e.outcome}")
+    for case in e.cases:
+        print("  " + "; ".join([case.label, *(str(merit) for merit in case.merits)]))
+fastest, sigmoid = (case.merits[0].value for case in limits["calibrated"].cases)
+print(f"rise {fastest * 1e3:.1f} ms against {sigmoid * 1e3:.1f} ms of the sigmoid at the same peak current")
+assert fastest < 0.85 * sigmoid
+
+# %% [markdown]
+# **Summary.** Every bound of Figs 12 to 14 is met; Fig. 16 needs the attraction fed forward; the payload and the
+# 300 % need the calibrated bases. The whole ledger, computed: `malta claims`.
+
+# %%
+fig, ax = plt.subplots()
+for (key, e), style in zip(stiff.items(), ("-", "--"), strict=True):
+    ax.loglog(e.curves["frequency"], e.curves["compliance"] * 1e6, style, color="black", label=key)
+    ax.loglog(e.curves["tones"], e.curves["simulated"] * 1e6, "o", color="black", fillstyle="none")
+ax.set_xlabel("frequency [Hz]")
+ax.set_ylabel("compliance, x1 to F_x [µm/N]")
+ax.legend(frameon=False)
+fig.savefig("build/03_compliance.png")
+np.testing.assert_allclose(stiff["calibrated"].curves["compliance"][-1], 0, atol=1e-6)
