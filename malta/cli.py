@@ -6,7 +6,7 @@ import gc
 import io
 import json
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -170,6 +170,17 @@ def simulate(
     quantize: Annotated[
         bool | None, typer.Option(help="Sensors with the machine's resolution. [the scenario's]")
     ] = None,
+    sensor: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=VALUE",
+            help="An error of the sensors: gain_x1=0.02, offset_y2=5um, hall_amplitude=0.01, hall_phase=2deg, ...",
+        ),
+    ] = None,
+    bearing: Annotated[
+        bool | None,
+        typer.Option(help="Touchdown bearings push back, or a touchdown ends the run. [the scenario's]"),
+    ] = None,
     estimator: Annotated[
         str | None, typer.Option(help="steady-state, kalman (time-varying) or extended. [steady-state]")
     ] = None,
@@ -220,6 +231,8 @@ def simulate(
         "fidelity": fidelity,
         "noise": noise,
         "quantize": quantize,
+        "sensor_errors": _assigned("--sensor", sensor, {s.name: s.unit for s in plant.sensor_errors}) or None,
+        "bearing": bearing,
         "estimator": estimator,
         "scheduled": scheduled,
         "feedforward": feedforward,
@@ -379,26 +392,43 @@ def _design(file: Path, out: Path, figures: Path, made: dict[Path, Path], *, qui
 
 def _changed(parameters: Parameters, changes: list[str] | None) -> Parameters:
     """The parameters with `NAME=VALUE` applied; a unit may follow the value."""
-    import re
     from dataclasses import replace
 
-    from malta.data import to_si, units_of
+    from malta.data import units_of
 
-    units = units_of(parameters)
-    values: dict[str, float] = {}
-    for change in changes or ():
-        match = re.fullmatch(r"\s*(\w+)\s*=\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\s*", change)
-        if match is None:
-            raise InputError("--set", "", repr(change), "NAME=VALUE, as m=0.56 or l_B=45mm")
-        name, number, unit = match.groups()
-        if name not in units:
-            raise InputError("--set", name, "an unknown parameter", "one of " + " ".join(units))
-        values[name] = to_si(float(number), unit or units[name], units[name], "--set", name)
+    values = _assigned("--set", changes, units_of(parameters))
     try:
         preset = f"{parameters.preset}, changed" if values else parameters.preset
         return replace(parameters, **values, preset=preset)
     except InputError as error:
         raise InputError("--set", error.field, error.found, error.expected) from error
+
+
+def _assigned(option: str, given: list[str] | None, units: Mapping[str, str]) -> dict[str, float]:
+    """Values in SI of `NAME=VALUE`, each with the unit that may follow it."""
+    import re
+
+    from malta.data import to_si
+
+    values: dict[str, float] = {}
+    for text in given or ():
+        match = re.fullmatch(r"\s*(\w+)\s*=\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\s*", text)
+        if match is None:
+            example = "m=0.56 or l_B=45mm" if option == "--set" else "gain_x1=0.02 or offset_y2=5um"
+            raise InputError(option, "", repr(text), f"NAME=VALUE, as {example}")
+        name, number, unit = match.groups()
+        if name not in units:
+            kind = "parameter" if option == "--set" else "sensor error"
+            raise InputError(option, name, f"an unknown {kind}", "one of " + " ".join(units))
+        plain = units[name] == "1"
+        if plain and unit not in ("", "%", "percent"):
+            raise InputError(option, f"{name}.unit", repr(unit), "no unit, or %")
+        values[name] = (
+            float(number) * (0.01 if unit else 1.0)
+            if plain
+            else to_si(float(number), unit or units[name], units[name], option, name)
+        )
+    return values
 
 
 def _published(machine: str) -> dict[str, Any] | None:

@@ -39,8 +39,8 @@ STYLES: Sequence[dict[str, Any]] = (  # told apart without colour: by darkness a
 MORE: Sequence[dict[str, Any]] = (  # after those
     {"color": "#000000", "linestyle": (0, (7, 2, 1.5, 2)), "linewidth": 1.4},
     {"color": "#c1440e", "linestyle": (0, (1.5, 1.5)), "linewidth": 1.6},
-    {"color": "#1f77b4", "linestyle": "-", "linewidth": 1.0},
-    {"color": "#8a8a8a", "linestyle": (0, (7, 2, 1.5, 2)), "linewidth": 1.2},
+    {"color": "#1f77b4", "linestyle": (0, (9, 2, 1.5, 2, 1.5, 2)), "linewidth": 1.4},
+    {"color": "#8a8a8a", "linestyle": "-", "linewidth": 1.2},
 )
 BOUND: dict[str, Any] = {"color": "#9a9a9a", "linestyle": (0, (8, 3)), "linewidth": 0.9}
 NOTE: dict[str, Any] = {"fontsize": 8, "color": "#5a5a5a"}
@@ -158,10 +158,8 @@ def hold_figure(e: Experiment, published: Published | None = None) -> Figure:
             found.append(("Table III", mean, std))
     for k, axes in enumerate(panels):
         reach = 1.4 * max(float(widest[k] if k == axis else widest[radial].max()), bins[k])
-        reach = max(
-            min(reach, 60 * bins[k]), *(2.4 * (abs(mean) + std) for _, mean, std in spreads[k][1:]), 0
-        )
-        _histogram(axes, (y[:, k], p[:, k]), labels, bins[k], reach)
+        told = [2.4 * (abs(mean) + std) for _, mean, std in spreads[k][1:]]
+        _histogram(axes, (y[:, k], p[:, k]), labels, bins[k], max([min(reach, 60 * bins[k]), *told]))
         _finish(axes, f"{names[k]} [µm]", "share of samples [%]")
     highest = max(panels[k].dataLim.y1 for k in radial)
     for k, axes in enumerate(panels):
@@ -224,7 +222,7 @@ def tilt_figure(e: Experiment, published: Published | None = None) -> Figure:
     _published_bound(deviation, published, "figure_16.deviation", "um", where="below right")
     _square(circle)
     _square(blow_up, least=1.4 * bound)
-    late_part = "last period" if all(run.verdict.completed for run in _runs(e)) else "second half"
+    late_part = "second half" if any(map(_touched, _runs(e))) else "last period"
     _finish(circle, f"x1, {late_part} [µm]", "y1 [µm]")
     _finish(blow_up, f"x2, {late_part} [µm]", "y2 [µm]")
     _finish(tracking, "time [s]", "plane 1, off reference [µm]")
@@ -272,13 +270,12 @@ def payload_figure(e: Experiment, published: Published | None = None) -> Figure:
         shown = slice(0, min(last, _end(run) + 1))
         _line(sag, (run.t[shown] - picked) * 1e3, y[shown], label=case.label, **style)
         _mark(sag, run, (run.t - picked) * 1e3, y)
-        carried = run.verdict.completed
-        largest.plot(mass, case.merits[0].value * 1e6, **(DOT if carried else CROSS))
-        if carried:
+        largest.plot(mass, case.merits[0].value * 1e6, **(CROSS if _touched(run) else DOT))
+        if not _touched(run):
             ms, error = (run.t[last:] - begin) * 1e3, (run.reference - run.p)[last:]
             _line(axial, ms, error[:, plant.stroke_output] * 1e3, **style)
             _line(radial, ms, np.abs(error[:, :4]).max(axis=1) * 1e6, **style)
-    if not any(run.verdict.completed for run in runs):
+    if all(map(_touched, runs)):
         axial.annotate("none is carried", (0.5, 0.5), xycoords="axes fraction", ha="center", **NOTE)
     _bound(sag, -clearance(plant) * 1e6, "touchdown bearing")
     _bound(largest, clearance(plant) * 1e6, "touchdown bearing", where="above left")
@@ -369,11 +366,11 @@ def faults_figure(e: Experiment, _: Published | None = None) -> Figure:
     figure = _figure(_runs(e), "faults during a hold", survived, left=0.245, wspace=0.24)
     bars, traces = figure.subplots(1, 2, width_ratios=(1, 1.25))
     for place, case in enumerate(e.cases):
-        done, deviation = case.run.verdict.completed, case.merits[0].value * 1e6
-        bars.barh(place, deviation, height=0.62, color="#c9c9c9" if done else "#2b2b2b")
-        text = f"{number(deviation, 2)} µm" if done else _when(case.merits[1])
+        down, deviation = _touched(case.run), case.merits[0].value * 1e6
+        bars.barh(place, deviation, height=0.62, color="#2b2b2b" if down else "#c9c9c9")
+        text = _when(case.merits[1]) if down else f"{number(deviation, 2)} µm"
         inside = deviation > edge / 10
-        style = NOTE | {"color": NOTE["color"] if done else "#ffffff", "ha": "right" if inside else "left"}
+        style = NOTE | {"color": "#ffffff" if down else NOTE["color"], "ha": "right" if inside else "left"}
         bars.annotate(text, (deviation * (0.88 if inside else 1.1), place), va="center", **style)
     bars.set_yticks(range(len(e.cases)), [_micro(case.label) for case in e.cases], fontsize=9)
     bars.invert_yaxis()
@@ -502,7 +499,7 @@ def _line(axes: Axes, t: FloatArray, values: FloatArray, **style: Any) -> None:
 
 def _mark(axes: Axes, run: Trajectory, t: FloatArray, values: FloatArray, *, named: bool = True) -> None:
     """A cross where the run touched something; `named` in the legend."""
-    if not (run.verdict.completed or run.verdict.name == "interrupted"):
+    if _touched(run):
         k = min(_end(run), len(t) - 1)
         low, high = axes.get_xlim()
         if not (axes.get_autoscalex_on() or low <= t[k] <= high):
@@ -512,6 +509,11 @@ def _mark(axes: Axes, run: Trajectory, t: FloatArray, values: FloatArray, *, nam
 
 
 TOUCHED = "touchdown"
+
+
+def _touched(run: Trajectory) -> bool:
+    """Whether something ended the run, other than time and Ctrl-C."""
+    return run.verdict.name not in ("completed", "interrupted")
 
 
 def _end(run: Trajectory) -> int:

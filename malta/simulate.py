@@ -324,6 +324,13 @@ def setup_of(plant: Plant, c: Controller, s: Scenario) -> Setup:
     if "open phase" in kinds and s.fidelity != "phase":
         found = f"an open phase at fidelity {s.fidelity}"
         raise InputError(f"scenario {s.name}", "faults", found, "fidelity phase")
+    known = [signal.name for signal in plant.sensor_errors]
+    for name, value in (s.sensor_errors or {}).items():
+        if name not in known:
+            where = f"scenario {s.name}"
+            raise InputError(where, f"sensor_errors.{name}", "an unknown error", "one of " + " ".join(known))
+        if not math.isfinite(value):
+            raise InputError(f"scenario {s.name}", f"sensor_errors.{name}", repr(value), "a finite number")
     return Setup(
         fidelity=s.fidelity,
         delay=plant.actuator.delay(c.sample_time) if s.delay is None else s.delay,

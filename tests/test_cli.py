@@ -539,6 +539,101 @@ def test_options_of_the_stroke_are_taken(run: Run) -> None:
     assert stroke("--delay", "6")["axial_error"] > 1.01 * plain["axial_error"]
 
 
+def test_every_scenario_is_named_in_the_help() -> None:
+    from malta.experiments import EXPERIMENTS
+
+    assert f"What to simulate: {', '.join(EXPERIMENTS)}." == cli.SCENARIOS
+
+
+def test_a_scenario_of_several_runs_writes_each_and_one_figure(run: Run, tmp_path: Path) -> None:
+    code, out, err = run("simulate", CALIBRATED, "--scenario", "tilt", "--out", tmp_path)
+    assert (code, err) == (0, "")
+    assert max(map(len, (line for line in out.splitlines() if not line.startswith("wrote ")))) <= WIDTH
+    names = sorted(path.name for path in tmp_path.iterdir())
+    runs = [f"calibrated_tilt_feedforward_{kind}.npz" for kind in ("attraction", "axial")]
+    assert names == ["calibrated_tilt.png", *runs]
+
+
+def test_findings_are_no_failures(run: Run) -> None:
+    """Faults that end in touchdown are what was asked for; a lift-off that does not lift is a failure."""
+    code, out, err = run("simulate", TABLE2, "--scenario", "payload", "--json")
+    assert (code, err) == (0, "")
+    cases = {case["label"]: case for case in json.loads(out)["cases"]}
+    assert cases["200 g"]["verdict"]["name"].startswith("touchdown")
+    assert cases["50 g"]["verdict"]["name"] == "completed"
+    code, _, err = run(
+        "simulate", TABLE2, "--scenario", "lift-off", "--estimator", "kalman", "--set", "I_max=0.5"
+    )
+    assert code == 1
+    assert "lift-off: not lifted at 0.1499 s" in one_sentence(err)
+
+
+def test_sensor_errors_are_taken(run: Run) -> None:
+    def held(*options: str) -> float:
+        code, out, _ = run("simulate", CALIBRATED, "--scenario", "hold", "--json", *options)
+        assert code == 0
+        value: float = json.loads(out)["merits"]["true x1, rms"]
+        return value
+
+    assert held("--sensor", "offset_x1=20um", "--sensor", "gain_y1=2%") > 15e-6 > 1e-6 > held()
+
+
+def test_the_number_of_substeps_comes_with_an_error(run: Run) -> None:
+    code, out, _ = run("simulate", CALIBRATED, "--fidelity", "force", "--substeps", "1")
+    assert code == 0
+    estimate = re.search(r"integration error, estimated: (\S+) m", out)
+    assert estimate is not None
+    assert 1e-13 < float(estimate[1]) < 1e-10
+
+
+def test_without_a_compiler_it_says_so(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    import malta.engine
+    from malta.simulate import compiled_shape, engine_of
+
+    monkeypatch.setattr(malta.engine, "compiler", lambda: None)
+    for cached in (compiled_shape, engine_of):
+        cached.cache_clear()
+    code, out, err = run("simulate", CALIBRATED)
+    assert (code, "completed" in out) == (0, True)
+    assert one_sentence(err).startswith("no C compiler: simulated on CasADi's virtual machine")
+    code, _, err = run("simulate", CALIBRATED, "--engine", "compiled")
+    assert code == 2
+    assert "engine: found no C compiler that works" in one_sentence(err)
+    for cached in (compiled_shape, engine_of):
+        cached.cache_clear()
+
+
+def test_ctrl_c_leaves_what_was_computed(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    module = sys.modules["malta.simulate"]
+    looked = 0
+    judged = module._judged  # type: ignore[attr-defined]
+
+    def interrupted(*arguments: Any) -> Any:
+        nonlocal looked
+        looked += 1
+        if looked == 3:
+            raise KeyboardInterrupt
+        return judged(*arguments)
+
+    monkeypatch.setattr(module, "PORTION", 1000)
+    monkeypatch.setattr(module, "_judged", interrupted)
+    code, out, err = run("simulate", CALIBRATED, "--scenario", "hold", "--out", tmp_path)
+    assert code == 130
+    assert "interrupted at 0.09" in one_sentence(err)
+    with np.load(tmp_path / "calibrated_hold.npz") as archive:
+        assert len(archive["t"]) == 2000
+    assert "measured x1, std" in out
+
+
+def test_claims_prints_the_ledger(run: Run) -> None:
+    code, out, err = run("claims", "design/table2.toml")
+    assert (code, err) == (0, "")
+    assert max(map(len, out.splitlines())) <= WIDTH
+    assert "table2" in out
+    assert "±218.92" in out
+    assert "not reproduced" in out
+
+
 # --- bad input ---
 
 
@@ -561,6 +656,8 @@ def test_options_of_the_stroke_are_taken(run: Run) -> None:
         ("simulate TABLE2 --engine jit", "engine: found 'jit'", "one of auto, compiled, virtual machine"),
         ("simulate TABLE2 --real-pwm", "real_pwm: found fidelity dq", "fidelity phase"),
         ("simulate TABLE2 --substeps 0", "substeps: found 0", "a number above 0"),
+        ("simulate TABLE2 --sensor gain_q=1", "--sensor: gain_q: found an unknown sensor error", "gain_x1"),
+        ("simulate TABLE2 --sensor gain_x1=1mm", "--sensor: gain_x1.unit: found 'mm'", "no unit, or %"),
         ("claims nothing.toml", "nothing.toml: found no such file", "a TOML file"),
         ("simulate TABLE2 --set q=1", "--set: q: found an unknown parameter", "one of m I_xx I_yy"),
         ("simulate TABLE2 --set preset=1", "--set: preset: found an unknown parameter", "one of m I_xx I_yy"),
