@@ -53,7 +53,7 @@ class Batch:
     force: FloatArray  # runs x inputs, N, largest |v|
     contact: FloatArray  # runs x contacts, largest share of each clearance that was used up
     rise: FloatArray  # s, 10-90 % of the stroke; NaN when it was not reached
-    overshoot: FloatArray  # beyond the end, as a share of the stroke
+    overshoot: FloatArray  # beyond the end, as a share of the stroke; NaN when the run ended early
 
     def __post_init__(self) -> None:
         for name in self.__dataclass_fields__:
@@ -271,7 +271,11 @@ def _batch(kept: FloatArray, samples: int, Ts: float, sizes: Mapping[str, int]) 
         force=columns["force"],
         contact=columns["contact"],
         rise=np.where(completed, (last - first) * Ts, np.nan),
-        overshoot=np.maximum(columns["largest_share"][:, 0] - 1, 0),
+        overshoot=np.where(
+            completed & (columns["scale"][:, 0] != 0),
+            np.maximum(columns["largest_share"][:, 0] - 1, 0),
+            np.nan,
+        ),
     )
 
 
@@ -291,7 +295,6 @@ def _one_by_one(
         run = simulate(machine_k, controller, scenario_k, engine="virtual machine")
         stroke = stroke_figures(run)
         error = run.p - run.reference
-        moved = bool(run.reference[-1, plant.stroke_output] != run.reference[0, plant.stroke_output])
         row = {
             "duration": run.verdict.time,
             "completed": run.verdict.completed,
@@ -299,8 +302,8 @@ def _one_by_one(
             "rms": np.sqrt((error**2).mean(axis=0)),
             "force": np.abs(run.v).max(axis=0),
             "contact": run.contact.max(axis=0),
-            "rise": stroke.rise if moved else np.nan,
-            "overshoot": stroke.overshoot if moved else 0.0,
+            "rise": stroke.rise,
+            "overshoot": stroke.overshoot,
         }
         for name, value in row.items():
             figures[name].append(value)

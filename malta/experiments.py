@@ -484,7 +484,9 @@ def disturbance(
         "frequency": w / (2 * math.pi),
         "compliance": curve,
         "tones": np.array(TONES[: len(sines)]),
-        "simulated": np.array([case.merits[0].value / TONE_FORCE for case in sines]),
+        "simulated": np.array(
+            [case.merits[0].value / TONE_FORCE if case.run.verdict.completed else np.nan for case in sines]
+        ),
     }
     return Experiment("disturbance", "How stiff is it?", steps, found, curves)
 
@@ -607,7 +609,8 @@ def _fault_merits(run: Trajectory, at: float) -> tuple[Merit, ...]:
             :, [k for k in range(run.p.shape[1]) if k != run.plant.stroke_output]
         ]
     )
-    touched = math.nan if run.verdict.completed else run.verdict.time - at
+    after = run.verdict.time - at
+    touched = after if after >= 0 and not run.verdict.completed else math.nan
     return (
         Merit("largest deviation", float(radial.max()), "um"),
         Merit("touchdown after", touched, "ms"),

@@ -619,7 +619,7 @@ class StrokeFigures:
     """What the published figures say of a stroke. SI."""
 
     rise: float  # s, 10 to 90 % of the true position; NaN when it was not reached
-    overshoot: float  # beyond the end, as a share of the stroke
+    overshoot: float  # beyond the end, as a share of the stroke; NaN when the run ended early
     axial_error: float  # m, largest |z* - z|
     radial: Mapping[str, float]  # m, largest deviation of each radial output
     force: float  # N, largest commanded thrust
@@ -632,12 +632,12 @@ def stroke_figures(run: Trajectory) -> StrokeFigures:
     axis = run.plant.stroke_output
     z, z_ref = run.p[:, axis], run.reference[:, axis]
     start, end = z_ref[0], z_ref[-1]
-    share = (z - start) / (end - start)
     error = np.abs(run.p - run.reference)
-    done = run.verdict.completed
+    whole = run.verdict.completed and end != start  # what ended early never saw where the stroke goes
+    share = (z - start) / (end - start) if whole else np.full(len(z), np.nan)
     return StrokeFigures(
-        rise=_reached(run.t, share, 0.9) - _reached(run.t, share, 0.1) if done else math.nan,
-        overshoot=max(float(share.max()) - 1, 0.0),
+        rise=_reached(run.t, share, 0.9) - _reached(run.t, share, 0.1) if whole else math.nan,
+        overshoot=max(float(share.max()) - 1, 0.0) if whole else math.nan,
         axial_error=float(error[:, axis].max()),
         radial={name: float(error[:, i].max()) for i, name in enumerate(names) if i != axis},
         force=float(np.abs(run.v[:, run.plant.thrust_input]).max()),

@@ -606,7 +606,7 @@ def test_without_a_compiler_it_says_so(run: Run, monkeypatch: pytest.MonkeyPatch
 def test_ctrl_c_leaves_what_was_computed(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     module = sys.modules["malta.simulate"]
     looked = 0
-    judged = module._judged  # type: ignore[attr-defined]
+    judged = module._judged
 
     def interrupted(*arguments: Any) -> Any:
         nonlocal looked
