@@ -86,7 +86,11 @@ def simulate_many(
     setup = setup_of(plant, controller, scenario)
     if setup.outside:
         raise InputError(where, "estimator", scenario.estimator, "steady-state in a campaign")
+    if workers is not None and workers < 1:
+        raise InputError("campaign", "workers", str(workers), "at least 1")
     runs = _count(plant, changes)
+    if "T_d" in changes:
+        raise InputError("campaign", "T_d", "a delay for each run", "one for all: it shapes the functions")
     shape = shape_of(plant, controller, setup)
     digest = _digest(shape)
     compiled = compiled_shape(shape, LANES, digest)
@@ -97,22 +101,20 @@ def simulate_many(
     theta = _thetas(plant, values, changes, runs)
     t, motion, given = sampled(plant, controller, scenario, setup)
     begin = _starts(plant, controller, setup, values, *beginning(plant, controller, scenario, given[0]))
-    states = np.vstack(
-        [evaluate(begin.map(len(part)), part)[0] for part in np.array_split(theta, -(-runs // BLOCK))]
-    )
+    states = _mapped(begin, theta)
     axis = plant.stroke_output
     sizes = _digest_sizes(plant)
     kept = np.zeros((runs, sum(sizes.values())))
     start, end = motion.p[0, axis], motion.p[-1, axis]
     kept[:, :3] = [1, start, 1 / (end - start) if end != start else 0]
-    kept[:, 4 : 4 + len(LEVELS)] = -1
-    sigma = np.ascontiguousarray(scenario.noise * np.array(plant.noise), dtype=float)
+    kept[:, 4 : 4 + len(LEVELS)] = kept[:, -1:] = -1
+    symbols, _, numbers = machine.numbered(plant, values)
+    noise = ca.Function("noise", [numbers], [scenario.noise * ca.densify(ca.vertcat(*symbols.noise))])
     ff = controller.feedforward
     table = feedforward_table(ff.z_grid, ff.v0)
     groups = -(-runs // LANES)
-    lanes = {
-        name: in_lanes(a, groups) for name, a in (("theta", theta), ("states", states), ("digests", kept))
-    }
+    rows = {"theta": theta, "states": states, "sigma": _mapped(noise, theta), "digests": kept}
+    lanes = {name: in_lanes(array, groups) for name, array in rows.items()}
     streams = keys(scenario.seed, first + np.minimum(np.arange(groups * LANES), runs - 1))
     step = max(
         1, min(16, groups // (4 * (workers or os.cpu_count() or 1)))
@@ -125,7 +127,6 @@ def simulate_many(
             substeps=scenario.substeps,
             table=table,
             given=given,
-            sigma=sigma,
             keys=streams.reshape(groups, LANES),
             **lanes,
         )
@@ -154,7 +155,14 @@ def replayed(
 
 def _count(plant: Plant, changes: Mapping[str, FloatArray]) -> int:
     known = units_of(plant.parameters)
-    sizes = {name: len(np.atleast_1d(values)) for name, values in changes.items()}
+    sizes = {}
+    for name, values in changes.items():
+        column = np.asarray(values)
+        if column.ndim != 1 or not column.size or column.dtype.kind not in "fiu":
+            raise InputError(
+                "campaign", name, f"{column.dtype} of shape {column.shape}", "a number for each run"
+            )
+        sizes[name] = len(column)
     for name in changes:
         if name not in known:
             raise InputError("campaign", name, "an unknown parameter", "one of " + " ".join(known))
@@ -201,6 +209,12 @@ def _starts(
     return ca.Function("start", [theta], [first])
 
 
+def _mapped(function: ca.Function, rows: FloatArray) -> FloatArray:
+    """A function of one row on all rows."""
+    parts = np.array_split(rows, -(-len(rows) // BLOCK))
+    return np.vstack([evaluate(function.map(len(part)), part)[0] for part in parts])
+
+
 def _digest_sizes(plant: Plant) -> dict[str, int]:
     p, m = len(plant.outputs), len(plant.inputs)
     return {
@@ -217,6 +231,9 @@ def _digest_sizes(plant: Plant) -> dict[str, int]:
         "squares": p,
         "force": m,
         "contact": len(plant.contacts),
+        "resting": 1,  # on the touchdown bearings at the start
+        "touching": 1,  # them at the end
+        "touched": 1,  # sample at which it first did, -1 before
     }
 
 
@@ -249,7 +266,16 @@ def _digest(shape: Any) -> ca.Function:
         "force": ca.fmax(kept["force"], ca.if_else(alive, ca.fabs(row["v"]), 0)),
         "contact": ca.if_else(alive, largest, kept["contact"]),
     }
-    result = ca.vertcat(*(after[name] for name in kept))
+    if setup.bearing:
+        touching = ca.mmax(row["contact"]) >= 1
+        ends = [row["contact"][i] for i, held in enumerate(plant.cushioned) if not held]
+        after["alive"] = ca.logic_and(alive, ca.mmax(ca.vertcat(*ends)) < 1)
+        first = kept["samples"] == 0
+        after["resting"] = ca.if_else(first, touching, kept["resting"])
+        after["touching"] = ca.if_else(alive, touching, kept["touching"])
+        now = ca.logic_and(touching, kept["touched"] < 0)
+        after["touched"] = ca.if_else(now, kept["samples"], kept["touched"])
+    result = ca.vertcat(*(after.get(name, kept[name]) for name in kept))
     arguments = [ca.vertcat(*part.values()) for part in (kept, row, given)]
     return ca.Function("digest", [*arguments, theta], [ca.densify(result)])
 
@@ -257,14 +283,17 @@ def _digest(shape: Any) -> ca.Function:
 def _batch(kept: FloatArray, samples: int, Ts: float, sizes: Mapping[str, int]) -> Batch:
     columns = dict(zip(sizes, np.split(kept, np.cumsum([*sizes.values()])[:-1], axis=1), strict=True))
     count = columns["samples"][:, 0]
-    completed = (columns["alive"][:, 0] == 1) & np.isfinite(kept).all(axis=1) & (count == samples)
+    resting, touching, touched = (columns[name][:, 0] for name in ("resting", "touching", "touched"))
+    held = np.where(resting == 1, touching == 0, touched < 0)
+    completed = (columns["alive"][:, 0] == 1) & np.isfinite(kept).all(axis=1) & (count == samples) & held
+    end = np.where((count == samples) & (resting == 0) & (touched >= 0), touched, np.maximum(count - 1, 0))
     reached, below, above = (columns[name] for name in ("reached", "below", "above"))
     with np.errstate(divide="ignore", invalid="ignore"):
         first, last = np.where(
             reached > 0, reached - 1 + (np.array(LEVELS) - below) / (above - below), np.nan
         ).T
     return Batch(
-        duration=np.where(completed, samples, np.maximum(count - 1, 0)) * Ts,
+        duration=np.where(completed, samples, end) * Ts,
         completed=completed,
         deviation=columns["deviation"],
         rms=np.sqrt(columns["squares"] / np.maximum(count, 1)[:, None]),

@@ -107,6 +107,7 @@ def duty_cycles(drive: Drive, u_phase: Any, V: Any, i_phase: Any, *, real_pwm: b
     limited = d != wanted
     if real_pwm:
         d = drive.pwm_step * ca.floor(d / drive.pwm_step + 0.5) - drive.dead_share * ca.sign(i_phase)
+        d = ca.fmax(ca.fmin(d, 1), 0)  # one that does not switch has no dead time
     return d, limited
 
 

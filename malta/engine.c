@@ -173,9 +173,9 @@ static inline void two_normals(bits64 key, uint64_t count, real *a, real *b) {
 
 /* LANES machines at once: only digests are kept. */
 static void run_group(long samples, long substeps, const double *theta, long grid, const double *table,
-                      double *states, const double *given, const double *sigma, const uint64_t *keys,
+                      double *states, const double *given, const double *scales, const uint64_t *keys,
                       double *digests) {
-  real t[THETA + 1], c[CONSTANTS + 1], state[STATES], next[STATES], moved[MACHINE], y[OUTPUTS], v[FORCES], held[HELD];
+  real sigma[OUTPUTS], t[THETA + 1], c[CONSTANTS + 1], state[STATES], next[STATES], moved[MACHINE], y[OUTPUTS], v[FORCES], held[HELD];
   real row[ROW], kept[DIGEST], kept_next[DIGEST], noise[2 * OUTPUTS];
   long hint[LANES] = {0};
   bits64 key;
@@ -185,7 +185,8 @@ static void run_group(long samples, long substeps, const double *theta, long gri
   memcpy(kept, digests, sizeof kept);
   prepare(t, c);
   int noisy = 0;
-  for (int j = 0; j < OUTPUTS; j++) noisy |= sigma[j] != 0;
+  memcpy(sigma, scales, sizeof sigma);
+  for (int j = 0; j < OUTPUTS * LANES; j++) noisy |= scales[j] != 0;
   memset(noise, 0, sizeof noise);
   for (long k = 0; k < samples; k++, given += GIVEN) {
     real at;
@@ -213,7 +214,7 @@ static void run_group(long samples, long substeps, const double *theta, long gri
 void run_many(long groups, long samples, long substeps, const double *theta, long grid, const double *table,
               double *states, const double *given, const double *sigma, const uint64_t *keys, double *digests) {
   for (long g = 0; g < groups; g++)
-    run_group(samples, substeps, theta + g * THETA * LANES, grid, table, states + g * STATES * LANES, given, sigma,
-              keys + g * LANES, digests + g * DIGEST * LANES);
+    run_group(samples, substeps, theta + g * THETA * LANES, grid, table, states + g * STATES * LANES, given,
+              sigma + g * OUTPUTS * LANES, keys + g * LANES, digests + g * DIGEST * LANES);
 }
 #endif

@@ -16,6 +16,7 @@ import ctypes
 import hashlib
 import os
 import platform
+import shlex
 import shutil
 import subprocess
 import tempfile
@@ -167,7 +168,7 @@ def _read(f: ca.Function, shared: Sequence[int]) -> tuple[list[_Node], list[tupl
                 _Node("" if i != theta else "INPUT", f"K({text})" if i in shared else text, (), i == theta)
             )
         elif op == ca.OP_CONST:
-            nodes.append(_Node("", f"K({f.instruction_constant(k)!r})", (), True))
+            nodes.append(_Node("", f"K({_number(f.instruction_constant(k))})", (), True))
         else:
             name = _NAMES[op]
             if name not in _FORMS and name not in _MASKS:
@@ -175,6 +176,11 @@ def _read(f: ca.Function, shared: Sequence[int]) -> tuple[list[_Node], list[tupl
             _append(nodes, name, tuple(slot[r] for r in reads))
         slot[writes[0]] = len(nodes) - 1
     return nodes, outputs
+
+
+def _number(value: float) -> str:
+    """A constant as C writes it."""
+    return repr(value).replace("inf", "INFINITY").replace("nan", "NAN")
 
 
 def _append(nodes: list[_Node], name: str, arguments: tuple[int, ...]) -> None:
@@ -242,10 +248,14 @@ def source(p: Parts, digest: ca.Function | None) -> str:
 
 
 @cache
-def compiler() -> str | None:
-    """Path of the system's C compiler: $CC, or the first of cc, gcc and clang."""
-    names = [os.environ["CC"]] if os.environ.get("CC") else ["cc", "gcc", "clang"]
-    return next((path for path in map(shutil.which, names) if path), None)
+def compiler() -> tuple[str, ...] | None:
+    """The system's C compiler, as a command: $CC (which may have options), or the first of cc, gcc and clang."""
+    chosen = shlex.split(os.environ.get("CC", ""))
+    for name, *options in [chosen] if chosen else [["cc"], ["gcc"], ["clang"]]:
+        path = shutil.which(name)
+        if path:
+            return path, *options
+    return None
 
 
 @cache
@@ -258,8 +268,8 @@ def _processor() -> str:
 
 
 @cache
-def _version(cc: str) -> str:
-    return subprocess.run([cc, "--version"], capture_output=True, text=True, check=False).stdout
+def _version(cc: tuple[str, ...]) -> str:
+    return subprocess.run([*cc, "--version"], capture_output=True, text=True, check=False).stdout
 
 
 def library(text: str, lanes: int, folder: Path | None = None) -> ctypes.CDLL | None:
@@ -267,7 +277,7 @@ def library(text: str, lanes: int, folder: Path | None = None) -> ctypes.CDLL | 
     cc = compiler()
     if cc is None:
         return None
-    key = "\n".join([text, str(lanes), *FLAGS, cc, _version(cc), _processor(), platform.platform()])
+    key = "\n".join([text, str(lanes), *FLAGS, *cc, _version(cc), _processor(), platform.platform()])
     name = f"{hashlib.sha256(key.encode()).hexdigest()}.so"
     for place in (folder or cache_folder(), Path(tempfile.gettempdir()) / f"malta-{os.getuid()}"):
         path = place / name
@@ -275,13 +285,20 @@ def library(text: str, lanes: int, folder: Path | None = None) -> ctypes.CDLL | 
             place.mkdir(parents=True, exist_ok=True, mode=0o700)
             if place.stat().st_uid != os.getuid():
                 continue  # code is loaded from here: nobody else's
-            if not path.exists() and not _compiled(cc, text, lanes, path):
+            if not _whole(path) and not _compiled(cc, text, lanes, path):
                 return None
             return ctypes.CDLL(str(path))
         except OSError:
-            with suppress(OSError):
-                path.unlink()  # damaged: it cannot be loaded
+            continue
     return None
+
+
+def _whole(path: Path) -> bool:
+    """Whether a library ends with the hash of what stands before: loading half of one would end the process."""
+    if not path.exists():
+        return False
+    content = path.read_bytes()
+    return len(content) > 32 and hashlib.sha256(content[:-32]).digest() == content[-32:]
 
 
 def cache_folder() -> Path:
@@ -289,14 +306,16 @@ def cache_folder() -> Path:
     return platformdirs.user_cache_path("malta")
 
 
-def _compiled(cc: str, text: str, lanes: int, path: Path) -> bool:
+def _compiled(cc: tuple[str, ...], text: str, lanes: int, path: Path) -> bool:
     """Compile to `path`, whole or not at all."""
     with tempfile.TemporaryDirectory(dir=path.parent) as scratch:
         c, so = Path(scratch) / "engine.c", Path(scratch) / "engine.so"
         c.write_text(text, encoding="utf-8")
         for native in (["-march=native"], []):
-            command = [cc, *FLAGS, *native, f"-DLANES={lanes}", str(c), "-o", str(so), "-lm"]
+            command = [*cc, *FLAGS, *native, f"-DLANES={lanes}", str(c), "-o", str(so), "-lm"]
             if subprocess.run(command, capture_output=True, check=False).returncode == 0:
+                content = so.read_bytes()
+                so.write_bytes(content + hashlib.sha256(content).digest())  # see _whole
                 so.replace(path)
                 return True
     return False
@@ -405,7 +424,7 @@ def run_many(
         _address(table),
         _address(states[chosen]),
         _address(given),
-        _address(sigma),
+        _address(sigma[chosen]),
         _address(keys[chosen]),
         _address(digests[chosen]),
     )

@@ -11,6 +11,7 @@ measurements would have. Covariances of forces and sensors are those of the filt
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import casadi as ca
@@ -27,7 +28,9 @@ from malta.plant import Plant
 if TYPE_CHECKING:
     from malta.plant import FloatArray
 
-Observer = Callable[[Engine, "FloatArray", "FloatArray", "FloatArray"], tuple["FloatArray", "FloatArray"]]
+Observer = Callable[
+    [Engine, Plant, "FloatArray", "FloatArray", "FloatArray"], tuple["FloatArray", "FloatArray"]
+]
 
 
 def observer(plant: Plant, c: Controller, setup: Setup, kind: str, substeps: int, errors: Any) -> Observer:
@@ -35,7 +38,11 @@ def observer(plant: Plant, c: Controller, setup: Setup, kind: str, substeps: int
     filter_ = _filter(c)
     predict = _nonlinear(c) if kind == "extended" else _linear(c)
     jacobian, output = _measurement(c)
-    sense = machine.parts(plant, c, setup, machine.numbers(plant, c, substeps, errors), constant=True).sense
+
+    @cache
+    def sensors(now: Plant) -> ca.Function:
+        return machine.parts(now, c, setup, machine.numbers(now, c, substeps, errors), constant=True).sense
+
     sizes = machine.layout(plant, c, setup).row
     edges = dict(zip(sizes, np.cumsum([0, *sizes.values()]), strict=False))
     commands = slice(edges["v"], edges["v"] + sizes["v"])
@@ -47,21 +54,28 @@ def observer(plant: Plant, c: Controller, setup: Setup, kind: str, substeps: int
     loads: list[FloatArray] = []
     started = False
 
+    @np.errstate(all="ignore")  # what is lost ends the run with a verdict
     def run(
-        engine: Engine, state: FloatArray, given: FloatArray, noise: FloatArray
+        engine: Engine, flown: Plant, state: FloatArray, given: FloatArray, noise: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         nonlocal started
         rows = []
+        sense = sensors(flown)
         for k in range(len(given)):
             y = np.array(sense(state, given[k], noise[k], [])[0]).ravel()
             if not started:
                 _begin(filter_, c, y)
                 started = True
-            filter_.update(y, jacobian, output)
+            try:
+                filter_.update(y, jacobian, output)
+            except (np.linalg.LinAlgError, ValueError):  # of no numbers
+                filter_.x = np.full(n, np.nan)
             now = given[k : k + 1].copy()
             now[0, -len(c.states) :] = np.concatenate([filter_.x, *sent])
             state, row = engine.run(state, now, noise[k : k + 1])
             rows.append(row)
+            if not np.isfinite(row).all():
+                break
             v0 = c.feedforward.at(y[stroke])
             sent.append(row[0, commands] - v0)
             loads.append(v0)
@@ -69,11 +83,8 @@ def observer(plant: Plant, c: Controller, setup: Setup, kind: str, substeps: int
                 filter_.x, sent.pop(0), loads.pop(0) if len(loads) > c.delay else v0
             )
             filter_.P = filter_.F @ filter_.P @ filter_.F.T + filter_.Q
-            if not np.isfinite(filter_.x).all():
-                break
         return state, np.concatenate(rows)
 
-    assert n == filter_.dim_x
     return run
 
 

@@ -120,7 +120,6 @@ def numbers(
         "believed": ca.DM(list(believed.force_constant)),
         "Kp": ca.DM(c.current_loop.Kp),
         "Ki_current": ca.DM(c.current_loop.Ki),
-        "current_time": ca.DM(c.current_loop.sample_time),
         "grid_ends": ca.DM([c.feedforward.z_grid[0], c.feedforward.z_grid[-1]]),
         "substep": ca.DM(c.sample_time / substeps),
         "errors": ca.DM(list(known.values())),
@@ -279,7 +278,7 @@ def _decided(
     current = ca.fmax(ca.fmin(v / g["believed"], limit), -limit)
     row: dict[str, Any] = {"xi_hat": xi_hat, "v": v, "saturated": frozen}
     if s.fidelity == "force":
-        command = current * ca.vertcat(*plant.actuator.force_constant)
+        command = _held_if_missed(s, given, controller, current * ca.vertcat(*plant.actuator.force_constant))
         row["force"] = machine["force"]
     else:
         command, electrics, more = _current_control(
@@ -288,13 +287,8 @@ def _decided(
         after |= electrics
         row |= more
     if s.faulty:
-        missed = given["missed"]
-        after["y_last"] = y
-        command = ca.if_else(missed, controller["command"], command)
-        after["command"] = command
-        for name in after:
-            if name not in ("y_last", "command"):
-                after[name] = ca.if_else(missed, controller[name], after[name])
+        after = {name: ca.if_else(given["missed"], controller[name], value) for name, value in after.items()}
+        after |= {"y_last": y, "command": command}
     queue = ca.vertcat(controller["under_way"], command)
     size = command.numel()
     after["under_way"] = queue[size:]
@@ -330,7 +324,10 @@ def _current_control(
     current: Any,
     xi_hat: Any,
 ) -> tuple[Any, dict[str, Any], dict[str, Any]]:
-    """PI controllers of the axes, integrals by backward Euler, waiting where the half-bridges are at their limit."""
+    """PI controllers of the axes, integrals by backward Euler, waiting where the half-bridges are at their limit.
+
+    They run once a control period, as on the machine, where both have 50 us.
+    """
     believed, drive = plant_of(c.parameters), plant.drive
     estimate = ca.SX.zeros(len(believed.states))  # where the controller takes the machine to be
     for k, index in enumerate(believed.controlled):
@@ -344,20 +341,26 @@ def _current_control(
     error = believed.drive.command(current) - i
     Q = believed.drive.turned(current * g["believed"]) if s.turning else ca.SX.eye(len(drive.axes))
     waiting = controller["u_limited"]
-    integral = controller["u_integral"] + g["Ki_current"] * g["current_time"] * (1 - waiting) * (Q @ error)
+    integral = controller["u_integral"] + g["Ki_current"] * g["control_time"] * (1 - waiting) * (Q @ error)
     u = g["Kp"] * error + Q.T @ integral + believed.drive.emf(estimate)
     row: dict[str, Any] = {"link": machine["link"], "i": i}
     if s.fidelity == "dq":
         command, limited = electric.modulation(drive, u, V)
+        command = _held_if_missed(s, given, controller, command)
         row |= {"u": command * V, "force": drive.force(i)}
     else:
         u_phase = believed.drive.to_phases(estimate) @ u
         command, limits = electric.duty_cycles(drive, u_phase, V, i_phase, real_pwm=s.real_pwm)
         limited = ca.vertcat(*_axes_limited(drive, limits))
-        true = drive.to_axes(machine["x"]) @ i_phase
-        applied = believed.drive.to_axes(estimate) @ ((command - 0.5) * V)
+        command = _held_if_missed(s, given, controller, command)
+        T = drive.to_axes(machine["x"])  # where the machine is, whatever the controller takes it to be
+        true, applied = T @ i_phase, T @ ((command - 0.5) * V)
         row |= {"u": applied, "force": drive.force(true), "i": true, "i_phase": i_phase, "duty": command}
     return command, {"u_integral": integral, "u_limited": limited}, row
+
+
+def _held_if_missed(s: Setup, given: Mapping[str, Any], controller: Mapping[str, Any], command: Any) -> Any:
+    return ca.if_else(given["missed"], controller["command"], command) if s.faulty else command
 
 
 def _axes_limited(drive: Any, limits: Any) -> list[Any]:
@@ -435,8 +438,12 @@ def _phase_slope(
     closed = 1 - given["open"] if s.faulty else ca.SX.ones(len(drive.phases))
     flowing = closed * i
     net = electric.phase_voltages(drive, u - actuator.R * flowing - drive.to_phases(x) @ drive.emf(x), closed)
-    # An open phase loses its current within a sample: the arc is short.
-    di = net / actuator.L - (1 - closed) * i / OPENING
+    # An open phase loses its current within a sample, and so do the others what they carried for it: the arc is short.
+    lost = (1 - closed) * i
+    for star in drive.stars if s.faulty else ():
+        phases = list(star)
+        lost[phases] += closed[phases] * ca.sum1(flowing[phases]) / ca.fmax(ca.sum1(closed[phases]), 1)
+    di = net / actuator.L - lost / OPENING
     power = ca.dot(u, flowing)
     return drive.force(drive.to_axes(x) @ flowing), ca.vertcat(di, electric.link_slope(drive, V, power))
 

@@ -87,7 +87,7 @@ class Drive:
     to_phases: CasadiFn  # x -> T(x)
     to_axes: CasadiFn  # x -> T(x)^+
     turned: CasadiFn  # inputs -> Q: Q i are the currents in axes that turn with the forces, as the paper commands them
-    peak: CasadiFn  # axis quantities -> largest phase quantity of each group of axes
+    peak: CasadiFn  # axis quantities -> a bound of the phase quantities of each group of axes
     groups: tuple[tuple[int, ...], ...]  # axes that share phases
     stars: tuple[tuple[int, ...], ...]  # phases that share a star point
     weight: tuple[float, ...]  # power = sum of weight u i over the axes

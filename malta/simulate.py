@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
 import casadi as ca
 import numpy as np
@@ -122,6 +122,18 @@ class Scenario:
         ):
             if getattr(self, name) not in known:
                 raise InputError(where, name, repr(getattr(self, name)), "one of " + ", ".join(known))
+        for fault in self.faults:
+            if fault.kind not in get_args(FaultKind):
+                raise InputError(
+                    where, "faults", repr(fault.kind), "one of " + ", ".join(get_args(FaultKind))
+                )
+            if math.isnan(fault.at) or math.isnan(fault.until):
+                raise InputError(where, fault.kind, f"{fault.at} s to {fault.until} s", "times")
+        for at, _ in self.changes:
+            if not math.isfinite(at):
+                raise InputError(where, "changes", f"{at} s", "a time")
+        if self.correction is not None and not (0 < self.correction.every < math.inf):
+            raise InputError(where, "correction", f"{self.correction.every} s", "a time above 0 s")
         if self.real_pwm and self.fidelity != "phase":
             raise InputError(where, "real_pwm", f"fidelity {self.fidelity}", "fidelity phase")
 
@@ -213,9 +225,12 @@ class Trajectory:
     @property
     def electrical_power(self) -> FloatArray:
         """Power into the windings, W, k; empty in fidelity `force`."""
-        return (
-            np.asarray((self.u * self.i) @ np.array(self.plant.drive.weight)) if self.i.size else self.i[:, 0]
-        )
+        if not self.i.size:
+            return np.empty(0)
+        own = self.plant.actuator.delay(self.controller.sample_time)
+        delay = min(own if self.scenario.delay is None else self.scenario.delay, len(self.u) - 1)
+        acting = np.vstack([np.repeat(self.u[:1], delay, axis=0), self.u[: len(self.u) - delay]])
+        return np.asarray((acting * self.i) @ np.array(self.plant.drive.weight))
 
     @property
     def axis_currents(self) -> FloatArray:
@@ -254,12 +269,12 @@ def simulate(
     setup = setup_of(plant, controller, scenario)
     t, motion, given = sampled(plant, controller, scenario, setup)
     samples = len(t)
-    noise = _noise(plant, scenario, t)
+    stages = _stages(plant, scenario, controller.sample_time)
+    noise = _noise(stages, scenario, t)
     x, xi_pred, current = beginning(plant, controller, scenario, given[0])
     first = machine.initial(plant, controller, setup, ca.DM(x), ca.DM(xi_pred), ca.DM(current))
     state = np.array(ca.evalf(first)).ravel()
     observer = _observer(plant, controller, scenario, setup) if setup.outside else None
-    stages = _stages(plant, scenario, controller.sample_time)
     stops = _stops(scenario, controller.sample_time, samples, [first for first, _ in stages])
     parts: list[FloatArray] = []
     verdict, kind, done = None, "", 0
@@ -271,7 +286,7 @@ def simulate(
             if observer is None:
                 state, rows = run.run(state, part, noise[done:stop])
             else:
-                state, rows = observer(run, state, part, noise[done:stop])
+                state, rows = observer(run, now, state, part, noise[done:stop])
             rows, verdict = _judged(plant, controller, setup, rows, t[done:stop])
             parts.append(rows)
             kind, done = run.kind, done + len(rows)
@@ -280,9 +295,15 @@ def simulate(
             if progress is not None:
                 progress(done / samples)
             if scenario.correction is not None and done < samples:
-                offset = scenario.correction.update(
-                    float(t[done]), _outputs(plant, setup, controller, rows[-1])
+                offset = np.asarray(
+                    scenario.correction.update(float(t[done]), _outputs(plant, setup, controller, rows[-1])),
+                    dtype=float,
                 )
+                if offset.shape != motion.p.shape[1:]:
+                    expected = f"{motion.p.shape[1]} numbers"
+                    raise InputError(
+                        f"scenario {scenario.name}", "correction", f"shape {offset.shape}", expected
+                    )
                 shifted = motion._replace(p=motion.p + offset)
                 given[done:] = _given(plant, controller, scenario, setup, shifted, t)[done:]
     except KeyboardInterrupt:
@@ -568,12 +589,15 @@ def _fault_flags(
     return flags
 
 
-def _noise(plant: Plant, scenario: Scenario, t: FloatArray) -> FloatArray:
+def _noise(stages: list[tuple[int, Plant]], scenario: Scenario, t: FloatArray) -> FloatArray:
     """Sensor noise, with what faults add to it."""
-    scale = scenario.noise * np.array(plant.noise)
-    drawn = np.zeros((len(t), len(plant.outputs)))
-    if scale.any():
-        drawn = scale * normals(keys(scenario.seed, np.array([scenario.run]))[0], len(t), len(scale))
+    plant = stages[0][1]
+    drawn: FloatArray = np.zeros((len(t), len(plant.outputs)))
+    if scenario.noise:
+        drawn = normals(keys(scenario.seed, np.array([scenario.run]))[0], *drawn.shape)
+        for k, (first, now) in enumerate(stages):
+            last = stages[k + 1][0] if k + 1 < len(stages) else len(t)
+            drawn[first:last] *= scenario.noise * np.array(now.noise)
     for fault in scenario.faults:
         if fault.kind in ("biased sensor", "noisy sensor"):
             column = _index(scenario, fault.kind, fault.what, plant.outputs)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import malta
-from malta.references import PROFILES, QUINTIC_DURATION, hold, stroke
+from malta.references import PROFILES, QUINTIC_DURATION, circle, hold, stroke
 
 if TYPE_CHECKING:
     from malta.plant import Plant
@@ -59,6 +60,23 @@ def test_hold_keeps_what_is_named(plant: Plant) -> None:
     assert not motion.dp.any()
     with pytest.raises(malta.InputError, match="hold: q: found an unknown output"):
         hold(plant, q=1.0)
+
+
+@given(radius=st.floats(1e-6, 5e-4), frequency=st.floats(0.1, 50))
+def test_the_circle_is_equation_21(plant: Plant, radius: float, frequency: float) -> None:
+    """p* = (S cos 2 pi f t, S sin 2 pi f t, 0, 0, 0), once around in 1 / f; it turns, so p*'' = -(2 pi f)^2 p*."""
+    w = 2 * math.pi * frequency
+    t = np.linspace(0, 1 / frequency, 401)
+    p, dp, ddp = circle(plant, radius, frequency)(t)
+    quarters = np.array([[1, 0], [0, 1], [-1, 0], [0, -1], [1, 0]]) * radius
+    assert np.abs(np.hypot(p[:, 0], p[:, 1]) - radius).max() < 1e-12 * radius
+    assert np.abs(p[::100, :2] - quarters).max() < 1e-12 * radius
+    assert np.abs(ddp + w**2 * p).max() < 1e-12 * w**2 * radius
+    assert np.abs(dp[:, :2] - w * np.column_stack([-p[:, 1], p[:, 0]])).max() < 1e-12 * w * radius
+    assert not any(part[:, 2:].any() for part in (p, dp, ddp))
+    h = t[1] - t[0]
+    chord = np.sin(w * h) / (w * h)  # a central difference of a circle falls short by this, exactly
+    assert np.abs((p[2:] - p[:-2]) / (2 * h) - chord * dp[1:-1]).max() < 1e-9 * w * radius
 
 
 def test_the_impossible_is_refused(plant: Plant) -> None:

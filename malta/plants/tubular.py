@@ -242,7 +242,7 @@ def drive(par: Parameters) -> Drive:
         return ca.diagcat(*blocks)
 
     def peak(u: Any) -> Any:
-        """Largest phase quantity at any position: amplitude along the machine, summed over its sequences."""
+        """A bound of the phase quantities at any position: both sequences' amplitudes, as if they met in one."""
         sizes = []
         for k in (0, 6):
             sizes.append(ca.sqrt(ca.sumsqr(u[k : k + 2])) + ca.sqrt(ca.sumsqr(u[k + 2 : k + 6])))

@@ -1,0 +1,662 @@
+"""The compiled engine against CasADi's own evaluation: every operation, every fidelity, and its cache."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import casadi as ca
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import malta
+from malta import engine, references
+from malta.engine import LANES
+from malta.machine import FIDELITIES, Fidelity, Parts
+from malta.simulate import SERIES, Fault, Scenario, compiled_shape, engine_of, setup_of, shape_of
+
+if TYPE_CHECKING:
+    from conftest import Design
+
+    from malta.plant import FloatArray
+
+STATES, GIVEN, THETA = 3, 3, 2  # of the engine that expressions are tried in
+SIXTYFOURTHS = st.integers(-512, 512).map(
+    lambda k: k / 64
+)  # sums, products and comparisons of these are exact
+OPERATIONS = """ADD SUB MUL DIV INV NEG SQ TWICE SQRT FABS FLOOR CEIL SIGN FMOD FMIN FMAX LT LE EQ NE NOT AND OR
+IF_ELSE_ZERO SIN COS TAN ASIN ACOS ATAN ATAN2 SINH COSH TANH EXP LOG POW CONSTPOW HYPOT"""
+NO_NOISE = np.zeros((1, 1))
+TABLE = engine.feedforward_table(np.array([-1.0, 0.0, 1.0]), np.array([[-1.0], [0.0], [3.0]]))
+
+
+class Trial(NamedTuple):
+    """Expressions of (state, given, theta): compiled with one lane, with eight, and as CasADi evaluates them."""
+
+    parts: Parts
+    one: Any
+    many: Any
+    reference: ca.Function
+
+
+needs_compiler = pytest.mark.skipif(engine.compiler() is None, reason="no C compiler")
+
+
+def _values(n: int) -> Any:
+    return st.lists(SIXTYFOURTHS, min_size=n, max_size=n)
+
+
+def _symbols() -> tuple[Any, ...]:
+    sizes = {"state": STATES + 1, "given": GIVEN, "noise": 1, "y": 1, "v0": 1, "held": 1, "theta": THETA}
+    return tuple(ca.SX.sym(name, size) for name, size in sizes.items())
+
+
+def _parts(row: Callable[[Any, Any, Any], Any]) -> tuple[Parts, ca.Function]:
+    """A machine that stands still and leaves `row` of its state, what it is given and its numbers; and its digest."""
+    state, around, noise, y, v0, held, theta = _symbols()
+    expression = ca.densify(row(state[:STATES], around, theta))
+    rest = ca.SX.sym("row", expression.numel() + 1)
+    parts = Parts(
+        ca.Function("sense", [state, around, noise, theta], [noise, around[0]]),
+        ca.Function("decide", [state, around, y, v0, theta], [state[STATES], v0, ca.vertcat(expression, v0)]),
+        ca.Function("substep", [state[:STATES], held, around, theta], [state[:STATES]]),
+        tuple(f"theta{k}" for k in range(THETA)),
+    )
+    kept = ca.SX.sym("kept", rest.numel())
+    return parts, ca.Function("digest", [kept, rest, around, theta], [rest])
+
+
+def _library(text: str, lanes: int, folder: Path | None = None) -> Any:
+    lib = engine.library(text, lanes, folder)
+    if lib is None:
+        pytest.skip("no C compiler")
+    return lib
+
+
+def _trial(row: Callable[[Any, Any, Any], Any]) -> Trial:
+    parts, digest = _parts(row)
+    state, around, *_, theta = _symbols()
+    return Trial(
+        parts,
+        _library(engine.source(parts, None), 1),
+        _library(engine.source(parts, digest), LANES),
+        ca.Function("reference", [state[:STATES], around, theta], [row(state[:STATES], around, theta)]),
+    )
+
+
+def _run_one(trial: Trial, state: Any, given: FloatArray, theta: Any) -> FloatArray:
+    """The rows that one lane leaves, without the last column: v0 of the table."""
+    run = engine.compiled_engine(trial.one.run, trial.parts, np.array(theta, dtype=float), 1, TABLE)
+    _, rows = run.run(np.append(np.array(state, dtype=float), 0.0), given, np.zeros((len(given), 1)))
+    return rows[:, :-1]
+
+
+def _run_lanes(trial: Trial, states: FloatArray, given: FloatArray, thetas: FloatArray) -> FloatArray:
+    """The last row of each of eight lanes."""
+    states = np.hstack([states, np.zeros((LANES, 1))])
+    theta, start, digests = (
+        engine.in_lanes(rows, 1)
+        for rows in (thetas, states, np.zeros((LANES, trial.parts.decide.size1_out(2))))
+    )
+    engine.run_many(
+        trial.many,
+        slice(0, 1),
+        substeps=1,
+        theta=theta,
+        table=TABLE,
+        states=start,
+        given=np.ascontiguousarray(given),
+        sigma=np.zeros((1, 1, LANES)),
+        keys=np.zeros((1, LANES), dtype=np.uint64),
+        digests=digests,
+    )
+    return np.asarray(digests[0, :-1].T)
+
+
+# Every operation
+
+
+def _continuous(rng: np.random.Generator, leaves: list[Any], depth: int) -> Any:
+    """A random expression of operations that pass on small errors as small errors, within a few hundred in size."""
+    if depth == 0:
+        return leaves[rng.integers(len(leaves))]
+
+    def part() -> Any:
+        return _continuous(rng, leaves, depth - 1)
+
+    def tame(scale: float) -> Any:
+        return scale * ca.tanh(part() / 8)
+
+    forms: list[Callable[[], Any]] = [
+        lambda: part() + part(),
+        lambda: part() - part(),
+        lambda: tame(8) * tame(8),
+        lambda: part() / (1.5 + ca.fabs(part())),
+        lambda: 1 / (1.5 + ca.fabs(part())),
+        lambda: -part(),
+        lambda: tame(8) ** 2,
+        lambda: part() + ca.fabs(part()),
+        lambda: ca.sin(tame(30)),
+        lambda: ca.cos(tame(30)),
+        lambda: ca.tan(tame(1.2)),
+        lambda: ca.exp(tame(3)),
+        lambda: ca.log(1 + ca.fabs(part())),
+        lambda: ca.sqrt(1 + ca.fabs(part())),
+        lambda: ca.asin(tame(0.9)),
+        lambda: ca.acos(tame(0.9)),
+        lambda: ca.atan(part()),
+        lambda: ca.sinh(tame(3)),
+        lambda: ca.cosh(tame(3)),
+        lambda: ca.tanh(part()),
+        lambda: ca.atan2(part(), 0.5 + ca.fabs(part())),
+        lambda: ca.hypot(part(), 1 + ca.fabs(part())),
+        lambda: (1 + ca.fabs(tame(3))) ** tame(2),
+        lambda: (1 + ca.fabs(tame(3))) ** 2.7,
+        lambda: ca.fmin(part(), part()),
+        lambda: ca.fmax(part(), part()),
+        lambda: 2 * part(),
+    ]
+    return forms[rng.integers(len(forms))]()
+
+
+def _steps(leaves: list[Any]) -> list[Any]:
+    """What jumps, of numbers that are exact: there both must agree on the side."""
+    a, b, c = leaves[0] + leaves[3], leaves[1] - leaves[4], leaves[6] * 0.5
+    return [
+        ca.floor(a),
+        ca.ceil(a),
+        ca.floor(b + 0.5),
+        ca.sign(c),
+        ca.sign(a - leaves[5]),
+        a < b,
+        a <= b,
+        a == c,
+        a != c,
+        ca.logic_not(leaves[2]),
+        ca.logic_and(leaves[2], leaves[5]),
+        ca.logic_or(leaves[2], leaves[5]),
+        ca.logic_and(a > b, ca.logic_or(b > c, c == 0)),
+        ca.if_else(a < b, leaves[2], c),
+        ca.if_else(a == b, ca.sin(a), ca.exp(c / 8)),
+        ca.if_else(b > 0, ca.sqrt(ca.fabs(b)), ca.if_else(c > 0, b * c, -a)),
+        ca.fmod(a, 3.0),
+        ca.fmod(a, 1 + leaves[5] ** 2),
+        ca.fmin(a, b),
+        ca.fmax(a, b),
+        ca.fmin(ca.fmax(a, -1.0), 1.0),
+        ca.atan2(a, b),
+        ca.atan2(leaves[2], leaves[5]),
+        ca.fabs(b) ** leaves[6],
+        ca.SX(2.5) + 0 * a,
+    ]
+
+
+def _everything(state: Any, around: Any, theta: Any) -> Any:
+    rng = np.random.default_rng(20)
+    leaves = [*ca.vertsplit(state), *ca.vertsplit(around), *ca.vertsplit(theta)]
+    random = [_continuous(rng, leaves, depth) for depth in (1, 2, 3) for _ in range(25)]
+    constant = [_continuous(rng, leaves[-THETA:], 3) for _ in range(10)]
+    mixed = [r * k + k / (2 + ca.fabs(k)) for r, k in zip(random, constant, strict=False)]
+    return ca.vertcat(*_steps(leaves), *random, *constant, *mixed, *leaves)
+
+
+@pytest.fixture(scope="module")
+def everything() -> Trial:
+    """Some 130 expressions in every operation that the engine knows, in one library for each number of lanes."""
+    return _trial(_everything)
+
+
+def test_every_operation_is_tried(everything: Trial) -> None:
+    f = everything.reference
+    names = {getattr(ca, name): name for name in dir(ca) if name.startswith("OP_")}
+    tried = {names[f.instruction_id(k)].removeprefix("OP_") for k in range(f.n_instructions())}
+    assert tried - {"INPUT", "OUTPUT", "CONST"} == set(OPERATIONS.split())
+
+
+@given(state=_values(STATES), around=_values(GIVEN), theta=_values(THETA))
+def test_one_lane_computes_what_casadi_does(
+    everything: Trial, state: list[float], around: list[float], theta: list[float]
+) -> None:
+    """Random trees of all operations, of states, inputs and constants: what is constant alone is computed once."""
+    expected = np.array(everything.reference(state, around, theta)).ravel()
+    found = _run_one(everything, state, np.array([around]), theta)[0]
+    assert np.isfinite(expected).all() == np.isfinite(found).all()
+    np.testing.assert_allclose(found, expected, rtol=1e-11, atol=1e-12)
+
+
+@given(values=_values(LANES * (STATES + THETA)), around=_values(GIVEN))
+def test_every_lane_computes_what_casadi_does(
+    everything: Trial, values: list[float], around: list[float]
+) -> None:
+    """Eight machines of different states and numbers in one register: branches differ from lane to lane."""
+    states, thetas = np.split(np.reshape(values, (LANES, STATES + THETA)), [STATES], axis=1)
+    found = _run_lanes(everything, states, np.array([around]), thetas)
+    for lane in range(LANES):
+        expected = np.array(everything.reference(states[lane], around, thetas[lane])).ravel()
+        np.testing.assert_allclose(found[lane], expected, rtol=1e-11, atol=1e-12)
+
+
+@pytest.fixture(scope="module")
+def waves() -> Trial:
+    """sin and cos of the first state plus the first input."""
+    return _trial(lambda s, g, _: ca.vertcat(ca.sin(s[0] + g[0]), ca.cos(s[0] + g[0])))
+
+
+def test_sine_and_cosine_are_right_to_1e_15(waves: Trial) -> None:
+    """Over +-1e5 rad, near the quadrants' edges, and where a shorter form takes over; small angles to two units in
+    the last place: a mover in its air gap tilts by milliradians."""
+    rng = np.random.default_rng(0)
+    edges = np.pi / 4 * np.arange(-2000, 2001)
+    x = np.concatenate(
+        [
+            *(rng.uniform(-size, size, 50_000) for size in (1e5, 1e4, 100, 1)),
+            *(edges + step for step in (0, 1e-12, -1e-12, 1e-6, -1e-6)),
+            *(near + rng.uniform(-1e-3, 1e-3, 1000) for near in (0.6**0.5, -(0.6**0.5), 0.785)),
+            10 ** rng.uniform(-300, -1, 1000),
+            np.array([0.0, 1e-300, -1e-20, 1e-9, 1e4, -1e5]),
+        ]
+    )
+    found = _run_one(waves, np.zeros(STATES), np.pad(x[:, None], ((0, 0), (0, 2))), np.zeros(THETA))
+    expected = np.array([np.sin(x), np.cos(x)]).T
+    assert np.abs(found - expected).max() < 1e-15
+    small = np.abs(x) < 0.7
+    assert (np.abs(found - expected) / np.spacing(np.abs(expected)))[small].max() <= 2
+
+
+def test_quotients_are_right_over_all_sizes() -> None:
+    """Reciprocals may be computed without a division; they are right to two units in the last place, and what has no
+    answer has none."""
+    trial = _trial(lambda s, g, _: ca.vertcat(1 / s[0], g[0] / s[0]))
+    rng = np.random.default_rng(2)
+    sizes = rng.choice([-1, 1], (100, LANES)) * 10 ** rng.uniform(-300, 300, (100, LANES))
+    for row in sizes:
+        states = np.zeros((LANES, STATES))
+        states[:, 0] = row
+        found = _run_lanes(trial, states, np.array([[3.0, 0, 0]]), np.zeros((LANES, THETA)))
+        np.testing.assert_allclose(found, np.array([1 / row, 3 / row]).T, rtol=5e-16)
+    nothing = _run_lanes(trial, np.zeros((LANES, STATES)), np.array([[3.0, 0, 0]]), np.zeros((LANES, THETA)))
+    assert not np.isfinite(nothing).any()
+
+
+def test_a_lane_does_not_depend_on_its_neighbours(waves: Trial) -> None:
+    """Small angles take a short way only where all lanes are small: the last digit is all that may differ."""
+    rng = np.random.default_rng(1)
+    around, thetas = np.zeros((1, GIVEN)), np.zeros((LANES, THETA))
+    for small in np.concatenate([rng.uniform(-0.785, 0.785, 300), [0.0, 0.7848, -0.7848]]):
+        states = np.zeros((LANES, STATES))
+        states[:, 0] = small
+        together = _run_lanes(waves, states, around, thetas)
+        assert np.array_equal(together, np.tile(together[0], (LANES, 1)))
+        states[1:, 0] = 100 * rng.uniform(1, 10, LANES - 1)
+        np.testing.assert_allclose(
+            _run_lanes(waves, states, around, thetas)[0], together[0], rtol=0, atol=1e-15
+        )
+
+
+def test_an_operation_without_a_form_is_refused() -> None:
+    state, _, theta = ca.SX.sym("state"), ca.SX.sym("given"), ca.SX.sym("theta")
+    for unknown, name in ((ca.erf, "OP_ERF"), (ca.log1p, "OP_LOG1P"), (ca.acosh, "OP_ACOSH")):
+        with pytest.raises(malta.CheckError, match=f"has no {name}"):
+            engine.translate(ca.Function("f", [state, theta], [unknown(state)]), [], 0)
+
+
+def test_constants_are_any_numbers(tmp_path: Path) -> None:
+    """Infinity, which is how an expression says "no limit", the smallest numbers and the largest."""
+    numbers = [np.inf, -np.inf, 5e-324, -1.7976931348623157e308, 0.1, -3.0, 1e22]
+    parts, _ = _parts(lambda s, g, _: ca.vertcat(*(ca.fmin(s[0] + g[0], n) for n in numbers)))
+    lib = engine.library(engine.source(parts, None), 1, tmp_path)
+    assert lib is not None, "it does not compile"
+    run = engine.compiled_engine(lib.run, parts, np.zeros(THETA), 1, TABLE).run
+    for value in (-1e9, 0.0, 1e9):
+        _, rows = run(np.array([value, 0, 0, 0]), np.zeros((1, GIVEN)), NO_NOISE)
+        assert rows[0, :-1].tolist() == [min(value, n) for n in numbers]
+
+
+def test_what_depends_on_constants_alone_is_computed_once() -> None:
+    """A division by a number of the machine is a reciprocal in `prepare` and a product in the loop."""
+    state, theta = ca.SX.sym("state"), ca.SX.sym("theta", 2)
+    f = ca.Function("f", [state, theta], [state / theta[0] + ca.exp(theta[1]) * ca.sin(theta[0])])
+    prepare, moving, constants = engine.translate(f, [], 5)
+    assert constants == 2
+    assert "theta[0]" in prepare
+    assert "exp(" in prepare
+    assert "c[5]" in moving
+    assert "c[6]" in moving
+    assert not any(word in moving for word in (" / ", "inverse", "exp", "sin"))
+    assert "theta" not in moving
+
+
+@given(z=st.floats(-2, 2), start=st.floats(-2, 2))
+def test_the_table_is_linear_between_its_points(waves: Trial, z: float, start: float) -> None:
+    """v0 of a grid that is looked up from wherever the search stood before: numpy's interpolation."""
+    run = engine.compiled_engine(waves.one.run, waves.parts, np.zeros(THETA), 1, TABLE).run
+    _, rows = run(np.zeros(STATES + 1), np.array([[start, 0, 0], [z, 0, 0.0]]), np.zeros((2, 1)))
+    inside = [np.clip(at, -1, 1) for at in (start, z)]
+    expected = np.interp(inside, [-1, 0, 1], [-1, 0, 3])
+    slope = [3.0 if at > 0 else 1.0 for at in (start, z)]
+    beyond = np.array([start, z]) - inside  # the machine asks within the grid only; the engine goes on
+    assert rows[:, -1] == pytest.approx(expected + slope * beyond, abs=1e-12)
+
+
+# Compiled and on CasADi's virtual machine
+
+
+def _push(t: FloatArray) -> FloatArray:
+    wrench = np.zeros((len(t), 6))
+    wrench[:, 0], wrench[:, 4] = 2.0 * (t > 5e-3), 0.01 * np.sin(300 * t)
+    return wrench
+
+
+def _every_option(fidelity: Fidelity) -> dict[str, Any]:
+    faults: tuple[Fault, ...] = (
+        Fault("lost sample", 2e-3, 2.2e-3),
+        Fault("missed step", 3e-3, 3.1e-3),
+        Fault("biased sensor", 4e-3, 5e-3, "x2", 3e-6),
+        Fault("stuck sensor", 8e-3, 8.5e-3, "y1"),
+        Fault("link sag", 10e-3, 11e-3, size=0.3),
+        Fault("noisy sensor", 12e-3, 13e-3, "x1", 5.0),
+    )
+    if fidelity == "phase":
+        faults += (Fault("open phase", 6e-3, 7e-3, "i_12_1"),)
+    return {
+        "noise": 1.0,
+        "quantize": True,
+        "bearing": True,
+        "scheduled": True,
+        "disturbance": _push,
+        "sensor_errors": {
+            "gain_x1": 0.01,
+            "offset_y2": 2e-6,
+            "hall_amplitude": 0.02,
+            "hall_phase": 0.01,
+            "hall_single": 0.3,
+        },
+        "faults": faults,
+        "changes": ((9e-3, {"m": 0.4, "K_ind": 2.0}),),
+        "real_pwm": fidelity == "phase",
+        "bearing_axes": "fixed" if fidelity == "force" else "turning",
+    }
+
+
+@needs_compiler
+@pytest.mark.parametrize("options", ["plain", "every"])
+@pytest.mark.parametrize("fidelity", FIDELITIES)
+def test_compiled_is_what_the_virtual_machine_computes(
+    designs: dict[str, Design], fidelity: Fidelity, options: str
+) -> None:
+    """Every series to 1e-12 of the largest value of its unit, with every option on and none, on a stroke that the
+    voltage limits: forces, axes, phases."""
+    design = designs["calibrated"]
+    chosen = _every_option(fidelity) if options == "every" else {}
+    scenario = Scenario.stroke(5e-3, rise=3e-3, duration=0.02, fidelity=fidelity, **chosen)
+    compiled, virtual = (
+        malta.simulate(design.plant, design.controller, scenario, engine=kind)
+        for kind in ("compiled", "virtual machine")
+    )
+    assert (compiled.engine, virtual.engine) == ("compiled", "virtual machine")
+    assert compiled.verdict == virtual.verdict
+    assert compiled.verdict.completed
+    for name in SERIES:
+        found, expected = getattr(compiled, name), getattr(virtual, name)
+        assert found.shape == expected.shape
+        if found.size:
+            np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
+    moved = np.abs(virtual.p).max(axis=0)
+    assert moved[4] > 2e-3
+    if options == "every":
+        assert moved[0] > 5e-6
+    if fidelity == "phase":
+        assert virtual.duty.max() > 0.9
+
+
+@needs_compiler
+def test_a_delay_beyond_a_sample_is_the_same_in_both(designs: dict[str, Design]) -> None:
+    """Commands under way queue up in the controller's state; an estimate from outside enters where it belongs."""
+    design = designs["calibrated"]
+    c = malta.lqg(design.model, design.spec.weights, 50e-6, "sampled-data", 2)
+    for options in ({"delay": 3}, {"estimator": "kalman"}):
+        scenario = Scenario.stroke(1e-3, rise=5e-3, duration=0.01, fidelity="force", noise=1.0, **options)
+        runs = [malta.simulate(design.plant, c, scenario, engine=e) for e in ("compiled", "virtual machine")]
+        assert np.abs(runs[0].x - runs[1].x).max() < 1e-15
+
+
+# One library for all machines and gains of a shape
+
+
+@needs_compiler
+def test_one_library_serves_designs_and_machines(designs: dict[str, Design]) -> None:
+    """Gains and parameters are arguments: the same library, and yet other trajectories; no hit is stale."""
+    tables, calibrated = (designs[name] for name in ("table2", "calibrated"))
+    heavy = malta.plant_of(replace(calibrated.spec.parameters, m=0.4))
+    scenario = Scenario.stroke(1e-3, rise=5e-3, duration=0.01, fidelity="force")
+    pairs = [
+        (calibrated.plant, calibrated.controller),
+        (calibrated.plant, tables.controller),
+        (heavy, calibrated.controller),
+    ]
+    shapes = [shape_of(plant, c, setup_of(plant, c, scenario)) for plant, c in pairs]
+    libraries = [compiled_shape(shape) for shape in shapes]
+    assert libraries[0] is not None
+    assert all(library is libraries[0] for library in libraries)
+    for plant, c in pairs:
+        compiled, virtual = (
+            malta.simulate(plant, c, scenario, engine=e) for e in ("compiled", "virtual machine")
+        )
+        assert np.abs(compiled.x - virtual.x).max() < 1e-15
+    ends = [malta.simulate(plant, c, scenario).x[-1, 2] for plant, c in pairs]
+    assert len(set(ends)) == 3
+
+
+@pytest.fixture
+def fresh(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Path]:
+    """A cache folder of its own, nothing remembered; and again nothing afterwards."""
+
+    memories = (engine.compiler, engine._processor, compiled_shape, engine_of)
+
+    def forget() -> None:
+        for memory in memories:
+            memory.cache_clear()
+
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "tmp"))
+    (tmp_path / "tmp").mkdir()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    forget()
+    yield tmp_path / "cache" / "malta"
+    forget()
+
+
+def _hold(duration: float = 1e-3) -> Scenario:
+    return Scenario("hold", duration, lambda plant: references.hold(plant, x1=1e-6), fidelity="force")
+
+
+@needs_compiler
+def test_the_folder_holds_one_file_for_two_designs(designs: dict[str, Design], fresh: Path) -> None:
+    for design in designs.values():
+        assert malta.simulate(design.plant, design.controller, _hold()).engine == "compiled"
+    assert engine.cache_folder() == fresh
+    assert [path.suffix for path in fresh.iterdir()] == [".so"]
+
+
+@pytest.fixture(scope="module")
+def small() -> tuple[Parts, str]:
+    """An engine that compiles at once: 3 s[0] + g[0], and sin(g[0])."""
+    parts, _ = _parts(lambda s, g, _: ca.vertcat(3 * s[0] + g[0], ca.sin(g[0])))
+    return parts, engine.source(parts, None)
+
+
+def _works(lib: Any, parts: Parts) -> bool:
+    run = engine.compiled_engine(lib.run, parts, np.zeros(THETA), 1, TABLE).run
+    _, rows = run(np.array([2.0, 0, 0, 0]), np.array([[0.5, 0, 0]]), NO_NOISE)
+    return bool(rows[0] == pytest.approx([6.5, np.sin(0.5), 1.5]))
+
+
+@pytest.mark.usefixtures("fresh")
+def test_the_cache_knows_what_a_library_depends_on(
+    small: tuple[Parts, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Text, lanes, options, processor and compiler: a file for each; the same again: none."""
+    parts, text = small
+
+    def files() -> int:
+        return len(list(tmp_path.glob("*.so")))
+
+    assert _works(_library(text, 1, tmp_path), parts)
+    assert _works(_library(text, 1, tmp_path), parts)
+    assert files() == 1
+    _library(text + "/* otherwise */", 1, tmp_path)
+    assert files() == 2
+    parts8, digest = _parts(lambda s, *_: s)
+    _library(engine.source(parts8, digest), LANES, tmp_path)
+    assert files() == 3
+    for name, value in (
+        ("FLAGS", (*engine.FLAGS, "-DNOTHING")),
+        ("_processor", lambda: "another"),
+        ("_version", lambda _: "another"),
+    ):
+        before = files()
+        with monkeypatch.context() as patch:
+            patch.setattr(engine, name, value)
+            assert _works(_library(text, 1, tmp_path), parts)
+        assert files() == before + 1
+    assert [path.name for path in tmp_path.iterdir() if path.is_file() and path.suffix != ".so"] == []
+
+
+@pytest.mark.parametrize("damage", ["empty", "no library", "its first bytes"])
+def test_a_damaged_library_is_replaced(
+    small: tuple[Parts, str], fresh: Path, tmp_path: Path, damage: str
+) -> None:
+    parts, text = small
+    folder = tmp_path / "libraries"
+    _library(text, 1, tmp_path / "sound")
+    (sound,) = (tmp_path / "sound").iterdir()
+    whole = sound.read_bytes()
+    folder.mkdir()
+    damaged = folder / sound.name
+    damaged.write_bytes(
+        {"empty": b"", "no library": b"#!/bin/sh\n" * 900, "its first bytes": whole[:64]}[damage]
+    )
+    assert _works(_library(text, 1, folder), parts)
+    assert damaged.exists(), "compiled again, but somewhere else"
+    assert len(damaged.read_bytes()) == len(whole)
+    assert fresh != folder
+
+
+@pytest.mark.parametrize("share", [0.3, 0.6])
+def test_a_library_that_was_cut_short_is_not_run(
+    small: tuple[Parts, str], tmp_path: Path, share: float
+) -> None:
+    """What a power failure leaves of a file: loading it would end the process with a bus error."""
+    _, text = small
+    _library(text, 1, tmp_path / "sound")
+    (sound,) = (tmp_path / "sound").iterdir()
+    folder = tmp_path / "libraries"
+    folder.mkdir()
+    whole = sound.read_bytes()
+    (folder / sound.name).write_bytes(whole[: int(share * len(whole))])
+    (tmp_path / "text.c").write_text(text, encoding="utf-8")
+    loading = (
+        "from pathlib import Path; from malta.engine import library; import sys\n"
+        "assert library(Path(sys.argv[1]).read_text(encoding='utf-8'), 1, Path(sys.argv[2])) is not None"
+    )
+    ended = subprocess.run(
+        [sys.executable, "-c", loading, str(tmp_path / "text.c"), str(folder)],
+        capture_output=True,
+        text=True,
+        check=False,
+        env=os.environ | {"TMPDIR": str(tmp_path)},
+    )
+    assert ended.returncode == 0, ended.stderr
+
+
+def test_a_folder_that_cannot_be_written_is_passed_over(
+    small: tuple[Parts, str], fresh: Path, tmp_path: Path
+) -> None:
+    """A file where the folder should be: the temporary folder serves."""
+    parts, text = small
+    (tmp_path / "cache").write_text("not a folder", encoding="utf-8")
+    assert _works(_library(text, 1), parts)
+    assert not fresh.exists()
+    assert len(list((tmp_path / "tmp").glob("malta-*/*.so"))) == 1
+
+
+def test_with_no_folder_at_all_the_virtual_machine_runs(
+    designs: dict[str, Design], fresh: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "cache").write_text("not a folder", encoding="utf-8")
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "cache"))
+    design = designs["calibrated"]
+    run = malta.simulate(design.plant, design.controller, _hold())
+    assert (run.engine, run.verdict.completed) == ("virtual machine", True)
+    assert not fresh.exists()
+
+
+@needs_compiler
+@pytest.mark.usefixtures("fresh")
+def test_without_a_compiler_the_virtual_machine_runs(
+    designs: dict[str, Design], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    design = designs["calibrated"]
+    with_one = malta.simulate(design.plant, design.controller, _hold(5e-3))
+    for cached in (compiled_shape, engine_of):
+        cached.cache_clear()
+    monkeypatch.setattr(engine, "compiler", lambda: None)
+    run = malta.simulate(design.plant, design.controller, _hold(5e-3))
+    assert (with_one.engine, run.engine) == ("compiled", "virtual machine")
+    np.testing.assert_allclose(run.x, with_one.x, rtol=0, atol=1e-12 * np.abs(run.x).max())
+    with pytest.raises(
+        malta.InputError,
+        match=r"simulate: engine: found no C compiler that works, expected cc, gcc or clang, or \$CC",
+    ):
+        malta.simulate(design.plant, design.controller, _hold(), engine="compiled")
+
+
+def test_a_compiler_that_fails_is_no_compiler(
+    designs: dict[str, Design], fresh: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("CC", "/bin/false")
+    design = designs["calibrated"]
+    assert engine.compiler() == ("/bin/false",)
+    run = malta.simulate(design.plant, design.controller, _hold())
+    assert (run.engine, run.verdict.completed) == ("virtual machine", True)
+    assert not list(fresh.iterdir())
+    with pytest.raises(malta.InputError, match="no C compiler that works"):
+        malta.simulate(design.plant, design.controller, _hold(), engine="compiled")
+
+
+@pytest.mark.usefixtures("fresh")
+def test_a_compiler_that_does_not_exist_is_no_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CC", "/nowhere/cc")
+    assert engine.compiler() is None
+    assert engine.library("", 1) is None
+
+
+def test_two_processes_may_compile_at_once(small: tuple[Parts, str], fresh: Path, tmp_path: Path) -> None:
+    """A compiler that takes its time, so that both are at it: both succeed, one file is left and nothing else."""
+    cc = engine.compiler()
+    if cc is None:
+        pytest.skip("no C compiler")
+    slow = tmp_path / "slow-cc"
+    slow.write_text(
+        f'#!/bin/sh\ncase "$*" in *-shared*) echo >> {tmp_path}/calls; sleep 0.4;; esac\nexec {cc[0]} "$@"\n'
+    )
+    slow.chmod(0o755)
+    (tmp_path / "text.c").write_text(small[1], encoding="utf-8")
+    compiling = (
+        "from pathlib import Path; from malta.engine import library; import sys\n"
+        "assert library(Path(sys.argv[1]).read_text(encoding='utf-8'), 1) is not None"
+    )
+    environment = os.environ | {"CC": str(slow)}
+    both = [
+        subprocess.Popen([sys.executable, "-c", compiling, str(tmp_path / "text.c")], env=environment)
+        for _ in range(2)
+    ]
+    assert [process.wait(timeout=60) for process in both] == [0, 0]
+    assert (tmp_path / "calls").read_text().splitlines() in ([""], ["", ""])
+    assert [path.suffix for path in fresh.iterdir()] == [".so"]
