@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from malta.plant import FloatArray
 
 CLOSE, NEAR = 0.05, 0.2  # of the published figure: reproduced; within x %
+ROUNDING = 1e-9
 FLOWN = ("stroke", "hold", "tilt", "payload", "thermal")
 
 
@@ -89,7 +90,7 @@ class Row(NamedTuple):
     published: str | float | None = (
         None  # key of data/published/, or a figure that its text implies; None: ours alone
     )
-    relation: str = "about"  # "equal" to the printed digits, "at most", "about"
+    relation: str = "about"  # "equal" to the printed digits, "at most", "at least", "about"
     note: str = ""  # where the paper leaves a definition open, or what explains the figures
     why: str = ""  # the reason for whatever is not reproduced
 
@@ -101,6 +102,8 @@ def ledger(specs: Sequence[Spec], published: Mapping[str, Any], progress: Any = 
 
     Raises InputError for designs of another machine, or when the published figures lack one.
     """
+    if not specs:
+        raise InputError("claims", "designs", "none", "at least one design")
     for spec in specs:
         if spec.plant.name != "tubular":
             raise InputError(spec.path, "machine", spec.plant.name, "tubular: whose paper the claims are of")
@@ -233,7 +236,7 @@ def _rows() -> list[Row]:
             "rad/s",
             "{:.4f}",
             _slowest_radial,
-            note="the printed integral weights take minutes to act",
+            note="its inverse is the time that integral action takes",
         ),
         Row(
             "axial stiffness of the feedback",
@@ -401,8 +404,8 @@ def _rows() -> list[Row]:
             "{:.2f}",
             partial(_merit, "payload", "largest of these carried and moved"),
             "position_controller.payload",
-            "about",
-            "without touchdown",
+            "at least",
+            "without touchdown; no more is tried",
             "touches down with more",
         ),
     ]
@@ -421,7 +424,7 @@ def _claim(row: Row, found: Sequence[Evidence], published: Mapping[str, Any]) ->
         row.unit,
     )
     printed = row.form.format(target) if row.relation == "equal" else f"{target:.4g}"
-    mark = {"at most": "≤ ", "about": "", "equal": ""}[row.relation]
+    mark = {"at most": "≤ ", "at least": "≥ "}.get(row.relation, "")
     return Claim(subject, mark + printed, ours, _verdict(row, target, values, [e.spec.name for e in found]))
 
 
@@ -439,16 +442,17 @@ def _verdict(row: Row, target: float, values: Sequence[float], names: Sequence[s
 def _word(row: Row, target: float, value: float) -> str:
     if math.isnan(value):
         return "not reproduced"
-    if row.relation == "at most":
-        return "reproduced" if value <= target else "not reproduced"
+    if row.relation in ("at most", "at least"):
+        within = value <= target if row.relation == "at most" else value >= target
+        return "reproduced" if within else "not reproduced"
     if row.relation == "equal":
         if row.form.format(value) == row.form.format(target):
             return "reproduced"
         return "not reproduced"
     off = abs(value / target - 1)
-    if off <= CLOSE:
+    if off <= CLOSE + ROUNDING:
         return "reproduced"
-    return f"within {math.ceil(off * 100)} %" if off <= NEAR else "not reproduced"
+    return f"within {math.ceil((off - ROUNDING) * 100)} %" if off <= NEAR + ROUNDING else "not reproduced"
 
 
 def _pole(name: str, e: Evidence) -> float:

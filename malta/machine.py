@@ -332,7 +332,9 @@ def _current_control(
     estimate = ca.SX.zeros(len(believed.states))  # where the controller takes the machine to be
     for k, index in enumerate(believed.controlled):
         estimate[index] = xi_hat[k]
-    V = machine["link"] * (1 - given["sag"] if s.faulty else 1)
+    V = machine["link"] * (
+        1 - given["sag"] if s.faulty else 1
+    )  # measured: the modulators know of a sag at once
     if s.fidelity == "dq":
         i, i_phase = machine["i"], None
     else:
@@ -343,7 +345,7 @@ def _current_control(
     waiting = controller["u_limited"]
     integral = controller["u_integral"] + g["Ki_current"] * g["control_time"] * (1 - waiting) * (Q @ error)
     u = g["Kp"] * error + Q.T @ integral + believed.drive.emf(estimate)
-    row: dict[str, Any] = {"link": machine["link"], "i": i}
+    row: dict[str, Any] = {"link": V, "i": i}
     if s.fidelity == "dq":
         command, limited = electric.modulation(drive, u, V)
         command = _held_if_missed(s, given, controller, command)

@@ -112,6 +112,8 @@ class Scenario:
             value = getattr(self, name)
             if whole and value is not None and not isinstance(value, int):
                 raise InputError(where, name, repr(value), "a whole number")
+            if value is not None and not isinstance(value, float | int | np.number):
+                raise InputError(where, name, repr(value), "a number")
             if value is not None and not (math.isfinite(value) and value >= low):
                 raise InputError(where, name, str(value), "a number above 0" if low else "0 or more")
         for name, known in (
@@ -275,7 +277,8 @@ def simulate(
     first = machine.initial(plant, controller, setup, ca.DM(x), ca.DM(xi_pred), ca.DM(current))
     state = np.array(ca.evalf(first)).ravel()
     observer = _observer(plant, controller, scenario, setup) if setup.outside else None
-    stops = _stops(scenario, controller.sample_time, samples, [first for first, _ in stages])
+    every = _every(scenario, controller.sample_time)
+    stops = _stops(every, samples, [first for first, _ in stages])
     parts: list[FloatArray] = []
     verdict, kind, done = None, "", 0
     try:
@@ -294,7 +297,7 @@ def simulate(
                 break
             if progress is not None:
                 progress(done / samples)
-            if scenario.correction is not None and done < samples:
+            if scenario.correction is not None and done < samples and done % every == 0:
                 offset = np.asarray(
                     scenario.correction.update(float(t[done]), _outputs(plant, setup, controller, rows[-1])),
                     dtype=float,
@@ -313,8 +316,8 @@ def simulate(
     table = np.concatenate(parts) if len(parts) > 1 else parts[0]
     sizes = machine.layout(plant, controller, setup).row
     columns = dict(zip(sizes, np.split(table, np.cumsum([*sizes.values()])[:-1], axis=1), strict=True))
-    if verdict is None and setup.bearing:
-        verdict = _touched(plant, columns["contact"], t)
+    if setup.bearing and (verdict is None or verdict.name in plant.contacts):  # what it touched first
+        verdict = _touched(plant, columns["contact"], t) or verdict
     return Trajectory(
         plant,
         controller,
@@ -454,9 +457,13 @@ def _stages(plant: Plant, scenario: Scenario, Ts: float) -> list[tuple[int, Plan
     return stages
 
 
-def _stops(scenario: Scenario, Ts: float, samples: int, changes: list[int]) -> list[int]:
+def _every(scenario: Scenario, Ts: float) -> int:
+    """Samples between corrections of the reference, or between looks at the run."""
+    return PORTION if scenario.correction is None else max(1, round(scenario.correction.every / Ts))
+
+
+def _stops(every: int, samples: int, changes: list[int]) -> list[int]:
     """Samples at which the run pauses: to look, to correct the reference, to change the machine."""
-    every = PORTION if scenario.correction is None else max(1, round(scenario.correction.every / Ts))
     marks = set(range(every, samples, every)) | set(range(PORTION, samples, PORTION)) | {samples}
     return sorted(marks | {k for k in changes if 0 < k < samples})
 

@@ -140,8 +140,9 @@ for name in ("lift-off", "payload", "faults"):
 # %% [markdown]
 # **Judgement.** Every estimator lifts the mover; a filter that knows it lies on its bearing does so with hardly
 # more than the 1.34 A that statics ask for. 0.2 kg are carried by the calibrated design and dropped by the printed
-# weights. Both survive 2.5 ms without samples or control steps; a stuck radial sensor or an open phase ends in the
-# touchdown bearing within some 50 to 120 ms.
+# weights. Struck where the stroke accelerates most, both survive 2.5 ms without samples or control steps; a stuck
+# radial sensor ends in the touchdown bearing within some 40 ms, a link at a tenth of its voltage within 20 ms, an open
+# phase that carries weight within 10 ms.
 
 # %% [markdown]
 # ## How stiff, how fast

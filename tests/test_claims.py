@@ -140,7 +140,7 @@ def test_rows_are_well_formed(published: dict[str, Any]) -> None:
     rows = claims._rows()
     assert len({row.subject for row in rows}) == len(rows)
     for row in rows:
-        assert row.relation in ("equal", "at most", "about")
+        assert row.relation in ("equal", "at most", "at least", "about")
         assert row.form.format(1.0)
         assert math.isfinite(in_unit(1.0, row.unit))
         if isinstance(row.published, str):
@@ -206,9 +206,9 @@ def test_the_verdict_of_several_designs() -> None:
     assert verdict(1.0, 1.01, note="read so", why="bad") == "reproduced; read so"  # no reason is needed
     assert verdict(2.0, 3.0, why="bad") == "not reproduced; bad"
     assert verdict(1.0, 2.0, why="bad") == "a: reproduced; b: not reproduced; bad"
-    assert verdict(1.1, 1.15, why="bad") == "a: within 11 %; b: within 15 %"
+    assert verdict(1.1, 1.15, why="bad") == "a: within 10 %; b: within 15 %"
     assert verdict(1.0, 1.1, 2.0, note="so", why="bad") == (
-        "a: reproduced; b: within 11 %; c: not reproduced; so; bad"
+        "a: reproduced; b: within 10 %; c: not reproduced; so; bad"
     )
     assert verdict(math.nan, 1.0) == "a: not reproduced; b: reproduced"
 

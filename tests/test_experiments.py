@@ -512,9 +512,9 @@ def test_the_lag_of_the_outer_loop(design: Design, flown: Flown) -> None:
     far, which doubles the outer loop's gain and halves its lag.
     """
     found = flown(design.spec.name, "thermal")
-    lag = _merit(found.merits, "lag of the outer loop at this speed")
+    lag = _merit(found.merits, "lag if the mover goes where it is sent")
     assert lag == pytest.approx(65e-6 / 2.0 * 10e-3 / 0.5)
-    assert _merit(found.merits, "lag of the outer loop at the true speed") == pytest.approx(lag / 30)
+    assert _merit(found.merits, "the same at the true speed") == pytest.approx(lag / 30)
     run = found.cases[0].run
     outside = run.p[:, 2] + found.curves["drift"]
     read = outside[199::200][100:]  # what the laser sees, in the second half
@@ -698,7 +698,7 @@ ENDS = {
     "y1 stuck": False,
     "y1 biased by 50 um": True,
     "noise of all sensors x 10": True,
-    "phase 11_1 open": False,
+    "phase 21_1 open": False,
     "DC link sags by 50 % for 50 ms": True,
     "DC link sags by 90 % for 50 ms": True,
 }
@@ -710,7 +710,7 @@ def test_what_survives_a_hold(design: Design, flown: Flown) -> None:
     It falls as e^(219 t): 1.7 times as far after 50 samples, of less than a micrometre. Lost for good, a sensor brings
     it down in tens of milliseconds, from noise alone.
     """
-    found = flown(design.spec.name, "faults")
+    found = flown(design.spec.name, "faults", during="hold")
     assert {case.label: case.run.verdict.completed for case in found.cases} == ENDS
     assert found.merits[0].value == 11
     assert not found.failed
@@ -720,8 +720,8 @@ def test_what_survives_a_hold(design: Design, flown: Flown) -> None:
             assert math.isnan(touched)
         else:
             assert case.run.contact[:, :2].max() > 1
-            assert 0.03 < touched < 0.25
-            assert _merit(case.merits, "largest deviation") == pytest.approx(0.61e-3, rel=0.02)
+            assert 0.005 < touched < 0.25
+            assert 0.5e-3 < _merit(case.merits, "largest deviation") < 0.63e-3
         if "lost" in case.label or "missed" in case.label or "sags" in case.label or "5 ms" in case.label:
             assert _merit(case.merits, "largest deviation") < 4e-6
             assert _merit(case.merits, "deviation at the end") < 1e-6
@@ -743,7 +743,7 @@ def test_before_it_strikes_a_fault_is_not_there(design: Design, flown: Flown) ->
         )
         for kind, options in kinds.items()
     }
-    for case in flown(design.spec.name, "faults").cases:
+    for case in flown(design.spec.name, "faults", during="hold").cases:
         kind = "phase" if "phase" in case.label else "noise" if "bias" in case.label else "listed"
         run, other = case.run, whole["noise" if "noise" in case.label else kind]
         assert np.array_equal(run.x[: STRUCK + 1], other.x[: STRUCK + 1]), case.label
@@ -762,10 +762,10 @@ def test_a_biased_sensor_moves_the_mover_as_the_linear_loop_does(design: Design,
         trace[k] = stage.Cd @ state[: len(stage.Ad)]
         state = stage.closed @ state + step
     linear = np.abs(trace[:, :4])
-    case = _case(flown(design.spec.name, "faults", **LINEAR), "y1 biased by 50 um")
+    case = _case(flown(design.spec.name, "faults", during="hold", **LINEAR), "y1 biased by 50 um")
     assert _merit(case.merits, "largest deviation") == pytest.approx(linear.max(), rel=1e-3)
     assert _merit(case.merits, "deviation at the end") == pytest.approx(linear[-1].max(), rel=1e-3)
-    windings = _case(flown(design.spec.name, "faults"), "y1 biased by 50 um")
+    windings = _case(flown(design.spec.name, "faults", during="hold"), "y1 biased by 50 um")
     assert _merit(windings.merits, "largest deviation") == pytest.approx(linear.max(), rel=0.1)
     if design.spec.name == "calibrated":
         assert trace[-1, 1] == pytest.approx(-50e-6, rel=0.15)
@@ -775,7 +775,7 @@ def test_a_biased_sensor_moves_the_mover_as_the_linear_loop_does(design: Design,
 
 
 def test_noise_times_ten_is_ten_times_the_noise(design: Design, flown: Flown) -> None:
-    run = _case(flown(design.spec.name, "faults"), "noise of all sensors x 10").run
+    run = _case(flown(design.spec.name, "faults", during="hold"), "noise of all sensors x 10").run
     noise = run.y - run.p
     before, after = noise[:STRUCK].std(axis=0), noise[STRUCK:].std(axis=0)
     steps = np.array(design.plant.resolution) / math.sqrt(12)
@@ -784,7 +784,7 @@ def test_noise_times_ten_is_ten_times_the_noise(design: Design, flown: Flown) ->
 
 
 def test_a_stuck_sensor_repeats_itself(design: Design, flown: Flown) -> None:
-    found = flown(design.spec.name, "faults")
+    found = flown(design.spec.name, "faults", during="hold")
     for label, samples in (("y1 stuck for 5 ms", 100), ("50 samples lost", 50), ("one sample lost", 1)):
         y = _case(found, label).run.y
         columns = [1] if "stuck" in label else [0, 1, 2, 3, 4]
@@ -811,25 +811,39 @@ def test_a_link_that_cannot_carry_the_weight_drops_the_mover(
     assert lowest > -2e-6 if survives else lowest < -0.6e-3
 
 
-def test_the_open_phase_of_the_list_carries_no_current(designs: dict[str, Design], flown: Flown) -> None:
-    """At z = 0 winding 11 has no part in the weight: noise winds up the integrals that it leaves without a winding, and
-    touchdown comes late. Windings 21 and 31 carry 0.3 A of it; without one of them the mover falls in 18 ms."""
+def test_the_open_phase_of_the_list_carries_the_weight(designs: dict[str, Design], flown: Flown) -> None:
+    """Windings 21 and 31 hold the mover up at z = 0; without one of them it falls in some 10 ms. 11 has no part in it:
+    noise winds up the integrals that it leaves without a winding, and touchdown comes late."""
     design = designs["calibrated"]
     names = [s.name for s in design.plant.drive.phases]
-    late = _case(flown("calibrated", "faults"), "phase 11_1 open").run
-    assert abs(late.i_phase[STRUCK - 100, names.index("i_11_1")]) < 0.02
-    assert late.verdict.time > 0.05 + 0.05
-    for phase in ("i_21_1", "i_31_1"):
-        fault = Fault("open phase", 0.05, what=phase)
-        scenario = Scenario("open", 0.1, references.hold, faults=(fault,), bearing=True, fidelity="phase")
-        run = simulate(design.plant, design.controller, scenario)
-        carried = abs(run.i_phase[STRUCK - 100, names.index(phase)])
-        assert carried == pytest.approx(
-            design.plant.mass * 9.81 / 2 / 5.2 * math.sin(2 * math.pi / 3), rel=0.02
-        )
-        assert run.verdict.name == "touchdown at sensor plane 1"
-        assert 0.06 < run.verdict.time < 0.075
-        assert np.abs(run.i_phase[STRUCK + 10 :, names.index(phase)]).max() < 1e-6
+    listed = _case(flown("calibrated", "faults", during="hold"), "phase 21_1 open").run
+    carried = abs(listed.i_phase[STRUCK - 100, names.index("i_21_1")])
+    assert carried == pytest.approx(design.plant.mass * 9.81 / 2 / 5.2 * math.sin(2 * math.pi / 3), rel=0.05)
+    assert 0.005 < listed.verdict.time - 0.05 < 0.025
+    assert np.abs(listed.i_phase[STRUCK + 10 :, names.index("i_21_1")]).max() < 1e-6
+    idle = Scenario(
+        "open",
+        0.1,
+        references.hold,
+        faults=(Fault("open phase", 0.05, what="i_11_1"),),
+        bearing=True,
+        fidelity="phase",
+    )
+    assert simulate(design.plant, design.controller, idle).verdict.completed
+
+
+def test_a_fault_during_the_stroke_is_harder_to_bear(design: Design, flown: Flown) -> None:
+    """It strikes where the reference accelerates most; a link of a tenth then has no thrust and no levitation left."""
+    moving, resting = (flown(design.spec.name, "faults", **o) for o in ({}, {"during": "hold"}))
+    run = moving.cases[0].run
+    acceleration = np.gradient(np.gradient(run.reference[:, 4], run.t), run.t)
+    assert run.t[acceleration.argmax()] == pytest.approx(0.05, abs=0.2e-3)
+    for label in ("50 samples lost", "50 control steps missed", "y1 stuck for 5 ms"):
+        sizes = [_merit(_case(found, label).merits, "largest deviation") for found in (moving, resting)]
+        assert sizes[0] > 1.5 * sizes[1]
+    sag = "DC link sags by 90 % for 50 ms"
+    assert _case(resting, sag).run.verdict.completed
+    assert not _case(moving, sag).run.verdict.completed
 
 
 # Drive limits
@@ -841,9 +855,9 @@ def test_the_fastest_stroke_stays_within_the_machine(design: Design, flown: Flow
     actuator, drive = design.plant.actuator, design.plant.drive
     assert not found.failed
     assert np.abs(found.curves["i"]).max() <= 0.8 * actuator.current_limit * (1 + 1e-6)
-    assert np.abs(found.curves["u"]).max() <= 0.9 * actuator.voltage_limit * (1 + 1e-6)
+    assert np.abs(found.curves["u"]).max() <= 0.7 * actuator.voltage_limit * (1 + 1e-6)
     assert found.merits[0].value == pytest.approx(4.0)
-    assert found.merits[1].value == pytest.approx(20.25)
+    assert found.merits[1].value == pytest.approx(15.75)
     symbol = ca.SX.sym("u", len(drive.axes))
     peak = ca.Function("peak", [symbol], [drive.peak(symbol)])
     for case in found.cases:
@@ -918,6 +932,19 @@ def test_what_an_experiment_does_not_take_is_refused(designs: dict[str, Design])
     assert _refused(design, "stroke", distance=0.0).field == "distance"
     assert _refused(design, "payload", masses=(-0.5,)).field == "m"
     assert _refused(design, "drive-limits", current_share=2.0).field == "current_share"
+    for name, option, value in (
+        ("tilt", "frequency", 0),
+        ("tilt", "radius", math.nan),
+        ("thermal", "faster", 0.0),
+        ("payload", "masses", ()),
+        ("stroke", "rise", "a"),
+        ("hold", "noise", "a"),
+        ("stroke", "reference", references.hold),
+        ("hold", "foo", 1),
+        ("faults", "during", "lunch"),
+    ):
+        assert option in _refused(design, name, **{option: value}).field
+    assert _refused(design, "hold", foo=1).found == "an unknown option"
 
 
 def test_every_experiment_bears_its_name_and_tells_its_progress(designs: dict[str, Design]) -> None:
@@ -963,7 +990,8 @@ def test_failure_is_a_run_that_should_not_have_ended(flown: Flown) -> None:
     assert two.outcome == "2 of 3 runs not completed (a case: touchdown at sensor plane 1 at 0.0724 s)"
     assert two.run is good.run
     assert not two.interrupted
-    assert Experiment("stroke", "?", (good, _ended(run, "interrupted")), ()).interrupted
+    stopped = Experiment("hold", "?", (good,), (), interrupted=True)
+    assert (stopped.failed, stopped.outcome) == (False, "interrupted after 1 runs")
 
 
 class _Stop:
