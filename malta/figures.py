@@ -19,6 +19,7 @@ import numpy as np
 from malta.data import in_unit, plant_of, published_value
 from malta.errors import InputError
 from malta.files import replace_files
+from malta.references import hold
 from malta.simulate import Trajectory, stroke_figures
 
 if TYPE_CHECKING:
@@ -363,7 +364,8 @@ def faults_figure(e: Experiment, _: Published | None = None) -> Figure:
     """The largest radial deviation after each fault against the clearance, and the four worst over time."""
     edge = clearance(e.run.plant) * 1e6
     survived = f"{e.merits[0].value:.0f} of {len(e.cases)} survived"
-    figure = _figure(_runs(e), "faults during a hold", survived, left=0.245, wspace=0.24)
+    during = "stroke" if e.run.scenario.reference is not hold else "hold"
+    figure = _figure(_runs(e), f"faults during a {during}", survived, left=0.245, wspace=0.24)
     bars, traces = figure.subplots(1, 2, width_ratios=(1, 1.25))
     for place, case in enumerate(e.cases):
         down, deviation = _touched(case.run), case.merits[0].value * 1e6

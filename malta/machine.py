@@ -23,6 +23,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import casadi as ca
@@ -75,6 +76,7 @@ class Parts(NamedTuple):
     theta: tuple[str, ...]  # names of the numbers, an entry for each
 
 
+@lru_cache(maxsize=64)
 def layout(plant: Plant, c: Controller, s: Setup) -> Layout:
     """What stands where."""
     n, m, p = len(c.states), len(c.forces), len(c.measurements)
@@ -199,6 +201,14 @@ def initial(plant: Plant, c: Controller, s: Setup, x: Any, xi_pred: Any, current
     return ca.densify(ca.vertcat(*(values.get(name, ca.SX.zeros(size)) for name, size in state.items())))
 
 
+@lru_cache(maxsize=32)
+def initial_state(plant: Plant, c: Controller, s: Setup) -> ca.Function:
+    """`initial` as a function of numbers: (x, xi_pred, current) -> state."""
+    sizes = (len(plant.states), len(c.states), len(plant.inputs))
+    arguments = [ca.SX.sym(name, size) for name, size in zip(("x", "xi_pred", "current"), sizes, strict=True)]
+    return ca.Function("initial", arguments, [initial(plant, c, s, *arguments)])
+
+
 def chained(p: Parts, c: Controller, substeps: int, block: int) -> ca.Function:
     """A block of samples on CasADi's virtual machine: (state, inputs) -> (states, rows); inputs = given, noise."""
     state, given = ca.SX.sym("state", p.sense.size1_in(0)), ca.SX.sym("given", p.sense.size1_in(1))
@@ -269,7 +279,7 @@ def _decided(
     C = _scheduled_C(c, y) if s.scheduled else None
     xi_hat = given["xi_hat"] if s.outside else estimated(g, controller["xi_pred"], y, C)
     p_ref, dp_ref, v_ff = (given[name] for name in ("p_ref", "dp_ref", "v_ff"))
-    xi_ref = ca.vertcat(state_reference(plant_of(c.parameters), p_ref, dp_ref), given["v_past"])
+    xi_ref = ca.vertcat(state_reference(plant_of(c.parameters))(p_ref, dp_ref), given["v_past"])
     e_now, frozen_now = controller["e"], controller["frozen"]
     xi_pred, e, frozen, v = commanded(g, xi_hat, e_now, frozen_now, y, p_ref, xi_ref, v_ff, v0)
     after: dict[str, Any] = {"xi_pred": xi_pred, "e": e, "frozen": frozen}
@@ -295,11 +305,12 @@ def _decided(
     return after, queue[:size], row
 
 
-def state_reference(believed: Plant, p_ref: Any, dp_ref: Any) -> Any:
-    """(P(z*)^-1 p*, its derivative): what the mechanical states should be."""
+@lru_cache(maxsize=16)
+def state_reference(believed: Plant) -> ca.Function:
+    """(p*, p*') -> (P(z*)^-1 p*, its derivative): what the mechanical states should be."""
     p, dp = ca.SX.sym("p", len(believed.outputs)), ca.SX.sym("dp", len(believed.outputs))
     q = believed.position_of(p)
-    return ca.Function("q", [p, dp], [ca.vertcat(q, ca.jtimes(q, p, dp))])(p_ref, dp_ref)
+    return ca.Function("q", [p, dp], [ca.densify(ca.vertcat(q, ca.jtimes(q, p, dp)))])
 
 
 def _scheduled_C(c: Controller, y: Any) -> Any:

@@ -274,8 +274,8 @@ def simulate(
     stages = _stages(plant, scenario, controller.sample_time)
     noise = _noise(stages, scenario, t)
     x, xi_pred, current = beginning(plant, controller, scenario, given[0])
-    first = machine.initial(plant, controller, setup, ca.DM(x), ca.DM(xi_pred), ca.DM(current))
-    state = np.array(ca.evalf(first)).ravel()
+    start = machine.initial_state(plant, controller, setup)
+    state = evaluate(start, x, xi_pred, current)[0].ravel()
     observer = _observer(plant, controller, scenario, setup) if setup.outside else None
     every = _every(scenario, controller.sample_time)
     stops = _stops(every, samples, [first for first, _ in stages])
@@ -624,12 +624,12 @@ def beginning(plant: Plant, c: Controller, scenario: Scenario, first: FloatArray
     p, n = len(plant.outputs), len(c.states)
     believed = plant_of(c.parameters)
     design = [s.name for s in plant.design_states]
-    moving = machine.state_reference(believed, ca.DM(first[:p]), ca.DM(first[p : 2 * p]))
-    x = plant.at(**(dict(zip(design, np.array(moving).ravel(), strict=True)) | dict(scenario.start))).x
+    moving = evaluate(machine.state_reference(believed), first[:p], first[p : 2 * p])[0].ravel()
+    x = plant.at(**(dict(zip(design, moving.tolist(), strict=True)) | dict(scenario.start))).x
     xi_pred, current = np.zeros(n), np.zeros(len(plant.inputs))
     if not scenario.cold:
         xi_pred[: len(design)] = x[list(plant.controlled)]
-        position = float(np.array(plant.h(ca.DM(x), 0))[plant.stroke_output, 0])
+        position = float(x[plant.stroke_state])
         current = c.feedforward.at(position) / np.array(believed.actuator.force_constant)
     return x, xi_pred, current
 

@@ -100,7 +100,7 @@ def _independent_stroke(plant: Plant, design: Design, samples: int, delay: int) 
     motion = references.stroke(plant, -5e-3, 5e-3, 16.2e-3, 0.05)(t)
     v_ff = feedforward(c, motion)
     xi_ref = np.array(
-        [np.array(state_reference(plant, p, dp)).ravel() for p, dp in zip(*motion[:2], strict=True)]
+        [np.array(state_reference(plant)(p, dp)).ravel() for p, dp in zip(*motion[:2], strict=True)]
     )
     start = plant.at(z=motion.p[0, 4], z_dot=motion.dp[0, 4]).x
 

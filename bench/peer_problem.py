@@ -1,0 +1,209 @@
+"""The stroke as plain arrays, for the peers that are written by hand: what does not depend on how a loop is run.
+
+The law's matrices fall apart into (x, beta), (y, alpha) and z; what lies between them must be zero, and is left out.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from malta.controller import Controller
+from malta.plants.tubular import Parameters
+
+if TYPE_CHECKING:
+    from malta.plant import FloatArray
+
+NO_SPIN = 0.0  # rad/s
+
+
+class Radial(NamedTuple):
+    """The law of (x, beta) or (y, alpha): states position, angle and their rates, two forces, two measurements."""
+
+    C: FloatArray  # 2 x 2, of position and angle
+    L: FloatArray  # 4 x 2
+    K: FloatArray  # 2 x 4
+    Ki: FloatArray  # 2 x 2
+    A: FloatArray  # 4 x 2, of position and its rate, or of angle and its rate
+    B: FloatArray  # 4 x 2
+    limit: FloatArray  # 2, N
+
+
+class Axial(NamedTuple):
+    """The law of z: states z, z_dot."""
+
+    C: float
+    L: FloatArray  # 2
+    K: FloatArray  # 2
+    Ki: float
+    A: FloatArray  # z of z, z of z_dot, z_dot of z_dot
+    B: FloatArray  # 2
+    limit: float  # N
+
+
+class Machine(NamedTuple):
+    """What all machines share. The unit of time of the mover is a Runge-Kutta step."""
+
+    l_S: float
+    g: float
+    wave: float  # cogging F_c sin(pi (wave z + phase))
+    phase: float
+    decay: float  # of the forces' lag in half a step
+    r_max2: float
+    z_max: float
+    substeps: int
+
+
+class Law(NamedTuple):
+    """The law and its v0(z)."""
+
+    x: Radial
+    y: Radial
+    z: Axial
+    Ts: float
+    K: FloatArray  # 5 x 10
+    low: float  # of the grid of v0(z)
+    high: float
+    per_step: float  # intervals a metre
+    last: int  # interval
+    rows: FloatArray  # an interval each: value and slope of y1, y2, z, and two of padding
+
+
+class Problem(NamedTuple):
+    """One controller and one reference, and `count` machines."""
+
+    machine: Machine
+    law: Law
+    # 8 x count, as Body and Forces of peers/loop.h: 2 K_A / m, 2 K_A l_B^2 / I, m / I, F_c / m, omega_z I_zz / I; what
+    # a newton of the law adds to the sums over m, the moments over I, the thrust over m
+    bodies: FloatArray
+    start: FloatArray  # the mover's twelve states
+    v0: FloatArray  # of y1, y2, z at the start
+    p_ref: FloatArray  # k x 5
+    feed: FloatArray  # k x 5, K xi* + v_ff
+
+
+def problem(
+    par: Parameters,
+    c: Controller,
+    p_ref: FloatArray,
+    xi_ref: FloatArray,
+    v_ff: FloatArray,
+    substeps: int,
+    factors: FloatArray | None = None,
+) -> Problem:
+    """`factors`: count x 4, on m, K_A, K_B and K_D of `par`; None is one machine as it is."""
+    assert par.I_xx == par.I_yy, "gamma is left out"
+    assert par.r_max < 0.007 * par.l_S, "sines and cosines are good for 0.01 rad"
+    law, believed, h = law_of(c), c.parameters, c.sample_time / substeps
+    assert isinstance(believed, Parameters)
+    assert (par.I_max, c.delay) == (believed.I_max, 0), "the law limits what the machine would"
+    by = np.ones(4) if factors is None else factors.T
+    m, K_A, K_B, K_D = par.m * by[0], par.K_A * by[1], par.K_B * by[2], par.K_D * by[3]
+    inertia, push = par.I_xx, K_B / believed.K_B * h**2
+    bodies = [2 * K_A / m * h**2, 2 * K_A * par.l_B**2 / inertia * h**2, m / inertia, par.F_c / m * h**2]
+    bodies += [
+        NO_SPIN * par.I_zz / inertia * h + 0 * m,
+        push / m,
+        push * par.l_B / inertia,
+        K_D / believed.K_D / m * h**2,
+    ]
+    start = np.zeros(12)
+    start[[0, 1, 2, 3, 4, 6, 7, 8, 9, 10]] = xi_ref[0]
+    return Problem(
+        machine=Machine(
+            l_S=par.l_S,
+            g=par.g * h**2,
+            wave=2 / par.L_p,
+            phase=par.phi_c / math.pi,
+            decay=math.exp(-par.w_cc * h / 2),
+            r_max2=par.r_max**2,
+            z_max=par.z_max,
+            substeps=substeps,
+        ),
+        law=law,
+        bodies=np.array(bodies).reshape(8, -1),
+        start=start,
+        v0=c.feedforward.at(float(start[2]))[[1, 3, 4]],
+        p_ref=np.ascontiguousarray(p_ref, dtype=float),
+        feed=xi_ref @ law.K.T + v_ff,
+    )
+
+
+@lru_cache(maxsize=8)
+def law_of(c: Controller) -> Law:
+    """Once a controller; records compare by identity."""
+    ff, believed = c.feedforward, c.parameters
+    assert isinstance(believed, Parameters)
+    constants = np.array([believed.K_B] * 4 + [2 * believed.K_D])
+    assert np.allclose(c.limits.force, believed.I_max * constants, rtol=1e-15)
+    steps = np.diff(ff.z_grid)
+    assert np.ptp(steps) < 1e-12, "the table is looked up on an even grid"
+    assert np.abs(ff.v0[:, [0, 2]]).max() < 1e-20, "gravity does not act along x"
+    left = {name: np.array(getattr(c, name)) for name in ("Ad", "Bd", "Cd", "K", "Ki", "L")}
+    x, y = (_radial(c, left, s, f) for s, f in (([0, 4, 5, 9], [0, 2]), ([1, 3, 6, 8], [1, 3])))
+    z = _axial(c, left)
+    assert not any(M.any() for M in left.values()), "couplings that are left out"
+    v0 = ff.v0[:, [1, 3, 4]]
+    rows = np.zeros((len(steps), 8))
+    rows[:, 0:6:2], rows[:, 1:6:2] = v0[:-1], np.diff(v0, axis=0)
+    return Law(
+        x=x,
+        y=y,
+        z=z,
+        Ts=c.sample_time,
+        K=c.K,
+        low=float(ff.z_grid[0]),
+        high=float(ff.z_grid[-1]),
+        per_step=float(1 / steps.mean()),
+        last=len(steps) - 1,
+        rows=rows,
+    )
+
+
+@lru_cache(maxsize=8)
+def packed(c: Controller) -> FloatArray:
+    """The numbers of `Law` in its order, without K and rows: 42 of x, 42 of y, 12 of z, 5."""
+    law = law_of(c)
+    return np.concatenate(
+        [np.ravel(M) for M in (*law.x, *law.y, *law.z, law.Ts, law.low, law.high, law.per_step, law.last)]
+    )
+
+
+def _taken(M: FloatArray, rows: list[int], columns: list[int]) -> FloatArray:
+    """A block of a matrix, which is zeroed there: in the end nothing may be left."""
+    block = M[np.ix_(rows, columns)]
+    M[np.ix_(rows, columns)] = 0
+    return block
+
+
+def _radial(c: Controller, left: dict[str, FloatArray], states: list[int], forces: list[int]) -> Radial:
+    A = _taken(left["Ad"], states, states)
+    pairs = [[j % 2, j % 2 + 2] for j in range(4)]
+    assert not any(A[j, k] for j in range(4) for k in range(4) if k not in pairs[j])
+    return Radial(
+        C=_taken(left["Cd"], forces, states[:2]),
+        L=_taken(left["L"], states, forces),
+        K=_taken(left["K"], forces, states),
+        Ki=_taken(left["Ki"], forces, forces),
+        A=np.array([A[j, pair] for j, pair in enumerate(pairs)]),
+        B=_taken(left["Bd"], states, forces),
+        limit=c.limits.force[forces],
+    )
+
+
+def _axial(c: Controller, left: dict[str, FloatArray]) -> Axial:
+    A = _taken(left["Ad"], [2, 7], [2, 7])
+    assert A[1, 0] == 0
+    return Axial(
+        C=float(_taken(left["Cd"], [4], [2])[0, 0]),
+        L=_taken(left["L"], [2, 7], [4]).ravel(),
+        K=_taken(left["K"], [4], [2, 7]).ravel(),
+        Ki=float(_taken(left["Ki"], [4], [4])[0, 0]),
+        A=A[[0, 0, 1], [0, 1, 1]],
+        B=_taken(left["Bd"], [2, 7], [4]).ravel(),
+        limit=float(c.limits.force[4]),
+    )
