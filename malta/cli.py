@@ -160,6 +160,9 @@ def simulate(
     profile: Annotated[
         str | None, typer.Option(help="stroke: logistic or quintic reference. [logistic]")
     ] = None,
+    during: Annotated[
+        str | None, typer.Option(help="faults: strike during a stroke or a hold. [stroke]")
+    ] = None,
     fidelity: Annotated[
         str | None,
         typer.Option(help="What makes the forces: force (first-order lags), dq (PI loops), phase. [dq]"),
@@ -228,6 +231,7 @@ def simulate(
         "distance": None if distance is None else distance * 1e-3,
         "rise": None if rise is None else rise * 1e-3,
         "profile": profile,
+        "during": during,
         "fidelity": fidelity,
         "noise": noise,
         "quantize": quantize,

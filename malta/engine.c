@@ -30,8 +30,13 @@ static inline real pick(whole m, real a, real b) { return value((m & bits(a)) | 
 #endif
 static inline real truth(whole m) { return value(m & bits((real){0} + 1.0)); }
 static inline real where(whole m, real x) { return value(m & bits(x)); }
+#if LANES == 8 && defined(__AVX512DQ__)
+static inline real larger(real a, real b) { return (real)_mm512_max_pd((__m512d)a, (__m512d)b); }
+static inline real smaller(real a, real b) { return (real)_mm512_min_pd((__m512d)a, (__m512d)b); }
+#else
 static inline real larger(real a, real b) { return pick(MASK(a > b), a, b); }
 static inline real smaller(real a, real b) { return pick(MASK(a < b), a, b); }
+#endif
 static inline real size(real x) { return value(bits(x) & 0x7fffffffffffffffLL); }
 #define K(x) ((x) - (real){0}) /* a constant in every lane */
 #define EACH(name, call) /* through an array: compilers make one instruction of sqrt, floor and fabs */ \

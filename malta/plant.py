@@ -194,7 +194,9 @@ class OperatingPoint:
 
 
 def readonly(array: ArrayLike) -> FloatArray:
-    """A private copy that cannot be written to."""
+    """A private copy that cannot be written to; what already cannot be is taken as it is."""
+    if isinstance(array, np.ndarray) and array.dtype == float and not array.flags.writeable:
+        return array
     copy = np.array(array, dtype=float)
     copy.flags.writeable = False
     return copy

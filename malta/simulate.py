@@ -314,6 +314,8 @@ def simulate(
             raise
         verdict = Verdict("interrupted", float(t[done - 1]))
     table = np.concatenate(parts) if len(parts) > 1 else parts[0]
+    for array in (table, given, t):
+        array.flags.writeable = False  # the trajectory's series are views of them
     sizes = machine.layout(plant, controller, setup).row
     columns = dict(zip(sizes, np.split(table, np.cumsum([*sizes.values()])[:-1], axis=1), strict=True))
     if setup.bearing and (verdict is None or verdict.name in plant.contacts):  # what it touched first
@@ -473,6 +475,8 @@ def _judged(
 ) -> tuple[FloatArray, Verdict | None]:
     """The rows up to the first at which the machine touches something or its state is no number."""
     contact = _columns(plant, c, setup, rows, "contact")
+    if np.isfinite(rows[-1]).all() and contact.max() < 1:
+        return rows, None  # a state that is no number stays none
     lost = np.atleast_1d(~np.isfinite(rows).all(axis=1))
     touching = contact >= 1
     if setup.bearing:  # the touchdown bearings hold it: only what has no bearing ends the run

@@ -651,6 +651,7 @@ def test_claims_prints_the_ledger(run: Run) -> None:
         ("simulate nothing.json", "nothing.json: found no such file", "a gain file"),
         ("simulate TABLE2 --scenario orbit", "scenario: found 'orbit'", "one of stroke, hold, tilt"),
         ("simulate TABLE2 --scenario hold --rise 3", "hold: rise: found an option of another scenario", "none"),
+        ("simulate TABLE2 --scenario faults --during lunch", "faults: during: found 'lunch'", "stroke or hold"),
         ("simulate TABLE2 --fidelity exact", "fidelity: found 'exact'", "one of force, dq, phase"),
         ("simulate TABLE2 --estimator ukf", "estimator: found 'ukf'", "one of steady-state, kalman, extended"),
         ("simulate TABLE2 --engine jit", "engine: found 'jit'", "one of auto, compiled, virtual machine"),
