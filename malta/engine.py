@@ -39,8 +39,10 @@ if TYPE_CHECKING:
     from malta.plant import FloatArray
 
 LANES = 8
-FLAGS = ("-std=gnu11", "-O3", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math")
-FLAGS += ("-fschedule-insns", "-fsched-pressure", "-fPIC", "-shared")
+FLAGS = (
+    *("-std=gnu11", "-O3", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math"),
+    *("-fschedule-insns", "-fsched-pressure", "-fPIC", "-shared"),
+)
 
 _BINARY = {"ADD": "+", "SUB": "-", "MUL": "*"}
 _TRUTH = {"LT": "<", "LE": "<=", "EQ": "==", "NE": "!="}
