@@ -14,6 +14,8 @@ import numpy as np
 from peer_problem import NO_SPIN, packed, problem
 
 from malta.controller import Controller
+from malta.data import plant_of
+from malta.engine import feedforward_table
 from malta.plants.tubular import Parameters
 
 if TYPE_CHECKING:
@@ -65,6 +67,44 @@ def single(
         ctypes.c_int64(len(p_ref)),
         _at(given.p_ref),
         _at(given.feed),
+        _at(p),
+        _at(x),
+    )
+    return p[:done], x[:done]
+
+
+def plain(
+    par: Parameters,
+    controller: Controller,
+    p_ref: FloatArray,
+    xi_ref: FloatArray,
+    v_ff: FloatArray,
+    *,
+    substeps: int = 4,
+) -> tuple[FloatArray, FloatArray]:
+    """The same as `single`, from the equations as they stand in malta, with the system's plain -O3."""
+    c, ff = controller, controller.feedforward
+    h = c.sample_time / substeps
+    wave, decay = 2 * np.pi / par.L_p, np.exp(-par.w_cc * h / 2)
+    body = [par.m, par.I_xx, par.I_yy, par.I_zz, par.K_A, par.l_B, par.l_S, wave, par.phi_c, par.F_c, par.g]
+    machine = np.array([*body, par.r_max, par.z_max, decay, h])
+    matrices = (c.L, c.Cd, c.Ad, c.Bd, c.K, c.Ki, c.limits.force, np.array(c.sample_time))
+    law = np.concatenate([np.ravel(M) for M in matrices])
+    grid = feedforward_table(ff.z_grid, ff.v0)
+    plant = plant_of(par)
+    mechanical = dict(zip([s.name for s in plant.design_states], xi_ref[0].tolist(), strict=True))
+    x0 = plant.at(**mechanical).x
+    state = np.concatenate([x0, ff.at(x0[2]), xi_ref[0], np.zeros(10)])
+    p, x = np.empty((len(p_ref), 5)), np.empty((len(p_ref), 12))
+    done = _library("plain").plain(
+        _at(machine),
+        _at(law),
+        ctypes.c_long(len(grid)),
+        _at(grid),
+        ctypes.c_long(len(p_ref)),
+        ctypes.c_long(substeps),
+        *(_at(np.ascontiguousarray(a)) for a in (p_ref, xi_ref, v_ff)),
+        _at(state),
         _at(p),
         _at(x),
     )
