@@ -18,7 +18,7 @@ import numpy as np
 
 from malta import machine
 from malta.controller import Controller
-from malta.data import units_of
+from malta.data import twins_of, units_of
 from malta.engine import LANES, evaluate, feedforward_table, in_lanes, run_many
 from malta.errors import InputError
 from malta.machine import Setup
@@ -100,25 +100,22 @@ def simulate_many(
     values = machine.numbers(plant, controller, scenario.substeps, scenario.sensor_errors)
     theta = _thetas(plant, values, changes, runs)
     t, motion, given = sampled(plant, controller, scenario, setup)
-    begin = _starts(plant, controller, setup, values, *beginning(plant, controller, scenario, given[0]))
-    states = _mapped(begin, theta)
+    first_state = beginning(plant, controller, scenario, given[0])
+    states, noise = _mapped(_starts(plant, controller, setup, values, *first_state), theta)
     axis = plant.stroke_output
-    sizes = _digest_sizes(plant)
-    kept = np.zeros((runs, sum(sizes.values())))
     start, end = motion.p[0, axis], motion.p[-1, axis]
-    kept[:, :3] = [1, start, 1 / (end - start) if end != start else 0]
-    kept[:, 4 : 4 + len(LEVELS)] = kept[:, -1:] = -1
-    symbols, _, numbers = machine.numbered(plant, values)
-    noise = ca.Function("noise", [numbers], [scenario.noise * ca.densify(ca.vertcat(*symbols.noise))])
+    scale = 1 / (end - start) if end != start else 0
+    known = {"alive": 1.0, "start": start, "scale": scale, "reached": -1.0, "touched": -1.0}
+    sizes = _digest_sizes(plant)
+    kept = np.tile(np.repeat([known.get(name, 0.0) for name in sizes], [*sizes.values()]), (runs, 1))
     ff = controller.feedforward
     table = feedforward_table(ff.z_grid, ff.v0)
     groups = -(-runs // LANES)
-    rows = {"theta": theta, "states": states, "sigma": _mapped(noise, theta), "digests": kept}
+    rows = {"theta": theta, "states": states, "sigma": scenario.noise * noise, "digests": kept}
     lanes = {name: in_lanes(array, groups) for name, array in rows.items()}
     streams = keys(scenario.seed, first + np.minimum(np.arange(groups * LANES), runs - 1))
-    step = max(
-        1, min(16, groups // (4 * (workers or os.cpu_count() or 1)))
-    )  # groups in one call, for the progress bar
+    workers = workers or os.cpu_count() or 1
+    step = max(1, min(16, groups // (4 * workers)))  # groups in one call, for the progress bar
 
     def fly(k: int) -> None:
         run_many(
@@ -131,7 +128,7 @@ def simulate_many(
             **lanes,
         )
 
-    with ThreadPoolExecutor(workers or os.cpu_count()) as pool:
+    with ThreadPoolExecutor(workers) as pool:
         try:
             for done, _ in enumerate(pool.map(fly, range(0, groups, step))):
                 if progress is not None:
@@ -185,12 +182,10 @@ def _thetas(
         for extreme in (column.min(), column.max()):  # NaN comes out of both
             replace(plant.parameters, **{name: float(extreme)})
         theta[:, place[f"machine.{name}"]] = column
-    for name, f in plant.parameters.__dataclass_fields__.items():
-        twin = f.metadata.get("twin")
-        if twin and getattr(plant.parameters, name) == getattr(plant.parameters, twin):
-            pair = theta[:, place[f"machine.{name}"]], theta[:, place[f"machine.{twin}"]]
-            if not np.array_equal(*pair):
-                raise InputError("campaign", name, f"values unlike {twin}", f"the same, as in {plant.name}")
+    for name, twin in twins_of(plant.parameters).items():
+        pair = theta[:, place[f"machine.{name}"]], theta[:, place[f"machine.{twin}"]]
+        if not np.array_equal(*pair):
+            raise InputError("campaign", name, f"values unlike {twin}", f"the same, as in {plant.name}")
     return theta
 
 
@@ -203,16 +198,17 @@ def _starts(
     xi_pred: FloatArray,
     current: FloatArray,
 ) -> ca.Function:
-    """theta -> the state in which a machine starts."""
+    """theta -> the state in which a machine starts, and the noise of its sensors."""
     symbolic, _, theta = machine.numbered(plant, values)
     first = machine.initial(symbolic, c, setup, ca.DM(x), ca.DM(xi_pred), ca.DM(current))
-    return ca.Function("start", [theta], [first])
+    return ca.Function("start", [theta], [first, ca.densify(ca.vertcat(*symbolic.noise))])
 
 
-def _mapped(function: ca.Function, rows: FloatArray) -> FloatArray:
-    """A function of one row on all rows."""
+def _mapped(function: ca.Function, rows: FloatArray) -> list[FloatArray]:
+    """A function of one row on all rows: each of its results."""
     parts = np.array_split(rows, -(-len(rows) // BLOCK))
-    return np.vstack([evaluate(function.map(len(part)), part)[0] for part in parts])
+    found = [evaluate(function.map(len(part)), part) for part in parts]
+    return [np.vstack(column) for column in zip(*found, strict=True)]
 
 
 def _digest_sizes(plant: Plant) -> dict[str, int]:

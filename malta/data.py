@@ -76,6 +76,12 @@ def units_of(record: type[Parameters] | Parameters) -> dict[str, str]:
     return {f.name: f.metadata["unit"] for f in fields(record) if "unit" in f.metadata}
 
 
+def twins_of(record: Parameters) -> dict[str, str]:
+    """The parameters that symbolic models take as one with another: declared twins of equal value."""
+    declared = {f.name: f.metadata.get("twin") for f in fields(record)}
+    return {k: twin for k, twin in declared.items() if twin and getattr(record, k) == getattr(record, twin)}
+
+
 def check_parameters(record: Parameters, where: str | Path = "parameters") -> None:
     """Refuse values that no machine has (NaN, a negative mass): InputError names the field."""
     for f in fields(record):

@@ -54,16 +54,19 @@ def K_L_inverse(theta: Any) -> Any:
     return 1.5 * K_L(theta).T
 
 
+def _around() -> Any:
+    """3 x 3: zero sequence and the two fixed bearing axes, at 0 (d) and pi/2 (q)."""
+    return ca.vertcat(K_R(0), K_R(math.pi / 2)[1, :])
+
+
 def to_axes(theta: Any) -> Any:
     """6 x 9: a module's phase quantities (x_11 x_12 x_13 x_21 ...) to AXES, phi fixed at 0 (d) and pi/2 (q)."""
-    around = ca.vertcat(K_R(0), K_R(math.pi / 2)[1, :])
-    return ca.kron(around, K_L(theta).T)
+    return ca.kron(_around(), K_L(theta).T)
 
 
 def to_phases(theta: Any) -> Any:
     """9 x 6: AXES to phase quantities, the Moore-Penrose inverse of `to_axes`."""
-    around = ca.vertcat(K_R(0), K_R(math.pi / 2)[1, :])
-    return ca.kron(around.T @ ca.diag(ca.DM([3, 1.5, 1.5])), K_L_inverse(theta).T)
+    return ca.kron(_around().T @ ca.diag(ca.DM([3, 1.5, 1.5])), K_L_inverse(theta).T)
 
 
 def magnitude_and_angle(f_x: float, f_y: float, K_B: float, phi_before: float = 0.0) -> tuple[float, float]:

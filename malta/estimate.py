@@ -48,9 +48,8 @@ def observer(plant: Plant, c: Controller, setup: Setup, kind: str, substeps: int
     commands = slice(edges["v"], edges["v"] + sizes["v"])
     stroke = plant_of(c.parameters).stroke_output
     n = len(c.A)
-    sent: list[FloatArray] = [
-        np.zeros(len(c.forces))
-    ] * c.delay  # v - v0 of the last samples, the oldest first
+    # v - v0 of the last samples, the oldest first
+    sent: list[FloatArray] = [np.zeros(len(c.forces))] * c.delay
     loads: list[FloatArray] = []
     started = False
 
@@ -121,21 +120,17 @@ def _linear(c: Controller) -> Callable[..., tuple[FloatArray, FloatArray]]:
 
 
 def _nonlinear(c: Controller) -> Callable[..., tuple[FloatArray, FloatArray]]:
-    """One Runge–Kutta step of the believed machine under v + v0, with its loads and bearings, and its Jacobian."""
+    """A sample of the believed machine under v + v0, with its loads and bearings, and its Jacobian."""
     believed = plant_of(c.parameters)
     x, u = ca.SX.sym("x", len(believed.states)), ca.SX.sym("u", len(c.forces))
     h = c.sample_time / 4
 
-    def rate(z: Any) -> Any:
+    def rate(z: Any, _: int) -> Any:
         return believed.f(z, u, believed.load(z) + believed.bearing(z))
 
     z = x
     for _ in range(4):
-        k1 = rate(z)
-        k2 = rate(z + h / 2 * k1)
-        k3 = rate(z + h / 2 * k2)
-        k4 = rate(z + h * k3)
-        z = z + h / 6 * (k1 + 2 * (k2 + k3) + k4)
+        z = machine.runge_kutta(rate, z, h)
     chosen = list(believed.controlled)
     step = ca.Function("step", [x, u], [z[chosen], ca.jacobian(z, x)[chosen, chosen]])
 

@@ -57,24 +57,10 @@ Progress = Callable[[float], None]
 DISTANCE = 10e-3  # m, the published stroke, Fig. 12
 FINDINGS = ("payload", "disturbance", "faults")  # experiments that ask where it ends
 # Fields of a scenario that may replace an experiment's own, and the engine.
-OPTIONS = {
-    "duration",
-    "noise",
-    "quantize",
-    "sensor_errors",
-    "seed",
-    "run",
-    "delay",
-    "substeps",
-    "fidelity",
-    "engine",
-}
-OPTIONS |= {"real_pwm", "bearing_axes", "bearing", "estimator", "scheduled", "feedforward"}
-REAL: dict[str, Any] = {
-    "noise": 1.0,
-    "quantize": True,
-    "sensor_errors": {},
-}  # sensors as built, no errors of their own
+OPTIONS = {"duration", "noise", "quantize", "sensor_errors", "seed", "run", "delay", "substeps", "fidelity"}
+OPTIONS |= {"real_pwm", "bearing_axes", "bearing", "estimator", "scheduled", "feedforward", "engine"}
+# Sensors as built, without errors of their own; and such that say the truth.
+REAL: dict[str, Any] = {"noise": 1.0, "quantize": True, "sensor_errors": {}}
 QUIET: dict[str, Any] = {"noise": 0.0, "quantize": False, "sensor_errors": None}
 
 
@@ -110,6 +96,10 @@ class Experiment:
     merits: tuple[Merit, ...]
     curves: Mapping[str, FloatArray] = field(default_factory=dict)  # what is drawn beside the runs
     interrupted: bool = False  # by Ctrl-C: the cases are those that were begun
+
+    def __str__(self) -> str:
+        cases = ("; ".join([case.label, *map(str, case.merits)]) for case in self.cases)
+        return "\n  ".join([f"{self.name}: {self.outcome}", *cases])
 
     @property
     def run(self) -> Trajectory:

@@ -21,24 +21,24 @@ controllers and the windings in `dq` and `phase`, where computation really takes
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
 import casadi as ca
 import numpy as np
 
 from malta import electric
 from malta.controller import Controller, commanded, estimated, gains_of
-from malta.data import plant_of, units_of
+from malta.data import plant_of, twins_of, units_of
 from malta.plant import Plant, symbolic
 
 if TYPE_CHECKING:
     from malta.plant import FloatArray
 
 Fidelity = Literal["force", "dq", "phase"]
-FIDELITIES: tuple[Fidelity, ...] = ("force", "dq", "phase")
+FIDELITIES: tuple[Fidelity, ...] = get_args(Fidelity)
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ def layout(plant: Plant, c: Controller, s: Setup) -> Layout:
         "dq": {"i": axes, "link": 1},
         "phase": {"i_phase": phases, "link": 1},
     }[s.fidelity]
-    held = {"force": m, "dq": axes, "phase": phases}[s.fidelity]
+    held = _held(plant, s)
     controller = {"xi_pred": n, "e": p, "frozen": p}
     if s.fidelity != "force":
         controller |= {"u_integral": axes, "u_limited": axes}
@@ -235,11 +235,7 @@ def _symbols(sizes: Mapping[str, int]) -> dict[str, Any]:
 def _symbolic_parameters(plant: Plant, g: Mapping[str, Any]) -> Any:
     par = plant.parameters
     symbols = {name: g[f"machine.{name}"] for name in units_of(par)}
-    for name in symbols:
-        twin = par.__dataclass_fields__[name].metadata["twin"]
-        if twin is not None and getattr(par, name) == getattr(par, twin):
-            symbols[name] = symbols[twin]
-    return symbolic(par, symbols)
+    return symbolic(par, symbols | {name: symbols[twin] for name, twin in twins_of(par).items()})
 
 
 def _held(plant: Plant, s: Setup) -> int:
@@ -410,24 +406,24 @@ def _moved(
         lag = machine["force"] - held
         decay = ca.exp(-plant.actuator.crossover * h / 2)
         forces = [held + lag, held + decay * lag, held + decay**2 * lag]
-        k1 = motion(x, forces[0])
-        k2 = motion(x + h / 2 * k1, forces[1])
-        k3 = motion(x + h / 2 * k2, forces[1])
-        k4 = motion(x + h * k3, forces[2])
-        return ca.vertcat(x + h / 6 * (k1 + 2 * (k2 + k3) + k4), forces[2])
+        return ca.vertcat(runge_kutta(lambda x, half: motion(x, forces[half]), x, h), forces[2])
     n, count = len(plant.states), machine["i" if s.fidelity == "dq" else "i_phase"].numel()
     slope = _axis_slope if s.fidelity == "dq" else _phase_slope
 
-    def rate(z: Any) -> Any:
+    def rate(z: Any, _: int) -> Any:
         x, i, V = z[:n], z[n : n + count], z[n + count]
         forces, electrics = slope(plant, s, given, x, i, V, held)
         return ca.vertcat(motion(x, forces), electrics)
 
-    z = ca.vertcat(*machine.values())
-    k1 = rate(z)
-    k2 = rate(z + h / 2 * k1)
-    k3 = rate(z + h / 2 * k2)
-    k4 = rate(z + h * k3)
+    return runge_kutta(rate, ca.vertcat(*machine.values()), h)
+
+
+def runge_kutta(rate: Callable[[Any, int], Any], z: Any, h: Any) -> Any:
+    """One step of the classical method, fourth order. rate: (z, half steps since the beginning: 0, 1 or 2) -> z'."""
+    k1 = rate(z, 0)
+    k2 = rate(z + h / 2 * k1, 1)
+    k3 = rate(z + h / 2 * k2, 1)
+    k4 = rate(z + h * k3, 2)
     return z + h / 6 * (k1 + 2 * (k2 + k3) + k4)
 
 

@@ -31,9 +31,8 @@ def normals(key: np.uint64, samples: int, channels: int) -> FloatArray:
     unit = 1 / 2**32
     radius = np.sqrt(-2 * np.log(((bits >> np.uint64(32)).astype(float) + 0.5) * unit))
     quadrant = ((bits >> np.uint64(30)) & np.uint64(3)).astype(float)
-    within = (
-        (bits & np.uint64(0x3FFFFFFF)).astype(float) - 536870911.5
-    ) / 2**30  # about the quadrant's middle
+    middle = 536870911.5  # of the 30 bits within a quadrant
+    within = ((bits & np.uint64(0x3FFFFFFF)).astype(float) - middle) / 2**30
     angle = (quadrant + within) * (np.pi / 2)
     drawn = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
     return drawn.reshape(-1, channels)[:samples]

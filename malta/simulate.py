@@ -20,7 +20,7 @@ import numpy as np
 
 from malta import machine, references
 from malta.controller import Controller, gains_of
-from malta.data import plant_of, units_of
+from malta.data import plant_of, twins_of, units_of
 from malta.engine import Engine, compiled_engine, evaluate, feedforward_table, library, source, virtual_engine
 from malta.errors import InputError
 from malta.files import replace_files
@@ -38,9 +38,9 @@ PORTION = 20_000  # samples between looks at how the run goes
 RISE = 16.2e-3  # s, 10-90 %: the published stroke, Fig. 12
 
 Estimator = Literal["steady-state", "kalman", "extended"]
-ESTIMATORS: tuple[Estimator, ...] = ("steady-state", "kalman", "extended")
+ESTIMATORS: tuple[Estimator, ...] = get_args(Estimator)
 FeedforwardChoice = Literal["axial", "attraction"]
-FEEDFORWARDS: tuple[FeedforwardChoice, ...] = ("axial", "attraction")
+FEEDFORWARDS: tuple[FeedforwardChoice, ...] = get_args(FeedforwardChoice)
 BearingAxes = Literal["fixed", "turning"]
 EngineChoice = Literal["auto", "compiled", "virtual machine"]
 FaultKind = Literal[
@@ -120,7 +120,7 @@ class Scenario:
             ("fidelity", FIDELITIES),
             ("estimator", ESTIMATORS),
             ("feedforward", FEEDFORWARDS),
-            ("bearing_axes", ("fixed", "turning")),
+            ("bearing_axes", get_args(BearingAxes)),
         ):
             if getattr(self, name) not in known:
                 raise InputError(where, name, repr(getattr(self, name)), "one of " + ", ".join(known))
@@ -229,8 +229,7 @@ class Trajectory:
         """Power into the windings, W, k; empty in fidelity `force`."""
         if not self.i.size:
             return np.empty(0)
-        own = self.plant.actuator.delay(self.controller.sample_time)
-        delay = min(own if self.scenario.delay is None else self.scenario.delay, len(self.u) - 1)
+        delay = min(setup_of(self.plant, self.controller, self.scenario).delay, len(self.u) - 1)
         acting = np.vstack([np.repeat(self.u[:1], delay, axis=0), self.u[: len(self.u) - delay]])
         return np.asarray((acting * self.i) @ np.array(self.plant.drive.weight))
 
@@ -266,8 +265,8 @@ def simulate(
     believed = plant_of(controller.parameters)
     if (plant.inputs, plant.outputs) != (believed.inputs, believed.outputs):
         raise InputError("simulate", "controller", f"gains of a {believed.name}", f"gains of a {plant.name}")
-    if engine not in ("auto", "compiled", "virtual machine"):
-        raise InputError("simulate", "engine", repr(engine), "one of auto, compiled, virtual machine")
+    if engine not in get_args(EngineChoice):
+        raise InputError("simulate", "engine", repr(engine), "one of " + ", ".join(get_args(EngineChoice)))
     setup = setup_of(plant, controller, scenario)
     t, motion, given = sampled(plant, controller, scenario, setup)
     samples = len(t)
@@ -299,7 +298,9 @@ def simulate(
                 progress(done / samples)
             if scenario.correction is not None and done < samples and done % every == 0:
                 offset = np.asarray(
-                    scenario.correction.update(float(t[done]), _outputs(plant, setup, controller, rows[-1])),
+                    scenario.correction.update(
+                        float(t[done]), _columns(plant, controller, setup, rows[-1], "p")
+                    ),
                     dtype=float,
                 )
                 if offset.shape != motion.p.shape[1:]:
@@ -307,8 +308,14 @@ def simulate(
                     raise InputError(
                         f"scenario {scenario.name}", "correction", f"shape {offset.shape}", expected
                     )
-                shifted = motion._replace(p=motion.p + offset)
-                given[done:] = _given(plant, controller, scenario, setup, shifted, t)[done:]
+                # Up to the next correction; the samples before are there for the feedforward under way.
+                before = min(done, controller.delay)
+                ahead = slice(done - before, done + every)
+                shifted = references.Motion(*(part[ahead] for part in motion))._replace(
+                    p=motion.p[ahead] + offset
+                )
+                new = _given(plant, controller, scenario, setup, shifted, t[ahead])
+                given[done : done + every] = new[before:]
     except KeyboardInterrupt:
         if not parts:
             raise
@@ -390,11 +397,7 @@ def shape_of(plant: Plant, c: Controller, setup: Setup) -> _Shape:
     """What the compiled functions of a plant and a controller depend on, beside numbers that they are given."""
     variant, par = plant.variant, plant.parameters
     kin = (variant.func, *sorted(variant.keywords.items())) if isinstance(variant, partial) else (variant,)
-    twins = tuple(
-        getattr(par, name) == getattr(par, f.metadata["twin"])
-        for name, f in par.__dataclass_fields__.items()
-        if f.metadata.get("twin")
-    )
+    twins = tuple(twins_of(par).items())
     patterns = tuple(
         (m.shape, *m.sparsity().get_triplet()[0], *m.sparsity().get_triplet()[1])
         for m in gains_of(c).values()
@@ -508,10 +511,6 @@ def _columns(plant: Plant, c: Controller, setup: Setup, rows: FloatArray, name: 
     return rows[..., first : first + sizes[name]]
 
 
-def _outputs(plant: Plant, setup: Setup, c: Controller, row: FloatArray) -> FloatArray:
-    return _columns(plant, c, setup, row, "p")
-
-
 def _given(
     plant: Plant,
     c: Controller,
@@ -548,9 +547,8 @@ def feedforward(c: Controller, motion: references.Motion, choice: FeedforwardCho
     if choice == "attraction":
         half = len(c.A) // 2
         hold = -np.linalg.lstsq(c.B[half:], c.A[half:, :half], rcond=None)[0]
-        p = ca.SX.sym("p", len(c.measurements))
-        positions = ca.Function("q", [p], [ca.densify(believed.position_of(p))]).map(len(motion.p))
-        v_ff += evaluate(positions, motion.p)[0] @ hold.T
+        states = evaluate(machine.state_reference(believed).map(len(motion.p)), motion.p, motion.dp)[0]
+        v_ff += states[:, :half] @ hold.T
     return v_ff
 
 

@@ -39,9 +39,7 @@ strokes = {}
 for key, controller in controllers.items():
     e = strokes[key] = malta.experiment("stroke", plants[key], controller)
     malta.report.experiment(e, f"build/03_{key}_stroke.png", published)
-    print(f"{key}: {e.outcome}")
-    for case in e.cases:
-        print("  " + "; ".join([case.label, *(str(merit) for merit in case.merits)]))
+    print(f"{key}, {e}")
 lagged = malta.experiment("stroke", plants["calibrated"], controllers["calibrated"], fidelity="force")
 figures = malta.stroke_figures(lagged.run)
 print(f"with first-order lags: axial error {figures.axial_error * 1e3:.2f} mm")
@@ -65,9 +63,7 @@ rests = {}
 for key, controller in controllers.items():
     e = rests[key] = malta.experiment("hold", plants[key], controller)
     malta.report.experiment(e, f"build/03_{key}_hold.png", published)
-    print(f"{key}: {e.outcome}")
-    for case in e.cases:
-        print("  " + "; ".join([case.label, *(str(merit) for merit in case.merits)]))
+    print(f"{key}, {e}")
 for e in rests.values():
     measured = e.run.y[-2000:, :4].std(axis=0) * 1e6
     true = e.run.p[-2000:, :4].std(axis=0) * 1e6
@@ -90,9 +86,7 @@ drifts = {}
 for key, controller in controllers.items():
     e = drifts[key] = malta.experiment("thermal", plants[key], controller)
     malta.report.experiment(e, f"build/03_{key}_thermal.png", published)
-    print(f"{key}: {e.outcome}")
-    for case in e.cases:
-        print("  " + "; ".join([case.label, *(str(merit) for merit in case.merits)]))
+    print(f"{key}, {e}")
 for e in drifts.values():
     left, raw = (case.merits[0].value for case in e.cases)
     assert left < 2e-6 < 60e-6 < raw
@@ -108,9 +102,7 @@ tilts = {}
 for key, controller in controllers.items():
     e = tilts[key] = malta.experiment("tilt", plants[key], controller)
     malta.report.experiment(e, f"build/03_{key}_tilt.png", published)
-    print(f"{key}: {e.outcome}")
-    for case in e.cases:
-        print("  " + "; ".join([case.label, *(str(merit) for merit in case.merits)]))
+    print(f"{key}, {e}")
 for key, e in tilts.items():
     as_printed, held = (case.merits[0].value * 1e6 for case in e.cases)
     print(
@@ -133,9 +125,7 @@ for name in ("lift-off", "payload", "faults"):
     for key, controller in controllers.items():
         e = malta.experiment(name, plants[key], controller)
         malta.report.experiment(e, f"build/03_{key}_{name}.png", published)
-        print(f"{key}, {name}: {e.outcome}")
-        for case in e.cases:
-            print("  " + "; ".join([case.label, *(str(merit) for merit in case.merits)]))
+        print(f"{key}, {e}")
 
 # %% [markdown]
 # **Judgement.** Every estimator lifts the mover; a filter that knows it lies on its bearing does so with hardly
@@ -153,16 +143,12 @@ stiff = {}
 for key, controller in controllers.items():
     e = stiff[key] = malta.experiment("disturbance", plants[key], controller)
     malta.report.experiment(e, f"build/03_{key}_disturbance.png", published)
-    print(f"{key}: {e.outcome}")
-    for case in e.cases:
-        print("  " + "; ".join([case.label, *(str(merit) for merit in case.merits)]))
+    print(f"{key}, {e}")
 limits = {}
 for key, controller in controllers.items():
     e = limits[key] = malta.experiment("drive-limits", plants[key], controller)
     malta.report.experiment(e, f"build/03_{key}_drive-limits.png", published)
-    print(f"{key}: {e.outcome}")
-    for case in e.cases:
-        print("  " + "; ".join([case.label, *(str(merit) for merit in case.merits)]))
+    print(f"{key}, {e}")
 fastest, sigmoid = (case.merits[0].value for case in limits["calibrated"].cases)
 print(f"rise {fastest * 1e3:.1f} ms against {sigmoid * 1e3:.1f} ms of the sigmoid at the same peak current")
 assert fastest < 0.85 * sigmoid
