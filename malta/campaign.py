@@ -54,10 +54,17 @@ class Batch:
     contact: FloatArray  # runs x contacts, largest share of each clearance that was used up
     rise: FloatArray  # s, 10-90 % of the stroke; NaN when it was not reached
     overshoot: FloatArray  # beyond the end, as a share of the stroke; NaN when the run ended early
+    saturated: FloatArray  # runs x inputs, share of the samples whose command was limited
+    verdict: FloatArray  # how it ended: index into `verdicts` of the plant
 
     def __post_init__(self) -> None:
         for name in self.__dataclass_fields__:
             object.__setattr__(self, name, readonly(getattr(self, name)))
+
+
+def verdicts(plant: Plant) -> tuple[str, ...]:
+    """How a run may end, the first of them as it should: the names of simulate.Verdict."""
+    return ("completed", "diverged", "not lifted", *plant.contacts)
 
 
 def simulate_many(
@@ -66,6 +73,7 @@ def simulate_many(
     scenario: Scenario,
     changes: Mapping[str, FloatArray],
     *,
+    sensor_errors: Mapping[str, FloatArray] | None = None,
     first: int = 0,
     workers: int | None = None,
     progress: Callable[[float], None] | None = None,
@@ -73,6 +81,7 @@ def simulate_many(
     """Run a scenario on many machines.
 
     changes : parameters of the machine by name, SI, a value for each run
+    sensor_errors : errors of the sensors by name, likewise, in place of the scenario's
     first : index of the first run; noise depends on scenario.seed and on the index
     workers : threads; None: one for each core
 
@@ -83,29 +92,30 @@ def simulate_many(
     for name in ("faults", "changes", "correction"):
         if getattr(scenario, name):
             raise InputError(where, name, "some", "none in a campaign")
+    scenario = _sensed(scenario, sensor_errors)
     setup = setup_of(plant, controller, scenario)
     if setup.outside:
         raise InputError(where, "estimator", scenario.estimator, "steady-state in a campaign")
     if workers is not None and workers < 1:
         raise InputError("campaign", "workers", str(workers), "at least 1")
-    runs = _count(plant, changes)
+    runs = _count(plant, changes, sensor_errors or {})
     if "T_d" in changes:
         raise InputError("campaign", "T_d", "a delay for each run", "one for all: it shapes the functions")
     shape = shape_of(plant, controller, setup)
     digest = _digest(shape)
     compiled = compiled_shape(shape, LANES, digest)
     if compiled is None:
-        return _one_by_one(plant, controller, scenario, changes, first, runs, progress)
+        return _one_by_one(plant, controller, scenario, changes, sensor_errors, first, runs, progress)
     lib, _ = compiled
     values = machine.numbers(plant, controller, scenario.substeps, scenario.sensor_errors)
-    theta = _thetas(plant, values, changes, runs)
+    theta = _thetas(plant, values, changes, sensor_errors or {}, runs)
     t, motion, given = sampled(plant, controller, scenario, setup)
     first_state = beginning(plant, controller, scenario, given[0])
     states, noise = _mapped(_starts(plant, controller, setup, values, *first_state), theta)
     axis = plant.stroke_output
     start, end = motion.p[0, axis], motion.p[-1, axis]
     scale = 1 / (end - start) if end != start else 0
-    known = {"alive": 1.0, "start": start, "scale": scale, "reached": -1.0, "touched": -1.0}
+    known = {"alive": 1.0, "start": start, "scale": scale, "reached": -1.0, "touched": -1.0, "culprit": -1.0}
     sizes = _digest_sizes(plant)
     kept = np.tile(np.repeat([known.get(name, 0.0) for name in sizes], [*sizes.values()]), (runs, 1))
     ff = controller.feedforward
@@ -141,19 +151,37 @@ def simulate_many(
 
 
 def replayed(
-    plant: Plant, scenario: Scenario, changes: Mapping[str, FloatArray], index: int, first: int = 0
+    plant: Plant,
+    scenario: Scenario,
+    changes: Mapping[str, FloatArray],
+    index: int,
+    first: int = 0,
+    sensor_errors: Mapping[str, FloatArray] | None = None,
 ) -> tuple[Plant, Scenario]:
     """Machine and scenario of one run of `simulate_many`, for `simulate`."""
-    par: Any = replace(
-        plant.parameters, **{name: float(values[index - first]) for name, values in changes.items()}
+    own, errors = (
+        {name: float(values[index - first]) for name, values in columns.items()}
+        for columns in (changes, sensor_errors or {})
     )
+    par: Any = replace(plant.parameters, **own)
+    if errors:
+        scenario = replace(scenario, sensor_errors=dict(scenario.sensor_errors or {}) | errors)
     return plant.variant(par), replace(scenario, run=index)
 
 
-def _count(plant: Plant, changes: Mapping[str, FloatArray]) -> int:
+def _sensed(scenario: Scenario, sensor_errors: Mapping[str, FloatArray] | None) -> Scenario:
+    """With sensors that may err where runs have errors of their own; none of them is known to be finite yet."""
+    if not sensor_errors:
+        return scenario
+    return replace(
+        scenario, sensor_errors=dict(scenario.sensor_errors or {}) | dict.fromkeys(sensor_errors, 0.0)
+    )
+
+
+def _count(plant: Plant, changes: Mapping[str, FloatArray], sensor_errors: Mapping[str, FloatArray]) -> int:
     known = units_of(plant.parameters)
     sizes = {}
-    for name, values in changes.items():
+    for name, values in [*changes.items(), *sensor_errors.items()]:
         column = np.asarray(values)
         if column.ndim != 1 or not column.size or column.dtype.kind not in "fiu":
             raise InputError(
@@ -169,7 +197,11 @@ def _count(plant: Plant, changes: Mapping[str, FloatArray]) -> int:
 
 
 def _thetas(
-    plant: Plant, values: Mapping[str, ca.DM], changes: Mapping[str, FloatArray], runs: int
+    plant: Plant,
+    values: Mapping[str, ca.DM],
+    changes: Mapping[str, FloatArray],
+    sensor_errors: Mapping[str, FloatArray],
+    runs: int,
 ) -> FloatArray:
     """theta of every run, a row each. Every record is checked as one that is read from a file."""
     place, k = {}, 0
@@ -182,6 +214,12 @@ def _thetas(
         for extreme in (column.min(), column.max()):  # NaN comes out of both
             replace(plant.parameters, **{name: float(extreme)})
         theta[:, place[f"machine.{name}"]] = column
+    names = [signal.name for signal in plant.sensor_errors]
+    for name, column in sensor_errors.items():
+        column = np.asarray(column, dtype=float)
+        if not np.isfinite(column).all():
+            raise InputError("campaign", name, "NaN or infinity", "finite errors of a sensor")
+        theta[:, place["errors"] + names.index(name)] = column
     for name, twin in twins_of(plant.parameters).items():
         pair = theta[:, place[f"machine.{name}"]], theta[:, place[f"machine.{twin}"]]
         if not np.array_equal(*pair):
@@ -226,10 +264,12 @@ def _digest_sizes(plant: Plant) -> dict[str, int]:
         "deviation": p,
         "squares": p,
         "force": m,
+        "limited": m,
         "contact": len(plant.contacts),
         "resting": 1,  # on the touchdown bearings at the start
         "touching": 1,  # them at the end
         "touched": 1,  # sample at which it first did, -1 before
+        "culprit": 1,  # index of what was touched first, -1 before
     }
 
 
@@ -260,7 +300,13 @@ def _digest(shape: Any) -> ca.Function:
         "deviation": ca.fmax(kept["deviation"], ca.fabs(error)),
         "squares": kept["squares"] + error**2,
         "force": ca.fmax(kept["force"], ca.if_else(alive, ca.fabs(row["v"]), 0)),
+        "limited": kept["limited"] + ca.if_else(alive, row["saturated"], 0),
         "contact": ca.if_else(alive, largest, kept["contact"]),
+        "culprit": ca.if_else(
+            ca.logic_and(ca.logic_and(alive, kept["culprit"] < 0), ca.mmax(row["contact"]) >= 1),
+            _largest(row["contact"]),
+            kept["culprit"],
+        ),
     }
     if setup.bearing:
         touching = ca.mmax(row["contact"]) >= 1
@@ -276,6 +322,15 @@ def _digest(shape: Any) -> ca.Function:
     return ca.Function("digest", [*arguments, theta], [ca.densify(result)])
 
 
+def _largest(values: Any) -> Any:
+    """Index of the largest entry, the first of equals."""
+    found, index = values[0], ca.SX(0)
+    for k in range(1, values.numel()):
+        index = ca.if_else(values[k] > found, k, index)
+        found = ca.fmax(found, values[k])
+    return index
+
+
 def _batch(kept: FloatArray, samples: int, Ts: float, sizes: Mapping[str, int]) -> Batch:
     columns = dict(zip(sizes, np.split(kept, np.cumsum([*sizes.values()])[:-1], axis=1), strict=True))
     count = columns["samples"][:, 0]
@@ -288,6 +343,13 @@ def _batch(kept: FloatArray, samples: int, Ts: float, sizes: Mapping[str, int]) 
         first, last = np.where(
             reached > 0, reached - 1 + (np.array(LEVELS) - below) / (above - below), np.nan
         ).T
+    # What follows the end is not guarded in "share" alone.
+    told = np.hstack([columns[name] for name in ("deviation", "squares", "contact")])
+    verdict = np.select(
+        [completed, ~np.isfinite(told).all(axis=1), resting == 1, columns["culprit"][:, 0] >= 0],
+        [0, 1, 2, 3 + columns["culprit"][:, 0]],
+        1,
+    )
     return Batch(
         duration=np.where(completed, samples, end) * Ts,
         completed=completed,
@@ -301,6 +363,8 @@ def _batch(kept: FloatArray, samples: int, Ts: float, sizes: Mapping[str, int]) 
             np.maximum(columns["largest_share"][:, 0] - 1, 0),
             np.nan,
         ),
+        saturated=columns["limited"] / np.maximum(count, 1)[:, None],
+        verdict=verdict,
     )
 
 
@@ -309,6 +373,7 @@ def _one_by_one(
     controller: Controller,
     scenario: Scenario,
     changes: Mapping[str, FloatArray],
+    sensor_errors: Mapping[str, FloatArray] | None,
     first: int,
     runs: int,
     progress: Callable[[float], None] | None,
@@ -316,7 +381,7 @@ def _one_by_one(
     """The same without a C compiler."""
     figures: dict[str, list[Any]] = {name: [] for name in Batch.__dataclass_fields__}
     for k in range(runs):
-        machine_k, scenario_k = replayed(plant, scenario, changes, first + k, first)
+        machine_k, scenario_k = replayed(plant, scenario, changes, first + k, first, sensor_errors)
         run = simulate(machine_k, controller, scenario_k, engine="virtual machine")
         stroke = stroke_figures(run)
         error = run.p - run.reference
@@ -329,6 +394,8 @@ def _one_by_one(
             "contact": run.contact.max(axis=0),
             "rise": stroke.rise,
             "overshoot": stroke.overshoot,
+            "saturated": run.saturated.mean(axis=0),
+            "verdict": verdicts(plant).index(run.verdict.name),
         }
         for name, value in row.items():
             figures[name].append(value)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from hypothesis import strategies as st
 
 import malta
 from malta import engine, references
-from malta.campaign import Batch, replayed, simulate_many
+from malta.campaign import Batch, replayed, simulate_many, verdicts
 from malta.machine import FIDELITIES, Fidelity
 from malta.noise import keys, normals
 from malta.simulate import (
@@ -69,6 +70,8 @@ def _expected(run: Trajectory) -> dict[str, Any]:
         "contact": run.contact.max(axis=0),
         "rise": stroke.rise,
         "overshoot": stroke.overshoot,
+        "saturated": run.saturated.mean(axis=0),
+        "verdict": verdicts(run.plant).index(run.verdict.name),
     }
 
 
@@ -236,7 +239,64 @@ def test_runs_that_end_in_no_numbers_are_not_completed(calibrated: Design) -> No
     lost = malta.simulate(*_replay(endless, calibrated, scenario, changes, 1))
     assert lost.verdict.name == "diverged"
     assert batch.duration[1] == pytest.approx(lost.verdict.time, abs=2 * 50e-6)
+    assert [verdicts(endless)[int(k)] for k in batch.verdict] == ["completed", "diverged", "completed"]
     assert np.array_equal(batch.deviation[0], batch.deviation[2])
+
+
+def test_each_run_has_its_own_sensor_errors(calibrated: Design) -> None:
+    """Gains, an offset and Hall sensors that differ from run to run, over the scenario's; without changes too."""
+    rng = np.random.default_rng(7)
+    errors = {
+        "gain_x1": rng.uniform(-0.02, 0.02, 9),
+        "offset_y2": rng.uniform(-5e-6, 5e-6, 9),
+        "hall_phase": rng.uniform(-0.03, 0.03, 9),
+    }
+    scenario = _stroke(fidelity="force", sensor_errors={"offset_y2": 1.0, "hall_amplitude": 0.01})
+    many = partial(simulate_many, calibrated.plant, calibrated.controller, scenario, sensor_errors=errors)
+    changes = _spread(calibrated, 9)
+    for varied, batch in ((changes, many(changes)), ({}, many({}))):
+        runs = [
+            malta.simulate(machine, calibrated.controller, scenario_k)
+            for machine, scenario_k in (
+                replayed(calibrated.plant, scenario, varied, k, sensor_errors=errors) for k in range(9)
+            )
+        ]
+        wanted = np.array([np.abs(run.p - run.reference).max(axis=0) for run in runs])
+        np.testing.assert_allclose(batch.deviation, wanted, rtol=0, atol=1e-12 * wanted.max())
+        assert runs[4].scenario.sensor_errors == {
+            "hall_amplitude": 0.01,
+            **{name: column[4] for name, column in errors.items()},
+        }
+        assert np.ptp(wanted[:, 3]) > 1e-6  # the offset is followed
+    with pytest.raises(malta.InputError, match="gain_q: found an unknown error"):
+        many(changes, sensor_errors={"gain_q": np.zeros(9)})
+    with pytest.raises(malta.InputError, match="gain_x1: found NaN or infinity"):
+        many(changes, sensor_errors={"gain_x1": np.full(9, math.nan)})
+    with pytest.raises(malta.InputError, match="as many values of each parameter"):
+        many(changes, sensor_errors={"gain_x1": np.zeros(8)})
+
+
+def test_how_a_lift_off_ends(calibrated: Design) -> None:
+    """Too little current to lift it in two of three runs, named as the single run names it."""
+    scenario = Scenario(
+        "lift-off",
+        0.03,
+        lambda plant: references.hold(plant),
+        start={"y": -0.6035e-3},
+        cold=True,
+        bearing=True,
+        fidelity="force",
+    )
+    changes = {"I_max": np.array([0.5, 8.0, 1.0])}
+    batch = simulate_many(calibrated.plant, calibrated.controller, scenario, changes)
+    names = [verdicts(calibrated.plant)[int(k)] for k in batch.verdict]
+    assert names == ["not lifted", "completed", "not lifted"]
+    for k, name in enumerate(names):
+        machine, scenario_k = replayed(calibrated.plant, scenario, changes, k)
+        run = malta.simulate(machine, calibrated.controller, scenario_k)
+        assert run.verdict.name == name
+        np.testing.assert_allclose(batch.saturated[k], run.saturated.mean(axis=0), atol=1e-12)
+    assert batch.saturated[0].max() > 0.01
 
 
 def _replay(
@@ -300,6 +360,8 @@ def test_a_lift_off_is_a_scenario_for_many(calibrated: Design) -> None:
             "contact": run.contact.max(axis=0),
             "rise": math.nan,
             "overshoot": np.nan,
+            "saturated": run.saturated.mean(axis=0),
+            "verdict": verdicts(run.plant).index(run.verdict.name),
         }
 
     runs = _assert_replayed(calibrated, batch, scenario, changes, expected=expected)
