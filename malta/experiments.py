@@ -86,6 +86,14 @@ class Case(NamedTuple):
     merits: tuple[Merit, ...]
 
 
+class Wanted(NamedTuple):
+    """A run that an experiment wants, and what is to be found in it."""
+
+    label: str
+    scenario: Scenario
+    merits: Callable[[Trajectory], tuple[Merit, ...]]
+
+
 @dataclass(frozen=True, eq=False)
 class Experiment:
     """What an experiment found."""
@@ -137,11 +145,18 @@ def stroke(
     **options: Any,
 ) -> Experiment:
     """The published stroke: tracking, radial deviation, currents, and K_D as the ratio of force and current."""
+    wanted = _stroke_cases(plant, controller, distance=distance, rise=rise, profile=profile, **options)
+    cases, cut = _flown(plant, controller, wanted, progress, options)
+    return Experiment("stroke", "Does it follow the stroke?", cases, cases[0].merits, interrupted=cut)
+
+
+def _stroke_cases(
+    _: Plant, __: Controller, *, distance: float, rise: float, profile: Profile, **options: Any
+) -> list[Wanted]:
     asked = {name: value for name, value in options.items() if name != "engine"}
     scenario = Scenario.stroke(distance, rise=rise, profile=profile, **asked)
-    merits = partial(stroke_merits, published=distance == DISTANCE and rise == RISE)
-    cases, cut = _flown(plant, controller, [("stroke", scenario, merits)], progress, options)
-    return Experiment("stroke", "Does it follow the stroke?", cases, cases[0].merits, interrupted=cut)
+    published = distance == DISTANCE and rise == RISE
+    return [Wanted("stroke", scenario, partial(stroke_merits, published=published))]
 
 
 def stroke_merits(run: Trajectory, *, published: bool = True) -> tuple[Merit, ...]:
@@ -195,9 +210,13 @@ def hold(
     plant: Plant, controller: Controller, *, progress: Progress | None = None, **options: Any
 ) -> Experiment:
     """Rest at the middle with sensor noise: statistics of the last 2000 measured samples, and the true motion."""
-    scenario = _scenario("hold", (RESTING + 6000) * controller.sample_time, references.hold, options)
-    cases, cut = _flown(plant, controller, [("hold", scenario, _rest_merits)], progress, options)
+    cases, cut = _flown(plant, controller, _hold_cases(plant, controller, **options), progress, options)
     return Experiment("hold", "How still does it stand?", cases, cases[0].merits, interrupted=cut)
+
+
+def _hold_cases(_: Plant, controller: Controller, **options: Any) -> list[Wanted]:
+    scenario = _scenario("hold", (RESTING + 6000) * controller.sample_time, references.hold, options)
+    return [Wanted("hold", scenario, _rest_merits)]
 
 
 RESTING = 2000  # samples, Table III
@@ -234,19 +253,23 @@ def tilt(
 
     As the paper, and with the attraction at the reference fed forward.
     """
+    wanted = _tilt_cases(plant, controller, radius=radius, frequency=frequency, **options)
+    cases, cut = _flown(plant, controller, wanted, progress, options)
+    return Experiment("tilt", "Does it tilt about sensor plane 2?", cases, (), interrupted=cut)
+
+
+def _tilt_cases(_: Plant, __: Controller, *, radius: float, frequency: float, **options: Any) -> list[Wanted]:
     kinds = [options["feedforward"]] if "feedforward" in options else list(FEEDFORWARDS)
     reference = partial(references.circle, radius=radius, frequency=frequency)
     merits = partial(_tilt_merits, settled=1 / frequency)
-    wanted = [
-        (
+    return [
+        Wanted(
             f"feedforward {kind}",
             _scenario("tilt", 2 / frequency, reference, {"start": AT_REST} | options | {"feedforward": kind}),
             merits,
         )
         for kind in kinds
     ]
-    cases, cut = _flown(plant, controller, wanted, progress, options)
-    return Experiment("tilt", "Does it tilt about sensor plane 2?", cases, (), interrupted=cut)
 
 
 AT_REST = dict.fromkeys(("x", "y", "alpha", "beta", "x_dot", "y_dot", "alpha_dot", "beta_dot"), 0.0)
@@ -270,17 +293,24 @@ def lift_off(
 
     One run for each start-up estimator, or the one that options name.
     """
+    wanted = _lift_cases(plant, controller, **options)
+    cases, cut = _flown(plant, controller, wanted, progress, options)
+    current = break_away_current(plant, wanted[0].scenario.start)
+    needed = Merit("current per module that lifts it, statics", current, "A")
+    return Experiment("lift-off", "Does it rise from its bearing?", cases, (needed,), interrupted=cut)
+
+
+def _lift_cases(plant: Plant, _: Controller, **options: Any) -> list[Wanted]:
     resting = rest_on_bearing(plant)
     kinds = [options["estimator"]] if "estimator" in options else list(ESTIMATORS)
     own = {"start": resting, "cold": True, "bearing": True}
     reference = partial(rise_from, start=resting)
-    wanted = [
-        (kind, _scenario("lift-off", 0.15, reference, own | options | {"estimator": kind}), _lift_merits)
+    return [
+        Wanted(
+            kind, _scenario("lift-off", 0.15, reference, own | options | {"estimator": kind}), _lift_merits
+        )
         for kind in kinds
     ]
-    cases, cut = _flown(plant, controller, wanted, progress, options)
-    needed = Merit("current per module that lifts it, statics", break_away_current(plant, resting), "A")
-    return Experiment("lift-off", "Does it rise from its bearing?", cases, (needed,), interrupted=cut)
 
 
 def rise_from(plant: Plant, start: Mapping[str, float], duration: float = 30e-3) -> Reference:
@@ -361,7 +391,7 @@ def payload(
     for extra in masses:
         own = {"changes": ((PICKED, {"m": plant.mass + extra}),), "bearing": True}
         scenario = _scenario("payload", WAIT + 0.15, reference, own | options)
-        wanted.append((f"{extra * 1e3:.0f} g", scenario, _payload_merits))
+        wanted.append(Wanted(f"{extra * 1e3:.0f} g", scenario, _payload_merits))
     cases, cut = _flown(plant, controller, wanted, progress, options)
     carried = max((m for m, c in zip(masses, cases, strict=False) if c.run.verdict.completed), default=0.0)
     merit = Merit("largest of these carried and moved", carried, "kg", "position_controller.payload")
@@ -411,7 +441,7 @@ def thermal(
         scenario = _scenario(
             "thermal", duration, references.hold, {"correction": Correction(every, laser)} | options
         )
-        wanted.append((label, scenario, merits))
+        wanted.append(Wanted(label, scenario, merits))
     cases, cut = _flown(plant, controller, wanted, progress, options)
     lag = drift / duration * every / gain
     found = (
@@ -453,30 +483,7 @@ def disturbance(
     plant: Plant, controller: Controller, *, progress: Progress | None = None, **options: Any
 ) -> Experiment:
     """Steps of force and torque, vibration of the housing, sines of force; the linear loop's compliance beside them."""
-    names = [s.name for s in plant.disturbances]
-    outputs = [s.name for s in plant.outputs]
-    wanted = []
-    for name, size, seen in (("F_x", 1.0, "x1"), ("F_z", 1.0, plant.stroke), ("T_y", 0.05, "x1")):
-        push = partial(_step_wrench, column=names.index(name), size=size, at=0.02, width=len(names))
-        scenario = _scenario("disturbance", 0.4, references.hold, QUIET | {"disturbance": push} | options)
-        unit = plant.disturbances[names.index(name)].unit
-        wanted.append(
-            (f"step of {size:g} {unit} {name}", scenario, partial(_step_merits, output=outputs.index(seen)))
-        )
-    shake = partial(
-        _sine_wrench, column=names.index("F_y"), size=plant.mass, frequency=50.0, width=len(names)
-    )
-    vibration = _scenario("vibration", 0.3, references.hold, QUIET | {"disturbance": shake} | options)
-    shaken = partial(_sine_merits, output=outputs.index("y1"), frequency=50.0)
-    wanted.append(("housing shaken by 1 m/s2 at 50 Hz along y", vibration, shaken))
-    for f in TONES:
-        push = partial(
-            _sine_wrench, column=names.index("F_x"), size=TONE_FORCE, frequency=f, width=len(names)
-        )
-        scenario = _scenario(
-            "sine", 2 * max(0.1, 4 / f), references.hold, QUIET | {"disturbance": push} | options
-        )
-        wanted.append((f"{f:g} Hz", scenario, partial(_sine_merits, output=outputs.index("x1"), frequency=f)))
+    wanted = _disturbance_cases(plant, controller, **options)
     cases, cut = _flown(plant, controller, wanted, progress, options)
     steps, sines = cases[:4], cases[4:]
     w = np.geomspace(0.01, 2000, 600) * 2 * math.pi
@@ -496,6 +503,34 @@ def disturbance(
         ),
     }
     return Experiment("disturbance", "How stiff is it?", steps, found, curves, interrupted=cut)
+
+
+def _disturbance_cases(plant: Plant, _: Controller, **options: Any) -> list[Wanted]:
+    names = [s.name for s in plant.disturbances]
+    outputs = [s.name for s in plant.outputs]
+    wanted: list[Wanted] = []
+    for name, size, seen in (("F_x", 1.0, "x1"), ("F_z", 1.0, plant.stroke), ("T_y", 0.05, "x1")):
+        push = partial(_step_wrench, column=names.index(name), size=size, at=0.02, width=len(names))
+        scenario = _scenario("disturbance", 0.4, references.hold, QUIET | {"disturbance": push} | options)
+        unit = plant.disturbances[names.index(name)].unit
+        merits = partial(_step_merits, output=outputs.index(seen))
+        wanted.append(Wanted(f"step of {size:g} {unit} {name}", scenario, merits))
+    shake = partial(
+        _sine_wrench, column=names.index("F_y"), size=plant.mass, frequency=50.0, width=len(names)
+    )
+    vibration = _scenario("vibration", 0.3, references.hold, QUIET | {"disturbance": shake} | options)
+    shaken = partial(_sine_merits, output=outputs.index("y1"), frequency=50.0)
+    wanted.append(Wanted("housing shaken by 1 m/s2 at 50 Hz along y", vibration, shaken))
+    for f in TONES:
+        push = partial(
+            _sine_wrench, column=names.index("F_x"), size=TONE_FORCE, frequency=f, width=len(names)
+        )
+        scenario = _scenario(
+            "sine", 2 * max(0.1, 4 / f), references.hold, QUIET | {"disturbance": push} | options
+        )
+        found = partial(_sine_merits, output=outputs.index("x1"), frequency=f)
+        wanted.append(Wanted(f"{f:g} Hz", scenario, found))
+    return wanted
 
 
 TONES, TONE_FORCE = (5.0, 20.0, 60.0, 150.0, 400.0), 0.5  # Hz, N
@@ -613,7 +648,8 @@ def faults(
         own: dict[str, Any] = {"faults": struck, "bearing": True} | options
         if any(fault.kind == "open phase" for fault in struck):
             own["fidelity"] = "phase"
-        wanted.append((label, _scenario("faults", 0.3, reference, own), partial(_fault_merits, at=at)))
+        scenario = _scenario("faults", 0.3, reference, own)
+        wanted.append(Wanted(label, scenario, partial(_fault_merits, at=at)))
     cases, cut = _flown(plant, controller, wanted, progress, options)
     survived = float(sum(case.run.verdict.completed for case in cases))
     merit = Merit(f"survived, of {len(cases)}", survived, "1")
@@ -651,18 +687,8 @@ def drive_limits(
 ) -> Experiment:
     """The fastest stroke within shares of the current and voltage limits (the rest is the feedback's), and the sigmoid
     whose peak current is the same."""
-    shares: dict[str, Any] = {"voltage_share": voltage_share, "current_share": current_share}
-    emf = induced_per_speed(plant)
-    best = fastest_stroke(plant, distance, emf, **shares)
-    sigmoid = sigmoid_at_peak_current(plant, distance, emf, **shares)
-    duration = max(0.1, 6 * sigmoid.rise)
-    ends: dict[str, Any] = {"start": -distance / 2, "end": distance / 2}
-    logistic = partial(references.stroke, **ends, rise=sigmoid.rise, centre=duration / 2)
-    fast = partial(best.reference, centre=duration / 2)
-    wanted = []
-    for label, reference, found in (("fastest", fast, best), ("sigmoid", logistic, sigmoid)):
-        scenario = _scenario("drive-limits", duration, reference, QUIET | options)
-        wanted.append((label, scenario, partial(_limit_merits, found=found)))
+    best, sigmoid = _limit_strokes(plant, distance, current_share, voltage_share)
+    wanted = _limit_cases(best, sigmoid, distance, options)
     cases, cut = _flown(plant, controller, wanted, progress, options)
     merits = (
         Merit("current limit used", current_share * plant.actuator.current_limit, "A"),
@@ -673,6 +699,43 @@ def drive_limits(
     )
     curves = {"t": best.t, "z": best.z, "u": best.u, "i": best.i}
     return Experiment("drive-limits", "How fast could it be?", cases, merits, curves, interrupted=cut)
+
+
+def _limit_strokes(
+    plant: Plant, distance: float, current_share: float, voltage_share: float
+) -> tuple[FastestStroke, SigmoidStroke]:
+    shares: dict[str, Any] = {"voltage_share": voltage_share, "current_share": current_share}
+    emf = induced_per_speed(plant)
+    return (
+        fastest_stroke(plant, distance, emf, **shares),
+        sigmoid_at_peak_current(plant, distance, emf, **shares),
+    )
+
+
+def _limit_cases(
+    best: FastestStroke, sigmoid: SigmoidStroke, distance: float, options: dict[str, Any]
+) -> list[Wanted]:
+    duration = max(0.1, 6 * sigmoid.rise)
+    ends: dict[str, Any] = {"start": -distance / 2, "end": distance / 2}
+    logistic = partial(references.stroke, **ends, rise=sigmoid.rise, centre=duration / 2)
+    fast = partial(best.reference, centre=duration / 2)
+    wanted: list[Wanted] = []
+    for label, reference, found in (("fastest", fast, best), ("sigmoid", logistic, sigmoid)):
+        scenario = _scenario("drive-limits", duration, reference, QUIET | options)
+        wanted.append(Wanted(label, scenario, partial(_limit_merits, found=found)))
+    return wanted
+
+
+def _limits(
+    plant: Plant,
+    _: Controller,
+    *,
+    distance: float,
+    current_share: float,
+    voltage_share: float,
+    **options: Any,
+) -> list[Wanted]:
+    return _limit_cases(*_limit_strokes(plant, distance, current_share, voltage_share), distance, options)
 
 
 def _limit_merits(run: Trajectory, found: FastestStroke | SigmoidStroke) -> tuple[Merit, ...]:
@@ -700,7 +763,7 @@ def _scenario(
 def _flown(
     plant: Plant,
     controller: Controller,
-    wanted: Sequence[tuple[str, Scenario, Callable[[Trajectory], tuple[Merit, ...]]]],
+    wanted: Sequence[Wanted],
     progress: Progress | None,
     options: Mapping[str, Any],
 ) -> tuple[tuple[Case, ...], bool]:
@@ -745,6 +808,34 @@ def experiment(
     name: str, plant: Plant, controller: Controller, *, progress: Progress | None = None, **options: Any
 ) -> Experiment:
     """Run an experiment by name. Raises InputError for an unknown one, or an option that it does not take."""
+    _check(name, options)
+    return EXPERIMENTS[name](plant, controller, progress=progress, **options)
+
+
+# Experiments whose cases ask the same of the machine from beginning to end: those that many machines can fly.
+CASES: dict[str, Callable[..., list[Wanted]]] = {
+    "stroke": _stroke_cases,
+    "hold": _hold_cases,
+    "tilt": _tilt_cases,
+    "lift-off": _lift_cases,
+    "disturbance": _disturbance_cases,
+    "drive-limits": _limits,
+}
+
+
+def cases_of(name: str, plant: Plant, controller: Controller, **options: Any) -> list[Wanted]:
+    """What an experiment of CASES would fly, without flying it. Raises InputError as `experiment` does."""
+    _check(name, options)
+    if name not in CASES:
+        found = f"{name!r}, which changes the machine or the reference in flight"
+        raise InputError("simulate", "scenario", found, "one of " + ", ".join(CASES))
+    own = _own_options(name)
+    defaults = {p.name: p.default for p in inspect.signature(EXPERIMENTS[name]).parameters.values()}
+    return CASES[name](plant, controller, **{option: defaults[option] for option in own} | options)
+
+
+def _check(name: str, options: Mapping[str, Any]) -> None:
+    """InputError for an unknown experiment, or an option that it does not take."""
     if name not in EXPERIMENTS:
         raise InputError("simulate", "scenario", repr(name), "one of " + ", ".join(EXPERIMENTS))
     own, others = _own_options(name), {option for other in EXPERIMENTS for option in _own_options(other)}
@@ -763,7 +854,6 @@ def experiment(
             math.isfinite(v) and v for v in values
         ):
             raise InputError("simulate", where, repr(value), "finite, other than 0")
-    return EXPERIMENTS[name](plant, controller, progress=progress, **options)
 
 
 def _own_options(name: str) -> set[str]:
