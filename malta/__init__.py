@@ -15,9 +15,9 @@ if TYPE_CHECKING:  # the contents page, as type checkers and readers see it
     from malta import plants as plants
     from malta import references as references
     from malta import report as report
-    from malta.campaign import Batch as Batch
-    from malta.campaign import replayed as replayed
-    from malta.campaign import simulate_many as simulate_many
+    from malta.campaign import Campaign as Campaign
+    from malta.campaign import Plan as Plan
+    from malta.campaign import campaign as campaign
     from malta.claims import ledger as ledger
     from malta.controller import Controller as Controller
     from malta.data import in_unit as in_unit
@@ -31,6 +31,9 @@ if TYPE_CHECKING:  # the contents page, as type checkers and readers see it
     from malta.fastest import fastest_stroke as fastest_stroke
     from malta.linearize import LinearModel as LinearModel
     from malta.linearize import linearize as linearize
+    from malta.many import Batch as Batch
+    from malta.many import replayed as replayed
+    from malta.many import simulate_many as simulate_many
     from malta.plant import OperatingPoint as OperatingPoint
     from malta.plant import Plant as Plant
     from malta.plant import Signal as Signal
@@ -53,7 +56,7 @@ if TYPE_CHECKING:  # the contents page, as type checkers and readers see it
     from malta.verify import verify as verify
 
 _NAMES = {  # the same, for the first use of each name
-    "campaign": ("Batch", "replayed", "simulate_many"),
+    "campaign": ("Campaign", "Plan", "campaign"),
     "claims": ("ledger",),
     "controller": ("Controller",),
     "data": ("in_unit", "plant_of", "published", "read"),
@@ -61,6 +64,7 @@ _NAMES = {  # the same, for the first use of each name
     "experiments": ("Experiment", "experiment"),
     "fastest": ("fastest_stroke",),
     "linearize": ("LinearModel", "linearize"),
+    "many": ("Batch", "replayed", "simulate_many"),
     "plant": ("OperatingPoint", "Plant", "Signal", "trim"),
     "simulate": ("Fault", "Scenario", "Trajectory", "simulate", "stroke_figures"),
     "spec": ("Spec", "Weights", "read_design"),

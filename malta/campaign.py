@@ -1,404 +1,269 @@
-"""Many machines at once: the same scenario and controller on plants that all differ, each with its own noise.
+"""A campaign: one scenario on thousands of machines, flown block by block and kept in a folder.
 
-Compiled, eight machines share a SIMD register and the cores share the rest; only a digest of each run is kept. Run i of
-a seed draws the same noise wherever and with whatever company it runs; `replayed` gives it back as a scenario.
+    Plan -> fly() block by block, here or on a cluster -> Campaign
+
+Every block is kept as soon as it is done, so that a campaign that was ended in the middle goes on where it was, and one
+that is done is read.
 """
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable, Mapping
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
 
-import casadi as ca
 import numpy as np
 
-from malta import machine
+from malta import engine
 from malta.controller import Controller
-from malta.data import twins_of, units_of
-from malta.engine import LANES, evaluate, feedforward_table, in_lanes, run_many
 from malta.errors import InputError
-from malta.machine import Setup
-from malta.noise import keys
-from malta.plant import Plant, readonly
-from malta.simulate import (
-    BLOCK,
-    Scenario,
-    beginning,
-    compiled_shape,
-    sampled,
-    setup_of,
-    shape_of,
-    simulate,
-    stroke_figures,
+from malta.experiments import Experiment, flown
+from malta.files import replace_files
+from malta.findings import Rate, rate
+from malta.folder import (
+    MANIFEST,
+    Block,
+    block_name,
+    encoded,
+    opened,
+    read_block,
+    read_manifest,
+    require_same,
+    shapes,
+    short,
 )
+from malta.many import Batch, is_compiled, replayed, simulate_many, verdicts
+from malta.plan import Plan as Plan
+from malta.plan import drawn, fingerprint, wanted_of
+from malta.plant import readonly
+from malta.simulate import EngineChoice
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from malta.plant import FloatArray
 
-LEVELS = (0.1, 0.9)  # of a stroke: its rise is between them
+BLOCK = 1024  # runs in a block, a fraction of a second of work
+SLOW_BLOCK = 32  # without a C compiler
+
+Progress = Callable[[float], None]
 
 
 @dataclass(frozen=True, eq=False)
-class Batch:
-    """What became of each run. SI; a row for each run."""
+class Campaign:
+    """What a campaign found: a row for each run that was flown. SI."""
 
-    duration: FloatArray  # s, until the end or until something was touched
-    completed: FloatArray  # 1 or 0
-    deviation: FloatArray  # runs x outputs, largest |p - p*|
-    rms: FloatArray  # runs x outputs, root mean square of p - p*
-    force: FloatArray  # runs x inputs, N, largest |v|
-    contact: FloatArray  # runs x contacts, largest share of each clearance that was used up
-    rise: FloatArray  # s, 10-90 % of the stroke; NaN when it was not reached
-    overshoot: FloatArray  # beyond the end, as a share of the stroke; NaN when the run ended early
-    saturated: FloatArray  # runs x inputs, share of the samples whose command was limited
-    verdict: FloatArray  # how it ended: index into `verdicts` of the plant
+    plan: Plan
+    index: NDArray[np.int64]  # of each run
+    names: tuple[str, ...]  # of what was varied: parameters, then errors of the sensors
+    values: FloatArray  # runs x names, SI
+    batch: Batch
+    engines: tuple[str, ...]  # what flew them: "compiled" or "virtual machine"
+    interrupted: bool = False  # by Ctrl-C: the runs are those of the blocks that were done
+    damaged: tuple[Path, ...] = ()  # blocks that could not be read, and were flown again
+    folder: Path | None = None
 
-    def __post_init__(self) -> None:
-        for name in self.__dataclass_fields__:
-            object.__setattr__(self, name, readonly(getattr(self, name)))
+    @property
+    def completed(self) -> FloatArray:
+        """True where the run went to its end."""
+        return np.asarray(self.batch.completed == 1)
+
+    @property
+    def ends(self) -> dict[str, int]:
+        """How often runs ended in which way, by the names of simulate.Verdict."""
+        counts = np.bincount(self.batch.verdict.astype(int), minlength=len(verdicts(self.plan.plant)))
+        return {name: int(n) for name, n in zip(verdicts(self.plan.plant), counts, strict=True) if n}
+
+    @property
+    def rate(self) -> Rate:
+        """Share of the runs that were completed."""
+        return rate(int(self.completed.sum()), len(self.index))
 
 
-def verdicts(plant: Plant) -> tuple[str, ...]:
-    """How a run may end, the first of them as it should: the names of simulate.Verdict."""
-    return ("completed", "diverged", "not lifted", *plant.contacts)
+def fly(
+    plan: Plan, first: int, count: int, workers: int | None = None, progress: Progress | None = None
+) -> Block:
+    """Simulate runs `first` to `first + count` of a plan. `first` is a multiple of the lanes of the engine."""
+    machines = drawn(plan)
+    scenario, part = wanted_of(plan).scenario, slice(first, first + count)
+    batch = simulate_many(
+        plan.plant,
+        plan.controller,
+        scenario,
+        {name: column[part] for name, column in machines.changes.items()},
+        sensor_errors={name: column[part] for name, column in machines.sensor_errors.items()},
+        first=first,
+        workers=workers,
+        progress=progress,
+    )
+    compiled = is_compiled(plan.plant, plan.controller, scenario)
+    return Block(machines.values[part], batch, "compiled" if compiled else "virtual machine")
 
 
-def simulate_many(
-    plant: Plant,
-    controller: Controller,
-    scenario: Scenario,
-    changes: Mapping[str, FloatArray],
+def campaign(
+    plan: Plan,
+    folder: str | Path | None = None,
     *,
-    sensor_errors: Mapping[str, FloatArray] | None = None,
-    first: int = 0,
     workers: int | None = None,
-    progress: Callable[[float], None] | None = None,
-) -> Batch:
-    """Run a scenario on many machines.
+    cluster: str | None = None,
+    block: int | None = None,
+    progress: Progress | None = None,
+) -> Campaign:
+    """Fly a plan, or what is left of it.
 
-    changes : parameters of the machine by name, SI, a value for each run
-    sensor_errors : errors of the sensors by name, likewise, in place of the scenario's
-    first : index of the first run; noise depends on scenario.seed and on the index
-    workers : threads; None: one for each core
+    folder : keeps every block as soon as it is done, and the manifest; None: nothing is written
+    workers : threads on this machine; None: one for each core
+    cluster : address of a Dask scheduler, as tcp://host:8786, whose workers fly the blocks
+    block : runs in a block, a multiple of 8; a folder that was begun keeps its own
+    progress : told the share that is done, now and then
 
-    Raises InputError for an unknown parameter, values of different number, or a scenario with faults, changes, another
-    estimator or an outer loop, which are for `simulate`.
+    Ctrl-C keeps what is done: the result says `interrupted`. Raises InputError for a folder that holds another campaign
+    or cannot be written to, and for a scheduler that does not answer; blocks that are done stand.
     """
-    where = f"scenario {scenario.name}"
-    for name in ("faults", "changes", "correction"):
-        if getattr(scenario, name):
-            raise InputError(where, name, "some", "none in a campaign")
-    scenario = _sensed(scenario, sensor_errors)
-    setup = setup_of(plant, controller, scenario)
-    if setup.outside:
-        raise InputError(where, "estimator", scenario.estimator, "steady-state in a campaign")
+    if cluster is not None and workers is not None:
+        raise InputError("campaign", "workers", str(workers), "none with a cluster, which has its own")
     if workers is not None and workers < 1:
         raise InputError("campaign", "workers", str(workers), "at least 1")
-    runs = _count(plant, changes, sensor_errors or {})
-    if "T_d" in changes:
-        raise InputError("campaign", "T_d", "a delay for each run", "one for all: it shapes the functions")
-    shape = shape_of(plant, controller, setup)
-    digest = _digest(shape)
-    compiled = compiled_shape(shape, LANES, digest)
-    if compiled is None:
-        return _one_by_one(plant, controller, scenario, changes, sensor_errors, first, runs, progress)
-    lib, _ = compiled
-    values = machine.numbers(plant, controller, scenario.substeps, scenario.sensor_errors)
-    theta = _thetas(plant, values, changes, sensor_errors or {}, runs)
-    t, motion, given = sampled(plant, controller, scenario, setup)
-    first_state = beginning(plant, controller, scenario, given[0])
-    states, noise = _mapped(_starts(plant, controller, setup, values, *first_state), theta)
-    axis = plant.stroke_output
-    start, end = motion.p[0, axis], motion.p[-1, axis]
-    scale = 1 / (end - start) if end != start else 0
-    known = {"alive": 1.0, "start": start, "scale": scale, "reached": -1.0, "touched": -1.0, "culprit": -1.0}
-    sizes = _digest_sizes(plant)
-    kept = np.tile(np.repeat([known.get(name, 0.0) for name in sizes], [*sizes.values()]), (runs, 1))
-    ff = controller.feedforward
-    table = feedforward_table(ff.z_grid, ff.v0)
-    groups = -(-runs // LANES)
-    rows = {"theta": theta, "states": states, "sigma": scenario.noise * noise, "digests": kept}
-    lanes = {name: in_lanes(array, groups) for name, array in rows.items()}
-    streams = keys(scenario.seed, first + np.minimum(np.arange(groups * LANES), runs - 1))
-    workers = workers or os.cpu_count() or 1
-    step = max(1, min(16, groups // (4 * workers)))  # groups in one call, for the progress bar
+    size = block or (BLOCK if engine.compiler() or cluster else SLOW_BLOCK)
+    if size < 1 or size % engine.LANES:
+        raise InputError("campaign", "block", f"{size} runs", f"a multiple of {engine.LANES}")
+    place = None if folder is None else Path(folder)
+    if place is not None:
+        size = opened(place, plan, size)
+    parts = {first: min(size, plan.samples - first) for first in range(0, plan.samples, size)}
+    done: dict[int, Block] = {}
+    damaged: list[Path] = []
+    interrupted = False
+    try:
+        if place is not None:
+            damaged += _read(place, plan, parts, done)
+        left = {first: count for first, count in parts.items() if first not in done}
+        runs = plan.samples - sum(left.values())
 
-    def fly(k: int) -> None:
-        run_many(
-            lib,
-            slice(k, min(k + step, groups)),
-            substeps=scenario.substeps,
-            table=table,
-            given=given,
-            keys=streams.reshape(groups, LANES),
-            **lanes,
+        def told(more: float) -> None:
+            if progress is not None:
+                progress((runs + more) / plan.samples)
+
+        for first, new in _flown_blocks(plan, left, workers, cluster, told):
+            if place is not None:
+                replace_files({place / block_name(first): encoded(new, plan)})
+            done[first] = new
+            runs += parts[first]
+            told(0)
+    except KeyboardInterrupt:
+        interrupted = True
+    return _gathered(plan, done, parts, place, tuple(damaged), interrupted)
+
+
+def _read(place: Path, plan: Plan, parts: Mapping[int, int], done: dict[int, Block]) -> list[Path]:
+    """Put the blocks of a folder into `done`; the files of those that are damaged."""
+    damaged = []
+    for first, count in parts.items():
+        path = place / block_name(first)
+        if not path.exists():
+            continue
+        found = read_block(path, plan, first, count)
+        if found is None:
+            damaged.append(path)
+        else:
+            done[first] = found
+    return damaged
+
+
+def _flown_blocks(
+    plan: Plan, left: Mapping[int, int], workers: int | None, cluster: str | None, told: Progress
+) -> Iterator[tuple[int, Block]]:
+    """Blocks as they are done; `told` the runs of those that are not."""
+    if cluster is not None and left:
+        from malta.cluster import blocks  # dask.distributed is an extra
+
+        yield from blocks(cluster, plan, left)
+        return
+    for first, count in left.items():
+        yield first, fly(plan, first, count, workers, partial(_told, told, count))
+
+
+def _told(told: Progress, count: int, share: float) -> None:
+    told(share * count)
+
+
+def _gathered(
+    plan: Plan,
+    done: Mapping[int, Block],
+    parts: Mapping[int, int],
+    place: Path | None,
+    damaged: tuple[Path, ...],
+    interrupted: bool,
+) -> Campaign:
+    order = sorted(done)
+    blocks = [done[first] for first in order]
+    index = np.concatenate([np.empty(0, np.int64), *(np.arange(k, k + parts[k]) for k in order)])
+    index.flags.writeable = False
+    names = drawn(plan).names
+    return Campaign(
+        plan,
+        index,
+        names,
+        readonly(np.concatenate([b.values for b in blocks]) if blocks else np.empty((0, len(names)))),
+        _joined(plan, [b.batch for b in blocks]),
+        tuple(sorted({b.engine for b in blocks})),
+        interrupted,
+        damaged,
+        place,
+    )
+
+
+def _joined(plan: Plan, batches: list[Batch]) -> Batch:
+    columns = {
+        name: [getattr(batch, name) for batch in batches] or [np.empty((0, *shape))]
+        for name, shape in shapes(plan).items()
+    }
+    return Batch(**{name: np.concatenate(column) for name, column in columns.items()})
+
+
+def read_plan(folder: str | Path, controller: Controller) -> Plan:
+    """The plan of the campaign in a folder. Raises InputError when it is not of this controller."""
+    path = Path(folder) / MANIFEST
+    content, _ = read_manifest(path)
+    own = fingerprint(controller)
+    try:
+        scenario, parameters = content["scenario"], content["machine"]["parameters"]
+        if content["gains"]["sha256"] != own:
+            found = f"a campaign of {content['gains']['name']}, sha256 {short(content['gains']['sha256'])}"
+            raise InputError(path, "gains", found, f"one of {controller.name}, sha256 {short(own)}")
+        plan = Plan(
+            controller,
+            scenario["name"],
+            content["spread"],
+            content["sensor_spread"],
+            content["samples"],
+            content["seed"],
+            content["sampler"],
+            replace(
+                controller.parameters,
+                **{name: float(value) for name, value in parameters.items()},
+                preset=content["machine"]["preset"],
+            ),
+            scenario["case"],
+            scenario["options"],
         )
-
-    with ThreadPoolExecutor(workers) as pool:
-        try:
-            for done, _ in enumerate(pool.map(fly, range(0, groups, step))):
-                if progress is not None:
-                    progress(min(1.0, (done + 1) * step / groups))
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
-    ends = lanes["digests"].swapaxes(1, 2).reshape(groups * LANES, -1)[:runs]
-    return _batch(ends, len(t), controller.sample_time, sizes)
+    except (KeyError, TypeError, AttributeError) as error:
+        raise InputError(path, "", f"a manifest without {error}", "the manifest of a campaign") from error
+    require_same(path, content, plan.manifest)
+    return plan
 
 
-def replayed(
-    plant: Plant,
-    scenario: Scenario,
-    changes: Mapping[str, FloatArray],
-    index: int,
-    first: int = 0,
-    sensor_errors: Mapping[str, FloatArray] | None = None,
-) -> tuple[Plant, Scenario]:
-    """Machine and scenario of one run of `simulate_many`, for `simulate`."""
-    own, errors = (
-        {name: float(values[index - first]) for name, values in columns.items()}
-        for columns in (changes, sensor_errors or {})
+def replay(
+    plan: Plan, index: int, *, engine: EngineChoice = "auto", progress: Progress | None = None
+) -> Experiment:
+    """One run of a campaign with all its time series: the same machine, sensor errors and noise."""
+    if not 0 <= index < plan.samples:
+        raise InputError("campaign", "run", str(index), f"0 to {plan.samples - 1}")
+    machines = drawn(plan)
+    wanted = wanted_of(plan)
+    plant, scenario = replayed(
+        plan.plant, wanted.scenario, machines.changes, index, sensor_errors=machines.sensor_errors
     )
-    par: Any = replace(plant.parameters, **own)
-    if errors:
-        scenario = replace(scenario, sensor_errors=dict(scenario.sensor_errors or {}) | errors)
-    return plant.variant(par), replace(scenario, run=index)
-
-
-def _sensed(scenario: Scenario, sensor_errors: Mapping[str, FloatArray] | None) -> Scenario:
-    """With sensors that may err where runs have errors of their own; none of them is known to be finite yet."""
-    if not sensor_errors:
-        return scenario
-    return replace(
-        scenario, sensor_errors=dict(scenario.sensor_errors or {}) | dict.fromkeys(sensor_errors, 0.0)
-    )
-
-
-def _count(plant: Plant, changes: Mapping[str, FloatArray], sensor_errors: Mapping[str, FloatArray]) -> int:
-    known = units_of(plant.parameters)
-    sizes = {}
-    for name, values in [*changes.items(), *sensor_errors.items()]:
-        column = np.asarray(values)
-        if column.ndim != 1 or not column.size or column.dtype.kind not in "fiu":
-            raise InputError(
-                "campaign", name, f"{column.dtype} of shape {column.shape}", "a number for each run"
-            )
-        sizes[name] = len(column)
-    for name in changes:
-        if name not in known:
-            raise InputError("campaign", name, "an unknown parameter", "one of " + " ".join(known))
-    if len(set(sizes.values())) != 1:
-        raise InputError("campaign", "changes", f"{sizes or 'nothing'}", "as many values of each parameter")
-    return next(iter(sizes.values()))
-
-
-def _thetas(
-    plant: Plant,
-    values: Mapping[str, ca.DM],
-    changes: Mapping[str, FloatArray],
-    sensor_errors: Mapping[str, FloatArray],
-    runs: int,
-) -> FloatArray:
-    """theta of every run, a row each. Every record is checked as one that is read from a file."""
-    place, k = {}, 0
-    for name, value in values.items():
-        place[name] = k
-        k += value.nnz()
-    theta = np.tile(machine.flat(values), (runs, 1))
-    for name, column in changes.items():
-        column = np.asarray(column, dtype=float)
-        for extreme in (column.min(), column.max()):  # NaN comes out of both
-            replace(plant.parameters, **{name: float(extreme)})
-        theta[:, place[f"machine.{name}"]] = column
-    names = [signal.name for signal in plant.sensor_errors]
-    for name, column in sensor_errors.items():
-        column = np.asarray(column, dtype=float)
-        if not np.isfinite(column).all():
-            raise InputError("campaign", name, "NaN or infinity", "finite errors of a sensor")
-        theta[:, place["errors"] + names.index(name)] = column
-    for name, twin in twins_of(plant.parameters).items():
-        pair = theta[:, place[f"machine.{name}"]], theta[:, place[f"machine.{twin}"]]
-        if not np.array_equal(*pair):
-            raise InputError("campaign", name, f"values unlike {twin}", f"the same, as in {plant.name}")
-    return theta
-
-
-def _starts(
-    plant: Plant,
-    c: Controller,
-    setup: Setup,
-    values: Mapping[str, ca.DM],
-    x: FloatArray,
-    xi_pred: FloatArray,
-    current: FloatArray,
-) -> ca.Function:
-    """theta -> the state in which a machine starts, and the noise of its sensors."""
-    symbolic, _, theta = machine.numbered(plant, values)
-    first = machine.initial(symbolic, c, setup, ca.DM(x), ca.DM(xi_pred), ca.DM(current))
-    return ca.Function("start", [theta], [first, ca.densify(ca.vertcat(*symbolic.noise))])
-
-
-def _mapped(function: ca.Function, rows: FloatArray) -> list[FloatArray]:
-    """A function of one row on all rows: each of its results."""
-    parts = np.array_split(rows, -(-len(rows) // BLOCK))
-    found = [evaluate(function.map(len(part)), part) for part in parts]
-    return [np.vstack(column) for column in zip(*found, strict=True)]
-
-
-def _digest_sizes(plant: Plant) -> dict[str, int]:
-    p, m = len(plant.outputs), len(plant.inputs)
-    return {
-        "alive": 1,
-        "start": 1,  # of the stroke, and 1 / its length or 0: constant
-        "scale": 1,
-        "samples": 1,
-        "reached": len(LEVELS),  # sample at which each level was reached, -1 before
-        "below": len(LEVELS),  # share of the stroke one sample before
-        "above": len(LEVELS),  # and then
-        "share": 1,
-        "largest_share": 1,
-        "deviation": p,
-        "squares": p,
-        "force": m,
-        "limited": m,
-        "contact": len(plant.contacts),
-        "resting": 1,  # on the touchdown bearings at the start
-        "touching": 1,  # them at the end
-        "touched": 1,  # sample at which it first did, -1 before
-        "culprit": 1,  # index of what was touched first, -1 before
-    }
-
-
-@lru_cache(maxsize=16)
-def _digest(shape: Any) -> ca.Function:
-    """(kept, row, given, theta) -> kept: what a run leaves behind, sample by sample, until something is touched."""
-    plant, c, setup = shape.plant, shape.controller, shape.setup
-    sizes = machine.layout(plant, c, setup)
-    kept = {name: ca.SX.sym(name, size) for name, size in _digest_sizes(plant).items()}
-    row = {name: ca.SX.sym(name, size) for name, size in sizes.row.items()}
-    given = {name: ca.SX.sym(name, size) for name, size in sizes.given.items()}
-    theta = ca.SX.sym("theta", len(machine.flat(machine.numbers(plant, c, 1))))
-    largest = ca.fmax(kept["contact"], row["contact"])
-    alive = kept["alive"]  # what follows adds nothing once it is 0
-    error = ca.if_else(alive, row["p"] - given["p_ref"], 0)
-    share = (row["p"][plant.stroke_output] - kept["start"]) * kept["scale"]
-    now = ca.logic_and(ca.logic_and(alive, kept["reached"] < 0), share >= ca.DM(LEVELS))
-    after = {
-        "alive": ca.logic_and(alive, ca.mmax(largest) < 1),
-        "start": kept["start"],
-        "scale": kept["scale"],
-        "samples": kept["samples"] + alive,
-        "reached": ca.if_else(now, kept["samples"], kept["reached"]),
-        "below": ca.if_else(now, kept["share"], kept["below"]),
-        "above": ca.if_else(now, share, kept["above"]),
-        "share": share,
-        "largest_share": ca.if_else(alive, ca.fmax(kept["largest_share"], share), kept["largest_share"]),
-        "deviation": ca.fmax(kept["deviation"], ca.fabs(error)),
-        "squares": kept["squares"] + error**2,
-        "force": ca.fmax(kept["force"], ca.if_else(alive, ca.fabs(row["v"]), 0)),
-        "limited": kept["limited"] + ca.if_else(alive, row["saturated"], 0),
-        "contact": ca.if_else(alive, largest, kept["contact"]),
-        "culprit": ca.if_else(
-            ca.logic_and(ca.logic_and(alive, kept["culprit"] < 0), ca.mmax(row["contact"]) >= 1),
-            _largest(row["contact"]),
-            kept["culprit"],
-        ),
-    }
-    if setup.bearing:
-        touching = ca.mmax(row["contact"]) >= 1
-        ends = [row["contact"][i] for i, held in enumerate(plant.cushioned) if not held]
-        after["alive"] = ca.logic_and(alive, ca.mmax(ca.vertcat(*ends)) < 1)
-        first = kept["samples"] == 0
-        after["resting"] = ca.if_else(first, touching, kept["resting"])
-        after["touching"] = ca.if_else(alive, touching, kept["touching"])
-        now = ca.logic_and(touching, kept["touched"] < 0)
-        after["touched"] = ca.if_else(now, kept["samples"], kept["touched"])
-    result = ca.vertcat(*(after.get(name, kept[name]) for name in kept))
-    arguments = [ca.vertcat(*part.values()) for part in (kept, row, given)]
-    return ca.Function("digest", [*arguments, theta], [ca.densify(result)])
-
-
-def _largest(values: Any) -> Any:
-    """Index of the largest entry, the first of equals."""
-    found, index = values[0], ca.SX(0)
-    for k in range(1, values.numel()):
-        index = ca.if_else(values[k] > found, k, index)
-        found = ca.fmax(found, values[k])
-    return index
-
-
-def _batch(kept: FloatArray, samples: int, Ts: float, sizes: Mapping[str, int]) -> Batch:
-    columns = dict(zip(sizes, np.split(kept, np.cumsum([*sizes.values()])[:-1], axis=1), strict=True))
-    count = columns["samples"][:, 0]
-    resting, touching, touched = (columns[name][:, 0] for name in ("resting", "touching", "touched"))
-    held = np.where(resting == 1, touching == 0, touched < 0)
-    completed = (columns["alive"][:, 0] == 1) & np.isfinite(kept).all(axis=1) & (count == samples) & held
-    end = np.where((count == samples) & (resting == 0) & (touched >= 0), touched, np.maximum(count - 1, 0))
-    reached, below, above = (columns[name] for name in ("reached", "below", "above"))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        first, last = np.where(
-            reached > 0, reached - 1 + (np.array(LEVELS) - below) / (above - below), np.nan
-        ).T
-    # What follows the end is not guarded in "share" alone.
-    told = np.hstack([columns[name] for name in ("deviation", "squares", "contact")])
-    verdict = np.select(
-        [completed, ~np.isfinite(told).all(axis=1), resting == 1, columns["culprit"][:, 0] >= 0],
-        [0, 1, 2, 3 + columns["culprit"][:, 0]],
-        1,
-    )
-    return Batch(
-        duration=np.where(completed, samples, end) * Ts,
-        completed=completed,
-        deviation=columns["deviation"],
-        rms=np.sqrt(columns["squares"] / np.maximum(count, 1)[:, None]),
-        force=columns["force"],
-        contact=columns["contact"],
-        rise=np.where(completed, (last - first) * Ts, np.nan),
-        overshoot=np.where(
-            completed & (columns["scale"][:, 0] != 0),
-            np.maximum(columns["largest_share"][:, 0] - 1, 0),
-            np.nan,
-        ),
-        saturated=columns["limited"] / np.maximum(count, 1)[:, None],
-        verdict=verdict,
-    )
-
-
-def _one_by_one(
-    plant: Plant,
-    controller: Controller,
-    scenario: Scenario,
-    changes: Mapping[str, FloatArray],
-    sensor_errors: Mapping[str, FloatArray] | None,
-    first: int,
-    runs: int,
-    progress: Callable[[float], None] | None,
-) -> Batch:
-    """The same without a C compiler."""
-    figures: dict[str, list[Any]] = {name: [] for name in Batch.__dataclass_fields__}
-    for k in range(runs):
-        machine_k, scenario_k = replayed(plant, scenario, changes, first + k, first, sensor_errors)
-        run = simulate(machine_k, controller, scenario_k, engine="virtual machine")
-        stroke = stroke_figures(run)
-        error = run.p - run.reference
-        row = {
-            "duration": run.verdict.time,
-            "completed": run.verdict.completed,
-            "deviation": np.abs(error).max(axis=0),
-            "rms": np.sqrt((error**2).mean(axis=0)),
-            "force": np.abs(run.v).max(axis=0),
-            "contact": run.contact.max(axis=0),
-            "rise": stroke.rise,
-            "overshoot": stroke.overshoot,
-            "saturated": run.saturated.mean(axis=0),
-            "verdict": verdicts(plant).index(run.verdict.name),
-        }
-        for name, value in row.items():
-            figures[name].append(value)
-        if progress is not None:
-            progress((k + 1) / runs)
-    return Batch(**{name: np.array(column) for name, column in figures.items()})
+    return flown(plan.scenario, plant, plan.controller, wanted._replace(scenario=scenario), engine, progress)

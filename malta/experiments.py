@@ -42,6 +42,7 @@ from malta.simulate import (
     FEEDFORWARDS,
     RISE,
     Correction,
+    EngineChoice,
     Fault,
     Scenario,
     Trajectory,
@@ -832,6 +833,20 @@ def cases_of(name: str, plant: Plant, controller: Controller, **options: Any) ->
     own = _own_options(name)
     defaults = {p.name: p.default for p in inspect.signature(EXPERIMENTS[name]).parameters.values()}
     return CASES[name](plant, controller, **{option: defaults[option] for option in own} | options)
+
+
+def flown(
+    name: str,
+    plant: Plant,
+    controller: Controller,
+    wanted: Wanted,
+    engine: EngineChoice = "auto",
+    progress: Progress | None = None,
+) -> Experiment:
+    """One run of an experiment by itself. Experiments whose figure compares runs have that of a single run."""
+    cases, cut = _flown(plant, controller, [wanted], progress, {"engine": engine})
+    shown = name if name in ("stroke", "hold", "tilt") else "run"
+    return Experiment(shown, f"{name}: {wanted.label}", cases, cases[0].merits, interrupted=cut)
 
 
 def _check(name: str, options: Mapping[str, Any]) -> None:

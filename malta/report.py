@@ -17,9 +17,12 @@ from scipy.optimize import linear_sum_assignment
 from malta.data import in_unit, published_value
 from malta.figures import STYLES as STYLES
 from malta.figures import Published, number, read_out
+from malta.figures import distributions_figure as distributions_figure
 from malta.figures import experiment_figure as experiment_figure
 from malta.figures import save as save
 from malta.figures import stroke_figure as stroke_figure
+from malta.figures import worst_figure as worst_figure
+from malta.figures import yield_figure as yield_figure
 from malta.linearize import LinearModel
 from malta.simulate import StrokeFigures, Trajectory
 from malta.spec import Spec
@@ -27,6 +30,7 @@ from malta.synthesize import continuous_poles
 from malta.verify import BANDWIDTHS, Margins, zone
 
 if TYPE_CHECKING:
+    from malta.campaign import Campaign
     from malta.claims import Ledger
     from malta.experiments import Experiment, Merit
     from malta.plant import ComplexArray, FloatArray
@@ -207,6 +211,92 @@ def claims_table(ledger: Ledger) -> Table:
     return table
 
 
+def campaign_tables(found: Campaign, published: Published | None = None, worst: int = 5) -> Group:
+    """How the runs of a campaign end, their figures of merit beside the published bounds, and the worst runs."""
+    tables: list[Table | str] = [_ends_table(found, published)]
+    if found.completed.any():
+        tables.append(_findings_table(found, published))
+    if worst and len(found.index):
+        tables.append(_worst_table(found, worst))
+    return Group(*tables)
+
+
+def _ends_table(found: Campaign, published: Published | None) -> Table:
+    from malta.findings import kept, rate
+
+    within, runs = kept(found, published), len(found.index)
+    table = _table("How the runs end", "end", "runs", "share [%]", "95 % interval [%]")
+    rows = {"completed": found.rate} | {
+        name: rate(count, runs) for name, count in found.ends.items() if name != "completed"
+    }
+    if within is not None:
+        rows["completed within the published bounds"] = rate(int(within.sum()), runs)
+    for name, share in rows.items():
+        interval = f"{number(100 * share.low)} to {number(100 * share.high)}"
+        _row(table, name, f"{share.passed}", number(100 * share.share), interval)
+    return table
+
+
+def _findings_table(found: Campaign, published: Published | None) -> Table:
+    from malta.findings import figures_of
+
+    listed = figures_of(found, published)
+    bounds = any(math.isfinite(f.published) for f in listed)
+    heads = [*(f"{p} %" for p in PERCENTILES), "largest", *(["published", "kept [%]"] if bounds else [])]
+    table = _table("Figures of merit: percentiles of the completed runs", "figure", *heads)
+    for f in listed:
+        values = in_unit(1.0, f.unit) * f.values[np.isfinite(f.values)]
+        if not values.size:
+            continue
+        cells = [number(float(v)) for v in (*np.percentile(values, PERCENTILES), values.max())]
+        if bounds and math.isfinite(f.published):
+            bound = f"{in_unit(f.published, f.unit):.6g}"
+            at_most = f.relation == "at most"
+            cells += [
+                f"<= {bound}" if at_most else bound,
+                number(100 * float(f.within.mean())) if at_most else "",
+            ]
+        unit = "%" if f.unit == "percent" else f.unit
+        _row(table, f"{f.label} [{unit}]", *cells, *([""] * (len(heads) - len(cells))))
+    return table
+
+
+PERCENTILES = (5, 50, 95, 99)
+
+
+def _worst_table(found: Campaign, count: int) -> Table:
+    """The worst runs, each with what it was flown with: parameters off the middle of the box, errors of the sensors."""
+    from malta.findings import worst_of
+    from malta.many import verdicts
+
+    table = _table("The worst runs", "run", "end", "at [ms]", "clearance [%]", "off the middle of the box")
+    table.columns[0].justify = "right"
+    table.columns[1].justify = table.columns[4].justify = "left"
+    names = verdicts(found.plan.plant)
+    for row in worst_of(found, count):
+        off = [_off(found, row, k) for k in range(len(found.names))]
+        _row(
+            table,
+            f"{found.index[row]}",
+            names[int(found.batch.verdict[row])],
+            f"{found.batch.duration[row] * 1e3:.1f}",
+            number(100 * float(found.batch.contact[row].max()), 3),
+            "  ".join(off),
+        )
+    return table
+
+
+def _off(found: Campaign, row: int, k: int) -> str:
+    name, value = found.names[k], float(found.values[row, k])
+    if name in found.plan.spread:
+        middle = getattr(found.plan.parameters, name)
+        return f"{name} {100 * (value / middle - 1):+.1f}%" if middle else f"{name} {value:+.3g}"
+    unit = {"1": "percent", "m": "um", "rad": "deg"}[
+        next(s.unit for s in found.plan.plant.sensor_errors if s.name == name)
+    ]
+    return f"{name} {in_unit(value, unit):+.2f}{'%' if unit == 'percent' else ' ' + unit}"
+
+
 def _named(merit: Merit) -> str:
     unit = {"percent": "%", "1": ""}.get(merit.unit, merit.unit)
     return f"{merit.label} [{unit}]" if unit else merit.label
@@ -272,3 +362,15 @@ def experiment(e: Experiment, path: str | Path | None = None, published: Publish
 
 def _default(run: Trajectory, name: str) -> Path:
     return Path("build") / f"{run.controller.name}_{name}.png"
+
+
+def campaign(found: Campaign, folder: str | Path, published: Published | None = None) -> list[Path]:
+    """Draw what a campaign found: distributions.png, yield.png and worst.png in a folder."""
+    return [
+        save(draw(found, published), Path(folder) / name)
+        for name, draw in (
+            ("distributions.png", distributions_figure),
+            ("yield.png", yield_figure),
+            ("worst.png", worst_figure),
+        )
+    ]

@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 
 import malta
 from malta import engine, references
-from malta.campaign import Batch, replayed, simulate_many, verdicts
 from malta.machine import FIDELITIES, Fidelity
+from malta.many import Batch, replayed, simulate_many, verdicts
 from malta.noise import keys, normals
 from malta.simulate import (
     Correction,

@@ -1,0 +1,130 @@
+"""What a campaign found: shares of runs with their intervals, figures of merit beside the paper's, the worst runs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from scipy.stats import binomtest
+
+from malta.data import published_value
+from malta.experiments import DISTANCE
+from malta.plant import readonly
+from malta.simulate import RISE
+
+if TYPE_CHECKING:
+    from malta.campaign import Campaign
+    from malta.plan import Plan
+    from malta.plant import FloatArray
+
+CONFIDENCE = 0.95  # of the interval about a share
+
+
+class Rate(NamedTuple):
+    """A share of runs with its two-sided interval (Clopper-Pearson) at CONFIDENCE."""
+
+    passed: int
+    runs: int
+    share: float  # NaN of no runs
+    low: float
+    high: float
+
+
+class Finding(NamedTuple):
+    """A figure of merit over all completed runs, SI."""
+
+    label: str
+    kind: str  # figures of a kind are drawn together
+    unit: str  # to show it in
+    values: FloatArray  # a row for each run of the campaign; NaN where it has none
+    published: float = math.nan  # SI; NaN where the paper has none
+    relation: str = "at most"  # of ours to the published: "about" or "at most"
+
+    @property
+    def within(self) -> FloatArray:
+        """Which runs were completed and keep the published bound."""
+        return np.asarray(self.values <= self.published)
+
+
+def rate(count: int, runs: int) -> Rate:
+    """A share with the interval that holds the true one at least CONFIDENCE of the time."""
+    if not runs:
+        return Rate(0, 0, math.nan, 0.0, 1.0)
+    low, high = binomtest(count, runs).proportion_ci(CONFIDENCE, method="exact")
+    return Rate(count, runs, count / runs, float(low), float(high))
+
+
+def figures_of(found: Campaign, published: Mapping[str, Any] | None = None) -> list[Finding]:
+    """The figures of merit of a campaign, with the bounds that the paper prints of this very scenario."""
+    plan, batch = found.plan, found.batch
+    plant = plan.plant
+    names = [signal.name for signal in plant.outputs]
+    paper = published if is_published(plan) else None
+    done = found.completed
+
+    def of(
+        name: str, kind: str, unit: str, values: FloatArray, key: str = "", relation: str = "at most"
+    ) -> Finding:
+        bound = published_value(paper, key) if paper is not None and key else math.nan
+        label = f"{kind} {name}" if name else kind
+        return Finding(label, kind, unit, readonly(np.where(done, values, np.nan)), bound, relation)
+
+    axis, thrust = plant.stroke_output, plant.thrust_input
+    bearings = [k for k in range(len(plant.inputs)) if k != thrust]
+    radial = [(k, name) for k, name in enumerate(names) if k != axis]
+    listed = []
+    if np.isfinite(batch.rise).any():
+        listed += [
+            of("", "rise, 10-90 %", "ms", batch.rise, "figure_12.rise_time", "about"),
+            of("", "overshoot", "percent", batch.overshoot, "figure_12.overshoot"),
+        ]
+    listed += [of("", f"deviation of {names[axis]}", "mm", batch.deviation[:, axis], "figure_12.axial_error")]
+    listed += [
+        of(n, "deviation", "um", batch.deviation[:, k], "figure_13.radial_deviation") for k, n in radial
+    ]
+    if plan.scenario == "hold":
+        listed += [of("", f"rms of {names[axis]}", "um", batch.rms[:, axis])]
+        listed += [of(n, "rms", "um", batch.rms[:, k]) for k, n in radial]
+    listed += [
+        of("", "largest bearing force", "N", batch.force[:, bearings].max(axis=1, initial=0.0)),
+        of("", "largest thrust", "N", batch.force[:, thrust]),
+    ]
+    listed += [
+        of(name.removeprefix("touchdown at "), "clearance used,", "percent", batch.contact[:, k])
+        for k, name in enumerate(plant.contacts)
+    ]
+    return [
+        *listed,
+        of("", "samples with limited commands", "percent", batch.saturated.max(axis=1, initial=0.0)),
+    ]
+
+
+def is_published(plan: Plan) -> bool:
+    """Whether the paper shows this very stroke."""
+    asked = {"distance": DISTANCE, "rise": RISE, "profile": "logistic"}
+    return plan.scenario == "stroke" and all(
+        plan.options.get(name, value) == value for name, value in asked.items()
+    )
+
+
+def kept(found: Campaign, published: Mapping[str, Any] | None = None) -> FloatArray | None:
+    """Which runs were completed within every published bound; None where the paper has none."""
+    bounds = [
+        f for f in figures_of(found, published) if f.relation == "at most" and math.isfinite(f.published)
+    ]
+    return np.all([f.within for f in bounds], axis=0) if bounds else None
+
+
+def worst_of(found: Campaign, count: int) -> list[int]:
+    """Rows of the worst runs, the worst first: those that ended early, then those that came closest to a touch.
+
+    How close is measured from the median run, which may have to go near an end stop.
+    """
+    batch = found.batch
+    if not len(found.index):
+        return []
+    closest = -(batch.contact - np.median(batch.contact, axis=0)).max(axis=1, initial=0.0)
+    order = np.lexsort((found.index, np.where(found.completed, closest, batch.duration), found.completed))
+    return [int(k) for k in order[:count]]
