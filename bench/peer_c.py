@@ -8,15 +8,12 @@ import subprocess
 import tempfile
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from peer_problem import NO_SPIN, packed, problem
+from peer_problem import MECHANICAL, NO_SPIN, Stated, Workload, packed, problem, stated
 
-from malta.controller import Controller
-from malta.data import plant_of
-from malta.engine import feedforward_table
-from malta.plants.tubular import Parameters
+from malta.noise import keys
 
 if TYPE_CHECKING:
     from malta.plant import FloatArray
@@ -34,28 +31,21 @@ def _library(name: str) -> ctypes.CDLL:
     with tempfile.TemporaryDirectory() as scratch:
         library = Path(scratch) / f"{name}.so"
         command = [str(GCC), *FLAGS.split(), "-fopenmp", "-shared", "-fPIC", "-o", str(library)]
-        subprocess.run([*command, str(SOURCES / f"{name}.c"), "-lm"], check=True)
+        subprocess.run([*command, str(SOURCES / f"{name}.c"), "-lmvec", "-lm"], check=True)
         return ctypes.CDLL(str(library))
 
 
 def _at(array: np.ndarray) -> ctypes.c_void_p:
-    return ctypes.c_void_p(array.ctypes.data)
+    """Its address, which keeps it alive."""
+    return array.ctypes.data_as(ctypes.c_void_p)
 
 
-def single(
-    par: Parameters,
-    controller: Controller,
-    p_ref: FloatArray,
-    xi_ref: FloatArray,
-    v_ff: FloatArray,
-    *,
-    substeps: int = 4,
-) -> tuple[FloatArray, FloatArray]:
+def single(work: Workload) -> tuple[FloatArray, FloatArray]:
     """True outputs, k x 5, and states, k x 12, up to and with the sample of a contact."""
-    given = problem(par, controller, p_ref, xi_ref, v_ff, substeps)
-    machine, law = np.array(given.machine), packed(controller)
+    given = problem(work)
+    machine, law = np.array(given.machine), packed(work.controller)
     body = np.ascontiguousarray(given.bodies[:, 0])
-    p, x = np.empty((len(p_ref), 5)), np.empty((len(p_ref), 12))
+    p, x = _series(work)
     done = _library("single").single(
         _at(machine),
         _at(law),
@@ -64,7 +54,7 @@ def single(
         _at(body[5:]),
         ctypes.c_double(NO_SPIN),
         _at(given.start),
-        ctypes.c_int64(len(p_ref)),
+        ctypes.c_int64(len(p)),
         _at(given.p_ref),
         _at(given.feed),
         _at(p),
@@ -73,66 +63,54 @@ def single(
     return p[:done], x[:done]
 
 
-def plain(
-    par: Parameters,
-    controller: Controller,
-    p_ref: FloatArray,
-    xi_ref: FloatArray,
-    v_ff: FloatArray,
-    *,
-    substeps: int = 4,
-) -> tuple[FloatArray, FloatArray]:
-    """The same as `single`, from the equations as they stand in malta, with the system's plain -O3."""
-    c, ff = controller, controller.feedforward
-    h = c.sample_time / substeps
-    wave, decay = 2 * np.pi / par.L_p, np.exp(-par.w_cc * h / 2)
-    body = [par.m, par.I_xx, par.I_yy, par.I_zz, par.K_A, par.l_B, par.l_S, wave, par.phi_c, par.F_c, par.g]
-    machine = np.array([*body, par.r_max, par.z_max, decay, h])
-    matrices = (c.L, c.Cd, c.Ad, c.Bd, c.K, c.Ki, c.limits.force, np.array(c.sample_time))
-    law = np.concatenate([np.ravel(M) for M in matrices])
-    grid = feedforward_table(ff.z_grid, ff.v0)
-    plant = plant_of(par)
-    mechanical = dict(zip([s.name for s in plant.design_states], xi_ref[0].tolist(), strict=True))
-    x0 = plant.at(**mechanical).x
-    state = np.concatenate([x0, ff.at(x0[2]), xi_ref[0], np.zeros(10)])
-    p, x = np.empty((len(p_ref), 5)), np.empty((len(p_ref), 12))
+def plain(work: Workload) -> tuple[FloatArray, FloatArray]:
+    """The same as `single`, from the equations as they stand in malta."""
+    given = stated(work)
+    p, x = _series(work)
     done = _library("plain").plain(
-        _at(machine),
-        _at(law),
-        ctypes.c_long(len(grid)),
-        _at(grid),
-        ctypes.c_long(len(p_ref)),
-        ctypes.c_long(substeps),
-        *(_at(np.ascontiguousarray(a)) for a in (p_ref, xi_ref, v_ff)),
-        _at(state),
+        _at(np.ascontiguousarray(given.machines[:, 0])),
+        *_asked(work, given),
+        _at(np.ascontiguousarray(given.states[:, 0])),
         _at(p),
         _at(x),
     )
     return p[:done], x[:done]
 
 
-def many(
-    par: Parameters,
-    controller: Controller,
-    factors: FloatArray,
-    p_ref: FloatArray,
-    xi_ref: FloatArray,
-    v_ff: FloatArray,
-    *,
-    substeps: int = 4,
-    noise: float = 0.0,
-    seed: int = 0,
-    scalar_noise: bool = False,
-) -> tuple[FloatArray, FloatArray]:
+def plain_many(work: Workload) -> tuple[FloatArray, FloatArray]:
+    """The same as `many`, from the equations as they stand in malta, with malta's own noise."""
+    given, library = stated(work), _library("plain_many")
+    count = given.machines.shape[1]
+    machines, states = (
+        np.pad(rows, ((0, 0), (0, -count % library.width())), mode="edge")
+        for rows in (given.machines, given.states)
+    )
+    largest, touched = _found(machines.shape[1])
+    matrices, points, grid, *rest = _asked(work, given)
+    library.many(
+        _at(machines),
+        matrices,
+        points,
+        grid,
+        ctypes.c_long(machines.shape[1]),
+        *rest,
+        _at(states),
+        _at(keys(work.seed, np.arange(machines.shape[1]))),
+        _at(work.sigma),
+        _at(largest),
+        _at(touched),
+    )
+    return largest[:, :count].T, touched[:count].astype(bool)
+
+
+def many(work: Workload, *, scalar_noise: bool = False) -> tuple[FloatArray, FloatArray]:
     """Largest |p - p*| of each machine, count x 5, and whether it touched down."""
-    given = problem(par, controller, p_ref, xi_ref, v_ff, substeps, factors)
-    library = _library("many")
-    machine, law = np.array(given.machine), packed(controller)
-    count = len(factors)
+    given, library = problem(work), _library("many")
+    machine, law = np.array(given.machine), packed(work.controller)
+    count = given.bodies.shape[1]
     bodies = np.pad(given.bodies, ((0, 0), (0, -count % library.width())), mode="edge")
-    start = np.concatenate([given.start[[0, 1, 2, 3, 4, 6, 7, 8, 9, 10]], given.v0])
-    deviation = noise * np.array([par.s_r] * 4 + [par.s_z])
-    largest, touched = np.empty((5, bodies.shape[1])), np.empty(bodies.shape[1], dtype=np.uint8)
+    start = np.concatenate([given.start[MECHANICAL], given.v0])
+    largest, touched = _found(bodies.shape[1])
     library.many(
         _at(machine),
         _at(law),
@@ -140,13 +118,29 @@ def many(
         _at(bodies),
         ctypes.c_int64(bodies.shape[1]),
         _at(start),
-        ctypes.c_int64(len(p_ref)),
+        ctypes.c_int64(len(given.p_ref)),
         _at(given.p_ref),
         _at(given.feed),
-        ctypes.c_int(0 if not noise else 2 if scalar_noise else 1),
-        ctypes.c_uint64(seed),
-        _at(deviation),
+        ctypes.c_int(0 if not work.noise else 2 if scalar_noise else 1),
+        ctypes.c_uint64(work.seed),
+        _at(work.sigma),
         _at(largest),
         _at(touched),
     )
     return largest[:, :count].T, touched[:count].astype(bool)
+
+
+def _series(work: Workload) -> tuple[FloatArray, FloatArray]:
+    return np.empty((len(work.p_ref), 5)), np.empty((len(work.p_ref), 12))
+
+
+def _found(count: int) -> tuple[FloatArray, np.ndarray]:
+    return np.empty((5, count)), np.empty(count, dtype=np.uint8)
+
+
+def _asked(work: Workload, given: Stated) -> tuple[Any, ...]:
+    """Law, grid, samples, steps and references."""
+    rows = (np.ascontiguousarray(a, dtype=float) for a in (work.p_ref, work.xi_ref, work.v_ff))
+    counts = (ctypes.c_long(n) for n in (len(given.grid), len(work.p_ref), work.substeps))
+    points, samples, substeps = counts
+    return _at(given.law), points, _at(given.grid), samples, substeps, *(_at(a) for a in rows)

@@ -11,10 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from peer_problem import Machine, packed, problem
-
-from malta.controller import Controller
-from malta.plants.tubular import Parameters
+from peer_problem import Machine, Workload, packed, problem
 
 if TYPE_CHECKING:
     from malta.plant import FloatArray
@@ -232,33 +229,30 @@ def fly(
 compiled = jax.jit(fly, static_argnames=("substeps", "noisy"))
 
 
-def many(
-    par: Parameters,
-    controller: Controller,
-    factors: FloatArray,
-    p_ref: FloatArray,
-    xi_ref: FloatArray,
-    v_ff: FloatArray,
-    *,
-    substeps: int = 4,
-    noise: float = 0.0,
-    seed: int = 0,
-) -> tuple[FloatArray, FloatArray]:
+def many(work: Workload) -> tuple[FloatArray, FloatArray]:
     """Largest |p - p*| of each machine, count x 5, and whether it touched down."""
-    given = problem(par, controller, p_ref, xi_ref, v_ff, substeps, factors)
-    fixed = (given.start, given.v0, given.p_ref, given.feed, noise * np.array([par.s_r] * 4 + [par.s_z]))
-    key = jax.random.key(seed, impl="rbg")
-    bodies = np.pad(given.bodies, ((0, 0), (0, -len(factors) % PART)), mode="edge")
+    given = problem(work)
+    fixed = (given.start, given.v0, given.p_ref, given.feed, work.sigma)
+    key = jax.random.key(work.seed, impl="rbg")
+    count = given.bodies.shape[1]
+    bodies = np.pad(given.bodies, ((0, 0), (0, -count % PART)), mode="edge")
 
     def part(first: int) -> tuple[FloatArray, FloatArray]:
         plants = tuple(bodies[:, first : first + PART])
         own = jax.random.fold_in(key, first)
         largest, flying = compiled(
-            given.machine, substeps, noise > 0, packed(controller), given.law.rows, plants, *fixed, own
+            given.machine,
+            work.substeps,
+            work.noise > 0,
+            packed(work.controller),
+            given.law.rows,
+            plants,
+            *fixed,
+            own,
         )
         return np.asarray(largest), np.asarray(flying)
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        done = list(pool.map(part, range(0, len(factors), PART)))
-    largest, flying = (np.concatenate(kind)[: len(factors)] for kind in zip(*done, strict=True))
+        done = list(pool.map(part, range(0, count, PART)))
+    largest, flying = (np.concatenate(kind)[:count] for kind in zip(*done, strict=True))
     return largest, ~flying

@@ -11,10 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 import numba
 import numpy as np
 from numba.np.unsafe.ndarray import to_fixed_tuple
-from peer_problem import NO_SPIN, Machine, packed, problem
-
-from malta.controller import Controller
-from malta.plants.tubular import Parameters
+from peer_problem import NO_SPIN, Machine, Workload, packed, problem
 
 if TYPE_CHECKING:
     from malta.plant import FloatArray
@@ -484,21 +481,13 @@ def fly_all(
         )
 
 
-def single(
-    par: Parameters,
-    controller: Controller,
-    p_ref: FloatArray,
-    xi_ref: FloatArray,
-    v_ff: FloatArray,
-    *,
-    substeps: int = 4,
-) -> tuple[FloatArray, FloatArray]:
+def single(work: Workload) -> tuple[FloatArray, FloatArray]:
     """True outputs, k x 5, and states, k x 12, up to and with the sample of a contact."""
-    given = problem(par, controller, p_ref, xi_ref, v_ff, substeps)
-    p, x = np.empty((len(p_ref), 5)), np.empty((len(p_ref), 12))
+    given = problem(work)
+    p, x = np.empty((len(given.p_ref), 5)), np.empty((len(given.p_ref), 12))
     done = fly(
         np.array(given.machine),
-        packed(controller),
+        packed(work.controller),
         given.law.rows,
         np.ascontiguousarray(given.bodies[:, 0]),
         NO_SPIN,
@@ -512,38 +501,27 @@ def single(
     return p[:done], x[:done]
 
 
-def many(
-    par: Parameters,
-    controller: Controller,
-    factors: FloatArray,
-    p_ref: FloatArray,
-    xi_ref: FloatArray,
-    v_ff: FloatArray,
-    *,
-    substeps: int = 4,
-    noise: float = 0.0,
-    seed: int = 0,
-    scalar_noise: bool = False,
-) -> tuple[FloatArray, FloatArray]:
+def many(work: Workload, *, scalar_noise: bool = False) -> tuple[FloatArray, FloatArray]:
     """Largest |p - p*| of each machine, count x 5, and whether it touched down.
 
     scalar_noise: from numba's own np.random, one number at a time
     """
-    given = problem(par, controller, p_ref, xi_ref, v_ff, substeps, factors)
-    largest, touched = np.empty((len(factors), 5)), np.empty(len(factors), dtype=bool)
-    blocks = (len(factors) + LANES - 1) // LANES
+    given = problem(work)
+    count = given.bodies.shape[1]
+    largest, touched = np.empty((count, 5)), np.empty(count, dtype=bool)
+    blocks = (count + LANES - 1) // LANES
     fly_all(
         np.array(given.machine),
-        packed(controller),
+        packed(work.controller),
         given.law.rows,
         np.ascontiguousarray(given.bodies.T),
         given.start,
         given.v0,
         given.p_ref,
         given.feed,
-        noise * np.array([par.s_r] * 4 + [par.s_z]),
-        scalar_noise and noise > 0,
-        np.random.default_rng(seed).integers(2**64, size=(blocks, 4, LANES), dtype=np.uint64),
+        work.sigma,
+        scalar_noise and work.noise > 0,
+        np.random.default_rng(work.seed).integers(2**64, size=(blocks, 4, LANES), dtype=np.uint64),
         largest,
         touched,
     )

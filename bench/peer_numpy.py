@@ -7,10 +7,9 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING
 
 import numpy as np
-from peer_problem import Machine, Problem, problem
+from peer_problem import Machine, Problem, Workload, problem
 
 from malta.controller import Controller
-from malta.plants.tubular import Parameters
 
 if TYPE_CHECKING:
     from malta.plant import FloatArray
@@ -172,27 +171,16 @@ def fly(
     return largest.T, ~flying
 
 
-def many(
-    par: Parameters,
-    controller: Controller,
-    factors: FloatArray,
-    p_ref: FloatArray,
-    xi_ref: FloatArray,
-    v_ff: FloatArray,
-    *,
-    substeps: int = 4,
-    noise: float = 0.0,
-    seed: int = 0,
-) -> tuple[FloatArray, FloatArray]:
+def many(work: Workload) -> tuple[FloatArray, FloatArray]:
     """Largest |p - p*| of each machine, count x 5, and whether it touched down."""
-    given = problem(par, controller, p_ref, xi_ref, v_ff, substeps, factors)
-    deviation = noise * np.array([par.s_r] * 4 + [par.s_z])[:, None]
-    size = min(PART, -(-len(factors) // (os.cpu_count() or 1)))
-    parts = [np.ascontiguousarray(given.bodies[:, i : i + size]) for i in range(0, len(factors), size)]
-    seeds = np.random.SeedSequence(seed).generate_state(len(parts))
+    given = problem(work)
+    count, deviation = given.bodies.shape[1], work.sigma[:, None]
+    size = min(PART, -(-count // (os.cpu_count() or 1)))
+    parts = [np.ascontiguousarray(given.bodies[:, i : i + size]) for i in range(0, count, size)]
+    seeds = np.random.SeedSequence(work.seed).generate_state(len(parts))
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         done = list(
-            pool.map(lambda part, own: fly(given, controller, part, deviation, int(own)), parts, seeds)
+            pool.map(lambda part, own: fly(given, work.controller, part, deviation, int(own)), parts, seeds)
         )
     largest, touched = (np.concatenate(kind) for kind in zip(*done, strict=True))
     return largest, touched

@@ -1,6 +1,7 @@
 """The stroke as plain arrays, for the peers that are written by hand: what does not depend on how a loop is run.
 
-The law's matrices fall apart into (x, beta), (y, alpha) and z; what lies between them must be zero, and is left out.
+`stated` has the equations' own numbers; `problem` those of the reformulated ones. Either way the law's matrices fall
+apart into (x, beta), (y, alpha) and z; what lies between them must be zero, and is left out.
 """
 
 from __future__ import annotations
@@ -12,12 +13,48 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from malta.controller import Controller
+from malta.engine import feedforward_table
 from malta.plants.tubular import Parameters
 
 if TYPE_CHECKING:
     from malta.plant import FloatArray
 
 NO_SPIN = 0.0  # rad/s
+MECHANICAL = [0, 1, 2, 3, 4, 6, 7, 8, 9, 10]  # of the twelve states: all but gamma's
+
+
+class Workload(NamedTuple):
+    """One controller and one reference, on one machine or, with `factors`, on many."""
+
+    par: Parameters
+    controller: Controller
+    p_ref: FloatArray  # k x 5
+    xi_ref: FloatArray  # k x 10
+    v_ff: FloatArray  # k x 5
+    factors: FloatArray | None = None  # count x 4, on m, K_A, K_B and K_D of `par`
+    noise: float = 0.0  # in multiples of the sensors' own
+    seed: int = 0
+    substeps: int = 4
+
+    @property
+    def sigma(self) -> FloatArray:
+        return self.noise * np.array([self.par.s_r] * 4 + [self.par.s_z])
+
+    @property
+    def varied(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """m, K_A, K_B and K_D of each machine."""
+        by = np.ones((1, 4)) if self.factors is None else self.factors
+        m, K_A, K_B, K_D = (by * [self.par.m, self.par.K_A, self.par.K_B, self.par.K_D]).T
+        return m, K_A, K_B, K_D
+
+
+class Stated(NamedTuple):
+    """What the equations as they stand are given."""
+
+    machines: FloatArray  # 17 x count, as Machine of peers/plain.h
+    law: FloatArray  # as Law of peers/plain.h
+    grid: FloatArray  # rows of z, v0 and its slope
+    states: FloatArray  # 27 x count: the mover's, forces, xi
 
 
 class Radial(NamedTuple):
@@ -86,23 +123,45 @@ class Problem(NamedTuple):
     feed: FloatArray  # k x 5, K xi* + v_ff
 
 
-def problem(
-    par: Parameters,
-    c: Controller,
-    p_ref: FloatArray,
-    xi_ref: FloatArray,
-    v_ff: FloatArray,
-    substeps: int,
-    factors: FloatArray | None = None,
-) -> Problem:
-    """`factors`: count x 4, on m, K_A, K_B and K_D of `par`; None is one machine as it is."""
+def stated(work: Workload) -> Stated:
+    par, c, (m, K_A, K_B, K_D) = work.par, work.controller, work.varied
+    believed, ff, h = c.parameters, c.feedforward, work.controller.sample_time / work.substeps
+    assert isinstance(believed, Parameters)
+    law_of(c)  # checks
+    rows = (
+        *(1 / m, 2 * K_A, 2 * K_A * par.l_B**2, K_B / believed.K_B, K_D / believed.K_D),
+        *(
+            1 / par.I_xx,
+            par.I_zz / par.I_xx,
+            par.l_B,
+            par.l_S,
+            2 * math.pi / par.L_p,
+            par.phi_c,
+            par.F_c,
+            par.g,
+        ),
+        *(math.exp(-par.w_cc * h / 2), h, par.r_max**2, par.z_max),
+    )
+    machines = np.array([np.broadcast_to(row, m.shape) for row in rows])
+    matrices = (c.L, c.Cd, c.Ad, c.Bd, c.K, c.Ki, c.limits.force, np.array(c.sample_time))
+    states = np.zeros((27, len(m)))
+    states[MECHANICAL] = work.xi_ref[0][:, None]
+    states[12:17] = ff.at(float(work.xi_ref[0, 2]))[:, None] * machines[[3, 3, 3, 3, 4]]
+    states[17:] = work.xi_ref[0][:, None]
+    return Stated(
+        machines, np.concatenate([np.ravel(M) for M in matrices]), feedforward_table(ff.z_grid, ff.v0), states
+    )
+
+
+def problem(work: Workload) -> Problem:
+    """The numbers of peers/loop.h."""
+    par, c, h = work.par, work.controller, work.controller.sample_time / work.substeps
     assert par.I_xx == par.I_yy, "gamma is left out"
     assert par.r_max < 0.007 * par.l_S, "sines and cosines are good for 0.01 rad"
-    law, believed, h = law_of(c), c.parameters, c.sample_time / substeps
+    law, believed = law_of(c), c.parameters
     assert isinstance(believed, Parameters)
     assert (par.I_max, c.delay) == (believed.I_max, 0), "the law limits what the machine would"
-    by = np.ones(4) if factors is None else factors.T
-    m, K_A, K_B, K_D = par.m * by[0], par.K_A * by[1], par.K_B * by[2], par.K_D * by[3]
+    m, K_A, K_B, K_D = work.varied
     inertia, push = par.I_xx, K_B / believed.K_B * h**2
     bodies = [2 * K_A / m * h**2, 2 * K_A * par.l_B**2 / inertia * h**2, m / inertia, par.F_c / m * h**2]
     bodies += [
@@ -112,7 +171,7 @@ def problem(
         K_D / believed.K_D / m * h**2,
     ]
     start = np.zeros(12)
-    start[[0, 1, 2, 3, 4, 6, 7, 8, 9, 10]] = xi_ref[0]
+    start[MECHANICAL] = work.xi_ref[0]
     return Problem(
         machine=Machine(
             l_S=par.l_S,
@@ -122,14 +181,14 @@ def problem(
             decay=math.exp(-par.w_cc * h / 2),
             r_max2=par.r_max**2,
             z_max=par.z_max,
-            substeps=substeps,
+            substeps=work.substeps,
         ),
         law=law,
         bodies=np.array(bodies).reshape(8, -1),
         start=start,
         v0=c.feedforward.at(float(start[2]))[[1, 3, 4]],
-        p_ref=np.ascontiguousarray(p_ref, dtype=float),
-        feed=xi_ref @ law.K.T + v_ff,
+        p_ref=np.ascontiguousarray(work.p_ref, dtype=float),
+        feed=work.xi_ref @ law.K.T + work.v_ff,
     )
 
 
