@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
 
@@ -18,9 +18,12 @@ from malta.errors import CheckError, InputError
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from malta.campaign import Campaign
+    from malta.controller import Controller
     from malta.experiments import Experiment
+    from malta.plan import Sampler
     from malta.plant import Parameters
-    from malta.simulate import StrokeFigures, Trajectory
+    from malta.simulate import EngineChoice, StrokeFigures, Trajectory
     from malta.verify import Margins
 
 app = typer.Typer(
@@ -62,6 +65,43 @@ Changes = Annotated[
 SCENARIOS = (
     "What to simulate: stroke, hold, tilt, lift-off, payload, thermal, disturbance, faults, drive-limits."
 )
+# Options of a run, in `simulate` and in `campaign`.
+Distance = Annotated[float | None, typer.Option(help="stroke, drive-limits: length [mm]. [10]")]
+Rise = Annotated[
+    float | None, typer.Option(help="stroke: rise of the reference, 10-90 % [ms]. [the published 16.2]")
+]
+ProfileName = Annotated[str | None, typer.Option(help="stroke: logistic or quintic reference. [logistic]")]
+FidelityName = Annotated[
+    str | None,
+    typer.Option(help="What makes the forces: force (first-order lags), dq (PI loops), phase. [dq]"),
+]
+Noise = Annotated[
+    float | None, typer.Option(help="Sensor noise in multiples of the machine's. [the scenario's]")
+]
+Quantize = Annotated[
+    bool | None, typer.Option(help="Sensors with the machine's resolution. [the scenario's]")
+]
+Bearing = Annotated[
+    bool | None,
+    typer.Option(help="Touchdown bearings push back, or a touchdown ends the run. [the scenario's]"),
+]
+Scheduled = Annotated[bool | None, typer.Option(help="C(z) of the measured z in the filter.")]
+Feedforward = Annotated[
+    str | None,
+    typer.Option(help="axial, as printed, or attraction: also what holds it off centre. [axial]"),
+]
+BearingAxes = Annotated[
+    str | None,
+    typer.Option(
+        help="dq, phase: current controllers in fixed axes, or turning with the force as printed. [fixed]"
+    ),
+]
+RealPwm = Annotated[
+    bool | None, typer.Option(help="phase: duty cycles in steps, dead time of the half-bridges.")
+]
+Delay = Annotated[int | None, typer.Option(help="Samples between measurement and command. [the machine's]")]
+Substeps = Annotated[int | None, typer.Option(help="Runge-Kutta steps a sample; the error is estimated. [4]")]
+Seed = Annotated[int | None, typer.Option(help="Seed of the noise. [0]")]
 GainFile = Annotated[Path, typer.Argument(metavar="GAINS", help="A gain file: .json, .npz or .mat.")]
 
 
@@ -151,28 +191,17 @@ def verify(gains: GainFile, change: Changes = None, as_json: AsJson = False) -> 
 @app.command()
 def simulate(
     gains: GainFile,
-    scenario: Annotated[str, typer.Option(help=SCENARIOS)] = "stroke",
+    scenario: Annotated[str | None, typer.Option(help=f"{SCENARIOS} [stroke]")] = None,
     change: Changes = None,
-    distance: Annotated[float | None, typer.Option(help="stroke, drive-limits: length [mm]. [10]")] = None,
-    rise: Annotated[
-        float | None, typer.Option(help="stroke: rise of the reference, 10-90 % [ms]. [the published 16.2]")
-    ] = None,
-    profile: Annotated[
-        str | None, typer.Option(help="stroke: logistic or quintic reference. [logistic]")
-    ] = None,
+    distance: Distance = None,
+    rise: Rise = None,
+    profile: ProfileName = None,
     during: Annotated[
         str | None, typer.Option(help="faults: strike during a stroke or a hold. [stroke]")
     ] = None,
-    fidelity: Annotated[
-        str | None,
-        typer.Option(help="What makes the forces: force (first-order lags), dq (PI loops), phase. [dq]"),
-    ] = None,
-    noise: Annotated[
-        float | None, typer.Option(help="Sensor noise in multiples of the machine's. [the scenario's]")
-    ] = None,
-    quantize: Annotated[
-        bool | None, typer.Option(help="Sensors with the machine's resolution. [the scenario's]")
-    ] = None,
+    fidelity: FidelityName = None,
+    noise: Noise = None,
+    quantize: Quantize = None,
     sensor: Annotated[
         list[str] | None,
         typer.Option(
@@ -180,37 +209,26 @@ def simulate(
             help="An error of the sensors: gain_x1=0.02, offset_y2=5um, hall_amplitude=0.01, hall_phase=2deg, ...",
         ),
     ] = None,
-    bearing: Annotated[
-        bool | None,
-        typer.Option(help="Touchdown bearings push back, or a touchdown ends the run. [the scenario's]"),
-    ] = None,
+    bearing: Bearing = None,
     estimator: Annotated[
         str | None, typer.Option(help="steady-state, kalman (time-varying) or extended. [steady-state]")
     ] = None,
-    scheduled: Annotated[bool | None, typer.Option(help="C(z) of the measured z in the filter.")] = None,
-    feedforward: Annotated[
-        str | None,
-        typer.Option(help="axial, as printed, or attraction: also what holds it off centre. [axial]"),
-    ] = None,
-    bearing_axes: Annotated[
-        str | None,
-        typer.Option(
-            help="dq, phase: current controllers in fixed axes, or turning with the force as printed. [fixed]"
-        ),
-    ] = None,
-    real_pwm: Annotated[
-        bool | None, typer.Option(help="phase: duty cycles in steps, dead time of the half-bridges.")
-    ] = None,
-    delay: Annotated[
-        int | None, typer.Option(help="Samples between measurement and command. [the machine's]")
-    ] = None,
-    substeps: Annotated[
-        int | None, typer.Option(help="Runge-Kutta steps a sample; the error is estimated. [4]")
-    ] = None,
-    seed: Annotated[int | None, typer.Option(help="Seed of the noise. [0]")] = None,
+    scheduled: Scheduled = None,
+    feedforward: Feedforward = None,
+    bearing_axes: BearingAxes = None,
+    real_pwm: RealPwm = None,
+    delay: Delay = None,
+    substeps: Substeps = None,
+    seed: Seed = None,
     engine: Annotated[str, typer.Option(help="auto, compiled or virtual-machine.")] = "auto",
     out: Annotated[
         Path | None, typer.Option(help="Folder for the figure (.png) and the time series (.npz).")
+    ] = None,
+    replay: Annotated[
+        str | None,
+        typer.Option(
+            metavar="FOLDER:RUN", help="One run of a campaign again: its machine, sensors and noise."
+        ),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -247,15 +265,19 @@ def simulate(
         "seed": seed,
     }
     given = {name: value for name, value in options.items() if value is not None}
-    with _bar(scenario, quiet=as_json) as progress:
-        found = experiment(
-            scenario, plant, controller, progress=progress, engine=engine.replace("-", " "), **given
-        )
+    chosen, choice = scenario or "stroke", engine.replace("-", " ")
+    stem = f"{controller.name}_{chosen}"
+    with _bar(scenario or "simulating", quiet=as_json) as progress:
+        if replay is None:
+            found = experiment(chosen, plant, controller, progress=progress, engine=choice, **given)
+        else:
+            other = [*given, *(["scenario"] if scenario else []), *(["set"] if change else [])]
+            found, chosen, stem = _replayed(replay, controller, other, choice, progress)
     published = _published(plant.name)
-    files = [] if out is None else _kept(found, out, published)
+    files = [] if out is None else _kept(found, out, stem, published)
     if as_json:
         _print_json(
-            {"gains": str(gains), "scenario": scenario, "files": [str(f) for f in files]} | _found(found)
+            {"gains": str(gains), "scenario": chosen, "files": [str(f) for f in files]} | _found(found)
         )
     else:
         from malta import report
@@ -263,7 +285,7 @@ def simulate(
         console = _console()
         run = found.run
         console.print(
-            f"{gains}: {scenario}, fidelity {run.scenario.fidelity}", *(change or ()), f"-> {found.outcome}"
+            f"{gains}: {chosen}, fidelity {run.scenario.fidelity}", *(change or ()), f"-> {found.outcome}"
         )
         console.print(report.experiment_table(found, published))
         if substeps is not None:
@@ -281,7 +303,133 @@ def simulate(
         print(f"malta: interrupted: {found.outcome}; what was computed is shown", file=sys.stderr)
         raise typer.Exit(130)
     if found.failed:
-        raise CheckError(f"{gains}: {scenario}: {found.outcome}")
+        raise CheckError(f"{gains}: {chosen}: {found.outcome}")
+
+
+@app.command()
+def campaign(
+    gains: GainFile,
+    samples: Annotated[int, typer.Option(help="Machines.")] = 10_000,
+    scenario: Annotated[
+        str, typer.Option(help="What each one does: stroke, hold, tilt, lift-off, disturbance, drive-limits.")
+    ] = "stroke",
+    case: Annotated[
+        str | None, typer.Option(help="tilt, disturbance, drive-limits: which of its runs. [the first]")
+    ] = None,
+    spread: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="[NAME=]SHARE",
+            help="How far parameters vary, either way: 20% (those of the gain file's uncertainty), m=10%, ... "
+            "[the gain file's own]",
+        ),
+    ] = None,
+    sensor: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=VALUE",
+            help="How far an error of the sensors varies, either way: gain_x1=2%, offset_y2=5um, hall_phase=2deg, ...",
+        ),
+    ] = None,
+    sampler: Annotated[str, typer.Option(help="latin-hypercube or sobol.")] = "latin-hypercube",
+    change: Changes = None,
+    distance: Distance = None,
+    rise: Rise = None,
+    profile: ProfileName = None,
+    fidelity: FidelityName = None,
+    noise: Annotated[float, typer.Option(help="Sensor noise in multiples of the machine's.")] = 1.0,
+    quantize: Quantize = None,
+    bearing: Bearing = None,
+    scheduled: Scheduled = None,
+    feedforward: Feedforward = None,
+    bearing_axes: BearingAxes = None,
+    real_pwm: RealPwm = None,
+    delay: Delay = None,
+    substeps: Substeps = None,
+    seed: Annotated[int, typer.Option(help="Seed of machines and noise.")] = 0,
+    workers: Annotated[int | None, typer.Option(help="Threads. [one for each core]")] = None,
+    cluster: Annotated[
+        str | None,
+        typer.Option(metavar="ADDRESS", help="Fly on the workers of a Dask scheduler: tcp://host:8786."),
+    ] = None,
+    worst: Annotated[int, typer.Option(min=0, help="How many of the worst runs to list.")] = 5,
+    out: Annotated[
+        Path | None,
+        typer.Option(help="Folder of blocks and figures. [build/campaigns/, one for each campaign]"),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Simulate many machines that differ, each with noise of its own: the yield, and what goes wrong where.
+
+    Every block of runs is kept in the folder. The same command goes on where it was ended, and reads what is done;
+    `malta simulate GAINS --replay FOLDER:RUN` shows one of the runs. Whatever the yield is, the exit code is 0.
+
+    \b
+    Example:  malta campaign design/gains/calibrated.json --samples 10000 --spread 20%
+    """
+    from malta import gains as gain_files
+    from malta.campaign import campaign as fly
+    from malta.data import plant_of, units_of
+    from malta.plan import Plan
+
+    controller = gain_files.read(gains)
+    machine = _changed(controller.parameters, change)
+    plant = plant_of(machine)
+    published = _published(plant.name)
+    options = {
+        "distance": None if distance is None else distance * 1e-3,
+        "rise": None if rise is None else rise * 1e-3,
+        "profile": profile,
+        "fidelity": fidelity,
+        "noise": noise,
+        "quantize": quantize,
+        "bearing": bearing,
+        "scheduled": scheduled,
+        "feedforward": feedforward,
+        "bearing_axes": bearing_axes,
+        "real_pwm": real_pwm,
+        "delay": delay,
+        "substeps": substeps,
+    }
+    plan = Plan(
+        controller,
+        scenario,
+        _box(gains, spread, units_of(machine), published),
+        _assigned("--sensor", sensor, {s.name: s.unit for s in plant.sensor_errors}),
+        samples,
+        seed,
+        cast("Sampler", sampler),
+        machine,
+        case,
+        {name: value for name, value in options.items() if value is not None},
+    )
+    folder = out or Path("build") / "campaigns" / f"{controller.name}_{scenario}_{plan.identity[:8]}"
+    with _bar(scenario, quiet=as_json) as progress:
+        found = fly(plan, folder, workers=workers, cluster=cluster, progress=progress)
+    for file in found.damaged:
+        print(f"malta: {file}: a damaged block, flown again", file=sys.stderr)
+    files: list[Path] = []
+    if len(found.index):
+        from malta import report
+
+        files = report.campaign(found, folder, published)
+    if as_json:
+        described = {"gains": str(gains), "folder": str(folder), "files": [str(f) for f in files]}
+        _print_json(described | _campaign(found, published, worst))
+    else:
+        _show_campaign(gains, found, published, worst, files)
+    if "virtual machine" in found.engines:
+        print(
+            "malta: no C compiler: simulated on CasADi's virtual machine, some hundred times slower",
+            file=sys.stderr,
+        )
+    if found.interrupted:
+        print(
+            f"malta: interrupted after {len(found.index)} of {samples} runs, which {folder} keeps; "
+            "the same command goes on",
+            file=sys.stderr,
+        )
+        raise typer.Exit(130)
 
 
 @app.command()
@@ -418,11 +566,12 @@ def _assigned(option: str, given: list[str] | None, units: Mapping[str, str]) ->
     for text in given or ():
         match = re.fullmatch(r"\s*(\w+)\s*=\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\s*", text)
         if match is None:
-            example = "m=0.56 or l_B=45mm" if option == "--set" else "gain_x1=0.02 or offset_y2=5um"
+            examples = {"--set": "m=0.56 or l_B=45mm", "--spread": "20% or m=10%"}
+            example = examples.get(option, "gain_x1=0.02 or offset_y2=5um")
             raise InputError(option, "", repr(text), f"NAME=VALUE, as {example}")
         name, number, unit = match.groups()
         if name not in units:
-            kind = "parameter" if option == "--set" else "sensor error"
+            kind = "sensor error" if option == "--sensor" else "parameter"
             raise InputError(option, name, f"an unknown {kind}", "one of " + " ".join(units))
         plain = units[name] == "1"
         if plain and unit not in ("", "%", "percent"):
@@ -433,6 +582,104 @@ def _assigned(option: str, given: list[str] | None, units: Mapping[str, str]) ->
             else to_si(float(number), unit or units[name], units[name], option, name)
         )
     return values
+
+
+def _box(
+    gains: Path, spread: list[str] | None, units: Mapping[str, str], published: Mapping[str, Any] | None
+) -> dict[str, float]:
+    """The shares of `--spread`: one for all uncertain parameters, others by name, or the gain file's own."""
+    from malta.plan import box_of
+
+    named = [text for text in spread or () if "=" in text]
+    general = [text for text in spread or () if "=" not in text]
+    if len(general) > 1:
+        raise InputError("--spread", "", " and ".join(general), "one share for all, others as NAME=SHARE")
+    box: dict[str, float] = {}
+    if general or not named:
+        box = box_of(gains, published)
+    if general:
+        share = _assigned("--spread", [f"all={general[0]}"], {"all": "1"})["all"]
+        box = dict.fromkeys(box, share)
+    return box | _assigned("--spread", named, dict.fromkeys(units, "1"))
+
+
+def _replayed(
+    text: str, controller: Controller, other: list[str], engine: str, progress: Callable[[float], None] | None
+) -> tuple[Experiment, str, str]:
+    """A run of a campaign as `FOLDER:RUN` names it, its scenario, and how its files are called."""
+    from malta.campaign import read_plan
+    from malta.campaign import replay as again
+
+    folder, _, run = text.rpartition(":")
+    if not folder or not run.isdecimal():
+        raise InputError("--replay", "", repr(text), "FOLDER:RUN, as build/campaigns/mine:17")
+    if other:
+        options = ", ".join("--" + name.replace("_", "-") for name in other)
+        raise InputError("--replay", "", f"{options} too", "none of them: the campaign says how it runs")
+    plan = read_plan(folder, controller)
+    found = again(plan, int(run), engine=cast("EngineChoice", engine), progress=progress)
+    return found, plan.scenario, f"{controller.name}_{plan.scenario}_run_{int(run)}"
+
+
+def _show_campaign(gains: Path, found: Campaign, published: Any, worst: int, files: list[Path]) -> None:
+    from malta import report
+    from malta.plan import wanted_of
+
+    plan, console = found.plan, _console()
+    fidelity = wanted_of(plan).scenario.fidelity
+    console.print(
+        f"{gains}: {plan.scenario}, fidelity {fidelity}, {len(found.index)} of {plan.samples} machines, "
+        f"seed {plan.seed}: {report.box_text(found)}"
+    )
+    if not len(found.index):
+        return
+    console.print(report.campaign_tables(found, published, worst))
+    if worst:
+        console.print(
+            f"one of them again: malta simulate {gains} --replay {found.folder}:RUN", soft_wrap=True
+        )
+    for file in files:
+        console.print(f"wrote {file}", soft_wrap=True)
+
+
+def _campaign(found: Campaign, published: Any, worst: int) -> dict[str, Any]:
+    """What a campaign found as plain tables; SI."""
+    import numpy as np
+
+    from malta.findings import figures_of, kept, worst_of
+    from malta.many import verdicts
+
+    within = kept(found, published)
+    names = verdicts(found.plan.plant)
+    merits = {}
+    for f in figures_of(found, published):
+        values = f.values[np.isfinite(f.values)]
+        marks = np.percentile(values, (5, 50, 95, 99, 100)) if values.size else [float("nan")] * 5
+        merits[f.label] = dict(
+            zip(("p5", "p50", "p95", "p99", "largest"), map(float, marks), strict=True)
+        ) | {"published": f.published}
+    return {
+        "manifest": found.plan.manifest,
+        "runs": len(found.index),
+        "interrupted": found.interrupted,
+        "engines": list(found.engines),
+        "yield": found.rate._asdict(),
+        "within_published": None if within is None else int(within.sum()),
+        "ends": found.ends,
+        "merits": merits,
+        "worst": [
+            {
+                "run": int(found.index[row]),
+                "end": names[int(found.batch.verdict[row])],
+                "time": float(found.batch.duration[row]),
+                "values": dict(zip(found.names, found.values[row].tolist(), strict=True)),
+                "deviation": found.batch.deviation[row].tolist(),
+                "contact": found.batch.contact[row].tolist(),
+                "replay": f"{found.folder}:{found.index[row]}",
+            }
+            for row in worst_of(found, worst)
+        ],
+    }
 
 
 def _published(machine: str) -> dict[str, Any] | None:
@@ -447,12 +694,11 @@ def _published(machine: str) -> dict[str, Any] | None:
     return None
 
 
-def _kept(found: Experiment, out: Path, published: Any) -> list[Path]:
+def _kept(found: Experiment, out: Path, stem: str, published: Any) -> list[Path]:
     """Write the figure, and the time series of every run."""
     from malta import report
     from malta.simulate import save as save_series
 
-    stem = f"{found.run.controller.name}_{found.name}"
     names = [stem] if len(found.cases) == 1 else [f"{stem}_{_slug(case.label)}" for case in found.cases]
     series = [
         save_series(case.run, out / f"{name}.npz") for name, case in zip(names, found.cases, strict=True)

@@ -846,7 +846,8 @@ def flown(
     """One run of an experiment by itself. Experiments whose figure compares runs have that of a single run."""
     cases, cut = _flown(plant, controller, [wanted], progress, {"engine": engine})
     shown = name if name in ("stroke", "hold", "tilt") else "run"
-    return Experiment(shown, f"{name}: {wanted.label}", cases, cases[0].merits, interrupted=cut)
+    what = name if wanted.label == name else f"{name}: {wanted.label}"
+    return Experiment(shown, what, cases, cases[0].merits, interrupted=cut)
 
 
 def _check(name: str, options: Mapping[str, Any]) -> None:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import casadi as ca
 import numpy as np
 
-from malta.data import in_unit, plant_of, published_value, units_of
+from malta.data import in_unit, plant_of, published_value
 from malta.errors import InputError
 from malta.files import replace_files
 from malta.references import hold
@@ -597,7 +597,9 @@ def yield_figure(found: Campaign, published: Published | None = None) -> Figure:
 
 def _bands(axes: Axes, found: Campaign, name: str, band: Any) -> None:
     """Shares of the ways in which runs end, stacked, in bins of one parameter."""
-    unit = _unit_of(found, name)
+    from malta.findings import unit_of
+
+    unit = unit_of(found.plan, name)
     values = found.values[:, found.names.index(name)] * in_unit(1.0, unit)
     edges = np.linspace(values.min(), values.max(), 11 if len(values) >= 200 else 6)
     total = np.histogram(values, edges)[0]
@@ -626,7 +628,7 @@ def _bands(axes: Axes, found: Campaign, name: str, band: Any) -> None:
 
 def worst_figure(found: Campaign, published: Published | None = None) -> Figure:
     """The worst runs: where in the box their machines lie, and how far off the reference they went."""
-    from malta.findings import is_published, worst_of
+    from malta.findings import half_text, is_published, worst_of
 
     plan, plant = found.plan, found.plan.plant
     rows = worst_of(found, len(STYLES) + len(MORE))
@@ -654,7 +656,7 @@ def worst_figure(found: Campaign, published: Published | None = None) -> Figure:
             color=style["color"],
             clip_on=False,
         )
-    spreads = [_half(found, name) for name in found.names]
+    spreads = [half_text(found.plan, name) for name in found.names]
     box.set_xticks(at, [f"{n}\n{s}" for n, s in zip(found.names, spreads, strict=True)], fontsize=9)
     box.set_yticks([-100, -50, 0, 50, 100])
     far.set_yticks(range(len(rows)), [_ended(found, row) for row in rows], fontsize=8)
@@ -705,24 +707,6 @@ def _ended(found: Campaign, row: int) -> str:
     name = verdicts(found.plan.plant)[int(found.batch.verdict[row])]
     text = f"run {found.index[row]}"
     return text if name == "completed" else f"{text}\n{name.replace(' at ', chr(10) + 'at ')}"
-
-
-def _unit_of(found: Campaign, name: str) -> str:
-    """The unit to show a varied value in."""
-    signals = {s.name: s.unit for s in found.plan.plant.sensor_errors}
-    if name in signals:
-        return {"1": "percent", "m": "um", "rad": "deg"}[signals[name]]
-    return units_of(found.plan.parameters)[name]
-
-
-def _half(found: Campaign, name: str) -> str:
-    """Half the width of a box, as an axis has it."""
-    if name in found.plan.spread:
-        return f"±{100 * found.plan.spread[name]:.3g} %"
-    unit = _unit_of(found, name)
-    return (
-        f"±{in_unit(found.plan.sensor_spread[name], unit):.3g} {'%' if unit == 'percent' else _micro(unit)}"
-    )
 
 
 # --- what figures are made of ---

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from scipy.stats import binomtest
 
-from malta.data import published_value
+from malta.data import in_unit, published_value, units_of
 from malta.experiments import DISTANCE
 from malta.plant import readonly
 from malta.simulate import RISE
@@ -92,12 +92,12 @@ def figures_of(found: Campaign, published: Mapping[str, Any] | None = None) -> l
         of("", "largest thrust", "N", batch.force[:, thrust]),
     ]
     listed += [
-        of(name.removeprefix("touchdown at "), "clearance used,", "percent", batch.contact[:, k])
+        of(name.removeprefix("touchdown at "), "clearance:", "percent", batch.contact[:, k])
         for k, name in enumerate(plant.contacts)
     ]
     return [
         *listed,
-        of("", "samples with limited commands", "percent", batch.saturated.max(axis=1, initial=0.0)),
+        of("", "limited commands", "percent", batch.saturated.max(axis=1, initial=0.0)),
     ]
 
 
@@ -128,3 +128,19 @@ def worst_of(found: Campaign, count: int) -> list[int]:
     closest = -(batch.contact - np.median(batch.contact, axis=0)).max(axis=1, initial=0.0)
     order = np.lexsort((found.index, np.where(found.completed, closest, batch.duration), found.completed))
     return [int(k) for k in order[:count]]
+
+
+def unit_of(plan: Plan, name: str) -> str:
+    """The unit to show a varied value in."""
+    errors = {signal.name: signal.unit for signal in plan.plant.sensor_errors}
+    shown = {"1": "percent", "m": "um", "rad": "deg"}
+    return shown[errors[name]] if name in errors else units_of(plan.parameters)[name]
+
+
+def half_text(plan: Plan, name: str) -> str:
+    """How far a value varies, either way."""
+    if name in plan.spread:
+        return f"±{100 * plan.spread[name]:.4g} %"
+    unit = unit_of(plan, name)
+    size = f"±{in_unit(plan.sensor_spread[name], unit):.4g}"
+    return f"{size} %" if unit == "percent" else f"{size} {unit.replace('um', 'µm')}"

@@ -211,6 +211,16 @@ def claims_table(ledger: Ledger) -> Table:
     return table
 
 
+def box_text(found: Campaign) -> str:
+    """What was varied, and how far either way."""
+    from malta.findings import half_text
+
+    spreads: dict[str, list[str]] = {}
+    for name in (*found.plan.spread, *found.plan.sensor_spread):
+        spreads.setdefault(half_text(found.plan, name), []).append(name)
+    return ", ".join(f"{' '.join(names)} {width}" for width, names in spreads.items())
+
+
 def campaign_tables(found: Campaign, published: Published | None = None, worst: int = 5) -> Group:
     """How the runs of a campaign end, their figures of merit beside the published bounds, and the worst runs."""
     tables: list[Table | str] = [_ends_table(found, published)]
@@ -269,10 +279,11 @@ def _worst_table(found: Campaign, count: int) -> Table:
     from malta.findings import worst_of
     from malta.many import verdicts
 
-    table = _table("The worst runs", "run", "end", "at [ms]", "clearance [%]", "off the middle of the box")
+    table = _table("The worst runs", "run", "end", "at [ms]", "radial [um]", "off the middle of the box")
     table.columns[0].justify = "right"
     table.columns[1].justify = table.columns[4].justify = "left"
-    names = verdicts(found.plan.plant)
+    plant = found.plan.plant
+    names, radial = verdicts(plant), [k for k in range(len(plant.outputs)) if k != plant.stroke_output]
     for row in worst_of(found, count):
         off = [_off(found, row, k) for k in range(len(found.names))]
         _row(
@@ -280,21 +291,21 @@ def _worst_table(found: Campaign, count: int) -> Table:
             f"{found.index[row]}",
             names[int(found.batch.verdict[row])],
             f"{found.batch.duration[row] * 1e3:.1f}",
-            number(100 * float(found.batch.contact[row].max()), 3),
-            "  ".join(off),
+            number(1e6 * float(found.batch.deviation[row, radial].max()), 3),
+            " ".join(off),
         )
     return table
 
 
 def _off(found: Campaign, row: int, k: int) -> str:
+    from malta.findings import unit_of
+
     name, value = found.names[k], float(found.values[row, k])
     if name in found.plan.spread:
         middle = getattr(found.plan.parameters, name)
-        return f"{name} {100 * (value / middle - 1):+.1f}%" if middle else f"{name} {value:+.3g}"
-    unit = {"1": "percent", "m": "um", "rad": "deg"}[
-        next(s.unit for s in found.plan.plant.sensor_errors if s.name == name)
-    ]
-    return f"{name} {in_unit(value, unit):+.2f}{'%' if unit == 'percent' else ' ' + unit}"
+        return f"{name}={100 * (value / middle - 1):+.1f}%" if middle else f"{name}={value:+.3g}"
+    unit = unit_of(found.plan, name)
+    return f"{name}={in_unit(value, unit):+.2f}{'%' if unit == 'percent' else unit}"
 
 
 def _named(merit: Merit) -> str:
