@@ -625,12 +625,13 @@ def _show_campaign(gains: Path, found: Campaign, published: Any, worst: int, fil
     from malta import report
     from malta.plan import wanted_of
 
-    plan, console = found.plan, _console()
-    fidelity = wanted_of(plan).scenario.fidelity
+    plan, console, wanted = found.plan, _console(), wanted_of(found.plan)
+    case = "" if wanted.label == plan.scenario else f" ({wanted.label})"
     console.print(
-        f"{gains}: {plan.scenario}, fidelity {fidelity}, {len(found.index)} of {plan.samples} machines, "
-        f"seed {plan.seed}: {report.box_text(found)}"
+        f"{gains}: {plan.scenario}{case}, fidelity {wanted.scenario.fidelity}, "
+        f"{len(found.index)} of {plan.samples} machines"
     )
+    console.print(f"{report.box_text(found)}; {plan.sampler}, seed {plan.seed}")
     if not len(found.index):
         return
     console.print(report.campaign_tables(found, published, worst))

@@ -456,24 +456,25 @@ def run_figure(e: Experiment, _: Published | None = None) -> Figure:
     names, error = [s.name for s in run.plant.outputs], run.p - run.reference
     radial = [k for k in range(len(names)) if k != axis]
     furthest = f"furthest off its reference: {number(np.abs(error[:, radial]).max() * 1e6, 3)} µm radially, "
-    furthest += f"{number(np.abs(error[:, axis]).max() * 1e3, 3)} mm axially"
+    size, unit = (1e6, "µm") if np.abs(error[:, axis]).max() < 0.1e-3 else (1e3, "mm")
+    furthest += f"{number(np.abs(error[:, axis]).max() * size, 3)} {unit} axially"
     figure = _figure([run], f"{_micro(e.question)}{_ending(run)}", furthest, hspace=0.24)
     (planes, forces), (stroke, ways) = figure.subplots(2, 2, sharex=True)
     for k, style in zip(radial, (1, 0, 3, 2), strict=False):
         _line(planes, ms, error[:, k] * 1e6, label=names[k], **STYLES[style])
-    _line(stroke, ms, error[:, axis] * 1e3, **STYLES[0])
+    _line(stroke, ms, error[:, axis] * size, **STYLES[0])
     for name, style, k in _widest_currents(run):
         _line(forces, ms, run.v[:, k], label=name, **STYLES[style])
     for k, name in enumerate(run.plant.contacts):
         way = np.maximum(run.contact[:, k] * 100, 1e-3)
-        _line(ways, ms, way, label=name.removeprefix("touchdown at "), **STYLES[k % len(STYLES)])
+        _line(ways, ms, way, label=name.removeprefix("touchdown at sensor "), **STYLES[k % len(STYLES)])
     ways.set_yscale("log")
     ways.set_ylim(bottom=0.01)
     _bound(ways, 100, "touched")
     _finish(planes, "", "radial, off reference [µm]", legend=4)
     _finish(forces, "", "commanded force [N]", legend=3)
-    _finish(stroke, "time [ms]", f"{names[axis]}, off reference [mm]")
-    _finish(ways, "time [ms]", "clearance used up [%]", legend=3)
+    _finish(stroke, "time [ms]", f"{names[axis]}, off reference [{unit}]")
+    _finish(ways, "time [ms]", "clearance used up [%]", legend=3, side="right")
     return figure
 
 
@@ -690,10 +691,10 @@ def _campaign_figure(found: Campaign, what: str, **places: float) -> Figure:
     figure = Figure(figsize=(9.0, 6.0), dpi=120)
     usual = {"left": 0.085, "right": 0.98, "bottom": 0.085, "top": 0.86, "wspace": 0.25, "hspace": 0.3}
     figure.subplots_adjust(**usual | places)
-    fidelity = wanted_of(plan).scenario.fidelity
-    figure.suptitle(
-        f"{plan.controller.name}, {plan.scenario}, fidelity {fidelity}: {what}", fontsize=11, y=0.985
-    )
+    wanted = wanted_of(plan)
+    flown = plan.scenario if wanted.label == plan.scenario else f"{plan.scenario} ({wanted.label})"
+    title = f"{plan.controller.name}, {flown}, fidelity {wanted.scenario.fidelity}: {what}"
+    figure.suptitle(title, fontsize=11, y=0.985)
     text = f"{share.passed} of {share.runs} runs completed: {100 * share.share:.4g} % "
     text += f"(95 %: {100 * share.low:.4g} to {100 * share.high:.4g} %)"
     figure.text(0.5, 0.945, text, fontsize=9, color="#4a4a4a", ha="center", va="top")
