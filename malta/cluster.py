@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
 from importlib.metadata import version
+from threading import Thread
 from typing import TYPE_CHECKING, Any
 
 from malta.errors import InputError
@@ -15,7 +16,7 @@ if TYPE_CHECKING:
     from malta.folder import Block
     from malta.plan import Plan
 
-ANSWER = 5.0  # s, within which a scheduler answers
+ANSWER = 3.0  # s, within which a scheduler answers
 WAIT = 30.0  # s without any worker, after which the campaign stops
 
 
@@ -43,19 +44,15 @@ def blocks(address: str, plan: Plan, left: Mapping[int, int]) -> Iterator[tuple[
         raise InputError("--cluster", "", f"no dask.distributed here ({error})", expected) from error
     dask: Any = distributed
     logging.getLogger("distributed").setLevel(logging.CRITICAL)  # losing a worker is no news
-    try:
-        client = dask.Client(address, timeout=ANSWER, set_as_default=False)
-    except (OSError, ValueError, TypeError) as error:
-        raise InputError(
-            "--cluster", address, _said(error), "a Dask scheduler, as tcp://host:8786"
-        ) from error
+    client = _connected(dask, address)
     try:
         task = _Task(plan.identity, version("malta"), plan)
         waiting = {client.submit(_at_worker, task, *part, pure=False): part[0] for part in left.items()}
         alone = 0.0
         while waiting:
             try:
-                done = dask.wait(list(waiting), timeout=1.0, return_when="FIRST_COMPLETED").done
+                with client.as_current():
+                    done = dask.wait(list(waiting), timeout=1.0, return_when="FIRST_COMPLETED").done
             except TimeoutError:
                 alone = 0.0 if _workers(client) else alone + 1.0
                 if alone >= WAIT:
@@ -67,10 +64,29 @@ def blocks(address: str, plan: Plan, left: Mapping[int, int]) -> Iterator[tuple[
         client.close(timeout=2)
 
 
+def _connected(dask: Any, address: str) -> Any:
+    """A client of the scheduler. In a thread: what accepts the connection and says nothing would hold it forever."""
+    found: list[Any] = []
+
+    def connect() -> None:
+        try:
+            found.append(dask.Client(address, timeout=ANSWER, set_as_default=False))
+        except Exception as error:  # what answers may be anything
+            found.append(error)
+
+    thread = Thread(target=connect, daemon=True)
+    thread.start()
+    thread.join(3 * ANSWER)
+    if found and not isinstance(found[0], Exception):
+        return found[0]
+    reason = _said(found[0]) if found else "something that does not answer as one"
+    raise InputError("--cluster", address, reason, "a Dask scheduler, as tcp://host:8786")
+
+
 def _workers(client: Any) -> int:
     try:
-        return len(client.scheduler_info(n_workers=-1)["workers"])
-    except (OSError, KeyError, TypeError):
+        return len(client.nthreads())
+    except Exception:  # a scheduler that is lost says so in many ways
         return 0
 
 
