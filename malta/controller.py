@@ -92,6 +92,19 @@ class Noise:
             object.__setattr__(self, name, readonly(getattr(self, name)))
 
 
+@dataclass(frozen=True, eq=False)
+class Cost:
+    """Diagonals of the weights that the regulator minimizes: Q, R and Q_i."""
+
+    state: FloatArray  # n0 mechanical states
+    input: FloatArray  # m forces, 1/N^2
+    integral: FloatArray  # p integrals of errors
+
+    def __post_init__(self) -> None:
+        for name in ("state", "input", "integral"):
+            object.__setattr__(self, name, readonly(getattr(self, name)))
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class Controller:
     """Gains, models and limits of one controller; n states, m forces, p = m measurements.
@@ -116,6 +129,7 @@ class Controller:
     K: FloatArray  # m x n
     Ki: FloatArray  # m x p
     L: FloatArray  # n x p, filter form
+    cost: Cost
     noise: Noise
     feedforward: Feedforward
     current_loop: CurrentLoop

@@ -8,6 +8,7 @@
     signals          states [n], forces [m], measurements [p]: {name, unit} each, SI
     model            A n0 x n0, B n0 x m, C p x n0 (continuous, n0 mechanical states); Ad n x n, Bd n x m, Cd p x n
     gains            K m x n, Ki m x p, L n x p (filter form)
+    cost             state n0, input m, integral p: diagonals of Q, R, Q_i that the regulator minimizes, SI
     noise            process [N^2] m, sensor [m^2] p: variances that the filter was designed for
     feedforward      mass [kg], z_grid [g] [m], v0 g x m [N]
     current_loop     Kp [V/A], Ki [V/(A s)], sample_time [s]
@@ -18,8 +19,7 @@
     sha256           of the rest as compact JSON with sorted keys
 
 n = n0 + m d where the design models a delay of d samples: the mechanical states first, then stored forces. The control
-law is in controller.py. Current loops and voltage limits are for the implementation: the linear loop and the harness
-here take first-order lags in their place.
+law is in controller.py.
 
 The JSON is the specification: matrices row by row with round-trip precision, no time stamp, so the same inputs give the
 same file. The .npz has the same names joined by dots ("gains.K"), the .mat the same names as nested structs; in both a
@@ -38,7 +38,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 from pydantic import BeforeValidator, Field, StrictInt, StrictStr
 
-from malta.controller import Controller, CurrentLoop, Feedforward, Limits, Noise, stored_forces
+from malta.controller import Controller, Cost, CurrentLoop, Feedforward, Limits, Noise, stored_forces
 from malta.data import Finite, Machine, Quantity, Record, machine_module, plant_of, units_of, validated
 from malta.encodings import SUFFIXES as SUFFIXES
 from malta.encodings import content_sha256, decode, encode
@@ -111,6 +111,12 @@ class _Gains(Record):
     L: Matrix
 
 
+class _Cost(Record):
+    state: Vector
+    input: Vector
+    integral: Vector
+
+
 class _Noise(Record):
     process: Vector
     sensor: Vector
@@ -176,6 +182,7 @@ class GainFile(Record):
     signals: _SignalTable
     model: _Model
     gains: _Gains
+    cost: _Cost
     noise: _Noise
     feedforward: _Feedforward
     current_loop: _CurrentLoop
@@ -209,6 +216,7 @@ def document(controller: Controller, margins: Margins) -> dict[str, Any]:
         },
         "model": {key: getattr(c, key) for key in ("A", "B", "C", "Ad", "Bd", "Cd")},
         "gains": {key: getattr(c, key) for key in ("K", "Ki", "L")},
+        "cost": {key: getattr(c.cost, key) for key in ("state", "input", "integral")},
         "noise": {"process": c.noise.process, "sensor": c.noise.sensor},
         "feedforward": {key: getattr(c.feedforward, key) for key in ("mass", "z_grid", "v0")},
         "current_loop": {key: getattr(c.current_loop, key) for key in ("Kp", "Ki", "sample_time")},
@@ -309,6 +317,7 @@ def _controller(file: GainFile, path: str | Path) -> Controller:
         "operating_point": {"x": (n0,), "u": (m,)},
         "feedforward": {"z_grid": (g,), "v0": (g, m)},
         "limits": {"current": (m,), "voltage": (m,), "force": (m,)},
+        "cost": {"state": (n0,), "input": (m,), "integral": (p,)},
         "noise": {"process": (m,), "sensor": (p,)},
     }
     arrays = {
@@ -329,6 +338,14 @@ def _controller(file: GainFile, path: str | Path) -> Controller:
     for key, variance in arrays["noise"].items():
         if not (variance > 0).all():
             raise InputError(path, f"noise.{key}", str(variance.tolist()), "variances above 0")
+    for key, weight in arrays["cost"].items():
+        if (weight < 0).any() or (key == "input" and not (weight > 0).all()):
+            raise InputError(
+                path,
+                f"cost.{key}",
+                str(weight.tolist()),
+                "weights above 0" if key == "input" else "none below 0",
+            )
     return Controller(
         name=file.design.name,
         spec_sha256=file.design.spec_sha256,
@@ -340,6 +357,7 @@ def _controller(file: GainFile, path: str | Path) -> Controller:
         measurements=measurements,
         **arrays["model"],
         **arrays["gains"],
+        cost=Cost(**arrays["cost"]),
         noise=Noise(**arrays["noise"]),
         feedforward=Feedforward(file.feedforward.mass, z_grid, arrays["feedforward"]["v0"]),
         current_loop=CurrentLoop(file.current_loop.Kp, file.current_loop.Ki, file.current_loop.sample_time),

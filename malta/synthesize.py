@@ -17,12 +17,12 @@ from __future__ import annotations
 import math
 from contextlib import suppress
 from dataclasses import replace
-from typing import TYPE_CHECKING, get_args
+from typing import TYPE_CHECKING, NamedTuple, Protocol, get_args
 
 import numpy as np
 from scipy import linalg
 
-from malta.controller import Controller, CurrentLoop, Feedforward, Limits, Noise, stored_forces
+from malta.controller import Controller, Cost, CurrentLoop, Feedforward, Limits, Noise, stored_forces
 from malta.errors import CheckError, InputError
 from malta.linearize import LinearModel
 from malta.plant import Actuator, Plant, trims
@@ -44,13 +44,35 @@ if TYPE_CHECKING:
 V0_STEP = 0.25e-3  # m, grid of v0(z): interpolation errs by 0.14 % of the cogging amplitude
 
 
-def lqr(model: LinearModel, weights: Weights) -> FloatArray:
+class Linear(Protocol):
+    """xi' = A xi + B v, p = C xi: a LinearModel, or the part of one that nothing joins to the rest."""
+
+    @property
+    def A(self) -> FloatArray: ...
+    @property
+    def B(self) -> FloatArray: ...
+    @property
+    def C(self) -> FloatArray: ...
+
+
+class Gains(NamedTuple):
+    """The sampled design model with its gains, as the controller runs them."""
+
+    Ad: FloatArray
+    Bd: FloatArray
+    Cd: FloatArray
+    K: FloatArray
+    Ki: FloatArray
+    L: FloatArray
+
+
+def lqr(model: Linear, weights: Weights) -> FloatArray:
     """Continuous LQR gain K, m x n: v = -K xi minimizes the integral of xi'Q xi + v'R v."""
     _check_sizes(model, weights)
     return care(model.A, model.B, weights.Q, weights.R, "LQR").K
 
 
-def lqi(model: LinearModel, weights: Weights) -> tuple[FloatArray, FloatArray]:
+def lqi(model: Linear, weights: Weights) -> tuple[FloatArray, FloatArray]:
     """Continuous LQR with the integrals of the measured errors: K (m x n) and Ki (m x p).
 
     v = K (xi* - xi) + Ki e, e' = p* - p. The Riccati gain on e acts as -K_e e, so Ki = -K_e.
@@ -64,7 +86,7 @@ def lqi(model: LinearModel, weights: Weights) -> tuple[FloatArray, FloatArray]:
     return gain[:, :n], -gain[:, n:]
 
 
-def kalman(model: LinearModel, weights: Weights) -> FloatArray:
+def kalman(model: Linear, weights: Weights) -> FloatArray:
     """Continuous steady-state Kalman gain L, n x p: xi_hat' = A xi_hat + B v + L (y - C xi_hat).
 
     Only the ratio of process to sensor noise matters, so variances of a sample serve as intensities.
@@ -89,10 +111,22 @@ def continuous_poles(model: LinearModel, weights: Weights) -> dict[str, ComplexA
     return {name: np.sort_complex(values) for name, values in poles.items()}
 
 
-def sampled_model(model: LinearModel, Ts: float, delay: int = 0) -> tuple[FloatArray, FloatArray, FloatArray]:
+def sampled_model(model: Linear, Ts: float, delay: int = 0) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Ad, Bd, Cd under a zero-order hold, with the forces of the last `delay` samples as states."""
     Ad, Bd = delay_inputs(*sample(model.A, model.B, Ts), delay)
     return Ad, Bd, np.hstack([model.C, np.zeros((len(model.C), len(Ad) - len(model.A)))])
+
+
+def gains(
+    model: Linear, weights: Weights, Ts: float, discretization: Discretization, delay: int = 0
+) -> Gains:
+    """LQR with integrals and Kalman filter of a model, sampled. Raises CheckError as riccati.dare."""
+    if discretization == "backward-euler":
+        return Gains(*_backward_euler(model, weights, Ts))
+    integrated = discretization == "sampled-data"
+    Ad, Bd, Cd = sampled_model(model, Ts, delay)
+    K, Ki = _sampled_regulator(model, weights, Ts, delay, integrated=integrated)
+    return Gains(Ad, Bd, Cd, K, Ki, _sampled_filter(model, weights, Ts, delay, integrated=integrated))
 
 
 @np.errstate(all="ignore")  # what overflows is found at the end
@@ -133,12 +167,7 @@ def lqg(
             "lqg", "delay", f"{delay} with {discretization}", "0, or more with zoh or sampled-data"
         )
     _check_sizes(model, weights)
-    if discretization == "backward-euler":
-        Ad, Bd, Cd, K, Ki, L = _backward_euler(model, weights, Ts)
-    else:
-        Ad, Bd, Cd = sampled_model(model, Ts, delay)
-        K, Ki = _sampled_regulator(model, weights, Ts, delay, integrated=discretization == "sampled-data")
-        L = _sampled_filter(model, weights, Ts, delay, integrated=discretization == "sampled-data")
+    Ad, Bd, Cd, K, Ki, L = gains(model, weights, Ts, discretization, delay)
     if not all(np.isfinite(M).all() for M in (Ad, Bd, K, Ki, L)):
         raise CheckError("lqg: the gains overflow")
     plant = model.plant
@@ -164,6 +193,9 @@ def lqg(
         Ki=Ki,
         L=L,
         feedforward=static_feedforward(plant),
+        cost=Cost(
+            weights.q / weights.q_base**2, weights.r / weights.r_base**2, weights.q_i / weights.q_i_base**2
+        ),
         noise=Noise(weights.process_variance, weights.sensor_variance),
         current_loop=CurrentLoop(Kp, Ki_current, actuator.sample_time),
         limits=Limits(
@@ -260,7 +292,7 @@ def static_feedforward(plant: Plant) -> Feedforward:
 
 
 def _backward_euler(
-    model: LinearModel, weights: Weights, Ts: float
+    model: Linear, weights: Weights, Ts: float
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
     """Continuous gains; xi_hat' = A xi_hat + B v + L (y - C xi_hat) by backward Euler, in filter form.
 
@@ -275,7 +307,7 @@ def _backward_euler(
 
 
 def _sampled_regulator(
-    model: LinearModel, weights: Weights, Ts: float, delay: int, *, integrated: bool
+    model: Linear, weights: Weights, Ts: float, delay: int, *, integrated: bool
 ) -> tuple[FloatArray, FloatArray]:
     """K, Ki of the sampled model. With delay, a force acts on the states d samples after it is commanded.
 
@@ -301,7 +333,7 @@ def _sampled_regulator(
 
 
 def _sampled_filter(
-    model: LinearModel, weights: Weights, Ts: float, delay: int, *, integrated: bool
+    model: Linear, weights: Weights, Ts: float, delay: int, *, integrated: bool
 ) -> FloatArray:
     """Filter-form Kalman gain. The stored forces are known, so their rows are zero.
 
@@ -318,7 +350,7 @@ def _sampled_filter(
     return np.vstack([L, np.zeros((delay * model.B.shape[1], len(V)))])
 
 
-def _check_sizes(model: LinearModel, weights: Weights) -> None:
+def _check_sizes(model: Linear, weights: Weights) -> None:
     n, m, p = len(model.A), model.B.shape[1], len(model.C)
     for field, what, size in (("q", "states", n), ("r", "inputs", m), ("q_i", "measured signals", p)):
         if len(getattr(weights, field)) != size:

@@ -1,0 +1,459 @@
+"""Enclosures of the characteristic function f(s; p) of a loop, over boxes of parameters and intervals of frequency.
+
+    f(s; p) = det( N(s; p) - B(p) H(s) F(s) C(s; p) ),   N = s^2 - s A22 - A21  (or s - A)
+
+Along frequency every quantity is c + g e with e in [-1, 1] and a disk that holds the rest (first-order Taylor models).
+Along the parameters f is a polynomial: its Bernstein coefficients over a box hold its values there.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from scipy import linalg
+
+from malta.uncertain import Compensator, UncertainSystem
+
+if TYPE_CHECKING:
+    from malta.plant import ComplexArray, FloatArray
+
+GUARD = 1e-9  # what floating point may err, in an angle; a thousandth of it relative to the terms of f
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """One factor of the characteristic function: some positions of the plant, some states of the compensator."""
+
+    system: UncertainSystem
+    own: Compensator  # restricted to the states of this group
+    states: tuple[int, ...]  # of the plant: positions where it is of second order
+
+
+@dataclass(frozen=True, eq=False)
+class Taylor:
+    """Values on intervals: c + g e + (a disk of radius r), e in [-1, 1] along the interval. Complex arrays, r real."""
+
+    c: ComplexArray
+    g: ComplexArray
+    r: FloatArray
+
+    def __add__(self, other: Any) -> Taylor:
+        if isinstance(other, Taylor):
+            return Taylor(self.c + other.c, self.g + other.g, self.r + other.r)
+        return Taylor(self.c + other, self.g, self.r)
+
+    def __mul__(self, other: Any) -> Taylor:
+        if not isinstance(other, Taylor):
+            return Taylor(self.c * other, self.g * other, self.r * np.abs(other))
+        a, b = self, other
+        spread = (np.abs(a.g) + a.r) * (np.abs(b.g) + b.r)
+        return Taylor(a.c * b.c, a.c * b.g + a.g * b.c, np.abs(a.c) * b.r + a.r * np.abs(b.c) + spread)
+
+    __radd__, __rmul__ = __add__, __mul__
+
+    def __neg__(self) -> Taylor:
+        return Taylor(-self.c, -self.g, self.r)
+
+    def __sub__(self, other: Any) -> Taylor:
+        return self.__add__(-other)
+
+    def __getitem__(self, key: Any) -> Taylor:
+        return Taylor(self.c[key], self.g[key], self.r[key])
+
+    def conj(self) -> Taylor:
+        return Taylor(self.c.conj(), self.g.conj(), self.r)
+
+    def inverse(self) -> Taylor:
+        """1/c - g/c^2 e, off by at most |g|^2 / (|c|^2 min |c + g e|); infinite where zero is near."""
+        size = np.abs(self.c)
+        along = np.where(self.g == 0, 0, -self.c / np.where(self.g == 0, 1, self.g)).real
+        nearest = np.abs(self.c + self.g * np.clip(along, -1, 1))
+        curved = np.abs(self.g) ** 2 / (size**2 * nearest)
+        disk = np.where(nearest > self.r, self.r / (nearest * (nearest - self.r)), np.inf)
+        return Taylor(1 / self.c, -self.g / self.c**2, curved + np.where(self.r == 0, 0, disk))
+
+    def mapped(self, matrix: Any, rule: str) -> Taylor:
+        """Linear in it: einsum of constants with it."""
+        return Taylor(
+            np.einsum(rule, matrix, self.c),
+            np.einsum(rule, matrix, self.g),
+            np.einsum(rule, np.abs(matrix), self.r),
+        )
+
+
+class Frequencies(NamedTuple):
+    """s = sigma / tau on intervals, homogeneous so that infinity is a number; what a sampled loop has at z."""
+
+    sigma: Taylor
+    tau: Taylor
+    scale: Taylor  # that f is multiplied by, once a position, for the integrators: s, (z - 1) / T or 1
+    z: Taylor | None
+    middle: FloatArray  # rad/s
+    highest: FloatArray  # rad/s
+
+
+def frequencies(c: Compensator, cells: FloatArray) -> Frequencies:
+    """cells: rows of branch, from, to. Branch 0 counts in w, branch 1 in 1/w."""
+    branch, middle, half = cells[:, 0], cells[:, 1:].mean(axis=1), np.diff(cells[:, 1:])[:, 0] / 2
+    zero, one = np.zeros(len(cells)), np.ones(len(cells))
+    low = branch == 0
+    sigma = Taylor(1j * np.where(low, middle, 1), 1j * np.where(low, half, 0), zero)
+    tau = Taylor(np.where(low, 1.0, middle) + 0j, np.where(low, 0.0, half) + 0j, zero)
+    with np.errstate(divide="ignore"):
+        highest = np.where(low, cells[:, 2], 1 / cells[:, 1])
+        at = np.where(low, middle, 1 / middle)
+    if c.sample_time is None:
+        scale = Taylor(np.where(low, sigma.c, 1), np.where(low, sigma.g, 0), zero)
+        if not c.integrals:
+            scale = Taylor(one + 0j, zero + 0j, zero)
+        return Frequencies(sigma, tau, scale, None, at, highest)
+    T = c.sample_time
+    c_z = np.exp(1j * middle * T)
+    z = Taylor(c_z, 1j * T * half * c_z, (T * half) ** 2 / 2)
+    scale = (z + (-1.0)) * (1 / T) if c.integrals else Taylor(one + 0j, zero + 0j, zero)
+    # z - 1 cancels near w = 0; its parts are known better than their difference
+    if c.integrals:
+        exact = np.expm1(1j * middle * T) / T
+        scale = Taylor(exact, scale.g, scale.r)
+    return Frequencies(sigma, tau, scale, z, at, highest)
+
+
+def response(c: Compensator, f: Frequencies, cells: FloatArray, order: int, stiffest: float) -> Taylor:
+    """scale x H F on the intervals: cells x inputs x outputs. order, stiffest: of the plant, for a hold's images."""
+    k = len(c.A) - c.integrals
+    T, Q = linalg.schur(c.A[:k, :k], output="complex")
+    sampled = c.sample_time is not None
+    low = (cells[:, 0] == 0)[:, None, None]
+
+    def wide(t: Taylor) -> Taylor:
+        return t[:, None, None]
+
+    def constant(M: Any) -> Taylor:
+        M = np.asarray(M, dtype=complex)[None]
+        return Taylor(M, 0 * M, np.zeros(M.shape))
+
+    if sampled:
+        assert f.z is not None
+        assert c.sample_time is not None
+        sigma, tau = f.z, Taylor(np.ones_like(f.z.c), 0 * f.z.c, 0 * f.z.r)
+        summed = constant(c.B[k:] / c.sample_time)
+    else:
+        sigma, tau = f.sigma, f.tau
+        # e = B y / s; times s on branch 0, as it is on branch 1
+        once = Taylor(
+            np.where(low, 1, (f.tau.c * -1j)[:, None, None]),
+            np.where(low, 0, (f.tau.g * -1j)[:, None, None]),
+            np.zeros(low.shape),
+        )
+        summed = once * constant(c.B[k:])
+    driven = wide(f.scale) * constant(Q.conj().T @ c.B[:k]) + summed.mapped(
+        Q.conj().T @ c.A[:k, k:], "ij,wjl->wil"
+    )
+    driven = wide(tau) * driven
+    rows: list[Taylor] = [driven[:, :0]] * k
+    for i in reversed(range(k)):
+        x = driven[:, i]
+        for j in range(i + 1, k):
+            if T[i, j] != 0:
+                x = x + (tau[:, None] * rows[j]) * T[i, j]
+        rows[i] = x * (sigma - tau * T[i, i]).inverse()[:, None]
+    total = wide(f.scale) * constant(c.D)
+    if k:
+        stacked = Taylor(
+            *(np.stack([getattr(row, name) for row in rows], axis=1) for name in ("c", "g", "r"))
+        )
+        total = total + stacked.mapped(c.C[:, :k] @ Q, "ij,wjl->wil")
+    if c.integrals:
+        total = total + summed.mapped(c.C[:, k:], "ij,wjl->wil")
+    between = _actuator(c, f, cells, order, stiffest)
+    return total if between is None else wide(between) * total
+
+
+def _actuator(
+    c: Compensator, f: Frequencies, cells: FloatArray, order: int, stiffest: float
+) -> Taylor | None:
+    """H: lag, hold, delay; the images of the hold in its radius. None where nothing stands between."""
+    H = None
+    if c.lag is not None:
+        H = (f.sigma + f.tau * c.lag).inverse() * f.tau * c.lag
+    if c.sample_time is None:
+        return H
+    T = c.sample_time
+    middle, half = cells[:, 1:].mean(axis=1), np.diff(cells[:, 1:])[:, 0] / 2
+    # (1 - e^-jwT) / (jwT) = e^-ja sin(a)/a, a = wT/2; every derivative of order n is below T^n / (n + 1)
+    a = middle * T / 2
+    small = a < 1e-4
+    safe = np.where(small, 1, a)
+    shape = np.where(small, 1 - a**2 / 6, np.sin(safe) / safe)
+    slope = np.where(small, -a / 3, (np.cos(safe) - np.sin(safe) / safe) / safe)
+    turn = np.exp(-1j * a)
+    hold = Taylor(turn * shape, T / 2 * turn * (slope - 1j * shape) * half, T**2 / 6 * half**2)
+    late = c.delay * T
+    delay = Taylor(
+        np.exp(-1j * middle * late), -1j * late * half * np.exp(-1j * middle * late), (late * half) ** 2 / 2
+    )
+    direct = hold if H is None else H * hold
+    images = _images(c, f.highest, order, stiffest)
+    return Taylor(direct.c, direct.g, direct.r + images) * delay
+
+
+def _images(c: Compensator, w: FloatArray, order: int, stiffest: float) -> FloatArray:
+    """Bound of what the hold's images at w + 2 pi k / T add to H at w, as seen through the plant.
+
+    Sum over k of |H(W)| |N(jw) N(jW)^-1| with W = w + 2 pi k / T, |N| between W^order -+ stiffest^order.
+    """
+    T = c.sample_time
+    assert T is not None
+    k = np.concatenate([np.arange(-40, 0), np.arange(1, 41)])
+    W = np.abs(w[:, None] + 2 * np.pi / T * k)
+    held = 2 * np.abs(np.sin(np.minimum(w * T / 2, np.pi / 2)))[:, None] / (W * T)
+    if c.lag is not None:
+        held = held * c.lag / np.hypot(W, c.lag)
+    own, image = w**order + stiffest**order, W**order - stiffest**order
+    terms = np.where(image > 0, held * own[:, None] / np.where(image > 0, image, 1), np.inf)
+    return np.asarray(1.1 * terms.sum(axis=1))  # beyond 40: below a tenth of the sum for any order
+
+
+@dataclass(frozen=True, eq=False)
+class Matrices:
+    """N, B, C of a group at rows of parameters: rows x ... each."""
+
+    N0: FloatArray  # N = s^2 - s N1 - N0, or s - N0
+    N1: FloatArray | None
+    B: FloatArray
+    C0: FloatArray  # C = C0 + s C1
+    C1: FloatArray | None
+    stiffest: float  # 1/s, no pole of the plant is further out
+
+    @property
+    def order(self) -> int:
+        return 1 if self.N1 is None else 2
+
+
+def matrices_of(block: Block, p: FloatArray) -> Matrices:
+    A, B, C = block.system.at(p)
+    q = np.array(block.states)
+    far = 1.5 * max(np.abs(np.linalg.eigvals(M)).max() for M in A)
+    if not block.system.second_order:
+        return Matrices(A[:, q][:, :, q], None, B[:, q], C[:, :, q], None, far)
+    d = q + A.shape[1] // 2
+    C1 = C[:, :, d]
+    return Matrices(A[:, d][:, :, q], A[:, d][:, :, d], B[:, d], C[:, :, q], C1 if C1.any() else None, far)
+
+
+def characteristic(c: Compensator, M: Matrices, cells: FloatArray) -> Taylor:
+    """f on the intervals at the rows of parameters: cells x rows."""
+    f = frequencies(c, cells)
+    G = response(c, f, cells, M.order, M.stiffest)
+
+    def through(G: Taylor, C: FloatArray) -> Taylor:
+        inner = G.mapped(M.B, "jak,wkl->wjal")
+        return Taylor(inner.c @ C, inner.g @ C, inner.r @ np.abs(C))
+
+    def wide(t: Taylor) -> Taylor:
+        return t[:, None, None, None]
+
+    eye = np.eye(M.N0.shape[1])[None, None]
+    if M.N1 is None:
+        F = (
+            wide(f.scale * f.sigma) * eye
+            - wide(f.scale * f.tau) * M.N0[None]
+            - through(f.tau[:, None, None] * G, M.C0)
+        )
+    else:
+        squared = f.tau * f.tau
+        F = wide(f.scale * f.sigma * f.sigma) * eye - wide(f.scale * squared) * M.N0[None]
+        if M.N1.any():
+            F = F - wide(f.scale * f.sigma * f.tau) * M.N1[None]
+        F = F - through(squared[:, None, None] * G, M.C0)
+        if M.C1 is not None:
+            F = F - through((f.sigma * f.tau)[:, None, None] * G, M.C1)
+    return _determinant(F)
+
+
+def _determinant(F: Taylor) -> Taylor:
+    """By expansion along the first row: the matrices are small."""
+    n = F.c.shape[-1]
+    if n == 1:
+        return F[..., 0, 0]
+    total: Taylor | None = None
+    for k in range(n):
+        rest = [j for j in range(n) if j != k]
+        term = F[..., 0, k] * _determinant(F[..., 1:, :][..., rest])
+        total = term if total is None else total + (term if k % 2 == 0 else -term)
+    assert total is not None
+    return total
+
+
+class Polynomial(NamedTuple):
+    """f p^poles is a polynomial of these degrees in the parameters."""
+
+    degrees: tuple[int, ...]
+    poles: tuple[int, ...]  # powers of each parameter that clear its denominators
+
+
+def polynomial(block: Block, names: Sequence[str], sides: FloatArray) -> Polynomial | str:
+    """Degrees of f in each parameter, found from its values and checked; a sentence where it is none.
+
+    Chebyshev coefficients along a parameter vanish beyond its degree: to 1e-10, at three frequencies.
+    """
+    rng = np.random.default_rng(1)
+    u = np.cos(np.pi * (np.arange(9) + 0.5) / 9)
+    degrees, poles = [], []
+    for i, name in enumerate(names):
+        middle, half = sides[i].mean(), np.diff(sides[i])[0] / 2
+        if half == 0:
+            degrees.append(0)
+            poles.append(0)
+            continue
+        rows = np.repeat(rng.uniform(sides[:, 0], sides[:, 1], (3, len(sides))), 9, axis=0)
+        rows[:, i] = np.tile(middle + half * u, 3)
+        values = characteristic_values(block, rows).reshape(-1, 3, 9)
+        found = None
+        for total, power in sorted((d + a, a) for d in range(6) for a in range(4)):
+            scaled = values * rows[:, i].reshape(3, 9) ** power
+            coefficients = np.abs(scaled @ np.polynomial.chebyshev.chebvander(u, 8) / 9)
+            degree = total - power
+            if (coefficients[..., degree + 1 :].max(axis=-1) <= 1e-10 * coefficients.max(axis=-1)).all():
+                found = degree, power
+                break
+        if found is None:
+            return f"{name} enters neither as a polynomial of degree 5 nor over a power of itself"
+        degrees.append(found[0])
+        poles.append(found[1])
+    return Polynomial(tuple(degrees), tuple(poles))
+
+
+def characteristic_values(block: Block, rows: FloatArray, w: FloatArray | None = None) -> ComplexArray:
+    """f at frequencies and rows of parameters; without w at three frequencies over the range that matters."""
+    M = replace(matrices_of(block, rows), stiffest=0.0)  # the hold's images are no part of the values
+    c = block.own
+    if w is None:
+        end = np.pi / c.sample_time if c.sample_time is not None else 1e3
+        w = np.array([0.003, 0.03, 0.3]) * end
+    return characteristic(c, M, np.column_stack([0 * w, w, w])).c
+
+
+def nodes(degree: int) -> FloatArray:
+    return (1 - np.cos(np.pi * np.arange(degree + 1) / max(degree, 1))) / 2
+
+
+def bernstein(degree: int, u: FloatArray) -> FloatArray:
+    """Bernstein polynomials at u: ... x (degree + 1)."""
+    i = np.arange(degree + 1)
+    binomial = np.array([math.comb(degree, k) for k in i], dtype=float)
+    u = np.asarray(u)[..., None]
+    return np.asarray(binomial * u**i * (1 - u) ** (degree - i))
+
+
+class Enclosure(NamedTuple):
+    """Bernstein coefficients of f p^poles over the whole box, on intervals of frequency: cells x (degrees + 1)."""
+
+    block: Block
+    shape: tuple[int, ...]
+    weights: FloatArray  # p^poles at the nodes
+    matrices: Matrices  # at the nodes
+    inverse: tuple[FloatArray, ...]  # values at nodes -> Bernstein coefficients, one matrix a parameter
+    rows: FloatArray  # the nodes
+    sides: FloatArray  # of the box: parameters x 2
+
+
+def enclosure(block: Block, nominal: FloatArray, sides: FloatArray, poly: Polynomial) -> Enclosure:
+    axes = [
+        low + (high - low) * nodes(d) if d else np.array([own])
+        for (low, high), d, own in zip(sides, poly.degrees, nominal, strict=True)
+    ]
+    rows = np.array(list(itertools.product(*axes)))
+    inverse = tuple(np.linalg.inv(bernstein(d, nodes(d))) if d else np.ones((1, 1)) for d in poly.degrees)
+    weights = np.prod(rows ** np.array(poly.poles), axis=1)
+    sizes = tuple(d + 1 for d in poly.degrees)
+    return Enclosure(block, sizes, weights, matrices_of(block, rows), inverse, rows, sides)
+
+
+def coefficients(e: Enclosure, cells: FloatArray) -> Taylor:
+    with np.errstate(all="ignore"):  # intervals that are too wide have no bound: they are split
+        f = characteristic(e.block.own, e.matrices, cells) * e.weights
+        f = Taylor(f.c, f.g, f.r + 1e-14 * np.abs(f.c))
+        return along(f, e.shape, [m[None] for m in e.inverse])
+
+
+def along(f: Taylor, shape: tuple[int, ...], matrices: Sequence[FloatArray]) -> Taylor:
+    """A matrix along each parameter: cells x (degree + 1) x (degree + 1) each, or one for all cells."""
+
+    def turn(values: Any, *, sizes: bool) -> Any:
+        array = values.reshape(-1, *shape)
+        for axis, M in enumerate(matrices, start=1):
+            if shape[axis - 1] == 1:
+                continue
+            M = np.abs(M) if sizes else M
+            moved = np.moveaxis(array, axis, -1)
+            flat = moved.reshape(len(moved), -1, shape[axis - 1])
+            array = np.moveaxis((flat @ M.swapaxes(-1, -2)).reshape(moved.shape), -1, axis)
+        return array.reshape(len(array), -1)
+
+    return Taylor(turn(f.c, sizes=False), turn(f.g, sizes=False), turn(f.r, sizes=True))
+
+
+def excludes_zero(f: Taylor) -> Any:
+    """Whether the points c +- g with their disks lie within an open half plane: rows.
+
+    Seen from zero they then fill less than half a turn.
+    """
+    middle = f.c.mean(axis=1, keepdims=True)
+    points = np.concatenate([f.c - f.g, f.c + f.g], axis=1)
+    radius = np.concatenate([f.r, f.r], axis=1) + GUARD * 1e-3 * np.abs(f.c).max(axis=1, keepdims=True)
+    size = np.abs(points)
+    with np.errstate(all="ignore"):
+        half = np.arcsin(np.where(size > radius, radius / size, 1))
+        angle = np.angle(points / middle)
+    span = (angle + half).max(axis=1) - (angle - half).min(axis=1)
+    fine = np.isfinite(f.r).all(axis=1) & (size > radius).all(axis=1) & (middle[:, 0] != 0)
+    return fine & (span < np.pi - GUARD)
+
+
+def products(e: Enclosure, rows: FloatArray) -> FloatArray:
+    """Products of Bernstein polynomials at parameters: rows x coefficients."""
+    total = np.ones((len(rows), 1))
+    for i, size in enumerate(e.shape):
+        if size > 1:
+            u = (rows[:, i] - e.sides[i, 0]) / (e.sides[i, 1] - e.sides[i, 0])
+            total = (total[:, :, None] * bernstein(size - 1, u)[:, None, :]).reshape(len(rows), -1)
+    return total
+
+
+def restrictions(shape: tuple[int, ...], boxes: FloatArray) -> Sequence[FloatArray]:
+    """Bernstein coefficients over the whole box -> over parts of it, for each parameter: cells x d x d."""
+    found: list[FloatArray] = []
+    for axis, size in enumerate(shape):
+        if size == 1:
+            found.append(np.ones((1, 1, 1)))
+            continue
+        u = nodes(size - 1)
+        low, high = boxes[:, axis, :1], boxes[:, axis, 1:]
+        found.append(np.linalg.inv(bernstein(size - 1, u)) @ bernstein(size - 1, low + (high - low) * u))
+    return found
+
+
+def cover(c: Compensator, stiffest: float) -> FloatArray:
+    """Intervals from zero to the Nyquist frequency, or to infinity: rows of branch, from, to."""
+    top = np.pi / c.sample_time if c.sample_time is not None else 64 * (stiffest + 1)
+    edges = top * 2.0 ** np.arange(-24, 1)
+    cells = np.column_stack([0 * edges, np.r_[0, edges[:-1]], edges])
+    return cells if c.sample_time is not None else np.vstack([cells, [1, 0, 1 / top]])
+
+
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """A group whose modes couple, with the first loss of stability that was found."""
+
+    block: Block
+    upper: float
+    frequency: float | None
+    witness: FloatArray | None
+    reason: str = ""  # why nothing can be proven
+    exact: bool = False  # in closed form, at the phase crossovers

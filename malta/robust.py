@@ -1,0 +1,524 @@
+"""Robust stability against real parameters: how far they may all deviate before the loop can become unstable.
+
+    margin = the largest t for which every p with  nominal - t (nominal - low) <= p <= nominal + t (high - nominal)
+             is stable; 1: the whole modelled box; 3: three times it ("300 %"), as MATLAB's robstab counts.
+
+A stable loop becomes unstable only where its characteristic function f(jw; p) = 0 for some w. `upper` is a p at which
+it does, checked by the eigenvalues of the loop. `lower` is proven: zero is excluded from f over the whole box and over
+*intervals* of frequency that cover all of them, w = 0 and the Nyquist frequency (or infinity) included.
+
+    f(s; p) = det( N(s; p) - B(p) H(s) F(s) C(s; p) ),   N = s^2 - s A22 - A21  (or s - A)
+
+N, B, C come from the CasADi model. F is the controller's own frequency response, of sampled ones at z = e^(jwT), H what
+stands between: current loops, hold and delay, exactly. A hold's images at w + 2 pi k / T are bounded, not computed.
+
+Each group of states that closes a loop by itself is treated alone. Where it is a single mode, f = mu(w, p) - nu(p) h(w)
+with real mu and nu > 0: zero needs Im h(w) = 0, so the boundary of stability is a plane in p at each phase crossover,
+in closed form. Where modes couple, f is a polynomial in p: its Bernstein coefficients enclose it over a box, and boxes
+and frequency intervals are split until zero is outside of all of them (branch and bound).
+Arithmetic is floating point with a guard of 1e-9; the tests repeat the proofs in ball arithmetic.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy import sparse
+
+from malta.enclose import (
+    GUARD,
+    Block,
+    Enclosure,
+    along,
+    characteristic_values,
+    coefficients,
+    cover,
+    enclosure,
+    excludes_zero,
+    frequencies,
+    polynomial,
+    products,
+    response,
+    restrictions,
+)
+from malta.errors import InputError
+from malta.uncertain import Compensator, UncertainSystem, instability
+
+if TYPE_CHECKING:
+    from malta.plant import ComplexArray, FloatArray
+
+DUST = 1e-11  # entries of the balanced closed loop below this, relative, are rounding
+FAR = 1e3  # multiples of the modelled box beyond which nobody looks
+# How close the proven bound comes to the witness, relative:
+EXACT = 5e-7  # where all modes are single
+TOLERANCE = 1e-3  # where modes couple
+
+
+@dataclass(frozen=True, eq=False)
+class Certificate:
+    """What proves the lower bound: zero is excluded on each cell."""
+
+    method: str  # "phase crossovers" or "branch and bound"
+    cells: int
+    frequencies: tuple[float, float]  # rad/s, covered without a gap
+    crossovers: tuple[float, ...] = ()  # rad/s, where f can vanish at all
+    intervals: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))  # branch, from, to of each cell
+    boxes: FloatArray = field(default_factory=lambda: np.zeros((0, 0, 2)))  # of the parameters of each cell
+
+
+@dataclass(frozen=True, eq=False)
+class Margin:
+    """A robust stability margin in multiples of the modelled box.
+
+    lower: proven; None where nothing is, `reason` says why. upper: reached by `witness`; infinite where no parameter
+    of the range that exists destabilizes.
+    """
+
+    lower: float | None
+    upper: float
+    frequency: float | None  # rad/s, at which the witness loses stability
+    witness: Mapping[str, float] | None  # SI
+    sensitivity: Mapping[str, float]  # share of each parameter in the margin; they add up to 1
+    certificate: tuple[Certificate, ...]  # one for each group of states
+    seconds: float
+    reason: str = ""
+
+    @property
+    def exhausted(self) -> bool:
+        """Stable as far as the parameters exist (a mass above zero)."""
+        return math.isinf(self.upper)
+
+    def __str__(self) -> str:
+        low = "nothing proven" if self.lower is None else f"proven {100 * self.lower:.2f} %"
+        if self.exhausted:
+            return f"{low}: stable as far as the parameters exist"
+        where = "" if self.frequency is None else f" at {self.frequency:.4g} rad/s"
+        return f"{low}, lost at {100 * self.upper:.2f} %{where}"
+
+
+def robust_margin(
+    system: UncertainSystem,
+    compensator: Compensator,
+    ranges: Mapping[str, float | tuple[float, float]],
+    over: Mapping[str, tuple[float, float]] | None = None,
+    *,
+    tolerance: float | None = None,
+    most_cells: int = 400_000,
+) -> Margin:
+    """How far the parameters may deviate together, in multiples of their modelled range, before the loop is unstable.
+
+    Parameters
+    ----------
+    ranges : by name; 0.2 is +-20 % of the nominal value, (low, high) an interval in SI. With t the lower side is
+        nominal - t (nominal - low), the upper one nominal + t (high - nominal): linear on each side.
+    over : intervals that do not grow with t, in SI: the bound holds anywhere in them (`z` over the travel)
+    tolerance : how close the proven bound shall come to the witness, relative; None: 5e-7, where modes couple 1e-3
+    most_cells : where the proof is given up
+
+    Raises InputError for names that the system does not have and ranges that are none.
+    """
+    start = time.perf_counter()
+    box = _box(system, ranges, over or {})
+    if not (instability(system, compensator, _midpoint(box)) < 0).all():
+        at = dict(zip(system.names, _midpoint(box)[0].tolist(), strict=True))
+        return Margin(0.0, 0.0, None, at, {}, (), time.perf_counter() - start, "the nominal loop is unstable")
+    reach = min(box.most * (1 - 1e-9), FAR)
+    found: list[_Bound] = []
+    for block in _blocks(system, compensator, box):
+        found.append(_search(block, box, reach))
+        reach = min(reach, found[-1].upper)
+    # What is beyond the smallest witness needs no proof.
+    if any(math.isfinite(b.upper) for b in found):
+        reach *= 1 - (tolerance or (EXACT if all(b.exact for b in found) else TOLERANCE))
+    bounds = [_branch_and_bound(b, box, reach, most_cells) for b in found]
+    return _merged(system, compensator, box, bounds, start)
+
+
+@dataclass(frozen=True, eq=False)
+class _Box:
+    """Nominal values and how far each grows downwards and upwards with t; `over` stays."""
+
+    names: tuple[str, ...]
+    nominal: FloatArray
+    down: FloatArray
+    up: FloatArray
+    over: FloatArray  # names x 2: added to nominal, whatever t
+    most: float  # t at which a parameter leaves what it can be
+
+    def sides(self, t: float) -> FloatArray:
+        """Low and high of every parameter: names x 2."""
+        return np.column_stack([self.nominal - t * self.down, self.nominal + t * self.up]) + self.over
+
+
+def _box(
+    system: UncertainSystem,
+    ranges: Mapping[str, float | tuple[float, float]],
+    over: Mapping[str, tuple[float, float]],
+) -> _Box:
+    k = len(system.names)
+    down, up, fixed = np.zeros(k), np.zeros(k), np.zeros((k, 2))
+    most = math.inf
+    for name, value in (*ranges.items(), *over.items()):
+        if name not in system.names:
+            raise InputError(
+                "robust_margin", name, "an unknown parameter", "one of " + " ".join(system.names)
+            )
+        i = system.names.index(name)
+        nominal = float(system.nominal[i])
+        pair = (
+            value
+            if isinstance(value, tuple)
+            else (nominal - abs(nominal) * value, nominal + abs(nominal) * value)
+        )
+        sound = len(pair) == 2 and all(math.isfinite(v) for v in pair) and pair[0] <= nominal <= pair[1]
+        if not sound or pair[0] == pair[1] or (not isinstance(value, tuple) and not value > 0):
+            raise InputError(
+                "robust_margin",
+                name,
+                repr(value),
+                f"a share above 0, or (low, high) about the nominal {nominal:g}",
+            )
+        if name in over:
+            fixed[i] = pair[0] - nominal, pair[1] - nominal
+            continue
+        down[i], up[i] = nominal - pair[0], pair[1] - nominal
+        low, high = system.limits[i]
+        for room, rate in ((nominal - low, down[i]), (high - nominal, up[i])):
+            most = min(most, room / rate) if rate > 0 else most
+    if not ranges:
+        raise InputError("robust_margin", "ranges", "no parameters", "at least one uncertain parameter")
+    return _Box(system.names, system.nominal, down, up, fixed, most)
+
+
+def _midpoint(box: _Box) -> FloatArray:
+    """Nominal values, at both ends and the middle of what stays."""
+    ends = box.nominal + box.over.T
+    return np.unique(np.vstack([ends, box.nominal[None, :] + 0 * ends[:1]]), axis=0)
+
+
+def _blocks(system: UncertainSystem, c: Compensator, box: _Box) -> list[Block]:
+    """The strongly connected groups of the closed loop, at any parameters: their factors are independent."""
+    rng = np.random.default_rng(0)
+    sides = box.sides(min(1.0, 0.9 * box.most))
+    rows = np.vstack([_midpoint(box), sides.T, rng.uniform(sides[:, 0], sides[:, 1], (8, len(sides)))])
+    n = system.matrices.size1_out(0)
+    touch = np.zeros((n + len(c.A),) * 2, bool)
+    for A, B, C in zip(*system.at(rows), strict=True):
+        closed = np.block([[A + B @ c.D @ C, B @ c.C], [c.B @ C, c.A]])
+        terms = np.block(
+            [[abs(A) + abs(B) @ abs(c.D) @ abs(C), abs(B) @ abs(c.C)], [abs(c.B) @ abs(C), abs(c.A)]]
+        )
+        size = np.abs(closed)
+        reference = np.sqrt(np.outer(size.max(axis=1), size.max(axis=0)))
+        touch |= size > DUST * np.maximum(terms, reference)
+    _, label = sparse.csgraph.connected_components(touch, directed=True, connection="strong")
+    blocks = []
+    positions = n // 2 if system.second_order else n
+    for k in dict.fromkeys(label.tolist()):
+        own = np.flatnonzero(label[n:] == k)
+        states = tuple(np.flatnonzero(label[:positions] == k).tolist())
+        if states:
+            integrals = int((own >= len(c.A) - c.integrals).sum())
+            inner = replace(c, A=c.A[np.ix_(own, own)], B=c.B[own], C=c.C[:, own], integrals=integrals)
+            blocks.append(Block(system, inner, states))
+    return blocks
+
+
+@dataclass(frozen=True, eq=False)
+class _Bound:
+    """What is known of one group."""
+
+    block: Block
+    upper: float = math.inf
+    frequency: float | None = None  # rad/s
+    witness: FloatArray | None = None
+    exact: bool = False  # in closed form, at the phase crossovers
+    lower: float | None = None
+    certificate: Certificate | None = None
+    reason: str = ""  # why nothing is proven
+
+
+def _search(block: Block, box: _Box, goal: float) -> _Bound:
+    """The first loss of stability below `goal`: at the phase crossovers of a mode, or along the box's diagonals."""
+    found = _Bound(block)
+    for _ in range(8):
+        poly = polynomial(block, box.names, box.sides(goal))
+        if isinstance(poly, str):
+            return replace(found, reason=poly)
+        e = enclosure(block, box.nominal, box.sides(goal), poly)
+        exact = _at_crossovers(e, box, goal)
+        better = exact if exact is not None else _worst_ray(e, box, goal)
+        if better is None or not better[0] < found.upper:
+            return replace(found, exact=exact is not None)
+        upper, frequency, witness = better
+        found = _Bound(block, upper, frequency, witness, exact is not None)
+        if found.exact:
+            return found
+        goal = upper * (1 - TOLERANCE)
+    return found
+
+
+def _at_crossovers(e: Enclosure, box: _Box, goal: float) -> tuple[float, float, FloatArray] | None:
+    """t, w, p where a single mode first loses its stability; t is infinite where it does not below goal.
+
+    f = -(w^2 M(p) + S(p) + nu(p) h(w)) with M, S, nu affine in p, so f = 0 where Im h = 0 is a plane in p. None where f
+    is not of this form.
+    """
+    M, c = e.matrices, e.block.own
+    if M.N1 is None or M.N0.shape[1] > 1 or M.N1.any() or any(size > 2 for size in e.shape):
+        return None
+    paths = np.einsum("jk,jl->jkl", M.B[:, 0], M.C0[:, :, 0])
+    largest = np.unravel_index(np.abs(paths[0]).argmax(), paths[0].shape)
+    nu = paths[:, *largest] / paths[0][largest]
+    if (
+        paths[0][largest] == 0
+        or np.abs(paths - nu[:, None, None] * paths[0]).max() > GUARD * np.abs(paths).max()
+    ):
+        return None
+    free = [i for i, size in enumerate(e.shape) if size > 1]
+    corners = np.column_stack([np.ones(len(e.rows)), e.rows[:, free] / box.nominal[free]])
+    parts = np.column_stack([e.weights, e.weights * M.N0[:, 0, 0], e.weights * nu])
+    affine = np.linalg.lstsq(corners, parts, rcond=None)[0]
+    if (np.abs(corners @ affine - parts) > GUARD * np.abs(parts).max(axis=0)).any() or not (nu > 0).all():
+        return None
+    C1 = None if M.C1 is None else M.C1[0, :, 0]
+
+    def h(w: FloatArray) -> ComplexArray:
+        cells = np.column_stack([0 * w, w, w])
+        f = frequencies(c, cells)
+        with np.errstate(all="ignore"):  # only centres count here
+            G = response(c, f, cells, 2, M.stiffest).c
+        value = np.einsum("k,wkl,l->w", M.B[0, 0], G, M.C0[0, :, 0]) / f.scale.c
+        if C1 is not None:
+            value = value + 1j * w * np.einsum("k,wkl,l->w", M.B[0, 0], G, C1) / f.scale.c
+        return np.asarray(value)
+
+    top = cover(c, M.stiffest)[:, 2].max()
+    w = np.geomspace(1e-9, 1, 1600) * top
+    turned = h(w).imag
+    k = np.flatnonzero(np.sign(turned[1:]) != np.sign(turned[:-1]))
+    low, high, left = w[k], w[k + 1], turned[k]
+    for _ in range(11):  # sixteen parts of each at a time, all crossovers at once
+        inside = np.linspace(0, 1, 18)[1:-1]
+        points = low + (high - low) * inside[:, None]
+        side = np.sign(h(points.ravel()).imag.reshape(points.shape)) == np.sign(left)
+        count = np.where(side.all(axis=0), len(inside), side.argmin(axis=0))
+        edges = np.vstack([low, points, high])
+        low, high = (np.take_along_axis(edges, (count + i)[None], axis=0)[0] for i in (0, 1))
+    crossings = (low + high) / 2
+    if not c.integrals:
+        crossings = np.r_[0.0, crossings]
+    values = h(crossings).real
+    down, up = (rate[free] / box.nominal[free] for rate in (box.down, box.up))
+    best: tuple[float, float, FloatArray] = (math.inf, 0.0, box.nominal)
+    for at, value in zip(crossings.tolist(), values.tolist(), strict=True):
+        plane = affine @ np.array([at**2, 1.0, value])
+        now = float(plane.sum())
+        toward = -np.sign(now) * plane[1:]
+        rate = np.where(toward > 0, up, -down)
+        t = abs(now) / max(float(toward @ rate), 1e-300)
+        if t < min(best[0], goal):
+            p = box.nominal.copy()
+            p[free] *= 1 + t * np.where(np.abs(toward) > GUARD * np.abs(plane[1:]).max(), rate, 0)
+            best = t, at, p
+    return best
+
+
+def _branch_and_bound(found: _Bound, box: _Box, goal: float, most_cells: int) -> _Bound:
+    """Prove the box at `goal`, which is below the witness, or a smaller one."""
+    if found.reason:
+        return found
+    reason = ""
+    for _ in range(12):
+        poly = polynomial(found.block, box.names, box.sides(goal))
+        if isinstance(poly, str):
+            return replace(found, reason=poly)
+        proof = _prove(enclosure(found.block, box.nominal, box.sides(goal), poly), most_cells)
+        if isinstance(proof, Certificate):
+            return replace(found, lower=goal, certificate=proof)
+        reason = proof
+        goal *= 0.97
+    return replace(found, reason=reason)
+
+
+def _worst_ray(e: Enclosure, box: _Box, goal: float) -> tuple[float, float, FloatArray] | None:
+    """The first loss of stability along the diagonals of the box: t, w, p. None when there is none below goal.
+
+    Stable where f turns as often as at the nominal parameters between w = 0 and the end (argument principle).
+    """
+    intervals = cover(e.block.own, e.matrices.stiffest)
+    parts = [
+        np.column_stack([np.full(16, b), *(2 * [np.linspace(lo, hi, 17)[:-1]])]) for b, lo, hi in intervals
+    ]
+    if e.block.own.sample_time is None:
+        parts[-1] = parts[-1][::-1]
+    grid = np.vstack(parts)
+    values = coefficients(e, grid).c
+
+    def unstable(rows: FloatArray) -> Any:
+        ratio = (products(e, rows) @ values.T) / (products(e, nominal) @ values.T)
+        turned = np.unwrap(np.angle(ratio), axis=1)
+        return (ratio[:, 0].real < 0) | (np.abs(turned[:, -1] - np.angle(ratio[:, 0])) > np.pi / 2)
+
+    free = [i for i, size in enumerate(e.shape) if size > 1]
+    grown = [i for i in free if box.down[i] + box.up[i] > 0]
+    stay = [i for i in free if i not in grown]
+    places = [
+        np.array(place)
+        for place in itertools.product(*(np.linspace(box.over[i, 0], box.over[i, 1], 3) for i in stay))
+    ]
+    signs = itertools.product((-1, 1), repeat=len(grown))
+    nominal = box.nominal[None, :].copy()
+    start, step = [], []
+    for place, sign in itertools.product(places, signs):
+        p, d = box.nominal.copy(), np.zeros(len(box.nominal))
+        p[stay] += place
+        for i, s in zip(grown, sign, strict=True):
+            d[i] = s * (box.up[i] if s > 0 else box.down[i])
+        start.append(p)
+        step.append(d)
+    P, D = np.array(start), np.array(step)
+    scan = goal * np.linspace(0, 1, 25)[1:]
+    crossed = np.array([unstable(P + t * D) for t in scan])  # t x rays
+    if not crossed.any():
+        return None
+    first = np.where(crossed.any(axis=0), crossed.argmax(axis=0), len(scan))
+    rays = np.flatnonzero(first == first.min())
+    low, high = np.full(len(rays), scan[first.min()] - scan[0]), np.full(len(rays), scan[first.min()])
+    for _ in range(40):
+        t = (low + high) / 2
+        bad = unstable(P[rays] + t[:, None] * D[rays])
+        low, high = np.where(bad, low, t), np.where(bad, t, high)
+    k = int(high.argmin())
+    ray = rays[k]
+    p = P[ray] + high[k] * D[ray]
+    size = np.abs(products(e, p[None]) @ values.T)[0]
+    at = grid[int((size / np.abs(products(e, nominal) @ values.T)[0]).argmin())]
+    t, cell = _polished(e, P[ray], D[ray], float(high[k]), at)
+    w = cell[1] if cell[0] == 0 else 1 / cell[1] if cell[1] > 1e-12 / e.matrices.stiffest else math.inf
+    return t, float(w), P[ray] + t * D[ray]
+
+
+def _polished(
+    e: Enclosure, p: FloatArray, d: FloatArray, t: float, cell: FloatArray
+) -> tuple[float, FloatArray]:
+    """Newton's method for f = 0 in t and frequency along p + t d; the start where it does not settle nearby."""
+    first, at, step = t, cell[1], 1e-6
+    for _ in range(12):
+        half = step * max(at, 1e-12)
+        f = coefficients(e, np.array([[cell[0], at - half, at + half]]))
+        rows = p + np.array([t, t * (1 + step)])[:, None] * d
+        weights = products(e, rows)
+        value, moved = (weights @ f.c[0]).tolist()
+        slopes = [(moved - value) / (t * step), complex(weights[0] @ f.g[0]) / half]
+        J = np.array([[g.real for g in slopes], [g.imag for g in slopes]])
+        if not np.isfinite(J).all() or np.linalg.cond(J) > 1e15:
+            return first, cell
+        dt, dw = np.linalg.solve(J, [-value.real, -value.imag])
+        t, at = t + dt, at + dw
+        if not (0.98 * first < t < 1.02 * first and at > 0):
+            return first, cell
+    return float(t), np.array([cell[0], at, at])
+
+
+def _prove(e: Enclosure, most_cells: int) -> Certificate | str:
+    """Exclude zero from f over the whole box and all frequencies, or say why not."""
+    free = [axis for axis, size in enumerate(e.shape) if size > 1]
+    cells = cover(e.block.own, e.matrices.stiffest)
+    ends = (0.0, float(cells[:, 2].max()) if e.block.own.sample_time is not None else math.inf)
+    boxes = np.tile([0.0, 1.0], (len(cells), len(e.shape), 1))
+    done_cells, done_boxes, count = [], [], 0
+    while len(cells):
+        batch, rest = slice(-4096, None), slice(None, -4096)
+        own, own_boxes = cells[batch], boxes[batch]
+        cells, boxes = cells[rest], boxes[rest]
+        unique, index = np.unique(own, axis=0, return_inverse=True)
+        whole = coefficients(e, unique)[index.ravel()]
+        with np.errstate(invalid="ignore"):
+            f = along(whole, e.shape, restrictions(e.shape, own_boxes))
+        good = excludes_zero(f)
+        done_cells.append(own[good])
+        done_boxes.append(own_boxes[good])
+        count += len(own)
+        bad = ~good
+        if not bad.any():
+            continue
+        if count > most_cells:
+            return f"not settled within {most_cells} cells"
+        own, own_boxes, f = own[bad], own_boxes[bad], f[bad]
+        # split what moves f most: frequency, or a parameter
+        moves = [np.abs(f.g).sum(axis=1) + f.r.sum(axis=1)]
+        values = f.c.reshape(-1, *e.shape)
+        for axis in free:
+            moves.append(np.abs(np.diff(values, axis=axis + 1)).reshape(len(own), -1).sum(axis=1) / 2)
+        moves[0] = np.where(np.isfinite(moves[0]), moves[0], np.inf)
+        choice = np.argmax(moves, axis=0)
+        if (np.diff(own[:, 1:], axis=1)[:, 0] < 1e-13 * np.maximum(own[:, 2], 1e-9 * ends[0])).any():
+            return f"zero is not excluded near {own[0, 1:].mean():.6g} rad/s"
+        for k in range(1 + len(free)):
+            chosen = choice == k
+            if not chosen.any():
+                continue
+            for side in (0, 1):
+                c, b = own[chosen].copy(), own_boxes[chosen].copy()
+                if k == 0:
+                    c[:, 2 - side] = c[:, 1:].mean(axis=1)
+                else:
+                    b[:, free[k - 1], 1 - side] = b[:, free[k - 1]].mean(axis=1)
+                cells, boxes = np.vstack([cells, c]), np.vstack([boxes, b])
+    return Certificate("branch and bound", count, ends, (), np.vstack(done_cells), np.vstack(done_boxes))
+
+
+def _merged(system: UncertainSystem, c: Compensator, box: _Box, bounds: list[_Bound], start: float) -> Margin:
+    """The smallest bounds, the witness beyond the boundary far enough for the eigenvalues of the loop to say so."""
+    worst = min(bounds, key=lambda b: b.upper)
+    reasons = [b.reason for b in bounds if b.reason]
+    lower = (
+        None if any(b.lower is None for b in bounds) else min(b.lower for b in bounds if b.lower is not None)
+    )
+    upper, frequency, witness, shares = worst.upper, worst.frequency, None, {}
+    if worst.witness is not None:
+        shares = _shares(worst, box)
+        grows = box.down + box.up > 0
+        for beyond in (2e-7, 1e-6, 1e-5, 1e-4):
+            p = worst.witness.copy()
+            p[grows] = box.nominal[grows] + (1 + beyond) * (p[grows] - box.nominal[grows])
+            if float(instability(system, c, p)[0]) > 0:
+                upper, witness = worst.upper * (1 + beyond), p
+                break
+        else:
+            reasons.append("the eigenvalues do not confirm the witness")
+            upper, frequency, lower = math.inf, None, None
+    named = None if witness is None else dict(zip(system.names, witness.tolist(), strict=True))
+    proofs = tuple(b.certificate for b in bounds if b.certificate is not None)
+    return Margin(
+        lower, upper, frequency, named, shares, proofs, time.perf_counter() - start, "; ".join(reasons)
+    )
+
+
+def _shares(bound: _Bound, box: _Box) -> dict[str, float]:
+    """What each parameter contributes to reaching the boundary: d ln(margin) = -sum of share x d ln(range).
+
+    Along f(jw, p) = 0 the margin moves by Im(conj(f_w) f_p dp); at the witness all of them pull the same way.
+    """
+    assert bound.witness is not None
+    assert bound.frequency is not None
+    w = bound.frequency
+    p, moved = bound.witness, bound.witness - box.nominal
+    names = [i for i in range(len(p)) if box.down[i] + box.up[i] > 0 and moved[i] != 0]
+    if math.isinf(w) or len(names) == 1:
+        return {box.names[i]: 1 / len(names) for i in names}
+    h = 1e-6
+    rows = np.vstack([p, *(p - h * moved * (np.arange(len(p)) == i) for i in names)])
+    at = np.array([w, w * (1 + h) if w > 0 else 1e-6])
+    f = characteristic_values(bound.block, rows, at)
+    slope, pulls = f[1, 0] - f[0, 0], f[0, 1:] - f[0, 0]
+    size = (np.conj(slope) * pulls).imag if w > 0 else pulls.real
+    total = size.sum()
+    return {box.names[i]: float(s / total) for i, s in zip(names, size, strict=True)} if total else {}

@@ -1,0 +1,218 @@
+"""Linear models and control laws with uncertain parameters: what a robustness margin is asked of.
+
+x' = A(p) x + B(p) u,  y = C(p) x        derived from a plant's CasADi model, parameters by name
+u = H F y                                 a control law F, and what stands between it and the plant: H
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import casadi as ca
+import numpy as np
+
+from malta.controller import Controller, CurrentLoop, linear_law
+from malta.errors import InputError
+from malta.plant import Plant, readonly, symbolic
+from malta.riccati import delay_inputs, sample
+
+if TYPE_CHECKING:
+    from malta.plant import FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class UncertainSystem:
+    """x' = A(p) x + B(p) u, y = C(p) x with parameters p by name.
+
+    second_order: x = (q, q'), so A = [[0, I], [A21, A22]] and B = [[0], [B2]].
+    limits: what each parameter may be at all, (above, below), exclusive.
+    """
+
+    names: tuple[str, ...]
+    nominal: FloatArray
+    matrices: ca.Function  # p -> A, B, C
+    second_order: bool
+    limits: tuple[tuple[float, float], ...]
+
+    def at(self, p: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """A, B, C at rows of parameters: arrays of k matrices."""
+        rows = np.atleast_2d(p)
+        found = self.matrices.map(len(rows))(rows.T)
+        shapes = [self.matrices.size_out(i) for i in range(3)]
+        return tuple(  # type: ignore[return-value]
+            np.array(M).reshape(a, len(rows), b).swapaxes(0, 1)
+            for M, (a, b) in zip(found, shapes, strict=True)
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Compensator:
+    """u = F y: x+ = A x + B y (x' where sample_time is None), u = C x + D y; the last states integrate alone.
+
+    What stands between u and the plant: a whole number of samples of delay, a zero-order hold where sampled, and a
+    first-order lag w_c / (s + w_c) where `lag` is given.
+    """
+
+    A: FloatArray
+    B: FloatArray
+    C: FloatArray
+    D: FloatArray
+    integrals: int = 0  # how many of the last states: x+ = x + B y, x' = B y
+    sample_time: float | None = None  # s; None: continuous
+    delay: int = 0  # samples
+    lag: float | None = None  # rad/s
+
+
+def uncertain(
+    plant: Plant, names: Sequence[str], *, states: bool = False, **positions: float
+) -> UncertainSystem:
+    """The design model of a plant at a position along its stroke, in parameters by name, without preload.
+
+    The stroke itself may be one of the names (`z` for MALTA): its nominal value is the position.
+    Inputs are commanded forces: a controller divides by the force constants it knows, the plant multiplies by its own.
+    states: the states follow the outputs in y.
+
+    Raises InputError for an unknown name.
+    """
+    from malta.data import twins_of, units_of
+
+    par = plant.parameters
+    known = [*units_of(par), plant.stroke]
+    for name in names:
+        if name not in known:
+            raise InputError("robust_margin", name, "an unknown parameter", "one of " + " ".join(known))
+    x0 = plant.at(**positions).x
+    symbols = {name: ca.SX.sym(name) for name in names}
+    p = ca.vertcat(*symbols.values())
+    own = {name: symbol for name, symbol in symbols.items() if name != plant.stroke}
+    own |= {name: own[twin] for name, twin in twins_of(par).items() if twin in own}
+    machine: Plant = plant.variant(symbolic(par, own))
+    x, u = ca.SX.sym("x", len(plant.states)), ca.SX.sym("u", len(plant.inputs))
+    rate, y = machine.f(x, u, ca.SX.zeros(len(plant.disturbances))), machine.h(x, u)
+    at = ca.SX(x0)
+    if plant.stroke in symbols:
+        at[plant.stroke_state] = symbols[plant.stroke]
+    keep = list(plant.controlled)
+    scale = ca.diag(ca.vertcat(*machine.actuator.force_constant) / ca.DM(list(plant.actuator.force_constant)))
+    jacobians = [
+        ca.jacobian(rate, x)[keep, keep],
+        ca.jacobian(rate, u)[keep, :] @ scale,
+        ca.jacobian(y, x)[:, keep],
+    ]
+    A, B, C = ca.substitute(jacobians, [x, u], [at, ca.SX.zeros(len(plant.inputs))])
+    if states:
+        C = ca.vertcat(C, ca.SX.eye(len(keep)))
+    nominal = [x0[plant.stroke_state] if name == plant.stroke else getattr(par, name) for name in names]
+    bounds = {f.name: f.metadata.get("above") for f in par.__dataclass_fields__.values()}
+    limits = tuple(
+        (-math.inf, math.inf) if name == plant.stroke else (_or(bounds[name], -math.inf), math.inf)
+        for name in names
+    )
+    matrices = ca.Function("matrices", [p], [ca.densify(M) for M in (A, B, C)])
+    return UncertainSystem(tuple(names), readonly(nominal), matrices, True, limits)
+
+
+def _or(value: float | None, default: float) -> float:
+    return default if value is None else float(value)
+
+
+def sampled_law(
+    controller: Controller, delay: int, lag: float, loop: CurrentLoop | None = None, R: float = 1.0
+) -> Compensator:
+    """The control law of a gain file as the machine runs it: hold, `delay` samples, current loops.
+
+    lag : rad/s, crossover of the current loops, taken as first-order lags; with `loop`, the windings' own R / L
+    loop : PI controllers of the currents, for windings of resistance R (ohm), sampled with the control law
+    """
+    law, T = linear_law(controller), controller.sample_time
+    n, m, half = len(controller.states), len(controller.forces), len(controller.A) // 2
+    p = len(law.A) - n
+    # Sums of errors and stored forces in the coordinates of the modes, where these decouple.
+    to_modes = np.eye(len(law.A))
+    if p == m == half:
+        to_modes[n:, n:] = np.linalg.inv(controller.C[:, :half])
+        for k in range(2 * half, n, m):
+            to_modes[k : k + m, k : k + m] = controller.B[half:]
+    back = np.linalg.inv(to_modes)
+    c = Compensator(
+        to_modes @ law.A @ back, to_modes @ law.B_y, law.C @ back, law.D_y,
+        integrals=p, sample_time=T, delay=delay, lag=lag,
+    )  # fmt: skip
+    return c if loop is None else _with_current_control(c, loop, R, controller.B[half:])
+
+
+def _with_current_control(c: Compensator, loop: CurrentLoop, R: float, B2: FloatArray) -> Compensator:
+    """In series: the voltages that PI controllers ask for, over R, so that the lag R / L makes currents of them.
+
+    Each axis: e = v - i, I+ = I + Ki T e, u = Kp e + I+, i+ = a i + (1 - a) u[k - d] / R with a = e^(-T R / L).
+    """
+    assert c.sample_time is not None
+    assert c.lag is not None
+    T, d, m = c.sample_time, c.delay, len(c.C)
+    a = math.exp(-T * c.lag)
+    slope, gain = loop.Ki * T, loop.Kp + loop.Ki * T
+    A, B = np.zeros((2 + d, 2 + d)), np.zeros((2 + d, 1))  # I, i, voltages under way (the oldest first)
+    A[0, :2], B[0] = (1, -slope), slope
+    A[1, 1] = a
+    C, D = np.zeros((1, 2 + d)), gain
+    C[0, :2] = 1, -gain
+    if d:
+        A[1, 2] = (1 - a) / R
+        A[2:-1, 3:] = np.eye(d - 1)
+        A[-1], B[-1] = C, D
+    else:
+        A[1] += (1 - a) / R * C[0]
+        B[1] = (1 - a) / R * D
+    k = len(c.A) - c.integrals
+    modes = B2 if B2.shape == (m, m) else np.eye(m)
+    A5, B5, C5 = np.kron(A, np.eye(m)), np.kron(B, modes), np.kron(C, np.linalg.inv(modes)) / R
+    own = [*range(k), *range(k + len(A5), k + len(A5) + c.integrals)]
+    axes = [*range(k, k + len(A5))]
+    full = np.zeros((len(c.A) + len(A5),) * 2)
+    full[np.ix_(own, own)] = c.A
+    full[np.ix_(axes, axes)] = A5
+    full[np.ix_(axes, own)] = B5 @ c.C
+    driven, out = np.zeros((len(full), c.B.shape[1])), np.zeros((m, len(full)))
+    driven[own], driven[axes] = c.B, B5 @ c.D
+    out[:, own], out[:, axes] = c.C * D / R, C5
+    return replace(c, A=full, B=driven, C=out, D=c.D * D / R)
+
+
+def closed_loop(system: UncertainSystem, c: Compensator, p: FloatArray) -> FloatArray:
+    """State matrices of the closed loop at rows of parameters, exactly; of sampled loops (A - 1) / T.
+
+    Poles of slow modes stand close to 1, where A itself has lost their digits.
+    States: plant, lags, stored inputs, compensator.
+    """
+    matrices = []
+    for A, B, C in zip(*system.at(p), strict=True):
+        m = B.shape[1]
+        F = c.A
+        if c.lag is not None:
+            A = np.block([[A, B], [np.zeros((m, len(A))), -c.lag * np.eye(m)]])
+            B = np.vstack([np.zeros_like(B), c.lag * np.eye(m)])
+        if c.sample_time is not None:
+            n, T = len(A), c.sample_time
+            _, Phi = sample(A, np.eye(n), T)  # (e^AT - 1) / T = A Phi / T
+            A, B = delay_inputs(A @ Phi / T, Phi @ B / T, c.delay)
+            stored = np.arange(n, len(A))  # of these, delay_inputs gives the next values
+            A[n:], B[n:] = A[n:] / T, B[n:] / T
+            A[stored, stored] -= 1 / T
+            F = (c.A - np.eye(len(c.A))) / T
+        C = np.hstack([C, np.zeros((len(C), len(A) - C.shape[1]))])
+        driven = c.B if c.sample_time is None else c.B / c.sample_time
+        matrices.append(np.block([[A + B @ c.D @ C, B @ c.C], [driven @ C, F]]))
+    return np.array(matrices)
+
+
+def instability(system: UncertainSystem, c: Compensator, p: FloatArray) -> FloatArray:
+    """How far the worst pole is beyond the boundary, 1/s: its real part, of sampled loops ln|lambda| / T."""
+    poles = np.linalg.eigvals(closed_loop(system, c, p))
+    if c.sample_time is not None:
+        T = c.sample_time
+        grown = (2 * T * poles.real + T**2 * np.abs(poles) ** 2).max(axis=1)  # |lambda|^2 - 1
+        return np.asarray(np.log1p(np.maximum(grown, -1 + 1e-15)) / (2 * T))
+    return np.asarray(poles.real.max(axis=1))
