@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import lru_cache
 from importlib.metadata import version
@@ -43,25 +44,54 @@ def blocks(address: str, plan: Plan, left: Mapping[int, int]) -> Iterator[tuple[
         expected = "it installed: pip install 'malta[cluster]'"
         raise InputError("--cluster", "", f"no dask.distributed here ({error})", expected) from error
     dask: Any = distributed
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # losing a worker is no news
-    client = _connected(dask, address)
+    with _quiet():
+        client = _connected(dask, address)
+        try:
+            yield from _finished(dask, client, address, plan, left)
+        finally:
+            client.close(timeout=2)
+
+
+def _finished(
+    dask: Any, client: Any, address: str, plan: Plan, left: Mapping[int, int]
+) -> Iterator[tuple[int, Block]]:
+    task = _Task(plan.identity, version("malta"), plan)
+    waiting = {client.submit(_at_worker, task, *part, pure=False): part[0] for part in left.items()}
+    alone = 0.0  # s
+    while waiting:
+        try:
+            with client.as_current():
+                done = dask.wait(list(waiting), timeout=1.0, return_when="FIRST_COMPLETED").done
+        except TimeoutError:
+            alone = 0.0 if _workers(client) else alone + 1.0
+            if alone >= WAIT:
+                raise InputError("--cluster", address, "no workers", "a scheduler with some") from None
+            continue
+        except Exception as error:  # the scheduler is gone, and with it what was under way
+            raise InputError(
+                "--cluster", address, f"the connection lost ({type(error).__name__})", AGAIN
+            ) from error
+        for future in done:
+            yield waiting.pop(future), _result(address, future)
+
+
+AGAIN = "the same command once more: it goes on with what is left"
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Without the library's own messages: that a worker is lost is no news, other failures become one sentence."""
+    loggers = [
+        logging.getLogger(name) for name in logging.root.manager.loggerDict if name.startswith("distributed")
+    ]
+    before = [logger.disabled for logger in loggers]
+    for logger in loggers:
+        logger.disabled = True
     try:
-        task = _Task(plan.identity, version("malta"), plan)
-        waiting = {client.submit(_at_worker, task, *part, pure=False): part[0] for part in left.items()}
-        alone = 0.0
-        while waiting:
-            try:
-                with client.as_current():
-                    done = dask.wait(list(waiting), timeout=1.0, return_when="FIRST_COMPLETED").done
-            except TimeoutError:
-                alone = 0.0 if _workers(client) else alone + 1.0
-                if alone >= WAIT:
-                    raise InputError("--cluster", address, "no workers", "a scheduler with some") from None
-                continue
-            for future in done:
-                yield waiting.pop(future), _result(address, future)
+        yield
     finally:
-        client.close(timeout=2)
+        for logger, disabled in zip(loggers, before, strict=True):
+            logger.disabled = disabled
 
 
 def _connected(dask: Any, address: str) -> Any:
@@ -94,12 +124,7 @@ def _result(address: str, future: Any) -> Block:
     if future.status != "finished":
         error = future.exception() if future.status == "error" else None
         found = "the connection lost" if error is None else f"a worker that fails ({_said(error)})"
-        raise InputError(
-            "--cluster",
-            address,
-            found,
-            "the same command once more: it goes on with the blocks that are left",
-        )
+        raise InputError("--cluster", address, found, AGAIN)
     found = future.result()
     if isinstance(found, tuple) and len(found) == 4 and all(isinstance(part, str) for part in found):
         raise InputError(*found)
