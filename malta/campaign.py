@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, get_args
 
 import numpy as np
 
@@ -34,7 +34,7 @@ from malta.folder import (
     shapes,
     short,
 )
-from malta.many import Batch, is_compiled, replayed, simulate_many, verdicts
+from malta.many import Batch, is_compiled, recorded_run, replayed, simulate_many, verdicts
 from malta.plan import Plan as Plan
 from malta.plan import drawn, fingerprint, wanted_of
 from malta.plant import readonly
@@ -258,12 +258,27 @@ def read_plan(folder: str | Path, controller: Controller) -> Plan:
 def replay(
     plan: Plan, index: int, *, engine: EngineChoice = "auto", progress: Progress | None = None
 ) -> Experiment:
-    """One run of a campaign with all its time series: the same machine, sensor errors and noise."""
+    """One run of a campaign with all its time series: the same machine, sensor errors and noise, to the bit.
+
+    engine : "virtual machine" gives the run by itself, without the C compiler, whose last digits differ
+    """
     if not 0 <= index < plan.samples:
         raise InputError("campaign", "run", str(index), f"0 to {plan.samples - 1}")
-    machines = drawn(plan)
-    wanted = wanted_of(plan)
-    plant, scenario = replayed(
-        plan.plant, wanted.scenario, machines.changes, index, sensor_errors=machines.sensor_errors
+    if engine not in get_args(EngineChoice):
+        raise InputError("campaign", "engine", repr(engine), "one of " + ", ".join(get_args(EngineChoice)))
+    machines, wanted = drawn(plan), wanted_of(plan)
+    changes, errors = machines.changes, machines.sensor_errors
+    plant, scenario = replayed(plan.plant, wanted.scenario, changes, index, sensor_errors=errors)
+    wanted = wanted._replace(scenario=scenario)
+    if engine == "virtual machine":
+        return flown(plan.scenario, plant, plan.controller, wanted, engine, progress)
+    run = recorded_run(
+        plan.plant,
+        plan.controller,
+        wanted_of(plan).scenario,
+        changes,
+        index,
+        sensor_errors=errors,
+        progress=progress,
     )
-    return flown(plan.scenario, plant, plan.controller, wanted._replace(scenario=scenario), engine, progress)
+    return flown(plan.scenario, plant, plan.controller, wanted, engine, progress, run)

@@ -842,9 +842,13 @@ def flown(
     wanted: Wanted,
     engine: EngineChoice = "auto",
     progress: Progress | None = None,
+    run: Trajectory | None = None,
 ) -> Experiment:
-    """One run of an experiment by itself. Experiments whose figure compares runs have that of a single run."""
-    cases, cut = _flown(plant, controller, [wanted], progress, {"engine": engine})
+    """One run of an experiment by itself, flown now or before; those whose figure compares runs have a plain one."""
+    if run is None:
+        cases, cut = _flown(plant, controller, [wanted], progress, {"engine": engine})
+    else:
+        cases, cut = (Case(wanted.label, run, wanted.merits(run)),), False
     shown = name if name in ("stroke", "hold", "tilt") else "run"
     what = name if wanted.label == name else f"{name}: {wanted.label}"
     return Experiment(shown, what, cases, cases[0].merits, interrupted=cut)

@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -22,13 +22,15 @@ from malta.data import twins_of, units_of
 from malta.engine import LANES, evaluate, feedforward_table, in_lanes, run_many
 from malta.errors import InputError
 from malta.machine import Setup
-from malta.noise import keys
+from malta.noise import GAMMA, keys
 from malta.plant import Plant, readonly
 from malta.simulate import (
     BLOCK,
     Scenario,
+    Trajectory,
     beginning,
     compiled_shape,
+    recorded,
     sampled,
     setup_of,
     shape_of,
@@ -37,6 +39,8 @@ from malta.simulate import (
 )
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from malta.plant import FloatArray
 
 LEVELS = (0.1, 0.9)  # of a stroke: its rise is between them
@@ -107,23 +111,15 @@ def simulate_many(
     if compiled is None:
         return _one_by_one(plant, controller, scenario, changes, sensor_errors, first, runs, progress)
     lib, _ = compiled
-    values = machine.numbers(plant, controller, scenario.substeps, scenario.sensor_errors)
-    theta = _thetas(plant, values, changes, sensor_errors or {}, runs)
-    t, motion, given = sampled(plant, controller, scenario, setup)
-    first_state = beginning(plant, controller, scenario, given[0])
-    states, noise = _mapped(_starts(plant, controller, setup, values, *first_state), theta)
+    ready = _prepared(plant, controller, scenario, changes, sensor_errors or {}, first, runs)
     axis = plant.stroke_output
-    start, end = motion.p[0, axis], motion.p[-1, axis]
+    start, end = ready.p_ref[0, axis], ready.p_ref[-1, axis]
     scale = 1 / (end - start) if end != start else 0
     known = {"alive": 1.0, "start": start, "scale": scale, "reached": -1.0, "touched": -1.0, "culprit": -1.0}
     sizes = _digest_sizes(plant)
-    kept = np.tile(np.repeat([known.get(name, 0.0) for name in sizes], [*sizes.values()]), (runs, 1))
-    ff = controller.feedforward
-    table = feedforward_table(ff.z_grid, ff.v0)
-    groups = -(-runs // LANES)
-    rows = {"theta": theta, "states": states, "sigma": scenario.noise * noise, "digests": kept}
-    lanes = {name: in_lanes(array, groups) for name, array in rows.items()}
-    streams = keys(scenario.seed, first + np.minimum(np.arange(groups * LANES), runs - 1))
+    kept = np.repeat([known.get(name, 0.0) for name in sizes], [*sizes.values()])
+    lanes = ready.lanes | {"digests": in_lanes(np.tile(kept, (runs, 1)), ready.groups)}
+    groups = ready.groups
     workers = workers or os.cpu_count() or 1
     step = max(1, min(16, groups // (4 * workers)))  # groups in one call, for the progress bar
 
@@ -132,9 +128,9 @@ def simulate_many(
             lib,
             slice(k, min(k + step, groups)),
             substeps=scenario.substeps,
-            table=table,
-            given=given,
-            keys=streams.reshape(groups, LANES),
+            table=ready.table,
+            given=ready.given,
+            keys=ready.keys,
             **lanes,
         )
 
@@ -147,7 +143,109 @@ def simulate_many(
             pool.shutdown(cancel_futures=True)
             raise
     ends = lanes["digests"].swapaxes(1, 2).reshape(groups * LANES, -1)[:runs]
-    return _batch(ends, len(t), controller.sample_time, sizes)
+    return _batch(ends, len(ready.t), controller.sample_time, sizes)
+
+
+class _Ready(NamedTuple):
+    """What flies many machines: those of LANES in a group, a group in the first axis."""
+
+    t: FloatArray
+    p_ref: FloatArray
+    given: FloatArray
+    table: FloatArray  # of v0(z)
+    groups: int
+    lanes: dict[str, FloatArray]
+    keys: NDArray[np.uint64]
+
+
+def _prepared(
+    plant: Plant,
+    controller: Controller,
+    scenario: Scenario,
+    changes: Mapping[str, FloatArray],
+    sensor_errors: Mapping[str, FloatArray],
+    first: int,
+    runs: int,
+) -> _Ready:
+    setup = setup_of(plant, controller, scenario)
+    values = machine.numbers(plant, controller, scenario.substeps, scenario.sensor_errors)
+    theta = _thetas(plant, values, changes, sensor_errors, runs)
+    t, motion, given = sampled(plant, controller, scenario, setup)
+    first_state = beginning(plant, controller, scenario, given[0])
+    states, noise = _mapped(_starts(plant, controller, setup, values, *first_state), theta)
+    ff = controller.feedforward
+    groups = -(-runs // LANES)
+    rows = {"theta": theta, "states": states, "sigma": scenario.noise * noise}
+    lanes = {name: in_lanes(array, groups) for name, array in rows.items()}
+    streams = keys(scenario.seed, first + np.minimum(np.arange(groups * LANES), runs - 1))
+    table = feedforward_table(ff.z_grid, ff.v0)
+    return _Ready(t, motion.p, given, table, groups, lanes, streams.reshape(groups, LANES))
+
+
+def recorded_run(
+    plant: Plant,
+    controller: Controller,
+    scenario: Scenario,
+    changes: Mapping[str, FloatArray],
+    index: int,
+    *,
+    sensor_errors: Mapping[str, FloatArray] | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> Trajectory | None:
+    """One run of `simulate_many` with its time series, the same to the bit; None without a C compiler.
+
+    `simulate` computes one machine by itself, whose last digits differ; sensors in steps, and machines that barely fall
+    or barely do not, make more of them. Here the run's whole group is flown again, with everything recorded.
+
+    changes, sensor_errors : those of all runs, of which `simulate_many` had blocks that begin with a multiple of LANES
+    """
+    begin = index // LANES * LANES
+    group = {
+        kind: {name: column[begin : begin + LANES] for name, column in columns.items()}
+        for kind, columns in (("changes", changes), ("errors", sensor_errors or {}))
+    }
+    own_plant, own_scenario = replayed(plant, scenario, changes, index, sensor_errors=sensor_errors)
+    scenario = _sensed(scenario, sensor_errors)
+    setup = setup_of(plant, controller, scenario)
+    shape = shape_of(plant, controller, setup)
+    compiled = compiled_shape(shape, LANES, _recorder(shape))
+    if compiled is None:
+        return None
+    runs = _count(plant, group["changes"], group["errors"])
+    ready = _prepared(plant, controller, scenario, group["changes"], group["errors"], begin, runs)
+    width = sum(machine.layout(plant, controller, setup).row.values())
+    rows = np.empty((len(ready.t), width))
+    stream = ready.keys.copy()
+    kept = np.zeros((1, 2 * width, LANES))
+    for k in range(0, len(rows), 2):  # the noise of two samples is drawn at once
+        part = ready.given[k : k + 2]
+        run_many(
+            compiled[0],
+            slice(0, 1),
+            substeps=scenario.substeps,
+            table=ready.table,
+            given=part,
+            keys=stream,
+            digests=kept,
+            **ready.lanes,
+        )
+        rows[k : k + len(part)] = kept[0, :, index - begin].reshape(2, width)[2 - len(part) :]
+        stream += np.uint64(len(plant.outputs) * GAMMA % 2**64)
+        if progress is not None and k % 1000 == 0:
+            progress(k / len(rows))
+    asked = (ready.t, ready.given)
+    return recorded(own_plant, controller, own_scenario, setup, asked, rows, "compiled")
+
+
+@lru_cache(maxsize=16)
+def _recorder(shape: Any) -> ca.Function:
+    """A digest that keeps the last two rows as they are."""
+    sizes = machine.layout(shape.plant, shape.controller, shape.setup)
+    width, given = sum(sizes.row.values()), sum(sizes.given.values())
+    kept, row = ca.SX.sym("kept", 2 * width), ca.SX.sym("row", width)
+    theta = ca.SX.sym("theta", len(machine.flat(machine.numbers(shape.plant, shape.controller, 1))))
+    arguments = [kept, row, ca.SX.sym("given", given), theta]
+    return ca.Function("digest", arguments, [ca.vertcat(kept[width:], row)])
 
 
 def replayed(

@@ -254,11 +254,12 @@ def _findings_table(found: Campaign, published: Published | None) -> Table:
     bounds = any(math.isfinite(f.published) for f in listed)
     heads = [*(f"{p} %" for p in PERCENTILES), "largest", *(["published", "kept [%]"] if bounds else [])]
     table = _table("Figures of merit: percentiles of the completed runs", "figure", *heads)
+    table.columns[0].no_wrap = True
     for f in listed:
         values = in_unit(1.0, f.unit) * f.values[np.isfinite(f.values)]
         if not values.size:
             continue
-        cells = [number(float(v)) for v in (*np.percentile(values, PERCENTILES), values.max())]
+        cells = [number(float(v), 3) for v in (*np.percentile(values, PERCENTILES), values.max())]
         if bounds and math.isfinite(f.published):
             bound = f"{in_unit(f.published, f.unit):.6g}"
             at_most = f.relation == "at most"

@@ -321,6 +321,35 @@ def simulate(
             raise
         verdict = Verdict("interrupted", float(t[done - 1]))
     table = np.concatenate(parts) if len(parts) > 1 else parts[0]
+    return _labelled(plant, controller, scenario, setup, (t, given), table, verdict, kind)
+
+
+def recorded(
+    plant: Plant,
+    controller: Controller,
+    scenario: Scenario,
+    setup: Setup,
+    asked: tuple[FloatArray, FloatArray],
+    rows: FloatArray,
+    kind: str,
+) -> Trajectory:
+    """The trajectory of a run whose rows, one for each sample, are there already; `asked` as `sampled` gives them."""
+    rows, verdict = _judged(plant, controller, setup, rows, asked[0])
+    return _labelled(plant, controller, scenario, setup, asked, rows, verdict, kind)
+
+
+def _labelled(
+    plant: Plant,
+    controller: Controller,
+    scenario: Scenario,
+    setup: Setup,
+    asked: tuple[FloatArray, FloatArray],
+    table: FloatArray,
+    verdict: Verdict | None,
+    kind: str,
+) -> Trajectory:
+    """Rows up to the verdict as labelled series."""
+    (t, given), done = asked, len(table)
     for array in (table, given, t):
         array.flags.writeable = False  # the trajectory's series are views of them
     sizes = machine.layout(plant, controller, setup).row
