@@ -18,6 +18,8 @@ if TYPE_CHECKING:  # the contents page, as type checkers and readers see it
     from malta.campaign import Campaign as Campaign
     from malta.campaign import Plan as Plan
     from malta.campaign import campaign as campaign
+    from malta.chain import Robustness as Robustness
+    from malta.chain import robustness as robustness
     from malta.claims import ledger as ledger
     from malta.controller import Controller as Controller
     from malta.data import in_unit as in_unit
@@ -38,6 +40,8 @@ if TYPE_CHECKING:  # the contents page, as type checkers and readers see it
     from malta.plant import Plant as Plant
     from malta.plant import Signal as Signal
     from malta.plant import trim as trim
+    from malta.robust import Margin as Margin
+    from malta.robust import robust_margin as robust_margin
     from malta.simulate import Fault as Fault
     from malta.simulate import Scenario as Scenario
     from malta.simulate import Trajectory as Trajectory
@@ -52,11 +56,15 @@ if TYPE_CHECKING:  # the contents page, as type checkers and readers see it
     from malta.synthesize import lqi as lqi
     from malta.synthesize import lqr as lqr
     from malta.synthesize import synthesize as synthesize
+    from malta.uncertain import Compensator as Compensator
+    from malta.uncertain import UncertainSystem as UncertainSystem
+    from malta.uncertain import uncertain as uncertain
     from malta.verify import Margins as Margins
     from malta.verify import verify as verify
 
 _NAMES = {  # the same, for the first use of each name
     "campaign": ("Campaign", "Plan", "campaign"),
+    "chain": ("Robustness", "robustness"),
     "claims": ("ledger",),
     "controller": ("Controller",),
     "data": ("in_unit", "plant_of", "published", "read"),
@@ -66,9 +74,11 @@ _NAMES = {  # the same, for the first use of each name
     "linearize": ("LinearModel", "linearize"),
     "many": ("Batch", "replayed", "simulate_many"),
     "plant": ("OperatingPoint", "Plant", "Signal", "trim"),
+    "robust": ("Margin", "robust_margin"),
     "simulate": ("Fault", "Scenario", "Trajectory", "simulate", "stroke_figures"),
     "spec": ("Spec", "Weights", "read_design"),
     "synthesize": ("calibrate", "kalman", "lqg", "lqi", "lqr", "synthesize"),
+    "uncertain": ("Compensator", "UncertainSystem", "uncertain"),
     "verify": ("Margins", "verify"),
 }
 _MODULES = ("gains", "plants", "references", "report")

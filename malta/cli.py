@@ -19,12 +19,14 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from malta.campaign import Campaign
+    from malta.chain import Robustness
     from malta.controller import Controller
     from malta.experiments import Experiment
     from malta.plan import Sampler
     from malta.plant import Parameters
+    from malta.robust import Margin
     from malta.simulate import EngineChoice, StrokeFigures, Trajectory
-    from malta.verify import Margins
+    from malta.verify import CurrentLoops, Margins
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -142,10 +144,29 @@ def design(
 
 
 @app.command()
-def verify(gains: GainFile, change: Changes = None, as_json: AsJson = False) -> None:
+def verify(
+    gains: GainFile,
+    change: Changes = None,
+    uncertain: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--uncertain",
+            metavar="SHARE|NAME=SHARE",
+            help="How far parameters vary at margin 1, either way: 20% (those of the gain file), m=10%, ... "
+            "[the gain file's]",
+        ),
+    ] = None,
+    current_loops: Annotated[
+        str, typer.Option(help="Of the machine's loop: lag (first order), or pi (sampled PI loops).")
+    ] = "lag",
+    out: Annotated[Path | None, typer.Option(help="Folder for the figure (.png).")] = None,
+    as_json: AsJson = False,
+) -> None:
     """Verify a gain file on the machine, stage by stage.
 
-    Poles, bandwidths by definition, peak sensitivities with their ISO 14839-3 zones.
+    Poles, bandwidths by definition, peak sensitivities with their ISO 14839-3 zones; real parametric margins with
+    their proof, from full state feedback to the sampled loop, and over the travel; disk and delay margins, gang of
+    four, tolerance of each parameter.
 
     The machine is the one in the file, with the changes given by --set (m, K_A, K_B, l_B, F_c, T_d, ... as far as
     they shape the linear loop; windings and DC link do not).
@@ -154,7 +175,8 @@ def verify(gains: GainFile, change: Changes = None, as_json: AsJson = False) -> 
     Example:  malta verify design/gains/calibrated.json --set m=0.56
     """
     from malta import gains as gain_files
-    from malta.data import plant_of
+    from malta.chain import robustness
+    from malta.data import plant_of, units_of
     from malta.linearize import linearize
     from malta.verify import require_stable
     from malta.verify import verify as verified
@@ -164,16 +186,28 @@ def verify(gains: GainFile, change: Changes = None, as_json: AsJson = False) -> 
     names = [s.name for s in plant.design_states]
     point = plant.at(**dict(zip(names, controller.operating_point[0].tolist(), strict=True)))
     model = linearize(plant, point)
+    published = _published(plant.name)
+    box = _box(gains, uncertain, units_of(plant.parameters), published, option="--uncertain")
     try:
         margins = verified(model, controller)
+        with _bar("margins", quiet=as_json) as progress:
+            found = robustness(
+                plant, controller, box, current_loops=cast("CurrentLoops", current_loops), progress=progress
+            )
     except CheckError as error:
         raise CheckError(f"{gains}: {error}") from error
+    files = []
+    if out is not None:
+        from malta import report
+
+        files = [report.robustness(found, controller.name, box, out / f"{controller.name}_margins.png")]
     if as_json:
-        _print_json({"gains": str(gains), "design": controller.name} | _margins(margins))
+        described = {"gains": str(gains), "design": controller.name, "files": [str(file) for file in files]}
+        _print_json(described | _margins(margins) | {"robust": _robustness(found, box)})
     else:
         from malta import report
 
-        console, published = _console(), _published(plant.name)
+        console = _console()
         console.print(
             f"{gains}: {controller.name}, {plant.name}, preset {controller.parameters.preset}",
             *(change or ()),
@@ -183,8 +217,16 @@ def verify(gains: GainFile, change: Changes = None, as_json: AsJson = False) -> 
             report.loop_poles_table(margins),
             report.bandwidth_table(margins, published),
             report.sensitivity_table(margins),
+            "Uncertainty: " + "  ".join(f"{name} +-{100 * share:g} %" for name, share in box.items()) + "\n",
+            report.chain_table(found),
+            report.disk_table(found, controller.sample_time),
+            report.gang_table(found),
+            report.tolerance_table(found, box),
+            report.places_table(found, controller.sample_time),
         ):
             console.print(table)
+        for file in files:
+            console.print(f"wrote {file}", soft_wrap=True)
     require_stable(margins, str(gains))
 
 
@@ -585,22 +627,26 @@ def _assigned(option: str, given: list[str] | None, units: Mapping[str, str]) ->
 
 
 def _box(
-    gains: Path, spread: list[str] | None, units: Mapping[str, str], published: Mapping[str, Any] | None
+    gains: Path,
+    spread: list[str] | None,
+    units: Mapping[str, str],
+    published: Mapping[str, Any] | None,
+    option: str = "--spread",
 ) -> dict[str, float]:
-    """The shares of `--spread`: one for all uncertain parameters, others by name, or the gain file's own."""
+    """The shares of an option: one for all uncertain parameters, others by name, or the gain file's own."""
     from malta.plan import box_of
 
     named = [text for text in spread or () if "=" in text]
     general = [text for text in spread or () if "=" not in text]
     if len(general) > 1:
-        raise InputError("--spread", "", " and ".join(general), "one share for all, others as NAME=SHARE")
+        raise InputError(option, "", " and ".join(general), "one share for all, others as NAME=SHARE")
     box: dict[str, float] = {}
     if general or not named:
         box = box_of(gains, published)
     if general:
-        share = _assigned("--spread", [f"all={general[0]}"], {"all": "1"})["all"]
+        share = _assigned(option, [f"all={general[0]}"], {"all": "1"})["all"]
         box = dict.fromkeys(box, share)
-    return box | _assigned("--spread", named, dict.fromkeys(units, "1"))
+    return box | _assigned(option, named, dict.fromkeys(units, "1"))
 
 
 def _replayed(
@@ -740,6 +786,50 @@ def _margins(margins: Margins) -> dict[str, Any]:
         "poles": margins.poles.pairs(),
         "bandwidth": dict(margins.bandwidth),
         "peak_sensitivity": {stage.name: dict(stage.peak_sensitivity) for stage in margins.stages},
+    }
+
+
+def _robustness(found: Robustness, box: Mapping[str, float]) -> dict[str, Any]:
+    def margin(m: Margin) -> dict[str, Any]:
+        return {
+            "lower": m.lower,
+            "upper": None if m.exhausted else m.upper,
+            "frequency": m.frequency,
+            "witness": None if m.witness is None else dict(m.witness),
+            "sensitivity": dict(m.sensitivity),
+            "cells": sum(proof.cells for proof in m.certificate),
+            "seconds": m.seconds,
+            "reason": m.reason,
+        }
+
+    return {
+        "uncertainty": dict(box),
+        "chain": [
+            {"stage": link.name, "peak_sensitivity": link.peak, "at": link.broken_at} | margin(link.margin)
+            for link in found.chain
+        ],
+        "travel": margin(found.travel),
+        "disks": [
+            {
+                "channels": d.channels,
+                "size": d.size,
+                "gain": d.gain,
+                "phase": d.phase,
+                "frequency": d.frequency,
+            }
+            for d in found.disks
+        ],
+        "delay": dict(found.delay),
+        "gang_of_four": {
+            name: dict(zip(("S", "T", "SP", "FS"), v, strict=True)) for name, v in found.gang.items()
+        },
+        "tolerance": {k: {"down": margin(a), "up": margin(b)} for k, (a, b) in found.tolerance.items()},
+        "payload": None if found.payload is None else margin(found.payload),
+        "places": [
+            {"position": p.position, "peak_sensitivity": p.peak, "disk": p.disk, "delay": p.delay}
+            | margin(p.margin)
+            for p in found.places
+        ],
     }
 
 

@@ -14,7 +14,8 @@
     current_loop     Kp [V/A], Ki [V/(A s)], sample_time [s]
     limits           current [A], voltage [V], force [N]: m each
     verification     poles {open_loop, regulator, filter, closed_loop} as rows [re, im] in rad/s, bandwidth [rad/s],
-                     peak_sensitivity, robust {uncertainty, lower, upper, witness} or null; null bounds are not proven
+                     peak_sensitivity, robust {uncertainty, lower, upper, witness [SI]} or null: the margin over
+                     the travel in multiples of the uncertainty; lower null: not proven, upper null: no witness
     provenance       versions of malta, python, numpy, scipy, control, casadi
     sha256           of the rest as compact JSON with sorted keys
 
@@ -225,15 +226,7 @@ def document(controller: Controller, margins: Margins) -> dict[str, Any]:
             "poles": margins.poles.pairs(),
             "bandwidth": dict(margins.bandwidth),
             "peak_sensitivity": dict(margins.peak_sensitivity),
-            # The box that the design names; null: no bound is proven, no witness known.
-            "robust": {
-                "uncertainty": dict(margins.uncertainty),
-                "lower": None,
-                "upper": None,
-                "witness": None,
-            }
-            if margins.uncertainty
-            else None,
+            "robust": _robust(margins),
         },
         "provenance": {"malta": version("malta"), "python": platform.python_version()}
         | {name: version(name) for name in ("numpy", "scipy", "control", "casadi")},
@@ -241,6 +234,19 @@ def document(controller: Controller, margins: Margins) -> dict[str, Any]:
     plain: dict[str, Any] = _plain(tables)
     plain["sha256"] = content_sha256(plain)
     return plain
+
+
+def _robust(margins: Margins) -> dict[str, Any] | None:
+    """The bounds over the travel: lower is null where nothing is proven, upper where no witness is known."""
+    margin = margins.robust
+    if margin is None:
+        return None
+    return {
+        "uncertainty": dict(margins.uncertainty),
+        "lower": margin.lower,
+        "upper": None if margin.exhausted else margin.upper,
+        "witness": None if margin.witness is None else dict(margin.witness),
+    }
 
 
 def write(controller: Controller, margins: Margins, *paths: str | Path) -> None:

@@ -24,6 +24,7 @@ from malta.figures import stroke_figure as stroke_figure
 from malta.figures import worst_figure as worst_figure
 from malta.figures import yield_figure as yield_figure
 from malta.linearize import LinearModel
+from malta.margin_figures import chain_figure as chain_figure
 from malta.simulate import StrokeFigures, Trajectory
 from malta.spec import Spec
 from malta.synthesize import continuous_poles
@@ -31,9 +32,11 @@ from malta.verify import BANDWIDTHS, Margins, zone
 
 if TYPE_CHECKING:
     from malta.campaign import Campaign
+    from malta.chain import Robustness
     from malta.claims import Ledger
     from malta.experiments import Experiment, Merit
     from malta.plant import ComplexArray, FloatArray
+    from malta.robust import Margin
 
 
 # --- pages ---
@@ -96,6 +99,117 @@ def sensitivity_table(margins: Margins) -> Table:
     return table
 
 
+def chain_table(found: Robustness) -> Table:
+    """Parametric margin and peak sensitivity, stage by stage."""
+    table = _table(
+        "Where the margin goes: multiples of the uncertainty that no parameter set may exceed",
+        "stage", "proven", "lost at", "rad/s", "first to give", "peak |S|", "of",
+    )  # fmt: skip
+    for link in found.chain:
+        peak = "unstable" if math.isnan(link.peak) else f"{link.peak:.2f}"
+        if link.broken_at == "sensors" and not math.isnan(link.peak):
+            peak += f" {zone(link.peak)}"
+        _row(table, link.name, *_margin_cells(link.margin), _blame(link.margin), peak, link.broken_at)
+    travel = found.travel
+    _row(table, "all of the travel", *_margin_cells(travel), _blame(travel), "", "")
+    return table
+
+
+def _margin_cells(margin: Margin) -> tuple[str, str, str]:
+    low = "nothing" if margin.lower is None else f"{100 * margin.lower:.2f} %"
+    high = "not found" if margin.exhausted else f"{100 * margin.upper:.2f} %"
+    return low, high, "" if margin.frequency is None else f"{margin.frequency:.4g}"
+
+
+def _blame(margin: Margin) -> str:
+    """The parameters that pull hardest, and which way they went."""
+    if margin.witness is None:
+        return margin.reason
+    largest = sorted(margin.sensitivity, key=lambda name: -margin.sensitivity[name])
+    return " ".join(
+        f"{name}{'+' if margin.moved[name] > 0 else '-'}"
+        for name in largest
+        if margin.sensitivity[name] > 0.02
+    )
+
+
+def disk_table(found: Robustness, Ts: float) -> Table:
+    """Disk margins of the machine's loop, and the delay that each sensor's loop stands."""
+    table = _table(
+        "Margins of the sampled loop without parameters", "factor in", "disk", "gain", "phase [deg]", "rad/s"
+    )
+    for disk in found.disks:
+        _row(
+            table,
+            disk.channels,
+            f"{disk.size:.3f}",
+            f"{1 / disk.gain:.2f} .. {disk.gain:.2f}",
+            f"+-{math.degrees(disk.phase):.1f}",
+            f"{disk.frequency:.4g}",
+        )
+    for name, delay in found.delay.items():
+        _row(table, f"delay at {name} alone", f"{delay * 1e6:.0f} us", f"{delay / Ts:.1f} samples", "", "")
+    return table
+
+
+def gang_table(found: Robustness) -> Table:
+    """Gang of four: the largest gain of each closed-loop response, by sensor."""
+    table = _table(
+        "Gang of four, largest over frequency",
+        "sensor",
+        "|S|",
+        "|T|",
+        "from force |SP| [um/N]",
+        "to force |FS| [N/um]",
+    )
+    for name, (S, T, PS, FS) in found.gang.items():
+        _row(table, name, f"{S:.2f}", f"{T:.2f}", f"{PS * 1e6:.1f}", f"{FS * 1e-6:.3f}")
+    return table
+
+
+def tolerance_table(found: Robustness, uncertainty: Mapping[str, float]) -> Table:
+    """What each parameter may do alone, proven, and its share in the margin of all."""
+    table = _table("One at a time, proven", "parameter", "down to", "up to", "share in the margin")
+    shares = found.chain[-1].margin.sensitivity
+    for name, (down, up) in found.tolerance.items():
+        cells = []
+        for margin, sign in ((down, -1), (up, 1)):
+            t = margin.lower
+            change = "nothing proven" if t is None else f"{100 * sign * t * uncertainty[name]:+.1f} %"
+            cells.append(f"{change} and further" if t is not None and margin.exhausted else change)
+        _row(table, name, *cells, f"{100 * shares.get(name, 0):.0f} %")
+    if found.payload is not None:
+        t = found.payload.lower
+        more = " and more" if found.payload.exhausted else ""
+        _row(table, "payload", "", "nothing proven" if t is None else f"{t:.3g} kg{more}", "")
+    return table
+
+
+def places_table(found: Robustness, Ts: float) -> Table:
+    """The machine's loop along the travel: even in the position."""
+    table = _table(
+        "Along the travel, either way",
+        "at [mm]",
+        "proven",
+        "lost at",
+        "rad/s",
+        "peak |S|",
+        "disk, all",
+        "delay",
+    )
+    for place in found.places:
+        peak = "unstable" if math.isnan(place.peak) else f"{place.peak:.2f} {zone(place.peak)}"
+        _row(
+            table,
+            f"{place.position * 1e3:.1f}",
+            *_margin_cells(place.margin),
+            peak,
+            f"{place.disk:.3f}",
+            f"{place.delay * 1e6:.0f} us, {place.delay / Ts:.1f} samples",
+        )
+    return table
+
+
 def stroke_table(figures: StrokeFigures, published: Published | None) -> Table:
     """The stroke beside the published figures."""
     rows = [
@@ -127,8 +241,14 @@ def design_page(
         loop_poles_table(margins, continuous_poles(model, spec.weights)),
         bandwidth_table(margins, published),
         sensitivity_table(margins),
+        *([] if margins.robust is None else [_travel_text(margins)]),
         stroke_table(figures, published),
     )
+
+
+def _travel_text(margins: Margins) -> Text:
+    box_text = " ".join(f"{name} +-{100 * share:g} %" for name, share in margins.uncertainty.items())
+    return Text(f"Parametric margin over the whole travel ({box_text}): {margins.robust}\n")
 
 
 def experiment_table(e: Experiment, published: Published | None = None) -> Group:
@@ -374,6 +494,11 @@ def experiment(e: Experiment, path: str | Path | None = None, published: Publish
 
 def _default(run: Trajectory, name: str) -> Path:
     return Path("build") / f"{run.controller.name}_{name}.png"
+
+
+def robustness(found: Robustness, name: str, uncertainty: Mapping[str, float], path: str | Path) -> Path:
+    """Draw where the margin of a design goes."""
+    return save(chain_figure(found, name, uncertainty), Path(path))
 
 
 def campaign(found: Campaign, folder: str | Path, published: Published | None = None) -> list[Path]:

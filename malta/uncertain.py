@@ -7,9 +7,9 @@ u = H F y                                 a control law F, and what stands betwe
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -20,7 +20,7 @@ from malta.plant import Plant, readonly, symbolic
 from malta.riccati import delay_inputs, sample
 
 if TYPE_CHECKING:
-    from malta.plant import FloatArray
+    from malta.plant import ComplexArray, FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,13 +67,13 @@ class Compensator:
 
 
 def uncertain(
-    plant: Plant, names: Sequence[str], *, states: bool = False, **positions: float
+    plant: Plant, names: Sequence[str], *, at: Mapping[str, float] | None = None, states: bool = False
 ) -> UncertainSystem:
     """The design model of a plant at a position along its stroke, in parameters by name, without preload.
 
     The stroke itself may be one of the names (`z` for MALTA): its nominal value is the position.
     Inputs are commanded forces: a controller divides by the force constants it knows, the plant multiplies by its own.
-    states: the states follow the outputs in y.
+    at: the position, SI; states: the states follow the outputs in y.
 
     Raises InputError for an unknown name.
     """
@@ -84,7 +84,7 @@ def uncertain(
     for name in names:
         if name not in known:
             raise InputError("robust_margin", name, "an unknown parameter", "one of " + " ".join(known))
-    x0 = plant.at(**positions).x
+    x0 = plant.at(**(at or {})).x
     symbols = {name: ca.SX.sym(name) for name in names}
     p = ca.vertcat(*symbols.values())
     own = {name: symbol for name, symbol in symbols.items() if name != plant.stroke}
@@ -92,9 +92,9 @@ def uncertain(
     machine: Plant = plant.variant(symbolic(par, own))
     x, u = ca.SX.sym("x", len(plant.states)), ca.SX.sym("u", len(plant.inputs))
     rate, y = machine.f(x, u, ca.SX.zeros(len(plant.disturbances))), machine.h(x, u)
-    at = ca.SX(x0)
+    point = ca.SX(x0)
     if plant.stroke in symbols:
-        at[plant.stroke_state] = symbols[plant.stroke]
+        point[plant.stroke_state] = symbols[plant.stroke]
     keep = list(plant.controlled)
     scale = ca.diag(ca.vertcat(*machine.actuator.force_constant) / ca.DM(list(plant.actuator.force_constant)))
     jacobians = [
@@ -102,21 +102,20 @@ def uncertain(
         ca.jacobian(rate, u)[keep, :] @ scale,
         ca.jacobian(y, x)[:, keep],
     ]
-    A, B, C = ca.substitute(jacobians, [x, u], [at, ca.SX.zeros(len(plant.inputs))])
+    A, B, C = ca.substitute(jacobians, [x, u], [point, ca.SX.zeros(len(plant.inputs))])
     if states:
         C = ca.vertcat(C, ca.SX.eye(len(keep)))
     nominal = [x0[plant.stroke_state] if name == plant.stroke else getattr(par, name) for name in names]
-    bounds = {f.name: f.metadata.get("above") for f in par.__dataclass_fields__.values()}
-    limits = tuple(
-        (-math.inf, math.inf) if name == plant.stroke else (_or(bounds[name], -math.inf), math.inf)
-        for name in names
-    )
+    bounds = {f.name: _lowest(f.metadata) for f in fields(par)}
+    limits = tuple((bounds.get(name, -math.inf), math.inf) for name in names)
     matrices = ca.Function("matrices", [p], [ca.densify(M) for M in (A, B, C)])
     return UncertainSystem(tuple(names), readonly(nominal), matrices, True, limits)
 
 
-def _or(value: float | None, default: float) -> float:
-    return default if value is None else float(value)
+def _lowest(declared: Mapping[str, Any]) -> float:
+    """What a parameter is above, or at least."""
+    found = [declared[key] for key in ("above", "at_least") if declared.get(key) is not None]
+    return float(max(found)) if found else -math.inf
 
 
 def sampled_law(
@@ -181,31 +180,58 @@ def _with_current_control(c: Compensator, loop: CurrentLoop, R: float, B2: Float
     return replace(c, A=full, B=driven, C=out, D=c.D * D / R)
 
 
+class _Sides(NamedTuple):
+    """Both sides of the loop as the eigenvalues and responses want them: x' = A x + B u, or of sampled (x+ - x) / T."""
+
+    A: FloatArray  # plant, lags, stored inputs
+    B: FloatArray
+    C: FloatArray
+    F_A: FloatArray  # compensator
+    F_B: FloatArray
+
+
+def _sides(c: Compensator, A: FloatArray, B: FloatArray, C: FloatArray) -> _Sides:
+    """Differences, as poles of slow modes stand close to 1, where A of x+ = A x itself has lost their digits."""
+    m = B.shape[1]
+    if c.lag is not None:
+        A = np.block([[A, B], [np.zeros((m, len(A))), -c.lag * np.eye(m)]])
+        B = np.vstack([np.zeros_like(B), c.lag * np.eye(m)])
+    F_A, F_B = c.A, c.B
+    if c.sample_time is not None:
+        n, T = len(A), c.sample_time
+        _, Phi = sample(A, np.eye(n), T)  # (e^AT - 1) / T = A Phi / T
+        A, B = delay_inputs(A @ Phi / T, Phi @ B / T, c.delay)
+        stored = np.arange(n, len(A))  # of these, delay_inputs gives the next values
+        A[n:], B[n:] = A[n:] / T, B[n:] / T
+        A[stored, stored] -= 1 / T
+        F_A, F_B = (c.A - np.eye(len(c.A))) / T, c.B / T
+    return _Sides(A, B, np.hstack([C, np.zeros((len(C), len(A) - C.shape[1]))]), F_A, F_B)
+
+
 def closed_loop(system: UncertainSystem, c: Compensator, p: FloatArray) -> FloatArray:
     """State matrices of the closed loop at rows of parameters, exactly; of sampled loops (A - 1) / T.
 
-    Poles of slow modes stand close to 1, where A itself has lost their digits.
     States: plant, lags, stored inputs, compensator.
     """
     matrices = []
-    for A, B, C in zip(*system.at(p), strict=True):
-        m = B.shape[1]
-        F = c.A
-        if c.lag is not None:
-            A = np.block([[A, B], [np.zeros((m, len(A))), -c.lag * np.eye(m)]])
-            B = np.vstack([np.zeros_like(B), c.lag * np.eye(m)])
-        if c.sample_time is not None:
-            n, T = len(A), c.sample_time
-            _, Phi = sample(A, np.eye(n), T)  # (e^AT - 1) / T = A Phi / T
-            A, B = delay_inputs(A @ Phi / T, Phi @ B / T, c.delay)
-            stored = np.arange(n, len(A))  # of these, delay_inputs gives the next values
-            A[n:], B[n:] = A[n:] / T, B[n:] / T
-            A[stored, stored] -= 1 / T
-            F = (c.A - np.eye(len(c.A))) / T
-        C = np.hstack([C, np.zeros((len(C), len(A) - C.shape[1]))])
-        driven = c.B if c.sample_time is None else c.B / c.sample_time
-        matrices.append(np.block([[A + B @ c.D @ C, B @ c.C], [driven @ C, F]]))
+    for plant in zip(*system.at(p), strict=True):
+        s = _sides(c, *plant)
+        matrices.append(np.block([[s.A + s.B @ c.D @ s.C, s.B @ c.C], [s.F_B @ s.C, s.F_A]]))
     return np.array(matrices)
+
+
+def responses(
+    system: UncertainSystem, c: Compensator, p: FloatArray, w: FloatArray
+) -> tuple[ComplexArray, ComplexArray]:
+    """P H and F at one row of parameters and frequencies w (rad/s): k x outputs x inputs, k x inputs x outputs."""
+    s = _sides(c, *(M[0] for M in system.at(p)))
+    jw: ComplexArray = 1j * np.asarray(w, dtype=float)
+    if c.sample_time is not None:
+        jw = np.expm1(jw * c.sample_time) / c.sample_time
+    jw = jw[:, None, None]
+    P: ComplexArray = s.C @ np.linalg.solve(jw * np.eye(len(s.A)) - s.A, s.B)
+    F = c.C @ np.linalg.solve(jw * np.eye(len(s.F_A)) - s.F_A, s.F_B) + c.D
+    return P, np.asarray(F, dtype=complex)
 
 
 def instability(system: UncertainSystem, c: Compensator, p: FloatArray) -> FloatArray:

@@ -8,21 +8,25 @@ zero-order hold, exactly; F the control law from measurements to forces (v = F y
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 
 from malta.controller import Controller, LinearLaw, linear_law
 from malta.data import plant_of
-from malta.errors import CheckError
+from malta.errors import CheckError, InputError
 from malta.linearize import LinearModel, linearize
 from malta.plant import trim
 from malta.riccati import add_integrals, delay_inputs, eigenvalues, sample
+from malta.robust import Margin, robust_margin
+from malta.uncertain import Compensator, sampled_law, uncertain
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Mapping
 
-    from malta.plant import ComplexArray, FloatArray
+    from malta.plant import ComplexArray, FloatArray, Plant
+
+CurrentLoops = Literal["lag", "pi"]
 
 # ISO 14839-3: upper limits of the peak sensitivity
 ZONES = ((3.0, "A"), (4.0, "B"), (5.0, "C"), (np.inf, "D"))
@@ -64,6 +68,7 @@ class Margins:
     stages: tuple[Stage, ...]
     bandwidth: Mapping[str, float]  # rad/s, by definition
     uncertainty: Mapping[str, float]  # the relative box, by parameter, that the design is meant for
+    robust: Margin | None  # in multiples of it, anywhere in the travel; None without a box
 
     @property
     def stable(self) -> bool:
@@ -89,7 +94,7 @@ class Margins:
             lines.append(f"bandwidth, {BANDWIDTHS[key]}: {value:.1f} rad/s ({value / (2 * np.pi):.2f} Hz)")
         if self.uncertainty:
             box = "  ".join(f"{name} +-{share * 100:g} %" for name, share in self.uncertainty.items())
-            lines.append(f"uncertainty: {box}: no bound proven")
+            lines += [f"uncertainty: {box}", f"robust over the travel: {self.robust}"]
         return "\n".join(lines)
 
 
@@ -205,7 +210,8 @@ def verify(
     """Poles, peak sensitivities and bandwidths of a controller on a machine's linear model.
 
     Stages: the sampled loop as designed; with the current loops; the machine (`machine_loop`). An unstable loop is
-    reported, not raised; its sensitivities are NaN. `uncertainty` is kept for the record.
+    reported, not raised; its sensitivities are NaN. `uncertainty` is the relative half range of each parameter, which
+    the margin over the travel counts in.
     Raises CheckError where numbers overflow or no input holds the machine.
     """
     try:
@@ -232,7 +238,34 @@ def _verify(model: LinearModel, controller: Controller, uncertainty: Mapping[str
         closed_loop=_continuous(eigenvalues(machine.closed), controller.sample_time),
     )
     bandwidths = _bandwidths(model, controller, machine, stable=stages[-1].stable)
-    return Margins(poles, stages, bandwidths, uncertainty)
+    robust = travel_margin(model.plant, controller, uncertainty) if uncertainty else None
+    return Margins(poles, stages, bandwidths, uncertainty, robust)
+
+
+def machine_law(plant: Plant, controller: Controller, current_loops: CurrentLoops = "lag") -> Compensator:
+    """The control law with the machine's hold, delay and current loops: lags at their crossover, or the PI loops.
+
+    Raises InputError for other current loops.
+    """
+    if current_loops not in get_args(CurrentLoops):
+        raise InputError("verify", "current_loops", repr(current_loops), "lag or pi")
+    a = plant.actuator
+    delay = a.delay(controller.sample_time)
+    if current_loops == "lag":
+        return sampled_law(controller, delay, a.crossover)
+    return sampled_law(controller, delay, a.R / a.L, controller.current_loop, a.R)
+
+
+def travel_margin(
+    plant: Plant,
+    controller: Controller,
+    uncertainty: Mapping[str, float],
+    current_loops: CurrentLoops = "lag",
+) -> Margin:
+    """The margin of the machine's loop anywhere in its travel: the position is one more interval of the proof."""
+    over = {plant.stroke: (-plant.travel, plant.travel)}
+    system = uncertain(plant, [*uncertainty, plant.stroke], at={plant.stroke: 0.0})
+    return robust_margin(system, machine_law(plant, controller, current_loops), uncertainty, over)
 
 
 def require_stable(margins: Margins, name: str) -> None:
@@ -257,18 +290,21 @@ def _stage(name: str, stage: Loop, sensors: list[str]) -> Stage:
         S = stage.sensitivity(w)
         return np.column_stack([np.abs(np.einsum("kii->ki", S)), _singular_values(S)[:, 0]])
 
-    w = _grid(stage.sample_time)
-    around, values = np.tile(w, (len(sensors) + 1, 1)), sizes(w).T  # one row for each peak
-    for _ in range(3):  # zoom in on the largest values
+    peaks, at = largest(sizes, _grid(stage.sample_time))
+    return Stage(name, dict(zip([*sensors, "sigma_max"], peaks.tolist(), strict=True)), float(at[-1]), radius)
+
+
+def largest(sizes: Callable[[FloatArray], FloatArray], w: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Largest values along frequency and where: sizes(w) has a column for each; w is zoomed into three times."""
+    around, values = np.tile(w, (sizes(w[:1]).shape[1], 1)), sizes(w).T
+    for _ in range(3):
         k = values.argmax(axis=1)
         rows = np.arange(len(k))
         low, high = around[rows, np.maximum(k - 1, 0)], around[rows, np.minimum(k + 1, around.shape[1] - 1)]
         around = np.geomspace(low, high, 17, axis=1)
         found = sizes(around.ravel()).reshape(*around.shape, -1)
         values = found[rows, :, rows]
-    peaks = values.max(axis=1)
-    at = float(around[-1, values[-1].argmax()])
-    return Stage(name, dict(zip([*sensors, "sigma_max"], peaks.tolist(), strict=True)), at, radius)
+    return values.max(axis=1), around[rows, values.argmax(axis=1)]
 
 
 def _bandwidths(

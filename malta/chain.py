@@ -1,0 +1,351 @@
+"""Where the margin goes, from full state feedback to the machine's own loop; and the classical margins of that loop.
+
+    LQR -> LQI -> LQG -> LQGI -> with current loops -> sampled: the gain file's own gains, with hold and delay
+
+The first five are continuous, synthesized from the cost and the noise that the file names. Each has its parametric
+margin (robust.py) and its peak sensitivity: at the forces for state feedback, where the LQR promises at most 1, at the
+sensors for output feedback, as ISO 14839-3 measures it.
+Everything here is the design model at a position, without preload: what loads add is in verify's last stage.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from malta.controller import Controller
+from malta.data import plant_of, units_of
+from malta.errors import InputError
+from malta.linearize import linearize
+from malta.plant import Plant
+from malta.robust import Margin, robust_margin
+from malta.spec import Weights
+from malta.synthesize import kalman, lqi, lqr
+from malta.uncertain import Compensator, UncertainSystem, instability, responses, uncertain
+from malta.verify import CurrentLoops, largest, machine_law, travel_margin
+
+if TYPE_CHECKING:
+    from malta.plant import ComplexArray, FloatArray
+
+SAMPLED = "sampled"  # the last link: the machine's own loop
+PLACES = (0.0, 1 / 3, 2 / 3, 1.0)  # shares of the travel: everything is even in it
+
+
+@dataclass(frozen=True, eq=False)
+class Link:
+    """One stage of the chain."""
+
+    name: str
+    margin: Margin
+    peak: float  # largest |S_ii|; NaN where unstable
+    broken_at: Literal["forces", "sensors"]  # where S is taken
+
+
+@dataclass(frozen=True)
+class Disk:
+    """A loop stands any factor (1 + d/2) / (1 - d/2) with |d| < size in each channel that it names."""
+
+    channels: str
+    size: float
+    frequency: float  # rad/s
+
+    @property
+    def gain(self) -> float:
+        """The factor of gain that it stands, up or down; infinite from size 2 on."""
+        return (1 + self.size / 2) / (1 - self.size / 2) if self.size < 2 else float("inf")
+
+    @property
+    def phase(self) -> float:
+        """rad"""
+        return float(2 * np.arctan(self.size / 2))
+
+
+@dataclass(frozen=True)
+class Place:
+    """Figures at one position of the stroke."""
+
+    position: float  # m
+    margin: Margin
+    peak: float
+    disk: float  # all forces and sensors at once
+    delay: float  # s
+
+
+@dataclass(frozen=True, eq=False)
+class Robustness:
+    """What `robustness` found of a controller on a machine."""
+
+    chain: tuple[Link, ...]
+    travel: Margin  # the last link, anywhere in the travel, in one proof
+    disks: tuple[Disk, ...]
+    delay: Mapping[str, float]  # s, that each sensor's loop stands alone, the others closed
+    gang: Mapping[str, tuple[float, float, float, float]]  # by sensor: |S|, |T|, m/N, N/m: largest in its row
+    tolerance: Mapping[
+        str, tuple[Margin, Margin]
+    ]  # each parameter alone, down and up, in multiples of its range
+    payload: Margin | None  # in kg; None for a machine without a mass m
+    places: tuple[Place, ...]
+
+
+def compensators(
+    plant: Plant, controller: Controller, current_loops: CurrentLoops = "lag"
+) -> dict[str, tuple[Compensator, bool]]:
+    """The stages by name, and whether they feed back the states; `plant` is the machine, which has the delays."""
+    believed = plant_of(controller.parameters)
+    names = [s.name for s in believed.design_states]
+    model = linearize(
+        believed, believed.at(**dict(zip(names, controller.operating_point[0].tolist(), strict=True)))
+    )
+    one = np.ones_like
+    weights = Weights(
+        q=controller.cost.state,
+        q_base=one(controller.cost.state),
+        r=controller.cost.input,
+        r_base=one(controller.cost.input),
+        q_i=controller.cost.integral,
+        q_i_base=one(controller.cost.integral),
+        process_variance=controller.noise.process,
+        sensor_variance=controller.noise.sensor,
+    )
+    A, B, C, K, L = model.A, model.B, model.C, lqr(model, weights), kalman(model, weights)
+    n, p, m = len(A), len(C), B.shape[1]
+    half = n // 2
+    to_modes = np.linalg.inv(C[:, :half]) if p == half else np.eye(p)
+    back = np.linalg.inv(to_modes)
+    stages: dict[str, tuple[Compensator, bool]] = {
+        "LQR": (
+            Compensator(
+                np.zeros((0, 0)), np.zeros((0, p + n)), np.zeros((m, 0)), np.hstack([np.zeros((m, p)), -K])
+            ),
+            True,
+        )
+    }
+    integral = bool(controller.cost.integral.any())
+    K_i, Ki = lqi(model, weights) if integral else (K, np.zeros((m, p)))
+    if integral:  # e' = -y, in the coordinates of the modes
+        e = np.hstack([-to_modes, np.zeros((p, n))])
+        D = np.hstack([np.zeros((m, p)), -K_i])
+        stages["LQI"] = Compensator(np.zeros((p, p)), e, Ki @ back, D, integrals=p), True
+    stages["LQG"] = Compensator(A - B @ K - L @ C, L, -K, np.zeros((m, p))), False
+    last = stages["LQG"][0]
+    if integral:
+        observer = np.block([[A - B @ K_i - L @ C, B @ Ki @ back], [np.zeros((p, n + p))]])
+        last = Compensator(
+            observer, np.vstack([L, -to_modes]), np.hstack([-K_i, Ki @ back]), np.zeros((m, p)), integrals=p
+        )
+        stages["LQGI"] = last, False
+    a = plant.actuator
+    stages["+ current loops"] = (
+        Compensator(last.A, last.B, last.C, last.D, integrals=last.integrals, lag=a.crossover),
+        False,
+    )
+    stages[SAMPLED] = machine_law(plant, controller, current_loops), False
+    return stages
+
+
+def robustness(
+    plant: Plant,
+    controller: Controller,
+    uncertainty: Mapping[str, float],
+    *,
+    current_loops: CurrentLoops = "lag",
+    progress: Callable[[float], None] | None = None,
+) -> Robustness:
+    """Parametric and classical margins of a controller on a machine.
+
+    uncertainty : relative half range of each parameter, e.g. {"m": 0.2}; the margins count in it
+    current_loops : lag, as verify takes them, or pi, the sampled controllers of the gain file on the windings
+
+    Raises InputError for unknown parameters or none.
+    """
+    if not uncertainty:
+        raise InputError("robustness", "uncertainty", "no parameters", 'some, as {"m": 0.2}')
+    steps = iter(range(1, 100))
+    total = 8 + 2 * len(uncertainty) + len(PLACES)
+
+    def done() -> None:
+        if progress is not None:
+            progress(min(1.0, next(steps) / total))
+
+    names = list(uncertainty)
+    position = float(controller.operating_point[0][plant.stroke_state])
+    at = {plant.stroke: position}
+    links = []
+    stages = compensators(plant, controller, current_loops)
+    for name, (law, states) in stages.items():
+        system = uncertain(plant, names, states=states, at=at)
+        links.append(
+            Link(
+                name,
+                robust_margin(system, law, uncertainty),
+                _peak(system, law, states),
+                "forces" if states else "sensors",
+            )
+        )
+        done()
+    law = stages[SAMPLED][0]
+    system = uncertain(plant, names, at=at)
+    travel = travel_margin(plant, controller, uncertainty, current_loops)
+    done()
+    tolerance = {}
+    for name, share in uncertainty.items():
+        alone, nominal = uncertain(plant, [name], at=at), getattr(plant.parameters, name)
+        sides = []
+        for pair in ((nominal * (1 - share), nominal), (nominal, nominal * (1 + share))):
+            sides.append(robust_margin(alone, law, {name: pair}))
+            done()
+        tolerance[name] = (sides[0], sides[1])
+    payload = None
+    if "m" in units_of(plant.parameters):
+        m: float = getattr(plant.parameters, "m")  # noqa: B009  a machine's own field
+        payload = robust_margin(uncertain(plant, ["m"], at=at), law, {"m": (m, m + 1.0)})
+    done()
+    places = []
+    for share in PLACES:
+        here = uncertain(plant, names, at={plant.stroke: share * plant.travel})
+        P, F = _at_nominal(here, law, _frequencies(law))
+        places.append(
+            Place(
+                share * plant.travel,
+                robust_margin(here, law, uncertainty),
+                _peak(here, law, states=False),
+                disk_margin(here, law, "forces and sensors").size,
+                min(delay_margins(P @ F, _frequencies(law)).tolist()),
+            )
+        )
+        done()
+    stable = _stable(system, law)
+    w = _frequencies(law)
+    P, F = _at_nominal(system, law, w)
+    sensors = [s.name for s in plant.outputs]
+    delays = delay_margins(P @ F, w) if stable else np.full(len(sensors), np.nan)
+    disks = [disk_margin(system, law, kind) for kind in ("forces", "sensors", "forces and sensors")]
+    disks += [
+        replace(disk_margin(system, law, "sensors", only=k), channels=f"{name} alone")
+        for k, name in enumerate(sensors)
+    ]
+    return Robustness(
+        tuple(links),
+        travel,
+        tuple(disks) if stable else (),
+        dict(zip(sensors, delays.tolist(), strict=True)),
+        dict(zip(sensors, _gang(P, F), strict=True)) if stable else {},
+        tolerance,
+        payload,
+        tuple(places),
+    )
+
+
+def disk_margin(
+    system: UncertainSystem,
+    law: Compensator,
+    kind: Literal["forces", "sensors", "forces and sensors"],
+    only: int | None = None,
+) -> Disk:
+    """The symmetric disk margin of the nominal loop: all channels at once, each with its own factor, or one alone.
+
+    Factors (1 + d/2) / (1 - d/2) in the signals of Q, around which the loop is closed, leave it stable while
+    |d| < 1 / mu(M), M = (1 - Q)^-1 - 1/2 (Seiler, Packard, Gahinet 2020). mu is bounded above by a balanced D M D^-1,
+    so several channels stand at least this much; one channel is exact.
+    """
+    w = _frequencies(law)
+
+    def sizes(w: FloatArray) -> FloatArray:
+        P, F = _at_nominal(system, law, w)
+        if kind == "forces":
+            Q = F @ P
+        elif kind == "sensors":
+            Q = P @ F
+        else:
+            zero = np.zeros((len(w), P.shape[1], P.shape[1])), np.zeros((len(w), F.shape[1], F.shape[1]))
+            Q = np.block([[zero[0], P], [F, zero[1]]])
+        eye = np.eye(Q.shape[-1])
+        M = np.linalg.inv(eye - Q) - eye / 2
+        mu = _balanced(M) if only is None else np.abs(M[:, only, only])
+        return np.asarray(mu[:, None])
+
+    (mu,), (at,) = largest(sizes, w)
+    channels = kind if only is None else f"{kind[:-1]} {only + 1}"
+    return Disk(channels, float(1 / mu), float(at))
+
+
+def _balanced(M: ComplexArray) -> FloatArray:
+    """sigma_max of D M D^-1 with the diagonal D that equals rows and columns (Osborne): an upper bound of mu."""
+    size = np.abs(M)
+    d = np.ones(size.shape[:2])
+    off = size * (1 - np.eye(size.shape[-1]))
+    for _ in range(60):
+        scaled = off * d[:, :, None] / d[:, None, :]
+        rows, columns = np.sqrt((scaled**2).sum(2)), np.sqrt((scaled**2).sum(1))
+        both = (rows > 0) & (columns > 0)
+        d = d * np.where(both, columns / np.where(both, rows, 1), 1) ** 0.25
+    return np.asarray(np.linalg.svd(M * d[:, :, None] / d[:, None, :], compute_uv=False)[:, 0])
+
+
+def delay_margins(L: ComplexArray, w: FloatArray) -> FloatArray:
+    """The delay that each channel stands alone, s: min of phi(w) / w over the gain crossovers, the others closed.
+
+    L : k x p x p, y = L y around the loop. Infinite where a channel has no crossover.
+    """
+    eye = np.eye(L.shape[-1])
+    S = np.einsum("kii->ki", np.linalg.inv(eye - L))
+    alone = 1 / S - 1  # the open loop of one channel, negative feedback
+    size = np.log(np.abs(alone))
+    phase = np.unwrap(np.angle(alone), axis=0)
+    found = np.full(L.shape[-1], np.inf)
+    for i in range(len(found)):
+        k = np.flatnonzero(np.sign(size[1:, i]) != np.sign(size[:-1, i]))
+        share = size[k, i] / (size[k, i] - size[k + 1, i])
+        at = w[k] * (w[k + 1] / w[k]) ** share
+        angle = phase[k, i] + share * (phase[k + 1, i] - phase[k, i])
+        if len(k):
+            found[i] = (np.mod(angle + np.pi, 2 * np.pi) / at).min()
+    return found
+
+
+def _frequencies(law: Compensator) -> FloatArray:
+    top = 1e5 if law.sample_time is None else np.pi / law.sample_time
+    return np.geomspace(1e-2, top, 400)
+
+
+def _at_nominal(
+    system: UncertainSystem, law: Compensator, w: FloatArray
+) -> tuple[ComplexArray, ComplexArray]:
+    return responses(system, law, system.nominal, w)
+
+
+def _stable(system: UncertainSystem, law: Compensator) -> bool:
+    return bool(instability(system, law, system.nominal)[0] < 0)
+
+
+def _peak(system: UncertainSystem, law: Compensator, states: bool) -> float:
+    """Largest |S_ii|, at the forces of state feedback, else at the sensors."""
+    if not _stable(system, law):
+        return float("nan")
+
+    def sizes(w: FloatArray) -> FloatArray:
+        P, F = _at_nominal(system, law, w)
+        Q = F @ P if states else P @ F
+        S = np.linalg.inv(np.eye(Q.shape[-1]) - Q)
+        return np.asarray(np.abs(np.einsum("kii->ki", S)))
+
+    return float(largest(sizes, _frequencies(law))[0].max())
+
+
+def _gang(P: ComplexArray, F: ComplexArray) -> list[tuple[float, float, float, float]]:
+    """For each sensor: |S_ii|, |T_ii|, the largest |(S P)_ij| (m/N) and |(F S)_ji| (N/m)."""
+    S = np.linalg.inv(np.eye(P.shape[1]) - P @ F)
+    T = np.eye(P.shape[1]) - S
+    compliance, noise = np.abs(S @ P), np.abs(F @ S)
+    return [
+        (
+            float(np.abs(S[:, i, i]).max()),
+            float(np.abs(T[:, i, i]).max()),
+            float(compliance[:, i].max()),
+            float(noise[:, :, i].max()),
+        )
+        for i in range(P.shape[1])
+    ]
