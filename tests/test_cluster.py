@@ -1,0 +1,224 @@
+"""Campaigns on a Dask scheduler of the loopback: the same bits as here, whoever dies on the way."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+import pytest
+
+import malta
+from malta import cluster
+from malta.campaign import Plan, campaign, fly
+from malta.cluster import _at_worker, _finished, _result, _Task, blocks
+from malta.many import Batch
+
+if TYPE_CHECKING:
+    from conftest import Design
+
+GAINS = "design/gains/calibrated.json"
+NOBODY = "tcp://127.0.0.1:1"
+QUICK: dict[str, Any] = {"fidelity": "force", "duration": 0.02, "rise": 3e-3}
+
+
+@pytest.fixture(scope="module")
+def plan(designs: dict[str, Design]) -> Plan:
+    return Plan(designs["calibrated"].controller, "stroke", {"m": 0.2, "K_A": 0.1}, samples=24, options=QUICK)
+
+
+class Loopback(NamedTuple):
+    """A scheduler and two workers, each a process."""
+
+    address: str
+    scheduler: subprocess.Popen[bytes]
+    workers: list[subprocess.Popen[bytes]]
+
+
+@pytest.fixture
+def loopback(tmp_path: Path) -> Iterator[Loopback]:
+    pytest.importorskip("distributed")
+    file = tmp_path / "scheduler.json"
+    common = ("--scheduler-file", str(file), "--host", "127.0.0.1", "--no-dashboard")
+    one = ("--nthreads", "1", "--no-nanny", "--local-directory", str(tmp_path))
+    with ExitStack() as stack:
+
+        def started(kind: str, *options: str) -> subprocess.Popen[bytes]:
+            command = [sys.executable, "-m", f"distributed.cli.dask_{kind}", *common, *options]
+            log = stack.enter_context((tmp_path / f"{kind}.log").open("ab"))
+            process = subprocess.Popen(
+                command, stdout=log, stderr=log, env=os.environ | {"PYTHONWARNINGS": ""}
+            )
+            stack.callback(process.wait)
+            stack.callback(process.kill)
+            return process
+
+        scheduler = started("scheduler", "--port", "0", "--dashboard-address", "127.0.0.1:0")
+        workers = [started("worker", *one) for _ in range(2)]
+        for _ in range(3000):
+            if file.exists() and file.read_text(encoding="utf-8").endswith("}"):
+                break
+            time.sleep(0.01)
+        address = json.loads(file.read_text(encoding="utf-8"))["address"]
+        yield Loopback(address, scheduler, workers)
+
+
+def _malta(folder: Path, samples: int, *options: str) -> subprocess.Popen[str]:
+    box = ("--fidelity", "force", "--spread", "20%", "--sensor", "gain_x1=2%", "--quantize")
+    command = [sys.executable, "-m", "malta.cli", "campaign", GAINS, "--samples", str(samples), *box]
+    command += ["--out", str(folder), *options]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def _wait_for_block(process: subprocess.Popen[str], folder: Path) -> None:
+    for _ in range(6000):
+        if list(folder.glob("runs_*.npz")):
+            return
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.01)
+    raise AssertionError("no block within a minute")
+
+
+def _blocks(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in sorted(folder.glob("runs_*.npz"))}
+
+
+@pytest.mark.slow
+def test_a_worker_is_killed_and_then_the_scheduler(loopback: Loopback, tmp_path: Path) -> None:
+    """Of two workers one is killed in the middle: bit for bit what this machine finds. Then the scheduler is killed in
+    the middle of the same campaign: one sentence, blocks stand, and this machine flies what is left."""
+    whole = _malta(tmp_path / "here", 12288)
+    found = _malta(tmp_path / "there", 12288, "--cluster", loopback.address)
+    _wait_for_block(found, tmp_path / "there")
+    loopback.workers[0].kill()
+    out, err = found.communicate(timeout=120)
+    assert (found.returncode, err) == (0, "")
+    assert out.startswith(f"{GAINS}: stroke, fidelity force, 12288 of 12288 machines\n")
+    assert whole.wait(timeout=120) == 0
+    whole.communicate()
+    assert len(_blocks(tmp_path / "here")) == 12
+    assert _blocks(tmp_path / "here") == _blocks(tmp_path / "there")
+
+    cut = _malta(tmp_path / "cut", 12288, "--cluster", loopback.address)
+    _wait_for_block(cut, tmp_path / "cut")
+    loopback.scheduler.kill()
+    out, err = cut.communicate(timeout=120)
+    assert (cut.returncode, out) == (2, "")
+    assert "Traceback" not in err
+    assert err.count("\n") == 1
+    assert "the connection lost" in err
+    assert "it goes on with what is left" in err
+    kept = _blocks(tmp_path / "cut")
+    assert 0 < len(kept) < 12
+    rest = _malta(tmp_path / "cut", 12288)
+    rest.communicate(timeout=120)
+    assert rest.returncode == 0
+    assert _blocks(tmp_path / "cut") == _blocks(tmp_path / "here")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("address", [NOBODY, "nonsense", ""])
+def test_nobody_at_the_address_is_one_sentence(plan: Plan, tmp_path: Path, address: str) -> None:
+    """Within some seconds, and what was done before is not lost."""
+    pytest.importorskip("distributed")
+    campaign(replace(plan, samples=16), tmp_path, block=8)
+    (tmp_path / "runs_00000008.npz").unlink()
+    before = _blocks(tmp_path)
+    start = time.monotonic()
+    with pytest.raises(malta.InputError, match="expected a Dask scheduler, as tcp://host:8786") as caught:
+        campaign(replace(plan, samples=16), tmp_path, cluster=address)
+    assert time.monotonic() - start < 12
+    assert str(caught.value).isprintable()
+    assert _blocks(tmp_path) == before
+
+
+def test_what_is_done_needs_no_cluster(plan: Plan, tmp_path: Path) -> None:
+    campaign(plan, tmp_path)
+    assert campaign(plan, tmp_path, cluster=NOBODY).completed.all()
+
+
+def test_without_the_extra_it_says_how_to_get_it(plan: Plan, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(malta.InputError, match=r"pip install 'malta\[cluster\]'"):
+        campaign(plan, cluster=NOBODY)
+
+
+def test_what_a_worker_does_is_what_is_done_here(plan: Plan) -> None:
+    task = _Task(plan.identity, malta_version(), plan)
+    block = _at_worker(task, 8, 8)
+    assert not isinstance(block, str)
+    here = fly(plan, 8, 8)
+    for name in Batch.__dataclass_fields__:
+        assert np.array_equal(getattr(block[1], name), getattr(here.batch, name), equal_nan=True)
+    again = _Task(plan.identity, malta_version(), replace(plan))  # as it comes with the next block
+    assert cluster._first_copy(again) is cluster._first_copy(task)
+
+
+def malta_version() -> str:
+    from importlib.metadata import version
+
+    return version("malta")
+
+
+def test_what_a_worker_refuses_comes_back_as_a_sentence(plan: Plan, monkeypatch: pytest.MonkeyPatch) -> None:
+    refused = _at_worker(_Task(plan.identity, "9", plan), 0, 8)
+    with pytest.raises(malta.InputError, match=f"a worker: found malta {malta_version()}, expected malta 9"):
+        _result(NOBODY, _future(refused))
+
+    def none(*_: Any, **__: Any) -> Any:
+        raise malta.InputError("campaign", "m", "lead", "iron")
+
+    monkeypatch.setattr(sys.modules["malta.campaign"], "fly", none)
+    refused = _at_worker(_Task(plan.identity, malta_version(), plan), 0, 8)
+    with pytest.raises(malta.InputError, match="campaign: m: found lead, expected iron"):
+        _result(NOBODY, _future(refused))
+
+
+def _future(result: Any, status: str = "finished") -> Any:
+    return SimpleNamespace(status=status, result=lambda: result, exception=lambda: result)
+
+
+def test_a_worker_that_fails_is_one_sentence() -> None:
+    with pytest.raises(malta.InputError, match="found a worker that fails \\(ModuleNotFoundError: No module"):
+        _result(NOBODY, _future(ModuleNotFoundError("No module named 'malta'"), "error"))
+    with pytest.raises(malta.InputError, match="found the connection lost"):
+        _result(NOBODY, _future(None, "cancelled"))
+
+
+class _Idle:
+    """A scheduler that nobody works for."""
+
+    def submit(self, *_: Any, **__: Any) -> Any:
+        return object()
+
+    def nthreads(self) -> dict[str, int]:
+        return {}
+
+    def as_current(self) -> ExitStack:
+        return ExitStack()
+
+
+def test_a_scheduler_without_workers_is_not_waited_for_forever(
+    plan: Plan, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def wait(*_: Any, **__: Any) -> Any:
+        raise TimeoutError
+
+    monkeypatch.setattr(cluster, "WAIT", 3.0)
+    with pytest.raises(malta.InputError, match="found no workers, expected a scheduler with some"):
+        list(_finished(SimpleNamespace(wait=wait), _Idle(), NOBODY, plan, {0: 8}))
+
+
+def test_nothing_left_asks_nobody(plan: Plan, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cluster, "_connected", lambda *_: SimpleNamespace(close=lambda **_: None))
+    pytest.importorskip("distributed")
+    assert list(blocks(NOBODY, plan, {})) == []
