@@ -21,7 +21,6 @@ from malta.controller import Controller
 from malta.data import twins_of, units_of
 from malta.engine import LANES, evaluate, feedforward_table, in_lanes, run_many
 from malta.errors import InputError
-from malta.machine import Setup
 from malta.noise import GAMMA, keys
 from malta.plant import Plant, readonly
 from malta.simulate import (
@@ -171,8 +170,8 @@ def _prepared(
     values = machine.numbers(plant, controller, scenario.substeps, scenario.sensor_errors)
     theta = _thetas(plant, values, changes, sensor_errors, runs)
     t, motion, given = sampled(plant, controller, scenario, setup)
-    first_state = beginning(plant, controller, scenario, given[0])
-    states, noise = _mapped(_starts(plant, controller, setup, values, *first_state), theta)
+    start = np.concatenate(beginning(plant, controller, scenario, given[0]))
+    states, noise = _mapped(_starts(shape_of(plant, controller, setup)), theta, start)
     ff = controller.feedforward
     groups = -(-runs // LANES)
     rows = {"theta": theta, "states": states, "sigma": scenario.noise * noise}
@@ -331,25 +330,22 @@ def _thetas(
     return theta
 
 
-def _starts(
-    plant: Plant,
-    c: Controller,
-    setup: Setup,
-    values: Mapping[str, ca.DM],
-    x: FloatArray,
-    xi_pred: FloatArray,
-    current: FloatArray,
-) -> ca.Function:
-    """theta -> the state in which a machine starts, and the noise of its sensors."""
-    symbolic, _, theta = machine.numbered(plant, values)
-    first = machine.initial(symbolic, c, setup, ca.DM(x), ca.DM(xi_pred), ca.DM(current))
-    return ca.Function("start", [theta], [first, ca.densify(ca.vertcat(*symbolic.noise))])
+@lru_cache(maxsize=16)
+def _starts(shape: Any) -> ca.Function:
+    """(theta, x, xi_pred, currents) -> the state in which a machine starts, and the noise of its sensors."""
+    plant, c, setup = shape.plant, shape.controller, shape.setup
+    symbolic, _, theta = machine.numbered(plant, machine.numbers(plant, c, 1))
+    sizes = {"x": len(plant.states), "xi_pred": len(c.states), "current": len(plant.inputs)}
+    beginning = [ca.SX.sym(name, size) for name, size in sizes.items()]
+    first = machine.initial(symbolic, c, setup, *beginning)
+    noise = ca.densify(ca.vertcat(*symbolic.noise))
+    return ca.Function("start", [theta, ca.vertcat(*beginning)], [first, noise])
 
 
-def _mapped(function: ca.Function, rows: FloatArray) -> list[FloatArray]:
-    """A function of one row on all rows: each of its results."""
+def _mapped(function: ca.Function, rows: FloatArray, same: FloatArray) -> list[FloatArray]:
+    """A function of a row and of what is the same for all, on all rows: each of its results."""
     parts = np.array_split(rows, -(-len(rows) // BLOCK))
-    found = [evaluate(function.map(len(part)), part) for part in parts]
+    found = [evaluate(function.map(len(part)), part, np.tile(same, (len(part), 1))) for part in parts]
     return [np.vstack(column) for column in zip(*found, strict=True)]
 
 
