@@ -6,6 +6,7 @@
 
 #include <math.h>
 #include <stdint.h>
+#include <stdlib.h>
 #include <string.h>
 #if LANES > 1 && defined(__AVX512DQ__)
 #include <immintrin.h>
@@ -80,52 +81,72 @@ static inline real inverse(real x) { return 1.0 / x; }
 #endif
 
 /* sin(x) = (-1)^n sin(x - n pi) with the nearest n, cos(x) = sin(x + pi/2); between the zeros an odd polynomial of degree
-   15, whose terms stand in pairs (Estrin): chains of operations that wait for each other stay short. Absolute error
-   below 2e-15 up to 1e5 rad.                                                                                        */
+   15. One machine waits for chains of operations, so its terms stand in pairs (Estrin); many lanes wait for the number of
+   operations. Absolute error below 2e-15 up to 1e5 rad.                                                             */
+#define ONE 0.9999999999999998
+#define THREE -0.16666666666666075
+#define FIVE 0.00833333333328281
+#define SEVEN -0.00019841269824874834
+#define NINE 2.755731661057137e-06
+#define ELEVEN -2.505188203572492e-08
+#define THIRTEEN 1.6048170941500553e-10
+#define FIFTEEN -7.37441787774225e-13
 static inline real sine_of_part(real x, real half) { /* sin of x + half pi */
   const double shift = 6755399441055744.0; /* 1.5 * 2^52: its last bits are the nearest whole number */
   real counted = x * 0.31830988618379067154 + half + shift, n = counted - shift - half;
   real r = (x - n * 3.14159265358979311600) - n * 1.22464679914735317723e-16;
-  real t = r * r, t2 = t * t, t4 = t2 * t2;
-  real a = 0.9999999999999998 + t * -0.16666666666666075, b = 0.00833333333328281 + t * -0.00019841269824874834, c = 2.755731661057137e-06 + t * -2.505188203572492e-08, d = 1.6048170941500553e-10 + t * -7.37441787774225e-13;
-  return value(bits(r * ((a + t2 * b) + t4 * (c + t2 * d))) ^ (bits(counted) << 63));
+  real t = r * r;
+#if LANES == 1
+  real t2 = t * t, a = ONE + t * THREE, b = FIVE + t * SEVEN, c = NINE + t * ELEVEN, d = THIRTEEN + t * FIFTEEN;
+  real s = (a + t2 * b) + t2 * t2 * (c + t2 * d);
+#else
+  real s = ONE + t * (THREE + t * (FIVE + t * (SEVEN + t * (NINE + t * (ELEVEN + t * (THIRTEEN + t * FIFTEEN))))));
+#endif
+  return value(bits(r * s) ^ (bits(counted) << 63));
 }
 /* A mover in its air gap tilts by milliradians: there these terms of the series are right to the last bit. */
 #define TINY(x) __builtin_expect(nowhere(MASK((x) * (x) > 4e-4)), 1)
-static inline real sine(real x) {
-  real z = x * x;
+static inline real tilt_sine(real x, real z) {
   if (TINY(x)) return x + x * z * (-1.0 / 6 + z * (1.0 / 120 + z * (-1.0 / 5040)));
   return sine_of_part(x, (real){0});
 }
-static inline real cosine(real x) {
-  real z = x * x;
-  if (TINY(x)) return 1.0 + z * (-1.0 / 2 + z * (1.0 / 24 + z * (-1.0 / 720 + z * (1.0 / 40320))));
+static inline real tilt_cosine(real x, real z) {
+  if (TINY(x)) return 1.0 + z * (-1.0 / 2 + z * (1.0 / 24 + z * (-1.0 / 720)));
   return sine_of_part(x, (real){0} + 0.5);
 }
+#define tilt(x) ((x) * (x))
+#define tilt_secant(x, z) inverse(tilt_cosine(x, z))
+static inline real sine(real x) { return sine_of_part(x, (real){0}); }
+static inline real cosine(real x) { return sine_of_part(x, (real){0} + 0.5); }
+/* The same where it is known to be within the square root of NEAR; `range` is the largest square that was met. */
+#define NEAR 1e-4
+static inline real near_square(real *range, real x) {
+  real z = x * x;
+  *range = larger(*range, z);
+  return z;
+}
+#define near(x) near_square(range, x)
+#define near_sine(x, z) ((x) + (x) * (z) * (-1.0 / 6 + (z) * (1.0 / 120)))
+#define near_cosine(x, z) (1.0 + (z) * (-1.0 / 2 + (z) * (1.0 / 24 + (z) * (-1.0 / 720))))
+#define near_secant(x, z) (1.0 + (z) * (1.0 / 2 + (z) * (5.0 / 24 + (z) * (61.0 / 720))))
 
 /*MODEL*/
 
-/* v0(z), linear between the points of the grid: rows of `table` are z, v0 and dv0/dz. `hint` is each lane's interval. */
-static inline void look_up(long n, const double *table, long *hint, real at, real *v) {
-  enum { WIDTH = 1 + 2 * FORCES };
-  double found[FORCES][LANES];
-  for (int i = 0; i < LANES; i++) {
-    double a = LANE(at, i);
-    long k = hint[i];
-    while (k > 0 && !(a >= table[k * WIDTH])) k--;
-    while (k < n - 2 && a > table[(k + 1) * WIDTH]) k++;
-    hint[i] = k;
-    const double *row = table + k * WIDTH;
-    for (int j = 0; j < FORCES; j++) found[j][i] = row[1 + j] + (a - row[0]) * row[1 + FORCES + j];
-  }
-  memcpy(v, found, sizeof found);
+/* v0(z), linear between the points of the grid: rows of `table` are z, v0 and dv0/dz. */
+enum { WIDTH = 1 + 2 * FORCES };
+#if LANES == 1
+static inline void look_up(long n, const double *table, long *hint, double at, double *v) {
+  long k = *hint; /* where the search stood before */
+  while (k > 0 && !(at >= table[k * WIDTH])) k--;
+  while (k < n - 2 && at > table[(k + 1) * WIDTH]) k++;
+  const double *row = table + (*hint = k) * WIDTH;
+  for (int j = 0; j < FORCES; j++) v[j] = row[1 + j] + (at - row[0]) * row[1 + FORCES + j];
 }
 
-#if LANES == 1
 /* Rows of `samples` control periods; `state` is taken and left behind. */
 void run(long samples, long substeps, const double *theta, long grid, const double *table,
          double *state, const double *given, const double *noise, double *rows) {
-  double c[CONSTANTS + 1], y[OUTPUTS], v[FORCES], held[HELD], next[STATES], moved[MACHINE];
+  double c[CONSTANTS + 1], y[OUTPUTS], v[FORCES], held[HELD], next[STATES];
   long hint = 0;
   prepare(theta, c);
   for (long k = 0; k < samples; k++, given += GIVEN, noise += OUTPUTS, rows += ROW) {
@@ -133,10 +154,7 @@ void run(long samples, long substeps, const double *theta, long grid, const doub
     sense(c, state, given, noise, y, &at);
     look_up(grid, table, &hint, at, v);
     decide(c, state, given, y, v, next + MACHINE, held, rows);
-    for (long i = 0; i < substeps; i++) {
-      substep(c, state, held, given, moved);
-      memcpy(state, moved, sizeof moved);
-    }
+    for (long i = 0; i < substeps; i++) substep(c, state, held, given, state);
     memcpy(state + MACHINE, next + MACHINE, (STATES - MACHINE) * sizeof *state);
   }
 }
@@ -186,50 +204,127 @@ static inline void two_normals(bits64 key, uint64_t count, real *a, real *b) {
   *b = value(((bits(c) & odd) | (bits(s) & ~odd)) ^ ((q & 2) << 62));
 }
 
+/* In lanes: each lane's row of v0 at its z, in parts of LANES forces, and the rows transposed. */
+typedef struct { long n, even; const double *table; double first, step, per_metre, *values, *slopes; } Grid;
+enum { PADDED = (FORCES + LANES - 1) / LANES * LANES };
+
+#ifdef __clang__
+#define MIXED(x, y, ...) __builtin_shufflevector(x, y, __VA_ARGS__)
+#else
+#define MIXED(x, y, ...) __builtin_shuffle(x, y, (whole){__VA_ARGS__})
+#endif
+#define TURN(i, j, low, high) { \
+    real x = row[i], y = row[j]; \
+    row[i] = MIXED(x, y, low), row[j] = MIXED(x, y, high); \
+  }
+#define EVEN 0, 8, 2, 10, 4, 12, 6, 14
+#define ODD 1, 9, 3, 11, 5, 13, 7, 15
+#define PAIRS 0, 1, 8, 9, 4, 5, 12, 13
+#define OTHERS 2, 3, 10, 11, 6, 7, 14, 15
+#define FRONT 0, 1, 2, 3, 8, 9, 10, 11
+#define BACK 4, 5, 6, 7, 12, 13, 14, 15
+static inline void transpose(real *row) { /* LANES is 8 */
+  TURN(0, 1, EVEN, ODD) TURN(2, 3, EVEN, ODD) TURN(4, 5, EVEN, ODD) TURN(6, 7, EVEN, ODD)
+  TURN(0, 2, PAIRS, OTHERS) TURN(1, 3, PAIRS, OTHERS) TURN(4, 6, PAIRS, OTHERS) TURN(5, 7, PAIRS, OTHERS)
+  TURN(0, 4, FRONT, BACK) TURN(1, 5, FRONT, BACK) TURN(2, 6, FRONT, BACK) TURN(3, 7, FRONT, BACK)
+}
+static inline void look_up(const Grid *g, real at, real *v) {
+  real u = larger(smaller((at - g->first) * g->per_metre, (real){0} + (double)(g->n - 2)), (real){0});
+  whole index = __builtin_convertvector(u, whole);
+  real beyond = at - (g->first + g->step * __builtin_convertvector(index, real));
+  if (!g->even)
+    for (int i = 0; i < LANES; i++) {
+      long low = 0, high = g->n - 1;
+      while (high - low > 1) {
+        long k = (low + high) / 2;
+        if (at[i] >= g->table[k * WIDTH]) low = k;
+        else high = k;
+      }
+      index[i] = low, beyond[i] = at[i] - g->table[low * WIDTH];
+    }
+  for (int part = 0; part < PADDED; part += LANES) {
+    real row[LANES], base, slope;
+#pragma GCC unroll 8
+    for (int i = 0; i < LANES; i++) {
+      long k = index[i];
+      memcpy(&base, g->values + k * PADDED + part, sizeof base);
+      memcpy(&slope, g->slopes + k * PADDED + part, sizeof slope);
+      row[i] = base + beyond[i] * slope;
+    }
+    transpose(row);
+    for (int j = part; j < FORCES && j < part + LANES; j++) v[j] = row[j - part];
+  }
+}
+
+/* What a group of machines is between two samples. */
+typedef struct { real state[STATES], kept[DIGEST + 1]; } Group;
+
+/* One sample: 0 where `near` turns out not to hold, and `after` means nothing. Mostly the first look tells. Which of the
+   two a sample is computed by depends on nothing but that sample, so that it can be computed again to the bit.       */
+#define SAMPLE(name, near, attributes, ...) \
+  static attributes int name(const real *c, const Group *m, Group *after, const Grid *grid, long substeps, \
+                             const double *given, const real *noise) { \
+    real range = {0}, at, y[OUTPUTS], v[FORCES], held[HELD], row[ROW]; \
+    const real *from = m->state; \
+    sense##near(__VA_ARGS__ c, m->state, given, noise, y, &at); \
+    if (!nowhere(MASK(range > NEAR))) return 0; \
+    look_up(grid, at, v); \
+    decide##near(__VA_ARGS__ c, m->state, given, y, v, after->state + MACHINE, held, row); \
+    digest(c, m->kept, row, given, after->kept); \
+    for (long i = 0; i < substeps; i++, from = after->state) \
+      substep##near(__VA_ARGS__ c, from, held, given, after->state); \
+    return nowhere(MASK(range > NEAR)); \
+  }
+SAMPLE(sample_near, _near, inline, &range, )
+SAMPLE(sample, , __attribute__((noinline, cold)), )
+
 /* LANES machines at once: only digests are kept. */
-static void run_group(long samples, long substeps, const double *theta, long grid, const double *table,
-                      double *states, const double *given, const double *scales, const uint64_t *keys,
-                      double *digests) {
-  real sigma[OUTPUTS], t[THETA + 1], c[CONSTANTS + 1], state[STATES], next[STATES], moved[MACHINE], y[OUTPUTS], v[FORCES], held[HELD];
-  real row[ROW], kept[DIGEST], kept_next[DIGEST], noise[2 * OUTPUTS];
-  long hint[LANES] = {0};
+static void run_group(long samples, long substeps, const double *theta, const Grid *grid, double *states,
+                      const double *given, const double *scales, const uint64_t *keys, double *digests) {
+  Group m[2], *now = m, *after = m + 1, *before;
+  real c[CONSTANTS + 1], sigma[OUTPUTS], t[THETA + 1], noise[2 * OUTPUTS];
+  int noisy = 0;
   bits64 key;
   memcpy(&key, keys, sizeof key);
   memcpy(t, theta, sizeof(real) * THETA);
-  memcpy(state, states, sizeof state);
-  memcpy(kept, digests, sizeof kept);
+  memcpy(now->state, states, sizeof now->state);
+  memcpy(now->kept, digests, sizeof(real) * DIGEST);
   prepare(t, c);
-  int noisy = 0;
   memcpy(sigma, scales, sizeof sigma);
   for (int j = 0; j < OUTPUTS * LANES; j++) noisy |= scales[j] != 0;
   memset(noise, 0, sizeof noise);
   for (long k = 0; k < samples; k++, given += GIVEN) {
-    real at;
+    const real *drawn = noise + k % 2 * OUTPUTS;
     if (noisy && k % 2 == 0) {
       for (int j = 0; j < OUTPUTS; j++)
         two_normals(key, (uint64_t)(k / 2 * OUTPUTS + j), noise + 2 * j, noise + 2 * j + 1);
       for (int j = 0; j < 2 * OUTPUTS; j++) noise[j] = noise[j] * sigma[j % OUTPUTS];
     }
-    sense(c, state, given, noise + k % 2 * OUTPUTS, y, &at);
-    look_up(grid, table, hint, at, v);
-    decide(c, state, given, y, v, next + MACHINE, held, row);
-    digest(c, kept, row, given, kept_next);
-    memcpy(kept, kept_next, sizeof kept);
-    for (long i = 0; i < substeps; i++) {
-      substep(c, state, held, given, moved);
-      memcpy(state, moved, sizeof moved);
-    }
-    memcpy(state + MACHINE, next + MACHINE, (STATES - MACHINE) * sizeof *state);
+    if (!sample_near(c, now, after, grid, substeps, given, drawn))
+      sample(c, now, after, grid, substeps, given, drawn);
+    before = now, now = after, after = before;
   }
-  memcpy(states, state, sizeof state);
-  memcpy(digests, kept, sizeof kept);
+  memcpy(states, now->state, sizeof now->state);
+  memcpy(digests, now->kept, sizeof(real) * DIGEST);
 }
 
 /* Groups of LANES machines, one after the other; states and digests are taken and left behind. */
-void run_many(long groups, long samples, long substeps, const double *theta, long grid, const double *table,
+void run_many(long groups, long samples, long substeps, const double *theta, long points, const double *table,
               double *states, const double *given, const double *sigma, const uint64_t *keys, double *digests) {
+  const size_t size = (size_t)points * PADDED * sizeof(double);
+  double *rows = aligned_alloc(64, 2 * size), first = table[0];
+  if (!rows) abort();
+  double step = (table[(points - 1) * WIDTH] - first) / (double)(points - 1);
+  Grid grid = {points, 1, table, first, step, 1 / step, rows, rows + points * PADDED};
+  memset(rows, 0, 2 * size);
+  for (long k = 0; k < points; k++) {
+    grid.even &= fabs((table[k * WIDTH] - first) * grid.per_metre - (double)k) < 1e-9;
+    memcpy(rows + k * PADDED, table + k * WIDTH + 1, FORCES * sizeof(double));
+    memcpy(rows + (points + k) * PADDED, table + k * WIDTH + 1 + FORCES, FORCES * sizeof(double));
+  }
   for (long g = 0; g < groups; g++)
-    run_group(samples, substeps, theta + g * THETA * LANES, grid, table, states + g * STATES * LANES, given,
+    run_group(samples, substeps, theta + g * THETA * LANES, &grid, states + g * STATES * LANES, given,
               sigma + g * OUTPUTS * LANES, keys + g * LANES, digests + g * DIGEST * LANES);
+  free(rows);
 }
 #endif

@@ -2,8 +2,10 @@
 
 The functions of machine.py are straight lines of scalar operations. Here they become C inside the loop of engine.c,
 with every number of machine and controller an argument: one compilation serves all machines and gain files of a shape.
-What depends on those numbers alone is computed once a run (`prepare`). For many machines the same text is compiled with
-one machine in each lane of a SIMD register.
+What depends on those numbers alone is computed once a run (`prepare`), nothing is computed twice, and factors that sums
+share are taken out of them. For many machines the same text is compiled with one machine in each lane of a SIMD
+register, and once more for tilts as small as an air gap leaves room for: without a branch, and done over where a tilt
+turns out to have been larger.
 
 Compiled engines stay in the user's cache folder under the SHA-256 of their text, the compiler, its options and the
 processor; two processes that compile at once write the same file, each under a name of its own first. Without a C
@@ -80,6 +82,10 @@ _FORMS = (
         "OP_CONSTPOW": "each_pow({0}, {1})",
         "OP_IF_ELSE_ZERO": "where({0}, {1})",  # the first as a mask
         "PICK": "pick({0}, {1}, {2})",  # likewise
+        "TILT": "tilt({0})",  # the square of an angle that is likely to be small, and its functions
+        "TILT_SINE": "tilt_sine({0}, {1})",
+        "TILT_COSINE": "tilt_cosine({0}, {1})",
+        "TILT_SECANT": "tilt_secant({0}, {1})",
     }
 )
 # Truths are masks; they become 1 and 0 where they are calculated with.
@@ -135,11 +141,17 @@ def translate(f: ca.Function, shared: Sequence[int], first_constant: int) -> tup
     prepare = [line(k) for k in fixed if nodes[k].op]
     prepare += [f"  c[{place[k]}] = {text(k, moving=False)};" for k in kept]
     lines = [line(k) for k in used if nodes[k].op and not nodes[k].fixed]
-    lines += [f"  r{i}[{j}] = {text(k, moving=True)};" for i, j, k in outputs]
+    results = [(f"r{i}[{j}]", text(k, moving=True)) for i, j, k in outputs]
+    lines += [f"  const real o{n} = {found};" for n, (_, found) in enumerate(results)]
+    lines += [f"  {place} = o{n};" for n, (place, _) in enumerate(results)]
     kinds = ["double" if i in shared else "real" for i in range(f.n_in() - 1)]
+    # The first argument may be the first result: what is read is read before anything is written.
     head = ", ".join(
-        ["const real *restrict c", *(f"const {kind} *restrict a{i}" for i, kind in enumerate(kinds))]
-        + [f"real *restrict r{i}" for i in range(f.n_out())]
+        [
+            "const real *restrict c",
+            *(f"const {kind} *{'restrict ' * (i > 0)}a{i}" for i, kind in enumerate(kinds)),
+        ]
+        + [f"real *{'restrict ' * (i > 0)}r{i}" for i in range(f.n_out())]
     )
     function = [f"static inline __attribute__((always_inline)) void {f.name()}({head}) {{", *lines, "}", ""]
     return "\n".join(["  {", *prepare, "  }"]), "\n".join(function), len(kept)
@@ -148,7 +160,7 @@ def translate(f: ca.Function, shared: Sequence[int], first_constant: int) -> tup
 def _read(f: ca.Function, shared: Sequence[int]) -> tuple[list[_Node], list[tuple[int, int, int]]]:
     """The instructions of an SX function, and which node is which entry of which result."""
     theta = f.n_in() - 1
-    nodes: list[_Node] = []
+    nodes = _Line()
     slot: dict[int, int] = {}  # of CasADi's work vector: the node it holds
     outputs: list[tuple[int, int, int]] = []
     for k in range(f.n_instructions()):
@@ -159,18 +171,17 @@ def _read(f: ca.Function, shared: Sequence[int]) -> tuple[list[_Node], list[tupl
         if op == ca.OP_INPUT:
             i, j = reads
             text = f"theta[{j}]" if i == theta else f"a{i}[{j}]"
-            nodes.append(
-                _Node("" if i != theta else "INPUT", f"K({text})" if i in shared else text, (), i == theta)
-            )
+            node = _Node("" if i != theta else "INPUT", f"K({text})" if i in shared else text, (), i == theta)
+            slot[writes[0]] = nodes.place(node)
         elif op == ca.OP_CONST:
-            nodes.append(_Node("", f"K({_number(f.instruction_constant(k))})", (), True))
+            text = f"K({_number(f.instruction_constant(k))})"
+            slot[writes[0]] = nodes.place(_Node("", text, (), True))
         else:
             name = _NAMES[op]
             if name not in _FORMS and name not in _MASKS:
                 raise CheckError(f"the compiled engine has no {name}")
-            _append(nodes, name, tuple(slot[r] for r in reads))
-        slot[writes[0]] = len(nodes) - 1
-    return nodes, outputs
+            slot[writes[0]] = nodes.add(name, *(slot[r] for r in reads))
+    return nodes.nodes, outputs
 
 
 def _number(value: float) -> str:
@@ -178,23 +189,94 @@ def _number(value: float) -> str:
     return repr(value).replace("inf", "INFINITY").replace("nan", "NAN")
 
 
-def _append(nodes: list[_Node], name: str, arguments: tuple[int, ...]) -> None:
-    """Add an operation, in the form that costs least."""
-    if name == "OP_DIV" and nodes[arguments[1]].fixed:  # one reciprocal a run instead of a division each
-        nodes.append(_Node("OP_INV", "1.0 / {0}", arguments[1:], True))
-        name, arguments = "OP_MUL", (arguments[0], len(nodes) - 1)
-    if name == "OP_ADD":  # if_else(c, x, y) comes as (c ? x : 0) + (not c ? y : 0)
-        one, other = (nodes[a] for a in arguments)
-        if one.op == other.op == "OP_IF_ELSE_ZERO" and nodes[other.arguments[0]] == _not(
-            one.arguments[0], nodes
-        ):
-            name, arguments = "PICK", (*one.arguments, other.arguments[1])
-    form = _MASKS.get(name) or _FORMS[name]
-    nodes.append(_Node(name, form, arguments, all(nodes[a].fixed for a in arguments)))
+class _Line:
+    """Nodes, each of them once."""
 
+    def __init__(self) -> None:
+        self.nodes: list[_Node] = []
+        self._known: dict[_Node, int] = {}
 
-def _not(k: int, nodes: list[_Node]) -> _Node:
-    return _Node("OP_NOT", _MASKS["OP_NOT"], (k,), nodes[k].fixed)
+    def place(self, node: _Node) -> int:
+        """Where this very node stands, now or already."""
+        if node not in self._known:
+            self._known[node] = len(self.nodes)
+            self.nodes.append(node)
+        return self._known[node]
+
+    def add(self, name: str, *arguments: int) -> int:
+        """Where the result of an operation stands, in the form that costs least."""
+        made = getattr(self, f"_{name.removeprefix('OP_').lower()}", None)
+        found: int | None = made(*arguments) if made is not None else None
+        return self._plain(name, *arguments) if found is None else found
+
+    def _plain(self, name: str, *arguments: int) -> int:
+        if name in ("OP_ADD", "OP_MUL"):
+            arguments = tuple(sorted(arguments))
+        fixed = all(self.nodes[a].fixed for a in arguments)
+        return self.place(_Node(name, _MASKS.get(name) or _FORMS[name], arguments, fixed))
+
+    def _scaled(self, k: int) -> tuple[int, int] | None:
+        """The fixed factor and the moving one of a product."""
+        node = self.nodes[k]
+        if node.op != "OP_MUL" or node.fixed:
+            return None
+        one, other = node.arguments
+        if self.nodes[one].fixed:
+            return one, other
+        return (other, one) if self.nodes[other].fixed else None
+
+    def _mul(self, one: int, other: int) -> int | None:
+        """Fixed factors are multiplied with each other, once a run."""
+        for factor, product in ((one, other), (other, one)):
+            parts = self._scaled(product)
+            if self.nodes[factor].fixed and parts is not None:
+                return self._plain("OP_MUL", self._plain("OP_MUL", factor, parts[0]), parts[1])
+        return None
+
+    def _div(self, one: int, other: int) -> int | None:
+        """A reciprocal, which is computed once a run where it is fixed, and a product."""
+        return self.add("OP_MUL", one, self.add("OP_INV", other))
+
+    def _inv(self, k: int) -> int | None:
+        node = self.nodes[k]
+        if node.fixed:
+            return self.place(_Node("OP_INV", "1.0 / {0}", (k,), True))
+        return self._plain("TILT_SECANT", *node.arguments) if node.op == "TILT_COSINE" else None
+
+    def _add(self, one: int, other: int) -> int | None:
+        """if_else(c, x, y) comes as (c ? x : 0) + (not c ? y : 0)."""
+        first, second = self.nodes[one], self.nodes[other]
+        if first.op == second.op == "OP_IF_ELSE_ZERO":
+            condition = self.nodes[second.arguments[0]]
+            if condition.op == "OP_NOT" and condition.arguments == first.arguments[:1]:
+                return self._plain("PICK", *first.arguments, second.arguments[1])
+        return self._together("OP_ADD", one, other)
+
+    def _sub(self, one: int, other: int) -> int | None:
+        return self._together("OP_SUB", one, other)
+
+    def _together(self, name: str, one: int, other: int) -> int | None:
+        """The sum of two products that share their fixed factor."""
+        first, second = self._scaled(one), self._scaled(other)
+        if first is None or second is None or first[0] != second[0]:
+            return None
+        return self.add("OP_MUL", first[0], self.add(name, first[1], second[1]))
+
+    def _sin(self, k: int) -> int | None:
+        return self._tilt("TILT_SINE", k)
+
+    def _cos(self, k: int) -> int | None:
+        return self._tilt("TILT_COSINE", k)
+
+    def _tilt(self, name: str, k: int) -> int | None:
+        """The angle is taken for a tilt, radians of a mover in its air gap, where it is a state and what is added."""
+        return self._plain(name, k, self._plain("TILT", k)) if self._state(k) else None
+
+    def _state(self, k: int) -> bool:
+        node = self.nodes[k]
+        if node.op in ("OP_ADD", "OP_SUB"):
+            return any(self._state(a) for a in node.arguments)
+        return node.form.startswith("a0[")
 
 
 def _mask_arguments(node: _Node) -> range:
@@ -223,6 +305,8 @@ def source(p: Parts, digest: ca.Function | None) -> str:
         prepare, function, more = translate(f, given[f.name()], count)
         prepares.append(prepare)
         functions.append(function)
+        if f is not digest:
+            functions.append("#if LANES > 1\n" + _near(function) + "#endif\n")
         count += more
     sizes = {
         "THETA": len(p.theta),
@@ -240,6 +324,12 @@ def source(p: Parts, digest: ca.Function | None) -> str:
     prepare = "static void prepare(const real *theta, real *c) {\n" + "\n".join(prepares) + "\n}\n"
     frame = files("malta").joinpath("engine.c").read_text(encoding="utf-8")
     return defines + frame.replace("/*MODEL*/", prepare + "".join(functions))
+
+
+def _near(function: str) -> str:
+    """The function for small tilts alone, which tells by `range` whether they were: its code has no branches."""
+    name, rest = function.replace("tilt", "near").split("(const real *", 1)
+    return f"{name}_near(real *range, const real *{rest}"
 
 
 @cache

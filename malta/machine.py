@@ -406,7 +406,9 @@ def _moved(
         lag = machine["force"] - held
         decay = ca.exp(-plant.actuator.crossover * h / 2)
         forces = [held + lag, held + decay * lag, held + decay**2 * lag]
-        return ca.vertcat(runge_kutta(lambda x, half: motion(x, forces[half]), x, h), forces[2])
+        half = len(plant.states) // 2
+        moved = runge_kutta(lambda x, halves: motion(x, forces[halves]), x, h, half)
+        return ca.vertcat(moved, forces[2])
     n, count = len(plant.states), machine["i" if s.fidelity == "dq" else "i_phase"].numel()
     slope = _axis_slope if s.fidelity == "dq" else _phase_slope
 
@@ -415,16 +417,30 @@ def _moved(
         forces, electrics = slope(plant, s, given, x, i, V, held)
         return ca.vertcat(motion(x, forces), electrics)
 
-    return runge_kutta(rate, ca.vertcat(*machine.values()), h)
+    return runge_kutta(rate, ca.vertcat(*machine.values()), h, n // 2)
 
 
-def runge_kutta(rate: Callable[[Any, int], Any], z: Any, h: Any) -> Any:
-    """One step of the classical method, fourth order. rate: (z, half steps since the beginning: 0, 1 or 2) -> z'."""
-    k1 = rate(z, 0)
-    k2 = rate(z + h / 2 * k1, 1)
-    k3 = rate(z + h / 2 * k2, 1)
-    k4 = rate(z + h * k3, 2)
-    return z + h / 6 * (k1 + 2 * (k2 + k3) + k4)
+def runge_kutta(rate: Callable[[Any, int], Any], z: Any, h: Any, positions: int = 0) -> Any:
+    """One step of the classical method, fourth order. rate: (z, half steps since the beginning: 0, 1 or 2) -> z'.
+
+    positions : how many entries stand first whose rates are the entries that follow them. What the method does to them
+        is written in accelerations, as Nyström did: the same numbers in fewer operations.
+    """
+    q, w = z[:positions], z[positions:]
+    dq = w[:positions]
+
+    def slope(q: Any, w: Any, halves: int) -> Any:
+        return rate(ca.vertcat(q, w), halves)[positions:]
+
+    k1 = slope(q, w, 0)
+    middle = q + h / 2 * dq
+    k2 = slope(middle, w + h / 2 * k1, 1)
+    k3 = slope(middle + h * h / 4 * k1[:positions], w + h / 2 * k2, 1)
+    end = q + h * dq
+    k4 = slope(end + h * h / 2 * k2[:positions], w + h * k3, 2)
+    late = k2 + k3
+    early = k1 + late
+    return ca.vertcat(end + h * h / 6 * early[:positions], w + h / 6 * (early + late + k4))
 
 
 def _axis_slope(

@@ -98,8 +98,16 @@ def _run_one(trial: Trial, state: Any, given: FloatArray, theta: Any) -> FloatAr
     return rows[:, :-1]
 
 
-def _run_lanes(trial: Trial, states: FloatArray, given: FloatArray, thetas: FloatArray) -> FloatArray:
-    """The last row of each of eight lanes."""
+def _run_lanes(
+    trial: Trial, states: FloatArray, given: FloatArray, thetas: FloatArray, table: FloatArray = TABLE
+) -> FloatArray:
+    """The last row of each of eight lanes, without v0 of the table."""
+    return _digests(trial, states, given, thetas, table)[:, :-1]
+
+
+def _digests(
+    trial: Trial, states: FloatArray, given: FloatArray, thetas: FloatArray, table: FloatArray
+) -> FloatArray:
     states = np.hstack([states, np.zeros((LANES, 1))])
     theta, start, digests = (
         engine.in_lanes(rows, 1)
@@ -110,14 +118,14 @@ def _run_lanes(trial: Trial, states: FloatArray, given: FloatArray, thetas: Floa
         slice(0, 1),
         substeps=1,
         theta=theta,
-        table=TABLE,
+        table=table,
         states=start,
         given=np.ascontiguousarray(given),
         sigma=np.zeros((1, 1, LANES)),
         keys=np.zeros((1, LANES), dtype=np.uint64),
         digests=digests,
     )
-    return np.asarray(digests[0, :-1].T)
+    return np.asarray(digests[0].T)
 
 
 # Every operation
@@ -298,6 +306,68 @@ def test_a_lane_does_not_depend_on_its_neighbours(waves: Trial) -> None:
         np.testing.assert_allclose(
             _run_lanes(waves, states, around, thetas)[0], together[0], rtol=0, atol=1e-15
         )
+
+
+@pytest.fixture(scope="module")
+def tilted() -> Trial:
+    """Sine, cosine and their quotients of a state and an input: angles of a mover, as the engine sees it."""
+    return _trial(
+        lambda s, g, _: ca.vertcat(
+            ca.sin(s[0] + g[0]), ca.cos(s[0] + g[0]), 1 / ca.cos(s[0] + g[0]), ca.tan(s[0] + g[0])
+        )
+    )
+
+
+def test_small_tilts_are_right_to_two_units_in_the_last_place(tilted: Trial) -> None:
+    rng = np.random.default_rng(3)
+    for size in (1e-300, 1e-9, 1e-4, 1e-2, 0.02):
+        angles = size * rng.uniform(-1, 1, (50, LANES))
+        for x in angles:
+            states = np.zeros((LANES, STATES))
+            states[:, 0] = x
+            found = _run_lanes(tilted, states, np.zeros((1, GIVEN)), np.zeros((LANES, THETA)))
+            expected = np.array([np.sin(x), np.cos(x), 1 / np.cos(x), np.tan(x)]).T
+            unit = np.spacing(expected)
+            assert (np.abs(found - expected) / np.abs(unit)).max() <= 2
+
+
+@pytest.mark.parametrize("lane", [0, LANES - 1])
+def test_a_tilt_that_grows_is_done_over(tilted: Trial, lane: int) -> None:
+    """Small, large for a while, and small again: right at every sample."""
+    states = np.zeros((LANES, STATES))
+    states[:, 0] = 1e-3 * np.arange(LANES)
+    states[lane, 0] = 5e-3
+    inputs = np.zeros((9, GIVEN))
+    inputs[3:6, 0], inputs[7, 0] = 1.0, 7e-3
+    for samples in range(1, 10):
+        found = _run_lanes(tilted, states, inputs[:samples], np.zeros((LANES, THETA)))
+        x = states[:, 0] + inputs[samples - 1, 0]
+        expected = np.array([np.sin(x), np.cos(x), 1 / np.cos(x), np.tan(x)]).T
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-15 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("z_grid", [[-1.0, 0.0, 1.0, 2.0], [-1.0, -0.9, 1.0, 2.0], [0.5, 3.0]])
+def test_lanes_look_up_even_grids_and_others(waves: Trial, z_grid: list[float]) -> None:
+    v0 = np.random.default_rng(4).uniform(-3, 3, len(z_grid))
+    table = engine.feedforward_table(np.array(z_grid), v0[:, None])
+    at = np.unique([*np.linspace(z_grid[0], z_grid[-1], 50), *z_grid])
+    for z in at:
+        given = np.array([[z, 0, 0]])
+        found = _digests(waves, np.zeros((LANES, STATES)), given, np.zeros((LANES, THETA)), table)[:, -1]
+        np.testing.assert_allclose(found, np.interp(z, z_grid, v0), rtol=0, atol=1e-14)
+
+
+def test_sums_share_their_factor() -> None:
+    """Two quotients by one number of the machine are one product; equal operations are one; nothing is lost."""
+    state, theta = ca.SX.sym("state", 3), ca.SX.sym("theta", 2)
+    apart = [
+        state[0] / theta[0] * theta[1],
+        state[1] * (1 / theta[0]) * theta[1],
+        theta[1] * state[2] / theta[0],
+    ]
+    _, moving, constants = engine.translate(ca.Function("f", [state, theta], [sum(apart)]), [], 0)
+    assert moving.count(" * ") == 1
+    assert constants == 1
 
 
 def test_an_operation_without_a_form_is_refused() -> None:
