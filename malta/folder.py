@@ -46,9 +46,15 @@ def block_name(first: int) -> str:
 def opened(folder: Path, plan: Plan, block: int) -> int:
     """The folder with the manifest of a plan in it, found or written; the runs in a block."""
     path = folder / MANIFEST
-    for stale in folder.glob(f".*.{os.getpid()}"):  # of a killed process that had this one's number
-        stale.unlink(missing_ok=True)
-    if path.exists():
+    try:
+        for stale in folder.glob(f".*.npz.{os.getpid()}"):  # of a killed process that had this one's number
+            stale.unlink(missing_ok=True)
+        begun = path.exists()
+    except OSError as error:
+        raise InputError(
+            folder, "", error.strerror or str(error), "a folder to keep a campaign in"
+        ) from error
+    if begun:
         found, size = read_manifest(path)
         require_same(path, found, plan.manifest)
         return size

@@ -603,6 +603,20 @@ def test_a_folder_that_is_none_is_refused(controller: Controller, tmp_path: Path
     assert file.read_text(encoding="utf-8") == "mine"
 
 
+def test_a_folder_that_may_not_be_looked_into_is_refused(
+    controller: Controller, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def forbidden(*_: Any) -> bool:
+        raise PermissionError(13, "Permission denied")
+
+    plan = _plan(controller, 8)
+    monkeypatch.setattr(Path, "exists", forbidden)
+    with pytest.raises(
+        malta.InputError, match="found Permission denied, expected a folder to keep a campaign in"
+    ):
+        campaign(plan, tmp_path)
+
+
 def test_what_a_killed_process_left_is_no_obstacle(controller: Controller, tmp_path: Path) -> None:
     """Half a block under a temporary name, by a process that had the same number: as in a container, started anew."""
     stale = tmp_path / f".{block_name(0)}.{os.getpid()}"
