@@ -66,7 +66,7 @@ class Campaign:
     folder: Path | None = None
 
     @property
-    def completed(self) -> FloatArray:
+    def completed(self) -> NDArray[np.bool_]:
         """True where the run went to its end."""
         return np.asarray(self.batch.completed == 1)
 
@@ -229,10 +229,11 @@ def read_plan(folder: str | Path, controller: Controller) -> Plan:
     content, _ = read_manifest(path)
     own = fingerprint(controller)
     try:
-        scenario, parameters = content["scenario"], content["machine"]["parameters"]
-        if content["gains"]["sha256"] != own:
-            found = f"a campaign of {content['gains']['name']}, sha256 {short(content['gains']['sha256'])}"
+        gains, scenario, machine = content["gains"], content["scenario"], content["machine"]
+        if gains["sha256"] != own:
+            found = f"a campaign of {gains['name']}, sha256 {short(gains['sha256'])}"
             raise InputError(path, "gains", found, f"one of {controller.name}, sha256 {short(own)}")
+        values = {name: float(value) for name, value in machine["parameters"].items()}
         plan = Plan(
             controller,
             scenario["name"],
@@ -241,16 +242,16 @@ def read_plan(folder: str | Path, controller: Controller) -> Plan:
             content["samples"],
             content["seed"],
             content["sampler"],
-            replace(
-                controller.parameters,
-                **{name: float(value) for name, value in parameters.items()},
-                preset=content["machine"]["preset"],
-            ),
+            replace(controller.parameters, **values, preset=machine["preset"]),
             scenario["case"],
             scenario["options"],
         )
-    except (KeyError, TypeError, AttributeError) as error:
-        raise InputError(path, "", f"a manifest without {error}", "the manifest of a campaign") from error
+    except InputError as error:
+        raise InputError(path, error.field, error.found, error.expected) from error
+    except (KeyError, TypeError, AttributeError, ValueError) as error:
+        raise InputError(
+            path, "", f"a damaged or foreign file ({error})", "the manifest of a campaign"
+        ) from error
     require_same(path, content, plan.manifest)
     return plan
 

@@ -15,6 +15,8 @@ from malta.plant import readonly
 from malta.simulate import RISE
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from malta.campaign import Campaign
     from malta.plan import Plan
     from malta.plant import FloatArray
@@ -43,7 +45,7 @@ class Finding(NamedTuple):
     relation: str = "at most"  # of ours to the published: "about" or "at most"
 
     @property
-    def within(self) -> FloatArray:
+    def within(self) -> NDArray[np.bool_]:
         """Which runs were completed and keep the published bound."""
         return np.asarray(self.values <= self.published)
 
@@ -109,7 +111,7 @@ def is_published(plan: Plan) -> bool:
     )
 
 
-def kept(found: Campaign, published: Mapping[str, Any] | None = None) -> FloatArray | None:
+def kept(found: Campaign, published: Mapping[str, Any] | None = None) -> NDArray[np.bool_] | None:
     """Which runs were completed within every published bound; None where the paper has none."""
     bounds = [
         f for f in figures_of(found, published) if f.relation == "at most" and math.isfinite(f.published)

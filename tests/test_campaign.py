@@ -388,7 +388,7 @@ def test_figures_count_completed_runs_and_bounds_of_the_published_stroke(
     assert listed["deviation y1"].published == pytest.approx(20e-6)
     assert listed["rise, 10-90 %"].relation == "about"
     for figure in listed.values():
-        assert np.isnan(figure.values[found.batch.completed == 0]).all()
+        assert np.isnan(figure.values[~found.completed]).all()
     within = kept(found, published)
     assert within is not None
     for row in range(64):
@@ -556,7 +556,12 @@ MANIFESTS: dict[str, Callable[[dict[str, Any]], Any]] = {
     "no scenario": lambda m: {k: v for k, v in m.items() if k != "scenario"},
     "a scenario in words": lambda m: m | {"scenario": "stroke"},
     "another version of malta": lambda m: m | {"malta": "9"},
-    "an edited option": lambda m: m | {"machine": m["machine"] | {"name": "other"}},
+    "another machine": lambda m: m | {"machine": m["machine"] | {"name": "other"}},
+    "a mass in words": lambda m: m | {"machine": m["machine"] | {"parameters": {"m": "heavy"}}},
+    "a parameter that is none": lambda m: m | {"machine": m["machine"] | {"parameters": {"mass": 1.0}}},
+    "a spread of all": lambda m: m | {"spread": {"m": 2.0}},
+    "a spread of words": lambda m: m | {"spread": {"m": "wide"}},
+    "spreads in a list": lambda m: m | {"spread": [1, 2]},
 }
 
 
