@@ -5,8 +5,9 @@ from __future__ import annotations
 import gc
 import io
 import json
+import math
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, cast
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from malta.plant import Parameters
     from malta.robust import Margin
     from malta.simulate import EngineChoice, StrokeFigures, Trajectory
+    from malta.tune import Requirement
     from malta.verify import CurrentLoops, Margins
 
 app = typer.Typer(
@@ -475,6 +477,96 @@ def campaign(
 
 
 @app.command()
+def tune(
+    file: Annotated[
+        Path, typer.Argument(metavar="SPEC", help="A design file with [specification] and [search].")
+    ],
+    out: Annotated[
+        Path, typer.Option(help="Folder of the design file that is found, the trials, the front.")
+    ] = Path("build/tuned"),
+    check: Annotated[
+        bool, typer.Option("--check", help="Only judge the design as it stands in the file.")
+    ] = False,
+    generations: Annotated[
+        int, typer.Option(min=0, help="Of the global search; 0 starts from the file's numbers.")
+    ] = 20,
+    front: Annotated[
+        int, typer.Option(min=0, help="Trials for each number and point of the Pareto front; 0: no front.")
+    ] = 40,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace a design file of that name.")
+    ] = False,
+    restart: Annotated[
+        bool, typer.Option("--restart", help="Forget the trials of an earlier search.")
+    ] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Find weights, bases and noise for what a design file asks for: margin, bandwidth, noise, experiments.
+
+    The design file that is found is the one that was given, with other numbers. Every trial is kept in the folder: the
+    same command goes on where it was ended. Exit code 1 when something asked for is not reached; the nearest design is
+    written all the same.
+
+    \b
+    Example:  malta tune design/robust.toml --out build/tuned
+    """
+    from malta import report
+    from malta.files import replace_files
+    from malta.spec import read_design
+    from malta.tune import Effort, design_text, judged
+    from malta.tune import tune as tuned
+
+    spec = read_design(file)
+    if check:
+        requirements = judged(spec)
+        if as_json:
+            _print_json({"design": spec.name, "requirements": [_requirement(r) for r in requirements]})
+        else:
+            _console().print(report.requirements_table(requirements))
+        _require(requirements, file)
+        return
+    target, journal = out / f"{spec.name}.toml", out / f"{spec.name}_trials.jsonl"
+    if target.resolve() == spec.path.resolve() and not overwrite:
+        raise InputError(target, "", "the design file that was given", "another --out, or --overwrite")
+    if target.exists() and not overwrite:
+        raise InputError(target, "", "a design file", "another --out, or --overwrite")
+    effort = Effort(generations=generations, front=front)
+    with _bar(f"tuning {spec.name}", quiet=as_json) as progress:
+        try:
+            found = tuned(spec, journal, effort=effort, restart=restart, progress=progress)
+        except KeyboardInterrupt:
+            print(f"malta: interrupted; the same command goes on from {journal}", file=sys.stderr)
+            raise typer.Exit(130) from None
+    files = {target: design_text(spec, found.trial, target).encode()}
+    if found.front:
+        files[out / f"{spec.name}_front.md"] = report.front_markdown(found).encode()
+    replace_files(files)
+    written = list(files)
+    if found.front:
+        written.append(report.front(found, out / f"{spec.name}_front.png"))
+    if as_json:
+        _print_json(
+            {
+                "design": spec.name,
+                "files": [str(path) for path in written],
+                "trials": found.trials,
+                "values": dict(zip((v.name for v in spec.search), found.trial.values, strict=True)),
+                "delay": found.trial.delay,
+                "requirements": [_requirement(r) for r in found.requirements],
+                "front": [dict(one.figures) for one in found.front],
+            }
+        )
+    else:
+        console = _console()
+        if found.front:
+            console.print(report.front_table(found))
+        console.print(report.requirements_table(found.requirements))
+        for path in written:
+            console.print(f"wrote {path}", soft_wrap=True)
+    _require(found.requirements, target)
+
+
+@app.command()
 def claims(
     designs: Annotated[
         list[Path] | None,
@@ -582,6 +674,19 @@ def _design(file: Path, out: Path, figures: Path, made: dict[Path, Path], *, qui
         | _margins(margins)
         | _stroke(run, stroke)
     )
+
+
+def _require(requirements: Sequence[Requirement], file: Path) -> None:
+    """Raise CheckError when something asked for is not reached: what, by how much, and what binds most."""
+    failed = sorted((r for r in requirements if not r.holds), key=lambda r: -r.ratio)
+    if failed:
+        text = "; ".join(map(str, failed))
+        raise CheckError(f"{file}: not reached: {text} ({failed[0].name.replace('_', ' ')} binds most)")
+
+
+def _requirement(r: Requirement) -> dict[str, Any]:
+    ratio = r.ratio if r.ratio < float("inf") else None
+    return {**r._asdict(), "ratio": ratio, "holds": r.holds}
 
 
 def _changed(parameters: Parameters, changes: list[str] | None) -> Parameters:
@@ -798,7 +903,6 @@ def _robustness(found: Robustness, box: Mapping[str, float]) -> dict[str, Any]:
             "witness": None if m.witness is None else dict(m.witness),
             "sensitivity": dict(m.sensitivity),
             "cells": sum(proof.cells for proof in m.certificate),
-            "seconds": m.seconds,
             "reason": m.reason,
         }
 
@@ -845,7 +949,7 @@ def _print_json(content: Any) -> None:
             return {key: finite(entry) for key, entry in value.items()}
         if isinstance(value, list):
             return [finite(entry) for entry in value]
-        return None if isinstance(value, float) and value != value else value
+        return None if isinstance(value, float) and not math.isfinite(value) else value
 
     print(json.dumps(finite(content), indent=1, allow_nan=False))
 

@@ -22,7 +22,7 @@ from malta.files import read_file
 
 MAT_HEADER = 116  # bytes of descriptive text that open a MAT-file
 MATRICES = ("model.", "gains.", "feedforward.v0", "verification.poles.")
-VECTORS = ("operating_point.", "feedforward.z_grid", "limits.", "noise.")
+VECTORS = ("operating_point.", "feedforward.z_grid", "limits.", "cost.", "noise.")
 
 _Form = tuple[Callable[[Mapping[str, Any]], bytes], Callable[[bytes], Any]]
 

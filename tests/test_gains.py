@@ -47,6 +47,7 @@ LAYOUT: dict[str, set[str]] = {  # the gain file, version 1
     "signals": {"states", "forces", "measurements"},
     "model": {"A", "B", "C", "Ad", "Bd", "Cd"},
     "gains": {"K", "Ki", "L"},
+    "cost": {"state", "input", "integral"},
     "noise": {"process", "sensor"},
     "feedforward": {"mass", "z_grid", "v0"},
     "current_loop": {"Kp", "Ki", "sample_time"},
@@ -61,6 +62,7 @@ SHAPES: dict[str, tuple[int, ...]] = {  # ten states, five forces, five measurem
     "gains.K": (5, 10), "gains.Ki": (5, 5), "gains.L": (10, 5),
     "operating_point.x": (10,), "operating_point.u": (5,),
     "feedforward.z_grid": (121,), "feedforward.v0": (121, 5),
+    "cost.state": (10,), "cost.input": (5,), "cost.integral": (5,),
     "noise.process": (5,), "noise.sensor": (5,),
     "limits.current": (5,), "limits.voltage": (5,), "limits.force": (5,),
 }  # fmt: skip
