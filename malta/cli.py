@@ -6,6 +6,7 @@ import gc
 import io
 import json
 import math
+import os
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -608,6 +609,8 @@ def claims(
 
 def main() -> None:
     """Entry point: errors become one sentence and an exit code."""
+    # The matrices here are small: threads of the linear algebra would only get into each other's way.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # Numeric libraries make many lasting objects; going through them again and again costs a sixth of the time.
     gc.set_threshold(200_000, 50, 50)
     for stream in (sys.stdout, sys.stderr):

@@ -398,21 +398,24 @@ def _radius(design: Design, share: float) -> float:
 
 
 def test_the_share_on_the_machine_by_hand(found: Found, designs: dict[str, Design]) -> None:
-    """33 and 163 %: where the largest eigenvalue of matrices written out leaves the unit circle."""
-    for name, expected in zip(NAMES, (33, 163), strict=True):
-        share = found.value("the same with observer", name) / 100
-        assert _radius(designs[name], 0.995 * share) < 1 < _radius(designs[name], 1.005 * share)
-        assert 100 * share == pytest.approx(expected, abs=0.7)
+    """33 and 162 %: where the largest eigenvalue of matrices written out leaves the unit circle, K_A up, K_B down.
+
+    The mass, which the proof lets vary too, takes another percent.
+    """
+    for name, expected in zip(NAMES, (33.4, 161.6), strict=True):
+        share = found.value("the same, sampled, with observer", name) / 100
+        assert _radius(designs[name], 0.995 * share) < 1 < _radius(designs[name], 1.02 * share)
+        assert 100 * share == pytest.approx(expected, abs=0.1)
 
 
 @pytest.mark.parametrize("fidelity", ["force", "dq"])
-@pytest.mark.parametrize(("beyond", "grows"), [(0.93, False), (1.07, True)])
+@pytest.mark.parametrize(("beyond", "grows"), [(0.93, False), (1.1, True)])
 def test_the_share_on_the_machine_simulated(
     found: Found, designs: dict[str, Design], fidelity: Any, beyond: float, grows: bool
 ) -> None:
     """Inside, 0.1 um off centre decays; outside it grows, with windings as with lags: it is a slow mode that leaves."""
     for name, design in designs.items():
-        share = beyond * found.value("the same with observer", name) / 100
+        share = beyond * found.value("the same, sampled, with observer", name) / 100
         par: Any = design.spec.parameters
         corner = replace(
             par, K_A=par.K_A * (1 + 0.2 * share), K_B=par.K_B * (1 - 0.2 * share), g=0.0, F_c=0.0
