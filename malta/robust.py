@@ -54,7 +54,7 @@ if TYPE_CHECKING:
     from malta.plant import ComplexArray, FloatArray
 
 DUST = 1e-11  # entries of the balanced closed loop below this, relative, are rounding
-FAR = 1e3  # multiples of the modelled box beyond which nobody looks
+FAR = 1e2  # multiples of the modelled box beyond which nobody looks
 # How close the proven bound comes to the witness, relative:
 EXACT = 5e-7  # where all modes are single
 TOLERANCE = 1e-3  # where modes couple

@@ -1,0 +1,83 @@
+# %% [markdown]
+# # Robustness: where the margin goes, and how to keep it
+#
+# The paper lets m, K_A, K_D and K_B vary by 20 % and reports that its LQR stands "up to around 300 %" of that. An LQR
+# that measures every state is not what runs on the machine: an observer, current loops, a hold and a sample of delay do.
+#
+# **Question:** what is left of the margin on the machine, and what does it take to have it back?
+
+# %%
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+import malta
+
+# The project's root, wherever Jupyter was started.
+os.chdir(next(p for p in (Path.cwd(), *Path.cwd().parents) if (p / "design").is_dir()))
+Path("build").mkdir(exist_ok=True)
+
+# %% [markdown]
+# ## Parameters
+
+# %%
+NAMES = ("table2", "calibrated", "robust")
+BOX = {"m": 0.2, "K_A": 0.2, "K_D": 0.2, "K_B": 0.2}  # either way; 100 % is this box
+controllers = {name: malta.gains.read(f"design/gains/{name}.json") for name in NAMES}
+plant = malta.plant_of(controllers["robust"].parameters)
+
+# %% [markdown]
+# ## The chain
+# From full state feedback to the sampled loop. Every bar is proven: no set of parameters inside destabilizes, at any
+# frequency. Every red mark is a set of parameters that does, by the eigenvalues of the loop.
+
+# %%
+found = {name: malta.robustness(plant, controller, BOX) for name, controller in controllers.items()}
+for name, result in found.items():
+    malta.report.robustness(result, name, BOX, f"build/04_{name}_margins.png")
+    print(name)
+    for link in result.chain:
+        print(f"  {link.name:16} {link.margin};  peak |S| {link.peak:.2f} at the {link.broken_at}")
+    print(f"  {'all travel':16} {result.travel}")
+
+lqr = {name: result.chain[0].margin.upper for name, result in found.items()}
+machine = {name: result.travel for name, result in found.items()}
+assert abs(lqr["table2"] - 5 / 3) < 1e-3 * 5 / 3
+assert abs(lqr["calibrated"] - 3) < 0.03
+assert machine["table2"].upper < 0.34
+assert machine["robust"].lower is not None
+assert machine["robust"].lower >= 3.5
+
+# %% [markdown]
+# **Judgement.** The claimed 300 % is that of full state feedback with a gain four times as stiff as the attraction
+# pulls (`calibrated`). The observer takes half of it, and with the printed noise (`table2`) it takes all but a third of
+# the box. Current loops, hold and delay cost little after that. `robust` is designed for the loop as it is: a fast
+# observer for the bearings, a slow one for the noisy axial sensor, and keeps more than the claim with output feedback.
+
+# %% [markdown]
+# ## A witness flies
+# What the eigenvalues say, the nonlinear machine should show: just inside the boundary a small step dies out, just beyond
+# it grows. Simulated with the forces as first-order lags, as the proof has them, without loads.
+
+
+# %%
+def flown(name: str, share: float) -> float:
+    """The motion (m) half a second after 0.1 um off centre, at a share of the way to the witness."""
+    margin = found[name].chain[-1].margin
+    assert margin.witness is not None
+    nominal = plant.parameters
+    far = {k: getattr(nominal, k) + share * margin.moved[k] for k in BOX}
+    true = malta.plant_of(replace(nominal, **far, F_c=0.0, g=0.0))  # type: ignore[arg-type]
+    c = controllers[name]
+    alone = replace(c, feedforward=replace(c.feedforward, v0=0 * c.feedforward.v0))
+    scenario = malta.Scenario("witness", 0.6, malta.references.hold, {"x": 1e-7, "z": 1e-7}, fidelity="force")
+    run = malta.simulate(true, alone, scenario)
+    return float(np.abs(run.p[-2000:]).max())
+
+
+for name in ("calibrated", "robust"):
+    inside, outside = flown(name, 0.9), flown(name, 1.1)
+    print(f"{name}: {inside * 1e6:.2g} um are left inside the boundary, {outside * 1e6:.2g} um beyond")
+    assert inside < 2e-8 < 1e-6 < outside
