@@ -56,6 +56,7 @@ if TYPE_CHECKING:  # the contents page, as type checkers and readers see it
     from malta.synthesize import lqi as lqi
     from malta.synthesize import lqr as lqr
     from malta.synthesize import synthesize as synthesize
+    from malta.tune import tune as tune
     from malta.uncertain import Compensator as Compensator
     from malta.uncertain import UncertainSystem as UncertainSystem
     from malta.uncertain import uncertain as uncertain
@@ -78,6 +79,7 @@ _NAMES = {  # the same, for the first use of each name
     "simulate": ("Fault", "Scenario", "Trajectory", "simulate", "stroke_figures"),
     "spec": ("Spec", "Weights", "read_design"),
     "synthesize": ("calibrate", "kalman", "lqg", "lqi", "lqr", "synthesize"),
+    "tune": ("tune",),
     "uncertain": ("Compensator", "UncertainSystem", "uncertain"),
     "verify": ("Margins", "verify"),
 }

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from malta.experiments import Case, Experiment, Merit
     from malta.findings import Finding
     from malta.plant import FloatArray, Plant
+    from malta.tune import Tuned
 
 Published = Mapping[str, Any]  # a file of data/published/
 
@@ -708,6 +709,47 @@ def _ended(found: Campaign, row: int) -> str:
     name = verdicts(found.plan.plant)[int(found.batch.verdict[row])]
     text = f"run {found.index[row]}"
     return text if name == "completed" else f"{text}\n{name.replace(' at ', chr(10) + 'at ')}"
+
+
+def front_figure(tuned: Tuned) -> Figure:
+    """Noise of the forces and motion against the proven margin: what the search found, and what it took."""
+    from matplotlib.figure import Figure
+
+    asked, chosen, front = tuned.spec.specification, tuned.trial, tuned.front
+    figure = Figure(figsize=(9.0, 4.6), dpi=120)
+    figure.subplots_adjust(left=0.085, right=0.98, bottom=0.115, top=0.8, wspace=0.25)
+    kept = [one for one in front if one.values == chosen.values] or [chosen]
+    found = (
+        f"{tuned.trials} designs tried; taken: margin {100 * kept[0].figures.get('margin', math.nan):.0f} %"
+    )
+    figure.suptitle(f"{tuned.spec.name}: margin against noise", fontsize=11, y=0.985)
+    figure.text(0.5, 0.925, found, fontsize=9, color="#4a4a4a", ha="center", va="top")
+    margins = [100 * one.figures["margin"] for one in front]
+    panels: Any = figure.subplots(1, 2)
+    sides = (
+        (("force_noise", "bearing force", 1.0, 0), ("thrust_noise", "thrust", 1.0, 2)),
+        (("radial_motion", "radial", 1e6, 0), ("axial_motion", "axial", 1e6, 2)),
+    )
+    for axes, lines, y in zip(
+        panels, sides, ("noise of the commanded force [N rms]", "true motion [µm rms]"), strict=True
+    ):
+        axes.set_yscale("log")
+        for name, label, scale, style in lines:
+            if not all(name in one.figures for one in front):
+                continue
+            sizes = [scale * one.figures[name] for one in front]
+            axes.plot(margins, sizes, marker="o", markersize=4, label=label, **STYLES[style])
+            axes.plot(
+                100 * kept[0].figures["margin"],
+                scale * kept[0].figures[name],
+                **(DOT | {"markersize": 10}),
+                mfc="none",
+            )
+        if asked.margin is not None:
+            axes.axvline(100 * asked.margin, **BOUND)
+        _finish(axes, "robust margin over the travel, proven [% of the box]", y, legend=2)
+        axes.margins(x=0.04)
+    return figure
 
 
 # --- what figures are made of ---

@@ -19,6 +19,7 @@ from malta.figures import STYLES as STYLES
 from malta.figures import Published, number, read_out
 from malta.figures import distributions_figure as distributions_figure
 from malta.figures import experiment_figure as experiment_figure
+from malta.figures import front_figure as front_figure
 from malta.figures import save as save
 from malta.figures import stroke_figure as stroke_figure
 from malta.figures import worst_figure as worst_figure
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
     from malta.experiments import Experiment, Merit
     from malta.plant import ComplexArray, FloatArray
     from malta.robust import Margin
+    from malta.tune import Requirement, Tuned
 
 
 # --- pages ---
@@ -444,6 +446,69 @@ def _printed(merit: Merit, published: Published) -> str:
         return ""
     value = f"{read_out(published, merit.published, merit.unit):.6g}"
     return f"<= {value}" if merit.relation == "at most" else value
+
+
+def requirements_table(requirements: Sequence[Requirement]) -> Table:
+    """What a design was asked for, what it has, and how near each limit is."""
+    table = _table("Requirements", "requirement", "asked", "found", "of the limit", "", "from")
+    for r in requirements:
+        scale, unit = UNITS.get(r.unit, (1.0, ""))
+        bound = ">=" if r.more else "<="
+        _row(
+            table,
+            r.name.replace("_", " "),
+            f"{bound} {r.asked * scale:.4g} {unit}".rstrip(),
+            f"{r.found * scale:.4g} {unit}".rstrip(),
+            f"{100 * r.ratio:.1f} %",
+            "holds" if r.holds else "FAILS",
+            r.how,
+        )
+    return table
+
+
+UNITS = {"m": (1e6, "um"), "rad/s": (1.0, "rad/s"), "N": (1.0, "N"), "kg": (1.0, "kg")}
+FRONT_COLUMNS = {
+    "margin": ("margin, proven", 100.0, "%"),
+    "force_noise": ("bearing force", 1.0, "N rms"),
+    "thrust_noise": ("thrust", 1.0, "N rms"),
+    "radial_motion": ("radial motion", 1e6, "um rms"),
+    "axial_motion": ("axial motion", 1e6, "um rms"),
+    "peak_sensitivity": ("peak sensitivity", 1.0, ""),
+    "bandwidth": ("bandwidth", 1.0, "rad/s"),
+}
+
+
+def front_rows(tuned: Tuned) -> tuple[list[str], list[list[str]]]:
+    """The Pareto front as headings and cells: a row for each trial, the chosen one with a star."""
+    shown = [name for name in FRONT_COLUMNS if any(name in one.figures for one in tuned.front)]
+    heads = [f"{FRONT_COLUMNS[k][0]} [{FRONT_COLUMNS[k][2]}]".removesuffix(" []") for k in shown]
+    rows = [
+        [f"{one.figures[k] * FRONT_COLUMNS[k][1]:.4g}" if k in one.figures else "" for k in shown]
+        + ["*" if one.values == tuned.trial.values else ""]
+        for one in tuned.front
+    ]
+    return [*heads, ""], rows
+
+
+def front_table(tuned: Tuned) -> Table:
+    """Margin against force noise against motion, by margin."""
+    heads, rows = front_rows(tuned)
+    table = _table("What the margin costs (* chosen)", *heads)
+    for row in rows:
+        _row(table, *row)
+    return table
+
+
+def front_markdown(tuned: Tuned) -> str:
+    """The same table for a page."""
+    heads, rows = front_rows(tuned)
+    lines = ["| " + " | ".join(row) + " |" for row in (heads, ["---:"] * len(heads), *rows)]
+    return "\n".join([*lines, ""])
+
+
+def front(tuned: Tuned, path: str | Path) -> Path:
+    """Draw the Pareto front."""
+    return save(front_figure(tuned), path)
 
 
 def _table(title: str, *columns: str) -> Table:

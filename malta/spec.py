@@ -3,6 +3,9 @@
 Weights are dimensionless and stand on explicit bases (Bryson's rule): Q = diag(q / base^2). Noise is given as the
 standard deviation or the variance of one sample. Wherever numbers are expected, `{ published = "table_II.state" }`
 stands for what the machine's paper prints under that name in data/published/.
+
+What `malta tune` is to reach and what it may vary stand in [specification] and [search]; they shape no gains by
+themselves.
 """
 
 from __future__ import annotations
@@ -12,10 +15,10 @@ import json
 import math
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from pydantic import BeforeValidator, Field, StrictBool, StrictInt, StrictStr
@@ -98,6 +101,51 @@ class Weights:
         return np.diag(self.q_i / self.q_i_base**2)
 
 
+@dataclass(frozen=True)
+class Specification:
+    """What a design shall reach; None: not asked for. Bounds from below: margin, bandwidth."""
+
+    margin: float | None = None  # multiples of the box of `uncertainty`, anywhere in the travel
+    peak_sensitivity: float | None = None  # of every sensor, on the machine
+    bandwidth: float | None = None  # rad/s, by every definition
+    radial_motion: float | None = None  # m rms, of the true outputs, from the sensors' noise and steps
+    axial_motion: float | None = None  # m rms, of the stroke's
+    force_noise: float | None = None  # N rms, commanded bearing forces
+    thrust_noise: float | None = None  # N rms, commanded thrust
+    tracking_error: float | None = (
+        None  # m, largest in the stroke with 5 % too much or too little drive force
+    )
+    radial_deviation: float | None = None  # m, largest in these strokes
+    tilt_deviation: float | None = None  # m, of the sensor plane that a tilt holds
+    payload: float | None = None  # kg, picked up and carried through the stroke without touchdown
+    lift_off: bool = False  # from rest on the touchdown bearing, by every start-up estimator
+
+
+SPECIFIED = {  # SI units
+    "margin": "1",
+    "peak_sensitivity": "1",
+    "bandwidth": "rad/s",
+    "radial_motion": "m",
+    "axial_motion": "m",
+    "force_noise": "N",
+    "thrust_noise": "N",
+    "tracking_error": "m",
+    "radial_deviation": "m",
+    "tilt_deviation": "m",
+    "payload": "kg",
+}
+
+
+class Variable(NamedTuple):
+    """A number that the search may choose: entries of the design file that share it."""
+
+    name: str
+    entries: tuple[str, ...]  # as "bases.state.x"
+    low: float
+    high: float
+    unit: str  # of low and high, as the file will hold it
+
+
 @dataclass(frozen=True, eq=False)
 class Spec:
     """A design file, read and checked."""
@@ -115,11 +163,31 @@ class Spec:
     current_loop_delay: bool  # whether the current loops are designed with the machine's dead time
     weights: Weights
     uncertainty: Mapping[str, float]  # relative, either way, by parameter
+    specification: Specification = Specification()
+    search: tuple[Variable, ...] = ()
+    delays: tuple[int, ...] = ()  # that the search may choose from
 
     @property
     def plant(self) -> Plant:
         """The machine that the controller is designed for."""
         return plant_of(self.parameters)
+
+    def varied(self, values: Sequence[float]) -> Weights:
+        """The weights with these values (in their own units) of the variables of the search."""
+        fields = {name: np.array(getattr(self.weights, name)) for name in self.weights.__dataclass_fields__}
+        for variable, value in zip(self.search, values, strict=True):
+            for entry in variable.entries:
+                field, index, unit, squared = _place(entry, self.plant, self.path)
+                si = value if unit == "1" else to_si(value, variable.unit, unit, self.path, entry)
+                fields[field][index] = si * si if squared else si
+        return replace(self.weights, **fields)
+
+    def value_of(self, variable: Variable) -> float:
+        """What the file holds now for a variable of the search, in its unit."""
+        field, index, unit, squared = _place(variable.entries[0], self.plant, self.path)
+        si = float(getattr(self.weights, field)[index])
+        si = math.sqrt(si) if squared else si
+        return si if unit == "1" else si / to_si(1.0, variable.unit, unit, self.path, variable.name)
 
 
 def _table_or_SI(value: Any) -> Any:
@@ -148,6 +216,33 @@ class _NoiseTable(Record):
     sensor: dict[StrictStr, Quantity]
 
 
+class _Range(Record):
+    vary: Annotated[list[StrictStr], Field(min_length=1)]
+    low: Annotated[Finite, Field(gt=0)]
+    high: Annotated[Finite, Field(gt=0)]
+    unit: StrictStr = "1"
+
+
+class _SearchTable(Record):
+    delay: list[Annotated[StrictInt, Field(ge=0, le=10)]] = Field(default_factory=list)
+    numbers: dict[StrictStr, _Range]
+
+
+class _SpecificationTable(Record):
+    margin: Annotated[Finite, Field(gt=0)] | None = None
+    peak_sensitivity: Annotated[Finite, Field(gt=1)] | None = None
+    bandwidth: Quantity | None = None
+    radial_motion: Quantity | None = None
+    axial_motion: Quantity | None = None
+    force_noise: Quantity | None = None
+    thrust_noise: Quantity | None = None
+    tracking_error: Quantity | None = None
+    radial_deviation: Quantity | None = None
+    tilt_deviation: Quantity | None = None
+    payload: Quantity | None = None
+    lift_off: StrictBool = False
+
+
 class _DesignFile(Record):
     name: Annotated[StrictStr, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")]
     summary: StrictStr
@@ -162,6 +257,8 @@ class _DesignFile(Record):
     bases: _BasesTable
     noise: _NoiseTable
     uncertainty: dict[StrictStr, Annotated[Finite, Field(gt=0, lt=1)]]
+    specification: _SpecificationTable | None = None
+    search: _SearchTable | None = None
 
 
 def read_design(path: str | Path) -> Spec:
@@ -186,7 +283,9 @@ def read_design(path: str | Path) -> Spec:
     for name in content.uncertainty:
         if name not in units_of(par):
             raise InputError(path, f"uncertainty.{name}", "an unknown parameter", ", ".join(units_of(par)))
-    shaping = json.dumps(content.model_dump(exclude={"summary", "machine"}), sort_keys=True)
+    shaping = json.dumps(
+        content.model_dump(exclude={"summary", "machine", "specification", "search"}), sort_keys=True
+    )
     Ts = to_si(content.sample_time.value, content.sample_time.unit, "s", path, "sample_time")
     if not Ts > 0:
         raise InputError(path, "sample_time", f"{Ts:g} s", "more than 0 s")
@@ -207,7 +306,7 @@ def read_design(path: str | Path) -> Spec:
         )
     except InputError as error:  # the record does not know the file
         raise InputError(path, error.field, error.found, error.expected) from error
-    return Spec(
+    spec = Spec(
         name=content.name,
         summary=content.summary,
         path=path,
@@ -222,6 +321,111 @@ def read_design(path: str | Path) -> Spec:
         weights=weights,
         uncertainty=dict(content.uncertainty),
     )
+    return replace(spec, specification=_specification(content, spec), **_search(content.search, raw, spec))
+
+
+def _specification(content: _DesignFile, spec: Spec) -> Specification:
+    """What is asked for, in SI; InputError for what no design could reach or what contradicts itself."""
+    table, path = content.specification, spec.path
+    if table is None:
+        return Specification()
+    values: dict[str, float] = {}
+    for name, unit in SPECIFIED.items():
+        given = getattr(table, name)
+        if given is not None:
+            field = f"specification.{name}"
+            values[name] = (
+                to_si(given.value, given.unit, unit, path, field)
+                if isinstance(given, Quantity)
+                else float(given)
+            )
+            _positive(values[name], path, field, unit)
+    if not values and not table.lift_off:
+        expected = "at least one of " + " ".join([*SPECIFIED, "lift_off"])
+        raise InputError(path, "specification", "nothing to reach", expected)
+    found = Specification(**values, lift_off=table.lift_off)
+    if found.margin is not None:
+        if not spec.uncertainty:
+            raise InputError(path, "specification.margin", "no uncertainty in the file", "its parameters")
+        widest = max(spec.uncertainty, key=lambda name: spec.uncertainty[name])
+        most = 1 / spec.uncertainty[widest]
+        if found.margin >= most:
+            raise InputError(
+                path,
+                "specification.margin",
+                f"{found.margin:g}",
+                f"less than {most:g}, where {widest} is zero",
+            )
+    if found.bandwidth is not None and found.bandwidth >= math.pi / spec.sample_time:
+        nyquist = math.pi / spec.sample_time
+        raise InputError(
+            path,
+            "specification.bandwidth",
+            f"{found.bandwidth:g} rad/s",
+            f"less than half of sampling, {nyquist:.0f}",
+        )
+    return found
+
+
+def _search(table: _SearchTable | None, raw: Mapping[str, Any], spec: Spec) -> dict[str, Any]:
+    """Variables and delays. An entry belongs to one variable, and stands in the file as a number of its own."""
+    if table is None:
+        return {}
+    path, seen, variables = spec.path, set[str](), []
+    for name, given in table.numbers.items():
+        where = f"search.numbers.{name}"
+        for entry in given.vary:
+            _, _, unit, _ = _place(entry, spec.plant, path, f"{where}.vary")
+            if unit == "1" and given.unit != "1":
+                raise InputError(path, f"{where}.unit", repr(given.unit), f"no unit, as {entry} has none")
+            if unit != "1":
+                to_si(1.0, given.unit, unit, path, where)
+            if not _stands(entry, raw):
+                expected = "a number of the file itself, not SI or published"
+                raise InputError(path, f"{where}.vary", f"{entry}, which is none", expected)
+            if entry in seen:
+                raise InputError(path, f"{where}.vary", f"{entry} a second time", "each entry once")
+            seen.add(entry)
+        if not given.low < given.high:
+            raise InputError(path, where, f"{given.low:g} to {given.high:g}", "low below high")
+        variables.append(Variable(name, tuple(given.vary), given.low, given.high, given.unit))
+    if not variables:
+        raise InputError(path, "search.numbers", "nothing to vary", "at least one number")
+    if any(table.delay) and spec.discretization == "backward-euler":
+        raise InputError(path, "search.delay", str(table.delay), "0 with backward-euler, which has no delay")
+    return {"search": tuple(variables), "delays": tuple(dict.fromkeys(table.delay)) or (spec.delay,)}
+
+
+def _stands(entry: str, raw: Mapping[str, Any]) -> bool:
+    node: Any = raw
+    for key in entry.split("."):
+        node = node.get(key) if isinstance(node, Mapping) else None
+    return node is not None and (not isinstance(node, Mapping) or "value" in node)
+
+
+def _place(entry: str, plant: Plant, where: Path, field: str = "search") -> tuple[str, int, str, bool]:
+    """Where an entry of the design file stands in Weights: field, index, SI unit, whether as its square."""
+    integrals = [Signal(s.name, f"{s.unit} s") for s in plant.outputs]
+    plain = [Signal(s.name, "1") for s in plant.design_states + plant.inputs + plant.outputs]
+    tables: dict[str, tuple[str, Sequence[Signal], bool]] = {
+        "bases.state": ("q_base", plant.design_states, False),
+        "bases.input": ("r_base", plant.inputs, False),
+        "bases.integral": ("q_i_base", integrals, False),
+        "noise.process": ("process_variance", plant.inputs, True),
+        "noise.sensor": ("sensor_variance", plant.outputs, True),
+        "weights.state": ("q", plain[: len(plant.design_states)], False),
+        "weights.input": ("r", plain[len(plant.design_states) :][: len(plant.inputs)], False),
+        "weights.integral": ("q_i", plain[-len(plant.outputs) :], False),
+    }
+    table, _, name = entry.rpartition(".")
+    if table not in tables:
+        raise InputError(where, field, repr(entry), "an entry as bases.state.x: " + " ".join(tables))
+    weight, signals, squared = tables[table]
+    names = [s.name for s in signals]
+    if name not in names:
+        raise InputError(where, field, repr(entry), f"one of {table}: {' '.join(names)}")
+    index = names.index(name)
+    return weight, index, signals[index].unit, squared
 
 
 def _resolve(

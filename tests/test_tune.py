@@ -1,0 +1,530 @@
+"""Tuning: what the flagship has, that quick figures are the verified ones, that a search can be resumed."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from conftest import ROOT, refusal
+
+import malta
+from malta import cli, gains, report
+from malta.controller import linear_law
+from malta.experiments import experiment
+from malta.riccati import eigenvalues
+from malta.spec import Specification
+from malta.tune import (
+    LINEAR,
+    Effort,
+    Requirement,
+    Tuned,
+    _clusters,
+    _figures,
+    _Journal,
+    _Search,
+    design_text,
+    drive_constant,
+    found_spec,
+    judged,
+    law_of,
+    merged,
+    noise_of,
+    problem_sha256,
+)
+from malta.tune import tune as tuned
+from malta.verify import BANDWIDTHS, loop, machine_loop
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from malta.controller import Controller
+    from malta.linearize import LinearModel
+    from malta.spec import Spec
+    from malta.verify import Margins
+
+ROBUST = ROOT / "design" / "robust.toml"
+QUICK = Effort(generations=1, polish=3, front=0)
+
+
+@pytest.fixture(scope="module")
+def spec() -> Spec:
+    return malta.read_design(ROBUST)
+
+
+@pytest.fixture(scope="module")
+def flagship(spec: Spec) -> tuple[LinearModel, Controller, Margins]:
+    """The shipped gains, as a machine would read them, and what verify finds."""
+    model = malta.linearize(spec.plant, spec.plant.at())
+    controller = gains.read(ROOT / "design" / "gains" / "robust.json")
+    return model, controller, malta.verify(model, controller, spec.uncertainty)
+
+
+@pytest.fixture(scope="module")
+def requirements(spec: Spec) -> dict[tuple[str, str], Requirement]:
+    return {(r.name, r.how): r for r in judged(spec)}
+
+
+@pytest.fixture
+def small(spec: Spec) -> Spec:
+    """The flagship's search of the axial loop alone, with linear figures, which take milliseconds."""
+    asked = Specification(margin=3.5, peak_sensitivity=2.0, bandwidth=400.0)
+    return replace(spec, specification=asked, delays=(0,), search=spec.search[4:])
+
+
+# --- the flagship ---
+
+
+def test_the_flagship_meets_every_requirement(requirements: dict[tuple[str, str], Requirement]) -> None:
+    names = {name for name, _ in requirements}
+    assert names == {*LINEAR, "tracking_error", "radial_deviation", "payload", "lift_off"}
+    assert {name: r.ratio for name, r in requirements.items() if not r.holds} == {}
+
+
+def test_its_margin_is_proven_over_the_travel(flagship: tuple[LinearModel, Controller, Margins]) -> None:
+    """350 % of the 20 % box on m, K_A, K_D and K_B: they all may vary by 70 %."""
+    robust = flagship[2].robust
+    assert robust is not None
+    assert robust.lower is not None
+    assert 3.5 <= robust.lower <= robust.upper <= 1.002 * robust.lower
+
+
+@pytest.mark.parametrize("z", [-15e-3, -7e-3, 0.0, 4e-3, 15e-3])
+def test_every_corner_at_350_percent_is_stable(
+    z: float, spec: Spec, flagship: tuple[LinearModel, Controller, Margins]
+) -> None:
+    """Eigenvalues of the machine's loop, built by another way than the proof's, and one corner that is lost beyond."""
+    par, controller = spec.parameters, flagship[1]
+
+    def radius(share: float, signs: tuple[float, ...]) -> float:
+        values = {
+            name: getattr(par, name) * (1 + 0.2 * share * sign)
+            for name, sign in zip(("m", "K_A", "K_D", "K_B"), signs, strict=True)
+        }
+        plant = malta.plant_of(replace(par, **values))
+        model = malta.linearize(plant, plant.at(z=z))
+        closed = loop(model, controller, delay=1, current_loops=True).closed
+        return float(np.abs(eigenvalues(closed)).max())
+
+    corners = np.array(np.meshgrid(*[(-1, 1)] * 4)).reshape(4, -1).T
+    assert max(radius(3.5, tuple(corner)) for corner in corners.tolist()) < 1
+    assert max(radius(3.75, tuple(corner)) for corner in corners.tolist()) > 1
+
+
+def test_its_sensitivity_and_bandwidth(flagship: tuple[LinearModel, Controller, Margins]) -> None:
+    margins = flagship[2]
+    for sensor in ("x1", "y1", "x2", "y2", "z"):
+        assert margins.peak_sensitivity[sensor] <= 2
+    assert margins.peak_sensitivity["sigma_max"] <= 2
+    for definition in BANDWIDTHS:
+        assert margins.bandwidth[definition] >= 400, definition
+
+
+def test_its_noise_by_two_ways(spec: Spec, flagship: tuple[LinearModel, Controller, Margins]) -> None:
+    """The covariance, the integral of |T|^2 over all frequencies, and the simulated machine with its steps of 1 um."""
+    model, controller, _ = flagship
+    machine = machine_loop(model, controller)
+    motion, force = noise_of(machine, spec.plant)
+    w, V = np.geomspace(1e-3, np.pi / 50e-6, 20_000), np.array([0.5e-6**2 + 1e-12 / 12] * 4 + [15e-6**2])
+    spectrum = np.abs(np.eye(5) - machine.sensitivity(w)) ** 2 @ V
+    variance = np.trapezoid(spectrum, w, axis=0) * 50e-6 / np.pi
+    assert motion == pytest.approx(np.sqrt(variance), rel=1e-3)
+    assert motion[:4].max() <= 0.15e-6
+    assert motion[4] <= 10e-6
+    assert force[:4].max() <= 0.5
+    run = experiment("hold", spec.plant, controller, duration=0.6).run
+    rest = slice(-6000, None)
+    assert run.p[rest, :4].std(axis=0).max() <= 0.15e-6
+    assert run.p[rest, 4].std() <= 10e-6
+    assert run.v[rest, :4].std(axis=0) == pytest.approx(force[:4], rel=0.08)
+
+
+def test_its_observer_has_the_ten_states_of_the_machine(
+    flagship: tuple[LinearModel, Controller, Margins],
+) -> None:
+    assert len(flagship[1].states) == 10
+    assert flagship[1].delay == 0
+
+
+def test_its_gains_are_those_of_its_file(
+    spec: Spec, flagship: tuple[LinearModel, Controller, Margins]
+) -> None:
+    model, committed, _ = flagship
+    made = malta.synthesize(spec, model)
+    assert made.spec_sha256 == committed.spec_sha256
+    for name in ("K", "Ki", "L", "Ad", "Bd"):
+        entry = getattr(committed, name)
+        assert getattr(made, name) == pytest.approx(entry, abs=1e-9 * np.abs(entry).max())
+
+
+def test_equal_ratios_of_stiffness_keep_plane_2_still(
+    flagship: tuple[LinearModel, Controller, Margins],
+) -> None:
+    """K1 / k in x and in beta: what the attraction leaves of a tilt is then the same in both."""
+    model, c, _ = flagship
+    K1 = model.force_map @ c.K[:, :5]
+    ratios = np.diag(K1) / np.where(np.diag(model.stiffness) > 0, np.diag(model.stiffness), np.inf)
+    assert ratios[[0, 1]] == pytest.approx(ratios[[3, 4]], rel=0.05)
+    assert ratios[0] > 7
+
+
+# --- quick figures are the verified ones ---
+
+
+def test_the_law_of_gains_is_the_controllers(
+    spec: Spec, flagship: tuple[LinearModel, Controller, Margins]
+) -> None:
+    from malta.synthesize import gains as gains_of
+
+    model = flagship[0]
+    for delay in (0, 2):
+        weights = spec.weights
+        c = malta.lqg(model, weights, 50e-6, delay=delay)
+        law, exact = law_of(gains_of(model, weights, 50e-6, "sampled-data", delay), 50e-6), linear_law(c)
+        for name, own in (("A", exact.A), ("B", exact.B_y), ("C", exact.C), ("D", exact.D_y)):
+            assert getattr(law, name) == pytest.approx(own, rel=1e-12, abs=1e-12 * np.abs(own).max())
+
+
+def test_quick_figures_are_those_of_verify(
+    spec: Spec, flagship: tuple[LinearModel, Controller, Margins], requirements: Any
+) -> None:
+    clusters = _clusters(spec)
+    assert [len(c.variables) for c in clusters] == [4, 4]
+    assert [len(c.groups) for c in clusters] == [1, 1]  # y and alpha are the mirror image of x and beta
+    quick = merged([_figures(spec, g, spec.weights, 0) for c in clusters for g in c.groups])
+    margins = flagship[2]
+    assert margins.robust is not None
+    assert margins.robust.lower is not None
+    assert quick["margin"] == pytest.approx(margins.robust.lower, rel=5e-3)
+    assert quick["peak_sensitivity"] == pytest.approx(
+        requirements_of(requirements, "peak_sensitivity"), rel=5e-3
+    )
+    assert quick["bandwidth"] <= min(margins.bandwidth.values()) * 1.001  # every loop's own crossover too
+    for name in ("radial_motion", "axial_motion", "force_noise", "thrust_noise"):
+        # The machine's cogging and its feedforward, which the trials leave out, are worth 0.6 % of the axial motion.
+        assert quick[name] == pytest.approx(requirements[name, "covariance"].found, rel=1e-2)
+    assert quick["tilt_deviation"] == pytest.approx(requirements_of(requirements, "tilt_deviation"), rel=0.35)
+
+
+def requirements_of(requirements: dict[tuple[str, str], Requirement], name: str) -> float:
+    return next(r.found for (own, _), r in requirements.items() if own == name)
+
+
+def test_an_unstable_trial_has_no_figures(spec: Spec) -> None:
+    cluster = _clusters(spec)[0]
+    hasty = replace(spec.weights, process_variance=spec.weights.process_variance * 1e10)
+    assert _figures(spec, cluster.groups[0], replace(hasty, q_base=spec.weights.q_base / 30), 0) == {}
+    search = _Search(spec, cluster, 0, _Journal(None, spec, restart=False))
+    search.journal.known = {f"{cluster.variables} 0 {search.values(search.start)}": {}}
+    assert search.worst(search.start) == 1e3
+
+
+def test_ratios_count_from_either_side() -> None:
+    assert Requirement("margin", 3.5, 7.0, "1", "").ratio == 0.5
+    assert Requirement("force_noise", 0.5, 1.0, "N", "").ratio == 2.0
+    assert Requirement("lift_off", 1.0, 0.0, "1", "").ratio == math.inf
+    assert not Requirement("tilt_deviation", 1e-6, math.nan, "m", "").holds
+
+
+def test_the_drive_constant_is_found(spec: Spec) -> None:
+    assert drive_constant(spec.plant) == "K_D"
+
+
+# --- the search ---
+
+
+def same(a: Tuned, b: Tuned) -> None:
+    assert a.trial == b.trial
+    assert a.front == b.front
+    assert a.requirements == b.requirements
+    assert a.trials == b.trials
+
+
+def test_a_search_that_was_interrupted_ends_where_it_would_have(small: Spec, tmp_path: Path) -> None:
+    whole = tuned(small, tmp_path / "whole.jsonl", effort=QUICK)
+    journal = tmp_path / "cut.jsonl"
+    calls = 0
+
+    def stop(_: float) -> None:
+        nonlocal calls
+        calls += 1
+        if calls == 60:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        tuned(small, journal, effort=QUICK, progress=stop)
+    lines = journal.read_text(encoding="utf-8").splitlines()
+    assert 50 < len(lines) < whole.trials
+    journal.write_text("\n".join([*lines[:-1], lines[-1][:20]]), encoding="utf-8")  # while it was written
+    shares: list[float] = []
+    same(tuned(small, journal, effort=QUICK, progress=shares.append), whole)
+    assert shares[-1] == 1.0
+    assert shares == sorted(shares)
+    # Nothing is left to compute: the journal is not touched.
+    before = journal.read_bytes()
+    same(tuned(small, journal, effort=QUICK), whole)
+    assert journal.read_bytes() == before
+
+
+def test_the_journal_of_another_search_is_refused(small: Spec, tmp_path: Path) -> None:
+    journal = tmp_path / "trials.jsonl"
+    journal.write_text(json.dumps({"malta-tune": 1, "problem": "another"}) + "\n", encoding="utf-8")
+    refusal(lambda: _Journal(journal, small, restart=False), journal)
+    _Journal(journal, small, restart=True)
+    assert problem_sha256(small) in journal.read_text(encoding="utf-8")
+    assert problem_sha256(small) != problem_sha256(replace(small, specification=Specification(margin=3.0)))
+
+
+def test_what_is_found_has_the_figures_that_were_found(small: Spec, tmp_path: Path) -> None:
+    """Through the written file: the same bits of weights, comments kept, the machine found from another folder."""
+    clusters = _clusters(small)
+    search = _Search(small, clusters[-1], 0, _Journal(None, small, restart=False))
+    found = tuned(small, effort=Effort(generations=0, polish=2, front=0))
+    assert found.front == ()
+    target = tmp_path / "deep" / "robust.toml"
+    target.parent.mkdir()
+    target.write_text(design_text(small, found.trial, target), encoding="utf-8")
+    again = malta.read_design(target)
+    assert again.parameters == small.parameters
+    for name in again.weights.__dataclass_fields__:
+        assert (getattr(again.weights, name) == getattr(found.spec.weights, name)).all(), name
+    old, new = (path.read_text(encoding="utf-8").splitlines() for path in (ROBUST, target))
+    assert len(old) == len(new)
+    changed = {a.split("=")[0].strip() for a, b in zip(old, new, strict=True) if a != b}
+    assert changed <= {"machine", "x", "y", "z", "alpha", "beta", "z_dot", "x1", "y1", "x2", "y2", "process"}
+    assert search.values(search.start) == tuple(
+        float(f"{small.value_of(small.search[i]):.5g}") for i in clusters[-1].variables
+    )
+
+
+def test_the_front_trades_margin_for_noise(
+    spec: Spec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys.modules["malta.tune"], "FRONT", (0.65, 0.95))
+    asked = Specification(margin=3.5, peak_sensitivity=2.0, bandwidth=400.0)
+    radial = replace(spec, specification=asked, delays=(0,), search=spec.search[:4])
+    found = tuned(radial, effort=Effort(generations=0, polish=0, front=20))
+    margins = [one.figures["margin"] for one in found.front]
+    assert margins == sorted(margins)
+    assert any(one.values == found.trial.values for one in found.front)
+    least = {
+        share: min(o.figures["force_noise"] for o in found.front if o.figures["margin"] >= share)
+        for share in (2.2, 3.3)
+    }
+    assert least[2.2] < 0.7 * least[3.3]
+    picture = report.front(found, tmp_path / "front.png")
+    assert picture.stat().st_size > 10_000
+    rows = report.front_markdown(found).splitlines()
+    assert len(rows) == 2 + len(found.front)
+    assert len({row.count("|") for row in rows}) == 1
+
+
+@pytest.mark.slow
+def test_a_poor_start_finds_its_way(spec: Spec) -> None:
+    """From the middle of every range, where the loop has a margin of a third of what is asked for, or none."""
+    middle = [math.sqrt(v.low * v.high) for v in spec.search]
+    asked = replace(
+        spec.specification, tracking_error=None, radial_deviation=None, payload=None, lift_off=False
+    )
+    poor = replace(spec, weights=spec.varied(middle), delays=(0,), specification=asked)
+    found = tuned(poor, effort=Effort(generations=15, polish=30, front=0))
+    assert found.reached, found.binding
+    assert found.trial.figures["margin"] >= 3.5
+
+
+def test_an_impossible_wish_names_what_binds(small: Spec) -> None:
+    asked = Specification(margin=4.4, peak_sensitivity=1.2, bandwidth=400.0)
+    found = tuned(replace(small, specification=asked), effort=Effort(generations=0, polish=1, front=0))
+    assert not found.reached
+    assert found.binding.name in ("margin", "peak_sensitivity")
+    assert "asked for at" in str(found.binding)
+
+
+def test_a_search_needs_something_to_reach_and_to_vary(spec: Spec) -> None:
+    refusal(lambda: tuned(replace(spec, specification=Specification())), spec.path)
+    refusal(lambda: tuned(replace(spec, search=())), spec.path)
+    table2 = malta.read_design(ROOT / "design" / "table2.toml")
+    assert table2.specification == Specification()
+    assert (table2.search, table2.delays) == ((), ())
+
+
+# --- the design file ---
+
+MARGIN = "margin = 3.5 "
+PEAK = "peak_sensitivity = 2 "
+BANDWIDTH = 'bandwidth = { value = 400, unit = "rad/s" }'
+DELAYS = "delay = [0, 1]"
+STROKE = 'stroke = { vary = ["bases.state.z"], low = 3, high = 100, unit = "um" }'
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "field"),
+    [
+        (MARGIN, "margni = 3.5 ", "specification.margni"),
+        (MARGIN, 'margin = "3.5" ', "specification.margin"),
+        (MARGIN, "margin = 5 ", "specification.margin"),
+        (MARGIN, "margin = -1 ", "specification.margin"),
+        (MARGIN, "margin = nan ", "specification.margin"),
+        (PEAK, "peak_sensitivity = 0.9 ", "specification.peak_sensitivity"),
+        (BANDWIDTH, "bandwidth = 400", "specification.bandwidth"),
+        (BANDWIDTH, 'bandwidth = { value = 400, unit = "Hz" }', "specification.bandwidth.unit"),
+        (BANDWIDTH, 'bandwidth = { value = 0, unit = "rad/s" }', "specification.bandwidth"),
+        (BANDWIDTH, 'bandwidth = { value = 1e5, unit = "rad/s" }', "specification.bandwidth"),
+        ("lift_off = true", "lift_off = 1", "specification.lift_off"),
+        (DELAYS, "delay = [-1]", "search.delay.0"),
+        (DELAYS, "delay = 1", "search.delay"),
+        ('"bases.state.z"]', '"bases.state.w"]', "search.numbers.stroke.vary"),
+        ('"bases.state.z"]', '"bases.z"]', "search.numbers.stroke.vary"),
+        ('"bases.state.z"]', '"bases.input.f_D"]', "search.numbers.stroke.unit"),
+        ('"bases.state.z"]', '"bases.state.x"]', "search.numbers.stroke.vary"),
+        (STROKE, STROKE.replace('"um"', '"N"'), "search.numbers.stroke.unit"),
+        (STROKE, STROKE.replace('"bases.state.z"', '"weights.state.z"'), "search.numbers.stroke.unit"),
+        (STROKE, STROKE.replace("low = 3", "low = 300"), "search.numbers.stroke"),
+        (STROKE, STROKE.replace("low = 3", "low = 0"), "search.numbers.stroke.low"),
+        (STROKE, STROKE.replace("low = 3,", ""), "search.numbers.stroke.low"),
+    ],
+)  # fmt: skip
+def test_a_wrong_wish_gets_one_sentence(tmp_path: Path, old: str, new: str, field: str) -> None:
+    error = refusal(lambda: malta.read_design(edited(tmp_path, (old, new))), tmp_path / "robust.toml")
+    assert error.field.startswith(field)
+
+
+def edited(folder: Path, *changes: tuple[str, str]) -> Path:
+    text = ROBUST.read_text(encoding="utf-8")
+    machine = (ROOT / "data" / "tubular.toml").as_posix()
+    for old, new in (('"../data/tubular.toml"', f'"{machine}"'), *changes):
+        assert text.count(old) == 1, old
+        text = text.replace(old, new)
+    path = folder / "robust.toml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_wishes_do_not_shape_the_gains(tmp_path: Path, spec: Spec) -> None:
+    other = malta.read_design(edited(tmp_path, (MARGIN, "margin = 3 ")))
+    assert other.sha256 == spec.sha256
+    assert other.specification != spec.specification
+
+
+def test_what_varies_must_stand_in_the_file(tmp_path: Path) -> None:
+    name = 'thrust = { vary = ["noise.process.f_D"], low = 0.1, high = 100, unit = "N" }'
+    path = edited(
+        tmp_path,
+        (name, 'thrust = { vary = ["noise.sensor.z"], low = 0.1, high = 100, unit = "N" }'),
+    )
+    assert refusal(lambda: malta.read_design(path), path).field == "search.numbers.thrust.unit"
+    text = path.read_text(encoding="utf-8")
+    first = text.index("sensor = {")
+    published = text[:first] + 'sensor = { published = "table_III.std" }\n' + text[text.index("\n", first) :]
+    path.write_text(published.replace('100, unit = "N" }', '100, unit = "um" }'), encoding="utf-8")
+    error = refusal(lambda: malta.read_design(path), path)
+    assert error.field == "search.numbers.thrust.vary"
+
+
+def test_a_variable_without_effect_is_refused(tmp_path: Path) -> None:
+    """The base of a weight that is zero."""
+    other = 'stroke = { vary = ["bases.state.x_dot"], low = 0.1, high = 100, unit = "mm/s" }'
+    path = edited(tmp_path, (STROKE, other))
+    spec = malta.read_design(path)
+    assert spec.search[4].entries == ("bases.state.x_dot",)
+    assert refusal(lambda: _clusters(spec), path).field == "search.numbers.stroke"
+
+
+# --- the command ---
+
+
+@pytest.fixture
+def run(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> Callable[..., tuple[int, str, str]]:
+    def runs(*arguments: str | Path) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["malta", "tune", *map(str, arguments)])
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as ended:
+            cli.main()
+        out, err = capsys.readouterr()
+        code = ended.value.code
+        return (code if isinstance(code, int) else 0), out, err
+
+    return runs
+
+
+def bare(folder: Path, *asked: str) -> Path:
+    """The flagship with another specification and one delay."""
+    path = edited(folder, (DELAYS, "delay = [0]"))
+    text = path.read_text(encoding="utf-8")
+    first, last = text.index("[specification]"), text.index("[search]")
+    path.write_text("\n".join([text[:first] + "[specification]", *asked, "", text[last:]]), encoding="utf-8")
+    return path
+
+
+def test_the_command_finds_writes_and_goes_on(run: Any, tmp_path: Path) -> None:
+    path, out = bare(tmp_path, "margin = 3.5", "peak_sensitivity = 2"), tmp_path / "out"
+    quick = ("--generations", "0", "--front", "0")
+    code, text, err = run(path, "--out", out, *quick)
+    assert (code, err) == (0, "")
+    assert f"wrote {out / 'robust.toml'}" in text
+    assert sorted(p.name for p in out.iterdir()) == ["robust.toml", "robust_trials.jsonl"]
+    assert max(map(len, text.splitlines())) <= 100
+    written = (out / "robust.toml").read_bytes()
+    code, _, err = run(path, "--out", out, *quick)
+    assert code == 2
+    assert "expected another --out, or --overwrite" in err
+    code, text, err = run(path, "--out", out, *quick, "--overwrite", "--json")
+    assert (code, err) == (0, "")
+    assert (out / "robust.toml").read_bytes() == written
+    found = json.loads(text)
+    assert [r["name"] for r in found["requirements"]] == ["margin", "peak_sensitivity"]
+    assert found["values"].keys() == {v.name for v in malta.read_design(path).search}
+    code, _, err = run(path, "--out", path.parent)
+    assert code == 2
+    assert path.read_text(encoding="utf-8").startswith("# The flagship")
+
+
+def test_the_command_says_what_is_not_reached(run: Any, tmp_path: Path) -> None:
+    path, out = bare(tmp_path, "margin = 4.4", "peak_sensitivity = 1.2"), tmp_path / "out"
+    code, _, err = run(path, "--check")
+    assert code == 1
+    assert err.count("\n") == 1
+    assert "not reached: " in err
+    code, text, err = run(path, "--out", out, "--generations", "0", "--front", "0")
+    assert code == 1
+    assert "binds most" in err
+    assert "FAILS" in text
+    assert (out / "robust.toml").exists()
+
+
+def test_the_command_without_wishes_is_bad_input(run: Any, tmp_path: Path) -> None:
+    code, _, err = run(ROOT / "design" / "table2.toml", "--out", tmp_path)
+    assert code == 2
+    assert "specification" in err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_ctrl_c_leaves_the_trials(run: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    module = sys.modules["malta.tune"]
+
+    def cut(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(module, "judged", cut)
+    path, out = bare(tmp_path, "margin = 3.5"), tmp_path / "out"
+    code, _text, err = run(path, "--out", out, "--generations", "0", "--front", "0")
+    assert code == 130
+    assert "goes on from" in err
+    assert [p.name for p in out.iterdir()] == ["robust_trials.jsonl"]
+
+
+def test_found_spec_keeps_what_is_not_varied(spec: Spec) -> None:
+    values = [spec.value_of(v) for v in spec.search]
+    again = spec.varied(values)
+    for name in again.__dataclass_fields__:
+        assert getattr(again, name) == pytest.approx(getattr(spec.weights, name), rel=1e-12)
+    from malta.tune import Trial
+
+    assert found_spec(spec, Trial(tuple(values), 2, {})).delay == 2
