@@ -39,10 +39,11 @@ from malta.data import plant_of, units_of
 from malta.errors import CheckError, InputError
 from malta.experiments import experiment
 from malta.linearize import linearize
+from malta.plant import trim
 from malta.riccati import delay_inputs, sample
 from malta.simulate import Scenario, simulate, stroke_figures
 from malta.spec import SPECIFIED, Spec, Specification, Weights
-from malta.synthesize import Gains, gains, synthesize
+from malta.synthesize import Gains, gains, static_feedforward, synthesize
 from malta.uncertain import uncertain
 from malta.verify import BANDWIDTHS, machine_loop, travel_margin, verify
 
@@ -179,7 +180,8 @@ class _Group:
     inputs: tuple[int, ...]
     outputs: tuple[int, ...]
     model: _Part
-    nominal: _Machine
+    nominal: _Machine  # with its loads, at their trim
+    slope: FloatArray  # of v0(z), which acts against them: inputs x outputs
     corners: _Machine | None  # levels x corners
     w: FloatArray  # rad/s
     response: ComplexArray  # of the nominal machine at w
@@ -205,8 +207,11 @@ def _groups(spec: Spec) -> list[_Group]:
     """The groups of a design's machine, each with what its trials need."""
     plant, Ts = spec.plant, spec.sample_time
     model = linearize(plant, plant.at(**spec.operating_point))
-    asked = spec.specification
-    positions = sorted({spec.operating_point.get(plant.stroke, 0.0), -plant.travel, plant.travel})
+    loaded = linearize(plant, trim(plant, **spec.operating_point))
+    asked, position = spec.specification, spec.operating_point.get(plant.stroke, 0.0)
+    positions = sorted({position, -plant.travel, plant.travel})
+    slope = np.zeros((model.B.shape[1], len(model.C)))
+    slope[:, plant.stroke_output] = static_feedforward(plant).slope(position)
     n, m = model.B.shape
     touch = np.zeros((n + m + len(model.C),) * 2, dtype=bool)
     for z in positions:
@@ -227,7 +232,7 @@ def _groups(spec: Spec) -> list[_Group]:
                 spec.path, "machine", "states that no input or sensor reaches", "another machine"
             )
         part = _Part(model.A[np.ix_(i, i)], model.B[np.ix_(i, j)], model.C[np.ix_(o, i)])
-        nominal = _sampled(spec, part)
+        nominal = _sampled(spec, _Part(loaded.A[np.ix_(i, i)], part.B, part.C))
         w = np.concatenate([np.geomspace(0.05, 50, 30), np.geomspace(60, 0.2 / Ts, 240), [1 / Ts, 2 / Ts]])
         lag = np.exp(1j * w * Ts)[:, None, None] * np.eye(len(nominal.Ad)) - nominal.Ad
         index = list(o)
@@ -239,6 +244,7 @@ def _groups(spec: Spec) -> list[_Group]:
                 tuple(o.tolist()),
                 part,
                 nominal,
+                slope[np.ix_(j, o)],
                 _corners(spec, systems, i, j, o) if systems else None,
                 w,
                 np.asarray(nominal.Cd @ np.linalg.solve(lag, nominal.Bd)),
@@ -311,12 +317,14 @@ def _figures(spec: Spec, group: _Group, weights: Weights, delay: int) -> dict[st
     except CheckError:
         return {}
     F = law_of(g, Ts)
-    closed = group.nominal.closed(F)
+    steady = F._replace(D=F.D + group.slope)
+    closed = group.nominal.closed(steady)
     if not (np.isfinite(closed).all() and np.abs(np.linalg.eigvals(closed)).max() < 1):
         return {}
     found: dict[str, float] = {}
     if group.corners is not None:
         found["margin"] = _margin(group, F)
+    F = steady
     z = np.exp(1j * group.w * Ts)[:, None, None]
     law = F.C @ np.linalg.solve(z * np.eye(len(F.A)) - F.A, F.B) + F.D
     eye = np.eye(len(group.outputs))

@@ -206,8 +206,7 @@ def test_quick_figures_are_those_of_verify(
     )
     assert quick["bandwidth"] <= min(margins.bandwidth.values()) * 1.001  # every loop's own crossover too
     for name in ("radial_motion", "axial_motion", "force_noise", "thrust_noise"):
-        # The machine's cogging and its feedforward, which the trials leave out, are worth 0.6 % of the axial motion.
-        assert quick[name] == pytest.approx(requirements[name, "covariance"].found, rel=1e-2)
+        assert quick[name] == pytest.approx(requirements[name, "covariance"].found, rel=1e-3)
     assert quick["tilt_deviation"] == pytest.approx(requirements_of(requirements, "tilt_deviation"), rel=0.35)
 
 
