@@ -8,11 +8,15 @@ that is done is read.
 
 from __future__ import annotations
 
+import signal
+import threading
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, get_args
+from types import FrameType
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 
@@ -137,24 +141,49 @@ def campaign(
     damaged: list[Path] = []
     interrupted = False
     try:
-        if place is not None:
-            damaged += _read(place, plan, parts, done)
-        left = {first: count for first, count in parts.items() if first not in done}
-        runs = plan.samples - sum(left.values())
-
-        def told(more: float) -> None:
-            if progress is not None:
-                progress((runs + more) / plan.samples)
-
-        for first, new in _flown_blocks(plan, left, workers, cluster, told):
+        with _noted() as pressed:
             if place is not None:
-                replace_files({place / block_name(first): encoded(new, plan)})
-            done[first] = new
-            runs += parts[first]
-            told(0)
+                damaged += _read(place, plan, parts, done)
+            left = {first: count for first, count in parts.items() if first not in done}
+            runs = plan.samples - sum(left.values())
+
+            def told(more: float) -> None:
+                if progress is not None:
+                    progress((runs + more) / plan.samples)
+
+            for first, new in _flown_blocks(plan, left, workers, cluster, told):
+                if place is not None:
+                    replace_files({place / block_name(first): encoded(new, plan)})
+                done[first] = new
+                runs += parts[first]
+                told(0)
+                if pressed:
+                    raise KeyboardInterrupt
     except KeyboardInterrupt:
         interrupted = True
+        if place is not None:  # one may have been kept, and not yet counted
+            _read(place, plan, {k: n for k, n in parts.items() if k not in done}, done)
     return _gathered(plan, done, parts, place, tuple(damaged), interrupted)
+
+
+@contextmanager
+def _noted() -> Iterator[list[int]]:
+    """Ctrl-C, noted as it comes: libraries that are called while it comes now and then drop the exception."""
+    before, pressed = signal.getsignal(signal.SIGINT), list[int]()
+    if threading.current_thread() is not threading.main_thread() or not callable(before):
+        yield pressed
+        return
+    handle: Callable[[int, FrameType | None], Any] = before
+
+    def note(number: int, frame: FrameType | None) -> None:
+        pressed.append(number)
+        handle(number, frame)
+
+    signal.signal(signal.SIGINT, note)
+    try:
+        yield pressed
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def _read(place: Path, plan: Plan, parts: Mapping[int, int], done: dict[int, Block]) -> list[Path]:

@@ -7,8 +7,12 @@ import json
 import math
 import os
 import pickle
+import signal
 import sys
+import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -452,6 +456,31 @@ def test_an_interruption_keeps_what_is_done(
     whole = campaign(plan, tmp_path)
     assert not whole.interrupted
     _same(whole, campaign(plan))
+
+
+def test_an_interruption_that_a_library_drops_is_noticed(
+    controller: Controller, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ctrl-C while something is called that swallows it: the campaign ends with that block, here and in a thread."""
+    plan, fly, before = _plan(controller), MODULE.fly, signal.getsignal(signal.SIGINT)
+
+    def deaf(*arguments: Any) -> Any:
+        with suppress(KeyboardInterrupt):
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(1)
+        return fly(*arguments)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(MODULE, "fly", deaf)
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        try:
+            cut = campaign(plan, block=16)
+        finally:
+            signal.signal(signal.SIGINT, before)
+    assert cut.interrupted
+    assert cut.index.tolist() == list(range(16))
+    with ThreadPoolExecutor(1) as pool:  # where no signal may be handled
+        assert not pool.submit(campaign, plan).result().interrupted
 
 
 def test_an_interruption_before_anything_is_done(

@@ -300,7 +300,7 @@ def test_ctrl_c_keeps_and_shows_what_is_done(tmp_path: Path) -> None:
     process.send_signal(signal.SIGINT)
     out, err = process.communicate()
     done = 1024 * len(_blocks(tmp_path))
-    assert process.returncode == 130
+    assert process.returncode == 130, err
     assert f"{done} of 10240 machines" in out
     assert "The worst runs" in out
     assert _sentence(err) == (
