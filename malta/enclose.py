@@ -11,7 +11,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -22,7 +22,8 @@ from malta.uncertain import Compensator, UncertainSystem
 if TYPE_CHECKING:
     from malta.plant import ComplexArray, FloatArray
 
-GUARD = 1e-9  # what floating point may err, in an angle; a thousandth of it relative to the terms of f
+GUARD = 1e-9  # what floating point may err, in an angle
+ROUNDING = 1e-11  # relative to the terms of f; 1e-13 is seen
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,6 +66,10 @@ class Taylor:
     def __getitem__(self, key: Any) -> Taylor:
         return Taylor(self.c[key], self.g[key], self.r[key])
 
+    def size(self) -> FloatArray:
+        """Largest absolute value."""
+        return np.asarray(np.abs(self.c) + np.abs(self.g) + self.r)
+
     def conj(self) -> Taylor:
         return Taylor(self.c.conj(), self.g.conj(), self.r)
 
@@ -92,9 +97,7 @@ class Frequencies(NamedTuple):
     sigma: Taylor
     tau: Taylor
     scale: Taylor  # that f is multiplied by, once a position, for the integrators: s, (z - 1) / T or 1
-    z: Taylor | None
-    middle: FloatArray  # rad/s
-    highest: FloatArray  # rad/s
+    delta: Taylor | None  # (z - 1) / T of a sampled loop
 
 
 def frequencies(c: Compensator, cells: FloatArray) -> Frequencies:
@@ -104,31 +107,26 @@ def frequencies(c: Compensator, cells: FloatArray) -> Frequencies:
     low = branch == 0
     sigma = Taylor(1j * np.where(low, middle, 1), 1j * np.where(low, half, 0), zero)
     tau = Taylor(np.where(low, 1.0, middle) + 0j, np.where(low, 0.0, half) + 0j, zero)
-    with np.errstate(divide="ignore"):
-        highest = np.where(low, cells[:, 2], 1 / cells[:, 1])
-        at = np.where(low, middle, 1 / middle)
-    if c.sample_time is None:
-        scale = Taylor(np.where(low, sigma.c, 1), np.where(low, sigma.g, 0), zero)
-        if not c.integrals:
-            scale = Taylor(one + 0j, zero + 0j, zero)
-        return Frequencies(sigma, tau, scale, None, at, highest)
-    T = c.sample_time
-    c_z = np.exp(1j * middle * T)
-    z = Taylor(c_z, 1j * T * half * c_z, (T * half) ** 2 / 2)
-    scale = (z + (-1.0)) * (1 / T) if c.integrals else Taylor(one + 0j, zero + 0j, zero)
-    # z - 1 cancels near w = 0; its parts are known better than their difference
+    scale, delta = Taylor(one + 0j, zero + 0j, zero), None
+    if c.sample_time is not None:
+        T = c.sample_time
+        turn = np.exp(1j * middle * T)
+        delta = Taylor(np.expm1(1j * middle * T) / T, 1j * half * turn, T * half**2 / 2)
     if c.integrals:
-        exact = np.expm1(1j * middle * T) / T
-        scale = Taylor(exact, scale.g, scale.r)
-    return Frequencies(sigma, tau, scale, z, at, highest)
+        scale = delta or Taylor(np.where(low, sigma.c, 1), np.where(low, sigma.g, 0), zero)
+    return Frequencies(sigma, tau, scale, delta)
 
 
-def response(c: Compensator, f: Frequencies, cells: FloatArray, order: int, stiffest: float) -> Taylor:
-    """scale x H F on the intervals: cells x inputs x outputs. order, stiffest: of the plant, for a hold's images."""
-    k = len(c.A) - c.integrals
-    T, Q = linalg.schur(c.A[:k, :k], output="complex")
-    sampled = c.sample_time is not None
-    low = (cells[:, 0] == 0)[:, None, None]
+def response(c: Compensator, f: Frequencies, cells: FloatArray) -> Taylor:
+    """scale x F on the intervals: cells x inputs x outputs.
+
+    Of sampled laws C (delta - (A - 1) / T)^-1 B / T + D: as differences, so that slow poles keep their digits.
+    """
+    k, T = len(c.A) - c.integrals, c.sample_time
+    A, B = (c.A, c.B) if T is None else ((c.A - np.eye(len(c.A))) / T, c.B / T)
+    balanced, (units, _) = linalg.matrix_balance(A[:k, :k], permute=False, separate=True)
+    S, Q = linalg.schur(balanced, output="complex")
+    into, back = Q.conj().T / units, units[:, None] * Q
 
     def wide(t: Taylor) -> Taylor:
         return t[:, None, None]
@@ -137,86 +135,90 @@ def response(c: Compensator, f: Frequencies, cells: FloatArray, order: int, stif
         M = np.asarray(M, dtype=complex)[None]
         return Taylor(M, 0 * M, np.zeros(M.shape))
 
-    if sampled:
-        assert f.z is not None
-        assert c.sample_time is not None
-        sigma, tau = f.z, Taylor(np.ones_like(f.z.c), 0 * f.z.c, 0 * f.z.r)
-        summed = constant(c.B[k:] / c.sample_time)
+    summed = constant(B[k:])  # scale x what the sums are
+    if f.delta is not None:
+        sigma, tau = f.delta, Taylor(np.ones_like(f.tau.c), 0 * f.tau.c, 0 * f.tau.r)
     else:
         sigma, tau = f.sigma, f.tau
         # e = B y / s; times s on branch 0, as it is on branch 1
-        once = Taylor(
-            np.where(low, 1, (f.tau.c * -1j)[:, None, None]),
-            np.where(low, 0, (f.tau.g * -1j)[:, None, None]),
-            np.zeros(low.shape),
-        )
-        summed = once * constant(c.B[k:])
-    driven = wide(f.scale) * constant(Q.conj().T @ c.B[:k]) + summed.mapped(
-        Q.conj().T @ c.A[:k, k:], "ij,wjl->wil"
-    )
+        low = cells[:, 0] == 0
+        once = Taylor(np.where(low, 1, -1j * tau.c), np.where(low, 0, -1j * tau.g), np.zeros(len(cells)))
+        summed = wide(once) * summed
+    driven = wide(f.scale) * constant(into @ B[:k]) + summed.mapped(into @ A[:k, k:], "ij,wjl->wil")
     driven = wide(tau) * driven
     rows: list[Taylor] = [driven[:, :0]] * k
     for i in reversed(range(k)):
         x = driven[:, i]
         for j in range(i + 1, k):
-            if T[i, j] != 0:
-                x = x + (tau[:, None] * rows[j]) * T[i, j]
-        rows[i] = x * (sigma - tau * T[i, i]).inverse()[:, None]
+            if S[i, j] != 0:
+                x = x + (tau[:, None] * rows[j]) * S[i, j]
+        rows[i] = x * (sigma - tau * S[i, i]).inverse()[:, None]
     total = wide(f.scale) * constant(c.D)
     if k:
         stacked = Taylor(
             *(np.stack([getattr(row, name) for row in rows], axis=1) for name in ("c", "g", "r"))
         )
-        total = total + stacked.mapped(c.C[:, :k] @ Q, "ij,wjl->wil")
+        total = total + stacked.mapped(c.C[:, :k] @ back, "ij,wjl->wil")
     if c.integrals:
         total = total + summed.mapped(c.C[:, k:], "ij,wjl->wil")
-    between = _actuator(c, f, cells, order, stiffest)
-    return total if between is None else wide(between) * total
+    return total
 
 
-def _actuator(
-    c: Compensator, f: Frequencies, cells: FloatArray, order: int, stiffest: float
-) -> Taylor | None:
-    """H: lag, hold, delay; the images of the hold in its radius. None where nothing stands between."""
-    H = None
-    if c.lag is not None:
-        H = (f.sigma + f.tau * c.lag).inverse() * f.tau * c.lag
-    if c.sample_time is None:
-        return H
+def actuator(c: Compensator, f: Frequencies, cells: FloatArray, order: int) -> Taylor | None:
+    """H: lag, hold, delay. None where nothing stands between.
+
+    A hold's images at W = w + 2 pi k / T are in it as a free mass has them, (w / W)^order H(W) summed over k: the free
+    mass sampled exactly. What stiffness and damping add is in `_images`.
+    """
     T = c.sample_time
+    if T is None:
+        return None if c.lag is None else (f.sigma + f.tau * c.lag).inverse() * f.tau * c.lag
+    assert f.delta is not None
     middle, half = cells[:, 1:].mean(axis=1), np.diff(cells[:, 1:])[:, 0] / 2
-    # (1 - e^-jwT) / (jwT) = e^-ja sin(a)/a, a = wT/2; every derivative of order n is below T^n / (n + 1)
+    # (e^jwT - 1) / (jwT) = e^ja sin(a)/a, a = wT/2; every derivative of order n is below T^n / (n + 1)
     a = middle * T / 2
     small = a < 1e-4
     safe = np.where(small, 1, a)
     shape = np.where(small, 1 - a**2 / 6, np.sin(safe) / safe)
     slope = np.where(small, -a / 3, (np.cos(safe) - np.sin(safe) / safe) / safe)
-    turn = np.exp(-1j * a)
-    hold = Taylor(turn * shape, T / 2 * turn * (slope - 1j * shape) * half, T**2 / 6 * half**2)
+    turn = np.exp(1j * a)
+    step = Taylor(turn * shape, T / 2 * turn * (slope + 1j * shape) * half, T**2 / 6 * half**2)
+    once = step.inverse()  # s / delta: a sampled integrator, times s
+    z = f.delta * T + 1.0
+    H = once if order == 1 else once * once * (z + 1.0) * 0.5
+    if c.lag is not None:  # by partial fractions of lag / (s^order (s + lag))
+        s, pole = f.sigma * (1 / c.lag), math.exp(-c.lag * T)
+        own = s * (1 - pole) * (z - pole).inverse()
+        H = H - own if order == 1 else H - s * (once - own)
     late = c.delay * T
-    delay = Taylor(
-        np.exp(-1j * middle * late), -1j * late * half * np.exp(-1j * middle * late), (late * half) ** 2 / 2
-    )
-    direct = hold if H is None else H * hold
-    images = _images(c, f.highest, order, stiffest)
-    return Taylor(direct.c, direct.g, direct.r + images) * delay
+    turned = np.exp(-1j * middle * late)
+    return H * Taylor(turned, -1j * late * half * turned, (late * half) ** 2 / 2)
 
 
-def _images(c: Compensator, w: FloatArray, order: int, stiffest: float) -> FloatArray:
-    """Bound of what the hold's images at w + 2 pi k / T add to H at w, as seen through the plant.
+def _images(c: Compensator, M: Matrices, cells: FloatArray) -> FloatArray:
+    """Bound of the rest of a hold's images: E of (H + E) B F C, cells x positions x positions.
 
-    Sum over k of |H(W)| |N(jw) N(jW)^-1| with W = w + 2 pi k / T, |N| between W^order -+ stiffest^order.
+    N(jw) N(jW)^-1 - (w/W)^2 = (j w (1 - w/W) N1 + (1 - w^2/W^2) N0) / W^2 (1 + X)^-1, X = j N1 / W + N0 / W^2
     """
     T = c.sample_time
     assert T is not None
-    k = np.concatenate([np.arange(-40, 0), np.arange(1, 41)])
-    W = np.abs(w[:, None] + 2 * np.pi / T * k)
-    held = 2 * np.abs(np.sin(np.minimum(w * T / 2, np.pi / 2)))[:, None] / (W * T)
+    low, high = cells[:, 1], cells[:, 2]
+    turns = 2 * np.pi / T * np.arange(1, 41)
+    W = np.hstack([turns - high[:, None], turns + low[:, None]])  # at least
+    held = 2 * np.abs(np.sin(np.minimum(high * T / 2, np.pi / 2)))[:, None] / (W * T)
     if c.lag is not None:
         held = held * c.lag / np.hypot(W, c.lag)
-    own, image = w**order + stiffest**order, W**order - stiffest**order
-    terms = np.where(image > 0, held * own[:, None] / np.where(image > 0, image, 1), np.inf)
-    return np.asarray(1.1 * terms.sum(axis=1))  # beyond 40: below a tenth of the sum for any order
+    share = 1.1 * (held / W**M.order).sum(axis=1)  # beyond 40: below a tenth of the sum
+    N0 = 1.5 * np.abs(M.N0).max(axis=0)  # the half for what lies between the nodes
+    nearest = np.pi / T
+    if M.N1 is None:
+        moved, X = np.broadcast_to(2 * N0, (len(cells), *N0.shape)), N0 / nearest
+    else:
+        N1 = 1.5 * np.abs(M.N1).max(axis=0)
+        moved, X = N0 + 2 * high[:, None, None] * N1, N1 / nearest + N0 / nearest**2
+    if np.abs(np.linalg.eigvals(X)).max() >= 1:
+        return np.full(moved.shape, np.inf)
+    return np.asarray(share[:, None, None] * (moved @ np.linalg.inv(np.eye(len(X)) - X)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -246,17 +248,19 @@ def matrices_of(block: Block, p: FloatArray) -> Matrices:
     return Matrices(A[:, d][:, :, q], A[:, d][:, :, d], B[:, d], C[:, :, q], C1 if C1.any() else None, far)
 
 
-def characteristic(c: Compensator, M: Matrices, cells: FloatArray) -> Taylor:
-    """f on the intervals at the rows of parameters: cells x rows."""
+def characteristic(c: Compensator, M: Matrices, cells: FloatArray) -> tuple[Taylor, FloatArray]:
+    """f on the intervals at the rows of parameters: cells x rows; and how far a hold's images move it at any: cells."""
     f = frequencies(c, cells)
-    G = response(c, f, cells, M.order, M.stiffest)
+    bare, H = response(c, f, cells), actuator(c, f, cells, M.order)
+
+    def wide(t: Taylor) -> Taylor:
+        return t[:, None, None, None]
+
+    G = bare if H is None else H[:, None, None] * bare
 
     def through(G: Taylor, C: FloatArray) -> Taylor:
         inner = G.mapped(M.B, "jak,wkl->wjal")
         return Taylor(inner.c @ C, inner.g @ C, inner.r @ np.abs(C))
-
-    def wide(t: Taylor) -> Taylor:
-        return t[:, None, None, None]
 
     eye = np.eye(M.N0.shape[1])[None, None]
     if M.N1 is None:
@@ -273,19 +277,35 @@ def characteristic(c: Compensator, M: Matrices, cells: FloatArray) -> Taylor:
         F = F - through(squared[:, None, None] * G, M.C0)
         if M.C1 is not None:
             F = F - through((f.sigma * f.tau)[:, None, None] * G, M.C1)
-    return _determinant(F)
+    C = np.abs(M.C0)[None]
+    if M.C1 is not None:
+        w = np.where(cells[:, 0] == 0, cells[:, 2], 1.0)  # times tau where that is not 1
+        C = C + w[:, None, None, None] * np.abs(M.C1)
+    terms = np.abs(M.B) @ bare.size()[:, None] @ C
+    own = np.abs(
+        f.scale.size()[:, None, None, None]
+        * (f.sigma.size()[:, None, None, None] ** M.order * eye + np.abs(M.N0))
+    )
+    F = Taylor(F.c, F.g, F.r + ROUNDING * (own + terms))
+    if c.sample_time is None:
+        return _determinant(F), np.zeros(len(cells))
+    if terms.shape[-1] == 1:  # a factor of the input: f keeps its degrees
+        return Taylor(F.c, F.g, F.r + _images(c, M, cells)[:, None] @ terms)[..., 0, 0], np.zeros(len(cells))
+    terms = terms.max(axis=1)  # 1.5 for what lies between the rows
+    moved = Taylor(1.5 * F.size().max(axis=1) + 0j, 0 * terms + 0j, _images(c, M, cells) @ (2.25 * terms))
+    return _determinant(F), _determinant(moved, signed=False).r
 
 
-def _determinant(F: Taylor) -> Taylor:
-    """By expansion along the first row: the matrices are small."""
+def _determinant(F: Taylor, *, signed: bool = True) -> Taylor:
+    """By expansion along the first row: the matrices are small. Not signed: the permanent."""
     n = F.c.shape[-1]
     if n == 1:
         return F[..., 0, 0]
     total: Taylor | None = None
     for k in range(n):
         rest = [j for j in range(n) if j != k]
-        term = F[..., 0, k] * _determinant(F[..., 1:, :][..., rest])
-        total = term if total is None else total + (term if k % 2 == 0 else -term)
+        term = F[..., 0, k] * _determinant(F[..., 1:, :][..., rest], signed=signed)
+        total = term if total is None else total + (-term if signed and k % 2 else term)
     assert total is not None
     return total
 
@@ -331,12 +351,11 @@ def polynomial(block: Block, names: Sequence[str], sides: FloatArray) -> Polynom
 
 def characteristic_values(block: Block, rows: FloatArray, w: FloatArray | None = None) -> ComplexArray:
     """f at frequencies and rows of parameters; without w at three frequencies over the range that matters."""
-    M = replace(matrices_of(block, rows), stiffest=0.0)  # the hold's images are no part of the values
-    c = block.own
+    M, c = matrices_of(block, rows), block.own
     if w is None:
         end = np.pi / c.sample_time if c.sample_time is not None else 1e3
         w = np.array([0.003, 0.03, 0.3]) * end
-    return characteristic(c, M, np.column_stack([0 * w, w, w])).c
+    return characteristic(c, M, np.column_stack([0 * w, w, w]))[0].c
 
 
 def nodes(degree: int) -> FloatArray:
@@ -361,6 +380,7 @@ class Enclosure(NamedTuple):
     inverse: tuple[FloatArray, ...]  # values at nodes -> Bernstein coefficients, one matrix a parameter
     rows: FloatArray  # the nodes
     sides: FloatArray  # of the box: parameters x 2
+    nominal: FloatArray
 
 
 def enclosure(block: Block, nominal: FloatArray, sides: FloatArray, poly: Polynomial) -> Enclosure:
@@ -372,14 +392,15 @@ def enclosure(block: Block, nominal: FloatArray, sides: FloatArray, poly: Polyno
     inverse = tuple(np.linalg.inv(bernstein(d, nodes(d))) if d else np.ones((1, 1)) for d in poly.degrees)
     weights = np.prod(rows ** np.array(poly.poles), axis=1)
     sizes = tuple(d + 1 for d in poly.degrees)
-    return Enclosure(block, sizes, weights, matrices_of(block, rows), inverse, rows, sides)
+    return Enclosure(block, sizes, weights, matrices_of(block, rows), inverse, rows, sides, nominal)
 
 
 def coefficients(e: Enclosure, cells: FloatArray) -> Taylor:
     with np.errstate(all="ignore"):  # intervals that are too wide have no bound: they are split
-        f = characteristic(e.block.own, e.matrices, cells) * e.weights
-        f = Taylor(f.c, f.g, f.r + 1e-14 * np.abs(f.c))
-        return along(f, e.shape, [m[None] for m in e.inverse])
+        f, images = characteristic(e.block.own, e.matrices, cells)
+        f = f * e.weights
+        f = along(Taylor(f.c, f.g, f.r + 1e-14 * np.abs(f.c)), e.shape, [m[None] for m in e.inverse])
+        return Taylor(f.c, f.g, f.r + (images * 1.5 * np.abs(e.weights).max())[:, None])
 
 
 def along(f: Taylor, shape: tuple[int, ...], matrices: Sequence[FloatArray]) -> Taylor:
@@ -406,7 +427,7 @@ def excludes_zero(f: Taylor) -> Any:
     """
     middle = f.c.mean(axis=1, keepdims=True)
     points = np.concatenate([f.c - f.g, f.c + f.g], axis=1)
-    radius = np.concatenate([f.r, f.r], axis=1) + GUARD * 1e-3 * np.abs(f.c).max(axis=1, keepdims=True)
+    radius = np.concatenate([f.r, f.r], axis=1) + ROUNDING * np.abs(f.c).max(axis=1, keepdims=True)
     size = np.abs(points)
     with np.errstate(all="ignore"):
         half = np.arcsin(np.where(size > radius, radius / size, 1))
@@ -445,15 +466,3 @@ def cover(c: Compensator, stiffest: float) -> FloatArray:
     edges = top * 2.0 ** np.arange(-24, 1)
     cells = np.column_stack([0 * edges, np.r_[0, edges[:-1]], edges])
     return cells if c.sample_time is not None else np.vstack([cells, [1, 0, 1 / top]])
-
-
-@dataclass(frozen=True, eq=False)
-class _Found:
-    """A group whose modes couple, with the first loss of stability that was found."""
-
-    block: Block
-    upper: float
-    frequency: float | None
-    witness: FloatArray | None
-    reason: str = ""  # why nothing can be proven
-    exact: bool = False  # in closed form, at the phase crossovers

@@ -24,17 +24,18 @@ from __future__ import annotations
 import itertools
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy import sparse
+from scipy import linalg, sparse
 
 from malta.enclose import (
     GUARD,
     Block,
     Enclosure,
+    actuator,
     along,
     characteristic_values,
     coefficients,
@@ -48,7 +49,7 @@ from malta.enclose import (
     restrictions,
 )
 from malta.errors import InputError
-from malta.uncertain import Compensator, UncertainSystem, instability
+from malta.uncertain import Compensator, UncertainSystem, critical, instability
 
 if TYPE_CHECKING:
     from malta.plant import ComplexArray, FloatArray
@@ -126,20 +127,27 @@ def robust_margin(
     """
     start = time.perf_counter()
     box = _box(system, ranges, over or {})
-    if not (instability(system, compensator, _midpoint(box)) < 0).all():
-        at = dict(zip(system.names, _midpoint(box)[0].tolist(), strict=True))
-        return Margin(
-            0.0, 0.0, None, at, {}, {}, (), time.perf_counter() - start, "the nominal loop is unstable"
-        )
+    unstable = instability(system, compensator, _standing(box)) >= 0
+    if unstable.any():
+        where = dict(zip(system.names, _standing(box)[unstable.argmax()].tolist(), strict=True))
+        spent = time.perf_counter() - start
+        return Margin(0.0, 0.0, None, where, {}, {}, (), spent, "the nominal loop is unstable")
     reach = min(box.most * (1 - 1e-9), FAR)
     found: list[_Bound] = []
     for block in _blocks(system, compensator, box):
         found.append(_search(block, box, reach))
         reach = min(reach, found[-1].upper)
+    if any(b.reason for b in found):
+        found = _by_eigenvalues(system, compensator, box, reach, found)
+        reach = min(reach, *(b.upper for b in found))
     # What is beyond the smallest witness needs no proof.
+    close = tolerance or (EXACT if all(b.exact for b in found) else TOLERANCE)
     if any(math.isfinite(b.upper) for b in found):
-        reach *= 1 - (tolerance or (EXACT if all(b.exact for b in found) else TOLERANCE))
-    bounds = [_branch_and_bound(b, box, reach, most_cells) for b in found]
+        reach *= 1 - close
+    bounds: list[_Bound] = []
+    for b in found:
+        bounds.append(_branch_and_bound(b, box, reach, close, most_cells))
+        reach = min(reach, bounds[-1].upper * (1 - close))
     return _merged(system, compensator, box, bounds, start)
 
 
@@ -187,6 +195,8 @@ def _box(
                 repr(value),
                 f"a share above 0, or (low, high) about the nominal {nominal:g}",
             )
+        if name in ranges and name in over:
+            raise InputError("robust_margin", name, "in ranges and in over", "in one of them")
         if name in over:
             fixed[i] = pair[0] - nominal, pair[1] - nominal
             continue
@@ -199,27 +209,37 @@ def _box(
     return _Box(system.names, system.nominal, down, up, fixed, most)
 
 
-def _midpoint(box: _Box) -> FloatArray:
-    """Nominal values, at both ends and the middle of what stays."""
-    ends = box.nominal + box.over.T
-    return np.unique(np.vstack([ends, box.nominal[None, :] + 0 * ends[:1]]), axis=0)
+def _standing(box: _Box) -> FloatArray:
+    """Nominal values, at both ends and the middle of everything that stays; the nominal ones first."""
+    sides = (np.unique([0.0, low, (low + high) / 2, high]) for low, high in box.over)
+    places = np.array(list(itertools.product(*sides)))
+    order = np.argsort(np.abs(places).sum(axis=1), kind="stable")
+    return np.asarray(box.nominal + places[order])
 
 
 def _blocks(system: UncertainSystem, c: Compensator, box: _Box) -> list[Block]:
     """The strongly connected groups of the closed loop, at any parameters: their factors are independent."""
     rng = np.random.default_rng(0)
     sides = box.sides(min(1.0, 0.9 * box.most))
-    rows = np.vstack([_midpoint(box), sides.T, rng.uniform(sides[:, 0], sides[:, 1], (8, len(sides)))])
+    rows = np.vstack([_standing(box), sides.T, rng.uniform(sides[:, 0], sides[:, 1], (8, len(sides)))])
     n = system.matrices.size1_out(0)
-    touch = np.zeros((n + len(c.A),) * 2, bool)
-    for A, B, C in zip(*system.at(rows), strict=True):
-        closed = np.block([[A + B @ c.D @ C, B @ c.C], [c.B @ C, c.A]])
-        terms = np.block(
-            [[abs(A) + abs(B) @ abs(c.D) @ abs(C), abs(B) @ abs(c.C)], [abs(c.B) @ abs(C), abs(c.A)]]
-        )
-        size = np.abs(closed)
-        reference = np.sqrt(np.outer(size.max(axis=1), size.max(axis=0)))
-        touch |= size > DUST * np.maximum(terms, reference)
+    A, B, C = system.at(rows)
+    k = len(rows)
+    size, terms = np.zeros((2, k, n + len(c.A), n + len(c.A)))
+    size[:, :n, :n], size[:, :n, n:], size[:, n:, :n], size[:, n:, n:] = (
+        A + B @ c.D @ C,
+        B @ c.C,
+        c.B @ C,
+        c.A,
+    )
+    size = np.abs(size)
+    terms[:, :n, :n] = abs(A) + abs(B) @ abs(c.D) @ abs(C)
+    terms[:, :n, n:], terms[:, n:, :n] = abs(B) @ abs(c.C), abs(c.B) @ abs(C)
+    # whatever the units of the states
+    _, (units, _) = linalg.matrix_balance(size.max(axis=0), permute=False, separate=True)
+    size, terms = size * units / units[:, None], terms * units / units[:, None]
+    reference = np.sqrt(size.max(axis=2)[:, :, None] * size.max(axis=1)[:, None, :])
+    touch = (size > DUST * np.maximum(terms, reference)).any(axis=0)
     _, label = sparse.csgraph.connected_components(touch, directed=True, connection="strong")
     blocks = []
     positions = n // 2 if system.second_order else n
@@ -276,7 +296,8 @@ def _at_crossovers(e: Enclosure, box: _Box, goal: float) -> tuple[float, float, 
     M, c = e.matrices, e.block.own
     if M.N1 is None or M.N0.shape[1] > 1 or M.N1.any() or any(size > 2 for size in e.shape):
         return None
-    paths = np.einsum("jk,jl->jkl", M.B[:, 0], M.C0[:, :, 0])
+    C = M.C0 if M.C1 is None else np.concatenate([M.C0, M.C1], axis=2)
+    paths = np.einsum("jk,jlc->jklc", M.B[:, 0], C).reshape(len(M.B), M.B.shape[2], -1)
     largest = np.unravel_index(np.abs(paths[0]).argmax(), paths[0].shape)
     nu = paths[:, *largest] / paths[0][largest]
     if (
@@ -285,7 +306,8 @@ def _at_crossovers(e: Enclosure, box: _Box, goal: float) -> tuple[float, float, 
     ):
         return None
     free = [i for i, size in enumerate(e.shape) if size > 1]
-    corners = np.column_stack([np.ones(len(e.rows)), e.rows[:, free] / box.nominal[free]])
+    unit = np.abs(e.sides[free]).max(axis=1)
+    corners = np.column_stack([np.ones(len(e.rows)), e.rows[:, free] / unit])
     parts = np.column_stack([e.weights, e.weights * M.N0[:, 0, 0], e.weights * nu])
     affine = np.linalg.lstsq(corners, parts, rcond=None)[0]
     if (np.abs(corners @ affine - parts) > GUARD * np.abs(parts).max(axis=0)).any() or not (nu > 0).all():
@@ -296,7 +318,8 @@ def _at_crossovers(e: Enclosure, box: _Box, goal: float) -> tuple[float, float, 
         cells = np.column_stack([0 * w, w, w])
         f = frequencies(c, cells)
         with np.errstate(all="ignore"):  # only centres count here
-            G = response(c, f, cells, 2, M.stiffest).c
+            G, H = response(c, f, cells).c, actuator(c, f, cells, 2)
+            G = G if H is None else H.c[:, None, None] * G
         value = np.einsum("k,wkl,l->w", M.B[0, 0], G, M.C0[0, :, 0]) / f.scale.c
         if C1 is not None:
             value = value + 1j * w * np.einsum("k,wkl,l->w", M.B[0, 0], G, C1) / f.scale.c
@@ -318,40 +341,56 @@ def _at_crossovers(e: Enclosure, box: _Box, goal: float) -> tuple[float, float, 
     if not c.integrals:
         crossings = np.r_[0.0, crossings]
     values = h(crossings).real
-    down, up = (rate[free] / box.nominal[free] for rate in (box.down, box.up))
+    own, down, up = (of[free] / unit for of in (box.nominal, box.down, box.up))
+    stay = box.over[free].T / unit
     best: tuple[float, float, FloatArray] = (math.inf, 0.0, box.nominal)
     for at, value in zip(crossings.tolist(), values.tolist(), strict=True):
         plane = affine @ np.array([at**2, 1.0, value])
-        now = float(plane.sum())
+        now = float(plane[0] + plane[1:] @ own)
         toward = -np.sign(now) * plane[1:]
-        rate = np.where(toward > 0, up, -down)
-        t = abs(now) / max(float(toward @ rate), 1e-300)
+        rate, there = np.where(toward > 0, up, -down), np.where(toward > 0, stay[1], stay[0])
+        t = max(0.0, abs(now) - float(toward @ there)) / max(float(toward @ rate), 1e-300)
         if t < min(best[0], goal):
             p = box.nominal.copy()
-            p[free] *= 1 + t * np.where(np.abs(toward) > GUARD * np.abs(plane[1:]).max(), rate, 0)
+            pulls = np.abs(toward) > GUARD * np.abs(plane[1:]).max()
+            p[free] += unit * np.where(pulls, there + t * rate, 0)
             best = t, at, p
     return best
 
 
-def _branch_and_bound(found: _Bound, box: _Box, goal: float, most_cells: int) -> _Bound:
-    """Prove the box at `goal`, which is below the witness, or a smaller one."""
+def _branch_and_bound(found: _Bound, box: _Box, goal: float, tolerance: float, most_cells: int) -> _Bound:
+    """Prove the box at `goal`, which is below the witness, or a smaller one.
+
+    Where a proof gets stuck, stability may be lost off the diagonals: the witness is looked for around that place.
+    """
     if found.reason:
         return found
-    full, reason = goal, ""
-    for share in (0.0, 1e-5, 1e-4, 1e-3, 1e-2, 0.03, 0.1, 0.2, 0.3, 0.4, 0.5):
-        goal = full * (1 - share)
+    looked, reason = 0, ""
+    shares = iter((1e-5, 1e-4, 1e-3, 1e-2, 0.03, 0.1, 0.2, 0.3, 0.4, 0.5, 0.7, 0.9, 0.99))
+    top = goal
+    while True:
         poly = polynomial(found.block, box.names, box.sides(goal))
         if isinstance(poly, str):
             return replace(found, reason=poly)
-        proved = _prove(enclosure(found.block, box.nominal, box.sides(goal), poly), most_cells)
+        e = enclosure(found.block, box.nominal, box.sides(goal), poly)
+        proved = _prove(e, most_cells)
         if isinstance(proved, Certificate):
             return replace(found, lower=goal, certificate=proved)
-        reason = proved
-    return replace(found, reason=reason)
+        reason, place = proved
+        looked += 1
+        better = _around(e, box, goal, place) if looked <= 4 else None
+        if better is not None and better[0] < min(goal, found.upper):
+            found = replace(found, upper=better[0], frequency=better[1], witness=better[2], exact=False)
+            goal = top = better[0] * (1 - tolerance)
+            continue
+        share = next(shares, None)
+        if share is None:
+            return replace(found, reason=reason)
+        goal = top * (1 - share)
 
 
-def _worst_ray(e: Enclosure, box: _Box, goal: float) -> tuple[float, float, FloatArray] | None:
-    """The first loss of stability along the diagonals of the box: t, w, p. None when there is none below goal.
+def _stability(e: Enclosure) -> tuple[FloatArray, ComplexArray, Callable[[FloatArray], Any]]:
+    """A grid of frequencies, f's coefficients on it, and what says of rows of parameters whether they are unstable.
 
     Stable where f turns as often as at the nominal parameters between w = 0 and the end (argument principle).
     """
@@ -363,49 +402,129 @@ def _worst_ray(e: Enclosure, box: _Box, goal: float) -> tuple[float, float, Floa
         parts[-1] = parts[-1][::-1]
     grid = np.vstack(parts)
     values = coefficients(e, grid).c
+    own = products(e, e.nominal[None, :]) @ values.T
 
     def unstable(rows: FloatArray) -> Any:
-        ratio = (products(e, rows) @ values.T) / (products(e, nominal) @ values.T)
+        ratio = (products(e, rows) @ values.T) / own
         turned = np.unwrap(np.angle(ratio), axis=1)
         return (ratio[:, 0].real < 0) | (np.abs(turned[:, -1] - np.angle(ratio[:, 0])) > np.pi / 2)
 
+    return grid, values, unstable
+
+
+def _first(unstable: Callable[[FloatArray], Any], P: FloatArray, D: FloatArray, goal: float) -> FloatArray:
+    """Where the first of the rays p + t d become unstable: t of each, infinite of the others."""
+    scan = goal * np.unique(np.r_[np.geomspace(1e-3, 1, 13), np.linspace(0, 1, 25)[1:]])
+    t, before = np.full(len(P), math.inf), 0.0
+    for at in scan.tolist():
+        rays = np.flatnonzero(unstable(P + at * D))
+        if len(rays):
+            low, high = np.full(len(rays), before), np.full(len(rays), at)
+            for _ in range(40):
+                middle = (low + high) / 2
+                bad = unstable(P[rays] + middle[:, None] * D[rays])
+                low, high = np.where(bad, low, middle), np.where(bad, middle, high)
+            t[rays] = high
+            break
+        before = at
+    return t
+
+
+def _worst_ray(e: Enclosure, box: _Box, goal: float) -> tuple[float, float, FloatArray] | None:
+    """The first loss of stability along the diagonals of the box: t, w, p. None when there is none below goal."""
+    grid, values, unstable = _stability(e)
+    P, D = _rays(box, [i for i, size in enumerate(e.shape) if size > 1])
+    t = _first(unstable, P, D, goal)
+    k = int(t.argmin())
+    return None if math.isinf(t[k]) else _sharpened(e, grid, values, P[k], D[k], float(t[k]))
+
+
+def _around(
+    e: Enclosure, box: _Box, goal: float, place: FloatArray
+) -> tuple[float, float, FloatArray] | None:
+    """The first loss of stability on rays about the one through `place`: t, w, p. None where none is below goal."""
+    grid, values, unstable = _stability(e)
     free = [i for i, size in enumerate(e.shape) if size > 1]
+    grown = np.array([box.down[i] + box.up[i] > 0 for i in free])
+    low = np.where(grown, -1.0, box.over[free, 0])
+    high = np.where(grown, 1.0, box.over[free, 1])
+    down, up = box.down[free], box.up[free]
+
+    def rays(u: FloatArray) -> tuple[FloatArray, FloatArray]:
+        P, D = np.tile(box.nominal, (len(u), 1)), np.zeros((len(u), len(box.nominal)))
+        P[:, free] += np.where(grown, 0, u)
+        D[:, free] = np.where(grown, np.where(u > 0, u * up, u * down), 0)
+        return P, D
+
+    moved = place[free] - box.nominal[free]
+    u = np.where(grown, moved / np.where(grown, np.where(moved > 0, up, down), 1), moved)
+    size = np.abs(u[grown]).max(initial=0.0)
+    if size == 0:
+        return None
+    u = np.clip(np.where(grown, u / size, u), low, high)
+    best, step = math.inf, 0.5
+    while step > 1e-3:
+        moves = np.vstack([0 * u, *(s * step * np.diag(high - low) / 2 for s in (1, -1))])
+        trial = np.clip(u + moves, low, high)
+        t = _first(unstable, *rays(trial), min(goal, best))
+        k = int(t.argmin())
+        if t[k] < best * (1 - 1e-9):
+            best, u = float(t[k]), trial[k]
+        else:
+            step /= 2
+        if math.isinf(best) and step < 0.1:
+            return None
+    (p,), (d,) = rays(u[None, :])
+    return _sharpened(e, grid, values, p, d, best)
+
+
+def _sharpened(
+    e: Enclosure, grid: FloatArray, values: ComplexArray, p: FloatArray, d: FloatArray, t: float
+) -> tuple[float, float, FloatArray]:
+    """t, w, p + t d where f vanishes near t."""
+    size = np.abs(products(e, (p + t * d)[None, :]) @ values.T)[0]
+    at = grid[int((size / np.abs(products(e, e.nominal[None, :]) @ values.T)[0]).argmin())]
+    t, cell = _polished(e, p, d, t, at)
+    w = cell[1] if cell[0] == 0 else 1 / cell[1] if cell[1] > 1e-12 / e.matrices.stiffest else math.inf
+    return t, float(w), p + t * d
+
+
+def _rays(box: _Box, free: list[int]) -> tuple[FloatArray, FloatArray]:
+    """Starts p and directions d of p + t d: to the corners, from both ends and the middle of what stays."""
     grown = [i for i in free if box.down[i] + box.up[i] > 0]
     stay = [i for i in free if i not in grown]
-    places = [
-        np.array(place)
-        for place in itertools.product(*(np.linspace(box.over[i, 0], box.over[i, 1], 3) for i in stay))
+    places = np.array(
+        list(itertools.product(*(np.linspace(box.over[i, 0], box.over[i, 1], 3) for i in stay)))
+    )
+    signs = np.array(list(itertools.product((-1, 1), repeat=len(grown))))
+    start = np.tile(box.nominal, (len(places) * len(signs), 1))
+    step = np.zeros_like(start)
+    start[:, stay] += np.repeat(places, len(signs), axis=0)
+    step[:, grown] = np.tile(np.where(signs > 0, box.up[grown], -box.down[grown]), (len(places), 1))
+    return start, step
+
+
+def _by_eigenvalues(
+    system: UncertainSystem, c: Compensator, box: _Box, goal: float, found: list[_Bound]
+) -> list[_Bound]:
+    """With the first loss of stability along the box's diagonals, where f is no polynomial."""
+    P, D = _rays(box, list(range(len(box.nominal))))
+    t = _first(lambda rows: instability(system, c, rows) >= 0, P, D, goal)
+    k = int(t.argmin())
+    if math.isinf(t[k]):
+        return found
+    p = P[k] + t[k] * D[k]
+    w = np.array([critical(system, c, p)])
+    sizes = [
+        math.inf
+        if not b.reason
+        else np.abs(characteristic_values(b.block, p[None, :], w)).item()
+        / np.abs(characteristic_values(b.block, box.nominal[None, :], w)).item()
+        for b in found
     ]
-    signs = itertools.product((-1, 1), repeat=len(grown))
-    nominal = box.nominal[None, :].copy()
-    start, step = [], []
-    for place, sign in itertools.product(places, signs):
-        p, d = box.nominal.copy(), np.zeros(len(box.nominal))
-        p[stay] += place
-        for i, s in zip(grown, sign, strict=True):
-            d[i] = s * (box.up[i] if s > 0 else box.down[i])
-        start.append(p)
-        step.append(d)
-    P, D = np.array(start), np.array(step)
-    scan = goal * np.linspace(0, 1, 25)[1:]
-    crossed = np.array([unstable(P + t * D) for t in scan])  # t x rays
-    if not crossed.any():
-        return None
-    first = np.where(crossed.any(axis=0), crossed.argmax(axis=0), len(scan))
-    rays = np.flatnonzero(first == first.min())
-    low, high = np.full(len(rays), scan[first.min()] - scan[0]), np.full(len(rays), scan[first.min()])
-    for _ in range(40):
-        t = (low + high) / 2
-        bad = unstable(P[rays] + t[:, None] * D[rays])
-        low, high = np.where(bad, low, t), np.where(bad, t, high)
-    k = int(high.argmin())
-    ray = rays[k]
-    p = P[ray] + high[k] * D[ray]
-    size = np.abs(products(e, p[None]) @ values.T)[0]
-    at = grid[int((size / np.abs(products(e, nominal) @ values.T)[0]).argmin())]
-    t, cell = _polished(e, P[ray], D[ray], float(high[k]), at)
-    w = cell[1] if cell[0] == 0 else 1 / cell[1] if cell[1] > 1e-12 / e.matrices.stiffest else math.inf
-    return t, float(w), P[ray] + t * D[ray]
+    i = int(np.argmin(sizes))
+    worse = replace(found[i], upper=float(t[k]), frequency=float(w[0]), witness=p)
+    return [*found[:i], worse, *found[i + 1 :]]
 
 
 def _polished(
@@ -430,8 +549,8 @@ def _polished(
     return float(t), np.array([cell[0], at, at])
 
 
-def _prove(e: Enclosure, most_cells: int) -> Certificate | str:
-    """Exclude zero from f over the whole box and all frequencies, or say why not."""
+def _prove(e: Enclosure, most_cells: int) -> Certificate | tuple[str, FloatArray]:
+    """Exclude zero from f over the whole box and all frequencies, or say why not, and at which parameters."""
     free = [axis for axis, size in enumerate(e.shape) if size > 1]
     cells = cover(e.block.own, e.matrices.stiffest)
     ends = (0.0, float(cells[:, 2].max()) if e.block.own.sample_time is not None else math.inf)
@@ -452,9 +571,17 @@ def _prove(e: Enclosure, most_cells: int) -> Certificate | str:
         bad = ~good
         if not bad.any():
             continue
-        if count > most_cells:
-            return f"not settled within {most_cells} cells"
         own, own_boxes, f = own[bad], own_boxes[bad], f[bad]
+        narrow = np.diff(own[:, 1:], axis=1)[:, 0] < 1e-13 * np.maximum(own[:, 2], 1e-9 * ends[0])
+        if count > most_cells or narrow.any():
+            k = int(np.argmax(narrow)) if narrow.any() else -1
+            middle = float(own[k, 1:].mean())
+            w = middle if own[k, 0] == 0 else 1 / middle
+            place = e.sides[:, 0] + np.diff(e.sides)[:, 0] * own_boxes[k].mean(axis=1)
+            settled = (
+                f"not settled within {most_cells} cells" if count > most_cells else "zero is not excluded"
+            )
+            return f"{settled}, near {w:.6g} rad/s", place
         # split what moves f most: frequency, or a parameter
         moves = [np.abs(f.g).sum(axis=1) + f.r.sum(axis=1)]
         values = f.c.reshape(-1, *e.shape)
@@ -462,8 +589,6 @@ def _prove(e: Enclosure, most_cells: int) -> Certificate | str:
             moves.append(np.abs(np.diff(values, axis=axis + 1)).reshape(len(own), -1).sum(axis=1) / 2)
         moves[0] = np.where(np.isfinite(moves[0]), moves[0], np.inf)
         choice = np.argmax(moves, axis=0)
-        if (np.diff(own[:, 1:], axis=1)[:, 0] < 1e-13 * np.maximum(own[:, 2], 1e-9 * ends[0])).any():
-            return f"zero is not excluded near {own[0, 1:].mean():.6g} rad/s"
         for k in range(1 + len(free)):
             chosen = choice == k
             if not chosen.any():
@@ -489,7 +614,7 @@ def _merged(system: UncertainSystem, c: Compensator, box: _Box, bounds: list[_Bo
     if worst.witness is not None:
         shares = _shares(worst, box)
         grows = box.down + box.up > 0
-        for beyond in (2e-7, 1e-6, 1e-5, 1e-4):
+        for beyond in (2e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2):
             p = worst.witness.copy()
             p[grows] = box.nominal[grows] + (1 + beyond) * (p[grows] - box.nominal[grows])
             if float(instability(system, c, p)[0]) > 0:

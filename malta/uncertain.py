@@ -242,3 +242,12 @@ def instability(system: UncertainSystem, c: Compensator, p: FloatArray) -> Float
         grown = (2 * T * poles.real + T**2 * np.abs(poles) ** 2).max(axis=1)  # |lambda|^2 - 1
         return np.asarray(np.log1p(np.maximum(grown, -1 + 1e-15)) / (2 * T))
     return np.asarray(poles.real.max(axis=1))
+
+
+def critical(system: UncertainSystem, c: Compensator, p: FloatArray) -> float:
+    """Frequency of the worst pole at one row of parameters, rad/s."""
+    (poles,) = np.linalg.eigvals(closed_loop(system, c, p))
+    if c.sample_time is None:
+        return float(abs(poles[poles.real.argmax()].imag))
+    z = 1 + c.sample_time * poles
+    return float(abs(np.angle(z[np.abs(z).argmax()])) / c.sample_time)
