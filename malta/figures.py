@@ -718,13 +718,12 @@ def front_figure(tuned: Tuned) -> Figure:
     asked, chosen, front = tuned.spec.specification, tuned.trial, tuned.front
     figure = Figure(figsize=(9.0, 4.6), dpi=120)
     figure.subplots_adjust(left=0.085, right=0.98, bottom=0.115, top=0.8, wspace=0.25)
-    kept = [one for one in front if one.values == chosen.values] or [chosen]
-    found = (
-        f"{tuned.trials} designs tried; taken: margin {100 * kept[0].figures.get('margin', math.nan):.0f} %"
-    )
+    taken = next((one for one in front if one.values == chosen.values), chosen)
+    others = [one for one in front if one is not taken] or [taken]
+    found = f"{tuned.trials} trials; taken: margin {100 * taken.figures['margin']:.0f} %, which keeps a reserve in all"
     figure.suptitle(f"{tuned.spec.name}: margin against noise", fontsize=11, y=0.985)
     figure.text(0.5, 0.925, found, fontsize=9, color="#4a4a4a", ha="center", va="top")
-    margins = [100 * one.figures["margin"] for one in front]
+    margins = [100 * one.figures["margin"] for one in others]
     panels: Any = figure.subplots(1, 2)
     sides = (
         (("force_noise", "bearing force", 1.0, 0), ("thrust_noise", "thrust", 1.0, 2)),
@@ -737,14 +736,11 @@ def front_figure(tuned: Tuned) -> Figure:
         for name, label, scale, style in lines:
             if not all(name in one.figures for one in front):
                 continue
-            sizes = [scale * one.figures[name] for one in front]
+            sizes = [scale * one.figures[name] for one in others]
             axes.plot(margins, sizes, marker="o", markersize=4, label=label, **STYLES[style])
-            axes.plot(
-                100 * kept[0].figures["margin"],
-                scale * kept[0].figures[name],
-                **(DOT | {"markersize": 10}),
-                mfc="none",
-            )
+            where = 100 * taken.figures["margin"], scale * taken.figures[name]
+            ring = {"markersize": 9, "markerfacecolor": "none", "markeredgecolor": STYLES[style]["color"]}
+            axes.plot(*where, **DOT | ring)
         if asked.margin is not None:
             axes.axvline(100 * asked.margin, **BOUND)
         _finish(axes, "robust margin over the travel, proven [% of the box]", y, legend=2)

@@ -473,7 +473,7 @@ FRONT_COLUMNS = {
     "thrust_noise": ("thrust", 1.0, "N rms"),
     "radial_motion": ("radial motion", 1e6, "um rms"),
     "axial_motion": ("axial motion", 1e6, "um rms"),
-    "peak_sensitivity": ("peak sensitivity", 1.0, ""),
+    "peak_sensitivity": ("peak S", 1.0, ""),
     "bandwidth": ("bandwidth", 1.0, "rad/s"),
 }
 
