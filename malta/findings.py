@@ -136,7 +136,7 @@ def unit_of(plan: Plan, name: str) -> str:
     """The unit to show a varied value in."""
     errors = {signal.name: signal.unit for signal in plan.plant.sensor_errors}
     shown = {"1": "percent", "m": "um", "rad": "deg"}
-    return shown[errors[name]] if name in errors else units_of(plan.parameters)[name]
+    return shown.get(errors[name], errors[name]) if name in errors else units_of(plan.parameters)[name]
 
 
 def half_text(plan: Plan, name: str) -> str:
