@@ -571,7 +571,7 @@ def tune(
 def claims(
     designs: Annotated[
         list[Path] | None,
-        typer.Argument(help="Design files; table2 and calibrated of design/ if none is named."),
+        typer.Argument(help="Design files; all of design/ if none is named."),
     ] = None,
     markdown: Annotated[
         bool, typer.Option("--markdown", help="Print the table as the README holds it.")
@@ -595,6 +595,8 @@ def claims(
             "claims", "", "no design files (*.toml) here", "a folder design/ with some, or their names"
         )
     specs = [read_design(file) for file in chosen]
+    if not designs:
+        specs.sort(key=lambda spec: bool(spec.search))  # the paper's own designs first
     with _bar("claims", quiet=as_json) as progress:
         found = ledger(specs, published(specs[0].machine_file), progress)
     if as_json:

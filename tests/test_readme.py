@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 
 import pytest
-from conftest import DESIGNS, ROOT
+from conftest import ROOT
 
 import malta
 
@@ -31,7 +31,7 @@ def _is_noisy(subject: str) -> bool:
 
 
 def test_the_table_of_claims_is_computed() -> None:
-    specs = [malta.read_design(f"design/{name}.toml") for name in DESIGNS]
+    specs = [malta.read_design(f"design/{name}.toml") for name in ("table2", "calibrated", "robust")]
     found = _cells(malta.ledger(specs, malta.published("data/tubular.toml")).markdown())
     start = README.index("| claim |")
     shown = _cells(README[start : README.index("\n\n", start)])
