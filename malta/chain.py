@@ -25,7 +25,7 @@ from malta.robust import Margin, robust_margin
 from malta.spec import Weights
 from malta.synthesize import kalman, lqi, lqr
 from malta.uncertain import Compensator, UncertainSystem, instability, responses, uncertain
-from malta.verify import CurrentLoops, largest, machine_law, travel_margin
+from malta.verify import CurrentLoops, largest, machine_law
 
 if TYPE_CHECKING:
     from malta.plant import ComplexArray, FloatArray
@@ -70,7 +70,7 @@ class Place:
     position: float  # m
     margin: Margin
     peak: float
-    disk: float  # all forces and sensors at once
+    disk: float  # all forces and sensors at once; NaN where unstable, as the peak and the delay
     delay: float  # s
 
 
@@ -172,11 +172,11 @@ def robustness(
 
     names = list(uncertainty)
     position = float(controller.operating_point[0][plant.stroke_state])
-    at = {plant.stroke: position}
+    at, believed = {plant.stroke: position}, plant_of(controller.parameters)
     links = []
     stages = compensators(plant, controller, current_loops)
     for name, (law, states) in stages.items():
-        system = uncertain(plant, names, states=states, at=at)
+        system = uncertain(plant, names, states=states, at=at, believed=believed)
         links.append(
             Link(
                 name,
@@ -187,12 +187,13 @@ def robustness(
         )
         done()
     law = stages[SAMPLED][0]
-    system = uncertain(plant, names, at=at)
-    travel = travel_margin(plant, controller, uncertainty, current_loops)
+    system = uncertain(plant, names, at=at, believed=believed)
+    anywhere = uncertain(plant, [*names, plant.stroke], at={plant.stroke: 0.0}, believed=believed)
+    travel = robust_margin(anywhere, law, uncertainty, {plant.stroke: (-plant.travel, plant.travel)})
     done()
     tolerance = {}
     for name, share in uncertainty.items():
-        alone, nominal = uncertain(plant, [name], at=at), getattr(plant.parameters, name)
+        alone, nominal = uncertain(plant, [name], at=at, believed=believed), getattr(plant.parameters, name)
         sides = []
         for pair in ((nominal * (1 - share), nominal), (nominal, nominal * (1 + share))):
             sides.append(robust_margin(alone, law, {name: pair}))
@@ -201,36 +202,35 @@ def robustness(
     payload = None
     if "m" in units_of(plant.parameters):
         m: float = getattr(plant.parameters, "m")  # noqa: B009  a machine's own field
-        payload = robust_margin(uncertain(plant, ["m"], at=at), law, {"m": (m, m + 1.0)})
+        payload = robust_margin(uncertain(plant, ["m"], at=at, believed=believed), law, {"m": (m, m + 1.0)})
     done()
     places = []
     for share in PLACES:
-        here = uncertain(plant, names, at={plant.stroke: share * plant.travel})
-        P, F = _at_nominal(here, law, _frequencies(law))
-        places.append(
-            Place(
-                share * plant.travel,
-                robust_margin(here, law, uncertainty),
-                _peak(here, law, states=False),
-                disk_margin(here, law, "forces and sensors").size,
-                min(delay_margins(P @ F, _frequencies(law)).tolist()),
-            )
-        )
+        here = uncertain(plant, names, at={plant.stroke: share * plant.travel}, believed=believed)
+        disk, delay = np.nan, np.nan
+        if _stable(here, law):
+            P, F = _at_nominal(here, law, _frequencies(law))
+            disk = disk_margin(here, law, "forces and sensors").size
+            delay = float(delay_margins(P @ F, _frequencies(law)).min())
+        margin, peak = robust_margin(here, law, uncertainty), _peak(here, law, states=False)
+        places.append(Place(share * plant.travel, margin, peak, disk, delay))
         done()
     stable = _stable(system, law)
     w = _frequencies(law)
     P, F = _at_nominal(system, law, w)
     sensors = [s.name for s in plant.outputs]
     delays = delay_margins(P @ F, w) if stable else np.full(len(sensors), np.nan)
-    disks = [disk_margin(system, law, kind) for kind in ("forces", "sensors", "forces and sensors")]
-    disks += [
-        replace(disk_margin(system, law, "sensors", only=k), channels=f"{name} alone")
-        for k, name in enumerate(sensors)
-    ]
+    disks: list[Disk] = []
+    if stable:
+        disks += [disk_margin(system, law, kind) for kind in ("forces", "sensors", "forces and sensors")]
+        disks += [
+            replace(disk_margin(system, law, "sensors", only=k), channels=f"{name} alone")
+            for k, name in enumerate(sensors)
+        ]
     return Robustness(
         tuple(links),
         travel,
-        tuple(disks) if stable else (),
+        tuple(disks),
         dict(zip(sensors, delays.tolist(), strict=True)),
         dict(zip(sensors, _gang(P, F), strict=True)) if stable else {},
         tolerance,

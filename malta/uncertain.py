@@ -67,13 +67,19 @@ class Compensator:
 
 
 def uncertain(
-    plant: Plant, names: Sequence[str], *, at: Mapping[str, float] | None = None, states: bool = False
+    plant: Plant,
+    names: Sequence[str],
+    *,
+    at: Mapping[str, float] | None = None,
+    states: bool = False,
+    believed: Plant | None = None,
 ) -> UncertainSystem:
     """The design model of a plant at a position along its stroke, in parameters by name, without preload.
 
     The stroke itself may be one of the names (`z` for MALTA): its nominal value is the position.
     Inputs are commanded forces: a controller divides by the force constants it knows, the plant multiplies by its own.
-    at: the position, SI; states: the states follow the outputs in y.
+    at: the position, SI; states: the states follow the outputs in y; believed: the machine that the controller knows,
+    where it is another one.
 
     Raises InputError for an unknown name.
     """
@@ -96,7 +102,10 @@ def uncertain(
     if plant.stroke in symbols:
         point[plant.stroke_state] = symbols[plant.stroke]
     keep = list(plant.controlled)
-    scale = ca.diag(ca.vertcat(*machine.actuator.force_constant) / ca.DM(list(plant.actuator.force_constant)))
+    scale = ca.diag(
+        ca.vertcat(*machine.actuator.force_constant)
+        / ca.DM(list((believed or plant).actuator.force_constant))
+    )
     jacobians = [
         ca.jacobian(rate, x)[keep, keep],
         ca.jacobian(rate, u)[keep, :] @ scale,
