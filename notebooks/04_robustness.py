@@ -2,7 +2,8 @@
 # # Robustness: where the margin goes, and how to keep it
 #
 # The paper lets m, K_A, K_D and K_B vary by 20 % and reports that its LQR stands "up to around 300 %" of that. An LQR
-# that measures every state is not what runs on the machine: an observer, current loops, a hold and a sample of delay do.
+# that measures every state is not what runs on the machine: there are an observer, current loops, a hold and a sample
+# of delay.
 #
 # **Question:** what is left of the margin on the machine, and what does it take to have it back?
 
@@ -10,7 +11,9 @@
 import os
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import matplotlib.pyplot as plt
 import numpy as np
 
 import malta
@@ -58,8 +61,8 @@ assert machine["robust"].lower >= 3.5
 
 # %% [markdown]
 # ## A witness flies
-# What the eigenvalues say, the nonlinear machine should show: just inside the boundary a small step dies out, just beyond
-# it grows. Simulated with the forces as first-order lags, as the proof has them, without loads.
+# What the eigenvalues say, the nonlinear machine should show: just inside the boundary a small step dies out, just
+# beyond it grows. Simulated with the forces as first-order lags, as the proof has them, without loads.
 
 
 # %%
@@ -67,9 +70,9 @@ def flown(name: str, share: float) -> float:
     """The motion (m) half a second after 0.1 um off centre, at a share of the way to the witness."""
     margin = found[name].chain[-1].margin
     assert margin.witness is not None
-    nominal = plant.parameters
+    nominal: Any = plant.parameters
     far = {k: getattr(nominal, k) + share * margin.moved[k] for k in BOX}
-    true = malta.plant_of(replace(nominal, **far, F_c=0.0, g=0.0))  # type: ignore[arg-type]
+    true = malta.plant_of(replace(nominal, **far, F_c=0.0, g=0.0))
     c = controllers[name]
     alone = replace(c, feedforward=replace(c.feedforward, v0=0 * c.feedforward.v0))
     scenario = malta.Scenario("witness", 0.6, malta.references.hold, {"x": 1e-7, "z": 1e-7}, fidelity="force")
@@ -81,3 +84,68 @@ for name in ("calibrated", "robust"):
     inside, outside = flown(name, 0.9), flown(name, 1.1)
     print(f"{name}: {inside * 1e6:.2g} um are left inside the boundary, {outside * 1e6:.2g} um beyond")
     assert inside < 2e-8 < 1e-6 < outside
+
+# %% [markdown]
+# ## Machines by the hundred
+# A proof holds for the linear loop. What do machines do that are drawn from ever larger boxes and fly the stroke, with
+# gravity, cogging, saturation, sensor noise? The share that completes it, over the size of the box:
+
+# %%
+SIZES = np.array([0.25, 0.5, 1, 1.5, 2, 2.5, 3, 3.5, 4, 4.5])
+RUNS = 256
+yields = {}
+for name, controller in controllers.items():
+    shares = []
+    for size in SIZES:
+        rng = np.random.default_rng(7)
+        changes = {
+            k: getattr(plant.parameters, k) * (1 + size * share * rng.uniform(-1, 1, RUNS))
+            for k, share in BOX.items()
+        }
+        scenario = malta.Scenario.stroke(fidelity="force", noise=1.0)
+        shares.append(float(malta.simulate_many(plant, controller, scenario, changes).completed.mean()))
+    yields[name] = np.array(shares)
+
+figure, axes = plt.subplots(figsize=(7.5, 4), layout="constrained")
+for (name, completed), style in zip(yields.items(), malta.report.STYLES, strict=False):
+    axes.plot(100 * SIZES, 100 * completed, marker="o", markersize=4, label=name, **style)
+    axes.axvline(100 * (machine[name].lower or 0), **style | {"linewidth": 0.8})
+axes.set_xlabel("size of the box [%]; thin lines: proven over the travel")
+axes.set_ylabel(f"strokes completed of {RUNS} [%]")
+axes.legend(frameon=False)
+figure.savefig("build/04_yield.png", dpi=120)
+for name, completed in yields.items():
+    told = "  ".join(f"{size:.0%} {share:.0%}" for size, share in zip(SIZES, completed, strict=True))
+    print(f"{name:10} {told}")
+    assert (completed[(machine[name].lower or 0) >= SIZES] == 1).all()
+
+# %% [markdown]
+# **Judgement.** Inside its proven box every machine flies. Beyond it machines fall one by one, not all at once: the
+# proof is about the worst combination, which few machines have. That is why sampling reports margins that are too
+# large.
+
+# %% [markdown]
+# ## The worst machines
+# The ones that come closest to the touchdown bearings, in the modelled box.
+
+# %%
+plan = malta.Plan(controllers["calibrated"], "stroke", BOX, samples=1024, options={"fidelity": "force"})
+campaign = malta.campaign(plan, "build/04_campaign")
+malta.report.campaign(campaign, "build/04_campaign", malta.published("data/tubular.toml"))
+assert campaign.completed.all()
+
+# %% [markdown]
+# ## What it costs
+# More margin costs force noise. `malta tune` draws the front: the least noise at each margin, everything else as
+# specified (design/figures/robust_front.svg).
+
+# %%
+front = Path("design/figures/robust_front.md").read_text(encoding="utf-8")
+print(front)
+rows = [line.strip("|").split("|") for line in front.splitlines()[2:]]
+margin, noise = np.array([[float(row[0]), float(row[1])] for row in rows if "*" not in row[-1]]).T
+assert (np.diff(noise[np.argsort(margin)]) > 0).all()
+
+# %% [markdown]
+# **Judgement.** The front bends at 350 %: up to there every percent costs little, from 370 % on the bearing force noise
+# trebles. The shipped design (*) stands beside the front, with a few percent of room in every requirement.
