@@ -195,10 +195,10 @@ def actuator(c: Compensator, f: Frequencies, cells: FloatArray, order: int) -> T
     return H * Taylor(turned, -1j * late * half * turned, (late * half) ** 2 / 2)
 
 
-def _images(c: Compensator, M: Matrices, cells: FloatArray) -> FloatArray:
-    """Bound of the rest of a hold's images: E of (H + E) B F C, cells x positions x positions.
+def _images(c: Compensator, M: Matrices, cells: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Bounds of the rest of a hold's images, cells x positions x positions: E of C0 (H + E) and of s C1 (H + E / s).
 
-    N(jw) N(jW)^-1 - (w/W)^2 = (j w (1 - w/W) N1 + (1 - w^2/W^2) N0) / W^2 (1 + X)^-1, X = j N1 / W + N0 / W^2
+    N(jW)^-1 N(jw) - (w/W)^2 = (1 + X)^-1 (j w (1 - w/W) N1 + (1 - w^2/W^2) N0) / W^2,  X = j N1 / W + N0 / W^2
     """
     T = c.sample_time
     assert T is not None
@@ -208,7 +208,6 @@ def _images(c: Compensator, M: Matrices, cells: FloatArray) -> FloatArray:
     held = 2 * np.abs(np.sin(np.minimum(high * T / 2, np.pi / 2)))[:, None] / (W * T)
     if c.lag is not None:
         held = held * c.lag / np.hypot(W, c.lag)
-    share = 1.1 * (held / W**M.order).sum(axis=1)  # beyond 40: below a tenth of the sum
     N0 = 1.5 * np.abs(M.N0).max(axis=0)  # the half for what lies between the nodes
     nearest = np.pi / T
     if M.N1 is None:
@@ -217,8 +216,12 @@ def _images(c: Compensator, M: Matrices, cells: FloatArray) -> FloatArray:
         N1 = 1.5 * np.abs(M.N1).max(axis=0)
         moved, X = N0 + 2 * high[:, None, None] * N1, N1 / nearest + N0 / nearest**2
     if np.abs(np.linalg.eigvals(X)).max() >= 1:
-        return np.full(moved.shape, np.inf)
-    return np.asarray(share[:, None, None] * (moved @ np.linalg.inv(np.eye(len(X)) - X)))
+        return np.full(moved.shape, np.inf), np.full(moved.shape, np.inf)
+    moved = np.linalg.inv(np.eye(len(X)) - X) @ moved
+    # 1.1 for the images beyond 40, which are below a tenth of the sum
+    shares = (1.1 * (held / W**power).sum(axis=1)[:, None, None] for power in (M.order, 1))
+    E0, E1 = (np.asarray(share * moved) for share in shares)
+    return E0, E1
 
 
 @dataclass(frozen=True, eq=False)
@@ -251,12 +254,16 @@ def matrices_of(block: Block, p: FloatArray) -> Matrices:
 def characteristic(c: Compensator, M: Matrices, cells: FloatArray) -> tuple[Taylor, FloatArray]:
     """f on the intervals at the rows of parameters: cells x rows; and how far a hold's images move it at any: cells."""
     f = frequencies(c, cells)
-    bare, H = response(c, f, cells), actuator(c, f, cells, M.order)
+    bare = response(c, f, cells)
 
     def wide(t: Taylor) -> Taylor:
         return t[:, None, None, None]
 
-    G = bare if H is None else H[:, None, None] * bare
+    def driven(order: int) -> Taylor:
+        H = actuator(c, f, cells, order)
+        return bare if H is None else H[:, None, None] * bare
+
+    G = driven(M.order)
 
     def through(G: Taylor, C: FloatArray) -> Taylor:
         inner = G.mapped(M.B, "jak,wkl->wjal")
@@ -276,24 +283,23 @@ def characteristic(c: Compensator, M: Matrices, cells: FloatArray) -> tuple[Tayl
             F = F - wide(f.scale * f.sigma * f.tau) * M.N1[None]
         F = F - through(squared[:, None, None] * G, M.C0)
         if M.C1 is not None:
-            F = F - through((f.sigma * f.tau)[:, None, None] * G, M.C1)
-    C = np.abs(M.C0)[None]
-    if M.C1 is not None:
-        w = np.where(cells[:, 0] == 0, cells[:, 2], 1.0)  # times tau where that is not 1
-        C = C + w[:, None, None, None] * np.abs(M.C1)
-    terms = np.abs(M.B) @ bare.size()[:, None] @ C
-    own = np.abs(
-        f.scale.size()[:, None, None, None]
-        * (f.sigma.size()[:, None, None, None] ** M.order * eye + np.abs(M.N0))
-    )
+            F = F - through((f.sigma * f.tau)[:, None, None] * driven(1), M.C1)
+    # rounding, relative to the terms
+    s, C0 = f.sigma.size()[:, None, None, None], np.abs(M.C0)[None]
+    C1 = None if M.C1 is None else np.abs(M.C1)[None]
+    inward = np.abs(M.B) @ bare.size()[:, None]
+    terms = inward @ (C0 if C1 is None else C0 + s * C1)
+    own = f.scale.size()[:, None, None, None] * (s**M.order * eye + np.abs(M.N0))
     F = Taylor(F.c, F.g, F.r + ROUNDING * (own + terms))
     if c.sample_time is None:
         return _determinant(F), np.zeros(len(cells))
-    if terms.shape[-1] == 1:  # a factor of the input: f keeps its degrees
-        return Taylor(F.c, F.g, F.r + _images(c, M, cells)[:, None] @ terms)[..., 0, 0], np.zeros(len(cells))
-    terms = terms.max(axis=1)  # 1.5 for what lies between the rows
-    moved = Taylor(1.5 * F.size().max(axis=1) + 0j, 0 * terms + 0j, _images(c, M, cells) @ (2.25 * terms))
-    return _determinant(F), _determinant(moved, signed=False).r
+    E0, E1 = (E[:, None] for E in _images(c, M, cells))
+    rest = inward @ (C0 @ E0 if C1 is None else C0 @ E0 + C1 @ E1)
+    if rest.shape[-1] == 1:  # a factor of the output: f keeps its degrees
+        return Taylor(F.c, F.g, F.r + rest)[..., 0, 0], np.zeros(len(cells))
+    # elsewhere they couple what the plant does not; 1.5 of each matrix for what lies between the rows
+    most, moved = 1.5 * F.size().max(axis=1), 2.25 * rest.max(axis=1)
+    return _determinant(F), _determinant(Taylor(most + 0j, 0j * most, moved), signed=False).r
 
 
 def _determinant(F: Taylor, *, signed: bool = True) -> Taylor:

@@ -318,12 +318,14 @@ def _at_crossovers(e: Enclosure, box: _Box, goal: float) -> tuple[float, float, 
         cells = np.column_stack([0 * w, w, w])
         f = frequencies(c, cells)
         with np.errstate(all="ignore"):  # only centres count here
-            G, H = response(c, f, cells).c, actuator(c, f, cells, 2)
-            G = G if H is None else H.c[:, None, None] * G
-        value = np.einsum("k,wkl,l->w", M.B[0, 0], G, M.C0[0, :, 0]) / f.scale.c
-        if C1 is not None:
-            value = value + 1j * w * np.einsum("k,wkl,l->w", M.B[0, 0], G, C1) / f.scale.c
-        return np.asarray(value)
+            F = response(c, f, cells).c / f.scale.c[:, None, None]
+            total = np.zeros(len(w), dtype=complex)
+            for order, C in ((2, M.C0[0, :, 0]), (1, C1)):
+                if C is not None:
+                    H = actuator(c, f, cells, order)
+                    path = np.einsum("k,wkl,l->w", M.B[0, 0], F, C) * (1.0 if H is None else H.c)
+                    total += path * (1.0 if order == 2 else 1j * w)
+        return total
 
     top = cover(c, M.stiffest)[:, 2].max()
     w = np.geomspace(1e-9, 1, 1600) * top
