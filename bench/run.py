@@ -35,6 +35,7 @@ import malta
 from malta.machine import state_reference
 from malta.plants import tubular
 from malta.simulate import compiled_shape, engine_of, feedforward
+from malta.verify import machine_law, travel_margin
 
 ROOT = Path(__file__).parents[1]
 IMPORTS = "import numpy, scipy, control, casadi"
@@ -225,6 +226,86 @@ def many(runs: int) -> list[Result]:
     ]
 
 
+def margin(runs: int) -> list[Result]:
+    """The margin of the flagship's loop on the machine at z = 0, and what others report of it."""
+    peer = importlib.import_module("peer_margin")
+    controller = malta.gains.read(ROOT / "design" / "gains" / "robust.json")
+    plant = malta.plant_of(controller.parameters)
+    box = dict.fromkeys(("m", "K_A", "K_D", "K_B"), peer.SHARE)
+    problem = peer.Problem(malta.uncertain(plant, list(box)), machine_law(plant, controller))
+    ours = malta.robust_margin(problem.system, problem.law, box)
+    travel = travel_margin(plant, controller, box)
+    calls: dict[str, Callable[[], float]] = {
+        "gridding": lambda: peer.gridding(problem, 5),
+        "Monte-Carlo for 2 s": lambda: peer.monte_carlo(problem, 2.0),
+    }
+    if optional("slycot"):
+        calls["AB13MD on 300 frequencies"] = lambda: peer.ab13md(problem)
+    answers = {name: call() for name, call in calls.items()}
+    seconds, everywhere, *theirs = medians(
+        lambda: malta.robust_margin(problem.system, problem.law, box),
+        lambda: travel_margin(plant, controller, box),
+        *calls.values(),
+        runs=runs,
+        what="margin",
+    )
+    told = f"margin at z = 0: {ours.lower:.4f} .. {ours.upper:.4f}"
+    rows = [
+        Result(told, seconds, f"{name}: {answers[name]:.3f}", took, "")
+        for name, took in zip(calls, theirs, strict=True)
+    ]
+    return [
+        *rows,
+        Result(f"all the travel: {travel.lower:.4f} .. {travel.upper:.4f}", everywhere, "z = 0", seconds, ""),
+    ]
+
+
+def campaigns(runs: int) -> list[Result]:
+    """Strokes of different machines: a campaign, with its files, beside loops over what a user would pick."""
+    _, work = workload("calibrated")
+    names = ("m", "K_A", "K_B", "K_D")
+    plan = malta.Plan(
+        work.controller, "stroke", dict.fromkeys(names, 0.2), samples=4096, options={"fidelity": "force"}
+    )
+
+    def flown() -> object:
+        with tempfile.TemporaryDirectory() as folder:
+            return malta.campaign(plan, folder)
+
+    factors = 1 + 0.2 * np.random.default_rng(0).uniform(-1, 1, (4, len(names)))
+    peers: dict[str, tuple[int, Callable[[], object]]] = {}
+    if optional("joblib"):
+        joblib = importlib.import_module("joblib")
+        jobs = [joblib.delayed(documented_stroke)(row.tolist()) for row in factors]
+        peers["python-control in a joblib loop"] = 4, lambda: joblib.Parallel(n_jobs=-1)(jobs)
+    found = optional("peer_numba_plain")
+    if found:
+        some = 1 + 0.2 * np.random.default_rng(0).uniform(-1, 1, (512, len(names)))
+        many_work = work._replace(factors=some, noise=1.0)
+        peers["numba prange, same equations"] = 512, lambda: found["peer_numba_plain"].many(many_work)
+    ours, *theirs = medians(flown, *(call for _, call in peers.values()), runs=runs, what="campaign")
+    return [
+        Result("campaign, seconds a machine", ours / plan.samples, name, seconds / count, "")
+        for (name, (count, _)), seconds in zip(peers.items(), theirs, strict=True)
+    ]
+
+
+def documented_stroke(factors: list[float]) -> float:
+    """One machine's stroke with python-control, in a process of joblib's."""
+    plant, work = workload("calibrated")
+    par = replace(
+        work.par,
+        **{n: getattr(work.par, n) * f for n, f in zip(("m", "K_A", "K_B", "K_D"), factors, strict=True)},
+    )
+    start = malta.simulate(plant, work.controller, SCENARIO)
+    inputs = np.hstack([work.p_ref, work.xi_ref, work.v_ff]).T
+    first = np.concatenate([start.x[0], start.force[0], work.xi_ref[0], np.zeros(10)])
+    t = np.arange(2000) * work.controller.sample_time
+    loop = closed_loop(par, work.controller, lean=False)
+    found = control.input_output_response(loop, t, inputs, X0=first)
+    return float(np.abs(found.outputs).max())
+
+
 def main() -> None:
     """Run all and print one table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -233,7 +314,7 @@ def main() -> None:
     table = Table(title=f"medians of {runs} runs in turn, seconds", title_justify="left", box=box.SIMPLE_HEAD)
     for column in ("malta", "s", "peer", "s", "peer / malta", "wanted"):
         table.add_column(column, justify="left" if column in ("malta", "peer") else "right")
-    for row in whole_process(runs) + stroke(runs) + many(runs):
+    for row in whole_process(runs) + stroke(runs) + many(runs) + margin(runs) + campaigns(runs):
         ratio = f"{row.theirs / row.ours:.2f}"
         table.add_row(row.workload, f"{row.ours:.4f}", row.peer, f"{row.theirs:.4f}", ratio, row.wanted)
     Console(width=100).print(table)
