@@ -24,7 +24,8 @@ import malta
 from malta import riccati
 from malta.data import published as read_published
 from malta.data import published_value
-from malta.engine import compiler
+from malta.engine import compiler, translate
+from malta.plant import symbolic
 from malta.plants import planar, planar_field
 from malta.plants.planar_field import ODD_X, ODD_Y, Series
 from malta.references import QUINTIC_DURATION, quintic
@@ -210,7 +211,7 @@ def test_the_series_is_the_quadrature(par: planar.Parameters) -> None:
 def test_the_series_has_converged(par: planar.Parameters, truth: Series) -> None:
     """Neither more harmonics nor more nodes change the forces of 3 A by more than 0.05 mN."""
     x, y, z = quarter(par, 18)
-    finer = planar_field.series(par, planar_field.modes(par, 24), planar_field.winding(par, nodes=96))
+    finer = planar_field.series(par, planar_field.modes(par, 20), planar_field.winding(par, nodes=80))
     assert largest(AMPERES * (finer(x, y, z) - truth(x, y, z))).max() < 5e-5
 
 
@@ -515,6 +516,28 @@ def test_hover_holds(par: planar.Parameters, exact: Series) -> None:
     assert i @ i == pytest.approx(170.8, abs=0.1)
 
 
+def test_parameters_may_be_symbols(par: planar.Parameters, exact: Series) -> None:
+    """Mass, inertias, gravity, coil pitch and arm, with the two equal inertias as one: the same motion."""
+    names = ["m", "I_x", "I_z", "g", "coil_pitch", "r_z"]
+    symbols = {name: ca.SX.sym(name) for name in names}
+    record = symbolic(par, symbols | {"I_y": symbols["I_x"]})
+    x, i = ca.SX.sym("x", 12), ca.SX.sym("i", 16)
+    rate = planar.motion(record, x, planar.wrench_matrix(record, exact, x[:3], x[3:6]) @ i, ca.SX.zeros(6))
+    f = ca.Function("f", [x, i, ca.vertcat(*symbols.values())], [rate])
+    at, currents = np.linspace(1e-3, 2e-3, 12), np.linspace(-3, 3, 16)
+    expected = np.array(planar.dynamics(par, exact)(at, currents, np.zeros(6)))
+    found = np.array(f(at, currents, [getattr(par, name) for name in names]))
+    np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12)
+
+
+def test_the_compiled_engine_can_read_it(par: planar.Parameters, exact: Series) -> None:
+    """K(p), its pseudo-inverse and the mover, from a Fourier series, are straight lines of operations it has."""
+    p, W, theta = ca.SX.sym("p", 3), ca.SX.sym("W", 6), ca.SX.sym("theta", 1)
+    i = planar.currents(planar.wrench_matrix(par, exact.above(1e-3, par.h), p), W)
+    _, text, _ = translate(ca.Function("allocate", [p, W, theta], [ca.cse(i)]), [], 0)
+    assert "void allocate(" in text
+
+
 def test_linear_model(par: planar.Parameters, exact: Series) -> None:
     """B is M^-1 K, the stiffnesses of a hovering mover add up to zero (Earnshaw), and held currents do not hold it."""
     f, i = planar.dynamics(par, exact), planar.hover(par, exact, AT)
@@ -533,7 +556,7 @@ def test_tilt_stiffness_against_tilted_coils(par: planar.Parameters, exact: Seri
     """What `wrench_matrix` leaves out: 5 % of the stiffness in tilt, 2 % in yaw, of coils that turn in the field."""
     i, step = planar.hover(par, exact, AT), 1e-5
     A, _ = planar.linear(planar.dynamics(par, exact), np.array([*AT, *np.zeros(9)]), i)
-    field, coil = planar_field.modes(par, 5), planar_field.winding(par, nodes=24)
+    field, coil = planar_field.modes(par, 5), planar_field.winding(par, nodes=16)
 
     def torque(q_r: FloatArray) -> FloatArray:
         R = np.array(ca.DM(rotation(ca.DM(q_r))))
@@ -668,7 +691,7 @@ def fly_continuously(
     start: tuple[float, float],
     reference: Reference,
 ) -> Flight:
-    """Six PID controllers at 1500 rad/s and the decoupling without sampling or delay: Runge-Kutta steps of 0.1 ms."""
+    """Six PID controllers at 1500 rad/s and the decoupling without sampling or delay: Runge-Kutta steps of 0.2 ms."""
     Kp, Ki, Kd = pid(1500.0)
     M, top = inertias(par), limits(par)
     s, r = ca.MX.sym("s", 18), ca.MX.sym("r", 18)
@@ -678,13 +701,13 @@ def fly_continuously(
     moved = planar.dynamics(par, plant)(s[:12], planar.decoupling(par, model)(s[:3], held), ca.DM.zeros(6))
     wound = ca.if_else(ca.fabs(W) > top, 0, e)
     rate = ca.Function("rate", [s, r], [ca.vertcat(moved, wound)])
-    state, step, rows = np.zeros(18), 1e-4, []
+    state, step, rows = np.zeros(18), 2e-4, []
     state[:2] = start
 
     def f(at: FloatArray, t: float) -> FloatArray:
         return np.array(rate(at, reference(t).ravel())).ravel()
 
-    for k in range(1000):
+    for k in range(500):
         t = k * step
         k1 = f(state, t)
         k2 = f(state + step / 2 * k1, t + step / 2)
@@ -693,7 +716,7 @@ def fly_continuously(
         state = state + step / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
         rows.append(state[:6] - reference(t + step)[0])
     nothing = np.zeros(0)
-    return Flight(np.arange(1, 1001) * step, np.array(rows), nothing, nothing)
+    return Flight(np.arange(1, 501) * step, np.array(rows), nothing, nothing)
 
 
 def fly(
@@ -717,8 +740,8 @@ def fly(
     weight = np.array([0, 0, par.m * par.g, 0, 0, 0])
     f = planar.dynamics(par, plant)
     x_, i_ = ca.MX.sym("x", 12), ca.MX.sym("i", 16)
-    y_, h = x_, Ts / 4
-    for _ in range(4):
+    y_, h = x_, Ts / 2
+    for _ in range(2):
         k1 = f(y_, i_, ca.DM.zeros(6))
         k2 = f(y_ + h / 2 * k1, i_, ca.DM.zeros(6))
         k3 = f(y_ + h / 2 * k2, i_, ca.DM.zeros(6))

@@ -16,6 +16,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import product
 from typing import TYPE_CHECKING, Any
 
 import casadi as ca
@@ -85,6 +86,7 @@ RATES = tuple(Signal(f"{s.name}_dot", f"{s.unit}/s") for s in POSITIONS)
 WRENCH = tuple(Signal(f"F_{a}", "N") for a in "xyz") + tuple(Signal(f"T_{a}", "N m") for a in "xyz")
 CURRENTS = tuple(Signal(f"i_{k}", "A") for k in range(1, 17))
 
+STEPS = (-1.5, -0.5, 0.5, 1.5)  # coil pitches from the mover's centre, along x and y
 WORST = 10.0  # largest accepted condition of K(p): 2.4 with a pitch of 16/3 tau_n, 20 and more with a bad one
 
 
@@ -211,7 +213,7 @@ def table(par: Parameters, model: CoilModel, n: int) -> Table:
 
 def coil_centres(par: Parameters) -> FloatArray:
     """(x_k, y_k, r_z) of the coils' centres of force from the centre of gravity, 16 x 3: eq. (3)."""
-    steps = (np.arange(4) - 1.5) * par.coil_pitch
+    steps = np.array(STEPS) * par.coil_pitch
     x, y = (grid.ravel() for grid in np.meshgrid(steps, steps, indexing="ij"))
     return np.stack([x, y, np.full(16, par.r_z)], axis=-1)
 
@@ -233,14 +235,15 @@ def wrench_matrix(par: Parameters, model: CoilModel, p: Any, q_r: Any = None) ->
     if it were level itself: the stiffness against tilt that the arms make is there, the 2 to 6 % within a coil are not.
     NOTE: (33) prints F_z3 in column 2.
     """
-    arms, levers = _arms(par)
     if isinstance(p, np.ndarray):
+        arms, levers = _arms(par)
         at = arms + checked(par, p)
         K: FloatArray = (levers @ model(at[:, 0], at[:, 1], at[:, 2] - par.r_z)[..., None])[..., 0].T
         return K
     columns = []
-    for arm in arms:
-        at = ca.DM(arm) if q_r is None else rotation(q_r).T @ ca.DM(arm)
+    for a, b in product(STEPS, STEPS):  # parameters may be symbols here
+        arm = ca.vertcat(a * par.coil_pitch, b * par.coil_pitch, par.r_z)
+        at = arm if q_r is None else rotation(q_r).T @ arm
         own = model(p[0] + at[0], p[1] + at[1], p[2] + at[2] - par.r_z)
         columns.append(ca.vertcat(own[:3], own[3:] + ca.cross(at, own[:3])))
     return ca.horzcat(*columns)
