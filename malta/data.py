@@ -28,7 +28,7 @@ from malta.files import read_file
 if TYPE_CHECKING:
     from malta.plant import Parameters, Plant
 
-Machine = Literal["tubular", "planar"]  # the modules of malta/plants/
+Machine = Literal["tubular", "halbach", "planar"]  # the modules of malta/plants/
 
 _Model = TypeVar("_Model", bound=BaseModel)
 Finite = Annotated[float, Checked(strict=True, allow_inf_nan=False)]
