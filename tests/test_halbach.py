@@ -400,6 +400,42 @@ def test_ramps_over_the_whole_travel(
     assert run.verdicts == ()
 
 
+@pytest.mark.parametrize("kind", ["pid", "lqg"])
+def test_ramps_with_a_late_laser(par: Parameters, kind: str) -> None:
+    m = halbach.held(par, F_Z, 1)
+    c = halbach.pid(par, m) if kind == "pid" else halbach.lqg(par, m)
+    late = replace(IDEAL, latency=1)
+    reference = halbach.ramp(par, 20e-3, 5e-3)
+    run = simulate(par, reference, F_z=F_Z, controller=c, electronics=late, every=50)
+    moving = (reference.velocity > 0) & (run.reading_time > 3)
+    assert abs(run.error[moving].mean()) < 1e-6
+    assert run.rows["F_z"] == pytest.approx(F_Z, rel=0.02)
+
+
+@pytest.mark.parametrize("latency", [0, 1])
+@pytest.mark.parametrize("preset", ["identified", "emf"])
+def test_small_steps_against_matrices_and_a_pid_written_out(preset: str, latency: int) -> None:
+    """Two rates, quantities of three phases and PID in increments; against sums of errors on the held model.
+
+    The model knows nothing of the current loops: their 2 ms are the difference, and they take out induced voltage.
+    """
+    p = malta.read("data/halbach.toml", preset=preset)
+    m, step = halbach.held(p, F_Z, latency), 1e-6
+    c = halbach.pid(p, m)
+    quiet = replace(IDEAL, latency=latency)
+    run = simulate(
+        p, halbach.steps(p, (0, 0.11), (step, 1.65)), F_z=F_Z, controller=c, electronics=quiet, every=50
+    )
+    xi, total, last = np.zeros(len(m.A)), 0.0, 0.0
+    for k, found in enumerate(run.position):
+        assert found == pytest.approx(xi[0], abs=0.05 * step)
+        r, y = (step if k >= 2 else 0.0), float(m.C[0] @ xi)
+        total += r - y
+        F = c.Kp * (c.weight * r - y) + c.Ki * c.T * total - c.Kd * (y - last) / c.T
+        xi, last = m.A @ xi + m.B.ravel() * F, y
+    assert xi[0] == pytest.approx(step, rel=0.01)
+
+
 def test_ramps_without_feedforward_start_later(par: Parameters, pid: Pid) -> None:
     reference = halbach.ramp(par, 10e-3, 5e-3)
     worst = [
@@ -621,7 +657,18 @@ def test_limits_are_verdicts_and_never_nan(par: Parameters, pid: Pid) -> None:
         assert verdict in run.verdicts
         assert all(np.isfinite(values).all() for values in run.rows.values())
         assert np.abs(np.array([run.rows[f"d_{p}"] for p in "abc"]) - 0.5).max() <= 0.5
-    assert simulate(par, halbach.steps(par, (0, 0.55)), F_z=F_Z, controller=pid).verdicts == ()
+    rest = halbach.steps(par, (0, 0.55))
+    assert simulate(par, rest, F_z=F_Z, controller=pid).verdicts == ()
+    pushed = simulate(par, halbach.steps(par, (0, 11)), F_z=F_Z, controller=pid, faults=Faults(force=20.0))
+    assert pushed.verdicts[:2] == ("force limit", "left the travel")
+    assert len(pushed.position) == len(pushed.error) == len(pushed.reading_time) < 20
+    for force in (1e300, -1e300):
+        lost = simulate(par, rest, F_z=F_Z, mode="open", faults=Faults(force=force))
+        assert lost.verdicts == ("left the travel",)
+        assert all(np.isfinite(values).all() for values in lost.rows.values())
+    for F_z in (halbach.F_MOST, -halbach.F_MOST):
+        run = simulate(par, rest, F_z=F_z, controller=pid)
+        assert all(np.isfinite(values).all() for values in run.rows.values())
 
 
 def test_readings_fall_on_pwm_periods(par: Parameters, pid: Pid) -> None:
@@ -637,7 +684,7 @@ def test_readings_fall_on_pwm_periods(par: Parameters, pid: Pid) -> None:
 
 
 def test_bad_input_is_refused_in_one_sentence(par: Parameters, pid: Pid) -> None:
-    rest = halbach.steps(par, (0, 0.55))
+    rest, far = halbach.steps(par, (0, 0.55)), halbach.steps(par, (0.051, 0.55))
     refused: list[tuple[Any, str]] = [
         (lambda: replace(par, A=math.nan), "halbach.Parameters: A: found nan"),
         (lambda: replace(par, m=-1.0), "m: found -1.0 kg, expected a finite number above 0"),
@@ -666,7 +713,15 @@ def test_bad_input_is_refused_in_one_sentence(par: Parameters, pid: Pid) -> None
         (lambda: halbach.dead_zones(par, F_Z, "exact"), "dead_zones: found pwm 'exact' at 5 N"),
         (
             lambda: simulate(par, rest, F_z=math.nan, controller=pid),
-            "F_z: found nan, expected a finite number",
+            "F_z: found nan N, expected at most 10000 N",
+        ),
+        (
+            lambda: simulate(par, rest, F_z=F_Z, controller=pid, x0=-0.06),
+            "x0: found -0.06 m, expected at most 0.05 m",
+        ),
+        (
+            lambda: simulate(par, far, F_z=F_Z, controller=pid),
+            "reference: found 0.051 m, expected at most 0.05 m",
         ),
         (lambda: simulate(par, rest, F_z=F_Z, mode="dq"), "mode: found 'dq'"),  # type: ignore[arg-type]
         (lambda: simulate(par, rest, F_z=F_Z), "controller: found none in mode 'vector'"),

@@ -199,7 +199,7 @@ def held(par: Parameters, F_z: float, latency: int = 0, *, spring: bool = True) 
     """The motor with the Park angle held at the last reading, which is `latency` samples old; force held as well.
 
     Current loops keep the phase currents, so damping is b alone. spring=False is what one would write down without
-    the held angle, a mass with friction: its sampled pole is 0.871 where the motor at 5 N has 0.509.
+    the held angle, a mass with friction: its sampled pole is 0.871 where the motor at 5 N has 0.51.
     """
     K = stiffness(par, F_z) if spring else 0.0
     A = np.array([[0, 1], [-K / par.m, -par.b / par.m]])
@@ -545,6 +545,8 @@ def _law_start(controller: Pid | Lqg | None, x0: float) -> FloatArray:
 
 # The two rates
 
+F_MOST = 1e4  # N, of a vertical force to ask for: far beyond any supply, far from the largest float
+
 Mode = Literal["open", "position", "vector"]
 
 
@@ -683,12 +685,14 @@ class Run:
     position: FloatArray  # m, true, at the readings
     force: FloatArray  # N, F_x that the position controller asked for
     reference: Reference
-    verdicts: tuple[str, ...]  # limits that were met: "force limit", "duty limit", "current range"
+    verdicts: tuple[
+        str, ...
+    ]  # limits that were met: "force limit", "left the travel", "duty limit", "current range"
 
     @property
     def error(self) -> FloatArray:
         """Reference less true position at the readings, m."""
-        return self.reference.position - self.position
+        return np.asarray(self.reference.position[: len(self.position)] - self.position)
 
 
 def simulate(
@@ -707,16 +711,21 @@ def simulate(
     """The motor from rest at x0, with the currents of F_z there, along a reference; every so many periods are kept.
 
     Readings fall on the first PWM period that begins after them: 805 or 806 periods apart. Raises InputError for
-    numbers that are none; limits that are met on the way are verdicts in the result.
+    numbers that are none; limits that are met on the way are verdicts in the result. A motor that leaves its travel by
+    more than a pitch ends the run.
     """
     if mode not in get_args(Mode):
         raise InputError("halbach", "mode", repr(mode), _one_of(Mode))
     if (controller is None) != (mode == "open"):
         found = "a controller" if controller is not None else "none"
         raise InputError("halbach", "controller", f"{found} in mode {mode!r}", "one unless the loop is open")
-    for name, value in (("F_z", F_z), ("x0", x0)):
-        if not math.isfinite(value):
-            raise InputError("halbach", name, repr(value), "a finite number")
+    for name, value, most, unit in (
+        ("F_z", F_z, F_MOST, "N"),
+        ("x0", x0, par.travel, "m"),
+        ("reference", float(np.abs(reference.position).max()), par.travel, "m"),
+    ):
+        if not abs(value) <= most:
+            raise InputError("halbach", name, f"{value:g} {unit}", f"at most {most:g} {unit} either way")
     if not (isinstance(every, int) and every > 0):
         raise InputError("halbach", "every", repr(every), "a whole number of periods")
     parts = loop(par, mode, controller, electronics, faults)
@@ -724,7 +733,7 @@ def simulate(
     count = len(reference.position)
     at = np.ceil(np.arange(count + 1) * (par.T_laser * par.f_pwm) - 1e-6).astype(int)
     state = start(par, mode, controller, electronics, F_z, x0)
-    rows, readings = [], []
+    rows, readings, left = [], [], False
     for k in range(count):
         jitter = par.n_laser * rng.uniform(-1, 1)
         given = np.array([reference.position[k], reference.velocity[k], F_z, jitter])
@@ -737,16 +746,20 @@ def simulate(
         states, block = evaluate(chain, state, noise)
         state = states[-1]
         rows.append(block.reshape(length, -1))
+        if left := abs(state[0]) > par.travel + 2 * math.pi / par.k:
+            break
     table = np.concatenate(rows)
     at_readings = np.array(readings)
     verdicts = [name for name in ROW[-2:] if table[:, ROW.index(name)].any()]
+    if left:
+        verdicts.insert(0, "left the travel")
     if controller is not None and (np.abs(at_readings[:, 2]) >= controller.F_max).any():
         verdicts.insert(0, "force limit")
     kept = table[::every]
     return Run(
         time=np.arange(len(table))[::every] / par.f_pwm,
         rows=dict(zip(ROW[:-2], kept.T, strict=False)),
-        reading_time=at[:-1] / par.f_pwm,
+        reading_time=at[: len(at_readings)] / par.f_pwm,
         reading=at_readings[:, 1],
         position=at_readings[:, 0],
         force=at_readings[:, 2],
