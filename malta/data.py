@@ -250,7 +250,11 @@ def plant_of(parameters: Parameters) -> Plant:
 
 @lru_cache(maxsize=64)  # records are immutable; building one takes longer than much that is done with it
 def _plant_of(parameters: Any) -> Plant:
-    plant: Plant = machine_module(type(parameters).__module__.rpartition(".")[2]).plant(parameters)
+    name = type(parameters).__module__.rpartition(".")[2]
+    module = machine_module(name)
+    if not hasattr(module, "plant"):
+        raise InputError("machine", "", repr(name), "a machine with a plant: so far its physics stand alone")
+    plant: Plant = module.plant(parameters)
     return plant
 
 
