@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 
@@ -80,14 +80,14 @@ class Robustness:
 
     chain: tuple[Link, ...]
     travel: Margin  # the last link, anywhere in the travel, in one proof
+    # The smallest or largest of `places`; none where one of them is unstable:
     disks: tuple[Disk, ...]
     delay: Mapping[str, float]  # s, that each sensor's loop stands alone, the others closed
-    gang: Mapping[str, tuple[float, float, float, float]]  # by sensor: |S|, |T|, m/N, N/m: largest in its row
-    tolerance: Mapping[
-        str, tuple[Margin, Margin]
-    ]  # each parameter alone, down and up, in multiples of its range
+    gang: Mapping[str, tuple[float, ...]]  # by sensor: |S|, |T|, m/N, N/m: largest in its row
+    # Proven anywhere in the travel, in multiples of the range:
+    tolerance: Mapping[str, tuple[Margin, Margin]]  # each parameter alone, down and up
     payload: Margin | None  # in kg; None for a machine without a mass m
-    places: tuple[Place, ...]
+    places: tuple[Place, ...]  # along the travel, in which everything is even
 
 
 def compensators(
@@ -170,72 +170,92 @@ def robustness(
         if progress is not None:
             progress(min(1.0, next(steps) / total))
 
-    names = list(uncertainty)
-    position = float(controller.operating_point[0][plant.stroke_state])
-    at, believed = {plant.stroke: position}, plant_of(controller.parameters)
+    names, stroke = list(uncertainty), plant.stroke
+    at = {stroke: float(controller.operating_point[0][plant.stroke_state])}
+    believed = plant_of(controller.parameters)
     links = []
     stages = compensators(plant, controller, current_loops)
     for name, (law, states) in stages.items():
         system = uncertain(plant, names, states=states, at=at, believed=believed)
-        links.append(
-            Link(
-                name,
-                robust_margin(system, law, uncertainty),
-                _peak(system, law, states),
-                "forces" if states else "sensors",
-            )
-        )
+        margin, peak = robust_margin(system, law, uncertainty), _peak(system, law, states)
+        links.append(Link(name, margin, peak, "forces" if states else "sensors"))
         done()
     law = stages[SAMPLED][0]
-    system = uncertain(plant, names, at=at, believed=believed)
-    anywhere = uncertain(plant, [*names, plant.stroke], at={plant.stroke: 0.0}, believed=believed)
-    travel = robust_margin(anywhere, law, uncertainty, {plant.stroke: (-plant.travel, plant.travel)})
-    done()
+    over = {stroke: (-plant.travel, plant.travel)}
+
+    def anywhere(ranges: Mapping[str, float | tuple[float, float]]) -> Margin:
+        system = uncertain(plant, [*ranges, stroke], at={stroke: 0.0}, believed=believed)
+        found = robust_margin(system, law, ranges, over)
+        done()
+        return found
+
+    travel = anywhere(uncertainty)
     tolerance = {}
     for name, share in uncertainty.items():
-        alone, nominal = uncertain(plant, [name], at=at, believed=believed), getattr(plant.parameters, name)
-        sides = []
-        for pair in ((nominal * (1 - share), nominal), (nominal, nominal * (1 + share))):
-            sides.append(robust_margin(alone, law, {name: pair}))
-            done()
-        tolerance[name] = (sides[0], sides[1])
+        nominal = getattr(plant.parameters, name)
+        down = anywhere({name: (nominal * (1 - share), nominal)})
+        tolerance[name] = down, anywhere({name: (nominal, nominal * (1 + share))})
     payload = None
     if "m" in units_of(plant.parameters):
         m: float = getattr(plant.parameters, "m")  # noqa: B009  a machine's own field
-        payload = robust_margin(uncertain(plant, ["m"], at=at, believed=believed), law, {"m": (m, m + 1.0)})
-    done()
-    places = []
+        payload = anywhere({"m": (m, m + 1.0)})
+    sensors = [s.name for s in plant.outputs]
+    places: list[Place] = []
+    classical: list[_Classical | None] = []
     for share in PLACES:
-        here = uncertain(plant, names, at={plant.stroke: share * plant.travel}, believed=believed)
-        disk, delay = np.nan, np.nan
-        if _stable(here, law):
-            P, F = _at_nominal(here, law, _frequencies(law))
-            disk = disk_margin(here, law, "forces and sensors").size
-            delay = float(delay_margins(P @ F, _frequencies(law)).min())
+        here = uncertain(plant, names, at={stroke: share * plant.travel}, believed=believed)
+        found = _classical(here, law, sensors) if _stable(here, law) else None
+        disk, delay = (found.disks[2].size, min(found.delay.values())) if found else (np.nan, np.nan)
         margin, peak = robust_margin(here, law, uncertainty), _peak(here, law, states=False)
         places.append(Place(share * plant.travel, margin, peak, disk, delay))
+        classical.append(found)
+        if found and share:  # the sensors change places
+            there = uncertain(plant, names, at={stroke: -share * plant.travel}, believed=believed)
+            classical.append(_classical(there, law, sensors))
         done()
-    stable = _stable(system, law)
-    w = _frequencies(law)
-    P, F = _at_nominal(system, law, w)
-    sensors = [s.name for s in plant.outputs]
-    delays = delay_margins(P @ F, w) if stable else np.full(len(sensors), np.nan)
-    disks: list[Disk] = []
-    if stable:
-        disks += [disk_margin(system, law, kind) for kind in ("forces", "sensors", "forces and sensors")]
-        disks += [
-            replace(disk_margin(system, law, "sensors", only=k), channels=f"{name} alone")
-            for k, name in enumerate(sensors)
-        ]
+    worst = _worst([found for found in classical if found is not None]) if all(classical) else None
     return Robustness(
         tuple(links),
         travel,
-        tuple(disks),
-        dict(zip(sensors, delays.tolist(), strict=True)),
-        dict(zip(sensors, _gang(P, F), strict=True)) if stable else {},
+        worst.disks if worst else (),
+        worst.delay if worst else dict.fromkeys(sensors, float("nan")),
+        worst.gang if worst else {},
         tolerance,
         payload,
         tuple(places),
+    )
+
+
+class _Classical(NamedTuple):
+    """Margins without parameters at one position, or the worst of several."""
+
+    disks: tuple[Disk, ...]
+    delay: dict[str, float]
+    gang: dict[str, tuple[float, ...]]
+
+
+def _classical(system: UncertainSystem, law: Compensator, sensors: list[str]) -> _Classical:
+    w = _frequencies(law)
+    P, F = _at_nominal(system, law, w)
+    disks = [disk_margin(system, law, kind) for kind in ("forces", "sensors", "forces and sensors")]
+    for k, name in enumerate(sensors):
+        disks.append(replace(disk_margin(system, law, "sensors", only=k), channels=f"{name} alone"))
+    delays = delay_margins(P @ F, w).tolist()
+    return _Classical(
+        tuple(disks), dict(zip(sensors, delays, strict=True)), dict(zip(sensors, _gang(P, F), strict=True))
+    )
+
+
+def _worst(found: list[_Classical]) -> _Classical:
+    disks = tuple(min(same, key=lambda d: d.size) for same in zip(*(one.disks for one in found), strict=True))
+    first = found[0]
+    return _Classical(
+        disks,
+        {name: min(one.delay[name] for one in found) for name in first.delay},
+        {
+            name: tuple(max(values) for values in zip(*(one.gang[name] for one in found), strict=True))
+            for name in first.gang
+        },
     )
 
 
@@ -335,7 +355,7 @@ def _peak(system: UncertainSystem, law: Compensator, states: bool) -> float:
     return float(largest(sizes, _frequencies(law))[0].max())
 
 
-def _gang(P: ComplexArray, F: ComplexArray) -> list[tuple[float, float, float, float]]:
+def _gang(P: ComplexArray, F: ComplexArray) -> list[tuple[float, ...]]:
     """For each sensor: |S_ii|, |T_ii|, the largest |(S P)_ij| (m/N) and |(F S)_ji| (N/m)."""
     S = np.linalg.inv(np.eye(P.shape[1]) - P @ F)
     T = np.eye(P.shape[1]) - S

@@ -138,7 +138,12 @@ def _blame(margin: Margin) -> str:
 def disk_table(found: Robustness, Ts: float) -> Table:
     """Disk margins of the machine's loop, and the delay that each sensor's loop stands."""
     table = _table(
-        "Margins of the sampled loop without parameters", "factor in", "disk", "gain", "phase [deg]", "rad/s"
+        "Margins of the sampled loop without parameters, the smallest along the travel",
+        "factor in",
+        "disk",
+        "gain",
+        "phase [deg]",
+        "rad/s",
     )
     for disk in found.disks:
         _row(
@@ -157,7 +162,7 @@ def disk_table(found: Robustness, Ts: float) -> Table:
 def gang_table(found: Robustness) -> Table:
     """Gang of four: the largest gain of each closed-loop response, by sensor."""
     table = _table(
-        "Gang of four, largest over frequency",
+        "Gang of four, largest over frequency and travel",
         "sensor",
         "|S|",
         "|T|",
@@ -171,7 +176,9 @@ def gang_table(found: Robustness) -> Table:
 
 def tolerance_table(found: Robustness, uncertainty: Mapping[str, float]) -> Table:
     """What each parameter may do alone, proven, and its share in the margin of all."""
-    table = _table("One at a time, proven", "parameter", "down to", "up to", "share in the margin")
+    table = _table(
+        "One at a time, proven anywhere in the travel", "parameter", "down to", "up to", "share in the margin"
+    )
     shares = found.chain[-1].margin.sensitivity
     for name, (down, up) in found.tolerance.items():
         cells = []
