@@ -58,7 +58,7 @@ DUST = 1e-11  # entries of the balanced closed loop below this, relative, are ro
 FAR = 1e2  # multiples of the modelled box beyond which nobody looks
 # How close the proven bound comes to the witness, relative:
 EXACT = 5e-7  # where all modes are single
-TOLERANCE = 1e-3  # where modes couple
+TOLERANCE = 9.98e-4  # where modes couple: upper / lower <= 1.001
 
 
 @dataclass(frozen=True, eq=False)
