@@ -56,6 +56,7 @@ if TYPE_CHECKING:
 
 DUST = 1e-11  # entries of the balanced closed loop below this, relative, are rounding
 FAR = 1e2  # multiples of the modelled box beyond which nobody looks
+EDGE = 1e-4  # how far from the end of what a parameter can be the search stays, relative
 # How close the proven bound comes to the witness, relative:
 EXACT = 5e-7  # where all modes are single
 TOLERANCE = 9.98e-4  # where modes couple: upper / lower <= 1.001
@@ -132,7 +133,7 @@ def robust_margin(
         where = dict(zip(system.names, _standing(box)[unstable.argmax()].tolist(), strict=True))
         spent = time.perf_counter() - start
         return Margin(0.0, 0.0, None, where, {}, {}, (), spent, "the nominal loop is unstable")
-    reach = min(box.most * (1 - 1e-9), FAR)
+    reach = min(box.most * (1 - EDGE), FAR)
     found: list[_Bound] = []
     for block in _blocks(system, compensator, box):
         found.append(_search(block, box, reach))
