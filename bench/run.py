@@ -1,6 +1,6 @@
 """Benchmarks: malta beside what a user would pick instead, as ratios of medians from one run.
 
-make bench            python bench/run.py [--runs N]
+make bench            python bench/run.py [--runs N] [--only stroke many ...]
 
 The peers that are not python-control are written by hand (peers/ and peer_*.py). Some have malta's equations as they
 stand; those called reformulated are what an expert makes of them for this machine alone: modes apart, small angles
@@ -306,18 +306,36 @@ def documented_stroke(factors: list[float]) -> float:
     return float(np.abs(found.outputs).max())
 
 
+WORKLOADS: dict[str, Callable[[int], list[Result]]] = {
+    "process": whole_process,
+    "stroke": stroke,
+    "many": many,
+    "margin": margin,
+    "campaign": campaigns,
+}
+
+
 def main() -> None:
-    """Run all and print one table."""
+    """Run the workloads, a table each."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--runs", type=int, default=7, help="counted runs of each")
-    runs = parser.parse_args().runs
-    table = Table(title=f"medians of {runs} runs in turn, seconds", title_justify="left", box=box.SIMPLE_HEAD)
-    for column in ("malta", "s", "peer", "s", "peer / malta", "wanted"):
-        table.add_column(column, justify="left" if column in ("malta", "peer") else "right")
-    for row in whole_process(runs) + stroke(runs) + many(runs) + margin(runs) + campaigns(runs):
-        ratio = f"{row.theirs / row.ours:.2f}"
-        table.add_row(row.workload, f"{row.ours:.4f}", row.peer, f"{row.theirs:.4f}", ratio, row.wanted)
-    Console(width=100).print(table)
+    parser.add_argument(
+        "--only", choices=WORKLOADS, nargs="+", default=[*WORKLOADS], help="some of the workloads"
+    )
+    arguments = parser.parse_args()
+    for name in arguments.only:
+        found = WORKLOADS[name](arguments.runs)
+        table = Table(
+            title=f"{name}: medians of {arguments.runs} runs in turn, seconds",
+            title_justify="left",
+            box=box.SIMPLE_HEAD,
+        )
+        for column in ("malta", "s", "peer", "s", "peer / malta", "wanted"):
+            table.add_column(column, justify="left" if column in ("malta", "peer") else "right")
+        for row in found:
+            ratio = f"{row.theirs / row.ours:.2f}"
+            table.add_row(row.workload, f"{row.ours:.4g}", row.peer, f"{row.theirs:.4g}", ratio, row.wanted)
+        Console(width=100).print(table)
 
 
 if __name__ == "__main__":
