@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from malta.plant import ComplexArray, FloatArray
 
 SAMPLED = "sampled"  # the last link: the machine's own loop
-PLACES = (0.0, 1 / 3, 2 / 3, 1.0)  # shares of the travel: everything is even in it
+PLACES = (0.0, 1 / 3, 2 / 3, 1.0)  # shares of the travel, either way
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +65,7 @@ class Disk:
 
 @dataclass(frozen=True)
 class Place:
-    """Figures at one position of the stroke."""
+    """Figures at a position of the stroke, the worse of both sides: the machine is even in it, a law need not be."""
 
     position: float  # m
     margin: Margin
@@ -203,15 +203,19 @@ def robustness(
     places: list[Place] = []
     classical: list[_Classical | None] = []
     for share in PLACES:
-        here = uncertain(plant, names, at={stroke: share * plant.travel}, believed=believed)
-        found = _classical(here, law, sensors) if _stable(here, law) else None
-        disk, delay = (found.disks[2].size, min(found.delay.values())) if found else (np.nan, np.nan)
-        margin, peak = robust_margin(here, law, uncertainty), _peak(here, law, states=False)
-        places.append(Place(share * plant.travel, margin, peak, disk, delay))
-        classical.append(found)
-        if found and share:  # the sensors change places
-            there = uncertain(plant, names, at={stroke: -share * plant.travel}, believed=believed)
-            classical.append(_classical(there, law, sensors))
+        margins, peaks, sides = [], [], []
+        for z in dict.fromkeys((share * plant.travel, -share * plant.travel)):
+            here = uncertain(plant, names, at={stroke: z}, believed=believed)
+            margins.append(robust_margin(here, law, uncertainty))
+            peaks.append(_peak(here, law, states=False))
+            sides.append(_classical(here, law, sensors) if _stable(here, law) else None)
+        classical += sides
+        disk, delay = np.nan, np.nan
+        if all(sides):
+            both = _worst([found for found in sides if found is not None])
+            disk, delay = both.disks[2].size, min(both.delay.values())
+        margin = min(margins, key=lambda m: (m.lower is not None, m.lower, m.upper))
+        places.append(Place(share * plant.travel, margin, float(np.max(peaks)), disk, delay))
         done()
     worst = _worst([found for found in classical if found is not None]) if all(classical) else None
     return Robustness(

@@ -67,7 +67,7 @@ def chain_figure(found: Robustness, name: str, uncertainty: Mapping[str, float])
 
 
 def _along_travel(left: Axes, right: Axes, found: Robustness) -> None:
-    """Even in the position, so both sides are drawn from one."""
+    """The worse of both sides of the position, drawn on both."""
     places = found.places
     z = np.array([p.position for p in places]) * 1e3
     both = np.concatenate([-z[:0:-1], z])

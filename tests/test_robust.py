@@ -186,7 +186,7 @@ def test_each_parameter_alone_of_full_state_feedback(
     assert found["K_B"].upper == pytest.approx(2.5, rel=1e-3)
     assert found["K_B"].lower == pytest.approx(2.5, rel=1e-3)
     assert found["m"].exhausted
-    assert found["m"].lower == pytest.approx(5, rel=1e-4)  # m = 0
+    assert found["m"].lower == pytest.approx(5, rel=2e-4)  # m = 0
     # K_A upwards alone: its lower end is zero attraction, just there
     up = robust_margin(uncertain(plant, ["K_A"], states=True), c, {"K_A": (8626.7, 1.2 * 8626.7)})
     assert up.upper == pytest.approx(5, rel=1e-3)

@@ -96,8 +96,7 @@ def test_the_closed_loop_is_verifys(design: Design) -> None:
     )
     w = np.geomspace(1, 6e4, 30)
     P, F = responses(system, law, system.nominal, w)
-    L = -P @ F
-    assert L == pytest.approx(expected.loop_gain(w), rel=1e-6, abs=1e-8)
+    assert np.abs(-P @ F - expected.loop_gain(w)).max() < 1e-6
 
 
 def test_the_worst_pole_has_a_frequency(designs: dict[str, Design]) -> None:

@@ -1,0 +1,371 @@
+"""The chain of margins, the classical ones, and `malta verify` that prints them."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from malta import gains
+from malta.chain import (
+    SAMPLED,
+    Robustness,
+    _balanced,
+    _classical,
+    compensators,
+    delay_margins,
+    disk_margin,
+    robustness,
+)
+from malta.cli import app, main
+from malta.data import plant_of
+from malta.errors import InputError
+from malta.robust import robust_margin
+from malta.uncertain import Compensator, UncertainSystem, closed_loop, instability, responses, uncertain
+from malta.verify import machine_law
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+BOX = dict.fromkeys(("m", "K_A", "K_D", "K_B"), 0.2)
+STAGES = ["LQR", "LQI", "LQG", "LQGI", "+ current loops", "sampled"]
+DESIGNS = ("table2", "calibrated")
+
+
+@pytest.fixture(scope="module")
+def chains() -> dict[str, Robustness]:
+    found = {}
+    for name in DESIGNS:
+        c = gains.read(f"design/gains/{name}.json")
+        steps: list[float] = []
+        found[name] = robustness(plant_of(c.parameters), c, BOX, progress=steps.append)
+        assert steps == sorted(steps)
+        assert 0 < steps[0] < 0.2
+        assert 0.9 < steps[-1] <= 1
+    return found
+
+
+SENSORS = ["x1", "y1", "x2", "y2", "z"]
+
+
+def _sampled(name: str, z: float = 0.0) -> tuple[UncertainSystem, Compensator]:
+    c = gains.read(f"design/gains/{name}.json")
+    plant = plant_of(c.parameters)
+    return uncertain(plant, list(BOX), at={"z": z}), machine_law(plant, c)
+
+
+@pytest.mark.parametrize("name", DESIGNS)
+def test_margins_go_where_the_chain_says(name: str, chains: dict[str, Robustness]) -> None:
+    found = chains[name]
+    assert [link.name for link in found.chain] == STAGES
+    assert STAGES[-1] == SAMPLED
+    assert [link.broken_at for link in found.chain] == ["forces"] * 2 + ["sensors"] * 4
+    by_name = {link.name: link for link in found.chain}
+    for state_feedback in ("LQR", "LQI"):  # Kalman's inequality; R is diagonal
+        assert by_name[state_feedback].peak <= 1 + 1e-6
+    assert by_name["LQR"].margin.upper > by_name["LQG"].margin.upper
+    assert by_name["LQG"].peak < by_name["+ current loops"].peak + 1e-3
+    for link in found.chain:
+        assert link.margin.lower is not None
+        assert link.margin.lower <= link.margin.upper <= 1.0011 * link.margin.lower
+    assert found.travel.lower is not None
+    assert found.travel.lower <= min(place.margin.upper for place in found.places)
+    expected = {"table2": (5 / 3, 0.334), "calibrated": (3.0, 1.62)}[name]
+    assert (by_name["LQR"].margin.upper, by_name["sampled"].margin.upper) == pytest.approx(expected, rel=0.01)
+
+
+@pytest.mark.parametrize("name", DESIGNS)
+def test_places_stand_for_both_sides_of_the_travel(name: str, chains: dict[str, Robustness]) -> None:
+    c = gains.read(f"design/gains/{name}.json")
+    plant = plant_of(c.parameters)
+    places = chains[name].places
+    assert [place.position for place in places] == pytest.approx([0, 5e-3, 10e-3, 15e-3])
+    for z in (15e-3, -15e-3):
+        there = robust_margin(uncertain(plant, list(BOX), at={"z": z}), machine_law(plant, c), BOX)
+        assert there.upper >= places[-1].margin.upper * (1 - 1e-9)
+    assert places[-1].margin.upper >= (chains[name].travel.lower or 0)
+
+
+@pytest.mark.parametrize("name", DESIGNS)
+def test_gang_of_four_by_its_definition(name: str) -> None:
+    system, law = _sampled(name)
+    w = np.geomspace(1e-2, np.pi / 50e-6, 400)
+    P, F = responses(system, law, system.nominal, w)
+    S = np.linalg.inv(np.eye(5) - P @ F)
+    T = -P @ F @ S
+    assert np.abs(S + T - np.eye(5)).max() < 1e-7
+    for i, figures in enumerate(_classical(system, law, SENSORS).gang.values()):
+        expected = (
+            np.abs(S[:, i, i]).max(),
+            np.abs(T[:, i, i]).max(),
+            np.abs(S @ P)[:, i].max(),
+            np.abs(F @ S)[:, :, i].max(),
+        )
+        assert figures == pytest.approx(expected, rel=1e-9)
+
+
+@pytest.mark.parametrize("name", DESIGNS)
+def test_disks_are_stood_and_the_one_channel_disk_is_exact(name: str) -> None:
+    """Real factors within the disk, in all channels at once, leave it stable; one channel's is reached by a factor."""
+    system, law = _sampled(name)
+    disks = {d.channels: d for d in _classical(system, law, SENSORS).disks}
+    assert list(disks)[:3] == ["forces", "sensors", "forces and sensors"]
+    assert disks["forces and sensors"].size <= min(disks["forces"].size, disks["sensors"].size)
+    rng = np.random.default_rng(0)
+    for kind in ("forces", "sensors", "forces and sensors"):
+        d = disks[kind].size
+        for _ in range(10):
+            # real gains of the same size, by eigenvalues
+            sign = rng.choice((-1, 1), size=(2, 5)) * 0.999 * d / 2
+            g = (1 + sign) / (1 - sign)
+            real = replace(
+                law,
+                B=law.B @ (np.diag(g[1]) if "sensors" in kind else np.eye(5)),
+                C=(np.diag(g[0]) if "forces" in kind else np.eye(5)) @ law.C,
+            )
+            through = law.D @ (np.diag(g[1]) if "sensors" in kind else np.eye(5))
+            real = replace(real, D=(np.diag(g[0]) if "forces" in kind else np.eye(5)) @ through)
+            assert instability(system, real, system.nominal)[0] < 0
+    for i, sensor in enumerate(SENSORS):
+        disk = disks[f"{sensor} alone"]
+        w = np.array([disk.frequency])
+        P, F = responses(system, law, system.nominal, w)
+        S = np.linalg.inv(np.eye(5) - P @ F)[0, i, i]
+        assert 1 / abs(S - 0.5) == pytest.approx(disk.size, rel=1e-6)
+        smallest = []
+        for angle in np.linspace(0, 2 * np.pi, 7201):
+            d = disk.size * np.exp(1j * angle)
+            f = np.ones(5, dtype=complex)
+            f[i] = (1 + d / 2) / (1 - d / 2)
+            smallest.append(abs(np.linalg.det(np.eye(5) - np.diag(f) @ P[0] @ F[0])))
+        size = abs(np.linalg.det(np.eye(5) - P[0] @ F[0]))
+        assert min(smallest) < 2e-3 * size
+        assert np.median(smallest) > 2e-2 * size
+        assert disk.gain == pytest.approx((1 + disk.size / 2) / (1 - disk.size / 2))
+        assert disk.phase == pytest.approx(2 * math.atan(disk.size / 2))
+
+
+def test_a_single_loop_has_the_disk_of_its_peak() -> None:
+    """One channel: 1 / max |S - 1/2|, on a grid thirty times as dense."""
+    system, law = _sampled("calibrated")
+    P, F = responses(system, law, system.nominal, np.geomspace(1e-2, np.pi / 50e-6, 12_000))
+    S = np.linalg.inv(np.eye(5) - P @ F)
+    for i in range(5):
+        expected = 1 / np.abs(S[:, i, i] - 0.5).max()
+        assert disk_margin(system, law, "sensors", only=i).size == pytest.approx(expected, rel=1e-4)
+
+
+def test_a_balanced_matrix_bounds_mu() -> None:
+    """From above; random unit factors bound it from below: mu >= rho(U M). Exact for rank one."""
+    rng = np.random.default_rng(0)
+    M = rng.normal(size=(20, 4, 4)) + 1j * rng.normal(size=(20, 4, 4))
+    M *= 10.0 ** rng.uniform(-3, 3, (20, 4, 1)) * 10.0 ** rng.uniform(-3, 3, (20, 1, 4))
+    U = np.exp(2j * np.pi * rng.uniform(size=(500, 1, 4, 1)))
+    below = np.abs(np.linalg.eigvals(U * M)).max(axis=(0, 2))
+    above = _balanced(M)
+    assert (below <= above * (1 + 1e-9)).all()
+    assert np.median(above / below) < 1.3
+    a, b = rng.normal(size=(5, 4)) + 1j, rng.normal(size=(5, 4)) - 1j
+    assert _balanced(a[:, :, None] * b[:, None, :]) == pytest.approx(np.abs(a * b).sum(axis=1), rel=1e-3)
+
+
+@pytest.mark.parametrize("name", DESIGNS)
+def test_delay_margins_in_whole_samples(name: str) -> None:
+    """One sensor late by whole samples: stable up to the margin, unstable beyond."""
+    system, law = _sampled(name)
+    T, n = 50e-6, len(law.A)
+    for i, (_, margin) in enumerate(_classical(system, law, SENSORS).delay.items()):
+        if margin > 200 * T:  # as many states more
+            continue
+        stable = {}
+        for k in (math.floor(0.999 * margin / T), math.floor(1.001 * margin / T) + 1):
+            late = np.zeros((n + k, n + k))
+            late[:n, :n], B, D = law.A, np.zeros((n + k, 5)), law.D.copy()
+            B[:n] = law.B
+            C = np.hstack([law.C, np.zeros((5, k))])
+            if k:  # a chain of k samples in place of the sensor
+                late[:n, n], C[:, n], B[:n, i], D[:, i] = law.B[:, i], law.D[:, i], 0, 0
+                late[n : n + k - 1, n + 1 :] = np.eye(k - 1)
+                B[-1, i] = 1
+            slow = replace(law, A=late, B=B, C=C, D=D, integrals=0)
+            stable[k] = float(instability(system, slow, system.nominal)[0]) < 0
+        assert list(stable.values()) == [True, False], (i, margin)
+
+
+def test_delay_margin_of_an_integrator() -> None:
+    """L = 10 / s crosses over at 10 rad/s with 90 degrees to go: pi / 20 s."""
+    w = np.geomspace(1e-2, 1e4, 2000)
+    L = -10 / (1j * w)[:, None, None]
+    assert delay_margins(L, w) == pytest.approx(np.pi / 20, rel=1e-4)
+    assert delay_margins(0.5 * np.ones((5, 1, 1)) + 0j, w[:5])[0] == np.inf
+
+
+@pytest.mark.parametrize("name", DESIGNS)
+def test_each_parameter_alone(name: str, chains: dict[str, Robustness]) -> None:
+    """Tolerances against poles on a dense line."""
+    system, law = _sampled(name, -15e-3)
+    for i, (key, sides) in enumerate(chains[name].tolerance.items()):
+        for sign, margin in zip((-1, 1), sides, strict=True):
+            assert margin.lower is not None
+            p = np.tile(system.nominal, (60, 1))
+            p[:, i] *= 1 + sign * 0.2 * np.linspace(0, 1, 60) * margin.lower * (1 - 1e-9)
+            assert (instability(system, law, p) < 0).all(), key
+            if not margin.exhausted:
+                beyond = system.nominal.copy()
+                beyond[i] *= 1 + sign * 0.2 * margin.upper
+                there = uncertain(
+                    plant_of(gains.read(f"design/gains/{name}.json").parameters), [*BOX, "z"], at={"z": 0.0}
+                )
+                assert margin.witness is not None
+                beyond = np.r_[beyond, margin.witness["z"]]
+                assert instability(there, law, beyond)[0] > 0
+    payload = chains[name].payload
+    assert payload is not None
+    assert payload.lower is not None
+    assert instability(system, law, system.nominal + np.array([payload.lower, 0, 0, 0]))[0] < 0
+    assert payload.lower / 0.072 == pytest.approx(chains[name].tolerance["m"][1].lower, rel=1e-3)
+
+
+def test_force_constants_that_the_controller_does_not_know() -> None:
+    """--set K_B: poles of the chain's last stage are verify's."""
+    c = gains.read("design/gains/calibrated.json")
+    weak = plant_of(replace(c.parameters, K_B=4.0))
+    found = robustness(weak, c, {"m": 0.2})
+    strong = robustness(plant_of(c.parameters), c, {"m": 0.2})
+    assert found.chain[-1].peak < 0.95 * strong.chain[-1].peak
+    law = compensators(weak, c)[SAMPLED][0]
+    loops = [
+        closed_loop(uncertain(weak, ["m"], believed=b), law, np.array([0.36]))[0]
+        for b in (plant_of(c.parameters), None)
+    ]
+    assert np.abs(loops[0] - loops[1]).max() > 1
+
+
+def test_an_unstable_machine_is_reported() -> None:
+    c = gains.read("design/gains/calibrated.json")
+    found = robustness(plant_of(replace(c.parameters, K_A=3e4)), c, BOX)
+    assert [link.margin.upper > 0 for link in found.chain] == [True, True, False, False, False, False]
+    assert math.isnan(found.chain[-1].peak)
+    assert not found.disks
+    assert not found.gang
+    assert all(math.isnan(v) for v in found.delay.values())
+    assert all(math.isnan(p.disk) and math.isnan(p.delay) and p.margin.lower == 0 for p in found.places)
+
+
+def test_no_parameters_and_unknown_current_loops_are_refused() -> None:
+    c = gains.read("design/gains/calibrated.json")
+    with pytest.raises(InputError, match="no parameters"):
+        robustness(plant_of(c.parameters), c, {})
+    with pytest.raises(InputError, match="expected lag or pi"):
+        robustness(plant_of(c.parameters), c, BOX, current_loops="dq")  # type: ignore[arg-type]
+
+
+# malta verify
+
+
+def _strict(text: str) -> Any:
+    def refuse(token: str) -> Any:
+        raise AssertionError(token)
+
+    return json.loads(text, parse_constant=refuse)
+
+
+def test_verify_prints_tables_within_a_hundred_columns(tmp_path: Path) -> None:
+    out = CliRunner().invoke(app, ["verify", "design/gains/calibrated.json", "--out", str(tmp_path)])
+    assert out.exit_code == 0
+    lines = out.stdout.replace(str(tmp_path), "T").splitlines()
+    assert max(map(len, lines)) <= 100
+    for text in (
+        "Where the margin goes",
+        "all of the travel",
+        "Gang of four",
+        "One at a time",
+        "payload",
+        "Along the",
+    ):
+        assert text in out.stdout
+    assert (tmp_path / "calibrated_margins.png").stat().st_size > 20_000
+
+
+def test_verify_prints_one_json_document() -> None:
+    arguments = [
+        "verify",
+        "design/gains/calibrated.json",
+        "--json",
+        "--uncertain",
+        "m=10%",
+        "--current-loops",
+        "pi",
+        "--set",
+        "m=0.56",
+    ]
+    out = CliRunner().invoke(app, arguments)
+    assert out.exit_code == 0
+    found = _strict(out.stdout)
+    assert found["robust"]["uncertainty"] == {"m": 0.1}
+    assert [stage["stage"] for stage in found["robust"]["chain"]] == STAGES
+    assert found["robust"]["chain"][-1]["lower"] > 1
+    assert "nan" not in out.stdout.lower()
+
+
+def test_verify_of_an_unstable_machine_prints_and_fails(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for more in ([], ["--json"]):
+        arguments = ["malta", "verify", "design/gains/calibrated.json", "--set", "K_A=3e4", *more]
+        monkeypatch.setattr("sys.argv", arguments)
+        with pytest.raises(SystemExit) as caught:
+            main()
+        assert caught.value.code == 1
+        printed = capsys.readouterr()
+        assert printed.err.startswith("malta: design/gains/calibrated.json: the loop (sampled) is unstable")
+        assert len(printed.err.splitlines()) == 1
+        if more:
+            assert _strict(printed.out)["stable"] is False
+        else:
+            assert max(map(len, printed.out.splitlines())) <= 100
+
+
+@pytest.mark.parametrize(
+    ("more", "part"),
+    [
+        (["--current-loops", "dq"], "expected lag or pi"),
+        (["--uncertain", "K_X=10%"], "K_X"),
+        (["--uncertain", "m=0%"], "expected a share above 0"),
+        (["--uncertain", "m=-5%"], "expected a share above 0"),
+        (["--uncertain", "m=much"], "--uncertain"),
+        (["--set", "m=-1"], "m"),
+    ],
+)
+def test_bad_input_gets_one_sentence(
+    more: list[str], part: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sys.argv", ["malta", "verify", "design/gains/table2.json", *more])
+    with pytest.raises(SystemExit) as caught:
+        main()
+    assert caught.value.code == 2
+    printed = capsys.readouterr()
+    assert part in printed.err
+    assert len(printed.err.splitlines()) == 1
+
+
+@pytest.mark.parametrize("name", DESIGNS)
+def test_margins_without_parameters_are_the_smallest_along_the_travel(
+    name: str, chains: dict[str, Robustness]
+) -> None:
+    places = [
+        _classical(*_sampled(name, z), sensors=SENSORS)
+        for z in (-15e-3, -10e-3, -5e-3, 0.0, 5e-3, 10e-3, 15e-3)
+    ]
+    found = chains[name]
+    assert found.delay == pytest.approx({key: min(p.delay[key] for p in places) for key in SENSORS})
+    for k, disk in enumerate(found.disks):
+        assert disk.size == pytest.approx(min(p.disks[k].size for p in places))
+    for key, figures in found.gang.items():
+        assert figures == pytest.approx(np.max([p.gang[key] for p in places], axis=0))
