@@ -12,6 +12,7 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -122,11 +123,8 @@ def response(c: Compensator, f: Frequencies, cells: FloatArray) -> Taylor:
 
     Of sampled laws C (delta - (A - 1) / T)^-1 B / T + D: as differences, so that slow poles keep their digits.
     """
-    k, T = len(c.A) - c.integrals, c.sample_time
-    A, B = (c.A, c.B) if T is None else ((c.A - np.eye(len(c.A))) / T, c.B / T)
-    balanced, (units, _) = linalg.matrix_balance(A[:k, :k], permute=False, separate=True)
-    S, Q = linalg.schur(balanced, output="complex")
-    into, back = Q.conj().T / units, units[:, None] * Q
+    k = len(c.A) - c.integrals
+    A, B, S, into, back = _triangular(c)
 
     def wide(t: Taylor) -> Taylor:
         return t[:, None, None]
@@ -162,6 +160,21 @@ def response(c: Compensator, f: Frequencies, cells: FloatArray) -> Taylor:
     if c.integrals:
         total = total + summed.mapped(c.C[:, k:], "ij,wjl->wil")
     return total
+
+
+def differences(c: Compensator) -> tuple[FloatArray, FloatArray]:
+    """A, B of x' or of (x+ - x) / T."""
+    T = c.sample_time
+    return (c.A, c.B) if T is None else ((c.A - np.eye(len(c.A))) / T, c.B / T)
+
+
+@lru_cache(maxsize=64)  # of records that compare by identity
+def _triangular(c: Compensator) -> tuple[FloatArray, FloatArray, ComplexArray, ComplexArray, ComplexArray]:
+    """A, B of differences, the Schur form of A without its sums, to its coordinates and back; balanced first."""
+    k, (A, B) = len(c.A) - c.integrals, differences(c)
+    balanced, (units, _) = linalg.matrix_balance(A[:k, :k], permute=False, separate=True)
+    S, Q = linalg.schur(balanced, output="complex")
+    return A, B, S, Q.conj().T / units, units[:, None] * Q
 
 
 def actuator(c: Compensator, f: Frequencies, cells: FloatArray, order: int) -> Taylor | None:
@@ -243,7 +256,7 @@ class Matrices:
 def matrices_of(block: Block, p: FloatArray) -> Matrices:
     A, B, C = block.system.at(p)
     q = np.array(block.states)
-    far = 1.5 * max(np.abs(np.linalg.eigvals(M)).max() for M in A)
+    far = 1.5 * float(np.abs(np.linalg.eigvals(A)).max())
     if not block.system.second_order:
         return Matrices(A[:, q][:, :, q], None, B[:, q], C[:, :, q], None, far)
     d = q + A.shape[1] // 2
@@ -330,28 +343,22 @@ def polynomial(block: Block, names: Sequence[str], sides: FloatArray) -> Polynom
     """
     rng = np.random.default_rng(1)
     u = np.cos(np.pi * (np.arange(9) + 0.5) / 9)
-    degrees, poles = [], []
-    for i, name in enumerate(names):
-        middle, half = sides[i].mean(), np.diff(sides[i])[0] / 2
-        if half == 0:
-            degrees.append(0)
-            poles.append(0)
-            continue
-        rows = np.repeat(rng.uniform(sides[:, 0], sides[:, 1], (3, len(sides))), 9, axis=0)
-        rows[:, i] = np.tile(middle + half * u, 3)
-        values = characteristic_values(block, rows).reshape(-1, 3, 9)
-        found = None
-        for total, power in sorted((d + a, a) for d in range(6) for a in range(4)):
-            scaled = values * rows[:, i].reshape(3, 9) ** power
-            coefficients = np.abs(scaled @ np.polynomial.chebyshev.chebvander(u, 8) / 9)
-            degree = total - power
-            if (coefficients[..., degree + 1 :].max(axis=-1) <= 1e-10 * coefficients.max(axis=-1)).all():
-                found = degree, power
+    moving = [i for i, (low, high) in enumerate(sides) if low < high]
+    rows = np.repeat(rng.uniform(sides[:, 0], sides[:, 1], (len(moving), 3, len(sides))), 9, axis=1)
+    for k, i in enumerate(moving):
+        rows[k, :, i] = np.tile(sides[i].mean() + np.diff(sides[i])[0] / 2 * u, 3)
+    values = characteristic_values(block, rows.reshape(-1, len(sides))).reshape(-1, len(moving), 3, 9)
+    powers = sorted((degree + power, power) for degree in range(6) for power in range(4))
+    into = np.polynomial.chebyshev.chebvander(u, 8) / 9
+    degrees, poles = [0] * len(sides), [0] * len(sides)
+    for k, i in enumerate(moving):
+        for total, power in powers:
+            terms = np.abs((values[:, k] * rows[k, :, i].reshape(3, 9) ** power) @ into)
+            if (terms[..., total - power + 1 :].max(axis=-1) <= 1e-10 * terms.max(axis=-1)).all():
+                degrees[i], poles[i] = total - power, power
                 break
-        if found is None:
-            return f"{name} enters neither as a polynomial of degree 5 nor over a power of itself"
-        degrees.append(found[0])
-        poles.append(found[1])
+        else:
+            return f"{names[i]} enters neither as a polynomial of degree 5 nor over a power of itself"
     return Polynomial(tuple(degrees), tuple(poles))
 
 

@@ -35,17 +35,18 @@ from malta.enclose import (
     GUARD,
     Block,
     Enclosure,
+    Polynomial,
     actuator,
     along,
     characteristic_values,
     coefficients,
     cover,
+    differences,
     enclosure,
     excludes_zero,
     frequencies,
     polynomial,
     products,
-    response,
     restrictions,
 )
 from malta.errors import InputError
@@ -259,6 +260,7 @@ class _Bound:
     """What is known of one group."""
 
     block: Block
+    poly: Polynomial | None = None  # None where f is none
     upper: float = math.inf
     frequency: float | None = None  # rad/s
     witness: FloatArray | None = None
@@ -270,18 +272,18 @@ class _Bound:
 
 def _search(block: Block, box: _Box, goal: float) -> _Bound:
     """The first loss of stability below `goal`: at the phase crossovers of a mode, or along the box's diagonals."""
-    found = _Bound(block)
+    poly = polynomial(block, box.names, box.sides(goal))
+    if isinstance(poly, str):
+        return _Bound(block, reason=poly)
+    found = _Bound(block, poly)
     for _ in range(8):
-        poly = polynomial(block, box.names, box.sides(goal))
-        if isinstance(poly, str):
-            return replace(found, reason=poly)
         e = enclosure(block, box.nominal, box.sides(goal), poly)
         exact = _at_crossovers(e, box, goal)
         better = exact if exact is not None else _worst_ray(e, box, goal)
         if better is None or not better[0] < found.upper:
             return replace(found, exact=exact is not None)
         upper, frequency, witness = better
-        found = _Bound(block, upper, frequency, witness, exact is not None)
+        found = _Bound(block, poly, upper, frequency, witness, exact is not None)
         if found.exact:
             return found
         goal = upper * (1 - TOLERANCE)
@@ -315,16 +317,20 @@ def _at_crossovers(e: Enclosure, box: _Box, goal: float) -> tuple[float, float, 
         return None
     C1 = None if M.C1 is None else M.C1[0, :, 0]
 
+    A, B = differences(c)
+    out, eye = M.B[0, 0] @ c.C, np.eye(len(c.A))
+
     def h(w: FloatArray) -> ComplexArray:
         cells = np.column_stack([0 * w, w, w])
         f = frequencies(c, cells)
+        s = 1j * w if f.delta is None else f.delta.c
+        total = np.zeros(len(w), dtype=complex)
         with np.errstate(all="ignore"):  # only centres count here
-            F = response(c, f, cells).c / f.scale.c[:, None, None]
-            total = np.zeros(len(w), dtype=complex)
             for order, C in ((2, M.C0[0, :, 0]), (1, C1)):
                 if C is not None:
                     H = actuator(c, f, cells, order)
-                    path = np.einsum("k,wkl,l->w", M.B[0, 0], F, C) * (1.0 if H is None else H.c)
+                    inner = np.linalg.solve(s[:, None, None] * eye - A, (B @ C)[:, None])[..., 0]
+                    path = (inner @ out + M.B[0, 0] @ c.D @ C) * (1.0 if H is None else H.c)
                     total += path * (1.0 if order == 2 else 1j * w)
         return total
 
@@ -333,7 +339,7 @@ def _at_crossovers(e: Enclosure, box: _Box, goal: float) -> tuple[float, float, 
     turned = h(w).imag
     k = np.flatnonzero(np.sign(turned[1:]) != np.sign(turned[:-1]))
     low, high, left = w[k], w[k + 1], turned[k]
-    for _ in range(11):  # sixteen parts of each at a time, all crossovers at once
+    for _ in range(7):  # sixteen parts of each at a time, all crossovers at once
         inside = np.linspace(0, 1, 18)[1:-1]
         points = low + (high - low) * inside[:, None]
         side = np.sign(h(points.ravel()).imag.reshape(points.shape)) == np.sign(left)
@@ -366,16 +372,13 @@ def _branch_and_bound(found: _Bound, box: _Box, goal: float, tolerance: float, m
 
     Where a proof gets stuck, stability may be lost off the diagonals: the witness is looked for around that place.
     """
-    if found.reason:
+    if found.poly is None:
         return found
     looked, reason = 0, ""
     shares = iter((1e-5, 1e-4, 1e-3, 1e-2, 0.03, 0.1, 0.2, 0.3, 0.4, 0.5, 0.7, 0.9, 0.99))
     top = goal
     while True:
-        poly = polynomial(found.block, box.names, box.sides(goal))
-        if isinstance(poly, str):
-            return replace(found, reason=poly)
-        e = enclosure(found.block, box.nominal, box.sides(goal), poly)
+        e = enclosure(found.block, box.nominal, box.sides(goal), found.poly)
         proved = _prove(e, most_cells)
         if isinstance(proved, Certificate):
             return replace(found, lower=goal, certificate=proved)
