@@ -136,8 +136,10 @@ def robust_margin(
         return Margin(0.0, 0.0, None, where, {}, {}, (), spent, "the nominal loop is unstable")
     reach = min(box.most * (1 - EDGE), FAR)
     found: list[_Bound] = []
-    for block in _blocks(system, compensator, box):
-        found.append(_search(block, box, reach))
+    blocks = _blocks(system, compensator, box)
+    same = _alike(blocks, box)
+    for block, twin in zip(blocks, same, strict=True):
+        found.append(_search(block, box, reach) if twin is None else replace(found[twin], block=block))
         reach = min(reach, found[-1].upper)
     if any(b.reason for b in found):
         found = _by_eigenvalues(system, compensator, box, reach, found)
@@ -147,7 +149,10 @@ def robust_margin(
     if any(math.isfinite(b.upper) for b in found):
         reach *= 1 - close
     bounds: list[_Bound] = []
-    for b in found:
+    for b, twin in zip(found, same, strict=True):
+        if twin is not None and bounds[twin].lower is not None:
+            bounds.append(replace(bounds[twin], block=b.block))
+            continue
         bounds.append(_branch_and_bound(b, box, reach, close, most_cells))
         reach = min(reach, bounds[-1].upper * (1 - close))
     return _merged(system, compensator, box, bounds, start)
@@ -255,6 +260,30 @@ def _blocks(system: UncertainSystem, c: Compensator, box: _Box) -> list[Block]:
     return blocks
 
 
+def _alike(blocks: list[Block], box: _Box) -> list[int | None]:
+    """For each group an earlier one whose f is the same function up to a factor, as those of a round body's planes are.
+
+    Two analytic functions of frequency and parameters that agree at 48 places chosen at random are one.
+    """
+    rng = np.random.default_rng(2)
+    sides = box.sides(min(1.0, 0.9 * box.most))
+    rows = rng.uniform(sides[:, 0], sides[:, 1], (4, len(sides)))
+    if not blocks:
+        return []
+    T = blocks[0].own.sample_time
+    w = np.exp(rng.uniform(-6, 0, 12)) * (1e4 if T is None else np.pi / T)
+    seen: list[ComplexArray] = []
+    found: list[int | None] = []
+    for block in blocks:
+        f = characteristic_values(block, rows, w)
+        f = f / f[0, 0]
+        found.append(
+            next((k for k, g in enumerate(seen) if np.abs(f - g).max() <= 1e-9 * np.abs(f).max()), None)
+        )
+        seen.append(f if found[-1] is None else np.full_like(f, np.inf))
+    return found
+
+
 @dataclass(frozen=True, eq=False)
 class _Bound:
     """What is known of one group."""
@@ -335,7 +364,7 @@ def _at_crossovers(e: Enclosure, box: _Box, goal: float) -> tuple[float, float, 
         return total
 
     top = cover(c, M.stiffest)[:, 2].max()
-    w = np.geomspace(1e-9, 1, 1600) * top
+    w = np.geomspace(1e-9, 1, 600) * top
     turned = h(w).imag
     k = np.flatnonzero(np.sign(turned[1:]) != np.sign(turned[:-1]))
     low, high, left = w[k], w[k + 1], turned[k]
@@ -346,7 +375,8 @@ def _at_crossovers(e: Enclosure, box: _Box, goal: float) -> tuple[float, float, 
         count = np.where(side.all(axis=0), len(inside), side.argmin(axis=0))
         edges = np.vstack([low, points, high])
         low, high = (np.take_along_axis(edges, (count + i)[None], axis=0)[0] for i in (0, 1))
-    crossings = (low + high) / 2
+    ends = h(np.concatenate([low, high])).imag.reshape(2, -1)
+    crossings = low + (high - low) * ends[0] / (ends[0] - ends[1])
     if not c.integrals:
         crossings = np.r_[0.0, crossings]
     values = h(crossings).real
@@ -379,7 +409,7 @@ def _branch_and_bound(found: _Bound, box: _Box, goal: float, tolerance: float, m
     top = goal
     while True:
         e = enclosure(found.block, box.nominal, box.sides(goal), found.poly)
-        proved = _prove(e, most_cells)
+        proved = _prove(e, most_cells, found.frequency)
         if isinstance(proved, Certificate):
             return replace(found, lower=goal, certificate=proved)
         reason, place = proved
@@ -555,10 +585,19 @@ def _polished(
     return float(t), np.array([cell[0], at, at])
 
 
-def _prove(e: Enclosure, most_cells: int) -> Certificate | tuple[str, FloatArray]:
-    """Exclude zero from f over the whole box and all frequencies, or say why not, and at which parameters."""
+def _prove(e: Enclosure, most_cells: int, near: float | None) -> Certificate | tuple[str, FloatArray]:
+    """Exclude zero from f over the whole box and all frequencies, or say why not, and at which parameters.
+
+    near : rad/s, where it is hardest; the first intervals are narrow there
+    """
     free = [axis for axis, size in enumerate(e.shape) if size > 1]
     cells = cover(e.block.own, e.matrices.stiffest)
+    if near is not None and 0 < near < cells[cells[:, 0] == 0, 2].max():
+        away = 4.0 ** -np.arange(1, 12)
+        low = cells[:, 0] == 0
+        edges = np.unique(np.concatenate([[0.0], cells[low, 2], near * (1 - away), near * (1 + away)]))
+        edges = edges[edges <= cells[low, 2].max()]
+        cells = np.vstack([np.column_stack([0 * edges[1:], edges[:-1], edges[1:]]), cells[~low]])
     ends = (0.0, float(cells[:, 2].max()) if e.block.own.sample_time is not None else math.inf)
     boxes = np.tile([0.0, 1.0], (len(cells), len(e.shape), 1))
     done_cells, done_boxes, count = [], [], 0
