@@ -33,6 +33,7 @@ from scipy import linalg, sparse
 
 from malta.enclose import (
     GUARD,
+    ROUNDING,
     Block,
     Enclosure,
     Polynomial,
@@ -277,9 +278,8 @@ def _alike(blocks: list[Block], box: _Box) -> list[int | None]:
     for block in blocks:
         f = characteristic_values(block, rows, w)
         f = f / f[0, 0]
-        found.append(
-            next((k for k, g in enumerate(seen) if np.abs(f - g).max() <= 1e-9 * np.abs(f).max()), None)
-        )
+        close = 10 * ROUNDING * np.abs(f).max(axis=1, keepdims=True)  # at each frequency: f spans decades
+        found.append(next((k for k, g in enumerate(seen) if (np.abs(f - g) <= close).all()), None))
         seen.append(f if found[-1] is None else np.full_like(f, np.inf))
     return found
 

@@ -739,6 +739,24 @@ def test_a_box_beyond_the_witness_is_not_proven() -> None:
         for block in _blocks(s, c, box):
             poly = polynomial(block, box.names, box.sides(1.01 * m.upper))
             assert not isinstance(poly, str)
-            proved = _prove(enclosure(block, box.nominal, box.sides(1.01 * m.upper), poly), 20_000)
+            proved = _prove(enclosure(block, box.nominal, box.sides(1.01 * m.upper), poly), 20_000, None)
             refused += isinstance(proved, tuple)
         assert refused
+
+
+@pytest.mark.parametrize("more", [1e-4, 1e-5, 1e-6])
+def test_groups_that_differ_a_little_are_proven_each(more: float) -> None:
+    """Two modes at 20 kHz, the second a little less stable: its margin is the loop's, to less than they differ."""
+    K = np.diag([1e4, 1e4 * (1 + more)])
+
+    def of(p: Any) -> Any:
+        A = ca.vertcat(ca.horzcat(ca.SX(2, 2), ca.SX.eye(2)), ca.horzcat(p[0] * ca.DM(K), ca.SX(2, 2)))
+        return A, ca.vertcat(ca.SX(2, 2), ca.SX.eye(2)), np.eye(4)
+
+    s = system(of, [1.0], second_order=True)
+    c = static(np.hstack([-2e4 * np.eye(2), -200 * np.eye(2)]), sample_time=50e-6, delay=1, lag=3000.0)
+    m = robust_margin(s, c, {"p0": 0.2})
+    assert m.lower is not None
+    p = np.array([[1 + 0.2 * m.lower]])
+    assert instability(s, c, p)[0] < 0
+    assert m.lower < m.upper
