@@ -279,8 +279,17 @@ def characteristic(c: Compensator, M: Matrices, cells: FloatArray) -> tuple[Tayl
     G = driven(M.order)
 
     def through(G: Taylor, C: FloatArray) -> Taylor:
-        inner = G.mapped(M.B, "jak,wkl->wjal")
-        return Taylor(inner.c @ C, inner.g @ C, inner.r @ np.abs(C))
+        """B G C, as one product of all its terms."""
+        paths = np.einsum("jak,jlb->kljab", M.B, C)
+        flat, shape = paths.reshape(-1, M.B[:, :, 0].size * C.shape[2]), (len(cells), *paths.shape[2:])
+        entries = [part.reshape(len(cells), -1) for part in (G.c, G.g, G.r)]
+        sizes = np.abs(flat)
+        return Taylor(
+            *(
+                (part @ weights).reshape(shape)
+                for part, weights in zip(entries, (flat, flat, sizes), strict=True)
+            )
+        )
 
     eye = np.eye(M.N0.shape[1])[None, None]
     if M.N1 is None:

@@ -432,7 +432,7 @@ def _stability(e: Enclosure) -> tuple[FloatArray, ComplexArray, Callable[[FloatA
     """
     intervals = cover(e.block.own, e.matrices.stiffest)
     parts = [
-        np.column_stack([np.full(16, b), *(2 * [np.linspace(lo, hi, 17)[:-1]])]) for b, lo, hi in intervals
+        np.column_stack([np.full(10, b), *(2 * [np.linspace(lo, hi, 11)[:-1]])]) for b, lo, hi in intervals
     ]
     if e.block.own.sample_time is None:
         parts[-1] = parts[-1][::-1]
@@ -456,7 +456,7 @@ def _first(unstable: Callable[[FloatArray], Any], P: FloatArray, D: FloatArray, 
         rays = np.flatnonzero(unstable(P + at * D))
         if len(rays):
             low, high = np.full(len(rays), before), np.full(len(rays), at)
-            for _ in range(40):
+            for _ in range(26):
                 middle = (low + high) / 2
                 bad = unstable(P[rays] + middle[:, None] * D[rays])
                 low, high = np.where(bad, low, middle), np.where(bad, middle, high)
@@ -582,10 +582,12 @@ def _polished(
         t, at = t + dt, at + dw
         if not (0.98 * first < t < 1.02 * first and at > 0):
             return first, cell
+        if abs(dt) <= 1e-14 * t and abs(dw) <= 1e-14 * at:
+            break
     return float(t), np.array([cell[0], at, at])
 
 
-def _prove(e: Enclosure, most_cells: int, near: float | None) -> Certificate | tuple[str, FloatArray]:
+def _prove(e: Enclosure, most_cells: int, near: float | None = None) -> Certificate | tuple[str, FloatArray]:
     """Exclude zero from f over the whole box and all frequencies, or say why not, and at which parameters.
 
     near : rad/s, where it is hardest; the first intervals are narrow there
