@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 
 import control
 import numpy as np
-from peer_control import closed_loop
+from peer_control import closed_loop, documented_run
 from peer_problem import Workload
 from rich import box
 from rich.console import Console
@@ -262,7 +262,7 @@ def margin(runs: int) -> list[Result]:
 
 def campaigns(runs: int) -> list[Result]:
     """Strokes of different machines: a campaign, with its files, beside loops over what a user would pick."""
-    _, work = workload("calibrated")
+    plant, work = workload("calibrated")
     names = ("m", "K_A", "K_B", "K_D")
     plan = malta.Plan(
         work.controller, "stroke", dict.fromkeys(names, 0.2), samples=4096, options={"fidelity": "force"}
@@ -276,7 +276,16 @@ def campaigns(runs: int) -> list[Result]:
     peers: dict[str, tuple[int, Callable[[], object]]] = {}
     if optional("joblib"):
         joblib = importlib.import_module("joblib")
-        jobs = [joblib.delayed(documented_stroke)(row.tolist()) for row in factors]
+        start = malta.simulate(plant, work.controller, SCENARIO)
+        inputs = np.hstack([work.p_ref, work.xi_ref, work.v_ff]).T
+        first = np.concatenate([start.x[0], start.force[0], work.xi_ref[0], np.zeros(10)])
+        pars = [
+            replace(
+                work.par, **{n: getattr(work.par, n) * f for n, f in zip(names, row.tolist(), strict=True)}
+            )
+            for row in factors
+        ]
+        jobs = [joblib.delayed(documented_run)(par, work.controller, inputs, first) for par in pars]
         peers["python-control in a joblib loop"] = 4, lambda: joblib.Parallel(n_jobs=-1)(jobs)
     found = optional("peer_numba_plain")
     if found:
@@ -288,22 +297,6 @@ def campaigns(runs: int) -> list[Result]:
         Result("campaign, seconds a machine", ours / plan.samples, name, seconds / count, "")
         for (name, (count, _)), seconds in zip(peers.items(), theirs, strict=True)
     ]
-
-
-def documented_stroke(factors: list[float]) -> float:
-    """One machine's stroke with python-control, in a process of joblib's."""
-    plant, work = workload("calibrated")
-    par = replace(
-        work.par,
-        **{n: getattr(work.par, n) * f for n, f in zip(("m", "K_A", "K_B", "K_D"), factors, strict=True)},
-    )
-    start = malta.simulate(plant, work.controller, SCENARIO)
-    inputs = np.hstack([work.p_ref, work.xi_ref, work.v_ff]).T
-    first = np.concatenate([start.x[0], start.force[0], work.xi_ref[0], np.zeros(10)])
-    t = np.arange(2000) * work.controller.sample_time
-    loop = closed_loop(par, work.controller, lean=False)
-    found = control.input_output_response(loop, t, inputs, X0=first)
-    return float(np.abs(found.outputs).max())
 
 
 WORKLOADS: dict[str, Callable[[int], list[Result]]] = {

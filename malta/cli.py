@@ -191,6 +191,9 @@ def verify(
     model = linearize(plant, point)
     published = _published(plant.name)
     box = _box(gains, uncertain, units_of(plant.parameters), published, option="--uncertain")
+    for name, share in box.items():
+        if not 0 < share < math.inf:
+            raise InputError("--uncertain", name, f"{100 * share:g} %", "a share above 0 %")
     try:
         margins = verified(model, controller)
         with _bar("margins", quiet=as_json) as progress:

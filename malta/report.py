@@ -155,8 +155,14 @@ def disk_table(found: Robustness, Ts: float) -> Table:
             f"{disk.frequency:.4g}",
         )
     for name, delay in found.delay.items():
-        _row(table, f"delay at {name} alone", f"{delay * 1e6:.0f} us", f"{delay / Ts:.1f} samples", "", "")
+        _row(table, f"delay at {name} alone", *_delay_cells(delay, Ts), "", "")
     return table
+
+
+def _delay_cells(delay: float, Ts: float) -> tuple[str, str]:
+    if math.isnan(delay):
+        return "unstable", ""
+    return (f"{delay * 1e6:.0f} us", f"{delay / Ts:.1f} samples") if math.isfinite(delay) else ("any", "")
 
 
 def gang_table(found: Robustness) -> Table:
@@ -213,8 +219,8 @@ def places_table(found: Robustness, Ts: float) -> Table:
             f"{place.position * 1e3:.1f}",
             *_margin_cells(place.margin),
             peak,
-            f"{place.disk:.3f}",
-            f"{place.delay * 1e6:.0f} us, {place.delay / Ts:.1f} samples",
+            "none" if math.isnan(place.disk) else f"{place.disk:.3f}",
+            ", ".join(cell for cell in _delay_cells(place.delay, Ts) if cell),
         )
     return table
 

@@ -450,7 +450,7 @@ def _stability(e: Enclosure) -> tuple[FloatArray, ComplexArray, Callable[[FloatA
 
 def _first(unstable: Callable[[FloatArray], Any], P: FloatArray, D: FloatArray, goal: float) -> FloatArray:
     """Where the first of the rays p + t d become unstable: t of each, infinite of the others."""
-    scan = goal * np.unique(np.r_[np.geomspace(1e-3, 1, 13), np.linspace(0, 1, 25)[1:]])
+    scan = goal * np.unique(np.r_[np.geomspace(1e-3, 1, 9), np.linspace(0, 1, 17)[1:]])
     t, before = np.full(len(P), math.inf), 0.0
     for at in scan.tolist():
         rays = np.flatnonzero(unstable(P + at * D))

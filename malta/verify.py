@@ -264,7 +264,8 @@ def travel_margin(
 ) -> Margin:
     """The margin of the machine's loop anywhere in its travel: the position is one more interval of the proof."""
     over = {plant.stroke: (-plant.travel, plant.travel)}
-    system = uncertain(plant, [*uncertainty, plant.stroke], at={plant.stroke: 0.0})
+    believed = plant_of(controller.parameters)
+    system = uncertain(plant, [*uncertainty, plant.stroke], at={plant.stroke: 0.0}, believed=believed)
     return robust_margin(system, machine_law(plant, controller, current_loops), uncertainty, over)
 
 
