@@ -130,8 +130,9 @@ for name, completed in yields.items():
 
 # %%
 plan = malta.Plan(controllers["calibrated"], "stroke", BOX, samples=1024, options={"fidelity": "force"})
-campaign = malta.campaign(plan, "build/04_campaign")
-malta.report.campaign(campaign, "build/04_campaign", malta.published("data/tubular.toml"))
+folder = f"build/04_campaign_{plan.identity[:8]}"
+campaign = malta.campaign(plan, folder)
+malta.report.campaign(campaign, folder, malta.published("data/tubular.toml"))
 assert campaign.completed.all()
 
 # %% [markdown]
