@@ -64,24 +64,22 @@ assert machine["robust"].lower >= 3.5
 # What the eigenvalues say, the nonlinear machine should show: just inside the boundary a small step dies out, just
 # beyond it grows. Simulated with the forces as first-order lags, as the proof has them, without loads.
 
-
 # %%
-def flown(name: str, share: float) -> float:
-    """The motion (m) half a second after 0.1 um off centre, at a share of the way to the witness."""
-    margin = found[name].chain[-1].margin
-    assert margin.witness is not None
-    nominal: Any = plant.parameters
-    far = {k: getattr(nominal, k) + share * margin.moved[k] for k in BOX}
-    true = malta.plant_of(replace(nominal, **far, F_c=0.0, g=0.0))
+nominal: Any = plant.parameters
+for name in ("calibrated", "robust"):
+    moved = found[name].chain[-1].margin.moved  # from the nominal machine to the witness
     c = controllers[name]
     alone = replace(c, feedforward=replace(c.feedforward, v0=0 * c.feedforward.v0))
-    scenario = malta.Scenario("witness", 0.6, malta.references.hold, {"x": 1e-7, "z": 1e-7}, fidelity="force")
-    run = malta.simulate(true, alone, scenario)
-    return float(np.abs(run.p[-2000:]).max())
-
-
-for name in ("calibrated", "robust"):
-    inside, outside = flown(name, 0.9), flown(name, 1.1)
+    left = []
+    for share in (0.9, 1.1):
+        far = {k: getattr(nominal, k) + share * moved[k] for k in BOX}
+        true = malta.plant_of(replace(nominal, **far, F_c=0.0, g=0.0))
+        scenario = malta.Scenario(
+            "witness", 0.6, malta.references.hold, {"x": 1e-7, "z": 1e-7}, fidelity="force"
+        )
+        run = malta.simulate(true, alone, scenario)
+        left.append(float(np.abs(run.p[-2000:]).max()))
+    inside, outside = left
     print(f"{name}: {inside * 1e6:.2g} um are left inside the boundary, {outside * 1e6:.2g} um beyond")
     assert inside < 2e-8 < 1e-6 < outside
 
