@@ -714,10 +714,11 @@ def _ended(found: Campaign, row: int) -> str:
 def front_figure(tuned: Tuned) -> Figure:
     """Noise of the forces and motion against the proven margin: what the search found, and what it took."""
     from matplotlib.figure import Figure
+    from matplotlib.ticker import LogFormatter
 
     asked, chosen, front = tuned.spec.specification, tuned.trial, tuned.front
     figure = Figure(figsize=(9.0, 4.6), dpi=120)
-    figure.subplots_adjust(left=0.085, right=0.98, bottom=0.115, top=0.8, wspace=0.25)
+    figure.subplots_adjust(left=0.1, right=0.98, bottom=0.115, top=0.8, wspace=0.25)
     taken = next((one for one in front if one.values == chosen.values), chosen)
     others = [one for one in front if one is not taken] or [taken]
     found = f"{tuned.trials} trials; taken: margin {100 * taken.figures['margin']:.0f} %, which keeps a reserve in all"
@@ -730,9 +731,11 @@ def front_figure(tuned: Tuned) -> Figure:
         (("radial_motion", "radial", 1e6, 0), ("axial_motion", "axial", 1e6, 2)),
     )
     for axes, lines, y in zip(
-        panels, sides, ("noise of the commanded force [N rms]", "true motion [µm rms]"), strict=True
+        panels, sides, ("noise of the force [N rms]", "true motion [µm rms]"), strict=True
     ):
         axes.set_yscale("log")
+        for ticks in (axes.yaxis.set_major_formatter, axes.yaxis.set_minor_formatter):
+            ticks(LogFormatter(labelOnlyBase=False, minor_thresholds=(2, 0.4)))
         for name, label, scale, style in lines:
             if not all(name in one.figures for one in front):
                 continue
