@@ -714,7 +714,7 @@ def _ended(found: Campaign, row: int) -> str:
 def front_figure(tuned: Tuned) -> Figure:
     """Noise of the forces and motion against the proven margin: what the search found, and what it took."""
     from matplotlib.figure import Figure
-    from matplotlib.ticker import LogFormatter
+    from matplotlib.ticker import LogLocator
 
     asked, chosen, front = tuned.spec.specification, tuned.trial, tuned.front
     figure = Figure(figsize=(9.0, 4.6), dpi=120)
@@ -734,8 +734,9 @@ def front_figure(tuned: Tuned) -> Figure:
         panels, sides, ("noise of the force [N rms]", "true motion [µm rms]"), strict=True
     ):
         axes.set_yscale("log")
-        for ticks in (axes.yaxis.set_major_formatter, axes.yaxis.set_minor_formatter):
-            ticks(LogFormatter(labelOnlyBase=False, minor_thresholds=(2, 0.4)))
+        axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axes.yaxis.set_major_formatter("{x:g}")
+        axes.yaxis.set_minor_formatter("")
         for name, label, scale, style in lines:
             if not all(name in one.figures for one in front):
                 continue
