@@ -60,8 +60,8 @@ DUST = 1e-11  # entries of the balanced closed loop below this, relative, are ro
 FAR = 1e2  # multiples of the modelled box beyond which nobody looks
 EDGE = 1e-4  # how far from the end of what a parameter can be the search stays, relative
 # How close the proven bound comes to the witness, relative:
-EXACT = 5e-7  # where all modes are single
-TOLERANCE = 9.98e-4  # where modes couple: upper / lower <= 1.001
+EXACT = 5e-7  # where all modes are single, and of sampled loops at one position
+TOLERANCE = 9.98e-4  # else: upper / lower <= 1.001
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,7 +123,8 @@ def robust_margin(
     ranges : by name; 0.2 is +-20 % of the nominal value, (low, high) an interval in SI. With t the lower side is
         nominal - t (nominal - low), the upper one nominal + t (high - nominal): linear on each side.
     over : intervals that do not grow with t, in SI: the bound holds anywhere in them (`z` over the travel)
-    tolerance : how close the proven bound shall come to the witness, relative; None: 5e-7, where modes couple 1e-3
+    tolerance : how close the proven bound shall come to the witness, relative; None: 5e-7, or 1e-3 over
+        intervals and in continuous loops whose modes couple
     most_cells : where the proof is given up
 
     Raises InputError for names that the system does not have and ranges that are none.
@@ -146,7 +147,8 @@ def robust_margin(
         found = _by_eigenvalues(system, compensator, box, reach, found)
         reach = min(reach, *(b.upper for b in found))
     # What is beyond the smallest witness needs no proof.
-    close = tolerance or (EXACT if all(b.exact for b in found) else TOLERANCE)
+    easy = all(b.exact for b in found) or (compensator.sample_time is not None and not over)
+    close = tolerance or (EXACT if easy else TOLERANCE)
     if any(math.isfinite(b.upper) for b in found):
         reach *= 1 - close
     bounds: list[_Bound] = []
@@ -522,6 +524,8 @@ def _sharpened(
     at = grid[int((size / np.abs(products(e, e.nominal[None, :]) @ values.T)[0]).argmin())]
     t, cell = _polished(e, p, d, t, at)
     w = cell[1] if cell[0] == 0 else 1 / cell[1] if cell[1] > 1e-12 / e.matrices.stiffest else math.inf
+    if w < 1e-9 * e.matrices.stiffest:  # Newton's method does not land on zero itself
+        w = 0.0
     return t, float(w), p + t * d
 
 
