@@ -27,7 +27,8 @@ import math
 import os
 import re
 import tomllib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -38,6 +39,7 @@ from scipy import linalg, optimize, sparse
 from malta.data import plant_of, units_of
 from malta.errors import CheckError, InputError
 from malta.experiments import experiment
+from malta.files import read_file
 from malta.linearize import linearize
 from malta.plant import trim
 from malta.riccati import delay_inputs, sample
@@ -460,6 +462,10 @@ def merged(parts: Sequence[Mapping[str, float]]) -> dict[str, float]:
     }
 
 
+def _text(path: Path) -> str:
+    return path.read_text(encoding="utf-8")
+
+
 class _Journal:
     """Trials by what was tried: in memory, and one line each in a file."""
 
@@ -470,7 +476,8 @@ class _Journal:
         head = json.dumps({"malta-tune": 1, "problem": problem_sha256(spec)})
         if path is None:
             return
-        lines = [] if restart or not path.exists() else path.read_text(encoding="utf-8").split("\n")
+        old = "" if restart or not path.exists() else read_file(path, "file of trials", _text)
+        lines = old.split("\n") if old else []
         if lines and lines[0] != head:
             raise InputError(
                 path,
@@ -486,8 +493,18 @@ class _Journal:
                 continue
             self.known[key] = figures
             whole.append(line)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text("\n".join([*whole, ""]), encoding="utf-8")
+        with self._writing(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text("\n".join([*whole, ""]), encoding="utf-8")
+
+    @staticmethod
+    @contextmanager
+    def _writing(path: Path) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            found = error.strerror or type(error).__name__
+            raise InputError(path, "", found, "a place to keep the trials") from error
 
     def expect(self, trials: int, progress: Progress | None) -> None:
         self.expected, self.progress = trials, progress
@@ -496,7 +513,7 @@ class _Journal:
         if key not in self.known:
             self.known[key] = compute()
             if self.path is not None:
-                with self.path.open("a", encoding="utf-8") as file:
+                with self._writing(self.path), self.path.open("a", encoding="utf-8") as file:
                     file.write(json.dumps([key, self.known[key]]) + "\n")
         self.counted += 1
         if self.progress is not None:

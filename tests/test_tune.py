@@ -527,3 +527,16 @@ def test_found_spec_keeps_what_is_not_varied(spec: Spec) -> None:
     from malta.tune import Trial
 
     assert found_spec(spec, Trial(tuple(values), 2, {})).delay == 2
+
+
+def test_trials_that_cannot_be_kept_or_read_are_one_sentence(spec: Spec, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("", encoding="utf-8")
+    with pytest.raises(malta.InputError, match="a place to keep the trials"):
+        _Journal(tmp_path / "file" / "trials.jsonl", spec, restart=False)
+    foreign = tmp_path / "foreign.jsonl"
+    foreign.write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(malta.InputError, match="file of trials"):
+        _Journal(foreign, spec, restart=False)
+    foreign.write_text("{}", encoding="utf-8")
+    with pytest.raises(malta.InputError, match="another design file"):
+        _Journal(foreign, spec, restart=False)
