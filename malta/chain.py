@@ -25,7 +25,7 @@ from malta.robust import Margin, robust_margin
 from malta.spec import Weights
 from malta.synthesize import kalman, lqi, lqr
 from malta.uncertain import Compensator, UncertainSystem, instability, responses, uncertain
-from malta.verify import CurrentLoops, largest, machine_law
+from malta.verify import CurrentLoops, largest, machine_law, travel_margin
 
 if TYPE_CHECKING:
     from malta.plant import ComplexArray, FloatArray
@@ -181,11 +181,9 @@ def robustness(
         links.append(Link(name, margin, peak, "forces" if states else "sensors"))
         done()
     law = stages[SAMPLED][0]
-    over = {stroke: (-plant.travel, plant.travel)}
 
     def anywhere(ranges: Mapping[str, float | tuple[float, float]]) -> Margin:
-        system = uncertain(plant, [*ranges, stroke], at={stroke: 0.0}, believed=believed)
-        found = robust_margin(system, law, ranges, over)
+        found = travel_margin(plant, controller, ranges, current_loops)
         done()
         return found
 

@@ -293,26 +293,25 @@ def simulate(
 
     controller = gain_files.read(gains)
     plant = plant_of(_changed(controller.parameters, change))
-    options = {
-        "distance": None if distance is None else distance * 1e-3,
-        "rise": None if rise is None else rise * 1e-3,
-        "profile": profile,
-        "during": during,
-        "fidelity": fidelity,
-        "noise": noise,
-        "quantize": quantize,
-        "sensor_errors": _assigned("--sensor", sensor, {s.name: s.unit for s in plant.sensor_errors}) or None,
-        "bearing": bearing,
-        "estimator": estimator,
-        "scheduled": scheduled,
-        "feedforward": feedforward,
-        "bearing_axes": bearing_axes,
-        "real_pwm": real_pwm,
-        "delay": delay,
-        "substeps": substeps,
-        "seed": seed,
-    }
-    given = {name: value for name, value in options.items() if value is not None}
+    given = _given(
+        distance,
+        rise,
+        profile=profile,
+        during=during,
+        fidelity=fidelity,
+        noise=noise,
+        quantize=quantize,
+        sensor_errors=_assigned("--sensor", sensor, {s.name: s.unit for s in plant.sensor_errors}) or None,
+        bearing=bearing,
+        estimator=estimator,
+        scheduled=scheduled,
+        feedforward=feedforward,
+        bearing_axes=bearing_axes,
+        real_pwm=real_pwm,
+        delay=delay,
+        substeps=substeps,
+        seed=seed,
+    )
     chosen, choice = scenario or "stroke", engine.replace("-", " ")
     stem = f"{controller.name}_{chosen}"
     with _bar(scenario or "simulating", quiet=as_json) as progress:
@@ -424,21 +423,21 @@ def campaign(
     machine = _changed(controller.parameters, change)
     plant = plant_of(machine)
     published = _published(plant.name)
-    options = {
-        "distance": None if distance is None else distance * 1e-3,
-        "rise": None if rise is None else rise * 1e-3,
-        "profile": profile,
-        "fidelity": fidelity,
-        "noise": noise,
-        "quantize": quantize,
-        "bearing": bearing,
-        "scheduled": scheduled,
-        "feedforward": feedforward,
-        "bearing_axes": bearing_axes,
-        "real_pwm": real_pwm,
-        "delay": delay,
-        "substeps": substeps,
-    }
+    given = _given(
+        distance,
+        rise,
+        profile=profile,
+        fidelity=fidelity,
+        noise=noise,
+        quantize=quantize,
+        bearing=bearing,
+        scheduled=scheduled,
+        feedforward=feedforward,
+        bearing_axes=bearing_axes,
+        real_pwm=real_pwm,
+        delay=delay,
+        substeps=substeps,
+    )
     plan = Plan(
         controller,
         scenario,
@@ -449,7 +448,7 @@ def campaign(
         cast("Sampler", sampler),
         machine,
         case,
-        {name: value for name, value in options.items() if value is not None},
+        given,
     )
     folder = out or Path("build") / "campaigns" / f"{controller.name}_{scenario}_{plan.identity[:8]}"
     with _bar(scenario, quiet=as_json) as progress:
@@ -737,6 +736,13 @@ def _assigned(option: str, given: list[str] | None, units: Mapping[str, str]) ->
             else to_si(float(number), unit or units[name], units[name], option, name)
         )
     return values
+
+
+def _given(distance: float | None, rise: float | None, **others: Any) -> dict[str, Any]:
+    """The options of a scenario that were given, in SI: lengths come in mm, times in ms."""
+    scaled = {"distance": distance, "rise": rise}
+    options = {name: None if value is None else value * 1e-3 for name, value in scaled.items()} | others
+    return {name: value for name, value in options.items() if value is not None}
 
 
 def _box(

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from scipy import linalg
 
-from malta.uncertain import Compensator, UncertainSystem
+from malta.uncertain import Compensator, UncertainSystem, differences
 
 if TYPE_CHECKING:
     from malta.plant import ComplexArray, FloatArray
@@ -160,12 +160,6 @@ def response(c: Compensator, f: Frequencies, cells: FloatArray) -> Taylor:
     if c.integrals:
         total = total + summed.mapped(c.C[:, k:], "ij,wjl->wil")
     return total
-
-
-def differences(c: Compensator) -> tuple[FloatArray, FloatArray]:
-    """A, B of x' or of (x+ - x) / T."""
-    T = c.sample_time
-    return (c.A, c.B) if T is None else ((c.A - np.eye(len(c.A))) / T, c.B / T)
 
 
 @lru_cache(maxsize=64)  # of records that compare by identity

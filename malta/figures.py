@@ -875,15 +875,20 @@ def _square(axes: Axes, *, least: float = 0.0) -> None:
         side.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10]))
 
 
+def plain(axes: Axes) -> None:
+    """A light grid behind the data, no frame on the far sides."""
+    axes.grid(color="#e4e4e4", linewidth=0.6)
+    axes.set_axisbelow(True)
+    for edge in ("top", "right"):
+        axes.spines[edge].set_visible(False)
+
+
 def _finish(axes: Axes, x: str, y: str, *, legend: int = 0, side: str = "left") -> None:
     """Labels, grid, and a legend of so many columns above the axes, where it covers no data."""
     axes.set_xlabel(x)
     axes.set_ylabel(y)
-    axes.grid(color="#e4e4e4", linewidth=0.6)
-    axes.set_axisbelow(True)
+    plain(axes)
     axes.margins(x=0)
-    for edge in ("top", "right"):
-        axes.spines[edge].set_visible(False)
     if legend:
         where: dict[str, Any] = {"loc": f"lower {side}", "bbox_to_anchor": ({"left": 0, "right": 1}[side], 1)}
         handles, labels = _entries([axes])

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from malta.figures import NOTE, STYLES
+from malta.figures import BOUND, NOTE, STYLES, plain
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -53,14 +53,15 @@ def chain_figure(found: Robustness, name: str, uncertainty: Mapping[str, float])
     left.plot([], [], color="#c1440e", linewidth=1.6, label="witness: unstable there")
     left.bar(0, 0, color="#5a5a5a", label="proven, the machine's loop")
     _legend(left)
-    _bare(left, "parametric margin [% of the box]")
+    left.set_xlabel("parametric margin [% of the box]")
     right.set_yticks(range(len(rows)), [""] * len(rows))
     right.set_xlim(0, max(5.6, 1.15 * max(link.peak for link in found.chain if not math.isnan(link.peak))))
     for limit, text in LIMITS:
-        right.axvline(limit, color="#9a9a9a", linestyle=(0, (8, 3)), linewidth=0.9)
+        right.axvline(limit, **BOUND)
         right.text(limit, -0.75, text, ha="center", va="bottom", **NOTE)
-    _bare(right, "peak sensitivity |S|: zones of ISO 14839-3")
+    right.set_xlabel("peak sensitivity |S|: zones of ISO 14839-3")
     for axes in (left, right):
+        plain(axes)
         axes.set_ylim(len(rows) - 0.4, -0.8)
     _along_travel(figure.add_subplot(grid[1, 0]), figure.add_subplot(grid[1, 1]), found)
     return figure
@@ -90,25 +91,16 @@ def _along_travel(left: Axes, right: Axes, found: Robustness) -> None:
     left.set_xlabel("position z [mm]")
     right.plot(both, mirrored([p.peak for p in places]), marker="o", markersize=3.5, **STYLES[0])
     right.set_ylim(0, max(3.5, 1.2 * max([p.peak for p in places if not math.isnan(p.peak)] + [1.0])))
-    right.axhline(3, color="#9a9a9a", linestyle=(0, (8, 3)), linewidth=0.9)
+    right.axhline(3, **BOUND)
     right.annotate("zone A", (0.985, 3), xycoords=("axes fraction", "data"), ha="right", va="top", **NOTE)
     right.set_xlabel("position z [mm]")
     right.set_ylabel("peak |S|")
     for axes in (left, right):
-        _bare(axes, "")
+        plain(axes)
 
 
 def _percent(t: float | None) -> float:
     return 0.0 if t is None else 100 * t
-
-
-def _bare(axes: Axes, x: str) -> None:
-    if x:
-        axes.set_xlabel(x)
-    axes.grid(color="#e4e4e4", linewidth=0.6)
-    axes.set_axisbelow(True)
-    for edge in ("top", "right"):
-        axes.spines[edge].set_visible(False)
 
 
 def _legend(axes: Axes) -> None:

@@ -228,6 +228,13 @@ def delay_inputs(Ad: FloatArray, Bd: FloatArray, delay: int) -> tuple[FloatArray
     return A, np.vstack([np.zeros((n + stored - m, m)), np.eye(m)])
 
 
+def add_lags(A: FloatArray, B: FloatArray, rate: float) -> tuple[FloatArray, FloatArray]:
+    """The continuous system whose inputs follow as first-order lags, rate / (s + rate); they are states after x."""
+    m = B.shape[1]
+    lagged = np.block([[A, B], [np.zeros((m, len(A))), -rate * np.eye(m)]])
+    return lagged, np.vstack([np.zeros_like(B), rate * np.eye(m)])
+
+
 def add_integrals(Ad: FloatArray, Bd: FloatArray, Cd: FloatArray, Ts: float) -> tuple[FloatArray, FloatArray]:
     """The sampled system with e+ = e - Ts y+ appended, the controller's own sums of the measured errors."""
     p = len(Cd)

@@ -25,7 +25,7 @@ import itertools
 import math
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -42,7 +42,6 @@ from malta.enclose import (
     characteristic_values,
     coefficients,
     cover,
-    differences,
     enclosure,
     excludes_zero,
     frequencies,
@@ -51,7 +50,7 @@ from malta.enclose import (
     restrictions,
 )
 from malta.errors import InputError
-from malta.uncertain import Compensator, UncertainSystem, critical, instability
+from malta.uncertain import Compensator, UncertainSystem, critical, differences, instability
 
 if TYPE_CHECKING:
     from malta.plant import ComplexArray, FloatArray
@@ -68,12 +67,10 @@ TOLERANCE = 9.98e-4  # else: upper / lower <= 1.001
 class Certificate:
     """What proves the lower bound: zero is excluded on each cell."""
 
-    method: str  # "phase crossovers" or "branch and bound"
     cells: int
     frequencies: tuple[float, float]  # rad/s, covered without a gap
-    crossovers: tuple[float, ...] = ()  # rad/s, where f can vanish at all
-    intervals: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))  # branch, from, to of each cell
-    boxes: FloatArray = field(default_factory=lambda: np.zeros((0, 0, 2)))  # of the parameters of each cell
+    intervals: FloatArray  # of each cell: branch (0: of w, 1: of 1/w), from, to
+    boxes: FloatArray  # of each cell: of the parameters, as shares of the proven box
 
 
 @dataclass(frozen=True, eq=False)
@@ -651,7 +648,7 @@ def _prove(e: Enclosure, most_cells: int, near: float | None = None) -> Certific
                 else:
                     b[:, free[k - 1], 1 - side] = b[:, free[k - 1]].mean(axis=1)
                 cells, boxes = np.vstack([cells, c]), np.vstack([boxes, b])
-    return Certificate("branch and bound", count, ends, (), np.vstack(done_cells), np.vstack(done_boxes))
+    return Certificate(count, ends, np.vstack(done_cells), np.vstack(done_boxes))
 
 
 def _merged(system: UncertainSystem, c: Compensator, box: _Box, bounds: list[_Bound], start: float) -> Margin:

@@ -42,7 +42,7 @@ from malta.experiments import experiment
 from malta.files import read_file
 from malta.linearize import linearize
 from malta.plant import trim
-from malta.riccati import delay_inputs, sample
+from malta.riccati import add_lags, delay_inputs, sample
 from malta.simulate import Scenario, simulate, stroke_figures
 from malta.spec import SPECIFIED, Spec, Specification, Weights
 from malta.synthesize import Gains, gains, static_feedforward, synthesize
@@ -260,9 +260,7 @@ def _groups(spec: Spec) -> list[_Group]:
 
 def _sampled(spec: Spec, part: _Part) -> _Machine:
     actuator = spec.plant.actuator
-    A, B, m = part.A, part.B, part.B.shape[1]
-    A = np.block([[A, B], [np.zeros((m, len(A))), -actuator.crossover * np.eye(m)]])
-    B = np.vstack([np.zeros_like(B), actuator.crossover * np.eye(m)])
+    A, B = add_lags(part.A, part.B, actuator.crossover)
     Ad, Bd = delay_inputs(*sample(A, B, spec.sample_time), actuator.delay(spec.sample_time))
     return _Machine(Ad, Bd, np.hstack([part.C, np.zeros((len(part.C), len(Ad) - part.C.shape[1]))]))
 

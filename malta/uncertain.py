@@ -17,7 +17,7 @@ import numpy as np
 from malta.controller import Controller, CurrentLoop, linear_law
 from malta.errors import InputError
 from malta.plant import Plant, readonly, symbolic
-from malta.riccati import delay_inputs, sample
+from malta.riccati import add_lags, delay_inputs, sample
 
 if TYPE_CHECKING:
     from malta.plant import ComplexArray, FloatArray
@@ -189,6 +189,12 @@ def _with_current_control(c: Compensator, loop: CurrentLoop, R: float, B2: Float
     return replace(c, A=full, B=driven, C=out, D=c.D * D / R)
 
 
+def differences(c: Compensator) -> tuple[FloatArray, FloatArray]:
+    """A, B of x' or of (x+ - x) / T."""
+    T = c.sample_time
+    return (c.A, c.B) if T is None else ((c.A - np.eye(len(c.A))) / T, c.B / T)
+
+
 class _Sides(NamedTuple):
     """Both sides of the loop as the eigenvalues and responses want them: x' = A x + B u, or of sampled (x+ - x) / T."""
 
@@ -201,11 +207,8 @@ class _Sides(NamedTuple):
 
 def _sides(c: Compensator, A: FloatArray, B: FloatArray, C: FloatArray) -> _Sides:
     """Differences, as poles of slow modes stand close to 1, where A of x+ = A x itself has lost their digits."""
-    m = B.shape[1]
     if c.lag is not None:
-        A = np.block([[A, B], [np.zeros((m, len(A))), -c.lag * np.eye(m)]])
-        B = np.vstack([np.zeros_like(B), c.lag * np.eye(m)])
-    F_A, F_B = c.A, c.B
+        A, B = add_lags(A, B, c.lag)
     if c.sample_time is not None:
         n, T = len(A), c.sample_time
         _, Phi = sample(A, np.eye(n), T)  # (e^AT - 1) / T = A Phi / T
@@ -213,8 +216,7 @@ def _sides(c: Compensator, A: FloatArray, B: FloatArray, C: FloatArray) -> _Side
         stored = np.arange(n, len(A))  # of these, delay_inputs gives the next values
         A[n:], B[n:] = A[n:] / T, B[n:] / T
         A[stored, stored] -= 1 / T
-        F_A, F_B = (c.A - np.eye(len(c.A))) / T, c.B / T
-    return _Sides(A, B, np.hstack([C, np.zeros((len(C), len(A) - C.shape[1]))]), F_A, F_B)
+    return _Sides(A, B, np.hstack([C, np.zeros((len(C), len(A) - C.shape[1]))]), *differences(c))
 
 
 def closed_loop(system: UncertainSystem, c: Compensator, p: FloatArray) -> FloatArray:

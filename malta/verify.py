@@ -17,7 +17,7 @@ from malta.data import plant_of
 from malta.errors import CheckError, InputError
 from malta.linearize import LinearModel, linearize
 from malta.plant import trim
-from malta.riccati import add_integrals, delay_inputs, eigenvalues, sample
+from malta.riccati import add_integrals, add_lags, delay_inputs, eigenvalues, sample
 from malta.robust import Margin, robust_margin
 from malta.uncertain import Compensator, sampled_law, uncertain
 
@@ -164,9 +164,7 @@ def loop(
     """
     A, B, C = model.A, _force_map(model, controller), model.C
     if current_loops:
-        m, w_c = B.shape[1], model.plant.actuator.crossover
-        A = np.block([[A, B], [np.zeros((m, len(A))), -w_c * np.eye(m)]])
-        B = np.vstack([np.zeros_like(B), w_c * np.eye(m)])
+        A, B = add_lags(A, B, model.plant.actuator.crossover)
     Ad, Bd = delay_inputs(*sample(A, B, controller.sample_time), delay)
     Cd = np.hstack([C, np.zeros((len(C), len(Ad) - C.shape[1]))])
     law = linear_law(controller)
@@ -259,14 +257,17 @@ def machine_law(plant: Plant, controller: Controller, current_loops: CurrentLoop
 def travel_margin(
     plant: Plant,
     controller: Controller,
-    uncertainty: Mapping[str, float],
+    ranges: Mapping[str, float | tuple[float, float]],
     current_loops: CurrentLoops = "lag",
 ) -> Margin:
-    """The margin of the machine's loop anywhere in its travel: the position is one more interval of the proof."""
+    """The margin of the machine's loop anywhere in its travel: the position is one more interval of the proof.
+
+    ranges : of the parameters, as robust_margin takes them
+    """
     over = {plant.stroke: (-plant.travel, plant.travel)}
     believed = plant_of(controller.parameters)
-    system = uncertain(plant, [*uncertainty, plant.stroke], at={plant.stroke: 0.0}, believed=believed)
-    return robust_margin(system, machine_law(plant, controller, current_loops), uncertainty, over)
+    system = uncertain(plant, [*ranges, plant.stroke], at={plant.stroke: 0.0}, believed=believed)
+    return robust_margin(system, machine_law(plant, controller, current_loops), ranges, over)
 
 
 def require_stable(margins: Margins, name: str) -> None:
