@@ -2,9 +2,12 @@
 
 Source: F. Xing, B. Kou, L. Zhang, X. Yin, Y. Zhou, "Design of a Control System for a Maglev Planar Motor Based on
 Two-Dimension Linear Interpolation", 2017; equation and table numbers are its own.
-State: x y z, the angles phi theta psi of eq. (7), and their rates. x, y lie in the plane of the magnets, z is the
-height of the coils' lower faces above them while the mover is level; gravity is along -z. W = K(p) i is the wrench of
-the coil currents about the centre of gravity, in the frame of the magnets; for a level mover also in its own.
+State: x y z, the angles phi theta psi of eq. (7), and their rates. x, y lie in the plane of the magnets, gravity is
+along -z. W = K(p) i is the wrench of the coil currents about the centre of gravity, in the frame of the magnets; for a
+level mover also in its own.
+
+Heights: the plant's state z counts from the working height par.h, so that z = 0 is the air gap of Table 1. Coil models
+and the functions of a position p take the height of the coils' lower faces above the magnets, of a level mover.
 
 A coil model is a function (x, y, z) -> wrench of 1 A in a level coil there, about its own centre of force, in CasADi
 or numpy: `Analytical` is the paper's (17)-(24), `Table` its bilinear table, `planar_field.Series` the Fourier series.
@@ -14,9 +17,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from itertools import product
+from numbers import Real
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import casadi as ca
@@ -24,8 +29,8 @@ import numpy as np
 
 from malta.data import check_parameters, si
 from malta.errors import CheckError, InputError
-from malta.plant import Signal, readonly
-from malta.plants.planar_field import COIL_ORDER, ODD_X, ODD_Y, Series, modes, series, winding
+from malta.plant import Actuator, Plant, Signal, readonly, traced
+from malta.plants.planar_field import COIL_ORDER, ODD_X, ODD_Y, Series, Shape, centre_of_force, unit_series
 from malta.rigidbody import acceleration, principal, rotation, turned
 
 if TYPE_CHECKING:
@@ -36,20 +41,23 @@ if TYPE_CHECKING:
 class Parameters:
     """Physical parameters, SI; where each comes from is said in data/planar.toml."""
 
-    tau_n: float = si("m", above=0)  # pole pitch along x and y
-    w_c: float = si("m", above=0)  # width of a coil's leg
-    h_c: float = si("m", above=0)  # height of a coil
-    l_c: float = si("m", above=0)  # length of a leg, and distance of opposite legs' axes
-    r_c: float = si("m", at_least=0)  # inner corner radius of a coil
+    tau_n: float = si("m", above=0, shapes=True)  # pole pitch along x and y
+    w_c: float = si("m", above=0, shapes=True)  # width of a coil's leg
+    h_c: float = si("m", above=0, shapes=True)  # height of a coil
+    l_c: float = si("m", above=0, shapes=True)  # length of a leg, and distance of opposite legs' axes
+    r_c: float = si("m", at_least=0, shapes=True)  # inner corner radius of a coil
     N_c: float = si("1", above=0)  # turns
-    h_m: float = si("m", above=0)  # thickness of the magnets
+    h_m: float = si("m", above=0, shapes=True)  # thickness of the magnets
     B_r: float = si("T", above=0)  # their remanence, relative permeability 1
-    upright: float = si("1", above=0)  # width of the upright blocks in their own pole pitch, sqrt(2) tau_n
+    upright: float = si(
+        "1", above=0, shapes=True
+    )  # width of the upright blocks in their own pole pitch, sqrt(2) tau_n
     h: float = si("m", above=0)  # air gap: the working height
     B_z: float = si("T", above=0)  # flux density that (17)-(24) count with, at the working height
     C: float = si("1", above=0)  # harmonic compensation factor of (23), (24)
     coil_pitch: float = si("m", above=0)  # of the 4 x 4 coils
     r_z: float = si("m")  # centre of gravity to the coils' centre of force
+    w_m: float = si("m", above=0)  # width of the mover's square plate
     m: float = si("kg", above=0)  # mover with coils
     I_x: float = si("kg m^2", above=0)
     I_y: float = si("kg m^2", above=0, twin="I_x")
@@ -58,9 +66,16 @@ class Parameters:
     F_max: float = si("N", above=0)  # limit of each commanded force
     T_max: float = si("N m", above=0)  # limit of each commanded torque
     I_max: float = si("A", above=0)  # limit of each coil current
-    T_s: float = si("s", above=0)  # control period
+    T_s: float = si("s", above=0, shapes=True)  # control period
+    T_d: float = si("s", at_least=0, shapes=True)  # dead time of computation and hold
     xy_max: float = si("m", above=0)  # travel in the plane, either way
     z_max: float = si("m", above=0)  # greatest height
+    s_p: float = si("m", at_least=0)  # position sensor noise, rms of a sample
+    s_a: float = si("rad", at_least=0)  # angle sensor noise, rms of a sample
+    order: float = si("1", at_least=1, shapes=True)  # harmonics of the controller's coil model; 1: (17)-(24)
+    cells: float = si(
+        "1", at_least=0, shapes=True
+    )  # of its table over tau_n, along x and along y; 0: no table
     preset: str = "custom"
 
     def __post_init__(self) -> None:
@@ -77,6 +92,13 @@ class Parameters:
             raise InputError(
                 "planar.Parameters", "coil_pitch", found, f"at least {coil:.6g} m, the width of a coil"
             )
+        if not self.z_max > self.h:
+            raise InputError("planar.Parameters", "z_max", f"{self.z_max} m", f"more than h, {self.h} m")
+        if not (self.order <= COIL_ORDER and self.order == int(self.order)):
+            expected = f"a whole number from 1 to {COIL_ORDER}"
+            raise InputError("planar.Parameters", "order", f"{self.order:g}", expected)
+        if self.cells != int(self.cells):
+            raise InputError("planar.Parameters", "cells", f"{self.cells:g}", "a whole number")
 
 
 CoilModel = Callable[[Any, Any, Any], Any]
@@ -85,9 +107,163 @@ POSITIONS = tuple(Signal(n, "m") for n in "xyz") + tuple(Signal(n, "rad") for n 
 RATES = tuple(Signal(f"{s.name}_dot", f"{s.unit}/s") for s in POSITIONS)
 WRENCH = tuple(Signal(f"F_{a}", "N") for a in "xyz") + tuple(Signal(f"T_{a}", "N m") for a in "xyz")
 CURRENTS = tuple(Signal(f"i_{k}", "A") for k in range(1, 17))
+SENSOR_ERRORS = tuple(Signal(f"offset_{s.name}", s.unit) for s in POSITIONS)
+CONTACTS = ("touchdown on the magnets", "above the greatest height", "left the magnet array")
 
 STEPS = (-1.5, -0.5, 0.5, 1.5)  # coil pitches from the mover's centre, along x and y
+LEAST = 4e-5  # of the largest term's force on the magnets: what `simulated` leaves out
 WORST = 10.0  # largest accepted condition of K(p): 2.4 with a pitch of 16/3 tau_n, 20 and more with a bad one
+
+
+def plant(par: Parameters) -> Plant:
+    """The mover under the wrench of its coils; sixteen currents, found for the position as if the mover were level.
+
+    Raises CheckError when the coils cannot give every wrench: see `check_pitch`. Parameters that are symbols are not
+    checked: they stand for those of a record that was.
+    """
+    numbers = all(isinstance(getattr(par, f.name), Real | str) for f in fields(par))
+    if numbers:
+        check_pitch(par, simulated(par))
+    x, u, w = ca.SX.sym("x", 12), ca.SX.sym("u", 6), ca.SX.sym("w", 6)
+    return Plant(
+        name="planar",
+        parameters=par,
+        states=POSITIONS + RATES,
+        inputs=WRENCH,
+        outputs=POSITIONS,
+        disturbances=WRENCH,
+        uncontrolled=(),
+        f=traced("f", [x, u, w], motion(par, x, u, w)),
+        h=lambda x, _: x[:6],
+        load=lambda _: load(par),
+        position_of=lambda y: y,
+        preload=lambda _: -load(par),
+        currents=_commutation(par, numbers=numbers),
+        forces=lambda x, i: _forces(_shape(par))(x, i, _entering(par)),
+        limited=lambda i: limited(par, i),
+        tabulated=par.cells > 0,
+        actuator=Actuator(
+            coils=CURRENTS,
+            force_limit=(par.F_max, par.F_max, par.F_max, par.T_max, par.T_max, par.T_max),
+            force_constant=(),
+            current_limit=par.I_max,
+            voltage_limit=math.inf,
+            R=0.0,
+            L=0.0,
+            crossover=math.inf,
+            phase_margin=0.0,
+            sample_time=par.T_s,
+            dead_time=par.T_d,
+        ),
+        drive=None,
+        electronics=None,
+        contacts=CONTACTS,
+        contact=lambda x: contact(par, x),
+        cushioned=(False, False, False),
+        bearing=lambda _: ca.DM.zeros(6),
+        sense=lambda x, errors: x[:6] + errors,
+        sensor_errors=SENSOR_ERRORS,
+        noise=(par.s_p, par.s_p, par.s_p, par.s_a, par.s_a, par.s_a),
+        uniform=False,
+        resolution=(0.0,) * 6,
+        inertia=(par.m, par.m, par.m, par.I_x, par.I_y, par.I_z),
+        mass=par.m,
+        thrust="F_y",
+        stroke="y",
+        travel=par.xy_max,
+        variant=plant,
+    )
+
+
+def load(par: Parameters) -> Any:
+    """Gravity, as a wrench at the centre of gravity."""
+    return ca.vertcat(0, 0, -par.m * par.g, 0, 0, 0)
+
+
+def contact(par: Parameters, x: Any) -> Any:
+    """Shares of the way from the working height to the magnets and to z_max, and of xy_max: 1 at contact.
+
+    Touchdown is that of the lowest corner of a plate w_m wide in the plane of the coils' lower faces.
+    """
+    up = rotation(x[3:6])[:, 2]  # the vertical in the mover's frame
+    below = par.r_z - centre_of_force(par)  # centre of gravity to that plane
+    sunk = below * (1 - up[2]) + par.w_m / 2 * (ca.fabs(up[0]) + ca.fabs(up[1])) - x[2]
+    beyond = ca.fmax(ca.fabs(x[0]), ca.fabs(x[1])) / par.xy_max
+    return ca.vertcat(sunk / par.h, x[2] / (par.z_max - par.h), beyond)
+
+
+_ENTERING = ("coil_pitch", "r_z", "h", "N_c", "B_r", "B_z", "C")  # what K(p) takes besides the Shape
+
+
+def _entering(par: Parameters) -> Any:
+    return ca.vertcat(*(getattr(par, name) for name in _ENTERING))
+
+
+def _shape(par: Parameters) -> Shape:
+    return Shape(par.tau_n, par.w_c, par.h_c, par.l_c, par.r_c, par.h_m, par.upright)
+
+
+def _symbols(shape: Shape) -> tuple[Any, Any]:
+    """A stand-in for parameters of this shape, with symbols for those that enter, and their vector."""
+    symbols = {name: ca.SX.sym(name) for name in _ENTERING}
+    return SimpleNamespace(**shape._asdict() | symbols), ca.vertcat(*symbols.values())
+
+
+@lru_cache(maxsize=8)  # a third of a second, for all parameters of a shape
+def _forces(shape: Shape) -> ca.Function:
+    """(x, i, entering) -> W: what coil currents do to the mover where it is, tilted."""
+    par, entering = _symbols(shape)
+    x, i = ca.SX.sym("x", 12), ca.SX.sym("i", 16)
+    W = wrench_matrix(par, simulated(par), _place(par, x), x[3:6]) @ i
+    return ca.Function("forces", [x, i, entering], [ca.cse(W)])
+
+
+@lru_cache(maxsize=8)
+def _currents(shape: Shape, order: int) -> ca.Function:
+    """(y, W, entering) -> i, without a table."""
+    par, entering = _symbols(shape)
+    y, W = ca.SX.sym("y", 6), ca.SX.sym("W", 6)
+    i = currents(ca.cse(wrench_matrix(par, _harmonics(par, order), _place(par, y))), W)
+    return ca.Function("currents", [y, W, entering], [ca.cse(i)])
+
+
+def _place(par: Parameters, y: Any) -> Any:
+    """p, with the height above the magnets, of states or outputs."""
+    return ca.vertcat(y[:2], par.h + y[2])
+
+
+def _commutation(par: Parameters, *, numbers: bool) -> Callable[[Any, Any], Any]:
+    """(y, W) -> i by the coil model that `order` and `cells` name."""
+    if not par.cells:
+        return lambda y, W: _currents(_shape(par), int(par.order))(y, W, _entering(par))
+    if numbers:
+        look_up = decoupling(par, believed(par))
+        return lambda y, W: look_up(_place(par, y), W)
+
+    def refused(_y: Any, _W: Any) -> Any:
+        raise CheckError("planar: a table holds numbers: where parameters are symbols, cells has to be 0")
+
+    return refused
+
+
+def simulated(par: Parameters, order: int = COIL_ORDER) -> Series:
+    """`truth` without the terms below LEAST: 22 of 144 harmonics, whatever the height.
+
+    At 1 mm a coil's force changes by up to 0.2 of 8200 mN/A, on the magnets by 0.9 of 9900.
+    """
+    whole = unit_series(_shape(par), order)
+    few = whole.above(LEAST * float(np.abs(whole.G[:3]).max()), 0.0)
+    return replace(few, scale=par.N_c * par.B_r)
+
+
+def believed(par: Parameters) -> CoilModel:
+    """The controller's coil model: (17)-(24) with `order` 1, else as many harmonics; sampled in a table of `cells`."""
+    model = _harmonics(par, int(par.order))
+    return table(par, model, int(par.cells)) if par.cells else model
+
+
+def _harmonics(par: Parameters, order: int) -> CoilModel:
+    return Analytical(par) if order == 1 else simulated(par, order)
 
 
 @dataclass(frozen=True)
@@ -119,8 +295,8 @@ class Analytical:
 
 
 def truth(par: Parameters, order: int = COIL_ORDER) -> Series:
-    """The exact wrench of the rounded coil in the whole field: what the simulated machine has."""
-    return series(par, modes(par, order), winding(par))
+    """The exact wrench of the rounded coil in the whole field."""
+    return replace(unit_series(_shape(par), order), scale=par.N_c * par.B_r)
 
 
 def compensation(par: Parameters, model: CoilModel) -> float:
@@ -243,8 +419,12 @@ def wrench_matrix(par: Parameters, model: CoilModel, p: Any, q_r: Any = None) ->
     columns = []
     for a, b in product(STEPS, STEPS):  # parameters may be symbols here
         arm = ca.vertcat(a * par.coil_pitch, b * par.coil_pitch, par.r_z)
-        at = arm if q_r is None else rotation(q_r).T @ arm
-        own = model(p[0] + at[0], p[1] + at[1], p[2] + at[2] - par.r_z)
+        rows = ca.diag(arm) if q_r is None else ca.diag(arm) @ rotation(q_r)
+        at = ca.sum1(rows).T
+        # Decays over a column's rise, a row's and the mover's height are factors, each for several coils.
+        heights = (p[2] + rows[2, 2] - par.r_z, rows[0, 2], rows[1, 2])
+        z: Any = heights if q_r is not None and isinstance(model, Series) else p[2] + at[2] - par.r_z
+        own = model(p[0] + at[0], p[1] + at[1], z)
         columns.append(ca.vertcat(own[:3], own[3:] + ca.cross(at, own[:3])))
     return ca.horzcat(*columns)
 
@@ -276,10 +456,11 @@ def currents(K: Any, W: Any, weights: Any = None) -> Any:
     return i
 
 
-def limited(par: Parameters, i: FloatArray) -> tuple[FloatArray, bool]:
-    """Coil currents within I_max, scaled together so that the wrench keeps its direction; whether they had to be."""
-    excess = float(np.abs(i).max()) / par.I_max
-    return (i / excess, True) if excess > 1 else (i, False)
+def limited(par: Parameters, i: Any) -> Any:
+    """Coil currents within I_max, scaled together so that the wrench keeps its direction: numpy or CasADi."""
+    if isinstance(i, np.ndarray):
+        return i / max(1.0, float(np.abs(i).max()) / par.I_max)
+    return i / ca.fmax(1, ca.mmax(ca.fabs(i)) / par.I_max)
 
 
 def checked(par: Parameters, p: FloatArray) -> FloatArray:
@@ -320,22 +501,24 @@ def check_pitch(par: Parameters, model: CoilModel) -> float:
 
 
 def motion(par: Parameters, x: Any, W: Any, w: Any) -> Any:
-    """x' of the mover under the coils' wrench W, gravity, and an outer wrench w: eqs (36)-(38) with exact angles.
+    """x' of the mover under the coils' wrench W and an outer wrench w, gravity in it: (36)-(38) with exact angles.
 
     `x` is a CasADi SX symbol of 12; both wrenches are about the centre of gravity, in the frame of the magnets.
     NOTE: (39) prints roll twice, and (36) leaves out the products of rates; with them the angles are those of eq. (7).
     """
     inertia = (par.I_x, par.I_y, par.I_z)
-    F_I = W[:3] + w[:3] - ca.vertcat(0, 0, par.m * par.g)
     T_B = turned(principal(x[3:6], inertia), W[3:] + w[3:])
-    q_t_ddot, q_r_ddot = acceleration(par.m, inertia, x[3:6], x[9:12], F_I, T_B)
+    q_t_ddot, q_r_ddot = acceleration(par.m, inertia, x[3:6], x[9:12], W[:3] + w[:3], T_B)
     return ca.vertcat(x[6:12], q_t_ddot, q_r_ddot)
 
 
 def dynamics(par: Parameters, model: CoilModel) -> ca.Function:
-    """(x, i, w) -> x': the mover under its sixteen coil currents, with the coils where tilt puts them."""
+    """(x, i, w) -> x': the mover under its coil currents and gravity, with the coils where tilt puts them.
+
+    x holds the height above the magnets, w is what acts besides.
+    """
     x, i, w = ca.SX.sym("x", 12), ca.SX.sym("i", 16), ca.SX.sym("w", 6)
-    rate = motion(par, x, wrench_matrix(par, model, x[:3], x[3:6]) @ i, w)
+    rate = motion(par, x, wrench_matrix(par, model, x[:3], x[3:6]) @ i, w + load(par))
     return ca.Function("dynamics", [x, i, w], [ca.cse(rate)], ["x", "i", "w"], ["dx"])
 
 

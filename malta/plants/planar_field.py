@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import casadi as ca
@@ -32,6 +33,20 @@ ODD_X = (1, 0, 0, 0, 1, 1)
 ODD_Y = (0, 1, 0, 1, 0, 1)
 
 
+class Shape(NamedTuple):
+    """The parameters that harmonics are computed from, with one turn and one tesla: those are factors."""
+
+    tau_n: float
+    w_c: float
+    h_c: float
+    l_c: float
+    r_c: float
+    h_m: float
+    upright: float
+    N_c: float = 1.0
+    B_r: float = 1.0
+
+
 class Modes(NamedTuple):
     """Harmonics of the field: orders and the amplitude of B_z at z = 0."""
 
@@ -46,7 +61,7 @@ class Modes(NamedTuple):
         return self.k * np.hypot(self.m, self.n)
 
 
-def modes(par: Parameters, order: int = ORDER) -> Modes:
+def modes(par: Parameters | Shape, order: int = ORDER) -> Modes:
     """Harmonics up to `order` in x and in y.
 
     Along x' and y' every kind of block is a product of two alternating square waves, of harmonics a, b = 1, 3, 5, ...:
@@ -102,7 +117,7 @@ class Winding(NamedTuple):
     j_y: FloatArray
 
 
-def winding(par: Parameters, *, rectangles: bool = False, nodes: int = 64) -> Winding:
+def winding(par: Parameters | Shape, *, rectangles: bool = False, nodes: int = 64) -> Winding:
     """A coil of uniform current density: four legs and four round corners of inner radius r_c, l_c between axes.
 
     rectangles: the four l_c x w_c rectangles of (23) and (24), which overlap at the corners.
@@ -135,7 +150,7 @@ def _gauss(nodes: int) -> tuple[FloatArray, FloatArray]:
     return x / 2, w / 2
 
 
-def centre_of_force(par: Parameters) -> float:
+def centre_of_force(par: Parameters | Shape) -> float:
     """Height of the centre of the fundamental's force above a coil's lower face, m: r_z counts from there."""
     k = math.pi / par.tau_n
     return 1 / k - par.h_c / math.expm1(k * par.h_c)
@@ -173,51 +188,70 @@ def quadrature(
 class Series:
     """Wrench of 1 A in a level coil, about its centre of force: exact where the field is.
 
-    Component c is the sum of G[c] e^(-K z) sin or cos(m k x) sin or cos(n k y), see ODD_X and ODD_Y.
+    Component c is `scale` times the sum of G[c] e^(-K z) sin or cos(m k x) sin or cos(n k y), see ODD_X and ODD_Y.
     """
 
     m: FloatArray
     n: FloatArray
     k: float  # rad/m
     K: FloatArray  # 1/m
-    G: FloatArray  # 6 x harmonics, N/A and N m/A at z = 0
+    G: FloatArray  # 6 x harmonics at z = 0; times scale, N/A and N m/A
+    scale: Any = 1.0  # a CasADi symbol where turns or remanence are
 
     def __call__(self, x: Any, y: Any, z: Any) -> Any:
-        """F_x F_y F_z T_x T_y T_z: CasADi's 6-vector, or (..., 6) of numpy arrays x, y, z of one shape."""
+        """F_x F_y F_z T_x T_y T_z: CasADi's 6-vector, or (..., 6) of numpy arrays x, y, z of one shape.
+
+        In CasADi z may be a tuple of heights that add up: coils in a row share the decay over those they share.
+        """
         if isinstance(x, np.ndarray):
-            decay = np.exp(-np.multiply.outer(z, self.K))
+            decay = self.scale * np.exp(-np.multiply.outer(z, self.K))
             X, Y = np.multiply.outer(x, self.k * self.m), np.multiply.outer(y, self.k * self.n)
             X_, Y_ = (np.cos(X) * decay, np.sin(X) * decay), (np.cos(Y), np.sin(Y))
             return np.stack(
                 [(X_[i] * Y_[j]) @ g for g, i, j in zip(self.G, ODD_X, ODD_Y, strict=True)], axis=-1
             )
         X, Y = (_multiples(self.k * v, int(max(*self.m, *self.n))) for v in (x, y))
+        heights = z if isinstance(z, tuple) else (z,)
+        decays = {K: math.prod(ca.exp(-K * height) for height in heights) for K in self.K.tolist()}
         parts: list[Any] = [0] * 6
-        for m, n, K, G in zip(self.m.astype(int), self.n.astype(int), self.K, self.G.T, strict=True):
-            decay = ca.exp(-K * z)
-            products = {(i, j): decay * (X[m][i] * Y[n][j]) for i, j in zip(ODD_X, ODD_Y, strict=True)}
-            for c, g in enumerate(G):
-                if g:
-                    parts[c] += g * products[ODD_X[c], ODD_Y[c]]
-        return ca.vertcat(*parts)
+        for m in range(int(self.m.max()) + 1):  # sums over n first: they are the same for all coils of one y
+            sums: list[Any] = [0] * 6
+            for h in np.flatnonzero(self.m == m):
+                waves = [decays[self.K[h]] * wave for wave in Y[int(self.n[h])]]
+                for c in np.flatnonzero(self.G[:, h]):
+                    sums[c] += self.G[c, h] * waves[ODD_Y[c]]
+            parts = [part + X[m][odd] * sum_n for part, odd, sum_n in zip(parts, ODD_X, sums, strict=True)]
+        return self.scale * ca.vertcat(*parts)
 
     def above(self, force: float, z: float) -> Series:
-        """Without the harmonics whose forces stay below `force` (N/A) at the height z."""
-        kept = np.abs(self.G[:3] * np.exp(-self.K * z)).max(axis=0) >= force
-        return Series(self.m[kept], self.n[kept], self.k, self.K[kept], readonly(self.G[:, kept]))
+        """Without the harmonics whose forces stay below `force` (N/A) at the height z, and without such torques.
+
+        A harmonic's three forces stay or go together, as without curl and divergence. Each of its torques counts as a
+        force at three pole pitches, a coil's size: the arms of the coils' forces are as long.
+        """
+        size = np.abs(self.scale * self.G * np.exp(-self.K * z))
+        kept = size[:3].max(axis=0) >= force
+        G = np.where(np.vstack([[kept] * 3, size[3:] >= force * 3 * math.pi / self.k]), self.G, 0.0)[:, kept]
+        return Series(self.m[kept], self.n[kept], self.k, self.K[kept], readonly(G), self.scale)
 
 
 def _multiples(angle: Any, order: int) -> list[tuple[Any, Any]]:
-    """(cos, sin) of 0, 1, ..., order times an angle, by addition theorems: two calls of libm."""
+    """(cos, sin) of 0, 1, ..., order times an angle, by Chebyshev's recurrence: two calls of libm."""
     c, s = ca.cos(angle), ca.sin(angle)
     found: list[tuple[Any, Any]] = [(1, 0), (c, s)]
     for _ in range(order - 1):
-        c_j, s_j = found[-1]
-        found.append((c * c_j - s * s_j, s * c_j + c * s_j))
+        (c_i, s_i), (c_j, s_j) = found[-2:]
+        found.append((2 * c * c_j - c_i, 2 * c * s_j - s_i))
     return found
 
 
-def series(par: Parameters, field: Modes, coil: Winding) -> Series:
+@lru_cache(maxsize=8)
+def unit_series(shape: Shape, order: int) -> Series:
+    """The whole field's harmonics up to `order`, for one turn and one tesla."""
+    return series(shape, modes(shape, order), winding(shape))
+
+
+def series(par: Parameters | Shape, field: Modes, coil: Winding) -> Series:
     """(12), (13) harmonic by harmonic: plan by quadrature, height in closed form, position by addition theorems.
 
     The terms that a coil of four-fold symmetry does not have are left out.
