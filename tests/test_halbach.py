@@ -22,10 +22,8 @@ from malta.data import published_value
 from malta.engine import compiler
 from malta.plants import halbach
 from malta.plants.halbach import (
-    IDEAL,
-    REAL,
-    Electronics,
     Faults,
+    Hardware,
     Lqg,
     Parameters,
     Pid,
@@ -40,6 +38,8 @@ if TYPE_CHECKING:
     from malta.plant import FloatArray
 
 F_Z = 5.0  # N, of all figures of the paper's Section 5
+REAL = halbach.HARDWARE
+IDEAL = Hardware("exact", adc_steps=False, adc_noise=False, laser_steps=False, laser_noise=False)
 PLAIN, FINE = replace(IDEAL, pwm="plain"), replace(IDEAL, pwm="fine")
 CURRENT = st.floats(-5, 5)
 PLACE = st.floats(-50e-3, 50e-3)
@@ -685,9 +685,9 @@ def test_bad_input_is_refused_in_one_sentence(par: Parameters, pid: Pid) -> None
     refused: list[tuple[Any, str]] = [
         (lambda: replace(par, A=math.nan), "halbach.Parameters: A: found nan"),
         (lambda: replace(par, m=-1.0), "m: found -1.0 kg, expected a finite number above 0"),
-        (lambda: Electronics(pwm="coarse"), "pwm: found 'coarse', expected one of exact, plain, fine"),  # type: ignore[arg-type]
-        (lambda: Electronics(mean_of=0), "mean_of: found 0, expected 1 to 4096 samples"),
-        (lambda: Electronics(latency=2), "latency: found 2, expected 0 or 1 samples of the laser"),
+        (lambda: Hardware(pwm="coarse"), "pwm: found 'coarse', expected one of exact, plain, fine"),  # type: ignore[arg-type]
+        (lambda: Hardware(mean_of=0), "mean_of: found 0, expected 1 to 4096 samples"),
+        (lambda: Hardware(latency=2), "latency: found 2, expected 0 or 1 samples of the laser"),
         (
             lambda: Faults(winding=(1.0, 0.0, 1.0)),
             "winding: found (1.0, 0.0, 1.0), expected finite numbers above 0",

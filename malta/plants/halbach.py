@@ -2,9 +2,9 @@
 
 Source: L. C. Díaz-Pérez et al., Actuators 7(4), 2018; equation and figure numbers are its own.
 
-    reference, F_z --> [ position law ] --> Id*, Iq* --> [ current loops ] --> duty cycles --> [ motor ] --> x
-                             ^  every 55 ms                    ^  every 68 us                     |
-                             +--- laser, Park angle            +--- two phase currents -----------+
+    reference --> [ position law ] --> F_x --> [ commutation ] --> currents --> [ current loops ] --> [ motor ] --> x
+                        ^  every 55 ms              ^  F_z, y, held                  ^  every 68 us      |
+                        +--- laser -----------------+                                +--- two of three --+
 
 SCALING. The transform is the paper's (6), P(x), with its inverse (9): they carry the factor 3/2 in one direction, so Id
 and Iq are 1.5 x the amplitude of the phase currents, and F = A (Id, Iq) without a factor. Voltages are transformed
@@ -18,8 +18,9 @@ that a position controller is designed on has that spring in it.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from functools import lru_cache
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import lru_cache, partial
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
 import casadi as ca
@@ -29,7 +30,7 @@ from scipy import linalg, optimize
 from malta.data import check_parameters, si
 from malta.engine import evaluate
 from malta.errors import CheckError, InputError
-from malta.plant import readonly
+from malta.plant import Actuator, Electronics, Plant, Signal, readonly
 from malta.riccati import dare, eigenvalues, sample, sample_noise
 
 if TYPE_CHECKING:
@@ -51,22 +52,36 @@ class Parameters:
     R: float = si("ohm", above=0)  # phase winding
     L: float = si("H", above=0)
     V_dc: float = si("V", above=0)
-    f_pwm: float = si("Hz", above=0)
+    f_pwm: float = si("Hz", above=0, shapes=True)
     counts: float = si("1", above=0)  # steps of a duty cycle
     dV_fine: float = si("V", above=0)  # step of the high-resolution PWM
     I_adc: float = si("A", above=0)  # full scale, either way
     codes: float = si("1", above=0)  # the largest
     s_adc: float = si("A", at_least=0)  # noise of a current sample, rms
-    T_laser: float = si("s", above=0)  # time between readings
+    T_laser: float = si("s", above=0, shapes=True)  # time between readings
     dx: float = si("m", above=0)  # resolution of the laser
     n_laser: float = si("m", at_least=0)  # its noise is uniform within +- this
+    latency: float = si("1", at_least=0, shapes=True)  # readings that the controller is late: 0 or 1
+    F_z: float = si("N", at_least=0)  # vertical force, commanded open loop
     F_max: float = si("N", above=0)  # limit of the horizontal force
-    travel: float = si("m", above=0)  # from end to end
+    travel: float = si("m", above=0)  # from end to end; either end may be where moves begin, x = 0
     pm_cc: float = si("rad", above=0)  # phase margin of the current loops
+    r_a: float = si("1", above=0)  # resistance of each phase in R, which is what the current loops know
+    r_b: float = si("1", above=0)
+    r_c: float = si("1", above=0)
+    a_a: float = si("1", above=0)  # motor constant of each phase in A, which is what commutation knows
+    a_b: float = si("1", above=0)
+    a_c: float = si("1", above=0)
     preset: str = "custom"
 
     def __post_init__(self) -> None:
         check_parameters(self, "halbach.Parameters")
+        if self.latency not in (0, 1):
+            found = f"{self.latency:g}"
+            raise InputError("halbach.Parameters", "latency", found, "0 or 1 readings of the laser")
+        if not self.pm_cc < math.pi / 2:
+            found = f"{math.degrees(self.pm_cc):.0f} deg"
+            raise InputError("halbach.Parameters", "pm_cc", found, "less than 90 deg, as the loop integrates")
 
 
 # The motor
@@ -89,11 +104,16 @@ def _park(c: Any, s: Any) -> Any:
 
 def forces(par: Parameters, x: Any, i: Any) -> Any:
     """(F_x, F_z) of three phase currents at the position x: the motor law (1)."""
-    return par.A * park(x, par.k) @ i
+    return par.A * _linked(par, x) @ i
+
+
+def _linked(par: Parameters, x: Any) -> Any:
+    """2 x 3: `park`, each phase with its share of the motor constant."""
+    return park(x, par.k) @ ca.diag(ca.vertcat(par.a_a, par.a_b, par.a_c))
 
 
 def phase_currents(par: Parameters, x: Any, F_x: Any, F_z: Any) -> Any:
-    """The three currents of smallest loss that make these forces at the position x."""
+    """The three currents of smallest loss that make these forces at the position x of a sound motor."""
     return unpark(x, par.k) @ ca.vertcat(F_x, F_z) / par.A
 
 
@@ -102,45 +122,33 @@ def duty_cycles(par: Parameters, V: Any) -> Any:
     return 0.5 + V / par.V_dc
 
 
-@dataclass(frozen=True)
-class Faults:
-    """What may be wrong with a motor that its controller takes for a sound one."""
-
-    winding: tuple[float, float, float] = (1.0, 1.0, 1.0)  # resistance of each phase, times R
-    magnet: tuple[float, float, float] = (1.0, 1.0, 1.0)  # motor constant of each phase, times A
-    angle: float = 0.0  # error of the controller's Park angle, rad
-    force: float = 0.0  # external horizontal force, N
-
-    def __post_init__(self) -> None:
-        for name, low in (("winding", 0), ("magnet", 0), ("angle", -math.inf), ("force", -math.inf)):
-            values = np.atleast_1d(np.asarray(getattr(self, name), dtype=float))
-            if not (np.isfinite(values).all() and (values > low).all()):
-                expected = "finite numbers above 0" if low == 0 else "a finite number"
-                raise InputError("halbach.Faults", name, repr(getattr(self, name)), expected)
+def motion(par: Parameters, x: Any, F_x: Any, w: Any) -> Any:
+    """Rates of (x, x') under a horizontal force and one from outside: m x'' = F_x - b x' + w."""
+    return ca.vertcat(x[1], (F_x - par.b * x[1] + w) / par.m)
 
 
-SOUND = Faults()
-
-
-def rates(par: Parameters, state: Any, V: Any, faults: Faults = SOUND) -> Any:
+def rates(par: Parameters, state: Any, V: Any, w: Any = 0) -> Any:
     """Rates of (x, x', i_a, i_b, i_c) under these voltages of the half-bridges; the star point floats."""
-    x, v, i = state[0], state[1], state[2:5]
-    P = park(x, par.k) @ ca.diag(ca.DM(list(faults.magnet)))
-    F_x = par.A * (P[0, :] @ i)
-    drop = V - par.R * ca.DM(list(faults.winding)) * i - par.K_e * v * P[0, :].T
-    return ca.vertcat(v, (F_x - par.b * v + faults.force) / par.m, (drop - ca.sum1(drop) / 3) / par.L)
+    x, i = state[0:2], state[2:5]
+    drop = V - _resistive(par, i) - par.K_e * x[1] * _linked(par, x[0])[0, :].T
+    return ca.vertcat(motion(par, x, forces(par, x[0], i)[0], w), (drop - ca.sum1(drop) / 3) / par.L)
 
 
-def moved(par: Parameters, state: Any, V: Any, faults: Faults = SOUND) -> Any:
+def _resistive(par: Parameters, i: Any) -> Any:
+    """Voltages of the windings' resistance."""
+    return par.R * ca.vertcat(par.r_a, par.r_b, par.r_c) * i
+
+
+def moved(par: Parameters, state: Any, V: Any, w: Any = 0) -> Any:
     """The motor one PWM period later, its half-bridges at these mean voltages: one Runge–Kutta step.
 
     Ripple within the period is left out, as in the paper. With L / R = 15 periods the step errs by 1e-8.
     """
     h = 1 / par.f_pwm
-    k1 = rates(par, state, V, faults)
-    k2 = rates(par, state + h / 2 * k1, V, faults)
-    k3 = rates(par, state + h / 2 * k2, V, faults)
-    k4 = rates(par, state + h * k3, V, faults)
+    k1 = rates(par, state, V, w)
+    k2 = rates(par, state + h / 2 * k1, V, w)
+    k3 = rates(par, state + h / 2 * k2, V, w)
+    k4 = rates(par, state + h * k3, V, w)
     return state + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
 
 
@@ -165,101 +173,46 @@ def servo(par: Parameters, F_z: float, displacement: float = 0.0) -> tuple[Float
     return A, np.array([[0], [K / par.m]])
 
 
-# What the position controllers are designed on
+# Electronics
+
+Pwm = Literal["exact", "plain", "fine"]
+MEAN_OF = 32  # samples in the rolling mean of a current, Sec. 4.2
 
 
-class Sampled(NamedTuple):
-    """The motor between readings: xi+ = A xi + B F_x + H n, y = C xi + n; xi = (x, x') and, with latency, the last x.
+@dataclass(frozen=True)
+class Options:
+    """What the electronics are; each source of error can be switched off."""
 
-    An error n of a reading is one of the Park angle, too: the spring hangs from where the laser says.
-    """
+    pwm: Pwm = "plain"  # duty cycles: exact, or in steps of the counter, or of the high-resolution PWM
+    adc_steps: bool = True
+    adc_noise: bool = True
+    mean_of: int = MEAN_OF  # samples in the rolling mean of a current
+    current_loops: bool = True  # vector control; without them voltages are R times the wanted currents
 
-    A: FloatArray
-    B: FloatArray
-    C: FloatArray
-    H: FloatArray
-    W: FloatArray  # covariance that a white force of 1 N2/Hz leaves in xi after one sample
-    T: float  # s
-    latency: int
-
-    def ramp(self) -> tuple[FloatArray, float]:
-        """The state, less the position, and the force (N) that go with a steady 1 m/s.
-
-        Within a sample the held spring pulls back, so the velocity at the readings is above the mean.
-        """
-        n = len(self.A)
-        shift = self.T * np.array([1.0, 0.0, 1.0][:n])
-        M = np.hstack([(self.A - np.eye(n))[:, 1:2], self.B])
-        offset = np.array([0.0, 0.0, -self.T][:n])
-        solution = np.linalg.lstsq(M, shift - (self.A - np.eye(n)) @ offset, rcond=None)[0]
-        return offset + np.array([0.0, solution[0], 0.0][:n]), float(solution[1])
-
-
-def held(par: Parameters, F_z: float, latency: int = 0, *, spring: bool = True) -> Sampled:
-    """The motor with the Park angle held at the last reading, which is `latency` samples old; force held as well.
-
-    Current loops keep the phase currents, so damping is b alone. spring=False is what one would write down without
-    the held angle, a mass with friction: its sampled pole is 0.871 where the motor at 5 N has 0.51.
-    """
-    K = stiffness(par, F_z) if spring else 0.0
-    A = np.array([[0, 1], [-K / par.m, -par.b / par.m]])
-    B = np.array([[0], [1 / par.m]])
-    E, G = sample(A, B, par.T_laser)
-    W = sample_noise(A, B @ B.T, par.T_laser)
-    pull = np.array([[1 - E[0, 0]], [-E[1, 0]]])  # of the point that the spring hangs from
-    if _latency(latency) == 0:  # it starts from rest at each reading
-        E[:, :1] += pull
-        return Sampled(E, G, np.array([[1.0, 0.0]]), pull, W, par.T_laser, 0)
-    A = np.block([[E, pull], [np.array([[1.0, 0.0, 0.0]])]])
-    B, H, C = np.vstack([G, [[0.0]]]), np.vstack([pull, [[0.0]]]), np.array([[0.0, 0.0, 1.0]])
-    return Sampled(A, B, C, H, linalg.block_diag(W, np.zeros((1, 1))), par.T_laser, 1)
+    def __post_init__(self) -> None:
+        if self.pwm not in get_args(Pwm):
+            raise InputError("halbach.Options", "pwm", repr(self.pwm), _one_of(Pwm))
+        if isinstance(self.mean_of, bool) or self.mean_of not in range(1, 4097):
+            raise InputError("halbach.Options", "mean_of", repr(self.mean_of), "1 to 4096 samples")
+        for name in ("adc_steps", "adc_noise", "current_loops"):
+            if not isinstance(getattr(self, name), bool):
+                raise InputError("halbach.Options", name, repr(getattr(self, name)), "True or False")
 
 
 def _one_of(choices: Any) -> str:
     return "one of " + ", ".join(get_args(choices))
 
 
-def _latency(latency: int) -> int:
-    if latency not in (0, 1):
-        raise InputError("halbach", "latency", repr(latency), "0 or 1 samples of the laser")
-    return latency
+REAL = Options()
+IDEAL = Options("exact", adc_steps=False, adc_noise=False)
 
 
-# Electronics
-
-Pwm = Literal["exact", "plain", "fine"]
-
-
-@dataclass(frozen=True)
-class Electronics:
-    """What stands between controller and motor; each source of error can be switched off."""
-
-    pwm: Pwm = "plain"  # duty cycles: exact, or in steps of the counter, or of the high-resolution PWM
-    adc_steps: bool = True
-    adc_noise: bool = True
-    mean_of: int = 32  # samples in the rolling mean of a current
-    laser_steps: bool = True
-    laser_noise: bool = True
-    latency: int = 0  # readings that the controller is late
-
-    def __post_init__(self) -> None:
-        if self.pwm not in get_args(Pwm):
-            raise InputError("halbach.Electronics", "pwm", repr(self.pwm), _one_of(Pwm))
-        if not (isinstance(self.mean_of, int) and 1 <= self.mean_of <= 4096):
-            raise InputError("halbach.Electronics", "mean_of", repr(self.mean_of), "1 to 4096 samples")
-        _latency(self.latency)
-
-
-REAL = Electronics()
-IDEAL = Electronics("exact", adc_steps=False, adc_noise=False, laser_steps=False, laser_noise=False)
-
-
-def pwm_step(par: Parameters, pwm: Pwm) -> float:
+def pwm_step(par: Parameters, pwm: Pwm) -> Any:
     """Smallest change of a phase voltage, V; 0 where duty cycles are exact."""
     return {"exact": 0.0, "plain": par.V_dc / par.counts, "fine": par.dV_fine}[pwm]
 
 
-def adc_step(par: Parameters) -> float:
+def adc_step(par: Parameters) -> Any:
     """A code of the current sensors, A."""
     return 2 * par.I_adc / par.codes
 
@@ -269,8 +222,10 @@ def modulated(par: Parameters, V: Any, pwm: Pwm) -> tuple[Any, Any]:
     wanted = duty_cycles(par, V)
     d = ca.fmin(ca.fmax(wanted, 0), 1)
     limited = ca.mmax(ca.fabs(d - wanted)) > 0
+    if pwm == "exact":
+        return d, limited
     step = pwm_step(par, pwm) / par.V_dc
-    return (ca.fmin(_round(d / step) * step, 1) if step else d), limited
+    return ca.fmin(_round(d / step) * step, 1), limited
 
 
 def sampled_current(par: Parameters, i: Any, *, steps: bool) -> tuple[Any, Any]:
@@ -324,6 +279,7 @@ class CurrentLoop(NamedTuple):
 
     Kp: float  # V/A
     Ki: float  # V/(A s)
+    crossover: float  # rad/s
 
 
 def current_delay(par: Parameters, mean_of: int) -> float:
@@ -338,10 +294,248 @@ def current_loop(par: Parameters, mean_of: int) -> CurrentLoop:
     than the motor on its spring.
     """
     w = (math.pi / 2 - par.pm_cc) / current_delay(par, mean_of)
-    if not w > 0:
-        found = f"{math.degrees(par.pm_cc):.0f} deg"
-        raise InputError("halbach.Parameters", "pm_cc", found, "less than 90 deg, as the loop integrates")
-    return CurrentLoop(w * par.L, w * par.R)
+    return CurrentLoop(w * par.L, w * par.R, w)
+
+
+def force_noise(par: Parameters, x: float | None = None) -> float:
+    """Intensity of the horizontal force that noise of the current sensors makes inside the current loops, N2/Hz.
+
+    Two samples of equal noise make Id, as the third current is computed: its variance is 1.5 to 4.5 times theirs as the
+    Park angle goes, 3 times on average (x=None).
+    """
+    share = 3.0
+    if x is not None:
+        d = np.array(park(x, par.k))[0]
+        share = float((d[0] - d[2]) ** 2 + (d[1] - d[2]) ** 2)
+    return share * (par.A * par.s_adc) ** 2 / par.f_pwm
+
+
+# The machine in the pipeline
+
+POSITION = Signal("x", "m")
+FORCE = Signal("F_x", "N")
+COILS = tuple(Signal(f"i_{phase}", "A") for phase in "abc")
+
+
+def plant(par: Parameters) -> Plant:
+    """The motor along its travel: F_x is the input, F_z a parameter that commutation makes along with it."""
+    return Plant(
+        name="halbach",
+        parameters=par,
+        states=(POSITION, Signal("x_dot", "m/s")),
+        inputs=(FORCE,),
+        outputs=(POSITION,),
+        disturbances=(FORCE,),
+        uncontrolled=(),
+        f=lambda x, u, w: motion(par, x, u[0], w[0]),
+        h=lambda x, _: x[0],
+        load=lambda _: ca.DM.zeros(1),
+        position_of=lambda p: p,
+        preload=lambda _: ca.DM.zeros(1),
+        currents=lambda y, v: phase_currents(par, y[0], v[0], par.F_z),
+        forces=lambda x, i: forces(par, x[0], i)[0],
+        limited=lambda i: i * (par.I_adc / ca.fmax(par.I_adc, ca.mmax(ca.fabs(i)))),  # their sum stays zero
+        tabulated=False,
+        actuator=Actuator(
+            coils=COILS,
+            force_limit=(par.F_max,),
+            force_constant=(par.A,),
+            current_limit=par.I_adc,
+            voltage_limit=par.V_dc / 2,
+            R=par.R,
+            L=par.L,
+            crossover=current_loop(par, MEAN_OF).crossover,
+            phase_margin=par.pm_cc,
+            sample_time=1 / par.f_pwm,
+            dead_time=(par.latency + 0.5) * par.T_laser,
+        ),
+        drive=None,
+        electronics=partial(electronics, par),
+        contacts=("left the travel",),
+        contact=lambda x: ca.fabs(x[0]) / par.travel,
+        cushioned=(False,),
+        bearing=lambda _: ca.DM.zeros(1),
+        sense=lambda x, errors: x[0] + errors[0],
+        sensor_errors=(Signal("offset_x", "m"),),  # of the Park angle: k times this
+        noise=(par.n_laser / math.sqrt(3),),
+        uniform=True,
+        resolution=(par.dx,),
+        inertia=(par.m,),
+        mass=par.m,
+        thrust="F_x",
+        stroke="x",
+        travel=par.travel,
+        variant=plant,
+    )
+
+
+FLAGS = ("duty limit", "current range")
+
+
+def electronics(par: Parameters, options: Options | None = None) -> Electronics:
+    """Current loops on Id and Iq, their sensors and the half-bridges, as they run in every PWM period.
+
+        i*, y --> [ held ] --> Id*, Iq*, cos, sin --> [ move: loops, modulator, windings, motor ] --> x, i
+                               until the next reading     ^ two phase currents, rolling means ----------|
+
+    Duty cycles that a period computes act in the next one. The loops know R, L and k, not the share that a phase has.
+    Options of None are those of the paper, REAL.
+    """
+    o = REAL if options is None else options
+    gains, n = current_loop(par, o.mean_of), o.mean_of
+    sizes = {"duty": 3, "met": len(FLAGS)}
+    if o.current_loops:
+        sizes |= {"u": 2, "sums": 2, "ring_a": n, "ring_b": n}
+
+    def held(i: Any, y: Any) -> Any:
+        c, s = ca.cos(par.k * y[0]), ca.sin(par.k * y[0])
+        return ca.vertcat(_park(c, s) @ i, c, s)
+
+    def start(x: Any, i: Any) -> dict[str, Any]:
+        P = park(x[0], par.k)
+        drop = _resistive(par, i) if o.current_loops else par.R * i  # loops have found what each phase needs
+        u = P @ drop
+        codes = sampled_current(par, i[0:2], steps=o.adc_steps)[0]
+        state = {
+            "duty": modulated(par, 2 / 3 * P.T @ u, o.pwm)[0],
+            "met": ca.DM.zeros(len(FLAGS)),
+            "u": u,
+            "sums": n * codes,
+            "ring_a": ca.repmat(codes[0], n, 1),
+            "ring_b": ca.repmat(codes[1], n, 1),
+        }
+        return {name: state[name] for name in sizes}
+
+    def move(
+        x: Any, i: Any, state: Mapping[str, Any], told: Any, w: Any, noise: Any
+    ) -> tuple[Any, Any, dict[str, Any]]:
+        P, after, far = _park(told[2], told[3]), dict(state), 0
+        if o.current_loops:
+            read = i[0:2] + (par.s_adc * noise if o.adc_noise else 0)
+            codes, out = sampled_current(par, read, steps=o.adc_steps)
+            far = ca.mmax(out)
+            oldest = ca.vertcat(state["ring_a"][0], state["ring_b"][0])
+            after |= {
+                "sums": state["sums"] + codes - oldest,
+                "ring_a": ca.vertcat(*ca.vertsplit(state["ring_a"])[1:], codes[0]),
+                "ring_b": ca.vertcat(*ca.vertsplit(state["ring_b"])[1:], codes[1]),
+            }
+            mean = after["sums"] / n * adc_step(par) - par.I_adc
+            e = told[0:2] - P @ ca.vertcat(mean, -ca.sum1(mean))  # (8): the third current is computed
+            duty, limited = modulated(par, 2 / 3 * P.T @ (state["u"] + gains.Kp * e), o.pwm)
+            after["u"] = state["u"] + ca.if_else(limited, 0, gains.Ki / par.f_pwm) * e
+        else:
+            duty, limited = modulated(par, 2 / 3 * P.T @ (par.R * told[0:2]), o.pwm)
+        after |= {"duty": duty, "met": ca.fmax(state["met"], ca.vertcat(limited, far))}
+        z = moved(par, ca.vertcat(x, i), par.V_dc * (state["duty"] - 0.5), w[0])
+        return z[0:2], z[2:5], after
+
+    return Electronics(
+        period=1 / par.f_pwm,
+        state=sizes,
+        noises=2 if o.current_loops and o.adc_noise else 0,
+        flags=FLAGS,
+        held_size=4,
+        held=held,
+        start=start,
+        move=move,
+        met=lambda state: state["met"],
+        duty=lambda state: state["duty"],
+    )
+
+
+# The motor with controllers and a simulation of its own, which needs nothing of the pipeline: the same by another route
+
+# What the position controllers are designed on
+
+
+class Sampled(NamedTuple):
+    """The motor between readings: xi+ = A xi + B F_x + H n, y = C xi + n; xi = (x, x') and, with latency, the last x.
+
+    An error n of a reading is one of the Park angle, too: the spring hangs from where the laser says.
+    """
+
+    A: FloatArray
+    B: FloatArray
+    C: FloatArray
+    H: FloatArray
+    W: FloatArray  # covariance that a white force of 1 N2/Hz leaves in xi after one sample
+    T: float  # s
+    latency: int
+
+    def ramp(self) -> tuple[FloatArray, float]:
+        """The state, less the position, and the force (N) that go with a steady 1 m/s.
+
+        Within a sample the held spring pulls back, so the velocity at the readings is above the mean.
+        """
+        n = len(self.A)
+        shift = self.T * np.array([1.0, 0.0, 1.0][:n])
+        M = np.hstack([(self.A - np.eye(n))[:, 1:2], self.B])
+        offset = np.array([0.0, 0.0, -self.T][:n])
+        solution = np.linalg.lstsq(M, shift - (self.A - np.eye(n)) @ offset, rcond=None)[0]
+        return offset + np.array([0.0, solution[0], 0.0][:n]), float(solution[1])
+
+
+def held(par: Parameters, F_z: float, latency: int = 0, *, spring: bool = True) -> Sampled:
+    """The motor with the Park angle held at the last reading, which is `latency` samples old; force held as well.
+
+    Current loops keep the phase currents, so damping is b alone. spring=False is what one would write down without
+    the held angle, a mass with friction: its sampled pole is 0.871 where the motor at 5 N has 0.51.
+    """
+    K = stiffness(par, F_z) if spring else 0.0
+    A = np.array([[0, 1], [-K / par.m, -par.b / par.m]])
+    B = np.array([[0], [1 / par.m]])
+    E, G = sample(A, B, par.T_laser)
+    W = sample_noise(A, B @ B.T, par.T_laser)
+    pull = np.array([[1 - E[0, 0]], [-E[1, 0]]])  # of the point that the spring hangs from
+    if _latency(latency) == 0:  # it starts from rest at each reading
+        E[:, :1] += pull
+        return Sampled(E, G, np.array([[1.0, 0.0]]), pull, W, par.T_laser, 0)
+    A = np.block([[E, pull], [np.array([[1.0, 0.0, 0.0]])]])
+    B, H, C = np.vstack([G, [[0.0]]]), np.vstack([pull, [[0.0]]]), np.array([[0.0, 0.0, 1.0]])
+    return Sampled(A, B, C, H, linalg.block_diag(W, np.zeros((1, 1))), par.T_laser, 1)
+
+
+def _latency(latency: int) -> int:
+    if latency not in (0, 1):
+        raise InputError("halbach", "latency", repr(latency), "0 or 1 samples of the laser")
+    return latency
+
+
+@dataclass(frozen=True)
+class Hardware(Options):
+    """The electronics, and what the laser is."""
+
+    laser_steps: bool = True
+    laser_noise: bool = True
+    latency: int = 0  # readings that the controller is late
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _latency(self.latency)
+
+
+HARDWARE = Hardware()
+
+
+@dataclass(frozen=True)
+class Faults:
+    """What may be wrong with a motor that its controller takes for a sound one."""
+
+    winding: tuple[float, float, float] = (1.0, 1.0, 1.0)  # resistance of each phase, times R
+    magnet: tuple[float, float, float] = (1.0, 1.0, 1.0)  # motor constant of each phase, times A
+    angle: float = 0.0  # error of the controller's Park angle, rad
+    force: float = 0.0  # external horizontal force, N
+
+    def __post_init__(self) -> None:
+        for name, low in (("winding", 0), ("magnet", 0), ("angle", -math.inf), ("force", -math.inf)):
+            values = np.atleast_1d(np.asarray(getattr(self, name), dtype=float))
+            if not (np.isfinite(values).all() and (values > low).all()):
+                expected = "finite numbers above 0" if low == 0 else "a finite number"
+                raise InputError("halbach.Faults", name, repr(getattr(self, name)), expected)
+
+
+SOUND = Faults()
 
 
 # Position controllers, one step every reading
@@ -470,19 +664,6 @@ def lqg(
     return Lqg(A, B, C, np.hstack([K, [[1.0]]]), L, np.append(ramp, 0.0), feedforward, par.F_max)
 
 
-def force_noise(par: Parameters, x: float | None = None) -> float:
-    """Intensity of the horizontal force that noise of the current sensors makes inside the current loops, N2/Hz.
-
-    Two samples of equal noise make Id, as the third current is computed: its variance is 1.5 to 4.5 times theirs as the
-    Park angle goes, 3 times on average (x=None).
-    """
-    share = 3.0
-    if x is not None:
-        d = np.array(park(x, par.k))[0]
-        share = float((d[0] - d[2]) ** 2 + (d[1] - d[2]) ** 2)
-    return share * (par.A * par.s_adc) ** 2 / par.f_pwm
-
-
 def closed_loop(model: Sampled, controller: Pid | Lqg) -> ComplexArray:
     """Poles of the sampled loop."""
     return eigenvalues(_closed(model, controller)[0])
@@ -566,7 +747,7 @@ def loop(
     par: Parameters,
     mode: Mode,
     controller: Pid | Lqg | None,
-    electronics: Electronics,
+    electronics: Hardware,
     faults: Faults = SOUND,
 ) -> Loop:
     """What happens at a reading and in a PWM period.
@@ -576,6 +757,10 @@ def loop(
            vector    the same currents through current loops on Id and Iq
     Duty cycles that a period computes act in the next one. The Park angle is the last reading's.
     """
+    shares: dict[str, Any] = dict(
+        zip(("r_a", "r_b", "r_c", "a_a", "a_b", "a_c"), (*faults.winding, *faults.magnet), strict=True)
+    )
+    par = replace(par, **shares)
     n = electronics.mean_of if mode == "vector" else 1
     sizes = {"motor": 5, "u": 2, "duty": 3, "ring_a": n, "ring_b": n, "sums": 2, "cos_sin": 2, "wanted": 2}
     sizes |= {"last": 1, "law": len(_law_start(controller, 0.0))}
@@ -601,7 +786,7 @@ def loop(
     )
 
     noise = ca.SX.sym("noise", 2)
-    after, row = _period(par, mode, electronics, faults, s, noise)
+    after, row = _period(par, mode, electronics, faults.force, s, noise)
     period = ca.Function(
         "period", [state, noise], ca.cse([ca.densify(ca.vertcat(*after.values())), ca.densify(row)])
     )
@@ -609,7 +794,7 @@ def loop(
 
 
 def _period(
-    par: Parameters, mode: Mode, electronics: Electronics, faults: Faults, s: dict[str, Any], noise: Any
+    par: Parameters, mode: Mode, electronics: Hardware, w: float, s: dict[str, Any], noise: Any
 ) -> tuple[dict[str, Any], Any]:
     motor, after = s["motor"], dict(s)
     P = _park(s["cos_sin"][0], s["cos_sin"][1])
@@ -632,8 +817,8 @@ def _period(
     else:
         duty, limited = modulated(par, 2 / 3 * P.T @ (par.R * s["wanted"]), electronics.pwm)
     after["duty"] = duty
-    after["motor"] = moved(par, motor, par.V_dc * (s["duty"] - 0.5), faults)
-    F = par.A * park(motor[0], par.k) @ (ca.DM(list(faults.magnet)) * motor[2:5])
+    after["motor"] = moved(par, motor, par.V_dc * (s["duty"] - 0.5), w)
+    F = forces(par, motor[0], motor[2:5])
     return after, ca.vertcat(motor[:2], F, motor[2:5], s["duty"], limited, far)
 
 
@@ -702,7 +887,7 @@ def simulate(
     F_z: float,
     mode: Mode = "vector",
     controller: Pid | Lqg | None = None,
-    electronics: Electronics = REAL,
+    electronics: Hardware = HARDWARE,
     faults: Faults = SOUND,
     x0: float = 0.0,
     seed: int = 0,
@@ -782,7 +967,7 @@ def _chain(period: ca.Function, length: int) -> ca.Function:
 
 
 def start(
-    par: Parameters, mode: Mode, controller: Pid | Lqg | None, electronics: Electronics, F_z: float, x0: float
+    par: Parameters, mode: Mode, controller: Pid | Lqg | None, electronics: Hardware, F_z: float, x0: float
 ) -> FloatArray:
     """The state at rest at x0, currents flowing, the rolling means full of them."""
     i = np.array(phase_currents(par, x0, 0, F_z)).ravel()
