@@ -2,6 +2,8 @@
 
     LQR -> LQI -> LQG -> LQGI -> with current loops -> sampled: the gain file's own gains, with hold and delay
 
+A PID has the last one alone; without weights on integrals the second and the fourth are left out.
+
 The first five are continuous, synthesized from the cost and the noise that the file names. Each has its parametric
 margin (robust.py) and its peak sensitivity: at the forces for state feedback, where the LQR promises at most 1, at the
 sensors for output feedback, as ISO 14839-3 measures it.
@@ -24,14 +26,13 @@ from malta.plant import Plant
 from malta.robust import Margin, robust_margin
 from malta.spec import Weights
 from malta.synthesize import kalman, lqi, lqr
-from malta.uncertain import Compensator, UncertainSystem, instability, responses, uncertain
-from malta.verify import CurrentLoops, largest, machine_law, travel_margin
+from malta.uncertain import Compensator, UncertainSystem, holds, instability, responses, uncertain
+from malta.verify import PLACES, CurrentLoops, largest, machine_law, travel_margin
 
 if TYPE_CHECKING:
     from malta.plant import ComplexArray, FloatArray
 
 SAMPLED = "sampled"  # the last link: the machine's own loop
-PLACES = (0.0, 1 / 3, 2 / 3, 1.0)  # shares of the travel, either way
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,6 +95,10 @@ def compensators(
     plant: Plant, controller: Controller, current_loops: CurrentLoops = "lag"
 ) -> dict[str, tuple[Compensator, bool]]:
     """The stages by name, and whether they feed back the states; `plant` is the machine, which has the delays."""
+    own = {SAMPLED: (machine_law(plant, controller, current_loops), False)}
+    cost, noise = controller.cost, controller.noise
+    if cost is None or noise is None:
+        return own
     believed = plant_of(controller.parameters)
     names = [s.name for s in believed.design_states]
     model = linearize(
@@ -101,14 +106,14 @@ def compensators(
     )
     one = np.ones_like
     weights = Weights(
-        q=controller.cost.state,
-        q_base=one(controller.cost.state),
-        r=controller.cost.input,
-        r_base=one(controller.cost.input),
-        q_i=controller.cost.integral,
-        q_i_base=one(controller.cost.integral),
-        process_variance=controller.noise.process,
-        sensor_variance=controller.noise.sensor,
+        q=cost.state,
+        q_base=one(cost.state),
+        r=cost.input,
+        r_base=one(cost.input),
+        q_i=cost.integral,
+        q_i_base=one(cost.integral),
+        process_variance=noise.process,
+        sensor_variance=noise.sensor,
     )
     A, B, C, K, L = model.A, model.B, model.C, lqr(model, weights), kalman(model, weights)
     n, p, m = len(A), len(C), B.shape[1]
@@ -123,7 +128,7 @@ def compensators(
             True,
         )
     }
-    integral = bool(controller.cost.integral.any())
+    integral = bool(cost.integral.any())
     K_i, Ki = lqi(model, weights) if integral else (K, np.zeros((m, p)))
     if integral:  # e' = -y, in the coordinates of the modes
         e = np.hstack([-to_modes, np.zeros((p, n))])
@@ -137,13 +142,9 @@ def compensators(
             observer, np.vstack([L, -to_modes]), np.hstack([-K_i, Ki @ back]), np.zeros((m, p)), integrals=p
         )
         stages["LQGI"] = last, False
-    a = plant.actuator
-    stages["+ current loops"] = (
-        Compensator(last.A, last.B, last.C, last.D, integrals=last.integrals, lag=a.crossover),
-        False,
-    )
-    stages[SAMPLED] = machine_law(plant, controller, current_loops), False
-    return stages
+    if np.isfinite(plant.actuator.crossover):
+        stages["+ current loops"] = replace(last, lag=plant.actuator.crossover), False
+    return stages | own
 
 
 def robustness(
@@ -170,13 +171,15 @@ def robustness(
         if progress is not None:
             progress(min(1.0, next(steps) / total))
 
-    names, stroke = list(uncertainty), plant.stroke
+    names, stroke, held = list(uncertainty), plant.stroke, holds(plant)
     at = {stroke: float(controller.operating_point[0][plant.stroke_state])}
     believed = plant_of(controller.parameters)
     links = []
     stages = compensators(plant, controller, current_loops)
     for name, (law, states) in stages.items():
-        system = uncertain(plant, names, states=states, at=at, believed=believed)
+        system = uncertain(
+            plant, names, states=states, at=at, believed=believed, held=name == SAMPLED and held
+        )
         margin, peak = robust_margin(system, law, uncertainty), _peak(system, law, states)
         links.append(Link(name, margin, peak, "forces" if states else "sensors"))
         done()
@@ -203,7 +206,7 @@ def robustness(
     for share in PLACES:
         margins, peaks, sides = [], [], []
         for z in dict.fromkeys((share * plant.travel, -share * plant.travel)):
-            here = uncertain(plant, names, at={stroke: z}, believed=believed)
+            here = uncertain(plant, names, at={stroke: z}, believed=believed, held=held)
             margins.append(robust_margin(here, law, uncertainty))
             peaks.append(_peak(here, law, states=False))
             sides.append(_classical(here, law, sensors) if _stable(here, law) else None)

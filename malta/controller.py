@@ -10,11 +10,15 @@ At every sample:
   1. y = measured outputs;                      e += Ts (p* - y), frozen on the axes that saturated last
   2. xi_hat = xi_pred + L (y - Cd xi_pred)                                     (steady-state Kalman filter)
   3. v_fb = K (xi* - xi_hat) + Ki e             with xi* = (P(z*)^-1 p*, its derivative)
-  4. v = saturate(v_fb + v_ff + v0(z)),         v_ff = m z*'' on the thrust, z the measured position
-  5. currents = v / force constants
+  4. v = saturate(v_fb + v_ff + v0(z)),         v_ff = inertia p*'' + speed p*', z the measured stroke
+  5. currents = those that make v where y says the machine is, held until the next sample
   6. xi_pred = Ad xi_hat + Bd (v - v0(z))
-The ten mechanical states stand first in xi. Where the design models a delay of d samples, the forces v - v0 of the
-last d samples follow, the oldest first; their reference is the feedforward that was commanded then.
+The mechanical states stand first in xi. Where the design models a delay of d samples, forces of the last d samples
+follow, the oldest first: v - v0, and what currents commutated for an old reading make beside it. Their reference is
+what was commanded then. Last come constant forces of disturbance, where the filter observes them; their reference is zero.
+
+A PID controller is the same law: its filter takes positions as measured and rates as filtered differences,
+Ad = diag(1, a), Bd = 0, L = (P^-1, (1 - a) P^-1 / Ts), and it has neither a cost nor noise that it was designed for.
 """
 
 from __future__ import annotations
@@ -36,15 +40,21 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Feedforward:
-    """v_ff = mass z*'' on the thrust; v0(z), linear between the grid points, constant beyond them."""
+    """v_ff = inertia p*'' + speed p*'; v0(z) of the stroke z, linear between the grid points, constant beyond them.
 
-    mass: float  # kg
+    Where currents are held that were commutated for the last reading, what they pull back with is periodic with the
+    samples: a steady ramp then takes a force, and passes the readings faster than on average.
+    """
+
+    inertia: FloatArray  # kg or kg m^2, m inputs; times the output of the same index
+    speed: FloatArray  # m x p, N s/m
+    rate: FloatArray  # n0 / 2 x p, rates at the samples beyond P^-1 p*', per unit of p*'
     z_grid: FloatArray  # m, g points
     v0: FloatArray  # N, g x m
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "z_grid", readonly(self.z_grid))
-        object.__setattr__(self, "v0", readonly(self.v0))
+        for name in ("inertia", "speed", "rate", "z_grid", "v0"):
+            object.__setattr__(self, name, readonly(getattr(self, name)))
 
     def at(self, z: float) -> FloatArray:
         """v0(z), N, m forces."""
@@ -69,11 +79,11 @@ class CurrentLoop:
 
 @dataclass(frozen=True, eq=False)
 class Limits:
-    """Of each input axis."""
+    """Of each coil, and of each input."""
 
-    current: FloatArray  # A
-    voltage: FloatArray  # V
-    force: FloatArray  # N
+    current: FloatArray  # A, coils
+    voltage: FloatArray  # V, coils; inf: none
+    force: FloatArray  # N or N m, m inputs
 
     def __post_init__(self) -> None:
         for name in ("current", "voltage", "force"):
@@ -86,9 +96,10 @@ class Noise:
 
     process: FloatArray  # N^2, m forces
     sensor: FloatArray  # m^2, p measurements
+    drift: FloatArray  # N^2, of a constant force of disturbance from sample to sample: m, or none
 
     def __post_init__(self) -> None:
-        for name in ("process", "sensor"):
+        for name in ("process", "sensor", "drift"):
             object.__setattr__(self, name, readonly(getattr(self, name)))
 
 
@@ -129,10 +140,10 @@ class Controller:
     K: FloatArray  # m x n
     Ki: FloatArray  # m x p
     L: FloatArray  # n x p, filter form
-    cost: Cost
-    noise: Noise
+    cost: Cost | None  # None, as the noise: a PID
+    noise: Noise | None
     feedforward: Feedforward
-    current_loop: CurrentLoop
+    current_loop: CurrentLoop | None  # None: currents follow their commands at once
     limits: Limits
 
     def __post_init__(self) -> None:
@@ -155,13 +166,23 @@ class Controller:
     @property
     def delay(self) -> int:
         """Samples of delay in the design model."""
-        return (len(self.Ad) - len(self.A)) // len(self.forces)
+        return (len(self.Ad) - len(self.A)) // len(self.forces) - self.observed
+
+    @property
+    def observed(self) -> int:
+        """1 where forces of disturbance are among the states, else 0."""
+        return int(self.states[-len(self.forces) :] == disturbances(self.forces))
+
+    @property
+    def integrating(self) -> bool:
+        """Whether sums of errors are fed back."""
+        return bool(self.Ki.any())
 
 
 class LinearLaw(NamedTuple):
     """The law without saturation: s+ = A s + B_y y + B_r r, v = C s + D_y y + D_r r.
 
-    s = (xi_pred, e), r = (p*, xi*, v_ff, v0).
+    s = (xi_pred, e), without e where it is not fed back; r = (p*, xi*, v_ff, v0).
     """
 
     A: FloatArray
@@ -175,6 +196,11 @@ class LinearLaw(NamedTuple):
 def stored_forces(inputs: tuple[Signal, ...], delay: int) -> tuple[Signal, ...]:
     """The states that hold the forces of the last `delay` samples, the oldest first."""
     return tuple(Signal(f"{s.name}[k-{age}]", s.unit) for age in range(delay, 0, -1) for s in inputs)
+
+
+def disturbances(inputs: tuple[Signal, ...]) -> tuple[Signal, ...]:
+    """The states that hold constant forces of disturbance."""
+    return tuple(Signal(f"{s.name}[d]", s.unit) for s in inputs)
 
 
 def gains_of(c: Controller) -> dict[str, ca.DM]:
@@ -237,8 +263,19 @@ def linear_law(c: Controller) -> LinearLaw:
     args = [ca.SX.sym(step.name_in(i), *step.size_in(i)) for i in range(step.n_in())]
     named = dict(zip(step.name_in(), args, strict=True))
     out = dict(zip(step.name_out(), step(*args), strict=True))
-    s = ca.vertcat(named["xi_pred"], named["e"])
+    kept = ["xi_pred", "e"] if c.integrating else ["xi_pred"]
+    s = ca.vertcat(*(named[name] for name in kept))
     r = ca.vertcat(*(named[name] for name in ("p_ref", "xi_ref", "v_ff", "v0")))
-    s_next = ca.vertcat(out["xi_pred_next"], out["e_next"])
+    s_next = ca.vertcat(*(out[f"{name}_next"] for name in kept))
     blocks = [ca.jacobian(of, by) for of in (s_next, out["v"]) for by in (s, named["y"], r)]
     return LinearLaw(*(readonly(np.array(M)) for M in ca.Function("linear", args, blocks)(*[0] * len(args))))
+
+
+def handed_on(law: LinearLaw) -> LinearLaw:
+    """The same law with the reading itself as further outputs: what currents are commutated for."""
+    p, n, r = law.B_y.shape[1], len(law.A), law.D_r.shape[1]
+    return law._replace(
+        C=np.vstack([law.C, np.zeros((p, n))]),
+        D_y=np.vstack([law.D_y, np.eye(p)]),
+        D_r=np.vstack([law.D_r, np.zeros((p, r))]),
+    )

@@ -62,13 +62,21 @@ class _MachineFile(Record):
 
 
 def si(
-    unit: str, *, above: float | None = None, at_least: float | None = None, twin: str | None = None
+    unit: str,
+    *,
+    above: float | None = None,
+    at_least: float | None = None,
+    twin: str | None = None,
+    shapes: bool = False,
 ) -> Any:
     """Declare a parameter: `m: float = si("kg", above=0)  # mover with magnets, Table IV`.
 
     twin: another parameter; where both are equal, symbolic models hold one symbol for them.
+    shapes: models are shaped by it (a delay, a number of harmonics): it stays a number where others are symbols.
     """
-    return field(metadata={"unit": unit, "above": above, "at_least": at_least, "twin": twin})
+    return field(
+        metadata={"unit": unit, "above": above, "at_least": at_least, "twin": twin, "shapes": shapes}
+    )
 
 
 def units_of(record: type[Parameters] | Parameters) -> dict[str, str]:
@@ -80,6 +88,11 @@ def twins_of(record: Parameters) -> dict[str, str]:
     """The parameters that symbolic models take as one with another: declared twins of equal value."""
     declared = {f.name: f.metadata.get("twin") for f in fields(record)}
     return {k: twin for k, twin in declared.items() if twin and getattr(record, k) == getattr(record, twin)}
+
+
+def shaping(record: Parameters) -> dict[str, float]:
+    """The parameters that shape models, with their values."""
+    return {f.name: getattr(record, f.name) for f in fields(record) if f.metadata.get("shapes")}
 
 
 def check_parameters(record: Parameters, where: str | Path = "parameters") -> None:
@@ -251,10 +264,7 @@ def plant_of(parameters: Parameters) -> Plant:
 @lru_cache(maxsize=64)  # records are immutable; building one takes longer than much that is done with it
 def _plant_of(parameters: Any) -> Plant:
     name = type(parameters).__module__.rpartition(".")[2]
-    module = machine_module(name)
-    if not hasattr(module, "plant"):
-        raise InputError("machine", "", repr(name), "a machine with a plant: so far its physics stand alone")
-    plant: Plant = module.plant(parameters)
+    plant: Plant = machine_module(name).plant(parameters)
     return plant
 
 

@@ -21,8 +21,15 @@ from malta.errors import InputError
 from malta.files import read_file
 
 MAT_HEADER = 116  # bytes of descriptive text that open a MAT-file
-MATRICES = ("model.", "gains.", "feedforward.v0", "verification.poles.")
-VECTORS = ("operating_point.", "feedforward.z_grid", "limits.", "cost.", "noise.")
+MATRICES = (
+    "model.",
+    "gains.",
+    "feedforward.v0",
+    "feedforward.speed",
+    "feedforward.rate",
+    "verification.poles.",
+)
+VECTORS = ("operating_point.", "feedforward.inertia", "feedforward.z_grid", "limits.", "cost.", "noise.")
 
 _Form = tuple[Callable[[Mapping[str, Any]], bytes], Callable[[bytes], Any]]
 

@@ -59,9 +59,11 @@ static inline real size(real x) { return value(bits(x) & 0x7fffffffffffffffLL); 
   }
 
 static inline double one_sign(double x) { return (x > 0) - (x < 0); }
+static inline double one_uniform(double x) { return sqrt(3.0) * erf(x * sqrt(0.5)); } /* of a normal number */
 EACH(each_sqrt, sqrt) EACH(each_floor, floor) EACH(each_ceil, ceil) EACH(each_exp, exp)
 EACH(each_log, log) EACH(each_tan, tan) EACH(each_tanh, tanh) EACH(each_asin, asin) EACH(each_acos, acos)
 EACH(each_atan, atan) EACH(each_sinh, sinh) EACH(each_cosh, cosh) EACH(each_sign, one_sign)
+EACH(each_uniform, one_uniform)
 PAIR(each_pow, pow) PAIR(each_atan2, atan2) PAIR(each_hypot, hypot) PAIR(each_fmod, fmod)
 
 #if LANES == 8 && defined(__AVX512DQ__)
@@ -143,18 +145,20 @@ static inline void look_up(long n, const double *table, long *hint, double at, d
   for (int j = 0; j < FORCES; j++) v[j] = row[1 + j] + (at - row[0]) * row[1 + FORCES + j];
 }
 
-/* Rows of `samples` control periods; `state` is taken and left behind. */
-void run(long samples, long substeps, const double *theta, long grid, const double *table,
-         double *state, const double *given, const double *noise, double *rows) {
+/* Rows of `samples` control periods from the one of number `first` on; `state` is taken and left behind. Where a sample is
+   no whole number of substeps, it begins with the first substep after it.                                             */
+void run(long first, long samples, double substeps, const double *theta, long grid, const double *table, double *state,
+         const double *given, const double *noise, const double *fast, double *rows) {
   double c[CONSTANTS + 1], y[OUTPUTS], v[FORCES], held[HELD], next[STATES];
-  long hint = 0;
+  long hint = 0, done = (long)ceil((double)first * substeps - 1e-6);
   prepare(theta, c);
-  for (long k = 0; k < samples; k++, given += GIVEN, noise += OUTPUTS, rows += ROW) {
+  for (long k = first; k < first + samples; k++, given += GIVEN, noise += OUTPUTS, rows += ROW) {
     double at;
     sense(c, state, given, noise, y, &at);
     look_up(grid, table, &hint, at, v);
     decide(c, state, given, y, v, next + MACHINE, held, rows);
-    for (long i = 0; i < substeps; i++) substep(c, state, held, given, state);
+    const long end = (long)ceil((double)(k + 1) * substeps - 1e-6);
+    for (; done < end; done++, fast += JITTER) substep(c, state, held, given, fast, state);
     memcpy(state + MACHINE, next + MACHINE, (STATES - MACHINE) * sizeof *state);
   }
 }
@@ -272,7 +276,7 @@ typedef struct { real state[STATES], kept[DIGEST + 1]; } Group;
     decide##near(__VA_ARGS__ c, m->state, given, y, v, after->state + MACHINE, held, row); \
     digest(c, m->kept, row, given, after->kept); \
     for (long i = 0; i < substeps; i++, from = after->state) \
-      substep##near(__VA_ARGS__ c, from, held, given, after->state); \
+      substep##near(__VA_ARGS__ c, from, held, given, 0, after->state); \
     return nowhere(MASK(range > NEAR)); \
   }
 SAMPLE(sample_near, _near, inline, &range, )
@@ -280,7 +284,7 @@ SAMPLE(sample, , __attribute__((noinline, cold)), )
 
 /* LANES machines at once: only digests are kept. */
 static void run_group(long samples, long substeps, const double *theta, const Grid *grid, double *states,
-                      const double *given, const double *scales, const uint64_t *keys, double *digests) {
+                      const double *given, long uniform, const double *scales, const uint64_t *keys, double *digests) {
   Group m[2], *now = m, *after = m + 1, *before;
   real c[CONSTANTS + 1], sigma[OUTPUTS], t[THETA + 1], noise[2 * OUTPUTS];
   int noisy = 0;
@@ -298,7 +302,8 @@ static void run_group(long samples, long substeps, const double *theta, const Gr
     if (noisy && k % 2 == 0) {
       for (int j = 0; j < OUTPUTS; j++)
         two_normals(key, (uint64_t)(k / 2 * OUTPUTS + j), noise + 2 * j, noise + 2 * j + 1);
-      for (int j = 0; j < 2 * OUTPUTS; j++) noise[j] = noise[j] * sigma[j % OUTPUTS];
+      for (int j = 0; j < 2 * OUTPUTS; j++)
+        noise[j] = (uniform ? each_uniform(noise[j]) : noise[j]) * sigma[j % OUTPUTS];
     }
     if (!sample_near(c, now, after, grid, substeps, given, drawn))
       sample(c, now, after, grid, substeps, given, drawn);
@@ -310,7 +315,8 @@ static void run_group(long samples, long substeps, const double *theta, const Gr
 
 /* Groups of LANES machines, one after the other; states and digests are taken and left behind. */
 void run_many(long groups, long samples, long substeps, const double *theta, long points, const double *table,
-              double *states, const double *given, const double *sigma, const uint64_t *keys, double *digests) {
+              double *states, const double *given, long uniform, const double *sigma, const uint64_t *keys,
+              double *digests) {
   const size_t size = (size_t)points * PADDED * sizeof(double);
   double *rows = aligned_alloc(64, 2 * size), first = table[0];
   if (!rows) abort();
@@ -323,7 +329,7 @@ void run_many(long groups, long samples, long substeps, const double *theta, lon
     memcpy(rows + (points + k) * PADDED, table + k * WIDTH + 1 + FORCES, FORCES * sizeof(double));
   }
   for (long g = 0; g < groups; g++)
-    run_group(samples, substeps, theta + g * THETA * LANES, &grid, states + g * STATES * LANES, given,
+    run_group(samples, substeps, theta + g * THETA * LANES, &grid, states + g * STATES * LANES, given, uniform,
               sigma + g * OUTPUTS * LANES, keys + g * LANES, digests + g * DIGEST * LANES);
   free(rows);
 }

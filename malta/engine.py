@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import ctypes
 import hashlib
+import math
 import os
 import platform
 import shlex
@@ -317,6 +318,7 @@ def source(p: Parts, digest: ca.Function | None) -> str:
         "OUTPUTS": p.sense.size1_in(2),
         "FORCES": p.decide.size1_in(3),
         "HELD": p.substep.size1_in(1),
+        "JITTER": p.substep.size1_in(3),
         "ROW": p.decide.size1_out(2),
         "DIGEST": digest.size1_in(0) if digest else 0,
     }
@@ -408,34 +410,43 @@ def _compiled(cc: tuple[str, ...], text: str, lanes: int, path: Path) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class Engine:
-    """Runs control periods of one machine: (state, inputs) -> (state, rows)."""
+    """Runs control periods of one machine: (first, state, given, noise, fast noise) -> (state, rows)."""
 
     kind: str  # "compiled" or "virtual machine"
-    run: Callable[[FloatArray, FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
+    run: Callable[[int, FloatArray, FloatArray, FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
 
 
 def _address(array: Any) -> ctypes.c_void_p:
     return ctypes.c_void_p(array.ctypes.data)
 
 
-def compiled_engine(run: Any, p: Parts, theta: FloatArray, substeps: int, table: FloatArray) -> Engine:
+def substeps_until(sample: int, substeps: float) -> int:
+    """Substeps before a sample, where it takes so many: each sample begins with the first substep after it."""
+    return math.ceil(sample * substeps - 1e-6)
+
+
+def compiled_engine(run: Any, p: Parts, theta: FloatArray, substeps: float, table: FloatArray) -> Engine:
     """`run` of a library with one lane. Rows per call are limited by memory alone."""
     width = p.decide.size1_out(2)
     theta, table = (np.ascontiguousarray(a, dtype=float) for a in (theta, table))
 
-    def call(state: FloatArray, given: FloatArray, noise: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def call(
+        first: int, state: FloatArray, given: FloatArray, noise: FloatArray, fast: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
         after = np.array(state, dtype=float)
-        given, noise = np.ascontiguousarray(given), np.ascontiguousarray(noise)
+        given, noise, fast = (np.ascontiguousarray(a) for a in (given, noise, fast))
         rows = np.empty((len(given), width))
         run(
+            ctypes.c_long(first),
             ctypes.c_long(len(given)),
-            ctypes.c_long(substeps),
+            ctypes.c_double(substeps),
             _address(theta),
             ctypes.c_long(len(table)),
             _address(table),
             _address(after),
             _address(given),
             _address(noise),
+            _address(fast),
             _address(rows),
         )
         return after, rows
@@ -449,19 +460,29 @@ def feedforward_table(z_grid: FloatArray, v0: FloatArray) -> FloatArray:
     return np.ascontiguousarray(np.hstack([z_grid[:, None], v0, np.vstack([slope, slope[-1:]])]))
 
 
-def virtual_engine(chain: ca.Function) -> Engine:
-    """The chained functions of machine.py on CasADi's virtual machine; a short last block is padded."""
-    block = chain.size2_in(1)
+def virtual_engine(chain_of: Callable[[int], ca.Function], substeps: float) -> Engine:
+    """The chained functions of machine.py on CasADi's virtual machine; a short last block is padded.
 
-    def call(state: FloatArray, given: FloatArray, noise: FloatArray) -> tuple[FloatArray, FloatArray]:
-        inputs = np.hstack([given, noise])
-        parts = []
-        for k in range(0, len(inputs), block):
-            part = inputs[k : k + block]
-            padded = np.vstack([part, np.repeat(part[-1:], block - len(part), axis=0)])
+    chain_of : the chain for samples of so many substeps
+    """
+
+    def call(
+        first: int, state: FloatArray, given: FloatArray, noise: FloatArray, fast: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        edges = np.array([substeps_until(first + k, substeps) for k in range(len(given) + 1)])
+        edges, parts, k = edges - edges[0], [], 0
+        while k < len(given):
+            chain = chain_of(int(edges[k + 1] - edges[k]))
+            block = chain.size2_in(1)
+            alike = np.diff(edges[k : k + block + 1]) == edges[k + 1] - edges[k]
+            end = k + (len(alike) if alike.all() else int(alike.argmin()))
+            part = fast[edges[k] : edges[end]].reshape(end - k, -1)
+            inputs = np.hstack([given[k:end], noise[k:end], part])
+            padded = np.vstack([inputs, np.repeat(inputs[-1:], block - len(inputs), axis=0)])
             states, rows = evaluate(chain, state, padded)
-            state = states[len(part) - 1]
-            parts.append(rows[: len(part)])
+            state = states[len(inputs) - 1]
+            parts.append(rows[: len(inputs)])
+            k = end
         return state, np.concatenate(parts)
 
     return Engine("virtual machine", call)
@@ -495,6 +516,7 @@ def run_many(
     table: FloatArray,
     states: FloatArray,
     given: FloatArray,
+    uniform: bool,
     sigma: FloatArray,
     keys: Any,
     digests: FloatArray,
@@ -509,6 +531,7 @@ def run_many(
         _address(table),
         _address(states[chosen]),
         _address(given),
+        ctypes.c_long(uniform),
         _address(sigma[chosen]),
         _address(keys[chosen]),
         _address(digests[chosen]),

@@ -19,9 +19,10 @@ import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
 
 from malta import machine
-from malta.controller import Controller
+from malta.controller import Controller, Noise
 from malta.data import plant_of
 from malta.engine import Engine
+from malta.errors import InputError
 from malta.machine import Setup
 from malta.plant import Plant
 
@@ -35,7 +36,10 @@ Observer = Callable[
 
 def observer(plant: Plant, c: Controller, setup: Setup, kind: str, substeps: int, errors: Any) -> Observer:
     """Runs control periods one by one with an estimate of its own: (engine, state, given, noise) -> (state, rows)."""
-    filter_ = _filter(c)
+    if c.noise is None or c.observed:
+        found = "a PID" if c.noise is None else "forces of disturbance in its own"
+        raise InputError("simulate", f"estimator {kind}", found, "an LQG with integrals")
+    filter_ = _filter(c, c.noise)
     predict = _nonlinear(c) if kind == "extended" else _linear(c)
     jacobian, output = _measurement(c)
 
@@ -59,7 +63,7 @@ def observer(plant: Plant, c: Controller, setup: Setup, kind: str, substeps: int
     ) -> tuple[FloatArray, FloatArray]:
         nonlocal started
         rows = []
-        sense = sensors(flown)
+        sense, none = sensors(flown), np.zeros((0, 0))
         for k in range(len(given)):
             y = np.array(sense(state, given[k], noise[k], [])[0]).ravel()
             if not started:
@@ -71,7 +75,7 @@ def observer(plant: Plant, c: Controller, setup: Setup, kind: str, substeps: int
                 filter_.x = np.full(n, np.nan)
             now = given[k : k + 1].copy()
             now[0, -len(c.states) :] = np.concatenate([filter_.x, *sent])
-            state, row = engine.run(state, now, noise[k : k + 1])
+            state, row = engine.run(0, state, now, noise[k : k + 1], none)
             rows.append(row)
             if not np.isfinite(row).all():
                 break
@@ -87,12 +91,12 @@ def observer(plant: Plant, c: Controller, setup: Setup, kind: str, substeps: int
     return run
 
 
-def _filter(c: Controller) -> Any:
+def _filter(c: Controller, noise: Noise) -> Any:
     n, p = len(c.A), len(c.measurements)
     kalman = ExtendedKalmanFilter(dim_x=n, dim_z=p, dim_u=len(c.forces))
     B = (c.Ad[:n, n : n + len(c.forces)] if c.delay else c.Bd)[:n]
-    kalman.Q = B * c.noise.process @ B.T
-    kalman.R = np.diag(c.noise.sensor)
+    kalman.Q = B * noise.process @ B.T
+    kalman.R = np.diag(noise.sensor)
     kalman.x = np.zeros(n)
     return kalman
 

@@ -9,18 +9,20 @@
     model            A n0 x n0, B n0 x m, C p x n0 (continuous, n0 mechanical states); Ad n x n, Bd n x m, Cd p x n
     gains            K m x n, Ki m x p, L n x p (filter form)
     cost             state n0, input m, integral p: diagonals of Q, R, Q_i that the regulator minimizes, SI
-    noise            process [N^2] m, sensor [m^2] p: variances that the filter was designed for
-    feedforward      mass [kg], z_grid [g] [m], v0 g x m [N]
+    noise            process [N^2] m, sensor [m^2] p: variances that the filter was designed for; drift [N^2] m or null
+    feedforward      inertia [kg or kg m^2] m, speed m x p [N s/m], rate n0/2 x p, z_grid [g] [m], v0 g x m [N]
     current_loop     Kp [V/A], Ki [V/(A s)], sample_time [s]
-    limits           current [A], voltage [V], force [N]: m each
+    limits           current [A], voltage [V]: of each of c coils; force [N or N m]: m
     verification     poles {open_loop, regulator, filter, closed_loop} as rows [re, im] in rad/s, bandwidth [rad/s],
                      peak_sensitivity, robust {uncertainty, lower, upper, witness [SI]} or null: the margin over
                      the travel in multiples of the uncertainty; lower null: not proven, upper null: no witness
     provenance       versions of malta, python, numpy, scipy, control, casadi
     sha256           of the rest as compact JSON with sorted keys
 
-n = n0 + m d where the design models a delay of d samples: the mechanical states first, then stored forces. The control
-law is in controller.py.
+n = n0 + m d where the design models a delay of d samples: the mechanical states first, then stored forces; m more where
+the filter observes forces of disturbance. The control law is in controller.py. For a PID controller, which is the same
+law, cost and noise are null, as its poles of regulator and filter; current_loop is null where currents follow
+their commands at once, limits.voltage where there are none.
 
 The JSON is the specification: matrices row by row with round-trip precision, no time stamp, so the same inputs give the
 same file. The .npz has the same names joined by dots ("gains.K"), the .mat the same names as nested structs; in both a
@@ -39,14 +41,23 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 from pydantic import BeforeValidator, Field, StrictInt, StrictStr
 
-from malta.controller import Controller, Cost, CurrentLoop, Feedforward, Limits, Noise, stored_forces
+from malta.controller import (
+    Controller,
+    Cost,
+    CurrentLoop,
+    Feedforward,
+    Limits,
+    Noise,
+    disturbances,
+    stored_forces,
+)
 from malta.data import Finite, Machine, Quantity, Record, machine_module, plant_of, units_of, validated
 from malta.encodings import SUFFIXES as SUFFIXES
 from malta.encodings import content_sha256, decode, encode
 from malta.errors import CheckError, InputError
 from malta.files import replace_files
 from malta.plant import Signal
-from malta.verify import own_poles, require_stable
+from malta.verify import require_stable, unstable_gain
 
 if TYPE_CHECKING:
     from malta.plant import FloatArray, Parameters
@@ -121,10 +132,13 @@ class _Cost(Record):
 class _Noise(Record):
     process: Vector
     sensor: Vector
+    drift: Vector | None
 
 
 class _Feedforward(Record):
-    mass: Annotated[Finite, Field(gt=0)]
+    inertia: Vector
+    speed: Matrix
+    rate: Matrix
     z_grid: Vector
     v0: Matrix
 
@@ -137,14 +151,14 @@ class _CurrentLoop(Record):
 
 class _Limits(Record):
     current: Vector
-    voltage: Vector
+    voltage: Vector | None
     force: Vector
 
 
 class _Poles(Record):
     open_loop: Matrix
-    regulator: Matrix
-    filter: Matrix
+    regulator: Matrix | None
+    filter: Matrix | None
     closed_loop: Matrix
 
 
@@ -183,10 +197,10 @@ class GainFile(Record):
     signals: _SignalTable
     model: _Model
     gains: _Gains
-    cost: _Cost
-    noise: _Noise
+    cost: _Cost | None
+    noise: _Noise | None
     feedforward: _Feedforward
-    current_loop: _CurrentLoop
+    current_loop: _CurrentLoop | None
     limits: _Limits
     verification: _Verification
     provenance: _Provenance
@@ -217,11 +231,11 @@ def document(controller: Controller, margins: Margins) -> dict[str, Any]:
         },
         "model": {key: getattr(c, key) for key in ("A", "B", "C", "Ad", "Bd", "Cd")},
         "gains": {key: getattr(c, key) for key in ("K", "Ki", "L")},
-        "cost": {key: getattr(c.cost, key) for key in ("state", "input", "integral")},
-        "noise": {"process": c.noise.process, "sensor": c.noise.sensor},
-        "feedforward": {key: getattr(c.feedforward, key) for key in ("mass", "z_grid", "v0")},
-        "current_loop": {key: getattr(c.current_loop, key) for key in ("Kp", "Ki", "sample_time")},
-        "limits": {key: getattr(c.limits, key) for key in ("current", "voltage", "force")},
+        "cost": _table(c.cost, "state", "input", "integral"),
+        "noise": _table(c.noise, "process", "sensor", "drift"),
+        "feedforward": _table(c.feedforward, "inertia", "speed", "rate", "z_grid", "v0"),
+        "current_loop": _table(c.current_loop, "Kp", "Ki", "sample_time"),
+        "limits": _table(c.limits, "current", "voltage", "force"),
         "verification": {
             "poles": margins.poles.pairs(),
             "bandwidth": dict(margins.bandwidth),
@@ -231,9 +245,15 @@ def document(controller: Controller, margins: Margins) -> dict[str, Any]:
         "provenance": {"malta": version("malta"), "python": platform.python_version()}
         | {name: version(name) for name in ("numpy", "scipy", "control", "casadi")},
     }
+    if not np.isfinite(c.limits.voltage).all():
+        tables["limits"]["voltage"] = None
     plain: dict[str, Any] = _plain(tables)
     plain["sha256"] = content_sha256(plain)
     return plain
+
+
+def _table(record: Any, *keys: str) -> dict[str, Any] | None:
+    return None if record is None else {key: getattr(record, key) for key in keys}
 
 
 def _robust(margins: Margins) -> dict[str, Any] | None:
@@ -280,18 +300,16 @@ def read(path: str | Path) -> Controller:
     controller = _controller(file, path)
     try:
         with np.errstate(all="ignore"):
-            regulator, observer = own_poles(controller)
+            unstable = unstable_gain(controller)
     except CheckError as error:
         raise InputError(path, "model", str(error), "a model whose numbers can be multiplied") from error
-    for field, poles in (("gains.K", regulator), ("gains.L", observer)):
-        radius = float(np.abs(poles).max())
-        if not radius < 1:
-            raise InputError(
-                path,
-                field,
-                f"a pole of the file's own model at |lambda| = {radius:.7g}",
-                "gains that stabilize it",
-            )
+    if unstable is not None:
+        name, radius = unstable
+        whose = (
+            "the file's own model" if controller.cost is not None else "the loop on the file's own machine"
+        )
+        found = f"a pole of {whose} at |lambda| = {radius:.7g}"
+        raise InputError(path, f"gains.{name}", found, "gains that stabilize it")
     return controller
 
 
@@ -311,24 +329,31 @@ def _controller(file: GainFile, path: str | Path) -> Controller:
         if found != wanted:
             raise InputError(path, f"signals.{key}", _names(found), f"{_names(wanted)} of the {plant.name}")
     n, n0, m, p = len(states), len(mechanical), len(forces), len(measurements)
-    g = len(file.feedforward.z_grid)
+    g, coils = len(file.feedforward.z_grid), len(plant.actuator.coils)
     if (n - n0) % m:
         raise InputError(path, "signals.states", f"{n} states", f"{n0} and a multiple of {m} stored forces")
-    stored = stored_forces(forces, (n - n0) // m)
+    observed = disturbances(forces) if states[-m:] == disturbances(forces) else ()
+    stored = stored_forces(forces, (n - n0 - len(observed)) // m) + observed
     if states[n0:] != stored:
         raise InputError(path, "signals.states", _names(states[n0:]), f"stored forces, as {_names(stored)}")
+    if (file.cost is None) != (file.noise is None):
+        raise InputError(path, "noise", "null" if file.noise is None else "some", "null where cost is null")
     shapes: dict[str, dict[str, tuple[int, ...]]] = {
         "model": {"A": (n0, n0), "B": (n0, m), "C": (p, n0), "Ad": (n, n), "Bd": (n, m), "Cd": (p, n)},
         "gains": {"K": (m, n), "Ki": (m, p), "L": (n, p)},
         "operating_point": {"x": (n0,), "u": (m,)},
-        "feedforward": {"z_grid": (g,), "v0": (g, m)},
-        "limits": {"current": (m,), "voltage": (m,), "force": (m,)},
-        "cost": {"state": (n0,), "input": (m,), "integral": (p,)},
-        "noise": {"process": (m,), "sensor": (p,)},
+        "feedforward": {"inertia": (m,), "speed": (m, p), "rate": (n0 // 2, p), "z_grid": (g,), "v0": (g, m)},
+        "limits": {"current": (coils,), "force": (m,)},
     }
-    arrays = {
+    if file.limits.voltage is not None:
+        shapes["limits"]["voltage"] = (coils,)
+    if file.cost is not None:
+        shapes["cost"] = {"state": (n0,), "input": (m,), "integral": (p,)}
+    if file.noise is not None:
+        shapes["noise"] = {"process": (m,), "sensor": (p,), "drift": (len(observed),)}
+    arrays: dict[str, dict[str, FloatArray]] = {
         table: {
-            key: _array(getattr(getattr(file, table), key), shape, path, f"{table}.{key}")
+            key: _array(getattr(getattr(file, table), key) or [], shape, path, f"{table}.{key}")
             for key, shape in keys.items()
         }
         for table, keys in shapes.items()
@@ -341,10 +366,10 @@ def _controller(file: GainFile, path: str | Path) -> Controller:
     for key, limit in arrays["limits"].items():
         if not (limit > 0).all():
             raise InputError(path, f"limits.{key}", str(limit.tolist()), "limits above 0")
-    for key, variance in arrays["noise"].items():
+    for key, variance in arrays.get("noise", {}).items():
         if not (variance > 0).all():
             raise InputError(path, f"noise.{key}", str(variance.tolist()), "variances above 0")
-    for key, weight in arrays["cost"].items():
+    for key, weight in arrays.get("cost", {}).items():
         if (weight < 0).any() or (key == "input" and not (weight > 0).all()):
             raise InputError(
                 path,
@@ -363,11 +388,11 @@ def _controller(file: GainFile, path: str | Path) -> Controller:
         measurements=measurements,
         **arrays["model"],
         **arrays["gains"],
-        cost=Cost(**arrays["cost"]),
-        noise=Noise(**arrays["noise"]),
-        feedforward=Feedforward(file.feedforward.mass, z_grid, arrays["feedforward"]["v0"]),
-        current_loop=CurrentLoop(file.current_loop.Kp, file.current_loop.Ki, file.current_loop.sample_time),
-        limits=Limits(**arrays["limits"]),
+        cost=Cost(**arrays["cost"]) if "cost" in arrays else None,
+        noise=Noise(**arrays["noise"]) if "noise" in arrays else None,
+        feedforward=Feedforward(**arrays["feedforward"]),
+        current_loop=None if file.current_loop is None else CurrentLoop(**file.current_loop.model_dump()),
+        limits=Limits(**({"voltage": np.full(coils, np.inf)} | arrays["limits"])),
     )
 
 
@@ -400,11 +425,11 @@ def _names(signals: tuple[Signal, ...]) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """Tables, lists and numbers only; no negative zeros, which JSON readers of other languages may lose."""
+    """Tables, lists, numbers and nulls for empty lists; no negative zeros, which some readers of JSON may lose."""
     if isinstance(value, Mapping):
         return {key: _plain(entry) for key, entry in value.items()}
     if isinstance(value, np.ndarray):
         return _plain(value.tolist())
     if isinstance(value, list):
-        return [_plain(entry) for entry in value]
+        return [_plain(entry) for entry in value] or None
     return value + 0.0 if isinstance(value, float) else value

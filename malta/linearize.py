@@ -1,6 +1,10 @@
 """Plant at an operating point -> linear model, by CasADi's exact derivatives.
 
 xi' = A xi + B v,   p = C xi          eq. (19), xi = (q, q'), the uncontrolled states dropped
+
+Between samples currents are held that were commutated for the last reading y_k, and the machine moves on: then
+
+xi' = A xi + B v + E (y_k - C xi)     E = 0 where forces do not depend on the position, as MALTA's in its own axes
 """
 
 from __future__ import annotations
@@ -21,16 +25,17 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class LinearModel:
-    """xi' = A xi + B v, p = C xi, about `operating_point`. A is n x n, B n x m, C p x n."""
+    """xi' = A xi + B v, p = C xi, about `operating_point`. A is n x n, B n x m, C p x n, E n x p."""
 
     plant: Plant
     operating_point: OperatingPoint
     A: FloatArray
     B: FloatArray
     C: FloatArray
+    E: FloatArray
 
     def __post_init__(self) -> None:
-        for name in "ABC":
+        for name in "ABCE":
             object.__setattr__(self, name, readonly(getattr(self, name)))
 
     def __repr__(self) -> str:
@@ -68,12 +73,14 @@ class LinearModel:
         return self.B[len(self.A) // 2 :]
 
 
-def linearize(plant: Plant, point: OperatingPoint) -> LinearModel:
+def linearize(plant: Plant, point: OperatingPoint, believed: Plant | None = None) -> LinearModel:
     """Linearize x' = f(x, u, w), y = h(x, u) at an operating point.
 
     At `plant.at(z=...)` the loads are left out, as v0(z) cancels them; at `trim(plant, z=...)` they act, which
     adds the slopes of the loads and of their balance (for MALTA: m g / Ixx from z into alpha'', the cogging's slope in
     z'', and off the centre z f_D / Ixx in alpha'' and beta'').
+
+    believed : the machine that commutates, where it is another one; the inputs are the forces that it wants
 
     Raises InputError when the point has the wrong size, CheckError when the Jacobian is not finite.
     """
@@ -82,15 +89,39 @@ def linearize(plant: Plant, point: OperatingPoint) -> LinearModel:
         raise InputError(
             plant.name, "operating point", f"x {point.x.shape}, u {point.u.shape}", f"x ({n},), u ({m},)"
         )
-    x, u = ca.SX.sym("x", n), ca.SX.sym("u", m)
-    w = plant.load(x) if point.loaded else ca.SX.zeros(len(plant.disturbances))
-    rate, y = plant.f(x, u, w), plant.h(x, u)
-    derivatives = ca.Function(
-        "derivatives", [x, u], [ca.jacobian(rate, x), ca.jacobian(rate, u), ca.jacobian(y, x)]
-    )
-    A, B, C = (np.array(value) for value in derivatives(point.x, point.u))
+    kind = ca.MX if (believed or plant).tabulated else ca.SX
+    x, u = kind.sym("x", n), kind.sym("u", m)
+    w = plant.load(x) if point.loaded else kind.zeros(len(plant.disturbances))
+    derivatives = ca.Function("derivatives", [x, u], list(jacobians(plant, believed, x, u, w)))
+    A, B, C, E = (np.array(value) for value in derivatives(point.x, point.u))
     keep = list(plant.controlled)
-    A, B, C = A[np.ix_(keep, keep)], B[keep], C[:, keep]
-    if not all(np.isfinite(M).all() for M in (A, B, C)):
+    A, B, C, E = A[np.ix_(keep, keep)], B[keep], C[:, keep], E[keep]
+    if not all(np.isfinite(M).all() for M in (A, B, C, E)):
         raise CheckError(f"{plant.name}: the linear model is not finite at x = {point.x.tolist()}")
-    return LinearModel(plant, point, A, B, C)
+    return LinearModel(plant, point, A, B, C, E)
+
+
+def jacobians(plant: Plant, believed: Plant | None, x: Any, u: Any, w: Any) -> tuple[Any, Any, Any, Any]:
+    """A, B, C, E as expressions of the symbols x and u, for all states.
+
+    A machine that knows itself makes just the inputs that it wants, so B is that of f; another one's currents make
+    other forces, and B holds their ratio. A has the stiffness of what commutation that follows does not cancel: that of
+    coordinates which it leaves out of account, as the planar motor's tilt, or takes from another machine.
+    """
+    C = ca.jacobian(plant.h(x, u), x)
+    kind = type(x)
+    y, v, i = kind.sym("y", C.shape[0]), kind.sym("v", *u.shape), kind.sym("i", len(plant.actuator.coils))
+    rate, made = plant.f(x, u, w), plant.forces(x, i)
+    wanted = (believed or plant).currents(y, v)
+    here = [plant.h(x, u), u]
+    (carried,) = ca.substitute([wanted], [y, v], here)
+
+    def at(expression: Any) -> Any:
+        return ca.substitute([expression], [y, v, i], [*here, carried])[0]
+
+    from_i = ca.jacobian(made, i)
+    G = ca.jacobian(rate, u)
+    turned = at(from_i @ ca.jacobian(wanted, y))  # forces from the reading
+    A = ca.jacobian(rate, x) + G @ (at(ca.jacobian(made, x)) + turned @ C)
+    B = G if believed is None else G @ at(from_i @ ca.jacobian(wanted, v))
+    return A, B, C, G @ turned

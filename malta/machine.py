@@ -7,20 +7,22 @@
 
 The state is (machine, controller). What stands in them depends on the fidelity, i.e. on what makes the forces:
 
-    force   forces follow their commands as first-order lags at the current loops' crossover, exactly
+    force   currents of the coils follow their commands as first-order lags at the current loops' crossover, exactly
     dq      PI loops and windings in the axes of the transformation; voltage limit of the half-bridges, induced
             voltage and its feedforward, DC link
-    phase   the same controllers, on every winding: phase currents, duty cycles, star points
+    phase   the same controllers, on every winding: phase currents, duty cycles, star points; or the machine's own
+            electronics, where these run many times in a sample
 
-    machine     x; then forces | axis currents, link voltage | phase currents, link voltage
+    machine     x; then coil currents | axis currents, link voltage | phase currents, link voltage or electronics
     controller  xi_pred, e, frozen; PI integrals and their limits; last y and held commands (faults); commands under way
 
-The one sample of delay stands between the control law and the forces in `force`, and between the current
+The one sample of delay stands between the control law and the coils in `force`, and between the current
 controllers and the windings in `dq` and `phase`, where computation really takes its time.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
@@ -30,9 +32,9 @@ import casadi as ca
 import numpy as np
 
 from malta import electric
-from malta.controller import Controller, commanded, estimated, gains_of
-from malta.data import plant_of, twins_of, units_of
-from malta.plant import Plant, symbolic
+from malta.controller import Controller, CurrentLoop, commanded, estimated, gains_of
+from malta.data import plant_of, shaping, twins_of, units_of
+from malta.plant import Electronics, Plant, symbolic
 
 if TYPE_CHECKING:
     from malta.plant import FloatArray
@@ -56,6 +58,8 @@ class Setup:
     real_pwm: bool = False  # duty cycles in steps, dead time
     turning: bool = False  # current controllers in axes that turn with the forces, as printed
     outside: bool = False  # the estimate comes from outside
+    open_loop: bool = False  # no feedback: what is fed forward, commutated for the reference
+    electronics: Any = None  # options of the machine's own electronics
 
 
 class Layout(NamedTuple):
@@ -72,7 +76,7 @@ class Parts(NamedTuple):
 
     sense: ca.Function  # (state, given, noise, theta) -> y, position for v0(z)
     decide: ca.Function  # (state, given, y, v0, theta) -> controller, held, row
-    substep: ca.Function  # (machine, held, given, theta) -> machine
+    substep: ca.Function  # (machine, held, given, fast noise, theta) -> machine
     theta: tuple[str, ...]  # names of the numbers, an entry for each
 
 
@@ -80,20 +84,22 @@ class Parts(NamedTuple):
 def layout(plant: Plant, c: Controller, s: Setup) -> Layout:
     """What stands where."""
     n, m, p = len(c.states), len(c.forces), len(c.measurements)
-    axes, phases = len(plant.drive.axes), len(plant.drive.phases)
-    electric_state = {
-        "force": {"force": m},
-        "dq": {"i": axes, "link": 1},
-        "phase": {"i_phase": phases, "link": 1},
-    }[s.fidelity]
+    coils, fast = len(plant.actuator.coils), electronics_of(plant, s)
+    axes, phases = _windings(plant)
+    driven = s.fidelity != "force" and fast is None
+    electric_state: dict[str, int] = {"i_coil": coils}
+    if fast is not None:
+        electric_state |= fast.state
+    elif s.fidelity != "force":
+        electric_state = {"i": axes, "link": 1} if s.fidelity == "dq" else {"i_phase": phases, "link": 1}
     held = _held(plant, s)
     controller = {"xi_pred": n, "e": p, "frozen": p}
-    if s.fidelity != "force":
+    if driven:
         controller |= {"u_integral": axes, "u_limited": axes}
     if s.faulty:
         controller |= {"y_last": p, "command": held}
     controller |= {"under_way": held * s.delay}
-    given = {"p_ref": p, "dp_ref": p, "v_ff": m, "v_past": n - len(c.A)}
+    given = {"p_ref": p, "dp_ref": p, "v_ff": m, "v_past": n - len(c.A)}  # and zero for disturbances
     if s.disturbed:
         given |= {"w": len(plant.disturbances)}
     if s.faulty:
@@ -101,11 +107,11 @@ def layout(plant: Plant, c: Controller, s: Setup) -> Layout:
     if s.outside:
         given |= {"xi_hat": n}
     row = {"x": len(plant.states), "p": p, "y": p, "xi_hat": n, "v": m, "force": m, "saturated": p}
-    row |= {"contact": len(plant.contacts)}
-    if s.fidelity != "force":
+    row |= {"contact": len(plant.contacts), "current": coils, "met": 1 + (len(fast.flags) if fast else 0)}
+    if driven:
         row |= {"i": axes, "u": axes, "link": 1}
     if s.fidelity == "phase":
-        row |= {"i_phase": phases, "duty": phases}
+        row |= dict.fromkeys(("i_phase", "duty"), phases if driven else coils)
     return Layout({"x": len(plant.states)} | electric_state, controller, given, row)
 
 
@@ -113,15 +119,16 @@ def numbers(
     plant: Plant, c: Controller, substeps: int, errors: Mapping[str, float] | None = None
 ) -> dict[str, ca.DM]:
     """Every number of machine, controller and sensors, by name."""
-    believed = plant_of(c.parameters).actuator
-    machine = {name: ca.DM(getattr(plant.parameters, name)) for name in units_of(plant.parameters)}
+    fixed = shaping(plant.parameters)
+    machine = {k: ca.DM(getattr(plant.parameters, k)) for k in units_of(plant.parameters) if k not in fixed}
+    loop = c.current_loop or CurrentLoop(0.0, 0.0, 0.0)
     known = dict.fromkeys((signal.name for signal in plant.sensor_errors), 0.0) | dict(errors or {})
     return {
         **{f"machine.{name}": ca.DM(value) for name, value in machine.items()},
         **gains_of(c),
-        "believed": ca.DM(list(believed.force_constant)),
-        "Kp": ca.DM(c.current_loop.Kp),
-        "Ki_current": ca.DM(c.current_loop.Ki),
+        "Kp": ca.DM(loop.Kp),
+        "Ki_current": ca.DM(loop.Ki),
+        "rate": ca.DM(c.feedforward.rate),
         "grid_ends": ca.DM([c.feedforward.z_grid[0], c.feedforward.z_grid[-1]]),
         "substep": ca.DM(c.sample_time / substeps),
         "errors": ca.DM(list(known.values())),
@@ -146,11 +153,12 @@ def parts(plant: Plant, c: Controller, s: Setup, values: Mapping[str, ca.DM], *,
         plant, g, theta = numbered(plant, values)
         names = tuple(name for name, symbol in g.items() for _ in range(symbol.nnz()))
     sizes = layout(plant, c, s)
-    machine, controller, given = (_symbols(part) for part in sizes[:3])
+    machine, controller, given = (_symbols(part, ca.SX) for part in sizes[:3])
     state = ca.vertcat(*machine.values(), *controller.values())
     around = ca.vertcat(*given.values())
-    noise, y = ca.SX.sym("noise", len(plant.outputs)), ca.SX.sym("y", len(plant.outputs))
-    v0, held = ca.SX.sym("v0", len(plant.inputs)), ca.SX.sym("held", _held(plant, s))
+    noise, held = ca.SX.sym("noise", len(plant.outputs)), ca.SX.sym("held", _held(plant, s))
+    fast = electronics_of(plant, s)
+    jitter = ca.SX.sym("jitter", 0 if fast is None else fast.noises)
     x = machine["x"]
 
     measured = _measured(plant, s, g, x, noise)
@@ -160,6 +168,21 @@ def parts(plant: Plant, c: Controller, s: Setup, values: Mapping[str, ca.DM], *,
     at = ca.fmax(ca.fmin(measured[plant.stroke_output], last), first)
     sense = ca.Function("sense", [state, around, noise, theta], ca.cse([measured, at]))
 
+    moved = ca.cse(_moved(plant, s, g, machine, given, held, jitter))
+    substep = ca.Function("substep", [ca.vertcat(*machine.values()), held, around, jitter, theta], [moved])
+    return Parts(sense, _decide(plant, c, s, g, theta, sizes), substep, names)
+
+
+def _decide(
+    plant: Plant, c: Controller, s: Setup, g: Mapping[str, Any], theta: Any, sizes: Layout
+) -> ca.Function:
+    """The function `decide` of Parts: in CasADi's SX; in MX where the controller looks something up in a table."""
+    kind = ca.MX if plant_of(c.parameters).tabulated else ca.SX
+    if kind is ca.MX:
+        g, theta = {name: ca.MX(ca.DM(value)) for name, value in g.items()}, ca.MX(0, 1)
+    machine, controller, given = (_symbols(part, kind) for part in sizes[:3])
+    y, v0 = kind.sym("y", len(plant.outputs)), kind.sym("v0", len(plant.inputs))
+    x = machine["x"]
     after, command, row = _decided(plant, c, s, g, machine, controller, given, y, v0)
     row = {"x": x, "p": plant.h(x, 0), "y": y, "contact": plant.contact(x)} | row
     decided = [
@@ -167,10 +190,18 @@ def parts(plant: Plant, c: Controller, s: Setup, values: Mapping[str, ca.DM], *,
         command,
         ca.vertcat(*(row[name] for name in sizes.row)),
     ]
-    decide = ca.Function("decide", [state, around, y, v0, theta], ca.cse(decided))
-    moved = ca.cse(_moved(plant, s, g, machine, given, held))
-    substep = ca.Function("substep", [ca.vertcat(*machine.values()), held, around, theta], [moved])
-    return Parts(sense, decide, substep, names)
+    state = ca.vertcat(*machine.values(), *controller.values())
+    arguments = [state, ca.vertcat(*given.values()), y, v0, theta]
+    if kind is ca.SX:
+        return ca.Function("decide", arguments, ca.cse(decided))
+    # Functions of MX take symbols: the parts are cut out of whole vectors.
+    whole = [ca.MX.sym("state", *arguments[0].shape), ca.MX.sym("given", *arguments[1].shape)]
+    pieces = []
+    for vector, sizes_of in zip(whole, ({**sizes.machine, **sizes.controller}, sizes.given), strict=True):
+        pieces += ca.vertsplit(vector, np.cumsum([0, *sizes_of.values()]).tolist())
+    symbols = [*machine.values(), *controller.values(), *given.values()]
+    decided = ca.substitute(decided, symbols, pieces)
+    return ca.Function("decide", [*whole, y, v0, ca.MX.sym("theta", 0, 1)], decided)
 
 
 def numbered(plant: Plant, values: Mapping[str, ca.DM]) -> tuple[Plant, dict[str, Any], Any]:
@@ -181,18 +212,21 @@ def numbered(plant: Plant, values: Mapping[str, ca.DM]) -> tuple[Plant, dict[str
 
 
 def initial(plant: Plant, c: Controller, s: Setup, x: Any, xi_pred: Any, current: Any) -> Any:
-    """State with the machine at x, these currents of the inputs (A) flowing, and the observer at xi_pred."""
-    drive, actuator = plant.drive, plant.actuator
-    force = ca.SX(current) * ca.vertcat(*actuator.force_constant)
-    values: dict[str, Any] = {"x": x, "force": force, "link": drive.link_voltage, "xi_pred": xi_pred}
-    values |= {"y_last": plant.h(ca.SX(x), 0), "command": force}
-    if s.fidelity != "force":
-        i, e, T = drive.command(ca.SX(current)), drive.emf(ca.SX(x)), drive.to_phases(ca.SX(x))
+    """State with the machine at x, these currents of the coils (A) flowing, and the observer at xi_pred."""
+    actuator, fast = plant.actuator, electronics_of(plant, s)
+    x, current = ca.SX(x), ca.SX(current)
+    values: dict[str, Any] = {"x": x, "i_coil": current, "xi_pred": xi_pred}
+    values |= {"y_last": plant.h(x, 0), "command": current}
+    if fast is not None:
+        values |= fast.start(x, current) | {"command": fast.held(current, plant.h(x, 0))}
+    elif s.fidelity != "force":
+        drive = plant.drive
+        i, e, T = drive.command(current), drive.emf(x), drive.to_phases(x)
         share = (actuator.R * i + e) / drive.link_voltage
-        values |= {"i": i, "i_phase": T @ i, "u_integral": actuator.R * i}
+        values |= {"i": i, "i_phase": T @ i, "u_integral": actuator.R * i, "link": drive.link_voltage}
         if s.turning:
             believed = plant_of(c.parameters)
-            Q = believed.drive.turned(ca.SX(current) * ca.DM(list(believed.actuator.force_constant)))
+            Q = believed.drive.turned(believed.forces(x, current))
             values["u_integral"] = Q @ values["u_integral"]
         values["command"] = share if s.fidelity == "dq" else 0.5 + T @ share
     values["under_way"] = ca.repmat(values["command"], s.delay, 1)
@@ -204,43 +238,70 @@ def initial(plant: Plant, c: Controller, s: Setup, x: Any, xi_pred: Any, current
 @lru_cache(maxsize=32)
 def initial_state(plant: Plant, c: Controller, s: Setup) -> ca.Function:
     """`initial` as a function of numbers: (x, xi_pred, current) -> state."""
-    sizes = (len(plant.states), len(c.states), len(plant.inputs))
+    sizes = (len(plant.states), len(c.states), len(plant.actuator.coils))
     arguments = [ca.SX.sym(name, size) for name, size in zip(("x", "xi_pred", "current"), sizes, strict=True)]
     return ca.Function("initial", arguments, [initial(plant, c, s, *arguments)])
 
 
 def chained(p: Parts, c: Controller, substeps: int, block: int) -> ca.Function:
-    """A block of samples on CasADi's virtual machine: (state, inputs) -> (states, rows); inputs = given, noise."""
-    state, given = ca.SX.sym("state", p.sense.size1_in(0)), ca.SX.sym("given", p.sense.size1_in(1))
-    noise = ca.SX.sym("noise", p.sense.size1_in(2))
-    y, v0 = ca.SX.sym("y", p.decide.size1_in(2)), ca.SX.sym("v0", p.decide.size1_in(3))
-    controller, held, row = p.decide(state, given, y, v0, ca.SX(0, 1))
-    machine = state[: p.substep.size1_in(0)]
-    for _ in range(substeps):
-        machine = p.substep(machine, held, given, ca.SX(0, 1))
-    inputs = ca.vertcat(given, noise)
-    before = ca.Function("before", [state, inputs], p.sense(state, given, noise, ca.SX(0, 1)))
-    rest = ca.Function("rest", [state, inputs, y, v0], [ca.vertcat(machine, controller), ca.densify(row)])
+    """A block of samples on CasADi's virtual machine: (state, inputs) -> (states, rows).
+
+    inputs = given, noise, and the fast noise of all substeps.
+    """
+    state, given = ca.MX.sym("state", p.sense.size1_in(0)), ca.MX.sym("given", p.sense.size1_in(1))
+    noise = ca.MX.sym("noise", p.sense.size1_in(2))
+    jitters = [ca.MX.sym("jitter", p.substep.size1_in(3)) for _ in range(substeps)]
+    inputs = ca.vertcat(given, noise, *jitters)
+    S, U = ca.MX.sym("state", state.numel()), ca.MX.sym("inputs", inputs.numel())
+    edges = np.cumsum([0, given.numel(), noise.numel(), *(j.numel() for j in jitters)]).tolist()
+    given, noise, *jitters = ca.vertsplit(U, edges)
+    measured, at = p.sense(S, given, noise, ca.DM(0, 1))
     # v0(z) is a table, which scalar expressions cannot look up.
     table = ca.interpolant("table", "linear", [c.feedforward.z_grid], c.feedforward.v0.ravel())
-    S, U = ca.MX.sym("state", state.numel()), ca.MX.sym("inputs", inputs.numel())
-    measured, at = before(S, U)
-    return ca.Function("step", [S, U], rest(S, U, measured, table(at))).mapaccum("chain", block)
+    controller, held, row = p.decide(S, given, measured, table(at), ca.DM(0, 1))
+    machine = S[: p.substep.size1_in(0)]
+    for jitter in jitters:
+        machine = p.substep(machine, held, given, jitter, ca.DM(0, 1))
+    after = ca.vertcat(machine, controller)
+    return ca.Function("step", [S, U], [after, ca.densify(row)]).mapaccum("chain", block)
 
 
-def _symbols(sizes: Mapping[str, int]) -> dict[str, Any]:
-    return {name: ca.SX.sym(name, size) for name, size in sizes.items()}
+def electronics_of(plant: Plant, s: Setup) -> Electronics | None:
+    """The machine's own electronics, where a setup has them."""
+    if s.fidelity != "phase" or plant.electronics is None:
+        return None
+    return plant.electronics(s.electronics)
+
+
+def fidelities(plant: Plant) -> tuple[Fidelity, ...]:
+    """The fidelities that there are of a machine."""
+    if plant.windings is not None:
+        return FIDELITIES
+    return ("force",) if plant.electronics is None else ("force", "phase")
+
+
+def _windings(plant: Plant) -> tuple[int, int]:
+    """Axes and phases of the drive."""
+    drive = plant.windings
+    return (0, 0) if drive is None else (len(drive.axes), len(drive.phases))
+
+
+def _symbols(sizes: Mapping[str, int], kind: Any) -> dict[str, Any]:
+    return {name: kind.sym(name, size) for name, size in sizes.items()}
 
 
 def _symbolic_parameters(plant: Plant, g: Mapping[str, Any]) -> Any:
-    par = plant.parameters
-    symbols = {name: g[f"machine.{name}"] for name in units_of(par)}
+    par, fixed = plant.parameters, shaping(plant.parameters)
+    symbols = {name: g[f"machine.{name}"] for name in units_of(par) if name not in fixed}
     return symbolic(par, symbols | {name: symbols[twin] for name, twin in twins_of(par).items()})
 
 
 def _held(plant: Plant, s: Setup) -> int:
-    sizes = {"force": plant.inputs, "dq": plant.drive.axes, "phase": plant.drive.phases}
-    return len(sizes[s.fidelity])
+    fast = electronics_of(plant, s)
+    if fast is not None:
+        return fast.held_size
+    axes, phases = _windings(plant)
+    return {"force": len(plant.actuator.coils), "dq": axes, "phase": phases}[s.fidelity]
 
 
 def _measured(plant: Plant, s: Setup, g: Mapping[str, Any], x: Any, noise: Any) -> Any:
@@ -275,23 +336,37 @@ def _decided(
     C = _scheduled_C(c, y) if s.scheduled else None
     xi_hat = given["xi_hat"] if s.outside else estimated(g, controller["xi_pred"], y, C)
     p_ref, dp_ref, v_ff = (given[name] for name in ("p_ref", "dp_ref", "v_ff"))
-    xi_ref = ca.vertcat(state_reference(plant_of(c.parameters))(p_ref, dp_ref), given["v_past"])
+    believed = plant_of(c.parameters)
+    half = len(c.A) // 2
+    faster = ca.vertcat(ca.DM(half, 1), g["rate"] @ dp_ref)
+    xi_ref = ca.vertcat(state_reference(believed)(p_ref, dp_ref) + faster, given["v_past"])
     e_now, frozen_now = controller["e"], controller["frozen"]
     xi_pred, e, frozen, v = commanded(g, xi_hat, e_now, frozen_now, y, p_ref, xi_ref, v_ff, v0)
+    if s.open_loop:
+        v = v_ff + v0
     after: dict[str, Any] = {"xi_pred": xi_pred, "e": e, "frozen": frozen}
-    # The gain file's force constants turn forces into currents, the machine limits those and makes its own forces.
-    limit = plant.actuator.current_limit
-    current = ca.fmax(ca.fmin(v / g["believed"], limit), -limit)
-    row: dict[str, Any] = {"xi_hat": xi_hat, "v": v, "saturated": frozen}
-    if s.fidelity == "force":
-        command = _held_if_missed(s, given, controller, current * ca.vertcat(*plant.actuator.force_constant))
-        row["force"] = machine["force"]
+    # The gain file's machine turns forces into currents, the simulated one limits those and makes its own forces.
+    place = p_ref if s.open_loop else y
+    wanted = believed.currents(place, v)
+    current, fast = plant.limited(wanted), electronics_of(plant, s)
+    met = [ca.mmax(ca.fabs(current - wanted)) > 0]
+    row: dict[str, Any] = {"xi_hat": xi_hat, "v": v, "saturated": frozen, "current": current}
+    if fast is not None:
+        command = _held_if_missed(s, given, controller, fast.held(current, place))
+        electric_state = {name: machine[name] for name in fast.state}
+        met.append(fast.met(electric_state))
+        row |= {"i_phase": machine["i_coil"], "duty": fast.duty(electric_state)}
+        row["force"] = plant.forces(machine["x"], machine["i_coil"])
+    elif s.fidelity == "force":
+        command = _held_if_missed(s, given, controller, current)
+        row["force"] = plant.forces(machine["x"], machine["i_coil"])
     else:
         command, electrics, more = _current_control(
             plant, c, s, g, machine, controller, given, current, xi_hat
         )
         after |= electrics
         row |= more
+    row["met"] = ca.vertcat(*met)
     if s.faulty:
         after = {name: ca.if_else(given["missed"], controller[name], value) for name, value in after.items()}
         after |= {"y_last": y, "command": command}
@@ -336,6 +411,7 @@ def _current_control(
     They run once a control period, as on the machine, where both have 50 us.
     """
     believed, drive = plant_of(c.parameters), plant.drive
+    known = believed.drive
     estimate = ca.SX.zeros(len(believed.states))  # where the controller takes the machine to be
     for k, index in enumerate(believed.controlled):
         estimate[index] = xi_hat[k]
@@ -346,19 +422,19 @@ def _current_control(
         i, i_phase = machine["i"], None
     else:
         i_phase = machine["i_phase"]
-        i = believed.drive.to_axes(estimate) @ i_phase
-    error = believed.drive.command(current) - i
-    Q = believed.drive.turned(current * g["believed"]) if s.turning else ca.SX.eye(len(drive.axes))
+        i = known.to_axes(estimate) @ i_phase
+    error = known.command(current) - i
+    Q = known.turned(believed.forces(estimate, current)) if s.turning else ca.SX.eye(len(drive.axes))
     waiting = controller["u_limited"]
     integral = controller["u_integral"] + g["Ki_current"] * g["control_time"] * (1 - waiting) * (Q @ error)
-    u = g["Kp"] * error + Q.T @ integral + believed.drive.emf(estimate)
+    u = g["Kp"] * error + Q.T @ integral + known.emf(estimate)
     row: dict[str, Any] = {"link": V, "i": i}
     if s.fidelity == "dq":
         command, limited = electric.modulation(drive, u, V)
         command = _held_if_missed(s, given, controller, command)
         row |= {"u": command * V, "force": drive.force(i)}
     else:
-        u_phase = believed.drive.to_phases(estimate) @ u
+        u_phase = known.to_phases(estimate) @ u
         command, limits = electric.duty_cycles(drive, u_phase, V, i_phase, real_pwm=s.real_pwm)
         limited = ca.vertcat(*_axes_limited(drive, limits))
         command = _held_if_missed(s, given, controller, command)
@@ -390,8 +466,9 @@ def _moved(
     machine: Mapping[str, Any],
     given: Mapping[str, Any],
     held: Any,
+    jitter: Any,
 ) -> Any:
-    """One Runge–Kutta step of the machine under held commands."""
+    """One Runge–Kutta step of the machine under held commands, or a period of its electronics."""
     h = g["substep"]
     outside = (
         given["w"] if s.disturbed else ca.SX(len(plant.disturbances), 1)
@@ -401,14 +478,16 @@ def _moved(
         w = plant.load(x) + outside
         return plant.f(x, inputs, w + plant.bearing(x) if s.bearing else w)
 
-    x = machine["x"]
-    if s.fidelity == "force":  # the lag is solved exactly: force = v + (force_0 - v) e^(-w_c t)
-        lag = machine["force"] - held
-        decay = ca.exp(-plant.actuator.crossover * h / 2)
-        forces = [held + lag, held + decay * lag, held + decay**2 * lag]
+    x, fast = machine["x"], electronics_of(plant, s)
+    if fast is not None:
+        own = {name: machine[name] for name in fast.state}
+        x, i, own = fast.move(x, machine["i_coil"], own, held, plant.load(x) + outside, jitter)
+        return ca.vertcat(x, i, *(own[name] for name in fast.state))
+    if s.fidelity == "force":
+        currents = _lagging(plant.actuator.crossover, machine["i_coil"], held, h)
         half = len(plant.states) // 2
-        moved = runge_kutta(lambda x, halves: motion(x, forces[halves]), x, h, half)
-        return ca.vertcat(moved, forces[2])
+        moved = runge_kutta(lambda x, n: motion(x, plant.forces(x, currents[n])), x, h, half)
+        return ca.vertcat(moved, currents[2])
     n, count = len(plant.states), machine["i" if s.fidelity == "dq" else "i_phase"].numel()
     slope = _axis_slope if s.fidelity == "dq" else _phase_slope
 
@@ -418,6 +497,14 @@ def _moved(
         return ca.vertcat(motion(x, forces), electrics)
 
     return runge_kutta(rate, ca.vertcat(*machine.values()), h, n // 2)
+
+
+def _lagging(crossover: Any, i: Any, held: Any, h: Any) -> list[Any]:
+    """Currents at the beginning, the middle and the end of a step, exactly: i = held + (i_0 - held) e^(-w_c t)."""
+    if isinstance(crossover, float) and math.isinf(crossover):
+        return [held] * 3
+    lag, decay = i - held, ca.exp(-crossover * h / 2)
+    return [held + lag, held + decay * lag, held + decay**2 * lag]
 
 
 def runge_kutta(rate: Callable[[Any, int], Any], z: Any, h: Any, positions: int = 0) -> Any:

@@ -18,7 +18,7 @@ import numpy as np
 
 from malta import machine
 from malta.controller import Controller
-from malta.data import twins_of, units_of
+from malta.data import shaping, twins_of, units_of
 from malta.engine import LANES, evaluate, feedforward_table, in_lanes, run_many
 from malta.errors import InputError
 from malta.noise import GAMMA, keys
@@ -99,11 +99,13 @@ def simulate_many(
     setup = setup_of(plant, controller, scenario)
     if setup.outside:
         raise InputError(where, "estimator", scenario.estimator, "steady-state in a campaign")
+    if machine.electronics_of(plant, setup) is not None:
+        raise InputError(where, "fidelity", "phase", f"force in a campaign of a {plant.name}")
     if workers is not None and workers < 1:
         raise InputError("campaign", "workers", str(workers), "at least 1")
     runs = _count(plant, changes, sensor_errors or {})
-    if "T_d" in changes:
-        raise InputError("campaign", "T_d", "a delay for each run", "one for all: it shapes the functions")
+    for name in set(changes) & set(shaping(plant.parameters)):
+        raise InputError("campaign", name, "another one for each run", "one for all: it shapes the functions")
     shape = shape_of(plant, controller, setup)
     digest = _digest(shape)
     compiled = compiled_shape(shape, LANES, digest)
@@ -129,6 +131,7 @@ def simulate_many(
             substeps=scenario.substeps,
             table=ready.table,
             given=ready.given,
+            uniform=plant.uniform,
             keys=ready.keys,
             **lanes,
         )
@@ -224,6 +227,7 @@ def recorded_run(
             substeps=scenario.substeps,
             table=ready.table,
             given=part,
+            uniform=plant.uniform,
             keys=stream,
             digests=kept,
             **ready.lanes,
@@ -335,7 +339,7 @@ def _starts(shape: Any) -> ca.Function:
     """(theta, x, xi_pred, currents) -> the state in which a machine starts, and the noise of its sensors."""
     plant, c, setup = shape.plant, shape.controller, shape.setup
     symbolic, _, theta = machine.numbered(plant, machine.numbers(plant, c, 1))
-    sizes = {"x": len(plant.states), "xi_pred": len(c.states), "current": len(plant.inputs)}
+    sizes = {"x": len(plant.states), "xi_pred": len(c.states), "current": len(plant.actuator.coils)}
     beginning = [ca.SX.sym(name, size) for name, size in sizes.items()]
     first = machine.initial(symbolic, c, setup, *beginning)
     noise = ca.densify(ca.vertcat(*symbolic.noise))

@@ -20,7 +20,7 @@ import numpy as np
 from scipy.stats import qmc
 
 from malta.controller import Controller
-from malta.data import plant_of, twins_of, units_of
+from malta.data import plant_of, shaping, twins_of, units_of
 from malta.encodings import decode
 from malta.errors import InputError
 from malta.experiments import Wanted, cases_of
@@ -136,9 +136,9 @@ def _check_spread(plan: Plan, units: Mapping[str, str]) -> None:
             raise InputError("campaign", where, "an unknown parameter", "one of " + " ".join(units))
         if not 0 <= share < 1:
             raise InputError("campaign", where, f"{100 * share:g} %", "from 0 % to less than 100 %")
-        if name == "T_d":
+        if name in shaping(plan.parameters):
             raise InputError(
-                "campaign", where, "a delay for each run", "one for all: it shapes the functions"
+                "campaign", where, "another one for each run", "one for all: it shapes the functions"
             )
         if share and not getattr(plan.parameters, name):
             raise InputError(

@@ -45,17 +45,19 @@ class Signal(NamedTuple):
 
 @dataclass(frozen=True)
 class Actuator:
-    """What turns a commanded input into a force: a current loop per input, with limits.
+    """The coils that make the inputs: their current loops and limits.
 
     The current loop is a PI controller on 1 / (L s + R), designed for `crossover` and `phase_margin`.
     """
 
-    force_constant: tuple[float, ...]  # N/A, per input
-    current_limit: float  # A
-    voltage_limit: float  # V
+    coils: tuple[Signal, ...]  # their currents, A
+    force_limit: tuple[float, ...]  # of each input, N or N m
+    force_constant: tuple[float, ...]  # N/A, of each input; empty where several share their coils
+    current_limit: float  # A, of each coil
+    voltage_limit: float  # V; inf: none
     R: float  # ohm
     L: float  # H
-    crossover: float  # rad/s
+    crossover: float  # rad/s; inf: currents follow their commands at once
     phase_margin: float  # rad
     sample_time: float  # s
     dead_time: float  # s
@@ -63,11 +65,6 @@ class Actuator:
     def delay(self, Ts: float) -> int:
         """Whole samples between measurement and force: the dead time less the half sample that a hold takes."""
         return max(0, round(self.dead_time / Ts - 0.5))
-
-    @property
-    def force_limit(self) -> FloatArray:
-        """Largest force of each input, N."""
-        return self.current_limit * np.array(self.force_constant)
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,11 +96,33 @@ class Drive:
 
 
 @dataclass(frozen=True, eq=False)
+class Electronics:
+    """Current loops, their sensors and modulators, where they run many times in a sample of the control law.
+
+    A period of theirs is a step of the simulation. `state` stands beside the mover's state and the coil currents.
+    """
+
+    period: float  # s
+    state: Mapping[str, int]  # names and sizes
+    noises: int  # standard normal numbers that a period takes
+    flags: tuple[str, ...]  # limits that may be met, as a result names them
+    held_size: int
+    held: CasadiFn  # (currents commanded, y) -> what the loops are told until the next sample
+    start: CasadiFn  # (x, i) -> state by name, at rest
+    move: CasadiFn  # (x, i, state by name, held, w, noise) -> x, i, state by name, a period later
+    met: CasadiFn  # state by name -> 1 for each flag that was met so far
+    duty: CasadiFn  # state by name -> duty cycle of each coil
+
+
+@dataclass(frozen=True, eq=False)
 class Plant:
     """A machine: equations of motion that CasADi can trace, and the names and units of its signals.
 
     `states` are positions, then their rates in the same order. `uncontrolled` are states that no input
     reaches (the rotation of a tubular mover): simulated, but left out of the design.
+
+    The inputs are forces. `currents` commutates: what the coils shall carry to make them where the sensors say the
+    machine is; it is held until the next sample, while `forces`, what these currents make, go with the machine.
     """
 
     name: str
@@ -117,8 +136,16 @@ class Plant:
     h: CasadiFn  # (x, u) -> y
     load: CasadiFn  # x -> w of gravity and cogging
     position_of: CasadiFn  # y -> controlled positions; the inverse of h at rest
+    preload: CasadiFn  # x -> inputs that the design model stands on
+    currents: CasadiFn  # (y, inputs) -> currents of the coils, A
+    forces: CasadiFn  # (x, currents of the coils) -> inputs
+    limited: CasadiFn  # currents of the coils -> the same within their limits
+    tabulated: bool  # `currents` looks something up in a table: CasADi MX alone
     actuator: Actuator
-    drive: Drive
+    windings: Drive | None  # None: fidelity force, and phase where there are electronics
+    electronics: (
+        Callable[[Any], Electronics] | None
+    )  # by the options of the machine; None: those of the drive
     contacts: tuple[str, ...]  # what the moving part may touch
     contact: CasadiFn  # x -> share of each clearance that is used up; 1 at contact
     cushioned: tuple[bool, ...]  # which contacts the touchdown bearings hold
@@ -126,12 +153,23 @@ class Plant:
     sense: CasadiFn  # (x, errors) -> y as the sensors' own signals give it, before noise
     sensor_errors: tuple[Signal, ...]
     noise: tuple[float, ...]  # of each sensor, rms of a sample, in the unit of each output
+    uniform: bool  # whether it is uniform, or else normal
     resolution: tuple[float, ...]  # of each sensor; 0 where it has none to speak of
-    mass: float  # moved by the `thrust` input, for the feedforward m z''
+    inertia: tuple[
+        float, ...
+    ]  # of each input, fed forward times the second derivative of the same output; 0: not
+    mass: float  # moved by the `thrust` input
     thrust: str  # the input that drives the stroke
     stroke: str  # the output that the stroke moves
     travel: float  # of that output, either way, m
     variant: Callable[[Any], Plant]  # the same machine with other parameters
+
+    @property
+    def drive(self) -> Drive:
+        """The windings. InputError for a machine without a model of them."""
+        if self.windings is None:
+            raise InputError(self.name, "drive", "none", "a machine whose windings are modelled")
+        return self.windings
 
     @property
     def controlled(self) -> tuple[int, ...]:
@@ -159,11 +197,13 @@ class Plant:
         return [s.name for s in self.inputs].index(self.thrust)
 
     def at(self, /, **positions: float) -> OperatingPoint:
-        """The operating point at these states (SI), the others zero, without preload.
+        """The operating point at these states (SI), the others zero, at the preload of the design model.
 
         The loads are taken as cancelled at every position, as v0(z) does. `plant.at(z=5e-3)`
         """
-        return OperatingPoint(self._state(positions), np.zeros(len(self.inputs)), loaded=False)
+        x = self._state(positions)
+        u = np.array(ca.DM(self.preload(ca.DM(x))), dtype=float).ravel()
+        return OperatingPoint(x, u, loaded=False)
 
     def _state(self, values: Mapping[str, float]) -> FloatArray:
         names = [s.name for s in self.states]

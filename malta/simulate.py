@@ -11,17 +11,27 @@ import io
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import lru_cache, partial
+from functools import cache, lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
 import casadi as ca
 import numpy as np
+from scipy.special import erf
 
 from malta import machine, references
 from malta.controller import Controller, gains_of
-from malta.data import plant_of, twins_of, units_of
-from malta.engine import Engine, compiled_engine, evaluate, feedforward_table, library, source, virtual_engine
+from malta.data import plant_of, shaping, twins_of, units_of
+from malta.engine import (
+    Engine,
+    compiled_engine,
+    evaluate,
+    feedforward_table,
+    library,
+    source,
+    substeps_until,
+    virtual_engine,
+)
 from malta.errors import InputError
 from malta.files import replace_files
 from malta.machine import FIDELITIES, Fidelity, Parts, Setup
@@ -95,6 +105,8 @@ class Scenario:
     scheduled: bool = False  # C(z) of the measured z in the steady-state filter
     faults: tuple[Fault, ...] = ()
     correction: Correction | None = None
+    open_loop: bool = False  # no feedback: what is fed forward, commutated for the reference
+    electronics: Any = None  # options of the machine's own electronics (fidelity phase), where it has some
     changes: tuple[
         tuple[float, Mapping[str, float]], ...
     ] = ()  # s: parameters of the machine (SI) from then on
@@ -184,7 +196,8 @@ class Verdict(NamedTuple):
 class Trajectory:
     """Labelled time series, one row a sample, up to the verdict. SI.
 
-    Axis currents, their voltages and the link voltage are empty in fidelity `force`; phases in all but `phase`.
+    Axis currents, their voltages and the link voltage are empty in fidelity `force`; phases in all but `phase`; of
+    machines with electronics of their own the phases are the coils.
     """
 
     plant: Plant
@@ -202,6 +215,8 @@ class Trajectory:
     force: FloatArray  # k x m, acting forces, N
     saturated: FloatArray  # k x m, 1 where the command was limited
     contact: FloatArray  # k x contacts, share of each clearance that is used up
+    current: FloatArray  # k x coils, commanded, A
+    met: FloatArray  # k x limits, 1 where one was met: of the coil currents, then those of the electronics until then
     i: FloatArray  # k x axes, A
     u: FloatArray  # k x axes, V
     link: FloatArray  # k x 1, V
@@ -213,21 +228,26 @@ class Trajectory:
             object.__setattr__(self, name, readonly(getattr(self, name)))
 
     @property
-    def current(self) -> FloatArray:
-        """Commanded currents, A, k x m: v over the force constants that the controller believes in."""
-        return np.asarray(self.v / np.array(plant_of(self.controller.parameters).actuator.force_constant))
+    def limits(self) -> tuple[str, ...]:
+        """The limits that were met on the way, by name."""
+        fast = machine.electronics_of(self.plant, setup_of(self.plant, self.controller, self.scenario))
+        names = ("current limit", *(fast.flags if fast is not None else ()))
+        met = [name for name, column in zip(names, self.met.T, strict=True) if column.any()]
+        return (*(["force limit"] if self.saturated.any() else []), *met)
 
     @property
     def copper_loss(self) -> FloatArray:
         """Heat in the windings, W, k: sum of R i^2 over phases or, with its weights, over axes."""
         if self.i_phase.size:
             return np.asarray(self.plant.actuator.R * (self.i_phase**2).sum(axis=1))
+        if self.plant.windings is None:
+            return np.asarray(self.plant.actuator.R * (self.current**2).sum(axis=1))
         return np.asarray(self.plant.actuator.R * self.axis_currents**2 @ np.array(self.plant.drive.weight))
 
     @property
     def electrical_power(self) -> FloatArray:
         """Power into the windings, W, k; empty in fidelity `force`."""
-        if not self.i.size:
+        if not self.i.size or self.plant.windings is None:
             return np.empty(0)
         delay = min(setup_of(self.plant, self.controller, self.scenario).delay, len(self.u) - 1)
         acting = np.vstack([np.repeat(self.u[:1], delay, axis=0), self.u[: len(self.u) - delay]])
@@ -236,7 +256,7 @@ class Trajectory:
     @property
     def axis_currents(self) -> FloatArray:
         """Currents of the transformation's axes, A, k x axes; in fidelity `force` what the forces take."""
-        if self.i.size:
+        if self.i.size or self.plant.windings is None:
             return self.i
         drive, constants = self.plant.drive, np.array(self.plant.actuator.force_constant)
         symbol = ca.SX.sym("i", len(constants))
@@ -244,7 +264,10 @@ class Trajectory:
         return evaluate(axes.map(len(self.force)), self.force / constants)[0]
 
 
-SERIES = ("p", "y", "x", "xi_hat", "v", "force", "saturated", "contact", "i", "u", "link", "i_phase", "duty")
+SERIES = (
+    *("p", "y", "x", "xi_hat", "v", "force", "saturated", "contact", "current", "met"),
+    *("i", "u", "link", "i_phase", "duty"),
+)
 
 
 def simulate(
@@ -272,6 +295,8 @@ def simulate(
     samples = len(t)
     stages = _stages(plant, scenario, controller.sample_time)
     noise = _noise(stages, scenario, t)
+    steps = substeps_of(plant, controller, setup, scenario)
+    fast = _fast_noise(plant, setup, scenario, substeps_until(samples, steps))
     x, xi_pred, current = beginning(plant, controller, scenario, given[0])
     start = machine.initial_state(plant, controller, setup)
     state = evaluate(start, x, xi_pred, current)[0].ravel()
@@ -285,8 +310,9 @@ def simulate(
             now = next(p for first, p in reversed(stages) if first <= done)
             run = engine_of(now, controller, setup, scenario.substeps, _errors(scenario), engine)
             part = given[done:stop]
+            jitter = fast[substeps_until(done, steps) : substeps_until(stop, steps)]
             if observer is None:
-                state, rows = run.run(state, part, noise[done:stop])
+                state, rows = run.run(done, state, part, noise[done:stop], jitter)
             else:
                 state, rows = observer(run, now, state, part, noise[done:stop])
             rows, verdict = _judged(plant, controller, setup, rows, t[done:stop])
@@ -386,6 +412,16 @@ def setup_of(plant: Plant, c: Controller, s: Scenario) -> Setup:
     if "open phase" in kinds and s.fidelity != "phase":
         found = f"an open phase at fidelity {s.fidelity}"
         raise InputError(f"scenario {s.name}", "faults", found, "fidelity phase")
+    able = machine.fidelities(plant)
+    if s.fidelity not in able:
+        expected = "one of " + ", ".join(able) + f" for a {plant.name}"
+        raise InputError(f"scenario {s.name}", "fidelity", s.fidelity, expected)
+    own = plant.electronics is not None and s.fidelity == "phase"
+    if s.electronics is not None and not own:
+        found = f"options of electronics at fidelity {s.fidelity}"
+        raise InputError(f"scenario {s.name}", "electronics", found, "a machine that has some, at phase")
+    if own and (s.real_pwm or s.bearing_axes == "turning" or "open phase" in kinds or "link sag" in kinds):
+        raise InputError(f"scenario {s.name}", "fidelity", "options of a drive", "those of the electronics")
     known = [signal.name for signal in plant.sensor_errors]
     for name, value in (s.sensor_errors or {}).items():
         if name not in known:
@@ -405,7 +441,15 @@ def setup_of(plant: Plant, c: Controller, s: Scenario) -> Setup:
         real_pwm=s.real_pwm,
         turning=s.bearing_axes == "turning" and s.fidelity != "force",
         outside=s.estimator != "steady-state",
+        open_loop=s.open_loop,
+        electronics=s.electronics,
     )
+
+
+def substeps_of(plant: Plant, c: Controller, setup: Setup, s: Scenario) -> float:
+    """Steps of the simulation in a sample: the scenario's, or the periods of the machine's electronics."""
+    fast = machine.electronics_of(plant, setup)
+    return s.substeps if fast is None else c.sample_time / fast.period
 
 
 def _errors(scenario: Scenario) -> tuple[tuple[str, float], ...]:
@@ -431,7 +475,8 @@ def shape_of(plant: Plant, c: Controller, setup: Setup) -> _Shape:
         (m.shape, *m.sparsity().get_triplet()[0], *m.sparsity().get_triplet()[1])
         for m in gains_of(c).values()
     )
-    return _Shape((kin, twins, patterns, c.parameters), plant, c, setup)
+    fixed = tuple(shaping(par).items())
+    return _Shape((type(par), kin, twins, fixed, patterns, c.parameters), plant, c, setup)
 
 
 @lru_cache(maxsize=32)
@@ -440,6 +485,8 @@ def compiled_shape(
 ) -> tuple[Any, Parts] | None:
     """The library for a shape; None where it cannot be compiled."""
     c = shape.controller
+    if plant_of(c.parameters).tabulated:
+        return None
     p = machine.parts(shape.plant, c, shape.setup, machine.numbers(shape.plant, c, 1), constant=False)
     lib = library(source(p, digest), lanes)
     return None if lib is None else (lib, p)
@@ -456,17 +503,24 @@ def engine_of(
 ) -> Engine:
     """What runs the control periods of this machine: compiled where possible, else CasADi's virtual machine."""
     values = machine.numbers(plant, c, substeps, dict(errors))
+    fast = machine.electronics_of(plant, setup)
+    steps = substeps if fast is None else c.sample_time / fast.period
     if choice != "virtual machine":
         found = compiled_shape(shape_of(plant, c, setup))
         if found is not None:
             lib, p = found
             ff = c.feedforward
             table = feedforward_table(ff.z_grid, ff.v0)
-            return compiled_engine(lib.run, p, machine.flat(values), substeps, table)
+            return compiled_engine(lib.run, p, machine.flat(values), steps, table)
         if choice == "compiled":
+            if plant_of(c.parameters).tabulated:
+                raise InputError(
+                    "simulate", "engine", "a controller that looks up a table", "virtual machine"
+                )
             raise InputError("simulate", "engine", "no C compiler that works", "cc, gcc or clang, or $CC")
     p = machine.parts(plant, c, setup, values, constant=True)
-    return virtual_engine(machine.chained(p, c, substeps, 1 if setup.outside else BLOCK))
+    block = 1 if setup.outside or fast is not None else BLOCK
+    return virtual_engine(cache(lambda count: machine.chained(p, c, count, block)), steps)
 
 
 def _observer(plant: Plant, c: Controller, scenario: Scenario, setup: Setup) -> Any:
@@ -550,7 +604,15 @@ def _given(
 ) -> FloatArray:
     """What every sample is given, in the order of machine.layout."""
     v_ff = feedforward(c, motion, scenario.feedforward)
-    past = [np.vstack([np.repeat(v_ff[:1], age, axis=0), v_ff[:-age]]) for age in range(c.delay, 0, -1)]
+    stored = v_ff
+    if c.delay:  # and what currents commutated for the reference make, in the row of the newest stored force
+        n, m = len(c.A), len(c.forces)
+        newest = n + m * (c.delay - 1)
+        states = evaluate(machine.state_reference(plant_of(c.parameters)).map(len(t)), motion.p, motion.dp)[0]
+        stored = v_ff + states @ c.Ad[newest : newest + m, :n].T
+    past = [np.vstack([np.repeat(stored[:1], age, axis=0), stored[:-age]]) for age in range(c.delay, 0, -1)]
+    if c.observed:
+        past.append(np.zeros_like(v_ff))
     parts = {"p_ref": motion.p, "dp_ref": motion.dp, "v_ff": v_ff}
     if past:
         parts["v_past"] = np.hstack(past)
@@ -564,15 +626,14 @@ def _given(
 
 
 def feedforward(c: Controller, motion: references.Motion, choice: FeedforwardChoice = "axial") -> FloatArray:
-    """v_ff, N, k x m: mass z*'' on the thrust, as the paper; "attraction" adds the forces that hold the mover at q*.
+    """v_ff, N, k x m: inertia p*'' + speed p*'; "attraction" adds the forces that hold the mover at q*.
 
     With state feedback alone a mover that is pulled with stiffness k and held with K1 goes to K1 / (K1 - k) of what is
     asked, until the integrals have taken it back: twice as far at K1 = 2 k. From the file's own model q'' = k q + G v,
     these forces are -G^-1 k q*.
     """
     believed = plant_of(c.parameters)
-    v_ff = np.zeros((len(motion.p), len(c.forces)))
-    v_ff[:, believed.thrust_input] = c.feedforward.mass * motion.ddp[:, believed.stroke_output]
+    v_ff = c.feedforward.inertia * motion.ddp + motion.dp @ c.feedforward.speed.T
     if choice == "attraction":
         half = len(c.A) // 2
         hold = -np.linalg.lstsq(c.B[half:], c.A[half:, :half], rcond=None)[0]
@@ -633,6 +694,8 @@ def _noise(stages: list[tuple[int, Plant]], scenario: Scenario, t: FloatArray) -
     drawn: FloatArray = np.zeros((len(t), len(plant.outputs)))
     if scenario.noise:
         drawn = normals(keys(scenario.seed, np.array([scenario.run]))[0], *drawn.shape)
+        if plant.uniform:
+            drawn = math.sqrt(3) * erf(drawn / math.sqrt(2))
         for k, (first, now) in enumerate(stages):
             last = stages[k + 1][0] if k + 1 < len(stages) else len(t)
             drawn[first:last] *= scenario.noise * np.array(now.noise)
@@ -647,8 +710,16 @@ def _noise(stages: list[tuple[int, Plant]], scenario: Scenario, t: FloatArray) -
     return drawn
 
 
+def _fast_noise(plant: Plant, setup: Setup, scenario: Scenario, periods: int) -> FloatArray:
+    """Standard normal numbers for the electronics, a row for each of their periods."""
+    fast = machine.electronics_of(plant, setup)
+    if fast is None or not fast.noises:
+        return np.zeros((periods, 0))
+    return normals(keys(scenario.seed, np.array([-1 - scenario.run]))[0], periods, fast.noises)
+
+
 def beginning(plant: Plant, c: Controller, scenario: Scenario, first: FloatArray) -> tuple[FloatArray, ...]:
-    """x, xi_pred and the currents of the inputs (A) at the start.
+    """x, xi_pred and the currents of the coils (A) at the start.
 
     On the reference and moving with it, or as the scenario says; the observer knows it, and v0 acts, unless it is cold.
     """
@@ -657,12 +728,23 @@ def beginning(plant: Plant, c: Controller, scenario: Scenario, first: FloatArray
     design = [s.name for s in plant.design_states]
     moving = evaluate(machine.state_reference(believed), first[:p], first[p : 2 * p])[0].ravel()
     x = plant.at(**(dict(zip(design, moving.tolist(), strict=True)) | dict(scenario.start))).x
-    xi_pred, current = np.zeros(n), np.zeros(len(plant.inputs))
+    xi_pred, current = np.zeros(n), np.zeros(len(plant.actuator.coils))
     if not scenario.cold:
         xi_pred[: len(design)] = x[list(plant.controlled)]
-        position = float(x[plant.stroke_state])
-        current = c.feedforward.at(position) / np.array(believed.actuator.force_constant)
+        held = c.feedforward.at(float(x[plant.stroke_state]))
+        xi_pred[len(design) : len(design) + c.delay * len(held)] = first[2 * p + len(held) :][
+            : c.delay * len(held)
+        ]
+        current = np.array(_commutated(believed)(plant.h(ca.DM(x), 0), held)).ravel()
     return x, xi_pred, current
+
+
+@lru_cache(maxsize=16)
+def _commutated(believed: Plant) -> ca.Function:
+    """(y, v) -> currents of the coils, as a function of numbers."""
+    kind = ca.MX if believed.tabulated else ca.SX
+    y, v = kind.sym("y", len(believed.outputs)), kind.sym("v", len(believed.inputs))
+    return ca.Function("currents", [y, v], [ca.densify(believed.currents(y, v))])
 
 
 def integration_error(run: Trajectory) -> float:
@@ -716,7 +798,8 @@ def _reached(t: FloatArray, share: FloatArray, level: float) -> float:
 
 def save(run: Trajectory, path: str | Path) -> Path:
     """Write the time series as .npz: t, and a named array for every kind of signal with the names of its columns."""
-    path = Path(path)
+    path, drive = Path(path), run.plant.windings
+    axes, phases = ((), run.plant.actuator.coils) if drive is None else (drive.axes, drive.phases)
     columns = {
         "reference": run.plant.outputs,
         "p": run.plant.outputs,
@@ -726,11 +809,12 @@ def save(run: Trajectory, path: str | Path) -> Path:
         "v": run.plant.inputs,
         "force": run.plant.inputs,
         "saturated": run.plant.inputs,
-        "i": run.plant.drive.axes,
-        "u": tuple(Signal(s.name.replace("i_", "u_"), "V") for s in run.plant.drive.axes),
+        "current": run.plant.actuator.coils,
+        "i": axes,
+        "u": tuple(Signal(s.name.replace("i_", "u_"), "V") for s in axes),
         "link": (Signal("V_link", "V"),),
-        "i_phase": run.plant.drive.phases,
-        "duty": tuple(Signal(s.name.replace("i_", "d_"), "1") for s in run.plant.drive.phases),
+        "i_phase": phases,
+        "duty": tuple(Signal(s.name.replace("i_", "d_"), "1") for s in phases),
     }
     arrays: dict[str, Any] = {"t": run.t, "verdict": np.array([run.verdict.name])}
     for name, signals in columns.items():

@@ -16,6 +16,7 @@ import math
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from dataclasses import field as dataclass_field
 from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
@@ -59,6 +60,9 @@ class Weights:
     q_i_base: FloatArray  # p, m s
     process_variance: FloatArray  # m, N2, of the forces held over a sample
     sensor_variance: FloatArray  # p, m2, of each sample
+    drift_variance: FloatArray = dataclass_field(
+        default_factory=lambda: np.zeros(0)
+    )  # m, N2: how far a constant force of disturbance goes in a sample; none: the filter observes none
 
     def __post_init__(self) -> None:
         for name in self.__dataclass_fields__:
@@ -99,6 +103,26 @@ class Weights:
     def Q_i(self) -> FloatArray:
         """Weight of the error integrals, p x p, 1/(m s)2."""
         return np.diag(self.q_i / self.q_i_base**2)
+
+
+@dataclass(frozen=True, eq=False)
+class Pid:
+    """Gains of a PID controller for each output and the input of the same index."""
+
+    Kp: FloatArray  # m, N/m
+    Ki: FloatArray  # m, N/(m s)
+    Kd: FloatArray  # m, N s/m
+    filter: float  # s, time constant of the measured rate; 0: plain differences
+
+    def __post_init__(self) -> None:
+        for name in ("Kp", "Ki", "Kd"):
+            value = readonly(getattr(self, name))
+            object.__setattr__(self, name, value)
+            if value.ndim != 1 or not np.isfinite(value).all() or value.shape != np.shape(self.Kp):
+                raise InputError("Pid", name, str(value.tolist()), "finite numbers, one for each input")
+        object.__setattr__(self, "filter", float(self.filter))
+        if not 0 <= self.filter < math.inf:
+            raise InputError("Pid", "filter", f"{self.filter} s", "a time of 0 s or more")
 
 
 @dataclass(frozen=True)
@@ -161,7 +185,7 @@ class Spec:
     discretization: Discretization
     delay: int  # samples between measurement and force in the design model
     current_loop_delay: bool  # whether the current loops are designed with the machine's dead time
-    weights: Weights
+    law: Weights | Pid  # of an LQG, or the gains of a PID
     uncertainty: Mapping[str, float]  # relative, either way, by parameter
     specification: Specification = Specification()
     search: tuple[Variable, ...] = ()
@@ -172,20 +196,33 @@ class Spec:
         """The machine that the controller is designed for."""
         return plant_of(self.parameters)
 
-    def varied(self, values: Sequence[float]) -> Weights:
-        """The weights with these values (in their own units) of the variables of the search."""
-        fields = {name: np.array(getattr(self.weights, name)) for name in self.weights.__dataclass_fields__}
+    @property
+    def weights(self) -> Weights:
+        """Of an LQG. InputError for a PID, which has none."""
+        if isinstance(self.law, Pid):
+            raise InputError(self.path, "pid", "a PID controller", "weights, bases and noise of an LQG")
+        return self.law
+
+    @property
+    def pid(self) -> Pid | None:
+        """Gains of a PID; None for an LQG."""
+        return self.law if isinstance(self.law, Pid) else None
+
+    def varied(self, values: Sequence[float]) -> Spec:
+        """The same with these values (in their own units) of the variables of the search."""
+        fields = {name: np.array(getattr(self.law, name)) for name in self.law.__dataclass_fields__}
         for variable, value in zip(self.search, values, strict=True):
             for entry in variable.entries:
                 field, index, unit, squared = _place(entry, self.plant, self.path)
                 si = value if unit == "1" else to_si(value, variable.unit, unit, self.path, entry)
                 fields[field][index] = si * si if squared else si
-        return replace(self.weights, **fields)
+        law: Any = type(self.law)
+        return replace(self, law=law(**fields))
 
     def value_of(self, variable: Variable) -> float:
         """What the file holds now for a variable of the search, in its unit."""
         field, index, unit, squared = _place(variable.entries[0], self.plant, self.path)
-        si = float(getattr(self.weights, field)[index])
+        si = float(np.asarray(getattr(self.law, field))[index])
         si = math.sqrt(si) if squared else si
         return si if unit == "1" else si / to_si(1.0, variable.unit, unit, self.path, variable.name)
 
@@ -214,6 +251,14 @@ class _BasesTable(Record):
 class _NoiseTable(Record):
     process: dict[StrictStr, Quantity]
     sensor: dict[StrictStr, Quantity]
+    drift: dict[StrictStr, Quantity] | None = None
+
+
+class _PidTable(Record):
+    Kp: dict[StrictStr, Quantity]
+    Ki: dict[StrictStr, Quantity]
+    Kd: dict[StrictStr, Quantity]
+    filter: Quantity
 
 
 class _Range(Record):
@@ -249,13 +294,14 @@ class _DesignFile(Record):
     machine: StrictStr
     preset: StrictStr
     sample_time: Quantity
-    discretization: Discretization
-    delay: Annotated[StrictInt, Field(ge=0, le=10)]
+    discretization: Discretization = "sampled-data"
+    delay: Annotated[StrictInt, Field(ge=0, le=10)] = 0
     current_loop_delay: StrictBool
     operating_point: dict[StrictStr, Quantity]
-    weights: _WeightsTable
-    bases: _BasesTable
-    noise: _NoiseTable
+    weights: _WeightsTable | None = None
+    bases: _BasesTable | None = None
+    noise: _NoiseTable | None = None
+    pid: _PidTable | None = None
     uncertainty: dict[StrictStr, Annotated[Finite, Field(gt=0, lt=1)]]
     specification: _SpecificationTable | None = None
     search: _SearchTable | None = None
@@ -275,16 +321,15 @@ def read_design(path: str | Path) -> Spec:
     machine_file = Path(os.path.normpath(path.parent / machine))
     printed = cache(partial(published, machine_file))  # read once, and only where something refers to it
     content = validated(_DesignFile, _resolve(raw, printed, machine_file, path), path)
+    _require_law(content, raw, path)
     par = read(machine_file, content.preset)
     plant = plant_of(par)
-    states, inputs, outputs = plant.design_states, plant.inputs, plant.outputs
-    integrals = [Signal(s.name, f"{s.unit} s") for s in outputs]
-    q, bases, noise = content.weights, content.bases, content.noise
     for name in content.uncertainty:
         if name not in units_of(par):
             raise InputError(path, f"uncertainty.{name}", "an unknown parameter", ", ".join(units_of(par)))
     shaping = json.dumps(
-        content.model_dump(exclude={"summary", "machine", "specification", "search"}), sort_keys=True
+        content.model_dump(exclude={"summary", "machine", "specification", "search"}, exclude_none=True),
+        sort_keys=True,
     )
     Ts = to_si(content.sample_time.value, content.sample_time.unit, "s", path, "sample_time")
     if not Ts > 0:
@@ -294,16 +339,7 @@ def read_design(path: str | Path) -> Spec:
             path, "delay", f"{content.delay} with backward-euler, which has none", "0, or zoh or sampled-data"
         )
     try:
-        weights = Weights(
-            q=_numbers(q.state, states, path, "weights.state", "states"),
-            q_base=_bases(bases.state, states, path, "bases.state", "states"),
-            r=_numbers(q.input, inputs, path, "weights.input", "inputs", above=True),
-            r_base=_bases(bases.input, inputs, path, "bases.input", "inputs"),
-            q_i=_numbers(q.integral, outputs, path, "weights.integral", "measured signals"),
-            q_i_base=_bases(bases.integral, integrals, path, "bases.integral", "measured signals"),
-            process_variance=_variances(noise.process, inputs, path, "noise.process", "inputs"),
-            sensor_variance=_variances(noise.sensor, outputs, path, "noise.sensor", "measured signals"),
-        )
+        law = _weights(content, plant, path) if content.pid is None else _pid(content.pid, plant, path)
     except InputError as error:  # the record does not know the file
         raise InputError(path, error.field, error.found, error.expected) from error
     spec = Spec(
@@ -318,10 +354,68 @@ def read_design(path: str | Path) -> Spec:
         discretization=content.discretization,
         delay=content.delay,
         current_loop_delay=content.current_loop_delay,
-        weights=weights,
+        law=law,
         uncertainty=dict(content.uncertainty),
     )
     return replace(spec, specification=_specification(content, spec), **_search(content.search, raw, spec))
+
+
+LQG = ("discretization", "delay", "weights", "bases", "noise")
+
+
+def _require_law(content: _DesignFile, raw: Mapping[str, Any], path: Path) -> None:
+    """InputError unless the file describes an LQG or a PID, whole and alone."""
+    for name in LQG:
+        if content.pid is None and name not in raw:
+            raise InputError(path, name, "nothing", "this key")
+        if content.pid is not None and name in raw:
+            raise InputError(path, name, "this key beside [pid]", "one of them: an LQG, or a PID")
+
+
+def _weights(content: _DesignFile, plant: Plant, path: Path) -> Weights:
+    states, inputs, outputs = plant.design_states, plant.inputs, plant.outputs
+    integrals = [Signal(s.name, f"{s.unit} s") for s in outputs]
+    q, bases, noise = content.weights, content.bases, content.noise
+    assert q is not None
+    assert bases is not None
+    assert noise is not None
+    drift = {}
+    if noise.drift is not None:
+        drift["drift_variance"] = _variances(noise.drift, inputs, path, "noise.drift", "inputs")
+    return Weights(
+        q=_numbers(q.state, states, path, "weights.state", "states"),
+        q_base=_bases(bases.state, states, path, "bases.state", "states"),
+        r=_numbers(q.input, inputs, path, "weights.input", "inputs", above=True),
+        r_base=_bases(bases.input, inputs, path, "bases.input", "inputs"),
+        q_i=_numbers(q.integral, outputs, path, "weights.integral", "measured signals"),
+        q_i_base=_bases(bases.integral, integrals, path, "bases.integral", "measured signals"),
+        process_variance=_variances(noise.process, inputs, path, "noise.process", "inputs"),
+        sensor_variance=_variances(noise.sensor, outputs, path, "noise.sensor", "measured signals"),
+        **drift,
+    )
+
+
+def _pid(table: _PidTable, plant: Plant, path: Path) -> Pid:
+    gains = {}
+    for name, signals in _pid_signals(plant).items():
+        entries = _ordered(getattr(table, name), signals, path, f"pid.{name}", "inputs")
+        gains[name] = np.array(
+            [
+                to_si(q.value, q.unit, s.unit, path, f"pid.{name}.{s.name}")
+                for q, s in zip(entries, signals, strict=True)
+            ]
+        )
+    return Pid(**gains, filter=to_si(table.filter.value, table.filter.unit, "s", path, "pid.filter"))
+
+
+def _pid_signals(plant: Plant) -> dict[str, list[Signal]]:
+    """The gains of a PID, by input, with their units."""
+    pairs = list(zip(plant.inputs, plant.outputs, strict=True))
+    return {
+        "Kp": [Signal(i.name, f"({i.unit}) / ({o.unit})") for i, o in pairs],
+        "Ki": [Signal(i.name, f"({i.unit}) / ({o.unit}) / s") for i, o in pairs],
+        "Kd": [Signal(i.name, f"({i.unit}) s / ({o.unit})") for i, o in pairs],
+    }
 
 
 def _specification(content: _DesignFile, spec: Spec) -> Specification:
@@ -403,8 +497,10 @@ def _stands(entry: str, raw: Mapping[str, Any]) -> bool:
     return node is not None and (not isinstance(node, Mapping) or "value" in node)
 
 
-def _place(entry: str, plant: Plant, where: Path, field: str = "search") -> tuple[str, int, str, bool]:
-    """Where an entry of the design file stands in Weights: field, index, SI unit, whether as its square."""
+def _place(
+    entry: str, plant: Plant, where: Path, field: str = "search"
+) -> tuple[str, int | tuple[()], str, bool]:
+    """Where an entry of the design file stands in Weights or Pid: field, index, SI unit, whether as its square."""
     integrals = [Signal(s.name, f"{s.unit} s") for s in plant.outputs]
     plain = [Signal(s.name, "1") for s in plant.design_states + plant.inputs + plant.outputs]
     tables: dict[str, tuple[str, Sequence[Signal], bool]] = {
@@ -416,7 +512,11 @@ def _place(entry: str, plant: Plant, where: Path, field: str = "search") -> tupl
         "weights.state": ("q", plain[: len(plant.design_states)], False),
         "weights.input": ("r", plain[len(plant.design_states) :][: len(plant.inputs)], False),
         "weights.integral": ("q_i", plain[-len(plant.outputs) :], False),
+        "noise.drift": ("drift_variance", plant.inputs, True),
     }
+    tables |= {f"pid.{name}": (name, signals, False) for name, signals in _pid_signals(plant).items()}
+    if entry == "pid.filter":
+        return "filter", (), "s", False
     table, _, name = entry.rpartition(".")
     if table not in tables:
         raise InputError(where, field, repr(entry), "an entry as bases.state.x: " + " ".join(tables))
@@ -525,7 +625,7 @@ def _positive(value: float, where: Path, field: str, unit: str) -> float:
 
 
 def _operating_point(entries: Mapping[str, Quantity], plant: Plant, where: Path) -> dict[str, float]:
-    """Along the stroke only: elsewhere the attraction leaves no equilibrium that v0(z) could hold."""
+    """Along the stroke only: elsewhere v0(z) knows no equilibrium."""
     units = {s.name: s.unit for s in plant.design_states if s.name == plant.stroke}
     values = {}
     for name, q in entries.items():

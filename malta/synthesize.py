@@ -10,6 +10,10 @@ Three ways to a sampled controller:
                    what MATLAB calls lqrd and kalmd
 The integrals are the controller's own sums, e+ = e + Ts (p* - y), so their weight is a sum in both sampled ways.
 Noise is given for one sample; held over it (forces) or spread over it (intensity = variance x Ts).
+
+Both sampled ways know what is held between samples: the currents, commutated for the last reading (E of the linear
+model), so that the sampled machine hangs on their spring. In place of integrals, or beside them, the filter may observe
+a constant force of disturbance on each input, which the regulator takes off again.
 """
 
 from __future__ import annotations
@@ -17,12 +21,21 @@ from __future__ import annotations
 import math
 from contextlib import suppress
 from dataclasses import replace
-from typing import TYPE_CHECKING, NamedTuple, Protocol, get_args
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, get_args
 
 import numpy as np
 from scipy import linalg
 
-from malta.controller import Controller, Cost, CurrentLoop, Feedforward, Limits, Noise, stored_forces
+from malta.controller import (
+    Controller,
+    Cost,
+    CurrentLoop,
+    Feedforward,
+    Limits,
+    Noise,
+    disturbances,
+    stored_forces,
+)
 from malta.errors import CheckError, InputError
 from malta.linearize import LinearModel
 from malta.plant import Actuator, Plant, trims
@@ -36,7 +49,7 @@ from malta.riccati import (
     sample_cost,
     sample_noise,
 )
-from malta.spec import Discretization, Spec, Weights
+from malta.spec import Discretization, Pid, Spec, Weights
 
 if TYPE_CHECKING:
     from malta.plant import ComplexArray, FloatArray
@@ -45,7 +58,7 @@ V0_STEP = 0.25e-3  # m, grid of v0(z): interpolation errs by 0.14 % of the coggi
 
 
 class Linear(Protocol):
-    """xi' = A xi + B v, p = C xi: a LinearModel, or the part of one that nothing joins to the rest."""
+    """xi' = A xi + B v + E (y_k - p), p = C xi: a LinearModel, or the part of one that nothing joins to the rest."""
 
     @property
     def A(self) -> FloatArray: ...
@@ -53,6 +66,8 @@ class Linear(Protocol):
     def B(self) -> FloatArray: ...
     @property
     def C(self) -> FloatArray: ...
+    @property
+    def E(self) -> FloatArray: ...
 
 
 class Gains(NamedTuple):
@@ -75,11 +90,13 @@ def lqr(model: Linear, weights: Weights) -> FloatArray:
 def lqi(model: Linear, weights: Weights) -> tuple[FloatArray, FloatArray]:
     """Continuous LQR with the integrals of the measured errors: K (m x n) and Ki (m x p).
 
-    v = K (xi* - xi) + Ki e, e' = p* - p. The Riccati gain on e acts as -K_e e, so Ki = -K_e.
+    v = K (xi* - xi) + Ki e, e' = p* - p. The Riccati gain on e acts as -K_e e, so Ki = -K_e; 0 where nothing weighs e.
     Raises InputError and CheckError as riccati.care.
     """
     _check_sizes(model, weights)
     n, p = len(model.A), len(model.C)
+    if not weights.q_i.any():
+        return lqr(model, weights), np.zeros((model.B.shape[1], p))
     A = np.block([[model.A, np.zeros((n, p))], [-model.C, np.zeros((p, p))]])
     B = np.vstack([model.B, np.zeros((p, model.B.shape[1]))])
     gain = care(A, B, linalg.block_diag(weights.Q, weights.Q_i), weights.R, "LQI").K
@@ -99,22 +116,41 @@ def kalman(model: Linear, weights: Weights) -> FloatArray:
 def continuous_poles(model: LinearModel, weights: Weights) -> dict[str, ComplexArray]:
     """Poles of the continuous LQR, LQI and Kalman filter, rad/s: what the weights ask for, before sampling."""
     p = len(model.C)
-    K, Ki = lqi(model, weights)
-    integrating = np.block([[model.A - model.B @ K, model.B @ Ki], [-model.C, np.zeros((p, p))]])
     poles = {}
     with suppress(CheckError):  # weights on the integrals alone stabilize the LQI only
         poles["LQR"] = eigenvalues(model.A - model.B @ lqr(model, weights))
-    poles |= {
-        "LQR with integrals": eigenvalues(integrating),
-        "Kalman filter": eigenvalues(model.A - kalman(model, weights) @ model.C),
-    }
+    if weights.q_i.any():
+        K, Ki = lqi(model, weights)
+        integrating = np.block([[model.A - model.B @ K, model.B @ Ki], [-model.C, np.zeros((p, p))]])
+        poles["LQR with integrals"] = eigenvalues(integrating)
+    poles["Kalman filter"] = eigenvalues(model.A - kalman(model, weights) @ model.C)
     return {name: np.sort_complex(values) for name, values in poles.items()}
 
 
+class Held(NamedTuple):
+    """A machine between samples, its currents held: x' = A x + B (v + H y_k), y_k the last reading."""
+
+    A: FloatArray
+    H: FloatArray  # m x p, N/m
+
+
+def held(model: Linear) -> Held:
+    """What a linear model is between samples; E is in the reach of the inputs."""
+    if not model.E.any():
+        return Held(model.A, np.zeros((model.B.shape[1], len(model.C))))
+    return Held(model.A - model.E @ model.C, np.linalg.lstsq(model.B, model.E, rcond=None)[0])
+
+
 def sampled_model(model: Linear, Ts: float, delay: int = 0) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Ad, Bd, Cd under a zero-order hold, with the forces of the last `delay` samples as states."""
-    Ad, Bd = delay_inputs(*sample(model.A, model.B, Ts), delay)
-    return Ad, Bd, np.hstack([model.C, np.zeros((len(model.C), len(Ad) - len(model.A)))])
+    """Ad, Bd, Cd under held currents, with the forces of the last `delay` samples as states."""
+    still = held(model)
+    Ad, Bd = delay_inputs(*sample(still.A, model.B, Ts), delay)
+    n, pull = len(model.A), still.H @ model.C
+    if delay:
+        Ad[-len(pull) :, :n] = pull
+    else:
+        Ad = Ad + Bd @ pull
+    return Ad, Bd, np.hstack([model.C, np.zeros((len(model.C), len(Ad) - n))])
 
 
 def gains(
@@ -126,7 +162,15 @@ def gains(
     integrated = discretization == "sampled-data"
     Ad, Bd, Cd = sampled_model(model, Ts, delay)
     K, Ki = _sampled_regulator(model, weights, Ts, delay, integrated=integrated)
-    return Gains(Ad, Bd, Cd, K, Ki, _sampled_filter(model, weights, Ts, delay, integrated=integrated))
+    L = _sampled_filter(model, weights, Ts, delay, integrated=integrated)
+    if weights.drift_variance.size:  # x+ = Ad x + Bd (v + d), d+ = d, and v takes d off
+        n, m, p = len(model.A), model.B.shape[1], len(Cd)
+        pushed = np.zeros((len(Ad), m))
+        pushed[:n] = Ad[:n, n : n + m] if delay else Bd
+        Ad = np.block([[Ad, pushed], [np.zeros((m, len(Ad))), np.eye(m)]])
+        Bd, Cd = np.vstack([Bd, np.zeros((m, m))]), np.hstack([Cd, np.zeros((p, m))])
+        K = np.hstack([K, np.eye(m)])
+    return Gains(Ad, Bd, Cd, K, Ki, L)
 
 
 @np.errstate(all="ignore")  # what overflows is found at the end
@@ -162,62 +206,104 @@ def lqg(
         raise InputError(
             "lqg", "discretization", repr(discretization), "one of " + ", ".join(get_args(Discretization))
         )
-    if delay < 0 or (delay and discretization == "backward-euler"):
+    sampled_only = {"delay": delay, "held currents": model.E.any(), "drift": weights.drift_variance.size}
+    asked = [what for what, given in sampled_only.items() if given]
+    if delay < 0 or (asked and discretization == "backward-euler"):
+        what = str(delay) if delay else asked[0]
         raise InputError(
-            "lqg", "delay", f"{delay} with {discretization}", "0, or more with zoh or sampled-data"
+            "lqg", "delay", f"{what} with {discretization}", "0, or more with zoh or sampled-data"
         )
     _check_sizes(model, weights)
-    Ad, Bd, Cd, K, Ki, L = gains(model, weights, Ts, discretization, delay)
-    if not all(np.isfinite(M).all() for M in (Ad, Bd, K, Ki, L)):
+    found = gains(model, weights, Ts, discretization, delay)
+    if not all(np.isfinite(M).all() for M in found):
         raise CheckError("lqg: the gains overflow")
     plant = model.plant
-    axes = len(plant.inputs)
-    actuator = plant.actuator
-    Kp, Ki_current = pi_current_loop(actuator, actuator.dead_time if current_loop_delay else 0.0)
+    observed = disturbances(plant.inputs) if weights.drift_variance.size else ()
     return Controller(
+        **_machine_part(model, Ts, delay, current_loop_delay=current_loop_delay),
+        **found._asdict(),
         name=name,
-        spec_sha256="",
-        parameters=plant.parameters,
-        operating_point=(model.operating_point.x[list(plant.controlled)], model.operating_point.u),
-        sample_time=Ts,
-        states=plant.design_states + stored_forces(plant.inputs, delay),
-        forces=plant.inputs,
-        measurements=plant.outputs,
-        A=model.A,
-        B=model.B,
-        C=model.C,
-        Ad=Ad,
-        Bd=Bd,
-        Cd=Cd,
-        K=K,
-        Ki=Ki,
-        L=L,
-        feedforward=static_feedforward(plant),
+        states=plant.design_states + stored_forces(plant.inputs, delay) + observed,
         cost=Cost(
             weights.q / weights.q_base**2, weights.r / weights.r_base**2, weights.q_i / weights.q_i_base**2
         ),
-        noise=Noise(weights.process_variance, weights.sensor_variance),
-        current_loop=CurrentLoop(Kp, Ki_current, actuator.sample_time),
-        limits=Limits(
-            current=np.full(axes, actuator.current_limit),
-            voltage=np.full(axes, actuator.voltage_limit),
-            force=actuator.force_limit,
+        noise=Noise(weights.process_variance, weights.sensor_variance, weights.drift_variance),
+    )
+
+
+def _machine_part(model: LinearModel, Ts: float, delay: int, *, current_loop_delay: bool) -> dict[str, Any]:
+    """What of a controller its machine decides, not its law."""
+    plant, actuator = model.plant, model.plant.actuator
+    loop = None
+    if math.isfinite(actuator.crossover):
+        dead_time = actuator.dead_time if current_loop_delay else 0.0
+        loop = CurrentLoop(*pi_current_loop(actuator, dead_time), actuator.sample_time)
+    coils = len(actuator.coils)
+    return {
+        "spec_sha256": "",
+        "parameters": plant.parameters,
+        "operating_point": (model.operating_point.x[list(plant.controlled)], model.operating_point.u),
+        "sample_time": Ts,
+        "forces": plant.inputs,
+        "measurements": plant.outputs,
+        "A": model.A,
+        "B": model.B,
+        "C": model.C,
+        "feedforward": feedforward(model, Ts, delay),
+        "current_loop": loop,
+        "limits": Limits(
+            current=np.full(coils, actuator.current_limit),
+            voltage=np.full(coils, actuator.voltage_limit),
+            force=np.array(actuator.force_limit),
         ),
+    }
+
+
+def pid(
+    model: LinearModel,
+    terms: Pid,
+    Ts: float,
+    *,
+    name: str = "pid",
+    current_loop_delay: bool = True,
+) -> Controller:
+    """A PID controller of each output with the input of the same index.
+
+    v = Kp (p* - y) + Ki e + Kd (p*' - d),  d+ = a d + (1 - a) (y - y_last) / Ts,  a = e^(-Ts / filter)
+
+    Raises InputError for a sample time that is none, or terms of another number than the inputs.
+    """
+    if not (math.isfinite(Ts) and Ts > 0):
+        raise InputError("pid", "Ts", f"{Ts} s", "a sample time above 0 s")
+    plant, half = model.plant, len(model.A) // 2
+    if len(terms.Kp) != len(plant.inputs):
+        raise InputError("pid", "Kp", f"{len(terms.Kp)} gains", f"{len(plant.inputs)}, one for each input")
+    P = model.C[:, :half]
+    back, a = np.linalg.inv(P), math.exp(-Ts / terms.filter) if terms.filter else 0.0
+    delay = plant.actuator.delay(Ts)
+    return Controller(
+        **_machine_part(model, Ts, delay, current_loop_delay=current_loop_delay),
+        name=name,
+        states=plant.design_states,
+        Ad=linalg.block_diag(np.eye(half), a * np.eye(half)),
+        Bd=np.zeros_like(model.B),
+        Cd=model.C,
+        K=np.hstack([terms.Kp[:, None] * P, terms.Kd[:, None] * P]),
+        Ki=np.diag(terms.Ki),
+        L=np.vstack([back, (1 - a) / Ts * back]),
+        cost=None,
+        noise=None,
     )
 
 
 def synthesize(spec: Spec, model: LinearModel) -> Controller:
     """The controller that a design file asks for. Errors name the file."""
+    named: dict[str, Any] = {"name": spec.name, "current_loop_delay": spec.current_loop_delay}
     try:
-        controller = lqg(
-            model,
-            spec.weights,
-            spec.sample_time,
-            spec.discretization,
-            spec.delay,
-            name=spec.name,
-            current_loop_delay=spec.current_loop_delay,
-        )
+        if spec.pid is not None:
+            controller = pid(model, spec.pid, spec.sample_time, **named)
+        else:
+            controller = lqg(model, spec.weights, spec.sample_time, spec.discretization, spec.delay, **named)
     except InputError as error:
         raise InputError(spec.path, f"{error.where}: {error.field}", error.found, error.expected) from error
     except (CheckError, np.linalg.LinAlgError) as error:
@@ -284,11 +370,31 @@ def pi_current_loop(actuator: Actuator, delay: float = 0.0) -> tuple[float, floa
     return Kp, Ki
 
 
+def feedforward(model: LinearModel, Ts: float, delay: int = 0) -> Feedforward:
+    """v0 along the travel, inertias, and what a steady ramp takes where held currents pull back.
+
+    With x = (q, w) at a sample, q going on by Ts P^-1 p*', and currents that are `delay` samples old:
+        Ad (0, w) + Bd (f - H Ts delay p*') = (Ts P^-1 p*', w)
+    """
+    static, half = static_feedforward(model.plant), len(model.A) // 2
+    if not model.E.any():
+        return static
+    still = held(model)
+    Ad, Bd = sample(still.A, model.B, Ts)
+    back = np.linalg.inv(model.C[:, :half])
+    moved = np.vstack([Ts * back, np.zeros_like(back)]) + Bd @ still.H * (Ts * delay)
+    unknown = np.hstack([Ad[:, half:] - np.eye(2 * half)[:, half:], Bd])
+    found = np.linalg.solve(unknown, moved)
+    return replace(static, speed=found[half:], rate=found[:half] - back)
+
+
 def static_feedforward(plant: Plant) -> Feedforward:
-    """v0(z): the forces that hold the machine at each point of its travel against gravity and cogging."""
+    """Inertias, and v0(z): the forces that hold the machine along its travel against gravity and cogging."""
     half = round(plant.travel / V0_STEP)
     z_grid = np.linspace(-plant.travel, plant.travel, 2 * half + 1)
-    return Feedforward(plant.mass, z_grid, trims(plant, plant.stroke, z_grid))
+    m, p, rates = len(plant.inputs), len(plant.outputs), len(plant.controlled) // 2
+    v0 = trims(plant, plant.stroke, z_grid)
+    return Feedforward(np.array(plant.inertia), np.zeros((m, p)), np.zeros((rates, p)), z_grid, v0)
 
 
 def _backward_euler(
@@ -312,19 +418,25 @@ def _sampled_regulator(
     """K, Ki of the sampled model. With delay, a force acts on the states d samples after it is commanded.
 
     Its own weight R Ts may be charged when it is commanded, which shifts a sum and changes no optimum. What is left
-    beside the oldest stored force, Van Loan's integral with R = 0, is positive semidefinite.
+    beside the oldest stored force, Van Loan's integral with R = 0, is positive semidefinite. What acts is v + H y.
     """
     n, m, p, d = len(model.A), model.B.shape[1], len(model.C), delay
+    still, commanded = held(model), weights.R * Ts
     if integrated:
-        Q, N, R = sample_cost(model.A, model.B, weights.Q, weights.R, Ts)
+        Q, N, R = sample_cost(still.A, model.B, weights.Q, weights.R, Ts)
     else:
-        Q, N, R = weights.Q * Ts, np.zeros((n, m)), weights.R * Ts
+        Q, N, R = weights.Q * Ts, np.zeros((n, m)), commanded
     Ad, Bd, Cd = sampled_model(model, Ts, d)
     if d:
         rest = m * (d - 1)
-        commanded = weights.R * Ts
         Q = linalg.block_diag(np.block([[Q, N], [N.T, R - commanded]]), np.zeros((rest, rest)))
         N, R = np.zeros((n + m * d, m)), commanded
+    else:
+        pull, acting = still.H @ model.C, R - commanded
+        Q = Q + N @ pull + pull.T @ N.T + pull.T @ acting @ pull
+        N = N + pull.T @ acting
+    if not weights.q_i.any():
+        return dare(Ad, Bd, Q, R, N, "sampled LQR").K, np.zeros((m, p))
     A, B = add_integrals(Ad, Bd, Cd, Ts)
     gain = dare(
         A, B, linalg.block_diag(Q, weights.Q_i * Ts), R, np.vstack([N, np.zeros((p, m))]), "sampled LQI"
@@ -335,19 +447,28 @@ def _sampled_regulator(
 def _sampled_filter(
     model: Linear, weights: Weights, Ts: float, delay: int, *, integrated: bool
 ) -> FloatArray:
-    """Filter-form Kalman gain. The stored forces are known, so their rows are zero.
+    """Filter-form Kalman gain. The stored forces are known, so their rows are zero; disturbances stand last.
 
-    L = P C' (C P C' + V)^-1 with the covariance P of the prediction.
+    L = P C' (C P C' + V)^-1 with the covariance P of the prediction. The noise of a reading is in the currents that are
+    commutated for it, too; beside what it does through the law that is next to nothing, and left out.
     """
-    V = np.diag(weights.sensor_variance)
-    Ad, Bd = sample(model.A, model.B, Ts)
+    n, m, p = len(model.A), model.B.shape[1], len(model.C)
+    V, C, still = np.diag(weights.sensor_variance), model.C, held(model)
+    Ad, Bd = sample(still.A, model.B, Ts)
     if integrated:
-        W = sample_noise(model.A, model.B * (weights.process_variance * Ts) @ model.B.T, Ts)
+        W = sample_noise(still.A, model.B * (weights.process_variance * Ts) @ model.B.T, Ts)
     else:
         W = Bd * weights.process_variance @ Bd.T
-    P = dare(Ad.T, model.C.T, W, V, what="sampled Kalman filter").X
-    L = np.linalg.solve(model.C @ P @ model.C.T + V, model.C @ P).T
-    return np.vstack([L, np.zeros((delay * model.B.shape[1], len(V)))])
+    if not delay:
+        Ad = Ad + Bd @ still.H @ C
+    drift = weights.drift_variance
+    if drift.size:
+        Ad = np.block([[Ad, Bd], [np.zeros((m, n)), np.eye(m)]])
+        W = np.asarray(linalg.block_diag(W, np.diag(drift)))
+        C = np.hstack([C, np.zeros((p, m))])
+    P = dare(Ad.T, C.T, W, V, what="sampled Kalman filter").X
+    L = np.linalg.solve(C @ P @ C.T + V, C @ P).T
+    return np.vstack([L[:n], np.zeros((delay * m, p)), L[n:]])
 
 
 def _check_sizes(model: Linear, weights: Weights) -> None:
@@ -360,6 +481,7 @@ def _check_sizes(model: Linear, weights: Weights) -> None:
                 f"{len(getattr(weights, field))} entries",
                 f"{size}, one for each of the {what}",
             )
-    for field, size in (("process_variance", m), ("sensor_variance", p)):
+    drifts = m if weights.drift_variance.size else 0
+    for field, size in (("process_variance", m), ("sensor_variance", p), ("drift_variance", drifts)):
         if len(getattr(weights, field)) != size:
             raise InputError("Weights", field, f"{len(getattr(weights, field))} entries", f"{size}")

@@ -138,6 +138,11 @@ class _Part(NamedTuple):
     B: FloatArray
     C: FloatArray
 
+    @property
+    def E(self) -> FloatArray:
+        """Nothing is held between samples here; see `_groups`."""
+        return np.zeros((len(self.A), len(self.C)))
+
 
 class _Law(NamedTuple):
     """s+ = A s + B y, v = C s + D y; s = (xi_pred, e)."""
@@ -209,6 +214,11 @@ def _groups(spec: Spec) -> list[_Group]:
     """The groups of a design's machine, each with what its trials need."""
     plant, Ts = spec.plant, spec.sample_time
     model = linearize(plant, plant.at(**spec.operating_point))
+    if model.E.any():
+        what = f"a {plant.name}, whose currents are held between samples"
+        raise InputError(
+            spec.path, "search", what, "a PID, or a machine whose forces do not depend on where it is"
+        )
     loaded = linearize(plant, trim(plant, **spec.operating_point))
     asked, position = spec.specification, spec.operating_point.get(plant.stroke, 0.0)
     positions = sorted({position, -plant.travel, plant.travel})
@@ -416,7 +426,7 @@ def _clusters(spec: Spec) -> list[_Cluster]:
     middle = [math.sqrt(v.low * v.high) for v in spec.search]
     for index in range(len(spec.search)):
         other = [value * (1.5 if k == index else 1) for k, value in enumerate(middle)]
-        a, b = spec.varied(middle), spec.varied(other)
+        a, b = spec.varied(middle).weights, spec.varied(other).weights
         touched.append({k for k, g in enumerate(groups) if _differ(g.part(a), g.part(b))})
         if not touched[-1]:
             raise InputError(
@@ -437,7 +447,7 @@ def _clusters(spec: Spec) -> list[_Cluster]:
             # Mirror images stay so under every weight that the search tries.
             same = tuple(
                 tuple(tuple(getattr(g.part(w), name).tolist()) for name in Weights.__dataclass_fields__)
-                for w in (base, spec.varied(middle))
+                for w in (base, spec.varied(middle).weights)
             )
             distinct.setdefault((g.picture, same), g)
         clusters.append(_Cluster(variables, tuple(distinct.values())))
@@ -555,7 +565,7 @@ class _Search:
             every = list(self.others)
             for index, value in zip(self.cluster.variables, values, strict=True):
                 every[index] = value
-            weights = self.spec.varied(every)
+            weights = self.spec.varied(every).weights
             return merged([_figures(self.spec, g, weights, self.delay) for g in self.cluster.groups])
 
         return self.journal.get(key, compute)
@@ -733,7 +743,7 @@ def _front(
 
 def found_spec(spec: Spec, trial: Trial) -> Spec:
     """The design with the numbers of a trial."""
-    return replace(spec, weights=spec.varied(trial.values), delay=trial.delay)
+    return replace(spec.varied(trial.values), delay=trial.delay)
 
 
 # ---------------------------------------------------------------------------------------------------------------------

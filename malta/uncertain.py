@@ -14,8 +14,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import casadi as ca
 import numpy as np
 
-from malta.controller import Controller, CurrentLoop, linear_law
-from malta.errors import InputError
+from malta.controller import Controller, CurrentLoop, LinearLaw, handed_on, linear_law
+from malta.errors import CheckError, InputError
+from malta.linearize import jacobians
 from malta.plant import Plant, readonly, symbolic
 from malta.riccati import add_lags, delay_inputs, sample
 
@@ -73,45 +74,44 @@ def uncertain(
     at: Mapping[str, float] | None = None,
     states: bool = False,
     believed: Plant | None = None,
+    held: bool = False,
 ) -> UncertainSystem:
-    """The design model of a plant at a position along its stroke, in parameters by name, without preload.
+    """The design model of a plant at a position along its stroke, in parameters by name, at its preload.
 
     The stroke itself may be one of the names (`z` for MALTA): its nominal value is the position.
-    Inputs are commanded forces: a controller divides by the force constants it knows, the plant multiplies by its own.
+    Inputs are commanded forces: a controller commutates as the machine it knows, the plant's currents make their own.
     at: the position, SI; states: the states follow the outputs in y; believed: the machine that the controller knows,
-    where it is another one.
+    where it is another one; held: currents are held between samples, and the reading that they were commutated for is
+    a further input.
 
     Raises InputError for an unknown name.
     """
-    from malta.data import twins_of, units_of
+    from malta.data import shaping, twins_of, units_of
 
     par = plant.parameters
     known = [*units_of(par), plant.stroke]
     for name in names:
         if name not in known:
             raise InputError("robust_margin", name, "an unknown parameter", "one of " + " ".join(known))
-    x0 = plant.at(**(at or {})).x
+    for name in set(names) & set(shaping(par)):
+        raise InputError("robust_margin", name, "a parameter that shapes the model", "one that enters it")
+    nominal_point = plant.at(**(at or {}))
+    x0 = nominal_point.x
     symbols = {name: ca.SX.sym(name) for name in names}
     p = ca.vertcat(*symbols.values())
     own = {name: symbol for name, symbol in symbols.items() if name != plant.stroke}
     own |= {name: own[twin] for name, twin in twins_of(par).items() if twin in own}
     machine: Plant = plant.variant(symbolic(par, own))
     x, u = ca.SX.sym("x", len(plant.states)), ca.SX.sym("u", len(plant.inputs))
-    rate, y = machine.f(x, u, ca.SX.zeros(len(plant.disturbances))), machine.h(x, u)
     point = ca.SX(x0)
     if plant.stroke in symbols:
         point[plant.stroke_state] = symbols[plant.stroke]
     keep = list(plant.controlled)
-    scale = ca.diag(
-        ca.vertcat(*machine.actuator.force_constant)
-        / ca.DM(list((believed or plant).actuator.force_constant))
-    )
-    jacobians = [
-        ca.jacobian(rate, x)[keep, keep],
-        ca.jacobian(rate, u)[keep, :] @ scale,
-        ca.jacobian(y, x)[:, keep],
-    ]
-    A, B, C = ca.substitute(jacobians, [x, u], [point, ca.SX.zeros(len(plant.inputs))])
+    found = jacobians(machine, believed or plant, x, u, ca.SX.zeros(len(plant.disturbances)))
+    A, B, C, E = ca.substitute(list(found), [x, u], [point, ca.SX(nominal_point.u)])
+    A, B, C, E = A[keep, keep], B[keep, :], C[:, keep], E[keep, :]
+    if held:
+        A, B = A - E @ C, ca.horzcat(B, E)
     if states:
         C = ca.vertcat(C, ca.SX.eye(len(keep)))
     nominal = [x0[plant.stroke_state] if name == plant.stroke else getattr(par, name) for name in names]
@@ -121,6 +121,13 @@ def uncertain(
     return UncertainSystem(tuple(names), readonly(nominal), matrices, True, limits)
 
 
+def holds(plant: Plant) -> bool:
+    """Whether the currents of a machine depend on where they were commutated, so that holding them matters."""
+    kind = ca.MX if plant.tabulated else ca.SX
+    y, v = kind.sym("y", len(plant.outputs)), kind.sym("v", len(plant.inputs))
+    return bool(ca.which_depends(plant.currents(y, v), y, 1, True) != [False] * len(plant.actuator.coils))
+
+
 def _lowest(declared: Mapping[str, Any]) -> float:
     """What a parameter is above, or at least."""
     found = [declared[key] for key in ("above", "at_least") if declared.get(key) is not None]
@@ -128,28 +135,62 @@ def _lowest(declared: Mapping[str, Any]) -> float:
 
 
 def sampled_law(
-    controller: Controller, delay: int, lag: float, loop: CurrentLoop | None = None, R: float = 1.0
+    controller: Controller,
+    delay: int,
+    lag: float,
+    loop: CurrentLoop | None = None,
+    R: float = 1.0,
+    *,
+    held: bool = False,
 ) -> Compensator:
     """The control law of a gain file as the machine runs it: hold, `delay` samples, current loops.
 
     lag : rad/s, crossover of the current loops, taken as first-order lags; with `loop`, the windings' own R / L
     loop : PI controllers of the currents, for windings of resistance R (ohm), sampled with the control law
+    held : for a system whose further inputs are the readings that currents are commutated for
     """
     law, T = linear_law(controller), controller.sample_time
     n, m, half = len(controller.states), len(controller.forces), len(controller.A) // 2
     p = len(law.A) - n
     # Sums of errors and stored forces in the coordinates of the modes, where these decouple.
     to_modes = np.eye(len(law.A))
-    if p == m == half:
-        to_modes[n:, n:] = np.linalg.inv(controller.C[:, :half])
+    if len(controller.measurements) == m == half:
+        if p:
+            to_modes[n:, n:] = np.linalg.inv(controller.C[:, :half])
         for k in range(2 * half, n, m):
             to_modes[k : k + m, k : k + m] = controller.B[half:]
     back = np.linalg.inv(to_modes)
+    law = law._replace(A=to_modes @ law.A @ back, B_y=to_modes @ law.B_y, C=law.C @ back)
+    if controller.observed:
+        p += m
+        law = _integrals_last(law, p)
+    if held:
+        law = handed_on(law)
     c = Compensator(
-        to_modes @ law.A @ back, to_modes @ law.B_y, law.C @ back, law.D_y,
-        integrals=p, sample_time=T, delay=delay, lag=lag,
+        law.A, law.B_y, law.C, law.D_y,
+        integrals=p, sample_time=T, delay=delay, lag=lag if math.isfinite(lag) else None,
     )  # fmt: skip
     return c if loop is None else _with_current_control(c, loop, R, controller.B[half:])
+
+
+def _integrals_last(law: LinearLaw, count: int) -> LinearLaw:
+    """A law that takes off `count` constant disturbances has as many poles at z = 1: these states by themselves, last.
+
+    A (U V) = (U V) diag(A_rest, 1): V spans the null space of A - 1, U what the rest leaves invariant.
+    """
+    A = law.A
+    left, size, right = np.linalg.svd(A - np.eye(len(A)))
+    if size[-count] > 1e-9 * size[0]:
+        raise CheckError(
+            f"the law does not integrate: its pole nearest to z = 1 is off by {size[-count]:.1e}"
+        )
+    V, kept = right[-count:].T, left[:, :-count]  # A - 1 maps all onto `kept`, which it maps onto itself
+    T = np.hstack([kept, V])
+    A = np.linalg.solve(T, A @ T)
+    A[:, -count:] = 0
+    A[-count:] = 0
+    A[-count:, -count:] = np.eye(count)
+    return law._replace(A=A, B_y=np.linalg.solve(T, law.B_y), B_r=np.linalg.solve(T, law.B_r), C=law.C @ T)
 
 
 def _with_current_control(c: Compensator, loop: CurrentLoop, R: float, B2: FloatArray) -> Compensator:

@@ -3,23 +3,25 @@
 The loop is the block diagram of controller.py, sampled: P is the machine from forces to measurements under a
 zero-order hold, exactly; F the control law from measurements to forces (v = F y). At the sensors
     S = (I - P F)^-1,   T = I - S,   L = -P F.
+Where currents are held that were commutated for the last reading, that is one more input of P, and F hands it on.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 
-from malta.controller import Controller, LinearLaw, linear_law
+from malta.controller import Controller, LinearLaw, handed_on, linear_law
 from malta.data import plant_of
 from malta.errors import CheckError, InputError
 from malta.linearize import LinearModel, linearize
 from malta.plant import trim
 from malta.riccati import add_integrals, add_lags, delay_inputs, eigenvalues, sample
 from malta.robust import Margin, robust_margin
-from malta.uncertain import Compensator, sampled_law, uncertain
+from malta.uncertain import Compensator, holds, sampled_law, uncertain
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -37,8 +39,8 @@ class Poles:
     """Poles in rad/s; of sampled systems ln(lambda) / Ts, poles of pure delay left out."""
 
     open_loop: ComplexArray  # of the continuous model
-    regulator: ComplexArray  # of the file's own sampled model with K, Ki
-    filter: ComplexArray  # of the file's own sampled observer
+    regulator: ComplexArray  # of the file's own sampled model with K, Ki; none of a PID
+    filter: ComplexArray  # of the file's own sampled observer; none of a PID
     closed_loop: ComplexArray  # of the machine: hold, delay, current loops, controller
 
     def pairs(self) -> dict[str, list[list[float]]]:
@@ -160,20 +162,25 @@ def loop(
     current_loops : forces follow their commands as a first-order lag at the loops' crossover
     feedforward : v0(z) acts by its slope; for models at their trim, where the loads act by theirs
 
-    The controller divides forces by the force constants that it believes in, the machine multiplies by its own.
+    The controller commutates as the machine that it believes in, the machine's currents make their own forces.
     """
-    A, B, C = model.A, _force_map(model, controller), model.C
-    if current_loops:
-        A, B = add_lags(A, B, model.plant.actuator.crossover)
+    model, law = _commanded(model, controller), linear_law(controller)
+    A, B, C = model.A, model.B, model.C
+    if model.E.any():
+        A, B = A - model.E @ C, np.hstack([B, model.E])
+    lag = model.plant.actuator.crossover
+    if current_loops and math.isfinite(lag):
+        A, B = add_lags(A, B, lag)
     Ad, Bd = delay_inputs(*sample(A, B, controller.sample_time), delay)
     Cd = np.hstack([C, np.zeros((len(C), len(Ad) - C.shape[1]))])
-    law = linear_law(controller)
     if feedforward:
         m, plant = len(controller.forces), model.plant
         slope = np.zeros((m, len(C)))
         position = float(model.operating_point.x[plant.stroke_state])
         slope[:, plant.stroke_output] = controller.feedforward.slope(position)
         law = law._replace(B_y=law.B_y + law.B_r[:, -m:] @ slope, D_y=law.D_y + law.D_r[:, -m:] @ slope)
+    if model.E.any():
+        law = handed_on(law)
     return Loop(Ad, Bd, Cd, law, controller.sample_time)
 
 
@@ -189,17 +196,44 @@ def machine_loop(model: LinearModel, controller: Controller) -> Loop:
     return loop(loaded, controller, delay=delay, current_loops=True, feedforward=True)
 
 
-def _force_map(model: LinearModel, controller: Controller) -> FloatArray:
-    """B for commanded forces: the machine's force constants over those that the controller believes in."""
-    believed = plant_of(controller.parameters).actuator.force_constant
-    return np.asarray(model.B * (np.array(model.plant.actuator.force_constant) / np.array(believed)))
+def _commanded(model: LinearModel, controller: Controller) -> LinearModel:
+    """The model whose inputs are the forces that the controller wants of the machine it believes in."""
+    believed = plant_of(controller.parameters)
+    if believed is model.plant:
+        return model
+    return linearize(model.plant, model.operating_point, believed)
 
 
 def own_poles(c: Controller) -> tuple[ComplexArray, ComplexArray]:
-    """Eigenvalues in z of regulator and filter on the controller's own model (separation principle)."""
-    A, B = add_integrals(c.Ad, c.Bd, c.Cd, c.sample_time)
-    regulator = eigenvalues(A - B @ np.hstack([c.K, -c.Ki]))
-    return regulator, eigenvalues((np.eye(len(c.Ad)) - c.L @ c.Cd) @ c.Ad)
+    """Eigenvalues in z of regulator and filter on the controller's own model (separation principle).
+
+    Forces of disturbance are for the filter to follow, not for the regulator to move.
+    """
+    k = len(c.Ad) - c.observed * len(c.forces)
+    A, B, K = c.Ad[:k, :k], c.Bd[:k], c.K[:, :k]
+    if c.integrating:
+        A, B = add_integrals(A, B, c.Cd[:, :k], c.sample_time)
+        K = np.hstack([K, -c.Ki])
+    return eigenvalues(A - B @ K), eigenvalues((np.eye(len(c.Ad)) - c.L @ c.Cd) @ c.Ad)
+
+
+def unstable_gain(c: Controller) -> tuple[str, float] | None:
+    """Which gains leave the file's own model unstable, and the size of the worst eigenvalue; None: none do.
+
+    An LQG is judged by its regulator and its filter. A PID has no model: it is judged on the machine that it names.
+    """
+    if c.cost is None:
+        plant = plant_of(c.parameters)
+        names = [s.name for s in plant.design_states]
+        point = plant.at(**dict(zip(names, c.operating_point[0].tolist(), strict=True)))
+        found = {"K": eigenvalues(machine_loop(linearize(plant, point), c).closed)}
+    else:
+        found = dict(zip("KL", own_poles(c), strict=True))
+    for name, poles in found.items():
+        radius = float(np.abs(poles).max())
+        if not radius < 1:
+            return name, radius
+    return None
 
 
 def verify(
@@ -228,7 +262,8 @@ def _verify(model: LinearModel, controller: Controller, uncertainty: Mapping[str
     }
     names = [s.name for s in controller.measurements]
     stages = tuple(_stage(name, stage, names) for name, stage in loops.items())
-    regulator, observer = own_poles(controller)
+    empty = np.zeros(0, dtype=complex)
+    regulator, observer = (empty, empty) if controller.cost is None else own_poles(controller)
     poles = Poles(
         open_loop=_sorted(eigenvalues(model.A)),
         regulator=_continuous(regulator, controller.sample_time),
@@ -247,10 +282,12 @@ def machine_law(plant: Plant, controller: Controller, current_loops: CurrentLoop
     """
     if current_loops not in get_args(CurrentLoops):
         raise InputError("verify", "current_loops", repr(current_loops), "lag or pi")
-    a = plant.actuator
+    a, held = plant.actuator, holds(plant)
     delay = a.delay(controller.sample_time)
-    if current_loops == "lag":
-        return sampled_law(controller, delay, a.crossover)
+    if current_loops == "lag" or controller.current_loop is None:
+        return sampled_law(controller, delay, a.crossover, held=held)
+    if held:
+        raise InputError("verify", "current_loops", "pi", f"lag: a {plant.name} controls its currents faster")
     return sampled_law(controller, delay, a.R / a.L, controller.current_loop, a.R)
 
 
@@ -266,8 +303,19 @@ def travel_margin(
     """
     over = {plant.stroke: (-plant.travel, plant.travel)}
     believed = plant_of(controller.parameters)
-    system = uncertain(plant, [*ranges, plant.stroke], at={plant.stroke: 0.0}, believed=believed)
-    return robust_margin(system, machine_law(plant, controller, current_loops), ranges, over)
+    law, held = machine_law(plant, controller, current_loops), holds(plant)
+    if not held:
+        system = uncertain(plant, [*ranges, plant.stroke], at={plant.stroke: 0.0}, believed=believed)
+        return robust_margin(system, law, ranges, over)
+    # Currents that are held for a position make waves along the travel: no polynomials, so it is proven in places.
+    found = []
+    for z in sorted({sign * share * plant.travel for share in PLACES for sign in (-1, 1)}):
+        system = uncertain(plant, list(ranges), at={plant.stroke: z}, believed=believed, held=True)
+        found.append(robust_margin(system, law, ranges))
+    return min(found, key=lambda m: (m.lower is not None, m.lower, m.upper))
+
+
+PLACES = (0.0, 1 / 3, 2 / 3, 1.0)  # shares of the travel, either way
 
 
 def require_stable(margins: Margins, name: str) -> None:
@@ -313,7 +361,8 @@ def _bandwidths(
     model: LinearModel, controller: Controller, machine: Loop, *, stable: bool
 ) -> dict[str, float]:
     n = len(model.A) // 2
-    closed = _force_map(model, controller)[n:] @ controller.K[:, :n] - model.stiffness
+    own = _commanded(model, controller)
+    closed = own.force_map @ controller.K[:, :n] - own.stiffness
     w_n = np.sqrt(np.maximum(eigenvalues(closed).real, 0))
     natural = {"w_n_max": float(w_n.max()), "w_n_min": float(w_n.min())}
     if not stable:

@@ -181,7 +181,7 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "all of it": ({"spread": {"m": 1.0}}, "spread m: found 100 %"),
     "NaN": ({"spread": {"m": math.nan}}, "spread m: found nan %"),
-    "a delay": ({"spread": {"T_d": 0.1}}, "spread T_d: found a delay for each run"),
+    "a delay": ({"spread": {"T_d": 0.1}}, "spread T_d: found another one for each run"),
     "of nothing": ({"spread": {"phi_c": 0.1}}, "spread phi_c: found phi_c = 0"),
     "twins apart": ({"spread": {"I_xx": 0.1, "I_yy": 0.2}}, "spread I_yy: found another one than I_xx's"),
     "no spread": ({"spread": {}, "sensor_spread": {}}, "spread: found nothing"),

@@ -255,13 +255,22 @@ def test_design_without_names_takes_the_folder(
         ((TS, 'sample_time = { value = 10, unit = "s" }'), 1, "overflow"),
         ((PROCESS, f"process = {forces('1e200')}"), 2, "noise.process.fx_B1: found inf"),
         ((PROCESS, f"process = {forces('1e-200')}"), 2, "noise.process.fx_B1: found 0"),
-        ((INTEGRAL, "integral = { x1 = 0, y1 = 0, x2 = 0, y2 = 0, z = 0 }"), 1, "LQI: "),
+        ((INTEGRAL, "integral = { x1 = 1, y1 = 0, x2 = 0, y2 = 0, z = 0 }"), 1, "LQI: "),
         ((INPUT_BASES, f"input = {forces('1e200')}"), 2, "bases: found [1e+200, "),
         ((INPUT_BASES, f"input = {forces('1e-200')}"), 2, "bases: found [1e-200, "),
         ((INPUT_BASES, 'input = "metric"'), 2, "bases.input: found 'metric'"),
         (("delay = 0 ", 'delay = 0\n"a\\nb" = 3 '), 2, "a b: found an unknown key"),
     ],
-    ids=["10 s", "loud", "silent", "no integrals", "large bases", "small bases", "metric", "two lines"],
+    ids=[
+        "10 s",
+        "loud",
+        "silent",
+        "an integral of one axis",
+        "large bases",
+        "small bases",
+        "metric",
+        "two lines",
+    ],
 )
 def test_design_that_cannot_be_computed_names_its_file(
     run: Run, tmp_path: Path, base: str, design: tuple[str, str], code: int, found: str
@@ -281,7 +290,7 @@ def test_design_that_cannot_be_computed_names_its_file(
         ((TS, 'sample_time = { value = 5, unit = "ms" }'), ("", ""), "is unstable, |lambda| = 1."),
         (("", ""), (R_MAX, "r_max  = { value = 0.001,"), "touchdown at sensor plane"),
         (
-            (INTEGRAL, "integral = { x1 = 0, y1 = 0, x2 = 0, y2 = 0, z = 0 }"),
+            (INTEGRAL, "integral = { x1 = 1, y1 = 0, x2 = 0, y2 = 0, z = 0 }"),
             ("", ""),
             "LQI: ",
         ),

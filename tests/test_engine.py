@@ -34,6 +34,7 @@ SIXTYFOURTHS = st.integers(-512, 512).map(
 OPERATIONS = """ADD SUB MUL DIV INV NEG SQ TWICE SQRT FABS FLOOR CEIL SIGN FMOD FMIN FMAX LT LE EQ NE NOT AND OR
 IF_ELSE_ZERO SIN COS TAN ASIN ACOS ATAN ATAN2 SINH COSH TANH EXP LOG POW CONSTPOW HYPOT"""
 NO_NOISE = np.zeros((1, 1))
+NOT_FAST = np.zeros((0, 0))
 TABLE = engine.feedforward_table(np.array([-1.0, 0.0, 1.0]), np.array([[-1.0], [0.0], [3.0]]))
 
 
@@ -66,7 +67,7 @@ def _parts(row: Callable[[Any, Any, Any], Any]) -> tuple[Parts, ca.Function]:
     parts = Parts(
         ca.Function("sense", [state, around, noise, theta], [noise, around[0]]),
         ca.Function("decide", [state, around, y, v0, theta], [state[STATES], v0, ca.vertcat(expression, v0)]),
-        ca.Function("substep", [state[:STATES], held, around, theta], [state[:STATES]]),
+        ca.Function("substep", [state[:STATES], held, around, ca.SX(0, 1), theta], [state[:STATES]]),
         tuple(f"theta{k}" for k in range(THETA)),
     )
     kept = ca.SX.sym("kept", rest.numel())
@@ -94,7 +95,8 @@ def _trial(row: Callable[[Any, Any, Any], Any]) -> Trial:
 def _run_one(trial: Trial, state: Any, given: FloatArray, theta: Any) -> FloatArray:
     """The rows that one lane leaves, without the last column: v0 of the table."""
     run = engine.compiled_engine(trial.one.run, trial.parts, np.array(theta, dtype=float), 1, TABLE)
-    _, rows = run.run(np.append(np.array(state, dtype=float), 0.0), given, np.zeros((len(given), 1)))
+    begin = np.append(np.array(state, dtype=float), 0.0)
+    _, rows = run.run(0, begin, given, np.zeros((len(given), 1)), NOT_FAST)
     return rows[:, :-1]
 
 
@@ -121,6 +123,7 @@ def _digests(
         table=table,
         states=start,
         given=np.ascontiguousarray(given),
+        uniform=False,
         sigma=np.zeros((1, 1, LANES)),
         keys=np.zeros((1, LANES), dtype=np.uint64),
         digests=digests,
@@ -385,7 +388,7 @@ def test_constants_are_any_numbers(tmp_path: Path) -> None:
     assert lib is not None, "it does not compile"
     run = engine.compiled_engine(lib.run, parts, np.zeros(THETA), 1, TABLE).run
     for value in (-1e9, 0.0, 1e9):
-        _, rows = run(np.array([value, 0, 0, 0]), np.zeros((1, GIVEN)), NO_NOISE)
+        _, rows = run(0, np.array([value, 0, 0, 0]), np.zeros((1, GIVEN)), NO_NOISE, NOT_FAST)
         assert rows[0, :-1].tolist() == [min(value, n) for n in numbers]
 
 
@@ -407,7 +410,7 @@ def test_what_depends_on_constants_alone_is_computed_once() -> None:
 def test_the_table_is_linear_between_its_points(waves: Trial, z: float, start: float) -> None:
     """v0 of a grid that is looked up from wherever the search stood before: numpy's interpolation."""
     run = engine.compiled_engine(waves.one.run, waves.parts, np.zeros(THETA), 1, TABLE).run
-    _, rows = run(np.zeros(STATES + 1), np.array([[start, 0, 0], [z, 0, 0.0]]), np.zeros((2, 1)))
+    _, rows = run(0, np.zeros(STATES + 1), np.array([[start, 0, 0], [z, 0, 0.0]]), np.zeros((2, 1)), NOT_FAST)
     inside = [np.clip(at, -1, 1) for at in (start, z)]
     expected = np.interp(inside, [-1, 0, 1], [-1, 0, 3])
     slope = [3.0 if at > 0 else 1.0 for at in (start, z)]
@@ -563,7 +566,7 @@ def small() -> tuple[Parts, str]:
 
 def _works(lib: Any, parts: Parts) -> bool:
     run = engine.compiled_engine(lib.run, parts, np.zeros(THETA), 1, TABLE).run
-    _, rows = run(np.array([2.0, 0, 0, 0]), np.array([[0.5, 0, 0]]), NO_NOISE)
+    _, rows = run(0, np.array([2.0, 0, 0, 0]), np.array([[0.5, 0, 0]]), NO_NOISE, NOT_FAST)
     return bool(rows[0] == pytest.approx([6.5, np.sin(0.5), 1.5]))
 
 

@@ -65,6 +65,7 @@ def _gain(design: Design, c: Controller, estimator: Estimator, samples: int) -> 
 
 def _steady(c: Controller) -> FloatArray:
     """The filter's gain of Riccati's equation, with the covariances that the filters are given."""
+    assert c.noise is not None
     W, V = c.Bd * c.noise.process @ c.Bd.T, np.diag(c.noise.sensor)
     P = dare(c.Ad.T, c.Cd.T, W, V).X
     return np.asarray(np.linalg.solve(c.Cd @ P @ c.Cd.T + V, c.Cd @ P).T)

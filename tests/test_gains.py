@@ -48,8 +48,8 @@ LAYOUT: dict[str, set[str]] = {  # the gain file, version 1
     "model": {"A", "B", "C", "Ad", "Bd", "Cd"},
     "gains": {"K", "Ki", "L"},
     "cost": {"state", "input", "integral"},
-    "noise": {"process", "sensor"},
-    "feedforward": {"mass", "z_grid", "v0"},
+    "noise": {"process", "sensor", "drift"},
+    "feedforward": {"inertia", "speed", "rate", "z_grid", "v0"},
     "current_loop": {"Kp", "Ki", "sample_time"},
     "limits": {"current", "voltage", "force"},
     "verification": {"poles", "bandwidth", "peak_sensitivity"},
@@ -61,6 +61,7 @@ SHAPES: dict[str, tuple[int, ...]] = {  # ten states, five forces, five measurem
     "model.Ad": (10, 10), "model.Bd": (10, 5), "model.Cd": (5, 10),
     "gains.K": (5, 10), "gains.Ki": (5, 5), "gains.L": (10, 5),
     "operating_point.x": (10,), "operating_point.u": (5,),
+    "feedforward.inertia": (5,), "feedforward.speed": (5, 5), "feedforward.rate": (5, 5),
     "feedforward.z_grid": (121,), "feedforward.v0": (121, 5),
     "cost.state": (10,), "cost.input": (5,), "cost.integral": (5,),
     "noise.process": (5,), "noise.sensor": (5,),
@@ -230,7 +231,7 @@ def test_document_says_what_the_current_loops_and_limits_are(sound: dict[str, An
     assert sound["limits"]["force"] == [26.0, 26.0, 26.0, 26.0, 52.0]
     assert sound["limits"]["voltage"] == [22.5] * 5
     assert sound["current_loop"]["sample_time"] == 5e-5
-    assert sound["feedforward"]["mass"] == 0.36
+    assert sound["feedforward"]["inertia"] == [0, 0, 0, 0, 0.36]
     assert sound["plant"]["parameters"]["w_cc"] == {"value": 3000.0, "unit": "rad/s"}
 
 
@@ -447,7 +448,7 @@ def faults() -> dict[str, tuple[Edit, str, str, str]]:
         "model beyond all floats": (
             change("model.Ad", lambda rows: [[1e308] * len(rows)] * len(rows)), "model", "overflow", "multiplied",
         ),
-        "negative moving mass": (put("feedforward.mass", -0.36), "feedforward.mass", "-0.36", "greater than 0"),
+        "inertia of one": (put("feedforward.inertia", [0.36]), "feedforward.inertia", "(1,)", "(5,)"),
         "negative current gain": (put("current_loop.Kp", -8.0), "current_loop.Kp", "-8.0", "greater than 0"),
         "no current integral": (put("current_loop.Ki", 0.0), "current_loop.Ki", "0.0", "greater than 0"),
         "signal without unit": (

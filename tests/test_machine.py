@@ -83,7 +83,9 @@ def _step_by_step(plant: Plant, c: Controller, scenario: Scenario) -> dict[str, 
     states = []
     for k in range(len(t)):
         states.append(state)
-        state, _ = engine.run(state, given_[k : k + 1], np.zeros((1, len(plant.outputs))))
+        state, _ = engine.run(
+            k, state, given_[k : k + 1], np.zeros((1, len(plant.outputs))), np.zeros((0, 0))
+        )
     sizes = machine.layout(plant, c, setup)
     names = {**sizes.machine, **sizes.controller}
     columns = np.split(np.array(states), np.cumsum([*names.values()])[:-1], axis=1)
@@ -168,6 +170,7 @@ def test_axes_are_sampled_windings_under_a_sampled_law(
     k = 2  # dd of module 1
     wanted = run.v[:, 0] / par.K_B
     error = wanted - run.i[:, k]
+    assert c.current_loop is not None
     integral = c.current_loop.Ki * Ts * np.cumsum(error)
     _close(run.u[:, k], c.current_loop.Kp * error + integral, atol=1e-9)
     acting = np.concatenate([np.zeros(delay), run.u[: len(run.u) - delay, k]])

@@ -330,7 +330,7 @@ def test_a_poor_start_finds_its_way(spec: Spec) -> None:
     asked = replace(
         spec.specification, tracking_error=None, radial_deviation=None, payload=None, lift_off=False
     )
-    poor = replace(spec, weights=spec.varied(middle), delays=(0,), specification=asked)
+    poor = replace(spec.varied(middle), delays=(0,), specification=asked)
     found = tuned(poor, effort=Effort(generations=15, polish=30, front=0))
     assert found.reached, found.binding
     assert found.trial.figures["margin"] >= 3.5
@@ -521,7 +521,7 @@ def test_ctrl_c_leaves_the_trials(run: Any, tmp_path: Path, monkeypatch: pytest.
 
 def test_found_spec_keeps_what_is_not_varied(spec: Spec) -> None:
     values = [spec.value_of(v) for v in spec.search]
-    again = spec.varied(values)
+    again = spec.varied(values).weights
     for name in again.__dataclass_fields__:
         assert getattr(again, name) == pytest.approx(getattr(spec.weights, name), rel=1e-12)
     from malta.tune import Trial

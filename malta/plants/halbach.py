@@ -349,7 +349,7 @@ def plant(par: Parameters) -> Plant:
             sample_time=1 / par.f_pwm,
             dead_time=(par.latency + 0.5) * par.T_laser,
         ),
-        drive=None,
+        windings=None,
         electronics=partial(electronics, par),
         contacts=("left the travel",),
         contact=lambda x: ca.fabs(x[0]) / par.travel,

@@ -155,7 +155,7 @@ def plant(par: Parameters) -> Plant:
             sample_time=par.T_s,
             dead_time=par.T_d,
         ),
-        drive=None,
+        windings=None,
         electronics=None,
         contacts=CONTACTS,
         contact=lambda x: contact(par, x),

@@ -50,7 +50,7 @@ class Parameters:
     T_cc: float = si("s", above=0)  # period of the current controllers
     w_cc: float = si("rad/s", above=0)  # crossover of the current loops
     pm_cc: float = si("rad", above=0)  # their phase margin
-    T_d: float = si("s", at_least=0)  # dead time of computation and hold
+    T_d: float = si("s", at_least=0, shapes=True)  # dead time of computation and hold
     z_max: float = si("m", above=0)  # axial travel, either way
     r_max: float = si("m", above=0)  # radial travel, either way: touchdown
     s_r: float = si("m", at_least=0)  # radial sensor noise, rms of a sample
@@ -70,6 +70,9 @@ class Parameters:
 POSITIONS = tuple(Signal(n, "m") for n in "xyz") + tuple(Signal(n, "rad") for n in ("alpha", "beta", "gamma"))
 RATES = tuple(Signal(f"{s.name}_dot", f"{s.unit}/s") for s in POSITIONS)
 INPUTS = tuple(Signal(n, "N") for n in ("fx_B1", "fy_B1", "fx_B2", "fy_B2", "f_D"))
+COILS = tuple(
+    Signal(s.name.replace("f", "i", 1), "A") for s in INPUTS
+)  # axes of the transformation, one for each input
 OUTPUTS = tuple(Signal(n, "m") for n in ("x1", "y1", "x2", "y2", "z"))
 SENSOR_ERRORS = (
     *(Signal(f"gain_{s.name}", "1") for s in OUTPUTS[:4]),
@@ -88,6 +91,7 @@ def plant(par: Parameters, *, small_angle: bool = False) -> Plant:
     """
     x, u, w = ca.SX.sym("x", 12), ca.SX.sym("u", 5), ca.SX.sym("w", 6)
     trig = SMALL_ANGLE if small_angle else EXACT
+    constants = (par.K_B, par.K_B, par.K_B, par.K_B, 2 * par.K_D)  # f_D = f_D1 + f_D2, eq. (17)
     inertia = (par.I_xx, par.I_yy, par.I_zz)
     q_B = principal(x[3:6], inertia)
     F_I, M_I = _wrench(par, x, u, rotation(x[3:6], trig)[2, :2].T, conservative=not small_angle)
@@ -106,8 +110,15 @@ def plant(par: Parameters, *, small_angle: bool = False) -> Plant:
         h=lambda x, _: measured(par, x, trig),
         load=lambda x: load(par, x),
         position_of=lambda p: position_of(par, p),
+        preload=lambda _: ca.DM.zeros(5),
+        currents=lambda _, v: v / ca.vertcat(*constants),
+        forces=lambda _, i: ca.vertcat(*constants) * i,
+        limited=lambda i: ca.fmax(ca.fmin(i, par.I_max), -par.I_max),
+        tabulated=False,
         actuator=Actuator(
-            force_constant=(par.K_B, par.K_B, par.K_B, par.K_B, 2 * par.K_D),  # f_D = f_D1 + f_D2, eq. (17)
+            coils=COILS,
+            force_limit=tuple(par.I_max * constant for constant in constants),
+            force_constant=constants,
             current_limit=par.I_max,
             voltage_limit=par.V_max,
             R=par.R,
@@ -117,7 +128,8 @@ def plant(par: Parameters, *, small_angle: bool = False) -> Plant:
             sample_time=par.T_cc,
             dead_time=par.T_d,
         ),
-        drive=drive(par),
+        windings=drive(par),
+        electronics=None,
         contacts=("touchdown at sensor plane 1", "touchdown at sensor plane 2", "axial end stop"),
         contact=lambda x: contact(par, x, trig),
         cushioned=(True, True, False),
@@ -126,7 +138,9 @@ def plant(par: Parameters, *, small_angle: bool = False) -> Plant:
         sensor_errors=SENSOR_ERRORS,
         travel=par.z_max,
         noise=(par.s_r, par.s_r, par.s_r, par.s_r, par.s_z),
+        uniform=False,
         resolution=(par.dp, par.dp, par.dp, par.dp, 0.0),
+        inertia=(0.0, 0.0, 0.0, 0.0, par.m),
         mass=par.m,
         thrust="f_D",
         stroke="z",
