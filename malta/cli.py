@@ -7,6 +7,7 @@ import io
 import json
 import math
 import os
+import re
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -25,9 +26,9 @@ if TYPE_CHECKING:
     from malta.controller import Controller
     from malta.experiments import Experiment
     from malta.plan import Sampler
-    from malta.plant import Parameters
+    from malta.plant import Parameters, Plant
     from malta.robust import Margin
-    from malta.simulate import EngineChoice, StrokeFigures, Trajectory
+    from malta.simulate import EngineChoice
     from malta.tune import Requirement
     from malta.verify import CurrentLoops, Margins
 
@@ -67,18 +68,24 @@ Changes = Annotated[
         "--set", metavar="NAME=VALUE", help="Change a parameter of the machine: m=0.56 (SI) or l_B=45mm."
     ),
 ]
-SCENARIOS = (
-    "What to simulate: stroke, hold, tilt, lift-off, payload, thermal, disturbance, faults, drive-limits."
-)
+SCENARIOS = "one of the machine's own, which `--scenario help` lists. [its first]"
 # Options of a run, in `simulate` and in `campaign`.
-Distance = Annotated[float | None, typer.Option(help="stroke, drive-limits: length [mm]. [10]")]
-Rise = Annotated[
-    float | None, typer.Option(help="stroke: rise of the reference, 10-90 % [ms]. [the published 16.2]")
+Distance = Annotated[float | None, typer.Option(help="Length of a stroke [mm]. [the scenario's]")]
+Rise = Annotated[float | None, typer.Option(help="Rise of its reference, 10-90 % [ms]. [the scenario's]")]
+ProfileName = Annotated[str | None, typer.Option(help="Its reference: logistic or quintic. [the scenario's]")]
+Own = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--option",
+        metavar="NAME=VALUE",
+        help="Any other option that `--scenario help` lists: radius=0.1mm, masses=50g,100g, during=hold, ...",
+    ),
 ]
-ProfileName = Annotated[str | None, typer.Option(help="stroke: logistic or quintic reference. [logistic]")]
 FidelityName = Annotated[
     str | None,
-    typer.Option(help="What makes the forces: force (first-order lags), dq (PI loops), phase. [dq]"),
+    typer.Option(
+        help="What makes the forces: force (first-order lags), dq (PI loops), phase. [the scenario's]"
+    ),
 ]
 Noise = Annotated[
     float | None, typer.Option(help="Sensor noise in multiples of the machine's. [the scenario's]")
@@ -123,7 +130,7 @@ def design(
 ) -> None:
     """Design controllers: synthesize, verify, simulate, write gain files.
 
-    Gain files are replaced only by a design that is stable on the machine and completes the stroke.
+    Gain files are replaced only by a design that is stable on the machine and completes its main job, as the stroke.
 
     \b
     Example:  malta design design/table2.toml
@@ -171,8 +178,8 @@ def verify(
     their proof, from full state feedback to the sampled loop, and over the travel; disk and delay margins, gang of
     four, tolerance of each parameter.
 
-    The machine is the one in the file, with the changes given by --set (m, K_A, K_B, l_B, F_c, T_d, ... as far as
-    they shape the linear loop; windings and DC link do not).
+    The machine is the one in the file, with the changes given by --set, as far as they shape the linear loop (on MALTA
+    m, K_A, K_B, l_B, F_c, T_d; windings and DC link do not).
 
     \b
     Example:  malta verify design/gains/calibrated.json --set m=0.56
@@ -206,7 +213,8 @@ def verify(
     if out is not None:
         from malta import report
 
-        files = [report.robustness(found, controller.name, box, out / f"{controller.name}_margins.png")]
+        picture, position = out / f"{controller.name}_margins.png", f"position {plant.stroke}"
+        files = [report.robustness(found, controller.name, box, picture, position)]
     if as_json:
         described = {"gains": str(gains), "design": controller.name, "files": [str(file) for file in files]}
         _print_json(described | _margins(margins) | {"robust": _robustness(found, box)})
@@ -226,7 +234,7 @@ def verify(
             "Uncertainty: " + "  ".join(f"{name} +-{100 * share:g} %" for name, share in box.items()) + "\n",
             report.chain_table(found),
             report.disk_table(found, controller.sample_time),
-            report.gang_table(found),
+            report.gang_table(found, plant),
             report.tolerance_table(found, box),
             report.places_table(found, controller.sample_time),
         ):
@@ -239,14 +247,15 @@ def verify(
 @app.command()
 def simulate(
     gains: GainFile,
-    scenario: Annotated[str | None, typer.Option(help=f"{SCENARIOS} [stroke]")] = None,
+    scenario: Annotated[str | None, typer.Option(help=f"What to simulate: {SCENARIOS}")] = None,
     change: Changes = None,
     distance: Distance = None,
     rise: Rise = None,
     profile: ProfileName = None,
     during: Annotated[
-        str | None, typer.Option(help="faults: strike during a stroke or a hold. [stroke]")
+        str | None, typer.Option(help="Faults strike during a stroke or a hold. [the scenario's]")
     ] = None,
+    option: Own = None,
     fidelity: FidelityName = None,
     noise: Noise = None,
     quantize: Quantize = None,
@@ -289,10 +298,14 @@ def simulate(
     """
     from malta import gains as gain_files
     from malta.data import plant_of
-    from malta.experiments import experiment
+    from malta.experiments import experiment, main_job
 
     controller = gain_files.read(gains)
     plant = plant_of(_changed(controller.parameters, change))
+    if scenario == "help":
+        _list_scenarios(plant)
+        raise typer.Exit
+    chosen, choice = scenario or main_job(plant), engine.replace("-", " ")
     given = _given(
         distance,
         rise,
@@ -312,7 +325,7 @@ def simulate(
         substeps=substeps,
         seed=seed,
     )
-    chosen, choice = scenario or "stroke", engine.replace("-", " ")
+    given = _with_own(given, option, chosen, plant)
     stem = f"{controller.name}_{chosen}"
     with _bar(scenario or "simulating", quiet=as_json) as progress:
         if replay is None:
@@ -338,7 +351,8 @@ def simulate(
         if substeps is not None:
             from malta.simulate import integration_error
 
-            console.print(f"integration error, estimated: {integration_error(run):.1g} m")
+            units = "/".join(dict.fromkeys(signal.unit for signal in run.plant.outputs))
+            console.print(f"integration error, estimated: {integration_error(run):.1g} {units}")
         for file in files:
             console.print(f"wrote {file}", soft_wrap=True)
     if found.run.engine == "virtual machine" and engine == "auto":
@@ -357,11 +371,9 @@ def simulate(
 def campaign(
     gains: GainFile,
     samples: Annotated[int, typer.Option(help="Machines.")] = 10_000,
-    scenario: Annotated[
-        str, typer.Option(help="What each one does: stroke, hold, tilt, lift-off, disturbance, drive-limits.")
-    ] = "stroke",
+    scenario: Annotated[str | None, typer.Option(help=f"What each one does: {SCENARIOS}")] = None,
     case: Annotated[
-        str | None, typer.Option(help="tilt, disturbance, drive-limits: which of its runs. [the first]")
+        str | None, typer.Option(help="Of a scenario with several runs: which one. [the first]")
     ] = None,
     spread: Annotated[
         list[str] | None,
@@ -383,6 +395,7 @@ def campaign(
     distance: Distance = None,
     rise: Rise = None,
     profile: ProfileName = None,
+    option: Own = None,
     fidelity: FidelityName = None,
     noise: Annotated[float, typer.Option(help="Sensor noise in multiples of the machine's.")] = 1.0,
     quantize: Quantize = None,
@@ -417,11 +430,16 @@ def campaign(
     from malta import gains as gain_files
     from malta.campaign import campaign as fly
     from malta.data import plant_of, units_of
+    from malta.experiments import main_job
     from malta.plan import Plan
 
     controller = gain_files.read(gains)
     machine = _changed(controller.parameters, change)
     plant = plant_of(machine)
+    if scenario == "help":
+        _list_scenarios(plant, many=True)
+        raise typer.Exit
+    scenario = scenario or main_job(plant)
     published = _published(plant.name)
     given = _given(
         distance,
@@ -438,6 +456,7 @@ def campaign(
         delay=delay,
         substeps=substeps,
     )
+    given = _with_own(given, option, scenario, plant)
     plan = Plan(
         controller,
         scenario,
@@ -580,14 +599,16 @@ def claims(
     ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Print the ledger: every number that the paper publishes, ours for each design, and a verdict.
+    """Print the ledger: every number that a machine's paper publishes, ours for each design, and a verdict.
 
-    All of it is computed now: models, gains, margins, experiments on the simulated drive.
+    One table for each machine, all of it computed now: models, gains, margins, experiments on the simulated machine.
 
     \b
     Example:  malta claims design/table2.toml
     """
-    from malta.claims import ledger
+    from dataclasses import asdict
+
+    from malta.claims import ledger, part
     from malta.data import published
     from malta.spec import read_design
 
@@ -599,16 +620,24 @@ def claims(
     specs = [read_design(file) for file in chosen]
     if not designs:
         specs.sort(key=lambda spec: bool(spec.search))  # the paper's own designs first
+    machines = [
+        [spec for spec in specs if spec.plant.name == name]
+        for name in dict.fromkeys(spec.plant.name for spec in specs)
+    ]
     with _bar("claims", quiet=as_json) as progress:
-        found = ledger(specs, published(specs[0].machine_file), progress)
+        found = [
+            ledger(those, published(those[0].machine_file), part(progress, n, len(machines)))
+            for n, those in enumerate(machines)
+        ]
     if as_json:
-        _print_json({"designs": list(found.designs), "claims": [claim._asdict() for claim in found.claims]})
+        _print_json([asdict(one) | {"claims": [claim._asdict() for claim in one.claims]} for one in found])
     elif markdown:
-        print(found.markdown(), end="")
+        print("\n".join(f"### {one.title}\n\n{one.markdown()}" for one in found), end="")
     else:
         from malta import report
 
-        _console().print(report.claims_table(found))
+        for one in found:
+            _console().print(report.claims_table(one))
 
 
 def main() -> None:
@@ -637,20 +666,20 @@ def _design(file: Path, out: Path, figures: Path, made: dict[Path, Path], *, qui
     from malta import gains as gain_files
     from malta import report
     from malta.data import published as published_of
+    from malta.experiments import experiment, main_job
     from malta.linearize import linearize
-    from malta.simulate import Scenario, stroke_figures
-    from malta.simulate import simulate as simulated
     from malta.spec import read_design
     from malta.synthesize import synthesize
     from malta.verify import require_stable
     from malta.verify import verify as verified
 
     spec = read_design(file)
-    picture = figures / f"{spec.name}_stroke.png"
+    plant = spec.plant
+    job = main_job(plant)
+    picture = figures / f"{spec.name}_{job}.png"
     for target in (out / f"{spec.name}.json", picture):
         if made.setdefault(target, file) != file:
             raise InputError(file, "name", repr(spec.name), f"another name than that of {made[target]}")
-    plant = spec.plant
     model = linearize(plant, plant.at(**spec.operating_point))
     controller = synthesize(spec, model)
     margins = verified(model, controller, spec.uncertainty)
@@ -659,15 +688,14 @@ def _design(file: Path, out: Path, figures: Path, made: dict[Path, Path], *, qui
     with tempfile.TemporaryDirectory() as scratch:
         trial = Path(scratch) / f"{spec.name}.json"
         gain_files.write(controller, margins, trial)
-        run = simulated(plant, gain_files.read(trial), Scenario.stroke())
-    if not run.verdict.completed:
-        raise CheckError(
-            f"{file}: the stroke ends at {run.verdict.time:.4g} s: {run.verdict.name}; gain files unchanged"
-        )
+        found = experiment(job, plant, gain_files.read(trial))
+    for case in found.cases:
+        end = case.run.verdict
+        if not end.completed:
+            raise CheckError(f"{file}: the {job} ends at {end.time:.4g} s: {end.name}; gain files unchanged")
     published = published_of(spec.machine_file)
-    stroke = stroke_figures(run)
-    page = report.design_page(spec, model, margins, stroke, published)
-    report.stroke(run, picture, published)
+    page = report.design_page(spec, model, margins, found, published)
+    report.experiment(found, picture, published)
     paths = [out / f"{spec.name}{suffix}" for suffix in gain_files.SUFFIXES]
     gain_files.write(controller, margins, *paths)  # last: whatever fails before leaves the old files
     if not quiet:
@@ -679,7 +707,7 @@ def _design(file: Path, out: Path, figures: Path, made: dict[Path, Path], *, qui
     return (
         {"design": spec.name, "files": [str(p) for p in (*paths, picture)]}
         | _margins(margins)
-        | _stroke(run, stroke)
+        | _found(found)
     )
 
 
@@ -712,30 +740,74 @@ def _changed(parameters: Parameters, changes: list[str] | None) -> Parameters:
 
 def _assigned(option: str, given: list[str] | None, units: Mapping[str, str]) -> dict[str, float]:
     """Values in SI of `NAME=VALUE`, each with the unit that may follow it."""
-    import re
-
-    from malta.data import to_si
-
     values: dict[str, float] = {}
     for text in given or ():
-        match = re.fullmatch(r"\s*(\w+)\s*=\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\s*", text)
-        if match is None:
+        name, _, value = (part.strip() for part in text.partition("="))
+        number = re.fullmatch(NUMBER, value)
+        if number is None or not name.isidentifier():
             examples = {"--set": "m=0.56 or l_B=45mm", "--spread": "20% or m=10%"}
             example = examples.get(option, "gain_x1=0.02 or offset_y2=5um")
             raise InputError(option, "", repr(text), f"NAME=VALUE, as {example}")
-        name, number, unit = match.groups()
         if name not in units:
             kind = "sensor error" if option == "--sensor" else "parameter"
             raise InputError(option, name, f"an unknown {kind}", "one of " + " ".join(units))
-        plain = units[name] == "1"
-        if plain and unit not in ("", "%", "percent"):
-            raise InputError(option, f"{name}.unit", repr(unit), "no unit, or %")
-        values[name] = (
-            float(number) * (0.01 if unit else 1.0)
-            if plain
-            else to_si(float(number), unit or units[name], units[name], option, name)
-        )
+        values[name] = _in_si(number, units[name], option, name)
     return values
+
+
+NUMBER = r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)"
+
+
+def _in_si(number: re.Match[str], si_unit: str, option: str, name: str) -> float:
+    """The value of a number with the unit that may follow it."""
+    from malta.data import to_si
+
+    value, unit = float(number[1]), number[2]
+    if si_unit != "1":
+        return to_si(value, unit or si_unit, si_unit, option, name)
+    if unit not in ("", "%", "percent"):
+        raise InputError(option, f"{name}.unit", repr(unit), "no unit, or %")
+    return value * (0.01 if unit else 1.0)
+
+
+def _with_own(given: dict[str, Any], texts: list[str] | None, scenario: str, plant: Plant) -> dict[str, Any]:
+    """The options of a scenario with those of `--option NAME=VALUE`, in SI, read as the default is."""
+    from malta.experiments import option_of, said
+
+    units = said(plant, "OPTION_UNITS", {})
+    found = dict(given)
+    for text in texts or ():
+        name, _, value = (part.strip() for part in text.partition("="))
+        if not (name and value):
+            raise InputError("--option", "", repr(text), "NAME=VALUE")
+        default = option_of(scenario, plant, name)
+        if name in found:
+            raise InputError("--option", name, f"{value!r} for the second time", "it once")
+        if isinstance(default, str) or default is None:
+            found[name] = value
+        elif isinstance(default, bool):
+            if value not in ("true", "false"):
+                raise InputError("--option", name, repr(value), "true or false")
+            found[name] = value == "true"
+        else:
+            several = isinstance(default, tuple)
+            numbers = [
+                re.fullmatch(NUMBER, part.strip()) for part in (value.split(",") if several else [value])
+            ]
+            read = [_in_si(n, units.get(name, "1"), "--option", name) for n in numbers if n is not None]
+            if len(read) < len(numbers):
+                raise InputError("--option", name, repr(value), "numbers" if several else "a number")
+            whole = isinstance(default, int) and read[0].is_integer()
+            found[name] = tuple(read) if several else int(read[0]) if whole else read[0]
+    return found
+
+
+def _list_scenarios(plant: Plant, *, many: bool = False) -> None:
+    """What the machine can be asked for: all, or what many can fly."""
+    from malta import report
+    from malta.experiments import said
+
+    _console().print(report.scenarios_table(plant, said(plant, "CASES", {}) if many else None))
 
 
 def _given(distance: float | None, rise: float | None, **others: Any) -> dict[str, Any]:
@@ -893,9 +965,11 @@ def _found(found: Experiment) -> dict[str, Any]:
         ],
     }
     if found.name == "stroke":
+        from dataclasses import asdict
+
         from malta.simulate import stroke_figures
 
-        content |= _stroke(found.run, stroke_figures(found.run))
+        content["stroke"] = asdict(stroke_figures(found.run))
     return content
 
 
@@ -949,12 +1023,6 @@ def _robustness(found: Robustness, box: Mapping[str, float]) -> dict[str, Any]:
             for p in found.places
         ],
     }
-
-
-def _stroke(run: Trajectory, figures: StrokeFigures) -> dict[str, Any]:
-    from dataclasses import asdict
-
-    return {"verdict": run.verdict._asdict(), "stroke": asdict(figures)}
 
 
 def _print_json(content: Any) -> None:

@@ -10,9 +10,9 @@ import numpy as np
 from scipy.stats import binomtest
 
 from malta.data import in_unit, published_value, units_of
-from malta.experiments import DISTANCE
+from malta.experiments import said
 from malta.plant import readonly
-from malta.simulate import RISE
+from malta.signals import inputs_of, outputs_of, stroke_unit
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -61,37 +61,35 @@ def rate(count: int, runs: int) -> Rate:
 def figures_of(found: Campaign, published: Mapping[str, Any] | None = None) -> list[Finding]:
     """The figures of merit of a campaign, with the bounds that the paper prints of this very scenario."""
     plan, batch = found.plan, found.batch
-    plant = plan.plant
+    plant, done = plan.plant, found.completed
     names = [signal.name for signal in plant.outputs]
-    paper = published if is_published(plan) else None
-    done = found.completed
+    keys = {} if published is None else bounds_of(plan)
 
     def of(
         name: str, kind: str, unit: str, values: FloatArray, key: str = "", relation: str = "at most"
     ) -> Finding:
-        bound = published_value(paper, key) if paper is not None and key else math.nan
+        bound = published_value(published or {}, keys[key]) if key in keys else math.nan
         label = f"{kind} {name}" if name else kind
         return Finding(label, kind, unit, readonly(np.where(done, values, np.nan)), bound, relation)
 
-    axis, thrust = plant.stroke_output, plant.thrust_input
-    bearings = [k for k in range(len(plant.inputs)) if k != thrust]
-    radial = [(k, name) for k, name in enumerate(names) if k != axis]
+    (stroke, *others), (thrust, *efforts) = outputs_of(plant), inputs_of(plant)
+    (axis,) = stroke.columns
+    sides = [(k, group) for group in others for k in group.columns]
     listed = []
     if np.isfinite(batch.rise).any():
         listed += [
-            of("", "rise, 10-90 %", "ms", batch.rise, "figure_12.rise_time", "about"),
-            of("", "overshoot", "percent", batch.overshoot, "figure_12.overshoot"),
+            of("", "rise, 10-90 %", "ms", batch.rise, "rise", "about"),
+            of("", "overshoot", "percent", batch.overshoot, "overshoot"),
         ]
-    listed += [of("", f"deviation of {names[axis]}", "mm", batch.deviation[:, axis], "figure_12.axial_error")]
-    listed += [
-        of(n, "deviation", "um", batch.deviation[:, k], "figure_13.radial_deviation") for k, n in radial
-    ]
+    along = f"deviation of {names[axis]}", stroke_unit(plant), batch.deviation[:, axis], "stroke"
+    listed += [of("", *along)]
+    listed += [of(names[k], "deviation", g.fine, batch.deviation[:, k], g.unit) for k, g in sides]
     if plan.scenario == "hold":
-        listed += [of("", f"rms of {names[axis]}", "um", batch.rms[:, axis])]
-        listed += [of(n, "rms", "um", batch.rms[:, k]) for k, n in radial]
+        listed += [of("", f"rms of {names[axis]}", stroke.fine, batch.rms[:, axis])]
+        listed += [of(names[k], "rms", g.fine, batch.rms[:, k]) for k, g in sides]
     listed += [
-        of("", "largest bearing force", "N", batch.force[:, bearings].max(axis=1, initial=0.0)),
-        of("", "largest thrust", "N", batch.force[:, thrust]),
+        of("", f"largest {g.name}", g.unit, batch.force[:, g.columns].max(axis=1, initial=0.0))
+        for g in (*efforts, thrust)
     ]
     listed += [
         of(name.removeprefix("touchdown at "), "clearance:", "percent", batch.contact[:, k])
@@ -103,12 +101,11 @@ def figures_of(found: Campaign, published: Mapping[str, Any] | None = None) -> l
     ]
 
 
-def is_published(plan: Plan) -> bool:
-    """Whether the paper shows this very stroke."""
-    asked = {"distance": DISTANCE, "rise": RISE, "profile": "logistic"}
-    return plan.scenario == "stroke" and all(
-        plan.options.get(name, value) == value for name, value in asked.items()
-    )
+def bounds_of(plan: Plan) -> Mapping[str, str]:
+    """What the machine's paper prints of this very scenario, as keys of data/published/."""
+    bounds = said(plan.plant, "bounds", None)
+    found: Mapping[str, str] = {} if bounds is None else bounds(plan.scenario, plan.options)
+    return found
 
 
 def kept(found: Campaign, published: Mapping[str, Any] | None = None) -> NDArray[np.bool_] | None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from malta.figures import BOUND, NOTE, STYLES, plain
+from malta.figures.parts import BOUND, NOTE, STYLES, plain
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -19,8 +19,13 @@ if TYPE_CHECKING:
 LIMITS = ((3.0, "A | B"), (4.0, "B | C"), (5.0, "C | D"))  # ISO 14839-3
 
 
-def chain_figure(found: Robustness, name: str, uncertainty: Mapping[str, float]) -> Figure:
-    """The chain as bars, proven part and witness; peak sensitivities beside them; both along the travel below."""
+def chain_figure(
+    found: Robustness, name: str, uncertainty: Mapping[str, float], position: str = "position"
+) -> Figure:
+    """The chain as bars, proven part and witness; peak sensitivities beside them; both along the travel below.
+
+    position : what the machine calls it, as "position z"
+    """
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(9.0, 6.0), dpi=120)
@@ -63,7 +68,10 @@ def chain_figure(found: Robustness, name: str, uncertainty: Mapping[str, float])
     for axes in (left, right):
         plain(axes)
         axes.set_ylim(len(rows) - 0.4, -0.8)
-    _along_travel(figure.add_subplot(grid[1, 0]), figure.add_subplot(grid[1, 1]), found)
+    along = figure.add_subplot(grid[1, 0]), figure.add_subplot(grid[1, 1])
+    _along_travel(*along, found)
+    for axes in along:
+        axes.set_xlabel(f"{position} [mm]")
     return figure
 
 
@@ -88,12 +96,10 @@ def _along_travel(left: Axes, right: Axes, found: Robustness) -> None:
         )  # fmt: skip
     left.set_ylim(0, 1.25 * max([_percent(p.margin.lower) for p in places] + [1.0]))
     left.set_ylabel("margin [%]")
-    left.set_xlabel("position z [mm]")
     right.plot(both, mirrored([p.peak for p in places]), marker="o", markersize=3.5, **STYLES[0])
     right.set_ylim(0, max(3.5, 1.2 * max([p.peak for p in places if not math.isnan(p.peak)] + [1.0])))
     right.axhline(3, **BOUND)
     right.annotate("zone A", (0.985, 3), xycoords=("axes fraction", "data"), ha="right", va="top", **NOTE)
-    right.set_xlabel("position z [mm]")
     right.set_ylabel("peak |S|")
     for axes in (left, right):
         plain(axes)

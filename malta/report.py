@@ -1,11 +1,12 @@
-"""Records -> pages: tables for a terminal of 100 columns, and the figures of figures.py, saved."""
+"""Records -> pages: tables for a terminal of 100 columns, and the figures of figures/, saved."""
 
 from __future__ import annotations
 
+import inspect
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeGuard
 
 import numpy as np
 from rich import box
@@ -15,8 +16,7 @@ from rich.text import Text
 from scipy.optimize import linear_sum_assignment
 
 from malta.data import in_unit, published_value
-from malta.figures import STYLES as STYLES
-from malta.figures import Published, number, read_out
+from malta.experiments import experiments_of, options_of, said
 from malta.figures import distributions_figure as distributions_figure
 from malta.figures import experiment_figure as experiment_figure
 from malta.figures import front_figure as front_figure
@@ -24,9 +24,12 @@ from malta.figures import save as save
 from malta.figures import stroke_figure as stroke_figure
 from malta.figures import worst_figure as worst_figure
 from malta.figures import yield_figure as yield_figure
+from malta.figures.parts import STYLES as STYLES
+from malta.figures.parts import Published, number, read_out
 from malta.linearize import LinearModel
 from malta.margin_figures import chain_figure as chain_figure
-from malta.simulate import StrokeFigures, Trajectory
+from malta.signals import aside, compliance_unit, inputs_of, outputs_of, stiffness_unit
+from malta.simulate import Trajectory
 from malta.spec import Spec
 from malta.synthesize import continuous_poles
 from malta.verify import BANDWIDTHS, Margins, zone
@@ -36,7 +39,7 @@ if TYPE_CHECKING:
     from malta.chain import Robustness
     from malta.claims import Ledger
     from malta.experiments import Experiment, Merit
-    from malta.plant import ComplexArray, FloatArray
+    from malta.plant import ComplexArray, FloatArray, Plant
     from malta.robust import Margin
     from malta.tune import Requirement, Tuned
 
@@ -46,15 +49,25 @@ if TYPE_CHECKING:
 
 def poles_table(model: LinearModel, published: Published | None) -> Table:
     """Open-loop poles by mode, beside Table I where it applies."""
-    names, values = _modes(model)
+    n = len(model.A) // 2
+    if np.any(model.A[n:, n:]):  # damped: no pairs of opposite poles
+        table = _table("Open-loop poles [rad/s]", "of", "poles")
+        poles = np.linalg.eigvals(model.A).astype(complex)
+        _row(table, "ours", _pole_text(np.where(np.abs(poles) < 1e-9 * np.abs(poles).max(), 0, poles)))
+        return table
+    names, squares = _modes(model)
     table = _table("Open-loop poles [rad/s]", "mode", *names)
-    _row(table, "ours, +-", *(f"{value:.2f}" for value in values))
+    _row(table, "ours, +-", *(f"{math.sqrt(abs(s)):.2f}{'j' if s < 0 else ''}" for s in squares))
     at_centre = not np.any(model.operating_point.x)
-    if published is not None and at_centre:
+    if _prints(published, "table_I", "poles") and at_centre:
         printed = [published_value(published, f"table_I.poles.{name}") for name in names]
         digits = published["table_I"]["digits"]
         _row(table, "Table I, +-", *(f"{value:.{digits}f}" for value in printed))
     return table
+
+
+def _prints(published: Published | None, table: str, key: str) -> TypeGuard[Published]:
+    return published is not None and key in published.get(table, {})
 
 
 def loop_poles_table(margins: Margins, continuous: Mapping[str, ComplexArray] | None = None) -> Table:
@@ -67,17 +80,18 @@ def loop_poles_table(margins: Margins, continuous: Mapping[str, ComplexArray] | 
         ("sampled Kalman filter", "filter"),
         ("closed loop of the machine", "closed_loop"),
     ):
-        _row(table, what, _pole_text(getattr(margins.poles, key)))
+        if (found := getattr(margins.poles, key)).size:
+            _row(table, what, _pole_text(found))
     return table
 
 
 def bandwidth_table(margins: Margins, published: Published | None) -> Table:
-    """Bandwidths by definition; the paper gives one figure and no definition."""
+    """Bandwidths by definition; a paper may give one figure and no definition."""
     table = _table("Bandwidth by definition", "definition", "rad/s", "Hz")
     for key, meaning in BANDWIDTHS.items():
         value = margins.bandwidth[key]
         _row(table, meaning, f"{value:.1f}", f"{value / (2 * math.pi):.2f}")
-    if published is not None:
+    if _prints(published, "position_controller", "bandwidth"):
         value = read_out(published, "position_controller.bandwidth", "rad/s")
         _row(table, "published, without a definition", f"about {value:.0f}", f"{value / (2 * math.pi):.0f}")
     return table
@@ -165,18 +179,20 @@ def _delay_cells(delay: float, Ts: float) -> tuple[str, str]:
     return (f"{delay * 1e6:.0f} us", f"{delay / Ts:.1f} samples") if math.isfinite(delay) else ("any", "")
 
 
-def gang_table(found: Robustness) -> Table:
+def gang_table(found: Robustness, plant: Plant) -> Table:
     """Gang of four: the largest gain of each closed-loop response, by sensor."""
-    table = _table(
-        "Gang of four, largest over frequency and travel",
-        "sensor",
-        "|S|",
-        "|T|",
-        "from force |SP| [um/N]",
-        "to force |FS| [N/um]",
-    )
+    units = {signal.name: signal.unit for signal in plant.outputs}
+    one = next(iter(set(units.values()))) if len(set(units.values())) == 1 else ""
+    heads = (f" [{per(one)}]" if one else "" for per in (compliance_unit, stiffness_unit))
+    title = "Gang of four, largest over frequency and travel"
+    forces = (f"{what}{unit}" for what, unit in zip(("from force |SP|", "to force |FS|"), heads, strict=True))
+    table = _table(title, "sensor", "|S|", "|T|", *forces)
     for name, (S, T, PS, FS) in found.gang.items():
-        _row(table, name, f"{S:.2f}", f"{T:.2f}", f"{PS * 1e6:.1f}", f"{FS * 1e-6:.3f}")
+        unit = units[name]
+        cells = f"{PS * 1e6:.1f}", f"{FS * 1e-6:.3f}"
+        if not one:
+            cells = f"{cells[0]} {compliance_unit(unit)}", f"{cells[1]} {stiffness_unit(unit)}"
+        _row(table, name, f"{S:.2f}", f"{T:.2f}", *cells)
     return table
 
 
@@ -225,39 +241,23 @@ def places_table(found: Robustness, Ts: float) -> Table:
     return table
 
 
-def stroke_table(figures: StrokeFigures, published: Published | None) -> Table:
-    """The stroke beside the published figures."""
-    rows = [
-        ("rise, 10-90 % [ms]", figures.rise * 1e3, "figure_12.rise_time", "ms", 2, "{:.1f}"),
-        ("overshoot [%]", figures.overshoot * 1e2, "figure_12.overshoot", "percent", 2, "<= {:.1f}"),
-        ("axial error [mm]", figures.axial_error * 1e3, "figure_12.axial_error", "mm", 3, "<= {:.1f}"),
-    ]
-    radial = ("figure_13.radial_deviation", "um", 2, "<= {:.0f}")
-    rows += [(f"deviation {name} [um]", value * 1e6, *radial) for name, value in figures.radial.items()]
-    table = _table("Stroke", "figure", "ours", "published")
-    for label, value, key, unit, digits, form in rows:
-        printed = "" if published is None else form.format(read_out(published, key, unit))
-        _row(table, label, f"{value:.{digits}f}", printed)
-    _row(table, "largest thrust [N]", f"{figures.force:.1f}", "")
-    _row(table, "largest current [A]", f"{figures.current:.2f}", "")
-    return table
-
-
 def design_page(
-    spec: Spec, model: LinearModel, margins: Margins, figures: StrokeFigures, published: Published | None
+    spec: Spec, model: LinearModel, margins: Margins, flown: Experiment, published: Published | None
 ) -> Group:
-    """One readable page about a design."""
+    """One readable page about a design, and what it does in the machine's main job."""
+    made = f"{spec.discretization}, {1e-3 / spec.sample_time:g} kHz, delay {spec.delay} in the design model"
+    if spec.pid is not None:
+        made = f"PID, {1e-3 / spec.sample_time:g} kHz"
     return Group(
         Text(f"{spec.name}: {spec.summary}", style="bold"),
-        f"{model.plant.name}, preset {spec.parameters.preset}, {spec.discretization}, "
-        f"{1e-3 / spec.sample_time:g} kHz, delay {spec.delay} in the design model",
+        f"{model.plant.name}, preset {spec.parameters.preset}, {made}",
         "",
         poles_table(model, published),
-        loop_poles_table(margins, continuous_poles(model, spec.weights)),
+        loop_poles_table(margins, continuous_poles(model, spec.weights) if spec.pid is None else None),
         bandwidth_table(margins, published),
         sensitivity_table(margins),
         *([] if margins.robust is None else [_travel_text(margins)]),
-        stroke_table(figures, published),
+        experiment_table(flown, published),
     )
 
 
@@ -337,9 +337,33 @@ def _listed(e: Experiment) -> Table:
     return table
 
 
+def scenarios_table(plant: Plant, flown: Collection[str] | None = None) -> Table:
+    """What a machine can be asked for, with the options that each experiment has of its own."""
+    table = _table(
+        f"Scenarios of the machine {plant.name!r}", "scenario", "what is run", "options of its own"
+    )
+    table.columns[1].justify = table.columns[2].justify = "left"
+    for name, run in experiments_of(plant).items():
+        if flown is None or name in flown:
+            what = (inspect.getdoc(run) or "").partition("\n\n")[0]
+            _row(table, name, " ".join(what.split()), "\n".join(_options(name, plant)))
+    return table
+
+
+def _options(name: str, plant: Plant) -> list[str]:
+    units, shown = said(plant, "OPTION_UNITS", {}), []
+    for option, default in options_of(name, plant).items():
+        values = default if isinstance(default, tuple) else (default,)
+        text = ",".join(str(v).lower() if isinstance(v, bool) else f"{v}" for v in values)
+        shown.append(f"{option}={text} {units.get(option, '')}".rstrip())
+    return shown
+
+
 def claims_table(ledger: Ledger) -> Table:
     """The ledger of published numbers."""
-    table = _table("Published numbers and ours", "claim", "published", *ledger.designs, "verdict")
+    table = _table(
+        f"Published numbers and ours: {ledger.title}", "claim", "published", *ledger.designs, "verdict"
+    )
     table.columns[-1].justify = "left"
     for claim in ledger.claims:
         _row(table, claim.subject, claim.published, *claim.ours, claim.verdict)
@@ -415,11 +439,12 @@ def _worst_table(found: Campaign, count: int) -> Table:
     from malta.findings import worst_of
     from malta.many import verdicts
 
-    table = _table("The worst runs", "run", "end", "at [ms]", "radial [um]", "off the middle of the box")
-    table.columns[0].justify = "right"
-    table.columns[1].justify = table.columns[4].justify = "left"
     plant = found.plan.plant
-    names, radial = verdicts(plant), [k for k in range(len(plant.outputs)) if k != plant.stroke_output]
+    names, groups = verdicts(plant), aside(plant)
+    far = [f"{group.name} [{group.fine}]" for group in groups]
+    table = _table("The worst runs", "run", "end", "at [ms]", *far, "off the middle of the box")
+    table.columns[0].justify = "right"
+    table.columns[1].justify = table.columns[-1].justify = "left"
     for row in worst_of(found, count):
         off = [_off(found, row, k) for k in range(len(found.names))]
         _row(
@@ -427,7 +452,7 @@ def _worst_table(found: Campaign, count: int) -> Table:
             f"{found.index[row]}",
             names[int(found.batch.verdict[row])],
             f"{found.batch.duration[row] * 1e3:.1f}",
-            number(1e6 * float(found.batch.deviation[row, radial].max()), 3),
+            *(number(in_unit(float(found.batch.deviation[row, g.columns].max()), g.fine), 3) for g in groups),
             " ".join(off),
         )
     return table
@@ -479,24 +504,38 @@ def requirements_table(requirements: Sequence[Requirement]) -> Table:
     return table
 
 
-UNITS = {"m": (1e6, "um"), "rad/s": (1.0, "rad/s"), "N": (1.0, "N"), "kg": (1.0, "kg")}
-FRONT_COLUMNS = {
-    "margin": ("margin, proven", 100.0, "%"),
-    "force_noise": ("bearing force", 1.0, "N rms"),
-    "thrust_noise": ("thrust", 1.0, "N rms"),
-    "radial_motion": ("radial motion", 1e6, "um rms"),
-    "axial_motion": ("axial motion", 1e6, "um rms"),
-    "peak_sensitivity": ("peak S", 1.0, ""),
-    "bandwidth": ("bandwidth", 1.0, "rad/s"),
+UNITS = {
+    "m": (1e6, "um"),
+    "rad": (1e6, "urad"),
+    "rad/s": (1.0, "rad/s"),
+    "N": (1.0, "N"),
+    "N m": (1.0, "N m"),
+    "kg": (1.0, "kg"),
 }
+
+
+def _front_columns(plant: Plant) -> dict[str, tuple[str, float, str]]:
+    """What the front may hold: heading, factor, unit."""
+    along, *across = (group.name for group in outputs_of(plant))
+    thrust, *others = (group.name for group in inputs_of(plant))
+    return {
+        "margin": ("margin, proven", 100.0, "%"),
+        "force_noise": (" ".join(others[:1]), 1.0, "N rms"),
+        "thrust_noise": (thrust, 1.0, "N rms"),
+        "radial_motion": (" ".join([*across[:1], "motion"]), 1e6, "um rms"),
+        "axial_motion": (f"{along} motion", 1e6, "um rms"),
+        "peak_sensitivity": ("peak S", 1.0, ""),
+        "bandwidth": ("bandwidth", 1.0, "rad/s"),
+    }
 
 
 def front_rows(tuned: Tuned) -> tuple[list[str], list[list[str]]]:
     """The Pareto front as headings and cells: a row for each trial, the chosen one with a star."""
-    shown = [name for name in FRONT_COLUMNS if any(name in one.figures for one in tuned.front)]
-    heads = [f"{FRONT_COLUMNS[k][0]} [{FRONT_COLUMNS[k][2]}]".removesuffix(" []") for k in shown]
+    columns = _front_columns(tuned.spec.plant)
+    shown = [name for name in columns if any(name in one.figures for one in tuned.front)]
+    heads = [f"{columns[k][0]} [{columns[k][2]}]".removesuffix(" []") for k in shown]
     rows = [
-        [f"{one.figures[k] * FRONT_COLUMNS[k][1]:.4g}" if k in one.figures else "" for k in shown]
+        [f"{one.figures[k] * columns[k][1]:.4g}" if k in one.figures else "" for k in shown]
         + ["*" if one.values == tuned.trial.values else ""]
         for one in tuned.front
     ]
@@ -537,12 +576,13 @@ def _row(table: Table, *cells: str) -> None:
 
 
 def _modes(model: LinearModel) -> tuple[list[str], FloatArray]:
-    """Each pair of poles +-value by the position that moves most in it."""
+    """Squares of the pairs of poles +-value, each by the position that moves most in it."""
     names = [s.name for s in model.plant.design_states[: len(model.stiffness)]]
     squares, shapes = np.linalg.eig(model.stiffness)
     participation = np.abs(shapes * np.linalg.inv(shapes).T)  # of position i in mode j, free of units
     _, mode = linear_sum_assignment(-participation)
-    return names, np.sqrt(np.maximum(squares.real, 0))[mode]
+    found = squares.real[mode]
+    return names, np.where(np.abs(found) < 1e-12 * np.abs(found).max(initial=0.0), 0.0, found)
 
 
 def _pole_text(poles: ComplexArray) -> str:
@@ -561,7 +601,7 @@ def _pole_text(poles: ComplexArray) -> str:
 
 
 def stroke(run: Trajectory, path: str | Path | None = None, published: Published | None = None) -> Path:
-    """Draw a stroke and save it, as build/NAME_SCENARIO.png if no path is given."""
+    """Draw a stroke, or a run, and save it, as build/NAME_SCENARIO.png if no path is given."""
     return save(stroke_figure(run, published), _default(run, run.scenario.name) if path is None else path)
 
 
@@ -574,9 +614,15 @@ def _default(run: Trajectory, name: str) -> Path:
     return Path("build") / f"{run.controller.name}_{name}.png"
 
 
-def robustness(found: Robustness, name: str, uncertainty: Mapping[str, float], path: str | Path) -> Path:
-    """Draw where the margin of a design goes."""
-    return save(chain_figure(found, name, uncertainty), Path(path))
+def robustness(
+    found: Robustness,
+    name: str,
+    uncertainty: Mapping[str, float],
+    path: str | Path,
+    position: str = "position",
+) -> Path:
+    """Draw where the margin of a design goes; `position` is what the machine calls it."""
+    return save(chain_figure(found, name, uncertainty, position), Path(path))
 
 
 def campaign(found: Campaign, folder: str | Path, published: Published | None = None) -> list[Path]:

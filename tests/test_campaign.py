@@ -27,7 +27,8 @@ import malta
 from malta import campaign as function
 from malta import engine, figures, report
 from malta.campaign import SLOW_BLOCK, Campaign, Plan, campaign, read_plan, replay
-from malta.experiments import CASES, EXPERIMENTS, cases_of
+from malta.experiments import cases_of
+from malta.experiments.tubular import CASES, EXPERIMENTS
 from malta.findings import figures_of, kept, rate, worst_of
 from malta.folder import MANIFEST, block_name
 from malta.many import Batch, verdicts

@@ -17,7 +17,8 @@ from scipy.linalg import expm
 
 import malta
 from malta import claims, references
-from malta.claims import Claim, Evidence, Ledger, Row
+from malta.claims import Claim, Ledger, Row, tubular
+from malta.claims.tubular import Evidence
 from malta.data import in_unit, plant_of, published_value
 from malta.simulate import Scenario, simulate
 from malta.verify import machine_loop
@@ -25,7 +26,7 @@ from malta.verify import machine_loop
 if TYPE_CHECKING:
     from conftest import Design
 
-    from malta.plants import tubular
+    from malta.plants.tubular import Parameters
 
 NAMES = ("table2", "calibrated")
 
@@ -67,7 +68,7 @@ class Found(NamedTuple):
     def value(self, start: str, name: str) -> float:
         """What a row computes for a design, in the row's unit."""
         if (start, name) not in self.values:
-            (row,) = [r for r in claims._rows() if r.subject.startswith(start)]
+            (row,) = [r for r in tubular.rows() if r.subject.startswith(start)]
             value = in_unit(row.value(self.evidence[NAMES.index(name)]), row.unit)
             self.values[start, name] = value
         return self.values[start, name]
@@ -77,14 +78,14 @@ class Found(NamedTuple):
 def found(designs: dict[str, Design], published: dict[str, Any]) -> Found:
     made: list[Evidence] = []
     shares: list[float] = []
-    compute = claims._evidence
+    compute = tubular.evidence
 
     def kept(*arguments: Any) -> Evidence:
         made.append(compute(*arguments))
         return made[-1]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(claims, "_evidence", kept)
+        patch.setattr(tubular, "evidence", kept)
         ledger = claims.ledger([designs[name].spec for name in NAMES], published, shares.append)
     return Found(ledger, tuple(made), tuple(shares), {})
 
@@ -105,7 +106,7 @@ def _figures(table: Mapping[str, Any], above: str = "") -> Iterator[str]:
 def test_every_published_figure_has_a_row(published: dict[str, Any]) -> None:
     figures = list(_figures(published))
     assert len(figures) > 70
-    rows = {row.published for row in claims._rows() if isinstance(row.published, str)}
+    rows = {row.published for row in tubular.rows() if isinstance(row.published, str)}
     for key in figures:
         excepted = any(key == name or key.startswith(name + ".") for name in INPUTS)
         assert (TWINS.get(key, key) in rows) != excepted, key
@@ -137,7 +138,7 @@ def test_table_II_is_what_is_designed_with(published: dict[str, Any], designs: d
 
 
 def test_rows_are_well_formed(published: dict[str, Any]) -> None:
-    rows = claims._rows()
+    rows = tubular.rows()
     assert len({row.subject for row in rows}) == len(rows)
     for row in rows:
         assert row.relation in ("equal", "at most", "at least", "about")
@@ -236,7 +237,7 @@ def test_a_claim_shows_its_figures(found: Found, published: dict[str, Any]) -> N
 
 
 def test_a_figure_that_is_not_published_is_missed(found: Found) -> None:
-    row = next(r for r in claims._rows() if r.published == "figure_12.rise_time")
+    row = next(r for r in tubular.rows() if r.published == "figure_12.rise_time")
     with pytest.raises(malta.InputError) as caught:
         claims._claim(row, found.evidence, {"figure_12": {}})
     assert (caught.value.where, caught.value.field) == ("data/published", "figure_12.rise_time")
@@ -251,16 +252,18 @@ def test_designs_of_another_machine_are_refused(
     error = caught.value
     assert str(error).isprintable()
     assert (error.where, error.field, error.found) == ("design/rotary.toml", "machine", "rotary")
+    with pytest.raises(malta.InputError, match=r"expected one that malta has claims of: .*tubular"):
+        claims.ledger([other], published)
 
 
 # The ledger as it stands
 
 
 def test_the_table_has_a_line_for_each_claim(found: Found) -> None:
-    assert found.ledger.designs == NAMES
+    assert (found.ledger.machine, found.ledger.designs) == ("tubular", NAMES)
     lines = found.ledger.markdown().split("\n")
     assert lines.pop() == ""
-    assert len(lines) == len(found.ledger.claims) + 2 == len(claims._rows()) + 2
+    assert len(lines) == len(found.ledger.claims) + 2 == len(tubular.rows()) + 2
     assert {line.count("|") for line in lines} == {len(NAMES) + 4}
     assert lines[0] == "| claim | published | `table2` | `calibrated` | verdict |"
     assert set(lines[1]) == {"|", "-"}
@@ -280,7 +283,7 @@ def test_the_work_is_told(found: Found) -> None:
 
 
 def test_a_reason_stands_beside_whatever_is_not_reproduced(found: Found) -> None:
-    rows = {row.subject: row for row in claims._rows()}
+    rows = {row.subject: row for row in tubular.rows()}
     for claim in found.ledger.claims:
         row = next(r for s, r in rows.items() if claim.subject.startswith(s + " [") or claim.subject == s)
         if "not reproduced" in claim.verdict:
@@ -334,7 +337,7 @@ def test_the_verdicts(found: Found, start: str) -> None:
 # The figures by another route
 
 
-def test_poles_by_hand(found: Found, par: tubular.Parameters) -> None:
+def test_poles_by_hand(found: Found, par: Parameters) -> None:
     """sqrt(2 K_A / m), sqrt(2 K_A l_B^2 / I_xx); and Table IV's K_A as the note has it."""
     x, alpha = (math.sqrt(2 * par.K_A * arm) for arm in (1 / par.m, par.l_B**2 / par.I_xx))
     assert found.claim("poles of x, y").ours == (f"±{x:.2f}",) * 2 == ("±218.92",) * 2
@@ -468,7 +471,9 @@ def test_current_loops_by_hand(found: Found, designs: dict[str, Design]) -> None
     """|Kp - j Ki / w| = |R + j w L| at the crossover; the phase there, with the dead time that was designed for."""
     for name, dead_time in zip(NAMES, (0.0, 75e-6), strict=True):
         par: Any = designs[name].spec.parameters
-        Kp, Ki = designs[name].controller.current_loop.Kp, designs[name].controller.current_loop.Ki
+        loop = designs[name].controller.current_loop
+        assert loop is not None
+        Kp, Ki = loop.Kp, loop.Ki
         w = found.value("current loops: crossover", name)
         assert math.hypot(Kp, Ki / w) == pytest.approx(math.hypot(par.R, w * par.L), rel=1e-9)
         phase = -math.atan2(Ki / w, Kp) - math.atan2(w * par.L, par.R) - w * dead_time
@@ -531,7 +536,7 @@ def test_cogging_pushes_a_soft_axis_aside(found: Found) -> None:
 def test_figures_are_those_of_the_experiments(found: Found) -> None:
     """What a user sees of `malta simulate` is what the ledger says."""
     for name, evidence in zip(NAMES, found.evidence, strict=True):
-        assert set(evidence.flown) == set(claims.FLOWN)
+        assert set(evidence.flown) == set(tubular.FLOWN)
         for start, experiment, label in (
             ("stroke: f/i", "stroke", "drive constant per module, f / i"),
             ("stroke: rise", "stroke", "rise, 10-90 %"),

@@ -191,7 +191,8 @@ def test_design_prints_table_I_beside_ours(designed: tuple[Path, str]) -> None:
 
 def test_design_prints_bandwidths_sensitivities_and_stroke(designed: tuple[Path, str]) -> None:
     _, printed = designed
-    for title in ("Bandwidth by definition", "Peak sensitivity (ISO 14839-3", "\nStroke ", "overshoot [%]"):
+    stroke = "\nDoes it follow the stroke? "
+    for title in ("Bandwidth by definition", "Peak sensitivity (ISO 14839-3", stroke, "overshoot [%]"):
         assert printed.count(title) == 2, title
     assert "calibrated: Table II's weights on bases" in printed
 
@@ -430,21 +431,37 @@ def test_verify_of_a_machine_beyond_computing_is_one_sentence(run: Run, change: 
 
 
 @pytest.mark.parametrize("arguments", [("verify", ROOT / TABLE2), ("design", "design/table2.toml")])
-def test_published_data_without_a_table_names_it(
+def test_published_data_without_a_figure_of_a_table_names_it(
     run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: tuple[str | Path, ...]
 ) -> None:
     project(tmp_path, ("", ""))
     file = tmp_path / "data" / "published" / "tubular.toml"
-    text, count = re.subn(
-        r"(?m)^\[table_I\].*\n(?:[^\n\[]*\n)+?\n", "", file.read_text(encoding="utf-8"), count=1
-    )
-    assert count == 1
-    file.write_text(text, encoding="utf-8")
+    text = file.read_text(encoding="utf-8")
+    assert "{ x = 218.92, " in text
+    file.write_text(text.replace("{ x = 218.92, ", "{ "), encoding="utf-8")
     monkeypatch.chdir(tmp_path)
     code, _, err = run(*arguments)
     assert code == 2
     assert "published: table_I.poles.x: found nothing, expected " in one_sentence(err)
     assert not (tmp_path / "design" / "gains").exists()
+
+
+def test_what_the_paper_does_not_print_is_not_shown(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    project(tmp_path, ("", ""))
+    file = tmp_path / "data" / "published" / "tubular.toml"
+    text = file.read_text(encoding="utf-8")
+    for table in ("table_I", "position_controller"):
+        text, count = re.subn(rf"(?m)^\[{table}\].*\n(?:[^\n\[]*\n)+?\n", "", text, count=1)
+        assert count == 1
+    file.write_text(text, encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    code, out, err = run("verify", ROOT / TABLE2)
+    assert (code, err) == (0, "")
+    assert "218.92" in out
+    assert "Table I," not in out
+    assert "published, without a definition" not in out
 
 
 def test_verify_of_a_changed_machine_says_so(run: Run) -> None:
@@ -550,10 +567,31 @@ def test_options_of_the_stroke_are_taken(run: Run) -> None:
     assert stroke("--delay", "6")["axial_error"] > 1.01 * plain["axial_error"]
 
 
-def test_every_scenario_is_named_in_the_help() -> None:
-    from malta.experiments import EXPERIMENTS
+def test_the_scenarios_of_the_machine_are_listed(run: Run) -> None:
+    from malta.experiments.tubular import CASES, EXPERIMENTS
 
-    assert f"What to simulate: {', '.join(EXPERIMENTS)}." == cli.SCENARIOS
+    for command, names in (("simulate", EXPERIMENTS), ("campaign", CASES)):
+        code, out, err = run(command, CALIBRATED, "--scenario", "help")
+        assert (code, err) == (0, "")
+        assert max(map(len, out.splitlines())) <= WIDTH
+        assert [line.split()[0] for line in out.splitlines()[4:] if line[:2].strip()] == list(names)
+    assert "radius=0.0002 m" in out
+
+
+def test_options_of_a_scenario_come_with_their_units(run: Run) -> None:
+    def lifted(masses: str) -> dict[str, Any]:
+        code, out, err = run("simulate", CALIBRATED, "--json", "--scenario", "payload", "--option", masses)
+        assert (code, err) == (0, "")
+        found: dict[str, Any] = json.loads(out)
+        return found
+
+    assert [case["label"] for case in lifted("masses=50g, 0.12")["cases"]] == ["50 g", "120 g"]
+    quick = ("simulate", CALIBRATED, "--json", "--scenario", "tilt", "--feedforward", "axial", "--option")
+    circles = [run(*quick, f"radius={radius}")[1] for radius in ("0.1mm", "1e-4", "100 um")]
+    assert circles == [circles[0]] * 3
+    assert circles[0] != run(*quick, "radius=0.2mm")[1]
+    held = run("simulate", CALIBRATED, "--json", "--scenario", "faults", "--option", "during=hold")
+    assert held == run("simulate", CALIBRATED, "--json", "--scenario", "faults", "--during", "hold")
 
 
 def test_a_scenario_of_several_runs_writes_each_and_one_figure(run: Run, tmp_path: Path) -> None:
@@ -640,9 +678,19 @@ def test_claims_prints_the_ledger(run: Run) -> None:
     code, out, err = run("claims", "design/table2.toml")
     assert (code, err) == (0, "")
     assert max(map(len, out.splitlines())) <= WIDTH
+    assert out.startswith("Published numbers and ours: tubular, S. Miric et al.")
     assert "table2" in out
     assert "±218.92" in out
     assert "not reproduced" in out
+    code, out, err = run("claims", "design/table2.toml", "--json")
+    assert (code, err) == (0, "")
+    (ledger,) = json.loads(out)
+    assert (ledger["machine"], ledger["designs"]) == ("tubular", ["table2"])
+    assert ledger["claims"][0]["ours"] == ["±218.92"]
+    code, out, err = run("claims", "design/table2.toml", "--markdown")
+    heading, empty, header = out.splitlines()[:3]
+    assert (heading, empty) == (f"### tubular, {ledger['source']}", "")
+    assert header == "| claim | published | `table2` | verdict |"
 
 
 # --- bad input ---
@@ -663,6 +711,14 @@ def test_claims_prints_the_ledger(run: Run) -> None:
         ("simulate TABLE2 --scenario orbit", "scenario: found 'orbit'", "one of stroke, hold, tilt"),
         ("simulate TABLE2 --scenario hold --rise 3", "hold: rise: found an option of another scenario", "none"),
         ("simulate TABLE2 --scenario faults --during lunch", "faults: during: found 'lunch'", "stroke or hold"),
+        ("simulate TABLE2 --option foo=1", "stroke: foo: found an unknown option", "distance profile rise"),
+        ("simulate TABLE2 --option masses=50g", "stroke: masses: found an option of another scenario", "distance"),
+        ("simulate TABLE2 --option distance", "--option: found 'distance'", "NAME=VALUE"),
+        ("simulate TABLE2 --option distance=far", "--option: distance: found 'far'", "a number"),
+        ("simulate TABLE2 --option distance=3kg", "--option: distance.unit: found 'kg'", "a unit of m"),
+        ("simulate TABLE2 --distance 5 --option distance=5mm", "distance: found '5mm' for the second", "it once"),
+        ("simulate TABLE2 --scenario orbit --option a=1", "scenario: found 'orbit'", "one of stroke, hold, tilt"),
+        ("campaign TABLE2 --scenario hold --option radius=1", "radius: found an option of another", "none of its"),
         ("simulate TABLE2 --fidelity exact", "fidelity: found 'exact'", "one of force, dq, phase"),
         ("simulate TABLE2 --estimator ukf", "estimator: found 'ukf'", "one of steady-state, kalman, extended"),
         ("simulate TABLE2 --engine jit", "engine: found 'jit'", "one of auto, compiled, virtual machine"),

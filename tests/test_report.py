@@ -18,8 +18,9 @@ from rich.console import Console
 import malta
 from malta import figures, report
 from malta.claims import Claim, Ledger
-from malta.experiments import EXPERIMENTS, Case, Experiment, Merit
-from malta.simulate import Scenario, Verdict, stroke_figures
+from malta.experiments import Case, Experiment, Merit
+from malta.experiments.tubular import EXPERIMENTS
+from malta.simulate import Scenario, Verdict
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -86,11 +87,11 @@ def words(figure: Figure) -> list[str]:
     return [text.get_text() for axes in figure.axes for text in axes.texts]
 
 
-def test_the_page_of_a_design_fits_and_names_its_figures(design: Design, published: dict[str, Any]) -> None:
-    run = malta.simulate(design.plant, design.controller, Scenario.stroke())
-    text = printed(
-        report.design_page(design.spec, design.model, design.margins, stroke_figures(run), published)
-    )
+def test_the_page_of_a_design_fits_and_names_its_figures(
+    design: Design, flown: Flown, published: dict[str, Any]
+) -> None:
+    stroke = flown(design.spec.name, "stroke")
+    text = printed(report.design_page(design.spec, design.model, design.margins, stroke, published))
     for wanted in (
         "218.92",
         "157.53",
@@ -502,6 +503,9 @@ def test_the_ledger_fits() -> None:
         ),
         Claim("a claim whose subject takes more than one line of the table", "–", ("1", "2"), "ours"),
     )
-    text = printed(report.claims_table(Ledger(("table2", "calibrated"), claims)))
+    text = printed(
+        report.claims_table(Ledger("tubular", "A. Author, 2021", ("table2", "calibrated"), claims))
+    )
     assert "±218.92" in text
     assert "calibrated" in text
+    assert text.startswith("Published numbers and ours: tubular, A. Author, 2021")

@@ -1,35 +1,35 @@
-"""The ledger: every number that the source paper publishes, ours for each design, and a verdict. Computed, not typed.
-
-What the paper prints is read from data/published/, ours comes from the same functions that a user calls: model, gains,
-margins, and the experiments on the simulated drive. A verdict follows from the numbers:
-
-    reproduced          equal to the printed digits, within the printed bound, or within 5 % of an "about"
-    within x %          of the published figure, x up to 20
-    not reproduced      else, with the reason
-
-It is said by design where the designs differ, and with the reading where the paper leaves a definition open.
-"""
+"""The claims of the paper on MALTA."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.optimize import brentq
 
 from malta.chain import compensators
+from malta.claims import (
+    Row,
+    bandwidth,
+    first_merit,
+    machine_share,
+    merit,
+    part,
+    peak_sensitivity,
+    proven,
+)
 from malta.controller import Controller
-from malta.data import in_unit, published_value
+from malta.data import published_value
 from malta.electric import link_voltage, open_loop_gain
-from malta.errors import InputError
-from malta.experiments import Experiment, experiment, late_stroke
+from malta.experiments import Experiment, Progress, experiment
+from malta.experiments.tubular import late_stroke
 from malta.linearize import LinearModel, linearize
 from malta.riccati import add_integrals
-from malta.robust import Margin, robust_margin
+from malta.robust import robust_margin
 from malta.simulate import Scenario, StrokeFigures, simulate, stroke_figures
 from malta.spec import Spec
 from malta.synthesize import lqr, synthesize
@@ -39,33 +39,8 @@ from malta.verify import Margins, verify
 if TYPE_CHECKING:
     from malta.plant import FloatArray
 
-CLOSE, NEAR = 0.05, 0.2  # of the published figure: reproduced; within x %
-ROUNDING = 1e-9
+SOURCE = "S. Miric et al., IEEE Trans. Ind. Electron. 68(1), 2021"
 FLOWN = ("stroke", "hold", "tilt", "payload", "thermal")
-
-
-class Claim(NamedTuple):
-    """A line of the ledger."""
-
-    subject: str
-    published: str
-    ours: tuple[str, ...]  # for each design
-    verdict: str
-
-
-@dataclass(frozen=True)
-class Ledger:
-    """All claims, for some designs."""
-
-    designs: tuple[str, ...]
-    claims: tuple[Claim, ...]
-
-    def markdown(self) -> str:
-        """The table as the README shows it."""
-        header = ["claim", "published", *(f"`{name}`" for name in self.designs), "verdict"]
-        rows = [[c.subject, c.published, *c.ours, c.verdict] for c in self.claims]
-        lines = ["| " + " | ".join(row) + " |" for row in (header, *rows)]
-        return "\n".join([lines[0], "|---" * len(header) + "|", *lines[1:]]) + "\n"
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,51 +58,14 @@ class Evidence:
     growth: float  # m, of the published arm
 
 
-class Row(NamedTuple):
-    """A figure that the paper publishes, and how to find ours."""
-
-    subject: str
-    unit: str  # that both are shown in
-    form: str
-    value: Callable[[Evidence], float]  # SI
-    published: str | float | None = (
-        None  # key of data/published/, or a figure that its text implies; None: ours alone
-    )
-    relation: str = "about"  # "equal" to the printed digits, "at most", "at least", "about"
-    note: str = ""  # where the paper leaves a definition open, or what explains the figures
-    why: str = ""  # the reason for whatever is not reproduced
-
-
-def ledger(specs: Sequence[Spec], published: Mapping[str, Any], progress: Any = None) -> Ledger:
-    """Compute every claim for these designs.
-
-    progress : told the share that is done
-
-    Raises InputError for designs of another machine, or when the published figures lack one.
-    """
-    if not specs:
-        raise InputError("claims", "designs", "none", "at least one design")
-    for spec in specs:
-        if spec.plant.name != "tubular":
-            raise InputError(spec.path, "machine", spec.plant.name, "tubular: whose paper the claims are of")
-    found = []
-    for n, spec in enumerate(specs):
-        found.append(_evidence(spec, published, _part(progress, n, len(specs))))
-    claims = [_claim(row, found, published) for row in _rows()]
-    return Ledger(tuple(e.spec.name for e in found), tuple(claims))
-
-
-def _part(progress: Any, n: int, total: int) -> Any:
-    return None if progress is None else lambda share: progress((n + share) / total)
-
-
-def _evidence(spec: Spec, published: Mapping[str, Any], progress: Any) -> Evidence:
+def evidence(spec: Spec, published: Mapping[str, Any], progress: Progress | None = None) -> Evidence:
+    """Design, prove and fly."""
     plant = spec.plant
     model = linearize(plant, plant.at(**spec.operating_point))
     controller = synthesize(spec, model)
     flown = {}
     for n, name in enumerate(FLOWN):
-        flown[name] = experiment(name, plant, controller, progress=_part(progress, n, len(FLOWN)))
+        flown[name] = experiment(name, plant, controller, progress=part(progress, n, len(FLOWN)))
     v0 = controller.feedforward.v0.copy()
     v0[:, plant.thrust_input] = 0
     without = replace(controller, feedforward=replace(controller.feedforward, v0=v0))
@@ -145,10 +83,10 @@ def _evidence(spec: Spec, published: Mapping[str, Any], progress: Any) -> Eviden
     )
 
 
-def _rows() -> list[Row]:
+def rows() -> list[Row]:
     plain = "printed weights as plain SI are next to nothing beside (2 K_A)^2"
     undefined = "the paper gives no definition"
-    rows = [
+    found = [
         Row(
             "poles of x, y",
             "rad/s",
@@ -201,14 +139,14 @@ def _rows() -> list[Row]:
             "the same, sampled, with observer, delay and current loops",
             "percent",
             "{:.0f}",
-            _machine_share,
+            machine_share,
             note="proven anywhere in the travel; the paper's is of full state feedback",
         ),
         Row(
             "bandwidth: last −3 dB of σ_max(T)",
             "rad/s",
             "{:.0f}",
-            partial(_bandwidth, "sigma_max_T"),
+            partial(bandwidth, "sigma_max_T"),
             "position_controller.bandwidth",
             "about",
             "",
@@ -218,7 +156,7 @@ def _rows() -> list[Row]:
             "bandwidth: last 0 dB of σ_max(L)",
             "rad/s",
             "{:.0f}",
-            partial(_bandwidth, "crossover_max"),
+            partial(bandwidth, "crossover_max"),
             "position_controller.bandwidth",
             "about",
             "",
@@ -228,7 +166,7 @@ def _rows() -> list[Row]:
             "bandwidth: regulator's fastest w_n",
             "rad/s",
             "{:.0f}",
-            partial(_bandwidth, "w_n_max"),
+            partial(bandwidth, "w_n_max"),
             "position_controller.bandwidth",
             "about",
             "",
@@ -252,7 +190,7 @@ def _rows() -> list[Row]:
             "peak sensitivity, worst sensor",
             "1",
             "{:.1f}",
-            lambda e: _peak(e)[0],
+            peak_sensitivity,
             note="ISO 14839-3 zone A ends at 3",
         ),
         Row(
@@ -318,7 +256,7 @@ def _rows() -> list[Row]:
             "stroke: f/i of a module",
             "N/A",
             "{:.2f}",
-            partial(_merit, "stroke", "drive constant per module, f / i"),
+            partial(merit, "stroke", "drive constant per module, f / i"),
             "figure_12.drive_constant",
         ),
         Row(
@@ -352,12 +290,12 @@ def _rows() -> list[Row]:
             "m g of Table IV; and statics load module 2 more, not 1",
         ),
     ]
-    rows += [
+    found += [
         Row(
             f"at rest: {name} measured, std",
             "um",
             "{:.2f}",
-            partial(_merit, "hold", f"measured {name}, std"),
+            partial(merit, "hold", f"measured {name}, std"),
             f"table_III.std.{name}",
             "about",
             "noise of that size is put in",
@@ -365,7 +303,7 @@ def _rows() -> list[Row]:
         )
         for name in ("x1", "y1", "x2", "y2", "z")
     ]
-    rows += [
+    found += [
         Row(
             "at rest: radial motion, true rms",
             "um",
@@ -377,7 +315,7 @@ def _rows() -> list[Row]:
             "tilt: SP2 deviates, law as printed",
             "um",
             "{:.1f}",
-            partial(_case, "tilt", 0),
+            partial(first_merit, "tilt", 0),
             "figure_16.deviation",
             "at most",
             "",
@@ -387,7 +325,7 @@ def _rows() -> list[Row]:
             "tilt: SP2, attraction fed forward",
             "um",
             "{:.2f}",
-            partial(_case, "tilt", 1),
+            partial(first_merit, "tilt", 1),
             "figure_16.deviation",
             "at most",
         ),
@@ -398,64 +336,21 @@ def _rows() -> list[Row]:
             "thermal: left after compensation",
             "um",
             "{:.2f}",
-            partial(_case, "thermal", 0),
+            partial(first_merit, "thermal", 0),
             note="run 30 times as fast",
         ),
         Row(
             "payload carried through a stroke",
             "kg",
             "{:.2f}",
-            partial(_merit, "payload", "largest of these carried and moved"),
+            partial(merit, "payload", "largest of these carried and moved"),
             "position_controller.payload",
             "at least",
             "without touchdown; no more is tried",
             "touches down with more",
         ),
     ]
-    return rows
-
-
-def _claim(row: Row, found: Sequence[Evidence], published: Mapping[str, Any]) -> Claim:
-    values = [in_unit(row.value(e), row.unit) for e in found]
-    ours = tuple("–" if math.isnan(value) else row.form.format(value) for value in values)
-    unit = {"1": "", "percent": " [%]", "um": " [µm]", "deg": " [°]"}.get(row.unit, f" [{row.unit}]")
-    subject = row.subject + unit
-    if row.published is None:
-        return Claim(subject, "–", ours, "ours" + (f": {row.note}" if row.note else ""))
-    target = in_unit(
-        published_value(published, row.published) if isinstance(row.published, str) else row.published,
-        row.unit,
-    )
-    printed = row.form.format(target) if row.relation == "equal" else f"{target:.4g}"
-    mark = {"at most": "≤ ", "at least": "≥ "}.get(row.relation, "")
-    return Claim(subject, mark + printed, ours, _verdict(row, target, values, [e.spec.name for e in found]))
-
-
-def _verdict(row: Row, target: float, values: Sequence[float], names: Sequence[str]) -> str:
-    """What the figures of all designs say together."""
-    words = [_word(row, target, value) for value in values]
-    note = f"; {row.note}" if row.note else ""
-    if len(set(words)) == 1:
-        text = words[0] + note
-    else:
-        text = "; ".join(f"{name}: {word}" for name, word in zip(names, words, strict=True)) + note
-    return text + (f"; {row.why}" if row.why and "not reproduced" in text else "")
-
-
-def _word(row: Row, target: float, value: float) -> str:
-    if math.isnan(value):
-        return "not reproduced"
-    if row.relation in ("at most", "at least"):
-        within = value <= target if row.relation == "at most" else value >= target
-        return "reproduced" if within else "not reproduced"
-    if row.relation == "equal":
-        if row.form.format(value) == row.form.format(target):
-            return "reproduced"
-        return "not reproduced"
-    off = abs(value / target - 1)
-    if off <= CLOSE + ROUNDING:
-        return "reproduced"
-    return f"within {math.ceil((off - ROUNDING) * 100)} %" if off <= NEAR + ROUNDING else "not reproduced"
+    return found
 
 
 def _pole(name: str, e: Evidence) -> float:
@@ -477,19 +372,7 @@ def _stiffness_ratio(e: Evidence) -> float:
 def _full_state_share(e: Evidence) -> float:
     law, states = compensators(e.model.plant, e.controller)["LQR"]
     system = uncertain(e.model.plant, list(e.spec.uncertainty), at=e.spec.operating_point, states=states)
-    return _proven(robust_margin(system, law, e.spec.uncertainty))
-
-
-def _machine_share(e: Evidence) -> float:
-    return math.nan if e.margins.robust is None else _proven(e.margins.robust)
-
-
-def _proven(margin: Margin) -> float:
-    return math.nan if margin.lower is None else margin.lower
-
-
-def _bandwidth(definition: str, e: Evidence) -> float:
-    return e.margins.bandwidth[definition]
+    return proven(robust_margin(system, law, e.spec.uncertainty))
 
 
 def _slowest_radial(e: Evidence) -> float:
@@ -505,15 +388,11 @@ def _axial_stiffness(e: Evidence) -> float:
     return float(e.controller.K[plant.thrust_input, plant.stroke_state])
 
 
-def _peak(e: Evidence) -> tuple[float, str]:
-    peaks = {name: v for name, v in e.margins.peak_sensitivity.items() if name != "sigma_max"}
-    worst = max(peaks, key=lambda name: peaks[name])
-    return peaks[worst], worst
-
-
 def _current_loop(e: Evidence) -> tuple[float, float]:
     """Crossover (rad/s) and phase margin (rad) of the loop that the gain file's Kp and Ki make."""
     loop, actuator = e.controller.current_loop, e.model.plant.actuator
+    if loop is None:
+        return math.nan, math.nan
     delay = actuator.dead_time if e.spec.current_loop_delay else 0.0
 
     def gain(w: float) -> complex:
@@ -541,13 +420,5 @@ def _weight(e: Evidence) -> float:
     return float(v[1] + v[3])
 
 
-def _merit(name: str, label: str, e: Evidence) -> float:
-    return next(merit.value for merit in e.flown[name].merits if merit.label == label)
-
-
-def _case(name: str, number: int, e: Evidence) -> float:
-    return e.flown[name].cases[number].merits[0].value
-
-
 def _true_radial(e: Evidence) -> float:
-    return max(_merit("hold", f"true {name}, rms", e) for name in ("x1", "y1", "x2", "y2"))
+    return max(merit("hold", f"true {name}, rms", e) for name in ("x1", "y1", "x2", "y2"))

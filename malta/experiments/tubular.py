@@ -1,28 +1,22 @@
-"""The experiments on a levitated machine, each by name: what is run, and its figures of merit.
+"""The experiments on MALTA.
 
-An experiment is a function (plant, controller, **options) -> Experiment. Options are fields of simulate.Scenario that
-replace the experiment's own (fidelity, noise, seed, estimator, ...), and those that its signature names.
-
-    stroke        the published move, Figs 12 and 13
-    hold          2000 samples at rest with sensor noise, Fig. 14 and Table III
-    tilt          a circle in sensor plane 1, sensor plane 2 held, Fig. 16 and eq. (21)
-    lift-off      from rest on the touchdown bearing, by each start-up estimator
-    payload       masses picked during a hold, and a stroke with them
-    thermal       a drifting support, seen by an outside laser and compensated, Fig. 15
-    disturbance   force and torque steps, vibration of the housing, compliance over frequency
-    faults        sensors, samples, a phase, the DC link: what survives and what touches down
-    drive-limits  the fastest stroke that the drive allows, against the sigmoid at the same peak current
+stroke        the published move, Figs 12 and 13
+hold          2000 samples at rest with sensor noise, Fig. 14 and Table III
+tilt          a circle in sensor plane 1, sensor plane 2 held, Fig. 16 and eq. (21)
+lift-off      from rest on the touchdown bearing, by each start-up estimator
+payload       masses picked during a hold, and a stroke with them
+thermal       a drifting support, seen by an outside laser and compensated, Fig. 15
+disturbance   force and torque steps, vibration of the housing, compliance over frequency
+faults        sensors, samples, a phase, the DC link: what survives and what touches down
+drive-limits  the fastest stroke that the drive allows, against the sigmoid at the same peak current
 """
 
 from __future__ import annotations
 
-import inspect
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping
 from functools import partial
-from numbers import Real
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import casadi as ca
 import numpy as np
@@ -30,10 +24,10 @@ from scipy.optimize import brentq
 
 from malta import references
 from malta.controller import Controller
-from malta.data import in_unit
 from malta.errors import InputError
+from malta.experiments import QUIET, Experiment, Merit, Progress, Wanted, fly, rms, scenario_of
+from malta.experiments.responses import amplitude, compliance, sine_wrench, step_wrench
 from malta.fastest import FastestStroke, SigmoidStroke, fastest_stroke, sigmoid_at_peak_current
-from malta.linearize import linearize
 from malta.noise import keys, normals
 from malta.plant import Plant, trim
 from malta.references import Motion, Profile, Reference
@@ -42,97 +36,16 @@ from malta.simulate import (
     FEEDFORWARDS,
     RISE,
     Correction,
-    EngineChoice,
     Fault,
     Scenario,
     Trajectory,
-    simulate,
     stroke_figures,
 )
-from malta.verify import machine_loop
 
 if TYPE_CHECKING:
     from malta.plant import FloatArray
 
-Progress = Callable[[float], None]
 DISTANCE = 10e-3  # m, the published stroke, Fig. 12
-FINDINGS = ("payload", "disturbance", "faults")  # experiments that ask where it ends
-# Fields of a scenario that may replace an experiment's own, and the engine.
-OPTIONS = {"duration", "noise", "quantize", "sensor_errors", "seed", "run", "delay", "substeps", "fidelity"}
-OPTIONS |= {"real_pwm", "bearing_axes", "bearing", "estimator", "scheduled", "feedforward", "engine"}
-# Sensors as built, without errors of their own; and such that say the truth.
-REAL: dict[str, Any] = {"noise": 1.0, "quantize": True, "sensor_errors": {}}
-QUIET: dict[str, Any] = {"noise": 0.0, "quantize": False, "sensor_errors": None}
-
-
-class Merit(NamedTuple):
-    """A figure of merit: SI value, the unit to show it in, and where the paper prints its own."""
-
-    label: str
-    value: float
-    unit: str
-    published: str = ""  # key of data/published/
-    relation: str = "about"  # of ours to the published: "about" or "at most"
-
-    def __str__(self) -> str:
-        unit = "%" if self.unit == "percent" else self.unit
-        return f"{self.label} {in_unit(self.value, self.unit):.3g} {unit}"
-
-
-class Case(NamedTuple):
-    """One of several runs of an experiment."""
-
-    label: str
-    run: Trajectory
-    merits: tuple[Merit, ...]
-
-
-class Wanted(NamedTuple):
-    """A run that an experiment wants, and what is to be found in it."""
-
-    label: str
-    scenario: Scenario
-    merits: Callable[[Trajectory], tuple[Merit, ...]]
-
-
-@dataclass(frozen=True, eq=False)
-class Experiment:
-    """What an experiment found."""
-
-    name: str
-    question: str
-    cases: tuple[Case, ...]
-    merits: tuple[Merit, ...]
-    curves: Mapping[str, FloatArray] = field(default_factory=dict)  # what is drawn beside the runs
-    interrupted: bool = False  # by Ctrl-C: the cases are those that were begun
-
-    def __str__(self) -> str:
-        cases = ("; ".join([case.label, *map(str, case.merits)]) for case in self.cases)
-        return "\n  ".join([f"{self.name}: {self.outcome}", *cases])
-
-    @property
-    def run(self) -> Trajectory:
-        """The first run."""
-        return self.cases[0].run
-
-    @property
-    def failed(self) -> bool:
-        """Whether a run ended that should not have; where touchdown is a finding, it is none."""
-        ends = {case.run.verdict.name for case in self.cases}
-        return self.name not in FINDINGS and not ends <= {"completed", "interrupted"}
-
-    @property
-    def outcome(self) -> str:
-        """How its runs ended, in words."""
-        ends = [case for case in self.cases if not case.run.verdict.completed]
-        if not ends and self.interrupted:
-            return f"interrupted after {len(self.cases)} runs"
-        if not ends:
-            return f"completed at {self.run.verdict.time:.4g} s"
-        verdicts = [f"{case.run.verdict.name} at {case.run.verdict.time:.4g} s" for case in ends]
-        if len(self.cases) == 1:
-            return verdicts[0]
-        return f"{len(ends)} of {len(self.cases)} runs not completed ({ends[0].label}: {verdicts[0]})"
 
 
 def stroke(
@@ -147,7 +60,7 @@ def stroke(
 ) -> Experiment:
     """The published stroke: tracking, radial deviation, currents, and K_D as the ratio of force and current."""
     wanted = _stroke_cases(plant, controller, distance=distance, rise=rise, profile=profile, **options)
-    cases, cut = _flown(plant, controller, wanted, progress, options)
+    cases, cut = fly(plant, controller, wanted, progress, options)
     return Experiment("stroke", "Does it follow the stroke?", cases, cases[0].merits, interrupted=cut)
 
 
@@ -211,12 +124,12 @@ def hold(
     plant: Plant, controller: Controller, *, progress: Progress | None = None, **options: Any
 ) -> Experiment:
     """Rest at the middle with sensor noise: statistics of the last 2000 measured samples, and the true motion."""
-    cases, cut = _flown(plant, controller, _hold_cases(plant, controller, **options), progress, options)
+    cases, cut = fly(plant, controller, _hold_cases(plant, controller, **options), progress, options)
     return Experiment("hold", "How still does it stand?", cases, cases[0].merits, interrupted=cut)
 
 
 def _hold_cases(_: Plant, controller: Controller, **options: Any) -> list[Wanted]:
-    scenario = _scenario("hold", (RESTING + 6000) * controller.sample_time, references.hold, options)
+    scenario = scenario_of("hold", (RESTING + 6000) * controller.sample_time, references.hold, options)
     return [Wanted("hold", scenario, _rest_merits)]
 
 
@@ -236,8 +149,8 @@ def _rest_merits(run: Trajectory) -> tuple[Merit, ...]:
             Merit(f"measured {n}, mean", float(y[:, k].mean()), "um", f"table_III.mean.{n}")
             for k, n in enumerate(names)
         ),
-        *(Merit(f"true {n}, rms", _rms(p[:, k]), "um") for k, n in enumerate(names)),
-        Merit("bearing force, rms about its mean", _rms((v - v.mean(axis=0))[:, bearings]), "N"),
+        *(Merit(f"true {n}, rms", rms(p[:, k]), "um") for k, n in enumerate(names)),
+        Merit("bearing force, rms about its mean", rms((v - v.mean(axis=0))[:, bearings]), "N"),
     )
 
 
@@ -255,7 +168,7 @@ def tilt(
     As the paper, and with the attraction at the reference fed forward.
     """
     wanted = _tilt_cases(plant, controller, radius=radius, frequency=frequency, **options)
-    cases, cut = _flown(plant, controller, wanted, progress, options)
+    cases, cut = fly(plant, controller, wanted, progress, options)
     return Experiment("tilt", "Does it tilt about sensor plane 2?", cases, (), interrupted=cut)
 
 
@@ -266,7 +179,9 @@ def _tilt_cases(_: Plant, __: Controller, *, radius: float, frequency: float, **
     return [
         Wanted(
             f"feedforward {kind}",
-            _scenario("tilt", 2 / frequency, reference, {"start": AT_REST} | options | {"feedforward": kind}),
+            scenario_of(
+                "tilt", 2 / frequency, reference, {"start": AT_REST} | options | {"feedforward": kind}
+            ),
             merits,
         )
         for kind in kinds
@@ -295,7 +210,7 @@ def lift_off(
     One run for each start-up estimator, or the one that options name.
     """
     wanted = _lift_cases(plant, controller, **options)
-    cases, cut = _flown(plant, controller, wanted, progress, options)
+    cases, cut = fly(plant, controller, wanted, progress, options)
     current = break_away_current(plant, wanted[0].scenario.start)
     needed = Merit("current per module that lifts it, statics", current, "A")
     return Experiment("lift-off", "Does it rise from its bearing?", cases, (needed,), interrupted=cut)
@@ -308,7 +223,7 @@ def _lift_cases(plant: Plant, _: Controller, **options: Any) -> list[Wanted]:
     reference = partial(rise_from, start=resting)
     return [
         Wanted(
-            kind, _scenario("lift-off", 0.15, reference, own | options | {"estimator": kind}), _lift_merits
+            kind, scenario_of("lift-off", 0.15, reference, own | options | {"estimator": kind}), _lift_merits
         )
         for kind in kinds
     ]
@@ -391,9 +306,9 @@ def payload(
     wanted = []
     for extra in masses:
         own = {"changes": ((PICKED, {"m": plant.mass + extra}),), "bearing": True}
-        scenario = _scenario("payload", WAIT + 0.15, reference, own | options)
+        scenario = scenario_of("payload", WAIT + 0.15, reference, own | options)
         wanted.append(Wanted(f"{extra * 1e3:.0f} g", scenario, _payload_merits))
-    cases, cut = _flown(plant, controller, wanted, progress, options)
+    cases, cut = fly(plant, controller, wanted, progress, options)
     carried = max((m for m, c in zip(masses, cases, strict=False) if c.run.verdict.completed), default=0.0)
     merit = Merit("largest of these carried and moved", carried, "kg", "position_controller.payload")
     return Experiment("payload", "What can it pick and move?", cases, (merit,), interrupted=cut)
@@ -439,11 +354,11 @@ def thermal(
     wanted = []
     for label, share in (("compensated", gain), ("not compensated", 0.0)):
         laser = _Laser(moved, share, [0, 2], len(plant.outputs))
-        scenario = _scenario(
+        scenario = scenario_of(
             "thermal", duration, references.hold, {"correction": Correction(every, laser)} | options
         )
         wanted.append(Wanted(label, scenario, merits))
-    cases, cut = _flown(plant, controller, wanted, progress, options)
+    cases, cut = fly(plant, controller, wanted, progress, options)
     lag = drift / duration * every / gain
     found = (
         Merit("drift of the support", drift, "um", "thermal.drift"),
@@ -458,7 +373,7 @@ def _thermal_merits(run: Trajectory, moved: Callable[[Any], Any], late: float) -
     outside = (run.p[:, 2] + moved(run.t))[run.t >= min(late, run.t[-1])]
     return (
         Merit("largest deviation in space", float(np.abs(outside).max()), "um"),
-        Merit("rms deviation in space", _rms(outside), "um"),
+        Merit("rms deviation in space", rms(outside), "um"),
     )
 
 
@@ -485,7 +400,7 @@ def disturbance(
 ) -> Experiment:
     """Steps of force and torque, vibration of the housing, sines of force; the linear loop's compliance beside them."""
     wanted = _disturbance_cases(plant, controller, **options)
-    cases, cut = _flown(plant, controller, wanted, progress, options)
+    cases, cut = fly(plant, controller, wanted, progress, options)
     steps, sines = cases[:4], cases[4:]
     w = np.geomspace(0.01, 2000, 600) * 2 * math.pi
     curve = compliance(plant, controller, w)
@@ -511,22 +426,18 @@ def _disturbance_cases(plant: Plant, _: Controller, **options: Any) -> list[Want
     outputs = [s.name for s in plant.outputs]
     wanted: list[Wanted] = []
     for name, size, seen in (("F_x", 1.0, "x1"), ("F_z", 1.0, plant.stroke), ("T_y", 0.05, "x1")):
-        push = partial(_step_wrench, column=names.index(name), size=size, at=0.02, width=len(names))
-        scenario = _scenario("disturbance", 0.4, references.hold, QUIET | {"disturbance": push} | options)
+        push = partial(step_wrench, column=names.index(name), size=size, at=0.02, width=len(names))
+        scenario = scenario_of("disturbance", 0.4, references.hold, QUIET | {"disturbance": push} | options)
         unit = plant.disturbances[names.index(name)].unit
         merits = partial(_step_merits, output=outputs.index(seen))
         wanted.append(Wanted(f"step of {size:g} {unit} {name}", scenario, merits))
-    shake = partial(
-        _sine_wrench, column=names.index("F_y"), size=plant.mass, frequency=50.0, width=len(names)
-    )
-    vibration = _scenario("vibration", 0.3, references.hold, QUIET | {"disturbance": shake} | options)
+    shake = partial(sine_wrench, column=names.index("F_y"), size=plant.mass, frequency=50.0, width=len(names))
+    vibration = scenario_of("vibration", 0.3, references.hold, QUIET | {"disturbance": shake} | options)
     shaken = partial(_sine_merits, output=outputs.index("y1"), frequency=50.0)
     wanted.append(Wanted("housing shaken by 1 m/s2 at 50 Hz along y", vibration, shaken))
     for f in TONES:
-        push = partial(
-            _sine_wrench, column=names.index("F_x"), size=TONE_FORCE, frequency=f, width=len(names)
-        )
-        scenario = _scenario(
+        push = partial(sine_wrench, column=names.index("F_x"), size=TONE_FORCE, frequency=f, width=len(names))
+        scenario = scenario_of(
             "sine", 2 * max(0.1, 4 / f), references.hold, QUIET | {"disturbance": push} | options
         )
         found = partial(_sine_merits, output=outputs.index("x1"), frequency=f)
@@ -546,66 +457,7 @@ def _step_merits(run: Trajectory, output: int) -> tuple[Merit, ...]:
 
 
 def _sine_merits(run: Trajectory, output: int, frequency: float) -> tuple[Merit, ...]:
-    return (
-        Merit(f"amplitude of {run.plant.outputs[output].name}", _amplitude(run, output, frequency), "um"),
-    )
-
-
-def compliance(
-    plant: Plant, controller: Controller, w: FloatArray, output: int = 0, wrench: str = "F_x"
-) -> FloatArray:
-    """|S(j w) G_w(j w)|, m/N: from a force on the centre of gravity to an output, on the linear loop of the machine.
-
-    S is the sampled loop's sensitivity at the sensors, G_w the open machine's response to the force between samples.
-    """
-    point = plant.at(
-        **dict(
-            zip([s.name for s in plant.design_states], controller.operating_point[0].tolist(), strict=True)
-        )
-    )
-    model = linearize(plant, point)
-    loop = machine_loop(model, controller)
-    x, w_ext = ca.SX.sym("x", len(plant.states)), ca.SX.sym("w", len(plant.disturbances))
-    rate = plant.f(x, ca.SX(point.u), w_ext)
-    column = [s.name for s in plant.disturbances].index(wrench)
-    B = np.array(ca.Function("B", [x, w_ext], [ca.jacobian(rate, w_ext)])(point.x, 0))[
-        list(plant.controlled), column
-    ]
-    S = loop.sensitivity(w)
-    eye = np.eye(len(model.A))
-    G = np.array([model.C @ np.linalg.solve(1j * wk * eye - model.A, B) for wk in w])
-    return np.asarray(np.abs(np.einsum("kij,kj->ki", S, G)[:, output]))
-
-
-def _step_wrench(t: FloatArray, column: int, size: float, at: float, width: int) -> FloatArray:
-    wrench = np.zeros((len(t), width))
-    wrench[t >= at, column] = size
-    return wrench
-
-
-def _sine_wrench(t: FloatArray, column: int, size: float, frequency: float, width: int) -> FloatArray:
-    wrench = np.zeros((len(t), width))
-    wrench[:, column] = size * np.sin(2 * math.pi * frequency * t)
-    return wrench
-
-
-def _amplitude(run: Trajectory, output: int, frequency: float) -> float:
-    """Amplitude of an output at a frequency (Hz), over the last whole periods of the second half of a run."""
-    Ts = run.controller.sample_time
-    period = 1 / frequency
-    periods = max(1, int(len(run.t) / 2 * Ts / period))
-    last = round(periods * period / Ts)
-    t, p = run.t[-last:], run.p[-last:, output]
-    basis = np.column_stack(
-        [
-            np.sin(2 * math.pi * frequency * t),
-            np.cos(2 * math.pi * frequency * t),
-            np.ones(len(t)),
-            t - t.mean(),
-        ]
-    )
-    fit = np.linalg.lstsq(basis, p, rcond=None)[0]
-    return float(math.hypot(fit[0], fit[1]))
+    return (Merit(f"amplitude of {run.plant.outputs[output].name}", amplitude(run, output, frequency), "um"),)
 
 
 def faults(
@@ -649,9 +501,9 @@ def faults(
         own: dict[str, Any] = {"faults": struck, "bearing": True} | options
         if any(fault.kind == "open phase" for fault in struck):
             own["fidelity"] = "phase"
-        scenario = _scenario("faults", 0.3, reference, own)
+        scenario = scenario_of("faults", 0.3, reference, own)
         wanted.append(Wanted(label, scenario, partial(_fault_merits, at=at)))
-    cases, cut = _flown(plant, controller, wanted, progress, options)
+    cases, cut = fly(plant, controller, wanted, progress, options)
     survived = float(sum(case.run.verdict.completed for case in cases))
     merit = Merit(f"survived, of {len(cases)}", survived, "1")
     return Experiment("faults", "What does it survive?", cases, (merit,), interrupted=cut)
@@ -690,7 +542,7 @@ def drive_limits(
     whose peak current is the same."""
     best, sigmoid = _limit_strokes(plant, distance, current_share, voltage_share)
     wanted = _limit_cases(best, sigmoid, distance, options)
-    cases, cut = _flown(plant, controller, wanted, progress, options)
+    cases, cut = fly(plant, controller, wanted, progress, options)
     merits = (
         Merit("current limit used", current_share * plant.actuator.current_limit, "A"),
         Merit("voltage limit used", voltage_share * plant.actuator.voltage_limit, "V"),
@@ -722,7 +574,7 @@ def _limit_cases(
     fast = partial(best.reference, centre=duration / 2)
     wanted: list[Wanted] = []
     for label, reference, found in (("fastest", fast, best), ("sigmoid", logistic, sigmoid)):
-        scenario = _scenario("drive-limits", duration, reference, QUIET | options)
+        scenario = scenario_of("drive-limits", duration, reference, QUIET | options)
         wanted.append(Wanted(label, scenario, partial(_limit_merits, found=found)))
     return wanted
 
@@ -753,45 +605,6 @@ def induced_per_speed(plant: Plant) -> float:
     return float(np.abs(np.array(ca.evalf(plant.drive.emf(ca.SX(ca.DM(plant.at(**{rate: 1.0}).x)))))).max())
 
 
-def _scenario(
-    name: str, duration: float, reference: Callable[[Plant], Reference], options: Mapping[str, Any]
-) -> Scenario:
-    """An experiment's scenario: real sensors unless the options say otherwise."""
-    fields = REAL | {key: value for key, value in options.items() if key != "engine"}
-    return replace(Scenario(name, duration, reference), **fields)
-
-
-def _flown(
-    plant: Plant,
-    controller: Controller,
-    wanted: Sequence[Wanted],
-    progress: Progress | None,
-    options: Mapping[str, Any],
-) -> tuple[tuple[Case, ...], bool]:
-    """Run scenarios one after the other. Ctrl-C ends the series with what there is: the second result."""
-    cases: list[Case] = []
-    for n, (label, scenario, merits) in enumerate(wanted):
-        share = None if progress is None else partial(_overall, progress, n, len(wanted))
-        try:
-            run = simulate(plant, controller, scenario, engine=options.get("engine", "auto"), progress=share)
-        except KeyboardInterrupt:
-            if not cases:
-                raise
-            return tuple(cases), True
-        cases.append(Case(label, run, merits(run)))
-        if run.verdict.name == "interrupted":
-            return tuple(cases), True
-    return tuple(cases), False
-
-
-def _overall(progress: Progress, done: int, total: int, share: float) -> None:
-    progress((done + share) / total)
-
-
-def _rms(values: FloatArray) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))
-
-
 EXPERIMENTS: dict[str, Callable[..., Experiment]] = {
     "stroke": stroke,
     "hold": hold,
@@ -803,17 +616,7 @@ EXPERIMENTS: dict[str, Callable[..., Experiment]] = {
     "faults": faults,
     "drive-limits": drive_limits,
 }
-
-
-def experiment(
-    name: str, plant: Plant, controller: Controller, *, progress: Progress | None = None, **options: Any
-) -> Experiment:
-    """Run an experiment by name. Raises InputError for an unknown one, or an option that it does not take."""
-    _check(name, options)
-    return EXPERIMENTS[name](plant, controller, progress=progress, **options)
-
-
-# Experiments whose cases ask the same of the machine from beginning to end: those that many machines can fly.
+# Their cases ask the same of the machine from beginning to end.
 CASES: dict[str, Callable[..., list[Wanted]]] = {
     "stroke": _stroke_cases,
     "hold": _hold_cases,
@@ -822,60 +625,37 @@ CASES: dict[str, Callable[..., list[Wanted]]] = {
     "disturbance": _disturbance_cases,
     "drive-limits": _limits,
 }
+FINDINGS = ("payload", "disturbance", "faults")
+ALONE = ("stroke", "hold", "tilt")
+WORDS = {"stroke": "axial", "m": "radial", "thrust": "thrust", "N": "bearing force"}
+STROKE_UNIT = "mm"
+OPTION_UNITS = {
+    "distance": "m",
+    "rise": "s",
+    "radius": "m",
+    "frequency": "Hz",
+    "masses": "kg",
+    "drift": "m",
+    "minute": "s",
+}
 
 
-def cases_of(name: str, plant: Plant, controller: Controller, **options: Any) -> list[Wanted]:
-    """What an experiment of CASES would fly, without flying it. Raises InputError as `experiment` does."""
-    _check(name, options)
-    if name not in CASES:
-        found = f"{name!r}, which changes the machine or the reference in flight"
-        raise InputError("simulate", "scenario", found, "one of " + ", ".join(CASES))
-    own = _own_options(name)
-    defaults = {p.name: p.default for p in inspect.signature(EXPERIMENTS[name]).parameters.values()}
-    return CASES[name](plant, controller, **{option: defaults[option] for option in own} | options)
+def check(name: str, option: str, value: Any) -> None:
+    """InputError for a number without a sense. A stroke's own are looked at where it is made."""
+    if option in ("distance", "rise", "profile", "during"):
+        return
+    if not all(math.isfinite(v) and v for v in (value if option == "masses" else (value,))):
+        raise InputError("simulate", f"{name}: {option}", repr(value), "finite, other than 0")
 
 
-def flown(
-    name: str,
-    plant: Plant,
-    controller: Controller,
-    wanted: Wanted,
-    engine: EngineChoice = "auto",
-    progress: Progress | None = None,
-    run: Trajectory | None = None,
-) -> Experiment:
-    """One run of an experiment by itself, flown now or before; those whose figure compares runs have a plain one."""
-    if run is None:
-        cases, cut = _flown(plant, controller, [wanted], progress, {"engine": engine})
-    else:
-        cases, cut = (Case(wanted.label, run, wanted.merits(run)),), False
-    shown = name if name in ("stroke", "hold", "tilt") else "run"
-    what = name if wanted.label == name else f"{name}: {wanted.label}"
-    return Experiment(shown, what, cases, cases[0].merits, interrupted=cut)
-
-
-def _check(name: str, options: Mapping[str, Any]) -> None:
-    """InputError for an unknown experiment, or an option that it does not take."""
-    if name not in EXPERIMENTS:
-        raise InputError("simulate", "scenario", repr(name), "one of " + ", ".join(EXPERIMENTS))
-    own, others = _own_options(name), {option for other in EXPERIMENTS for option in _own_options(other)}
-    for option, value in options.items():
-        where = f"{name}: {option}"
-        if option not in own | OPTIONS:
-            found = "an option of another scenario" if option in others else "an unknown option"
-            raise InputError("simulate", where, found, " ".join(sorted(own)) or "none of its own")
-        values = value if option == "masses" else (value,)
-        if option in own - {"profile", "during"} and not (
-            values and all(isinstance(v, Real) for v in values)
-        ):
-            raise InputError("simulate", where, repr(value), "a number")
-        checked_later = {"distance", "rise"}
-        if option in own - {"profile", "during"} - checked_later and not all(
-            math.isfinite(v) and v for v in values
-        ):
-            raise InputError("simulate", where, repr(value), "finite, other than 0")
-
-
-def _own_options(name: str) -> set[str]:
-    signature = inspect.signature(EXPERIMENTS[name])
-    return {p.name for p in signature.parameters.values() if p.kind is p.KEYWORD_ONLY} - {"progress"}
+def bounds(scenario: str, options: Mapping[str, Any]) -> dict[str, str]:
+    """What the paper prints of the published stroke."""
+    asked = {"distance": DISTANCE, "rise": RISE, "profile": "logistic"}
+    if scenario != "stroke" or any(options.get(name, value) != value for name, value in asked.items()):
+        return {}
+    return {
+        "rise": "figure_12.rise_time",
+        "overshoot": "figure_12.overshoot",
+        "stroke": "figure_12.axial_error",
+        "m": "figure_13.radial_deviation",
+    }

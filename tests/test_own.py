@@ -1,0 +1,219 @@
+"""A machine of one's own: its experiments, words, units and figures, found by its name."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from conftest import refusal
+
+import malta
+from malta import figures, report
+from malta.experiments import (
+    Case,
+    Experiment,
+    Merit,
+    Wanted,
+    cases_of,
+    fly,
+    main_job,
+    options_of,
+    scenario_of,
+)
+from malta.findings import bounds_of
+from malta.own import own, required
+from malta.plant import Signal
+from malta.references import hold
+from malta.signals import aside, inputs_of, outputs_of, stroke_unit
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from conftest import Design
+
+    from malta.controller import Controller
+    from malta.plant import Plant
+
+
+def rest(
+    plant: Plant,
+    controller: Controller,
+    *,
+    wait: float = 0.01,
+    often: int = 1,
+    twice: bool = False,
+    axes: tuple[float, ...] = (1.0,),
+    how: str = "still",
+    progress: Callable[[float], None] | None = None,
+    **options: Any,
+) -> Experiment:
+    """Rest."""
+    wanted = [
+        Wanted(how, scenario_of("rest", wait * often, hold, options), lambda _: (Merit("a", 1.0, "1"),))
+    ]
+    cases, cut = fly(plant, controller, wanted * (2 if twice else len(axes)), progress, options)
+    return Experiment("rest", "Does it rest?", cases, cases[0].merits, interrupted=cut)
+
+
+@pytest.fixture
+def toy(designs: dict[str, Design], monkeypatch: pytest.MonkeyPatch) -> Plant:
+    """MALTA under another name, with one experiment and no word for anything."""
+    monkeypatch.setitem(sys.modules, "malta.experiments.toy", SimpleNamespace(EXPERIMENTS={"rest": rest}))
+    return replace(designs["calibrated"].plant, name="toy")
+
+
+def test_parts_of_a_machine_are_found_by_its_name(toy: Plant) -> None:
+    for part in ("experiments", "figures", "claims"):
+        assert required(part, "tubular").__name__ == f"malta.{part}.tubular"
+    assert own("figures", toy.name) is None
+    error = refusal(lambda: required("claims", "toy"), Path("claims"))
+    assert (error.field, error.found) == ("machine", "'toy'")
+    assert "tubular" in error.expected
+    assert "__init__" not in error.expected
+
+
+def test_what_a_module_lacks_is_not_taken_for_a_machine_that_is_not_there(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    (tmp_path / "toy.py").write_text("import nothing_of_that_name\n")
+    monkeypatch.setattr("malta.claims.__path__", [*sys.modules["malta.claims"].__path__, str(tmp_path)])
+    with pytest.raises(ModuleNotFoundError, match="nothing_of_that_name"):
+        own("claims", "toy")
+
+
+def test_an_experiment_of_another_machine_is_flown(toy: Plant, designs: dict[str, Design]) -> None:
+    controller = designs["calibrated"].controller
+    assert main_job(toy) == "rest"
+    assert options_of("rest", toy) == {
+        "wait": 0.01,
+        "often": 1,
+        "twice": False,
+        "axes": (1.0,),
+        "how": "still",
+    }
+    found = malta.experiment("rest", toy, controller, often=2, noise=0.0)
+    assert len(found.run.t) == 400
+    assert found.run.scenario.noise == 0
+    assert not found.failed
+    ended = replace(found.run, verdict=found.run.verdict._replace(name="touchdown"))
+    assert replace(found, cases=(Case("a", ended, ()),)).failed  # no finding of its own
+    refused: tuple[tuple[str, Any, str], ...] = (
+        ("wait", "a", "a number"),
+        ("often", True, "a number"),
+        ("twice", 1.0, "true or false"),
+        ("axes", 1.0, "numbers"),
+        ("axes", (), "numbers"),
+        ("rise", 1.0, "axes how often twice wait"),
+    )
+    for option, value, expected in refused:
+        with pytest.raises(malta.InputError, match=f"rest: {option}: found .*, expected {expected}$"):
+            malta.experiment("rest", toy, controller, **{option: value})
+    with pytest.raises(malta.InputError, match="found 'stroke', expected one of rest"):
+        malta.experiment("stroke", toy, controller)
+    with pytest.raises(malta.InputError, match="'rest', which changes the machine"):
+        cases_of("rest", toy, controller)
+
+
+def test_without_a_figure_of_its_own_an_experiment_has_that_of_its_first_run(
+    toy: Plant, designs: dict[str, Design], tmp_path: Path
+) -> None:
+    controller = designs["calibrated"].controller
+    found = malta.experiment("rest", toy, controller, twice=True)
+    figure = report.experiment_figure(found)
+    assert figure.get_suptitle().endswith("Does it rest? still, one of 2")
+    labels = [axes.get_ylabel() for axes in figure.axes]
+    assert labels == [
+        "x1 y1 x2 y2, off reference [µm]",
+        "commanded force [N]",
+        "z, off reference [µm]",
+        "clearance used up [%]",
+    ]
+    assert report.stroke(found.run, tmp_path / "run.svg").stat().st_size > 10_000
+    with pytest.raises(malta.InputError, match="'lunch', expected one of rest, run"):
+        report.experiment_figure(replace(found, name="lunch"))
+
+
+def test_angles_and_torques_have_panels_and_units_of_their_own(
+    toy: Plant, designs: dict[str, Design], tmp_path: Path
+) -> None:
+    """The same numbers, read as two positions, two angles and the stroke; three forces and two torques."""
+    run = malta.experiment("rest", toy, designs["calibrated"].controller).run
+    outputs = [Signal(s.name, "rad" if s.name.endswith("2") else "m") for s in toy.outputs]
+    inputs = [Signal(s.name, "N m" if s.name.endswith("2") else "N") for s in toy.inputs]
+    turning = replace(toy, outputs=tuple(outputs), inputs=tuple(inputs))
+    assert [(g.name, g.fine, g.columns) for g in outputs_of(turning)] == [
+        ("z", "um", (4,)),
+        ("x1 y1", "um", (0, 1)),
+        ("x2 y2", "urad", (2, 3)),
+    ]
+    assert [(g.name, g.unit) for g in inputs_of(turning)] == [
+        ("f_D", "N"),
+        ("fx_B1 fy_B1", "N"),
+        ("fx_B2 fy_B2", "N m"),
+    ]
+    e = Experiment("run", "A run", (Case("a", replace(run, plant=turning), ()),), ())
+    figure = report.experiment_figure(e)
+    labels = [axes.get_ylabel() for axes in figure.axes if axes.get_visible()]
+    assert labels == [
+        "x1 y1, off reference [µm]",
+        "x2 y2, off reference [µrad]",
+        "commanded force [N]",
+        "commanded torque [N m]",
+        "z, off reference [µm]",
+        "clearance used up [%]",
+    ]
+    assert "x2 y2 " in figure.texts[-1].get_text()
+    figures.save(figure, tmp_path / "run.png")
+    free = replace(turning, contacts=())
+    alone = report.experiment_figure(replace(e, cases=(Case("a", replace(run, plant=free), ()),)))
+    assert alone.axes[5].get_ylabel() == "currents, from least to largest [A]"
+
+
+def test_the_words_of_a_machine(plant: Plant, toy: Plant) -> None:
+    assert [group.name for group in outputs_of(plant)] == ["axial", "radial"]
+    assert [group.name for group in inputs_of(plant)] == ["thrust", "bearing force"]
+    assert (stroke_unit(plant), stroke_unit(toy)) == ("mm", "um")
+    one = replace(toy, outputs=(toy.outputs[0],), stroke="x1")
+    assert [group.name for group in aside(one)] == ["x1"]
+
+
+def test_only_what_the_paper_shows_has_its_bounds(toy: Plant, plant: Plant) -> None:
+    plan: Any = SimpleNamespace(plant=plant, scenario="stroke", options={"noise": 1.0})
+    assert set(bounds_of(plan)) == {"rise", "overshoot", "stroke", "m"}
+    plan.options = {"rise": 0.02}
+    assert bounds_of(plan) == {}
+    plan.plant, plan.options = toy, {}
+    assert bounds_of(plan) == {}
+
+
+def test_the_gang_of_four_of_angles_says_its_units(toy: Plant) -> None:
+    from test_report import printed
+
+    angles = replace(toy, outputs=(Signal("x1", "m"), Signal("a", "rad")))
+    gang = {"x1": (1.0, 1.0, 2e-6, 3e6), "a": (1.0, 1.0, 4e-6, 5e6)}
+    found: Any = SimpleNamespace(gang=gang)
+    text = printed(report.gang_table(found, angles))
+    for cell in ("2.0 um/N", "3.000 N/um", "4.0 urad/(N m)", "5.000 N m/urad"):
+        assert cell in text
+    found = SimpleNamespace(gang={"x1": gang["x1"]})
+    assert "from force |SP| [um/N]" in printed(report.gang_table(found, toy))
+
+
+def test_poles_of_damped_and_of_stable_machines(designs: dict[str, Design]) -> None:
+    from test_report import printed
+
+    model = designs["calibrated"].model
+    A = model.A.copy()
+    half = len(A) // 2
+    A[half:, :half] = -A[half:, :half]
+    assert "218.92j" in printed(report.poles_table(replace(model, A=A), None))
+    A[half + 2, half + 2] = -2.5
+    text = printed(report.poles_table(replace(model, A=A), None))
+    assert "-2.5" in text
+    assert "0+-218.9j" in text or "+-218.9j" in text
+    assert np.all(model.A[half:, half:] == 0)
