@@ -39,7 +39,7 @@ plant = malta.plant_of(controllers["robust"].parameters)
 # %%
 found = {name: malta.robustness(plant, controller, BOX) for name, controller in controllers.items()}
 for name, result in found.items():
-    malta.report.robustness(result, name, BOX, f"build/04_{name}_margins.png")
+    malta.report.robustness(result, name, BOX, f"build/04_{name}_margins.png", "position z")
     print(name)
     for link in result.chain:
         print(f"  {link.name:16} {link.margin};  peak |S| {link.peak:.2f} at the {link.broken_at}")
