@@ -15,7 +15,8 @@ At every sample:
   6. xi_pred = Ad xi_hat + Bd (v - v0(z))
 The mechanical states stand first in xi. Where the design models a delay of d samples, forces of the last d samples
 follow, the oldest first: v - v0, and what currents commutated for an old reading make beside it. Their reference is
-what was commanded then. Last come constant forces of disturbance, where the filter observes them; their reference is zero.
+what was commanded then. Last come constant forces of disturbance, where the filter observes them, with zero for a
+reference.
 
 A PID controller is the same law: its filter takes positions as measured and rates as filtered differences,
 Ad = diag(1, a), Bd = 0, L = (P^-1, (1 - a) P^-1 / Ts), and it has neither a cost nor noise that it was designed for.

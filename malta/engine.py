@@ -28,6 +28,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -42,6 +43,7 @@ if TYPE_CHECKING:
     from malta.plant import FloatArray
 
 LANES = 8
+WHOLE, PART = 4000, 1500  # statements: the longest function that is not cut, and the longest part of one that is
 FLAGS = (
     *("-std=gnu11", "-O3", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math"),
     *("-fschedule-insns", "-fsched-pressure", "-fPIC", "-shared"),
@@ -121,41 +123,87 @@ def translate(f: ca.Function, shared: Sequence[int], first_constant: int) -> tup
     read = {a for k in used if not nodes[k].fixed for a in nodes[k].arguments} | {k for *_, k in outputs}
     kept = [k for k in fixed if k in read and nodes[k].op]
     place = {k: first_constant + index for index, k in enumerate(kept)}
+    moving = [k for k in used if nodes[k].op and not nodes[k].fixed]
+    parts = _cut(moving)
+    part = {k: index for index, members in enumerate(parts) for k in members}
+    slot = _slots(nodes, parts, {k for *_, k in outputs})
 
-    def text(k: int, *, moving: bool, mask: bool = False) -> str:
+    def text(k: int, *, at: int | None, mask: bool = False) -> str:
+        """What a node is called in a part of the function, or in `prepare`; as a mask if that is asked for."""
         node = nodes[k]
-        if moving and k in place:
+        is_mask = node.op in _MASKS
+        if at is not None and k in place:
             plain, is_mask = f"c[{place[k]}]", False
+        elif k in slot and part[k] != at:
+            plain = f"bits(s[{slot[k]}])" if is_mask else f"s[{slot[k]}]"
         else:
-            plain, is_mask = (f"t{k}" if node.op else node.form), node.op in _MASKS
+            plain = f"t{k}" if node.op else node.form
         if mask:
             return plain if is_mask else f"MASK({plain} != 0.0)"
         return f"truth({plain})" if is_mask else plain
 
     def line(k: int) -> str:
-        node, moving = nodes[k], not nodes[k].fixed
+        node, at = nodes[k], part.get(k)
         masks = _mask_arguments(node)
-        values = [text(a, moving=moving, mask=i in masks) for i, a in enumerate(node.arguments)]
+        values = [text(a, at=at, mask=i in masks) for i, a in enumerate(node.arguments)]
         kind = "whole" if node.op in _MASKS else "real"
         return f"  const {kind} t{k} = {node.form.format(*values)};"
 
+    def handed_over(k: int) -> str:
+        return f"  s[{slot[k]}] = {f'value(t{k})' if nodes[k].op in _MASKS else f't{k}'};"
+
     prepare = [line(k) for k in fixed if nodes[k].op]
-    prepare += [f"  c[{place[k]}] = {text(k, moving=False)};" for k in kept]
-    lines = [line(k) for k in used if nodes[k].op and not nodes[k].fixed]
-    results = [(f"r{i}[{j}]", text(k, moving=True)) for i, j, k in outputs]
-    lines += [f"  const real o{n} = {found};" for n, (_, found) in enumerate(results)]
-    lines += [f"  {place} = o{n};" for n, (place, _) in enumerate(results)]
+    prepare += [f"  c[{place[k]}] = {text(k, at=None)};" for k in kept]
+    bodies = [[x for k in members for x in (line(k), *([handed_over(k)] if k in slot else []))] for members in parts]
+    results = [(f"r{i}[{j}]", text(k, at=len(parts) - 1)) for i, j, k in outputs]
+    bodies[-1] += [f"  const real o{n} = {found};" for n, (_, found) in enumerate(results)]
+    bodies[-1] += [f"  {place} = o{n};" for n, (place, _) in enumerate(results)]
     kinds = ["double" if i in shared else "real" for i in range(f.n_in() - 1)]
     # The first argument may be the first result: what is read is read before anything is written.
-    head = ", ".join(
-        [
-            "const real *restrict c",
-            *(f"const {kind} *{'restrict ' * (i > 0)}a{i}" for i, kind in enumerate(kinds)),
-        ]
-        + [f"real *{'restrict ' * (i > 0)}r{i}" for i in range(f.n_out())]
-    )
-    function = [f"static inline __attribute__((always_inline)) void {f.name()}({head}) {{", *lines, "}", ""]
-    return "\n".join(["  {", *prepare, "  }"]), "\n".join(function), len(kept)
+    arguments = [
+        ("const real *restrict ", "c"),
+        *((f"const {kind} *{'restrict ' * (i > 0)}", f"a{i}") for i, kind in enumerate(kinds)),
+        *((f"real *{'restrict ' * (i > 0)}", f"r{i}") for i in range(f.n_out())),
+    ]
+    function = _assembled(f.name(), arguments, bodies, len(set(slot.values())))
+    return "\n".join(["  {", *prepare, "  }"]), function, len(kept)
+
+
+def _cut(statements: list[int]) -> list[list[int]]:
+    """A long function in parts of about the same length: compilers take more than twice as long for twice as much."""
+    count = math.ceil(len(statements) / PART) if len(statements) > WHOLE else 1
+    edges = [len(statements) * k // count for k in range(count + 1)]
+    return [statements[begin:end] for begin, end in pairwise(edges)]
+
+
+def _slots(nodes: list[_Node], parts: list[list[int]], results: set[int]) -> dict[int, int]:
+    """Where the nodes that later parts read stand meanwhile; a place is taken again after the last part that reads."""
+    last = {k: index for index, members in enumerate(parts) for reader in members for k in nodes[reader].arguments}
+    last |= dict.fromkeys(results, len(parts) - 1)  # the last part writes them
+    slot: dict[int, int] = {}
+    free: list[int] = []
+    size, leaving = 0, [[] for _ in parts]
+    for index, members in enumerate(parts):
+        free += leaving[index - 1] if index else []
+        for k in members:
+            if last[k] > index:
+                if not free:
+                    free, size = [size], size + 1
+                slot[k] = free.pop()
+                leaving[last[k]].append(slot[k])
+    return slot
+
+
+def _assembled(name: str, arguments: list[tuple[str, str]], bodies: list[list[str]], slots: int) -> str:
+    """The function; or its parts, which share the array s, and a function that calls one after the other."""
+    taken, given = ", ".join(map("".join, arguments)), ", ".join(called for _, called in arguments)
+    inline, apart = (f"static {x}void" for x in ("inline __attribute__((always_inline)) ", "__attribute__((noinline)) "))
+    (*_, body), lines = bodies, []
+    if len(bodies) > 1:
+        for k, members in enumerate(bodies):
+            lines += [f"{apart} {name}_{k}({taken}, real *restrict s) {{", *members, "}"]
+        body = [f"  real s[{slots}];", *(f"  {name}_{k}({given}, s);" for k in range(len(bodies)))]
+    return "\n".join([*lines, f"{inline} {name}({taken}) {{", *body, "}", ""])
 
 
 def _read(f: ca.Function, shared: Sequence[int]) -> tuple[list[_Node], list[tuple[int, int, int]]]:
@@ -330,8 +378,8 @@ def source(p: Parts, digest: ca.Function | None) -> str:
 
 def _near(function: str) -> str:
     """The function for small tilts alone, which tells by `range` whether they were: its code has no branches."""
-    name, rest = function.replace("tilt", "near").split("(const real *", 1)
-    return f"{name}_near(real *range, const real *{rest}"
+    text = function.replace("tilt", "near").replace("(const real *", "_near(real *range, const real *")
+    return text.replace("(c, ", "_near(range, c, ")  # calls of its parts
 
 
 @cache

@@ -59,8 +59,9 @@ class Actuator:
     L: float  # H
     crossover: float  # rad/s; inf: currents follow their commands at once
     phase_margin: float  # rad
-    sample_time: float  # s
-    dead_time: float  # s
+    sample_time: float  # s, of the current loops
+    loop_delay: float  # s, their dead time
+    dead_time: float  # s, from measurement to force
 
     def delay(self, Ts: float) -> int:
         """Whole samples between measurement and force: the dead time less the half sample that a hold takes."""

@@ -163,13 +163,13 @@ def gains(
     Ad, Bd, Cd = sampled_model(model, Ts, delay)
     K, Ki = _sampled_regulator(model, weights, Ts, delay, integrated=integrated)
     L = _sampled_filter(model, weights, Ts, delay, integrated=integrated)
-    if weights.drift_variance.size:  # x+ = Ad x + Bd (v + d), d+ = d, and v takes d off
+    if weights.drift_variance.size:  # x+ = Ad x + Bd (v + d), d+ = d; v takes d off, stored forces have done so
         n, m, p = len(model.A), model.B.shape[1], len(Cd)
         pushed = np.zeros((len(Ad), m))
         pushed[:n] = Ad[:n, n : n + m] if delay else Bd
         Ad = np.block([[Ad, pushed], [np.zeros((m, len(Ad))), np.eye(m)]])
         Bd, Cd = np.vstack([Bd, np.zeros((m, m))]), np.hstack([Cd, np.zeros((p, m))])
-        K = np.hstack([K, np.eye(m)])
+        K = np.hstack([K, np.eye(m) + K[:, n:].reshape(m, delay, m).sum(axis=1)])
     return Gains(Ad, Bd, Cd, K, Ki, L)
 
 
@@ -236,7 +236,7 @@ def _machine_part(model: LinearModel, Ts: float, delay: int, *, current_loop_del
     plant, actuator = model.plant, model.plant.actuator
     loop = None
     if math.isfinite(actuator.crossover):
-        dead_time = actuator.dead_time if current_loop_delay else 0.0
+        dead_time = actuator.loop_delay if current_loop_delay else 0.0
         loop = CurrentLoop(*pi_current_loop(actuator, dead_time), actuator.sample_time)
     coils = len(actuator.coils)
     return {

@@ -116,6 +116,7 @@ def test_current_loops_in_the_law_are_those_of_the_machine(name: str, delay: int
     plant = plant_of(c.parameters)
     T, a = c.sample_time, plant.actuator
     current, law = c.current_loop, linear_law(c)
+    assert current is not None
     system = uncertain(plant, ["m"], at={"z": 3e-3})
     A, B, C = (M[0] for M in system.at(system.nominal))
     # forces follow voltages / R with the windings' time constant

@@ -393,7 +393,7 @@ def _current_loop(e: Evidence) -> tuple[float, float]:
     loop, actuator = e.controller.current_loop, e.model.plant.actuator
     if loop is None:
         return math.nan, math.nan
-    delay = actuator.dead_time if e.spec.current_loop_delay else 0.0
+    delay = actuator.loop_delay if e.spec.current_loop_delay else 0.0
 
     def gain(w: float) -> complex:
         return complex(open_loop_gain(actuator, loop.Kp, loop.Ki, delay, np.array([w]))[0])

@@ -347,6 +347,7 @@ def plant(par: Parameters) -> Plant:
             crossover=current_loop(par, MEAN_OF).crossover,
             phase_margin=par.pm_cc,
             sample_time=1 / par.f_pwm,
+            loop_delay=current_delay(par, MEAN_OF),
             dead_time=(par.latency + 0.5) * par.T_laser,
         ),
         windings=None,

@@ -153,6 +153,7 @@ def plant(par: Parameters) -> Plant:
             crossover=math.inf,
             phase_margin=0.0,
             sample_time=par.T_s,
+            loop_delay=0.0,
             dead_time=par.T_d,
         ),
         windings=None,

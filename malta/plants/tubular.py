@@ -126,6 +126,7 @@ def plant(par: Parameters, *, small_angle: bool = False) -> Plant:
             crossover=par.w_cc,
             phase_margin=par.pm_cc,
             sample_time=par.T_cc,
+            loop_delay=par.T_d,
             dead_time=par.T_d,
         ),
         windings=drive(par),
