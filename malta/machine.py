@@ -166,9 +166,9 @@ def parts(plant: Plant, c: Controller, s: Setup, values: Mapping[str, ca.DM], *,
         measured = ca.if_else(given["stuck"], controller["y_last"], measured)
     first, last = g["grid_ends"][0], g["grid_ends"][1]
     at = ca.fmax(ca.fmin(measured[plant.stroke_output], last), first)
-    sense = ca.Function("sense", [state, around, noise, theta], ca.cse([measured, at]))
+    sense = ca.Function("sense", [state, around, noise, theta], ca.cse([ca.densify(measured), at]))
 
-    moved = ca.cse(_moved(plant, s, g, machine, given, held, jitter))
+    moved = ca.cse(ca.densify(_moved(plant, s, g, machine, given, held, jitter)))
     substep = ca.Function("substep", [ca.vertcat(*machine.values()), held, around, jitter, theta], [moved])
     return Parts(sense, _decide(plant, c, s, g, theta, sizes), substep, names)
 
@@ -190,6 +190,7 @@ def _decide(
         command,
         ca.vertcat(*(row[name] for name in sizes.row)),
     ]
+    decided = [ca.densify(values) for values in decided]  # engines read every entry: no zero may be left out
     state = ca.vertcat(*machine.values(), *controller.values())
     arguments = [state, ca.vertcat(*given.values()), y, v0, theta]
     if kind is ca.SX:
