@@ -26,8 +26,8 @@ from malta.plant import Plant
 from malta.robust import Margin, robust_margin
 from malta.spec import Weights
 from malta.synthesize import kalman, lqi, lqr
-from malta.uncertain import Compensator, UncertainSystem, holds, instability, responses, uncertain
-from malta.verify import PLACES, CurrentLoops, largest, machine_law, travel_margin
+from malta.uncertain import Compensator, UncertainSystem, instability, responses, uncertain
+from malta.verify import PLACES, CurrentLoops, largest, machine_law, machine_system, travel_margin
 
 if TYPE_CHECKING:
     from malta.plant import ComplexArray, FloatArray
@@ -171,22 +171,23 @@ def robustness(
         if progress is not None:
             progress(min(1.0, next(steps) / total))
 
-    names, stroke, held = list(uncertainty), plant.stroke, holds(plant)
+    names, stroke = list(uncertainty), plant.stroke
+    every = [*names, *({"m"} & set(units_of(plant.parameters)) - set(names))]
     at = {stroke: float(controller.operating_point[0][plant.stroke_state])}
     believed = plant_of(controller.parameters)
     links = []
     stages = compensators(plant, controller, current_loops)
     for name, (law, states) in stages.items():
-        system = uncertain(
-            plant, names, states=states, at=at, believed=believed, held=name == SAMPLED and held
-        )
+        if name == SAMPLED:
+            system, law = machine_system(plant, controller, names, at, current_loops)
+        else:
+            system = uncertain(plant, names, states=states, at=at, believed=believed)
         margin, peak = robust_margin(system, law, uncertainty), _peak(system, law, states)
         links.append(Link(name, margin, peak, "forces" if states else "sensors"))
         done()
-    law = stages[SAMPLED][0]
 
     def anywhere(ranges: Mapping[str, float | tuple[float, float]]) -> Margin:
-        found = travel_margin(plant, controller, ranges, current_loops)
+        found = travel_margin(plant, controller, ranges, current_loops, every)
         done()
         return found
 
@@ -206,7 +207,7 @@ def robustness(
     for share in PLACES:
         margins, peaks, sides = [], [], []
         for z in dict.fromkeys((share * plant.travel, -share * plant.travel)):
-            here = uncertain(plant, names, at={stroke: z}, believed=believed, held=held)
+            here, law = machine_system(plant, controller, names, {stroke: z}, current_loops)
             margins.append(robust_margin(here, law, uncertainty))
             peaks.append(_peak(here, law, states=False))
             sides.append(_classical(here, law, sensors) if _stable(here, law) else None)

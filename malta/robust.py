@@ -61,6 +61,7 @@ EDGE = 1e-4  # how far from the end of what a parameter can be the search stays,
 # How close the proven bound comes to the witness, relative:
 EXACT = 5e-7  # where all modes are single, and of sampled loops at one position
 TOLERANCE = 9.98e-4  # else: upper / lower <= 1.001
+CLOSE = 0.01  # where what is only bounded keeps the proof away from the witness
 
 
 @dataclass(frozen=True, eq=False)
@@ -400,23 +401,35 @@ def _branch_and_bound(found: _Bound, box: _Box, goal: float, tolerance: float, m
     """Prove the box at `goal`, which is below the witness, or a smaller one.
 
     Where a proof gets stuck, stability may be lost off the diagonals: the witness is looked for around that place.
+    Between the largest box that is proven and the smallest that is not, the proof is tried to within a percent.
     """
     if found.poly is None:
         return found
-    looked, reason = 0, ""
+    looked, reason, failed = 0, "", math.inf
     shares = iter((1e-5, 1e-4, 1e-3, 1e-2, 0.03, 0.1, 0.2, 0.3, 0.4, 0.5, 0.7, 0.9, 0.99))
     top = goal
     while True:
         e = enclosure(found.block, box.nominal, box.sides(goal), found.poly)
         proved = _prove(e, most_cells, found.frequency)
         if isinstance(proved, Certificate):
-            return replace(found, lower=goal, certificate=proved)
+            found = replace(found, lower=goal, certificate=proved)
+            if failed - goal <= CLOSE * goal or math.isinf(failed):
+                return found
+            goal = (goal + failed) / 2
+            continue
         reason, place = proved
+        failed = goal
+        if found.lower is not None:
+            if failed - found.lower <= CLOSE * found.lower:
+                return found
+            goal = (found.lower + failed) / 2
+            continue
         looked += 1
         better = _around(e, box, goal, place) if looked <= 4 else None
         if better is not None and better[0] < min(goal, found.upper):
             found = replace(found, upper=better[0], frequency=better[1], witness=better[2], exact=False)
             goal = top = better[0] * (1 - tolerance)
+            failed = math.inf
             continue
         share = next(shares, None)
         if share is None:
@@ -602,6 +615,9 @@ def _prove(e: Enclosure, most_cells: int, near: float | None = None) -> Certific
         edges = edges[edges <= cells[low, 2].max()]
         cells = np.vstack([np.column_stack([0 * edges[1:], edges[:-1], edges[1:]]), cells[~low]])
     ends = (0.0, float(cells[:, 2].max()) if e.block.own.sample_time is not None else math.inf)
+    lost = _hopeless(e, cells)
+    if lost is not None:
+        return lost
     boxes = np.tile([0.0, 1.0], (len(cells), len(e.shape), 1))
     done_cells, done_boxes, count = [], [], 0
     while len(cells):
@@ -651,32 +667,79 @@ def _prove(e: Enclosure, most_cells: int, near: float | None = None) -> Certific
     return Certificate(count, ends, np.vstack(done_cells), np.vstack(done_boxes))
 
 
+def _hopeless(e: Enclosure, cells: FloatArray) -> tuple[str, FloatArray] | None:
+    """Where f is smaller than what of it is only bounded, as images of a slow hold are: why, and at which parameters.
+
+    No split makes that smaller. Looked for at the corners and in the middle of the box, at the edges of the cells.
+    """
+    if e.block.own.sample_time is None:
+        return None
+    edges = np.unique(cells[:, [0, 2]], axis=0)
+    f = coefficients(e, np.column_stack([edges, edges[:, 1]]))
+    shares = np.array(list(itertools.product(*((0.0, 0.5, 1.0) if n > 1 else (0.5,) for n in e.shape))))
+    places = e.sides[:, 0] + np.diff(e.sides, axis=1)[:, 0] * shares
+    at = products(e, places).T
+    with np.errstate(all="ignore"):
+        left = np.abs(f.c @ at) - f.r @ np.abs(at)
+    k, place = np.unravel_index(np.where(np.isfinite(left), left, np.inf).argmin(), left.shape)
+    if not left[k, place] < 0:
+        return None
+    w = edges[k, 1] if edges[k, 0] == 0 else 1 / edges[k, 1]
+    return f"zero is not excluded, near {w:.6g} rad/s", places[place]
+
+
 def _merged(system: UncertainSystem, c: Compensator, box: _Box, bounds: list[_Bound], start: float) -> Margin:
     """The smallest bounds, the witness beyond the boundary far enough for the eigenvalues of the loop to say so."""
     worst = min(bounds, key=lambda b: b.upper)
-    reasons = [b.reason for b in bounds if b.reason]
+    reasons = list(dict.fromkeys(b.reason for b in bounds if b.reason))
     lower = (
         None if any(b.lower is None for b in bounds) else min(b.lower for b in bounds if b.lower is not None)
     )
     upper, frequency, witness, shares = worst.upper, worst.frequency, None, {}
     if worst.witness is not None:
         shares = _shares(worst, box)
-        grows = box.down + box.up > 0
-        for beyond in (2e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2):
-            p = worst.witness.copy()
-            p[grows] = box.nominal[grows] + (1 + beyond) * (p[grows] - box.nominal[grows])
-            if float(instability(system, c, p)[0]) > 0:
-                upper, witness = worst.upper * (1 + beyond), p
-                break
-        else:
+        beyond = _confirmed(system, c, box, worst.witness)
+        if beyond is None:
             reasons.append("the eigenvalues do not confirm the witness")
             upper, frequency, lower = math.inf, None, None
+        else:
+            upper, witness = worst.upper * beyond, _stretched(box, worst.witness, beyond)
     named = None if witness is None else dict(zip(system.names, witness.tolist(), strict=True))
     moved = {name: value - float(system.nominal[i]) for i, (name, value) in enumerate((named or {}).items())}
     proofs = tuple(b.certificate for b in bounds if b.certificate is not None)
     return Margin(
         lower, upper, frequency, named, moved, shares, proofs, time.perf_counter() - start, "; ".join(reasons)
     )
+
+
+def _stretched(box: _Box, p: FloatArray, share: float) -> FloatArray:
+    """Parameters that deviate `share` times as far, those that stay as they are."""
+    return np.where(box.down + box.up > 0, box.nominal + share * (p - box.nominal), p)
+
+
+def _confirmed(system: UncertainSystem, c: Compensator, box: _Box, p: FloatArray) -> float | None:
+    """How much further the eigenvalues of the loop say that p has to go to be unstable, as a factor; None: they do not.
+
+    f leaves out the images of a hold but for those of a free mass: it may be a few percent off where the hold is slow.
+    """
+
+    def unstable(share: float) -> bool:
+        return float(instability(system, c, _stretched(box, p, share))[0]) > 0
+
+    last = 1 - 1e-3
+    if unstable(last):
+        found, last = last, 0.0
+    else:
+        for found in (1 + 2e-7, 1 + 1e-6, 1 + 1e-5, 1 + 1e-4, 1.001, 1.01, 1.03, 1.1, 1.3):
+            if unstable(found):
+                break
+            last = found
+        else:
+            return None
+    while found - last > 1e-6:
+        middle = (found + last) / 2
+        found, last = (middle, last) if unstable(middle) else (found, middle)
+    return found
 
 
 def _shares(bound: _Bound, box: _Box) -> dict[str, float]:

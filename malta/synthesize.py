@@ -12,8 +12,8 @@ The integrals are the controller's own sums, e+ = e + Ts (p* - y), so their weig
 Noise is given for one sample; held over it (forces) or spread over it (intensity = variance x Ts).
 
 Both sampled ways know what is held between samples: the currents, commutated for the last reading (E of the linear
-model), so that the sampled machine hangs on their spring. In place of integrals, or beside them, the filter may observe
-a constant force of disturbance on each input, which the regulator takes off again.
+model), so that the sampled machine hangs on their spring. In place of integrals the filter may observe a constant force
+of disturbance on each input, which the regulator takes off again.
 """
 
 from __future__ import annotations
@@ -163,7 +163,7 @@ def gains(
     Ad, Bd, Cd = sampled_model(model, Ts, delay)
     K, Ki = _sampled_regulator(model, weights, Ts, delay, integrated=integrated)
     L = _sampled_filter(model, weights, Ts, delay, integrated=integrated)
-    if weights.drift_variance.size:  # x+ = Ad x + Bd (v + d), d+ = d; v takes d off, stored forces have done so
+    if weights.drift_variance.size:  # x+ = Ad x + Bd (v + d), d+ = d; v takes d off, as stored forces have
         n, m, p = len(model.A), model.B.shape[1], len(Cd)
         pushed = np.zeros((len(Ad), m))
         pushed[:n] = Ad[:n, n : n + m] if delay else Bd
@@ -212,6 +212,10 @@ def lqg(
         what = str(delay) if delay else asked[0]
         raise InputError(
             "lqg", "delay", f"{what} with {discretization}", "0, or more with zoh or sampled-data"
+        )
+    if weights.drift_variance.size and weights.q_i.any():
+        raise InputError(
+            "lqg", "drift", "integrals with a weight", "weights.integral all 0: one of them takes off loads"
         )
     _check_sizes(model, weights)
     found = gains(model, weights, Ts, discretization, delay)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import casadi as ca
@@ -74,19 +75,19 @@ def uncertain(
     at: Mapping[str, float] | None = None,
     states: bool = False,
     believed: Plant | None = None,
-    held: bool = False,
+    held: FloatArray | None = None,
 ) -> UncertainSystem:
     """The design model of a plant at a position along its stroke, in parameters by name, at its preload.
 
     The stroke itself may be one of the names (`z` for MALTA): its nominal value is the position.
     Inputs are commanded forces: a controller commutates as the machine it knows, the plant's currents make their own.
     at: the position, SI; states: the states follow the outputs in y; believed: the machine that the controller knows,
-    where it is another one; held: currents are held between samples, and the reading that they were commutated for is
-    a further input.
+    where it is another one; held: H of currents that are held between samples (`held_at`): the inputs are
+    v + H y, and where the parameters leave more of the reading than that, it is a further input.
 
     Raises InputError for an unknown name.
     """
-    from malta.data import shaping, twins_of, units_of
+    from malta.data import shaping, units_of
 
     par = plant.parameters
     known = [*units_of(par), plant.stroke]
@@ -95,30 +96,68 @@ def uncertain(
             raise InputError("robust_margin", name, "an unknown parameter", "one of " + " ".join(known))
     for name in set(names) & set(shaping(par)):
         raise InputError("robust_margin", name, "a parameter that shapes the model", "one that enters it")
-    nominal_point = plant.at(**(at or {}))
-    x0 = nominal_point.x
-    symbols = {name: ca.SX.sym(name) for name in names}
-    p = ca.vertcat(*symbols.values())
-    own = {name: symbol for name, symbol in symbols.items() if name != plant.stroke}
-    own |= {name: own[twin] for name, twin in twins_of(par).items() if twin in own}
-    machine: Plant = plant.variant(symbolic(par, own))
-    x, u = ca.SX.sym("x", len(plant.states)), ca.SX.sym("u", len(plant.inputs))
-    point = ca.SX(x0)
-    if plant.stroke in symbols:
-        point[plant.stroke_state] = symbols[plant.stroke]
-    keep = list(plant.controlled)
-    found = jacobians(machine, believed or plant, x, u, ca.SX.zeros(len(plant.disturbances)))
-    A, B, C, E = ca.substitute(list(found), [x, u], [point, ca.SX(nominal_point.u)])
-    A, B, C, E = A[keep, keep], B[keep, :], C[:, keep], E[keep, :]
-    if held:
-        A, B = A - E @ C, ca.horzcat(B, E)
+    if believed is not None and believed.tabulated:
+        found = "a controller that looks up a table"
+        raise InputError("robust_margin", "believed", found, "one whose currents are a formula")
+    x0 = plant.at(**(at or {})).x
+    position = float(x0[plant.stroke_state])
+    of = _model(plant, believed or plant, tuple(name for name in names if name != plant.stroke))
+    kind = (
+        ca.SX if held is None else ca.MX
+    )  # what is held is of a size that nobody wants to write out at every place
+    p = kind.sym("p", len(names))
+    own = [k for k, name in enumerate(names) if name != plant.stroke]
+    z = p[names.index(plant.stroke)] if plant.stroke in names else position
+    A, B, C, E = of(p[own], z)
+    nominal = [position if name == plant.stroke else getattr(par, name) for name in names]
+    if held is not None:
+        A, left = A - E @ C, E - B @ ca.DM(held)
+        if not _vanishes(p, left, E, nominal):
+            B = ca.horzcat(B, left)
     if states:
-        C = ca.vertcat(C, ca.SX.eye(len(keep)))
-    nominal = [x0[plant.stroke_state] if name == plant.stroke else getattr(par, name) for name in names]
+        C = ca.vertcat(C, ca.DM.eye(len(plant.controlled)))
     bounds = {f.name: _lowest(f.metadata) for f in fields(par)}
     limits = tuple((bounds.get(name, -math.inf), math.inf) for name in names)
     matrices = ca.Function("matrices", [p], [ca.densify(M) for M in (A, B, C)])
     return UncertainSystem(tuple(names), readonly(nominal), matrices, True, limits)
+
+
+def held_at(plant: Plant, position: float) -> FloatArray:
+    """H of the currents that are held at a position along the stroke, where E = B H."""
+    _, B, _, E = (np.array(M) for M in _model(plant, plant, ())(ca.DM(0, 1), position))
+    return np.asarray(np.linalg.lstsq(B, E, rcond=None)[0])
+
+
+@lru_cache(maxsize=16)  # plants compare by identity, and are built once for their parameters
+def _model(plant: Plant, believed: Plant, names: tuple[str, ...]) -> ca.Function:
+    """(parameters, position along the stroke) -> A, B, C, E of the design model."""
+    from malta.data import twins_of
+
+    par = plant.parameters
+    p, z = ca.SX.sym("p", len(names)), ca.SX.sym("z")
+    own = dict(zip(names, ca.vertsplit(p), strict=True)) if names else {}
+    own |= {name: own[twin] for name, twin in twins_of(par).items() if twin in own}
+    machine: Plant = plant.variant(symbolic(par, own))
+    x, u = ca.SX.sym("x", len(plant.states)), ca.SX.sym("u", len(plant.inputs))
+    point = ca.SX(plant.at().x)
+    point[plant.stroke_state] = z
+    found = jacobians(machine, believed, x, u, ca.SX.zeros(len(plant.disturbances)))
+    A, B, C, E = ca.substitute(list(found), [x, u], [point, ca.SX(plant.preload(point))])
+    keep = list(plant.controlled)
+    parts = [A[keep, keep], B[keep, :], C[:, keep], E[keep, :]]
+    return ca.Function("model", [p, z], ca.cse([ca.densify(part) for part in parts]))
+
+
+def _vanishes(p: Any, expression: Any, beside: Any, nominal: list[float]) -> bool:
+    """Whether an analytic expression is zero at any parameters: it is at eight places chosen at random."""
+    rng = np.random.default_rng(3)
+    values = ca.Function("left", [p], [ca.densify(expression), ca.densify(beside)])
+    for _ in range(8):
+        row = np.array(nominal) * rng.uniform(0.5, 1.5, len(nominal))
+        left, size = (np.abs(np.array(M)).max() for M in values(row))
+        if not left <= 1e-9 * size:
+            return False
+    return True
 
 
 def holds(plant: Plant) -> bool:
@@ -141,13 +180,14 @@ def sampled_law(
     loop: CurrentLoop | None = None,
     R: float = 1.0,
     *,
-    held: bool = False,
+    held: FloatArray | None = None,
+    handed: bool = False,
 ) -> Compensator:
     """The control law of a gain file as the machine runs it: hold, `delay` samples, current loops.
 
     lag : rad/s, crossover of the current loops, taken as first-order lags; with `loop`, the windings' own R / L
     loop : PI controllers of the currents, for windings of resistance R (ohm), sampled with the control law
-    held : for a system whose further inputs are the readings that currents are commutated for
+    held : H of currents that are held: v + H y acts; handed: the reading itself is a further input of the system
     """
     law, T = linear_law(controller), controller.sample_time
     n, m, half = len(controller.states), len(controller.forces), len(controller.A) // 2
@@ -162,9 +202,10 @@ def sampled_law(
     back = np.linalg.inv(to_modes)
     law = law._replace(A=to_modes @ law.A @ back, B_y=to_modes @ law.B_y, C=law.C @ back)
     if controller.observed:
-        p += m
-        law = _integrals_last(law, p)
-    if held:
+        law, p = _integrals_last(law, m), m
+    if held is not None:
+        law = law._replace(D_y=law.D_y + held)
+    if handed:
         law = handed_on(law)
     c = Compensator(
         law.A, law.B_y, law.C, law.D_y,
@@ -174,23 +215,26 @@ def sampled_law(
 
 
 def _integrals_last(law: LinearLaw, count: int) -> LinearLaw:
-    """A law that takes off `count` constant disturbances has as many poles at z = 1: these states by themselves, last.
+    """A law that takes off disturbances d integrates: d + X xi is a plain sum of the readings, in the place of d, last.
 
-    A (U V) = (U V) diag(A_rest, 1): V spans the null space of A - 1, U what the rest leaves invariant.
+    With A = [[M, N], [G, 1]] that is X (M - 1) = -G; then X N = 0, as the law leaves no constant disturbance in xi.
     """
-    A = law.A
-    left, size, right = np.linalg.svd(A - np.eye(len(A)))
-    if size[-count] > 1e-9 * size[0]:
+    A, k = law.A, len(law.A) - count
+    X = -np.linalg.solve((A[:k, :k] - np.eye(k)).T, A[k:, :k].T).T
+    left, size = np.abs(X @ A[:k, k:]).max(), (np.abs(X) @ np.abs(A[:k, k:])).max()
+    if not left <= 1e-8 * size:
         raise CheckError(
-            f"the law does not integrate: its pole nearest to z = 1 is off by {size[-count]:.1e}"
+            f"the law does not take off constant disturbances: {left / size:.1e} of them is left"
         )
-    V, kept = right[-count:].T, left[:, :-count]  # A - 1 maps all onto `kept`, which it maps onto itself
-    T = np.hstack([kept, V])
-    A = np.linalg.solve(T, A @ T)
-    A[:, -count:] = 0
-    A[-count:] = 0
-    A[-count:, -count:] = np.eye(count)
-    return law._replace(A=A, B_y=np.linalg.solve(T, law.B_y), B_r=np.linalg.solve(T, law.B_r), C=law.C @ T)
+
+    def summed(M: FloatArray) -> FloatArray:
+        return np.vstack([M[:k], M[k:] + X @ M[:k]])
+
+    T = np.eye(len(A))
+    T[k:, :k] = -X
+    A = summed(A) @ T
+    A[k:] = np.eye(len(A))[k:]
+    return law._replace(A=A, B_y=summed(law.B_y), B_r=summed(law.B_r), C=law.C @ T)
 
 
 def _with_current_control(c: Compensator, loop: CurrentLoop, R: float, B2: FloatArray) -> Compensator:

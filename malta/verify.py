@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
+from functools import lru_cache
 from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
@@ -21,10 +22,10 @@ from malta.linearize import LinearModel, linearize
 from malta.plant import trim
 from malta.riccati import add_integrals, add_lags, delay_inputs, eigenvalues, sample
 from malta.robust import Margin, robust_margin
-from malta.uncertain import Compensator, holds, sampled_law, uncertain
+from malta.uncertain import Compensator, UncertainSystem, closed_loop, held_at, holds, sampled_law, uncertain
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Mapping, Sequence
 
     from malta.plant import ComplexArray, FloatArray, Plant
 
@@ -278,16 +279,46 @@ def _verify(model: LinearModel, controller: Controller, uncertainty: Mapping[str
 def machine_law(plant: Plant, controller: Controller, current_loops: CurrentLoops = "lag") -> Compensator:
     """The control law with the machine's hold, delay and current loops: lags at their crossover, or the PI loops.
 
-    Raises InputError for other current loops.
+    Raises InputError for other current loops, or PI loops that do not run with the control law.
     """
+    return _law_of(plant, controller, current_loops)
+
+
+def machine_system(
+    plant: Plant,
+    controller: Controller,
+    names: Sequence[str],
+    at: Mapping[str, float],
+    current_loops: CurrentLoops = "lag",
+) -> tuple[UncertainSystem, Compensator]:
+    """The machine at a position in parameters by name, and its law: what its margin is asked of. See `machine_law`."""
+    believed = plant_of(controller.parameters)
+    if not holds(believed):
+        return uncertain(plant, names, at=at, believed=believed), machine_law(
+            plant, controller, current_loops
+        )
+    H = held_at(believed, float(believed.at(**at).x[believed.stroke_state]))
+    system = uncertain(plant, names, at=at, believed=believed, held=H)
+    handed = system.matrices.size2_out(1) > len(H)
+    return system, _law_of(plant, controller, current_loops, held=H, handed=handed)
+
+
+def _law_of(
+    plant: Plant,
+    controller: Controller,
+    current_loops: CurrentLoops,
+    *,
+    held: FloatArray | None = None,
+    handed: bool = False,
+) -> Compensator:
     if current_loops not in get_args(CurrentLoops):
         raise InputError("verify", "current_loops", repr(current_loops), "lag or pi")
-    a, held = plant.actuator, holds(plant)
+    a = plant.actuator
     delay = a.delay(controller.sample_time)
     if current_loops == "lag" or controller.current_loop is None:
-        return sampled_law(controller, delay, a.crossover, held=held)
-    if held:
-        raise InputError("verify", "current_loops", "pi", f"lag: a {plant.name} controls its currents faster")
+        return sampled_law(controller, delay, a.crossover, held=held, handed=handed)
+    if plant.windings is None:
+        raise InputError("verify", "current_loops", "pi", f"lag: those of a {plant.name} run much faster")
     return sampled_law(controller, delay, a.R / a.L, controller.current_loop, a.R)
 
 
@@ -296,23 +327,50 @@ def travel_margin(
     controller: Controller,
     ranges: Mapping[str, float | tuple[float, float]],
     current_loops: CurrentLoops = "lag",
+    names: Sequence[str] = (),
 ) -> Margin:
     """The margin of the machine's loop anywhere in its travel: the position is one more interval of the proof.
 
+    Currents that are held for a position make waves along the travel, no polynomials: there it is proven in PLACES.
+
     ranges : of the parameters, as robust_margin takes them
+    names : parameters of the model, where others stand still beside those of `ranges`: one model for several questions
     """
-    over = {plant.stroke: (-plant.travel, plant.travel)}
-    believed = plant_of(controller.parameters)
-    law, held = machine_law(plant, controller, current_loops), holds(plant)
-    if not held:
-        system = uncertain(plant, [*ranges, plant.stroke], at={plant.stroke: 0.0}, believed=believed)
+    names = tuple(names or ranges)
+    if not holds(plant):
+        over = {plant.stroke: (-plant.travel, plant.travel)}
+        system, law = machine_system(
+            plant, controller, [*names, plant.stroke], {plant.stroke: 0.0}, current_loops
+        )
         return robust_margin(system, law, ranges, over)
-    # Currents that are held for a position make waves along the travel: no polynomials, so it is proven in places.
-    found = []
-    for z in sorted({sign * share * plant.travel for share in PLACES for sign in (-1, 1)}):
-        system = uncertain(plant, list(ranges), at={plant.stroke: z}, believed=believed, held=True)
-        found.append(robust_margin(system, law, ranges))
+    found = [robust_margin(*loop, ranges) for loop in _along(plant, controller, names, current_loops)]
     return min(found, key=lambda m: (m.lower is not None, m.lower, m.upper))
+
+
+@lru_cache(maxsize=8)  # several questions are asked of the same loops; records compare by identity
+def _along(
+    plant: Plant, controller: Controller, names: tuple[str, ...], current_loops: CurrentLoops
+) -> list[tuple[UncertainSystem, Compensator]]:
+    """The machine's loops in PLACES of its travel, those that are the same once."""
+    found: list[tuple[UncertainSystem, Compensator]] = []
+    seen: list[FloatArray] = []
+    for z in dict.fromkeys(sign * share * plant.travel for share in PLACES for sign in (1, -1)):
+        loop = machine_system(plant, controller, names, {plant.stroke: z}, current_loops)
+        here = _fingerprint(*loop)
+        if not any(here.shape == other.shape and np.allclose(here, other, 1e-9, 1e-12) for other in seen):
+            seen.append(here)
+            found.append(loop)
+    return found
+
+
+def _fingerprint(system: UncertainSystem, law: Compensator) -> FloatArray:
+    """What two places have in common where their loops are the same: closed loops at parameters chosen at random."""
+    rng = np.random.default_rng(4)
+    rows = system.nominal * rng.uniform(0.7, 1.4, (4, len(system.nominal)))
+    poles = np.linalg.eigvals(closed_loop(system, law, rows))
+    order = np.lexsort((poles.imag, poles.real))
+    found = np.take_along_axis(poles, order, axis=1)
+    return np.asarray(np.concatenate([found.real, found.imag]))
 
 
 PLACES = (0.0, 1 / 3, 2 / 3, 1.0)  # shares of the travel, either way
