@@ -40,8 +40,13 @@ static inline real smaller(real a, real b) { return pick(MASK(a < b), a, b); }
 #endif
 static inline real size(real x) { return value(bits(x) & 0x7fffffffffffffffLL); }
 #define K(x) ((x) - (real){0}) /* a constant in every lane */
-#define EACH(name, call) /* through an array: compilers make one instruction of sqrt, floor and fabs */ \
-  static inline real name(real x) { \
+#if LANES == 1
+#define APART inline
+#else
+#define APART __attribute__((noinline)) /* a library's function for every lane: too much text to repeat */
+#endif
+#define EACH(kind, name, call) /* through an array: compilers make one instruction of sqrt and floor */ \
+  static kind real name(real x) { \
     double a[LANES]; \
     memcpy(a, &x, sizeof a); \
     for (int i = 0; i < LANES; i++) a[i] = call(a[i]); \
@@ -49,7 +54,7 @@ static inline real size(real x) { return value(bits(x) & 0x7fffffffffffffffLL); 
     return x; \
   }
 #define PAIR(name, call) \
-  static inline real name(real x, real y) { \
+  static APART real name(real x, real y) { \
     double a[LANES], b[LANES]; \
     memcpy(a, &x, sizeof a); \
     memcpy(b, &y, sizeof b); \
@@ -60,10 +65,11 @@ static inline real size(real x) { return value(bits(x) & 0x7fffffffffffffffLL); 
 
 static inline double one_sign(double x) { return (x > 0) - (x < 0); }
 static inline double one_uniform(double x) { return sqrt(3.0) * erf(x * sqrt(0.5)); } /* of a normal number */
-EACH(each_sqrt, sqrt) EACH(each_floor, floor) EACH(each_ceil, ceil) EACH(each_exp, exp)
-EACH(each_log, log) EACH(each_tan, tan) EACH(each_tanh, tanh) EACH(each_asin, asin) EACH(each_acos, acos)
-EACH(each_atan, atan) EACH(each_sinh, sinh) EACH(each_cosh, cosh) EACH(each_sign, one_sign)
-EACH(each_uniform, one_uniform)
+EACH(inline, each_sqrt, sqrt) EACH(inline, each_floor, floor) EACH(inline, each_ceil, ceil)
+EACH(inline, each_sign, one_sign)
+EACH(APART, each_exp, exp) EACH(APART, each_log, log) EACH(APART, each_tan, tan) EACH(APART, each_tanh, tanh)
+EACH(APART, each_asin, asin) EACH(APART, each_acos, acos) EACH(APART, each_atan, atan) EACH(APART, each_sinh, sinh)
+EACH(APART, each_cosh, cosh) EACH(APART, each_uniform, one_uniform)
 PAIR(each_pow, pow) PAIR(each_atan2, atan2) PAIR(each_hypot, hypot) PAIR(each_fmod, fmod)
 
 #if LANES == 8 && defined(__AVX512DQ__)

@@ -3,9 +3,10 @@
 The functions of machine.py are straight lines of scalar operations. Here they become C inside the loop of engine.c,
 with every number of machine and controller an argument: one compilation serves all machines and gain files of a shape.
 What depends on those numbers alone is computed once a run (`prepare`), nothing is computed twice, and factors that sums
-share are taken out of them. For many machines the same text is compiled with one machine in each lane of a SIMD
-register, and once more for tilts as small as an air gap leaves room for: without a branch, and done over where a tilt
-turns out to have been larger.
+share are taken out of them. Long functions come in parts, which hand over numbers in an array: twice the text in one
+piece takes a compiler far more than twice the time. For many machines the same text is compiled with one machine in
+each lane of a SIMD register, and once more for tilts as small as an air gap leaves room for: without a branch, and done
+over where a tilt turns out to have been larger.
 
 Compiled engines stay in the user's cache folder under the SHA-256 of their text, the compiler, its options and the
 processor; two processes that compile at once write the same file, each under a name of its own first. Without a C
@@ -43,7 +44,8 @@ if TYPE_CHECKING:
     from malta.plant import FloatArray
 
 LANES = 8
-WHOLE, PART = 4000, 1500  # statements: the longest function that is not cut, and the longest part of one that is
+WHOLE = 4000  # statements of the longest function that is not cut in parts
+PART = 300  # statements of a part, at most
 FLAGS = (
     *("-std=gnu11", "-O3", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math"),
     *("-fschedule-insns", "-fsched-pressure", "-fPIC", "-shared"),
@@ -154,7 +156,9 @@ def translate(f: ca.Function, shared: Sequence[int], first_constant: int) -> tup
 
     prepare = [line(k) for k in fixed if nodes[k].op]
     prepare += [f"  c[{place[k]}] = {text(k, at=None)};" for k in kept]
-    bodies = [[x for k in members for x in (line(k), *([handed_over(k)] if k in slot else []))] for members in parts]
+    bodies = [
+        [x for k in members for x in (line(k), *([handed_over(k)] if k in slot else []))] for members in parts
+    ]
     results = [(f"r{i}[{j}]", text(k, at=len(parts) - 1)) for i, j, k in outputs]
     bodies[-1] += [f"  const real o{n} = {found};" for n, (_, found) in enumerate(results)]
     bodies[-1] += [f"  {place} = o{n};" for n, (place, _) in enumerate(results)]
@@ -170,7 +174,7 @@ def translate(f: ca.Function, shared: Sequence[int], first_constant: int) -> tup
 
 
 def _cut(statements: list[int]) -> list[list[int]]:
-    """A long function in parts of about the same length: compilers take more than twice as long for twice as much."""
+    """The statements of one function, or of parts of about the same length."""
     count = math.ceil(len(statements) / PART) if len(statements) > WHOLE else 1
     edges = [len(statements) * k // count for k in range(count + 1)]
     return [statements[begin:end] for begin, end in pairwise(edges)]
@@ -178,11 +182,14 @@ def _cut(statements: list[int]) -> list[list[int]]:
 
 def _slots(nodes: list[_Node], parts: list[list[int]], results: set[int]) -> dict[int, int]:
     """Where the nodes that later parts read stand meanwhile; a place is taken again after the last part that reads."""
-    last = {k: index for index, members in enumerate(parts) for reader in members for k in nodes[reader].arguments}
+    last = {
+        k: index for index, members in enumerate(parts) for reader in members for k in nodes[reader].arguments
+    }
     last |= dict.fromkeys(results, len(parts) - 1)  # the last part writes them
     slot: dict[int, int] = {}
+    leaving: list[list[int]] = [[] for _ in parts]  # places by the last part that reads them
     free: list[int] = []
-    size, leaving = 0, [[] for _ in parts]
+    size = 0
     for index, members in enumerate(parts):
         free += leaving[index - 1] if index else []
         for k in members:
@@ -197,7 +204,9 @@ def _slots(nodes: list[_Node], parts: list[list[int]], results: set[int]) -> dic
 def _assembled(name: str, arguments: list[tuple[str, str]], bodies: list[list[str]], slots: int) -> str:
     """The function; or its parts, which share the array s, and a function that calls one after the other."""
     taken, given = ", ".join(map("".join, arguments)), ", ".join(called for _, called in arguments)
-    inline, apart = (f"static {x}void" for x in ("inline __attribute__((always_inline)) ", "__attribute__((noinline)) "))
+    inline, apart = (
+        f"static {x}void" for x in ("inline __attribute__((always_inline)) ", "__attribute__((noinline)) ")
+    )
     (*_, body), lines = bodies, []
     if len(bodies) > 1:
         for k, members in enumerate(bodies):
@@ -377,9 +386,18 @@ def source(p: Parts, digest: ca.Function | None) -> str:
 
 
 def _near(function: str) -> str:
-    """The function for small tilts alone, which tells by `range` whether they were: its code has no branches."""
-    text = function.replace("tilt", "near").replace("(const real *", "_near(real *range, const real *")
-    return text.replace("(c, ", "_near(range, c, ")  # calls of its parts
+    """The function for small tilts alone, which tells by `range` whether they were: its code has no branches.
+
+    Parts without a tilt serve both.
+    """
+    end = "}\n"
+    *parts, whole = function.removesuffix(end).split(end)
+    tilted = [part for part in parts if "tilt" in part]
+    for part in tilted:
+        name = part.partition("(const real *")[0].split()[-1]
+        whole = whole.replace(f" {name}(c, ", f" {name}_near(range, c, ")
+    texts = [text.replace("(const real *", "_near(real *range, const real *", 1) for text in (*tilted, whole)]
+    return "".join(text.replace("tilt", "near") + end for text in texts)
 
 
 @cache
@@ -437,7 +455,7 @@ def _whole(path: Path) -> bool:
 
 
 def cache_folder() -> Path:
-    """Where compiled engines stay; deleting it costs a second of compilation."""
+    """Where compiled engines stay; deleting it costs seconds of compilation."""
     return platformdirs.user_cache_path("malta")
 
 

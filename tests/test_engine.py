@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -218,10 +220,20 @@ def _everything(state: Any, around: Any, theta: Any) -> Any:
     return ca.vertcat(*_steps(leaves), *random, *constant, *mixed, *leaves)
 
 
-@pytest.fixture(scope="module")
-def everything() -> Trial:
+@contextmanager
+def _parts_of(statements: int) -> Iterator[None]:
+    """Every function that is longer is cut in parts of so many statements."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(engine, "WHOLE", statements)
+        patch.setattr(engine, "PART", statements)
+        yield
+
+
+@pytest.fixture(scope="module", params=[engine.WHOLE, 7], ids=["whole", "in parts"])
+def everything(request: pytest.FixtureRequest) -> Trial:
     """Some 130 expressions in every operation that the engine knows, in one library for each number of lanes."""
-    return _trial(_everything)
+    with _parts_of(request.param):
+        return _trial(_everything)
 
 
 def test_every_operation_is_tried(everything: Trial) -> None:
@@ -311,14 +323,16 @@ def test_a_lane_does_not_depend_on_its_neighbours(waves: Trial) -> None:
         )
 
 
-@pytest.fixture(scope="module")
-def tilted() -> Trial:
+def _tilts(state: Any, around: Any, _: Any) -> Any:
+    x = state[0] + around[0]
+    return ca.vertcat(ca.sin(x), ca.cos(x), 1 / ca.cos(x), ca.tan(x))
+
+
+@pytest.fixture(scope="module", params=[engine.WHOLE, 1], ids=["whole", "in parts"])
+def tilted(request: pytest.FixtureRequest) -> Trial:
     """Sine, cosine and their quotients of a state and an input: angles of a mover, as the engine sees it."""
-    return _trial(
-        lambda s, g, _: ca.vertcat(
-            ca.sin(s[0] + g[0]), ca.cos(s[0] + g[0]), 1 / ca.cos(s[0] + g[0]), ca.tan(s[0] + g[0])
-        )
-    )
+    with _parts_of(request.param):
+        return _trial(_tilts)
 
 
 def test_small_tilts_are_right_to_two_units_in_the_last_place(tilted: Trial) -> None:
@@ -371,6 +385,134 @@ def test_sums_share_their_factor() -> None:
     _, moving, constants = engine.translate(ca.Function("f", [state, theta], [sum(apart)]), [], 0)
     assert moving.count(" * ") == 1
     assert constants == 1
+
+
+# Long functions in parts
+
+
+_PLACE = re.compile(r"\bs\[\d+\]")  # of the array that parts hand numbers over in
+
+
+def _statements(text: str) -> list[tuple[str, str]]:
+    """What is computed from what, in order, whatever the functions it stands in."""
+    lines = [line for line in text.splitlines() if line.startswith("  const ")]
+    return [(name, value) for name, _, value in (line.partition(" = ") for line in lines)]
+
+
+def _engine_text(row: Callable[[Any, Any, Any], Any], name: str = "decide") -> str:
+    """C of one function of the engine that `row` is tried in."""
+    parts, _ = _parts(row)
+    return engine.translate(getattr(parts, name), [1], 0)[1]
+
+
+def test_only_long_functions_are_cut() -> None:
+    """In parts of the same statements in the same order, none of them longer than allowed."""
+    whole = _engine_text(_everything)
+    count = len(re.findall(r"^  const \w+ t", whole, re.MULTILINE))
+    with _parts_of(count):
+        assert _engine_text(_everything) == whole
+    assert "noinline" not in whole
+    with _parts_of(count - 1):
+        assert _engine_text(_everything).count("noinline") == 2
+    with _parts_of(40):
+        cut = _engine_text(_everything)
+    *parts, last = cut.split("}\n")[:-1]
+    assert len(parts) == -(-count // 40)
+    assert all(30 <= len(re.findall(r"^  const \w+ t", part, re.MULTILINE)) <= 40 for part in parts)
+    assert re.findall(r"  decide_(\d+)\(c, ", last) == [str(k) for k in range(len(parts))]
+    for found, expected in zip(_statements(cut), _statements(whole), strict=True):
+        assert found[0] == expected[0]
+
+
+def test_parts_find_every_place_as_it_was_left() -> None:
+    """Whoever reads a place of the array finds the very number that it was written for; places are taken again."""
+    with _parts_of(20):
+        cut = _engine_text(_everything)
+    expected = iter(_statements(_engine_text(_everything)))
+    places: dict[str, str] = {}
+    again = 0
+    for line in cut.splitlines():
+        written = re.fullmatch(r"  (s\[\d+\]) = (t\d+|value\(t\d+\));", line)
+        if written:
+            again += written[1] in places
+            places[written[1]] = written[2].replace("value", "bits")
+        elif line.startswith("  const "):
+            ((name, value),) = _statements(line)
+            restored = _PLACE.sub(lambda found: places[found[0]], value)
+            assert (name, re.sub(r"bits\(bits\((t\d+)\)\)", r"\1", restored)) == next(expected)
+    assert next(expected, None) is None
+    assert again
+    assert f"  real s[{len(places)}];" in cut.splitlines()
+
+
+def test_truths_cross_parts_as_masks() -> None:
+    def row(s: Any, g: Any, _: Any) -> Any:
+        less, equal = s[0] < g[0], s[1] == g[1]
+        both = ca.logic_and(less, equal)
+        return ca.vertcat(ca.if_else(both, s[0], g[2]), less + s[1], equal, ca.logic_not(both), 1 / s[2])
+
+    with _parts_of(1):
+        trial, text = _trial(row), _engine_text(row)
+    for form in ("= value(t", "pick(bits(s[", "truth(bits(s[", "~bits(s["):
+        assert form in text
+    for values in np.ndindex(2, 2, 2, 2):
+        numbers = np.array([*values, 3.0])
+        state, around = numbers[[0, 1, 4]], numbers[[2, 3, 4]]
+        expected = np.array(row(ca.DM(state), ca.DM(around), None)).ravel()
+        assert _run_one(trial, state, around[None], np.zeros(THETA))[0].tolist() == expected.tolist()
+        lanes = np.tile(state, (LANES, 1))
+        lanes[0, 0] = 5.0  # the others' truths are not this one's
+        found = _run_lanes(trial, lanes, around[None], np.zeros((LANES, THETA)))
+        np.testing.assert_allclose(found[1:], np.tile(expected, (LANES - 1, 1)), rtol=1e-15)
+
+
+def test_parts_without_a_tilt_serve_near_and_far() -> None:
+    """What is the same for small tilts and for others is compiled once."""
+
+    def row(s: Any, g: Any, theta: Any) -> Any:
+        return ca.vertcat(ca.sin(s[0]), ca.exp(g[0] * theta[0]), 1 / g[1] + ca.cos(s[0]))
+
+    with _parts_of(1):
+        parts, _ = _parts(row)
+        text = engine.source(parts, None)
+    defined = re.findall(r"void (decide\w*)\((real \*range)?", text)
+    near = {name.removesuffix("_near"): taken for name, taken in defined if name.endswith("_near")}
+    tilts = {
+        name
+        for name, body in re.findall(r"void (decide_\d+)\([^\n]*\n(.*?)\n}", text, re.DOTALL)
+        if "tilt" in body
+    }
+    assert len(tilts) == 3
+    assert set(near) == {"decide", *tilts}
+    assert all(near.values())
+    called = set(re.findall(r"  (decide_\d+_near)\(range, c, ", text))
+    assert called == {f"{name}_near" for name in tilts}
+
+
+def _long(state: Any, around: Any, theta: Any) -> Any:
+    """Long enough to be cut: a walk that stays small, of truths and tilts, whose early steps later ones read."""
+    x: list[Any] = [*ca.vertsplit(state), *ca.vertsplit(around)]
+    for k in range(780):
+        first, second, third = x[-1], x[-2 - k % 4], x[k // 2]
+        tilt = ca.sin(state[0] + 1e-3 * around[0])
+        x.append(ca.if_else(first < third, 0.5 * second - first, ca.tanh(third + theta[0] * tilt) / (k + 2)))
+    return ca.vertcat(*x[::10], x[-1])
+
+
+def test_a_long_function_is_compiled_in_parts() -> None:
+    """With the limits as they are, near tilts and far ones."""
+    assert f"decide_{engine.WHOLE // engine.PART}(" in _engine_text(_long)
+    trial = _trial(_long)
+    rng = np.random.default_rng(5)
+    for size in (1e-3, 1.0):
+        states, thetas = size * rng.uniform(-1, 1, (LANES, STATES)), rng.uniform(-1, 1, (LANES, THETA))
+        around = rng.uniform(-1, 1, (1, GIVEN))
+        together = _run_lanes(trial, states, around, thetas)
+        for lane in range(LANES):
+            expected = np.array(trial.reference(states[lane], around, thetas[lane])).ravel()
+            alone = _run_one(trial, states[lane], around, thetas[lane])[0]
+            for found in (alone, together[lane]):
+                np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-14)
 
 
 def test_an_operation_without_a_form_is_refused() -> None:
