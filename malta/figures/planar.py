@@ -88,7 +88,7 @@ def errors_figure(e: Experiment, published: Published | None = None) -> Figure:
         "largest error of F_z: " + ", ".join(largest),
         wspace=0.48,
         hspace=0.36,
-        left=0.06,
+        left=0.075,
         right=0.985,
     )
     (*maps, steps), (forces, missed, torque) = figure.subplots(2, 3)
