@@ -698,10 +698,12 @@ def _merged(system: UncertainSystem, c: Compensator, box: _Box, bounds: list[_Bo
     upper, frequency, witness, shares = worst.upper, worst.frequency, None, {}
     if worst.witness is not None:
         shares = _shares(worst, box)
-        beyond = _confirmed(system, c, box, worst.witness)
+        beyond = _confirmed(system, c, box, worst.witness, box.most / worst.upper)
         if beyond is None:
             reasons.append("the eigenvalues do not confirm the witness")
-            upper, frequency, lower = math.inf, None, None
+            upper, frequency = math.inf, None
+            # With a slow hold it may not be one: the proof counts its images in, the search does not.
+            lower = None if c.sample_time is None else lower
         else:
             upper, witness = worst.upper * beyond, _stretched(box, worst.witness, beyond)
     named = None if witness is None else dict(zip(system.names, witness.tolist(), strict=True))
@@ -717,10 +719,12 @@ def _stretched(box: _Box, p: FloatArray, share: float) -> FloatArray:
     return np.where(box.down + box.up > 0, box.nominal + share * (p - box.nominal), p)
 
 
-def _confirmed(system: UncertainSystem, c: Compensator, box: _Box, p: FloatArray) -> float | None:
+def _confirmed(
+    system: UncertainSystem, c: Compensator, box: _Box, p: FloatArray, most: float
+) -> float | None:
     """How much further the eigenvalues of the loop say that p has to go to be unstable, as a factor; None: they do not.
 
-    f leaves out the images of a hold but for those of a free mass: it may be a few percent off where the hold is slow.
+    `most` is as far as parameters exist. f leaves out the images of a hold but for those of a free mass: it may be a few percent off where the hold is slow.
     """
 
     def unstable(share: float) -> bool:
@@ -731,6 +735,8 @@ def _confirmed(system: UncertainSystem, c: Compensator, box: _Box, p: FloatArray
         found, last = last, 0.0
     else:
         for found in (1 + 2e-7, 1 + 1e-6, 1 + 1e-5, 1 + 1e-4, 1.001, 1.01, 1.03, 1.1, 1.3):
+            if found >= most:
+                return None
             if unstable(found):
                 break
             last = found
