@@ -344,7 +344,7 @@ def _decided(
     e_now, frozen_now = controller["e"], controller["frozen"]
     xi_pred, e, frozen, v = commanded(g, xi_hat, e_now, frozen_now, y, p_ref, xi_ref, v_ff, v0)
     if s.open_loop:
-        v = v_ff + v0
+        v, frozen = v_ff + v0, 0 * frozen  # no limit of the feedback is met
     after: dict[str, Any] = {"xi_pred": xi_pred, "e": e, "frozen": frozen}
     # The gain file's machine turns forces into currents, the simulated one limits those and makes its own forces.
     place = p_ref if s.open_loop else y

@@ -107,6 +107,13 @@ def forces(par: Parameters, x: Any, i: Any) -> Any:
     return par.A * _linked(par, x) @ i
 
 
+def lift(par: Parameters, x: FloatArray, i: FloatArray) -> FloatArray:
+    """F_z, N, at k positions of k x 3 phase currents."""
+    place, currents = ca.SX.sym("x"), ca.SX.sym("i", 3)
+    law = ca.Function("lift", [place, currents], [forces(par, place, currents)[1]])
+    return np.array(law.map(len(x))(np.atleast_2d(x), np.transpose(i))).ravel()
+
+
 def _linked(par: Parameters, x: Any) -> Any:
     """2 x 3: `park`, each phase with its share of the motor constant."""
     return park(x, par.k) @ ca.diag(ca.vertcat(par.a_a, par.a_b, par.a_c))
