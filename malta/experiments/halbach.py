@@ -5,6 +5,7 @@ stairs   steps of 10 um: open loop and position control, plain and high-resoluti
 ramp     50 mm at constant speed, Fig. 8
 force    the vertical force of a move of 5 mm under three control laws, Fig. 10, and what faults make of it
 budget   the error of a motor at rest by source, Sec. 5.1
+identify the step of 2 mm in the open loop that mass and friction were found from, Sec. 2.3
 
 Electronics run period by period at fidelity "phase", which is the default; many machines fly at fidelity "force".
 """
@@ -25,19 +26,16 @@ from malta.errors import InputError
 from malta.experiments import QUIET, REAL, Case, Experiment, Merit, Progress, Wanted, fly, rms, scenario_of
 from malta.plant import Plant
 from malta.plants import halbach
-from malta.plants.halbach import IDEAL, MEAN_OF, Options, Pwm
+from malta.plants.halbach import F_MOST, IDEAL, MEAN_OF, Options, Pwm
 from malta.references import Motion, Reference
+from malta.riccati import sample
 from malta.simulate import Trajectory
 
 if TYPE_CHECKING:
     from malta.plant import FloatArray
 
-STEP, BEFORE, PAUSE, REST = (
-    100e-6,
-    5,
-    40,
-    400,
-)  # m, Fig. 9; readings before the steps, between them, after the last
+STEP, COUNT = 100e-6, 20  # m, Fig. 9
+BEFORE, PAUSE, REST = 5, 40, 400  # readings before the steps, between them, after the last
 
 
 def step(
@@ -46,7 +44,7 @@ def step(
     *,
     distance: float = STEP,
     rise: float = 0.3,
-    count: int = 20,
+    count: int = COUNT,
     pwm: Pwm = "plain",
     adc_noise: bool = True,
     adc_steps: bool = True,
@@ -469,17 +467,70 @@ def _rest_merits(run: Trajectory) -> tuple[Merit, ...]:
     )
 
 
+# Sec. 2.3
+
+IDENTIFIED, LASTS = 2e-3, 6.0  # m, s
+
+
+def identify(
+    plant: Plant,
+    controller: Controller,
+    *,
+    distance: float = IDENTIFIED,
+    F_z: float = 1.0,
+    progress: Progress | None = None,
+    **options: Any,
+) -> Experiment:
+    """A step of the open loop at a vertical force of `F_z` (N), beside the linear servo (5) that was fitted to one."""
+    par: Any = plant.parameters
+    believed: Any = controller.parameters
+    fast = controller.sample_time / FASTER
+    commanding = replace(controller, sample_time=fast, parameters=replace(believed, F_z=F_z))
+    own = {
+        "fidelity": "phase",
+        "electronics": replace(IDEAL, current_loops=False),
+        "open_loop": True,
+        "delay": 0,
+    }
+    scenario = scenario_of(
+        "identify", LASTS, partial(move, distance=distance, rise=0.0, begin=0.0), QUIET | own | options
+    )
+    wanted = Wanted("motor", replace(scenario, start={"x": 0.0}), lambda _: ())
+    (case,), cut = fly(plant, commanding, [wanted], progress, options)
+    E, G = sample(*halbach.servo(par, F_z, distance), fast)
+    states = [np.zeros(2)]
+    for _ in case.run.t[1:]:
+        states.append(E @ states[-1] + G[:, 0] * distance)
+    linear = np.array(states)[:, 0]
+    off = linear - case.run.p[:, 0]
+    merits = (
+        Merit("linear servo off by, rms", rms(off), "mm"),
+        Merit("the same in the first 2 s", rms(off[case.run.t < 2]), "mm"),
+        Merit("secant stiffness", halbach.stiffness(par, F_z, distance), "N/m", "servo.K"),
+        Merit("tangent stiffness", halbach.stiffness(par, F_z), "N/m"),
+    )
+    return Experiment(
+        "identify",
+        "Is the motor a linear servo?",
+        (case._replace(merits=merits),),
+        merits,
+        {"linear": linear},
+        cut,
+    )
+
+
 EXPERIMENTS: dict[str, Callable[..., Experiment]] = {
     "step": step,
     "stairs": stairs,
     "ramp": ramp,
     "force": force,
     "budget": budget,
+    "identify": identify,
 }
 CASES: dict[str, Callable[..., list[Wanted]]] = {"step": _step_cases, "ramp": _ramp_cases}
 ALONE = ("step", "ramp")
 WORDS = {"stroke": "position", "thrust": "force"}
-OPTION_UNITS = {"distance": "m", "rise": "s", "speeds": "m/s", "place": "m"}
+OPTION_UNITS = {"distance": "m", "rise": "s", "speeds": "m/s", "place": "m", "F_z": "N"}
 
 
 def check(name: str, option: str, value: Any) -> None:
@@ -490,6 +541,8 @@ def check(name: str, option: str, value: Any) -> None:
         raise InputError("simulate", f"{name}: {option}", repr(value), "1 to 1000 steps")
     elif option == "rise":
         references.check_rise(value)
+    elif option == "F_z" and not 0 < value <= F_MOST:
+        raise InputError("simulate", f"{name}: F_z", f"{value:g} N", f"above 0 and at most {F_MOST:g} N")
     elif option in ("distance", "speeds", "place"):
         values = value if option == "speeds" else (value,)
         if not all(

@@ -55,8 +55,8 @@ ASKED: dict[str, Any] = {"color": "#c1440e", "linestyle": (0, (5, 2)), "linewidt
 def step_figure(e: Experiment, _: Published | None = None) -> Figure:
     """All steps on top of each other with their mean, the position at rest, and the vertical force. Fig. 9."""
     run = e.run
-    merits = " and ".join(dict.fromkeys(f"{m.label} {said(m)}" for m in e.cases[0].merits[:4]))
-    figure = page([run], f"steps{ending(run)}", f"{e.cases[0].label}: {micro(merits)}".replace(" and ", ", "))
+    merits = "; ".join(f"{m.label} {said(m)}" for m in e.cases[0].merits[:4])
+    figure = page([run], f"steps{ending(run)}", f"{e.cases[0].label}: {micro(merits)}")
     grid = figure.add_gridspec(2, 2)
     if len(e.cases) > 1:
         panels = [figure.add_subplot(grid[0, k]) for k in range(2)]
@@ -90,8 +90,8 @@ def _steps(axes: Axes, case: Case) -> None:
     ms = 1e3 * run.controller.sample_time * np.arange(PAUSE)
     shown = ms < 1200
     for k, share in enumerate(shares):
-        label = {"label": "each step"} if k == 0 else {}
-        axes.plot(ms[shown], 1e6 * distance * share[shown], **EACH, **label)
+        named = {"label": "each step"} if k == 0 else {}
+        axes.plot(ms[shown], 1e6 * distance * share[shown], **EACH | named)
     axes.plot(ms[shown], 1e6 * distance * shares.mean(axis=0)[shown], label="mean", **STYLES[0])
     asked = run.reference[BEFORE : BEFORE + PAUSE, 0]
     axes.plot(ms[shown][: len(asked)], 1e6 * asked[shown[: len(asked)]], label="reference", **ASKED)
@@ -104,7 +104,7 @@ def stairs_figure(e: Experiment, published: Published | None = None) -> Figure:
     if len(e.merits) > 1:
         zones = "; ".join(f"{m.label} {said(m)}" for m in e.merits)
         text = zones if published is None else f"{zones} (published: {_printed(e, published)})"
-    figure = page(runs_of(e), "stairs", micro(text), hspace=0.28)
+    figure = page(runs_of(e), "stairs", micro(text), top=0.83, hspace=0.28)
     panels = figure.subplots(2, 2, sharex=True, sharey=True).ravel()
     for k, (axes, case) in enumerate(zip(panels, e.cases, strict=False)):
         run = case.run
@@ -180,9 +180,8 @@ def _faults(axes: Axes, e: Experiment, published: Published | None) -> None:
             value = read_out(published, f"figure_10.{PRINTED[law]}", "percent")
             axes.axvline(value, color=style["color"], linewidth=0.9, linestyle=style["linestyle"])
     if published is not None:
-        axes.annotate(
-            "lines: measured by the paper", (0.5, 0.01), xycoords="axes fraction", ha="center", **NOTE
-        )
+        where: dict[str, Any] = {"xycoords": "axes fraction", "ha": "center", "va": "bottom"}
+        axes.annotate("lines: as\nthe paper\nmeasured", (0.27, 0.01), **where, **NOTE)
     axes.set_yticks([-row for row in range(len(FAULTS))], [_broken(fault) for fault in FAULTS], fontsize=8)
     axes.set_ylim(-len(FAULTS) + 0.35, 0.5)
     axes.set_xlabel("steady change of the vertical force [%]")
@@ -201,7 +200,7 @@ def budget_figure(e: Experiment, _: Published | None = None) -> Figure:
     bars, along = figure.subplots(1, 2, width_ratios=(1.2, 1))
     values = [in_unit(case.merits[0].value, "um") for case in e.cases]
     floor = 1e-3  # um: what is less is nothing beside a reading of 1 nm
-    for k, (case, value) in enumerate(zip(e.cases, values, strict=True)):
+    for k, value in enumerate(values):
         bars.bar(
             k, max(value, floor) - floor, bottom=floor, color="#d4d4d4", edgecolor="#000000", linewidth=0.9
         )
@@ -221,10 +220,26 @@ def budget_figure(e: Experiment, _: Published | None = None) -> Figure:
     return figure
 
 
+def identify_figure(e: Experiment, _: Published | None = None) -> Figure:
+    """The motor's step beside the linear servo's, and their difference. Sec. 2.3."""
+    run, linear = e.run, e.curves["linear"]
+    text = ", ".join(f"{m.label.replace(', ', ' ')} {said(m)}" for m in e.merits)
+    figure = page([run], f"a step of the open loop{ending(run)}", micro(text), hspace=0.2)
+    position, difference = figure.subplots(2, 1, sharex=True)
+    line(position, run.t, 1e3 * run.p[:, 0], label="motor", **STYLES[0])
+    line(position, run.t, 1e3 * linear, label="linear servo, eq. (5)", **ASKED)
+    line(difference, run.t, 1e3 * (linear - run.p[:, 0]), **STYLES[0])
+    finish(position, "", "position [mm]")
+    finish(difference, "time [s]", "linear servo less motor [mm]")
+    shared_legend(figure)
+    return figure
+
+
 FIGURES: dict[str, Callable[[Experiment, Published | None], Figure]] = {
     "step": step_figure,
     "stairs": stairs_figure,
     "ramp": ramp_figure,
     "force": force_figure,
     "budget": budget_figure,
+    "identify": identify_figure,
 }
