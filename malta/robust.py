@@ -724,7 +724,8 @@ def _confirmed(
 ) -> float | None:
     """How much further the eigenvalues of the loop say that p has to go to be unstable, as a factor; None: they do not.
 
-    `most` is as far as parameters exist. f leaves out the images of a hold but for those of a free mass: it may be a few percent off where the hold is slow.
+    `most` is as far as parameters exist. f leaves out the images of a hold but for those of a free mass: it may be
+    a few percent off where the hold is slow.
     """
 
     def unstable(share: float) -> bool:
