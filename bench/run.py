@@ -32,8 +32,10 @@ from rich.progress import track
 from rich.table import Table
 
 import malta
+from malta.data import published_value
+from malta.experiments.planar import CELLS, compiled
 from malta.machine import state_reference
-from malta.plants import tubular
+from malta.plants import planar, tubular
 from malta.simulate import compiled_shape, engine_of, feedforward
 from malta.verify import machine_law, travel_margin
 
@@ -299,12 +301,59 @@ def campaigns(runs: int) -> list[Result]:
     ]
 
 
+def decoupling(runs: int) -> list[Result]:
+    """K(p) of the planar motor and its pseudo-inverse: CasADi's C code compiled by malta, beside numpy."""
+    peer = importlib.import_module("peer_planar")
+    par = malta.read(ROOT / "data" / "planar.toml")
+    assert isinstance(par, planar.Parameters)
+    exact = planar.simulated(par)
+    models: dict[str, planar.CoilModel] = {
+        "table": planar.table(par, exact, CELLS),
+        "exact": exact,
+        "analytical": planar.Analytical(par),
+    }
+    arms, calls, few = peer.coils(par), 2000, 50
+    codes = {name: compiled(planar.decoupling(par, model)) for name, model in models.items()}
+    p, W = np.array([6e-3, 4e-3, par.h]), np.array([10.0, 200, 400, 1, 2, 3])
+
+    def by_hand() -> Any:
+        return [peer.currents(par, models["table"], arms, p, W) for _ in range(few)][-1]
+
+    def by_malta() -> Any:
+        return [planar.currents(planar.wrench_matrix(par, models["table"], p), W) for _ in range(few)][-1]
+
+    def calling(code: Any) -> Callable[[], Any]:
+        return lambda: code(calls, p, W)[1]
+
+    ours = {name: calling(code) for name, code in codes.items() if code is not None}
+    if not ours:
+        print("left out: planar (no C compiler)", file=sys.stderr)
+        return []
+    difference = np.abs(ours["table"]() - by_hand()).max()
+    assert difference < 1e-9, f"numpy and malta differ by {difference} A"
+    own, plain, *compiled_times = medians(by_malta, by_hand, *ours.values(), runs=runs, what="planar")
+    own, plain = own / few, plain / few
+    seconds = dict(zip(ours, (taken / calls for taken in compiled_times), strict=True))
+    printed = malta.published(ROOT / "data" / "planar.toml")
+    loop = published_value(printed, "real_time.mean")
+    numpy_loop = "numpy, a loop and pinv"
+    return [
+        Result("K(p), pinv: table, compiled", seconds["table"], numpy_loop, plain, "at least 20"),
+        Result("the same", seconds["table"], "5 us", 5e-6, "at least 1"),
+        Result("the same", seconds["table"], "the paper's whole loop", loop, ""),
+        Result("exact series, compiled", seconds["exact"], numpy_loop, plain, "at least 20"),
+        Result("analytical, compiled", seconds["analytical"], numpy_loop, plain, "at least 20"),
+        Result("table, malta's numpy", own, numpy_loop, plain, "at least 1"),
+    ]
+
+
 WORKLOADS: dict[str, Callable[[int], list[Result]]] = {
     "process": whole_process,
     "stroke": stroke,
     "many": many,
     "margin": margin,
     "campaign": campaigns,
+    "planar": decoupling,
 }
 
 

@@ -1,19 +1,17 @@
-"""The planar motor's physics: its field and coils by independent routes, its decoupling, and the loop closed around it.
+"""The planar motor's physics: its field and coils by independent routes, its decoupling, and a loop closed around it.
 
-The closed loops here are written on their own: without a sample, and sampled, beside the one loop of malta/machine.py.
-The machine as a Plant is tested in test_planar_plant.py.
+The closed loop here is written on its own, without samples and delay, beside the one loop of malta/machine.py: what a
+coil model alone moves. The machine as a Plant is tested in test_planar_plant.py, the sampled loops that a user flies in
+test_planar_experiments.py.
 """
 
 from __future__ import annotations
 
-import ctypes
 import math
-import subprocess
-import time
 from collections.abc import Callable
 from dataclasses import FrozenInstanceError, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import casadi as ca
 import numpy as np
@@ -22,10 +20,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import malta
-from malta import riccati
 from malta.data import published as read_published
 from malta.data import published_value
-from malta.engine import compiler, translate
+from malta.engine import translate
 from malta.plant import symbolic
 from malta.plants import planar, planar_field
 from malta.plants.planar_field import ODD_X, ODD_Y, Series
@@ -576,82 +573,9 @@ def test_tilt_stiffness_against_tilted_coils(par: planar.Parameters, exact: Seri
         assert A[9 + axis, 3 + axis] / full == pytest.approx(1 - missing, abs=5e-3)
 
 
-# --- Time ---
-
-
-@pytest.mark.parametrize("kind", ["table", "series"])
-def test_compiled_decoupling(
-    par: planar.Parameters, truth: Series, table: planar.Table, kind: str, tmp_path: Path
-) -> None:
-    """C of K(p) and its pseudo-inverse: the numbers of numpy, in 2.1 us with the table and 1.1 us with 8 harmonics."""
-    cc = compiler()
-    if cc is None:
-        pytest.skip("no C compiler")
-    model: planar.CoilModel = table if kind == "table" else truth.above(1e-3, par.h)
-    generator = ca.CodeGenerator("decoupling.c")
-    generator.add(planar.decoupling(par, model))
-    generator.generate(f"{tmp_path}/")
-    source = tmp_path / "decoupling.c"
-    source.write_text(source.read_text(encoding="utf-8") + _TIMED, encoding="utf-8")
-    options = ["-O2", "-march=native", "-fPIC", "-shared", "-lm"]
-    subprocess.run(
-        [*cc, str(source), "-o", str(tmp_path / "d.so"), *options], check=True, capture_output=True
-    )
-    timed = ctypes.CDLL(str(tmp_path / "d.so")).timed
-    timed.restype = ctypes.c_double
-    W, i = np.array([10.0, 200, 400, 1, 2, 3]), np.empty(16)
-    address = [ctypes.c_void_p(array.ctypes.data) for array in (AT, W, i)]
-    best = min(timed(*address, ctypes.c_int(2000)) for _ in range(20))
-    np.testing.assert_allclose(
-        i, planar.currents(planar.wrench_matrix(par, model, AT), W), rtol=0, atol=1e-12
-    )
-    assert best < 5e-6
-
-
-_TIMED = """
-#include <time.h>
-double timed(const double *p, const double *W, double *i, int n) {
-  static const double *arg[64]; static double *res[64]; static casadi_int iw[4096]; static double w[65536];
-  struct timespec a, b;
-  clock_gettime(CLOCK_MONOTONIC, &a);
-  for (int k = 0; k < n; k++) {
-    arg[0] = p; arg[1] = W; res[0] = i;
-    decoupling(arg, res, iw, w, 0);
-  }
-  clock_gettime(CLOCK_MONOTONIC, &b);
-  return ((b.tv_sec - a.tv_sec) + 1e-9 * (b.tv_nsec - a.tv_nsec)) / n;
-}
-"""
-
-
-def test_numpy_decoupling(par: planar.Parameters, table: planar.Table) -> None:
-    """K(p) from the table and its pseudo-inverse, checks included, within 60 us (about 45)."""
-    W, best = np.array([10.0, 200, 400, 1, 2, 3]), math.inf
-    for _ in range(30):
-        start = time.perf_counter()
-        for _ in range(20):
-            planar.currents(planar.wrench_matrix(par, table, AT), W)
-        best = min(best, (time.perf_counter() - start) / 20)
-    assert best < 60e-6
-
-
-# --- Closed loops ---
+# --- A closed loop ---
 
 Reference = Callable[[float], "FloatArray"]  # t -> 3 x 6: positions, rates, accelerations
-
-
-class Flight(NamedTuple):
-    """Errors q - q* after each step, and the commanded wrenches and largest currents where they were kept."""
-
-    t: FloatArray
-    error: FloatArray  # steps x 6, m and rad
-    W: FloatArray
-    current: FloatArray
-
-    @property
-    def worst(self) -> FloatArray:
-        """Largest deviations, um and urad."""
-        return np.asarray(np.abs(self.error).max(axis=0) * 1e6)
 
 
 def profiled(paper: dict[str, Any], start: tuple[float, float], y_time: float = 0.04) -> Reference:
@@ -692,8 +616,11 @@ def fly_continuously(
     model: planar.CoilModel,
     start: tuple[float, float],
     reference: Reference,
-) -> Flight:
-    """Six PID controllers at 1500 rad/s and the decoupling without sampling or delay: Runge-Kutta steps of 0.2 ms."""
+) -> FloatArray:
+    """Six PID controllers at 1500 rad/s and the decoupling without sampling or delay: Runge-Kutta steps of 0.2 ms.
+
+    Largest deviations of the six positions, um and urad.
+    """
     Kp, Ki, Kd = pid(1500.0)
     M, top = inertias(par), limits(par)
     s, r = ca.MX.sym("s", 18), ca.MX.sym("r", 18)
@@ -717,91 +644,16 @@ def fly_continuously(
         k4 = f(state + step * k3, t + step)
         state = state + step / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
         rows.append(state[:6] - reference(t + step)[0])
-    nothing = np.zeros(0)
-    return Flight(np.arange(1, 501) * step, np.array(rows), nothing, nothing)
-
-
-def fly(
-    par: planar.Parameters,
-    plant: Series,
-    model: planar.CoilModel,
-    start: tuple[float, float],
-    reference: Reference,
-    *,
-    controller: str = "lqg",
-    predicted: bool = True,
-    bandwidth: float = 1500.0,
-) -> Flight:
-    """Sampled at T_s: currents are held, and act one sample after the measurement they come from.
-
-    lqg : a regulator and a Kalman filter of position, rate and disturbance for each axis; `predicted`: the filter knows
-    of the delay, and the decoupling takes the position where its currents will act. Otherwise six PID controllers whose
-    integrals stop at the limits.
-    """
-    Ts, M, top = par.T_s, inertias(par), limits(par)
-    weight = np.array([0, 0, par.m * par.g, 0, 0, 0])
-    f = planar.dynamics(par, plant)
-    x_, i_ = ca.MX.sym("x", 12), ca.MX.sym("i", 16)
-    y_, h = x_, Ts / 2
-    for _ in range(2):
-        k1 = f(y_, i_, ca.DM.zeros(6))
-        k2 = f(y_ + h / 2 * k1, i_, ca.DM.zeros(6))
-        k3 = f(y_ + h / 2 * k2, i_, ca.DM.zeros(6))
-        y_ = y_ + h / 6 * (k1 + 2 * k2 + 2 * k3 + f(y_ + h * k3, i_, ca.DM.zeros(6)))
-    hold = ca.Function("hold", [x_, i_], [y_])
-
-    A, B, C = np.diag([1.0, 1.0], k=1), np.array([[0], [1], [0.0]]), np.array([[1, 0, 0.0]])
-    Ad, Bd = riccati.sample(A, B, Ts)
-    K = riccati.dare(Ad[:2, :2], Bd[:2], np.diag([bandwidth**4, 0]), np.eye(1), what="regulator").K[0]
-    V = np.array([[(1e-8) ** 2]])
-    P = riccati.dare(Ad.T, C.T, riccati.sample_noise(A, np.diag([0, 1e-2, 1e4]), Ts), V, what="filter").X
-    L = P @ C.T / (C @ P @ C.T + V)
-    Kp, Ki, Kd = pid(bandwidth)
-
-    def commanded(p: FloatArray, W: FloatArray) -> FloatArray:
-        inside = np.array([*p[:2], max(p[2], 0.0)])
-        i: FloatArray = planar.limited(par, planar.currents(planar.wrench_matrix(par, model, inside), W))
-        return i
-
-    x, pred = np.zeros(12), np.zeros((3, 6))
-    x[:2] = pred[0, :2] = start
-    i, acting, total, before = commanded(x[:3], weight), np.zeros(6), np.zeros(6), x[:6]
-    rows, wrenches, peaks = [], [], []
-    for k in range(600):
-        y = x[:6]
-        ahead = reference((k + 1.5) * Ts)[2]  # the middle of the sample in which this command acts
-        if controller == "lqg":
-            est = pred + L * (y - pred[0])
-            then = Ad @ est + Bd * acting if predicted else est
-            r = reference((k + predicted) * Ts)
-            a, place = ahead - K @ (then[:2] - r[:2]) - then[2], then[0, :3]
-        else:
-            e, slope = (
-                reference(k * Ts)[0] - y,
-                reference(k * Ts)[0] - reference((k - 1) * Ts)[0] - (y - before),
-            )
-            a, place, before = ahead + Kp * e + Ki * total + Kd * slope / Ts, y[:3], y
-        W = np.clip(M * a + weight, -top, top)
-        if controller == "pid":
-            total = total + np.where(np.abs(M * a + weight) > top, 0, e * Ts)
-        command = (W - weight) / M
-        if controller == "lqg":
-            pred = Ad @ est + Bd * (acting if predicted else command)
-        x = np.array(hold(x, i)).ravel()
-        i, acting = commanded(place, W), command
-        rows.append(x[:6] - reference((k + 1) * Ts)[0])
-        wrenches.append(W)
-        peaks.append(np.abs(i).max())
-    return Flight(np.arange(1, 601) * Ts, np.array(rows), np.array(wrenches), np.array(peaks))
+    return np.asarray(np.abs(rows).max(axis=0) * 1e6)
 
 
 def test_a_symmetric_start_stays_symmetric(
     par: planar.Parameters, paper: dict[str, Any], exact: Series
 ) -> None:
     """From (0, 0) a wrong model never moves x, theta and psi: the paper, which shows them move, started elsewhere."""
-    flight = fly_continuously(par, exact, planar.Analytical(par), (0.0, 0.0), profiled(paper, (0.0, 0.0)))
-    assert flight.worst[[0, 4, 5]].max() < 1e-9  # um and urad
-    assert flight.worst[3] > 0.1
+    worst = fly_continuously(par, exact, planar.Analytical(par), (0.0, 0.0), profiled(paper, (0.0, 0.0)))
+    assert worst[[0, 4, 5]].max() < 1e-9  # um and urad
+    assert worst[3] > 0.1
 
 
 def test_what_a_model_error_moves(par: planar.Parameters, paper: dict[str, Any], exact: Series) -> None:
@@ -816,40 +668,9 @@ def test_what_a_model_error_moves(par: planar.Parameters, paper: dict[str, Any],
         "fundamental": planar.truth(par, order=1),
         "printed": planar.Analytical(par),
     }
-    worst = {
-        name: fly_continuously(par, exact, model, START, reference).worst for name, model in models.items()
-    }
+    worst = {name: fly_continuously(par, exact, model, START, reference) for name, model in models.items()}
     assert worst["exact"][3:].max() < 1e-9
     assert worst["table"][3] == pytest.approx(0.0064, abs=5e-4)
     assert worst["table"][4] == pytest.approx(0.0235, abs=1e-3)
     assert worst["fundamental"][3] == pytest.approx(0.117, abs=0.01)
     assert worst["printed"][3] == pytest.approx(3.92, abs=0.1)
-
-
-@pytest.mark.parametrize("controller", ["lqg", "pid"])
-def test_sampled_steps(
-    par: planar.Parameters, paper: dict[str, Any], exact: Series, table: planar.Table, controller: str
-) -> None:
-    """10 mm in y and 1 mm in z, 200 us and one sample of delay, forces within 1000 N, currents within 24 A."""
-    flight = fly(par, exact, table, START, profiled(paper, START), controller=controller)
-    y_begin, z_begin = (published_value(paper, f"steps.{n}_time") for n in "yz")
-    y, z = flight.error[:, 1], flight.error[:, 2]
-    assert np.abs(y[flight.t >= y_begin + 0.06 - 1e-9]).max() < 10e-6
-    assert y[flight.t >= y_begin + 0.04].max() < 1e-6
-    assert np.abs(z[flight.t >= z_begin + 0.02 - 1e-9]).max() < 1.5e-6
-    assert np.abs(flight.W[:, :3]).max() < par.F_max
-    assert flight.current.max() < 24
-    assert flight.worst[3:].max() < {"lqg": 0.1, "pid": 0.7}[controller]
-
-
-def test_the_predictor_has_to_know_of_the_delay(
-    par: planar.Parameters, paper: dict[str, Any], exact: Series, table: planar.Table
-) -> None:
-    """At 3000 rad/s the loop whose filter does not know circles by tens of urad, else 0.03; at 1500 both are quiet."""
-    reference = profiled(paper, START)
-    knows = fly(par, exact, table, START, reference, bandwidth=3000.0)
-    ignores = fly(par, exact, table, START, reference, bandwidth=3000.0, predicted=False)
-    slow = fly(par, exact, table, START, reference, predicted=False)
-    assert knows.worst[3:].max() < 0.05
-    assert np.abs(ignores.error[-50:, 3:]).max() > 10e-6
-    assert slow.worst[3:].max() < 0.2

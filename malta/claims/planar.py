@@ -117,7 +117,7 @@ def _coil_rows() -> list[Row]:
                 f"analytical model, error of {name}",
                 unit,
                 "{:.3f}",
-                partial(_error, 1, name),
+                partial(_error, "analytical", name),
                 f"model.error_analytical.{name}",
                 "at most",
                 errors[unit],
@@ -134,7 +134,7 @@ def _table_rows() -> list[Row]:
                 f"table of τ_n/35, error of {name}",
                 unit,
                 "{:.3f}",
-                partial(_error, 0, name),
+                partial(_error, "table", name),
                 f"model.error_interpolation.{name}",
                 "at most",
             )
@@ -257,14 +257,7 @@ def _step_rows() -> list[Row]:
     rectangles = f"{missing}; and the overlapping rectangles of (23), (24) make too much torque"
     for model, key, why in (("analytical", "analytical", rectangles), ("table", "interpolation", missing)):
         for name, unit in (("x", "um"), ("phi", "urad"), ("theta", "urad"), ("psi", "urad")):
-            found += _range(
-                model,
-                key,
-                name,
-                unit,
-                "p",
-                missing,
-            )
+            found += _range(model, key, name, unit, "p", why)
         found += [
             row
             for name, unit in (("F_x", "N"), ("T_x", "N m"), ("T_y", "N m"), ("T_z", "N m"))
@@ -371,8 +364,9 @@ def _formulas(e: Evidence) -> float:
     )
 
 
-def _error(case: int, name: str, e: Evidence) -> float:
-    return _of(e.flown["errors"].cases[case], f"{name}, largest error")
+def _error(model: str, name: str, e: Evidence) -> float:
+    case = next(case for case in e.flown["errors"].cases if case.label == model)
+    return _of(case, f"{name}, largest error")
 
 
 def _of(case: Case, label: str) -> float:

@@ -226,8 +226,8 @@ def errors(
     planar.checked(par, np.array([*place, par.h]))
     truth = planar.truth(par)
     models: dict[str, planar.CoilModel] = {
-        "table": planar.table(par, truth, cells),
         "analytical": planar.Analytical(par),
+        "table": planar.table(par, truth, cells),
     }
     x, y = np.meshgrid(*[np.linspace(0, 2 * par.tau_n, 141)] * 2, indexing="ij")
     exact = coil_wrench(par, truth, current, x, y)
@@ -279,7 +279,7 @@ def _by_step(par: planar.Parameters, truth: planar.CoilModel, current: float) ->
     """Largest errors of a table, for each of NODES, N: F_x and F_z, in the middle and on the edges of cells."""
     found = []
     for n in NODES:
-        fine = np.linspace(0, par.tau_n, 4 * n + 1)
+        fine = np.linspace(0, par.tau_n, 2 * n + 1)
         x, y = np.meshgrid(fine, fine, indexing="ij")
         exact = coil_wrench(par, truth, current, x, y)
         error = np.abs(coil_wrench(par, planar.table(par, truth, n), current, x, y) - exact)

@@ -1,0 +1,470 @@
+"""The planar motor as a user meets it: designs, experiments, figures, claims, command line, and what is refused."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import casadi as ca
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import malta
+from malta import cli
+from malta.claims import ledger
+from malta.claims import planar as claims
+from malta.data import published as read_published
+from malta.data import published_value
+from malta.experiments import Experiment, cases_of, experiments_of
+from malta.experiments import planar as experiments
+from malta.figures import experiment_figure
+from malta.plants import planar
+from malta.verify import Margins
+
+if TYPE_CHECKING:
+    from malta.controller import Controller
+    from malta.plant import FloatArray, Plant
+    from malta.spec import Spec
+
+GAINS = "design/gains/planar.json"
+SLOW: dict[str, Any] = {"engine": "virtual machine"}  # half a second a run, and nothing to compile
+
+
+class Design(NamedTuple):
+    """A design file, read, and its controller."""
+
+    spec: Spec
+    plant: Plant
+    controller: Controller
+    margins: Margins
+
+
+def made(name: str) -> Design:
+    spec = malta.read_design(f"design/{name}.toml")
+    model = malta.linearize(spec.plant, spec.plant.at())
+    controller = malta.synthesize(spec, model)
+    return Design(spec, spec.plant, controller, malta.verify(model, controller))
+
+
+@pytest.fixture(scope="module")
+def lqg() -> Design:
+    return made("planar")
+
+
+@pytest.fixture(scope="module")
+def pid() -> Design:
+    return made("planar_pid")
+
+
+@pytest.fixture(scope="module")
+def paper() -> dict[str, Any]:
+    return read_published("data/planar.toml")
+
+
+@pytest.fixture(scope="module")
+def flown(lqg: Design) -> dict[str, Experiment]:
+    """Every experiment, once."""
+    return {
+        name: malta.experiment(name, lqg.plant, lqg.controller, **SLOW) for name in experiments.EXPERIMENTS
+    }
+
+
+def merits(e: Experiment, label: str = "") -> dict[str, float]:
+    """Those of the experiment, or of the case whose label begins so."""
+    found = e.merits if not label else next(case.merits for case in e.cases if case.label.startswith(label))
+    return {merit.label: merit.value for merit in found}
+
+
+# --- Designs ---
+
+
+@pytest.mark.parametrize("name", ["planar", "planar_pid"])
+def test_gain_files_are_of_the_design_files(name: str, request: pytest.FixtureRequest) -> None:
+    design: Design = request.getfixturevalue("lqg" if name == "planar" else "pid")
+    kept = malta.gains.read(f"design/gains/{name}.json")
+    assert kept.spec_sha256 == design.spec.sha256
+    for gain in ("K", "Ki", "L"):
+        np.testing.assert_allclose(
+            getattr(kept, gain), getattr(design.controller, gain), rtol=1e-6, atol=1e-9
+        )
+
+
+def test_the_lqg_observes_disturbances_and_predicts_a_sample(lqg: Design) -> None:
+    """1350 rad/s in every axis, zone A: 2.64; 24 states: the mover's, forces under way and of disturbance."""
+    c = lqg.controller
+    assert (len(c.states), c.delay, c.observed, c.integrating) == (24, 1, 1, False)
+    assert lqg.margins.stable
+    assert lqg.margins.peak_sensitivity["sigma_max"] == pytest.approx(2.64, abs=0.01)
+    assert lqg.margins.bandwidth["w_n_max"] == pytest.approx(1350, abs=1)
+
+
+def test_the_pid_is_one_of_a_double_integrator(pid: Design) -> None:
+    """Crossover 1500 rad/s with zeros at a third and a tenth; every axis the same, times its inertia."""
+    g = 1500.0**2 / np.sqrt(10 * 1.01)
+    wanted = {"Kp": 1.3 * g, "Ki": g * 150, "Kd": 3 * g / 1500}
+    assert pid.spec.pid is not None
+    for name, size in wanted.items():
+        np.testing.assert_allclose(getattr(pid.spec.pid, name) / pid.plant.inertia, size, rtol=5e-3)
+    assert pid.margins.peak_sensitivity["sigma_max"] == pytest.approx(2.17, abs=0.01)
+
+
+# --- The steps ---
+
+
+@pytest.mark.parametrize("model", experiments.MODELS)
+@pytest.mark.parametrize("place", ["(6, 4)", "(0, 0)"])
+def test_the_steps_meet_the_table(flown: dict[str, Experiment], model: str, place: str) -> None:
+    """y within 10 um in 60 ms, overshoot below 1 um, z within 1.5 um 20 ms after its step, forces within 1000 N."""
+    found = merits(flown["step"], f"{model}, from {place}")
+    assert found["y within 10 um after its step"] < 60e-3
+    assert found["y, overshoot"] < 1e-6
+    assert found["z, from 20 ms after its step"] < 1.5e-6
+    assert found["largest force"] < 1000
+    assert found["largest coil current"] < 30
+    assert flown["step"].run.limits == ()
+
+
+def test_a_symmetric_start_stays_symmetric(flown: dict[str, Experiment]) -> None:
+    """From (0, 0) no model moves x, theta and psi by 1e-9 um or urad: the paper, where they move, started elsewhere."""
+    for model in experiments.MODELS:
+        found = merits(flown["step"], f"{model}, from (0, 0)")
+        assert max(found[f"{name}, deviation"] for name in ("x", "theta", "psi")) < 1e-15
+
+
+def test_what_a_coil_model_moves(flown: dict[str, Experiment]) -> None:
+    """Off the path with the exact one: table phi 0.010, theta 0.025 urad; (17)-(24) phi 3.8 urad by their torque."""
+    found = merits(flown["step"])
+    assert found["table moves phi by"] == pytest.approx(0.010e-6, abs=0.001e-6)
+    assert found["table moves theta by"] == pytest.approx(0.0253e-6, abs=0.001e-6)
+    assert found["analytical moves phi by"] == pytest.approx(3.79e-6, abs=0.05e-6)
+
+
+def test_currents_that_act_late_tilt_the_mover(lqg: Design, flown: dict[str, Experiment]) -> None:
+    """phi by 0.8 urad with the exact model, a sample late and held; 0.3 urad when the computation takes no time."""
+    assert merits(flown["step"], "exact, from (6, 4)")["phi, deviation"] == pytest.approx(
+        0.81e-6, abs=0.01e-6
+    )
+    first = cases_of("step", lqg.plant, lqg.controller, delay=0)[0]
+    run = malta.simulate(lqg.plant, lqg.controller, first.scenario, **SLOW)
+    assert np.abs(run.p[:, 3]).max() == pytest.approx(0.296e-6, abs=0.01e-6)
+
+
+def test_the_pid_is_slower_to_arrive(pid: Design) -> None:
+    """Its feedforward acts a sample late and nothing predicts: 3.9 um beyond, 2.6 um in z, 0.7 urad."""
+    first = cases_of("step", pid.plant, pid.controller)[0]
+    found = {
+        m.label: m.value
+        for m in first.merits(malta.simulate(pid.plant, pid.controller, first.scenario, **SLOW))
+    }
+    assert found["y within 10 um after its step"] < 60e-3
+    assert found["y, overshoot"] == pytest.approx(3.88e-6, abs=0.1e-6)
+    assert found["z, from 20 ms after its step"] == pytest.approx(2.65e-6, abs=0.1e-6)
+    assert found["phi, deviation"] < 0.7e-6
+
+
+def test_sensor_noise(lqg: Design) -> None:
+    """20 nm and 0.1 urad of noise make 15 nm and 1.7 N rms of it: the steps are met as before."""
+    first = cases_of("step", lqg.plant, lqg.controller, noise=1.0)[0]
+    run = malta.simulate(lqg.plant, lqg.controller, first.scenario, **SLOW)
+    found = {m.label: m.value for m in first.merits(run)}
+    assert found["y within 10 um after its step"] < 60e-3
+    assert found["y, overshoot"] < 1e-6
+    assert found["z, from 20 ms after its step"] < 1.5e-6
+    still = (run.p - run.reference)[run.t > 0.09]
+    assert still[:, 0].std() == pytest.approx(15e-9, rel=0.5)
+
+
+def test_the_run_by_another_integrator(lqg: Design, flown: dict[str, Experiment]) -> None:
+    """scipy, numpy's decoupling and the mover in heights above the magnets: the same 20 samples to 1e-12 m.
+
+    The currents of a sample are those for the reading before, limited together, and they are held.
+    """
+    run, par = flown["step"].run, experiments._parameters(lqg.plant)
+    model = planar.simulated(par)
+    f = planar.dynamics(par, model)
+    shift = np.array([0, 0, par.h, *np.zeros(9)])
+
+    def rate(_: float, x: FloatArray, i: FloatArray) -> FloatArray:
+        return np.array(f(x, i, np.zeros(6))).ravel()
+
+    first = int(0.045 / par.T_s)  # the middle of the move in y
+    x = run.x[first] + shift
+    for k in range(first, first + 20):
+        read = (run.x[k - 1] + shift)[:3]
+        i = planar.limited(par, planar.currents(planar.wrench_matrix(par, model, read), run.v[k - 1]))
+        np.testing.assert_allclose(run.current[k - 1], i, rtol=0, atol=1e-9)
+        x = solve_ivp(rate, (0, par.T_s), x, args=(i,), rtol=1e-10, atol=1e-14).y[:, -1]
+        np.testing.assert_allclose(run.p[k + 1], (x - shift)[:6], rtol=0, atol=1e-12)
+
+
+def test_one_runge_kutta_step_a_sample_is_enough(lqg: Design) -> None:
+    first = cases_of("step", lqg.plant, lqg.controller)[0]
+    coarse, fine = (
+        malta.simulate(lqg.plant, lqg.controller, replace(first.scenario, duration=0.05, substeps=n), **SLOW)
+        for n in (1, 4)
+    )
+    assert first.scenario.substeps == 1
+    assert np.abs(coarse.p - fine.p).max() < 1e-10
+
+
+def test_the_believed_model_is_a_parameter(lqg: Design) -> None:
+    """`believing` changes what the controller commutates by, and no gain; the machine stays the same."""
+    table = experiments.believing(lqg.controller, "table", 20)
+    assert (experiments._parameters(table).order, experiments._parameters(table).cells) == (16, 20)
+    assert table.K is lqg.controller.K
+    assert experiments.believing(table, "exact").parameters == lqg.controller.parameters
+
+
+# --- Errors of the coil models ---
+
+
+def test_errors_of_the_models(flown: dict[str, Experiment], paper: dict[str, Any]) -> None:
+    """At 3 A: the fundamental 0.043 and 0.075 N, the table of tau_n / 35 0.0125 and 0.024 N; all within the paper's."""
+    e = flown["errors"]
+    fundamental, table = merits(e, "analytical"), merits(e, "table")
+    assert [fundamental[f"{n}, largest error"] for n in ("F_x", "F_z")] == pytest.approx(
+        [0.043, 0.075], abs=2e-3
+    )
+    assert table["F_x, largest error"] == pytest.approx(0.012, abs=2e-3)
+    assert table["F_z, largest error"] == pytest.approx(0.024, abs=2e-3)
+    for model, found in (("analytical", fundamental), ("interpolation", table)):
+        for name, _ in claims.WRENCH:
+            assert found[f"{name}, largest error"] < published_value(paper, f"model.error_{model}.{name}")
+
+
+def test_amplitudes_and_step_of_the_table(flown: dict[str, Experiment]) -> None:
+    """12.40 and 24.70 N; tau_n / 10 errs by 0.155 N, and four times less with every halving."""
+    e = flown["errors"]
+    found, n = merits(e), experiments.NODES
+    assert found["F_x, amplitude"] == pytest.approx(12.39, abs=0.1)
+    assert found["F_z, amplitude"] == pytest.approx(24.7, abs=0.1)
+    assert found["fitted C of the analytical model"] == pytest.approx(1.138, abs=1e-3)
+    assert e.curves["by step"][n.index(10), 0] == pytest.approx(0.155, abs=0.01)
+    assert found["error of the table, each halving of its step"] == pytest.approx(4.0, abs=0.05)
+
+
+def test_a_hover_corrects_what_the_model_misses(flown: dict[str, Experiment]) -> None:
+    """0.18 and 0.10 N that the observed disturbance takes off."""
+    for model, force in (("analytical", 0.20), ("table", 0.12)):
+        assert merits(flown["errors"], model)["hover: force to correct"] == pytest.approx(force, abs=0.01)
+
+
+def test_a_coil_off_the_centre_has_arms(lqg: Design) -> None:
+    """T about the centre of gravity is the coil's own and arm x F, as in K(p)."""
+    par = experiments._parameters(lqg.plant)
+    model = planar.truth(par)
+    x, y = np.array([3e-3]), np.array([5e-3])
+    centre = np.array([x[0] - par.coil_pitch / 2, y[0] - par.coil_pitch / 2, par.h])
+    column = planar.wrench_matrix(par, model, centre)[
+        :, 10
+    ]  # the third of the third row: half a pitch along both
+    np.testing.assert_allclose(
+        experiments.coil_wrench(par, model, 2.0, x, y)[0], 2 * column, rtol=0, atol=1e-11
+    )
+
+
+# --- Delay and time ---
+
+
+def test_the_filter_has_to_know_of_the_delay(flown: dict[str, Experiment]) -> None:
+    """As designed both are quiet at rest; at twice and three times the speed the one that does not know circles."""
+    e = flown["delay"]
+    left = {case.label: case.merits[1].value for case in e.cases}
+    assert left["with, 1 x"] < 2e-9
+    assert left["without, 1 x"] < 2e-9
+    assert left["with, 3 x"] < 1e-11
+    assert left["without, 2 x"] > 30e-6
+    assert left["without, 3 x"] > 30e-6
+
+
+def test_times_are_those_of_the_numbers(lqg: Design, flown: dict[str, Experiment]) -> None:
+    """The timed C code gives numpy's currents. Times themselves are for bench/run.py."""
+    par = experiments._parameters(lqg.plant)
+    p, W = np.array([6e-3, 4e-3, par.h]), np.array([10.0, 200, 400, 1, 2, 3])
+    for model in (
+        planar.table(par, planar.simulated(par), 35),
+        planar.simulated(par),
+        planar.Analytical(par),
+    ):
+        compiled = experiments.compiled(planar.decoupling(par, model))
+        if compiled is None:
+            pytest.skip("no C compiler")
+        seconds, i = compiled(10, p, W)
+        assert seconds > 0
+        expected = planar.currents(planar.wrench_matrix(par, model, p), W)
+        np.testing.assert_allclose(i, expected, rtol=0, atol=1e-11)
+    assert {m.label for m in flown["timing"].merits} >= {"table, numpy", "table, compiled"}
+
+
+def test_without_a_compiler_there_is_no_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("malta.engine.compiler", lambda: None)
+    x = ca.SX.sym("x")
+    assert np.isnan(experiments.compiled_seconds(ca.Function("square", [x], [x * x]), np.ones(1)))
+
+
+# --- Figures and claims ---
+
+
+@pytest.mark.parametrize("name", list(experiments.EXPERIMENTS))
+def test_figures(flown: dict[str, Experiment], paper: dict[str, Any], name: str) -> None:
+    """Every panel has labels with units, and every experiment its own figure, with and without the paper."""
+    for published in (paper, None):
+        figure = experiment_figure(flown[name], published)
+        labelled = [a for a in figure.axes if a.get_xlabel() or a.get_ylabel()]
+        assert labelled
+        assert any("[" in a.get_xlabel() + a.get_ylabel() for a in labelled)
+        assert "planar" in figure.get_suptitle()
+
+
+def test_the_ledger(
+    lqg: Design, flown: dict[str, Experiment], paper: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What a mended model can have is reproduced; what contradicts itself or lacks its start has a reason."""
+    monkeypatch.setattr(claims, "experiment", lambda name, *_, **__: flown[name])
+    monkeypatch.setattr(claims, "verify", lambda *_: lqg.margins)
+    found = {claim.subject: claim for claim in ledger([lqg.spec], paper).claims}
+    reproduced = (
+        "one coil at 3 A: F_x [N]",
+        "largest force [N]",
+        "table of τ_n/35, error of F_z [N]",
+        "phi moved: analytical over table",
+    )
+    for subject in reproduced:
+        assert found[subject].verdict.startswith("reproduced")
+    reasons = {
+        "F_z over F_x": "without curl",
+        "T_z that (20)–(22) make of the printed F_x, F_z, T_x, T_y [N m]": "contradict each other",
+        "one coil at 3 A: T_x [N m]": "pitch",
+        "analytical: phi, highest [µrad]": "rectangles",
+        "table: phi, highest [µrad]": "missing",
+    }
+    for subject, reason in reasons.items():
+        assert found[subject].verdict.startswith("not reproduced")
+        assert reason in found[subject].verdict
+    assert found["the same with 4 τ_n"].ours == ("inf",)
+    assert found["step of the table that errs by the printed F_x [mm]"].ours == ("1.93",)
+    assert found["step of the table that errs by the printed F_z [mm]"].ours == ("1.57",)
+
+
+def test_every_printed_number_is_claimed(paper: dict[str, Any]) -> None:
+    """Each figure of data/published/ that is no input of ours."""
+    keys = {row.published for row in claims.rows() if isinstance(row.published, str)}
+
+    def printed(node: dict[str, Any], path: str = "") -> list[str]:
+        below = [
+            (f"{path}.{key}".lstrip("."), value) for key, value in node.items() if isinstance(value, dict)
+        ]
+        return [p if "value" in v else "" for p, v in below] + [k for p, v in below for k in printed(v, p)]
+
+    inputs = {
+        "model.current",
+        "model.range",
+        "steps.duration",
+        "steps.z_step",
+        "steps.z_time",
+        "steps.y_step",
+        "steps.y_time",
+    }
+    assert {key for key in printed(paper) if key} - keys == inputs | {"real_time.longest"}
+
+
+# --- The command line ---
+
+Run = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
+    def runs(*arguments: str | Path) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["malta", *map(str, arguments)])
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as ended:
+            cli.main()
+        out, err = capsys.readouterr()
+        assert isinstance(ended.value.code, int)
+        return ended.value.code, out, err
+
+    return runs
+
+
+def test_design(run: Run, tmp_path: Path) -> None:
+    """From the design file to gain files and a figure: they are the shipped ones, bit for bit but for dates."""
+    code, out, _ = run("design", "design/planar.toml", "--out", tmp_path, "--figures", tmp_path)
+    assert code == 0
+    assert "What does the coil model move?" in out
+    assert max(len(line) for line in out.splitlines() if not line.startswith("wrote")) <= 100
+    assert {path.name for path in tmp_path.iterdir()} == {
+        "planar.json",
+        "planar.npz",
+        "planar.mat",
+        "planar_step.png",
+    }
+    np.testing.assert_allclose(
+        malta.gains.read(tmp_path / "planar.json").K, malta.gains.read(GAINS).K, rtol=1e-6, atol=1e-9
+    )
+
+
+@pytest.mark.parametrize("scenario", ["step", "errors", "timing"])
+def test_simulate(run: Run, tmp_path: Path, scenario: str) -> None:
+    arguments = ("--scenario", scenario, "--engine", "virtual-machine", "--out", tmp_path)
+    code, out, err = run("simulate", GAINS, *arguments)
+    assert (code, err) == (0, "")
+    assert (tmp_path / f"planar_{scenario}.png").exists()
+    assert max(len(line) for line in out.splitlines() if not line.startswith("wrote")) <= 100
+
+
+def test_simulate_json(run: Run) -> None:
+    code, out, _ = run("simulate", GAINS, "--engine", "virtual-machine", "--option", "cells=10", "--json")
+    found = json.loads(out)
+    assert code == 0
+    assert len(found["cases"]) == 6
+    assert found["merits"]["table moves theta by"] > 0.1e-6
+
+
+def test_a_campaign(lqg: Design, tmp_path: Path) -> None:
+    """Machines whose coils, magnets and masses differ: all arrive; the unknown pitch tilts by some urad."""
+    spread = {"m": 0.05, "B_r": 0.05, "I_x": 0.1, "coil_pitch": 0.002}
+    found = malta.campaign(malta.Plan(lqg.controller, "step", spread, samples=8), tmp_path)
+    assert found.batch.completed.all()
+    assert 1e-6 < found.batch.deviation[:, 3].max() < 20e-6
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "sentence"),
+    [
+        (("--set", "coil_pitch=70.8mm"), 1, "= 4 tau_n, K(p) is singular"),
+        (("--set", "coil_pitch=60mm"), 2, "the width of a coil"),
+        (("--option", "place=200mm,0mm"), 2, "x: found 0.2 m, expected a position from -0.1 to 0.1 m"),
+        (("--option", "place=6mm"), 2, "found 1 numbers, expected x and y"),
+        (("--option", "distance=300mm"), 2, "y: found 0.304 m"),
+        (("--option", "lift=9mm"), 2, "z: found 0.00905 m"),
+        (("--option", "gap=-1um"), 2, "z: found -1e-06 m"),
+        (("--option", "gap=0mm"), 1, "touchdown on the magnets at 0 s"),
+        (("--option", "cells=0"), 2, "finite, above 0"),
+        (("--option", "cells=3.5"), 2, "a whole number"),
+        (("--fidelity", "dq"), 2, "one of force for a planar"),
+        (("--scenario", "errors", "--option", "place=0,0,0"), 2, "3 numbers"),
+        (("--scenario", "errors", "--option", "current=0"), 2, "finite, above 0"),
+        (("--scenario", "delay", "--option", "speeds=1,-2"), 2, "finite, above 0"),
+        (("--scenario", "stroke"), 2, "one of step, errors, delay, timing"),
+    ],
+)
+def test_what_is_refused(run: Run, arguments: tuple[str, ...], code: int, sentence: str) -> None:
+    found, _, err = run("simulate", GAINS, *arguments, "--engine", "virtual-machine")
+    assert found == code
+    assert sentence in err
+    assert err.count("\n") == 1
+
+
+def test_a_pid_predicts_nothing(pid: Design) -> None:
+    with pytest.raises(malta.InputError, match="a PID, which predicts nothing"):
+        malta.experiment("delay", pid.plant, pid.controller, **SLOW)
+
+
+def test_the_main_job_comes_first(lqg: Design) -> None:
+    assert list(experiments_of(lqg.plant)) == ["step", "errors", "delay", "timing"]
