@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from malta.plant import Parameters, Plant
     from malta.robust import Margin
     from malta.simulate import EngineChoice
-    from malta.tune import Requirement
+    from malta.trials import Requirement
     from malta.verify import CurrentLoops, Margins
 
 app = typer.Typer(
@@ -523,7 +523,9 @@ def tune(
     ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Find weights, bases and noise for what a design file asks for: margin, bandwidth, noise, experiments.
+    """Find the numbers of a design for what its file asks for: margin, bandwidth, noise, experiments.
+
+    Of an LQG these are weights, bases and noise. Of a PID they are gains, and what its [cost] names is made small.
 
     The design file that is found is the one that was given, with other numbers. Every trial is kept in the folder: the
     same command goes on where it was ended. Exit code 1 when something asked for is not reached; the nearest design is
@@ -535,7 +537,8 @@ def tune(
     from malta import report
     from malta.files import replace_files
     from malta.spec import read_design
-    from malta.tune import Effort, design_text, judged
+    from malta.trials import Effort, design_text
+    from malta.tune import judged
     from malta.tune import tune as tuned
 
     spec = read_design(file)

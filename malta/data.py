@@ -159,18 +159,22 @@ def _units() -> Any:
     return registry
 
 
+@cache
+def _root_units(unit: str) -> Any:
+    return _units().get_root_units(_units().parse_units(unit))
+
+
 def to_si(value: float, unit: str, si_unit: str, where: str | Path, name: str) -> float:
     """Convert to `si_unit` ("kg", "m/s", "N m", ...).
 
     Raises InputError that names `where` and `name` when the unit is unknown or of another kind.
     """
-    registry = _units()
     expected = f"a unit of {si_unit}"
     try:
-        factor, found_root = registry.get_root_units(registry.parse_units(unit))
+        factor, found_root = _root_units(unit)
     except Exception as error:  # pint raises many kinds, tokenizer errors among them
         raise InputError(where, f"{name}.unit", repr(unit), expected) from error
-    si_factor, si_root = registry.get_root_units(registry.parse_units(si_unit))
+    si_factor, si_root = _root_units(si_unit)
     if found_root != si_root:
         raise InputError(where, f"{name}.unit", repr(unit), expected)
     ratio = float(factor) / float(si_factor)

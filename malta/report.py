@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from malta.experiments import Experiment, Merit
     from malta.plant import ComplexArray, FloatArray, Plant
     from malta.robust import Margin
-    from malta.tune import Requirement, Tuned
+    from malta.trials import Requirement, Tuned
 
 
 # --- pages ---
@@ -491,12 +491,16 @@ def requirements_table(requirements: Sequence[Requirement]) -> Table:
     table = _table("Requirements", "requirement", "asked", "found", "of the limit", "", "from")
     for r in requirements:
         scale, unit = UNITS.get(r.unit, (1.0, ""))
+        found = f"{r.found * scale:.4g} {unit}".rstrip()
+        if r.asked is None:
+            _row(table, r.name.replace("_", " "), "least", found, "", "", r.how)
+            continue
         bound = ">=" if r.more else "<="
         _row(
             table,
             r.name.replace("_", " "),
             f"{bound} {r.asked * scale:.4g} {unit}".rstrip(),
-            f"{r.found * scale:.4g} {unit}".rstrip(),
+            found,
             f"{100 * r.ratio:.1f} %",
             "holds" if r.holds else "FAILS",
             r.how,
@@ -507,6 +511,8 @@ def requirements_table(requirements: Sequence[Requirement]) -> Table:
 UNITS = {
     "m": (1e6, "um"),
     "rad": (1e6, "urad"),
+    "m s^0.5": (1e6, "um s^0.5"),
+    "rad s^0.5": (1e6, "urad s^0.5"),
     "rad/s": (1.0, "rad/s"),
     "N": (1.0, "N"),
     "N m": (1.0, "N m"),

@@ -4,8 +4,8 @@ Weights are dimensionless and stand on explicit bases (Bryson's rule): Q = diag(
 standard deviation or the variance of one sample. Wherever numbers are expected, `{ published = "table_II.state" }`
 stands for what the machine's paper prints under that name in data/published/.
 
-What `malta tune` is to reach and what it may vary stand in [specification] and [search]; they shape no gains by
-themselves.
+What `malta tune` is to reach and what it may vary stand in [specification] and [search], and what it makes small for a
+PID in [cost]; they shape no gains by themselves.
 """
 
 from __future__ import annotations
@@ -126,6 +126,15 @@ class Pid:
 
 
 @dataclass(frozen=True)
+class Loads:
+    """What a PID is judged by: [cost]. White noise, a force's spread over the sample, a sensor's of each reading."""
+
+    load: tuple[float, ...]  # m, N or N m: a constant force from outside on each input, one at a time
+    force_noise: tuple[float, ...]  # m, N or N m rms of one sample
+    sensor_noise: tuple[float, ...]  # p, m or rad rms of one sample
+
+
+@dataclass(frozen=True)
 class Specification:
     """What a design shall reach; None: not asked for. Bounds from below: margin, bandwidth."""
 
@@ -143,8 +152,12 @@ class Specification:
     tilt_deviation: float | None = None  # m, of the sensor plane that a tilt holds
     payload: float | None = None  # kg, picked up and carried through the stroke without touchdown
     lift_off: bool = False  # from rest on the touchdown bearing, by every start-up estimator
+    noise_motion: Mapping[str, float] = dataclass_field(
+        default_factory=dict
+    )  # m or rad rms by output, of a PID's true outputs, from the noise of [cost]
 
 
+OF_A_PID = ("margin", "peak_sensitivity", "bandwidth", "noise_motion")  # what can be asked of one
 SPECIFIED = {  # SI units
     "margin": "1",
     "peak_sensitivity": "1",
@@ -187,6 +200,7 @@ class Spec:
     current_loop_delay: bool  # whether the current loops are designed with the machine's dead time
     law: Weights | Pid  # of an LQG, or the gains of a PID
     uncertainty: Mapping[str, float]  # relative, either way, by parameter
+    loads: Loads | None = None  # what a PID is judged by
     specification: Specification = Specification()
     search: tuple[Variable, ...] = ()
     delays: tuple[int, ...] = ()  # that the search may choose from
@@ -261,6 +275,12 @@ class _PidTable(Record):
     filter: Quantity
 
 
+class _CostTable(Record):
+    load: dict[StrictStr, Quantity]
+    force_noise: dict[StrictStr, Quantity] | None = None
+    sensor_noise: dict[StrictStr, Quantity] | None = None
+
+
 class _Range(Record):
     vary: Annotated[list[StrictStr], Field(min_length=1)]
     low: Annotated[Finite, Field(gt=0)]
@@ -286,6 +306,7 @@ class _SpecificationTable(Record):
     tilt_deviation: Quantity | None = None
     payload: Quantity | None = None
     lift_off: StrictBool = False
+    noise_motion: dict[StrictStr, Quantity] = Field(default_factory=dict)
 
 
 class _DesignFile(Record):
@@ -303,6 +324,7 @@ class _DesignFile(Record):
     noise: _NoiseTable | None = None
     pid: _PidTable | None = None
     uncertainty: dict[StrictStr, Annotated[Finite, Field(gt=0, lt=1)]]
+    cost: _CostTable | None = None
     specification: _SpecificationTable | None = None
     search: _SearchTable | None = None
 
@@ -328,7 +350,9 @@ def read_design(path: str | Path) -> Spec:
         if name not in units_of(par):
             raise InputError(path, f"uncertainty.{name}", "an unknown parameter", ", ".join(units_of(par)))
     shaping = json.dumps(
-        content.model_dump(exclude={"summary", "machine", "specification", "search"}, exclude_none=True),
+        content.model_dump(
+            exclude={"summary", "machine", "cost", "specification", "search"}, exclude_none=True
+        ),
         sort_keys=True,
     )
     Ts = to_si(content.sample_time.value, content.sample_time.unit, "s", path, "sample_time")
@@ -357,7 +381,12 @@ def read_design(path: str | Path) -> Spec:
         law=law,
         uncertainty=dict(content.uncertainty),
     )
-    return replace(spec, specification=_specification(content, spec), **_search(content.search, raw, spec))
+    return replace(
+        spec,
+        loads=_loads(content, spec),
+        specification=_specification(content, spec),
+        **_search(content.search, raw, spec),
+    )
 
 
 LQG = ("discretization", "delay", "weights", "bases", "noise")
@@ -418,11 +447,39 @@ def _pid_signals(plant: Plant) -> dict[str, list[Signal]]:
     }
 
 
+def _loads(content: _DesignFile, spec: Spec) -> Loads | None:
+    """What a PID is judged by, in SI. Noise that is not given: none of forces, the machine's own of sensors."""
+    table, path, plant, terms = content.cost, spec.path, spec.plant, spec.pid
+    if table is None:
+        return None
+    if terms is None:
+        raise InputError(
+            path, "cost", "this table without [pid]", "the weights of an LQG, which are its cost"
+        )
+    for signal, gain in zip(plant.inputs, terms.Ki, strict=True):
+        if not gain:
+            expected = "an integral gain, as a constant force leaves an error without one"
+            raise InputError(path, "cost.load", f"pid.Ki.{signal.name} of 0", expected)
+    force: FloatArray = np.zeros(len(plant.inputs))
+    if table.force_noise is not None:
+        force = _bases(table.force_noise, plant.inputs, path, "cost.force_noise", "inputs")
+    sensor: FloatArray = np.sqrt(np.square(plant.noise) + np.square(plant.resolution) / 12)
+    if table.sensor_noise is not None:
+        sensor = _bases(table.sensor_noise, plant.outputs, path, "cost.sensor_noise", "measured signals")
+    load = _bases(table.load, plant.inputs, path, "cost.load", "inputs")
+    return Loads(tuple(load.tolist()), tuple(force.tolist()), tuple(sensor.tolist()))
+
+
 def _specification(content: _DesignFile, spec: Spec) -> Specification:
     """What is asked for, in SI; InputError for what no design could reach or what contradicts itself."""
     table, path = content.specification, spec.path
     if table is None:
         return Specification()
+    for name in sorted(table.model_fields_set):
+        if spec.pid is not None and name not in OF_A_PID:
+            raise InputError(path, f"specification.{name}", "a wish for an LQG", " ".join(OF_A_PID))
+        if spec.pid is None and name == "noise_motion":
+            raise InputError(path, f"specification.{name}", "a wish for a PID", " ".join(SPECIFIED))
     values: dict[str, float] = {}
     for name, unit in SPECIFIED.items():
         given = getattr(table, name)
@@ -434,10 +491,11 @@ def _specification(content: _DesignFile, spec: Spec) -> Specification:
                 else float(given)
             )
             _positive(values[name], path, field, unit)
-    if not values and not table.lift_off:
-        expected = "at least one of " + " ".join([*SPECIFIED, "lift_off"])
+    motion = _noise_motion(table.noise_motion, spec)
+    if not (values or table.lift_off or motion):
+        expected = "at least one of " + " ".join(OF_A_PID if spec.pid else [*SPECIFIED, "lift_off"])
         raise InputError(path, "specification", "nothing to reach", expected)
-    found = Specification(**values, lift_off=table.lift_off)
+    found = Specification(**values, lift_off=table.lift_off, noise_motion=motion)
     if found.margin is not None:
         if not spec.uncertainty:
             raise InputError(path, "specification.margin", "no uncertainty in the file", "its parameters")
@@ -459,6 +517,19 @@ def _specification(content: _DesignFile, spec: Spec) -> Specification:
             f"less than half of sampling, {nyquist:.0f}",
         )
     return found
+
+
+def _noise_motion(entries: Mapping[str, Quantity], spec: Spec) -> dict[str, float]:
+    """Bounds of some outputs, in SI."""
+    units = {s.name: s.unit for s in spec.plant.outputs}
+    values = {}
+    for name, q in entries.items():
+        field = f"specification.noise_motion.{name}"
+        if name not in units:
+            raise InputError(spec.path, field, "an unknown output", "one of " + " ".join(units))
+        value = to_si(q.value, q.unit, units[name], spec.path, field)
+        values[name] = _positive(value, spec.path, field, units[name])
+    return values
 
 
 def _search(table: _SearchTable | None, raw: Mapping[str, Any], spec: Spec) -> dict[str, Any]:
@@ -485,6 +556,8 @@ def _search(table: _SearchTable | None, raw: Mapping[str, Any], spec: Spec) -> d
         variables.append(Variable(name, tuple(given.vary), given.low, given.high, given.unit))
     if not variables:
         raise InputError(path, "search.numbers", "nothing to vary", "at least one number")
+    if table.delay and spec.pid is not None:
+        raise InputError(path, "search.delay", str(table.delay), "none, as a PID has no model of a delay")
     if any(table.delay) and spec.discretization == "backward-euler":
         raise InputError(path, "search.delay", str(table.delay), "0 with backward-euler, which has no delay")
     return {"search": tuple(variables), "delays": tuple(dict.fromkeys(table.delay)) or (spec.delay,)}

@@ -282,21 +282,27 @@ def pid(
     plant, half = model.plant, len(model.A) // 2
     if len(terms.Kp) != len(plant.inputs):
         raise InputError("pid", "Kp", f"{len(terms.Kp)} gains", f"{len(plant.inputs)}, one for each input")
-    P = model.C[:, :half]
-    back, a = np.linalg.inv(P), math.exp(-Ts / terms.filter) if terms.filter else 0.0
     delay = plant.actuator.delay(Ts)
     return Controller(
         **_machine_part(model, Ts, delay, current_loop_delay=current_loop_delay),
+        **pid_gains(model.C[:, :half], terms, Ts)._asdict(),
         name=name,
         states=plant.design_states,
-        Ad=linalg.block_diag(np.eye(half), a * np.eye(half)),
-        Bd=np.zeros_like(model.B),
-        Cd=model.C,
+        cost=None,
+        noise=None,
+    )
+
+
+def pid_gains(P: FloatArray, terms: Pid, Ts: float) -> Gains:
+    """A PID as the control law runs it, for positions q with p = P q: these and their rates come from the outputs."""
+    n, back, a = len(P), np.linalg.inv(P), math.exp(-Ts / terms.filter) if terms.filter else 0.0
+    return Gains(
+        Ad=linalg.block_diag(np.eye(n), a * np.eye(n)),
+        Bd=np.zeros((2 * n, n)),
+        Cd=np.hstack([P, np.zeros((n, n))]),
         K=np.hstack([terms.Kp[:, None] * P, terms.Kd[:, None] * P]),
         Ki=np.diag(terms.Ki),
         L=np.vstack([back, (1 - a) / Ts * back]),
-        cost=None,
-        noise=None,
     )
 
 

@@ -14,30 +14,25 @@ import pytest
 from conftest import ROOT, refusal
 
 import malta
-from malta import cli, gains, report
+from malta import cli, gains, report, tune_lqg
 from malta.controller import linear_law
 from malta.experiments import experiment
 from malta.riccati import eigenvalues
 from malta.spec import Specification
-from malta.tune import (
-    LINEAR,
+from malta.trials import (
     Effort,
+    Journal,
     Requirement,
+    Trial,
     Tuned,
-    _clusters,
-    _figures,
-    _Journal,
-    _Search,
     design_text,
-    drive_constant,
     found_spec,
-    judged,
     law_of,
     merged,
-    noise_of,
-    problem_sha256,
 )
+from malta.tune import judged, problem_sha256
 from malta.tune import tune as tuned
+from malta.tune_lqg import LINEAR, _clusters, _figures, _search, _worst, drive_constant, noise_of
 from malta.verify import BANDWIDTHS, loop, machine_loop
 
 if TYPE_CHECKING:
@@ -218,9 +213,9 @@ def test_an_unstable_trial_has_no_figures(spec: Spec) -> None:
     cluster = _clusters(spec)[0]
     hasty = replace(spec.weights, process_variance=spec.weights.process_variance * 1e10)
     assert _figures(spec, cluster.groups[0], replace(hasty, q_base=spec.weights.q_base / 30), 0) == {}
-    search = _Search(spec, cluster, 0, _Journal(None, spec, restart=False))
+    search = _search(spec, cluster, 0, Journal(None, problem_sha256(spec), restart=False))
     search.journal.known = {f"{cluster.variables} 0 {search.values(search.start)}": {}}
-    assert search.worst(search.start) == 1e3
+    assert _worst(search, search.start) == 1e3
 
 
 def test_ratios_count_from_either_side() -> None:
@@ -273,8 +268,8 @@ def test_a_search_that_was_interrupted_ends_where_it_would_have(small: Spec, tmp
 def test_the_journal_of_another_search_is_refused(small: Spec, tmp_path: Path) -> None:
     journal = tmp_path / "trials.jsonl"
     journal.write_text(json.dumps({"malta-tune": 1, "problem": "another"}) + "\n", encoding="utf-8")
-    refusal(lambda: _Journal(journal, small, restart=False), journal)
-    _Journal(journal, small, restart=True)
+    refusal(lambda: Journal(journal, problem_sha256(small), restart=False), journal)
+    Journal(journal, problem_sha256(small), restart=True)
     assert problem_sha256(small) in journal.read_text(encoding="utf-8")
     assert problem_sha256(small) != problem_sha256(replace(small, specification=Specification(margin=3.0)))
 
@@ -282,7 +277,7 @@ def test_the_journal_of_another_search_is_refused(small: Spec, tmp_path: Path) -
 def test_what_is_found_has_the_figures_that_were_found(small: Spec, tmp_path: Path) -> None:
     """Through the written file: the same bits of weights, comments kept, the machine found from another folder."""
     clusters = _clusters(small)
-    search = _Search(small, clusters[-1], 0, _Journal(None, small, restart=False))
+    search = _search(small, clusters[-1], 0, Journal(None, problem_sha256(small), restart=False))
     found = tuned(small, effort=Effort(generations=0, polish=2, front=0))
     assert found.front == ()
     target = tmp_path / "deep" / "robust.toml"
@@ -304,7 +299,7 @@ def test_what_is_found_has_the_figures_that_were_found(small: Spec, tmp_path: Pa
 def test_the_front_trades_margin_for_noise(
     spec: Spec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sys.modules["malta.tune"], "FRONT", (0.65, 0.95))
+    monkeypatch.setattr(tune_lqg, "FRONT", (0.65, 0.95))
     asked = Specification(margin=3.5, peak_sensitivity=2.0, bandwidth=400.0)
     radial = replace(spec, specification=asked, delays=(0,), search=spec.search[:4])
     found = tuned(radial, effort=Effort(generations=0, polish=0, front=20))
@@ -524,19 +519,17 @@ def test_found_spec_keeps_what_is_not_varied(spec: Spec) -> None:
     again = spec.varied(values).weights
     for name in again.__dataclass_fields__:
         assert getattr(again, name) == pytest.approx(getattr(spec.weights, name), rel=1e-12)
-    from malta.tune import Trial
-
     assert found_spec(spec, Trial(tuple(values), 2, {})).delay == 2
 
 
 def test_trials_that_cannot_be_kept_or_read_are_one_sentence(spec: Spec, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("", encoding="utf-8")
     with pytest.raises(malta.InputError, match="a place to keep the trials"):
-        _Journal(tmp_path / "file" / "trials.jsonl", spec, restart=False)
+        Journal(tmp_path / "file" / "trials.jsonl", problem_sha256(spec), restart=False)
     foreign = tmp_path / "foreign.jsonl"
     foreign.write_bytes(b"\xff\xfe\x00")
     with pytest.raises(malta.InputError, match="file of trials"):
-        _Journal(foreign, spec, restart=False)
+        Journal(foreign, problem_sha256(spec), restart=False)
     foreign.write_text("{}", encoding="utf-8")
     with pytest.raises(malta.InputError, match="another design file"):
-        _Journal(foreign, spec, restart=False)
+        Journal(foreign, problem_sha256(spec), restart=False)

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from malta.tune import Tuned
+    from malta.trials import Tuned
 
 
 def experiment_figure(e: Experiment, published: Published | None = None) -> Figure:
