@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 from collections.abc import Callable
 from dataclasses import replace
@@ -397,6 +398,9 @@ def test_design(run: Run, tmp_path: Path) -> None:
     code, out, _ = run("design", "design/planar.toml", "--out", tmp_path, "--figures", tmp_path)
     assert code == 0
     assert "What does the coil model move?" in out
+    assert re.search(
+        r"proven\s33\d\.\d+ %", out
+    )  # of the box of m, I_x, I_z, B_r and r_z, anywhere in the travel
     assert max(len(line) for line in out.splitlines() if not line.startswith("wrote")) <= 100
     assert {path.name for path in tmp_path.iterdir()} == {
         "planar.json",
