@@ -19,6 +19,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -33,6 +34,7 @@ from rich.table import Table
 
 import malta
 from malta.data import published_value
+from malta.experiments.halbach import there_and_back
 from malta.experiments.planar import CELLS, compiled
 from malta.machine import state_reference
 from malta.plants import planar, tubular
@@ -347,6 +349,32 @@ def decoupling(runs: int) -> list[Result]:
     ]
 
 
+def halbach(runs: int) -> list[Result]:
+    """20 s of the Halbach motor going there and back, every source of error on: 290 000 PWM periods, 364 readings."""
+    peer = importlib.import_module("peer_halbach")
+    controller = malta.gains.read(ROOT / "design" / "gains" / "halbach.json")
+    plant = malta.plant_of(controller.parameters)
+    reference = partial(there_and_back, distance=100e-6, rise=0.0, count=8, Ts=controller.sample_time)
+    scenario = malta.Scenario("steps", 20.0, reference, fidelity="phase", noise=1.0, quantize=True)
+    found = malta.simulate(plant, controller, scenario)
+    given = peer.given(plant, controller, scenario)
+    rows = peer.run(controller, *given)
+    difference = np.abs(np.array([row.x for row in rows]) - found.p[:, 0]).max()
+    assert difference < 1e-9, f"plain Python and malta differ by {difference} m"
+    ours, theirs = medians(
+        lambda: malta.simulate(plant, controller, scenario),
+        lambda: peer.run(controller, *given),
+        runs=runs,
+        what="Halbach motor",
+    )
+    return [
+        Result(
+            "Halbach motor, 20 s, all errors", ours, "plain Python, same arithmetic", theirs, "at least 100"
+        ),
+        Result("the same", ours, "real time", 20.0, "at least 100"),
+    ]
+
+
 WORKLOADS: dict[str, Callable[[int], list[Result]]] = {
     "process": whole_process,
     "stroke": stroke,
@@ -354,6 +382,7 @@ WORKLOADS: dict[str, Callable[[int], list[Result]]] = {
     "margin": margin,
     "campaign": campaigns,
     "planar": decoupling,
+    "halbach": halbach,
 }
 
 

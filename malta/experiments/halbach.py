@@ -26,7 +26,7 @@ from malta.errors import InputError
 from malta.experiments import QUIET, REAL, Case, Experiment, Merit, Progress, Wanted, fly, rms, scenario_of
 from malta.plant import Plant
 from malta.plants import halbach
-from malta.plants.halbach import F_MOST, IDEAL, MEAN_OF, Options, Pwm
+from malta.plants.halbach import IDEAL, MEAN_OF, Options, Pwm
 from malta.references import Motion, Reference
 from malta.riccati import sample
 from malta.simulate import Trajectory
@@ -470,6 +470,7 @@ def _rest_merits(run: Trajectory) -> tuple[Merit, ...]:
 # Sec. 2.3
 
 IDENTIFIED, LASTS = 2e-3, 6.0  # m, s
+F_MOST = 1e4  # N, to ask for: far beyond any supply, far from the largest float
 
 
 def identify(
