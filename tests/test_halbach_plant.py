@@ -11,13 +11,12 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.linalg import expm
 
 import malta
 from malta.data import shaping
 from malta.plant import Electronics, Plant, symbolic
 from malta.plants import halbach
-from malta.plants.halbach import IDEAL, REAL, Faults, Hardware, Options, Parameters
+from malta.plants.halbach import IDEAL, REAL, Options, Parameters
 
 if TYPE_CHECKING:
     from malta.plant import FloatArray
@@ -35,7 +34,6 @@ OPTIONS = [
     *(replace(REAL, pwm=pwm, current_loops=False) for pwm in ("plain", "exact", "fine")),
 ]
 FAULTY: dict[str, Any] = {"r_a": 0.9, "r_b": 0.95, "r_c": 1.25, "a_a": 0.8, "a_b": 1.1, "a_c": 1.05}
-FAULTS = Faults(winding=(0.9, 0.95, 1.25), magnet=(0.8, 1.1, 1.05))
 
 
 @pytest.fixture(scope="module", params=["identified", "emf"])
@@ -155,18 +153,6 @@ def test_a_weak_phase_leaves_a_stiffness_that_goes_with_the_place(par: Parameter
     assert max(slopes) > 50 > -50 > min(slopes)  # N/m, beside a spring of 1055 N/m
 
 
-@pytest.mark.parametrize("F_z", [1.0, 5.0])
-def test_design_model_is_that_of_the_held_angle(par: Parameters, F_z: float) -> None:
-    """Two routes to the sampled motor: from commutation and forces of the record, and written out."""
-    plant = halbach.plant(replace(par, F_z=F_z))
-    model, old = malta.linearize(plant, plant.at()), halbach.held(par, F_z)
-    M = np.block([[model.A - model.E @ model.C, model.B, model.E], [np.zeros((2, 4))]])
-    E = expm(M * par.T_laser)
-    np.testing.assert_allclose(E[:2, :2] + E[:2, 3:] @ model.C, old.A, atol=1e-12)
-    np.testing.assert_allclose(E[:2, 2:3], old.B, atol=1e-12)
-    np.testing.assert_allclose(E[:2, 3:], old.H, atol=1e-12)
-
-
 # Electronics
 
 
@@ -279,70 +265,50 @@ def test_a_period_against_one_written_out_in_numbers(par: Parameters, o: Options
             np.testing.assert_allclose(_flat(value), by_hand, rtol=1e-12, atol=1e-12)
 
 
-def _hardware(o: Options, **laser: Any) -> Hardware:
-    return Hardware(**{f.name: getattr(o, f.name) for f in fields(o)}, **laser)
-
-
-def _mode(o: Options) -> Any:
-    return "vector" if o.current_loops else "position"
-
-
 @pytest.mark.parametrize("o", OPTIONS, ids=str)
-def test_a_period_and_300_against_the_simulation_of_its_own(par: Parameters, o: Options) -> None:
-    pid = halbach.pid(par, halbach.held(par, par.F_z))
-    faults = replace(FAULTS, force=0.3)
-    old = halbach.loop(par, _mode(o), pid, _hardware(o), faults)
-    e = halbach.electronics(replace(par, **FAULTY), o)
+def test_300_periods_against_the_ones_written_out(par: Parameters, o: Options) -> None:
+    faulty = replace(par, **FAULTY)
+    e = halbach.electronics(faulty, o)
+    x, i, s, told = _random(par, o, 0)
+    told[:2] /= 3
+    z = [x, i, np.concatenate([s[name] for name in e.state])]
+    noise = np.random.default_rng(1).standard_normal((300, 2))
     period = _period(e)
-    rng = np.random.default_rng(1)
-    for seed in range(10):
-        x, i, s, told = _random(par, o, seed)
-        told[:2] /= 3
-        given_old = {"motor": np.append(x, i), "wanted": told[:2], "cos_sin": told[2:]} | s
-        z = np.concatenate([given_old.get(name, np.zeros(size)) for name, size in old.sizes.items()])
-        state = np.concatenate([s[name] for name in e.state])
-        met = np.zeros(2)
-        for k in range(300 if seed == 0 else 1):
-            noise = rng.standard_normal(2)
-            x, i, state = (_flat(v) for v in period(x, i, state, told, 0.3, noise[: e.noises]))
-            z, row = (_flat(v) for v in old.period(z, noise))
-            met = np.maximum(met, row[-2:])
-            parts = dict(zip(old.sizes, np.split(z, np.cumsum(list(old.sizes.values()))[:-1]), strict=True))
-            mine = dict(zip(e.state, np.split(state, np.cumsum(list(e.state.values()))[:-1]), strict=True))
-            np.testing.assert_allclose(np.append(x, i), parts["motor"], rtol=0, atol=1e-12 * (1 + k))
-            for name in e.state:
-                expected = met if name == "met" else parts[name]
-                np.testing.assert_allclose(mine[name], expected, rtol=1e-12, atol=1e-12 * (1 + k))
+    for row in noise:
+        z = [_flat(v) for v in period(*z, told, 0.3, row[: e.noises])]
+        x, i, s = _by_hand(faulty, o, x, i, s, told, row)
+    for value, by_hand in zip(z, [x, i, np.concatenate([s[name] for name in e.state])], strict=True):
+        np.testing.assert_allclose(value, by_hand, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("offset", [0.0, 1e-3])
-def test_what_loops_are_told_is_what_a_reading_told_them(
-    par: Parameters, plant: Plant, offset: float
-) -> None:
-    """An error of the reading is one of the Park angle, k times as large."""
-    pid = halbach.pid(par, halbach.held(par, par.F_z))
-    quiet = _hardware(IDEAL, laser_steps=False, laser_noise=False)
-    old = halbach.loop(par, "vector", pid, quiet, Faults(angle=par.k * offset))
-    z = halbach.start(par, "vector", pid, quiet, par.F_z, 2e-3)
-    z, row = (_flat(v) for v in old.reading(z, [2.1e-3, 0.0, par.F_z, 0.0]))
-    parts = dict(zip(old.sizes, np.split(z, np.cumsum(list(old.sizes.values()))[:-1]), strict=True))
+def test_what_loops_are_told(par: Parameters, plant: Plant, offset: float) -> None:
+    """Wanted Id and Iq, and the Park angle; an error of the reading is one of the angle, k times as large."""
     y = plant.sense(ca.DM([2e-3, 0]), ca.DM([offset]))
-    told = halbach.electronics(par).held(plant.currents(y, ca.DM(row[1])), y)
-    assert abs(row[1]) > 0.01
-    np.testing.assert_allclose(_flat(told), [*parts["wanted"], *parts["cos_sin"]], rtol=0, atol=1e-12)
+    told = halbach.electronics(par).held(plant.currents(y, ca.DM(0.7)), y)
+    angle = par.k * (2e-3 + offset)
+    expected = [0.7 / par.A, par.F_z / par.A, math.cos(angle), math.sin(angle)]
+    np.testing.assert_allclose(_flat(told), expected, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("o", OPTIONS, ids=str)
-def test_start_is_that_of_the_simulation_of_its_own(par: Parameters, plant: Plant, o: Options) -> None:
-    x0 = 2e-3
-    z = halbach.start(par, _mode(o), None, _hardware(o), par.F_z, x0)
-    sizes = halbach.loop(par, _mode(o), None, _hardware(o)).sizes
-    parts = dict(zip(sizes, np.split(z, np.cumsum(list(sizes.values()))[:-1]), strict=True))
-    i = plant.currents(ca.DM([x0]), ca.DM([0]))
-    found = _arrays(halbach.electronics(par, o).start(ca.DM([x0, 0]), i))
-    assert {name: len(value) for name, value in found.items()} == dict(halbach.electronics(par, o).state)
-    for name, value in found.items():
-        np.testing.assert_allclose(value, parts.get(name, np.zeros(2)), rtol=0, atol=1e-12)
+def test_it_starts_with_rolling_means_full_of_what_flows(par: Parameters, plant: Plant, o: Options) -> None:
+    i = plant.currents(ca.DM([2e-3]), ca.DM([0]))
+    e = halbach.electronics(par, o)
+    found = _arrays(e.start(ca.DM([2e-3, 0]), i))
+    assert {name: len(value) for name, value in found.items()} == dict(e.state)
+    assert found["met"].tolist() == [0, 0]
+    duty = 0.5 + par.R * _flat(i) / par.V_dc
+    np.testing.assert_allclose(
+        found["duty"], duty, rtol=0, atol=0.5 * 6e-3 / 12 if o.pwm != "exact" else 1e-12
+    )
+    if o.current_loops:
+        np.testing.assert_allclose(found["u"], [0, par.R * par.F_z / par.A], rtol=0, atol=1e-12)
+        for phase, ring in enumerate(("ring_a", "ring_b")):
+            assert np.ptp(found[ring]) == 0
+            assert found["sums"][phase] == pytest.approx(o.mean_of * found[ring][0])
+            flowing = found[ring][0] * 2 * par.I_adc / par.codes - par.I_adc
+            assert flowing == pytest.approx(_flat(i)[phase], abs=0.0051 if o.adc_steps else 1e-12)
 
 
 @pytest.mark.parametrize("loops", [True, False])
