@@ -348,6 +348,8 @@ def simulate(
             f"{gains}: {chosen}, fidelity {run.scenario.fidelity}", *(change or ()), f"-> {found.outcome}"
         )
         console.print(report.experiment_table(found, published))
+        for line in report.limits_text(found):
+            console.print(line)
         if substeps is not None:
             from malta.simulate import integration_error
 
@@ -355,7 +357,8 @@ def simulate(
             console.print(f"integration error, estimated: {integration_error(run):.1g} {units}")
         for file in files:
             console.print(f"wrote {file}", soft_wrap=True)
-    if found.run.engine == "virtual machine" and engine == "auto":
+    able = [case.run for case in found.cases if not plant_of(case.run.controller.parameters).tabulated]
+    if engine == "auto" and any(run.engine == "virtual machine" for run in able):
         print(
             "malta: no C compiler: simulated on CasADi's virtual machine, some ten times slower",
             file=sys.stderr,
@@ -484,7 +487,7 @@ def campaign(
         _print_json(described | _campaign(found, published, worst))
     else:
         _show_campaign(gains, found, published, worst, files)
-    if "virtual machine" in found.engines:
+    if "virtual machine" in found.engines and not plant_of(controller.parameters).tabulated:
         print(
             "malta: no C compiler: simulated on CasADi's virtual machine, some hundred times slower",
             file=sys.stderr,
@@ -962,6 +965,7 @@ def _found(found: Experiment) -> dict[str, Any]:
             {
                 "label": case.label,
                 "verdict": case.run.verdict._asdict(),
+                "limits": list(case.run.limits),
                 "merits": {merit.label: merit.value for merit in case.merits},
             }
             for case in found.cases

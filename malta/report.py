@@ -76,7 +76,7 @@ def loop_poles_table(margins: Margins, continuous: Mapping[str, ComplexArray] | 
     for what, poles in (continuous or {}).items():
         _row(table, what, _pole_text(poles))
     for what, key in (
-        ("sampled regulator, with integrals", "regulator"),
+        ("sampled regulator", "regulator"),
         ("sampled Kalman filter", "filter"),
         ("closed loop of the machine", "closed_loop"),
     ):
@@ -245,9 +245,9 @@ def design_page(
     spec: Spec, model: LinearModel, margins: Margins, flown: Experiment, published: Published | None
 ) -> Group:
     """One readable page about a design, and what it does in the machine's main job."""
-    made = f"{spec.discretization}, {1e-3 / spec.sample_time:g} kHz, delay {spec.delay} in the design model"
+    made = f"{spec.discretization}, {_sampled(spec.sample_time)}, delay {spec.delay} in the design model"
     if spec.pid is not None:
-        made = f"PID, {1e-3 / spec.sample_time:g} kHz"
+        made = f"PID, {_sampled(spec.sample_time)}"
     return Group(
         Text(f"{spec.name}: {spec.summary}", style="bold"),
         f"{model.plant.name}, preset {spec.parameters.preset}, {made}",
@@ -264,6 +264,18 @@ def design_page(
 def _travel_text(margins: Margins) -> Text:
     box_text = " ".join(f"{name} +-{100 * share:g} %" for name, share in margins.uncertainty.items())
     return Text(f"Parametric margin over the whole travel ({box_text}): {margins.robust}\n")
+
+
+def _sampled(Ts: float) -> str:
+    return f"{1e-3 / Ts:g} kHz" if Ts <= 1e-3 else f"a sample every {Ts * 1e3:g} ms"
+
+
+def limits_text(e: Experiment) -> list[str]:
+    """The limits that runs met on the way, a line for each set of them."""
+    met: dict[tuple[str, ...], list[str]] = {}
+    for case in e.cases:
+        met.setdefault(case.run.limits, []).append(case.label)
+    return [f"met the {' and the '.join(names)}: {', '.join(cases)}" for names, cases in met.items() if names]
 
 
 def experiment_table(e: Experiment, published: Published | None = None) -> Group:
@@ -297,21 +309,25 @@ def _cases_table(e: Experiment, published: Published | None) -> Table:
         return _listed(e)
     if len(labels) > COLUMNS:
         return _transposed(e, fullest)
-    table = _table(e.question, "case", "verdict", "at [ms]", *map(_named, fullest))
-    table.columns[0].no_wrap = True
-    table.columns[1].justify = "left"
+    ended = any(not case.run.verdict.completed for case in e.cases)
+    heads = ["verdict", "at [ms]"] if ended else []
+    table = _table(e.question, "case", *heads, *map(_named, fullest))
+    longest = max(len(case.label) for case in e.cases)
+    table.columns[0].no_wrap = longest <= WORDY
+    if ended:
+        table.columns[1].justify = "left"
     for case in e.cases:
         end, found = case.run.verdict, {merit.label: _shown(merit) for merit in case.merits}
-        _row(
-            table, case.label, end.name, f"{end.time * 1e3:.1f}", *(found.get(label, "-") for label in labels)
-        )
+        ends = [end.name, f"{end.time * 1e3:.1f}"] if ended else []
+        _row(table, case.label, *ends, *(found.get(label, "-") for label in labels))
     if published is not None and any(merit.published for merit in fullest):
         table.add_section()
-        _row(table, "published", "", "", *(_printed(merit, published) for merit in fullest))
+        _row(table, "published", *("" for _ in heads), *(_printed(merit, published) for merit in fullest))
     return table
 
 
 COLUMNS = 6  # figures of merit beside each other, at most
+WORDY = 44  # letters of a case's name that stay in one line
 
 
 def _transposed(e: Experiment, fullest: Sequence[Merit]) -> Table:
