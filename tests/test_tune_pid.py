@@ -19,6 +19,7 @@ from scipy import linalg
 import malta
 from malta import cli, tune_pid
 from malta.plants import halbach
+from malta.riccati import sample, sample_noise
 from malta.spec import Pid
 from malta.trials import Effort, Journal, Search, design_text, joined, synthesized
 from malta.tune import judged, problem_sha256
@@ -182,14 +183,23 @@ def test_the_motion_from_noise_by_two_ways(motor: Spec) -> None:
     assert isinstance(par, halbach.Parameters)
     assert loads_of(motor).force_noise[0] == pytest.approx(math.sqrt(halbach.force_noise(par) / Ts), rel=1e-3)
     assert loads_of(motor).sensor_noise[0] == pytest.approx(par.n_laser / math.sqrt(3), rel=1e-5)
-    sampled = halbach.held(par, par.F_z)
-    own = halbach.pid(par, sampled)
-    terms = Pid(np.array([own.Kp]), np.array([own.Ki]), np.array([own.Kd]), 0.0)
+    Kp, Ki, Kd = 340.0, 923.3, 16.43  # three poles of the motor between readings at one place
+    spring = par.k * par.F_z  # of the Park angle that is held
+    A, B = np.array([[0, 1], [-spring / par.m, -par.b / par.m]]), np.array([[0], [1 / par.m]])
+    E, G = sample(A, B, Ts)
+    pull = np.array([1 - E[0, 0], -E[1, 0]])  # of where the spring hangs from
+    proportional = Kp + Ki * Ts + Kd / Ts
+    M = np.zeros((4, 4))  # position, speed, sum of errors, last reading
+    M[:2, :2] = E + np.outer(pull - proportional * G[:, 0], [1, 0])
+    M[:2, 2:] = G @ [[Ki, Kd / Ts]]
+    M[2, [0, 2]], M[3, 0] = (-Ts, 1), 1
+    reading = np.array([*(pull - proportional * G[:, 0]), -Ts, 1])
+    pushed = linalg.block_diag(sample_noise(A, B @ B.T, Ts) * halbach.force_noise(par), np.zeros((2, 2)))
+    noise = pushed + np.outer(reading, reading) * par.n_laser**2 / 3
     quick = replace(par, L=par.L / 100, pm_cc=0.1)
-    other = math.hypot(*(halbach.deviation(par, sampled, own, math.pi / 3 / par.k * k)[0] for k in range(3)))
-    force, laser = other / math.sqrt(3), halbach.deviation(par, sampled, own, 0.0)[1]
+    terms = Pid(np.array([Kp]), np.array([Ki]), np.array([Kd]), 0.0)
     ours = figures_of(replace(motor, law=terms, parameters=quick))["noise_motion x"]
-    assert ours == pytest.approx(math.hypot(force, laser), rel=0.02)
+    assert ours == pytest.approx(math.sqrt(linalg.solve_discrete_lyapunov(M, noise)[0, 0]), rel=0.02)
 
 
 @pytest.mark.parametrize("name", ["motor", "mover"])

@@ -1,0 +1,153 @@
+# %% [markdown]
+# # The Halbach linear motor: one force to move with, one to levitate with
+#
+# Three phase currents make a horizontal and a vertical force. A laser reads the position every 55 ms, the current
+# loops run every 68 µs. Source: Díaz-Pérez et al., Actuators 7(4), 2018.
+#
+# **Question:** which of the published figures follow from the published numbers, and which do not?
+
+# %%
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import numpy as np
+
+import malta
+from malta.plants import halbach
+from malta.synthesize import sampled_model
+
+# The project's root, wherever Jupyter was started.
+os.chdir(next(p for p in (Path.cwd(), *Path.cwd().parents) if (p / "design").is_dir()))
+Path("build").mkdir(exist_ok=True)
+
+# %% [markdown]
+# ## Parameters
+# As printed; what the paper is silent on is marked as assumed in the data file.
+
+# %%
+par = malta.read("data/halbach.toml")
+published = malta.published("data/halbach.toml")
+print(f"A = {par.A} N/A, k = {par.k} rad/m, m = {par.m} kg, b = {par.b} N s/m, F_z = {par.F_z} N")
+
+# %% [markdown]
+# ## Motor law
+# Fig. 2: the forces of fixed currents along a pitch are sines, a quarter of a pitch apart.
+
+# %%
+x = np.linspace(0, 2 * np.pi / par.k, 361)
+currents = np.array([0.0, -0.3593, 0.3593])
+F = np.array([np.array(halbach.forces(par, place, currents)).ravel() for place in x])
+print(f"largest force {F.max():.4f} N")
+assert abs(F.max() - 1) < 1e-3
+
+# %% [markdown]
+# ## Dead zones
+# Phase voltages come in steps of 5.9 mV, and in the open loop the motor stands where the angle of its voltages says.
+# References within a dead zone make the same duty cycles.
+
+# %%
+places = halbach.settled(par, 10e-6 * np.arange(5), par.F_z, "plain")
+zones = {pwm: halbach.dead_zones(par, par.F_z, pwm)[1].max() for pwm in ("plain", "fine")}
+print("stairs of 10 µm end at", (1e6 * places).round(2), "µm")
+print(", ".join(f"{pwm}: {1e6 * zone:.3f} µm" for pwm, zone in zones.items()))
+assert abs(places[1] - places[2]) < 1e-12
+assert abs(zones["plain"] - 15.3e-6) < 0.03 * 15.3e-6
+assert abs(zones["fine"] - 69e-9) < 0.03 * 69e-9
+
+# %% [markdown]
+# **Judgement.** 15 µm and the dead second stair are the paper's. Its 700 nm with high-resolution PWM are ten times
+# too large: the motion goes as the step of the voltage, which is 224 times smaller.
+
+# %% [markdown]
+# ## The held angle
+# Between two readings the Park angle stands still, and so do the currents: the motor hangs on a spring k F_z. That is
+# another plant than a mass with friction, which a design without vertical force would be made for.
+
+# %%
+poles = {}
+for F_z in (0.0, par.F_z):
+    plant = halbach.plant(replace(par, F_z=F_z))
+    Ad = sampled_model(malta.linearize(plant, plant.at()), par.T_laser)[0]
+    poles[F_z] = float(np.linalg.eigvals(Ad).real.min())
+    print(f"F_z = {F_z:g} N: pole at {poles[F_z]:.3f}")
+assert abs(poles[par.F_z] - 0.509) < 1e-3
+assert abs(poles[0.0] - 0.871) < 1e-3
+
+# %% [markdown]
+# ## Design
+# An LQG that observes a constant force of disturbance, and the paper's cascade as a PID with gains of ours.
+
+# %%
+controllers = {name: malta.gains.read(f"design/gains/{name}.json") for name in ("halbach", "halbach_pid")}
+plant = malta.plant_of(par)
+model = malta.linearize(plant, plant.at())
+for name, controller in controllers.items():
+    margins = malta.verify(model, controller, {"m": 0.1, "A": 0.1, "b": 0.5})
+    print(name, controller, margins.robust, {k: round(v, 2) for k, v in margins.peak_sensitivity.items()})
+    assert margins.stable
+
+# %% [markdown]
+# ## Steps with every source of error
+# 20 steps of 100 µm there and back, as jumps and as quintics, and 22 s of rest.
+
+# %%
+for name, controller in controllers.items():
+    e = malta.experiment("step", plant, controller)
+    malta.report.experiment(e, f"build/05_{name}_step.png", published)
+    print(f"{name}, {e}")
+    jumps, quintics = ({merit.label: merit.value for merit in case.merits} for case in e.cases)
+    for merits in (quintics, *([jumps] if name == "halbach" else [])):
+        assert merits["mean overshoot"] < 0.1
+        assert merits["mean within 5 % after"] < 0.5
+        assert merits["at rest, mean error"] < 0.1e-6
+
+# %% [markdown]
+# **Judgement.** Both stand within 3 µm rms. The PID has no set-point weight and overshoots a jump by 40 %; profiled
+# references cost it nothing.
+
+# %% [markdown]
+# ## Fig. 10: the vertical force of a move of 5 mm
+
+# %%
+force = malta.experiment("force", plant, controllers["halbach"])
+malta.report.experiment(force, "build/05_halbach_force.png", published)
+steady = {case.label: case.merits[0].value for case in force.cases}
+for label, value in steady.items():
+    print(f"{label}: {100 * value:.2f} %")
+for law in ("open loop", "position control", "vector control"):
+    assert abs(steady[law]) < 1e-3
+assert abs(force.cases[0].merits[1].value + 0.503) < 1e-3
+
+# %% [markdown]
+# **Judgement.** Vector control keeps the force, as the paper says. Its steady -18 % in the open loop and +7 % under
+# position control do not follow from its motor law: all three end where they began. Unequal windings are the one
+# fault here that vector control takes out, and they move both others the same way.
+
+# %% [markdown]
+# ## What keeps it from standing still
+
+# %%
+budget = malta.experiment("budget", plant, controllers["halbach"])
+malta.report.experiment(budget, "build/05_halbach_budget.png", published)
+rms = {case.label: 1e6 * case.merits[0].value for case in budget.cases}
+for label, value in rms.items():
+    print(f"{label}: {value:.3f} µm rms")
+assert 1.6 < rms["current noise"] < 3.1
+assert rms["laser"] < 0.1
+assert rms["PWM"] < 0.01
+
+# %% [markdown]
+# **Summary.** Noise of the current sensors decides, and the rolling mean leaves it: within the current loops what
+# counts is its density, not its rms. The laser is a thirtieth of it, the PWM nothing. The whole ledger, computed:
+# `malta claims design/halbach.toml`.
+
+# %%
+fig, ax = plt.subplots()
+for column, style, label in ((0, "-", "F_x"), (1, "--", "F_z")):
+    ax.plot(1e3 * x, F[:, column], style, color="black", label=label)
+ax.set_xlabel("position [mm]")
+ax.set_ylabel("force [N]")
+ax.legend(frameon=False)
+fig.savefig("build/05_motor_law.png")
