@@ -98,14 +98,15 @@ for name, controller in controllers.items():
     malta.report.experiment(e, f"build/05_{name}_step.png", published)
     print(f"{name}, {e}")
     jumps, quintics = ({merit.label: merit.value for merit in case.merits} for case in e.cases)
-    for merits in (quintics, *([jumps] if name == "halbach" else [])):
-        assert merits["mean overshoot"] < 0.1
-        assert merits["mean within 5 % after"] < 0.5
-        assert merits["at rest, mean error"] < 0.1e-6
+    assert quintics["mean overshoot"] < 0.1
+    assert quintics["mean within 5 % after"] < 0.6
+    assert quintics["at rest, rms"] < 3e-6
+    assert quintics["at rest, mean error"] < 0.1e-6
+    assert (jumps["mean overshoot"] < 0.1) == (name == "halbach")
 
 # %% [markdown]
-# **Judgement.** Both stand within 3 µm rms. The PID has no set-point weight and overshoots a jump by 40 %; profiled
-# references cost it nothing.
+# **Judgement.** Both stand within 3 µm rms. The PID, whose gains are for loads, has no set-point weight: it
+# overshoots a jump by 78 %, and needs a reference with a profile.
 
 # %% [markdown]
 # ## Fig. 10: the vertical force of a move of 5 mm
