@@ -429,6 +429,18 @@ def test_limits_are_named_and_nothing_is_nan() -> None:
     assert np.isfinite(run.p).all()
 
 
+@pytest.mark.parametrize(
+    ("name", "options"), [("force", {"distance": 60e-3}), ("step", {"distance": 60e-3, "count": 1})]
+)
+def test_what_leaves_the_travel_is_shown(name: str, options: dict[str, Any], printed: dict[str, Any]) -> None:
+    c = controller_of("halbach")
+    e = experiment(name, plant_for(c), c, **options)
+    assert e.failed
+    assert "left the travel" in e.outcome
+    malta.report.experiment_figure(e, printed)
+    malta.report.experiment_table(e, printed)
+
+
 BAD: tuple[tuple[str, dict[str, Any], str], ...] = (
     ("step", {"pwm": "coarse"}, "pwm: found 'coarse', expected one of exact, plain, fine"),
     ("step", {"mean_of": 0}, "mean_of: found 0, expected 1 to 4096 samples"),

@@ -382,7 +382,9 @@ def test_the_table_of_an_experiment_fits_and_names_its_merits(
     for merit in e.merits:
         unit = {"percent": "%", "1": ""}.get(merit.unit, merit.unit)
         assert (f"{merit.label} [{unit}]" if unit else merit.label) in flat
-    ended = [case for case in e.cases if not case.run.verdict.completed]  # how is said where one did not go to its end
+    ended = [
+        case for case in e.cases if not case.run.verdict.completed
+    ]  # how is said where one did not go to its end
     if len(e.cases) > 1:
         for case in e.cases:
             assert case.label in flat

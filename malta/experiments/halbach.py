@@ -365,7 +365,7 @@ def _move(
     machine = plant.variant(replace(par, **faulty)) if faulty else plant
     begin, end = CALM * controller.sample_time, (CALM + AFTER) * controller.sample_time
     own: dict[str, Any] = {"fidelity": "phase"} | dict(options)
-    own["electronics"] = replace(own["electronics"], current_loops=vector)
+    own["electronics"] = replace(own["electronics"] or halbach.REAL, current_loops=vector)
     if not position:
         controller = replace(controller, sample_time=controller.sample_time / FASTER)
         own |= {"open_loop": True, "delay": 0}
@@ -404,13 +404,20 @@ def _move_merits(run: Trajectory, begin: float, printed: str) -> tuple[Merit, ..
     F, later = lift_of(run), run.t > begin
     earlier, late = (run.t > begin - 1) & ~later, run.t > run.scenario.duration - 1
     if not late.any():  # it ended before
-        return ()
-    before, steady = F[earlier].mean(), F[late].mean()
+        steady = lowest = highest = moved = math.nan
+    else:
+        shares = F / F[earlier].mean() - 1
+        steady, lowest, highest = (
+            float(shares[late].mean()),
+            float(shares[later].min()),
+            float(shares[later].max()),
+        )
+        moved = float(run.p[late, 0].mean() - run.p[earlier, 0].mean())
     return (
-        Merit("steady change", float(steady / before - 1), "percent", printed),
-        Merit("lowest", float(F[later].min() / before - 1), "percent"),
-        Merit("highest", float(F[later].max() / before - 1), "percent"),
-        Merit("moved", float(run.p[late, 0].mean() - run.p[earlier, 0].mean()), "mm"),
+        Merit("steady change", steady, "percent", printed),
+        Merit("lowest", lowest, "percent"),
+        Merit("highest", highest, "percent"),
+        Merit("moved", moved, "mm"),
     )
 
 
