@@ -263,11 +263,11 @@ def _closed_loop() -> list[Row]:
             note="current loops take them out",
         ),
         Row(
-            "share of the box of m, A, b",
+            "share of the box of m, A, b, R",
             "percent",
             "{:.0f}",
             machine_share,
-            note="proven; at 200 % the friction is gone",
+            note="proven; 10 % of m and A, 20 % of b and R; k makes waves along the travel and is flown in campaigns",
         ),
         Row("peak sensitivity", "1", "{:.2f}", peak_sensitivity),
     ]
