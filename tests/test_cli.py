@@ -391,7 +391,7 @@ def test_verify_as_json_holds_finite_numbers(run: Run) -> None:
 def test_all_forms_of_a_gain_file_verify_alike(run: Run) -> None:
     results = []
     for suffix in ("json", "npz", "mat"):
-        code, out, _ = run("verify", f"design/gains/table2.{suffix}", "--json")
+        code, out, _ = run("verify", f"design/gains/table2.{suffix}", "--json", "--uncertain", "K_B=20%")
         results.append((code, json.loads(out) | {"gains": ""}))
     assert results == [results[0]] * 3
     assert results[0][0] == 0
@@ -409,7 +409,7 @@ def test_verify_of_an_unstable_machine_fails_after_printing(run: Run) -> None:
 
 
 def test_verify_counts_the_force_constants_of_the_machine(run: Run) -> None:
-    code, out, err = run("verify", TABLE2, "--set", "K_B=2.6")
+    code, out, err = run("verify", TABLE2, "--set", "K_B=2.6", "--uncertain", "K_B=20%")
     assert code == 1
     assert re.fullmatch(
         rf"{TABLE2}: the loop \(sampled\) is unstable, \|lambda\| = 1\.0\d+", one_sentence(err)
@@ -417,7 +417,7 @@ def test_verify_counts_the_force_constants_of_the_machine(run: Run) -> None:
     assert "Peak sensitivity" in out
     peaks = []
     for change in ("K_B=5.2", "K_B=5.0"):
-        code, out, _ = run("verify", CALIBRATED, "--json", "--set", change)
+        code, out, _ = run("verify", CALIBRATED, "--json", "--set", change, "--uncertain", "K_B=20%")
         assert code == 0
         peaks.append(json.loads(out)["peak_sensitivity"]["sampled"]["x1"])
     assert peaks[0] != pytest.approx(peaks[1], rel=1e-3)

@@ -456,7 +456,7 @@ def test_the_command_finds_gains_and_judges_them(run: Any, tmp_path: Path) -> No
     assert rows["peak_sensitivity"]["ratio"] == pytest.approx(1, abs=1e-4)
 
 
-@pytest.mark.parametrize("name", ["halbach_pid", "planar_pid"])
+@pytest.mark.parametrize("name", ["halbach_pid", pytest.param("planar_pid", marks=pytest.mark.slow)])
 def test_the_shipped_gains_are_those_that_the_search_ends_with(name: str) -> None:
     """Every bound holds, and no polish from there finds a load error that is smaller by 0.1 %."""
     spec = malta.read_design(ROOT / "design" / f"{name}.toml")
