@@ -112,7 +112,10 @@ RealPwm = Annotated[
     bool | None, typer.Option(help="phase: duty cycles in steps, dead time of the half-bridges.")
 ]
 Delay = Annotated[int | None, typer.Option(help="Samples between measurement and command. [the machine's]")]
-Substeps = Annotated[int | None, typer.Option(help="Runge-Kutta steps a sample; the error is estimated. [4]")]
+Substeps = Annotated[
+    int | None,
+    typer.Option(help="Runge-Kutta steps a sample; the error is estimated. [4, more for slow samples]"),
+]
 Seed = Annotated[int | None, typer.Option(help="Seed of the noise. [0]")]
 GainFile = Annotated[Path, typer.Argument(metavar="GAINS", help="A gain file: .json, .npz or .mat.")]
 

@@ -25,6 +25,7 @@ from malta.engine import Engine
 from malta.errors import InputError
 from malta.machine import Setup
 from malta.plant import Plant
+from malta.uncertain import holds
 
 if TYPE_CHECKING:
     from malta.plant import FloatArray
@@ -39,6 +40,9 @@ def observer(plant: Plant, c: Controller, setup: Setup, kind: str, substeps: int
     if c.noise is None or c.observed:
         found = "a PID" if c.noise is None else "forces of disturbance in its own"
         raise InputError("simulate", f"estimator {kind}", found, "an LQG with integrals")
+    if holds(plant_of(c.parameters)):
+        found = f"a {plant.name}, whose currents are held between samples"
+        raise InputError("simulate", f"estimator {kind}", found, "steady-state, which knows of that")
     filter_ = _filter(c, c.noise)
     predict = _nonlinear(c) if kind == "extended" else _linear(c)
     jacobian, output = _measurement(c)

@@ -315,7 +315,10 @@ def read(path: str | Path) -> Controller:
 
 def _controller(file: GainFile, path: str | Path) -> Controller:
     par = _parameters(file.plant, path)
-    plant = plant_of(par)
+    try:
+        plant = plant_of(par)
+    except CheckError as error:
+        raise InputError(path, "plant.parameters", str(error), "a machine that can be controlled") from error
     states, forces, measurements = (
         tuple(Signal(s.name, s.unit) for s in getattr(file.signals, key))
         for key in ("states", "forces", "measurements")
@@ -336,6 +339,9 @@ def _controller(file: GainFile, path: str | Path) -> Controller:
     stored = stored_forces(forces, (n - n0 - len(observed)) // m) + observed
     if states[n0:] != stored:
         raise InputError(path, "signals.states", _names(states[n0:]), f"stored forces, as {_names(stored)}")
+    if observed and any(any(row) for row in file.gains.Ki):
+        both = "sums of errors beside observed disturbances"
+        raise InputError(path, "gains.Ki", both, "zeros: one of them takes off loads")
     if (file.cost is None) != (file.noise is None):
         raise InputError(path, "noise", "null" if file.noise is None else "some", "null where cost is null")
     shapes: dict[str, dict[str, tuple[int, ...]]] = {

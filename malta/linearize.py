@@ -90,10 +90,13 @@ def linearize(plant: Plant, point: OperatingPoint, believed: Plant | None = None
             plant.name, "operating point", f"x {point.x.shape}, u {point.u.shape}", f"x ({n},), u ({m},)"
         )
     kind = ca.MX if (believed or plant).tabulated else ca.SX
-    x, u = kind.sym("x", n), kind.sym("u", m)
+    x, u, v = kind.sym("x", n), kind.sym("u", m), kind.sym("v", m)
     w = plant.load(x) if point.loaded else kind.zeros(len(plant.disturbances))
-    derivatives = ca.Function("derivatives", [x, u], list(jacobians(plant, believed, x, u, w)))
-    A, B, C, E = (np.array(value) for value in derivatives(point.x, point.u))
+    derivatives = ca.Function("derivatives", [x, u, v], list(jacobians(plant, believed, x, u, v, w)))
+    A, B, C, E, made, G = (np.array(value) for value in derivatives(point.x, point.u, point.u))
+    if believed is not None:  # what has to be wanted so that these inputs act
+        wanted = point.u + np.linalg.lstsq(G, point.u - made.ravel(), rcond=None)[0]
+        A, B, C, E, *_ = (np.array(value) for value in derivatives(point.x, point.u, wanted))
     keep = list(plant.controlled)
     A, B, C, E = A[np.ix_(keep, keep)], B[keep], C[:, keep], E[keep]
     if not all(np.isfinite(M).all() for M in (A, B, C, E)):
@@ -101,27 +104,28 @@ def linearize(plant: Plant, point: OperatingPoint, believed: Plant | None = None
     return LinearModel(plant, point, A, B, C, E)
 
 
-def jacobians(plant: Plant, believed: Plant | None, x: Any, u: Any, w: Any) -> tuple[Any, Any, Any, Any]:
-    """A, B, C, E as expressions of the symbols x and u, for all states.
+def jacobians(
+    plant: Plant, believed: Plant | None, x: Any, u: Any, v: Any, w: Any
+) -> tuple[Any, Any, Any, Any, Any, Any]:
+    """A, B, C, E for all states; the inputs that `v` makes, and their derivatives by it: expressions of x, u, v.
 
-    A machine that knows itself makes just the inputs that it wants, so B is that of f; another one's currents make
-    other forces, and B holds their ratio. A has the stiffness of what commutation that follows does not cancel: that of
-    coordinates which it leaves out of account, as the planar motor's tilt, or takes from another machine.
+    u acts, and v is what the controller wants. A machine that knows itself makes just that, so B is that of f; another
+    one's currents make other forces, and B holds their ratio. A has the stiffness of what commutation that follows does
+    not cancel: that of coordinates which it leaves out of account, as the planar motor's tilt, or takes from another
+    machine.
     """
     C = ca.jacobian(plant.h(x, u), x)
     kind = type(x)
-    y, v, i = kind.sym("y", C.shape[0]), kind.sym("v", *u.shape), kind.sym("i", len(plant.actuator.coils))
-    rate, made = plant.f(x, u, w), plant.forces(x, i)
-    wanted = (believed or plant).currents(y, v)
-    here = [plant.h(x, u), u]
-    (carried,) = ca.substitute([wanted], [y, v], here)
+    y, i = kind.sym("y", C.shape[0]), kind.sym("i", len(plant.actuator.coils))
+    made, wanted = plant.forces(x, i), (believed or plant).currents(y, v)
+    here = plant.h(x, u)
+    (carried,) = ca.substitute([wanted], [y], [here])
 
     def at(expression: Any) -> Any:
-        return ca.substitute([expression], [y, v, i], [*here, carried])[0]
+        return ca.substitute([expression], [y, i], [here, carried])[0]
 
-    from_i = ca.jacobian(made, i)
-    G = ca.jacobian(rate, u)
+    from_i, rate = ca.jacobian(made, i), plant.f(x, u, w)
+    G, ratio = ca.jacobian(rate, u), at(from_i @ ca.jacobian(wanted, v))
     turned = at(from_i @ ca.jacobian(wanted, y))  # forces from the reading
     A = ca.jacobian(rate, x) + G @ (at(ca.jacobian(made, x)) + turned @ C)
-    B = G if believed is None else G @ at(from_i @ ca.jacobian(wanted, v))
-    return A, B, C, G @ turned
+    return A, G if believed is None else G @ ratio, C, G @ turned, at(made), ratio

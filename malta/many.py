@@ -34,6 +34,7 @@ from malta.simulate import (
     setup_of,
     shape_of,
     simulate,
+    steps_of,
     stroke_figures,
 )
 
@@ -128,7 +129,7 @@ def simulate_many(
         run_many(
             lib,
             slice(k, min(k + step, groups)),
-            substeps=scenario.substeps,
+            substeps=steps_of(plant, controller, scenario),
             table=ready.table,
             given=ready.given,
             uniform=plant.uniform,
@@ -170,7 +171,8 @@ def _prepared(
     runs: int,
 ) -> _Ready:
     setup = setup_of(plant, controller, scenario)
-    values = machine.numbers(plant, controller, scenario.substeps, scenario.sensor_errors)
+    count = steps_of(plant, controller, scenario)
+    values = machine.numbers(plant, controller, count, scenario.sensor_errors)
     theta = _thetas(plant, values, changes, sensor_errors, runs)
     t, motion, given = sampled(plant, controller, scenario, setup)
     start = np.concatenate(beginning(plant, controller, scenario, given[0]))
@@ -224,7 +226,7 @@ def recorded_run(
         run_many(
             compiled[0],
             slice(0, 1),
-            substeps=scenario.substeps,
+            substeps=steps_of(plant, controller, scenario),
             table=ready.table,
             given=part,
             uniform=plant.uniform,

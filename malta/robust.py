@@ -49,7 +49,7 @@ from malta.enclose import (
     products,
     restrictions,
 )
-from malta.errors import InputError
+from malta.errors import CheckError, InputError
 from malta.uncertain import Compensator, UncertainSystem, critical, differences, instability
 
 if TYPE_CHECKING:
@@ -558,13 +558,10 @@ def _by_eigenvalues(
     system: UncertainSystem, c: Compensator, box: _Box, goal: float, found: list[_Bound]
 ) -> list[_Bound]:
     """With the first loss of stability along the box's diagonals, where f is no polynomial."""
-    P, D = _rays(box, list(range(len(box.nominal))))
-    t = _first(lambda rows: instability(system, c, rows) >= 0, P, D, goal)
-    k = int(t.argmin())
-    if math.isinf(t[k]):
+    t, frequency, p = _by_poles(system, c, box, goal)
+    if frequency is None or p is None:
         return found
-    p = P[k] + t[k] * D[k]
-    w = np.array([critical(system, c, p)])
+    w = np.array([frequency])
     sizes = [
         math.inf
         if not b.reason
@@ -573,7 +570,7 @@ def _by_eigenvalues(
         for b in found
     ]
     i = int(np.argmin(sizes))
-    worse = replace(found[i], upper=float(t[k]), frequency=float(w[0]), witness=p)
+    worse = replace(found[i], upper=t, frequency=frequency, witness=p)
     return [*found[:i], worse, *found[i + 1 :]]
 
 
@@ -699,19 +696,36 @@ def _merged(system: UncertainSystem, c: Compensator, box: _Box, bounds: list[_Bo
     if worst.witness is not None:
         shares = _shares(worst, box)
         beyond = _confirmed(system, c, box, worst.witness, box.most / worst.upper)
-        if beyond is None:
-            reasons.append("the eigenvalues do not confirm the witness")
-            upper, frequency = math.inf, None
-            # With a slow hold it may not be one: the proof counts its images in, the search does not.
-            lower = None if c.sample_time is None else lower
-        else:
+        if beyond is not None:
             upper, witness = worst.upper * beyond, _stretched(box, worst.witness, beyond)
+        elif c.sample_time is None:
+            reasons.append("the eigenvalues do not confirm the witness")
+            upper, frequency, lower = math.inf, None, None
+        else:  # with a slow hold it may not be one: the proof counts its images in, the search did not
+            upper, frequency, witness = _by_poles(system, c, box, min(box.most * (1 - EDGE), FAR))
+            shares = {} if witness is None else shares
     named = None if witness is None else dict(zip(system.names, witness.tolist(), strict=True))
     moved = {name: value - float(system.nominal[i]) for i, (name, value) in enumerate((named or {}).items())}
     proofs = tuple(b.certificate for b in bounds if b.certificate is not None)
     return Margin(
         lower, upper, frequency, named, moved, shares, proofs, time.perf_counter() - start, "; ".join(reasons)
     )
+
+
+def _by_poles(
+    system: UncertainSystem, c: Compensator, box: _Box, reach: float
+) -> tuple[float, float | None, FloatArray | None]:
+    """The first loss of stability along the box's diagonals, by the poles of the loop alone: t, w, p; or infinity."""
+    P, D = _rays(box, list(range(len(box.nominal))))
+    try:
+        t = _first(lambda rows: instability(system, c, rows) >= 0, P, D, reach)
+    except CheckError:  # a machine that is faster than numbers
+        return math.inf, None, None
+    k = int(t.argmin())
+    if math.isinf(t[k]):
+        return math.inf, None, None
+    p = P[k] + t[k] * D[k]
+    return float(t[k]), critical(system, c, p), p
 
 
 def _stretched(box: _Box, p: FloatArray, share: float) -> FloatArray:

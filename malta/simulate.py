@@ -93,7 +93,9 @@ class Scenario:
     seed: int = 0
     run: int = 0  # of a campaign: its noise depends on seed and run alone
     delay: int | None = None  # samples between measurement and force; None: the machine's own
-    substeps: int = 4  # Runge–Kutta steps a sample
+    substeps: int | None = (
+        None  # Runge–Kutta steps a sample; None: as many as the current loops ask for, at least 4
+    )
     fidelity: Fidelity = "dq"  # what makes the forces, see machine.py
     real_pwm: bool = False  # duty cycles in steps, dead time (fidelity phase)
     bearing_axes: BearingAxes = "fixed"  # of the current controllers; "turning": (18) as printed
@@ -295,7 +297,7 @@ def simulate(
     samples = len(t)
     stages = _stages(plant, scenario, controller.sample_time)
     noise = _noise(stages, scenario, t)
-    steps = substeps_of(plant, controller, setup, scenario)
+    steps, count = substeps_of(plant, controller, setup, scenario), steps_of(plant, controller, scenario)
     fast = _fast_noise(plant, setup, scenario, substeps_until(samples, steps))
     x, xi_pred, current = beginning(plant, controller, scenario, given[0])
     start = machine.initial_state(plant, controller, setup)
@@ -308,7 +310,7 @@ def simulate(
     try:
         for stop in stops:
             now = next(p for first, p in reversed(stages) if first <= done)
-            run = engine_of(now, controller, setup, scenario.substeps, _errors(scenario), engine)
+            run = engine_of(now, controller, setup, count, _errors(scenario), engine)
             part = given[done:stop]
             jitter = fast[substeps_until(done, steps) : substeps_until(stop, steps)]
             if observer is None:
@@ -337,9 +339,9 @@ def simulate(
                 # Up to the next correction; the samples before are there for the feedforward under way.
                 before = min(done, controller.delay)
                 ahead = slice(done - before, done + every)
-                shifted = references.Motion(*(part[ahead] for part in motion))._replace(
-                    p=motion.p[ahead] + offset
-                )
+                p_ref = motion.p[ahead] + offset
+                p_ref[:before] = given[done - before : done, : len(offset)]  # as they were
+                shifted = references.Motion(*(part[ahead] for part in motion))._replace(p=p_ref)
                 new = _given(plant, controller, scenario, setup, shifted, t[ahead])
                 given[done : done + every] = new[before:]
     except KeyboardInterrupt:
@@ -420,6 +422,9 @@ def setup_of(plant: Plant, c: Controller, s: Scenario) -> Setup:
     if s.electronics is not None and not own:
         found = f"options of electronics at fidelity {s.fidelity}"
         raise InputError(f"scenario {s.name}", "electronics", found, "a machine that has some, at phase")
+    if own and s.estimator != "steady-state":
+        found = f"{s.estimator} with electronics of their own pace"
+        raise InputError(f"scenario {s.name}", "estimator", found, "steady-state, or fidelity force")
     if own and (s.real_pwm or s.bearing_axes == "turning" or "open phase" in kinds or "link sag" in kinds):
         raise InputError(f"scenario {s.name}", "fidelity", "options of a drive", "those of the electronics")
     known = [signal.name for signal in plant.sensor_errors]
@@ -449,7 +454,15 @@ def setup_of(plant: Plant, c: Controller, s: Scenario) -> Setup:
 def substeps_of(plant: Plant, c: Controller, setup: Setup, s: Scenario) -> float:
     """Steps of the simulation in a sample: the scenario's, or the periods of the machine's electronics."""
     fast = machine.electronics_of(plant, setup)
-    return s.substeps if fast is None else c.sample_time / fast.period
+    return steps_of(plant, c, s) if fast is None else c.sample_time / fast.period
+
+
+def steps_of(plant: Plant, c: Controller, s: Scenario) -> int:
+    """Runge–Kutta steps in a sample: the scenario's, or one for each time constant of the current loops, at least 4."""
+    if s.substeps is not None:
+        return s.substeps
+    lag = c.sample_time * plant.actuator.crossover
+    return max(4, math.ceil(lag)) if math.isfinite(lag) else 4
 
 
 def _errors(scenario: Scenario) -> tuple[tuple[str, float], ...]:
@@ -526,7 +539,8 @@ def engine_of(
 def _observer(plant: Plant, c: Controller, scenario: Scenario, setup: Setup) -> Any:
     from malta.estimate import observer  # filterpy takes a while to import
 
-    return observer(plant, c, setup, scenario.estimator, scenario.substeps, scenario.sensor_errors)
+    count = steps_of(plant, c, scenario)
+    return observer(plant, c, setup, scenario.estimator, count, scenario.sensor_errors)
 
 
 def _stages(plant: Plant, scenario: Scenario, Ts: float) -> list[tuple[int, Plant]]:
@@ -538,6 +552,11 @@ def _stages(plant: Plant, scenario: Scenario, Ts: float) -> list[tuple[int, Plan
             if name not in known:
                 raise InputError(
                     f"scenario {scenario.name}", f"changes.{name}", "an unknown parameter", " ".join(known)
+                )
+            if name in shaping(plant.parameters):
+                found = "a parameter that shapes the machine's functions"
+                raise InputError(
+                    f"scenario {scenario.name}", f"changes.{name}", found, "one that enters them"
                 )
         before = stages[-1][1]
         par: Any = replace(before.parameters, **values)
@@ -732,9 +751,11 @@ def beginning(plant: Plant, c: Controller, scenario: Scenario, first: FloatArray
     if not scenario.cold:
         xi_pred[: len(design)] = x[list(plant.controlled)]
         held = c.feedforward.at(float(x[plant.stroke_state]))
-        xi_pred[len(design) : len(design) + c.delay * len(held)] = first[2 * p + len(held) :][
-            : c.delay * len(held)
-        ]
+        if c.delay:  # what acted before, with currents that were commutated for here
+            n, m = len(design), len(held)
+            pull = c.Ad[n + m * (c.delay - 1) : n + m * c.delay, :n] @ (xi_pred[:n] - moving)
+            stored = first[2 * p + m :][: m * c.delay]
+            xi_pred[n : n + m * c.delay] = stored + np.tile(pull, c.delay)
         current = np.array(_commutated(believed)(plant.h(ca.DM(x), 0), held)).ravel()
     return x, xi_pred, current
 
@@ -753,7 +774,8 @@ def integration_error(run: Trajectory) -> float:
     Halving the steps of a fourth-order method leaves 1/16 of the error, so the difference is 15/16 of it.
     """
     s = run.scenario
-    finer = simulate(run.plant, run.controller, replace(s, substeps=2 * s.substeps))
+    count = steps_of(run.plant, run.controller, s)
+    finer = simulate(run.plant, run.controller, replace(s, substeps=2 * count))
     k = min(len(run.p), len(finer.p))
     return float(np.abs(run.p[:k] - finer.p[:k]).max()) * 16 / 15
 

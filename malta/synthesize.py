@@ -282,9 +282,11 @@ def pid(
     plant, half = model.plant, len(model.A) // 2
     if len(terms.Kp) != len(plant.inputs):
         raise InputError("pid", "Kp", f"{len(terms.Kp)} gains", f"{len(plant.inputs)}, one for each input")
-    delay = plant.actuator.delay(Ts)
+    part = _machine_part(model, Ts, plant.actuator.delay(Ts), current_loop_delay=current_loop_delay)
+    # Differences of readings are the mean rate between them, whatever the rate at the readings is.
+    part["feedforward"] = replace(part["feedforward"], rate=np.zeros((half, len(plant.outputs))))
     return Controller(
-        **_machine_part(model, Ts, delay, current_loop_delay=current_loop_delay),
+        **part,
         **pid_gains(model.C[:, :half], terms, Ts)._asdict(),
         name=name,
         states=plant.design_states,

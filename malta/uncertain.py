@@ -102,13 +102,17 @@ def uncertain(
     x0 = plant.at(**(at or {})).x
     position = float(x0[plant.stroke_state])
     of = _model(plant, believed or plant, tuple(name for name in names if name != plant.stroke))
-    kind = (
-        ca.SX if held is None else ca.MX
-    )  # what is held is of a size that nobody wants to write out at every place
+    # What is held is of a size that nobody wants to write out at every place.
+    kind = ca.MX if holds(plant) else ca.SX
     p = kind.sym("p", len(names))
     own = [k for k, name in enumerate(names) if name != plant.stroke]
     z = p[names.index(plant.stroke)] if plant.stroke in names else position
-    A, B, C, E = of(p[own], z)
+    acting = of(p[own], z, ca.DM.zeros(len(plant.inputs)))[-1]
+    v = acting
+    if kind is ca.MX:  # what has to be wanted so that the preload acts
+        made, ratio = of(p[own], z, acting)[4:6]
+        v = acting + ca.solve(ratio, acting - made)
+    A, B, C, E = of(p[own], z, v)[:4]
     nominal = [position if name == plant.stroke else getattr(par, name) for name in names]
     if held is not None:
         A, left = A - E @ C, E - B @ ca.DM(held)
@@ -124,36 +128,44 @@ def uncertain(
 
 def held_at(plant: Plant, position: float) -> FloatArray:
     """H of the currents that are held at a position along the stroke, where E = B H."""
-    _, B, _, E = (np.array(M) for M in _model(plant, plant, ())(ca.DM(0, 1), position))
+    of, none = _model(plant, plant, ()), ca.DM(0, 1)
+    acting = of(none, position, 0)[-1]
+    _, B, _, E = (np.array(M) for M in of(none, position, acting)[:4])
     return np.asarray(np.linalg.lstsq(B, E, rcond=None)[0])
 
 
 @lru_cache(maxsize=16)  # plants compare by identity, and are built once for their parameters
 def _model(plant: Plant, believed: Plant, names: tuple[str, ...]) -> ca.Function:
-    """(parameters, position along the stroke) -> A, B, C, E of the design model."""
+    """(parameters, position along the stroke, inputs wanted) -> what `jacobians` gives, and the preload that acts."""
     from malta.data import twins_of
 
     par = plant.parameters
-    p, z = ca.SX.sym("p", len(names)), ca.SX.sym("z")
+    p, z, v = ca.SX.sym("p", len(names)), ca.SX.sym("z"), ca.SX.sym("v", len(plant.inputs))
     own = dict(zip(names, ca.vertsplit(p), strict=True)) if names else {}
-    own |= {name: own[twin] for name, twin in twins_of(par).items() if twin in own}
+    own = {name: own[twin] for name, twin in twins_of(par).items() if twin in own} | own
     machine: Plant = plant.variant(symbolic(par, own))
     x, u = ca.SX.sym("x", len(plant.states)), ca.SX.sym("u", len(plant.inputs))
     point = ca.SX(plant.at().x)
     point[plant.stroke_state] = z
-    found = jacobians(machine, believed, x, u, ca.SX.zeros(len(plant.disturbances)))
-    A, B, C, E = ca.substitute(list(found), [x, u], [point, ca.SX(plant.preload(point))])
+    preload = ca.SX(machine.preload(point))
+    found = jacobians(machine, believed, x, u, v, ca.SX.zeros(len(plant.disturbances)))
+    A, B, C, E, made, ratio = ca.substitute(list(found), [x, u], [point, preload])
     keep = list(plant.controlled)
-    parts = [A[keep, keep], B[keep, :], C[:, keep], E[keep, :]]
-    return ca.Function("model", [p, z], ca.cse([ca.densify(part) for part in parts]))
+    parts = [A[keep, keep], B[keep, :], C[:, keep], E[keep, :], made, ratio, preload]
+    return ca.Function("model", [p, z, v], ca.cse([ca.densify(part) for part in parts]))
+
+
+def around(nominal: FloatArray, rng: np.random.Generator, count: int) -> FloatArray:
+    """Rows of parameters at random: up to half of each nominal value away from it, 1e-3 where that is zero."""
+    spread = np.where(nominal == 0, 1e-3, np.abs(nominal) / 2)
+    return np.asarray(nominal + spread * rng.uniform(-1, 1, (count, len(nominal))))
 
 
 def _vanishes(p: Any, expression: Any, beside: Any, nominal: list[float]) -> bool:
     """Whether an analytic expression is zero at any parameters: it is at eight places chosen at random."""
     rng = np.random.default_rng(3)
     values = ca.Function("left", [p], [ca.densify(expression), ca.densify(beside)])
-    for _ in range(8):
-        row = np.array(nominal) * rng.uniform(0.5, 1.5, len(nominal))
+    for row in around(np.array(nominal), rng, 8):
         left, size = (np.abs(np.array(M)).max() for M in values(row))
         if not left <= 1e-9 * size:
             return False
@@ -220,7 +232,10 @@ def _integrals_last(law: LinearLaw, count: int) -> LinearLaw:
     With A = [[M, N], [G, 1]] that is X (M - 1) = -G; then X N = 0, as the law leaves no constant disturbance in xi.
     """
     A, k = law.A, len(law.A) - count
-    X = -np.linalg.solve((A[:k, :k] - np.eye(k)).T, A[k:, :k].T).T
+    try:
+        X = -np.linalg.solve((A[:k, :k] - np.eye(k)).T, A[k:, :k].T).T
+    except np.linalg.LinAlgError as error:
+        raise CheckError("the law sums errors beside the disturbances that it observes") from error
     left, size = np.abs(X @ A[:k, k:]).max(), (np.abs(X) @ np.abs(A[:k, k:])).max()
     if not left <= 1e-8 * size:
         raise CheckError(

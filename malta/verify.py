@@ -22,7 +22,16 @@ from malta.linearize import LinearModel, linearize
 from malta.plant import trim
 from malta.riccati import add_integrals, add_lags, delay_inputs, eigenvalues, sample
 from malta.robust import Margin, robust_margin
-from malta.uncertain import Compensator, UncertainSystem, closed_loop, held_at, holds, sampled_law, uncertain
+from malta.uncertain import (
+    Compensator,
+    UncertainSystem,
+    around,
+    closed_loop,
+    held_at,
+    holds,
+    sampled_law,
+    uncertain,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -366,7 +375,7 @@ def _along(
 def _fingerprint(system: UncertainSystem, law: Compensator) -> FloatArray:
     """What two places have in common where their loops are the same: closed loops at parameters chosen at random."""
     rng = np.random.default_rng(4)
-    rows = system.nominal * rng.uniform(0.7, 1.4, (4, len(system.nominal)))
+    rows = around(system.nominal, rng, 4)
     poles = np.linalg.eigvals(closed_loop(system, law, rows))
     order = np.lexsort((poles.imag, poles.real))
     found = np.take_along_axis(poles, order, axis=1)

@@ -110,6 +110,7 @@ def test_simulation_and_linear_loop_agree(delay: int) -> None:
     state = np.zeros(len(exact.closed))
     state[0] = state[n] = 1e-9  # where it is, and where the observer takes it to be
     state[2:n] = [0.0, 1e-9] * (1 + delay)  # no force, and currents that were commutated for it
+    state[n + 2 : n + 2 + delay] = held(model).H.item() * 1e-9  # which it knows
     seen = []
     for _ in range(len(run.t)):
         seen.append(state[0])
@@ -467,3 +468,130 @@ def test_disturbances_by_hand() -> None:
     )
     L = P @ C.T / (C @ P @ C.T + w.sensor_variance[0])
     assert c.L.ravel() == pytest.approx(L.ravel(), rel=1e-3)
+
+
+# What was wrong once
+
+
+def _slow() -> Controller:
+    """So slow that what tilt stiffness does to the planar motor decides."""
+    w = _weights("planar")
+    base = np.where(np.arange(12) < 6, 10e-3, 1.0)
+    slow = replace(w, q_base=base, sensor_variance=1e4 * w.sensor_variance)
+    return lqg(_model("planar"), slow, 200e-6, "sampled-data", 1)
+
+
+def test_currents_carry_the_weight_that_there_is() -> None:
+    """A lighter mover is held by smaller currents, which tilt it less: proofs and the exact loop agree on that."""
+    plant, c = _plant("planar"), _slow()
+    system, law = machine_system(plant, c, ["m", "B_r"], {"y": 0.0})
+    par: Any = plant.parameters
+    for m, B_r in ((20.0, 1.17), (10.0, 1.17), (15.0, 1.0)):
+        light = plant_of(replace(par, m=m, B_r=B_r))
+        model = malta.linearize(light, light.at())
+        radius = np.abs(np.linalg.eigvals(machine_loop(model, c).closed)).max()
+        (ours,) = closed_loop(system, law, np.array([m, B_r]))
+        assert np.abs(1 + c.sample_time * np.linalg.eigvals(ours)).max() == pytest.approx(radius, abs=1e-9)
+
+
+def test_twins_that_are_both_named_move_apart() -> None:
+    plant, c = _plant("planar"), _controller("planar", 1)
+    system, law = machine_system(plant, c, ["I_x", "I_y"], {"y": 0.0})
+    both = malta.robust_margin(system, law, {"I_x": 0.01, "I_y": 0.2})
+    system, law = machine_system(plant, c, ["I_z", "I_y"], {"y": 0.0})
+    alone = malta.robust_margin(system, law, {"I_y": 0.2})
+    assert both.upper <= 1.001 * alone.upper
+
+
+def test_parameters_that_shape_functions_do_not_change_in_flight() -> None:
+    plant, c = _plant("halbach"), _controller("halbach", 0)
+    scenario = Scenario("faster", 1.0, _still, fidelity="phase", changes=((0.5, {"f_pwm": 2e4}),))
+    with pytest.raises(malta.InputError, match=r"changes.f_pwm: found a parameter that shapes"):
+        simulate(plant, c, scenario)
+
+
+@pytest.mark.parametrize(
+    ("fidelity", "found"),
+    [("phase", "kalman with electronics of their own pace"), ("force", "whose currents are held")],
+)
+def test_other_estimators_know_nothing_of_held_currents(fidelity: Any, found: str) -> None:
+    plant, c = _plant("halbach"), _controller("halbach", 0, drift=False)
+    with pytest.raises(malta.InputError, match=found):
+        simulate(plant, c, Scenario("hold", 1.0, _still, fidelity=fidelity, estimator="kalman"))
+
+
+def test_a_margin_says_where_stability_is_lost_where_the_first_guess_was_wrong() -> None:
+    """A hold of 0.1 s: the search neglects images, and looks again by the poles of the loop."""
+    plant = _plant("halbach", b=0.5, T_laser=0.1)
+    model = malta.linearize(plant, plant.at())
+    c = lqg(model, _weights("halbach"), 0.1, "sampled-data", 0)
+    box = {"m": 0.3, "A": 0.112, "b": 0.219}
+    system, law = machine_system(plant, c, list(box), {"x": 0.0})
+    found = malta.robust_margin(system, law, box)
+    assert found.lower is not None
+    assert not found.exhausted
+    assert found.lower < found.upper < 3.4
+    worse = system.nominal + 1.001 * (np.array(list((found.witness or {}).values())) - system.nominal)
+    assert np.abs(1 + 0.1 * np.linalg.eigvals(closed_loop(system, law, worse)[0])).max() > 1
+
+
+def test_a_pid_takes_the_mean_rate_between_readings() -> None:
+    c = pid(_model("halbach"), TERMS, 55e-3)
+    assert not c.feedforward.rate.any()
+    assert c.feedforward.speed[0, 0] > 0
+
+
+def test_currents_far_below_their_limit_have_not_met_it() -> None:
+    """x / x as a product with a reciprocal is not always 1."""
+    plant, c = _plant("halbach", I_adc=49.0), _controller("halbach", 0, I_adc=49.0)
+    run = simulate(plant, c, Scenario("hold", 5.0, _still, fidelity="phase", noise=1.0))
+    assert np.abs(run.current).max() < 10
+    assert run.limits == ()
+
+
+@pytest.mark.parametrize(("machine", "start"), [("halbach", {"x": 1e-4}), ("planar", {"x": 1e-5})])
+def test_an_observer_that_knows_the_start_sees_no_disturbance(machine: str, start: Any) -> None:
+    """Off the reference, with a sample of delay: what acted before is what the currents made there."""
+    late = {"latency": 1.0} if machine == "halbach" else {}
+    plant, c = _plant(machine, **late), _controller(machine, 1, **late)
+    scenario = Scenario("let go", 10 * c.sample_time, _still, start=start, fidelity="force", substeps=64)
+    run = simulate(plant, c, scenario, engine="virtual machine" if machine == "planar" else "auto")
+    seen = np.abs(run.xi_hat[:, -len(c.forces)]).max()
+    assert seen < (
+        3e-3 if machine == "halbach" else 1e-3
+    )  # the lag of the current loops is in no design model
+
+
+def test_a_gain_file_with_two_kinds_of_integrals_is_refused(tmp_path: Path) -> None:
+    c, model = _controller("halbach", 0), _model("halbach")
+    path = tmp_path / "both.json"
+    margins = verify(model, c)
+    gains.write(replace(c, Ki=np.array([[1.0]])), margins, path)
+    with pytest.raises(malta.InputError, match=r"gains.Ki: found sums of errors beside"):
+        gains.read(path)
+
+
+def test_a_machine_that_cannot_be_controlled_is_refused_by_its_file(tmp_path: Path) -> None:
+    import json
+
+    from malta.encodings import content_sha256
+
+    c, model = _controller("planar", 1), _model("planar")
+    path = tmp_path / "pitch.json"
+    gains.write(c, verify(model, c), path)
+    content = json.loads(path.read_text(encoding="utf-8"))
+    content["plant"]["parameters"]["coil_pitch"]["value"] = 0.1
+    content["sha256"] = content_sha256(content)
+    path.write_text(json.dumps(content), encoding="utf-8")
+    with pytest.raises(
+        malta.InputError, match=r"pitch.json: plant.parameters: found planar: with a coil pitch"
+    ):
+        gains.read(path)
+
+
+def test_slow_samples_take_as_many_steps_as_their_current_loops_ask_for() -> None:
+    plant, c = _plant("halbach"), _controller("halbach", 0)
+    scenario = Scenario("let go", 2.0, _still, start={"x": 1e-4}, fidelity="force")
+    found = simulate(plant, c, scenario).p
+    fine = simulate(plant, c, replace(scenario, substeps=256)).p
+    assert np.abs(found - fine).max() < 2e-9

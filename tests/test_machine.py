@@ -17,7 +17,7 @@ import malta
 from malta import electric, machine, references
 from malta.plants import tubular
 from malta.references import Motion
-from malta.simulate import Correction, Fault, Scenario, beginning, engine_of, sampled, setup_of
+from malta.simulate import Correction, Fault, Scenario, beginning, engine_of, sampled, setup_of, steps_of
 
 if TYPE_CHECKING:
     from conftest import Design
@@ -79,7 +79,7 @@ def _step_by_step(plant: Plant, c: Controller, scenario: Scenario) -> dict[str, 
     t, _, given_ = sampled(plant, c, scenario, setup)
     start = [ca.DM(a) for a in beginning(plant, c, scenario, given_[0])]
     state = np.array(ca.evalf(machine.initial(plant, c, setup, *start))).ravel()
-    engine = engine_of(plant, c, setup, scenario.substeps)
+    engine = engine_of(plant, c, setup, steps_of(plant, c, scenario))
     states = []
     for k in range(len(t)):
         states.append(state)

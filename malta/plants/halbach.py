@@ -338,7 +338,7 @@ def plant(par: Parameters) -> Plant:
         preload=lambda _: ca.DM.zeros(1),
         currents=lambda y, v: phase_currents(par, y[0], v[0], par.F_z),
         forces=lambda x, i: forces(par, x[0], i)[0],
-        limited=lambda i: i * (par.I_adc / ca.fmax(par.I_adc, ca.mmax(ca.fabs(i)))),  # their sum stays zero
+        limited=lambda i: i / ca.fmax(1, ca.mmax(ca.fabs(i)) / par.I_adc),  # their sum stays zero
         tabulated=False,
         actuator=Actuator(
             coils=COILS,
