@@ -237,7 +237,7 @@ def test_force_constants_that_the_controller_does_not_know() -> None:
     """--set K_B: the last stage peaks as verify's machine, which has the slope of its loads too."""
     c = gains.read("design/gains/calibrated.json")
     weak = plant_of(replace(c.parameters, K_B=4.0))
-    found = robustness(weak, c, {"m": 0.2})
+    found = robustness(weak, c, {"K_A": 0.2})
     margins = malta.verify(malta.linearize(weak, weak.at()), c)
     largest = max(v for k, v in margins.peak_sensitivity.items() if k != "sigma_max")
     assert found.chain[-1].peak == pytest.approx(largest, rel=1e-5)
