@@ -202,11 +202,12 @@ class Plant:
 
         The loads are taken as cancelled at every position, as v0(z) does. `plant.at(z=5e-3)`
         """
-        x = self._state(positions)
+        x = self.state(positions)
         u = np.array(ca.DM(self.preload(ca.DM(x))), dtype=float).ravel()
         return OperatingPoint(x, u, loaded=False)
 
-    def _state(self, values: Mapping[str, float]) -> FloatArray:
+    def state(self, values: Mapping[str, float]) -> FloatArray:
+        """The state with these entries (SI), the others zero."""
         names = [s.name for s in self.states]
         x = np.zeros(len(names))
         for name, value in values.items():

@@ -746,7 +746,7 @@ def beginning(plant: Plant, c: Controller, scenario: Scenario, first: FloatArray
     believed = plant_of(c.parameters)
     design = [s.name for s in plant.design_states]
     moving = evaluate(machine.state_reference(believed), first[:p], first[p : 2 * p])[0].ravel()
-    x = plant.at(**(dict(zip(design, moving.tolist(), strict=True)) | dict(scenario.start))).x
+    x = plant.state(dict(zip(design, moving.tolist(), strict=True)) | dict(scenario.start))
     xi_pred, current = np.zeros(n), np.zeros(len(plant.actuator.coils))
     if not scenario.cold:
         xi_pred[: len(design)] = x[list(plant.controlled)]
@@ -756,16 +756,16 @@ def beginning(plant: Plant, c: Controller, scenario: Scenario, first: FloatArray
             pull = c.Ad[n + m * (c.delay - 1) : n + m * c.delay, :n] @ (xi_pred[:n] - moving)
             stored = first[2 * p + m :][: m * c.delay]
             xi_pred[n : n + m * c.delay] = stored + np.tile(pull, c.delay)
-        current = np.array(_commutated(believed)(plant.h(ca.DM(x), 0), held)).ravel()
+        current[:] = evaluate(_commutated(plant, believed), x, held)[0].ravel()
     return x, xi_pred, current
 
 
 @lru_cache(maxsize=16)
-def _commutated(believed: Plant) -> ca.Function:
-    """(y, v) -> currents of the coils, as a function of numbers."""
+def _commutated(plant: Plant, believed: Plant) -> ca.Function:
+    """(x, v) -> currents of the coils that the controller holds a machine at x with, as a function of numbers."""
     kind = ca.MX if believed.tabulated else ca.SX
-    y, v = kind.sym("y", len(believed.outputs)), kind.sym("v", len(believed.inputs))
-    return ca.Function("currents", [y, v], [ca.densify(believed.currents(y, v))])
+    x, v = kind.sym("x", len(plant.states)), kind.sym("v", len(plant.inputs))
+    return ca.Function("currents", [x, v], [ca.densify(believed.currents(plant.h(x, 0), v))])
 
 
 def integration_error(run: Trajectory) -> float:
