@@ -737,14 +737,18 @@ def _changed(parameters: Parameters, changes: list[str] | None) -> Parameters:
     """The parameters with `NAME=VALUE` applied; a unit may follow the value."""
     from dataclasses import replace
 
-    from malta.data import units_of
+    from malta.data import plant_of, units_of
 
     values = _assigned("--set", changes, units_of(parameters))
     try:
         preset = f"{parameters.preset}, changed" if values else parameters.preset
-        return replace(parameters, **values, preset=preset)
+        changed = replace(parameters, **values, preset=preset)
+        plant_of(changed)
     except InputError as error:
         raise InputError("--set", error.field, error.found, error.expected) from error
+    except CheckError as error:
+        raise InputError("--set", "", str(error), "a machine that can be controlled") from error
+    return changed
 
 
 def _assigned(option: str, given: list[str] | None, units: Mapping[str, str]) -> dict[str, float]:

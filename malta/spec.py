@@ -36,7 +36,7 @@ from malta.data import (
     units_of,
     validated,
 )
-from malta.errors import InputError
+from malta.errors import CheckError, InputError
 from malta.plant import Plant, Signal, readonly
 
 if TYPE_CHECKING:
@@ -345,7 +345,10 @@ def read_design(path: str | Path) -> Spec:
     content = validated(_DesignFile, _resolve(raw, printed, machine_file, path), path)
     _require_law(content, raw, path)
     par = read(machine_file, content.preset)
-    plant = plant_of(par)
+    try:
+        plant = plant_of(par)
+    except CheckError as error:
+        raise InputError(path, "preset", str(error), "a machine that can be controlled") from error
     for name in content.uncertainty:
         if name not in units_of(par):
             raise InputError(path, f"uncertainty.{name}", "an unknown parameter", ", ".join(units_of(par)))

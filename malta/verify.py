@@ -26,9 +26,9 @@ from malta.uncertain import (
     Compensator,
     UncertainSystem,
     around,
-    closed_loop,
     held_at,
     holds,
+    responses,
     sampled_law,
     uncertain,
 )
@@ -362,24 +362,28 @@ def _along(
 ) -> list[tuple[UncertainSystem, Compensator]]:
     """The machine's loops in PLACES of its travel, those that are the same once."""
     found: list[tuple[UncertainSystem, Compensator]] = []
-    seen: list[FloatArray] = []
+    seen: list[ComplexArray] = []
     for z in dict.fromkeys(sign * share * plant.travel for share in PLACES for sign in (1, -1)):
         loop = machine_system(plant, controller, names, {plant.stroke: z}, current_loops)
         here = _fingerprint(*loop)
-        if not any(here.shape == other.shape and np.allclose(here, other, 1e-9, 1e-12) for other in seen):
+        if not any(np.allclose(here, other, 1e-7, 0) for other in seen):
             seen.append(here)
             found.append(loop)
     return found
 
 
-def _fingerprint(system: UncertainSystem, law: Compensator) -> FloatArray:
-    """What two places have in common where their loops are the same: closed loops at parameters chosen at random."""
+def _fingerprint(system: UncertainSystem, law: Compensator) -> ComplexArray:
+    """det(1 - P F) at parameters and frequencies chosen at random: what loops have in common that are the same, or
+    mirror images of each other."""
     rng = np.random.default_rng(4)
-    rows = around(system.nominal, rng, 4)
-    poles = np.linalg.eigvals(closed_loop(system, law, rows))
-    order = np.lexsort((poles.imag, poles.real))
-    found = np.take_along_axis(poles, order, axis=1)
-    return np.asarray(np.concatenate([found.real, found.imag]))
+    T = law.sample_time
+    assert T is not None
+    w = np.exp(rng.uniform(-4, 0, 6)) * np.pi / T
+    found = []
+    for row in around(system.nominal, rng, 4):
+        P, F = responses(system, law, row, w)
+        found.append(np.linalg.det(np.eye(P.shape[1]) - P @ F))
+    return np.array(found)
 
 
 PLACES = (0.0, 1 / 3, 2 / 3, 1.0)  # shares of the travel, either way

@@ -442,7 +442,7 @@ def test_a_campaign(lqg: Design, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "code", "sentence"),
     [
-        (("--set", "coil_pitch=70.8mm"), 1, "= 4 tau_n, K(p) is singular"),
+        (("--set", "coil_pitch=70.8mm"), 2, "= 4 tau_n, K(p) is singular"),
         (("--set", "coil_pitch=60mm"), 2, "the width of a coil"),
         (("--option", "place=200mm,0mm"), 2, "x: found 0.2 m, expected a position from -0.1 to 0.1 m"),
         (("--option", "place=6mm"), 2, "found 1 numbers, expected x and y"),
