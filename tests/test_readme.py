@@ -12,7 +12,7 @@ import malta
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 DESIGNS = {
     "tubular": ("table2", "calibrated", "robust"),
-    "halbach": ("halbach", "halbach_pid"),
+    "halbach": ("halbach_late", "halbach", "halbach_pid"),
     "planar": ("planar", "planar_pid"),
 }
 TIMED = "K(p) and pseudo-inverse"  # rows that are measured on the computer that computes them
