@@ -24,8 +24,7 @@ from malta.errors import InputError
 from malta.linearize import linearize
 from malta.plant import Plant
 from malta.robust import Margin, robust_margin
-from malta.spec import Weights
-from malta.synthesize import kalman, lqi, lqr
+from malta.synthesize import kalman, lqi, lqr, weights_of
 from malta.uncertain import Compensator, UncertainSystem, instability, responses, uncertain
 from malta.verify import PLACES, CurrentLoops, largest, machine_law, machine_system, travel_margin
 
@@ -96,25 +95,10 @@ def compensators(
 ) -> dict[str, tuple[Compensator, bool]]:
     """The stages by name, and whether they feed back the states; `plant` is the machine, which has the delays."""
     own = {SAMPLED: (machine_law(plant, controller, current_loops), False)}
-    cost, noise = controller.cost, controller.noise
-    if cost is None or noise is None:
+    if controller.cost is None:
         return own
-    believed = plant_of(controller.parameters)
-    names = [s.name for s in believed.design_states]
-    model = linearize(
-        believed, believed.at(**dict(zip(names, controller.operating_point[0].tolist(), strict=True)))
-    )
-    one = np.ones_like
-    weights = Weights(
-        q=cost.state,
-        q_base=one(cost.state),
-        r=cost.input,
-        r_base=one(cost.input),
-        q_i=cost.integral,
-        q_i_base=one(cost.integral),
-        process_variance=noise.process,
-        sensor_variance=noise.sensor,
-    )
+    believed, weights = plant_of(controller.parameters), weights_of(controller)
+    model = linearize(believed, believed.point(controller.operating_point[0]))
     A, B, C, K, L = model.A, model.B, model.C, lqr(model, weights), kalman(model, weights)
     n, p, m = len(A), len(C), B.shape[1]
     half = n // 2
@@ -128,7 +112,7 @@ def compensators(
             True,
         )
     }
-    integral = bool(cost.integral.any())
+    integral = bool(weights.q_i.any())
     K_i, Ki = lqi(model, weights) if integral else (K, np.zeros((m, p)))
     if integral:  # e' = -y, in the coordinates of the modes
         e = np.hstack([-to_modes, np.zeros((p, n))])

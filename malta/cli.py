@@ -196,9 +196,7 @@ def verify(
 
     controller = gain_files.read(gains)
     plant = plant_of(_changed(controller.parameters, change))
-    names = [s.name for s in plant.design_states]
-    point = plant.at(**dict(zip(names, controller.operating_point[0].tolist(), strict=True)))
-    model = linearize(plant, point)
+    model = linearize(plant, plant.point(controller.operating_point[0]))
     published = _published(plant.name)
     box = _box(gains, uncertain, units_of(plant.parameters), published, option="--uncertain")
     for name, share in box.items():
@@ -617,8 +615,9 @@ def claims(
     """
     from dataclasses import asdict
 
-    from malta.claims import ledger, part
+    from malta.claims import ledger
     from malta.data import published
+    from malta.experiments import part
     from malta.spec import read_design
 
     chosen = designs or sorted(Path("design").glob("*.toml"), reverse=True)

@@ -116,7 +116,7 @@ def layout(plant: Plant, c: Controller, s: Setup) -> Layout:
 
 
 def numbers(
-    plant: Plant, c: Controller, substeps: int, errors: Mapping[str, float] | None = None
+    plant: Plant, c: Controller, substeps: float, errors: Mapping[str, float] | None = None
 ) -> dict[str, ca.DM]:
     """Every number of machine, controller and sensors, by name."""
     fixed = shaping(plant.parameters)

@@ -202,7 +202,15 @@ class Plant:
 
         The loads are taken as cancelled at every position, as v0(z) does. `plant.at(z=5e-3)`
         """
-        x = self.state(positions)
+        return self._preloaded(self.state(positions))
+
+    def point(self, design: ArrayLike) -> OperatingPoint:
+        """The same at these states of the design model (SI), the uncontrolled ones zero."""
+        x = np.zeros(len(self.states))
+        x[list(self.controlled)] = design
+        return self._preloaded(x)
+
+    def _preloaded(self, x: FloatArray) -> OperatingPoint:
         u = np.array(ca.DM(self.preload(ca.DM(x))), dtype=float).ravel()
         return OperatingPoint(x, u, loaded=False)
 

@@ -297,7 +297,7 @@ def simulate(
     samples = len(t)
     stages = _stages(plant, scenario, controller.sample_time)
     noise = _noise(stages, scenario, t)
-    steps, count = substeps_of(plant, controller, setup, scenario), steps_of(plant, controller, scenario)
+    steps = substeps_of(plant, controller, setup, scenario)
     fast = _fast_noise(plant, setup, scenario, substeps_until(samples, steps))
     x, xi_pred, current = beginning(plant, controller, scenario, given[0])
     start = machine.initial_state(plant, controller, setup)
@@ -310,7 +310,7 @@ def simulate(
     try:
         for stop in stops:
             now = next(p for first, p in reversed(stages) if first <= done)
-            run = engine_of(now, controller, setup, count, _errors(scenario), engine)
+            run = engine_of(now, controller, setup, steps, _errors(scenario), engine)
             part = given[done:stop]
             jitter = fast[substeps_until(done, steps) : substeps_until(stop, steps)]
             if observer is None:
@@ -510,21 +510,19 @@ def engine_of(
     plant: Plant,
     c: Controller,
     setup: Setup,
-    substeps: int,
+    substeps: float,
     errors: tuple[tuple[str, float], ...] = (),
     choice: EngineChoice = "auto",
 ) -> Engine:
     """What runs the control periods of this machine: compiled where possible, else CasADi's virtual machine."""
     values = machine.numbers(plant, c, substeps, dict(errors))
-    fast = machine.electronics_of(plant, setup)
-    steps = substeps if fast is None else c.sample_time / fast.period
     if choice != "virtual machine":
         found = compiled_shape(shape_of(plant, c, setup))
         if found is not None:
             lib, p = found
             ff = c.feedforward
             table = feedforward_table(ff.z_grid, ff.v0)
-            return compiled_engine(lib.run, p, machine.flat(values), steps, table)
+            return compiled_engine(lib.run, p, machine.flat(values), substeps, table)
         if choice == "compiled":
             if plant_of(c.parameters).tabulated:
                 raise InputError(
@@ -532,8 +530,8 @@ def engine_of(
                 )
             raise InputError("simulate", "engine", "no C compiler that works", "cc, gcc or clang, or $CC")
     p = machine.parts(plant, c, setup, values, constant=True)
-    block = 1 if setup.outside or fast is not None else BLOCK
-    return virtual_engine(cache(lambda count: machine.chained(p, c, count, block)), steps)
+    block = 1 if setup.outside or machine.electronics_of(plant, setup) is not None else BLOCK
+    return virtual_engine(cache(lambda count: machine.chained(p, c, count, block)), substeps)
 
 
 def _observer(plant: Plant, c: Controller, scenario: Scenario, setup: Setup) -> Any:

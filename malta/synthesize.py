@@ -235,6 +235,25 @@ def lqg(
     )
 
 
+def weights_of(controller: Controller) -> Weights:
+    """What an LQG was designed for, on bases of one SI unit. InputError for a PID, which was not."""
+    cost, noise = controller.cost, controller.noise
+    if cost is None or noise is None:
+        raise InputError(controller.name, "cost", "none, as a PID has", "an LQG")
+    one = np.ones_like
+    return Weights(
+        q=cost.state,
+        q_base=one(cost.state),
+        r=cost.input,
+        r_base=one(cost.input),
+        q_i=cost.integral,
+        q_i_base=one(cost.integral),
+        process_variance=noise.process,
+        sensor_variance=noise.sensor,
+        drift_variance=noise.drift,
+    )
+
+
 def _machine_part(model: LinearModel, Ts: float, delay: int, *, current_loop_delay: bool) -> dict[str, Any]:
     """What of a controller its machine decides, not its law."""
     plant, actuator = model.plant, model.plant.actuator

@@ -172,6 +172,7 @@ def _vanishes(p: Any, expression: Any, beside: Any, nominal: list[float]) -> boo
     return True
 
 
+@lru_cache(maxsize=64)  # writing out the currents takes longer than most that is asked of the answer
 def holds(plant: Plant) -> bool:
     """Whether the currents of a machine depend on where they were commutated, so that holding them matters."""
     kind = ca.MX if plant.tabulated else ca.SX

@@ -206,6 +206,7 @@ def machine_loop(model: LinearModel, controller: Controller) -> Loop:
     return loop(loaded, controller, delay=delay, current_loops=True, feedforward=True)
 
 
+@lru_cache(maxsize=8)  # every stage asks for it; records compare by identity, so no hit is stale
 def _commanded(model: LinearModel, controller: Controller) -> LinearModel:
     """The model whose inputs are the forces that the controller wants of the machine it believes in."""
     believed = plant_of(controller.parameters)
@@ -234,9 +235,8 @@ def unstable_gain(c: Controller) -> tuple[str, float] | None:
     """
     if c.cost is None:
         plant = plant_of(c.parameters)
-        names = [s.name for s in plant.design_states]
-        point = plant.at(**dict(zip(names, c.operating_point[0].tolist(), strict=True)))
-        found = {"K": eigenvalues(machine_loop(linearize(plant, point), c).closed)}
+        model = linearize(plant, plant.point(c.operating_point[0]))
+        found = {"K": eigenvalues(machine_loop(model, c).closed)}
     else:
         found = dict(zip("KL", own_poles(c), strict=True))
     for name, poles in found.items():
@@ -285,12 +285,29 @@ def _verify(model: LinearModel, controller: Controller, uncertainty: Mapping[str
     return Margins(poles, stages, bandwidths, uncertainty, robust)
 
 
-def machine_law(plant: Plant, controller: Controller, current_loops: CurrentLoops = "lag") -> Compensator:
+def machine_law(
+    plant: Plant,
+    controller: Controller,
+    current_loops: CurrentLoops = "lag",
+    *,
+    held: FloatArray | None = None,
+    handed: bool = False,
+) -> Compensator:
     """The control law with the machine's hold, delay and current loops: lags at their crossover, or the PI loops.
+
+    held, handed : as sampled_law takes them
 
     Raises InputError for other current loops, or PI loops that do not run with the control law.
     """
-    return _law_of(plant, controller, current_loops)
+    if current_loops not in get_args(CurrentLoops):
+        raise InputError("verify", "current_loops", repr(current_loops), "lag or pi")
+    a = plant.actuator
+    delay = a.delay(controller.sample_time)
+    if current_loops == "lag" or controller.current_loop is None:
+        return sampled_law(controller, delay, a.crossover, held=held, handed=handed)
+    if plant.windings is None:
+        raise InputError("verify", "current_loops", "pi", f"lag: those of a {plant.name} run much faster")
+    return sampled_law(controller, delay, a.R / a.L, controller.current_loop, a.R)
 
 
 def machine_system(
@@ -309,26 +326,7 @@ def machine_system(
     H = held_at(believed, float(believed.at(**at).x[believed.stroke_state]))
     system = uncertain(plant, names, at=at, believed=believed, held=H)
     handed = system.matrices.size2_out(1) > len(H)
-    return system, _law_of(plant, controller, current_loops, held=H, handed=handed)
-
-
-def _law_of(
-    plant: Plant,
-    controller: Controller,
-    current_loops: CurrentLoops,
-    *,
-    held: FloatArray | None = None,
-    handed: bool = False,
-) -> Compensator:
-    if current_loops not in get_args(CurrentLoops):
-        raise InputError("verify", "current_loops", repr(current_loops), "lag or pi")
-    a = plant.actuator
-    delay = a.delay(controller.sample_time)
-    if current_loops == "lag" or controller.current_loop is None:
-        return sampled_law(controller, delay, a.crossover, held=held, handed=handed)
-    if plant.windings is None:
-        raise InputError("verify", "current_loops", "pi", f"lag: those of a {plant.name} run much faster")
-    return sampled_law(controller, delay, a.R / a.L, controller.current_loop, a.R)
+    return system, machine_law(plant, controller, current_loops, held=H, handed=handed)
 
 
 def travel_margin(

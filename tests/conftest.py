@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import pytest
 
 import malta
+from malta import cli
 from malta.data import published as read_published
 from malta.plants import tubular
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from malta.controller import Controller
     from malta.linearize import LinearModel
     from malta.plant import Plant
@@ -44,6 +45,33 @@ def refusal(read: Callable[[], object], where: Path) -> malta.InputError:
     assert str(error).startswith(f"{where}: ")
     assert f"found {error.found}, expected {error.expected}" in str(error)
     return error
+
+
+class Said(NamedTuple):
+    """What a command leaves behind."""
+
+    code: int
+    out: str
+    err: str
+
+
+Run = Callable[..., Said]
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
+    """Run `malta ARGUMENTS`: exit code, standard output, standard error."""
+
+    def runs(*arguments: str | Path) -> Said:
+        monkeypatch.setattr(sys, "argv", ["malta", *map(str, arguments)])
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as ended:
+            cli.main()
+        out, err = capsys.readouterr()
+        assert isinstance(ended.value.code, int)
+        return Said(ended.value.code, out, err)
+
+    return runs
 
 
 @pytest.fixture(autouse=True)

@@ -7,12 +7,12 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from conftest import Run
 from typer.testing import CliRunner
 
 from malta import cli
@@ -20,24 +20,6 @@ from malta import cli
 GAINS = "design/gains/calibrated.json"
 SHAKY = "design/gains/table2.json"
 QUICK = ("--fidelity", "force", "--rise", "3")
-
-Run = Callable[..., tuple[int, str, str]]
-
-
-@pytest.fixture
-def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
-    """Run `malta ARGUMENTS`: exit code, standard output, standard error."""
-
-    def runs(*arguments: str | Path) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["malta", *map(str, arguments)])
-        capsys.readouterr()
-        with pytest.raises(SystemExit) as ended:
-            cli.main()
-        out, err = capsys.readouterr()
-        assert isinstance(ended.value.code, int)
-        return ended.value.code, out, err
-
-    return runs
 
 
 @pytest.fixture

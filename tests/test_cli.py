@@ -9,13 +9,13 @@ import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from conftest import Run
 from typer.testing import CliRunner
 
 from malta import cli, gains
@@ -35,24 +35,6 @@ INTEGRAL = 'integral = { published = "table_II.integral" }'
 R_MAX = "r_max  = { value = 0.6,"
 
 FORCES = ("fx_B1", "fy_B1", "fx_B2", "fy_B2", "f_D")
-
-Run = Callable[..., tuple[int, str, str]]
-
-
-@pytest.fixture
-def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
-    """Run `malta ARGUMENTS`: exit code, standard output, standard error."""
-
-    def runs(*arguments: str | Path) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["malta", *map(str, arguments)])
-        capsys.readouterr()
-        with pytest.raises(SystemExit) as ended:
-            cli.main()
-        out, err = capsys.readouterr()
-        assert isinstance(ended.value.code, int)
-        return ended.value.code, out, err
-
-    return runs
 
 
 def project(

@@ -9,19 +9,18 @@ import json
 import math
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from conftest import ROOT
+from conftest import ROOT, Run
 from scipy.linalg import solve_discrete_lyapunov
 
 import malta
-from malta import cli
 from malta.claims import halbach as claims
 from malta.claims import ledger
 from malta.controller import Controller, linear_law
@@ -476,32 +475,10 @@ def test_bad_options_are_refused_in_one_sentence(name: str, options: dict[str, A
 # The command line
 
 
-class Said(NamedTuple):
-    code: int
-    out: str
-    err: str
-
-
-@pytest.fixture
-def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., Said]:
-    """Run `malta ARGUMENTS`."""
-
-    def runs(*arguments: str | Path) -> Said:
-        monkeypatch.setattr(sys, "argv", ["malta", *map(str, arguments)])
-        capsys.readouterr()
-        with pytest.raises(SystemExit) as ended:
-            cli.main()
-        out, err = capsys.readouterr()
-        assert isinstance(ended.value.code, int)
-        return Said(ended.value.code, out, err)
-
-    return runs
-
-
 GAINS = "design/gains/halbach.json"
 
 
-def test_design_makes_the_shipped_gain_files(run: Callable[..., Said], tmp_path: Path) -> None:
+def test_design_makes_the_shipped_gain_files(run: Run, tmp_path: Path) -> None:
     designs = [f"design/{name}.toml" for name in DESIGNS]
     said = run("design", *designs, "--out", tmp_path, "--figures", tmp_path)
     assert (said.code, said.err) == (0, "")
@@ -512,14 +489,14 @@ def test_design_makes_the_shipped_gain_files(run: Callable[..., Said], tmp_path:
 
 
 @pytest.mark.parametrize("scenario", SCENARIOS)
-def test_simulate_each_scenario(run: Callable[..., Said], tmp_path: Path, scenario: str) -> None:
+def test_simulate_each_scenario(run: Run, tmp_path: Path, scenario: str) -> None:
     said = run("simulate", GAINS, "--scenario", scenario, "--out", tmp_path)
     assert (said.code, said.err) == (0, "")
     assert "fidelity phase" in said.out
     assert (tmp_path / f"halbach_{scenario}.png").stat().st_size > 20_000
 
 
-def test_simulate_with_options_of_the_electronics(run: Callable[..., Said]) -> None:
+def test_simulate_with_options_of_the_electronics(run: Run) -> None:
     said = run(
         "simulate",
         GAINS,
@@ -538,19 +515,19 @@ def test_simulate_with_options_of_the_electronics(run: Callable[..., Said]) -> N
     assert "pwm: found 'coarse', expected one of exact, plain, fine" in said.err
 
 
-def test_verify(run: Callable[..., Said]) -> None:
+def test_verify(run: Run) -> None:
     said = run("verify", GAINS, "--uncertain", "b=50%")
     assert (said.code, said.err) == (0, "")
     assert "Peak sensitivity" in said.out
 
 
-def test_claims(run: Callable[..., Said]) -> None:
+def test_claims(run: Run) -> None:
     said = run("claims", "design/halbach.toml", "--markdown")
     assert said.code == 0
     assert said.out.startswith("### halbach, L. C. Díaz-Pérez et al., Actuators 7(4), 2018")
 
 
-def test_campaign_of_a_few_machines(run: Callable[..., Said], tmp_path: Path) -> None:
+def test_campaign_of_a_few_machines(run: Run, tmp_path: Path) -> None:
     said = run(
         "campaign",
         GAINS,

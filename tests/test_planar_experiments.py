@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import sys
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -13,10 +11,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import casadi as ca
 import numpy as np
 import pytest
+from conftest import Run
 from scipy.integrate import solve_ivp
 
 import malta
-from malta import cli
 from malta.claims import ledger
 from malta.claims import planar as claims
 from malta.data import published as read_published
@@ -327,8 +325,8 @@ def test_the_ledger(
     lqg: Design, flown: dict[str, Experiment], paper: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What a mended model can have is reproduced; what contradicts itself or lacks its start has a reason."""
-    monkeypatch.setattr(claims, "experiment", lambda name, *_, **__: flown[name])
-    monkeypatch.setattr(claims, "verify", lambda *_: lqg.margins)
+    monkeypatch.setattr("malta.claims.experiment", lambda name, *_, **__: flown[name])
+    monkeypatch.setattr("malta.claims.verify", lambda *_: lqg.margins)
     found = {claim.subject: claim for claim in ledger([lqg.spec], paper).claims}
     reproduced = (
         "one coil at 3 A: F_x [N]",
@@ -376,22 +374,6 @@ def test_every_printed_number_is_claimed(paper: dict[str, Any]) -> None:
 
 
 # --- The command line ---
-
-Run = Callable[..., tuple[int, str, str]]
-
-
-@pytest.fixture
-def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
-    def runs(*arguments: str | Path) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["malta", *map(str, arguments)])
-        capsys.readouterr()
-        with pytest.raises(SystemExit) as ended:
-            cli.main()
-        out, err = capsys.readouterr()
-        assert isinstance(ended.value.code, int)
-        return ended.value.code, out, err
-
-    return runs
 
 
 def test_design(run: Run, tmp_path: Path) -> None:

@@ -6,15 +6,16 @@ import json
 import math
 import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from conftest import ROOT, refusal
+from conftest import ROOT, Run, refusal
 
 import malta
-from malta import cli, gains, report, tune_lqg
+from malta import gains, report, tune_lqg
 from malta.controller import linear_law
 from malta.experiments import experiment
 from malta.riccati import eigenvalues
@@ -36,8 +37,6 @@ from malta.tune_lqg import LINEAR, _clusters, _figures, _search, _worst, drive_c
 from malta.verify import BANDWIDTHS, loop, machine_loop
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from malta.controller import Controller
     from malta.linearize import LinearModel
     from malta.spec import Spec
@@ -433,19 +432,9 @@ def test_a_variable_without_effect_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.fixture
-def run(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> Callable[..., tuple[int, str, str]]:
-    def runs(*arguments: str | Path) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["malta", "tune", *map(str, arguments)])
-        capsys.readouterr()
-        with pytest.raises(SystemExit) as ended:
-            cli.main()
-        out, err = capsys.readouterr()
-        code = ended.value.code
-        return (code if isinstance(code, int) else 0), out, err
-
-    return runs
+def run(run: Run) -> Run:
+    """Run `malta tune ARGUMENTS`."""
+    return partial(run, "tune")
 
 
 def bare(folder: Path, *asked: str) -> Path:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import json
 import math
-import sys
 from dataclasses import replace
 from functools import partial
 from types import SimpleNamespace
@@ -13,11 +12,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from conftest import ROOT, refusal
+from conftest import ROOT, Run, refusal
 from scipy import linalg
 
 import malta
-from malta import cli, tune_pid
+from malta import tune_pid
 from malta.plants import halbach
 from malta.riccati import sample, sample_noise
 from malta.spec import Pid
@@ -28,7 +27,7 @@ from malta.tune_pid import _closed, _figures, _goal, _parts, _whole, loads_of
 from malta.verify import machine_loop
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Mapping
     from pathlib import Path
 
     from malta.controller import Controller
@@ -425,19 +424,9 @@ def test_cost_does_not_shape_the_gains(tmp_path: Path, motor: Spec) -> None:
 
 
 @pytest.fixture
-def run(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> Callable[..., tuple[int, str, str]]:
-    def runs(*arguments: str | Path) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["malta", "tune", *map(str, arguments)])
-        capsys.readouterr()
-        with pytest.raises(SystemExit) as ended:
-            cli.main()
-        out, err = capsys.readouterr()
-        code = ended.value.code
-        return (code if isinstance(code, int) else 0), out, err
-
-    return runs
+def run(run: Run) -> Run:
+    """Run `malta tune ARGUMENTS`."""
+    return partial(run, "tune")
 
 
 def test_the_command_finds_gains_and_judges_them(run: Any, tmp_path: Path) -> None:

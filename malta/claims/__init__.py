@@ -24,14 +24,16 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 from malta.data import in_unit, published_value
 from malta.errors import InputError
-from malta.experiments import Experiment, Progress
+from malta.experiments import Experiment, Progress, experiment, part
+from malta.linearize import LinearModel, linearize
 from malta.own import required
+from malta.synthesize import synthesize
+from malta.verify import Margins, verify
 
 if TYPE_CHECKING:
     from malta.controller import Controller
     from malta.robust import Margin
     from malta.spec import Spec
-    from malta.verify import Margins
 
 CLOSE, NEAR = 0.05, 0.2  # of the published figure: reproduced; within x %
 ROUNDING = 1e-9
@@ -81,6 +83,27 @@ class Found(Protocol):
     def flown(self) -> Mapping[str, Experiment]: ...
 
 
+class Designed(NamedTuple):
+    """A design from its file to the runs that claims are made of."""
+
+    model: LinearModel
+    controller: Controller
+    margins: Margins
+    flown: dict[str, Experiment]
+
+
+def designed(spec: Spec, names: Sequence[str], progress: Progress | None = None) -> Designed:
+    """Design, prove and fly the experiments of these names."""
+    plant = spec.plant
+    model = linearize(plant, plant.at(**spec.operating_point))
+    controller = synthesize(spec, model)
+    flown = {
+        name: experiment(name, plant, controller, progress=part(progress, n, len(names)))
+        for n, name in enumerate(names)
+    }
+    return Designed(model, controller, verify(model, controller, spec.uncertainty), flown)
+
+
 class Row(NamedTuple):
     """A figure that the paper publishes, and how to find ours."""
 
@@ -115,11 +138,6 @@ def ledger(specs: Sequence[Spec], published: Mapping[str, Any], progress: Progre
     ]
     claims = [_claim(row, found, published) for row in paper.rows()]
     return Ledger(machine, paper.SOURCE, tuple(e.spec.name for e in found), tuple(claims))
-
-
-def part(progress: Progress | None, n: int, total: int) -> Progress | None:
-    """Progress of the n-th of so many parts."""
-    return None if progress is None else lambda share: progress((n + share) / total)
 
 
 def _claim(row: Row, found: Sequence[Found], published: Mapping[str, Any]) -> Claim:

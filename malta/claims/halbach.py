@@ -10,17 +10,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from malta.claims import Row, machine_share, merit, part, peak_sensitivity
+from malta.claims import Row, designed, machine_share, merit, peak_sensitivity
 from malta.controller import Controller
 from malta.data import published_value
-from malta.experiments import Experiment, Progress, experiment
+from malta.experiments import Experiment, Progress
 from malta.experiments.halbach import COUNT, FAULTS, LAWS, PAUSE, STEP, places, responses
-from malta.linearize import LinearModel, linearize
+from malta.linearize import LinearModel
 from malta.plants import halbach
 from malta.plants.halbach import MEAN_OF, Parameters
 from malta.spec import Spec
-from malta.synthesize import sampled_model, synthesize
-from malta.verify import Margins, verify
+from malta.synthesize import sampled_model
+from malta.verify import Margins
 
 if TYPE_CHECKING:
     from malta.plant import FloatArray
@@ -54,13 +54,8 @@ class Evidence:
 
 def evidence(spec: Spec, published: Mapping[str, Any], progress: Progress | None = None) -> Evidence:
     """Design, prove and fly."""
-    plant = spec.plant
-    model = linearize(plant, plant.at(**spec.operating_point))
-    controller = synthesize(spec, model)
-    flown = {}
-    for n, name in enumerate(FLOWN):
-        flown[name] = experiment(name, plant, controller, progress=part(progress, n, len(FLOWN)))
-    return Evidence(spec, published, model, controller, verify(model, controller, spec.uncertainty), flown)
+    found = designed(spec, FLOWN, progress)
+    return Evidence(spec, published, found.model, found.controller, found.margins, found.flown)
 
 
 def rows() -> list[Row]:

@@ -10,17 +10,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from malta.claims import Row, machine_share, merit, part, peak_sensitivity
+from malta.claims import Row, designed, machine_share, merit, peak_sensitivity
 from malta.controller import Controller
 from malta.data import published_value
-from malta.experiments import Case, Experiment, Progress, experiment
+from malta.experiments import Case, Experiment, Progress
 from malta.experiments.planar import CURRENT
-from malta.linearize import linearize
 from malta.plants import planar, planar_field
 from malta.simulate import Trajectory
 from malta.spec import Spec
-from malta.synthesize import synthesize
-from malta.verify import Margins, verify
+from malta.verify import Margins
 
 if TYPE_CHECKING:
     from malta.plant import FloatArray
@@ -43,14 +41,9 @@ class Evidence:
 
 def evidence(spec: Spec, published: Mapping[str, Any], progress: Progress | None = None) -> Evidence:
     """Design, prove and fly."""
-    plant = spec.plant
-    model = linearize(plant, plant.at(**spec.operating_point))
-    controller = synthesize(spec, model)
-    flown = {}
-    for n, name in enumerate(FLOWN[: 3 if controller.cost is None else 4]):
-        flown[name] = experiment(name, plant, controller, progress=part(progress, n, len(FLOWN)))
+    found = designed(spec, FLOWN[: 3 if spec.pid is not None else 4], progress)
     par: Any = spec.parameters
-    return Evidence(spec, published, par, controller, verify(model, controller, spec.uncertainty), flown)
+    return Evidence(spec, published, par, found.controller, found.margins, found.flown)
 
 
 def rows() -> list[Row]:

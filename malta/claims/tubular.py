@@ -15,26 +15,26 @@ from malta.chain import compensators
 from malta.claims import (
     Row,
     bandwidth,
+    designed,
     first_merit,
     machine_share,
     merit,
-    part,
     peak_sensitivity,
     proven,
 )
 from malta.controller import Controller
 from malta.data import published_value
 from malta.electric import link_voltage, open_loop_gain
-from malta.experiments import Experiment, Progress, experiment
+from malta.experiments import Experiment, Progress
 from malta.experiments.tubular import late_stroke
 from malta.linearize import LinearModel, linearize
 from malta.riccati import add_integrals
 from malta.robust import robust_margin
 from malta.simulate import Scenario, StrokeFigures, simulate, stroke_figures
 from malta.spec import Spec
-from malta.synthesize import lqr, synthesize
+from malta.synthesize import lqr
 from malta.uncertain import uncertain
-from malta.verify import Margins, verify
+from malta.verify import Margins
 
 if TYPE_CHECKING:
     from malta.plant import FloatArray
@@ -61,11 +61,7 @@ class Evidence:
 def evidence(spec: Spec, published: Mapping[str, Any], progress: Progress | None = None) -> Evidence:
     """Design, prove and fly."""
     plant = spec.plant
-    model = linearize(plant, plant.at(**spec.operating_point))
-    controller = synthesize(spec, model)
-    flown = {}
-    for n, name in enumerate(FLOWN):
-        flown[name] = experiment(name, plant, controller, progress=part(progress, n, len(FLOWN)))
+    model, controller, margins, flown = designed(spec, FLOWN, progress)
     v0 = controller.feedforward.v0.copy()
     v0[:, plant.thrust_input] = 0
     without = replace(controller, feedforward=replace(controller.feedforward, v0=v0))
@@ -74,7 +70,7 @@ def evidence(spec: Spec, published: Mapping[str, Any], progress: Progress | None
         spec,
         model,
         controller,
-        verify(model, controller, spec.uncertainty),
+        margins,
         lqr(model, spec.weights),
         flown,
         stroke_figures(slow),

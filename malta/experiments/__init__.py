@@ -27,7 +27,6 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from functools import partial
 from numbers import Real
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -140,9 +139,18 @@ def fly(
     options: Mapping[str, Any],
 ) -> tuple[tuple[Case, ...], bool]:
     """Run scenarios one after the other. Ctrl-C ends the series with what there is: the second result."""
+    return fly_all([(plant, controller, one) for one in wanted], progress, options)
+
+
+def fly_all(
+    flights: Sequence[tuple[Plant, Controller, Wanted]],
+    progress: Progress | None,
+    options: Mapping[str, Any],
+) -> tuple[tuple[Case, ...], bool]:
+    """The same, each with a machine and a controller of its own."""
     cases: list[Case] = []
-    for n, (label, scenario, merits) in enumerate(wanted):
-        share = None if progress is None else partial(_overall, progress, n, len(wanted))
+    for n, (plant, controller, (label, scenario, merits)) in enumerate(flights):
+        share = part(progress, n, len(flights))
         try:
             run = simulate(plant, controller, scenario, engine=options.get("engine", "auto"), progress=share)
         except KeyboardInterrupt:
@@ -155,8 +163,9 @@ def fly(
     return tuple(cases), False
 
 
-def _overall(progress: Progress, done: int, total: int, share: float) -> None:
-    progress((done + share) / total)
+def part(progress: Progress | None, n: int, total: int) -> Progress | None:
+    """Progress of the n-th of so many parts."""
+    return None if progress is None else lambda share: progress((n + share) / total)
 
 
 def rms(values: FloatArray) -> float:

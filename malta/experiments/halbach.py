@@ -23,7 +23,18 @@ import numpy as np
 from malta import references
 from malta.controller import Controller
 from malta.errors import InputError
-from malta.experiments import QUIET, REAL, Case, Experiment, Merit, Progress, Wanted, fly, rms, scenario_of
+from malta.experiments import (
+    QUIET,
+    REAL,
+    Experiment,
+    Merit,
+    Progress,
+    Wanted,
+    fly,
+    fly_all,
+    rms,
+    scenario_of,
+)
 from malta.plant import Plant
 from malta.plants import halbach
 from malta.plants.halbach import IDEAL, MEAN_OF, Options, Pwm
@@ -333,20 +344,9 @@ def force(
     In the open loop the reference jumps; with feedback it is a quintic with a rise of `rise` (s).
     """
     own = {"electronics": Options(pwm, adc_noise=adc_noise)} | options
-    flights = [(fault, law) for fault in FAULTS for law in LAWS]
-    cases: list[Case] = []
-    cut = False
-    for n, (fault, law) in enumerate(flights):
-        share = None if progress is None else partial(_part, progress, n, len(flights))
-        found, cut = fly(*_move(plant, controller, fault, law, distance, rise, own), share, options)
-        cases += found
-        if cut:
-            break
-    return Experiment("force", "Does a move disturb the vertical force?", tuple(cases), (), interrupted=cut)
-
-
-def _part(progress: Progress, n: int, total: int, share: float) -> None:
-    progress((n + share) / total)
+    flights = [_move(plant, controller, fault, law, distance, rise, own) for fault in FAULTS for law in LAWS]
+    cases, cut = fly_all(flights, progress, options)
+    return Experiment("force", "Does a move disturb the vertical force?", cases, (), interrupted=cut)
 
 
 def _move(
@@ -357,7 +357,7 @@ def _move(
     distance: float,
     rise: float,
     options: Mapping[str, Any],
-) -> tuple[Plant, Controller, list[Wanted]]:
+) -> tuple[Plant, Controller, Wanted]:
     """The machine, what commands it and what is asked: nothing waits for the laser where nothing is fed back."""
     par: Any = plant.parameters
     (position, vector), faulty = LAWS[law], dict(FAULTS[fault])
@@ -377,7 +377,7 @@ def _move(
     printed = f"figure_10.{PRINTED[law]}" if fault == "sound" and distance == MOVE else ""
     merits = partial(_move_merits, begin=begin, printed=printed)
     label = law if fault == "sound" else f"{law}, {fault}"
-    return machine, controller, [Wanted(label, scenario_of("force", end, reference, own), merits)]
+    return machine, controller, Wanted(label, scenario_of("force", end, reference, own), merits)
 
 
 def move(_: Plant, distance: float, rise: float, begin: float) -> Reference:

@@ -13,7 +13,7 @@ from __future__ import annotations
 import ctypes
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -24,15 +24,14 @@ import numpy as np
 from malta import engine, references
 from malta.controller import Controller
 from malta.errors import InputError
-from malta.experiments import QUIET, Case, Experiment, Merit, Progress, Wanted, fly, scenario_of
+from malta.experiments import QUIET, Case, Experiment, Merit, Progress, Wanted, fly, fly_all, scenario_of
 from malta.linearize import linearize
 from malta.plant import Plant
 from malta.plants import planar
 from malta.plants.planar_field import COIL_ORDER
 from malta.references import Motion, Reference
 from malta.simulate import Trajectory
-from malta.spec import Weights
-from malta.synthesize import lqg
+from malta.synthesize import lqg, weights_of
 
 if TYPE_CHECKING:
     from malta.plant import FloatArray
@@ -82,21 +81,14 @@ def step(
     Once with each coil model in the controller; `cells` of the table over tau_n.
     """
     wanted = _step_cases(plant, controller, place=place, gap=gap, lift=lift, distance=distance, **options)
-    cases: list[Case] = []
-    cut = False
-    for n, model in enumerate(MODELS):
-        share = None if progress is None else partial(_overall, progress, n)
-        own = believing(controller, model, cells)
-        found, cut = fly(plant, own, wanted, share, options)
-        cases += [case._replace(label=f"{model}, {case.label}") for case in found]
-        if cut:
-            break
+    flights = [
+        (plant, believing(controller, model, cells), one._replace(label=f"{model}, {one.label}"))
+        for model in MODELS
+        for one in wanted
+    ]
+    cases, cut = fly_all(flights, progress, options)
     merits = cases[0].merits if cut else _moved_by(cases)
-    return Experiment("step", "What does the coil model move?", tuple(cases), merits, interrupted=cut)
-
-
-def _overall(progress: Progress, done: int, share: float) -> None:
-    progress((done + share) / len(MODELS))
+    return Experiment("step", "What does the coil model move?", cases, merits, interrupted=cut)
 
 
 def _step_cases(
@@ -182,7 +174,7 @@ def _largest(values: FloatArray) -> float:
     return float(values.max()) if values.size else math.nan
 
 
-def _moved_by(cases: list[Case]) -> tuple[Merit, ...]:
+def _moved_by(cases: Sequence[Case]) -> tuple[Merit, ...]:
     """How far each coil model moves the mover off the path that the exact one takes, from the first place.
 
     What is left with the exact one comes of currents that are held, and a sample old; the paper's runs have neither.
@@ -232,20 +224,15 @@ def errors(
     x, y = np.meshgrid(*[np.linspace(0, 2 * par.tau_n, 141)] * 2, indexing="ij")
     exact = coil_wrench(par, truth, current, x, y)
     curves: dict[str, FloatArray] = {"x": x[:, 0], "exact": exact}
-    cases: list[Case] = []
-    cut = False
     reference = partial(references.hold, x=place[0], y=place[1])
-    for n, (name, model) in enumerate(models.items()):
+    scenario = scenario_of("errors", 0.02, reference, FORCES | options)
+    flights = []
+    for name, model in models.items():
         error = coil_wrench(par, model, current, x, y) - exact
         curves[name] = error
-        scenario = scenario_of("errors", 0.02, reference, FORCES | options)
         merits = partial(_error_merits, largest=np.abs(error).max(axis=(0, 1)))
-        share = None if progress is None else partial(_half, progress, n)
-        own = believing(controller, name, cells)
-        found, cut = fly(plant, own, [Wanted(name, scenario, merits)], share, options)
-        cases += found
-        if cut:
-            break
+        flights.append((plant, believing(controller, name, cells), Wanted(name, scenario, merits)))
+    cases, cut = fly_all(flights, progress, options)
     curves |= {"step": par.tau_n / np.array(NODES), "by step": _by_step(par, truth, current)}
     amplitude = np.abs(exact).max(axis=(0, 1))
     found_merits = (
@@ -256,13 +243,7 @@ def errors(
         Merit("fitted C of the analytical model", planar.compensation(par, truth), "1"),
         Merit("error of the table, each halving of its step", _order(curves), "1"),
     )
-    return Experiment(
-        "errors", "What do the coil models miss?", tuple(cases), found_merits, curves, interrupted=cut
-    )
-
-
-def _half(progress: Progress, done: int, share: float) -> None:
-    progress((done + share) / 2)
+    return Experiment("errors", "What do the coil models miss?", cases, found_merits, curves, interrupted=cut)
 
 
 def coil_wrench(
@@ -323,26 +304,18 @@ def delay(
     if controller.cost is None or controller.noise is None:
         raise InputError("simulate", "scenario", "'delay' with a PID, which predicts nothing", "an LQG")
     moves: dict[str, Any] = {"place": place, "gap": GAP, "lift": LIFT, "distance": DISTANCE}
-    wanted = _step_cases(plant, controller, **moves, **options)[:1]
-    designs = [(speed, knows) for speed in speeds for knows in (True, False)]
-    cases: list[Case] = []
-    cut = False
-    for n, (speed, knows) in enumerate(designs):
-        share = None if progress is None else partial(_part, progress, n, len(designs))
-        name = f"{'with' if knows else 'without'}, {speed:g} x"
-        own = faster(controller, speed, controller.delay if knows else 0)
-        scenario = wanted[0]._replace(label=name, merits=_late_merits)
-        found, cut = fly(plant, own, [scenario], share, options)
-        cases += found
-        if cut:
-            break
-    return Experiment(
-        "delay", "Does the filter have to know of the delay?", tuple(cases), (), interrupted=cut
-    )
-
-
-def _part(progress: Progress, done: int, total: int, share: float) -> None:
-    progress((done + share) / total)
+    wanted = _step_cases(plant, controller, **moves, **options)[0]._replace(merits=_late_merits)
+    flights = [
+        (
+            plant,
+            faster(controller, speed, controller.delay if knows else 0),
+            wanted._replace(label=f"{'with' if knows else 'without'}, {speed:g} x"),
+        )
+        for speed in speeds
+        for knows in (True, False)
+    ]
+    cases, cut = fly_all(flights, progress, options)
+    return Experiment("delay", "Does the filter have to know of the delay?", cases, (), interrupted=cut)
 
 
 def faster(controller: Controller, speed: float, delay: int) -> Controller:
@@ -351,28 +324,14 @@ def faster(controller: Controller, speed: float, delay: int) -> Controller:
     Natural frequencies of a double integrator go with the fourth root of q / r, those of its filter with the fourth
     root of the ratio of variances; a disturbance is then followed as many times as fast.
     """
-    cost, noise = controller.cost, controller.noise
-    assert cost is not None
-    assert noise is not None
-    plant = planar.plant(_parameters(controller))
-    ones = np.ones(len(cost.input))
-    weights = Weights(
-        q=cost.state * speed**4,
-        q_base=np.ones(len(cost.state)),
-        r=cost.input,
-        r_base=ones,
-        q_i=cost.integral,
-        q_i_base=ones,
-        process_variance=noise.process * speed**4,
-        sensor_variance=noise.sensor,
-        drift_variance=noise.drift * speed**6,
+    plant, own = planar.plant(_parameters(controller)), weights_of(controller)
+    weights = replace(
+        own,
+        q=own.q * speed**4,
+        process_variance=own.process_variance * speed**4,
+        drift_variance=own.drift_variance * speed**6,
     )
-    model = linearize(
-        plant,
-        plant.at(
-            **dict(zip([s.name for s in plant.states], controller.operating_point[0].tolist(), strict=True))
-        ),
-    )
+    model = linearize(plant, plant.point(controller.operating_point[0]))
     return lqg(model, weights, controller.sample_time, "sampled-data", delay, name=controller.name)
 
 

@@ -25,11 +25,7 @@ def compliance(
 
     S is the sampled loop's sensitivity at the sensors, G_w the open machine's response to the force between samples.
     """
-    point = plant.at(
-        **dict(
-            zip([s.name for s in plant.design_states], controller.operating_point[0].tolist(), strict=True)
-        )
-    )
+    point = plant.point(controller.operating_point[0])
     model = linearize(plant, point)
     loop = machine_loop(model, controller)
     x, w_ext = ca.SX.sym("x", len(plant.states)), ca.SX.sym("w", len(plant.disturbances))
