@@ -36,12 +36,14 @@ if TYPE_CHECKING:  # the contents page, as type checkers and readers see it
     from malta.many import Batch as Batch
     from malta.many import replayed as replayed
     from malta.many import simulate_many as simulate_many
+    from malta.margins.robust import Margin as Margin
+    from malta.margins.robust import margin_of_polynomial as margin_of_polynomial
+    from malta.margins.robust import robust_margin as robust_margin
+    from malta.margins.systems import uncertain as uncertain
     from malta.plant import OperatingPoint as OperatingPoint
     from malta.plant import Plant as Plant
     from malta.plant import Signal as Signal
     from malta.plant import trim as trim
-    from malta.robust import Margin as Margin
-    from malta.robust import robust_margin as robust_margin
     from malta.simulate import Fault as Fault
     from malta.simulate import Scenario as Scenario
     from malta.simulate import Trajectory as Trajectory
@@ -59,7 +61,6 @@ if TYPE_CHECKING:  # the contents page, as type checkers and readers see it
     from malta.tune import tune as tune
     from malta.uncertain import Compensator as Compensator
     from malta.uncertain import UncertainSystem as UncertainSystem
-    from malta.uncertain import uncertain as uncertain
     from malta.verify import Margins as Margins
     from malta.verify import verify as verify
 
@@ -75,12 +76,13 @@ _NAMES = {  # the same, for the first use of each name
     "linearize": ("LinearModel", "linearize"),
     "many": ("Batch", "replayed", "simulate_many"),
     "plant": ("OperatingPoint", "Plant", "Signal", "trim"),
-    "robust": ("Margin", "robust_margin"),
+    "margins.robust": ("Margin", "margin_of_polynomial", "robust_margin"),
+    "margins.systems": ("uncertain",),
     "simulate": ("Fault", "Scenario", "Trajectory", "simulate", "stroke_figures"),
     "spec": ("Spec", "Weights", "read_design"),
     "synthesize": ("calibrate", "kalman", "lqg", "lqi", "lqr", "synthesize"),
     "tune": ("tune",),
-    "uncertain": ("Compensator", "UncertainSystem", "uncertain"),
+    "uncertain": ("Compensator", "UncertainSystem"),
     "verify": ("Margins", "verify"),
 }
 _MODULES = ("gains", "plants", "references", "report")

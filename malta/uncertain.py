@@ -27,17 +27,21 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class UncertainSystem:
-    """x' = A(p) x + B(p) u, y = C(p) x with parameters p by name.
+    """E(p) x' = A(p) x + B(p) u, y = C(p) x + D(p) u with parameters p by name.
 
-    second_order: x = (q, q'), so A = [[0, I], [A21, A22]] and B = [[0], [B2]].
-    limits: what each parameter may be at all, (above, below), exclusive.
+    matrices: p -> A, B, C, or with D, or with D and E.
+    second_order: x = (q, q'), so A = [[0, I], [A21, A22]] and B = [[0], [B2]]. `malta.margins` reads all structure from
+    the expressions and takes no word for it.
+    limits: what each parameter may be at all, (above, below), exclusive; anything where none are given.
+    sample_time: s, where x+ stands in place of x'.
     """
 
     names: tuple[str, ...]
     nominal: FloatArray
-    matrices: ca.Function  # p -> A, B, C
-    second_order: bool
-    limits: tuple[tuple[float, float], ...]
+    matrices: ca.Function
+    second_order: bool = False
+    limits: tuple[tuple[float, float], ...] = ()
+    sample_time: float | None = None
 
     def at(self, p: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """A, B, C at rows of parameters: arrays of k matrices."""
@@ -101,7 +105,7 @@ def uncertain(
         raise InputError("robust_margin", "believed", found, "one whose currents are a formula")
     x0 = plant.at(**(at or {})).x
     position = float(x0[plant.stroke_state])
-    of = _model(plant, believed or plant, tuple(name for name in names if name != plant.stroke))
+    of = model_of(plant, believed or plant, tuple(name for name in names if name != plant.stroke))
     # What is held is of a size that nobody wants to write out at every place.
     kind = ca.MX if holds(plant) else ca.SX
     p = kind.sym("p", len(names))
@@ -120,7 +124,7 @@ def uncertain(
             B = ca.horzcat(B, left)
     if states:
         C = ca.vertcat(C, ca.DM.eye(len(plant.controlled)))
-    bounds = {f.name: _lowest(f.metadata) for f in fields(par)}
+    bounds = {f.name: lowest(f.metadata) for f in fields(par)}
     limits = tuple((bounds.get(name, -math.inf), math.inf) for name in names)
     matrices = ca.Function("matrices", [p], [ca.densify(M) for M in (A, B, C)])
     return UncertainSystem(tuple(names), readonly(nominal), matrices, True, limits)
@@ -128,14 +132,14 @@ def uncertain(
 
 def held_at(plant: Plant, position: float) -> FloatArray:
     """H of the currents that are held at a position along the stroke, where E = B H."""
-    of, none = _model(plant, plant, ()), ca.DM(0, 1)
+    of, none = model_of(plant, plant, ()), ca.DM(0, 1)
     acting = of(none, position, 0)[-1]
     _, B, _, E = (np.array(M) for M in of(none, position, acting)[:4])
     return np.asarray(np.linalg.lstsq(B, E, rcond=None)[0])
 
 
 @lru_cache(maxsize=16)  # plants compare by identity, and are built once for their parameters
-def _model(plant: Plant, believed: Plant, names: tuple[str, ...]) -> ca.Function:
+def model_of(plant: Plant, believed: Plant, names: tuple[str, ...]) -> ca.Function:
     """(parameters, position along the stroke, inputs wanted) -> what `jacobians` gives, and the preload that acts."""
     from malta.data import twins_of
 
@@ -180,7 +184,7 @@ def holds(plant: Plant) -> bool:
     return bool(ca.which_depends(plant.currents(y, v), y, 1, True) != [False] * len(plant.actuator.coils))
 
 
-def _lowest(declared: Mapping[str, Any]) -> float:
+def lowest(declared: Mapping[str, Any]) -> float:
     """What a parameter is above, or at least."""
     found = [declared[key] for key in ("above", "at_least") if declared.get(key) is not None]
     return float(max(found)) if found else -math.inf

@@ -20,6 +20,7 @@ from malta.linearize import LinearModel
 from malta.plant import Plant
 from malta.references import Motion
 from malta.riccati import sample
+from malta.robust import robust_margin
 from malta.simulate import Scenario, simulate
 from malta.spec import Pid, Weights
 from malta.synthesize import held, lqg, pid, sampled_model
@@ -351,7 +352,7 @@ def test_margins_count_what_holding_costs() -> None:
 def test_coil_positions_make_waves_and_have_a_witness_only() -> None:
     plant, c = _plant("planar"), _controller("planar", 1)
     system, law = machine_system(plant, c, ["coil_pitch"], {"y": 0.0})
-    found = malta.robust_margin(system, law, {"coil_pitch": 0.01})
+    found = robust_margin(system, law, {"coil_pitch": 0.01})
     assert found.lower is None
     assert "neither as a polynomial" in found.reason
     assert found.upper > 1
@@ -361,7 +362,7 @@ def test_mass_inertia_and_field_of_the_planar_motor_are_proven() -> None:
     plant, c = _plant("planar"), _controller("planar", 1)
     box = {"m": 0.2, "I_x": 0.2, "I_z": 0.2, "B_r": 0.2, "r_z": 0.1}
     system, law = machine_system(plant, c, list(box), {"y": 0.0})
-    found = malta.robust_margin(system, law, box)
+    found = robust_margin(system, law, box)
     assert found.lower is not None
     assert found.lower > 1
     assert found.upper / found.lower < 1.03
@@ -497,9 +498,9 @@ def test_currents_carry_the_weight_that_there_is() -> None:
 def test_twins_that_are_both_named_move_apart() -> None:
     plant, c = _plant("planar"), _controller("planar", 1)
     system, law = machine_system(plant, c, ["I_x", "I_y"], {"y": 0.0})
-    both = malta.robust_margin(system, law, {"I_x": 0.01, "I_y": 0.2})
+    both = robust_margin(system, law, {"I_x": 0.01, "I_y": 0.2})
     system, law = machine_system(plant, c, ["I_z", "I_y"], {"y": 0.0})
-    alone = malta.robust_margin(system, law, {"I_y": 0.2})
+    alone = robust_margin(system, law, {"I_y": 0.2})
     assert both.upper <= 1.001 * alone.upper
 
 
@@ -527,7 +528,7 @@ def test_a_margin_says_where_stability_is_lost_where_the_first_guess_was_wrong()
     c = lqg(model, _weights("halbach"), 0.1, "sampled-data", 0)
     box = {"m": 0.3, "A": 0.112, "b": 0.219}
     system, law = machine_system(plant, c, list(box), {"x": 0.0})
-    found = malta.robust_margin(system, law, box)
+    found = robust_margin(system, law, box)
     assert found.lower is not None
     assert not found.exhausted
     assert found.lower < found.upper < 3.4

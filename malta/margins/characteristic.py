@@ -1,0 +1,433 @@
+"""The characteristic polynomial of a group of states, at given parameters and bounded over complex balls of them.
+
+Continuous loops:           a(s; p) = det(s I - A_cl(p)), times the denominators of the entries
+Sampled and discrete ones:  a(v; p) = (1 - v)^N det(g I - (A_cl(p) - I)),  g = z - 1 = 2 v / (1 - v)
+
+The bilinear map takes the unit circle to the imaginary axis, v = j tan(w T / 2), so that both are zero-free on
+s = jw, w from 0 to infinity, or they are not. A continuous system under a hold is sampled exactly, by the exponential.
+At given p the coefficients are exact rationals, or balls as narrow as wanted.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property, lru_cache
+from typing import Any
+
+import numpy as np
+from flint import acb, arb, arb_mat, ctx, fmpq, fmpq_mat
+
+from malta.margins.algebra import Ratio, Symbolic, evaluated, value
+from malta.margins.closed import closed_loop, coefficients, majorant_matrix, parts
+from malta.margins.expressions import BALLS, EXACT, POINTS, NotAnalytic
+from malta.margins.loop import A, B, C, D, E, Group, Loop, divided
+from malta.margins.majorant import coefficient_bounds
+from malta.margins.minors import Minors, minors
+
+
+@dataclass(frozen=True, eq=False)
+class Characteristic:
+    """The characteristic polynomial of one group of a loop."""
+
+    loop: Loop
+    group: Group
+    names: tuple[str, ...]
+    _seen: dict[Any, Any] = field(default_factory=dict, repr=False)
+
+    @property
+    def foreign(self) -> tuple[str, ...]:
+        """Operations of the model that have no enclosure."""
+        return self.loop.program.foreign
+
+    @property
+    def discrete(self) -> bool:
+        return self.loop.law.sample_time is not None
+
+    @cached_property
+    def exact(self) -> bool:
+        """Whether the coefficients are rational in p, so that their degrees are known."""
+        return self.loop.symbolic is not None and self.loop.program.rational and not self.loop.sampled
+
+    @property
+    def _coupled_descriptor(self) -> bool:
+        s = self.loop.symbolic
+        return self.loop.descriptor and s is not None and any(i != j for i, j in s.entries[E])
+
+    @cached_property
+    def inverted(self) -> tuple[bool, ...]:
+        """Parameters that enter sampled loops as polynomials of 1 / p, as masses do: interpolated in 1 / p."""
+        s = self.loop.symbolic
+        if self.exact or s is None:
+            return (False,) * len(self.names)
+        found, entries, g = [], divided(self.loop, s), set(self.group.states)
+        own = [r for (k, j), r in entries[A].items() if k in g and j in g]
+        own += [r for (k, _), r in entries[B].items() if k in g]
+        own += [r for (_, j), r in entries[C].items() if j in g]
+        own += list(entries[D].values()) if self.loop.direct else []
+        for i in range(len(self.names)):
+            powers: list[tuple[int, int | None]] = [(_degree(r.num, i), _alone(r.den, i)) for r in own]
+            below = any(den not in (0, None) for _, den in powers)
+            hidden = any(_touches(s, k, i) for k in range(len(s.atoms)))
+            polynomial = all(den is not None and num <= den for num, den in powers)
+            found.append(below and polynomial and not hidden and not self._coupled_descriptor)
+        return tuple(found)
+
+    @cached_property
+    def degrees(self) -> tuple[int | None, ...]:
+        """The degree in each parameter, an upper bound read from the entries; None where it is no polynomial."""
+        if self.exact:
+            assert self.loop.symbolic is not None
+            rows = _cleared(self.loop, self.group, self.loop.symbolic)
+            return tuple(_determinant_degree(rows, i) for i in range(len(self.names)))
+        return tuple(self._degree_beside(i) for i in range(len(self.names)))
+
+    def _degree_beside(self, i: int) -> int | None:
+        """Of a parameter that enters B and C alone, by minors (Cauchy, Binet); 0 where it does not enter."""
+        s, g, program = self.loop.symbolic, self.group, self.loop.program
+        if not any(i in on for on in program.depends):
+            return 0
+        if s is None or i in program.depends[A] or self.loop.direct or self.loop.descriptor:
+            return None if s is None or self._enters(s, i) else 0
+        if any(_touches(s, k, i) for k in range(len(s.atoms))):
+            return None
+        into = {at: r for at, r in s.entries[B].items() if at[0] in g.states}
+        out = {at: r for at, r in s.entries[C].items() if at[1] in g.states}
+        if any(r.den is not None and _degree(r.den, i) for r in (*into.values(), *out.values())):
+            return None
+        total = 0
+        for matrix in (into, out):
+            rows = [[(_degree(r.num, i), at) for at, r in matrix.items() if _degree(r.num, i)]]
+            if rows[0]:
+                order = min(len({at[0] for _, at in rows[0]}), len({at[1] for _, at in rows[0]}))
+                total += order * max(d for d, _ in rows[0])
+        return total
+
+    def _enters(self, s: Symbolic, i: int) -> bool:
+        """Whether the group's own entries depend on a parameter, atoms included."""
+        g = set(self.group.states)
+        rows: list[tuple[int, int | None]] = [(A, 0), (B, 0), (C, 1)]
+        if len(s.entries) > D:
+            rows += [(which, None) for which in range(D, len(s.entries))]
+        hidden = [s.inputs + k for k in range(len(s.atoms)) if _touches(s, k, i)]
+        for which, side in rows:
+            for at, r in s.entries[which].items():
+                if side is None or at[side] in g:
+                    for var in (i, *hidden):
+                        if _degree(r.num, var) or (r.den is not None and _degree(r.den, var)):
+                            return True
+        return False
+
+    @cached_property
+    def minors(self) -> Minors | None:
+        return minors(self.loop, self.group)
+
+    # values
+
+    def at(self, v: Sequence[Any]) -> list[Any]:
+        """a_0 ... a_N at p = v (or 1 / v where inverted), exact rationals.
+
+        Raises NotAnalytic where the matrices have no value there.
+        """
+        p = [1 / x if inverted else x for x, inverted in zip(v, self.inverted, strict=True)]
+        rational = self.loop.program.rational
+        entries = self.loop.program.run(p if rational else [arb(x) for x in p], EXACT if rational else POINTS)
+        if self.exact:
+            scale = _multiplier(self.loop, self.group, p)
+            return [c * scale for c in self._mapped(self._coefficients(entries, fmpq_mat, v))]
+        if rational:
+            entries = [[(i, j, arb(x)) for i, j, x in matrix] for matrix in entries]
+        return self._mapped(self._coefficients(entries, arb_mat, v))
+
+    def _coefficients(
+        self, entries: list[list[tuple[int, int, Any]]], matrix: Any, v: Sequence[Any]
+    ) -> list[Any]:
+        if self.minors is None:
+            driven, factor = parts(self.loop, self.group, entries, matrix)
+            return [c * factor for c in coefficients(closed_loop(*driven))]
+        key = (ctx.prec, *(v[i] for i in self._of_plant))
+        if key not in self._seen:
+            if len(self._seen) > 50_000:
+                self._seen.clear()
+            self._seen[key] = self.minors.plant(entries, matrix)
+        found = self.minors.joined(self._seen[key], self.minors.forces(entries, matrix), matrix)
+        zero = 0 * found[0]
+        return found + [zero] * (self.minors.degree + 1 - len(found))
+
+    @cached_property
+    def _of_plant(self) -> tuple[int, ...]:
+        """The parameters on which A, C and E depend."""
+        on = self.loop.program.depends
+        return tuple(sorted(frozenset().union(*(on[k] for k in (A, C, E) if k < len(on)))))
+
+    def _mapped(self, a: list[Any]) -> list[Any]:
+        return mapped(a) if self.discrete else a
+
+    # bounds
+
+    @cached_property
+    def _polynomials(self) -> tuple[dict[tuple[int, int], tuple[dict[Any, Any], dict[Any, Any] | None]], ...]:
+        """Entries as polynomials of v over polynomials without the inverted parameters."""
+        assert self.loop.symbolic is not None
+        picked = [i for i, inverted in enumerate(self.inverted) if inverted]
+        found, g = [], set(self.group.states)
+        for which, matrix in enumerate(divided(self.loop, self.loop.symbolic)[: D + 1]):
+            turned = {}
+            for at, r in matrix.items():
+                if (which in (A, B) and at[0] not in g) or (which in (A, C) and at[1] not in g):
+                    continue
+                powers = {i: _alone(r.den, i) or 0 for i in picked}
+
+                def flipped(polynomial: Any, powers: dict[int, int]) -> dict[Any, Any]:
+                    return {
+                        tuple(powers[i] - e if i in powers else e for i, e in enumerate(m)): c
+                        for m, c in polynomial.to_dict().items()
+                    }
+
+                den = None if r.den is None else flipped(r.den, powers)
+                turned[at] = flipped(r.num, powers), den
+            found.append(turned)
+        return tuple(found)
+
+    def _balls(self, v: Sequence[Any]) -> list[list[tuple[int, int, Any]]]:
+        """Entries of the matrices over balls of v."""
+        if not any(self.inverted):
+            return self.loop.program.run(v, BALLS)
+        s = self.loop.symbolic
+        assert s is not None
+        values = list(v)
+        if s.atoms:  # none of them depends on an inverted parameter
+            p = [acb(1) if inverted else x for x, inverted in zip(v, self.inverted, strict=True)]
+            steps = evaluated(self.loop.program, p)
+            values += [steps[k] for k in s.atoms]
+        powers: dict[tuple[int, int], Any] = {}
+
+        def value(polynomial: dict[Any, Any]) -> Any:
+            total = acb(0)
+            for monomial, c in polynomial.items():
+                term = acb(c)
+                for i, e in enumerate(monomial):
+                    if e:
+                        if (i, e) not in powers:
+                            powers[i, e] = values[i] ** int(e)
+                        term *= powers[i, e]
+                total += term
+            return total
+
+        return [
+            [
+                (*at, value(num) if den is None else _finite(value(num) / value(den)))
+                for at, (num, den) in matrix.items()
+            ]
+            for matrix in self._polynomials
+        ]
+
+    def neglected(
+        self, moves: Sequence[Any], sides: Sequence[tuple[Any, Any]]
+    ) -> list[tuple[float, int]] | None:
+        """Bounds of what neglected couplings (`dust`) change the coefficients by, over a box: (mantissa, exponent)."""
+        if not moves:
+            return None
+        law, total = self.loop.law, list(moves)
+        degree = len(self.group.states) + len(self.group.own)
+        acting = self.minors.rows if self.minors is not None else self._acting
+        lags = len(acting) if law.lag is not None else 0
+        if self.discrete:  # |z - a| <= 2 of a lag, |z| = 1 of stored inputs
+            degree += lags + law.delay * (self.minors.order if self.minors is not None else len(acting))
+            total = [c * 2**lags for c in total] + [arb(0)] * (degree + 1 - len(total))
+            return [pair(c) for c in outward(total)]
+        for _ in range(lags):
+            rate = arb(law.lag)
+            total = [
+                (total[j - 1] if j else 0) + (total[j] * rate if j < len(total) else 0)
+                for j in range(len(total) + 1)
+            ]
+        scale = arb(1)
+        if self.exact and self.loop.symbolic is not None:
+            p = [acb(low).union(acb(high)) for low, high in sides]
+            for den in _denominators(self.loop, self.group):
+                scale *= abs(value(den, p))
+            if self.loop.descriptor:
+                for (i, j), r in self.loop.symbolic.entries[E].items():
+                    if i == j and i in self.group.states:
+                        scale *= abs(value(r.num, p) / (1 if r.den is None else value(r.den, p)))
+        total += [arb(0)] * (degree + lags + 1 - len(total))
+        return [pair(c * scale) for c in total]
+
+    @property
+    def _acting(self) -> tuple[int, ...]:
+        """The inputs of the group's own matrix."""
+        inputs = self.group.inputs
+        return tuple(range(self.loop.program.shapes[B][1])) if inputs is None else inputs
+
+    def majorant(self, v: Sequence[Any]) -> list[tuple[float, int]]:
+        """At least |a_k| for all complex v in these balls: (mantissa, exponent) of each.
+
+        Raises NotAnalytic where the matrices are not analytic on them.
+        """
+        entries = self._balls(v)
+        if self.minors is None:
+            size = majorant_matrix(self.loop, self.group, entries)
+            product = coefficient_bounds(size, np.ones(len(size)))
+        else:
+            product = self.minors.majorant(entries)
+        return [pair(c) for c in (outward(product) if self.discrete else product)]
+
+
+def outward(product: list[Any]) -> list[Any]:
+    """Bounds of the coefficients of g -> those of v."""
+    n = len(product) - 1
+    turned = [arb(0)] * (n + 1)
+    for k, c in enumerate(product):
+        for j in range(n - k + 1):
+            turned[k + j] += c * (2**k * math.comb(n - k, j))
+    return turned
+
+
+def _finite(z: Any) -> Any:
+    if not z.is_finite():
+        raise NotAnalytic("a division by what may be zero")
+    return z
+
+
+def pair(c: Any) -> tuple[float, int]:
+    m, e = (int(i) for i in c.abs_upper().man_exp())
+    if m == 0:
+        return 0.0, 0
+    shift = max(m.bit_length() - 50, 0)
+    return float((m >> shift) + 1), e + shift
+
+
+# degrees
+
+
+def _degree(polynomial: Any, i: int) -> int:
+    return int(polynomial.degrees()[i]) if len(polynomial) else 0
+
+
+def _alone(den: Any, i: int) -> int | None:
+    """k where den is p_i^k times what has no p_i in it; None where it is not."""
+    if den is None:
+        return 0
+    powers = {monomial[i] for monomial in den.monoms()}
+    return powers.pop() if len(powers) == 1 else None
+
+
+def _touches(s: Symbolic, atom: int, i: int) -> bool:
+    """Whether a further variable depends on p_i."""
+    seen, stack = set(), [s.atoms[atom]]
+    while stack:
+        k = stack.pop()
+        if k in seen:
+            continue
+        seen.add(k)
+        name, target, operands, _ = s.program.steps[k]
+        if name == "input" and target == i:
+            return True
+        stack += operands
+    return False
+
+
+def _cleared(loop: Loop, g: Group, s: Symbolic) -> list[dict[Any, Any]]:
+    """Rows of the polynomial matrix whose determinant is a: those of x, then those of y; columns x, u, y."""
+    rows: list[dict[Any, Ratio]] = []
+    for i in g.states:
+        row: dict[Any, Ratio] = {("u", j): r for (k, j), r in s.entries[B].items() if k == i}
+        for (k, j), r in s.entries[A].items():
+            if k == i and j in g.states:
+                row["x", j] = r
+        if loop.descriptor:
+            for (k, j), r in s.entries[E].items():
+                if k == i and j in g.states:
+                    row["e", j] = r
+        rows.append(row)
+    for i in range(loop.program.shapes[C][0]):
+        row = {("x", j): r for (k, j), r in s.entries[C].items() if k == i and j in g.states}
+        if loop.direct:
+            row |= {("u", j): r for (k, j), r in s.entries[D].items() if k == i}
+        rows.append(row)
+    return [_row(row) for row in rows]
+
+
+def _row(row: dict[Any, Ratio]) -> dict[Any, Any]:
+    """Numerators over the row's common denominator, which is entry None."""
+    common = None
+    for r in row.values():
+        if r.den is None:
+            continue
+        common = r.den if common is None else common * (r.den / common.gcd(r.den))
+    found = {
+        at: r.num if common is None else r.num * (common if r.den is None else common / r.den)
+        for at, r in row.items()
+    }
+    if common is not None:
+        found[None] = common
+    return found
+
+
+def _determinant_degree(rows: list[dict[Any, Any]], i: int) -> int:
+    """An upper bound of the degree in p_i: by rows, by columns, or by the rank of what multiplies p_i."""
+    by_row = [max((_degree(entry, i) for entry in row.values()), default=0) for row in rows]
+    columns: dict[Any, int] = {}
+    for k, row in enumerate(rows):
+        for at, entry in row.items():
+            # a row's denominator stands in the column of its own s (or y)
+            place = ("own", k) if at is None else at
+            if place[0] == "e":
+                place = ("x", place[1])
+            columns[place] = max(columns.get(place, 0), _degree(entry, i))
+    bound = min(sum(by_row), sum(columns.values()))
+    if max(by_row, default=0) <= 1 and bound > 1:
+        bound = min(bound, _rank(rows, i))
+    return bound
+
+
+def _rank(rows: list[dict[Any, Any]], i: int) -> int:
+    """Rank of the coefficients of p_i where these are numbers; the number of rows that have them elsewhere."""
+    parts: list[dict[Any, Any]] = []
+    constant = True
+    for row in rows:
+        part: dict[Any, Any] = {}
+        for at, entry in row.items():
+            if _degree(entry, i):
+                slope = entry.derivative(i)
+                constant &= bool(slope.is_constant())
+                part[("own", len(parts)) if at is None else at] = slope
+        if part:
+            parts.append(part)
+    if not constant or len(parts) < 2:
+        return len(parts)
+    places = sorted({at for part in parts for at in part}, key=str)
+    table = [[part[at].leading_coefficient() if at in part else fmpq(0) for at in places] for part in parts]
+    return int(fmpq_mat(table).rank())
+
+
+@lru_cache(maxsize=64)
+def _denominators(loop: Loop, g: Group) -> tuple[Any, ...]:
+    assert loop.symbolic is not None
+    return tuple(row[None] for row in _cleared(loop, g, loop.symbolic) if None in row)
+
+
+def _multiplier(loop: Loop, g: Group, p: Sequence[Any]) -> Any:
+    found = fmpq(1)
+    for den in _denominators(loop, g):
+        found *= den(*p)
+    return found
+
+
+@lru_cache(maxsize=64)
+def _bilinear(n: int) -> Any:
+    """Coefficients of sum a_k g^k -> those of (1 - v)^n sum a_k (2 v / (1 - v))^k."""
+    table = [[fmpq(0)] * (n + 1) for _ in range(n + 1)]
+    for k in range(n + 1):
+        for j in range(n - k + 1):
+            table[k + j][k] += fmpq(2**k * math.comb(n - k, j) * (-1) ** j)
+    return fmpq_mat(table)
+
+
+def mapped(a: list[Any]) -> list[Any]:
+    table = _bilinear(len(a) - 1)
+    if isinstance(a[-1], fmpq) or isinstance(a[0], fmpq):
+        return list((table * fmpq_mat(len(a), 1, a)).entries())
+    return list((arb_mat(table) * arb_mat(len(a), 1, a)).entries())

@@ -1,0 +1,216 @@
+"""Long expressions of p written out as the short rational functions that they are.
+
+The planar motor's matrices at a place come from sums over sixteen coils: ten thousand operations that amount to
+polynomials of a few terms. Written out exactly, then rounded to doubles once, what symmetry makes zero is zero but for
+that rounding: terms below 1e-11 of the largest in their row and column are left out of the model.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import casadi as ca
+import numpy as np
+
+from malta.margins.algebra import Ratio, Symbolic, symbolic
+from malta.margins.expressions import exact, program
+
+if TYPE_CHECKING:
+    from malta.plant import FloatArray
+
+ROUNDING = 1e-11  # terms below this, relative, are rounding of the model's own arithmetic
+
+Table = dict[tuple[int, int], Ratio]
+
+
+def written_out(function: ca.Function, nominal: FloatArray) -> tuple[Symbolic, list[Table]]:
+    """The matrices of a function of one vector as exact rational functions, without terms that are rounding.
+
+    nominal : values at which terms are weighed
+    Raises TooLarge, NotAnalytic.
+    """
+    s = symbolic(program(function))
+    scales = np.concatenate([nominal, np.ones(len(s.atoms))])
+    circles = _circles(s)
+    return s, [rounded(s, {at: _turned(s, r, circles) for at, r in t.items()}, scales) for t in s.entries]
+
+
+def _circles(s: Symbolic) -> list[tuple[int, int]]:
+    """Variables that are sine and cosine of the same angle."""
+    found: dict[tuple[int, ...], dict[str, int]] = {}
+    for k, step in enumerate(s.atoms):
+        name, _, operands, _ = s.program.steps[step]
+        found.setdefault(operands, {})[name] = s.inputs + k
+    return [(pair["sin"], pair["cos"]) for pair in found.values() if {"sin", "cos"} <= set(pair)]
+
+
+def _turned(s: Symbolic, r: Ratio, circles: list[tuple[int, int]]) -> Ratio:
+    """With cos^2 as 1 - sin^2 of the same angle, so that equal expressions look alike."""
+    if not circles:
+        return r
+
+    def turn(polynomial: Any) -> Any:
+        total = s.context.constant(0)
+        gens = s.context.gens()
+        for monomial, c in polynomial.to_dict().items():
+            rest, factor = list(monomial), s.context.constant(1)
+            for sine, cosine in circles:
+                squares, rest[cosine] = divmod(int(rest[cosine]), 2)
+                factor *= (1 - gens[sine] ** 2) ** squares
+            total += s.context.from_dict({tuple(rest): c}) * factor
+        return total
+
+    return Ratio(turn(r.num), None if r.den is None else turn(r.den))
+
+
+def free_of_functions(s: Symbolic, tables: Sequence[Table]) -> bool:
+    """Whether nothing but p itself is left in the entries."""
+    for table in tables:
+        for r in table.values():
+            for polynomial in (r.num, r.den):
+                if polynomial is not None and any(any(m[s.inputs :]) for m in polynomial.monoms()):
+                    return False
+    return True
+
+
+def rounded(s: Symbolic, table: Table, nominal: FloatArray, *beside: Table) -> Table:
+    """A table without the terms that are rounding beside the largest in their row and column (of other tables)."""
+    weights = [abs(float(x)) or 1.0 for x in nominal]
+    rows: dict[int, float] = {}
+    columns: dict[int, float] = {}
+    for (i, j), r in (pair for one in (beside or (table,)) for pair in one.items()):
+        size = max(_sizes(r, weights).values(), default=0.0)
+        rows[i], columns[j] = max(rows.get(i, 0.0), size), max(columns.get(j, 0.0), size)
+    found: Table = {}
+    for (i, j), r in table.items():
+        limit = ROUNDING * math.sqrt(rows.get(i, 0.0) * columns.get(j, 0.0))
+        sizes = _sizes(r, weights)
+        kept = {m: _double(c) for m, c in r.num.to_dict().items() if sizes[m] > limit}
+        if kept:
+            num = Ratio(s.context.from_dict(kept))
+            found[i, j] = num if r.den is None else num / Ratio(_plain(s, r.den, weights))
+    return found
+
+
+def _plain(s: Symbolic, polynomial: Any, weights: list[float]) -> Any:
+    """A polynomial without the terms that are rounding beside its largest."""
+    sizes = _sizes(Ratio(polynomial), weights)
+    limit = ROUNDING * max(sizes.values())
+    return s.context.from_dict({m: _double(c) for m, c in polynomial.to_dict().items() if sizes[m] > limit})
+
+
+def _sizes(r: Ratio, weights: list[float]) -> dict[Any, float]:
+    """Of each term of the numerator, over the denominator's."""
+
+    def weigh(monomial: Sequence[int], c: Any) -> float:
+        size = abs(int(c.p) / int(c.q))
+        for e, w in zip(monomial, weights, strict=False):
+            size *= w ** int(e)
+        return size
+
+    below = 1.0 if r.den is None else sum(weigh(m, c) for m, c in r.den.to_dict().items()) or 1.0
+    return {m: weigh(m, c) / below for m, c in r.num.to_dict().items()}
+
+
+def product(one: Table, two: Table) -> Table:
+    """The product of two matrices."""
+    found: Table = {}
+    for (i, k), r in one.items():
+        for (row, j), q in two.items():
+            if k == row:
+                found[i, j] = found[i, j] + r * q if (i, j) in found else r * q
+    return found
+
+
+def difference(one: Table, two: Table) -> Table:
+    found = dict(one)
+    for at, r in two.items():
+        found[at] = found[at] - r if at in found else -r
+    return found
+
+
+def _double(c: Any) -> Any:
+    """The double next to an exact number."""
+    return exact(int(c.p) / int(c.q))
+
+
+def substituted(s: Symbolic, r: Ratio, values: Mapping[int, Ratio]) -> Ratio:
+    """r with variables replaced by rational functions."""
+
+    def turn(polynomial: Any) -> Ratio:
+        total = Ratio(s.context.constant(0))
+        for monomial, c in polynomial.to_dict().items():
+            rest = tuple(0 if i in values else e for i, e in enumerate(monomial))
+            term = Ratio(s.context.from_dict({rest: c}))
+            for i, e in enumerate(monomial):
+                if e and i in values:
+                    term = term * values[i] ** int(e)
+            total = total + term
+        return total
+
+    num = turn(r.num)
+    return num if r.den is None else num / turn(r.den)
+
+
+def solution(s: Symbolic, matrix: Table, right: Mapping[int, Ratio], n: int) -> list[Ratio]:
+    """x of M x = b, by elimination in exact rational functions; pivots with the fewest terms first.
+
+    Raises ZeroDivisionError where M is singular for all p.
+    """
+    zero = Ratio(s.context.constant(0))
+    rows = [{j: matrix[i, j] for j in range(n) if (i, j) in matrix} for i in range(n)]
+    b = [right.get(i, zero) for i in range(n)]
+    order: list[tuple[int, int]] = []
+    left = set(range(n))
+    while left:
+        choices = [(len(r.num), len(rows[i]), i, j) for i in left for j, r in rows[i].items()]
+        if not choices:
+            raise ZeroDivisionError
+        _, _, i, j = min(choices)
+        left.discard(i)
+        order.append((i, j))
+        for k in left:
+            if j not in rows[k]:
+                continue
+            share = rows[k].pop(j) / rows[i][j]
+            b[k] = b[k] - share * b[i]
+            for at, r in rows[i].items():
+                if at != j:
+                    new = rows[k].get(at, zero) - share * r
+                    rows[k].pop(at, None)
+                    if not new.is_zero():
+                        rows[k][at] = new
+    x = [zero] * n
+    for i, j in reversed(order):
+        total = b[i]
+        for at, r in rows[i].items():
+            if at != j:
+                total = total - r * x[at]
+        x[j] = total / rows[i][j]
+    return x
+
+
+def expression(r: Ratio, p: Any) -> Any:
+    """As a CasADi expression of the vector p."""
+
+    def turn(polynomial: Any) -> Any:
+        total: Any = ca.SX(0)
+        for monomial, c in polynomial.to_dict().items():
+            term: Any = ca.SX(int(c.p) / int(c.q))
+            for i, e in enumerate(monomial):
+                for _ in range(int(e)):
+                    term = term * p[i]
+            total = total + term
+        return total
+
+    return turn(r.num) if r.den is None else turn(r.num) / turn(r.den)
+
+
+def matrix_of(table: Table, shape: tuple[int, int], p: Any) -> Any:
+    """A CasADi matrix, structurally zero where the table has no entry."""
+    found = ca.SX(*shape)
+    for (i, j), r in table.items():
+        found[i, j] = expression(r, p)
+    return found

@@ -1,0 +1,251 @@
+"""A characteristic polynomial enclosed over a box of parameters: interpolated, and what that leaves out bounded.
+
+With |a_k| <= M on the disc of radius R about the middle of a side (of half width 1), interpolation of degree d at
+Chebyshev nodes leaves out at most (1 + Lambda_d) M R^-d / (R - 1): Cauchy's estimate, Lambda_d the Lebesgue constant.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from flint import acb, arb, ctx, fmpq
+
+from malta.margins.characteristic import pair
+from malta.margins.expressions import NotAnalytic, exact
+from malta.margins.family import Family, family, nodes
+
+if TYPE_CHECKING:
+    from malta.margins.problem import Polynomial
+    from malta.plant import FloatArray
+
+MOST_NODES = 20_000  # places of exact coefficients, at most
+MOST_BALLS = 6000  # places where they take an exponential
+PLENTY = 1500  # places beyond which more may be left out
+TAILS = (1e-9, 1e-7, 3e-6)  # what interpolation may leave out, relative to each coefficient
+WORST = 1e-5  # beyond which the box is cut
+HIGHEST = 16  # degree of an interpolation along one parameter
+RADII = tuple(2.0**k for k in (0.5, 1, 1.5, 2, 3, 4, 5, 6, 8, 10, 12, 14, 17, 20))
+BITS = 160
+
+
+class Unproven(Exception):
+    """Why no enclosure of the characteristic polynomial was found."""
+
+
+class TooWide(Unproven):
+    """The box is too wide along this axis for one enclosure; narrower ones may have it."""
+
+    def __init__(self, axis: int, reason: str) -> None:
+        super().__init__(reason)
+        self.axis = axis
+
+
+@contextmanager
+def precision(bits: int) -> Iterator[None]:
+    before, ctx.prec = ctx.prec, bits
+    try:
+        yield
+    finally:
+        ctx.prec = before
+
+
+@dataclass(frozen=True, eq=False)
+class Side:
+    """How one parameter's side is sampled: degree, Chebyshev nodes or uniform ones, and the bounds of the rest."""
+
+    degree: int
+    chebyshev: bool
+    tails: tuple[tuple[float, int], ...] | None
+
+
+def over_box(f: Polynomial, sides: FloatArray, moves: Sequence[Any] = (), until: float = math.inf) -> Family:
+    """The family over a box (P x 2, of p); moves: what couplings that are neglected can do (`dust`).
+
+    Raises TooWide where a narrower box may do, and Unproven.
+    """
+    if f.foreign:
+        raise Unproven(f"the model has {f.foreign[0]}, which has no enclosure")
+    low, high = _ends(f, sides)
+    with precision(BITS):
+        known = f.degrees
+        plan = _plan(f, low, high, known)
+        count = math.prod(side.degree + 1 for side in plan)
+        if count > (MOST_NODES if f.exact else MOST_BALLS):
+            axis = max(range(len(plan)), key=lambda i: plan[i].degree)
+            if plan[axis].chebyshev:
+                raise TooWide(axis, f"{count} places are too many to interpolate at")
+            raise Unproven(f"{f.names[axis]} enters with degree {plan[axis].degree}: {count} coefficients")
+    grid = [
+        [low[i] + (high[i] - low[i]) * _share(side, k) for k in range(side.degree + 1)]
+        for i, side in enumerate(plan)
+    ]
+    points = _values(f, list(itertools.product(*grid)), until)
+    tails = _added(_summed(plan), f.neglected(moves, _real(sides)))
+    return family([s.degree + 1 for s in plan], [s.chebyshev for s in plan], points, tails)
+
+
+def _real(sides: FloatArray) -> list[tuple[Any, Any]]:
+    return [(arb(a), arb(b)) for a, b in sides.tolist()]
+
+
+def _added(
+    one: list[tuple[float, int]] | None, two: list[tuple[float, int]] | None
+) -> list[tuple[float, int]] | None:
+    """Sums of bounds."""
+    if one is None or two is None:
+        return one if two is None else two
+    total = []
+    for (a, i), (b, j) in zip(one, two, strict=True):
+        top = max(i, j)
+        total.append((math.ldexp(a, max(i - top, -1000)) + math.ldexp(b, max(j - top, -1000)), top))
+    return total
+
+
+def _ends(f: Polynomial, sides: FloatArray) -> tuple[list[Any], list[Any]]:
+    """The box in v, exactly."""
+    low, high = [], []
+    for (a, b), inverted in zip(sides.tolist(), f.inverted, strict=True):
+        if inverted and a <= 0 <= b:
+            raise Unproven("a parameter that divides reaches zero")
+        ends = [exact(a), exact(b)]
+        low.append(1 / ends[1] if inverted else ends[0])
+        high.append(1 / ends[0] if inverted else ends[1])
+    return low, high
+
+
+def _share(side: Side, k: int) -> Any:
+    if side.degree == 0:
+        return fmpq(1, 2)
+    return exact(nodes(side.degree, chebyshev=True)[k]) if side.chebyshev else fmpq(k, side.degree)
+
+
+def _values(f: Polynomial, places: list[tuple[Any, ...]], until: float = math.inf) -> list[list[Any]]:
+    """Coefficients at the places, balls to 60 bits each."""
+
+    def timed(place: tuple[Any, ...]) -> list[Any]:
+        if time.monotonic() > until:
+            raise Unproven("time was up before the coefficients were found")
+        return f.at(place)
+
+    bits = BITS
+    while True:
+        try:
+            with precision(bits):
+                first = f.at(places[len(places) // 2])
+                if f.exact or bits > 8000 or all(_accurate(c) for c in first):
+                    return [timed(place) for place in places]
+        except NotAnalytic as error:
+            raise Unproven(f"the matrices have no value on the box: {error}") from error
+        bits *= 2
+
+
+def _accurate(c: Any) -> bool:
+    return bool(c.rel_accuracy_bits() >= 66) if hasattr(c, "rel_accuracy_bits") else True
+
+
+def _plan(f: Polynomial, low: list[Any], high: list[Any], known: tuple[int | None, ...]) -> list[Side]:
+    """How each side is sampled; less is left out where that takes few places."""
+    free = [i for i, d in enumerate(known) if d is None and low[i] < high[i]]
+    discs: dict[int, list[Disc]] = {}
+    if free:
+        middle = [(a + b) / 2 for a, b in zip(low, high, strict=True)]
+        (nominal,) = _values(f, [tuple(middle)])
+        size = [pair(c if hasattr(c, "abs_upper") else arb(c)) for c in nominal]
+        discs = {i: _discs(f, i, low, high, size) for i in free}
+    plan: list[Side] = []
+    for tail in TAILS:
+        plan = [
+            _interpolated(f.names[i], i, discs[i], tail) if i in discs
+            else Side(0 if low[i] == high[i] else d or 0, False, None)
+            for i, d in enumerate(known)
+        ]  # fmt: skip
+        if math.prod(side.degree + 1 for side in plan) <= PLENTY:
+            break
+    return plan
+
+
+class Disc(NamedTuple):
+    """Bounds of the coefficients on a disc about the middle of a side."""
+
+    radius: float  # in half widths of the side
+    share: float  # log2 of the largest bound over the coefficient in the middle
+    most: list[tuple[float, int]]
+
+
+def _discs(
+    f: Polynomial, i: int, low: list[Any], high: list[Any], size: list[tuple[float, int]]
+) -> list[Disc]:
+    """Bounds over growing discs along one parameter, as far as the matrices are analytic.
+
+    Raises TooWide where they are not even a little beyond the side.
+    """
+    found: list[Disc] = []
+    for radius in RADII:
+        balls = []
+        for k, (a, b) in enumerate(zip(low, high, strict=True)):
+            middle, half = arb((a + b) / 2), arb((b - a) / 2)
+            if k == i:
+                room = arb(0, float((half * radius).upper()) * (1 + 1e-12))
+                balls.append(acb(middle + room, room))
+            else:
+                balls.append(acb(middle + arb(0, float(half.upper()) * (1 + 1e-12))))
+        try:
+            most = f.majorant(balls)
+        except NotAnalytic as error:
+            if not found:
+                raise TooWide(i, f"{f.names[i]}: {error}") from error
+            break
+        found.append(
+            Disc(radius, max(_log2(m) - _log2(s) for m, s in zip(most, size, strict=True) if s[0] > 0), most)
+        )
+    return found
+
+
+def _interpolated(name: str, axis: int, discs: list[Disc], tail: float) -> Side:
+    """The lowest degree whose tail is small enough, by any of the discs; or the smallest tail there is."""
+    best, best_rank = None, (True, 0, math.inf)
+    for radius, share, most in discs:
+        rest = share + 3 - math.log2(radius - 1)
+        wanted = math.ceil((rest - math.log2(tail)) / math.log2(radius))
+        degree = max(1, min(wanted, HIGHEST))
+        left = rest - degree * math.log2(radius)
+        enough = left <= math.log2(tail)
+        rank = (not enough, degree if enough else 0, left)
+        if best is None or rank < best_rank:
+            scale = 3.5 * radius**-degree / (radius - 1)
+            best = Side(degree, True, tuple((m * scale, e) for m, e in most))
+            best_rank = rank
+    assert best is not None
+    if best_rank[2] > math.log2(WORST):
+        raise TooWide(axis, f"{name}: its range is too wide for one expansion")
+    return best
+
+
+def _log2(pair: tuple[float, int]) -> float:
+    return math.log2(pair[0]) + pair[1] if pair[0] > 0 else -math.inf
+
+
+def _summed(plan: list[Side]) -> list[tuple[float, int]] | None:
+    """Tails of all axes; each with the Lebesgue constants of those before it, below 3."""
+    parts = [(side.tails, 3.0**k) for k, side in enumerate(s for s in plan if s.tails is not None)]
+    if not parts:
+        return None
+    total = []
+    for pairs in zip(*(tails for tails, _ in parts if tails is not None), strict=True):
+        top = max(e for _, e in pairs)
+        total.append(
+            (
+                sum(
+                    math.ldexp(m * growth, max(e - top, -1000))
+                    for (m, e), (_, growth) in zip(pairs, parts, strict=True)
+                ),
+                top,
+            )
+        )
+    return total

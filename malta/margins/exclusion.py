@@ -1,0 +1,253 @@
+"""Branch and bound: a characteristic polynomial has no zero at any frequency on the box.
+
+A cell is an interval of frequency and a part of the box. On it f lies in the convex hull of the Bernstein coefficients
+of its expansion, widened by radii; where all of that lies in an open half plane Re(conj(c) f) > 0, zero is excluded,
+c is the cell's witness. Other cells are split. Cells are taken in the order of the smallest margin t of any point in
+them, so that `lower`, the smallest t of a cell that is still open, only grows: it is true whenever the clock stops.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from malta.margins.family import Family, restrict
+from malta.margins.frequency import Expansion, cover, expand
+
+if TYPE_CHECKING:
+    from malta.plant import ComplexArray, FloatArray
+
+GUARD = 1e-9  # rad that a half plane must have to spare
+BATCH = 1024
+STUCK = 14  # splits beyond the first of a cell that holds a candidate for the witness
+
+
+@dataclass(frozen=True, eq=False)
+class Growth:
+    """Where u in [0, 1]^P lies in the boxes that grow with t: nominal - t down <= p <= nominal + t up.
+
+    p = v or 1 / v (inverted), v = low + (high - low) u. Axes with neither down nor up do not grow.
+    """
+
+    low: FloatArray
+    high: FloatArray
+    inverted: tuple[bool, ...]
+    nominal: FloatArray
+    down: FloatArray
+    up: FloatArray
+
+    @property
+    def grows(self) -> FloatArray:
+        return np.asarray(self.down + self.up > 0)
+
+    def parameters(self, u: FloatArray) -> FloatArray:
+        """p at u: ... x P."""
+        v = self.low + (self.high - self.low) * u
+        return np.asarray(np.where(self.inverted, 1 / np.where(self.inverted, v, 1), v))
+
+    def slopes(self, u: FloatArray) -> FloatArray:
+        """dp / du at u: P."""
+        v = self.low + (self.high - self.low) * u
+        return np.asarray(
+            (self.high - self.low) * np.where(self.inverted, -1 / np.where(self.inverted, v, 1) ** 2, 1)
+        )
+
+    def shares(self, p: FloatArray) -> FloatArray:
+        """u at p, within the box."""
+        v = np.where(self.inverted, 1 / np.where(self.inverted, p, 1), p)
+        width = np.where(self.high > self.low, self.high - self.low, 1)
+        return np.asarray(np.clip(np.where(self.high > self.low, (v - self.low) / width, 0.5), 0, 1))
+
+    def margin(self, p: FloatArray) -> FloatArray:
+        """The smallest t with p in box(t): ... -> ..."""
+        moved = p - self.nominal
+        with np.errstate(divide="ignore", invalid="ignore"):
+            t = np.where(moved > 0, moved / self.up, np.where(moved < 0, -moved / self.down, 0))
+        return np.asarray(np.where(self.grows, t, 0).max(axis=-1, initial=0.0))
+
+    def smallest(self, boxes: FloatArray) -> FloatArray:
+        """The smallest t of any point of each box (cells x P x 2)."""
+        a, b = self.parameters(boxes[..., 0]), self.parameters(boxes[..., 1])
+        return self.margin(np.clip(self.nominal, np.minimum(a, b), np.maximum(a, b)))
+
+
+@dataclass(frozen=True, eq=False)
+class Cell:
+    """Where zero was not excluded: an interval of frequency and a part of the box."""
+
+    branch: int
+    interval: tuple[float, float]
+    box: FloatArray  # P x 2
+    smallest: float
+
+
+@dataclass(eq=False)
+class Search:
+    """Open and finished cells of one family. `lower`: zero is excluded on every box(t) with t below it."""
+
+    family: Family
+    growth: Growth
+    cells: FloatArray
+    boxes: FloatArray
+    smallest: FloatArray
+    depth: FloatArray
+    target: float
+    count: int = 0
+    done: list[tuple[FloatArray, FloatArray, ComplexArray]] = field(default_factory=list)
+
+    @property
+    def lower(self) -> float:
+        return float(min(self.smallest.min(initial=np.inf), self.target))
+
+    @property
+    def finished(self) -> bool:
+        return not (self.smallest < self.target).any()
+
+    def excluded(self, axes: int) -> tuple[FloatArray, FloatArray, ComplexArray]:
+        """Cells from which zero is excluded: intervals, boxes, directions."""
+        if not self.done:
+            return np.zeros((0, 3)), np.zeros((0, axes, 2)), np.zeros(0, dtype=complex)
+        cells, boxes, c = zip(*self.done, strict=True)
+        return np.vstack(cells), np.vstack(boxes), np.concatenate(c)
+
+    def first(self) -> Cell | None:
+        """The open cell of smallest t."""
+        if not len(self.cells):
+            return None
+        k = int(self.smallest.argmin())
+        b, lo, hi = self.cells[k]
+        return Cell(int(b), (float(lo), float(hi)), self.boxes[k], float(self.smallest[k]))
+
+    def hardest(self) -> Cell | None:
+        """The open cell of smallest t that has been split the most, if it looks stuck."""
+        stuck = (self.depth >= STUCK) & (self.smallest < self.target)
+        if not stuck.any():
+            return None
+        k = int(np.lexsort((-self.depth, np.where(stuck, self.smallest, np.inf)))[0])
+        b, lo, hi = self.cells[k]
+        return Cell(int(b), (float(lo), float(hi)), self.boxes[k], float(self.smallest[k]))
+
+
+def start(family: Family, growth: Growth, target: float) -> Search:
+    cells = cover(family)
+    boxes = np.tile([0.0, 1.0], (len(cells), len(family.shape), 1))
+    zero = np.zeros(len(cells))
+    return Search(family, growth, cells, boxes, growth.smallest(boxes), zero, target)
+
+
+def advance(s: Search) -> None:
+    """Take a batch of open cells of the smallest t: exclude zero from them, or split them."""
+    batch = s.smallest < s.target
+    if not batch.any():
+        return
+    most = max(16, min(BATCH, 4_000_000 // max(1, s.family.values.shape[1] * 8)))
+    if batch.sum() > most:
+        order = np.argpartition(s.smallest, most)
+        batch = np.zeros(len(s.cells), dtype=bool)
+        batch[order[:most]] = True
+    cells, boxes, depth = s.cells[batch], s.boxes[batch], s.depth[batch]
+    s.cells, s.boxes, s.smallest, s.depth = (
+        s.cells[~batch],
+        s.boxes[~batch],
+        s.smallest[~batch],
+        s.depth[~batch],
+    )
+    s.count += len(cells)
+    terms, radius = on_boxes(s.family, cells, boxes)
+    c = half_plane(terms, radius)
+    good = c != 0
+    if good.any():
+        s.done.append((cells[good], boxes[good], c[good]))
+    bad = ~good
+    if bad.any():
+        _split(s, cells[bad], boxes[bad], depth[bad], [t[bad] for t in terms], radius[bad])
+
+
+def on_boxes(f: Family, cells: FloatArray, boxes: FloatArray) -> tuple[list[ComplexArray], FloatArray]:
+    """The expansion of each cell with its coefficients over the cell's own box."""
+    unique, index = np.unique(cells, axis=0, return_inverse=True)
+    with np.errstate(over="ignore", invalid="ignore"):
+        e: Expansion = expand(f, unique)
+        index = index.ravel()
+        terms = [np.asarray(restrict(t[index], f.shape, boxes)) for t in e.terms]
+    return terms, e.radius[index]
+
+
+def half_plane(terms: list[ComplexArray], radius: FloatArray) -> ComplexArray:
+    """c of unit size with Re(conj(c) f) > 0 on the cell; zero where none was found."""
+    b0, b1 = terms[:2]
+    beside = (
+        radius[:, None] + sum(np.abs(b) for b in terms[2:]) + 1e-14 * np.abs(b0).max(axis=1, keepdims=True)
+    )
+    points = np.concatenate([b0 - b1, b0 + b1], axis=1)
+    radii = np.concatenate([beside, beside], axis=1)
+    size = np.abs(points)
+    fine = np.isfinite(radii).all(axis=1) & (size > radii).all(axis=1)
+    c = np.zeros(len(points), dtype=complex)
+    if not fine.any():
+        return c
+    points, radii, size = points[fine], radii[fine], size[fine]
+    middle = (points / size).mean(axis=1, keepdims=True)
+    middle = np.where(np.abs(middle) > 1e-3, middle / np.maximum(np.abs(middle), 1e-3), 1)
+    angle = np.angle(points * np.conj(middle))
+    half = np.arcsin(radii / size)
+    high, low = (angle + half).max(axis=1), (angle - half).min(axis=1)
+    c[fine] = np.where(high - low < np.pi - GUARD, np.exp(0.5j * (high + low)) * middle[:, 0], 0)
+    c[fine] = np.where(np.abs(c[fine]) > 0, c[fine] / np.maximum(np.abs(c[fine]), 0.5), 0)
+    return c
+
+
+def _split(
+    s: Search,
+    cells: FloatArray,
+    boxes: FloatArray,
+    depth: FloatArray,
+    terms: list[ComplexArray],
+    radius: FloatArray,
+) -> None:
+    """Each cell in two, across what moves f most: frequency, or a parameter."""
+    shape = s.family.shape
+    count = terms[0].shape[1]
+    width = (
+        np.abs(terms[1]).sum(axis=1) + sum(2 * np.abs(t).sum(axis=1) for t in terms[2:]) + 2 * radius * count
+    )
+    moves = [np.where(np.isfinite(width), width, np.inf)]
+    values = terms[0].reshape(-1, *shape)
+    for axis, size in enumerate(shape):
+        if size == 1:
+            moves.append(np.zeros(len(cells)))
+            continue
+        ends = np.take(values, size - 1, axis=axis + 1) - np.take(values, 0, axis=axis + 1)
+        inner = np.abs(np.diff(values, axis=axis + 1)).reshape(len(cells), -1).sum(axis=1) * (
+            1.0 if size > 2 else 0
+        )
+        moves.append(
+            0.5 * np.maximum(np.abs(ends).reshape(len(cells), -1).sum(axis=1) * size, inner * size / 2)
+        )
+    choice = np.argmax(np.array(moves), axis=0)
+    new_cells, new_boxes, new_depth = [], [], []
+    for axis in np.unique(choice):
+        k = choice == axis
+        for side in (0, 1):
+            c, b = cells[k].copy(), boxes[k].copy()
+            if axis == 0:
+                c[:, 2 - side] = c[:, 1:].mean(axis=1)
+            else:
+                b[:, axis - 1, 1 - side] = _middle(b[:, axis - 1], s.growth, axis - 1)
+            new_cells.append(c)
+            new_boxes.append(b)
+            new_depth.append(depth[k] + 1)
+    c, b = np.vstack(new_cells), np.vstack(new_boxes)
+    s.cells, s.boxes = np.vstack([s.cells, c]), np.vstack([s.boxes, b])
+    s.smallest = np.concatenate([s.smallest, s.growth.smallest(b)])
+    s.depth = np.concatenate([s.depth, *new_depth])
+
+
+def _middle(sides: FloatArray, growth: Growth, axis: int) -> FloatArray:
+    """Where to split: the nominal value first, so that parts away from it need no proof at small t."""
+    low, high = sides[:, 0], sides[:, 1]
+    c = float(growth.shares(growth.nominal)[axis])
+    inside = (low < c) & (c < high) & (high - low == 1.0)
+    return np.asarray(np.where(inside & growth.grows[axis], c, (low + high) / 2))

@@ -1,0 +1,252 @@
+"""A CasADi function's instructions, walked in whatever arithmetic is asked for.
+
+The same straight-line program is evaluated on exact rationals (a point), on polynomials (structure), and on complex
+balls (a bound over a whole box, complex neighbourhoods included). What an arithmetic cannot do it refuses by raising
+`NotAnalytic` with the operation's name.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import casadi as ca
+from flint import acb, arb, fmpq
+
+from malta.errors import InputError
+
+NAMES = {getattr(ca, name): name.removeprefix("OP_").lower() for name in dir(ca) if name.startswith("OP_")}
+FIELD: dict[str, Callable[..., Any]] = {  # operations of any field
+    "assign": lambda a: a,
+    "add": lambda a, b: a + b,
+    "sub": lambda a, b: a - b,
+    "mul": lambda a, b: a * b,
+    "div": lambda a, b: a / b,
+    "neg": lambda a: -a,
+    "sq": lambda a: a * a,
+    "twice": lambda a: a + a,
+    "inv": lambda a: 1 / a,
+}
+
+
+class NotAnalytic(Exception):
+    """An operation that has no value, or is not analytic, where it was asked for."""
+
+
+def exact(x: float) -> Any:
+    """The rational number that a float is."""
+    if not abs(x) < float("inf"):
+        raise NotAnalytic("a constant that is not finite")
+    return fmpq(*float(x).as_integer_ratio())
+
+
+@dataclass(frozen=True, eq=False)
+class Program:
+    """Matrices of scalar expressions in p: instructions (operation, target, operands, constant) on numbered cells."""
+
+    steps: tuple[tuple[str, int, tuple[int, ...], float], ...]
+    entries: tuple[tuple[tuple[int, int, int], ...], ...]  # of each matrix: row, column, step that made it
+    shapes: tuple[tuple[int, int], ...]
+    inputs: int
+
+    @cached_property
+    def rational(self) -> bool:
+        """Whether p enters by +, -, *, / and whole powers alone."""
+        return all(
+            name in FIELD or name in ("const", "input") or (name == "constpow" and value == round(value))
+            for name, _, _, value in self.steps
+        )
+
+    @cached_property
+    def foreign(self) -> tuple[str, ...]:
+        """Operations that have no complex extension: if_else, abs, floor, ..."""
+        return tuple(sorted({name for name, *_ in self.steps if name not in KNOWN}))
+
+    @cached_property
+    def depends(self) -> tuple[frozenset[int], ...]:
+        """Of each matrix, the parameters that it depends on."""
+        on: list[frozenset[int]] = []
+        for name, target, operands, _ in self.steps:
+            if name == "input":
+                on.append(frozenset({target}))
+            else:
+                on.append(frozenset().union(*(on[k] for k in operands)))
+        return tuple(frozenset().union(*(on[k] for _, _, k in entries)) for entries in self.entries)
+
+    def run(self, p: Sequence[Any], field: Arithmetic) -> list[list[tuple[int, int, Any]]]:
+        """Entries (row, column, value) of each matrix at p; those that are structurally zero are left out."""
+        cells: list[Any] = []
+        for name, target, operands, value in self.steps:
+            if name == "input":
+                cells.append(p[target])
+            elif name == "const":
+                cells.append(field.constant(value))
+            else:
+                cells.append(field.apply(name, [cells[k] for k in operands], value))
+        return [[(i, j, cells[k]) for i, j, k in entries] for entries in self.entries]
+
+
+class Arithmetic:
+    """Field operations of its numbers, and a table of others."""
+
+    def __init__(self, constant: Callable[[float], Any], others: dict[str, Callable[..., Any]]) -> None:
+        self.constant = constant
+        self.others = others
+
+    def apply(self, name: str, operands: list[Any], value: float) -> Any:
+        try:
+            if name in FIELD:
+                return FIELD[name](*operands)
+            if name == "constpow":
+                return self._power(operands[0], value)
+            if name in self.others:
+                return self.others[name](*operands)
+        except ZeroDivisionError as error:
+            raise NotAnalytic("a division by zero") from error
+        raise NotAnalytic(name)
+
+    def _power(self, base: Any, exponent: float) -> Any:
+        if exponent == round(exponent):
+            k = int(exponent)
+            return base**k if k >= 0 else 1 / base ** (-k)
+        if "pow" not in self.others:
+            raise NotAnalytic("pow")
+        return self.others["pow"](base, self.constant(exponent))
+
+
+def _off_the_cut(z: Any) -> Any:
+    """z, where its ball keeps off the negative real axis and zero."""
+    if z.imag.contains(0) and not z.real > 0:
+        raise NotAnalytic("a root or logarithm at zero or below")
+    return z
+
+
+def _within_unit(z: Any) -> Any:
+    if not abs(z) < 1:
+        raise NotAnalytic("an inverse sine or tangent beyond 1")
+    return z
+
+
+def _finite(z: Any) -> Any:
+    if not z.is_finite():
+        raise NotAnalytic("a division by what may be zero")
+    return z
+
+
+_BALLS: dict[str, Callable[..., Any]] = {
+    "sin": lambda z: z.sin(),
+    "cos": lambda z: z.cos(),
+    "tan": lambda z: _finite(z.sin() / z.cos()),
+    "exp": lambda z: z.exp(),
+    "expm1": lambda z: z.exp() - 1,
+    "sinh": lambda z: z.sinh(),
+    "cosh": lambda z: z.cosh(),
+    "tanh": lambda z: _finite(z.sinh() / z.cosh()),
+    "sqrt": lambda z: _off_the_cut(z).sqrt(),
+    "log": lambda z: _off_the_cut(z).log(),
+    "log1p": lambda z: _off_the_cut(z + 1).log(),
+    "pow": lambda z, w: (_off_the_cut(z).log() * w).exp(),
+    "asin": lambda z: _within_unit(z).asin(),
+    "acos": lambda z: _within_unit(z).acos(),
+    "atan": lambda z: _within_unit(z).atan(),
+    "hypot": lambda a, b: _off_the_cut(a * a + b * b).sqrt(),
+}
+_POINTS = _BALLS | {  # on the real axis no branch is near
+    "atan": lambda x: x.atan(),
+    "asin": lambda x: x.asin(),
+    "acos": lambda x: x.acos(),
+}
+KNOWN = frozenset({*FIELD, *_BALLS, "const", "input", "constpow"})
+EXACT = Arithmetic(exact, {})
+
+
+def _real(x: float) -> Any:
+    exact(x)
+    return arb(x)
+
+
+def _ball(x: float) -> Any:
+    exact(x)
+    return acb(x)
+
+
+class _Checked(Arithmetic):
+    """Balls: a quotient must be finite."""
+
+    def apply(self, name: str, operands: list[Any], value: float) -> Any:
+        found = super().apply(name, operands, value)
+        return _finite(found) if name in ("div", "inv", "constpow", "pow") else found
+
+
+def _at_points(functions: dict[str, Callable[..., Any]]) -> dict[str, Callable[..., Any]]:
+    """Functions of real balls by those of complex ones: real where the argument is."""
+
+    def wrapped(function: Callable[..., Any]) -> Callable[..., Any]:
+        return lambda *z: function(*(acb(x) for x in z)).real
+
+    return {name: wrapped(function) for name, function in functions.items()}
+
+
+POINTS = _Checked(_real, _at_points(_POINTS))
+BALLS = _Checked(_ball, _BALLS)
+
+
+def program(function: ca.Function) -> Program:
+    """The instructions of a function p -> matrices.
+
+    Raises InputError where the function calls others that cannot be written out, as interpolation tables are.
+    """
+    try:
+        flat = function.expand() if not function.is_a("SXFunction") else function
+    except RuntimeError as error:
+        raise InputError(
+            "uncertain", function.name(), "calls of functions that cannot be written out", "plain expressions"
+        ) from error
+    made: dict[int, int] = {}  # work cell of CasADi -> our step
+    steps: list[tuple[str, int, tuple[int, ...], float]] = []
+    outputs: dict[tuple[int, int], int] = {}
+    arity = dict.fromkeys(("assign", "neg", "sq", "twice", "inv", "constpow"), 1)
+    for k in range(flat.n_instructions()):
+        op, source, target = flat.instruction_id(k), flat.instruction_input(k), flat.instruction_output(k)
+        name = NAMES[op]
+        if name == "output":
+            outputs[target[0], target[1]] = made[source[0]]
+            continue
+        if name == "input":
+            steps.append((name, source[1], (), 0.0))
+        elif name == "const":
+            steps.append((name, 0, (), flat.instruction_constant(k)))
+        elif name == "constpow":
+            exponent = steps[made[source[1]]] if len(source) > 1 else None
+            value = exponent[3] if exponent is not None else flat.instruction_constant(k)
+            steps.append((name, 0, (made[source[0]],), value))
+        else:
+            steps.append(_step(name, [made[i] for i in source[: arity.get(name, len(source))]], steps))
+        made[target[0]] = len(steps) - 1
+    entries = []
+    for n in range(flat.n_out()):
+        pattern = flat.sparsity_out(n)
+        rows, columns = pattern.get_triplet()
+        entries.append(
+            tuple(
+                (i, j, outputs[n, k])
+                for k, (i, j) in enumerate(zip(rows, columns, strict=True))
+                if (n, k) in outputs and not _is_zero(steps[outputs[n, k]])
+            )
+        )
+    shapes = tuple(flat.size_out(n) for n in range(flat.n_out()))
+    return Program(tuple(steps), tuple(entries), shapes, flat.size1_in(0))
+
+
+def _step(
+    name: str, operands: list[int], steps: list[tuple[str, int, tuple[int, ...], float]]
+) -> tuple[str, int, tuple[int, ...], float]:
+    if name == "pow" and steps[operands[1]][0] == "const":
+        return ("constpow", 0, (operands[0],), steps[operands[1]][3])
+    return (name, 0, tuple(operands), 0.0)
+
+
+def _is_zero(step: tuple[str, int, tuple[int, ...], float]) -> bool:
+    return step[0] == "const" and step[3] == 0.0

@@ -1,0 +1,215 @@
+"""A characteristic polynomial over a box of parameters: a(s; p) = sum_k a_k(p) s^k.
+
+Each a_k is a Bernstein polynomial in p over the box, with a radius for what that polynomial leaves out (rounding,
+truncation, couplings taken as zero). The coefficients of different k spread over hundreds of decades, so each k has a
+power of two of its own, and s counts in a power of two: nothing here has a unit, and no scale changes an answer.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from malta.plant import FloatArray
+
+EPS = 2.0**-52
+
+
+@dataclass(frozen=True, eq=False)
+class Family:
+    """a_k(p) = 2^exponents[k] (sum_b values[k, b] B_b(u) +- radius[k]), with u = (p - low) / (high - low) in [0, 1].
+
+    values : (n + 1) x nodes; shape: (d_1 + 1, ..., d_P + 1), of which nodes is the product
+    scale : s counts in 2^scale, so a(s) = sum_k a_k (s / 2^scale)^k
+    """
+
+    shape: tuple[int, ...]
+    values: FloatArray
+    radius: FloatArray
+    exponents: tuple[int, ...]
+    scale: int
+
+    @property
+    def degree(self) -> int:
+        return len(self.values) - 1
+
+    def size(self) -> FloatArray:
+        """The largest |a_k| over the box, in units of 2^exponents[k]."""
+        return np.asarray(np.abs(self.values).max(axis=1) + self.radius)
+
+
+def nodes(degree: int, *, chebyshev: bool = False) -> list[float]:
+    """Where a polynomial of this degree on [0, 1] is sampled."""
+    if degree == 0:
+        return [0.5]
+    if chebyshev:
+        return [0.5 - 0.5 * math.cos(math.pi * (i + 0.5) / (degree + 1)) for i in range(degree + 1)]
+    return [i / degree for i in range(degree + 1)]
+
+
+@lru_cache(maxsize=64)
+def to_bernstein(degree: int, chebyshev: bool) -> Any:
+    """Values at the nodes -> Bernstein coefficients, exactly."""
+    from flint import fmpq, fmpq_mat
+
+    u = [fmpq(*x.as_integer_ratio()) for x in nodes(degree, chebyshev=chebyshev)]
+    if degree and not chebyshev:
+        u = [fmpq(i, degree) for i in range(degree + 1)]
+    one = fmpq(1)
+    rows = [[math.comb(degree, k) * x**k * (one - x) ** (degree - k) for k in range(degree + 1)] for x in u]
+    return fmpq_mat(rows).inv()
+
+
+def binary(x: Any) -> tuple[float, float, int]:
+    """An exact rational or a real ball as (mantissa, radius, exponent): x = (mantissa +- radius) 2^exponent."""
+    if hasattr(x, "rad"):
+        if not x.is_finite():
+            return 0.0, math.inf, 0
+        m, e = (int(v) for v in x.mid().man_exp())
+        shift = m.bit_length() - 60 if m else 0
+        value = float(m >> shift if shift > 0 else m)
+        exponent = e + max(shift, 0)
+        rm, re = (int(v) for v in x.rad().man_exp())
+        radius = math.ldexp(rm, min(re - exponent, 900)) if rm else 0.0
+        cut = 1.0 if shift > 0 else 0.0  # digits that were shifted out
+        return value, radius + abs(value) * EPS + cut, exponent
+    p, q = int(x.p), int(x.q)
+    if p == 0:
+        return 0.0, 0.0, 0
+    exponent = p.bit_length() - q.bit_length()
+    value = p / (q << exponent) if exponent >= 0 else (p << -exponent) / q
+    return value, abs(value) * EPS, exponent
+
+
+def family(
+    shape: Sequence[int], chebyshev: Sequence[bool], points: list[list[Any]], tails: Any = None
+) -> Family:
+    """The family through exact values (rationals or balls): points[node][k] = a_k at the tensor grid's nodes.
+
+    tails : bound of what a_k has beyond these degrees, for each k as (mantissa, exponent), where not polynomial
+    """
+    count = len(points[0])
+    table = np.empty((len(points), count), dtype=object)
+    for b, row in enumerate(points):
+        table[b] = row
+    for axis, (n, cheb) in enumerate(zip(shape, chebyshev, strict=True)):
+        if n > 2 or (cheb and n > 1):
+            table = _transformed(table, tuple(shape), axis, to_bernstein(n - 1, cheb))
+    mantissas, radii, powers = (np.zeros((count, len(points))) for _ in range(3))
+    for (b, k), x in np.ndenumerate(table):
+        mantissas[k, b], radii[k, b], powers[k, b] = binary(x)
+    sizes = np.where(
+        mantissas == 0, -np.inf, powers + np.log2(np.abs(np.where(mantissas == 0, 1, mantissas)))
+    )
+    top = sizes.max(axis=1)
+    scale = _scale(top)
+    exponents = [int(np.ceil(t)) if np.isfinite(t) else 0 for t in top]
+    shift = np.clip(powers - np.array(exponents)[:, None], -1020, 1020).astype(int)
+    values, radius = np.ldexp(mantissas, shift), np.ldexp(radii, shift).max(axis=1)
+    if tails is not None:
+        radius = radius + [
+            math.ldexp(m, max(min(e - x, 1000), -1020)) for (m, e), x in zip(tails, exponents, strict=True)
+        ]
+    moved = tuple(e + scale * k for k, e in enumerate(exponents))
+    return _reduced(Family(tuple(shape), values, np.asarray(radius), moved, scale))
+
+
+def _transformed(table: Any, shape: tuple[int, ...], axis: int, M: Any) -> Any:
+    """An exact matrix along one parameter of a tensor of exact values."""
+    from flint import arb_mat, fmpq, fmpq_mat
+
+    kind = fmpq_mat if all(isinstance(x, fmpq) for x in table.ravel().tolist()) else arb_mat
+    n, count = shape[axis], table.shape[1]
+    array = np.moveaxis(table.reshape(*shape, count), axis, 0)
+    rest = array.shape[1:]
+    flat = array.reshape(n, -1)
+    product = kind(M) * kind(n, flat.shape[1], flat.ravel().tolist())
+    made = np.empty(flat.size, dtype=object)
+    made[:] = product.entries()
+    return np.moveaxis(made.reshape(n, *rest), 0, axis).reshape(-1, count)
+
+
+def _scale(top: FloatArray) -> int:
+    """The power of two that s counts in: the geometric mean of the roots' sizes."""
+    known = np.flatnonzero(np.isfinite(top))
+    if len(known) < 2:
+        return 0
+    first, last = known[0], known[-1]
+    return round(float(top[first] - top[last]) / int(last - first))
+
+
+def _reduced(f: Family) -> Family:
+    """Degrees that contribute less than rounding become part of the radius."""
+    shape, values, radius = list(f.shape), f.values, f.radius.copy()
+    size = np.abs(values).max(axis=1)
+    for axis, count in enumerate(f.shape):
+        d = count - 1
+        while d > 0:
+            array = np.moveaxis(values.reshape(len(values), *shape), axis + 1, -1)
+            signs = np.array([(-1) ** (d - i) * math.comb(d, i) for i in range(d + 1)], dtype=float)
+            lead = np.abs(array @ signs).reshape(len(values), -1).max(axis=1)  # of u^d
+            # u^d less its best approximation of a lower degree is below 2^(1 - 2 d) on [0, 1]
+            if not (lead * 2.0 ** (1 - 2 * d) <= 64 * EPS * 4**d * size).all():
+                break
+            array, error = _lowered(array, d)
+            values = np.moveaxis(array, -1, axis + 1).reshape(len(values), -1)
+            shape[axis] = d
+            radius += error
+            d -= 1
+    return Family(tuple(shape), values, radius, f.exponents, f.scale)
+
+
+def _lowered(array: FloatArray, d: int) -> tuple[FloatArray, FloatArray]:
+    """Bernstein coefficients of degree d -> d - 1, and what that leaves out: the degree raised again, compared."""
+    raise_ = np.zeros((d + 1, d))
+    for i in range(d):
+        raise_[i, i] = (d - i) / d
+        raise_[i + 1, i] = (i + 1) / d
+    lower = np.linalg.pinv(raise_)
+    new = array @ lower.T
+    left = np.abs(array - new @ raise_.T).reshape(len(array), -1).max(axis=1)
+    return new, left + 8 * d * EPS * np.abs(array).reshape(len(array), -1).max(axis=1)
+
+
+def basis(degree: int, u: FloatArray) -> FloatArray:
+    """Bernstein polynomials at u: ... x (degree + 1)."""
+    i = np.arange(degree + 1)
+    binomial = np.array([math.comb(degree, int(k)) for k in i], dtype=float)
+    u = np.asarray(u)[..., None]
+    return np.asarray(binomial * u**i * (1 - u) ** (degree - i))
+
+
+def restriction(degree: int, low: FloatArray, high: FloatArray) -> FloatArray:
+    """Bernstein coefficients over [0, 1] -> over [low, high]: cells x (d + 1) x (d + 1), no entry negative.
+
+    Row i holds the blossom at (d - i) times low and i times high.
+    """
+    M = np.zeros((len(low), degree + 1, degree + 1))
+    for i in range(degree + 1):
+        a, b = basis(degree - i, low), basis(i, high)
+        for j in range(degree - i + 1):
+            M[:, i, j : j + i + 1] += a[:, j, None] * b
+    return M
+
+
+def restrict(values: Any, shape: tuple[int, ...], boxes: FloatArray) -> Any:
+    """Cells x nodes over [0, 1]^P -> over each cell's box (cells x P x 2)."""
+    for axis, count in enumerate(shape):
+        if count == 1:
+            continue
+        low, high = boxes[:, axis, 0], boxes[:, axis, 1]
+        if (low == 0).all() and (high == 1).all():
+            continue
+        M = restriction(count - 1, low, high)
+        array = np.moveaxis(values.reshape(len(values), *shape), axis + 1, -1)
+        flat = array.reshape(len(values), -1, count)
+        values = np.moveaxis((flat @ M.swapaxes(1, 2)).reshape(array.shape), -1, axis + 1).reshape(
+            len(values), -1
+        )
+    return values

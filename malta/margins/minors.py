@@ -1,0 +1,295 @@
+"""The characteristic polynomial by minors (Cauchy, Binet): what does not depend on p is computed once.
+
+    d_P d_F det(I - F P) = sum_k (-1)^k sum_(S, R, T) pi_SR  beta_RT  kappa_TS        |S| = |R| = |T| = k
+
+P = X B, X from forces on the rows R of the state equations to the outputs S; pi_SR = d_P det X[S, R] and
+kappa_TS = d_F det F[T, S] are polynomials, beta_RT = det B[R, T] numbers. A delay of d samples is z^-d of P.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from flint import acb_mat, arb, arb_mat, arb_poly, fmpq_mat, fmpq_poly
+
+from malta.margins.closed import (
+    beside,
+    columns,
+    dense,
+    driven_bounds,
+    hold,
+    lagged,
+    rows_of,
+    solved,
+)
+from malta.margins.expressions import exact
+from malta.margins.loop import A, B, C, E, Group, Loop, rational, upper
+from malta.margins.majorant import coefficient_bounds
+
+if TYPE_CHECKING:
+    from malta.plant import FloatArray
+
+MOST = 24  # minors beyond which the closed loop's own matrix is cheaper
+
+Pair = tuple[tuple[int, ...], tuple[int, ...]]
+
+
+@dataclass(frozen=True, eq=False)
+class Minors:
+    """A group's rows that inputs act on, its inputs, its outputs, and the compensator's minors between these."""
+
+    loop: Loop
+    group: Group
+    rows: tuple[int, ...]  # states, by their number in the group
+    inputs: tuple[int, ...]
+    outputs: tuple[int, ...]
+
+    @property
+    def order(self) -> int:
+        return min(len(self.rows), len(self.inputs), len(self.outputs))
+
+    @property
+    def count(self) -> int:
+        """Polynomials to be found at each place."""
+        return sum(
+            math.comb(len(self.rows), k) * math.comb(len(self.outputs), k) for k in range(self.order + 1)
+        )
+
+    @cached_property
+    def kappa(self) -> dict[Pair, Any]:
+        """d_F det F[T, S] of the compensator's own states, in s or g = z - 1: exact."""
+        law, own = self.loop.law, list(self.group.own)
+        a = law.A[np.ix_(own, own)]
+        table = rational(a)
+        if law.sample_time is not None:
+            table = [[v - (i == j) for j, v in enumerate(row)] for i, row in enumerate(table)]
+        n = len(own)
+        f = fmpq_mat(table) if n else None
+        d = fmpq_poly([1]) if f is None else fmpq_poly(f.charpoly())
+        entries: dict[tuple[int, int], Any] = {}
+        for t in self.inputs:
+            for s in self.outputs:
+                entry = d * exact(float(law.D[t, s]))
+                if f is not None:
+                    b = fmpq_mat(rational(law.B[own][:, [s]]))
+                    c = fmpq_mat(rational(law.C[[t]][:, own]))
+                    entry += fmpq_poly((f - b * c).charpoly()) - d
+                entries[t, s] = entry
+        found: dict[Pair, Any] = {((), ()): d}
+        for k in range(1, self.order + 1):
+            for T in itertools.combinations(self.inputs, k):
+                for S in itertools.combinations(self.outputs, k):
+                    det = _determinant([[entries[t, s] for s in S] for t in T])
+                    found[T, S] = det if k == 1 else _quotient(det, d, k - 1)
+        return found
+
+    @cached_property
+    def late(self) -> tuple[Any, ...]:
+        """z^(d (K - k)) for k = 0 .. K."""
+        z = fmpq_poly([1, 1])
+        return tuple(z ** (self.loop.law.delay * (self.order - k)) for k in range(self.order + 1))
+
+    @cached_property
+    def balls(self) -> tuple[dict[Pair, Any], dict[Pair, Any]]:
+        """kappa times the delay's power, signed, as exact polynomials and as balls."""
+        signed = {pair: p * self.late[len(pair[0])] * (-1) ** len(pair[0]) for pair, p in self.kappa.items()}
+        return signed, {pair: arb_poly(p) for pair, p in signed.items()}
+
+    def plant(self, entries: list[list[tuple[int, int, Any]]], matrix: Any) -> dict[Pair, Any]:
+        """pi_SR at given p, rows by their number in the group."""
+        a, c, factor = self._matrices(entries, matrix)
+        law, r = self.loop.law, len(self.rows)
+        b = dense(matrix, a.nrows(), r, ((i, k, 1) for k, i in enumerate(self.rows)))
+        if self.loop.sampled:
+            if law.lag is not None:
+                a, b, c, _ = lagged(matrix, a, b, c, None, arb(law.lag))
+            a, b = hold(matrix, a, b, arb(law.sample_time))
+        elif law.lag is not None:
+            a, b, c, _ = lagged(matrix, a, b, c, None, exact(law.lag))
+        elif law.sample_time is not None:
+            a = a - dense(matrix, a.nrows(), a.nrows(), ((i, i, 1) for i in range(a.nrows())))
+        found = _minors(a, b, c, len(self.rows), len(self.outputs), self.order)
+        return {pair: p * factor for pair, p in found.items()}
+
+    def _matrices(self, entries: list[list[tuple[int, int, Any]]], matrix: Any) -> tuple[Any, Any, Any]:
+        x = {state: k for k, state in enumerate(self.group.states)}
+        n, y = len(x), {output: k for k, output in enumerate(self.outputs)}
+        a = dense(matrix, n, n, ((x[i], x[j], r) for i, j, r in entries[A] if i in x and j in x))
+        c = dense(matrix, len(y), n, ((y[i], x[j], r) for i, j, r in entries[C] if i in y and j in x))
+        factor: Any = 1
+        if self.loop.descriptor:
+            e = dense(matrix, n, n, ((x[i], x[j], r) for i, j, r in entries[E] if i in x and j in x))
+            factor = e.det()
+            a = solved(e, a)
+        return a, c, factor
+
+    def forces(self, entries: list[list[tuple[int, int, Any]]], matrix: Any) -> dict[Pair, Any]:
+        """beta_RT at given p."""
+        x = {state: k for k, state in enumerate(self.group.states)}
+        n, u = len(x), {t: k for k, t in enumerate(self.inputs)}
+        b = dense(matrix, n, len(u), ((x[i], u[j], r) for i, j, r in entries[B] if i in x and j in u))
+        if self.loop.descriptor:
+            e = dense(matrix, n, n, ((x[i], x[j], r) for i, j, r in entries[E] if i in x and j in x))
+            b = solved(e, b)
+        found: dict[Pair, Any] = {}
+        for k in range(1, self.order + 1):
+            for R in itertools.combinations(range(len(self.rows)), k):
+                for T in itertools.combinations(self.inputs, k):
+                    part = [[b[self.rows[i], u[t]] for t in T] for i in R]
+                    found[R, T] = _determinant(part)
+        return found
+
+    def joined(self, pi: dict[Pair, Any], beta: dict[Pair, Any], matrix: Any) -> list[Any]:
+        """a_0 ... a_N from the minors."""
+        kappa = self.balls[0 if matrix is fmpq_mat else 1]
+        total = pi[(), ()] * kappa[(), ()]
+        for (S, R), p in pi.items():
+            if not R:
+                continue
+            names = tuple(self.outputs[s] for s in S)
+            part = None
+            for T in itertools.combinations(self.inputs, len(R)):
+                term = kappa[T, names] * beta[R, T]
+                part = term if part is None else part + term
+            total = total + p * part
+        return list(total.coeffs())
+
+    @property
+    def degree(self) -> int:
+        law = self.loop.law
+        return (
+            len(self.group.states) + len(self.group.own)
+            + (len(self.rows) if law.lag is not None else 0) + self.order * law.delay
+        )  # fmt: skip
+
+    def majorant(self, entries: list[list[tuple[int, int, Any]]]) -> list[Any]:
+        """At least the coefficients (of s or g) of each power, from balls of the entries."""
+        a, b, c, diagonal = _sizes(self, entries)
+        r = len(self.rows)
+        a, into, c, _ = driven_bounds(self.loop, (a, np.eye(len(a))[:, list(self.rows)], c, None), diagonal)
+        result = _product(_bound(a, None, None), _absolute(self.balls[0][(), ()]))
+        for k in range(1, self.order + 1):
+            for S in itertools.combinations(range(len(self.outputs)), k):
+                names = tuple(self.outputs[s] for s in S)
+                for R in itertools.combinations(range(r), k):
+                    pi = _bound(a, into[:, list(R)], c[list(S)])
+                    weight: list[Any] = []
+                    for T in itertools.combinations(self.inputs, k):
+                        part = b[np.ix_(R, [self.inputs.index(t) for t in T])]
+                        size = float(np.prod(part.sum(axis=1))) * (1 + 1e-9)
+                        if size:
+                            weight = _sum(weight, [arb(size) * x for x in _absolute(self.balls[0][T, names])])
+                    if weight:
+                        result = _sum(result, _product(pi, weight))
+        return result
+
+
+def minors(loop: Loop, g: Group) -> Minors | None:
+    """None where the closed loop's own matrix is the better way: direct feedthrough, or too many minors."""
+    if loop.direct or not g.states:
+        return None
+    x = {state: k for k, state in enumerate(g.states)}
+    own = list(g.own)
+    rows = sorted({x[i] for i, _, _ in loop.program.entries[B] if i in x})
+    inputs = sorted({j for i, j, _ in loop.program.entries[B] if i in x})
+    if loop.descriptor:
+        rows = list(range(len(x)))
+    outputs = sorted({i for i, j, _ in loop.program.entries[C] if j in x})
+    law = loop.law
+    inputs = [t for t in inputs if law.C[t, own].any() or law.D[t, outputs].any()]
+    outputs = [s for s in outputs if law.B[own, s].any() or law.D[inputs, s].any()]
+    found = Minors(loop, g, tuple(rows), tuple(inputs), tuple(outputs))
+    return found if found.count <= MOST else None
+
+
+def _determinant(m: list[list[Any]]) -> Any:
+    if len(m) == 1:
+        return m[0][0]
+    total = None
+    for j, entry in enumerate(m[0]):
+        part = entry * _determinant([row[:j] + row[j + 1 :] for row in m[1:]])
+        part = -part if j % 2 else part
+        total = part if total is None else total + part
+    return total
+
+
+def _quotient(p: Any, d: Any, k: int) -> Any:
+    for _ in range(k):
+        q, rest = divmod(p, d)
+        assert rest == 0
+        p = q
+    return p
+
+
+def _minors(a: Any, b: Any, c: Any, r: int, p: int, order: int) -> dict[Pair, Any]:
+    """d det X[S, R]: det(g - A + B_R C_S) is d times the sum of all principal minors of I + X[S, R]."""
+    own = a.charpoly()
+    kind = arb_poly if isinstance(a, arb_mat) else fmpq_poly
+    d = kind(own)
+    found: dict[Pair, Any] = {((), ()): d}
+    matrix = type(a)
+    for k in range(1, order + 1):
+        for S in itertools.combinations(range(p), k):
+            for R in itertools.combinations(range(r), k):
+                closed = a - columns(matrix, b, R) * rows_of(matrix, c, S)
+                rest = kind(closed.charpoly()) - d
+                for size in range(1, k):
+                    for at in itertools.combinations(range(k), size):
+                        rest -= found[tuple(S[i] for i in at), tuple(R[i] for i in at)]
+                found[S, R] = rest
+    return found
+
+
+def _sizes(
+    m: Minors, entries: list[list[tuple[int, int, Any]]]
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    x = {state: k for k, state in enumerate(m.group.states)}
+    u, y = ({j: k for k, j in enumerate(own)} for own in (m.inputs, m.outputs))
+    n = len(x)
+    a_balls = [(x[i], x[j], z) for i, j, z in entries[A] if i in x and j in x]
+    b_balls = [(x[i], u[j], z) for i, j, z in entries[B] if i in x and j in u]
+    if len(entries) > E:
+        e = dense(acb_mat, n, n, ((x[i], x[j], z) for i, j, z in entries[E] if i in x and j in x))
+        both = beside(acb_mat, dense(acb_mat, n, n, a_balls), dense(acb_mat, n, len(u), b_balls))
+        ab = solved(e, both)
+        a_balls = [(i, j, ab[i, j]) for i in range(n) for j in range(n)]
+        b_balls = [(i, j, ab[i, n + j]) for i in range(n) for j in range(len(u))]
+
+    def size(rows: int, count: int, values: Any) -> FloatArray:
+        found = np.zeros((rows, count))
+        for i, j, z in values:
+            found[i, j] = float(abs(z).upper()) * (1 + 1e-9)
+        return found
+
+    c = size(len(y), n, ((y[i], x[j], z) for i, j, z in entries[C] if i in y and j in x))
+    diagonal = np.zeros(n)
+    for i, j, z in a_balls:
+        if i == j:
+            diagonal[i] = upper(z)
+    return size(n, n, a_balls), size(n, len(u), b_balls)[list(m.rows)], c, diagonal
+
+
+def _bound(a: FloatArray, b: FloatArray | None, c: FloatArray | None) -> list[Any]:
+    """Above the coefficients of det [[g - A, B], [C, 0]], from entrywise bounds."""
+    n, m = len(a), a
+    if b is not None and c is not None:
+        m = np.block([[a, b], [c, np.zeros((len(c), len(c)))]])
+    return coefficient_bounds(m, np.where(np.arange(len(m)) < n, 1.0, 0.0))
+
+
+def _absolute(p: Any) -> list[Any]:
+    return [arb(abs(x)) for x in p.coeffs()]
+
+
+def _product(one: list[Any], two: list[Any]) -> list[Any]:
+    return list((arb_poly(one) * arb_poly(two)).coeffs()) if one and two else []
+
+
+def _sum(one: list[Any], two: list[Any]) -> list[Any]:
+    long, short = (one, two) if len(one) >= len(two) else (two, one)
+    return [x + short[k] if k < len(short) else x for k, x in enumerate(long)]

@@ -1,0 +1,122 @@
+"""The design model of a plant at a position along its stroke, or along all of it, in parameters by name."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
+from typing import TYPE_CHECKING, Any
+
+import casadi as ca
+import numpy as np
+
+from malta.data import shaping, units_of
+from malta.errors import InputError
+from malta.margins import compact
+from malta.margins.algebra import Ratio, TooLarge
+from malta.plant import Plant, readonly
+from malta.uncertain import UncertainSystem, holds, lowest, model_of
+
+if TYPE_CHECKING:
+    from malta.plant import FloatArray
+
+LONGEST = 20_000  # operations of a model beyond which it is not written out
+
+
+def of_plant(
+    plant: Plant,
+    names: Sequence[str],
+    *,
+    at: Mapping[str, float] | None = None,
+    states: bool = False,
+    believed: Plant | None = None,
+    held: FloatArray | None = None,
+) -> UncertainSystem:
+    """The design model of a plant at a position along its stroke, in parameters by name, at its preload.
+
+    The stroke itself may be one of the names (`z` for MALTA): its nominal value is the position.
+    Inputs are commanded forces: a controller commutates as the machine it knows, the plant's currents make their own.
+    at: the position, SI; states: the states follow the outputs in y; believed: the machine that the controller knows,
+    where it is another one; held: H of currents that are held between samples (`held_at`): the inputs are
+    v + H y, and where the parameters leave more of the reading than that, it is a further input.
+
+    Raises InputError for an unknown name.
+    """
+    par = plant.parameters
+    known = [*units_of(par), plant.stroke]
+    for name in names:
+        if name not in known:
+            raise InputError("robust_margin", name, "an unknown parameter", "one of " + " ".join(known))
+    for name in set(names) & set(shaping(par)):
+        raise InputError("robust_margin", name, "a parameter that shapes the model", "one that enters it")
+    if believed is not None and believed.tabulated:
+        found = "a controller that looks up a table"
+        raise InputError("robust_margin", "believed", found, "one whose currents are a formula")
+    x0 = plant.at(**(at or {})).x
+    position = float(x0[plant.stroke_state])
+    of = model_of(plant, believed or plant, tuple(name for name in names if name != plant.stroke))
+    p = ca.SX.sym("p", len(names))
+    own = [k for k, name in enumerate(names) if name != plant.stroke]
+    z = p[names.index(plant.stroke)] if plant.stroke in names else position
+    nominal = [position if name == plant.stroke else getattr(par, name) for name in names]
+    short = _written_out(of, p, z, np.array(nominal, dtype=float), held) if holds(plant) else None
+    if short is not None:
+        A, B, C = short
+    else:
+        acting = of(p[own], z, ca.DM.zeros(len(plant.inputs)))[-1]
+        v = acting
+        if holds(plant):  # what has to be wanted so that the preload acts
+            made, ratio = of(p[own], z, acting)[4:6]
+            v = acting + ca.solve(ratio, acting - made)
+        A, B, C, E = of(p[own], z, v)[:4]
+        if held is not None:
+            A, left = A - E @ C, E - B @ ca.DM(held)
+            B = ca.horzcat(B, left)
+    if states:
+        C = ca.vertcat(C, ca.DM.eye(len(plant.controlled)))
+    bounds = {f.name: lowest(f.metadata) for f in fields(par)}
+    limits = tuple((bounds.get(name, -math.inf), math.inf) for name in names)
+    matrices = ca.Function("matrices", [p], [A, B, C])
+    return UncertainSystem(tuple(names), readonly(nominal), matrices, limits=limits)
+
+
+def _written_out(
+    of: ca.Function, p: Any, z: Any, nominal: FloatArray, held: FloatArray | None
+) -> tuple[Any, Any, Any] | None:
+    """A, B, C of held currents as the short rational functions of p that they are; None where they are none."""
+    k, m = p.numel(), of.numel_in(2)
+    q = ca.SX.sym("q", k + m)
+    fixed = isinstance(z, float)
+    place = z if fixed else ca.substitute([z], [p], [q[:k]])[0]
+    own = [i for i in range(k) if fixed or not ca.is_equal(p[i], z)]
+    model = ca.Function("model", [q], list(of(q[own], place, q[k:])))
+    if model.n_instructions() > LONGEST:
+        return None
+    scales = np.concatenate([nominal, np.array(model(np.r_[nominal, np.zeros(m)])[-1]).ravel()])
+    try:
+        s, tables = compact.written_out(model, scales)
+    except TooLarge:
+        return None
+    A, B, C, E, made, ratio, preload = tables
+    zero = Ratio(s.context.constant(0))
+    acting = {k + i: preload.get((i, 0), zero) for i in range(m)}
+    left = {i: acting[k + i] - compact.substituted(s, made.get((i, 0), zero), acting) for i in range(m)}
+    ratio = {at: compact.substituted(s, r, acting) for at, r in ratio.items()}
+    moved = compact.solution(
+        s, ratio, left, m
+    )  # what has to be wanted beyond the preload so that the preload acts
+    wanted = {k + i: acting[k + i] + moved[i] for i in range(m)}
+    A, B, C, E = ({at: compact.substituted(s, r, wanted) for at, r in t.items()} for t in (A, B, C, E))
+    n, outputs = of.size1_out(0), of.size1_out(2)
+    rest: compact.Table = {}
+    if held is not None:
+        carried = compact.product(E, C)
+        A = compact.rounded(s, compact.difference(A, carried), scales, A, carried)
+        gains = {(i, j): s.constant(float(x)) for (i, j), x in np.ndenumerate(held) if x}
+        rest = compact.rounded(s, compact.difference(E, compact.product(B, gains)), scales, E)
+    if not compact.free_of_functions(s, (A, B, C, rest)):
+        return None
+    b = compact.matrix_of(B, (n, m), p)
+    if rest:
+        b = ca.horzcat(b, compact.matrix_of(rest, (n, outputs), p))
+    return compact.matrix_of(A, (n, n), p), b, compact.matrix_of(C, (outputs, n), p)

@@ -1,0 +1,292 @@
+"""What a margin is asked of: a loop, or a polynomial with coefficients in p. Both give characteristic polynomials."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+from flint import acb, arb, arb_mat, fmpq
+
+from malta.margins import dust
+from malta.margins.algebra import Symbolic, TooLarge, symbolic
+from malta.margins.characteristic import Characteristic, mapped, outward, pair
+from malta.margins.closed import closed_loop
+from malta.margins.closed import parts as driven
+from malta.margins.expressions import BALLS, EXACT, POINTS, NotAnalytic, Program
+from malta.margins.loop import Group, Loop
+from malta.uncertain import critical, instability
+
+if TYPE_CHECKING:
+    from malta.plant import FloatArray
+
+
+class Polynomial(Protocol):
+    """A characteristic polynomial: `Characteristic`, or `OfCoefficients`."""
+
+    @property
+    def names(self) -> tuple[str, ...]: ...
+    @property
+    def exact(self) -> bool: ...
+    @property
+    def foreign(self) -> tuple[str, ...]: ...
+    @property
+    def inverted(self) -> tuple[bool, ...]: ...
+    @property
+    def degrees(self) -> tuple[int | None, ...]: ...
+    def at(self, v: Sequence[Any]) -> list[Any]: ...
+    def majorant(self, v: Sequence[Any]) -> list[tuple[float, int]]: ...
+    def neglected(
+        self, moves: Sequence[Any], sides: Sequence[tuple[Any, Any]]
+    ) -> list[tuple[float, int]] | None: ...
+
+
+class Problem(Protocol):
+    """Where a margin is asked for."""
+
+    def parts(self, p: Sequence[Any]) -> list[tuple[Polynomial, tuple[Any, ...]]]:
+        """The characteristic polynomials over real balls p, and what neglected couplings can do to each."""
+
+    def instability(self, rows: FloatArray) -> FloatArray:
+        """How far the worst root is beyond the boundary at rows of parameters, in floating point."""
+
+    def critical(self, p: FloatArray) -> float:
+        """Frequency of the worst root, rad/s."""
+
+    def physical(self, x: float) -> float:
+        """s / j of the polynomials -> rad/s."""
+
+
+@dataclass(frozen=True, eq=False)
+class OfLoop:
+    """A closed loop."""
+
+    loop: Loop
+    names: tuple[str, ...]
+    known: dict[Any, Characteristic] = field(default_factory=dict)
+
+    @cached_property
+    def couplings(self) -> dust.Couplings | None:
+        return None if self.loop.symbolic is None else dust.Couplings(self.loop, self.loop.symbolic)
+
+    def parts(self, p: Sequence[Any]) -> list[tuple[Polynomial, tuple[Any, ...]]]:
+        found: list[tuple[Polynomial, tuple[Any, ...]]] = []
+        for part in dust.parts(self.loop, self.couplings, p):
+            key = (part.group.states, part.group.own)
+            if key not in self.known:
+                self.known[key] = Characteristic(self.loop, part.group, self.names)
+            found.append((self.known[key], part.moves))
+        return found
+
+    @property
+    def _plain(self) -> bool:
+        """Whether the loop is A, B, C alone, in continuous time or sampled."""
+        return not (self.loop.direct or self.loop.descriptor or self.loop.system.sample_time)
+
+    def _poles(self, p: FloatArray) -> Any:
+        """Of x' = A x, or of differences x+ - x; none where the matrices have no value."""
+        n, k = self.loop.states, len(self.loop.law.A)
+        whole = Group(tuple(range(n)), tuple(range(k)), None)
+        try:
+            entries = self.loop.program.run([arb(x) for x in p.tolist()], POINTS)
+            matrix, _ = closed_loop(*driven(self.loop, whole, entries, arb_mat)[0])
+        except NotAnalytic:
+            return np.zeros(0)
+        found = np.array(
+            [[float(matrix[i, j].mid()) for j in range(matrix.ncols())] for i in range(matrix.nrows())]
+        )
+        return np.linalg.eigvals(found) if np.isfinite(found).all() else np.zeros(0)
+
+    def instability(self, rows: FloatArray) -> FloatArray:
+        if self._plain:
+            return instability(self.loop.system, self.loop.law, rows)
+        worst = []
+        for p in np.atleast_2d(rows):
+            poles = self._poles(p)
+            sizes = poles.real if self.loop.law.sample_time is None else 2 * poles.real + np.abs(poles) ** 2
+            worst.append(float(sizes.max(initial=-math.inf)))
+        return np.array(worst)
+
+    def critical(self, p: FloatArray) -> float:
+        if self._plain:
+            return critical(self.loop.system, self.loop.law, p)
+        poles, T = self._poles(p), self.loop.law.sample_time
+        if T is None:
+            return float(abs(poles[poles.real.argmax()].imag))
+        z = 1 + poles
+        return float(abs(np.angle(z[np.abs(z).argmax()])) / T)
+
+    def physical(self, x: float) -> float:
+        return physical(x, self.loop.law.sample_time)
+
+
+def physical(x: float, T: float | None) -> float:
+    """v = j x -> rad/s."""
+    return x if T is None else 2 * math.atan(x) / T
+
+
+@dataclass(frozen=True, eq=False)
+class OfCoefficients:
+    """A polynomial in s (or z) whose coefficients, lowest first, are a program of p."""
+
+    program: Program
+    names: tuple[str, ...]
+    discrete: bool
+
+    @cached_property
+    def _symbolic(self) -> Symbolic | None:
+        try:
+            return symbolic(self.program)
+        except (TooLarge, NotAnalytic):
+            return None
+
+    @property
+    def count(self) -> int:
+        return self.program.shapes[0][0]
+
+    @cached_property
+    def exact(self) -> bool:
+        return self.program.rational and self._symbolic is not None
+
+    @property
+    def foreign(self) -> tuple[str, ...]:
+        return self.program.foreign
+
+    @property
+    def inverted(self) -> tuple[bool, ...]:
+        return (False,) * len(self.names)
+
+    @cached_property
+    def _common(self) -> Any:
+        """The common denominator of the coefficients; None where it is one."""
+        assert self._symbolic is not None
+        found = None
+        for r in self._symbolic.entries[0].values():
+            if r.den is not None:
+                found = r.den if found is None else found * (r.den / found.gcd(r.den))
+        return found
+
+    @cached_property
+    def degrees(self) -> tuple[int | None, ...]:
+        s = self._symbolic
+        if not self.exact or s is None:
+            used = self.program.depends[0]
+            return tuple(None if i in used else 0 for i in range(len(self.names)))
+        found = np.zeros(len(self.names), dtype=int)
+        for r in s.entries[0].values():
+            num = (
+                r.num
+                if self._common is None
+                else r.num * (self._common if r.den is None else self._common / r.den)
+            )
+            found = np.maximum(found, num.degrees()[: len(self.names)])
+        if self._common is not None:
+            found = np.maximum(found, self._common.degrees()[: len(self.names)])
+        return tuple(int(d) for d in found)
+
+    def at(self, v: Sequence[Any]) -> list[Any]:
+        rational = self.program.rational
+        (entries,) = self.program.run(v if rational else [arb(x) for x in v], EXACT if rational else POINTS)
+        a: list[Any] = [fmpq(0) if rational else arb(0)] * self.count
+        scale = self._common(*v) if self.exact and self._common is not None else 1
+        for i, _, x in entries:
+            a[i] = x * scale
+        return mapped(_about_one(a)) if self.discrete else a
+
+    def majorant(self, v: Sequence[Any]) -> list[tuple[float, int]]:
+        (entries,) = self.program.run([acb(x) for x in v], BALLS)
+        a = [arb(0)] * self.count
+        for i, _, x in entries:
+            a[i] = abs(x)
+        if self.discrete:  # z = 1 + g
+            a = outward(
+                [sum((c * math.comb(k, j) for k, c in enumerate(a) if k >= j), arb(0)) for j in range(len(a))]
+            )
+        return [pair(x) for x in a]
+
+    def neglected(
+        self, moves: Sequence[Any], sides: Sequence[tuple[Any, Any]]
+    ) -> list[tuple[float, int]] | None:
+        del moves, sides
+        return None
+
+
+def _about_one(a: list[Any]) -> list[Any]:
+    """Coefficients of z -> those of g = z - 1."""
+    return [sum((c * math.comb(k, j) for k, c in enumerate(a) if k >= j), 0 * a[0]) for j in range(len(a))]
+
+
+@dataclass(frozen=True, eq=False)
+class OfPolynomial:
+    """A polynomial, given as it is."""
+
+    polynomial: OfCoefficients
+
+    def parts(self, p: Sequence[Any]) -> list[tuple[Polynomial, tuple[Any, ...]]]:
+        del p
+        return [(self.polynomial, ())]
+
+    def _roots(self, p: FloatArray) -> Any:
+        """Roots, on a scale of the coefficients' own."""
+        from malta.margins.expressions import exact
+
+        a = [
+            float(x) if not isinstance(x, fmpq) else int(x.p) / int(x.q)
+            for x in self._values([exact(x) for x in p.tolist()])
+        ]
+        while len(a) > 1 and a[-1] == 0:
+            a.pop()
+        known = [k for k, c in enumerate(a) if c]
+        step = (math.log2(abs(a[known[0]])) - math.log2(abs(a[known[-1]]))) / max(known[-1] - known[0], 1)
+        scale = 2.0 ** round(step)
+        top = max(math.log2(abs(a[k])) + k * round(step) for k in known)
+        scaled = [
+            c and math.copysign(2.0 ** (math.log2(abs(c)) + k * round(step) - top), c)
+            for k, c in enumerate(a)
+        ]
+        return np.roots(scaled[::-1]) * scale
+
+    def _values(self, v: list[Any]) -> list[Any]:
+        f = self.polynomial
+        plain = OfCoefficients(f.program, f.names, False)
+        return plain.at(v)
+
+    def instability(self, rows: FloatArray) -> FloatArray:
+        found = []
+        for row in np.atleast_2d(rows):
+            roots = self._roots(row)
+            sizes = np.abs(roots) - 1 if self.polynomial.discrete else roots.real
+            found.append(float(sizes.max(initial=-math.inf)))
+        return np.array(found)
+
+    def critical(self, p: FloatArray) -> float:
+        roots = self._roots(p)
+        if self.polynomial.discrete:
+            return float(abs(np.angle(roots[np.abs(roots).argmax()])))
+        return float(abs(roots[roots.real.argmax()].imag))
+
+    def physical(self, x: float) -> float:
+        return physical(x, 1.0 if self.polynomial.discrete else None)
+
+
+def hurwitz(a: Sequence[Any]) -> bool | None:
+    """Whether all roots of a_0 + a_1 s + ... lie left of the axis, by Routh's scheme in exact numbers or balls.
+
+    None where balls are too wide to tell.
+    """
+    rows = [list(reversed(a))[::2], list(reversed(a))[1::2]]
+    lead = rows[0][0]
+    if not (lead > 0 or lead < 0):
+        return None if lead == 0 or hasattr(lead, "rad") else False
+    positive = lead > 0
+    while rows[1]:
+        one, two = rows
+        if not (two[0] > 0 if positive else two[0] < 0):
+            return False if (two[0] < 0 if positive else two[0] > 0) or not hasattr(two[0], "rad") else None
+        q = one[0] / two[0]
+        rest = [x - q * (two[k + 1] if k + 1 < len(two) else 0) for k, x in enumerate(one[1:])]
+        rows = [two, rest]
+    return True

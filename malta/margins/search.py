@@ -1,0 +1,403 @@
+"""The search of one margin: families over a box, the nearest witness, the proof, and witnesses out of stuck cells."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import time as clock
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from flint import arb
+
+from malta.errors import CheckError
+from malta.margins.box import Box
+from malta.margins.enclosure import TooWide, Unproven, over_box, precision
+from malta.margins.exclusion import Growth, Search, advance, start
+from malta.margins.expressions import NotAnalytic, exact
+from malta.margins.family import Family
+from malta.margins.problem import Polynomial, Problem, hurwitz
+from malta.margins.robust import Certificate, Margin, Progress
+from malta.margins.witness import Zero, from_cell, gradients, nearest, starts
+
+if TYPE_CHECKING:
+    from malta.plant import FloatArray
+
+FAR = 1e2  # search limit, in multiples of the modelled box
+EDGE = 1e-4  # distance that the search keeps from the end of what a parameter can be, relative
+FIRST = 3.97  # the first box that is searched, in multiples of the modelled one
+CHEAP = 4000  # cells below which the proof is brought closer to the witness than the tolerance
+FINEST = 3e-7  # how close, relative
+DEAR = 3.0  # s that families take beyond which their boxes grow in small steps
+PATIENCE = 60_000  # cells without progress after which the proof is given up
+PATCHES = 64  # parts that a box is cut into where one expansion does not do
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """One characteristic polynomial on one part of the box."""
+
+    of: Polynomial
+    sides: FloatArray
+    family: Family
+    growth: Growth
+
+
+@dataclass(eq=False)
+class Job:
+    """What is known of one margin so far."""
+
+    problem: Problem
+    box: Box
+    tolerance: float
+    fixed: bool  # whether the tolerance was asked for
+    until: float
+    most_cells: int
+    progress: Progress | None
+
+    def __post_init__(self) -> None:
+        self.asked = self.tolerance
+        self.limit = min(self.box.most * (1 - EDGE), FAR)
+        self.upper = math.inf
+        self.zero: tuple[Zero, Part] | None = None
+        self.reasons: list[str] = []
+
+    def late(self) -> bool:
+        return clock.monotonic() > self.until
+
+    # families
+
+    def parts(self, reach: float, last: float) -> list[Part]:
+        """Families of all groups over box(reach), cut where one expansion does not do, until the time `last`.
+
+        Raises Unproven.
+        """
+        sides = self.box.sides(reach)
+        made: list[Part] = []
+        for polynomial, moves in self.problem.parts([arb(a).union(arb(b)) for a, b in sides.tolist()]):
+            made += self._cut(polynomial, sides, moves, last)
+        return _without_twins(made)
+
+    def _cut(self, f: Polynomial, sides: FloatArray, moves: tuple[Any, ...], last: float) -> list[Part]:
+        todo, made = [sides], []
+        while todo:
+            own = todo.pop()
+            if clock.monotonic() > last:
+                raise Unproven("time was up before the coefficients were found")
+            try:
+                made.append(self._part(f, own, moves, last))
+            except TooWide as error:
+                if len(todo) + len(made) >= PATCHES:
+                    raise Unproven(str(error)) from error
+                for half in _halves(own, error.axis, float(self.box.nominal[error.axis])):
+                    todo.append(half)
+        return made
+
+    def _part(self, f: Polynomial, sides: FloatArray, moves: tuple[Any, ...], last: float) -> Part:
+        made = over_box(f, sides, moves, last)
+        inverted = np.array(f.inverted)
+        low, high = sides[:, 0], sides[:, 1]
+        v_low = np.where(inverted, 1 / np.where(inverted, high, 1), low)
+        v_high = np.where(inverted, 1 / np.where(inverted, low, 1), high)
+        growth = Growth(v_low, v_high, f.inverted, self.box.nominal, self.box.down, self.box.up)
+        return Part(f, sides, made, growth)
+
+    def stable(self) -> bool:
+        """Whether the nominal loop is stable, by Routh's scheme in exact numbers or balls."""
+        nominal = self.box.nominal
+        for f, _ in self.problem.parts([arb(x) for x in nominal.tolist()]):
+            bits, found = 160, None
+            while found is None and bits <= 5120:
+                with precision(bits):
+                    v = [exact(x) for x in nominal.tolist()]
+                    v = [1 / x if inverted else x for x, inverted in zip(v, f.inverted, strict=True)]
+                    found = hurwitz(f.at(v))
+                bits *= 2
+            if not found:
+                return False
+        return True
+
+    # witness
+
+    def look(self, part: Part, zero: Zero | None) -> bool:
+        """Keep the zero of smallest t."""
+        if zero is None or not zero.t < self.upper:
+            return False
+        self.upper, self.zero = zero.t, (zero, part)
+        return True
+
+    def search(self) -> tuple[list[Part], float]:
+        """Families over a box that holds the nearest witness found, or all there is to look at."""
+        parts, reach, done, refused = [], min(self.limit, FIRST), 0.0, math.inf
+        why, begun = "", clock.monotonic()
+        while True:
+            spent = clock.monotonic() - begun
+            last = math.inf if not done else clock.monotonic() + max(2 * DEAR, 3 * spent)
+            try:
+                found = self.parts(reach, min(self.until, last))
+            except Unproven as error:
+                refused, why = reach, str(error)
+                if self.late() or reach < 1e-3 or (done and spent > DEAR):
+                    break
+                reach = done + 0.6 * (reach - done) if done else 0.5 * reach
+            else:
+                parts, done = found, reach
+                for part in parts:
+                    self._descend(part)
+                spent = clock.monotonic() - begun
+                if (
+                    self.upper <= done
+                    or done >= self.limit
+                    or spent > min(0.3 * (self.until - begun), 4 * DEAR)
+                ):
+                    break
+                wanted = (6 if spent < DEAR else 1.5) * done
+                wanted = max(wanted, 1.01 * self.upper if math.isfinite(self.upper) else 0)
+                reach = min(self.limit, wanted, 0.5 * (done + refused))
+            if done and refused - done < EDGE * done:
+                break
+        if self.upper > done and (why or done < self.limit):
+            self.reasons.append(
+                why or f"nothing beyond {done:.3g} was looked at: the model is dear to enclose"
+            )
+        if self.upper < done / 3 and not self.late():
+            done = 1.05 * self.upper
+            parts = self.parts(done, self.until)
+        return parts, done
+
+    def _descend(self, part: Part) -> None:
+        misses = 0
+        for distance, branch, x, u in starts(part.family, part.growth):
+            if self.late() or misses > 4 or (misses > 1 and distance > 3 * self.upper):
+                return
+            better = self.look(part, nearest(part.family, part.growth, branch, x, u, self.upper))
+            misses = 0 if better else misses + 1
+
+    # proof
+
+    def target(self, reach: float) -> float:
+        return min(reach, self.upper * (1 - self.tolerance))
+
+    def prove(self, parts: list[Part], reach: float) -> tuple[float, list[tuple[Part, Search]]]:
+        """The largest t for which zero is excluded from all parts, as far as time goes."""
+        searches = [(part, start(part.family, part.growth, self.target(reach))) for part in parts]
+        tried, stood, since = 0, -1.0, 0
+        while True:
+            lower = min((s.lower for _, s in searches), default=reach)
+            if self.progress is not None:
+                self.progress(lower, self.upper)
+            count = sum(s.count for _, s in searches)
+            if lower > stood * (1 + self.tolerance / 10):
+                stood, since = lower, count
+            patience = PATIENCE if self.tolerance == self.asked else CHEAP
+            if self.late() or count >= self.most_cells or count - since > patience:
+                break
+            part, s = min(searches, key=lambda pair: (pair[1].finished, pair[1].lower))
+            if s.finished:
+                if not self._tightened(count):
+                    break
+                for _, other in searches:
+                    other.target = self.target(reach)
+                continue
+            advance(s)
+            cell = s.hardest()
+            if cell is not None and tried < 8 + count // 500:
+                tried += 1
+                if self.look(part, from_cell(s.family, s.growth, cell, self.upper)):
+                    for _, other in searches:
+                        other.target = min(other.target, self.target(reach))
+        if lower < min(reach, self.upper * (1 - self.asked)):
+            self._unsettled(searches, count)
+        return lower, searches
+
+    def _tightened(self, count: int) -> bool:
+        """Whether the proof shall come closer to the witness, as it may where that costs little."""
+        if self.fixed or count > CHEAP or self.tolerance <= FINEST or math.isinf(self.upper):
+            return False
+        self.tolerance = max(self.tolerance / 10, FINEST)
+        return True
+
+    def _unsettled(self, searches: list[tuple[Part, Search]], count: int) -> None:
+        worst = min((s for _, s in searches), key=lambda s: s.lower)
+        why = "not settled in time" if self.late() else f"not settled within {count} cells"
+        cell = worst.hardest() or worst.first()
+        if cell is not None:
+            x = Zero(0.0, cell.branch, sum(cell.interval) / 2, np.zeros(0)).frequency(worst.family)
+            why += f", near {self.problem.physical(x):.6g} rad/s"
+        self.reasons.append(why)
+
+    # result
+
+    def margin(self, begun: float) -> Margin:
+        parts, reach = self.search()
+        if not parts:
+            return self._by_poles(begun)
+        lower, searches = self.prove(parts, reach)
+        for _ in range(
+            3
+        ):  # where the enclosure over the whole box is too wide, those over smaller ones may do
+            reach /= 2
+            if lower > reach or self.late():
+                break
+            try:
+                inner = self.prove(self.parts(reach, self.until), reach)
+            except Unproven:
+                continue
+            if inner[0] > lower:
+                lower, searches = inner
+        if not self.stable():
+            lower = 0.0
+            self.reasons.append("the nominal loop is not proven stable")
+        upper, frequency, witness = self._confirmed()
+        if not lower <= upper:
+            raise CheckError(f"the proof ({lower:.9g}) and the witness ({upper:.9g}) contradict each other")
+        names, nominal = self.box.names, self.box.nominal
+        named = None if witness is None else dict(zip(names, witness.tolist(), strict=True))
+        moved = {} if witness is None else dict(zip(names, (witness - nominal).tolist(), strict=True))
+        return Margin(
+            lower if lower > 0 else None, upper, frequency, named, moved,
+            {} if witness is None else self._shares(),
+            tuple(self._certificate(part, s) for part, s in searches),
+            clock.monotonic() - begun, "; ".join(dict.fromkeys(self.reasons)),
+        )  # fmt: skip
+
+    def _certificate(self, part: Part, s: Search) -> Certificate:
+        axes = len(part.family.shape)
+        cells, boxes, c = s.excluded(axes)
+        top = self.problem.physical(math.inf)
+        return Certificate(
+            s.count, (0.0, top), cells, boxes, np.angle(c), part.sides, part.of.inverted, part.family.scale
+        )
+
+    def _confirmed(self) -> tuple[float, float | None, FloatArray | None]:
+        """The witness, moved outwards until the poles of the loop are unstable."""
+        if self.zero is None:
+            return math.inf, None, None
+        zero, part = self.zero
+        p = part.growth.parameters(zero.u)
+        w = self.problem.physical(zero.frequency(part.family))
+        for share in 1 + 10.0 ** np.arange(-9, -1.5, 0.5):
+            there = self.box.stretched(p, share)
+            if self._unstable(there):
+                return float(self.upper * share), w, there
+        self.reasons.append("the poles of the loop do not confirm the witness")
+        return math.inf, None, None
+
+    def _unstable(self, p: FloatArray) -> bool:
+        try:
+            return bool(self.problem.instability(p[None])[0] > 0)
+        except (CheckError, np.linalg.LinAlgError):
+            return False
+
+    def _shares(self) -> dict[str, float]:
+        """What each parameter contributes to reaching the boundary: d ln(margin) = -sum of share x d ln(range).
+
+        Along f(jw, p) = 0 the margin moves by Im(conj(f_w) f_p dp); at the witness all of them pull the same way.
+        """
+        assert self.zero is not None
+        zero, part = self.zero
+        g = part.growth
+        p = g.parameters(zero.u)
+        moved = np.where(g.grows, p - g.nominal, 0)
+        by_u, by_x = gradients(part.family, zero)
+        slope = g.slopes(zero.u)
+        pulls = by_u / np.where(slope == 0, 1, slope) * moved
+        size = pulls.real if zero.x == 0 else (np.conj(by_x) * pulls).imag
+        total = size.sum()
+        used = [i for i in range(len(p)) if abs(moved[i]) > 1e-9 * abs(p[i]) and size[i] != 0]
+        return {self.box.names[i]: float(size[i] / total) for i in used} if total else {}
+
+    def _by_poles(self, begun: float) -> Margin:
+        """Without an enclosure: the first loss of stability along the box's diagonals, by the poles alone."""
+        t, frequency, p = first_loss(self.problem, self.box, min(self.box.most * (1 - EDGE), FAR))
+        names = self.box.names
+        named = None if p is None else dict(zip(names, p.tolist(), strict=True))
+        moved = {} if p is None else dict(zip(names, (p - self.box.nominal).tolist(), strict=True))
+        reason = "; ".join(dict.fromkeys(self.reasons))
+        return Margin(None, t, frequency, named, moved, {}, (), clock.monotonic() - begun, reason)
+
+
+def _halves(sides: FloatArray, axis: int, nominal: float) -> list[FloatArray]:
+    low, high = sides[axis]
+    at = (
+        nominal
+        if low < nominal < high and min(nominal - low, high - nominal) > 0.2 * (high - low)
+        else (low + high) / 2
+    )
+    found = []
+    for a, b in ((low, at), (at, high)):
+        half = sides.copy()
+        half[axis] = a, b
+        found.append(half)
+    return found
+
+
+def _without_twins(parts: list[Part]) -> list[Part]:
+    """One family for groups whose coefficients agree to rounding, as those of a round body's planes do."""
+    kept: list[Part] = []
+    for part in parts:
+        for k, other in enumerate(kept):
+            both = _together(other, part)
+            if both is not None:
+                kept[k] = both
+                break
+        else:
+            kept.append(part)
+    return kept
+
+
+def _together(one: Part, two: Part) -> Part | None:
+    """A part whose radius covers both families; None where they differ by more than rounding."""
+    f, g = one.family, two.family
+    if (f.shape, f.exponents, f.scale) != (
+        g.shape,
+        g.exponents,
+        g.scale,
+    ) or one.of.inverted != two.of.inverted:
+        return None
+    if not np.array_equal(one.sides, two.sides):
+        return None
+    apart = np.abs(f.values - g.values).max(axis=1)
+    if not (apart <= 1e-9 * f.size()).all():
+        return None
+    radius = np.maximum(f.radius, g.radius + apart * (1 + 1e-9))
+    return Part(one.of, one.sides, Family(f.shape, f.values, radius, f.exponents, f.scale), one.growth)
+
+
+def first_loss(problem: Problem, box: Box, reach: float) -> tuple[float, float | None, FloatArray | None]:
+    """t, w, p at the first loss of stability along the diagonals of the box, by the poles; or infinity."""
+    free = [i for i in range(len(box.names)) if box.down[i] + box.up[i] > 0]
+    signs = np.array(list(itertools.islice(itertools.product((-1, 1), repeat=len(free)), 256)))
+    best: tuple[float, float | None, FloatArray | None] = (math.inf, None, None)
+    for place in box.standing()[:27]:
+        for sign in signs:
+            d = np.zeros(len(box.names))
+            d[free] = np.where(sign > 0, box.up[free], -box.down[free])
+            t = _along(problem, place, d, min(reach, best[0]))
+            if t < best[0]:
+                p = place + t * d
+                best = (t, problem.critical(p), p)
+    return best
+
+
+def _along(problem: Problem, p: FloatArray, d: FloatArray, reach: float) -> float:
+    """The first t of a grid up to reach at which p + t d is unstable, bisected; infinite where there is none."""
+
+    def unstable(t: Sequence[float] | FloatArray) -> FloatArray:
+        try:
+            return np.asarray(problem.instability(p + np.asarray(t)[:, None] * d) >= 0)
+        except (CheckError, np.linalg.LinAlgError, NotAnalytic):
+            return np.zeros(len(t), dtype=bool)
+
+    grid = np.unique(np.concatenate([np.geomspace(1e-3, 1, 24) * reach, np.linspace(0, reach, 41)[1:]]))
+    bad = unstable(grid)
+    if not bad.any():
+        return math.inf
+    k = int(bad.argmax())
+    low, high = (grid[k - 1] if k else 0.0), grid[k]
+    for _ in range(40):
+        middle = (low + high) / 2
+        low, high = (low, middle) if unstable([middle])[0] else (middle, high)
+    return float(high)
