@@ -84,6 +84,8 @@ def beside(matrix: Any, *parts: Any) -> Any:
 
 def _stack(matrix: Any, blocks: list[list[Any]]) -> Any:
     rows = [beside(matrix, *row) for row in blocks if row[0].nrows()]
+    if not rows:
+        return matrix(0, 0, [])
     columns = rows[0].ncols()
     values = [row[i, j] for row in rows for i in range(row.nrows()) for j in range(columns)]
     return matrix(sum(row.nrows() for row in rows), columns, values)

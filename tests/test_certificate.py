@@ -1,0 +1,339 @@
+"""Certificates of margins: those of loops that are known hold, and whatever is changed in one is refused."""
+
+from __future__ import annotations
+
+import ast
+import copy
+import json
+import math
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from flint import arb, fmpq
+
+import malta
+from malta.controller import Controller
+from malta.errors import InputError
+from malta.margins import certificate, checked_file
+from malta.margins.check import check, tiled
+from malta.margins.checked_loop import determinant_bounds
+from malta.plant import Plant
+from malta.uncertain import Compensator, UncertainSystem, held_at, holds
+from malta.verify import machine_law
+
+ROOT = Path(__file__).parents[1]
+HALBACH = ROOT / "design" / "gains" / "halbach.json"
+Loops = list[tuple[UncertainSystem, Compensator]]
+
+
+def travel_loops(
+    plant: Plant, controller: Controller, names: tuple[str, ...]
+) -> tuple[Loops, dict[str, tuple[float, float]]]:
+    """The machine's loop with its position as one more parameter, and the interval of that."""
+    H = held_at(plant, 0.0) if holds(plant) else None
+    system = malta.uncertain(plant, [*names, plant.stroke], at={plant.stroke: 0.0}, believed=plant, held=H)
+    law = machine_law(plant, controller, held=H)
+    return [(system, law)], {plant.stroke: (-plant.travel, plant.travel)}
+
+
+def travel_margin(plant: Plant, controller: Controller, ranges: dict[str, float]) -> malta.Margin:
+    ((system, law),), over = travel_loops(plant, controller, tuple(ranges))
+    return malta.robust_margin(system, law, ranges, over)
+
+
+Change = Callable[[dict[str, Any]], None]
+
+
+@pytest.fixture(scope="module")
+def document(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """The certificate of the Halbach stage's loop: sampled, with hold and lag, along its travel."""
+    return shipped("halbach", tmp_path_factory.mktemp("certificate"))[1]
+
+
+def shipped(name: str, folder: Path) -> tuple[Path, dict[str, Any]]:
+    """A design's certificate for 20 % of every parameter that its machine names, or 10 %."""
+    gains = ROOT / "design" / "gains" / f"{name}.json"
+    controller = malta.gains.read(gains)
+    plant = malta.plant_of(controller.parameters)
+    ranges = dict.fromkeys(("m", "A", "b") if plant.name == "halbach" else ("m", "K_A", "K_D", "K_B"), 0.2)
+    margin = travel_margin(plant, controller, ranges)
+    places, over = travel_loops(plant, controller, tuple(ranges))
+    path = certificate.write(folder / "certificate.json", places, ranges, over, margin, gains)
+    assert path.stat().st_size < 1_000_000
+    content = json.loads(path.read_text())
+    assert isinstance(content, dict)
+    return path, content
+
+
+def written(content: dict[str, Any], folder: Path, *, signed: bool = True) -> Path:
+    """A changed certificate, with the digest of what it holds now."""
+    if signed:
+        content = content | {"sha256": checked_file.digest(content)}
+    path = folder / "changed.json"
+    path.write_text(json.dumps(content))
+    return path
+
+
+def first(content: dict[str, Any]) -> dict[str, Any]:
+    """The first part of the first group."""
+    part = content["loops"][0]["groups"][0]["parts"][0]
+    assert isinstance(part, dict)
+    return part
+
+
+# loops that are known
+
+
+def spring() -> Any:
+    def matrices(m: Any, k: Any) -> Any:
+        return [[0, 1], [-k / m, -0.2 / m]], [[0], [1 / m]], [[1, 0]]
+
+    return malta.uncertain(matrices, {"m": 1.0, "k": 4.0})
+
+
+def gain(*values: float) -> Compensator:
+    """Each input from its own output."""
+    n = len(values)
+    return Compensator(np.zeros((0, 0)), np.zeros((0, n)), np.zeros((n, 0)), np.diag(values))
+
+
+def test_a_continuous_loop(tmp_path: Path) -> None:
+    # m s^2 + 0.2 s + k - 1: stable until k = 1, t = 3 / 0.4; the mass stays above zero until t = 5
+    system, law = spring(), gain(1.0)
+    margin = malta.robust_margin(system, law, {"m": 0.1, "k": 0.1})
+    assert margin.upper == pytest.approx(7.5, rel=1e-6)
+    path = certificate.write(tmp_path / "c.json", [(system, law)], {"m": 0.1, "k": 0.1}, None, margin)
+    found = check(path)
+    assert found.ok
+    assert found.claim == pytest.approx(0.999 * 7.5, rel=2e-3)
+    assert len(found.groups) == 1
+
+
+@pytest.mark.parametrize(("delay", "lag"), [(0, None), (2, None), (1, 50.0)])
+def test_a_sampled_loop_with_delay_and_lag(tmp_path: Path, delay: int, lag: float | None) -> None:
+    own = Compensator(
+        np.array([[0.5]]), np.array([[1.0]]), np.array([[0.3]]), np.array([[-0.4]]),
+        sample_time=0.05, delay=delay, lag=lag,
+    )  # fmt: skip
+    margin = malta.robust_margin(spring(), own, {"m": 0.3, "k": 0.3})
+    path = certificate.write(tmp_path / "c.json", [(spring(), own)], {"m": 0.3, "k": 0.3}, None, margin)
+    found = check(path)
+    assert found.ok, found.failures
+    assert margin.lower is not None
+    assert found.claim == pytest.approx(margin.lower, rel=2e-3)
+
+
+def test_groups_and_several_loops(tmp_path: Path) -> None:
+    system = malta.uncertain(
+        lambda a: ([[-1 + a, 0], [1, -2]], [[1, 0], [0, 1]], [[1, 0], [0, 1]]), {"a": 0.1}
+    )
+    loops = [(system, gain(-1.0, -g)) for g in (1.0, 2.0)]
+    margins = [malta.robust_margin(*loop, {"a": (0.0, 0.2)}) for loop in loops]
+    path = certificate.write(tmp_path / "c.json", loops, {"a": (0.0, 0.2)}, None, margins[0])
+    found = check(path)
+    assert found.ok, found.failures
+    assert len(found.groups) == 4
+
+
+def test_an_expression_without_a_rule_is_refused(tmp_path: Path) -> None:
+    import casadi as ca
+
+    system = malta.uncertain(lambda a: ([[-1 - ca.sin(a)]], [[1]], [[1]]), {"a": 0.1})
+    margin = malta.robust_margin(system, gain(-1.0), {"a": (0.0, 0.2)})
+    with pytest.raises(InputError, match="found sin"):
+        certificate.write(tmp_path / "c.json", [(system, gain(-1.0))], {"a": (0.0, 0.2)}, None, margin)
+
+
+# tampering
+
+
+def shrunk(content: dict[str, Any]) -> None:
+    cell = first(content)["cells"][3]
+    cell[2] = cell[1] + 0.99 * (cell[2] - cell[1])
+
+
+def removed(content: dict[str, Any]) -> None:
+    del first(content)["cells"][-1]
+
+
+def raised(content: dict[str, Any]) -> None:
+    content["lower"] = (1.01 * float.fromhex(content["lower"])).hex()
+
+
+def raised_with_its_box(content: dict[str, Any]) -> None:
+    """1 % more, and the cells stretched with it: beyond the margin they cannot hold."""
+    raised(content)
+    for side, p in zip(first(content)["box"], content["parameters"], strict=True):
+        t, nominal = float.fromhex(content["lower"]), float.fromhex(p["nominal"])
+        low = nominal - t * float.fromhex(p["down"]) + float.fromhex(p["over"][0])
+        high = nominal + t * float.fromhex(p["up"]) + float.fromhex(p["over"][1])
+        side[:] = [math.nextafter(low, -math.inf).hex(), math.nextafter(high, math.inf).hex()]
+
+
+def turned(content: dict[str, Any]) -> None:
+    for cell in first(content)["cells"]:
+        cell[4], cell[5] = -cell[5], cell[4]
+
+
+def narrowed(content: dict[str, Any]) -> None:
+    side = first(content)["box"][0]
+    side[0] = (float.fromhex(side[0]) * 1.001).hex()
+
+
+def gain_changed(content: dict[str, Any]) -> None:
+    row = content["loops"][0]["compensator"]["D"][0]
+    row[0] = (-float.fromhex(row[0])).hex()
+
+
+def stripped(content: dict[str, Any]) -> None:
+    content["loops"][0]["groups"][0]["states"] = [0]
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        (shrunk, "leave a gap"),
+        (removed, "leave a gap"),
+        (raised, "parts of the box leave a gap"),
+        (raised_with_its_box, "zero is not excluded"),
+        (turned, "zero is not excluded"),
+        (narrowed, "parts of the box leave a gap"),
+        (gain_changed, "not shown to be stable|zero is not excluded"),
+        (stripped, "do not hold each state once"),
+    ],
+)
+def test_whatever_is_changed_is_refused(
+    document: dict[str, Any], tmp_path: Path, change: Change, why: str
+) -> None:
+    content = copy.deepcopy(document)
+    change(content)
+    plain = check(written(content, tmp_path, signed=False))
+    assert not plain.ok
+    assert "changed after it was written" in plain.failures[0]
+    found = check(written(content, tmp_path))
+    assert not found.ok
+    assert re.search(why, found.failures[0])
+
+
+def test_a_last_digit_of_a_gain_is_seen_beside_the_gain_file(
+    document: dict[str, Any], tmp_path: Path
+) -> None:
+    content = copy.deepcopy(document)
+    controller = malta.gains.read(HALBACH)
+    plant = malta.plant_of(controller.parameters)
+    places, _ = travel_loops(plant, controller, ("m", "A", "b"))
+    assert certificate.matches(written(content, tmp_path), places)
+    row = content["loops"][0]["compensator"]["B"][0]
+    row[0] = math.nextafter(float.fromhex(row[0]), math.inf).hex()
+    assert not certificate.matches(written(content, tmp_path), places)
+
+
+def test_another_gain_file_is_refused(document: dict[str, Any], tmp_path: Path) -> None:
+    path = written(document, tmp_path)
+    assert check(path, HALBACH).ok
+    other = tmp_path / "halbach.json"
+    other.write_bytes(HALBACH.read_bytes() + b"\n")
+    found = check(path, other)
+    assert not found.ok
+    assert "another gain file" in found.failures[0]
+
+
+# files that are none
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("no json", "no JSON"),
+        ("[" * 100_000, "no JSON"),
+        ("[]", "a table"),
+        ("{}", "format: found nothing"),
+        ('{"format": "malta margin certificate", "version": 2}', "version 1"),
+    ],
+)
+def test_files_that_are_no_certificates(tmp_path: Path, text: str, why: str) -> None:
+    (tmp_path / "c.json").write_text(text)
+    with pytest.raises(InputError, match=why):
+        check(tmp_path / "c.json")
+
+
+@pytest.mark.parametrize(
+    ("place", "value"),
+    [
+        (("lower",), float("nan")), (("lower",), "0x1p2000"), (("lower",), -1.0), (("lower",), None),
+        (("loops",), {}), (("loops", 0, "shape"), [10**9, 1, 1]), (("loops", 0, "delay"), 10**6),
+        (("loops", 0, "sample_time"), "inf"), (("loops", 0, "compensator", "A", 0), []),
+        (("loops", 0, "steps", 0), ["call", 0, [], 0.0]), (("loops", 0, "A", 0), [0, 0, 10**6]),
+        (("loops", 0, "groups", 0, "parts", 0, "cells", 0), [2, 0, 1, [], 1, 0]),
+        (("loops", 0, "groups", 0, "parts", 0, "box", 0), [2.0, 1.0]),
+        (("parameters", 0, "nominal"), 1e300), (("gains",), None),
+    ],
+)  # fmt: skip
+def test_fields_that_are_wrong(
+    document: dict[str, Any], tmp_path: Path, place: tuple[Any, ...], value: Any
+) -> None:
+    content = copy.deepcopy(document)
+    table: Any = content
+    for key in place[:-1]:
+        table = table[key]
+    table[place[-1]] = value
+    with pytest.raises(InputError):
+        check(written(content, tmp_path))
+    if isinstance(table, dict):
+        del table[place[-1]]
+        with pytest.raises(InputError):
+            check(written(content, tmp_path))
+
+
+# the parts of the proof
+
+
+def test_the_checker_shares_no_code_with_the_search() -> None:
+    margins = ROOT / "malta" / "margins"
+    for name in ("check", "checked_loop", "checked_file"):
+        for node in ast.walk(ast.parse((margins / f"{name}.py").read_text())):
+            if isinstance(node, ast.ImportFrom) and str(node.module).startswith("malta"):
+                assert str(node.module) in (
+                    "malta.errors",
+                    "malta.margins.checked_loop",
+                    "malta.margins.checked_file",
+                )
+
+
+def test_a_check_ends_in_time(document: dict[str, Any], tmp_path: Path) -> None:
+    found = check(written(document, tmp_path), seconds=1e-9)
+    assert (found.ok, found.failures) == (False, ("loop: time is up",))
+
+
+def test_tiles_without_a_gap() -> None:
+    half, whole = fmpq(1, 2), [(fmpq(0), fmpq(1))] * 2
+    left, low, high = ((0, half), (0, 1)), ((half, 1), (0, half)), ((half, 1), (half, 1))
+    assert tiled([left, low, high], whole)
+    assert not tiled([left, low], whole)
+    assert not tiled([left, low, ((half, 1), (half + fmpq(1, 10**30), 1))], whole)
+    assert not tiled([], whole)
+
+
+def test_determinant_bounds_are_bounds() -> None:
+    rng = np.random.default_rng(1)
+    for _ in range(20):
+        m = rng.normal(size=(5, 5)) * 10.0 ** rng.uniform(-6, 6, (5, 5))
+        found = determinant_bounds([[arb(abs(x)) for x in row] for row in m.tolist()])
+        exact = np.abs(np.poly(-m)[::-1])
+        assert all(float(b) >= 0.999999 * a for a, b in zip(exact, found, strict=True))
+
+
+# the command line
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["table2", "calibrated", "robust"])
+def test_shipped_designs(tmp_path: Path, name: str) -> None:
+    path, content = shipped(name, tmp_path)
+    found = check(path, ROOT / "design" / "gains" / f"{name}.json")
+    assert found.ok, found.failures
+    assert len(found.groups) == len(content["loops"][0]["groups"])
