@@ -142,7 +142,7 @@ def test_a_statespace_and_affine_matrices_are_taken() -> None:
     assert both[0].lower == pytest.approx(10, rel=1e-5)
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=8, deadline=None, derandomize=True)
 @given(st.integers(0, 10_000))
 def test_random_loops_are_stable_in_the_proven_box(seed: int) -> None:
     """Random plants of two or three parameters, continuous or sampled: 200 plants of each proven box by their poles."""
@@ -163,7 +163,7 @@ def test_random_loops_are_stable_in_the_proven_box(seed: int) -> None:
         return float(np.abs(np.linalg.eigvals(sys.A + gain * sys.B @ sys.C)).max() - 1)
 
     assume(worst(np.zeros(k)) < -1e-3)
-    m = malta.robust_margin(system, law, dict.fromkeys(terms, (-0.1, 0.1)), time=20.0)
+    m = malta.robust_margin(system, law, dict.fromkeys(terms, (-0.1, 0.1)), time=8.0)
     assert m.lower is None or m.lower <= m.upper
     u = rng.uniform(-1, 1, (200, k))
     u[::2] = np.sign(u[::2])

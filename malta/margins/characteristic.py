@@ -261,6 +261,7 @@ class Characteristic:
         inputs = self.group.inputs
         return tuple(range(self.loop.program.shapes[B][1])) if inputs is None else inputs
 
+    @np.errstate(over="ignore", invalid="ignore")  # bounds that overflow are refused
     def majorant(self, v: Sequence[Any]) -> list[tuple[float, int]]:
         """At least |a_k| for all complex v in these balls: (mantissa, exponent) of each.
 

@@ -59,6 +59,7 @@ class Couplings:
                 add(measured, (i, j), q, float(law.B[i, b]))
         return own, held, measured
 
+    @np.errstate(over="ignore", invalid="ignore")  # bounds that overflow are refused
     def bounds(self, p: Sequence[Any]) -> FloatArray:
         """Entrywise bounds of M less its diagonal s (or g), x first, over real balls p."""
         loop, law = self.loop, self.loop.law

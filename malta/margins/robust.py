@@ -208,4 +208,5 @@ def margin_of(problem: Problem, box: Box, effort: Effort) -> Margin:
         effort.most_cells,
         effort.progress,
     )
-    return job.margin(begun)
+    with np.errstate(all="ignore"):  # what is not finite excludes nothing
+        return job.margin(begun)
