@@ -37,6 +37,7 @@ from malta.data import published_value
 from malta.experiments.halbach import there_and_back
 from malta.experiments.planar import CELLS, compiled
 from malta.machine import state_reference
+from malta.margins.robust import problem_of
 from malta.plants import planar, tubular
 from malta.simulate import compiled_shape, engine_of, feedforward
 from malta.verify import machine_law, travel_margin
@@ -246,9 +247,18 @@ def margin(runs: int) -> list[Result]:
     if optional("slycot"):
         calls["AB13MD on 300 frequencies"] = lambda: peer.ab13md(problem)
     answers = {name: call() for name, call in calls.items()}
+
+    def anew() -> Any:  # without what is remembered of the loop
+        problem_of.cache_clear()
+        return malta.robust_margin(problem.system, problem.law, box)
+
+    def along() -> Any:
+        problem_of.cache_clear()
+        return travel_margin(plant, controller, box)
+
     seconds, everywhere, *theirs = medians(
-        lambda: malta.robust_margin(problem.system, problem.law, box),
-        lambda: travel_margin(plant, controller, box),
+        anew,
+        along,
         *calls.values(),
         runs=runs,
         what="margin",

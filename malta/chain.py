@@ -22,11 +22,23 @@ from malta.controller import Controller
 from malta.data import plant_of, units_of
 from malta.errors import InputError
 from malta.linearize import linearize
+from malta.margins.plants import of_plant
+from malta.margins.robust import Margin, robust_margin
 from malta.plant import Plant
-from malta.robust import Margin, robust_margin
 from malta.synthesize import kalman, lqi, lqr, weights_of
-from malta.uncertain import Compensator, UncertainSystem, instability, responses, uncertain
-from malta.verify import PLACES, CurrentLoops, largest, machine_law, machine_system, travel_margin
+from malta.uncertain import Compensator, UncertainSystem, instability, responses
+from malta.verify import (
+    EACH,
+    NOT_PROVEN,
+    PLACES,
+    CurrentLoops,
+    largest,
+    loop_at,
+    machine_law,
+    place_margin,
+    places_along,
+    travel_margin,
+)
 
 if TYPE_CHECKING:
     from malta.plant import ComplexArray, FloatArray
@@ -138,11 +150,16 @@ def robustness(
     *,
     current_loops: CurrentLoops = "lag",
     progress: Callable[[float], None] | None = None,
+    bounds: Callable[[float, float], None] | None = None,
+    time: float | None = None,
+    proof: bool = True,
 ) -> Robustness:
     """Parametric and classical margins of a controller on a machine.
 
     uncertainty : relative half range of each parameter, e.g. {"m": 0.2}; the margins count in it
     current_loops : lag, as verify takes them, or pi, the sampled controllers of the gain file on the windings
+    bounds : called with the bounds of the margin over the travel so far
+    time : s, of each proof over the travel; proof: whether there is any
 
     Raises InputError for unknown parameters or none.
     """
@@ -159,48 +176,59 @@ def robustness(
     every = [*names, *({"m"} & set(units_of(plant.parameters)) - set(names))]
     at = {stroke: float(controller.operating_point[0][plant.stroke_state])}
     believed = plant_of(controller.parameters)
+
+    shares = places_along(plant, controller, tuple(every), current_loops)
+
+    def here(position: float) -> Margin:
+        return place_margin(plant, controller, uncertainty, position, current_loops, every)
+
     links = []
     stages = compensators(plant, controller, current_loops)
     for name, (law, states) in stages.items():
         if name == SAMPLED:
-            system, law = machine_system(plant, controller, names, at, current_loops)
+            system, law = loop_at(plant, controller, tuple(every), at[stroke], current_loops)
+            margin = here(at[stroke]) if proof else NOT_PROVEN
         else:
-            system = uncertain(plant, names, states=states, at=at, believed=believed)
-        margin, peak = robust_margin(system, law, uncertainty), _peak(system, law, states)
-        links.append(Link(name, margin, peak, "forces" if states else "sensors"))
+            system = of_plant(plant, names, states=states, at=at, believed=believed)
+            margin = robust_margin(system, law, uncertainty, time=time) if proof else NOT_PROVEN
+        links.append(Link(name, margin, _peak(system, law, states), "forces" if states else "sensors"))
         done()
 
-    def anywhere(ranges: Mapping[str, float | tuple[float, float]]) -> Margin:
-        found = travel_margin(plant, controller, ranges, current_loops, every)
+    def anywhere(
+        ranges: Mapping[str, float | tuple[float, float]],
+        report: Callable[[float, float], None] | None = None,
+    ) -> Margin:
+        asked = time if report is not None or len(shares) > 2 else min(time or EACH, EACH)
+        found = travel_margin(plant, controller, ranges, current_loops, every, time=asked, progress=report)
         done()
         return found
 
-    travel = anywhere(uncertainty)
+    travel = anywhere(uncertainty, bounds or _silent) if proof else NOT_PROVEN
     tolerance = {}
-    for name, share in uncertainty.items():
+    for name, share in uncertainty.items() if proof else ():
         nominal = getattr(plant.parameters, name)
         down = anywhere({name: (nominal * (1 - share), nominal)})
         tolerance[name] = down, anywhere({name: (nominal, nominal * (1 + share))})
     payload = None
-    if "m" in units_of(plant.parameters):
+    if proof and "m" in units_of(plant.parameters):
         m: float = getattr(plant.parameters, "m")  # noqa: B009  a machine's own field
         payload = anywhere({"m": (m, m + 1.0)})
     sensors = [s.name for s in plant.outputs]
     places: list[Place] = []
     classical: list[_Classical | None] = []
-    for share in PLACES:
-        margins, peaks, sides = [], [], []
-        for z in dict.fromkeys((share * plant.travel, -share * plant.travel)):
-            here, law = machine_system(plant, controller, names, {stroke: z}, current_loops)
-            margins.append(robust_margin(here, law, uncertainty))
-            peaks.append(_peak(here, law, states=False))
-            sides.append(_classical(here, law, sensors) if _stable(here, law) else None)
+    for share in shares:
+        positions = dict.fromkeys((share * plant.travel, -share * plant.travel))
+        loops = [loop_at(plant, controller, tuple(every), z, current_loops) for z in positions]
+        margin = _smallest([here(z) for z in positions]) if proof else NOT_PROVEN
+        peaks, sides = [], []
+        for system, law in loops:
+            peaks.append(_peak(system, law, states=False))
+            sides.append(_classical(system, law, sensors) if _stable(system, law) else None)
         classical += sides
         disk, delay = np.nan, np.nan
         if all(sides):
             both = _worst([found for found in sides if found is not None])
             disk, delay = both.disks[2].size, min(both.delay.values())
-        margin = min(margins, key=lambda m: (m.lower is not None, m.lower, m.upper))
         places.append(Place(share * plant.travel, margin, float(np.max(peaks)), disk, delay))
         done()
     worst = _worst([found for found in classical if found is not None]) if all(classical) else None
@@ -214,6 +242,17 @@ def robustness(
         payload,
         tuple(places),
     )
+
+
+def _silent(lower: float, upper: float) -> None:
+    del lower, upper
+
+
+def _smallest(found: list[Margin]) -> Margin:
+    """The smallest lower and the smallest upper bound of margins that all shall hold."""
+    lower = None if any(m.lower is None for m in found) else min(m.lower or 0.0 for m in found)
+    reason = "; ".join(dict.fromkeys(m.reason for m in found if m.reason))
+    return replace(min(found, key=lambda m: m.upper), lower=lower, reason=reason)
 
 
 class _Classical(NamedTuple):

@@ -9,6 +9,7 @@ import math
 import os
 import re
 import sys
+import time as clock
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -25,9 +26,9 @@ if TYPE_CHECKING:
     from malta.chain import Robustness
     from malta.controller import Controller
     from malta.experiments import Experiment
+    from malta.margins.robust import Margin
     from malta.plan import Sampler
     from malta.plant import Parameters, Plant
-    from malta.robust import Margin
     from malta.simulate import EngineChoice
     from malta.trials import Requirement
     from malta.verify import CurrentLoops, Margins
@@ -172,6 +173,19 @@ def verify(
     current_loops: Annotated[
         str, typer.Option(help="Of the machine's loop: lag (first order), or pi (sampled PI loops).")
     ] = "lag",
+    time: Annotated[
+        float | None,
+        typer.Option(metavar="SECONDS", help="Longest search of a margin over the travel. [120]"),
+    ] = None,
+    no_proof: Annotated[
+        bool, typer.Option("--no-proof", help="A first look: no proof of the margins over the travel.")
+    ] = False,
+    worst_case: Annotated[
+        bool, typer.Option("--worst-case", help="The largest |S| of each sensor over the uncertainty, too.")
+    ] = False,
+    certificate: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Write the proof of the margin, for `malta check`.")
+    ] = None,
     out: Annotated[Path | None, typer.Option(help="Folder for the figure (.png).")] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -191,7 +205,7 @@ def verify(
     from malta.chain import robustness
     from malta.data import plant_of, units_of
     from malta.linearize import linearize
-    from malta.verify import require_stable
+    from malta.verify import require_stable, worst_sensitivities
     from malta.verify import verify as verified
 
     controller = gain_files.read(gains)
@@ -202,23 +216,46 @@ def verify(
     for name, share in box.items():
         if not 0 < share < math.inf:
             raise InputError("--uncertain", name, f"{100 * share:g} %", "a share above 0 %")
+    if time is not None and not 0 < time < math.inf:
+        raise InputError("--time", "", f"{time:g}", "seconds above 0")
+    if certificate is not None and no_proof:
+        raise InputError("--certificate", "", "--no-proof", "one of them")
+    loops = cast("CurrentLoops", current_loops)
     try:
         margins = verified(model, controller)
-        with _bar("margins", quiet=as_json) as progress:
+        with _bounds("margins", quiet=as_json) as (progress, bounds):
             found = robustness(
-                plant, controller, box, current_loops=cast("CurrentLoops", current_loops), progress=progress
-            )
+                plant, controller, box,
+                current_loops=loops, progress=progress, bounds=bounds, time=time, proof=not no_proof,
+            )  # fmt: skip
+        worst = worst_sensitivities(plant, controller, box, loops, time=time) if worst_case else {}
     except CheckError as error:
         raise CheckError(f"{gains}: {error}") from error
-    files = []
+    files: list[Path] = []
+    refused: InputError | CheckError | None = None
+    if certificate is not None:
+        try:
+            files.append(_certified(certificate, gains, plant, controller, box, loops, found.travel))
+        except (InputError, CheckError) as error:
+            refused = error  # the tables come first
     if out is not None:
         from malta import report
 
         picture, position = out / f"{controller.name}_margins.png", f"position {plant.stroke}"
-        files = [report.robustness(found, controller.name, box, picture, position)]
+        files.append(report.robustness(found, controller.name, box, picture, position))
     if as_json:
         described = {"gains": str(gains), "design": controller.name, "files": [str(file) for file in files]}
-        _print_json(described | _margins(margins) | {"robust": _robustness(found, box)})
+        largest = {
+            name: {
+                "found": gain.lower,
+                "frequency": gain.frequency,
+                "proven": gain.upper,
+                "reason": gain.reason,
+            }
+            for name, gain in worst.items()
+        }
+        robust = _robustness(found, box) | ({"worst_sensitivity": largest} if worst else {})
+        _print_json(described | _margins(margins) | {"robust": robust})
     else:
         from malta import report
 
@@ -238,11 +275,50 @@ def verify(
             report.gang_table(found, plant),
             report.tolerance_table(found, box),
             report.places_table(found, controller.sample_time),
+            *([report.worst_case_table(worst)] if worst else []),
         ):
             console.print(table)
         for file in files:
             console.print(f"wrote {file}", soft_wrap=True)
     require_stable(margins, str(gains))
+    if refused is not None:
+        raise refused
+
+
+@app.command()
+def check(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="A certificate that verify wrote.")],
+    gains: Annotated[
+        Path | None,
+        typer.Option(metavar="GAINS", help="The gain file that it has to be of, to the last digit."),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Check the proof of a margin, in arithmetic with rigorous bounds and without the code that found it.
+
+    \b
+    Example:  malta check build/table2_margin.json --gains design/gains/table2.json
+    """
+    from malta.margins.check import check as checked
+
+    found = checked(file, gains)
+    failures = list(found.failures)
+    if gains is not None and not failures and not _is_of(file, gains):
+        failures.append(f"the loops are not those of {gains}")
+    if as_json:
+        described = {"file": str(file), "holds": not failures, "lower": found.claim}
+        _print_json(described | {"groups": list(found.groups), "failures": failures})
+    else:
+        console = _console()
+        for line in found.groups:
+            console.print(line, soft_wrap=True)
+        verdict = "does not hold" if failures else "holds"
+        console.print(
+            f"{file}: stable in {100 * found.claim:.3f} % of the uncertainty: {verdict}", soft_wrap=True
+        )
+        for line in failures:
+            print(f"malta: {file}: {line}", file=sys.stderr)
+    raise typer.Exit(1 if failures else 0)
 
 
 @app.command()
@@ -1081,6 +1157,75 @@ def _bar(what: str, *, quiet: bool) -> Iterator[Callable[[float], None] | None]:
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task(what, total=1.0)
         yield lambda share: bar.update(task, completed=share)
+
+
+@contextmanager
+def _bounds(
+    what: str, *, quiet: bool
+) -> Iterator[tuple[Callable[[float], None] | None, Callable[[float, float], None]]]:
+    """A bar and the bounds of a margin so far; without a terminal a line every 2 s, once the proof takes longer.
+
+    Ctrl-C prints what stands and ends with 130.
+    """
+    stands: list[float] = []
+    terminal = sys.stderr.isatty()
+    due: float | None = None  # when the next line is, from the proof's first word on
+
+    def words() -> str:
+        lower, upper = stands
+        high = "not found" if math.isinf(upper) else f"{100 * upper:.2f} %"
+        return f"proven {100 * max(lower, 0):.2f} %, lost at {high}"
+
+    with _bar(what, quiet=quiet) as progress:
+
+        def bounds(lower: float, upper: float) -> None:
+            nonlocal due
+            stands[:] = lower, upper
+            due = clock.monotonic() + PATIENCE if due is None else due
+            if quiet or terminal or clock.monotonic() < due:
+                return
+            due = clock.monotonic() + 2.0
+            print(f"malta: {what}: {words()}", file=sys.stderr, flush=True)
+
+        try:
+            yield progress, bounds
+        except KeyboardInterrupt:
+            print("malta: interrupted; " + (words() if stands else "nothing proven"), file=sys.stderr)
+            raise typer.Exit(130) from None
+
+
+PATIENCE = 5.0  # s, before the first line about a proof
+
+
+def _certified(
+    path: Path,
+    gains: Path,
+    plant: Plant,
+    controller: Controller,
+    box: Mapping[str, float],
+    current_loops: CurrentLoops,
+    margin: Margin,
+) -> Path:
+    """Write the certificate of a margin over the travel."""
+    from malta.margins import certificate
+    from malta.verify import travel_loops
+
+    places, over = travel_loops(plant, controller, tuple(box), current_loops)
+    return certificate.write(path, places, box, over, margin, gains)
+
+
+def _is_of(path: Path, gains: Path) -> bool:
+    """Whether a certificate's loops are those of a gain file, with either kind of current loops."""
+    from malta import gains as gain_files
+    from malta.data import plant_of
+    from malta.margins import certificate, checked_file
+    from malta.verify import travel_loops
+
+    controller = gain_files.read(gains)
+    plant = plant_of(controller.parameters)
+    names = tuple(p["name"] for p in checked_file.content_of(path)["parameters"] if p["name"] != plant.stroke)
+    kinds: tuple[CurrentLoops, ...] = ("lag", "pi") if controller.current_loop is not None else ("lag",)
+    return any(certificate.matches(path, travel_loops(plant, controller, names, kind)[0]) for kind in kinds)
 
 
 def _complain(error: InputError | CheckError, file: Path | None = None) -> int:

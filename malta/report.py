@@ -32,15 +32,16 @@ from malta.signals import aside, compliance_unit, inputs_of, outputs_of, stiffne
 from malta.simulate import Trajectory
 from malta.spec import Spec
 from malta.synthesize import continuous_poles
-from malta.verify import BANDWIDTHS, Margins, zone
+from malta.verify import BANDWIDTHS, NOT_BETWEEN, NOT_PROVEN, Margins, zone
 
 if TYPE_CHECKING:
     from malta.campaign import Campaign
     from malta.chain import Robustness
     from malta.claims import Ledger
     from malta.experiments import Experiment, Merit
+    from malta.margins.gain import Gain
+    from malta.margins.robust import Margin
     from malta.plant import ComplexArray, FloatArray, Plant
-    from malta.robust import Margin
     from malta.trials import Requirement, Tuned
 
 
@@ -127,11 +128,14 @@ def chain_table(found: Robustness) -> Table:
             peak += f" {zone(link.peak)}"
         _row(table, link.name, *_margin_cells(link.margin), _blame(link.margin), peak, link.broken_at)
     travel = found.travel
-    _row(table, "all of the travel", *_margin_cells(travel), _blame(travel), "", "")
+    where = "all of the travel" if _everywhere(travel) else "middle and end of it"
+    _row(table, where, *_margin_cells(travel), _blame(travel), "", "")
     return table
 
 
 def _margin_cells(margin: Margin) -> tuple[str, str, str]:
+    if margin is NOT_PROVEN:
+        return "not asked", "", ""
     low = "nothing" if margin.lower is None else f"{100 * margin.lower:.2f} %"
     high = "not found" if margin.exhausted else f"{100 * margin.upper:.2f} %"
     return low, high, "" if margin.frequency is None else f"{margin.frequency:.4g}"
@@ -140,7 +144,7 @@ def _margin_cells(margin: Margin) -> tuple[str, str, str]:
 def _blame(margin: Margin) -> str:
     """The parameters that pull hardest, and which way they went."""
     if margin.witness is None:
-        return margin.reason
+        return "" if margin is NOT_PROVEN else margin.reason
     largest = sorted(margin.sensitivity, key=lambda name: -margin.sensitivity[name])
     return " ".join(
         f"{name}{'+' if margin.moved[name] > 0 else '-'}"
@@ -198,9 +202,8 @@ def gang_table(found: Robustness, plant: Plant) -> Table:
 
 def tolerance_table(found: Robustness, uncertainty: Mapping[str, float]) -> Table:
     """What each parameter may do alone, proven, and its share in the margin of all."""
-    table = _table(
-        "One at a time, proven anywhere in the travel", "parameter", "down to", "up to", "share in the margin"
-    )
+    where = "anywhere in the travel" if _everywhere(found.travel) else "in its middle and at its end"
+    table = _table(f"One at a time, proven {where}", "parameter", "down to", "up to", "share in the margin")
     shares = found.chain[-1].margin.sensitivity
     for name, (down, up) in found.tolerance.items():
         cells = []
@@ -213,6 +216,16 @@ def tolerance_table(found: Robustness, uncertainty: Mapping[str, float]) -> Tabl
         t = found.payload.lower
         more = " and more" if found.payload.exhausted else ""
         _row(table, "payload", "", "nothing proven" if t is None else f"{t:.3g} kg{more}", "")
+    return table
+
+
+def worst_case_table(gains: Mapping[str, Gain]) -> Table:
+    """The largest |S| of each sensor over the modelled box and the travel, found and proven."""
+    title = "Worst-case peak |S| over the uncertainty and the travel"
+    table = _table(title, "sensor", "found", "at rad/s", "proven below", "zone")
+    for name, gain in gains.items():
+        high = "nothing proven" if gain.upper is None else f"{gain.upper:.3f}"
+        _row(table, name, f"{gain.lower:.3f}", f"{gain.frequency:.4g}", high, zone(gain.upper or math.inf))
     return table
 
 
@@ -263,7 +276,18 @@ def design_page(
 
 def _travel_text(margins: Margins) -> Text:
     box_text = " ".join(f"{name} +-{100 * share:g} %" for name, share in margins.uncertainty.items())
-    return Text(f"Parametric margin over the whole travel ({box_text}): {margins.robust}\n")
+    assert margins.robust is not None
+    where = (
+        "over the whole travel"
+        if _everywhere(margins.robust)
+        else "in the middle and at the end of the travel"
+    )
+    return Text(f"Parametric margin {where} ({box_text}): {margins.robust}\n")
+
+
+def _everywhere(margin: Margin) -> bool:
+    """Whether a margin of the travel is one of all positions, or of places alone."""
+    return NOT_BETWEEN not in margin.reason
 
 
 def _sampled(Ts: float) -> str:

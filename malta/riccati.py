@@ -27,6 +27,7 @@ RESIDUAL = 1e-9  # largest accepted relative residual of a Riccati equation
 REFINED = 1e-13  # the residual above which a solution is refined: rounding leaves less than a tenth of it
 EPS = float(np.finfo(float).eps)
 STEPS = 8  # of Newton's at most; each squares the error
+ROUNDING = 1e-16  # couplings below this, relative to what else acts on and from both ends, are none
 DOUBLINGS = 64  # at most: sums of 2^64 samples
 
 
@@ -265,12 +266,28 @@ def _parts(
     r = np.sqrt(np.where(np.diag(R) > 0, np.diag(R), 1))  # units of the inputs
     if np.linalg.eigvalsh(R / np.outer(r, r)).min() <= 0:
         raise InputError(what, "R", "a matrix that is not positive definite", "R > 0")
-    touch = np.block([[(A != 0) | (Q != 0), (B != 0) | (N != 0)], [np.zeros((m, n), bool), R != 0]])
-    count, label = sparse.csgraph.connected_components(touch, directed=False)
+    count, label = sparse.csgraph.connected_components(_touch(A, B, Q, R, N), directed=False)
     parts = [(np.flatnonzero(label[:n] == k), np.flatnonzero(label[n:] == k)) for k in range(count)]
     if any(not len(i) or not len(j) for i, j in parts):  # a state without input, an input without state
         return [(np.arange(n), np.arange(m))]
     return parts
+
+
+def _touch(A: FloatArray, B: FloatArray, Q: FloatArray, R: FloatArray, N: FloatArray) -> NDArray[np.bool_]:
+    """Which states and inputs act on each other by more than rounding, in balanced units.
+
+    What a model's trigonometry leaves of exact zeros, 1e-20 of the loop's own stiffness, joins nothing.
+    """
+    m = B.shape[1]
+    r = np.sqrt(np.diag(R))
+    t = _balance(A, (B / r) @ (B / r).T, Q)
+    scaled = np.abs(
+        np.block([[A * t / t[:, None], B / r / t[:, None]], [N.T * t / r[:, None], np.zeros((m, m))]])
+    )
+    weights = np.abs(linalg.block_diag(Q, R))
+    own = np.sqrt(np.diag(weights))
+    large = np.sqrt(np.outer(scaled.max(axis=1, initial=0), scaled.max(axis=0, initial=0)))
+    return np.asarray((scaled > ROUNDING * large) | (weights > ROUNDING * np.outer(own, own)))
 
 
 def _balance(A: FloatArray, G: FloatArray, Q: FloatArray) -> FloatArray:

@@ -31,6 +31,7 @@ from malta.data import plant_of, units_of
 from malta.errors import CheckError, InputError
 from malta.experiments import experiment
 from malta.linearize import linearize
+from malta.margins.plants import of_plant
 from malta.plant import trim
 from malta.riccati import add_lags, delay_inputs, sample
 from malta.simulate import Scenario, simulate, stroke_figures
@@ -56,7 +57,6 @@ from malta.trials import (
     synthesized,
     together,
 )
-from malta.uncertain import uncertain
 from malta.verify import BANDWIDTHS, machine_loop, travel_margin, verify
 
 if TYPE_CHECKING:
@@ -162,7 +162,7 @@ def _groups(spec: Spec) -> list[_Group]:
         touch[n + m :, :n] |= at.C != 0
     count, label = sparse.csgraph.connected_components(touch, directed=False)
     names = tuple(spec.uncertainty)
-    systems = [uncertain(plant, names, at={plant.stroke: z}) for z in positions] if asked.margin else []
+    systems = [of_plant(plant, names, at={plant.stroke: z}) for z in positions] if asked.margin else []
     found = []
     for k in range(count):
         i, j, o = (

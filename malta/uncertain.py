@@ -7,8 +7,8 @@ u = H F y                                 a control law F, and what stands betwe
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -16,9 +16,9 @@ import casadi as ca
 import numpy as np
 
 from malta.controller import Controller, CurrentLoop, LinearLaw, handed_on, linear_law
-from malta.errors import CheckError, InputError
+from malta.errors import CheckError
 from malta.linearize import jacobians
-from malta.plant import Plant, readonly, symbolic
+from malta.plant import Plant, symbolic
 from malta.riccati import add_lags, delay_inputs, sample
 
 if TYPE_CHECKING:
@@ -29,9 +29,7 @@ if TYPE_CHECKING:
 class UncertainSystem:
     """E(p) x' = A(p) x + B(p) u, y = C(p) x + D(p) u with parameters p by name.
 
-    matrices: p -> A, B, C, or with D, or with D and E.
-    second_order: x = (q, q'), so A = [[0, I], [A21, A22]] and B = [[0], [B2]]. `malta.margins` reads all structure from
-    the expressions and takes no word for it.
+    matrices: p -> A, B, C, or with D, or with D and E. All structure is read from its expressions.
     limits: what each parameter may be at all, (above, below), exclusive; anything where none are given.
     sample_time: s, where x+ stands in place of x'.
     """
@@ -39,7 +37,6 @@ class UncertainSystem:
     names: tuple[str, ...]
     nominal: FloatArray
     matrices: ca.Function
-    second_order: bool = False
     limits: tuple[tuple[float, float], ...] = ()
     sample_time: float | None = None
 
@@ -70,64 +67,6 @@ class Compensator:
     sample_time: float | None = None  # s; None: continuous
     delay: int = 0  # samples
     lag: float | None = None  # rad/s
-
-
-def uncertain(
-    plant: Plant,
-    names: Sequence[str],
-    *,
-    at: Mapping[str, float] | None = None,
-    states: bool = False,
-    believed: Plant | None = None,
-    held: FloatArray | None = None,
-) -> UncertainSystem:
-    """The design model of a plant at a position along its stroke, in parameters by name, at its preload.
-
-    The stroke itself may be one of the names (`z` for MALTA): its nominal value is the position.
-    Inputs are commanded forces: a controller commutates as the machine it knows, the plant's currents make their own.
-    at: the position, SI; states: the states follow the outputs in y; believed: the machine that the controller knows,
-    where it is another one; held: H of currents that are held between samples (`held_at`): the inputs are
-    v + H y, and where the parameters leave more of the reading than that, it is a further input.
-
-    Raises InputError for an unknown name.
-    """
-    from malta.data import shaping, units_of
-
-    par = plant.parameters
-    known = [*units_of(par), plant.stroke]
-    for name in names:
-        if name not in known:
-            raise InputError("robust_margin", name, "an unknown parameter", "one of " + " ".join(known))
-    for name in set(names) & set(shaping(par)):
-        raise InputError("robust_margin", name, "a parameter that shapes the model", "one that enters it")
-    if believed is not None and believed.tabulated:
-        found = "a controller that looks up a table"
-        raise InputError("robust_margin", "believed", found, "one whose currents are a formula")
-    x0 = plant.at(**(at or {})).x
-    position = float(x0[plant.stroke_state])
-    of = model_of(plant, believed or plant, tuple(name for name in names if name != plant.stroke))
-    # What is held is of a size that nobody wants to write out at every place.
-    kind = ca.MX if holds(plant) else ca.SX
-    p = kind.sym("p", len(names))
-    own = [k for k, name in enumerate(names) if name != plant.stroke]
-    z = p[names.index(plant.stroke)] if plant.stroke in names else position
-    acting = of(p[own], z, ca.DM.zeros(len(plant.inputs)))[-1]
-    v = acting
-    if kind is ca.MX:  # what has to be wanted so that the preload acts
-        made, ratio = of(p[own], z, acting)[4:6]
-        v = acting + ca.solve(ratio, acting - made)
-    A, B, C, E = of(p[own], z, v)[:4]
-    nominal = [position if name == plant.stroke else getattr(par, name) for name in names]
-    if held is not None:
-        A, left = A - E @ C, E - B @ ca.DM(held)
-        if not _vanishes(p, left, E, nominal):
-            B = ca.horzcat(B, left)
-    if states:
-        C = ca.vertcat(C, ca.DM.eye(len(plant.controlled)))
-    bounds = {f.name: lowest(f.metadata) for f in fields(par)}
-    limits = tuple((bounds.get(name, -math.inf), math.inf) for name in names)
-    matrices = ca.Function("matrices", [p], [ca.densify(M) for M in (A, B, C)])
-    return UncertainSystem(tuple(names), readonly(nominal), matrices, True, limits)
 
 
 def held_at(plant: Plant, position: float) -> FloatArray:
@@ -163,17 +102,6 @@ def around(nominal: FloatArray, rng: np.random.Generator, count: int) -> FloatAr
     """Rows of parameters at random: up to half of each nominal value away from it, 1e-3 where that is zero."""
     spread = np.where(nominal == 0, 1e-3, np.abs(nominal) / 2)
     return np.asarray(nominal + spread * rng.uniform(-1, 1, (count, len(nominal))))
-
-
-def _vanishes(p: Any, expression: Any, beside: Any, nominal: list[float]) -> bool:
-    """Whether an analytic expression is zero at any parameters: it is at eight places chosen at random."""
-    rng = np.random.default_rng(3)
-    values = ca.Function("left", [p], [ca.densify(expression), ca.densify(beside)])
-    for row in around(np.array(nominal), rng, 8):
-        left, size = (np.abs(np.array(M)).max() for M in values(row))
-        if not left <= 1e-9 * size:
-            return False
-    return True
 
 
 @lru_cache(maxsize=64)  # writing out the currents takes longer than most that is asked of the answer

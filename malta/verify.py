@@ -9,7 +9,7 @@ Where currents are held that were commutated for the last reading, that is one m
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, Literal, get_args
 
@@ -19,18 +19,17 @@ from malta.controller import Controller, LinearLaw, handed_on, linear_law
 from malta.data import plant_of
 from malta.errors import CheckError, InputError
 from malta.linearize import LinearModel, linearize
+from malta.margins.gain import Gain, worst_case_gain
+from malta.margins.plants import of_plant
+from malta.margins.robust import TOLERANCE, Margin, common_margin, margin_at, robust_margin
 from malta.plant import trim
 from malta.riccati import add_integrals, add_lags, delay_inputs, eigenvalues, sample
-from malta.robust import Margin, robust_margin
 from malta.uncertain import (
     Compensator,
     UncertainSystem,
-    around,
     held_at,
     holds,
-    responses,
     sampled_law,
-    uncertain,
 )
 
 if TYPE_CHECKING:
@@ -106,7 +105,9 @@ class Margins:
             lines.append(f"bandwidth, {BANDWIDTHS[key]}: {value:.1f} rad/s ({value / (2 * np.pi):.2f} Hz)")
         if self.uncertainty:
             box = "  ".join(f"{name} +-{share * 100:g} %" for name, share in self.uncertainty.items())
-            lines += [f"uncertainty: {box}", f"robust over the travel: {self.robust}"]
+            everywhere = self.robust is None or NOT_BETWEEN not in self.robust.reason
+            where = "over the travel" if everywhere else "in the middle and at the end of the travel"
+            lines += [f"uncertainty: {box}", f"robust {where}: {self.robust}"]
         return "\n".join(lines)
 
 
@@ -320,11 +321,9 @@ def machine_system(
     """The machine at a position in parameters by name, and its law: what its margin is asked of. See `machine_law`."""
     believed = plant_of(controller.parameters)
     if not holds(believed):
-        return uncertain(plant, names, at=at, believed=believed), machine_law(
-            plant, controller, current_loops
-        )
+        return of_plant(plant, names, at=at, believed=believed), machine_law(plant, controller, current_loops)
     H = held_at(believed, float(believed.at(**at).x[believed.stroke_state]))
-    system = uncertain(plant, names, at=at, believed=believed, held=H)
+    system = of_plant(plant, names, at=at, believed=believed, held=H)
     handed = system.matrices.size2_out(1) > len(H)
     return system, machine_law(plant, controller, current_loops, held=H, handed=handed)
 
@@ -335,56 +334,113 @@ def travel_margin(
     ranges: Mapping[str, float | tuple[float, float]],
     current_loops: CurrentLoops = "lag",
     names: Sequence[str] = (),
+    *,
+    time: float | None = None,
+    progress: Callable[[float, float], None] | None = None,
 ) -> Margin:
     """The margin of the machine's loop anywhere in its travel: the position is one more interval of the proof.
 
-    Currents that are held for a position make waves along the travel, no polynomials: there it is proven in PLACES.
+    Where the matrices have no short form along the travel, as those of the planar motor's held currents, the margin is
+    that in the middle and at the end, and says so.
 
     ranges : of the parameters, as robust_margin takes them
     names : parameters of the model, where others stand still beside those of `ranges`: one model for several questions
+    time : s, of the whole search; None: 120
     """
     names = tuple(names or ranges)
-    if not holds(plant):
-        over = {plant.stroke: (-plant.travel, plant.travel)}
-        system, law = machine_system(
-            plant, controller, [*names, plant.stroke], {plant.stroke: 0.0}, current_loops
-        )
-        return robust_margin(system, law, ranges, over)
-    found = [robust_margin(*loop, ranges) for loop in _along(plant, controller, names, current_loops)]
-    return min(found, key=lambda m: (m.lower is not None, m.lower, m.upper))
+    along, over = travel_loops(plant, controller, names, current_loops)
+    found = common_margin(along, ranges, over, time=time, progress=progress)
+    if len(along) == 1:
+        return found
+    here = f"at {len(along)} places of the travel, {NOT_BETWEEN}"
+    return replace(found, reason=f"{here}; {found.reason}" if found.reason else here)
+
+
+def travel_loops(
+    plant: Plant, controller: Controller, names: tuple[str, ...], current_loops: CurrentLoops = "lag"
+) -> tuple[list[tuple[UncertainSystem, Compensator]], dict[str, tuple[float, float]]]:
+    """The loops of which travel_margin proves a margin, and the intervals that do not grow."""
+    along = _along(plant, controller, names, current_loops)
+    return along, {plant.stroke: (-plant.travel, plant.travel)} if len(along) == 1 else {}
 
 
 @lru_cache(maxsize=8)  # several questions are asked of the same loops; records compare by identity
 def _along(
     plant: Plant, controller: Controller, names: tuple[str, ...], current_loops: CurrentLoops
 ) -> list[tuple[UncertainSystem, Compensator]]:
-    """The machine's loops in PLACES of its travel, those that are the same once."""
-    found: list[tuple[UncertainSystem, Compensator]] = []
-    seen: list[ComplexArray] = []
-    for z in dict.fromkeys(sign * share * plant.travel for share in PLACES for sign in (1, -1)):
-        loop = machine_system(plant, controller, names, {plant.stroke: z}, current_loops)
-        here = _fingerprint(*loop)
-        if not any(np.allclose(here, other, 1e-7, 0) for other in seen):
-            seen.append(here)
-            found.append(loop)
+    """The machine's loop with its position as a parameter; its loops in the middle and at the end where not."""
+    whole = machine_system(plant, controller, [*names, plant.stroke], {plant.stroke: 0.0}, current_loops)
+    if whole[0].matrices.n_instructions() < LONG:
+        return [whole]
+    return [loop_at(plant, controller, names, share * plant.travel, current_loops) for share in ENDS]
+
+
+def place_margin(
+    plant: Plant,
+    controller: Controller,
+    ranges: Mapping[str, float | tuple[float, float]],
+    position: float,
+    current_loops: CurrentLoops = "lag",
+    names: Sequence[str] = (),
+) -> Margin:
+    """The margin of the machine's loop at a position along the stroke; arguments as travel_margin takes them.
+
+    Where there is no proof along the travel the search takes EACH at most.
+    """
+    names = tuple(names or ranges)
+    along, over = travel_loops(plant, controller, names, current_loops)
+    if over:
+        return margin_at(*along[0], ranges, {plant.stroke: position}, over, tolerance=TOLERANCE)
+    return robust_margin(*loop_at(plant, controller, names, position, current_loops), ranges, time=EACH)
+
+
+def worst_sensitivities(
+    plant: Plant,
+    controller: Controller,
+    ranges: Mapping[str, float | tuple[float, float]],
+    current_loops: CurrentLoops = "lag",
+    *,
+    time: float | None = None,
+) -> dict[str, Gain]:
+    """The largest |S| of each sensor, the other loops closed, over the modelled box and the travel.
+
+    Arguments as travel_margin takes them; where there is no proof along the travel, in its middle and at its end.
+    """
+    along, over = travel_loops(plant, controller, tuple(ranges), current_loops)
+    found = {}
+    for k, sensor in enumerate(plant.outputs):
+        each = [worst_case_gain(*loop, ranges, over, channel=k, time=time) for loop in along]
+        worst = max(each, key=lambda gain: gain.lower)
+        proven = [gain.upper for gain in each if gain.upper is not None]
+        found[sensor.name] = replace(worst, upper=max(proven) if len(proven) == len(each) else None)
     return found
 
 
-def _fingerprint(system: UncertainSystem, law: Compensator) -> ComplexArray:
-    """det(1 - P F) at parameters and frequencies chosen at random: what loops have in common that are the same, or
-    mirror images of each other."""
-    rng = np.random.default_rng(4)
-    T = law.sample_time
-    assert T is not None
-    w = np.exp(rng.uniform(-4, 0, 6)) * np.pi / T
-    found = []
-    for row in around(system.nominal, rng, 4):
-        P, F = responses(system, law, row, w)
-        found.append(np.linalg.det(np.eye(P.shape[1]) - P @ F))
-    return np.array(found)
+def places_along(
+    plant: Plant, controller: Controller, names: tuple[str, ...], current_loops: CurrentLoops = "lag"
+) -> tuple[float, ...]:
+    """Shares of the travel at which a margin of its own is worth its time."""
+    return PLACES if len(_along(plant, controller, names, current_loops)) == 1 else ENDS
 
 
+@lru_cache(maxsize=32)
+def loop_at(
+    plant: Plant,
+    controller: Controller,
+    names: tuple[str, ...],
+    position: float,
+    current_loops: CurrentLoops = "lag",
+) -> tuple[UncertainSystem, Compensator]:
+    """The machine's loop at a position along the stroke; the same records for the same question."""
+    return machine_system(plant, controller, names, {plant.stroke: position}, current_loops)
+
+
+NOT_PROVEN = Margin(None, math.inf, None, None, {}, {}, (), 0.0, "not asked")  # of a first look
+NOT_BETWEEN = "not between them"  # what a margin of several places says
+LONG = 5000  # operations of matrices that are not enclosed over an interval of positions
 PLACES = (0.0, 1 / 3, 2 / 3, 1.0)  # shares of the travel, either way
+EACH = 6.0  # s, of the margin at a position for itself
+ENDS = (0.0, 1.0)  # of those, where no interval is enclosed
 
 
 def require_stable(margins: Margins, name: str) -> None:

@@ -13,38 +13,19 @@ from typing import Any
 
 import numpy as np
 import pytest
+from conftest import Run
 from flint import arb, fmpq
 
 import malta
-from malta.controller import Controller
 from malta.errors import InputError
 from malta.margins import certificate, checked_file
 from malta.margins.check import check, tiled
 from malta.margins.checked_loop import determinant_bounds
-from malta.plant import Plant
-from malta.uncertain import Compensator, UncertainSystem, held_at, holds
-from malta.verify import machine_law
+from malta.uncertain import Compensator
+from malta.verify import travel_loops, travel_margin
 
 ROOT = Path(__file__).parents[1]
 HALBACH = ROOT / "design" / "gains" / "halbach.json"
-Loops = list[tuple[UncertainSystem, Compensator]]
-
-
-def travel_loops(
-    plant: Plant, controller: Controller, names: tuple[str, ...]
-) -> tuple[Loops, dict[str, tuple[float, float]]]:
-    """The machine's loop with its position as one more parameter, and the interval of that."""
-    H = held_at(plant, 0.0) if holds(plant) else None
-    system = malta.uncertain(plant, [*names, plant.stroke], at={plant.stroke: 0.0}, believed=plant, held=H)
-    law = machine_law(plant, controller, held=H)
-    return [(system, law)], {plant.stroke: (-plant.travel, plant.travel)}
-
-
-def travel_margin(plant: Plant, controller: Controller, ranges: dict[str, float]) -> malta.Margin:
-    ((system, law),), over = travel_loops(plant, controller, tuple(ranges))
-    return malta.robust_margin(system, law, ranges, over)
-
-
 Change = Callable[[dict[str, Any]], None]
 
 
@@ -330,10 +311,63 @@ def test_determinant_bounds_are_bounds() -> None:
 # the command line
 
 
+def test_verify_writes_and_check_confirms(run: Run, tmp_path: Path) -> None:
+    path = tmp_path / "c.json"
+    code, out, _ = run(
+        "verify", str(HALBACH), "--uncertain", "b=20%", "--time", "60", "--certificate", str(path)
+    )
+    assert (code, f"wrote {path}" in out) == (0, True)
+    code, out, err = run("check", str(path), "--gains", str(HALBACH))
+    assert (code, err) == (0, "")
+    assert out.splitlines()[-1].endswith("% of the uncertainty: holds")
+    code, out, err = run("check", str(path), "--gains", str(ROOT / "design/gains/table2.json"))
+    assert code == 1
+    assert "another gain file" in err
+    content = json.loads(path.read_text())
+    raised(content)
+    code, out, err = run("check", str(written(content, tmp_path)), "--json")
+    assert (code, json.loads(out)["holds"]) == (1, False)
+    assert run("check", "pyproject.toml")[0] == 2
+
+
+def test_a_first_look_without_the_proof(run: Run) -> None:
+    code, out, err = run("verify", str(HALBACH), "--uncertain", "b=20%", "--no-proof")
+    assert (code, err) == (0, "")
+    assert "not asked" in out
+    assert run("verify", str(HALBACH), "--no-proof", "--certificate", "c.json")[0] == 2
+    assert run("verify", str(HALBACH), "--time", "0")[0] == 2
+
+
+def test_ctrl_c_prints_what_stands(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(*_: Any, bounds: Callable[[float, float], None], **__: Any) -> None:
+        bounds(1.5, math.inf)
+        bounds(1.5, 1.75)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("malta.chain.robustness", interrupted)
+    code, out, err = run("verify", str(HALBACH))
+    assert (code, out) == (130, "")
+    assert err == "malta: interrupted; proven 150.00 %, lost at 175.00 %\n"
+
+
+def test_a_long_proof_says_where_it_is(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("malta.cli.PATIENCE", 0.0)
+    _, _, err = run("verify", str(HALBACH), "--uncertain", "b=20%")
+    assert re.match(r"malta: margins: proven \d+\.\d\d %, lost at ", err)
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["table2", "calibrated", "robust"])
+@pytest.mark.parametrize("name", ["table2", "calibrated", "robust", "halbach", "halbach_late", "halbach_pid"])
 def test_shipped_designs(tmp_path: Path, name: str) -> None:
     path, content = shipped(name, tmp_path)
     found = check(path, ROOT / "design" / "gains" / f"{name}.json")
     assert found.ok, found.failures
     assert len(found.groups) == len(content["loops"][0]["groups"])
+
+
+def test_verify_asks_for_the_worst_case(run: Run) -> None:
+    code, out, err = run("verify", str(HALBACH), "--no-proof", "--worst-case")
+    assert (code, err) == (0, "")
+    found = re.search(r"^ x +(\d\.\d+) +6\.6\d+ +(\d\.\d+) +A", out, re.M)
+    assert found is not None
+    assert 1.91 < float(found[1]) < float(found[2]) < 1.93

@@ -26,8 +26,9 @@ from malta.chain import (
 from malta.cli import app, main
 from malta.data import plant_of
 from malta.errors import InputError
-from malta.robust import robust_margin
-from malta.uncertain import Compensator, UncertainSystem, closed_loop, instability, responses, uncertain
+from malta.margins.robust import robust_margin
+from malta.margins.systems import uncertain
+from malta.uncertain import Compensator, UncertainSystem, closed_loop, instability, responses
 from malta.verify import machine_law
 
 if TYPE_CHECKING:

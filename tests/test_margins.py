@@ -81,13 +81,13 @@ def test_loops_that_differ_are_proven_each(rate: float) -> None:
     assert m.upper == pytest.approx(1 / 3 / 0.02, rel=1e-6)
 
 
-def test_what_is_declared_is_not_believed() -> None:
-    """x' = (p - 10) x + u is no second-order system, whatever its caller says: lost at p = 10."""
+def test_a_system_need_not_be_of_second_order() -> None:
+    """x' = (p - 10) x + u has no positions and speeds: lost at p = 10."""
     p = ca.SX.sym("p")
     matrices = ca.Function(
         "f", [p], [ca.vertcat(ca.horzcat(p - 10, 1), ca.horzcat(0, -1)), ca.SX([0, 1]), ca.SX([[1, 0]])]
     )
-    system = UncertainSystem(("p",), np.array([1.0]), matrices, True, ((-math.inf, math.inf),))
+    system = UncertainSystem(("p",), np.array([1.0]), matrices, ((-math.inf, math.inf),))
     m = malta.robust_margin(system, [[0.0]], {"p": (0.0, 2.0)})
     assert m.lower == pytest.approx(9, rel=1e-5)
     assert m.upper == pytest.approx(9, rel=1e-6)

@@ -14,8 +14,9 @@ from malta import gains
 from malta.controller import linear_law
 from malta.data import plant_of
 from malta.errors import InputError
-from malta.robust import robust_margin
-from malta.uncertain import closed_loop, critical, instability, responses, sampled_law, uncertain
+from malta.margins.robust import robust_margin
+from malta.margins.systems import uncertain
+from malta.uncertain import closed_loop, critical, instability, responses, sampled_law
 from malta.verify import loop, machine_law
 
 if TYPE_CHECKING:
@@ -36,7 +37,6 @@ def test_matrices_are_those_of_a_machine_with_these_parameters(design: Design, z
     """The controller divides by its own force constants: B grows with the machine's."""
     plant = design.plant
     system = uncertain(plant, NAMES, at={"z": z})
-    assert system.second_order
     assert system.nominal.tolist() == [getattr(plant.parameters, name) for name in NAMES]
     rng = np.random.default_rng(0)
     for p in (system.nominal, *(system.nominal * rng.uniform(0.7, 1.4, (4, len(NAMES))))):

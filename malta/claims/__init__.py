@@ -32,7 +32,7 @@ from malta.verify import Margins, verify
 
 if TYPE_CHECKING:
     from malta.controller import Controller
-    from malta.robust import Margin
+    from malta.margins.robust import Margin
     from malta.spec import Spec
 
 CLOSE, NEAR = 0.05, 0.2  # of the published figure: reproduced; within x %

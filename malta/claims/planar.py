@@ -313,7 +313,7 @@ def _loop_rows() -> list[Row]:
             "percent",
             "{:.0f}",
             machine_share,
-            note="anywhere in the travel",
+            note="in the middle and at the end of the travel",
         ),
         *(
             Row(

@@ -28,12 +28,12 @@ from malta.electric import link_voltage, open_loop_gain
 from malta.experiments import Experiment, Progress
 from malta.experiments.tubular import late_stroke
 from malta.linearize import LinearModel, linearize
+from malta.margins.plants import of_plant
+from malta.margins.robust import robust_margin
 from malta.riccati import add_integrals
-from malta.robust import robust_margin
 from malta.simulate import Scenario, StrokeFigures, simulate, stroke_figures
 from malta.spec import Spec
 from malta.synthesize import lqr
-from malta.uncertain import uncertain
 from malta.verify import Margins
 
 if TYPE_CHECKING:
@@ -367,7 +367,7 @@ def _stiffness_ratio(e: Evidence) -> float:
 
 def _full_state_share(e: Evidence) -> float:
     law, states = compensators(e.model.plant, e.controller)["LQR"]
-    system = uncertain(e.model.plant, list(e.spec.uncertainty), at=e.spec.operating_point, states=states)
+    system = of_plant(e.model.plant, list(e.spec.uncertainty), at=e.spec.operating_point, states=states)
     return proven(robust_margin(system, law, e.spec.uncertainty))
 
 

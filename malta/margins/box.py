@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -26,10 +26,20 @@ class Box:
     up: FloatArray
     over: FloatArray  # names x 2: added to nominal, whatever t
     most: float  # t at which a parameter leaves what it can be
+    frame: Mapping[int, tuple[float, float]] = field(
+        default_factory=dict
+    )  # by index: an interval around `over`
 
     def sides(self, t: float) -> FloatArray:
         """Low and high of every parameter: names x 2."""
         return np.column_stack([self.nominal - t * self.down, self.nominal + t * self.up]) + self.over
+
+    def framed(self, t: float) -> FloatArray:
+        """`sides`, those of the frame as wide as that: what several boxes have in common."""
+        sides = self.sides(t)
+        for i, interval in self.frame.items():
+            sides[i] = interval
+        return sides
 
     def standing(self) -> FloatArray:
         """Nominal values, at both ends and the middle of everything that stays; the nominal ones first."""

@@ -32,6 +32,8 @@ WORST = 1e-5  # beyond which the box is cut
 HIGHEST = 16  # degree of an interpolation along one parameter
 RADII = tuple(2.0**k for k in (0.5, 1, 1.5, 2, 3, 4, 5, 6, 8, 10, 12, 14, 17, 20))
 BITS = 160
+MOST_BITS = 640  # beyond which a coefficient is taken as the ball that it is
+HOPE = 0.4  # of what the first place took, at least, the others take
 
 
 class Unproven(Exception):
@@ -137,8 +139,12 @@ def _values(f: Polynomial, places: list[tuple[Any, ...]], until: float = math.in
     while True:
         try:
             with precision(bits):
+                begun = time.monotonic()
                 first = f.at(places[len(places) // 2])
-                if f.exact or bits > 8000 or all(_accurate(c) for c in first):
+                spent = time.monotonic() - begun
+                if time.monotonic() + HOPE * spent * len(places) > until:
+                    raise Unproven("time would be up before the coefficients were found")
+                if f.exact or bits >= MOST_BITS or all(_accurate(c) for c in first):
                     return [timed(place) for place in places]
         except NotAnalytic as error:
             raise Unproven(f"the matrices have no value on the box: {error}") from error

@@ -8,6 +8,7 @@ them, so that `lower`, the smallest t of a cell that is still open, only grows: 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -60,6 +61,15 @@ class Growth:
         width = np.where(self.high > self.low, self.high - self.low, 1)
         return np.asarray(np.clip(np.where(self.high > self.low, (v - self.low) / width, 0.5), 0, 1))
 
+    def inside(self, t: float) -> FloatArray:
+        """Sides in u that hold box(t), from 0 to 1 where that is not within: P x 2."""
+        with np.errstate(all="ignore"):
+            ends = np.array([self.nominal - t * self.down, self.nominal + t * self.up])
+            sides = np.sort([self.shares(p) for p in ends], axis=0).T + np.array([-1e-9, 1e-9])
+        divides = self.inverted & (ends[0] * ends[1] <= 0)
+        known = self.grows & ~divides & np.isfinite(sides).all(axis=1) & np.isfinite(t)
+        return np.asarray(np.clip(np.where(known[:, None], sides, [0.0, 1.0]), 0, 1))
+
     def margin(self, p: FloatArray) -> FloatArray:
         """The smallest t with p in box(t): ... -> ..."""
         moved = p - self.nominal
@@ -95,6 +105,10 @@ class Search:
     depth: FloatArray
     target: float
     count: int = 0
+    beside: Family | None = (
+        None  # zero is to stay excluded by `share` times the size of this one, aligned with family
+    )
+    share: Callable[[FloatArray], FloatArray] | None = None  # of each cell
     done: list[tuple[FloatArray, FloatArray, ComplexArray]] = field(default_factory=list)
 
     @property
@@ -130,9 +144,10 @@ class Search:
         return Cell(int(b), (float(lo), float(hi)), self.boxes[k], float(self.smallest[k]))
 
 
-def start(family: Family, growth: Growth, target: float) -> Search:
+def start(family: Family, growth: Growth, target: float, until: float = np.inf) -> Search:
+    """A search up to `target`; until: what the target may be later."""
     cells = cover(family)
-    boxes = np.tile([0.0, 1.0], (len(cells), len(family.shape), 1))
+    boxes = np.tile(growth.inside(max(target, until)), (len(cells), 1, 1))
     zero = np.zeros(len(cells))
     return Search(family, growth, cells, boxes, growth.smallest(boxes), zero, target)
 
@@ -156,7 +171,7 @@ def advance(s: Search) -> None:
     )
     s.count += len(cells)
     terms, radius = on_boxes(s.family, cells, boxes)
-    c = half_plane(terms, radius)
+    c = half_plane([*terms, *_discs(s, cells, boxes)], radius)
     good = c != 0
     if good.any():
         s.done.append((cells[good], boxes[good], c[good]))
@@ -165,14 +180,25 @@ def advance(s: Search) -> None:
         _split(s, cells[bad], boxes[bad], depth[bad], [t[bad] for t in terms], radius[bad])
 
 
-def on_boxes(f: Family, cells: FloatArray, boxes: FloatArray) -> tuple[list[ComplexArray], FloatArray]:
+def on_boxes(
+    f: Family, cells: FloatArray, boxes: FloatArray, like: Family | None = None
+) -> tuple[list[ComplexArray], FloatArray]:
     """The expansion of each cell with its coefficients over the cell's own box."""
     unique, index = np.unique(cells, axis=0, return_inverse=True)
     with np.errstate(over="ignore", invalid="ignore"):
-        e: Expansion = expand(f, unique)
+        e: Expansion = expand(f, unique, like)
         index = index.ravel()
         terms = [np.asarray(restrict(t[index], f.shape, boxes)) for t in e.terms]
     return terms, e.radius[index]
+
+
+def _discs(s: Search, cells: FloatArray, boxes: FloatArray) -> list[ComplexArray]:
+    """Radii of discs about the coefficients: how large the family beside is at each."""
+    if s.beside is None or s.share is None:
+        return []
+    terms, radius = on_boxes(s.beside, cells, boxes, s.family)
+    size = sum(np.abs(t) for t in terms) + radius[:, None]
+    return [np.asarray(s.share(cells)[:, None] * (1 + 1e-12) * size, dtype=complex)]
 
 
 def half_plane(terms: list[ComplexArray], radius: FloatArray) -> ComplexArray:
@@ -249,5 +275,5 @@ def _middle(sides: FloatArray, growth: Growth, axis: int) -> FloatArray:
     """Where to split: the nominal value first, so that parts away from it need no proof at small t."""
     low, high = sides[:, 0], sides[:, 1]
     c = float(growth.shares(growth.nominal)[axis])
-    inside = (low < c) & (c < high) & (high - low == 1.0)
+    inside = (low < c) & (c < high) & (high - low == (high - low).max())
     return np.asarray(np.where(inside & growth.grows[axis], c, (low + high) / 2))

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
@@ -101,7 +101,69 @@ def family(
     for axis, (n, cheb) in enumerate(zip(shape, chebyshev, strict=True)):
         if n > 2 or (cheb and n > 1):
             table = _transformed(table, tuple(shape), axis, to_bernstein(n - 1, cheb))
-    mantissas, radii, powers = (np.zeros((count, len(points))) for _ in range(3))
+    return _in_doubles(shape, table, tails)
+
+
+def narrowed(f: Family, axis: int, low: float, high: float) -> Family:
+    """The family over [low, high] of one parameter's side; of one value where these are equal."""
+    n = f.shape[axis]
+    boxes = np.tile([0.0, 1.0], (1, len(f.shape), 1))
+    boxes[0, axis] = low, high
+    values = restrict(f.values, f.shape, boxes) if n > 1 else f.values
+    shape = list(f.shape)
+    if low == high and n > 1:
+        values = np.take(values.reshape(len(values), *shape), 0, axis=axis + 1).reshape(len(values), -1)
+        shape[axis] = 1
+    # convex combinations of n values each, and low and high to the last digit
+    slack = 8 * n * n * EPS * np.abs(f.values).max(axis=1)
+    return Family(tuple(shape), values, f.radius + slack, f.exponents, f.scale)
+
+
+def aligned(f: Family, g: Family) -> tuple[Family, Family]:
+    """Both with the same degrees, and s counted on f's scale."""
+    shape = tuple(max(n, m) for n, m in zip(f.shape, g.shape, strict=True))
+    count = max(len(f.values), len(g.values))
+    moved = tuple(e + (f.scale - g.scale) * k for k, e in enumerate(g.exponents))
+    return _raised(f, shape, count), _raised(replace(g, exponents=moved, scale=f.scale), shape, count)
+
+
+def _raised(f: Family, shape: tuple[int, ...], count: int) -> Family:
+    """With higher degrees in the parameters, and coefficients that are zero up to `count`."""
+    values, slack = f.values.reshape(len(f.values), *f.shape), 0.0
+    for axis, (n, m) in enumerate(zip(f.shape, shape, strict=True)):
+        if m > n:
+            d, D = n - 1, m - 1
+            E = np.array([[math.comb(d, j) * math.comb(D - d, i - j) / math.comb(D, i) if 0 <= i - j <= D - d else 0.0
+                           for j in range(n)] for i in range(m)])  # fmt: skip
+            values = np.moveaxis(np.moveaxis(values, axis + 1, -1) @ E.T, -1, axis + 1)
+            slack += 4 * m * EPS
+    values = values.reshape(len(values), -1)
+    more = count - len(values)
+    radius = f.radius + slack * np.abs(f.values).max(axis=1)
+    return Family(
+        shape,
+        np.vstack([values, np.zeros((more, values.shape[1]))]),
+        np.append(radius, np.zeros(more)),
+        (*f.exponents, *[f.exponents[-1]] * more),
+        f.scale,
+    )
+
+
+def combined(f: Family, g: Family, a: float, b: float) -> Family:
+    """a f + b g of aligned families."""
+    top = np.maximum(np.array(f.exponents), np.array(g.exponents))
+    x = np.ldexp(1.0, np.clip(np.array(f.exponents) - top, -1070, 0))
+    y = np.ldexp(1.0, np.clip(np.array(g.exponents) - top, -1070, 0))
+    values = a * x[:, None] * f.values + b * y[:, None] * g.values
+    size = abs(a) * x * f.size() + abs(b) * y * g.size()
+    radius = abs(a) * x * f.radius + abs(b) * y * g.radius + 4 * EPS * size + 1e-300
+    return Family(f.shape, values, radius, tuple(int(e) for e in top), f.scale)
+
+
+def _in_doubles(shape: Sequence[int], table: Any, tails: Any) -> Family:
+    """Bernstein coefficients (nodes x k, exact or balls) as a family."""
+    each, count = table.shape
+    mantissas, radii, powers = (np.zeros((count, each)) for _ in range(3))
     for (b, k), x in np.ndenumerate(table):
         mantissas[k, b], radii[k, b], powers[k, b] = binary(x)
     sizes = np.where(

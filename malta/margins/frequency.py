@@ -47,8 +47,8 @@ def cover(f: Family) -> FloatArray:
     return np.array([*cells, [1, 0, 1 / edges[-1]]])
 
 
-def expand(f: Family, cells: FloatArray) -> Expansion:
-    """The expansions on intervals (rows of branch, from, to), each on a scale of its own."""
+def expand(f: Family, cells: FloatArray, like: Family | None = None) -> Expansion:
+    """The expansions on intervals (rows of branch, from, to), each on a scale of its own, or on those of `like`."""
     n = f.degree
     high = cells[:, 0] == 1
     x0, h = (cells[:, 2] + cells[:, 1]) / 2, (cells[:, 2] - cells[:, 1]) / 2
@@ -56,13 +56,9 @@ def expand(f: Family, cells: FloatArray) -> Expansion:
     k = np.arange(n + 1)
     power = np.where(high[:, None], n - k, k)  # of x in term k
     size = f.size()
-    exponents = np.array(f.exponents)
     m_end, e_end = np.frexp(end)
-    tops = power * e_end[:, None] + exponents
-    with np.errstate(divide="ignore"):
-        heights = tops + np.log2(np.maximum(size, 1e-300)) + power * np.log2(m_end)[:, None]
-    heights = np.where(size > 0, heights, -np.inf)
-    shift = np.round(heights.max(axis=1)).astype(int)
+    tops = power * e_end[:, None] + np.array(f.exponents)
+    shift = _shifts(like or f, power, m_end, e_end)
     scaled = np.clip(tops - shift[:, None], -1000, 1000)
     # terms C(k, m) x0^(k - m) h^m = end^k C(k, m) (x0 / end)^(k - m) (h / end)^m
     whole = np.ldexp(m_end[:, None] ** power, scaled)
@@ -77,6 +73,14 @@ def expand(f: Family, cells: FloatArray) -> Expansion:
     rounding = whole * (4 * n + 32) * EPS
     radius = rest @ size * (1 + 1e-9) + rounding @ size + whole @ f.radius * (1 + 1e-9)
     return Expansion(tuple(terms), radius + 1e-290)
+
+
+def _shifts(f: Family, power: FloatArray, m_end: FloatArray, e_end: FloatArray) -> FloatArray:
+    """log2 of the largest term on each interval."""
+    size, tops = f.size(), power * e_end[:, None] + np.array(f.exponents)
+    with np.errstate(divide="ignore"):
+        heights = tops + np.log2(np.maximum(size, 1e-300)) + power * np.log2(m_end)[:, None]
+    return np.asarray(np.round(np.where(size > 0, heights, -np.inf).max(axis=1)).astype(int))
 
 
 def _binomial(n: FloatArray, m: int) -> FloatArray:

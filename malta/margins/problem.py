@@ -123,6 +123,26 @@ class OfLoop:
         return physical(x, self.loop.law.sample_time)
 
 
+@dataclass(frozen=True, eq=False)
+class OfSeveral:
+    """Loops in the same parameters, of which all shall be stable, on one clock."""
+
+    problems: tuple[Problem, ...]
+
+    def parts(self, p: Sequence[Any]) -> list[tuple[Polynomial, tuple[Any, ...]]]:
+        return [part for problem in self.problems for part in problem.parts(p)]
+
+    def instability(self, rows: FloatArray) -> FloatArray:
+        return np.asarray(np.max([problem.instability(rows) for problem in self.problems], axis=0))
+
+    def critical(self, p: FloatArray) -> float:
+        rows = p[None]
+        return max(self.problems, key=lambda problem: float(problem.instability(rows)[0])).critical(p)
+
+    def physical(self, x: float) -> float:
+        return self.problems[0].physical(x)
+
+
 def physical(x: float, T: float | None) -> float:
     """v = j x -> rad/s."""
     return x if T is None else 2 * math.atan(x) / T

@@ -14,8 +14,9 @@ from __future__ import annotations
 
 import math
 import time as clock
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -24,7 +25,7 @@ from malta.errors import InputError
 from malta.margins.box import Box, box_of
 from malta.margins.expressions import program
 from malta.margins.loop import loop_of
-from malta.margins.problem import OfCoefficients, OfLoop, OfPolynomial, Problem
+from malta.margins.problem import OfCoefficients, OfLoop, OfPolynomial, OfSeveral, Problem
 from malta.margins.systems import compensator_of, polynomial_system
 from malta.uncertain import Compensator, UncertainSystem
 
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
 
 TOLERANCE = 9e-4  # how close the proven bound comes to the witness, relative
 MOST_CELLS = 300_000
+LONGEST = 120.0  # s, unless a time is asked for: an answer comes anyway
 
 Ranges = Mapping[str, "float | tuple[float, float]"]
 Progress = Callable[[float, float], None]  # called with lower and upper so far
@@ -104,7 +106,7 @@ def robust_margin(
     over : intervals that do not grow with t, in SI: the bound holds anywhere in them (`z` over the travel)
     tolerance : how close the proven bound shall come to the witness, relative; None: 9e-4,
         and closer where that costs little
-    time : s, after which the bounds found so far are returned; None: no limit
+    time : s, after which the bounds found so far are returned; None: 120
     most_cells : where the proof is given up
     progress : called with the bounds so far
 
@@ -118,13 +120,74 @@ def robust_margin(
     >>> found.lower <= found.upper
     True
     """
+    box = box_of(system.names, system.nominal, system.limits, ranges, over or {})
+    problem = problem_of(system, law_of(system, compensator))
+    return margin_of(problem, box, Effort(tolerance, time, most_cells, progress))
+
+
+def common_margin(
+    places: Sequence[tuple[UncertainSystem, Compensator]],
+    ranges: Ranges,
+    over: Mapping[str, tuple[float, float]] | None = None,
+    *,
+    tolerance: float | None = None,
+    time: float | None = None,
+    progress: Progress | None = None,
+) -> Margin:
+    """The margin of several loops in the same parameters, as of one machine at several places: all stay stable.
+
+    places: systems with the same names, nominal values and limits, and their compensators, on the same sample time.
+    Further as robust_margin, whose witness is the first one of all the loops.
+
+    Raises InputError for loops that differ in these.
+    """
+    first, law = places[0]
+    for system, other in places[1:]:
+        same = system.names == first.names and np.array_equal(system.nominal, first.nominal)
+        if not (same and other.sample_time == law.sample_time and system.sample_time == first.sample_time):
+            raise InputError(
+                "common_margin", "places", "loops of different parameters or clocks", "alike ones"
+            )
+    box = box_of(first.names, first.nominal, first.limits, ranges, over or {})
+    problems = tuple(problem_of(system, law_of(system, other)) for system, other in places)
+    return margin_of(OfSeveral(problems), box, Effort(tolerance, time, MOST_CELLS, progress))
+
+
+def margin_at(
+    system: UncertainSystem,
+    compensator: Compensator,
+    ranges: Ranges,
+    at: Mapping[str, float],
+    within: Mapping[str, tuple[float, float]],
+    *,
+    tolerance: float | None = None,
+    time: float | None = None,
+) -> Margin:
+    """robust_margin where parameters stand at other values than the nominal ones, each within an interval.
+
+    The coefficients are enclosed over these intervals, once for all margins in them.
+    """
+    nominal = system.nominal.copy()
+    for name, value in at.items():
+        nominal[system.names.index(name)] = value
+    frame = {system.names.index(name): interval for name, interval in within.items()}
+    box = replace(box_of(system.names, nominal, system.limits, ranges, {}), frame=frame)
+    return margin_of(problem_of(system, compensator), box, Effort(tolerance, time))
+
+
+def law_of(system: UncertainSystem, compensator: Any) -> Compensator:
+    """A compensator as a record, on the system's clock. Raises InputError."""
     f = system.matrices
     law = compensator_of(compensator, f.size1_out(2), f.size2_out(1)) if f.n_out() >= 3 else compensator
     if system.sample_time is not None and law.sample_time is None and not len(law.A):
-        law = Compensator(law.A, law.B, law.C, law.D, sample_time=system.sample_time)
-    loop = loop_of(system, law)
-    box = box_of(system.names, system.nominal, system.limits, ranges, over or {})
-    return margin_of(OfLoop(loop, system.names), box, Effort(tolerance, time, most_cells, progress))
+        return Compensator(law.A, law.B, law.C, law.D, sample_time=system.sample_time)
+    return law
+
+
+@lru_cache(maxsize=32)  # several questions are asked of the same loops; records compare by identity
+def problem_of(system: UncertainSystem, law: Compensator) -> OfLoop:
+    """The closed loop, with what is known of it so far."""
+    return OfLoop(loop_of(system, law), system.names)
 
 
 def margin_of_polynomial(
@@ -198,7 +261,7 @@ def margin_of(problem: Problem, box: Box, effort: Effort) -> Margin:
         where = dict(zip(box.names, box.standing()[unstable.argmax()].tolist(), strict=True))
         spent = clock.monotonic() - begun
         return Margin(0.0, 0.0, None, where, {}, {}, (), spent, "the nominal loop is unstable")
-    until = begun + (effort.time if effort.time is not None else math.inf)
+    until = begun + (LONGEST if effort.time is None else effort.time)
     job = Job(
         problem,
         box,

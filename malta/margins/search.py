@@ -8,16 +8,18 @@ import time as clock
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from flint import arb
 
 from malta.errors import CheckError
 from malta.margins.box import Box
+from malta.margins.characteristic import pair
 from malta.margins.enclosure import TooWide, Unproven, over_box, precision
 from malta.margins.exclusion import Growth, Search, advance, start
 from malta.margins.expressions import NotAnalytic, exact
-from malta.margins.family import Family
+from malta.margins.family import Family, narrowed
 from malta.margins.problem import Polynomial, Problem, hurwitz
 from malta.margins.robust import Certificate, Margin, Progress
 from malta.margins.witness import Zero, from_cell, gradients, nearest, starts
@@ -31,7 +33,11 @@ FIRST = 3.97  # the first box that is searched, in multiples of the modelled one
 CHEAP = 4000  # cells below which the proof is brought closer to the witness than the tolerance
 FINEST = 3e-7  # how close, relative
 DEAR = 3.0  # s that families take beyond which their boxes grow in small steps
-PATIENCE = 60_000  # cells without progress after which the proof is given up
+BRIEF = 0.5  # s that a wider box may take at least
+PATIENCE = 20_000  # cells without progress after which the proof is given up
+REMEMBERED = 8  # families of a polynomial over boxes
+HARD = 4000  # cells after which smaller boxes are proven first
+LEVELS = 5  # of these boxes, each half of the next
 PATCHES = 64  # parts that a box is cut into where one expansion does not do
 
 
@@ -43,6 +49,10 @@ class Part:
     sides: FloatArray
     family: Family
     growth: Growth
+
+
+Searches = list[tuple[Part, Search]]
+FAMILIES: WeakKeyDictionary[Polynomial, dict[Any, Family]] = WeakKeyDictionary()
 
 
 @dataclass(eq=False)
@@ -60,6 +70,7 @@ class Job:
     def __post_init__(self) -> None:
         self.asked = self.tolerance
         self.limit = min(self.box.most * (1 - EDGE), FAR)
+        self.stands = 0.0
         self.upper = math.inf
         self.zero: tuple[Zero, Part] | None = None
         self.reasons: list[str] = []
@@ -74,7 +85,7 @@ class Job:
 
         Raises Unproven.
         """
-        sides = self.box.sides(reach)
+        sides = self.box.framed(reach)
         made: list[Part] = []
         for polynomial, moves in self.problem.parts([arb(a).union(arb(b)) for a, b in sides.tolist()]):
             made += self._cut(polynomial, sides, moves, last)
@@ -87,22 +98,46 @@ class Job:
             if clock.monotonic() > last:
                 raise Unproven("time was up before the coefficients were found")
             try:
-                made.append(self._part(f, own, moves, last))
+                made += self._part(f, own, moves, last)
             except TooWide as error:
                 if len(todo) + len(made) >= PATCHES:
                     raise Unproven(str(error)) from error
-                for half in _halves(own, error.axis, float(self.box.nominal[error.axis])):
+                for half in halves(own, error.axis, float(self.box.nominal[error.axis])):
                     todo.append(half)
         return made
 
-    def _part(self, f: Polynomial, sides: FloatArray, moves: tuple[Any, ...], last: float) -> Part:
-        made = over_box(f, sides, moves, last)
+    def _part(self, f: Polynomial, sides: FloatArray, moves: tuple[Any, ...], last: float) -> list[Part]:
+        """The part of a box that lies in the frame's part `sides`, if any."""
+        made = self._family(f, sides, moves, last)
+        whole = self._growth(f, sides)
+        own = sides.copy()
+        for i in self.box.frame:
+            own[i] = self.box.nominal[i] + self.box.over[i]
+            if not sides[i, 0] <= own[i, 0] <= own[i, 1] <= sides[i, 1]:
+                return []
+            ends = [
+                float(whole.shares(np.where(np.arange(len(own)) == i, p, self.box.nominal))[i])
+                for p in own[i]
+            ]
+            made = narrowed(made, i, min(ends), max(ends))
+        return [Part(f, own, made, self._growth(f, own))]
+
+    def _growth(self, f: Polynomial, sides: FloatArray) -> Growth:
         inverted = np.array(f.inverted)
         low, high = sides[:, 0], sides[:, 1]
         v_low = np.where(inverted, 1 / np.where(inverted, high, 1), low)
         v_high = np.where(inverted, 1 / np.where(inverted, low, 1), high)
-        growth = Growth(v_low, v_high, f.inverted, self.box.nominal, self.box.down, self.box.up)
-        return Part(f, sides, made, growth)
+        return Growth(v_low, v_high, f.inverted, self.box.nominal, self.box.down, self.box.up)
+
+    def _family(self, f: Polynomial, sides: FloatArray, moves: tuple[Any, ...], last: float) -> Family:
+        """Over the same box several questions are asked of the same polynomial."""
+        known = FAMILIES.setdefault(f, {})
+        key = (sides.tobytes(), tuple(pair(m) for m in moves))
+        if key not in known:
+            if len(known) >= REMEMBERED:
+                known.pop(next(iter(known)))
+            known[key] = over_box(f, sides, moves, last)
+        return known[key]
 
     def stable(self) -> bool:
         """Whether the nominal loop is stable, by Routh's scheme in exact numbers or balls."""
@@ -134,7 +169,10 @@ class Job:
         why, begun = "", clock.monotonic()
         while True:
             spent = clock.monotonic() - begun
-            last = math.inf if not done else clock.monotonic() + max(2 * DEAR, 3 * spent)
+            now = clock.monotonic()
+            last = now + 0.3 * (self.until - now)
+            if done:
+                last = min(last, now + max(BRIEF, 2 * spent))
             try:
                 found = self.parts(reach, min(self.until, last))
             except Unproven as error:
@@ -180,24 +218,58 @@ class Job:
     def target(self, reach: float) -> float:
         return min(reach, self.upper * (1 - self.tolerance))
 
-    def prove(self, parts: list[Part], reach: float) -> tuple[float, list[tuple[Part, Search]]]:
-        """The largest t for which zero is excluded from all parts, as far as time goes."""
-        searches = [(part, start(part.family, part.growth, self.target(reach))) for part in parts]
+    def prove(self, parts: list[Part], reach: float) -> tuple[float, Searches]:
+        """The largest t for which zero is excluded from all parts, as far as time goes.
+
+        Where the whole box takes long, smaller ones are proven first: each is a bound that stands.
+        """
+        searches = self._begin(parts, self.target(reach), min(reach, self.upper))
+        final = self._advance(searches, reach, min(self.most_cells, HARD))
+        best, kept = 0.0, searches
+        if self._open(searches) and not self.late():
+            top = self.target(reach)
+            for level in range(LEVELS, 0, -1):
+                small = self._begin(parts, top * 0.5**level, top * 0.5**level)
+                found = self._advance(small, top * 0.5**level, HARD, rest=0.3)
+                if found > best:
+                    best, kept = found, small
+                if self._open(small) or self.late():
+                    break
+            final = self._advance(searches, reach, self.most_cells)
+        if self._open(searches):
+            self._unsettled(searches)
+        return (final, searches) if final >= best else (best, kept)
+
+    def _begin(self, parts: list[Part], target: float, until: float) -> Searches:
+        return [(part, start(part.family, part.growth, target, until)) for part in parts]
+
+    def _open(self, searches: Searches) -> bool:
+        """Whether the proof has not come as close to the witness as was asked."""
+        return any(not s.finished for _, s in searches)
+
+    def _advance(self, searches: Searches, reach: float, most: int, rest: float = 1.0) -> float:
+        """Exclude zero from cells until all are, or `most` were looked at, or a share of the time that is left is gone.
+
+        Returns t for which that proves stability.
+        """
         tried, stood, since = 0, -1.0, 0
+        now = clock.monotonic()
+        until = self.until if math.isinf(self.until) else now + rest * (self.until - now)
         while True:
             lower = min((s.lower for _, s in searches), default=reach)
+            self.stands = max(self.stands, lower)
             if self.progress is not None:
-                self.progress(lower, self.upper)
+                self.progress(self.stands, self.upper)
             count = sum(s.count for _, s in searches)
             if lower > stood * (1 + self.tolerance / 10):
                 stood, since = lower, count
             patience = PATIENCE if self.tolerance == self.asked else CHEAP
-            if self.late() or count >= self.most_cells or count - since > patience:
-                break
+            if clock.monotonic() > until or count >= most or count - since > patience:
+                return lower
             part, s = min(searches, key=lambda pair: (pair[1].finished, pair[1].lower))
             if s.finished:
-                if not self._tightened(count):
-                    break
+                if rest < 1 or not self._tightened(count):
+                    return lower
                 for _, other in searches:
                     other.target = self.target(reach)
                 continue
@@ -208,9 +280,6 @@ class Job:
                 if self.look(part, from_cell(s.family, s.growth, cell, self.upper)):
                     for _, other in searches:
                         other.target = min(other.target, self.target(reach))
-        if lower < min(reach, self.upper * (1 - self.asked)):
-            self._unsettled(searches, count)
-        return lower, searches
 
     def _tightened(self, count: int) -> bool:
         """Whether the proof shall come closer to the witness, as it may where that costs little."""
@@ -219,8 +288,11 @@ class Job:
         self.tolerance = max(self.tolerance / 10, FINEST)
         return True
 
-    def _unsettled(self, searches: list[tuple[Part, Search]], count: int) -> None:
+    def _unsettled(self, searches: Searches) -> None:
         worst = min((s for _, s in searches), key=lambda s: s.lower)
+        if worst.lower >= self.upper * (1 - self.asked):
+            return
+        count = sum(s.count for _, s in searches)
         why = "not settled in time" if self.late() else f"not settled within {count} cells"
         cell = worst.hardest() or worst.first()
         if cell is not None:
@@ -235,6 +307,7 @@ class Job:
         if not parts:
             return self._by_poles(begun)
         lower, searches = self.prove(parts, reach)
+        looked = reach
         for _ in range(
             3
         ):  # where the enclosure over the whole box is too wide, those over smaller ones may do
@@ -251,6 +324,8 @@ class Job:
             lower = 0.0
             self.reasons.append("the nominal loop is not proven stable")
         upper, frequency, witness = self._confirmed()
+        if witness is None and looked < self.limit:
+            upper, frequency, witness = first_loss(self.problem, self.box, self.limit)
         if not lower <= upper:
             raise CheckError(f"the proof ({lower:.9g}) and the witness ({upper:.9g}) contradict each other")
         names, nominal = self.box.names, self.box.nominal
@@ -258,7 +333,7 @@ class Job:
         moved = {} if witness is None else dict(zip(names, (witness - nominal).tolist(), strict=True))
         return Margin(
             lower if lower > 0 else None, upper, frequency, named, moved,
-            {} if witness is None else self._shares(),
+            {} if self.zero is None or witness is None else self._shares(),
             tuple(self._certificate(part, s) for part, s in searches),
             clock.monotonic() - begun, "; ".join(dict.fromkeys(self.reasons)),
         )  # fmt: skip
@@ -319,7 +394,8 @@ class Job:
         return Margin(None, t, frequency, named, moved, {}, (), clock.monotonic() - begun, reason)
 
 
-def _halves(sides: FloatArray, axis: int, nominal: float) -> list[FloatArray]:
+def halves(sides: FloatArray, axis: int, nominal: float) -> list[FloatArray]:
+    """A box cut across one axis, at the nominal value where that is well inside."""
     low, high = sides[axis]
     at = (
         nominal

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -68,6 +68,11 @@ def _slope(degree: int, u: float) -> FloatArray:
         return np.zeros(1)
     low = basis(degree - 1, np.array(u))
     return np.asarray(degree * (np.append(0.0, low) - np.append(low, 0.0)))
+
+
+def rows_at(f: Family, branch: int, x: FloatArray) -> ComplexArray:
+    """Weights of a_k in f(x) at points of a branch, on a scale of each point's own: points x K."""
+    return _rows(f, branch, x)[0]
 
 
 def _rows(f: Family, branch: int, x: FloatArray) -> tuple[ComplexArray, ComplexArray]:
@@ -130,9 +135,9 @@ def starts(f: Family, g: Growth, most: int = 6) -> list[tuple[float, int, float,
             found.append((float(t[k]), 0, float(x[k]), u))
         for branch, end in ENDS:
             found.append((float(linear_distance(f, g, u, branch, np.array([end]))[0]), branch, end, u))
-    found += _corners(f, g, most)
     found.sort(key=lambda s: s[0])
-    return [start for start in found[: 2 * most] if np.isfinite(start[0])]
+    crossings = _corners(f, g, most)  # first: these do cross, where a small linear distance may lead nowhere
+    return [*crossings, *(start for start in found[: 2 * most] if np.isfinite(start[0]))]
 
 
 def _corners(f: Family, g: Growth, most: int) -> list[tuple[float, int, float, FloatArray]]:
@@ -221,53 +226,148 @@ def _value(f: Family, branch: int, x: float, u: FloatArray) -> tuple[float, floa
 def _step(
     f: Family, g: Growth, branch: int, x: float, u: FloatArray, trust: float
 ) -> tuple[float, float, float, float, FloatArray] | None:
-    """|f|, its size, and the t, x, u that the linear program finds."""
-    from scipy.optimize import linprog
-
+    """|f|, its size, and the t, x, u that solve the linearized equation with the smallest t."""
     a, slopes = coefficients_at(f, u)
     rows, along = _rows(f, branch, np.array([x]))
     value, size = complex((rows @ a)[0]), float((np.abs(rows) @ f.size())[0])
-    moved, turned = (rows @ slopes.T)[0], complex((along @ a)[0])
-    k = len(u)
-    real = x == 0
-    # unknowns: du, d ln x, t
-    columns = np.concatenate([moved, [0 if real else turned], [0]])
-    scale = np.abs(columns).max()
+    turned = None if x == 0 else complex((along @ a)[0])
+    free = np.array([n > 1 for n in f.shape], dtype=bool)
+    moved = np.where(free, (rows @ slopes.T)[0], 0)
+    scale = max(np.abs(moved).max(initial=0.0), abs(turned or 0.0))
     if not (0 < scale < np.inf and abs(value) < 1e12 * scale):
         return None
-    equations = [columns.real / scale] if real else [columns.real / scale, columns.imag / scale]
-    right = [-value.real / scale] if real else [-value.real / scale, -value.imag / scale]
-    limits, free = [], []
-    bounds: list[tuple[float, float | None]] = []
-    p, slope, grows = g.parameters(u), g.slopes(u), g.grows
-    for i in range(k):
-        if f.shape[i] == 1:
-            bounds.append((0.0, 0.0))
-            continue
-        bounds.append((max(-trust, -float(u[i])), min(trust, 1 - float(u[i]))))
-        if grows[i]:
-            for sign, room in ((1.0, g.up[i]), (-1.0, g.down[i])):
-                row = np.zeros(k + 2)
-                row[i], row[-1] = sign * slope[i], -room
-                unit = 1 / max(abs(slope[i]), room)
-                limits.append(row * unit)
-                free.append(sign * (g.nominal[i] - p[i]) * unit)
-    bounds += [(-trust, trust), (0, None)]
-    cost = np.zeros(k + 2)
-    cost[-1] = 1
+    line = _Line(value / scale, moved / scale, None if turned is None else turned / scale)
+    room = np.where(free, np.maximum(-trust, -u), 0), np.where(free, np.minimum(trust, 1 - u), 0)
+    found = _reached(line, _sides(g, u, free), room, trust) or _programmed(
+        line, _sides(g, u, free), room, trust
+    )
+    if found is None:
+        return None
+    t, du, dx = found
+    return abs(value), size, t, x * float(np.exp(dx)), np.clip(u + du, 0, 1)
+
+
+class _Line(NamedTuple):
+    """value + moved du + turned d ln x = 0; none of the last where x stands."""
+
+    value: complex
+    moved: ComplexArray
+    turned: complex | None
+
+
+class _Sides(NamedTuple):
+    """Of box(t) as seen from u: middle - t below <= du <= middle + t above on the axes that grow."""
+
+    grows: Any
+    middle: FloatArray
+    below: FloatArray
+    above: FloatArray
+
+
+def _sides(g: Growth, u: FloatArray, free: Any) -> _Sides:
+    slope, grows = g.slopes(u), g.grows & free
+    unit = np.where(slope == 0, 1, slope)
+    below, above = np.where(unit > 0, g.down, g.up), np.where(unit > 0, g.up, g.down)
+    return _Sides(grows, (g.nominal - g.parameters(u)) / unit, below / np.abs(unit), above / np.abs(unit))
+
+
+Move = tuple[float, "FloatArray", float]  # t, du, d ln x
+
+
+def _reached(line: _Line, sides: _Sides, room: tuple[FloatArray, FloatArray], trust: float) -> Move | None:
+    """The smallest t in closed form, where d ln x is free; None where there is none within the trust region.
+
+    Without ln x one real equation s du = h is left, and the largest s du in box(t) is piecewise linear in t.
+    """
+    turn = 1.0 if line.turned is None else 1j * np.conj(line.turned) / max(abs(line.turned), 1e-300)
+    h, s = -(turn * line.value).real, (turn * line.moved).real
+    s = np.where(np.abs(s) > 1e-12 * np.abs(s).max(initial=0.0), s, 0)
+    (low, high), (grows, middle, below, above) = room, sides
+    with np.errstate(all="ignore"):
+        outside = np.where(
+            middle > high, (middle - high) / below, np.where(middle < low, (low - middle) / above, 0)
+        )
+    t = float(np.where(grows, outside, 0).max(initial=0.0))
+    if not t < np.inf:
+        return None
+
+    def end(t: float, s: FloatArray) -> FloatArray:
+        """du of the largest s du in box(t)."""
+        top = np.where(grows, np.minimum(high, middle + t * above), high)
+        bottom = np.where(grows, np.maximum(low, middle - t * below), low)
+        rest = np.clip(
+            np.where(grows, middle, 0), bottom, top
+        )  # what does not act stays nominal, or where it is
+        return np.asarray(np.where(s > 0, top, np.where(s < 0, bottom, rest)))
+
+    most, least = end(t, s), end(t, -s)
+    if s @ most < h:
+        t, du = _grown(t, s, h, end, sides, room)
+    elif s @ least > h:
+        t, du = _grown(t, -s, -h, end, sides, room)
+    else:
+        span = float(s @ (most - least))
+        du = least + (most - least) * ((h - s @ least) / span if span > 0 else 0.5)
+    if not t < np.inf:
+        return None
+    left = line.value + line.moved @ du
+    if line.turned is None:
+        return t, du, 0.0
+    dx = -float((np.conj(line.turned) * left).real) / max(abs(line.turned) ** 2, 1e-300)
+    return (t, du, dx) if abs(dx) <= trust else None
+
+
+def _grown(
+    t: float, s: FloatArray, h: float, end: Any, sides: _Sides, room: tuple[FloatArray, FloatArray]
+) -> tuple[float, FloatArray]:
+    """The smallest t from which on box(t) holds a du with s du = h; infinite where the trust region ends before."""
+    (low, high), (grows, middle, below, above) = room, sides
+    with np.errstate(all="ignore"):
+        full = np.where(
+            s > 0, (high - middle) / above, (middle - low) / below
+        )  # where an axis has no more room
+        rate = np.where(grows & (s != 0), np.abs(s) * np.where(s > 0, above, below), 0)
+    for stop in [*np.sort(full[(rate > 0) & (full > t)]).tolist(), np.inf]:
+        pull = float(rate[full > t].sum())
+        missing = h - float(s @ end(t, s))
+        if pull > 0 and t + missing / pull <= stop:
+            t += missing / pull
+            return t, end(t, s)
+        t = stop
+        if not np.isfinite(t):
+            break
+    return np.inf, np.zeros(len(s))
+
+
+def _programmed(line: _Line, sides: _Sides, room: tuple[FloatArray, FloatArray], trust: float) -> Move | None:
+    """The smallest t with d ln x within the trust region, by a linear program."""
+    from scipy.optimize import linprog
+
+    k = len(line.moved)
+    if line.turned is None:
+        return None
+    columns = np.concatenate([line.moved, [line.turned, 0]])
+    limits, most = [], []
+    for i in np.flatnonzero(sides.grows):
+        for sign, rate in ((1.0, sides.above[i]), (-1.0, sides.below[i])):
+            row = np.zeros(k + 2)
+            row[i], row[-1] = sign, -rate
+            limits.append(row / max(1.0, rate))
+            most.append(sign * sides.middle[i] / max(1.0, rate))
+    bounds: list[tuple[float, float | None]] = list(zip(*(side.tolist() for side in room), strict=True))
     found = linprog(
-        cost,
+        np.eye(k + 2)[-1],
         np.array(limits) if limits else None,
-        free or None,
-        np.array(equations),
-        right,
-        bounds,
+        most or None,
+        np.array([columns.real, columns.imag]),
+        [-line.value.real, -line.value.imag],
+        [*bounds, (-trust, trust), (0, None)],
         method="highs",
     )
     if found.status != 0:
         return None
     moves: Any = found.x
-    return abs(value), size, float(moves[-1]), x * float(np.exp(moves[k])), np.clip(u + moves[:k], 0, 1)
+    return float(moves[-1]), np.asarray(moves[:k]), float(moves[k])
 
 
 def from_cell(f: Family, g: Growth, cell: Cell, below: float) -> Zero | None:

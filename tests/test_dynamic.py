@@ -1,0 +1,117 @@
+"""Unmodelled dynamics beside real parameters: published margins, norms by another route, weights, bad input."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import control
+import numpy as np
+import pytest
+
+import malta
+from malta import gains
+from malta.data import plant_of
+from malta.errors import InputError
+from malta.margins.dynamic import Dynamic, dynamic_margin
+from malta.uncertain import responses
+from malta.verify import travel_loops
+
+
+def pid(Kp: float, Ki: float, Kd: float, Tf: float) -> control.TransferFunction:
+    return -(control.tf([Kp], [1]) + control.tf([Ki], [1, 0]) + control.tf([Kd, 0], [Tf, 1]))
+
+
+def robstab() -> malta.UncertainSystem:
+    """18 / (s^2 + 1.8 s + k): the example of robstab's reference page."""
+    return malta.uncertain(lambda k: ([[0, 1], [-k, -1.8]], [[0], [18]], [[1, 0]]), {"k": 10.0})
+
+
+@pytest.mark.parametrize(
+    ("weight", "expected", "k"), [(0.5, 1.599258325, 3.603), (0.25, 2.907434278, -1.630)]
+)
+def test_a_parameter_and_dynamics_of_robstab(weight: float, expected: float, k: float) -> None:
+    """MATLAB's reference page of robstab prints 1.5960 .. 1.5993 for k +-40 % and 50 % of dynamics; and with 25 %."""
+    m = dynamic_margin(robstab(), pid(2.3, 3, 0.38, 0.001), {"k": 0.4}, Dynamic(weight))
+    assert m.lower is not None
+    assert 0.998 * expected <= m.lower <= expected <= m.upper * (1 + 1e-9)
+    assert m.upper == pytest.approx(expected, rel=1e-8)
+    assert m.witness is not None
+    assert m.witness["k"] == pytest.approx(k, abs=2e-3)
+
+
+def test_dynamics_of_a_resonance_alone() -> None:
+    """RobustAndOptimalControl.jl, test_uncertainty: the reciprocal of an H-infinity norm, 1 / 1.1861."""
+    s = malta.uncertain(lambda d: ([[0, 1], [-1, -d]], [[0], [1]], [[1, 0]]), {"d": 0.2})
+    m = dynamic_margin(s, pid(1, 2, 0.9, 0.1), {}, Dynamic(0.2))
+    assert m.upper == pytest.approx(1 / 1.1861225121, rel=1e-8)
+    assert m.frequency == pytest.approx(1.4352, rel=1e-3)
+    assert m.lower is not None
+    assert 0.998 * m.upper <= m.lower <= m.upper
+
+
+def test_feedback_dynamics_are_one_over_the_peak_of_s() -> None:
+    s, C = robstab(), pid(2.3, 3, 0.38, 0.001)
+    m = dynamic_margin(s, C, {}, Dynamic(0.5, kind="feedback"))
+    w = np.geomspace(1e-2, 1e4, 200_001)
+    P = 18 / ((1j * w) ** 2 + 1.8j * w + 10)
+    peak = float(np.abs(1 / (1 - P * C(1j * w))).max())
+    assert m.upper == pytest.approx(2 / peak, rel=1e-6)
+    assert m.lower is not None
+    assert 0.99 / peak * 2 <= m.lower <= m.upper
+
+
+def test_a_weight_that_rises_with_frequency() -> None:
+    """|W T| on a fine grid, over the values of k that the margin allows; the smallest loss is the bound's."""
+    s, C, W = robstab(), pid(2.3, 3, 0.38, 0.001), control.tf([0.5, 0.1], [0.1, 1])
+    m = dynamic_margin(s, C, {"k": 0.4}, Dynamic(W))
+    assert m.lower is not None
+    assert m.lower <= m.upper <= 1.01 * m.lower
+    w = np.geomspace(1e-2, 1e4, 50_001)
+    for t in (m.lower, m.upper):
+        worst = 0.0
+        for k in 10 + 4 * t * np.linspace(-1, 1, 41):
+            L = 18 / ((1j * w) ** 2 + 1.8j * w + k) * C(1j * w)
+            worst = max(worst, float(np.abs(W(1j * w) * L / (1 - L)).max()))
+        assert (worst * t < 1) == (t == m.lower) or worst * t == pytest.approx(1, abs=2e-3)
+
+
+def test_dynamics_of_a_machine_over_its_travel() -> None:
+    """MALTA's flagship with 20 % of dynamics at the axial sensor: nothing within the proven set closes |W T| t >= 1."""
+    c = gains.read("design/gains/robust.json")
+    plant = plant_of(c.parameters)
+    box = {"m": 0.2, "K_A": 0.2}
+    ((s, law),), over = travel_loops(plant, c, tuple(box))
+    m = dynamic_margin(s, law, box, Dynamic(0.2, channel=4), over)
+    assert m.lower is not None
+    assert 1 < m.lower <= m.upper <= 1.1 * m.lower
+    assert law.sample_time is not None
+    rng, w = np.random.default_rng(3), np.geomspace(10, np.pi / law.sample_time, 400)
+    for _ in range(60):
+        p = s.nominal * (1 + m.lower * np.array([0.2, 0.2, 0]) * rng.uniform(-1, 1, 3))
+        p[-1] = rng.uniform(-plant.travel, plant.travel)
+        P, F = responses(s, law, p, w)
+        T = np.linalg.inv(np.eye(5) - P @ F) - np.eye(5)
+        assert m.lower * 0.2 * np.abs(T[:, 4, 4]).max() < 1
+
+
+def test_an_unstable_loop_has_no_margin() -> None:
+    m = dynamic_margin(robstab(), [[1.0]], {"k": 0.4}, Dynamic(0.5))
+    assert (m.lower, m.upper) == (0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("dynamic", "says"),
+    [
+        (Dynamic(0.0), "above zero"),
+        (Dynamic("large"), "a number or a transfer function"),
+        (Dynamic(control.tf([1, 0], [1])), "stable, proper"),
+        (Dynamic(control.tf([1], [1, -1])), "stable, proper"),
+        (Dynamic(control.tf([1], [1, 0.5], 0.1)), "stable, proper"),
+        (Dynamic(0.5, channel=3), "one of the sensors"),
+        (Dynamic(0.5, at="here"), "sensors or forces"),  # type: ignore[arg-type]
+    ],
+)
+def test_bad_input_gets_one_sentence(dynamic: Dynamic, says: str) -> None:
+    more: dict[str, Any] = {"k": 0.4}
+    with pytest.raises(InputError, match=says):
+        dynamic_margin(robstab(), pid(2.3, 3, 0.38, 0.001), more, dynamic)

@@ -1,0 +1,131 @@
+"""Worst-case gains: closed forms, frequency responses of random plants, and bad input."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import control
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import malta
+from malta import gains
+from malta.data import plant_of
+from malta.errors import InputError
+from malta.margins.family import aligned, combined, family
+from malta.uncertain import responses
+from malta.verify import travel_loops
+
+
+def first_order(k: float = 1.0) -> malta.UncertainSystem:
+    return malta.uncertain(lambda k: ([[-1.0]], [[k]], [[1.0]]), {"k": k})
+
+
+def test_a_gain_in_closed_form() -> None:
+    """T = 2 k / (s + 1 + 2 k): largest at w = 0 and the largest k, 3/4; |S| rises to 1."""
+    T = malta.worst_case_gain(first_order(), [[-2.0]], {"k": 0.5}, of="complementary")
+    assert T.upper is not None
+    assert 0.745 < T.lower <= 0.75 <= T.upper < 0.755
+    S = malta.worst_case_gain(first_order(), [[-2.0]], {"k": 0.5})
+    assert S.upper is not None
+    assert 0.99 < S.lower <= 1 <= S.upper < 1.01
+
+
+def test_a_resonance_in_closed_form() -> None:
+    """S = (s^2 + c s + k) / (s^2 + c s + k + 1): at the smallest c and k, on a fine grid of frequencies."""
+    s = malta.uncertain(lambda k, c: ([[0, 1], [-k, -c]], [[0], [1]], [[1, 0]]), {"k": 1.0, "c": 0.2})
+    m = malta.worst_case_gain(s, [[-1.0]], {"k": 0.3, "c": 0.5}, tolerance=1e-3)
+    w = np.linspace(1.2, 1.4, 200_001)
+    ks = np.linspace(0.7, 1.3, 61)
+    found = max(float(np.abs((k - w**2 + 0.1j * w) / (k + 1 - w**2 + 0.1j * w)).max()) for k in ks)
+    assert m.upper is not None
+    assert m.lower == pytest.approx(found, rel=1e-6)
+    assert found <= m.upper <= 1.002 * found
+    assert m.witness == pytest.approx({"k": 0.7, "c": 0.1}, rel=1e-6)
+
+
+def test_nothing_uncertain_is_the_norm_of_python_control() -> None:
+    """A box of nearly no width: the H-infinity norm of S, by slycot's or scipy's own way."""
+    plant, K = control.tf([18], [1, 1.8, 10]), control.tf([2.3, 3], [0.1, 1])
+    s = malta.uncertain(lambda k: ([[0, 1], [-k, -1.8]], [[0], [18]], [[1, 0]]), {"k": 10.0})
+    m = malta.worst_case_gain(s, -K, {"k": 1e-9})
+    w = np.geomspace(0.1, 1e3, 100_001)
+    size = np.abs(control.frequency_response(control.feedback(1, plant * K), w).frdata).max()
+    assert m.upper is not None
+    assert m.lower == pytest.approx(float(size), rel=1e-6)
+    assert size <= m.upper <= 1.004 * size
+
+
+@pytest.mark.parametrize("at", ["sensors", "forces"])
+def test_no_machine_of_the_box_exceeds_what_is_proven(at: Any) -> None:
+    """The flagship anywhere in its travel: 200 machines at corners and within, on a grid of frequencies."""
+    c = gains.read("design/gains/robust.json")
+    plant = plant_of(c.parameters)
+    box = {"m": 0.2, "K_A": 0.2, "K_D": 0.2, "K_B": 0.2}
+    ((s, law),), over = travel_loops(plant, c, tuple(box))
+    m = malta.worst_case_gain(s, law, box, over, at=at, channel=4)
+    assert m.upper is not None
+    assert m.lower <= m.upper <= 1.04 * m.lower
+    assert law.sample_time is not None
+    rng, w, worst = np.random.default_rng(1), np.geomspace(100, math.pi / law.sample_time, 200), 0.0
+    for _ in range(200):
+        p = s.nominal * (1 + np.array([*box.values(), 0]) * np.clip(rng.uniform(-2, 2, 5), -1, 1))
+        p[-1] = rng.uniform(-plant.travel, plant.travel)
+        P, F = responses(s, law, p, w)
+        S = np.linalg.inv(np.eye(5) - (P @ F if at == "sensors" else F @ P))
+        worst = max(worst, float(np.abs(S[:, 4, 4]).max()))
+    assert 0.8 * m.lower < worst <= m.upper
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.integers(0, 10_000))
+def test_random_loops_stay_below_what_is_proven(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    A, b, c = -np.eye(3) * 2 + rng.normal(size=(3, 3)) * 0.4, rng.normal(size=(3, 1)), rng.normal(size=(1, 3))
+    s = malta.uncertain(lambda k, d: (A - d * np.eye(3), k * b, c), {"k": 1.0, "d": 0.5})
+    m = malta.worst_case_gain(s, [[0.3]], {"k": 0.4, "d": 0.5}, time=5.0)
+    if m.upper is None:
+        assert m.reason
+        return
+    w = np.geomspace(1e-2, 1e2, 300)
+    for k, d in rng.uniform([0.6, 0.25], [1.4, 0.75], (30, 2)):
+        P, F = responses(s, malta.Compensator(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), np.array([[0.3]])),
+                         np.array([k, d]), w)  # fmt: skip
+        assert (np.abs(1 / (1 - (P @ F)[:, 0, 0])) <= m.upper).all()
+
+
+def test_families_add_up() -> None:
+    from flint import fmpq
+
+    f = family([2, 1], [False, False], [[fmpq(1), fmpq(2)], [fmpq(3), fmpq(5)]])
+    g = family([3, 1], [False, False], [[fmpq(x * x), fmpq(1000 * x)] for x in (1, 2, 4)])
+    f, g = aligned(f, g)
+    assert f.shape == g.shape == (3, 1)
+    N = combined(f, g, 2.0, -1.0)
+    middle = np.array([0.25, 0.5, 0.25])  # Bernstein's basis of degree 2 at 1/2
+    for k, value in enumerate((2 * 2 - 4, 2 * 3.5 - 2000)):
+        unit = 2.0 ** (N.exponents[k] - N.scale * k)
+        assert abs(N.values[k] @ middle * unit - value) <= N.radius[k] * unit + 1e-12 * abs(value)
+
+
+def test_an_unstable_box_has_no_bound() -> None:
+    m = malta.worst_case_gain(first_order(), [[0.8]], {"k": 0.5})
+    assert m.upper is None
+    assert m.reason
+
+
+@pytest.mark.parametrize(
+    ("more", "says"),
+    [
+        ({"channel": 1}, "one of the sensors"),
+        ({"of": "gain"}, "sensitivity or complementary"),
+        ({"at": "here"}, "sensors or forces"),
+        ({"tolerance": 0.0}, "above zero"),
+    ],
+)
+def test_bad_input_gets_one_sentence(more: dict[str, Any], says: str) -> None:
+    with pytest.raises(InputError, match=says):
+        malta.worst_case_gain(first_order(), [[-2.0]], {"k": 0.5}, **more)
