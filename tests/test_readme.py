@@ -38,7 +38,7 @@ def _shown(title: str) -> dict[str, list[str]]:
 
 
 def _is_noisy(machine: str, subject: str) -> bool:
-    """Noise, steps of sensors and limit cycles: the last bit of a processor's arithmetic decides where a sample falls."""
+    """Noise, steps of sensors, limit cycles: the last bit of the arithmetic decides where a sample falls."""
     noisy = ("at rest", "tilt", "thermal: left", "three times as fast, filter without")
     return machine == "halbach" or subject.startswith(noisy)
 
