@@ -97,6 +97,25 @@ def test_random_loops_stay_below_what_is_proven(seed: int) -> None:
         assert (np.abs(1 / (1 - (P @ F)[:, 0, 0])) <= m.upper).all()
 
 
+def test_a_channel_that_acts_nowhere_but_off_the_nominal() -> None:
+    """S = (s + 1) / (s + 1 + 2 k) with k = 0 nominal: one there, 1 / 0.6 where k = -0.2."""
+    s = malta.uncertain(lambda k: ([[-1.0]], [[k]], [[1.0]]), {"k": 0.0})
+    for at in ("sensors", "forces"):
+        m = malta.worst_case_gain(s, [[-2.0]], {"k": (-0.2, 0.2)}, at=at)
+        assert m.upper is None or m.upper >= 1 / 0.6
+        assert m.lower == pytest.approx(1 / 0.6, rel=1e-6)
+
+
+def test_systems_beyond_a_b_c_are_refused() -> None:
+    direct = malta.uncertain(lambda k: ([[-1.0]], [[k]], [[1.0]], [[k]]), {"k": 1.0})
+    discrete = malta.uncertain(lambda k: ([[k]], [[1.0]], [[1.0]]), {"k": 0.5}, sample_time=0.1)
+    for system in (direct, discrete):
+        with pytest.raises(InputError, match="A, B, C alone"):
+            malta.worst_case_gain(system, [[-0.1]], {"k": 0.5})
+        with pytest.raises(InputError, match="A, B, C alone"):
+            malta.dynamic_margin(system, [[-0.1]], {"k": 0.5}, malta.Dynamic(0.5))
+
+
 def test_families_add_up() -> None:
     from flint import fmpq
 

@@ -23,10 +23,11 @@ from scipy import optimize
 
 from malta.errors import InputError
 from malta.margins.box import Box, box_of
-from malta.margins.enclosure import MOST_BITS, TooWide, Unproven, over_box, precision
+from malta.margins.enclosure import TooWide, Unproven, over_box
 from malta.margins.exclusion import Growth, advance, start
 from malta.margins.family import Family, aligned, combined
 from malta.margins.frequency import cover
+from malta.margins.loop import B, C, Group, Loop
 from malta.margins.robust import law_of, problem_of
 from malta.margins.search import Job, halves
 from malta.margins.witness import coefficients_at, rows_at
@@ -46,7 +47,7 @@ MOST_CELLS = 60_000
 PATCHES = 64
 GRID = 400  # frequencies
 CORNERS = 48
-LOW = 1.0  # rad/s
+LOW = 1e-9  # rad/s, that stands for zero
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,6 +147,9 @@ class Question:
 
     def check(self, system: UncertainSystem, kind: str) -> None:
         """Raise InputError for channels and kinds that there are not."""
+        if system.matrices.n_out() != 3 or system.sample_time is not None:
+            found = "D or E, or discrete time"
+            raise InputError("channel", "system", found, "A, B, C alone in continuous time")
         outputs, inputs = system.matrices.size1_out(2), system.matrices.size2_out(1)
         known = kind in ("sensitivity", "complementary", "multiplicative", "feedback")
         if self.at not in ("sensors", "forces") or not known:
@@ -183,7 +187,7 @@ def pairs_of(one: OfLoop, two: OfLoop, asked: Question, reach: float = 1.0) -> l
     found: list[Pair] = []
     touched = 0
     for (f, moves), (g, other) in zip(first, second, strict=True):
-        acts = _differ(f, g, asked.box.nominal)
+        acts = _acts(one.loop, f.group, asked)  # type: ignore[attr-defined]
         touched += acts
         todo = [sides]
         while todo:
@@ -205,16 +209,11 @@ def _members(parts: Any) -> list[Any]:
     return [(f.group.states, f.group.own, f.group.inputs) for f, _ in parts]
 
 
-def _differ(f: Polynomial, g: Polynomial, nominal: FloatArray) -> bool:
-    from malta.margins.expressions import exact
-
-    v = [exact(x) for x in nominal.tolist()]
-    v = [1 / x if inverted else x for x, inverted in zip(v, f.inverted, strict=True)]
-    with precision(MOST_BITS):
-        return any(
-            not (a - b).contains(0) if isinstance(a, arb) else a != b
-            for a, b in zip(f.at(v), g.at(v), strict=True)
-        )
+def _acts(loop: Loop, group: Group, asked: Question) -> bool:
+    """Whether the channel reads or drives states of a group anywhere, by the expressions and not by their values."""
+    which, side = (C, 0) if asked.at == "sensors" else (B, 1)
+    entries = loop.program.entries[which] if loop.symbolic is None else loop.symbolic.entries[which]
+    return any(at[side] == asked.channel and at[1 - side] in group.states for at in entries)
 
 
 def _pair(
@@ -291,7 +290,7 @@ def climbed(
 
 def gain_at(system: UncertainSystem, law: Compensator, asked: Question, p: FloatArray, w: float) -> float:
     """The channel's gain by frequency responses of plant and compensator."""
-    P, F = responses(system, law, p, np.array([max(w, 1e-9 * LOW)]))
+    P, F = responses(system, law, p, np.array([max(w, LOW)]))
     L = P @ F if asked.at == "sensors" else F @ P
     S = np.linalg.inv(np.eye(L.shape[1]) - L[0])[asked.channel, asked.channel]
     return float(abs(S if asked.of == "sensitivity" else S - 1))
