@@ -196,23 +196,24 @@ def robustness(
 
     def anywhere(
         ranges: Mapping[str, float | tuple[float, float]],
+        longest: float | None,
         report: Callable[[float, float], None] | None = None,
     ) -> Margin:
-        asked = time if report is not None or len(shares) > 2 else min(time or EACH, EACH)
-        found = travel_margin(plant, controller, ranges, current_loops, every, time=asked, progress=report)
+        found = travel_margin(plant, controller, ranges, current_loops, every, time=longest, progress=report)
         done()
         return found
 
-    travel = anywhere(uncertainty, bounds or _silent) if proof else NOT_PROVEN
+    travel = anywhere(uncertainty, time, bounds) if proof else NOT_PROVEN
+    brief = time if len(shares) > 2 else min(time or EACH, EACH)
     tolerance = {}
     for name, share in uncertainty.items() if proof else ():
         nominal = getattr(plant.parameters, name)
-        down = anywhere({name: (nominal * (1 - share), nominal)})
-        tolerance[name] = down, anywhere({name: (nominal, nominal * (1 + share))})
+        down = anywhere({name: (nominal * (1 - share), nominal)}, brief)
+        tolerance[name] = down, anywhere({name: (nominal, nominal * (1 + share))}, brief)
     payload = None
     if proof and "m" in units_of(plant.parameters):
         m: float = getattr(plant.parameters, "m")  # noqa: B009  a machine's own field
-        payload = anywhere({"m": (m, m + 1.0)})
+        payload = anywhere({"m": (m, m + 1.0)}, brief)
     sensors = [s.name for s in plant.outputs]
     places: list[Place] = []
     classical: list[_Classical | None] = []
@@ -242,10 +243,6 @@ def robustness(
         payload,
         tuple(places),
     )
-
-
-def _silent(lower: float, upper: float) -> None:
-    del lower, upper
 
 
 def _smallest(found: list[Margin]) -> Margin:

@@ -98,12 +98,6 @@ def model_of(plant: Plant, believed: Plant, names: tuple[str, ...]) -> ca.Functi
     return ca.Function("model", [p, z, v], ca.cse([ca.densify(part) for part in parts]))
 
 
-def around(nominal: FloatArray, rng: np.random.Generator, count: int) -> FloatArray:
-    """Rows of parameters at random: up to half of each nominal value away from it, 1e-3 where that is zero."""
-    spread = np.where(nominal == 0, 1e-3, np.abs(nominal) / 2)
-    return np.asarray(nominal + spread * rng.uniform(-1, 1, (count, len(nominal))))
-
-
 @lru_cache(maxsize=64)  # writing out the currents takes longer than most that is asked of the answer
 def holds(plant: Plant) -> bool:
     """Whether the currents of a machine depend on where they were commutated, so that holding them matters."""

@@ -12,7 +12,7 @@ from typing import Any
 
 from flint import Ordering, acb, fmpq_mpoly_ctx
 
-from malta.margins.expressions import BALLS, FIELD, NotAnalytic, Program, exact
+from malta.margins.expressions import FIELD, NotAnalytic, Program, exact
 
 LARGEST = 4000  # terms of an expression beyond which it is not written out
 
@@ -100,18 +100,6 @@ class Symbolic:
 
     def constant(self, x: float) -> Ratio:
         return Ratio(self.context.constant(exact(x)))
-
-
-def evaluated(program: Program, p: list[Any]) -> list[Any]:
-    cells: list[Any] = []
-    for name, target, operands, value in program.steps:
-        if name == "input":
-            cells.append(p[target])
-        elif name == "const":
-            cells.append(BALLS.constant(value))
-        else:
-            cells.append(BALLS.apply(name, [cells[k] for k in operands], value))
-    return cells
 
 
 def value(polynomial: Any, p: Sequence[Any]) -> Any:

@@ -19,9 +19,9 @@ from typing import Any
 import numpy as np
 from flint import acb, arb, arb_mat, ctx, fmpq, fmpq_mat
 
-from malta.margins.algebra import Ratio, Symbolic, evaluated, value
+from malta.margins.algebra import Ratio, Symbolic, value
 from malta.margins.closed import closed_loop, coefficients, majorant_matrix, parts
-from malta.margins.expressions import BALLS, EXACT, POINTS, NotAnalytic
+from malta.margins.expressions import BALLS, EXACT, POINTS, finite
 from malta.margins.loop import A, B, C, D, E, Group, Loop, divided
 from malta.margins.majorant import coefficient_bounds
 from malta.margins.minors import Minors, minors
@@ -199,7 +199,7 @@ class Characteristic:
         values = list(v)
         if s.atoms:  # none of them depends on an inverted parameter
             p = [acb(1) if inverted else x for x, inverted in zip(v, self.inverted, strict=True)]
-            steps = evaluated(self.loop.program, p)
+            steps = self.loop.program.cells(p, BALLS)
             values += [steps[k] for k in s.atoms]
         powers: dict[tuple[int, int], Any] = {}
 
@@ -217,7 +217,7 @@ class Characteristic:
 
         return [
             [
-                (*at, value(num) if den is None else _finite(value(num) / value(den)))
+                (*at, value(num) if den is None else finite(value(num) / value(den)))
                 for at, (num, den) in matrix.items()
             ]
             for matrix in self._polynomials
@@ -284,12 +284,6 @@ def outward(product: list[Any]) -> list[Any]:
         for j in range(n - k + 1):
             turned[k + j] += c * (2**k * math.comb(n - k, j))
     return turned
-
-
-def _finite(z: Any) -> Any:
-    if not z.is_finite():
-        raise NotAnalytic("a division by what may be zero")
-    return z
 
 
 def pair(c: Any) -> tuple[float, int]:

@@ -17,8 +17,8 @@ import numpy as np
 from flint import acb, arb
 from scipy import linalg, sparse
 
-from malta.margins.algebra import Ratio, Symbolic, evaluated, value
-from malta.margins.expressions import NotAnalytic
+from malta.margins.algebra import Ratio, Symbolic, value
+from malta.margins.expressions import BALLS, NotAnalytic, finite
 from malta.margins.loop import A, B, C, Group, Loop, divided, groups, held, upper
 from malta.margins.majorant import coefficient_bounds
 
@@ -66,7 +66,7 @@ class Couplings:
         n, k = loop.states, len(law.A)
         values = [acb(x) for x in p]
         if self.symbolic.atoms:
-            steps = evaluated(loop.program, values)
+            steps = loop.program.cells(values, BALLS)
             values += [steps[i] for i in self.symbolic.atoms]
         size: FloatArray = np.zeros((n + k, n + k))
         own: FloatArray = np.zeros((n, n))
@@ -90,10 +90,7 @@ class Couplings:
 
 def _ratio(r: Ratio, values: list[Any]) -> Any:
     top = value(r.num, values)
-    found = top if r.den is None else top / value(r.den, values)
-    if not found.is_finite():
-        raise NotAnalytic("a division by what may be zero")
-    return found
+    return finite(top if r.den is None else top / value(r.den, values))
 
 
 @dataclass(frozen=True, eq=False)

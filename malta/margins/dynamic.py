@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 import time as clock
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -21,8 +21,17 @@ import numpy as np
 from malta.errors import InputError
 from malta.margins.box import Box, box_of
 from malta.margins.enclosure import Unproven
-from malta.margins.exclusion import advance, start
-from malta.margins.gain import Channel, Pair, Question, climbed, doubled, gain_at, pairs_of
+from malta.margins.gain import (
+    MOST_CELLS,
+    Channel,
+    Pair,
+    Question,
+    climbed,
+    doubled,
+    excluded,
+    gain_at,
+    pairs_of,
+)
 from malta.margins.robust import Margin, law_of, problem_of
 from malta.margins.search import EDGE, FAR, Job
 from malta.uncertain import Compensator, UncertainSystem
@@ -34,7 +43,6 @@ if TYPE_CHECKING:
 
 TOLERANCE = 1e-3
 STEPS = (1, 3, 10, 30, 100, 300, 1000, 3000, 10_000)  # multiples of the tolerance that are tried
-MOST_CELLS = 60_000
 HALVINGS = 40
 
 
@@ -145,16 +153,15 @@ class _Search:
         nominal, box = self.asked.box.nominal, self.asked.box
         best: tuple[float, float, FloatArray] = (math.inf, math.nan, nominal)
         pairs: list[Pair] = []
-        reach, reason = min(1.0, self._limit), ""
+        reach = min(1.0, self._limit)
         while True:
             try:
-                found = pairs_of(self.one, self.two, self.asked, reach)
+                pairs = pairs_of(self.one, self.two, self.asked, reach)
             except Unproven as error:
                 return (*best, pairs, str(error))
-            pairs = found
             best = min(best, self._within(pairs, reach), key=lambda place: place[0])
             if best[0] <= reach or reach >= self._limit or not (box.down + box.up).any():
-                return (*best, pairs, reason)
+                return (*best, pairs, "")
             reach = min(4 * reach, self._limit, max(1.05 * best[0], reach * 1.01))
 
     def _within(self, pairs: list[Pair], reach: float) -> tuple[float, float, FloatArray]:
@@ -206,13 +213,7 @@ class _Search:
         def share(cells: FloatArray) -> FloatArray:
             return t * np.array([self._largest(cell, pair.f.scale) for cell in cells])
 
-        search = start(pair.f, pair.growth, t if pair.growth.grows.any() else 1.0)
-        search = replace(search, beside=pair.N, share=share)
-        while not search.finished:
-            if search.count > MOST_CELLS or clock.monotonic() > self.asked.until:
-                return False
-            advance(search)
-        return True
+        return excluded(pair, t if pair.growth.grows.any() else 1.0, share, self.asked.until)[0]
 
     def _largest(self, cell: FloatArray, scale: int) -> float:
         """|W| over a cell's interval of frequency."""

@@ -18,6 +18,7 @@ from malta.margins.family import Family, restrict
 from malta.margins.frequency import Expansion, cover, expand
 
 if TYPE_CHECKING:
+    from malta.margins.box import Box
     from malta.plant import ComplexArray, FloatArray
 
 GUARD = 1e-9  # rad that a half plane must have to spare
@@ -81,6 +82,14 @@ class Growth:
         """The smallest t of any point of each box (cells x P x 2)."""
         a, b = self.parameters(boxes[..., 0]), self.parameters(boxes[..., 1])
         return self.margin(np.clip(self.nominal, np.minimum(a, b), np.maximum(a, b)))
+
+
+def growth_over(sides: FloatArray, inverted: tuple[bool, ...], box: Box) -> Growth:
+    """Of a box's growth seen from a part of it: sides of p, P x 2."""
+    low, high = sides[:, 0], sides[:, 1]
+    v_low = np.where(inverted, 1 / np.where(inverted, high, 1), low)
+    v_high = np.where(inverted, 1 / np.where(inverted, low, 1), high)
+    return Growth(v_low, v_high, inverted, box.nominal, box.down, box.up)
 
 
 @dataclass(frozen=True, eq=False)

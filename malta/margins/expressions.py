@@ -77,6 +77,11 @@ class Program:
 
     def run(self, p: Sequence[Any], field: Arithmetic) -> list[list[tuple[int, int, Any]]]:
         """Entries (row, column, value) of each matrix at p; those that are structurally zero are left out."""
+        cells = self.cells(p, field)
+        return [[(i, j, cells[k]) for i, j, k in entries] for entries in self.entries]
+
+    def cells(self, p: Sequence[Any], field: Arithmetic) -> list[Any]:
+        """What each step makes of p."""
         cells: list[Any] = []
         for name, target, operands, value in self.steps:
             if name == "input":
@@ -85,7 +90,7 @@ class Program:
                 cells.append(field.constant(value))
             else:
                 cells.append(field.apply(name, [cells[k] for k in operands], value))
-        return [[(i, j, cells[k]) for i, j, k in entries] for entries in self.entries]
+        return cells
 
 
 class Arithmetic:
@@ -129,7 +134,8 @@ def _within_unit(z: Any) -> Any:
     return z
 
 
-def _finite(z: Any) -> Any:
+def finite(z: Any) -> Any:
+    """z, where it is no quotient by what may be zero."""
     if not z.is_finite():
         raise NotAnalytic("a division by what may be zero")
     return z
@@ -138,12 +144,12 @@ def _finite(z: Any) -> Any:
 _BALLS: dict[str, Callable[..., Any]] = {
     "sin": lambda z: z.sin(),
     "cos": lambda z: z.cos(),
-    "tan": lambda z: _finite(z.sin() / z.cos()),
+    "tan": lambda z: finite(z.sin() / z.cos()),
     "exp": lambda z: z.exp(),
     "expm1": lambda z: z.exp() - 1,
     "sinh": lambda z: z.sinh(),
     "cosh": lambda z: z.cosh(),
-    "tanh": lambda z: _finite(z.sinh() / z.cosh()),
+    "tanh": lambda z: finite(z.sinh() / z.cosh()),
     "sqrt": lambda z: _off_the_cut(z).sqrt(),
     "log": lambda z: _off_the_cut(z).log(),
     "log1p": lambda z: _off_the_cut(z + 1).log(),
@@ -177,7 +183,7 @@ class _Checked(Arithmetic):
 
     def apply(self, name: str, operands: list[Any], value: float) -> Any:
         found = super().apply(name, operands, value)
-        return _finite(found) if name in ("div", "inv", "constpow", "pow") else found
+        return finite(found) if name in ("div", "inv", "constpow", "pow") else found
 
 
 def _at_points(functions: dict[str, Callable[..., Any]]) -> dict[str, Callable[..., Any]]:

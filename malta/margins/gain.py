@@ -24,7 +24,7 @@ from scipy import optimize
 from malta.errors import InputError
 from malta.margins.box import Box, box_of
 from malta.margins.enclosure import TooWide, Unproven, over_box
-from malta.margins.exclusion import Growth, advance, start
+from malta.margins.exclusion import Growth, advance, growth_over, start
 from malta.margins.family import Family, aligned, combined
 from malta.margins.frequency import cover
 from malta.margins.loop import B, C, Group, Loop
@@ -228,12 +228,7 @@ def _pair(
     ):  # what couplings taken as zero do with the fictitious gain closed: entries grow as with twice the gain
         share = np.exp2(np.clip(np.array(g.exponents) - np.array(f.exponents), -1000, 1000))
         f = replace(f, radius=f.radius + 2 * share * g.radius)
-    inverted = np.array(of.inverted)
-    low, high = sides[:, 0], sides[:, 1]
-    v_low = np.where(inverted, 1 / np.where(inverted, high, 1), low)
-    v_high = np.where(inverted, 1 / np.where(inverted, low, 1), high)
-    box = asked.box
-    return Pair(f, N, Growth(v_low, v_high, of.inverted, box.nominal, box.down, box.up))
+    return Pair(f, N, growth_over(sides, of.inverted, asked.box))
 
 
 # the largest gain that is found
@@ -335,11 +330,20 @@ def _excluded(pairs: list[Pair], bound: float, until: float) -> tuple[bool, int]
     """Whether |N| < bound |f| on all cells."""
     count = 0
     for pair in pairs:
-        search = start(pair.f, pair.growth, 1 + 1e-9)
-        search = replace(search, beside=pair.N, share=lambda cells: np.full(len(cells), 1 / bound))
-        while not search.finished:
-            if search.count > MOST_CELLS or clock.monotonic() > until:
-                return False, count + search.count
-            advance(search)
-        count += search.count
+        done, cells = excluded(pair, 1 + 1e-9, lambda cells: np.full(len(cells), 1 / bound), until)
+        count += cells
+        if not done:
+            return False, count
     return True, count
+
+
+def excluded(
+    pair: Pair, target: float, share: Callable[[FloatArray], FloatArray], until: float
+) -> tuple[bool, int]:
+    """Whether share |N| < |f| on all cells of box(target), share by the cell; and the cells that were looked at."""
+    search = replace(start(pair.f, pair.growth, target), beside=pair.N, share=share)
+    while not search.finished:
+        if search.count > MOST_CELLS or clock.monotonic() > until:
+            return False, search.count
+        advance(search)
+    return True, search.count

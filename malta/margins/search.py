@@ -17,7 +17,7 @@ from malta.errors import CheckError
 from malta.margins.box import Box
 from malta.margins.characteristic import pair
 from malta.margins.enclosure import TooWide, Unproven, over_box, precision
-from malta.margins.exclusion import Growth, Search, advance, start
+from malta.margins.exclusion import Growth, Search, advance, growth_over, start
 from malta.margins.expressions import NotAnalytic, exact
 from malta.margins.family import Family, narrowed
 from malta.margins.problem import Polynomial, Problem, hurwitz
@@ -109,7 +109,7 @@ class Job:
     def _part(self, f: Polynomial, sides: FloatArray, moves: tuple[Any, ...], last: float) -> list[Part]:
         """The part of a box that lies in the frame's part `sides`, if any."""
         made = self._family(f, sides, moves, last)
-        whole = self._growth(f, sides)
+        whole = growth_over(sides, f.inverted, self.box)
         own = sides.copy()
         for i in self.box.frame:
             own[i] = self.box.nominal[i] + self.box.over[i]
@@ -120,14 +120,7 @@ class Job:
                 for p in own[i]
             ]
             made = narrowed(made, i, min(ends), max(ends))
-        return [Part(f, own, made, self._growth(f, own))]
-
-    def _growth(self, f: Polynomial, sides: FloatArray) -> Growth:
-        inverted = np.array(f.inverted)
-        low, high = sides[:, 0], sides[:, 1]
-        v_low = np.where(inverted, 1 / np.where(inverted, high, 1), low)
-        v_high = np.where(inverted, 1 / np.where(inverted, low, 1), high)
-        return Growth(v_low, v_high, f.inverted, self.box.nominal, self.box.down, self.box.up)
+        return [Part(f, own, made, growth_over(own, f.inverted, self.box))]
 
     def _family(self, f: Polynomial, sides: FloatArray, moves: tuple[Any, ...], last: float) -> Family:
         """Over the same box several questions are asked of the same polynomial."""
@@ -386,7 +379,7 @@ class Job:
 
     def _by_poles(self, begun: float) -> Margin:
         """Without an enclosure: the first loss of stability along the box's diagonals, by the poles alone."""
-        t, frequency, p = first_loss(self.problem, self.box, min(self.box.most * (1 - EDGE), FAR))
+        t, frequency, p = first_loss(self.problem, self.box, self.limit)
         names = self.box.names
         named = None if p is None else dict(zip(names, p.tolist(), strict=True))
         moved = {} if p is None else dict(zip(names, (p - self.box.nominal).tolist(), strict=True))
