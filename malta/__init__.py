@@ -36,7 +36,7 @@ if TYPE_CHECKING:  # the contents page, as type checkers and readers see it
     from malta.many import Batch as Batch
     from malta.many import replayed as replayed
     from malta.many import simulate_many as simulate_many
-    from malta.margins.dynamic import Dynamic as Dynamic
+    from malta.margins.blocks import Dynamic as Dynamic
     from malta.margins.dynamic import dynamic_margin as dynamic_margin
     from malta.margins.gain import Gain as Gain
     from malta.margins.gain import worst_case_gain as worst_case_gain
@@ -80,7 +80,8 @@ _NAMES = {  # the same, for the first use of each name
     "linearize": ("LinearModel", "linearize"),
     "many": ("Batch", "replayed", "simulate_many"),
     "plant": ("OperatingPoint", "Plant", "Signal", "trim"),
-    "margins.dynamic": ("Dynamic", "dynamic_margin"),
+    "margins.blocks": ("Dynamic",),
+    "margins.dynamic": ("dynamic_margin",),
     "margins.gain": ("Gain", "worst_case_gain"),
     "margins.robust": ("Margin", "margin_of_polynomial", "robust_margin"),
     "margins.systems": ("uncertain",),

@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 
 import malta
-from malta import gains
+from malta import Dynamic, dynamic_margin, gains
 from malta.data import plant_of
 from malta.errors import InputError
-from malta.margins.dynamic import Dynamic, dynamic_margin
 from malta.uncertain import responses
 from malta.verify import travel_loops
 

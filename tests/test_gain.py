@@ -106,16 +106,6 @@ def test_a_channel_that_acts_nowhere_but_off_the_nominal() -> None:
         assert m.lower == pytest.approx(1 / 0.6, rel=1e-6)
 
 
-def test_systems_beyond_a_b_c_are_refused() -> None:
-    direct = malta.uncertain(lambda k: ([[-1.0]], [[k]], [[1.0]], [[k]]), {"k": 1.0})
-    discrete = malta.uncertain(lambda k: ([[k]], [[1.0]], [[1.0]]), {"k": 0.5}, sample_time=0.1)
-    for system in (direct, discrete):
-        with pytest.raises(InputError, match="A, B, C alone"):
-            malta.worst_case_gain(system, [[-0.1]], {"k": 0.5})
-        with pytest.raises(InputError, match="A, B, C alone"):
-            malta.dynamic_margin(system, [[-0.1]], {"k": 0.5}, malta.Dynamic(0.5))
-
-
 def test_families_add_up() -> None:
     from flint import fmpq
 
@@ -140,9 +130,13 @@ def test_an_unstable_box_has_no_bound() -> None:
     ("more", "says"),
     [
         ({"channel": 1}, "one of the sensors"),
-        ({"of": "gain"}, "sensitivity or complementary"),
+        ({"of": "gain"}, "compliance or effort"),
         ({"at": "here"}, "sensors or forces"),
         ({"tolerance": 0.0}, "above zero"),
+        ({"of": "compliance"}, "\\(sensors, forces\\) of compliance"),
+        ({"of": "effort", "channel": (0, 1)}, "one of the sensors"),
+        ({"channel": (0, 0)}, "one of the sensors"),
+        ({"dynamics": ["much"]}, "a malta.Dynamic"),
     ],
 )
 def test_bad_input_gets_one_sentence(more: dict[str, Any], says: str) -> None:

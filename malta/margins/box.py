@@ -59,8 +59,12 @@ def box_of(
     limits: Sequence[tuple[float, float]],
     ranges: Mapping[str, float | tuple[float, float]],
     over: Mapping[str, tuple[float, float]],
+    *,
+    empty: bool = False,
 ) -> Box:
     """The box of ranges (that grow) and of intervals that stay, about the nominal values `at`.
+
+    empty : whether there may be no ranges at all
 
     Raises InputError for names that are not known and ranges that are none.
     """
@@ -98,6 +102,6 @@ def box_of(
         down[i], up[i] = nominal - pair[0], pair[1] - nominal
         for room, rate in ((nominal - low, down[i]), (high - nominal, up[i])):
             most = min(most, room / rate) if rate > 0 else most
-    if not ranges:
+    if not ranges and not empty:
         raise InputError("robust_margin", "ranges", "no parameters", "at least one uncertain parameter")
     return Box(names, at, down, up, fixed, most)

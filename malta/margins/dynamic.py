@@ -1,85 +1,65 @@
-"""Dynamics that nobody modelled, beside real parameters: a stable Delta with |Delta(jw)| <= t |W(jw)| in a channel.
+"""Dynamics that nobody modelled, beside real parameters: stable blocks Delta_k with |Delta_k(jw)| <= t |W_k(jw)|.
 
-    multiplicative: the channel's gain is 1 + Delta,       lost where |W T| = 1 / t
-    feedback:       the channel's gain is 1 / (1 + Delta), lost where |W S| = 1 / t
-
-The loop with Delta has the characteristic function f + Delta N, N of `gain`. It is not zero for any complex Delta of
-that size where no point of f comes within t |W N| of zero: one exclusion covers parameters and dynamics together.
+The loop is lost at the smallest t with det(1 - M(jw; p) Delta) = 0 for some p of box(t), some Delta of that size and
+some frequency; one block alone is lost where |W M| = 1 / t. `polydisc` proves the rest zero-free.
 """
 
 from __future__ import annotations
 
 import math
 import time as clock
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy import optimize
 
 from malta.errors import InputError
+from malta.margins.blocks import Block, Dynamic, block_of, check_blocks, probed
 from malta.margins.box import Box, box_of
 from malta.margins.enclosure import Unproven
-from malta.margins.gain import (
-    MOST_CELLS,
-    Channel,
-    Pair,
-    Question,
-    climbed,
-    doubled,
-    excluded,
-    gain_at,
-    pairs_of,
-)
-from malta.margins.robust import Margin, law_of, problem_of
-from malta.margins.search import EDGE, FAR, Job
+from malta.margins.loop import loop_of
+from malta.margins.peaks import Peak, climb, patterns
+from malta.margins.polydisc import Part, Size, excluded, parts_of
+from malta.margins.problem import OfLoop
+from malta.margins.robust import LONGEST, Margin, law_of, problem_of
+from malta.margins.search import EDGE, FAR, Job, first_loss
+from malta.margins.transfer import responses, structured, transfer
+from malta.margins.weight import Expanded, Weight
 from malta.uncertain import Compensator, UncertainSystem
 
 if TYPE_CHECKING:
-    from malta.margins.problem import OfLoop
     from malta.margins.robust import Ranges
-    from malta.plant import FloatArray
+    from malta.plant import ComplexArray, FloatArray
 
 TOLERANCE = 1e-3
 STEPS = (1, 3, 10, 30, 100, 300, 1000, 3000, 10_000)  # multiples of the tolerance that are tried
-HALVINGS = 40
-
-
-@dataclass(frozen=True, eq=False)
-class Dynamic:
-    """Unmodelled dynamics in one channel: Delta stable, |Delta(jw)| <= |W(jw)| in the modelled set.
-
-    weight: W, a number or a control.TransferFunction in s; kind: multiplicative or feedback;
-    at, channel: sensors or forces, counted from 0.
-    """
-
-    weight: Any
-    kind: Literal["multiplicative", "feedback"] = "multiplicative"
-    at: Channel = "sensors"
-    channel: int = 0
+ROUNDS = 3
 
 
 def dynamic_margin(
     system: UncertainSystem,
     compensator: Compensator | Any,
     ranges: Ranges,
-    dynamic: Dynamic,
+    dynamic: Dynamic | Sequence[Dynamic],
     over: Mapping[str, tuple[float, float]] | None = None,
     *,
     tolerance: float = TOLERANCE,
     time: float | None = None,
 ) -> Margin:
-    """How far real parameters and one block of unmodelled dynamics may go together, as robstab takes ultidyn.
+    """How far real parameters and blocks of unmodelled dynamics may go together, as robstab takes ureal and ultidyn.
 
     Parameters
     ----------
     compensator, ranges, over : as robust_margin takes them; ranges may be empty
-    dynamic : the block; t times its weight belongs to t times the ranges
+    dynamic : a block, or up to four that act in this order, at most one of them full; t times their weights belongs to
+        t times the ranges
     tolerance : how close the proven bound shall come to the loss that was found, relative
-    time : s, after which what stands is returned
+    time : s, after which what stands is returned; 120 where None is given
 
-    `witness` holds the parameters; the block's size there is t |W| at `frequency`.
+    `witness` holds the parameters; the blocks' sizes there are t |W| at `frequency`.
 
     Raises InputError as robust_margin does, for channels that the loop does not have and weights that are none.
 
@@ -90,186 +70,171 @@ def dynamic_margin(
     3.0
     """
     begun = clock.monotonic()
-    law, over = law_of(system, compensator), dict(over or {})
-    if ranges:
-        box = box_of(system.names, system.nominal, system.limits, ranges, over)
-    else:
-        none = np.zeros(len(system.names))
-        fixed = [
-            np.subtract(over.get(name, (p, p)), p)
-            for name, p in zip(system.names, system.nominal, strict=True)
-        ]
-        box = Box(system.names, system.nominal, none, none, np.array(fixed).reshape(-1, 2), math.inf)
-    size = _weight(dynamic.weight)
-    until = math.inf if time is None else begun + time
-    of: Literal["sensitivity", "complementary"] = (
-        "sensitivity" if dynamic.kind == "feedback" else "complementary"
-    )
-    asked = Question(box, of, dynamic.at, dynamic.channel, tolerance, until)
-    asked.check(system, dynamic.kind)
-    one, two = problem_of(system, law), problem_of(system, doubled(law, dynamic.at, dynamic.channel))
-    if (one.instability(box.standing()) >= 0).any():
-        return Margin(
-            0.0, 0.0, None, None, {}, {}, (), clock.monotonic() - begun, "the nominal loop is unstable"
-        )
-    search = _Search(system, law, one, two, asked, size)
+    law = law_of(system, compensator)
+    box = box_of(system.names, system.nominal, system.limits, ranges, over or {}, empty=True)
+    if not tolerance > 0:
+        raise InputError("dynamic_margin", "tolerance", f"{tolerance}", "a number above zero")
+    given = [dynamic] if isinstance(dynamic, Dynamic) else list(dynamic)
+    if not given:
+        raise InputError("dynamic_margin", "dynamic", "no block", "at least one malta.Dynamic")
+    asked = Blocks.of(system, law, box, [block_of(system, d) for d in given])
+    if asked.unstable():
+        reason = "the nominal loop is unstable"
+        return Margin(0.0, 0.0, None, None, {}, {}, (), clock.monotonic() - begun, reason)
+    until = begun + (LONGEST if time is None else time)
     with np.errstate(all="ignore"):  # what is not finite excludes nothing
-        return search.margin(begun)
-
-
-Size = Callable[[float, float], float]  # the largest |W(jw)| on an interval of rad/s
+        lost = _loss(asked, until)
+        t = math.inf if lost is None else _size(asked, lost)
+        lower, reason = _proven(asked, min(t, asked.limit), tolerance, until)
+    spent, names = clock.monotonic() - begun, box.names
+    if lost is None:
+        return Margin(lower, math.inf, None, None, {}, {}, (), spent, reason)
+    witness = dict(zip(names, lost.p.tolist(), strict=True))
+    moved = dict(zip(names, (lost.p - box.nominal).tolist(), strict=True))
+    return Margin(lower, t, lost.frequency, witness, moved, {}, (), spent, reason)
 
 
 @dataclass(frozen=True, eq=False)
-class _Search:
+class Blocks:
+    """A loop with complex blocks, over a box of parameters."""
+
     system: UncertainSystem
     law: Compensator
-    one: OfLoop
-    two: OfLoop
-    asked: Question
-    size: Size
+    box: Box
+    blocks: tuple[Block, ...]
+    problem: OfLoop  # without the blocks
+    with_blocks: OfLoop
 
-    def margin(self, begun: float) -> Margin:
-        upper, w, p, pairs, reason = self._lost()
-        lower = None
-        if pairs:
-            lower = self._proven(pairs, min(upper, self._limit))
-            if lower is None:
-                reason = reason or "not settled"
-            elif not Job(self.one, self.asked.box, 1e-3, True, self.asked.until, MOST_CELLS, None).stable():
-                lower, reason = None, "the nominal loop is not proven stable"
-        names, nominal = self.asked.box.names, self.asked.box.nominal
-        named = None if math.isinf(upper) else dict(zip(names, p.tolist(), strict=True))
-        moved = {} if math.isinf(upper) else dict(zip(names, (p - nominal).tolist(), strict=True))
-        spent = clock.monotonic() - begun
-        return Margin(lower, upper, None if math.isinf(upper) else w, named, moved, {}, (), spent, reason)
+    @classmethod
+    def of(cls, system: UncertainSystem, law: Compensator, box: Box, blocks: Sequence[Block]) -> Blocks:
+        """Raises InputError for blocks that cannot be taken together."""
+        check_blocks(blocks)
+        problem = problem_of(system, law)
+        scaled = tuple(_scaled(system, law, box.nominal, b, problem) for b in blocks)
+        more, wider = probed(system, law, scaled)
+        return cls(system, law, box, scaled, problem, OfLoop(loop_of(more, wider), more.names, neglect=False))
 
     @property
-    def _limit(self) -> float:
-        return min(self.asked.box.most * (1 - EDGE), FAR)
+    def limit(self) -> float:
+        return min(self.box.most * (1 - EDGE), FAR)
 
-    def _lost(self) -> tuple[float, float, FloatArray, list[Pair], str]:
-        """The smallest t that was found to lose stability, where, and f and N over the box that holds it."""
-        nominal, box = self.asked.box.nominal, self.asked.box
-        best: tuple[float, float, FloatArray] = (math.inf, math.nan, nominal)
-        pairs: list[Pair] = []
-        reach = min(1.0, self._limit)
-        while True:
-            try:
-                pairs = pairs_of(self.one, self.two, self.asked, reach)
-            except Unproven as error:
-                return (*best, pairs, str(error))
-            best = min(best, self._within(pairs, reach), key=lambda place: place[0])
-            if best[0] <= reach or reach >= self._limit or not (box.down + box.up).any():
-                return (*best, pairs, "")
-            reach = min(4 * reach, self._limit, max(1.05 * best[0], reach * 1.01))
+    def unstable(self) -> bool:
+        """Whether a loop that nothing has moved yet is unstable."""
+        return bool((self.problem.instability(self.box.standing()) >= 0).any())
 
-    def _within(self, pairs: list[Pair], reach: float) -> tuple[float, float, FloatArray]:
-        """The smallest t within `reach` for which some place of box(t) has t |W N| >= |f|."""
+    def transfer(self, p: FloatArray, w: FloatArray) -> ComplexArray:
+        """M with rows in units of the blocks' sizes."""
+        M = transfer(responses(self.system, self.law, p, w), self.blocks)
+        scale = np.array([b.weight.at(w) for b in self.blocks for _ in b.columns])
+        return np.asarray(M * scale.T[:, :, None])
 
-        def worst(t: float) -> tuple[float, float, FloatArray]:
-            found = [climbed(pair, self.one, t, self._weighted) for pair in pairs if pair.N is not None]
-            places = [(self._gain(p, w) * self.size(w, w), w, p) for p, w in found]
-            return max(places, key=lambda place: place[0], default=(0.0, math.nan, self.asked.box.nominal))
+    def stable(self, until: float) -> bool:
+        """Whether the nominal loops are proven stable."""
+        return Job(self.problem, self.box, 1e-3, True, until, 60_000, None).stable()
 
-        def lost_at(place: tuple[float, float, FloatArray]) -> tuple[float, float, FloatArray]:
-            size, w, p = place
-            return max(float(pairs[0].growth.margin(p)), 1 / size if size > 0 else math.inf), w, p
+    def sizes(self, share: float) -> list[Size]:
+        """share W_k on cells, of each block."""
+        T = self.law.sample_time
 
-        top = worst(reach)
-        low, high = 0.0, reach
-        best = lost_at(top)
-        if not (self.asked.box.down + self.asked.box.up).any() or top[0] * reach < 1:
-            return best
-        for _ in range(HALVINGS):
-            middle = (low + high) / 2
-            here = worst(middle)
-            if here[0] * middle >= 1:
-                high = middle
-            else:
-                low = middle
-            best = min(best, lost_at(here), key=lambda place: place[0])
-            if high - low < 1e-9 * high:
-                break
-        return best
+        def on(weight: Weight, cells: FloatArray, scale: int) -> Expanded:
+            return weight.on(cells, scale, T).times(share)
 
-    def _weighted(self, w: FloatArray) -> FloatArray:
-        return np.array([self.size(x, x) for x in w.tolist()])
+        return [partial(on, b.weight) for b in self.blocks]
 
-    def _gain(self, p: FloatArray, w: float) -> float:
-        return gain_at(self.system, self.law, self.asked, p, w)
-
-    def _proven(self, pairs: list[Pair], upper: float) -> float | None:
-        """The largest t of those tried for which stability is proven."""
-        for step in STEPS:
-            t = upper / (1 + step * self.asked.tolerance)
-            if all(self._excluded(pair, t) for pair in pairs):
-                return t
-            if clock.monotonic() > self.asked.until:
-                break
-        return None
-
-    def _excluded(self, pair: Pair, t: float) -> bool:
-        def share(cells: FloatArray) -> FloatArray:
-            return t * np.array([self._largest(cell, pair.f.scale) for cell in cells])
-
-        return excluded(pair, t if pair.growth.grows.any() else 1.0, share, self.asked.until)[0]
-
-    def _largest(self, cell: FloatArray, scale: int) -> float:
-        """|W| over a cell's interval of frequency."""
-        branch, a, b = cell.tolist()
-        ends = [math.inf if x == 0 else 1 / x for x in (b, a)] if branch else [a, b]
-        low, high = (self.one.physical(math.ldexp(x, scale) if math.isfinite(x) else x) for x in ends)
-        return self.size(low * (1 - 1e-12), high * (1 + 1e-12))
+    def starts(self, t: float, chosen: FloatArray) -> list[FloatArray]:
+        """Parameters at patterns of -1 to 1 in box(t)."""
+        sides = self.box.sides(t)
+        return [sides.mean(axis=1) + x * (sides[:, 1] - sides[:, 0]) / 2 for x in chosen]
 
 
-def _weight(weight: Any) -> Size:
-    """Bounds of |W(jw)| on intervals. Raises InputError for what is no weight."""
-    if isinstance(weight, (int, float)) and not isinstance(weight, bool):
-        if not 0 < weight < math.inf:
-            raise InputError(
-                "dynamic_margin", "weight", f"{weight}", "a number above zero, or a transfer function"
-            )
-        return partial(_constant, float(weight))
-    try:
-        num, den = (np.asarray(c[0][0], dtype=float) for c in (weight.num, weight.den))
-        stable, continuous = bool((weight.poles().real < 0).all()), not weight.dt
-    except (AttributeError, TypeError, ValueError, IndexError):
-        raise InputError(
-            "dynamic_margin", "weight", type(weight).__name__, "a number or a transfer function"
-        ) from None
-    if not (stable and continuous and len(num) <= len(den) and np.isfinite([*num, *den]).all()):
-        raise InputError(
-            "dynamic_margin", "weight", "not stable, not proper or discrete", "a stable, proper one in s"
-        )
-    num = np.concatenate([np.zeros(len(den) - len(num)), num])
+def _scaled(
+    system: UncertainSystem, law: Compensator, nominal: FloatArray, b: Block, problem: OfLoop
+) -> Block:
+    """A block probed by entries that count about as much as the loop's own gain, by powers of two."""
+    if b.kind in ("multiplicative", "feedback"):
+        return b
+    from malta.margins.peaks import frequencies
 
-    def largest(low: float, high: float) -> float:
-        if math.isinf(high):  # in y = 1 / w, from 0 on
-            return _ratio(num[::-1], den[::-1], 0.0, 1 / low if low > 0 else math.inf, -1j)
-        return _ratio(num, den, low, high, 1j)
-
-    return largest
+    M = transfer(responses(system, law, nominal, frequencies(problem, nominal)), [b])
+    size = float(np.abs(M[np.isfinite(M)]).max(initial=0.0))
+    return replace(b, unit=2.0 ** -round(1 + math.log2(size))) if size > 0 else b
 
 
-def _constant(size: float, low: float, high: float) -> float:
-    del low, high
-    return size
+def _size(asked: Blocks, place: Peak) -> float:
+    """The smallest t that holds a place's parameters and blocks."""
+    box, moved = asked.box, place.p - asked.box.nominal
+    with np.errstate(divide="ignore", invalid="ignore"):
+        t = np.where(moved > 0, moved / box.up, np.where(moved < 0, -moved / box.down, 0))
+    share = float(np.where(box.down + box.up > 0, t, 0).max(initial=0.0))
+    return max(share, 1 / place.value)
 
 
-def _ratio(num: FloatArray, den: FloatArray, low: float, high: float, turn: complex) -> float:
-    """At least |num / den| at turn x for x in [low, high], by Taylor's expansions; coefficients highest power first."""
-    if not math.isfinite(high):
-        return math.inf
-    middle, half = (low + high) / 2, (high - low) / 2
+def _loss(asked: Blocks, until: float) -> Peak | None:
+    """The smallest t that was found to lose stability; none within what the parameters can be."""
+    box, every = asked.box, patterns(len(asked.box.names))
+    seen: list[Peak] = []
 
-    def terms(c: FloatArray) -> list[float]:
-        p, found = np.poly1d(c), []
-        for m in range(len(c)):
-            found.append(abs(complex(p(turn * middle))) * half**m / math.factorial(m))
-            p = p.deriv()
+    def value(p: FloatArray, w: FloatArray) -> FloatArray:
+        return structured(asked.transfer(p, w), asked.blocks)[0]
+
+    def peak(t: float, chosen: FloatArray) -> Peak:
+        found = climb(value, asked.problem, box.sides(t), asked.starts(t, chosen))
+        seen.append(found)
         return found
 
-    top, bottom = terms(num), terms(den)
-    least = bottom[0] - sum(bottom[1:])
-    return math.inf if least <= 0 else (sum(top) / least) * (1 + 1e-9)
+    first = peak(0.0, every)
+    if not (box.down + box.up).any():
+        return first if first.value > 0 else None
+    high = min(1 / first.value if first.value > 0 else math.inf, asked.limit)
+    alone: Peak | None = None
+    if (asked.problem.instability(np.array(asked.starts(high, every))) >= 0).any():
+        t, w, p = first_loss(asked.problem, box, high)  # by the parameters alone
+        if p is not None and w is not None:
+            alone, high = Peak(1 / t, w, p), t
+            seen.append(alone)
+    top = peak(high, every)
+    if top.value * high < 1:
+        return alone
+    for _ in range(ROUNDS):
+        chosen = _pattern(box, high, top.p)
+        low = high / 2
+        while low > 1e-9 * high and peak(low, chosen).value * low >= 1:
+            high, low = low, low / 2
+
+        def excess(x: float, chosen: FloatArray = chosen) -> float:
+            return math.log(max(peak(math.exp(x), chosen).value, 1e-300)) + x
+
+        optimize.brentq(excess, math.log(low), math.log(high), xtol=1e-11, maxiter=40)
+        best = min(seen, key=lambda place: _size(asked, place))
+        t = _size(asked, best)
+        top = peak(t, every)
+        if top.value * t < 1 + 1e-9 or clock.monotonic() > until:
+            break
+        high = t
+    return min(seen, key=lambda place: _size(asked, place))
+
+
+def _pattern(box: Box, t: float, p: FloatArray) -> FloatArray:
+    """Where in box(t) p lies, -1 to 1; and the middle."""
+    sides = box.sides(t)
+    half = (sides[:, 1] - sides[:, 0]) / 2
+    x = np.where(half > 0, (p - sides.mean(axis=1)) / np.where(half > 0, half, 1), 0)
+    return np.array([np.clip(x, -1, 1), 0 * x])
+
+
+def _proven(asked: Blocks, upper: float, tolerance: float, until: float) -> tuple[float | None, str]:
+    """The largest t of those tried for which stability is proven, and why there is none."""
+    parts: list[Part] = []
+    reason = ""
+    for step in STEPS:
+        t = upper / (1 + step * tolerance)
+        try:
+            parts = parts or parts_of(asked.with_blocks, asked.blocks, asked.box, t, until)
+        except Unproven as error:
+            reason = str(error)
+            continue
+        if excluded(parts, t, asked.sizes(t), until)[0]:
+            return (t, "") if asked.stable(until) else (None, "the nominal loop is not proven stable")
+        if clock.monotonic() > until:
+            break
+    return None, reason or "not settled"

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -102,6 +102,18 @@ class Cell:
     smallest: float
 
 
+class Beside(NamedTuple):
+    """f on cells where more than the family acts on it: expansions, discs about them, what each further axis moves."""
+
+    terms: list[ComplexArray]
+    radius: FloatArray
+    discs: ComplexArray  # cells x nodes
+    moves: list[FloatArray]
+    sure: ComplexArray | None = (
+        None  # directions of cells that are excluded for reasons of their own, zero elsewhere
+    )
+
+
 @dataclass(eq=False)
 class Search:
     """Open and finished cells of one family. `lower`: zero is excluded on every box(t) with t below it."""
@@ -114,10 +126,9 @@ class Search:
     depth: FloatArray
     target: float
     count: int = 0
-    beside: Family | None = (
-        None  # zero is to stay excluded by `share` times the size of this one, aligned with family
+    beside: Callable[[FloatArray, FloatArray], Beside] | None = (
+        None  # f by more than its family, on cells and boxes
     )
-    share: Callable[[FloatArray], FloatArray] | None = None  # of each cell
     done: list[tuple[FloatArray, FloatArray, ComplexArray]] = field(default_factory=list)
 
     @property
@@ -179,14 +190,18 @@ def advance(s: Search) -> None:
         s.depth[~batch],
     )
     s.count += len(cells)
-    terms, radius = on_boxes(s.family, cells, boxes)
-    c = half_plane([*terms, *_discs(s, cells, boxes)], radius)
+    found = _expanded(s, cells, boxes)
+    terms, radius = found.terms, found.radius
+    c = half_plane([*terms, found.discs], radius)
+    if found.sure is not None:
+        c = np.where(c == 0, found.sure, c)
     good = c != 0
     if good.any():
         s.done.append((cells[good], boxes[good], c[good]))
     bad = ~good
     if bad.any():
-        _split(s, cells[bad], boxes[bad], depth[bad], [t[bad] for t in terms], radius[bad])
+        kept = Beside([t[bad] for t in terms], radius[bad], found.discs[bad], [m[bad] for m in found.moves])
+        _split(s, cells[bad], boxes[bad], depth[bad], kept)
 
 
 def on_boxes(
@@ -201,13 +216,11 @@ def on_boxes(
     return terms, e.radius[index]
 
 
-def _discs(s: Search, cells: FloatArray, boxes: FloatArray) -> list[ComplexArray]:
-    """Radii of discs about the coefficients: how large the family beside is at each."""
-    if s.beside is None or s.share is None:
-        return []
-    terms, radius = on_boxes(s.beside, cells, boxes, s.family)
-    size = sum(np.abs(t) for t in terms) + radius[:, None]
-    return [np.asarray(s.share(cells)[:, None] * (1 + 1e-12) * size, dtype=complex)]
+def _expanded(s: Search, cells: FloatArray, boxes: FloatArray) -> Beside:
+    if s.beside is not None:
+        return s.beside(cells, boxes)
+    terms, radius = on_boxes(s.family, cells, boxes)
+    return Beside(terms, radius, np.zeros((len(cells), 1), dtype=complex), [])
 
 
 def half_plane(terms: list[ComplexArray], radius: FloatArray) -> ComplexArray:
@@ -239,11 +252,10 @@ def _split(
     cells: FloatArray,
     boxes: FloatArray,
     depth: FloatArray,
-    terms: list[ComplexArray],
-    radius: FloatArray,
+    found: Beside,
 ) -> None:
-    """Each cell in two, across what moves f most: frequency, or a parameter."""
-    shape = s.family.shape
+    """Each cell in two, across what moves f most: frequency, a parameter, or what acts beside them."""
+    shape, terms, radius = s.family.shape, found.terms, found.radius
     count = terms[0].shape[1]
     width = (
         np.abs(terms[1]).sum(axis=1) + sum(2 * np.abs(t).sum(axis=1) for t in terms[2:]) + 2 * radius * count
@@ -261,6 +273,7 @@ def _split(
         moves.append(
             0.5 * np.maximum(np.abs(ends).reshape(len(cells), -1).sum(axis=1) * size, inner * size / 2)
         )
+    moves += [np.where(np.isfinite(m), m, 0.0) for m in found.moves]
     choice = np.argmax(np.array(moves), axis=0)
     new_cells, new_boxes, new_depth = [], [], []
     for axis in np.unique(choice):

@@ -1,53 +1,39 @@
-"""The largest gain of a channel anywhere in a box of parameters: a peak of sensitivity that no plant exceeds.
+"""The largest gain of a loop anywhere in a box of parameters: a peak of sensitivity that no plant exceeds.
 
-With f(s) the loop's characteristic polynomial, a channel's gain is N(s) / f(s), where N follows from the loop with
-twice the gain in that channel: det is affine in a gain of rank one, so that
-
-    S = (2 f - f_2) / f,        T = (f_2 - f) / f.
-
-|N / f| < G on the box and at all frequencies where no point of f's cells comes within |N| / G of zero: the exclusion of
-the margin, with a disc about each Bernstein coefficient. It is robust stability against a fictitious complex gain.
+A gain below G, with unmodelled dynamics of their size or without, is robust stability against one more complex block of
+size 1 / G that reads the gain's output and drives its input: a fictitious one, the last of `polydisc`.
 """
 
 from __future__ import annotations
 
 import math
 import time as clock
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from flint import arb
-from scipy import optimize
 
 from malta.errors import InputError
-from malta.margins.box import Box, box_of
-from malta.margins.enclosure import TooWide, Unproven, over_box
-from malta.margins.exclusion import Growth, advance, growth_over, start
-from malta.margins.family import Family, aligned, combined
-from malta.margins.frequency import cover
-from malta.margins.loop import B, C, Group, Loop
-from malta.margins.robust import law_of, problem_of
-from malta.margins.search import Job, halves
-from malta.margins.witness import coefficients_at, rows_at
-from malta.uncertain import Compensator, UncertainSystem, responses
+from malta.margins.blocks import At, Block, Channels, Dynamic, block_of, channels_of, shape_of
+from malta.margins.box import box_of
+from malta.margins.dynamic import Blocks
+from malta.margins.enclosure import Unproven
+from malta.margins.peaks import climb, patterns
+from malta.margins.polydisc import excluded, parts_of
+from malta.margins.robust import LONGEST, law_of
+from malta.margins.transfer import performance
+from malta.margins.weight import weight_of
+from malta.uncertain import Compensator, UncertainSystem
 
 if TYPE_CHECKING:
-    from malta.margins.problem import OfLoop, Polynomial
     from malta.margins.robust import Ranges
     from malta.plant import FloatArray
 
-Channel = Literal["sensors", "forces"]
-Kind = Literal["sensitivity", "complementary"]
+Of = Literal["sensitivity", "complementary", "compliance", "effort"]
 
 TOLERANCE = 3e-3  # how close the proven bound comes to the largest gain found, relative
 STEPS = (1, 3, 10, 30, 100, 300, 1000)  # multiples of the tolerance that are tried
-MOST_CELLS = 60_000
-PATCHES = 64
-GRID = 400  # frequencies
-CORNERS = 48
-LOW = 1e-9  # rad/s, that stands for zero
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,37 +53,33 @@ class Gain:
         return f"{self.lower:.4g} at {self.frequency:.4g} rad/s, {high}"
 
 
-@dataclass(frozen=True, eq=False)
-class Pair:
-    """f and N over a part of the box; no N of groups that the channel does not act on."""
-
-    f: Family
-    N: Family | None
-    growth: Growth
-
-
 def worst_case_gain(
     system: UncertainSystem,
     compensator: Compensator | Any,
     ranges: Ranges,
     over: Mapping[str, tuple[float, float]] | None = None,
     *,
-    of: Kind = "sensitivity",
-    at: Channel = "sensors",
-    channel: int = 0,
+    of: Of = "sensitivity",
+    at: At = "sensors",
+    channel: Channels | tuple[Channels, Channels] | None = 0,
+    dynamics: Sequence[Dynamic] = (),
     tolerance: float = TOLERANCE,
     time: float | None = None,
 ) -> Gain:
-    """The largest |S| or |T| of one channel over all parameters of a box and all frequencies, as wcgain gives it.
+    """The largest gain of a closed loop over all parameters of a box and all frequencies, as wcgain gives it.
 
     Parameters
     ----------
     compensator, ranges, over : as robust_margin takes them; the box is the modelled one, t = 1
     of : sensitivity S = 1 / (1 - L) or complementary sensitivity T = L / (1 - L), L around the loop from the channel
-        back to it, the other channels closed
-    at, channel : sensors or forces, counted from 0
+        back to it, the other channels closed; compliance (1 - P F)^-1 P from a force on the plant to a sensor; effort
+        F (1 - P F)^-1 from a sensor's noise to a command. Forces of a sampled loop are held for a sample.
+    at : sensors or forces, of S and T
+    channel : counted from 0; several of them as a tuple, all as None: the largest singular value; of compliance
+        (sensors, forces), of effort (forces, sensors)
+    dynamics : blocks of unmodelled dynamics of their full size beside the parameters
     tolerance : how close the proven bound shall come to the gain that was found, relative
-    time : s, after which what stands is returned
+    time : s, after which what stands is returned; 120 where None is given
 
     Raises InputError as robust_margin does, and for channels that the loop does not have.
 
@@ -109,241 +91,73 @@ def worst_case_gain(
     """
     begun = clock.monotonic()
     law = law_of(system, compensator)
-    box = box_of(system.names, system.nominal, system.limits, ranges, over or {})
-    until = math.inf if time is None else begun + time
-    asked = Question(box, of, at, channel, tolerance, until)
-    asked.check(system, of)
+    box = box_of(system.names, system.nominal, system.limits, ranges, over or {}, empty=True)
+    last = _performance_block(system, of, at, channel)
+    if not tolerance > 0:
+        raise InputError("worst_case_gain", "tolerance", f"{tolerance}", "a number above zero")
     if not box.most > 1:
         raise InputError("worst_case_gain", "ranges", "a box that reaches a limit", "one within the limits")
-    one, two = problem_of(system, law), problem_of(system, doubled(law, at, channel))
-    if (one.instability(box.standing()) >= 0).any():
-        return Gain(
-            math.inf, None, math.nan, {}, 0, clock.monotonic() - begun, "the nominal loop is unstable"
-        )
+    asked = Blocks.of(system, law, box, [*(block_of(system, d) for d in dynamics), last])
+    if asked.unstable():
+        reason = "the nominal loop is unstable"
+        return Gain(math.inf, None, math.nan, {}, 0, clock.monotonic() - begun, reason)
+    until = begun + (LONGEST if time is None else time)
+
+    def value(p: FloatArray, w: FloatArray) -> FloatArray:
+        return performance(asked.transfer(p, w), asked.blocks)
+
+    with np.errstate(all="ignore"):  # what is not finite excludes nothing
+        starts = asked.starts(1.0, patterns(len(box.names)))
+        worst = asked.problem.instability(np.array(starts))
+        if worst.max() >= 0:
+            p = starts[int(worst.argmax())]
+            lower, w = math.inf, asked.problem.critical(p)
+        else:
+            lower, w, p = climb(value, asked.problem, box.sides(1.0), starts)
+        upper, cells, reason = _proven(asked, lower, tolerance, until)
+    named = dict(zip(box.names, p.tolist(), strict=True))
+    return Gain(lower, upper, w, named, cells, clock.monotonic() - begun, reason)
+
+
+def _performance_block(system: UncertainSystem, of: Of, at: At, channel: Any) -> Block:
+    """The fictitious block of a gain. Raises InputError for gains and channels that there are not."""
+    if of not in ("sensitivity", "complementary", "compliance", "effort") or at not in ("sensors", "forces"):
+        expected = "sensitivity, complementary, compliance or effort; sensors or forces"
+        raise InputError("worst_case_gain", "of, at", f"{of}, {at}", expected)
+    counts = dict(zip(("sensors", "forces"), shape_of(system), strict=True))
+    one = weight_of(1.0)
+    if of in ("sensitivity", "complementary"):
+        picked = tuple(range(counts[at])) if channel is None else channel
+        channels = channels_of(picked, counts[at], at)
+        return Block("feedback" if of == "sensitivity" else "multiplicative", at, channels, channels, one)
+    names = ("sensors", "forces") if of == "compliance" else ("forces", "sensors")
+    both = tuple(tuple(range(counts[name])) for name in names) if channel is None else channel
+    if not isinstance(both, tuple) or len(both) != 2:
+        raise InputError("worst_case_gain", "channel", repr(channel), f"({names[0]}, {names[1]}) of {of}")
+    read, driven = (channels_of(c, counts[name], name) for c, name in zip(both, names, strict=True))
+    return Block(of, "sensors", driven, read, one)  # type: ignore[arg-type]
+
+
+def _proven(asked: Blocks, lower: float, tolerance: float, until: float) -> tuple[float | None, int, str]:
+    """The smallest bound of those tried that holds, the cells that were looked at, and why there is none."""
+    if not math.isfinite(lower):
+        return None, 0, "the box holds an unstable loop"
     try:
-        with np.errstate(all="ignore"):  # what is not finite excludes nothing
-            pairs = pairs_of(one, two, asked)
+        parts = parts_of(asked.with_blocks, asked.blocks, asked.box, 1.0, until)
     except Unproven as error:
-        lower, w, p = _response(system, law, asked, box.nominal, [])
-        return Gain(lower, None, w, _named(box, p), 0, clock.monotonic() - begun, str(error))
-    starts = [climbed(pair, one) for pair in pairs if pair.N is not None]
-    lower, w, p = _response(system, law, asked, box.nominal, starts)
-    with np.errstate(all="ignore"):
-        upper, cells = _proven(pairs, lower, asked)
-    reason = "" if upper is not None else "not settled: the box may hold an unstable loop"
-    if upper is not None and not Job(one, box, 1e-3, True, until, MOST_CELLS, None).stable():
-        upper, reason = None, "the nominal loop is not proven stable"
-    return Gain(lower, upper, w, _named(box, p), cells, clock.monotonic() - begun, reason)
-
-
-@dataclass(frozen=True, eq=False)
-class Question:
-    box: Box
-    of: Kind
-    at: Channel
-    channel: int
-    tolerance: float
-    until: float
-
-    def check(self, system: UncertainSystem, kind: str) -> None:
-        """Raise InputError for channels and kinds that there are not."""
-        if system.matrices.n_out() != 3 or system.sample_time is not None:
-            found = "D or E, or discrete time"
-            raise InputError("channel", "system", found, "A, B, C alone in continuous time")
-        outputs, inputs = system.matrices.size1_out(2), system.matrices.size2_out(1)
-        known = kind in ("sensitivity", "complementary", "multiplicative", "feedback")
-        if self.at not in ("sensors", "forces") or not known:
-            expected = "sensitivity or complementary, multiplicative or feedback; sensors or forces"
-            raise InputError("channel", "kind, at", f"{kind}, {self.at}", expected)
-        if not 0 <= self.channel < (outputs if self.at == "sensors" else inputs):
-            raise InputError("channel", "channel", f"{self.channel}", f"one of the {self.at}, from 0")
-        if not self.tolerance > 0:
-            raise InputError("channel", "tolerance", f"{self.tolerance}", "a number above zero")
-
-
-def _named(box: Box, p: FloatArray) -> dict[str, float]:
-    return dict(zip(box.names, p.tolist(), strict=True))
-
-
-def doubled(law: Compensator, at: Channel, channel: int) -> Compensator:
-    """The compensator with twice the gain in one channel."""
-    B, C, D = law.B.copy(), law.C.copy(), law.D.copy()
-    if at == "sensors":
-        B[:, channel] *= 2
-        D[:, channel] *= 2
-    else:
-        C[channel] *= 2
-        D[channel] *= 2
-    return replace(law, B=B, C=C, D=D)
-
-
-def pairs_of(one: OfLoop, two: OfLoop, asked: Question, reach: float = 1.0) -> list[Pair]:
-    """f and N of the group that the channel acts on, over parts of box(reach). Raises Unproven."""
-    sides = asked.box.sides(reach)
-    p = [arb(a).union(arb(b)) for a, b in sides.tolist()]
-    first, second = one.parts(p), two.parts(p)
-    if _members(first) != _members(second):
-        raise Unproven("the channel joins groups of states")
-    found: list[Pair] = []
-    touched = 0
-    for (f, moves), (g, other) in zip(first, second, strict=True):
-        acts = _acts(one.loop, f.group, asked)  # type: ignore[attr-defined]
-        touched += acts
-        todo = [sides]
-        while todo:
-            own = todo.pop()
-            try:
-                families = over_box(f, own, moves, asked.until), over_box(g, own, other, asked.until)
-            except TooWide as error:
-                if len(todo) + len(found) >= PATCHES:
-                    raise Unproven(str(error)) from error
-                todo += halves(own, error.axis, float(asked.box.nominal[error.axis]))
-                continue
-            found.append(_pair(*families, f, own, asked, acts=acts, neglects=bool(moves or other)))
-    if touched > 1:
-        raise Unproven("the channel acts on several groups of states")
-    return found
-
-
-def _members(parts: Any) -> list[Any]:
-    return [(f.group.states, f.group.own, f.group.inputs) for f, _ in parts]
-
-
-def _acts(loop: Loop, group: Group, asked: Question) -> bool:
-    """Whether the channel reads or drives states of a group anywhere, by the expressions and not by their values."""
-    which, side = (C, 0) if asked.at == "sensors" else (B, 1)
-    entries = loop.program.entries[which] if loop.symbolic is None else loop.symbolic.entries[which]
-    return any(at[side] == asked.channel and at[1 - side] in group.states for at in entries)
-
-
-def _pair(
-    f: Family, g: Family, of: Polynomial, sides: FloatArray, asked: Question, *, acts: bool, neglects: bool
-) -> Pair:
-    f, g = aligned(f, g)
-    N = None
-    if acts:
-        N = combined(f, g, 2.0, -1.0) if asked.of == "sensitivity" else combined(f, g, -1.0, 1.0)
-    if (
-        neglects
-    ):  # what couplings taken as zero do with the fictitious gain closed: entries grow as with twice the gain
-        share = np.exp2(np.clip(np.array(g.exponents) - np.array(f.exponents), -1000, 1000))
-        f = replace(f, radius=f.radius + 2 * share * g.radius)
-    return Pair(f, N, growth_over(sides, of.inverted, asked.box))
-
-
-# the largest gain that is found
-
-
-def climbed(
-    pair: Pair, problem: OfLoop, t: float = 1.0, weighted: Callable[[FloatArray], FloatArray] | None = None
-) -> tuple[FloatArray, float]:
-    """p in box(t) and rad/s of a large |N / f|, times a weight: the best of a grid, and uphill from there."""
-    f, N, growth = pair.f, pair.N, pair.growth
-    assert N is not None
-    share = np.exp2(np.array(N.exponents) - np.array(f.exponents))
-
-    def gain(u: FloatArray, x: FloatArray) -> FloatArray:
-        a, b = coefficients_at(f, u)[0], coefficients_at(N, u)[0] * share
-        rows = rows_at(f, 0, x)
-        size = np.abs(rows @ b) / np.maximum(np.abs(rows @ a), 1e-300)
-        if weighted is not None:
-            size = size * weighted(np.array([problem.physical(float(v)) for v in np.ldexp(x, f.scale)]))
-        return np.asarray(size)
-
-    inner = cover(f)
-    inner = inner[(inner[:, 0] == 0) & (inner[:, 1] > 0)]
-    x = np.geomspace(inner[0, 1], inner[-1, 2], GRID) if len(inner) else np.ones(1)
-    sides = growth.inside(t)
-    sides[np.array(f.shape) == 1] = 0.5
-    rng = np.random.default_rng(0)
-    corners = [sides[np.arange(len(sides)), rng.integers(0, 2, len(sides))] for _ in range(CORNERS)]
-    places = [(u, gain(u, x)) for u in np.unique([sides.mean(axis=1), *corners], axis=0)]
-    u, sizes = max(places, key=lambda place: float(place[1].max()))
-    k = int(sizes.argmax())
-    if float(gain(u, np.zeros(1))[0]) > 0.999 * float(sizes[k]):  # at w = 0
-        return growth.parameters(u), 0.0
-
-    def loss(z: FloatArray) -> float:
-        u = np.clip(z[:-1], sides[:, 0], sides[:, 1])
-        return -math.log(max(float(gain(u, np.exp(z[-1:]))[0]), 1e-300))
-
-    z0 = np.append(u, math.log(x[k]))
-    bounds = [*(tuple(side) for side in sides.tolist()), (z0[-1] - 2, z0[-1] + 2)]
-    found = optimize.minimize(
-        loss, z0, method="L-BFGS-B", bounds=bounds, options={"ftol": 1e-15, "gtol": 1e-10}
-    )
-    z = np.asarray(found.x) if found.fun <= loss(z0) else z0
-    polished = optimize.minimize_scalar(
-        lambda y: loss(np.append(z[:-1], y)), bounds=(z[-1] - 0.05, z[-1] + 0.05), method="bounded",
-        options={"xatol": 1e-10},
-    )  # fmt: skip
-    if polished.fun < loss(z):
-        z = np.append(z[:-1], polished.x)
-    u = np.clip(z[:-1], sides[:, 0], sides[:, 1])
-    return growth.parameters(u), problem.physical(float(np.ldexp(math.exp(z[-1]), f.scale)))
-
-
-def gain_at(system: UncertainSystem, law: Compensator, asked: Question, p: FloatArray, w: float) -> float:
-    """The channel's gain by frequency responses of plant and compensator."""
-    P, F = responses(system, law, p, np.array([max(w, LOW)]))
-    L = P @ F if asked.at == "sensors" else F @ P
-    S = np.linalg.inv(np.eye(L.shape[1]) - L[0])[asked.channel, asked.channel]
-    return float(abs(S if asked.of == "sensitivity" else S - 1))
-
-
-def _response(
-    system: UncertainSystem,
-    law: Compensator,
-    asked: Question,
-    nominal: FloatArray,
-    starts: list[tuple[FloatArray, float]],
-) -> tuple[float, float, FloatArray]:
-    """The gain at the places found, by frequency responses of plant and compensator: gain, rad/s, p."""
-    top = math.pi / law.sample_time if law.sample_time is not None else 1e6
-    places = starts or [(nominal, w) for w in np.geomspace(1e-6 * top, 0.999 * top, 300)]
-    best = (0.0, math.nan, nominal)
-    for p, w in places:
-        size = gain_at(system, law, asked, p, min(w, top))
-        if size > best[0]:
-            best = (size, float(w), p)
-    return best
-
-
-# what no plant exceeds
-
-
-def _proven(pairs: list[Pair], lower: float, asked: Question) -> tuple[float | None, int]:
-    """The smallest bound of those tried that holds for all pairs, and the cells that were looked at."""
-    count = 0
+        return None, 0, str(error)
+    count, last = 0, len(asked.blocks) - 1
     for step in STEPS:
-        bound = max(lower, 1e-9) * (1 + step * asked.tolerance)
-        found, cells = _excluded(pairs, bound, asked.until)
+        bound = max(lower, 1e-300) * (1 + step * tolerance)
+        sizes = [*asked.sizes(1.0)[:last], asked.sizes(1 / bound)[last]]
+        found, cells = excluded(parts, 1 + 1e-9, sizes, until)
         count += cells
         if found:
-            return bound, count
-        if clock.monotonic() > asked.until:
+            return (
+                (bound, count, "")
+                if asked.stable(until)
+                else (None, count, "the nominal loop is not proven stable")
+            )
+        if clock.monotonic() > until:
             break
-    return None, count
-
-
-def _excluded(pairs: list[Pair], bound: float, until: float) -> tuple[bool, int]:
-    """Whether |N| < bound |f| on all cells."""
-    count = 0
-    for pair in pairs:
-        done, cells = excluded(pair, 1 + 1e-9, lambda cells: np.full(len(cells), 1 / bound), until)
-        count += cells
-        if not done:
-            return False, count
-    return True, count
-
-
-def excluded(
-    pair: Pair, target: float, share: Callable[[FloatArray], FloatArray], until: float
-) -> tuple[bool, int]:
-    """Whether share |N| < |f| on all cells of box(target), share by the cell; and the cells that were looked at."""
-    search = replace(start(pair.f, pair.growth, target), beside=pair.N, share=share)
-    while not search.finished:
-        if search.count > MOST_CELLS or clock.monotonic() > until:
-            return False, search.count
-        advance(search)
-    return True, search.count
+    return None, count, "not settled: the box may hold an unstable loop"

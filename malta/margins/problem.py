@@ -18,6 +18,7 @@ from malta.margins.closed import closed_loop
 from malta.margins.closed import parts as driven
 from malta.margins.expressions import BALLS, EXACT, POINTS, NotAnalytic, Program
 from malta.margins.loop import Group, Loop
+from malta.uncertain import closed_loop as closed_matrices
 from malta.uncertain import critical, instability
 
 if TYPE_CHECKING:
@@ -67,10 +68,13 @@ class OfLoop:
     loop: Loop
     names: tuple[str, ...]
     known: dict[Any, Characteristic] = field(default_factory=dict)
+    neglect: bool = True  # whether couplings that are only rounding are taken as zero, and accounted for
 
     @cached_property
     def couplings(self) -> dust.Couplings | None:
-        return None if self.loop.symbolic is None else dust.Couplings(self.loop, self.loop.symbolic)
+        if self.loop.symbolic is None or not self.neglect:
+            return None
+        return dust.Couplings(self.loop, self.loop.symbolic)
 
     def parts(self, p: Sequence[Any]) -> list[tuple[Polynomial, tuple[Any, ...]]]:
         found: list[tuple[Polynomial, tuple[Any, ...]]] = []
@@ -109,6 +113,19 @@ class OfLoop:
             sizes = poles.real if self.loop.law.sample_time is None else 2 * poles.real + np.abs(poles) ** 2
             worst.append(float(sizes.max(initial=-math.inf)))
         return np.array(worst)
+
+    def poles(self, p: FloatArray) -> Any:
+        """The closed loop's poles in s; of sampled loops ln z / T."""
+        T = self.loop.law.sample_time
+        if self._plain:
+            (found,) = np.linalg.eigvals(closed_matrices(self.loop.system, self.loop.law, p))
+            found = found if T is None else T * found
+        else:
+            found = self._poles(p)
+        if T is None:
+            return found
+        with np.errstate(divide="ignore"):
+            return np.log(1 + found.astype(complex)) / T
 
     def critical(self, p: FloatArray) -> float:
         if self._plain:

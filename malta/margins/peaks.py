@@ -1,0 +1,106 @@
+"""Where a gain is largest over a box of parameters and all frequencies: a grid at corners, and uphill from there.
+
+What is found is true of a plant of the box, so that it bounds from below; nothing here says that it is the largest.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from scipy import optimize
+
+if TYPE_CHECKING:
+    from malta.margins.problem import OfLoop
+    from malta.plant import ComplexArray, FloatArray
+
+CORNERS = 32
+PLACES = 4  # that are climbed from
+AROUND = np.array([0.5, 0.8, 0.9, 0.95, 0.98, 1.0, 1.02, 1.05, 1.1, 1.25, 2.0])
+ENDS = (0.01, 100.0)  # beyond the slowest and the fastest pole
+FAR_ENDS = (1e-5, 1e4)  # that stand for zero and for infinity
+GRID = 80
+
+Value = Callable[["FloatArray", "FloatArray"], "FloatArray"]  # of p and of rows of w
+
+
+class Peak(NamedTuple):
+    value: float
+    frequency: float  # rad/s
+    p: FloatArray
+
+
+def patterns(count: int) -> FloatArray:
+    """Where in a box the climb starts, -1 to 1: the middle, corners; some of these where they are many."""
+    if 2**count <= CORNERS:
+        corners = np.array(list(itertools.product((-1.0, 1.0), repeat=count))).reshape(-1, count)
+    else:
+        corners = np.random.default_rng(0).choice((-1.0, 1.0), (CORNERS, count))
+    return np.vstack([np.zeros((1, count)), corners])
+
+
+def frequencies(problem: OfLoop, p: FloatArray) -> FloatArray:
+    """Frequencies that show a loop's peaks: between its slowest and its fastest pole and about each of them, rad/s."""
+    s: ComplexArray = problem.poles(p)
+    known = np.concatenate([np.abs(s), np.abs(s.imag)])
+    known = known[np.isfinite(known) & (known > 0)]
+    T = problem.loop.law.sample_time
+    top = math.inf if T is None else math.pi / T
+    if not len(known):
+        known = np.array([1.0])
+    wide = np.geomspace(known.min() * ENDS[0], min(known.max() * ENDS[1], top), GRID)
+    far = np.array([known.min(), known.max()]) * FAR_ENDS
+    w = np.unique(np.concatenate([wide, far, (known[:, None] * AROUND).ravel()]))
+    return np.asarray(np.append(w[w < top], top) if T is not None else w)
+
+
+def climb(value: Value, problem: OfLoop, sides: FloatArray, starts: Sequence[FloatArray]) -> Peak:
+    """The largest value found within the sides of a box (P x 2), from the best places at some parameters."""
+    places: list[Peak] = []
+    for p in starts:
+        w = frequencies(problem, p)
+        v = value(p, w)
+        inner = np.flatnonzero((v >= np.append(v[1:], -np.inf)) & (v >= np.append(-np.inf, v[:-1])))
+        places += [Peak(float(v[k]), float(w[k]), p) for k in inner[np.argsort(v[inner])[-3:]]]
+    places.sort(key=lambda place: -place.value)
+    if not math.isfinite(places[0].value):
+        return places[0]
+    T = problem.loop.law.sample_time
+    top = math.inf if T is None else math.pi / T
+    return max(
+        (_uphill(value, place, sides, top) for place in places[: min(PLACES, len(starts))]),
+        key=lambda place: place.value,
+    )
+
+
+def _uphill(value: Value, place: Peak, sides: FloatArray, top: float) -> Peak:
+    """From a place to the top nearby, by L-BFGS in parameters and log frequency, then in frequency alone."""
+    free = np.flatnonzero(sides[:, 1] > sides[:, 0])
+    low, width = sides[free, 0], sides[free, 1] - sides[free, 0]
+    best = place
+
+    def at(z: FloatArray) -> tuple[FloatArray, float]:
+        p = place.p.copy()
+        p[free] = low + width * np.clip(z[:-1], 0, 1)
+        return p, min(place.frequency * math.exp(float(z[-1])), top)
+
+    def loss(z: FloatArray) -> float:
+        nonlocal best
+        p, w = at(z)
+        found = float(value(p, np.array([w]))[0])
+        if found > best.value:
+            best = Peak(found, w, p)
+        return -math.log(max(found, 1e-300)) if math.isfinite(found) else -700.0
+
+    bounds = [(0.0, 1.0)] * len(free) + [(-3.0, 3.0)]
+    z = np.append(np.clip((place.p[free] - low) / width, 0, 1), 0.0)
+    optimize.minimize(loss, z, method="L-BFGS-B", bounds=bounds, options={"maxiter": 60})
+    z = np.append(np.clip((best.p[free] - low) / width, 0, 1), math.log(best.frequency / place.frequency))
+    optimize.minimize_scalar(
+        lambda x: loss(np.append(z[:-1], x)), bounds=(z[-1] - 0.02, z[-1] + 0.02), method="bounded",
+        options={"xatol": 1e-10},
+    )  # fmt: skip
+    return best

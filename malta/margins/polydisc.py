@@ -1,0 +1,385 @@
+"""A characteristic polynomial that has no zero for any complex blocks of a size, on boxes of parameters.
+
+For scalar blocks delta_1 .. delta_K and what `blocks` says of M, f is affine in each of them:
+
+    f(delta) = sum over sets S of the blocks: (-1)^|S| delta^S a_S,    a_S = f times the minor of M of S.
+
+It is not zero for all |delta_k| <= r_k if, for every k in turn, with the first k - 1 of them anywhere on the circles
+|delta_i| = r_i and the later ones zero,
+
+    |sum_S (-1)^|S| delta^S a_S|  >  r_k |sum_S (-1)^|S| delta^S a_{S + k}|:
+
+by induction the left side has no zero in the polydisc, so that the quotient is largest on its circles. Phases are cut
+like parameters. A full block comes last: its critical values have rank one, so that r |a_{S + k}| is r times the
+largest singular value of the matrix that its entries give.
+"""
+
+from __future__ import annotations
+
+import math
+import time as clock
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from flint import arb
+
+from malta.margins.blocks import Block
+from malta.margins.box import Box
+from malta.margins.enclosure import TooWide, Unproven, over_box
+from malta.margins.exclusion import Beside, Growth, advance, growth_over, on_boxes, start
+from malta.margins.family import Family, aligned, combined
+from malta.margins.search import halves
+from malta.margins.weight import Expanded
+
+if TYPE_CHECKING:
+    from malta.margins.problem import OfLoop, Polynomial
+    from malta.plant import ComplexArray, FloatArray
+
+PATCHES = 64
+MOST_CELLS = 200_000
+Size = Callable[["FloatArray", int], Expanded]  # of a block, on cells of a scale
+Matrix = tuple[tuple[tuple[Family, ...], ...], ...]  # rows x columns of a_{S + ij}
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """One group's polynomial over a part of the box, and what the blocks that act on the group add to it.
+
+    scalars: indices of blocks; sets: a_S, S a number whose binary digits say which of the scalars
+    full: index of a full block; entries: rows x columns of a_{S + ij}
+    """
+
+    growth: Growth
+    scale: int
+    scalars: tuple[int, ...]
+    sets: tuple[Family, ...]
+    full: int | None = None
+    entries: Matrix = ()
+
+
+def parts_of(problem: OfLoop, blocks: Sequence[Block], box: Box, reach: float, until: float) -> list[Part]:
+    """The groups' polynomials over parts of box(reach); the problem's last parameters are the blocks' entries.
+
+    Raises Unproven.
+    """
+    sides, pins, first = box.sides(reach), [], len(box.names)
+    for b in blocks:
+        pins.append([first + k for k in range(len(b.entries))])
+        first += len(b.entries)
+    units = [[-b.unit, 0.0] for b in blocks for _ in b.entries]
+    p = [arb(low).union(arb(high)) for low, high in [*sides.tolist(), *units]]
+    groups = [f for f, _ in problem.parts(p)]
+    found: list[Part] = []
+    owners = _owners(groups, blocks, pins)
+    for f, acting in zip(groups, owners, strict=True):
+        todo = [sides]
+        while todo:
+            own = todo.pop()
+            try:
+                found.append(_part(f, own, [(k, blocks[k], pins[k]) for k in acting], box, until))
+            except TooWide as error:
+                if len(todo) + len(found) >= PATCHES:
+                    raise Unproven(str(error)) from error
+                todo += halves(own, error.axis, float(box.nominal[error.axis]))
+    return found
+
+
+def _owners(groups: Sequence[Polynomial], blocks: Sequence[Block], pins: list[list[int]]) -> list[list[int]]:
+    """Which blocks each group's polynomial may depend on; a feedback around nothing is counted with the first."""
+    found: list[list[int]] = [[] for _ in groups]
+    for k, b in enumerate(blocks):
+        touched = [n for n, f in enumerate(groups) if any(f.degrees[i] != 0 for i in pins[k])]
+        if not touched and b.kind == "feedback":
+            touched = [0]
+        for n in touched:
+            found[n].append(k)
+    return found
+
+
+def _part(
+    f: Polynomial, sides: FloatArray, acting: list[tuple[int, Block, list[int]]], box: Box, until: float
+) -> Part:
+    """The families of one group, from its values with entries at zero and at -unit."""
+    known: dict[frozenset[int], Family] = {}
+    count = len(f.names) - len(sides)
+
+    def family(at: frozenset[int]) -> Family:
+        """With the entries `at` (parameters) at -unit, all others at zero."""
+        if at not in known:
+            fixed = np.zeros((count, 2))
+            for _, b, pins in acting:
+                for i in pins:
+                    fixed[i - len(sides)] = -b.unit if i in at else 0.0
+            made = over_box(f, np.vstack([sides, fixed]), (), until)
+            known[at] = replace(made, shape=made.shape[: len(sides)])  # entries are pinned
+        return known[at]
+
+    scalars = [(k, b, pins[0]) for k, b, pins in acting if not b.full]
+    full = next(((k, b, pins) for k, b, pins in acting if b.full), None)
+    plain = [
+        [(b, pin, False) for n, (_, b, pin) in enumerate(scalars) if S >> n & 1]
+        for S in range(2 ** len(scalars))
+    ]
+    sums = [_probe(picked, family) for picked in plain]
+    entries: list[list[list[dict[Any, float]]]] = []
+    if full is not None:
+        _, b, pins = full
+        width = len(b.columns)
+        entries = [
+            [
+                [_probe([*picked, (b, pins[i * width + j], i != j)], family) for picked in plain]
+                for j in range(width)
+            ]
+            for i in range(len(b.rows))
+        ]
+    made = _common(sums, entries, known)
+    growth = _widened(growth_over(np.asarray(sides), f.inverted[: len(sides)], box), len(scalars))
+    flat = iter(made)
+    sets = tuple(next(flat) for _ in sums)
+    matrix = tuple(tuple(tuple(next(flat) for _ in plain) for _ in row) for row in entries)
+    return Part(
+        growth,
+        sets[0].scale,
+        tuple(k for k, _, _ in scalars),
+        sets,
+        None if full is None else full[0],
+        matrix,
+    )
+
+
+def _probe(
+    picked: list[tuple[Block, int, bool]], family: Callable[[frozenset[int]], Family]
+) -> dict[frozenset[int], float]:
+    """a_S as a sum of the polynomial's values: weights by which entries are at -unit.
+
+    M_ii f of a feedback is f without the channel, where its gain 1 + delta is zero; all others are
+    (f(-unit) - f(0)) / unit. Both follow from f(-unit), as f is affine; at -1 itself f may have coefficients of zero.
+    """
+    total: dict[frozenset[int], float] = {frozenset(): 1.0}
+    for b, pin, beside in picked:
+        own = 1.0 if b.kind == "feedback" and not beside else 0.0
+        turned: dict[frozenset[int], float] = {}
+        for at, weight in total.items():
+            turned[at | {pin}] = turned.get(at | {pin}, 0.0) + weight / b.unit
+            turned[at] = turned.get(at, 0.0) + weight * (own - 1 / b.unit)
+        total = turned
+    for at in total:
+        family(at)
+    return total
+
+
+def _common(
+    sums: list[dict[frozenset[int], float]],
+    entries: list[list[list[dict[frozenset[int], float]]]],
+    known: dict[frozenset[int], Family],
+) -> list[Family]:
+    """The sums of families, all on the same degrees and scale."""
+    base = known[frozenset()]
+    for g in known.values():
+        base = aligned(base, g)[0]
+    raised = {at: aligned(base, g)[1] for at, g in known.items()}
+
+    def summed(weights: dict[frozenset[int], float]) -> Family:
+        (first, a), *rest = weights.items()
+        total = raised[first] if a == 1.0 else combined(raised[first], raised[first], a, 0.0)
+        for at, weight in rest:
+            total = combined(total, raised[at], 1.0, weight)
+        return total
+
+    return [summed(s) for s in [*sums, *(s for row in entries for cell in row for s in cell)]]
+
+
+def _widened(growth: Growth, phases: int) -> Growth:
+    """With phases of blocks as axes that do not grow, in turns."""
+    none, one = np.zeros(phases), np.ones(phases)
+    return Growth(
+        np.append(growth.low, none), np.append(growth.high, one), (*growth.inverted, *[False] * phases),
+        np.append(growth.nominal, none), np.append(growth.down, none), np.append(growth.up, none),
+    )  # fmt: skip
+
+
+# exclusion
+
+
+def excluded(parts: Sequence[Part], target: float, sizes: Sequence[Size], until: float) -> tuple[bool, int]:
+    """Whether no polynomial has a zero on box(target) with blocks of these radii; and the cells that were looked at."""
+    count = 0
+    for part in parts:
+        levels = range(max(1, len(part.scalars) + (part.full is not None)))
+        for level in levels:
+            done, cells = _level(part, level, target, sizes, until)
+            count += cells
+            if not done:
+                return False, count
+    return True, count
+
+
+def _level(part: Part, level: int, target: float, sizes: Sequence[Size], until: float) -> tuple[bool, int]:
+    """Blocks before `level` on their circles, that of `level` anywhere in its disc, the later ones zero."""
+    growth = part.growth
+    axes = len(growth.low) - len(part.scalars)
+    keep = axes + level
+    growth = Growth(
+        growth.low[:keep], growth.high[:keep], growth.inverted[:keep],
+        growth.nominal[:keep], growth.down[:keep], growth.up[:keep],
+    )  # fmt: skip
+    search = start(part.sets[0], growth, target if growth.grows.any() else 1.0)
+    if part.scalars or part.full is not None:
+        search = replace(search, beside=_Circles(part, level, axes, sizes).beside)
+    while not search.finished:
+        if search.count > MOST_CELLS or clock.monotonic() > until:
+            return False, search.count
+        advance(search)
+    return True, search.count
+
+
+@dataclass(frozen=True, eq=False)
+class _Circles:
+    """f on cells with the blocks before `level` on circles and that of `level` in a disc; phases follow `axes`."""
+
+    part: Part
+    level: int
+    axes: int
+    sizes: Sequence[Size]
+
+    def beside(self, cells: FloatArray, boxes: FloatArray) -> Beside:
+        part, level = self.part, self.level
+        phases = boxes[:, self.axes :]
+        on_circles = [self.sizes[k](cells, part.scale) for k in part.scalars[:level]]
+        circle = _circle(on_circles, phases, None)
+        f = _summed(part.sets[: 2**level], circle, cells, boxes, part.sets[0])
+        if level < len(part.scalars):
+            k = part.scalars[level]
+            matrix: Matrix = ((part.sets[2**level : 2 ** (level + 1)],),)
+        else:
+            assert part.full is not None
+            k, matrix = part.full, part.entries
+        within = _circle(on_circles, phases, self.sizes[k](cells, part.scale))
+        g = [[_summed(families, within, cells, boxes, part.sets[0]) for families in row] for row in matrix]
+        discs = f.disc + sum(np.abs(x) for x in f.slopes) + _largest(g)
+        moves = [
+            2 * (np.abs(x) + sum(np.abs(entry.slopes[n]) for row in g for entry in row)).sum(axis=1)
+            for n, x in enumerate(f.slopes)
+        ]
+        sure = _directed(f, g[0][0]) if len(g) == len(g[0]) == 1 else None
+        return Beside(f.terms, f.radius, discs.astype(complex), moves, sure)
+
+
+def _directed(f: _Sum, g: _Sum) -> ComplexArray:
+    """c where Re(conj(c) f) > |g| on the whole cell, c the direction of f in the middle; zero elsewhere.
+
+    All of g lies within an angle e of d, so that |g| <= Re(conj(d) g) / cos(e): what is left is linear in both.
+    """
+    c, d = (x / np.maximum(np.abs(x), 1e-300) for x in (f.terms[0].mean(axis=1), g.terms[0].mean(axis=1)))
+    beside = sum(np.abs(x) for x in (*g.terms[1:], *g.slopes)) + g.disc + g.radius[:, None]
+    size = np.abs(g.terms[0])
+    close = (size > beside).all(axis=1) & np.isfinite(beside).all(axis=1)
+    turned = np.abs(np.angle(g.terms[0] * np.conj(d)[:, None]))
+    angle = (turned + np.arcsin(np.where(size > beside, beside / np.maximum(size, 1e-300), 1))).max(axis=1)
+    close &= angle < 1.2
+    rate = (1 + 1e-12) / np.cos(np.where(close, angle, 0))
+
+    def along(x: ComplexArray, y: ComplexArray) -> FloatArray:
+        return np.asarray((np.conj(c)[:, None] * x).real - rate[:, None] * (np.conj(d)[:, None] * y).real)
+
+    left = along(f.terms[0], g.terms[0]) - np.abs(along(f.terms[1], g.terms[1]))
+    for x, y in zip(f.slopes, g.slopes, strict=True):
+        left = left - np.abs(along(x, y))
+    for x, y in zip(f.terms[2:], g.terms[2:], strict=True):
+        left = left - np.abs(along(x, y))
+    rounding = 1e-13 * (np.abs(f.terms[0]) + rate[:, None] * size).max(axis=1)
+    left = left - f.disc - rate[:, None] * g.disc - (f.radius + rate * g.radius + rounding)[:, None]
+    with np.errstate(invalid="ignore"):
+        return np.where(close & (left > 0).all(axis=1), c, 0)
+
+
+class _Circle(NamedTuple):
+    """Products of (-delta) over sets of blocks on circles, on cells; rows are sets, in binary order."""
+
+    value: ComplexArray  # sets x cells: in the middle of the cell
+    slope: ComplexArray  # sets x cells: along the cell's frequencies
+    rest: FloatArray  # sets x cells: what these leave out
+    spread: FloatArray  # sets x blocks x cells: half the interval of each phase that the set holds, rad
+
+
+def _circle(sizes: list[Expanded], phases: FloatArray, last: Expanded | None) -> _Circle:
+    """sizes: of the blocks on circles; phases: cells x blocks x 2, in turns; last: what every set is multiplied by.
+
+    W itself stands for its size, as the circle holds every phase; so a circle is the same whichever cells hold it.
+    """
+    cells = len(phases)
+    middle = np.exp(1j * math.pi * phases.sum(axis=2))
+    arc = math.pi * (phases[:, :, 1] - phases[:, :, 0]) * (1 + 1e-12)
+    none = np.zeros(cells)
+    found = []
+    for S in range(2 ** len(sizes)):
+        inside = [n for n in range(len(sizes)) if S >> n & 1]
+        value, slope, rest = last or Expanded(none + 1 + 0j, none + 0j, none)
+        for n in inside:
+            one = sizes[n].times(1.0)
+            rest = (
+                rest * (np.abs(one.value) + np.abs(one.slope) + one.rest)
+                + one.rest * (np.abs(value) + np.abs(slope))
+                + np.abs(slope * one.slope)
+            )
+            turn = -middle[:, n]
+            value, slope = turn * value * one.value, turn * (slope * one.value + value * one.slope)
+        found.append((value, slope, rest, [arc[:, n] * (n in inside) for n in range(len(sizes))]))
+    values, slopes, rests, spreads = zip(*found, strict=True)
+    shape = (2 ** len(sizes), len(sizes), cells)
+    return _Circle(
+        np.array(values), np.array(slopes), np.array(rests) * (1 + 1e-12), np.array(spreads).reshape(shape)
+    )
+
+
+class _Sum(NamedTuple):
+    """A sum over sets of blocks, on cells: expansions in frequency and in phases, and how far they may be off."""
+
+    terms: list[ComplexArray]  # in frequency: cells x nodes
+    slopes: list[ComplexArray]  # in each phase
+    disc: FloatArray  # cells x nodes
+    radius: FloatArray  # cells
+
+
+def _summed(
+    families: Sequence[Family], circle: _Circle, cells: FloatArray, boxes: FloatArray, like: Family
+) -> _Sum:
+    """With e^(j x) = 1 + j x + rest, |rest| <= x^2 / 2, x the sum of a set's phases less their middles."""
+    terms: list[Any] = [0.0] * 4
+    slopes: list[Any] = [0.0] * circle.spread.shape[1]
+    disc: Any = 0.0
+    radius: Any = 0.0
+    for family, value, slope, left, spread in zip(families, *circle, strict=True):
+        found, rest = on_boxes(family, cells, boxes, None if family is like else like)
+        high = sum(np.abs(x) for x in found[1:]) + rest[:, None]
+        x, steep = spread.sum(axis=0), np.abs(slope)
+        size = np.abs(value) + steep + left  # of the factor
+        moved = [np.zeros_like(found[0]), *found]
+        for m, (y, before) in enumerate(zip(found, moved, strict=False)):
+            terms[m] = terms[m] + value[:, None] * y + slope[:, None] * before
+        slopes = [m + (1j * value * s)[:, None] * found[0] for m, s in zip(slopes, spread, strict=True)]
+        # what the products of expansions in frequency, weights and phases leave out
+        beyond = size * np.minimum(x**2 / 2, x + 2) + left * (1 + x) + steep * x
+        disc = disc + beyond[:, None] * (np.abs(found[0]) + high) + (np.abs(value) * x)[:, None] * high
+        disc = disc + steep[:, None] * np.abs(found[-1])
+        radius = radius + size * (rest + 1e-14 * (np.abs(found[0]) + high).max(axis=1))  # rounded products
+    return _Sum(terms, slopes, np.asarray(disc), np.asarray(radius))
+
+
+def _largest(matrix: list[list[_Sum]]) -> FloatArray:
+    """At least the largest singular value of the matrix at each node: cells x nodes."""
+    if len(matrix) == len(matrix[0]) == 1:
+        (one,) = matrix[0]
+        return np.asarray(sum(np.abs(t) for t in (*one.terms, *one.slopes)) + one.disc + one.radius[:, None])
+    total: Any = 0.0
+    for m in range(4):
+        stacked = np.array([[g.terms[m] for g in row] for row in matrix]).transpose(2, 3, 0, 1)
+        finite = np.isfinite(stacked).all(axis=(2, 3))
+        size = np.linalg.norm(np.where(finite[..., None, None], stacked, 0), ord=2, axis=(2, 3))
+        total = total + np.where(finite, size, np.inf) * (1 + 1e-12)
+    rest = sum(
+        (g.disc + sum(np.abs(x) for x in g.slopes) + g.radius[:, None]) ** 2 for row in matrix for g in row
+    )
+    return np.asarray(total + np.sqrt(rest), dtype=float)
