@@ -181,8 +181,12 @@ def verify(
         bool, typer.Option("--no-proof", help="A first look: no proof of the margins over the travel.")
     ] = False,
     worst_case: Annotated[
-        bool, typer.Option("--worst-case", help="The largest |S| of each sensor over the uncertainty, too.")
-    ] = False,
+        bool | None,
+        typer.Option(
+            "--worst-case/--no-worst-case",
+            help="The largest |S| of each sensor over the uncertainty. [where one proof covers the travel]",
+        ),
+    ] = None,
     certificate: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Write the proof of the margin, for `malta check`.")
     ] = None,
@@ -205,7 +209,7 @@ def verify(
     from malta.chain import robustness
     from malta.data import plant_of, units_of
     from malta.linearize import linearize
-    from malta.verify import require_stable, worst_sensitivities
+    from malta.verify import covers_travel, require_stable, worst_sensitivities
     from malta.verify import verify as verified
 
     controller = gain_files.read(gains)
@@ -228,6 +232,8 @@ def verify(
                 plant, controller, box,
                 current_loops=loops, progress=progress, bounds=bounds, time=time, proof=not no_proof,
             )  # fmt: skip
+        if worst_case is None:
+            worst_case = not no_proof and covers_travel(plant, controller, tuple(box), loops)
         worst = worst_sensitivities(plant, controller, box, loops, time=time) if worst_case else {}
     except CheckError as error:
         raise CheckError(f"{gains}: {error}") from error

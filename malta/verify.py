@@ -420,7 +420,14 @@ def places_along(
     plant: Plant, controller: Controller, names: tuple[str, ...], current_loops: CurrentLoops = "lag"
 ) -> tuple[float, ...]:
     """Shares of the travel at which a margin of its own is worth its time."""
-    return PLACES if len(_along(plant, controller, names, current_loops)) == 1 else ENDS
+    return PLACES if covers_travel(plant, controller, names, current_loops) else ENDS
+
+
+def covers_travel(
+    plant: Plant, controller: Controller, names: tuple[str, ...], current_loops: CurrentLoops = "lag"
+) -> bool:
+    """Whether one proof covers the travel, and not places of it."""
+    return len(_along(plant, controller, names, current_loops)) == 1
 
 
 @lru_cache(maxsize=32)

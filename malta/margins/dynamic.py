@@ -112,7 +112,7 @@ class Blocks:
         problem = problem_of(system, law)
         scaled = tuple(_scaled(system, law, box.nominal, b, problem) for b in blocks)
         more, wider = probed(system, law, scaled)
-        return cls(system, law, box, scaled, problem, OfLoop(loop_of(more, wider), more.names, neglect=False))
+        return cls(system, law, box, scaled, problem, OfLoop(loop_of(more, wider), more.names))
 
     @property
     def limit(self) -> float:
@@ -140,6 +140,11 @@ class Blocks:
             return weight.on(cells, scale, T).times(share)
 
         return [partial(on, b.weight) for b in self.blocks]
+
+    def parts(self, reach: float, shares: Sequence[float], until: float) -> list[Part]:
+        """The groups' polynomials over box(reach), for blocks of these shares of their weights. Raises Unproven."""
+        most = [share * b.weight.most for share, b in zip(shares, self.blocks, strict=True)]
+        return parts_of(self.with_blocks, self.blocks, self.box, reach, most, until)
 
     def starts(self, t: float, chosen: FloatArray) -> list[FloatArray]:
         """Parameters at patterns of -1 to 1 in box(t)."""
@@ -229,7 +234,7 @@ def _proven(asked: Blocks, upper: float, tolerance: float, until: float) -> tupl
     for step in STEPS:
         t = upper / (1 + step * tolerance)
         try:
-            parts = parts or parts_of(asked.with_blocks, asked.blocks, asked.box, t, until)
+            parts = parts or asked.parts(t, [t] * len(asked.blocks), until)
         except Unproven as error:
             reason = str(error)
             continue

@@ -20,7 +20,7 @@ from malta.margins.box import box_of
 from malta.margins.dynamic import Blocks
 from malta.margins.enclosure import Unproven
 from malta.margins.peaks import climb, patterns
-from malta.margins.polydisc import excluded, parts_of
+from malta.margins.polydisc import excluded
 from malta.margins.robust import LONGEST, law_of
 from malta.margins.transfer import performance
 from malta.margins.weight import weight_of
@@ -143,7 +143,7 @@ def _proven(asked: Blocks, lower: float, tolerance: float, until: float) -> tupl
     if not math.isfinite(lower):
         return None, 0, "the box holds an unstable loop"
     try:
-        parts = parts_of(asked.with_blocks, asked.blocks, asked.box, 1.0, until)
+        parts = asked.parts(1.0, [*[1.0] * (len(asked.blocks) - 1), 1 / max(lower, 1e-300)], until)
     except Unproven as error:
         return None, 0, str(error)
     count, last = 0, len(asked.blocks) - 1

@@ -23,7 +23,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from flint import arb
+from flint import acb, arb
 
 from malta.margins.blocks import Block
 from malta.margins.box import Box
@@ -59,8 +59,13 @@ class Part:
     entries: Matrix = ()
 
 
-def parts_of(problem: OfLoop, blocks: Sequence[Block], box: Box, reach: float, until: float) -> list[Part]:
+def parts_of(
+    problem: OfLoop, blocks: Sequence[Block], box: Box, reach: float, most: Sequence[float], until: float
+) -> list[Part]:
     """The groups' polynomials over parts of box(reach); the problem's last parameters are the blocks' entries.
+
+    most : how large each block will be asked for, as far as that is known; couplings that are only rounding are then
+        taken as zero, and accounted for
 
     Raises Unproven.
     """
@@ -68,17 +73,26 @@ def parts_of(problem: OfLoop, blocks: Sequence[Block], box: Box, reach: float, u
     for b in blocks:
         pins.append([first + k for k in range(len(b.entries))])
         first += len(b.entries)
-    units = [[-b.unit, 0.0] for b in blocks for _ in b.entries]
-    p = [arb(low).union(arb(high)) for low, high in [*sides.tolist(), *units]]
-    groups = [f for f, _ in problem.parts(p)]
+    known = all(
+        math.isfinite(r) and (b.kind != "feedback" or r < 1) for b, r in zip(blocks, most, strict=True)
+    )
+    p: list[Any] = [arb(low).union(arb(high)) for low, high in sides.tolist()]
+    grown = 1.0
+    for b, r in zip(blocks, most, strict=True):
+        if b.kind == "feedback" and known:  # the gain is 1 / (1 - delta), and f times 1 - delta
+            r, grown = r / (1 - r), grown * (1 + r)
+        disc = arb(0, max(b.unit, r) * (1 + 1e-9)) if known else arb(0, b.unit)
+        p += [acb(disc, disc)] * len(b.entries)
+    groups = (problem if known else replace(problem, neglect=False)).parts(p)
     found: list[Part] = []
-    owners = _owners(groups, blocks, pins)
-    for f, acting in zip(groups, owners, strict=True):
+    owners = _owners([f for f, _ in groups], blocks, pins)
+    for (f, moves), acting in zip(groups, owners, strict=True):
+        scaled = tuple(arb(grown) * c for c in moves)
         todo = [sides]
         while todo:
             own = todo.pop()
             try:
-                found.append(_part(f, own, [(k, blocks[k], pins[k]) for k in acting], box, until))
+                found.append(_part(f, own, scaled, [(k, blocks[k], pins[k]) for k in acting], box, until))
             except TooWide as error:
                 if len(todo) + len(found) >= PATCHES:
                     raise Unproven(str(error)) from error
@@ -99,7 +113,12 @@ def _owners(groups: Sequence[Polynomial], blocks: Sequence[Block], pins: list[li
 
 
 def _part(
-    f: Polynomial, sides: FloatArray, acting: list[tuple[int, Block, list[int]]], box: Box, until: float
+    f: Polynomial,
+    sides: FloatArray,
+    moves: tuple[Any, ...],
+    acting: list[tuple[int, Block, list[int]]],
+    box: Box,
+    until: float,
 ) -> Part:
     """The families of one group, from its values with entries at zero and at -unit."""
     known: dict[frozenset[int], Family] = {}
@@ -112,7 +131,7 @@ def _part(
             for _, b, pins in acting:
                 for i in pins:
                     fixed[i - len(sides)] = -b.unit if i in at else 0.0
-            made = over_box(f, np.vstack([sides, fixed]), (), until)
+            made = over_box(f, np.vstack([sides, fixed]), () if at else moves, until)
             known[at] = replace(made, shape=made.shape[: len(sides)])  # entries are pinned
         return known[at]
 

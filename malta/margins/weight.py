@@ -40,6 +40,11 @@ class Weight:
     num: FloatArray
     den: FloatArray
 
+    @property
+    def most(self) -> float:
+        """At least |W| anywhere; infinite where it is not a number."""
+        return float(abs(self.num[0] / self.den[0])) if len(self.den) == 1 else math.inf
+
     def at(self, w: FloatArray) -> FloatArray:
         """|W(jw)|."""
         s = 1j * np.asarray(w, dtype=float)
