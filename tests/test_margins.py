@@ -116,6 +116,38 @@ def test_what_cannot_be_enclosed_is_not_proven() -> None:
     assert "if_else" in m.reason
 
 
+def test_algebraic_equations_are_solved_for_their_states() -> None:
+    """A motor with its winding's current as an algebraic state: R i = u - K w, J w' = K i - b w."""
+    descriptor = malta.uncertain(
+        lambda R, J: (
+            [[-0.1, 0.5], [-0.5, -R]], [[0], [1]], [[1, 0]], [[0]], [[J, 0], [0, 0]],
+        ),
+        {"R": 2.0, "J": 0.01},
+    )  # fmt: skip
+    plain = malta.uncertain(
+        lambda R, J: ([[(-0.1 - 0.25 / R) / J]], [[0.5 / R / J]], [[1]]), {"R": 2.0, "J": 0.01}
+    )
+    law = control.ss([[-20.0]], [[1.0]], [[-150.0]], [[0.0]])
+    box = {"R": 0.3, "J": 0.2}
+    one, two = (malta.robust_margin(s, law, box) for s in (descriptor, plain))
+    assert one.lower is not None
+    assert two.lower is not None
+    assert one.lower == pytest.approx(two.lower, rel=2e-3)
+    assert one.upper == pytest.approx(two.upper, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("E", "A", "says"),
+    [
+        ([[1, 1], [0, 0]], [[-1, 0], [0, 1]], "as many of one"),
+        ([[1, 0], [0, 0]], [[-1, 1], [1, 0]], "not singular"),
+    ],
+)
+def test_algebraic_equations_of_a_higher_index_are_refused(E: Any, A: Any, says: str) -> None:
+    with pytest.raises(InputError, match=says):
+        malta.uncertain(lambda k: (A, [[k], [0]], [[1, 0]], [[0]], E), {"k": 1.0})
+
+
 def test_descriptors_feedthrough_and_discrete_systems() -> None:
     """m x' = -x + u as E x' = ...; y = x + d u around u = -2 y; x+ = p x."""
     descriptor = malta.uncertain(lambda m: ([[-1]], [[1]], [[1]], [[0]], [[m]]), {"m": 1.0})

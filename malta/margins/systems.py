@@ -17,6 +17,7 @@ import casadi as ca
 import numpy as np
 
 from malta.errors import InputError
+from malta.margins.algebraic import solved_algebraic
 from malta.plant import Plant, readonly
 
 if TYPE_CHECKING:
@@ -55,7 +56,8 @@ def from_source(
     Parameters
     ----------
     source : a function of the parameters by name (or of one array p), of numpy and CasADi operations, that returns
-        A, B, C, or with D, or with D and E; a casadi.Function of the vector p; or matrices A0, B0, C0[, D0[, E0]]
+        A, B, C, or with D, or with D and E (rows of zeros in E are algebraic equations); a casadi.Function of the
+        vector p; or matrices A0, B0, C0[, D0[, E0]]
     nominal : values of the parameters by name
     terms : with matrices, what each parameter multiplies: {"k": (A1, B1, C1)}, None for a zero; A0 + sum p_i A_i
     limits : what a parameter can be at all, (above, below); infinite where none are given
@@ -181,7 +183,7 @@ def _checked(found: list[Any]) -> list[Any]:
         constants = ca.DM(M[:]) if M.is_constant() else ca.DM(0)
         if not np.isfinite(np.array(constants)).all():
             raise InputError("uncertain", letter, "NaN or infinity", "finite numbers")
-    return matrices
+    return solved_algebraic(matrices)
 
 
 def _matrix(M: Any, letter: str) -> Any:
