@@ -12,11 +12,10 @@ from __future__ import annotations
 
 import argparse
 import importlib
-import statistics
+import math
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -25,63 +24,26 @@ from typing import Any, NamedTuple
 
 import control
 import numpy as np
+from margins import margin, published
 from peer_control import closed_loop, documented_run
 from peer_problem import Workload
 from rich import box
 from rich.console import Console
-from rich.progress import track
 from rich.table import Table
+from timing import Result, medians, optional
 
 import malta
 from malta.data import published_value
 from malta.experiments.halbach import there_and_back
 from malta.experiments.planar import CELLS, compiled
 from malta.machine import state_reference
-from malta.margins.robust import problem_of
 from malta.plants import planar, tubular
 from malta.simulate import compiled_shape, engine_of, feedforward
-from malta.verify import machine_law, travel_margin
 
 ROOT = Path(__file__).parents[1]
 IMPORTS = "import numpy, scipy, control, casadi"
 MACHINES = 10_000
-PATIENCE = 10.0  # s, of counted runs of one call
 SCENARIO = malta.Scenario.stroke(delay=0, fidelity="force")
-
-
-class Result(NamedTuple):
-    """A line of the table."""
-
-    workload: str
-    ours: float  # s
-    peer: str
-    theirs: float  # s
-    wanted: str
-
-
-def medians(*calls: Callable[[], object], runs: int, what: str) -> list[float]:
-    """Median seconds of each call, taken in turn after one warm-up of each; what takes long has fewer turns."""
-    times: list[list[float]] = [[] for _ in calls]
-    for run in track(range(runs + 1), what, console=Console(stderr=True), transient=True):
-        for call, seconds in zip(calls, times, strict=True):
-            if sum(seconds) > PATIENCE:
-                continue
-            start = time.perf_counter()
-            call()
-            if run or time.perf_counter() - start > PATIENCE:
-                seconds.append(time.perf_counter() - start)
-    return [statistics.median(seconds) for seconds in times]
-
-
-def optional(*names: str) -> dict[str, Any]:
-    """Peers whose compiler or library is here."""
-    found = {}
-    for name in names:
-        try:
-            found[name] = importlib.import_module(name)
-        except ImportError as error:
-            print(f"left out: {name} ({error})", file=sys.stderr)
-    return found
 
 
 def whole_process(runs: int) -> list[Result]:
@@ -231,49 +193,6 @@ def many(runs: int) -> list[Result]:
     ]
 
 
-def margin(runs: int) -> list[Result]:
-    """The margin of the flagship's loop on the machine at z = 0, and what others report of it."""
-    peer = importlib.import_module("peer_margin")
-    controller = malta.gains.read(ROOT / "design" / "gains" / "robust.json")
-    plant = malta.plant_of(controller.parameters)
-    box = dict.fromkeys(("m", "K_A", "K_D", "K_B"), peer.SHARE)
-    problem = peer.Problem(malta.uncertain(plant, list(box)), machine_law(plant, controller))
-    ours = malta.robust_margin(problem.system, problem.law, box)
-    travel = travel_margin(plant, controller, box)
-    calls: dict[str, Callable[[], float]] = {
-        "gridding": lambda: peer.gridding(problem, 5),
-        "Monte-Carlo for 2 s": lambda: peer.monte_carlo(problem, 2.0),
-    }
-    if optional("slycot"):
-        calls["AB13MD on 300 frequencies"] = lambda: peer.ab13md(problem)
-    answers = {name: call() for name, call in calls.items()}
-
-    def anew() -> Any:  # without what is remembered of the loop
-        problem_of.cache_clear()
-        return malta.robust_margin(problem.system, problem.law, box)
-
-    def along() -> Any:
-        problem_of.cache_clear()
-        return travel_margin(plant, controller, box)
-
-    seconds, everywhere, *theirs = medians(
-        anew,
-        along,
-        *calls.values(),
-        runs=runs,
-        what="margin",
-    )
-    told = f"margin at z = 0: {ours.lower:.4f} .. {ours.upper:.4f}"
-    rows = [
-        Result(told, seconds, f"{name}: {answers[name]:.3f}", took, "")
-        for name, took in zip(calls, theirs, strict=True)
-    ]
-    return [
-        *rows,
-        Result(f"all the travel: {travel.lower:.4f} .. {travel.upper:.4f}", everywhere, "z = 0", seconds, ""),
-    ]
-
-
 def campaigns(runs: int) -> list[Result]:
     """Strokes of different machines: a campaign, with its files, beside loops over what a user would pick."""
     plant, work = workload("calibrated")
@@ -390,6 +309,7 @@ WORKLOADS: dict[str, Callable[[int], list[Result]]] = {
     "stroke": stroke,
     "many": many,
     "margin": margin,
+    "published": published,
     "campaign": campaigns,
     "planar": decoupling,
     "halbach": halbach,
@@ -414,8 +334,10 @@ def main() -> None:
         for column in ("malta", "s", "peer", "s", "peer / malta", "wanted"):
             table.add_column(column, justify="left" if column in ("malta", "peer") else "right")
         for row in found:
-            ratio = f"{row.theirs / row.ours:.2f}"
-            table.add_row(row.workload, f"{row.ours:.4g}", row.peer, f"{row.theirs:.4g}", ratio, row.wanted)
+            theirs, ratio = f"{row.theirs:.4g}", f"{row.theirs / row.ours:.2f}"
+            if math.isnan(row.theirs):
+                theirs = ratio = "–"
+            table.add_row(row.workload, f"{row.ours:.4g}", row.peer, theirs, ratio, row.wanted)
         Console(width=100).print(table)
 
 

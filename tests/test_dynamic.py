@@ -7,6 +7,7 @@ from typing import Any
 import control
 import numpy as np
 import pytest
+from published_cases import ROBSTAB, Loop, pid
 
 import malta
 from malta import Dynamic, dynamic_margin, gains
@@ -16,21 +17,15 @@ from malta.uncertain import responses
 from malta.verify import travel_loops
 
 
-def pid(Kp: float, Ki: float, Kd: float, Tf: float) -> control.TransferFunction:
-    return -(control.tf([Kp], [1]) + control.tf([Ki], [1, 0]) + control.tf([Kd, 0], [Tf, 1]))
-
-
 def robstab() -> malta.UncertainSystem:
     """18 / (s^2 + 1.8 s + k): the example of robstab's reference page."""
-    return malta.uncertain(lambda k: ([[0, 1], [-k, -1.8]], [[0], [18]], [[1, 0]]), {"k": 10.0})
+    return malta.uncertain(ROBSTAB[0].matrices, ROBSTAB[0].nominal)
 
 
-@pytest.mark.parametrize(
-    ("weight", "expected", "k"), [(0.5, 1.599258325, 3.603), (0.25, 2.907434278, -1.630)]
-)
-def test_a_parameter_and_dynamics_of_robstab(weight: float, expected: float, k: float) -> None:
+@pytest.mark.parametrize(("case", "k"), [(ROBSTAB[0], 3.603), (ROBSTAB[1], -1.630)])
+def test_a_parameter_and_dynamics_of_robstab(case: Loop, k: float) -> None:
     """MATLAB's reference page of robstab prints 1.5960 .. 1.5993 for k +-40 % and 50 % of dynamics; and with 25 %."""
-    m = dynamic_margin(robstab(), pid(2.3, 3, 0.38, 0.001), {"k": 0.4}, Dynamic(weight))
+    m, expected = dynamic_margin(robstab(), case.law, case.box, Dynamic(case.dynamics)), case.margin
     assert m.lower is not None
     assert 0.998 * expected <= m.lower <= expected <= m.upper * (1 + 1e-9)
     assert m.upper == pytest.approx(expected, rel=1e-8)

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import math
-import sys
 import time
 from collections.abc import Mapping
 from dataclasses import replace
@@ -16,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import peer_halbach as peer
 import pytest
 from conftest import ROOT, Run
 from scipy.linalg import solve_discrete_lyapunov
@@ -38,9 +38,6 @@ from malta.synthesize import sampled_model
 if TYPE_CHECKING:
     from malta.experiments import Experiment
     from malta.plant import FloatArray
-
-sys.path.insert(0, str(ROOT / "bench"))
-import peer_halbach as peer
 
 DESIGNS = ("halbach", "halbach_pid")
 SCENARIOS = ("step", "stairs", "ramp", "force", "budget", "identify")

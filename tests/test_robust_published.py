@@ -11,17 +11,17 @@ import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import published_cases as cases
 import pytest
 
 import malta
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Mapping
+
+    from published_cases import Box, Coefficients, Polynomial
 
     from malta import Margin
-
-    Coefficients = Callable[..., list[Any]]
-    Box = Mapping[str, tuple[float, float]]
 
 
 def bracketed(m: Margin, number: float, rounding: float = 1e-9) -> None:
@@ -64,19 +64,15 @@ def margin(
     return m
 
 
+def margin_of(case: Polynomial) -> Margin:
+    return margin(case.coefficients, case.box, case.nominal)
+
+
 def test_de_gaston_and_safonov_1988() -> None:
     """Exact calculation of the multiloop stability margin, IEEE TAC 33; Handbook of Test Problems 7.3.1: 0.34174."""
-    m = margin(
-        lambda q1, q2, q3: [
-            1,
-            q2 + q3 + 10,
-            q2 * q3 + 10 * (q2 + q3),
-            10 * q2 * q3 + q1,
-            2 * q1,
-        ],
-        {"q1": (720, 880), "q2": (3.8, 4.2), "q3": (5.7, 6.3)},
-    )
-    bracketed(m, 3.4173955, 1e-8)
+    case = cases.DE_GASTON_SAFONOV
+    m = margin_of(case)
+    bracketed(m, case.margin, 1e-8)
     assert m.moved == pytest.approx({"q1": 273.392, "q2": -0.683479, "q3": -1.025219}, rel=1e-3)
 
 
@@ -85,63 +81,27 @@ def test_handbook_7_3_2() -> None:
 
     Given there as its last Hurwitz determinant, which a polynomial of first order has as its root.
     """
-    m = margin(
-        lambda q1, q2, q3: [1, q1**4 * q2**4 - q1**4 - q2**4 * q3],
-        {"q1": (1.15, 1.65), "q2": (1.3, 1.7), "q3": (0.6, 1.0)},
-    )
-    bracketed(m, 1.0898639714, 1e-8)
+    case = cases.HANDBOOK_7_3_2
+    m = margin_of(case)
+    bracketed(m, case.margin, 1e-8)
     assert m.upper == pytest.approx(1.0899, abs=1.2e-3)
 
 
 def test_handbook_7_3_3() -> None:
     """Floudas et al. 7.3.3: 0.8175, with all three parameters at their upper ends."""
-    m = margin(
-        lambda q1, q2, q3: [
-            16,
-            16 * q1 - 24,
-            78 - 9.625 * q1 - 16 * q2,
-            19 * q1 + 8 * q2 + q3 - 44,
-            12 - 4 * q1 - q2 + q3,
-        ],
-        {"q1": (2.0, 2.5), "q2": (1.0, 2.0), "q3": (0.0, 3.0)},
-    )
-    bracketed(m, 0.8175290489)
+    case = cases.HANDBOOK_7_3_3
+    m = margin_of(case)
+    bracketed(m, case.margin)
     assert m.moved == pytest.approx({"q1": 0.204382, "q2": 0.408765, "q3": 1.226294}, rel=1e-3)
     assert m.frequency == pytest.approx(1.162318, rel=1e-3)
 
 
 def test_vicino_tesi_and_milanese_1990() -> None:
     """Computation of nonconservative stability perturbation bounds, IEEE TAC 35; Handbook 7.3.4: 6.2746."""
-
-    def coefficients(q1: Any, q2: Any, q3: Any, q4: Any, q5: Any) -> list[Any]:
-        return [
-            q3**2 * q2 * (4 * q2 + 7 * q1),
-            7 * q4 * q3**2 * q2 - 64.918 * q3**2 * q2 + 380.067 * q3 * q2 + 3 * q5 * (q2 + q1),
-            3 * (-9.81 * q3 * q2 * (q2 + q1) - 4.312 * q3**2 * q2 + 264.896 * q3 * q2 + q4 * q5 - 9.274 * q5),
-            0.2 * (-147.15 * q4 * q3 * q2 + 1364.67 * q3 * q2 - 27.72 * q5),
-            54.387 * q3 * q2,
-        ]
-
-    box = {"q1": (9, 11), "q2": (0.9, 1.1), "q3": (0.9, 1.1), "q4": (0.19, 0.21), "q5": (0.045, 0.055)}
-    m = margin(coefficients, box)
-    bracketed(m, 6.274633, 1e-6)
+    case = cases.VICINO_TESI_MILANESE
+    m = margin_of(case)
+    bracketed(m, case.margin, 1e-6)
     assert m.frequency == pytest.approx(0.9864, rel=1e-3)  # the Handbook's
-
-
-def bus(v: Any, m: Any) -> list[Any]:
-    """A bus guided by a wire: velocity in m/s, mass in t."""
-    v2m2, v2m, vm = v * v * m * m, v * v * m, v * m
-    return [
-        v2m2,
-        50 * v2m2 + 1080 * vm,
-        1250 * v2m2 + 16.8 * v2m + 53.9e3 * vm + 270e3,
-        15.6e3 * v2m2 + 840 * v2m + 1.35e6 * vm + 13.5e6,
-        1.45e6 * v2m + 16.8e6 * vm + 338e6,
-        6.93e6 * v2m + 911e6 * v + 4220e6,
-        5.72e6 * v2m + 113e6 * v * v + 4250e6 * v,
-        528e6 * v * v + 3640e6 * v,
-        453e6 * v * v,
-    ]
 
 
 def test_the_bus_of_handbook_7_3_5_is_lost_beyond_its_frequencies() -> None:
@@ -150,15 +110,15 @@ def test_the_bus_of_handbook_7_3_5_is_lost_beyond_its_frequencies() -> None:
     That is 17.5 / 14.5, where the bus stands. Both bound w, by 10 and by 2 rad/s: at 0.9888, full speed and the least
     mass, the loop is lost at 16.4 rad/s.
     """
-    m = margin(bus, {"v": (3, 32), "m": (5, 35)})
-    bracketed(m, 0.9887712283)
+    m = margin_of(cases.BUS)
+    bracketed(m, cases.BUS.margin)
     assert m.frequency == pytest.approx(16.44757, rel=1e-3)
-    assert max(np.roots(bus(32.0, 5.0)).real) > 0.1  # the published box itself
+    assert max(np.roots(cases.bus(32.0, 5.0)).real) > 0.1  # the published box itself
 
 
 def test_ackermanns_bus_is_lost_where_it_stands() -> None:
     """v in 3 .. 20 m/s, m in 9.95 .. 32 t: to v = 0, where two roots come to zero and two go to infinity."""
-    m = malta.margin_of_polynomial(bus, {"v": (3, 20), "m": (9.95, 32)})
+    m = malta.margin_of_polynomial(cases.bus, {"v": (3, 20), "m": (9.95, 32)})
     bracketed(m, 11.5 / 8.5)
 
 
@@ -231,26 +191,16 @@ def test_the_island_of_barmishs_examination(e: float) -> None:
     bracketed(m, 0.5 - math.sqrt(e / 2))
 
 
-def island(r: float) -> Coefficients:
-    """Ackermann, Kaesbauer and Muench 1991: unstable inside the circle of radius r about (1, 1), stable around it."""
-    return lambda q1, q2: [
-        1,
-        q1 + q2 + 1,
-        q1 + q2 + 3,
-        1 + r * r + 6 * (q1 + q2) + 2 * q1 * q2,
-    ]
-
-
 @pytest.mark.parametrize("r", [0.2, 0.1, 0.01, 1e-3])
 def test_an_island_that_a_side_of_the_box_meets(r: float) -> None:
     """MATLAB's robstab (2022) prints 0.2722 .. 1.2389 at r = 0.1: exactly, the side q1 = 1.4 - 1.1 t is at 1 + r."""
-    m = margin(island(r), {"q1": (0.3, 2.5), "q2": (0, 1.7)})
-    bracketed(m, (0.4 - r) / 1.1)
+    case = cases.island_by_a_side(r)
+    bracketed(margin_of(case), case.margin)
 
 
 @pytest.mark.parametrize("r", [0.5, 0.1, 0.01, 1e-3])
 def test_an_island_that_a_corner_of_the_box_meets(r: float) -> None:
-    m = margin(island(r), {"q1": (0, 2), "q2": (0, 2)}, {"q1": 0, "q2": 0})
+    m = margin(cases.island(r), {"q1": (0, 2), "q2": (0, 2)}, {"q1": 0, "q2": 0})
     bracketed(m, (1 - r / math.sqrt(2)) / 2)
 
 

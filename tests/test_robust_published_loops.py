@@ -9,66 +9,45 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Any
 
-import control
 import numpy as np
+import published_cases as cases
 import pytest
 from test_robust_published import bracketed
 
 import malta
 
 if TYPE_CHECKING:
+    from published_cases import Loop
+
     from malta import UncertainSystem
 
 
-def pid(Kp: float, Ki: float, Kd: float, Tf: float) -> control.TransferFunction:
-    """-(Kp + Ki / s + Kd s / (Tf s + 1)): MATLAB's pid, fed back."""
-    return control.tf([-(Kp * Tf + Kd), -(Kp + Ki * Tf), -Ki], [Tf, 1, 0])
+def system_of(case: Loop) -> UncertainSystem:
+    return malta.uncertain(case.matrices, case.nominal, limits=case.limits)
 
 
-@pytest.fixture(scope="module")
-def carts() -> UncertainSystem:
-    """Two masses and a spring, a force on the first, the position of the second."""
-    return malta.uncertain(
-        lambda m1, m2, k: (
-            [[0, 0, 1, 0], [0, 0, 0, 1], [-k / m1, k / m1, 0, 0], [k / m2, -k / m2, 0, 0]],
-            [[0], [0], [1 / m1], [0]],
-            [[0, 1, 0, 0]],
-        ),
-        {"m1": 1.0, "m2": 1.0, "k": 1.0},
-        limits={"m1": (0.0, math.inf), "m2": (0.0, math.inf), "k": (0.0, math.inf)},
-    )
-
-
-def test_two_carts_of_robstab(carts: UncertainSystem) -> None:
+def test_two_carts_of_robstab() -> None:
     """MATLAB, Robust Stability and Worst-Case Gain: 2.8826 .. 2.8864 at 575.034 rad/s, k = 1.5773, m = 0.4227."""
-    section = control.ss(control.tf([1, 1], [0.001, 1]))
-    m = malta.robust_margin(carts, -100 * section * section * section, dict.fromkeys(("m1", "m2", "k"), 0.2))
-    bracketed(m, 2.886359369, 1e-8)
+    case = cases.CARTS
+    m = malta.robust_margin(system_of(case), case.law, case.box)
+    bracketed(m, case.margin, 1e-8)
     assert m.lower is not None
     assert m.upper - m.lower < 2.8864 - 2.8826
     assert m.frequency == pytest.approx(575.0339, rel=1e-3)
     assert m.witness == pytest.approx({"m1": 0.4227, "m2": 0.4227, "k": 1.5773}, rel=1e-3)
 
 
-def test_acc_benchmark(carts: UncertainSystem) -> None:
+def test_acc_benchmark() -> None:
     """Wie and Bernstein 1992: k in 0.5 .. 2 about 1, met by the nominal law in Rocchetta, Crespo and Kenny 2019.
 
     One parameter, so the roots alone tell the margin: k = 0.43535 at 0.748 rad/s, and k = 3.905 above.
     """
-    law = control.tf([0.1324, -0.3533, -0.6005, -0.0728], [0.5503, 1.4175, 2.6531, 2.4802, 1.0])
-    m = malta.robust_margin(carts, law, {"k": (0.5, 2.0)})
-    bracketed(m, (1 - 0.43535122268) / 0.5)
+    case = cases.ACC_BENCHMARK
+    m = malta.robust_margin(system_of(case), case.law, case.box)
+    bracketed(m, case.margin)
     assert m.frequency == pytest.approx(0.74807, rel=1e-3)
-    m = malta.robust_margin(carts, law, {"k": (1.0, 2.0)})
+    m = malta.robust_margin(system_of(case), case.law, {"k": (1.0, 2.0)})
     bracketed(m, 2.904789227)
-
-
-# The spinning satellite
-
-
-def satellite(e1: Any, e2: Any) -> Any:
-    """Doyle's: coupled rates, and torques that are a little more or less than asked for."""
-    return [[0, 10], [-10, 0]], [[1 + e1, 0], [0, 1 + e2]], [[1, 10], [-10, 1]]
 
 
 def test_spinning_satellite() -> None:
@@ -76,13 +55,14 @@ def test_spinning_satellite() -> None:
 
     Either torque alone may grow without end. det = s^2 + (2 + e1 + e2) s + 1 + e1 + e2 + 101 e1 e2.
     """
-    s = malta.uncertain(satellite, {"e1": 0.0, "e2": 0.0})
-    m = malta.robust_margin(s, -np.eye(2), {"e1": (-1.0, 1.0), "e2": (-1.0, 1.0)})
-    bracketed(m, 1 / math.sqrt(101))
+    case = cases.SATELLITE
+    s = system_of(case)
+    m = malta.robust_margin(s, case.law, case.box)
+    bracketed(m, case.margin)
     assert m.frequency == pytest.approx(0, abs=1e-6)
-    alone = malta.robust_margin(s, -np.eye(2), {"e1": (-0.5, 0.5)})
+    alone = malta.robust_margin(s, case.law, {"e1": (-0.5, 0.5)})
     bracketed(alone, 2)  # the gain of one loop, down to -1
-    more = malta.robust_margin(s, -np.eye(2), {"e1": (0.0, 1.0)})
+    more = malta.robust_margin(s, case.law, {"e1": (0.0, 1.0)})
     assert more.upper == math.inf
     assert more.lower is not None
     assert more.lower >= 99
@@ -90,15 +70,13 @@ def test_spinning_satellite() -> None:
 
 def test_guaranteed_margins_for_LQG_regulators() -> None:
     """There are none: Doyle 1978, IEEE TAC 23. With q = sigma = 60 both gains are 10: up to 1.01, down to 0.92975."""
-    gain, A = 10.0, np.array([[1.0, 1], [0, 1]])
-    B, C, K = np.array([[0.0], [1]]), np.array([[1.0, 0]]), np.full((1, 2), gain)
-    law = malta.Compensator(A - B @ K - K.T @ C, K.T, -K, np.zeros((1, 1)))
-    s = malta.uncertain(lambda m: (A, [[0], [m]], C), {"m": 1.0})
+    case = cases.DOYLE
+    s, law = system_of(case), case.law
     m = malta.robust_margin(s, law, {"m": (1.0, 1.1)})
     bracketed(m, 0.1)
     assert m.frequency == pytest.approx(0, abs=1e-6)
     bracketed(malta.robust_margin(s, law, {"m": (0.9, 1.0)}), (1 - 0.929745773666) / 0.1)
-    bracketed(malta.robust_margin(s, law, {"m": 0.1}), 0.1)
+    bracketed(malta.robust_margin(s, law, case.box), case.margin)
 
 
 # What follows by hand
@@ -149,6 +127,3 @@ def test_two_gains_of_a_damped_satellite() -> None:
     )
     m = malta.robust_margin(s, -np.eye(2), {"e1": (-1.0, 1.0), "e2": (-1.0, 1.0)})
     bracketed(m, math.sqrt(2))
-
-
-# Dynamics that nobody modelled
