@@ -1,6 +1,7 @@
 # make design   set up ./.venv and run the main job: every design, verified, exported, simulated, reported
-# make test     set up ./.venv and run the tests
-# make check    what CI runs: lint, format, types, tests
+# make test     set up ./.venv and run the tests that take seconds
+# make slow     the tests that take longer
+# make check    what CI runs: lint, format, types, both kinds of tests
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
@@ -10,15 +11,18 @@ export PIP_CONSTRAINT := $(CURDIR)/constraints.txt
 export OPENBLAS_NUM_THREADS ?= 1
 export MPLCONFIGDIR ?= $(CURDIR)/$(VENV)/matplotlib
 
-.PHONY: design test check lint types notebooks bench figures clean
+.PHONY: design test slow check lint types notebooks bench figures clean
 
 design: $(VENV)/runtime
 	$(BIN)/malta design
 
 test: $(VENV)/dev
-	$(BIN)/python -m pytest -n auto
+	$(BIN)/python -m pytest -n auto --dist loadfile -m "not slow"
 
-check: lint types test
+slow: $(VENV)/dev
+	$(BIN)/python -m pytest -n auto --dist loadgroup -m slow
+
+check: lint types test slow
 
 lint: $(VENV)/dev
 	$(BIN)/ruff check .

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import math
+import pickle
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -12,11 +15,14 @@ import pytest
 import malta
 from malta import cli
 from malta.data import published as read_published
+from malta.margins import robust
+from malta.margins.problem import OfLoop, OfSeveral, Problem
 from malta.plants import tubular
 
 if TYPE_CHECKING:
     from malta.controller import Controller
     from malta.linearize import LinearModel
+    from malta.margins.box import Box
     from malta.plant import Plant
     from malta.spec import Spec
     from malta.verify import Margins
@@ -45,6 +51,17 @@ def refusal(read: Callable[[], object], where: Path) -> malta.InputError:
     assert str(error).startswith(f"{where}: ")
     assert f"found {error.found}, expected {error.expected}" in str(error)
     return error
+
+
+def numbers(content: Any) -> list[float]:
+    """Every number in a JSON document; null counts as NaN."""
+    if isinstance(content, dict):
+        return [number for entry in content.values() for number in numbers(entry)]
+    if isinstance(content, list):
+        return [number for entry in content for number in numbers(entry)]
+    if content is None:
+        return [math.nan]
+    return [float(content)] if isinstance(content, (int, float)) else []
 
 
 class Said(NamedTuple):
@@ -80,6 +97,52 @@ def _in_the_root(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(ROOT)
 
 
+def _question(problem: Problem, box: Box, effort: robust.Effort) -> bytes | None:
+    """All that a margin depends on; None of polynomials."""
+    loops = []
+    for one in problem.problems if isinstance(problem, OfSeveral) else (problem,):
+        if not isinstance(one, OfLoop):
+            return None
+        s = one.loop.system
+        matrices = s.matrices.serialize()
+        loops.append((s.names, s.nominal, matrices, s.limits, s.sample_time, vars(one.loop.law)))
+    return pickle.dumps((loops, vars(box), effort.tolerance, effort.time, effort.most_cells))
+
+
+@contextmanager
+def _remembering(proofs: dict[bytes, malta.Margin]) -> Iterator[None]:
+    """Questions that are answered already are not searched again."""
+    searched = robust.margin_of
+
+    def margin_of(problem: Problem, box: Box, effort: robust.Effort) -> malta.Margin:
+        question = _question(problem, box, effort)
+        if question is None:
+            return searched(problem, box, effort)
+        if question not in proofs:
+            proofs[question] = searched(problem, box, effort)
+        found = proofs[question]
+        if effort.progress is not None:
+            effort.progress(found.lower or 0.0, found.upper)
+        return found
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(robust, "margin_of", margin_of)
+        yield
+
+
+@pytest.fixture(scope="session")
+def _proofs() -> dict[bytes, malta.Margin]:
+    """What is proven so far, by question."""
+    return {}
+
+
+@pytest.fixture(scope="module")
+def proven_once(_proofs: dict[bytes, malta.Margin]) -> Iterator[None]:
+    """For modules that are about what is done with margins: one search for each question."""
+    with _remembering(_proofs):
+        yield
+
+
 @pytest.fixture(scope="session")
 def par() -> tubular.Parameters:
     """MALTA's parameters, preset table1."""
@@ -106,7 +169,7 @@ def published() -> dict[str, Any]:
 
 
 @pytest.fixture(scope="session")
-def designs() -> dict[str, Design]:
+def designs(_proofs: dict[bytes, malta.Margin]) -> dict[str, Design]:
     """The shipped designs by name."""
     made = {}
     for name in DESIGNS:
@@ -114,7 +177,9 @@ def designs() -> dict[str, Design]:
         plant = spec.plant
         model = malta.linearize(plant, plant.at(**spec.operating_point))
         controller = malta.synthesize(spec, model)
-        made[name] = Design(spec, plant, model, controller, malta.verify(model, controller, spec.uncertainty))
+        with _remembering(_proofs):
+            margins = malta.verify(model, controller, spec.uncertainty)
+        made[name] = Design(spec, plant, model, controller, margins)
     return made
 
 

@@ -39,6 +39,8 @@ if TYPE_CHECKING:
     from conftest import Design
 
     from malta.controller import Controller
+
+pytestmark = pytest.mark.usefixtures("proven_once")
 MODULE: Any = sys.modules["malta.campaign"]  # `malta.campaign` is the function
 BOX = {"m": 0.2, "K_A": 0.2, "K_D": 0.2, "K_B": 0.2}
 SHORT: dict[str, Any] = {"fidelity": "force", "duration": 0.02, "rise": 3e-3}

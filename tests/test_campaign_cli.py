@@ -17,6 +17,8 @@ from typer.testing import CliRunner
 
 from malta import cli
 
+pytestmark = pytest.mark.usefixtures("proven_once")
+
 GAINS = "design/gains/calibrated.json"
 SHAKY = "design/gains/table2.json"
 QUICK = ("--fidelity", "force", "--rise", "3")
@@ -259,6 +261,7 @@ MANY = ("--samples", "10240", "--fidelity", "force", "--spread", "20%", "--senso
 
 
 @pytest.mark.usefixtures("undrawn")
+@pytest.mark.slow
 def test_a_killed_campaign_goes_on_where_it_was(run: Run, tmp_path: Path) -> None:
     """SIGKILL in the middle, then the same command: bit for bit what an undisturbed one finds."""
     arguments = ("campaign", GAINS, *MANY, "--quantize", "--out")

@@ -24,6 +24,8 @@ from malta.margins.checked_loop import determinant_bounds
 from malta.uncertain import Compensator
 from malta.verify import travel_loops, travel_margin
 
+pytestmark = pytest.mark.usefixtures("proven_once")
+
 ROOT = Path(__file__).parents[1]
 HALBACH = ROOT / "design" / "gains" / "halbach.json"
 Change = Callable[[dict[str, Any]], None]

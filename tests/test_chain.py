@@ -1,14 +1,18 @@
-"""The chain of margins, the classical ones, and `malta verify` that prints them."""
+"""The chain of margins, the classical ones, their figure, and `malta verify` that prints them."""
 
 from __future__ import annotations
 
 import json
 import math
 from dataclasses import replace
+from functools import cache
 from typing import TYPE_CHECKING, Any
 
+import matplotlib.text
 import numpy as np
 import pytest
+from conftest import Run, numbers
+from matplotlib.patches import Rectangle
 from typer.testing import CliRunner
 
 import malta
@@ -26,6 +30,7 @@ from malta.chain import (
 from malta.cli import app, main
 from malta.data import plant_of
 from malta.errors import InputError
+from malta.margin_figures import chain_figure
 from malta.margins.robust import robust_margin
 from malta.margins.systems import uncertain
 from malta.uncertain import Compensator, UncertainSystem, closed_loop, instability, responses
@@ -34,22 +39,27 @@ from malta.verify import machine_law
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from matplotlib.figure import Figure
+
+pytestmark = pytest.mark.usefixtures("proven_once")
+
 
 BOX = dict.fromkeys(("m", "K_A", "K_D", "K_B"), 0.2)
 STAGES = ["LQR", "LQI", "LQG", "LQGI", "+ current loops", "sampled"]
 DESIGNS = ("table2", "calibrated")
 
 
-@pytest.fixture(scope="module")
-def chains() -> dict[str, Robustness]:
-    found = {}
-    for name in DESIGNS:
-        c = gains.read(f"design/gains/{name}.json")
-        steps: list[float] = []
-        found[name] = robustness(plant_of(c.parameters), c, BOX, progress=steps.append)
-        assert steps == sorted(steps)
-        assert 0 < steps[0] < 0.2
-        assert 0.9 < steps[-1] <= 1
+CHAINED = (pytest.param("table2", marks=[pytest.mark.slow, pytest.mark.xdist_group("chain")]), "calibrated")
+
+
+@cache
+def chain_of(name: str) -> Robustness:
+    c = gains.read(f"design/gains/{name}.json")
+    steps: list[float] = []
+    found = robustness(plant_of(c.parameters), c, BOX, progress=steps.append)
+    assert steps == sorted(steps)
+    assert 0 < steps[0] < 0.2
+    assert 0.9 < steps[-1] <= 1
     return found
 
 
@@ -62,9 +72,9 @@ def _sampled(name: str, z: float = 0.0) -> tuple[UncertainSystem, Compensator]:
     return uncertain(plant, list(BOX), at={"z": z}), machine_law(plant, c)
 
 
-@pytest.mark.parametrize("name", DESIGNS)
-def test_margins_go_where_the_chain_says(name: str, chains: dict[str, Robustness]) -> None:
-    found = chains[name]
+@pytest.mark.parametrize("name", CHAINED)
+def test_margins_go_where_the_chain_says(name: str) -> None:
+    found = chain_of(name)
     assert [link.name for link in found.chain] == STAGES
     assert STAGES[-1] == SAMPLED
     assert [link.broken_at for link in found.chain] == ["forces"] * 2 + ["sensors"] * 4
@@ -82,16 +92,16 @@ def test_margins_go_where_the_chain_says(name: str, chains: dict[str, Robustness
     assert (by_name["LQR"].margin.upper, by_name["sampled"].margin.upper) == pytest.approx(expected, rel=0.01)
 
 
-@pytest.mark.parametrize("name", DESIGNS)
-def test_places_stand_for_both_sides_of_the_travel(name: str, chains: dict[str, Robustness]) -> None:
+@pytest.mark.parametrize("name", CHAINED)
+def test_places_stand_for_both_sides_of_the_travel(name: str) -> None:
     c = gains.read(f"design/gains/{name}.json")
     plant = plant_of(c.parameters)
-    places = chains[name].places
+    places = chain_of(name).places
     assert [place.position for place in places] == pytest.approx([0, 5e-3, 10e-3, 15e-3])
     for z in (15e-3, -15e-3):
         there = robust_margin(uncertain(plant, list(BOX), at={"z": z}), machine_law(plant, c), BOX)
         assert there.upper >= places[-1].margin.upper * (1 - 1e-9)
-    assert places[-1].margin.upper >= (chains[name].travel.lower or 0)
+    assert places[-1].margin.upper >= (chain_of(name).travel.lower or 0)
 
 
 @pytest.mark.parametrize("name", DESIGNS)
@@ -208,11 +218,11 @@ def test_delay_margin_of_an_integrator() -> None:
     assert delay_margins(0.5 * np.ones((5, 1, 1)) + 0j, w[:5])[0] == np.inf
 
 
-@pytest.mark.parametrize("name", DESIGNS)
-def test_each_parameter_alone(name: str, chains: dict[str, Robustness]) -> None:
+@pytest.mark.parametrize("name", CHAINED)
+def test_each_parameter_alone(name: str) -> None:
     """Tolerances against poles on a dense line."""
     system, law = _sampled(name, -15e-3)
-    for i, (key, sides) in enumerate(chains[name].tolerance.items()):
+    for i, (key, sides) in enumerate(chain_of(name).tolerance.items()):
         for sign, margin in zip((-1, 1), sides, strict=True):
             assert margin.lower is not None
             p = np.tile(system.nominal, (60, 1))
@@ -227,18 +237,18 @@ def test_each_parameter_alone(name: str, chains: dict[str, Robustness]) -> None:
                 assert margin.witness is not None
                 beyond = np.r_[beyond, margin.witness["z"]]
                 assert instability(there, law, beyond)[0] > 0
-    payload = chains[name].payload
+    payload = chain_of(name).payload
     assert payload is not None
     assert payload.lower is not None
     assert instability(system, law, system.nominal + np.array([payload.lower, 0, 0, 0]))[0] < 0
-    assert payload.lower / 0.072 == pytest.approx(chains[name].tolerance["m"][1].lower, rel=1e-3)
+    assert payload.lower / 0.072 == pytest.approx(chain_of(name).tolerance["m"][1].lower, rel=1e-3)
 
 
 def test_force_constants_that_the_controller_does_not_know() -> None:
     """--set K_B: the last stage peaks as verify's machine, which has the slope of its loads too."""
     c = gains.read("design/gains/calibrated.json")
     weak = plant_of(replace(c.parameters, K_B=4.0))
-    found = robustness(weak, c, {"K_A": 0.2})
+    found = robustness(weak, c, {"K_A": 0.2}, proof=False)
     margins = malta.verify(malta.linearize(weak, weak.at()), c)
     largest = max(v for k, v in margins.peak_sensitivity.items() if k != "sigma_max")
     assert found.chain[-1].peak == pytest.approx(largest, rel=1e-5)
@@ -269,6 +279,48 @@ def test_no_parameters_and_unknown_current_loops_are_refused() -> None:
         robustness(plant_of(c.parameters), c, BOX, current_loops="dq")  # type: ignore[arg-type]
 
 
+# The figure
+
+
+def _texts(figure: Figure) -> list[str]:
+    return [text.get_text() for text in figure.findobj(matplotlib.text.Text)]
+
+
+def test_the_figure_names_what_it_shows() -> None:
+    found = chain_of("calibrated")
+    figure = chain_figure(found, "calibrated", BOX)
+    figure.draw_without_rendering()
+    texts = _texts(figure)
+    assert "calibrated: where the margin goes" in texts
+    assert "100 %: m ±20 %, K_A ±20 %, K_D ±20 %, K_B ±20 %, all at once" in texts
+    left, right = figure.axes[:2]
+    names = [tick.get_text() for tick in left.get_yticklabels()]
+    assert names == [*(link.name for link in found.chain), "all of the travel"]
+    widths = [bar.get_bbox().width for bar in left.patches[: len(names)] if isinstance(bar, Rectangle)]
+    assert widths == pytest.approx(
+        [100 * (m.lower or 0) for m in (*(k.margin for k in found.chain), found.travel)]
+    )
+    assert [bar.get_bbox().width for bar in right.patches if isinstance(bar, Rectangle)] == pytest.approx(
+        [link.peak for link in found.chain]
+    )
+    assert {"A | B", "B | C", "C | D"} <= set(texts)
+    along = figure.axes[2].lines[0]
+    assert along.get_xdata().tolist() == pytest.approx([-15, -10, -5, 0, 5, 10, 15])  # type: ignore[union-attr]
+    # bars stay below the right edge, no text beyond the picture
+    assert max(widths) < left.get_xlim()[1]
+
+
+def test_unstable_loops_and_unproven_margins_are_drawn() -> None:
+    found = chain_of("calibrated")
+    c = gains.read("design/gains/calibrated.json")
+    unstable = robustness(plant_of(replace(c.parameters, K_A=3e4)), c, BOX)
+    chain_figure(unstable, "unstable", BOX).draw_without_rendering()
+    nothing = replace(found.travel, lower=None, upper=float("inf"), reason="not settled")
+    figure = chain_figure(replace(found, travel=nothing), "unproven", BOX)
+    figure.draw_without_rendering()
+    assert "none" in _texts(figure)
+
+
 # malta verify
 
 
@@ -296,6 +348,20 @@ def test_verify_prints_tables_within_a_hundred_columns(tmp_path: Path) -> None:
     assert (tmp_path / "calibrated_margins.png").stat().st_size > 20_000
 
 
+def test_verify_as_json_holds_finite_numbers(run: Run) -> None:
+    code, out, err = run("verify", "design/gains/calibrated.json", "--json")
+    assert (code, err) == (0, "")
+    result = json.loads(out)
+    robust = result.pop("robust")  # null where no witness exists
+    assert robust["travel"]["lower"] == pytest.approx(1.6172, abs=1e-3)
+    found = numbers(result)
+    assert len(found) > 60
+    assert all(map(math.isfinite, found))
+    assert (result["design"], result["stable"]) == ("calibrated", True)
+    assert max(result["poles"]["open_loop"])[0] == pytest.approx(218.92, abs=0.005)
+
+
+@pytest.mark.slow
 def test_verify_prints_one_json_document() -> None:
     arguments = [
         "verify",
@@ -358,15 +424,13 @@ def test_bad_input_gets_one_sentence(
     assert len(printed.err.splitlines()) == 1
 
 
-@pytest.mark.parametrize("name", DESIGNS)
-def test_margins_without_parameters_are_the_smallest_along_the_travel(
-    name: str, chains: dict[str, Robustness]
-) -> None:
+@pytest.mark.parametrize("name", CHAINED)
+def test_margins_without_parameters_are_the_smallest_along_the_travel(name: str) -> None:
     places = [
         _classical(*_sampled(name, z), sensors=SENSORS)
         for z in (-15e-3, -10e-3, -5e-3, 0.0, 5e-3, 10e-3, 15e-3)
     ]
-    found = chains[name]
+    found = chain_of(name)
     assert found.delay == pytest.approx({key: min(p.delay[key] for p in places) for key in SENSORS})
     for k, disk in enumerate(found.disks):
         assert disk.size == pytest.approx(min(p.disks[k].size for p in places))

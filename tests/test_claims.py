@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 
     from malta.plants.tubular import Parameters
 
+pytestmark = pytest.mark.usefixtures("proven_once")
+
 NAMES = ("table2", "calibrated")
 
 # Published figures without a row of their own, and why.

@@ -15,10 +15,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import Run
+from conftest import Run, numbers
 from typer.testing import CliRunner
 
 from malta import cli, gains
+
+pytestmark = pytest.mark.usefixtures("proven_once")
 
 ROOT = Path(__file__).parents[1]
 TABLE2, CALIBRATED = "design/gains/table2.json", "design/gains/calibrated.json"
@@ -64,17 +66,6 @@ def old_gains(folder: Path) -> dict[Path, bytes]:
     return old
 
 
-def numbers(content: Any) -> list[float]:
-    """Every number in a JSON document; null counts as NaN."""
-    if isinstance(content, dict):
-        return [number for entry in content.values() for number in numbers(entry)]
-    if isinstance(content, list):
-        return [number for entry in content for number in numbers(entry)]
-    if content is None:
-        return [math.nan]
-    return [float(content)] if isinstance(content, (int, float)) else []
-
-
 def one_sentence(err: str) -> str:
     """The one line on standard error, without the name of the program."""
     assert "Traceback" not in err
@@ -94,7 +85,7 @@ def test_help_of_each_command_shows_an_example(command: str) -> None:
     assert "--json" in result.output
 
 
-@pytest.mark.parametrize("command", ["verify", "simulate"])
+@pytest.mark.parametrize("command", [pytest.param("verify", marks=pytest.mark.slow), "simulate"])
 def test_example_in_the_help_runs(run: Run, tmp_path: Path, command: str) -> None:
     text = " ".join(CliRunner().invoke(cli.app, [command, "--help"]).output.split())
     example = re.search(r"Example: malta (.*?) (?:Arguments|Options)", text)
@@ -355,19 +346,6 @@ def test_verify_prints_poles_bandwidths_and_sensitivities(run: Run) -> None:
     assert "218.92   218.92   0.00   157.53   157.53" in out
     assert "6.93 D" in out
     assert max(map(len, out.splitlines())) <= WIDTH
-
-
-def test_verify_as_json_holds_finite_numbers(run: Run) -> None:
-    code, out, err = run("verify", CALIBRATED, "--json")
-    assert (code, err) == (0, "")
-    result = json.loads(out)
-    robust = result.pop("robust")  # null where no witness exists
-    assert robust["travel"]["lower"] == pytest.approx(1.6172, abs=1e-3)
-    found = numbers(result)
-    assert len(found) > 60
-    assert all(map(math.isfinite, found))
-    assert (result["design"], result["stable"]) == ("calibrated", True)
-    assert max(result["poles"]["open_loop"])[0] == pytest.approx(218.92, abs=0.005)
 
 
 def test_all_forms_of_a_gain_file_verify_alike(run: Run) -> None:
@@ -830,6 +808,7 @@ def test_program_ends_with_the_exit_code(arguments: list[str], code: int, lines:
     assert max(map(len, done.stdout.splitlines()), default=0) <= WIDTH
 
 
+@pytest.mark.slow
 def test_terminal_without_greek_letters_shows_the_page(tmp_path: Path) -> None:
     file = project(tmp_path, (SUMMARY, f"{SUMMARY}weights α and Σ, "))
     command = [sys.executable, "-W", "error", "-c", "from malta.cli import main; main()", "design", str(file)]

@@ -287,6 +287,7 @@ def test_files_carry_no_time_stamp(tmp_path: Path, design: Design) -> None:
     assert re.search(r"Platform|Created|\d\d:\d\d", header) is None
 
 
+@pytest.mark.slow
 def test_another_process_writes_the_same_bytes(tmp_path: Path, designs: dict[str, Design]) -> None:
     program = """
 import sys

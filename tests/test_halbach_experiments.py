@@ -39,6 +39,8 @@ if TYPE_CHECKING:
     from malta.experiments import Experiment
     from malta.plant import FloatArray
 
+pytestmark = pytest.mark.usefixtures("proven_once")
+
 DESIGNS = ("halbach", "halbach_pid")
 SCENARIOS = ("step", "stairs", "ramp", "force", "budget", "identify")
 

@@ -10,14 +10,22 @@ import pytest
 from conftest import ROOT
 from matplotlib import pyplot
 
+pytestmark = pytest.mark.usefixtures("proven_once")
+
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.py"))
+SLOW = {name: [pytest.mark.slow] for name in ("03_experiments", "05_halbach", "06_planar")} | {
+    "04_robustness": [pytest.mark.slow, pytest.mark.xdist_group("chain")]  # where its margins are proven once
+}
 
 
 def test_there_are_notebooks() -> None:
     assert [n.name for n in NOTEBOOKS][:2] == ["01_model.py", "02_lqg.py"]
 
 
-@pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda n: n.stem)
+@pytest.mark.parametrize(
+    "notebook",
+    [pytest.param(n, marks=SLOW.get(n.stem, []), id=n.stem) for n in NOTEBOOKS],
+)
 def test_notebook_runs_from_its_own_folder(notebook: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As Jupyter starts it."""
     monkeypatch.chdir(notebook.parent)

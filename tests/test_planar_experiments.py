@@ -30,6 +30,8 @@ if TYPE_CHECKING:
     from malta.plant import FloatArray, Plant
     from malta.spec import Spec
 
+pytestmark = pytest.mark.usefixtures("proven_once")
+
 GAINS = "design/gains/planar.json"
 SLOW: dict[str, Any] = {"engine": "virtual machine"}  # half a second a run, and nothing to compile
 
@@ -376,6 +378,8 @@ def test_every_printed_number_is_claimed(paper: dict[str, Any]) -> None:
 # --- The command line ---
 
 
+@pytest.mark.slow
+@pytest.mark.xdist_group("planar")  # where its margin is proven once
 def test_design(run: Run, tmp_path: Path) -> None:
     """From the design file to gain files and a figure: they are the shipped ones, bit for bit but for dates."""
     code, out, _ = run("design", "design/planar.toml", "--out", tmp_path, "--figures", tmp_path)

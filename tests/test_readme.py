@@ -9,6 +9,8 @@ from conftest import ROOT
 
 import malta
 
+pytestmark = pytest.mark.usefixtures("proven_once")
+
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 DESIGNS = {
     "tubular": ("table2", "calibrated", "robust"),
@@ -44,7 +46,12 @@ def _is_noisy(machine: str, subject: str) -> bool:
 
 
 @pytest.mark.parametrize(
-    "machine", [pytest.param(name, marks=[pytest.mark.slow] if name == "planar" else []) for name in DESIGNS]
+    "machine",
+    [
+        "tubular",
+        pytest.param("halbach", marks=pytest.mark.slow),
+        pytest.param("planar", marks=[pytest.mark.slow, pytest.mark.xdist_group("planar")]),
+    ],
 )
 def test_the_table_of_claims_is_computed(machine: str) -> None:
     specs = [malta.read_design(f"design/{name}.toml") for name in DESIGNS[machine]]

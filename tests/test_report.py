@@ -33,6 +33,8 @@ if TYPE_CHECKING:
     Flown = Callable[[str, str], Experiment]
     Pictured = Callable[[str, str], tuple[Figure, bytes]]
 
+pytestmark = pytest.mark.usefixtures("proven_once")
+
 
 SHORT: dict[str, dict[str, Any]] = {"lift-off": {"duration": 0.06}, "thermal": {"faster": 100.0}}
 

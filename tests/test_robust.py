@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+import time
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -228,11 +229,12 @@ def _machine(
 @pytest.mark.parametrize("name", SHIPPED)
 def test_shipped_designs_have_the_margin_that_is_proven(name: str, current_loops: Any) -> None:
     s, c = _machine(name, current_loops)
+    begun = time.process_time()
     m = robust_margin(s, c, BOX)
+    assert time.process_time() - begun < 5
     assert m.lower is not None
     assert 0 < m.upper / m.lower - 1 <= 1e-5
     assert at_witness(s, c, m) > 0
-    assert m.seconds < 5
     assert (instability(s, c, samples(s, m, BOX, {}, 1000)) < 0).all()
     assert m.frequency is not None
     p = np.array(list((m.witness or {}).values()))
@@ -242,11 +244,12 @@ def test_shipped_designs_have_the_margin_that_is_proven(name: str, current_loops
 @pytest.mark.parametrize("name", SHIPPED)
 def test_the_whole_travel_in_one_proof(name: str) -> None:
     c, plant = shipped(name)
+    begun = time.process_time()
     m = travel_margin(plant, c, BOX)
+    assert time.process_time() - begun < 5
     s, law = _machine(name, names=(*BOX, "z"))
     assert m.lower is not None
     assert m.upper / m.lower <= 1.001
-    assert m.seconds < 5
     assert at_witness(s, law, m) > 0
     over = {"z": (-15e-3, 15e-3)}
     assert (instability(s, law, samples(s, m, BOX, over, 1000)) < 0).all()
@@ -362,6 +365,7 @@ def handmade(seed: int) -> tuple[UncertainSystem, Compensator]:
     return system(of, [0.0] * k), c
 
 
+@pytest.mark.slow
 @settings(max_examples=25, deadline=None)
 @given(st.integers(0, 100_000))
 def test_no_machine_of_a_proven_box_is_unstable(seed: int) -> None:
@@ -456,6 +460,7 @@ def test_a_slowly_sampled_loop_is_lost_at_the_nyquist_frequency() -> None:
     assert m.frequency == pytest.approx(np.pi / 0.1, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_parameters_of_the_geometry_and_twins() -> None:
     """l_B enters squared, I_xx stands for I_yy as well, z couples: all of it in one proof."""
     c, plant = shipped("calibrated")
@@ -469,16 +474,16 @@ def test_parameters_of_the_geometry_and_twins() -> None:
     assert (instability(s, law, samples(s, m, ranges, {}, 1000)) < 0).all()
 
 
-def test_shares_are_what_the_margin_loses_with_a_range() -> None:
+@pytest.mark.parametrize("name", ["table2", pytest.param("calibrated", marks=pytest.mark.slow)])
+def test_shares_are_what_the_margin_loses_with_a_range(name: str) -> None:
     """-d ln margin / d ln range by differences; together one, as a scaled box has a margin scaled back."""
-    for name in ("table2", "calibrated"):
-        s, c = _machine(name)
-        m = robust_margin(s, c, BOX)
-        for key in BOX:
-            more, less = (robust_margin(s, c, BOX | {key: 0.2 * f}).upper for f in (1.001, 0.999))
-            share = -(math.log(more) - math.log(less)) / (math.log(1.001) - math.log(0.999))
-            assert m.sensitivity.get(key, 0.0) == pytest.approx(share, abs=2e-3)
-        assert sum(m.sensitivity.values()) == pytest.approx(1)
+    s, c = _machine(name)
+    m = robust_margin(s, c, BOX)
+    for key in BOX:
+        more, less = (robust_margin(s, c, BOX | {key: 0.2 * f}).upper for f in (1.001, 0.999))
+        share = -(math.log(more) - math.log(less)) / (math.log(1.001) - math.log(0.999))
+        assert m.sensitivity.get(key, 0.0) == pytest.approx(share, abs=2e-3)
+    assert sum(m.sensitivity.values()) == pytest.approx(1)
 
 
 def test_an_unstable_loop_has_no_margin() -> None:

@@ -42,6 +42,8 @@ if TYPE_CHECKING:
     from malta.spec import Spec
     from malta.verify import Margins
 
+pytestmark = pytest.mark.usefixtures("proven_once")
+
 ROBUST = ROOT / "design" / "robust.toml"
 QUICK = Effort(generations=1, polish=3, front=0)
 
@@ -295,6 +297,7 @@ def test_what_is_found_has_the_figures_that_were_found(small: Spec, tmp_path: Pa
     )
 
 
+@pytest.mark.slow
 def test_the_front_trades_margin_for_noise(
     spec: Spec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -438,11 +441,13 @@ def run(run: Run) -> Run:
 
 
 def bare(folder: Path, *asked: str) -> Path:
-    """The flagship with another specification and one delay."""
+    """The flagship with another specification and one delay; the axial loop alone is searched."""
     path = edited(folder, (DELAYS, "delay = [0]"))
     text = path.read_text(encoding="utf-8")
     first, last = text.index("[specification]"), text.index("[search]")
-    path.write_text("\n".join([text[:first] + "[specification]", *asked, "", text[last:]]), encoding="utf-8")
+    bearings, axial = text.index("translation = {"), text.index("stroke = {")
+    parts = [text[:first] + "[specification]", *asked, "", text[last:bearings] + text[axial:]]
+    path.write_text("\n".join(parts), encoding="utf-8")
     return path
 
 

@@ -290,6 +290,7 @@ def test_a_search_that_was_interrupted_ends_where_it_would_have(motor: Spec, tmp
     assert problem_sha256(other) != problem_sha256(motor)
 
 
+@pytest.mark.slow
 def test_an_axis_of_six_is_searched_by_itself(mover: Spec) -> None:
     """The height alone: the others stay as they are, and are computed once."""
     found = tuned(mover, effort=Effort(generations=5))
