@@ -248,7 +248,7 @@ def verify(
         from malta import report
 
         picture, position = out / f"{controller.name}_margins.png", f"position {plant.stroke}"
-        files.append(report.robustness(found, controller.name, box, picture, position))
+        files.append(report.robustness(found, controller.name, box, picture, position, worst))
     if as_json:
         described = {"gains": str(gains), "design": controller.name, "files": [str(file) for file in files]}
         largest = {

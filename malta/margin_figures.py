@@ -15,16 +15,22 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from malta.chain import Robustness
+    from malta.margins.gain import Gain
 
 LIMITS = ((3.0, "A | B"), (4.0, "B | C"), (5.0, "C | D"))  # ISO 14839-3
 
 
 def chain_figure(
-    found: Robustness, name: str, uncertainty: Mapping[str, float], position: str = "position"
+    found: Robustness,
+    name: str,
+    uncertainty: Mapping[str, float],
+    position: str = "position",
+    worst: Mapping[str, Gain] | None = None,
 ) -> Figure:
     """The chain as bars, proven part and witness; peak sensitivities beside them; both along the travel below.
 
     position : what the machine calls it, as "position z"
+    worst : the largest |S| of each sensor over the uncertainty and the travel
     """
     from matplotlib.figure import Figure
 
@@ -36,7 +42,7 @@ def chain_figure(
     grid = figure.add_gridspec(2, 2, height_ratios=(1.6, 1))
     left, right = figure.add_subplot(grid[0, 0]), figure.add_subplot(grid[0, 1])
     rows = [(link.name, link.margin, link.peak) for link in found.chain]
-    rows.append(("all of the travel", found.travel, math.nan))
+    rows.append(("all of the travel", found.travel, max(place.peak for place in found.places)))
     most = max([_percent(m.lower) for _, m, _ in rows if m.lower is not None] + [100.0])
     for k, (_, margin, peak) in enumerate(rows):
         proven = _percent(margin.lower)
@@ -69,13 +75,13 @@ def chain_figure(
         plain(axes)
         axes.set_ylim(len(rows) - 0.4, -0.8)
     along = figure.add_subplot(grid[1, 0]), figure.add_subplot(grid[1, 1])
-    _along_travel(*along, found)
+    _along_travel(*along, found, _bound(worst))
     for axes in along:
         axes.set_xlabel(f"{position} [mm]")
     return figure
 
 
-def _along_travel(left: Axes, right: Axes, found: Robustness) -> None:
+def _along_travel(left: Axes, right: Axes, found: Robustness, bound: float) -> None:
     """The worse of both sides of the position, drawn on both."""
     places = found.places
     z = np.array([p.position for p in places]) * 1e3
@@ -97,12 +103,25 @@ def _along_travel(left: Axes, right: Axes, found: Robustness) -> None:
     left.set_ylim(0, 1.25 * max([_percent(p.margin.lower) for p in places] + [1.0]))
     left.set_ylabel("margin [%]")
     right.plot(both, mirrored([p.peak for p in places]), marker="o", markersize=3.5, **STYLES[0])
-    right.set_ylim(0, max(3.5, 1.2 * max([p.peak for p in places if not math.isnan(p.peak)] + [1.0])))
+    peaks = [p.peak for p in places if not math.isnan(p.peak)] + ([bound] if math.isfinite(bound) else [])
+    right.set_ylim(0, max(3.5, 1.2 * max([*peaks, 1.0])))
+    if math.isfinite(bound):
+        right.axhline(bound, **STYLES[1])
+        right.annotate(
+            "no more for any parameters of the box", (0.02, bound), xycoords=("axes fraction", "data"),
+            xytext=(0, 3), textcoords="offset points", va="bottom", **NOTE,
+        )  # fmt: skip
     right.axhline(3, **BOUND)
     right.annotate("zone A", (0.985, 3), xycoords=("axes fraction", "data"), ha="right", va="top", **NOTE)
     right.set_ylabel("peak |S|")
     for axes in (left, right):
         plain(axes)
+
+
+def _bound(worst: Mapping[str, Gain] | None) -> float:
+    """What no |S| exceeds; NaN where that is not known of every sensor."""
+    found = [gain.upper for gain in (worst or {}).values()]
+    return max([bound for bound in found if bound is not None]) if found and None not in found else math.nan
 
 
 def _percent(t: float | None) -> float:

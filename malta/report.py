@@ -666,9 +666,10 @@ def robustness(
     uncertainty: Mapping[str, float],
     path: str | Path,
     position: str = "position",
+    worst: Mapping[str, Gain] | None = None,
 ) -> Path:
-    """Draw where the margin of a design goes; `position` is what the machine calls it."""
-    return save(chain_figure(found, name, uncertainty, position), Path(path))
+    """Draw where the margin of a design goes; arguments as `chain_figure` takes them."""
+    return save(chain_figure(found, name, uncertainty, position, worst), Path(path))
 
 
 def campaign(found: Campaign, folder: str | Path, published: Published | None = None) -> list[Path]:

@@ -31,6 +31,7 @@ from malta.cli import app, main
 from malta.data import plant_of
 from malta.errors import InputError
 from malta.margin_figures import chain_figure
+from malta.margins.gain import Gain
 from malta.margins.robust import robust_margin
 from malta.margins.systems import uncertain
 from malta.uncertain import Compensator, UncertainSystem, closed_loop, instability, responses
@@ -288,7 +289,8 @@ def _texts(figure: Figure) -> list[str]:
 
 def test_the_figure_names_what_it_shows() -> None:
     found = chain_of("calibrated")
-    figure = chain_figure(found, "calibrated", BOX)
+    worst = {"x1": Gain(2.4, 2.41, 500.0, {}, 1, 0.0), "z": Gain(1.9, 1.91, 90.0, {}, 1, 0.0)}
+    figure = chain_figure(found, "calibrated", BOX, worst=worst)
     figure.draw_without_rendering()
     texts = _texts(figure)
     assert "calibrated: where the margin goes" in texts
@@ -301,8 +303,10 @@ def test_the_figure_names_what_it_shows() -> None:
         [100 * (m.lower or 0) for m in (*(k.margin for k in found.chain), found.travel)]
     )
     assert [bar.get_bbox().width for bar in right.patches if isinstance(bar, Rectangle)] == pytest.approx(
-        [link.peak for link in found.chain]
+        [*(link.peak for link in found.chain), max(place.peak for place in found.places)]
     )
+    assert any(line.get_ydata() == [2.41, 2.41] for line in figure.axes[3].lines)
+    assert "no more for any parameters of the box" in texts
     assert {"A | B", "B | C", "C | D"} <= set(texts)
     along = figure.axes[2].lines[0]
     assert along.get_xdata().tolist() == pytest.approx([-15, -10, -5, 0, 5, 10, 15])  # type: ignore[union-attr]
