@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -39,9 +39,25 @@ class Family:
     def degree(self) -> int:
         return len(self.values) - 1
 
+    @cached_property
+    def _largest(self) -> FloatArray:
+        return np.asarray(np.abs(self.values).max(axis=1) + self.radius)
+
     def size(self) -> FloatArray:
         """The largest |a_k| over the box, in units of 2^exponents[k]."""
-        return np.asarray(np.abs(self.values).max(axis=1) + self.radius)
+        return self._largest
+
+    @cached_property
+    def powers(self) -> FloatArray:
+        """The exponents as an array."""
+        return np.array(self.exponents)
+
+    @cached_property
+    def levels(self) -> FloatArray:
+        """log2 of the largest value of each a_k over the box; -inf where it is zero."""
+        size = np.abs(self.values).max(axis=1)
+        with np.errstate(divide="ignore"):
+            return np.asarray(np.log2(size) + self.powers)
 
 
 def nodes(degree: int, *, chebyshev: bool = False) -> list[float]:
@@ -239,10 +255,16 @@ def _lowered(array: FloatArray, d: int) -> tuple[FloatArray, FloatArray]:
     return new, left + 8 * d * EPS * np.abs(array).reshape(len(array), -1).max(axis=1)
 
 
+@lru_cache(maxsize=64)
+def _powers(degree: int) -> tuple[Any, FloatArray]:
+    """i and C(degree, i), i = 0 .. degree."""
+    i = np.arange(degree + 1)
+    return i, np.array([math.comb(degree, int(k)) for k in i], dtype=float)
+
+
 def basis(degree: int, u: FloatArray) -> FloatArray:
     """Bernstein polynomials at u: ... x (degree + 1)."""
-    i = np.arange(degree + 1)
-    binomial = np.array([math.comb(degree, int(k)) for k in i], dtype=float)
+    i, binomial = _powers(degree)
     u = np.asarray(u)[..., None]
     return np.asarray(binomial * u**i * (1 - u) ** (degree - i))
 

@@ -16,13 +16,14 @@ from flint import arb
 from malta.errors import CheckError
 from malta.margins.box import Box
 from malta.margins.characteristic import pair
+from malta.margins.descent import from_cell, nearest
 from malta.margins.enclosure import TooWide, Unproven, over_box, precision
 from malta.margins.exclusion import Growth, Search, advance, growth_over, start
 from malta.margins.expressions import NotAnalytic, exact
 from malta.margins.family import Family, narrowed
 from malta.margins.problem import Polynomial, Problem, hurwitz
 from malta.margins.robust import Certificate, Margin, Progress
-from malta.margins.witness import Zero, from_cell, gradients, nearest, starts
+from malta.margins.witness import Zero, gradients, starts
 
 if TYPE_CHECKING:
     from malta.plant import FloatArray
@@ -35,7 +36,7 @@ FINEST = 3e-7  # how close, relative
 DEAR = 3.0  # s that families take beyond which their boxes grow in small steps
 BRIEF = 0.5  # s that a wider box may take at least
 PATIENCE = 20_000  # cells without progress after which the proof is given up
-REMEMBERED = 8  # families of a polynomial over boxes
+REMEMBERED = 24  # families of a polynomial over boxes
 HARD = 4000  # cells after which smaller boxes are proven first
 LEVELS = 5  # of these boxes, each half of the next
 PATCHES = 64  # parts that a box is cut into where one expansion does not do

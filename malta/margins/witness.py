@@ -1,19 +1,14 @@
-"""The nearest loss of stability: the smallest t with a(jw; p) = 0 for some w and some p in box(t).
-
-From a start (w, p) the equation is linearized and the smallest t that solves it found by a linear program, within a
-trust region; repeated, that is Newton's method with the freedom that is left used to make t small. At w = 0 and at
-infinity (the Nyquist frequency) the equation is real.
-"""
+"""Where a(jw; p) may vanish first: a family's values and derivatives at points, and starts for a descent to a zero."""
 
 from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from malta.margins.exclusion import Cell, Growth
+from malta.margins.exclusion import Growth
 from malta.margins.family import Family, basis
 from malta.margins.frequency import cover
 
@@ -46,21 +41,11 @@ class Zero:
 
 def coefficients_at(f: Family, u: FloatArray) -> tuple[FloatArray, FloatArray]:
     """a_k at u, and its derivatives: K and P x K."""
-    values = f.values.reshape(len(f.values), *f.shape)
-    axes = [basis(n - 1, np.array(x)) for n, x in zip(f.shape, u, strict=True)]
-    slopes = [_slope(n - 1, float(x)) for n, x in zip(f.shape, u, strict=True)]
-
-    def contract(vectors: list[FloatArray]) -> FloatArray:
-        found = values
-        for v in reversed(vectors):
-            found = found @ v
-        return np.asarray(found)
-
-    moved = [
-        contract([*axes[:i], slopes[i], *axes[i + 1 :]]) if n > 1 else np.zeros(len(f.values))
-        for i, n in enumerate(f.shape)
-    ]
-    return contract(axes), np.array(moved).reshape(len(u), -1)
+    found = f.values.reshape(1, len(f.values), *f.shape)  # a, then its derivatives, last parameters first
+    for n, x in zip(reversed(f.shape), reversed(u.tolist()), strict=True):
+        moved = found[:1] @ _slope(n - 1, x) if n > 1 else np.zeros((1, *found.shape[1:-1]))
+        found = np.concatenate([found @ basis(n - 1, np.array(x)) if n > 1 else found[..., 0], moved])
+    return found[0], found[:0:-1]
 
 
 def _slope(degree: int, u: float) -> FloatArray:
@@ -72,30 +57,29 @@ def _slope(degree: int, u: float) -> FloatArray:
 
 def rows_at(f: Family, branch: int, x: FloatArray) -> ComplexArray:
     """Weights of a_k in f(x) at points of a branch, on a scale of each point's own: points x K."""
-    return _rows(f, branch, x)[0]
+    return rows_and_slopes(f, branch, x)[0]
 
 
-def _rows(f: Family, branch: int, x: FloatArray) -> tuple[ComplexArray, ComplexArray]:
+def rows_and_slopes(f: Family, branch: int, x: Any) -> tuple[ComplexArray, ComplexArray]:
     """Weights of a_k in f(x) and in x f'(x) at points x of a branch, scaled alike: points x K each."""
     n = f.degree
     k = np.arange(n + 1)
     power = n - k if branch else k
-    x = np.atleast_1d(np.asarray(x, dtype=float))[:, None]
+    x = np.atleast_1d(np.asarray(x))[:, None]
     with np.errstate(divide="ignore", invalid="ignore"):
-        logs = np.where(power == 0, 0.0, power * np.log2(x)) + np.array(f.exponents)
-        size = np.abs(f.values).max(axis=1)
-        shift = np.where(size > 0, logs + np.log2(np.where(size > 0, size, 1)), -np.inf).max(
-            axis=1, keepdims=True
-        )
+        logs = np.where(power == 0, 0.0, power * np.log2(np.abs(x)))
+        shift = (logs + f.levels).max(axis=1, keepdims=True)
         turn = (k - n if branch else k) % 4  # the last coefficient, alone at infinity, is real there
-        weights = np.exp2(np.clip(logs - shift, -1070, 1000)) * 1j**turn
+        weights = np.exp2(np.clip(logs + f.powers - shift, -1070, 1000)) * 1j**turn
+    if np.iscomplexobj(x):
+        weights = weights * np.exp(1j * power * np.angle(x))
     return weights, weights * power
 
 
 def linear_distance(f: Family, g: Growth, u: FloatArray, branch: int, x: FloatArray) -> FloatArray:
     """t at which the linearization about u first vanishes, at each of the frequencies x."""
     a, slopes = coefficients_at(f, u)
-    rows, by_x = _rows(f, branch, x)
+    rows, by_x = rows_and_slopes(f, branch, x)
     value, moved = rows @ a, rows @ slopes.T
     grows: Any = g.grows
     slope = g.slopes(u)
@@ -183,239 +167,9 @@ def _worst_root(f: Family, u: FloatArray) -> tuple[float, float]:
     return float(worst.real / max(abs(worst), 1e-300)), float(abs(worst.imag))
 
 
-def nearest(f: Family, g: Growth, branch: int, x: float, u: FloatArray, below: float) -> Zero | None:
-    """Descend to a zero of f of smallest t from a start; None where none is found with t below `below`."""
-    trust, best, failures = 0.5, None, 0
-    for k in range(120):
-        step = _step(f, g, branch, x, u, trust)
-        if step is None:  # nothing within the trust region solves the equation
-            trust, failures = 2 * trust, failures + 1
-            if failures > 8 or trust > 2:
-                break
-            continue
-        value, size, t, new_x, new_u = step
-        if (k > 2 and t > 1.2 * below) or (value > 5e-3 * size and k > 24):
-            break  # a start that leads further out, or nowhere
-        change = float(np.abs(new_u - u).max(initial=0.0)) + (abs(new_x / x - 1) if x else 0.0)
-        residual = _value(f, branch, new_x, new_u)[0]
-        if residual > 0.9 * value and residual > 1e-9 * size:
-            trust /= 3
-            failures += 1
-            if trust < 1e-7 or failures > (8 if value > 5e-3 * size else 40):
-                break
-            continue
-        x, u = new_x, new_u
-        t = float(g.margin(g.parameters(u)))
-        if residual <= 1e-11 * size:
-            if best is None or t < best.t * (1 - 1e-12):
-                best = Zero(t, branch, x, u)
-            elif change < 1e-6:
-                break
-        if change < 1e-10:
-            break
-    return best if best is None or best.t < below else None
-
-
-def _value(f: Family, branch: int, x: float, u: FloatArray) -> tuple[float, float]:
-    """|f|, and the sum of its terms' sizes."""
-    a, _ = coefficients_at(f, u)
-    rows, _ = _rows(f, branch, np.array([x]))
-    return float(np.abs(rows @ a)[0]), float((np.abs(rows) @ f.size())[0])
-
-
-def _step(
-    f: Family, g: Growth, branch: int, x: float, u: FloatArray, trust: float
-) -> tuple[float, float, float, float, FloatArray] | None:
-    """|f|, its size, and the t, x, u that solve the linearized equation with the smallest t."""
-    a, slopes = coefficients_at(f, u)
-    rows, along = _rows(f, branch, np.array([x]))
-    value, size = complex((rows @ a)[0]), float((np.abs(rows) @ f.size())[0])
-    turned = None if x == 0 else complex((along @ a)[0])
-    free = np.array([n > 1 for n in f.shape], dtype=bool)
-    moved = np.where(free, (rows @ slopes.T)[0], 0)
-    scale = max(np.abs(moved).max(initial=0.0), abs(turned or 0.0))
-    if not (0 < scale < np.inf and abs(value) < 1e12 * scale):
-        return None
-    line = _Line(value / scale, moved / scale, None if turned is None else turned / scale)
-    room = np.where(free, np.maximum(-trust, -u), 0), np.where(free, np.minimum(trust, 1 - u), 0)
-    found = _reached(line, _sides(g, u, free), room, trust) or _programmed(
-        line, _sides(g, u, free), room, trust
-    )
-    if found is None:
-        return None
-    t, du, dx = found
-    return abs(value), size, t, x * float(np.exp(dx)), np.clip(u + du, 0, 1)
-
-
-class _Line(NamedTuple):
-    """value + moved du + turned d ln x = 0; none of the last where x stands."""
-
-    value: complex
-    moved: ComplexArray
-    turned: complex | None
-
-
-class _Sides(NamedTuple):
-    """Of box(t) as seen from u: middle - t below <= du <= middle + t above on the axes that grow."""
-
-    grows: Any
-    middle: FloatArray
-    below: FloatArray
-    above: FloatArray
-
-
-def _sides(g: Growth, u: FloatArray, free: Any) -> _Sides:
-    slope, grows = g.slopes(u), g.grows & free
-    unit = np.where(slope == 0, 1, slope)
-    below, above = np.where(unit > 0, g.down, g.up), np.where(unit > 0, g.up, g.down)
-    return _Sides(grows, (g.nominal - g.parameters(u)) / unit, below / np.abs(unit), above / np.abs(unit))
-
-
-Move = tuple[float, "FloatArray", float]  # t, du, d ln x
-
-
-def _reached(line: _Line, sides: _Sides, room: tuple[FloatArray, FloatArray], trust: float) -> Move | None:
-    """The smallest t in closed form, where d ln x is free; None where there is none within the trust region.
-
-    Without ln x one real equation s du = h is left, and the largest s du in box(t) is piecewise linear in t.
-    """
-    turn = 1.0 if line.turned is None else 1j * np.conj(line.turned) / max(abs(line.turned), 1e-300)
-    h, s = -(turn * line.value).real, (turn * line.moved).real
-    s = np.where(np.abs(s) > 1e-12 * np.abs(s).max(initial=0.0), s, 0)
-    (low, high), (grows, middle, below, above) = room, sides
-    with np.errstate(all="ignore"):
-        outside = np.where(
-            middle > high, (middle - high) / below, np.where(middle < low, (low - middle) / above, 0)
-        )
-    t = float(np.where(grows, outside, 0).max(initial=0.0))
-    if not t < np.inf:
-        return None
-
-    def end(t: float, s: FloatArray) -> FloatArray:
-        """du of the largest s du in box(t)."""
-        top = np.where(grows, np.minimum(high, middle + t * above), high)
-        bottom = np.where(grows, np.maximum(low, middle - t * below), low)
-        rest = np.clip(
-            np.where(grows, middle, 0), bottom, top
-        )  # what does not act stays nominal, or where it is
-        return np.asarray(np.where(s > 0, top, np.where(s < 0, bottom, rest)))
-
-    most, least = end(t, s), end(t, -s)
-    if s @ most < h:
-        t, du = _grown(t, s, h, end, sides, room)
-    elif s @ least > h:
-        t, du = _grown(t, -s, -h, end, sides, room)
-    else:
-        span = float(s @ (most - least))
-        du = least + (most - least) * ((h - s @ least) / span if span > 0 else 0.5)
-    if not t < np.inf:
-        return None
-    left = line.value + line.moved @ du
-    if line.turned is None:
-        return t, du, 0.0
-    dx = -float((np.conj(line.turned) * left).real) / max(abs(line.turned) ** 2, 1e-300)
-    return (t, du, dx) if abs(dx) <= trust else None
-
-
-def _grown(
-    t: float, s: FloatArray, h: float, end: Any, sides: _Sides, room: tuple[FloatArray, FloatArray]
-) -> tuple[float, FloatArray]:
-    """The smallest t from which on box(t) holds a du with s du = h; infinite where the trust region ends before."""
-    (low, high), (grows, middle, below, above) = room, sides
-    with np.errstate(all="ignore"):
-        full = np.where(
-            s > 0, (high - middle) / above, (middle - low) / below
-        )  # where an axis has no more room
-        rate = np.where(grows & (s != 0), np.abs(s) * np.where(s > 0, above, below), 0)
-    for stop in [*np.sort(full[(rate > 0) & (full > t)]).tolist(), np.inf]:
-        pull = float(rate[full > t].sum())
-        missing = h - float(s @ end(t, s))
-        if pull > 0 and t + missing / pull <= stop:
-            t += missing / pull
-            return t, end(t, s)
-        t = stop
-        if not np.isfinite(t):
-            break
-    return np.inf, np.zeros(len(s))
-
-
-def _programmed(line: _Line, sides: _Sides, room: tuple[FloatArray, FloatArray], trust: float) -> Move | None:
-    """The smallest t with d ln x within the trust region, by a linear program."""
-    from scipy.optimize import linprog
-
-    k = len(line.moved)
-    if line.turned is None:
-        return None
-    columns = np.concatenate([line.moved, [line.turned, 0]])
-    limits, most = [], []
-    for i in np.flatnonzero(sides.grows):
-        for sign, rate in ((1.0, sides.above[i]), (-1.0, sides.below[i])):
-            row = np.zeros(k + 2)
-            row[i], row[-1] = sign, -rate
-            limits.append(row / max(1.0, rate))
-            most.append(sign * sides.middle[i] / max(1.0, rate))
-    bounds: list[tuple[float, float | None]] = list(zip(*(side.tolist() for side in room), strict=True))
-    found = linprog(
-        np.eye(k + 2)[-1],
-        np.array(limits) if limits else None,
-        most or None,
-        np.array([columns.real, columns.imag]),
-        [-line.value.real, -line.value.imag],
-        [*bounds, (-trust, trust), (0, None)],
-        method="highs",
-    )
-    if found.status != 0:
-        return None
-    moves: Any = found.x
-    return float(moves[-1]), np.asarray(moves[:k]), float(moves[k])
-
-
-def from_cell(f: Family, g: Growth, cell: Cell, below: float) -> Zero | None:
-    """A zero of t below `below` out of a cell where zero was not excluded: the next one, and the descent from there."""
-    low, high = cell.interval
-    u, best = cell.box.mean(axis=1), None
-    for x in ((low + high) / 2, *([0.0] if low == 0 else [])):
-        near = projected(f, g, cell.branch, x, u)
-        if near is not None and near.t < (best.t if best is not None else below):
-            best = near
-    if best is None:
-        return None
-    if best.t <= 1.01 * cell.smallest:
-        return best
-    further = nearest(f, g, best.branch, best.x, best.u, best.t)
-    return further if further is not None and further.t < best.t else best
-
-
-def projected(f: Family, g: Growth, branch: int, x: float, u: FloatArray) -> Zero | None:
-    """The zero next to a place, by Newton's method with steps of least norm; None where it leads out of the box."""
-    free = np.array([n > 1 for n in f.shape])
-    for _ in range(30):
-        a, slopes = coefficients_at(f, u)
-        rows, along = _rows(f, branch, np.array([x]))
-        value, size = complex((rows @ a)[0]), float((np.abs(rows) @ f.size())[0])
-        if abs(value) <= 1e-12 * size:
-            return Zero(float(g.margin(g.parameters(u))), branch, x, u)
-        moved, turned = (rows @ slopes.T)[0] * free, complex((along @ a)[0])
-        columns = moved if x == 0 else np.append(moved, turned)
-        J = columns.real[None] if x == 0 else np.array([columns.real, columns.imag])
-        right = np.array([value.real]) if x == 0 else np.array([value.real, value.imag])
-        if not np.isfinite(J).all():
-            return None
-        step = -np.linalg.lstsq(J / size, right / size, rcond=1e-12)[0]
-        if np.abs(step).max() > 0.5:
-            return None
-        u = u + step[: len(u)]
-        if (u < -1e-9).any() or (u > 1 + 1e-9).any():
-            return None
-        u = np.clip(u, 0, 1)
-        x = x if x == 0 else x * float(np.exp(step[-1]))
-    return None
-
-
 def gradients(f: Family, zero: Zero) -> tuple[ComplexArray, complex]:
     """Derivatives of f at a zero: by u, and by ln w."""
-    _, slopes = coefficients_at(f, zero.u)
-    a, _ = coefficients_at(f, zero.u)
-    rows, along = _rows(f, zero.branch, np.array([zero.x]))
+    a, slopes = coefficients_at(f, zero.u)
+    rows, along = rows_and_slopes(f, zero.branch, np.array([zero.x]))
     by_x = complex((along @ a)[0]) * (-1 if zero.branch else 1)
     return np.asarray((rows @ slopes.T)[0]), by_x
