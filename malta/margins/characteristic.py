@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any
 
@@ -26,6 +26,8 @@ from malta.margins.loop import A, B, C, D, E, Group, Loop, divided
 from malta.margins.majorant import coefficient_bounds
 from malta.margins.minors import Minors, minors
 
+MOST = 50_000  # places that are remembered
+
 
 @dataclass(frozen=True, eq=False)
 class Characteristic:
@@ -34,7 +36,6 @@ class Characteristic:
     loop: Loop
     group: Group
     names: tuple[str, ...]
-    _seen: dict[Any, Any] = field(default_factory=dict, repr=False)
 
     @property
     def foreign(self) -> tuple[str, ...]:
@@ -131,29 +132,34 @@ class Characteristic:
         Raises NotAnalytic where the matrices have no value there.
         """
         p = [1 / x if inverted else x for x, inverted in zip(v, self.inverted, strict=True)]
-        rational = self.loop.program.rational
-        entries = self.loop.program.run(p if rational else [arb(x) for x in p], EXACT if rational else POINTS)
-        if self.exact:
-            scale = _multiplier(self.loop, self.group, p)
-            return [c * scale for c in self._mapped(self._coefficients(entries, fmpq_mat, v))]
-        if rational:
-            entries = [[(i, j, arb(x)) for i, j, x in matrix] for matrix in entries]
-        return self._mapped(self._coefficients(entries, arb_mat, v))
+        a = self._mapped(self._coefficients(p, fmpq_mat if self.exact else arb_mat))
+        if not self.exact:
+            return a
+        scale = _multiplier(self.loop, self.group, p)
+        return [c * scale for c in a]
 
-    def _coefficients(
-        self, entries: list[list[tuple[int, int, Any]]], matrix: Any, v: Sequence[Any]
-    ) -> list[Any]:
+    def _coefficients(self, p: list[Any], matrix: Any) -> list[Any]:
         if self.minors is None:
-            driven, factor = parts(self.loop, self.group, entries, matrix)
+            driven, factor = parts(self.loop, self.group, self._entries(p), matrix)
             return [c * factor for c in coefficients(closed_loop(*driven))]
-        key = (ctx.prec, *(v[i] for i in self._of_plant))
-        if key not in self._seen:
-            if len(self._seen) > 50_000:
-                self._seen.clear()
-            self._seen[key] = self.minors.plant(entries, matrix)
-        found = self.minors.joined(self._seen[key], self.minors.forces(entries, matrix), matrix)
+        known, place = self.minors.known, (ctx.prec, tuple(p))
+        if place not in known:
+            if len(known) > MOST:
+                known.clear()
+            entries, own = self._entries(p), (ctx.prec, *(p[i] for i in self._of_plant))
+            if own not in known:
+                known[own] = self.minors.plant(entries, matrix)
+            known[place] = known[own], self.minors.forces(entries, matrix)
+        pi, beta = known[place]
+        found = self.minors.joined(pi, beta, matrix)
         zero = 0 * found[0]
         return found + [zero] * (self.minors.degree + 1 - len(found))
+
+    def _entries(self, p: list[Any]) -> list[list[tuple[int, int, Any]]]:
+        if not self.loop.program.rational:
+            return self.loop.program.run([arb(x) for x in p], POINTS)
+        entries = self.loop.program.run(p, EXACT)
+        return entries if self.exact else [[(i, j, arb(x)) for i, j, x in matrix] for matrix in entries]
 
     @cached_property
     def _of_plant(self) -> tuple[int, ...]:
@@ -267,12 +273,14 @@ class Characteristic:
 
         Raises NotAnalytic where the matrices are not analytic on them.
         """
-        entries = self._balls(v)
         if self.minors is None:
-            size = majorant_matrix(self.loop, self.group, entries)
+            size = majorant_matrix(self.loop, self.group, self._balls(v))
             product = coefficient_bounds(size, np.ones(len(size)))
         else:
-            product = self.minors.majorant(entries)
+            known, where = self.minors.known, tuple(_ends_of(x) for x in v)
+            if where not in known:
+                known[where] = self.minors.sizes(self._balls(v))
+            product = self.minors.majorant(known[where])
         return [pair(c) for c in (outward(product) if self.discrete else product)]
 
 
@@ -284,6 +292,11 @@ def outward(product: list[Any]) -> list[Any]:
         for j in range(n - k + 1):
             turned[k + j] += c * (2**k * math.comb(n - k, j))
     return turned
+
+
+def _ends_of(x: Any) -> tuple[Any, ...]:
+    """A complex ball as numbers that compare."""
+    return tuple(part.man_exp() for one in (x.real, x.imag) for part in (one.mid(), one.rad()))
 
 
 def pair(c: Any) -> tuple[float, int]:

@@ -84,8 +84,8 @@ def _begun(f: Family, g: Growth, branch: int, x: complex, u: FloatArray) -> _Pla
     if x == 0:
         return _followed(f, g, branch, 0.0, u)
     for _ in range(12):
-        here = _followed(f, g, branch, x, u)
-        if here is not None and abs(np.log(here.x / x)) < NEAR:
+        here = _followed(f, g, branch, x, u, NEAR)
+        if here is not None:
             return here
         a, slopes = coefficients_at(f, u)
         rows, along = rows_and_slopes(f, branch, x)
@@ -95,14 +95,16 @@ def _begun(f: Family, g: Growth, branch: int, x: complex, u: FloatArray) -> _Pla
         place = _Place(x, u, t, float((turn * value).real), (turn * moved).real)
         found = _reached(f, g, place, 0.5)
         if found is None:
-            return here
+            return None
         u = np.clip(u + found[2], 0, 1)
         x *= float(np.exp(np.clip(-((value + moved @ found[2]) / turned).real, -0.5, 0.5)))
-    return here
+    return None
 
 
-def _followed(f: Family, g: Growth, branch: int, x: complex, u: FloatArray) -> _Place | None:
-    """The root next to x at u, by Newton's method in ln x; None where it does not settle."""
+def _followed(
+    f: Family, g: Growth, branch: int, x: complex, u: FloatArray, far: float = FAR
+) -> _Place | None:
+    """The root next to x at u, by Newton's method in ln x, which changes by `far` at most; None where there is none."""
     a, slopes = coefficients_at(f, u)
     t = float(g.margin(g.parameters(u)))
     if x == 0:
@@ -115,7 +117,7 @@ def _followed(f: Family, g: Growth, branch: int, x: complex, u: FloatArray) -> _
         rows, along = rows_and_slopes(f, branch, complex(x))
         turned = complex((along @ a)[0])
         step = complex((rows @ a)[0]) / turned if turned else np.inf
-        if not np.isfinite(step) or abs(np.log(x / first)) > FAR:
+        if not np.isfinite(step) or abs(np.log(x / first)) > far:
             return None
         x = x * np.exp(-step if abs(step) < 0.5 else -0.5 * step / abs(step))
         if abs(step) < 1e-9:  # the next one would be below rounding

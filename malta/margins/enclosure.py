@@ -187,12 +187,13 @@ class Disc(NamedTuple):
 def _discs(
     f: Polynomial, i: int, low: list[Any], high: list[Any], size: list[tuple[float, int]]
 ) -> list[Disc]:
-    """Bounds over growing discs along one parameter, as far as the matrices are analytic.
+    """Bounds over discs along one parameter on which the matrices are analytic, from the largest on.
 
     Raises TooWide where they are not even a little beyond the side.
     """
     found: list[Disc] = []
-    for radius in RADII:
+    refused = NotAnalytic("no disc about its range")
+    for radius in reversed(RADII):  # the largest that there is leaves out the least, mostly
         balls = []
         for k, (a, b) in enumerate(zip(low, high, strict=True)):
             middle, half = arb((a + b) / 2), arb((b - a) / 2)
@@ -204,22 +205,29 @@ def _discs(
         try:
             most = f.majorant(balls)
         except NotAnalytic as error:
-            if not found:
-                raise TooWide(i, f"{f.names[i]}: {error}") from error
+            refused = error
+            continue
+        share = max(_log2(m) - _log2(s) for m, s in zip(most, size, strict=True) if s[0] > 0)
+        found.append(Disc(radius, share, most))
+        if len(found) > 2 and _degree(found[-1], TAILS[0]) > _degree(found[-3], TAILS[0]):
             break
-        found.append(
-            Disc(radius, max(_log2(m) - _log2(s) for m, s in zip(most, size, strict=True) if s[0] > 0), most)
-        )
+    if not found:
+        raise TooWide(i, f"{f.names[i]}: {refused}") from refused
     return found
+
+
+def _degree(disc: Disc, tail: float) -> int:
+    """The lowest degree that leaves out no more than this by a disc's bound."""
+    return math.ceil((disc.share + 3 - math.log2(disc.radius - 1) - math.log2(tail)) / math.log2(disc.radius))
 
 
 def _interpolated(name: str, axis: int, discs: list[Disc], tail: float) -> Side:
     """The lowest degree whose tail is small enough, by any of the discs; or the smallest tail there is."""
     best, best_rank = None, (True, 0, math.inf)
-    for radius, share, most in discs:
+    for disc in discs:
+        radius, share, most = disc
         rest = share + 3 - math.log2(radius - 1)
-        wanted = math.ceil((rest - math.log2(tail)) / math.log2(radius))
-        degree = max(1, min(wanted, HIGHEST))
+        degree = max(1, min(_degree(disc, tail), HIGHEST))
         left = rest - degree * math.log2(radius)
         enough = left <= math.log2(tail)
         rank = (not enough, degree if enough else 0, left)

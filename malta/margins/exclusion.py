@@ -211,9 +211,11 @@ def on_boxes(
     unique, index = np.unique(cells, axis=0, return_inverse=True)
     with np.errstate(over="ignore", invalid="ignore"):
         e: Expansion = expand(f, unique, like)
-        index = index.ravel()
-        terms = [np.asarray(restrict(t[index], f.shape, boxes)) for t in e.terms]
-    return terms, e.radius[index]
+        index, count = index.ravel(), len(e.terms)
+        together = np.stack(e.terms, axis=1)[index].reshape(len(index), -1)  # one more axis, which is not cut
+        whole = np.concatenate([np.broadcast_to([0.0, 1.0], (len(index), 1, 2)), boxes], axis=1)
+        cut = restrict(together, (count, *f.shape), whole).reshape(len(index), count, -1)
+    return list(np.moveaxis(cut, 1, 0)), e.radius[index]
 
 
 def _expanded(s: Search, cells: FloatArray, boxes: FloatArray) -> Beside:

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from malta.plant import FloatArray
 
 EPS = 2.0**-52
+FEW = 6  # degree up to which a restriction is one product of matrices
 
 
 @dataclass(frozen=True, eq=False)
@@ -274,12 +275,28 @@ def restriction(degree: int, low: FloatArray, high: FloatArray) -> FloatArray:
 
     Row i holds the blossom at (d - i) times low and i times high.
     """
+    if degree <= FEW:
+        j, rest, k, left, weights = _blossoms(degree)
+        powers = [np.power(x[:, None], np.arange(degree + 1)) for x in (low, 1 - low, high, 1 - high)]
+        terms = powers[0][:, j] * powers[1][:, rest] * powers[2][:, k] * powers[3][:, left]
+        return np.asarray((terms @ weights).reshape(-1, degree + 1, degree + 1))
     M = np.zeros((len(low), degree + 1, degree + 1))
     for i in range(degree + 1):
         a, b = basis(degree - i, low), basis(i, high)
         for j in range(degree - i + 1):
             M[:, i, j : j + i + 1] += a[:, j, None] * b
     return M
+
+
+@lru_cache(maxsize=FEW + 1)
+def _blossoms(degree: int) -> tuple[Any, ...]:
+    """Powers of low, 1 - low, high, 1 - high in each term, and the terms' weights in each entry: terms x entries."""
+    terms = [(i, j, k) for i in range(degree + 1) for j in range(degree - i + 1) for k in range(i + 1)]
+    i, j, k = np.array(terms).T
+    weights = np.zeros((len(terms), (degree + 1) ** 2))
+    for n, (row, a, b) in enumerate(terms):
+        weights[n, row * (degree + 1) + a + b] = math.comb(degree - row, a) * math.comb(row, b)
+    return j, degree - i - j, k, i - k, weights
 
 
 def restrict(values: Any, shape: tuple[int, ...], boxes: FloatArray) -> Any:

@@ -8,7 +8,7 @@ Couplings that are zero as expressions, with exact numbers, split the loop; thos
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import casadi as ca
@@ -35,13 +35,10 @@ class Loop:
     law: Compensator
     program: Program
 
-    @cached_property
+    @property
     def symbolic(self) -> Symbolic | None:
         """None where the expressions are too large to be written out."""
-        try:
-            return symbolic(self.program)
-        except (TooLarge, NotAnalytic):
-            return None
+        return _symbolic(self.program)
 
     @property
     def states(self) -> int:
@@ -107,7 +104,20 @@ def loop_of(system: UncertainSystem, law: Compensator) -> Loop:
     if system.sample_time is not None and law.sample_time != system.sample_time:
         found = "a continuous compensator" if law.sample_time is None else f"{law.sample_time:g} s"
         raise InputError("compensator", "sample_time", found, f"that of the system, {system.sample_time:g} s")
-    return Loop(system, law, program(f))
+    return Loop(system, law, _program(system))
+
+
+@lru_cache(maxsize=32)  # laws change, the system stays; records compare by identity
+def _program(system: UncertainSystem) -> Program:
+    return program(system.matrices)
+
+
+@lru_cache(maxsize=32)
+def _symbolic(program: Program) -> Symbolic | None:
+    try:
+        return symbolic(program)
+    except (TooLarge, NotAnalytic):
+        return None
 
 
 def groups(loop: Loop) -> list[Group]:

@@ -27,15 +27,21 @@ def coefficient_bounds(m: FloatArray, roots: FloatArray) -> list[Any]:
 
     Raises NotAnalytic where numbers overflow.
     """
+    return all_bounds(m[None], roots)[0]
+
+
+def all_bounds(m: FloatArray, roots: FloatArray) -> list[list[Any]]:
+    """`coefficient_bounds` of several matrices: rows x n x n."""
     if not np.isfinite(m).all():
         raise NotAnalytic("numbers that overflow")
-    count, positive = int(roots.sum()), m[m > 0]
-    low = math.log2(float(positive.min(initial=1.0))) - 2
-    high = math.log2(float(positive.max(initial=1.0))) + 3 + math.log2(max(len(m), 1))
-    rho = np.exp2(np.linspace(max(low, -400), min(high, 400), 28))
-    heights = _heights(m[None] + rho[:, None, None] * np.diag(roots)[None])
-    logs = (heights[:, None] - np.arange(count + 1) * np.log2(rho)[:, None]).min(axis=0)
-    return [power_of_two(x) for x in logs.tolist()]
+    count, n = int(roots.sum()), m.shape[1]
+    low = np.log2(np.where(m > 0, m, np.inf).min(axis=(1, 2), initial=1.0)) - 2
+    high = np.log2(m.max(axis=(1, 2), initial=1.0)) + 3 + math.log2(max(n, 1))
+    rho = np.exp2(np.linspace(np.maximum(low, -400), np.minimum(high, 400), 28, axis=1))
+    full = m[:, None] + rho[:, :, None, None] * np.diag(roots)
+    heights = _heights(full.reshape(-1, n, n)).reshape(rho.shape)
+    logs = (heights[:, :, None] - np.arange(count + 1) * np.log2(rho)[:, :, None]).min(axis=1)
+    return [[power_of_two(x) for x in row] for row in logs.tolist()]
 
 
 def power_of_two(x: float) -> Any:

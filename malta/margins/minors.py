@@ -11,8 +11,8 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import dataclass
-from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from functools import cached_property, lru_cache
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from flint import acb_mat, arb, arb_mat, arb_poly, fmpq_mat, fmpq_poly
@@ -27,9 +27,9 @@ from malta.margins.closed import (
     rows_of,
     solved,
 )
-from malta.margins.expressions import exact
+from malta.margins.expressions import Program, exact
 from malta.margins.loop import A, B, C, E, Group, Loop, rational, upper
-from malta.margins.majorant import coefficient_bounds
+from malta.margins.majorant import all_bounds, coefficient_bounds
 
 if TYPE_CHECKING:
     from malta.plant import FloatArray
@@ -167,26 +167,64 @@ class Minors:
             + (len(self.rows) if law.lag is not None else 0) + self.order * law.delay
         )  # fmt: skip
 
-    def majorant(self, entries: list[list[tuple[int, int, Any]]]) -> list[Any]:
-        """At least the coefficients (of s or g) of each power, from balls of the entries."""
+    def sizes(self, entries: list[list[tuple[int, int, Any]]]) -> Sizes:
+        """Bounds of the system's minors from balls of the entries."""
         a, b, c, diagonal = _sizes(self, entries)
-        r = len(self.rows)
         a, into, c, _ = driven_bounds(self.loop, (a, np.eye(len(a))[:, list(self.rows)], c, None), diagonal)
-        result = _product(_bound(a, None, None), _absolute(self.balls[0][(), ()]))
+        pi: dict[Pair, Any] = {((), ()): coefficient_bounds(a, np.ones(len(a)))}
         for k in range(1, self.order + 1):
-            for S in itertools.combinations(range(len(self.outputs)), k):
-                names = tuple(self.outputs[s] for s in S)
-                for R in itertools.combinations(range(r), k):
-                    pi = _bound(a, into[:, list(R)], c[list(S)])
-                    weight: list[Any] = []
-                    for T in itertools.combinations(self.inputs, k):
-                        part = b[np.ix_(R, [self.inputs.index(t) for t in T])]
-                        size = float(np.prod(part.sum(axis=1))) * (1 + 1e-9)
-                        if size:
-                            weight = _sum(weight, [arb(size) * x for x in _absolute(self.balls[0][T, names])])
-                    if weight:
-                        result = _sum(result, _product(pi, weight))
+            places = [
+                (S, R)
+                for S in itertools.combinations(range(len(self.outputs)), k)
+                for R in itertools.combinations(range(len(self.rows)), k)
+            ]
+            pi |= zip(places, _bounds(a, [(into[:, list(R)], c[list(S)]) for S, R in places]), strict=True)
+        beta = {
+            (R, T): float(np.prod(b[np.ix_(R, [self.inputs.index(t) for t in T])].sum(axis=1))) * (1 + 1e-9)
+            for k in range(1, self.order + 1)
+            for R in itertools.combinations(range(len(self.rows)), k)
+            for T in itertools.combinations(self.inputs, k)
+        }
+        return Sizes(pi, beta)
+
+    def majorant(self, sizes: Sizes) -> list[Any]:
+        """At least the coefficients (of s or g) of each power."""
+        result: list[Any] = []
+        for (S, R), pi in sizes.pi.items():
+            names = tuple(self.outputs[s] for s in S)
+            weight = [] if R else self._absolute[(), ()]
+            for T in itertools.combinations(self.inputs, len(R)) if R else ():
+                if sizes.beta[R, T]:
+                    weight = _sum(weight, [arb(sizes.beta[R, T]) * x for x in self._absolute[T, names]])
+            if weight:
+                result = _sum(result, _product(pi, weight))
         return result
+
+    @cached_property
+    def _absolute(self) -> dict[Pair, list[Any]]:
+        return {pair: [arb(abs(x)) for x in p.coeffs()] for pair, p in self.balls[0].items()}
+
+    @property
+    def known(self) -> dict[Any, Any]:
+        """What was found of the system at places and on discs: the compensator has no part in it."""
+        g, law = self.group, self.loop.law
+        return _known(
+            self.loop.program, g.states, self.rows, self.inputs, self.outputs,
+            (law.sample_time, law.lag, self.loop.sampled),
+        )  # fmt: skip
+
+
+@lru_cache(maxsize=64)  # laws change, the system stays
+def _known(program: Program, *of: Any) -> dict[Any, Any]:
+    del program, of
+    return {}
+
+
+class Sizes(NamedTuple):
+    """Bounds of the coefficients of pi_SR, and of beta_RT."""
+
+    pi: dict[Pair, Any]
+    beta: dict[Pair, float]
 
 
 def minors(loop: Loop, g: Group) -> Minors | None:
@@ -274,16 +312,11 @@ def _sizes(
     return size(n, n, a_balls), size(n, len(u), b_balls)[list(m.rows)], c, diagonal
 
 
-def _bound(a: FloatArray, b: FloatArray | None, c: FloatArray | None) -> list[Any]:
-    """Above the coefficients of det [[g - A, B], [C, 0]], from entrywise bounds."""
-    n, m = len(a), a
-    if b is not None and c is not None:
-        m = np.block([[a, b], [c, np.zeros((len(c), len(c)))]])
-    return coefficient_bounds(m, np.where(np.arange(len(m)) < n, 1.0, 0.0))
-
-
-def _absolute(p: Any) -> list[Any]:
-    return [arb(abs(x)) for x in p.coeffs()]
+def _bounds(a: FloatArray, sides: list[tuple[FloatArray, FloatArray]]) -> list[list[Any]]:
+    """Above the coefficients of det [[g - A, B], [C, 0]], from entrywise bounds of A and of each B and C."""
+    k = len(sides[0][1])
+    m = np.array([np.block([[a, b], [c, np.zeros((k, k))]]) for b, c in sides])
+    return all_bounds(m, np.where(np.arange(m.shape[1]) < len(a), 1.0, 0.0))
 
 
 def _product(one: list[Any], two: list[Any]) -> list[Any]:

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 import time as clock
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 from weakref import WeakKeyDictionary
@@ -19,8 +17,9 @@ from malta.margins.characteristic import pair
 from malta.margins.descent import from_cell, nearest
 from malta.margins.enclosure import TooWide, Unproven, over_box, precision
 from malta.margins.exclusion import Growth, Search, advance, growth_over, start
-from malta.margins.expressions import NotAnalytic, exact
+from malta.margins.expressions import exact
 from malta.margins.family import Family, narrowed
+from malta.margins.poles import first_loss, loss_of_one
 from malta.margins.problem import Polynomial, Problem, hurwitz
 from malta.margins.robust import Certificate, Margin, Progress
 from malta.margins.witness import Zero, gradients, starts
@@ -159,13 +158,13 @@ class Job:
 
     def search(self) -> tuple[list[Part], float]:
         """Families over a box that holds the nearest witness found, or all there is to look at."""
-        parts, reach, done, refused = [], min(self.limit, FIRST), 0.0, math.inf
+        parts, reach, done, refused = [], self._first(), 0.0, math.inf
         why, begun = "", clock.monotonic()
         while True:
             spent = clock.monotonic() - begun
             now = clock.monotonic()
             last = now + 0.3 * (self.until - now)
-            if done:
+            if done or FIRST < reach >= self.limit:
                 last = min(last, now + max(BRIEF, 2 * spent))
             try:
                 found = self.parts(reach, min(self.until, last))
@@ -173,7 +172,7 @@ class Job:
                 refused, why = reach, str(error)
                 if self.late() or reach < 1e-3 or (done and spent > DEAR):
                     break
-                reach = done + 0.6 * (reach - done) if done else 0.5 * reach
+                reach = done + 0.6 * (reach - done) if done else FIRST if reach > 2 * FIRST else 0.5 * reach
             else:
                 parts, done = found, reach
                 for part in parts:
@@ -198,6 +197,11 @@ class Job:
             done = 1.05 * self.upper
             parts = self.parts(done, self.until)
         return parts, done
+
+    def _first(self) -> float:
+        """The first box: of a single parameter a little beyond where the poles are lost, or all there is to look at."""
+        t = loss_of_one(self.problem, self.box, self.limit)
+        return min(self.limit, FIRST if t is None else 1.02 * t)
 
     def _descend(self, part: Part) -> None:
         misses = 0
@@ -434,40 +438,3 @@ def _together(one: Part, two: Part) -> Part | None:
         return None
     radius = np.maximum(f.radius, g.radius + apart * (1 + 1e-9))
     return Part(one.of, one.sides, Family(f.shape, f.values, radius, f.exponents, f.scale), one.growth)
-
-
-def first_loss(problem: Problem, box: Box, reach: float) -> tuple[float, float | None, FloatArray | None]:
-    """t, w, p at the first loss of stability along the diagonals of the box, by the poles; or infinity."""
-    free = [i for i in range(len(box.names)) if box.down[i] + box.up[i] > 0]
-    signs = np.array(list(itertools.islice(itertools.product((-1, 1), repeat=len(free)), 256)))
-    best: tuple[float, float | None, FloatArray | None] = (math.inf, None, None)
-    for place in box.standing()[:27]:
-        for sign in signs:
-            d = np.zeros(len(box.names))
-            d[free] = np.where(sign > 0, box.up[free], -box.down[free])
-            t = _along(problem, place, d, min(reach, best[0]))
-            if t < best[0]:
-                p = place + t * d
-                best = (t, problem.critical(p), p)
-    return best
-
-
-def _along(problem: Problem, p: FloatArray, d: FloatArray, reach: float) -> float:
-    """The first t of a grid up to reach at which p + t d is unstable, bisected; infinite where there is none."""
-
-    def unstable(t: Sequence[float] | FloatArray) -> FloatArray:
-        try:
-            return np.asarray(problem.instability(p + np.asarray(t)[:, None] * d) >= 0)
-        except (CheckError, np.linalg.LinAlgError, NotAnalytic):
-            return np.zeros(len(t), dtype=bool)
-
-    grid = np.unique(np.concatenate([np.geomspace(1e-3, 1, 24) * reach, np.linspace(0, reach, 41)[1:]]))
-    bad = unstable(grid)
-    if not bad.any():
-        return math.inf
-    k = int(bad.argmax())
-    low, high = (grid[k - 1] if k else 0.0), grid[k]
-    for _ in range(40):
-        middle = (low + high) / 2
-        low, high = (low, middle) if unstable([middle])[0] else (middle, high)
-    return float(high)

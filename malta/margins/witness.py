@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 STEPS = 8  # of the frequency grid in an octave
 SPACING = 0.6 / STEPS  # half a step and more, in ln w
+HALVINGS = 6  # of the way to a corner, of which the descent follows the rest
 ENDS = ((0, 0.0), (1, 0.0))  # w = 0 and w = infinity
 
 
@@ -144,7 +145,7 @@ def _corners(f: Family, g: Growth, most: int) -> list[tuple[float, int, float, F
         if _worst_root(f, end)[0] <= 0:
             continue
         low, high = 0.0, 1.0
-        for _ in range(14):
+        for _ in range(HALVINGS):
             middle = (low + high) / 2
             low, high = (
                 (low, middle) if _worst_root(f, start + middle * (end - start))[0] > 0 else (middle, high)
