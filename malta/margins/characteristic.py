@@ -143,14 +143,16 @@ class Characteristic:
             driven, factor = parts(self.loop, self.group, self._entries(p), matrix)
             return [c * factor for c in coefficients(closed_loop(*driven))]
         known, place = self.minors.known, (ctx.prec, tuple(p))
-        if place not in known:
+        pi, beta = known.get(place, (None, None))
+        if beta is None:
             if len(known) > MOST:
                 known.clear()
             entries, own = self._entries(p), (ctx.prec, *(p[i] for i in self._of_plant))
-            if own not in known:
-                known[own] = self.minors.plant(entries, matrix)
-            known[place] = known[own], self.minors.forces(entries, matrix)
-        pi, beta = known[place]
+            pi = known.get(own)
+            if pi is None:
+                known[own] = pi = self.minors.plant(entries, matrix)
+            beta = self.minors.forces(entries, matrix)
+            known[place] = pi, beta
         found = self.minors.joined(pi, beta, matrix)
         zero = 0 * found[0]
         return found + [zero] * (self.minors.degree + 1 - len(found))

@@ -38,15 +38,15 @@ class _Place(NamedTuple):
 
 def nearest(f: Family, g: Growth, branch: int, x: float, u: FloatArray, below: float) -> Zero | None:
     """Descend to a zero of f of smallest t from a start; None where none is found with t below `below`."""
-    here = _begun(f, g, branch, x, u)
-    trust, best = 0.5, None
+    here = _begun(f, g, branch, x, u, below)
+    trust, widest, best = 0.5, 1.0, None
     for k in range(MOST if here is not None else 0):
         assert here is not None
         found = _reached(f, g, here, trust)
         if found is None:  # nothing within the trust region solves the equation
-            if trust >= 1:
+            if trust >= widest:
                 break
-            trust = min(2 * trust, 1.0)
+            trust = min(2 * trust, widest)
             continue
         t, cost, du = found
         left = here.t + cost * abs(here.value) - t
@@ -60,11 +60,11 @@ def nearest(f: Family, g: Growth, branch: int, x: float, u: FloatArray, below: f
             if zero is not None and left <= CLOSE * here.t:
                 break
         if there is None or gain < 0.1 * left:
-            trust = min(trust, float(np.abs(du).max(initial=0.0))) / 3
+            trust = widest = min(trust, float(np.abs(du).max(initial=0.0))) / 3
             if trust < 1e-8:
                 break
             continue
-        here = there
+        here, widest = there, 1.0
         if gain > 0.6 * left:
             trust = min(2 * trust, 1.0)
     return best if best is None or best.t < below else None
@@ -79,7 +79,7 @@ def _settled(f: Family, branch: int, here: _Place) -> Zero | None:
     return Zero(here.t, branch, x, here.u) if small else None
 
 
-def _begun(f: Family, g: Growth, branch: int, x: complex, u: FloatArray) -> _Place | None:
+def _begun(f: Family, g: Growth, branch: int, x: complex, u: FloatArray, below: float) -> _Place | None:
     """The root next to x, where it is next to the boundary; or one that the linearized equation leads to."""
     if x == 0:
         return _followed(f, g, branch, 0.0, u)
@@ -94,7 +94,7 @@ def _begun(f: Family, g: Growth, branch: int, x: complex, u: FloatArray) -> _Pla
         t = float(g.margin(g.parameters(u)))
         place = _Place(x, u, t, float((turn * value).real), (turn * moved).real)
         found = _reached(f, g, place, 0.5)
-        if found is None:
+        if found is None or found[0] > below:
             return None
         u = np.clip(u + found[2], 0, 1)
         x *= float(np.exp(np.clip(-((value + moved @ found[2]) / turned).real, -0.5, 0.5)))

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import casadi as ca
@@ -35,6 +35,7 @@ class NotAnalytic(Exception):
     """An operation that has no value, or is not analytic, where it was asked for."""
 
 
+@lru_cache(maxsize=4096)  # constants of programs, and gains, are asked for at every place
 def exact(x: float) -> Any:
     """The rational number that a float is."""
     if not abs(x) < float("inf"):
@@ -84,7 +85,13 @@ class Program:
         """What each step makes of p."""
         cells: list[Any] = []
         for name, target, operands, value in self.steps:
-            if name == "input":
+            if name == "mul":  # nine of ten steps are these
+                cells.append(cells[operands[0]] * cells[operands[1]])
+            elif name == "add":
+                cells.append(cells[operands[0]] + cells[operands[1]])
+            elif name == "sub":
+                cells.append(cells[operands[0]] - cells[operands[1]])
+            elif name == "input":
                 cells.append(p[target])
             elif name == "const":
                 cells.append(field.constant(value))

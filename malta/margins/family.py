@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from malta.plant import FloatArray
 
 EPS = 2.0**-52
+WIDE = 8  # nodes of the axes that follow, from which on they are multiplied where they stand
 FEW = 6  # degree up to which a restriction is one product of matrices
 
 
@@ -88,6 +89,9 @@ def binary(x: Any) -> tuple[float, float, int]:
     if hasattr(x, "rad"):
         if not x.is_finite():
             return 0.0, math.inf, 0
+        value = float(x)  # the middle, to the last digit
+        if 1e-280 < abs(value) < 1e280:
+            return value, float(x.rad()) * (1 + EPS) + abs(value) * EPS, 0
         m, e = (int(v) for v in x.mid().man_exp())
         shift = m.bit_length() - 60 if m else 0
         value = float(m >> shift if shift > 0 else m)
@@ -301,16 +305,18 @@ def _blossoms(degree: int) -> tuple[Any, ...]:
 
 def restrict(values: Any, shape: tuple[int, ...], boxes: FloatArray) -> Any:
     """Cells x nodes over [0, 1]^P -> over each cell's box (cells x P x 2)."""
+    cells, before = len(values), 1
     for axis, count in enumerate(shape):
-        if count == 1:
-            continue
         low, high = boxes[:, axis, 0], boxes[:, axis, 1]
-        if (low == 0).all() and (high == 1).all():
-            continue
-        M = restriction(count - 1, low, high)
-        array = np.moveaxis(values.reshape(len(values), *shape), axis + 1, -1)
-        flat = array.reshape(len(values), -1, count)
-        values = np.moveaxis((flat @ M.swapaxes(1, 2)).reshape(array.shape), -1, axis + 1).reshape(
-            len(values), -1
-        )
+        if count > 1 and not ((low == 0).all() and (high == 1).all()):
+            M = restriction(count - 1, low, high)
+            array = values.reshape(cells, before, count, -1)
+            if array.shape[3] >= WIDE:  # nothing needs to be moved
+                flat = np.ascontiguousarray(array).view(float)
+                values = (M[:, None] @ flat).view(values.dtype)
+            else:
+                flat = array.swapaxes(2, 3).reshape(cells, -1, count) @ M.swapaxes(1, 2)
+                values = flat.reshape(cells, before, -1, count).swapaxes(2, 3)
+            values = values.reshape(cells, -1)
+        before *= count
     return values

@@ -129,19 +129,22 @@ class Minors:
         return a, c, factor
 
     def forces(self, entries: list[list[tuple[int, int, Any]]], matrix: Any) -> dict[Pair, Any]:
-        """beta_RT at given p."""
+        """beta_RT at given p, where they are not zero by their entries."""
         x = {state: k for k, state in enumerate(self.group.states)}
         n, u = len(x), {t: k for k, t in enumerate(self.inputs)}
-        b = dense(matrix, n, len(u), ((x[i], u[j], r) for i, j, r in entries[B] if i in x and j in u))
+        own = {(x[i], u[j]): r for i, j, r in entries[B] if i in x and j in u}
         if self.loop.descriptor:
             e = dense(matrix, n, n, ((x[i], x[j], r) for i, j, r in entries[E] if i in x and j in x))
-            b = solved(e, b)
+            b = solved(e, dense(matrix, n, len(u), ((*at, r) for at, r in own.items())))
+            own = {(i, j): b[i, j] for i in range(n) for j in range(len(u))}
         found: dict[Pair, Any] = {}
         for k in range(1, self.order + 1):
             for R in itertools.combinations(range(len(self.rows)), k):
                 for T in itertools.combinations(self.inputs, k):
-                    part = [[b[self.rows[i], u[t]] for t in T] for i in R]
-                    found[R, T] = _determinant(part)
+                    part = [[own.get((self.rows[i], u[t])) for t in T] for i in R]
+                    det = _determinant(part)
+                    if det is not None:
+                        found[R, T] = det
         return found
 
     def joined(self, pi: dict[Pair, Any], beta: dict[Pair, Any], matrix: Any) -> list[Any]:
@@ -154,9 +157,11 @@ class Minors:
             names = tuple(self.outputs[s] for s in S)
             part = None
             for T in itertools.combinations(self.inputs, len(R)):
-                term = kappa[T, names] * beta[R, T]
-                part = term if part is None else part + term
-            total = total + p * part
+                if (R, T) in beta:
+                    term = kappa[T, names] * beta[R, T]
+                    part = term if part is None else part + term
+            if part is not None:
+                total = total + p * part
         return list(total.coeffs())
 
     @property
@@ -246,12 +251,15 @@ def minors(loop: Loop, g: Group) -> Minors | None:
 
 
 def _determinant(m: list[list[Any]]) -> Any:
+    """By the first row; None stands for zero."""
     if len(m) == 1:
         return m[0][0]
     total = None
     for j, entry in enumerate(m[0]):
-        part = entry * _determinant([row[:j] + row[j + 1 :] for row in m[1:]])
-        part = -part if j % 2 else part
+        rest = None if entry is None else _determinant([row[:j] + row[j + 1 :] for row in m[1:]])
+        if rest is None:
+            continue
+        part = -(entry * rest) if j % 2 else entry * rest
         total = part if total is None else total + part
     return total
 
