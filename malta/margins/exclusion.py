@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 GUARD = 1e-9  # rad that a half plane must have to spare
 BATCH = 1024
+NARROW = 1e-4  # of an interval of frequency, whose expansion leaves out less than rounding
+HOPELESS = 0.1  # variation of f on a cell, in radii, below which smaller cells exclude no more
 STUCK = 14  # splits beyond the first of a cell that holds a candidate for the witness
 
 
@@ -129,6 +131,8 @@ class Search:
     beside: Callable[[FloatArray, FloatArray], Beside] | None = (
         None  # f by more than its family, on cells and boxes
     )
+    # the smallest t of a cell that no splitting frees of zero, as the radius is larger than f
+    blocked: float = np.inf
     done: list[tuple[FloatArray, FloatArray, ComplexArray]] = field(default_factory=list)
 
     @property
@@ -200,8 +204,17 @@ def advance(s: Search) -> None:
         s.done.append((cells[good], boxes[good], c[good]))
     bad = ~good
     if bad.any():
+        narrow = cells[:, 2] - cells[:, 1] < NARROW * cells[:, 2]  # the radius is not the expansion's
+        hopeless = bad & narrow & (_spread(terms) < HOPELESS * radius)
+        s.blocked = min(s.blocked, float(s.growth.smallest(boxes[hopeless]).min(initial=np.inf)))
         kept = Beside([t[bad] for t in terms], radius[bad], found.discs[bad], [m[bad] for m in found.moves])
         _split(s, cells[bad], boxes[bad], depth[bad], kept)
+
+
+def _spread(terms: list[ComplexArray]) -> FloatArray:
+    """How far f varies on each cell, about."""
+    b0 = terms[0]
+    return np.asarray(np.abs(b0 - b0[:, :1]).max(axis=1) + sum(np.abs(t).max(axis=1) for t in terms[1:]))
 
 
 def on_boxes(
@@ -259,9 +272,10 @@ def _split(
     """Each cell in two, across what moves f most: frequency, a parameter, or what acts beside them."""
     shape, terms, radius = s.family.shape, found.terms, found.radius
     count = terms[0].shape[1]
-    width = (
-        np.abs(terms[1]).sum(axis=1) + sum(2 * np.abs(t).sum(axis=1) for t in terms[2:]) + 2 * radius * count
-    )
+    width = np.abs(terms[1]).sum(axis=1) + sum(2 * np.abs(t).sum(axis=1) for t in terms[2:])
+    width = width + np.minimum(
+        2 * radius * count, width
+    )  # what no interval of frequency makes smaller is not its own
     moves = [np.where(np.isfinite(width), width, np.inf)]
     values = terms[0].reshape(-1, *shape)
     for axis, size in enumerate(shape):

@@ -35,7 +35,7 @@ FINEST = 3e-7  # how close, relative
 DEAR = 3.0  # s that families take beyond which their boxes grow in small steps
 BRIEF = 0.5  # s that a wider box may take at least
 PATIENCE = 20_000  # cells without progress after which the proof is given up
-REMEMBERED = 24  # families of a polynomial over boxes
+REMEMBERED = 4_000_000  # numbers in the families of a polynomial, beyond which the oldest are forgotten
 HARD = 4000  # cells after which smaller boxes are proven first
 LEVELS = 5  # of these boxes, each half of the next
 PATCHES = 64  # parts that a box is cut into where one expansion does not do
@@ -127,9 +127,10 @@ class Job:
         known = FAMILIES.setdefault(f, {})
         key = (sides.tobytes(), tuple(pair(m) for m in moves))
         if key not in known:
-            if len(known) >= REMEMBERED:
+            made = over_box(f, sides, moves, last)
+            while sum(family.values.size for family in known.values()) > REMEMBERED:
                 known.pop(next(iter(known)))
-            known[key] = over_box(f, sides, moves, last)
+            known[key] = made
         return known[key]
 
     def stable(self) -> bool:
@@ -224,7 +225,7 @@ class Job:
         searches = self._begin(parts, self.target(reach), min(reach, self.upper))
         final = self._advance(searches, reach, min(self.most_cells, HARD))
         best, kept = 0.0, searches
-        if self._open(searches) and not self.late():
+        if self._open(searches) and not self.late() and not _blocked(searches):
             top = self.target(reach)
             for level in range(LEVELS, 0, -1):
                 small = self._begin(parts, top * 0.5**level, top * 0.5**level)
@@ -262,7 +263,8 @@ class Job:
             if lower > stood * (1 + self.tolerance / 10):
                 stood, since = lower, count
             patience = PATIENCE if self.tolerance == self.asked else CHEAP
-            if clock.monotonic() > until or count >= most or count - since > patience:
+            over = clock.monotonic() > until or count >= most or count - since > patience
+            if over or _blocked(searches):
                 return lower
             part, s = min(searches, key=lambda pair: (pair[1].finished, pair[1].lower))
             if s.finished:
@@ -306,9 +308,8 @@ class Job:
             return self._by_poles(begun)
         lower, searches = self.prove(parts, reach)
         looked = reach
-        for _ in range(
-            3
-        ):  # where the enclosure over the whole box is too wide, those over smaller ones may do
+        # where the enclosure over the whole box is too wide, those over smaller ones may do
+        for _ in range(3):
             reach /= 2
             if lower > reach or self.late():
                 break
@@ -390,6 +391,11 @@ class Job:
         moved = {} if p is None else dict(zip(names, (p - self.box.nominal).tolist(), strict=True))
         reason = "; ".join(dict.fromkeys(self.reasons))
         return Margin(None, t, frequency, named, moved, {}, (), clock.monotonic() - begun, reason)
+
+
+def _blocked(searches: Searches) -> bool:
+    """Whether the smallest t is that of a cell which no splitting settles."""
+    return any(s.lower >= s.blocked for _, s in searches)
 
 
 def halves(sides: FloatArray, axis: int, nominal: float) -> list[FloatArray]:
