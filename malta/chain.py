@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
@@ -37,6 +38,7 @@ from malta.verify import (
     machine_law,
     place_margin,
     places_along,
+    stroke_enters,
     travel_margin,
 )
 
@@ -176,11 +178,12 @@ def robustness(
     every = [*names, *({"m"} & set(units_of(plant.parameters)) - set(names))]
     at = {stroke: float(controller.operating_point[0][plant.stroke_state])}
     believed = plant_of(controller.parameters)
-
     shares = places_along(plant, controller, tuple(every), current_loops)
+    moves = stroke_enters(plant, controller, tuple(every), current_loops)
+    proven = cache(lambda z: place_margin(plant, controller, uncertainty, z, current_loops, every))
 
-    def here(position: float) -> Margin:
-        return place_margin(plant, controller, uncertainty, position, current_loops, every)
+    def here(position: float) -> Margin:  # the operating point is one of the places
+        return proven(position if moves else 0.0)
 
     links = []
     stages = compensators(plant, controller, current_loops)

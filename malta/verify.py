@@ -21,7 +21,7 @@ from malta.errors import CheckError, InputError
 from malta.linearize import LinearModel, linearize
 from malta.margins.gain import Gain, worst_case_gain
 from malta.margins.plants import of_plant
-from malta.margins.robust import TOLERANCE, Margin, common_margin, margin_at, robust_margin
+from malta.margins.robust import TOLERANCE, Margin, common_margin, margin_at, problem_of, robust_margin
 from malta.plant import trim
 from malta.riccati import add_integrals, add_lags, delay_inputs, eigenvalues, sample
 from malta.uncertain import (
@@ -428,6 +428,18 @@ def covers_travel(
 ) -> bool:
     """Whether one proof covers the travel, and not places of it."""
     return len(_along(plant, controller, names, current_loops)) == 1
+
+
+def stroke_enters(
+    plant: Plant, controller: Controller, names: tuple[str, ...], current_loops: CurrentLoops = "lag"
+) -> bool:
+    """Whether the machine's loop depends on the position; names as places_along takes them."""
+    along = _along(plant, controller, names, current_loops)
+    if len(along) > 1:
+        return True
+    system, law = along[0]
+    stroke = system.names.index(plant.stroke)
+    return any(stroke in on for on in problem_of(system, law).loop.program.depends)
 
 
 @lru_cache(maxsize=32)
