@@ -22,10 +22,11 @@ from malta.margins.box import Box, box_of
 from malta.margins.enclosure import Unproven
 from malta.margins.loop import loop_of
 from malta.margins.peaks import Peak, climb, patterns
+from malta.margins.poles import first_loss
 from malta.margins.polydisc import Part, Size, excluded, parts_of
 from malta.margins.problem import OfLoop
 from malta.margins.robust import LONGEST, Margin, law_of, problem_of
-from malta.margins.search import EDGE, FAR, Job, first_loss
+from malta.margins.search import EDGE, FAR, Job
 from malta.margins.transfer import responses, structured, transfer
 from malta.margins.weight import Expanded, Weight
 from malta.uncertain import Compensator, UncertainSystem
