@@ -119,7 +119,10 @@ def _remembering(proofs: dict[bytes, malta.Margin]) -> Iterator[None]:
         if question is None:
             return searched(problem, box, effort)
         if question not in proofs:
-            proofs[question] = searched(problem, box, effort)
+            found = searched(problem, box, effort)
+            if found.reason:  # as where the time was up
+                return found
+            proofs[question] = found
         found = proofs[question]
         if effort.progress is not None:
             effort.progress(found.lower or 0.0, found.upper)

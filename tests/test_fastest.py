@@ -164,6 +164,7 @@ def test_a_finer_mesh_takes_as_long(plant: Plant, par: tubular.Parameters, strok
         assert other.rise == pytest.approx(stroke.rise, rel=3e-4)
 
 
+@pytest.mark.slow
 @settings(max_examples=3, deadline=None)
 @given(
     distance=st.floats(1e-4, 0.03),
