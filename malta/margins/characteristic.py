@@ -80,7 +80,7 @@ class Characteristic:
         """The degree in each parameter, an upper bound read from the entries; None where it is no polynomial."""
         if self.exact:
             assert self.loop.symbolic is not None
-            rows = _cleared(self.loop, self.group, self.loop.symbolic)
+            rows = cleared(self.loop, self.group, self.loop.symbolic)
             return tuple(_determinant_degree(rows, i) for i in range(len(self.names)))
         return tuple(self._degree_beside(i) for i in range(len(self.names)))
 
@@ -339,7 +339,7 @@ def _touches(s: Symbolic, atom: int, i: int) -> bool:
     return False
 
 
-def _cleared(loop: Loop, g: Group, s: Symbolic) -> list[dict[Any, Any]]:
+def cleared(loop: Loop, g: Group, s: Symbolic) -> list[dict[Any, Any]]:
     """Rows of the polynomial matrix whose determinant is a: those of x, then those of y; columns x, u, y."""
     rows: list[dict[Any, Ratio]] = []
     for i in g.states:
@@ -416,7 +416,7 @@ def _rank(rows: list[dict[Any, Any]], i: int) -> int:
 @lru_cache(maxsize=64)
 def _denominators(loop: Loop, g: Group) -> tuple[Any, ...]:
     assert loop.symbolic is not None
-    return tuple(row[None] for row in _cleared(loop, g, loop.symbolic) if None in row)
+    return tuple(row[None] for row in cleared(loop, g, loop.symbolic) if None in row)
 
 
 def _multiplier(loop: Loop, g: Group, p: Sequence[Any]) -> Any:

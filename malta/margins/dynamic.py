@@ -21,8 +21,8 @@ from malta.margins.blocks import Block, Dynamic, block_of, check_blocks, probed
 from malta.margins.box import Box, box_of
 from malta.margins.enclosure import Unproven
 from malta.margins.loop import loop_of
+from malta.margins.loss import first_loss
 from malta.margins.peaks import Peak, climb, patterns
-from malta.margins.poles import first_loss
 from malta.margins.polydisc import Part, Size, excluded, parts_of
 from malta.margins.problem import OfLoop
 from malta.margins.robust import LONGEST, Margin, law_of, problem_of

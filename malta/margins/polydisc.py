@@ -30,7 +30,7 @@ from malta.margins.box import Box
 from malta.margins.enclosure import TooWide, Unproven, over_box
 from malta.margins.exclusion import Beside, Growth, advance, growth_over, on_boxes, start
 from malta.margins.family import Family, aligned, combined
-from malta.margins.search import halves
+from malta.margins.parts import halves
 from malta.margins.weight import Expanded
 
 if TYPE_CHECKING:

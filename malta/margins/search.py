@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time as clock
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 from weakref import WeakKeyDictionary
 
@@ -16,15 +17,18 @@ from malta.margins.box import Box
 from malta.margins.characteristic import pair
 from malta.margins.descent import from_cell, nearest
 from malta.margins.enclosure import TooWide, Unproven, over_box, precision
-from malta.margins.exclusion import Growth, Search, advance, growth_over, start
+from malta.margins.exclusion import Search, advance, growth_over, start
 from malta.margins.expressions import exact
 from malta.margins.family import Family, narrowed
-from malta.margins.poles import first_loss, loss_of_one
+from malta.margins.loss import first_loss, loss_of_one
+from malta.margins.parts import Part, halves, without_twins
 from malta.margins.problem import Polynomial, Problem, hurwitz
 from malta.margins.robust import Certificate, Margin, Progress
+from malta.margins.structured import Structured, rows_of
 from malta.margins.witness import Zero, gradients, starts
 
 if TYPE_CHECKING:
+    from malta.margins.loss import Loss
     from malta.plant import FloatArray
 
 FAR = 1e2  # search limit, in multiples of the modelled box
@@ -38,17 +42,9 @@ PATIENCE = 20_000  # cells without progress after which the proof is given up
 REMEMBERED = 4_000_000  # numbers in the families of a polynomial, beyond which the oldest are forgotten
 HARD = 4000  # cells after which smaller boxes are proven first
 LEVELS = 5  # of these boxes, each half of the next
+SHARES = {False: 0.6, True: 0.3}  # share of the time for families: of few parameters, and of many
+MANY = 5  # parameters from which on multipliers come before many cells
 PATCHES = 64  # parts that a box is cut into where one expansion does not do
-
-
-@dataclass(frozen=True, eq=False)
-class Part:
-    """One characteristic polynomial on one part of the box."""
-
-    of: Polynomial
-    sides: FloatArray
-    family: Family
-    growth: Growth
 
 
 Searches = list[tuple[Part, Search]]
@@ -68,12 +64,16 @@ class Job:
     progress: Progress | None
 
     def __post_init__(self) -> None:
-        self.asked = self.tolerance
+        self.asked, self.end = self.tolerance, self.until
         self.limit = min(self.box.most * (1 - EDGE), FAR)
         self.stands = 0.0
         self.upper = math.inf
         self.zero: tuple[Zero, Part] | None = None
         self.reasons: list[str] = []
+
+    @property
+    def _many(self) -> bool:
+        return bool(sum(self.box.down + self.box.up > 0) >= MANY)
 
     def late(self) -> bool:
         return clock.monotonic() > self.until
@@ -89,7 +89,7 @@ class Job:
         made: list[Part] = []
         for polynomial, moves in self.problem.parts([arb(a).union(arb(b)) for a, b in sides.tolist()]):
             made += self._cut(polynomial, sides, moves, last)
-        return _without_twins(made)
+        return without_twins(made)
 
     def _cut(self, f: Polynomial, sides: FloatArray, moves: tuple[Any, ...], last: float) -> list[Part]:
         todo, made = [sides], []
@@ -164,7 +164,7 @@ class Job:
         while True:
             spent = clock.monotonic() - begun
             now = clock.monotonic()
-            last = now + 0.3 * (self.until - now)
+            last = now + 0.3 * (self.end - now)
             if done or FIRST < reach >= self.limit:
                 last = min(last, now + max(BRIEF, 2 * spent))
             try:
@@ -225,6 +225,10 @@ class Job:
         searches = self._begin(parts, self.target(reach), min(reach, self.upper))
         final = self._advance(searches, reach, min(self.most_cells, HARD))
         best, kept = 0.0, searches
+        if self._open(searches) and self._many:
+            self._multiply(self.target(reach), 0.6)
+            if self._settled():
+                return final, searches
         if self._open(searches) and not self.late() and not _blocked(searches):
             top = self.target(reach)
             for level in range(LEVELS, 0, -1):
@@ -238,6 +242,30 @@ class Job:
         if self._open(searches):
             self._unsettled(searches)
         return (final, searches) if final >= best else (best, kept)
+
+    @cached_property
+    def structured(self) -> Structured | None:
+        """What proves by multipliers; None where the loop has no pencil of rational functions."""
+        rows = None if self.box.frame else rows_of(self.problem)
+        return None if rows is None else Structured(rows, self.box, self.until, self.most_cells, self._told)
+
+    def _multiply(self, target: float, share: float) -> None:
+        """Raise the proven bound by multipliers, for a share of the time that is left."""
+        now = clock.monotonic()
+        if self.structured is not None and now < self.until:
+            self.structured.until = now + share * (self.until - now)
+            self.structured.raised(target)
+
+    def _told(self, t: float) -> None:
+        self.stands = max(self.stands, t)
+        if self.progress is not None:
+            self.progress(self.stands, self.upper)
+
+    def _multiplied(self) -> float:
+        return 0.0 if self.structured is None else self.structured.lower
+
+    def _settled(self) -> bool:
+        return self._multiplied() >= self.upper * (1 - self.asked)
 
     def _begin(self, parts: list[Part], target: float, until: float) -> Searches:
         return [(part, start(part.family, part.growth, target, until)) for part in parts]
@@ -303,7 +331,10 @@ class Job:
     # result
 
     def margin(self, begun: float) -> Margin:
+        if self.structured is not None:  # families may take all the time there is, and not come to be
+            self.until = begun + SHARES[self._many] * (self.end - begun)
         parts, reach = self.search()
+        self.until = self.end
         if not parts:
             return self._by_poles(begun)
         lower, searches = self.prove(parts, reach)
@@ -311,7 +342,7 @@ class Job:
         # where the enclosure over the whole box is too wide, those over smaller ones may do
         for _ in range(3):
             reach /= 2
-            if lower > reach or self.late():
+            if lower > reach or self.late() or self._multiplied() > reach:
                 break
             try:
                 inner = self.prove(self.parts(reach, self.until), reach)
@@ -319,22 +350,45 @@ class Job:
                 continue
             if inner[0] > lower:
                 lower, searches = inner
-        if not self.stable():
-            lower = 0.0
-            self.reasons.append("the nominal loop is not proven stable")
         upper, frequency, witness = self._confirmed()
         if witness is None and looked < self.limit:
             upper, frequency, witness = first_loss(self.problem, self.box, self.limit)
+        if max(lower, self._multiplied()) < upper * (1 - 2 * self.asked):
+            self._multiply(min(self.limit, upper * (1 - self.tolerance)), 1.0)
+        proofs = [self._certificate(part, s) for part, s in searches]
+        return self._margin(lower, (upper, frequency, witness), proofs, begun)
+
+    def _margin(
+        self,
+        lower: float,
+        loss: Loss,
+        proofs: list[Certificate],
+        begun: float,
+    ) -> Margin:
+        upper, frequency, witness = loss
+        if self.structured is not None and self._multiplied() > lower:
+            lower, proofs = self._multiplied(), [self._multiplier_proof(self.structured)]
+        if lower > 0 and not self.stable():
+            lower = 0.0
+            self.reasons.append("the nominal loop is not proven stable")
         if not lower <= upper:
             raise CheckError(f"the proof ({lower:.9g}) and the witness ({upper:.9g}) contradict each other")
+        if lower >= upper * (1 - self.asked):
+            self.reasons.clear()
         names, nominal = self.box.names, self.box.nominal
         named = None if witness is None else dict(zip(names, witness.tolist(), strict=True))
         moved = {} if witness is None else dict(zip(names, (witness - nominal).tolist(), strict=True))
         return Margin(
             lower if lower > 0 else None, upper, frequency, named, moved,
             {} if self.zero is None or witness is None else self._shares(),
-            tuple(self._certificate(part, s) for part, s in searches),
-            clock.monotonic() - begun, "; ".join(dict.fromkeys(self.reasons)),
+            tuple(proofs), clock.monotonic() - begun, "; ".join(dict.fromkeys(self.reasons)),
+        )  # fmt: skip
+
+    def _multiplier_proof(self, s: Structured) -> Certificate:
+        axes, top = len(self.box.names), self.problem.physical(math.inf)
+        return Certificate(
+            s.count, (0.0, top), np.zeros((0, 3)), np.zeros((0, axes, 2)), np.zeros(0),
+            self.box.sides(s.lower), (False,) * axes, 0,
         )  # fmt: skip
 
     def _certificate(self, part: Part, s: Search) -> Certificate:
@@ -384,63 +438,13 @@ class Job:
         return {self.box.names[i]: float(size[i] / total) for i in used} if total else {}
 
     def _by_poles(self, begun: float) -> Margin:
-        """Without an enclosure: the first loss of stability along the box's diagonals, by the poles alone."""
-        t, frequency, p = first_loss(self.problem, self.box, self.limit)
-        names = self.box.names
-        named = None if p is None else dict(zip(names, p.tolist(), strict=True))
-        moved = {} if p is None else dict(zip(names, (p - self.box.nominal).tolist(), strict=True))
-        reason = "; ".join(dict.fromkeys(self.reasons))
-        return Margin(None, t, frequency, named, moved, {}, (), clock.monotonic() - begun, reason)
+        """Without families: the first loss of stability along the box's diagonals, and what multipliers prove."""
+        loss = first_loss(self.problem, self.box, self.limit)
+        self.upper = loss[0]
+        self._multiply(min(self.limit, self.upper * (1 - self.tolerance)), 1.0)
+        return self._margin(0.0, loss, [], begun)
 
 
 def _blocked(searches: Searches) -> bool:
     """Whether the smallest t is that of a cell which no splitting settles."""
     return any(s.lower >= s.blocked for _, s in searches)
-
-
-def halves(sides: FloatArray, axis: int, nominal: float) -> list[FloatArray]:
-    """A box cut across one axis, at the nominal value where that is well inside."""
-    low, high = sides[axis]
-    at = (
-        nominal
-        if low < nominal < high and min(nominal - low, high - nominal) > 0.2 * (high - low)
-        else (low + high) / 2
-    )
-    found = []
-    for a, b in ((low, at), (at, high)):
-        half = sides.copy()
-        half[axis] = a, b
-        found.append(half)
-    return found
-
-
-def _without_twins(parts: list[Part]) -> list[Part]:
-    """One family for groups whose coefficients agree to rounding, as those of a round body's planes do."""
-    kept: list[Part] = []
-    for part in parts:
-        for k, other in enumerate(kept):
-            both = _together(other, part)
-            if both is not None:
-                kept[k] = both
-                break
-        else:
-            kept.append(part)
-    return kept
-
-
-def _together(one: Part, two: Part) -> Part | None:
-    """A part whose radius covers both families; None where they differ by more than rounding."""
-    f, g = one.family, two.family
-    if (f.shape, f.exponents, f.scale) != (
-        g.shape,
-        g.exponents,
-        g.scale,
-    ) or one.of.inverted != two.of.inverted:
-        return None
-    if not np.array_equal(one.sides, two.sides):
-        return None
-    apart = np.abs(f.values - g.values).max(axis=1)
-    if not (apart <= 1e-9 * f.size()).all():
-        return None
-    radius = np.maximum(f.radius, g.radius + apart * (1 + 1e-9))
-    return Part(one.of, one.sides, Family(f.shape, f.values, radius, f.exponents, f.scale), one.growth)

@@ -1,4 +1,4 @@
-"""Where stability is lost along lines through the box, by the poles in floating point: estimates, no proofs."""
+"""Where stability is lost along lines through a box, by the poles in floating point: estimates, no proofs."""
 
 from __future__ import annotations
 
@@ -10,12 +10,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from malta.errors import CheckError
-from malta.margins.box import Box
 from malta.margins.expressions import NotAnalytic
-from malta.margins.problem import Problem
 
 if TYPE_CHECKING:
+    from malta.margins.box import Box
+    from malta.margins.problem import Problem
     from malta.plant import FloatArray
+
+    Loss = tuple[float, float | None, FloatArray | None]  # t, w, p
+
+STEP = 1e-6  # of a range, for slopes of the worst root
+ROUNDS = 6  # from corner to corner
 
 
 def loss_of_one(problem: Problem, box: Box, reach: float) -> float | None:
@@ -48,11 +53,11 @@ def loss_of_one(problem: Problem, box: Box, reach: float) -> float | None:
     return high
 
 
-def first_loss(problem: Problem, box: Box, reach: float) -> tuple[float, float | None, FloatArray | None]:
+def first_loss(problem: Problem, box: Box, reach: float) -> Loss:
     """t, w, p at the first loss of stability along the diagonals of the box, by the poles; or infinity."""
     free = [i for i in range(len(box.names)) if box.down[i] + box.up[i] > 0]
     signs = np.array(list(itertools.islice(itertools.product((-1, 1), repeat=len(free)), 256)))
-    best: tuple[float, float | None, FloatArray | None] = (math.inf, None, None)
+    best: Loss = (math.inf, None, None)
     for place in box.standing()[:27]:
         for sign in signs:
             d = np.zeros(len(box.names))
@@ -61,7 +66,35 @@ def first_loss(problem: Problem, box: Box, reach: float) -> tuple[float, float |
             if t < best[0]:
                 p = place + t * d
                 best = (t, problem.critical(p), p)
+        best = _turned(problem, box, place, best)
     return best
+
+
+def _turned(problem: Problem, box: Box, place: FloatArray, best: Loss) -> Loss:
+    """The loss at the corner that the slopes of the worst root point to, as long as that comes nearer."""
+    for _ in range(ROUNDS):
+        t, _, p = best
+        if p is None or not np.isfinite(t):
+            break
+        steps = STEP * (box.up + box.down)
+        rows = p + np.diag(steps)[steps > 0]
+        with np.errstate(all="ignore"):
+            slopes = np.zeros(len(p))
+            slopes[steps > 0] = _instability(problem, rows) - _instability(problem, p[None])
+        d = np.where(slopes > 0, box.up, -box.down)
+        nearer = _along(problem, place, d, t)
+        if not nearer < t * (1 - 1e-9):
+            break
+        there = place + nearer * d
+        best = (nearer, problem.critical(there), there)
+    return best
+
+
+def _instability(problem: Problem, rows: FloatArray) -> FloatArray:
+    try:
+        return np.asarray(problem.instability(rows))
+    except (CheckError, np.linalg.LinAlgError, NotAnalytic):
+        return np.zeros(len(rows))
 
 
 def _along(problem: Problem, p: FloatArray, d: FloatArray, reach: float) -> float:

@@ -1,0 +1,73 @@
+"""Parts of a box with the characteristic polynomials on them; alike ones are proven once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from malta.margins.exclusion import Growth
+from malta.margins.family import Family
+from malta.margins.problem import Polynomial
+
+if TYPE_CHECKING:
+    from malta.plant import FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """One characteristic polynomial on one part of the box."""
+
+    of: Polynomial
+    sides: FloatArray
+    family: Family
+    growth: Growth
+
+
+def halves(sides: FloatArray, axis: int, nominal: float) -> list[FloatArray]:
+    """A box cut across one axis, at the nominal value where that is well inside."""
+    low, high = sides[axis]
+    at = (
+        nominal
+        if low < nominal < high and min(nominal - low, high - nominal) > 0.2 * (high - low)
+        else (low + high) / 2
+    )
+    found = []
+    for a, b in ((low, at), (at, high)):
+        half = sides.copy()
+        half[axis] = a, b
+        found.append(half)
+    return found
+
+
+def without_twins(parts: list[Part]) -> list[Part]:
+    """One family for groups whose coefficients agree to rounding, as those of a round body's planes do."""
+    kept: list[Part] = []
+    for part in parts:
+        for k, other in enumerate(kept):
+            both = _together(other, part)
+            if both is not None:
+                kept[k] = both
+                break
+        else:
+            kept.append(part)
+    return kept
+
+
+def _together(one: Part, two: Part) -> Part | None:
+    """A part whose radius covers both families; None where they differ by more than rounding."""
+    f, g = one.family, two.family
+    if (f.shape, f.exponents, f.scale) != (
+        g.shape,
+        g.exponents,
+        g.scale,
+    ) or one.of.inverted != two.of.inverted:
+        return None
+    if not np.array_equal(one.sides, two.sides):
+        return None
+    apart = np.abs(f.values - g.values).max(axis=1)
+    if not (apart <= 1e-9 * f.size()).all():
+        return None
+    radius = np.maximum(f.radius, g.radius + apart * (1 + 1e-9))
+    return Part(one.of, one.sides, Family(f.shape, f.values, radius, f.exponents, f.scale), one.growth)

@@ -1,0 +1,185 @@
+"""The closed loop as a pencil in v that is linear in the parameters, but for a bound of what is left.
+
+    M(v) = P_0 + sum_i delta_i P_0i + R_0 + v (P_1 + sum_i delta_i P_1i + R_1),   |delta_i| <= 1, |R_k| <= bounds
+
+It is singular on v = jx, x from 0 to infinity, exactly where the loop is on the boundary of stability. Rows are
+multiplied by their denominators, so that masses, springs and dampers enter linearly. v is s in continuous time,
+(z - 1) / (z + 1) otherwise: a row z a - b becomes (a - b) + v (a + b).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from malta.margins.characteristic import cleared
+from malta.margins.expansion import EPS, Expansion, constant, stacked, table
+from malta.margins.loop import C, Group, Loop
+from malta.margins.series import held, square_held
+
+if TYPE_CHECKING:
+    from malta.margins.expansion import Table
+    from malta.plant import FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Pencil:
+    """M on a box. dynamic: rows that are multiplied by 1 / v towards infinity; others hold no v."""
+
+    constant: Expansion
+    linear: Expansion
+    dynamic: Any
+    curved: bool  # by a hold: neither slopes of low rank nor nothing beyond them
+
+    def branch(self, k: int) -> tuple[Expansion, Expansion]:
+        """M, or M / v in its dynamic rows where k is 1: the constant part and that of jx, of 1 / x there."""
+        if k == 0:
+            return self.constant, self.linear
+        d = self.dynamic
+
+        def picked(one: Expansion, two: Expansion | None, sign: float) -> Expansion:
+            zero = np.zeros_like(one.middle)
+            return Expansion(
+                np.where(d[:, None], sign * one.middle, zero if two is None else two.middle),
+                np.where(d[:, None], sign * one.slopes, 0 if two is None else two.slopes),
+                np.where(d[:, None], one.rest, zero if two is None else two.rest),
+            )
+
+        # P_1 + P_0 / (j x) = P_1 - j (1 / x) P_0
+        return picked(self.linear, self.constant, 1.0), picked(self.constant, None, -1.0)
+
+
+class Rows:
+    """The rows of one group of a loop as polynomials in p, from which pencils over boxes are made."""
+
+    def __init__(self, loop: Loop, group: Group) -> None:
+        s, law = loop.symbolic, loop.law
+        assert s is not None
+        self.loop, self.group, self.count = loop, group, loop.program.inputs
+        n, p = len(group.states), self.count
+        found, one = cleared(loop, group, s), s.context.constant(1)
+        state = {j: k for k, j in enumerate(group.states)}
+        self.inputs = sorted({at[1] for row in found for at in row if at is not None and at[0] == "u"})
+        u = {j: k for k, j in enumerate(self.inputs)}
+        self.reads = [
+            k for k in range(loop.program.shapes[C][0])
+            if any(at is not None for at in found[n + k])
+            and (law.B[list(group.own), k].any() or law.D[self.inputs, k].any())
+        ]  # fmt: skip
+        y, m = len(self.reads), len(self.inputs)
+
+        def picked(rows: list[dict[Any, Any]], kind: str, columns: dict[int, int]) -> Table:
+            entries = {
+                (i, columns[at[1]]): polynomial
+                for i, row in enumerate(rows)
+                for at, polynomial in row.items()
+                if at is not None and at[0] == kind
+            }
+            return table((len(rows), len(columns)), entries, p)
+
+        def below(rows: list[dict[Any, Any]]) -> Table:
+            return table((len(rows),) * 2, {(i, i): row.get(None, one) for i, row in enumerate(rows)}, p)
+
+        own, out = found[:n], [found[n + k] for k in self.reads]
+        self.A, self.B, self.dens = picked(own, "x", state), picked(own, "u", u), below(own)
+        self.E = picked(own, "e", state) if loop.descriptor else self.dens
+        self.C, self.D, self.below = picked(out, "x", state), picked(out, "u", u), below(out)
+        assert (self.C.shape, self.D.shape) == ((y, n), (y, m))
+
+    @property
+    def cost(self) -> int:
+        """Terms of all entries."""
+        return sum(len(t.gains) for t in (self.A, self.B, self.C, self.D, self.E))
+
+    def over(self, sides: FloatArray) -> Pencil | None:
+        """The pencil on a box (P x 2); None where a denominator may vanish on it, or a sample is too long."""
+        c = sides.mean(axis=1)
+        r = np.where(
+            sides[:, 1] > sides[:, 0], np.maximum(sides[:, 1] - c, c - sides[:, 0]) * (1 + 4 * EPS), 0
+        )
+        dens, below = self.dens.over(c, r), self.below.over(c, r)
+        for d in (dens, below):
+            least = np.abs(np.diag(d.middle)) - np.diag(np.abs(d.slopes).sum(axis=0) + d.rest)
+            if not (least > 1e-9 * np.abs(np.diag(d.middle))).all():
+                return None
+        plant = self._plant(dens, c, r)
+        return None if plant is None else self._joined(plant, below, c, r)
+
+    def _plant(self, dens: Expansion, c: FloatArray, r: FloatArray) -> tuple[Expansion, ...] | None:
+        """P_0 and P_1 of the rows of x and of the lags: for these states, then for what acts on them."""
+        law, loop, T = self.loop.law, self.loop, self.loop.law.sample_time
+        A, B = self.A.over(c, r), self.B.over(c, r)
+        E = self.E.over(c, r) if loop.descriptor else dens
+        if law.lag is not None:
+            n, m = B.middle.shape
+            own, none = constant(law.lag * np.eye(m), self.count), constant(np.zeros((m, n)), self.count)
+            unit, beside = constant(np.eye(m), self.count), constant(np.zeros((n, m)), self.count)
+            A = stacked([[A, B], [none, own.times(-1)]])
+            E, dens = (stacked([[part, beside], [none, unit]]) for part in (E, dens))
+            B = stacked([[beside], [own]])
+        if T is None:
+            return A.times(-1), E, B.times(-1), B.times(0)
+        if not loop.sampled:
+            return E + A.times(-1), E + A, B.times(-1), B
+        curved = square_held(A, dens, T)
+        if curved is not None:
+            return A.times(-T), curved, B.times(-T), B.times(T)
+        found = held(A, B, dens, T)
+        if found is None:
+            return None
+        change, driven = found
+        return (
+            change.times(-1),
+            change + constant(2 * np.eye(len(A.middle)), self.count),
+            driven.times(-1),
+            driven,
+        )
+
+    def _joined(self, plant: tuple[Expansion, ...], below: Expansion, c: FloatArray, r: FloatArray) -> Pencil:
+        """Columns: x with lags, the compensator's states, stored inputs, y."""
+        law, own, late = self.loop.law, list(self.group.own), self.loop.law.delay
+        n, k, m, y = len(plant[0].middle), len(own), len(self.inputs), len(self.reads)
+        edges = np.cumsum([0, n, k, m * late, y]).tolist()
+        N, (x, w, _, z) = edges[-1], (slice(a, b) for a, b in pairwise(edges))
+        eye = np.eye(N)
+        wanted = np.zeros((m, N))
+        wanted[:, w], wanted[:, z] = law.C[np.ix_(self.inputs, own)], law.D[np.ix_(self.inputs, self.reads)]
+        stored = [eye[n + k + m * d : n + k + m * (d + 1)] for d in range(late)]
+        asked = np.zeros((k, N))
+        asked[:, w], asked[:, z] = law.A[np.ix_(own, own)], law.B[np.ix_(own, self.reads)]
+        P0, P1 = _Sum(N, self.count), _Sum(N, self.count)
+        for P, of_x, of_u in ((P0, plant[0], plant[2]), (P1, plant[1], plant[3])):
+            P.add(x, x, of_x)
+            P.add(x, slice(0, N), of_u.columns([wanted, *stored][-1]))
+        rows = [(w, asked)]
+        for d, before in enumerate([wanted, *stored][:late]):
+            rows.append((slice(n + k + m * d, n + k + m * (d + 1)), before))
+        for at, given in rows:  # s w = a, or z w = a
+            own_rows = constant(eye[at], self.count)
+            part = constant(given, self.count)
+            if law.sample_time is None:
+                P0.add(at, slice(0, N), part.times(-1))
+                P1.add(at, slice(0, N), own_rows)
+            else:
+                P0.add(at, slice(0, N), own_rows + part.times(-1))
+                P1.add(at, slice(0, N), own_rows + part)
+        P0.add(z, slice(0, len(self.group.states)), self.C.over(c, r).times(-1))
+        P0.add(z, slice(0, N), self.D.over(c, r).columns(wanted).times(-1))
+        P0.add(z, z, below)
+        return Pencil(P0.total, P1.total, np.arange(N) < n + k + m * late, self.loop.sampled)
+
+
+class _Sum:
+    """A square matrix, made of parts."""
+
+    def __init__(self, n: int, count: int) -> None:
+        self.total = constant(np.zeros((n, n)), count)
+
+    def add(self, rows: slice, columns: slice, part: Expansion) -> None:
+        whole = self.total.part(rows, columns) + part
+        self.total.middle[rows, columns] = whole.middle
+        self.total.slopes[:, rows, columns] = whole.slopes
+        self.total.rest[rows, columns] = whole.rest

@@ -1,0 +1,277 @@
+"""Margins of many parameters: a loop's pencil is not singular, shown by multipliers, cell by cell.
+
+A cell is an interval of frequency and a part of box(t). Where multipliers show that no parameters of it reach the
+boundary of stability there it is done; else it is split, across frequency where they do in its middle, across the
+parameter that matters most where they do not. Multipliers take real parameters as they are, all at once: their effort
+grows as a power of the number of parameters, not exponentially, and a box is seldom split at all.
+"""
+
+from __future__ import annotations
+
+import math
+import time as clock
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy import linalg
+
+from malta.margins.loop import groups
+from malta.margins.multipliers import Blocks, Multiplier, multiplier
+from malta.margins.pencil import Rows
+from malta.margins.problem import OfLoop, OfSeveral, Problem
+from malta.margins.response import Branch, excluded, response
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from malta.margins.box import Box
+    from malta.margins.pencil import Pencil
+    from malta.plant import FloatArray
+
+NEAR = 0.98  # beta up to which splitting frequency is expected to do
+NARROWEST = 1e-9  # of an interval of frequency, relative
+LOWEST = 1e-12  # end of the one from zero, relative to the octave that it was cut from
+REMEMBERED = 64  # pencils
+TERMS = 20_000  # of all entries, beyond which they are not expanded
+ROUGH = 0.1  # how close the first beta is to the smallest, relative
+SMALLEST = 1e-6  # of the target: boxes below that are not tried
+FIRST_STEP, LAST_STEP = 1.2, 1.003  # from one box to the next
+PATIENCE = 0.5  # share of the time that is left for one box
+
+
+@dataclass(frozen=True, eq=False)
+class Cell:
+    """An interval of frequency of a branch, and a part of the box, with a multiplier to begin with."""
+
+    rows: int
+    sides: FloatArray
+    branch: int
+    low: float
+    high: float
+    top: float  # end of the interval that rows and columns are scaled for
+    near: Multiplier | None = None
+
+
+@dataclass(eq=False)
+class Structured:
+    """The groups of loops, and the largest t for which all of box(t) is shown to be as stable as the nominal values."""
+
+    rows: list[Rows]
+    box: Box
+    until: float
+    most: int = 1_000_000  # cells
+    told: Callable[[float], None] | None = None  # of each t that is proven
+    lower: float = 0.0
+    count: int = 0
+    _branches: dict[Any, tuple[Pencil | None, dict[Any, Branch]]] = field(default_factory=dict, repr=False)
+
+    def late(self, until: float = math.inf) -> bool:
+        return clock.monotonic() > min(until, self.until) or self.count >= self.most
+
+    def raised(self, target: float) -> float:
+        """Prove ever larger boxes up to box(target), whole ones first, as far as time goes."""
+        cells = self._whole(target)
+        step = FIRST_STEP
+        while self.lower < target and step > LAST_STEP and not self.late():
+            t = min(target, self.lower * step) if self.lower else target / 64
+            now = clock.monotonic()
+            last = now + PATIENCE * (self.until - now)
+            hard = self._prove(self._on(cells or self.cover(t), t), last, split=True)
+            if hard is None:
+                self._stands(t)
+            elif not self.lower:
+                break
+            else:
+                step = math.sqrt(step)
+        return self.lower
+
+    def _stands(self, t: float) -> None:
+        self.lower = max(self.lower, t)
+        if self.told is not None:
+            self.told(self.lower)
+
+    def _on(self, cells: list[Cell], t: float) -> list[Cell]:
+        sides = self.box.sides(t)
+        return [replace(cell, sides=sides) for cell in cells]
+
+    def _whole(self, target: float) -> list[Cell]:
+        """The largest box that is proven without a cut; the cells of all frequencies, those that resist first."""
+        t, (beta, cells) = target, self._survey(target)
+        while not cells and not self.late() and t > SMALLEST * target:
+            t /= 2
+            beta, cells = self._survey(t)
+        t *= min(1.0, 0.95 / max(beta, 1e-9)) if math.isfinite(beta) else 0.1
+        now = clock.monotonic()
+        last = now + 0.7 * (self.until - now)
+        while cells and not self.late(last) and t > SMALLEST * target:
+            hard = self._prove(self._on(cells, t), last, split=False)
+            if hard is None:
+                self._stands(t)
+                break
+            cells = [hard[1], *cells]
+            t *= min(0.9, max(0.9 / hard[0], 0.3))
+        return cells
+
+    def _survey(self, t: float) -> tuple[float, list[Cell]]:
+        """The largest beta on box(t) at a grid of frequencies, and cells of all of them by falling beta; none: no t."""
+        found, near = [], None
+        for cell in self.cover(t):
+            for part in [cell] if cell.low == 0 else across_frequency(cell):
+                own = self._branch(part)
+                if own is None:
+                    return math.inf, []
+                at = math.sqrt(part.low * part.high) if part.low else part.high / 2
+                r, beta = response(own, at, at), math.inf
+                if r is not None and own.channels[0].blocks.real and not self.late():
+                    try:
+                        # slopes alone: what is beyond them is dear, and counts where boxes are large
+                        blocks = Blocks(own.channels[0].blocks.real)
+                        N = r.terms[0][: blocks.size, : blocks.size]
+                        near, beta = multiplier(N, blocks, near, 0.0, ROUGH)
+                    except (np.linalg.LinAlgError, ValueError):
+                        near = None
+                found.append((beta, replace(part, near=near)))
+        found.sort(key=lambda pair: -pair[0])
+        return max((beta for beta, _ in found if math.isfinite(beta)), default=math.inf), [
+            c for _, c in found
+        ]
+
+    def _prove(self, cells: list[Cell], last: float, *, split: bool) -> tuple[float, Cell] | None:
+        """None where all cells are excluded, else beta of one that is not, and the cell."""
+        todo = list(reversed(cells))
+        inner = self.box.sides(self.lower) if self.lower else None
+        while todo:
+            cell = todo.pop()
+            if self.late(last):
+                return math.inf, cell
+            if inner is not None and split and _within(cell.sides, inner):
+                continue
+            beta, m, done = self._level(cell)
+            if done:
+                if todo and todo[-1].near is None:
+                    todo[-1] = replace(todo[-1], near=m)
+            elif beta < NEAR:
+                if cell.high - cell.low < NARROWEST * cell.high or cell.high < LOWEST * cell.top:
+                    return 1.0, cell
+                todo += [replace(half, near=m) for half in reversed(across_frequency(cell))]
+            elif split:
+                todo += self._across_box(cell, m)
+            else:
+                return beta, cell
+        return None
+
+    def _branch(self, cell: Cell) -> Branch | None:
+        key = (cell.rows, cell.sides.tobytes())
+        if key not in self._branches:
+            while len(self._branches) >= REMEMBERED:
+                self._branches.pop(next(iter(self._branches)))
+            self._branches[key] = self.rows[cell.rows].over(cell.sides), {}
+        pencil, known = self._branches[key]
+        if pencil is None:
+            return None
+        if (cell.branch, cell.top) not in known:
+            known[cell.branch, cell.top] = Branch(pencil, cell.branch, cell.top)
+        return known[cell.branch, cell.top]
+
+    def cover(self, t: float) -> list[Cell]:
+        """All frequencies of all groups on box(t)."""
+        found, sides = [], self.box.sides(t)
+        for k, rows in enumerate(self.rows):
+            for branch, low, high in intervals(rows, self.box.nominal):
+                found.append(Cell(k, sides, branch, low, high, high))
+        return found
+
+    def _level(self, cell: Cell) -> tuple[float, Multiplier | None, bool]:
+        """beta in the middle of a cell, its multiplier, and whether the cell is excluded."""
+        self.count += 1
+        own = self._branch(cell)
+        if own is None:
+            return math.inf, None, False
+        found = response(own, cell.low, cell.high)
+        if found is None:
+            return 0.0, cell.near, False
+        blocks = own.channels[0].blocks
+        if not blocks.size:
+            return 0.0, None, True
+        near = cell.near if cell.near is not None and len(cell.near.D) == blocks.size else None
+        if near is not None and excluded(found, near):
+            return 0.0, near, True
+        try:
+            m, beta = multiplier(found.terms[0], blocks, near, NEAR)
+        except (np.linalg.LinAlgError, ValueError):
+            return math.inf, None, False
+        return beta, m, beta < 1 and excluded(found, m)
+
+    def _across_box(self, cell: Cell, m: Multiplier | None) -> list[Cell]:
+        sides = cell.sides
+        width = (sides[:, 1] - sides[:, 0]) / np.maximum(self.box.up + self.box.down, 1e-300)
+        axis = int(width.argmax())
+        own = self._branch(cell)
+        if own is not None and m is not None:
+            found = response(own, cell.low, cell.high)
+            if found is not None:
+                axis = worst(found.terms[0], m, own.channels[0].owners, len(sides), axis)
+        made = []
+        for side in (0, 1):
+            half = sides.copy()
+            half[axis, 1 - side] = sides[axis].mean()
+            made.append(replace(cell, sides=half, near=m))
+        return made
+
+
+def _within(sides: FloatArray, outer: FloatArray) -> bool:
+    return bool((sides[:, 0] >= outer[:, 0]).all() and (sides[:, 1] <= outer[:, 1]).all())
+
+
+def across_frequency(cell: Cell) -> list[Cell]:
+    low, high = cell.low, cell.high
+    middle = math.sqrt(low * high) if low > 0 and high > 4 * low else low + 0.5 * (high - low)
+    if low == 0:
+        middle = high / 8
+    return [replace(cell, high=middle), replace(cell, low=middle)]
+
+
+def worst(N: Any, m: Multiplier, owners: Any, count: int, other: int) -> int:
+    """The parameter that moves most in the direction that is excluded least."""
+    D, G = m
+    H = N.conj().T
+    S = H @ D @ N + 1j * (G @ N - H @ G)
+    _, vectors = linalg.eigh((S + S.conj().T) / 2, (D + D.conj().T) / 2)
+    w = vectors[:, -1]
+    each = (w.conj() * (D @ w)).real
+    shares = np.zeros(count)
+    np.add.at(shares, owners[owners >= 0], each[owners >= 0])
+    return int(shares.argmax()) if shares.max(initial=0) > 0 else other
+
+
+def intervals(rows: Rows, nominal: FloatArray) -> list[tuple[int, float, float]]:
+    """Frequencies from zero to infinity, octaves about the poles."""
+    pencil = rows.over(np.column_stack([nominal, nominal]))
+    known = np.ones(1)
+    if pencil is not None:
+        with np.errstate(all="ignore"):
+            poles = np.abs(linalg.eigvals(-pencil.constant.middle, pencil.linear.middle, check_finite=False))
+        poles = poles[np.isfinite(poles) & (poles > 0)]
+        if len(poles):
+            typical = np.exp(np.median(np.log(poles)))
+            known = poles[(poles < 1e12 * typical) & (poles > 1e-12 * typical)]
+    low, high = math.floor(math.log2(known.min())) - 3, math.ceil(math.log2(known.max())) + 3
+    edges = [2.0**k for k in range(low, high + 1)]
+    inner = [(0, a, b) for a, b in pairwise(edges)]
+    return [(0, 0.0, edges[0]), *inner, (1, 0.0, 1 / edges[-1])]
+
+
+def rows_of(problem: Problem) -> list[Rows] | None:
+    """Of all groups of the loops; None where they are no rational functions of p, or too many terms."""
+    if isinstance(problem, OfSeveral):
+        parts = [rows_of(part) for part in problem.problems]
+        return None if any(part is None for part in parts) else [r for part in parts for r in part or []]
+    if not isinstance(problem, OfLoop):
+        return None
+    loop = problem.loop
+    if loop.symbolic is None or not loop.program.rational or (loop.descriptor and loop.sampled):
+        return None
+    found = [Rows(loop, group) for group in groups(loop)]
+    return found if sum(rows.cost for rows in found) <= TERMS else None

@@ -1,0 +1,178 @@
+"""Margins of many parameters by multipliers: chains of masses and springs, and random sampled loops."""
+
+from __future__ import annotations
+
+import math
+import time as clock
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+from scipy import linalg
+
+import malta
+from malta.margins.box import Box, box_of
+from malta.margins.multipliers import Blocks, multiplier
+from malta.margins.problem import OfLoop
+from malta.margins.response import Branch, response
+from malta.margins.robust import law_of, problem_of
+from malta.margins.structured import Structured, rows_of
+from malta.riccati import care, dare
+from malta.uncertain import Compensator, UncertainSystem, instability
+
+Loop = tuple[UncertainSystem, Compensator]
+
+
+def chain(n: int, T: float | None) -> Loop:
+    """n masses and springs under a force on the last one, and an LQG law; all parameters are 1."""
+
+    def of(p: Any) -> Any:
+        m, k, A = [p[i] for i in range(n)], [p[n + i] for i in range(n)], ca.SX(2 * n, 2 * n)
+        for i in range(n):
+            A[i, n + i] = 1
+            A[n + i, i] -= k[i] / m[i]
+            A[n + i, n + i] -= 0.002 * k[i] / m[i]
+            if i:
+                A[n + i, i - 1] += k[i] / m[i]
+                A[n + i - 1, i] += k[i] / m[i - 1]
+                A[n + i - 1, i - 1] -= k[i] / m[i - 1]
+        B, C = ca.SX(2 * n, 1), ca.SX(1, 2 * n)
+        B[2 * n - 1], C[0, n - 1] = 1 / m[n - 1], 1
+        return A, B, C
+
+    system = malta.uncertain(of, {f"p{i}": 1.0 for i in range(2 * n)})
+    A, B, C = (np.array(M) for M in system.matrices(np.ones(2 * n)))
+    weight, solve = 0.1 * np.eye(2 * n), care if T is None else dare
+    if T is not None:
+        held = linalg.expm(T * np.block([[A, B], [np.zeros((1, 2 * n + 1))]]))
+        A, B = held[:-1, :-1], held[:-1, -1:]
+    K = solve(A, B, weight, np.eye(1)).K
+    L = solve(A.T, C.T, weight + B @ B.T, 0.01 * np.eye(1)).K.T
+    return system, Compensator(A - B @ K - L @ C, L, -K, np.zeros((1, 1)), sample_time=T)
+
+
+def ranges(system: UncertainSystem, share: float = 0.1) -> dict[str, float]:
+    return dict.fromkeys(system.names, share)
+
+
+def asked(loop: Loop, share: float = 0.1) -> Structured:
+    system, law = loop
+    box = box_of(system.names, system.nominal, system.limits, ranges(system, share), {})
+    problem = problem_of(system, law_of(system, law))
+    assert isinstance(problem, OfLoop)
+    rows = rows_of(problem)
+    assert rows is not None
+    return Structured(rows, box, math.inf)
+
+
+def stable_within(loop: Loop, box: Box, t: float, count: int = 2000) -> bool:
+    """Corners and places inside of box(t)."""
+    rng = np.random.default_rng(0)
+    sides = box.sides(t)
+    u = rng.uniform(0, 1, (count, len(sides)))
+    u[::2] = rng.integers(0, 2, u[::2].shape)
+    return bool((instability(*loop, sides[:, 0] + u * (sides[:, 1] - sides[:, 0])) < 0).all())
+
+
+@pytest.mark.parametrize("T", [None, 0.1, 1.5])
+def test_pencils_hold_the_loop_all_over_their_box(T: float | None) -> None:
+    system, law = chain(2, T)
+    s = asked((system, Compensator(law.A, law.B, law.C, law.D, sample_time=T, delay=2 if T else 0)))
+    rng, sides = np.random.default_rng(1), s.box.sides(1.7)
+    whole = s.rows[0].over(sides)
+    assert whole is not None
+    for _ in range(20):
+        delta = rng.uniform(-1, 1, 4)
+        p = sides.mean(axis=1) + delta * (sides[:, 1] - sides[:, 0]) / 2
+        point = s.rows[0].over(np.column_stack([p, p]))
+        assert point is not None
+        for wide, narrow in ((whole.constant, point.constant), (whole.linear, point.linear)):
+            moved = wide.middle + np.tensordot(delta, wide.slopes, 1)
+            assert (np.abs(moved - narrow.middle) <= wide.rest + narrow.rest).all()
+
+
+@pytest.mark.parametrize("T", [None, 0.1, 1.5])
+def test_pencils_are_singular_at_the_poles(T: float | None) -> None:
+    system, law = chain(2, T)
+    s = asked((system, law))
+    p = np.array([1.1, 0.9, 0.8, 1.2])
+    pencil = s.rows[0].over(np.column_stack([p, p]))
+    assert pencil is not None
+    for v in linalg.eigvals(-pencil.constant.middle, pencil.linear.middle):
+        if abs(v) < 1e8:
+            pole = v if T is None else (1 + v) / (1 - v)
+            poles = linalg.eigvals(_matrix(system, law, p))
+            assert np.abs(poles - pole).min() < 1e-6 * (1 + abs(pole))
+
+
+def _matrix(system: UncertainSystem, law: Compensator, p: Any) -> Any:
+    """Of the closed loop: x', or x+."""
+    A, B, C = (np.array(M) for M in system.matrices(p))
+    if law.sample_time is not None:
+        n = len(A)
+        held = linalg.expm(law.sample_time * np.block([[A, B], [np.zeros((1, n + 1))]]))
+        A, B = held[:n, :n], held[:n, n:]
+    return np.block([[A + B @ law.D @ C, B @ law.C], [law.B @ C, law.A]])
+
+
+@pytest.mark.parametrize("T", [None, 0.1])
+def test_responses_hold_over_their_interval(T: float | None) -> None:
+    s = asked(chain(2, T))
+    pencil = s.rows[0].over(s.box.sides(1.0))
+    assert pencil is not None
+    own = Branch(pencil, 0, 0.5)
+    wide = response(own, 0.48, 0.5)
+    assert wide is not None
+    for t in np.linspace(-1, 1, 9):
+        x = 0.49 + 0.01 * t
+        point = response(own, x, x)
+        assert point is not None
+        N = wide.terms[0] + t * wide.terms[1] + t * t * wide.terms[2]
+        assert (np.abs(N - point.terms[0]) <= wide.rest + point.rest + 1e-12).all()
+
+
+def test_multipliers_of_one_repeated_parameter_are_exact() -> None:
+    """1 - delta N is singular for real delta at the real eigenvalues of N alone."""
+    N = np.array([[0.0, 2.0], [-2.0, 0.0]]) + 0.5 * np.eye(2)
+    _, beta = multiplier(N.astype(complex), Blocks((2,)), None, 0.0, 1e-3)
+    assert beta < 0.1
+    _, beta = multiplier(np.diag([0.5, -0.8]).astype(complex), Blocks((2,)), None, 0.0, 1e-3)
+    assert beta == pytest.approx(0.8, rel=1e-2)
+
+
+@pytest.mark.parametrize(("n", "T", "t"), [(3, None, 2.0), (3, 0.1, 1.5), (7, None, 0.5)])
+def test_chains_are_stable_where_it_is_proven(n: int, T: float | None, t: float) -> None:
+    """Six and fourteen parameters."""
+    loop = chain(n, T)
+    s = asked(loop)
+    assert s.raised(t) == t
+    assert stable_within(loop, s.box, t)
+
+
+def test_no_box_is_proven_that_holds_an_unstable_loop() -> None:
+    loop = chain(3, None)
+    m = malta.robust_margin(*loop, ranges(loop[0]), time=2)
+    s = asked(loop)
+    s.until = clock.monotonic() + 2
+    assert m.lower is not None
+    assert m.lower <= m.upper
+    assert s.raised(1.2 * m.upper) < m.upper
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("T", [None, 0.1])
+def test_fourteen_parameters_have_a_bound_in_a_minute_and_four_gigabytes(T: float | None) -> None:
+    import resource
+
+    before = resource.getrlimit(resource.RLIMIT_AS)
+    resource.setrlimit(resource.RLIMIT_AS, (4 << 30, before[1]))
+    try:
+        loop = chain(7, T)
+        m = malta.robust_margin(*loop, ranges(loop[0]), time=60)
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, before)
+    assert m.lower is not None
+    assert 0.2 < m.lower <= m.upper
+    assert m.seconds < 66
+    assert stable_within(loop, asked(loop).box, m.lower)
