@@ -125,7 +125,7 @@ def response(branch: Branch, low: float, high: float) -> Response | None:
     """On an interval of frequency; None where it is too wide for that."""
     one, two = branch.parts
     channels, rest0, rest1 = branch.channels
-    n, x, h = len(one.middle), (low + high) / 2, (high - low) / 2 * (1 + 1e-15)
+    n, x, h = len(one.middle), (low + high) / 2, (high - low) / 2 + 4 * EPS * high
     L = one.middle + 1j * x * two.middle
     slope = 1j * h * two.middle
     size = np.abs(one.middle) + high * np.abs(two.middle)
@@ -138,7 +138,7 @@ def response(branch: Branch, low: float, high: float) -> Response | None:
         return None
     wide = np.abs(X)
     S = X @ slope
-    H = np.abs(np.eye(n) - X @ L) + 4 * (n + 4) * EPS * (wide @ size) + wide @ beside
+    H = np.abs(np.eye(n) - X @ L) + 8 * (n + 4) * EPS * (wide @ size) + wide @ beside
     B = channels.B[0] + 1j * x * channels.B[1], 1j * h * channels.B[1]
     C = channels.C[0] + 1j * x * channels.C[1], 1j * h * channels.C[1]
     g0 = X @ B[0]

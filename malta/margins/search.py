@@ -42,7 +42,14 @@ PATIENCE = 20_000  # cells without progress after which the proof is given up
 REMEMBERED = 4_000_000  # numbers in the families of a polynomial, beyond which the oldest are forgotten
 HARD = 4000  # cells after which smaller boxes are proven first
 LEVELS = 5  # of these boxes, each half of the next
-SHARES = {False: 0.6, True: 0.3}  # share of the time for families: of few parameters, and of many
+SHARES = (
+    0.6,
+    0.6,
+    0.6,
+    0.6,
+    0.4,
+    0.3,
+)  # of the time for families, by the number of parameters, the last for MANY
 MANY = 5  # parameters from which on multipliers come before many cells
 PATCHES = 64  # parts that a box is cut into where one expansion does not do
 
@@ -72,8 +79,9 @@ class Job:
         self.reasons: list[str] = []
 
     @property
-    def _many(self) -> bool:
-        return bool(sum(self.box.down + self.box.up > 0) >= MANY)
+    def _count(self) -> int:
+        """Parameters whose ranges grow."""
+        return int((self.box.down + self.box.up > 0).sum())
 
     def late(self) -> bool:
         return clock.monotonic() > self.until
@@ -225,7 +233,7 @@ class Job:
         searches = self._begin(parts, self.target(reach), min(reach, self.upper))
         final = self._advance(searches, reach, min(self.most_cells, HARD))
         best, kept = 0.0, searches
-        if self._open(searches) and self._many:
+        if self._open(searches) and self._count >= MANY:
             self._multiply(self.target(reach), 0.6)
             if self._settled():
                 return final, searches
@@ -332,7 +340,7 @@ class Job:
 
     def margin(self, begun: float) -> Margin:
         if self.structured is not None:  # families may take all the time there is, and not come to be
-            self.until = begun + SHARES[self._many] * (self.end - begun)
+            self.until = begun + SHARES[min(self._count, MANY)] * (self.end - begun)
         parts, reach = self.search()
         self.until = self.end
         if not parts:

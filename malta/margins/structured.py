@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 NEAR = 0.98  # beta up to which splitting frequency is expected to do
 NARROWEST = 1e-9  # of an interval of frequency, relative
-LOWEST = 1e-12  # end of the one from zero, relative to the octave that it was cut from
+LOWEST = 1e-5  # end of the one from zero, relative to the octave that it was cut from
 REMEMBERED = 64  # pencils
 TERMS = 20_000  # of all entries, beyond which they are not expanded
 ROUGH = 0.1  # how close the first beta is to the smallest, relative
