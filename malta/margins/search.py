@@ -234,7 +234,7 @@ class Job:
         final = self._advance(searches, reach, min(self.most_cells, HARD))
         best, kept = 0.0, searches
         if self._open(searches) and self._count >= MANY:
-            self._multiply(self.target(reach), 0.6)
+            self._multiply(self.target(reach), 0.9)
             if self._settled():
                 return final, searches
         if self._open(searches) and not self.late() and not _blocked(searches):

@@ -65,6 +65,7 @@ class Structured:
     told: Callable[[float], None] | None = None  # of each t that is proven
     lower: float = 0.0
     count: int = 0
+    _order: list[Cell] = field(default_factory=list, repr=False)  # those that resist first
     _branches: dict[Any, tuple[Pencil | None, dict[Any, Branch]]] = field(default_factory=dict, repr=False)
 
     def late(self, until: float = math.inf) -> bool:
@@ -72,7 +73,7 @@ class Structured:
 
     def raised(self, target: float) -> float:
         """Prove ever larger boxes up to box(target), whole ones first, as far as time goes."""
-        cells = self._whole(target)
+        cells = self._order = self._order if self.lower else self._whole(target)
         step = FIRST_STEP
         while self.lower < target and step > LAST_STEP and not self.late():
             t = min(target, self.lower * step) if self.lower else target / 64
