@@ -361,7 +361,7 @@ class Job:
         upper, frequency, witness = self._confirmed()
         if witness is None and looked < self.limit:
             upper, frequency, witness = first_loss(self.problem, self.box, self.limit)
-        if max(lower, self._multiplied()) < upper * (1 - 2 * self.asked):
+        if max(lower, self._multiplied()) < min(self.limit, upper * (1 - 2 * self.asked)):
             self._multiply(min(self.limit, upper * (1 - self.tolerance)), 1.0)
         proofs = [self._certificate(part, s) for part, s in searches]
         return self._margin(lower, (upper, frequency, witness), proofs, begun)
