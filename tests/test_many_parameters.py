@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time as clock
+from dataclasses import replace
 from typing import Any
 
 import casadi as ca
@@ -13,7 +14,7 @@ from scipy import linalg
 
 import malta
 from malta.margins.box import Box, box_of
-from malta.margins.multipliers import Blocks, multiplier
+from malta.margins.multipliers import Blocks, Multiplier, multiplier
 from malta.margins.problem import OfLoop
 from malta.margins.response import Branch, response
 from malta.margins.robust import law_of, problem_of
@@ -139,6 +140,24 @@ def test_multipliers_of_one_repeated_parameter_are_exact() -> None:
     assert beta < 0.1
     _, beta = multiplier(np.diag([0.5, -0.8]).astype(complex), Blocks((2,)), None, 0.0, 1e-3)
     assert beta == pytest.approx(0.8, rel=1e-2)
+
+
+def test_multipliers_of_another_structure_are_not_taken() -> None:
+    """One of 1 - N diag(a, a, b) passes F > 0 for 1 - N diag(a, b, b) too, of which it proves nothing."""
+    s = asked(chain(2, None))
+    taken: list[Blocks] = []
+    for cell in s.cover(1.0):
+        own = s._branch(cell)
+        assert own is not None
+        blocks = own.channels[0].blocks
+        size = blocks.size
+        other = Blocks((size,))  # full matrices, that show more than there is
+        D = np.eye(size) + 0j
+        _, near, done = s._level(replace(cell, near=Multiplier(D, 0 * D, other)))
+        if done and near is not None:
+            taken.append(near.blocks)
+            assert near.blocks == blocks
+    assert taken
 
 
 @pytest.mark.parametrize(("n", "T", "t"), [(3, None, 2.0), (3, 0.1, 1.5), (7, None, 0.5)])

@@ -28,11 +28,6 @@ FLAT = 0.01  # relative progress below which the level is the best there is
 SLACK = 1e-6  # what keeps G within thousands of D where nothing else does
 
 
-class Multiplier(NamedTuple):
-    D: ComplexArray
-    G: ComplexArray
-
-
 @dataclass(frozen=True)
 class Blocks:
     """Sizes of the real blocks, and of a complex one at the end, which may be empty."""
@@ -43,6 +38,12 @@ class Blocks:
     @property
     def size(self) -> int:
         return sum(self.real) + self.other
+
+
+class Multiplier(NamedTuple):
+    D: ComplexArray
+    G: ComplexArray
+    blocks: Blocks  # whose structure D and G have: it shows nothing of others
 
 
 class Basis(NamedTuple):
@@ -105,16 +106,20 @@ def multiplier(
     scale = units(N, blocks)
     turn = scale[:, None] / scale
     back = scale[:, None] * scale
-    start = None if first is None or len(first.D) != len(N) else Multiplier(first.D / back, first.G / back)
+    start = (
+        None
+        if first is None or first.blocks != blocks
+        else Multiplier(first.D / back, first.G / back, blocks)
+    )
     found, level = _Centres(N * turn, blocks).lowest(start, wanted**2, flat)
-    return Multiplier(found.D * back, found.G * back), float(np.sqrt(max(level, 0.0)))
+    return Multiplier(found.D * back, found.G * back, blocks), float(np.sqrt(max(level, 0.0)))
 
 
 class _Centres:
     """Analytic centres of b D - S(D, G) > 0, D > 0 with S = N* D N + j (G N - N* G), b = beta^2."""
 
     def __init__(self, N: ComplexArray, blocks: Blocks) -> None:
-        self.N, self.H, self.basis = N, N.conj().T, _basis(blocks)
+        self.N, self.H, self.blocks, self.basis = N, N.conj().T, blocks, _basis(blocks)
         self.count = len(self.basis.D)
         on_diagonal = self.basis.rows == self.basis.columns
         traces = self.basis.D[:, on_diagonal].sum(axis=1).real
@@ -157,7 +162,7 @@ class _Centres:
                 break
             b = level + SHARE * (b - level)
         D, G, _ = self.matrices(x)
-        return Multiplier(D, G), level
+        return Multiplier(D, G, self.blocks), level
 
     def _coordinates(self, first: Multiplier) -> FloatArray:
         def of(M: ComplexArray, elements: ComplexArray) -> FloatArray:

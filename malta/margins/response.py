@@ -176,7 +176,7 @@ def positive(M: Any, beside: float) -> bool:
 
 def excluded(r: Response, m: Multiplier) -> bool:
     """Whether F > 0 for all |t| <= 1, and D > 0."""
-    D, G = m
+    D, G = m.D, m.G
     N0, N1, N2 = r.terms
     H0, H1, H2 = (N.conj().T for N in r.terms)
     F0 = D - H0 @ D @ N0 - 1j * (G @ N0 - H0 @ G)

@@ -196,7 +196,7 @@ class Structured:
         blocks = own.channels[0].blocks
         if not blocks.size:
             return 0.0, None, True
-        near = cell.near if cell.near is not None and len(cell.near.D) == blocks.size else None
+        near = cell.near if cell.near is not None and cell.near.blocks == blocks else None
         if near is not None and excluded(found, near):
             return 0.0, near, True
         try:
@@ -236,7 +236,7 @@ def across_frequency(cell: Cell) -> list[Cell]:
 
 def worst(N: Any, m: Multiplier, owners: Any, count: int, other: int) -> int:
     """The parameter that moves most in the direction that is excluded least."""
-    D, G = m
+    D, G = m.D, m.G
     H = N.conj().T
     S = H @ D @ N + 1j * (G @ N - H @ G)
     _, vectors = linalg.eigh((S + S.conj().T) / 2, (D + D.conj().T) / 2)
