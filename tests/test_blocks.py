@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time as clock
 from typing import Any
 
 import control
@@ -18,7 +19,7 @@ from malta.margins.blocks import Block, probed
 from malta.margins.transfer import performance, responses, structured, transfer
 from malta.margins.weight import weight_of
 
-ONE = weight_of(1.0)
+ONE = weight_of(1.0, "")
 
 
 def law_of(A: Any, B: Any, C: Any, D: Any, **more: Any) -> malta.Compensator:
@@ -140,7 +141,7 @@ def test_expansions_hold_the_weight(seed: int, inverse: bool, T: float | None) -
     rng = np.random.default_rng(seed)
     zeros, poles = -(10.0 ** rng.uniform(-3, 3, 2)), -(10.0 ** rng.uniform(-3, 3, 2))
     W = control.zpk(zeros, poles, 1.0)
-    weight = weight_of(control.tf(W))
+    weight = weight_of(control.tf(W), "")
     scale, low = int(rng.integers(-8, 12)), float(10 ** rng.uniform(-2, 1))
     high = low * (1 + 10 ** rng.uniform(-4, -1))
     found = weight.on(np.array([[float(inverse), low, high]]), scale, T)
@@ -213,10 +214,10 @@ def test_several_blocks_beside_parameters(count: int) -> None:
     assert m.witness is not None
     assert m.frequency is not None
     assert 0.998 * m.upper <= m.lower <= m.upper
-    from malta.margins.blocks import block_of
+    from malta.margins.blocks import blocks_of
     from malta.margins.robust import law_of as converted
 
-    law, blocks = converted(s, F), [block_of(s, d) for d in every[:count]]
+    law, blocks = converted(s, F), blocks_of(s, every[:count], "")
 
     def mu(p: np.ndarray[Any, Any], w: np.ndarray[Any, Any]) -> Any:
         sizes = np.array([b.weight.at(w) for b in blocks]).T
@@ -255,20 +256,110 @@ def test_gains_of_systems_beyond_a_b_c(kind: str) -> None:
     assert 0.99 * d.upper <= d.lower <= d.upper
 
 
+def test_the_nominal_loss_is_found_in_any_box() -> None:
+    """Sensors whose gain peaks at the nominal k: parameters that move only help, and the loss is the nominal one."""
+    s = malta.uncertain(
+        lambda k: ([[0, 1], [-1, -0.2]], [[0], [1]], [[1 / (1 + 25 * (k - 1) * (k - 1)), 0]]), {"k": 1.0}
+    )
+    alone = malta.dynamic_margin(s, [[-0.5]], {}, Dynamic(0.5))
+    for sides in ((0.8, 1.2), (0.95, 1.9), (0.1, 1.05)):
+        m = malta.dynamic_margin(s, [[-0.5]], {"k": sides}, Dynamic(0.5))
+        assert m.upper == pytest.approx(alone.upper, rel=1e-6)
+        assert m.lower is not None
+        assert 0.99 * m.upper <= m.lower <= m.upper
+
+
+def test_a_block_that_nothing_passes_at_the_nominal() -> None:
+    """T = 2 k / (s + 1 + 2 k): 0.5 t |T| = 1 at w = 0 and k = -t, where t^2 + 2 t = 1; nothing at the nominal k = 0."""
+    s = malta.uncertain(lambda k: ([[-1.0]], [[k]], [[1.0]]), {"k": 0.0})
+    m = malta.dynamic_margin(s, [[-2.0]], {"k": (-1.0, 1.0)}, Dynamic(0.5))
+    exact = math.sqrt(2) - 1
+    assert m.upper == pytest.approx(exact, rel=1e-6)
+    assert m.lower is not None
+    assert 0.99 * exact <= m.lower <= exact * (1 + 1e-9)
+
+
+def test_a_gain_of_nothing_is_proven_small() -> None:
+    s = malta.uncertain(lambda k: ([[-1.0]], [[k]], [[1.0]]), {"k": 1.0})
+    for of, channel in (("complementary", 0), ("effort", (0, 0))):
+        m = malta.worst_case_gain(s, [[0.0]], {"k": 0.5}, of=of, channel=channel)  # type: ignore[arg-type]
+        assert m.lower == 0
+        assert m.upper is not None
+        assert m.upper <= 1e-6
+
+
+@pytest.mark.parametrize(
+    "weight",
+    [np.float64(0.5), np.float32(0.5), np.int64(1), 1, control.ss([[-2.0]], [[1.0]], [[1.0]], [[0.1]])],
+)
+def test_weights_of_every_kind(weight: Any) -> None:
+    s = malta.uncertain(lambda k: ([[-1.0]], [[k]], [[1.0]]), {"k": 1.0})
+    m = malta.dynamic_margin(s, [[-2.0]], {}, Dynamic(weight))
+    size = (
+        weight if not isinstance(weight, control.StateSpace) else 0.6
+    )  # at w = 0, where T = 2 / 3 is largest
+    assert m.upper == pytest.approx(1.5 / float(size), rel=1e-6)
+
+
+def test_a_pole_at_zero_and_a_single_block_of_dynamics() -> None:
+    """Deadbeat: nothing warns. |T| = 0.5 / |z|, and S with 20 % of dynamics at most 1.5 / (1 - 0.1)."""
+    s = malta.uncertain(lambda k: ([[0.5]], [[k]], [[1.0]]), {"k": 1.0}, sample_time=0.1)
+    m = malta.dynamic_margin(s, [[-0.5]], {}, Dynamic(0.2))
+    assert m.upper == pytest.approx(10, rel=1e-9)
+    g = malta.worst_case_gain(s, [[-0.5]], {}, dynamics=Dynamic(0.2), tolerance=1e-3)
+    assert g.upper is not None
+    assert g.lower == pytest.approx(1.5 / 0.9, rel=1e-6)
+    assert g.upper < 1.005 * g.lower
+
+
+def test_the_time_is_kept() -> None:
+    """A loop of six states and six parameters with three blocks, sampled with lag and delay, within the time asked."""
+    rng = np.random.default_rng(0)
+    A, B, C = rng.normal(size=(6, 6)) - 4 * np.eye(6), rng.normal(size=(6, 2)), rng.normal(size=(2, 6))
+
+    def of(a: Any, b: Any, c: Any, d: Any, e: Any, f: Any) -> Any:
+        return A * a - np.diag([b, c, d, e, f, 1]), B, C
+
+    s = malta.uncertain(of, dict.fromkeys("abcdef", 1.0))
+    F = law_of(0.5 * np.eye(2), 0.1 * np.eye(2), 0.1 * np.eye(2), -0.1 * np.eye(2),
+               sample_time=0.05, lag=30.0, delay=1)  # fmt: skip
+    blocks = [Dynamic(0.1), Dynamic(0.1, channel=1), Dynamic(0.1, at="forces", channel=(0, 1))]
+    begun = clock.process_time()
+    m = malta.dynamic_margin(s, F, dict.fromkeys("abcdef", 0.1), blocks, time=1.0)
+    assert clock.process_time() - begun < 6
+    assert m.lower is None or m.lower <= m.upper
+
+
 @pytest.mark.parametrize(
     ("blocks", "says"),
     [
         ([], "at least one"),
+        (None, "malta.Dynamic, one or a list"),
+        ([Dynamic(control.tf([[[1], [5]], [[5], [5]]], [[[1], [1]], [[1], [1]]]))], "one of each"),
+        ([Dynamic(10**400)], "above zero"),
+        ([Dynamic(True)], "a number above zero"),
+        ([Dynamic(0.1, channel=True)], "sensors from 0 to 1"),
         ([Dynamic(0.1)] * 5, "at most 4"),
         ([Dynamic(0.1, channel=(0, 1)), Dynamic(0.1, at="forces", channel=(0, 1))], "one of them full"),
         ([Dynamic(0.1, "additive")], "of an additive block"),
-        ([Dynamic(0.1, "additive", channel=(0, 2))], "one of the forces"),
-        ([Dynamic(0.1, channel=(1, 1))], "one of the sensors"),
-        ([Dynamic(0.1, channel=1.0)], "one of the sensors"),  # type: ignore[arg-type]
-        (["much"], "a malta.Dynamic"),
+        ([Dynamic(0.1, "additive", channel=(0, 2))], "0, forces are counted|forces from 0"),
+        ([Dynamic(0.1, channel=(1, 1))], "each of the sensors once"),
+        ([Dynamic(0.1, channel=1.0)], "sensors from 0 to 1"),  # type: ignore[arg-type]
+        (["much"], "malta.Dynamic, one or a list"),
     ],
 )
-def test_blocks_that_cannot_be_taken_get_one_sentence(blocks: list[Any], says: str) -> None:
+def test_blocks_that_cannot_be_taken_get_one_sentence(blocks: Any, says: str) -> None:
     s, F = satellite()
     with pytest.raises(InputError, match=says):
         malta.dynamic_margin(s, F, {"a": 0.1}, blocks)
+
+
+@pytest.mark.parametrize("function", ["dynamic", "gain"])
+@pytest.mark.parametrize("more", [{"time": 0}, {"time": -1.0}, {"time": math.nan}, {"time": "a"},
+                                  {"tolerance": math.inf}, {"tolerance": None}, {"tolerance": "a"}])  # fmt: skip
+def test_time_and_tolerance_are_checked(function: str, more: dict[str, Any]) -> None:
+    s, F = satellite()
+    asked = malta.dynamic_margin if function == "dynamic" else malta.worst_case_gain
+    given: tuple[Any, ...] = (Dynamic(0.1),) if function == "dynamic" else ()
+    with pytest.raises(InputError, match="above"):
+        asked(s, F, {"a": 0.1}, *given, **more)

@@ -98,11 +98,11 @@ def test_an_unstable_loop_has_no_margin() -> None:
     ("dynamic", "says"),
     [
         (Dynamic(0.0), "above zero"),
-        (Dynamic("large"), "a number or a transfer function"),
+        (Dynamic("large"), "a number above zero, or a transfer function"),
         (Dynamic(control.tf([1, 0], [1])), "stable, proper"),
         (Dynamic(control.tf([1], [1, -1])), "stable, proper"),
         (Dynamic(control.tf([1], [1, 0.5], 0.1)), "stable, proper"),
-        (Dynamic(0.5, channel=3), "one of the sensors"),
+        (Dynamic(0.5, channel=3), "sensors are counted from 0"),
         (Dynamic(0.5, at="here"), "sensors or forces"),  # type: ignore[arg-type]
     ],
 )

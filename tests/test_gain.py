@@ -129,14 +129,14 @@ def test_an_unstable_box_has_no_bound() -> None:
 @pytest.mark.parametrize(
     ("more", "says"),
     [
-        ({"channel": 1}, "one of the sensors"),
+        ({"channel": 1}, "sensors are counted from 0"),
         ({"of": "gain"}, "compliance or effort"),
         ({"at": "here"}, "sensors or forces"),
-        ({"tolerance": 0.0}, "above zero"),
+        ({"tolerance": 0.0}, "above 0, at most 1"),
         ({"of": "compliance"}, "\\(sensors, forces\\) of compliance"),
-        ({"of": "effort", "channel": (0, 1)}, "one of the sensors"),
-        ({"channel": (0, 0)}, "one of the sensors"),
-        ({"dynamics": ["much"]}, "a malta.Dynamic"),
+        ({"of": "effort", "channel": (0, 1)}, "sensors are counted from 0"),
+        ({"channel": (0, 0)}, "each of the sensors once"),
+        ({"dynamics": ["much"]}, "malta.Dynamic, one or a list"),
     ],
 )
 def test_bad_input_gets_one_sentence(more: dict[str, Any], says: str) -> None:

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from numbers import Integral
 from typing import TYPE_CHECKING, Any, Literal
 
 import casadi as ca
@@ -37,8 +38,12 @@ MOST = 4  # blocks: 2^4 polynomials
 class Dynamic:
     """Unmodelled dynamics: Delta stable, of largest singular value |Delta(jw)| <= |W(jw)| in the modelled set.
 
+    In a sampled loop Delta acts on samples, of readings or of held commands: a discrete-time system with
+    |Delta(e^jwT)| <= |W(jw)| up to Nyquist's frequency. What a continuous one between hold and sampler folds back from
+    beyond it is not covered; of a Delta that is small there that is little.
+
     weight: W, a number or a control.TransferFunction in s (additive: units of the sensor over those of the force)
-    kind: multiplicative (a gain 1 + Delta), feedback (1 / (1 + Delta)) or additive (P + Delta)
+    kind: multiplicative (a gain 1 + Delta), feedback (1 / (1 - Delta)) or additive (P + Delta)
     at: sensors or forces, of multiplicative and feedback
     channel: counted from 0; several of them, as a tuple, share one full block; additive: (sensors, forces)
     """
@@ -75,49 +80,57 @@ def shape_of(system: UncertainSystem) -> tuple[int, int]:
     return system.matrices.size1_out(2), system.matrices.size2_out(1)
 
 
-def block_of(system: UncertainSystem, dynamic: Dynamic) -> Block:
-    """A declared block. Raises InputError for weights, kinds and channels that there are not."""
-    if not isinstance(dynamic, Dynamic):
-        raise InputError("dynamic_margin", "dynamic", type(dynamic).__name__, "a malta.Dynamic")
-    weight = weight_of(dynamic.weight)
+def blocks_of(system: UncertainSystem, declared: Any, where: str) -> list[Block]:
+    """Declared blocks, one or several; where: the function that was asked.
+
+    Raises InputError for weights, kinds and channels that there are not.
+    """
+    several = [declared] if isinstance(declared, Dynamic) else declared
+    if not isinstance(several, (list, tuple)) or not all(isinstance(d, Dynamic) for d in several):
+        found = ", ".join(type(d).__name__ for d in several) if isinstance(several, (list, tuple)) else ""
+        raise InputError(where, "dynamics", found or type(declared).__name__, "malta.Dynamic, one or a list")
+    return [_block_of(system, d, where) for d in several]
+
+
+def _block_of(system: UncertainSystem, dynamic: Dynamic, where: str) -> Block:
+    weight = weight_of(dynamic.weight, where)
     if dynamic.kind == "additive":
         both = dynamic.channel
         if not isinstance(both, tuple) or len(both) != 2:
-            raise InputError(
-                "dynamic_margin", "channel", repr(both), "(sensors, forces) of an additive block"
-            )
+            raise InputError(where, "channel", repr(both), "(sensors, forces) of an additive block")
         rows, columns = (
-            channels_of(c, k, name) for c, k, name in zip(both, shape_of(system), _NAMES, strict=True)
+            channels_of(c, k, name, where) for c, k, name in zip(both, shape_of(system), _NAMES, strict=True)
         )
         return Block("additive", "sensors", rows, columns, weight)
     if dynamic.kind not in ("multiplicative", "feedback") or dynamic.at not in _NAMES:
         expected = "multiplicative, feedback or additive; sensors or forces"
-        raise InputError("dynamic_margin", "kind, at", f"{dynamic.kind}, {dynamic.at}", expected)
+        raise InputError(where, "kind, at", f"{dynamic.kind}, {dynamic.at}", expected)
     count = shape_of(system)[_NAMES.index(dynamic.at)]
-    channels = channels_of(dynamic.channel, count, dynamic.at)
+    channels = channels_of(dynamic.channel, count, dynamic.at, where)
     return Block(dynamic.kind, dynamic.at, channels, channels, weight)
 
 
 _NAMES = ("sensors", "forces")
 
 
-def channels_of(channel: Any, count: int, name: str) -> tuple[int, ...]:
+def channels_of(channel: Any, count: int, name: str, where: str) -> tuple[int, ...]:
     """One channel or several as a tuple. Raises InputError."""
     found = channel if isinstance(channel, tuple) else (channel,)
-    known = all(
-        isinstance(c, (int, np.integer)) and not isinstance(c, bool) and 0 <= c < count for c in found
-    )
-    if not found or not known or len(set(found)) < len(found):
-        raise InputError("channel", "channel", repr(channel), f"one of the {name}, from 0 to {count - 1}")
+    known = all(isinstance(c, Integral) and not isinstance(c, bool) and 0 <= int(c) < count for c in found)
+    if not found or not known:
+        range_of = f"0, {name} are counted from 0" if count == 1 else f"{name} from 0 to {count - 1}"
+        raise InputError(where, "channel", repr(channel), range_of)
+    if len(set(found)) < len(found):
+        raise InputError(where, "channel", repr(channel), f"each of the {name} once")
     return tuple(int(c) for c in found)
 
 
-def check_blocks(blocks: Sequence[Block]) -> None:
+def check_blocks(blocks: Sequence[Block], where: str) -> None:
     """Raise InputError for more blocks than are proven together."""
     full = sum(b.full for b in blocks)
     if len(blocks) > MOST or full > 1:
         found = f"{len(blocks)} complex blocks, {full} of them full"
-        raise InputError("dynamic", "blocks", found, f"at most {MOST}, at most one of them full")
+        raise InputError(where, "dynamics", found, f"at most {MOST}, at most one of them full")
 
 
 # the plant with the entries of blocks as parameters

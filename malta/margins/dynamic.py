@@ -8,21 +8,21 @@ from __future__ import annotations
 
 import math
 import time as clock
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from numbers import Real
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy import optimize
 
 from malta.errors import InputError
-from malta.margins.blocks import Block, Dynamic, block_of, check_blocks, probed
+from malta.margins.blocks import Block, Dynamic, blocks_of, check_blocks, probed
 from malta.margins.box import Box, box_of
 from malta.margins.enclosure import Unproven
 from malta.margins.loop import loop_of
 from malta.margins.loss import first_loss
-from malta.margins.peaks import Peak, climb, patterns
+from malta.margins.peaks import Peak, climb, frequencies, patterns
 from malta.margins.polydisc import Part, Size, excluded, parts_of
 from malta.margins.problem import OfLoop
 from malta.margins.robust import LONGEST, Margin, law_of, problem_of
@@ -38,6 +38,8 @@ if TYPE_CHECKING:
 TOLERANCE = 1e-3
 STEPS = (1, 3, 10, 30, 100, 300, 1000, 3000, 10_000)  # multiples of the tolerance that are tried
 ROUNDS = 3
+ROUNDS_OF_SECANT = 40
+SEARCH = 0.4  # of the time, for what is lost; the rest is for the proof
 
 
 def dynamic_margin(
@@ -73,18 +75,17 @@ def dynamic_margin(
     begun = clock.monotonic()
     law = law_of(system, compensator)
     box = box_of(system.names, system.nominal, system.limits, ranges, over or {}, empty=True)
-    if not tolerance > 0:
-        raise InputError("dynamic_margin", "tolerance", f"{tolerance}", "a number above zero")
-    given = [dynamic] if isinstance(dynamic, Dynamic) else list(dynamic)
-    if not given:
+    check_effort("dynamic_margin", tolerance, time)
+    blocks = blocks_of(system, dynamic, "dynamic_margin")
+    if not blocks:
         raise InputError("dynamic_margin", "dynamic", "no block", "at least one malta.Dynamic")
-    asked = Blocks.of(system, law, box, [block_of(system, d) for d in given])
+    asked = Blocks.of(system, law, box, blocks, "dynamic_margin")
     if asked.unstable():
         reason = "the nominal loop is unstable"
         return Margin(0.0, 0.0, None, None, {}, {}, (), clock.monotonic() - begun, reason)
     until = begun + (LONGEST if time is None else time)
     with np.errstate(all="ignore"):  # what is not finite excludes nothing
-        lost = _loss(asked, until)
+        lost = _loss(asked, begun + SEARCH * (until - begun))
         t = math.inf if lost is None else _size(asked, lost)
         lower, reason = _proven(asked, min(t, asked.limit), tolerance, until)
     spent, names = clock.monotonic() - begun, box.names
@@ -107,9 +108,11 @@ class Blocks:
     with_blocks: OfLoop
 
     @classmethod
-    def of(cls, system: UncertainSystem, law: Compensator, box: Box, blocks: Sequence[Block]) -> Blocks:
+    def of(
+        cls, system: UncertainSystem, law: Compensator, box: Box, blocks: Sequence[Block], where: str
+    ) -> Blocks:
         """Raises InputError for blocks that cannot be taken together."""
-        check_blocks(blocks)
+        check_blocks(blocks, where)
         problem = problem_of(system, law)
         scaled = tuple(_scaled(system, law, box.nominal, b, problem) for b in blocks)
         more, wider = probed(system, law, scaled)
@@ -159,11 +162,20 @@ def _scaled(
     """A block probed by entries that count about as much as the loop's own gain, by powers of two."""
     if b.kind in ("multiplicative", "feedback"):
         return b
-    from malta.margins.peaks import frequencies
-
     M = transfer(responses(system, law, nominal, frequencies(problem, nominal)), [b])
     size = float(np.abs(M[np.isfinite(M)]).max(initial=0.0))
-    return replace(b, unit=2.0 ** -round(1 + math.log2(size))) if size > 0 else b
+    return replace(b, unit=2.0 ** -min(max(round(1 + math.log2(size)), -500), 500)) if size > 0 else b
+
+
+def check_effort(where: str, tolerance: Any, time: Any) -> None:
+    """Raise InputError for what is no tolerance, from 0 to 1, and no time."""
+    for name, value, most in (("tolerance", tolerance, 1.0), ("time", time, math.inf)):
+        known = isinstance(value, (Real, np.generic)) and not isinstance(value, (bool, np.bool_))
+        if value is None and name == "time":
+            continue
+        if not known or not 0 < float(value) <= most:
+            expected = "seconds above zero" if name == "time" else "a number above 0, at most 1"
+            raise InputError(where, name, repr(value), expected)
 
 
 def _size(asked: Blocks, place: Peak) -> float:
@@ -172,7 +184,7 @@ def _size(asked: Blocks, place: Peak) -> float:
     with np.errstate(divide="ignore", invalid="ignore"):
         t = np.where(moved > 0, moved / box.up, np.where(moved < 0, -moved / box.down, 0))
     share = float(np.where(box.down + box.up > 0, t, 0).max(initial=0.0))
-    return max(share, 1 / place.value)
+    return max(share, 1 / place.value if place.value > 0 else math.inf)
 
 
 def _loss(asked: Blocks, until: float) -> Peak | None:
@@ -184,40 +196,56 @@ def _loss(asked: Blocks, until: float) -> Peak | None:
         return structured(asked.transfer(p, w), asked.blocks)[0]
 
     def peak(t: float, chosen: FloatArray) -> Peak:
-        found = climb(value, asked.problem, box.sides(t), asked.starts(t, chosen))
+        starts = [box.nominal, *asked.starts(t, chosen)]
+        found = climb(value, asked.problem, box.sides(t), starts, until)
         seen.append(found)
         return found
 
-    first = peak(0.0, every)
-    if not (box.down + box.up).any():
-        return first if first.value > 0 else None
-    high = min(1 / first.value if first.value > 0 else math.inf, asked.limit)
-    alone: Peak | None = None
-    if (asked.problem.instability(np.array(asked.starts(high, every))) >= 0).any():
-        t, w, p = first_loss(asked.problem, box, high)  # by the parameters alone
-        if p is not None and w is not None:
-            alone, high = Peak(1 / t, w, p), t
-            seen.append(alone)
-    top = peak(high, every)
-    if top.value * high < 1:
-        return alone
-    for _ in range(ROUNDS):
-        chosen = _pattern(box, high, top.p)
-        low = high / 2
-        while low > 1e-9 * high and peak(low, chosen).value * low >= 1:
-            high, low = low, low / 2
+    def nearest() -> Peak:
+        return min(seen, key=lambda place: _size(asked, place))
 
-        def excess(x: float, chosen: FloatArray = chosen) -> float:
-            return math.log(max(peak(math.exp(x), chosen).value, 1e-300)) + x
+    peak(0.0, every)
+    if (box.down + box.up).any():
+        high = min(_size(asked, nearest()), asked.limit)
+        if (asked.problem.instability(np.array(asked.starts(high, every))) >= 0).any():
+            t, w, p = first_loss(asked.problem, box, high)  # by the parameters alone
+            if p is not None and w is not None:
+                seen.append(Peak(1 / t, w, p))
+                high = t
+        top = peak(high, every)
+        for _ in range(ROUNDS):
+            if top.value * high < 1 or clock.monotonic() > until:
+                break
+            _narrowed(peak, high, _pattern(box, high, top.p), until)
+            high = _size(asked, nearest())
+            top = peak(high, every)
+            if top.value * high < 1 + 1e-9:
+                break
+    best = nearest()
+    return best if math.isfinite(_size(asked, best)) else None
 
-        optimize.brentq(excess, math.log(low), math.log(high), xtol=1e-11, maxiter=40)
-        best = min(seen, key=lambda place: _size(asked, place))
-        t = _size(asked, best)
-        top = peak(t, every)
-        if top.value * t < 1 + 1e-9 or clock.monotonic() > until:
-            break
-        high = t
-    return min(seen, key=lambda place: _size(asked, place))
+
+def _narrowed(
+    peak: Callable[[float, FloatArray], Peak], high: float, chosen: FloatArray, until: float
+) -> None:
+    """Bisect t, in its logarithm, between where t |M| is below one and `high`, where it is not."""
+    low = high / 2
+    while low > 1e-9 * high and peak(low, chosen).value * low >= 1 and clock.monotonic() < until:
+        high, low = low, low / 2
+    below, above = math.log(low), math.log(high)
+    at_below, at_above = (math.log(max(peak(t, chosen).value, 1e-300)) + math.log(t) for t in (low, high))
+    for _ in range(ROUNDS_OF_SECANT):
+        if not at_below < 0 <= at_above or above - below < 1e-11 or clock.monotonic() > until:
+            return
+        share = min(max(at_above / (at_above - at_below), 0.02), 0.98)
+        x = above - share * (above - below)
+        here = math.log(max(peak(math.exp(x), chosen).value, 1e-300)) + x
+        if here < 0:
+            below, at_below, at_above = x, here, at_above / 2
+        else:
+            above, at_above, at_below = x, here, at_below / 2
+        if abs(here) < 1e-10:
+            return
 
 
 def _pattern(box: Box, t: float, p: FloatArray) -> FloatArray:
@@ -233,6 +261,8 @@ def _proven(asked: Blocks, upper: float, tolerance: float, until: float) -> tupl
     parts: list[Part] = []
     reason = ""
     for step in STEPS:
+        if clock.monotonic() > until:
+            break
         t = upper / (1 + step * tolerance)
         try:
             parts = parts or asked.parts(t, [t] * len(asked.blocks), until)
@@ -241,6 +271,4 @@ def _proven(asked: Blocks, upper: float, tolerance: float, until: float) -> tupl
             continue
         if excluded(parts, t, asked.sizes(t), until)[0]:
             return (t, "") if asked.stable(until) else (None, "the nominal loop is not proven stable")
-        if clock.monotonic() > until:
-            break
     return None, reason or "not settled"

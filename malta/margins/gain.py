@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from malta.errors import InputError
-from malta.margins.blocks import At, Block, Channels, Dynamic, block_of, channels_of, shape_of
+from malta.margins.blocks import At, Block, Channels, Dynamic, blocks_of, channels_of, shape_of
 from malta.margins.box import box_of
-from malta.margins.dynamic import Blocks
+from malta.margins.dynamic import SEARCH, Blocks, check_effort
 from malta.margins.enclosure import Unproven
 from malta.margins.peaks import climb, patterns
 from malta.margins.polydisc import excluded
@@ -34,6 +34,8 @@ Of = Literal["sensitivity", "complementary", "compliance", "effort"]
 
 TOLERANCE = 3e-3  # how close the proven bound comes to the largest gain found, relative
 STEPS = (1, 3, 10, 30, 100, 300, 1000)  # multiples of the tolerance that are tried
+LEAST = 1e-12  # below which a gain is taken as none, and one of these bounds is proven
+NOTHING = (1e-12, 1e-9, 1e-6, 1e-3, 1.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +64,7 @@ def worst_case_gain(
     of: Of = "sensitivity",
     at: At = "sensors",
     channel: Channels | tuple[Channels, Channels] | None = 0,
-    dynamics: Sequence[Dynamic] = (),
+    dynamics: Dynamic | Sequence[Dynamic] = (),
     tolerance: float = TOLERANCE,
     time: float | None = None,
 ) -> Gain:
@@ -93,11 +95,11 @@ def worst_case_gain(
     law = law_of(system, compensator)
     box = box_of(system.names, system.nominal, system.limits, ranges, over or {}, empty=True)
     last = _performance_block(system, of, at, channel)
-    if not tolerance > 0:
-        raise InputError("worst_case_gain", "tolerance", f"{tolerance}", "a number above zero")
+    check_effort("worst_case_gain", tolerance, time)
     if not box.most > 1:
         raise InputError("worst_case_gain", "ranges", "a box that reaches a limit", "one within the limits")
-    asked = Blocks.of(system, law, box, [*(block_of(system, d) for d in dynamics), last])
+    blocks = [*blocks_of(system, dynamics, "worst_case_gain"), last]
+    asked = Blocks.of(system, law, box, blocks, "worst_case_gain")
     if asked.unstable():
         reason = "the nominal loop is unstable"
         return Gain(math.inf, None, math.nan, {}, 0, clock.monotonic() - begun, reason)
@@ -113,7 +115,8 @@ def worst_case_gain(
             p = starts[int(worst.argmax())]
             lower, w = math.inf, asked.problem.critical(p)
         else:
-            lower, w, p = climb(value, asked.problem, box.sides(1.0), starts)
+            last_climb = begun + SEARCH * (until - begun)
+            lower, w, p = climb(value, asked.problem, box.sides(1.0), starts, last_climb)
         upper, cells, reason = _proven(asked, lower, tolerance, until)
     named = dict(zip(box.names, p.tolist(), strict=True))
     return Gain(lower, upper, w, named, cells, clock.monotonic() - begun, reason)
@@ -125,16 +128,18 @@ def _performance_block(system: UncertainSystem, of: Of, at: At, channel: Any) ->
         expected = "sensitivity, complementary, compliance or effort; sensors or forces"
         raise InputError("worst_case_gain", "of, at", f"{of}, {at}", expected)
     counts = dict(zip(("sensors", "forces"), shape_of(system), strict=True))
-    one = weight_of(1.0)
+    one = weight_of(1.0, "worst_case_gain")
     if of in ("sensitivity", "complementary"):
         picked = tuple(range(counts[at])) if channel is None else channel
-        channels = channels_of(picked, counts[at], at)
+        channels = channels_of(picked, counts[at], at, "worst_case_gain")
         return Block("feedback" if of == "sensitivity" else "multiplicative", at, channels, channels, one)
     names = ("sensors", "forces") if of == "compliance" else ("forces", "sensors")
     both = tuple(tuple(range(counts[name])) for name in names) if channel is None else channel
     if not isinstance(both, tuple) or len(both) != 2:
         raise InputError("worst_case_gain", "channel", repr(channel), f"({names[0]}, {names[1]}) of {of}")
-    read, driven = (channels_of(c, counts[name], name) for c, name in zip(both, names, strict=True))
+    read, driven = (
+        channels_of(c, counts[name], name, "worst_case_gain") for c, name in zip(both, names, strict=True)
+    )
     return Block(of, "sensors", driven, read, one)  # type: ignore[arg-type]
 
 
@@ -147,8 +152,7 @@ def _proven(asked: Blocks, lower: float, tolerance: float, until: float) -> tupl
     except Unproven as error:
         return None, 0, str(error)
     count, last = 0, len(asked.blocks) - 1
-    for step in STEPS:
-        bound = max(lower, 1e-300) * (1 + step * tolerance)
+    for bound in [lower * (1 + step * tolerance) for step in STEPS] if lower > LEAST else NOTHING:
         sizes = [*asked.sizes(1.0)[:last], asked.sizes(1 / bound)[last]]
         found, cells = excluded(parts, 1 + 1e-9, sizes, until)
         count += cells

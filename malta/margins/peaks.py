@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import itertools
 import math
+import time as clock
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from scipy import optimize
@@ -44,7 +45,8 @@ def patterns(count: int) -> FloatArray:
 
 def frequencies(problem: OfLoop, p: FloatArray) -> FloatArray:
     """Frequencies that show a loop's peaks: between its slowest and its fastest pole and about each of them, rad/s."""
-    s: ComplexArray = problem.poles(p)
+    with np.errstate(all="ignore"):
+        s: ComplexArray = problem.poles(p)
     known = np.concatenate([np.abs(s), np.abs(s.imag)])
     known = known[np.isfinite(known) & (known > 0)]
     T = problem.loop.law.sample_time
@@ -57,10 +59,14 @@ def frequencies(problem: OfLoop, p: FloatArray) -> FloatArray:
     return np.asarray(np.append(w[w < top], top) if T is not None else w)
 
 
-def climb(value: Value, problem: OfLoop, sides: FloatArray, starts: Sequence[FloatArray]) -> Peak:
-    """The largest value found within the sides of a box (P x 2), from the best places at some parameters."""
+def climb(
+    value: Value, problem: OfLoop, sides: FloatArray, starts: Sequence[FloatArray], until: float = math.inf
+) -> Peak:
+    """The largest value found within the sides of a box (P x 2) until a time, from the best places of some starts."""
     places: list[Peak] = []
     for p in starts:
+        if places and clock.monotonic() > until:
+            break
         w = frequencies(problem, p)
         v = value(p, w)
         inner = np.flatnonzero((v >= np.append(v[1:], -np.inf)) & (v >= np.append(-np.inf, v[:-1])))
@@ -70,13 +76,15 @@ def climb(value: Value, problem: OfLoop, sides: FloatArray, starts: Sequence[Flo
         return places[0]
     T = problem.loop.law.sample_time
     top = math.inf if T is None else math.pi / T
-    return max(
-        (_uphill(value, place, sides, top) for place in places[: min(PLACES, len(starts))]),
-        key=lambda place: place.value,
-    )
+    best = places[0]
+    for place in places[: min(PLACES, len(starts))]:
+        if clock.monotonic() > until:
+            break
+        best = max(best, _uphill(value, place, sides, top, until), key=lambda found: found.value)
+    return best
 
 
-def _uphill(value: Value, place: Peak, sides: FloatArray, top: float) -> Peak:
+def _uphill(value: Value, place: Peak, sides: FloatArray, top: float, until: float) -> Peak:
     """From a place to the top nearby, by L-BFGS in parameters and log frequency, then in frequency alone."""
     free = np.flatnonzero(sides[:, 1] > sides[:, 0])
     low, width = sides[free, 0], sides[free, 1] - sides[free, 0]
@@ -84,7 +92,7 @@ def _uphill(value: Value, place: Peak, sides: FloatArray, top: float) -> Peak:
 
     def at(z: FloatArray) -> tuple[FloatArray, float]:
         p = place.p.copy()
-        p[free] = low + width * np.clip(z[:-1], 0, 1)
+        p[free] = np.clip(low + width * np.clip(z[:-1], 0, 1), *sides[free].T)
         return p, min(place.frequency * math.exp(float(z[-1])), top)
 
     def loss(z: FloatArray) -> float:
@@ -97,7 +105,13 @@ def _uphill(value: Value, place: Peak, sides: FloatArray, top: float) -> Peak:
 
     bounds = [(0.0, 1.0)] * len(free) + [(-3.0, 3.0)]
     z = np.append(np.clip((place.p[free] - low) / width, 0, 1), 0.0)
-    optimize.minimize(loss, z, method="L-BFGS-B", bounds=bounds, options={"maxiter": 60})
+
+    def stop(z: Any) -> None:
+        del z
+        if clock.monotonic() > until:
+            raise StopIteration
+
+    optimize.minimize(loss, z, method="L-BFGS-B", bounds=bounds, options={"maxiter": 60}, callback=stop)
     z = np.append(np.clip((best.p[free] - low) / width, 0, 1), math.log(best.frequency / place.frequency))
     optimize.minimize_scalar(
         lambda x: loss(np.append(z[:-1], x)), bounds=(z[-1] - 0.02, z[-1] + 0.02), method="bounded",

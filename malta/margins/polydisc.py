@@ -91,6 +91,8 @@ def parts_of(
         todo = [sides]
         while todo:
             own = todo.pop()
+            if clock.monotonic() > until:
+                raise Unproven("time was up before the coefficients were found")
             try:
                 found.append(_part(f, own, scaled, [(k, blocks[k], pins[k]) for k in acting], box, until))
             except TooWide as error:

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from numbers import Real
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -107,25 +108,36 @@ def _taylor(c: ComplexArray, z: FloatArray, slope: ComplexArray, bent: FloatArra
     return Expanded(np.asarray(terms[0], dtype=complex), first * slope, rest * (1 + 1e-12) + rounding)
 
 
-def weight_of(weight: Any) -> Weight:
+def weight_of(weight: Any, where: str) -> Weight:
     """W as a record. Raises InputError for what is neither a positive number nor a stable, proper W(s)."""
-    if isinstance(weight, (int, float)) and not isinstance(weight, bool):
-        if not 0 < weight < math.inf:
-            raise InputError(
-                "dynamic_margin", "weight", f"{weight}", "a number above zero, or a transfer function"
-            )
-        return Weight(np.array([float(weight)]), np.ones(1))
+    expected = "a number above zero, or a transfer function"
+    if isinstance(weight, (Real, np.generic)) and not isinstance(weight, (bool, np.bool_)):
+        try:
+            value = float(weight)
+        except (OverflowError, TypeError):
+            value = math.inf
+        if not 0 < value < math.inf:
+            raise InputError(where, "weight", f"{value}", expected)
+        return Weight(np.array([value]), np.ones(1))
+    if type(weight).__name__ == "StateSpace":
+        weight = _transfer_function(weight)
     try:
+        single = np.shape(weight.num)[:2] == (1, 1) or (len(weight.num), len(weight.num[0])) == (1, 1)
         num, den = (np.asarray(c[0][0], dtype=float) for c in (weight.num, weight.den))
-        stable, continuous = bool((weight.poles().real < 0).all()), not weight.dt
-    except (AttributeError, TypeError, ValueError, IndexError):
-        raise InputError(
-            "dynamic_margin", "weight", type(weight).__name__, "a number or a transfer function"
-        ) from None
+        with np.errstate(all="ignore"):
+            stable, continuous = bool((weight.poles().real < 0).all()), not weight.dt
+    except (AttributeError, TypeError, ValueError, IndexError, np.linalg.LinAlgError):
+        raise InputError(where, "weight", type(weight).__name__, expected) from None
+    if not single:
+        raise InputError(where, "weight", "several inputs or outputs", "one of each")
     num, den = np.trim_zeros(num, "f"), np.trim_zeros(den, "f")
     known = len(num) and np.isfinite([*num, *den]).all()
     if not (known and stable and continuous and len(num) <= len(den)):
-        raise InputError(
-            "dynamic_margin", "weight", "not stable, not proper or discrete", "a stable, proper one in s"
-        )
+        raise InputError(where, "weight", "not stable, not proper or discrete", "a stable, proper one in s")
     return Weight(np.concatenate([np.zeros(len(den) - len(num)), num])[::-1], den[::-1])
+
+
+def _transfer_function(weight: Any) -> Any:
+    import control
+
+    return control.ss2tf(weight)
