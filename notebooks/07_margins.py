@@ -230,19 +230,15 @@ assert hits <= 6
 
 
 # %%
-def pid(Kp: float, Ki: float, Kd: float, Tf: float) -> control.TransferFunction:
-    return -(control.tf([Kp], [1]) + control.tf([Ki], [1, 0]) + control.tf([Kd, 0], [Tf, 1]))
-
-
 second_order = malta.uncertain(lambda k: ([[0, 1], [-k, -1.8]], [[0], [18]], [[1, 0]]), {"k": 10.0})
-law = pid(2.3, 3, 0.38, 0.001)
+law = -(2.3 + control.tf([3], [1, 0]) + control.tf([0.38, 0], [0.001, 1]))
 found = malta.dynamic_margin(second_order, law, {"k": 0.4}, malta.Dynamic(0.5))
 assert found.lower is not None
 print(f"robstab 1.5960 .. 1.5993, ours {found.lower:.4f} .. {found.upper:.4f}")
 assert 1.5960 <= found.lower <= found.upper <= 1.5993
 
 integrator = malta.uncertain(lambda a: ([[a]], [[1]], [[1]]), {"a": 0.0})
-derivative = pid(2, 0, -0.04, 0.02)
+derivative = -(2 + control.tf([-0.04, 0], [0.02, 1]))
 additive = malta.Dynamic(0.4, "additive", channel=(0, 0))
 peak = malta.worst_case_gain(integrator, derivative, {}, dynamics=[additive], tolerance=1e-3)
 assert peak.upper is not None

@@ -111,7 +111,7 @@ def _uphill(value: Value, place: Peak, sides: FloatArray, top: float, until: flo
         if clock.monotonic() > until:
             raise StopIteration
 
-    optimize.minimize(loss, z, method="L-BFGS-B", bounds=bounds, options={"maxiter": 60}, callback=stop)
+    optimize.minimize(loss, z, method="L-BFGS-B", bounds=bounds, options={"maxiter": 60}, callback=stop)  # type: ignore[call-overload]
     z = np.append(np.clip((best.p[free] - low) / width, 0, 1), math.log(best.frequency / place.frequency))
     optimize.minimize_scalar(
         lambda x: loss(np.append(z[:-1], x)), bounds=(z[-1] - 0.02, z[-1] + 0.02), method="bounded",
