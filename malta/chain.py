@@ -223,7 +223,10 @@ def robustness(
     for share in shares:
         positions = dict.fromkeys((share * plant.travel, -share * plant.travel))
         loops = [loop_at(plant, controller, tuple(every), z, current_loops) for z in positions]
-        margin = _smallest([here(z) for z in positions]) if proof else NOT_PROVEN
+        asked = (
+            positions if len(shares) > 2 else [share * plant.travel]
+        )  # a place takes as long as a travel there
+        margin = _smallest([here(z) for z in asked]) if proof else NOT_PROVEN
         peaks, sides = [], []
         for system, law in loops:
             peaks.append(_peak(system, law, states=False))

@@ -232,7 +232,9 @@ def worst_case_table(gains: Mapping[str, Gain]) -> Table:
 def places_table(found: Robustness, Ts: float) -> Table:
     """The machine's loop along the travel: even in the position."""
     table = _table(
-        "Along the travel, either way",
+        "Along the travel, either way"
+        if _everywhere(found.travel)
+        else "In the middle of the travel and at its ends (margin: at the positive one)",
         "at [mm]",
         "proven",
         "lost at",

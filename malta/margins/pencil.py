@@ -90,6 +90,13 @@ class Rows:
         assert (self.C.shape, self.D.shape) == ((y, n), (y, m))
 
     @property
+    def size(self) -> int:
+        """Rows of the pencil."""
+        law, m = self.loop.law, len(self.inputs)
+        lags = m if law.lag is not None else 0
+        return len(self.group.states) + lags + len(self.group.own) + m * law.delay + len(self.reads)
+
+    @property
     def cost(self) -> int:
         """Terms of all entries."""
         return sum(len(t.gains) for t in (self.A, self.B, self.C, self.D, self.E))

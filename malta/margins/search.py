@@ -42,15 +42,10 @@ PATIENCE = 20_000  # cells without progress after which the proof is given up
 REMEMBERED = 4_000_000  # numbers in the families of a polynomial, beyond which the oldest are forgotten
 HARD = 4000  # cells after which smaller boxes are proven first
 LEVELS = 5  # of these boxes, each half of the next
-SHARES = (
-    0.6,
-    0.6,
-    0.6,
-    0.6,
-    0.4,
-    0.3,
-)  # of the time for families, by the number of parameters, the last for MANY
+# of the time for families, by the number of parameters, the last for MANY
+SHARES = (0.6, 0.6, 0.6, 0.6, 0.4, 0.3)
 MANY = 5  # parameters from which on multipliers come before many cells
+TURN, TURN_AFTER = 0.5, 4.0  # their share of the time in that turn, and how many times what was spent before
 PATCHES = 64  # parts that a box is cut into where one expansion does not do
 
 
@@ -71,7 +66,7 @@ class Job:
     progress: Progress | None
 
     def __post_init__(self) -> None:
-        self.asked, self.end = self.tolerance, self.until
+        self.asked, self.end, self.begun = self.tolerance, self.until, clock.monotonic()
         self.limit = min(self.box.most * (1 - EDGE), FAR)
         self.stands = 0.0
         self.upper = math.inf
@@ -234,7 +229,9 @@ class Job:
         final = self._advance(searches, reach, min(self.most_cells, HARD))
         best, kept = 0.0, searches
         if self._open(searches) and self._count >= MANY:
-            self._multiply(self.target(reach), 0.9)
+            self._multiply(self.target(reach), TURN, TURN_AFTER * (clock.monotonic() - self.begun))
+            if self._multiplied() > final:
+                self._multiply(self.target(reach), 0.9)
             if self._settled():
                 return final, searches
         if self._open(searches) and not self.late() and not _blocked(searches):
@@ -257,11 +254,11 @@ class Job:
         rows = None if self.box.frame else rows_of(self.problem)
         return None if rows is None else Structured(rows, self.box, self.until, self.most_cells, self._told)
 
-    def _multiply(self, target: float, share: float) -> None:
-        """Raise the proven bound by multipliers, for a share of the time that is left."""
+    def _multiply(self, target: float, share: float, most: float = math.inf) -> None:
+        """Raise the proven bound by multipliers, for a share of the time that is left, and `most` seconds."""
         now = clock.monotonic()
         if self.structured is not None and now < self.until:
-            self.structured.until = now + share * (self.until - now)
+            self.structured.until = now + min(share * (self.until - now), most)
             self.structured.raised(target)
 
     def _told(self, t: float) -> None:

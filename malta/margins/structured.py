@@ -35,6 +35,7 @@ NARROWEST = 1e-9  # of an interval of frequency, relative
 LOWEST = 1e-5  # end of the one from zero, relative to the octave that it was cut from
 REMEMBERED = 64  # pencils
 TERMS = 20_000  # of all entries, beyond which they are not expanded
+LARGEST = 40  # rows of a group's pencil, beyond which families of its smaller groups are cheaper
 ROUGH = 0.1  # how close the first beta is to the smallest, relative
 SMALLEST = 1e-6  # of the target: boxes below that are not tried
 FIRST_STEP, LAST_STEP = 1.2, 1.003  # from one box to the next
@@ -265,7 +266,7 @@ def intervals(rows: Rows, nominal: FloatArray) -> list[tuple[int, float, float]]
 
 
 def rows_of(problem: Problem) -> list[Rows] | None:
-    """Of all groups of the loops; None where they are no rational functions of p, or too many terms."""
+    """Of all groups of the loops; None where they are no rational functions of p, or too large."""
     if isinstance(problem, OfSeveral):
         parts = [rows_of(part) for part in problem.problems]
         return None if any(part is None for part in parts) else [r for part in parts for r in part or []]
@@ -275,4 +276,5 @@ def rows_of(problem: Problem) -> list[Rows] | None:
     if loop.symbolic is None or not loop.program.rational or (loop.descriptor and loop.sampled):
         return None
     found = [Rows(loop, group) for group in groups(loop)]
-    return found if sum(rows.cost for rows in found) <= TERMS else None
+    small = sum(rows.cost for rows in found) <= TERMS and max(rows.size for rows in found) <= LARGEST
+    return found if small else None
