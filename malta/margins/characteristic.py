@@ -21,7 +21,7 @@ from flint import acb, arb, arb_mat, ctx, fmpq, fmpq_mat
 
 from malta.margins.algebra import Ratio, Symbolic, value
 from malta.margins.closed import closed_loop, coefficients, majorant_matrix, parts
-from malta.margins.expressions import BALLS, EXACT, POINTS, finite
+from malta.margins.expressions import BALLS, EXACT, POINTS, NotAnalytic, finite
 from malta.margins.loop import A, B, C, D, E, Group, Loop, divided
 from malta.margins.majorant import coefficient_bounds
 from malta.margins.minors import Minors, minors
@@ -302,6 +302,9 @@ def _ends_of(x: Any) -> tuple[Any, ...]:
 
 
 def pair(c: Any) -> tuple[float, int]:
+    """At least |c|: mantissa and exponent. Raises NotAnalytic where it is not finite."""
+    if not c.is_finite():
+        raise NotAnalytic("numbers that overflow")
     m, e = (int(i) for i in c.abs_upper().man_exp())
     if m == 0:
         return 0.0, 0

@@ -175,7 +175,10 @@ def coefficients(closed: tuple[Any, Any]) -> list[Any]:
 
 
 def majorant_matrix(loop: Loop, g: Group, entries: list[list[tuple[int, int, Any]]]) -> FloatArray:
-    """Entrywise bounds of the closed loop's state matrix (of differences where discrete), from balls of the entries."""
+    """Entrywise bounds of the closed loop's state matrix (of differences where discrete), from balls of the entries.
+
+    Raises NotAnalytic where numbers overflow, or the direct feedthrough is too large.
+    """
     law, x = loop.law, {state: k for k, state in enumerate(g.states)}
     m, p, n = loop.program.shapes[B][1], loop.program.shapes[C][0], len(x)
 
@@ -200,6 +203,8 @@ def majorant_matrix(loop: Loop, g: Group, entries: list[list[tuple[int, int, Any
     c = sizes(p, n, ((i, x[j], r) for i, j, r in entries[C] if j in x))
     d = sizes(p, m, entries[D]) if loop.direct else None
     out, through = np.abs(law.C[:, list(g.own)]), np.abs(law.D)
+    if not all(np.isfinite(part).all() for part in (a, b, c, d) if part is not None):
+        raise NotAnalytic("numbers that overflow")
     if g.inputs is not None:
         picked = [x[i] for i in g.inputs]
         out, through, b = b[picked] @ out, b[picked] @ through, np.eye(n)[:, picked]

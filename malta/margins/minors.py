@@ -27,7 +27,7 @@ from malta.margins.closed import (
     rows_of,
     solved,
 )
-from malta.margins.expressions import Program, exact
+from malta.margins.expressions import NotAnalytic, Program, exact
 from malta.margins.loop import A, B, C, E, Group, Loop, rational, upper
 from malta.margins.majorant import all_bounds, coefficient_bounds
 
@@ -173,7 +173,10 @@ class Minors:
         )  # fmt: skip
 
     def sizes(self, entries: list[list[tuple[int, int, Any]]]) -> Sizes:
-        """Bounds of the system's minors from balls of the entries."""
+        """Bounds of the system's minors from balls of the entries.
+
+        Raises NotAnalytic where numbers overflow.
+        """
         a, b, c, diagonal = _sizes(self, entries)
         a, into, c, _ = driven_bounds(self.loop, (a, np.eye(len(a))[:, list(self.rows)], c, None), diagonal)
         pi: dict[Pair, Any] = {((), ()): coefficient_bounds(a, np.ones(len(a)))}
@@ -190,6 +193,8 @@ class Minors:
             for R in itertools.combinations(range(len(self.rows)), k)
             for T in itertools.combinations(self.inputs, k)
         }
+        if not all(math.isfinite(size) for size in beta.values()):
+            raise NotAnalytic("numbers that overflow")
         return Sizes(pi, beta)
 
     def majorant(self, sizes: Sizes) -> list[Any]:

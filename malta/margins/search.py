@@ -18,7 +18,7 @@ from malta.margins.characteristic import pair
 from malta.margins.descent import from_cell, nearest
 from malta.margins.enclosure import TooWide, Unproven, over_box, precision
 from malta.margins.exclusion import Search, advance, growth_over, start
-from malta.margins.expressions import exact
+from malta.margins.expressions import NotAnalytic, exact
 from malta.margins.family import Family, narrowed
 from malta.margins.loss import first_loss, loss_of_one
 from malta.margins.parts import Part, halves, without_twins
@@ -90,8 +90,11 @@ class Job:
         """
         sides = self.box.framed(reach)
         made: list[Part] = []
-        for polynomial, moves in self.problem.parts([arb(a).union(arb(b)) for a, b in sides.tolist()]):
-            made += self._cut(polynomial, sides, moves, last)
+        try:
+            for polynomial, moves in self.problem.parts([arb(a).union(arb(b)) for a, b in sides.tolist()]):
+                made += self._cut(polynomial, sides, moves, last)
+        except NotAnalytic as error:
+            raise Unproven(f"the matrices have no value on the box: {error}") from error
         return without_twins(made)
 
     def _cut(self, f: Polynomial, sides: FloatArray, moves: tuple[Any, ...], last: float) -> list[Part]:
