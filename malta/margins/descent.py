@@ -8,6 +8,7 @@ Nyquist frequency) the equation is that of one real coefficient.
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -75,7 +76,7 @@ def _settled(f: Family, branch: int, here: _Place) -> Zero | None:
     x = abs(here.x)
     a, _ = coefficients_at(f, here.u)
     rows, _ = rows_and_slopes(f, branch, x)
-    small = abs(complex((rows @ a)[0])) <= 1e-11 * float((np.abs(rows) @ f.size())[0])
+    small = _length(complex((rows @ a)[0])) <= 1e-11 * float((np.abs(rows) @ f.size())[0])
     return Zero(here.t, branch, x, here.u) if small else None
 
 
@@ -229,13 +230,13 @@ def projected(f: Family, g: Growth, branch: int, x: float, u: FloatArray) -> Zer
         a, slopes = coefficients_at(f, u)
         rows, along = rows_and_slopes(f, branch, x)
         value, size = complex((rows @ a)[0]), float((np.abs(rows) @ f.size())[0])
-        if abs(value) <= 1e-12 * size:
+        if _length(value) <= 1e-12 * size:
             return Zero(float(g.margin(g.parameters(u))), branch, x, u)
         moved, turned = (rows @ slopes.T)[0] * free, complex((along @ a)[0])
         columns = moved if x == 0 else np.append(moved, turned)
         J = columns.real[None] if x == 0 else np.array([columns.real, columns.imag])
         right = np.array([value.real]) if x == 0 else np.array([value.real, value.imag])
-        if not np.isfinite(J).all():
+        if not (np.isfinite(J).all() and np.isfinite(right).all()):
             return None
         step = -np.linalg.lstsq(J / size, right / size, rcond=1e-12)[0]
         if np.abs(step).max() > 0.5:
@@ -246,3 +247,8 @@ def projected(f: Family, g: Growth, branch: int, x: float, u: FloatArray) -> Zer
         u = np.clip(u, 0, 1)
         x = x if x == 0 else x * float(np.exp(step[-1]))
     return None
+
+
+def _length(z: complex) -> float:
+    """|z|; infinite where that overflows, which abs() takes for an error."""
+    return math.hypot(z.real, z.imag)

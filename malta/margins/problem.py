@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Protocol
@@ -16,7 +17,8 @@ from malta.margins.algebra import Symbolic, TooLarge, symbolic
 from malta.margins.characteristic import Characteristic, mapped, outward, pair
 from malta.margins.closed import closed_loop
 from malta.margins.closed import parts as driven
-from malta.margins.expressions import BALLS, EXACT, POINTS, NotAnalytic, Program
+from malta.margins.expressions import BALLS, EXACT, POINTS, NotAnalytic, Program, exact
+from malta.margins.family import binary
 from malta.margins.loop import Group, Loop
 from malta.uncertain import closed_loop as closed_matrices
 from malta.uncertain import critical, instability
@@ -106,7 +108,8 @@ class OfLoop:
 
     def instability(self, rows: FloatArray) -> FloatArray:
         if self._plain:
-            return instability(self.loop.system, self.loop.law, rows)
+            with suppress(np.linalg.LinAlgError):  # numbers that overflow at some row: each by itself
+                return instability(self.loop.system, self.loop.law, rows)
         worst = []
         for p in np.atleast_2d(rows):
             poles = self._poles(p)
@@ -268,23 +271,19 @@ class OfPolynomial:
 
     def _roots(self, p: FloatArray) -> Any:
         """Roots, on a scale of the coefficients' own."""
-        from malta.margins.expressions import exact
-
-        a = [
-            float(x) if not isinstance(x, fmpq) else int(x.p) / int(x.q)
-            for x in self._values([exact(x) for x in p.tolist()])
-        ]
-        while len(a) > 1 and a[-1] == 0:
-            a.pop()
-        known = [k for k, c in enumerate(a) if c]
-        step = (math.log2(abs(a[known[0]])) - math.log2(abs(a[known[-1]]))) / max(known[-1] - known[0], 1)
-        scale = 2.0 ** round(step)
-        top = max(math.log2(abs(a[k])) + k * round(step) for k in known)
+        a = [binary(x) for x in self._values([exact(x) for x in p.tolist()])]
+        logs = {k: math.log2(abs(m)) + e for k, (m, _, e) in enumerate(a) if m}
+        if not logs:  # zero, whatever s
+            return np.ones(1)
+        first, last = min(logs), max(logs)
+        step = round((logs[first] - logs[last]) / max(last - first, 1))
+        step = max(min(step, 1000), -1000)  # that roots are numbers
+        top = max(log + k * step for k, log in logs.items())
         scaled = [
-            c and math.copysign(2.0 ** (math.log2(abs(c)) + k * round(step) - top), c)
-            for k, c in enumerate(a)
+            math.copysign(2.0 ** (logs[k] + k * step - top), a[k][0]) if k in logs else 0.0
+            for k in range(last + 1)
         ]
-        return np.roots(scaled[::-1]) * scale
+        return np.roots(scaled[::-1]) * 2.0**step
 
     def _values(self, v: list[Any]) -> list[Any]:
         f = self.polynomial

@@ -57,6 +57,11 @@ class Branch:
         return tuple(Expansion(p.middle * turn, p.slopes * turn, p.rest * turn) for p in own)  # type: ignore[return-value]
 
     @cached_property
+    def finite(self) -> bool:
+        """Whether no number overflows."""
+        return all(np.isfinite(M).all() for p in self.parts for M in (p.middle, p.slopes, p.rest))
+
+    @cached_property
     def channels(self) -> tuple[Channels, FloatArray, FloatArray]:
         """Channels, and what is left beside them of the constant part and of that of x."""
         one, two = self.parts

@@ -175,7 +175,8 @@ class Structured:
             return None
         if (cell.branch, cell.top) not in known:
             known[cell.branch, cell.top] = Branch(pencil, cell.branch, cell.top)
-        return known[cell.branch, cell.top]
+        found = known[cell.branch, cell.top]
+        return found if found.finite else None
 
     def cover(self, t: float) -> list[Cell]:
         """All frequencies of all groups on box(t)."""
@@ -240,7 +241,10 @@ def worst(N: Any, m: Multiplier, owners: Any, count: int, other: int) -> int:
     D, G = m.D, m.G
     H = N.conj().T
     S = H @ D @ N + 1j * (G @ N - H @ G)
-    _, vectors = linalg.eigh((S + S.conj().T) / 2, (D + D.conj().T) / 2)
+    try:
+        _, vectors = linalg.eigh((S + S.conj().T) / 2, (D + D.conj().T) / 2)
+    except (np.linalg.LinAlgError, ValueError):  # numbers that overflow
+        return other
     w = vectors[:, -1]
     each = (w.conj() * (D @ w)).real
     shares = np.zeros(count)
