@@ -74,7 +74,8 @@ class Group:
 def loop_of(system: UncertainSystem, law: Compensator) -> Loop:
     """Check that system and compensator fit.
 
-    Raises InputError for shapes that do not, entries that are not finite, sample times that differ.
+    Raises InputError for shapes that do not, entries that are not finite, sample times that differ, a loop without
+    states.
     """
     f: ca.Function = system.matrices
     if f.n_out() < 3 or f.n_out() > 5:
@@ -97,6 +98,8 @@ def loop_of(system: UncertainSystem, law: Compensator) -> Loop:
             )
         if not np.isfinite(matrix).all():
             raise InputError("compensator", name, "NaN or infinity", "finite numbers")
+    if not n + k and law.lag is None and not law.delay:
+        raise InputError("uncertain", "A", "no states but algebraic ones", "at least one state in the loop")
     if system.sample_time is not None and law.lag is not None:
         raise InputError("compensator", "lag", "a continuous lag", "none before a system in discrete time")
     if law.sample_time is None and law.delay:
