@@ -6,11 +6,12 @@ import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from malta.errors import InputError
+from malta.margins.given import LARGEST, by_name, described, is_number, is_pair
 
 if TYPE_CHECKING:
     from malta.plant import FloatArray
@@ -61,41 +62,31 @@ def box_of(
     over: Mapping[str, tuple[float, float]],
     *,
     empty: bool = False,
+    caller: str = "robust_margin",
 ) -> Box:
     """The box of ranges (that grow) and of intervals that stay, about the nominal values `at`.
 
     empty : whether there may be no ranges at all
+    caller : the function whose input this is
 
     Raises InputError for names that are not known and ranges that are none.
     """
+    by_name(caller, "ranges", ranges, '{"k": 0.2} or {"k": (1, 2)}')
+    by_name(caller, "over", over, '{"k": (1, 2)}')
     k = len(names)
     down, up, fixed = np.zeros(k), np.zeros(k), np.zeros((k, 2))
     most = math.inf
     for name, value in (*ranges.items(), *over.items()):
         if name not in names:
-            raise InputError("robust_margin", name, "an unknown parameter", "one of " + " ".join(names))
+            raise InputError(caller, name, "an unknown parameter", "one of " + " ".join(names))
+        if name in ranges and name in over:
+            raise InputError(caller, name, "in ranges and in over", "in one of them")
         i = names.index(name)
         nominal = float(at[i])
-        pair = (
-            value
-            if isinstance(value, tuple)
-            else (nominal - abs(nominal) * value, nominal + abs(nominal) * value)
-        )
-        sound = len(pair) == 2 and all(math.isfinite(v) for v in pair) and pair[0] <= nominal <= pair[1]
-        if not sound or pair[0] == pair[1] or (not isinstance(value, tuple) and not value > 0):
-            raise InputError(
-                "robust_margin",
-                name,
-                repr(value),
-                f"a share above 0, or (low, high) about the nominal {nominal:g}",
-            )
-        if name in ranges and name in over:
-            raise InputError("robust_margin", name, "in ranges and in over", "in one of them")
+        pair = _sides(caller, name, value, nominal)
         low, high = limits[i] if limits else (-math.inf, math.inf)
         if not low < nominal < high or (name in over and not low < pair[0] < pair[1] < high):
-            raise InputError(
-                "robust_margin", name, f"{pair}", f"values within its limits ({low:g}, {high:g})"
-            )
+            raise InputError(caller, name, f"{pair}", f"values within its limits ({low:g}, {high:g})")
         if name in over:
             fixed[i] = pair[0] - nominal, pair[1] - nominal
             continue
@@ -103,5 +94,20 @@ def box_of(
         for room, rate in ((nominal - low, down[i]), (high - nominal, up[i])):
             most = min(most, room / rate) if rate > 0 else most
     if not ranges and not empty:
-        raise InputError("robust_margin", "ranges", "no parameters", "at least one uncertain parameter")
+        raise InputError(caller, "ranges", "no parameters", "at least one uncertain parameter")
     return Box(names, at, down, up, fixed, most)
+
+
+def _sides(caller: str, name: str, value: Any, nominal: float) -> tuple[float, float]:
+    """(low, high) of a range about the nominal value: a share of that, or an interval. Raises InputError."""
+    low = high = math.nan
+    if is_pair(value) and all(is_number(v) for v in value):
+        low, high = (float(v) for v in value)
+    elif is_number(value) and value > 0:
+        low, high = nominal - abs(nominal) * float(value), nominal + abs(nominal) * float(value)
+    if not (low <= nominal <= high and low < high):
+        wanted = f"a share above 0, or (low, high) about the nominal {nominal:g}"
+        raise InputError(caller, name, described(value), wanted)
+    if max(-low, high) > LARGEST:
+        raise InputError(caller, name, described(value), f"values between -{LARGEST:g} and {LARGEST:g}")
+    return low, high
