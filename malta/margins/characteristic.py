@@ -19,8 +19,9 @@ from typing import Any
 import numpy as np
 from flint import acb, arb, arb_mat, ctx, fmpq, fmpq_mat
 
-from malta.margins.algebra import Ratio, Symbolic, value
+from malta.margins.algebra import Symbolic, value
 from malta.margins.closed import closed_loop, coefficients, majorant_matrix, parts
+from malta.margins.degrees import cleared, degree, depends, determinant_degree, sole_power
 from malta.margins.expressions import BALLS, EXACT, POINTS, NotAnalytic, finite
 from malta.margins.loop import A, B, C, D, E, Group, Loop, divided
 from malta.margins.majorant import coefficient_bounds
@@ -68,9 +69,9 @@ class Characteristic:
         own += [r for (_, j), r in entries[C].items() if j in g]
         own += list(entries[D].values()) if self.loop.direct else []
         for i in range(len(self.names)):
-            powers: list[tuple[int, int | None]] = [(_degree(r.num, i), _alone(r.den, i)) for r in own]
+            powers: list[tuple[int, int | None]] = [(degree(r.num, i), sole_power(r.den, i)) for r in own]
             below = any(den not in (0, None) for _, den in powers)
-            hidden = any(_touches(s, k, i) for k in range(len(s.atoms)))
+            hidden = any(depends(s, k, i) for k in range(len(s.atoms)))
             polynomial = all(den is not None and num <= den for num, den in powers)
             found.append(below and polynomial and not hidden and not self._coupled_descriptor)
         return tuple(found)
@@ -81,7 +82,7 @@ class Characteristic:
         if self.exact:
             assert self.loop.symbolic is not None
             rows = cleared(self.loop, self.group, self.loop.symbolic)
-            return tuple(_determinant_degree(rows, i) for i in range(len(self.names)))
+            return tuple(determinant_degree(rows, i) for i in range(len(self.names)))
         return tuple(self._degree_beside(i) for i in range(len(self.names)))
 
     def _degree_beside(self, i: int) -> int | None:
@@ -91,15 +92,15 @@ class Characteristic:
             return 0
         if s is None or i in program.depends[A] or self.loop.direct or self.loop.descriptor:
             return None if s is None or self._enters(s, i) else 0
-        if any(_touches(s, k, i) for k in range(len(s.atoms))):
+        if any(depends(s, k, i) for k in range(len(s.atoms))):
             return None
         into = {at: r for at, r in s.entries[B].items() if at[0] in g.states}
         out = {at: r for at, r in s.entries[C].items() if at[1] in g.states}
-        if any(r.den is not None and _degree(r.den, i) for r in (*into.values(), *out.values())):
+        if any(r.den is not None and degree(r.den, i) for r in (*into.values(), *out.values())):
             return None
         total = 0
         for matrix in (into, out):
-            rows = [[(_degree(r.num, i), at) for at, r in matrix.items() if _degree(r.num, i)]]
+            rows = [[(degree(r.num, i), at) for at, r in matrix.items() if degree(r.num, i)]]
             if rows[0]:
                 order = min(len({at[0] for _, at in rows[0]}), len({at[1] for _, at in rows[0]}))
                 total += order * max(d for d, _ in rows[0])
@@ -111,12 +112,12 @@ class Characteristic:
         rows: list[tuple[int, int | None]] = [(A, 0), (B, 0), (C, 1)]
         if len(s.entries) > D:
             rows += [(which, None) for which in range(D, len(s.entries))]
-        hidden = [s.inputs + k for k in range(len(s.atoms)) if _touches(s, k, i)]
+        hidden = [s.inputs + k for k in range(len(s.atoms)) if depends(s, k, i)]
         for which, side in rows:
             for at, r in s.entries[which].items():
                 if side is None or at[side] in g:
                     for var in (i, *hidden):
-                        if _degree(r.num, var) or (r.den is not None and _degree(r.den, var)):
+                        if degree(r.num, var) or (r.den is not None and degree(r.den, var)):
                             return True
         return False
 
@@ -185,7 +186,7 @@ class Characteristic:
             for at, r in matrix.items():
                 if (which in (A, B) and at[0] not in g) or (which in (A, C) and at[1] not in g):
                     continue
-                powers = {i: _alone(r.den, i) or 0 for i in picked}
+                powers = {i: sole_power(r.den, i) or 0 for i in picked}
 
                 def flipped(polynomial: Any, powers: dict[int, int]) -> dict[Any, Any]:
                     return {
@@ -310,110 +311,6 @@ def pair(c: Any) -> tuple[float, int]:
         return 0.0, 0
     shift = max(m.bit_length() - 50, 0)
     return float((m >> shift) + 1), e + shift
-
-
-# degrees
-
-
-def _degree(polynomial: Any, i: int) -> int:
-    return int(polynomial.degrees()[i]) if len(polynomial) else 0
-
-
-def _alone(den: Any, i: int) -> int | None:
-    """k where den is p_i^k times what has no p_i in it; None where it is not."""
-    if den is None:
-        return 0
-    powers = {monomial[i] for monomial in den.monoms()}
-    return powers.pop() if len(powers) == 1 else None
-
-
-def _touches(s: Symbolic, atom: int, i: int) -> bool:
-    """Whether a further variable depends on p_i."""
-    seen, stack = set(), [s.atoms[atom]]
-    while stack:
-        k = stack.pop()
-        if k in seen:
-            continue
-        seen.add(k)
-        name, target, operands, _ = s.program.steps[k]
-        if name == "input" and target == i:
-            return True
-        stack += operands
-    return False
-
-
-def cleared(loop: Loop, g: Group, s: Symbolic) -> list[dict[Any, Any]]:
-    """Rows of the polynomial matrix whose determinant is a: those of x, then those of y; columns x, u, y."""
-    rows: list[dict[Any, Ratio]] = []
-    for i in g.states:
-        row: dict[Any, Ratio] = {("u", j): r for (k, j), r in s.entries[B].items() if k == i}
-        for (k, j), r in s.entries[A].items():
-            if k == i and j in g.states:
-                row["x", j] = r
-        if loop.descriptor:
-            for (k, j), r in s.entries[E].items():
-                if k == i and j in g.states:
-                    row["e", j] = r
-        rows.append(row)
-    for i in range(loop.program.shapes[C][0]):
-        row = {("x", j): r for (k, j), r in s.entries[C].items() if k == i and j in g.states}
-        if loop.direct:
-            row |= {("u", j): r for (k, j), r in s.entries[D].items() if k == i}
-        rows.append(row)
-    return [_row(row) for row in rows]
-
-
-def _row(row: dict[Any, Ratio]) -> dict[Any, Any]:
-    """Numerators over the row's common denominator, which is entry None."""
-    common = None
-    for r in row.values():
-        if r.den is None:
-            continue
-        common = r.den if common is None else common * (r.den / common.gcd(r.den))
-    found = {
-        at: r.num if common is None else r.num * (common if r.den is None else common / r.den)
-        for at, r in row.items()
-    }
-    if common is not None:
-        found[None] = common
-    return found
-
-
-def _determinant_degree(rows: list[dict[Any, Any]], i: int) -> int:
-    """An upper bound of the degree in p_i: by rows, by columns, or by the rank of what multiplies p_i."""
-    by_row = [max((_degree(entry, i) for entry in row.values()), default=0) for row in rows]
-    columns: dict[Any, int] = {}
-    for k, row in enumerate(rows):
-        for at, entry in row.items():
-            # a row's denominator stands in the column of its own s (or y)
-            place = ("own", k) if at is None else at
-            if place[0] == "e":
-                place = ("x", place[1])
-            columns[place] = max(columns.get(place, 0), _degree(entry, i))
-    bound = min(sum(by_row), sum(columns.values()))
-    if max(by_row, default=0) <= 1 and bound > 1:
-        bound = min(bound, _rank(rows, i))
-    return bound
-
-
-def _rank(rows: list[dict[Any, Any]], i: int) -> int:
-    """Rank of the coefficients of p_i where these are numbers; the number of rows that have them elsewhere."""
-    parts: list[dict[Any, Any]] = []
-    constant = True
-    for row in rows:
-        part: dict[Any, Any] = {}
-        for at, entry in row.items():
-            if _degree(entry, i):
-                slope = entry.derivative(i)
-                constant &= bool(slope.is_constant())
-                part[("own", len(parts)) if at is None else at] = slope
-        if part:
-            parts.append(part)
-    if not constant or len(parts) < 2:
-        return len(parts)
-    places = sorted({at for part in parts for at in part}, key=str)
-    table = [[part[at].leading_coefficient() if at in part else fmpq(0) for at in places] for part in parts]
-    return int(fmpq_mat(table).rank())
 
 
 @lru_cache(maxsize=64)

@@ -17,13 +17,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from malta.errors import InputError
+from malta.margins.block_parts import Part, parts_of
 from malta.margins.blocks import Block, Dynamic, blocks_of, check_blocks, probed
 from malta.margins.box import Box, box_of
 from malta.margins.enclosure import Unproven
 from malta.margins.loop import loop_of
 from malta.margins.loss import first_loss
 from malta.margins.peaks import Peak, climb, frequencies, patterns
-from malta.margins.polydisc import Part, Size, excluded, parts_of
+from malta.margins.polydisc import Size, excluded
 from malta.margins.problem import OfLoop
 from malta.margins.robust import LONGEST, Margin, law_of, problem_of
 from malta.margins.search import EDGE, FAR, Job

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from malta.margins.characteristic import cleared
+from malta.margins.degrees import cleared
 from malta.margins.expansion import EPS, Expansion, constant, stacked, table
 from malta.margins.loop import C, Group, Loop
 from malta.margins.series import held, square_held

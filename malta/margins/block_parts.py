@@ -1,0 +1,208 @@
+"""What complex blocks add to a loop's characteristic polynomials, over a box of parameters.
+
+With the entries of blocks as further parameters (`blocks.probed`), a polynomial is affine in each of them: its values
+where some of them are at zero and some at -unit give a_S of `polydisc`, for every set S of the blocks.
+"""
+
+from __future__ import annotations
+
+import math
+import time as clock
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from flint import acb, arb
+
+from malta.margins.blocks import Block
+from malta.margins.box import Box
+from malta.margins.enclosure import TooWide, Unproven, over_box
+from malta.margins.exclusion import Growth, growth_over
+from malta.margins.family import Family, aligned, combined
+from malta.margins.parts import halves
+
+if TYPE_CHECKING:
+    from malta.margins.problem import OfLoop, Polynomial
+    from malta.plant import FloatArray
+
+PATCHES = 64  # parts that a box is cut into where one expansion does not do
+Matrix = tuple[tuple[tuple[Family, ...], ...], ...]  # rows x columns of a_{S + ij}
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """One group's polynomial over a part of the box, and what the blocks that act on the group add to it.
+
+    scalars: indices of blocks; sets: a_S, S a number whose binary digits say which of the scalars
+    full: index of a full block; entries: rows x columns of a_{S + ij}
+    """
+
+    growth: Growth
+    scale: int
+    scalars: tuple[int, ...]
+    sets: tuple[Family, ...]
+    full: int | None = None
+    entries: Matrix = ()
+
+
+def parts_of(
+    problem: OfLoop, blocks: Sequence[Block], box: Box, reach: float, most: Sequence[float], until: float
+) -> list[Part]:
+    """The groups' polynomials over parts of box(reach); the problem's last parameters are the blocks' entries.
+
+    most : how large each block will be asked for, as far as that is known; couplings that are only rounding are then
+        taken as zero, and accounted for
+
+    Raises Unproven.
+    """
+    sides, pins, first = box.sides(reach), [], len(box.names)
+    for b in blocks:
+        pins.append([first + k for k in range(len(b.entries))])
+        first += len(b.entries)
+    known = all(
+        math.isfinite(r) and (b.kind != "feedback" or r < 1) for b, r in zip(blocks, most, strict=True)
+    )
+    p: list[Any] = [arb(low).union(arb(high)) for low, high in sides.tolist()]
+    grown = 1.0
+    for b, r in zip(blocks, most, strict=True):
+        if b.kind == "feedback" and known:  # the gain is 1 / (1 - delta), and f times 1 - delta
+            r, grown = r / (1 - r), grown * (1 + r)
+        disc = arb(0, max(b.unit, r) * (1 + 1e-9)) if known else arb(0, b.unit)
+        p += [acb(disc, disc)] * len(b.entries)
+    groups = (problem if known else replace(problem, neglect=False)).parts(p)
+    found: list[Part] = []
+    owners = _owners([f for f, _ in groups], blocks, pins)
+    for (f, moves), acting in zip(groups, owners, strict=True):
+        scaled = tuple(arb(grown) * c for c in moves)
+        todo = [sides]
+        while todo:
+            own = todo.pop()
+            if clock.monotonic() > until:
+                raise Unproven("time was up before the coefficients were found")
+            try:
+                found.append(_part(f, own, scaled, [(k, blocks[k], pins[k]) for k in acting], box, until))
+            except TooWide as error:
+                if len(todo) + len(found) >= PATCHES:
+                    raise Unproven(str(error)) from error
+                todo += halves(own, error.axis, float(box.nominal[error.axis]))
+    return found
+
+
+def _owners(groups: Sequence[Polynomial], blocks: Sequence[Block], pins: list[list[int]]) -> list[list[int]]:
+    """Which blocks each group's polynomial may depend on; a feedback around nothing is counted with the first."""
+    found: list[list[int]] = [[] for _ in groups]
+    for k, b in enumerate(blocks):
+        touched = [n for n, f in enumerate(groups) if any(f.degrees[i] != 0 for i in pins[k])]
+        if not touched and b.kind == "feedback":
+            touched = [0]
+        for n in touched:
+            found[n].append(k)
+    return found
+
+
+def _part(
+    f: Polynomial,
+    sides: FloatArray,
+    moves: tuple[Any, ...],
+    acting: list[tuple[int, Block, list[int]]],
+    box: Box,
+    until: float,
+) -> Part:
+    """The families of one group, from its values with entries at zero and at -unit."""
+    known: dict[frozenset[int], Family] = {}
+    count = len(f.names) - len(sides)
+
+    def family(at: frozenset[int]) -> Family:
+        """With the entries `at` (parameters) at -unit, all others at zero."""
+        if at not in known:
+            fixed = np.zeros((count, 2))
+            for _, b, pins in acting:
+                for i in pins:
+                    fixed[i - len(sides)] = -b.unit if i in at else 0.0
+            made = over_box(f, np.vstack([sides, fixed]), () if at else moves, until)
+            known[at] = replace(made, shape=made.shape[: len(sides)])  # entries are pinned
+        return known[at]
+
+    scalars = [(k, b, pins[0]) for k, b, pins in acting if not b.full]
+    full = next(((k, b, pins) for k, b, pins in acting if b.full), None)
+    plain = [
+        [(b, pin, False) for n, (_, b, pin) in enumerate(scalars) if S >> n & 1]
+        for S in range(2 ** len(scalars))
+    ]
+    sums = [_probe(picked, family) for picked in plain]
+    entries: list[list[list[dict[Any, float]]]] = []
+    if full is not None:
+        _, b, pins = full
+        width = len(b.columns)
+        entries = [
+            [
+                [_probe([*picked, (b, pins[i * width + j], i != j)], family) for picked in plain]
+                for j in range(width)
+            ]
+            for i in range(len(b.rows))
+        ]
+    made = _common(sums, entries, known)
+    growth = _widened(growth_over(np.asarray(sides), f.inverted[: len(sides)], box), len(scalars))
+    flat = iter(made)
+    sets = tuple(next(flat) for _ in sums)
+    matrix = tuple(tuple(tuple(next(flat) for _ in plain) for _ in row) for row in entries)
+    return Part(
+        growth,
+        sets[0].scale,
+        tuple(k for k, _, _ in scalars),
+        sets,
+        None if full is None else full[0],
+        matrix,
+    )
+
+
+def _probe(
+    picked: list[tuple[Block, int, bool]], family: Callable[[frozenset[int]], Family]
+) -> dict[frozenset[int], float]:
+    """a_S as a sum of the polynomial's values: weights by which entries are at -unit.
+
+    M_ii f of a feedback is f without the channel, where its gain 1 + delta is zero; all others are
+    (f(-unit) - f(0)) / unit. Both follow from f(-unit), as f is affine; at -1 itself f may have coefficients of zero.
+    """
+    total: dict[frozenset[int], float] = {frozenset(): 1.0}
+    for b, pin, beside in picked:
+        own = 1.0 if b.kind == "feedback" and not beside else 0.0
+        turned: dict[frozenset[int], float] = {}
+        for at, weight in total.items():
+            turned[at | {pin}] = turned.get(at | {pin}, 0.0) + weight / b.unit
+            turned[at] = turned.get(at, 0.0) + weight * (own - 1 / b.unit)
+        total = turned
+    for at in total:
+        family(at)
+    return total
+
+
+def _common(
+    sums: list[dict[frozenset[int], float]],
+    entries: list[list[list[dict[frozenset[int], float]]]],
+    known: dict[frozenset[int], Family],
+) -> list[Family]:
+    """The sums of families, all on the same degrees and scale."""
+    base = known[frozenset()]
+    for g in known.values():
+        base = aligned(base, g)[0]
+    raised = {at: aligned(base, g)[1] for at, g in known.items()}
+
+    def summed(weights: dict[frozenset[int], float]) -> Family:
+        (first, a), *rest = weights.items()
+        total = raised[first] if a == 1.0 else combined(raised[first], raised[first], a, 0.0)
+        for at, weight in rest:
+            total = combined(total, raised[at], 1.0, weight)
+        return total
+
+    return [summed(s) for s in [*sums, *(s for row in entries for cell in row for s in cell)]]
+
+
+def _widened(growth: Growth, phases: int) -> Growth:
+    """With phases of blocks as axes that do not grow, in turns."""
+    none, one = np.zeros(phases), np.ones(phases)
+    return Growth(
+        np.append(growth.low, none), np.append(growth.high, one), (*growth.inverted, *[False] * phases),
+        np.append(growth.nominal, none), np.append(growth.down, none), np.append(growth.up, none),
+    )  # fmt: skip
