@@ -11,6 +11,7 @@ from __future__ import annotations
 import casadi as ca
 
 from malta.errors import InputError
+from malta.margins.given import counted
 
 
 def solved_algebraic(matrices: list[ca.SX]) -> list[ca.SX]:
@@ -28,7 +29,7 @@ def solved_algebraic(matrices: list[ca.SX]) -> list[ca.SX]:
     algebraic, free = sorted(set(range(n)) - rows), sorted(set(range(n)) - columns)
     if not algebraic and not free:
         return matrices
-    found = f"{len(algebraic)} rows and {len(free)} columns of zeros"
+    found = f"{counted(len(algebraic), 'row')} and {counted(len(free), 'column')} of zeros"
     if len(algebraic) != len(free):
         raise InputError(
             "uncertain", "E", found, "as many of one as of the other: algebraic states of index 1"

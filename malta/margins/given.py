@@ -44,8 +44,10 @@ def number(caller: str, name: str, value: Any) -> float:
     return float(value)
 
 
-def positive(caller: str, name: str, value: Any, below: float = math.inf) -> float:
-    """A number above zero, and below a bound. Raises InputError."""
+def positive(caller: str, name: str, value: Any, below: float = math.inf, *, endless: bool = False) -> float:
+    """A number above zero, and below a bound; `endless`: or infinity. Raises InputError."""
+    if endless and isinstance(value, float) and value == math.inf:
+        return value
     if not (is_number(value) and 0 < float(value) < below):
         wanted = "a number above zero" + ("" if math.isinf(below) else f" and below {below:g}")
         raise InputError(caller, name, described(value), wanted)
@@ -78,7 +80,7 @@ def by_name(caller: str, name: str, value: Any, example: str) -> Mapping[str, An
     return value
 
 
-def matrix(caller: str, name: str, value: Any) -> FloatArray:
+def matrix(caller: str, name: str, value: Any, wanted: str = "a matrix of numbers") -> FloatArray:
     """A matrix of finite numbers; a number is 1 x 1, a row of them 1 x n. Raises InputError."""
     try:
         found = np.asarray(value)
@@ -86,7 +88,7 @@ def matrix(caller: str, name: str, value: Any) -> FloatArray:
     except (TypeError, ValueError, RuntimeError, NotImplementedError):
         read = None
     if read is None or read.ndim != 2:
-        raise InputError(caller, name, described(value), "a matrix of numbers")
+        raise InputError(caller, name, described(value), wanted)
     if not np.isfinite(read).all():
         raise InputError(caller, name, "NaN or infinity", "finite numbers")
     return read

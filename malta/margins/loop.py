@@ -19,6 +19,7 @@ from scipy import sparse
 from malta.errors import InputError
 from malta.margins.algebra import Ratio, Symbolic, TooLarge, symbolic
 from malta.margins.expressions import NotAnalytic, Program, exact, program
+from malta.margins.given import counted
 from malta.uncertain import Compensator, UncertainSystem
 
 if TYPE_CHECKING:
@@ -94,7 +95,10 @@ def loop_of(system: UncertainSystem, law: Compensator) -> Loop:
         matrix = getattr(law, name)
         if matrix.shape != shape:
             raise InputError(
-                "compensator", name, f"shape {matrix.shape}", f"{shape}: {p} outputs, {m} inputs"
+                "compensator",
+                name,
+                f"shape {matrix.shape}",
+                f"{shape}: {counted(p, 'output')}, {counted(m, 'input')}",
             )
         if not np.isfinite(matrix).all():
             raise InputError("compensator", name, "NaN or infinity", "finite numbers")

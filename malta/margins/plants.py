@@ -14,6 +14,7 @@ from malta.data import shaping, units_of
 from malta.errors import InputError
 from malta.margins import compact
 from malta.margins.algebra import Ratio, TooLarge
+from malta.margins.given import described
 from malta.plant import Plant, readonly
 from malta.uncertain import UncertainSystem, holds, lowest, model_of
 
@@ -40,18 +41,20 @@ def of_plant(
     where it is another one; held: H of currents that are held between samples (`held_at`): the inputs are
     v + H y, and where the parameters leave more of the reading than that, it is a further input.
 
-    Raises InputError for an unknown name.
+    Raises InputError for names that are none, or not known.
     """
     par = plant.parameters
     known = [*units_of(par), plant.stroke]
+    if not isinstance(names, tuple | list):
+        raise InputError("uncertain", "names", described(names), "names of parameters, as a tuple or a list")
     for name in names:
         if name not in known:
-            raise InputError("robust_margin", name, "an unknown parameter", "one of " + " ".join(known))
+            raise InputError("uncertain", f"{name}", "an unknown parameter", "one of " + " ".join(known))
     for name in set(names) & set(shaping(par)):
-        raise InputError("robust_margin", name, "a parameter that shapes the model", "one that enters it")
+        raise InputError("uncertain", name, "a parameter that shapes the model", "one that enters it")
     if believed is not None and believed.tabulated:
         found = "a controller that looks up a table"
-        raise InputError("robust_margin", "believed", found, "one whose currents are a formula")
+        raise InputError("uncertain", "believed", found, "one whose currents are a formula")
     x0 = plant.at(**(at or {})).x
     position = float(x0[plant.stroke_state])
     of = model_of(plant, believed or plant, tuple(name for name in names if name != plant.stroke))

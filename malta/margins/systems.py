@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import casadi as ca
@@ -18,6 +18,7 @@ import numpy as np
 
 from malta.errors import InputError
 from malta.margins.algebraic import solved_algebraic
+from malta.margins.given import by_name, counted, described, interval, is_number, matrix, number, positive
 from malta.plant import Plant, readonly
 
 if TYPE_CHECKING:
@@ -36,11 +37,12 @@ def uncertain(source: Any, names: Any, **options: Any) -> UncertainSystem:
     """
     from malta.margins.plants import of_plant
 
-    return (
-        of_plant(source, names, **options)
-        if isinstance(source, Plant)
-        else from_source(source, names, **options)
-    )
+    made = of_plant if isinstance(source, Plant) else from_source
+    known = [q.name for q in inspect.signature(made).parameters.values() if q.kind is q.KEYWORD_ONLY]
+    for option in options:
+        if option not in known:
+            raise InputError("uncertain", option, "an unknown option", "one of " + " ".join(known))
+    return made(source, names, **options)
 
 
 def from_source(
@@ -67,130 +69,124 @@ def from_source(
     """
     from malta.uncertain import UncertainSystem
 
-    names = tuple(nominal)
+    names = tuple(by_name("uncertain", "nominal", nominal, '{"k": 1.5}'))
     if not names:
         raise InputError("uncertain", "nominal", "no parameters", 'values by name, as {"k": 1.5}')
-    values = np.array([_number(name, value) for name, value in nominal.items()])
+    values = np.array([number("uncertain", name, value) for name, value in nominal.items()])
+    bounds = _limits(names, {} if limits is None else limits)
+    period = None if sample_time is None else positive("uncertain", "sample_time", sample_time)
     p = ca.SX.sym("p", len(names))
-    if isinstance(source, ca.Function):
-        found = _called(source, p, names)
-    elif callable(source):
-        found = _traced(source, p, names)
-    else:
-        found = _affine(source, p, names, terms or {})
-    if terms and (callable(source) or isinstance(source, ca.Function)):
+    if not callable(source):
+        found = _affine(source, p, names, {} if terms is None else terms)
+    elif terms:
         raise InputError("uncertain", "terms", "beside a function", "matrices A0, B0, C0 as the source")
-    for name in limits or {}:
-        if name not in names:
-            raise InputError(
-                "uncertain", f"limits.{name}", "an unknown parameter", "one of " + " ".join(names)
-            )
-    if sample_time is not None and not (math.isfinite(sample_time) and sample_time > 0):
-        raise InputError("uncertain", "sample_time", f"{sample_time}", "a time above zero")
-    bounds = tuple((limits or {}).get(name, (-math.inf, math.inf)) for name in names)
+    else:
+        found = _several(_returned(source, p, names, "uncertain"))
     matrices = ca.Function("matrices", [p], _checked(found))
-    return UncertainSystem(names, readonly(values), matrices, limits=bounds, sample_time=sample_time)
+    return UncertainSystem(names, readonly(values), matrices, limits=bounds, sample_time=period)
 
 
-def _number(name: str, value: Any) -> float:
-    try:
-        number = float(value)
-    except (TypeError, ValueError):
-        number = math.nan
-    if not math.isfinite(number):
-        raise InputError("uncertain", name, repr(value), "a finite number")
-    return number
+def _limits(names: tuple[str, ...], limits: Mapping[str, Any]) -> tuple[tuple[float, float], ...]:
+    for name in by_name("uncertain", "limits", limits, '{"k": (0, 2)}'):
+        _known("limits", name, names)
+    free = (-math.inf, math.inf)
+    return tuple(interval("uncertain", f"limits.{name}", limits.get(name, free)) for name in names)
 
 
-def _called(source: ca.Function, p: Any, names: tuple[str, ...]) -> list[Any]:
+def _known(field: str, name: str, names: tuple[str, ...]) -> None:
+    if name not in names:
+        raise InputError("uncertain", f"{field}.{name}", "an unknown parameter", "one of " + " ".join(names))
+
+
+def _returned(source: Callable[..., Any], p: Any, names: tuple[str, ...], caller: str) -> Any:
+    """What a function of the parameters returns for symbols. Raises InputError."""
+    return (_called if isinstance(source, ca.Function) else _traced)(source, p, names, caller)
+
+
+def _called(source: ca.Function, p: Any, names: tuple[str, ...], caller: str) -> Any:
     if source.n_in() == 1 and source.numel_in(0) == len(names):
-        return _several(source(p))
+        return source(p)
     if source.n_in() == len(names) and all(source.numel_in(i) == 1 for i in range(len(names))):
-        return _several(source(*ca.vertsplit(p)))
+        return source(*ca.vertsplit(p))
     found = " ".join(f"{source.name_in(i)} ({source.numel_in(i)})" for i in range(source.n_in()))
-    raise InputError("uncertain", source.name(), f"inputs {found}", f"one vector of {len(names)} parameters")
+    wanted = f"one vector of {counted(len(names), 'parameter')}"
+    raise InputError(caller, source.name(), f"inputs {found}" if found else "no inputs", wanted)
 
 
 def _several(found: Any) -> list[Any]:
+    if found is None or isinstance(found, str):
+        raise InputError("uncertain", "source", f"a function that returns {described(found)}", "A, B, C")
     return list(found) if isinstance(found, tuple | list) else [found]
 
 
-def _traced(source: Callable[..., Any], p: Any, names: tuple[str, ...]) -> list[Any]:
+def _traced(source: Callable[..., Any], p: Any, names: tuple[str, ...], caller: str) -> Any:
     symbols = dict(zip(names, ca.vertsplit(p), strict=True))
-    wanted = [
-        q.name for q in inspect.signature(source).parameters.values()
-        if q.kind in (q.POSITIONAL_OR_KEYWORD, q.KEYWORD_ONLY)
-    ]  # fmt: skip
+    try:
+        own = inspect.signature(source).parameters.values()
+    except (TypeError, ValueError) as error:
+        found = "a function whose parameters cannot be read"
+        raise InputError(caller, "source", found, "one of the parameters " + " ".join(names)) from error
+    wanted = [q.name for q in own if q.kind in (q.POSITIONAL_OR_KEYWORD, q.KEYWORD_ONLY)]
     try:
         if set(wanted) == set(names):
-            return _several(source(**symbols))
+            return source(**symbols)
         if len(wanted) == 1:
-            return _several(source(np.array(list(symbols.values()), dtype=object)))
-    except (TypeError, ValueError, NotImplementedError, RuntimeError) as error:
-        first = str(error).strip().split("\n")[0]
-        raise InputError(
-            "uncertain",
-            "source",
-            f"a function that cannot be traced ({first})",
-            "numpy and CasADi operations",
-        ) from error
-    raise InputError(
-        "uncertain", "source", "a function of " + " ".join(wanted), "the parameters " + " ".join(names)
-    )
+            return source(np.array(list(symbols.values()), dtype=object))
+    except Exception as error:  # whatever a function of numbers does with symbols
+        first = f"{type(error).__name__}: {error}".strip().split("\n")[0]
+        found = f"a function that cannot be traced ({first})"
+        raise InputError(caller, "source", found, "numpy and CasADi operations") from error
+    found = "a function of " + " ".join(wanted) if wanted else "a function without named parameters"
+    raise InputError(caller, "source", found, "the parameters " + " ".join(names))
 
 
-def _affine(source: Any, p: Any, names: tuple[str, ...], terms: Mapping[str, Sequence[Any]]) -> list[Any]:
-    try:
-        base = [np.atleast_2d(np.asarray(M, dtype=float)) for M in source]
-    except (TypeError, ValueError) as error:
-        raise InputError(
-            "uncertain", "source", type(source).__name__, "a function, or matrices A, B, C"
-        ) from error
+def _affine(source: Any, p: Any, names: tuple[str, ...], terms: Mapping[str, Any]) -> list[Any]:
+    if not isinstance(source, Iterable) or isinstance(source, str | Mapping):
+        raise InputError("uncertain", "source", described(source), "a function, or matrices A, B, C")
+    base = [
+        matrix("uncertain", letter, M) for letter, M in zip(LETTERS, _counted(list(source)), strict=False)
+    ]
     found = [ca.SX(ca.DM(M)) for M in base]
-    for name, parts in terms.items():
-        if name not in names:
-            raise InputError(
-                "uncertain", f"terms.{name}", "an unknown parameter", "one of " + " ".join(names)
-            )
+    for name, parts in by_name("uncertain", "terms", terms, '{"k": (A1, B1, C1)}').items():
+        _known("terms", name, names)
+        if not isinstance(parts, tuple | list):
+            raise InputError("uncertain", f"terms.{name}", described(parts), "matrices (A1, B1, C1)")
         if len(parts) > len(base):
-            raise InputError("uncertain", f"terms.{name}", f"{len(parts)} matrices", f"at most {len(base)}")
+            most = f"at most {len(base)}"
+            raise InputError("uncertain", f"terms.{name}", counted(len(parts), "matrix", "matrices"), most)
         for k, part in enumerate(parts):
             if part is None:
                 continue
-            M = np.atleast_2d(np.asarray(part, dtype=float))
+            M = matrix("uncertain", f"terms.{name}", part)
             if M.shape != base[k].shape:
                 raise InputError(
                     "uncertain", f"terms.{name}", f"{LETTERS[k]} of shape {M.shape}", f"{base[k].shape}"
                 )
-            if not np.isfinite(M).all():
-                raise InputError("uncertain", f"terms.{name}", "NaN or infinity", "finite numbers")
             found[k] = found[k] + p[names.index(name)] * ca.sparsify(ca.DM(M))
+    return found
+
+
+def _counted(found: list[Any]) -> list[Any]:
+    if not 3 <= len(found) <= len(LETTERS):
+        count = counted(len(found), "matrix", "matrices")
+        raise InputError("uncertain", "source", count, "A, B, C, or with D, or with D and E")
     return found
 
 
 def _checked(found: list[Any]) -> list[Any]:
     """SX matrices, D only where it is not zero."""
-    if not 3 <= len(found) <= 5:
-        raise InputError(
-            "uncertain", "source", f"{len(found)} matrices", "A, B, C, or with D, or with D and E"
-        )
-    matrices = [_matrix(M, LETTERS[k]) for k, M in enumerate(found)]
+    matrices = [_matrix(M, LETTERS[k]) for k, M in enumerate(_counted(found))]
     n, m, q = matrices[0].shape[0], matrices[1].shape[1], matrices[2].shape[0]
     shapes = [(n, n), (n, m), (q, n), (q, m), (n, n)]
     for letter, M, shape in zip(LETTERS, matrices, shapes, strict=False):
         if M.shape != shape:
             raise InputError("uncertain", letter, f"shape {M.shape}", f"{shape}")
-        constants = ca.DM(M[:]) if M.is_constant() else ca.DM(0)
-        if not np.isfinite(np.array(constants)).all():
-            raise InputError("uncertain", letter, "NaN or infinity", "finite numbers")
     return solved_algebraic(matrices)
 
 
 def _matrix(M: Any, letter: str) -> Any:
     if isinstance(M, ca.SX | ca.DM):
-        return ca.SX(M)
-    if isinstance(M, ca.MX):
-        raise InputError("uncertain", letter, "a CasADi MX", "SX expressions, numbers, or a casadi.Function")
+        return _finite(ca.SX(M), "uncertain", letter)
     try:
         array = np.array(M, dtype=object)
     except ValueError as error:
@@ -198,9 +194,30 @@ def _matrix(M: Any, letter: str) -> Any:
     if array.ndim < 2:
         array = np.atleast_2d(array)
     if array.ndim != 2:
-        raise InputError("uncertain", letter, f"{array.ndim} dimensions", "a matrix")
-    rows = [ca.horzcat(*(ca.SX(x) for x in row)) for row in array.tolist()]
+        raise InputError("uncertain", letter, counted(array.ndim, "dimension"), "a matrix")
+    if any(isinstance(x, tuple | list) for x in array.flat):
+        raise InputError("uncertain", letter, "rows of different lengths", "a matrix")
+    rows = [ca.horzcat(*(_entry(x, "uncertain", letter) for x in row)) for row in array.tolist()]
     return ca.vertcat(*rows) if rows else ca.SX(*array.shape)
+
+
+def _entry(x: Any, caller: str, field: str) -> Any:
+    """One number, or expression of the parameters. Raises InputError."""
+    if isinstance(x, ca.MX):
+        raise InputError(caller, field, "a CasADi MX", "SX expressions, numbers, or a casadi.Function")
+    if isinstance(x, ca.SX | ca.DM):
+        return _finite(ca.SX(x), caller, field)
+    if isinstance(x, bool | np.bool_) or is_number(x):
+        return ca.SX(float(x))
+    raise InputError(caller, field, described(x), "finite numbers, and expressions of the parameters")
+
+
+def _finite(M: Any, caller: str, field: str) -> Any:
+    """The same, where no entry is NaN or infinite by itself. Raises InputError."""
+    for x in M.nonzeros():
+        if x.is_constant() and not math.isfinite(float(x)):
+            raise InputError(caller, field, "NaN or infinity", "finite numbers")
+    return M
 
 
 def compensator_of(law: Any, outputs: int, inputs: int) -> Compensator:
@@ -212,55 +229,53 @@ def compensator_of(law: Any, outputs: int, inputs: int) -> Compensator:
 
     if isinstance(law, Compensator):
         return law
+    wanted = "a Compensator, a proper control.StateSpace or TransferFunction, or a gain matrix"
     if hasattr(law, "num_list") or hasattr(law, "num_array"):
         import control
 
-        law = control.ss(law)
+        try:
+            law = control.ss(law)
+        except Exception as error:  # improper, or of several inputs and outputs: as the library has it
+            first = str(error).strip().split("\n")[0]
+            raise InputError("compensator", "law", f"a TransferFunction ({first})", wanted) from error
     if all(hasattr(law, name) for name in ("A", "B", "C", "D", "dt")):
         if law.dt is True:
             raise InputError("compensator", "dt", "True", "0, or a sample time in seconds")
         T = None if not law.dt else float(law.dt)
         A, B, C, D = (np.asarray(M, dtype=float) for M in (law.A, law.B, law.C, law.D))
         found = Compensator(A, B.reshape(len(A), -1), C.reshape(-1, len(A)), D, sample_time=T)
+    elif hasattr(law, "ninputs") or isinstance(law, bool | None):  # a response, which has no states
+        raise InputError("compensator", "law", described(law), wanted)
     else:
-        try:
-            D = np.atleast_2d(np.asarray(law, dtype=float))
-        except (TypeError, ValueError) as error:
-            raise InputError(
-                "compensator",
-                "law",
-                type(law).__name__,
-                "a Compensator, a control.StateSpace or a gain matrix",
-            ) from error
+        D = matrix("compensator", "law", law, wanted)
         found = Compensator(np.zeros((0, 0)), np.zeros((0, D.shape[1])), np.zeros((len(D), 0)), D)
     if found.D.shape != (inputs, outputs):
         raise InputError(
             "compensator",
             "D",
             f"shape {found.D.shape}",
-            f"{(inputs, outputs)}: {inputs} inputs u from {outputs} outputs y",
+            f"{(inputs, outputs)}: {counted(inputs, 'input')} u from {counted(outputs, 'output')} y",
         )
     return found
 
 
 def polynomial_system(coefficients: Callable[..., Any], names: tuple[str, ...]) -> tuple[ca.Function, int]:
-    """Coefficients of s, lowest first, as a CasADi function of p; and the degree."""
+    """Coefficients of s, lowest first, as a CasADi function of p; and the degree.
+
+    Raises InputError for what is no function of the parameters, and coefficients that are no expressions of them.
+    """
+    caller, field = "margin_of_polynomial", "coefficients"
+    if not callable(coefficients):
+        raise InputError(caller, field, described(coefficients), "a function of the parameters")
     p = ca.SX.sym("p", len(names))
-    found = (
-        _called(coefficients, p, names)
-        if isinstance(coefficients, ca.Function)
-        else _traced(coefficients, p, names)
-    )
+    found = _returned(coefficients, p, names, caller)
     flat: list[Any] = []
-    for entry in found:
-        if isinstance(entry, ca.SX | ca.DM) and entry.numel() != 1:
-            flat += ca.vertsplit(ca.vec(ca.densify(entry)))
-        else:
-            flat.append(ca.SX(entry))
+    for entry in found if isinstance(found, tuple | list | np.ndarray) else [found]:
+        for x in entry.flat if isinstance(entry, np.ndarray) else [entry]:
+            flat += ca.vertsplit(ca.vec(ca.densify(_entry(x, caller, field))))
     while flat and flat[0].is_constant() and float(flat[0]) == 0:
         flat = flat[1:]
     if len(flat) < 2:
-        raise InputError(
-            "margin_of_polynomial", "coefficients", f"{len(flat)} of them", "a polynomial of degree 1 or more"
-        )
+        found = counted(len(flat), "coefficient")
+        raise InputError(caller, field, found, "a polynomial of degree 1 or more")
     return ca.Function("coefficients", [p], [ca.vertcat(*reversed(flat))]), len(flat) - 1
