@@ -58,7 +58,7 @@ def box_of(
     names: tuple[str, ...],
     at: FloatArray,
     limits: Sequence[tuple[float, float]],
-    ranges: Mapping[str, float | tuple[float, float]],
+    ranges: Mapping[str, float | tuple[float, float] | list[float]],
     over: Mapping[str, tuple[float, float]],
     *,
     empty: bool = False,

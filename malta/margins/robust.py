@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 import time as clock
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
@@ -24,6 +24,7 @@ import numpy as np
 from malta.errors import InputError
 from malta.margins.box import Box, box_of
 from malta.margins.expressions import program
+from malta.margins.given import by_name, described, interval, is_pair, number, positive
 from malta.margins.loop import loop_of
 from malta.margins.problem import OfCoefficients, OfLoop, OfPolynomial, OfSeveral, Problem
 from malta.margins.systems import compensator_of, polynomial_system
@@ -36,7 +37,7 @@ TOLERANCE = 9e-4  # how close the proven bound comes to the witness, relative
 MOST_CELLS = 300_000
 LONGEST = 120.0  # s, unless a time is asked for: an answer comes anyway
 
-Ranges = Mapping[str, "float | tuple[float, float]"]
+Ranges = Mapping[str, "float | tuple[float, float] | list[float]"]
 Progress = Callable[[float, float], None]  # called with lower and upper so far
 
 
@@ -120,13 +121,14 @@ def robust_margin(
     >>> found.lower <= found.upper
     True
     """
-    box = box_of(system.names, system.nominal, system.limits, ranges, over or {})
-    problem = problem_of(system, law_of(system, compensator))
-    return margin_of(problem, box, Effort(tolerance, time, most_cells, progress))
+    effort = Effort(tolerance, time, most_cells, progress)
+    law = law_of(system, compensator)
+    box = box_of(system.names, system.nominal, system.limits, ranges, {} if over is None else over)
+    return margin_of(problem_of(system, law), box, effort)
 
 
 def common_margin(
-    places: Sequence[tuple[UncertainSystem, Compensator]],
+    places: Sequence[tuple[UncertainSystem, Compensator | Any]],
     ranges: Ranges,
     over: Mapping[str, tuple[float, float]] | None = None,
     *,
@@ -141,16 +143,27 @@ def common_margin(
 
     Raises InputError for loops that differ in these.
     """
-    first, law = places[0]
-    for system, other in places[1:]:
+    effort = Effort(tolerance, time, MOST_CELLS, progress, "common_margin")
+    loops = [(system, law_of(system, law, "common_margin")) for system, law in _pairs(places)]
+    first, law = loops[0]
+    for system, other in loops[1:]:
         same = system.names == first.names and np.array_equal(system.nominal, first.nominal)
         if not (same and other.sample_time == law.sample_time and system.sample_time == first.sample_time):
             raise InputError(
                 "common_margin", "places", "loops of different parameters or clocks", "alike ones"
             )
-    box = box_of(first.names, first.nominal, first.limits, ranges, over or {})
-    problems = tuple(problem_of(system, law_of(system, other)) for system, other in places)
-    return margin_of(OfSeveral(problems), box, Effort(tolerance, time, MOST_CELLS, progress))
+    outside = {} if over is None else over
+    box = box_of(first.names, first.nominal, first.limits, ranges, outside, caller="common_margin")
+    return margin_of(OfSeveral(tuple(problem_of(*loop) for loop in loops)), box, effort)
+
+
+def _pairs(places: Any) -> list[tuple[UncertainSystem, Any]]:
+    """Loops as pairs. Raises InputError."""
+    found = list(places) if isinstance(places, Iterable) and not isinstance(places, str) else []
+    if not found or not all(is_pair(place) for place in found):
+        wanted = "pairs of a system and its compensator, at least one"
+        raise InputError("common_margin", "places", described(places), wanted)
+    return [(system, law) for system, law in found]
 
 
 def margin_at(
@@ -175,8 +188,10 @@ def margin_at(
     return margin_of(problem_of(system, compensator), box, Effort(tolerance, time))
 
 
-def law_of(system: UncertainSystem, compensator: Any) -> Compensator:
-    """A compensator as a record, on the system's clock. Raises InputError."""
+def law_of(system: UncertainSystem, compensator: Any, caller: str = "robust_margin") -> Compensator:
+    """A compensator as a record, on the system's clock. Raises InputError, also where the system is none."""
+    if not isinstance(system, UncertainSystem):
+        raise InputError(caller, "system", described(system), "a malta.uncertain system")
     f = system.matrices
     law = compensator_of(compensator, f.size1_out(2), f.size2_out(1)) if f.n_out() >= 3 else compensator
     if system.sample_time is not None and law.sample_time is None and not len(law.A):
@@ -217,35 +232,53 @@ def margin_of_polynomial(
     >>> malta.margin_of_polynomial(lambda k: [1, 3, 3, 1 + k], {"k": (1, 2)}, {"k": 1}).upper.__round__(6)
     7.0
     """
-    everything = {**box, **(over or {})}
-    values = {}
-    for name, value in everything.items():
-        if nominal is not None and name in nominal:
-            values[name] = float(nominal[name])
-        elif isinstance(value, tuple) and len(value) == 2:
-            values[name] = (value[0] + value[1]) / 2
-        else:
-            raise InputError("margin_of_polynomial", name, "a share without a nominal value", "nominal={...}")
-    for name in nominal or {}:
-        if name not in everything:
-            raise InputError(
-                "margin_of_polynomial", name, "a nominal value without a range", "a range in box"
-            )
+    caller = "margin_of_polynomial"
+    effort = Effort(tolerance, time, MOST_CELLS, progress, caller)
+    outside = by_name(caller, "over", {} if over is None else over, '{"k": (1, 2)}')
+    values = _middles({**by_name(caller, "box", box, '{"k": (1, 2)}'), **outside}, nominal)
     names = tuple(values)
     function, _ = polynomial_system(coefficients, names)
     problem = OfPolynomial(OfCoefficients(program(function), names, discrete))
-    where = box_of(names, np.array(list(values.values())), (), box, over or {})
-    return margin_of(problem, where, Effort(tolerance, time, MOST_CELLS, progress))
+    where = box_of(names, np.array(list(values.values())), (), box, outside, caller=caller)
+    return margin_of(problem, where, effort)
+
+
+def _middles(ranges: Mapping[str, Any], nominal: Any) -> dict[str, float]:
+    """The nominal values of a polynomial's parameters, the middle of the interval where none is given."""
+    caller = "margin_of_polynomial"
+    given = by_name(caller, "nominal", {} if nominal is None else nominal, '{"k": 1.5}')
+    for name in given:
+        if name not in ranges:
+            raise InputError(caller, name, "a nominal value without a range", "a range in box")
+    if not ranges:
+        raise InputError(caller, "box", "no parameters", "at least one uncertain parameter")
+    values = {}
+    for name, value in ranges.items():
+        if name in given:
+            values[name] = number(caller, name, given[name])
+        elif is_pair(value):
+            low, high = interval(caller, name, value)
+            values[name] = low / 2 + high / 2
+        else:
+            raise InputError(caller, name, "a share without a nominal value", "nominal={...}")
+    return values
 
 
 @dataclass(frozen=True)
 class Effort:
-    """How far to go."""
+    """How far to go. Raises InputError for a tolerance or time that is none."""
 
     tolerance: float | None = None
     time: float | None = None
     most_cells: int = MOST_CELLS
     progress: Progress | None = None
+    caller: str = "robust_margin"
+
+    def __post_init__(self) -> None:
+        if self.tolerance is not None:
+            positive(self.caller, "tolerance", self.tolerance, below=1)
+        if self.time is not None:
+            positive(self.caller, "time", self.time, endless=True)
 
 
 def margin_of(problem: Problem, box: Box, effort: Effort) -> Margin:
@@ -253,9 +286,6 @@ def margin_of(problem: Problem, box: Box, effort: Effort) -> Margin:
     from malta.margins.search import Job
 
     begun = clock.monotonic()
-    for name, value in (("tolerance", effort.tolerance), ("time", effort.time)):
-        if value is not None and not value > 0:
-            raise InputError("robust_margin", name, f"{value}", "a number above zero")
     unstable = problem.instability(box.standing()) >= 0
     if unstable.any():
         where = dict(zip(box.names, box.standing()[unstable.argmax()].tolist(), strict=True))
