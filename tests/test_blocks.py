@@ -363,3 +363,15 @@ def test_time_and_tolerance_are_checked(function: str, more: dict[str, Any]) -> 
     given: tuple[Any, ...] = (Dynamic(0.1),) if function == "dynamic" else ()
     with pytest.raises(InputError, match="above"):
         asked(s, F, {"a": 0.1}, *given, **more)
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"ranges": {"b": 0.1}}, {"ranges": {"a": "much"}}, {"over": {"b": (1, 2)}}, {"system": None}]
+)
+def test_messages_name_the_function_that_was_asked(wrong: dict[str, Any]) -> None:
+    s, F = satellite()
+    given: dict[str, Any] = {"system": s, "compensator": F, "ranges": {"a": 0.1}} | wrong
+    with pytest.raises(InputError, match=r"^worst_case_gain: "):
+        malta.worst_case_gain(**given)
+    with pytest.raises(InputError, match=r"^dynamic_margin: "):
+        malta.dynamic_margin(**given, dynamic=Dynamic(0.1))

@@ -132,7 +132,7 @@ def test_an_unstable_box_has_no_bound() -> None:
         ({"channel": 1}, "sensors are counted from 0"),
         ({"of": "gain"}, "compliance or effort"),
         ({"at": "here"}, "sensors or forces"),
-        ({"tolerance": 0.0}, "above 0, at most 1"),
+        ({"tolerance": 0.0}, "above zero and below 1"),
         ({"of": "compliance"}, "\\(sensors, forces\\) of compliance"),
         ({"of": "effort", "channel": (0, 1)}, "sensors are counted from 0"),
         ({"channel": (0, 0)}, "each of the sensors once"),

@@ -11,7 +11,6 @@ import time as clock
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from numbers import Real
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,6 +20,7 @@ from malta.margins.block_parts import Part, parts_of
 from malta.margins.blocks import Block, Dynamic, blocks_of, check_blocks, probed
 from malta.margins.box import Box, box_of
 from malta.margins.enclosure import Unproven
+from malta.margins.given import positive
 from malta.margins.loop import loop_of
 from malta.margins.loss import first_loss
 from malta.margins.peaks import Peak, climb, frequencies, patterns
@@ -74,8 +74,7 @@ def dynamic_margin(
     3.0
     """
     begun = clock.monotonic()
-    law = law_of(system, compensator)
-    box = box_of(system.names, system.nominal, system.limits, ranges, over or {}, empty=True)
+    law, box = asked_of("dynamic_margin", system, compensator, ranges, over)
     check_effort("dynamic_margin", tolerance, time)
     blocks = blocks_of(system, dynamic, "dynamic_margin")
     if not blocks:
@@ -168,15 +167,19 @@ def _scaled(
     return replace(b, unit=2.0 ** -min(max(round(1 + math.log2(size)), -500), 500)) if size > 0 else b
 
 
-def check_effort(where: str, tolerance: Any, time: Any) -> None:
+def asked_of(caller: str, system: Any, compensator: Any, ranges: Any, over: Any) -> tuple[Compensator, Box]:
+    """The law as a record and the box. Raises InputError."""
+    law = law_of(system, compensator, caller)
+    none = {} if over is None else over
+    box = box_of(system.names, system.nominal, system.limits, ranges, none, empty=True, caller=caller)
+    return law, box
+
+
+def check_effort(caller: str, tolerance: Any, time: Any) -> None:
     """Raise InputError for what is no tolerance, from 0 to 1, and no time."""
-    for name, value, most in (("tolerance", tolerance, 1.0), ("time", time, math.inf)):
-        known = isinstance(value, (Real, np.generic)) and not isinstance(value, (bool, np.bool_))
-        if value is None and name == "time":
-            continue
-        if not known or not 0 < float(value) <= most:
-            expected = "seconds above zero" if name == "time" else "a number above 0, at most 1"
-            raise InputError(where, name, repr(value), expected)
+    positive(caller, "tolerance", tolerance, below=1.0)
+    if time is not None:
+        positive(caller, "time", time, endless=True)
 
 
 def _size(asked: Blocks, place: Peak) -> float:

@@ -16,12 +16,11 @@ import numpy as np
 
 from malta.errors import InputError
 from malta.margins.blocks import At, Block, Channels, Dynamic, blocks_of, channels_of, shape_of
-from malta.margins.box import box_of
-from malta.margins.dynamic import SEARCH, Blocks, check_effort
+from malta.margins.dynamic import SEARCH, Blocks, asked_of, check_effort
 from malta.margins.enclosure import Unproven
 from malta.margins.peaks import climb, patterns
 from malta.margins.polydisc import excluded
-from malta.margins.robust import LONGEST, law_of
+from malta.margins.robust import LONGEST
 from malta.margins.transfer import performance
 from malta.margins.weight import weight_of
 from malta.uncertain import Compensator, UncertainSystem
@@ -92,8 +91,7 @@ def worst_case_gain(
     (0.75, True)
     """
     begun = clock.monotonic()
-    law = law_of(system, compensator)
-    box = box_of(system.names, system.nominal, system.limits, ranges, over or {}, empty=True)
+    law, box = asked_of("worst_case_gain", system, compensator, ranges, over)
     last = _performance_block(system, of, at, channel)
     check_effort("worst_case_gain", tolerance, time)
     if not box.most > 1:

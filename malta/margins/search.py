@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time as clock
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -201,8 +202,8 @@ class Job:
                 why or f"nothing beyond {done:.3g} was looked at: the model is dear to enclose"
             )
         if self.upper < done / 3 and not self.late():
-            done = 1.05 * self.upper
-            parts = self.parts(done, self.until)
+            with suppress(Unproven):  # families over a smaller box are narrower; the larger ones do as well
+                parts, done = self.parts(1.05 * self.upper, self.until), 1.05 * self.upper
         return parts, done
 
     def _first(self) -> float:
