@@ -109,6 +109,7 @@ class Beside(NamedTuple):
 
     terms: list[ComplexArray]
     radius: FloatArray
+    lasting: FloatArray  # what of the radius narrower intervals of frequency leave
     discs: ComplexArray  # cells x nodes
     moves: list[FloatArray]
     sure: ComplexArray | None = (
@@ -207,7 +208,8 @@ def advance(s: Search) -> None:
         narrow = cells[:, 2] - cells[:, 1] < NARROW * cells[:, 2]  # the radius is not the expansion's
         hopeless = bad & narrow & (_spread(terms) < HOPELESS * radius)
         s.blocked = min(s.blocked, float(s.growth.smallest(boxes[hopeless]).min(initial=np.inf)))
-        kept = Beside([t[bad] for t in terms], radius[bad], found.discs[bad], [m[bad] for m in found.moves])
+        moves = [m[bad] for m in found.moves]
+        kept = Beside([t[bad] for t in terms], radius[bad], found.lasting[bad], found.discs[bad], moves)
         _split(s, cells[bad], boxes[bad], depth[bad], kept)
 
 
@@ -217,9 +219,7 @@ def _spread(terms: list[ComplexArray]) -> FloatArray:
     return np.asarray(np.abs(b0 - b0[:, :1]).max(axis=1) + sum(np.abs(t).max(axis=1) for t in terms[1:]))
 
 
-def on_boxes(
-    f: Family, cells: FloatArray, boxes: FloatArray, like: Family | None = None
-) -> tuple[list[ComplexArray], FloatArray]:
+def on_boxes(f: Family, cells: FloatArray, boxes: FloatArray, like: Family | None = None) -> Expansion:
     """The expansion of each cell with its coefficients over the cell's own box."""
     unique, index = np.unique(cells, axis=0, return_inverse=True)
     with np.errstate(over="ignore", invalid="ignore"):
@@ -228,14 +228,14 @@ def on_boxes(
         together = np.stack(e.terms, axis=1)[index].reshape(len(index), -1)  # one more axis, which is not cut
         whole = np.concatenate([np.broadcast_to([0.0, 1.0], (len(index), 1, 2)), boxes], axis=1)
         cut = restrict(together, (count, *f.shape), whole).reshape(len(index), count, -1)
-    return list(np.moveaxis(cut, 1, 0)), e.radius[index]
+    return Expansion(tuple(np.moveaxis(cut, 1, 0)), e.radius[index], e.lasting[index])
 
 
 def _expanded(s: Search, cells: FloatArray, boxes: FloatArray) -> Beside:
     if s.beside is not None:
         return s.beside(cells, boxes)
-    terms, radius = on_boxes(s.family, cells, boxes)
-    return Beside(terms, radius, np.zeros((len(cells), 1), dtype=complex), [])
+    e = on_boxes(s.family, cells, boxes)
+    return Beside(list(e.terms), e.radius, e.lasting, np.zeros((len(cells), 1), dtype=complex), [])
 
 
 def half_plane(terms: list[ComplexArray], radius: FloatArray) -> ComplexArray:
@@ -273,9 +273,7 @@ def _split(
     shape, terms, radius = s.family.shape, found.terms, found.radius
     count = terms[0].shape[1]
     width = np.abs(terms[1]).sum(axis=1) + sum(2 * np.abs(t).sum(axis=1) for t in terms[2:])
-    width = width + np.minimum(
-        2 * radius * count, width
-    )  # what no interval of frequency makes smaller is not its own
+    width = width + 2 * np.maximum(radius - found.lasting, 0) * count
     moves = [np.where(np.isfinite(width), width, np.inf)]
     values = terms[0].reshape(-1, *shape)
     for axis, size in enumerate(shape):

@@ -27,6 +27,7 @@ class Expansion(NamedTuple):
 
     terms: tuple[ComplexArray, ...]  # b_0, b_1, b_2, b_3: cells x nodes
     radius: FloatArray  # cells
+    lasting: FloatArray  # cells: what of it narrower intervals leave
 
 
 def cover(f: Family) -> FloatArray:
@@ -71,8 +72,9 @@ def expand(f: Family, cells: FloatArray, like: Family | None = None) -> Expansio
         terms.append(_product(weight, turn, f.values))
     rest = whole * _binomial(power, ORDER) * step**ORDER
     rounding = whole * (4 * n + 32) * EPS
-    radius = rest @ size * (1 + 1e-9) + rounding @ size + whole @ f.radius * (1 + 1e-9)
-    return Expansion(tuple(terms), radius + 1e-290)
+    lasting = rounding @ size + whole @ f.radius * (1 + 1e-9)
+    radius = rest @ size * (1 + 1e-9) + lasting
+    return Expansion(tuple(terms), radius + 1e-290, lasting)
 
 
 def _shifts(f: Family, power: FloatArray, m_end: FloatArray, e_end: FloatArray) -> FloatArray:

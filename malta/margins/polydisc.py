@@ -97,7 +97,8 @@ class _Circles:
             for n, x in enumerate(f.slopes)
         ]
         sure = _directed(f, g[0][0]) if len(g) == len(g[0]) == 1 else None
-        return Beside(f.terms, f.radius, discs.astype(complex), moves, sure)
+        none = np.zeros(len(cells))
+        return Beside(f.terms, f.radius, none, discs.astype(complex), moves, sure)
 
 
 def _directed(f: _Sum, g: _Sum) -> ComplexArray:
@@ -185,7 +186,7 @@ def _summed(
     disc: Any = 0.0
     radius: Any = 0.0
     for family, value, slope, left, spread in zip(families, *circle, strict=True):
-        found, rest = on_boxes(family, cells, boxes, None if family is like else like)
+        found, rest, _ = on_boxes(family, cells, boxes, None if family is like else like)
         high = sum(np.abs(x) for x in found[1:]) + rest[:, None]
         x, steep = spread.sum(axis=0), np.abs(slope)
         size = np.abs(value) + steep + left  # of the factor
