@@ -332,3 +332,11 @@ def test_parameters_of_a_plant_are_known() -> None:
         malta.uncertain(PLANT, ["K_X"])
     with pytest.raises(InputError, match=r"^uncertain: foo: found an unknown option, expected one of at"):
         malta.uncertain(PLANT, ["m"], foo=1)
+
+
+def test_a_loss_where_a_mass_is_zero_has_an_answer() -> None:
+    """Stable for every mass above zero: what is lost beyond has no poles at zero itself."""
+    s = malta.uncertain(lambda m: ([[0, 1], [-1 / m, -1 / m]], [[0], [1 / m]], [[1, 0]]), {"m": 1.0})
+    for time in (0.05, 2.0):
+        m = malta.robust_margin(s, [[-0.5]], {"m": 0.1}, time=time)
+        assert m.lower is None or m.lower <= 10 <= m.upper * (1 + 1e-9)

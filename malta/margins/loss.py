@@ -65,7 +65,7 @@ def first_loss(problem: Problem, box: Box, reach: float) -> Loss:
             t = _along(problem, place, d, min(reach, best[0]))
             if t < best[0]:
                 p = place + t * d
-                best = (t, problem.critical(p), p)
+                best = (t, _critical(problem, p, place), p)
         best = _turned(problem, box, place, best)
     return best
 
@@ -86,8 +86,20 @@ def _turned(problem: Problem, box: Box, place: FloatArray, best: Loss) -> Loss:
         if not nearer < t * (1 - 1e-9):
             break
         there = place + nearer * d
-        best = (nearer, problem.critical(there), there)
+        best = (nearer, _critical(problem, there, place), there)
     return best
+
+
+def _critical(problem: Problem, p: FloatArray, place: FloatArray) -> float | None:
+    """Frequency of the worst root, a little beyond p where the loop has none there (a mass of zero)."""
+    for share in (1.0, 1 + 1e-9, 1 + 1e-6):
+        try:
+            found = problem.critical(place + share * (p - place))
+        except (CheckError, np.linalg.LinAlgError, NotAnalytic):
+            continue
+        if np.isfinite(found):
+            return found
+    return None
 
 
 def _instability(problem: Problem, rows: FloatArray) -> FloatArray:

@@ -46,6 +46,7 @@ LEVELS = 5  # of these boxes, each half of the next
 # of the time for families, by the number of parameters, the last for MANY
 SHARES = (0.6, 0.6, 0.6, 0.6, 0.4, 0.3)
 MANY = 5  # parameters from which on multipliers come before many cells
+LAST = 20.0  # s that they may take at the end where cells have proven something
 TURN, TURN_AFTER = 0.5, 4.0  # their share of the time in that turn, and how many times what was spent before
 PATCHES = 64  # parts that a box is cut into where one expansion does not do
 
@@ -363,7 +364,8 @@ class Job:
         if witness is None and looked < self.limit:
             upper, frequency, witness = first_loss(self.problem, self.box, self.limit)
         if max(lower, self._multiplied()) < min(self.limit, upper * (1 - 2 * self.asked)):
-            self._multiply(min(self.limit, upper * (1 - self.tolerance)), 1.0)
+            most = max(LAST, 0.5 * (clock.monotonic() - self.begun)) if lower > 0 else math.inf
+            self._multiply(min(self.limit, upper * (1 - self.tolerance)), 1.0, most)
         proofs = [self._certificate(part, s) for part, s in searches]
         return self._margin(lower, (upper, frequency, witness), proofs, begun)
 
