@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 import malta
 from malta import Dynamic
 from malta.errors import InputError
-from malta.margins.blocks import Block, probed
-from malta.margins.transfer import performance, responses, structured, transfer
+from malta.margins.blocks import Block, probe
+from malta.margins.transfer import mu_bound, performance, responses, transfer
 from malta.margins.weight import weight_of
 
 ONE = weight_of(1.0, "")
@@ -100,7 +100,7 @@ def test_the_blocks_close_the_loop_as_m_says(
     back = np.array([b.kind == "feedback" for b in blocks])
     entries = np.where(back, d / (1 - d), d)  # a gain 1 + entry = 1 / (1 - d)
     w, p = np.array([0.3, 2.0, 20.0]), np.array([1.1])
-    wide, law = probed(s, F, blocks)
+    wide, law = probe(s, F, blocks)
 
     def difference(entries: np.ndarray[Any, Any]) -> Any:
         r = responses(wide, law, np.append(p, entries), w)
@@ -119,7 +119,7 @@ def test_bounds_of_mu_are_reached_by_their_delta(seed: int) -> None:
     blocks = [Block("additive", "sensors", tuple(range(r)), tuple(range(c)), ONE) for r, c in shapes]
     rows, columns = (sum(s[k] for s in shapes) for k in (0, 1))
     M = rng.normal(size=(5, columns, rows)) + 1j * rng.normal(size=(5, columns, rows))
-    mu, delta = structured(M, blocks)
+    mu, delta = mu_bound(M, blocks)
     for one, size, d in zip(M, mu, delta, strict=True):
         assert np.linalg.norm(d, 2) == pytest.approx(1, rel=1e-9)
         assert np.abs(np.linalg.eigvals(one @ d)).max() == pytest.approx(size, rel=1e-6)
@@ -130,8 +130,8 @@ def test_bounds_of_mu_are_reached_by_their_delta(seed: int) -> None:
         a, b = scaled.copy(), scaled.copy()
         a[:, shapes[0][1] :] /= (1.001 * gain)[:, None, None]
         b[:, shapes[0][1] :] /= (0.999 * gain)[:, None, None]
-        assert (structured(a, blocks)[0] < 1).all()
-        assert (structured(b, blocks)[0] > 1 - 1e-9).all()
+        assert (mu_bound(a, blocks)[0] < 1).all()
+        assert (mu_bound(b, blocks)[0] > 1 - 1e-9).all()
 
 
 @settings(max_examples=60, deadline=None)
@@ -221,7 +221,7 @@ def test_several_blocks_beside_parameters(count: int) -> None:
 
     def mu(p: np.ndarray[Any, Any], w: np.ndarray[Any, Any]) -> Any:
         sizes = np.array([b.weight.at(w) for b in blocks]).T
-        return structured(transfer(responses(s, law, p, w), blocks) * sizes[:, :, None], blocks)[0]
+        return mu_bound(transfer(responses(s, law, p, w), blocks) * sizes[:, :, None], blocks)[0]
 
     w = np.geomspace(0.1, 1e4, 800)
     for k in 10 + 4 * m.lower * np.linspace(-1, 1, 11):

@@ -165,7 +165,7 @@ def test_chains_are_stable_where_it_is_proven(n: int, T: float | None, t: float)
     """Six and fourteen parameters."""
     loop = chain(n, T)
     s = asked(loop)
-    assert s.raised(t) == t
+    assert s.raise_bound(t) == t
     assert stable_within(loop, s.box, t)
 
 
@@ -176,7 +176,7 @@ def test_no_box_is_proven_that_holds_an_unstable_loop() -> None:
     s.until = clock.monotonic() + 2
     assert m.lower is not None
     assert m.lower <= m.upper
-    assert s.raised(1.2 * m.upper) < m.upper
+    assert s.raise_bound(1.2 * m.upper) < m.upper
 
 
 @pytest.mark.slow

@@ -1,6 +1,6 @@
 """What complex blocks add to a loop's characteristic polynomials, over a box of parameters.
 
-With the entries of blocks as further parameters (`blocks.probed`), a polynomial is affine in each of them: its values
+With the entries of blocks as further parameters (`blocks.probe`), a polynomial is affine in each of them: its values
 where some of them are at zero and some at -unit give a_S of `polydisc`, for every set S of the blocks.
 """
 

@@ -136,7 +136,7 @@ def check_blocks(blocks: Sequence[Block], where: str) -> None:
 # the plant with the entries of blocks as parameters
 
 
-def probed(
+def probe(
     system: UncertainSystem, law: Compensator, blocks: Sequence[Block]
 ) -> tuple[UncertainSystem, Compensator]:
     """The loop with one more parameter for each entry of each block, zero at the nominal; blocks act in their order.
@@ -155,11 +155,11 @@ def probed(
         for i, j in b.entries:
             delta[i, j] = d[k]
             k += 1
-        wiring = wiring.joined(b, delta)
+        wiring = wiring.join(b, delta)
     behind = any(b.kind in ("additive", "compliance", "effort") for b in blocks)
     if behind and law.lag is not None:
-        wiring = wiring.lagged()
-    matrices, law = wiring.closed()
+        wiring = wiring.with_lags()
+    matrices, law = wiring.close()
     f = ca.Function("probed", [ca.vertcat(p, d)], [ca.cse(M) for M in matrices])
     names = (*system.names, *(f"Delta {i + 1}" for i in range(count)))
     limits = (*system.limits, *[(-np.inf, np.inf)] * count) if system.limits else ()
@@ -179,17 +179,17 @@ class _Wiring:
     last: tuple[Block, ca.SX] | None = None  # compliance or effort
     lags: int = 0  # the last states: h u
 
-    def joined(self, b: Block, delta: ca.SX) -> _Wiring:
+    def join(self, b: Block, delta: ca.SX) -> _Wiring:
         if b.kind in ("compliance", "effort"):
             return replace(self, last=(b, delta))
         if b.kind == "additive":
-            return replace(self, H=_added(self.H, b, delta))
-        gain = _added(ca.SX.eye((self.G if b.at == "sensors" else self.F).shape[0]), b, delta)
+            return replace(self, H=_add(self.H, b, delta))
+        gain = _add(ca.SX.eye((self.G if b.at == "sensors" else self.F).shape[0]), b, delta)
         if b.at == "forces":
             return replace(self, F=gain @ self.F)
         return replace(self, G=gain @ self.G, H=gain @ self.H)
 
-    def lagged(self) -> _Wiring:
+    def with_lags(self) -> _Wiring:
         """Lags as states, so that what comes and goes beside the commands does not pass them."""
         A, B, C, D, *E = self.made
         n, m = B.shape
@@ -199,7 +199,7 @@ class _Wiring:
         made += [ca.diagcat(e, ca.SX.eye(m)) for e in E]
         return replace(self, made=made, law=replace(self.law, lag=None), lags=m)
 
-    def closed(self) -> tuple[list[ca.SX], Compensator]:
+    def close(self) -> tuple[list[ca.SX], Compensator]:
         """A, B, C, D (and E where there is one) and the law; D is left out where it is zero and last."""
         A, B, C, D, *E = self.made
         n, m, q = A.shape[0], B.shape[1], C.shape[0]
@@ -220,17 +220,17 @@ class _Wiring:
                 drive = ca.horzcat(drive, B[:, i] @ delta)
                 C = ca.vertcat(C, read[j, :])
                 rows = ca.blockcat([[through, self.G @ push], [direct[j, :], push[j, :]]])
-                law = _widened(law, outputs=k, reads=np.eye(k))
+                law = _widen(law, outputs=k, reads=np.eye(k))
             else:
                 drive = ca.horzcat(drive, ca.SX(n, k))
-                rows = ca.horzcat(through, _added(ca.SX(q, k), replace(b, columns=tuple(range(k))), delta))
-                law = _widened(law, echoes=j)
+                rows = ca.horzcat(through, _add(ca.SX(q, k), replace(b, columns=tuple(range(k))), delta))
+                law = _widen(law, echoes=j)
         if rows.nnz() or E:
             return [A, drive, C, rows, *E], law
         return [A, drive, C], law
 
 
-def _added(matrix: ca.SX, b: Block, delta: ca.SX) -> ca.SX:
+def _add(matrix: ca.SX, b: Block, delta: ca.SX) -> ca.SX:
     """A matrix plus a block's entries at its rows and columns."""
     found = ca.SX(matrix)
     for i, j in b.entries:
@@ -238,7 +238,7 @@ def _added(matrix: ca.SX, b: Block, delta: ca.SX) -> ca.SX:
     return found
 
 
-def _widened(
+def _widen(
     law: Compensator, outputs: int = 0, reads: FloatArray | None = None, echoes: Sequence[int] = ()
 ) -> Compensator:
     """A law that hands further readings on as further inputs, or gives some of its commands twice."""

@@ -17,18 +17,18 @@ import numpy as np
 
 from malta.errors import InputError
 from malta.margins.block_parts import Part, parts_of
-from malta.margins.blocks import Block, Dynamic, blocks_of, check_blocks, probed
+from malta.margins.blocks import Block, Dynamic, blocks_of, check_blocks, probe
 from malta.margins.box import Box, box_of
 from malta.margins.enclosure import Unproven
 from malta.margins.given import positive
 from malta.margins.loop import loop_of
 from malta.margins.loss import first_loss
 from malta.margins.peaks import Peak, climb, frequencies, patterns
-from malta.margins.polydisc import Size, excluded
+from malta.margins.polydisc import Size, is_zero_free
 from malta.margins.problem import OfLoop
 from malta.margins.robust import LONGEST, Margin, law_of, problem_of
 from malta.margins.search import EDGE, FAR, Job
-from malta.margins.transfer import responses, structured, transfer
+from malta.margins.transfer import mu_bound, responses, transfer
 from malta.margins.weight import Expanded, Weight
 from malta.uncertain import Compensator, UncertainSystem
 
@@ -74,7 +74,7 @@ def dynamic_margin(
     3.0
     """
     begun = clock.monotonic()
-    law, box = asked_of("dynamic_margin", system, compensator, ranges, over)
+    law, box = question_of("dynamic_margin", system, compensator, ranges, over)
     check_effort("dynamic_margin", tolerance, time)
     blocks = blocks_of(system, dynamic, "dynamic_margin")
     if not blocks:
@@ -115,7 +115,7 @@ class Blocks:
         check_blocks(blocks, where)
         problem = problem_of(system, law)
         scaled = tuple(_scaled(system, law, box.nominal, b, problem) for b in blocks)
-        more, wider = probed(system, law, scaled)
+        more, wider = probe(system, law, scaled)
         return cls(system, law, box, scaled, problem, OfLoop(loop_of(more, wider), more.names))
 
     @property
@@ -167,7 +167,9 @@ def _scaled(
     return replace(b, unit=2.0 ** -min(max(round(1 + math.log2(size)), -500), 500)) if size > 0 else b
 
 
-def asked_of(caller: str, system: Any, compensator: Any, ranges: Any, over: Any) -> tuple[Compensator, Box]:
+def question_of(
+    caller: str, system: Any, compensator: Any, ranges: Any, over: Any
+) -> tuple[Compensator, Box]:
     """The law as a record and the box. Raises InputError."""
     law = law_of(system, compensator, caller)
     none = {} if over is None else over
@@ -197,7 +199,7 @@ def _loss(asked: Blocks, until: float) -> Peak | None:
     seen: list[Peak] = []
 
     def value(p: FloatArray, w: FloatArray) -> FloatArray:
-        return structured(asked.transfer(p, w), asked.blocks)[0]
+        return mu_bound(asked.transfer(p, w), asked.blocks)[0]
 
     def peak(t: float, chosen: FloatArray) -> Peak:
         starts = [box.nominal, *asked.starts(t, chosen)]
@@ -273,6 +275,6 @@ def _proven(asked: Blocks, upper: float, tolerance: float, until: float) -> tupl
         except Unproven as error:
             reason = str(error)
             continue
-        if excluded(parts, t, asked.sizes(t), until)[0]:
+        if is_zero_free(parts, t, asked.sizes(t), until)[0]:
             return (t, "") if asked.stable(until) else (None, "the nominal loop is not proven stable")
     return None, reason or "not settled"

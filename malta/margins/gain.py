@@ -16,10 +16,10 @@ import numpy as np
 
 from malta.errors import InputError
 from malta.margins.blocks import At, Block, Channels, Dynamic, blocks_of, channels_of, shape_of
-from malta.margins.dynamic import SEARCH, Blocks, asked_of, check_effort
+from malta.margins.dynamic import SEARCH, Blocks, check_effort, question_of
 from malta.margins.enclosure import Unproven
 from malta.margins.peaks import climb, patterns
-from malta.margins.polydisc import excluded
+from malta.margins.polydisc import is_zero_free
 from malta.margins.robust import LONGEST
 from malta.margins.transfer import performance
 from malta.margins.weight import weight_of
@@ -91,7 +91,7 @@ def worst_case_gain(
     (0.75, True)
     """
     begun = clock.monotonic()
-    law, box = asked_of("worst_case_gain", system, compensator, ranges, over)
+    law, box = question_of("worst_case_gain", system, compensator, ranges, over)
     last = _performance_block(system, of, at, channel)
     check_effort("worst_case_gain", tolerance, time)
     if not box.most > 1:
@@ -152,7 +152,7 @@ def _proven(asked: Blocks, lower: float, tolerance: float, until: float) -> tupl
     count, last = 0, len(asked.blocks) - 1
     for bound in [lower * (1 + step * tolerance) for step in STEPS] if lower > LEAST else NOTHING:
         sizes = [*asked.sizes(1.0)[:last], asked.sizes(1 / bound)[last]]
-        found, cells = excluded(parts, 1 + 1e-9, sizes, until)
+        found, cells = is_zero_free(parts, 1 + 1e-9, sizes, until)
         count += cells
         if found:
             return (

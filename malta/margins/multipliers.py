@@ -154,9 +154,9 @@ class _Centres:
         b = level + 0.5 * abs(level) + 1e-6
         for _ in range(STEPS):
             if level < wanted:
-                x = self.centred(x, 1.0)  # with room to all sides, for intervals of frequency
+                x = self.centre(x, 1.0)  # with room to all sides, for intervals of frequency
                 break
-            x = self.centred(x, b)
+            x = self.centre(x, b)
             level = self.level(x)
             if b - level < flat * abs(level) + 1e-9:
                 break
@@ -172,7 +172,7 @@ class _Centres:
         x = np.concatenate([of(first.D, self.basis.D), of(first.G, self.basis.G)])
         return np.asarray(x * (self.trace @ self.start) / max(float(self.trace @ x), 1e-300))
 
-    def centred(self, x: FloatArray, b: float) -> FloatArray:
+    def centre(self, x: FloatArray, b: float) -> FloatArray:
         """Newton steps towards the centre for b."""
         total = float(self.trace @ self.start)
         for _ in range(INNER):

@@ -36,7 +36,9 @@ MOST_CELLS = 200_000
 Size = Callable[["FloatArray", int], Expanded]  # of a block, on cells of a scale
 
 
-def excluded(parts: Sequence[Part], target: float, sizes: Sequence[Size], until: float) -> tuple[bool, int]:
+def is_zero_free(
+    parts: Sequence[Part], target: float, sizes: Sequence[Size], until: float
+) -> tuple[bool, int]:
     """Whether no polynomial has a zero on box(target) with blocks of these radii; and the cells that were looked at."""
     count = 0
     for part in parts:
@@ -82,7 +84,7 @@ class _Circles:
         phases = boxes[:, self.axes :]
         on_circles = [self.sizes[k](cells, part.scale) for k in part.scalars[:level]]
         circle = _circle(on_circles, phases, None)
-        f = _summed(part.sets[: 2**level], circle, cells, boxes, part.sets[0])
+        f = _sum_over(part.sets[: 2**level], circle, cells, boxes, part.sets[0])
         if level < len(part.scalars):
             k = part.scalars[level]
             matrix: Matrix = ((part.sets[2**level : 2 ** (level + 1)],),)
@@ -90,18 +92,18 @@ class _Circles:
             assert part.full is not None
             k, matrix = part.full, part.entries
         within = _circle(on_circles, phases, self.sizes[k](cells, part.scale))
-        g = [[_summed(families, within, cells, boxes, part.sets[0]) for families in row] for row in matrix]
+        g = [[_sum_over(families, within, cells, boxes, part.sets[0]) for families in row] for row in matrix]
         discs = f.disc + sum(np.abs(x) for x in f.slopes) + _largest(g)
         moves = [
             2 * (np.abs(x) + sum(np.abs(entry.slopes[n]) for row in g for entry in row)).sum(axis=1)
             for n, x in enumerate(f.slopes)
         ]
-        sure = _directed(f, g[0][0]) if len(g) == len(g[0]) == 1 else None
+        sure = _half_plane(f, g[0][0]) if len(g) == len(g[0]) == 1 else None
         none = np.zeros(len(cells))
         return Beside(f.terms, f.radius, none, discs.astype(complex), moves, sure)
 
 
-def _directed(f: _Sum, g: _Sum) -> ComplexArray:
+def _half_plane(f: _Sum, g: _Sum) -> ComplexArray:
     """c where Re(conj(c) f) > |g| on the whole cell, c the direction of f in the middle; zero elsewhere.
 
     All of g lies within an angle e of d, so that |g| <= Re(conj(d) g) / cos(e): what is left is linear in both.
@@ -177,7 +179,7 @@ class _Sum(NamedTuple):
     radius: FloatArray  # cells
 
 
-def _summed(
+def _sum_over(
     families: Sequence[Family], circle: _Circle, cells: FloatArray, boxes: FloatArray, like: Family
 ) -> _Sum:
     """With e^(j x) = 1 + j x + rest, |rest| <= x^2 / 2, x the sum of a set's phases less their middles."""

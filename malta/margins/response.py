@@ -179,7 +179,7 @@ def positive(M: Any, beside: float) -> bool:
     return bool(np.isfinite(M).all())
 
 
-def excluded(r: Response, m: Multiplier) -> bool:
+def excludes_zero(r: Response, m: Multiplier) -> bool:
     """Whether F > 0 for all |t| <= 1, and D > 0."""
     D, G = m.D, m.G
     N0, N1, N2 = r.terms

@@ -257,16 +257,16 @@ class Job:
     def structured(self) -> Structured | None:
         """What proves by multipliers; None where the loop has no pencil of rational functions."""
         rows = None if self.box.frame else rows_of(self.problem)
-        return None if rows is None else Structured(rows, self.box, self.until, self.most_cells, self._told)
+        return None if rows is None else Structured(rows, self.box, self.until, self.most_cells, self._report)
 
     def _multiply(self, target: float, share: float, most: float = math.inf) -> None:
         """Raise the proven bound by multipliers, for a share of the time that is left, and `most` seconds."""
         now = clock.monotonic()
         if self.structured is not None and now < self.until:
             self.structured.until = now + min(share * (self.until - now), most)
-            self.structured.raised(target)
+            self.structured.raise_bound(target)
 
-    def _told(self, t: float) -> None:
+    def _report(self, t: float) -> None:
         self.stands = max(self.stands, t)
         if self.progress is not None:
             self.progress(self.stands, self.upper)

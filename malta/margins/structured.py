@@ -21,7 +21,7 @@ from malta.margins.loop import groups
 from malta.margins.multipliers import Blocks, Multiplier, multiplier
 from malta.margins.pencil import Rows
 from malta.margins.problem import OfLoop, OfSeveral, Problem
-from malta.margins.response import Branch, excluded, response
+from malta.margins.response import Branch, excludes_zero, response
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -63,7 +63,7 @@ class Structured:
     box: Box
     until: float
     most: int = 1_000_000  # cells
-    told: Callable[[float], None] | None = None  # of each t that is proven
+    report: Callable[[float], None] | None = None  # of each t that is proven
     lower: float = 0.0
     count: int = 0
     _order: list[Cell] = field(default_factory=list, repr=False)  # those that resist first
@@ -72,7 +72,7 @@ class Structured:
     def late(self, until: float = math.inf) -> bool:
         return clock.monotonic() > min(until, self.until) or self.count >= self.most
 
-    def raised(self, target: float) -> float:
+    def raise_bound(self, target: float) -> float:
         """Prove ever larger boxes up to box(target), whole ones first, as far as time goes."""
         cells = self._order = self._order if self.lower else self._whole(target)
         step = FIRST_STEP
@@ -91,8 +91,8 @@ class Structured:
 
     def _stands(self, t: float) -> None:
         self.lower = max(self.lower, t)
-        if self.told is not None:
-            self.told(self.lower)
+        if self.report is not None:
+            self.report(self.lower)
 
     def _on(self, cells: list[Cell], t: float) -> list[Cell]:
         sides = self.box.sides(t)
@@ -199,13 +199,13 @@ class Structured:
         if not blocks.size:
             return 0.0, None, True
         near = cell.near if cell.near is not None and cell.near.blocks == blocks else None
-        if near is not None and excluded(found, near):
+        if near is not None and excludes_zero(found, near):
             return 0.0, near, True
         try:
             m, beta = multiplier(found.terms[0], blocks, near, NEAR)
         except (np.linalg.LinAlgError, ValueError):
             return math.inf, None, False
-        return beta, m, beta < 1 and excluded(found, m)
+        return beta, m, beta < 1 and excludes_zero(found, m)
 
     def _across_box(self, cell: Cell, m: Multiplier | None) -> list[Cell]:
         sides = cell.sides

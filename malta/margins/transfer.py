@@ -103,7 +103,7 @@ def transfer(r: Responses, blocks: Sequence[Block]) -> ComplexArray:
 _LOOPS = ("multiplicative", "feedback")
 
 
-def structured(M: ComplexArray, blocks: Sequence[Block]) -> tuple[FloatArray, ComplexArray]:
+def mu_bound(M: ComplexArray, blocks: Sequence[Block]) -> tuple[FloatArray, ComplexArray]:
     """A lower bound of mu, and Delta of size one that has it: det(1 - M Delta / mu) = 0.
 
     M: k x columns x rows; Delta: k x rows x columns, of blocks on the diagonal. One block has the largest singular
@@ -192,20 +192,20 @@ def performance(M: ComplexArray, blocks: Sequence[Block]) -> FloatArray:
     g mu(g) rises to it; it is infinite where the others close a loop by themselves.
     """
     if len(blocks) == 1:
-        return structured(M, blocks)[0]
+        return mu_bound(M, blocks)[0]
     if M.shape[1:] == (2, 2) and len(blocks) == 2:
         return _behind_one(M)
     _, last = _parts(blocks)[-1]
     without = M[:, : last.start, : _parts(blocks)[-1][0].start]
-    g = structured(M[:, last, _parts(blocks)[-1][0]], blocks[-1:])[0]
+    g = mu_bound(M[:, last, _parts(blocks)[-1][0]], blocks[-1:])[0]
     for _ in range(ROUNDS):
         scaled = M.copy()
         scaled[:, last] /= np.maximum(g, 1e-300)[:, None, None]
-        grown = structured(scaled, blocks)[0]
+        grown = mu_bound(scaled, blocks)[0]
         g = g * np.maximum(grown, 1.0)
         if (grown < 1 + 1e-10).all():
             break
-    return np.where(structured(without, blocks[:-1])[0] >= 1, np.inf, g)
+    return np.where(mu_bound(without, blocks[:-1])[0] >= 1, np.inf, g)
 
 
 def _behind_one(M: ComplexArray) -> FloatArray:
