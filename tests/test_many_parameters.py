@@ -195,3 +195,38 @@ def test_fourteen_parameters_have_a_bound_in_a_minute_and_four_gigabytes(T: floa
     assert 0.2 < m.lower <= m.upper
     assert m.seconds < 66
     assert stable_within(loop, asked(loop).box, m.lower)
+
+
+@pytest.mark.parametrize("count", [2, 4, 6])
+def test_eight_states_over_twelve_decades(count: int) -> None:
+    """Four masses of a gram on springs of 1e5 N/m, states counted in units from 1e-6 to 1e6: settled at once."""
+    n, units = 4, np.array([1e-6, 1e-3, 1, 1e3, 1e6, 1e-2, 1e2, 1e4])
+
+    def of(p: Any) -> Any:
+        m, k = [p[i] * 1e-3 for i in range(n)], [p[n + i] * 1e5 for i in range(n)]
+        A, B, C = ca.SX(2 * n, 2 * n), ca.SX(2 * n, 1), ca.SX(1, 2 * n)
+        for i in range(n):
+            A[i, n + i] = 1
+            A[n + i, i] -= k[i] / m[i]
+            A[n + i, n + i] -= 2e-7 * k[i] / m[i]
+            if i:
+                A[n + i, i - 1] += k[i] / m[i]
+                A[n + i - 1, i] += k[i] / m[i - 1]
+                A[n + i - 1, i - 1] -= k[i] / m[i - 1]
+        B[2 * n - 1], C[0, n - 1] = 1 / m[n - 1], 1
+        to, back = ca.DM(np.diag(units)), ca.DM(np.diag(1 / units))
+        return to @ A @ back, to @ B, C @ back
+
+    names = [*(f"m{i}" for i in range(n)), *(f"k{i}" for i in range(n))]
+    system = malta.uncertain(of, dict.fromkeys(names, 1.0))
+    A, B, C = (np.array(M) for M in system.matrices(np.ones(2 * n)))
+    back, to = np.diag(1 / units), np.diag(units)
+    A, B, C = back @ A @ to, back @ B, C @ to
+    K = care(A, B, np.diag([1e4] * n + [1e-4] * n), 1e-4 * np.eye(1)).K
+    L = care(A.T, C.T, 1e-2 * np.eye(2 * n) + 1e2 * B @ B.T, 1e-8 * np.eye(1)).K.T
+    law = Compensator(A - B @ K - L @ C, L, -K, np.zeros((1, 1)))
+    chosen = names[: count // 2] + names[n : n + count // 2]
+    m = malta.robust_margin(system, law, dict.fromkeys(chosen, 0.1), time=20.0)
+    assert m.lower is not None
+    assert m.upper <= 1.001 * m.lower
+    assert m.upper == pytest.approx({2: 1.6833, 4: 0.5107, 6: 0.2838}[count], rel=1e-3)
