@@ -7,9 +7,9 @@ where some of them are at zero and some at -unit give a_S of `polydisc`, for eve
 from __future__ import annotations
 
 import math
-import time as clock
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,16 +17,15 @@ from flint import acb, arb
 
 from malta.margins.blocks import Block
 from malta.margins.box import Box
-from malta.margins.enclosure import TooWide, Unproven, over_box
+from malta.margins.enclosure import over_box
 from malta.margins.exclusion import Growth, growth_over
 from malta.margins.family import Family, aligned, combined
-from malta.margins.parts import halves
+from malta.margins.parts import PATCHES, cut
 
 if TYPE_CHECKING:
     from malta.margins.problem import OfLoop, Polynomial
     from malta.plant import FloatArray
 
-PATCHES = 64  # parts that a box is cut into where one expansion does not do
 Matrix = tuple[tuple[tuple[Family, ...], ...], ...]  # rows x columns of a_{S + ij}
 
 
@@ -75,17 +74,9 @@ def parts_of(
     owners = _owners([f for f, _ in groups], blocks, pins)
     for (f, moves), acting in zip(groups, owners, strict=True):
         scaled = tuple(arb(grown) * c for c in moves)
-        todo = [sides]
-        while todo:
-            own = todo.pop()
-            if clock.monotonic() > until:
-                raise Unproven("time was up before the coefficients were found")
-            try:
-                found.append(_part(f, own, scaled, [(k, blocks[k], pins[k]) for k in acting], box, until))
-            except TooWide as error:
-                if len(todo) + len(found) >= PATCHES:
-                    raise Unproven(str(error)) from error
-                todo += halves(own, error.axis, float(box.nominal[error.axis]))
+        own = [(k, blocks[k], pins[k]) for k in acting]
+        made = partial(_part, f, moves=scaled, acting=own, box=box, until=until)
+        found += cut(sides, box.nominal, until, made, PATCHES - len(found))
     return found
 
 
@@ -108,7 +99,7 @@ def _part(
     acting: list[tuple[int, Block, list[int]]],
     box: Box,
     until: float,
-) -> Part:
+) -> list[Part]:
     """The families of one group, from its values with entries at zero and at -unit."""
     known: dict[frozenset[int], Family] = {}
     count = len(f.names) - len(sides)
@@ -147,7 +138,7 @@ def _part(
     flat = iter(made)
     sets = tuple(next(flat) for _ in sums)
     matrix = tuple(tuple(tuple(next(flat) for _ in plain) for _ in row) for row in entries)
-    return Part(
+    part = Part(
         growth,
         sets[0].scale,
         tuple(k for k, _, _ in scalars),
@@ -155,6 +146,7 @@ def _part(
         None if full is None else full[0],
         matrix,
     )
+    return [part]
 
 
 def _probe(

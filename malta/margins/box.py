@@ -17,6 +17,18 @@ if TYPE_CHECKING:
     from malta.plant import FloatArray
 
 
+FAR = 1e2  # search limit, in multiples of the modelled box
+EDGE = 1e-4  # distance that the search keeps from the end of what a parameter can be, relative
+
+
+def smallest_t(p: FloatArray, nominal: FloatArray, down: FloatArray, up: FloatArray) -> FloatArray:
+    """The smallest t with nominal - t down <= p <= nominal + t up on the axes that grow: ... x P -> ..."""
+    moved = p - nominal
+    with np.errstate(divide="ignore", invalid="ignore"):
+        t = np.where(moved > 0, moved / up, np.where(moved < 0, -moved / down, 0))
+    return np.asarray(np.where(down + up > 0, t, 0).max(axis=-1, initial=0.0))
+
+
 @dataclass(frozen=True, eq=False)
 class Box:
     """Nominal values and how far each grows downwards and upwards with t; `over` stays."""
@@ -30,6 +42,15 @@ class Box:
     frame: Mapping[int, tuple[float, float]] = field(
         default_factory=dict
     )  # by index: an interval around `over`
+
+    @property
+    def limit(self) -> float:
+        """How far a search goes: near the end of what a parameter can be, or far beyond what is modelled."""
+        return min(self.most * (1 - EDGE), FAR)
+
+    def margin(self, p: FloatArray) -> FloatArray:
+        """The smallest t with p in box(t): ... -> ..."""
+        return smallest_t(p, self.nominal, self.down, self.up)
 
     def sides(self, t: float) -> FloatArray:
         """Low and high of every parameter: names x 2."""

@@ -26,8 +26,8 @@ from malta.margins.loss import first_loss
 from malta.margins.peaks import Peak, climb, frequencies, patterns
 from malta.margins.polydisc import Size, is_zero_free
 from malta.margins.problem import OfLoop
-from malta.margins.robust import LONGEST, Margin, law_of, problem_of
-from malta.margins.search import EDGE, FAR, Job
+from malta.margins.robust import Margin, deadline, law_of, problem_of
+from malta.margins.search import Job
 from malta.margins.transfer import mu_bound, responses, transfer
 from malta.margins.weight import Expanded, Weight
 from malta.uncertain import Compensator, UncertainSystem
@@ -83,11 +83,11 @@ def dynamic_margin(
     if asked.unstable():
         reason = "the nominal loop is unstable"
         return Margin(0.0, 0.0, None, None, {}, {}, (), clock.monotonic() - begun, reason)
-    until = begun + (LONGEST if time is None else time)
+    until = deadline(begun, time)
     with np.errstate(all="ignore"):  # what is not finite excludes nothing
         lost = _loss(asked, begun + SEARCH * (until - begun))
         t = math.inf if lost is None else _size(asked, lost)
-        lower, reason = _proven(asked, min(t, asked.limit), tolerance, until)
+        lower, reason = _proven(asked, min(t, asked.box.limit), tolerance, until)
     spent, names = clock.monotonic() - begun, box.names
     if lost is None:
         return Margin(lower, math.inf, None, None, {}, {}, (), spent, reason)
@@ -117,10 +117,6 @@ class Blocks:
         scaled = tuple(_scaled(system, law, box.nominal, b, problem) for b in blocks)
         more, wider = probe(system, law, scaled)
         return cls(system, law, box, scaled, problem, OfLoop(loop_of(more, wider), more.names))
-
-    @property
-    def limit(self) -> float:
-        return min(self.box.most * (1 - EDGE), FAR)
 
     def unstable(self) -> bool:
         """Whether a loop that nothing has moved yet is unstable."""
@@ -186,11 +182,7 @@ def check_effort(caller: str, tolerance: Any, time: Any) -> None:
 
 def _size(asked: Blocks, place: Peak) -> float:
     """The smallest t that holds a place's parameters and blocks."""
-    box, moved = asked.box, place.p - asked.box.nominal
-    with np.errstate(divide="ignore", invalid="ignore"):
-        t = np.where(moved > 0, moved / box.up, np.where(moved < 0, -moved / box.down, 0))
-    share = float(np.where(box.down + box.up > 0, t, 0).max(initial=0.0))
-    return max(share, 1 / place.value if place.value > 0 else math.inf)
+    return max(float(asked.box.margin(place.p)), 1 / place.value if place.value > 0 else math.inf)
 
 
 def _loss(asked: Blocks, until: float) -> Peak | None:
@@ -212,7 +204,7 @@ def _loss(asked: Blocks, until: float) -> Peak | None:
 
     peak(0.0, every)
     if (box.down + box.up).any():
-        high = min(_size(asked, nearest()), asked.limit)
+        high = min(_size(asked, nearest()), asked.box.limit)
         if (asked.problem.instability(np.array(asked.starts(high, every))) >= 0).any():
             t, w, p = first_loss(asked.problem, box, high)  # by the parameters alone
             if p is not None and w is not None:
@@ -222,7 +214,7 @@ def _loss(asked: Blocks, until: float) -> Peak | None:
         for _ in range(ROUNDS):
             if top.value * high < 1 or clock.monotonic() > until:
                 break
-            _narrowed(peak, high, _pattern(box, high, top.p), until)
+            _narrow(peak, high, _pattern(box, high, top.p), until)
             high = _size(asked, nearest())
             top = peak(high, every)
             if top.value * high < 1 + 1e-9:
@@ -231,21 +223,25 @@ def _loss(asked: Blocks, until: float) -> Peak | None:
     return best if math.isfinite(_size(asked, best)) else None
 
 
-def _narrowed(
-    peak: Callable[[float, FloatArray], Peak], high: float, chosen: FloatArray, until: float
-) -> None:
+def _narrow(peak: Callable[[float, FloatArray], Peak], high: float, chosen: FloatArray, until: float) -> None:
     """Bisect t, in its logarithm, between where t |M| is below one and `high`, where it is not."""
-    low = high / 2
-    while low > 1e-9 * high and peak(low, chosen).value * low >= 1 and clock.monotonic() < until:
-        high, low = low, low / 2
-    below, above = math.log(low), math.log(high)
-    at_below, at_above = (math.log(max(peak(t, chosen).value, 1e-300)) + math.log(t) for t in (low, high))
+
+    def excess(x: float) -> float:
+        return math.log(max(peak(math.exp(x), chosen).value, 1e-300)) + x
+
+    above = math.log(high)
+    below = above - math.log(2)
+    at_above, at_below = excess(above), excess(below)
+    while at_below >= 0 and clock.monotonic() < until:
+        above, at_above = below, at_below
+        below -= math.log(2)
+        at_below = excess(below)
     for _ in range(ROUNDS_OF_SECANT):
         if not at_below < 0 <= at_above or above - below < 1e-11 or clock.monotonic() > until:
             return
         share = min(max(at_above / (at_above - at_below), 0.02), 0.98)
         x = above - share * (above - below)
-        here = math.log(max(peak(math.exp(x), chosen).value, 1e-300)) + x
+        here = excess(x)
         if here < 0:
             below, at_below, at_above = x, here, at_above / 2
         else:

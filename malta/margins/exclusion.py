@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from malta.margins.box import Box, smallest_t
 from malta.margins.family import Family, restrict
 from malta.margins.frequency import Expansion, cover, expand
 
 if TYPE_CHECKING:
-    from malta.margins.box import Box
     from malta.plant import ComplexArray, FloatArray
 
 GUARD = 1e-9  # rad that a half plane must have to spare
@@ -75,10 +75,7 @@ class Growth:
 
     def margin(self, p: FloatArray) -> FloatArray:
         """The smallest t with p in box(t): ... -> ..."""
-        moved = p - self.nominal
-        with np.errstate(divide="ignore", invalid="ignore"):
-            t = np.where(moved > 0, moved / self.up, np.where(moved < 0, -moved / self.down, 0))
-        return np.asarray(np.where(self.grows, t, 0).max(axis=-1, initial=0.0))
+        return smallest_t(p, self.nominal, self.down, self.up)
 
     def smallest(self, boxes: FloatArray) -> FloatArray:
         """The smallest t of any point of each box (cells x P x 2)."""

@@ -20,7 +20,7 @@ from malta.margins.dynamic import SEARCH, Blocks, check_effort, question_of
 from malta.margins.enclosure import Unproven
 from malta.margins.peaks import climb, patterns
 from malta.margins.polydisc import is_zero_free
-from malta.margins.robust import LONGEST
+from malta.margins.robust import deadline
 from malta.margins.transfer import performance
 from malta.margins.weight import weight_of
 from malta.uncertain import Compensator, UncertainSystem
@@ -101,7 +101,7 @@ def worst_case_gain(
     if asked.unstable():
         reason = "the nominal loop is unstable"
         return Gain(math.inf, None, math.nan, {}, 0, clock.monotonic() - begun, reason)
-    until = begun + (LONGEST if time is None else time)
+    until = deadline(begun, time)
 
     def value(p: FloatArray, w: FloatArray) -> FloatArray:
         return performance(asked.transfer(p, w), asked.blocks)

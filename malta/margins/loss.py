@@ -37,10 +37,8 @@ def loss_of_one(problem: Problem, box: Box, reach: float) -> float | None:
 
     def unstable(t: FloatArray) -> FloatArray:
         rows = (places[None] + t[:, None, None] * d).reshape(-1, len(d))
-        try:
-            return np.asarray((problem.instability(rows) >= 0).reshape(len(t), -1).any(axis=1))
-        except (CheckError, np.linalg.LinAlgError, NotAnalytic):
-            return np.zeros(len(t), dtype=bool)
+        bad = _instability(problem, rows, -math.inf) >= 0
+        return np.asarray(bad.reshape(len(t), -1).any(axis=1))
 
     high, low = reach, 0.0
     for steps in (np.geomspace(1e-2, 1, 15) * reach, *[np.linspace(0, 1, 6)[1:]] * 2):
@@ -80,7 +78,7 @@ def _turned(problem: Problem, box: Box, place: FloatArray, best: Loss) -> Loss:
         rows = p + np.diag(steps)[steps > 0]
         with np.errstate(all="ignore"):
             slopes = np.zeros(len(p))
-            slopes[steps > 0] = _instability(problem, rows) - _instability(problem, p[None])
+            slopes[steps > 0] = _instability(problem, rows, 0.0) - _instability(problem, p[None], 0.0)
         d = np.where(slopes > 0, box.up, -box.down)
         nearer = _along(problem, place, d, t)
         if not nearer < t * (1 - 1e-9):
@@ -102,21 +100,19 @@ def _critical(problem: Problem, p: FloatArray, place: FloatArray) -> float | Non
     return None
 
 
-def _instability(problem: Problem, rows: FloatArray) -> FloatArray:
+def _instability(problem: Problem, rows: FloatArray, unknown: float) -> FloatArray:
+    """How far the worst root is beyond the boundary; `unknown` for all rows where one of them has no loop."""
     try:
         return np.asarray(problem.instability(rows))
     except (CheckError, np.linalg.LinAlgError, NotAnalytic):
-        return np.zeros(len(rows))
+        return np.full(len(rows), unknown)
 
 
 def _along(problem: Problem, p: FloatArray, d: FloatArray, reach: float) -> float:
     """The first t of a grid up to reach at which p + t d is unstable, bisected; infinite where there is none."""
 
     def unstable(t: Sequence[float] | FloatArray) -> FloatArray:
-        try:
-            return np.asarray(problem.instability(p + np.asarray(t)[:, None] * d) >= 0)
-        except (CheckError, np.linalg.LinAlgError, NotAnalytic):
-            return np.zeros(len(t), dtype=bool)
+        return np.asarray(_instability(problem, p + np.asarray(t)[:, None] * d, -math.inf) >= 0)
 
     grid = np.unique(np.concatenate([np.geomspace(1e-3, 1, 24) * reach, np.linspace(0, reach, 41)[1:]]))
     bad = unstable(grid)

@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import time as clock
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from malta.margins.enclosure import TooWide, Unproven
 from malta.margins.exclusion import Growth
 from malta.margins.family import Family
 from malta.margins.problem import Polynomial
 
 if TYPE_CHECKING:
     from malta.plant import FloatArray
+
+
+PATCHES = 64  # parts that a box is cut into where one expansion does not do
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,7 +31,32 @@ class Part:
     growth: Growth
 
 
-def halves(sides: FloatArray, axis: int, nominal: float) -> list[FloatArray]:
+def cut(
+    sides: FloatArray,
+    nominal: FloatArray,
+    until: float,
+    made: Callable[[FloatArray], list[Any]],
+    most: int = PATCHES,
+) -> list[Any]:
+    """Parts of a box, cut where one expansion does not do, `most` of them; made: what a part of it gives.
+
+    Raises Unproven, also where time is up.
+    """
+    todo, found = [sides], list[Any]()
+    while todo:
+        own = todo.pop()
+        if clock.monotonic() > until:
+            raise Unproven("time was up before the coefficients were found")
+        try:
+            found += made(own)
+        except TooWide as error:
+            if len(todo) + len(found) >= most:
+                raise Unproven(str(error)) from error
+            todo += _halves(own, error.axis, float(nominal[error.axis]))
+    return found
+
+
+def _halves(sides: FloatArray, axis: int, nominal: float) -> list[FloatArray]:
     """A box cut across one axis, at the nominal value where that is well inside."""
     low, high = sides[axis]
     at = (

@@ -49,14 +49,19 @@ def frequencies(problem: OfLoop, p: FloatArray) -> FloatArray:
         s: ComplexArray = problem.poles(p)
     known = np.concatenate([np.abs(s), np.abs(s.imag)])
     known = known[np.isfinite(known) & (known > 0)]
-    T = problem.loop.law.sample_time
-    top = math.inf if T is None else math.pi / T
+    top = _top(problem)
     if not len(known):
         known = np.array([1.0])
     wide = np.geomspace(known.min() * ENDS[0], min(known.max() * ENDS[1], top), GRID)
     far = np.array([known.min(), known.max()]) * FAR_ENDS
     w = np.unique(np.concatenate([wide, far, (known[:, None] * AROUND).ravel()]))
-    return np.asarray(np.append(w[w < top], top) if T is not None else w)
+    return np.asarray(np.append(w[w < top], top) if math.isfinite(top) else w)
+
+
+def _top(problem: OfLoop) -> float:
+    """The highest frequency that a loop knows, rad/s."""
+    T = problem.loop.law.sample_time
+    return math.inf if T is None else math.pi / T
 
 
 def climb(
@@ -74,8 +79,7 @@ def climb(
     places.sort(key=lambda place: -place.value)
     if not math.isfinite(places[0].value):
         return places[0]
-    T = problem.loop.law.sample_time
-    top = math.inf if T is None else math.pi / T
+    top = _top(problem)
     best = places[0]
     for place in places[: min(PLACES, len(starts))]:
         if clock.monotonic() > until:

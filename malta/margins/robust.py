@@ -281,6 +281,11 @@ class Effort:
             positive(self.caller, "time", self.time, endless=True)
 
 
+def deadline(begun: float, time: float | None) -> float:
+    """When a search that began then has to end."""
+    return begun + (LONGEST if time is None else time)
+
+
 def margin_of(problem: Problem, box: Box, effort: Effort) -> Margin:
     """The margin of a problem over a box."""
     from malta.margins.search import Job
@@ -291,7 +296,7 @@ def margin_of(problem: Problem, box: Box, effort: Effort) -> Margin:
         where = dict(zip(box.names, box.standing()[unstable.argmax()].tolist(), strict=True))
         spent = clock.monotonic() - begun
         return Margin(0.0, 0.0, None, where, {}, {}, (), spent, "the nominal loop is unstable")
-    until = begun + (LONGEST if effort.time is None else effort.time)
+    until = deadline(begun, effort.time)
     job = Job(
         problem,
         box,

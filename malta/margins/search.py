@@ -14,15 +14,15 @@ import numpy as np
 from flint import arb
 
 from malta.errors import CheckError
-from malta.margins.box import Box
+from malta.margins.box import EDGE, Box
 from malta.margins.characteristic import pair
 from malta.margins.descent import from_cell, nearest
-from malta.margins.enclosure import TooWide, Unproven, over_box, precision
+from malta.margins.enclosure import Unproven, over_box, precision
 from malta.margins.exclusion import Search, advance, growth_over, start
 from malta.margins.expressions import NotAnalytic, exact
 from malta.margins.family import Family, narrowed
 from malta.margins.loss import first_loss, loss_of_one
-from malta.margins.parts import Part, halves, without_twins
+from malta.margins.parts import Part, cut, without_twins
 from malta.margins.problem import Polynomial, Problem, hurwitz
 from malta.margins.robust import Certificate, Margin, Progress
 from malta.margins.structured import Structured, rows_of
@@ -32,8 +32,6 @@ if TYPE_CHECKING:
     from malta.margins.loss import Loss
     from malta.plant import FloatArray
 
-FAR = 1e2  # search limit, in multiples of the modelled box
-EDGE = 1e-4  # distance that the search keeps from the end of what a parameter can be, relative
 FIRST = 3.97  # the first box that is searched, in multiples of the modelled one
 CHEAP = 4000  # cells below which the proof is brought closer to the witness than the tolerance
 FINEST = 3e-7  # how close, relative
@@ -48,8 +46,6 @@ SHARES = (0.6, 0.6, 0.6, 0.6, 0.4, 0.3)
 MANY = 5  # parameters from which on multipliers come before many cells
 LAST = 20.0  # s that they may take at the end where cells have proven something
 TURN, TURN_AFTER = 0.5, 4.0  # their share of the time in that turn, and how many times what was spent before
-PATCHES = 64  # parts that a box is cut into where one expansion does not do
-
 
 Searches = list[tuple[Part, Search]]
 FAMILIES: WeakKeyDictionary[Polynomial, dict[Any, Family]] = WeakKeyDictionary()
@@ -69,7 +65,7 @@ class Job:
 
     def __post_init__(self) -> None:
         self.asked, self.end, self.begun = self.tolerance, self.until, clock.monotonic()
-        self.limit = min(self.box.most * (1 - EDGE), FAR)
+        self.limit = self.box.limit
         self.stands = 0.0
         self.upper = math.inf
         self.zero: tuple[Zero, Part] | None = None
@@ -100,19 +96,7 @@ class Job:
         return without_twins(made)
 
     def _cut(self, f: Polynomial, sides: FloatArray, moves: tuple[Any, ...], last: float) -> list[Part]:
-        todo, made = [sides], []
-        while todo:
-            own = todo.pop()
-            if clock.monotonic() > last:
-                raise Unproven("time was up before the coefficients were found")
-            try:
-                made += self._part(f, own, moves, last)
-            except TooWide as error:
-                if len(todo) + len(made) >= PATCHES:
-                    raise Unproven(str(error)) from error
-                for half in halves(own, error.axis, float(self.box.nominal[error.axis])):
-                    todo.append(half)
-        return made
+        return cut(sides, self.box.nominal, last, lambda own: self._part(f, own, moves, last))
 
     def _part(self, f: Polynomial, sides: FloatArray, moves: tuple[Any, ...], last: float) -> list[Part]:
         """The part of a box that lies in the frame's part `sides`, if any."""

@@ -12,12 +12,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from numbers import Real
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from malta.errors import InputError
+from malta.margins.given import described, is_number
 
 if TYPE_CHECKING:
     from malta.plant import ComplexArray, FloatArray
@@ -111,14 +111,10 @@ def _taylor(c: ComplexArray, z: FloatArray, slope: ComplexArray, bent: FloatArra
 def weight_of(weight: Any, where: str) -> Weight:
     """W as a record. Raises InputError for what is neither a positive number nor a stable, proper W(s)."""
     expected = "a number above zero, or a transfer function"
-    if isinstance(weight, (Real, np.generic)) and not isinstance(weight, (bool, np.bool_)):
-        try:
-            value = float(weight)
-        except (OverflowError, TypeError):
-            value = math.inf
-        if not 0 < value < math.inf:
-            raise InputError(where, "weight", f"{value}", expected)
-        return Weight(np.array([value]), np.ones(1))
+    if is_number(weight):
+        if not float(weight) > 0:
+            raise InputError(where, "weight", described(weight), expected)
+        return Weight(np.array([float(weight)]), np.ones(1))
     if type(weight).__name__ == "StateSpace":
         weight = _transfer_function(weight)
     try:
@@ -127,7 +123,7 @@ def weight_of(weight: Any, where: str) -> Weight:
         with np.errstate(all="ignore"):
             stable, continuous = bool((weight.poles().real < 0).all()), not weight.dt
     except (AttributeError, TypeError, ValueError, IndexError, np.linalg.LinAlgError):
-        raise InputError(where, "weight", type(weight).__name__, expected) from None
+        raise InputError(where, "weight", described(weight), expected) from None
     if not single:
         raise InputError(where, "weight", "several inputs or outputs", "one of each")
     num, den = np.trim_zeros(num, "f"), np.trim_zeros(den, "f")
