@@ -13,7 +13,7 @@ from timing import Result, medians, optional
 
 import malta
 from malta.margins.robust import problem_of
-from malta.verify import machine_law, travel_margin
+from malta.margins.verify import machine_law, travel_margin
 
 ROOT = Path(__file__).parents[1]
 SAMPLES, BATCH = 10_000, 100

@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from peer_problem import MECHANICAL, NO_SPIN, Stated, Workload, packed, problem, stated
 
-from malta.noise import keys
+from malta.simulation.noise import keys
 
 if TYPE_CHECKING:
-    from malta.plant import FloatArray
+    from malta.model.plant import FloatArray
 
 SOURCES = Path(__file__).parent / "peers"
 GCC = shutil.which("gcc")

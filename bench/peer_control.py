@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING, Any
 import control
 import numpy as np
 
-from malta.controller import Controller
-from malta.plants.tubular import Parameters
+from malta.machines.tubular.plant import Parameters
+from malta.synthesis.controller import Controller
 
 if TYPE_CHECKING:
-    from malta.plant import FloatArray
+    from malta.model.plant import FloatArray
 
 SUBSTEPS = 4
 

@@ -11,15 +11,15 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from scipy.special import erf
 
-from malta.noise import keys, normals
-from malta.plants.halbach import MEAN_OF, Parameters, current_loop
+from malta.machines.halbach.plant import MEAN_OF, Parameters, current_loop
+from malta.simulation.noise import keys, normals
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from malta.controller import Controller
-    from malta.plant import Plant
-    from malta.simulate import Scenario
+    from malta.model.plant import Plant
+    from malta.simulation.simulate import Scenario
+    from malta.synthesis.controller import Controller
 
 PHASES = (0.0, 2 * math.pi / 3, -2 * math.pi / 3)
 TURNED = [(math.cos(p), math.sin(p)) for p in PHASES]

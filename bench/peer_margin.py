@@ -17,10 +17,15 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from malta.uncertain import Compensator, UncertainSystem, instability, responses
+from malta.margins.uncertain import (
+    Compensator,
+    UncertainSystem,
+    instability,
+    responses,
+)
 
 if TYPE_CHECKING:
-    from malta.plant import ComplexArray, FloatArray
+    from malta.model.plant import ComplexArray, FloatArray
 
 Lost = Callable[["FloatArray"], np.ndarray]  # which rows are unstable; deviations in multiples of the box
 SHARE = 0.2

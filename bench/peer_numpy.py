@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from peer_problem import Machine, Problem, Workload, problem
 
-from malta.controller import Controller
+from malta.synthesis.controller import Controller
 
 if TYPE_CHECKING:
-    from malta.plant import FloatArray
+    from malta.model.plant import FloatArray
 
 PART = 5000  # machines, at most
 

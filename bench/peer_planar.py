@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from malta.plants.planar import Parameters, Table
+from malta.machines.planar.plant import Parameters, Table
 
 if TYPE_CHECKING:
-    from malta.plant import FloatArray
+    from malta.model.plant import FloatArray
 
 ODD = np.array([[1, 0, 0, 0, 1, 1], [0, 1, 0, 1, 0, 1]])  # F_x F_y F_z T_x T_y T_z, about x and about y
 

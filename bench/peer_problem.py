@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from malta.controller import Controller
-from malta.engine import feedforward_table
-from malta.plants.tubular import Parameters
+from malta.machines.tubular.plant import Parameters
+from malta.simulation.engines import feedforward_table
+from malta.synthesis.controller import Controller
 
 if TYPE_CHECKING:
-    from malta.plant import FloatArray
+    from malta.model.plant import FloatArray
 
 NO_SPIN = 0.0  # rad/s
 MECHANICAL = [0, 1, 2, 3, 4, 6, 7, 8, 9, 10]  # of the twelve states: all but gamma's

@@ -17,10 +17,10 @@ from published_cases import Loop, Polynomial
 
 import malta
 from malta.margins.robust import law_of
-from malta.uncertain import instability
+from malta.margins.uncertain import instability
 
 if TYPE_CHECKING:
-    from malta.plant import ComplexArray, FloatArray
+    from malta.model.plant import ComplexArray, FloatArray
 
 MOST = 16.0  # boxes that are looked at
 FREQUENCIES = np.geomspace(1e-2, 1e4, 300)  # rad/s

@@ -33,12 +33,13 @@ from rich.table import Table
 from timing import Result, medians, optional
 
 import malta
-from malta.data import published_value
-from malta.experiments.halbach import there_and_back
-from malta.experiments.planar import CELLS, compiled
-from malta.machine import state_reference
-from malta.plants import planar, tubular
-from malta.simulate import compiled_shape, engine_of, feedforward
+from malta.machines.halbach.experiments import there_and_back
+from malta.machines.planar import plant as planar
+from malta.machines.planar.experiments import CELLS, compiled
+from malta.machines.tubular import plant as tubular
+from malta.model.data import published_value
+from malta.simulation.period import state_reference
+from malta.simulation.simulate import compiled_shape, engine_of, feedforward
 
 ROOT = Path(__file__).parents[1]
 IMPORTS = "import numpy, scipy, control, casadi"
@@ -49,7 +50,7 @@ SCENARIO = malta.Scenario.stroke(delay=0, fidelity="force")
 def whole_process(runs: int) -> list[Result]:
     """`malta design design/table2.toml` against a process that only imports what it needs."""
     with tempfile.TemporaryDirectory() as scratch:
-        command = [sys.executable, "-m", "malta.cli", "design", "design/table2.toml"]
+        command = [sys.executable, "-m", "malta.cli.main", "design", "design/table2.toml"]
         command += ["--out", scratch, "--figures", scratch]
 
         def process(arguments: list[str]) -> Callable[[], object]:

@@ -15,7 +15,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import malta
-from malta.plants import tubular
+from malta.machines.tubular import plant as tubular
 
 # The project's root, wherever Jupyter was started.
 os.chdir(next(p for p in (Path.cwd(), *Path.cwd().parents) if (p / "design").is_dir()))

@@ -15,8 +15,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import malta
-from malta.plants import halbach
-from malta.synthesize import sampled_model
+from malta.machines.halbach import plant as halbach
+from malta.synthesis.lqg import sampled_model
 
 # The project's root, wherever Jupyter was started.
 os.chdir(next(p for p in (Path.cwd(), *Path.cwd().parents) if (p / "design").is_dir()))

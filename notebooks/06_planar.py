@@ -17,7 +17,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import malta
-from malta.plants import planar, planar_field
+from malta.machines.planar import field as planar_field
+from malta.machines.planar import plant as planar
 
 # The project's root, wherever Jupyter was started.
 os.chdir(next(p for p in (Path.cwd(), *Path.cwd().parents) if (p / "design").is_dir()))

@@ -20,7 +20,7 @@ from matplotlib.patches import Circle, Rectangle
 from scipy.spatial import ConvexHull
 
 import malta
-from malta.riccati import care
+from malta.synthesis.riccati import care
 
 # The project's root, wherever Jupyter was started.
 os.chdir(next(p for p in (Path.cwd(), *Path.cwd().parents) if (p / "design").is_dir()))

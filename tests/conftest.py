@@ -13,19 +13,19 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import pytest
 
 import malta
-from malta import cli
-from malta.data import published as read_published
+from malta.cli import main as cli
+from malta.machines.tubular import plant as tubular
 from malta.margins import robust
 from malta.margins.problem import OfLoop, OfSeveral, Problem
-from malta.plants import tubular
+from malta.model.data import published as read_published
 
 if TYPE_CHECKING:
-    from malta.controller import Controller
-    from malta.linearize import LinearModel
     from malta.margins.box import Box
-    from malta.plant import Plant
-    from malta.spec import Spec
-    from malta.verify import Margins
+    from malta.margins.verify import Margins
+    from malta.model.linearize import LinearModel
+    from malta.model.plant import Plant
+    from malta.synthesis.controller import Controller
+    from malta.synthesis.spec import Spec
 
 ROOT = Path(__file__).parents[1]
 DESIGNS = ("table2", "calibrated")

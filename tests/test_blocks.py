@@ -16,7 +16,12 @@ import malta
 from malta import Dynamic
 from malta.errors import InputError
 from malta.margins.blocks import Block, probe
-from malta.margins.transfer import mu_bound, performance, responses, transfer
+from malta.margins.transfer import (
+    mu_bound,
+    performance,
+    responses,
+    transfer,
+)
 from malta.margins.weight import weight_of
 
 ONE = weight_of(1.0, "")
@@ -184,8 +189,8 @@ def test_compliance_and_effort_of_a_mass_in_closed_form() -> None:
 def test_compliance_of_the_flagship_in_its_travel() -> None:
     """Axial compliance of the sampled loop, by frequency responses of 60 machines."""
     from malta import gains
-    from malta.data import plant_of
-    from malta.verify import travel_loops
+    from malta.margins.verify import travel_loops
+    from malta.model.data import plant_of
 
     c = gains.read("design/gains/robust.json")
     plant = plant_of(c.parameters)

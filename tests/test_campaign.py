@@ -25,23 +25,42 @@ from hypothesis import strategies as st
 
 import malta
 from malta import campaign as function
-from malta import engine, figures, report
-from malta.campaign import SLOW_BLOCK, Campaign, Plan, campaign, read_plan, replay
-from malta.experiments import cases_of
-from malta.experiments.tubular import CASES, EXPERIMENTS
-from malta.findings import figures_of, kept, rate, worst_of
-from malta.folder import MANIFEST, block_name
-from malta.many import Batch, verdicts
-from malta.plan import SAMPLERS, box_of, drawn, wanted_of
-from malta.simulate import compiled_shape, engine_of
+from malta import report
+from malta.campaigns.campaign import (
+    SLOW_BLOCK,
+    Campaign,
+    Plan,
+    campaign,
+    read_plan,
+    replay,
+)
+from malta.campaigns.plan import (
+    SAMPLERS,
+    box_of,
+    drawn,
+    wanted_of,
+)
+from malta.campaigns.statistics import (
+    figures_of,
+    kept,
+    rate,
+    worst_of,
+)
+from malta.campaigns.store import MANIFEST, block_name
+from malta.machines.tubular.experiments import CASES, EXPERIMENTS
+from malta.report import figures
+from malta.simulation import engines as engine
+from malta.simulation.batch import Batch, verdicts
+from malta.simulation.experiments import cases_of
+from malta.simulation.simulate import compiled_shape, engine_of
 
 if TYPE_CHECKING:
     from conftest import Design
 
-    from malta.controller import Controller
+    from malta.synthesis.controller import Controller
 
 pytestmark = pytest.mark.usefixtures("proven_once")
-MODULE: Any = sys.modules["malta.campaign"]  # `malta.campaign` is the function
+MODULE: Any = sys.modules["malta.campaigns.campaign"]  # `malta.campaign` is the function
 BOX = {"m": 0.2, "K_A": 0.2, "K_D": 0.2, "K_B": 0.2}
 SHORT: dict[str, Any] = {"fidelity": "force", "duration": 0.02, "rise": 3e-3}
 SIZES = (8, 24, 1024)  # runs in a block

@@ -15,7 +15,7 @@ import pytest
 from conftest import Run
 from typer.testing import CliRunner
 
-from malta import cli
+from malta.cli import main as cli
 
 pytestmark = pytest.mark.usefixtures("proven_once")
 
@@ -27,7 +27,7 @@ QUICK = ("--fidelity", "force", "--rise", "3")
 @pytest.fixture
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without figures, which take longer than so few runs."""
-    monkeypatch.setattr("malta.report.campaign", lambda *_: [])
+    monkeypatch.setattr("malta.report.pages.campaign", lambda *_: [])
 
 
 def _sentence(err: str) -> str:
@@ -239,7 +239,7 @@ def test_what_is_no_run_of_a_campaign_is_one_sentence(run: Run, tmp_path: Path) 
 
 
 # As from a terminal, where Ctrl-C is not ignored.
-START = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); from malta.cli import main; main()"
+START = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); from malta.cli.main import main; main()"
 
 
 def _malta(*arguments: str | Path) -> subprocess.Popen[str]:
@@ -295,8 +295,8 @@ def test_ctrl_c_keeps_and_shows_what_is_done(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("undrawn")
 def test_without_a_compiler_it_says_so(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from malta import engine
-    from malta.simulate import compiled_shape, engine_of
+    from malta.simulation import engines as engine
+    from malta.simulation.simulate import compiled_shape, engine_of
 
     monkeypatch.setattr(engine, "compiler", lambda: None)
     for memory in (compiled_shape, engine_of):

@@ -21,8 +21,8 @@ from malta.errors import InputError
 from malta.margins import certificate, checked_file
 from malta.margins.check import check, tiled
 from malta.margins.checked_loop import determinant_bounds
-from malta.uncertain import Compensator
-from malta.verify import travel_loops, travel_margin
+from malta.margins.uncertain import Compensator
+from malta.margins.verify import travel_loops, travel_margin
 
 pytestmark = pytest.mark.usefixtures("proven_once")
 
@@ -346,14 +346,14 @@ def test_ctrl_c_prints_what_stands(run: Run, monkeypatch: pytest.MonkeyPatch) ->
         bounds(1.5, 1.75)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("malta.chain.robustness", interrupted)
+    monkeypatch.setattr("malta.margins.stages.robustness", interrupted)
     code, out, err = run("verify", str(HALBACH))
     assert (code, out) == (130, "")
     assert err == "malta: interrupted; proven 150.00 %, lost at 175.00 %\n"
 
 
 def test_a_long_proof_says_where_it_is(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("malta.cli.PATIENCE", 0.0)
+    monkeypatch.setattr("malta.cli.main.PATIENCE", 0.0)
     _, _, err = run("verify", str(HALBACH), "--uncertain", "b=20%")
     assert re.match(r"malta: margins: proven \d+\.\d\d %, lost at ", err)
 

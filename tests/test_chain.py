@@ -17,7 +17,11 @@ from typer.testing import CliRunner
 
 import malta
 from malta import gains
-from malta.chain import (
+from malta.cli.main import app, main
+from malta.errors import InputError
+from malta.margins.gain import Gain
+from malta.margins.robust import robust_margin
+from malta.margins.stages import (
     SAMPLED,
     Robustness,
     _balanced,
@@ -27,15 +31,17 @@ from malta.chain import (
     disk_margin,
     robustness,
 )
-from malta.cli import app, main
-from malta.data import plant_of
-from malta.errors import InputError
-from malta.margin_figures import chain_figure
-from malta.margins.gain import Gain
-from malta.margins.robust import robust_margin
 from malta.margins.systems import uncertain
-from malta.uncertain import Compensator, UncertainSystem, closed_loop, instability, responses
-from malta.verify import machine_law
+from malta.margins.uncertain import (
+    Compensator,
+    UncertainSystem,
+    closed_loop,
+    instability,
+    responses,
+)
+from malta.margins.verify import machine_law
+from malta.model.data import plant_of
+from malta.report.figures.margins import chain_figure
 
 if TYPE_CHECKING:
     from pathlib import Path

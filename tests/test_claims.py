@@ -16,17 +16,19 @@ from hypothesis import strategies as st
 from scipy.linalg import expm
 
 import malta
-from malta import claims, references
-from malta.claims import Claim, Ledger, Row, tubular
-from malta.claims.tubular import Evidence
-from malta.data import in_unit, plant_of, published_value
-from malta.simulate import Scenario, simulate
-from malta.verify import machine_loop
+from malta import references
+from malta.machines.tubular import claims as tubular
+from malta.machines.tubular.claims import Evidence
+from malta.margins.verify import machine_loop
+from malta.model.data import in_unit, plant_of, published_value
+from malta.report import ledger as claims
+from malta.report.ledger import Claim, Ledger, Row
+from malta.simulation.simulate import Scenario, simulate
 
 if TYPE_CHECKING:
     from conftest import Design
 
-    from malta.plants.tubular import Parameters
+    from malta.machines.tubular.plant import Parameters
 
 pytestmark = pytest.mark.usefixtures("proven_once")
 

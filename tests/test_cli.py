@@ -18,7 +18,8 @@ import pytest
 from conftest import Run, numbers
 from typer.testing import CliRunner
 
-from malta import cli, gains
+from malta import gains
+from malta.cli import main as cli
 
 pytestmark = pytest.mark.usefixtures("proven_once")
 
@@ -111,9 +112,9 @@ def test_help_names_commands_and_exit_codes() -> None:
 def test_help_imports_nothing_heavy(arguments: list[str]) -> None:
     program = f"""
 import sys
-import malta.cli
+from malta.cli.main import main
 try:
-    malta.cli.main()
+    main()
 except SystemExit as ended:
     print("exit", ended.code, "loaded", *sorted(set(sys.modules) & set({HEAVY})))
 """
@@ -530,7 +531,7 @@ def test_options_of_the_stroke_are_taken(run: Run) -> None:
 
 
 def test_the_scenarios_of_the_machine_are_listed(run: Run) -> None:
-    from malta.experiments.tubular import CASES, EXPERIMENTS
+    from malta.machines.tubular.experiments import CASES, EXPERIMENTS
 
     for command, names in (("simulate", EXPERIMENTS), ("campaign", CASES)):
         code, out, err = run(command, CALIBRATED, "--scenario", "help")
@@ -598,10 +599,10 @@ def test_the_number_of_substeps_comes_with_an_error(run: Run) -> None:
 
 
 def test_without_a_compiler_it_says_so(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    import malta.engine
-    from malta.simulate import compiled_shape, engine_of
+    from malta.simulation import engines
+    from malta.simulation.simulate import compiled_shape, engine_of
 
-    monkeypatch.setattr(malta.engine, "compiler", lambda: None)
+    monkeypatch.setattr(engines, "compiler", lambda: None)
     for cached in (compiled_shape, engine_of):
         cached.cache_clear()
     code, out, err = run("simulate", CALIBRATED)
@@ -615,7 +616,7 @@ def test_without_a_compiler_it_says_so(run: Run, monkeypatch: pytest.MonkeyPatch
 
 
 def test_ctrl_c_leaves_what_was_computed(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    module = sys.modules["malta.simulate"]
+    module = sys.modules["malta.simulation.simulate"]
     looked = 0
     judged = module._judged
 
@@ -801,7 +802,7 @@ def test_wrong_usage_names_the_option(run: Run, arguments: str, named: str) -> N
     ],
 )
 def test_program_ends_with_the_exit_code(arguments: list[str], code: int, lines: int) -> None:
-    program = [sys.executable, "-c", "from malta.cli import main; main()", *arguments]
+    program = [sys.executable, "-c", "from malta.cli.main import main; main()", *arguments]
     done = subprocess.run(program, capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == code
     assert len(done.stderr.splitlines()) == lines
@@ -811,7 +812,7 @@ def test_program_ends_with_the_exit_code(arguments: list[str], code: int, lines:
 @pytest.mark.slow
 def test_terminal_without_greek_letters_shows_the_page(tmp_path: Path) -> None:
     file = project(tmp_path, (SUMMARY, f"{SUMMARY}weights α and Σ, "))
-    command = [sys.executable, "-W", "error", "-c", "from malta.cli import main; main()", "design", str(file)]
+    command = [sys.executable, "-W", "error", "-c", "from malta.cli.main import main; main()", "design", str(file)]
     environment = os.environ | {"PYTHONIOENCODING": "ascii"}
     done = subprocess.run(
         command, cwd=tmp_path, env=environment, capture_output=True, timeout=60, check=False

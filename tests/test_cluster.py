@@ -18,10 +18,16 @@ import numpy as np
 import pytest
 
 import malta
-from malta import cluster
-from malta.campaign import Plan, campaign, fly
-from malta.cluster import _at_worker, _finished, _result, _Task, blocks
-from malta.many import Batch
+from malta.campaigns import dask as cluster
+from malta.campaigns.campaign import Plan, campaign, fly
+from malta.campaigns.dask import (
+    _at_worker,
+    _finished,
+    _result,
+    _Task,
+    blocks,
+)
+from malta.simulation.batch import Batch
 
 if TYPE_CHECKING:
     from conftest import Design
@@ -74,7 +80,7 @@ def loopback(tmp_path: Path) -> Iterator[Loopback]:
 
 def _malta(folder: Path, samples: int, *options: str) -> subprocess.Popen[str]:
     box = ("--fidelity", "force", "--spread", "20%", "--sensor", "gain_x1=2%", "--quantize")
-    command = [sys.executable, "-m", "malta.cli", "campaign", GAINS, "--samples", str(samples), *box]
+    command = [sys.executable, "-m", "malta.cli.main", "campaign", GAINS, "--samples", str(samples), *box]
     command += ["--out", str(folder), *options]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
@@ -177,7 +183,7 @@ def test_what_a_worker_refuses_comes_back_as_a_sentence(plan: Plan, monkeypatch:
     def none(*_: Any, **__: Any) -> Any:
         raise malta.InputError("campaign", "m", "lead", "iron")
 
-    monkeypatch.setattr(sys.modules["malta.campaign"], "fly", none)
+    monkeypatch.setattr(sys.modules["malta.campaigns.campaign"], "fly", none)
     refused = _at_worker(_Task(plan.identity, malta_version(), plan), 0, 8)
     with pytest.raises(malta.InputError, match="campaign: m: found lead, expected iron"):
         _result(NOBODY, _future(refused))

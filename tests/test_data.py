@@ -13,9 +13,9 @@ import pytest
 from conftest import refusal
 
 import malta
-from malta.data import load_toml, to_si, units_of
-from malta.data import published as read_published
-from malta.plants import tubular
+from malta.machines.tubular import plant as tubular
+from malta.model.data import load_toml, to_si, units_of
+from malta.model.data import published as read_published
 
 if TYPE_CHECKING:
     pass

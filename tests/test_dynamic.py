@@ -11,10 +11,10 @@ from published_cases import ROBSTAB, Loop, pid
 
 import malta
 from malta import Dynamic, dynamic_margin, gains
-from malta.data import plant_of
 from malta.errors import InputError
-from malta.uncertain import responses
-from malta.verify import travel_loops
+from malta.margins.uncertain import responses
+from malta.margins.verify import travel_loops
+from malta.model.data import plant_of
 
 
 def robstab() -> malta.UncertainSystem:

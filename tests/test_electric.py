@@ -16,13 +16,23 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 import malta
-from malta import electric
-from malta.electric import AXES, K_L, K_R, TURN, WEIGHT, K_L_inverse, K_R_inverse, to_axes, to_phases
-from malta.synthesize import pi_current_loop
+from malta.model import electric
+from malta.model.electric import (
+    AXES,
+    K_L,
+    K_R,
+    TURN,
+    WEIGHT,
+    K_L_inverse,
+    K_R_inverse,
+    to_axes,
+    to_phases,
+)
+from malta.synthesis.lqg import pi_current_loop
 
 if TYPE_CHECKING:
-    from malta.plant import FloatArray, Plant
-    from malta.plants import tubular
+    from malta.machines.tubular import plant as tubular
+    from malta.model.plant import FloatArray, Plant
 
 ANGLE = st.floats(-20, 20)
 NINE = st.lists(st.floats(-10, 10), min_size=9, max_size=9)

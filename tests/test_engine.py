@@ -19,15 +19,24 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import malta
-from malta import engine, references
-from malta.engine import LANES
-from malta.machine import FIDELITIES, Fidelity, Parts
-from malta.simulate import SERIES, Fault, Scenario, compiled_shape, engine_of, setup_of, shape_of
+from malta import references
+from malta.simulation import engines as engine
+from malta.simulation.engines import LANES
+from malta.simulation.period import FIDELITIES, Fidelity, Parts
+from malta.simulation.simulate import (
+    SERIES,
+    Fault,
+    Scenario,
+    compiled_shape,
+    engine_of,
+    setup_of,
+    shape_of,
+)
 
 if TYPE_CHECKING:
     from conftest import Design
 
-    from malta.plant import FloatArray
+    from malta.model.plant import FloatArray
 
 STATES, GIVEN, THETA = 3, 3, 2  # of the engine that expressions are tried in
 SIXTYFOURTHS = st.integers(-512, 512).map(
@@ -777,7 +786,7 @@ def test_a_library_that_was_cut_short_is_not_run(
     (folder / sound.name).write_bytes(whole[: int(share * len(whole))])
     (tmp_path / "text.c").write_text(text, encoding="utf-8")
     loading = (
-        "from pathlib import Path; from malta.engine import library; import sys\n"
+        "from pathlib import Path; from malta.simulation.engines import library; import sys\n"
         "assert library(Path(sys.argv[1]).read_text(encoding='utf-8'), 1, Path(sys.argv[2])) is not None"
     )
     ended = subprocess.run(
@@ -864,7 +873,7 @@ def test_two_processes_may_compile_at_once(small: tuple[Parts, str], fresh: Path
     slow.chmod(0o755)
     (tmp_path / "text.c").write_text(small[1], encoding="utf-8")
     compiling = (
-        "from pathlib import Path; from malta.engine import library; import sys\n"
+        "from pathlib import Path; from malta.simulation.engines import library; import sys\n"
         "assert library(Path(sys.argv[1]).read_text(encoding='utf-8'), 1) is not None"
     )
     environment = os.environ | {"CC": str(slow)}

@@ -11,15 +11,21 @@ import pytest
 
 import malta
 from malta import references
-from malta.riccati import dare
-from malta.simulate import ESTIMATORS, Estimator, Fault, Scenario, Trajectory
+from malta.simulation.simulate import (
+    ESTIMATORS,
+    Estimator,
+    Fault,
+    Scenario,
+    Trajectory,
+)
+from malta.synthesis.riccati import dare
 
 if TYPE_CHECKING:
     from conftest import Design
 
-    from malta.controller import Controller
-    from malta.plant import FloatArray
-    from malta.plants import tubular
+    from malta.machines.tubular import plant as tubular
+    from malta.model.plant import FloatArray
+    from malta.synthesis.controller import Controller
 
 Ts = 50e-6
 # Equal to the compiled engine (test_engine.py), and no compilation for a single run.

@@ -17,19 +17,33 @@ from scipy.linalg import expm
 
 import malta
 from malta import references
-from malta.data import plant_of, published_value
-from malta.experiments import Case, Experiment, Merit, experiment, tubular
-from malta.experiments.responses import compliance
-from malta.experiments.tubular import EXPERIMENTS
-from malta.simulate import ESTIMATORS, RISE, Fault, Scenario, Trajectory, Verdict, simulate
-from malta.synthesize import lqr
-from malta.verify import loop, machine_loop
+from malta.machines.tubular import experiments as tubular
+from malta.machines.tubular.experiments import EXPERIMENTS
+from malta.margins.verify import loop, machine_loop
+from malta.model.data import plant_of, published_value
+from malta.simulation.experiments import (
+    Case,
+    Experiment,
+    Merit,
+    experiment,
+)
+from malta.simulation.responses import compliance
+from malta.simulation.simulate import (
+    ESTIMATORS,
+    RISE,
+    Fault,
+    Scenario,
+    Trajectory,
+    Verdict,
+    simulate,
+)
+from malta.synthesis.lqg import lqr
 
 if TYPE_CHECKING:
     from conftest import Design
 
-    from malta.linearize import LinearModel
-    from malta.plant import FloatArray, Plant
+    from malta.model.linearize import LinearModel
+    from malta.model.plant import FloatArray, Plant
 
 Flown = Callable[..., Experiment]
 QUIET: dict[str, Any] = {"noise": 0.0, "quantize": False, "sensor_errors": None}
@@ -1010,7 +1024,7 @@ class _Stop:
 def test_ctrl_c_keeps_what_was_computed(
     designs: dict[str, Design], flown: Flown, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sys.modules["malta.simulate"], "PORTION", 1000)  # samples between looks
+    monkeypatch.setattr(sys.modules["malta.simulation.simulate"], "PORTION", 1000)  # samples between looks
     design = designs["calibrated"]
     for name, share, cases, samples in (
         ("hold", 0.45, 1, 4000),  # 8000 samples, stopped at the first look after 45 %

@@ -23,16 +23,16 @@ from scipy.integrate import simpson, solve_ivp
 from scipy.optimize import fsolve
 
 import malta
-from malta import fastest
-from malta.fastest import FastestStroke, fastest_stroke, sigmoid_at_peak_current
-from malta.plant import trims
-from malta.plants import tubular
-from malta.synthesize import static_feedforward
+from malta.machines.tubular import plant as tubular
+from malta.model.plant import trims
+from malta.simulation import time_optimal as fastest
+from malta.simulation.time_optimal import FastestStroke, fastest_stroke, sigmoid_at_peak_current
+from malta.synthesis.lqg import static_feedforward
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from malta.plant import FloatArray, Plant
+    from malta.model.plant import FloatArray, Plant
 
 DISTANCE = 10e-3  # m
 

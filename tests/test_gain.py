@@ -13,11 +13,11 @@ from hypothesis import strategies as st
 
 import malta
 from malta import gains
-from malta.data import plant_of
 from malta.errors import InputError
 from malta.margins.family import aligned, combined, family
-from malta.uncertain import responses
-from malta.verify import travel_loops
+from malta.margins.uncertain import responses
+from malta.margins.verify import travel_loops
+from malta.model.data import plant_of
 
 
 def first_order(k: float = 1.0) -> malta.UncertainSystem:

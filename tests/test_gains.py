@@ -23,15 +23,16 @@ from hypothesis import strategies as st
 from scipy.io import loadmat, savemat
 
 import malta
-from malta import encodings, gains
-from malta.plant import Signal
+from malta import gains
+from malta.gains import encodings
+from malta.model.plant import Signal
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from conftest import Design
 
-    from malta.controller import Controller
+    from malta.synthesis.controller import Controller
 
     Edit = Callable[[dict[str, Any]], object]
 

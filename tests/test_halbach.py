@@ -14,13 +14,13 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
 import malta
-from malta.data import published_value
-from malta.plants import halbach
-from malta.plants.halbach import Parameters
-from malta.synthesize import sampled_model
+from malta.machines.halbach import plant as halbach
+from malta.machines.halbach.plant import Parameters
+from malta.model.data import published_value
+from malta.synthesis.lqg import sampled_model
 
 if TYPE_CHECKING:
-    from malta.plant import FloatArray
+    from malta.model.plant import FloatArray
 
 F_Z = 5.0  # N, of all figures of the paper's Section 5
 CURRENT = st.floats(-5, 5)

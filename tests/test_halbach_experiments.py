@@ -21,23 +21,30 @@ from conftest import ROOT, Run
 from scipy.linalg import solve_discrete_lyapunov
 
 import malta
-from malta.claims import halbach as claims
-from malta.claims import ledger
-from malta.controller import Controller, linear_law
-from malta.data import published_value
-from malta.engine import compiler
-from malta.experiments import cases_of, experiment
-from malta.experiments.halbach import FAULTS, LAWS, lift_of, move, places, there_and_back
-from malta.plant import Plant
-from malta.plants import halbach
-from malta.plants.halbach import IDEAL, Options, Parameters
-from malta.riccati import sample_noise
-from malta.simulate import Scenario, simulate
-from malta.synthesize import sampled_model
+from malta.machines.halbach import claims as claims
+from malta.machines.halbach import plant as halbach
+from malta.machines.halbach.experiments import (
+    FAULTS,
+    LAWS,
+    lift_of,
+    move,
+    places,
+    there_and_back,
+)
+from malta.machines.halbach.plant import IDEAL, Options, Parameters
+from malta.model.data import published_value
+from malta.model.plant import Plant
+from malta.report.ledger import ledger
+from malta.simulation.engines import compiler
+from malta.simulation.experiments import cases_of, experiment
+from malta.simulation.simulate import Scenario, simulate
+from malta.synthesis.controller import Controller, linear_law
+from malta.synthesis.lqg import sampled_model
+from malta.synthesis.riccati import sample_noise
 
 if TYPE_CHECKING:
-    from malta.experiments import Experiment
-    from malta.plant import FloatArray
+    from malta.model.plant import FloatArray
+    from malta.simulation.experiments import Experiment
 
 pytestmark = pytest.mark.usefixtures("proven_once")
 

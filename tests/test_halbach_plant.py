@@ -13,13 +13,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import malta
-from malta.data import shaping
-from malta.plant import Electronics, Plant, symbolic
-from malta.plants import halbach
-from malta.plants.halbach import IDEAL, REAL, Options, Parameters
+from malta.machines.halbach import plant as halbach
+from malta.machines.halbach.plant import (
+    IDEAL,
+    REAL,
+    Options,
+    Parameters,
+)
+from malta.model.data import shaping
+from malta.model.plant import Electronics, Plant, symbolic
 
 if TYPE_CHECKING:
-    from malta.plant import FloatArray
+    from malta.model.plant import FloatArray
 
 State = dict[str, Any]
 PLACE = st.floats(-50e-3, 50e-3)

@@ -14,18 +14,36 @@ from scipy import linalg
 
 import malta
 from malta import gains
-from malta.controller import Controller, linear_law
-from malta.data import plant_of
-from malta.linearize import LinearModel
 from malta.margins.systems import uncertain
-from malta.plant import Plant
-from malta.references import Motion
-from malta.riccati import sample
-from malta.simulate import Scenario, simulate
-from malta.spec import Pid, Weights
-from malta.synthesize import held, lqg, pid, sampled_model
-from malta.uncertain import UncertainSystem, closed_loop, responses, sampled_law
-from malta.verify import loop, machine_loop, machine_system, own_poles, travel_margin, unstable_gain, verify
+from malta.margins.uncertain import (
+    UncertainSystem,
+    closed_loop,
+    responses,
+    sampled_law,
+)
+from malta.margins.verify import (
+    loop,
+    machine_loop,
+    machine_system,
+    own_poles,
+    travel_margin,
+    unstable_gain,
+    verify,
+)
+from malta.model.data import plant_of
+from malta.model.linearize import LinearModel
+from malta.model.plant import Plant
+from malta.simulation.references import Motion
+from malta.simulation.simulate import Scenario, simulate
+from malta.synthesis.controller import Controller, linear_law
+from malta.synthesis.lqg import (
+    held,
+    lqg,
+    pid,
+    sampled_model,
+)
+from malta.synthesis.riccati import sample
+from malta.synthesis.spec import Pid, Weights
 
 ROOT = Path(__file__).parent.parent
 
@@ -581,7 +599,7 @@ def test_a_gain_file_with_two_kinds_of_integrals_is_refused(tmp_path: Path) -> N
 def test_a_machine_that_cannot_be_controlled_is_refused_by_its_file(tmp_path: Path) -> None:
     import json
 
-    from malta.encodings import content_sha256
+    from malta.gains.encodings import content_sha256
 
     c, model = _controller("planar", 1), _model("planar")
     path = tmp_path / "pitch.json"

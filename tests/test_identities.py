@@ -11,14 +11,14 @@ import pytest
 from filterpy.kalman import KalmanFilter
 
 import malta
-from malta.controller import law, linear_law
-from malta.riccati import eigenvalues, sample, sample_noise
-from malta.verify import loop, own_poles
+from malta.margins.verify import loop, own_poles
+from malta.synthesis.controller import law, linear_law
+from malta.synthesis.riccati import eigenvalues, sample, sample_noise
 
 if TYPE_CHECKING:
     from conftest import Design
 
-    from malta.spec import Discretization
+    from malta.synthesis.spec import Discretization
 
 WAYS: list[tuple[Discretization, int]] = [
     ("backward-euler", 0),

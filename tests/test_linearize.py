@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 import malta
-from malta.plant import OperatingPoint
-from malta.plants import tubular
+from malta.machines.tubular import plant as tubular
+from malta.model.plant import OperatingPoint
 
 if TYPE_CHECKING:
-    from malta.linearize import LinearModel
-    from malta.plant import FloatArray, Plant
+    from malta.model.linearize import LinearModel
+    from malta.model.plant import FloatArray, Plant
 
 STROKE = [-15e-3, -7.3e-3, 0.0, 5e-3, 15e-3]  # m
 Q = ("x", "y", "z", "alpha", "beta")

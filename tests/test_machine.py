@@ -14,16 +14,27 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import malta
-from malta import electric, machine, references
-from malta.plants import tubular
-from malta.references import Motion
-from malta.simulate import Correction, Fault, Scenario, beginning, engine_of, sampled, setup_of, steps_of
+from malta import references
+from malta.machines.tubular import plant as tubular
+from malta.model import electric
+from malta.simulation import period as machine
+from malta.simulation.references import Motion
+from malta.simulation.simulate import (
+    Correction,
+    Fault,
+    Scenario,
+    beginning,
+    engine_of,
+    sampled,
+    setup_of,
+    steps_of,
+)
 
 if TYPE_CHECKING:
     from conftest import Design
 
-    from malta.controller import Controller
-    from malta.plant import FloatArray, Plant
+    from malta.model.plant import FloatArray, Plant
+    from malta.synthesis.controller import Controller
 
 Ts = 50e-6  # s, of every design here
 FORCE_AXES = [1, 2, 4, 7, 8, 10]  # 0q, dd and qd of both modules: what (17) and (18) make forces of

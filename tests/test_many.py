@@ -14,11 +14,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import malta
-from malta import engine, references
-from malta.machine import FIDELITIES, Fidelity
-from malta.many import Batch, replayed, simulate_many, verdicts
-from malta.noise import keys, normals
-from malta.simulate import (
+from malta import references
+from malta.simulation import engines as engine
+from malta.simulation.batch import (
+    Batch,
+    replayed,
+    simulate_many,
+    verdicts,
+)
+from malta.simulation.noise import keys, normals
+from malta.simulation.period import FIDELITIES, Fidelity
+from malta.simulation.simulate import (
     Correction,
     Fault,
     Scenario,
@@ -31,7 +37,7 @@ from malta.simulate import (
 if TYPE_CHECKING:
     from conftest import Design
 
-    from malta.plant import FloatArray
+    from malta.model.plant import FloatArray
 
 FIGURES = tuple(Batch.__dataclass_fields__)
 

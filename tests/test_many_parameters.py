@@ -19,8 +19,8 @@ from malta.margins.problem import OfLoop
 from malta.margins.response import Branch, response
 from malta.margins.robust import law_of, problem_of
 from malta.margins.structured import Structured, rows_of
-from malta.riccati import care, dare
-from malta.uncertain import Compensator, UncertainSystem, instability
+from malta.margins.uncertain import Compensator, UncertainSystem, instability
+from malta.synthesis.riccati import care, dare
 
 Loop = tuple[UncertainSystem, Compensator]
 

@@ -16,13 +16,13 @@ import pytest
 
 import malta
 from malta import gains
-from malta.data import plant_of
 from malta.errors import InputError
 from malta.margins.box import box_of
 from malta.margins.expressions import program
 from malta.margins.problem import OfCoefficients, OfPolynomial
 from malta.margins.robust import common_margin
-from malta.uncertain import UncertainSystem
+from malta.margins.uncertain import UncertainSystem
+from malta.model.data import plant_of
 
 PLANT = plant_of(gains.read("design/gains/table2.json").parameters)
 LAG = control.ss([[-1.0]], [[1.0]], [[-1.0]], [[0.0]])

@@ -9,8 +9,13 @@ import pytest
 from flint import arb, ctx
 
 import malta
-from malta.margins import family, loop, minors, robust
-from malta.uncertain import Compensator
+from malta.margins import (
+    family,
+    loop,
+    minors,
+    robust,
+)
+from malta.margins.uncertain import Compensator
 
 
 @pytest.mark.parametrize("decades", [0, 90, -90, 400])

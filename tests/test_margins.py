@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 import malta
 from malta.errors import InputError
 from malta.margins.problem import hurwitz
-from malta.uncertain import Compensator, UncertainSystem
+from malta.margins.uncertain import Compensator, UncertainSystem
 
 
 def chain(tau: float, unit: float = 1.0) -> UncertainSystem:

@@ -11,10 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from malta.noise import GAMMA, keys, normals
+from malta.simulation.noise import GAMMA, keys, normals
 
 if TYPE_CHECKING:
-    from malta.plant import FloatArray
+    from malta.model.plant import FloatArray
 
 SEED = st.integers(0, 2**64)
 RUNS = 64

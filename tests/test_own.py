@@ -13,8 +13,18 @@ import pytest
 from conftest import refusal
 
 import malta
-from malta import figures, report
-from malta.experiments import (
+from malta import report
+from malta.campaigns.statistics import bounds_of
+from malta.model.machines import own, required
+from malta.model.plant import Signal
+from malta.model.signals import (
+    aside,
+    inputs_of,
+    outputs_of,
+    stroke_unit,
+)
+from malta.report import figures
+from malta.simulation.experiments import (
     Case,
     Experiment,
     Merit,
@@ -25,19 +35,15 @@ from malta.experiments import (
     options_of,
     scenario_of,
 )
-from malta.findings import bounds_of
-from malta.own import own, required
-from malta.plant import Signal
-from malta.references import hold
-from malta.signals import aside, inputs_of, outputs_of, stroke_unit
+from malta.simulation.references import hold
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from conftest import Design
 
-    from malta.controller import Controller
-    from malta.plant import Plant
+    from malta.model.plant import Plant
+    from malta.synthesis.controller import Controller
 
 
 def rest(
@@ -63,13 +69,15 @@ def rest(
 @pytest.fixture
 def toy(designs: dict[str, Design], monkeypatch: pytest.MonkeyPatch) -> Plant:
     """MALTA under another name, with one experiment and no word for anything."""
-    monkeypatch.setitem(sys.modules, "malta.experiments.toy", SimpleNamespace(EXPERIMENTS={"rest": rest}))
+    monkeypatch.setitem(
+        sys.modules, "malta.machines.toy.experiments", SimpleNamespace(EXPERIMENTS={"rest": rest})
+    )
     return replace(designs["calibrated"].plant, name="toy")
 
 
 def test_parts_of_a_machine_are_found_by_its_name(toy: Plant) -> None:
     for part in ("experiments", "figures", "claims"):
-        assert required(part, "tubular").__name__ == f"malta.{part}.tubular"
+        assert required(part, "tubular").__name__ == f"malta.machines.tubular.{part}"
     assert own("figures", toy.name) is None
     error = refusal(lambda: required("claims", "toy"), Path("claims"))
     assert (error.field, error.found) == ("machine", "'toy'")
@@ -80,8 +88,10 @@ def test_parts_of_a_machine_are_found_by_its_name(toy: Plant) -> None:
 def test_what_a_module_lacks_is_not_taken_for_a_machine_that_is_not_there(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    (tmp_path / "toy.py").write_text("import nothing_of_that_name\n")
-    monkeypatch.setattr("malta.claims.__path__", [*sys.modules["malta.claims"].__path__, str(tmp_path)])
+    (tmp_path / "toy").mkdir()
+    (tmp_path / "toy" / "claims.py").write_text("import nothing_of_that_name\n")
+    machines = sys.modules["malta.machines"]
+    monkeypatch.setattr(machines, "__path__", [*machines.__path__, str(tmp_path)])
     with pytest.raises(ModuleNotFoundError, match="nothing_of_that_name"):
         own("claims", "toy")
 

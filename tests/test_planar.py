@@ -1,6 +1,6 @@
 """The planar motor's physics: its field and coils by independent routes, its decoupling, and a loop closed around it.
 
-The closed loop here is written on its own, without samples and delay, beside the one loop of malta/machine.py: what a
+The closed loop here is written on its own, without samples and delay, beside the one loop of malta/simulation/period.py: what a
 coil model alone moves. The machine as a Plant is tested in test_planar_plant.py, the sampled loops that a user flies in
 test_planar_experiments.py.
 """
@@ -20,17 +20,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import malta
-from malta.data import published as read_published
-from malta.data import published_value
-from malta.engine import translate
-from malta.plant import symbolic
-from malta.plants import planar, planar_field
-from malta.plants.planar_field import ODD_X, ODD_Y, Series
-from malta.references import QUINTIC_DURATION, quintic
-from malta.rigidbody import rotation
+from malta.machines.planar import field as planar_field
+from malta.machines.planar import plant as planar
+from malta.machines.planar.field import ODD_X, ODD_Y, Series
+from malta.model.data import published as read_published
+from malta.model.data import published_value
+from malta.model.plant import symbolic
+from malta.model.rigidbody import rotation
+from malta.simulation.engines import translate
+from malta.simulation.references import QUINTIC_DURATION, quintic
 
 if TYPE_CHECKING:
-    from malta.plant import FloatArray
+    from malta.model.plant import FloatArray
 
 FILE = Path("data/planar.toml")
 START = (6e-3, 4e-3)  # m, where nothing is symmetric
@@ -86,7 +87,7 @@ def single(model: planar.CoilModel, p: FloatArray) -> FloatArray:
 
 def test_every_printed_value_is_tagged_so(par: planar.Parameters, paper: dict[str, Any]) -> None:
     """Table 1 is in the data file, value by value; nothing else but the force limit is called printed."""
-    entries = malta.data.load_toml(FILE)["parameters"]
+    entries = malta.model.data.load_toml(FILE)["parameters"]
     printed = {name for name, entry in entries.items() if entry["tag"] == "printed"}
     assert printed == {*paper["table_1"]["parameters"], "F_max"}
     assert par.coil_pitch == pytest.approx(16 / 3 * par.tau_n, rel=1e-12)

@@ -15,20 +15,20 @@ from conftest import Run
 from scipy.integrate import solve_ivp
 
 import malta
-from malta.claims import ledger
-from malta.claims import planar as claims
-from malta.data import published as read_published
-from malta.data import published_value
-from malta.experiments import Experiment, cases_of, experiments_of
-from malta.experiments import planar as experiments
-from malta.figures import experiment_figure
-from malta.plants import planar
-from malta.verify import Margins
+from malta.machines.planar import claims as claims
+from malta.machines.planar import experiments as experiments
+from malta.machines.planar import plant as planar
+from malta.margins.verify import Margins
+from malta.model.data import published as read_published
+from malta.model.data import published_value
+from malta.report.figures import experiment_figure
+from malta.report.ledger import ledger
+from malta.simulation.experiments import Experiment, cases_of, experiments_of
 
 if TYPE_CHECKING:
-    from malta.controller import Controller
-    from malta.plant import FloatArray, Plant
-    from malta.spec import Spec
+    from malta.model.plant import FloatArray, Plant
+    from malta.synthesis.controller import Controller
+    from malta.synthesis.spec import Spec
 
 pytestmark = pytest.mark.usefixtures("proven_once")
 
@@ -304,7 +304,7 @@ def test_times_are_those_of_the_numbers(lqg: Design, flown: dict[str, Experiment
 
 
 def test_without_a_compiler_there_is_no_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("malta.engine.compiler", lambda: None)
+    monkeypatch.setattr("malta.simulation.engines.compiler", lambda: None)
     x = ca.SX.sym("x")
     assert np.isnan(experiments.compiled_seconds(ca.Function("square", [x], [x * x]), np.ones(1)))
 
@@ -327,8 +327,8 @@ def test_the_ledger(
     lqg: Design, flown: dict[str, Experiment], paper: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What a mended model can have is reproduced; what contradicts itself or lacks its start has a reason."""
-    monkeypatch.setattr("malta.claims.experiment", lambda name, *_, **__: flown[name])
-    monkeypatch.setattr("malta.claims.verify", lambda *_: lqg.margins)
+    monkeypatch.setattr("malta.report.ledger.experiment", lambda name, *_, **__: flown[name])
+    monkeypatch.setattr("malta.report.ledger.verify", lambda *_: lqg.margins)
     found = {claim.subject: claim for claim in ledger([lqg.spec], paper).claims}
     reproduced = (
         "one coil at 3 A: F_x [N]",

@@ -14,12 +14,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import malta
-from malta.data import plant_of, shaping, units_of
-from malta.plant import Plant, symbolic, trim
-from malta.plants import planar
+from malta.machines.planar import plant as planar
+from malta.model.data import plant_of, shaping, units_of
+from malta.model.plant import Plant, symbolic, trim
 
 if TYPE_CHECKING:
-    from malta.plant import FloatArray
+    from malta.model.plant import FloatArray
 
 FILE = Path("data/planar.toml")
 AT = np.array([6e-3, 4e-3, 0.3e-3, *np.zeros(9)])  # level, where nothing is symmetric

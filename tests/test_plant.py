@@ -12,11 +12,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import malta
-from malta.plant import OperatingPoint, trims
-from malta.plants import tubular
+from malta.machines.tubular import plant as tubular
+from malta.model.plant import OperatingPoint, trims
 
 if TYPE_CHECKING:
-    from malta.plant import Plant
+    from malta.model.plant import Plant
 
 
 def test_records_are_frozen(par: tubular.Parameters, plant: Plant) -> None:

@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 
 import malta
-from malta.plants import tubular
-from malta.simulate import RISE
-from malta.synthesize import pi_current_loop
+from malta.machines.tubular import plant as tubular
+from malta.simulation.simulate import RISE
+from malta.synthesis.lqg import pi_current_loop
 
 if TYPE_CHECKING:
     from conftest import Design
 
-    from malta.linearize import LinearModel
+    from malta.model.linearize import LinearModel
 
 
 def test_table_I_poles_to_every_printed_digit(model: LinearModel, published: dict[str, Any]) -> None:

@@ -11,10 +11,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import malta
-from malta.references import PROFILES, QUINTIC_DURATION, circle, hold, stroke
+from malta.simulation.references import (
+    PROFILES,
+    QUINTIC_DURATION,
+    circle,
+    hold,
+    stroke,
+)
 
 if TYPE_CHECKING:
-    from malta.plant import Plant
+    from malta.model.plant import Plant
 
 
 @pytest.mark.parametrize("profile", list(PROFILES))

@@ -16,11 +16,12 @@ import pytest
 from rich.console import Console
 
 import malta
-from malta import figures, report
-from malta.claims import Claim, Ledger
-from malta.experiments import Case, Experiment, Merit
-from malta.experiments.tubular import EXPERIMENTS
-from malta.simulate import Scenario, Verdict
+from malta import report
+from malta.machines.tubular.experiments import EXPERIMENTS
+from malta.report import figures
+from malta.report.ledger import Claim, Ledger
+from malta.simulation.experiments import Case, Experiment, Merit
+from malta.simulation.simulate import Scenario, Verdict
 
 if TYPE_CHECKING:
     from collections.abc import Callable

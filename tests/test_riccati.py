@@ -15,16 +15,25 @@ from scipy import linalg
 from scipy.integrate import quad_vec
 
 import malta
-from malta import riccati
-from malta.riccati import RESIDUAL, care, dare, delay_inputs, eigenvalues, sample, sample_cost, sample_noise
+from malta.synthesis import riccati
+from malta.synthesis.riccati import (
+    RESIDUAL,
+    care,
+    dare,
+    delay_inputs,
+    eigenvalues,
+    sample,
+    sample_cost,
+    sample_noise,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from conftest import Design
 
-    from malta.linearize import LinearModel
-    from malta.plant import FloatArray
+    from malta.model.linearize import LinearModel
+    from malta.model.plant import FloatArray
 
 
 @given(

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
-from malta.rigidbody import (
+from malta.model.rigidbody import (
     EXACT,
     SMALL_ANGLE,
     Trig,
@@ -25,7 +25,7 @@ from malta.rigidbody import (
 )
 
 if TYPE_CHECKING:
-    from malta.plant import FloatArray
+    from malta.model.plant import FloatArray
 
 ANGLES = st.lists(st.floats(-10, 10), min_size=3, max_size=3)
 TILTS = st.tuples(st.floats(-10, 10), st.floats(-1.4, 1.4), st.floats(-10, 10))  # beta short of +-90 degrees

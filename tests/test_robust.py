@@ -16,20 +16,26 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from malta import gains
-from malta.chain import compensators
-from malta.data import plant_of
 from malta.errors import InputError
 from malta.margins.robust import robust_margin
+from malta.margins.stages import compensators
 from malta.margins.systems import uncertain
-from malta.uncertain import Compensator, UncertainSystem, critical, instability, responses
-from malta.verify import machine_law, travel_margin
+from malta.margins.uncertain import (
+    Compensator,
+    UncertainSystem,
+    critical,
+    instability,
+    responses,
+)
+from malta.margins.verify import machine_law, travel_margin
+from malta.model.data import plant_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from malta.controller import Controller
     from malta.margins.robust import Certificate, Margin
-    from malta.plant import FloatArray, Plant
+    from malta.model.plant import FloatArray, Plant
+    from malta.synthesis.controller import Controller
 
 SHIPPED = ("table2", "calibrated", "robust")
 BOX = dict.fromkeys(("m", "K_A", "K_D", "K_B"), 0.2)

@@ -14,17 +14,22 @@ from scipy.integrate import solve_ivp
 
 import malta
 from malta import references
-from malta.controller import linear_law
-from malta.machine import state_reference
-from malta.simulate import Scenario, feedforward, save, stroke_figures
-from malta.verify import loop
+from malta.margins.verify import loop
+from malta.simulation.period import state_reference
+from malta.simulation.simulate import (
+    Scenario,
+    feedforward,
+    save,
+    stroke_figures,
+)
+from malta.synthesis.controller import linear_law
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from conftest import Design
 
-    from malta.plant import FloatArray, Plant
+    from malta.model.plant import FloatArray, Plant
 
 SP1 = {"x1": 1e-6, "y1": -0.7e-6, "x2": 0.4e-6, "y2": 0.9e-6}
 

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 
 import malta
-from malta.synthesize import pi_current_loop, sampled_model, static_feedforward
-from malta.verify import own_poles
+from malta.margins.verify import own_poles
+from malta.synthesis.lqg import pi_current_loop, sampled_model, static_feedforward
 
 if TYPE_CHECKING:
     from conftest import Design
 
-    from malta.linearize import LinearModel
-    from malta.plant import Plant
-    from malta.spec import Discretization
+    from malta.model.linearize import LinearModel
+    from malta.model.plant import Plant
+    from malta.synthesis.spec import Discretization
 
 
 def test_the_three_ways_agree_as_the_sample_time_falls(designs: dict[str, Design]) -> None:

@@ -15,12 +15,23 @@ import pytest
 from conftest import ROOT, Run, refusal
 
 import malta
-from malta import gains, report, tune_lqg
-from malta.controller import linear_law
-from malta.experiments import experiment
-from malta.riccati import eigenvalues
-from malta.spec import Specification
-from malta.trials import (
+from malta import gains, report
+from malta.margins.verify import BANDWIDTHS, loop, machine_loop
+from malta.simulation.experiments import experiment
+from malta.synthesis.controller import linear_law
+from malta.synthesis.riccati import eigenvalues
+from malta.synthesis.spec import Specification
+from malta.tuning import lqg as tune_lqg
+from malta.tuning.lqg import (
+    LINEAR,
+    _clusters,
+    _figures,
+    _search,
+    _worst,
+    drive_constant,
+    noise_of,
+)
+from malta.tuning.search import (
     Effort,
     Journal,
     Requirement,
@@ -31,16 +42,14 @@ from malta.trials import (
     law_of,
     merged,
 )
-from malta.tune import judged, problem_sha256
-from malta.tune import tune as tuned
-from malta.tune_lqg import LINEAR, _clusters, _figures, _search, _worst, drive_constant, noise_of
-from malta.verify import BANDWIDTHS, loop, machine_loop
+from malta.tuning.tune import judged, problem_sha256
+from malta.tuning.tune import tune as tuned
 
 if TYPE_CHECKING:
-    from malta.controller import Controller
-    from malta.linearize import LinearModel
-    from malta.spec import Spec
-    from malta.verify import Margins
+    from malta.margins.verify import Margins
+    from malta.model.linearize import LinearModel
+    from malta.synthesis.controller import Controller
+    from malta.synthesis.spec import Spec
 
 pytestmark = pytest.mark.usefixtures("proven_once")
 
@@ -175,7 +184,7 @@ def test_equal_ratios_of_stiffness_keep_plane_2_still(
 def test_the_law_of_gains_is_the_controllers(
     spec: Spec, flagship: tuple[LinearModel, Controller, Margins]
 ) -> None:
-    from malta.synthesize import gains as gains_of
+    from malta.synthesis.lqg import gains as gains_of
 
     model = flagship[0]
     for delay in (0, 2):
@@ -495,7 +504,7 @@ def test_the_command_without_wishes_is_bad_input(run: Any, tmp_path: Path) -> No
 
 
 def test_ctrl_c_leaves_the_trials(run: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    module = sys.modules["malta.tune"]
+    module = sys.modules["malta.tuning.tune"]
 
     def cut(*_: object, **__: object) -> None:
         raise KeyboardInterrupt

@@ -16,25 +16,39 @@ from conftest import ROOT, Run, refusal
 from scipy import linalg
 
 import malta
-from malta import tune_pid
-from malta.plants import halbach
-from malta.riccati import sample, sample_noise
-from malta.spec import Pid
-from malta.trials import Effort, Journal, Search, design_text, joined, synthesized
-from malta.tune import judged, problem_sha256
-from malta.tune import tune as tuned
-from malta.tune_pid import _closed, _figures, _goal, _parts, _whole, loads_of
-from malta.verify import machine_loop
+from malta.machines.halbach import plant as halbach
+from malta.margins.verify import machine_loop
+from malta.synthesis.riccati import sample, sample_noise
+from malta.synthesis.spec import Pid
+from malta.tuning import pid as tune_pid
+from malta.tuning.pid import (
+    _closed,
+    _figures,
+    _goal,
+    _parts,
+    _whole,
+    loads_of,
+)
+from malta.tuning.search import (
+    Effort,
+    Journal,
+    Search,
+    design_text,
+    joined,
+    synthesized,
+)
+from malta.tuning.tune import judged, problem_sha256
+from malta.tuning.tune import tune as tuned
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
 
-    from malta.controller import Controller
-    from malta.linearize import LinearModel
-    from malta.spec import Spec
-    from malta.trials import Tuned
-    from malta.verify import Margins
+    from malta.margins.verify import Margins
+    from malta.model.linearize import LinearModel
+    from malta.synthesis.controller import Controller
+    from malta.synthesis.spec import Spec
+    from malta.tuning.search import Tuned
 
 HALBACH = """
 name = "motor_pid"

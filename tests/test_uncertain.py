@@ -11,18 +11,24 @@ from scipy import linalg
 
 import malta
 from malta import gains
-from malta.controller import linear_law
-from malta.data import plant_of
 from malta.errors import InputError
 from malta.margins.robust import robust_margin
 from malta.margins.systems import uncertain
-from malta.uncertain import closed_loop, critical, instability, responses, sampled_law
-from malta.verify import loop, machine_law
+from malta.margins.uncertain import (
+    closed_loop,
+    critical,
+    instability,
+    responses,
+    sampled_law,
+)
+from malta.margins.verify import loop, machine_law
+from malta.model.data import plant_of
+from malta.synthesis.controller import linear_law
 
 if TYPE_CHECKING:
     from conftest import Design
 
-    from malta.plant import FloatArray, Plant
+    from malta.model.plant import FloatArray, Plant
 
 NAMES = ("m", "K_A", "K_D", "K_B", "l_B", "l_S", "I_xx")
 

@@ -10,8 +10,14 @@ import numpy as np
 import pytest
 
 import malta
-from malta.riccati import eigenvalues
-from malta.verify import BANDWIDTHS, loop, machine_loop, require_stable, zone
+from malta.margins.verify import (
+    BANDWIDTHS,
+    loop,
+    machine_loop,
+    require_stable,
+    zone,
+)
+from malta.synthesis.riccati import eigenvalues
 
 if TYPE_CHECKING:
     from pathlib import Path

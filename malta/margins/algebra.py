@@ -12,7 +12,12 @@ from typing import Any
 
 from flint import Ordering, acb, fmpq_mpoly_ctx
 
-from malta.margins.expressions import FIELD, NotAnalytic, Program, exact
+from malta.margins.expressions import (
+    FIELD,
+    NotAnalytic,
+    Program,
+    exact,
+)
 
 LARGEST = 4000  # terms of an expression beyond which it is not written out
 

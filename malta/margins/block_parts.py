@@ -24,7 +24,7 @@ from malta.margins.parts import PATCHES, cut
 
 if TYPE_CHECKING:
     from malta.margins.problem import OfLoop, Polynomial
-    from malta.plant import FloatArray
+    from malta.model.plant import FloatArray
 
 Matrix = tuple[tuple[tuple[Family, ...], ...], ...]  # rows x columns of a_{S + ij}
 

@@ -23,11 +23,11 @@ import casadi as ca
 import numpy as np
 
 from malta.errors import InputError
+from malta.margins.uncertain import Compensator, UncertainSystem
 from malta.margins.weight import Weight, weight_of
-from malta.uncertain import Compensator, UncertainSystem
 
 if TYPE_CHECKING:
-    from malta.plant import FloatArray
+    from malta.model.plant import FloatArray
 
 At = Literal["sensors", "forces"]
 Channels = int | tuple[int, ...]

@@ -11,10 +11,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from malta.errors import InputError
-from malta.margins.given import LARGEST, by_name, described, is_number, is_pair
+from malta.margins.given import (
+    LARGEST,
+    by_name,
+    described,
+    is_number,
+    is_pair,
+)
 
 if TYPE_CHECKING:
-    from malta.plant import FloatArray
+    from malta.model.plant import FloatArray
 
 
 FAR = 1e2  # search limit, in multiples of the modelled box

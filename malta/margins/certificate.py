@@ -24,7 +24,13 @@ from malta.margins import checked_file
 from malta.margins import loop as loops
 from malta.margins.box import Box, box_of
 from malta.margins.check import Enclosure, enclose
-from malta.margins.checked_loop import Polynomial, Refused, Tables, coupled, split
+from malta.margins.checked_loop import (
+    Polynomial,
+    Refused,
+    Tables,
+    coupled,
+    split,
+)
 from malta.margins.exclusion import Growth, advance, start
 from malta.margins.expressions import FIELD, exact
 from malta.margins.family import Family, binary
@@ -32,8 +38,8 @@ from malta.margins.systems import compensator_of
 
 if TYPE_CHECKING:
     from malta.margins.robust import Margin, Ranges
-    from malta.plant import FloatArray
-    from malta.uncertain import Compensator, UncertainSystem
+    from malta.margins.uncertain import Compensator, UncertainSystem
+    from malta.model.plant import FloatArray
 
 SHARE = 0.999  # of the margin's lower bound that is claimed
 MOST_CELLS = 60_000  # that are looked at for one group

@@ -20,10 +20,36 @@ import numpy as np
 from flint import acb, arb, arb_mat, ctx, fmpq, fmpq_mat
 
 from malta.margins.algebra import Symbolic, value
-from malta.margins.closed import closed_loop, coefficients, majorant_matrix, parts
-from malta.margins.degrees import cleared, degree, depends, determinant_degree, sole_power
-from malta.margins.expressions import BALLS, EXACT, POINTS, NotAnalytic, finite
-from malta.margins.loop import A, B, C, D, E, Group, Loop, divided
+from malta.margins.closed import (
+    closed_loop,
+    coefficients,
+    majorant_matrix,
+    parts,
+)
+from malta.margins.degrees import (
+    cleared,
+    degree,
+    depends,
+    determinant_degree,
+    sole_power,
+)
+from malta.margins.expressions import (
+    BALLS,
+    EXACT,
+    POINTS,
+    NotAnalytic,
+    finite,
+)
+from malta.margins.loop import (
+    A,
+    B,
+    C,
+    D,
+    E,
+    Group,
+    Loop,
+    divided,
+)
 from malta.margins.majorant import coefficient_bounds
 from malta.margins.minors import Minors, minors
 

@@ -24,7 +24,12 @@ from typing import Any
 from flint import acb, arb, arb_mat, arb_poly, ctx, fmpq, fmpq_mat
 
 from malta.margins.checked_file import Document, Part, read
-from malta.margins.checked_loop import Polynomial, Refused, height, split
+from malta.margins.checked_loop import (
+    Polynomial,
+    Refused,
+    height,
+    split,
+)
 
 BITS = 400  # of the coefficients; cells need fewer
 CELL_BITS = 160

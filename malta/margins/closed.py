@@ -9,10 +9,21 @@ import numpy as np
 from flint import acb_mat, arb
 
 from malta.margins.expressions import NotAnalytic, exact
-from malta.margins.loop import A, B, C, D, E, Group, Loop, held, rational, upper
+from malta.margins.loop import (
+    A,
+    B,
+    C,
+    D,
+    E,
+    Group,
+    Loop,
+    held,
+    rational,
+    upper,
+)
 
 if TYPE_CHECKING:
-    from malta.plant import FloatArray
+    from malta.model.plant import FloatArray
 
 
 def parts(

@@ -18,7 +18,7 @@ from malta.margins.algebra import Ratio, Symbolic, symbolic
 from malta.margins.expressions import exact, program
 
 if TYPE_CHECKING:
-    from malta.plant import FloatArray
+    from malta.model.plant import FloatArray
 
 ROUNDING = 1e-11  # terms below this, relative, are rounding of the model's own arithmetic
 

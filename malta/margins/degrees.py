@@ -7,7 +7,15 @@ from typing import Any
 from flint import fmpq, fmpq_mat
 
 from malta.margins.algebra import Ratio, Symbolic
-from malta.margins.loop import A, B, C, D, E, Group, Loop
+from malta.margins.loop import (
+    A,
+    B,
+    C,
+    D,
+    E,
+    Group,
+    Loop,
+)
 
 
 def degree(polynomial: Any, i: int) -> int:

@@ -18,7 +18,7 @@ from malta.margins.family import Family
 from malta.margins.witness import Zero, coefficients_at, rows_and_slopes
 
 if TYPE_CHECKING:
-    from malta.plant import FloatArray
+    from malta.model.plant import FloatArray
 
 MOST = 60  # steps of a descent
 BEYOND = 1.2  # of the smallest t known: descents that lead further out are given up

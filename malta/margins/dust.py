@@ -19,11 +19,21 @@ from scipy import linalg, sparse
 
 from malta.margins.algebra import Ratio, Symbolic, value
 from malta.margins.expressions import BALLS, NotAnalytic, finite
-from malta.margins.loop import A, B, C, Group, Loop, divided, groups, held, upper
+from malta.margins.loop import (
+    A,
+    B,
+    C,
+    Group,
+    Loop,
+    divided,
+    groups,
+    held,
+    upper,
+)
 from malta.margins.majorant import coefficient_bounds
 
 if TYPE_CHECKING:
-    from malta.plant import FloatArray
+    from malta.model.plant import FloatArray
 
 SMALL = 1e-11  # couplings below this, relative, may be rounding
 

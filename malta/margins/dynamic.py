@@ -17,24 +17,40 @@ import numpy as np
 
 from malta.errors import InputError
 from malta.margins.block_parts import Part, parts_of
-from malta.margins.blocks import Block, Dynamic, blocks_of, check_blocks, probe
+from malta.margins.blocks import (
+    Block,
+    Dynamic,
+    blocks_of,
+    check_blocks,
+    probe,
+)
 from malta.margins.box import Box, box_of
 from malta.margins.enclosure import Unproven
 from malta.margins.given import positive
 from malta.margins.loop import loop_of
 from malta.margins.loss import first_loss
-from malta.margins.peaks import Peak, climb, frequencies, patterns
+from malta.margins.peaks import (
+    Peak,
+    climb,
+    frequencies,
+    patterns,
+)
 from malta.margins.polydisc import Size, is_zero_free
 from malta.margins.problem import OfLoop
-from malta.margins.robust import Margin, deadline, law_of, problem_of
+from malta.margins.robust import (
+    Margin,
+    deadline,
+    law_of,
+    problem_of,
+)
 from malta.margins.search import Job
 from malta.margins.transfer import mu_bound, responses, transfer
+from malta.margins.uncertain import Compensator, UncertainSystem
 from malta.margins.weight import Expanded, Weight
-from malta.uncertain import Compensator, UncertainSystem
 
 if TYPE_CHECKING:
     from malta.margins.robust import Ranges
-    from malta.plant import ComplexArray, FloatArray
+    from malta.model.plant import ComplexArray, FloatArray
 
 TOLERANCE = 1e-3
 STEPS = (1, 3, 10, 30, 100, 300, 1000, 3000, 10_000)  # multiples of the tolerance that are tried

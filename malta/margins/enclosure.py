@@ -22,7 +22,7 @@ from malta.margins.family import Family, family, nodes
 
 if TYPE_CHECKING:
     from malta.margins.problem import Polynomial
-    from malta.plant import FloatArray
+    from malta.model.plant import FloatArray
 
 MOST_NODES = 20_000  # places of exact coefficients, at most
 MOST_BALLS = 6000  # places where they take an exponential

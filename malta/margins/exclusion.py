@@ -19,7 +19,7 @@ from malta.margins.family import Family, restrict
 from malta.margins.frequency import Expansion, cover, expand
 
 if TYPE_CHECKING:
-    from malta.plant import ComplexArray, FloatArray
+    from malta.model.plant import ComplexArray, FloatArray
 
 GUARD = 1e-9  # rad that a half plane must have to spare
 BATCH = 1024

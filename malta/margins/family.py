@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 if TYPE_CHECKING:
-    from malta.plant import FloatArray
+    from malta.model.plant import FloatArray
 
 EPS = 2.0**-52
 WIDE = 8  # nodes of the axes that follow, from which on they are multiplied where they stand

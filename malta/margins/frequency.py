@@ -17,7 +17,7 @@ import numpy as np
 from malta.margins.family import EPS, Family
 
 if TYPE_CHECKING:
-    from malta.plant import ComplexArray, FloatArray
+    from malta.model.plant import ComplexArray, FloatArray
 
 ORDER = 4
 

@@ -15,19 +15,32 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from malta.errors import InputError
-from malta.margins.blocks import At, Block, Channels, Dynamic, blocks_of, channels_of, shape_of
-from malta.margins.dynamic import SEARCH, Blocks, check_effort, question_of
+from malta.margins.blocks import (
+    At,
+    Block,
+    Channels,
+    Dynamic,
+    blocks_of,
+    channels_of,
+    shape_of,
+)
+from malta.margins.dynamic import (
+    SEARCH,
+    Blocks,
+    check_effort,
+    question_of,
+)
 from malta.margins.enclosure import Unproven
 from malta.margins.peaks import climb, patterns
 from malta.margins.polydisc import is_zero_free
 from malta.margins.robust import deadline
 from malta.margins.transfer import performance
+from malta.margins.uncertain import Compensator, UncertainSystem
 from malta.margins.weight import weight_of
-from malta.uncertain import Compensator, UncertainSystem
 
 if TYPE_CHECKING:
     from malta.margins.robust import Ranges
-    from malta.plant import FloatArray
+    from malta.model.plant import FloatArray
 
 Of = Literal["sensitivity", "complementary", "compliance", "effort"]
 

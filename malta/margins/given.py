@@ -11,7 +11,7 @@ import numpy as np
 from malta.errors import InputError
 
 if TYPE_CHECKING:
-    from malta.plant import FloatArray
+    from malta.model.plant import FloatArray
 
 LARGEST = 1e150  # of what a parameter may be: squares of multiples of it are numbers still
 LONG = 60  # characters of a value that a message shows

@@ -17,13 +17,23 @@ from flint import arb, arb_mat
 from scipy import sparse
 
 from malta.errors import InputError
-from malta.margins.algebra import Ratio, Symbolic, TooLarge, symbolic
-from malta.margins.expressions import NotAnalytic, Program, exact, program
+from malta.margins.algebra import (
+    Ratio,
+    Symbolic,
+    TooLarge,
+    symbolic,
+)
+from malta.margins.expressions import (
+    NotAnalytic,
+    Program,
+    exact,
+    program,
+)
 from malta.margins.given import counted
-from malta.uncertain import Compensator, UncertainSystem
+from malta.margins.uncertain import Compensator, UncertainSystem
 
 if TYPE_CHECKING:
-    from malta.plant import FloatArray
+    from malta.model.plant import FloatArray
 
 A, B, C, D, E = range(5)
 

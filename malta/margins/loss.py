@@ -15,7 +15,7 @@ from malta.margins.expressions import NotAnalytic
 if TYPE_CHECKING:
     from malta.margins.box import Box
     from malta.margins.problem import Problem
-    from malta.plant import FloatArray
+    from malta.model.plant import FloatArray
 
     Loss = tuple[float, float | None, FloatArray | None]  # t, w, p
 

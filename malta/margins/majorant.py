@@ -16,7 +16,7 @@ from flint import arb
 from malta.margins.expressions import NotAnalytic
 
 if TYPE_CHECKING:
-    from malta.plant import FloatArray
+    from malta.model.plant import FloatArray
 
 ROUNDS = 12
 SAFE = 1 + 1e-9

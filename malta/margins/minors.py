@@ -28,11 +28,20 @@ from malta.margins.closed import (
     solved,
 )
 from malta.margins.expressions import NotAnalytic, Program, exact
-from malta.margins.loop import A, B, C, E, Group, Loop, rational, upper
+from malta.margins.loop import (
+    A,
+    B,
+    C,
+    E,
+    Group,
+    Loop,
+    rational,
+    upper,
+)
 from malta.margins.majorant import all_bounds, coefficient_bounds
 
 if TYPE_CHECKING:
-    from malta.plant import FloatArray
+    from malta.model.plant import FloatArray
 
 MOST = 24  # minors beyond which the closed loop's own matrix is cheaper
 

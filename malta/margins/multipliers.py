@@ -19,7 +19,7 @@ import numpy as np
 from scipy import linalg
 
 if TYPE_CHECKING:
-    from malta.plant import ComplexArray, FloatArray
+    from malta.model.plant import ComplexArray, FloatArray
 
 STEPS = 60  # of the level, at most
 INNER = 5  # Newton steps for each

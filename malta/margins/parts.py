@@ -15,7 +15,7 @@ from malta.margins.family import Family
 from malta.margins.problem import Polynomial
 
 if TYPE_CHECKING:
-    from malta.plant import FloatArray
+    from malta.model.plant import FloatArray
 
 
 PATCHES = 64  # parts that a box is cut into where one expansion does not do

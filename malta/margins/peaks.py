@@ -16,7 +16,7 @@ from scipy import optimize
 
 if TYPE_CHECKING:
     from malta.margins.problem import OfLoop
-    from malta.plant import ComplexArray, FloatArray
+    from malta.model.plant import ComplexArray, FloatArray
 
 CORNERS = 32
 PLACES = 4  # that are climbed from

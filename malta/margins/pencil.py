@@ -16,13 +16,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from malta.margins.degrees import cleared
-from malta.margins.expansion import EPS, Expansion, constant, stacked, table
+from malta.margins.expansion import (
+    EPS,
+    Expansion,
+    constant,
+    stacked,
+    table,
+)
 from malta.margins.loop import C, Group, Loop
 from malta.margins.series import held, square_held
 
 if TYPE_CHECKING:
     from malta.margins.expansion import Table
-    from malta.plant import FloatArray
+    from malta.model.plant import FloatArray
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,16 +10,21 @@ from typing import TYPE_CHECKING, Any
 import casadi as ca
 import numpy as np
 
-from malta.data import shaping, units_of
 from malta.errors import InputError
 from malta.margins import compact
 from malta.margins.algebra import Ratio, TooLarge
 from malta.margins.given import described
-from malta.plant import Plant, readonly
-from malta.uncertain import UncertainSystem, holds, lowest, model_of
+from malta.margins.uncertain import (
+    UncertainSystem,
+    holds,
+    lowest,
+    model_of,
+)
+from malta.model.data import shaping, units_of
+from malta.model.plant import Plant, readonly
 
 if TYPE_CHECKING:
-    from malta.plant import FloatArray
+    from malta.model.plant import FloatArray
 
 LONGEST = 20_000  # operations of a model beyond which it is not written out
 

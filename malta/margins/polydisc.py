@@ -25,12 +25,18 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from malta.margins.block_parts import Matrix, Part
-from malta.margins.exclusion import Beside, Growth, advance, on_boxes, start
+from malta.margins.exclusion import (
+    Beside,
+    Growth,
+    advance,
+    on_boxes,
+    start,
+)
 from malta.margins.family import Family
 from malta.margins.weight import Expanded
 
 if TYPE_CHECKING:
-    from malta.plant import ComplexArray, FloatArray
+    from malta.model.plant import ComplexArray, FloatArray
 
 MOST_CELLS = 200_000
 Size = Callable[["FloatArray", int], Expanded]  # of a block, on cells of a scale

@@ -14,17 +14,29 @@ from flint import acb, arb, arb_mat, fmpq
 
 from malta.margins import dust
 from malta.margins.algebra import Symbolic, TooLarge, symbolic
-from malta.margins.characteristic import Characteristic, mapped, outward, pair
+from malta.margins.characteristic import (
+    Characteristic,
+    mapped,
+    outward,
+    pair,
+)
 from malta.margins.closed import closed_loop
 from malta.margins.closed import parts as driven
-from malta.margins.expressions import BALLS, EXACT, POINTS, NotAnalytic, Program, exact
+from malta.margins.expressions import (
+    BALLS,
+    EXACT,
+    POINTS,
+    NotAnalytic,
+    Program,
+    exact,
+)
 from malta.margins.family import binary
 from malta.margins.loop import Group, Loop
-from malta.uncertain import closed_loop as closed_matrices
-from malta.uncertain import critical, instability
+from malta.margins.uncertain import closed_loop as closed_matrices
+from malta.margins.uncertain import critical, instability
 
 if TYPE_CHECKING:
-    from malta.plant import FloatArray
+    from malta.model.plant import FloatArray
 
 
 class Polynomial(Protocol):

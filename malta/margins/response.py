@@ -19,7 +19,7 @@ from malta.margins.multipliers import Blocks, Multiplier
 
 if TYPE_CHECKING:
     from malta.margins.pencil import Pencil
-    from malta.plant import ComplexArray, FloatArray
+    from malta.model.plant import ComplexArray, FloatArray
 
 FINE = 1e-11  # of the largest: what a slope has below that is no channel
 COARSE = 3e-4  # where a hold curves the slopes

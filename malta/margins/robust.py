@@ -24,14 +24,27 @@ import numpy as np
 from malta.errors import InputError
 from malta.margins.box import Box, box_of
 from malta.margins.expressions import program
-from malta.margins.given import by_name, described, interval, is_pair, number, positive
+from malta.margins.given import (
+    by_name,
+    described,
+    interval,
+    is_pair,
+    number,
+    positive,
+)
 from malta.margins.loop import loop_of
-from malta.margins.problem import OfCoefficients, OfLoop, OfPolynomial, OfSeveral, Problem
+from malta.margins.problem import (
+    OfCoefficients,
+    OfLoop,
+    OfPolynomial,
+    OfSeveral,
+    Problem,
+)
 from malta.margins.systems import compensator_of, polynomial_system
-from malta.uncertain import Compensator, UncertainSystem
+from malta.margins.uncertain import Compensator, UncertainSystem
 
 if TYPE_CHECKING:
-    from malta.plant import FloatArray
+    from malta.model.plant import FloatArray
 
 TOLERANCE = 9e-4  # how close the proven bound comes to the witness, relative
 MOST_CELLS = 300_000

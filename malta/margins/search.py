@@ -18,7 +18,12 @@ from malta.margins.box import EDGE, Box
 from malta.margins.characteristic import pair
 from malta.margins.descent import from_cell, nearest
 from malta.margins.enclosure import Unproven, over_box, precision
-from malta.margins.exclusion import Search, advance, growth_over, start
+from malta.margins.exclusion import (
+    Search,
+    advance,
+    growth_over,
+    start,
+)
 from malta.margins.expressions import NotAnalytic, exact
 from malta.margins.family import Family, narrowed
 from malta.margins.loss import first_loss, loss_of_one
@@ -30,7 +35,7 @@ from malta.margins.witness import Zero, gradients, starts
 
 if TYPE_CHECKING:
     from malta.margins.loss import Loss
-    from malta.plant import FloatArray
+    from malta.model.plant import FloatArray
 
 FIRST = 3.97  # the first box that is searched, in multiples of the modelled one
 CHEAP = 4000  # cells below which the proof is brought closer to the witness than the tolerance

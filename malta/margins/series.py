@@ -19,7 +19,7 @@ from scipy import linalg
 from malta.margins.expansion import EPS, Expansion, stacked
 
 if TYPE_CHECKING:
-    from malta.plant import FloatArray
+    from malta.model.plant import FloatArray
 
 BERNOULLI = 36  # terms of c
 LARGEST = 4.8  # norm of Y up to which c is taken: its series ends at 2 pi

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
     from malta.margins.box import Box
     from malta.margins.pencil import Pencil
-    from malta.plant import FloatArray
+    from malta.model.plant import FloatArray
 
 NEAR = 0.98  # beta up to which splitting frequency is expected to do
 NARROWEST = 1e-9  # of an interval of frequency, relative

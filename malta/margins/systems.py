@@ -18,11 +18,20 @@ import numpy as np
 
 from malta.errors import InputError
 from malta.margins.algebraic import solved_algebraic
-from malta.margins.given import by_name, counted, described, interval, is_number, matrix, number, positive
-from malta.plant import Plant, readonly
+from malta.margins.given import (
+    by_name,
+    counted,
+    described,
+    interval,
+    is_number,
+    matrix,
+    number,
+    positive,
+)
+from malta.model.plant import Plant, readonly
 
 if TYPE_CHECKING:
-    from malta.uncertain import Compensator, UncertainSystem
+    from malta.margins.uncertain import Compensator, UncertainSystem
 
 LETTERS = "ABCDE"
 
@@ -67,7 +76,7 @@ def from_source(
 
     Raises InputError for names, shapes and values that do not fit.
     """
-    from malta.uncertain import UncertainSystem
+    from malta.margins.uncertain import UncertainSystem
 
     names = tuple(by_name("uncertain", "nominal", nominal, '{"k": 1.5}'))
     if not names:
@@ -225,7 +234,7 @@ def compensator_of(law: Any, outputs: int, inputs: int) -> Compensator:
 
     Raises InputError where it has another number of inputs and outputs than the system, or an unspecified sample time.
     """
-    from malta.uncertain import Compensator
+    from malta.margins.uncertain import Compensator
 
     if isinstance(law, Compensator):
         return law

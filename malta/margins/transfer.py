@@ -18,11 +18,11 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from malta.margins.blocks import Block
-from malta.riccati import sample
-from malta.uncertain import Compensator, UncertainSystem, differences
+from malta.margins.uncertain import Compensator, UncertainSystem, differences
+from malta.synthesis.riccati import sample
 
 if TYPE_CHECKING:
-    from malta.plant import ComplexArray, FloatArray
+    from malta.model.plant import ComplexArray, FloatArray
 
 STEPS = 24  # of the power iteration
 STARTS = 3

@@ -20,7 +20,7 @@ from malta.errors import InputError
 from malta.margins.given import described, is_number
 
 if TYPE_CHECKING:
-    from malta.plant import ComplexArray, FloatArray
+    from malta.model.plant import ComplexArray, FloatArray
 
 
 class Expanded(NamedTuple):

@@ -13,7 +13,7 @@ from malta.margins.family import Family, basis
 from malta.margins.frequency import cover
 
 if TYPE_CHECKING:
-    from malta.plant import ComplexArray, FloatArray
+    from malta.model.plant import ComplexArray, FloatArray
 
 STEPS = 8  # of the frequency grid in an octave
 SPACING = 0.6 / STEPS  # half a step and more, in ln w

@@ -17,11 +17,11 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
 import malta
-from malta.plants import tubular
-from malta.rigidbody import cardan_rates, rotation
+from malta.machines.tubular import plant as tubular
+from malta.model.rigidbody import cardan_rates, rotation
 
 if TYPE_CHECKING:
-    from malta.plant import FloatArray, Plant
+    from malta.model.plant import FloatArray, Plant
 
 Rate = Callable[[Any, Any, Any], "FloatArray"]
 

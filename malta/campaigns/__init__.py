@@ -1,0 +1,1 @@
+"""Campaigns: plans of many runs, blocks in a folder, threads or a cluster, statistics."""

@@ -1,0 +1,271 @@
+"""What a campaign flies: one scenario on machines drawn from a box.
+
+A plan decides everything: run i has the same machine, sensor errors and noise whatever flies it, with whatever company
+and in whatever order. Its manifest names all that it depends on.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, is_dataclass, replace
+from functools import lru_cache
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
+
+import numpy as np
+from scipy.stats import qmc
+
+from malta.errors import InputError
+from malta.gains.encodings import decode
+from malta.model.data import (
+    plant_of,
+    shaping,
+    twins_of,
+    units_of,
+)
+from malta.model.plant import Plant, readonly
+from malta.simulation.experiments import Wanted, cases_of
+from malta.synthesis.controller import Controller
+
+if TYPE_CHECKING:
+    from malta.model.plant import FloatArray
+
+SCHEMA, VERSION = "malta-campaign", 1
+Sampler = Literal["latin-hypercube", "sobol"]
+SAMPLERS: tuple[Sampler, ...] = get_args(Sampler)
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """Everything that decides what a campaign finds.
+
+    Values are uniform in their boxes. Parameters that are declared twins (I_xx and I_yy) and equal stay equal.
+
+    Raises InputError for what cannot be flown: an unknown scenario, case, option, parameter or sensor error, a spread
+    that is no share from 0 to 1, a scenario that changes the machine in flight.
+    """
+
+    controller: Controller
+    scenario: str = "stroke"  # an experiment that many can fly, see experiments.CASES
+    spread: Mapping[str, float] = field(default_factory=dict)  # parameter -> share, either way
+    sensor_spread: Mapping[str, float] = field(default_factory=dict)  # error of a sensor -> SI, either way
+    samples: int = 10_000
+    seed: int = 0  # of the machines and of the noise
+    sampler: Sampler = "latin-hypercube"
+    parameters: Any = None  # the machine in the middle of the box; None: the one in the gain file
+    case: str | None = None  # of a scenario with several, by its label; None: the first
+    options: Mapping[str, Any] = field(
+        default_factory=dict
+    )  # of the scenario, SI; the noise is 1 unless given
+
+    def __post_init__(self) -> None:
+        machine = self.controller.parameters if self.parameters is None else self.parameters
+        units = units_of(machine)
+        order = [name for name in units if name in self.spread]
+        errors = [signal.name for signal in plant_of(machine).sensor_errors]
+        for name, value in {
+            "parameters": machine,
+            "options": {"noise": 1.0} | dict(self.options),
+            "spread": {name: float(self.spread[name]) for name in order}
+            | {name: value for name, value in self.spread.items() if name not in units},
+            "sensor_spread": {name: float(v) for name, v in sorted(self.sensor_spread.items())},
+        }.items():
+            object.__setattr__(self, name, value)
+        _check_counts(self)
+        _check_spread(self, units)
+        for name, value in self.sensor_spread.items():
+            if name not in errors:
+                raise InputError(
+                    "campaign", f"sensor {name}", "an unknown sensor error", "one of " + " ".join(errors)
+                )
+            if not (math.isfinite(value) and value >= 0):
+                raise InputError("campaign", f"sensor {name}", f"{value:g}", "a finite spread of 0 or more")
+        wanted_of(self)
+
+    @property
+    def plant(self) -> Plant:
+        """The machine in the middle of the box."""
+        return plant_of(self.parameters)
+
+    @property
+    def manifest(self) -> dict[str, Any]:
+        """The plan as plain tables; SI. Two plans with the same manifest are the same."""
+        return _manifest(self)
+
+    @property
+    def identity(self) -> str:
+        """sha256 of the manifest."""
+        return hashlib.sha256(_compact(self.manifest)).hexdigest()
+
+
+def box_of(gains: str | Path, published: Mapping[str, Any] | None = None) -> dict[str, float]:
+    """The uncertain parameters of a gain file and their spreads: its own, else those that the machine's paper names."""
+    robust = decode(Path(gains)).get("verification", {}).get("robust") or {}
+    own = robust.get("uncertainty") or (published or {}).get("position_controller", {}).get("uncertainty")
+    if not own:
+        raise InputError(
+            gains, "verification.robust", "no uncertain parameters", "them, or --spread NAME=10%"
+        )
+    return {name: float(value) for name, value in own.items()}
+
+
+def _check_counts(plan: Plan) -> None:
+    for name, least in (("samples", 1), ("seed", 0)):
+        value = getattr(plan, name)
+        if not isinstance(value, int) or isinstance(value, bool) or value < least:
+            raise InputError("campaign", name, repr(value), f"a whole number of at least {least}")
+    if plan.samples > MOST:
+        raise InputError("campaign", "samples", str(plan.samples), f"at most {MOST}")
+    if plan.sampler not in SAMPLERS:
+        raise InputError("campaign", "sampler", repr(plan.sampler), "one of " + ", ".join(SAMPLERS))
+    for name in ("seed", "run", "engine"):
+        if name in plan.options:
+            raise InputError(
+                "campaign", f"options: {name}", repr(plan.options[name]), "none: the plan has its own"
+            )
+
+
+MOST = 10_000_000  # runs: their digests fill 3 GB
+
+
+def _check_spread(plan: Plan, units: Mapping[str, str]) -> None:
+    if not plan.spread and not plan.sensor_spread:
+        raise InputError("campaign", "spread", "nothing", "a parameter that varies, by 0 % if need be")
+    for name, share in plan.spread.items():
+        where = f"spread {name}"
+        if name not in units:
+            raise InputError("campaign", where, "an unknown parameter", "one of " + " ".join(units))
+        if not 0 <= share < 1:
+            raise InputError("campaign", where, f"{100 * share:g} %", "from 0 % to less than 100 %")
+        if name in shaping(plan.parameters):
+            raise InputError(
+                "campaign", where, "another one for each run", "one for all: it shapes the functions"
+            )
+        if share and not getattr(plan.parameters, name):
+            raise InputError(
+                "campaign", where, f"{name} = 0", "a parameter other than 0: spreads are relative"
+            )
+    for name, twin in twins_of(plan.parameters).items():
+        given = {plan.spread[k] for k in (name, twin) if k in plan.spread}
+        if len(given) > 1:
+            raise InputError(
+                "campaign", f"spread {name}", f"another one than {twin}'s", "one: they stay equal"
+            )
+
+
+def _manifest(plan: Plan) -> dict[str, Any]:
+    tables = {
+        "schema": SCHEMA,
+        "version": VERSION,
+        "malta": version("malta"),
+        "gains": {"name": plan.controller.name, "sha256": fingerprint(plan.controller)},
+        "machine": {
+            "name": plan.plant.name,
+            "preset": plan.parameters.preset,
+            "parameters": {name: getattr(plan.parameters, name) for name in units_of(plan.parameters)},
+        },
+        "scenario": {"name": plan.scenario, "case": wanted_of(plan).label, "options": dict(plan.options)},
+        "spread": dict(plan.spread),
+        "sensor_spread": dict(plan.sensor_spread),
+        "samples": plan.samples,
+        "seed": plan.seed,
+        "sampler": plan.sampler,
+    }
+    content: dict[str, Any] = _whole(json.loads(_compact(tables)))
+    return content
+
+
+def _whole(value: Any) -> Any:
+    """Whole numbers as such: noise 1 and noise 1.0 are the same plan."""
+    if isinstance(value, dict):
+        return {key: _whole(entry) for key, entry in value.items()}
+    if isinstance(value, list):
+        return [_whole(entry) for entry in value]
+    return int(value) if isinstance(value, float) and value.is_integer() else value
+
+
+def _compact(content: Mapping[str, Any]) -> bytes:
+    return json.dumps(content, sort_keys=True, separators=(",", ":"), allow_nan=False, default=float).encode()
+
+
+def fingerprint(record: Any) -> str:
+    """sha256 of every number and name in a controller: the same for a gain file's .json, .npz and .mat."""
+    marks = hashlib.sha256()
+
+    def add(value: Any) -> None:
+        if isinstance(value, np.ndarray | float | int):
+            marks.update(f"{np.shape(value)}".encode())
+            marks.update((np.asarray(value, dtype="<f8") + 0.0).tobytes())  # a file keeps no negative zeros
+        elif is_dataclass(value):
+            for f in fields(value):
+                marks.update(f.name.encode())
+                add(getattr(value, f.name))
+        elif isinstance(value, tuple):
+            for entry in value:
+                add(entry)
+        else:
+            marks.update(f"{value!r};".encode())
+
+    add(record)
+    return marks.hexdigest()
+
+
+@lru_cache(maxsize=8)
+def wanted_of(plan: Plan) -> Wanted:
+    """The scenario of a plan, with its seed, and what single runs of it are looked at for."""
+    cases = cases_of(plan.scenario, plan.plant, plan.controller, **plan.options)
+    able = {case.label: case for case in cases if case.scenario.estimator == "steady-state"}
+    if not able:
+        found = cases[0].scenario.estimator
+        raise InputError("campaign", "estimator", repr(found), "steady-state: the one inside the controller")
+    label = next(iter(able)) if plan.case is None else plan.case
+    if label not in able:
+        raise InputError("campaign", f"{plan.scenario}: case", repr(label), "one of " + ", ".join(able))
+    scenario = replace(able[label].scenario, seed=plan.seed)
+    if plan.sensor_spread:  # on top of what the scenario's sensors have
+        scenario = replace(scenario, sensor_errors=dict(scenario.sensor_errors or {}))
+    return able[label]._replace(scenario=scenario)
+
+
+class Drawn(NamedTuple):
+    """The machines of a plan: a value for each run."""
+
+    changes: Mapping[str, FloatArray]  # parameters
+    sensor_errors: Mapping[str, FloatArray]
+    names: tuple[str, ...]  # of what varies by itself, parameters first
+    values: FloatArray  # runs x names, SI
+
+
+@lru_cache(maxsize=8)
+def drawn(plan: Plan) -> Drawn:
+    """Draw all machines of a plan. The same plan gives the same machines."""
+    twins = {name: twin for name, twin in twins_of(plan.parameters).items() if name in plan.spread}
+    own = {name: twin for name, twin in twins.items() if twin in plan.spread}
+    parameters = [name for name in plan.spread if name not in own]
+    names = (*parameters, *plan.sensor_spread)
+    unit = 2 * _unit_box(plan, len(names)) - 1
+    middle = np.array(
+        [getattr(plan.parameters, name) for name in parameters] + [0.0] * len(plan.sensor_spread)
+    )
+    half = [getattr(plan.parameters, name) * plan.spread[name] for name in parameters]
+    values = middle + unit * np.array([*half, *plan.sensor_spread.values()])
+    changes = dict(zip(parameters, values.T, strict=False))
+    pairs = [*twins_of(plan.parameters).items()]
+    for name, twin in [*pairs, *((twin, name) for name, twin in pairs)]:
+        if twin in changes and name not in changes:
+            changes[name] = changes[twin]
+    errors = dict(zip(plan.sensor_spread, values.T[len(parameters) :], strict=True))
+    return Drawn(changes, errors, names, readonly(values))
+
+
+def _unit_box(plan: Plan, dimensions: int) -> FloatArray:
+    """Points of the unit box, runs x dimensions."""
+    if plan.sampler == "latin-hypercube":
+        return np.asarray(qmc.LatinHypercube(dimensions, rng=plan.seed).random(plan.samples))
+    # A power of two keeps the sequence balanced; its first points are used.
+    points = qmc.Sobol(dimensions, rng=plan.seed).random_base2(math.ceil(math.log2(max(plan.samples, 2))))
+    return np.asarray(points[: plan.samples])

@@ -1,0 +1,145 @@
+"""What a campaign found: shares of runs with their intervals, figures of merit beside the paper's, the worst runs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from scipy.stats import binomtest
+
+from malta.model.data import in_unit, published_value, units_of
+from malta.model.plant import readonly
+from malta.model.signals import inputs_of, outputs_of, stroke_unit
+from malta.simulation.experiments import said
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from malta.campaigns.campaign import Campaign
+    from malta.campaigns.plan import Plan
+    from malta.model.plant import FloatArray
+
+CONFIDENCE = 0.95  # of the interval about a share
+
+
+class Rate(NamedTuple):
+    """A share of runs with its two-sided interval (Clopper-Pearson) at CONFIDENCE."""
+
+    passed: int
+    runs: int
+    share: float  # NaN of no runs
+    low: float
+    high: float
+
+
+class Finding(NamedTuple):
+    """A figure of merit over all completed runs, SI."""
+
+    label: str
+    kind: str  # figures of a kind are drawn together
+    unit: str  # to show it in
+    values: FloatArray  # a row for each run of the campaign; NaN where it has none
+    published: float = math.nan  # SI; NaN where the paper has none
+    relation: str = "at most"  # of ours to the published: "about" or "at most"
+
+    @property
+    def within(self) -> NDArray[np.bool_]:
+        """Which runs were completed and keep the published bound."""
+        return np.asarray(self.values <= self.published)
+
+
+def rate(count: int, runs: int) -> Rate:
+    """A share with the interval that holds the true one at least CONFIDENCE of the time."""
+    if not runs:
+        return Rate(0, 0, math.nan, 0.0, 1.0)
+    low, high = binomtest(count, runs).proportion_ci(CONFIDENCE, method="exact")
+    return Rate(count, runs, count / runs, float(low), float(high))
+
+
+def figures_of(found: Campaign, published: Mapping[str, Any] | None = None) -> list[Finding]:
+    """The figures of merit of a campaign, with the bounds that the paper prints of this very scenario."""
+    plan, batch = found.plan, found.batch
+    plant, done = plan.plant, found.completed
+    names = [signal.name for signal in plant.outputs]
+    keys = {} if published is None else bounds_of(plan)
+
+    def of(
+        name: str, kind: str, unit: str, values: FloatArray, key: str = "", relation: str = "at most"
+    ) -> Finding:
+        bound = published_value(published or {}, keys[key]) if key in keys else math.nan
+        label = f"{kind} {name}" if name else kind
+        return Finding(label, kind, unit, readonly(np.where(done, values, np.nan)), bound, relation)
+
+    (stroke, *others), (thrust, *efforts) = outputs_of(plant), inputs_of(plant)
+    (axis,) = stroke.columns
+    sides = [(k, group) for group in others for k in group.columns]
+    listed = []
+    if np.isfinite(batch.rise).any():
+        listed += [
+            of("", "rise, 10-90 %", "ms", batch.rise, "rise", "about"),
+            of("", "overshoot", "percent", batch.overshoot, "overshoot"),
+        ]
+    along = f"deviation of {names[axis]}", stroke_unit(plant), batch.deviation[:, axis], "stroke"
+    listed += [of("", *along)]
+    listed += [of(names[k], "deviation", g.fine, batch.deviation[:, k], g.unit) for k, g in sides]
+    if plan.scenario == "hold":
+        listed += [of("", f"rms of {names[axis]}", stroke.fine, batch.rms[:, axis])]
+        listed += [of(names[k], "rms", g.fine, batch.rms[:, k]) for k, g in sides]
+    listed += [
+        of("", f"largest {g.name}", g.unit, batch.force[:, g.columns].max(axis=1, initial=0.0))
+        for g in (*efforts, thrust)
+    ]
+    listed += [
+        of(name.removeprefix("touchdown at "), "clearance:", "percent", batch.contact[:, k])
+        for k, name in enumerate(plant.contacts)
+    ]
+    return [
+        *listed,
+        of("", "limited commands", "percent", batch.saturated.max(axis=1, initial=0.0)),
+    ]
+
+
+def bounds_of(plan: Plan) -> Mapping[str, str]:
+    """What the machine's paper prints of this very scenario, as keys of data/published/."""
+    bounds = said(plan.plant, "bounds", None)
+    found: Mapping[str, str] = {} if bounds is None else bounds(plan.scenario, plan.options)
+    return found
+
+
+def kept(found: Campaign, published: Mapping[str, Any] | None = None) -> NDArray[np.bool_] | None:
+    """Which runs were completed within every published bound; None where the paper has none."""
+    bounds = [
+        f for f in figures_of(found, published) if f.relation == "at most" and math.isfinite(f.published)
+    ]
+    return np.all([f.within for f in bounds], axis=0) if bounds else None
+
+
+def worst_of(found: Campaign, count: int) -> list[int]:
+    """Rows of the worst runs, the worst first: those that ended early, then those that came closest to a touch.
+
+    How close is measured from the median run, which may have to go near an end stop.
+    """
+    batch = found.batch
+    if not len(found.index):
+        return []
+    closest = -(batch.contact - np.median(batch.contact, axis=0)).max(axis=1, initial=0.0)
+    order = np.lexsort((found.index, np.where(found.completed, closest, batch.duration), found.completed))
+    return [int(k) for k in order[:count]]
+
+
+def unit_of(plan: Plan, name: str) -> str:
+    """The unit to show a varied value in."""
+    errors = {signal.name: signal.unit for signal in plan.plant.sensor_errors}
+    shown = {"1": "percent", "m": "um", "rad": "deg"}
+    return shown.get(errors[name], errors[name]) if name in errors else units_of(plan.parameters)[name]
+
+
+def half_text(plan: Plan, name: str) -> str:
+    """How far a value varies, either way."""
+    if name in plan.spread:
+        return f"±{100 * plan.spread[name]:.4g} %"
+    unit = unit_of(plan, name)
+    size = f"±{in_unit(plan.sensor_spread[name], unit):.4g}"
+    return f"{size} %" if unit == "percent" else f"{size} {unit.replace('um', 'µm')}"

@@ -1,0 +1,162 @@
+"""The folder of a campaign: its manifest, and a file for each block of runs that is done.
+
+    campaign.json        the plan's manifest, and the runs in a block
+    runs_00000000.npz    the block that begins with run 0: what became of its runs, and their machines
+    runs_00001024.npz    ...
+
+Files are whole or not there. Blocks name the plan that they belong to; a damaged one is flown again.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from malta.campaigns.plan import (
+    SCHEMA,
+    VERSION,
+    Plan,
+    drawn,
+)
+from malta.errors import InputError
+from malta.files import read_file, replace_files
+from malta.simulation.batch import Batch
+from malta.simulation.engines import LANES
+
+if TYPE_CHECKING:
+    from malta.model.plant import FloatArray
+
+MANIFEST = "campaign.json"
+
+
+class Block(NamedTuple):
+    """Some runs of a plan, from one index on."""
+
+    values: FloatArray  # runs x names, SI: what was drawn for them
+    batch: Batch
+    engine: str  # what flew them: "compiled" or "virtual machine"
+
+
+def block_name(first: int) -> str:
+    """The file of the block that begins with this run."""
+    return f"runs_{first:08d}.npz"
+
+
+def opened(folder: Path, plan: Plan, block: int) -> int:
+    """The folder with the manifest of a plan in it, found or written; the runs in a block."""
+    path = folder / MANIFEST
+    try:
+        for stale in folder.glob(f".*.npz.{os.getpid()}"):  # of a killed process that had this one's number
+            stale.unlink(missing_ok=True)
+        begun = path.exists()
+    except OSError as error:
+        raise InputError(
+            folder, "", error.strerror or str(error), "a folder to keep a campaign in"
+        ) from error
+    if begun:
+        found, size = read_manifest(path)
+        require_same(path, found, plan.manifest)
+        return size
+    blocks = sorted(folder.glob("runs_*.npz"))
+    if blocks:
+        raise InputError(
+            folder, "", f"{blocks[0].name} without {MANIFEST}", "a campaign's folder or an empty one"
+        )
+    text = json.dumps(plan.manifest | {"block": block}, indent=1) + "\n"
+    replace_files({path: text.encode()})
+    return block
+
+
+def read_manifest(path: Path) -> tuple[dict[str, Any], int]:
+    text = read_file(path, "campaign's manifest", lambda p: p.read_text(encoding="utf-8"))
+    try:
+        content = json.loads(text)
+        size = content.pop("block")
+    except (ValueError, RecursionError, AttributeError, KeyError, TypeError) as error:
+        raise InputError(path, "", "a damaged or foreign file", "the manifest of a campaign") from error
+    for key, wanted in (("schema", SCHEMA), ("version", VERSION)):
+        if content.get(key) != wanted:
+            raise InputError(path, key, repr(content.get(key, "nothing")), repr(wanted))
+    if not isinstance(size, int) or size < 1 or size % LANES:
+        raise InputError(path, "block", repr(size), f"a multiple of {LANES}")
+    return content, size
+
+
+def require_same(path: Path, found: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
+    """InputError that names the first entry of the manifest in which two campaigns differ."""
+    for key, (one, other) in _differences(found, wanted):
+        raise InputError(
+            path,
+            key,
+            f"{short(one)}: another campaign",
+            f"{short(other)}, or a folder of its own for this one",
+        )
+
+
+def _differences(found: Any, wanted: Any, key: str = "") -> Iterator[tuple[str, tuple[Any, Any]]]:
+    if isinstance(found, Mapping) and isinstance(wanted, Mapping):
+        for name in {**wanted, **found}:
+            inner = f"{key}.{name}" if key else name
+            yield from _differences(found.get(name, "nothing"), wanted.get(name, "nothing"), inner)
+    elif found != wanted:
+        yield key, (found, wanted)
+
+
+def short(value: Any) -> str:
+    text = value if isinstance(value, str) else json.dumps(value)
+    return text if len(text) <= 40 else text[:12] + "..."
+
+
+def encoded(block: Block, plan: Plan) -> bytes:
+    buffer = io.BytesIO()
+    arrays: dict[str, Any] = {name: getattr(block.batch, name) for name in Batch.__dataclass_fields__}
+    names = np.array(drawn(plan).names)
+    np.savez(
+        buffer,
+        campaign=np.array(plan.identity),
+        engine=np.array(block.engine),
+        names=names,
+        values=block.values,
+        **arrays,
+    )
+    return buffer.getvalue()
+
+
+def read_block(path: Path, plan: Plan, first: int, count: int) -> Block | None:
+    """A block; None where it is damaged. InputError where it belongs to another campaign."""
+    data = read_file(path, "block of a campaign", Path.read_bytes)
+    try:
+        with np.load(io.BytesIO(data), allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}  # checks the sums of the archive
+        identity, kind = str(arrays["campaign"]), str(arrays["engine"])
+        columns = {name: arrays[name] for name in Batch.__dataclass_fields__}
+        values = arrays["values"]
+    except Exception:  # a damaged archive makes its reader raise nearly anything
+        return None
+    if identity != plan.identity:
+        raise InputError(path, "", "a block of another campaign", f"one of that in {MANIFEST}")
+    sizes = shapes(plan)
+    whole = all(columns[name].shape == (count, *sizes[name]) for name in columns)
+    if not whole or not np.array_equal(values, drawn(plan).values[first : first + count]):
+        return None
+    return Block(values, Batch(**columns), kind)
+
+
+def shapes(plan: Plan) -> dict[str, tuple[int, ...]]:
+    """Of one run's figures in a batch."""
+    plant = plan.plant
+    p, m = len(plant.outputs), len(plant.inputs)
+    rows = {
+        "deviation": (p,),
+        "rms": (p,),
+        "force": (m,),
+        "saturated": (m,),
+        "contact": (len(plant.contacts),),
+    }
+    return {name: rows.get(name, ()) for name in Batch.__dataclass_fields__}

@@ -1,0 +1,1 @@
+"""The machines that come with malta, each a folder: plant, experiments, figures, claims."""

@@ -1,0 +1,1 @@
+"""A linear motor with a Halbach array."""

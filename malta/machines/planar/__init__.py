@@ -1,0 +1,1 @@
+"""A maglev planar motor."""

@@ -1,0 +1,283 @@
+"""Field of the planar motor's magnets and the wrench it puts on a coil: exact Fourier series, quadrature over the legs.
+
+The magnets are a 2-D Halbach array of equal height, relative permeability 1, without iron and without edges. Its own
+axes x', y' lie at 45 degrees to x, y; poles alternate every tau = sqrt(2) tau_n along them. Above its top face, z = 0,
+
+    B = -grad sum b / K cos(m k x) cos(n k y) e^(-K z),    k = pi / tau_n, K = k sqrt(m^2 + n^2), m + n odd.
+
+A north pole stands at (tau_n, 0): with it a current that is positive counter-clockwise, seen from above, gives the
+signs of (17)-(24). Equation numbers are those of the paper named in planar.py.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import casadi as ca
+import numpy as np
+
+from malta.model.plant import readonly
+
+if TYPE_CHECKING:
+    from malta.machines.planar.plant import Parameters
+    from malta.model.plant import FloatArray
+
+ORDER = 60  # field: e^-K z is 2e-5 of the last harmonic kept at z = 1 mm
+COIL_ORDER = 16  # wrench: a coil averages the rest away; see test_planar.py
+# Harmonic orders in x and y are `sin` (1) or `cos` (0) in the coil's position: mirroring the coil at x = 0 turns the
+# signs of F_x, T_y and T_z, mirroring it at y = 0 those of F_y, T_x and T_z.
+ODD_X = (1, 0, 0, 0, 1, 1)
+ODD_Y = (0, 1, 0, 1, 0, 1)
+
+
+class Shape(NamedTuple):
+    """The parameters that harmonics are computed from, with one turn and one tesla: those are factors."""
+
+    tau_n: float
+    w_c: float
+    h_c: float
+    l_c: float
+    r_c: float
+    h_m: float
+    upright: float
+    N_c: float = 1.0
+    B_r: float = 1.0
+
+
+class Modes(NamedTuple):
+    """Harmonics of the field: orders and the amplitude of B_z at z = 0."""
+
+    m: FloatArray
+    n: FloatArray
+    b: FloatArray  # T
+    k: float  # of the fundamental, rad/m
+
+    @property
+    def K(self) -> FloatArray:
+        """Decay of each harmonic with height, 1/m."""
+        return self.k * np.hypot(self.m, self.n)
+
+
+def modes(par: Parameters | Shape, order: int = ORDER) -> Modes:
+    """Harmonics up to `order` in x and in y.
+
+    Along x' and y' every kind of block is a product of two alternating square waves, of harmonics a, b = 1, 3, 5, ...:
+    s(a) cos for the upright blocks, q(a) sin for the lying ones. Each slab of magnetization (A cos cos upright,
+    -P sin cos and -Q cos sin lying) gives B_z = B_r / 2 (1 - e^(-K h_m)) (A + (alpha P + beta Q) / K).
+    """
+    tau = math.sqrt(2) * par.tau_n
+    a, b = (odd.astype(float) for odd in np.meshgrid(*[np.arange(1, 2 * order + 2, 2)] * 2, indexing="ij"))
+    alpha, beta = a * math.pi / tau, b * math.pi / tau
+    K = np.hypot(alpha, beta)
+
+    def s(j: FloatArray) -> FloatArray:
+        return 4 / (math.pi * j) * np.sin(j * math.pi * par.upright / 2)
+
+    def q(j: FloatArray) -> FloatArray:
+        return 4 / (math.pi * j) * np.sin(j * math.pi / 2) * np.sin(j * math.pi * (1 - par.upright) / 2)
+
+    rise = s(a) * s(b) + (alpha * q(a) * s(b) + beta * s(a) * q(b)) / K
+    B_z = par.B_r / 2 * -np.expm1(-K * par.h_m) * rise
+    amplitude = np.zeros((order + 1, order + 1))
+    # cos(alpha x') cos(beta y') is half the sum of two waves of orders (a +- b) / 2 and (a -+ b) / 2 in x and y.
+    for sign in (1, -1):
+        m, n = np.abs(a + sign * b).astype(int) // 2, np.abs(a - sign * b).astype(int) // 2
+        kept = (m <= order) & (n <= order)
+        np.add.at(amplitude, (m[kept], n[kept]), 0.5 * B_z[kept] * (-1.0) ** m[kept])
+    m, n = np.nonzero(amplitude)
+    n_b = (readonly(n.astype(float)), readonly(amplitude[m, n]))
+    return Modes(readonly(m.astype(float)), *n_b, k=math.pi / par.tau_n)
+
+
+def fundamental(par: Parameters, B_z: float) -> Modes:
+    """The field that (17)-(24) are written for, of amplitude B_z at z = 0: -B_z / 2 (cos k x - cos k y) e^(-k z)."""
+    m, n, b = np.array([1.0, 0.0]), np.array([0.0, 1.0]), np.array([-B_z / 2, B_z / 2])
+    return Modes(readonly(m), readonly(n), readonly(b), math.pi / par.tau_n)
+
+
+def flux_density(field: Modes, points: FloatArray) -> FloatArray:
+    """B at points (..., 3) above the magnets: T."""
+    x, y, z = (points[..., i, None] for i in range(3))
+    kx, ky = field.m * field.k, field.n * field.k
+    decay = field.b * np.exp(-field.K * z)
+    s_x, c_x, s_y, c_y = np.sin(kx * x), np.cos(kx * x), np.sin(ky * y), np.cos(ky * y)
+    parts = (kx / field.K * s_x * c_y, ky / field.K * c_x * s_y, c_x * c_y)
+    return np.stack([(decay * part).sum(-1) for part in parts], axis=-1)
+
+
+class Winding(NamedTuple):
+    """Where a coil's current flows: nodes of a quadrature over its plan, about its centre."""
+
+    x: FloatArray  # m
+    y: FloatArray
+    j_x: FloatArray  # direction of the current times the area that the node stands for, m^2
+    j_y: FloatArray
+
+
+def winding(par: Parameters | Shape, *, rectangles: bool = False, nodes: int = 64) -> Winding:
+    """A coil of uniform current density: four legs and four round corners of inner radius r_c, l_c between axes.
+
+    rectangles: the four l_c x w_c rectangles of (23) and (24), which overlap at the corners.
+    """
+    s, w_s = _gauss(nodes)
+    r, w_r = _gauss(max(8, nodes // 4))
+    straight = par.l_c if rectangles else par.l_c - par.w_c - 2 * par.r_c
+    # The leg at x > 0 carries its current along +y, the corner after it turns it to -x; the others are turned copies.
+    along, across = (grid.ravel() for grid in np.meshgrid(s * straight, r * par.w_c, indexing="ij"))
+    area = np.outer(w_s * straight, w_r * par.w_c).ravel()
+    leg = (par.l_c / 2 + across, along, 0 * area, area)
+    pieces = [leg]
+    if not rectangles:
+        angle, radius = np.meshgrid((s + 0.5) * math.pi / 2, par.r_c + (r + 0.5) * par.w_c, indexing="ij")
+        area = np.outer(w_s * math.pi / 2, w_r * par.w_c) * radius
+        c, s_ = np.cos(angle), np.sin(angle)
+        corner = (straight / 2 + radius * c, straight / 2 + radius * s_, -area * s_, area * c)
+        pieces.append(tuple(part.ravel() for part in corner))
+    turned = []
+    for x, y, j_x, j_y in pieces:
+        for _ in range(4):
+            turned.append((x, y, j_x, j_y))
+            x, y, j_x, j_y = -y, x, -j_y, j_x
+    return Winding(*(readonly(np.concatenate(part)) for part in zip(*turned, strict=True)))
+
+
+def _gauss(nodes: int) -> tuple[FloatArray, FloatArray]:
+    """Gauss-Legendre nodes and weights from -1/2 to 1/2."""
+    x, w = np.polynomial.legendre.leggauss(nodes)
+    return x / 2, w / 2
+
+
+def centre_of_force(par: Parameters | Shape) -> float:
+    """Height of the centre of the fundamental's force above a coil's lower face, m: r_z counts from there."""
+    k = math.pi / par.tau_n
+    return 1 / k - par.h_c / math.expm1(k * par.h_c)
+
+
+def quadrature(
+    par: Parameters, field: Modes, coil: Winding, position: FloatArray, turn: FloatArray | None = None
+) -> FloatArray:
+    """(12), (13) for 1 A in one coil by quadrature: F and T about the coil's centre of force, in the coil's frame.
+
+    position : of the coil's axis, and the height of its lower face there, m
+    turn : its R_RI where it is not level; it turns about its centre of force
+    """
+    z, w_z = _gauss(12)
+    R = np.eye(3) if turn is None else turn
+    shape = (len(z), len(coil.x))
+    local = np.stack(
+        [
+            np.broadcast_to(coil.x, shape),
+            np.broadcast_to(coil.y, shape),
+            np.broadcast_to(((z + 0.5) * par.h_c - centre_of_force(par))[:, None], shape),
+        ],
+        axis=-1,
+    )
+    centre = position + np.array([0, 0, centre_of_force(par)])
+    density = (
+        par.N_c / (par.w_c * par.h_c) * np.multiply.outer(w_z * par.h_c, np.stack([coil.j_x, coil.j_y], -1))
+    )
+    J = np.concatenate([density, np.zeros((*shape, 1))], axis=-1)
+    F = np.cross(J, flux_density(field, centre + local @ R) @ R.T)
+    return np.concatenate([F.sum((0, 1)), np.cross(local, F).sum((0, 1))])
+
+
+@dataclass(frozen=True, eq=False)
+class Series:
+    """Wrench of 1 A in a level coil, about its centre of force: exact where the field is.
+
+    Component c is `scale` times the sum of G[c] e^(-K z) sin or cos(m k x) sin or cos(n k y), see ODD_X and ODD_Y.
+    """
+
+    m: FloatArray
+    n: FloatArray
+    k: float  # rad/m
+    K: FloatArray  # 1/m
+    G: FloatArray  # 6 x harmonics at z = 0; times scale, N/A and N m/A
+    scale: Any = 1.0  # a CasADi symbol where turns or remanence are
+
+    def __call__(self, x: Any, y: Any, z: Any) -> Any:
+        """F_x F_y F_z T_x T_y T_z: CasADi's 6-vector, or (..., 6) of numpy arrays x, y, z of one shape.
+
+        In CasADi z may be a tuple of heights that add up: coils in a row share the decay over those they share.
+        """
+        if isinstance(x, np.ndarray):
+            decay = self.scale * np.exp(-np.multiply.outer(z, self.K))
+            X, Y = np.multiply.outer(x, self.k * self.m), np.multiply.outer(y, self.k * self.n)
+            X_, Y_ = (np.cos(X) * decay, np.sin(X) * decay), (np.cos(Y), np.sin(Y))
+            return np.stack(
+                [(X_[i] * Y_[j]) @ g for g, i, j in zip(self.G, ODD_X, ODD_Y, strict=True)], axis=-1
+            )
+        X, Y = (_multiples(self.k * v, int(max(*self.m, *self.n))) for v in (x, y))
+        heights = z if isinstance(z, tuple) else (z,)
+        decays = {K: math.prod(ca.exp(-K * height) for height in heights) for K in self.K.tolist()}
+        parts: list[Any] = [0] * 6
+        for m in range(int(self.m.max()) + 1):  # sums over n first: they are the same for all coils of one y
+            sums: list[Any] = [0] * 6
+            for h in np.flatnonzero(self.m == m):
+                waves = [decays[self.K[h]] * wave for wave in Y[int(self.n[h])]]
+                for c in np.flatnonzero(self.G[:, h]):
+                    sums[c] += self.G[c, h] * waves[ODD_Y[c]]
+            parts = [part + X[m][odd] * sum_n for part, odd, sum_n in zip(parts, ODD_X, sums, strict=True)]
+        return self.scale * ca.vertcat(*parts)
+
+    def above(self, force: float, z: float) -> Series:
+        """Without the harmonics whose forces stay below `force` (N/A) at the height z, and without such torques.
+
+        A harmonic's three forces stay or go together, as without curl and divergence. Each of its torques counts as a
+        force at three pole pitches, a coil's size: the arms of the coils' forces are as long.
+        """
+        size = np.abs(self.scale * self.G * np.exp(-self.K * z))
+        kept = size[:3].max(axis=0) >= force
+        G = np.where(np.vstack([[kept] * 3, size[3:] >= force * 3 * math.pi / self.k]), self.G, 0.0)[:, kept]
+        return Series(self.m[kept], self.n[kept], self.k, self.K[kept], readonly(G), self.scale)
+
+
+def _multiples(angle: Any, order: int) -> list[tuple[Any, Any]]:
+    """(cos, sin) of 0, 1, ..., order times an angle, by Chebyshev's recurrence: two calls of libm."""
+    c, s = ca.cos(angle), ca.sin(angle)
+    found: list[tuple[Any, Any]] = [(1, 0), (c, s)]
+    for _ in range(order - 1):
+        (c_i, s_i), (c_j, s_j) = found[-2:]
+        found.append((2 * c * c_j - c_i, 2 * c * s_j - s_i))
+    return found
+
+
+@lru_cache(maxsize=8)
+def unit_series(shape: Shape, order: int) -> Series:
+    """The whole field's harmonics up to `order`, for one turn and one tesla."""
+    return series(shape, modes(shape, order), winding(shape))
+
+
+def series(par: Parameters | Shape, field: Modes, coil: Winding) -> Series:
+    """(12), (13) harmonic by harmonic: plan by quadrature, height in closed form, position by addition theorems.
+
+    The terms that a coil of four-fold symmetry does not have are left out.
+    """
+    m, n, K = field.m[:, None], field.n[:, None], field.K
+    kappa = np.hypot(m, n)
+    x, y, j_x, j_y = coil
+    X, Y = field.k * m * x, field.k * n * y
+    s_x, c_x, s_y, c_y = np.sin(X), np.cos(X), np.sin(Y), np.cos(Y)
+    plan = [
+        -j_y * s_x * c_y,
+        j_x * c_x * s_y,
+        j_x * n / kappa * c_x * s_y - j_y * m / kappa * s_x * c_y,
+        y * (j_x * n / kappa * c_x * c_y + j_y * m / kappa * s_x * s_y),
+        x * (j_x * n / kappa * s_x * s_y + j_y * m / kappa * c_x * c_y),
+        -(x * j_x + y * j_y) * s_x * s_y,
+    ]
+    G = np.array([part.sum(-1) for part in plan])
+    # Integrals over the height of e^(-K z) and of (z - centre of force) e^(-K z).
+    zeroth = -np.expm1(-K * par.h_c) / K
+    first = (1 / K - centre_of_force(par)) * zeroth - par.h_c * np.exp(-K * par.h_c) / K
+    torque = np.array([-G[1], G[0]]) * first
+    G = G * zeroth
+    G[3:5] += torque
+    G *= par.N_c / (par.w_c * par.h_c) * field.b
+    G[np.abs(G) < 1e-13 * np.abs(G).max()] = 0  # rounding of what symmetry makes zero
+    kept = np.abs(G).max(axis=0) > 0
+    m_n = readonly(field.m[kept]), readonly(field.n[kept])
+    return Series(*m_n, k=field.k, K=readonly(K[kept]), G=readonly(G[:, kept]))

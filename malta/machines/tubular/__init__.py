@@ -1,0 +1,1 @@
+"""MALTA, the magnetically levitated tubular actuator."""

@@ -1,0 +1,404 @@
+"""The figures of the experiments on MALTA, as its paper draws them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from itertools import cycle
+from typing import TYPE_CHECKING
+
+import casadi as ca
+import numpy as np
+
+from malta.machines.tubular.experiments import RESTING
+from malta.model.data import plant_of
+from malta.report.figures.parts import (
+    BOUND,
+    CROSS,
+    DOT,
+    MORE,
+    NOTE,
+    STYLES,
+    Published,
+    bound_line,
+    callipers,
+    clearance,
+    end_of,
+    ending,
+    finish,
+    histogram,
+    line,
+    mark,
+    micro,
+    number,
+    page,
+    published_line,
+    read_out,
+    runs_of,
+    said,
+    shared_legend,
+    square,
+    told,
+    touched,
+    upright,
+)
+from malta.simulation.references import hold
+from malta.simulation.simulate import Trajectory, stroke_figures
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from malta.model.plant import Plant
+    from malta.simulation.experiments import Experiment, Merit
+
+
+def stroke_figure(run: Trajectory, published: Published | None = None) -> Figure:
+    """Axial position, tracking error, radial deviation, currents and thrust of a stroke. Figs 12 and 13."""
+    plant, f, axis, ms = run.plant, stroke_figures(run), run.plant.stroke_output, run.t * 1e3
+    first, last = run.scenario.reference(plant)(np.array([0, run.scenario.duration])).p[:, axis]
+    errors = (
+        f"axial error {f.axial_error * 1e3:.2f} mm, radial deviation {max(f.radial.values()) * 1e6:.1f} µm"
+    )
+    tracked = f"rise {number(f.rise * 1e3, 3)} ms, overshoot {f.overshoot * 100:.1f} %, "
+    figure = page(
+        [run],
+        f"stroke of {(last - first) * 1e3:.3g} mm{ending(run)}",
+        (tracked if run.verdict.completed else "") + errors,
+        right=0.925,
+        hspace=0.24,
+    )
+    (position, radial), (error, current) = figure.subplots(2, 2, sharex=True)
+    names = [s.name for s in plant.outputs]
+    line(position, ms, run.reference[:, axis] * 1e3, label="reference z*", **STYLES[2])
+    line(position, ms, run.p[:, axis] * 1e3, label="position z", **STYLES[0])
+    line(error, ms, (run.reference[:, axis] - run.p[:, axis]) * 1e3, **STYLES[0])
+    for i, style in zip((k for k in range(len(names)) if k != axis), (1, 0, 3, 2), strict=False):
+        line(radial, ms, (run.p[:, i] - run.reference[:, i]) * 1e6, label=names[i], **STYLES[style])
+    for name, style, i in _widest_currents(run):
+        line(current, ms, run.current[:, i], label=name, **STYLES[style])
+    published_line(error, published, "figure_12.axial_error", "mm", both=True)
+    published_line(radial, published, "figure_13.radial_deviation", "um", both=True)
+    reached = np.array([first, last, run.p[:, axis].min(), run.p[:, axis].max()]) * 1e3
+    margin = 0.05 * (reached.max() - reached.min())  # about the whole stroke, whatever became of it
+    position.set_ylim(reached.min() - margin, reached.max() + margin)
+    finish(position, "", "axial position z [mm]", legend=2)
+    finish(radial, "", "radial deviation [µm]", legend=4)
+    finish(error, "time [ms]", "axial error z* - z [mm]")
+    finish(current, "time [ms]", "current per module [A]", legend=3)
+    constant = plant_of(run.controller.parameters).actuator.force_constant[plant.thrust_input]
+    thrust = current.secondary_yaxis("right", functions=(lambda i: i * constant, lambda f: f / constant))
+    thrust.set_ylabel("thrust [N]")
+    return figure
+
+
+def _widest_currents(run: Trajectory) -> list[tuple[str, int, int]]:
+    """The thrust current and the two bearing currents that carry the weight: label, style, index."""
+    inputs = [s.name for s in run.plant.inputs]
+    thrust = run.plant.thrust_input
+    widest = np.argsort(-np.abs(run.v).max(axis=0), kind="stable")
+    others = sorted(int(i) for i in widest[widest != thrust][:2])
+    return [(inputs[i], style, i) for style, i in enumerate([thrust, *others])]
+
+
+def hold_figure(e: Experiment, published: Published | None = None) -> Figure:
+    """Histograms of measured and true positions at rest, in bins of the sensors' resolution. Fig. 14, Table III."""
+    run, axis = e.run, e.run.plant.stroke_output
+    names = [s.name for s in run.plant.outputs]
+    y, p = run.y[-RESTING:] * 1e6, run.p[-RESTING:] * 1e6
+    bins = [1e6 * (r or s / 3) or 1.0 for r, s in zip(run.plant.resolution, run.plant.noise, strict=True)]
+    rms, widest = np.sqrt((p**2).mean(axis=0)), np.abs(y).max(axis=0)
+    radial = [k for k in range(len(names)) if k != axis]
+    figure = page(
+        [run],
+        f"{len(y)} samples at rest{ending(run)}",
+        "mean and standard deviation of what is measured above the bars; "
+        f"true motion {number(rms[radial].max(), 2)} µm rms radially, {number(rms[axis], 2)} µm axially",
+        wspace=0.33,
+    )
+    grid = figure.add_gridspec(2, 3)
+    panels = [figure.add_subplot(grid[k % 2, k // 2] if k != axis else grid[:, 2]) for k in range(len(names))]
+    labels = (
+        f"measured, in bins of {bins[0]:.2g} µm ({names[axis]}: {bins[axis]:.2g} µm)",
+        "true, in bins of a tenth",
+    )
+    spreads = [[("ours", float(y[:, k].mean()), float(y[:, k].std()))] for k in range(len(names))]
+    if published is not None:
+        for name, found in zip(names, spreads, strict=True):
+            mean, std = (read_out(published, f"table_III.{what}.{name}", "um") for what in ("mean", "std"))
+            found.append(("Table III", mean, std))
+    for k, axes in enumerate(panels):
+        reach = 1.4 * max(float(widest[k] if k == axis else widest[radial].max()), bins[k])
+        told = [2.4 * (abs(mean) + std) for _, mean, std in spreads[k][1:]]
+        histogram(axes, (y[:, k], p[:, k]), labels, bins[k], max([min(reach, 60 * bins[k]), *told]))
+        finish(axes, f"{names[k]} [µm]", "share of samples [%]")
+    highest = max(panels[k].dataLim.y1 for k in radial)
+    for k, axes in enumerate(panels):
+        callipers(axes, spreads[k], float(axes.dataLim.y1) if k == axis else highest)
+    shared_legend(figure)
+    return figure
+
+
+def tilt_figure(e: Experiment, published: Published | None = None) -> Figure:
+    """The circle in sensor plane 1, what it leaves in sensor plane 2, and both over time. Fig. 16, eq. (21)."""
+    figure = page(runs_of(e), "circle in sensor plane 1, sensor plane 2 held", told(e.cases, 0))
+    (circle, tracking), (blow_up, deviation) = figure.subplots(2, 2, width_ratios=(1, 1.6))
+    for case, style in zip(e.cases, STYLES, strict=False):
+        run, error = case.run, (case.run.p - case.run.reference) * 1e6
+        late = slice(len(error) // 2, None)
+        circle.plot(run.p[late, 0] * 1e6, run.p[late, 1] * 1e6, label=case.label, **style)
+        blow_up.plot(error[late, 2], error[late, 3], **style)
+        for axes, k in ((tracking, 0), (deviation, 2)):
+            distance = np.hypot(error[:, k], error[:, k + 1])
+            line(axes, run.t, distance, **style)
+            mark(axes, run, run.t, distance)
+    asked = e.run.reference * 1e6
+    circle.plot(
+        asked[:, 0], asked[:, 1], label="reference", **STYLES[2] | {"color": "#000000", "linewidth": 0.9}
+    )
+    bound = 0.0
+    if published is not None:
+        bound, angle = read_out(published, "figure_16.deviation", "um"), np.linspace(0, 2 * math.pi, 181)
+        blow_up.plot(bound * np.cos(angle), bound * np.sin(angle), **BOUND)
+        blow_up.annotate("published bound", (0, -1.08 * bound), ha="center", va="top", **NOTE)
+    for axes in (tracking, deviation):
+        axes.set_yscale("log")
+        axes.set_ylim(bottom=0.1)
+    published_line(deviation, published, "figure_16.deviation", "um", where="below right")
+    square(circle)
+    square(blow_up, least=1.4 * bound)
+    late_part = "second half" if any(map(touched, runs_of(e))) else "last period"
+    finish(circle, f"x1, {late_part} [µm]", "y1 [µm]")
+    finish(blow_up, f"x2, {late_part} [µm]", "y2 [µm]")
+    finish(tracking, "time [s]", "plane 1, off reference [µm]")
+    finish(deviation, "time [s]", "plane 2, off centre [µm]")
+    shared_legend(figure)
+    return figure
+
+
+def lift_off_figure(e: Experiment, _: Published | None = None) -> Figure:
+    """From the touchdown bearing to the centre, and the bearing currents, for each start-up estimator."""
+    plant, runs = e.run.plant, runs_of(e)
+    figure = page(runs, "lift-off from the touchdown bearing", told(e.cases, 1), hspace=0.2)
+    panels = figure.subplots(2, 2, sharex=True, sharey="row")
+    for k, (height, current) in zip((1, 3), panels.T, strict=True):
+        for case, style in zip(e.cases, STYLES, strict=False):
+            ms, y = case.run.t * 1e3, case.run.p[:, k] * 1e6
+            line(height, ms, y, label=case.label, **style)
+            mark(height, case.run, ms, y)
+            line(current, ms, case.run.force[:, k] / plant.actuator.force_constant[k], **style)
+        bound_line(height, -clearance(plant) * 1e6, "touchdown bearing")
+        bound_line(current, e.merits[0].value, "lifts it by statics")
+        finish(height, "", f"{plant.outputs[k].name} [µm]")
+        finish(current, "time [ms]", f"current of {plant.inputs[k].name} [A]")
+    moving = max(float(run.t[np.flatnonzero(np.abs(run.p[:, 1]) > 20e-6)].max(initial=0.0)) for run in runs)
+    panels[0, 0].set_xlim(0, 1e3 * min(1.6 * moving, max(float(run.t[-1]) for run in runs)) or None)
+    shared_legend(figure)
+    return figure
+
+
+def payload_figure(e: Experiment, published: Published | None = None) -> Figure:
+    """Sag after the pick and the stroke that follows, for each mass; touchdowns are marked."""
+    plant, runs = e.run.plant, runs_of(e)
+    figure = page(runs, "masses picked during a hold, then moved", told(e.cases, 0))
+    (sag, axial), (largest, radial) = figure.subplots(2, 2)
+    t, picked = e.run.t, e.run.scenario.changes[0][0]
+    begin = _half_way(e.run) - 0.05
+    lowest = min((1, 3), key=lambda k: float(e.run.p[(t >= picked) & (t < begin), k].min(initial=0.0)))
+    sag.set_xlim(-20, (begin - picked) * 1e3)
+    for axes in (axial, radial):
+        axes.set_xlim(0, (e.run.scenario.duration - begin) * 1e3)
+    masses = [(run.scenario.changes[0][1]["m"] - plant.mass) * 1e3 for run in runs]
+    for case, mass, style in zip(e.cases, masses, cycle((*STYLES, *MORE))):
+        run, y = case.run, case.run.p[:, lowest] * 1e6
+        last = int(np.searchsorted(run.t, begin))
+        shown = slice(0, min(last, end_of(run) + 1))
+        line(sag, (run.t[shown] - picked) * 1e3, y[shown], label=case.label, **style)
+        mark(sag, run, (run.t - picked) * 1e3, y)
+        largest.plot(mass, case.merits[0].value * 1e6, **(CROSS if touched(run) else DOT))
+        if not touched(run):
+            ms, error = (run.t[last:] - begin) * 1e3, (run.reference - run.p)[last:]
+            line(axial, ms, error[:, plant.stroke_output] * 1e3, **style)
+            line(radial, ms, np.abs(error[:, :4]).max(axis=1) * 1e6, **style)
+    if all(map(touched, runs)):
+        axial.annotate("none is carried", (0.5, 0.5), xycoords="axes fraction", ha="center", **NOTE)
+    bound_line(sag, -clearance(plant) * 1e6, "touchdown bearing")
+    bound_line(largest, clearance(plant) * 1e6, "touchdown bearing", where="above left")
+    if published is not None:
+        payload = read_out(published, "position_controller.payload", "kg") * 1e3
+        largest.axvline(payload, **BOUND)
+        upright(largest, payload, 0.26, "published payload", ha="right")
+    published_line(axial, published, "figure_12.axial_error", "mm", EMPTY, both=True, where="above left")
+    published_line(radial, published, "figure_13.radial_deviation", "um", EMPTY, where="above left")
+    finish(sag, "time after the pick [ms]", f"sag {plant.outputs[lowest].name} [µm]")
+    finish(largest, "picked mass [g]", "largest sag [µm]")
+    largest.set(xlim=(0, 1.1 * max(masses)), ylim=(0, None))
+    radial.set_ylim(0, None)
+    finish(axial, "time of the stroke [ms]", "axial error z* - z [mm]")
+    finish(radial, "time of the stroke [ms]", "largest radial deviation [µm]")
+    shared_legend(figure)
+    return figure
+
+
+EMPTY = "published, empty"  # the paper's bounds are of a stroke without payload
+
+
+def _half_way(run: Trajectory) -> float:
+    """When the reference of the stroke axis is fastest, s; of the whole scenario."""
+    t = np.arange(0, run.scenario.duration, run.controller.sample_time)
+    return float(t[np.abs(run.scenario.reference(run.plant)(t).dp[:, run.plant.stroke_output]).argmax()])
+
+
+def thermal_figure(e: Experiment, published: Published | None = None) -> Figure:
+    """The drift of the support, and the mover's place in space with and without the outer loop. Fig. 15."""
+    _, now, true = (said(merit) for merit in e.merits)
+    found = f"{told(e.cases, 0)}; lag {now}, at true speed {true}"
+    figure = page(runs_of(e), "support drifts by thermal expansion", found, hspace=0.18)
+    space, blow_up = figure.subplots(2, 1, sharex=True)
+    t, drift = e.run.t, e.curves["drift"]
+    line(space, t, drift * 1e6, label="drift of the support", color="#cfcfcf", linewidth=6)
+    for case, style in zip(e.cases, STYLES, strict=False):
+        size = min(len(t), len(case.run.t))
+        place = (case.run.p[:size, 2] + drift[:size]) * 1e6
+        line(space, t[:size], place, label=f"mover in space, {case.label}", **style)
+        mark(space, case.run, t[:size], place)
+        if case is e.cases[0]:
+            line(blow_up, t, place, **style | {"linewidth": 0.8})
+    read = ("figure_14.resolution", "um", "published resolution of the sensors")
+    published_line(blow_up, published, *read, both=True, where="under right")
+    finish(space, "", "x2 in space [µm]")
+    finish(blow_up, "simulated time [s]", f"{e.cases[0].label}, enlarged [µm]")
+    shared_legend(figure)
+    return figure
+
+
+def disturbance_figure(e: Experiment, _: Published | None = None) -> Figure:
+    """Compliance over frequency with simulated points, and the responses to steps and to vibration."""
+    plant, c = e.run.plant, e.curves
+    worst, at, stiffness = (said(merit) for merit in e.merits)
+    found = f"largest compliance {worst} at {at}, smallest dynamic stiffness {stiffness}"
+    figure = page(runs_of(e), "forces and torques on the mover", found, hspace=0.44)
+    (compliance, radial), (axial, vibration) = figure.subplots(2, 2)
+    compliance.loglog(
+        c["frequency"], c["compliance"] * 1e6, label="linear loop, currents as lags", **STYLES[0]
+    )
+    points = DOT | {"color": STYLES[1]["color"], "label": f"simulated, {e.run.scenario.fidelity}"}
+    compliance.loglog(c["tones"], c["simulated"] * 1e6, **points)
+    sideways = iter(STYLES)
+    for case in e.cases:
+        run, ms = case.run, case.run.t * 1e3
+        if not case.label.startswith("step"):
+            late = run.t > run.t[-1] - 0.1
+            line(vibration, ms[late], run.p[late, 1] * 1e6, label=case.label, **STYLES[0])
+            continue
+        if "F_z" in case.label:
+            axes, deflection, style = axial, run.p[:, plant.stroke_output] * 1e3, STYLES[0]
+        else:
+            axes, deflection, style = radial, run.p[:, 0] * 1e6, next(sideways)
+        line(axes, ms, deflection, label=case.label.removeprefix("step of "), **style)
+        mark(axes, run, ms, deflection)
+    finish(compliance, "frequency [Hz]", "x1 over F_x [µm/N]", legend=2)
+    finish(radial, "time [ms]", f"{plant.outputs[0].name} [µm]", legend=3)
+    finish(axial, "time [ms]", f"{plant.stroke} [mm]", legend=2)
+    finish(vibration, "time [ms]", f"{plant.outputs[1].name} [µm]", legend=1)
+    return figure
+
+
+def faults_figure(e: Experiment, _: Published | None = None) -> Figure:
+    """The largest radial deviation after each fault against the clearance, and the four worst over time."""
+    edge = clearance(e.run.plant) * 1e6
+    survived = f"{e.merits[0].value:.0f} of {len(e.cases)} survived"
+    during = "stroke" if e.run.scenario.reference is not hold else "hold"
+    figure = page(runs_of(e), f"faults during a {during}", survived, left=0.245, wspace=0.24)
+    bars, traces = figure.subplots(1, 2, width_ratios=(1, 1.25))
+    for place, case in enumerate(e.cases):
+        down, deviation = touched(case.run), case.merits[0].value * 1e6
+        bars.barh(place, deviation, height=0.62, color="#2b2b2b" if down else "#c9c9c9")
+        text = _when(case.merits[1]) if down else f"{number(deviation, 2)} µm"
+        inside = deviation > edge / 10
+        style = NOTE | {"color": "#ffffff" if down else NOTE["color"], "ha": "right" if inside else "left"}
+        bars.annotate(text, (deviation * (0.88 if inside else 1.1), place), va="center", **style)
+    bars.set_yticks(range(len(e.cases)), [micro(case.label) for case in e.cases], fontsize=9)
+    bars.invert_yaxis()
+    bars.set_xscale("log")
+    bars.set_xlim(0.1, 2 * edge)
+    bars.axvline(edge, **BOUND)
+    upright(bars, 1.1 * edge, 0.02, "touchdown bearing", ha="left")
+    struck = e.run.scenario.faults[0].at
+    traces.set_xlim(-20, (e.run.scenario.duration - struck) * 1e3)
+    worst = sorted(e.cases, key=lambda case: -case.merits[0].value)[: len(STYLES)]
+    for case, style in zip(worst, STYLES, strict=False):
+        run, last = case.run, end_of(case.run) + 1
+        ms = (run.t[:last] - struck) * 1e3
+        deviation = np.maximum(np.abs(run.p[:last, :4]).max(axis=1) * 1e6, 1e-3)
+        line(traces, ms, deviation, label=micro(case.label), **style)
+        mark(traces, run, ms, deviation, named=False)
+    traces.set_yscale("log")
+    traces.set_ylim(bottom=0.1)
+    bound_line(traces, edge, "touchdown bearing")
+    finish(bars, "largest radial deviation [µm]", "")
+    finish(traces, "time after the fault [ms]", "radial deviation of the worst [µm]", legend=2, side="right")
+    return figure
+
+
+def _when(after: Merit) -> str:
+    return f"touchdown after {said(after)}" if after.value >= 0 else "touchdown before it"
+
+
+def drive_limits_figure(e: Experiment, _: Published | None = None) -> Figure:
+    """Position, speed, current and voltage of the fastest stroke and of the sigmoid, against the limits."""
+    plant, actuator = e.run.plant, e.run.plant.actuator
+    what = "fastest stroke, and sigmoid of the same peak current"
+    what += "".join(f", {case.label}{ending(case.run)}" for case in e.cases if ending(case.run))
+    figure = page(runs_of(e), what, told(e.cases, 1), hspace=0.2)
+    (position, current), (speed, voltage) = figure.subplots(2, 2, sharex=True)
+    half = 0.75e3 * e.cases[-1].merits[1].value
+    position.set_xlim(-half, half)
+    thrust, rate = _thrust_axis(plant), len(plant.states) // 2 + plant.stroke_state
+    for case, style in zip(e.cases, STYLES, strict=False):
+        run, ms = case.run, (case.run.t - case.run.scenario.duration / 2) * 1e3
+        line(position, ms, run.p[:, plant.stroke_output] * 1e3, label=case.label, **style)
+        mark(position, run, ms, run.p[:, plant.stroke_output] * 1e3)
+        line(speed, ms, run.x[:, rate], **style)
+        line(current, ms, run.axis_currents[:, thrust], **style)
+        if run.u.size:
+            line(voltage, ms, run.u[:, thrust], **style)
+    if not e.run.u.size:
+        note = f"none at fidelity {e.run.scenario.fidelity}"
+        voltage.annotate(note, (0.5, 0.5), xycoords="axes fraction", ha="center", **NOTE)
+    for axes, merit, limit in (
+        (current, e.merits[0], actuator.current_limit),
+        (voltage, e.merits[1], actuator.voltage_limit),
+    ):
+        bound_line(axes, merit.value, "for the reference", both=True, where="below left")
+        bound_line(axes, limit, "limit of the drive", both=True, where="above left")
+    finish(position, "", "position z [mm]")
+    finish(current, "", "current per module [A]")
+    finish(speed, "time from half-way [ms]", "speed [m/s]")
+    finish(voltage, "time from half-way [ms]", "voltage per module [V]")
+    shared_legend(figure)
+    return figure
+
+
+def _thrust_axis(plant: Plant) -> int:
+    """The first axis that carries the thrust current."""
+    unit = np.zeros(len(plant.inputs))
+    unit[plant.thrust_input] = 1.0
+    return int(np.flatnonzero(np.array(ca.DM(plant.drive.command(ca.DM(unit)))))[0])
+
+
+def _published_stroke(e: Experiment, published: Published | None) -> Figure:
+    """Bounds only where the paper shows this very stroke."""
+    return stroke_figure(e.run, published if any(merit.published for merit in e.merits) else None)
+
+
+FIGURES: dict[str, Callable[[Experiment, Published | None], Figure]] = {
+    "stroke": _published_stroke,
+    "hold": hold_figure,
+    "tilt": tilt_figure,
+    "lift-off": lift_off_figure,
+    "payload": payload_figure,
+    "thermal": thermal_figure,
+    "disturbance": disturbance_figure,
+    "faults": faults_figure,
+    "drive-limits": drive_limits_figure,
+}

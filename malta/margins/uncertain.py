@@ -1,0 +1,297 @@
+"""Linear models and control laws with uncertain parameters: what a robustness margin is asked of.
+
+x' = A(p) x + B(p) u,  y = C(p) x        derived from a plant's CasADi model, parameters by name
+u = H F y                                 a control law F, and what stands between it and the plant: H
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import casadi as ca
+import numpy as np
+
+from malta.errors import CheckError
+from malta.model.linearize import jacobians
+from malta.model.plant import Plant, symbolic
+from malta.synthesis.controller import (
+    Controller,
+    CurrentLoop,
+    LinearLaw,
+    handed_on,
+    linear_law,
+)
+from malta.synthesis.riccati import add_lags, delay_inputs, sample
+
+if TYPE_CHECKING:
+    from malta.model.plant import ComplexArray, FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class UncertainSystem:
+    """E(p) x' = A(p) x + B(p) u, y = C(p) x + D(p) u with parameters p by name.
+
+    matrices: p -> A, B, C, or with D, or with D and E. All structure is read from its expressions.
+    limits: what each parameter may be at all, (above, below), exclusive; anything where none are given.
+    sample_time: s, where x+ stands in place of x'.
+    """
+
+    names: tuple[str, ...]
+    nominal: FloatArray
+    matrices: ca.Function
+    limits: tuple[tuple[float, float], ...] = ()
+    sample_time: float | None = None
+
+    def at(self, p: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """A, B, C at rows of parameters: arrays of k matrices."""
+        rows = np.atleast_2d(p)
+        found = self.matrices.map(len(rows))(rows.T)
+        shapes = [self.matrices.size_out(i) for i in range(3)]
+        return tuple(  # type: ignore[return-value]
+            np.array(M).reshape(a, len(rows), b).swapaxes(0, 1)
+            for M, (a, b) in zip(found, shapes, strict=True)
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Compensator:
+    """u = F y: x+ = A x + B y (x' where sample_time is None), u = C x + D y; the last states integrate alone.
+
+    What stands between u and the plant: a whole number of samples of delay, a zero-order hold where sampled, and a
+    first-order lag w_c / (s + w_c) where `lag` is given.
+    """
+
+    A: FloatArray
+    B: FloatArray
+    C: FloatArray
+    D: FloatArray
+    integrals: int = 0  # how many of the last states: x+ = x + B y, x' = B y
+    sample_time: float | None = None  # s; None: continuous
+    delay: int = 0  # samples
+    lag: float | None = None  # rad/s
+
+
+def held_at(plant: Plant, position: float) -> FloatArray:
+    """H of the currents that are held at a position along the stroke, where E = B H."""
+    of, none = model_of(plant, plant, ()), ca.DM(0, 1)
+    acting = of(none, position, 0)[-1]
+    _, B, _, E = (np.array(M) for M in of(none, position, acting)[:4])
+    return np.asarray(np.linalg.lstsq(B, E, rcond=None)[0])
+
+
+@lru_cache(maxsize=16)  # plants compare by identity, and are built once for their parameters
+def model_of(plant: Plant, believed: Plant, names: tuple[str, ...]) -> ca.Function:
+    """(parameters, position along the stroke, inputs wanted) -> what `jacobians` gives, and the preload that acts."""
+    from malta.model.data import twins_of
+
+    par = plant.parameters
+    p, z, v = ca.SX.sym("p", len(names)), ca.SX.sym("z"), ca.SX.sym("v", len(plant.inputs))
+    own = dict(zip(names, ca.vertsplit(p), strict=True)) if names else {}
+    own = {name: own[twin] for name, twin in twins_of(par).items() if twin in own} | own
+    machine: Plant = plant.variant(symbolic(par, own))
+    x, u = ca.SX.sym("x", len(plant.states)), ca.SX.sym("u", len(plant.inputs))
+    point = ca.SX(plant.at().x)
+    point[plant.stroke_state] = z
+    preload = ca.SX(machine.preload(point))
+    found = jacobians(machine, believed, x, u, v, ca.SX.zeros(len(plant.disturbances)))
+    A, B, C, E, made, ratio = ca.substitute(list(found), [x, u], [point, preload])
+    keep = list(plant.controlled)
+    parts = [A[keep, keep], B[keep, :], C[:, keep], E[keep, :], made, ratio, preload]
+    return ca.Function("model", [p, z, v], ca.cse([ca.densify(part) for part in parts]))
+
+
+@lru_cache(maxsize=64)  # writing out the currents takes longer than most that is asked of the answer
+def holds(plant: Plant) -> bool:
+    """Whether the currents of a machine depend on where they were commutated, so that holding them matters."""
+    kind = ca.MX if plant.tabulated else ca.SX
+    y, v = kind.sym("y", len(plant.outputs)), kind.sym("v", len(plant.inputs))
+    return bool(ca.which_depends(plant.currents(y, v), y, 1, True) != [False] * len(plant.actuator.coils))
+
+
+def lowest(declared: Mapping[str, Any]) -> float:
+    """What a parameter is above, or at least."""
+    found = [declared[key] for key in ("above", "at_least") if declared.get(key) is not None]
+    return float(max(found)) if found else -math.inf
+
+
+def sampled_law(
+    controller: Controller,
+    delay: int,
+    lag: float,
+    loop: CurrentLoop | None = None,
+    R: float = 1.0,
+    *,
+    held: FloatArray | None = None,
+    handed: bool = False,
+) -> Compensator:
+    """The control law of a gain file as the machine runs it: hold, `delay` samples, current loops.
+
+    lag : rad/s, crossover of the current loops, taken as first-order lags; with `loop`, the windings' own R / L
+    loop : PI controllers of the currents, for windings of resistance R (ohm), sampled with the control law
+    held : H of currents that are held: v + H y acts; handed: the reading itself is a further input of the system
+    """
+    law, T = linear_law(controller), controller.sample_time
+    n, m, half = len(controller.states), len(controller.forces), len(controller.A) // 2
+    p = len(law.A) - n
+    # Sums of errors and stored forces in the coordinates of the modes, where these decouple.
+    to_modes = np.eye(len(law.A))
+    if len(controller.measurements) == m == half:
+        if p:
+            to_modes[n:, n:] = np.linalg.inv(controller.C[:, :half])
+        for k in range(2 * half, n, m):
+            to_modes[k : k + m, k : k + m] = controller.B[half:]
+    back = np.linalg.inv(to_modes)
+    law = law._replace(A=to_modes @ law.A @ back, B_y=to_modes @ law.B_y, C=law.C @ back)
+    if controller.observed:
+        law, p = _integrals_last(law, m), m
+    if held is not None:
+        law = law._replace(D_y=law.D_y + held)
+    if handed:
+        law = handed_on(law)
+    c = Compensator(
+        law.A, law.B_y, law.C, law.D_y,
+        integrals=p, sample_time=T, delay=delay, lag=lag if math.isfinite(lag) else None,
+    )  # fmt: skip
+    return c if loop is None else _with_current_control(c, loop, R, controller.B[half:])
+
+
+def _integrals_last(law: LinearLaw, count: int) -> LinearLaw:
+    """A law that takes off disturbances d integrates: d + X xi is a plain sum of the readings, in the place of d, last.
+
+    With A = [[M, N], [G, 1]] that is X (M - 1) = -G; then X N = 0, as the law leaves no constant disturbance in xi.
+    """
+    A, k = law.A, len(law.A) - count
+    try:
+        X = -np.linalg.solve((A[:k, :k] - np.eye(k)).T, A[k:, :k].T).T
+    except np.linalg.LinAlgError as error:
+        raise CheckError("the law sums errors beside the disturbances that it observes") from error
+    left, size = np.abs(X @ A[:k, k:]).max(), (np.abs(X) @ np.abs(A[:k, k:])).max()
+    if not left <= 1e-8 * size:
+        raise CheckError(
+            f"the law does not take off constant disturbances: {left / size:.1e} of them is left"
+        )
+
+    def summed(M: FloatArray) -> FloatArray:
+        return np.vstack([M[:k], M[k:] + X @ M[:k]])
+
+    T = np.eye(len(A))
+    T[k:, :k] = -X
+    A = summed(A) @ T
+    A[k:] = np.eye(len(A))[k:]
+    return law._replace(A=A, B_y=summed(law.B_y), B_r=summed(law.B_r), C=law.C @ T)
+
+
+def _with_current_control(c: Compensator, loop: CurrentLoop, R: float, B2: FloatArray) -> Compensator:
+    """In series: the voltages that PI controllers ask for, over R, so that the lag R / L makes currents of them.
+
+    Each axis: e = v - i, I+ = I + Ki T e, u = Kp e + I+, i+ = a i + (1 - a) u[k - d] / R with a = e^(-T R / L).
+    """
+    assert c.sample_time is not None
+    assert c.lag is not None
+    T, d, m = c.sample_time, c.delay, len(c.C)
+    a = math.exp(-T * c.lag)
+    slope, gain = loop.Ki * T, loop.Kp + loop.Ki * T
+    A, B = np.zeros((2 + d, 2 + d)), np.zeros((2 + d, 1))  # I, i, voltages under way (the oldest first)
+    A[0, :2], B[0] = (1, -slope), slope
+    A[1, 1] = a
+    C, D = np.zeros((1, 2 + d)), gain
+    C[0, :2] = 1, -gain
+    if d:
+        A[1, 2] = (1 - a) / R
+        A[2:-1, 3:] = np.eye(d - 1)
+        A[-1], B[-1] = C, D
+    else:
+        A[1] += (1 - a) / R * C[0]
+        B[1] = (1 - a) / R * D
+    k = len(c.A) - c.integrals
+    modes = B2 if B2.shape == (m, m) else np.eye(m)
+    A5, B5, C5 = np.kron(A, np.eye(m)), np.kron(B, modes), np.kron(C, np.linalg.inv(modes)) / R
+    own = [*range(k), *range(k + len(A5), k + len(A5) + c.integrals)]
+    axes = [*range(k, k + len(A5))]
+    full = np.zeros((len(c.A) + len(A5),) * 2)
+    full[np.ix_(own, own)] = c.A
+    full[np.ix_(axes, axes)] = A5
+    full[np.ix_(axes, own)] = B5 @ c.C
+    driven, out = np.zeros((len(full), c.B.shape[1])), np.zeros((m, len(full)))
+    driven[own], driven[axes] = c.B, B5 @ c.D
+    out[:, own], out[:, axes] = c.C * D / R, C5
+    return replace(c, A=full, B=driven, C=out, D=c.D * D / R)
+
+
+def differences(c: Compensator) -> tuple[FloatArray, FloatArray]:
+    """A, B of x' or of (x+ - x) / T."""
+    T = c.sample_time
+    return (c.A, c.B) if T is None else ((c.A - np.eye(len(c.A))) / T, c.B / T)
+
+
+class _Sides(NamedTuple):
+    """Both sides of the loop as the eigenvalues and responses want them: x' = A x + B u, or of sampled (x+ - x) / T."""
+
+    A: FloatArray  # plant, lags, stored inputs
+    B: FloatArray
+    C: FloatArray
+    F_A: FloatArray  # compensator
+    F_B: FloatArray
+
+
+def _sides(c: Compensator, A: FloatArray, B: FloatArray, C: FloatArray) -> _Sides:
+    """Differences, as poles of slow modes stand close to 1, where A of x+ = A x itself has lost their digits."""
+    if c.lag is not None:
+        A, B = add_lags(A, B, c.lag)
+    if c.sample_time is not None:
+        n, T = len(A), c.sample_time
+        _, Phi = sample(A, np.eye(n), T)  # (e^AT - 1) / T = A Phi / T
+        A, B = delay_inputs(A @ Phi / T, Phi @ B / T, c.delay)
+        stored = np.arange(n, len(A))  # of these, delay_inputs gives the next values
+        A[n:], B[n:] = A[n:] / T, B[n:] / T
+        A[stored, stored] -= 1 / T
+    return _Sides(A, B, np.hstack([C, np.zeros((len(C), len(A) - C.shape[1]))]), *differences(c))
+
+
+def closed_loop(system: UncertainSystem, c: Compensator, p: FloatArray) -> FloatArray:
+    """State matrices of the closed loop at rows of parameters, exactly; of sampled loops (A - 1) / T.
+
+    States: plant, lags, stored inputs, compensator.
+    """
+    matrices = []
+    for plant in zip(*system.at(p), strict=True):
+        s = _sides(c, *plant)
+        matrices.append(np.block([[s.A + s.B @ c.D @ s.C, s.B @ c.C], [s.F_B @ s.C, s.F_A]]))
+    return np.array(matrices)
+
+
+def responses(
+    system: UncertainSystem, c: Compensator, p: FloatArray, w: FloatArray
+) -> tuple[ComplexArray, ComplexArray]:
+    """P H and F at one row of parameters and frequencies w (rad/s): k x outputs x inputs, k x inputs x outputs."""
+    s = _sides(c, *(M[0] for M in system.at(p)))
+    jw: ComplexArray = 1j * np.asarray(w, dtype=float)
+    if c.sample_time is not None:
+        jw = np.expm1(jw * c.sample_time) / c.sample_time
+    jw = jw[:, None, None]
+    P: ComplexArray = s.C @ np.linalg.solve(jw * np.eye(len(s.A)) - s.A, s.B)
+    F = c.C @ np.linalg.solve(jw * np.eye(len(s.F_A)) - s.F_A, s.F_B) + c.D
+    return P, np.asarray(F, dtype=complex)
+
+
+def instability(system: UncertainSystem, c: Compensator, p: FloatArray) -> FloatArray:
+    """How far the worst pole is beyond the boundary, 1/s: its real part, of sampled loops ln|lambda| / T."""
+    poles = np.linalg.eigvals(closed_loop(system, c, p))
+    if c.sample_time is not None:
+        T = c.sample_time
+        grown = (2 * T * poles.real + T**2 * np.abs(poles) ** 2).max(axis=1)  # |lambda|^2 - 1
+        return np.asarray(np.log1p(np.maximum(grown, -1 + 1e-15)) / (2 * T))
+    return np.asarray(poles.real.max(axis=1))
+
+
+def critical(system: UncertainSystem, c: Compensator, p: FloatArray) -> float:
+    """Frequency of the worst pole at one row of parameters, rad/s."""
+    (poles,) = np.linalg.eigvals(closed_loop(system, c, p))
+    if c.sample_time is None:
+        return float(abs(poles[poles.real.argmax()].imag))
+    z = 1 + c.sample_time * poles
+    return float(abs(np.angle(z[np.abs(z).argmax()])) / c.sample_time)

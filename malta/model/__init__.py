@@ -1,0 +1,1 @@
+"""Machines as records: parameters, plants in CasADi, rigid bodies, linearization, signals and units."""

@@ -1,0 +1,159 @@
+"""Windings and inverter: the two-directional dq transformation, duty cycles, DC link, position sensing.
+
+A module has 3 x 3 coils, r around and c along the machine; x_rc is any phase quantity. Eq. (16), X_dq = K_R X_abc K_L:
+
+    K_R(phi)   = [1/3 1/3 1/3; 2/3 cos(phi - 2 pi r / 3)]               zero sequence, bearing axis
+    K_L(theta) = 2/3 [cos(theta - 2 pi c / 3), -sin(theta - 2 pi c / 3)],   theta = pi z / L_p
+
+The paper does not print the two; these map pure currents to single entries of 1 (amplitude-invariant). Both have rank
+2 and inverses in the Moore-Penrose sense only: five of the nine modes carry nothing.
+
+NOTE: (18) commands a magnitude and an angle phi = atan2(f_y, f_x) (the paper prints a quotient in it). That angle is
+undefined at zero force and jumps by pi through it. Here phi stands still at 0 and at pi/2: two fixed bearing axes,
+d along x and q along y, whose currents are f_x / K_B and f_y / K_B. The axes of a module are AXES, rotary letter first.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import casadi as ca
+import numpy as np
+
+from malta.model.plant import Actuator, Drive
+
+if TYPE_CHECKING:
+    from malta.model.plant import FloatArray
+
+AXES = ("0d", "0q", "dd", "dq", "qd", "qq")
+WEIGHT = (4.5, 4.5, 2.25, 2.25, 2.25, 2.25)  # power of a module = sum of weight u i
+TURN = 2 * math.pi / 3
+
+
+def K_R(phi: Any) -> Any:
+    """2 x 3: zero sequence and the bearing axis at the angle phi (rad), of the three coils around the machine."""
+    return ca.vertcat(
+        ca.horzcat(*[1 / 3] * 3), ca.horzcat(*(2 / 3 * ca.cos(phi - TURN * r) for r in range(3)))
+    )
+
+
+def K_L(theta: Any) -> Any:
+    """3 x 2: d and q along the machine at the electrical angle theta (rad), of the three coils along it."""
+    angles = [theta - TURN * c for c in range(3)]
+    return 2 / 3 * ca.vertcat(*(ca.horzcat(ca.cos(a), -ca.sin(a)) for a in angles))
+
+
+def K_R_inverse(phi: Any) -> Any:
+    """3 x 2, Moore-Penrose: K_R' with its orthogonal rows scaled by 1 / |row|^2 = 3 and 3/2."""
+    return K_R(phi).T @ ca.diag(ca.DM([3, 1.5]))
+
+
+def K_L_inverse(theta: Any) -> Any:
+    """2 x 3, Moore-Penrose: K_L' with its orthogonal columns scaled by 1 / |column|^2 = 3/2."""
+    return 1.5 * K_L(theta).T
+
+
+def _around() -> Any:
+    """3 x 3: zero sequence and the two fixed bearing axes, at 0 (d) and pi/2 (q)."""
+    return ca.vertcat(K_R(0), K_R(math.pi / 2)[1, :])
+
+
+def to_axes(theta: Any) -> Any:
+    """6 x 9: a module's phase quantities (x_11 x_12 x_13 x_21 ...) to AXES, phi fixed at 0 (d) and pi/2 (q)."""
+    return ca.kron(_around(), K_L(theta).T)
+
+
+def to_phases(theta: Any) -> Any:
+    """9 x 6: AXES to phase quantities, the Moore-Penrose inverse of `to_axes`."""
+    return ca.kron(_around().T @ ca.diag(ca.DM([3, 1.5, 1.5])), K_L_inverse(theta).T)
+
+
+def magnitude_and_angle(f_x: float, f_y: float, K_B: float, phi_before: float = 0.0) -> tuple[float, float]:
+    """i_bd (A) and phi (rad) of the printed form (18). At zero force the angle is undefined: the one before stays.
+
+    A force that passes through zero turns phi by pi within one sample, faster than any current can follow.
+    """
+    force = math.hypot(f_x, f_y)
+    return force / K_B, math.atan2(f_y, f_x) if force else phi_before
+
+
+def open_loop_gain(actuator: Actuator, Kp: float, Ki: float, delay: float, w: FloatArray) -> Any:
+    """(Kp + Ki / s) e^(-s delay) / (L s + R) at s = j w: the loop of one current axis, eq. (20)."""
+    s = 1j * np.asarray(w, dtype=float)
+    return (Kp + Ki / s) * np.exp(-s * delay) / (actuator.L * s + actuator.R)
+
+
+def modulation(drive: Drive, u: Any, V: Any) -> tuple[Any, Any]:
+    """Axis voltages as shares of the link voltage V, within what its half-bridges can make, and who was limited.
+
+    Where the largest phase voltage of a group of axes would pass V/2, the group is scaled down: its direction stays.
+    """
+    peak = drive.peak(u)
+    m, limited = ca.SX(u / V), ca.SX.zeros(len(drive.axes))
+    for k, group in enumerate(drive.groups):
+        fits = 2 * peak[k] <= V
+        scale = ca.if_else(fits, 1, V / (2 * ca.fmax(peak[k], 1e-12)))
+        for axis in group:
+            m[axis], limited[axis] = m[axis] * scale, ca.logic_not(fits)
+    return m, limited
+
+
+def duty_cycles(drive: Drive, u_phase: Any, V: Any, i_phase: Any, *, real_pwm: bool) -> tuple[Any, Any]:
+    """Duty cycles of the half-bridges, 0 to 1, and who was limited: d = 1/2 + u / V.
+
+    real_pwm: duty cycles in the steps of the modulator's counter, and the voltage that dead time costs,
+    dead_share V against the current's direction.
+    """
+    wanted = 0.5 + u_phase / V
+    d = ca.fmax(ca.fmin(wanted, 1), 0)
+    limited = d != wanted
+    if real_pwm:
+        d = drive.pwm_step * ca.floor(d / drive.pwm_step + 0.5) - drive.dead_share * ca.sign(i_phase)
+        d = ca.fmax(ca.fmin(d, 1), 0)  # one that does not switch has no dead time
+    return d, limited
+
+
+def phase_voltages(drive: Drive, drop: Any, closed: Any) -> Any:
+    """What drives the current of each winding, V: `drop` = u - R i - emf, less the star point that it hangs on.
+
+    The star point floats so that the currents of its phases keep adding to zero. closed: 1 per phase, 0 where it is
+    open; an open phase drives nothing.
+    """
+    net = ca.SX(drop)
+    for star in drive.stars:
+        phases = list(star)
+        count = ca.fmax(ca.sum1(closed[phases]), 1)
+        net[phases] = closed[phases] * (drop[phases] - ca.dot(closed[phases], drop[phases]) / count)
+    return net
+
+
+def link_slope(drive: Drive, V: Any, power: Any) -> Any:
+    """V' of the DC link, V/s: the supply's current through its resistance, never backwards, less power / V."""
+    supply = ca.fmax(drive.link_voltage - V, 0) / drive.supply_resistance
+    return (supply - power / V) / drive.link_capacitance
+
+
+def link_voltage(V: float, C: float, energy: float) -> float:
+    """Voltage of a link of C (F) at V (V) after it took up `energy` (J) without loss."""
+    return math.sqrt(V**2 + 2 * energy / C)
+
+
+def hall_position(z: Any, x: Any, y: Any, pole: Any, errors: Any) -> Any:
+    """Axial position as atan2 of the two planes' averaged Hall signals gives it, m.
+
+    Each plane has four sensors, on +x, +y, -x, -y; the field grows as e^(pi r / L_p) towards a sensor that the mover
+    nears by r, so one sensor reads z and r alike. Their average keeps (cosh(pi x / L_p) + cosh(pi y / L_p)) / 2, in
+    which the first order cancels. Half a pole apart, one plane gives the cosine and the other the sine.
+    x, y    : radial positions at the two planes, m, two each
+    errors  : amplitude of the sine relative to the cosine less 1; its phase error, rad; share of the radial
+              sensitivity that averaging leaves (0 as built, 1 for a single sensor on +x)
+    """
+    k = math.pi / pole
+    amplitude, phase, single = errors
+    cosine, sine = (
+        (1 - single) * (ca.cosh(k * x[i]) + ca.cosh(k * y[i])) / 2 + single * ca.exp(k * x[i]) for i in (0, 1)
+    )
+    angle = ca.atan2((1 + amplitude) * sine * ca.sin(k * z + phase), cosine * ca.cos(k * z))
+    turns = (k * z - angle) / (2 * math.pi)
+    return (angle + 2 * math.pi * ca.floor(turns + 0.5)) / k  # counted periods: never a pole off

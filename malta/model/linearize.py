@@ -1,0 +1,131 @@
+"""Plant at an operating point -> linear model, by CasADi's exact derivatives.
+
+xi' = A xi + B v,   p = C xi          eq. (19), xi = (q, q'), the uncontrolled states dropped
+
+Between samples currents are held that were commutated for the last reading y_k, and the machine moves on: then
+
+xi' = A xi + B v + E (y_k - C xi)     E = 0 where forces do not depend on the position, as MALTA's in its own axes
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import casadi as ca
+import numpy as np
+
+from malta.errors import CheckError, InputError
+from malta.model.plant import OperatingPoint, Plant, readonly
+
+if TYPE_CHECKING:
+    from malta.model.plant import FloatArray
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class LinearModel:
+    """xi' = A xi + B v, p = C xi, about `operating_point`. A is n x n, B n x m, C p x n, E n x p."""
+
+    plant: Plant
+    operating_point: OperatingPoint
+    A: FloatArray
+    B: FloatArray
+    C: FloatArray
+    E: FloatArray
+
+    def __post_init__(self) -> None:
+        for name in "ABCE":
+            object.__setattr__(self, name, readonly(getattr(self, name)))
+
+    def __repr__(self) -> str:
+        where = {
+            s.name: v for s, v in zip(self.plant.states, self.operating_point.x.tolist(), strict=True) if v
+        }
+        kind = "trim" if self.operating_point.loaded else "no preload"
+        return f"LinearModel({self.plant.name!r} at {where or 'the centre'}, {kind}, {len(self.A)} states)"
+
+    @cached_property
+    def sys(self) -> Any:
+        """The model as a control.StateSpace with named states, inputs and outputs."""
+        import control  # imports matplotlib and takes a second: only where it is used
+
+        return control.ss(
+            self.A,
+            self.B,
+            self.C,
+            np.zeros((self.C.shape[0], self.B.shape[1])),
+            name=self.plant.name,
+            states=[s.name for s in self.plant.design_states],
+            inputs=[s.name for s in self.plant.inputs],
+            outputs=[s.name for s in self.plant.outputs],
+        )
+
+    @property
+    def stiffness(self) -> FloatArray:
+        """q'' per q: the lower left block of A, 1/s2. M^-1 S in the paper's letters."""
+        n = len(self.A) // 2
+        return self.A[n:, :n]
+
+    @property
+    def force_map(self) -> FloatArray:
+        """q'' per v: the lower half of B. M^-1 V in the paper's letters."""
+        return self.B[len(self.A) // 2 :]
+
+
+def linearize(plant: Plant, point: OperatingPoint, believed: Plant | None = None) -> LinearModel:
+    """Linearize x' = f(x, u, w), y = h(x, u) at an operating point.
+
+    At `plant.at(z=...)` the loads are left out, as v0(z) cancels them; at `trim(plant, z=...)` they act, which
+    adds the slopes of the loads and of their balance (for MALTA: m g / Ixx from z into alpha'', the cogging's slope in
+    z'', and off the centre z f_D / Ixx in alpha'' and beta'').
+
+    believed : the machine that commutates, where it is another one; the inputs are the forces that it wants
+
+    Raises InputError when the point has the wrong size, CheckError when the Jacobian is not finite.
+    """
+    n, m = len(plant.states), len(plant.inputs)
+    if point.x.shape != (n,) or point.u.shape != (m,):
+        raise InputError(
+            plant.name, "operating point", f"x {point.x.shape}, u {point.u.shape}", f"x ({n},), u ({m},)"
+        )
+    kind = ca.MX if (believed or plant).tabulated else ca.SX
+    x, u, v = kind.sym("x", n), kind.sym("u", m), kind.sym("v", m)
+    w = plant.load(x) if point.loaded else kind.zeros(len(plant.disturbances))
+    derivatives = ca.Function("derivatives", [x, u, v], list(jacobians(plant, believed, x, u, v, w)))
+    A, B, C, E, made, G = (np.array(value) for value in derivatives(point.x, point.u, point.u))
+    if believed is not None:  # what has to be wanted so that these inputs act
+        wanted = point.u + np.linalg.lstsq(G, point.u - made.ravel(), rcond=None)[0]
+        A, B, C, E, *_ = (np.array(value) for value in derivatives(point.x, point.u, wanted))
+    keep = list(plant.controlled)
+    A, B, C, E = A[np.ix_(keep, keep)], B[keep], C[:, keep], E[keep]
+    if not all(np.isfinite(M).all() for M in (A, B, C, E)):
+        raise CheckError(f"{plant.name}: the linear model is not finite at x = {point.x.tolist()}")
+    return LinearModel(plant, point, A, B, C, E)
+
+
+def jacobians(
+    plant: Plant, believed: Plant | None, x: Any, u: Any, v: Any, w: Any
+) -> tuple[Any, Any, Any, Any, Any, Any]:
+    """A, B, C, E for all states; the inputs that `v` makes, and their derivatives by it: expressions of x, u, v.
+
+    u acts, and v is what the controller wants. A machine that knows itself makes just that, so B is that of f; another
+    one's currents make other forces, and B holds their ratio. A has the stiffness of what commutation that follows does
+    not cancel: that of coordinates which it leaves out of account, as the planar motor's tilt, or takes from another
+    machine.
+    """
+    C = ca.jacobian(plant.h(x, u), x)
+    kind = type(x)
+    y, i = kind.sym("y", C.shape[0]), kind.sym("i", len(plant.actuator.coils))
+    made, wanted = plant.forces(x, i), (believed or plant).currents(y, v)
+    here = plant.h(x, u)
+    (carried,) = ca.substitute([wanted], [y], [here])
+
+    def at(expression: Any) -> Any:
+        return ca.substitute([expression], [y, i], [here, carried])[0]
+
+    from_i, rate = ca.jacobian(made, i), plant.f(x, u, w)
+    G, ratio = ca.jacobian(rate, u), at(from_i @ ca.jacobian(wanted, v))
+    turned = at(from_i @ ca.jacobian(wanted, y))  # forces from the reading
+    A = ca.jacobian(rate, x) + G @ (at(ca.jacobian(made, x)) + turned @ C)
+    return A, G if believed is None else G @ ratio, C, G @ turned, at(made), ratio

@@ -1,0 +1,67 @@
+"""How a machine's signals are shown: in groups of one unit, by the words that its experiments have for them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+from malta.model.machines import own
+from malta.model.plant import Plant, Signal
+
+FINE: Mapping[str, str] = {"m": "um", "rad": "urad"}  # what deviations are shown in
+KINDS: Mapping[str, str] = {"N": "force", "N m": "torque"}
+
+
+class Group(NamedTuple):
+    """Signals that are shown together."""
+
+    name: str
+    unit: str  # SI
+    columns: tuple[int, ...]
+
+    @property
+    def fine(self) -> str:
+        """The unit that deviations are shown in."""
+        return FINE.get(self.unit, self.unit)
+
+
+def outputs_of(plant: Plant) -> tuple[Group, ...]:
+    """The machine's outputs: the stroke, then the others by their units."""
+    return _groups(plant, plant.outputs, plant.stroke_output, "stroke")
+
+
+def inputs_of(plant: Plant) -> tuple[Group, ...]:
+    """The machine's inputs: the thrust, then the others by their units."""
+    return _groups(plant, plant.inputs, plant.thrust_input, "thrust")
+
+
+def compliance_unit(unit: str) -> str:
+    """Of an output to the force or torque that moves it."""
+    return {"m": "um/N", "rad": "urad/(N m)"}[unit]
+
+
+def stiffness_unit(unit: str) -> str:
+    """The other way round."""
+    return {"m": "N/um", "rad": "N m/urad"}[unit]
+
+
+def aside(plant: Plant) -> tuple[Group, ...]:
+    """Outputs other than the stroke; of a machine with one output that one."""
+    found = outputs_of(plant)
+    return found[1:] or found
+
+
+def stroke_unit(plant: Plant) -> str:
+    """The unit that deviations along the stroke are shown in."""
+    unit: str = getattr(own("experiments", plant.name), "STROKE_UNIT", outputs_of(plant)[0].fine)
+    return unit
+
+
+def _groups(plant: Plant, signals: Sequence[Signal], first: int, role: str) -> tuple[Group, ...]:
+    words: Mapping[str, str] = getattr(own("experiments", plant.name), "WORDS", {})
+    found = [Group(words.get(role, signals[first].name), signals[first].unit, (first,))]
+    others = [k for k in range(len(signals)) if k != first]
+    for unit in dict.fromkeys(signals[k].unit for k in others):
+        columns = tuple(k for k in others if signals[k].unit == unit)
+        found.append(Group(words.get(unit, " ".join(signals[k].name for k in columns)), unit, columns))
+    return tuple(found)

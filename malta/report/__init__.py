@@ -1,0 +1,37 @@
+"""Tables and figures of everything that malta computes."""
+
+from malta.report.pages import STYLES as STYLES
+from malta.report.pages import bandwidth_table as bandwidth_table
+from malta.report.pages import box_text as box_text
+from malta.report.pages import campaign as campaign
+from malta.report.pages import campaign_tables as campaign_tables
+from malta.report.pages import chain_figure as chain_figure
+from malta.report.pages import chain_table as chain_table
+from malta.report.pages import claims_table as claims_table
+from malta.report.pages import design_page as design_page
+from malta.report.pages import disk_table as disk_table
+from malta.report.pages import distributions_figure as distributions_figure
+from malta.report.pages import experiment as experiment
+from malta.report.pages import experiment_figure as experiment_figure
+from malta.report.pages import experiment_table as experiment_table
+from malta.report.pages import front as front
+from malta.report.pages import front_figure as front_figure
+from malta.report.pages import front_markdown as front_markdown
+from malta.report.pages import front_rows as front_rows
+from malta.report.pages import front_table as front_table
+from malta.report.pages import gang_table as gang_table
+from malta.report.pages import limits_text as limits_text
+from malta.report.pages import loop_poles_table as loop_poles_table
+from malta.report.pages import places_table as places_table
+from malta.report.pages import poles_table as poles_table
+from malta.report.pages import requirements_table as requirements_table
+from malta.report.pages import robustness as robustness
+from malta.report.pages import save as save
+from malta.report.pages import scenarios_table as scenarios_table
+from malta.report.pages import sensitivity_table as sensitivity_table
+from malta.report.pages import stroke as stroke
+from malta.report.pages import stroke_figure as stroke_figure
+from malta.report.pages import tolerance_table as tolerance_table
+from malta.report.pages import worst_case_table as worst_case_table
+from malta.report.pages import worst_figure as worst_figure
+from malta.report.pages import yield_figure as yield_figure

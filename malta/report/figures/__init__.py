@@ -1,0 +1,224 @@
+"""Records -> figures, as a report has them. What draws imports matplotlib, and only there.
+
+Every figure names the design and the fidelity behind it, and holds what the paper prints of the same experiment. A
+machine's own figures are in the module of its name here, which has
+
+    FIGURES        name of an experiment -> (experiment, published or None) -> figure
+    stroke_figure  (run, published or None) -> figure, of a machine whose main job is a stroke
+
+An experiment without a figure of its own has that of its first run: `run_figure`.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Callable
+from functools import partial
+from itertools import cycle
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from malta.errors import InputError
+from malta.files import replace_files
+from malta.model.data import in_unit
+from malta.model.machines import own
+from malta.model.signals import (
+    KINDS,
+    Group,
+    inputs_of,
+    outputs_of,
+)
+from malta.report.figures.campaign import distributions_figure as distributions_figure
+from malta.report.figures.campaign import worst_figure as worst_figure
+from malta.report.figures.campaign import yield_figure as yield_figure
+from malta.report.figures.parts import (
+    BOUND,
+    DOT,
+    Published,
+    bound_line,
+    ending,
+    finish,
+    line,
+    micro,
+    page,
+)
+from malta.report.figures.parts import MORE as MORE
+from malta.report.figures.parts import POINTS as POINTS
+from malta.report.figures.parts import STYLES as STYLES
+from malta.report.figures.parts import number as number
+from malta.simulation.experiments import Case, Experiment, experiments_of
+from malta.simulation.simulate import Trajectory
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from malta.tuning.search import Tuned
+
+
+def experiment_figure(e: Experiment, published: Published | None = None) -> Figure:
+    """The figure of an experiment, beside what the paper prints of it."""
+    plant = e.run.plant
+    drawn: dict[str, Callable[[Experiment, Published | None], Figure]] = {
+        **dict.fromkeys(experiments_of(plant), run_figure),
+        **getattr(own("figures", plant.name), "FIGURES", {}),
+        "run": run_figure,
+    }
+    if e.name not in drawn:
+        raise InputError("figure", "experiment", repr(e.name), "one of " + ", ".join(drawn))
+    return drawn[e.name](e, published)
+
+
+def stroke_figure(run: Trajectory, published: Published | None = None) -> Figure:
+    """The machine's figure of a stroke, or of a run."""
+    draw = getattr(own("figures", run.plant.name), "stroke_figure", None)
+    if draw is None:
+        return run_figure(Experiment("run", run.scenario.name, (Case(run.scenario.name, run, ()),), ()))
+    figure: Figure = draw(run, published)
+    return figure
+
+
+def save(figure: Figure, path: str | Path) -> Path:
+    """Write a figure as .png or .svg, whole or not at all; the same figure gives the same bytes."""
+    import matplotlib
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    path = Path(path)
+    if path.suffix not in (".png", ".svg"):
+        raise InputError(path, "", f"suffix {path.suffix!r}", "one of .png, .svg")
+    buffer = io.BytesIO()
+    with matplotlib.rc_context({"svg.hashsalt": "malta", "svg.fonttype": "none"}):
+        if path.suffix == ".svg":
+            figure.savefig(buffer, format="svg", metadata={"Date": None})
+        else:
+            # Figure.savefig lays everything out in a draw of its own first, which only tight boxes need.
+            canvas: Any = FigureCanvasAgg(figure)
+            canvas.print_png(buffer, metadata={"Software": None}, pil_kwargs={"compress_level": 1})
+    replace_files({path: buffer.getvalue()})
+    return path
+
+
+def run_figure(e: Experiment, _: Published | None = None) -> Figure:
+    """One run: how far every output is off its reference, the forces, and the way to what it could touch."""
+    run = e.run
+    stroke, *others = outputs_of(run.plant)
+    panels: list[Callable[[Axes, str], None]] = [
+        *(partial(_errors, run=run, group=group, unit=group.fine) for group in others),
+        *(partial(_forces, run=run, unit=unit) for unit in dict.fromkeys(s.unit for s in run.plant.inputs)),
+        partial(_errors, run=run, group=stroke, unit=_stroke_unit(run)),
+        partial(_ways if run.plant.contacts else _currents, run=run),
+    ]
+    furthest = [(group.name, _furthest(run, group), group.fine) for group in others]
+    furthest.append((stroke.name, _furthest(run, stroke), _stroke_unit(run)))
+    told = (f"{name} {number(in_unit(size, unit), 3)} {micro(unit)}" for name, size, unit in furthest)
+    what = e.question if len(e.cases) == 1 else f"{e.question} {e.cases[0].label}, one of {len(e.cases)}"
+    text = "furthest off its reference: " + ", ".join(told)
+    rows = 2 if len(panels) > 3 else len(panels)
+    columns = math.ceil(len(panels) / rows)
+    places = {"hspace": 0.24, "wspace": 0.25 if columns < 3 else 0.42}
+    figure = page([run], f"{micro(what)}{ending(run)}", text, **places)
+    grid = figure.subplots(rows, columns, sharex=True, squeeze=False).ravel()
+    last = len(panels) - columns
+    for k, (axes, draw) in enumerate(zip(grid, panels, strict=False)):
+        draw(axes, "time [ms]" if k >= last else "")
+        axes.tick_params(labelbottom=k >= last)
+    for axes in grid[len(panels) :]:
+        axes.set_visible(False)
+    return figure
+
+
+def _furthest(run: Trajectory, group: Group) -> float:
+    return float(np.abs((run.p - run.reference)[:, group.columns]).max())
+
+
+def _stroke_unit(run: Trajectory) -> str:
+    """A unit in which the error along the stroke is neither long nor short."""
+    stroke = outputs_of(run.plant)[0]
+    small = _furthest(run, stroke) < 1e-4
+    return stroke.fine if small else {"m": "mm", "rad": "mrad"}.get(stroke.unit, stroke.unit)
+
+
+def _errors(axes: Axes, x: str, run: Trajectory, group: Group, unit: str) -> None:
+    error = in_unit(1.0, unit) * (run.p - run.reference)
+    styles = cycle((1, 0, 3, 2)) if len(group.columns) > 1 else (0,)
+    for k, style in zip(group.columns, styles, strict=False):
+        line(axes, run.t * 1e3, error[:, k], label=run.plant.outputs[k].name, **STYLES[style])
+    several = len(group.columns) if len(group.columns) > 1 else 0
+    name = group.name if several else run.plant.outputs[group.columns[0]].name
+    finish(axes, x, f"{name}, off reference [{micro(unit)}]", legend=several)
+
+
+def _forces(axes: Axes, x: str, run: Trajectory, unit: str) -> None:
+    """The thrust and the two others that go furthest."""
+    plant = run.plant
+    widest = np.argsort(-np.abs(run.v).max(axis=0), kind="stable").tolist()
+    others = [k for k in widest if plant.inputs[k].unit == unit and k != plant.thrust_input]
+    first = [plant.thrust_input] if plant.inputs[plant.thrust_input].unit == unit else []
+    shown = [*first, *sorted(others[: 3 - len(first)])]
+    for k, style in zip(shown, STYLES, strict=False):
+        line(axes, run.t * 1e3, run.v[:, k], label=plant.inputs[k].name, **style)
+    finish(axes, x, f"commanded {KINDS.get(unit, 'input')} [{unit}]", legend=3)
+
+
+def _ways(axes: Axes, x: str, run: Trajectory) -> None:
+    for name, used, style in zip(run.plant.contacts, run.contact.T, cycle(STYLES)):
+        way = np.maximum(used * 100, 1e-3)
+        line(axes, run.t * 1e3, way, label=name.removeprefix("touchdown at sensor "), **style)
+    axes.set_yscale("log")
+    axes.set_ylim(bottom=0.01)
+    bound_line(axes, 100, "touched")
+    finish(axes, x, "clearance used up [%]", legend=3, side="right")
+
+
+def _currents(axes: Axes, x: str, run: Trajectory) -> None:
+    """The largest and the smallest of all, where there is nothing to touch."""
+    for values, style in zip((run.current.max(axis=1), run.current.min(axis=1)), STYLES, strict=False):
+        line(axes, run.t * 1e3, values, **style)
+    finish(axes, x, "currents, from least to largest [A]")
+
+
+def front_figure(tuned: Tuned) -> Figure:
+    """Noise of the forces and motion against the proven margin: what the search found, and what it took."""
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import LogLocator
+
+    asked, chosen, front = tuned.spec.specification, tuned.trial, tuned.front
+    figure = Figure(figsize=(9.0, 4.6), dpi=120)
+    figure.subplots_adjust(left=0.1, right=0.98, bottom=0.115, top=0.8, wspace=0.25)
+    taken = next((one for one in front if one.values == chosen.values), chosen)
+    others = [one for one in front if one is not taken] or [taken]
+    found = f"{tuned.trials} trials; taken: margin {100 * taken.figures['margin']:.0f} %, which keeps a reserve in all"
+    figure.suptitle(f"{tuned.spec.name}: margin against noise", fontsize=11, y=0.985)
+    figure.text(0.5, 0.925, found, fontsize=9, color="#4a4a4a", ha="center", va="top")
+    margins = [100 * one.figures["margin"] for one in others]
+    plant = tuned.spec.plant
+    thrust, *efforts = (group.name for group in inputs_of(plant))
+    along, *across = (group.name for group in outputs_of(plant))
+    panels: Any = figure.subplots(1, 2)
+    sides = (
+        (("force_noise", " ".join(efforts[:1]), 1.0, 0), ("thrust_noise", thrust, 1.0, 2)),
+        (("radial_motion", " ".join(across[:1]), 1e6, 0), ("axial_motion", along, 1e6, 2)),
+    )
+    for axes, lines, y in zip(
+        panels, sides, ("noise of the force [N rms]", "true motion [µm rms]"), strict=True
+    ):
+        axes.set_yscale("log")
+        axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axes.yaxis.set_major_formatter("{x:g}")
+        axes.yaxis.set_minor_formatter("")
+        for name, label, scale, style in lines:
+            if not all(name in one.figures for one in front):
+                continue
+            sizes = [scale * one.figures[name] for one in others]
+            axes.plot(margins, sizes, marker="o", markersize=4, label=label, **STYLES[style])
+            where = 100 * taken.figures["margin"], scale * taken.figures[name]
+            ring = {"markersize": 9, "markerfacecolor": "none", "markeredgecolor": STYLES[style]["color"]}
+            axes.plot(*where, **DOT | ring)
+        if asked.margin is not None:
+            axes.axvline(100 * asked.margin, **BOUND)
+        finish(axes, "robust margin over the travel, proven [% of the box]", y, legend=2)
+        axes.margins(x=0.04)
+    return figure

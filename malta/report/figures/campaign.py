@@ -1,0 +1,253 @@
+"""The figures of a campaign: distributions, how runs end over the parameters, the worst runs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from itertools import cycle
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from malta.model.data import in_unit
+from malta.model.signals import aside
+from malta.report.figures.parts import (
+    BOUND,
+    LEGEND,
+    MORE,
+    NOTE,
+    STYLES,
+    Published,
+    clearance,
+    entries,
+    finish,
+    micro,
+    read_out,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from malta.campaigns.campaign import Campaign
+    from malta.campaigns.statistics import Finding
+
+
+FINE: Mapping[str, dict[str, Any]] = {  # how runs end, the best first, light to dark; what is touched follows
+    "within the published bounds": {"facecolor": "#f0f0f0"},
+    "completed": {"facecolor": "#d0d0d0"},
+    "completed, commands limited": {"facecolor": "#d0d0d0", "hatch": "////"},
+    "diverged": {"facecolor": "#c1440e"},
+    "not lifted": {"facecolor": "#909090", "hatch": ".."},
+}
+TOUCHES: Sequence[dict[str, Any]] = (
+    {"facecolor": "#202020"},
+    {"facecolor": "#6a6a6a"},
+    {"facecolor": "#202020", "hatch": "xx"},
+)
+BINS = 40  # of a distribution
+
+
+def distributions_figure(found: Campaign, published: Published | None = None) -> Figure:
+    """How the figures of merit of the completed runs are distributed, with the published bounds."""
+    from malta.campaigns.statistics import figures_of
+
+    panels: dict[tuple[str, str], list[Finding]] = {}  # what is of a kind and a unit goes into one
+    for listed in figures_of(found, published):
+        panels.setdefault((listed.kind, listed.unit), []).append(listed)
+    figure = _campaign_figure(found, "figures of merit of the completed runs", hspace=0.44, wspace=0.28)
+    for axes, ((kind, _), group) in zip(figure.subplots(2, 3).ravel(), panels.items(), strict=False):
+        _distribution(axes, kind, group)
+    return figure
+
+
+def _distribution(axes: Axes, kind: str, listed: Sequence[Finding]) -> None:
+    """Histograms of figures of one kind, on a logarithmic axis where they reach over decades."""
+    unit = listed[0].unit
+    series = [in_unit(1.0, unit) * f.values[np.isfinite(f.values)] for f in listed]
+    bound = in_unit(listed[0].published, unit)
+    every = np.concatenate(series)
+    told = "%" if unit == "percent" else micro(unit)
+    finish(axes, f"{kind} [{told}]", "share of runs [%]")
+    if not every.size:
+        axes.annotate("no run completed", (0.5, 0.5), xycoords="axes fraction", ha="center", **NOTE)
+        return
+    low, high = float(every.min()), float(every.max())
+    if math.isfinite(bound):
+        low, high = min(low, bound), max(high, bound)
+    logarithmic = low > 0 and high > 30 * low
+    room = 0.04 * (high - low) or 0.05 * abs(high) or 1.0
+    edges = (
+        np.geomspace(low / 1.1, high * 1.1, BINS + 1)
+        if logarithmic
+        else np.linspace(max(low - room, 0.0) if low >= 0 else low - room, high + room, BINS + 1)
+    )
+    for f, values, style in zip(listed, series, cycle((1, 0, 3, 2)), strict=False):
+        share = 100 * np.histogram(values, edges)[0] / max(len(values), 1)
+        line = {"color": STYLES[0]["color"], "linewidth": 1.2} if len(listed) == 1 else STYLES[style]
+        if len(listed) == 1:
+            axes.stairs(share, edges, fill=True, facecolor="#d4d4d4")
+        axes.stairs(share, edges, label=f.label.removeprefix(f"{kind} ") if len(listed) > 1 else None, **line)
+    if logarithmic:
+        axes.set_xscale("log")
+    axes.set_xlim(edges[0], edges[-1])
+    axes.set_ylim(0, None)
+    if math.isfinite(bound):
+        axes.axvline(bound, **BOUND)
+        text = "published" if listed[0].relation == "about" else "published bound"
+        axes.annotate(
+            text, (bound, 1.01), xycoords=("data", "axes fraction"), ha="center", va="bottom", **NOTE
+        )
+    if len(listed) > 1:
+        where: dict[str, Any] = {"loc": "lower left", "bbox_to_anchor": (0, 1.06), "borderaxespad": 0.2}
+        axes.legend(ncols=len(listed), **where, **LEGEND)
+
+
+def yield_figure(found: Campaign, published: Published | None = None) -> Figure:
+    """How runs end over each parameter that was varied, the others wherever they were drawn."""
+    from malta.campaigns.statistics import kept
+    from malta.simulation.batch import verdicts
+
+    names = [name for k, name in enumerate(found.names) if len(set(found.values[:, k])) > 1]
+    shown = names[:9]
+    limited = found.batch.saturated.max(axis=1, initial=0.0) > 0
+    within = kept(found, published)
+    known = verdicts(found.plan.plant)
+    band = np.array(known, dtype=object)[found.batch.verdict.astype(int)]
+    band[found.completed & limited] = "completed, commands limited"
+    if within is not None:
+        band[within] = "within the published bounds"
+    columns = min(3, max(1, len(shown))) if len(shown) != 4 else 2
+    rows = max(1, -(-len(shown) // columns))
+    more = f", {len(shown)} of {len(names)} shown" if len(shown) < len(names) else ""
+    figure = _campaign_figure(found, f"how runs end over the parameters{more}", hspace=0.5, top=0.8)
+    panels = figure.subplots(rows, columns, squeeze=False, sharey=True).ravel()
+    for axes, name in zip(panels, shown, strict=False):
+        _bands(axes, found, name, band)
+    for axes in panels[len(shown) :]:
+        axes.set_visible(False)
+    for axes in panels[: len(shown) : columns]:
+        axes.set_ylabel("share of runs [%]")
+    handles, labels = entries(list(panels))
+    where: dict[str, Any] = {"loc": "upper center", "bbox_to_anchor": (0.5, 0.91)}
+    if handles:
+        figure.legend(handles, labels, ncols=min(4, len(labels)), **where, **LEGEND)
+    return figure
+
+
+def _bands(axes: Axes, found: Campaign, name: str, band: Any) -> None:
+    """Shares of the ways in which runs end, stacked, in bins of one parameter."""
+    from malta.campaigns.statistics import unit_of
+
+    unit = unit_of(found.plan, name)
+    values = found.values[:, found.names.index(name)] * in_unit(1.0, unit)
+    edges = np.linspace(values.min(), values.max(), 11 if len(values) >= 200 else 6)
+    total = np.histogram(values, edges)[0]
+    base = np.zeros(len(total))
+    styles = dict(FINE) | dict(zip(found.plan.plant.contacts, cycle(TOUCHES)))
+    for label, style in styles.items():
+        if not (band == label).any():
+            continue
+        share = 100 * np.histogram(values[band == label], edges)[0] / np.maximum(total, 1)
+        axes.bar(
+            edges[:-1],
+            share,
+            np.diff(edges),
+            base,
+            align="edge",
+            label=label,
+            edgecolor="#ffffff",
+            linewidth=0.6,
+            **style,
+        )
+        base += share
+    finish(axes, f"{name} [{'%' if unit == 'percent' else micro(unit)}]", "")
+    axes.set_xlim(edges[0], edges[-1])
+    axes.set_ylim(0, 100)
+
+
+def worst_figure(found: Campaign, published: Published | None = None) -> Figure:
+    """The worst runs: where in the box their machines lie, and how far off the reference they went."""
+    from malta.campaigns.statistics import bounds_of, half_text, worst_of
+
+    plan, plant = found.plan, found.plan.plant
+    rows = worst_of(found, len(STYLES) + len(MORE))
+    figure = _campaign_figure(found, "the worst runs and their machines", wspace=0.34, top=0.84, bottom=0.13)
+    box, far = figure.subplots(1, 2, width_ratios=(1.7, 1))
+    at = np.arange(len(found.names))
+    middle = np.array([getattr(plan.parameters, n) if n in plan.spread else 0.0 for n in found.names])
+    half = np.array(
+        [
+            getattr(plan.parameters, n) * plan.spread[n] if n in plan.spread else plan.sensor_spread[n]
+            for n in found.names
+        ]
+    )
+    across = aside(plant)[0]
+    fine = in_unit(1.0, across.fine)
+    for place, (row, style) in enumerate(zip(rows, (*STYLES, *MORE), strict=False)):
+        where = 100 * (found.values[row] - middle) / np.where(half == 0, 1, half)
+        box.plot(at, where, marker="o", markersize=4, **style)
+        off = float(found.batch.deviation[row, across.columns].max()) * fine
+        far.plot([1e-3, off], [place, place], **style)
+        far.plot(
+            off,
+            place,
+            marker="o" if found.completed[row] else "X",
+            markersize=7,
+            color=style["color"],
+            clip_on=False,
+        )
+    spreads = [half_text(found.plan, name) for name in found.names]
+    box.set_xticks(at, [f"{n}\n{s}" for n, s in zip(found.names, spreads, strict=True)], fontsize=9)
+    box.set_yticks([-100, -50, 0, 50, 100])
+    far.set_yticks(range(len(rows)), [_ended(found, row) for row in rows], fontsize=8)
+    far.invert_yaxis()
+    offs = found.batch.deviation[rows][:, across.columns] * fine
+    far.set_xscale("log")
+    least = float(offs.max(axis=1).min()) if len(rows) else 1.0
+    bounds = {"clearance": clearance(plant) * fine} if across.unit == "m" else {}
+    key = bounds_of(plan).get(across.unit)
+    if published is not None and key is not None:
+        bounds["published bound"] = read_out(published, key, across.fine)
+    bounds = {text: value for text, value in bounds.items() if math.isfinite(value)}
+    most = float(offs.max()) if len(rows) else 1.0
+    far.set_xlim(min([least, *bounds.values()]) / 2, 1.6 * max([most, *bounds.values()]))
+    for text, value in bounds.items():
+        far.axvline(value, **BOUND)
+        far.annotate(
+            text, (value, 1.01), xycoords=("data", "axes fraction"), ha="center", va="bottom", **NOTE
+        )
+    finish(box, "", "place in the box [% of half its width]")
+    finish(far, f"largest {across.name} deviation [{micro(across.fine)}]", "")
+    box.set_xlim(-0.3, len(at) - 0.7)
+    box.set_ylim(-108, 108)
+    return figure
+
+
+def _campaign_figure(found: Campaign, what: str, **places: float) -> Figure:
+    """A figure that says of which campaign it is, and its yield."""
+    from matplotlib.figure import Figure
+
+    from malta.campaigns.plan import wanted_of
+
+    plan, share = found.plan, found.rate
+    figure = Figure(figsize=(9.0, 6.0), dpi=120)
+    usual = {"left": 0.085, "right": 0.98, "bottom": 0.085, "top": 0.86, "wspace": 0.25, "hspace": 0.3}
+    figure.subplots_adjust(**usual | places)
+    wanted = wanted_of(plan)
+    flown = plan.scenario if wanted.label == plan.scenario else f"{plan.scenario} ({wanted.label})"
+    title = f"{plan.controller.name}, {flown}, fidelity {wanted.scenario.fidelity}: {what}"
+    figure.suptitle(title, fontsize=11, y=0.985)
+    text = f"{share.passed} of {share.runs} runs completed: {100 * share.share:.4g} % "
+    text += f"(95 %: {100 * share.low:.4g} to {100 * share.high:.4g} %)"
+    figure.text(0.5, 0.945, text, fontsize=9, color="#4a4a4a", ha="center", va="top")
+    return figure
+
+
+def _ended(found: Campaign, row: int) -> str:
+    """A run by its number, and what ended it."""
+    from malta.simulation.batch import verdicts
+
+    name = verdicts(found.plan.plant)[int(found.batch.verdict[row])]
+    text = f"run {found.index[row]}"
+    return text if name == "completed" else f"{text}\n{name.replace(' at ', chr(10) + 'at ')}"

@@ -1,0 +1,139 @@
+"""Figures of robustness: where the margin goes, and the machine's loop along its travel."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from malta.report.figures.parts import (
+    BOUND,
+    NOTE,
+    STYLES,
+    plain,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from malta.margins.gain import Gain
+    from malta.margins.stages import Robustness
+
+LIMITS = ((3.0, "A | B"), (4.0, "B | C"), (5.0, "C | D"))  # ISO 14839-3
+
+
+def chain_figure(
+    found: Robustness,
+    name: str,
+    uncertainty: Mapping[str, float],
+    position: str = "position",
+    worst: Mapping[str, Gain] | None = None,
+) -> Figure:
+    """The chain as bars, proven part and witness; peak sensitivities beside them; both along the travel below.
+
+    position : what the machine calls it, as "position z"
+    worst : the largest |S| of each sensor over the uncertainty and the travel
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9.0, 6.0), dpi=120)
+    figure.subplots_adjust(left=0.21, right=0.97, bottom=0.09, top=0.86, wspace=0.12, hspace=0.45)
+    box = ", ".join(f"{key} ±{100 * share:g} %" for key, share in uncertainty.items())
+    figure.suptitle(f"{name}: where the margin goes", fontsize=11, y=0.985)
+    figure.text(0.5, 0.945, f"100 %: {box}, all at once", fontsize=9, color="#4a4a4a", ha="center", va="top")
+    grid = figure.add_gridspec(2, 2, height_ratios=(1.6, 1))
+    left, right = figure.add_subplot(grid[0, 0]), figure.add_subplot(grid[0, 1])
+    rows = [(link.name, link.margin, link.peak) for link in found.chain]
+    rows.append(("all of the travel", found.travel, max(place.peak for place in found.places)))
+    most = max([_percent(m.lower) for _, m, _ in rows if m.lower is not None] + [100.0])
+    for k, (_, margin, peak) in enumerate(rows):
+        proven = _percent(margin.lower)
+        left.barh(k, proven, height=0.6, color="#c9c9c9" if k < len(found.chain) - 1 else "#5a5a5a")
+        if not margin.exhausted:
+            left.plot([_percent(margin.upper)] * 2, [k - 0.38, k + 0.38], color="#c1440e", linewidth=1.6)
+        left.text(
+            proven + 0.02 * most,
+            k,
+            "none" if margin.lower is None else f"{proven:.1f} %",
+            va="center",
+            **NOTE,
+        )
+        if not math.isnan(peak):
+            right.barh(k, peak, height=0.6, color="#c9c9c9" if k < len(found.chain) - 1 else "#5a5a5a")
+            right.text(peak + 0.08, k, f"{peak:.2f}", va="center", **NOTE)
+    left.set_xlim(0, 1.2 * most)
+    left.set_yticks(range(len(rows)), [row[0] for row in rows])
+    left.plot([], [], color="#c1440e", linewidth=1.6, label="witness: unstable there")
+    left.bar(0, 0, color="#5a5a5a", label="proven, the machine's loop")
+    _legend(left)
+    left.set_xlabel("parametric margin [% of the box]")
+    right.set_yticks(range(len(rows)), [""] * len(rows))
+    right.set_xlim(0, max(5.6, 1.15 * max(link.peak for link in found.chain if not math.isnan(link.peak))))
+    for limit, text in LIMITS:
+        right.axvline(limit, **BOUND)
+        right.text(limit, -0.75, text, ha="center", va="bottom", **NOTE)
+    right.set_xlabel("peak sensitivity |S|: zones of ISO 14839-3")
+    for axes in (left, right):
+        plain(axes)
+        axes.set_ylim(len(rows) - 0.4, -0.8)
+    along = figure.add_subplot(grid[1, 0]), figure.add_subplot(grid[1, 1])
+    _along_travel(*along, found, _bound(worst))
+    for axes in along:
+        axes.set_xlabel(f"{position} [mm]")
+    return figure
+
+
+def _along_travel(left: Axes, right: Axes, found: Robustness, bound: float) -> None:
+    """The worse of both sides of the position, drawn on both."""
+    places = found.places
+    z = np.array([p.position for p in places]) * 1e3
+    both = np.concatenate([-z[:0:-1], z])
+
+    def mirrored(values: list[float]) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+        array = np.array(values)
+        return np.concatenate([array[:0:-1], array])
+
+    left.plot(
+        both, mirrored([_percent(p.margin.lower) for p in places]), marker="o", markersize=3.5, **STYLES[0]
+    )
+    if found.travel.lower is not None:
+        left.axhline(100 * found.travel.lower, **STYLES[1])
+        left.annotate(
+            "proven for all of it at once", (0.02, 100 * found.travel.lower), xycoords=("axes fraction", "data"),
+            xytext=(0, -3), textcoords="offset points", va="top", **NOTE,
+        )  # fmt: skip
+    left.set_ylim(0, 1.25 * max([_percent(p.margin.lower) for p in places] + [1.0]))
+    left.set_ylabel("margin [%]")
+    right.plot(both, mirrored([p.peak for p in places]), marker="o", markersize=3.5, **STYLES[0])
+    peaks = [p.peak for p in places if not math.isnan(p.peak)] + ([bound] if math.isfinite(bound) else [])
+    right.set_ylim(0, max(3.5, 1.2 * max([*peaks, 1.0])))
+    if math.isfinite(bound):
+        right.axhline(bound, **STYLES[1])
+        right.annotate(
+            "no more for any parameters of the box", (0.02, bound), xycoords=("axes fraction", "data"),
+            xytext=(0, 3), textcoords="offset points", va="bottom", **NOTE,
+        )  # fmt: skip
+    right.axhline(3, **BOUND)
+    right.annotate("zone A", (0.985, 3), xycoords=("axes fraction", "data"), ha="right", va="top", **NOTE)
+    right.set_ylabel("peak |S|")
+    for axes in (left, right):
+        plain(axes)
+
+
+def _bound(worst: Mapping[str, Gain] | None) -> float:
+    """What no |S| exceeds; NaN where that is not known of every sensor."""
+    found = [gain.upper for gain in (worst or {}).values()]
+    return max([bound for bound in found if bound is not None]) if found and None not in found else math.nan
+
+
+def _percent(t: float | None) -> float:
+    return 0.0 if t is None else 100 * t
+
+
+def _legend(axes: Axes) -> None:
+    axes.legend(
+        loc="lower left", bbox_to_anchor=(0, 1), ncols=2, borderaxespad=0.2, frameon=False, fontsize=8
+    )

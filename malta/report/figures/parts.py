@@ -1,0 +1,272 @@
+"""What figures are made of: styles, pages, lines, bounds, legends, numbers."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import casadi as ca
+import numpy as np
+
+from malta.model.data import in_unit, published_value
+from malta.model.plant import Plant
+from malta.simulation.simulate import Trajectory
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from malta.model.plant import FloatArray
+    from malta.simulation.experiments import Case, Experiment, Merit
+
+Published = Mapping[str, Any]  # a file of data/published/
+
+STYLES: Sequence[dict[str, Any]] = (  # told apart without colour: by darkness and by dash
+    {"color": "#000000", "linestyle": "-", "linewidth": 1.6},
+    {"color": "#c1440e", "linestyle": "-", "linewidth": 1.4},
+    {"color": "#1f77b4", "linestyle": (0, (5, 2)), "linewidth": 1.4},
+    {"color": "#8a8a8a", "linestyle": (0, (1.5, 1.5)), "linewidth": 1.6},
+)
+MORE: Sequence[dict[str, Any]] = (  # after those
+    {"color": "#000000", "linestyle": (0, (7, 2, 1.5, 2)), "linewidth": 1.4},
+    {"color": "#c1440e", "linestyle": (0, (1.5, 1.5)), "linewidth": 1.6},
+    {"color": "#1f77b4", "linestyle": (0, (9, 2, 1.5, 2, 1.5, 2)), "linewidth": 1.4},
+    {"color": "#8a8a8a", "linestyle": "-", "linewidth": 1.2},
+)
+BOUND: dict[str, Any] = {"color": "#9a9a9a", "linestyle": (0, (8, 3)), "linewidth": 0.9}
+NOTE: dict[str, Any] = {"fontsize": 8, "color": "#5a5a5a"}
+DOT: dict[str, Any] = {"marker": "o", "markersize": 6, "linestyle": "none", "color": "#000000"}
+CROSS: dict[str, Any] = DOT | {"marker": "X", "markersize": 9, "markeredgecolor": "#ffffff", "clip_on": False}
+LEGEND: dict[str, Any] = {"frameon": False, "fontsize": 8, "handlelength": 2.4, "columnspacing": 1.5}
+POINTS = 3000  # of a line: more than a page resolves
+
+
+def runs_of(e: Experiment) -> list[Trajectory]:
+    return [case.run for case in e.cases]
+
+
+def page(runs: Sequence[Trajectory], what: str, found: str, **places: float) -> Figure:
+    """A figure that says which design and fidelity drew it, and what was found."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9.0, 6.0), dpi=120)
+    usual = {"left": 0.085, "right": 0.98, "bottom": 0.085, "top": 0.86, "wspace": 0.25, "hspace": 0.3}
+    figure.subplots_adjust(**usual | places)
+    fidelities = " and ".join(dict.fromkeys(run.scenario.fidelity for run in runs))
+    figure.suptitle(f"{runs[0].controller.name}, fidelity {fidelities}: {what}", fontsize=11, y=0.985)
+    figure.text(0.5, 0.945, found, fontsize=9, color="#4a4a4a", ha="center", va="top")
+    return figure
+
+
+def ending(run: Trajectory) -> str:
+    """How a run ended, if not completed."""
+    end = run.verdict
+    return "" if end.completed else f" ({end.name} at {end.time * 1e3:.0f} ms)"
+
+
+def line(axes: Axes, t: FloatArray, values: FloatArray, **style: Any) -> None:
+    """A line; of more samples than the page resolves, the least and the greatest of each stretch."""
+    size = math.ceil(2 * len(t) / POINTS)
+    if size > 2:
+        first = np.arange(0, len(t) - size + 1, size)
+        stretches = values[: len(first) * size].reshape(-1, size)
+        peaks = np.column_stack([stretches.argmin(axis=1), stretches.argmax(axis=1)]) + first[:, None]
+        kept = np.unique([0, *peaks.ravel(), len(t) - 1])
+        t, values = t[kept], values[kept]
+    axes.plot(t, values, **style)
+
+
+def mark(axes: Axes, run: Trajectory, t: FloatArray, values: FloatArray, *, named: bool = True) -> None:
+    """A cross where the run touched something; `named` in the legend."""
+    if touched(run):
+        k = min(end_of(run), len(t) - 1)
+        low, high = axes.get_xlim()
+        if not (axes.get_autoscalex_on() or low <= t[k] <= high):
+            return
+        label = TOUCHED if run.verdict.name.startswith(TOUCHED) else run.verdict.name
+        axes.plot(t[k], values[k], **CROSS | ({"label": label} if named else {}))
+
+
+TOUCHED = "touchdown"
+
+
+def touched(run: Trajectory) -> bool:
+    """Whether something ended the run, other than time and Ctrl-C."""
+    return run.verdict.name not in ("completed", "interrupted")
+
+
+def end_of(run: Trajectory) -> int:
+    """The sample of the verdict."""
+    return min(int(np.searchsorted(run.t, run.verdict.time)), len(run.t) - 1)
+
+
+def published_line(
+    axes: Axes,
+    published: Published | None,
+    key: str,
+    unit: str,
+    text: str = "published bound",
+    **drawn: Any,
+) -> None:
+    if published is not None:
+        bound_line(axes, read_out(published, key, unit), text, **drawn)
+
+
+def bound_line(
+    axes: Axes, value: float, text: str, *, both: bool = False, where: str = "above right"
+) -> None:
+    """A line at a value, or at both signs; the axes reach beyond it.
+
+    where : of its name: above, below, or under the lower line of both; left or right
+    """
+    lines = [np.asarray(line.get_ydata(), dtype=float) for line in axes.lines]
+    reach = max((float(np.abs(y[np.isfinite(y)]).max(initial=0.0)) for y in lines), default=0.0)
+    for sign in (-1, 1) if both else (1,):
+        axes.axhline(sign * value, **BOUND)
+    height, side = where.split()
+    axes.annotate(
+        text,
+        ({"left": 0.015, "right": 0.985}[side], -value if height == "under" else value),
+        xycoords=("axes fraction", "data"),
+        xytext=(0, 1.5 if height == "above" else -1.5),
+        textcoords="offset points",
+        ha=side,
+        va="bottom" if height == "above" else "top",
+        **NOTE,
+    )
+    room = max(1.25 * abs(value), 1.1 * reach)
+    if both:
+        axes.set_ylim(-room, room)
+    elif axes.get_yscale() == "log":
+        axes.set_ylim(top=max(2.5 * abs(value), 1.5 * reach))
+    elif value > 0:
+        axes.set_ylim(top=room)
+
+
+def upright(axes: Axes, x: float, height: float, text: str, *, ha: str) -> None:
+    """A name along an upright line, from a share of the axes' height."""
+    where: dict[str, Any] = {"xycoords": ("data", "axes fraction"), "rotation": 90, "va": "bottom", "ha": ha}
+    axes.annotate(text, (x, height), **where, **NOTE)
+
+
+def square(axes: Axes, *, least: float = 0.0) -> None:
+    """Equal axes about the centre that hold all that is drawn, and at least so much."""
+    from matplotlib.ticker import MaxNLocator
+
+    box = axes.dataLim
+    reach = max(least, 1.1 * max(abs(edge) for edge in (box.x0, box.x1, box.y0, box.y1)))
+    axes.set_xlim(-reach, reach)
+    axes.set_ylim(-reach, reach)
+    axes.set_box_aspect(1)
+    axes.tick_params(labelsize=8)
+    for side in (axes.xaxis, axes.yaxis):
+        side.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10]))
+
+
+def plain(axes: Axes) -> None:
+    """A light grid behind the data, no frame on the far sides."""
+    axes.grid(color="#e4e4e4", linewidth=0.6)
+    axes.set_axisbelow(True)
+    for edge in ("top", "right"):
+        axes.spines[edge].set_visible(False)
+
+
+def finish(axes: Axes, x: str, y: str, *, legend: int = 0, side: str = "left") -> None:
+    """Labels, grid, and a legend of so many columns above the axes, where it covers no data."""
+    axes.set_xlabel(x)
+    axes.set_ylabel(y)
+    plain(axes)
+    axes.margins(x=0)
+    if legend:
+        where: dict[str, Any] = {"loc": f"lower {side}", "bbox_to_anchor": ({"left": 0, "right": 1}[side], 1)}
+        handles, labels = entries([axes])
+        axes.legend(handles, labels, ncols=legend, borderaxespad=0.2, **where, **LEGEND)
+
+
+def shared_legend(figure: Figure) -> None:
+    """One legend for all panels, below the title."""
+    handles, labels = entries(figure.axes)
+    where: dict[str, Any] = {"loc": "upper center", "bbox_to_anchor": (0.5, 0.925)}
+    figure.legend(handles, labels, ncols=len(labels), **where, **LEGEND)
+
+
+def entries(panels: Sequence[Axes]) -> tuple[list[Any], list[str]]:
+    """Handles and labels, each label once, crosses last."""
+    found: dict[str, Any] = {}
+    for axes in panels:
+        for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
+            found.setdefault(label, handle)
+    labels = sorted(found, key=lambda label: getattr(found[label], "get_marker", str)() == CROSS["marker"])
+    return [found[label] for label in labels], labels
+
+
+def histogram(
+    axes: Axes, series: Sequence[FloatArray], labels: Sequence[str], bins: float, reach: float
+) -> None:
+    styles: tuple[dict[str, Any], ...] = (
+        {"fill": True, "facecolor": "#d4d4d4", "edgecolor": "#8a8a8a", "linewidth": 0.8},
+        {"edgecolor": "#000000", "linewidth": 1.2},
+    )
+    for values, label, width, style in zip(series, labels, (bins, bins / 10), styles, strict=True):
+        count = math.ceil(reach / width)
+        edges = (np.arange(-count, count + 2) - 0.5) * width
+        axes.stairs(100 * np.histogram(values, edges)[0] / len(values), edges, label=label, **style)
+    axes.set_xlim(-reach, reach)
+
+
+def callipers(axes: Axes, spreads: Sequence[tuple[str, float, float]], top: float) -> None:
+    """Mean and standard deviation above the data."""
+    for n, (label, mean, std) in enumerate(spreads):
+        height = top * (1.26 - 0.13 * n)
+        style = {"color": STYLES[n]["color"], "marker": "|", "markersize": 7}
+        axes.plot([mean - std, mean, mean + std], 3 * [height], **style)
+        where: dict[str, Any] = {"xycoords": ("axes fraction", "data"), "va": "center"}
+        axes.annotate(label, (0.03, height), **where, **NOTE)
+        axes.annotate(f"{number(std, 3)} µm", (0.99, height), ha="right", **where, **NOTE)
+    axes.set_ylim(0, 1.36 * top)
+
+
+def clearance(plant: Plant) -> float:
+    """The shortest way across the stroke that ends in a touch, m; infinite where there is none."""
+    way, half = 1e-6, len(plant.states) // 2
+    across = [s.name for k, s in enumerate(plant.states[:half]) if s.unit == "m" and k != plant.stroke_state]
+
+    def share(**moved: float) -> FloatArray:
+        return np.array(ca.evalf(plant.contact(ca.SX(ca.DM(plant.at(**moved).x))))).ravel()
+
+    nearer = [share(**{name: side * way}) - share() for name in across for side in (1, -1)]
+    most = max((float(used.max(initial=0.0)) for used in nearer), default=0.0)
+    return way / most if most else math.inf
+
+
+def read_out(published: Published, key: str, unit: str) -> float:
+    """A published quantity in the unit to show it in."""
+    return in_unit(published_value(published, key), unit)
+
+
+def number(value: float, digits: int = 4) -> str:
+    """A number in so many digits, without exponent; "-" for NaN."""
+    if not math.isfinite(value):
+        return "-" if math.isnan(value) else f"{value}"
+    decimals = digits - 1 - math.floor(math.log10(abs(value))) if value else 0
+    text = f"{value:.{min(max(decimals, 0), digits + 1)}f}"
+    return text if float(text) else "0"
+
+
+def said(merit: Merit, digits: int = 3) -> str:
+    """A figure of merit in its unit, as a sentence has it."""
+    unit = {"percent": " %", "1": ""}.get(merit.unit, f" {micro(merit.unit)}")
+    return number(in_unit(merit.value, merit.unit), digits) + unit
+
+
+def told(cases: Sequence[Case], which: int) -> str:
+    """One merit of every case, in a line."""
+    found = ", ".join(f"{case.label} {said(case.merits[which])}" for case in cases)
+    return micro(f"{cases[0].merits[which].label.replace(': ', ', ')}: {found}")
+
+
+def micro(text: str) -> str:
+    """um as µm."""
+    return re.sub(r"\bu(?=(?:rad|[msANV])\b)", "µ", text)

@@ -1,0 +1,220 @@
+"""The ledger: every number that a source paper publishes, ours for each design, and a verdict. Computed, not typed.
+
+What the paper prints is read from data/published/, ours comes from the same functions that a user calls: model, gains,
+margins, and the experiments on the simulated machine. A verdict follows from the numbers:
+
+    reproduced          equal to the printed digits, within the printed bound, or within 5 % of an "about"
+    within x %          of the published figure, x up to 20
+    not reproduced      else, with the reason
+
+It is said by design where the designs differ, and with the reading where the paper leaves a definition open. The claims
+on a machine are in the module of its name here, which has
+
+    SOURCE        the paper
+    evidence      (spec, published, progress) -> what is known of a design: Found, and what its rows ask for besides
+    rows          () -> list[Row]
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+
+from malta.errors import InputError
+from malta.margins.verify import Margins, verify
+from malta.model.data import in_unit, published_value
+from malta.model.linearize import LinearModel, linearize
+from malta.model.machines import required
+from malta.simulation.experiments import (
+    Experiment,
+    Progress,
+    experiment,
+    part,
+)
+from malta.synthesis.lqg import synthesize
+
+if TYPE_CHECKING:
+    from malta.margins.robust import Margin
+    from malta.synthesis.controller import Controller
+    from malta.synthesis.spec import Spec
+
+CLOSE, NEAR = 0.05, 0.2  # of the published figure: reproduced; within x %
+ROUNDING = 1e-9
+
+
+class Claim(NamedTuple):
+    """A line of the ledger."""
+
+    subject: str
+    published: str
+    ours: tuple[str, ...]  # for each design
+    verdict: str
+
+
+@dataclass(frozen=True)
+class Ledger:
+    """All claims of the paper on a machine, for some designs."""
+
+    machine: str
+    source: str  # the paper
+    designs: tuple[str, ...]
+    claims: tuple[Claim, ...]
+
+    @property
+    def title(self) -> str:
+        """The machine and its paper."""
+        return f"{self.machine}, {self.source}"
+
+    def markdown(self) -> str:
+        """The table as the README shows it."""
+        header = ["claim", "published", *(f"`{name}`" for name in self.designs), "verdict"]
+        rows = [[c.subject, c.published, *c.ours, c.verdict] for c in self.claims]
+        lines = ["| " + " | ".join(row) + " |" for row in (header, *rows)]
+        return "\n".join([lines[0], "|---" * len(header) + "|", *lines[1:]]) + "\n"
+
+
+class Found(Protocol):
+    """What is known of one design; a machine's evidence may hold more."""
+
+    @property
+    def spec(self) -> Spec: ...
+    @property
+    def controller(self) -> Controller: ...
+    @property
+    def margins(self) -> Margins: ...
+    @property
+    def flown(self) -> Mapping[str, Experiment]: ...
+
+
+class Designed(NamedTuple):
+    """A design from its file to the runs that claims are made of."""
+
+    model: LinearModel
+    controller: Controller
+    margins: Margins
+    flown: dict[str, Experiment]
+
+
+def designed(spec: Spec, names: Sequence[str], progress: Progress | None = None) -> Designed:
+    """Design, prove and fly the experiments of these names."""
+    plant = spec.plant
+    model = linearize(plant, plant.at(**spec.operating_point))
+    controller = synthesize(spec, model)
+    flown = {
+        name: experiment(name, plant, controller, progress=part(progress, n, len(names)))
+        for n, name in enumerate(names)
+    }
+    return Designed(model, controller, verify(model, controller, spec.uncertainty), flown)
+
+
+class Row(NamedTuple):
+    """A figure that the paper publishes, and how to find ours."""
+
+    subject: str
+    unit: str  # that both are shown in
+    form: str
+    value: Callable[[Any], float]  # of the machine's evidence; SI
+    published: str | float | None = (
+        None  # key of data/published/, or a figure that its text implies; None: ours alone
+    )
+    relation: str = "about"  # "equal" to the printed digits, "at most", "at least", "about"
+    note: str = ""  # where the paper leaves a definition open, or what explains the figures
+    why: str = ""  # the reason for whatever is not reproduced
+
+
+def ledger(specs: Sequence[Spec], published: Mapping[str, Any], progress: Progress | None = None) -> Ledger:
+    """Compute every claim of the paper on a machine for these designs of it.
+
+    progress : told the share that is done
+
+    Raises InputError for designs of another machine, of one without claims, or when the published figures lack one.
+    """
+    if not specs:
+        raise InputError("claims", "designs", "none", "at least one design")
+    machine = specs[0].plant.name
+    for spec in specs:
+        if spec.plant.name != machine:
+            raise InputError(spec.path, "machine", spec.plant.name, f"{machine}, as of {specs[0].path}")
+    paper = required("claims", machine)
+    found: list[Found] = [
+        paper.evidence(spec, published, part(progress, n, len(specs))) for n, spec in enumerate(specs)
+    ]
+    claims = [_claim(row, found, published) for row in paper.rows()]
+    return Ledger(machine, paper.SOURCE, tuple(e.spec.name for e in found), tuple(claims))
+
+
+def _claim(row: Row, found: Sequence[Found], published: Mapping[str, Any]) -> Claim:
+    values = [in_unit(row.value(e), row.unit) for e in found]
+    ours = tuple("–" if math.isnan(value) else row.form.format(value) for value in values)
+    unit = {"1": "", "percent": " [%]", "um": " [µm]", "urad": " [µrad]", "deg": " [°]"}.get(
+        row.unit, f" [{row.unit}]"
+    )
+    subject = row.subject + unit
+    if row.published is None:
+        return Claim(subject, "–", ours, "ours" + (f": {row.note}" if row.note else ""))
+    target = in_unit(
+        published_value(published, row.published) if isinstance(row.published, str) else row.published,
+        row.unit,
+    )
+    printed = row.form.format(target) if row.relation == "equal" else f"{target:.4g}"
+    mark = {"at most": "≤ ", "at least": "≥ "}.get(row.relation, "")
+    return Claim(subject, mark + printed, ours, _verdict(row, target, values, [e.spec.name for e in found]))
+
+
+def _verdict(row: Row, target: float, values: Sequence[float], names: Sequence[str]) -> str:
+    """What the figures of all designs say together."""
+    words = [_word(row, target, value) for value in values]
+    note = f"; {row.note}" if row.note else ""
+    if len(set(words)) == 1:
+        text = words[0] + note
+    else:
+        text = "; ".join(f"{name}: {word}" for name, word in zip(names, words, strict=True)) + note
+    return text + (f"; {row.why}" if row.why and "not reproduced" in text else "")
+
+
+def _word(row: Row, target: float, value: float) -> str:
+    if math.isnan(value):
+        return "not reproduced"
+    if row.relation in ("at most", "at least"):
+        within = value <= target if row.relation == "at most" else value >= target
+        return "reproduced" if within else "not reproduced"
+    if row.relation == "equal":
+        if row.form.format(value) == row.form.format(target):
+            return "reproduced"
+        return "not reproduced"
+    off = abs(value / target - 1)
+    if off <= CLOSE + ROUNDING:
+        return "reproduced"
+    return f"within {math.ceil((off - ROUNDING) * 100)} %" if off <= NEAR + ROUNDING else "not reproduced"
+
+
+def machine_share(e: Found) -> float:
+    """Of the machine's own loop: the share of the design's uncertainty that is proven."""
+    return math.nan if e.margins.robust is None else proven(e.margins.robust)
+
+
+def proven(margin: Margin) -> float:
+    """NaN where nothing is."""
+    return math.nan if margin.lower is None else margin.lower
+
+
+def bandwidth(definition: str, e: Found) -> float:
+    """By one of the definitions of verify."""
+    return e.margins.bandwidth[definition]
+
+
+def peak_sensitivity(e: Found) -> float:
+    """Of the worst sensor."""
+    return max(v for name, v in e.margins.peak_sensitivity.items() if name != "sigma_max")
+
+
+def merit(name: str, label: str, e: Found) -> float:
+    """A figure of merit of an experiment."""
+    return next(merit.value for merit in e.flown[name].merits if merit.label == label)
+
+
+def first_merit(name: str, number: int, e: Found) -> float:
+    """The first figure of merit of a case."""
+    return e.flown[name].cases[number].merits[0].value

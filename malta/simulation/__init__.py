@@ -1,0 +1,1 @@
+"""Nonlinear simulation: the control period as one function, its engines, scenarios, experiments."""

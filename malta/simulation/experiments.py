@@ -1,0 +1,279 @@
+"""Experiments on a machine, each by name: what is run, and its figures of merit.
+
+An experiment is a function (plant, controller, *, progress=None, **options) -> Experiment. Options are fields of
+simulate.Scenario that replace the experiment's own (fidelity, noise, seed, estimator, ...), and those that its
+signature names: numbers in SI, words, true or false, tuples of numbers; their defaults say which.
+
+A machine's experiments are in the module of its name here, which has
+
+    EXPERIMENTS   name -> experiment; the first is the machine's main job, which every design has to complete
+
+and, where they say something,
+
+    CASES         name -> (plant, controller, **options) -> list[Wanted]: experiments that many machines can fly
+    FINDINGS      names of experiments that ask where it ends: a touchdown is no failure
+    ALONE         names of experiments whose figure shows one run by itself
+    OPTION_UNITS  option -> SI unit
+    check         (experiment, option, value): raises InputError for a value that the experiment does not stand
+    WORDS         what the machine calls its "stroke" and "thrust", and by unit ("m", "rad", "N", "N m") its other
+                  outputs and inputs; without a word the names of the signals are used
+    STROKE_UNIT   what deviations along the stroke are shown in, if not in um
+    bounds        (scenario, options) -> what the paper prints of this very scenario, as keys of data/published/:
+                  "rise" and "overshoot" of the stroke, largest deviations "stroke" along it, "m" and "rad" else
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from numbers import Real
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from malta.errors import InputError
+from malta.model.data import in_unit
+from malta.model.machines import own, required
+from malta.model.plant import Plant
+from malta.simulation.references import Reference
+from malta.simulation.simulate import (
+    EngineChoice,
+    Scenario,
+    Trajectory,
+    simulate,
+)
+from malta.synthesis.controller import Controller
+
+if TYPE_CHECKING:
+    from malta.model.plant import FloatArray
+
+Progress = Callable[[float], None]
+# Fields of a scenario that make the experiment, all others may replace its own; and the engine.
+MADE = {"name", "reference", "start", "cold", "disturbance", "faults", "correction", "changes"}
+OPTIONS = {f.name for f in fields(Scenario)} - MADE | {"engine"}
+# Sensors as built, without errors of their own; and such that say the truth.
+REAL: dict[str, Any] = {"noise": 1.0, "quantize": True, "sensor_errors": {}}
+QUIET: dict[str, Any] = {"noise": 0.0, "quantize": False, "sensor_errors": None}
+
+
+class Merit(NamedTuple):
+    """A figure of merit: SI value, the unit to show it in, and where the paper prints its own."""
+
+    label: str
+    value: float
+    unit: str
+    published: str = ""  # key of data/published/
+    relation: str = "about"  # of ours to the published: "about" or "at most"
+
+    def __str__(self) -> str:
+        unit = "%" if self.unit == "percent" else self.unit
+        return f"{self.label} {in_unit(self.value, self.unit):.3g} {unit}"
+
+
+class Case(NamedTuple):
+    """One of several runs of an experiment."""
+
+    label: str
+    run: Trajectory
+    merits: tuple[Merit, ...]
+
+
+class Wanted(NamedTuple):
+    """A run that an experiment wants, and what is to be found in it."""
+
+    label: str
+    scenario: Scenario
+    merits: Callable[[Trajectory], tuple[Merit, ...]]
+
+
+@dataclass(frozen=True, eq=False)
+class Experiment:
+    """What an experiment found."""
+
+    name: str
+    question: str
+    cases: tuple[Case, ...]
+    merits: tuple[Merit, ...]
+    curves: Mapping[str, FloatArray] = field(default_factory=dict)  # what is drawn beside the runs
+    interrupted: bool = False  # by Ctrl-C: the cases are those that were begun
+
+    def __str__(self) -> str:
+        cases = ("; ".join([case.label, *map(str, case.merits)]) for case in self.cases)
+        return "\n  ".join([f"{self.name}: {self.outcome}", *cases])
+
+    @property
+    def run(self) -> Trajectory:
+        """The first run."""
+        return self.cases[0].run
+
+    @property
+    def failed(self) -> bool:
+        """Whether a run ended that should not have; where touchdown is a finding, it is none."""
+        ends = {case.run.verdict.name for case in self.cases}
+        findings = said(self.run.plant, "FINDINGS", ())
+        return self.name not in findings and not ends <= {"completed", "interrupted"}
+
+    @property
+    def outcome(self) -> str:
+        """How its runs ended, in words."""
+        ends = [case for case in self.cases if not case.run.verdict.completed]
+        if not ends and self.interrupted:
+            return f"interrupted after {len(self.cases)} runs"
+        if not ends:
+            return f"completed at {self.run.verdict.time:.4g} s"
+        verdicts = [f"{case.run.verdict.name} at {case.run.verdict.time:.4g} s" for case in ends]
+        if len(self.cases) == 1:
+            return verdicts[0]
+        return f"{len(ends)} of {len(self.cases)} runs not completed ({ends[0].label}: {verdicts[0]})"
+
+
+def scenario_of(
+    name: str, duration: float, reference: Callable[[Plant], Reference], options: Mapping[str, Any]
+) -> Scenario:
+    """An experiment's scenario: real sensors unless the options say otherwise."""
+    fields = REAL | {key: value for key, value in options.items() if key != "engine"}
+    return replace(Scenario(name, duration, reference), **fields)
+
+
+def fly(
+    plant: Plant,
+    controller: Controller,
+    wanted: Sequence[Wanted],
+    progress: Progress | None,
+    options: Mapping[str, Any],
+) -> tuple[tuple[Case, ...], bool]:
+    """Run scenarios one after the other. Ctrl-C ends the series with what there is: the second result."""
+    return fly_all([(plant, controller, one) for one in wanted], progress, options)
+
+
+def fly_all(
+    flights: Sequence[tuple[Plant, Controller, Wanted]],
+    progress: Progress | None,
+    options: Mapping[str, Any],
+) -> tuple[tuple[Case, ...], bool]:
+    """The same, each with a machine and a controller of its own."""
+    cases: list[Case] = []
+    for n, (plant, controller, (label, scenario, merits)) in enumerate(flights):
+        share = part(progress, n, len(flights))
+        try:
+            run = simulate(plant, controller, scenario, engine=options.get("engine", "auto"), progress=share)
+        except KeyboardInterrupt:
+            if not cases:
+                raise
+            return tuple(cases), True
+        cases.append(Case(label, run, merits(run)))
+        if run.verdict.name == "interrupted":
+            return tuple(cases), True
+    return tuple(cases), False
+
+
+def part(progress: Progress | None, n: int, total: int) -> Progress | None:
+    """Progress of the n-th of so many parts."""
+    return None if progress is None else lambda share: progress((n + share) / total)
+
+
+def rms(values: FloatArray) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def experiments_of(plant: Plant) -> Mapping[str, Callable[..., Experiment]]:
+    """A machine's experiments by name, its main job first. Raises InputError for a machine that has none."""
+    found: Mapping[str, Callable[..., Experiment]] = required("experiments", plant.name).EXPERIMENTS
+    return found
+
+
+def said(plant: Plant, name: str, default: Any) -> Any:
+    """What the module of the machine's experiments says under this name."""
+    return getattr(own("experiments", plant.name), name, default)
+
+
+def main_job(plant: Plant) -> str:
+    """The experiment that stands for all."""
+    return next(iter(experiments_of(plant)))
+
+
+def experiment(
+    name: str, plant: Plant, controller: Controller, *, progress: Progress | None = None, **options: Any
+) -> Experiment:
+    """Run an experiment by name. Raises InputError for an unknown one, or an option that it does not take."""
+    _check(name, plant, options)
+    return experiments_of(plant)[name](plant, controller, progress=progress, **options)
+
+
+def cases_of(name: str, plant: Plant, controller: Controller, **options: Any) -> list[Wanted]:
+    """What one of the machine's CASES would fly, without flying it. Raises InputError as `experiment` does."""
+    _check(name, plant, options)
+    cases: Mapping[str, Callable[..., list[Wanted]]] = said(plant, "CASES", {})
+    if name not in cases:
+        found = f"{name!r}, which changes the machine or the reference in flight"
+        raise InputError("simulate", "scenario", found, "one of " + ", ".join(cases))
+    return cases[name](plant, controller, **options_of(name, plant) | options)
+
+
+def flown(
+    name: str,
+    plant: Plant,
+    controller: Controller,
+    wanted: Wanted,
+    engine: EngineChoice = "auto",
+    progress: Progress | None = None,
+    run: Trajectory | None = None,
+) -> Experiment:
+    """One run of an experiment by itself, flown now or before; those whose figure compares runs have a plain one."""
+    if run is None:
+        cases, cut = fly(plant, controller, [wanted], progress, {"engine": engine})
+    else:
+        cases, cut = (Case(wanted.label, run, wanted.merits(run)),), False
+    shown = name if name in said(plant, "ALONE", ()) else "run"
+    what = name if wanted.label == name else f"{name}: {wanted.label}"
+    return Experiment(shown, what, cases, cases[0].merits, interrupted=cut)
+
+
+def options_of(name: str, plant: Plant) -> dict[str, Any]:
+    """The options that an experiment has of its own, with their defaults. Raises InputError for an unknown one."""
+    known = experiments_of(plant)
+    if name not in known:
+        raise InputError("simulate", "scenario", repr(name), "one of " + ", ".join(known))
+    parameters = inspect.signature(known[name]).parameters.values()
+    return {p.name: p.default for p in parameters if p.kind is p.KEYWORD_ONLY and p.name != "progress"}
+
+
+def option_of(name: str, plant: Plant, option: str) -> Any:
+    """The default of one of them. Raises InputError for an option that the experiment does not have."""
+    mine = options_of(name, plant)
+    if option not in mine:
+        others = {o for other in experiments_of(plant) for o in options_of(other, plant)}
+        found = "an option of another scenario" if option in others else "an unknown option"
+        expected = " ".join(sorted(mine)) or "none of its own"
+        raise InputError("simulate", f"{name}: {option}", found, expected)
+    return mine[option]
+
+
+def _check(name: str, plant: Plant, options: Mapping[str, Any]) -> None:
+    """InputError for an unknown experiment, or an option that it does not take."""
+    mine, check = options_of(name, plant), said(plant, "check", None)
+    for option, value in options.items():
+        if option in OPTIONS and option not in mine:
+            continue
+        expected = _expected(value, option_of(name, plant, option))
+        if expected:
+            raise InputError("simulate", f"{name}: {option}", repr(value), expected)
+        if check is not None:
+            check(name, option, value)
+
+
+def _expected(value: Any, default: Any) -> str:
+    """What an option takes whose default is of this kind, unless it is this value."""
+    if isinstance(default, bool):
+        return "" if isinstance(value, bool) else "true or false"
+    if isinstance(default, Real):
+        return "" if _is_number(value) else "a number"
+    if isinstance(default, tuple):
+        several = isinstance(value, tuple | list) and len(value) > 0
+        return "" if several and all(map(_is_number, value)) else "numbers"
+    return ""  # words are looked up where they are used
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, Real) and not isinstance(value, bool)

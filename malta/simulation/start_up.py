@@ -1,0 +1,164 @@
+"""Kalman filters for a start that the steady-state filter knows nothing of: filterpy's, on the machine's CasADi model.
+
+    kalman     time-varying: the gain file's model, the gain still large while nothing is known
+    extended   the nonlinear machine as the controller believes it to be: gravity, cogging, touchdown bearings; so it
+               knows what holds a mover that rests on its bearing
+
+Both start from the first measurement: positions as measured, rates zero with the variance that the difference of two
+measurements would have. Covariances of forces and sensors are those of the filter in the gain file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from typing import TYPE_CHECKING, Any
+
+import casadi as ca
+import numpy as np
+from filterpy.kalman import ExtendedKalmanFilter
+
+from malta.errors import InputError
+from malta.margins.uncertain import holds
+from malta.model.data import plant_of
+from malta.model.plant import Plant
+from malta.simulation import period as machine
+from malta.simulation.engines import Engine
+from malta.simulation.period import Setup
+from malta.synthesis.controller import Controller, Noise
+
+if TYPE_CHECKING:
+    from malta.model.plant import FloatArray
+
+Observer = Callable[
+    [Engine, Plant, "FloatArray", "FloatArray", "FloatArray"], tuple["FloatArray", "FloatArray"]
+]
+
+
+def observer(plant: Plant, c: Controller, setup: Setup, kind: str, substeps: int, errors: Any) -> Observer:
+    """Runs control periods one by one with an estimate of its own: (engine, state, given, noise) -> (state, rows)."""
+    if c.noise is None or c.observed:
+        found = "a PID" if c.noise is None else "forces of disturbance in its own"
+        raise InputError("simulate", f"estimator {kind}", found, "an LQG with integrals")
+    if holds(plant_of(c.parameters)):
+        found = f"a {plant.name}, whose currents are held between samples"
+        raise InputError("simulate", f"estimator {kind}", found, "steady-state, which knows of that")
+    filter_ = _filter(c, c.noise)
+    predict = _nonlinear(c) if kind == "extended" else _linear(c)
+    jacobian, output = _measurement(c)
+
+    @cache
+    def sensors(now: Plant) -> ca.Function:
+        return machine.parts(now, c, setup, machine.numbers(now, c, substeps, errors), constant=True).sense
+
+    sizes = machine.layout(plant, c, setup).row
+    edges = dict(zip(sizes, np.cumsum([0, *sizes.values()]), strict=False))
+    commands = slice(edges["v"], edges["v"] + sizes["v"])
+    stroke = plant_of(c.parameters).stroke_output
+    n = len(c.A)
+    # v - v0 of the last samples, the oldest first
+    sent: list[FloatArray] = [np.zeros(len(c.forces))] * c.delay
+    loads: list[FloatArray] = []
+    started = False
+
+    @np.errstate(all="ignore")  # what is lost ends the run with a verdict
+    def run(
+        engine: Engine, flown: Plant, state: FloatArray, given: FloatArray, noise: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        nonlocal started
+        rows = []
+        sense, none = sensors(flown), np.zeros((0, 0))
+        for k in range(len(given)):
+            y = np.array(sense(state, given[k], noise[k], [])[0]).ravel()
+            if not started:
+                _begin(filter_, c, y)
+                started = True
+            try:
+                filter_.update(y, jacobian, output)
+            except (np.linalg.LinAlgError, ValueError):  # of no numbers
+                filter_.x = np.full(n, np.nan)
+            now = given[k : k + 1].copy()
+            now[0, -len(c.states) :] = np.concatenate([filter_.x, *sent])
+            state, row = engine.run(0, state, now, noise[k : k + 1], none)
+            rows.append(row)
+            if not np.isfinite(row).all():
+                break
+            v0 = c.feedforward.at(y[stroke])
+            sent.append(row[0, commands] - v0)
+            loads.append(v0)
+            filter_.x, filter_.F = predict(
+                filter_.x, sent.pop(0), loads.pop(0) if len(loads) > c.delay else v0
+            )
+            filter_.P = filter_.F @ filter_.P @ filter_.F.T + filter_.Q
+        return state, np.concatenate(rows)
+
+    return run
+
+
+def _filter(c: Controller, noise: Noise) -> Any:
+    n, p = len(c.A), len(c.measurements)
+    kalman = ExtendedKalmanFilter(dim_x=n, dim_z=p, dim_u=len(c.forces))
+    B = (c.Ad[:n, n : n + len(c.forces)] if c.delay else c.Bd)[:n]
+    kalman.Q = B * noise.process @ B.T
+    kalman.R = np.diag(noise.sensor)
+    kalman.x = np.zeros(n)
+    return kalman
+
+
+def _begin(kalman: Any, c: Controller, y: FloatArray) -> None:
+    """One measurement: positions P^-1 y with its covariance, rates zero +- sqrt(2) of that a sample."""
+    believed = plant_of(c.parameters)
+    symbol = ca.SX.sym("y", len(y))
+    q = believed.position_of(symbol)
+    values = ca.Function("q", [symbol], [q, ca.jacobian(q, symbol)])(y)
+    position, J = np.array(values[0]).ravel(), np.array(values[1])
+    half = len(position)
+    kalman.x = np.concatenate([position, np.zeros(len(c.A) - half)])
+    spread = J @ kalman.R @ J.T
+    kalman.P = np.zeros((len(c.A), len(c.A)))
+    kalman.P[:half, :half] = spread
+    kalman.P[half:, half:] = 2 * np.diag(np.diag(spread)) / c.sample_time**2
+
+
+def _linear(c: Controller) -> Callable[..., tuple[FloatArray, FloatArray]]:
+    n, m = len(c.A), len(c.forces)
+    A = c.Ad[:n, :n]
+    B = c.Ad[:n, n : n + m] if c.delay else c.Bd
+    return lambda x, v, _: (A @ x + B @ v, A)
+
+
+def _nonlinear(c: Controller) -> Callable[..., tuple[FloatArray, FloatArray]]:
+    """A sample of the believed machine under v + v0, with its loads and bearings, and its Jacobian."""
+    believed = plant_of(c.parameters)
+    x, u = ca.SX.sym("x", len(believed.states)), ca.SX.sym("u", len(c.forces))
+    h = c.sample_time / 4
+
+    def rate(z: Any, _: int) -> Any:
+        return believed.f(z, u, believed.load(z) + believed.bearing(z))
+
+    z = x
+    for _ in range(4):
+        z = machine.runge_kutta(rate, z, h)
+    chosen = list(believed.controlled)
+    step = ca.Function("step", [x, u], [z[chosen], ca.jacobian(z, x)[chosen, chosen]])
+
+    def predict(estimate: FloatArray, v: FloatArray, v0: FloatArray) -> tuple[FloatArray, FloatArray]:
+        full = np.zeros(len(believed.states))
+        full[chosen] = estimate
+        after, F = step(full, v + v0)
+        return np.array(after).ravel(), np.array(F)
+
+    return predict
+
+
+def _measurement(c: Controller) -> tuple[Callable[..., FloatArray], Callable[..., FloatArray]]:
+    believed = plant_of(c.parameters)
+    x = ca.SX.sym("x", len(c.A))
+    full = ca.SX.zeros(len(believed.states))
+    full[list(believed.controlled)] = x
+    y = believed.h(full, 0)
+    function = ca.Function("h", [x], [y, ca.jacobian(y, x)])
+    return (
+        lambda estimate: np.array(function(estimate)[1]),
+        lambda estimate: np.array(function(estimate)[0]).ravel(),
+    )

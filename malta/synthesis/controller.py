@@ -1,0 +1,282 @@
+"""The controller: everything that a digital implementation needs, and its control law, stated once.
+
+                     v_ff, v0(z)
+                         |            w
+  p*, xi* --> [ law ] ---+--> v --> [ current loops ] --> [ plant ] --+--> p
+                ^                                                     |
+                +------------------------ y = p + noise <-------------+
+
+At every sample:
+  1. y = measured outputs;                      e += Ts (p* - y), frozen on the axes that saturated last
+  2. xi_hat = xi_pred + L (y - Cd xi_pred)                                     (steady-state Kalman filter)
+  3. v_fb = K (xi* - xi_hat) + Ki e             with xi* = (P(z*)^-1 p*, its derivative)
+  4. v = saturate(v_fb + v_ff + v0(z)),         v_ff = inertia p*'' + speed p*', z the measured stroke
+  5. currents = those that make v where y says the machine is, held until the next sample
+  6. xi_pred = Ad xi_hat + Bd (v - v0(z))
+The mechanical states stand first in xi. Where the design models a delay of d samples, forces of the last d samples
+follow, the oldest first: v - v0, and what currents commutated for an old reading make beside it. Their reference is
+what was commanded then. Last come constant forces of disturbance, where the filter observes them, with zero for a
+reference.
+
+A PID controller is the same law: its filter takes positions as measured and rates as filtered differences,
+Ad = diag(1, a), Bd = 0, L = (P^-1, (1 - a) P^-1 / Ts), and it has neither a cost nor noise that it was designed for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import casadi as ca
+import numpy as np
+
+from malta.errors import InputError
+from malta.model.plant import Parameters, Signal, readonly
+
+if TYPE_CHECKING:
+    from malta.model.plant import FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Feedforward:
+    """v_ff = inertia p*'' + speed p*'; v0(z) of the stroke z, linear between the grid points, constant beyond them.
+
+    Where currents are held that were commutated for the last reading, what they pull back with is periodic with the
+    samples: a steady ramp then takes a force, and passes the readings faster than on average.
+    """
+
+    inertia: FloatArray  # kg or kg m^2, m inputs; times the output of the same index
+    speed: FloatArray  # m x p, N s/m
+    rate: FloatArray  # n0 / 2 x p, rates at the samples beyond P^-1 p*', per unit of p*'
+    z_grid: FloatArray  # m, g points
+    v0: FloatArray  # N, g x m
+
+    def __post_init__(self) -> None:
+        for name in ("inertia", "speed", "rate", "z_grid", "v0"):
+            object.__setattr__(self, name, readonly(getattr(self, name)))
+
+    def at(self, z: float) -> FloatArray:
+        """v0(z), N, m forces."""
+        return np.array([np.interp(z, self.z_grid, column) for column in self.v0.T])
+
+    def slope(self, z: float) -> FloatArray:
+        """dv0/dz, N/m, m forces, across the grid interval about z; zero beyond the grid."""
+        if not self.z_grid[0] < z < self.z_grid[-1]:
+            return np.zeros(self.v0.shape[1])
+        k = min(int(np.searchsorted(self.z_grid, z, side="right")), len(self.z_grid) - 1)
+        return np.asarray((self.v0[k] - self.v0[k - 1]) / (self.z_grid[k] - self.z_grid[k - 1]))
+
+
+@dataclass(frozen=True)
+class CurrentLoop:
+    """PI controller of the current in each axis, u = Kp e + Ki integral of e."""
+
+    Kp: float  # V/A
+    Ki: float  # V/(A s)
+    sample_time: float  # s
+
+
+@dataclass(frozen=True, eq=False)
+class Limits:
+    """Of each coil, and of each input."""
+
+    current: FloatArray  # A, coils
+    voltage: FloatArray  # V, coils; inf: none
+    force: FloatArray  # N or N m, m inputs
+
+    def __post_init__(self) -> None:
+        for name in ("current", "voltage", "force"):
+            object.__setattr__(self, name, readonly(getattr(self, name)))
+
+
+@dataclass(frozen=True, eq=False)
+class Noise:
+    """Variances that the filter was designed for: white over a sample."""
+
+    process: FloatArray  # N^2, m forces
+    sensor: FloatArray  # m^2, p measurements
+    drift: FloatArray  # N^2, of a constant force of disturbance from sample to sample: m, or none
+
+    def __post_init__(self) -> None:
+        for name in ("process", "sensor", "drift"):
+            object.__setattr__(self, name, readonly(getattr(self, name)))
+
+
+@dataclass(frozen=True, eq=False)
+class Cost:
+    """Diagonals of the weights that the regulator minimizes: Q, R and Q_i."""
+
+    state: FloatArray  # n0 mechanical states
+    input: FloatArray  # m forces, 1/N^2
+    integral: FloatArray  # p integrals of errors
+
+    def __post_init__(self) -> None:
+        for name in ("state", "input", "integral"):
+            object.__setattr__(self, name, readonly(getattr(self, name)))
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Controller:
+    """Gains, models and limits of one controller; n states, m forces, p = m measurements.
+
+    Force i and measurement i are of the same axis: when force i saturates, error integral i waits.
+    """
+
+    name: str
+    spec_sha256: str
+    parameters: Parameters  # of the machine that it was designed for
+    operating_point: tuple[FloatArray, FloatArray]  # x (the mechanical states), u
+    sample_time: float  # s
+    states: tuple[Signal, ...]  # n
+    forces: tuple[Signal, ...]  # m
+    measurements: tuple[Signal, ...]  # p
+    A: FloatArray  # continuous, mechanical states only
+    B: FloatArray
+    C: FloatArray
+    Ad: FloatArray  # n x n
+    Bd: FloatArray  # n x m
+    Cd: FloatArray  # p x n
+    K: FloatArray  # m x n
+    Ki: FloatArray  # m x p
+    L: FloatArray  # n x p, filter form
+    cost: Cost | None  # None, as the noise: a PID
+    noise: Noise | None
+    feedforward: Feedforward
+    current_loop: CurrentLoop | None  # None: currents follow their commands at once
+    limits: Limits
+
+    def __post_init__(self) -> None:
+        for f in fields(self):
+            value = getattr(self, f.name)
+            if isinstance(value, np.ndarray):
+                object.__setattr__(self, f.name, readonly(value))
+        x, u = self.operating_point
+        object.__setattr__(self, "operating_point", (readonly(x), readonly(u)))
+        if len(self.forces) != len(self.measurements):
+            found = f"{len(self.forces)} forces and {len(self.measurements)} measurements"
+            raise InputError("Controller", "forces", found, "as many of one as of the other")
+
+    def __repr__(self) -> str:
+        return (
+            f"Controller({self.name!r}, preset {self.parameters.preset!r}, {len(self.states)} states, "
+            f"{len(self.forces)} forces, {1e-3 / self.sample_time:g} kHz, delay {self.delay})"
+        )
+
+    @property
+    def delay(self) -> int:
+        """Samples of delay in the design model."""
+        return (len(self.Ad) - len(self.A)) // len(self.forces) - self.observed
+
+    @property
+    def observed(self) -> int:
+        """1 where forces of disturbance are among the states, else 0."""
+        return int(self.states[-len(self.forces) :] == disturbances(self.forces))
+
+    @property
+    def integrating(self) -> bool:
+        """Whether sums of errors are fed back."""
+        return bool(self.Ki.any())
+
+
+class LinearLaw(NamedTuple):
+    """The law without saturation: s+ = A s + B_y y + B_r r, v = C s + D_y y + D_r r.
+
+    s = (xi_pred, e), without e where it is not fed back; r = (p*, xi*, v_ff, v0).
+    """
+
+    A: FloatArray
+    B_y: FloatArray
+    B_r: FloatArray
+    C: FloatArray
+    D_y: FloatArray
+    D_r: FloatArray
+
+
+def stored_forces(inputs: tuple[Signal, ...], delay: int) -> tuple[Signal, ...]:
+    """The states that hold the forces of the last `delay` samples, the oldest first."""
+    return tuple(Signal(f"{s.name}[k-{age}]", s.unit) for age in range(delay, 0, -1) for s in inputs)
+
+
+def disturbances(inputs: tuple[Signal, ...]) -> tuple[Signal, ...]:
+    """The states that hold constant forces of disturbance."""
+    return tuple(Signal(f"{s.name}[d]", s.unit) for s in inputs)
+
+
+def gains_of(c: Controller) -> dict[str, ca.DM]:
+    """What the law computes with, sparse: exact zeros cost nothing at run time."""
+    matrices = {name: ca.sparsify(ca.DM(getattr(c, name))) for name in ("Ad", "Bd", "Cd", "K", "Ki", "L")}
+    return matrices | {"force_limit": ca.DM(c.limits.force), "control_time": ca.DM(c.sample_time)}
+
+
+def estimated(g: Mapping[str, Any], xi_pred: Any, y: Any, C: Any = None) -> Any:
+    """Step 2, the filter: xi_hat. C: in place of Cd where it is scheduled."""
+    return xi_pred + g["L"] @ (y - (g["Cd"] if C is None else C) @ xi_pred)
+
+
+def commanded(
+    g: Mapping[str, Any],
+    xi_hat: Any,
+    e: Any,
+    frozen: Any,
+    y: Any,
+    p_ref: Any,
+    xi_ref: Any,
+    v_ff: Any,
+    v0: Any,
+) -> tuple[Any, Any, Any, Any]:
+    """Steps 1, 3, 4 and 6: (xi_pred, e, frozen, v) from the estimate."""
+    e = e + g["control_time"] * (1 - frozen) * (p_ref - y)
+    wanted = g["K"] @ (xi_ref - xi_hat) + g["Ki"] @ e + v_ff + v0
+    v = ca.fmax(ca.fmin(wanted, g["force_limit"]), -g["force_limit"])
+    return g["Ad"] @ xi_hat + g["Bd"] @ (v - v0), e, v != wanted, v
+
+
+def law(c: Controller) -> ca.Function:
+    """The control law of one sample as a CasADi function.
+
+    (xi_pred, e, frozen, y, p_ref, xi_ref, v_ff, v0) -> (xi_pred, e, frozen, v, xi_hat)
+    """
+    n, m, p = len(c.states), len(c.forces), len(c.measurements)
+    sizes = {"xi_pred": n, "e": p, "frozen": p, "y": p, "p_ref": p, "xi_ref": n, "v_ff": m, "v0": m}
+    args = {name: ca.SX.sym(name, size) for name, size in sizes.items()}
+    xi_pred, e, frozen, *given = args.values()
+    g = gains_of(c)
+    xi_hat = estimated(g, xi_pred, args["y"])
+    xi_pred_next, e_next, frozen_next, v = commanded(g, xi_hat, e, frozen, *given)
+    outputs = {
+        "xi_pred_next": xi_pred_next,
+        "e_next": e_next,
+        "frozen_next": frozen_next,
+        "v": v,
+        "xi_hat": xi_hat,
+    }
+    return ca.Function("law", list(args.values()), list(outputs.values()), list(args), list(outputs))
+
+
+@lru_cache(
+    maxsize=8
+)  # every loop of a controller asks for it; records compare by identity, so no hit is stale
+def linear_law(c: Controller) -> LinearLaw:
+    """The control law linearized where no axis saturates: exact, by differentiating `law`."""
+    step = law(c)
+    args = [ca.SX.sym(step.name_in(i), *step.size_in(i)) for i in range(step.n_in())]
+    named = dict(zip(step.name_in(), args, strict=True))
+    out = dict(zip(step.name_out(), step(*args), strict=True))
+    kept = ["xi_pred", "e"] if c.integrating else ["xi_pred"]
+    s = ca.vertcat(*(named[name] for name in kept))
+    r = ca.vertcat(*(named[name] for name in ("p_ref", "xi_ref", "v_ff", "v0")))
+    s_next = ca.vertcat(*(out[f"{name}_next"] for name in kept))
+    blocks = [ca.jacobian(of, by) for of in (s_next, out["v"]) for by in (s, named["y"], r)]
+    return LinearLaw(*(readonly(np.array(M)) for M in ca.Function("linear", args, blocks)(*[0] * len(args))))
+
+
+def handed_on(law: LinearLaw) -> LinearLaw:
+    """The same law with the reading itself as further outputs: what currents are commutated for."""
+    p, n, r = law.B_y.shape[1], len(law.A), law.D_r.shape[1]
+    return law._replace(
+        C=np.vstack([law.C, np.zeros((p, n))]),
+        D_y=np.vstack([law.D_y, np.eye(p)]),
+        D_r=np.vstack([law.D_r, np.zeros((p, r))]),
+    )

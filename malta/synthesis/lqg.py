@@ -1,0 +1,523 @@
+"""Linear model + weights -> controller: LQR, LQR with integrals, steady-state Kalman filter, sampling.
+
+    minimize  integral of  xi' Q xi + e' Q_i e + v' R v      subject to  xi' = A xi + B v,  e' = -C xi
+    v = K (xi* - xi) + Ki e
+
+Three ways to a sampled controller:
+  backward-euler   continuous gains; the observer's equation by backward Euler (the paper's way)
+  zoh              gains of the exactly sampled model; weights and noise taken once a sample
+  sampled-data     gains of the exactly sampled model; weights and noise integrated over the sample (Van Loan),
+                   what MATLAB calls lqrd and kalmd
+The integrals are the controller's own sums, e+ = e + Ts (p* - y), so their weight is a sum in both sampled ways.
+Noise is given for one sample; held over it (forces) or spread over it (intensity = variance x Ts).
+
+Both sampled ways know what is held between samples: the currents, commutated for the last reading (E of the linear
+model), so that the sampled machine hangs on their spring. In place of integrals the filter may observe a constant force
+of disturbance on each input, which the regulator takes off again.
+"""
+
+from __future__ import annotations
+
+import math
+from contextlib import suppress
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, get_args
+
+import numpy as np
+from scipy import linalg
+
+from malta.errors import CheckError, InputError
+from malta.model.linearize import LinearModel
+from malta.model.plant import Actuator, Plant, trims
+from malta.synthesis.controller import (
+    Controller,
+    Cost,
+    CurrentLoop,
+    Feedforward,
+    Limits,
+    Noise,
+    disturbances,
+    stored_forces,
+)
+from malta.synthesis.riccati import (
+    add_integrals,
+    care,
+    dare,
+    delay_inputs,
+    eigenvalues,
+    sample,
+    sample_cost,
+    sample_noise,
+)
+from malta.synthesis.spec import (
+    Discretization,
+    Pid,
+    Spec,
+    Weights,
+)
+
+if TYPE_CHECKING:
+    from malta.model.plant import ComplexArray, FloatArray
+
+V0_STEP = 0.25e-3  # m, grid of v0(z): interpolation errs by 0.14 % of the cogging amplitude
+
+
+class Linear(Protocol):
+    """xi' = A xi + B v + E (y_k - p), p = C xi: a LinearModel, or the part of one that nothing joins to the rest."""
+
+    @property
+    def A(self) -> FloatArray: ...
+    @property
+    def B(self) -> FloatArray: ...
+    @property
+    def C(self) -> FloatArray: ...
+    @property
+    def E(self) -> FloatArray: ...
+
+
+class Gains(NamedTuple):
+    """The sampled design model with its gains, as the controller runs them."""
+
+    Ad: FloatArray
+    Bd: FloatArray
+    Cd: FloatArray
+    K: FloatArray
+    Ki: FloatArray
+    L: FloatArray
+
+
+def lqr(model: Linear, weights: Weights) -> FloatArray:
+    """Continuous LQR gain K, m x n: v = -K xi minimizes the integral of xi'Q xi + v'R v."""
+    _check_sizes(model, weights)
+    return care(model.A, model.B, weights.Q, weights.R, "LQR").K
+
+
+def lqi(model: Linear, weights: Weights) -> tuple[FloatArray, FloatArray]:
+    """Continuous LQR with the integrals of the measured errors: K (m x n) and Ki (m x p).
+
+    v = K (xi* - xi) + Ki e, e' = p* - p. The Riccati gain on e acts as -K_e e, so Ki = -K_e; 0 where nothing weighs e.
+    Raises InputError and CheckError as riccati.care.
+    """
+    _check_sizes(model, weights)
+    n, p = len(model.A), len(model.C)
+    if not weights.q_i.any():
+        return lqr(model, weights), np.zeros((model.B.shape[1], p))
+    A = np.block([[model.A, np.zeros((n, p))], [-model.C, np.zeros((p, p))]])
+    B = np.vstack([model.B, np.zeros((p, model.B.shape[1]))])
+    gain = care(A, B, linalg.block_diag(weights.Q, weights.Q_i), weights.R, "LQI").K
+    return gain[:, :n], -gain[:, n:]
+
+
+def kalman(model: Linear, weights: Weights) -> FloatArray:
+    """Continuous steady-state Kalman gain L, n x p: xi_hat' = A xi_hat + B v + L (y - C xi_hat).
+
+    Only the ratio of process to sensor noise matters, so variances of a sample serve as intensities.
+    """
+    _check_sizes(model, weights)
+    W = model.B * weights.process_variance @ model.B.T
+    return care(model.A.T, model.C.T, W, np.diag(weights.sensor_variance), "Kalman filter").K.T
+
+
+def continuous_poles(model: LinearModel, weights: Weights) -> dict[str, ComplexArray]:
+    """Poles of the continuous LQR, LQI and Kalman filter, rad/s: what the weights ask for, before sampling."""
+    p = len(model.C)
+    poles = {}
+    with suppress(CheckError):  # weights on the integrals alone stabilize the LQI only
+        poles["LQR"] = eigenvalues(model.A - model.B @ lqr(model, weights))
+    if weights.q_i.any():
+        K, Ki = lqi(model, weights)
+        integrating = np.block([[model.A - model.B @ K, model.B @ Ki], [-model.C, np.zeros((p, p))]])
+        poles["LQR with integrals"] = eigenvalues(integrating)
+    poles["Kalman filter"] = eigenvalues(model.A - kalman(model, weights) @ model.C)
+    return {name: np.sort_complex(values) for name, values in poles.items()}
+
+
+class Held(NamedTuple):
+    """A machine between samples, its currents held: x' = A x + B (v + H y_k), y_k the last reading."""
+
+    A: FloatArray
+    H: FloatArray  # m x p, N/m
+
+
+def held(model: Linear) -> Held:
+    """What a linear model is between samples; E is in the reach of the inputs."""
+    if not model.E.any():
+        return Held(model.A, np.zeros((model.B.shape[1], len(model.C))))
+    return Held(model.A - model.E @ model.C, np.linalg.lstsq(model.B, model.E, rcond=None)[0])
+
+
+def sampled_model(model: Linear, Ts: float, delay: int = 0) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Ad, Bd, Cd under held currents, with the forces of the last `delay` samples as states."""
+    still = held(model)
+    Ad, Bd = delay_inputs(*sample(still.A, model.B, Ts), delay)
+    n, pull = len(model.A), still.H @ model.C
+    if delay:
+        Ad[-len(pull) :, :n] = pull
+    else:
+        Ad = Ad + Bd @ pull
+    return Ad, Bd, np.hstack([model.C, np.zeros((len(model.C), len(Ad) - n))])
+
+
+def gains(
+    model: Linear, weights: Weights, Ts: float, discretization: Discretization, delay: int = 0
+) -> Gains:
+    """LQR with integrals and Kalman filter of a model, sampled. Raises CheckError as riccati.dare."""
+    if discretization == "backward-euler":
+        return Gains(*_backward_euler(model, weights, Ts))
+    integrated = discretization == "sampled-data"
+    Ad, Bd, Cd = sampled_model(model, Ts, delay)
+    K, Ki = _sampled_regulator(model, weights, Ts, delay, integrated=integrated)
+    L = _sampled_filter(model, weights, Ts, delay, integrated=integrated)
+    if weights.drift_variance.size:  # x+ = Ad x + Bd (v + d), d+ = d; v takes d off, as stored forces have
+        n, m, p = len(model.A), model.B.shape[1], len(Cd)
+        pushed = np.zeros((len(Ad), m))
+        pushed[:n] = Ad[:n, n : n + m] if delay else Bd
+        Ad = np.block([[Ad, pushed], [np.zeros((m, len(Ad))), np.eye(m)]])
+        Bd, Cd = np.vstack([Bd, np.zeros((m, m))]), np.hstack([Cd, np.zeros((p, m))])
+        K = np.hstack([K, np.eye(m) + K[:, n:].reshape(m, delay, m).sum(axis=1)])
+    return Gains(Ad, Bd, Cd, K, Ki, L)
+
+
+@np.errstate(all="ignore")  # what overflows is found at the end
+def lqg(
+    model: LinearModel,
+    weights: Weights,
+    Ts: float,
+    discretization: Discretization = "sampled-data",
+    delay: int = 0,
+    *,
+    name: str = "lqg",
+    current_loop_delay: bool = True,
+) -> Controller:
+    """Design the controller: LQR with integrals, steady-state Kalman filter, feedforward, current loop.
+
+    Parameters
+    ----------
+    Ts : sample time, s
+    delay : samples between measurement and force in the design model (not with backward-euler)
+    current_loop_delay : design the current loop with the machine's dead time
+
+    Raises InputError for arguments that do not fit, CheckError when an equation has no sound solution.
+    """
+    if not (math.isfinite(Ts) and Ts > 0):
+        raise InputError("lqg", "Ts", f"{Ts} s", "a sample time above 0 s")
+    if model.operating_point.loaded:
+        raise InputError(
+            "lqg", "model", "a model at its trim", "one at plant.at(...): v0(z) cancels the loads"
+        )
+    if not isinstance(delay, int):
+        raise InputError("lqg", "delay", repr(delay), "a whole number of samples")
+    if discretization not in get_args(Discretization):
+        raise InputError(
+            "lqg", "discretization", repr(discretization), "one of " + ", ".join(get_args(Discretization))
+        )
+    sampled_only = {"delay": delay, "held currents": model.E.any(), "drift": weights.drift_variance.size}
+    asked = [what for what, given in sampled_only.items() if given]
+    if delay < 0 or (asked and discretization == "backward-euler"):
+        what = str(delay) if delay else asked[0]
+        raise InputError(
+            "lqg", "delay", f"{what} with {discretization}", "0, or more with zoh or sampled-data"
+        )
+    if weights.drift_variance.size and weights.q_i.any():
+        raise InputError(
+            "lqg", "drift", "integrals with a weight", "weights.integral all 0: one of them takes off loads"
+        )
+    _check_sizes(model, weights)
+    found = gains(model, weights, Ts, discretization, delay)
+    if not all(np.isfinite(M).all() for M in found):
+        raise CheckError("lqg: the gains overflow")
+    plant = model.plant
+    observed = disturbances(plant.inputs) if weights.drift_variance.size else ()
+    return Controller(
+        **_machine_part(model, Ts, delay, current_loop_delay=current_loop_delay),
+        **found._asdict(),
+        name=name,
+        states=plant.design_states + stored_forces(plant.inputs, delay) + observed,
+        cost=Cost(
+            weights.q / weights.q_base**2, weights.r / weights.r_base**2, weights.q_i / weights.q_i_base**2
+        ),
+        noise=Noise(weights.process_variance, weights.sensor_variance, weights.drift_variance),
+    )
+
+
+def weights_of(controller: Controller) -> Weights:
+    """What an LQG was designed for, on bases of one SI unit. InputError for a PID, which was not."""
+    cost, noise = controller.cost, controller.noise
+    if cost is None or noise is None:
+        raise InputError(controller.name, "cost", "none, as a PID has", "an LQG")
+    one = np.ones_like
+    return Weights(
+        q=cost.state,
+        q_base=one(cost.state),
+        r=cost.input,
+        r_base=one(cost.input),
+        q_i=cost.integral,
+        q_i_base=one(cost.integral),
+        process_variance=noise.process,
+        sensor_variance=noise.sensor,
+        drift_variance=noise.drift,
+    )
+
+
+def _machine_part(model: LinearModel, Ts: float, delay: int, *, current_loop_delay: bool) -> dict[str, Any]:
+    """What of a controller its machine decides, not its law."""
+    plant, actuator = model.plant, model.plant.actuator
+    loop = None
+    if math.isfinite(actuator.crossover):
+        dead_time = actuator.loop_delay if current_loop_delay else 0.0
+        loop = CurrentLoop(*pi_current_loop(actuator, dead_time), actuator.sample_time)
+    coils = len(actuator.coils)
+    return {
+        "spec_sha256": "",
+        "parameters": plant.parameters,
+        "operating_point": (model.operating_point.x[list(plant.controlled)], model.operating_point.u),
+        "sample_time": Ts,
+        "forces": plant.inputs,
+        "measurements": plant.outputs,
+        "A": model.A,
+        "B": model.B,
+        "C": model.C,
+        "feedforward": feedforward(model, Ts, delay),
+        "current_loop": loop,
+        "limits": Limits(
+            current=np.full(coils, actuator.current_limit),
+            voltage=np.full(coils, actuator.voltage_limit),
+            force=np.array(actuator.force_limit),
+        ),
+    }
+
+
+def pid(
+    model: LinearModel,
+    terms: Pid,
+    Ts: float,
+    *,
+    name: str = "pid",
+    current_loop_delay: bool = True,
+) -> Controller:
+    """A PID controller of each output with the input of the same index.
+
+    v = Kp (p* - y) + Ki e + Kd (p*' - d),  d+ = a d + (1 - a) (y - y_last) / Ts,  a = e^(-Ts / filter)
+
+    Raises InputError for a sample time that is none, or terms of another number than the inputs.
+    """
+    if not (math.isfinite(Ts) and Ts > 0):
+        raise InputError("pid", "Ts", f"{Ts} s", "a sample time above 0 s")
+    plant, half = model.plant, len(model.A) // 2
+    if len(terms.Kp) != len(plant.inputs):
+        raise InputError("pid", "Kp", f"{len(terms.Kp)} gains", f"{len(plant.inputs)}, one for each input")
+    part = _machine_part(model, Ts, plant.actuator.delay(Ts), current_loop_delay=current_loop_delay)
+    # Differences of readings are the mean rate between them, whatever the rate at the readings is.
+    part["feedforward"] = replace(part["feedforward"], rate=np.zeros((half, len(plant.outputs))))
+    return Controller(
+        **part,
+        **pid_gains(model.C[:, :half], terms, Ts)._asdict(),
+        name=name,
+        states=plant.design_states,
+        cost=None,
+        noise=None,
+    )
+
+
+def pid_gains(P: FloatArray, terms: Pid, Ts: float) -> Gains:
+    """A PID as the control law runs it, for positions q with p = P q: these and their rates come from the outputs."""
+    n, back, a = len(P), np.linalg.inv(P), math.exp(-Ts / terms.filter) if terms.filter else 0.0
+    return Gains(
+        Ad=linalg.block_diag(np.eye(n), a * np.eye(n)),
+        Bd=np.zeros((2 * n, n)),
+        Cd=np.hstack([P, np.zeros((n, n))]),
+        K=np.hstack([terms.Kp[:, None] * P, terms.Kd[:, None] * P]),
+        Ki=np.diag(terms.Ki),
+        L=np.vstack([back, (1 - a) / Ts * back]),
+    )
+
+
+def synthesize(spec: Spec, model: LinearModel) -> Controller:
+    """The controller that a design file asks for. Errors name the file."""
+    named: dict[str, Any] = {"name": spec.name, "current_loop_delay": spec.current_loop_delay}
+    try:
+        if spec.pid is not None:
+            controller = pid(model, spec.pid, spec.sample_time, **named)
+        else:
+            controller = lqg(model, spec.weights, spec.sample_time, spec.discretization, spec.delay, **named)
+    except InputError as error:
+        raise InputError(spec.path, f"{error.where}: {error.field}", error.found, error.expected) from error
+    except (CheckError, np.linalg.LinAlgError) as error:
+        raise CheckError(f"{spec.path}: {error}") from error
+    return replace(controller, spec_sha256=spec.sha256)
+
+
+def calibrate(
+    model: LinearModel,
+    weights: Weights,
+    stiffness_ratio: float,
+    axial_ratio: float = 1.0,
+    integral_time: float = 1.0,
+) -> Weights:
+    """Bases on which the LQR (without integrals) has the stiffness K1 = stiffness_ratio k in every unstable mode.
+
+    Where the modes decouple, q'' = k q + u with input weight 1/g gives K1 = k + sqrt(k^2 + q g / base^2), so the
+    base follows. The natural frequency is then w_n = sqrt((stiffness_ratio - 1) k). Modes without stiffness get
+    axial_ratio times the w_n of the first mode. A rate's base is w_n times its position's, an error integral's is
+    `integral_time` (s) times that of the first position (radial) or of its own (modes without stiffness).
+
+    k, K1 and g are per unit of mass or inertia (1/s2). Integral action makes the exported controller a little stiffer.
+    Raises InputError when stiffness_ratio <= 2 (2 is reached at zero weight), axial_ratio or integral_time <= 0, the
+    first mode has no stiffness, or the modes couple.
+    """
+    k, G = model.stiffness, model.force_map
+    n = len(k)
+    coupling = k - np.diag(np.diag(k))
+    if np.abs(coupling).max() > 1e-9 * np.abs(k).max():
+        raise InputError("calibrate", "model", "coupled modes", "decoupled ones: z_ss = 0, zero preload")
+    if not stiffness_ratio > 2:
+        raise InputError("calibrate", "stiffness_ratio", f"{stiffness_ratio:g}", "more than 2")
+    for name, value in (("axial_ratio", axial_ratio), ("integral_time", integral_time)):
+        if not value > 0:
+            raise InputError("calibrate", name, f"{value:g}", "more than 0")
+    stiffness = np.diag(k)
+    if not (stiffness[0] > 0 and (stiffness >= 0).all()):
+        raise InputError("calibrate", "model", f"stiffness {stiffness[0]:g} 1/s2", "an unstable first mode")
+    g = np.diag(G * (weights.r_base**2 / weights.r) @ G.T)
+    free = stiffness == 0
+    w_n = np.sqrt((stiffness_ratio - 1) * np.where(free, stiffness[0] * axial_ratio**2, stiffness))
+    K1 = w_n**2 + stiffness
+    base = np.sqrt(weights.q[:n] * g / ((K1 - stiffness) ** 2 - stiffness**2))
+    own = {s.name: i for i, s in enumerate(model.plant.design_states[:n])}
+    integral_base = [base[own.get(s.name, 0)] * integral_time for s in model.plant.outputs]
+    return replace(weights, q_base=np.concatenate([base, base * w_n]), q_i_base=np.array(integral_base))
+
+
+def pi_current_loop(actuator: Actuator, delay: float = 0.0) -> tuple[float, float]:
+    """Kp (V/A) and Ki (V/(A s)) that give 1/(L s + R) e^(-s delay) its crossover and phase margin, exactly.
+
+    |C G| = 1 and arg C G = margin - pi at s = j crossover. Cancelling the winding's pole instead would give 90
+    degrees, which is not the paper's design.
+    """
+    w = actuator.crossover
+    gain = abs(actuator.R + 1j * w * actuator.L)
+    phase = actuator.phase_margin - math.pi + w * delay + math.atan2(w * actuator.L, actuator.R)
+    Kp, Ki = gain * math.cos(phase), -w * gain * math.sin(phase)
+    if not (Kp > 0 and Ki > 0):
+        raise CheckError(
+            f"current loop: no PI controller reaches a phase margin of {math.degrees(actuator.phase_margin):.0f} deg "
+            f"at {w:.0f} rad/s with {delay * 1e6:.0f} us of delay"
+        )
+    return Kp, Ki
+
+
+def feedforward(model: LinearModel, Ts: float, delay: int = 0) -> Feedforward:
+    """v0 along the travel, inertias, and what a steady ramp takes where held currents pull back.
+
+    With x = (q, w) at a sample, q going on by Ts P^-1 p*', and currents that are `delay` samples old:
+        Ad (0, w) + Bd (f - H Ts delay p*') = (Ts P^-1 p*', w)
+    """
+    static, half = static_feedforward(model.plant), len(model.A) // 2
+    if not model.E.any():
+        return static
+    still = held(model)
+    Ad, Bd = sample(still.A, model.B, Ts)
+    back = np.linalg.inv(model.C[:, :half])
+    moved = np.vstack([Ts * back, np.zeros_like(back)]) + Bd @ still.H * (Ts * delay)
+    unknown = np.hstack([Ad[:, half:] - np.eye(2 * half)[:, half:], Bd])
+    found = np.linalg.solve(unknown, moved)
+    return replace(static, speed=found[half:], rate=found[:half] - back)
+
+
+def static_feedforward(plant: Plant) -> Feedforward:
+    """Inertias, and v0(z): the forces that hold the machine along its travel against gravity and cogging."""
+    half = round(plant.travel / V0_STEP)
+    z_grid = np.linspace(-plant.travel, plant.travel, 2 * half + 1)
+    m, p, rates = len(plant.inputs), len(plant.outputs), len(plant.controlled) // 2
+    v0 = trims(plant, plant.stroke, z_grid)
+    return Feedforward(np.array(plant.inertia), np.zeros((m, p)), np.zeros((rates, p)), z_grid, v0)
+
+
+def _backward_euler(
+    model: Linear, weights: Weights, Ts: float
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Continuous gains; xi_hat' = A xi_hat + B v + L (y - C xi_hat) by backward Euler, in filter form.
+
+    (I - Ts A) xi_pred = xi_hat + Ts B v, and the correction is (I - Ts (A - L C))^-1 Ts L (y - C xi_pred).
+    """
+    K, Ki = lqi(model, weights)
+    Lc = kalman(model, weights)
+    eye = np.eye(len(model.A))
+    Ad = np.linalg.inv(eye - Ts * model.A)
+    L = np.linalg.solve(eye - Ts * (model.A - Lc @ model.C), Ts * Lc)
+    return Ad, Ts * Ad @ model.B, model.C, K, Ki, L
+
+
+def _sampled_regulator(
+    model: Linear, weights: Weights, Ts: float, delay: int, *, integrated: bool
+) -> tuple[FloatArray, FloatArray]:
+    """K, Ki of the sampled model. With delay, a force acts on the states d samples after it is commanded.
+
+    Its own weight R Ts may be charged when it is commanded, which shifts a sum and changes no optimum. What is left
+    beside the oldest stored force, Van Loan's integral with R = 0, is positive semidefinite. What acts is v + H y.
+    """
+    n, m, p, d = len(model.A), model.B.shape[1], len(model.C), delay
+    still, commanded = held(model), weights.R * Ts
+    if integrated:
+        Q, N, R = sample_cost(still.A, model.B, weights.Q, weights.R, Ts)
+    else:
+        Q, N, R = weights.Q * Ts, np.zeros((n, m)), commanded
+    Ad, Bd, Cd = sampled_model(model, Ts, d)
+    if d:
+        rest = m * (d - 1)
+        Q = linalg.block_diag(np.block([[Q, N], [N.T, R - commanded]]), np.zeros((rest, rest)))
+        N, R = np.zeros((n + m * d, m)), commanded
+    else:
+        pull, acting = still.H @ model.C, R - commanded
+        Q = Q + N @ pull + pull.T @ N.T + pull.T @ acting @ pull
+        N = N + pull.T @ acting
+    if not weights.q_i.any():
+        return dare(Ad, Bd, Q, R, N, "sampled LQR").K, np.zeros((m, p))
+    A, B = add_integrals(Ad, Bd, Cd, Ts)
+    gain = dare(
+        A, B, linalg.block_diag(Q, weights.Q_i * Ts), R, np.vstack([N, np.zeros((p, m))]), "sampled LQI"
+    ).K
+    return gain[:, : n + m * d], -gain[:, n + m * d :]
+
+
+def _sampled_filter(
+    model: Linear, weights: Weights, Ts: float, delay: int, *, integrated: bool
+) -> FloatArray:
+    """Filter-form Kalman gain. The stored forces are known, so their rows are zero; disturbances stand last.
+
+    L = P C' (C P C' + V)^-1 with the covariance P of the prediction. The noise of a reading is in the currents that are
+    commutated for it, too; beside what it does through the law that is next to nothing, and left out.
+    """
+    n, m, p = len(model.A), model.B.shape[1], len(model.C)
+    V, C, still = np.diag(weights.sensor_variance), model.C, held(model)
+    Ad, Bd = sample(still.A, model.B, Ts)
+    if integrated:
+        W = sample_noise(still.A, model.B * (weights.process_variance * Ts) @ model.B.T, Ts)
+    else:
+        W = Bd * weights.process_variance @ Bd.T
+    if not delay:
+        Ad = Ad + Bd @ still.H @ C
+    drift = weights.drift_variance
+    if drift.size:
+        Ad = np.block([[Ad, Bd], [np.zeros((m, n)), np.eye(m)]])
+        W = np.asarray(linalg.block_diag(W, np.diag(drift)))
+        C = np.hstack([C, np.zeros((p, m))])
+    P = dare(Ad.T, C.T, W, V, what="sampled Kalman filter").X
+    L = np.linalg.solve(C @ P @ C.T + V, C @ P).T
+    return np.vstack([L[:n], np.zeros((delay * m, p)), L[n:]])
+
+
+def _check_sizes(model: Linear, weights: Weights) -> None:
+    n, m, p = len(model.A), model.B.shape[1], len(model.C)
+    for field, what, size in (("q", "states", n), ("r", "inputs", m), ("q_i", "measured signals", p)):
+        if len(getattr(weights, field)) != size:
+            raise InputError(
+                "Weights",
+                field,
+                f"{len(getattr(weights, field))} entries",
+                f"{size}, one for each of the {what}",
+            )
+    drifts = m if weights.drift_variance.size else 0
+    for field, size in (("process_variance", m), ("sensor_variance", p), ("drift_variance", drifts)):
+        if len(getattr(weights, field)) != size:
+            raise InputError("Weights", field, f"{len(getattr(weights, field))} entries", f"{size}")

@@ -1,0 +1,1 @@
+"""Search for weights or PID gains that meet a specification."""

@@ -1,0 +1,325 @@
+"""Specification -> gains of a PID: the smallest errors that constant forces leave, within what is asked for.
+
+On the machine's own sampled loop (hold, held currents, delay, current loops), with the sizes of the design's [cost]:
+
+    load error         J_i = sqrt(sum of Ts p_i^2), the output i at the samples after a constant force from outside has
+                       set in at its input, which acts between samples too; discrete Lyapunov equation
+    noise motion       rms of p_i from white forces, which act between samples too, and from the sensors' noise
+    peak sensitivity   largest |S_ii|; bandwidth: the smaller of T's and the last crossover, in every part
+
+The root of the sum of J_i^2 is minimized, in SI units, so that the forces weigh the axes; [specification] bounds the
+rest. Integral gains become as large as that allows. Parts of the machine that nothing joins are searched by themselves.
+Differential evolution finds the region, COBYQA (Ragonneau and Zhang) the place on the bounds. A margin over the travel
+and the regulator's natural frequencies are judged, but not searched for.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy import optimize, sparse
+
+from malta.errors import InputError
+from malta.margins.verify import (
+    BANDWIDTHS,
+    Loop,
+    machine_loop,
+    verify,
+)
+from malta.model.linearize import linearize
+from malta.model.plant import trim
+from malta.synthesis.controller import LinearLaw, handed_on
+from malta.synthesis.lqg import pid_gains
+from malta.synthesis.riccati import sample, sample_noise
+from malta.synthesis.spec import Loads, Pid, Spec
+from malta.tuning.search import (
+    UNSTABLE,
+    Effort,
+    Journal,
+    Progress,
+    Requirement,
+    Search,
+    Trial,
+    covariance,
+    falls,
+    found_spec,
+    joined,
+    law_of,
+    merged,
+    outside,
+    ratio_of,
+    synthesized,
+    together,
+)
+
+if TYPE_CHECKING:
+    from malta.model.linearize import LinearModel
+    from malta.model.plant import FloatArray
+    from malta.synthesis.controller import Controller
+
+JOINS = 1e-9  # of the largest entries of its row and column: smaller ones are rounding
+STEEP = 30.0  # cost of a bound's logarithm in that of the load error: far beyond what any bound is worth
+ROOM = 1e-5  # below a bound, for what a part's grid and rounding may hide of the whole machine
+RADII = ((0.05, 1e-3), (0.01, 1e-4))  # of COBYQA's trust region at first and last, in the unit cube
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """Some outputs with the forces of the same index, the sampled states behind them, and what acts from outside."""
+
+    outputs: tuple[int, ...]  # k of them
+    Ad: FloatArray  # n x n
+    Bd: FloatArray  # n x k forces, then the k readings that currents are commutated for, where they are held
+    Cd: FloatArray
+    slope: FloatArray  # of v0(z), k x k
+    push: FloatArray  # n x k, what constant forces leave in the states after a sample
+    shaken: FloatArray  # n x n, covariance that the noise of forces leaves there
+
+
+def _whole(model: LinearModel, controller: Controller, loads: Loads) -> _Part:
+    """All of a machine."""
+    machine, plant, Ts = machine_loop(model, controller), model.plant, controller.sample_time
+    position = float(model.operating_point.x[plant.stroke_state])
+    loaded = linearize(plant, trim(plant, **{plant.stroke: position}))
+    A, B, n = loaded.A - loaded.E @ loaded.C, loaded.B, len(loaded.A)
+    push, shaken = np.zeros((len(machine.Ad), B.shape[1])), np.zeros_like(machine.Ad)
+    push[:n] = sample(A, B, Ts)[1]
+    shaken[:n, :n] = sample_noise(A, B * (np.square(loads.force_noise) * Ts) @ B.T, Ts)
+    slope = np.zeros((B.shape[1], len(machine.Cd)))
+    slope[:, plant.stroke_output] = controller.feedforward.slope(position)
+    return _Part(
+        tuple(range(len(machine.Cd))), machine.Ad, machine.Bd, machine.Cd, slope, push, shaken
+    )  # fmt: skip
+
+
+def _parts(whole: _Part) -> list[_Part]:
+    """What nothing joins to the rest."""
+    n, m = len(whole.Ad), len(whole.Cd)
+    M = np.abs(np.block([[whole.Ad, whole.Bd], [whole.Cd, np.zeros((m, whole.Bd.shape[1]))]]))
+    least = JOINS * np.sqrt(np.outer(M.max(axis=1), M.max(axis=0)))
+    counts = least < M
+    touch = np.zeros((n + m, n + m), dtype=bool)
+    touch[:, :n] = counts[:, :n]
+    for first in range(n, n + whole.Bd.shape[1], m):  # forces, then readings: each of its output
+        touch[:n, n:] |= counts[:n, first : first + m]
+    touch[n:, n:] = whole.slope != 0
+    count, label = sparse.csgraph.connected_components(touch, directed=False)
+    parts = []
+    for k in range(count):
+        i, o = np.flatnonzero(label[:n] == k), np.flatnonzero(label[n:] == k)
+        inputs = np.concatenate([o + first for first in range(0, whole.Bd.shape[1], m)])
+        parts.append(
+            _Part(
+                tuple(o.tolist()),
+                whole.Ad[np.ix_(i, i)],
+                whole.Bd[np.ix_(i, inputs)],
+                whole.Cd[np.ix_(o, i)],
+                whole.slope[np.ix_(o, o)],
+                whole.push[np.ix_(i, o)],
+                whole.shaken[np.ix_(i, i)],
+            )
+        )
+    return parts
+
+
+def _closed(part: _Part, terms: Pid, Ts: float) -> Loop:
+    """A part's loop with these gains, as `machine_loop` has the whole."""
+    own, k = list(part.outputs), len(part.outputs)
+    few = Pid(terms.Kp[own], terms.Ki[own], terms.Kd[own], terms.filter)
+    law = law_of(pid_gains(np.eye(k), few, Ts), Ts)
+    linear = LinearLaw(law.A, law.B, np.zeros((3 * k, 0)), law.C, law.D + part.slope, np.zeros((k, 0)))
+    return Loop(part.Ad, part.Bd, part.Cd, linear if part.Bd.shape[1] == k else handed_on(linear), Ts)
+
+
+def _figures(spec: Spec, part: _Part, loop: Loop) -> dict[str, float]:
+    """The figures of a part's loop; none where it is unstable."""
+    closed, c, n, Ts = loop.closed, loop.control, len(part.Ad), loop.sample_time
+    if not np.isfinite(closed).all():
+        return {}
+    poles = np.linalg.eigvals(closed)
+    if not np.abs(poles).max() < 1:
+        return {}
+    own, names = list(part.outputs), [spec.plant.outputs[o].name for o in part.outputs]
+    loads = loads_of(spec)
+    found = {}
+    pushed = np.vstack([part.push * np.array(loads.load)[own], np.zeros((len(c.A), len(own)))])
+    for name, row, x in zip(
+        names, loop.Cd, np.linalg.solve(np.eye(len(closed)) - closed, pushed).T, strict=True
+    ):
+        X = covariance(closed, np.outer(x, x))  # it starts at -x from where it ends
+        found[f"load_error {name}"] = math.sqrt(Ts * float(row @ X[:n, :n] @ row))
+    noise = np.vstack([loop.Bd @ c.D_y, c.B_y])
+    W = noise * np.square(np.array(loads.sensor_noise)[own]) @ noise.T
+    W[:n, :n] += part.shaken
+    motion = np.sqrt(np.diag(loop.Cd @ covariance(closed, W)[:n, :n] @ loop.Cd.T))
+    found |= {f"noise_motion {name}": value for name, value in zip(names, motion.tolist(), strict=True)}
+    turning = np.angle(poles[poles.imag > 0]) / Ts  # where peaks are that a grid might miss
+    w = np.sort(np.concatenate([np.geomspace(1e-3 / Ts, np.pi / Ts, 120), turning]))
+    peaks = _peaks(lambda w: np.log(np.abs(np.einsum("kii->ki", loop.sensitivity(w)))), w)
+    found |= {f"peak_sensitivity {name}": peak for name, peak in zip(names, peaks.tolist(), strict=True)}
+    if spec.specification.bandwidth:
+        L = loop.loop_gain(w)
+        T = np.linalg.svd(np.eye(len(own)) - np.linalg.inv(np.eye(len(own)) + L), compute_uv=False)
+        gain = np.linalg.svd(L, compute_uv=False)
+        found["bandwidth"] = min(falls(w, T[:, -1], math.sqrt(0.5)), falls(w, gain[:, 0], 1.0, last=True))
+    return found
+
+
+def _peaks(logs: Callable[[FloatArray], FloatArray], w: FloatArray) -> FloatArray:
+    """Largest values along frequency, a column each, of their logarithms on a grid.
+
+    A search leaves several peaks as large. So each is looked at, on the parabola of three values close by: what comes
+    out changes smoothly, where zooming into the largest value of a grid would jump.
+    """
+    y = logs(w)
+    k = np.flatnonzero(((y[1:-1] >= y[:-2]) & (y[1:-1] >= y[2:])).any(axis=1))
+    fine = logs(np.geomspace(w[k], w[k + 2], 17, axis=1).ravel()).reshape(len(k), 17, y.shape[1])
+    low, top, high = fine[:, :-2], fine[:, 1:-1], fine[:, 2:]
+    bent = 2 * top - low - high
+    inside = (top >= low) & (top >= high) & (bent > 0)
+    tip = top + np.where(inside, (low - high) ** 2 / np.where(inside, 8 * bent, 1.0), 0.0)
+    return np.asarray(np.exp(np.maximum(tip.max(axis=(0, 1), initial=-np.inf), y.max(axis=0))))
+
+
+def loads_of(spec: Spec) -> Loads:
+    """What a PID is judged by. InputError for a design file that does not say."""
+    if spec.loads is None:
+        raise InputError(spec.path, "cost", "nothing", "a table of the loads whose errors a PID makes small")
+    return spec.loads
+
+
+def _ratios(spec: Spec, figures: Mapping[str, float]) -> list[float]:
+    """How near their bounds the figures are."""
+    asked = spec.specification
+    bounds = {f"noise_motion {name}": bound for name, bound in asked.noise_motion.items()}
+    if asked.peak_sensitivity:
+        bounds |= {f"peak_sensitivity {s.name}": asked.peak_sensitivity for s in spec.plant.outputs}
+    if asked.bandwidth:
+        bounds["bandwidth"] = asked.bandwidth
+    return [ratio_of(name, bounds[name], value) for name, value in figures.items() if name in bounds]
+
+
+def _load_error(figures: Mapping[str, float]) -> float:
+    """Of all outputs together."""
+    return math.hypot(*(value for name, value in figures.items() if name.startswith("load_error")))
+
+
+def _goal(search: Search, u: FloatArray, outputs: Collection[str]) -> float:
+    """The logarithm of these outputs' load error; beyond a bound it costs more than it can gain."""
+    figures = _of(search.figures(u), outputs)
+    if not figures:
+        return UNSTABLE + outside(u)
+    beyond = max([math.log(ratio) + ROOM for ratio in _ratios(search.spec, figures)], default=0.0)
+    return math.log(_load_error(figures)) + STEEP * (max(beyond, 0.0) + outside(u))
+
+
+def _of(figures: Mapping[str, float], outputs: Collection[str]) -> dict[str, float]:
+    """Those of some outputs, and of all together."""
+    return {name: value for name, value in figures.items() if name.partition(" ")[2] in ("", *outputs)}
+
+
+def _polished(search: Search, u: FloatArray, trials: int, outputs: Collection[str]) -> FloatArray:
+    """The place: the best of what COBYQA tries on its way, bounds given as their ratios' logarithms."""
+    if not (trials and len(u)):
+        return u
+    tried = [u]
+    count = len(_ratios(search.spec, _of(search.figures(u), outputs))) or 1
+
+    def error(u: FloatArray) -> float:
+        tried.append(u.copy())
+        figures = _of(search.figures(u), outputs)
+        return math.log(_load_error(figures)) if figures else 0.0
+
+    def bounds(u: FloatArray) -> FloatArray:
+        return np.log(_ratios(search.spec, _of(search.figures(u), outputs)) or [math.e] * count)
+
+    for first, last in RADII:  # once more from the best, as peaks that change places mislead its models
+        optimize.minimize(
+            error, u, method="COBYQA", bounds=optimize.Bounds(np.zeros(len(u)), np.ones(len(u))),
+            constraints=optimize.NonlinearConstraint(bounds, -np.inf, -2 * ROOM),
+            options={"maxfev": trials, "initial_tr_radius": first, "final_tr_radius": last},
+        )  # fmt: skip
+        u = min(tried, key=partial(_goal, search, outputs=outputs))
+    return u
+
+
+def searched(
+    spec: Spec, journal: Journal, effort: Effort, progress: Progress | None
+) -> tuple[Trial, tuple[Trial, ...]]:
+    """The trial with the smallest load error that the bounds allow. There is no front.
+
+    In a part of several outputs each is searched by itself, twice around, then all together from there.
+    """
+    parts = _parts(_whole(*synthesized(spec), loads_of(spec)))
+    axis = {s.name: {k} for k, s in enumerate(spec.plant.inputs)}
+    everything = set(range(len(axis)))  # what the filter touches
+    outputs = [
+        set[int]().union(*(axis.get(entry.rpartition(".")[2], everything) for entry in variable.entries))
+        for variable in spec.search
+    ]
+    touched = [{k for k, part in enumerate(parts) if own & set(part.outputs)} for own in outputs]
+    clusters, blocks = joined(touched, len(parts)), joined(outputs, len(axis))
+    numbers = [len(own) for own, _ in blocks if own]
+    journal.expect(
+        sum(max(8 * k, 6) * (effort.generations + 1) + 4 * effort.polish * k for k in numbers), progress
+    )
+    places = []
+    for variables, members in clusters:
+
+        def compute(design: Spec, members: tuple[int, ...] = members) -> dict[str, float]:
+            terms, Ts = design.pid, design.sample_time
+            assert terms is not None
+            return merged([_figures(spec, parts[k], _closed(parts[k], terms, Ts)) for k in members])
+
+        own = [block for block in blocks if block[0] and set(block[0]) <= set(variables)]
+        rounds = [(*block, effort.generations) for block in own]
+        if own[1:]:
+            rounds += [(*block, 0) for block in own]
+            rounds.append((variables, tuple(o for k in members for o in parts[k].outputs), 0))
+        there = spec
+        for some, axes, generations in rounds:
+            names = [spec.plant.outputs[o].name for o in axes]
+            search = Search(there, some, spec.delay, journal, compute, among=variables)
+            u = search.evolved(partial(_goal, search, outputs=names), generations)
+            u = _polished(search, u, 3 * effort.polish * len(some), names)
+            there = found_spec(there, together(there, [(search, u)]))
+        search = Search(there, variables, spec.delay, journal, compute)
+        places.append((search, search.start))
+    return together(spec, places), ()
+
+
+def judged(spec: Spec) -> tuple[Requirement, ...]:
+    """Load errors, and every requirement of a design: of the whole machine's loop, as verify has it."""
+    asked, plant, loads = spec.specification, spec.plant, loads_of(spec)
+    model, controller = synthesized(spec)
+    margins = verify(model, controller, spec.uncertainty if asked.margin else None)
+    figures = _figures(spec, _whole(model, controller, loads), machine_loop(model, controller))
+    rows = []
+    for output, force, size in zip(plant.outputs, plant.inputs, loads.load, strict=True):
+        name = f"load_error {output.name}"
+        how = f"constant force, {size:g} {force.unit} at {force.name}"
+        rows.append(Requirement(name, None, figures.get(name, math.inf), f"{output.unit} s^0.5", how))
+    found = [(f"noise_motion {name}", bound, "covariance") for name, bound in asked.noise_motion.items()]
+    units = {f"noise_motion {s.name}": s.unit for s in plant.outputs}
+    rows += [
+        Requirement(name, bound, figures.get(name, math.inf), units[name], how) for name, bound, how in found
+    ]
+    if asked.peak_sensitivity:
+        worst = max(margins.peak_sensitivity[s.name] for s in controller.measurements)
+        rows.append(
+            Requirement("peak_sensitivity", asked.peak_sensitivity, worst, "1", "worst sensor, machine")
+        )
+    if asked.bandwidth:
+        narrow = min(margins.bandwidth, key=lambda key: margins.bandwidth[key])
+        row = ("bandwidth", asked.bandwidth, margins.bandwidth[narrow], "rad/s", BANDWIDTHS[narrow])
+        rows.append(Requirement(*row))
+    if margins.robust is not None:
+        rows.append(
+            Requirement("margin", asked.margin, margins.robust.lower or 0.0, "1", "proven over the travel")
+        )
+    return tuple(rows)
