@@ -10,7 +10,38 @@ from typing import TypeVar
 
 from malta.errors import InputError
 
+PACKAGE = Path(__file__).resolve().parent
+FOLDERS = ("data", "design", "notebooks", "examples")  # that come with malta
 _Content = TypeVar("_Content", str, bytes)
+
+
+def shipped(*parts: str) -> Path:
+    """A file or folder that comes with malta, as `shipped("data", "tubular.toml")`.
+
+    An installed package holds data/, design/, notebooks/ and examples/ in its folder `shipped`; in a checkout they
+    stand beside the package.
+    """
+    inside = PACKAGE / "shipped"
+    return (inside if inside.is_dir() else PACKAGE.parent).joinpath(*parts)
+
+
+def located(path: str | Path) -> Path:
+    """The file that a user names: where he says, or of the same name among those that come with malta.
+
+    `design/gains/robust.json` is thus found from any folder, and a file of the user's own goes first.
+    """
+    path = Path(path)
+    if path.is_absolute() or (path.parts[:1] and path.parts[0] not in FOLDERS) or _exists(path):
+        return path
+    other = shipped(*path.parts)
+    return other if _exists(other) else path
+
+
+def _exists(path: Path) -> bool:
+    try:
+        return path.exists()
+    except (OSError, ValueError):  # a name that no file can have
+        return False
 
 
 def replace_files(contents: Mapping[Path, bytes]) -> None:

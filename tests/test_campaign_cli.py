@@ -239,7 +239,10 @@ def test_what_is_no_run_of_a_campaign_is_one_sentence(run: Run, tmp_path: Path) 
 
 
 # As from a terminal, where Ctrl-C is not ignored.
-START = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); from malta.cli.main import main; main()"
+START = (
+    "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
+    "from malta.cli.main import main; main()"
+)
 
 
 def _malta(*arguments: str | Path) -> subprocess.Popen[str]:

@@ -812,7 +812,15 @@ def test_program_ends_with_the_exit_code(arguments: list[str], code: int, lines:
 @pytest.mark.slow
 def test_terminal_without_greek_letters_shows_the_page(tmp_path: Path) -> None:
     file = project(tmp_path, (SUMMARY, f"{SUMMARY}weights α and Σ, "))
-    command = [sys.executable, "-W", "error", "-c", "from malta.cli.main import main; main()", "design", str(file)]
+    command = [
+        sys.executable,
+        "-W",
+        "error",
+        "-c",
+        "from malta.cli.main import main; main()",
+        "design",
+        str(file),
+    ]
     environment = os.environ | {"PYTHONIOENCODING": "ascii"}
     done = subprocess.run(
         command, cwd=tmp_path, env=environment, capture_output=True, timeout=60, check=False

@@ -24,7 +24,7 @@ from scipy.optimize import fsolve
 
 import malta
 from malta.machines.tubular import plant as tubular
-from malta.model.plant import trims
+from malta.model.plant import load_balance
 from malta.simulation import time_optimal as fastest
 from malta.simulation.time_optimal import FastestStroke, fastest_stroke, sigmoid_at_peak_current
 from malta.synthesis.lqg import static_feedforward
@@ -217,7 +217,7 @@ def test_the_whole_machine_arrives(plant: Plant, par: tubular.Parameters, stroke
 def flown(plant: Plant, par: tubular.Parameters, stroke: FastestStroke) -> Any:
     """All six degrees of freedom and the current, under the stroke's voltage and the bearing forces that hold."""
     grid = np.linspace(-plant.travel, plant.travel, 3)
-    holding = trims(plant, "z", grid)[:, :4]  # linear in z
+    holding = load_balance(plant, np.array([plant.at(z=z).x for z in grid]))[:, :4]  # linear in z
 
     def rate(t: float, y: FloatArray) -> FloatArray:
         x, i = y[:12], y[12]

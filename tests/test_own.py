@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
+from types import ModuleType, SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,7 +15,8 @@ from conftest import refusal
 import malta
 from malta import report
 from malta.campaigns.statistics import bounds_of
-from malta.model.machines import own, required
+from malta.model import machines
+from malta.model.machines import part_of, require_part
 from malta.model.plant import Signal
 from malta.model.signals import (
     aside,
@@ -69,6 +70,11 @@ def rest(
 @pytest.fixture
 def toy(designs: dict[str, Design], monkeypatch: pytest.MonkeyPatch) -> Plant:
     """MALTA under another name, with one experiment and no word for anything."""
+    ours = machines._installed()
+    monkeypatch.setattr(machines, "_installed", lambda: ours | {"toy": "malta.machines.toy.plant"})
+    tubular, model = machines.machine("tubular"), ModuleType("malta.machines.toy.plant")
+    vars(model).update(Parameters=tubular.Parameters, plant=tubular.plant)
+    monkeypatch.setitem(sys.modules, model.__name__, model)
     monkeypatch.setitem(
         sys.modules, "malta.machines.toy.experiments", SimpleNamespace(EXPERIMENTS={"rest": rest})
     )
@@ -77,9 +83,9 @@ def toy(designs: dict[str, Design], monkeypatch: pytest.MonkeyPatch) -> Plant:
 
 def test_parts_of_a_machine_are_found_by_its_name(toy: Plant) -> None:
     for part in ("experiments", "figures", "claims"):
-        assert required(part, "tubular").__name__ == f"malta.machines.tubular.{part}"
-    assert own("figures", toy.name) is None
-    error = refusal(lambda: required("claims", "toy"), Path("claims"))
+        assert require_part(part, "tubular").__name__ == f"malta.machines.tubular.{part}"
+    assert part_of("figures", toy.name) is None
+    error = refusal(lambda: require_part("claims", "toy"), Path("claims"))
     assert (error.field, error.found) == ("machine", "'toy'")
     assert "tubular" in error.expected
     assert "__init__" not in error.expected
@@ -90,10 +96,13 @@ def test_what_a_module_lacks_is_not_taken_for_a_machine_that_is_not_there(
 ) -> None:
     (tmp_path / "toy").mkdir()
     (tmp_path / "toy" / "claims.py").write_text("import nothing_of_that_name\n")
-    machines = sys.modules["malta.machines"]
-    monkeypatch.setattr(machines, "__path__", [*machines.__path__, str(tmp_path)])
+    (tmp_path / "toy" / "plant.py").write_text("Parameters = plant = dict\n")
+    ours = machines._installed()
+    monkeypatch.setattr(machines, "_installed", lambda: ours | {"toy": "malta.machines.toy.plant"})
+    package = sys.modules["malta.machines"]
+    monkeypatch.setattr(package, "__path__", [*package.__path__, str(tmp_path)])
     with pytest.raises(ModuleNotFoundError, match="nothing_of_that_name"):
-        own("claims", "toy")
+        part_of("claims", "toy")
 
 
 def test_an_experiment_of_another_machine_is_flown(toy: Plant, designs: dict[str, Design]) -> None:

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 import malta
 from malta.machines.tubular import plant as tubular
-from malta.model.plant import OperatingPoint, trims
+from malta.model.plant import OperatingPoint, load_balance
 
 if TYPE_CHECKING:
     from malta.model.plant import Plant
@@ -122,12 +122,21 @@ def test_every_pose_in_the_gap_is_held(plant: Plant, states: dict[str, float]) -
     assert abs(left).max() < 1e-9  # m/s2, rad/s2
 
 
-def test_trims_are_the_trims_one_by_one(plant: Plant) -> None:
-    """A row for each value."""
+def test_load_balance_is_the_trim_along_the_stroke(plant: Plant) -> None:
+    """A row for each state: the machine itself pulls nowhere along its axis."""
     stroke = np.linspace(-15e-3, 15e-3, 7)
-    rows = trims(plant, "z", stroke)
+    rows = load_balance(plant, np.array([plant.at(z=z).x for z in stroke]))
     assert rows.shape == (7, 5)
     for z, row in zip(stroke, rows, strict=True):
         np.testing.assert_array_equal(row, malta.trim(plant, z=z).u)
     with pytest.raises(malta.InputError, match="finite"):
-        trims(plant, "z", [0.0, math.nan])
+        plant.at(z=math.nan)
+
+
+def test_load_balance_leaves_the_machines_own_pull_to_the_controller(plant: Plant) -> None:
+    """1 mm off the axis the trim holds against 2 K_A x, the balance of the loads does not."""
+    x = plant.at(x=1e-3).x
+    (balance,), pull = load_balance(plant, x[None, :]), malta.trim(plant, x=1e-3).u
+    K_A: float = plant.parameters.K_A  # type: ignore[attr-defined]
+    assert balance[0] + balance[2] == pytest.approx(0.0, abs=1e-9)
+    assert pull[0] + pull[2] == pytest.approx(-2 * K_A * 1e-3, rel=1e-9)

@@ -12,7 +12,7 @@ from scipy.stats import binomtest
 from malta.model.data import in_unit, published_value, units_of
 from malta.model.plant import readonly
 from malta.model.signals import inputs_of, outputs_of, stroke_unit
-from malta.simulation.experiments import said
+from malta.simulation.experiments import setting
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -103,7 +103,7 @@ def figures_of(found: Campaign, published: Mapping[str, Any] | None = None) -> l
 
 def bounds_of(plan: Plan) -> Mapping[str, str]:
     """What the machine's paper prints of this very scenario, as keys of data/published/."""
-    bounds = said(plan.plant, "bounds", None)
+    bounds = setting(plan.plant, "bounds", None)
     found: Mapping[str, str] = {} if bounds is None else bounds(plan.scenario, plan.options)
     return found
 

@@ -757,7 +757,7 @@ def _design(file: Path, out: Path, figures: Path, made: dict[Path, Path], *, qui
     from malta import report
     from malta.margins.verify import require_stable
     from malta.margins.verify import verify as verified
-    from malta.model.data import published as published_of
+    from malta.model.data import published_beside
     from malta.model.linearize import linearize
     from malta.simulation.experiments import experiment, main_job
     from malta.synthesis.lqg import synthesize
@@ -783,7 +783,7 @@ def _design(file: Path, out: Path, figures: Path, made: dict[Path, Path], *, qui
         end = case.run.verdict
         if not end.completed:
             raise CheckError(f"{file}: the {job} ends at {end.time:.4g} s: {end.name}; gain files unchanged")
-    published = published_of(spec.machine_file)
+    published = published_beside(spec.machine_file)
     page = report.design_page(spec, model, margins, found, published)
     report.experiment(found, picture, published)
     paths = [out / f"{spec.name}{suffix}" for suffix in gain_files.SUFFIXES]
@@ -866,9 +866,9 @@ def _in_si(number: re.Match[str], si_unit: str, option: str, name: str) -> float
 
 def _with_own(given: dict[str, Any], texts: list[str] | None, scenario: str, plant: Plant) -> dict[str, Any]:
     """The options of a scenario with those of `--option NAME=VALUE`, in SI, read as the default is."""
-    from malta.simulation.experiments import option_of, said
+    from malta.simulation.experiments import option_of, setting
 
-    units = said(plant, "OPTION_UNITS", {})
+    units = setting(plant, "OPTION_UNITS", {})
     found = dict(given)
     for text in texts or ():
         name, _, value = (part.strip() for part in text.partition("="))
@@ -899,9 +899,9 @@ def _with_own(given: dict[str, Any], texts: list[str] | None, scenario: str, pla
 def _list_scenarios(plant: Plant, *, many: bool = False) -> None:
     """What the machine can be asked for: all, or what many can fly."""
     from malta import report
-    from malta.simulation.experiments import said
+    from malta.simulation.experiments import series_of
 
-    _console().print(report.scenarios_table(plant, said(plant, "CASES", {}) if many else None))
+    _console().print(report.scenarios_table(plant, series_of(plant) if many else None))
 
 
 def _given(distance: float | None, rise: float | None, **others: Any) -> dict[str, Any]:

@@ -42,20 +42,20 @@ import numpy as np
 from pydantic import BeforeValidator, Field, StrictInt, StrictStr
 
 from malta.errors import CheckError, InputError
-from malta.files import replace_files
+from malta.files import located, replace_files
 from malta.gains.encodings import SUFFIXES as SUFFIXES
 from malta.gains.encodings import content_sha256, decode, encode
 from malta.margins.verify import require_stable, unstable_gain
 from malta.model.data import (
     Finite,
-    Machine,
     Quantity,
     Record,
-    machine_module,
+    parameters_record,
     plant_of,
     units_of,
     validated,
 )
+from malta.model.machines import machine
 from malta.model.plant import Signal
 from malta.synthesis.controller import (
     Controller,
@@ -101,7 +101,7 @@ class _Design(Record):
 
 
 class _Plant(Record):
-    name: Machine
+    name: StrictStr
     preset: StrictStr
     parameters: dict[StrictStr, Quantity]
 
@@ -296,7 +296,8 @@ def read(path: str | Path) -> Controller:
     wrong shape, NaN or infinity, a non-positive sample time, content that does not match its sha256, gains that do not
     stabilize the file's own model.
     """
-    content = decode(Path(path))
+    path = located(path)
+    content = decode(path)
     for key, wanted in (("schema", SCHEMA), ("version", VERSION)):
         if content.get(key) != wanted:
             raise InputError(path, key, repr(content[key]) if key in content else "nothing", repr(wanted))
@@ -412,7 +413,12 @@ def _controller(file: GainFile, path: str | Path) -> Controller:
 
 
 def _parameters(plant: _Plant, path: str | Path) -> Parameters:
-    record: type[Parameters] = machine_module(plant.name).Parameters
+    try:
+        record = parameters_record(machine(plant.name), path)
+    except InputError as error:
+        if error.where != "machine":
+            raise
+        raise InputError(path, "plant.name", error.found, error.expected) from error
     units = units_of(record)
     if set(plant.parameters) != set(units):
         odd = sorted(set(plant.parameters) ^ set(units))

@@ -21,7 +21,7 @@ from malta.margins.uncertain import (
     model_of,
 )
 from malta.model.data import shaping, units_of
-from malta.model.plant import Plant, readonly
+from malta.model.plant import Plant, position_in, readonly
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
@@ -49,7 +49,7 @@ def of_plant(
     Raises InputError for names that are none, or not known.
     """
     par = plant.parameters
-    known = [*units_of(par), plant.stroke]
+    known = [*units_of(par), *((plant.stroke,) if plant.has_stroke else ())]
     if not isinstance(names, tuple | list):
         raise InputError("uncertain", "names", described(names), "names of parameters, as a tuple or a list")
     for name in names:
@@ -61,7 +61,7 @@ def of_plant(
         found = "a controller that looks up a table"
         raise InputError("uncertain", "believed", found, "one whose currents are a formula")
     x0 = plant.at(**(at or {})).x
-    position = float(x0[plant.stroke_state])
+    position = position_in(plant, x0)
     of = model_of(plant, believed or plant, tuple(name for name in names if name != plant.stroke))
     p = ca.SX.sym("p", len(names))
     own = [k for k, name in enumerate(names) if name != plant.stroke]

@@ -43,7 +43,7 @@ from malta.margins.verify import (
 )
 from malta.model.data import plant_of, units_of
 from malta.model.linearize import linearize
-from malta.model.plant import Plant
+from malta.model.plant import Plant, position_at
 from malta.synthesis.controller import Controller
 from malta.synthesis.lqg import (
     kalman,
@@ -184,23 +184,24 @@ def robustness(
         if progress is not None:
             progress(min(1.0, next(steps) / total))
 
-    names, stroke = list(uncertainty), plant.stroke
+    names = list(uncertainty)
     every = [*names, *({"m"} & set(units_of(plant.parameters)) - set(names))]
-    at = {stroke: float(controller.operating_point[0][plant.stroke_state])}
+    at = position_at(plant, plant.point(controller.operating_point[0]).x)
+    position = at.get(plant.stroke, 0.0)
     believed = plant_of(controller.parameters)
     shares = places_along(plant, controller, tuple(every), current_loops)
     moves = stroke_enters(plant, controller, tuple(every), current_loops)
     proven = cache(lambda z: place_margin(plant, controller, uncertainty, z, current_loops, every))
 
-    def here(position: float) -> Margin:  # the operating point is one of the places
-        return proven(position if moves else 0.0)
+    def here(z: float) -> Margin:  # the operating point is one of the places
+        return proven(z if moves else 0.0)
 
     links = []
     stages = compensators(plant, controller, current_loops)
     for name, (law, states) in stages.items():
         if name == SAMPLED:
-            system, law = loop_at(plant, controller, tuple(every), at[stroke], current_loops)
-            margin = here(at[stroke]) if proof else NOT_PROVEN
+            system, law = loop_at(plant, controller, tuple(every), position, current_loops)
+            margin = here(position) if proof else NOT_PROVEN
         else:
             system = of_plant(plant, names, states=states, at=at, believed=believed)
             margin = robust_margin(system, law, uncertainty, time=time) if proof else NOT_PROVEN

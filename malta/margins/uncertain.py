@@ -95,7 +95,8 @@ def model_of(plant: Plant, believed: Plant, names: tuple[str, ...]) -> ca.Functi
     machine: Plant = plant.variant(symbolic(par, own))
     x, u = ca.SX.sym("x", len(plant.states)), ca.SX.sym("u", len(plant.inputs))
     point = ca.SX(plant.at().x)
-    point[plant.stroke_state] = z
+    if plant.has_stroke:
+        point[plant.stroke_state] = z
     preload = ca.SX(machine.preload(point))
     found = jacobians(machine, believed, x, u, v, ca.SX.zeros(len(plant.disturbances)))
     A, B, C, E, made, ratio = ca.substitute(list(found), [x, u], [point, preload])

@@ -35,7 +35,7 @@ from malta.margins.uncertain import (
 )
 from malta.model.data import plant_of
 from malta.model.linearize import LinearModel, linearize
-from malta.model.plant import trim
+from malta.model.plant import position_at, position_in, trim
 from malta.synthesis.controller import (
     Controller,
     LinearLaw,
@@ -205,8 +205,9 @@ def loop(
     if feedforward:
         m, plant = len(controller.forces), model.plant
         slope = np.zeros((m, len(C)))
-        position = float(model.operating_point.x[plant.stroke_state])
-        slope[:, plant.stroke_output] = controller.feedforward.slope(position)
+        if plant.has_stroke:
+            position = float(model.operating_point.x[plant.stroke_state])
+            slope[:, plant.stroke_output] = controller.feedforward.slope(position)
         law = law._replace(B_y=law.B_y + law.B_r[:, -m:] @ slope, D_y=law.D_y + law.D_r[:, -m:] @ slope)
     if model.E.any():
         law = handed_on(law)
@@ -219,8 +220,7 @@ def machine_loop(model: LinearModel, controller: Controller) -> Loop:
     Raises CheckError when no input holds the machine at the model's operating point.
     """
     plant = model.plant
-    position = float(model.operating_point.x[plant.stroke_state])
-    loaded = linearize(plant, trim(plant, **{plant.stroke: position}))
+    loaded = linearize(plant, trim(plant, **position_at(plant, model.operating_point.x)))
     delay = plant.actuator.delay(controller.sample_time)
     return loop(loaded, controller, delay=delay, current_loops=True, feedforward=True)
 
@@ -340,7 +340,7 @@ def machine_system(
     believed = plant_of(controller.parameters)
     if not holds(believed):
         return of_plant(plant, names, at=at, believed=believed), machine_law(plant, controller, current_loops)
-    H = held_at(believed, float(believed.at(**at).x[believed.stroke_state]))
+    H = held_at(believed, position_in(believed, believed.at(**at).x))
     system = of_plant(plant, names, at=at, believed=believed, held=H)
     handed = system.matrices.size2_out(1) > len(H)
     return system, machine_law(plant, controller, current_loops, held=H, handed=handed)
@@ -379,7 +379,8 @@ def travel_loops(
 ) -> tuple[list[tuple[UncertainSystem, Compensator]], dict[str, tuple[float, float]]]:
     """The loops of which travel_margin proves a margin, and the intervals that do not grow."""
     along = _along(plant, controller, names, current_loops)
-    return along, {plant.stroke: (-plant.travel, plant.travel)} if len(along) == 1 else {}
+    interval = {plant.stroke: (-plant.travel, plant.travel)} if plant.has_stroke else {}
+    return along, interval if len(along) == 1 else {}
 
 
 @lru_cache(maxsize=8)  # several questions are asked of the same loops; records compare by identity
@@ -387,6 +388,8 @@ def _along(
     plant: Plant, controller: Controller, names: tuple[str, ...], current_loops: CurrentLoops
 ) -> list[tuple[UncertainSystem, Compensator]]:
     """The machine's loop with its position as a parameter; its loops in the middle and at the end where not."""
+    if not plant.has_stroke:
+        return [loop_at(plant, controller, names, 0.0, current_loops)]
     whole = machine_system(plant, controller, [*names, plant.stroke], {plant.stroke: 0.0}, current_loops)
     if whole[0].matrices.n_instructions() < LONG:
         return [whole]
@@ -438,6 +441,8 @@ def places_along(
     plant: Plant, controller: Controller, names: tuple[str, ...], current_loops: CurrentLoops = "lag"
 ) -> tuple[float, ...]:
     """Shares of the travel at which a margin of its own is worth its time."""
+    if not plant.has_stroke:
+        return (0.0,)
     return PLACES if covers_travel(plant, controller, names, current_loops) else ENDS
 
 
@@ -455,6 +460,8 @@ def stroke_enters(
     along = _along(plant, controller, names, current_loops)
     if len(along) > 1:
         return True
+    if not plant.has_stroke:
+        return False
     system, law = along[0]
     stroke = system.names.index(plant.stroke)
     return any(stroke in on for on in problem_of(system, law).loop.program.depends)
@@ -469,7 +476,8 @@ def loop_at(
     current_loops: CurrentLoops = "lag",
 ) -> tuple[UncertainSystem, Compensator]:
     """The machine's loop at a position along the stroke; the same records for the same question."""
-    return machine_system(plant, controller, names, {plant.stroke: position}, current_loops)
+    at = {plant.stroke: position} if plant.has_stroke else {}
+    return machine_system(plant, controller, names, at, current_loops)
 
 
 NOT_PROVEN = Margin(None, math.inf, None, None, {}, {}, (), 0.0, "not asked")  # of a first look

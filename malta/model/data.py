@@ -1,6 +1,6 @@
 """Machine data: TOML files into parameter records, in SI units, each value with its source.
 
-    data/tubular.toml -> read() -> machines.tubular.plant.Parameters
+    data/tubular.toml -> read() -> the Parameters record of the machine that the file names
 
 A parameter stands in the file as `{ value = 0.360, unit = "kg", tag = "printed", source = "Table IV" }`.
 `tag` says how far to trust it: printed (in the source), computed (from what is printed) or assumed
@@ -9,26 +9,27 @@ A parameter stands in the file as `{ value = 0.360, unit = "kg", tag = "printed"
 
 from __future__ import annotations
 
-import importlib
 import math
+import sys
 import tomllib
-from collections.abc import Mapping
-from dataclasses import MISSING, Field, field, fields
+from collections.abc import Callable, Mapping
+from dataclasses import MISSING, Field, field, fields, is_dataclass
 from functools import cache, lru_cache
 from numbers import Real
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
+from types import ModuleType
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, cast
 
 from pydantic import BaseModel, ConfigDict, StrictStr, ValidationError
 from pydantic import Field as Checked
 
 from malta.errors import InputError
-from malta.files import read_file
+from malta.files import located, read_file, shipped
+from malta.model.checks import check_plant
+from malta.model.machines import file_of, machine, machine_names
 
 if TYPE_CHECKING:
     from malta.model.plant import Parameters, Plant
-
-Machine = Literal["tubular", "halbach", "planar"]  # the modules of malta/machines/
 
 _Model = TypeVar("_Model", bound=BaseModel)
 Finite = Annotated[float, Checked(strict=True, allow_inf_nan=False)]
@@ -55,10 +56,10 @@ class Sourced(Quantity):
 
 
 class _MachineFile(Record):
-    machine: Machine
-    default_preset: StrictStr
+    machine: Annotated[StrictStr, Checked(pattern=r"^[^\x00-\x1f]+$")]
+    default_preset: StrictStr = ""
     parameters: dict[str, Sourced]
-    presets: dict[str, dict[str, Sourced]]
+    presets: dict[str, dict[str, Sourced]] = Checked(default_factory=dict)
 
 
 def si(
@@ -219,25 +220,31 @@ def explain(error: ValidationError, where: str | Path) -> InputError:
 
 
 def read(path: str | Path, preset: str | None = None) -> Any:
-    """Read a machine's data file into the Parameters record of its module in malta/machines/.
+    """Read a machine's data file into the Parameters record of its module.
 
-    Which record that is, the file says (`machine = "tubular"` gives machines.tubular.plant.Parameters).
+    The file names the machine: `machine = "tubular"` is one that an installed package offers, `machine = "rotor.py"`
+    the module in this file beside it, which is imported.
 
     Parameters
     ----------
     path : a file as data/tubular.toml
-    preset : a table of its `presets`, laid over `parameters`; the file's default_preset if None
+    preset : a table of its `presets`, laid over `parameters`; the file's default_preset if None. A file without
+        presets has one alone, "data", which is all of its parameters.
 
     Raises InputError, naming file and field: a missing, unknown or doubled key, an unknown preset, a
-    wrong unit, NaN, a value out of range.
+    wrong unit, NaN, a value out of range, a machine that is not known or cannot be imported.
     """
+    path = located(path)
     content = validated(_MachineFile, load_toml(path), path)
-    name = content.default_preset if preset is None else preset
-    if name not in content.presets:
-        raise InputError(path, "presets", f"no preset {name!r}", "one of " + ", ".join(content.presets))
-    record: type[Parameters] = machine_module(content.machine).Parameters
+    presets = content.presets or {ONLY_PRESET: {}}
+    if content.presets and not content.default_preset:
+        raise InputError(path, "default_preset", "nothing", "this key, one of " + ", ".join(presets))
+    name = content.default_preset or next(iter(presets)) if preset is None else preset
+    if name not in presets:
+        raise InputError(path, "presets", f"no preset {name!r}", "one of " + ", ".join(presets))
+    record = parameters_record(machine_beside(content.machine, Path(path)), path)
     known = {f.name: f for f in fields(record) if "unit" in f.metadata}
-    tables = {"parameters": content.parameters} | {f"presets.{k}": v for k, v in content.presets.items()}
+    tables = {"parameters": content.parameters} | {f"presets.{k}": v for k, v in presets.items()}
     values: dict[str, float] = {}
     for table, entries in tables.items():  # every preset is checked, the chosen one is used
         for key, entry in entries.items():
@@ -255,26 +262,82 @@ def read(path: str | Path, preset: str | None = None) -> Any:
     return record(**values, preset=name)  # type: ignore[call-arg]
 
 
-def machine_module(machine: str) -> Any:
-    """The module that models a machine: it has Parameters and plant()."""
-    return importlib.import_module(f"malta.machines.{machine}.plant")
+ONLY_PRESET = "data"  # name of the preset of a file that has none
+
+
+def machine_beside(name: str, data_file: Path) -> ModuleType:
+    """The module of the machine that a data file names: by its name, or by a file relative to the data file."""
+    try:
+        return machine(data_file.parent / name if name.endswith(".py") else name)
+    except InputError as error:
+        if error.where != "machine":
+            raise
+        known = ", ".join(map(repr, machine_names()))
+        raise InputError(
+            data_file, "machine", repr(name), f"one of {known}, or the file of its module, as rotor.py"
+        ) from error
+
+
+def parameters_record(module: ModuleType, where: str | Path) -> type[Parameters]:
+    """The class Parameters of a machine's module. InputError where it is no frozen dataclass with `preset`."""
+    record: Any = getattr(module, "Parameters")  # noqa: B009  a user's module
+    if not (is_dataclass(record) and isinstance(record, type)):
+        raise InputError(
+            where, f"{module.__name__.rpartition('.')[2]}.Parameters", repr(record), "a frozen dataclass"
+        )
+    if not any("unit" in f.metadata for f in fields(record)):
+        raise InputError(
+            where, "Parameters", "no field with a unit", 'some, as `m: float = si("kg", above=0)`'
+        )
+    if "preset" not in {f.name for f in fields(record)}:
+        raise InputError(where, "Parameters", "no field preset", '`preset: str = "custom"`')
+    return cast("type[Parameters]", record)
 
 
 def plant_of(parameters: Parameters) -> Plant:
-    """The plant that these parameters describe."""
+    """The plant that these parameters describe: by the function `plant` of the module that defines their record.
+
+    Raises InputError where the module has none, or where its plant does not fit together.
+    """
     return _plant_of(parameters)
 
 
 @lru_cache(maxsize=64)  # records are immutable; building one takes longer than much that is done with it
 def _plant_of(parameters: Any) -> Plant:
-    plant: Plant = importlib.import_module(type(parameters).__module__).plant(parameters)
+    module = sys.modules[type(parameters).__module__]
+    build: Callable[[Any], Plant] | None = getattr(module, "plant", None)
+    if build is None:
+        raise InputError(module.__name__, "plant", "nothing", "a function of Parameters -> Plant beside them")
+    plant = build(parameters)
+    check_plant(plant)
     return plant
 
 
 def published(machine_file: str | Path) -> dict[str, Any]:
-    """What the source paper prints: published/NAME.toml beside the machine's data file NAME.toml."""
-    path = Path(machine_file)
-    return load_toml(path.parent / "published" / path.name)
+    """The figures that the machine's paper prints: published/NAME.toml, or published.toml, beside its data file.
+
+    Raises InputError where there is neither; `published_beside` gives None then.
+    """
+    return load_toml(_published_file(Path(machine_file)))
+
+
+def published_beside(machine_file: str | Path) -> dict[str, Any] | None:
+    """The same, or None for a machine without published figures."""
+    file = _published_file(located(machine_file))
+    return load_toml(file) if file.exists() else None
+
+
+def published_figures(machine: str) -> dict[str, Any] | None:
+    """The same by the machine's name: of the data that comes with malta, or beside the file that the user named."""
+    file = file_of(machine)
+    return published_beside(shipped("data", f"{machine}.toml") if file is None else file.with_suffix(".toml"))
+
+
+def _published_file(data_file: Path) -> Path:
+    data_file = located(data_file)
+    alone = data_file.parent / "published.toml"
+    of_its_name = data_file.parent / "published" / data_file.name
+    return alone if alone.exists() and not of_its_name.exists() else of_its_name
 
 
 def published_value(content: Mapping[str, Any], key: str) -> float:

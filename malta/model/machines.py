@@ -1,33 +1,172 @@
-"""Where the parts of a machine are: modules of its folder in malta/machines/."""
+"""Machines by name: the one place that finds one.
+
+A machine is a Python module with `Parameters` and `plant(par) -> Plant`. It comes from
+  - an entry point of the group `malta.machines`: `tubular = "malta.machines.tubular.plant"` (malta's own and those of
+    any installed package);
+  - a file that the user names: `machine = "rotor.py"` in a data file, `--machine rotor.py`, or in Python
+    `malta.machine("rotor.py")`.
+A gain file names a machine, never a path, so reading one never runs code that the user did not name.
+
+Optional parts are found beside the model: EXPERIMENTS, FIGURES, CLAIMS, REQUIREMENTS, WORDS and other names are those
+of the module itself, or of the modules `experiments`, `figures`, `claims`, `requirements` beside it.
+"""
 
 from __future__ import annotations
 
+import re
+import sys
+from functools import cache
 from importlib import import_module
-from importlib.util import find_spec
-from pkgutil import iter_modules
-from typing import Any, Literal
+from importlib.metadata import entry_points
+from importlib.util import module_from_spec, spec_from_file_location
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING, Any, Literal
 
 from malta.errors import InputError
 
-Part = Literal["experiments", "figures", "claims"]
+if TYPE_CHECKING:
+    from malta.model.plant import Plant
+
+GROUP = "malta.machines"
+Part = Literal["experiments", "figures", "claims", "requirements"]
+FILES = "malta_machine_files"  # in sys.modules, the machines that come from files are modules of this package
+_files: dict[str, Path] = {}  # machines that the user named by their files
 
 
-def own(part: Part, machine: str) -> Any:
-    """The machine's module of a part, or None where it has none."""
-    name = f"malta.machines.{machine}.{part}"
+def machine(name: str | Path | ModuleType) -> ModuleType:
+    """The module of a machine: by its name, by the file that models it, or the module itself.
+
+    A file is loaded once, and its machine is known by the file's stem from then on: `malta.machine("rotor.py")` lets
+    `malta.gains.read("design/gains/rotor.json")` find the machine `rotor`.
+
+    Raises InputError for an unknown name, a file that cannot be imported, or a module without Parameters and plant.
+    """
+    if isinstance(name, ModuleType):
+        return _complete(name, str(getattr(name, "__file__", name.__name__)))
+    if isinstance(name, Path) or name.endswith(".py"):
+        return _from_file(Path(name))
+    if name in _files:
+        return sys.modules[f"{FILES}.{name}"]
+    installed = _installed()
+    if name not in installed:
+        known = ", ".join(map(repr, machine_names()))
+        raise InputError("machine", "name", repr(name), f"one of {known}, or its file by --machine {name}.py")
     try:
-        return import_module(name)
+        module = import_module(installed[name])
+    except ImportError as error:
+        raise InputError("machine", name, _reason(error), "a module that can be imported") from error
+    return _complete(module, installed[name])
+
+
+def name_of(module: ModuleType) -> str:
+    """The name under which a machine's module is known."""
+    if module.__name__.startswith(FILES + "."):
+        return module.__name__.removeprefix(FILES + ".")
+    for name, target in _installed().items():
+        if target == module.__name__:
+            return name
+    return module.__name__.rpartition(".")[2]
+
+
+def machine_names() -> list[str]:
+    """The machines that can be found by their names now."""
+    return sorted({*_installed(), *_files})
+
+
+def file_of(name: str) -> Path | None:
+    """The file of a machine that the user named by it."""
+    return _files.get(name)
+
+
+def part_of(part: Part, name: str) -> ModuleType | None:
+    """The module of a machine's optional part; None where there is none, or no such machine."""
+    if name not in _files and name not in _installed():
+        return None
+    module = machine(name)
+    folder = module.__name__ if hasattr(module, "__path__") else module.__name__.rpartition(".")[0]
+    target = f"{folder}.{part}"
+    try:
+        return import_module(target)
     except ModuleNotFoundError as error:
-        if error.name not in (name, f"malta.machines.{machine}"):  # of something that the module imports
+        if error.name not in (target, folder):  # a module that the part imports
             raise
         return None
 
 
-def required(part: Part, machine: str) -> Any:
-    """The same. Raises InputError where the machine has none."""
-    module = own(part, machine)
+def attribute_of(plant: Plant, part: Part, name: str, default: Any = None) -> Any:
+    """A name that a machine may define, in the module of its plant or in that of the part."""
+    model = sys.modules.get(type(plant.parameters).__module__)
+    if model is not None and hasattr(model, name):
+        return getattr(model, name)
+    return getattr(part_of(part, plant.name), name, default)
+
+
+def require_part(part: Part, name: str) -> ModuleType:
+    """The module of a machine's part. Raises InputError where the machine has none."""
+    module = part_of(part, name)
     if module is None:
-        machines = [m.name for m in iter_modules(import_module("malta.machines").__path__)]
-        known = ", ".join(name for name in machines if find_spec(f"malta.machines.{name}.{part}"))
-        raise InputError(part, "machine", repr(machine), f"one that malta has {part} of: {known}")
+        known = ", ".join(other for other in machine_names() if part_of(part, other) is not None)
+        raise InputError(part, "machine", repr(name), f"one that malta has {part} of: {known}")
     return module
+
+
+@cache
+def _installed() -> dict[str, str]:
+    """Names and modules of the machines that installed packages offer."""
+    return {point.name: point.value for point in entry_points(group=GROUP)}
+
+
+def _from_file(path: Path) -> ModuleType:
+    """The module of a machine's file. Modules beside it are imported as `from . import NAME`."""
+    where, name = path, path.stem
+    path = path.resolve()
+    if not re.fullmatch(r"[A-Za-z_]\w*", name):
+        raise InputError(
+            where, "", f"a file called {path.name!r}", "a name that Python can import, as rotor.py"
+        )
+    if not path.is_file():
+        raise InputError(where, "", "no such file", "a Python module with Parameters and plant")
+    known = sys.modules.get(f"{FILES}.{name}")
+    if known is not None and _files.get(name) == path:
+        return known
+    if name in _files or name in _installed():
+        other = _files.get(name, "an installed package")
+        raise InputError(where, "", f"a second machine {name!r}, beside that of {other}", "another file name")
+    sys.modules.setdefault(FILES, ModuleType(FILES))
+    spec = spec_from_file_location(f"{FILES}.{name}", path, submodule_search_locations=[str(path.parent)])
+    assert spec is not None
+    assert spec.loader is not None
+    module = module_from_spec(spec)
+    sys.modules[spec.name] = module
+    try:
+        spec.loader.exec_module(module)
+        _complete(module, where)
+    except BaseException as error:
+        del sys.modules[spec.name]
+        if isinstance(error, InputError) or not isinstance(error, Exception):
+            raise
+        raise InputError(where, "", _reason(error), "a module that can be imported") from error
+    _files[name] = path
+    return module
+
+
+def _complete(module: ModuleType, where: str | Path) -> ModuleType:
+    """The module. InputError where it lacks Parameters or plant."""
+    for name, kind in (("Parameters", "a frozen dataclass"), ("plant", "a function of Parameters -> Plant")):
+        if not callable(getattr(module, name, None)):
+            raise InputError(where, name, "nothing", f"{kind} of this name")
+    return module
+
+
+def _reason(error: BaseException) -> str:
+    line = " ".join(str(error).split())[:160]
+    at = ""
+    trace = error.__traceback__
+    while trace is not None and trace.tb_next is not None:
+        trace = trace.tb_next
+    if isinstance(error, SyntaxError) and error.lineno:
+        at = f" (line {error.lineno})"
+    elif trace is not None and not trace.tb_frame.f_code.co_filename.startswith("<frozen"):
+        at = f" (line {trace.tb_lineno} of {Path(trace.tb_frame.f_code.co_filename).name})"
+    return f"{type(error).__name__}: {line}{at}"

@@ -7,6 +7,7 @@ them: the machine moves by f(x, u, w + load(x)), and the controller is designed 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Protocol
@@ -15,6 +16,7 @@ import casadi as ca
 import numpy as np
 
 from malta.errors import CheckError, InputError
+from malta.model.checks import DEFAULT, defaults
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
@@ -47,21 +49,29 @@ class Signal(NamedTuple):
 class Actuator:
     """The coils that make the inputs: their current loops and limits.
 
-    The current loop is a PI controller on 1 / (L s + R), designed for `crossover` and `phase_margin`.
+    The current loop is a PI controller on 1 / (L s + R), designed for `crossover` and `phase_margin`. Without a
+    crossover currents follow their commands at once, and nothing after `current_limit` is needed but the dead time.
+
+    Example: `Actuator(coils=(Signal("i", "A"),), force_constant=(38.0,), current_limit=3.0)`
     """
 
     coils: tuple[Signal, ...]  # their currents, A
-    force_limit: tuple[float, ...]  # of each input, N or N m
     force_constant: tuple[float, ...]  # N/A, of each input; empty where several share their coils
     current_limit: float  # A, of each coil
-    voltage_limit: float  # V; inf: none
-    R: float  # ohm
-    L: float  # H
-    crossover: float  # rad/s; inf: currents follow their commands at once
-    phase_margin: float  # rad
-    sample_time: float  # s, of the current loops
-    loop_delay: float  # s, their dead time
-    dead_time: float  # s, from measurement to force
+    force_limit: tuple[float, ...] = ()  # of each input, N or N m; none: those of the current limit
+    voltage_limit: float = math.inf  # V; inf: none
+    R: float = 0.0  # ohm
+    L: float = 0.0  # H
+    crossover: float = math.inf  # rad/s; inf: currents follow their commands at once
+    phase_margin: float = math.pi / 2  # rad
+    sample_time: float = 0.0  # s, of the current loops
+    loop_delay: float = 0.0  # s, their dead time
+    dead_time: float = 0.0  # s, from measurement to force
+
+    def __post_init__(self) -> None:
+        if not self.force_limit:
+            limits = tuple(self.current_limit * constant for constant in self.force_constant)
+            object.__setattr__(self, "force_limit", limits)
 
     def delay(self, Ts: float) -> int:
         """Whole samples between measurement and force: the dead time less the half sample that a hold takes."""
@@ -119,11 +129,16 @@ class Electronics:
 class Plant:
     """A machine: equations of motion that CasADi can trace, and the names and units of its signals.
 
-    `states` are positions, then their rates in the same order. `uncontrolled` are states that no input
-    reaches (the rotation of a tubular mover): simulated, but left out of the design.
+    `states` are positions, then their rates in the same order. `uncontrolled` are states that no input reaches, as the
+    rotation of a round mover: they are simulated, and left out of the design.
 
-    The inputs are forces. `currents` commutates: what the coils shall carry to make them where the sensors say the
-    machine is; it is held until the next sample, while `forces`, what these currents make, go with the machine.
+    The inputs are forces. `currents(y, v)` gives the coil currents for the forces v at the measured position y; they
+    are held for one sample, while `forces(x, i)`, the forces that these currents make, follow the machine.
+
+    A machine needs the fields without a default; the others say what it has beyond these. A machine without a `stroke`
+    has no travel, and its thrust and mass are not asked for.
+
+    `data.plant_of` checks that the fields fit each other. Examples: malta/machines/, the module that `malta new` writes.
     """
 
     name: str
@@ -131,39 +146,41 @@ class Plant:
     states: tuple[Signal, ...]
     inputs: tuple[Signal, ...]
     outputs: tuple[Signal, ...]
-    disturbances: tuple[Signal, ...]
-    uncontrolled: tuple[str, ...]
     f: CasadiFn  # (x, u, w) -> x'
     h: CasadiFn  # (x, u) -> y
-    load: CasadiFn  # x -> w of gravity and cogging
-    position_of: CasadiFn  # y -> controlled positions; the inverse of h at rest
-    preload: CasadiFn  # x -> inputs that the design model stands on
-    currents: CasadiFn  # (y, inputs) -> currents of the coils, A
-    forces: CasadiFn  # (x, currents of the coils) -> inputs
-    limited: CasadiFn  # currents of the coils -> the same within their limits
-    tabulated: bool  # `currents` looks something up in a table: CasADi MX alone
     actuator: Actuator
-    windings: Drive | None  # None: fidelity force, and phase where there are electronics
-    electronics: (
-        Callable[[Any], Electronics] | None
-    )  # by the options of the machine; None: those of the drive
-    contacts: tuple[str, ...]  # what the moving part may touch
-    contact: CasadiFn  # x -> share of each clearance that is used up; 1 at contact
-    cushioned: tuple[bool, ...]  # which contacts the touchdown bearings hold
-    bearing: CasadiFn  # x -> w of the touchdown bearings; zero without contact
-    sense: CasadiFn  # (x, errors) -> y as the sensors' own signals give it, before noise
-    sensor_errors: tuple[Signal, ...]
-    noise: tuple[float, ...]  # of each sensor, rms of a sample, in the unit of each output
-    uniform: bool  # whether it is uniform, or else normal
-    resolution: tuple[float, ...]  # of each sensor; 0 where it has none to speak of
-    inertia: tuple[
-        float, ...
-    ]  # of each input, fed forward times the second derivative of the same output; 0: not
-    mass: float  # moved by the `thrust` input
-    thrust: str  # the input that drives the stroke
-    stroke: str  # the output that the stroke moves
-    travel: float  # of that output, either way, m
-    variant: Callable[[Any], Plant]  # the same machine with other parameters
+    variant: Callable[[Any], Plant]  # the same machine with other parameters: its own function `plant`
+    disturbances: tuple[Signal, ...] = ()  # w: forces and torques from outside
+    uncontrolled: tuple[str, ...] = ()
+    load: CasadiFn = DEFAULT  # x -> w of gravity and cogging; none
+    position_of: CasadiFn = DEFAULT  # y -> controlled positions, the inverse of h at rest; y itself
+    preload: CasadiFn = DEFAULT  # x -> inputs that the design model stands on; none
+    currents: CasadiFn = DEFAULT  # (y, inputs) -> currents of the coils, A; by the force constants
+    forces: CasadiFn = DEFAULT  # (x, currents of the coils) -> inputs; by the force constants
+    limited: CasadiFn = DEFAULT  # currents of the coils -> the same within their limits
+    tabulated: bool = False  # `currents` looks something up in a table: CasADi MX alone
+    windings: Drive | None = None  # None: fidelity force, and phase where there are electronics
+    electronics: Callable[[Any], Electronics] | None = None  # by the machine's options; None: the drive's
+    contacts: tuple[str, ...] = ()  # surfaces that the moving part may touch
+    contact: CasadiFn = DEFAULT  # x -> share of each clearance that is used up; 1 at contact
+    cushioned: tuple[bool, ...] = ()  # which contacts the touchdown bearings carry
+    bearing: CasadiFn = DEFAULT  # x -> w of the touchdown bearings; zero without contact
+    sense: CasadiFn = DEFAULT  # (x, errors) -> y as the sensors' own signals give it, before noise; h
+    sensor_errors: tuple[Signal, ...] = ()
+    noise: tuple[float, ...] = ()  # of each sensor, rms of a sample, in the unit of each output; none
+    uniform: bool = False  # whether it is uniform, or else normal
+    resolution: tuple[float, ...] = ()  # of each sensor; 0 where it has none to speak of
+    inertia: tuple[float, ...] = ()  # of each input: times p*'' of the same output, fed forward; 0: not
+    mass: float = 0.0  # moved by the `thrust` input
+    thrust: str = ""  # the input that drives the stroke
+    stroke: str = ""  # the output that the stroke moves; "": the machine has no stroke
+    travel: float = 0.0  # of that output, either way, m
+
+    def __post_init__(self) -> None:
+        for name, value in defaults(self).items():
+            given = getattr(self, name)
+            if given is DEFAULT or given == ():
+                object.__setattr__(self, name, value)
 
     @property
     def drive(self) -> Drive:
@@ -183,18 +200,39 @@ class Plant:
         return tuple(self.states[i] for i in self.controlled)
 
     @property
+    def has_stroke(self) -> bool:
+        """Whether one of the outputs is a stroke."""
+        return bool(self.stroke)
+
+    @property
     def stroke_output(self) -> int:
-        """Index of the output that the stroke moves."""
+        """Index of the output that the stroke moves. InputError for a machine without a stroke."""
+        if not self.stroke:
+            raise InputError(self.name, "stroke", "none", "a machine with a stroke")
         return [s.name for s in self.outputs].index(self.stroke)
 
     @property
+    def leading_output(self) -> int:
+        """Index of the stroke among the outputs; of a machine without one the first."""
+        return self.stroke_output if self.stroke else 0
+
+    @property
+    def leading_input(self) -> int:
+        """Index of the thrust among the inputs; of a machine without a stroke the first."""
+        return self.thrust_input if self.stroke else 0
+
+    @property
     def stroke_state(self) -> int:
-        """Index of the state that the stroke moves."""
+        """Index of the state that the stroke moves. InputError for a machine without a stroke."""
+        if not self.stroke:
+            raise InputError(self.name, "stroke", "none", "a machine with a stroke")
         return [s.name for s in self.states].index(self.stroke)
 
     @property
     def thrust_input(self) -> int:
-        """Index of the input that drives the stroke."""
+        """Index of the input that drives the stroke. InputError for a machine without a stroke."""
+        if not self.thrust:
+            raise InputError(self.name, "thrust", "none", "a machine with a stroke")
         return [s.name for s in self.inputs].index(self.thrust)
 
     def at(self, /, **positions: float) -> OperatingPoint:
@@ -228,6 +266,16 @@ class Plant:
             if not np.isfinite(x[names.index(name)]):
                 raise InputError(self.name, name, repr(value), "a finite number")
         return x
+
+
+def position_in(plant: Plant, x: ArrayLike) -> float:
+    """The position along the stroke in a state; 0 for a machine without a stroke."""
+    return float(np.asarray(x)[plant.stroke_state]) if plant.has_stroke else 0.0
+
+
+def position_at(plant: Plant, x: ArrayLike) -> dict[str, float]:
+    """The same by its name, as `plant.at` takes it; none for a machine without a stroke."""
+    return {plant.stroke: position_in(plant, x)} if plant.has_stroke else {}
 
 
 @dataclass(frozen=True, eq=False)
@@ -280,14 +328,21 @@ def trim(plant: Plant, /, **positions: float) -> OperatingPoint:
     return OperatingPoint(x, _hold(plant, x[None, :])[0], loaded=True)
 
 
-def trims(plant: Plant, name: str, values: ArrayLike) -> FloatArray:
-    """The inputs of `trim` along one state, one row for each value."""
-    return _hold(plant, np.array([plant.at(**{name: value}).x for value in np.asarray(values)]))
+def load_balance(plant: Plant, states: FloatArray) -> FloatArray:
+    """The inputs that cancel the loads at rest, and nothing else: f(x, u, load(x)) = f(x, 0, 0); a row for each state.
+
+    Where the machine itself pulls, as a magnetic bearing off its centre does, that pull is left to the controller.
+
+    Raises CheckError when no input cancels the loads.
+    """
+    return _hold(plant, states, loads_alone=True)
 
 
-def _hold(plant: Plant, states: FloatArray) -> FloatArray:
+def _hold(plant: Plant, states: FloatArray, *, loads_alone: bool = False) -> FloatArray:
     x, u = ca.SX.sym("x", len(plant.states)), ca.SX.sym("u", len(plant.inputs))
     rate = plant.f(x, u, plant.load(x))
+    if loads_alone:
+        rate -= plant.f(x, ca.SX.zeros(len(plant.inputs)), ca.SX.zeros(len(plant.disturbances)))
     residual = ca.Function("residual", [x, u], [rate, ca.jacobian(rate, u)])
     held = np.zeros((len(states), len(plant.inputs)))
     for i, state in enumerate(states):

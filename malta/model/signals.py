@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-from malta.model.machines import own
+from malta.model.machines import attribute_of
 from malta.model.plant import Plant, Signal
 
 FINE: Mapping[str, str] = {"m": "um", "rad": "urad"}  # what deviations are shown in
@@ -26,13 +26,13 @@ class Group(NamedTuple):
 
 
 def outputs_of(plant: Plant) -> tuple[Group, ...]:
-    """The machine's outputs: the stroke, then the others by their units."""
-    return _groups(plant, plant.outputs, plant.stroke_output, "stroke")
+    """The machine's outputs: the stroke, if it has one, then the others by their units."""
+    return _groups(plant, plant.outputs, plant.stroke_output if plant.has_stroke else None, "stroke")
 
 
 def inputs_of(plant: Plant) -> tuple[Group, ...]:
-    """The machine's inputs: the thrust, then the others by their units."""
-    return _groups(plant, plant.inputs, plant.thrust_input, "thrust")
+    """The machine's inputs: the thrust, if it has a stroke, then the others by their units."""
+    return _groups(plant, plant.inputs, plant.thrust_input if plant.has_stroke else None, "thrust")
 
 
 def compliance_unit(unit: str) -> str:
@@ -48,18 +48,20 @@ def stiffness_unit(unit: str) -> str:
 def aside(plant: Plant) -> tuple[Group, ...]:
     """Outputs other than the stroke; of a machine with one output that one."""
     found = outputs_of(plant)
-    return found[1:] or found
+    return (found[1:] or found) if plant.has_stroke else found
 
 
 def stroke_unit(plant: Plant) -> str:
     """The unit that deviations along the stroke are shown in."""
-    unit: str = getattr(own("experiments", plant.name), "STROKE_UNIT", outputs_of(plant)[0].fine)
+    unit: str = attribute_of(plant, "experiments", "STROKE_UNIT", outputs_of(plant)[0].fine)
     return unit
 
 
-def _groups(plant: Plant, signals: Sequence[Signal], first: int, role: str) -> tuple[Group, ...]:
-    words: Mapping[str, str] = getattr(own("experiments", plant.name), "WORDS", {})
-    found = [Group(words.get(role, signals[first].name), signals[first].unit, (first,))]
+def _groups(plant: Plant, signals: Sequence[Signal], first: int | None, role: str) -> tuple[Group, ...]:
+    words: Mapping[str, str] = attribute_of(plant, "experiments", "WORDS", {})
+    found = []
+    if first is not None:
+        found.append(Group(words.get(role, signals[first].name), signals[first].unit, (first,)))
     others = [k for k in range(len(signals)) if k != first]
     for unit in dict.fromkeys(signals[k].unit for k in others):
         columns = tuple(k for k in others if signals[k].unit == unit)

@@ -26,7 +26,7 @@ from malta.errors import InputError
 from malta.margins.verify import Margins, verify
 from malta.model.data import in_unit, published_value
 from malta.model.linearize import LinearModel, linearize
-from malta.model.machines import required
+from malta.model.machines import require_part
 from malta.simulation.experiments import (
     Experiment,
     Progress,
@@ -137,7 +137,7 @@ def ledger(specs: Sequence[Spec], published: Mapping[str, Any], progress: Progre
     for spec in specs:
         if spec.plant.name != machine:
             raise InputError(spec.path, "machine", spec.plant.name, f"{machine}, as of {specs[0].path}")
-    paper = required("claims", machine)
+    paper = require_part("claims", machine)
     found: list[Found] = [
         paper.evidence(spec, published, part(progress, n, len(specs))) for n, spec in enumerate(specs)
     ]

@@ -41,7 +41,7 @@ from malta.report.figures import yield_figure as yield_figure
 from malta.report.figures.margins import chain_figure as chain_figure
 from malta.report.figures.parts import STYLES as STYLES
 from malta.report.figures.parts import Published, number, read_out
-from malta.simulation.experiments import experiments_of, options_of, said
+from malta.simulation.experiments import experiments_of, options_of, setting
 from malta.simulation.simulate import Trajectory
 from malta.synthesis.lqg import continuous_poles
 from malta.synthesis.spec import Spec
@@ -405,7 +405,7 @@ def scenarios_table(plant: Plant, flown: Collection[str] | None = None) -> Table
 
 
 def _options(name: str, plant: Plant) -> list[str]:
-    units, shown = said(plant, "OPTION_UNITS", {}), []
+    units, shown = setting(plant, "OPTION_UNITS", {}), []
     for option, default in options_of(name, plant).items():
         values = default if isinstance(default, tuple) else (default,)
         text = ",".join(str(v).lower() if isinstance(v, bool) else f"{v}" for v in values)

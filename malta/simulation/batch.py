@@ -120,7 +120,7 @@ def simulate_many(
         return _one_by_one(plant, controller, scenario, changes, sensor_errors, first, runs, progress)
     lib, _ = compiled
     ready = _prepared(plant, controller, scenario, changes, sensor_errors or {}, first, runs)
-    axis = plant.stroke_output
+    axis = plant.leading_output
     start, end = ready.p_ref[0, axis], ready.p_ref[-1, axis]
     scale = 1 / (end - start) if end != start else 0
     known = {"alive": 1.0, "start": start, "scale": scale, "reached": -1.0, "touched": -1.0, "culprit": -1.0}
@@ -395,12 +395,13 @@ def _digest(shape: Any) -> ca.Function:
     given = {name: ca.SX.sym(name, size) for name, size in sizes.given.items()}
     theta = ca.SX.sym("theta", len(machine.flat(machine.numbers(plant, c, 1))))
     largest = ca.fmax(kept["contact"], row["contact"])
+    most, used = (_most(contact) for contact in (largest, row["contact"]))
     alive = kept["alive"]  # what follows adds nothing once it is 0
     error = ca.if_else(alive, row["p"] - given["p_ref"], 0)
-    share = (row["p"][plant.stroke_output] - kept["start"]) * kept["scale"]
+    share = (row["p"][plant.leading_output] - kept["start"]) * kept["scale"]
     now = ca.logic_and(ca.logic_and(alive, kept["reached"] < 0), share >= ca.DM(LEVELS))
     after = {
-        "alive": ca.logic_and(alive, ca.mmax(largest) < 1),
+        "alive": ca.logic_and(alive, most < 1),
         "start": kept["start"],
         "scale": kept["scale"],
         "samples": kept["samples"] + alive,
@@ -415,13 +416,13 @@ def _digest(shape: Any) -> ca.Function:
         "limited": kept["limited"] + ca.if_else(alive, row["saturated"], 0),
         "contact": ca.if_else(alive, largest, kept["contact"]),
         "culprit": ca.if_else(
-            ca.logic_and(ca.logic_and(alive, kept["culprit"] < 0), ca.mmax(row["contact"]) >= 1),
-            _largest(row["contact"]),
+            ca.logic_and(ca.logic_and(alive, kept["culprit"] < 0), used >= 1),
+            _largest(row["contact"]) if plant.contacts else -1,
             kept["culprit"],
         ),
     }
     if setup.bearing:
-        touching = ca.mmax(row["contact"]) >= 1
+        touching = used >= 1
         ends = [row["contact"][i] for i, held in enumerate(plant.cushioned) if not held]
         after["alive"] = ca.logic_and(alive, ca.mmax(ca.vertcat(*ends)) < 1)
         first = kept["samples"] == 0
@@ -432,6 +433,11 @@ def _digest(shape: Any) -> ca.Function:
     result = ca.vertcat(*(after.get(name, kept[name]) for name in kept))
     arguments = [ca.vertcat(*part.values()) for part in (kept, row, given)]
     return ca.Function("digest", [*arguments, theta], [ca.densify(result)])
+
+
+def _most(contact: Any) -> Any:
+    """The largest share of a clearance that is used up; 0 for a machine that has nothing to touch."""
+    return ca.mmax(contact) if contact.numel() else ca.SX(0)
 
 
 def _largest(values: Any) -> Any:

@@ -4,11 +4,12 @@ An experiment is a function (plant, controller, *, progress=None, **options) -> 
 simulate.Scenario that replace the experiment's own (fidelity, noise, seed, estimator, ...), and those that its
 signature names: numbers in SI, words, true or false, tuples of numbers; their defaults say which.
 
-A machine's experiments are in the module of its name here, which has
+A machine without experiments of its own has those of simulation/generic.py. Others define them beside their model, in
+the module of the plant or in a module `experiments` beside it:
 
     EXPERIMENTS   name -> experiment; the first is the machine's main job, which every design has to complete
 
-and, where they say something,
+and, where they differ from the defaults,
 
     CASES         name -> (plant, controller, **options) -> list[Wanted]: experiments that many machines can fly
     FINDINGS      names of experiments that ask where it ends: a touchdown is no failure
@@ -34,7 +35,7 @@ import numpy as np
 
 from malta.errors import InputError
 from malta.model.data import in_unit
-from malta.model.machines import own, required
+from malta.model.machines import attribute_of
 from malta.model.plant import Plant
 from malta.simulation.references import Reference
 from malta.simulation.simulate import (
@@ -111,7 +112,7 @@ class Experiment:
     def failed(self) -> bool:
         """Whether a run ended that should not have; where touchdown is a finding, it is none."""
         ends = {case.run.verdict.name for case in self.cases}
-        findings = said(self.run.plant, "FINDINGS", ())
+        findings = setting(self.run.plant, "FINDINGS", ())
         return self.name not in findings and not ends <= {"completed", "interrupted"}
 
     @property
@@ -179,13 +180,25 @@ def rms(values: FloatArray) -> float:
 
 def experiments_of(plant: Plant) -> Mapping[str, Callable[..., Experiment]]:
     """A machine's experiments by name, its main job first. Raises InputError for a machine that has none."""
-    found: Mapping[str, Callable[..., Experiment]] = required("experiments", plant.name).EXPERIMENTS
+    from malta.simulation.generic import EXPERIMENTS
+
+    found: Mapping[str, Callable[..., Experiment]] = setting(plant, "EXPERIMENTS", EXPERIMENTS)
     return found
 
 
-def said(plant: Plant, name: str, default: Any) -> Any:
-    """What the module of the machine's experiments says under this name."""
-    return getattr(own("experiments", plant.name), name, default)
+def series_of(plant: Plant) -> Mapping[str, Callable[..., list[Wanted]]]:
+    """The experiments that many machines can fly, by name."""
+    from malta.simulation import generic
+
+    own: Mapping[str, Callable[..., list[Wanted]]] | None = setting(plant, "CASES", None)
+    if own is None:
+        return {} if experiments_of(plant) is not generic.EXPERIMENTS else generic.CASES
+    return own
+
+
+def setting(plant: Plant, name: str, default: Any) -> Any:
+    """A name that the machine defines for its experiments (the module's docstring lists them)."""
+    return attribute_of(plant, "experiments", name, default)
 
 
 def main_job(plant: Plant) -> str:
@@ -204,7 +217,7 @@ def experiment(
 def cases_of(name: str, plant: Plant, controller: Controller, **options: Any) -> list[Wanted]:
     """What one of the machine's CASES would fly, without flying it. Raises InputError as `experiment` does."""
     _check(name, plant, options)
-    cases: Mapping[str, Callable[..., list[Wanted]]] = said(plant, "CASES", {})
+    cases = series_of(plant)
     if name not in cases:
         found = f"{name!r}, which changes the machine or the reference in flight"
         raise InputError("simulate", "scenario", found, "one of " + ", ".join(cases))
@@ -225,7 +238,7 @@ def flown(
         cases, cut = fly(plant, controller, [wanted], progress, {"engine": engine})
     else:
         cases, cut = (Case(wanted.label, run, wanted.merits(run)),), False
-    shown = name if name in said(plant, "ALONE", ()) else "run"
+    shown = name if name in setting(plant, "ALONE", ()) else "run"
     what = name if wanted.label == name else f"{name}: {wanted.label}"
     return Experiment(shown, what, cases, cases[0].merits, interrupted=cut)
 
@@ -252,7 +265,7 @@ def option_of(name: str, plant: Plant, option: str) -> Any:
 
 def _check(name: str, plant: Plant, options: Mapping[str, Any]) -> None:
     """InputError for an unknown experiment, or an option that it does not take."""
-    mine, check = options_of(name, plant), said(plant, "check", None)
+    mine, check = options_of(name, plant), setting(plant, "check", None)
     for option, value in options.items():
         if option in OPTIONS and option not in mine:
             continue

@@ -176,7 +176,7 @@ def parts(plant: Plant, c: Controller, s: Setup, values: Mapping[str, ca.DM], *,
     if s.faulty:
         measured = ca.if_else(given["stuck"], controller["y_last"], measured)
     first, last = g["grid_ends"][0], g["grid_ends"][1]
-    at = ca.fmax(ca.fmin(measured[plant.stroke_output], last), first)
+    at = ca.fmax(ca.fmin(measured[plant.stroke_output], last), first) if plant.has_stroke else first
     sense = ca.Function("sense", [state, around, noise, theta], ca.cse([ca.densify(measured), at]))
 
     moved = ca.cse(ca.densify(_moved(plant, s, g, machine, given, held, jitter)))
@@ -401,7 +401,8 @@ def _scheduled_C(c: Controller, y: Any) -> Any:
     believed = plant_of(c.parameters)
     x = ca.SX.sym("x", len(believed.states))
     rest = ca.SX.zeros(len(believed.states))
-    rest[believed.stroke_state] = y[believed.stroke_output]
+    if believed.has_stroke:
+        rest[believed.stroke_state] = y[believed.stroke_output]
     C = ca.jacobian(believed.h(x, 0), x)[:, list(believed.controlled)]
     at = ca.substitute(C, x, rest)
     return ca.horzcat(at, ca.SX(at.shape[0], len(c.states) - at.shape[1]))

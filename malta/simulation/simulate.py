@@ -27,7 +27,7 @@ from malta.model.data import (
     twins_of,
     units_of,
 )
-from malta.model.plant import Plant, Signal, readonly
+from malta.model.plant import Plant, Signal, position_in, readonly
 from malta.simulation import period as machine
 from malta.simulation import references
 from malta.simulation.engines import (
@@ -589,7 +589,7 @@ def _judged(
 ) -> tuple[FloatArray, Verdict | None]:
     """The rows up to the first at which the machine touches something or its state is no number."""
     contact = _columns(plant, c, setup, rows, "contact")
-    if np.isfinite(rows[-1]).all() and contact.max() < 1:
+    if np.isfinite(rows[-1]).all() and contact.max(initial=0.0) < 1:
         return rows, None  # a state that is no number stays none
     lost = np.atleast_1d(~np.isfinite(rows).all(axis=1))
     touching = contact >= 1
@@ -759,7 +759,7 @@ def beginning(plant: Plant, c: Controller, scenario: Scenario, first: FloatArray
     xi_pred, current = np.zeros(n), np.zeros(len(plant.actuator.coils))
     if not scenario.cold:
         xi_pred[: len(design)] = x[list(plant.controlled)]
-        held = c.feedforward.at(float(x[plant.stroke_state]))
+        held = c.feedforward.at(position_in(plant, x))
         if c.delay:  # what acted before, with currents that were commutated for here
             n, m = len(design), len(held)
             pull = c.Ad[n + m * (c.delay - 1) : n + m * c.delay, :n] @ (xi_pred[:n] - moving)
@@ -802,9 +802,9 @@ class StrokeFigures:
 
 
 def stroke_figures(run: Trajectory) -> StrokeFigures:
-    """Rise, overshoot, tracking error and radial deviation of a stroke."""
+    """Rise, overshoot, tracking error and deviation of a stroke; without one, of a move of the first output."""
     names = [s.name for s in run.plant.outputs]
-    axis = run.plant.stroke_output
+    axis = run.plant.leading_output
     z, z_ref = run.p[:, axis], run.reference[:, axis]
     start, end = z_ref[0], z_ref[-1]
     error = np.abs(run.p - run.reference)
@@ -815,7 +815,7 @@ def stroke_figures(run: Trajectory) -> StrokeFigures:
         overshoot=max(float(share.max()) - 1, 0.0) if whole else math.nan,
         axial_error=float(error[:, axis].max()),
         radial={name: float(error[:, i].max()) for i, name in enumerate(names) if i != axis},
-        force=float(np.abs(run.v[:, run.plant.thrust_input]).max()),
+        force=float(np.abs(run.v[:, run.plant.leading_input]).max()),
         current=float(np.abs(run.current).max()),
     )
 

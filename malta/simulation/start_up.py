@@ -54,7 +54,7 @@ def observer(plant: Plant, c: Controller, setup: Setup, kind: str, substeps: int
     sizes = machine.layout(plant, c, setup).row
     edges = dict(zip(sizes, np.cumsum([0, *sizes.values()]), strict=False))
     commands = slice(edges["v"], edges["v"] + sizes["v"])
-    stroke = plant_of(c.parameters).stroke_output
+    axis = plant_of(c.parameters).leading_output
     n = len(c.A)
     # v - v0 of the last samples, the oldest first
     sent: list[FloatArray] = [np.zeros(len(c.forces))] * c.delay
@@ -83,7 +83,7 @@ def observer(plant: Plant, c: Controller, setup: Setup, kind: str, substeps: int
             rows.append(row)
             if not np.isfinite(row).all():
                 break
-            v0 = c.feedforward.at(y[stroke])
+            v0 = c.feedforward.at(y[axis])
             sent.append(row[0, commands] - v0)
             loads.append(v0)
             filter_.x, filter_.F = predict(

@@ -28,7 +28,7 @@ from scipy import linalg
 
 from malta.errors import CheckError, InputError
 from malta.model.linearize import LinearModel
-from malta.model.plant import Actuator, Plant, trims
+from malta.model.plant import Actuator, Plant, load_balance
 from malta.synthesis.controller import (
     Controller,
     Cost,
@@ -59,7 +59,8 @@ from malta.synthesis.spec import (
 if TYPE_CHECKING:
     from malta.model.plant import ComplexArray, FloatArray
 
-V0_STEP = 0.25e-3  # m, grid of v0(z): interpolation errs by 0.14 % of the cogging amplitude
+V0_STEP = 0.25e-3  # m, longest step of the grid of v0(z)
+V0_STEPS = 16  # at least, either way
 
 
 class Linear(Protocol):
@@ -425,11 +426,19 @@ def feedforward(model: LinearModel, Ts: float, delay: int = 0) -> Feedforward:
 
 
 def static_feedforward(plant: Plant) -> Feedforward:
-    """Inertias, and v0(z): the forces that hold the machine along its travel against gravity and cogging."""
-    half = round(plant.travel / V0_STEP)
-    z_grid = np.linspace(-plant.travel, plant.travel, 2 * half + 1)
+    """Inertias, and v0(z): the forces that hold the machine along its travel against gravity and cogging.
+
+    Without a stroke v0 is a constant; it stands at two positions of a grid that nothing looks up.
+    """
     m, p, rates = len(plant.inputs), len(plant.outputs), len(plant.controlled) // 2
-    v0 = trims(plant, plant.stroke, z_grid)
+    if plant.has_stroke:
+        half = max(V0_STEPS, round(plant.travel / V0_STEP))
+        z_grid = np.linspace(-plant.travel, plant.travel, 2 * half + 1)
+        states = np.array([plant.at(**{plant.stroke: z}).x for z in z_grid])
+    else:
+        z_grid = np.array([0.0, 1.0])
+        states = np.tile(plant.at().x, (2, 1))
+    v0 = load_balance(plant, states)
     return Feedforward(np.array(plant.inertia), np.zeros((m, p)), np.zeros((rates, p)), z_grid, v0)
 
 

@@ -24,7 +24,7 @@ import numpy as np
 from malta.errors import InputError
 from malta.files import replace_files
 from malta.model.data import in_unit
-from malta.model.machines import own
+from malta.model.machines import attribute_of
 from malta.model.signals import (
     KINDS,
     Group,
@@ -64,7 +64,7 @@ def experiment_figure(e: Experiment, published: Published | None = None) -> Figu
     plant = e.run.plant
     drawn: dict[str, Callable[[Experiment, Published | None], Figure]] = {
         **dict.fromkeys(experiments_of(plant), run_figure),
-        **getattr(own("figures", plant.name), "FIGURES", {}),
+        **attribute_of(plant, "figures", "FIGURES", {}),
         "run": run_figure,
     }
     if e.name not in drawn:
@@ -74,7 +74,7 @@ def experiment_figure(e: Experiment, published: Published | None = None) -> Figu
 
 def stroke_figure(run: Trajectory, published: Published | None = None) -> Figure:
     """The machine's figure of a stroke, or of a run."""
-    draw = getattr(own("figures", run.plant.name), "stroke_figure", None)
+    draw = attribute_of(run.plant, "figures", "stroke_figure")
     if draw is None:
         return run_figure(Experiment("run", run.scenario.name, (Case(run.scenario.name, run, ()),), ()))
     figure: Figure = draw(run, published)
@@ -155,8 +155,8 @@ def _forces(axes: Axes, x: str, run: Trajectory, unit: str) -> None:
     """The thrust and the two others that go furthest."""
     plant = run.plant
     widest = np.argsort(-np.abs(run.v).max(axis=0), kind="stable").tolist()
-    others = [k for k in widest if plant.inputs[k].unit == unit and k != plant.thrust_input]
-    first = [plant.thrust_input] if plant.inputs[plant.thrust_input].unit == unit else []
+    others = [k for k in widest if plant.inputs[k].unit == unit and k != plant.leading_input]
+    first = [plant.leading_input] if plant.inputs[plant.leading_input].unit == unit else []
     shown = [*first, *sorted(others[: 3 - len(first)])]
     for k, style in zip(shown, STYLES, strict=False):
         line(axes, run.t * 1e3, run.v[:, k], label=plant.inputs[k].name, **style)

@@ -231,7 +231,11 @@ def callipers(axes: Axes, spreads: Sequence[tuple[str, float, float]], top: floa
 def clearance(plant: Plant) -> float:
     """The shortest way across the stroke that ends in a touch, m; infinite where there is none."""
     way, half = 1e-6, len(plant.states) // 2
-    across = [s.name for k, s in enumerate(plant.states[:half]) if s.unit == "m" and k != plant.stroke_state]
+    across = [
+        s.name
+        for k, s in enumerate(plant.states[:half])
+        if s.unit == "m" and not (plant.has_stroke and k == plant.stroke_state)
+    ]
 
     def share(**moved: float) -> FloatArray:
         return np.array(ca.evalf(plant.contact(ca.SX(ca.DM(plant.at(**moved).x))))).ravel()

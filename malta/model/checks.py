@@ -1,0 +1,105 @@
+"""What a plant is where its optional fields are not given, and whether its fields fit each other."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import casadi as ca
+
+from malta.errors import InputError
+
+if TYPE_CHECKING:
+    from malta.model.plant import Plant
+
+DEFAULT: Any = None  # in place of a function that follows from the other fields
+
+
+def defaults(plant: Plant) -> dict[str, Any]:
+    """What the optional fields of a plant are where they are not given."""
+    m, p, w = len(plant.inputs), len(plant.outputs), len(plant.disturbances)
+    actuator = plant.actuator
+    constants, limit = actuator.force_constant, actuator.current_limit
+    return {
+        "load": partial(_zeros, w),
+        "position_of": _same,
+        "preload": lambda _: ca.DM.zeros(m),
+        "currents": lambda _, v: v / ca.vertcat(*constants),
+        "forces": lambda _, i: ca.vertcat(*constants) * i,
+        "limited": lambda i: ca.fmax(ca.fmin(i, limit), -limit),
+        "contact": partial(_zeros, 0),
+        "cushioned": (False,) * len(plant.contacts),
+        "bearing": partial(_zeros, w),
+        "sense": lambda x, _: plant.h(x, 0),
+        "noise": (0.0,) * p,
+        "resolution": (0.0,) * p,
+        "inertia": (0.0,) * m,
+    }
+
+
+def _zeros(size: int, x: Any) -> Any:
+    return type(x).zeros(size) if isinstance(x, ca.SX | ca.MX | ca.DM) else ca.DM.zeros(size)
+
+
+def _same(y: Any) -> Any:
+    return y
+
+
+def check_signals(plant: Plant) -> None:
+    """InputError where the fields of a plant do not fit each other, by their lengths and names."""
+    names = {
+        key: [s.name for s in getattr(plant, key)]
+        for key in ("states", "inputs", "outputs", "disturbances", "sensor_errors")
+    }
+    for key, own in names.items():
+        if len(set(own)) < len(own):
+            raise InputError(plant.name, key, " ".join(own), "names that differ")
+    for key in ("states", "inputs", "outputs"):
+        if not names[key]:
+            raise InputError(plant.name, key, "none", "at least one")
+    sizes = {"noise": "outputs", "resolution": "outputs", "inertia": "inputs"}
+    for key, of in sizes.items():
+        if len(getattr(plant, key)) != len(names[of]):
+            found = f"{len(getattr(plant, key))} entries"
+            raise InputError(plant.name, key, found, f"{len(names[of])}, one for each of the {of}")
+    for key, known in {"stroke": names["outputs"] + names["states"], "thrust": names["inputs"]}.items():
+        if getattr(plant, key) not in ("", *known):
+            raise InputError(plant.name, key, repr(getattr(plant, key)), "one of " + " ".join(known))
+    if bool(plant.stroke) != bool(plant.thrust):
+        raise InputError(plant.name, "stroke", repr(plant.stroke), "stroke and thrust, or neither")
+    for name in plant.uncontrolled:
+        if name not in names["states"]:
+            raise InputError(plant.name, "uncontrolled", repr(name), "one of " + " ".join(names["states"]))
+
+
+def check_plant(plant: Plant) -> None:
+    """InputError where a plant's signals do not fit each other, or a function of it has the wrong size or fails."""
+    check_signals(plant)
+    check_equations(plant)
+
+
+def check_equations(plant: Plant) -> None:
+    """InputError where f or h of a plant cannot be evaluated, or gives another number of entries than it should."""
+    kind = ca.MX if plant.tabulated else ca.SX
+    x, u = kind.sym("x", len(plant.states)), kind.sym("u", len(plant.inputs))
+    w, y = kind.sym("w", len(plant.disturbances)), kind.sym("y", len(plant.outputs))
+    i = kind.sym("i", len(plant.actuator.coils))
+    asked: dict[str, tuple[Callable[[], Any], int, str]] = {
+        "f": (lambda: plant.f(x, u, w), len(plant.states), "states"),
+        "h": (lambda: plant.h(x, u), len(plant.outputs), "outputs"),
+        "load": (lambda: plant.load(x), len(plant.disturbances), "disturbances"),
+        "currents": (lambda: plant.currents(y, u), len(plant.actuator.coils), "coils"),
+        "forces": (lambda: plant.forces(x, i), len(plant.inputs), "inputs"),
+        "position_of": (lambda: plant.position_of(y), len(plant.controlled) // 2, "controlled positions"),
+        "contact": (lambda: plant.contact(x), len(plant.contacts), "contacts"),
+    }
+    for name, (evaluate, size, of) in asked.items():
+        try:
+            entries = ca.vertcat(evaluate()).numel()
+        except Exception as error:  # a user's function may raise anything
+            line = " ".join(str(error).split())
+            found = f"{type(error).__name__}: {line[:120]}"
+            raise InputError(plant.name, name, found, "a function of CasADi expressions") from error
+        if entries != size:
+            raise InputError(plant.name, name, f"{entries} entries", f"{size}, one for each of the {of}")
