@@ -1,8 +1,8 @@
 """The planar motor's physics: its field and coils by independent routes, its decoupling, and a loop closed around it.
 
-The closed loop here is written on its own, without samples and delay, beside the one loop of malta/simulation/period.py: it
-shows how a coil model alone moves the machine. The machine as a Plant is tested in test_planar_plant.py, the sampled loops that a user flies in
-test_planar_experiments.py.
+The closed loop here is written on its own, without samples and delay, beside the one loop of malta's control period:
+it shows how a coil model alone moves the machine. The machine as a Plant is tested in test_planar_plant.py, the sampled
+loops that a user flies in test_planar_experiments.py.
 """
 
 from __future__ import annotations

@@ -138,7 +138,7 @@ class Plant:
     A machine needs the fields without a default; the others say what it has beyond these. A machine without a `stroke`
     has no travel, and its thrust and mass are not asked for.
 
-    `data.plant_of` checks that the fields fit each other. Examples: malta/machines/, the module that `malta new` writes.
+    `data.plant_of` checks that the fields fit each other. Examples: malta/machines/, the module of `malta new`.
     """
 
     name: str
