@@ -1,5 +1,6 @@
 """Gain files: a controller and its margins in .json, .npz and .mat."""
 
+from malta.gains.agreement import agrees as agrees
 from malta.gains.file import SUFFIXES as SUFFIXES
 from malta.gains.file import document as document
 from malta.gains.file import read as read

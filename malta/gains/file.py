@@ -297,16 +297,7 @@ def read(path: str | Path) -> Controller:
     stabilize the file's own model.
     """
     path = located(path)
-    content = decode(path)
-    for key, wanted in (("schema", SCHEMA), ("version", VERSION)):
-        if content.get(key) != wanted:
-            raise InputError(path, key, repr(content[key]) if key in content else "nothing", repr(wanted))
-    file = validated(GainFile, content, path)
-    plain = file.model_dump(by_alias=True)
-    if content_sha256(plain) != file.sha256:
-        raise InputError(
-            path, "sha256", "content that was changed or damaged", "the content that was written"
-        )
+    file, _ = content_of(path)
     controller = _controller(file, path)
     try:
         with np.errstate(all="ignore"):
@@ -321,6 +312,24 @@ def read(path: str | Path) -> Controller:
         found = f"a pole of {whose} at |lambda| = {radius:.7g}"
         raise InputError(path, f"gains.{name}", found, "gains that stabilize it")
     return controller
+
+
+def content_of(path: Path) -> tuple[GainFile, dict[str, Any]]:
+    """The document in a gain file, of the right schema and with its own sha256; and the same as plain tables.
+
+    Raises InputError as `read`; whether the gains fit the machine and stabilize it is not looked at.
+    """
+    content = decode(path)
+    for key, wanted in (("schema", SCHEMA), ("version", VERSION)):
+        if content.get(key) != wanted:
+            raise InputError(path, key, repr(content[key]) if key in content else "nothing", repr(wanted))
+    file = validated(GainFile, content, path)
+    plain = file.model_dump(by_alias=True)
+    if content_sha256(plain) != file.sha256:
+        raise InputError(
+            path, "sha256", "content that was changed or damaged", "the content that was written"
+        )
+    return file, plain
 
 
 def _controller(file: GainFile, path: str | Path) -> Controller:

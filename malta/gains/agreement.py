@@ -1,0 +1,83 @@
+"""Whether gain files hold the numbers of a design already, so that nothing but their provenance would change.
+
+Another processor or another patch version of a library moves last digits. Such a file is left as it is.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from malta.errors import InputError
+from malta.gains.file import content_of, document
+
+if TYPE_CHECKING:
+    from malta.margins.verify import Margins
+    from malta.synthesis.controller import Controller
+
+CLOSE = 1e-9  # of the largest number in the same array
+CLOSE_VERIFIED = 1e-6  # of poles and bandwidths, which magnify what moves a matrix
+NARROWER = 1.01
+APART = {"provenance", "sha256", "verification"}
+
+
+def agrees(controller: Controller, margins: Margins, *paths: str | Path) -> bool:
+    """Whether all of these gain files exist, are sound, and hold this controller to 1e-9 of each array's largest entry.
+
+    Poles and bandwidths have to agree to 1e-6. The bounds of the margin must not contradict those in the file, nor be
+    narrower by more than 1 %: how far a proof gets in its time is the machine's.
+
+    Raises CheckError as gains.document.
+    """
+    wanted = document(controller, margins)
+    with suppress(InputError):
+        return all(_same(wanted, content_of(Path(path))[1]) for path in paths)
+    return False
+
+
+def _same(wanted: Mapping[str, Any], found: dict[str, Any]) -> bool:
+    if set(wanted) != set(found) or not all(
+        _close(wanted[key], found[key], CLOSE) for key in set(wanted) - APART
+    ):
+        return False
+    verified, before = (dict(content["verification"]) for content in (wanted, found))
+    robust, earlier = verified.pop("robust"), before.pop("robust")
+    return _close(verified, before, CLOSE_VERIFIED) and _no_better(robust, earlier)
+
+
+def _no_better(now: Mapping[str, Any] | None, before: Mapping[str, Any] | None) -> bool:
+    """Whether the bounds of a margin agree with earlier ones and are hardly narrower: a proof may run out of time."""
+    if now is None or before is None or now["uncertainty"] != before["uncertainty"]:
+        return now == before
+    lower, upper = _bounds(now)
+    lowest, highest = _bounds(before)
+    room = 1 + CLOSE_VERIFIED
+    agree = lower <= highest * room and lowest <= upper * room
+    return agree and lower <= lowest * NARROWER and upper >= highest / NARROWER
+
+
+def _bounds(robust: Mapping[str, Any]) -> tuple[float, float]:
+    lower, upper = robust["lower"], robust["upper"]
+    return 0.0 if lower is None else lower, math.inf if upper is None else upper
+
+
+def _close(a: Any, b: Any, share: float) -> bool:
+    """Whether two plain values agree: tables by their keys, arrays within a share of their largest entry."""
+    if isinstance(a, Mapping) and isinstance(b, Mapping):
+        return set(a) == set(b) and all(_close(a[key], b[key], share) for key in a)
+    try:
+        first, second = np.asarray(a, dtype=float), np.asarray(b, dtype=float)
+    except (TypeError, ValueError):  # words, signals, nothing
+        if isinstance(a, list) and isinstance(b, list):
+            return len(a) == len(b) and all(_close(x, y, share) for x, y in zip(a, b, strict=True))
+        return bool(a == b)
+    if first.shape != second.shape or isinstance(a, str) or isinstance(b, str) or (a is None) != (b is None):
+        return bool(a == b)
+    if not first.size or a is None:
+        return True
+    return bool(np.abs(first - second).max() <= share * np.abs(first).max())
