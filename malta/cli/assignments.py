@@ -1,0 +1,138 @@
+"""Options of the form NAME=VALUE, read as numbers in SI."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from malta.errors import InputError
+
+if TYPE_CHECKING:
+    from malta.model.plant import Plant
+
+NUMBER = r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)"  # a number, and the unit that may follow it
+EXAMPLES = {"--set": "m=0.56 or l_B=45mm", "--spread": "20% or m=10%"}  # in the errors of these options
+EXAMPLE = "gain_x1=0.02 or offset_y2=5um"  # of the others
+
+
+def read_assignments(option: str, texts: list[str] | None, units: Mapping[str, str]) -> dict[str, float]:
+    """Read `NAME=VALUE`, each value with the unit that may follow it, as numbers in SI.
+
+    units : SI unit of each name that may be assigned; "1" for a number without unit, or in %
+
+    Raises InputError for another form, an unknown name or a unit that does not fit.
+
+    >>> read_assignments("--set", ["l_B=45mm"], {"l_B": "m"})
+    {'l_B': 0.045}
+    """
+    values: dict[str, float] = {}
+    for text in texts or ():
+        name, value = _split(text)
+        number = re.fullmatch(NUMBER, value)
+        if number is None or not name.isidentifier():
+            raise InputError(option, "", repr(text), f"NAME=VALUE, as {EXAMPLES.get(option, EXAMPLE)}")
+        if name not in units:
+            kind = "sensor error" if option == "--sensor" else "parameter"
+            raise InputError(option, name, f"an unknown {kind}", "one of " + " ".join(units))
+        values[name] = _in_si(number, units[name], option, name)
+    return values
+
+
+def read_sensor_errors(texts: list[str] | None, plant: Plant) -> dict[str, float]:
+    """Read `--sensor NAME=VALUE`, errors of a machine's sensors, in SI; raises as `read_assignments` does."""
+    return read_assignments("--sensor", texts, {error.name: error.unit for error in plant.sensor_errors})
+
+
+def read_shares(
+    gains: Path,
+    texts: list[str] | None,
+    units: Mapping[str, str],
+    published: Mapping[str, Any] | None,
+    option: str = "--spread",
+) -> dict[str, float]:
+    """Read how far parameters vary: `SHARE` for all that are uncertain, `NAME=SHARE` for one.
+
+    Without a text these are the shares in the gain file. units : of the parameters that may be named
+
+    Raises InputError for two shares for all, and as `read_assignments` does.
+    """
+    from malta.campaigns.plan import box_of
+
+    named = [text for text in texts or () if "=" in text]
+    general = [text for text in texts or () if "=" not in text]
+    if len(general) > 1:
+        raise InputError(option, "", " and ".join(general), "one share for all, others as NAME=SHARE")
+    shares: dict[str, float] = {}
+    if general or not named:
+        shares = box_of(gains, published)
+    if general:
+        share = read_assignments(option, [f"all={general[0]}"], {"all": "1"})["all"]
+        shares = dict.fromkeys(shares, share)
+    return shares | read_assignments(option, named, dict.fromkeys(units, "1"))
+
+
+def scenario_options(distance: float | None, rise: float | None, **others: Any) -> dict[str, Any]:
+    """The options of a scenario that are not None, in SI: `distance` comes in mm, `rise` in ms."""
+    scaled = {"distance": distance, "rise": rise}
+    options = {name: None if value is None else value * 1e-3 for name, value in scaled.items()} | others
+    return {name: value for name, value in options.items() if value is not None}
+
+
+def add_own_options(
+    options: Mapping[str, Any], texts: list[str] | None, scenario: str, plant: Plant
+) -> dict[str, Any]:
+    """Add the scenario's own options, `--option NAME=VALUE`, in SI and of the type of their defaults.
+
+    Raises InputError for an unknown option, one that is given twice, or a value of another type.
+    """
+    from malta.simulation.experiments import option_of, said
+
+    units = said(plant, "OPTION_UNITS", {})
+    merged = dict(options)
+    for text in texts or ():
+        name, value = _split(text)
+        if not (name and value):
+            raise InputError("--option", "", repr(text), "NAME=VALUE")
+        default = option_of(scenario, plant, name)
+        if name in merged:
+            raise InputError("--option", name, f"{value!r} for the second time", "it once")
+        merged[name] = _read_like(default, value, units.get(name, "1"), name)
+    return merged
+
+
+def _read_like(default: Any, text: str, si_unit: str, name: str) -> Any:
+    """Read the value of a scenario's option with the type of its default."""
+    if isinstance(default, str) or default is None:
+        return text
+    if isinstance(default, bool):
+        if text not in ("true", "false"):
+            raise InputError("--option", name, repr(text), "true or false")
+        return text == "true"
+    several = isinstance(default, tuple)
+    numbers = [re.fullmatch(NUMBER, part.strip()) for part in (text.split(",") if several else [text])]
+    values = [_in_si(number, si_unit, "--option", name) for number in numbers if number is not None]
+    if len(values) < len(numbers):
+        raise InputError("--option", name, repr(text), "numbers" if several else "a number")
+    if several:
+        return tuple(values)
+    return int(values[0]) if isinstance(default, int) and values[0].is_integer() else values[0]
+
+
+def _split(text: str) -> tuple[str, str]:
+    """The name and the value of `NAME=VALUE`; the value is empty where there is none."""
+    name, _, value = (part.strip() for part in text.partition("="))
+    return name, value
+
+
+def _in_si(number: re.Match[str], si_unit: str, option: str, name: str) -> float:
+    """The value in SI of a match of NUMBER."""
+    from malta.model.data import to_si
+
+    value, unit = float(number[1]), number[2]
+    if si_unit != "1":
+        return to_si(value, unit or si_unit, si_unit, option, name)
+    if unit not in ("", "%", "percent"):
+        raise InputError(option, f"{name}.unit", repr(unit), "no unit, or %")
+    return value * (0.01 if unit else 1.0)

@@ -1,0 +1,64 @@
+"""`malta check`: the proof in a certificate, checked without the code that found it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from malta.cli.options import AsJson
+from malta.cli.output import make_console, print_json, print_note
+
+if TYPE_CHECKING:
+    from malta.margins.verify import CurrentLoops
+
+
+def check(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="A certificate that verify wrote.")],
+    gains: Annotated[
+        Path | None,
+        typer.Option(metavar="GAINS", help="The gain file that it has to be of, to the last digit."),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Check the proof of a margin, in arithmetic with rigorous bounds and without the code that found it.
+
+    \b
+    Example:  malta check build/table2_margin.json --gains design/gains/table2.json
+    """
+    from malta.margins.check import check as check_certificate
+
+    verdict = check_certificate(file, gains)
+    failures = list(verdict.failures)
+    if gains is not None and not failures and not _matches_gains(file, gains):
+        failures.append(f"the loops are not those of {gains}")
+    if as_json:
+        claim = {"file": str(file), "holds": not failures, "lower": verdict.claim}
+        print_json(claim | {"groups": list(verdict.groups), "failures": failures})
+    else:
+        console = make_console()
+        for line in verdict.groups:
+            console.print(line, soft_wrap=True)
+        holds = "does not hold" if failures else "holds"
+        share = f"{100 * verdict.claim:.3f} %"
+        console.print(f"{file}: stable in {share} of the uncertainty: {holds}", soft_wrap=True)
+        for line in failures:
+            print_note(f"{file}: {line}")
+    raise typer.Exit(1 if failures else 0)
+
+
+def _matches_gains(certificate: Path, gains: Path) -> bool:
+    """Whether a certificate's loops are those of a gain file, with either kind of current loops."""
+    from malta import gains as gain_files
+    from malta.margins import checked_file
+    from malta.margins.certificate import matches
+    from malta.margins.verify import travel_loops
+    from malta.model.data import plant_of
+
+    controller = gain_files.read(gains)
+    plant = plant_of(controller.parameters)
+    parameters = (entry["name"] for entry in checked_file.content_of(certificate)["parameters"])
+    names = tuple(name for name in parameters if name != plant.stroke)
+    kinds: tuple[CurrentLoops, ...] = ("lag", "pi") if controller.current_loop is not None else ("lag",)
+    return any(matches(certificate, travel_loops(plant, controller, names, kind)[0]) for kind in kinds)

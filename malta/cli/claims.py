@@ -1,0 +1,68 @@
+"""`malta claims`: every number that a machine's paper publishes beside ours."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from malta.cli.inputs import design_files
+from malta.cli.options import AsJson
+from malta.cli.output import make_console, print_json, progress_bar
+
+if TYPE_CHECKING:
+    from malta.report.ledger import Ledger
+    from malta.synthesis.spec import Spec
+
+
+def claims(
+    designs: Annotated[
+        list[Path] | None,
+        typer.Argument(help="Design files; all of design/ if none is named."),
+    ] = None,
+    markdown: Annotated[
+        bool, typer.Option("--markdown", help="Print the table as the README holds it.")
+    ] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Print the ledger: every number that a machine's paper publishes, ours for each design, and a verdict.
+
+    One table for each machine, all of it computed now: models, gains, margins, experiments on the simulated machine.
+
+    \b
+    Example:  malta claims design/table2.toml
+    """
+    from malta.synthesis.spec import read_design
+
+    specs = [read_design(file) for file in design_files("claims", designs, reverse=True)]
+    if not designs:
+        specs.sort(key=lambda spec: bool(spec.search))  # the paper's own designs first
+    with progress_bar("claims", quiet=as_json) as progress:
+        ledgers = _compute_ledgers(specs, progress)
+    if as_json:
+        from dataclasses import asdict
+
+        print_json([asdict(one) | {"claims": [claim._asdict() for claim in one.claims]} for one in ledgers])
+    elif markdown:
+        print("\n".join(f"### {one.title}\n\n{one.markdown()}" for one in ledgers), end="")
+    else:
+        from malta import report
+
+        for one in ledgers:
+            make_console().print(report.claims_table(one))
+
+
+def _compute_ledgers(specs: Sequence[Spec], progress: Callable[[float], None] | None) -> list[Ledger]:
+    """Compute the ledger of each machine, in the order in which the designs name the machines."""
+    from malta.model.data import published
+    from malta.report.ledger import ledger
+    from malta.simulation.experiments import part
+
+    machines = dict.fromkeys(spec.plant.name for spec in specs)
+    groups = [[spec for spec in specs if spec.plant.name == name] for name in machines]
+    return [
+        ledger(group, published(group[0].machine_file), part(progress, n, len(groups)))
+        for n, group in enumerate(groups)
+    ]

@@ -1,0 +1,116 @@
+"""`malta design`: design file -> controller -> margins -> main job -> gain files and figure."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from malta.cli.documents import experiment_document, margins_document
+from malta.cli.inputs import design_files
+from malta.cli.options import AsJson
+from malta.cli.output import make_console, print_error, print_json, print_written, track_files
+from malta.errors import CheckError, InputError
+
+if TYPE_CHECKING:
+    from malta.margins.verify import Margins
+    from malta.simulation.experiments import Experiment
+    from malta.synthesis.controller import Controller
+    from malta.synthesis.spec import Spec
+
+
+def design(
+    files: Annotated[
+        list[Path] | None, typer.Argument(help="Design files; all of design/ if none is named.")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder of the gain files. [gains/ beside the design file]")
+    ] = None,
+    figures: Annotated[Path, typer.Option(help="Folder of the figures.")] = Path("build"),
+    as_json: AsJson = False,
+) -> None:
+    """Design controllers: synthesize, verify, simulate, write gain files.
+
+    Gain files are replaced only by a design that is stable on the machine and completes its main job, as the stroke.
+
+    \b
+    Example:  malta design design/table2.toml
+    """
+    documents: list[dict[str, Any]] = []
+    sources: dict[Path, Path] = {}  # output file -> the design file of this run that it comes from
+    code = 0
+    for file in track_files(design_files("design", files), "designing", quiet=as_json):
+        try:
+            folder = out or file.parent / "gains"
+            documents.append(_run_design(file, folder, figures, sources, quiet=as_json))
+        except (InputError, CheckError) as error:
+            code = max(code, print_error(error, file))
+    if as_json:
+        print_json(documents)
+    raise typer.Exit(code)
+
+
+def _run_design(
+    file: Path, out: Path, figures: Path, sources: dict[Path, Path], *, quiet: bool
+) -> dict[str, Any]:
+    """Design, verify and simulate the controller of one design file and write its gain files; the JSON document.
+
+    Raises InputError for a design of a name that `sources` has, CheckError where a check fails; nothing is written
+    over a gain file then.
+    """
+    from malta import gains, report
+    from malta.margins.verify import require_stable
+    from malta.margins.verify import verify as compute_margins
+    from malta.model.data import published as read_published
+    from malta.model.linearize import linearize
+    from malta.simulation.experiments import main_job
+    from malta.synthesis.lqg import synthesize
+    from malta.synthesis.spec import read_design
+
+    spec = read_design(file)
+    plant, job = spec.plant, main_job(spec.plant)
+    paths = [out / f"{spec.name}{suffix}" for suffix in gains.SUFFIXES]
+    picture = figures / f"{spec.name}_{job}.png"
+    for target in (out / f"{spec.name}.json", picture):
+        if sources.setdefault(target, file) != file:
+            raise InputError(file, "name", repr(spec.name), f"another name than that of {sources[target]}")
+    model = linearize(plant, plant.at(**spec.operating_point))
+    controller = synthesize(spec, model)
+    margins = compute_margins(model, controller, spec.uncertainty)
+    require_stable(margins, str(file))
+    result = _simulate_gain_file(file, spec, controller, margins, job)
+    published = read_published(spec.machine_file)
+    page = report.design_page(spec, model, margins, result, published)
+    report.experiment(result, picture, published)
+    gains.write(controller, margins, *paths)  # last: whatever fails before leaves the old files
+    if not quiet:
+        console = make_console()
+        console.print(page)
+        print_written(console, (*paths, picture))
+        console.print()
+    written = {"design": spec.name, "files": [str(path) for path in (*paths, picture)]}
+    return written | margins_document(margins) | experiment_document(result)
+
+
+def _simulate_gain_file(
+    file: Path, spec: Spec, controller: Controller, margins: Margins, job: str
+) -> Experiment:
+    """Simulate the main job with a gain file that is written for it alone, before a good one is replaced.
+
+    Raises CheckError, naming the design file, when a run ends early.
+    """
+    import tempfile
+
+    from malta import gains
+    from malta.simulation.experiments import experiment
+
+    with tempfile.TemporaryDirectory() as scratch:
+        trial = Path(scratch) / f"{spec.name}.json"
+        gains.write(controller, margins, trial)
+        result = experiment(job, spec.plant, gains.read(trial))
+    for case in result.cases:
+        end = case.run.verdict
+        if not end.completed:
+            raise CheckError(f"{file}: the {job} ends at {end.time:.4g} s: {end.name}; gain files unchanged")
+    return result

@@ -1,0 +1,66 @@
+"""Arguments and options that several commands share, with their help texts."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON document instead of tables.")]
+Changes = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set", metavar="NAME=VALUE", help="Change a parameter of the machine: m=0.56 (SI) or l_B=45mm."
+    ),
+]
+SCENARIOS = "one of the machine's own, which `--scenario help` lists. [its first]"
+# Options of a run, in `simulate` and in `campaign`.
+Distance = Annotated[float | None, typer.Option(help="Length of a stroke [mm]. [the scenario's]")]
+Rise = Annotated[float | None, typer.Option(help="Rise of its reference, 10-90 % [ms]. [the scenario's]")]
+ProfileName = Annotated[str | None, typer.Option(help="Its reference: logistic or quintic. [the scenario's]")]
+OwnOptions = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--option",
+        metavar="NAME=VALUE",
+        help="Any other option that `--scenario help` lists: radius=0.1mm, masses=50g,100g, during=hold, ...",
+    ),
+]
+FidelityName = Annotated[
+    str | None,
+    typer.Option(
+        help="What makes the forces: force (first-order lags), dq (PI loops), phase. [the scenario's]"
+    ),
+]
+Noise = Annotated[
+    float | None, typer.Option(help="Sensor noise in multiples of the machine's. [the scenario's]")
+]
+Quantize = Annotated[
+    bool | None, typer.Option(help="Sensors with the machine's resolution. [the scenario's]")
+]
+Bearing = Annotated[
+    bool | None,
+    typer.Option(help="Touchdown bearings push back, or a touchdown ends the run. [the scenario's]"),
+]
+Scheduled = Annotated[bool | None, typer.Option(help="C(z) of the measured z in the filter.")]
+Feedforward = Annotated[
+    str | None,
+    typer.Option(help="axial, as printed, or attraction: also what holds it off centre. [axial]"),
+]
+BearingAxes = Annotated[
+    str | None,
+    typer.Option(
+        help="dq, phase: current controllers in fixed axes, or turning with the force as printed. [fixed]"
+    ),
+]
+RealPwm = Annotated[
+    bool | None, typer.Option(help="phase: duty cycles in steps, dead time of the half-bridges.")
+]
+Delay = Annotated[int | None, typer.Option(help="Samples between measurement and command. [the machine's]")]
+Substeps = Annotated[
+    int | None,
+    typer.Option(help="Runge-Kutta steps a sample; the error is estimated. [4, more for slow samples]"),
+]
+Seed = Annotated[int | None, typer.Option(help="Seed of the noise. [0]")]
+GainFile = Annotated[Path, typer.Argument(metavar="GAINS", help="A gain file: .json, .npz or .mat.")]

@@ -1,0 +1,128 @@
+"""What commands print: tables and JSON on standard output, notes, errors and progress on standard error."""
+
+from __future__ import annotations
+
+import math
+import sys
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import typer
+
+from malta.errors import CheckError, InputError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+WIDTH = 100  # columns of tables on wide terminals, in files and in pipes
+PATIENCE = 5.0  # s, from the first bounds of a margin to the first line about them
+INTERVAL = 2.0  # s, between the lines
+
+
+def make_console() -> Console:
+    """A console on standard output that prints text as it stands, at most WIDTH columns wide."""
+    from rich.console import Console
+
+    console = Console(highlight=False, markup=False, emoji=False)
+    if not console.is_terminal or console.width > WIDTH:
+        console.width = WIDTH
+    return console
+
+
+def print_written(console: Console, files: Iterable[Path]) -> None:
+    """Print one line for each file that a command wrote."""
+    for file in files:
+        console.print(f"wrote {file}", soft_wrap=True)
+
+
+def print_json(content: Any) -> None:
+    """Print one JSON document; numbers that are not finite become null."""
+    import json
+
+    def finite(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {key: finite(entry) for key, entry in value.items()}
+        if isinstance(value, list):
+            return [finite(entry) for entry in value]
+        return None if isinstance(value, float) and not math.isfinite(value) else value
+
+    print(json.dumps(finite(content), indent=1, allow_nan=False))
+
+
+def print_note(text: str) -> None:
+    """Print one line on standard error, after the name of the program."""
+    print(f"malta: {text}", file=sys.stderr, flush=True)
+
+
+def print_error(error: InputError | CheckError, file: Path | None = None) -> int:
+    """Print an error as one line and return the exit code; a failed check is printed with its file."""
+    failed, text = isinstance(error, CheckError), str(error)
+    print_note(f"{file}: {text}" if failed and file and str(file) not in text else text)
+    return 1 if failed else 2
+
+
+def track_files(files: list[Path], what: str, *, quiet: bool) -> Iterable[Path]:
+    """Iterate over files behind a progress bar, on a terminal's standard error when there are several files."""
+    if quiet or len(files) < 2 or not sys.stderr.isatty():
+        return files
+    from rich.console import Console
+    from rich.progress import track
+
+    return track(files, what, console=Console(stderr=True), transient=True)
+
+
+@contextmanager
+def progress_bar(what: str, *, quiet: bool) -> Iterator[Callable[[float], None] | None]:
+    """Show a progress bar with the time left on a terminal's standard error while the work goes on.
+
+    Yields the function that takes the share done, 0 to 1, or None where no bar is shown.
+    """
+    if quiet or not sys.stderr.isatty():
+        yield None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task(what, total=1.0)
+        yield lambda share: bar.update(task, completed=share)
+
+
+@contextmanager
+def margin_progress(
+    what: str, *, quiet: bool
+) -> Iterator[tuple[Callable[[float], None] | None, Callable[[float, float], None]]]:
+    """Show a progress bar and the bounds of a margin while its proof is searched.
+
+    Yields the functions that take the share done and the bounds so far. Without a terminal the bounds are printed as
+    a line every INTERVAL, once the proof has taken PATIENCE. Ctrl-C prints the last bounds and ends with exit code 130.
+    """
+    last: tuple[float, float] | None = None  # the bounds so far
+    due: float | None = None  # when the next line is printed; None before the first bounds
+    terminal = sys.stderr.isatty()
+
+    def show(lower: float, upper: float) -> None:
+        nonlocal last, due
+        last = lower, upper
+        due = time.monotonic() + PATIENCE if due is None else due
+        if quiet or terminal or time.monotonic() < due:
+            return
+        due = time.monotonic() + INTERVAL
+        print_note(f"{what}: {_bounds_text(lower, upper)}")
+
+    with progress_bar(what, quiet=quiet) as progress:
+        try:
+            yield progress, show
+        except KeyboardInterrupt:
+            print_note("interrupted; " + (_bounds_text(*last) if last else "nothing proven"))
+            raise typer.Exit(130) from None
+
+
+def _bounds_text(lower: float, upper: float) -> str:
+    """The bounds of a margin as shares of the uncertainty."""
+    high = "not found" if math.isinf(upper) else f"{100 * upper:.2f} %"
+    return f"proven {100 * max(lower, 0):.2f} %, lost at {high}"

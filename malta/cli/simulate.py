@@ -1,0 +1,231 @@
+"""`malta simulate`: an experiment on the nonlinear machine with a gain file."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, cast
+
+import typer
+
+from malta.cli.assignments import add_own_options, read_sensor_errors, scenario_options
+from malta.cli.documents import experiment_document
+from malta.cli.inputs import change_machine, print_scenarios, published_figures
+from malta.cli.options import (
+    SCENARIOS,
+    AsJson,
+    Bearing,
+    BearingAxes,
+    Changes,
+    Delay,
+    Distance,
+    Feedforward,
+    FidelityName,
+    GainFile,
+    Noise,
+    OwnOptions,
+    ProfileName,
+    Quantize,
+    RealPwm,
+    Rise,
+    Scheduled,
+    Seed,
+    Substeps,
+)
+from malta.cli.output import make_console, print_json, print_note, print_written, progress_bar
+from malta.errors import CheckError, InputError
+
+if TYPE_CHECKING:
+    from malta.simulation.experiments import Experiment
+    from malta.simulation.simulate import EngineChoice
+    from malta.synthesis.controller import Controller
+
+
+class Simulation(NamedTuple):
+    """A simulated scenario."""
+
+    scenario: str
+    experiment: Experiment
+    stem: str  # of the names of its files
+
+
+def simulate(
+    gains: GainFile,
+    scenario: Annotated[str | None, typer.Option(help=f"What to simulate: {SCENARIOS}")] = None,
+    change: Changes = None,
+    distance: Distance = None,
+    rise: Rise = None,
+    profile: ProfileName = None,
+    during: Annotated[
+        str | None, typer.Option(help="Faults strike during a stroke or a hold. [the scenario's]")
+    ] = None,
+    option: OwnOptions = None,
+    fidelity: FidelityName = None,
+    noise: Noise = None,
+    quantize: Quantize = None,
+    sensor: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=VALUE",
+            help="An error of the sensors: gain_x1=0.02, offset_y2=5um, hall_amplitude=0.01, hall_phase=2deg, ...",
+        ),
+    ] = None,
+    bearing: Bearing = None,
+    estimator: Annotated[
+        str | None, typer.Option(help="steady-state, kalman (time-varying) or extended. [steady-state]")
+    ] = None,
+    scheduled: Scheduled = None,
+    feedforward: Feedforward = None,
+    bearing_axes: BearingAxes = None,
+    real_pwm: RealPwm = None,
+    delay: Delay = None,
+    substeps: Substeps = None,
+    seed: Seed = None,
+    engine: Annotated[str, typer.Option(help="auto, compiled or virtual-machine.")] = "auto",
+    out: Annotated[
+        Path | None, typer.Option(help="Folder for the figure (.png) and the time series (.npz).")
+    ] = None,
+    replay: Annotated[
+        str | None,
+        typer.Option(
+            metavar="FOLDER:RUN", help="One run of a campaign again: its machine, sensors and noise."
+        ),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Simulate the nonlinear machine and its drive with a gain file.
+
+    The machine is the one in the file, with the changes given by --set; the controller does not learn of them.
+
+    \b
+    Example:  malta simulate design/gains/calibrated.json --scenario stroke --set m=0.56 --noise 1 --out build
+    """
+    from malta import gains as gain_files
+    from malta.model.data import plant_of
+    from malta.simulation.experiments import experiment, main_job
+
+    controller = gain_files.read(gains)
+    plant = plant_of(change_machine(controller.parameters, change))
+    if scenario == "help":
+        print_scenarios(plant)
+        raise typer.Exit
+    chosen, choice = scenario or main_job(plant), engine.replace("-", " ")
+    options = scenario_options(
+        distance,
+        rise,
+        profile=profile,
+        during=during,
+        fidelity=fidelity,
+        noise=noise,
+        quantize=quantize,
+        sensor_errors=read_sensor_errors(sensor, plant) or None,
+        bearing=bearing,
+        estimator=estimator,
+        scheduled=scheduled,
+        feedforward=feedforward,
+        bearing_axes=bearing_axes,
+        real_pwm=real_pwm,
+        delay=delay,
+        substeps=substeps,
+        seed=seed,
+    )
+    options = add_own_options(options, option, chosen, plant)
+    with progress_bar(scenario or "simulating", quiet=as_json) as progress:
+        if replay is None:
+            result = experiment(chosen, plant, controller, progress=progress, engine=choice, **options)
+            simulation = Simulation(chosen, result, f"{controller.name}_{chosen}")
+        else:
+            others = [*options, *(["scenario"] if scenario else []), *(["set"] if change else [])]
+            simulation = _replay(replay, controller, others, choice, progress)
+    published = published_figures(plant.name)
+    files = [] if out is None else _save(simulation, out, published)
+    if as_json:
+        document = {"gains": str(gains), "scenario": simulation.scenario, "files": [str(f) for f in files]}
+        print_json(document | experiment_document(simulation.experiment))
+    else:
+        _print_tables(gains, simulation, change or (), published, estimate=substeps is not None)
+        print_written(make_console(), files)
+    _conclude(gains, simulation, engine)
+
+
+def _replay(
+    text: str,
+    controller: Controller,
+    others: Sequence[str],
+    engine: str,
+    progress: Callable[[float], None] | None,
+) -> Simulation:
+    """Simulate one run of a campaign, `FOLDER:RUN`, again.
+
+    Raises InputError for another form, and for `others`, the names of options that the campaign decides.
+    """
+    from malta.campaigns.campaign import read_plan
+    from malta.campaigns.campaign import replay as simulate_run
+
+    folder, _, run = text.rpartition(":")
+    if not folder or not run.isdecimal():
+        raise InputError("--replay", "", repr(text), "FOLDER:RUN, as build/campaigns/mine:17")
+    if others:
+        names = ", ".join("--" + name.replace("_", "-") for name in others)
+        raise InputError("--replay", "", f"{names} too", "none of them: the campaign says how it runs")
+    plan = read_plan(folder, controller)
+    result = simulate_run(plan, int(run), engine=cast("EngineChoice", engine), progress=progress)
+    return Simulation(plan.scenario, result, f"{controller.name}_{plan.scenario}_run_{int(run)}")
+
+
+def _save(simulation: Simulation, folder: Path, published: Mapping[str, Any] | None) -> list[Path]:
+    """Write the time series of every run, and the figure."""
+    from malta import report
+    from malta.simulation.simulate import save as save_series
+
+    cases, stem = simulation.experiment.cases, simulation.stem
+    stems = [stem] if len(cases) == 1 else [f"{stem}_{_slug(case.label)}" for case in cases]
+    series = [save_series(case.run, folder / f"{name}.npz") for name, case in zip(stems, cases, strict=True)]
+    return [*series, report.experiment(simulation.experiment, folder / f"{stem}.png", published)]
+
+
+def _slug(label: str) -> str:
+    """A label as a part of a file name: letters, digits and underscores."""
+    return "_".join("".join(c if c.isalnum() else " " for c in label).split())
+
+
+def _print_tables(
+    gains: Path,
+    simulation: Simulation,
+    changes: Sequence[str],
+    published: Mapping[str, Any] | None,
+    *,
+    estimate: bool,
+) -> None:
+    """Print the outcome of a simulation, its merits and limits, and an estimate of the integration error."""
+    from malta import report
+    from malta.simulation.simulate import integration_error
+
+    result = simulation.experiment
+    run, console = result.run, make_console()
+    console.print(
+        f"{gains}: {simulation.scenario}, fidelity {run.scenario.fidelity}",
+        *changes,
+        f"-> {result.outcome}",
+    )
+    console.print(report.experiment_table(result, published))
+    for line in report.limits_text(result):
+        console.print(line)
+    if estimate:
+        units = "/".join(dict.fromkeys(signal.unit for signal in run.plant.outputs))
+        console.print(f"integration error, estimated: {integration_error(run):.1g} {units}")
+
+
+def _conclude(gains: Path, simulation: Simulation, engine: str) -> None:
+    """Note a missing compiler; exit with code 130 after Ctrl-C, raise CheckError when a run ended early."""
+    from malta.model.data import plant_of
+
+    result = simulation.experiment
+    runs = [case.run for case in result.cases if not plant_of(case.run.controller.parameters).tabulated]
+    if engine == "auto" and any(run.engine == "virtual machine" for run in runs):
+        print_note("no C compiler: simulated on CasADi's virtual machine, some ten times slower")
+    if result.interrupted:
+        print_note(f"interrupted: {result.outcome}; what was computed is shown")
+        raise typer.Exit(130)
+    if result.failed:
+        raise CheckError(f"{gains}: {simulation.scenario}: {result.outcome}")

@@ -1,0 +1,229 @@
+"""`malta verify`: the margins of a gain file, with their proofs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, cast
+
+import typer
+
+from malta.cli.assignments import read_shares
+from malta.cli.documents import margins_document, robustness_document
+from malta.cli.inputs import change_machine, published_figures
+from malta.cli.options import AsJson, Changes, GainFile
+from malta.cli.output import make_console, margin_progress, print_json, print_written
+from malta.errors import CheckError, InputError
+
+if TYPE_CHECKING:
+    from malta.margins.gain import Gain
+    from malta.margins.robust import Margin
+    from malta.margins.stages import Robustness
+    from malta.margins.verify import CurrentLoops, Margins
+    from malta.model.linearize import LinearModel
+    from malta.model.plant import Plant
+    from malta.synthesis.controller import Controller
+
+
+class Loop(NamedTuple):
+    """A gain file on its machine, and the uncertainty that the margins count in."""
+
+    gains: Path
+    controller: Controller
+    plant: Plant
+    model: LinearModel
+    box: Mapping[str, float]  # parameter -> share, either way, at margin 1
+    current_loops: CurrentLoops
+
+
+class Analysis(NamedTuple):
+    """All that is computed of a loop."""
+
+    margins: Margins
+    robustness: Robustness
+    worst: Mapping[str, Gain]  # the largest |S| of each sensor; empty where it was not asked for
+
+
+def verify(
+    gains: GainFile,
+    change: Changes = None,
+    uncertain: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--uncertain",
+            metavar="SHARE|NAME=SHARE",
+            help="How far parameters vary at margin 1, either way: 20% (those of the gain file), m=10%, ... "
+            "[the gain file's]",
+        ),
+    ] = None,
+    current_loops: Annotated[
+        str, typer.Option(help="Of the machine's loop: lag (first order), or pi (sampled PI loops).")
+    ] = "lag",
+    time: Annotated[
+        float | None,
+        typer.Option(metavar="SECONDS", help="Longest search of a margin over the travel. [120]"),
+    ] = None,
+    no_proof: Annotated[
+        bool, typer.Option("--no-proof", help="A first look: no proof of the margins over the travel.")
+    ] = False,
+    worst_case: Annotated[
+        bool | None,
+        typer.Option(
+            "--worst-case/--no-worst-case",
+            help="The largest |S| of each sensor over the uncertainty. [where one proof covers the travel]",
+        ),
+    ] = None,
+    certificate: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Write the proof of the margin, for `malta check`.")
+    ] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder for the figure (.png).")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Verify a gain file on the machine, stage by stage.
+
+    Poles, bandwidths by definition, peak sensitivities with their ISO 14839-3 zones; real parametric margins with
+    their proof, from full state feedback to the sampled loop, and over the travel; disk and delay margins, gang of
+    four, tolerance of each parameter.
+
+    The machine is the one in the file, with the changes given by --set, as far as they shape the linear loop (on MALTA
+    m, K_A, K_B, l_B, F_c, T_d; windings and DC link do not).
+
+    \b
+    Example:  malta verify design/gains/calibrated.json --set m=0.56
+    """
+    from malta import gains as gain_files
+    from malta.margins.verify import require_stable
+    from malta.model.data import plant_of, units_of
+    from malta.model.linearize import linearize
+
+    controller = gain_files.read(gains)
+    plant = plant_of(change_machine(controller.parameters, change))
+    model = linearize(plant, plant.point(controller.operating_point[0]))
+    published = published_figures(plant.name)
+    box = read_shares(gains, uncertain, units_of(plant.parameters), published, option="--uncertain")
+    _require_options(box, time, certificate, proof=not no_proof)
+    loop = Loop(gains, controller, plant, model, box, cast("CurrentLoops", current_loops))
+    analysis = _analyse(loop, time, proof=not no_proof, worst_case=worst_case, quiet=as_json)
+    files: list[Path] = []
+    refusal: InputError | CheckError | None = None
+    if certificate is not None:
+        try:
+            files.append(_write_certificate(certificate, loop, analysis.robustness.travel))
+        except (InputError, CheckError) as error:
+            refusal = error  # the tables come first
+    if out is not None:
+        files.append(_draw(loop, analysis, out))
+    if as_json:
+        print_json(_document(loop, analysis, files))
+    else:
+        _print_tables(loop, analysis, published, change or (), files)
+    require_stable(analysis.margins, str(gains))
+    if refusal is not None:
+        raise refusal
+
+
+def _require_options(
+    box: Mapping[str, float], time: float | None, certificate: Path | None, *, proof: bool
+) -> None:
+    """Raise InputError for a share or a time that is not positive, or a certificate without a proof."""
+    for name, share in box.items():
+        if not 0 < share < math.inf:
+            raise InputError("--uncertain", name, f"{100 * share:g} %", "a share above 0 %")
+    if time is not None and not 0 < time < math.inf:
+        raise InputError("--time", "", f"{time:g}", "seconds above 0")
+    if certificate is not None and not proof:
+        raise InputError("--certificate", "", "--no-proof", "one of them")
+
+
+def _analyse(
+    loop: Loop, time: float | None, *, proof: bool, worst_case: bool | None, quiet: bool
+) -> Analysis:
+    """Compute the margins of a loop behind a progress bar.
+
+    time : s, longest search of a margin over the travel
+    worst_case : whether the largest |S| is searched; None: where one proof covers the travel
+
+    Raises CheckError, naming the gain file, when a result fails its own check.
+    """
+    from malta.margins.stages import robustness
+    from malta.margins.verify import covers_travel, worst_sensitivities
+    from malta.margins.verify import verify as compute_margins
+
+    plant, controller, box, current_loops = loop.plant, loop.controller, loop.box, loop.current_loops
+    try:
+        margins = compute_margins(loop.model, controller)
+        with margin_progress("margins", quiet=quiet) as (progress, bounds):
+            robust = robustness(
+                plant, controller, box,
+                current_loops=current_loops, progress=progress, bounds=bounds, time=time, proof=proof,
+            )  # fmt: skip
+        if worst_case is None:
+            worst_case = proof and covers_travel(plant, controller, tuple(box), current_loops)
+        worst = worst_sensitivities(plant, controller, box, current_loops, time=time) if worst_case else {}
+    except CheckError as error:
+        raise CheckError(f"{loop.gains}: {error}") from error
+    return Analysis(margins, robust, worst)
+
+
+def _write_certificate(path: Path, loop: Loop, margin: Margin) -> Path:
+    """Write the certificate of the margin over the travel."""
+    from malta.margins import certificate
+    from malta.margins.verify import travel_loops
+
+    places, over = travel_loops(loop.plant, loop.controller, tuple(loop.box), loop.current_loops)
+    return certificate.write(path, places, loop.box, over, margin, loop.gains)
+
+
+def _draw(loop: Loop, analysis: Analysis, folder: Path) -> Path:
+    """Draw the margins stage by stage and over the travel."""
+    from malta import report
+
+    name = loop.controller.name
+    picture, position = folder / f"{name}_margins.png", f"position {loop.plant.stroke}"
+    return report.robustness(analysis.robustness, name, loop.box, picture, position, analysis.worst)
+
+
+def _document(loop: Loop, analysis: Analysis, files: Sequence[Path]) -> dict[str, Any]:
+    """The JSON document of a verification."""
+    design = {
+        "gains": str(loop.gains),
+        "design": loop.controller.name,
+        "files": [str(file) for file in files],
+    }
+    robust = robustness_document(analysis.robustness, loop.box, analysis.worst)
+    return design | margins_document(analysis.margins) | {"robust": robust}
+
+
+def _print_tables(
+    loop: Loop,
+    analysis: Analysis,
+    published: Mapping[str, Any] | None,
+    changes: Sequence[str],
+    files: Sequence[Path],
+) -> None:
+    """Print the tables of a verification; poles of a changed machine stand beside no published ones."""
+    from malta import report
+
+    controller, margins, robust = loop.controller, analysis.margins, analysis.robustness
+    box = "  ".join(f"{name} +-{100 * share:g} %" for name, share in loop.box.items())
+    console = make_console()
+    console.print(
+        f"{loop.gains}: {controller.name}, {loop.plant.name}, preset {controller.parameters.preset}",
+        *changes,
+    )
+    for table in (
+        report.poles_table(loop.model, None if changes else published),
+        report.loop_poles_table(margins),
+        report.bandwidth_table(margins, published),
+        report.sensitivity_table(margins),
+        f"Uncertainty: {box}\n",
+        report.chain_table(robust),
+        report.disk_table(robust, controller.sample_time),
+        report.gang_table(robust, loop.plant),
+        report.tolerance_table(robust, loop.box),
+        report.places_table(robust, controller.sample_time),
+        *([report.worst_case_table(analysis.worst)] if analysis.worst else []),
+    ):
+        console.print(table)
+    print_written(console, files)
