@@ -50,7 +50,7 @@ SCENARIO = malta.Scenario.stroke(delay=0, fidelity="force")
 def whole_process(runs: int) -> list[Result]:
     """`malta design design/table2.toml` against a process that only imports what it needs."""
     with tempfile.TemporaryDirectory() as scratch:
-        command = [sys.executable, "-m", "malta.cli.main", "design", "design/table2.toml"]
+        command = [sys.executable, "-m", "malta", "design", "design/table2.toml"]
         command += ["--out", scratch, "--figures", scratch]
 
         def process(arguments: list[str]) -> Callable[[], object]:

@@ -834,6 +834,13 @@ def test_version(run: Run) -> None:
     assert run("--version") == (0, f"malta {version('malta')}\n", "")
 
 
+def test_python_runs_the_package_as_the_program() -> None:
+    command = [sys.executable, "-W", "error", "-m", "malta", "check", "nothing.json"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert one_sentence(done.stderr).startswith("nothing.json: found ")
+
+
 def test_away_from_the_data_the_published_column_is_empty_and_said_so(
     run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
