@@ -36,6 +36,7 @@ if TYPE_CHECKING:  # the contents page, as type checkers and readers see it
     from malta.model.data import read as read
     from malta.model.linearize import LinearModel as LinearModel
     from malta.model.linearize import linearize as linearize
+    from malta.model.machines import machine as machine
     from malta.model.plant import OperatingPoint as OperatingPoint
     from malta.model.plant import Plant as Plant
     from malta.model.plant import Signal as Signal
@@ -76,6 +77,7 @@ _NAMES = {  # the same, for the first use of each name
     "simulation.time_optimal": ("fastest_stroke",),
     "model.linearize": ("LinearModel", "linearize"),
     "simulation.batch": ("Batch", "replayed", "simulate_many"),
+    "model.machines": ("machine",),
     "model.plant": ("OperatingPoint", "Plant", "Signal", "trim"),
     "margins.blocks": ("Dynamic",),
     "margins.dynamic": ("dynamic_margin",),

@@ -87,9 +87,9 @@ def add_own_options(
 
     Raises InputError for an unknown option, one that is given twice, or a value of another type.
     """
-    from malta.simulation.experiments import option_of, said
+    from malta.simulation.experiments import option_of, setting
 
-    units = said(plant, "OPTION_UNITS", {})
+    units = setting(plant, "OPTION_UNITS", {})
     merged = dict(options)
     for text in texts or ():
         name, value = _split(text)

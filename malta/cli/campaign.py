@@ -10,7 +10,7 @@ import typer
 
 from malta.cli.assignments import add_own_options, read_sensor_errors, read_shares, scenario_options
 from malta.cli.documents import campaign_document
-from malta.cli.inputs import change_machine, print_scenarios, published_figures
+from malta.cli.inputs import change_machine, print_scenarios, read_controller
 from malta.cli.options import (
     SCENARIOS,
     AsJson,
@@ -22,6 +22,7 @@ from malta.cli.options import (
     Feedforward,
     FidelityName,
     GainFile,
+    MachineFile,
     OwnOptions,
     ProfileName,
     Quantize,
@@ -86,6 +87,7 @@ def campaign(
         Path | None,
         typer.Option(help="Folder of blocks and figures. [build/campaigns/, one for each campaign]"),
     ] = None,
+    machine: MachineFile = None,
     as_json: AsJson = False,
 ) -> None:
     """Simulate many machines that differ, each with noise of its own: the yield, and what goes wrong where.
@@ -96,15 +98,14 @@ def campaign(
     \b
     Example:  malta campaign design/gains/calibrated.json --samples 10000 --spread 20%
     """
-    from malta import gains as gain_files
     from malta.campaigns.campaign import campaign as run_campaign
     from malta.campaigns.plan import Plan
-    from malta.model.data import plant_of, units_of
+    from malta.model.data import plant_of, published_figures, units_of
     from malta.simulation.experiments import main_job
 
-    controller = gain_files.read(gains)
-    machine = change_machine(controller.parameters, change)
-    plant = plant_of(machine)
+    controller = read_controller(gains, machine)
+    parameters = change_machine(controller.parameters, change)
+    plant = plant_of(parameters)
     if scenario == "help":
         print_scenarios(plant, campaigns=True)
         raise typer.Exit
@@ -129,12 +130,12 @@ def campaign(
     plan = Plan(
         controller,
         scenario,
-        read_shares(gains, spread, units_of(machine), published),
+        read_shares(gains, spread, units_of(parameters), published),
         read_sensor_errors(sensor, plant),
         samples,
         seed,
         cast("Sampler", sampler),
-        machine,
+        parameters,
         case,
         options,
     )

@@ -7,11 +7,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from malta.cli.options import AsJson
+from malta.cli.inputs import read_controller
+from malta.cli.options import AsJson, MachineFile
 from malta.cli.output import make_console, print_json, print_note
 
 if TYPE_CHECKING:
     from malta.margins.verify import CurrentLoops
+    from malta.synthesis.controller import Controller
 
 
 def check(
@@ -20,6 +22,7 @@ def check(
         Path | None,
         typer.Option(metavar="GAINS", help="The gain file that it has to be of, to the last digit."),
     ] = None,
+    machine: MachineFile = None,
     as_json: AsJson = False,
 ) -> None:
     """Check the proof of a margin, in arithmetic with rigorous bounds and without the code that found it.
@@ -31,7 +34,7 @@ def check(
 
     verdict = check_certificate(file, gains)
     failures = list(verdict.failures)
-    if gains is not None and not failures and not _matches_gains(file, gains):
+    if gains is not None and not failures and not _matches_gains(file, read_controller(gains, machine)):
         failures.append(f"the loops are not those of {gains}")
     if as_json:
         claim = {"file": str(file), "holds": not failures, "lower": verdict.claim}
@@ -48,15 +51,13 @@ def check(
     raise typer.Exit(1 if failures else 0)
 
 
-def _matches_gains(certificate: Path, gains: Path) -> bool:
+def _matches_gains(certificate: Path, controller: Controller) -> bool:
     """Whether a certificate's loops are those of a gain file, with either kind of current loops."""
-    from malta import gains as gain_files
     from malta.margins import checked_file
     from malta.margins.certificate import matches
     from malta.margins.verify import travel_loops
     from malta.model.data import plant_of
 
-    controller = gain_files.read(gains)
     plant = plant_of(controller.parameters)
     parameters = (entry["name"] for entry in checked_file.content_of(certificate)["parameters"])
     names = tuple(name for name in parameters if name != plant.stroke)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from malta.cli.documents import experiment_document, margins_document
-from malta.cli.inputs import design_files
+from malta.cli.inputs import design_files, gains_folder
 from malta.cli.options import AsJson
 from malta.cli.output import make_console, print_error, print_json, print_written, track_files
 from malta.errors import CheckError, InputError
@@ -42,7 +42,7 @@ def design(
     code = 0
     for file in track_files(design_files("design", files), "designing", quiet=as_json):
         try:
-            folder = out or file.parent / "gains"
+            folder = out or gains_folder(file)
             documents.append(_run_design(file, folder, figures, sources, quiet=as_json))
         except (InputError, CheckError) as error:
             code = max(code, print_error(error, file))
@@ -62,7 +62,7 @@ def _run_design(
     from malta import gains, report
     from malta.margins.verify import require_stable
     from malta.margins.verify import verify as compute_margins
-    from malta.model.data import published as read_published
+    from malta.model.data import published_beside
     from malta.model.linearize import linearize
     from malta.simulation.experiments import main_job
     from malta.synthesis.lqg import synthesize
@@ -80,14 +80,18 @@ def _run_design(
     margins = compute_margins(model, controller, spec.uncertainty)
     require_stable(margins, str(file))
     result = _simulate_gain_file(file, spec, controller, margins, job)
-    published = read_published(spec.machine_file)
+    published = published_beside(spec.machine_file)
     page = report.design_page(spec, model, margins, result, published)
     report.experiment(result, picture, published)
-    gains.write(controller, margins, *paths)  # last: whatever fails before leaves the old files
+    unchanged = gains.agrees(controller, margins, *paths)
+    if not unchanged:
+        gains.write(controller, margins, *paths)  # last: whatever fails before leaves the old files
     if not quiet:
         console = make_console()
         console.print(page)
-        print_written(console, (*paths, picture))
+        if unchanged:
+            console.print(f"{paths[0]}: holds these numbers already; left as it is", soft_wrap=True)
+        print_written(console, (picture,) if unchanged else (*paths, picture))
         console.print()
     written = {"design": spec.name, "files": [str(path) for path in (*paths, picture)]}
     return written | margins_document(margins) | experiment_document(result)

@@ -3,27 +3,54 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from malta.cli.assignments import read_assignments
-from malta.cli.output import make_console, print_note
+from malta.cli.output import make_console
 from malta.errors import CheckError, InputError
+from malta.files import located, shipped
 
 if TYPE_CHECKING:
     from malta.model.plant import Parameters, Plant
+    from malta.synthesis.controller import Controller
 
 
 def design_files(command: str, named: list[Path] | None, *, reverse: bool = False) -> list[Path]:
     """The design files that were named, or all of design/ in alphabetical or reverse order.
 
+    Without a folder design/ here they are those that come with malta.
+
     Raises InputError, naming the command, where design/ has none.
     """
-    files = named or sorted(Path("design").glob("*.toml"), reverse=reverse)
+    folder = Path("design")
+    files = named or sorted(
+        (folder if folder.is_dir() else shipped("design")).glob("*.toml"), reverse=reverse
+    )
     if not files:
         raise InputError(
             command, "", "no design files (*.toml) here", "a folder design/ with some, or their names"
         )
     return files
+
+
+def gains_folder(design_file: Path) -> Path:
+    """Where the gain files of a design go: gains/ beside it; design/gains/ here, where it comes with malta."""
+    own = shipped("design").resolve()
+    inside = own in located(design_file).resolve().parents
+    return Path("design", "gains") if inside else design_file.parent / "gains"
+
+
+def read_controller(gains: Path, machine_file: Path | None) -> Controller:
+    """Read a gain file. `machine_file` models the machine that it names, where that is the user's own.
+
+    Raises InputError as `malta.machine` and `gains.read`; an unknown machine is named with the option that tells it.
+    """
+    from malta import gains as gain_files
+    from malta.model.machines import machine
+
+    if machine_file is not None:
+        machine(machine_file)
+    return gain_files.read(gains)
 
 
 def change_machine(parameters: Parameters, changes: list[str] | None) -> Parameters:
@@ -47,21 +74,9 @@ def change_machine(parameters: Parameters, changes: list[str] | None) -> Paramet
     return machine
 
 
-def published_figures(machine: str) -> dict[str, Any] | None:
-    """The figures that a machine's paper prints; None, and a note, where the working folder has no data/ of it."""
-    from malta.model.data import published
-
-    file = Path("data") / f"{machine}.toml"
-    printed = file.parent / "published" / file.name
-    if printed.exists():
-        return published(file)
-    print_note(f"no {printed} here: published figures are left out")
-    return None
-
-
 def print_scenarios(plant: Plant, *, campaigns: bool = False) -> None:
     """Print the scenarios of a machine: all of them, or those that campaigns can run."""
     from malta import report
-    from malta.simulation.experiments import said
+    from malta.simulation.experiments import series_of
 
-    make_console().print(report.scenarios_table(plant, said(plant, "CASES", {}) if campaigns else None))
+    make_console().print(report.scenarios_table(plant, series_of(plant) if campaigns else None))

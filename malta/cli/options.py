@@ -64,3 +64,13 @@ Substeps = Annotated[
 ]
 Seed = Annotated[int | None, typer.Option(help="Seed of the noise. [0]")]
 GainFile = Annotated[Path, typer.Argument(metavar="GAINS", help="A gain file: .json, .npz or .mat.")]
+MachineFile = Annotated[
+    Path | None,
+    typer.Option(
+        "--machine",
+        metavar="FILE",
+        envvar="MALTA_MACHINE",
+        help="The module of a machine of your own, as rotor.py, where a gain file names one.",
+        show_envvar=True,
+    ),
+]

@@ -10,7 +10,7 @@ import typer
 
 from malta.cli.assignments import add_own_options, read_sensor_errors, scenario_options
 from malta.cli.documents import experiment_document
-from malta.cli.inputs import change_machine, print_scenarios, published_figures
+from malta.cli.inputs import change_machine, print_scenarios, read_controller
 from malta.cli.options import (
     SCENARIOS,
     AsJson,
@@ -22,6 +22,7 @@ from malta.cli.options import (
     Feedforward,
     FidelityName,
     GainFile,
+    MachineFile,
     Noise,
     OwnOptions,
     ProfileName,
@@ -91,6 +92,7 @@ def simulate(
             metavar="FOLDER:RUN", help="One run of a campaign again: its machine, sensors and noise."
         ),
     ] = None,
+    machine: MachineFile = None,
     as_json: AsJson = False,
 ) -> None:
     """Simulate the nonlinear machine and its drive with a gain file.
@@ -100,11 +102,10 @@ def simulate(
     \b
     Example:  malta simulate design/gains/calibrated.json --scenario stroke --set m=0.56 --noise 1 --out build
     """
-    from malta import gains as gain_files
-    from malta.model.data import plant_of
+    from malta.model.data import plant_of, published_figures
     from malta.simulation.experiments import experiment, main_job
 
-    controller = gain_files.read(gains)
+    controller = read_controller(gains, machine)
     plant = plant_of(change_machine(controller.parameters, change))
     if scenario == "help":
         print_scenarios(plant)

@@ -11,8 +11,8 @@ import typer
 
 from malta.cli.assignments import read_shares
 from malta.cli.documents import margins_document, robustness_document
-from malta.cli.inputs import change_machine, published_figures
-from malta.cli.options import AsJson, Changes, GainFile
+from malta.cli.inputs import change_machine, read_controller
+from malta.cli.options import AsJson, Changes, GainFile, MachineFile
 from malta.cli.output import make_console, margin_progress, print_json, print_written
 from malta.errors import CheckError, InputError
 
@@ -78,6 +78,7 @@ def verify(
         Path | None, typer.Option(metavar="FILE", help="Write the proof of the margin, for `malta check`.")
     ] = None,
     out: Annotated[Path | None, typer.Option(help="Folder for the figure (.png).")] = None,
+    machine: MachineFile = None,
     as_json: AsJson = False,
 ) -> None:
     """Verify a gain file on the machine, stage by stage.
@@ -92,12 +93,11 @@ def verify(
     \b
     Example:  malta verify design/gains/calibrated.json --set m=0.56
     """
-    from malta import gains as gain_files
     from malta.margins.verify import require_stable
-    from malta.model.data import plant_of, units_of
+    from malta.model.data import plant_of, published_figures, units_of
     from malta.model.linearize import linearize
 
-    controller = gain_files.read(gains)
+    controller = read_controller(gains, machine)
     plant = plant_of(change_machine(controller.parameters, change))
     model = linearize(plant, plant.point(controller.operating_point[0]))
     published = published_figures(plant.name)
