@@ -190,3 +190,11 @@ def designs(_proofs: dict[bytes, malta.Margin]) -> dict[str, Design]:
 def design(request: pytest.FixtureRequest, designs: dict[str, Design]) -> Design:
     """Each shipped design in turn."""
     return designs[request.param]
+
+
+def one_sentence(err: str) -> str:
+    """The one line on standard error, without the name of the program."""
+    assert "Traceback" not in err
+    assert err.startswith("malta: ")
+    assert err.count("\n") == 1
+    return err.removeprefix("malta: ").rstrip("\n")

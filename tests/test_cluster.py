@@ -24,7 +24,7 @@ from malta.campaigns.dask import (
     _at_worker,
     _finished,
     _result,
-    _Task,
+    _task,
     blocks,
 )
 from malta.simulation.batch import Batch
@@ -159,13 +159,13 @@ def test_without_the_extra_it_says_how_to_get_it(plan: Plan, monkeypatch: pytest
 
 
 def test_what_a_worker_does_is_what_is_done_here(plan: Plan) -> None:
-    task = _Task(plan.identity, malta_version(), plan)
+    task = _task(plan, malta_version())
     block = _at_worker(task, 8, 8)
     assert not isinstance(block, str)
     here = fly(plan, 8, 8)
     for name in Batch.__dataclass_fields__:
         assert np.array_equal(getattr(block[1], name), getattr(here.batch, name), equal_nan=True)
-    again = _Task(plan.identity, malta_version(), replace(plan))  # as it comes with the next block
+    again = _task(replace(plan), malta_version())  # as it comes with the next block
     assert cluster._first_copy(again) is cluster._first_copy(task)
 
 
@@ -176,7 +176,7 @@ def malta_version() -> str:
 
 
 def test_what_a_worker_refuses_comes_back_as_a_sentence(plan: Plan, monkeypatch: pytest.MonkeyPatch) -> None:
-    refused = _at_worker(_Task(plan.identity, "9", plan), 0, 8)
+    refused = _at_worker(_task(plan, "9"), 0, 8)
     with pytest.raises(malta.InputError, match=f"a worker: found malta {malta_version()}, expected malta 9"):
         _result(NOBODY, _future(refused))
 
@@ -184,7 +184,7 @@ def test_what_a_worker_refuses_comes_back_as_a_sentence(plan: Plan, monkeypatch:
         raise malta.InputError("campaign", "m", "lead", "iron")
 
     monkeypatch.setattr(sys.modules["malta.campaigns.campaign"], "fly", none)
-    refused = _at_worker(_Task(plan.identity, malta_version(), plan), 0, 8)
+    refused = _at_worker(_task(plan, malta_version()), 0, 8)
     with pytest.raises(malta.InputError, match="campaign: m: found lead, expected iron"):
         _result(NOBODY, _future(refused))
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import pickle
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -12,6 +13,7 @@ from threading import Thread
 from typing import TYPE_CHECKING, Any
 
 from malta.errors import InputError
+from malta.model.machines import load_sources, sources_of
 
 if TYPE_CHECKING:
     from malta.campaigns.plan import Plan
@@ -23,11 +25,16 @@ WAIT = 30.0  # s without any worker, after which the campaign stops
 
 @dataclass(frozen=True)
 class _Task:
-    """A plan on its way to a worker, which keeps the first copy that it is sent."""
+    """A plan on its way to a worker, which keeps the first copy that it is sent.
+
+    A machine of the user's own goes along as the text of its modules: the worker has no file of it.
+    """
 
     identity: str
     version: str  # of malta
-    plan: Plan = field(compare=False)
+    machine: str
+    sources: Mapping[str, str] = field(compare=False)  # of the machine's modules, by their names
+    plan: bytes = field(compare=False)  # pickled: it can be read once the machine is there
 
 
 def blocks(address: str, plan: Plan, left: Mapping[int, int]) -> Iterator[tuple[int, Block]]:
@@ -55,7 +62,7 @@ def blocks(address: str, plan: Plan, left: Mapping[int, int]) -> Iterator[tuple[
 def _finished(
     dask: Any, client: Any, address: str, plan: Plan, left: Mapping[int, int]
 ) -> Iterator[tuple[int, Block]]:
-    task = _Task(plan.identity, version("malta"), plan)
+    task = _task(plan, version("malta"))
     waiting = {client.submit(_at_worker, task, *part, pure=False): part[0] for part in left.items()}
     alone = 0.0  # s
     while waiting:
@@ -73,6 +80,11 @@ def _finished(
             ) from error
         for future in done:
             yield waiting.pop(future), _result(address, future)
+
+
+def _task(plan: Plan, malta: str) -> _Task:
+    name = plan.plant.name
+    return _Task(plan.identity, malta, name, sources_of(name), pickle.dumps(plan))
 
 
 AGAIN = "the same command once more: it goes on with what is left"
@@ -151,5 +163,8 @@ def _at_worker(task: _Task, first: int, count: int) -> Block | tuple[str, str, s
 
 @lru_cache(maxsize=4)
 def _first_copy(task: _Task) -> Plan:
-    """What is computed once a plan, its machines and its scenario, is kept by the plan's place in memory."""
-    return task.plan
+    """The plan, read once: what is computed for its machines and its scenario is kept by its place in memory."""
+    if task.sources:
+        load_sources(task.machine, task.sources)
+    plan: Plan = pickle.loads(task.plan)
+    return plan

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from malta.cli.assignments import read_assignments
 from malta.cli.output import make_console
 from malta.errors import CheckError, InputError
-from malta.files import located, shipped
+from malta.files import located
 
 if TYPE_CHECKING:
     from malta.model.plant import Parameters, Plant
@@ -18,14 +18,9 @@ if TYPE_CHECKING:
 def design_files(command: str, named: list[Path] | None, *, reverse: bool = False) -> list[Path]:
     """The design files that were named, or all of design/ in alphabetical or reverse order.
 
-    Without a folder design/ here they are those that come with malta.
-
     Raises InputError, naming the command, where design/ has none.
     """
-    folder = Path("design")
-    files = named or sorted(
-        (folder if folder.is_dir() else shipped("design")).glob("*.toml"), reverse=reverse
-    )
+    files = named or sorted(Path("design").glob("*.toml"), reverse=reverse)
     if not files:
         raise InputError(
             command, "", "no design files (*.toml) here", "a folder design/ with some, or their names"
@@ -35,9 +30,7 @@ def design_files(command: str, named: list[Path] | None, *, reverse: bool = Fals
 
 def gains_folder(design_file: Path) -> Path:
     """Where the gain files of a design go: gains/ beside it; design/gains/ here, where it comes with malta."""
-    own = shipped("design").resolve()
-    inside = own in located(design_file).resolve().parents
-    return Path("design", "gains") if inside else design_file.parent / "gains"
+    return design_file.parent / "gains" if located(design_file) == design_file else Path("design", "gains")
 
 
 def read_controller(gains: Path, machine_file: Path | None) -> Controller:

@@ -26,7 +26,7 @@ from pydantic import Field as Checked
 from malta.errors import InputError
 from malta.files import located, read_file, shipped
 from malta.model.checks import check_plant
-from malta.model.machines import file_of, machine, machine_names
+from malta.model.machines import file_of, machine, machine_names, name_of
 
 if TYPE_CHECKING:
     from malta.model.plant import Parameters, Plant
@@ -309,6 +309,9 @@ def _plant_of(parameters: Any) -> Plant:
     if build is None:
         raise InputError(module.__name__, "plant", "nothing", "a function of Parameters -> Plant beside them")
     plant = build(parameters)
+    name = name_of(module)
+    if file_of(name) is not None and plant.name != name:
+        raise InputError(f"{name}.py", "plant: name", repr(plant.name), f"{name!r}, as the file is called")
     check_plant(plant)
     return plant
 

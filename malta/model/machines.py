@@ -13,8 +13,12 @@ of the module itself, or of the modules `experiments`, `figures`, `claims`, `req
 
 from __future__ import annotations
 
+import atexit
 import re
+import shutil
 import sys
+import tempfile
+from collections.abc import Mapping
 from functools import cache
 from importlib import import_module
 from importlib.metadata import entry_points
@@ -77,6 +81,29 @@ def machine_names() -> list[str]:
 def file_of(name: str) -> Path | None:
     """The file of a machine that the user named by it."""
     return _files.get(name)
+
+
+def sources_of(name: str) -> dict[str, str]:
+    """The text of the modules that a machine of the user's own was loaded from, by their names; none for others."""
+    if name not in _files:
+        return {}
+    own = f"{FILES}.{name}"
+    modules = {key: module for key, module in sys.modules.items() if key == own or key.startswith(own + ".")}
+    paths = {key: getattr(module, "__file__", None) for key, module in modules.items()}
+    return {key: Path(path).read_text(encoding="utf-8") for key, path in paths.items() if path}
+
+
+def load_sources(name: str, sources: Mapping[str, str]) -> ModuleType:
+    """The module of a machine from the text of its modules, as `sources_of` gives them, where there are no files."""
+    own = f"{FILES}.{name}"
+    if own in sys.modules:
+        return sys.modules[own]
+    sys.modules.setdefault(FILES, ModuleType(FILES))
+    folder = Path(tempfile.mkdtemp(prefix="malta-machine-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    for key, text in sources.items():
+        (folder / f"{key.rpartition('.')[2]}.py").write_text(text, encoding="utf-8")
+    return machine(folder / f"{name}.py")
 
 
 def part_of(part: Part, name: str) -> ModuleType | None:

@@ -1,0 +1,60 @@
+"""A steel sphere between two electromagnets: one axis, open-loop unstable.
+
+    m q'' = f + w - m g        f = C ((I_0 + i)^2 / (s - q)^2 - (I_0 - i)^2 / (s + q)^2)
+q points up from the middle, s is the gap there; the controller adds i to the bias current I_0 of the upper magnet and
+takes it from the lower one: f = k_i i + k_s q about the middle, and the force command f takes i = f / k_i.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+
+from malta.model.data import check_parameters, si
+from malta.model.plant import Actuator, Plant, Signal
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """SI; ball.toml says where each comes from."""
+
+    m: float = si("kg", above=0)  # sphere
+    C: float = si("N m^2/A^2", above=0)  # constant of each magnet
+    s: float = si("m", above=0)  # gap in the middle
+    I_0: float = si("A", above=0)  # bias current
+    g: float = si("m/s^2", at_least=0)
+    I_max: float = si("A", above=0)  # limit of i, either way
+    T_d: float = si("s", at_least=0, shapes=True)  # from measurement to force
+    q_max: float = si("m", above=0)  # clearance, either way
+    s_y: float = si("m", at_least=0)  # noise of the sensor, rms of a sample
+    preset: str = "custom"
+
+    def __post_init__(self) -> None:
+        check_parameters(self, "ball.Parameters")
+
+
+def plant(par: Parameters) -> Plant:
+    """The sphere with its magnets and its sensor."""
+    k_i = 4 * par.C * par.I_0 / par.s**2  # N/A
+    return Plant(
+        name="ball",
+        parameters=par,
+        variant=plant,
+        states=(Signal("q", "m"), Signal("q_dot", "m/s")),
+        inputs=(Signal("f", "N"),),
+        outputs=(Signal("y", "m"),),
+        disturbances=(Signal("w", "N"),),
+        f=lambda x, u, w: ca.vertcat(x[1], (u + w) / par.m),
+        h=lambda x, _: x[0],
+        load=lambda _: -par.m * par.g,
+        forces=lambda x, i: magnets(par, x[0], i),
+        actuator=Actuator((Signal("i", "A"),), (k_i,), current_limit=par.I_max, dead_time=par.T_d),
+        contacts=("stop",),
+        contact=lambda x: ca.fabs(x[0]) / par.q_max,
+        noise=(par.s_y,),
+    )
+
+
+def magnets(par: Parameters, q: Any, i: Any) -> Any:
+    """The force of both magnets, N, upwards."""
+    return par.C * (((par.I_0 + i) / (par.s - q)) ** 2 - ((par.I_0 - i) / (par.s + q)) ** 2)

@@ -1,0 +1,174 @@
+"""A machine of one's own, from its own folder, by every way in; and every wrong one in a sentence."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from conftest import ROOT, one_sentence
+
+import malta
+from malta.model import machines
+
+if TYPE_CHECKING:
+    from conftest import Run
+
+BALL = ROOT / "examples" / "ball"
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, run: Run) -> Iterator[Path]:
+    """A machine `lev`, as `malta new` writes it; forgotten afterwards."""
+    monkeypatch.chdir(tmp_path)
+    assert run("new", "lev")[0] == 0
+    monkeypatch.chdir(tmp_path / "lev")
+    yield tmp_path / "lev"
+    forget()
+
+
+def forget() -> None:
+    """Leave no machine of a file behind."""
+    machines._files.clear()
+    for name in [name for name in sys.modules if name.startswith(machines.FILES)]:
+        del sys.modules[name]
+
+
+@pytest.mark.usefixtures("folder")
+def test_new_writes_a_folder_that_runs_at_once(run: Run) -> None:
+    """Designed, verified, flown and flown many times by the command line."""
+    code, out, err = run("design")
+    assert (code, err) == (0, "")
+    forget()
+    gains = "design/gains/lev.json"
+    code, _, err = run("verify", gains)
+    assert code == 2
+    assert one_sentence(err).endswith("or its file by --machine lev.py")
+    code, out, err = run("verify", gains, "--machine", "lev.py", "--no-worst-case")
+    assert (code, err) == (0, "")
+    proven = re.search(r"sampled +([\d.]+) % +([\d.]+) %", out)
+    assert proven is not None
+    assert 300 < float(proven[1]) <= float(proven[2]) < 330
+    code, out, err = run("simulate", gains, "--scenario", "disturbance", "--option", "size=0.1")
+    assert (code, err) == (0, "")
+    assert "y moves by" in out
+    code, out, err = run("campaign", gains, "--samples", "8", "--scenario", "hold", "--out", "c")
+    assert (code, err) == (0, "")
+    assert "100.0" in out
+
+
+def test_the_module_has_at_most_60_lines(folder: Path) -> None:
+    assert len((folder / "lev.py").read_text(encoding="utf-8").splitlines()) <= 60
+    assert not [path for path in folder.rglob("*") if "ball" in path.name]
+
+
+def test_new_refuses_what_would_harm(folder: Path, run: Run) -> None:
+    for name, found in (("tubular", "'tubular'"), ("Bad-Name", "'Bad-Name'"), ("lev", "'lev'")):
+        code, _, err = run("new", name)
+        assert code == 2 or name == "lev"
+        assert found in err or name == "lev"
+    (folder / "other").mkdir()
+    code, _, err = run("new", "other")
+    assert (code, list((folder / "other").iterdir())) == (2, [])
+    assert one_sentence(err).startswith("other: found a file or folder of that name")
+
+
+def test_a_record_finds_its_own_plant(folder: Path) -> None:
+    """In Python: the module by its file, the plant by its record, the gain file by the name that is known then."""
+    module = malta.machine(folder / "lev.py")
+    assert malta.machine(folder / "lev.py") is module
+    par = malta.read(folder / "lev.toml")
+    assert isinstance(par, module.Parameters)
+    plant = malta.plant_of(par)
+    assert (plant.name, plant.has_stroke, plant.contacts) == ("lev", False, ("stop",))
+    spec = malta.read_design(folder / "design" / "lev.toml")
+    model = malta.linearize(plant, plant.at())
+    controller = malta.synthesize(spec, model)
+    malta.gains.write(controller, malta.verify(model, controller), folder / "lev.json")
+    again = malta.gains.read(folder / "lev.json")
+    np.testing.assert_array_equal(again.K, controller.K)
+
+
+WRONG = {
+    "does not import": (
+        "import casadi as ca",
+        "import nothing_of_that_name",
+        "ModuleNotFoundError: No module named",
+    ),
+    "a syntax error": ("def plant(", "def plant((", "SyntaxError"),
+    "no Parameters": ("class Parameters:", "class Values:", "found"),
+    "no plant": ("def plant(", "def machine(", "plant: found nothing, expected a function"),
+    "f of a wrong size": ("ca.vertcat(x[1], (u + w) / par.m)", "u / par.m", "f: found 1 entries, expected 2"),
+    "f that fails": ("(u + w) / par.m", "(u + w) / par.mass", "f: found AttributeError"),
+    "another name": ('name="lev"', 'name="other"', "name: found 'other', expected 'lev'"),
+    "twins": (
+        'Signal("q_dot", "m/s")',
+        'Signal("q", "m/s")',
+        "states: found q q, expected names that differ",
+    ),
+}
+
+
+@pytest.mark.parametrize("wrong", WRONG)
+def test_a_wrong_module_is_one_sentence(folder: Path, run: Run, wrong: str) -> None:
+    old, new, expected = WRONG[wrong]
+    file = folder / "lev.py"
+    text = file.read_text(encoding="utf-8")
+    assert old in text
+    file.write_text(text.replace(old, new), encoding="utf-8")
+    code, out, err = run("design", "design/lev.toml")
+    assert (code, out) == (2, "")
+    assert expected in one_sentence(err)
+    assert not (folder / "design" / "gains").exists()
+
+
+def test_wrong_data_is_one_sentence(folder: Path, run: Run) -> None:
+    file = folder / "lev.toml"
+    text = file.read_text(encoding="utf-8")
+    for old, new, expected in (
+        ("I_max ", "I_min ", "parameters.I_min: found an unknown parameter"),
+        ('machine = "lev.py"', 'machine = "lost.py"', "lost.py: found no such file"),
+        ('machine = "lev.py"', 'machine = "lost"', "machine: found 'lost', expected one of"),
+    ):
+        file.write_text(text.replace(old, new), encoding="utf-8")
+        code, out, err = run("design", "design/lev.toml")
+        assert (code, out) == (2, "")
+        assert expected in one_sentence(err)
+
+
+def test_a_gain_file_runs_no_code_that_was_not_named(folder: Path, run: Run) -> None:
+    """Beside a module of the machine's name, in the folder that the command runs in."""
+    assert run("design", "design/lev.toml")[0] == 0
+    forget()
+    (folder / "lev.py").write_text("raise SystemExit('run')", encoding="utf-8")
+    with pytest.raises(
+        malta.InputError, match=r"plant.name: found 'lev', expected one of .*--machine lev.py"
+    ):
+        malta.gains.read("design/gains/lev.json")
+
+
+def test_another_machine_of_the_same_name_is_refused(folder: Path, tmp_path: Path) -> None:
+    malta.machine(folder / "lev.py")
+    shutil.copy(folder / "lev.py", tmp_path / "lev.py")
+    with pytest.raises(malta.InputError, match="a second machine 'lev'"):
+        malta.machine(tmp_path / "lev.py")
+    shutil.copy(folder / "lev.py", tmp_path / "tubular.py")
+    with pytest.raises(malta.InputError, match="a second machine 'tubular'"):
+        malta.machine(tmp_path / "tubular.py")
+
+
+def test_the_text_of_a_machine_goes_to_a_worker(folder: Path) -> None:
+    """Loaded from the text of its module where there is no file: the same plant."""
+    malta.machine(folder / "lev.py")
+    text = machines.sources_of("lev")
+    assert list(text) == [f"{machines.FILES}.lev"]
+    forget()
+    shutil.rmtree(folder)
+    module = machines.load_sources("lev", text)
+    assert module.plant.__module__ == f"{machines.FILES}.lev"
+    assert machines.sources_of("tubular") == {}
