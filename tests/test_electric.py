@@ -16,8 +16,8 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 import malta
-from malta.model import electric
-from malta.model.electric import (
+from malta.machines.tubular import windings
+from malta.machines.tubular.windings import (
     AXES,
     K_L,
     K_R,
@@ -28,6 +28,7 @@ from malta.model.electric import (
     to_axes,
     to_phases,
 )
+from malta.simulation import inverter
 from malta.synthesis.lqg import pi_current_loop
 
 if TYPE_CHECKING:
@@ -59,7 +60,7 @@ def _moving(z: float, z_dot: float = 0.0) -> Any:
 
 
 def _hall(z: float, x: Any = (0.0, 0.0), y: Any = (0.0, 0.0), errors: Any = (0.0, 0.0, 0.0)) -> float:
-    return float(electric.hall_position(z, x, y, 15e-3, errors))
+    return float(windings.hall_position(z, x, y, 15e-3, errors))
 
 
 # The transformation (16)
@@ -150,7 +151,7 @@ def test_magnitude_and_angle_give_the_currents_of_the_fixed_axes(
     f_x: float, f_y: float, drive: float, theta: float
 ) -> None:
     """At any force but zero: i_bd (cos phi, sin phi) = (f_x, f_y) / K_B, and the same nine currents."""
-    i_bd, phi = electric.magnitude_and_angle(f_x, f_y, 5.2, phi_before=1.0)
+    i_bd, phi = windings.magnitude_and_angle(f_x, f_y, 5.2, phi_before=1.0)
     assert [i_bd * math.cos(phi), i_bd * math.sin(phi)] == pytest.approx([f_x / 5.2, f_y / 5.2], abs=1e-12)
     X_dq = np.array([[0, drive], [i_bd, 0]])
     printed = _array(K_R_inverse(phi)) @ X_dq @ _array(K_L_inverse(theta))
@@ -160,9 +161,9 @@ def test_magnitude_and_angle_give_the_currents_of_the_fixed_axes(
 
 def test_the_angle_jumps_by_pi_through_zero_where_it_is_undefined() -> None:
     """One nanonewton to the other side: the currents hardly change, the angle by half a turn. At zero it stays."""
-    before, phi_before = electric.magnitude_and_angle(0.6e-9, 0.8e-9, 5.2)
-    zero, phi_zero = electric.magnitude_and_angle(0.0, 0.0, 5.2, phi_before)
-    after, phi_after = electric.magnitude_and_angle(-0.6e-9, -0.8e-9, 5.2, phi_zero)
+    before, phi_before = windings.magnitude_and_angle(0.6e-9, 0.8e-9, 5.2)
+    zero, phi_zero = windings.magnitude_and_angle(0.0, 0.0, 5.2, phi_before)
+    after, phi_after = windings.magnitude_and_angle(-0.6e-9, -0.8e-9, 5.2, phi_zero)
     assert before == pytest.approx(after, rel=1e-12) == pytest.approx(1e-9 / 5.2)
     assert (zero, phi_zero) == (0.0, phi_before)
     assert abs(phi_after - phi_before) == pytest.approx(math.pi)
@@ -222,12 +223,12 @@ def test_crossover_and_phase_margin_are_found_on_the_loop(
     """Sec. IV-B: 3000 rad/s and 60 degrees, where |loop| passes 1, of the gains rounded as printed in model.md."""
 
     def size(w: float) -> float:
-        return float(abs(electric.open_loop_gain(plant.actuator, *gains, delay, np.array([w]))[0])) - 1
+        return float(abs(inverter.open_loop_gain(plant.actuator, *gains, delay, np.array([w]))[0])) - 1
 
     crossover = brentq(size, 1.0, 1e5)
     asked = published["current_controller"]
     assert crossover == pytest.approx(asked["crossover"]["value"], rel=2e-4)
-    phase = np.angle(electric.open_loop_gain(plant.actuator, *gains, delay, np.array([crossover])))[0]
+    phase = np.angle(inverter.open_loop_gain(plant.actuator, *gains, delay, np.array([crossover])))[0]
     assert 180 + math.degrees(phase) == pytest.approx(asked["phase_margin"]["value"], abs=0.02)
     assert gains == pytest.approx(pi_current_loop(plant.actuator, delay), rel=1e-4)
 
@@ -262,7 +263,7 @@ def test_the_sampled_current_loop_keeps_the_design(plant: Plant) -> None:
 def _link_after(plant: Plant, power: Callable[[float], float], seconds: float) -> float:
     """Link voltage after this course of the power, from the supply's."""
     run = solve_ivp(
-        lambda t, V: [float(electric.link_slope(plant.drive, V[0], power(t)))],
+        lambda t, V: [float(inverter.link_slope(plant.drive, V[0], power(t)))],
         (0, seconds),
         [plant.drive.link_voltage],
         "Radau",
@@ -279,7 +280,7 @@ def test_braking_from_5_m_per_s_lifts_the_link_by_1_12_volts(
     said = published["dc_link"]
     energy = par.m / 2 * said["speed"]["value"] ** 2
     assert energy == pytest.approx(4.5)
-    rise = electric.link_voltage(par.V_dc, par.C_dc, energy) - par.V_dc
+    rise = inverter.link_voltage(par.V_dc, par.C_dc, energy) - par.V_dc
     assert rise == pytest.approx(said["rise"]["value"], abs=0.005)
     assert rise / par.V_dc == pytest.approx(0.025, abs=5e-4)  # "around 2.5 %"
 
@@ -290,7 +291,7 @@ def test_the_links_slope_keeps_the_energy(par: tubular.Parameters, plant: Plant)
     def braking(t: float) -> float:
         return -4.5 / 20e-3 * (1 + math.sin(2 * math.pi * t / 20e-3))
 
-    expected = electric.link_voltage(par.V_dc, par.C_dc, 4.5)
+    expected = inverter.link_voltage(par.V_dc, par.C_dc, 4.5)
     assert _link_after(plant, braking, 20e-3) == pytest.approx(expected, abs=1e-8)
 
 
@@ -298,7 +299,7 @@ def test_the_links_slope_keeps_the_energy(par: tubular.Parameters, plant: Plant)
 def test_the_supply_gives_and_never_takes_back(plant: Plant, V: float, power: float) -> None:
     """C V V' = V (45 V - V) / R_dc - power below 45 V, and -power above."""
     drive = plant.drive
-    stored = drive.link_capacitance * V * float(electric.link_slope(drive, V, power))
+    stored = drive.link_capacitance * V * float(inverter.link_slope(drive, V, power))
     supplied = V * (drive.link_voltage - V) / drive.supply_resistance if drive.link_voltage > V else 0.0
     assert stored == pytest.approx(supplied - power, rel=1e-9, abs=1e-7)
     assert stored + power >= -1e-7
@@ -320,7 +321,7 @@ def test_duty_cycles_are_half_plus_u_over_V_within_0_and_1(
     plant: Plant, u: list[float], i: list[float], V: float
 ) -> None:
     d, limited = (
-        _flat(value) for value in electric.duty_cycles(plant.drive, ca.DM(u), V, ca.DM(i), real_pwm=False)
+        _flat(value) for value in inverter.duty_cycles(plant.drive, ca.DM(u), V, ca.DM(i), real_pwm=False)
     )
     asked = np.array(u)
     np.testing.assert_allclose((d - 0.5) * V, np.clip(asked, -V / 2, V / 2), rtol=0, atol=1e-12)
@@ -333,8 +334,8 @@ def test_real_duty_cycles_come_in_steps_and_lose_dead_time(
 ) -> None:
     """Steps of 1/1000 (100 kHz of a 100 MHz clock), rounded to the nearest; 20 ns of each 10 us against the current."""
     drive = plant.drive
-    ideal, _ = electric.duty_cycles(drive, ca.DM(u), V, ca.DM(i), real_pwm=False)
-    d, _ = electric.duty_cycles(drive, ca.DM(u), V, ca.DM(i), real_pwm=True)
+    ideal, _ = inverter.duty_cycles(drive, ca.DM(u), V, ca.DM(i), real_pwm=False)
+    d, _ = inverter.duty_cycles(drive, ca.DM(u), V, ca.DM(i), real_pwm=True)
     assert (drive.pwm_step, drive.dead_share) == pytest.approx((1e-3, 2e-3))
     counted = _flat(d) + 2e-3 * np.sign(i)
     inside = (_flat(ideal) > 2e-3) & (_flat(ideal) < 1 - 2e-3)
@@ -345,7 +346,7 @@ def test_real_duty_cycles_come_in_steps_and_lose_dead_time(
 @given(u=EIGHTEEN, i=EIGHTEEN)
 def test_a_half_bridge_makes_no_more_than_its_link(plant: Plant, u: list[float], i: list[float]) -> None:
     """A half-bridge that no longer switches has no dead time: its duty cycle stays between 0 and 1."""
-    d, _ = electric.duty_cycles(plant.drive, ca.DM(u), 45.0, ca.DM(i), real_pwm=True)
+    d, _ = inverter.duty_cycles(plant.drive, ca.DM(u), 45.0, ca.DM(i), real_pwm=True)
     assert _flat(d).min() >= 0
     assert _flat(d).max() <= 1
 
@@ -353,14 +354,14 @@ def test_a_half_bridge_makes_no_more_than_its_link(plant: Plant, u: list[float],
 def test_dead_time_costs_90_millivolts(plant: Plant) -> None:
     """20 ns of 10 us at 45 V, against the current, and nothing without current."""
     u, i = np.zeros(18), np.array([1.0, -1.0, 0.0] * 6)
-    d, _ = electric.duty_cycles(plant.drive, ca.DM(u), 45.0, ca.DM(i), real_pwm=True)
+    d, _ = inverter.duty_cycles(plant.drive, ca.DM(u), 45.0, ca.DM(i), real_pwm=True)
     assert (_flat(d) - 0.5) * 45 == pytest.approx([-0.09, 0.09, 0.0] * 6, abs=1e-12)
 
 
 @given(u=TWELVE, V=st.floats(5, 60))
 def test_modulation_keeps_the_direction_of_each_module(plant: Plant, u: list[float], V: float) -> None:
     """A module that fits is left alone; one that does not is scaled until its bound is V/2, and says so."""
-    m, limited = (_flat(value) for value in electric.modulation(plant.drive, ca.DM(u), V))
+    m, limited = (_flat(value) for value in inverter.modulation(plant.drive, ca.DM(u), V))
     asked = np.array(u)
     peaks = _flat(plant.drive.peak(ca.DM(u)))
     for group, peak in zip(plant.drive.groups, peaks, strict=True):
@@ -374,7 +375,7 @@ def test_modulation_keeps_the_direction_of_each_module(plant: Plant, u: list[flo
 def test_no_phase_is_asked_for_more_than_half_the_link(
     plant: Plant, u: list[float], V: float, z: float
 ) -> None:
-    m, _ = electric.modulation(plant.drive, ca.DM(u), V)
+    m, _ = inverter.modulation(plant.drive, ca.DM(u), V)
     phases = _array(plant.drive.to_phases(_moving(z))) @ _flat(m) * V
     assert np.abs(phases).max() <= V / 2 * (1 + 1e-12)
 
@@ -393,7 +394,7 @@ def test_the_bound_of_a_module_is_reached(plant: Plant) -> None:
 @given(drop=EIGHTEEN)
 def test_star_points_float(plant: Plant, drop: list[float]) -> None:
     """Each star's voltages, less those of its star point, add to zero and differ as they did."""
-    net = _flat(electric.phase_voltages(plant.drive, ca.DM(drop), ca.DM.ones(18))).reshape(6, 3)
+    net = _flat(inverter.phase_voltages(plant.drive, ca.DM(drop), ca.DM.ones(18))).reshape(6, 3)
     stars = np.reshape(drop, (6, 3))
     assert plant.drive.stars == tuple(tuple(range(k, k + 3)) for k in range(0, 18, 3))
     np.testing.assert_allclose(net.sum(axis=1), 0, atol=1e-12)
@@ -404,12 +405,12 @@ def test_star_points_float(plant: Plant, drop: list[float]) -> None:
 def test_two_phases_of_an_open_star_are_in_series(plant: Plant, drop: list[float], opened: int) -> None:
     closed = np.ones(18)
     closed[opened] = 0
-    net = _flat(electric.phase_voltages(plant.drive, ca.DM(drop), ca.DM(closed)))
+    net = _flat(inverter.phase_voltages(plant.drive, ca.DM(drop), ca.DM(closed)))
     star = opened // 3
     a, b = (k for k in range(3 * star, 3 * star + 3) if k != opened)
     assert net[opened] == 0
     assert net[[a, b]] == pytest.approx([(drop[a] - drop[b]) / 2, (drop[b] - drop[a]) / 2], abs=1e-12)
-    whole = _flat(electric.phase_voltages(plant.drive, ca.DM(drop), ca.DM.ones(18)))
+    whole = _flat(inverter.phase_voltages(plant.drive, ca.DM(drop), ca.DM.ones(18)))
     others = [k for k in range(18) if k // 3 != star]
     assert np.array_equal(net[others], whole[others])
 
@@ -419,7 +420,7 @@ def test_a_star_with_less_than_two_phases_carries_nothing(plant: Plant) -> None:
         closed = np.ones(18)
         closed[:3] = 0
         closed[left] = 1
-        net = _flat(electric.phase_voltages(plant.drive, ca.DM(np.arange(18.0)), ca.DM(closed)))
+        net = _flat(inverter.phase_voltages(plant.drive, ca.DM(np.arange(18.0)), ca.DM(closed)))
         assert not net[:3].any()
 
 

@@ -16,7 +16,6 @@ from hypothesis import strategies as st
 import malta
 from malta import references
 from malta.machines.tubular import plant as tubular
-from malta.model import electric
 from malta.simulation import period as machine
 from malta.simulation.references import Motion
 from malta.simulation.simulate import (

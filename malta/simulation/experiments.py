@@ -18,6 +18,7 @@ and, where they differ from the defaults,
     check         (experiment, option, value): raises InputError for a value that the experiment does not stand
     WORDS         what the machine calls its "stroke" and "thrust", and by unit ("m", "rad", "N", "N m") its other
                   outputs and inputs; without a word the names of the signals are used
+    RISE          s, 10-90 %, of a stroke that says nothing else
     STROKE_UNIT   what deviations along the stroke are shown in, if not in um
     bounds        (scenario, options) -> what the paper prints of this very scenario, as keys of data/published/:
                   "rise" and "overshoot" of the stroke, largest deviations "stroke" along it, "m" and "rad" else

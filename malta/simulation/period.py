@@ -31,7 +31,6 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 import casadi as ca
 import numpy as np
 
-from malta.model import electric
 from malta.model.data import (
     plant_of,
     shaping,
@@ -39,6 +38,7 @@ from malta.model.data import (
     units_of,
 )
 from malta.model.plant import Electronics, Plant, symbolic
+from malta.simulation import inverter
 from malta.synthesis.controller import (
     Controller,
     CurrentLoop,
@@ -443,12 +443,12 @@ def _current_control(
     u = g["Kp"] * error + Q.T @ integral + known.emf(estimate)
     row: dict[str, Any] = {"link": V, "i": i}
     if s.fidelity == "dq":
-        command, limited = electric.modulation(drive, u, V)
+        command, limited = inverter.modulation(drive, u, V)
         command = _held_if_missed(s, given, controller, command)
         row |= {"u": command * V, "force": drive.force(i)}
     else:
         u_phase = known.to_phases(estimate) @ u
-        command, limits = electric.duty_cycles(drive, u_phase, V, i_phase, real_pwm=s.real_pwm)
+        command, limits = inverter.duty_cycles(drive, u_phase, V, i_phase, real_pwm=s.real_pwm)
         limited = ca.vertcat(*_axes_limited(drive, limits))
         command = _held_if_missed(s, given, controller, command)
         T = drive.to_axes(machine["x"])  # where the machine is, whatever the controller takes it to be
@@ -551,7 +551,7 @@ def _axis_slope(
     u = m * V * (1 - given["sag"] if s.faulty else 1)
     di = (u - actuator.R * i - drive.emf(x)) / actuator.L + drive.coupling(x, i)
     power = ca.dot(ca.DM(list(drive.weight)), u * i)
-    return drive.force(i), ca.vertcat(di, electric.link_slope(drive, V, power))
+    return drive.force(i), ca.vertcat(di, inverter.link_slope(drive, V, power))
 
 
 def _phase_slope(
@@ -562,7 +562,7 @@ def _phase_slope(
     u = (d - 0.5) * V * (1 - given["sag"] if s.faulty else 1)
     closed = 1 - given["open"] if s.faulty else ca.SX.ones(len(drive.phases))
     flowing = closed * i
-    net = electric.phase_voltages(drive, u - actuator.R * flowing - drive.to_phases(x) @ drive.emf(x), closed)
+    net = inverter.phase_voltages(drive, u - actuator.R * flowing - drive.to_phases(x) @ drive.emf(x), closed)
     # An open phase loses its current within a sample, and so do the others what they carried for it: the arc is short.
     lost = (1 - closed) * i
     for star in drive.stars if s.faulty else ():
@@ -570,7 +570,7 @@ def _phase_slope(
         lost[phases] += closed[phases] * ca.sum1(flowing[phases]) / ca.fmax(ca.sum1(closed[phases]), 1)
     di = net / actuator.L - lost / OPENING
     power = ca.dot(u, flowing)
-    return drive.force(drive.to_axes(x) @ flowing), ca.vertcat(di, electric.link_slope(drive, V, power))
+    return drive.force(drive.to_axes(x) @ flowing), ca.vertcat(di, inverter.link_slope(drive, V, power))
 
 
 OPENING = 20e-6  # s, time constant with which the current of an opened phase dies

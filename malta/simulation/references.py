@@ -13,12 +13,14 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 import numpy as np
 
 from malta.errors import InputError
+from malta.model.machines import attribute_of
 from malta.model.plant import Plant
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
 
 Profile = Literal["logistic", "quintic"]
+RISE = 20e-3  # s, of machines that say nothing else
 
 
 class Motion(NamedTuple):
@@ -60,11 +62,16 @@ PROFILES = {"logistic": logistic, "quintic": quintic}
 
 
 def stroke(
-    plant: Plant, start: float, end: float, rise: float, centre: float, profile: Profile = "logistic"
+    plant: Plant, start: float, end: float, rise: float | None, centre: float, profile: Profile = "logistic"
 ) -> Reference:
-    """The stroke axis from `start` to `end` (m), half-way at `centre` (s), the other outputs held at zero."""
+    """The stroke axis from `start` to `end` (m), half-way at `centre` (s), the other outputs held at zero.
+
+    rise : s, 10-90 %; None: the machine's own, RISE of its experiments, or 20 ms
+    """
     if profile not in PROFILES:
         raise InputError("stroke", "profile", repr(profile), "one of " + ", ".join(PROFILES))
+    if rise is None:
+        rise = float(attribute_of(plant, "experiments", "RISE", RISE))
     check_rise(rise)
     axis = plant.stroke_output
     for name, value in (("start", start), ("end", end)):
@@ -105,7 +112,7 @@ def hold(plant: Plant, **outputs: float) -> Reference:
 
 
 def circle(plant: Plant, radius: float, frequency: float) -> Reference:
-    """Eq. (21): the first two outputs on a circle of `radius` (m) at `frequency` (Hz), the others at zero."""
+    """The first two outputs on a circle of `radius` (m) at `frequency` (Hz), the others at zero."""
     w = 2 * math.pi * frequency
 
     def at(t: FloatArray) -> Motion:

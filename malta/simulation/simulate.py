@@ -56,7 +56,6 @@ if TYPE_CHECKING:
 LONGEST = 4_000_000  # samples: 200 s at 20 kHz, 2 GB of trajectory
 BLOCK = 250  # samples in one call of the virtual machine's chain
 PORTION = 20_000  # samples between looks at how the run goes
-RISE = 16.2e-3  # s, 10-90 %: the published stroke, Fig. 12
 
 Estimator = Literal["steady-state", "kalman", "extended"]
 ESTIMATORS: tuple[Estimator, ...] = get_args(Estimator)
@@ -169,18 +168,21 @@ class Scenario:
         cls,
         distance: float = 10e-3,
         *,
-        rise: float = RISE,
+        rise: float | None = None,
         profile: Profile = "logistic",
         duration: float | None = None,
         **options: Any,
     ) -> Scenario:
-        """Move by `distance` (m), symmetrically about the middle, in `rise` (s, 10-90 %). Figs 12 and 13.
+        """Move by `distance` (m), symmetrically about the middle, in `rise` (s, 10-90 %).
 
+        rise : None: the machine's own, RISE of its experiments
         duration : s; None gives six times the rise, at least 0.1 s, so that the move is whole
         options : fields of the scenario, as noise=1.0
         """
-        references.check_rise(rise)
-        duration = max(0.1, 6 * rise) if duration is None else duration
+        if rise is not None:
+            references.check_rise(rise)
+        if duration is None:
+            duration = max(0.1, 6 * (rise or 0.0))
         if not (math.isfinite(distance) and distance != 0):
             raise InputError("stroke", "distance", f"{distance} m", "a finite distance other than 0 m")
         reference = partial(

@@ -17,7 +17,6 @@ from malta.margins.robust import robust_margin
 from malta.margins.stages import compensators
 from malta.margins.verify import Margins
 from malta.model.data import published_value
-from malta.model.electric import link_voltage, open_loop_gain
 from malta.model.linearize import LinearModel, linearize
 from malta.report.ledger import (
     Row,
@@ -30,6 +29,7 @@ from malta.report.ledger import (
     proven,
 )
 from malta.simulation.experiments import Experiment, Progress
+from malta.simulation.inverter import link_voltage, open_loop_gain
 from malta.simulation.simulate import (
     Scenario,
     StrokeFigures,

@@ -15,14 +15,14 @@ from typing import Any
 
 import casadi as ca
 
-from malta.model.data import check_parameters, si
-from malta.model.electric import (
+from malta.machines.tubular.windings import (
     AXES,
     WEIGHT,
     hall_position,
     to_axes,
     to_phases,
 )
+from malta.model.data import check_parameters, si
 from malta.model.plant import (
     Actuator,
     Drive,
