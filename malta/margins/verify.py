@@ -543,9 +543,9 @@ def _bandwidths(
     T = _singular_values(np.eye(len(machine.Cd)) - S)
     half = np.sqrt(0.5)
     return {
-        "sigma_max_T": _crossing(w, T[:, 0], half, last=True),
-        "sigma_min_T": _crossing(w, T[:, -1], half, last=False),
-        "crossover_max": _crossing(w, _singular_values(L)[:, 0], 1.0, last=True),
+        "sigma_max_T": crossing(w, T[:, 0], half, last=True),
+        "sigma_min_T": crossing(w, T[:, -1], half, last=False),
+        "crossover_max": crossing(w, _singular_values(L)[:, 0], 1.0, last=True),
         **natural,
     }
 
@@ -554,7 +554,7 @@ def _singular_values(G: ComplexArray) -> FloatArray:
     return np.asarray(np.linalg.svd(G, compute_uv=False))
 
 
-def _crossing(w: FloatArray, size: FloatArray, level: float, *, last: bool) -> float:
+def crossing(w: FloatArray, size: FloatArray, level: float, *, last: bool = False) -> float:
     """Where size falls below level for the first or last time, between grid points on a log-log line.
 
     Zero where it never reaches the level, the Nyquist frequency where it never falls below.

@@ -31,6 +31,7 @@ from malta.errors import CheckError, InputError
 from malta.margins.plants import of_plant
 from malta.margins.verify import (
     BANDWIDTHS,
+    crossing,
     machine_loop,
     travel_margin,
     verify,
@@ -53,7 +54,6 @@ from malta.tuning.search import (
     Search,
     Trial,
     covariance,
-    falls,
     found_spec,
     joined,
     law_of,
@@ -280,7 +280,7 @@ def _figures(spec: Spec, group: _Group, weights: Weights, delay: int) -> dict[st
     w_n = math.sqrt(max(float(np.linalg.eigvals(stiffness).real.min()), 0.0))
     found["peak_sensitivity"] = float(np.abs(np.einsum("kii->ki", S)).max())
     found["bandwidth"] = min(
-        falls(group.w, T[:, -1], math.sqrt(0.5)), falls(group.w, L[:, 0], 1.0, last=True), w_n
+        crossing(group.w, T[:, -1], math.sqrt(0.5)), crossing(group.w, L[:, 0], 1.0, last=True), w_n
     )
     noise = np.vstack([group.nominal.Bd @ F.D, F.B])
     X = covariance(closed, noise * group.variance @ noise.T)

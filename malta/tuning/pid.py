@@ -28,6 +28,7 @@ from malta.errors import InputError
 from malta.margins.verify import (
     BANDWIDTHS,
     Loop,
+    crossing,
     machine_loop,
     verify,
 )
@@ -46,7 +47,6 @@ from malta.tuning.search import (
     Search,
     Trial,
     covariance,
-    falls,
     found_spec,
     joined,
     law_of,
@@ -166,7 +166,7 @@ def _figures(spec: Spec, part: _Part, loop: Loop) -> dict[str, float]:
         L = loop.loop_gain(w)
         T = np.linalg.svd(np.eye(len(own)) - np.linalg.inv(np.eye(len(own)) + L), compute_uv=False)
         gain = np.linalg.svd(L, compute_uv=False)
-        found["bandwidth"] = min(falls(w, T[:, -1], math.sqrt(0.5)), falls(w, gain[:, 0], 1.0, last=True))
+        found["bandwidth"] = min(crossing(w, T[:, -1], math.sqrt(0.5)), crossing(w, gain[:, 0], 1.0, last=True))
     return found
 
 

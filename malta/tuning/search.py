@@ -153,16 +153,6 @@ def covariance(A: FloatArray, W: FloatArray) -> FloatArray:
     return X
 
 
-def falls(w: FloatArray, size: FloatArray, level: float, *, last: bool = False) -> float:
-    """Where size falls below level, on a log-log line between the grid's points, as verify has it."""
-    falls = np.flatnonzero((size[:-1] >= level) & (size[1:] < level))
-    if not len(falls):
-        return float(w[-1]) if size[-1] >= level else 0.0
-    k = falls[-1 if last else 0]
-    (a, b), (wa, wb) = np.log(size[k : k + 2] / level), np.log(w[k : k + 2])
-    return float(np.exp(wa + (wb - wa) * a / (a - b)))
-
-
 def ratio_of(name: str, asked: float, found: float) -> float:
     if not math.isfinite(found):
         return math.inf
