@@ -18,7 +18,7 @@ import malta
 from malta import gains, report
 from malta.margins.verify import BANDWIDTHS, loop, machine_loop
 from malta.simulation.experiments import experiment
-from malta.synthesis.controller import linear_law
+from malta.synthesis.controller import linear_law, linear_law_of
 from malta.synthesis.riccati import eigenvalues
 from malta.synthesis.spec import Specification
 from malta.tuning import lqg as tune_lqg
@@ -39,7 +39,6 @@ from malta.tuning.search import (
     Tuned,
     design_text,
     found_spec,
-    law_of,
     merged,
 )
 from malta.tuning.tune import judged, problem_sha256
@@ -190,8 +189,11 @@ def test_the_law_of_gains_is_the_controllers(
     for delay in (0, 2):
         weights = spec.weights
         c = malta.lqg(model, weights, 50e-6, delay=delay)
-        law, exact = law_of(gains_of(model, weights, 50e-6, "sampled-data", delay), 50e-6), linear_law(c)
-        for name, own in (("A", exact.A), ("B", exact.B_y), ("C", exact.C), ("D", exact.D_y)):
+        law, exact = (
+            linear_law_of(gains_of(model, weights, 50e-6, "sampled-data", delay), 50e-6),
+            linear_law(c),
+        )
+        for name, own in (("A", exact.A), ("B_y", exact.B_y), ("C", exact.C), ("D_y", exact.D_y)):
             assert getattr(law, name) == pytest.approx(own, rel=1e-12, abs=1e-12 * np.abs(own).max())
 
 

@@ -37,6 +37,7 @@ from malta.model.plant import Parameters, Signal, readonly
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
+    from malta.synthesis.lqg import Gains
 
 
 @dataclass(frozen=True, eq=False)
@@ -238,21 +239,24 @@ def law(c: Controller) -> ca.Function:
 
     (xi_pred, e, frozen, y, p_ref, xi_ref, v_ff, v0) -> (xi_pred, e, frozen, v, xi_hat)
     """
-    n, m, p = len(c.states), len(c.forces), len(c.measurements)
+    args, outputs = _symbolic_law(gains_of(c), len(c.states), len(c.forces), len(c.measurements))
+    return ca.Function("law", list(args.values()), list(outputs.values()), list(args), list(outputs))
+
+
+def _symbolic_law(g: Mapping[str, Any], n: int, m: int, p: int) -> tuple[dict[str, ca.SX], dict[str, ca.SX]]:
+    """Symbols of the law's arguments and expressions of its results, each by name; gains may be symbols too."""
     sizes = {"xi_pred": n, "e": p, "frozen": p, "y": p, "p_ref": p, "xi_ref": n, "v_ff": m, "v0": m}
     args = {name: ca.SX.sym(name, size) for name, size in sizes.items()}
     xi_pred, e, frozen, *given = args.values()
-    g = gains_of(c)
     xi_hat = estimated(g, xi_pred, args["y"])
     xi_pred_next, e_next, frozen_next, v = commanded(g, xi_hat, e, frozen, *given)
-    outputs = {
+    return args, {
         "xi_pred_next": xi_pred_next,
         "e_next": e_next,
         "frozen_next": frozen_next,
         "v": v,
         "xi_hat": xi_hat,
     }
-    return ca.Function("law", list(args.values()), list(outputs.values()), list(args), list(outputs))
 
 
 @lru_cache(
@@ -261,15 +265,45 @@ def law(c: Controller) -> ca.Function:
 def linear_law(c: Controller) -> LinearLaw:
     """The control law linearized where no axis saturates: exact, by differentiating `law`."""
     step = law(c)
-    args = [ca.SX.sym(step.name_in(i), *step.size_in(i)) for i in range(step.n_in())]
-    named = dict(zip(step.name_in(), args, strict=True))
-    out = dict(zip(step.name_out(), step(*args), strict=True))
-    kept = ["xi_pred", "e"] if c.integrating else ["xi_pred"]
-    s = ca.vertcat(*(named[name] for name in kept))
-    r = ca.vertcat(*(named[name] for name in ("p_ref", "xi_ref", "v_ff", "v0")))
-    s_next = ca.vertcat(*(out[f"{name}_next"] for name in kept))
-    blocks = [ca.jacobian(of, by) for of in (s_next, out["v"]) for by in (s, named["y"], r)]
-    return LinearLaw(*(readonly(np.array(M)) for M in ca.Function("linear", args, blocks)(*[0] * len(args))))
+    args = {step.name_in(i): ca.SX.sym(step.name_in(i), *step.size_in(i)) for i in range(step.n_in())}
+    out = dict(zip(step.name_out(), step(*args.values()), strict=True))
+    blocks = _blocks(args, out, integrating=c.integrating)
+    found = ca.Function("linear", list(args.values()), blocks)(*[0] * len(args))
+    return LinearLaw(*(readonly(np.array(M)) for M in found))
+
+
+def linear_law_of(g: Gains, Ts: float) -> LinearLaw:
+    """The same of gains alone, for a search that tries thousands: without references, so r is empty.
+
+    It is differentiated once for each number of states, forces and measurements, with the gains as symbols, and only
+    evaluated afterwards: `linear_law` takes longer than all else in a trial.
+    """
+    (n, m), p = g.Bd.shape, len(g.Cd)
+    found = _law_of_gains(n, m, p, bool(g.Ki.any()))(*g, Ts)
+    A, B_y, C, D_y = (np.array(M) for M in found)
+    return LinearLaw(A, B_y, np.zeros((len(A), 0)), C, D_y, np.zeros((m, 0)))
+
+
+@lru_cache(maxsize=32)
+def _law_of_gains(n: int, m: int, p: int, integrating: bool) -> ca.Function:
+    """(Ad, Bd, Cd, K, Ki, L, control_time) -> (A, B_y, C, D_y)."""
+    shapes = {"Ad": (n, n), "Bd": (n, m), "Cd": (p, n), "K": (m, n), "Ki": (m, p), "L": (n, p)}
+    g = {name: ca.SX.sym(name, *shape) for name, shape in shapes.items()}
+    g["control_time"] = ca.SX.sym("control_time")
+    args, out = _symbolic_law(g | {"force_limit": ca.inf}, n, m, p)
+    A, B_y, _, C, D_y, _ = _blocks(args, out, integrating=integrating)
+    still = [ca.DM.zeros(*symbol.shape) for symbol in args.values()]
+    blocks = ca.substitute([A, B_y, C, D_y], list(args.values()), still)
+    return ca.Function("law_of_gains", list(g.values()), blocks)
+
+
+def _blocks(args: Mapping[str, Any], out: Mapping[str, Any], *, integrating: bool) -> list[ca.SX]:
+    """The derivatives of a law, in the order of LinearLaw."""
+    states = ["xi_pred", "e"] if integrating else ["xi_pred"]
+    s = ca.vertcat(*(args[name] for name in states))
+    r = ca.vertcat(*(args[name] for name in ("p_ref", "xi_ref", "v_ff", "v0")))
+    s_next = ca.vertcat(*(out[f"{name}_next"] for name in states))
+    return [ca.jacobian(of, by) for of in (s_next, out["v"]) for by in (s, args["y"], r)]
 
 
 def handed_on(law: LinearLaw) -> LinearLaw:

@@ -41,6 +41,7 @@ from malta.model.linearize import linearize
 from malta.model.plant import trim
 from malta.simulation.experiments import experiment
 from malta.simulation.simulate import Scenario, simulate, stroke_figures
+from malta.synthesis.controller import linear_law_of
 from malta.synthesis.lqg import Gains, gains, static_feedforward
 from malta.synthesis.riccati import add_lags, delay_inputs, sample
 from malta.synthesis.spec import SPECIFIED, Spec, Weights
@@ -48,7 +49,6 @@ from malta.tuning.search import (
     UNSTABLE,
     Effort,
     Journal,
-    Law,
     Progress,
     Requirement,
     Search,
@@ -56,7 +56,6 @@ from malta.tuning.search import (
     covariance,
     found_spec,
     joined,
-    law_of,
     merged,
     outside,
     ratio_of,
@@ -68,7 +67,7 @@ if TYPE_CHECKING:
     from malta.margins.verify import Loop
     from malta.model.plant import ComplexArray, FloatArray, Plant
     from malta.simulation.experiments import Experiment
-    from malta.synthesis.controller import Controller
+    from malta.synthesis.controller import Controller, LinearLaw
 
 STEP = 0.15  # of the multiples of the box at which the machine is sampled; linear between them
 LINEAR = (
@@ -105,11 +104,11 @@ class _Machine:
     Bd: FloatArray
     Cd: FloatArray
 
-    def closed(self, F: Law) -> FloatArray:
+    def closed(self, F: LinearLaw) -> FloatArray:
         n, k = self.Ad.shape[-1], len(F.A)
         M = np.zeros((*self.Ad.shape[:-2], n + k, n + k))
-        M[..., :n, :n], M[..., :n, n:] = self.Ad + self.Bd @ F.D @ self.Cd, self.Bd @ F.C
-        M[..., n:, :n], M[..., n:, n:] = F.B @ self.Cd, F.A
+        M[..., :n, :n], M[..., :n, n:] = self.Ad + self.Bd @ F.D_y @ self.Cd, self.Bd @ F.C
+        M[..., n:, :n], M[..., n:, n:] = F.B_y @ self.Cd, F.A
         return M
 
 
@@ -229,7 +228,7 @@ def _corners(spec: Spec, systems: list[Any], i: Any, j: Any, o: Any) -> _Machine
     return _Machine(*(M.swapaxes(0, 1) for M in stacked))
 
 
-def _margin(group: _Group, F: Law) -> float:
+def _margin(group: _Group, F: LinearLaw) -> float:
     """Where the first corner of the growing box becomes unstable, by bisection."""
     table = group.corners
     assert table is not None
@@ -260,8 +259,8 @@ def _figures(spec: Spec, group: _Group, weights: Weights, delay: int) -> dict[st
             g = gains(group.model, own, Ts, spec.discretization, delay)
     except CheckError:
         return {}
-    F = law_of(g, Ts)
-    steady = F._replace(D=F.D + group.slope)
+    F = linear_law_of(g, Ts)
+    steady = F._replace(D_y=F.D_y + group.slope)
     closed = group.nominal.closed(steady)
     if not (np.isfinite(closed).all() and np.abs(np.linalg.eigvals(closed)).max() < 1):
         return {}
@@ -270,7 +269,7 @@ def _figures(spec: Spec, group: _Group, weights: Weights, delay: int) -> dict[st
         found["margin"] = _margin(group, F)
     F = steady
     z = np.exp(1j * group.w * Ts)[:, None, None]
-    law = F.C @ np.linalg.solve(z * np.eye(len(F.A)) - F.A, F.B) + F.D
+    law = F.C @ np.linalg.solve(z * np.eye(len(F.A)) - F.A, F.B_y) + F.D_y
     eye = np.eye(len(group.outputs))
     S = np.linalg.inv(eye - group.response @ law)
     T = np.linalg.svd(eye - S, compute_uv=False)
@@ -282,12 +281,12 @@ def _figures(spec: Spec, group: _Group, weights: Weights, delay: int) -> dict[st
     found["bandwidth"] = min(
         crossing(group.w, T[:, -1], math.sqrt(0.5)), crossing(group.w, L[:, 0], 1.0, last=True), w_n
     )
-    noise = np.vstack([group.nominal.Bd @ F.D, F.B])
+    noise = np.vstack([group.nominal.Bd @ F.D_y, F.B_y])
     X = covariance(closed, noise * group.variance @ noise.T)
     k = len(group.nominal.Ad)
     out = group.nominal.Cd @ X[:k, :k] @ group.nominal.Cd.T
-    command = np.hstack([F.D @ group.nominal.Cd, F.C])
-    force = np.diag(command @ X @ command.T + F.D * group.variance @ F.D.T)
+    command = np.hstack([F.D_y @ group.nominal.Cd, F.C])
+    force = np.diag(command @ X @ command.T + F.D_y * group.variance @ F.D_y.T)
     motion = float(np.sqrt(np.diag(out).max()))
     found["axial_motion" if group.stroke else "radial_motion"] = motion
     found["thrust_noise" if group.thrust else "force_noise"] = float(np.sqrt(force.max()))

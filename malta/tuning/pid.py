@@ -34,7 +34,7 @@ from malta.margins.verify import (
 )
 from malta.model.linearize import linearize
 from malta.model.plant import trim
-from malta.synthesis.controller import LinearLaw, handed_on
+from malta.synthesis.controller import handed_on, linear_law_of
 from malta.synthesis.lqg import pid_gains
 from malta.synthesis.riccati import sample, sample_noise
 from malta.synthesis.spec import Loads, Pid, Spec
@@ -49,7 +49,6 @@ from malta.tuning.search import (
     covariance,
     found_spec,
     joined,
-    law_of,
     merged,
     outside,
     ratio_of,
@@ -131,8 +130,8 @@ def _closed(part: _Part, terms: Pid, Ts: float) -> Loop:
     """A part's loop with these gains, as `machine_loop` has the whole."""
     own, k = list(part.outputs), len(part.outputs)
     few = Pid(terms.Kp[own], terms.Ki[own], terms.Kd[own], terms.filter)
-    law = law_of(pid_gains(np.eye(k), few, Ts), Ts)
-    linear = LinearLaw(law.A, law.B, np.zeros((3 * k, 0)), law.C, law.D + part.slope, np.zeros((k, 0)))
+    law = linear_law_of(pid_gains(np.eye(k), few, Ts), Ts)
+    linear = law._replace(D_y=law.D_y + part.slope)
     return Loop(part.Ad, part.Bd, part.Cd, linear if part.Bd.shape[1] == k else handed_on(linear), Ts)
 
 

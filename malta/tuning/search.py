@@ -20,12 +20,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from scipy import linalg, optimize, sparse
+from scipy import optimize, sparse
 
 from malta.errors import CheckError, InputError
 from malta.files import read_file
 from malta.model.linearize import linearize
-from malta.synthesis.lqg import Gains, synthesize
+from malta.synthesis.lqg import synthesize
 
 if TYPE_CHECKING:
     from malta.model.linearize import LinearModel
@@ -121,25 +121,6 @@ def synthesized(spec: Spec) -> tuple[LinearModel, Controller]:
 # ---------------------------------------------------------------------------------------------------------------------
 # Figures
 # ---------------------------------------------------------------------------------------------------------------------
-
-
-class Law(NamedTuple):
-    """s+ = A s + B y, v = C s + D y; s = (xi_pred, e)."""
-
-    A: FloatArray
-    B: FloatArray
-    C: FloatArray
-    D: FloatArray
-
-
-def law_of(g: Gains, Ts: float) -> Law:
-    """controller.linear_law of gains alone."""
-    n, p = len(g.Ad), len(g.Cd)
-    rest = np.eye(n) - g.L @ g.Cd
-    C, D = np.hstack([-g.K @ rest, g.Ki]), -g.K @ g.L - Ts * g.Ki
-    A = linalg.block_diag(g.Ad @ rest, np.eye(p))
-    A[:n] += g.Bd @ C
-    return Law(A, np.vstack([g.Ad @ g.L + g.Bd @ D, -Ts * np.eye(p)]), C, D)
 
 
 def covariance(A: FloatArray, W: FloatArray) -> FloatArray:
