@@ -11,8 +11,6 @@ import itertools
 import json
 import math
 import os
-import re
-import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -20,9 +18,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+import tomlkit
 from scipy import optimize, sparse
+from tomlkit.items import Item
 
-from malta.errors import CheckError, InputError
+from malta.errors import InputError
 from malta.files import read_file
 from malta.model.linearize import linearize
 from malta.synthesis.lqg import synthesize
@@ -324,51 +324,30 @@ def together(spec: Spec, places: Sequence[tuple[Search, FloatArray]]) -> Trial:
 
 
 def design_text(spec: Spec, trial: Trial, target: Path) -> str:
-    """The text of the design file with the numbers of a trial, everything else as it stands, for another folder.
+    """Write the text of the design file with the numbers of a trial, for another folder.
 
-    Raises CheckError when the text does not hold what was meant.
+    Comments, the order of keys and all other values stay as they stand in spec.path.
     """
-    text = spec.path.read_text(encoding="utf-8")
-    wanted: dict[str, str] = {}
+    document = tomlkit.parse(spec.path.read_text(encoding="utf-8"))
+    document["machine"] = Path(
+        os.path.relpath(spec.machine_file.resolve(), target.resolve().parent)
+    ).as_posix()
+    if spec.pid is None:
+        document["delay"] = trial.delay
     for variable, value in zip(spec.search, trial.values, strict=True):
-        number = f"{value:.{DIGITS}g}"
         for entry in variable.entries:
-            is_weight = entry.startswith("weights.")
-            wanted[entry] = number if is_weight else f'{{ value = {number}, unit = "{variable.unit}" }}'
-    machine = Path(os.path.relpath(spec.machine_file.resolve(), target.resolve().parent)).as_posix()
-    wanted |= {"machine": json.dumps(machine)} | ({} if spec.pid else {"delay": str(trial.delay)})
-    for entry, new in wanted.items():
-        text = _replaced(text, entry, new)
-    found = tomllib.loads(text)
-    for entry, new in wanted.items():
-        node: Any = found
-        for key in entry.split("."):
-            node = node[key]
-        if node != tomllib.loads(f"value = {new}")["value"]:
-            raise CheckError(
-                f"{spec.path}: {entry} stands where it cannot be replaced: a line of its own is needed"
-            )
-    return text
+            *tables, name = entry.split(".")
+            table: Any = document
+            for key in tables:
+                table = table[key]
+            if isinstance(table[name], dict):
+                table[name]["value"] = _number(value)
+                table[name]["unit"] = variable.unit
+            else:
+                table[name] = _number(value)
+    return tomlkit.dumps(document)
 
 
-VALUE = r"(\{[^{}]*\}|\"[^\"]*\"|[^\s,}#]+)"  # of a key: an inline table, a text, a number
-
-
-def _replaced(text: str, entry: str, value: str) -> str:
-    """The text with another value of a dotted key: on a line of its table, or in a table on one line."""
-    keys, header, lines = entry.split("."), "", text.split("\n")
-    for k, line in enumerate(lines):
-        table = re.match(r"\s*\[([^\[\]]+)\]", line)
-        if table:
-            header = table[1].strip()
-            continue
-        prefix = f"{header}." if header else ""
-        if not entry.startswith(prefix) or (header and header.split(".") != keys[: len(header.split("."))]):
-            continue
-        rest = keys[len(header.split(".")) if header else 0 :]
-        if re.match(rf"\s*{re.escape(rest[0])}\s*=", line) is None:
-            continue
-        pattern = rf"(?<![\w.-]){re.escape(rest[-1])}(\s*=\s*){VALUE}"
-        lines[k] = re.sub(pattern, lambda m: f"{rest[-1]}{m[1]}{value}", line, count=1)  # noqa: B023
-        break
-    return "\n".join(lines)
+def _number(value: float) -> Item:
+    """A number as the file shall hold it, in as many digits as were tried."""
+    return tomlkit.value(f"{value:.{DIGITS}g}")
