@@ -55,6 +55,7 @@ if TYPE_CHECKING:  # the contents page, as type checkers and readers see it
     from malta.simulation.simulate import stroke_figures as stroke_figures
     from malta.simulation.time_optimal import fastest_stroke as fastest_stroke
     from malta.synthesis.controller import Controller as Controller
+    from malta.synthesis.design_file import read_design as read_design
     from malta.synthesis.lqg import calibrate as calibrate
     from malta.synthesis.lqg import kalman as kalman
     from malta.synthesis.lqg import lqg as lqg
@@ -63,7 +64,6 @@ if TYPE_CHECKING:  # the contents page, as type checkers and readers see it
     from malta.synthesis.lqg import synthesize as synthesize
     from malta.synthesis.spec import Spec as Spec
     from malta.synthesis.spec import Weights as Weights
-    from malta.synthesis.spec import read_design as read_design
     from malta.tuning.tune import tune as tune
 
 _NAMES = {  # the same, for the first use of each name
@@ -85,7 +85,8 @@ _NAMES = {  # the same, for the first use of each name
     "margins.robust": ("Margin", "margin_of_polynomial", "robust_margin"),
     "margins.systems": ("uncertain",),
     "simulation.simulate": ("Fault", "Scenario", "Trajectory", "simulate", "stroke_figures"),
-    "synthesis.spec": ("Spec", "Weights", "read_design"),
+    "synthesis.design_file": ("read_design",),
+    "synthesis.spec": ("Spec", "Weights"),
     "synthesis.lqg": ("calibrate", "kalman", "lqg", "lqi", "lqr", "synthesize"),
     "tuning.tune": ("tune",),
     "margins.uncertain": ("Compensator", "UncertainSystem"),

@@ -20,24 +20,26 @@ from malta.machines.halbach import plant as halbach
 from malta.margins.verify import machine_loop
 from malta.synthesis.riccati import sample, sample_noise
 from malta.synthesis.spec import Pid
+from malta.tuning import outcomes
 from malta.tuning import pid as tune_pid
+from malta.tuning.design_text import design_text
+from malta.tuning.outcomes import judge
 from malta.tuning.pid import (
     _closed,
-    _figures,
     _goal,
-    _parts,
-    _whole,
     loads_of,
+    loop_figures,
+    parts_of,
+    whole_machine,
 )
 from malta.tuning.search import (
     Effort,
     Journal,
     Search,
-    design_text,
-    joined,
-    synthesized,
+    model_and_controller,
+    separate,
 )
-from malta.tuning.tune import judged, problem_sha256
+from malta.tuning.tune import problem_sha256
 from malta.tuning.tune import tune as tuned
 
 if TYPE_CHECKING:
@@ -48,7 +50,7 @@ if TYPE_CHECKING:
     from malta.model.linearize import LinearModel
     from malta.synthesis.controller import Controller
     from malta.synthesis.spec import Spec
-    from malta.tuning.search import Tuned
+    from malta.tuning.tune import Tuned
 
 HALBACH = """
 name = "motor_pid"
@@ -151,15 +153,17 @@ def terms_of(spec: Spec) -> Pid:
 
 def figures_of(spec: Spec) -> dict[str, float]:
     """Of the whole machine."""
-    model, controller = synthesized(spec)
-    return _figures(spec, _whole(model, controller, loads_of(spec)), machine_loop(model, controller))
+    model, controller = model_and_controller(spec)
+    return loop_figures(
+        spec, whole_machine(model, controller, loads_of(spec)), machine_loop(model, controller)
+    )
 
 
 def search_of(spec: Spec) -> Search:
-    (part,) = _parts(_whole(*synthesized(spec), loads_of(spec)))
+    (part,) = parts_of(whole_machine(*model_and_controller(spec), loads_of(spec)))
 
     def compute(design: Spec) -> dict[str, float]:
-        return _figures(spec, part, _closed(part, terms_of(design), spec.sample_time))
+        return loop_figures(spec, part, _closed(part, terms_of(design), spec.sample_time))
 
     return Search(spec, (0, 1, 2), 0, Journal(None, "", restart=False), compute)
 
@@ -175,7 +179,7 @@ def goal(search: Search, u: Any) -> float:
 def test_the_load_error_is_the_sum_over_a_simulated_step(name: str, request: pytest.FixtureRequest) -> None:
     """A force as one more state of the machine between samples, which holds still, and ten thousand samples."""
     spec: Spec = request.getfixturevalue(name)
-    model, controller = synthesized(spec)
+    model, controller = model_and_controller(spec)
     machine, Ts = machine_loop(model, controller), spec.sample_time
     n, m = model.B.shape
     closed, figures = machine.closed, figures_of(spec)
@@ -218,13 +222,13 @@ def test_the_motion_from_noise_by_two_ways(motor: Spec) -> None:
 @pytest.mark.parametrize("name", ["motor", "mover"])
 def test_parts_have_the_figures_of_the_whole_machine(name: str, request: pytest.FixtureRequest) -> None:
     spec: Spec = request.getfixturevalue(name)
-    model, controller = synthesized(spec)
-    parts = _parts(_whole(model, controller, loads_of(spec)))
+    model, controller = model_and_controller(spec)
+    parts = parts_of(whole_machine(model, controller, loads_of(spec)))
     expected = [(0,)] if name == "motor" else [(0, 4), (1, 3), (2,), (5,)]  # a tilt turns the lifting force
     assert [part.outputs for part in parts] == expected
     quick: dict[str, float] = {}
     for part in parts:
-        quick |= _figures(spec, part, _closed(part, terms_of(spec), spec.sample_time))
+        quick |= loop_figures(spec, part, _closed(part, terms_of(spec), spec.sample_time))
     whole = figures_of(spec)
     assert quick.keys() == whole.keys()
     for key, value in whole.items():
@@ -240,7 +244,7 @@ def test_an_unstable_loop_has_no_figures(motor: Spec) -> None:
     search = search_of(motor)
     assert goal(search, np.ones(3)) == 1e3
     assert goal(search, np.full(3, 1.5)) == 1e3 + 1.5
-    rows = {r.name: r for r in judged(hasty)}
+    rows = {r.name: r for r in judge(hasty)}
     assert not any(r.holds for r in rows.values())
     assert str(rows["load_error x"]) == "load_error x is inf m s^0.5, asked for little"
 
@@ -275,7 +279,7 @@ def test_the_bounds_hold_where_it_counts(found: Tuned) -> None:
 
 
 def test_a_tighter_bound_on_motion_costs_load_error(motor: Spec, found: Tuned) -> None:
-    asked = replace(motor.specification, noise_motion={"x": 2.3e-6})
+    asked = {**motor.specification, "noise_motion x": 2.3e-6}
     calm = tuned(replace(motor, specification=asked), effort=Effort(generations=5))
     assert calm.reached
     ratios = {r.name: r.ratio for r in calm.requirements}
@@ -326,18 +330,18 @@ def test_a_shared_filter_joins_all_axes(mover: Spec, monkeypatch: pytest.MonkeyP
     seen = []
 
     def looked_at(*given: Any) -> Any:
-        seen.append(joined(*given))
+        seen.append(separate(*given))
         return seen[-1]
 
-    monkeypatch.setattr(tune_pid, "joined", looked_at)
+    monkeypatch.setattr(tune_pid, "separate", looked_at)
     found = tuned(spec, effort=Effort(generations=0, polish=0))
     assert seen == [[((0, 1, 2, 3), tuple(range(count)))] for count in (4, 6)]  # parts, outputs
     assert {name.split()[1] for name in found.trial.figures} == {s.name for s in mover.plant.outputs}
     assert found.trial.values[3] == 50.0
 
 
-def test_bandwidth_and_margin_are_judged(motor: Spec, monkeypatch: pytest.MonkeyPatch) -> None:
-    asked = replace(motor.specification, bandwidth=8.0, margin=1.0)
+def test_bandwidth_and_margin_are_judge(motor: Spec, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = {**motor.specification, "bandwidth": 8.0, "margin": 1.0}
     spec = replace(motor, specification=asked, uncertainty={"m": 0.1})
 
     def proven(model: LinearModel, controller: Controller, box: Mapping[str, float]) -> Margins:
@@ -345,12 +349,12 @@ def test_bandwidth_and_margin_are_judged(motor: Spec, monkeypatch: pytest.Monkey
         bound: Any = SimpleNamespace(lower=1.25)
         return replace(malta.verify(model, controller), robust=bound)
 
-    monkeypatch.setattr(tune_pid, "verify", proven)
-    rows = {r.name: r for r in judged(spec)}
+    monkeypatch.setattr(outcomes, "verify", proven)
+    rows = {r.name: r for r in judge(spec)}
     assert rows["margin"].ratio == 0.8
-    assert rows["bandwidth"].more
+    assert rows["bandwidth"].at_least
     assert "bandwidth" in figures_of(spec)
-    search = search_of(replace(spec, specification=replace(asked, bandwidth=40.0)))
+    search = search_of(replace(spec, specification=asked | {"bandwidth": 40.0}))
     assert goal(search, search.start) > goal(search_of(motor), search.start)
 
 
@@ -412,7 +416,7 @@ def test_a_cost_belongs_to_a_pid_and_a_pid_with_wishes_needs_one(tmp_path: Path)
     path = motor_file(tmp_path, ("[cost]\n" + COST + "\n" + NOISE, ""))
     without = malta.read_design(path)
     assert without.loads is None
-    for use in (partial(tuned, without), partial(judged, without)):
+    for use in (partial(tuned, without), partial(judge, without)):
         error = refusal(use, path)
         assert (error.field, error.found) == ("cost", "nothing")
     lqg = (ROOT / "design" / "robust.toml").read_text(encoding="utf-8")
@@ -464,7 +468,7 @@ def test_the_command_finds_gains_and_judges_them(run: Any, tmp_path: Path) -> No
 def test_the_shipped_gains_are_those_that_the_search_ends_with(name: str) -> None:
     """Every bound holds, and no polish from there finds a load error that is smaller by 0.1 %."""
     spec = malta.read_design(ROOT / "design" / f"{name}.toml")
-    rows = {r.name: r for r in judged(spec)}
+    rows = {r.name: r for r in judge(spec)}
     assert rows["peak_sensitivity"].asked == 1.8
     assert rows["peak_sensitivity"].ratio == pytest.approx(1, abs=1e-4)
     assert all(r.holds for r in rows.values())

@@ -34,7 +34,7 @@ def claims(
     \b
     Example:  malta claims design/table2.toml
     """
-    from malta.synthesis.spec import read_design
+    from malta.synthesis.design_file import read_design
 
     specs = [read_design(file) for file in design_files("claims", designs, reverse=True)]
     if not designs:

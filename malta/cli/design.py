@@ -65,8 +65,8 @@ def _run_design(
     from malta.model.data import published_beside
     from malta.model.linearize import linearize
     from malta.simulation.experiments import main_job
+    from malta.synthesis.design_file import read_design
     from malta.synthesis.lqg import synthesize
-    from malta.synthesis.spec import read_design
 
     spec = read_design(file)
     plant, job = spec.plant, main_job(spec.plant)

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from malta.margins.stages import Robustness
     from malta.margins.verify import Margins
     from malta.simulation.experiments import Experiment
-    from malta.tuning.search import Requirement
+    from malta.tuning.outcomes import Outcome
 
 
 def margins_document(margins: Margins) -> dict[str, Any]:
@@ -117,10 +117,11 @@ def campaign_document(campaign: Campaign, published: Mapping[str, Any] | None, w
     }
 
 
-def requirement_document(requirement: Requirement) -> dict[str, Any]:
+def requirement_document(outcome: Outcome) -> dict[str, Any]:
     """A requirement on a design, and what the design reaches; the ratio is null where it is infinite."""
-    ratio = requirement.ratio if requirement.ratio < float("inf") else None
-    return {**requirement._asdict(), "ratio": ratio, "holds": requirement.holds}
+    ratio = outcome.ratio if outcome.ratio < float("inf") else None
+    fields = {name: value for name, value in outcome._asdict().items() if name != "at_least"}
+    return {**fields, "ratio": ratio, "holds": outcome.holds}
 
 
 def _margin_document(margin: Margin) -> dict[str, Any]:

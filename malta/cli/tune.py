@@ -15,7 +15,9 @@ from malta.errors import CheckError, InputError
 
 if TYPE_CHECKING:
     from malta.synthesis.spec import Spec
-    from malta.tuning.search import Effort, Requirement, Tuned
+    from malta.tuning.outcomes import Outcome
+    from malta.tuning.search import Effort
+    from malta.tuning.tune import Tuned
 
 
 def tune(
@@ -53,7 +55,7 @@ def tune(
     \b
     Example:  malta tune design/robust.toml --out build/tuned
     """
-    from malta.synthesis.spec import read_design
+    from malta.synthesis.design_file import read_design
     from malta.tuning.search import Effort
 
     spec = read_design(file)
@@ -78,9 +80,9 @@ def tune(
 def _judge(spec: Spec, file: Path, *, as_json: bool) -> None:
     """Print what the design as it stands reaches; raise CheckError when that is not all it is asked for."""
     from malta import report
-    from malta.tuning.tune import judged
+    from malta.tuning.outcomes import judge
 
-    requirements = judged(spec)
+    requirements = judge(spec)
     if as_json:
         print_json({"design": spec.name, "requirements": [requirement_document(r) for r in requirements]})
     else:
@@ -104,7 +106,7 @@ def _write(spec: Spec, tuned: Tuned, target: Path) -> list[Path]:
     """Write the design file that was found; beside it the Pareto front where there is one."""
     from malta import report
     from malta.files import replace_files
-    from malta.tuning.search import design_text
+    from malta.tuning.design_text import design_text
 
     files = {target: design_text(spec, tuned.trial, target).encode()}
     if not tuned.front:
@@ -139,7 +141,7 @@ def _print_tables(tuned: Tuned, files: Sequence[Path]) -> None:
     print_written(console, files)
 
 
-def _require_all(requirements: Sequence[Requirement], file: Path) -> None:
+def _require_all(requirements: Sequence[Outcome], file: Path) -> None:
     """Raise CheckError when a requirement is not reached: which, by how much, and which binds most."""
     failed = sorted((r for r in requirements if not r.holds), key=lambda r: -r.ratio)
     if failed:

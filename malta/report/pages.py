@@ -27,8 +27,6 @@ from malta.model.linearize import LinearModel
 from malta.model.signals import (
     aside,
     compliance_unit,
-    inputs_of,
-    outputs_of,
     stiffness_unit,
 )
 from malta.report.figures import distributions_figure as distributions_figure
@@ -40,10 +38,11 @@ from malta.report.figures import worst_figure as worst_figure
 from malta.report.figures import yield_figure as yield_figure
 from malta.report.figures.margins import chain_figure as chain_figure
 from malta.report.figures.parts import STYLES as STYLES
-from malta.report.figures.parts import Published, number, read_out
+from malta.report.figures.parts import UNITS, Published, number, read_out, traded
 from malta.simulation.experiments import experiments_of, options_of, setting
 from malta.simulation.simulate import Trajectory
 from malta.synthesis.lqg import continuous_poles
+from malta.synthesis.requirements import requirements_for
 from malta.synthesis.spec import Spec
 
 if TYPE_CHECKING:
@@ -54,7 +53,8 @@ if TYPE_CHECKING:
     from malta.model.plant import ComplexArray, FloatArray, Plant
     from malta.report.ledger import Ledger
     from malta.simulation.experiments import Experiment, Merit
-    from malta.tuning.search import Requirement, Tuned
+    from malta.tuning.outcomes import Outcome
+    from malta.tuning.tune import Tuned
 
 
 # --- pages ---
@@ -540,7 +540,7 @@ def _printed(merit: Merit, published: Published) -> str:
     return f"<= {value}" if merit.relation == "at most" else value
 
 
-def requirements_table(requirements: Sequence[Requirement]) -> Table:
+def requirements_table(requirements: Sequence[Outcome]) -> Table:
     """What a design was asked for, what it has, and how near each limit is."""
     table = _table("Requirements", "requirement", "asked", "found", "of the limit", "", "from")
     for r in requirements:
@@ -549,7 +549,7 @@ def requirements_table(requirements: Sequence[Requirement]) -> Table:
         if r.asked is None:
             _row(table, r.name.replace("_", " "), "least", found, "", "", r.how)
             continue
-        bound = ">=" if r.more else "<="
+        bound = ">=" if r.at_least else "<="
         _row(
             table,
             r.name.replace("_", " "),
@@ -562,36 +562,22 @@ def requirements_table(requirements: Sequence[Requirement]) -> Table:
     return table
 
 
-UNITS = {
-    "m": (1e6, "um"),
-    "rad": (1e6, "urad"),
-    "m s^0.5": (1e6, "um s^0.5"),
-    "rad s^0.5": (1e6, "urad s^0.5"),
-    "rad/s": (1.0, "rad/s"),
-    "N": (1.0, "N"),
-    "N m": (1.0, "N m"),
-    "kg": (1.0, "kg"),
-}
-
-
-def _front_columns(plant: Plant) -> dict[str, tuple[str, float, str]]:
-    """What the front may hold: heading, factor, unit."""
-    along, *across = (group.name for group in outputs_of(plant))
-    thrust, *others = (group.name for group in inputs_of(plant))
-    return {
-        "margin": ("margin, proven", 100.0, "%"),
-        "force_noise": (" ".join(others[:1]), 1.0, "N rms"),
-        "thrust_noise": (thrust, 1.0, "N rms"),
-        "radial_motion": (" ".join([*across[:1], "motion"]), 1e6, "um rms"),
-        "axial_motion": (f"{along} motion", 1e6, "um rms"),
-        "peak_sensitivity": ("peak S", 1.0, ""),
-        "bandwidth": ("bandwidth", 1.0, "rad/s"),
-    }
+def _front_columns(tuned: Tuned) -> dict[str, tuple[str, float, str]]:
+    """What the front holds of each trial: heading, factor, unit."""
+    names = dict.fromkeys(name for one in tuned.front for name in one.figures)
+    columns = {"margin": ("margin, proven", 100.0, "%")}
+    for trade, what in (("force", ""), ("motion", " motion")):
+        for name, label, scale, unit in traded(tuned.spec.plant, names, trade):
+            columns[name] = (f"{label}{what}", scale, f"{unit} rms")
+    for name, r in requirements_for(tuned.spec.plant).items():
+        if name in names and r.heading and not r.trade:
+            columns[name] = (r.heading, *UNITS.get(r.unit, (1.0, "")))
+    return columns
 
 
 def front_rows(tuned: Tuned) -> tuple[list[str], list[list[str]]]:
     """The Pareto front as headings and cells: a row for each trial, the chosen one with a star."""
-    columns = _front_columns(tuned.spec.plant)
+    columns = _front_columns(tuned)
     shown = [name for name in columns if any(name in one.figures for one in tuned.front)]
     heads = [f"{columns[k][0]} [{columns[k][2]}]".removesuffix(" []") for k in shown]
     rows = [

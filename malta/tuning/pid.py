@@ -25,35 +25,30 @@ import numpy as np
 from scipy import optimize, sparse
 
 from malta.errors import InputError
-from malta.margins.verify import (
-    BANDWIDTHS,
-    Loop,
-    crossing,
-    machine_loop,
-    verify,
-)
+from malta.margins.verify import Loop, crossing, machine_loop
 from malta.model.linearize import linearize
 from malta.model.plant import trim
 from malta.synthesis.controller import handed_on, linear_law_of
 from malta.synthesis.lqg import pid_gains
+from malta.synthesis.requirements import ratio_of
 from malta.synthesis.riccati import sample, sample_noise
 from malta.synthesis.spec import Loads, Pid, Spec
+from malta.tuning.noise import covariance
 from malta.tuning.search import (
     UNSTABLE,
     Effort,
     Journal,
     Progress,
-    Requirement,
     Search,
     Trial,
-    covariance,
-    found_spec,
-    joined,
-    merged,
-    outside,
-    ratio_of,
-    synthesized,
-    together,
+    apply_trial,
+    at_least_of,
+    base_of,
+    combine,
+    distance_outside,
+    merge,
+    model_and_controller,
+    separate,
 )
 
 if TYPE_CHECKING:
@@ -68,7 +63,7 @@ RADII = ((0.05, 1e-3), (0.01, 1e-4))  # of COBYQA's trust region at first and la
 
 
 @dataclass(frozen=True, eq=False)
-class _Part:
+class Part:
     """Some outputs with the forces of the same index, the sampled states behind them, and what acts from outside."""
 
     outputs: tuple[int, ...]  # k of them
@@ -80,8 +75,8 @@ class _Part:
     shaken: FloatArray  # n x n, covariance that the noise of forces leaves there
 
 
-def _whole(model: LinearModel, controller: Controller, loads: Loads) -> _Part:
-    """All of a machine."""
+def whole_machine(model: LinearModel, controller: Controller, loads: Loads) -> Part:
+    """Describe all of a machine as one part, with what the loads leave in its states."""
     machine, plant, Ts = machine_loop(model, controller), model.plant, controller.sample_time
     position = float(model.operating_point.x[plant.stroke_state])
     loaded = linearize(plant, trim(plant, **{plant.stroke: position}))
@@ -91,13 +86,13 @@ def _whole(model: LinearModel, controller: Controller, loads: Loads) -> _Part:
     shaken[:n, :n] = sample_noise(A, B * (np.square(loads.force_noise) * Ts) @ B.T, Ts)
     slope = np.zeros((B.shape[1], len(machine.Cd)))
     slope[:, plant.stroke_output] = controller.feedforward.slope(position)
-    return _Part(
+    return Part(
         tuple(range(len(machine.Cd))), machine.Ad, machine.Bd, machine.Cd, slope, push, shaken
     )  # fmt: skip
 
 
-def _parts(whole: _Part) -> list[_Part]:
-    """What nothing joins to the rest."""
+def parts_of(whole: Part) -> list[Part]:
+    """Split a machine into parts that nothing joins to each other."""
     n, m = len(whole.Ad), len(whole.Cd)
     M = np.abs(np.block([[whole.Ad, whole.Bd], [whole.Cd, np.zeros((m, whole.Bd.shape[1]))]]))
     least = JOINS * np.sqrt(np.outer(M.max(axis=1), M.max(axis=0)))
@@ -113,7 +108,7 @@ def _parts(whole: _Part) -> list[_Part]:
         i, o = np.flatnonzero(label[:n] == k), np.flatnonzero(label[n:] == k)
         inputs = np.concatenate([o + first for first in range(0, whole.Bd.shape[1], m)])
         parts.append(
-            _Part(
+            Part(
                 tuple(o.tolist()),
                 whole.Ad[np.ix_(i, i)],
                 whole.Bd[np.ix_(i, inputs)],
@@ -126,7 +121,7 @@ def _parts(whole: _Part) -> list[_Part]:
     return parts
 
 
-def _closed(part: _Part, terms: Pid, Ts: float) -> Loop:
+def _closed(part: Part, terms: Pid, Ts: float) -> Loop:
     """A part's loop with these gains, as `machine_loop` has the whole."""
     own, k = list(part.outputs), len(part.outputs)
     few = Pid(terms.Kp[own], terms.Ki[own], terms.Kd[own], terms.filter)
@@ -135,8 +130,8 @@ def _closed(part: _Part, terms: Pid, Ts: float) -> Loop:
     return Loop(part.Ad, part.Bd, part.Cd, linear if part.Bd.shape[1] == k else handed_on(linear), Ts)
 
 
-def _figures(spec: Spec, part: _Part, loop: Loop) -> dict[str, float]:
-    """The figures of a part's loop; none where it is unstable."""
+def loop_figures(spec: Spec, part: Part, loop: Loop) -> dict[str, float]:
+    """Compute the figures of a part's loop, by name and output; none where the loop is unstable."""
     closed, c, n, Ts = loop.closed, loop.control, len(part.Ad), loop.sample_time
     if not np.isfinite(closed).all():
         return {}
@@ -161,11 +156,13 @@ def _figures(spec: Spec, part: _Part, loop: Loop) -> dict[str, float]:
     w = np.sort(np.concatenate([np.geomspace(1e-3 / Ts, np.pi / Ts, 120), turning]))
     peaks = _peaks(lambda w: np.log(np.abs(np.einsum("kii->ki", loop.sensitivity(w)))), w)
     found |= {f"peak_sensitivity {name}": peak for name, peak in zip(names, peaks.tolist(), strict=True)}
-    if spec.specification.bandwidth:
+    if "bandwidth" in spec.specification:
         L = loop.loop_gain(w)
         T = np.linalg.svd(np.eye(len(own)) - np.linalg.inv(np.eye(len(own)) + L), compute_uv=False)
         gain = np.linalg.svd(L, compute_uv=False)
-        found["bandwidth"] = min(crossing(w, T[:, -1], math.sqrt(0.5)), crossing(w, gain[:, 0], 1.0, last=True))
+        found["bandwidth"] = min(
+            crossing(w, T[:, -1], math.sqrt(0.5)), crossing(w, gain[:, 0], 1.0, last=True)
+        )
     return found
 
 
@@ -186,21 +183,21 @@ def _peaks(logs: Callable[[FloatArray], FloatArray], w: FloatArray) -> FloatArra
 
 
 def loads_of(spec: Spec) -> Loads:
-    """What a PID is judged by. InputError for a design file that does not say."""
+    """Return the loads that a PID is judged by. Raises InputError for a design file without [cost]."""
     if spec.loads is None:
         raise InputError(spec.path, "cost", "nothing", "a table of the loads whose errors a PID makes small")
     return spec.loads
 
 
 def _ratios(spec: Spec, figures: Mapping[str, float]) -> list[float]:
-    """How near their bounds the figures are."""
-    asked = spec.specification
-    bounds = {f"noise_motion {name}": bound for name, bound in asked.noise_motion.items()}
-    if asked.peak_sensitivity:
-        bounds |= {f"peak_sensitivity {s.name}": asked.peak_sensitivity for s in spec.plant.outputs}
-    if asked.bandwidth:
-        bounds["bandwidth"] = asked.bandwidth
-    return [ratio_of(name, bounds[name], value) for name, value in figures.items() if name in bounds]
+    """How near their bounds the figures are: each output's by its own bound, or by one of all outputs."""
+    asked, ratios = spec.specification, []
+    for name, value in figures.items():
+        base = base_of(name)
+        bound = asked.get(name, asked.get(base))
+        if bound is not None:
+            ratios.append(ratio_of(bound, value, at_least=base == "bandwidth"))
+    return ratios
 
 
 def _load_error(figures: Mapping[str, float]) -> float:
@@ -212,9 +209,9 @@ def _goal(search: Search, u: FloatArray, outputs: Collection[str]) -> float:
     """The logarithm of these outputs' load error; beyond a bound it costs more than it can gain."""
     figures = _of(search.figures(u), outputs)
     if not figures:
-        return UNSTABLE + outside(u)
+        return UNSTABLE + distance_outside(u)
     beyond = max([math.log(ratio) + ROOM for ratio in _ratios(search.spec, figures)], default=0.0)
-    return math.log(_load_error(figures)) + STEEP * (max(beyond, 0.0) + outside(u))
+    return math.log(_load_error(figures)) + STEEP * (max(beyond, 0.0) + distance_outside(u))
 
 
 def _of(figures: Mapping[str, float], outputs: Collection[str]) -> dict[str, float]:
@@ -222,7 +219,7 @@ def _of(figures: Mapping[str, float], outputs: Collection[str]) -> dict[str, flo
     return {name: value for name, value in figures.items() if name.partition(" ")[2] in ("", *outputs)}
 
 
-def _polished(search: Search, u: FloatArray, trials: int, outputs: Collection[str]) -> FloatArray:
+def _polish(search: Search, u: FloatArray, trials: int, outputs: Collection[str]) -> FloatArray:
     """The place: the best of what COBYQA tries on its way, bounds given as their ratios' logarithms."""
     if not (trials and len(u)):
         return u
@@ -247,14 +244,14 @@ def _polished(search: Search, u: FloatArray, trials: int, outputs: Collection[st
     return u
 
 
-def searched(
+def search_gains(
     spec: Spec, journal: Journal, effort: Effort, progress: Progress | None
 ) -> tuple[Trial, tuple[Trial, ...]]:
-    """The trial with the smallest load error that the bounds allow. There is no front.
+    """Find the trial with the smallest load error that the bounds allow. There is no front.
 
     In a part of several outputs each is searched by itself, twice around, then all together from there.
     """
-    parts = _parts(_whole(*synthesized(spec), loads_of(spec)))
+    parts = parts_of(whole_machine(*model_and_controller(spec), loads_of(spec)))
     axis = {s.name: {k} for k, s in enumerate(spec.plant.inputs)}
     everything = set(range(len(axis)))  # what the filter touches
     outputs = [
@@ -262,18 +259,19 @@ def searched(
         for variable in spec.search
     ]
     touched = [{k for k, part in enumerate(parts) if own & set(part.outputs)} for own in outputs]
-    clusters, blocks = joined(touched, len(parts)), joined(outputs, len(axis))
+    clusters, blocks = separate(touched, len(parts)), separate(outputs, len(axis))
     numbers = [len(own) for own, _ in blocks if own]
     journal.expect(
         sum(max(8 * k, 6) * (effort.generations + 1) + 4 * effort.polish * k for k in numbers), progress
     )
-    places = []
+    places, at_least = [], at_least_of(spec.plant)
     for variables, members in clusters:
 
         def compute(design: Spec, members: tuple[int, ...] = members) -> dict[str, float]:
             terms, Ts = design.pid, design.sample_time
             assert terms is not None
-            return merged([_figures(spec, parts[k], _closed(parts[k], terms, Ts)) for k in members])
+            figures = [loop_figures(spec, parts[k], _closed(parts[k], terms, Ts)) for k in members]
+            return merge(figures, at_least)
 
         own = [block for block in blocks if block[0] and set(block[0]) <= set(variables)]
         rounds = [(*block, effort.generations) for block in own]
@@ -284,41 +282,9 @@ def searched(
         for some, axes, generations in rounds:
             names = [spec.plant.outputs[o].name for o in axes]
             search = Search(there, some, spec.delay, journal, compute, among=variables)
-            u = search.evolved(partial(_goal, search, outputs=names), generations)
-            u = _polished(search, u, 3 * effort.polish * len(some), names)
-            there = found_spec(there, together(there, [(search, u)]))
+            u = search.evolve(partial(_goal, search, outputs=names), generations)
+            u = _polish(search, u, 3 * effort.polish * len(some), names)
+            there = apply_trial(there, combine(there, [(search, u)]))
         search = Search(there, variables, spec.delay, journal, compute)
         places.append((search, search.start))
-    return together(spec, places), ()
-
-
-def judged(spec: Spec) -> tuple[Requirement, ...]:
-    """Load errors, and every requirement of a design: of the whole machine's loop, as verify has it."""
-    asked, plant, loads = spec.specification, spec.plant, loads_of(spec)
-    model, controller = synthesized(spec)
-    margins = verify(model, controller, spec.uncertainty if asked.margin else None)
-    figures = _figures(spec, _whole(model, controller, loads), machine_loop(model, controller))
-    rows = []
-    for output, force, size in zip(plant.outputs, plant.inputs, loads.load, strict=True):
-        name = f"load_error {output.name}"
-        how = f"constant force, {size:g} {force.unit} at {force.name}"
-        rows.append(Requirement(name, None, figures.get(name, math.inf), f"{output.unit} s^0.5", how))
-    found = [(f"noise_motion {name}", bound, "covariance") for name, bound in asked.noise_motion.items()]
-    units = {f"noise_motion {s.name}": s.unit for s in plant.outputs}
-    rows += [
-        Requirement(name, bound, figures.get(name, math.inf), units[name], how) for name, bound, how in found
-    ]
-    if asked.peak_sensitivity:
-        worst = max(margins.peak_sensitivity[s.name] for s in controller.measurements)
-        rows.append(
-            Requirement("peak_sensitivity", asked.peak_sensitivity, worst, "1", "worst sensor, machine")
-        )
-    if asked.bandwidth:
-        narrow = min(margins.bandwidth, key=lambda key: margins.bandwidth[key])
-        row = ("bandwidth", asked.bandwidth, margins.bandwidth[narrow], "rad/s", BANDWIDTHS[narrow])
-        rows.append(Requirement(*row))
-    if margins.robust is not None:
-        rows.append(
-            Requirement("margin", asked.margin, margins.robust.lower or 0.0, "1", "proven over the travel")
-        )
-    return tuple(rows)
+    return combine(spec, places), ()

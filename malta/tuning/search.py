@@ -1,4 +1,4 @@
-"""What every search of a design's numbers has: requirements, trials and their journal, the cube, the file.
+"""What every search of a design's numbers has: trials, their journal, and the cube that they are points of.
 
 The numbers of [search] are the unit cube, by their logarithms. Values are rounded to five digits before they are tried,
 so that the file that is written has the figures that were found. Every trial is kept in a journal. A search that was
@@ -9,66 +9,30 @@ from __future__ import annotations
 
 import itertools
 import json
-import math
-import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-import tomlkit
 from scipy import optimize, sparse
-from tomlkit.items import Item
 
 from malta.errors import InputError
 from malta.files import read_file
 from malta.model.linearize import linearize
 from malta.synthesis.lqg import synthesize
+from malta.synthesis.requirements import requirements_for
 
 if TYPE_CHECKING:
     from malta.model.linearize import LinearModel
-    from malta.model.plant import FloatArray
+    from malta.model.plant import FloatArray, Plant
     from malta.synthesis.controller import Controller
     from malta.synthesis.spec import Spec
 
 Progress = Callable[[float], None]
 DIGITS = 5  # significant, of what is tried and written
 UNSTABLE = 1e3  # ratio that stands for no figures at all
-MORE = ("margin", "bandwidth", "payload", "lift_off")  # asked for from below
-
-
-class Requirement(NamedTuple):
-    """What is asked for and what was found, SI."""
-
-    name: str
-    asked: float | None  # None: as little as the others leave
-    found: float
-    unit: str
-    how: str  # where the figure comes from
-
-    @property
-    def ratio(self) -> float:
-        """How near its limit: at most 1 where it holds."""
-        asked = math.inf if self.asked is None else self.asked
-        return ratio_of(self.name, asked, self.found)
-
-    @property
-    def more(self) -> bool:
-        """Asked for from below."""
-        return self.name in MORE
-
-    @property
-    def holds(self) -> bool:
-        return self.ratio <= 1
-
-    def __str__(self) -> str:
-        unit = "" if self.unit == "1" else f" {self.unit}"
-        if self.asked is None:
-            return f"{self.name} is {self.found:.4g}{unit}, asked for little"
-        bound = "at least" if self.more else "at most"
-        return f"{self.name} is {self.found:.4g}{unit}, asked for {bound} {self.asked:.4g}{unit}"
 
 
 class Trial(NamedTuple):
@@ -79,26 +43,6 @@ class Trial(NamedTuple):
     figures: Mapping[str, float]
 
 
-@dataclass(frozen=True, eq=False)
-class Tuned:
-    """What a search found."""
-
-    spec: Spec  # with the weights that were found
-    trial: Trial
-    requirements: tuple[Requirement, ...]
-    front: tuple[Trial, ...]  # by margin: least bearing force noise, least motion; and the trial itself
-    trials: int
-
-    @property
-    def reached(self) -> bool:
-        return all(r.holds for r in self.requirements)
-
-    @property
-    def binding(self) -> Requirement:
-        """What is nearest to its limit, or furthest beyond it."""
-        return max(self.requirements, key=lambda r: r.ratio)
-
-
 class Effort(NamedTuple):
     """How long to search."""
 
@@ -107,54 +51,36 @@ class Effort(NamedTuple):
     front: int = 40  # and of each point of the front
 
 
-def found_spec(spec: Spec, trial: Trial) -> Spec:
-    """The design with the numbers of a trial."""
-    return replace(spec.varied(trial.values), delay=trial.delay)
+def apply_trial(spec: Spec, trial: Trial) -> Spec:
+    """Return the design with the numbers of a trial."""
+    return replace(spec.vary(trial.values), delay=trial.delay)
 
 
-def synthesized(spec: Spec) -> tuple[LinearModel, Controller]:
-    """The model at the design's operating point, and its controller."""
+def model_and_controller(spec: Spec) -> tuple[LinearModel, Controller]:
+    """Linearize the machine at the design's operating point, and synthesize the controller."""
     model = linearize(spec.plant, spec.plant.at(**spec.operating_point))
     return model, synthesize(spec, model)
 
 
-# ---------------------------------------------------------------------------------------------------------------------
-# Figures
-# ---------------------------------------------------------------------------------------------------------------------
+def at_least_of(plant: Plant) -> frozenset[str]:
+    """Name the requirements that bound from below."""
+    return frozenset(name for name, r in requirements_for(plant).items() if r.at_least)
 
 
-def covariance(A: FloatArray, W: FloatArray) -> FloatArray:
-    """X = A X A' + W by doubling; slow poles next to 1 take some thirty steps."""
-    X, A = W, A.copy()
-    for _ in range(60):
-        more = A @ X @ A.T
-        X, A = X + more, A @ A
-        if np.abs(np.diag(more)).max() <= 1e-12 * np.abs(np.diag(X)).max():
-            break
-    return X
+def base_of(figure: str) -> str:
+    """Return the requirement that a figure belongs to: "noise_motion" of "noise_motion x"."""
+    return figure.partition(" ")[0]
 
 
-def ratio_of(name: str, asked: float, found: float) -> float:
-    if not math.isfinite(found):
-        return math.inf
-    if name in MORE:
-        return asked / found if found > 0 else math.inf
-    return found / asked
-
-
-def merged(parts: Sequence[Mapping[str, float]]) -> dict[str, float]:
-    """The worst of every figure; none where one part has none."""
+def merge(parts: Sequence[Mapping[str, float]], at_least: Collection[str]) -> dict[str, float]:
+    """Take the worst of every figure: the smallest of those that `at_least` names; none where one part has none."""
     if not all(parts):
         return {}
     names = dict.fromkeys(name for part in parts for name in part)
     return {
-        name: (min if name in MORE else max)(part[name] for part in parts if name in part) for name in names
+        name: (min if base_of(name) in at_least else max)(part[name] for part in parts if name in part)
+        for name in names
     }
-
-
-# ---------------------------------------------------------------------------------------------------------------------
-# The search
-# ---------------------------------------------------------------------------------------------------------------------
 
 
 def _text(path: Path) -> str:
@@ -202,9 +128,11 @@ class Journal:
             raise InputError(path, "", found, "a place to keep the trials") from error
 
     def expect(self, trials: int, progress: Progress | None) -> None:
+        """Set how many trials there will be, and who is told of their share."""
         self.expected, self.progress = trials, progress
 
     def get(self, key: str, compute: Callable[[], dict[str, float]]) -> dict[str, float]:
+        """Return the figures of a trial: those of the journal, or computed ones, which the journal then holds."""
         if key not in self.known:
             self.known[key] = compute()
             if self.path is not None:
@@ -216,8 +144,8 @@ class Journal:
         return self.known[key]
 
 
-def rounded(value: float) -> float:
-    """To the digits that a file is written with."""
+def round_off(value: float) -> float:
+    """Round a number to the digits that a file is written with."""
     return float(f"{value:.{DIGITS}g}")
 
 
@@ -244,20 +172,20 @@ class Search:
         self.others = [spec.value_of(v) for v in spec.search]
 
     def values(self, u: FloatArray) -> tuple[float, ...]:
-        """Numbers of the file at a point of the unit cube."""
+        """Return the numbers of the file at a point of the unit cube."""
         sizes = np.exp(self.low + np.clip(u, 0, 1) * self.width)
-        return tuple(rounded(float(size)) for size in sizes)
+        return tuple(round_off(float(size)) for size in sizes)
 
     def figures(self, u: FloatArray) -> dict[str, float]:
-        """What a point of the cube gives; none where its loop is unstable."""
-        every = [rounded(value) if i in self.among else value for i, value in enumerate(self.others)]
+        """Return the figures of a point of the cube; none where its loop is unstable."""
+        every = [round_off(value) if i in self.among else value for i, value in enumerate(self.others)]
         for index, value in zip(self.variables, self.values(u), strict=True):
             every[index] = value
         key = f"{self.among} {self.delay} {tuple(every[i] for i in self.among)}"
-        return self.journal.get(key, lambda: self.compute(self.spec.varied(every)))
+        return self.journal.get(key, lambda: self.compute(self.spec.vary(every)))
 
-    def evolved(self, goal: Callable[[FloatArray], float], generations: int) -> FloatArray:
-        """The region: differential evolution from a Latin hypercube with the file's own numbers in it."""
+    def evolve(self, goal: Callable[[FloatArray], float], generations: int) -> FloatArray:
+        """Find the region: differential evolution from a Latin hypercube with the file's own numbers in it."""
         if not (generations and len(self.low)):
             return self.start
         rng = np.random.default_rng(0)
@@ -273,8 +201,8 @@ class Search:
         best: FloatArray = np.asarray(found.x, dtype=float)
         return best
 
-    def polished(self, goal: Callable[[FloatArray], float], u: FloatArray, trials: int) -> FloatArray:
-        """The place: Nelder-Mead from steps of 5 % of a decade or so."""
+    def polish(self, goal: Callable[[FloatArray], float], u: FloatArray, trials: int) -> FloatArray:
+        """Find the place: Nelder-Mead from steps of 5 % of a decade or so."""
         if not (trials and len(u)):
             return u
         simplex = np.vstack([u, u + np.diag(np.where(u < 0.5, 1, -1) * 0.1 / self.width)])
@@ -286,21 +214,21 @@ class Search:
         return best
 
 
-def outside(u: FloatArray) -> float:
-    """How far a point is from the unit cube."""
+def distance_outside(u: FloatArray) -> float:
+    """Measure how far a point lies outside the unit cube, as a sum over its coordinates."""
     return float(np.abs(u - np.clip(u, 0, 1)).sum())
 
 
-def joined(touched: Sequence[set[int]], groups: int) -> list[tuple[tuple[int, ...], tuple[int, ...]]]:
-    """What can be searched by itself: variables, and the groups that they touch and no other variable does.
+def separate(touched: Sequence[set[int]], groups: int) -> list[tuple[tuple[int, ...], tuple[int, ...]]]:
+    """Find what can be searched by itself: variables, and the groups that they touch and no other variable does.
 
     Groups that none touches stand together, with no variables.
     """
-    together = np.eye(groups, dtype=bool)
+    joined = np.eye(groups, dtype=bool)
     for one in (*touched, set(range(groups)).difference(*touched)):
         for a, b in itertools.combinations(sorted(one), 2):
-            together[a, b] = True
-    count, label = sparse.csgraph.connected_components(together, directed=False)
+            joined[a, b] = True
+    count, label = sparse.csgraph.connected_components(joined, directed=False)
     found = []
     for c in range(count):
         members = tuple(k for k in range(groups) if label[k] == c)
@@ -308,46 +236,11 @@ def joined(touched: Sequence[set[int]], groups: int) -> list[tuple[tuple[int, ..
     return found
 
 
-def together(spec: Spec, places: Sequence[tuple[Search, FloatArray]]) -> Trial:
-    """One trial of what the searches of a design's parts have found."""
-    values = [rounded(spec.value_of(v)) for v in spec.search]
+def combine(spec: Spec, places: Sequence[tuple[Search, FloatArray]]) -> Trial:
+    """Make one trial of the places that the searches of a design's parts ended at."""
+    values = [round_off(spec.value_of(v)) for v in spec.search]
     for search, u in places:
         for index, value in zip(search.variables, search.values(u), strict=True):
             values[index] = value
-    figures = merged([search.figures(u) for search, u in places])
+    figures = merge([search.figures(u) for search, u in places], at_least_of(spec.plant))
     return Trial(tuple(values), places[0][0].delay, figures)
-
-
-# ---------------------------------------------------------------------------------------------------------------------
-# The file
-# ---------------------------------------------------------------------------------------------------------------------
-
-
-def design_text(spec: Spec, trial: Trial, target: Path) -> str:
-    """Write the text of the design file with the numbers of a trial, for another folder.
-
-    Comments, the order of keys and all other values stay as they stand in spec.path.
-    """
-    document = tomlkit.parse(spec.path.read_text(encoding="utf-8"))
-    document["machine"] = Path(
-        os.path.relpath(spec.machine_file.resolve(), target.resolve().parent)
-    ).as_posix()
-    if spec.pid is None:
-        document["delay"] = trial.delay
-    for variable, value in zip(spec.search, trial.values, strict=True):
-        for entry in variable.entries:
-            *tables, name = entry.split(".")
-            table: Any = document
-            for key in tables:
-                table = table[key]
-            if isinstance(table[name], dict):
-                table[name]["value"] = _number(value)
-                table[name]["unit"] = variable.unit
-            else:
-                table[name] = _number(value)
-    return tomlkit.dumps(document)
-
-
-def _number(value: float) -> Item:
-    """A number as the file shall hold it, in as many digits as were tried."""
-    return tomlkit.value(f"{value:.{DIGITS}g}")

@@ -1,6 +1,6 @@
 """Specification -> design: the numbers of [search] that reach what a design file asks for in [specification].
 
-The weights of an LQG are searched by `tune_lqg`, the gains of a PID by `tune_pid`; what is found is judged as the file
+The weights of an LQG are searched by tuning.lqg, the gains of a PID by tuning.pid; what is found is judged as the file
 that will be written.
 """
 
@@ -8,26 +8,41 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING
 
 from malta.errors import InputError
-from malta.synthesis.spec import Specification
-from malta.tuning import lqg as tune_lqg
-from malta.tuning import pid as tune_pid
-from malta.tuning.search import (
-    DIGITS,
-    Effort,
-    Journal,
-    Tuned,
-    found_spec,
-)
+from malta.tuning import groups, lqg, pid
+from malta.tuning.outcomes import judge
+from malta.tuning.search import DIGITS, Effort, Journal, apply_trial
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from malta.synthesis.spec import Spec
-    from malta.tuning.search import Progress, Requirement
+    from malta.tuning.outcomes import Outcome
+    from malta.tuning.search import Progress, Trial
+
+
+@dataclass(frozen=True, eq=False)
+class Tuned:
+    """What a search found."""
+
+    spec: Spec  # with the weights that were found
+    trial: Trial
+    requirements: tuple[Outcome, ...]
+    front: tuple[Trial, ...]  # by margin: least bearing force noise, least motion; and the trial itself
+    trials: int
+
+    @property
+    def reached(self) -> bool:
+        """Whether every requirement holds."""
+        return all(r.holds for r in self.requirements)
+
+    @property
+    def binding(self) -> Outcome:
+        """What is nearest to its limit, or furthest beyond it."""
+        return max(self.requirements, key=lambda r: r.ratio)
 
 
 def tune(
@@ -44,29 +59,24 @@ def tune(
 
     Raises InputError when the design file asks for nothing or lets nothing vary, or the journal is another search's.
     """
-    if spec.specification == Specification():
+    if not spec.specification:
         raise InputError(spec.path, "specification", "nothing", "a table of what the design shall reach")
     if not spec.search:
         raise InputError(spec.path, "search", "nothing", "a table of the numbers that may vary")
-    kept = Journal(journal, problem_sha256(spec), restart=restart)
-    searched = tune_pid.searched if spec.pid else tune_lqg.searched
-    trial, front = searched(spec, kept, effort, progress)
-    chosen = found_spec(spec, trial)
-    requirements = judged(chosen)
+    trials = Journal(journal, problem_sha256(spec), restart=restart)
+    search = pid.search_gains if spec.pid else lqg.search_weights
+    trial, front = search(spec, trials, effort, progress)
+    chosen = apply_trial(spec, trial)
+    requirements = judge(chosen)
     if progress is not None:
         progress(1.0)
-    return Tuned(chosen, trial, requirements, front, len(kept.known))
-
-
-def judged(spec: Spec) -> tuple[Requirement, ...]:
-    """Every requirement of a design, and what it has."""
-    return tune_pid.judged(spec) if spec.pid else tune_lqg.judged(spec)
+    return Tuned(chosen, trial, requirements, front, len(trials.known))
 
 
 def problem_sha256(spec: Spec) -> str:
-    """Of everything that the figures of a trial depend on, and of what is searched."""
-    asked, searched = asdict(spec.specification), (spec.search, spec.delays)
+    """Digest everything that the figures of a trial depend on, and what is searched."""
+    asked, searched = dict(spec.specification), (spec.search, spec.delays)
     loads = asdict(spec.loads) if spec.loads else None
-    settings = (tune_lqg.FRONT, DIGITS, tune_lqg.STEP)
+    settings = (lqg.FRONT, DIGITS, groups.STEP)
     content = [repr(spec.parameters), asked, loads, searched, spec.sha256, *settings]
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()

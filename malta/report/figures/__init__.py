@@ -28,7 +28,6 @@ from malta.model.machines import attribute_of
 from malta.model.signals import (
     KINDS,
     Group,
-    inputs_of,
     outputs_of,
 )
 from malta.report.figures.campaign import distributions_figure as distributions_figure
@@ -44,6 +43,7 @@ from malta.report.figures.parts import (
     line,
     micro,
     page,
+    traded,
 )
 from malta.report.figures.parts import MORE as MORE
 from malta.report.figures.parts import POINTS as POINTS
@@ -56,7 +56,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from malta.tuning.search import Tuned
+    from malta.tuning.tune import Tuned
 
 
 def experiment_figure(e: Experiment, published: Published | None = None) -> Figure:
@@ -194,14 +194,8 @@ def front_figure(tuned: Tuned) -> Figure:
     figure.suptitle(f"{tuned.spec.name}: margin against noise", fontsize=11, y=0.985)
     figure.text(0.5, 0.925, found, fontsize=9, color="#4a4a4a", ha="center", va="top")
     margins = [100 * one.figures["margin"] for one in others]
-    plant = tuned.spec.plant
-    thrust, *efforts = (group.name for group in inputs_of(plant))
-    along, *across = (group.name for group in outputs_of(plant))
     panels: Any = figure.subplots(1, 2)
-    sides = (
-        (("force_noise", " ".join(efforts[:1]), 1.0, 0), ("thrust_noise", thrust, 1.0, 2)),
-        (("radial_motion", " ".join(across[:1]), 1e6, 0), ("axial_motion", along, 1e6, 2)),
-    )
+    sides = (traded(tuned.spec.plant, taken.figures, trade) for trade in ("force", "motion"))
     for axes, lines, y in zip(
         panels, sides, ("noise of the force [N rms]", "true motion [µm rms]"), strict=True
     ):
@@ -209,7 +203,7 @@ def front_figure(tuned: Tuned) -> Figure:
         axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
         axes.yaxis.set_major_formatter("{x:g}")
         axes.yaxis.set_minor_formatter("")
-        for name, label, scale, style in lines:
+        for (name, label, scale, _), style in zip(lines, cycle((0, 2, 1)), strict=False):
             if not all(name in one.figures for one in front):
                 continue
             sizes = [scale * one.figures[name] for one in others]
@@ -217,8 +211,8 @@ def front_figure(tuned: Tuned) -> Figure:
             where = 100 * taken.figures["margin"], scale * taken.figures[name]
             ring = {"markersize": 9, "markerfacecolor": "none", "markeredgecolor": STYLES[style]["color"]}
             axes.plot(*where, **DOT | ring)
-        if asked.margin is not None:
-            axes.axvline(100 * asked.margin, **BOUND)
+        if "margin" in asked:
+            axes.axvline(100 * asked["margin"], **BOUND)
         finish(axes, "robust margin over the travel, proven [% of the box]", y, legend=2)
         axes.margins(x=0.04)
     return figure

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import casadi as ca
@@ -13,6 +13,7 @@ import numpy as np
 from malta.model.data import in_unit, published_value
 from malta.model.plant import Plant
 from malta.simulation.simulate import Trajectory
+from malta.synthesis.requirements import requirements_for
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -274,3 +275,27 @@ def told(cases: Sequence[Case], which: int) -> str:
 def micro(text: str) -> str:
     """um as µm."""
     return re.sub(r"\bu(?=(?:rad|[msANV])\b)", "µ", text)
+
+
+UNITS = {
+    "m": (1e6, "um"),
+    "rad": (1e6, "urad"),
+    "m s^0.5": (1e6, "um s^0.5"),
+    "rad s^0.5": (1e6, "urad s^0.5"),
+    "rad/s": (1.0, "rad/s"),
+    "N": (1.0, "N"),
+    "N m": (1.0, "N m"),
+    "kg": (1.0, "kg"),
+}
+
+
+def traded(plant: Plant, names: Iterable[str], trade: str) -> list[tuple[str, str, float, str]]:
+    """List those figures of a Pareto front that are noise of the "force", or "motion": name, label, factor, unit."""
+    known, found = requirements_for(plant), []
+    for name in names:
+        base, _, signal = name.partition(" ")
+        if base in known and known[base].trade == trade:
+            r = known[base]
+            unit = next((s.unit for s in r.signals(plant) if s.name == signal), r.unit)
+            found.append((name, signal or r.heading, *UNITS[unit]))
+    return found

@@ -1,0 +1,108 @@
+"""What MALTA's designs can be asked for, beside what every machine can: rest, strokes, tilts, payload and lift-off."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from functools import lru_cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from malta.simulation.simulate import Scenario, stroke_figures
+from malta.synthesis.requirements import (
+    Design,
+    Figure,
+    Requirement,
+    TrialLoop,
+    force_noise_of,
+    merit_of,
+    motion_of,
+)
+
+if TYPE_CHECKING:
+    from malta.model.plant import Plant
+
+DRIVE = "K_D"  # the force constant of the drive, which scales the thrust and no other force
+DRIVE_ERROR = 0.05  # of the drive's force constant, in the strokes of tracking_error
+TILT, TILTING = 200e-6, 2.0  # m, Hz: the tilt of the experiment
+SIGMAS = 4.5  # the largest of 10 000 samples
+
+
+def _radial(plant: Plant) -> list[int]:
+    return [k for k in range(len(plant.outputs)) if k != plant.stroke_output]
+
+
+def _axial(plant: Plant) -> list[int]:
+    return [plant.stroke_output]
+
+
+def _bearings(plant: Plant) -> list[int]:
+    return [k for k in range(len(plant.inputs)) if k != plant.thrust_input]
+
+
+def _thrust(plant: Plant) -> list[int]:
+    return [plant.thrust_input]
+
+
+@lru_cache(maxsize=1)  # two requirements ask for it; designs compare by identity, so no hit is stale
+def _strokes(design: Design) -> tuple[float, float]:
+    """The largest tracking error and radial deviation, m, of strokes with too weak and too strong a drive."""
+    par, worst = design.plant.parameters, np.zeros(2)
+    for share in (1 - DRIVE_ERROR, 1 + DRIVE_ERROR):
+        other = replace(par, **{DRIVE: share * getattr(par, DRIVE)})
+        run = design.simulate(other, Scenario.stroke(noise=1.0, quantize=True))
+        if not run.verdict.completed:
+            return math.inf, math.inf
+        figures = stroke_figures(run)
+        worst = np.maximum(worst, (figures.axial_error, max(figures.radial.values())))
+    axial, radial = worst.tolist()
+    return axial, radial
+
+
+def _of_strokes(index: int) -> Callable[[Design, float, str], list[Figure]]:
+    def measure(design: Design, _asked: float, _signal: str) -> list[Figure]:
+        return [Figure(_strokes(design)[index], f"strokes with {DRIVE} {100 * DRIVE_ERROR:g} % off")]
+
+    return measure
+
+
+def _tilt_estimate(loop: TrialLoop, _signal: str) -> float | None:
+    """How far the other sensor planes move, m, while the first follows the tilt's circle and they are held still.
+
+    Beside it SIGMAS times the motion at rest.
+    """
+    if len(loop.outputs) == 1 or loop.plant.stroke_output in loop.outputs:
+        return None
+    half, motion = len(loop.model.A) // 2, SIGMAS * float(loop.noise.motion.max())
+    C = loop.model.C[:, :half]
+    if C.shape[0] != half:
+        return motion
+    p, rate = TILT * np.eye(half)[0], 2 * math.pi * TILTING
+    q = np.linalg.solve(C, p)
+    moved = loop.follow(rate, p, np.concatenate([q, 1j * rate * q]))
+    return float(np.abs(moved[1:]).max()) + motion
+
+
+def _payload(design: Design, asked: float, _signal: str) -> list[Figure]:
+    picked = design.fly("payload", masses=(asked,))
+    return [Figure(asked if picked.cases[0].run.verdict.completed else 0.0, "hold and stroke")]
+
+
+def _lift_off(design: Design, _asked: float, _signal: str) -> list[Figure]:
+    return [Figure(float(not design.fly("lift-off").failed), "every estimator")]
+
+
+REQUIREMENTS = (
+    motion_of("radial_motion", _radial, "radial"),
+    motion_of("axial_motion", _axial, "axial"),
+    force_noise_of("force_noise", _bearings, "bearing force"),
+    force_noise_of("thrust_noise", _thrust, "thrust"),
+    Requirement("tracking_error", _of_strokes(0), "m"),
+    Requirement("radial_deviation", _of_strokes(1), "m"),
+    # of the sensor plane that a tilt holds
+    merit_of("tilt_deviation", "tilt", "m", "tilt, either feedforward", estimate=_tilt_estimate),
+    Requirement("payload", _payload, "kg", at_least=True),  # picked up and carried through the stroke
+    Requirement("lift_off", _lift_off, at_least=True, form="switch"),  # from rest, by every estimator
+)

@@ -1,0 +1,330 @@
+"""Design files: design/NAME.toml -> read_design() -> Spec.
+
+Wherever numbers are expected, `{ published = "table_II.state" }` stands for what the machine's paper prints under that
+name in data/published/. What `malta tune` is to reach and what it may vary stand in [specification] and [search], and
+what it makes small for a PID in [cost]; they shape no gains by themselves.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import cache, partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from malta.errors import CheckError, InputError
+from malta.model.data import (
+    Quantity,
+    load_toml,
+    plant_of,
+    published,
+    read,
+    to_si,
+    units_of,
+    validated,
+)
+from malta.model.plant import Plant, Signal
+from malta.synthesis.design_tables import (
+    DesignFile,
+    PidTable,
+    SearchTable,
+    specification_table,
+)
+from malta.synthesis.quantities import bases, numbers, ordered, positive, variances
+from malta.synthesis.requirements import Requirement, requirements_for
+from malta.synthesis.spec import (
+    Loads,
+    Pid,
+    Spec,
+    Variable,
+    Weights,
+    pid_signals,
+    place_of,
+)
+
+if TYPE_CHECKING:
+    from malta.model.plant import FloatArray
+
+
+def read_design(path: str | Path) -> Spec:
+    """Read a design file as design/table2.toml, and the data of the machine that it names.
+
+    Raises InputError, naming file and field, for anything missing, unknown, of a wrong unit or out of range.
+    """
+    path = Path(path)
+    raw = load_toml(path)
+    machine = raw.get("machine")
+    if not isinstance(machine, str):
+        found = "nothing" if machine is None else repr(machine)
+        raise InputError(path, "machine", found, "the path of the machine's data file")
+    machine_file = Path(os.path.normpath(path.parent / machine))
+    printed = cache(partial(published, machine_file))  # read once, and only where something refers to it
+    content = validated(DesignFile, _resolve(raw, printed, machine_file, path), path)
+    _require_law(content, raw, path)
+    par = read(machine_file, content.preset)
+    try:
+        plant = plant_of(par)
+    except CheckError as error:
+        raise InputError(path, "preset", str(error), "a machine that can be controlled") from error
+    for name in content.uncertainty:
+        if name not in units_of(par):
+            raise InputError(path, f"uncertainty.{name}", "an unknown parameter", ", ".join(units_of(par)))
+    spec = Spec(
+        name=content.name,
+        summary=content.summary,
+        path=path,
+        machine_file=machine_file,
+        sha256=_fingerprint(content),
+        parameters=par,
+        operating_point=_operating_point(content.operating_point, plant, path),
+        sample_time=_sample_time(content, path),
+        discretization=content.discretization,
+        delay=content.delay,
+        current_loop_delay=content.current_loop_delay,
+        law=_law(content, plant, path),
+        uncertainty=dict(content.uncertainty),
+    )
+    return replace(
+        spec,
+        loads=_loads(content, spec),
+        specification=_specification(content, spec),
+        **_search(content.search, raw, spec),
+    )
+
+
+def _fingerprint(content: DesignFile) -> str:
+    """SHA-256 of all that shapes the design."""
+    other = {"summary", "machine", "cost", "specification", "search"}
+    shaping = json.dumps(content.model_dump(exclude=other, exclude_none=True), sort_keys=True)
+    return hashlib.sha256(shaping.encode()).hexdigest()
+
+
+def _sample_time(content: DesignFile, path: Path) -> float:
+    """In s. InputError for none, and for a delay that the discretization does not know."""
+    Ts = to_si(content.sample_time.value, content.sample_time.unit, "s", path, "sample_time")
+    if not Ts > 0:
+        raise InputError(path, "sample_time", f"{Ts:g} s", "more than 0 s")
+    if content.delay and content.discretization == "backward-euler":
+        found = f"{content.delay} with backward-euler, which has none"
+        raise InputError(path, "delay", found, "0, or zoh or sampled-data")
+    return Ts
+
+
+def _law(content: DesignFile, plant: Plant, path: Path) -> Weights | Pid:
+    try:
+        return _weights(content, plant, path) if content.pid is None else _pid(content.pid, plant, path)
+    except InputError as error:  # the record does not know the file
+        raise InputError(path, error.field, error.found, error.expected) from error
+
+
+LQG = ("discretization", "delay", "weights", "bases", "noise")
+
+
+def _require_law(content: DesignFile, raw: Mapping[str, Any], path: Path) -> None:
+    """InputError unless the file describes an LQG or a PID, whole and alone."""
+    for name in LQG:
+        if content.pid is None and name not in raw:
+            raise InputError(path, name, "nothing", "this key")
+        if content.pid is not None and name in raw:
+            raise InputError(path, name, "this key beside [pid]", "one of them: an LQG, or a PID")
+
+
+def _weights(content: DesignFile, plant: Plant, path: Path) -> Weights:
+    states, inputs, outputs = plant.design_states, plant.inputs, plant.outputs
+    integrals = [Signal(s.name, f"{s.unit} s") for s in outputs]
+    q, base, noise = content.weights, content.bases, content.noise
+    assert q is not None
+    assert base is not None
+    assert noise is not None
+    drift = {}
+    if noise.drift is not None:
+        drift["drift_variance"] = variances(noise.drift, inputs, path, "noise.drift", "inputs")
+    return Weights(
+        q=numbers(q.state, states, path, "weights.state", "states"),
+        q_base=bases(base.state, states, path, "bases.state", "states"),
+        r=numbers(q.input, inputs, path, "weights.input", "inputs", above=True),
+        r_base=bases(base.input, inputs, path, "bases.input", "inputs"),
+        q_i=numbers(q.integral, outputs, path, "weights.integral", "measured signals"),
+        q_i_base=bases(base.integral, integrals, path, "bases.integral", "measured signals"),
+        process_variance=variances(noise.process, inputs, path, "noise.process", "inputs"),
+        sensor_variance=variances(noise.sensor, outputs, path, "noise.sensor", "measured signals"),
+        **drift,
+    )
+
+
+def _pid(table: PidTable, plant: Plant, path: Path) -> Pid:
+    gains = {}
+    for name, signals in pid_signals(plant).items():
+        entries = ordered(getattr(table, name), signals, path, f"pid.{name}", "inputs")
+        gains[name] = np.array(
+            [
+                to_si(q.value, q.unit, s.unit, path, f"pid.{name}.{s.name}")
+                for q, s in zip(entries, signals, strict=True)
+            ]
+        )
+    return Pid(**gains, filter=to_si(table.filter.value, table.filter.unit, "s", path, "pid.filter"))
+
+
+def _loads(content: DesignFile, spec: Spec) -> Loads | None:
+    """What a PID is judged by, in SI. Noise that is not given: none of forces, the machine's own of sensors."""
+    table, path, plant, terms = content.cost, spec.path, spec.plant, spec.pid
+    if table is None:
+        return None
+    if terms is None:
+        raise InputError(
+            path, "cost", "this table without [pid]", "the weights of an LQG, which are its cost"
+        )
+    for signal, gain in zip(plant.inputs, terms.Ki, strict=True):
+        if not gain:
+            expected = "an integral gain, as a constant force leaves an error without one"
+            raise InputError(path, "cost.load", f"pid.Ki.{signal.name} of 0", expected)
+    force: FloatArray = np.zeros(len(plant.inputs))
+    if table.force_noise is not None:
+        force = bases(table.force_noise, plant.inputs, path, "cost.force_noise", "inputs")
+    sensor: FloatArray = np.sqrt(np.square(plant.noise) + np.square(plant.resolution) / 12)
+    if table.sensor_noise is not None:
+        sensor = bases(table.sensor_noise, plant.outputs, path, "cost.sensor_noise", "measured signals")
+    load = bases(table.load, plant.inputs, path, "cost.load", "inputs")
+    return Loads(tuple(load.tolist()), tuple(force.tolist()), tuple(sensor.tolist()))
+
+
+def _specification(content: DesignFile, spec: Spec) -> dict[str, float]:
+    """What is asked for, in SI; InputError for what no design could reach or what contradicts itself."""
+    table, path = content.specification, spec.path
+    if table is None:
+        return {}
+    law = "PID" if spec.pid else "LQG"
+    known = requirements_for(spec.plant)
+    able = {name: r for name, r in known.items() if law in r.laws}
+    for name in table:
+        if name in known and name not in able:
+            other = " or ".join(f"an {one}" if one == "LQG" else f"a {one}" for one in known[name].laws)
+            raise InputError(path, f"specification.{name}", f"a requirement of {other}", " ".join(able))
+        if name not in known:
+            raise InputError(path, f"specification.{name}", "an unknown requirement", " ".join(able))
+    given = specification_table(able.values(), table, path)
+    asked: dict[str, float] = {}
+    for name, requirement in able.items():
+        asked |= _bounds(requirement, getattr(given, name), spec)
+    if not asked:
+        raise InputError(path, "specification", "nothing to reach", "at least one of " + " ".join(able))
+    _require_possible(asked, spec)
+    return asked
+
+
+def _bounds(requirement: Requirement, given: Any, spec: Spec) -> dict[str, float]:
+    """The bounds of one requirement, in SI, by its name and, where it bounds signals, the signal's."""
+    name = requirement.name
+    field = f"specification.{name}"
+    if given is None or given is False:
+        return {}
+    if isinstance(given, Quantity):
+        si = to_si(given.value, given.unit, requirement.unit, spec.path, field)
+        return {name: positive(si, spec.path, field, requirement.unit)}
+    if not isinstance(given, Mapping):
+        return {name: float(given)}
+    units = {s.name: s.unit for s in requirement.signals(spec.plant)}
+    bounds = {}
+    for signal, q in given.items():
+        where = f"{field}.{signal}"
+        if signal not in units:
+            raise InputError(spec.path, where, "an unknown signal", "one of " + " ".join(units))
+        si = to_si(q.value, q.unit, units[signal], spec.path, where)
+        bounds[f"{name} {signal}"] = positive(si, spec.path, where, units[signal])
+    return bounds
+
+
+def _require_possible(asked: Mapping[str, float], spec: Spec) -> None:
+    """InputError for a margin that takes a parameter to zero, and a bandwidth beyond half of sampling."""
+    path, margin, bandwidth = spec.path, asked.get("margin"), asked.get("bandwidth")
+    if margin is not None:
+        if not spec.uncertainty:
+            raise InputError(path, "specification.margin", "no uncertainty in the file", "its parameters")
+        widest = max(spec.uncertainty, key=lambda name: spec.uncertainty[name])
+        most = 1 / spec.uncertainty[widest]
+        if margin >= most:
+            expected = f"less than {most:g}, where {widest} is zero"
+            raise InputError(path, "specification.margin", f"{margin:g}", expected)
+    nyquist = math.pi / spec.sample_time
+    if bandwidth is not None and bandwidth >= nyquist:
+        expected = f"less than half of sampling, {nyquist:.0f}"
+        raise InputError(path, "specification.bandwidth", f"{bandwidth:g} rad/s", expected)
+
+
+def _search(table: SearchTable | None, raw: Mapping[str, Any], spec: Spec) -> dict[str, Any]:
+    """Variables and delays. An entry belongs to one variable, and stands in the file as a number of its own."""
+    if table is None:
+        return {}
+    path, seen, variables = spec.path, set[str](), []
+    for name, given in table.numbers.items():
+        where = f"search.numbers.{name}"
+        for entry in given.vary:
+            _, _, unit, _ = place_of(entry, spec.plant, path, f"{where}.vary")
+            if unit == "1" and given.unit != "1":
+                raise InputError(path, f"{where}.unit", repr(given.unit), f"no unit, as {entry} has none")
+            if unit != "1":
+                to_si(1.0, given.unit, unit, path, where)
+            if not _stands(entry, raw):
+                expected = "a number of the file itself, not SI or published"
+                raise InputError(path, f"{where}.vary", f"{entry}, which is none", expected)
+            if entry in seen:
+                raise InputError(path, f"{where}.vary", f"{entry} a second time", "each entry once")
+            seen.add(entry)
+        if not given.low < given.high:
+            raise InputError(path, where, f"{given.low:g} to {given.high:g}", "low below high")
+        variables.append(Variable(name, tuple(given.vary), given.low, given.high, given.unit))
+    if not variables:
+        raise InputError(path, "search.numbers", "nothing to vary", "at least one number")
+    if table.delay and spec.pid is not None:
+        raise InputError(path, "search.delay", str(table.delay), "none, as a PID has no model of a delay")
+    if any(table.delay) and spec.discretization == "backward-euler":
+        raise InputError(path, "search.delay", str(table.delay), "0 with backward-euler, which has no delay")
+    return {"search": tuple(variables), "delays": tuple(dict.fromkeys(table.delay)) or (spec.delay,)}
+
+
+def _stands(entry: str, raw: Mapping[str, Any]) -> bool:
+    node: Any = raw
+    for key in entry.split("."):
+        node = node.get(key) if isinstance(node, Mapping) else None
+    return node is not None and (not isinstance(node, Mapping) or "value" in node)
+
+
+def _resolve(
+    node: Any, printed: Callable[[], dict[str, Any]], machine_file: Path, where: Path, field: str = ""
+) -> Any:
+    """Put the published numbers in the place of every `{ published = "..." }`."""
+    if isinstance(node, dict):
+        if set(node) == {"published"}:
+            found: Any = printed()
+            for key in str(node["published"]).split("."):
+                if not isinstance(found, dict) or key not in found:
+                    source = machine_file.parent / "published" / machine_file.name
+                    raise InputError(where, field, repr(node["published"]), f"a table of {source}")
+                found = found[key]
+            return found
+        return {
+            k: _resolve(v, printed, machine_file, where, f"{field}.{k}".lstrip(".")) for k, v in node.items()
+        }
+    return node
+
+
+def _operating_point(entries: Mapping[str, Quantity], plant: Plant, where: Path) -> dict[str, float]:
+    """Along the stroke only: elsewhere v0(z) knows no equilibrium."""
+    units = {s.name: s.unit for s in plant.design_states if s.name == plant.stroke}
+    values = {}
+    for name, q in entries.items():
+        if name not in units:
+            raise InputError(
+                where, f"operating_point.{name}", "another state", f"{plant.stroke}, the stroke, alone"
+            )
+        values[name] = to_si(q.value, q.unit, units[name], where, f"operating_point.{name}")
+        if not math.isfinite(values[name]):
+            raise InputError(where, f"operating_point.{name}", str(values[name]), "a finite number")
+    return values

@@ -1,0 +1,317 @@
+"""What a design can be asked to reach: the keys of [specification].
+
+A requirement is one record: its key in the file, its unit, the side that it bounds from, how it is measured on a
+finished design, and how a search estimates it in milliseconds. GENERIC holds what every machine can be asked for. A
+machine's own stand as REQUIREMENTS in the module `requirements` of its folder, and replace generic ones of their name:
+
+    def _carried(design, asked, signal):
+        e = design.fly("payload", masses=(asked,))
+        return [Figure(asked if e.cases[0].run.verdict.completed else 0.0, "hold and stroke")]
+
+    REQUIREMENTS = (Requirement("payload", _carried, "kg", at_least=True),)
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol
+
+import numpy as np
+
+from malta.model.machines import attribute_of
+from malta.model.plant import Plant, Signal
+
+if TYPE_CHECKING:
+    from malta.model.plant import ComplexArray, FloatArray, Parameters
+    from malta.synthesis.controller import Controller
+    from malta.synthesis.lqg import Gains, Linear
+    from malta.synthesis.spec import Spec
+
+Law = Literal["LQG", "PID"]
+Form = Literal["number", "switch", "outputs", "inputs"]
+Indices = Callable[[Plant], Sequence[int]]  # of some of a plant's outputs, or inputs
+
+
+class Figure(NamedTuple):
+    """What a design has, in SI units, and the words that say where the number comes from."""
+
+    value: float
+    source: str
+
+
+class Noise(NamedTuple):
+    """Rms by output and by input: what the sensors' noise and steps leave in both."""
+
+    motion: FloatArray  # p, of the true outputs, m or rad
+    force: FloatArray  # m, of the commands, N or N m
+
+
+class Design(Protocol):
+    """A synthesized design, as a requirement measures it. What takes long is computed once, when first asked for."""
+
+    @property
+    def spec(self) -> Spec:
+        """The design as its file holds it."""
+
+    @property
+    def plant(self) -> Plant:
+        """The machine that the controller is designed for."""
+
+    @property
+    def controller(self) -> Controller:
+        """What a machine would run."""
+
+    @property
+    def margins(self) -> Any:
+        """margins.verify.Margins, with the proven robust margin where one is asked for."""
+
+    @property
+    def bandwidth(self) -> Figure:
+        """The smallest by the definitions of margins.verify, rad/s, and which one it is."""
+
+    @property
+    def noise(self) -> Noise:
+        """By the covariance of the machine's linear loop."""
+
+    @property
+    def hold(self) -> Noise:
+        """On the simulated machine at rest."""
+
+    @property
+    def load_figures(self) -> Mapping[str, float]:
+        """Of a PID under the loads of [cost]: "load_error x", "noise_motion x"."""
+
+    def __hash__(self) -> int:
+        """By identity, so that a machine's requirements may share what they compute."""
+
+    def fly(self, name: str, **options: Any) -> Any:
+        """Run an experiment of the machine by name: simulation.experiments.Experiment."""
+
+    def simulate(self, parameters: Parameters, scenario: Any) -> Any:
+        """Run a scenario on a machine with other parameters: simulation.simulate.Trajectory."""
+
+
+@dataclass(frozen=True, eq=False)
+class TrialLoop:
+    """The closed loop of a trial of the search: some outputs and inputs that nothing joins to the others.
+
+    closed = [Ad + Bd D Cd, Bd C; B Cd, A] of the sampled machine (Ad, Bd, Cd) and the law (A, B, C, D).
+    """
+
+    plant: Plant
+    sample_time: float  # s
+    outputs: tuple[int, ...]  # p of the plant's
+    inputs: tuple[int, ...]  # m of the plant's
+    model: Linear  # continuous, n states
+    gains: Gains
+    Bd: FloatArray  # of the sampled machine with hold, delay and current loops, as Cd
+    Cd: FloatArray
+    closed: FloatArray
+    noise: Noise  # p motions and m forces
+    margin: float | None  # None: not asked for
+    peak_sensitivity: float
+    bandwidth: float  # rad/s
+
+    def follow(self, w: float, p: FloatArray, x: ComplexArray) -> ComplexArray:
+        """Return the true outputs as complex amplitudes while the reference is p exp(jwt), with states x exp(jwt).
+
+        p : p outputs;  x : n states;  w : rad/s
+        """
+        g, Ts = self.gains, self.sample_time
+        xi = np.concatenate([x, np.zeros(len(g.Ad) - len(x))])
+        v = g.K @ xi + Ts * g.Ki @ p
+        driven = np.concatenate([self.Bd @ v, g.Bd @ v, Ts * p])[: len(self.closed)]
+        states = np.linalg.solve(np.exp(1j * w * Ts) * np.eye(len(self.closed)) - self.closed, driven)
+        return np.asarray(self.Cd @ states[: self.Cd.shape[1]])
+
+
+Measure = Callable[[Design, float, str], Sequence[Figure]]  # of a bound that is asked for, of a signal or ""
+Estimate = Callable[[TrialLoop, str], float | None]  # None: the loop has no such figure
+
+
+@dataclass(frozen=True, eq=False)
+class Requirement:
+    """A key of [specification].
+
+    name : as it stands in the file
+    measure : (design, bound, signal) -> figures, each of which is judged; signal is "" unless `form` is of signals
+    unit : SI; of a requirement by signal each signal's own
+    at_least : bounds from below; otherwise from above
+    laws : the kinds of controllers that can be asked for it
+    form : what the file holds: a number with its unit, true, or a table of outputs or inputs
+    above : numbers without a unit must be larger
+    estimate : (loop, signal) -> figure of a trial; None: the search does not look at it
+    needs_stability : an unstable loop has no such figure, and fails
+    trade : what the Pareto front shows it as, against the margin: noise of the force, or motion
+    heading : its words in the Pareto front, without "motion"; none: not shown, or by the signal's name
+    """
+
+    name: str
+    measure: Measure
+    unit: str = "1"
+    at_least: bool = False
+    laws: tuple[Law, ...] = ("LQG",)
+    form: Form = "number"
+    above: float = 0.0
+    estimate: Estimate | None = None
+    needs_stability: bool = True
+    trade: Literal["force", "motion"] | None = None
+    heading: str = ""
+
+    def signals(self, plant: Plant) -> tuple[Signal, ...]:
+        """Return the signals that can be bounded one by one; none for one bound of the whole machine."""
+        tables = {"outputs": tuple(plant.outputs), "inputs": tuple(plant.inputs)}
+        return tables.get(self.form, ())
+
+
+def requirements_for(plant: Plant) -> dict[str, Requirement]:
+    """List what a machine's designs can be asked for, by name: generic requirements, then the machine's own."""
+    mine: Sequence[Requirement] = attribute_of(plant, "requirements", "REQUIREMENTS", ())
+    names = {r.name for r in mine}
+    return {r.name: r for r in (*(g for g in GENERIC if g.name not in names), *mine)}
+
+
+def ratio_of(asked: float, found: float, *, at_least: bool) -> float:
+    """Return how near a figure is to its bound: at most 1 where the bound holds, infinite for no number."""
+    if not math.isfinite(found):
+        return math.inf
+    if at_least:
+        return asked / found if found > 0 else math.inf
+    return found / asked
+
+
+# --- requirements that machines make of their outputs, inputs and experiments ---
+
+
+def motion_of(name: str, outputs: Indices, heading: str) -> Requirement:
+    """Bound the true motion of some outputs at rest, rms, from the sensors' noise and steps: the worst of them."""
+
+    def measure(design: Design, _asked: float, _signal: str) -> list[Figure]:
+        return _worst(design, "motion", outputs(design.plant))
+
+    def estimate(loop: TrialLoop, _signal: str) -> float | None:
+        return _largest(loop.noise.motion, loop.outputs, outputs(loop.plant))
+
+    return Requirement(name, measure, "m", estimate=estimate, trade="motion", heading=heading)
+
+
+def force_noise_of(name: str, inputs: Indices, heading: str) -> Requirement:
+    """Bound the noise of some commanded forces at rest, rms: the worst of them."""
+
+    def measure(design: Design, _asked: float, _signal: str) -> list[Figure]:
+        return _worst(design, "force", inputs(design.plant))
+
+    def estimate(loop: TrialLoop, _signal: str) -> float | None:
+        return _largest(loop.noise.force, loop.inputs, inputs(loop.plant))
+
+    return Requirement(name, measure, "N", estimate=estimate, trade="force", heading=heading)
+
+
+def merit_of(
+    name: str, experiment: str, unit: str, source: str, *, merit: int = 0, estimate: Estimate | None = None
+) -> Requirement:
+    """Bound a figure of merit of an experiment from above: the worst of the experiment's cases.
+
+    experiment : its name among the machine's EXPERIMENTS;  source : words that say so in the report
+    merit : the index of the figure among each case's;  an experiment that failed does not hold
+    """
+
+    def measure(design: Design, _asked: float, _signal: str) -> list[Figure]:
+        e = design.fly(experiment)
+        worst = max(case.merits[merit].value for case in e.cases)
+        return [Figure(math.inf if e.failed else worst, source)]
+
+    return Requirement(name, measure, unit, estimate=estimate)
+
+
+def _worst(design: Design, kind: Literal["motion", "force"], indices: Sequence[int]) -> list[Figure]:
+    """The largest of these, by the covariance and on the simulated machine."""
+    return [
+        Figure(float(getattr(noise, kind)[list(indices)].max()), source)
+        for noise, source in ((design.noise, "covariance"), (design.hold, "simulated hold"))
+    ]
+
+
+def _largest(values: FloatArray, places: Sequence[int], indices: Sequence[int]) -> float | None:
+    """The largest of the values whose index is among these; None where there is none."""
+    return max((float(value) for k, value in zip(places, values, strict=True) if k in indices), default=None)
+
+
+# --- the requirements of every machine ---
+
+
+def _noise_motion(design: Design, _asked: float, signal: str) -> list[Figure]:
+    return [Figure(design.load_figures.get(f"noise_motion {signal}", math.inf), "covariance")]
+
+
+def _margin(design: Design, _asked: float, _signal: str) -> list[Figure]:
+    robust = design.margins.robust
+    return [Figure((robust and robust.lower) or 0.0, "proven over the travel")]
+
+
+def _peak_sensitivity(design: Design, _asked: float, _signal: str) -> list[Figure]:
+    peaks = design.margins.peak_sensitivity
+    worst = max(peaks[s.name] for s in design.controller.measurements)
+    return [Figure(worst, "worst sensor, machine")]
+
+
+def _bandwidth(design: Design, _asked: float, _signal: str) -> list[Figure]:
+    return [design.bandwidth]
+
+
+def _motion(design: Design, _asked: float, signal: str) -> list[Figure]:
+    return _worst(design, "motion", _named(design.plant.outputs, signal))
+
+
+def _motion_estimate(loop: TrialLoop, signal: str) -> float | None:
+    return _largest(loop.noise.motion, loop.outputs, _named(loop.plant.outputs, signal))
+
+
+def _force_noise(design: Design, _asked: float, signal: str) -> list[Figure]:
+    return _worst(design, "force", _named(design.plant.inputs, signal))
+
+
+def _force_estimate(loop: TrialLoop, signal: str) -> float | None:
+    return _largest(loop.noise.force, loop.inputs, _named(loop.plant.inputs, signal))
+
+
+def _named(signals: Sequence[Signal], name: str) -> list[int]:
+    return [k for k, s in enumerate(signals) if s.name == name]
+
+
+GENERIC = (
+    Requirement(
+        "noise_motion", _noise_motion, laws=("PID",), form="outputs"
+    ),  # rms, from the noise of [cost]
+    Requirement(  # multiples of the box of `uncertainty`, anywhere in the travel
+        "margin",
+        _margin,
+        at_least=True,
+        laws=("LQG", "PID"),
+        estimate=lambda loop, _: loop.margin,
+        needs_stability=False,
+    ),
+    Requirement(  # of every sensor, on the machine
+        "peak_sensitivity",
+        _peak_sensitivity,
+        laws=("LQG", "PID"),
+        above=1.0,
+        estimate=lambda loop, _: loop.peak_sensitivity,
+        needs_stability=False,
+        heading="peak S",
+    ),
+    Requirement(  # by every definition of verify
+        "bandwidth",
+        _bandwidth,
+        "rad/s",
+        at_least=True,
+        laws=("LQG", "PID"),
+        estimate=lambda loop, _: loop.bandwidth,
+        needs_stability=False,
+        heading="bandwidth",
+    ),
+    Requirement("motion", _motion, form="outputs", estimate=_motion_estimate, trade="motion"),
+    Requirement("force_noise", _force_noise, form="inputs", estimate=_force_estimate, trade="force"),
+)

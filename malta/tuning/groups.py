@@ -1,0 +1,320 @@
+"""The groups of a machine's states that close loops by themselves, and the linear figures of a trial's loops.
+
+The figures come from the machine's own loop (hold, delay, current loops):
+
+    margin             box of the parameters at which a corner of it becomes unstable, at the middle and the ends
+    peak sensitivity   largest |S_ii|; bandwidth: the smallest of verify's definitions, in every group
+    motion, noise      discrete Lyapunov equation with the sensors' noise and the steps' q^2 / 12
+
+What the requirements make of them is theirs: Requirement.estimate.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from scipy import sparse
+
+from malta.errors import CheckError, InputError
+from malta.margins.plants import of_plant
+from malta.margins.verify import crossing
+from malta.model.linearize import linearize
+from malta.model.plant import trim
+from malta.synthesis.controller import linear_law_of
+from malta.synthesis.lqg import gains, static_feedforward
+from malta.synthesis.requirements import Noise, TrialLoop, requirements_for
+from malta.synthesis.riccati import add_lags, delay_inputs, sample
+from malta.synthesis.spec import Spec, Weights
+from malta.tuning.noise import covariance, noise_variance
+
+if TYPE_CHECKING:
+    from malta.model.plant import ComplexArray, FloatArray
+    from malta.synthesis.controller import LinearLaw
+    from malta.synthesis.lqg import Gains
+    from malta.synthesis.requirements import Requirement
+
+STEP = 0.15  # of the multiples of the box at which the machine is sampled; linear between them
+
+
+class Part(NamedTuple):
+    """Continuous states of a machine that close loops by themselves: x' = A x + B v, p = C x."""
+
+    A: FloatArray
+    B: FloatArray
+    C: FloatArray
+
+    @property
+    def E(self) -> FloatArray:
+        """Nothing is held between samples here: `groups_of` refuses other machines."""
+        return np.zeros((len(self.A), len(self.C)))
+
+
+@dataclass(frozen=True, eq=False)
+class SampledMachine:
+    """Sampled machines with hold, delay and current loops; leading axes are corners of the box."""
+
+    Ad: FloatArray
+    Bd: FloatArray
+    Cd: FloatArray
+
+    def closed(self, F: LinearLaw) -> FloatArray:
+        """Close the loops with a law, without its references."""
+        n, k = self.Ad.shape[-1], len(F.A)
+        M = np.zeros((*self.Ad.shape[:-2], n + k, n + k))
+        M[..., :n, :n], M[..., :n, n:] = self.Ad + self.Bd @ F.D_y @ self.Cd, self.Bd @ F.C
+        M[..., n:, :n], M[..., n:, n:] = F.B_y @ self.Cd, F.A
+        return M
+
+
+@dataclass(frozen=True, eq=False)
+class Group:
+    """Some states, inputs and outputs of the machine that close loops by themselves."""
+
+    states: tuple[int, ...]
+    inputs: tuple[int, ...]
+    outputs: tuple[int, ...]
+    model: Part
+    nominal: SampledMachine  # with its loads, at their trim
+    slope: FloatArray  # of v0(z), which acts against them: inputs x outputs
+    corners: SampledMachine | None  # levels x corners
+    w: FloatArray  # rad/s
+    response: ComplexArray  # of the nominal machine at w
+    variance: FloatArray  # of a measurement, m2
+    role: tuple[Any, ...]  # what the requirements see in it: stroke, thrust, bounds of its signals
+    requirements: tuple[
+        tuple[str, str, Requirement], ...
+    ]  # figure, signal, requirement: those with an estimate
+
+    @property
+    def picture(self) -> tuple[Any, ...]:
+        """Equal for mirror images: nothing here depends on the signs of coordinates."""
+        parts = (np.abs(M).round(12) for M in self.model)
+        return (*(M.tobytes() for M in parts), self.variance.tobytes(), self.role)
+
+    def part(self, w: Weights) -> Weights:
+        """Pick the weights of the group's states, inputs and outputs."""
+        i, j, o = (list(index) for index in (self.states, self.inputs, self.outputs))
+        return Weights(
+            w.q[i], w.q_base[i], w.r[j], w.r_base[j], w.q_i[o], w.q_i_base[o],
+            w.process_variance[j], w.sensor_variance[o],
+        )  # fmt: skip
+
+
+def groups_of(spec: Spec) -> list[Group]:
+    """Find the groups of a design's machine, each with what its trials need.
+
+    Raises InputError for a machine whose currents are held between samples, and for one that has states which no input
+    or sensor reaches.
+    """
+    plant = spec.plant
+    model = linearize(plant, plant.at(**spec.operating_point))
+    if model.E.any():
+        what = f"a {plant.name}, whose currents are held between samples"
+        raise InputError(
+            spec.path, "search", what, "a PID, or a machine whose forces do not depend on where it is"
+        )
+    loaded = linearize(plant, trim(plant, **spec.operating_point))
+    position = spec.operating_point.get(plant.stroke, 0.0)
+    positions = sorted({position, -plant.travel, plant.travel})
+    slope = np.zeros((model.B.shape[1], len(model.C)))
+    slope[:, plant.stroke_output] = static_feedforward(plant).slope(position)
+    names = tuple(spec.uncertainty)
+    proven = "margin" in spec.specification
+    systems = [of_plant(plant, names, at={plant.stroke: z}) for z in positions] if proven else []
+    found = []
+    for i, j, o in _connected(spec, positions):
+        part = Part(model.A[np.ix_(i, i)], model.B[np.ix_(i, j)], model.C[np.ix_(o, i)])
+        nominal = _sampled(spec, Part(loaded.A[np.ix_(i, i)], part.B, part.C))
+        w = _frequencies(spec.sample_time)
+        lag = np.exp(1j * w * spec.sample_time)[:, None, None] * np.eye(len(nominal.Ad)) - nominal.Ad
+        found.append(
+            Group(
+                tuple(i.tolist()),
+                tuple(j.tolist()),
+                tuple(o.tolist()),
+                part,
+                nominal,
+                slope[np.ix_(j, o)],
+                _corners(spec, systems, i, j, o) if systems else None,
+                w,
+                np.asarray(nominal.Cd @ np.linalg.solve(lag, nominal.Bd)),
+                noise_variance(plant)[o],
+                _role(spec, j, o),
+                _estimated(spec),
+            )
+        )
+    return found
+
+
+def _connected(spec: Spec, positions: Sequence[float]) -> list[tuple[Any, Any, Any]]:
+    """States, inputs and outputs that nothing joins to the others at any of these positions of the stroke."""
+    plant = spec.plant
+    n, m, p = len(plant.design_states), len(plant.inputs), len(plant.outputs)
+    touch = np.zeros((n + m + p,) * 2, dtype=bool)
+    for z in positions:
+        at = linearize(plant, plant.at(**{plant.stroke: z}))
+        touch[:n, :n] |= at.A != 0
+        touch[:n, n : n + m] |= at.B != 0
+        touch[n + m :, :n] |= at.C != 0
+    count, label = sparse.csgraph.connected_components(touch, directed=False)
+    found = []
+    for k in range(count):
+        i, j, o = (
+            np.flatnonzero(label[part] == k) for part in (slice(n), slice(n, n + m), slice(n + m, None))
+        )
+        if not (len(i) and len(j) and len(o)):
+            raise InputError(
+                spec.path, "machine", "states that no input or sensor reaches", "another machine"
+            )
+        found.append((i, j, o))
+    return found
+
+
+def _frequencies(Ts: float) -> FloatArray:
+    """rad/s, at which the loops of a trial are looked at."""
+    return np.concatenate([np.geomspace(0.05, 50, 30), np.geomspace(60, 0.2 / Ts, 240), [1 / Ts, 2 / Ts]])
+
+
+def _role(spec: Spec, inputs: Any, outputs: Any) -> tuple[Any, ...]:
+    """What differs between mirror images where requirements tell their signals apart."""
+    plant, asked = spec.plant, spec.specification
+    names = [plant.inputs[j].name for j in inputs], [plant.outputs[o].name for o in outputs]
+    bounds = tuple(
+        tuple(
+            sorted((key.partition(" ")[0], value) for key, value in asked.items() if key.endswith(f" {name}"))
+        )
+        for some in names
+        for name in some
+    )
+    return plant.stroke_output in outputs, plant.thrust_input in inputs, bounds
+
+
+def _estimated(spec: Spec) -> tuple[tuple[str, str, Requirement], ...]:
+    """The figures of a trial: every requirement of the machine with an estimate; of signals, those asked for."""
+    found = []
+    for name, requirement in requirements_for(spec.plant).items():
+        if requirement.estimate is None:
+            continue
+        if requirement.form in ("number", "switch"):
+            found.append((name, "", requirement))
+        for key in spec.specification:
+            base, _, signal = key.partition(" ")
+            if signal and base == name:
+                found.append((key, signal, requirement))
+    return tuple(found)
+
+
+def _sampled(spec: Spec, part: Part) -> SampledMachine:
+    actuator = spec.plant.actuator
+    A, B = add_lags(part.A, part.B, actuator.crossover)
+    Ad, Bd = delay_inputs(*sample(A, B, spec.sample_time), actuator.delay(spec.sample_time))
+    return SampledMachine(Ad, Bd, np.hstack([part.C, np.zeros((len(part.C), len(Ad) - part.C.shape[1]))]))
+
+
+def _corners(spec: Spec, systems: list[Any], i: Any, j: Any, o: Any) -> SampledMachine:
+    """The machine at every corner of growing boxes, those that differ in this group."""
+    signs = np.array(list(itertools.product((-1, 1), repeat=len(spec.uncertainty))))
+    share = np.array(list(spec.uncertainty.values()))
+    levels = np.arange(0.0, min(1 / share) - STEP / 3, STEP)
+    made: dict[bytes, list[SampledMachine]] = {}  # machines that are mirror images have the same poles: once
+    for system in systems:
+        for corner in signs:
+            rows = np.array([system.nominal * (1 + t * share * corner) for t in levels])
+            A, B, C = system.at(rows)
+            parts = [A[:, i][:, :, i], B[:, i][:, :, j], C[:, o][:, :, i]]
+            key = b"".join(np.abs(M).round(9).tobytes() for M in parts)
+            if key not in made:
+                made[key] = [_sampled(spec, Part(*part)) for part in zip(*parts, strict=True)]
+    stacked = (
+        np.array([[getattr(m, name) for m in one] for one in made.values()]) for name in ("Ad", "Bd", "Cd")
+    )
+    return SampledMachine(*(M.swapaxes(0, 1) for M in stacked))
+
+
+def _margin(table: SampledMachine, F: LinearLaw) -> float:
+    """Where the first corner of the growing box becomes unstable, by bisection."""
+    last = len(table.Ad) - 1
+    which = np.arange(table.Ad.shape[1])
+    low, high = 0.0, STEP * last
+    for _ in range(13):
+        t = (low + high) / 2
+        k = min(int(t / STEP), last - 1)
+        share = t / STEP - k
+        between = SampledMachine(
+            *((1 - share) * M[k, which] + share * M[k + 1, which] for M in (table.Ad, table.Bd, table.Cd))
+        )
+        lost = np.abs(np.linalg.eigvals(between.closed(F))).max(axis=1) >= 1
+        if lost.any():
+            high, which = t, which[lost]  # the others are lost later
+        else:
+            low = t
+    return low
+
+
+def figures_of(spec: Spec, group: Group, weights: Weights, delay: int) -> dict[str, float]:
+    """Compute the linear figures of a group in a trial, by requirement; none where its loop is unstable."""
+    Ts = spec.sample_time
+    try:
+        with np.errstate(all="ignore"):
+            g = gains(group.model, group.part(weights), Ts, spec.discretization, delay)
+    except CheckError:
+        return {}
+    law = linear_law_of(g, Ts)
+    steady = law._replace(D_y=law.D_y + group.slope)
+    closed = group.nominal.closed(steady)
+    if not (np.isfinite(closed).all() and np.abs(np.linalg.eigvals(closed)).max() < 1):
+        return {}
+    peak, bandwidth = _response(group, g, steady, Ts)
+    loop = TrialLoop(
+        plant=spec.plant,
+        sample_time=Ts,
+        outputs=group.outputs,
+        inputs=group.inputs,
+        model=group.model,
+        gains=g,
+        Bd=group.nominal.Bd,
+        Cd=group.nominal.Cd,
+        closed=closed,
+        noise=_noise(group, steady, closed),
+        margin=None if group.corners is None else _margin(group.corners, law),
+        peak_sensitivity=peak,
+        bandwidth=bandwidth,
+    )
+    figures = {}
+    for name, signal, requirement in group.requirements:
+        assert requirement.estimate is not None
+        value = requirement.estimate(loop, signal)
+        if value is not None:
+            figures[name] = value
+    return figures
+
+
+def _response(group: Group, g: Gains, law: LinearLaw, Ts: float) -> tuple[float, float]:
+    """Peak sensitivity and bandwidth, rad/s."""
+    z = np.exp(1j * group.w * Ts)[:, None, None]
+    F = law.C @ np.linalg.solve(z * np.eye(len(law.A)) - law.A, law.B_y) + law.D_y
+    eye = np.eye(len(group.outputs))
+    S = np.linalg.inv(eye - group.response @ F)
+    T = np.linalg.svd(eye - S, compute_uv=False)
+    L = np.linalg.svd(group.response @ F, compute_uv=False)
+    half = len(group.states) // 2
+    stiffness = group.model.B[half:] @ g.K[:, :half] - group.model.A[half:, :half]
+    w_n = math.sqrt(max(float(np.linalg.eigvals(stiffness).real.min()), 0.0))
+    falls = crossing(group.w, T[:, -1], math.sqrt(0.5)), crossing(group.w, L[:, 0], 1.0, last=True)
+    return float(np.abs(np.einsum("kii->ki", S)).max()), min(*falls, w_n)
+
+
+def _noise(group: Group, law: LinearLaw, closed: FloatArray) -> Noise:
+    """Rms of the group's outputs and commands."""
+    noise = np.vstack([group.nominal.Bd @ law.D_y, law.B_y])
+    X = covariance(closed, noise * group.variance @ noise.T)
+    k = len(group.nominal.Ad)
+    out = group.nominal.Cd @ X[:k, :k] @ group.nominal.Cd.T
+    command = np.hstack([law.D_y @ group.nominal.Cd, law.C])
+    force = np.diag(command @ X @ command.T + law.D_y * group.variance @ law.D_y.T)
+    return Noise(np.sqrt(np.diag(out)), np.sqrt(force))

@@ -1,0 +1,166 @@
+"""What a design has of what it is asked for: requirements measured on its verified loop and simulated machine."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from malta.margins.verify import BANDWIDTHS, machine_loop, verify
+from malta.simulation import references
+from malta.simulation.experiments import experiment, scenario_of
+from malta.simulation.period import fidelities
+from malta.simulation.simulate import Scenario, simulate
+from malta.synthesis.requirements import Figure, Noise, Requirement, ratio_of, requirements_for
+from malta.tuning.noise import noise_of
+from malta.tuning.pid import loads_of, loop_figures, whole_machine
+from malta.tuning.search import base_of, model_and_controller
+
+if TYPE_CHECKING:
+    from malta.margins.verify import Margins
+    from malta.model.linearize import LinearModel
+    from malta.model.plant import FloatArray, Parameters, Plant
+    from malta.simulation.experiments import Experiment
+    from malta.simulation.simulate import Trajectory
+    from malta.synthesis.controller import Controller
+    from malta.synthesis.spec import Spec
+
+HOLD, SAMPLES = 1.0, 2000  # s, and samples at the least, of the simulated rest; its second half counts
+
+
+class Outcome(NamedTuple):
+    """What is asked for and what was found, SI."""
+
+    name: str
+    asked: float | None  # None: as little as the others leave
+    found: float
+    unit: str
+    how: str  # where the figure comes from
+    at_least: bool = False  # asked for from below
+
+    @property
+    def ratio(self) -> float:
+        """How near its limit: at most 1 where it holds."""
+        asked = math.inf if self.asked is None else self.asked
+        return ratio_of(asked, self.found, at_least=self.at_least)
+
+    @property
+    def holds(self) -> bool:
+        """Whether the figure is within its bound."""
+        return self.ratio <= 1
+
+    def __str__(self) -> str:
+        unit = "" if self.unit == "1" else f" {self.unit}"
+        if self.asked is None:
+            return f"{self.name} is {self.found:.4g}{unit}, asked for little"
+        bound = "at least" if self.at_least else "at most"
+        return f"{self.name} is {self.found:.4g}{unit}, asked for {bound} {self.asked:.4g}{unit}"
+
+
+@dataclass(frozen=True, eq=False)
+class SynthesizedDesign:
+    """A design with its controller: what requirements are measured on (synthesis.requirements.Design)."""
+
+    spec: Spec
+    model: LinearModel
+    controller: Controller
+
+    @property
+    def plant(self) -> Plant:
+        """The machine that the controller is designed for."""
+        return self.spec.plant
+
+    @cached_property
+    def margins(self) -> Margins:
+        """The verified loop, with the proven robust margin where one is asked for."""
+        box = self.spec.uncertainty if "margin" in self.spec.specification else None
+        return verify(self.model, self.controller, box)
+
+    @property
+    def bandwidth(self) -> Figure:
+        """The smallest by the definitions of verify, rad/s, and which one it is."""
+        bandwidths = self.margins.bandwidth
+        narrow = min(bandwidths, key=lambda key: bandwidths[key])
+        return Figure(bandwidths[narrow], BANDWIDTHS[narrow])
+
+    @cached_property
+    def noise(self) -> Noise:
+        """Motion and commanded forces at rest, rms, by the covariance of the machine's linear loop."""
+        return noise_of(machine_loop(self.model, self.controller), self.plant)
+
+    @cached_property
+    def hold(self) -> Noise:
+        """The same on the simulated machine."""
+        duration = max(HOLD, SAMPLES * self.controller.sample_time)
+        able = fidelities(self.plant)
+        fidelity = Scenario.fidelity if Scenario.fidelity in able else able[0]
+        scenario = scenario_of("hold", duration, references.hold, {"fidelity": fidelity})
+        run = self.simulate(self.spec.parameters, scenario)
+        rest = slice(-len(run.t) // 2, None)
+        moved, pushed = run.p[rest], run.v[rest] - run.v[rest].mean(axis=0)
+        return Noise(_rms(moved - moved.mean(axis=0)), _rms(pushed))
+
+    @cached_property
+    def load_figures(self) -> Mapping[str, float]:
+        """Of a PID under the loads of [cost], by name and output; none where its loop is unstable."""
+        whole = whole_machine(self.model, self.controller, loads_of(self.spec))
+        return loop_figures(self.spec, whole, machine_loop(self.model, self.controller))
+
+    def fly(self, name: str, **options: Any) -> Experiment:
+        """Run an experiment of the machine. Raises KeyboardInterrupt when Ctrl-C cut the experiment short."""
+        e = experiment(name, self.plant, self.controller, **options)
+        if e.interrupted or any(case.run.verdict.name == "interrupted" for case in e.cases):
+            raise KeyboardInterrupt
+        return e
+
+    def simulate(self, parameters: Parameters, scenario: Scenario) -> Trajectory:
+        """Run a scenario on a machine with other parameters. Raises KeyboardInterrupt as `fly`."""
+        run = simulate(self.plant.variant(parameters), self.controller, scenario)
+        if run.verdict.name == "interrupted":
+            raise KeyboardInterrupt
+        return run
+
+
+def judge(spec: Spec) -> tuple[Outcome, ...]:
+    """Measure every requirement of a design: proven margin, verified loop, covariance, simulated experiments.
+
+    A PID's load errors come first, which no bound is asked of. What an unstable loop does not have fails.
+
+    Raises InputError for a PID without [cost].
+    """
+    design = SynthesizedDesign(spec, *model_and_controller(spec))
+    outcomes = _load_errors(design) if spec.pid else []
+    known = requirements_for(spec.plant)
+    for name, asked in spec.specification.items():
+        requirement, signal = known[base_of(name)], name.partition(" ")[2]
+        unit = next((s.unit for s in requirement.signals(spec.plant) if s.name == signal), requirement.unit)
+        outcomes += [
+            Outcome(name, asked, figure.value, unit, figure.source, requirement.at_least)
+            for figure in _measure(requirement, design, asked, signal)
+        ]
+    return tuple(outcomes)
+
+
+def _measure(requirement: Requirement, design: SynthesizedDesign, asked: float, signal: str) -> list[Figure]:
+    """The figures of a requirement; the worst there is where the loop is unstable and so has none."""
+    if requirement.needs_stability and not design.margins.stable:
+        return [Figure(0.0 if requirement.at_least else math.inf, "unstable loop")]
+    return list(requirement.measure(design, asked, signal))
+
+
+def _load_errors(design: SynthesizedDesign) -> list[Outcome]:
+    plant, outcomes = design.plant, []
+    for output, force, size in zip(plant.outputs, plant.inputs, loads_of(design.spec).load, strict=True):
+        name = f"load_error {output.name}"
+        how = f"constant force, {size:g} {force.unit} at {force.name}"
+        found = design.load_figures.get(name, math.inf)
+        outcomes.append(Outcome(name, None, found, f"{output.unit} s^0.5", how))
+    return outcomes
+
+
+def _rms(values: FloatArray) -> FloatArray:
+    return np.asarray(np.sqrt(np.mean(np.square(values), axis=0)))

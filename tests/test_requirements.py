@@ -1,0 +1,122 @@
+"""What designs can be asked for: requirements of every machine, a machine's own, and what fails."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import ROOT, refusal
+
+import malta
+from malta.machines.tubular.requirements import REQUIREMENTS
+from malta.margins.verify import machine_loop
+from malta.synthesis.requirements import GENERIC, requirements_for
+from malta.synthesis.spec import Spec
+from malta.tuning.groups import figures_of, groups_of
+from malta.tuning.noise import noise_of
+from malta.tuning.outcomes import judge
+from malta.tuning.search import model_and_controller
+
+
+def motor_file(folder: Path, *lines: str) -> Path:
+    """The linear motor's LQG with a specification."""
+    text = (ROOT / "design" / "halbach.toml").read_text(encoding="utf-8")
+    text = text.replace('"../data/', f'"{(ROOT / "data").as_posix()}/')
+    path = folder / "motor.toml"
+    path.write_text("\n".join([text, "[specification]", *lines, ""]), encoding="utf-8")
+    return path
+
+
+MOTION = 'motion = { x = { value = 5, unit = "um" } }'
+FORCE = 'force_noise = { F_x = { value = 0.1, unit = "mN" } }'
+
+
+def test_every_machine_can_bound_its_outputs_and_inputs_one_by_one(tmp_path: Path) -> None:
+    spec = malta.read_design(motor_file(tmp_path, "peak_sensitivity = 3", MOTION, FORCE))
+    assert spec.specification == {"peak_sensitivity": 3.0, "motion x": 5e-6, "force_noise F_x": 1e-4}
+    rows = {(r.name, r.how): r for r in judge(spec)}
+    noise = noise_of(machine_loop(*model_and_controller(spec)), spec.plant)
+    assert rows["motion x", "covariance"].found == pytest.approx(noise.motion[0], rel=1e-12)
+    assert rows["force_noise F_x", "covariance"].found == pytest.approx(noise.force[0], rel=1e-12)
+    assert rows["motion x", "covariance"].holds
+    assert not rows["force_noise F_x", "covariance"].holds
+    assert rows["force_noise F_x", "simulated hold"].unit == "N"
+
+
+def test_a_machines_own_replace_generic_ones_of_their_name(tmp_path: Path) -> None:
+    motor = malta.read_design(motor_file(tmp_path, MOTION)).plant
+    assert list(requirements_for(motor).values()) == list(GENERIC)
+    tubular = malta.read_design(ROOT / "design" / "robust.toml").plant
+    known = requirements_for(tubular)
+    assert known["force_noise"] in REQUIREMENTS
+    assert {"margin", "motion", "payload"} < known.keys()
+    assert len(known) == len(GENERIC) + len(REQUIREMENTS) - 1
+
+
+@pytest.mark.parametrize(
+    ("line", "field", "found"),
+    [
+        ('payload = { value = 1, unit = "kg" }', "specification.payload", "an unknown requirement"),
+        (MOTION.replace("x =", "F_x ="), "specification.motion.F_x", "an unknown signal"),
+        (MOTION.replace("um", "N"), "specification.motion.x.unit", "'N'"),
+        ('motion = { value = 5, unit = "um" }', "specification.motion.value", "5"),
+        ("noise_motion = {}", "specification.noise_motion", "a requirement of a PID"),
+        ("motion = {}", "specification", "nothing to reach"),
+    ],
+)
+def test_what_a_machine_cannot_be_asked_for_gets_one_sentence(
+    tmp_path: Path, line: str, field: str, found: str
+) -> None:
+    path = motor_file(tmp_path, line)
+    error = refusal(lambda: malta.read_design(path), path)
+    assert error.field == field
+    assert error.found.startswith(found)
+
+
+@pytest.fixture(scope="module")
+def robust() -> Spec:
+    return malta.read_design(ROOT / "design" / "robust.toml")
+
+
+def test_a_search_sees_bounds_of_single_signals(robust: Spec) -> None:
+    """Mirror images are told apart where their bounds differ, and only there."""
+    asked = {"motion x1": 1e-6, "motion y1": 1e-6, "motion z": 1e-5}
+    groups = groups_of(replace(robust, specification=asked))
+    assert [len(g.outputs) for g in groups] == [2, 2, 1]
+    assert len({g.picture for g in groups}) == 2
+    figures = [figures_of(robust, g, robust.weights, 0) for g in groups]
+    assert figures[0]["motion x1"] == pytest.approx(figures[0]["radial_motion"], rel=1e-9)
+    assert figures[1]["motion y1"] == pytest.approx(figures[0]["motion x1"], rel=1e-9)
+    assert figures[2]["motion z"] == figures[2]["axial_motion"]
+    uneven = groups_of(replace(robust, specification=asked | {"motion y1": 2e-6}))
+    assert len({g.picture for g in uneven}) == 3
+
+
+def test_what_an_unstable_loop_does_not_have_fails(robust: Spec) -> None:
+    hasty = replace(
+        robust.weights,
+        process_variance=robust.weights.process_variance * 1e10,
+        q_base=robust.weights.q_base / 30,
+    )
+    rows = judge(replace(robust, law=hasty))
+    assert {r.name for r in rows} == robust.specification.keys()
+    fallen = {r.name: r for r in rows if r.how == "unstable loop"}
+    assert not any(r.holds for r in rows if r.name != "bandwidth")
+    assert fallen["payload"].found == 0
+    assert math.isinf(fallen["radial_motion"].found)
+    assert np.all([r.ratio == math.inf for r in fallen.values()])
+
+
+def test_generic_code_names_no_machines_requirements() -> None:
+    own = {r.name for r in REQUIREMENTS} - {r.name for r in GENERIC}
+    assert len(own) == 8
+    names = re.compile(rf"\b({'|'.join(sorted(own))})\b")
+    for folder in ("synthesis", "tuning", "report"):
+        for file in (ROOT / "malta" / folder).rglob("*.py"):
+            found = names.findall(file.read_text(encoding="utf-8"))
+            allowed = {"payload"}  # a margin in kg, and the example of how to write a requirement
+            assert set(found) <= allowed, file
