@@ -111,6 +111,11 @@ def test_what_an_unstable_loop_does_not_have_fails(robust: Spec) -> None:
     assert np.all([r.ratio == math.inf for r in fallen.values()])
 
 
+def test_an_unknown_requirement_made_in_code_gets_one_sentence(robust: Spec) -> None:
+    error = refusal(lambda: judge(replace(robust, specification={"margni": 3.0})), robust.path)
+    assert (error.field, error.found) == ("specification.margni", "an unknown requirement")
+
+
 def test_generic_code_names_no_machines_requirements() -> None:
     own = {r.name for r in REQUIREMENTS} - {r.name for r in GENERIC}
     assert len(own) == 8

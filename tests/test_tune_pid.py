@@ -25,8 +25,8 @@ from malta.tuning import pid as tune_pid
 from malta.tuning.design_text import design_text
 from malta.tuning.outcomes import judge
 from malta.tuning.pid import (
-    _closed,
     _goal,
+    close_loop,
     loads_of,
     loop_figures,
     parts_of,
@@ -163,7 +163,7 @@ def search_of(spec: Spec) -> Search:
     (part,) = parts_of(whole_machine(*model_and_controller(spec), loads_of(spec)))
 
     def compute(design: Spec) -> dict[str, float]:
-        return loop_figures(spec, part, _closed(part, terms_of(design), spec.sample_time))
+        return loop_figures(spec, part, close_loop(part, terms_of(design), spec.sample_time))
 
     return Search(spec, (0, 1, 2), 0, Journal(None, "", restart=False), compute)
 
@@ -228,7 +228,7 @@ def test_parts_have_the_figures_of_the_whole_machine(name: str, request: pytest.
     assert [part.outputs for part in parts] == expected
     quick: dict[str, float] = {}
     for part in parts:
-        quick |= loop_figures(spec, part, _closed(part, terms_of(spec), spec.sample_time))
+        quick |= loop_figures(spec, part, close_loop(part, terms_of(spec), spec.sample_time))
     whole = figures_of(spec)
     assert quick.keys() == whole.keys()
     for key, value in whole.items():

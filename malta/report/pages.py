@@ -38,11 +38,11 @@ from malta.report.figures import worst_figure as worst_figure
 from malta.report.figures import yield_figure as yield_figure
 from malta.report.figures.margins import chain_figure as chain_figure
 from malta.report.figures.parts import STYLES as STYLES
-from malta.report.figures.parts import UNITS, Published, number, read_out, traded
+from malta.report.figures.parts import UNITS, Published, front_lines, number, read_out
 from malta.simulation.experiments import experiments_of, options_of, setting
 from malta.simulation.simulate import Trajectory
 from malta.synthesis.lqg import continuous_poles
-from malta.synthesis.requirements import requirements_for
+from malta.synthesis.requirements import Trade, requirements_for
 from malta.synthesis.spec import Spec
 
 if TYPE_CHECKING:
@@ -566,8 +566,9 @@ def _front_columns(tuned: Tuned) -> dict[str, tuple[str, float, str]]:
     """What the front holds of each trial: heading, factor, unit."""
     names = dict.fromkeys(name for one in tuned.front for name in one.figures)
     columns = {"margin": ("margin, proven", 100.0, "%")}
-    for trade, what in (("force", ""), ("motion", " motion")):
-        for name, label, scale, unit in traded(tuned.spec.plant, names, trade):
+    sides: tuple[tuple[Trade, str], ...] = (("force", ""), ("motion", " motion"))
+    for trade, what in sides:
+        for name, label, scale, unit in front_lines(tuned.spec.plant, names, trade):
             columns[name] = (f"{label}{what}", scale, f"{unit} rms")
     for name, r in requirements_for(tuned.spec.plant).items():
         if name in names and r.heading and not r.trade:

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from malta.synthesis.spec import Spec
 
 Law = Literal["LQG", "PID"]
+Trade = Literal["force", "motion"]
 Form = Literal["number", "switch", "outputs", "inputs"]
 Indices = Callable[[Plant], Sequence[int]]  # of some of a plant's outputs, or inputs
 
@@ -157,7 +158,7 @@ class Requirement:
     above: float = 0.0
     estimate: Estimate | None = None
     needs_stability: bool = True
-    trade: Literal["force", "motion"] | None = None
+    trade: Trade | None = None
     heading: str = ""
 
     def signals(self, plant: Plant) -> tuple[Signal, ...]:
@@ -226,7 +227,7 @@ def merit_of(
     return Requirement(name, measure, unit, estimate=estimate)
 
 
-def _worst(design: Design, kind: Literal["motion", "force"], indices: Sequence[int]) -> list[Figure]:
+def _worst(design: Design, kind: Trade, indices: Sequence[int]) -> list[Figure]:
     """The largest of these, by the covariance and on the simulated machine."""
     return [
         Figure(float(getattr(noise, kind)[list(indices)].max()), source)
@@ -262,22 +263,22 @@ def _bandwidth(design: Design, _asked: float, _signal: str) -> list[Figure]:
 
 
 def _motion(design: Design, _asked: float, signal: str) -> list[Figure]:
-    return _worst(design, "motion", _named(design.plant.outputs, signal))
+    return _worst(design, "motion", _index(design.plant.outputs, signal))
 
 
 def _motion_estimate(loop: TrialLoop, signal: str) -> float | None:
-    return _largest(loop.noise.motion, loop.outputs, _named(loop.plant.outputs, signal))
+    return _largest(loop.noise.motion, loop.outputs, _index(loop.plant.outputs, signal))
 
 
 def _force_noise(design: Design, _asked: float, signal: str) -> list[Figure]:
-    return _worst(design, "force", _named(design.plant.inputs, signal))
+    return _worst(design, "force", _index(design.plant.inputs, signal))
 
 
 def _force_estimate(loop: TrialLoop, signal: str) -> float | None:
-    return _largest(loop.noise.force, loop.inputs, _named(loop.plant.inputs, signal))
+    return _largest(loop.noise.force, loop.inputs, _index(loop.plant.inputs, signal))
 
 
-def _named(signals: Sequence[Signal], name: str) -> list[int]:
+def _index(signals: Sequence[Signal], name: str) -> list[int]:
     return [k for k, s in enumerate(signals) if s.name == name]
 
 

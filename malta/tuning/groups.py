@@ -62,7 +62,7 @@ class SampledMachine:
     Bd: FloatArray
     Cd: FloatArray
 
-    def closed(self, F: LinearLaw) -> FloatArray:
+    def close(self, F: LinearLaw) -> FloatArray:
         """Close the loops with a law, without its references."""
         n, k = self.Ad.shape[-1], len(F.A)
         M = np.zeros((*self.Ad.shape[:-2], n + k, n + k))
@@ -127,9 +127,9 @@ def groups_of(spec: Spec) -> list[Group]:
     proven = "margin" in spec.specification
     systems = [of_plant(plant, names, at={plant.stroke: z}) for z in positions] if proven else []
     found = []
-    for i, j, o in _connected(spec, positions):
+    for i, j, o in _components(spec, positions):
         part = Part(model.A[np.ix_(i, i)], model.B[np.ix_(i, j)], model.C[np.ix_(o, i)])
-        nominal = _sampled(spec, Part(loaded.A[np.ix_(i, i)], part.B, part.C))
+        nominal = _sample(spec, Part(loaded.A[np.ix_(i, i)], part.B, part.C))
         w = _frequencies(spec.sample_time)
         lag = np.exp(1j * w * spec.sample_time)[:, None, None] * np.eye(len(nominal.Ad)) - nominal.Ad
         found.append(
@@ -145,13 +145,13 @@ def groups_of(spec: Spec) -> list[Group]:
                 np.asarray(nominal.Cd @ np.linalg.solve(lag, nominal.Bd)),
                 noise_variance(plant)[o],
                 _role(spec, j, o),
-                _estimated(spec),
+                _estimates(spec),
             )
         )
     return found
 
 
-def _connected(spec: Spec, positions: Sequence[float]) -> list[tuple[Any, Any, Any]]:
+def _components(spec: Spec, positions: Sequence[float]) -> list[tuple[Any, Any, Any]]:
     """States, inputs and outputs that nothing joins to the others at any of these positions of the stroke."""
     plant = spec.plant
     n, m, p = len(plant.design_states), len(plant.inputs), len(plant.outputs)
@@ -194,7 +194,7 @@ def _role(spec: Spec, inputs: Any, outputs: Any) -> tuple[Any, ...]:
     return plant.stroke_output in outputs, plant.thrust_input in inputs, bounds
 
 
-def _estimated(spec: Spec) -> tuple[tuple[str, str, Requirement], ...]:
+def _estimates(spec: Spec) -> tuple[tuple[str, str, Requirement], ...]:
     """The figures of a trial: every requirement of the machine with an estimate; of signals, those asked for."""
     found = []
     for name, requirement in requirements_for(spec.plant).items():
@@ -209,7 +209,7 @@ def _estimated(spec: Spec) -> tuple[tuple[str, str, Requirement], ...]:
     return tuple(found)
 
 
-def _sampled(spec: Spec, part: Part) -> SampledMachine:
+def _sample(spec: Spec, part: Part) -> SampledMachine:
     actuator = spec.plant.actuator
     A, B = add_lags(part.A, part.B, actuator.crossover)
     Ad, Bd = delay_inputs(*sample(A, B, spec.sample_time), actuator.delay(spec.sample_time))
@@ -229,7 +229,7 @@ def _corners(spec: Spec, systems: list[Any], i: Any, j: Any, o: Any) -> SampledM
             parts = [A[:, i][:, :, i], B[:, i][:, :, j], C[:, o][:, :, i]]
             key = b"".join(np.abs(M).round(9).tobytes() for M in parts)
             if key not in made:
-                made[key] = [_sampled(spec, Part(*part)) for part in zip(*parts, strict=True)]
+                made[key] = [_sample(spec, Part(*part)) for part in zip(*parts, strict=True)]
     stacked = (
         np.array([[getattr(m, name) for m in one] for one in made.values()]) for name in ("Ad", "Bd", "Cd")
     )
@@ -248,7 +248,7 @@ def _margin(table: SampledMachine, F: LinearLaw) -> float:
         between = SampledMachine(
             *((1 - share) * M[k, which] + share * M[k + 1, which] for M in (table.Ad, table.Bd, table.Cd))
         )
-        lost = np.abs(np.linalg.eigvals(between.closed(F))).max(axis=1) >= 1
+        lost = np.abs(np.linalg.eigvals(between.close(F))).max(axis=1) >= 1
         if lost.any():
             high, which = t, which[lost]  # the others are lost later
         else:
@@ -266,7 +266,7 @@ def figures_of(spec: Spec, group: Group, weights: Weights, delay: int) -> dict[s
         return {}
     law = linear_law_of(g, Ts)
     steady = law._replace(D_y=law.D_y + group.slope)
-    closed = group.nominal.closed(steady)
+    closed = group.nominal.close(steady)
     if not (np.isfinite(closed).all() and np.abs(np.linalg.eigvals(closed)).max() < 1):
         return {}
     peak, bandwidth = _response(group, g, steady, Ts)

@@ -11,14 +11,14 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Mapping, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, get_args
 
 import numpy as np
 
 from malta.errors import InputError
 from malta.margins.verify import travel_margin
 from malta.model.plant import Plant
-from malta.synthesis.requirements import ratio_of, requirements_for
+from malta.synthesis.requirements import Trade, ratio_of, requirements_for
 from malta.synthesis.spec import Spec, Weights
 from malta.tuning.groups import STEP, Group, figures_of, groups_of
 from malta.tuning.search import (
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from malta.model.plant import FloatArray
 
 FRONT = (0.6, 0.7, 0.8, 0.9, 0.95, 1.0, 1.05, 1.1)  # of the margin that is asked for
-TRADES = ("force", "motion")  # what the front has against the margin
+TRADES: tuple[Trade, ...] = get_args(Trade)  # what the front has against the margin
 
 
 class _Cluster(NamedTuple):
@@ -124,14 +124,14 @@ def _ratios(spec: Spec, figures: Mapping[str, float]) -> list[float]:
     ]
 
 
-def _traded(plant: Plant, trade: str) -> list[str]:
+def _names_of(plant: Plant, trade: Trade) -> list[str]:
     """The requirements that the front shows as noise of the force, or as motion."""
     return [name for name, r in requirements_for(plant).items() if r.trade == trade]
 
 
 def _beside_noise(spec: Spec, figures: Mapping[str, float]) -> float:
     """The worst ratio of what is no axis of the front."""
-    free = {"margin", *(name for trade in TRADES for name in _traded(spec.plant, trade))}
+    free = {"margin", *(name for trade in TRADES for name in _names_of(spec.plant, trade))}
     return max(_ratios(spec, {k: v for k, v in figures.items() if base_of(k) not in free}), default=0.0)
 
 
@@ -183,7 +183,7 @@ def _front(
             if share * margin > most:
                 continue
             for k, (search, _) in enumerate(places):
-                goal = partial(_frugal, search, margin=share * margin, kinds=_traded(spec.plant, trade))
+                goal = partial(_frugal, search, margin=share * margin, kinds=_names_of(spec.plant, trade))
                 around[k] = search.polish(goal, around[k], effort.front * len(search.low))
             trials.append(combine(spec, [(s, u) for (s, _), u in zip(places, around, strict=True)]))
     proven = []
@@ -201,7 +201,7 @@ def _best_of(spec: Spec, trials: Sequence[Trial], best: Trial) -> tuple[Trial, .
     for one in trials:  # what is equal to three digits counts once
         sizes = [-one.figures["margin"]]
         for trade in TRADES:
-            names = _traded(spec.plant, trade)
+            names = _names_of(spec.plant, trade)
             sizes += [value for name, value in one.figures.items() if base_of(name) in names][:1]
         unique.setdefault(tuple(float(f"{size:.3g}") for size in sizes), one)
     every = np.array(list(unique))

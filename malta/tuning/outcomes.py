@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from malta.errors import InputError
 from malta.margins.verify import BANDWIDTHS, machine_loop, verify
 from malta.simulation import references
 from malta.simulation.experiments import experiment, scenario_of
@@ -130,12 +131,14 @@ def judge(spec: Spec) -> tuple[Outcome, ...]:
 
     A PID's load errors come first, which no bound is asked of. What an unstable loop does not have fails.
 
-    Raises InputError for a PID without [cost].
+    Raises InputError for a PID without [cost], and for a requirement that the machine does not have.
     """
     design = SynthesizedDesign(spec, *model_and_controller(spec))
     outcomes = _load_errors(design) if spec.pid else []
     known = requirements_for(spec.plant)
     for name, asked in spec.specification.items():
+        if base_of(name) not in known:
+            raise InputError(spec.path, f"specification.{name}", "an unknown requirement", " ".join(known))
         requirement, signal = known[base_of(name)], name.partition(" ")[2]
         unit = next((s.unit for s in requirement.signals(spec.plant) if s.name == signal), requirement.unit)
         outcomes += [

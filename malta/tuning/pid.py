@@ -121,8 +121,8 @@ def parts_of(whole: Part) -> list[Part]:
     return parts
 
 
-def _closed(part: Part, terms: Pid, Ts: float) -> Loop:
-    """A part's loop with these gains, as `machine_loop` has the whole."""
+def close_loop(part: Part, terms: Pid, Ts: float) -> Loop:
+    """Close a part's loop with gains, as `machine_loop` closes the whole machine's."""
     own, k = list(part.outputs), len(part.outputs)
     few = Pid(terms.Kp[own], terms.Ki[own], terms.Kd[own], terms.filter)
     law = linear_law_of(pid_gains(np.eye(k), few, Ts), Ts)
@@ -270,7 +270,7 @@ def search_gains(
         def compute(design: Spec, members: tuple[int, ...] = members) -> dict[str, float]:
             terms, Ts = design.pid, design.sample_time
             assert terms is not None
-            figures = [loop_figures(spec, parts[k], _closed(parts[k], terms, Ts)) for k in members]
+            figures = [loop_figures(spec, parts[k], close_loop(parts[k], terms, Ts)) for k in members]
             return merge(figures, at_least)
 
         own = [block for block in blocks if block[0] and set(block[0]) <= set(variables)]

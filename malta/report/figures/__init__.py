@@ -17,7 +17,7 @@ from collections.abc import Callable
 from functools import partial
 from itertools import cycle
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 
@@ -40,10 +40,10 @@ from malta.report.figures.parts import (
     bound_line,
     ending,
     finish,
+    front_lines,
     line,
     micro,
     page,
-    traded,
 )
 from malta.report.figures.parts import MORE as MORE
 from malta.report.figures.parts import POINTS as POINTS
@@ -51,6 +51,7 @@ from malta.report.figures.parts import STYLES as STYLES
 from malta.report.figures.parts import number as number
 from malta.simulation.experiments import Case, Experiment, experiments_of
 from malta.simulation.simulate import Trajectory
+from malta.synthesis.requirements import Trade
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -195,7 +196,7 @@ def front_figure(tuned: Tuned) -> Figure:
     figure.text(0.5, 0.925, found, fontsize=9, color="#4a4a4a", ha="center", va="top")
     margins = [100 * one.figures["margin"] for one in others]
     panels: Any = figure.subplots(1, 2)
-    sides = (traded(tuned.spec.plant, taken.figures, trade) for trade in ("force", "motion"))
+    sides = (front_lines(tuned.spec.plant, taken.figures, trade) for trade in get_args(Trade))
     for axes, lines, y in zip(
         panels, sides, ("noise of the force [N rms]", "true motion [µm rms]"), strict=True
     ):

@@ -13,7 +13,7 @@ import numpy as np
 from malta.model.data import in_unit, published_value
 from malta.model.plant import Plant
 from malta.simulation.simulate import Trajectory
-from malta.synthesis.requirements import requirements_for
+from malta.synthesis.requirements import Trade, requirements_for
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -289,7 +289,7 @@ UNITS = {
 }
 
 
-def traded(plant: Plant, names: Iterable[str], trade: str) -> list[tuple[str, str, float, str]]:
+def front_lines(plant: Plant, names: Iterable[str], trade: Trade) -> list[tuple[str, str, float, str]]:
     """List those figures of a Pareto front that are noise of the "force", or "motion": name, label, factor, unit."""
     known, found = requirements_for(plant), []
     for name in names:
