@@ -19,7 +19,7 @@ from malta.synthesis.spec import Spec
 from malta.tuning.groups import figures_of, groups_of
 from malta.tuning.noise import noise_of
 from malta.tuning.outcomes import judge
-from malta.tuning.search import model_and_controller
+from malta.tuning.search import at_least_of, merge, model_and_controller
 
 
 def motor_file(folder: Path, *lines: str) -> Path:
@@ -94,6 +94,21 @@ def test_a_search_sees_bounds_of_single_signals(robust: Spec) -> None:
     assert figures[2]["motion z"] == figures[2]["axial_motion"]
     uneven = groups_of(replace(robust, specification=asked | {"motion y1": 2e-6}))
     assert len({g.picture for g in uneven}) == 3
+
+
+def test_a_search_sees_a_filter_that_observes_forces(robust: Spec) -> None:
+    """In place of integrals: the figures of a trial are those of the judged design."""
+    weights = replace(robust.weights, q_i=np.zeros(5), drift_variance=np.full(5, 1e-3))
+    asked = {name: robust.specification[name] for name in ("radial_motion", "axial_motion", "force_noise")}
+    spec = replace(robust, law=weights, specification=asked)
+    figures = merge([figures_of(spec, g, weights, 0) for g in groups_of(spec)], at_least_of(spec.plant))
+    rows = {r.name: r.found for r in judge(spec) if r.how == "covariance"}
+    assert figures["thrust_noise"] > 0
+    for name in asked:
+        assert figures[name] == pytest.approx(rows[name], rel=1e-3)
+    plain = replace(weights, drift_variance=robust.weights.drift_variance)
+    without = [figures_of(spec, g, plain, 0) for g in groups_of(spec)]
+    assert figures["force_noise"] > 1.001 * without[0]["force_noise"]
 
 
 def test_what_an_unstable_loop_does_not_have_fails(robust: Spec) -> None:

@@ -99,9 +99,10 @@ class Group:
     def part(self, w: Weights) -> Weights:
         """Pick the weights of the group's states, inputs and outputs."""
         i, j, o = (list(index) for index in (self.states, self.inputs, self.outputs))
+        drift = w.drift_variance[j] if w.drift_variance.size else w.drift_variance
         return Weights(
             w.q[i], w.q_base[i], w.r[j], w.r_base[j], w.q_i[o], w.q_i_base[o],
-            w.process_variance[j], w.sensor_variance[o],
+            w.process_variance[j], w.sensor_variance[o], drift,
         )  # fmt: skip
 
 

@@ -83,7 +83,7 @@ def _clusters(spec: Spec) -> list[_Cluster]:
 
 def _differ(a: Weights, b: Weights) -> bool:
     """Whether they may give other gains: bases of weights that are zero do not matter."""
-    names = ("Q", "R", "Q_i", "process_variance", "sensor_variance")
+    names = ("Q", "R", "Q_i", "process_variance", "sensor_variance", "drift_variance")
     return any((getattr(a, name) != getattr(b, name)).any() for name in names)
 
 
