@@ -15,11 +15,11 @@ import malta
 from malta.machines.tubular.requirements import REQUIREMENTS
 from malta.margins.verify import machine_loop
 from malta.synthesis.requirements import GENERIC, requirements_for
-from malta.synthesis.spec import Spec
+from malta.synthesis.spec import Loads, Pid, Spec
 from malta.tuning.groups import figures_of, groups_of
 from malta.tuning.noise import noise_of
 from malta.tuning.outcomes import judge
-from malta.tuning.search import at_least_of, merge, model_and_controller
+from malta.tuning.search import Effort, at_least_of, merge, model_and_controller
 
 
 def motor_file(folder: Path, *lines: str) -> Path:
@@ -129,6 +129,107 @@ def test_what_an_unstable_loop_does_not_have_fails(robust: Spec) -> None:
 def test_an_unknown_requirement_made_in_code_gets_one_sentence(robust: Spec) -> None:
     error = refusal(lambda: judge(replace(robust, specification={"margni": 3.0})), robust.path)
     assert (error.field, error.found) == ("specification.margni", "an unknown requirement")
+
+
+FLOATER = """
+from dataclasses import dataclass
+
+import casadi as ca
+
+from malta.model.data import si
+from malta.model.plant import Actuator, Plant, Signal
+from malta.synthesis.requirements import Figure, Requirement
+
+
+@dataclass(frozen=True)
+class Parameters:
+    m: float = si("kg", above=0)
+    k: float = si("N/m", above=0)
+    preset: str = "data"
+
+
+def plant(par):
+    def f(x, u, w):
+        return ca.vertcat(x[1], (par.k * x[0] + u) / par.m)
+
+    return Plant(
+        name="floater", parameters=par,
+        states=(Signal("y", "m"), Signal("y_dot", "m/s")), inputs=(Signal("F", "N"),), outputs=(Signal("y", "m"),),
+        f=f, h=lambda x, u: x[0], actuator=Actuator((Signal("i", "A"),), (10.0,), 5.0),
+        variant=plant, noise=(1e-6,),
+    )
+
+
+def gain(design, asked, signal):
+    return [Figure(float(design.controller.K[0, 0]), "the gain itself")]
+
+
+REQUIREMENTS = (Requirement("stiffness", gain, "N/m", at_least=True, needs_stability=False),)
+"""
+
+FLOATER_DESIGN = """
+name = "floater"
+summary = "LQG"
+machine = "floater.toml"
+preset = "data"
+sample_time = { value = 100, unit = "us" }
+delay = 0
+discretization = "sampled-data"
+current_loop_delay = false
+uncertainty = { m = 0.2, k = 0.2 }
+
+[operating_point]
+
+[weights]
+state = { y = 1, y_dot = 0 }
+input = { F = 1 }
+integral = { y = 1 }
+
+[bases]
+state = { y = { value = 50, unit = "um" }, y_dot = { value = 1, unit = "m/s" } }
+input = "SI"
+integral = { y = { value = 1, unit = "um s" } }
+
+[noise]
+process = { F = { value = 1, unit = "N" } }
+sensor = { y = { value = 1, unit = "um" } }
+
+[specification]
+margin = 1
+motion = { y = { value = 2, unit = "um" } }
+stiffness = { value = 25, unit = "N/mm" }
+
+[search.numbers]
+position = { vary = ["bases.state.y"], low = 5, high = 500, unit = "um" }
+"""
+
+
+def test_a_machine_of_ones_own_without_a_stroke_is_tuned_for_its_own_requirement(tmp_path: Path) -> None:
+    (tmp_path / "floater.py").write_text(FLOATER, encoding="utf-8")
+    quantity = '{{ value = {}, unit = "{}", tag = "assumed", source = "test" }}'
+    data = f'machine = "floater.py"\n[parameters]\nm = {quantity.format(1, "kg")}\nk = {quantity.format(1, "N/mm")}\n'
+    (tmp_path / "floater.toml").write_text(data, encoding="utf-8")
+    (tmp_path / "design.toml").write_text(FLOATER_DESIGN, encoding="utf-8")
+    spec = malta.read_design(tmp_path / "design.toml")
+    assert spec.specification == {"margin": 1.0, "motion y": 2e-6, "stiffness": 25e3}
+    (group,) = groups_of(spec)
+    quick = figures_of(spec, group, spec.weights, 0)
+    rows = {(r.name, r.how): r for r in judge(spec)}
+    assert quick["margin"] == pytest.approx(rows["margin", "proven over the travel"].found, rel=5e-3)
+    assert quick["motion y"] == pytest.approx(rows["motion y", "covariance"].found, rel=1e-6)
+    own = rows["stiffness", "the gain itself"]
+    assert own.ratio == pytest.approx(25e3 / own.found, rel=1e-12)
+    found = malta.tune(spec, effort=Effort(generations=0, polish=5, front=0))
+    assert found.trials > 3
+    assert {r.name for r in found.requirements} == spec.specification.keys()
+    gains = Pid(np.array([5e3]), np.array([5e4]), np.array([60.0]), 0.0)
+    loads = Loads((1.0,), (0.0,), (1e-6,))
+    calm = {
+        r.name: r
+        for r in judge(replace(spec, law=gains, loads=loads, specification={"noise_motion y": 1e-5}))
+    }
+    assert 0 < calm["load_error y"].found < 1e-3
+    assert calm["noise_motion y"].holds
 
 
 def test_generic_code_names_no_machines_requirements() -> None:

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -121,12 +121,14 @@ def groups_of(spec: Spec) -> list[Group]:
         )
     loaded = linearize(plant, trim(plant, **spec.operating_point))
     position = spec.operating_point.get(plant.stroke, 0.0)
-    positions = sorted({position, -plant.travel, plant.travel})
+    along = sorted({position, -plant.travel, plant.travel}) if plant.has_stroke else []
+    positions: list[dict[str, float]] = [{plant.stroke: z} for z in along] or [{}]
     slope = np.zeros((model.B.shape[1], len(model.C)))
-    slope[:, plant.stroke_output] = static_feedforward(plant).slope(position)
+    if plant.has_stroke:
+        slope[:, plant.stroke_output] = static_feedforward(plant).slope(position)
     names = tuple(spec.uncertainty)
     proven = "margin" in spec.specification
-    systems = [of_plant(plant, names, at={plant.stroke: z}) for z in positions] if proven else []
+    systems = [of_plant(plant, names, at=place) for place in positions] if proven else []
     found = []
     for i, j, o in _components(spec, positions):
         part = Part(model.A[np.ix_(i, i)], model.B[np.ix_(i, j)], model.C[np.ix_(o, i)])
@@ -152,13 +154,13 @@ def groups_of(spec: Spec) -> list[Group]:
     return found
 
 
-def _components(spec: Spec, positions: Sequence[float]) -> list[tuple[Any, Any, Any]]:
+def _components(spec: Spec, positions: Sequence[Mapping[str, float]]) -> list[tuple[Any, Any, Any]]:
     """States, inputs and outputs that nothing joins to the others at any of these positions of the stroke."""
     plant = spec.plant
     n, m, p = len(plant.design_states), len(plant.inputs), len(plant.outputs)
     touch = np.zeros((n + m + p,) * 2, dtype=bool)
-    for z in positions:
-        at = linearize(plant, plant.at(**{plant.stroke: z}))
+    for place in positions:
+        at = linearize(plant, plant.at(**place))
         touch[:n, :n] |= at.A != 0
         touch[:n, n : n + m] |= at.B != 0
         touch[n + m :, :n] |= at.C != 0
@@ -192,6 +194,8 @@ def _role(spec: Spec, inputs: Any, outputs: Any) -> tuple[Any, ...]:
         for some in names
         for name in some
     )
+    if not plant.has_stroke:
+        return bounds
     return plant.stroke_output in outputs, plant.thrust_input in inputs, bounds
 
 
@@ -212,7 +216,9 @@ def _estimates(spec: Spec) -> tuple[tuple[str, str, Requirement], ...]:
 
 def _sample(spec: Spec, part: Part) -> SampledMachine:
     actuator = spec.plant.actuator
-    A, B = add_lags(part.A, part.B, actuator.crossover)
+    A, B = part.A, part.B
+    if math.isfinite(actuator.crossover):
+        A, B = add_lags(A, B, actuator.crossover)
     Ad, Bd = delay_inputs(*sample(A, B, spec.sample_time), actuator.delay(spec.sample_time))
     return SampledMachine(Ad, Bd, np.hstack([part.C, np.zeros((len(part.C), len(Ad) - part.C.shape[1]))]))
 

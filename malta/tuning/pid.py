@@ -27,7 +27,7 @@ from scipy import optimize, sparse
 from malta.errors import InputError
 from malta.margins.verify import Loop, crossing, machine_loop
 from malta.model.linearize import linearize
-from malta.model.plant import trim
+from malta.model.plant import position_at, position_in, trim
 from malta.synthesis.controller import handed_on, linear_law_of
 from malta.synthesis.lqg import pid_gains
 from malta.synthesis.requirements import ratio_of
@@ -78,14 +78,15 @@ class Part:
 def whole_machine(model: LinearModel, controller: Controller, loads: Loads) -> Part:
     """Describe all of a machine as one part, with what the loads leave in its states."""
     machine, plant, Ts = machine_loop(model, controller), model.plant, controller.sample_time
-    position = float(model.operating_point.x[plant.stroke_state])
-    loaded = linearize(plant, trim(plant, **{plant.stroke: position}))
+    x = model.operating_point.x
+    loaded = linearize(plant, trim(plant, **position_at(plant, x)))
     A, B, n = loaded.A - loaded.E @ loaded.C, loaded.B, len(loaded.A)
     push, shaken = np.zeros((len(machine.Ad), B.shape[1])), np.zeros_like(machine.Ad)
     push[:n] = sample(A, B, Ts)[1]
     shaken[:n, :n] = sample_noise(A, B * (np.square(loads.force_noise) * Ts) @ B.T, Ts)
     slope = np.zeros((B.shape[1], len(machine.Cd)))
-    slope[:, plant.stroke_output] = controller.feedforward.slope(position)
+    if plant.has_stroke:
+        slope[:, plant.stroke_output] = controller.feedforward.slope(position_in(plant, x))
     return Part(
         tuple(range(len(machine.Cd))), machine.Ad, machine.Bd, machine.Cd, slope, push, shaken
     )  # fmt: skip
