@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 import malta
 from malta import references
 from malta.machines.tubular import plant as tubular
+from malta.machines.tubular import windings
 from malta.simulation import period as machine
 from malta.simulation.references import Motion
 from malta.simulation.simulate import (
@@ -225,7 +226,7 @@ def test_half_the_link_is_all_there_is_and_the_drive_lives_with_it(
     if fidelity == "dq":
         assert run.u.shape == (len(run.t), 12)
         theta = np.linspace(0, 2 * math.pi, 25)
-        T = np.vstack([np.array(ca.DM(electric.to_phases(a))) for a in theta])
+        T = np.vstack([np.array(ca.DM(windings.to_phases(a))) for a in theta])
         largest = np.abs(run.u[:, :6] @ T.T).max(axis=1)
         assert np.abs(largest / run.link[:, 0]).max() <= 0.5 + 1e-9
     else:
