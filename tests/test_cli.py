@@ -395,6 +395,7 @@ def test_published_data_without_a_figure_of_a_table_names_it(
     assert "{ x = 218.92, " in text
     file.write_text(text.replace("{ x = 218.92, ", "{ "), encoding="utf-8")
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("malta.files.PACKAGE", tmp_path / "malta")
     code, _, err = run(*arguments)
     assert code == 2
     assert "published: table_I.poles.x: found nothing, expected " in one_sentence(err)

@@ -19,7 +19,7 @@ SLOW = {name: [pytest.mark.slow] for name in ("03_experiments", "05_halbach", "0
 
 
 def test_there_are_notebooks() -> None:
-    assert [n.name for n in NOTEBOOKS][:2] == ["01_model.py", "02_lqg.py"]
+    assert [n.name for n in NOTEBOOKS][:3] == ["00_your_machine.py", "01_model.py", "02_lqg.py"]
 
 
 @pytest.mark.parametrize(

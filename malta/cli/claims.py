@@ -36,7 +36,7 @@ def claims(
     """
     from malta.synthesis.design_file import read_design
 
-    specs = [read_design(file) for file in design_files("claims", designs, reverse=True)]
+    specs = [read_design(file) for file in design_files("claims", designs, reverse=True, or_shipped=True)]
     if not designs:
         specs.sort(key=lambda spec: bool(spec.search))  # the paper's own designs first
     with progress_bar("claims", quiet=as_json) as progress:

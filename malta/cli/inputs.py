@@ -8,19 +8,26 @@ from typing import TYPE_CHECKING
 from malta.cli.assignments import read_assignments
 from malta.cli.output import make_console
 from malta.errors import CheckError, InputError
-from malta.files import located
+from malta.files import located, shipped
 
 if TYPE_CHECKING:
     from malta.model.plant import Parameters, Plant
     from malta.synthesis.controller import Controller
 
 
-def design_files(command: str, named: list[Path] | None, *, reverse: bool = False) -> list[Path]:
+def design_files(
+    command: str, named: list[Path] | None, *, reverse: bool = False, or_shipped: bool = False
+) -> list[Path]:
     """The design files that were named, or all of design/ in alphabetical or reverse order.
+
+    or_shipped : where there is no folder design/ here, those that come with malta
 
     Raises InputError, naming the command, where design/ has none.
     """
-    files = named or sorted(Path("design").glob("*.toml"), reverse=reverse)
+    folder = Path("design")
+    if or_shipped and not folder.is_dir():
+        folder = shipped("design")
+    files = named or sorted(folder.glob("*.toml"), reverse=reverse)
     if not files:
         raise InputError(
             command, "", "no design files (*.toml) here", "a folder design/ with some, or their names"

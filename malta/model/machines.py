@@ -14,6 +14,7 @@ of the module itself, or of the modules `experiments`, `figures`, `claims`, `req
 from __future__ import annotations
 
 import atexit
+import hashlib
 import re
 import shutil
 import sys
@@ -25,24 +26,34 @@ from importlib.metadata import entry_points
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from malta.errors import InputError
+from malta.files import read_file
 
 if TYPE_CHECKING:
     from malta.model.plant import Plant
 
+
+class _File(NamedTuple):
+    """A machine's file, and the module that was made of it: its name holds a hash of the text."""
+
+    path: Path
+    module: str
+
+
 GROUP = "malta.machines"
 Part = Literal["experiments", "figures", "claims", "requirements"]
 FILES = "malta_machine_files"  # in sys.modules, the machines that come from files are modules of this package
-_files: dict[str, Path] = {}  # machines that the user named by their files
+_files: dict[str, _File] = {}  # machines that the user named by their files, by the files' stems
 
 
 def machine(name: str | Path | ModuleType) -> ModuleType:
     """The module of a machine: by its name, by the file that models it, or the module itself.
 
-    A file is loaded once, and its machine is known by the file's stem from then on: `malta.machine("rotor.py")` lets
-    `malta.gains.read("design/gains/rotor.json")` find the machine `rotor`.
+    The machine of a file is known by the file's stem from then on: `malta.machine("rotor.py")` lets
+    `malta.gains.read("design/gains/rotor.json")` find the machine `rotor`. A file is loaded again when its text
+    changed; the last one of a name counts, and records of an earlier one keep their plant.
 
     Raises InputError for an unknown name, a file that cannot be imported, or a module without Parameters and plant.
     """
@@ -51,7 +62,7 @@ def machine(name: str | Path | ModuleType) -> ModuleType:
     if isinstance(name, Path) or name.endswith(".py"):
         return _from_file(Path(name))
     if name in _files:
-        return sys.modules[f"{FILES}.{name}"]
+        return sys.modules[_files[name].module]
     installed = _installed()
     if name not in installed:
         known = ", ".join(map(repr, machine_names()))
@@ -66,7 +77,7 @@ def machine(name: str | Path | ModuleType) -> ModuleType:
 def name_of(module: ModuleType) -> str:
     """The name under which a machine's module is known."""
     if module.__name__.startswith(FILES + "."):
-        return module.__name__.removeprefix(FILES + ".")
+        return module.__name__.removeprefix(FILES + ".").split(".")[0].rpartition("_")[0]
     for name, target in _installed().items():
         if target == module.__name__:
             return name
@@ -80,14 +91,14 @@ def machine_names() -> list[str]:
 
 def file_of(name: str) -> Path | None:
     """The file of a machine that the user named by it."""
-    return _files.get(name)
+    return _files[name].path if name in _files else None
 
 
 def sources_of(name: str) -> dict[str, str]:
     """The text of the modules that a machine of the user's own was loaded from, by their names; none for others."""
     if name not in _files:
         return {}
-    own = f"{FILES}.{name}"
+    own = _files[name].module
     modules = {key: module for key, module in sys.modules.items() if key == own or key.startswith(own + ".")}
     paths = {key: getattr(module, "__file__", None) for key, module in modules.items()}
     return {key: Path(path).read_text(encoding="utf-8") for key, path in paths.items() if path}
@@ -95,14 +106,14 @@ def sources_of(name: str) -> dict[str, str]:
 
 def load_sources(name: str, sources: Mapping[str, str]) -> ModuleType:
     """The module of a machine from the text of its modules, as `sources_of` gives them, where there are no files."""
-    own = f"{FILES}.{name}"
+    own = min(sources, key=len)
     if own in sys.modules:
         return sys.modules[own]
-    sys.modules.setdefault(FILES, ModuleType(FILES))
     folder = Path(tempfile.mkdtemp(prefix="malta-machine-"))
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     for key, text in sources.items():
-        (folder / f"{key.rpartition('.')[2]}.py").write_text(text, encoding="utf-8")
+        stem = name if key == own else key.rpartition(".")[2]
+        (folder / f"{stem}.py").write_text(text, encoding="utf-8")
     return machine(folder / f"{name}.py")
 
 
@@ -154,14 +165,17 @@ def _from_file(path: Path) -> ModuleType:
         )
     if not path.is_file():
         raise InputError(where, "", "no such file", "a Python module with Parameters and plant")
-    known = sys.modules.get(f"{FILES}.{name}")
-    if known is not None and _files.get(name) == path:
+    if name in _installed():
+        found = f"a machine {name!r}, as an installed package has one"
+        raise InputError(where, "", found, "another file name")
+    text = read_file(where, "Python module", Path.read_bytes)
+    file = _File(path, f"{FILES}.{name}_{hashlib.sha256(text).hexdigest()[:12]}")
+    known = sys.modules.get(file.module)
+    if known is not None:
+        _files[name] = file
         return known
-    if name in _files or name in _installed():
-        other = _files.get(name, "an installed package")
-        raise InputError(where, "", f"a second machine {name!r}, beside that of {other}", "another file name")
     sys.modules.setdefault(FILES, ModuleType(FILES))
-    spec = spec_from_file_location(f"{FILES}.{name}", path, submodule_search_locations=[str(path.parent)])
+    spec = spec_from_file_location(file.module, path, submodule_search_locations=[str(path.parent)])
     assert spec is not None
     assert spec.loader is not None
     module = module_from_spec(spec)
@@ -174,7 +188,7 @@ def _from_file(path: Path) -> ModuleType:
         if isinstance(error, InputError) or not isinstance(error, Exception):
             raise
         raise InputError(where, "", _reason(error), "a module that can be imported") from error
-    _files[name] = path
+    _files[name] = file
     return module
 
 

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from malta.errors import CheckError, InputError
+from malta.files import located
 from malta.model.data import (
     Quantity,
     load_toml,
@@ -58,7 +59,7 @@ def read_design(path: str | Path) -> Spec:
 
     Raises InputError, naming file and field, for anything missing, unknown, of a wrong unit or out of range.
     """
-    path = Path(path)
+    path = located(path)
     raw = load_toml(path)
     machine = raw.get("machine")
     if not isinstance(machine, str):

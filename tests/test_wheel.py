@@ -1,0 +1,111 @@
+"""An installed malta is whole: from a wheel, in an empty environment, in a folder of its own."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+import venv
+from pathlib import Path
+
+import pytest
+from conftest import ROOT
+
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+SOURCES = (
+    "malta",
+    "data",
+    "design",
+    "notebooks",
+    "examples",
+    "pyproject.toml",
+    "setup.py",
+    "MANIFEST.in",
+    "README.md",
+)
+SHORTER = {  # commands of the README that take minutes, as the same commands with less to do
+    "malta tune design/robust.toml": "malta tune design/robust.toml --check",
+    "malta tune design/halbach_pid.toml": "malta tune design/halbach_pid.toml --generations 0 --front 0",
+    "malta campaign design/gains/calibrated.json --spread 20%": "malta campaign design/gains/calibrated.json "
+    "--spread 20% --samples 32 --out campaign",
+    "malta simulate design/gains/calibrated.json --replay FOLDER:17": "malta simulate design/gains/calibrated.json "
+    "--replay campaign:17",
+    "malta claims": "malta claims design/table2.toml",
+}
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of programs of an environment that has the wheel and what it depends on, and nothing else."""
+    folder = tmp_path_factory.mktemp("wheel")
+    source = folder / "source"
+    source.mkdir()
+    for name in SOURCES:
+        path = ROOT / name
+        ignored = shutil.ignore_patterns("__pycache__")
+        shutil.copytree(path, source / name, ignore=ignored) if path.is_dir() else shutil.copy(path, source)
+    pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "--quiet"]
+    environment = os.environ | {"PIP_CONSTRAINT": ""}
+    command = [*pip, "wheel", "--no-deps", "--wheel-dir", str(folder), str(source)]
+    built = subprocess.run(command, env=environment, capture_output=True, text=True, check=False, timeout=300)
+    if built.returncode and "No matching distribution" in built.stderr:
+        pytest.skip("no package index to fetch the build system from")
+    assert built.returncode == 0, built.stderr
+    (wheel,) = folder.glob("malta-*.whl")
+    venv.create(folder / "environment", with_pip=True)
+    bin_ = folder / "environment" / "bin"
+    pip[0] = str(bin_ / "python")
+    constraints = ["--constraint", str(ROOT / "constraints.txt")]
+    command = [*pip, "install", *constraints, str(wheel)]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False, timeout=900)
+    assert done.returncode == 0, done.stderr
+    return bin_
+
+
+def run(program: Path, folder: Path, *command: str) -> subprocess.CompletedProcess[str]:
+    environment = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
+    environment |= {"MPLBACKEND": "agg", "OPENBLAS_NUM_THREADS": "1"}
+    return subprocess.run(
+        [str(program / command[0]), *command[1:]],
+        cwd=folder,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=600,
+    )
+
+
+def test_the_readmes_lines_and_commands(program: Path, tmp_path: Path) -> None:
+    """Five lines of Python, then every command, from a folder that has nothing."""
+    code = re.search(r"```python\n(.*?)```", README, re.S)
+    assert code is not None
+    done = run(program, tmp_path, "python", "-c", code[1])
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.startswith("stable with hold, delay and current loops")
+    lines = re.findall(r"^(malta .*?)(?: +#.*)?$", README, re.M)
+    assert len(lines) >= 12
+    for line in lines:
+        done = run(program, tmp_path, *SHORTER.get(line, line).split())
+        assert done.returncode == 0, (line, done.stderr)
+        assert "Traceback" not in done.stderr
+    assert (tmp_path / "design" / "gains" / "table2.json").is_file()
+    assert (tmp_path / "build" / "robust_margins.png").is_file()
+
+
+def test_a_machine_of_ones_own(program: Path, tmp_path: Path) -> None:
+    """`malta new`, its notebook and its design, verified and flown."""
+    assert run(program, tmp_path, "malta", "new", "lev").returncode == 0
+    folder = tmp_path / "lev"
+    done = run(program, folder, "malta", "design")
+    assert (done.returncode, done.stderr) == (0, "")
+    for command in ("verify", "simulate"):
+        done = run(program, folder, "malta", command, "design/gains/lev.json", "--machine", "lev.py")
+        assert (done.returncode, done.stderr) == (0, "")
+    done = run(program, folder, "python", "notebook.py")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "open-loop poles" in done.stdout
