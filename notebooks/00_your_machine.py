@@ -2,9 +2,9 @@
 # # Your machine in an hour
 #
 # A machine is a Python module with two names: `Parameters`, a record of numbers with units, and `plant`, a function
-# that makes equations of motion of them. Everything else follows: the linear model, an LQG or PID controller, the proof of
-# its margin, a simulation with noise and limits, campaigns, gain files. `malta new NAME` writes such a module, with its
-# data, designs, tests and a notebook; this page walks through that folder.
+# that makes equations of motion of them. Everything else follows: the linear model, an LQG or PID controller, the proof
+# of its margin, a simulation with noise and limits, campaigns, gain files. `malta new NAME` writes such a module, with
+# its data, designs, tests and a notebook; this page walks through that folder.
 #
 # **Question:** what has to be written down of a machine, and what does malta make of it?
 

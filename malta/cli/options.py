@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from malta.files import located
+
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON document instead of tables.")]
 Changes = Annotated[
     list[str] | None,
@@ -63,7 +65,9 @@ Substeps = Annotated[
     typer.Option(help="Runge-Kutta steps a sample; the error is estimated. [4, more for slow samples]"),
 ]
 Seed = Annotated[int | None, typer.Option(help="Seed of the noise. [0]")]
-GainFile = Annotated[Path, typer.Argument(metavar="GAINS", help="A gain file: .json, .npz or .mat.")]
+GainFile = Annotated[
+    Path, typer.Argument(metavar="GAINS", help="A gain file: .json, .npz or .mat.", callback=located)
+]
 MachineFile = Annotated[
     Path | None,
     typer.Option(
