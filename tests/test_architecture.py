@@ -1,0 +1,137 @@
+"""The house: packages in one order, modules without a cycle, generic code that knows no machine."""
+
+from __future__ import annotations
+
+import ast
+import io
+import re
+import tokenize
+from collections.abc import Iterator
+from graphlib import TopologicalSorter
+from pathlib import Path
+
+from conftest import ROOT
+
+# Each may import those before it; machines stand where nobody generic imports them.
+ORDER = (
+    *(
+        "errors",
+        "units",
+        "files",
+        "threads",
+        "model",
+        "synthesis",
+        "margins",
+        "gains",
+        "simulation",
+        "campaigns",
+    ),
+    *("tuning", "report", "machines", "cli"),
+)
+MACHINES = {"tubular", "halbach", "planar", "rotor"}
+SOURCES = sorted((ROOT / "malta").rglob("*.py"))
+
+
+def module_of(path: Path) -> str:
+    parts = path.relative_to(ROOT).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+MODULES = {module_of(path) for path in SOURCES}
+
+
+def imports(path: Path, *, at_load: bool = False) -> Iterator[str]:
+    """The modules of malta that a module imports; at_load: those that it imports when it is imported itself."""
+    for node in statements(ast.parse(path.read_text(encoding="utf-8")), at_load=at_load):
+        if isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] == "malta":
+            for alias in node.names:
+                whole = f"{node.module}.{alias.name}"
+                yield whole if whole in MODULES else node.module
+        elif isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names if alias.name.split(".")[0] == "malta")
+
+
+def statements(tree: ast.AST, *, at_load: bool) -> Iterator[ast.AST]:
+    for node in ast.iter_child_nodes(tree):
+        lazy = isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda)
+        typing = isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"
+        if not (at_load and (lazy or typing)):
+            yield node
+            yield from statements(node, at_load=at_load)
+
+
+def package_of(module: str) -> str | None:
+    parts = module.split(".")
+    return parts[1] if len(parts) > 1 else None
+
+
+def test_packages_import_one_way() -> None:
+    """In the order of the sentence: model, synthesis, margins, gains, simulation, campaigns, tuning, report."""
+    upwards = []
+    for path in SOURCES:
+        own = package_of(module_of(path))
+        if own in (None, "__main__"):
+            continue
+        assert own in ORDER
+        for module in imports(path):
+            other = package_of(module)
+            machine = other == "machines" and own != "machines"
+            if machine or (other is not None and ORDER.index(other) > ORDER.index(own)):
+                upwards.append((module_of(path), module))
+    assert upwards == []
+
+
+def test_no_module_imports_itself_in_a_circle() -> None:
+    graph = {
+        module_of(path): {name for name in imports(path, at_load=True) if name != module_of(path)}
+        for path in SOURCES
+    }
+    order = list(TopologicalSorter(graph).static_order())  # raises CycleError
+    assert (
+        order.index("malta.errors")
+        < order.index("malta.model.plant")
+        < order.index("malta.simulation.simulate")
+    )
+
+
+def test_machines_know_nothing_of_each_other() -> None:
+    for path in SOURCES:
+        own = module_of(path).split(".")[2:3] if package_of(module_of(path)) == "machines" else []
+        for module in imports(path):
+            if own and package_of(module) == "machines":
+                assert module.split(".")[2:3] in (own, []), (module_of(path), module)
+
+
+def words_of_code(path: Path) -> Iterator[str]:
+    """Names and texts of a module, without comments and docstrings."""
+    text = path.read_text(encoding="utf-8")
+    tree = ast.parse(text)
+    documented = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
+    docstrings = {
+        node.body[0].lineno
+        for node in ast.walk(tree)
+        if isinstance(node, documented) and node.body and ast.get_docstring(node) is not None
+    }
+    for token in tokenize.generate_tokens(io.StringIO(text).readline):
+        if token.type == tokenize.NAME or (
+            token.type == tokenize.STRING and token.start[0] not in docstrings
+        ):
+            yield token.string
+
+
+def test_generic_code_names_no_machine() -> None:
+    named = []
+    for path in SOURCES:
+        if package_of(module_of(path)) not in ("machines", "cli"):
+            words = set(re.findall(r"[a-z]+", " ".join(words_of_code(path)).lower()))
+            named += [(module_of(path), machine) for machine in words & MACHINES]
+    assert named == []
+
+
+def test_a_machine_is_a_folder() -> None:
+    folders = [
+        path for path in sorted((ROOT / "malta" / "machines").iterdir()) if (path / "plant.py").is_file()
+    ]
+    assert [path.name for path in folders] == ["halbach", "planar", "tubular"]
+    for folder in folders:
+        assert {"experiments", "figures", "claims"} <= {path.stem for path in folder.iterdir()}
