@@ -28,7 +28,7 @@ ORDER = (
     ),
     *("tuning", "report", "machines", "cli"),
 )
-MACHINES = {"tubular", "halbach", "planar", "rotor"}
+MACHINES = {"tubular", "halbach", "planar"}
 SOURCES = sorted((ROOT / "malta").rglob("*.py"))
 
 
