@@ -16,7 +16,7 @@ import malta
 from malta.margins.box import Box, box_of
 from malta.margins.multipliers import Blocks, Multiplier, multiplier
 from malta.margins.problem import OfLoop
-from malta.margins.response import Branch, response
+from malta.margins.response import Branch, excludes_zero, response
 from malta.margins.robust import law_of, problem_of
 from malta.margins.structured import Structured, rows_of
 from malta.margins.uncertain import Compensator, UncertainSystem, instability
@@ -167,6 +167,68 @@ def test_chains_are_stable_where_it_is_proven(n: int, T: float | None, t: float)
     s = asked(loop)
     assert s.raise_bound(t) == t
     assert stable_within(loop, s.box, t)
+
+
+@pytest.mark.parametrize(
+    ("n", "T", "t", "lost"),
+    [
+        (3, None, 6.63, 6.639),
+        pytest.param(3, 0.1, 6.4, 6.442, marks=pytest.mark.slow),
+        pytest.param(4, None, 6.5, 6.524, marks=pytest.mark.slow),
+    ],
+)
+def test_wide_chains_are_proven_to_within_a_percent(n: int, T: float | None, t: float, lost: float) -> None:
+    """Six and eight parameters of 10 % each: at the corner of light masses on stiff springs they are lost."""
+    loop = chain(n, T)
+    s = asked(loop)
+    assert s.raise_bound(t) == t
+    assert s.count < 3000
+    assert stable_within(loop, s.box, t)
+    if n == 3:
+        corner = np.array([1 - 0.1 * lost] * 3 + [1 + 0.1 * lost] * 3)
+        assert instability(*loop, corner[None])[0] > 0
+
+
+def test_multipliers_that_move_with_frequency_exclude_zero_all_along_it() -> None:
+    """F(t) > 0 with N, D and G of every t, and with D and G that stand on a narrower interval alone."""
+    s = asked(chain(3, None))
+    (own,) = (c for c in s.cover(5.0) if c.branch == 0 and c.low <= 1.2 < c.high)
+    branch = s._branch(own)
+    assert branch is not None
+    blocks, widths = branch.channels[0].blocks, []
+    for constant in (False, True):
+        width = 0.2
+        while True:
+            low, high = 1.2, 1.2 + width
+            r, x, half = response(branch, low, high), 1.2 + width / 2, width / 2
+            if r is not None:
+                m, beta = multiplier(r.terms[0], blocks, None, 1.0, along=r.terms[1] / half)
+                assert beta < 1
+                m = m._replace(x=x, slopes=None if constant else m.slopes)
+                if excludes_zero(r, m, half):
+                    break
+            width /= 2
+        widths.append(width)
+        for t in np.linspace(-1, 1, 7):
+            at = m.at(x + t * half)
+            N = r.terms[0] + t * r.terms[1] + t * t * r.terms[2]
+            turned = 1j * at.G @ N
+            F = at.D - N.conj().T @ at.D @ N - turned - turned.conj().T
+            assert linalg.eigvalsh(F).min() > 0
+            assert linalg.eigvalsh(at.D).min() > 0
+    assert widths[0] >= 2 * widths[1]
+
+
+def test_a_proof_goes_on_where_time_ended_it() -> None:
+    loop = chain(2, None)
+    whole, parts = asked(loop), asked(loop)
+    assert whole.raise_bound(3.0) == 3.0
+    for k in range(40):
+        parts.until = clock.monotonic() + 0.02 * 1.3**k
+        if parts.raise_bound(3.0) == 3.0:
+            break
+    assert parts.lower == 3.0
+    assert stable_within(loop, parts.box, 3.0)
 
 
 def test_no_box_is_proven_that_holds_an_unstable_loop() -> None:

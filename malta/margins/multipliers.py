@@ -25,6 +25,7 @@ STEPS = 60  # of the level, at most
 INNER = 5  # Newton steps for each
 SHARE = 0.3  # of the way from the level reached to the one that stands
 FLAT = 0.01  # relative progress below which the level is the best there is
+STEP = 1e-6  # of N, for the slopes of a centre
 SLACK = 1e-6  # what keeps G within thousands of D where nothing else does
 
 
@@ -41,49 +42,47 @@ class Blocks:
 
 
 class Multiplier(NamedTuple):
+    """D and G at a frequency x, and their slopes along it."""
+
     D: ComplexArray
     G: ComplexArray
     blocks: Blocks  # whose structure D and G have: it shows nothing of others
+    x: float = 0.0
+    slopes: tuple[ComplexArray, ComplexArray] | None = None  # none: constant
+
+    def at(self, x: float) -> Multiplier:
+        """The same ones, continued to another frequency."""
+        if self.slopes is None:
+            return self._replace(x=x)
+        D, G = (M + (x - self.x) * S for M, S in zip((self.D, self.G), self.slopes, strict=True))
+        return self._replace(D=D, G=G, x=x)
 
 
 class Basis(NamedTuple):
-    """Entries (row, column) that D and G may have, and Hermitian basis elements as sums of these."""
+    """Entries (a, b), a <= b, that D and G may have; `own` of them in real blocks, the others, of D, all the same.
 
-    rows: Any
-    columns: Any
-    D: ComplexArray  # elements x entries
-    G: ComplexArray
+    Coordinates of G are the real parts of its own entries, then the imaginary parts of those off the diagonal;
+    those of D the same, and one for the others.
+    """
+
+    a: Any
+    b: Any
+    own: int
+    off: Any  # places of those off the diagonal
+    weights: FloatArray  # 1 off the diagonal, 1/2 on it
 
 
 @lru_cache(maxsize=64)
 def _basis(blocks: Blocks) -> Basis:
-    rows: list[int] = []
-    columns: list[int] = []
-    elements: list[dict[int, complex]] = []
+    pairs: list[tuple[int, int]] = []
     at = 0
     for r in blocks.real:
-        place = {}
-        for a in range(at, at + r):
-            for b in range(at, at + r):
-                place[a, b] = len(rows)
-                rows.append(a)
-                columns.append(b)
-        for (a, b), k in place.items():
-            if a == b:
-                elements.append({k: 1})
-            elif a < b:
-                elements += [{k: 1, place[b, a]: 1}, {k: 1j, place[b, a]: -1j}]
+        pairs += [(a, b) for a in range(at, at + r) for b in range(a, at + r)]
         at += r
-    count = len(elements)
-    if blocks.other:
-        elements.append({len(rows) + k: 1 for k in range(blocks.other)})
-        rows += range(at, at + blocks.other)
-        columns += range(at, at + blocks.other)
-    table: ComplexArray = np.zeros((len(elements), len(rows)), dtype=complex)
-    for k, element in enumerate(elements):
-        for entry, value in element.items():
-            table[k, entry] = value
-    return Basis(np.array(rows), np.array(columns), table, table[:count])
+    own = len(pairs)
+    pairs += [(k, k) for k in range(at, at + blocks.other)]
+    a, b = np.array(pairs, dtype=int).reshape(-1, 2).T
+    return Basis(a, b, own, np.flatnonzero(a < b), np.where(a < b, 1.0, 0.5))
 
 
 def units(N: ComplexArray, blocks: Blocks) -> FloatArray:
@@ -100,9 +99,20 @@ def units(N: ComplexArray, blocks: Blocks) -> FloatArray:
 
 
 def multiplier(
-    N: ComplexArray, blocks: Blocks, first: Multiplier | None, wanted: float, flat: float = FLAT
+    N: ComplexArray,
+    blocks: Blocks,
+    first: Multiplier | None,
+    wanted: float,
+    flat: float = FLAT,
+    along: ComplexArray | None = None,
+    *,
+    hasty: bool = False,
 ) -> tuple[Multiplier, float]:
-    """D and G with the smallest beta found, and it; the centre for beta = 1 where beta is below `wanted`."""
+    """D and G with the smallest beta found, and it; the centre for beta = 1 where beta is below `wanted`.
+
+    along : slopes of N along frequency, to which the centre's own are wanted
+    hasty : whether to leave it at `first` where beta is not below `wanted` there
+    """
     scale = units(N, blocks)
     turn = scale[:, None] / scale
     back = scale[:, None] * scale
@@ -111,8 +121,14 @@ def multiplier(
         if first is None or first.blocks != blocks
         else Multiplier(first.D / back, first.G / back, blocks)
     )
-    found, level = _Centres(N * turn, blocks).lowest(start, wanted**2, flat)
-    return Multiplier(found.D * back, found.G * back, blocks), float(np.sqrt(max(level, 0.0)))
+    centres = _Centres(N * turn, blocks)
+    x, level = centres.lowest(start, wanted**2, flat, hasty and start is not None)
+    D, G, _ = centres.matrices(x)
+    slopes = None
+    if along is not None and level < wanted**2:
+        moved = centres.slopes(x, along * turn)
+        slopes = None if moved is None else (moved[0] * back, moved[1] * back)
+    return Multiplier(D * back, G * back, blocks, 0.0, slopes), float(np.sqrt(max(level, 0.0)))
 
 
 class _Centres:
@@ -120,20 +136,28 @@ class _Centres:
 
     def __init__(self, N: ComplexArray, blocks: Blocks) -> None:
         self.N, self.H, self.blocks, self.basis = N, N.conj().T, blocks, _basis(blocks)
-        self.count = len(self.basis.D)
-        on_diagonal = self.basis.rows == self.basis.columns
-        traces = self.basis.D[:, on_diagonal].sum(axis=1).real
-        self.trace = np.concatenate([traces, np.zeros(len(self.basis.G))])
+        self.own = self.basis.own + len(self.basis.off)  # coordinates of G
+        self.count = self.own + (blocks.other > 0)  # of D
+        self.trace = np.zeros(self.count + self.own)
+        self.trace[: self.basis.own] = self.basis.weights[: self.basis.own] < 1
+        self.trace[self.own : self.count] = blocks.other
         self.start = (self.trace > 0) * 1.0
 
-    def _matrix(self, x: FloatArray, elements: ComplexArray) -> ComplexArray:
+    def _matrix(self, x: FloatArray) -> ComplexArray:
+        """D, or G, of its coordinates."""
+        a, b, own, off, _ = self.basis
+        entries: ComplexArray = x[:own].astype(complex)
+        entries[off] += 1j * x[own : self.own]
         found: ComplexArray = np.zeros(self.N.shape, dtype=complex)
-        found[self.basis.rows, self.basis.columns] = x @ elements
+        found[a[:own], b[:own]] = entries
+        found[b[:own], a[:own]] = entries.conj()
+        if len(x) > self.own:
+            found[a[own:], a[own:]] = x[self.own]
         return found
 
     def matrices(self, x: FloatArray) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
         """D, G and S."""
-        D, G = self._matrix(x[: self.count], self.basis.D), self._matrix(x[self.count :], self.basis.G)
+        D, G = self._matrix(x[: self.count]), self._matrix(x[self.count :])
         turned = 1j * (G @ self.N)
         return D, G, self.H @ D @ self.N + turned + turned.conj().T
 
@@ -141,7 +165,9 @@ class _Centres:
         D, _, S = self.matrices(x)
         return float(linalg.eigh(S, D, eigvals_only=True, check_finite=False)[-1])
 
-    def lowest(self, first: Multiplier | None, wanted: float, flat: float) -> tuple[Multiplier, float]:
+    def lowest(
+        self, first: Multiplier | None, wanted: float, flat: float, hasty: bool
+    ) -> tuple[FloatArray, float]:
         x = self.start
         level = self.level(x)
         if first is not None:
@@ -152,39 +178,53 @@ class _Centres:
             except np.linalg.LinAlgError:
                 pass
         b = level + 0.5 * abs(level) + 1e-6
-        for _ in range(STEPS):
+        for _ in range(0 if hasty and level >= wanted else STEPS):
             if level < wanted:
                 x = self.centre(x, 1.0)  # with room to all sides, for intervals of frequency
+                level = min(level, self.level(x))
                 break
             x = self.centre(x, b)
             level = self.level(x)
             if b - level < flat * abs(level) + 1e-9:
                 break
             b = level + SHARE * (b - level)
-        D, G, _ = self.matrices(x)
-        return Multiplier(D, G, self.blocks), level
+        return x, level
 
     def _coordinates(self, first: Multiplier) -> FloatArray:
-        def of(M: ComplexArray, elements: ComplexArray) -> FloatArray:
-            entries = M[self.basis.rows, self.basis.columns]
-            return np.asarray((elements.conj() @ entries).real / (np.abs(elements) ** 2).sum(axis=1))
+        a, b, own, off, _ = self.basis
 
-        x = np.concatenate([of(first.D, self.basis.D), of(first.G, self.basis.G)])
+        def of(M: ComplexArray) -> list[Any]:
+            entries = M[a[:own], b[:own]]
+            return [entries.real, entries[off].imag]
+
+        other = first.D[a[own:], a[own:]].real
+        x = np.concatenate([*of(first.D), [other.mean()] if len(other) else [], *of(first.G)])
         return np.asarray(x * (self.trace @ self.start) / max(float(self.trace @ x), 1e-300))
+
+    def slopes(self, x: FloatArray, along: ComplexArray) -> tuple[ComplexArray, ComplexArray] | None:
+        """How D and G of the centre for beta = 1 move as N does, about: its gradient stays zero."""
+        step = STEP * float(np.abs(self.N).max()) / max(float(np.abs(along).max()), 1e-300)
+        try:
+            inverses = self._inverses(x, 1.0)
+            other = _Centres(self.N + step * along, self.blocks)
+            moved = other._gradient(x, 1.0, *other._inverses(x, 1.0)) - self._gradient(x, 1.0, *inverses)
+            found = -np.linalg.solve(self._curvature(1.0, *inverses), moved) / step
+        except np.linalg.LinAlgError:
+            return None
+        return self._matrix(found[: self.count]), self._matrix(found[self.count :])
+
+    def _inverses(self, x: FloatArray, b: float) -> tuple[ComplexArray, ComplexArray]:
+        """Of b D - S and of D. Raises LinAlgError."""
+        D, _, S = self.matrices(x)
+        return np.linalg.inv(b * D - S), np.linalg.inv(D)
 
     def centre(self, x: FloatArray, b: float) -> FloatArray:
         """Newton steps towards the centre for b."""
-        total = float(self.trace @ self.start)
         for _ in range(INNER):
-            D, _, S = self.matrices(x)
             try:
-                g, H = self._slopes(np.linalg.inv(b * D - S), np.linalg.inv(D), b)
-                g += (self.trace @ x - total) * self.trace
-                g[self.count :] += SLACK * x[self.count :]
-                H += np.outer(self.trace, self.trace)
-                H[np.diag_indices(len(H))] += SLACK * (np.arange(len(H)) >= self.count)
-                H[np.diag_indices(len(H))] *= 1 + 1e-11
-                move = -np.linalg.solve(H, g)
+                inverses = self._inverses(x, b)
+                g = self._gradient(x, b, *inverses)
+                move = -np.linalg.solve(self._curvature(b, *inverses), g)
             except np.linalg.LinAlgError:
                 return x
             left = -float(g @ move)
@@ -195,28 +235,69 @@ class _Centres:
                 break
         return x
 
-    def _slopes(self, P: ComplexArray, V: ComplexArray, b: float) -> tuple[FloatArray, FloatArray]:
-        """Gradient and Hessian of -log det (b D - S) - log det D, of whose matrices P and V are the inverses.
-
-        By entries E_ij of D and G: tr(P X_ij P X_kl) with X = b E - N* E N of D, -j (E N - N* E) of G.
-        """
-        i, j, k = self.basis.rows, self.basis.columns, self.count
-        Q, R = self.N @ P, P @ self.H
-        W = Q @ self.H
-        at = np.ix_(j, i)
-        one = {name: M[at] for name, M in (("P", P), ("Q", Q), ("R", R), ("W", W), ("V", V))}
-        two = {name: M[at].T for name, M in (("P", P), ("Q", Q), ("R", R), ("W", W), ("V", V))}
-        DD = b * b * one["P"] * two["P"] - b * (one["R"] * two["Q"] + one["Q"] * two["R"])
-        DD += one["W"] * two["W"] + one["V"] * two["V"]
-        GG = one["W"] * two["P"] + one["P"] * two["W"] - one["Q"] * two["Q"] - one["R"] * two["R"]
-        DG = b * (one["P"] * two["Q"] - one["R"] * two["P"]) - one["Q"] * two["W"] + one["W"] * two["R"]
-        own, other = self.basis.D, self.basis.G
-        H = np.empty((k + len(other),) * 2)
-        H[:k, :k] = (own @ DD @ own.T).real
-        H[k:, k:] = (other @ GG @ other.T).real
-        H[:k, k:] = (own @ (-1j * DG) @ other.T).real
-        H[k:, :k] = H[:k, k:].T
+    def _gradient(self, x: FloatArray, b: float, P: ComplexArray, V: ComplexArray) -> FloatArray:
+        """Of -log det (b D - S) - log det D, of whose matrices P and V are the inverses; with the trace's equation."""
+        own, off, weights = self.basis.own, self.basis.off, 2 * self.basis.weights
+        at = self.basis.a, self.basis.b
+        Q = self.N @ P
+        of_D, of_G = (b * P - Q @ self.H + V)[at], (1j * (Q.conj().T - Q))[at]
         g = np.concatenate([
-            -(own @ (b * P[j, i] - W[j, i] + V[j, i])).real, -(other @ (-1j * (Q - R)[j, i])).real
+            (weights * of_D.real)[:own], 2 * of_D.imag[off],
+            [of_D.real[own:].sum()] if len(of_D) > own else [],
+            (weights * of_G.real)[:own], 2 * of_G.imag[off],
         ])  # fmt: skip
-        return g, H
+        beside = float(self.trace @ x) - float(self.trace @ self.start)
+        slack = np.where(np.arange(len(x)) < self.count, 0, SLACK) * x
+        return np.asarray(beside * self.trace + slack - g)
+
+    def _curvature(self, b: float, P: Any, V: Any) -> FloatArray:
+        """The Hessian: by entries E_ij of D and G tr(P X_ij P X_kl), X = b E - N* E N of D, -j (E N - N* E) of G."""
+        Q, fold = self.N @ P, _fold(self.blocks)
+        parts = np.array([P, Q, Q.conj().T, Q @ self.H, V]).reshape(5, -1)
+        (P, Q, R, W, V), (p, q, r, w, v) = np.asarray(parts[:, fold.one]), np.asarray(parts[:, fold.two])
+        k, size = self.basis.own, len(self.basis.a)
+        X: ComplexArray = np.zeros((2, size + k, size + k), dtype=complex)
+        X[:, :size, :size] = b * b * P * p - b * (R * q + Q * r) + W * w + V * v
+        X[:, :size, size:] = (-1j * (b * (P * q - R * p) - Q * w + W * r))[:, :, :k]
+        X[:, size:, size:] = (W * p + P * w - Q * q - R * r)[:, :k, :k]
+        if size > k + 1:  # the others are one coordinate
+            X = np.asarray(np.add.reduceat(np.add.reduceat(X, fold.starts, axis=1), fold.starts, axis=2))
+        (x, y), (u, v) = X.real, X.imag
+        H: FloatArray = np.array([x + y, v - u, -u - v, y - x]).ravel()[fold.at] * fold.weights
+        H[self.count :, : self.count] = H[: self.count, self.count :].T
+        H += self.trace[:, None] * self.trace
+        diagonal = np.einsum("ii->i", H)
+        diagonal[self.count :] += SLACK
+        diagonal *= 1 + 1e-11
+        return H
+
+
+class Fold(NamedTuple):
+    """Where products by entries are: (a, b) of rows and (a, b) or (b, a) of columns; and coordinates among these."""
+
+    one: Any
+    two: Any
+    starts: Any  # of entries that are summed
+    at: Any
+    weights: FloatArray
+
+
+@lru_cache(maxsize=64)
+def _fold(blocks: Blocks) -> Fold:
+    a, b, own, off, w = _basis(blocks)
+    n, size = blocks.size, len(a)
+    across, right, left = b[:, None] * n + a, b[:, None] * n + b, a[:, None] * n + a
+    shared = size > own  # entries of D beside those of blocks, together one
+    starts = np.r_[np.arange(own + shared), size + np.arange(own)]
+    entries = [np.arange(own), off, np.full(int(shared), own)]
+    of_G = [own + shared + np.arange(own), own + shared + off]
+    place = np.concatenate([*entries, *of_G]).astype(int)
+    imaginary = np.concatenate([
+        np.zeros(own), np.ones(len(off)), np.zeros(int(shared)), np.zeros(own), np.ones(len(off))
+    ]).astype(int)  # fmt: skip
+    weights = np.concatenate([w[:own], np.full(int(shared), 0.5), w[:own]])[place]
+    kind = 2 * imaginary[:, None] + imaginary
+    at = (kind * len(starts) + place[:, None]) * len(starts) + place
+    return Fold(
+        np.array([across, right]), np.array([across.T, left.T]), starts, at, 2 * weights[:, None] * weights
+    )

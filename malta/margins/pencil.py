@@ -30,6 +30,9 @@ if TYPE_CHECKING:
     from malta.margins.expansion import Table
     from malta.model.plant import FloatArray
 
+LIFTED = 8  # states up to which the square of a hold is written out
+LESS = 0.05  # of the bound of what is left, at most, where it is
+
 
 @dataclass(frozen=True, eq=False)
 class Pencil:
@@ -99,8 +102,8 @@ class Rows:
     def size(self) -> int:
         """Rows of the pencil."""
         law, m = self.loop.law, len(self.inputs)
-        lags = m if law.lag is not None else 0
-        return len(self.group.states) + lags + len(self.group.own) + m * law.delay + len(self.reads)
+        driven = len(self.group.states) + (m if law.lag is not None else 0)
+        return driven * (2 if self.liftable else 1) + len(self.group.own) + m * law.delay + len(self.reads)
 
     @property
     def cost(self) -> int:
@@ -121,6 +124,23 @@ class Rows:
         plant = self._plant(dens, c, r)
         return None if plant is None else self._joined(plant, below, c, r)
 
+    def _lifts(self, c: FloatArray) -> bool:
+        """Whether a hold's square, Y^2 / 12 of c(Y), is written out by w = Y x, as more rows, each of them linear.
+
+        So it is where slopes of c(Y) alone leave out much more, over a tenth of the parameters to both sides.
+        """
+        T, r = self.loop.law.sample_time, 0.1 * np.abs(c)
+        if T is None or not self.liftable:
+            return False
+        A, dens = self.A.over(c, r), self.dens.over(c, r)
+        whole, beyond = square_held(A, dens, T), square_held(A, dens, T, beyond=True)
+        return whole is not None and beyond is not None and beyond.rest.sum() < LESS * whole.rest.sum()
+
+    @property
+    def liftable(self) -> bool:
+        """Whether there are few enough states for twice as many rows."""
+        return self.loop.sampled and len(self.group.states) <= LIFTED
+
     def _plant(self, dens: Expansion, c: FloatArray, r: FloatArray) -> tuple[Expansion, ...] | None:
         """P_0 and P_1 of the rows of x and of the lags: for these states, then for what acts on them."""
         law, loop, T = self.loop.law, self.loop, self.loop.law.sample_time
@@ -137,9 +157,11 @@ class Rows:
             return A.times(-1), E, B.times(-1), B.times(0)
         if not loop.sampled:
             return E + A.times(-1), E + A, B.times(-1), B
-        curved = square_held(A, dens, T)
+        lifted = self._lifts(c)
+        curved = square_held(A, dens, T, beyond=lifted)
         if curved is not None:
-            return A.times(-T), curved, B.times(-T), B.times(T)
+            lift = (A.times(T / 6), dens) if lifted else ()
+            return A.times(-T), curved, B.times(-T), B.times(T), *lift
         found = held(A, B, dens, T)
         if found is None:
             return None
@@ -152,11 +174,11 @@ class Rows:
         )
 
     def _joined(self, plant: tuple[Expansion, ...], below: Expansion, c: FloatArray, r: FloatArray) -> Pencil:
-        """Columns: x with lags, the compensator's states, stored inputs, y."""
+        """Columns: x with lags, the compensator's states, stored inputs, y, and Y x where the hold is lifted."""
         law, own, late = self.loop.law, list(self.group.own), self.loop.law.delay
         n, k, m, y = len(plant[0].middle), len(own), len(self.inputs), len(self.reads)
-        edges = np.cumsum([0, n, k, m * late, y]).tolist()
-        N, (x, w, _, z) = edges[-1], (slice(a, b) for a, b in pairwise(edges))
+        edges = np.cumsum([0, n, k, m * late, y, n if len(plant) > 4 else 0]).tolist()
+        N, (x, w, _, z, square) = edges[-1], (slice(a, b) for a, b in pairwise(edges))
         eye = np.eye(N)
         wanted = np.zeros((m, N))
         wanted[:, w], wanted[:, z] = law.C[np.ix_(self.inputs, own)], law.D[np.ix_(self.inputs, self.reads)]
@@ -182,7 +204,12 @@ class Rows:
         P0.add(z, slice(0, len(self.group.states)), self.C.over(c, r).times(-1))
         P0.add(z, slice(0, N), self.D.over(c, r).columns(wanted).times(-1))
         P0.add(z, z, below)
-        return Pencil(P0.total, P1.total, np.arange(N) < n + k + m * late, self.loop.sampled)
+        if len(plant) > 4:  # w = Y x: dens w - T A x, and v dens Y^2 / 6 x = v T A / 6 w
+            P1.add(x, square, plant[4])
+            P0.add(square, x, plant[0])
+            P0.add(square, square, plant[5])
+        curved = self.loop.sampled and len(plant) == 4
+        return Pencil(P0.total, P1.total, np.arange(N) < n + k + m * late, curved)
 
 
 class _Sum:

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 FINE = 1e-11  # of the largest: what a slope has below that is no channel
 COARSE = 3e-4  # where a hold curves the slopes
 SMALL = 1e-7  # of M: a rest below that is taken with the rounding
+SMALLEST = 1e-10  # where slopes are factored to the last digit
 GUARD = 1e-13
 
 
@@ -85,7 +86,7 @@ class Branch:
                 )
         other = 0
         whole = rest[0] + self.x * rest[1]
-        whole = np.where(whole > SMALL, whole, 0)
+        whole = np.where(whole > (SMALL if self.pencil.curved else SMALLEST), whole, 0)
         if whole.any():
             rest = [np.where(whole > 0, 0, part) for part in rest]
             u, v = np.sqrt(whole.sum(axis=1)), np.sqrt(whole.sum(axis=0))
@@ -179,29 +180,45 @@ def positive(M: Any, beside: float) -> bool:
     return bool(np.isfinite(M).all())
 
 
-def excludes_zero(r: Response, m: Multiplier) -> bool:
-    """Whether F > 0 for all |t| <= 1, and D > 0."""
-    D, G = m.D, m.G
+def excludes_zero(r: Response, m: Multiplier, half: float = 0.0) -> bool:
+    """Whether F > 0 for all |t| <= 1, and D > 0, where D and G move with t by `half` times their slopes."""
     N0, N1, N2 = r.terms
+    n = len(m.D)
+    D, G = m.D, m.G
+    none = np.zeros_like(D)
+    dD, dG = (none, none) if m.slopes is None else (half * m.slopes[0], half * m.slopes[1])
+
+    def both(M: Any) -> Any:
+        return M + M.conj().T
+
     H0, H1, H2 = (N.conj().T for N in r.terms)
-    F0 = D - H0 @ D @ N0 - 1j * (G @ N0 - H0 @ G)
+    D0, D1, D2, E0, E1, E2 = (M @ N for M in (D, dD) for N in r.terms)
+    F0 = D - H0 @ D0 - both(1j * (G @ N0))
     diagonal = np.diag(F0).real
     if not (diagonal > 0).all():
         return False
-    F1 = -(H0 @ D @ N1 + H1 @ D @ N0) - 1j * (G @ N1 - H1 @ G)
-    F2 = -(H0 @ D @ N2 + H2 @ D @ N0 + H1 @ D @ N1) - 1j * (G @ N2 - H2 @ G)
-    size, one, two = np.abs(N0) + np.abs(N1) + np.abs(N2), np.abs(N1), np.abs(N2)
-    d, g = np.abs(D), np.abs(G)
-    left = 2 * one.T @ d @ two + two.T @ d @ two
+    F1 = dD - both(H0 @ D1 + 1j * (G @ N1 + dG @ N0)) - H0 @ E0
+    F2 = -both(H0 @ D2 + H0 @ E1 + 1j * (G @ N2 + dG @ N1)) - H1 @ D1
+    # beyond second order
+    F3 = -both(H1 @ D2 + H0 @ E2 + 1j * (dG @ N2)) - H1 @ E1
+    F4 = -both(H1 @ E2) - H2 @ D2
+    size = np.abs(N0) + np.abs(N1) + np.abs(N2)
+    d, g = np.abs(D) + np.abs(dD), np.abs(G) + np.abs(dG)
+    left = np.abs(F3) + np.abs(F4) + np.abs(H2 @ E2)
     left = left + 2 * (size + r.rest).T @ d @ r.rest + 2 * g @ r.rest
-    left = left + 32 * (len(D) + 4) * EPS * (size.T @ d @ size + 2 * g @ size + d)
+    left = left + 64 * (n + 4) * EPS * (size.T @ d @ size + 2 * g @ size + d)
     scale = np.exp2(-np.round(np.log2(diagonal) / 2))
     turn = scale[:, None] * scale
     F0, F1, F2, left = F0 * turn, F1 * turn, F2 * turn, left * turn
     room = float(((left + left.T) / 2).sum(axis=1).max()) * (1 + 1e-12)
-    values, vectors = np.linalg.eigh((F2 + F2.conj().T) / 2)
+    values, vectors = np.linalg.eigh(both(F2) / 2)
     F2 = (vectors * np.minimum(values, 0)) @ vectors.conj().T
-    room += GUARD * 100 * len(D) * float(np.abs(values).max())
-    middle = (F0 + F0.conj().T) / 2 + F2
-    F1 = (F1 + F1.conj().T) / 2
-    return positive(middle + F1, room) and positive(middle - F1, room) and positive(D * turn, 0.0)
+    room += GUARD * 100 * n * float(np.abs(values).max())
+    middle, F1 = both(F0) / 2 + F2, both(F1) / 2
+    D, dD = D * turn, dD * turn
+    return (
+        positive(middle + F1, room)
+        and positive(middle - F1, room)
+        and positive(D + dD, 0.0)
+        and (m.slopes is None or positive(D - dD, 0.0))
+    )

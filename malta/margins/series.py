@@ -56,15 +56,21 @@ def quotient(A: Expansion, dens: Expansion) -> Expansion | None:
     return Expansion(middle, slopes, (rest + (linear + rest) * share / (1 - share)) * (1 + 1e-12))
 
 
-def square_held(A: Expansion, dens: Expansion, T: float) -> Expansion | None:
-    """dens (1 + c(Y)) 2 + ... = 2 dens + 2 dens c(T A / dens); None where the series does not do."""
+def square_held(A: Expansion, dens: Expansion, T: float, *, beyond: bool = False) -> Expansion | None:
+    """dens (1 + c(Y)) 2 + ... = 2 dens + 2 dens c(T A / dens); None where the series does not do.
+
+    beyond : c(Y) - Y^2 / 12 in place of c(Y), and no slopes of it but a bound
+    """
     own = quotient(A, dens)
     if own is None:
         return None
-    Y = own.times(T)
-    c = _function(Y, _bernoulli(), LARGEST, even=True)
+    Y, gains = own.times(T), _bernoulli()
+    c = _function(Y, (0.0, *gains[1:]) if beyond else gains, LARGEST, even=True)
     if c is None:
         return None
+    if beyond:
+        moves = np.abs(c.slopes).sum(axis=0) * (1 + 1e-12)
+        c = Expansion(c.middle, np.zeros_like(c.slopes), c.rest + moves)
     d0, moved = np.diag(dens.middle)[:, None], np.diagonal(dens.slopes, axis1=1, axis2=2)[:, :, None]
     beside, wide = np.diag(dens.rest)[:, None], np.abs(moved).sum(axis=0)
     linear = np.abs(c.slopes).sum(axis=0)

@@ -3,7 +3,8 @@
 A cell is an interval of frequency and a part of box(t). Where multipliers show that no parameters of it reach the
 boundary of stability there it is done; else it is split, across frequency where they do in its middle, across the
 parameter that matters most where they do not. Multipliers take real parameters as they are, all at once: their effort
-grows as a power of the number of parameters, not exponentially, and a box is seldom split at all.
+grows as a power of the number of parameters, not exponentially, and a box is seldom split at all. Along frequency the
+multipliers of one interval are continued to the next, by their slopes.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import math
 import time as clock
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from scipy import linalg
@@ -39,7 +40,10 @@ LARGEST = 40  # rows of a group's pencil, beyond which families of its smaller g
 ROUGH = 0.1  # how close the first beta is to the smallest, relative
 SMALLEST = 1e-6  # of the target: boxes below that are not tried
 FIRST_STEP, LAST_STEP = 1.2, 1.003  # from one box to the next
-PATIENCE = 0.5  # share of the time that is left for one box
+NOT_FAR = 5.0  # times what stands: boxes up to that are tried at once
+WIDER = 1.3  # the next interval of frequency than the last one
+HASTY = 0.4  # share of the last interval's width from which on a failure means that it was too wide
+PATIENCE = 0.8  # share of the time that is left for one box
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +59,41 @@ class Cell:
     near: Multiplier | None = None
 
 
+class Attempt(NamedTuple):
+    """What became of cells: beta of one that was not excluded, if any, and those that time did not do for."""
+
+    beta: float
+    cell: Cell | None
+    left: list[Cell]
+
+
+class Step(NamedTuple):
+    """How wide the next interval of frequency is taken on a part of the box, relative to its end."""
+
+    sides: FloatArray | None = None
+    share: float = math.inf
+    good: float = math.inf  # of the last one that was excluded
+
+    def hasty(self, cell: Cell) -> bool:
+        """Whether the interval is about as wide as one that was excluded next to it: a narrower one is, surely."""
+        wide = cell.high - cell.low > HASTY * self.good * cell.high
+        return cell.sides is self.sides and cell.low > 0 and wide
+
+    def cut(self, cell: Cell) -> tuple[Cell, list[Cell]]:
+        """The cell's first part of that width, and the rest of it, if any."""
+        width = self.share * cell.high
+        if cell.sides is not self.sides or cell.low == 0 or not cell.low + 1.2 * width < cell.high:
+            return cell, []
+        return replace(cell, high=cell.low + width), [replace(cell, low=cell.low + width)]
+
+    def after(self, cell: Cell, done: bool) -> Step:
+        if not cell.low:
+            return self
+        share = (cell.high - cell.low) / cell.high
+        good = share if done else self.good if cell.sides is self.sides else math.inf
+        return Step(cell.sides, (WIDER if done else 0.5) * share, good)
+
+
 @dataclass(eq=False)
 class Structured:
     """The groups of loops, and the largest t for which all of box(t) is shown to be as stable as the nominal values."""
@@ -67,27 +106,41 @@ class Structured:
     lower: float = 0.0
     count: int = 0
     _order: list[Cell] = field(default_factory=list, repr=False)  # those that resist first
+    # t of the largest box that was begun, and its cells that are left
+    _open: tuple[float, list[Cell]] | None = None
     _branches: dict[Any, tuple[Pencil | None, dict[Any, Branch]]] = field(default_factory=dict, repr=False)
 
     def late(self, until: float = math.inf) -> bool:
         return clock.monotonic() > min(until, self.until) or self.count >= self.most
 
     def raise_bound(self, target: float) -> float:
-        """Prove ever larger boxes up to box(target), whole ones first, as far as time goes."""
-        cells = self._order = self._order if self.lower else self._whole(target)
-        step = FIRST_STEP
-        while self.lower < target and step > LAST_STEP and not self.late():
-            t = min(target, self.lower * step) if self.lower else target / 64
-            now = clock.monotonic()
-            last = now + PATIENCE * (self.until - now)
-            hard = self._prove(self._on(cells or self.cover(t), t), last, split=True)
-            if hard is None:
+        """Prove box(target), or larger boxes on the way to it where that takes too long; called again, it goes on."""
+        if not self.lower:
+            self._order = self._whole(target)
+        t, begun = self._next(target), self._open
+        while self.lower < t and (t == target or t > LAST_STEP * self.lower) and not self.late():
+            if begun is not None and self.lower < begun[0] <= target:
+                t, cells = begun
+            else:
+                cells = self._on(self._order or self.cover(t), t)
+            begun, now = None, clock.monotonic()
+            found = self._prove(cells, now + PATIENCE * (self.until - now), split=True)
+            if found.cell is None:
                 self._stands(t)
+                t = self._next(target)
             elif not self.lower:
                 break
             else:
-                step = math.sqrt(step)
+                if found.left and (self._open is None or t >= self._open[0]):
+                    self._open = t, found.left
+                t = math.sqrt(t * self.lower)
         return self.lower
+
+    def _next(self, target: float) -> float:
+        """The box to be tried: the target where that is not far, else one a little larger than what stands."""
+        if not self.lower:
+            return target / 64
+        return target if target <= NOT_FAR * self.lower else FIRST_STEP * self.lower
 
     def _stands(self, t: float) -> None:
         self.lower = max(self.lower, t)
@@ -108,12 +161,12 @@ class Structured:
         now = clock.monotonic()
         last = now + 0.7 * (self.until - now)
         while cells and not self.late(last) and t > SMALLEST * target:
-            hard = self._prove(self._on(cells, t), last, split=False)
-            if hard is None:
+            found = self._prove(self._on(cells, t), last, split=False)
+            if found.cell is None:
                 self._stands(t)
                 break
-            cells = [hard[1], *cells]
-            t *= min(0.9, max(0.9 / hard[0], 0.3))
+            cells = [found.cell, *cells]
+            t *= min(0.9, max(0.9 / found.beta, 0.3))
         return cells
 
     def _survey(self, t: float) -> tuple[float, list[Cell]]:
@@ -140,29 +193,33 @@ class Structured:
             c for _, c in found
         ]
 
-    def _prove(self, cells: list[Cell], last: float, *, split: bool) -> tuple[float, Cell] | None:
-        """None where all cells are excluded, else beta of one that is not, and the cell."""
-        todo = list(reversed(cells))
+    def _prove(self, cells: list[Cell], last: float, *, split: bool) -> Attempt:
+        """Exclude all cells, next to each other along frequency by intervals that are as wide as the last ones were."""
+        todo, step = list(reversed(cells)), Step()
         inner = self.box.sides(self.lower) if self.lower else None
         while todo:
             cell = todo.pop()
             if self.late(last):
-                return math.inf, cell
+                return Attempt(math.inf, cell, [cell, *reversed(todo)])
             if inner is not None and split and _within(cell.sides, inner):
                 continue
-            beta, m, done = self._level(cell)
+            cell, rest = step.cut(cell)
+            todo += rest
+            beta, m, done = self._level(cell, hasty=step.hasty(cell))
             if done:
-                if todo and todo[-1].near is None:
+                step = step.after(cell, True)
+                if todo and (todo[-1].near is None or _beside(cell, todo[-1])):
                     todo[-1] = replace(todo[-1], near=m)
             elif beta < NEAR:
                 if cell.high - cell.low < NARROWEST * cell.high or cell.high < LOWEST * cell.top:
-                    return 1.0, cell
+                    return Attempt(1.0, cell, [])
+                step = step.after(cell, False)
                 todo += [replace(half, near=m) for half in reversed(across_frequency(cell))]
             elif split:
                 todo += self._across_box(cell, m)
             else:
-                return beta, cell
-        return None
+                return Attempt(beta, cell, [])
+        return Attempt(0.0, None, [])
 
     def _branch(self, cell: Cell) -> Branch | None:
         key = (cell.rows, cell.sides.tobytes())
@@ -186,7 +243,7 @@ class Structured:
                 found.append(Cell(k, sides, branch, low, high, high))
         return found
 
-    def _level(self, cell: Cell) -> tuple[float, Multiplier | None, bool]:
+    def _level(self, cell: Cell, *, hasty: bool = False) -> tuple[float, Multiplier | None, bool]:
         """beta in the middle of a cell, its multiplier, and whether the cell is excluded."""
         self.count += 1
         own = self._branch(cell)
@@ -198,14 +255,24 @@ class Structured:
         blocks = own.channels[0].blocks
         if not blocks.size:
             return 0.0, None, True
-        near = cell.near if cell.near is not None and cell.near.blocks == blocks else None
-        if near is not None and excludes_zero(found, near):
+        x, half = (cell.low + cell.high) / 2, (cell.high - cell.low) / 2
+        near = cell.near.at(x) if cell.near is not None and cell.near.blocks == blocks else None
+        if near is not None and excludes_zero(found, near, half):
             return 0.0, near, True
+        along = found.terms[1] / half if half > 0 else None
         try:
-            m, beta = multiplier(found.terms[0], blocks, near, NEAR)
+            m, beta = multiplier(found.terms[0], blocks, near, 1.0, along=along, hasty=hasty)
+            if hasty and beta >= 1 and near is not None:
+                return 0.0, near, False
+            done = beta < 1 and excludes_zero(found, m := m._replace(x=x), half)
+            if NEAR <= beta < 1 and not done:
+                narrow = response(own, x, x)
+                if narrow is not None and excludes_zero(narrow, m):
+                    return 0.0, m, False
+                m, beta = multiplier(found.terms[0], blocks, m, NEAR)
         except (np.linalg.LinAlgError, ValueError):
             return math.inf, None, False
-        return beta, m, beta < 1 and excludes_zero(found, m)
+        return beta, m, done
 
     def _across_box(self, cell: Cell, m: Multiplier | None) -> list[Cell]:
         sides = cell.sides
@@ -226,6 +293,11 @@ class Structured:
 
 def _within(sides: FloatArray, outer: FloatArray) -> bool:
     return bool((sides[:, 0] >= outer[:, 0]).all() and (sides[:, 1] <= outer[:, 1]).all())
+
+
+def _beside(cell: Cell, other: Cell) -> bool:
+    """Whether the other one goes on along frequency."""
+    return cell.sides is other.sides and cell.branch == other.branch and cell.high == other.low
 
 
 def across_frequency(cell: Cell) -> list[Cell]:
