@@ -25,6 +25,7 @@ GUARD = 1e-9  # rad that a half plane must have to spare
 BATCH = 1024
 NARROW = 1e-4  # of an interval of frequency, whose expansion leaves out less than rounding
 HOPELESS = 0.1  # variation of f on a cell, in radii, below which smaller cells exclude no more
+FEW, MANY = 24, 96  # cells up to which they are cut thrice, and twice, at once
 STUCK = 14  # splits beyond the first of a cell that holds a candidate for the witness
 
 
@@ -129,6 +130,7 @@ class Search:
     beside: Callable[[FloatArray, FloatArray], Beside] | None = (
         None  # f by more than its family, on cells and boxes
     )
+    hasty: bool = False  # whether few cells are cut several times at once
     # the smallest t of a cell that no splitting frees of zero, as the radius is larger than f
     blocked: float = np.inf
     done: list[tuple[FloatArray, FloatArray, ComplexArray]] = field(default_factory=list)
@@ -285,28 +287,33 @@ def _split(
             0.5 * np.maximum(np.abs(ends).reshape(len(cells), -1).sum(axis=1) * size, inner * size / 2)
         )
     moves += [np.where(np.isfinite(m), m, 0.0) for m in found.moves]
-    choice = np.argmax(np.array(moves), axis=0)
-    new_cells, new_boxes, new_depth = [], [], []
-    for axis in np.unique(choice):
-        k = choice == axis
+    sizes = np.array(moves)
+    for _ in range(_rounds(len(cells)) if s.hasty else 1):
+        choice, k = np.argmax(sizes, axis=0), np.arange(len(cells))
+        middles = np.concatenate([cells[:, 1:].mean(axis=1)[None], _middles(boxes, s.growth)])[choice, k]
+        sizes[choice, k] /= 2
+        wide, far = choice == 0, (k[choice > 0], choice[choice > 0] - 1)
+        halves = []
         for side in (0, 1):
-            c, b = cells[k].copy(), boxes[k].copy()
-            if axis == 0:
-                c[:, 2 - side] = c[:, 1:].mean(axis=1)
-            else:
-                b[:, axis - 1, 1 - side] = _middle(b[:, axis - 1], s.growth, axis - 1)
-            new_cells.append(c)
-            new_boxes.append(b)
-            new_depth.append(depth[k] + 1)
-    c, b = np.vstack(new_cells), np.vstack(new_boxes)
-    s.cells, s.boxes = np.vstack([s.cells, c]), np.vstack([s.boxes, b])
-    s.smallest = np.concatenate([s.smallest, s.growth.smallest(b)])
-    s.depth = np.concatenate([s.depth, *new_depth])
+            c, b = cells.copy(), boxes.copy()
+            c[wide, 2 - side] = middles[wide]
+            b[far[0], far[1], 1 - side] = middles[~wide]
+            halves.append((c, b))
+        cells, boxes = (np.vstack(pair) for pair in zip(*halves, strict=True))
+        sizes, depth = np.hstack([sizes, sizes]), np.tile(depth + 1, 2)
+    s.cells, s.boxes = np.vstack([s.cells, cells]), np.vstack([s.boxes, boxes])
+    s.smallest = np.concatenate([s.smallest, s.growth.smallest(boxes)])
+    s.depth = np.concatenate([s.depth, depth])
 
 
-def _middle(sides: FloatArray, growth: Growth, axis: int) -> FloatArray:
-    """Where to split: the nominal value first, so that parts away from it need no proof at small t."""
-    low, high = sides[:, 0], sides[:, 1]
-    c = float(growth.shares(growth.nominal)[axis])
-    inside = (low < c) & (c < high) & (high - low == (high - low).max())
-    return np.asarray(np.where(inside & growth.grows[axis], c, (low + high) / 2))
+def _rounds(count: int) -> int:
+    """How often cells are cut at once: few cost as much time as one."""
+    return 1 if count > MANY else 2 if count > FEW else 3
+
+
+def _middles(boxes: FloatArray, growth: Growth) -> FloatArray:
+    """Where to split, axes x cells: the nominal value first, so that parts away from it need no proof at small t."""
+    low, high = boxes[..., 0], boxes[..., 1]
+    c = growth.shares(growth.nominal)
+    inside = (low < c) & (c < high) & (high - low == (high - low).max(axis=0)) & growth.grows
+    return np.asarray(np.where(inside, c, (low + high) / 2).T)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time as clock
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 from weakref import WeakKeyDictionary
@@ -45,6 +45,7 @@ BRIEF = 0.5  # s that a wider box may take at least
 PATIENCE = 20_000  # cells without progress after which the proof is given up
 REMEMBERED = 4_000_000  # numbers in the families of a polynomial, beyond which the oldest are forgotten
 HARD = 4000  # cells after which smaller boxes are proven first
+FEW = 100  # cells of many parameters, of which each is dear, before multipliers take their turn
 LEVELS = 5  # of these boxes, each half of the next
 # of the time for families, by the number of parameters, the last for MANY
 SHARES = (0.6, 0.6, 0.6, 0.6, 0.4, 0.3)
@@ -220,7 +221,7 @@ class Job:
         Where the whole box takes long, smaller ones are proven first: each is a bound that stands.
         """
         searches = self._begin(parts, self.target(reach), min(reach, self.upper))
-        final = self._advance(searches, reach, min(self.most_cells, HARD))
+        final = self._advance(searches, reach, min(self.most_cells, FEW if self._count >= MANY else HARD))
         best, kept = 0.0, searches
         if self._open(searches) and self._count >= MANY:
             self._multiply(self.target(reach), TURN, TURN_AFTER * (clock.monotonic() - self.begun))
@@ -267,7 +268,8 @@ class Job:
         return self._multiplied() >= self.upper * (1 - self.asked)
 
     def _begin(self, parts: list[Part], target: float, until: float) -> Searches:
-        return [(part, start(part.family, part.growth, target, until)) for part in parts]
+        found = [(part, start(part.family, part.growth, target, until)) for part in parts]
+        return [(part, replace(search, hasty=True)) for part, search in found]
 
     def _open(self, searches: Searches) -> bool:
         """Whether the proof has not come as close to the witness as was asked."""
@@ -312,7 +314,7 @@ class Job:
         """Whether the proof shall come closer to the witness, as it may where that costs little."""
         if self.fixed or count > CHEAP or self.tolerance <= FINEST or math.isinf(self.upper):
             return False
-        self.tolerance = max(self.tolerance / 10, FINEST)
+        self.tolerance = FINEST
         return True
 
     def _unsettled(self, searches: Searches) -> None:
