@@ -63,9 +63,12 @@ def check_signals(plant: Plant) -> None:
         if len(getattr(plant, key)) != len(names[of]):
             found = f"{len(getattr(plant, key))} entries"
             raise InputError(plant.name, key, found, f"{len(names[of])}, one for each of the {of}")
-    for key, known in {"stroke": names["outputs"] + names["states"], "thrust": names["inputs"]}.items():
-        if getattr(plant, key) not in ("", *known):
-            raise InputError(plant.name, key, repr(getattr(plant, key)), "one of " + " ".join(known))
+    both = [name for name in names["outputs"] if name in names["states"]]
+    if plant.stroke not in ("", *both):
+        expected = "an output that is a state of the same name" + (f", as {' '.join(both)}" if both else "")
+        raise InputError(plant.name, "stroke", repr(plant.stroke), expected)
+    if plant.thrust not in ("", *names["inputs"]):
+        raise InputError(plant.name, "thrust", repr(plant.thrust), "one of " + " ".join(names["inputs"]))
     if bool(plant.stroke) != bool(plant.thrust):
         raise InputError(plant.name, "stroke", repr(plant.stroke), "stroke and thrust, or neither")
     for name in plant.uncontrolled:
