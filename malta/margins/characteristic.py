@@ -362,6 +362,11 @@ def _bilinear(n: int) -> Any:
     return fmpq_mat(table)
 
 
+def turned_table(n: int) -> Any:
+    """What turns coefficients of g into those of v, as balls."""
+    return arb_mat(_bilinear(n))
+
+
 def mapped(a: list[Any]) -> list[Any]:
     table = _bilinear(len(a) - 1)
     if isinstance(a[-1], fmpq) or isinstance(a[0], fmpq):

@@ -205,7 +205,10 @@ def advance(s: Search) -> None:
     bad = ~good
     if bad.any():
         narrow = cells[:, 2] - cells[:, 1] < NARROW * cells[:, 2]  # the radius is not the expansion's
-        hopeless = bad & narrow & (_spread(terms) < HOPELESS * radius)
+        spread = _spread(terms)
+        hopeless = bad & (
+            narrow & (spread < HOPELESS * radius) | (spread < HOPELESS * found.discs.real.max(axis=1))
+        )
         s.blocked = min(s.blocked, float(s.growth.smallest(boxes[hopeless]).min(initial=np.inf)))
         moves = [m[bad] for m in found.moves]
         kept = Beside([t[bad] for t in terms], radius[bad], found.lasting[bad], found.discs[bad], moves)

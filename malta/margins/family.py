@@ -191,7 +191,7 @@ def _in_doubles(shape: Sequence[int], table: Any, tails: Any) -> Family:
         mantissas == 0, -np.inf, powers + np.log2(np.abs(np.where(mantissas == 0, 1, mantissas)))
     )
     top = sizes.max(axis=1)
-    scale = _scale(top)
+    scale = scale_of(top)
     exponents = [int(np.ceil(t)) if np.isfinite(t) else 0 for t in top]
     shift = np.clip(powers - np.array(exponents)[:, None], -1020, 1020).astype(int)
     values, radius = np.ldexp(mantissas, shift), np.ldexp(radii, shift).max(axis=1)
@@ -218,8 +218,8 @@ def _transformed(table: Any, shape: tuple[int, ...], axis: int, M: Any) -> Any:
     return np.moveaxis(made.reshape(n, *rest), 0, axis).reshape(-1, count)
 
 
-def _scale(top: FloatArray) -> int:
-    """The power of two that s counts in: the geometric mean of the roots' sizes."""
+def scale_of(top: FloatArray) -> int:
+    """The power of two that s counts in: the geometric mean of the roots' sizes; top: log2 of the coefficients."""
     known = np.flatnonzero(np.isfinite(top))
     if len(known) < 2:
         return 0

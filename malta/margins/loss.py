@@ -74,18 +74,30 @@ def _turned(problem: Problem, box: Box, place: FloatArray, best: Loss) -> Loss:
         t, _, p = best
         if p is None or not np.isfinite(t):
             break
-        steps = STEP * (box.up + box.down)
-        rows = p + np.diag(steps)[steps > 0]
-        with np.errstate(all="ignore"):
-            slopes = np.zeros(len(p))
-            slopes[steps > 0] = _instability(problem, rows, 0.0) - _instability(problem, p[None], 0.0)
-        d = np.where(slopes > 0, box.up, -box.down)
+        d = _uphill(problem, box, p)
         nearer = _along(problem, place, d, t)
         if not nearer < t * (1 - 1e-9):
             break
         there = place + nearer * d
         best = (nearer, _critical(problem, there, place), there)
     return best
+
+
+def corner_of(problem: Problem, box: Box, p: FloatArray) -> FloatArray:
+    """The corner, of the box with p on its edge, that the slopes of the worst root point to; p where that is stable."""
+    d = _uphill(problem, box, p)
+    corner = np.where(box.down + box.up > 0, box.nominal + float(box.margin(p)) * d, p)
+    return corner if float(_instability(problem, corner[None], -math.inf)[0]) > 0 else p
+
+
+def _uphill(problem: Problem, box: Box, p: FloatArray) -> FloatArray:
+    """How each parameter moves the worst root outwards the fastest, as far as box(1) goes."""
+    steps = STEP * (box.up + box.down)
+    rows = p + np.diag(steps)[steps > 0]
+    with np.errstate(all="ignore"):
+        slopes = np.zeros(len(p))
+        slopes[steps > 0] = _instability(problem, rows, 0.0) - _instability(problem, p[None], 0.0)
+    return np.where(slopes > 0, box.up, -box.down)
 
 
 def _critical(problem: Problem, p: FloatArray, place: FloatArray) -> float | None:

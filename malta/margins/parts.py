@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from malta.margins.enclosure import TooWide, Unproven
-from malta.margins.exclusion import Growth
+from malta.margins.exclusion import Beside, Growth
 from malta.margins.family import Family
 from malta.margins.problem import Polynomial
 
@@ -29,6 +29,8 @@ class Part:
     sides: FloatArray
     family: Family
     growth: Growth
+    # the family with what couples it to others, on cells and boxes:
+    around: Callable[[FloatArray, FloatArray], Beside] | None = None
 
 
 def cut(
@@ -89,6 +91,8 @@ def without_twins(parts: list[Part]) -> list[Part]:
 def _together(one: Part, two: Part) -> Part | None:
     """A part whose radius covers both families; None where they differ by more than rounding."""
     f, g = one.family, two.family
+    if one.around is not None or two.around is not None:
+        return None
     if (f.shape, f.exponents, f.scale) != (
         g.shape,
         g.exponents,

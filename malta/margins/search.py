@@ -26,11 +26,12 @@ from malta.margins.exclusion import (
 )
 from malta.margins.expressions import NotAnalytic, exact
 from malta.margins.family import Family, narrowed
-from malta.margins.loss import first_loss, loss_of_one
+from malta.margins.loss import corner_of, first_loss, loss_of_one
 from malta.margins.parts import Part, cut, without_twins
 from malta.margins.problem import Polynomial, Problem, hurwitz
 from malta.margins.robust import Certificate, Margin, Progress
 from malta.margins.structured import Structured, rows_of
+from malta.margins.weak import AnywhereHeld
 from malta.margins.witness import Zero, gradients, starts
 
 if TYPE_CHECKING:
@@ -46,12 +47,16 @@ PATIENCE = 20_000  # cells without progress after which the proof is given up
 REMEMBERED = 4_000_000  # numbers in the families of a polynomial, beyond which the oldest are forgotten
 HARD = 4000  # cells after which smaller boxes are proven first
 FEW = 100  # cells of many parameters, of which each is dear, before multipliers take their turn
+BISECTIONS = 16  # of the way to a witness
+NEAR = 1.005  # box of couplings, in multiples of where axes by themselves are lost
 LEVELS = 5  # of these boxes, each half of the next
 # of the time for families, by the number of parameters, the last for MANY
 SHARES = (0.6, 0.6, 0.6, 0.6, 0.4, 0.3)
 MANY = 5  # parameters from which on multipliers come before many cells
 LAST = 20.0  # s that they may take at the end where cells have proven something
 TURN, TURN_AFTER = 0.5, 4.0  # their share of the time in that turn, and how many times what was spent before
+
+BOUNDED = "what the position does is bounded, not followed"
 
 Searches = list[tuple[Part, Search]]
 FAMILIES: WeakKeyDictionary[Polynomial, dict[Any, Family]] = WeakKeyDictionary()
@@ -93,6 +98,8 @@ class Job:
         Raises Unproven.
         """
         sides = self.box.framed(reach)
+        if isinstance(self.problem, AnywhereHeld):
+            return self.problem.enclosed(self.box, reach)
         made: list[Part] = []
         try:
             for polynomial, moves in self.problem.parts([arb(a).union(arb(b)) for a, b in sides.tolist()]):
@@ -192,9 +199,10 @@ class Job:
             self.reasons.append(
                 why or f"nothing beyond {done:.3g} was looked at: the model is dear to enclose"
             )
-        if self.upper < done / 3 and not self.late():
+        room = NEAR if isinstance(self.problem, AnywhereHeld) else 1.05  # couplings grow with the box
+        if self.upper < done / (3 if room > NEAR else room) and not self.late():
             with suppress(Unproven):  # families over a smaller box are narrower; the larger ones do as well
-                parts, done = self.parts(1.05 * self.upper, self.until), 1.05 * self.upper
+                parts, done = self.parts(room * self.upper, self.until), room * self.upper
         return parts, done
 
     def _first(self) -> float:
@@ -268,8 +276,12 @@ class Job:
         return self._multiplied() >= self.upper * (1 - self.asked)
 
     def _begin(self, parts: list[Part], target: float, until: float) -> Searches:
-        found = [(part, start(part.family, part.growth, target, until)) for part in parts]
-        return [(part, replace(search, hasty=True)) for part, search in found]
+        begun = [
+            (part, replace(start(part.family, part.growth, target, until), hasty=True)) for part in parts
+        ]
+        for part, search in begun:
+            search.beside = part.around
+        return begun
 
     def _open(self, searches: Searches) -> bool:
         """Whether the proof has not come as close to the witness as was asked."""
@@ -320,6 +332,9 @@ class Job:
     def _unsettled(self, searches: Searches) -> None:
         worst = min((s for _, s in searches), key=lambda s: s.lower)
         if worst.lower >= self.upper * (1 - self.asked):
+            return
+        if isinstance(self.problem, AnywhereHeld):
+            self.reasons.append(BOUNDED)
             return
         count = sum(s.count for _, s in searches)
         why = "not settled in time" if self.late() else f"not settled within {count} cells"
@@ -411,9 +426,21 @@ class Job:
         for share in 1 + 10.0 ** np.arange(-9, -1.5, 0.5):
             there = self.box.stretched(p, share)
             if self._unstable(there):
+                if isinstance(self.problem, AnywhereHeld):  # the zero is that of axes by themselves
+                    p = corner_of(self.problem, self.box, there)
+                    there = self.box.stretched(p, self._first_unstable(p))
+                    return float(self.box.margin(there)), w, there
                 return float(self.upper * share), w, there
         self.reasons.append("the poles of the loop do not confirm the witness")
         return math.inf, None, None
+
+    def _first_unstable(self, p: FloatArray) -> float:
+        """About the smallest share of the way to p, which is unstable, from where the loop is so on."""
+        low, high = 0.95, 1.0
+        for _ in range(BISECTIONS):
+            middle = (low + high) / 2
+            low, high = (low, middle) if self._unstable(self.box.stretched(p, middle)) else (middle, high)
+        return high
 
     def _unstable(self, p: FloatArray) -> bool:
         try:

@@ -16,13 +16,19 @@ from typing import TYPE_CHECKING, Literal, get_args
 import numpy as np
 
 from malta.errors import CheckError, InputError
+from malta.margins.box import Box, box_of
+from malta.margins.expressions import NotAnalytic
 from malta.margins.gain import Gain, worst_case_gain
-from malta.margins.plants import of_plant
+from malta.margins.held import held_machine
+from malta.margins.plants import LONGEST, of_plant
+from malta.margins.problem import OfSeveral
 from malta.margins.robust import (
     TOLERANCE,
+    Effort,
     Margin,
     common_margin,
     margin_at,
+    margin_of,
     problem_of,
     robust_margin,
 )
@@ -31,8 +37,10 @@ from malta.margins.uncertain import (
     UncertainSystem,
     held_at,
     holds,
+    model_of,
     sampled_law,
 )
+from malta.margins.weak import AnywhereHeld
 from malta.model.data import plant_of
 from malta.model.linearize import LinearModel, linearize
 from malta.model.plant import position_at, position_in, trim
@@ -358,8 +366,9 @@ def travel_margin(
 ) -> Margin:
     """The margin of the machine's loop anywhere in its travel: the position is one more interval of the proof.
 
-    Where the matrices have no short form along the travel, as those of the planar motor's held currents, the margin is
-    that in the middle and at the end, and says so.
+    Where the matrices have no short form along the travel, as those of the planar motor's held currents, its axes are
+    proven by themselves, with a bound of what couples them anywhere in the travel (`weak`). Where that fails too, the
+    margin is that in the middle and at the end, and says so.
 
     ranges : of the parameters, as robust_margin takes them
     names : parameters of the model, where others stand still beside those of `ranges`: one model for several questions
@@ -367,6 +376,10 @@ def travel_margin(
     """
     names = tuple(names or ranges)
     along, over = travel_loops(plant, controller, names, current_loops)
+    if not over and (problem := _anywhere(plant, controller, names, current_loops)) is not None:
+        found = margin_of(problem, _box(along[0][0], ranges), Effort(time=time, progress=progress))
+        if found.lower is not None:
+            return found
     found = common_margin(along, ranges, over, time=time, progress=progress)
     if len(along) == 1:
         return found
@@ -390,10 +403,51 @@ def _along(
     """The machine's loop with its position as a parameter; its loops in the middle and at the end where not."""
     if not plant.has_stroke:
         return [loop_at(plant, controller, names, 0.0, current_loops)]
-    whole = machine_system(plant, controller, [*names, plant.stroke], {plant.stroke: 0.0}, current_loops)
-    if whole[0].matrices.n_instructions() < LONG:
-        return [whole]
+    if not _is_long(plant, controller, names):
+        whole = machine_system(plant, controller, [*names, plant.stroke], {plant.stroke: 0.0}, current_loops)
+        if whole[0].matrices.n_instructions() < LONG:
+            return [whole]
     return [loop_at(plant, controller, names, share * plant.travel, current_loops) for share in ENDS]
+
+
+def _is_long(plant: Plant, controller: Controller, names: tuple[str, ...]) -> bool:
+    """Whether the model along the travel is too long to be written out."""
+    believed = plant_of(controller.parameters)
+    held = holds(believed) and not believed.tabulated
+    return held and model_of(plant, believed, names).n_instructions() > LONGEST
+
+
+@lru_cache(maxsize=8)
+def _anywhere(
+    plant: Plant,
+    controller: Controller,
+    names: tuple[str, ...],
+    current_loops: CurrentLoops,
+    position: float | None = None,
+) -> AnywhereHeld | None:
+    """The loop anywhere in the travel, or at a position, as `weak` takes it; None where it has not that form."""
+    law = machine_law(plant, controller, current_loops)
+    if not _is_long(plant, controller, names) or law.delay != 1 or law.lag is not None:
+        return None
+    along = _along(plant, controller, names, current_loops)
+    try:
+        if position is None:
+            travel = (-plant.travel, plant.travel)
+            machine = held_machine(plant, plant_of(controller.parameters), names, travel)
+        else:
+            whole = _anywhere(plant, controller, names, current_loops)
+            if whole is None:
+                return None
+            machine = whole.machine.at(position)
+            along = [loop_at(plant, controller, names, position, current_loops)]
+    except NotAnalytic:
+        return None
+    places = OfSeveral(tuple(problem_of(*loop) for loop in along))
+    return AnywhereHeld(machine, replace(law, delay=0), places)
+
+
+def _box(system: UncertainSystem, ranges: Mapping[str, float | tuple[float, float]]) -> Box:
+    return box_of(system.names, system.nominal, system.limits, ranges, {}, caller="travel_margin")
 
 
 def place_margin(
@@ -412,7 +466,12 @@ def place_margin(
     along, over = travel_loops(plant, controller, names, current_loops)
     if over:
         return margin_at(*along[0], ranges, {plant.stroke: position}, over, tolerance=TOLERANCE)
-    return robust_margin(*loop_at(plant, controller, names, position, current_loops), ranges, time=EACH)
+    loop = loop_at(plant, controller, names, position, current_loops)
+    if (problem := _anywhere(plant, controller, names, current_loops, position)) is not None:
+        found = margin_of(problem, _box(loop[0], ranges), Effort(time=EACH))
+        if found.lower is not None:
+            return found
+    return robust_margin(*loop, ranges, time=EACH)
 
 
 def worst_sensitivities(

@@ -1,0 +1,223 @@
+"""A few axes as double integrators under their share of a compensator: determinants and adjugates over a box.
+
+A group's sampled loop has q+ = q + T q' + T^2 / 2 a, q'+ = q' + T a, a+ = b v: its matrix M0 = z - A0 is affine in each
+of the b_i, which are monomials of p. So are its determinant and its adjugate: sums over subsets of the b_i, found once,
+that any box of p only weighs. Polynomials in g = z - 1 are turned to v as those of `characteristic` are.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from flint import arb, arb_mat, fmpq, fmpq_mat
+
+from malta.margins.characteristic import mapped, turned_table
+from malta.margins.enclosure import precision
+from malta.margins.expressions import exact
+from malta.margins.family import EPS, binary
+from malta.margins.held import HeldMachine
+from malta.margins.loop import rational
+
+if TYPE_CHECKING:
+    from malta.margins.uncertain import Compensator
+    from malta.model.plant import FloatArray
+
+BITS = 320
+
+
+@dataclass(frozen=True, eq=False)
+class Axes:
+    """A group of axes with its states of the compensator, in the polynomials of g = z - 1 turned to v.
+
+    subsets : of the b_i, at one each and the others at zero, what the determinant and the adjugate are made of
+    """
+
+    axes: tuple[int, ...]
+    own: tuple[int, ...]
+    machine: HeldMachine
+    determinants: tuple[list[Any], ...]  # exact
+    adjugates: FloatArray  # subsets x K x states x states, over 2^heights
+    slack: FloatArray  # how far these are off
+    heights: tuple[int, ...]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return self.machine.names
+
+    @property
+    def inverted(self) -> tuple[bool, ...]:
+        return (False,) * len(self.names)
+
+    @cached_property
+    def powers(self) -> list[tuple[int, ...]]:
+        """Of each subset, the monomial of p that it comes with, denominators cleared."""
+        found = []
+        for chosen in itertools.product((0, 1), repeat=len(self.axes)):
+            total = [0] * len(self.names)
+            for i, inside in zip(self.axes, chosen, strict=True):
+                for k, e in enumerate(self.machine.lead[i].monomial):
+                    total[k] += max(e, 0) if inside else max(-e, 0)
+            found.append(tuple(total))
+        return found
+
+    @cached_property
+    def degrees(self) -> tuple[int, ...]:
+        return tuple(max(row[k] for row in self.powers) for k in range(len(self.names)))
+
+    def at(self, v: Sequence[Any]) -> list[Any]:
+        """Coefficients of the determinant at exact p."""
+        total = [arb(0)] * len(self.determinants[0])
+        for power, a in zip(self.powers, self.determinants, strict=True):
+            weight = fmpq(1)
+            for x, e in zip(v, power, strict=True):
+                weight *= x**e
+            total = [t + weight * c for t, c in zip(total, a, strict=True)]
+        return total
+
+    def over(self, sides: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """The determinant and the adjugate over a box, denominators cleared, and how far each may be off.
+
+        K x nodes and K; K x states x states x nodes and K x states x states, over 2^heights.
+        """
+        weights = _bernstein(self.powers, self.degrees, sides)  # subsets x nodes
+        sizes = _bernstein(self.powers, self.degrees, np.abs(sides))
+        determinant, slack = _doubles(self.determinants, self.heights)
+        values = determinant.T @ weights
+        radius = (slack.T @ sizes + 64 * EPS * (np.abs(determinant).T @ sizes)).max(axis=1)
+        N = np.tensordot(self.adjugates, weights, axes=(0, 0))
+        slack = 64 * EPS * np.abs(self.adjugates) + 2 * self.slack
+        return values, radius, N, np.tensordot(slack, sizes, axes=(0, 0)).max(axis=3)
+
+
+def members_of(g: Axes, n: int) -> list[int]:
+    """A group's states among all: positions, rates, accelerations, the compensator's."""
+    return [*(k * n + i for k in range(3) for i in g.axes), *(3 * n + k for k in g.own)]
+
+
+def state_matrix(law: Compensator, axes: Sequence[int], own: Sequence[int], b: Sequence[Any]) -> FloatArray:
+    """M0's state matrix of a group, at values of b."""
+    r, T = len(axes), float(law.sample_time or 0)
+    A = np.zeros((3 * r + len(own),) * 2)
+    eye = np.eye(r)
+    A[:r, :r], A[:r, r : 2 * r], A[:r, 2 * r : 3 * r] = eye, T * eye, T**2 / 2 * eye
+    A[r : 2 * r, r : 2 * r], A[r : 2 * r, 2 * r : 3 * r] = eye, T * eye
+    A[2 * r : 3 * r, :r] = np.array(b)[:, None] * law.D[np.ix_(axes, axes)]
+    A[2 * r : 3 * r, 3 * r :] = np.array(b)[:, None] * law.C[np.ix_(axes, own)]
+    A[3 * r :, :r] = law.B[np.ix_(own, axes)]
+    A[3 * r :, 3 * r :] = law.A[np.ix_(own, own)]
+    return A
+
+
+def axes_of(machine: HeldMachine, law: Compensator, axes: tuple[int, ...], own: tuple[int, ...]) -> Axes:
+    """Determinants and adjugates of a group, for every subset of its b."""
+    vertices = []
+    chosen = list(itertools.product((0, 1), repeat=len(axes)))
+    with precision(BITS):
+        for on in chosen:
+            c = [machine.lead[i].coefficient if x else 0.0 for i, x in zip(axes, on, strict=True)]
+            vertices.append(_adjugate(_exact(law, axes, own, c)))
+        count = len(vertices[0][0])
+        determinants: list[list[Any]] = []
+        adjugates: list[list[Any]] = []
+        for on in chosen:
+            f, N = [arb(0)] * count, [0 * m for m in vertices[0][1]]
+            for other, (a, R) in zip(chosen, vertices, strict=True):
+                if any(y > x for x, y in zip(on, other, strict=True)):
+                    continue
+                sign = (-1) ** (sum(on) - sum(other))
+                f = [x + sign * y for x, y in zip(f, a, strict=True)]
+                N = [x + sign * y for x, y in zip(N, R, strict=True)]
+            determinants.append(f)
+            adjugates.append(N)
+        return _stored(machine, axes, own, determinants, adjugates)
+
+
+def _exact(law: Compensator, axes: Sequence[int], own: Sequence[int], c: Sequence[float]) -> Any:
+    """A0 - 1 of a group in exact numbers, rounded to balls."""
+    r, T = len(axes), exact(float(law.sample_time or 0))
+    n = 3 * r + len(own)
+    table = [[fmpq(0)] * n for _ in range(n)]
+    D, C = rational(law.D[np.ix_(axes, axes)]), rational(law.C[np.ix_(axes, own)])
+    B, A = rational(law.B[np.ix_(own, axes)]), rational(law.A[np.ix_(own, own)])
+    for i in range(r):
+        table[i][r + i], table[i][2 * r + i], table[r + i][2 * r + i] = T, T * T / 2, T
+        b = exact(c[i])
+        table[2 * r + i][:r] = [b * x for x in D[i]]
+        table[2 * r + i][3 * r :] = [b * x for x in C[i]]
+        table[2 * r + i][2 * r + i] = fmpq(-1)
+    for k in range(len(own)):
+        table[3 * r + k][:r] = B[k]
+        table[3 * r + k][3 * r :] = [x - (k == i) for i, x in enumerate(A[k])]
+    return arb_mat(fmpq_mat(table))
+
+
+def _adjugate(H: Any) -> tuple[list[Any], list[Any]]:
+    """det(g - H) and adj(g - H) by powers of g from the lowest on: Faddeev and LeVerrier."""
+    n = H.nrows()
+    eye = arb_mat([[int(i == j) for j in range(n)] for i in range(n)])
+    R, c = [eye], [arb(1)]
+    for k in range(1, n + 1):
+        moved = H * R[-1]
+        c.append(-sum((moved[i, i] for i in range(n)), arb(0)) / k)
+        if k < n:
+            R.append(moved + c[-1] * eye)
+    return c[::-1], R[::-1]
+
+
+def _stored(
+    machine: HeldMachine,
+    axes: tuple[int, ...],
+    own: tuple[int, ...],
+    determinants: list[list[Any]],
+    adjugates: list[list[Any]],
+) -> Axes:
+    """Turned from g to v."""
+    turned = [mapped(f) for f in determinants]
+    heights = []
+    for k in range(len(turned[0])):
+        sizes = [binary(f[k]) for f in turned]
+        heights.append(max((math.frexp(m)[1] + e for m, _, e in sizes if m), default=0))
+    n = 3 * len(axes) + len(own)
+    found, slack = np.zeros((2, len(turned), len(heights), n, n))
+    for s, N in enumerate(adjugates):
+        flat = arb_mat([m.entries() for m in N] + [[arb(0)] * (n * n)])
+        rows = turned_table(len(heights) - 1) * flat
+        for k, height in enumerate(heights):
+            values, radii = _doubles([[rows[k, i] for i in range(n * n)]], [height] * (n * n))
+            found[s, k], slack[s, k] = values.reshape(n, n), radii.reshape(n, n)
+    return Axes(axes, own, machine, tuple(turned), found, slack, tuple(heights))
+
+
+def _doubles(a: Sequence[list[Any]], heights: Sequence[int]) -> tuple[FloatArray, FloatArray]:
+    """Balls over 2^heights in floating point, and how far these may be off."""
+    values, radii = np.zeros((2, len(a), len(heights)))
+    for s, row in enumerate(a):
+        for k, (c, height) in enumerate(zip(row, heights, strict=True)):
+            m, r, e = binary(c)
+            shift = max(min(e - height, 900), -1000)
+            values[s, k], radii[s, k] = math.ldexp(m, shift), math.ldexp(r, shift) + 1e-300
+    return values, radii
+
+
+def _bernstein(powers: Sequence[Sequence[int]], degrees: Sequence[int], sides: FloatArray) -> FloatArray:
+    """Bernstein coefficients of monomials over a box: monomials x nodes."""
+    rows = []
+    for power in powers:
+        row = np.ones(1)
+        for r, d, (low, high) in zip(power, degrees, sides.tolist(), strict=True):
+            own = [
+                sum(
+                    math.comb(i, s) * math.comb(d - i, r - s) * high**s * low ** (r - s)
+                    for s in range(max(0, r - d + i), min(i, r) + 1)
+                ) / math.comb(d, r)
+                for i in range(d + 1)
+            ]  # fmt: skip
+            row = np.outer(row, own).ravel()
+        rows.append(row)
+    return np.array(rows)

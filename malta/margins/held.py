@@ -1,0 +1,258 @@
+"""Machines whose currents are held between samples, anywhere in their travel: double integrators and what is beside.
+
+    q'' = Z(p, y) q - E(p, y) (q - r) + B(p, y) v,    r: the reading that the currents were made for
+
+B is close to a diagonal of monomials b_i(p), and Z and E are the stiffness that currents made for one place have
+elsewhere: of the state equation of `jacobians`, A = [[0, 1], [Z, 0]]. All of it is enclosed for every y of the travel
+at once (`along`), as sums of monomials of p with coefficients in intervals.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import casadi as ca
+import numpy as np
+from flint import arb
+
+from malta.margins import taylor
+from malta.margins.along import Evaluation, Laurent, Monomial, Value
+from malta.margins.expressions import NotAnalytic, program
+from malta.margins.uncertain import model_of
+
+if TYPE_CHECKING:
+    from malta.model.plant import FloatArray, Plant
+
+INTERVALS = 160  # that the travel is cut into
+SURE = 1e-5  # what is left open of the forces that are wanted at rest, of the largest; checked over each box
+
+
+class Ranged(NamedTuple):
+    """A sum of monomials of p whose coefficients lie in intervals, whatever y."""
+
+    terms: tuple[tuple[Monomial, float, float], ...]
+
+
+class Lead(NamedTuple):
+    """coefficient p^monomial."""
+
+    coefficient: float
+    monomial: Monomial
+
+
+Table = Mapping[tuple[int, int], Ranged]
+
+
+@dataclass(frozen=True, eq=False)
+class HeldMachine:
+    """A machine anywhere in an interval of positions, in n axes.
+
+    lead : b_i of each axis
+    Z, E, shares : as above; B b^-1 - 1
+    ratios, rest : of the forces wanted at rest, v = v0 + (1 + K)^-1 x with K in ratios, x in rest, over what was left
+        open of v
+    """
+
+    names: tuple[str, ...]
+    nominal: FloatArray
+    lead: tuple[Lead, ...]
+    Z: Table
+    E: Table
+    shares: Table
+    ratios: Table
+    rest: Table
+    travel: tuple[float, float]
+    models: tuple[Mapping[tuple[int, int], Laurent], ...]  # what the tables are the ranges of
+
+    def bounds(self, p: Sequence[Any]) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Entrywise bounds of Z, of E, of B b^-1 - 1 and of b over real balls p.
+
+        Raises NotAnalytic where there are none.
+        """
+        n, powers = len(self.lead), dict[tuple[int, int], Any]()
+
+        def monomial(m: Monomial) -> Any:
+            total = arb(1)
+            for i, e in enumerate(m):
+                if e:
+                    if (i, e) not in powers:
+                        powers[i, e] = p[i] ** e if e > 0 else 1 / p[i] ** -e
+                    total *= powers[i, e]
+            return total
+
+        def size(table: Table) -> FloatArray:
+            found = np.zeros((n, n))
+            for at, entry in table.items():
+                total = sum((arb(a).union(arb(b)) * monomial(m) for m, a, b in entry.terms), arb(0))
+                found[at] = float(total.abs_upper()) * (1 + 1e-9)
+            return found
+
+        b = np.array([float((arb(c) * monomial(m)).abs_upper()) * (1 + 1e-9) for c, m in self.lead])
+        Z, E, shares, ratios, rest = (size(t) for t in (self.Z, self.E, self.shares, self.ratios, self.rest))
+        if not all(np.isfinite(M).all() for M in (Z, E, shares, ratios, rest, b)):
+            raise NotAnalytic("a parameter that divides reaches zero")
+        if self.rest and not (dominating(ratios, rest[:, :1]) <= 1).all():
+            raise NotAnalytic("forces at rest that are not what they were taken for")
+        return Z, E, shares, b
+
+    def at(self, y: float) -> HeldMachine:
+        """The machine at one position of the interval, enclosed as on the piece that holds it."""
+        low, high = self.travel
+        k = min(max(math.floor((y - low) / (high - low) * INTERVALS), 0), INTERVALS - 1)
+        pieces = range(max(k - 1, 0), k + 2)  # whatever rounding makes of k
+        Z, E, shares, ratios, rest = _tables(self.models, pieces)
+        return replace(self, Z=Z, E=E, shares=shares, ratios=ratios, rest=rest)
+
+
+def dominating(M: FloatArray, right: FloatArray) -> FloatArray:
+    """At least (1 + M + M^2 + ...) right, entrywise, for what is not negative.
+
+    Any S > M S + right is, and shows the sum to be finite.
+    Raises NotAnalytic where there is none.
+    """
+    floor = 1e-9 * right.max(axis=1, keepdims=True, initial=0.0) + 1e-290
+    with np.errstate(all="ignore"):
+        S: FloatArray = np.linalg.solve(np.eye(len(M)) - M, right + floor) * (1 + 1e-9)
+        fine = np.isfinite(S).all() and (S > 0).all() and ((M @ S + right) * (1 + 1e-12) < S).all()
+    if not fine:
+        raise NotAnalytic("a coupling that may be singular")
+    return S
+
+
+def held_machine(
+    plant: Plant, believed: Plant, names: Sequence[str], travel: tuple[float, float]
+) -> HeldMachine:
+    """Enclose a plant whose controller commutates as `believed` at every position of an interval.
+
+    Raises NotAnalytic where its model has not this form.
+    """
+    names, n, k = tuple(names), len(plant.inputs), len(names)
+    of = model_of(plant, believed, names)
+    q = ca.SX.sym("q", k + 1 + n)
+    outputs = of(q[:k], q[k], q[k + 1 :])
+    _require(outputs, q[k + 1 :], of(q[:k], q[k], ca.SX.zeros(n))[4])
+    nominal = np.array([getattr(plant.parameters, name) for name in names], dtype=float)
+    wanted, room = _wanted(of, nominal, sum(travel) / 2, n)
+    run = Evaluation(k, *travel, INTERVALS)
+    v = [_about(run, x, room) for x in wanted]
+    model = program(ca.Function("model", [q], list(outputs)))
+    entries = run.run(model, [*map(run.parameter, range(k)), run.y, *v])
+    A, B, C, E, _, ratio, preload = ({(i, j): x for i, j, x in matrix} for matrix in entries)
+    if {(i, i): 1.0 for i in range(n)} != C or of.size1_out(0) != 2 * n:
+        raise NotAnalytic("outputs that are not the positions")
+    upper = {at: x for at, x in A.items() if at[0] < n}
+    if upper != {(i, i + n): 1.0 for i in range(n)} or any(i < n for i, _ in (*B, *E)):
+        raise NotAnalytic("states that are not positions and their rates")
+    if any(i >= n and j >= n for i, j in A):
+        raise NotAnalytic("damping of the machine's own")
+
+    def lower(matrix: dict[tuple[int, int], Value], columns: int) -> dict[tuple[int, int], Value]:
+        return {(i - n, j): x for (i, j), x in matrix.items() if i >= n and j < columns}
+
+    lead, shares = _shares(run, lower(B, n), nominal, n)
+    by, ratios = _shares(run, ratio, nominal, n)
+    rest = _rest(run, ratio, preload, wanted, by)
+    rest = {at: _over(run, x, room) for at, x in rest.items()} if room.coefficient else {}
+    models = tuple(
+        {at: run.laurent(x) for at, x in table.items()}
+        for table in (lower(A, n), lower(E, n), shares, ratios, rest)
+    )
+    return HeldMachine(names, nominal, lead, *_tables(models), travel, models)
+
+
+def _require(outputs: Sequence[Any], v: Any, at_zero: Any) -> None:
+    """That what is wanted enters linearly, and makes nothing where it is zero."""
+    for k, order in ((0, 2), (3, 2), (4, 2), (1, 1), (5, 1)):
+        if any(ca.which_depends(ca.vec(outputs[k]), v, order, False)):
+            raise NotAnalytic("forces that are not proportional to what is wanted")
+    if not at_zero.is_zero():
+        raise NotAnalytic("forces where none are wanted")
+
+
+def _wanted(of: ca.Function, nominal: FloatArray, y: float, n: int) -> tuple[list[Lead], Lead]:
+    """About what has to be wanted so that the preload acts, as monomials of p; and how far it may be off."""
+
+    def at(p: FloatArray) -> FloatArray:
+        found = of(p, y, np.zeros(n))
+        return np.linalg.solve(np.array(found[5]), np.array(found[6])).ravel()
+
+    v = at(nominal)
+    v[np.abs(v) < 1e-6 * np.abs(v).max(initial=0.0)] = 0.0
+    powers = np.zeros((n, len(nominal)))
+    for i, x in enumerate(nominal):
+        moved = at(np.where(np.arange(len(nominal)) == i, 1.25 * x, nominal))
+        with np.errstate(all="ignore"):
+            powers[:, i] = np.where(v != 0, np.log(np.abs(moved / v)) / math.log(1.25), 0)
+    found = []
+    for x, own in zip(v, np.round(powers), strict=True):
+        scale = float(np.prod(nominal**own)) if x else 1.0
+        found.append(Lead(float(x / scale) if x else 0.0, tuple(int(e) for e in own)))
+    top = found[int(np.abs(v).argmax())]
+    return found, Lead(SURE * abs(top.coefficient), top.monomial)
+
+
+def _about(run: Evaluation, wanted: Lead, room: Lead) -> Value:
+    if not room.coefficient:
+        return 0.0
+    none = taylor.constant(0.0, run.count)
+    open_ = Laurent({room.monomial: taylor.Taylor(none.c, none.radius + room.coefficient)})
+    value = Laurent({wanted.monomial: taylor.constant(wanted.coefficient, run.count)})
+    return run.sum(value, open_) if wanted.coefficient else open_
+
+
+def _shares(
+    run: Evaluation, matrix: dict[tuple[int, int], Value], nominal: FloatArray, n: int
+) -> tuple[tuple[Lead, ...], dict[tuple[int, int], Value]]:
+    """The largest monomial of each diagonal entry, and the matrix over these, column by column, less one."""
+    leads = []
+    for j in range(n):
+        if (j, j) not in matrix:
+            raise NotAnalytic("a force that does not act on its own axis")
+        terms = run.laurent(matrix[j, j]).terms
+        weights = {m: float(np.prod(np.abs(nominal) ** np.array(m))) for m in terms}
+        m = max(terms, key=lambda m: weights[m] * float(np.abs(terms[m].c[0]).max()))
+        leads.append(Lead(sum(terms[m].bounds()) / 2, m))
+        if not leads[-1].coefficient:
+            raise NotAnalytic("a force that does not act on its own axis")
+    found: dict[tuple[int, int], Value] = {}
+    for (i, j), x in matrix.items():
+        over = _over(run, x, leads[j])
+        found[i, j] = run.sum(over, -1.0) if i == j else over
+    return tuple(leads), found
+
+
+def _over(run: Evaluation, x: Value, lead: Lead) -> Value:
+    one = taylor.constant(lead.coefficient, run.count)
+    return run.product(x, Laurent({tuple(-e for e in lead.monomial): taylor.inverse(one)}))
+
+
+def _rest(
+    run: Evaluation,
+    ratio: dict[tuple[int, int], Value],
+    preload: dict[tuple[int, int], Value],
+    wanted: list[Lead],
+    by: tuple[Lead, ...],
+) -> dict[tuple[int, int], Value]:
+    """b^-1 (preload - ratio v0), b the diagonal of the ratio: what the forces wanted at rest still miss."""
+    found: dict[tuple[int, int], Value] = {(i, 0): x for (i, _), x in preload.items()}
+    for (i, j), x in ratio.items():
+        c, m = wanted[j]
+        if c:
+            made = run.product(x, Laurent({m: taylor.constant(-c, run.count)}))
+            found[i, 0] = run.sum(found[i, 0], made) if (i, 0) in found else made
+    return {(i, 0): _over(run, x, by[i]) for (i, _), x in found.items()}
+
+
+def _tables(
+    models: Sequence[Mapping[tuple[int, int], Laurent]], pieces: range | None = None
+) -> tuple[Table, Table, Table, Table, Table]:
+    """Intervals of the coefficients, on all pieces of the travel or on some."""
+
+    def ranged(x: Laurent) -> Ranged:
+        return Ranged(tuple((m, *c.bounds(pieces)) for m, c in x.terms.items()))
+
+    Z, E, shares, ratios, rest = ({at: ranged(x) for at, x in table.items()} for table in models)
+    return Z, E, shares, ratios, rest

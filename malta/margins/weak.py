@@ -1,0 +1,320 @@
+"""Loops of machines with held currents, anywhere in their travel: axes by themselves, and what couples them bounded.
+
+Without Z, E and B b^-1 - 1 of `held` the sampled loop is M0 = diag(M_g), groups of a few axes whose determinants are
+multi-affine in the b_i. The loop is M0 - e(z). On |z| = 1 it is not singular where for some weights d > 0
+
+    sum_i |(M0^-1)_ji| sum_k |e_ik| d_k < d_j   for every state j,
+
+whatever y and however small a share of e acts: all of these loops are as stable as M0 at the nominal values. States are
+positions q, rates q' and accelerations a = b v stored for a sample, of each axis, and the compensator's xi:
+
+    q+, q'+ = Phi0 (q, q') + Gamma0 a + e,   e = Gamma0 W (q, q', a) + (V (q, q', a), 0),   Gamma0 = (T^2 / 2, T)
+
+M0^-1 e is followed along frequency; what digits of gains that should cancel leave is bounded by coefficients.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from flint import arb
+from scipy import linalg, sparse
+
+from malta.margins.axes import Axes, axes_of, members_of, state_matrix
+from malta.margins.enclosure import Unproven
+from malta.margins.exclusion import Beside, growth_over, on_boxes
+from malta.margins.expressions import NotAnalytic
+from malta.margins.family import Family, scale_of
+from malta.margins.held import HeldMachine, dominating
+from malta.margins.parts import Part
+from malta.margins.problem import Problem, physical
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from malta.margins.box import Box
+    from malta.margins.uncertain import Compensator
+    from malta.model.plant import FloatArray
+
+SMALL = 1e-11  # gains of a compensator below this, relative, may be rounding and do not join groups
+LARGEST = 4  # axes of a group
+LOOSE = 1e4  # how much larger bounds by coefficients are, about
+LIMIT = 0.3  # of the rows, where weights are chosen
+HALVINGS = 10
+SWEEP = 50  # frequencies at which weights are chosen
+FLOOR = 1e-6  # of what was seen, so that all weights are positive
+TERMS = 10  # of series in the stiffness
+SAFE = 1 + 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Coupling:
+    """Bounds of e over a box, and the weights d.
+
+    W, V : axes x states; rest : states x states, of gains that were dropped; weights : of the states
+    """
+
+    W: FloatArray
+    V: FloatArray
+    rest: FloatArray
+    weights: FloatArray
+    T: float
+
+    def acting(self, g: Axes, N: FloatArray, off: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """What acts on a group: M0^-1 e in rows of q, q' and a, bounds by coefficients, how far the first are off.
+
+        N, off : K x states x states x nodes, how far these are off
+        """
+        n, r = len(self.W), len(g.axes)
+        members, axes, T = members_of(g, n), list(g.axes), self.T
+        d = self.weights[members][:, None]
+        by_force, by_place = ((M @ self.weights)[axes] * SAFE / d for M in (self.W, self.V))
+        by_state = (self.rest @ self.weights)[members] * SAFE / d
+        through = _through(N, r, T, 2)
+        loose = _through(off, r, T, 2)
+        own = np.concatenate([by_force, by_place], axis=1)
+        scaled, loose = through * own[..., None], loose * own * SAFE
+        beyond = ((np.abs(N).max(axis=3) + off) * by_state).sum(axis=2)
+        size = (np.abs(scaled).max(axis=3) + loose).sum(axis=2)
+        more = np.maximum(
+            beyond[:, : 3 * r].max(axis=1), (beyond + size)[:, 3 * r :].max(axis=1, initial=0.0)
+        )
+        return scaled[:, : 3 * r], more * SAFE, loose[:, : 3 * r].max(axis=(1, 2))
+
+
+def _through(N: FloatArray, r: int, T: float, axis: int) -> FloatArray:
+    """What forces on the axes and moves of their positions make, of what moves of each state make."""
+    q, rate = np.take(N, range(r), axis=axis), np.take(N, range(r, 2 * r), axis=axis)
+    return np.concatenate([q * (T**2 / 2) + rate * T, q], axis=axis)
+
+
+def _part(g: Axes, coupling: Coupling, sides: FloatArray, box: Box) -> Part:
+    """A group's polynomial over a box, with what the coupling adds to it."""
+    values, radius, N, off = g.over(sides)
+    main, more, off = coupling.acting(g, N, off)
+    shape = tuple(d + 1 for d in g.degrees)
+    with np.errstate(divide="ignore"):
+        scale = scale_of(np.log2(np.abs(values).max(axis=1)) + np.array(g.heights))
+    exponents = tuple(h + scale * k for k, h in enumerate(g.heights))
+    family = Family(shape, values, radius + more, exponents, scale)
+    K, rows, inputs, nodes = main.shape
+    beside = Family((rows * inputs, *shape), main.reshape(K, -1), off, exponents, scale)
+
+    def around(cells: FloatArray, boxes: FloatArray) -> Beside:
+        f = on_boxes(family, cells, boxes)
+        whole = np.broadcast_to([0.0, 1.0], (len(cells), 1, 2))
+        e = on_boxes(beside, cells, np.concatenate([whole, boxes], axis=1), family)
+        size = sum(np.abs(t) for t in e.terms) + e.radius[:, None]
+        discs = size.reshape(len(cells), rows, inputs, nodes).sum(axis=2).max(axis=1) * SAFE
+        return Beside(list(f.terms), f.radius, f.lasting, discs.astype(complex), [])
+
+    group: Any = g  # of which a part asks `inverted` alone
+    return Part(group, sides, family, growth_over(sides, g.inverted, box), around)
+
+
+@dataclass(frozen=True, eq=False)
+class AnywhereHeld:
+    """A loop with held currents and a sample of delay, anywhere in its travel: what a margin is asked of.
+
+    law : on the readings alone, without its delay; places: loops that are looked at for what is lost
+    """
+
+    machine: HeldMachine
+    law: Compensator
+    places: Problem
+    known: dict[Any, Any] = field(default_factory=dict)
+
+    @property
+    def T(self) -> float:
+        assert self.law.sample_time is not None
+        return self.law.sample_time
+
+    @cached_property
+    def groups(self) -> tuple[Axes, ...]:
+        """Raises Unproven for groups of many axes, and for states of the compensator that are in none."""
+        n, label = len(self.machine.lead), _labels(self.law)
+        if not set(label[n:].tolist()) <= set(label[:n].tolist()):
+            raise Unproven("states of the compensator that act on no axis")
+        found = []
+        for k in dict.fromkeys(label[:n].tolist()):
+            axes = tuple(i for i in range(n) if label[i] == k)
+            if len(axes) > LARGEST:
+                raise Unproven(f"{len(axes)} axes in one loop")
+            own = tuple(i for i in range(len(self.law.A)) if label[n + i] == k)
+            found.append(axes_of(self.machine, self.law, axes, own))
+        return tuple(found)
+
+    def instability(self, rows: FloatArray) -> FloatArray:
+        return self.places.instability(rows)
+
+    def critical(self, p: FloatArray) -> float:
+        return self.places.critical(p)
+
+    def physical(self, x: float) -> float:
+        return physical(x, self.T)
+
+    def parts(self, p: Sequence[Any]) -> list[tuple[Any, tuple[Any, ...]]]:
+        del p
+        return [(g, ()) for g in self.groups]
+
+    def enclosed(self, box: Box, reach: float) -> list[Part]:
+        """The groups over a box, coupled. Raises Unproven."""
+        sides = box.sides(reach)
+        key = sides.tobytes()
+        if key not in self.known:
+            self.known.clear()
+            try:
+                self.known[key] = self._coupling(sides, box, reach)
+            except NotAnalytic as error:
+                raise Unproven(f"the matrices have no value on the box: {error}") from error
+        return [_part(g, self.known[key], sides, box) for g in self.groups]
+
+    # coupling
+
+    @np.errstate(over="ignore", invalid="ignore")  # bounds that overflow are refused
+    def _coupling(self, sides: FloatArray, box: Box, reach: float) -> Coupling:
+        Z, E, shares, b = self.machine.bounds([arb(low).union(arb(high)) for low, high in sides.tolist()])
+        W, V, rest = _beside(Z, E, shares, b, self.T, self._dropped)
+        weights = self._weights(np.vstack([W, V]), rest, box, reach)
+        return Coupling(W, V, rest, weights, self.T)
+
+    @cached_property
+    def _dropped(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """|A|, |B|, |C|, |D| of the compensator between groups."""
+        law = self.law
+        own, axis = np.zeros(len(law.A), dtype=int), np.zeros(len(law.C), dtype=int)
+        for k, g in enumerate(self.groups):
+            own[list(g.own)], axis[list(g.axes)] = k, k
+
+        def between(M: FloatArray, rows: FloatArray, columns: FloatArray) -> FloatArray:
+            return np.where(rows[:, None] != columns[None], np.abs(M), 0)
+
+        return (
+            between(law.A, own, own), between(law.B, own, axis),
+            between(law.C, axis, own), between(law.D, axis, axis),
+        )  # fmt: skip
+
+    def _weights(self, forces: FloatArray, rest: FloatArray, box: Box, reach: float) -> FloatArray:
+        """Weights for which the largest row of |M0^-1| |e| is below one as far out as possible, at corners of boxes.
+
+        Any positive weights are right; these are only good ones.
+        """
+        low, high = 0.0, reach
+        best, rho = self._perron(forces, rest, box.sides(0.0))
+        if rho >= LIMIT:
+            return best
+        for _ in range(HALVINGS):
+            t = (low + high) / 2 if high < reach or low else reach
+            found, rho = self._perron(forces, rest, box.sides(t))
+            if rho < LIMIT:
+                low, best = t, found
+                if t == reach:
+                    break
+            else:
+                high = t if t < reach else reach * (1 - 1e-9)
+        return best
+
+    def _perron(self, forces: FloatArray, rest: FloatArray, sides: FloatArray) -> tuple[FloatArray, float]:
+        """Perron's vector of what is seen of |M0^-1| |e|, and its value; infinite where M0 is not stable."""
+        n, T = len(forces) // 2, self.T
+        seen = np.zeros((len(rest), len(rest)))
+        for g in self.groups:
+            members, r = members_of(g, n), len(g.axes)
+            eye = np.eye(len(members))
+            for b in self._corners(g, sides):
+                A = state_matrix(self.law, g.axes, g.own, b)
+                poles = np.linalg.eigvals(A)
+                if not np.abs(poles).max() < 1:
+                    return np.ones(len(seen)), math.inf
+                angles = np.abs(np.angle(poles[np.abs(poles) > 0.3]))
+                z = np.exp(1j * np.concatenate([np.geomspace(1e-3, 1, SWEEP) * np.pi, angles]))
+                G = np.linalg.inv(z[:, None, None] * eye - A)
+                own = forces[[*g.axes, *(n + i for i in g.axes)]]
+                one = (np.abs(_through(G, r, T, 2)) @ own).max(axis=0)
+                one += (np.abs(G) @ rest[members]).max(axis=0) * LOOSE
+                one[3 * r :] *= LOOSE
+                seen[members] = np.maximum(seen[members], one)
+        balanced, (units, _) = linalg.matrix_balance(seen, permute=False, separate=True)
+        balanced = balanced + FLOOR * balanced.max()
+        d: FloatArray = np.ones(len(seen))
+        for _ in range(100):
+            d = balanced @ d
+            d = d / d.max()
+        return np.exp2(np.round(8 * np.log2(d * units)) / 8), float((balanced @ d / d).max())
+
+    def _corners(self, g: Axes, sides: FloatArray) -> FloatArray:
+        """The extreme b of a group at corners of a box: rows."""
+        lead = [self.machine.lead[i] for i in g.axes]
+        corners = np.array(list(itertools.product(*[(0, 1)] * len(sides))))
+        p = sides[np.arange(len(sides)), corners]
+        return np.unique(
+            np.array([x.coefficient * np.prod(p ** np.array(x.monomial), axis=1) for x in lead]).T, axis=0
+        )
+
+
+def _labels(law: Compensator) -> Any:
+    """The group of each axis and of each state of the compensator."""
+    n, k = len(law.C), len(law.A)
+
+    def joins(M: FloatArray) -> Any:
+        size = np.abs(M)
+        if not size.size:
+            return size > 0
+        return size > SMALL * np.sqrt(size.max(axis=1, keepdims=True) * size.max(axis=0, keepdims=True))
+
+    touch = np.zeros((n + k, n + k), dtype=bool)
+    touch[:n, :n], touch[:n, n:] = joins(law.D), joins(law.C)
+    touch[n:, :n], touch[n:, n:] = joins(law.B), joins(law.A)
+    return sparse.csgraph.connected_components(touch, directed=False)[1]
+
+
+def _beside(
+    Z: FloatArray, E: FloatArray, shares: FloatArray, b: FloatArray, T: float, dropped: tuple[FloatArray, ...]
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Bounds of W, of V, and of what the compensator's dropped gains do, from those of Z, E, B b^-1 - 1 and b.
+
+    X = Z - E C is the stiffness of held currents, |X| <= |Z| + |E|. With Gamma(X) = (sum X^k T^(2k + 2) / (2k + 2)!,
+    sum X^k T^(2k + 1) / (2k + 1)!), and e_q the part of e in q+,
+
+        e = Gamma(X) (Z q + B b^-1 a - E (q - r)) - Gamma0 a + (Phi(X) - Phi0) q'
+        q - r = (T q' + T^2 / 2 a + e_q) / z
+
+    The second row of e is T W; V is the first one less T / 2 times the second, term by term of the series.
+    """
+    n = len(Z)
+    X, eye = Z + E, np.eye(n)
+    size = float(X.sum(axis=1).max(initial=0.0)) * T**2
+    if not size < 0.5:
+        raise NotAnalytic("a stiffness that is fast beside the sample time")
+    tail, power = size**TERMS * T**2, eye
+    # of Gamma(X) - Gamma0 both parts, and what is not along Gamma0; over T where these are rates
+    less, short, skew, late = np.full((4, n, n), tail)
+    for k in range(1, TERMS):
+        power = power @ X
+        term = power * (T ** (2 * k + 2) / math.factorial(2 * k + 2))
+        less += term
+        short += term * (2 * k + 2)
+        skew += term * k
+        late += term * ((2 * k + 2) * (2 * k - 1) / 2)
+    less, short, skew, late = (M * SAFE for M in (less, short, skew, late))
+    q, rate, a = (slice(k * n, (k + 1) * n) for k in range(3))
+    W = np.hstack([Z, E * T, shares + E * (T**2 / 2), np.zeros((n, len(dropped[0])))]) * SAFE
+    driven = W.copy()  # with a itself, which Gamma(X) - Gamma0 acts on
+    driven[:, a] += eye
+    up = W * (T**2 / 2) + less @ driven
+    up[:, rate] += short / T
+    whole = eye * (T**2 / 2) + less  # of Gamma(X), the first part
+    moved = dominating(whole @ E * SAFE, up * SAFE)
+    W = W + (short @ driven + (eye * T**2 + short) @ E @ moved) / T**2
+    W[:, rate] += whole @ X / T
+    V = skew @ driven + skew @ E @ moved
+    V[:, rate] += late / T
+    rest = np.zeros((3 * n + len(dropped[0]),) * 2)
+    rest[a, 3 * n :], rest[a, q] = b[:, None] * dropped[2], b[:, None] * dropped[3]
+    rest[3 * n :, 3 * n :], rest[3 * n :, q] = dropped[0], dropped[1]
+    return W * SAFE, V * SAFE, rest * SAFE
