@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from typing import Any
@@ -47,7 +48,7 @@ def box_at(problem: AnywhereHeld) -> Any:
 def sampled(name: str, y: float, p: np.ndarray) -> tuple[np.ndarray, ...]:
     """Z, E, B in floating point, at a position and at parameters."""
     plant, _, _ = machine(name)
-    of = model_of(plant, plant_of(plant.parameters), NAMES)
+    of: Any = model_of(plant, plant_of(plant.parameters), NAMES)
     n = len(plant.inputs)
     A, B, C, E, made, ratio, acting = (np.array(x) for x in of(p, y, np.zeros(n)))
     v = np.linalg.solve(ratio, acting - made)
@@ -61,7 +62,7 @@ def test_taylor_models_hold_what_they_enclose() -> None:
     y = taylor.variable(-1.0, 2.0, 40)
     one = taylor.constant(3.5, 40)
     wave = taylor.multiply(taylor.sine(taylor.scaled(y, 5.0)), taylor.cosine(y))
-    cases: dict[str, tuple[Any, Any]] = {
+    cases: dict[str, tuple[taylor.Taylor, Callable[[Any], Any]]] = {
         "wave": (wave, lambda x: np.sin(5 * x) * np.cos(x)),
         "inverse": (taylor.inverse(taylor.add(one, wave)), lambda x: 1 / (3.5 + np.sin(5 * x) * np.cos(x))),
         "root": (taylor.root(taylor.subtract(one, wave)), lambda x: np.sqrt(3.5 - np.sin(5 * x) * np.cos(x))),
@@ -215,7 +216,14 @@ def test_the_planar_motor_is_proven_between_places() -> None:
     corners = np.array(list(itertools.product(*sides)))
     for y in rng.uniform(-plant.travel, plant.travel, 3):
         system, law = loop_at(plant, controller, NAMES, float(y))
-        assert instability(system, law, np.vstack([corners, rng.uniform(sides[:, 0], sides[:, 1], (100, 5))])).max() < 0
+        assert (
+            instability(
+                system,
+                law,
+                np.vstack([corners, sides[:, 0] + rng.uniform(0, 1, (100, 5)) * (sides[:, 1] - sides[:, 0])]),
+            ).max()
+            < 0
+        )
 
 
 @pytest.mark.slow
@@ -231,7 +239,7 @@ def test_a_stronger_coupling_proves_less() -> None:
             at: x._replace(terms=tuple((m, 10 * a, 10 * b) for m, a, b in x.terms)) for at, x in table.items()
         }
 
-    stiff = replace(problem, machine=replace(h, Z=grown(h.Z), E=grown(h.E)), known={})
+    stiff = replace(problem, machine=replace(h, Z=grown(h.Z), E=grown(h.E)))
     one, ten = (margin_of(x, box_at(problem), Effort(time=20)).lower for x in (problem, stiff))
     assert one is not None
     assert ten is not None

@@ -6,4 +6,6 @@ family         a(s; p) over a box: Bernstein polynomials in p and a radius for e
 exclusion      branch and bound: no a(jw; p) = 0 for any w on the box
 witness        the nearest p at which a(jw; p) = 0
 robust         the margin
+held, weak     machines with held currents anywhere in their travel: axes by themselves, their coupling bounded
+taylor, along  expressions of p and a position, enclosed over an interval of positions
 """

@@ -17,8 +17,9 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass, field
-from functools import cached_property
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cache, cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -45,7 +46,7 @@ SMALL = 1e-11  # gains of a compensator below this, relative, may be rounding an
 LARGEST = 4  # axes of a group
 LOOSE = 1e4  # how much larger bounds by coefficients are, about
 LIMIT = 0.3  # of the rows, where weights are chosen
-HALVINGS = 10
+HALVINGS = 9
 SWEEP = 50  # frequencies at which weights are chosen
 FLOOR = 1e-6  # of what was seen, so that all weights are positive
 TERMS = 10  # of series in the stiffness
@@ -93,27 +94,44 @@ def _through(N: FloatArray, r: int, T: float, axis: int) -> FloatArray:
     return np.concatenate([q * (T**2 / 2) + rate * T, q], axis=axis)
 
 
-def _part(g: Axes, coupling: Coupling, sides: FloatArray, box: Box) -> Part:
-    """A group's polynomial over a box, with what the coupling adds to it."""
-    values, radius, N, off = g.over(sides)
-    main, more, off = coupling.acting(g, N, off)
-    shape = tuple(d + 1 for d in g.degrees)
-    with np.errstate(divide="ignore"):
-        scale = scale_of(np.log2(np.abs(values).max(axis=1)) + np.array(g.heights))
-    exponents = tuple(h + scale * k for k, h in enumerate(g.heights))
-    family = Family(shape, values, radius + more, exponents, scale)
-    K, rows, inputs, nodes = main.shape
-    beside = Family((rows * inputs, *shape), main.reshape(K, -1), off, exponents, scale)
+@dataclass(frozen=True, eq=False)
+class _Coupled:
+    """A group's polynomial over a box, on cells of it with what the coupling adds: found when it is first asked for."""
 
-    def around(cells: FloatArray, boxes: FloatArray) -> Beside:
+    group: Axes
+    sides: FloatArray
+    plain: Family
+    coupling: Callable[[], Coupling]
+
+    @cached_property
+    def families(self) -> tuple[Family, Family, tuple[int, ...]]:
+        """The polynomial with bounds by coefficients, and what is followed: rows x inputs x nodes on one axis."""
+        f = self.plain
+        _, _, N, off = self.group.over(self.sides)
+        main, more, off = self.coupling().acting(self.group, N, off)
+        K, rows, inputs, nodes = main.shape
+        beside = Family((rows * inputs, *f.shape), main.reshape(K, -1), off, f.exponents, f.scale)
+        return replace(f, radius=f.radius + more), beside, (rows, inputs, nodes)
+
+    def on(self, cells: FloatArray, boxes: FloatArray) -> Beside:
+        family, beside, shape = self.families
         f = on_boxes(family, cells, boxes)
         whole = np.broadcast_to([0.0, 1.0], (len(cells), 1, 2))
         e = on_boxes(beside, cells, np.concatenate([whole, boxes], axis=1), family)
         size = sum(np.abs(t) for t in e.terms) + e.radius[:, None]
-        discs = size.reshape(len(cells), rows, inputs, nodes).sum(axis=2).max(axis=1) * SAFE
+        discs = size.reshape(len(cells), *shape).sum(axis=2).max(axis=1) * SAFE
         return Beside(list(f.terms), f.radius, f.lasting, discs.astype(complex), [])
 
+
+def _part(g: Axes, coupling: Callable[[], Coupling], sides: FloatArray, box: Box) -> Part:
+    """A group's polynomial over a box, with what the coupling adds to it."""
+    values, radius, _, _ = g.over(sides)
+    with np.errstate(divide="ignore"):
+        scale = scale_of(np.log2(np.abs(values).max(axis=1)) + np.array(g.heights))
+    exponents = tuple(h + scale * k for k, h in enumerate(g.heights))
+    family = Family(tuple(d + 1 for d in g.degrees), values, radius, exponents, scale)
     group: Any = g  # of which a part asks `inverted` alone
+    around = _Coupled(g, sides, family, coupling).on
     return Part(group, sides, family, growth_over(sides, g.inverted, box), around)
 
 
@@ -127,7 +145,6 @@ class AnywhereHeld:
     machine: HeldMachine
     law: Compensator
     places: Problem
-    known: dict[Any, Any] = field(default_factory=dict)
 
     @property
     def T(self) -> float:
@@ -165,23 +182,20 @@ class AnywhereHeld:
     def enclosed(self, box: Box, reach: float) -> list[Part]:
         """The groups over a box, coupled. Raises Unproven."""
         sides = box.sides(reach)
-        key = sides.tobytes()
-        if key not in self.known:
-            self.known.clear()
-            try:
-                self.known[key] = self._coupling(sides, box, reach)
-            except NotAnalytic as error:
-                raise Unproven(f"the matrices have no value on the box: {error}") from error
-        return [_part(g, self.known[key], sides, box) for g in self.groups]
+        try:
+            bounds = self.machine.bounds([arb(low).union(arb(high)) for low, high in sides.tolist()])
+            with np.errstate(over="ignore", invalid="ignore"):  # bounds that overflow are refused
+                W, V, rest = _beside(*bounds, self.T, self._dropped)
+        except NotAnalytic as error:
+            raise Unproven(f"the matrices have no value on the box: {error}") from error
+
+        @cache
+        def coupling() -> Coupling:
+            return Coupling(W, V, rest, self._weights(np.vstack([W, V]), rest, box, reach), self.T)
+
+        return [_part(g, coupling, sides, box) for g in self.groups]
 
     # coupling
-
-    @np.errstate(over="ignore", invalid="ignore")  # bounds that overflow are refused
-    def _coupling(self, sides: FloatArray, box: Box, reach: float) -> Coupling:
-        Z, E, shares, b = self.machine.bounds([arb(low).union(arb(high)) for low, high in sides.tolist()])
-        W, V, rest = _beside(Z, E, shares, b, self.T, self._dropped)
-        weights = self._weights(np.vstack([W, V]), rest, box, reach)
-        return Coupling(W, V, rest, weights, self.T)
 
     @cached_property
     def _dropped(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
@@ -284,7 +298,9 @@ def _beside(
         e = Gamma(X) (Z q + B b^-1 a - E (q - r)) - Gamma0 a + (Phi(X) - Phi0) q'
         q - r = (T q' + T^2 / 2 a + e_q) / z
 
-    The second row of e is T W; V is the first one less T / 2 times the second, term by term of the series.
+    which has a solution for all |z| >= 1, as |Gamma E| has no eigenvalue of one or more (`dominating`): e is analytic
+    there, and what is stable stays so. The second row of e is T W; V is the first one less T / 2 times the second, term
+    by term of the series.
     """
     n = len(Z)
     X, eye = Z + E, np.eye(n)

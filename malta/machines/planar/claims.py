@@ -320,7 +320,7 @@ def _loop_rows() -> list[Row]:
             "percent",
             "{:.0f}",
             machine_share,
-            note="in the middle and at the end of the travel",
+            note="anywhere in the travel",
         ),
         *(
             Row(
