@@ -8,6 +8,7 @@ import json
 import math
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -131,6 +132,157 @@ def test_an_expression_without_a_rule_is_refused(tmp_path: Path) -> None:
         certificate.write(tmp_path / "c.json", [(system, gain(-1.0))], {"a": (0.0, 0.2)}, None, margin)
 
 
+def masses() -> Any:
+    """m x'' = -k x - 0.2 x' + u as it stands, with the mass on the left."""
+
+    def matrices(m: Any, k: Any) -> Any:
+        return [[0, 1], [-k, -0.2]], [[0], [1]], [[1, 0]], [[0]], [[1, 0], [0, m]]
+
+    return malta.uncertain(matrices, {"m": 1.0, "k": 4.0})
+
+
+def test_a_diagonal_descriptor(tmp_path: Path) -> None:
+    system, law, box = masses(), gain(1.0), {"m": 0.1, "k": 0.1}
+    margin = malta.robust_margin(system, law, box)
+    assert margin.upper == pytest.approx(7.5, rel=1e-6)
+    path = certificate.write(tmp_path / "c.json", [(system, law)], box, None, margin)
+    found = check(path)
+    assert found.ok, found.failures
+    assert found.claim == pytest.approx(0.999 * 7.5, rel=2e-3)
+    content = json.loads(path.read_text())
+    content["loops"][0]["E"] = content["loops"][0]["E"][:1]
+    with pytest.raises(InputError, match="a diagonal"):
+        check(written(content, tmp_path))
+
+
+def test_a_mass_that_may_vanish_is_refused(tmp_path: Path) -> None:
+    # (p s + p) x: stable, but at p = 0 it is no equation at all; E and A cancel in E^-1 A
+    system = malta.uncertain(lambda p: ([[-p]], [[p]], [[1]], [[0]], [[p]]), {"p": 1.0})
+    margin = malta.robust_margin(system, gain(-1.0), {"p": 0.1}, time=1)
+    path = certificate.write(tmp_path / "c.json", [(system, gain(-1.0))], {"p": 0.1}, None, margin)
+    assert check(path).ok
+    content = json.loads(path.read_text())
+    content["lower"] = (20.0).hex()
+    first(content)["box"][0] = [-1.001, 3.001]
+    found = check(written(content, tmp_path))
+    assert found.failures == ("loop, group 1: E is not shown to be invertible",)
+
+
+@pytest.mark.parametrize(
+    ("system", "law", "why"),
+    [
+        (
+            lambda a: ([[-1 - a]], [[1]], [[1]], [[0.1]]),
+            -1.0,
+            "found a matrix D, expected outputs y = C x alone",
+        ),
+        (
+            lambda a: ([[-1 - a, 0], [0, -1]], [[1], [0]], [[1, 0]], [[0]], [[2, 1], [1, 2]]),
+            -1.0,
+            "found a matrix E that couples states, expected a diagonal E, or none",
+        ),
+    ],
+)
+def test_what_certificates_do_not_cover(tmp_path: Path, system: Any, law: float, why: str) -> None:
+    loop = malta.uncertain(system, {"a": 0.1}), gain(law)
+    margin = malta.robust_margin(*loop, {"a": (0.0, 0.2)})
+    assert margin.lower is not None
+    with pytest.raises(InputError, match=re.escape(why)):
+        certificate.write(tmp_path / "c.json", [loop], {"a": (0.0, 0.2)}, None, margin)
+
+
+def test_many_parameters_are_said_to_be_too_many(tmp_path: Path) -> None:
+    names = [f"p{k}" for k in range(14)]
+    system = malta.uncertain(
+        (np.array([[-1.0]]), np.array([[1.0]]), np.array([[1.0]])),
+        dict.fromkeys(names, 1.0),
+        terms={name: ([[-0.1]], None, None) for name in names},
+    )
+    box = dict.fromkeys(names, 0.1)
+    margin = replace(malta.robust_margin(system, gain(-1.0), box, time=0.1), lower=1.0)
+    with pytest.raises(InputError, match="found 14 that act on one group, expected at most 13"):
+        certificate.write(tmp_path / "c.json", [(system, gain(-1.0))], box, None, margin)
+
+
+# couplings that are rounding
+
+
+def springs(coupling: float, **options: Any) -> Any:
+    """Two springs that pull at one another."""
+
+    def matrices(k: Any) -> Any:
+        A = [[0, 1, 0, 0], [-k, -0.2, coupling, 0], [0, 0, 0, 1], [coupling, 0, -2 * k, -0.2]]
+        return A, [[0, 0], [1, 0], [0, 0], [0, 1]], [[1, 0, 0, 0], [0, 0, 1, 0]]
+
+    return malta.uncertain(matrices, {"k": 4.0}, **options)
+
+
+def cross(coupling: float, **options: Any) -> Compensator:
+    """Gains of two loops, each with a little of the other's reading."""
+    none = np.zeros((0, 0)), np.zeros((0, 2)), np.zeros((2, 0))
+    return Compensator(*none, np.array([[1.0, coupling], [coupling, 1.0]]), **options)
+
+
+@pytest.mark.parametrize(
+    ("system", "law"),
+    [
+        (springs(1e-15), gain(1.0, 1.0)),
+        (springs(0.0), cross(1e-15)),
+        (springs(0.0), cross(1e-15, lag=50.0)),
+        (springs(0.0), cross(1e-15, sample_time=0.05)),
+        (springs(0.0), cross(1e-15, sample_time=0.05, delay=1, lag=50.0)),
+    ],
+)
+def test_rounding_between_groups_is_bounded(tmp_path: Path, system: Any, law: Compensator) -> None:
+    margin = malta.robust_margin(system, law, {"k": 0.1})
+    assert margin.lower is not None
+    path = certificate.write(tmp_path / "c.json", [(system, law)], {"k": 0.1}, None, margin)
+    found = check(path)
+    assert found.ok, found.failures
+    assert found.claim == pytest.approx(0.999 * margin.lower)
+    assert [line.split(":")[0] for line in found.groups] == ["loop, group 1", "loop, group 2"]
+
+
+@pytest.mark.parametrize("coupling", [0.1, 3.0])
+def test_a_coupling_that_is_more_than_rounding_is_refused(tmp_path: Path, coupling: float) -> None:
+    # (k - 1) (2 k - 1) > coupling^2 is what the loop needs; the claim without coupling reaches down to k = 1.003
+    law, box = cross(1e-15), {"k": 0.1}
+    margin = malta.robust_margin(springs(0.0), law, box)
+    path = certificate.write(tmp_path / "c.json", [(springs(0.0), law)], box, None, margin)
+    content = json.loads(path.read_text())
+    gains = content["loops"][0]["compensator"]["D"]
+    gains[0][1] = gains[1][0] = coupling
+    assert "zero is not excluded" in check(written(content, tmp_path)).failures[0]
+    for units in ([0] * 4, [300, 300, 0, 0], [-300, 300, 7, 0]):  # sizes that would hide it
+        content["loops"][0]["units"] = units
+        assert not check(written(content, tmp_path)).ok
+
+
+def test_couplings_within_a_hold_are_refused(tmp_path: Path) -> None:
+    system, law = springs(0.0), cross(1e-15, sample_time=0.05)
+    margin = malta.robust_margin(system, law, {"k": 0.1})
+    path = certificate.write(tmp_path / "c.json", [(system, law)], {"k": 0.1}, None, margin)
+    content = json.loads(path.read_text())
+    content["loops"][0]["A"].append([1, 2, content["loops"][0]["A"][0][2]])
+    found = check(written(content, tmp_path))
+    assert found.failures == ("loop: groups that act on one another between samples",)
+
+
+def test_bounds_of_what_rounding_moves_are_bounds() -> None:
+    rng = np.random.default_rng(2)
+    for _ in range(20):
+        m = rng.normal(size=(5, 5)) * 10.0 ** rng.uniform(-3, 3, (5, 5))
+        e, units = 10.0 ** rng.uniform(-3, 3, 5), rng.integers(-4, 5, 5).tolist()
+        sizes = [[arb(x) for x in row] for row in np.abs(m).tolist()]
+        b = determinant_bounds(sizes, [True] * 5, [arb(x) for x in e.tolist()], dict(enumerate(units)))
+        for g in 10.0 ** rng.uniform(-3, 3, 5):
+            for angle in rng.uniform(0, 2 * np.pi, 3):
+                pencil = g * np.exp(1j * angle) * np.eye(5) + m
+                cofactors = np.linalg.det(pencil) * np.linalg.inv(pencil)  # adjugate: row j, column l
+                largest = (np.abs(cofactors) @ e / 2.0 ** np.array(units)).max()
+                assert sum(float(x) * g**k for k, x in enumerate(b)) >= 0.999999 * largest
+
+
 # tampering
 
 
@@ -167,6 +319,17 @@ def narrowed(content: dict[str, Any]) -> None:
     side[0] = (float.fromhex(side[0]) * 1.001).hex()
 
 
+def kept_less(content: dict[str, Any]) -> None:
+    """The enclosure's polynomials cut to their first terms."""
+    for axis in first(content)["axes"]:
+        axis[2] = 0
+
+
+def interpolated_less(content: dict[str, Any]) -> None:
+    for axis in first(content)["axes"]:
+        axis[0] = axis[2] = min(axis[0], 1)
+
+
 def gain_changed(content: dict[str, Any]) -> None:
     row = content["loops"][0]["compensator"]["D"][0]
     row[0] = (-float.fromhex(row[0])).hex()
@@ -185,6 +348,8 @@ def stripped(content: dict[str, Any]) -> None:
         (raised_with_its_box, "zero is not excluded"),
         (turned, "zero is not excluded"),
         (narrowed, "parts of the box leave a gap"),
+        (kept_less, "zero is not excluded"),
+        (interpolated_less, "zero is not excluded"),
         (gain_changed, "not shown to be stable|zero is not excluded"),
         (stripped, "do not hold each state once"),
     ],
@@ -253,7 +418,9 @@ def test_files_that_are_no_certificates(tmp_path: Path, text: str, why: str) -> 
         (("loops", 0, "steps", 0), ["call", 0, [], 0.0]), (("loops", 0, "A", 0), [0, 0, 10**6]),
         (("loops", 0, "groups", 0, "parts", 0, "cells", 0), [2, 0, 1, [], 1, 0]),
         (("loops", 0, "groups", 0, "parts", 0, "box", 0), [2.0, 1.0]),
-        (("parameters", 0, "nominal"), 1e300), (("gains",), None),
+        (("parameters", 0, "nominal"), 1e300), (("gains",), None), (("loops", 0, "units"), [1]),
+        (("loops", 0, "groups", 0, "parts", 0, "axes", 0), [2, 0.5, 2]),
+        (("loops", 0, "groups", 0, "parts", 0, "axes", 0), [2, 4.0, 3]),
     ],
 )  # fmt: skip
 def test_fields_that_are_wrong(
@@ -365,6 +532,24 @@ def test_shipped_designs(tmp_path: Path, name: str) -> None:
     found = check(path, ROOT / "design" / "gains" / f"{name}.json")
     assert found.ok, found.failures
     assert len(found.groups) == len(content["loops"][0]["groups"])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["planar", "planar_pid"])
+def test_designs_whose_rounding_couples_all_states(tmp_path: Path, name: str) -> None:
+    gains = ROOT / "design" / "gains" / f"{name}.json"
+    controller = malta.gains.read(gains)
+    plant = malta.plant_of(controller.parameters)
+    ranges = malta.read_design(ROOT / "design" / f"{name}.toml").uncertainty
+    margin = travel_margin(plant, controller, ranges)
+    places, over = travel_loops(plant, controller, tuple(ranges))
+    found = check(certificate.write(tmp_path / "c.json", places, ranges, over, margin, gains), gains)
+    assert found.ok, found.failures
+    assert margin.lower is not None
+    assert 3.0 < found.claim < margin.lower
+    assert (
+        len(found.groups) == 6
+    )  # four axes in the middle of the travel, of which pairs are coupled at its end
 
 
 def test_verify_asks_for_the_worst_case(run: Run) -> None:

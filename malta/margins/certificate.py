@@ -1,7 +1,7 @@
 """The proof of a margin as a file, which `check` confirms: matrices, parameters, claim, and the cells of each group.
 
 The cells are found here, by the same branch and bound as the margin but for the polynomial that `check` builds by
-itself, and without couplings taken as zero: a claim a little below the margin's own lower bound.
+itself: a claim a little below the margin's own lower bound, or the largest of a few shares of it that is proven.
 """
 
 from __future__ import annotations
@@ -10,27 +10,22 @@ import hashlib
 import json
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from flint import ctx
-from scipy import sparse
+from flint import arb, ctx
 
 from malta.errors import CheckError, InputError
 from malta.files import replace_files
 from malta.margins import checked_file
 from malta.margins import loop as loops
 from malta.margins.box import Box, box_of
-from malta.margins.check import Enclosure, enclose
-from malta.margins.checked_loop import (
-    Polynomial,
-    Refused,
-    Tables,
-    coupled,
-    split,
-)
+from malta.margins.certificate_groups import divides, groups_of, units_of
+from malta.margins.check import BITS, MOST_NODES, balls, bernstein, interpolated, within
+from malta.margins.checked_loop import Polynomial, Refused, expressions, height, split
 from malta.margins.exclusion import Growth, advance, start
 from malta.margins.expressions import FIELD, exact
 from malta.margins.family import Family, binary
@@ -41,9 +36,19 @@ if TYPE_CHECKING:
     from malta.margins.uncertain import Compensator, UncertainSystem
     from malta.model.plant import FloatArray
 
-SHARE = 0.999  # of the margin's lower bound that is claimed
-MOST_CELLS = 60_000  # that are looked at for one group
+SHARES = (
+    0.999,
+    0.97,
+    0.9,
+    0.75,
+    0.5,
+    0.25,
+)  # of the margin's lower bound: the first that is proven is claimed
+MOST_CELLS = 20_000  # that are looked at for one group
 MOST_PARTS = 64
+HIGHEST = 24  # degree of an interpolant along one parameter
+TAIL = -26.0  # log2 of what interpolation should leave out, relative to each coefficient
+RADII = (1.5, 2.0, 3.0, 4.0, 6.0, 8.0, *(2.0**k for k in (4, 5, 6, 8, 10, 14, 20, 30, 50, 99)))
 
 Places = Sequence[tuple["UncertainSystem", "Compensator"]]
 
@@ -75,9 +80,9 @@ def certificate_of(
     """What `write` writes, as one JSON document."""
     if margin.lower is None:
         raise CheckError(f"no certificate: nothing is proven ({margin.reason})")
-    lower = SHARE * margin.lower
     system = places[0][0]
     box = box_of(system.names, system.nominal, system.limits, ranges, over or {})
+    lower, proven = _proven(places, box, margin.lower)
     content: dict[str, Any] = {
         "format": checked_file.FORMAT,
         "version": checked_file.VERSION,
@@ -94,12 +99,22 @@ def certificate_of(
             }
             for i, name in enumerate(box.names)
         ],
-        "loops": [_loop(*place, box, lower) for place in places],
+        "loops": proven,
     }
     if gains is not None:
         found = hashlib.sha256(Path(gains).read_bytes()).hexdigest()
         content["gains"] = {"name": Path(gains).name, "sha256": found}
     return content | {"sha256": checked_file.digest(content)}
+
+
+def _proven(places: Places, box: Box, margin: float) -> tuple[float, list[dict[str, Any]]]:
+    """The claim, and the loops with their proofs. Raises CheckError, InputError."""
+    for share in SHARES:
+        try:
+            return share * margin, [_loop(*place, box, share * margin) for place in places]
+        except CheckError as error:
+            last = error
+    raise last
 
 
 def matches(path: str | Path, places: Places) -> bool:
@@ -122,16 +137,22 @@ def _law(system: UncertainSystem, law: Any) -> Compensator:
 def _described(loop: loops.Loop) -> dict[str, Any]:
     """A loop as it stands in a certificate, without its groups."""
     law, program = loop.law, loop.program
-    if loop.direct or loop.descriptor:
-        raise InputError("certificate", "system", "a matrix D or E", "A, B and C alone")
+    n = loop.states
+    if loop.direct:
+        raise InputError("certificate", "system", "a matrix D", "outputs y = C x alone")
+    if loop.descriptor and sorted((i, j) for i, j, _ in program.entries[loops.E]) != [
+        (i, i) for i in range(n)
+    ]:
+        raise InputError("certificate", "system", "a matrix E that couples states", "a diagonal E, or none")
     if not program.rational:
         foreign = sorted({name for name, *_ in program.steps} - {*FIELD, "const", "input", "constpow"})
         raise InputError("certificate", "system", " ".join(foreign) or "a power", "+ - * / and whole powers")
+    matrices = "ABCE" if loop.descriptor else "ABC"
     T = law.sample_time if loop.system.sample_time is None else loop.system.sample_time
     return {
-        "shape": [loop.states, program.shapes[1][1], program.shapes[2][0]],
+        "shape": [n, program.shapes[1][1], program.shapes[2][0]],
         "steps": [[name, target, list(on), float(value).hex()] for name, target, on, value in program.steps],
-        **{key: [list(e) for e in program.entries[i]] for i, key in enumerate("ABC")},
+        **{key: [list(e) for e in program.entries[i]] for i, key in enumerate("ABCDE") if key in matrices},
         "compensator": {
             key: [[float(x).hex() for x in row] for row in getattr(law, key).tolist()] for key in "ABCD"
         },
@@ -144,71 +165,32 @@ def _described(loop: loops.Loop) -> dict[str, Any]:
 
 def _loop(system: UncertainSystem, law: Any, box: Box, lower: float) -> dict[str, Any]:
     """One loop with the proof of each of its groups. Raises InputError, CheckError."""
-    described, reader = (
-        _described(loops.loop_of(system, _law(system, law))),
-        checked_file.Reader(Path("certificate")),
-    )
+    described = _described(loops.loop_of(system, _law(system, law)))
     count, before = len(box.names), ctx.prec
 
-    def read(groups: list[dict[str, Any]]) -> checked_file.Loop:
-        return reader.loop(described | {"groups": groups}, count)
+    def read() -> checked_file.Loop:
+        return checked_file.loop(checked_file.Field(Path("certificate"), "", described), count)
 
     try:
-        tables = coupled(read([]), (False,) * count)
-        groups = _groups(read([]), tables, count)
-        for g, own in zip(groups, split(read(groups)), strict=True):
-            g["inverted"] = [_divides(own, i) for i in range(count)]
-        loop = read(groups)
-        for g, group, own in zip(groups, loop.groups, split(loop), strict=True):
-            g["parts"] = _parts(Polynomial(loop, group, own), box, lower)
+        described |= {
+            "groups": [],
+            "units": [0] * (len(described["compensator"]["A"]) + described["shape"][0]),
+        }
+        groups = described["groups"] = groups_of(read(), expressions(read(), (False,) * count, math.inf), box)
+        for g, f in zip(groups, split(read()), strict=True):
+            g["inverted"] = [divides(f, i) for i in range(count)]
+        described["units"] = units_of(read, described, box)
+        for g, f in zip(groups, split(read()), strict=True):
+            g["parts"] = _parts(f, box, lower)
     except Refused as error:
         raise CheckError(f"no certificate: {error}") from error
     finally:
         ctx.prec = before
-    return described | {"groups": groups}
-
-
-def _groups(loop: checked_file.Loop, t: Tables, count: int) -> list[dict[str, Any]]:
-    """States that act on one another; a group is only acted on by those before it."""
-    n, k = loop.states, len(loop.law_a)
-    touch = np.zeros((n + k, n + k), dtype=bool)
-    for table, row, column in ((t.A, 0, 0), (t.K, 0, 0), (t.F, 0, n), (t.H, n, 0)):
-        for i, j in table:
-            touch[row + i, column + j] = True
-    touch[n:, n:] = [[x != 0 for x in row] for row in loop.law_a] if k else touch[n:, n:]
-    number, label = sparse.csgraph.connected_components(touch, directed=True, connection="strong")
-    left, order = set(range(number)), []
-    while left:
-        ready = sorted(
-            g
-            for g in left
-            if not any((label[touch[i]] == h).any() for i in np.flatnonzero(label == g) for h in left - {g})
-        )
-        order += ready
-        left -= set(ready)
-    members = [np.flatnonzero(label == g).tolist() for g in order]
-    return [
-        {
-            "states": [i for i in own if i < n],
-            "own": [i - n for i in own if i >= n],
-            "inverted": [False] * count,
-            "parts": [],
-        }
-        for own in members
-    ]
-
-
-def _divides(t: Tables, i: int) -> bool:
-    """Whether the entries are polynomials of 1 / p_i, as of a mass."""
-    found = [r for table in (t.A, t.K, t.F, t.H) for r in table.values()]
-    below = [{m[i] for m in r.den.monoms()} for r in found]
-    return any(max(b) > 0 for b in below) and all(
-        len(b) == 1 and r.num.degrees()[i] <= max(b) for r, b in zip(found, below, strict=True)
-    )
+    return described
 
 
 def _parts(f: Polynomial, box: Box, lower: float) -> list[dict[str, Any]]:
-    """The box cut where one enclosure does not do, each part with its cells. Raises Refused."""
+    """The box cut where one enclosure does not do, each part with its cells. Raises InputError, CheckError, Refused."""
     t = exact(lower)
     todo = [
         np.array([
@@ -216,13 +198,17 @@ def _parts(f: Polynomial, box: Box, lower: float) -> list[dict[str, Any]]:
             for c, d, u, o in zip(*(x.tolist() for x in (box.nominal, box.down, box.up, box.over)), strict=True)
         ])
     ]  # fmt: skip
+    moving = len(f.used & set(np.flatnonzero(todo[0][:, 0] < todo[0][:, 1]).tolist()))
+    if 2**moving > MOST_NODES:
+        most = math.floor(math.log2(MOST_NODES))
+        raise InputError("certificate", "parameters", f"{moving} that act on one group", f"at most {most}")
     made: list[dict[str, Any]] = []
     while todo:
         sides = todo.pop()
         v = [(exact(a), exact(b)) for a, b in sides.tolist()]
         v = [(1 / b, 1 / a) if inv else (a, b) for (a, b), inv in zip(v, f.group.inverted, strict=True)]
         try:
-            e = enclose(f, v)
+            proof = _enclosed(f, v, box, lower)
         except Refused:
             if len(todo) + len(made) >= MOST_PARTS:
                 raise
@@ -233,13 +219,13 @@ def _parts(f: Polynomial, box: Box, lower: float) -> list[dict[str, Any]]:
                 half[axis, 1 - k] = middle
                 todo.append(half)
             continue
-        made.append(_proof(e, sides, v, f.group.inverted, box, lower))
+        made.append({"box": [[a.hex(), b.hex()] for a, b in sides.tolist()]} | proof)
     return made
 
 
 def _below(x: Any) -> float:
     """A double at or below an exact number."""
-    found = int(x.p) / int(x.q)
+    found = _float(x)
     return found if exact(found) <= x else math.nextafter(found, -math.inf)
 
 
@@ -250,30 +236,75 @@ def _widest(f: Polynomial, sides: FloatArray) -> int:
     return int(np.argmax([s if i in f.used else -1.0 for i, s in enumerate(share)]))
 
 
-def _proof(
-    e: Enclosure, sides: FloatArray, v: Any, inverted: Sequence[bool], box: Box, lower: float
-) -> dict[str, Any]:
-    """The cells of one part. Raises Refused where zero is not excluded."""
-    family = _family(e)
-    low, high = (np.array([float(int(x.p) / int(x.q)) for x in ends]) for ends in zip(*v, strict=True))
+def _enclosed(f: Polynomial, v: list[tuple[Any, Any]], box: Box, lower: float) -> dict[str, Any]:
+    """How one part is enclosed, and its cells.
+
+    Raises Refused where it cannot be enclosed, CheckError where zero is not excluded.
+    """
+    ctx.prec = BITS
+    size = [height(x) for x in f.at([arb((a + b) / 2) for a, b in v])]
+    axes = [_axis(f, v, i, size) for i in range(len(v))]
+    values, left = interpolated(f, v, axes)
+    heights = np.array([height(x) for x in values]).reshape(f.count, *(axis.degree + 1 for axis in axes))
+    matters = heights > heights.reshape(f.count, -1).max(axis=1).reshape(-1, *[1] * len(axes)) + TAIL
+    kept = [max(np.nonzero(matters)[i + 1].tolist(), default=0) for i in range(len(axes))]
+    axes = [replace(axis, kept=k) for axis, k in zip(axes, kept, strict=True)]
+    family = _family(*bernstein(values, left, axes), f.moved(balls(v)))
+    return {
+        "axes": [[axis.degree, _float(axis.rho).hex(), axis.kept] for axis in axes],
+        "scale": family.scale,
+        "cells": _cells(family, v, f.group.inverted, box, lower),
+    }
+
+
+def _axis(f: Polynomial, v: list[tuple[Any, Any]], i: int, size: list[float]) -> checked_file.Axis:
+    """The ellipse along v_i that takes the lowest degree. Raises Refused."""
+    if i not in f.used or v[i][0] == v[i][1]:
+        return checked_file.Axis(0, exact(RADII[0]), 0)
+    best: tuple[float, int, float] | None = None
+    for rho in RADII:
+        try:
+            most = within(f, v, i, exact(rho))
+        except (Refused, OverflowError):
+            break
+        share = max((height(m) - s for m, s in zip(most, size, strict=True) if s > -math.inf), default=0.0)
+        rate, start = math.log2(rho), share + 1 - math.log2(rho - 1)
+        degree = min(max(math.ceil((start - TAIL) / rate), 0), HIGHEST)
+        rank = (max(start - degree * rate - TAIL, 0.0), degree, rho)
+        best = rank if best is None else min(best, rank)
+    if best is None or best[0] > 16:
+        raise Refused(f"parameter {i + 1} varies too much for one interpolation")
+    return checked_file.Axis(best[1], exact(best[2]), best[1])
+
+
+def _float(x: Any) -> float:
+    return int(x.p) / int(x.q)
+
+
+def _cells(
+    family: Family, v: list[tuple[Any, Any]], inverted: Sequence[bool], box: Box, lower: float
+) -> list[list[Any]]:
+    """Cells from which zero is excluded. Raises CheckError."""
+    low, high = (np.array([_float(x) for x in ends]) for ends in zip(*v, strict=True))
     growth = Growth(low, high, tuple(inverted), box.nominal, box.down, box.up)
     search = start(family, growth, 2 * lower + 1)
     while not search.finished:
-        if search.count > MOST_CELLS:
-            raise CheckError(f"no certificate: not proven within {MOST_CELLS} cells")
+        if search.count > MOST_CELLS or search.blocked < search.target:
+            raise CheckError(f"no certificate: not proven within {search.count} cells")
         advance(search)
     cells, boxes, c = search.excluded(len(v))
-    rows = [
+    return [
         [int(branch), a, b, own, z.real, z.imag]
         for (branch, a, b), own, z in zip(cells.tolist(), boxes.tolist(), c.tolist(), strict=True)
     ]
-    return {"box": [[a.hex(), b.hex()] for a, b in sides.tolist()], "scale": family.scale, "cells": rows}
 
 
-def _family(e: Enclosure) -> Family:
-    """An enclosure in doubles."""
-    each = math.prod(e.shape)
-    parts = np.array([binary(x) for x in e.values]).reshape(e.count, each, 3)
+def _family(bernstein: list[Any], shape: tuple[int, ...], dust: list[Any]) -> Family:
+    """An enclosure in doubles, with what couplings between groups can do as part of its radius."""
+    each = math.prod(shape)
+    count = len(bernstein) // each
+    beside = [arb(0, x.upper()) for x in dust] + [arb(0)] * (count - len(dust))
+    parts = np.array([binary(x + beside[k // each]) for k, x in enumerate(bernstein)]).reshape(count, each, 3)
     mantissas, radii, powers = parts[..., 0], parts[..., 1], parts[..., 2].astype(int)
     with np.errstate(divide="ignore"):
         sizes = np.where(mantissas == 0, -np.inf, powers + np.log2(np.abs(mantissas)))
@@ -284,4 +315,4 @@ def _family(e: Enclosure) -> Family:
     shift = np.clip(powers - exponents[:, None], -1020, 1020)
     values, radius = np.ldexp(mantissas, shift), np.ldexp(radii, shift).max(axis=1)
     moved = tuple(int(x) + scale * k for k, x in enumerate(exponents))
-    return Family(e.shape, values, radius, moved, scale)
+    return Family(shape, values, radius, moved, scale)

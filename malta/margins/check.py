@@ -1,14 +1,14 @@
 """A margin certificate checked: in balls with outward rounding, from the certificate's matrices alone.
 
-This file shares no code with the search that found the margin, and trusts no floating-point number. For every loop
-and every group of states it
+This file shares no code with the search that found the margin, and trusts no floating-point number. A stable loop
+becomes unstable over a connected box only where its characteristic polynomial a(s; p) has a zero s = jw, w = infinity
+among them. So for every loop and every group of states (`checked_loop`)
 
-1. builds the characteristic polynomial a_0 + a_1 s + ... of the closed loop (sampled: of v = (z - 1) / (z + 1)),
-2. encloses each a_k over a box of v (v: p or 1 / p): Bernstein coefficients of the interpolant at Chebyshev nodes, and
-   Cauchy's bound of what that leaves out,
-3. shows by Routh's scheme that the nominal loop is stable,
-4. shows that the cells tile all frequencies x box(lower): a stable loop can only become unstable through a(jw; p) = 0,
-5. shows on each cell that all Bernstein coefficients (in w and v) of Re(conj(c) a(jw; p)) are above zero.
+1. the nominal loop is stable, by Routh's scheme,
+2. the cells of the certificate tile all frequencies x box(lower), 1 / w for the high ones,
+3. the coefficients a_k, as functions of the parameters v (p or 1 / p) over a part of the box, are enclosed by
+   polynomials in Bernstein's form: interpolants at Chebyshev nodes, and Cauchy's bound of what these leave out,
+4. on each cell the Bernstein coefficients, in w and v, of Re(conj(c) a(jw; p)) are above zero: then so is all of it.
 """
 
 from __future__ import annotations
@@ -21,22 +21,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from flint import acb, arb, arb_mat, arb_poly, ctx, fmpq, fmpq_mat
+from flint import acb, arb, arb_mat, arb_poly, ctx, fmpq, fmpq_mat, fmpq_poly, fmpz_poly
 
-from malta.margins.checked_file import Document, Part, read
-from malta.margins.checked_loop import (
-    Polynomial,
-    Refused,
-    height,
-    split,
-)
+from malta.margins.checked_file import Axis, Document, Part, read
+from malta.margins.checked_loop import Polynomial, Refused, split
 
-BITS = 400  # of the coefficients; cells need fewer
+BITS = 256  # of the coefficients; cells need fewer
 CELL_BITS = 160
-HIGHEST = 24  # degree of an interpolant along one parameter
 MOST_NODES = 12_500
-TAIL = -26.0  # log2 of what interpolation should leave out, relative to each coefficient
-RADII = (1.5, 2.0, 3.0, 4.0, 6.0, 8.0, *(2.0**k for k in (4, 5, 6, 8, 10, 14, 20, 30, 50, 100)))
 
 Box = Sequence[tuple[Any, Any]]
 
@@ -60,50 +52,109 @@ def check(path: str | Path, gains: str | Path | None = None, seconds: float = 60
     claim = float(int(document.lower.p) / int(document.lower.q))
     if changed:
         return Verdict(False, claim, (), (changed,))
-    lines, failures = [], []
-    until = time.monotonic() + seconds
-    before = ctx.prec
+    lines, failures, until, before = [], [], time.monotonic() + seconds, ctx.prec
     try:
         for k, loop in enumerate(document.loops):
-            name = f"loop {k + 1}" if len(document.loops) > 1 else "loop"
+            name = where = f"loop {k + 1}" if len(document.loops) > 1 else "loop"
             try:
-                tables = split(loop, until)
+                for n, polynomial in enumerate(split(loop, until)):
+                    where = f"{name}, group {n + 1}"
+                    lines.append(f"{where}: {proven(document, polynomial, until)}")
             except (Refused, ArithmeticError) as error:
-                failures.append(f"{name}: {error}")
-                continue
-            for n, (group, table) in enumerate(zip(loop.groups, tables, strict=True)):
-                try:
-                    found = _proven(document, Polynomial(loop, group, table), until)
-                except (Refused, ArithmeticError) as error:
-                    failures.append(f"{name}, group {n + 1}: {error}")
-                else:
-                    lines.append(f"{name}, group {n + 1}: {found}")
+                failures.append(f"{where}: {error}")
     finally:
         ctx.prec = before
     return Verdict(not failures, claim, tuple(lines), tuple(failures))
 
 
-# enclosures over a box
+def proven(document: Document, f: Polynomial, until: float) -> str:
+    """One line of what was shown. Raises Refused."""
+    group, parameters, unit = f.group, document.parameters, (fmpq(0), fmpq(1))
+    ctx.prec = 2 * BITS
+    nominal = [1 / p.nominal if inv else p.nominal for p, inv in zip(parameters, group.inverted, strict=True)]
+    if not stable(f.at([arb(x) for x in nominal])):
+        raise Refused("the nominal loop is not shown to be stable")
+    t = document.lower
+    wanted = [(p.nominal - t * p.down + p.over[0], p.nominal + t * p.up + p.over[1]) for p in parameters]
+    if not tiled([part.box for part in group.parts], wanted, until):
+        raise Refused("the parts of the box leave a gap")
+    for k, part in enumerate(group.parts):
+        ends = [max((c.high for c in part.cells if c.branch == branch), default=fmpq(0)) for branch in (0, 1)]
+        if ends[0] * ends[1] < 1:  # s = jx up to the one, s = j / x up to the other, in units of 2^scale
+            raise Refused("frequencies between the two branches are missing")
+        for branch in (0, 1):
+            cells = [((c.low, c.high), *c.box) for c in part.cells if c.branch == branch]
+            if not tiled(cells, [(fmpq(0), ends[branch]), *([unit] * len(part.box))], until):
+                raise Refused(f"the cells of part {k + 1} leave a gap")
+        if any(a <= 0 <= b for (a, b), inv in zip(part.box, group.inverted, strict=True) if inv):
+            raise Refused("a parameter that divides reaches zero")
+        box = [
+            (1 / b, 1 / a) if inv else (a, b) for (a, b), inv in zip(part.box, group.inverted, strict=True)
+        ]
+        over = balls(box)
+        if not all(abs(r.at(over)) > 0 for r in f.leading):
+            raise Refused("E is not shown to be invertible")
+        values, left = interpolated(f, box, part.axes, until)
+        excluded(*bernstein(values, left, part.axes), f.moved(over), part, until)
+    count = sum(len(part.cells) for part in group.parts)
+    return f"{len(group.states)} + {len(group.own)} states, {count} cells, all above zero"
 
 
-@dataclass(frozen=True)
-class Enclosure:
-    """a_k over a box of v: Bernstein coefficients as balls, k after k, each over degrees (d_1 + 1) x (d_2 + 1) x ..."""
-
-    shape: tuple[int, ...]
-    values: list[Any]
-    count: int  # N + 1
+def balls(box: Box) -> list[Any]:
+    """The sides of a box, each as a ball."""
+    return [acb(arb((a + b) / 2, arb((b - a) / 2))) for a, b in box]
 
 
-def enclose(f: Polynomial, box: Box, until: float = math.inf) -> Enclosure:
-    """Raises Refused where that is not possible on the box."""
+def stable(a: list[Any]) -> bool:
+    """Whether all roots of a_0 + a_1 s + ... are left of the axis: the first column of Routh's scheme has one sign."""
+    one, two = a[::-1][::2], a[::-1][1::2]
+    sign = 1 if one[0] > 0 else -1
+    while two and sign * one[0] > 0:
+        q = one[0] / two[0]
+        one, two = two, [x - q * (two[k + 1] if k + 1 < len(two) else 0) for k, x in enumerate(one[1:])]
+    return bool(sign * one[0] > 0)
+
+
+def tiled(cells: Sequence[Any], whole: Box, until: float = math.inf) -> bool:
+    """Whether boxes cover a box: within it they do not overlap, and their volumes add up to its volume."""
+    wide = [i for i, (a, b) in enumerate(whole) if a < b]
+    own = [[(max(a, c), min(b, d)) for (a, b), (c, d) in zip(cell, whole, strict=True)] for cell in cells]
+    own = [cell for cell in own if all(a <= b for a, b in cell)]
+    if not wide or not own:
+        return bool(own)
+    own.sort(key=lambda cell: cell[wide[0]])
+    for k, one in enumerate(own):
+        if time.monotonic() > until:
+            raise Refused("time is up")
+        for two in own[k + 1 :]:
+            if two[wide[0]][0] >= one[wide[0]][1]:
+                break
+            if all(max(one[i][0], two[i][0]) < min(one[i][1], two[i][1]) for i in wide):
+                return False
+    volumes = [math.prod((cell[i][1] - cell[i][0] for i in wide), start=fmpq(1)) for cell in (*own, whole)]
+    return bool(sum(volumes[:-1], fmpq(0)) == volumes[-1])
+
+
+def interpolated(
+    f: Polynomial, box: Box, axes: Sequence[Axis], until: float = math.inf
+) -> tuple[list[Any], list[Any]]:
+    """a_0, a_1, ... in products of Chebyshev polynomials T_k(1 - 2 u), and bounds of what is left out of each.
+
+    Along one axis: |a| <= M within Bernstein's ellipse rho leaves 2 M rho^-d / (rho - 1), at most, out of the best
+    polynomial of degree d, and 1 + Lambda times that of the interpolant (Trefethen, Approximation Theory and
+    Approximation Practice, theorems 8.2 and 15.1); Lambda <= 1 + 2 / pi log(d + 1) (Rivlin).
+    """
     ctx.prec = BITS
-    middle = [arb((a + b) / 2) for a, b in box]
-    size = [height(c) for c in f.at(middle)]
-    axes = [_axis(f, i, box, size) for i in range(len(box))]
-    shape = tuple(d + 1 for d, _ in axes)
+    left, growth = [arb(0)] * f.count, arb(1)
+    for i, (axis, (a, b)) in enumerate(zip(axes, box, strict=True)):
+        if i in f.used and a < b:
+            best = [2 * m * axis.rho**-axis.degree / (axis.rho - 1) for m in within(f, box, i, axis.rho)]
+            constant = 1 + 2 * arb(axis.degree + 1).log() / arb.pi()
+            left = [x + growth * (1 + constant) * y for x, y in zip(left, best, strict=True)]
+            growth *= constant
+    shape = [axis.degree + 1 for axis in axes]
     if math.prod(shape) > MOST_NODES:
-        raise Refused(f"{math.prod(shape)} places are too many to interpolate at")
+        raise Refused(f"{math.prod(shape)} places of {len(shape)} parameters are too many to interpolate at")
     nodes = [[fmpq(2 * i + 1, 2 * n) for i in range(n)] for n in shape]  # angles over pi
     points = []
     for place in itertools.product(*nodes):
@@ -111,79 +162,43 @@ def enclose(f: Polynomial, box: Box, until: float = math.inf) -> Enclosure:
             raise Refused("time is up")
         shares = ((1 - arb(u).cos_pi()) / 2 for u in place)
         points.append(f.at([a + (b - a) * u for (a, b), u in zip(box, shares, strict=True)]))
-    values = [point[k] for k in range(len(size)) for point in points]
-    for i, n in enumerate(shape):  # coefficients of Chebyshev polynomials T_k(1 - 2 u)
+    values = [point[k] for k in range(f.count) for point in points]
+    for i, n in enumerate(shape):
         table = [arb(u * k).cos_pi() * fmpq(2 - (k == 0), n) for k in range(n) for u in nodes[i]]
         values = along(values, n, math.prod(shape[i + 1 :]), arb_mat(n, n, table))
-    left, growth = [arb(0)] * len(size), arb(1)
-    for degree, tail in axes:
-        lebesgue = 1 + 2 * (arb(degree + 1)).log() / arb.pi()  # of Chebyshev nodes, at most (Rivlin)
-        left = [x + growth * (1 + lebesgue) * y for x, y in zip(left, tail, strict=True)]
-        growth *= lebesgue if degree else 1
-    return _shortened(values, shape, left)
+    return values, left
 
 
-def _shortened(values: list[Any], shape: tuple[int, ...], left: list[Any]) -> Enclosure:
-    """Chebyshev coefficients -> Bernstein ones of the degrees that matter; the others, |T_k| <= 1, join the rest."""
-    count, new = len(left), list(shape)
-    places = list(itertools.product(range(count), *(range(n) for n in shape)))
-    heights = [height(x) for x in values]
-    top = [max(h for h, at in zip(heights, places, strict=True) if at[0] == k) for k in range(count)]
-    for i in range(len(shape)):
-        matter = (at[i + 1] + 1 for h, at in zip(heights, places, strict=True) if h > top[at[0]] + TAIL)
-        new[i] = max(matter, default=1)
-    kept, rest = [], list(left)
-    for x, at in zip(values, places, strict=True):
-        if all(a < n for a, n in zip(at[1:], new, strict=True)):
+def within(f: Polynomial, box: Box, i: int, rho: Any) -> list[Any]:
+    """Bounds of |a_k| with v_i in the rectangle about Bernstein's ellipse rho."""
+    v = balls(box)
+    half, middle = arb((box[i][1] - box[i][0]) / 2), arb((box[i][0] + box[i][1]) / 2)
+    v[i] = acb(
+        middle + arb(0, (half * (rho + 1 / rho) / 2).upper()), arb(0, (half * (rho - 1 / rho) / 2).upper())
+    )
+    ctx.prec = 64
+    try:
+        return f.bounds(v)
+    finally:
+        ctx.prec = BITS
+
+
+def bernstein(values: list[Any], left: list[Any], axes: Sequence[Axis]) -> tuple[list[Any], tuple[int, ...]]:
+    """Bernstein coefficients of the degrees that are kept; the other terms, |T_k| <= 1, join what is left out."""
+    shape, kept, rest = [axis.degree + 1 for axis in axes], [], list(left)
+    new = tuple(axis.kept + 1 for axis in axes)
+    for x, (k, *at) in zip(values, itertools.product(range(len(left)), *map(range, shape)), strict=True):
+        if all(a < n for a, n in zip(at, new, strict=True)):
             kept.append(x)
         else:
-            rest[at[0]] += abs(x)
+            rest[k] += abs(x)
     for i, n in enumerate(new):
-        u = [fmpq(k, max(n - 1, 1)) for k in range(n)]
-        bernstein = fmpq_mat(
-            [[math.comb(n - 1, k) * x**k * (1 - x) ** (n - 1 - k) for k in range(n)] for x in u]
-        )
-        chebyshev = fmpq_mat([[_chebyshev(k, 1 - 2 * x) for k in range(n)] for x in u])
-        kept = along(kept, n, math.prod(new[i + 1 :]), arb_mat(bernstein.inv() * chebyshev))
+        u, d = [fmpq(k, max(n - 1, 1)) for k in range(n)], n - 1
+        own = fmpq_mat([[math.comb(d, k) * x**k * (1 - x) ** (d - k) for k in range(n)] for x in u])
+        chebyshev = fmpq_mat([[fmpq_poly(fmpz_poly.chebyshev_t(k))(1 - 2 * x) for k in range(n)] for x in u])
+        kept = along(kept, n, math.prod(new[i + 1 :]), arb_mat(own.inv() * chebyshev))
     each = math.prod(new)
-    return Enclosure(tuple(new), [x + arb(0, rest[k // each].upper()) for k, x in enumerate(kept)], count)
-
-
-def _chebyshev(k: int, x: Any) -> Any:
-    one, two = fmpq(1), x
-    for _ in range(k):
-        one, two = two, 2 * x * two - one
-    return one
-
-
-def _axis(f: Polynomial, i: int, box: Box, size: list[float]) -> tuple[int, list[Any]]:
-    """The degree along v_i, and bounds of the distance of each a_k to polynomials of that degree (Cauchy)."""
-    zero = [arb(0)] * len(size)
-    if i not in f.used or box[i][0] == box[i][1]:
-        return 0, zero
-    best: tuple[float, int, list[Any]] | None = None
-    for radius in RADII:
-        v = [acb(arb((a + b) / 2, arb((b - a) / 2))) for a, b in box]
-        reach = arb(0, (arb((box[i][1] - box[i][0]) / 2) * radius).upper())
-        middle = arb((box[i][0] + box[i][1]) / 2)
-        v[i] = acb(middle + reach, reach)
-        ctx.prec = 64
-        try:
-            most = f.bounds(v)
-        except Refused:
-            break
-        finally:
-            ctx.prec = BITS
-        share = max((height(m) - s for m, s in zip(most, size, strict=True) if s > -math.inf), default=0.0)
-        rate, start = math.log2(radius), share - math.log2(radius - 1)
-        degree = min(max(math.ceil((start - TAIL) / rate), 0), HIGHEST)
-        rank = (max(start - degree * rate - TAIL, 0.0), degree)
-        if best is None or rank < best[:2]:
-            scale = arb(radius) ** -degree / (arb(radius) - 1)
-            best = (*rank, [m * scale for m in most])
-    if best is None or best[0] > 16:
-        raise Refused(f"parameter {i + 1} varies too much for one interpolation")
-    return best[1], best[2]
+    return [x + arb(0, rest[k // each].upper()) for k, x in enumerate(kept)], new
 
 
 def along(values: list[Any], n: int, after: int, matrix: Any) -> list[Any]:
@@ -196,140 +211,39 @@ def along(values: list[Any], n: int, after: int, matrix: Any) -> list[Any]:
     return [made[(i * before + b) * after + a] for b in range(before) for i in range(m) for a in range(after)]
 
 
-def _restriction(n: int, low: Any, high: Any) -> Any:
-    """Bernstein coefficients of degree n - 1 over [0, 1] -> over [low, high], by blossoms."""
-    d = n - 1
-    rows = []
-    for i in range(n):  # the blossom at low (d - i times) and high (i times)
-        p = arb_poly([1 - low, low]) ** (d - i) * arb_poly([1 - high, high]) ** i
-        rows += [p[k] for k in range(n)]
-    return arb_mat(n, n, rows)
+def excluded(values: list[Any], shape: tuple[int, ...], b: list[Any], part: Part, until: float) -> None:
+    """Re(conj(c) a(jw; p)) > |c| b(w) on each cell. Raises Refused.
 
-
-def _powers(n: int, low: Any, high: Any) -> list[list[Any]]:
-    """Bernstein coefficients over [low, high] of the monomials x^k, k < n, as polynomials of degree n - 1."""
-    d = n - 1
-    rows = []
-    for i in range(n):
-        p = arb_poly([1, low]) ** (d - i) * arb_poly([1, high]) ** i
-        rows.append([p[k] / math.comb(d, k) for k in range(n)])
-    return rows
-
-
-# the proof
-
-
-def _proven(document: Document, f: Polynomial, until: float) -> str:
-    """One line of what was shown. Raises Refused."""
-    group = f.group
-    ctx.prec = 2 * BITS
-    nominal = [
-        1 / p.nominal if inv else p.nominal
-        for p, inv in zip(document.parameters, group.inverted, strict=True)
-    ]
-    if not _stable(f.at([arb(x) for x in nominal])):
-        raise Refused("the nominal loop is not shown to be stable")
-    wanted = [
-        (p.nominal - document.lower * p.down + p.over[0], p.nominal + document.lower * p.up + p.over[1])
-        for p in document.parameters
-    ]
-    if not tiled([tuple(part.box) for part in group.parts], wanted, until):
-        raise Refused("the parts of the box leave a gap")
-    count = 0
-    for k, part in enumerate(group.parts):
-        if any(a <= 0 <= b for (a, b), inv in zip(part.box, group.inverted, strict=True) if inv):
-            raise Refused("a parameter that divides reaches zero")
-        reach = _frequencies(part)
-        for branch in (0, 1):
-            own = [((c.low, c.high), *c.box) for c in part.cells if c.branch == branch]
-            unit = (fmpq(0), fmpq(1))
-            if not tiled(own, [(fmpq(0), reach[branch]), *([unit] * len(part.box))], until):
-                raise Refused(f"the cells of part {k + 1} leave a gap")
-        box = [
-            (1 / b, 1 / a) if inv else (a, b) for (a, b), inv in zip(part.box, group.inverted, strict=True)
-        ]
-        _cells(enclose(f, box, until), part, until)
-        count += len(part.cells)
-    return f"{len(group.states)} + {len(group.own)} states, {count} cells, all above zero"
-
-
-def _frequencies(part: Part) -> tuple[Any, Any]:
-    """How far the cells of both branches reach: w = x 2^scale up to the one, 2^scale / x up to the other."""
-    ends = [max((c.high for c in part.cells if c.branch == branch), default=fmpq(0)) for branch in (0, 1)]
-    if ends[0] * ends[1] < 1:
-        raise Refused("frequencies between the two branches are missing")
-    return ends[0], ends[1]
-
-
-def tiled(cells: list[Any], whole: Sequence[tuple[Any, Any]], until: float = math.inf) -> bool:
-    """Whether boxes that come from cuts right through, one after another, cover a box."""
-    todo = [(cells, list(whole))]
-    while todo:
-        own, box = todo.pop()
-        if time.monotonic() > until:
-            raise Refused("time is up")
-        if len(own) == 1 and all(c[0] <= b[0] and b[1] <= c[1] for c, b in zip(own[0], box, strict=True)):
-            continue
-        cut = _cut(own, len(box)) if len(own) > 1 else None
-        if cut is None:
-            return False
-        axis, at = cut
-        for side in (0, 1):
-            part = list(box)
-            part[axis] = (box[axis][0], at) if side == 0 else (at, box[axis][1])
-            todo.append(([c for c in own if (c[axis][0] >= at) == bool(side)], part))
-    return True
-
-
-def _cut(cells: list[Any], axes: int) -> tuple[int, Any] | None:
-    """Where no cell is cut in two, with about as many on either side."""
-    best: tuple[int, int, Any] | None = None
-    for axis in range(axes):
-        order = sorted((c[axis] for c in cells), key=lambda side: side[0])
-        end = order[0][1]
-        for k in range(1, len(order)):
-            if (
-                end <= order[k][0]
-                and order[k - 1][0] < order[k][0]
-                and (best is None or abs(2 * k - len(order)) < best[0])
-            ):
-                best = (abs(2 * k - len(order)), axis, order[k][0])
-            end = max(end, order[k][1])
-    return None if best is None else best[1:]
-
-
-def _cells(e: Enclosure, part: Part, until: float) -> None:
-    """Re(conj(c) a(jw; p)) > 0 on each cell. Raises Refused."""
+    A polynomial lies between its Bernstein coefficients; those over a part of an interval are values of its blossom.
+    """
     ctx.prec = CELL_BITS
-    unit, n = arb(2) ** part.scale, e.count
-    values = [x * unit ** (k // math.prod(e.shape)) for k, x in enumerate(e.values)]
-    tables: dict[Any, Any] = {}
+    each, unit = math.prod(shape), arb(2) ** part.scale
+    n = len(values) // each
+    values = [x * unit ** (k // each) for k, x in enumerate(values)]
+    beside = arb_mat(n, 1, [x * unit**k for k, x in enumerate(b)] + [arb(0)] * (n - len(b)))
+    last: tuple[Any, Any] = (None, None)
     for number, cell in sorted(enumerate(part.cells), key=lambda pair: str(pair[1].box)):
         if time.monotonic() > until:
             raise Refused("time is up")
-        if cell.box not in tables:
+        if last[0] != cell.box:
             own = values
             for i, (low, high) in enumerate(cell.box):
-                if e.shape[i] > 1 and (low, high) != (0, 1):
-                    after = math.prod(e.shape[i + 1 :])
-                    own = along(own, e.shape[i], after, _restriction(e.shape[i], arb(low), arb(high)))
-            tables = {cell.box: arb_mat(n, math.prod(e.shape), own)}
+                if shape[i] > 1 and (low, high) != (0, 1):
+                    own = along(own, shape[i], math.prod(shape[i + 1 :]), restriction(shape[i], low, high))
+            last = cell.box, arb_mat(n, each, own)
+        monomials = arb_mat(n, n, [  # Bernstein coefficients of x^k over [low, high], k after k; branch 1: x^(N - k)
+            (arb_poly([1, cell.low]) ** (n - 1 - i) * arb_poly([1, cell.high]) ** i)[e] / math.comb(n - 1, e)
+            for i in range(n) for k in range(n) for e in (n - 1 - k if cell.branch else k,)
+        ])  # fmt: skip
         c = (cell.re, cell.im, -cell.re, -cell.im)  # Re(conj(c) j^k)
-        rows = _powers(n, arb(cell.low), arb(cell.high))
-        weights = [[row[n - 1 - k if cell.branch else k] * c[k % 4] for k in range(n)] for row in rows]
-        if not all(x > 0 for x in (arb_mat(weights) * tables[cell.box]).entries()):
+        turn = arb_mat(n, n, [c[k % 4] * (i == k) for i in range(n) for k in range(n)])
+        found = (monomials * turn * last[1]).tolist()
+        least = (monomials * beside * arb(cell.re**2 + cell.im**2).sqrt()).entries()
+        if not all(x > y for row, y in zip(found, least, strict=True) for x in row):
             raise Refused(f"zero is not excluded from cell {number + 1}")
 
 
-def _stable(a: list[Any]) -> bool:
-    """Whether all roots of a_0 + a_1 s + ... are left of the axis, by Routh's scheme in balls."""
-    one, two = a[::-1][::2], a[::-1][1::2]
-    sign = 1 if one[0] > 0 else -1
-    if not sign * one[0] > 0:
-        return False
-    while two:
-        if not sign * two[0] > 0:
-            return False
-        q = one[0] / two[0]
-        one, two = two, [x - q * (two[k + 1] if k + 1 < len(two) else 0) for k, x in enumerate(one[1:])]
-    return True
+def restriction(n: int, low: Any, high: Any) -> Any:
+    """Bernstein coefficients of degree n - 1 over [0, 1] -> over [low, high]: the blossom at low, ..., high, ..."""
+    rows = [arb_poly([1 - low, low]) ** (n - 1 - i) * arb_poly([1 - high, high]) ** i for i in range(n)]
+    return arb_mat(n, n, [row[k] for row in rows for k in range(n)])

@@ -51,9 +51,19 @@ class Cell:
 
 
 @dataclass(frozen=True)
+class Axis:
+    """How a part is enclosed along one parameter: degree of interpolation, ellipse it is bounded in, degree kept."""
+
+    degree: int
+    rho: Any
+    kept: int
+
+
+@dataclass(frozen=True)
 class Part:
     """A part of the box of p, and its cells."""
 
+    axes: tuple[Axis, ...]
     box: tuple[tuple[Any, Any], ...]
     scale: int
     cells: tuple[Cell, ...]
@@ -68,23 +78,32 @@ class Group:
     inverted: tuple[bool, ...]
     parts: tuple[Part, ...]
 
+    def members(self, n: int) -> tuple[int, ...]:
+        """Numbers of the states, those of the compensator after the system's n."""
+        return (*self.states, *(n + i for i in self.own))
+
 
 @dataclass(frozen=True)
 class Loop:
-    """x' = A x + B u (x+ where discrete), y = C x, u = F y after hold, delay (samples) and lag (rad/s)."""
+    """E x' = A x + B u (x+ where discrete), y = C x, u = F y after hold, delay (samples) and lag (rad/s)."""
 
     states: int
     steps: tuple[tuple[str, int, tuple[int, ...], Any], ...]
-    entries: tuple[tuple[tuple[int, int, int], ...], ...]  # of A, B, C: row, column, step
-    law_a: list[list[Any]]
-    law_b: list[list[Any]]
-    law_c: list[list[Any]]
-    law_d: list[list[Any]]
+    entries: tuple[
+        tuple[tuple[int, int, int], ...], ...
+    ]  # of A, B, C, E: row, column, step; E diagonal, or I
+    law: tuple[list[list[Any]], ...]  # A, B, C, D
     sample_time: Any
     discrete: bool
     delay: int
     lag: Any
+    units: tuple[int, ...]  # log2 of sizes of the states, in which small couplings are bounded
     groups: tuple[Group, ...]
+
+    @property
+    def held(self) -> bool:
+        """Whether the inputs of a continuous system are held between samples."""
+        return self.sample_time is not None and not self.discrete
 
 
 @dataclass(frozen=True)
@@ -96,151 +115,139 @@ class Document:
     loops: tuple[Loop, ...]
 
 
-class Reader:
-    """Fields of one file, with its name in every complaint."""
+@dataclass(frozen=True)
+class Field:
+    """A value of the file and its place, which every complaint names."""
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
+    file: Path
+    name: str
+    value: Any
 
-    def wrong(self, field: str, found: Any, expected: str) -> InputError:
-        return InputError(self.path, field, repr(found)[:60], expected)
+    def wrong(self, expected: str) -> InputError:
+        return InputError(self.file, self.name, repr(self.value)[:60], expected)
 
-    def get(self, table: Any, key: str) -> Any:
-        if not isinstance(table, dict):
-            raise self.wrong(key, table, "a table that holds it")
-        if key not in table:
-            raise InputError(self.path, key, "nothing", "a value")
-        return table[key]
+    def __getitem__(self, key: str) -> Field:
+        if not isinstance(self.value, dict):
+            raise self.wrong(f"a table with {key}")
+        if key not in self.value:
+            raise InputError(self.file, f"{self.name}.{key}".lstrip("."), "nothing", "a value")
+        return Field(self.file, f"{self.name}.{key}".lstrip("."), self.value[key])
 
-    def items(self, value: Any, field: str, least: int, most: int) -> list[Any]:
-        if not isinstance(value, list) or not least <= len(value) <= most:
-            raise self.wrong(field, value, f"a list of {least} to {most} items")
-        return value
+    def items(self, least: int, most: int | None = None) -> list[Field]:
+        most = least if most is None else most
+        if not isinstance(self.value, list) or not least <= len(self.value) <= most:
+            raise self.wrong(f"a list of {least} to {most} items")
+        return [Field(self.file, f"{self.name}[{k}]", x) for k, x in enumerate(self.value)]
 
-    def whole(self, value: Any, field: str, low: int, high: int) -> int:
-        if type(value) is not int or not low <= value <= high:
-            raise self.wrong(field, value, f"a whole number from {low} to {high}")
-        return value
+    def whole(self, low: int, high: int) -> int:
+        if type(self.value) is not int or not low <= self.value <= high:
+            raise self.wrong(f"a whole number from {low} to {high}")
+        return self.value
 
-    def number(self, value: Any, field: str) -> Any:
+    def truth(self) -> bool:
+        if type(self.value) is not bool:
+            raise self.wrong("true or false")
+        return self.value
+
+    def number(self, low: float = -1e90, high: float = 1e90) -> Any:
         """A double as a rational."""
-        found = value
-        if isinstance(value, str) and len(value) <= 40:
+        found = self.value
+        if isinstance(found, str) and len(found) <= 40:
             try:
-                found = float.fromhex(value)
+                found = float.fromhex(found)
             except (ValueError, OverflowError):
                 found = None
         if type(found) is int and abs(found) <= 2**53:
             found = float(found)
-        if type(found) is not float or not (found == 0 or 1e-90 < abs(found) < 1e90):
-            raise self.wrong(field, value, "a finite number, zero or of a size from 1e-90 to 1e90")
+        if type(found) is not float or not (found == 0 or abs(found) > 1e-90) or not low <= found <= high:
+            raise self.wrong(f"a number from {low:g} to {high:g}, zero or of at least 1e-90")
         return fmpq(*found.as_integer_ratio())
 
-    def pair(self, value: Any, field: str) -> tuple[Any, Any]:
-        low, high = (self.number(x, field) for x in self.items(value, field, 2, 2))
-        if not low <= high:
-            raise self.wrong(field, value, "low, high")
-        return low, high
+    def pair(self, low: float = -1e90, high: float = 1e90) -> tuple[Any, Any]:
+        one, two = (x.number(low, high) for x in self.items(2))
+        if not one <= two:
+            raise self.wrong("low, high")
+        return one, two
 
-    def matrix(self, value: Any, field: str, rows: int | None, columns: int | None) -> list[list[Any]]:
-        table = self.items(value, field, 0 if rows is None else rows, 60 if rows is None else rows)
-        wanted = len(table) if columns is None else columns
-        return [[self.number(x, field) for x in self.items(row, field, wanted, wanted)] for row in table]
+    def matrix(self, rows: int, columns: int) -> list[list[Any]]:
+        return [[x.number() for x in row.items(columns)] for row in self.items(rows)]
 
-    def indices(self, value: Any, field: str, count: int) -> tuple[int, ...]:
-        return tuple(self.whole(i, field, 0, count - 1) for i in self.items(value, field, 0, max(count, 1)))
+    def indices(self, count: int) -> tuple[int, ...]:
+        return tuple(x.whole(0, count - 1) for x in self.items(0, max(count, 1)))
 
-    # records
 
-    def parameter(self, value: Any) -> Parameter:
-        name = self.get(value, "name")
-        if not isinstance(name, str) or len(name) > 100:
-            raise self.wrong("name", name, "a parameter's name")
-        nominal, down, up = (
-            self.number(self.get(value, key), f"{name}.{key}") for key in ("nominal", "down", "up")
-        )
-        over = self.pair(self.get(value, "over"), f"{name}.over")
-        if down < 0 or up < 0 or not over[0] <= 0 <= over[1]:
-            raise self.wrong(name, value, "a range about the nominal value")
-        return Parameter(name, nominal, down, up, over)
+def parameter(f: Field) -> Parameter:
+    name, over = f["name"].value, f["over"].pair()
+    if not isinstance(name, str) or len(name) > 100 or not over[0] <= 0 <= over[1]:
+        raise f.wrong("a parameter's name, and a range about its nominal value")
+    return Parameter(name, f["nominal"].number(), f["down"].number(0), f["up"].number(0), over)
 
-    def steps(self, value: Any, inputs: int) -> tuple[tuple[str, int, tuple[int, ...], Any], ...]:
-        found = []
-        for k, row in enumerate(self.items(value, "steps", 0, 20_000)):
-            name, target, on, constant = self.items(row, f"steps[{k}]", 4, 4)
-            if not isinstance(name, str) or name not in ARITY:
-                raise self.wrong(f"steps[{k}]", name, "one of " + " ".join(ARITY))
-            operands = self.indices(on, f"steps[{k}]", k)
-            if len(operands) != ARITY[name]:
-                raise self.wrong(f"steps[{k}]", on, f"{ARITY[name]} operands")
-            amount = self.number(constant, f"steps[{k}]")
-            if name == "constpow" and (amount.q != 1 or abs(amount) > 32):
-                raise self.wrong(f"steps[{k}]", constant, "a whole power up to 32")
-            place = self.whole(target, f"steps[{k}]", 0, inputs - 1 if name == "input" else 0)
-            found.append((name, place, operands, amount))
-        return tuple(found)
 
-    def entries(
-        self, value: Any, field: str, shape: tuple[int, int], count: int
-    ) -> tuple[tuple[int, int, int], ...]:
-        found = {}
-        for row in self.items(value, field, 0, shape[0] * shape[1]):
-            i, j, step = self.items(row, field, 3, 3)
-            at = self.whole(i, field, 0, shape[0] - 1), self.whole(j, field, 0, shape[1] - 1)
-            found[at] = self.whole(step, field, 0, count - 1)
-        return tuple((*at, step) for at, step in found.items())
+def step(f: Field, k: int, inputs: int) -> tuple[str, int, tuple[int, ...], Any]:
+    """The k-th step: what is done, which input, on which steps before it, with which number."""
+    name, target, on, number = f.items(4)
+    operands, value = on.indices(k), number.number()
+    if not isinstance(name.value, str) or ARITY.get(name.value) != len(operands):
+        raise f.wrong("one of " + " ".join(ARITY) + ", with its operands")
+    if name.value == "constpow" and (value.q != 1 or abs(value) > 32):
+        raise f.wrong("a whole power up to 32")
+    return name.value, target.whole(0, inputs - 1 if name.value == "input" else 0), operands, value
 
-    def loop(self, value: Any, inputs: int) -> Loop:
-        n, m, p = (self.whole(x, "shape", 1, 60) for x in self.items(self.get(value, "shape"), "shape", 3, 3))
-        steps = self.steps(self.get(value, "steps"), inputs)
-        shapes = {"A": (n, n), "B": (n, m), "C": (p, n)}
-        entries = tuple(
-            self.entries(self.get(value, key), key, shape, len(steps)) for key, shape in shapes.items()
-        )
-        law = self.get(value, "compensator")
-        a = self.matrix(self.get(law, "A"), "compensator.A", None, None)
-        k = len(a)
-        b, c, d = (
-            self.matrix(self.get(law, key), f"compensator.{key}", *shape)
-            for key, shape in (("B", (k, p)), ("C", (m, k)), ("D", (m, p)))
-        )
-        T, lag = (
-            None if self.get(value, key) is None else self.number(value[key], key)
-            for key in ("sample_time", "lag")
-        )
-        discrete = self.get(value, "discrete")
-        if type(discrete) is not bool or (discrete and (T is None or lag is not None)):
-            raise self.wrong("discrete", discrete, "true or false, with a sample time and without a lag")
-        delay = self.whole(self.get(value, "delay"), "delay", 0, 20 if T is not None else 0)
-        for key, x in (("sample_time", T), ("lag", lag)):
-            if x is not None and not x > 0:
-                raise self.wrong(key, value[key], "a number above zero")
-        groups = tuple(
-            self.group(g, n, k, inputs) for g in self.items(self.get(value, "groups"), "groups", 0, n + k)
-        )
-        return Loop(n, steps, entries, a, b, c, d, T, discrete, delay, lag, groups)
 
-    def group(self, value: Any, n: int, k: int, inputs: int) -> Group:
-        inverted = self.items(self.get(value, "inverted"), "inverted", inputs, inputs)
-        if not all(type(x) is bool for x in inverted):
-            raise self.wrong("inverted", inverted, "true or false for each parameter")
-        parts = tuple(self.part(x, inputs) for x in self.items(self.get(value, "parts"), "parts", 0, 256))
-        states = self.indices(self.get(value, "states"), "states", n)
-        own = self.indices(self.get(value, "own"), "own", k)
-        return Group(states, own, tuple(inverted), parts)
+def entries(f: Field, rows: int, columns: int, steps: int) -> tuple[tuple[int, int, int], ...]:
+    found = {}
+    for row in f.items(0, rows * columns):
+        i, j, which = row.items(3)
+        found[i.whole(0, rows - 1), j.whole(0, columns - 1)] = which.whole(0, steps - 1)
+    return tuple((*at, which) for at, which in found.items())
 
-    def part(self, value: Any, inputs: int) -> Part:
-        box = tuple(self.pair(x, "box") for x in self.items(self.get(value, "box"), "box", inputs, inputs))
-        cells = []
-        for row in self.items(self.get(value, "cells"), "cells", 1, 20_000):
-            branch, low, high, own, re, im = self.items(row, "cells", 6, 6)
-            x = self.pair([low, high], "cells")
-            shares = tuple(self.pair(s, "cells") for s in self.items(own, "cells", inputs, inputs))
-            if x[0] < 0 or any(s[0] < 0 or s[1] > 1 for s in shares):
-                raise self.wrong("cells", row, "frequencies from 0, shares from 0 to 1")
-            c = self.number(re, "cells"), self.number(im, "cells")
-            cells.append(Cell(self.whole(branch, "cells", 0, 1), *x, shares, *c))
-        return Part(box, self.whole(self.get(value, "scale"), "scale", -300, 300), tuple(cells))
+
+def loop(f: Field, inputs: int) -> Loop:
+    n, m, p = (x.whole(1, 60) for x in f["shape"].items(3))
+    steps = tuple(step(x, k, inputs) for k, x in enumerate(f["steps"].items(0, 20_000)))
+    shapes = {"A": (n, n), "B": (n, m), "C": (p, n)} | ({"E": (n, n)} if "E" in f.value else {})
+    matrices = [entries(f[key], *shape, len(steps)) for key, shape in shapes.items()]
+    matrices += [()] * (4 - len(matrices))
+    if matrices[3] and sorted(at for *at, _ in matrices[3]) != [[i, i] for i in range(n)]:
+        raise f["E"].wrong("a diagonal of entries")
+    law = f["compensator"]
+    k = len(law["A"].items(0, 60))
+    T, lag = (None if f[key].value is None else f[key].number(1e-90) for key in ("sample_time", "lag"))
+    discrete = f["discrete"].truth()
+    if discrete and (T is None or lag is not None):
+        raise f["discrete"].wrong("false, or a sample time and no lag")
+    groups = tuple(group(g, n, k, inputs) for g in f["groups"].items(0, n + k))
+    units = tuple(x.whole(-300, 300) for x in f["units"].items(n + k))
+    return Loop(
+        n, steps, tuple(matrices),
+        tuple(law[key].matrix(*at) for key, at in (("A", (k, k)), ("B", (k, p)), ("C", (m, k)), ("D", (m, p)))),
+        T, discrete, f["delay"].whole(0, 20 if T is not None else 0), lag, units, groups,
+    )  # fmt: skip
+
+
+def group(f: Field, n: int, k: int, inputs: int) -> Group:
+    inverted = tuple(x.truth() for x in f["inverted"].items(inputs))
+    parts = tuple(part(x, inputs) for x in f["parts"].items(0, 256))
+    return Group(f["states"].indices(n), f["own"].indices(k), inverted, parts)
+
+
+def part(f: Field, inputs: int) -> Part:
+    cells = []
+    for row in f["cells"].items(1, 20_000):
+        branch, low, high, shares, re, im = row.items(6)
+        ends = Field(f.file, row.name, [low.value, high.value]).pair(0)
+        box = tuple(x.pair(0, 1) for x in shares.items(inputs))
+        cells.append(Cell(branch.whole(0, 1), *ends, box, re.number(), im.number()))
+    axes = []
+    for x in f["axes"].items(inputs):
+        degree, rho, kept = x.items(3)
+        axes.append(Axis(degree.whole(0, 24), rho.number(1.001, 1e30), kept.whole(0, degree.whole(0, 24))))
+    return Part(
+        tuple(axes),
+        tuple(x.pair() for x in f["box"].items(inputs)),
+        f["scale"].whole(-300, 300),
+        tuple(cells),
+    )
 
 
 def digest(content: dict[str, object]) -> str:
@@ -251,7 +258,6 @@ def digest(content: dict[str, object]) -> str:
 
 def content_of(path: Path) -> dict[str, Any]:
     """The JSON of a certificate. Raises InputError for what is none."""
-    reader = Reader(path)
     try:
         if path.stat().st_size > LARGEST:
             raise InputError(path, "", "a file that is too large", f"at most {LARGEST} bytes")
@@ -260,8 +266,9 @@ def content_of(path: Path) -> dict[str, Any]:
         raise InputError(path, "", error.strerror or "an unreadable file", "a certificate") from error
     except (ValueError, RecursionError) as error:
         raise InputError(path, "", f"no JSON ({str(error)[:80]})", "a certificate") from error
-    if reader.get(content, "format") != FORMAT or reader.get(content, "version") != VERSION:
-        raise reader.wrong("format", [content["format"], content["version"]], f"{FORMAT}, version {VERSION}")
+    f = Field(path, "", content)
+    if f["format"].value != FORMAT or f["version"].value != VERSION:
+        raise f["version"].wrong(f"{FORMAT}, version {VERSION}")
     assert isinstance(content, dict)
     return content
 
@@ -271,23 +278,20 @@ def read(path: Path, gains: Path | None) -> tuple[Document, str]:
 
     Raises InputError for files that cannot be read, and fields that are missing or wrong.
     """
-    content, reader = content_of(path), Reader(path)
-    own, of = reader.get(content, "sha256"), reader.get(reader.get(content, "gains"), "sha256")
-    refused = "" if own == digest(content) else "the file was changed after it was written (sha256)"
-    if gains is not None and not refused:
+    content = content_of(path)
+    f = Field(path, "", content)
+    of, refused = f["gains"]["sha256"].value, ""
+    if f["sha256"].value != digest(content):
+        refused = "the file was changed after it was written (sha256)"
+    elif gains is not None:
         try:
             found = hashlib.sha256(gains.read_bytes()).hexdigest()
         except OSError as error:
             raise InputError(gains, "", error.strerror or "an unreadable file", "a gain file") from error
         if found != of:
             refused = f"the certificate is of another gain file than {gains} (sha256)"
-    parameters = tuple(
-        reader.parameter(x) for x in reader.items(reader.get(content, "parameters"), "parameters", 1, 20)
-    )
-    lower = reader.number(reader.get(content, "lower"), "lower")
-    if not 0 < lower < 10_000:
-        raise reader.wrong("lower", content["lower"], "a number above zero, up to 10000")
-    loops = tuple(
-        reader.loop(x, len(parameters)) for x in reader.items(reader.get(content, "loops"), "loops", 1, 20)
-    )
-    return Document(parameters, lower, loops), refused
+    parameters = tuple(parameter(x) for x in f["parameters"].items(1, 20))
+    lower = f["lower"].number(1e-9, 10_000)
+    return Document(
+        parameters, lower, tuple(loop(x, len(parameters)) for x in f["loops"].items(1, 20))
+    ), refused

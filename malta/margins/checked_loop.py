@@ -1,44 +1,52 @@
-"""The characteristic polynomial of a certificate's loop: its matrices as rational functions, at balls and bounded."""
+"""The characteristic polynomial of a certificate's loop: its matrices as rational functions, at balls and bounded.
+
+Each group of states closes a loop; f are the forces, the inputs as they act on the rows of x, and P(g) is its pencil:
+
+    g x = Phi x + Gamma f     g = s: x' = A x + f. Sampled: g = z - 1, Phi = e^(A T) - 1. Lag, delay: further states.
+    q f = q (K x + F xi)      K = B D_c C, F = B C_c; q(p), their denominators, so that a mass may divide
+    g xi = H x + L xi         H = B_c C, L = A_c (sampled: A_c - 1)
+
+det P = q det(g - closed loop) is the polynomial; sampled it is one of v = (z - 1) / (z + 1), after (1 - v)^N.
+"""
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from functools import cached_property
 from typing import Any
 
-from flint import Ordering, arb, arb_mat, fmpq_mpoly_ctx
+from flint import Ordering, acb, arb, arb_mat, arb_poly, fmpq_mpoly_ctx
 
 from malta.margins.checked_file import Group, Loop
 
 MOST_TERMS = 2000  # of an expression
+SIDES = {"A": (0, 0), "K": (0, 0), "F": (0, 1), "H": (1, 0), "L": (1, 1)}  # rows, columns: 0 of x, 1 of xi
 
 Rows = list[list[Any]]
+Table = dict[tuple[int, int], Any]
 
 
 class Refused(Exception):
     """Why a certificate does not hold."""
 
 
-# expressions: rational functions of v, in lowest terms
-
-
 class Ratio:
-    """num / den"""
+    """num / den, polynomials of v in lowest terms."""
 
     def __init__(self, num: Any, den: Any) -> None:
         common = num.gcd(den)
-        if not common.is_constant():
-            num, den = num / common, den / common
-        self.num, self.den = num, den
-        terms = [*num.to_dict().values(), *den.to_dict().values()]
+        self.num, self.den = (num, den) if common.is_constant() else (num / common, den / common)
+        terms = [*self.num.to_dict().values(), *self.den.to_dict().values()]
         if len(terms) > MOST_TERMS or max(c.height_bits() for c in terms) > 50_000:
             raise Refused("expressions that are too long")
-        self.terms: tuple[Any, ...] = ()
 
     def __add__(self, other: Ratio) -> Ratio:
         return Ratio(self.num * other.den + other.num * self.den, self.den * other.den)
+
+    def __neg__(self) -> Ratio:
+        return Ratio(-self.num, self.den)
 
     def __mul__(self, other: Ratio) -> Ratio:
         return Ratio(self.num * other.num, self.den * other.den)
@@ -48,323 +56,316 @@ class Ratio:
             raise Refused("a division by zero")
         return Ratio(self.num * other.den, self.den * other.num)
 
+    def __pow__(self, power: int) -> Ratio:
+        whole = Ratio(self.num ** abs(power), self.den ** abs(power))
+        return whole if power >= 0 else whole / (whole * whole)
+
+    @cached_property
+    def terms(self) -> list[list[tuple[Any, list[tuple[int, int]]]]]:
+        """Of num and den: coefficients, and which v has which power."""
+        parts = [part.to_dict().items() for part in (self.num, self.den)]
+        return [[(c, [(i, int(e)) for i, e in enumerate(m) if e]) for m, c in part] for part in parts]
+
     def at(self, v: Sequence[Any]) -> Any:
         """The value at balls."""
-        if not self.terms:
-            self.terms = tuple(
-                [(c, [(i, int(e)) for i, e in enumerate(m) if e]) for m, c in part.to_dict().items()]
-                for part in (self.num, self.den)
-            )
-        found = []
-        for part in self.terms:
-            total = v[0] * 0
-            for c, powers in part:
-                term = v[0] * 0 + c
-                for i, e in powers:
-                    term *= v[i] ** e
-                total += term
-            found.append(total)
-        return found[0] if self.den == 1 else found[0] / found[1]
+        zero = v[0] * 0
+        num, den = (
+            sum((math.prod((v[i] ** e for i, e in m), start=zero + c) for c, m in part), zero)
+            for part in self.terms
+        )
+        return num if self.den == 1 else num / den
 
 
-Table = dict[tuple[int, int], Ratio]
+STEPS: dict[str, Any] = {
+    "assign": lambda a: a, "neg": lambda a: -a, "sq": lambda a: a * a, "twice": lambda a: a + a, "inv": lambda a: a**-1,
+    "add": lambda a, b: a + b, "sub": lambda a, b: a + -b, "mul": lambda a, b: a * b, "div": lambda a, b: a / b,
+}  # fmt: skip
 
 
-@dataclass
-class Tables:
-    """Of a group: A; B D_c C and B C_c, by rows of x; B_c C. Rows of x that are acted on. Zeros are left out."""
-
-    A: Table
-    K: Table
-    F: Table
-    H: Table
-
-
-def split(loop: Loop, until: float = math.inf) -> list[Tables]:
-    """The expressions of each group, which is for each in its own v.
-
-    Raises Refused unless all states are in one group, and no group acts on one before it.
-    """
-    n, k = loop.states, len(loop.law_a)
-    place = {
-        i: g for g, group in enumerate(loop.groups) for i in (*group.states, *(n + j for j in group.own))
-    }
-    if len(place) != n + k or sum(len(g.states) + len(g.own) for g in loop.groups) != n + k:
-        raise Refused("groups that do not hold each state once")
-    whole: dict[tuple[bool, ...], Tables] = {}
-    found = []
-    for group in loop.groups:
-        if group.inverted not in whole:
-            whole[group.inverted] = coupled(loop, group.inverted, until)
-        t, x = whole[group.inverted], {i: a for a, i in enumerate(group.states)}
-        own = {j: a for a, j in enumerate(group.own)}
-        for table, rows, columns in ((t.A, 0, 0), (t.K, 0, 0), (t.F, 0, n), (t.H, n, 0)):
-            if any(place[rows + i] < place[columns + j] for i, j in table):
-                raise Refused("groups that act on one another")
-        pick = [
-            {(left[i], right[j]): r for (i, j), r in table.items() if i in left and j in right}
-            for table, left, right in ((t.A, x, x), (t.K, x, x), (t.F, x, own), (t.H, own, x))
-        ]
-        found.append(Tables(*pick))
-    for i, row in enumerate(loop.law_a):
-        if any(value != 0 and place[n + i] < place[n + j] for j, value in enumerate(row)):
-            raise Refused("groups that act on one another")
-    return found
-
-
-def coupled(loop: Loop, inverted: tuple[bool, ...], until: float = math.inf) -> Tables:
-    """The program run on rational functions, and the products of its matrices with the compensator's."""
+def expressions(loop: Loop, inverted: Sequence[bool], until: float) -> dict[str, Table]:
+    """A, K, F, H and L as rational functions of v: the program run on them, and products with the compensator's."""
     context = fmpq_mpoly_ctx.get([f"v{i}" for i in range(len(inverted))], Ordering.lex)
-    one, gens = context.constant(1), context.gens()
+    unit = context.constant(1)
     cells: list[Ratio] = []
     for name, target, on, value in loop.steps:
         if time.monotonic() > until:
             raise Refused("time is up")
-        a = cells[on[0]] if on else None
-        b = cells[on[-1]] if on else None
-        if name == "input":
-            cells.append(Ratio(one, gens[target]) if inverted[target] else Ratio(gens[target], one))
-        elif name == "const":
-            cells.append(Ratio(context.constant(value), one))
+        if name in ("input", "const"):
+            v = Ratio(context.gens()[target] if name == "input" else context.constant(value), unit)
+            cells.append(v**-1 if name == "input" and inverted[target] else v)
         else:
-            cells.append(_operation(name, a, b, int(value.p), Ratio(one, one)))
-    A, B, C = ({(i, j): cells[s] for i, j, s in entries} for entries in loop.entries)
-
-    def times(one: Table, gain: Rows, two: Table | None) -> Table:
-        """one * gain, or one * gain * two; zeros left out."""
-        left: Table = {}
-        for (i, a), r in one.items():
-            for b, g in enumerate(gain[a]):
-                if g != 0:
-                    _add(left, (i, b), r * Ratio(context.constant(g), context.constant(1)))
-        if two is None:
-            return _without_zeros(left)
-        both: Table = {}
-        for (i, b), r in left.items():
-            for (c, j), q in two.items():
-                if b == c:
-                    _add(both, (i, j), r * q)
-        return _without_zeros(both)
-
-    # B_c C is the transpose of C' B_c'
-    back = [[row[b] for row in loop.law_b] for b in range(len(loop.law_d[0]))]
-    turned = times({(j, i): r for (i, j), r in C.items()}, back, None)
-    return Tables(
-        _without_zeros(A),
-        times(B, loop.law_d, C),
-        times(B, loop.law_c, None),
-        {(i, j): r for (j, i), r in turned.items()},
+            operands = [cells[i] for i in on]
+            cells.append(operands[0] ** int(value.p) if name == "constpow" else STEPS[name](*operands))
+    A, B, C, E = ({(i, j): cells[s] for i, j, s in entries} for entries in loop.entries)
+    A, B = ({(i, j): r / E[i, i] if E else r for (i, j), r in m.items()} for m in (A, B))
+    a, b, c, d = (
+        {
+            (i, j): Ratio(context.constant(x), unit)
+            for i, row in enumerate(m)
+            for j, x in enumerate(row)
+            if x != 0
+        }
+        for m in loop.law
     )
+    A = {at: r for at, r in A.items() if not r.num.is_zero()}
+    return {"A": A, "K": times(times(B, d), C), "F": times(B, c), "H": times(b, C), "L": a, "E": E}
 
 
-def _operation(name: str, a: Any, b: Any, power: int, one: Ratio) -> Ratio:
-    minus = Ratio(-one.num, one.den)
-    if name == "constpow":
-        found = one
-        for _ in range(abs(power)):
-            found = found * a
-        return found if power >= 0 else one / found
-    table: dict[str, Any] = {
-        "assign": lambda: a, "add": lambda: a + b, "sub": lambda: a + minus * b, "mul": lambda: a * b,
-        "div": lambda: a / b, "neg": lambda: minus * a, "sq": lambda: a * a, "twice": lambda: a + a,
-        "inv": lambda: one / a,
-    }  # fmt: skip
-    found = table[name]()
-    assert isinstance(found, Ratio)
+def times(one: Table, two: Table) -> Table:
+    """The product of two matrices; zeros are left out."""
+    found: Table = {}
+    for (i, a), r in one.items():
+        for (b, j), s in two.items():
+            if a == b:
+                found[i, j] = found[i, j] + r * s if (i, j) in found else r * s
+    return {at: r for at, r in found.items() if not r.num.is_zero()}
+
+
+def split(loop: Loop, until: float = math.inf) -> list[Polynomial]:
+    """The characteristic polynomial of each group, in its own v.
+
+    Where couplings only lead from groups to later ones, the loop's pencil is block triangular: its determinant is the
+    product of the groups'. Where some lead back, all between groups are dust (`Polynomial.moved`), which holds cannot
+    have within their exponential. Raises Refused.
+    """
+    n, whole = loop.states, {g.inverted: expressions(loop, g.inverted, until) for g in loop.groups}
+    place = {i: k for k, group in enumerate(loop.groups) for i in group.members(n)}
+    if not sum(len(g.members(n)) for g in loop.groups) == len(place) == n + len(loop.law[0]):
+        raise Refused("groups that do not hold each state once")
+    found = []
+    for k, group in enumerate(loop.groups):
+        local = [{i: a for a, i in enumerate(members)} for members in (group.states, group.own)]
+        inside: dict[str, Table] = {name: {} for name in SIDES}
+        dust, back = [], False
+        for name, (row, column) in SIDES.items():
+            for (i, j), r in whole[group.inverted][name].items():
+                one, two = place[i + n * row], place[j + n * column]
+                back |= one < two
+                if one == two == k:
+                    inside[name][local[row][i], local[column][j]] = r
+                elif one == k:
+                    dust.append((name, local[row][i], j + n * column, r))
+        if back and loop.held and any(name == "A" for name, *_ in dust):
+            raise Refused("groups that act on one another between samples")
+        leading = [whole[group.inverted]["E"][i, i] for i in group.states if loop.entries[3]]
+        found.append(Polynomial(loop, group, inside, dust if back else [], leading))
     return found
-
-
-def _add(table: Table, at: tuple[int, int], r: Ratio) -> None:
-    table[at] = table[at] + r if at in table else r
-
-
-def _without_zeros(table: Table) -> Table:
-    return {at: r for at, r in table.items() if not r.num.is_zero()}
-
-
-# the characteristic polynomial of a group
 
 
 class Polynomial:
-    """a_0 ... a_N of a group, at balls of v; and bounds of |a_k| over complex balls."""
+    """a_0 ... a_N of det P at balls of v, and bounds over complex balls."""
 
-    def __init__(self, loop: Loop, group: Group, tables: Tables) -> None:
-        self.loop, self.group, self.tables = loop, group, tables
-        self.acted = sorted({i for i, _ in (*tables.K, *tables.F)})
-        self.used = {
-            i
-            for table in (tables.A, tables.K, tables.F, tables.H)
-            for r in table.values()
-            for part in (r.num, r.den)
-            for i, e in enumerate(part.degrees())
-            if e
+    def __init__(
+        self, loop: Loop, group: Group, inside: dict[str, Table], dust: list[Any], leading: list[Ratio]
+    ) -> None:
+        self.loop, self.group, self.leading = loop, group, leading
+        forces = [(i, r) for name in "KF" for (i, _), r in inside[name].items()]
+        forces += [(i, r) for name, i, _, r in dust if name in "KF"]
+        q: dict[int, Any] = {}
+        for i, r in sorted(forces, key=lambda force: force[0]):
+            q[i] = r.den if i not in q else q[i] * r.den / q[i].gcd(r.den)
+        self.q = {i: Ratio(x, x * 0 + 1) for i, x in q.items()}
+        row = {i: k for k, i in enumerate(q)}
+        self.tables = inside | {
+            name: {(row[i], j): self.q[i] * r for (i, j), r in inside[name].items()} for name in "KF"
         }
+        n, r = len(group.states), len(q)
+        w = n + r * (loop.delay + (loop.lag is not None))
+        self.shape, self.count = (w, r, len(group.own)), w + len(group.own) + 1
+        self.units = {a: loop.units[i] for a, i in enumerate(group.states)}
+        self.units |= {w + r + a: loop.units[loop.states + i] for a, i in enumerate(group.own)}
+        self.dust = [
+            (w + row[i], j, self.q[i] * x) if name in "KF" else (i if name == "A" else w + r + i, j, x)
+            for name, i, j, x in dust
+        ]
+        entries = [part for t in self.tables.values() for x in t.values() for part in (x.num, x.den)]
+        self.used = {i for part in (*entries, *q.values()) for i, e in enumerate(part.degrees()) if e}
+
+    def values(self, v: Sequence[Any]) -> tuple[dict[str, Table], list[Any]]:
+        """A, H, L, q K and q F at balls, and q. Raises Refused for poles."""
+        found = {name: {at: r.at(v) for at, r in t.items()} for name, t in self.tables.items()}
+        if not all(x.is_finite() for table in found.values() for x in table.values()):
+            raise Refused("a division by what may be zero")
+        return found, [r.at(v) for r in self.q.values()]
 
     def at(self, v: Sequence[Any]) -> list[Any]:
-        """Coefficients at real balls."""
-        t, n = self.tables, len(self.group.states)
-        values = [{at: r.at(v) for at, r in table.items()} for table in (t.A, t.K, t.F, t.H)]
-        m = self._closed(_dense(n, n, values[0].items()), None, values[1:])
-        a = list(m.charpoly().coeffs())
-        a += [arb(0)] * (m.nrows() + 1 - len(a))
-        return a if self.loop.sample_time is None else _mapped(a, -1)
+        """Coefficients at real balls: of the closed loop, without f."""
+        (t, q), (w, r, k) = self.values(v), self.shape
+        phi, gamma = (matrix(x) for x in self._driven(t["A"], bounds=False))
+        K, F = ({(i, j): x / q[i] for (i, j), x in t[name].items()} for name in "KF")
+        inner, outer = phi + gamma * matrix(dense(r, w, K), w), gamma * matrix(dense(r, k, F), k)
+        closed = matrix(blocks([inner.tolist(), outer.tolist()], [dense(k, w, t["H"]), self._law(t["L"])]))
+        a = [x * math.prod(q, start=arb(1)) for x in closed.charpoly().coeffs()]
+        a += [arb(0)] * (w + k + 1 - len(a))
+        return a if self.loop.sample_time is None else mapped(a, [1, -1])
 
     def bounds(self, v: Sequence[Any]) -> list[Any]:
         """At least |a_k| for all complex v in balls."""
-        t, n = self.tables, len(self.group.states)
-        values = [{at: r.at(v) for at, r in table.items()} for table in (t.A, t.K, t.F, t.H)]
-        if not all(z.is_finite() for table in values for z in table.values()):
-            raise Refused("a division by what may be zero")
-        sizes = [{at: _upper(abs(z)) for at, z in table.items()} for table in values]
-        diagonal = [_top(values[0][i, i].real) if (i, i) in values[0] else arb(0) for i in range(n)]
-        m = self._closed(_dense(n, n, sizes[0].items()), diagonal, sizes[1:])
-        if not all(x.is_finite() for x in m.entries()):
-            raise Refused("numbers that overflow")
-        a = determinant_bounds([[_upper(m[i, j]) for j in range(m.ncols())] for i in range(m.nrows())])
-        return a if self.loop.sample_time is None else _mapped(a, 1)
+        a = determinant_bounds(*self.sizes(v))
+        return a if self.loop.sample_time is None else mapped(a, [1, 1])
 
-    def _closed(self, a: Rows, diagonal: list[Any] | None, tables: list[dict[tuple[int, int], Any]]) -> Any:
-        """The closed loop's matrix (sampled: less 1); with `diagonal`, bounds of its entries from bounds of them."""
-        loop, acted = self.loop, self.acted
-        n, r, k = len(a), len(acted), len(self.group.own)
-        sign = -1 if diagonal is None else 1
-        s = _dense(n, r, (((i, q), 1) for q, i in enumerate(acted)))
-        if loop.lag is not None:  # a lag of each force, as further states
-            a = [a[i] + s[i] for i in range(n)] + [
-                [0] * n + [sign * loop.lag * (i == q) for q in range(r)] for i in range(r)
-            ]
-            s = [[0] * r for _ in range(n)] + [[loop.lag * (i == q) for q in range(r)] for i in range(r)]
-            diagonal = None if diagonal is None else [*diagonal, *([-loop.lag] * r)]
-        if loop.sample_time is not None:
-            a, s = self._sampled(a, s, diagonal)
-            for _ in range(loop.delay):  # forces under way: the latest enters last
-                width = len(a)
-                a = [a[i] + s[i] for i in range(width)] + [
-                    [0] * width + [sign * (i == q) for q in range(r)] for i in range(r)
-                ]
-                s = [[0] * r for _ in range(width)] + [[int(i == q) for q in range(r)] for i in range(r)]
-        width, one = len(a), int(loop.sample_time is not None)
-        row = {i: q for q, i in enumerate(acted)}
-        K, F = ({(row[i], j): z for (i, j), z in table.items()} for table in tables[:2])
-        into = arb_mat(width, r, [x for line in s for x in line])
-        inner = arb_mat(width, width, [x for line in a for x in line])
-        inner += into * arb_mat(r, width, _flat(_dense(r, width, K.items())))
-        outer = into * arb_mat(r, k, _flat(_dense(r, k, F.items())))
-        own = [
-            [_less(loop.law_a[i][j], one * (i == j), diagonal) for j in self.group.own]
-            for i in self.group.own
-        ]
-        left = _dense(k, width, tables[2].items())
-        rows = [
-            [*(inner[i, j] for j in range(width)), *(outer[i, j] for j in range(k))] for i in range(width)
-        ]
-        return arb_mat(width + k, width + k, _flat(rows + [left[i] + own[i] for i in range(k)]))
+    def moved(self, v: Sequence[Any]) -> list[Any]:
+        """Coefficients of b such that dust e leaves the loop's pencil regular where |a(jw)| > b(w) in each group.
 
-    def _sampled(self, a: Rows, s: Rows, diagonal: list[Any] | None) -> tuple[Rows, Rows]:
-        """Held and sampled, less 1; bounds where `diagonal` has upper bounds of the real parts of A's diagonal.
-
-        |e^(A t)| <= e^(M t) with |A| for M beside its diagonal; e^(A T) - 1 = A V, V the integral of e^(A t).
+        P + e is regular where in some units d of the states the row sums of |P^-1 e| are below one. By Cramer's rule
+        that is sum_l |cofactor_lj| e_l / d_j < |det P| for each j, e_l = sum_m |e_lm| d_m. Then also P + tau e is,
+        tau from 0 to 1: no pole of the loop crosses the boundary. v: real balls.
         """
-        n, r, T = len(a), len(self.acted), self.loop.sample_time
-        if self.loop.discrete:
-            return [
-                [_less(x, int(i == j), diagonal) for j, x in enumerate(row)] for i, row in enumerate(a)
-            ], s
-        if diagonal is None:
-            both = (
-                arb_mat(n + r, n + r, _flat([a[i] + s[i] for i in range(n)] + [[0] * (n + r)] * r)) * arb(T)
-            ).exp()
-            phi = [[both[i, j] - int(i == j) for j in range(n)] for i in range(n)]
-            return phi, [[both[i, n + q] for q in range(r)] for i in range(n)]
-        top = [
-            [*(diagonal[i] if i == j else x for j, x in enumerate(row)), *(int(i == j) for j in range(n))]
-            for i, row in enumerate(a)
-        ]
-        whole = arb_mat(2 * n, 2 * n, _flat(top + [[0] * (2 * n)] * n)) * arb(T)
-        if not all(abs(x) < 3000 for x in whole.entries()):
-            raise Refused("numbers that overflow")
-        both = whole.exp()
-        V = arb_mat(n, n, [_upper(both[i, n + j]) for i in range(n) for j in range(n)])
-        both, into = arb_mat(n, n, _flat(a)) * V, V * arb_mat(n, r, _flat(s))
-        return [[both[i, j] for j in range(n)] for i in range(n)], [
-            [into[i, q] for q in range(r)] for i in range(n)
-        ]
+        if not self.dust:
+            return [arb(0)]
+        m, dynamic = self.sizes(v)
+        e = [arb(0)] * len(m)
+        for row, j, r in self.dust:
+            e[row] += upper(r.at(v)) * arb(2) ** self.loop.units[j]
+        if not all(x.is_finite() for x in e):
+            raise Refused("a division by what may be zero")
+        b = determinant_bounds(m, dynamic, e, self.units)
+        return b if self.loop.sample_time is None else mapped(b, [1, 1], [1, 0, 1])
 
-
-def _less(x: Any, one: int, bounds: Any) -> Any:
-    """x - one; its size, where bounds are asked for (of x in the compensator: exact)."""
-    if bounds is None:
-        return x - one
-    return abs(x) + one if isinstance(x, arb) else abs(x - one)
-
-
-def _dense(rows: int, columns: int, entries: Iterable[tuple[tuple[int, int], Any]]) -> Rows:
-    table: Rows = [[0] * columns for _ in range(rows)]
-    for (i, j), value in entries:
-        table[i][j] = value
-    return table
-
-
-def _flat(rows: Rows) -> list[Any]:
-    return [arb(x) for row in rows for x in row]
-
-
-def _upper(x: Any) -> Any:
-    return arb(x.abs_upper())
-
-
-def _top(x: Any) -> Any:
-    return arb(x.upper())
-
-
-def _mapped(a: list[Any], sign: int) -> list[Any]:
-    """Coefficients of g = z - 1 = 2 v / (1 - v) -> those of (1 - v)^N a; sign 1: bounds of their sizes."""
-    n = len(a) - 1
-    found = [arb(0)] * (n + 1)
-    for k, c in enumerate(a):
-        for j in range(n - k + 1):
-            found[k + j] += c * (2**k * math.comb(n - k, j) * sign**j)
-    return found
-
-
-def determinant_bounds(m: Rows) -> list[Any]:
-    """Bounds of the coefficients of det(s + M) from m >= |M|, entry by entry.
-
-    |a_k| rho^k is at most the product over i of sum_j (rho + m)_ij d_j / d_i, for any rho, d > 0; those tried are
-    powers of two, found in floating point, which is harmless.
-    """
-    n = len(m)
-    heights = [[height(x) for x in row] for row in m]
-    known = [h for row in heights for h in row if h > -math.inf] or [0.0]
-    low, high = math.floor(min(known)) - 2, math.ceil(max(known)) + 4
-    best: list[Any] = [None] * (n + 1)
-    for rho in sorted({round(low + (high - low) * k / 15) for k in range(16)}):
-        d = _balanced(
-            [[max(h, rho) if i == j else h for j, h in enumerate(row)] for i, row in enumerate(heights)]
+    def sizes(self, v: Sequence[Any]) -> tuple[Rows, list[bool]]:
+        """Bounds of the entries of P, and in which rows g stands."""
+        (t, q), (w, r, k) = self.values(v), self.shape
+        m = blocks(
+            [*self._driven(t["A"], bounds=True), dense(w, k)],
+            [dense(r, w, t["K"]), dense(r, r, {(i, i): x for i, x in enumerate(q)}), dense(r, k, t["F"])],
+            [dense(k, w, t["H"]), dense(k, r), self._law(t["L"])],
         )
-        total = arb(1)
-        for i, row in enumerate(m):
-            line = arb(2) ** rho
-            for j, x in enumerate(row):
-                line += x * arb(2) ** (d[j] - d[i])
-            total *= line
-        for k in range(n + 1):
-            bound = _upper(total * arb(2) ** (-rho * k))
-            best[k] = bound if best[k] is None or bound < best[k] else best[k]
-    return best
+        return [[upper(x) for x in row] for row in m], [True] * w + [False] * r + [True] * k
+
+    def _law(self, L: Table) -> Rows:
+        k, one = self.shape[2], int(self.loop.sample_time is not None)
+        return [[x - one * (i == j) for j, x in enumerate(row)] for i, row in enumerate(dense(k, k, L))]
+
+    def _driven(self, table: Table, *, bounds: bool) -> tuple[Rows, Rows]:
+        """Phi and Gamma: of x, then a lag of each force, then forces under way, of which the latest enters last."""
+        loop, n, r = self.loop, len(self.group.states), len(self.q)
+        a, b = dense(n, n, table), dense(n, r, {(i, k): arb(1) for k, i in enumerate(self.q)})
+        if loop.lag is not None:
+            a, b = blocks([a, b], [dense(r, n), eye(r, -loop.lag)]), blocks([dense(n, r)], [eye(r, loop.lag)])
+        if loop.held and a:
+            a, b = hold(a, b, arb(loop.sample_time), bounds)
+        elif loop.discrete:
+            a = [[x - (i == j) for j, x in enumerate(row)] for i, row in enumerate(a)]
+        for _ in range(loop.delay):
+            w = len(a)
+            a, b = blocks([a, b], [dense(r, w), eye(r, -1)]), blocks([dense(w, r)], [eye(r, 1)])
+        return a, b
 
 
-def _balanced(heights: list[list[float]]) -> list[int]:
-    """log2 of column scales that make the row sums small."""
-    n = len(heights)
-    d = [0.0] * n
-    for _ in range(6):
-        rows = [max(h + d[j] for j, h in enumerate(row)) for row in heights]
-        d = [-max(heights[i][j] - rows[i] for i in range(n)) for j in range(n)]
-    return [round(x) for x in d]
+def hold(a: Rows, b: Rows, T: Any, bounds: bool) -> tuple[Rows, Rows]:
+    """e^(A T) - 1 = A V and V B, V the integral of e^(A t) over a sample; or bounds of their entries.
+
+    |e^(A t)| <= e^(M t), entry by entry, with |A| for M, and on its diagonal the real part.
+    """
+    n, r = len(a), len(b[0])
+    if not bounds:
+        both = (matrix(blocks([a, b], [dense(r, n + r)])) * T).exp().tolist()[:n]
+        return [[x - (i == j) for j, x in enumerate(row[:n])] for i, row in enumerate(both)], [
+            row[n:] for row in both
+        ]
+    size, into = ([[upper(x) for x in row] for row in m] for m in (a, b))
+    top = [
+        [arb(acb(x).real.upper()) if i == j else upper(x) for j, x in enumerate(row)]
+        for i, row in enumerate(a)
+    ]
+    whole = matrix(blocks([top, eye(n, 1)], [dense(n, 2 * n)])) * T
+    if not all(abs(x) < 3000 for x in whole.entries()):
+        raise Refused("numbers that overflow")
+    V = matrix([[upper(x) for x in row[n:]] for row in whole.exp().tolist()[:n]])
+    return (matrix(size) * V).tolist(), (V * matrix(into, r)).tolist()
+
+
+# matrices as lists of rows
+
+
+def dense(rows: int, columns: int, entries: Mapping[tuple[int, int], Any] | None = None) -> Rows:
+    return [[(entries or {}).get((i, j), arb(0)) for j in range(columns)] for i in range(rows)]
+
+
+def eye(n: int, value: Any) -> Rows:
+    return dense(n, n, {(i, i): arb(value) for i in range(n)})
+
+
+def blocks(*rows: list[Rows]) -> Rows:
+    """A matrix of blocks."""
+    return [[x for part in line for x in part] for row in rows for line in zip(*row, strict=True)]
+
+
+def matrix(rows: Rows, columns: int = 0) -> Any:
+    return arb_mat(len(rows), len(rows[0]) if rows else columns, [x for row in rows for x in row])
+
+
+def upper(x: Any) -> Any:
+    """At least the size of a ball."""
+    return arb(abs(x).upper())
 
 
 def height(x: Any) -> float:
     """About log2 |x|."""
     m, e = (int(i) for i in x.abs_upper().man_exp())
     return math.log2(m) + e if m > 0 else -math.inf
+
+
+# polynomials and determinants
+
+
+def mapped(a: list[Any], one: list[int], square: list[int] | None = None) -> list[Any]:
+    """(1 - v)^N a(g) for g = z - 1 = 2 v / (1 - v), where `one` is 1 - v.
+
+    With 1 + v in its place: bounds of these coefficients. With 1 + v^2 for its square: of |(1 - v)^N a|, v on the axis.
+    """
+    n, single = len(a) - 1, arb_poly(one)
+    double = single**2 if square is None else arb_poly(square)
+    parts = [
+        arb_poly([0, 2]) ** k * c * double ** ((n - k) // 2) * single ** ((n - k) % 2)
+        for k, c in enumerate(a)
+    ]
+    found = sum(parts, arb_poly([]))
+    return [found[k] for k in range(n + 1)]
+
+
+def determinant_bounds(
+    m: Rows, dynamic: Sequence[bool] = (), e: Sequence[Any] = (), units: Mapping[int, int] | None = None
+) -> list[Any]:
+    """Bounds of the coefficients of det(g I + M) from m >= |M|, entry by entry; g in the dynamic rows alone, or in all.
+
+    Hadamard: |det| <= product of the rows' lengths, in any units d of the states; Cauchy: |a_k| rho^k is at most that
+    for |g| = rho. The rho and d that are tried are powers of two, found in floating point, which is harmless.
+    With e: bounds of sum_l |cofactor_lj| e_l / 2^units_j, the largest of all j that have units.
+    """
+    n = len(m)
+    best: list[Any] = []
+    dynamic = dynamic or [True] * n
+    known = [height(x) for row in m for x in row if x > 0] or [0.0]
+    low, high = math.floor(min(known)) - 2, math.ceil(max(known)) + 4
+    d = [0.0] * n
+    for rho in sorted({round(low + (high - low) * k / 23) for k in range(24)}):
+        full = [
+            (i, j, x + arb(2) ** rho if i == j and dynamic[i] else x)
+            for i, row in enumerate(m)
+            for j, x in enumerate(row)
+            if x > 0 or (i == j and dynamic[i])
+        ]
+        d = balanced(n, [(i, j, max(height(x), -250.0)) for i, j, x in full], d)
+        own, lines = [round(x) for x in d], [arb(0)] * n
+        for i, j, x in full:
+            lines[i] += (x * arb(2) ** (own[j] - own[i])) ** 2
+        total = math.prod((x.sqrt() for x in lines), start=arb(1))
+        if e:
+            total *= sum((x * arb(2) ** -own[i] / lines[i].sqrt() for i, x in enumerate(e)), arb(0))
+            total *= arb(2) ** max(own[j] - unit for j, unit in (units or {}).items())
+        bounds = [upper(total * arb(2) ** (-rho * k)) for k in range(sum(dynamic) + 1)]
+        best = [x if x < y else y for x, y in zip(bounds, best or bounds, strict=True)]
+    return best
+
+
+def balanced(n: int, heights: list[tuple[int, int, float]], d: list[float]) -> list[float]:
+    """log2 of units in which the product of the rows' lengths is small: Sinkhorn's iteration, from d."""
+    for _ in range(6):
+        rows, columns = [0.0] * n, [0.0] * n
+        for i, j, h in heights:
+            rows[i] += 4.0 ** (h + d[j])
+        for i, j, h in heights:
+            columns[j] += 4.0**h / rows[i]
+        d = [-math.log2(x) / 2 for x in columns]
+    return d
