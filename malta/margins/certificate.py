@@ -202,6 +202,10 @@ def _parts(f: Polynomial, box: Box, lower: float) -> list[dict[str, Any]]:
     if 2**moving > MOST_NODES:
         most = math.floor(math.log2(MOST_NODES))
         raise InputError("certificate", "parameters", f"{moving} that act on one group", f"at most {most}")
+    if any(
+        low <= 0 <= high for (low, high), inv in zip(todo[0].tolist(), f.group.inverted, strict=True) if inv
+    ):
+        raise Refused("a parameter that divides reaches zero")
     made: list[dict[str, Any]] = []
     while todo:
         sides = todo.pop()

@@ -66,9 +66,16 @@ class Ratio:
         parts = [part.to_dict().items() for part in (self.num, self.den)]
         return [[(c, [(i, int(e)) for i, e in enumerate(m) if e]) for m, c in part] for part in parts]
 
+    @cached_property
+    def constant(self) -> Any:
+        """The value of what does not depend on v; None for the rest."""
+        return self.num.leading_coefficient() if self.num.is_constant() and self.den == 1 else None
+
     def at(self, v: Sequence[Any]) -> Any:
         """The value at balls."""
         zero = v[0] * 0
+        if self.constant is not None:
+            return zero + self.constant
         num, den = (
             sum((math.prod((v[i] ** e for i, e in m), start=zero + c) for c, m in part), zero)
             for part in self.terms
