@@ -44,11 +44,19 @@ def check(
         for line in verdict.groups:
             console.print(line, soft_wrap=True)
         holds = "does not hold" if failures else "holds"
-        share = f"{100 * verdict.claim:.3f} %"
-        console.print(f"{file}: stable in {share} of the uncertainty: {holds}", soft_wrap=True)
+        share, loops = f"{100 * verdict.claim:.3f} %", _count_loops(file)
+        where = "" if loops == 1 else f" at each of {loops} places, not between them"
+        console.print(f"{file}: stable in {share} of the uncertainty{where}: {holds}", soft_wrap=True)
         for line in failures:
             print_note(f"{file}: {line}")
     raise typer.Exit(1 if failures else 0)
+
+
+def _count_loops(certificate: Path) -> int:
+    """The loops that a certificate is about: one, or the same machine at several places of its travel."""
+    from malta.margins import checked_file
+
+    return len(checked_file.content_of(certificate)["loops"])
 
 
 def _matches_gains(certificate: Path, controller: Controller) -> bool:
