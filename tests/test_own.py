@@ -15,6 +15,7 @@ from conftest import refusal
 import malta
 from malta import report
 from malta.campaigns.statistics import bounds_of
+from malta.margins.extent import NOWHERE
 from malta.model import machines
 from malta.model.machines import part_of, require_part
 from malta.model.plant import Signal
@@ -215,11 +216,11 @@ def test_the_gang_of_four_of_angles_says_its_units(toy: Plant) -> None:
 
     angles = replace(toy, outputs=(Signal("x1", "m"), Signal("a", "rad")))
     gang = {"x1": (1.0, 1.0, 2e-6, 3e6), "a": (1.0, 1.0, 4e-6, 5e6)}
-    found: Any = SimpleNamespace(gang=gang)
+    found: Any = SimpleNamespace(gang=gang, extent=NOWHERE)
     text = printed(report.gang_table(found, angles))
     for cell in ("2.0 um/N", "3.000 N/um", "4.0 urad/(N m)", "5.000 N m/urad"):
         assert cell in text
-    found = SimpleNamespace(gang={"x1": gang["x1"]})
+    found = SimpleNamespace(gang={"x1": gang["x1"]}, extent=NOWHERE)
     assert "from force |SP| [um/N]" in printed(report.gang_table(found, toy))
 
 

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 import numpy as np
 
 from malta.errors import InputError
+from malta.margins.extent import NOWHERE, Extent, extent_of, standing
 from malta.margins.plants import of_plant
 from malta.margins.robust import Margin, robust_margin
 from malta.margins.uncertain import (
@@ -33,12 +34,13 @@ from malta.margins.verify import (
     NOT_PROVEN,
     PLACES,
     CurrentLoops,
+    course_enters,
+    covers_travel,
     largest,
     loop_at,
     machine_law,
     place_margin,
     places_along,
-    stroke_enters,
     travel_margin,
 )
 from malta.model.data import plant_of, units_of
@@ -89,9 +91,12 @@ class Disk:
 
 @dataclass(frozen=True)
 class Place:
-    """Figures at a position of the stroke, the worse of both sides: the machine is even in it, a law need not be."""
+    """Figures at a position of the stroke, the worse of both sides: the machine is even in it, a law need not be.
 
-    position: float  # m
+    A machine without a stroke has its places along the first parameter of `plant.over`, as the speed of a rotor.
+    """
+
+    position: float  # SI: m, or the unit of that parameter
     margin: Margin
     peak: float
     disk: float  # all forces and sensors at once; NaN where unstable, as the peak and the delay
@@ -103,15 +108,16 @@ class Robustness:
     """What `robustness` found of a controller on a machine."""
 
     chain: tuple[Link, ...]
-    travel: Margin  # the last link, anywhere in the travel, in one proof
+    travel: Margin  # the last link, anywhere in `extent`, in one proof
     # The smallest or largest of `places`; none where one of them is unstable:
     disks: tuple[Disk, ...]
     delay: Mapping[str, float]  # s, that each sensor's loop stands alone, the others closed
     gang: Mapping[str, tuple[float, ...]]  # by sensor: |S|, |T|, m/N, N/m: largest in its row
-    # Proven anywhere in the travel, in multiples of the range:
+    # Proven anywhere in the extent, in multiples of the range:
     tolerance: Mapping[str, tuple[Margin, Margin]]  # each parameter alone, down and up
     payload: Margin | None  # in kg; None for a machine without a mass m
-    places: tuple[Place, ...]  # along the travel, in which everything is even
+    places: tuple[Place, ...]  # along the course; in a travel everything is even
+    extent: Extent = NOWHERE  # what the proof covers beside the uncertainty
 
 
 def compensators(
@@ -187,10 +193,12 @@ def robustness(
     names = list(uncertainty)
     every = [*names, *({"m"} & set(units_of(plant.parameters)) - set(names))]
     at = position_at(plant, plant.point(controller.operating_point[0]).x)
-    position = at.get(plant.stroke, 0.0)
+    extent = extent_of(plant, every)
+    position = standing(plant, extent, at)
     believed = plant_of(controller.parameters)
-    shares = places_along(plant, controller, tuple(every), current_loops)
-    moves = stroke_enters(plant, controller, tuple(every), current_loops)
+    along = places_along(plant, controller, tuple(every), current_loops)
+    whole = covers_travel(plant, controller, tuple(every), current_loops)
+    moves = course_enters(plant, controller, tuple(every), current_loops)
     proven = cache(lambda z: place_margin(plant, controller, uncertainty, z, current_loops, every))
 
     def here(z: float) -> Margin:  # the operating point is one of the places
@@ -224,7 +232,7 @@ def robustness(
         return known[key]
 
     travel = anywhere(uncertainty, time, bounds) if proof else NOT_PROVEN
-    brief = time if len(shares) > 2 else min(time or EACH, EACH)
+    brief = time if whole else min(time or EACH, EACH)
     tolerance = {}
     for name, share in uncertainty.items() if proof else ():
         nominal = getattr(plant.parameters, name)
@@ -237,12 +245,9 @@ def robustness(
     sensors = [s.name for s in plant.outputs]
     places: list[Place] = []
     classical: list[_Classical | None] = []
-    for share in shares:
-        positions = dict.fromkeys((share * plant.travel, -share * plant.travel))
+    for positions in along:
         loops = [loop_at(plant, controller, tuple(every), z, current_loops) for z in positions]
-        asked = (
-            positions if len(shares) > 2 else [share * plant.travel]
-        )  # a place takes as long as a travel there
+        asked = positions if whole else positions[:1]  # a place takes as long as a travel there
         margin = _smallest([here(z) for z in asked]) if proof else NOT_PROVEN
         peaks, sides = [], []
         for system, law in loops:
@@ -253,7 +258,7 @@ def robustness(
         if all(sides):
             both = _worst([found for found in sides if found is not None])
             disk, delay = both.disks[2].size, min(both.delay.values())
-        places.append(Place(share * plant.travel, margin, float(np.max(peaks)), disk, delay))
+        places.append(Place(positions[0], margin, float(np.max(peaks)), disk, delay))
         done()
     worst = _worst([found for found in classical if found is not None]) if all(classical) else None
     return Robustness(
@@ -265,6 +270,7 @@ def robustness(
         tolerance,
         payload,
         tuple(places),
+        extent,
     )
 
 

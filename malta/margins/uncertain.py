@@ -114,9 +114,11 @@ def holds(plant: Plant) -> bool:
 
 
 def lowest(declared: Mapping[str, Any]) -> float:
-    """What a parameter is above, or at least."""
-    found = [declared[key] for key in ("above", "at_least") if declared.get(key) is not None]
-    return float(max(found)) if found else -math.inf
+    """What a parameter is above; the float below what it is at least."""
+    above, least = declared.get("above"), declared.get("at_least")
+    found = [] if above is None else [float(above)]
+    found += [] if least is None else [math.nextafter(float(least), -math.inf)]
+    return max(found, default=-math.inf)
 
 
 def sampled_law(

@@ -18,6 +18,7 @@ import numpy as np
 from malta.errors import CheckError, InputError
 from malta.margins.box import Box, box_of
 from malta.margins.expressions import NotAnalytic
+from malta.margins.extent import NOWHERE, Extent, extent_of, machine_at, positions_of
 from malta.margins.gain import Gain, worst_case_gain
 from malta.margins.held import held_machine
 from malta.margins.plants import LONGEST, of_plant
@@ -105,7 +106,8 @@ class Margins:
     stages: tuple[Stage, ...]
     bandwidth: Mapping[str, float]  # rad/s, by definition
     uncertainty: Mapping[str, float]  # the relative box, by parameter, that the design is meant for
-    robust: Margin | None  # in multiples of it, anywhere in the travel; None without a box
+    robust: Margin | None  # in multiples of it, anywhere in `extent`; None without a box
+    extent: Extent = NOWHERE  # what the margin covers beside the box
 
     @property
     def stable(self) -> bool:
@@ -132,8 +134,8 @@ class Margins:
         if self.uncertainty:
             box = "  ".join(f"{name} +-{share * 100:g} %" for name, share in self.uncertainty.items())
             everywhere = self.robust is None or NOT_BETWEEN not in self.robust.reason
-            where = "over the travel" if everywhere else "in the middle and at the end of the travel"
-            lines += [f"uncertainty: {box}", f"robust {where}: {self.robust}"]
+            where = str(self.extent) if everywhere else "in the middle and at the end of the travel"
+            lines += [f"uncertainty: {box}", f"{f'robust {where}'.rstrip()}: {self.robust}"]
         return "\n".join(lines)
 
 
@@ -280,7 +282,7 @@ def verify(
 
     Stages: the sampled loop as designed; with the current loops; the machine (`machine_loop`). An unstable loop is
     reported, not raised; its sensitivities are NaN. `uncertainty` is the relative half range of each parameter, which
-    the margin over the travel counts in.
+    the margin counts in, which covers the travel and the intervals of `plant.over`.
     Raises CheckError where numbers overflow or no input holds the machine.
     """
     try:
@@ -309,7 +311,7 @@ def _verify(model: LinearModel, controller: Controller, uncertainty: Mapping[str
     )
     bandwidths = _bandwidths(model, controller, machine, stable=stages[-1].stable)
     robust = travel_margin(model.plant, controller, uncertainty) if uncertainty else None
-    return Margins(poles, stages, bandwidths, uncertainty, robust)
+    return Margins(poles, stages, bandwidths, uncertainty, robust, extent_of(model.plant, uncertainty))
 
 
 def machine_law(
@@ -366,6 +368,7 @@ def travel_margin(
 ) -> Margin:
     """The margin of the machine's loop anywhere in its travel: the position is one more interval of the proof.
 
+    So are the parameters of `plant.over` that are not uncertain: a rotor is proven for every speed at once.
     Where the matrices have no short form along the travel, as those of the planar motor's held currents, its axes are
     proven by themselves, with a bound of what couples them anywhere in the travel (`weak`). Where that fails too, the
     margin is that in the middle and at the end, and says so.
@@ -376,7 +379,8 @@ def travel_margin(
     """
     names = tuple(names or ranges)
     along, over = travel_loops(plant, controller, names, current_loops)
-    if not over and (problem := _anywhere(plant, controller, names, current_loops)) is not None:
+    alone = plant.has_stroke and not over  # places of the travel, and no other interval
+    if alone and (problem := _anywhere(plant, controller, names, current_loops)) is not None:
         found = margin_of(problem, _box(along[0][0], ranges), Effort(time=time, progress=progress))
         if found.lower is not None:
             return found
@@ -391,9 +395,8 @@ def travel_loops(
     plant: Plant, controller: Controller, names: tuple[str, ...], current_loops: CurrentLoops = "lag"
 ) -> tuple[list[tuple[UncertainSystem, Compensator]], dict[str, tuple[float, float]]]:
     """The loops of which travel_margin proves a margin, and the intervals that do not grow."""
-    along = _along(plant, controller, names, current_loops)
-    interval = {plant.stroke: (-plant.travel, plant.travel)} if plant.has_stroke else {}
-    return along, interval if len(along) == 1 else {}
+    along, extent = _along(plant, controller, names, current_loops), extent_of(plant, names)
+    return along, extent.intervals if len(along) == 1 else dict(extent.over)
 
 
 @lru_cache(maxsize=8)  # several questions are asked of the same loops; records compare by identity
@@ -401,13 +404,14 @@ def _along(
     plant: Plant, controller: Controller, names: tuple[str, ...], current_loops: CurrentLoops
 ) -> list[tuple[UncertainSystem, Compensator]]:
     """The machine's loop with its position as a parameter; its loops in the middle and at the end where not."""
-    if not plant.has_stroke:
-        return [loop_at(plant, controller, names, 0.0, current_loops)]
-    if not _is_long(plant, controller, names):
-        whole = machine_system(plant, controller, [*names, plant.stroke], {plant.stroke: 0.0}, current_loops)
-        if whole[0].matrices.n_instructions() < LONG:
+    extent = extent_of(plant, names)
+    if not (plant.has_stroke and _is_long(plant, controller, names)):
+        at = {plant.stroke: 0.0} if plant.has_stroke else {}
+        whole = machine_system(plant, controller, [*names, *extent.intervals], at, current_loops)
+        if not plant.has_stroke or whole[0].matrices.n_instructions() < LONG:
             return [whole]
-    return [loop_at(plant, controller, names, share * plant.travel, current_loops) for share in ENDS]
+    every = (*names, *extent.over)
+    return [loop_at(plant, controller, every, share * plant.travel, current_loops) for share in ENDS]
 
 
 def _is_long(plant: Plant, controller: Controller, names: tuple[str, ...]) -> bool:
@@ -458,13 +462,16 @@ def place_margin(
     current_loops: CurrentLoops = "lag",
     names: Sequence[str] = (),
 ) -> Margin:
-    """The margin of the machine's loop at a position along the stroke; arguments as travel_margin takes them.
+    """The margin of the machine's loop at a position along its course; arguments as travel_margin takes them.
 
-    Where there is no proof along the travel the search takes EACH at most.
+    The course is the stroke, or the first parameter of `plant.over`, as the speed of a rotor (`Extent.course`). Where
+    there is no proof along the travel the search takes EACH at most.
     """
     names = tuple(names or ranges)
+    if not plant.has_stroke:
+        return robust_margin(*loop_at(plant, controller, names, position, current_loops), ranges)
     along, over = travel_loops(plant, controller, names, current_loops)
-    if over:
+    if plant.stroke in over:
         return margin_at(*along[0], ranges, {plant.stroke: position}, over, tolerance=TOLERANCE)
     loop = loop_at(plant, controller, names, position, current_loops)
     if (problem := _anywhere(plant, controller, names, current_loops, position)) is not None:
@@ -482,7 +489,7 @@ def worst_sensitivities(
     *,
     time: float | None = None,
 ) -> dict[str, Gain]:
-    """The largest |S| of each sensor, the other loops closed, over the modelled box and the travel.
+    """The largest |S| of each sensor, the other loops closed, over the modelled box, the travel and `plant.over`.
 
     Arguments as travel_margin takes them; where there is no proof along the travel, in its middle and at its end.
     """
@@ -498,11 +505,10 @@ def worst_sensitivities(
 
 def places_along(
     plant: Plant, controller: Controller, names: tuple[str, ...], current_loops: CurrentLoops = "lag"
-) -> tuple[float, ...]:
-    """Shares of the travel at which a margin of its own is worth its time."""
-    if not plant.has_stroke:
-        return (0.0,)
-    return PLACES if covers_travel(plant, controller, names, current_loops) else ENDS
+) -> tuple[tuple[float, ...], ...]:
+    """Positions along the course at which a margin of its own is worth its time; each place has one, or both signs."""
+    shares = PLACES if covers_travel(plant, controller, names, current_loops) else ENDS
+    return positions_of(plant, extent_of(plant, names), shares)
 
 
 def covers_travel(
@@ -512,18 +518,18 @@ def covers_travel(
     return len(_along(plant, controller, names, current_loops)) == 1
 
 
-def stroke_enters(
+def course_enters(
     plant: Plant, controller: Controller, names: tuple[str, ...], current_loops: CurrentLoops = "lag"
 ) -> bool:
-    """Whether the machine's loop depends on the position; names as places_along takes them."""
-    along = _along(plant, controller, names, current_loops)
+    """Whether the machine's loop depends on the position along its course; names as places_along takes them."""
+    along, course = _along(plant, controller, names, current_loops), extent_of(plant, names).course
     if len(along) > 1:
         return True
-    if not plant.has_stroke:
+    if not course:
         return False
     system, law = along[0]
-    stroke = system.names.index(plant.stroke)
-    return any(stroke in on for on in problem_of(system, law).loop.program.depends)
+    index = system.names.index(course)
+    return any(index in on for on in problem_of(system, law).loop.program.depends)
 
 
 @lru_cache(maxsize=32)
@@ -534,9 +540,9 @@ def loop_at(
     position: float,
     current_loops: CurrentLoops = "lag",
 ) -> tuple[UncertainSystem, Compensator]:
-    """The machine's loop at a position along the stroke; the same records for the same question."""
-    at = {plant.stroke: position} if plant.has_stroke else {}
-    return machine_system(plant, controller, names, at, current_loops)
+    """The machine's loop at a position along its course; the same records for the same question."""
+    there, at = machine_at(plant, extent_of(plant, names).course, position)
+    return machine_system(there, controller, names, at, current_loops)
 
 
 NOT_PROVEN = Margin(None, math.inf, None, None, {}, {}, (), 0.0, "not asked")  # of a first look

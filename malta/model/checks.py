@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import fields
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -71,15 +73,34 @@ def check_signals(plant: Plant) -> None:
         raise InputError(plant.name, "thrust", repr(plant.thrust), "one of " + " ".join(names["inputs"]))
     if bool(plant.stroke) != bool(plant.thrust):
         raise InputError(plant.name, "stroke", repr(plant.stroke), "stroke and thrust, or neither")
+    _check_intervals(plant)
     for name in plant.uncontrolled:
         if name not in names["states"]:
             raise InputError(plant.name, "uncontrolled", repr(name), "one of " + " ".join(names["states"]))
+
+
+def _check_intervals(plant: Plant) -> None:
+    """InputError where `over` names no parameter, one that shapes the model, or an interval without its own value."""
+    entering = _entering(plant)
+    for name, interval in plant.over.items():
+        if name not in entering:
+            raise InputError(plant.name, "over", repr(name), "one of " + " ".join(entering))
+        value, ends = getattr(plant.parameters, name), tuple(interval)
+        if not (len(ends) == 2 and -math.inf < ends[0] <= value <= ends[1] < math.inf and ends[0] < ends[1]):
+            raise InputError(plant.name, f"over.{name}", f"{ends}", f"(low, high) about its value, {value:g}")
+
+
+def _entering(plant: Plant) -> list[str]:
+    """The parameters that may be symbols."""
+    declared = {f.name: f.metadata for f in fields(plant.parameters) if "unit" in f.metadata}
+    return [name for name, metadata in declared.items() if not metadata["shapes"]]
 
 
 def check_plant(plant: Plant) -> None:
     """InputError where a plant's signals do not fit each other, or a function of it has the wrong size or fails."""
     check_signals(plant)
     check_equations(plant)
+    check_symbols(plant)
 
 
 def check_equations(plant: Plant) -> None:
@@ -106,3 +127,41 @@ def check_equations(plant: Plant) -> None:
             raise InputError(plant.name, name, found, "a function of CasADi expressions") from error
         if entries != size:
             raise InputError(plant.name, name, f"{entries} entries", f"{size}, one for each of the {of}")
+
+
+def check_symbols(plant: Plant) -> None:
+    """InputError where a plant cannot be built of symbols: margins and simulations put them in place of parameters.
+
+    CasADi gives NaN where a symbol is taken for a number, as `math.sin(par.slope)` does, and says nothing.
+    """
+    if plant.tabulated:  # it holds numbers, and says so where it is asked for more
+        return
+    bad = _without_symbols(plant, _entering(plant))
+    if bad:
+        name = next((name for name in _entering(plant) if _without_symbols(plant, [name])), "its parameters")
+        expected = f"CasADi's functions of it, as ca.sin, or si(..., shapes=True) where {name} stays a number"
+        raise InputError(plant.name, bad, f"{name}, taken for a number", expected)
+
+
+def _without_symbols(plant: Plant, names: Sequence[str]) -> str:
+    """The function of a plant that fails, or gives NaN, where these parameters are symbols; "" for none."""
+    from malta.model.plant import symbolic  # which imports this module
+
+    symbols = {name: ca.SX.sym(name) for name in names}
+    values = [getattr(plant.parameters, name) for name in names]
+    try:
+        machine = plant.variant(symbolic(plant.parameters, symbols))
+    except Exception:  # a user's function may raise anything
+        return "plant"
+    x, u, w = ca.DM(plant.at().x), ca.DM.zeros(len(plant.inputs)), ca.DM.zeros(len(plant.disturbances))
+    y, i = ca.DM(plant.h(x, u)), ca.DM.zeros(len(plant.actuator.coils))
+    at = {"f": (x, u, w), "h": (x, u), "load": (x,), "currents": (y, u), "forces": (x, i), "contact": (x,)}
+    for key, arguments in at.items():
+        try:
+            found = ca.SX(getattr(machine, key)(*map(ca.SX, arguments)))
+        except Exception:  # likewise
+            return key
+        numbers = ca.Function(key, [ca.vertcat(*symbols.values())], [found])(ca.DM(values))
+        if ca.DM(numbers).is_regular() < ca.DM(getattr(plant, key)(*arguments)).is_regular():
+            return key
+    return ""

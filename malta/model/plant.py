@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Protocol
 
 import casadi as ca
@@ -136,7 +136,8 @@ class Plant:
     are held for one sample, while `forces(x, i)`, the forces that these currents make, follow the machine.
 
     A machine needs the fields without a default; the others say what it has beyond these. A machine without a `stroke`
-    has no travel, and its thrust and mass are not asked for.
+    has no travel, and its thrust and mass are not asked for. What runs at any value of a parameter, as a rotor at any
+    speed, names the interval in `over`: margins are then proven for all of it at once, as they are for the travel.
 
     `data.plant_of` checks that the fields fit each other. Examples: malta/machines/, the module of `malta new`.
     """
@@ -175,6 +176,9 @@ class Plant:
     thrust: str = ""  # the input that drives the stroke
     stroke: str = ""  # the output that the stroke moves; "": the machine has no stroke
     travel: float = 0.0  # of that output, either way, m
+    over: Mapping[str, tuple[float, float]] = field(
+        default_factory=dict
+    )  # parameters: intervals that proofs cover
 
     def __post_init__(self) -> None:
         for name, value in defaults(self).items():

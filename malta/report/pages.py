@@ -47,6 +47,7 @@ from malta.synthesis.spec import Spec
 
 if TYPE_CHECKING:
     from malta.campaigns.campaign import Campaign
+    from malta.margins.extent import Extent
     from malta.margins.gain import Gain
     from malta.margins.robust import Margin
     from malta.margins.stages import Robustness
@@ -139,10 +140,17 @@ def chain_table(found: Robustness) -> Table:
         if link.broken_at == "sensors" and not math.isnan(link.peak):
             peak += f" {zone(link.peak)}"
         _row(table, link.name, *_margin_cells(link.margin), _blame(link.margin), peak, link.broken_at)
-    travel = found.travel
-    where = "all of the travel" if _everywhere(travel) else "middle and end of it"
-    _row(table, where, *_margin_cells(travel), _blame(travel), "", "")
+    if found.extent.intervals:
+        _row(table, _everything(found), *_margin_cells(found.travel), _blame(found.travel), "", "")
     return table
+
+
+def _everything(found: Robustness) -> str:
+    """What the margin over the extent covers, as a row of a table."""
+    if not _everywhere(found.travel):
+        return "middle and end of it"
+    parts = ["all of the travel"] if found.extent.stroke else []
+    return ", ".join([*parts, found.extent.values] if found.extent.over else parts)
 
 
 def _margin_cells(margin: Margin) -> tuple[str, str, str]:
@@ -168,7 +176,7 @@ def _blame(margin: Margin) -> str:
 def disk_table(found: Robustness, Ts: float) -> Table:
     """Disk margins of the machine's loop, and the delay that each sensor's loop stands."""
     table = _table(
-        "Margins of the sampled loop without parameters, the smallest along the travel",
+        f"Margins of the sampled loop without parameters{_least_along(found)}",
         "factor in",
         "disk",
         "gain",
@@ -189,6 +197,13 @@ def disk_table(found: Robustness, Ts: float) -> Table:
     return table
 
 
+def _least_along(found: Robustness) -> str:
+    """Which of the places a figure is of, where there are several."""
+    course = found.extent.course
+    along = "along the travel" if found.extent.stroke else f"of {len(found.places)} values of {course}"
+    return f", the smallest {along}" if course else ""
+
+
 def _delay_cells(delay: float, Ts: float) -> tuple[str, str]:
     if math.isnan(delay):
         return "unstable", ""
@@ -200,7 +215,8 @@ def gang_table(found: Robustness, plant: Plant) -> Table:
     units = {signal.name: signal.unit for signal in plant.outputs}
     one = next(iter(set(units.values()))) if len(set(units.values())) == 1 else ""
     heads = (f" [{per(one)}]" if one else "" for per in (compliance_unit, stiffness_unit))
-    title = "Gang of four, largest over frequency and travel"
+    extent = found.extent
+    title = f"Gang of four, largest over frequency{f' and {_course(extent)}' if extent.course else ''}"
     forces = (f"{what}{unit}" for what, unit in zip(("from force |SP|", "to force |FS|"), heads, strict=True))
     table = _table(title, "sensor", "|S|", "|T|", *forces)
     for name, (S, T, PS, FS) in found.gang.items():
@@ -212,10 +228,18 @@ def gang_table(found: Robustness, plant: Plant) -> Table:
     return table
 
 
+def _course(extent: Extent) -> str:
+    return "travel" if extent.stroke else extent.course
+
+
 def tolerance_table(found: Robustness, uncertainty: Mapping[str, float]) -> Table:
     """What each parameter may do alone, proven, and its share in the margin of all."""
-    where = "anywhere in the travel" if _everywhere(found.travel) else "in its middle and at its end"
-    table = _table(f"One at a time, proven {where}", "parameter", "down to", "up to", "share in the margin")
+    anywhere = ["anywhere in the travel"] if found.extent.stroke else []
+    anywhere += [f"for {found.extent.values}"] if found.extent.over else []
+    where = " and ".join(anywhere) if _everywhere(found.travel) else "in its middle and at its end"
+    table = _table(
+        f"One at a time, proven {where}".rstrip(), "parameter", "down to", "up to", "share in the margin"
+    )
     shares = found.chain[-1].margin.sensitivity
     for name, (down, up) in found.tolerance.items():
         cells = []
@@ -232,8 +256,8 @@ def tolerance_table(found: Robustness, uncertainty: Mapping[str, float]) -> Tabl
 
 
 def worst_case_table(gains: Mapping[str, Gain]) -> Table:
-    """The largest |S| of each sensor over the modelled box and the travel, found and proven."""
-    title = "Worst-case peak |S| over the uncertainty and the travel"
+    """The largest |S| of each sensor over the modelled box and all that the margin covers, found and proven."""
+    title = "Worst-case peak |S| over the uncertainty and all that the margin covers"
     table = _table(title, "sensor", "found", "at rad/s", "proven below", "zone")
     for name, gain in gains.items():
         high = "nothing proven" if gain.upper is None else f"{gain.upper:.3f}"
@@ -242,12 +266,17 @@ def worst_case_table(gains: Mapping[str, Gain]) -> Table:
 
 
 def places_table(found: Robustness, Ts: float) -> Table:
-    """The machine's loop along the travel: even in the position."""
+    """The machine's loop along the travel, in which it is even, or along the first parameter that runs."""
+    extent = found.extent
+    if not extent.stroke:
+        title = f"Along {extent.course}" if extent.course else "The machine's loop"
+    elif _everywhere(found.travel):
+        title = "Along the travel, either way"
+    else:
+        title = "In the middle of the travel and at its ends (margin: at the positive one)"
     table = _table(
-        "Along the travel, either way"
-        if _everywhere(found.travel)
-        else "In the middle of the travel and at its ends (margin: at the positive one)",
-        "at [mm]",
+        title,
+        f"at [{'mm' if extent.stroke else extent.unit}]" if extent.course else "at",
         "proven",
         "lost at",
         "rad/s",
@@ -259,13 +288,17 @@ def places_table(found: Robustness, Ts: float) -> Table:
         peak = "unstable" if math.isnan(place.peak) else f"{place.peak:.2f} {zone(place.peak)}"
         _row(
             table,
-            f"{place.position * 1e3:.1f}",
+            f"{place.position * 1e3:.1f}" if extent.stroke else _at(extent, place.position),
             *_margin_cells(place.margin),
             peak,
             "none" if math.isnan(place.disk) else f"{place.disk:.3f}",
             ", ".join(cell for cell in _delay_cells(place.delay, Ts) if cell),
         )
     return table
+
+
+def _at(extent: Extent, position: float) -> str:
+    return f"{position:.4g}" if extent.course else "its values"
 
 
 def design_page(
@@ -291,12 +324,10 @@ def design_page(
 def _travel_text(margins: Margins) -> Text:
     box_text = " ".join(f"{name} +-{100 * share:g} %" for name, share in margins.uncertainty.items())
     assert margins.robust is not None
-    where = (
-        "over the whole travel"
-        if _everywhere(margins.robust)
-        else "in the middle and at the end of the travel"
-    )
-    return Text(f"Parametric margin {where} ({box_text}): {margins.robust}\n")
+    where = str(margins.extent).replace("the travel", "the whole travel")
+    if not _everywhere(margins.robust):
+        where = "in the middle and at the end of the travel"
+    return Text(f"{f'Parametric margin {where}'.rstrip()} ({box_text}): {margins.robust}\n")
 
 
 def _everywhere(margin: Margin) -> bool:

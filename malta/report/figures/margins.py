@@ -34,8 +34,10 @@ def chain_figure(
 ) -> Figure:
     """The chain as bars, proven part and witness; peak sensitivities beside them; both along the travel below.
 
+    A machine without a travel has the first parameter that its proofs cover in its place, or nothing below.
+
     position : what the machine calls it, as "position z"
-    worst : the largest |S| of each sensor over the uncertainty and the travel
+    worst : the largest |S| of each sensor over the uncertainty and all that the margin covers
     """
     from matplotlib.figure import Figure
 
@@ -44,10 +46,15 @@ def chain_figure(
     box = ", ".join(f"{key} ±{100 * share:g} %" for key, share in uncertainty.items())
     figure.suptitle(f"{name}: where the margin goes", fontsize=11, y=0.985)
     figure.text(0.5, 0.945, f"100 %: {box}, all at once", fontsize=9, color="#4a4a4a", ha="center", va="top")
-    grid = figure.add_gridspec(2, 2, height_ratios=(1.6, 1))
+    extent = found.extent
+    grid = figure.add_gridspec(
+        2 if extent.course else 1, 2, height_ratios=(1.6, 1) if extent.course else None
+    )
     left, right = figure.add_subplot(grid[0, 0]), figure.add_subplot(grid[0, 1])
     rows = [(link.name, link.margin, link.peak) for link in found.chain]
-    rows.append(("all of the travel", found.travel, max(place.peak for place in found.places)))
+    if extent.course:
+        everything = "all of the travel" if extent.stroke else f"every {extent.course}"
+        rows.append((everything, found.travel, max(place.peak for place in found.places)))
     most = max([_percent(m.lower) for _, m, _ in rows if m.lower is not None] + [100.0])
     for k, (_, margin, peak) in enumerate(rows):
         proven = _percent(margin.lower)
@@ -79,22 +86,23 @@ def chain_figure(
     for axes in (left, right):
         plain(axes)
         axes.set_ylim(len(rows) - 0.4, -0.8)
-    along = figure.add_subplot(grid[1, 0]), figure.add_subplot(grid[1, 1])
-    _along_travel(*along, found, _bound(worst))
-    for axes in along:
-        axes.set_xlabel(f"{position} [mm]")
+    if extent.course:
+        along = figure.add_subplot(grid[1, 0]), figure.add_subplot(grid[1, 1])
+        _along_course(*along, found, _bound(worst))
+        for axes in along:
+            axes.set_xlabel(f"{position} [mm]" if extent.stroke else f"{extent.course} [{extent.unit}]")
     return figure
 
 
-def _along_travel(left: Axes, right: Axes, found: Robustness, bound: float) -> None:
-    """The worse of both sides of the position, drawn on both."""
-    places = found.places
-    z = np.array([p.position for p in places]) * 1e3
-    both = np.concatenate([-z[:0:-1], z])
+def _along_course(left: Axes, right: Axes, found: Robustness, bound: float) -> None:
+    """Of a position the worse of both sides, drawn on both."""
+    places, even = found.places, bool(found.extent.stroke)
+    z = np.array([p.position for p in places]) * (1e3 if even else 1.0)
+    both = np.concatenate([-z[:0:-1], z]) if even else z
 
     def mirrored(values: list[float]) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
         array = np.array(values)
-        return np.concatenate([array[:0:-1], array])
+        return np.concatenate([array[:0:-1], array]) if even else array
 
     left.plot(
         both, mirrored([_percent(p.margin.lower) for p in places]), marker="o", markersize=3.5, **STYLES[0]
