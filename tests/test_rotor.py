@@ -22,6 +22,7 @@ from test_report import printed
 
 import malta
 from malta import report
+from malta.campaigns.statistics import figures_of
 from malta.margins.extent import NOWHERE, Extent, extent_of, positions_of
 from malta.margins.stages import robustness
 from malta.margins.uncertain import instability
@@ -30,6 +31,7 @@ from malta.model import machines
 from malta.model.checks import check_plant
 from malta.model.machines import machine
 from malta.model.plant import Plant
+from malta.simulation.experiments import cases_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -293,6 +295,25 @@ def test_a_parameter_taken_for_a_number_is_named(plant: Plant, par: Any) -> None
 
     with pytest.raises(malta.InputError, match=r"rotor: plant: found e_u, taken for a number"):
         check_plant(refusing(par))
+
+
+def test_rotors_that_differ_are_flown_and_listed(
+    plant: Plant, controllers: dict[str, Controller], tmp_path: Path
+) -> None:
+    """Without a stroke, and with nothing to touch but what carries it."""
+    plan = malta.Plan(controllers["rotor"], "lift-off", {"m": 0.1, "k_s": 0.1}, samples=8)
+    found = malta.campaign(plan, tmp_path / "campaign")
+    assert found.completed.tolist() == [True] * 8
+    labels = [listed.label for listed in figures_of(found)]
+    assert labels[:4] == [f"deviation {s.name}" for s in plant.outputs]
+    assert "largest bearing force" in labels
+    with pytest.raises(malta.InputError, match="'drop', which changes the machine"):
+        cases_of("drop", plant, controllers["rotor"])
+
+
+def test_every_case_has_its_figures(plant: Plant, controllers: dict[str, Controller]) -> None:
+    text = printed(report.experiment_table(malta.experiment("step", plant, controllers["rotor"])))
+    assert [s.name for s in plant.outputs if s.name in text] == ["s_Ax", "s_Ay", "s_Bx", "s_By"]
 
 
 @pytest.mark.slow

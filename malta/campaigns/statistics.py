@@ -72,8 +72,10 @@ def figures_of(found: Campaign, published: Mapping[str, Any] | None = None) -> l
         label = f"{kind} {name}" if name else kind
         return Finding(label, kind, unit, readonly(np.where(done, values, np.nan)), bound, relation)
 
-    (stroke, *others), (thrust, *efforts) = outputs_of(plant), inputs_of(plant)
-    (axis,) = stroke.columns
+    first = 1 if plant.has_stroke else 0  # of the groups: the stroke and the thrust
+    strokes, others = outputs_of(plant)[:first], outputs_of(plant)[first:]
+    thrusts, efforts = inputs_of(plant)[:first], inputs_of(plant)[first:]
+    lengthwise = [(k, group) for group in strokes for k in group.columns]
     sides = [(k, group) for group in others for k in group.columns]
     listed = []
     if np.isfinite(batch.rise).any():
@@ -81,15 +83,17 @@ def figures_of(found: Campaign, published: Mapping[str, Any] | None = None) -> l
             of("", "rise, 10-90 %", "ms", batch.rise, "rise", "about"),
             of("", "overshoot", "percent", batch.overshoot, "overshoot"),
         ]
-    along = f"deviation of {names[axis]}", stroke_unit(plant), batch.deviation[:, axis], "stroke"
-    listed += [of("", *along)]
+    listed += [
+        of("", f"deviation of {names[k]}", stroke_unit(plant), batch.deviation[:, k], "stroke")
+        for k, _ in lengthwise
+    ]
     listed += [of(names[k], "deviation", g.fine, batch.deviation[:, k], g.unit) for k, g in sides]
     if plan.scenario == "hold":
-        listed += [of("", f"rms of {names[axis]}", stroke.fine, batch.rms[:, axis])]
+        listed += [of("", f"rms of {names[k]}", g.fine, batch.rms[:, k]) for k, g in lengthwise]
         listed += [of(names[k], "rms", g.fine, batch.rms[:, k]) for k, g in sides]
     listed += [
         of("", f"largest {g.name}", g.unit, batch.force[:, g.columns].max(axis=1, initial=0.0))
-        for g in (*efforts, thrust)
+        for g in (*efforts, *thrusts)
     ]
     listed += [
         of(name.removeprefix("touchdown at "), "clearance:", "percent", batch.contact[:, k])

@@ -348,7 +348,12 @@ def limits_text(e: Experiment) -> list[str]:
 
 
 def experiment_table(e: Experiment, published: Published | None = None) -> Group:
-    """What an experiment found: its cases, and its figures of merit beside the published ones."""
+    """What an experiment found: its cases, and its figures of merit beside the published ones.
+
+    Of several cases whose figures nothing sums up, as steps of one output after the other, every one has its row.
+    """
+    if len(e.cases) > 1 and e.merits is e.cases[0].merits:
+        return Group(_cases_table(e, published))
     tables = []
     if [merit.label for merit in e.merits] != [merit.label for merit in e.cases[0].merits]:
         tables.append(_cases_table(e, published))

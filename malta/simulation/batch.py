@@ -424,7 +424,7 @@ def _digest(shape: Any) -> ca.Function:
     if setup.bearing:
         touching = used >= 1
         ends = [row["contact"][i] for i, held in enumerate(plant.cushioned) if not held]
-        after["alive"] = ca.logic_and(alive, ca.mmax(ca.vertcat(*ends)) < 1)
+        after["alive"] = ca.logic_and(alive, _most(ca.vertcat(*ends)) < 1)
         first = kept["samples"] == 0
         after["resting"] = ca.if_else(first, touching, kept["resting"])
         after["touching"] = ca.if_else(alive, touching, kept["touching"])
