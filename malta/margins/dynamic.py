@@ -47,6 +47,7 @@ from malta.margins.search import Job
 from malta.margins.transfer import mu_bound, responses, transfer
 from malta.margins.uncertain import Compensator, UncertainSystem
 from malta.margins.weight import Expanded, Weight
+from malta.threads import on_one_thread
 
 if TYPE_CHECKING:
     from malta.margins.robust import Ranges
@@ -59,6 +60,7 @@ ROUNDS_OF_SECANT = 40
 SEARCH = 0.4  # of the time, for what is lost; the rest is for the proof
 
 
+@on_one_thread
 def dynamic_margin(
     system: UncertainSystem,
     compensator: Compensator | Any,

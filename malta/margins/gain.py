@@ -37,6 +37,7 @@ from malta.margins.robust import deadline
 from malta.margins.transfer import performance
 from malta.margins.uncertain import Compensator, UncertainSystem
 from malta.margins.weight import weight_of
+from malta.threads import on_one_thread
 
 if TYPE_CHECKING:
     from malta.margins.robust import Ranges
@@ -67,6 +68,7 @@ class Gain:
         return f"{self.lower:.4g} at {self.frequency:.4g} rad/s, {high}"
 
 
+@on_one_thread
 def worst_case_gain(
     system: UncertainSystem,
     compensator: Compensator | Any,

@@ -42,6 +42,7 @@ from malta.margins.problem import (
 )
 from malta.margins.systems import compensator_of, polynomial_system
 from malta.margins.uncertain import Compensator, UncertainSystem
+from malta.threads import on_one_thread
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
@@ -99,6 +100,7 @@ class Margin:
         return f"{low}, lost at {100 * self.upper:.2f} %{where}"
 
 
+@on_one_thread
 def robust_margin(
     system: UncertainSystem,
     compensator: Compensator | Any,
@@ -140,6 +142,7 @@ def robust_margin(
     return margin_of(problem_of(system, law), box, effort)
 
 
+@on_one_thread
 def common_margin(
     places: Sequence[tuple[UncertainSystem, Compensator | Any]],
     ranges: Ranges,
@@ -179,6 +182,7 @@ def _pairs(places: Any) -> list[tuple[UncertainSystem, Any]]:
     return [(system, law) for system, law in found]
 
 
+@on_one_thread
 def margin_at(
     system: UncertainSystem,
     compensator: Compensator,
@@ -218,6 +222,7 @@ def problem_of(system: UncertainSystem, law: Compensator) -> OfLoop:
     return OfLoop(loop_of(system, law), system.names)
 
 
+@on_one_thread
 def margin_of_polynomial(
     coefficients: Any,
     box: Ranges,

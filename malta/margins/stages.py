@@ -53,6 +53,7 @@ from malta.synthesis.lqg import (
     lqr,
     weights_of,
 )
+from malta.threads import on_one_thread
 
 if TYPE_CHECKING:
     from malta.model.plant import ComplexArray, FloatArray
@@ -161,6 +162,7 @@ def compensators(
     return stages | own
 
 
+@on_one_thread
 def robustness(
     plant: Plant,
     controller: Controller,

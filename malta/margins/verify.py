@@ -58,6 +58,7 @@ from malta.synthesis.riccati import (
     eigenvalues,
     sample,
 )
+from malta.threads import on_one_thread
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -257,6 +258,7 @@ def own_poles(c: Controller) -> tuple[ComplexArray, ComplexArray]:
     return eigenvalues(A - B @ K), eigenvalues((np.eye(len(c.Ad)) - c.L @ c.Cd) @ c.Ad)
 
 
+@on_one_thread
 def unstable_gain(c: Controller) -> tuple[str, float] | None:
     """Which gains leave the file's own model unstable, and the size of the worst eigenvalue; None: none do.
 
@@ -275,6 +277,7 @@ def unstable_gain(c: Controller) -> tuple[str, float] | None:
     return None
 
 
+@on_one_thread
 def verify(
     model: LinearModel, controller: Controller, uncertainty: Mapping[str, float] | None = None
 ) -> Margins:
@@ -356,6 +359,7 @@ def machine_system(
     return system, machine_law(plant, controller, current_loops, held=H, handed=handed)
 
 
+@on_one_thread
 def travel_margin(
     plant: Plant,
     controller: Controller,
@@ -454,6 +458,7 @@ def _box(system: UncertainSystem, ranges: Mapping[str, float | tuple[float, floa
     return box_of(system.names, system.nominal, system.limits, ranges, {}, caller="travel_margin")
 
 
+@on_one_thread
 def place_margin(
     plant: Plant,
     controller: Controller,
@@ -481,6 +486,7 @@ def place_margin(
     return robust_margin(*loop, ranges, time=EACH)
 
 
+@on_one_thread
 def worst_sensitivities(
     plant: Plant,
     controller: Controller,

@@ -55,6 +55,7 @@ from malta.synthesis.spec import (
     Spec,
     Weights,
 )
+from malta.threads import on_one_thread
 
 if TYPE_CHECKING:
     from malta.model.plant import ComplexArray, FloatArray
@@ -87,12 +88,14 @@ class Gains(NamedTuple):
     L: FloatArray
 
 
+@on_one_thread
 def lqr(model: Linear, weights: Weights) -> FloatArray:
     """Continuous LQR gain K, m x n: v = -K xi minimizes the integral of xi'Q xi + v'R v."""
     _check_sizes(model, weights)
     return care(model.A, model.B, weights.Q, weights.R, "LQR").K
 
 
+@on_one_thread
 def lqi(model: Linear, weights: Weights) -> tuple[FloatArray, FloatArray]:
     """Continuous LQR with the integrals of the measured errors: K (m x n) and Ki (m x p).
 
@@ -109,6 +112,7 @@ def lqi(model: Linear, weights: Weights) -> tuple[FloatArray, FloatArray]:
     return gain[:, :n], -gain[:, n:]
 
 
+@on_one_thread
 def kalman(model: Linear, weights: Weights) -> FloatArray:
     """Continuous steady-state Kalman gain L, n x p: xi_hat' = A xi_hat + B v + L (y - C xi_hat).
 
@@ -179,6 +183,7 @@ def gains(
     return Gains(Ad, Bd, Cd, K, Ki, L)
 
 
+@on_one_thread
 @np.errstate(all="ignore")  # what overflows is found at the end
 def lqg(
     model: LinearModel,
@@ -288,6 +293,7 @@ def _machine_part(model: LinearModel, Ts: float, delay: int, *, current_loop_del
     }
 
 
+@on_one_thread
 def pid(
     model: LinearModel,
     terms: Pid,
@@ -333,6 +339,7 @@ def pid_gains(P: FloatArray, terms: Pid, Ts: float) -> Gains:
     )
 
 
+@on_one_thread
 def synthesize(spec: Spec, model: LinearModel) -> Controller:
     """The controller that a design file asks for. Errors name the file."""
     named: dict[str, Any] = {"name": spec.name, "current_loop_delay": spec.current_loop_delay}
@@ -348,6 +355,7 @@ def synthesize(spec: Spec, model: LinearModel) -> Controller:
     return replace(controller, spec_sha256=spec.sha256)
 
 
+@on_one_thread
 def calibrate(
     model: LinearModel,
     weights: Weights,
