@@ -132,7 +132,7 @@ def compensators(
     model = linearize(believed, believed.point(controller.operating_point[0]))
     A, B, C, K, L = model.A, model.B, model.C, lqr(model, weights), kalman(model, weights)
     n, p, m = len(A), len(C), B.shape[1]
-    half = n // 2
+    half = believed.coordinates
     to_modes = np.linalg.inv(C[:, :half]) if p == half else np.eye(p)
     back = np.linalg.inv(to_modes)
     stages: dict[str, tuple[Compensator, bool]] = {

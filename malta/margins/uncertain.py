@@ -16,6 +16,7 @@ import casadi as ca
 import numpy as np
 
 from malta.errors import CheckError
+from malta.model.data import plant_of
 from malta.model.linearize import jacobians
 from malta.model.plant import Plant, symbolic
 from malta.synthesis.controller import (
@@ -138,7 +139,8 @@ def sampled_law(
     held : H of currents that are held: v + H y acts; handed: the reading itself is a further input of the system
     """
     law, T = linear_law(controller), controller.sample_time
-    n, m, half = len(controller.states), len(controller.forces), len(controller.A) // 2
+    n, m = len(controller.states), len(controller.forces)
+    half = plant_of(controller.parameters).coordinates
     p = len(law.A) - n
     # Sums of errors and stored forces in the coordinates of the modes, where these decouple.
     to_modes = np.eye(len(law.A))

@@ -601,13 +601,9 @@ def largest(sizes: Callable[[FloatArray], FloatArray], w: FloatArray) -> tuple[F
 def _bandwidths(
     model: LinearModel, controller: Controller, machine: Loop, *, stable: bool
 ) -> dict[str, float]:
-    n = len(model.A) // 2
-    own = _commanded(model, controller)
-    closed = own.force_map @ controller.K[:, :n] - own.stiffness
-    w_n = np.sqrt(np.maximum(eigenvalues(closed).real, 0))
-    natural = {"w_n_max": float(w_n.max()), "w_n_min": float(w_n.min())}
+    natural = _natural_frequencies(_commanded(model, controller), controller)
     if not stable:
-        return {**dict.fromkeys(BANDWIDTHS, np.nan), **natural}
+        return {key: np.nan for key in BANDWIDTHS if not key.startswith("w_n")} | natural
     w = _grid(machine.sample_time)
     L = machine.loop_gain(w)
     S = machine.sensitivity(w)
@@ -619,6 +615,16 @@ def _bandwidths(
         "crossover_max": crossing(w, _singular_values(L)[:, 0], 1.0, last=True),
         **natural,
     }
+
+
+def _natural_frequencies(model: LinearModel, controller: Controller) -> dict[str, float]:
+    """Of q'' = (k - G K1) q, rad/s; none where the states are not (q, q')."""
+    n = model.plant.coordinates
+    if not n:
+        return {}
+    closed = model.force_map @ controller.K[:, :n] - model.stiffness
+    w_n = np.sqrt(np.maximum(eigenvalues(closed).real, 0))
+    return {"w_n_max": float(w_n.max()), "w_n_min": float(w_n.min())}
 
 
 def _singular_values(G: ComplexArray) -> FloatArray:

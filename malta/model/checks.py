@@ -115,18 +115,24 @@ def check_equations(plant: Plant) -> None:
         "load": (lambda: plant.load(x), len(plant.disturbances), "disturbances"),
         "currents": (lambda: plant.currents(y, u), len(plant.actuator.coils), "coils"),
         "forces": (lambda: plant.forces(x, i), len(plant.inputs), "inputs"),
-        "position_of": (lambda: plant.position_of(y), len(plant.controlled) // 2, "controlled positions"),
         "contact": (lambda: plant.contact(x), len(plant.contacts), "contacts"),
     }
-    for name, (evaluate, size, of) in asked.items():
-        try:
-            entries = ca.vertcat(evaluate()).numel()
-        except Exception as error:  # a user's function may raise anything
-            line = " ".join(str(error).split())
-            found = f"{type(error).__name__}: {line[:120]}"
-            raise InputError(plant.name, name, found, "a function of CasADi expressions") from error
-        if entries != size:
-            raise InputError(plant.name, name, f"{entries} entries", f"{size}, one for each of the {of}")
+    for name, question in asked.items():
+        _check_size(plant, name, *question)
+    half = plant.coordinates
+    size, of = (half, "controlled positions") if half else (len(plant.controlled), "controlled states")
+    _check_size(plant, "position_of", lambda: plant.position_of(y), size, of)
+
+
+def _check_size(plant: Plant, name: str, evaluate: Callable[[], Any], size: int, of: str) -> None:
+    try:
+        entries = ca.vertcat(evaluate()).numel()
+    except Exception as error:  # a user's function may raise anything
+        line = " ".join(str(error).split())
+        found = f"{type(error).__name__}: {line[:120]}"
+        raise InputError(plant.name, name, found, "a function of CasADi expressions") from error
+    if entries != size:
+        raise InputError(plant.name, name, f"{entries} entries", f"{size}, one for each of the {of}")
 
 
 def check_symbols(plant: Plant) -> None:

@@ -63,13 +63,15 @@ class LinearModel:
 
     @property
     def stiffness(self) -> FloatArray:
-        """q'' per q: the lower left block of A, 1/s2. M^-1 S in the paper's letters."""
+        """q'' per q: the lower left block of A, 1/s2. M^-1 S in the paper's letters. InputError without (q, q')."""
+        self.plant.require_second_order("stiffness")
         n = len(self.A) // 2
         return self.A[n:, :n]
 
     @property
     def force_map(self) -> FloatArray:
-        """q'' per v: the lower half of B. M^-1 V in the paper's letters."""
+        """q'' per v: the lower half of B. M^-1 V in the paper's letters. InputError without (q, q')."""
+        self.plant.require_second_order("force_map")
         return self.B[len(self.A) // 2 :]
 
 

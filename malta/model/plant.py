@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Protocol
 
 import casadi as ca
@@ -129,7 +130,8 @@ class Electronics:
 class Plant:
     """A machine: equations of motion that CasADi can trace, and the names and units of its signals.
 
-    `states` are positions, then their rates in the same order. `uncontrolled` are states that no input reaches, as the
+    `states` are positions, then their rates in the same order (`second_order`); a machine whose states are others has no
+    natural frequencies, no PID and no feedforward of speeds. `uncontrolled` are states that no input reaches, as the
     rotation of a round mover: they are simulated, and left out of the design.
 
     The inputs are forces. `currents(y, v)` gives the coil currents for the forces v at the measured position y; they
@@ -154,7 +156,8 @@ class Plant:
     disturbances: tuple[Signal, ...] = ()  # w: forces and torques from outside
     uncontrolled: tuple[str, ...] = ()
     load: CasadiFn = DEFAULT  # x -> w of gravity and cogging; none
-    position_of: CasadiFn = DEFAULT  # y -> controlled positions, the inverse of h at rest; y itself
+    # y -> controlled positions, the inverse of h at rest; y itself. Of states that are no (q, q'): all of them at rest
+    position_of: CasadiFn = DEFAULT
     preload: CasadiFn = DEFAULT  # x -> inputs that the design model stands on; none
     currents: CasadiFn = DEFAULT  # (y, inputs) -> currents of the coils, A; by the force constants
     forces: CasadiFn = DEFAULT  # (x, currents of the coils) -> inputs; by the force constants
@@ -202,6 +205,25 @@ class Plant:
     def design_states(self) -> tuple[Signal, ...]:
         """The states of the design model."""
         return tuple(self.states[i] for i in self.controlled)
+
+    @cached_property
+    def second_order(self) -> bool:
+        """Whether the states are (q, q'): the first half of f is, expression by expression, the second half of x."""
+        half, odd = divmod(len(self.states), 2)
+        x, u = ca.SX.sym("x", len(self.states)), ca.SX.sym("u", len(self.inputs))
+        rate = ca.SX(ca.vertcat(self.f(x, u, ca.SX.sym("w", len(self.disturbances)))))
+        return not odd and all(ca.is_equal(rate[k], x[half + k], 1) for k in range(half))
+
+    @property
+    def coordinates(self) -> int:
+        """How many positions stand first in the design model's states (q, q'); 0 where these are others."""
+        return len(self.controlled) // 2 if self.second_order else 0
+
+    def require_second_order(self, what: str) -> None:
+        """InputError where the states are not (q, q'), which `what` is made for."""
+        if not self.second_order:
+            found = "states that are not positions and then their rates"
+            raise InputError(self.name, what, found, "x = (q, q')")
 
     @property
     def has_stroke(self) -> bool:

@@ -64,7 +64,7 @@ if TYPE_CHECKING:
 def poles_table(model: LinearModel, published: Published | None) -> Table:
     """Open-loop poles by mode, beside Table I where it applies."""
     n = len(model.A) // 2
-    if np.any(model.A[n:, n:]):  # damped: no pairs of opposite poles
+    if not model.plant.second_order or np.any(model.A[n:, n:]):  # damped: no pairs of opposite poles
         table = _table("Open-loop poles [rad/s]", "of", "poles")
         poles = np.linalg.eigvals(model.A).astype(complex)
         _row(table, "ours", _pole_text(np.where(np.abs(poles) < 1e-9 * np.abs(poles).max(), 0, poles)))
@@ -103,6 +103,8 @@ def bandwidth_table(margins: Margins, published: Published | None) -> Table:
     """Bandwidths by definition; a paper may give one figure and no definition."""
     table = _table("Bandwidth by definition", "definition", "rad/s", "Hz")
     for key, meaning in BANDWIDTHS.items():
+        if key not in margins.bandwidth:  # a machine or a law without natural frequencies
+            continue
         value = margins.bandwidth[key]
         _row(table, meaning, f"{value:.1f}", f"{value / (2 * math.pi):.2f}")
     if _prints(published, "position_controller", "bandwidth"):

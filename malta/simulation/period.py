@@ -349,8 +349,8 @@ def _decided(
     xi_hat = given["xi_hat"] if s.outside else estimated(g, controller["xi_pred"], y, C)
     p_ref, dp_ref, v_ff = (given[name] for name in ("p_ref", "dp_ref", "v_ff"))
     believed = plant_of(c.parameters)
-    half = len(c.A) // 2
-    faster = ca.vertcat(ca.DM(half, 1), g["rate"] @ dp_ref)
+    rates = len(c.feedforward.rate)
+    faster = ca.vertcat(ca.DM(len(c.A) - rates, 1), g["rate"] @ dp_ref)
     xi_ref = ca.vertcat(state_reference(believed)(p_ref, dp_ref) + faster, given["v_past"])
     e_now, frozen_now = controller["e"], controller["frozen"]
     xi_pred, e, frozen, v = commanded(g, xi_hat, e_now, frozen_now, y, p_ref, xi_ref, v_ff, v0)
@@ -390,10 +390,14 @@ def _decided(
 
 @lru_cache(maxsize=16)
 def state_reference(believed: Plant) -> ca.Function:
-    """(p*, p*') -> (P(z*)^-1 p*, its derivative): what the mechanical states should be."""
+    """(p*, p*') -> (P(z*)^-1 p*, its derivative): what the mechanical states should be.
+
+    Of a machine whose states are not (q, q') the states at rest with the outputs p*.
+    """
     p, dp = ca.SX.sym("p", len(believed.outputs)), ca.SX.sym("dp", len(believed.outputs))
     q = believed.position_of(p)
-    return ca.Function("q", [p, dp], [ca.densify(ca.vertcat(q, ca.jtimes(q, p, dp)))])
+    states = ca.vertcat(q, ca.jtimes(q, p, dp)) if believed.second_order else q
+    return ca.Function("q", [p, dp], [ca.densify(states)])
 
 
 def _scheduled_C(c: Controller, y: Any) -> Any:
@@ -498,7 +502,7 @@ def _moved(
         return ca.vertcat(x, i, *(own[name] for name in fast.state))
     if s.fidelity == "force":
         currents = _lagging(plant.actuator.crossover, machine["i_coil"], held, h)
-        half = len(plant.states) // 2
+        half = len(plant.states) // 2 if plant.second_order else 0
         moved = runge_kutta(lambda x, n: motion(x, plant.forces(x, currents[n])), x, h, half)
         return ca.vertcat(moved, currents[2])
     n, count = len(plant.states), machine["i" if s.fidelity == "dq" else "i_phase"].numel()
@@ -509,7 +513,7 @@ def _moved(
         forces, electrics = slope(plant, s, given, x, i, V, held)
         return ca.vertcat(motion(x, forces), electrics)
 
-    return runge_kutta(rate, ca.vertcat(*machine.values()), h, n // 2)
+    return runge_kutta(rate, ca.vertcat(*machine.values()), h, n // 2 if plant.second_order else 0)
 
 
 def _lagging(crossover: Any, i: Any, held: Any, h: Any) -> list[Any]:

@@ -665,6 +665,7 @@ def feedforward(c: Controller, motion: references.Motion, choice: FeedforwardCho
     believed = plant_of(c.parameters)
     v_ff = c.feedforward.inertia * motion.ddp + motion.dp @ c.feedforward.speed.T
     if choice == "attraction":
+        believed.require_second_order("feedforward attraction")
         half = len(c.A) // 2
         hold = -np.linalg.lstsq(c.B[half:], c.A[half:, :half], rcond=None)[0]
         states = evaluate(machine.state_reference(believed).map(len(motion.p)), motion.p, motion.dp)[0]

@@ -40,7 +40,9 @@ def observer(plant: Plant, c: Controller, setup: Setup, kind: str, substeps: int
     if c.noise is None or c.observed:
         found = "a PID" if c.noise is None else "forces of disturbance in its own"
         raise InputError("simulate", f"estimator {kind}", found, "an LQG with integrals")
-    if holds(plant_of(c.parameters)):
+    believed = plant_of(c.parameters)
+    believed.require_second_order(f"estimator {kind}")
+    if holds(believed):
         found = f"a {plant.name}, whose currents are held between samples"
         raise InputError("simulate", f"estimator {kind}", found, "steady-state, which knows of that")
     filter_ = _filter(c, c.noise)

@@ -306,11 +306,13 @@ def pid(
 
     v = Kp (p* - y) + Ki e + Kd (p*' - d),  d+ = a d + (1 - a) (y - y_last) / Ts,  a = e^(-Ts / filter)
 
-    Raises InputError for a sample time that is none, or terms of another number than the inputs.
+    Raises InputError for a sample time that is none, terms of another number than the inputs, states that are not
+    positions and their rates.
     """
     if not (math.isfinite(Ts) and Ts > 0):
         raise InputError("pid", "Ts", f"{Ts} s", "a sample time above 0 s")
     plant, half = model.plant, len(model.A) // 2
+    plant.require_second_order("pid")
     if len(terms.Kp) != len(plant.inputs):
         raise InputError("pid", "Kp", f"{len(terms.Kp)} gains", f"{len(plant.inputs)}, one for each input")
     part = _machine_part(model, Ts, plant.actuator.delay(Ts), current_loop_delay=current_loop_delay)
@@ -424,6 +426,7 @@ def feedforward(model: LinearModel, Ts: float, delay: int = 0) -> Feedforward:
     static, half = static_feedforward(model.plant), len(model.A) // 2
     if not model.E.any():
         return static
+    model.plant.require_second_order("held currents")
     still = held(model)
     Ad, Bd = sample(still.A, model.B, Ts)
     back = np.linalg.inv(model.C[:, :half])
@@ -438,7 +441,7 @@ def static_feedforward(plant: Plant) -> Feedforward:
 
     Without a stroke v0 is a constant; it stands at two positions of a grid that nothing looks up.
     """
-    m, p, rates = len(plant.inputs), len(plant.outputs), len(plant.controlled) // 2
+    m, p, rates = len(plant.inputs), len(plant.outputs), plant.coordinates
     if plant.has_stroke:
         half = max(V0_STEPS, round(plant.travel / V0_STEP))
         z_grid = np.linspace(-plant.travel, plant.travel, 2 * half + 1)
