@@ -20,6 +20,8 @@ if TYPE_CHECKING:  # the contents page, as type checkers and readers see it
     from malta.margins.dynamic import dynamic_margin as dynamic_margin
     from malta.margins.gain import Gain as Gain
     from malta.margins.gain import worst_case_gain as worst_case_gain
+    from malta.margins.loop_systems import LoopSystems as LoopSystems
+    from malta.margins.loop_systems import loop_systems as loop_systems
     from malta.margins.robust import Margin as Margin
     from malta.margins.robust import margin_of_polynomial as margin_of_polynomial
     from malta.margins.robust import robust_margin as robust_margin
@@ -34,6 +36,7 @@ if TYPE_CHECKING:  # the contents page, as type checkers and readers see it
     from malta.model.data import plant_of as plant_of
     from malta.model.data import published as published
     from malta.model.data import read as read
+    from malta.model.linear import linear_machine as linear_machine
     from malta.model.linearize import LinearModel as LinearModel
     from malta.model.linearize import linearize as linearize
     from malta.model.machines import machine as machine
@@ -62,8 +65,10 @@ if TYPE_CHECKING:  # the contents page, as type checkers and readers see it
     from malta.synthesis.lqg import lqi as lqi
     from malta.synthesis.lqg import lqr as lqr
     from malta.synthesis.lqg import synthesize as synthesize
+    from malta.synthesis.lqg import weights as weights
     from malta.synthesis.spec import Spec as Spec
     from malta.synthesis.spec import Weights as Weights
+    from malta.synthesis.state_space import controller_of as controller_of
     from malta.tuning.tune import tune as tune
 
 _NAMES = {  # the same, for the first use of each name
@@ -75,6 +80,7 @@ _NAMES = {  # the same, for the first use of each name
     "errors": ("CheckError", "InputError"),
     "simulation.experiments": ("Experiment", "experiment"),
     "simulation.time_optimal": ("fastest_stroke",),
+    "model.linear": ("linear_machine",),
     "model.linearize": ("LinearModel", "linearize"),
     "simulation.batch": ("Batch", "replayed", "simulate_many"),
     "model.machines": ("machine",),
@@ -82,12 +88,14 @@ _NAMES = {  # the same, for the first use of each name
     "margins.blocks": ("Dynamic",),
     "margins.dynamic": ("dynamic_margin",),
     "margins.gain": ("Gain", "worst_case_gain"),
+    "margins.loop_systems": ("LoopSystems", "loop_systems"),
     "margins.robust": ("Margin", "margin_of_polynomial", "robust_margin"),
     "margins.systems": ("uncertain",),
     "simulation.simulate": ("Fault", "Scenario", "Trajectory", "simulate", "stroke_figures"),
     "synthesis.design_file": ("read_design",),
     "synthesis.spec": ("Spec", "Weights"),
-    "synthesis.lqg": ("calibrate", "kalman", "lqg", "lqi", "lqr", "synthesize"),
+    "synthesis.lqg": ("calibrate", "kalman", "lqg", "lqi", "lqr", "synthesize", "weights"),
+    "synthesis.state_space": ("controller_of",),
     "tuning.tune": ("tune",),
     "margins.uncertain": ("Compensator", "UncertainSystem"),
     "margins.verify": ("Margins", "verify"),

@@ -202,6 +202,8 @@ def fingerprint(record: Any) -> str:
             marks.update((np.asarray(value, dtype="<f8") + 0.0).tobytes())  # a file keeps no negative zeros
         elif is_dataclass(value):
             for f in fields(value):
+                if f.metadata.get("later") and getattr(value, f.name) == f.default:
+                    continue  # a field that came later: campaigns that were begun before it go on
                 marks.update(f.name.encode())
                 add(getattr(value, f.name))
         elif isinstance(value, tuple):

@@ -28,8 +28,19 @@ MATRICES = (
     "feedforward.speed",
     "feedforward.rate",
     "verification.poles.",
+    "plant.linear.matrices.",
+    "plant.linear.terms.",
 )
-VECTORS = ("operating_point.", "feedforward.inertia", "feedforward.z_grid", "limits.", "cost.", "noise.")
+VECTORS = (
+    "operating_point.",
+    "feedforward.inertia",
+    "feedforward.z_grid",
+    "limits.",
+    "cost.",
+    "noise.",
+    "plant.linear.limit",
+    "plant.linear.noise",
+)
 
 _Form = tuple[Callable[[Mapping[str, Any]], bytes], Callable[[bytes], Any]]
 
@@ -136,13 +147,13 @@ def _from_mat(data: bytes) -> dict[str, Any]:
     return tree
 
 
-def _columns(content: Mapping[str, Any]) -> dict[str, Any]:
+def _columns(content: Any) -> Any:
     """Signals as two lists, name and unit."""
-    signals = {
-        key: {column: [row[column] for row in rows] for column in ("name", "unit")}
-        for key, rows in content["signals"].items()
-    }
-    return {**content, "signals": signals}
+    if isinstance(content, list) and content and isinstance(content[0], Mapping):
+        return {column: [row[column] for row in content] for column in ("name", "unit")}
+    if isinstance(content, Mapping):
+        return {key: _columns(entry) for key, entry in content.items()}
+    return content
 
 
 def _flat(tables: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -1,6 +1,6 @@
-"""The gain file, version 1: everything that a digital implementation needs, as .json, .npz or .mat.
+"""The gain file: everything that a digital implementation needs, as .json, .npz or .mat.
 
-    schema "malta-gains", version 1
+    schema "malta-gains", version 1; 2 with what is below
     design           name, spec_sha256
     plant            name, preset, parameters {name: {value, unit}}
     operating_point  x [n0], u [m]
@@ -24,6 +24,17 @@ the filter observes forces of disturbance. The control law is in controller.py. 
 law, cost and noise are null, as its poles of regulator and filter; current_loop is null where currents follow
 their commands at once, limits.voltage where there are none.
 
+Version 2 is what has one more table, and may have another:
+
+    law              tracks "states" or "errors": what the control law takes, see controller.py
+    plant.linear     of a machine from plain matrices, whose name is "linear" and whose preset its own name:
+                     states, inputs, outputs: signals; matrices A, B, C; terms {parameter: A, B, C}; limit [m],
+                     noise [p], dead_time [s], as model/linear.py takes them
+
+There plant.parameters and its terms are null without parameters, feedforward.rate without rates among the states, and
+limits.current and limits.force without limits. The states of a law of errors are its own, then its last errors.
+All else stays version 1, and readers of it read these files.
+
 The JSON is the specification: matrices row by row with round-trip precision, no time stamp, so the same inputs give the
 same file. The .npz has the same names joined by dots ("gains.K"), the .mat the same names as nested structs; in both a
 list of signals is two lists, name and unit, and null is an empty array. The sha256 has a damaged or edited file refused
@@ -36,25 +47,24 @@ import platform
 from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
-from pydantic import BeforeValidator, Field, StrictInt, StrictStr
 
 from malta.errors import CheckError, InputError
 from malta.files import located, replace_files
 from malta.gains.encodings import SUFFIXES as SUFFIXES
 from malta.gains.encodings import content_sha256, decode, encode
+from malta.gains.linear import LINEAR, linear_parameters, linear_table, signal_tables
+from malta.gains.schema import GainFile, PlantTable
 from malta.margins.verify import require_stable, unstable_gain
 from malta.model.data import (
-    Finite,
-    Quantity,
-    Record,
     parameters_record,
     plant_of,
     units_of,
     validated,
 )
+from malta.model.linear import is_linear
 from malta.model.machines import machine
 from malta.model.plant import Signal
 from malta.synthesis.controller import (
@@ -72,148 +82,7 @@ if TYPE_CHECKING:
     from malta.margins.verify import Margins
     from malta.model.plant import FloatArray, Parameters
 
-SCHEMA, VERSION = "malta-gains", 1
-
-Vector = list[Finite]
-Matrix = list[list[Finite]]
-
-
-def _rows(value: Any) -> Any:
-    """Signals as the binary files hold them, two columns, back to a list of rows."""
-    if isinstance(value, dict) and set(value) == {"name", "unit"}:
-        names, units = value["name"], value["unit"]
-        if isinstance(names, list) and isinstance(units, list) and len(names) == len(units):
-            return [{"name": n, "unit": u} for n, u in zip(names, units, strict=True)]
-    return value
-
-
-class _Signal(Record):
-    name: StrictStr
-    unit: StrictStr
-
-
-_Signals = Annotated[list[_Signal], BeforeValidator(_rows)]
-
-
-class _Design(Record):
-    name: StrictStr
-    spec_sha256: StrictStr
-
-
-class _Plant(Record):
-    name: StrictStr
-    preset: StrictStr
-    parameters: dict[StrictStr, Quantity]
-
-
-class _OperatingPoint(Record):
-    x: Vector
-    u: Vector
-
-
-class _SignalTable(Record):
-    states: _Signals
-    forces: _Signals
-    measurements: _Signals
-
-
-class _Model(Record):
-    A: Matrix
-    B: Matrix
-    C: Matrix
-    Ad: Matrix
-    Bd: Matrix
-    Cd: Matrix
-
-
-class _Gains(Record):
-    K: Matrix
-    Ki: Matrix
-    L: Matrix
-
-
-class _Cost(Record):
-    state: Vector
-    input: Vector
-    integral: Vector
-
-
-class _Noise(Record):
-    process: Vector
-    sensor: Vector
-    drift: Vector | None
-
-
-class _Feedforward(Record):
-    inertia: Vector
-    speed: Matrix
-    rate: Matrix
-    z_grid: Vector
-    v0: Matrix
-
-
-class _CurrentLoop(Record):
-    Kp: Annotated[Finite, Field(gt=0)]
-    Ki: Annotated[Finite, Field(gt=0)]
-    sample_time: Annotated[Finite, Field(gt=0)]
-
-
-class _Limits(Record):
-    current: Vector
-    voltage: Vector | None
-    force: Vector
-
-
-class _Poles(Record):
-    open_loop: Matrix
-    regulator: Matrix | None
-    filter: Matrix | None
-    closed_loop: Matrix
-
-
-class _Robust(Record):
-    uncertainty: dict[StrictStr, Finite]
-    lower: Finite | None
-    upper: Finite | None
-    witness: dict[StrictStr, Finite] | None
-
-
-class _Verification(Record):
-    poles: _Poles
-    bandwidth: dict[StrictStr, Finite]
-    peak_sensitivity: dict[StrictStr, Finite]
-    robust: _Robust | None
-
-
-class _Provenance(Record):
-    malta: StrictStr
-    python: StrictStr
-    numpy: StrictStr
-    scipy: StrictStr
-    control: StrictStr
-    casadi: StrictStr
-
-
-class GainFile(Record):
-    """The document that a gain file holds."""
-
-    schema_: Annotated[Literal["malta-gains"], Field(alias="schema")]
-    version: Annotated[StrictInt, Field(ge=VERSION, le=VERSION)]
-    design: _Design
-    plant: _Plant
-    operating_point: _OperatingPoint
-    sample_time: Annotated[Finite, Field(gt=0)]
-    signals: _SignalTable
-    model: _Model
-    gains: _Gains
-    cost: _Cost | None
-    noise: _Noise | None
-    feedforward: _Feedforward
-    current_loop: _CurrentLoop | None
-    limits: _Limits
-    verification: _Verification
-    provenance: _Provenance
-    sha256: StrictStr
+SCHEMA = "malta-gains"
 
 
 def document(controller: Controller, margins: Margins) -> dict[str, Any]:
@@ -223,21 +92,22 @@ def document(controller: Controller, margins: Margins) -> dict[str, Any]:
     """
     require_stable(margins, controller.name)
     c = controller
-    units = units_of(c.parameters)
+    units, linear = units_of(c.parameters), is_linear(c.parameters)
+    extended = linear or c.tracks == "errors" or not c.feedforward.rate.size
     tables: dict[str, Any] = {
         "schema": SCHEMA,
-        "version": VERSION,
+        "version": 2 if extended else 1,
         "design": {"name": c.name, "spec_sha256": c.spec_sha256},
         "plant": {
-            "name": plant_of(c.parameters).name,
+            "name": LINEAR if linear else plant_of(c.parameters).name,
             "preset": c.parameters.preset,
             "parameters": {k: {"value": getattr(c.parameters, k), "unit": u} for k, u in units.items()},
+            **({"linear": linear_table(c.parameters)} if linear else {}),
         },
         "operating_point": {"x": c.operating_point[0], "u": c.operating_point[1]},
         "sample_time": c.sample_time,
-        "signals": {
-            key: [s._asdict() for s in getattr(c, key)] for key in ("states", "forces", "measurements")
-        },
+        **({"law": {"tracks": c.tracks}} if extended else {}),
+        "signals": signal_tables(c, "states", "forces", "measurements"),
         "model": {key: getattr(c, key) for key in ("A", "B", "C", "Ad", "Bd", "Cd")},
         "gains": {key: getattr(c, key) for key in ("K", "Ki", "L")},
         "cost": _table(c.cost, "state", "input", "integral"),
@@ -254,8 +124,9 @@ def document(controller: Controller, margins: Margins) -> dict[str, Any]:
         "provenance": {"malta": version("malta"), "python": platform.python_version()}
         | {name: version(name) for name in ("numpy", "scipy", "control", "casadi")},
     }
-    if not np.isfinite(c.limits.voltage).all():
-        tables["limits"]["voltage"] = None
+    for key, limit in tables["limits"].items():
+        if not np.isfinite(limit).all():
+            tables["limits"][key] = None
     plain: dict[str, Any] = _plain(tables)
     plain["sha256"] = content_sha256(plain)
     return plain
@@ -320,11 +191,11 @@ def content_of(path: Path) -> tuple[GainFile, dict[str, Any]]:
     Raises InputError as `read`; whether the gains fit the machine and stabilize it is not looked at.
     """
     content = decode(path)
-    for key, wanted in (("schema", SCHEMA), ("version", VERSION)):
+    for key, wanted in (("schema", SCHEMA), ("version", 2 if "law" in content else 1)):
         if content.get(key) != wanted:
             raise InputError(path, key, repr(content[key]) if key in content else "nothing", repr(wanted))
     file = validated(GainFile, content, path)
-    plain = file.model_dump(by_alias=True)
+    plain = file.model_dump(by_alias=True, exclude_unset=True)
     if content_sha256(plain) != file.sha256:
         raise InputError(
             path, "sha256", "content that was changed or damaged", "the content that was written"
@@ -333,6 +204,8 @@ def content_of(path: Path) -> tuple[GainFile, dict[str, Any]]:
 
 
 def _controller(file: GainFile, path: str | Path) -> Controller:
+    if file.plant.linear is not None and file.law is None:
+        raise InputError(path, "plant.linear", "a table", "none without a table law, as version 2 has it")
     par = _parameters(file.plant, path)
     try:
         plant = plant_of(par)
@@ -342,9 +215,9 @@ def _controller(file: GainFile, path: str | Path) -> Controller:
         tuple(Signal(s.name, s.unit) for s in getattr(file.signals, key))
         for key in ("states", "forces", "measurements")
     )
-    mechanical = plant.design_states
+    mechanical, errors = plant.design_states, file.law is not None and file.law.tracks == "errors"
     for key, found, wanted in (
-        ("states", states[: len(mechanical)], mechanical),
+        ("states", states[: len(mechanical)], states[: len(mechanical)] if errors else mechanical),
         ("forces", forces, plant.inputs),
         ("measurements", measurements, plant.outputs),
     ):
@@ -352,26 +225,25 @@ def _controller(file: GainFile, path: str | Path) -> Controller:
             raise InputError(path, f"signals.{key}", _names(found), f"{_names(wanted)} of the {plant.name}")
     n, n0, m, p = len(states), len(mechanical), len(forces), len(measurements)
     g, coils = len(file.feedforward.z_grid), len(plant.actuator.coils)
-    if (n - n0) % m:
-        raise InputError(path, "signals.states", f"{n} states", f"{n0} and a multiple of {m} stored forces")
-    observed = disturbances(forces) if states[-m:] == disturbances(forces) else ()
-    stored = stored_forces(forces, (n - n0 - len(observed)) // m) + observed
-    if states[n0:] != stored:
-        raise InputError(path, "signals.states", _names(states[n0:]), f"stored forces, as {_names(stored)}")
-    if observed and any(any(row) for row in file.gains.Ki):
-        both = "sums of errors beside observed disturbances"
-        raise InputError(path, "gains.Ki", both, "zeros: one of them takes off loads")
+    observed = () if errors else _observed(file, states, forces, n0, path)
     if (file.cost is None) != (file.noise is None):
         raise InputError(path, "noise", "null" if file.noise is None else "some", "null where cost is null")
     shapes: dict[str, dict[str, tuple[int, ...]]] = {
         "model": {"A": (n0, n0), "B": (n0, m), "C": (p, n0), "Ad": (n, n), "Bd": (n, m), "Cd": (p, n)},
         "gains": {"K": (m, n), "Ki": (m, p), "L": (n, p)},
         "operating_point": {"x": (n0,), "u": (m,)},
-        "feedforward": {"inertia": (m,), "speed": (m, p), "rate": (n0 // 2, p), "z_grid": (g,), "v0": (g, m)},
-        "limits": {"current": (coils,), "force": (m,)},
+        "feedforward": {
+            "inertia": (m,),
+            "speed": (m, p),
+            "rate": (plant.coordinates, p),
+            "z_grid": (g,),
+            "v0": (g, m),
+        },
+        "limits": {"current": (coils,), "force": (m,), "voltage": (coils,)},
     }
-    if file.limits.voltage is not None:
-        shapes["limits"]["voltage"] = (coils,)
+    unlimited = {key: np.full(size, np.inf) for key, size in shapes["limits"].items() if _endless(file, key)}
+    for key in unlimited:
+        del shapes["limits"][key]
     if file.cost is not None:
         shapes["cost"] = {"state": (n0,), "input": (m,), "integral": (p,)}
     if file.noise is not None:
@@ -402,6 +274,8 @@ def _controller(file: GainFile, path: str | Path) -> Controller:
                 str(weight.tolist()),
                 "weights above 0" if key == "input" else "none below 0",
             )
+    if errors:
+        _check_error_law(file, arrays, path)
     return Controller(
         name=file.design.name,
         spec_sha256=file.design.spec_sha256,
@@ -411,37 +285,81 @@ def _controller(file: GainFile, path: str | Path) -> Controller:
         states=states,
         forces=forces,
         measurements=measurements,
-        **arrays["model"],
-        **arrays["gains"],
+        **cast("dict[str, Any]", arrays["model"] | arrays["gains"]),
         cost=Cost(**arrays["cost"]) if "cost" in arrays else None,
         noise=Noise(**arrays["noise"]) if "noise" in arrays else None,
         feedforward=Feedforward(**arrays["feedforward"]),
         current_loop=None if file.current_loop is None else CurrentLoop(**file.current_loop.model_dump()),
-        limits=Limits(**({"voltage": np.full(coils, np.inf)} | arrays["limits"])),
+        limits=Limits(**(unlimited | arrays["limits"])),
+        tracks="errors" if errors else "states",
     )
 
 
-def _parameters(plant: _Plant, path: str | Path) -> Parameters:
+def _observed(
+    file: GainFile, states: tuple[Signal, ...], forces: tuple[Signal, ...], n0: int, path: str | Path
+) -> tuple[Signal, ...]:
+    """The disturbances among the states, after stored forces. InputError for others."""
+    n, m = len(states), len(forces)
+    if (n - n0) % m:
+        raise InputError(path, "signals.states", f"{n} states", f"{n0} and a multiple of {m} stored forces")
+    observed = disturbances(forces) if states[-m:] == disturbances(forces) else ()
+    stored = stored_forces(forces, (n - n0 - len(observed)) // m) + observed
+    if states[n0:] != stored:
+        raise InputError(path, "signals.states", _names(states[n0:]), f"stored forces, as {_names(stored)}")
+    if observed and any(any(row) for row in file.gains.Ki):
+        both = "sums of errors beside observed disturbances"
+        raise InputError(path, "gains.Ki", both, "zeros: one of them takes off loads")
+    return observed
+
+
+def _check_error_law(
+    file: GainFile, arrays: Mapping[str, Mapping[str, FloatArray]], path: str | Path
+) -> None:
+    """InputError where the matrices are not those of a law of errors, as controller.py has them."""
+    model, gains = arrays["model"], arrays["gains"]
+    n, p = gains["L"].shape
+    if n < p:
+        raise InputError(path, "signals.states", f"{n} states", f"{p} at least, the last errors")
+    zeros = {"model.Bd": model["Bd"], "model.Cd": model["Cd"], "gains.Ki": gains["Ki"]}
+    zeros["model.Ad"] = model["Ad"][n - p :]
+    zeros["gains.L"] = gains["L"] - np.eye(n, p, p - n)
+    for key, M in zeros.items():
+        if M.any():
+            raise InputError(path, key, "other entries", "those of a law that tracks errors")
+    if file.cost is not None:
+        raise InputError(path, "cost", "some", "null of a law that tracks errors")
+
+
+def _endless(file: GainFile, key: str) -> bool:
+    """Whether there is no such limit, as a file may say."""
+    return getattr(file.limits, key) is None and (key == "voltage" or file.law is not None)
+
+
+def _parameters(plant: PlantTable, path: str | Path) -> Parameters:
+    if plant.linear is not None:
+        return linear_parameters(plant, plant.linear, path)
     try:
         record = parameters_record(machine(plant.name), path)
     except InputError as error:
         if error.where != "machine":
             raise
         raise InputError(path, "plant.name", error.found, error.expected) from error
-    units = units_of(record)
-    if set(plant.parameters) != set(units):
-        odd = sorted(set(plant.parameters) ^ set(units))
+    units, given = units_of(record), plant.parameters or {}
+    if set(given) != set(units):
+        odd = sorted(set(given) ^ set(units))
         raise InputError(path, "plant.parameters", f"{odd[0]} missing or unknown", " ".join(units))
-    for key, q in plant.parameters.items():
+    for key, q in given.items():
         if q.unit != units[key]:
             raise InputError(path, f"plant.parameters.{key}.unit", repr(q.unit), repr(units[key]))
     try:
-        return record(**{k: q.value for k, q in plant.parameters.items()}, preset=plant.preset)  # type: ignore[call-arg]
+        return record(**{k: q.value for k, q in given.items()}, preset=plant.preset)  # type: ignore[call-arg]
     except InputError as error:
         raise InputError(path, f"plant.parameters.{error.field}", error.found, error.expected) from error
 
 
 def _array(value: list[Any], shape: tuple[int, ...], path: str | Path, field: str) -> FloatArray:
+    if not value and 0 in shape:
+        return np.zeros(shape)
     rows = {len(row) for row in value} if len(shape) == 2 else set()
     found = (len(value), *rows) if len(rows) <= 1 else None
     if found != shape:
@@ -455,9 +373,9 @@ def _names(signals: tuple[Signal, ...]) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """Tables, lists, numbers and nulls for empty lists; no negative zeros, which some readers of JSON may lose."""
+    """Tables, lists, numbers and nulls for empty ones; no negative zeros, which some readers of JSON may lose."""
     if isinstance(value, Mapping):
-        return {key: _plain(entry) for key, entry in value.items()}
+        return {key: _plain(entry) for key, entry in value.items()} or None
     if isinstance(value, np.ndarray):
         return _plain(value.tolist())
     if isinstance(value, list):

@@ -141,10 +141,10 @@ def sampled_law(
     law, T = linear_law(controller), controller.sample_time
     n, m = len(controller.states), len(controller.forces)
     half = plant_of(controller.parameters).coordinates
-    p = len(law.A) - n
+    p = len(controller.measurements) if controller.integrating else 0
     # Sums of errors and stored forces in the coordinates of the modes, where these decouple.
     to_modes = np.eye(len(law.A))
-    if len(controller.measurements) == m == half:
+    if controller.tracks == "states" and len(controller.measurements) == m == half:
         if p:
             to_modes[n:, n:] = np.linalg.inv(controller.C[:, :half])
         for k in range(2 * half, n, m):

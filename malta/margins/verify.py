@@ -262,7 +262,8 @@ def own_poles(c: Controller) -> tuple[ComplexArray, ComplexArray]:
 def unstable_gain(c: Controller) -> tuple[str, float] | None:
     """Which gains leave the file's own model unstable, and the size of the worst eigenvalue; None: none do.
 
-    An LQG is judged by its regulator and its filter. A PID has no model: it is judged on the machine that it names.
+    An LQG is judged by its regulator and its filter. A PID or a law of errors has no model: it is judged on the machine
+    that it names.
     """
     if c.cost is None:
         plant = plant_of(c.parameters)
@@ -618,9 +619,9 @@ def _bandwidths(
 
 
 def _natural_frequencies(model: LinearModel, controller: Controller) -> dict[str, float]:
-    """Of q'' = (k - G K1) q, rad/s; none where the states are not (q, q')."""
+    """Of q'' = (k - G K1) q, rad/s; none where the states are not (q, q'), or nothing is fed back of them."""
     n = model.plant.coordinates
-    if not n:
+    if not n or controller.tracks == "errors":
         return {}
     closed = model.force_map @ controller.K[:, :n] - model.stiffness
     w_n = np.sqrt(np.maximum(eigenvalues(closed).real, 0))

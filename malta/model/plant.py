@@ -130,8 +130,8 @@ class Electronics:
 class Plant:
     """A machine: equations of motion that CasADi can trace, and the names and units of its signals.
 
-    `states` are positions, then their rates in the same order (`second_order`); a machine whose states are others has no
-    natural frequencies, no PID and no feedforward of speeds. `uncontrolled` are states that no input reaches, as the
+    `states` are positions, then their rates in the same order (`second_order`); a machine whose states are others has
+    no natural frequencies, no PID and no feedforward of speeds. `uncontrolled` are states that no input reaches, as the
     rotation of a round mover: they are simulated, and left out of the design.
 
     The inputs are forces. `currents(y, v)` gives the coil currents for the forces v at the measured position y; they
@@ -260,6 +260,26 @@ class Plant:
         if not self.thrust:
             raise InputError(self.name, "thrust", "none", "a machine with a stroke")
         return [s.name for s in self.inputs].index(self.thrust)
+
+    def nlsys(self) -> Any:
+        """The machine as a continuous control.NonlinearIOSystem with names; CasADi computes its rates and outputs.
+
+        x' = f(x, u, w + load(x)), y = h(x, u): its inputs are those of the machine, then the disturbances w.
+        """
+        import control  # imports matplotlib and takes a second: only where it is used
+
+        m, kind = len(self.inputs), ca.MX if self.tabulated else ca.SX
+        x, u = kind.sym("x", len(self.states)), kind.sym("u", m + len(self.disturbances))
+        rate = ca.Function("rate", [x, u], [ca.densify(self.f(x, u[:m], u[m:] + self.load(x)))])
+        outputs = ca.Function("outputs", [x, u], [ca.densify(self.h(x, u[:m]))])
+        return control.nlsys(
+            lambda _, x, u, __: np.array(rate(x, u)).ravel(),
+            lambda _, x, u, __: np.array(outputs(x, u)).ravel(),
+            name=self.name,
+            states=[s.name for s in self.states],
+            inputs=[s.name for s in (*self.inputs, *self.disturbances)],
+            outputs=[s.name for s in self.outputs],
+        )
 
     def at(self, /, **positions: float) -> OperatingPoint:
         """The operating point at these states (SI), the others zero, at the preload of the design model.

@@ -44,6 +44,7 @@ from malta.synthesis.controller import (
     CurrentLoop,
     commanded,
     estimated,
+    filtered,
     gains_of,
 )
 
@@ -110,7 +111,8 @@ def layout(plant: Plant, c: Controller, s: Setup) -> Layout:
     if s.faulty:
         controller |= {"y_last": p, "command": held}
     controller |= {"under_way": held * s.delay}
-    given = {"p_ref": p, "dp_ref": p, "v_ff": m, "v_past": n - len(c.A)}  # and zero for disturbances
+    given = {"p_ref": p, "dp_ref": p, "v_ff": m}
+    given["v_past"] = n - len(c.A) if c.tracks == "states" else 0  # and zero for disturbances
     if s.disturbed:
         given |= {"w": len(plant.disturbances)}
     if s.faulty:
@@ -346,12 +348,11 @@ def _decided(
 ) -> tuple[dict[str, Any], Any, dict[str, Any]]:
     """The control law and the current controllers: controller state after, commands to hold, their part of the row."""
     C = _scheduled_C(c, y) if s.scheduled else None
-    xi_hat = given["xi_hat"] if s.outside else estimated(g, controller["xi_pred"], y, C)
-    p_ref, dp_ref, v_ff = (given[name] for name in ("p_ref", "dp_ref", "v_ff"))
+    p_ref, v_ff = given["p_ref"], given["v_ff"]
+    taken = filtered(c.tracks, y, p_ref)
+    xi_hat = given["xi_hat"] if s.outside else estimated(g, controller["xi_pred"], taken, C)
     believed = plant_of(c.parameters)
-    rates = len(c.feedforward.rate)
-    faster = ca.vertcat(ca.DM(len(c.A) - rates, 1), g["rate"] @ dp_ref)
-    xi_ref = ca.vertcat(state_reference(believed)(p_ref, dp_ref) + faster, given["v_past"])
+    xi_ref = _law_reference(c, believed, g, given)
     e_now, frozen_now = controller["e"], controller["frozen"]
     xi_pred, e, frozen, v = commanded(g, xi_hat, e_now, frozen_now, y, p_ref, xi_ref, v_ff, v0)
     if s.open_loop:
@@ -386,6 +387,15 @@ def _decided(
     size = command.numel()
     after["under_way"] = queue[size:]
     return after, queue[:size], row
+
+
+def _law_reference(c: Controller, believed: Plant, g: Mapping[str, Any], given: Mapping[str, Any]) -> Any:
+    """xi*: what the states of the law should be; 0 of a law of errors."""
+    if c.tracks == "errors":
+        return ca.DM(len(c.states), 1)
+    p_ref, dp_ref, rates = given["p_ref"], given["dp_ref"], len(c.feedforward.rate)
+    faster = ca.vertcat(ca.DM(len(c.A) - rates, 1), g["rate"] @ dp_ref)
+    return ca.vertcat(state_reference(believed)(p_ref, dp_ref) + faster, given["v_past"])
 
 
 @lru_cache(maxsize=16)

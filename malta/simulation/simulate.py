@@ -440,6 +440,8 @@ def setup_of(plant: Plant, c: Controller, s: Scenario) -> Setup:
         raise InputError(f"scenario {s.name}", "estimator", found, "steady-state, or fidelity force")
     if own and (s.real_pwm or s.bearing_axes == "turning" or "open phase" in kinds or "link sag" in kinds):
         raise InputError(f"scenario {s.name}", "fidelity", "options of a drive", "those of the electronics")
+    if s.scheduled and c.tracks == "errors":
+        raise InputError(f"scenario {s.name}", "scheduled", "a law of errors", "one with a filter of states")
     known = [signal.name for signal in plant.sensor_errors]
     for name, value in (s.sensor_errors or {}).items():
         if name not in known:
@@ -502,7 +504,7 @@ def shape_of(plant: Plant, c: Controller, setup: Setup) -> _Shape:
         for m in gains_of(c).values()
     )
     fixed = tuple(shaping(par).items())
-    return _Shape((type(par), kin, twins, fixed, patterns, c.parameters), plant, c, setup)
+    return _Shape((type(par), kin, twins, fixed, patterns, c.tracks, c.parameters), plant, c, setup)
 
 
 @lru_cache(maxsize=32)
@@ -761,7 +763,8 @@ def beginning(plant: Plant, c: Controller, scenario: Scenario, first: FloatArray
     x = plant.state(dict(zip(design, moving.tolist(), strict=True)) | dict(scenario.start))
     xi_pred, current = np.zeros(n), np.zeros(len(plant.actuator.coils))
     if not scenario.cold:
-        xi_pred[: len(design)] = x[list(plant.controlled)]
+        if c.tracks == "states":
+            xi_pred[: len(design)] = x[list(plant.controlled)]
         held = c.feedforward.at(position_in(plant, x))
         if c.delay:  # what acted before, with currents that were commutated for here
             n, m = len(design), len(held)

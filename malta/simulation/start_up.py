@@ -38,7 +38,8 @@ Observer = Callable[
 def observer(plant: Plant, c: Controller, setup: Setup, kind: str, substeps: int, errors: Any) -> Observer:
     """Runs control periods one by one with an estimate of its own: (engine, state, given, noise) -> (state, rows)."""
     if c.noise is None or c.observed:
-        found = "a PID" if c.noise is None else "forces of disturbance in its own"
+        without = "a PID" if c.tracks == "states" else "a law of errors"
+        found = without if c.noise is None else "forces of disturbance in its own"
         raise InputError("simulate", f"estimator {kind}", found, "an LQG with integrals")
     believed = plant_of(c.parameters)
     believed.require_second_order(f"estimator {kind}")

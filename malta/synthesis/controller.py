@@ -20,14 +20,18 @@ reference.
 
 A PID controller is the same law: its filter takes positions as measured and rates as filtered differences,
 Ad = diag(1, a), Bd = 0, L = (P^-1, (1 - a) P^-1 / Ts), and it has neither a cost nor noise that it was designed for.
+
+So is any discrete linear system s+ = A s + B u, v = C s + D u of the errors u = p* - y, as an H-infinity controller
+(`tracks` = "errors", state_space.controller_of). Step 2 takes y - p* in place of y, and xi* = 0:
+xi = (s, y - p*), Ad = [[A, -B], [0, 0]], Bd = 0, Cd = 0, L = (0, 1), K = (-C, D), Ki = 0.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
-from functools import lru_cache
-from typing import TYPE_CHECKING, Any, NamedTuple
+from dataclasses import dataclass, field, fields
+from functools import cached_property, lru_cache
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -40,6 +44,9 @@ if TYPE_CHECKING:
     from malta.synthesis.lqg import Gains
 
 
+Tracks = Literal["states", "errors"]
+
+
 @dataclass(frozen=True, eq=False)
 class Feedforward:
     """v_ff = inertia p*'' + speed p*'; v0(z) of the stroke z, linear between the grid points, constant beyond them.
@@ -50,7 +57,7 @@ class Feedforward:
 
     inertia: FloatArray  # kg or kg m^2, m inputs; times the output of the same index
     speed: FloatArray  # m x p, N s/m
-    rate: FloatArray  # n0 / 2 x p, rates at the samples beyond P^-1 p*', per unit of p*'
+    rate: FloatArray  # n0 / 2 x p (none without q'), rates at the samples beyond P^-1 p*', per unit of p*'
     z_grid: FloatArray  # m, g points
     v0: FloatArray  # N, g x m
 
@@ -142,11 +149,12 @@ class Controller:
     K: FloatArray  # m x n
     Ki: FloatArray  # m x p
     L: FloatArray  # n x p, filter form
-    cost: Cost | None  # None, as the noise: a PID
+    cost: Cost | None  # None, as the noise: a PID, or a law of errors
     noise: Noise | None
     feedforward: Feedforward
     current_loop: CurrentLoop | None  # None: currents follow their commands at once
     limits: Limits
+    tracks: Tracks = field(default="states", metadata={"later": True})  # what the filter takes: y, or y - p*
 
     def __post_init__(self) -> None:
         for f in fields(self):
@@ -167,24 +175,34 @@ class Controller:
 
     @property
     def delay(self) -> int:
-        """Samples of delay in the design model."""
+        """Samples of delay in the design model; 0 of a law of errors, which says nothing of its model."""
+        if self.tracks == "errors":
+            return 0
         return (len(self.Ad) - len(self.A)) // len(self.forces) - self.observed
 
     @property
     def observed(self) -> int:
         """1 where forces of disturbance are among the states, else 0."""
-        return int(self.states[-len(self.forces) :] == disturbances(self.forces))
+        return int(self.tracks == "states" and self.states[-len(self.forces) :] == disturbances(self.forces))
 
     @property
     def integrating(self) -> bool:
         """Whether sums of errors are fed back."""
         return bool(self.Ki.any())
 
+    @cached_property
+    def sys(self) -> Any:
+        """The law without saturation as a discrete control.StateSpace: see state_space.law_system."""
+        from malta.synthesis.state_space import law_system
+
+        return law_system(self)
+
 
 class LinearLaw(NamedTuple):
     """The law without saturation: s+ = A s + B_y y + B_r r, v = C s + D_y y + D_r r.
 
-    s = (xi_pred, e), without e where it is not fed back; r = (p*, xi*, v_ff, v0).
+    s = (xi_pred, e), without e where it is not fed back, and of a law of errors without the last error, which is new at
+    every sample; r = (p*, xi*, v_ff, v0).
     """
 
     A: FloatArray
@@ -209,6 +227,11 @@ def gains_of(c: Controller) -> dict[str, ca.DM]:
     """What the law computes with, sparse: exact zeros cost nothing at run time."""
     matrices = {name: ca.sparsify(ca.DM(getattr(c, name))) for name in ("Ad", "Bd", "Cd", "K", "Ki", "L")}
     return matrices | {"force_limit": ca.DM(c.limits.force), "control_time": ca.DM(c.sample_time)}
+
+
+def filtered(tracks: Tracks, y: Any, p_ref: Any) -> Any:
+    """The reading that step 2 takes: y, or y - p* in a law of errors."""
+    return y - p_ref if tracks == "errors" else y
 
 
 def estimated(g: Mapping[str, Any], xi_pred: Any, y: Any, C: Any = None) -> Any:
@@ -239,16 +262,18 @@ def law(c: Controller) -> ca.Function:
 
     (xi_pred, e, frozen, y, p_ref, xi_ref, v_ff, v0) -> (xi_pred, e, frozen, v, xi_hat)
     """
-    args, outputs = _symbolic_law(gains_of(c), len(c.states), len(c.forces), len(c.measurements))
+    args, outputs = _symbolic_law(gains_of(c), len(c.states), len(c.forces), len(c.measurements), c.tracks)
     return ca.Function("law", list(args.values()), list(outputs.values()), list(args), list(outputs))
 
 
-def _symbolic_law(g: Mapping[str, Any], n: int, m: int, p: int) -> tuple[dict[str, ca.SX], dict[str, ca.SX]]:
+def _symbolic_law(
+    g: Mapping[str, Any], n: int, m: int, p: int, tracks: Tracks = "states"
+) -> tuple[dict[str, ca.SX], dict[str, ca.SX]]:
     """Symbols of the law's arguments and expressions of its results, each by name; gains may be symbols too."""
     sizes = {"xi_pred": n, "e": p, "frozen": p, "y": p, "p_ref": p, "xi_ref": n, "v_ff": m, "v0": m}
     args = {name: ca.SX.sym(name, size) for name, size in sizes.items()}
     xi_pred, e, frozen, *given = args.values()
-    xi_hat = estimated(g, xi_pred, args["y"])
+    xi_hat = estimated(g, xi_pred, filtered(tracks, args["y"], args["p_ref"]))
     xi_pred_next, e_next, frozen_next, v = commanded(g, xi_hat, e, frozen, *given)
     return args, {
         "xi_pred_next": xi_pred_next,
@@ -268,8 +293,13 @@ def linear_law(c: Controller) -> LinearLaw:
     args = {step.name_in(i): ca.SX.sym(step.name_in(i), *step.size_in(i)) for i in range(step.n_in())}
     out = dict(zip(step.name_out(), step(*args.values()), strict=True))
     blocks = _blocks(args, out, integrating=c.integrating)
-    found = ca.Function("linear", list(args.values()), blocks)(*[0] * len(args))
-    return LinearLaw(*(readonly(np.array(M)) for M in found))
+    found = LinearLaw(
+        *(np.array(M) for M in ca.Function("linear", list(args.values()), blocks)(*[0] * len(args)))
+    )
+    if c.tracks == "errors":
+        k = len(c.states) - len(c.measurements)
+        found = found._replace(A=found.A[:k, :k], B_y=found.B_y[:k], B_r=found.B_r[:k], C=found.C[:, :k])
+    return LinearLaw(*map(readonly, found))
 
 
 def linear_law_of(g: Gains, Ts: float) -> LinearLaw:

@@ -58,6 +58,8 @@ from malta.synthesis.spec import (
 from malta.threads import on_one_thread
 
 if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
     from malta.model.plant import ComplexArray, FloatArray
 
 V0_STEP = 0.25e-3  # m, longest step of the grid of v0(z)
@@ -235,7 +237,7 @@ def lqg(
     plant = model.plant
     observed = disturbances(plant.inputs) if weights.drift_variance.size else ()
     return Controller(
-        **_machine_part(model, Ts, delay, current_loop_delay=current_loop_delay),
+        **machine_part(model, Ts, delay, current_loop_delay=current_loop_delay),
         **found._asdict(),
         name=name,
         states=plant.design_states + stored_forces(plant.inputs, delay) + observed,
@@ -246,26 +248,52 @@ def lqg(
     )
 
 
+def weights(
+    q: ArrayLike, r: ArrayLike, w: ArrayLike, v: ArrayLike, *, q_i: ArrayLike | None = None
+) -> Weights:
+    """Weights in SI units, without bases: of the cost, and variances of a sample of forces (w) and sensors (v).
+
+    A vector or a diagonal matrix each; q_i: of the integrals of the errors, none if None.
+    Raises InputError for a matrix that is not diagonal, and as Weights.
+
+    >>> import malta
+    >>> malta.weights([1e8, 1e4], [1], [1e-2], [1e-12]).Q.tolist()
+    [[100000000.0, 0.0], [0.0, 10000.0]]
+    """
+    of_states, of_inputs, forces, sensors = (
+        _diagonal(name, value) for name, value in (("q", q), ("r", r), ("w", w), ("v", v))
+    )
+    integrals = np.zeros(len(sensors)) if q_i is None else _diagonal("q_i", q_i)
+    return _without_bases(of_states, of_inputs, integrals, forces, sensors, np.zeros(0))
+
+
+def _diagonal(name: str, value: ArrayLike) -> FloatArray:
+    found: FloatArray = np.atleast_1d(np.asarray(value, dtype=float))
+    if found.ndim == 1:
+        return found
+    if found.ndim != 2 or found.shape[0] != found.shape[1] or np.any(found - np.diag(np.diag(found))):
+        raise InputError(
+            "weights", name, f"shape {found.shape}, not diagonal", "a vector or a diagonal matrix"
+        )
+    return np.diag(found)
+
+
 def weights_of(controller: Controller) -> Weights:
     """What an LQG was designed for, on bases of one SI unit. InputError for a PID, which was not."""
     cost, noise = controller.cost, controller.noise
     if cost is None or noise is None:
         raise InputError(controller.name, "cost", "none, as a PID has", "an LQG")
+    return _without_bases(cost.state, cost.input, cost.integral, noise.process, noise.sensor, noise.drift)
+
+
+def _without_bases(
+    q: FloatArray, r: FloatArray, q_i: FloatArray, w: FloatArray, v: FloatArray, drift: FloatArray
+) -> Weights:
     one = np.ones_like
-    return Weights(
-        q=cost.state,
-        q_base=one(cost.state),
-        r=cost.input,
-        r_base=one(cost.input),
-        q_i=cost.integral,
-        q_i_base=one(cost.integral),
-        process_variance=noise.process,
-        sensor_variance=noise.sensor,
-        drift_variance=noise.drift,
-    )
+    return Weights(q, one(q), r, one(r), q_i, one(q_i), w, v, drift)
 
 
-def _machine_part(model: LinearModel, Ts: float, delay: int, *, current_loop_delay: bool) -> dict[str, Any]:
+def machine_part(model: LinearModel, Ts: float, delay: int, *, current_loop_delay: bool) -> dict[str, Any]:
     """What of a controller its machine decides, not its law."""
     plant, actuator = model.plant, model.plant.actuator
     loop = None
@@ -315,7 +343,7 @@ def pid(
     plant.require_second_order("pid")
     if len(terms.Kp) != len(plant.inputs):
         raise InputError("pid", "Kp", f"{len(terms.Kp)} gains", f"{len(plant.inputs)}, one for each input")
-    part = _machine_part(model, Ts, plant.actuator.delay(Ts), current_loop_delay=current_loop_delay)
+    part = machine_part(model, Ts, plant.actuator.delay(Ts), current_loop_delay=current_loop_delay)
     # Differences of readings are the mean rate between them, whatever the rate at the readings is.
     part["feedforward"] = replace(part["feedforward"], rate=np.zeros((half, len(plant.outputs))))
     return Controller(

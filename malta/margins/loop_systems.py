@@ -1,0 +1,86 @@
+"""The loop of a machine and a controller as systems of python-control: to plot, to simulate, to compute with.
+
+       v  +-----+        +-----+  y             at the sensors   L = -P F,  S = (I + L)^-1,  T = I - S
+    +--o->|  P  |------->|  F  |--+             at the forces    L = -F P,  likewise
+    |     +-----+        +-----+  |
+    +-----------------------------+
+
+P is the machine as it runs, sampled: hold, delay, current loops, the loads against v0(z). F is the law, with negative
+feedback inside. They are those of verify.machine_loop.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from malta.margins.verify import machine_loop
+from malta.model.linearize import linearize
+from malta.model.plant import Plant
+from malta.synthesis.controller import Controller
+from malta.synthesis.state_space import reference_names, set_point
+from malta.threads import on_one_thread
+
+
+@dataclass(frozen=True, eq=False)
+class LoopSystems:
+    """Discrete control.StateSpace with the names of the machine's signals."""
+
+    P: Any  # forces -> outputs
+    F: Any  # measurements -> forces
+    L: Any  # at the sensors
+    S: Any
+    T: Any
+    L_forces: Any
+    S_forces: Any
+    T_forces: Any
+    tracking: Any  # references at rest, as "z_ref" -> outputs
+
+
+@on_one_thread
+def loop_systems(plant: Plant, controller: Controller) -> LoopSystems:
+    """The loop of a controller on a machine, at the controller's operating point.
+
+    Currents that are held between samples hang on the last reading, too: at the sensors this is part of F, and broken
+    with it; P, F and what is taken at the forces have it in the machine.
+
+    Example: `control.bode_plot(malta.loop_systems(plant, controller).S)`
+    Raises CheckError where no input holds the machine there.
+    """
+    loop = machine_loop(linearize(plant, plant.point(controller.operating_point[0])), controller)
+    law, m = loop.control, len(controller.forces)
+    n, k, p = len(loop.Ad), len(law.A), len(loop.Cd)
+    Cd, B1 = loop.Cd, loop.Bd[:, :m]
+    Ad = loop.Ad + (loop.Bd[:, m:] @ Cd if loop.Bd.shape[1] > m else 0)  # with what hangs on the reading
+    C1, D1, R = law.C[:m], law.D_y[:m], set_point(controller)
+    read = np.vstack([loop.Bd @ law.D_y, law.B_y])  # of an error of the reading
+    pushed = np.vstack([B1, np.zeros((k, m))])
+    sent = np.vstack([B1 @ law.D_r[:m] @ R, law.B_r @ R])
+    y, v = np.hstack([Cd, np.zeros((p, k))]), np.hstack([D1 @ Cd, C1])
+    cut_at_sensors = np.block([[loop.Ad, loop.Bd @ law.C], [np.zeros((k, n)), law.A]])
+    cut_at_forces = np.block([[Ad, np.zeros((n, k))], [law.B_y @ Cd, law.A]])
+    forces, outputs = ([s.name for s in signals] for signals in (plant.inputs, plant.outputs))
+    Ts, references = controller.sample_time, reference_names(controller)
+    one_p, one_m = np.eye(p), np.eye(m)
+    return LoopSystems(
+        P=_system("P", forces, outputs, Ts, Ad, B1, Cd),
+        F=_system("F", outputs, forces, Ts, law.A, law.B_y, C1, D1),
+        L=_system("L", outputs, outputs, Ts, cut_at_sensors, read, -y),
+        S=_system("S", outputs, outputs, Ts, loop.closed, read, y, one_p),
+        T=_system("T", outputs, outputs, Ts, loop.closed, read, -y),
+        L_forces=_system("L_forces", forces, forces, Ts, cut_at_forces, pushed, -v),
+        S_forces=_system("S_forces", forces, forces, Ts, loop.closed, pushed, v, one_m),
+        T_forces=_system("T_forces", forces, forces, Ts, loop.closed, pushed, -v),
+        tracking=_system("tracking", references, outputs, Ts, loop.closed, sent, y),
+    )
+
+
+def _system(
+    name: str, inputs: list[str], outputs: list[str], Ts: float, A: Any, B: Any, C: Any, D: Any = 0
+) -> Any:
+    import control  # imports matplotlib and takes a second: only where it is used
+
+    D = np.zeros((len(C), B.shape[1])) + D
+    return control.ss(A, B, C, D, Ts, name=name, inputs=inputs, outputs=outputs)

@@ -1,0 +1,294 @@
+"""A machine from plain matrices: x' = A x + B (u + d), y = C x, with entries that may be uncertain.
+
+    A = A0 + sum of p_i A_i, and B, C likewise      the parameters p by name; none where all entries are known
+
+Such a machine is designed for, verified, simulated and flown in campaigns as any other. Its currents are its inputs, d
+are its disturbances. Its gain file carries the matrices, so that reading the file back needs no module.
+"""
+
+from __future__ import annotations
+
+import keyword
+import math
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, make_dataclass
+from functools import cache
+from typing import TYPE_CHECKING, Any, TypedDict, cast
+
+import casadi as ca
+import numpy as np
+
+from malta.errors import InputError
+from malta.model.data import check_parameters, plant_of, si
+from malta.model.machines import machine_names
+from malta.model.plant import Actuator, Parameters, Plant, Signal
+
+if TYPE_CHECKING:
+    from typing import Unpack
+
+    from malta.model.plant import FloatArray
+
+Rows = tuple[tuple[float, ...], ...]
+LETTERS = "ABC"
+CALLER = "linear_machine"
+
+
+@dataclass(frozen=True)
+class LinearSystem:
+    """All of a linear machine but the values of its parameters: what its gain file holds. Equal by content."""
+
+    states: tuple[Signal, ...]  # n
+    inputs: tuple[Signal, ...]  # m
+    outputs: tuple[Signal, ...]  # p
+    matrices: tuple[Rows, Rows, Rows]  # A0 n x n, B0 n x m, C0 p x n
+    terms: tuple[tuple[str, tuple[Rows, Rows, Rows]], ...]  # by parameter: what it multiplies in A, B, C
+    limit: tuple[float, ...]  # m, of each input, its unit; inf: none
+    noise: tuple[float, ...]  # p, rms of a sample, the unit of each output
+    dead_time: float  # s, from measurement to force
+
+
+class Details(TypedDict, total=False):
+    """What of a linear machine has a default.
+
+    name : the machine's own name
+    states, inputs, outputs : names, "z [m]" with a unit, or Signals; those of a StateSpace, else x1 x2 ..., u1, y1
+    nominal : values of the parameters, as {"k": 1.5}
+    terms : what each parameter multiplies, as {"k": (A1, B1, C1)}; None, or left out at the end: zeros
+    limit : of the inputs: a number for all of them, or one for each; none
+    noise : of the sensors, rms of a sample, likewise; none
+    dead_time : s, from measurement to force; none
+    """
+
+    name: str
+    states: Sequence[str | Signal]
+    inputs: Sequence[str | Signal]
+    outputs: Sequence[str | Signal]
+    nominal: Mapping[str, float]
+    terms: Mapping[str, Sequence[Any]]
+    limit: float | Sequence[float]
+    noise: float | Sequence[float]
+    dead_time: float
+
+
+def linear_machine(A: Any, B: Any = None, C: Any = None, **details: Unpack[Details]) -> Plant:
+    """A machine x' = A x + B (u + d), y = C x from matrices, or from a continuous control.StateSpace in place of A.
+
+    A : n x n, B : n x m, C : m x n, as many outputs as inputs for a design; details : see `Details`
+
+    Positions that stand first with their rates after them, A = [[0, I], ...], make a machine of second order as those
+    that malta ships. Other states are as good for an LQG and a margin. Their reference is the rest at which the outputs
+    are what is asked for: [A B; C 0] (x*, u*) = (0, p*), in the least-squares sense.
+
+    Raises InputError for shapes and values that do not fit, a system that is discrete or passes its inputs on (D).
+
+    >>> import malta
+    >>> cart = malta.linear_machine([[0, 1], [0, -0.1]], [[0], [2]], [[1, 0]], name="cart", states=["z [m]", "v [m/s]"])
+    >>> malta.linearize(cart, cart.at()).A.tolist()
+    [[0.0, 1.0], [0.0, -0.1]]
+    """
+    for key in details:
+        if key not in Details.__annotations__:
+            known = " ".join(Details.__annotations__)
+            raise InputError(CALLER, key, "an unknown detail", f"one of {known}")
+    if B is None and C is None:
+        A, B, C, labels = _of_state_space(A)
+        details = {**labels, **details}
+    matrices = (_matrix("A", A), _matrix("B", B), _matrix("C", C))
+    n, m, p = len(matrices[0]), matrices[1].shape[1], len(matrices[2])
+    for letter, M, shape in zip(LETTERS, matrices, ((n, n), (n, m), (p, n)), strict=True):
+        if M.shape != shape or not M.size:
+            raise InputError(CALLER, letter, f"shape {M.shape}", f"{shape}, at least 1 x 1")
+    nominal = details.get("nominal", {})
+    system = LinearSystem(
+        _signals("states", details.get("states"), "x", n),
+        _signals("inputs", details.get("inputs"), "u", m),
+        _signals("outputs", details.get("outputs"), "y", p),
+        _rows(matrices),
+        _terms(nominal, details.get("terms", {}), matrices),
+        _numbers("limit", details.get("limit", math.inf), m, zero=False),
+        _numbers("noise", details.get("noise", 0.0), p),
+        _numbers("dead_time", details.get("dead_time", 0.0), 1)[0],
+    )
+    if not math.isfinite(sum(system.noise) + system.dead_time):
+        raise InputError(CALLER, "noise, dead_time", "infinity", "finite numbers")
+    if len({math.isinf(limit) for limit in system.limit}) > 1:
+        raise InputError(CALLER, "limit", str(system.limit), "one for each of the inputs, or none")
+    return plant_of(record_of(system, nominal, details.get("name", "linear")))
+
+
+def record_of(system: LinearSystem, values: Mapping[str, float], name: str) -> Parameters:
+    """The parameters of a linear machine: a field for each, the system, and the machine's name as the preset."""
+    if not isinstance(name, str) or not name or name in machine_names():
+        raise InputError(CALLER, "name", repr(name), "a name that no other machine has")
+    return cast("Parameters", _record(tuple(values))(*values.values(), system, name))
+
+
+@cache
+def _record(names: tuple[str, ...]) -> Callable[..., Any]:
+    """The class of the parameters with these names; one for all machines that have the same."""
+    entries: list[Any] = [(name, float, si("1")) for name in names]
+    entries.append(("system", LinearSystem, field(metadata={"shapes": True})))
+    entries.append(("preset", str, "linear"))
+    own = {
+        "__module__": __name__,  # where `plant` stands
+        "__post_init__": lambda record: check_parameters(record, CALLER),
+        "__reduce__": _reduced,
+    }
+    return make_dataclass("Parameters", entries, frozen=True, namespace=own)
+
+
+def _reduced(record: Any) -> tuple[Any, ...]:
+    """How pickle makes a record again, whose class has no name in this module."""
+    values = {name: getattr(record, name) for name, _ in record.system.terms}
+    return record_of, (record.system, values, record.preset)
+
+
+def is_linear(parameters: Any) -> bool:
+    """Whether these are the parameters of a linear machine."""
+    return isinstance(getattr(parameters, "system", None), LinearSystem)
+
+
+def plant(par: Any) -> Plant:
+    """The linear machine with these parameters, which may be CasADi symbols."""
+    s: LinearSystem = par.system
+    A, B, C = (ca.sparsify(ca.DM(M)) for M in s.matrices)
+    for name, terms in s.terms:
+        p = getattr(par, name)
+        A, B, C = (M + p * ca.sparsify(ca.DM(T)) for M, T in zip((A, B, C), terms, strict=True))
+
+    def position_of(y: Any) -> Any:
+        a, b, c = (np.array(ca.DM(M)) for M in (A, B, C))
+        return ca.DM(_rest(a, b, c, made.coordinates)) @ y
+
+    made = Plant(
+        name=par.preset,
+        parameters=par,
+        variant=plant,
+        states=s.states,
+        inputs=s.inputs,
+        outputs=s.outputs,
+        disturbances=tuple(Signal(f"d_{u.name}", u.unit) for u in s.inputs),
+        f=lambda x, u, w: A @ x + B @ (u + w),
+        h=lambda x, _: C @ x,
+        position_of=position_of,
+        actuator=Actuator(
+            coils=s.inputs,
+            force_constant=(1.0,) * len(s.inputs),
+            current_limit=math.inf,
+            force_limit=s.limit,
+            dead_time=s.dead_time,
+        ),
+        limited=lambda i: i,
+        noise=s.noise,
+    )
+    return made
+
+
+def _rest(A: FloatArray, B: FloatArray, C: FloatArray, coordinates: int) -> FloatArray:
+    """The states at rest by the outputs there; of (q, q') the positions."""
+    n, p, half = len(A), len(C), coordinates
+    if half and p == half and np.linalg.matrix_rank(C[:, :half]) == half:
+        return np.asarray(np.linalg.inv(C[:, :half]))
+    whole = np.block([[A, B], [C, np.zeros((p, B.shape[1]))]])
+    asked = np.vstack([np.zeros((n, p)), np.eye(p)])
+    return np.asarray(np.linalg.lstsq(whole, asked, rcond=None)[0][: half or n])
+
+
+def _of_state_space(source: Any) -> tuple[Any, Any, Any, Details]:
+    wanted = "matrices A, B, C, or a continuous control.StateSpace"
+    if not all(hasattr(source, name) for name in ("A", "B", "C", "D", "dt", "state_labels")):
+        raise InputError(CALLER, "A", f"a {type(source).__name__} alone", wanted)
+    if source.dt not in (0, None):
+        raise InputError(CALLER, "A", f"a discrete system, dt = {source.dt}", wanted)
+    if np.any(source.D):
+        raise InputError(CALLER, "D", "inputs that the outputs follow at once", "zeros")
+    labels: Details = {} if re.fullmatch(r"sys\[\d+\].*", source.name) else {"name": source.name}
+    if source.state_labels != [
+        f"x[{k}]" for k in range(source.nstates)
+    ]:  # not those that the library numbers
+        labels["states"] = source.state_labels
+    if source.input_labels != [f"u[{k}]" for k in range(source.ninputs)]:
+        labels["inputs"] = source.input_labels
+    if source.output_labels != [f"y[{k}]" for k in range(source.noutputs)]:
+        labels["outputs"] = source.output_labels
+    return source.A, source.B, source.C, labels
+
+
+def _matrix(name: str, value: Any) -> FloatArray:
+    try:
+        found = np.array(value, dtype=float)
+    except (TypeError, ValueError) as error:
+        raise InputError(CALLER, name, f"a {type(value).__name__}", "a matrix of numbers") from error
+    if found.ndim != 2 or not np.isfinite(found).all():
+        what = "NaN or infinity" if found.ndim == 2 else f"{found.ndim} dimensions"
+        raise InputError(CALLER, name, what, "a matrix of finite numbers, as [[0, 1], [2, 0]]")
+    return found
+
+
+def _rows(matrices: Sequence[FloatArray]) -> tuple[Rows, Rows, Rows]:
+    A, B, C = (tuple(tuple(map(float, row)) for row in M + 0.0) for M in matrices)
+    return A, B, C
+
+
+def _terms(
+    nominal: Any, terms: Any, base: Sequence[FloatArray]
+) -> tuple[tuple[str, tuple[Rows, Rows, Rows]], ...]:
+    """The terms in the order of the nominal values. Raises InputError."""
+    for what, given in (("nominal", nominal), ("terms", terms)):
+        if not isinstance(given, Mapping):
+            raise InputError(CALLER, what, f"a {type(given).__name__}", "a table by parameter")
+    for name in {**nominal, **terms}:
+        if name not in nominal or name not in terms:
+            where = "nominal" if name not in nominal else "terms"
+            raise InputError(CALLER, f"{where}.{name}", "nothing", "a nominal value and its terms")
+        if not str(name).isidentifier() or keyword.iskeyword(name) or name in ("system", "preset"):
+            raise InputError(CALLER, f"nominal.{name}", "this name", "a name as Python has them")
+    found = []
+    for name in nominal:
+        parts = (
+            list(terms[name]) if isinstance(terms[name], tuple | list) else [terms[name], None, None, None]
+        )
+        parts += [None] * (len(base) - len(parts))
+        if len(parts) != len(base):
+            raise InputError(CALLER, f"terms.{name}", f"{len(parts)} matrices", "(A1, B1, C1)")
+        own = [
+            np.zeros_like(M) if part is None else _matrix(f"terms.{name}", part)
+            for M, part in zip(base, parts, strict=True)
+        ]
+        for letter, M, part in zip(LETTERS, base, own, strict=True):
+            if M.shape != part.shape:
+                raise InputError(CALLER, f"terms.{name}: {letter}", f"shape {part.shape}", f"{M.shape}")
+        found.append((name, _rows(own)))
+    return tuple(found)
+
+
+def _signals(what: str, given: Any, letter: str, count: int) -> tuple[Signal, ...]:
+    if given is None:
+        return tuple(Signal(f"{letter}{k + 1}", "1") for k in range(count))
+    if isinstance(given, str) or not isinstance(given, Sequence) or len(given) != count:
+        found = f"{len(given)} names" if isinstance(given, Sequence) else repr(given)
+        raise InputError(CALLER, what, found, f"{count} names in a list")
+    return tuple(_signal(what, one) for one in given)
+
+
+def _signal(what: str, given: Any) -> Signal:
+    text = given.name if isinstance(given, Signal) else given
+    if not isinstance(text, str) or not text.strip() or "." in text.partition(" [")[0]:
+        raise InputError(CALLER, what, repr(given), 'a name without dots, or "z [m]"')
+    name, opened, unit = text.rpartition(" [")
+    if isinstance(given, Signal):
+        return given
+    return Signal(name, unit[:-1]) if opened and unit.endswith("]") else Signal(text, "1")
+
+
+def _numbers(what: str, given: Any, count: int, *, zero: bool = True) -> tuple[float, ...]:
+    """Numbers of at least, or above, 0: one for all, or as many as `count`. Raises InputError."""
+    wanted = f"{count} of at least 0, or one for all" if zero else f"{count} above 0, or one for all"
+    try:
+        found = np.broadcast_to(np.asarray(given, dtype=float), (count,))
+    except (TypeError, ValueError) as error:
+        raise InputError(CALLER, what, repr(given), wanted) from error
+    if not (found >= 0 if zero else found > 0).all():  # or NaN
+        raise InputError(CALLER, what, repr(given), wanted)
+    return tuple(found.tolist())

@@ -1,0 +1,132 @@
+"""Controllers from and to control.StateSpace.
+
+           +-----------------+
+p* ---(+)->| s+ = A s + B u  |--> v          u = p* - y, negative feedback
+       ^-  | v  = C s + D u  |
+       y   +-----------------+
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import casadi as ca
+import numpy as np
+
+from malta.errors import InputError
+from malta.model.data import plant_of
+from malta.model.linearize import linearize
+from malta.model.plant import OperatingPoint, Plant, Signal
+from malta.synthesis.controller import Controller, linear_law
+from malta.synthesis.lqg import machine_part
+from malta.threads import on_one_thread
+
+if TYPE_CHECKING:
+    from malta.model.plant import FloatArray
+
+CALLER = "controller_of"
+ERROR = "[e]"  # what follows a measurement's name in the name of its last error
+
+
+@on_one_thread
+def controller_of(
+    sys: Any, plant: Plant, point: OperatingPoint | None = None, *, name: str = ""
+) -> Controller:
+    """A discrete linear system of the errors u = p* - y as a controller of a plant, as any other is.
+
+    sys : discrete control.StateSpace, from the errors of the plant's outputs to its inputs; its dt is the sample time.
+        Of a system F from measurements to forces, v = F y, hand over -F.
+    point : where the machine is linearized; None: plant.at()
+    name : of the design; None: that of the system
+
+    A continuous one is sampled first, as by `control.c2d(sys, Ts, "tustin")`. When an input saturates, the states go on
+    as if it did not: what integrates in such a law winds up. The loads are cancelled by v0 as in every controller.
+    Raises InputError for another number of inputs and outputs, a system that is not discrete, NaN or infinity.
+
+    Example: `controller_of(control.c2d(control.ss(-K), 50e-6, "tustin"), plant, name="h-infinity")`
+    """
+    A, B, C, D, Ts = _discrete(sys)
+    p, m, n = len(plant.outputs), len(plant.inputs), len(A)
+    if D.shape != (m, p):
+        found, wanted = f"{D.shape[1]} inputs and {D.shape[0]} outputs", f"{p} errors and {m} forces"
+        raise InputError(CALLER, "sys", found, f"{wanted} of the {plant.name}")
+    if not all(np.isfinite(M).all() for M in (A, B, C, D)):
+        raise InputError(CALLER, "sys", "NaN or infinity", "finite numbers")
+    model = linearize(plant, plant.at() if point is None else point)
+    part = machine_part(model, Ts, plant.actuator.delay(Ts), current_loop_delay=True)
+    # xi* = 0: there are no rates at the samples for the feedforward to correct.
+    part["feedforward"] = replace(part["feedforward"], rate=np.zeros_like(part["feedforward"].rate))
+    states = (Signal(label, "1") for label in sys.state_labels)
+    return Controller(
+        **part,
+        name=name or sys.name,
+        states=(*states, *(Signal(s.name + ERROR, s.unit) for s in plant.outputs)),
+        Ad=np.block([[A, -B], [np.zeros((p, n + p))]]),
+        Bd=np.zeros((n + p, m)),
+        Cd=np.zeros((p, n + p)),
+        K=np.hstack([-C, D]),
+        Ki=np.zeros((m, p)),
+        L=np.vstack([np.zeros((n, p)), np.eye(p)]),
+        cost=None,
+        noise=None,
+        tracks="errors",
+    )
+
+
+def _discrete(sys: Any) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, float]:
+    """A, B, C, D and the sample time of a discrete system. Raises InputError."""
+    wanted = 'a discrete control.StateSpace, as control.c2d(sys, Ts, "tustin") gives it'
+    if not all(hasattr(sys, key) for key in ("A", "B", "C", "D", "dt", "state_labels")):
+        raise InputError(CALLER, "sys", f"a {type(sys).__name__}", wanted)
+    if sys.dt is True or not sys.dt:
+        raise InputError(CALLER, "sys", f"dt = {sys.dt}", wanted)
+    A, B, C, D = (np.asarray(M, dtype=float) for M in (sys.A, sys.B, sys.C, sys.D))
+    return A, B, C, D, float(sys.dt)
+
+
+def law_system(c: Controller) -> Any:
+    """The control law without saturation as a discrete control.StateSpace with names.
+
+    Inputs: the measurements by their names, then what they should be, as "z_ref", at rest (p*' = 0). Outputs: the
+    forces, without v0 and v_ff. Negative feedback is inside: v = F y + R p*, and the loop gain at the sensors is -P F.
+    States: those of the controller, then its sums of errors.
+    """
+    import control  # imports matplotlib and takes a second: only where it is used
+
+    law = linear_law(c)
+    R = set_point(c)
+    states = [s.name for s in c.states[: len(law.A)]]
+    sums = [f"{s.name}[i]" for s in c.measurements[: len(law.A) - len(states)]]
+    measured = [s.name for s in c.measurements]
+    return control.ss(
+        law.A,
+        np.hstack([law.B_y, law.B_r @ R]),
+        law.C,
+        np.hstack([law.D_y, law.D_r @ R]),
+        c.sample_time,
+        name=c.name,
+        states=[*states, *sums],
+        inputs=[*measured, *reference_names(c)],
+        outputs=[s.name for s in c.forces],
+    )
+
+
+def reference_names(c: Controller) -> list[str]:
+    """What the references of the measurements are called in systems."""
+    return [f"{s.name}_ref" for s in c.measurements]
+
+
+def set_point(c: Controller) -> FloatArray:
+    """r = (p*, xi*, v_ff, v0) of the law by p* at rest, near the operating point."""
+    n, m, p = len(c.states), len(c.forces), len(c.measurements)
+    R = np.zeros((p + n + 2 * m, p))
+    R[:p] = np.eye(p)
+    if c.tracks == "states":
+        plant = plant_of(c.parameters)
+        y = ca.SX.sym("y", p)
+        q = ca.densify(ca.jacobian(plant.position_of(y), y))
+        here = np.array(ca.DM(plant.h(ca.DM(plant.point(c.operating_point[0]).x), 0))).ravel()
+        X = np.array(ca.Function("X", [y], [q])(here))
+        R[p : p + len(X)] = X
+    return R
