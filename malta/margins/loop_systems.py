@@ -20,7 +20,7 @@ from malta.margins.verify import machine_loop
 from malta.model.linearize import linearize
 from malta.model.plant import Plant
 from malta.synthesis.controller import Controller
-from malta.synthesis.state_space import reference_names, set_point
+from malta.synthesis.state_space import named_system, reference_names, set_point
 from malta.threads import on_one_thread
 
 
@@ -65,22 +65,13 @@ def loop_systems(plant: Plant, controller: Controller) -> LoopSystems:
     Ts, references = controller.sample_time, reference_names(controller)
     one_p, one_m = np.eye(p), np.eye(m)
     return LoopSystems(
-        P=_system("P", forces, outputs, Ts, Ad, B1, Cd),
-        F=_system("F", outputs, forces, Ts, law.A, law.B_y, C1, D1),
-        L=_system("L", outputs, outputs, Ts, cut_at_sensors, read, -y),
-        S=_system("S", outputs, outputs, Ts, loop.closed, read, y, one_p),
-        T=_system("T", outputs, outputs, Ts, loop.closed, read, -y),
-        L_forces=_system("L_forces", forces, forces, Ts, cut_at_forces, pushed, -v),
-        S_forces=_system("S_forces", forces, forces, Ts, loop.closed, pushed, v, one_m),
-        T_forces=_system("T_forces", forces, forces, Ts, loop.closed, pushed, -v),
-        tracking=_system("tracking", references, outputs, Ts, loop.closed, sent, y),
+        P=named_system("P", forces, outputs, Ts, Ad, B1, Cd),
+        F=named_system("F", outputs, forces, Ts, law.A, law.B_y, C1, D1),
+        L=named_system("L", outputs, outputs, Ts, cut_at_sensors, read, -y),
+        S=named_system("S", outputs, outputs, Ts, loop.closed, read, y, one_p),
+        T=named_system("T", outputs, outputs, Ts, loop.closed, read, -y),
+        L_forces=named_system("L_forces", forces, forces, Ts, cut_at_forces, pushed, -v),
+        S_forces=named_system("S_forces", forces, forces, Ts, loop.closed, pushed, v, one_m),
+        T_forces=named_system("T_forces", forces, forces, Ts, loop.closed, pushed, -v),
+        tracking=named_system("tracking", references, outputs, Ts, loop.closed, sent, y),
     )
-
-
-def _system(
-    name: str, inputs: list[str], outputs: list[str], Ts: float, A: Any, B: Any, C: Any, D: Any = 0
-) -> Any:
-    import control  # imports matplotlib and takes a second: only where it is used
-
-    D = np.zeros((len(C), B.shape[1])) + D
-    return control.ss(A, B, C, D, Ts, name=name, inputs=inputs, outputs=outputs)

@@ -121,7 +121,8 @@ def record_of(system: LinearSystem, values: Mapping[str, float], name: str) -> P
     """The parameters of a linear machine: a field for each, the system, and the machine's name as the preset."""
     if not isinstance(name, str) or not name or name in machine_names():
         raise InputError(CALLER, "name", repr(name), "a name that no other machine has")
-    return cast("Parameters", _record(tuple(values))(*values.values(), system, name))
+    numbers = [float(v) if isinstance(v, int) and not isinstance(v, bool) else v for v in values.values()]
+    return cast("Parameters", _record(tuple(values))(*numbers, system, name))
 
 
 @cache
@@ -284,7 +285,7 @@ def _signal(what: str, given: Any) -> Signal:
 
 def _numbers(what: str, given: Any, count: int, *, zero: bool = True) -> tuple[float, ...]:
     """Numbers of at least, or above, 0: one for all, or as many as `count`. Raises InputError."""
-    wanted = f"{count} of at least 0, or one for all" if zero else f"{count} above 0, or one for all"
+    wanted = f"a number {'of at least' if zero else 'above'} 0, or {count} of them"
     try:
         found = np.broadcast_to(np.asarray(given, dtype=float), (count,))
     except (TypeError, ValueError) as error:

@@ -374,8 +374,10 @@ def _decided(
         command = _held_if_missed(s, given, controller, current)
         row["force"] = plant.forces(machine["x"], machine["i_coil"])
     else:
+        # A law of errors knows no states: what is measured, moving as the reference does.
+        known = xi_hat if c.tracks == "states" else state_reference(believed)(y, given["dp_ref"])
         command, electrics, more = _current_control(
-            plant, c, s, g, machine, controller, given, current, xi_hat
+            plant, c, s, g, machine, controller, given, current, known
         )
         after |= electrics
         row |= more
@@ -385,7 +387,7 @@ def _decided(
         after |= {"y_last": y, "command": command}
     queue = ca.vertcat(controller["under_way"], command)
     size = command.numel()
-    after["under_way"] = queue[size:]
+    after["under_way"] = queue[size:, 0]  # a column, also where nothing is left of a single entry
     return after, queue[:size], row
 
 
@@ -431,17 +433,16 @@ def _current_control(
     controller: Mapping[str, Any],
     given: Mapping[str, Any],
     current: Any,
-    xi_hat: Any,
+    known: Any,
 ) -> tuple[Any, dict[str, Any], dict[str, Any]]:
     """PI controllers of the axes, integrals by backward Euler, waiting where the half-bridges are at their limit.
 
-    They run once a control period, as on the machine, where both have 50 us.
+    They run once a control period, as on the machine, where both have 50 us. known: the states that they believe in.
     """
     believed, drive = plant_of(c.parameters), plant.drive
-    known = believed.drive
     estimate = ca.SX.zeros(len(believed.states))  # where the controller takes the machine to be
     for k, index in enumerate(believed.controlled):
-        estimate[index] = xi_hat[k]
+        estimate[index] = known[k]
     V = machine["link"] * (
         1 - given["sag"] if s.faulty else 1
     )  # measured: the modulators know of a sag at once
@@ -449,19 +450,19 @@ def _current_control(
         i, i_phase = machine["i"], None
     else:
         i_phase = machine["i_phase"]
-        i = known.to_axes(estimate) @ i_phase
-    error = known.command(current) - i
-    Q = known.turned(believed.forces(estimate, current)) if s.turning else ca.SX.eye(len(drive.axes))
+        i = believed.drive.to_axes(estimate) @ i_phase
+    error = believed.drive.command(current) - i
+    Q = believed.drive.turned(believed.forces(estimate, current)) if s.turning else ca.SX.eye(len(drive.axes))
     waiting = controller["u_limited"]
     integral = controller["u_integral"] + g["Ki_current"] * g["control_time"] * (1 - waiting) * (Q @ error)
-    u = g["Kp"] * error + Q.T @ integral + known.emf(estimate)
+    u = g["Kp"] * error + Q.T @ integral + believed.drive.emf(estimate)
     row: dict[str, Any] = {"link": V, "i": i}
     if s.fidelity == "dq":
         command, limited = inverter.modulation(drive, u, V)
         command = _held_if_missed(s, given, controller, command)
         row |= {"u": command * V, "force": drive.force(i)}
     else:
-        u_phase = known.to_phases(estimate) @ u
+        u_phase = believed.drive.to_phases(estimate) @ u
         command, limits = inverter.duty_cycles(drive, u_phase, V, i_phase, real_pwm=s.real_pwm)
         limited = ca.vertcat(*_axes_limited(drive, limits))
         command = _held_if_missed(s, given, controller, command)
@@ -540,21 +541,21 @@ def runge_kutta(rate: Callable[[Any, int], Any], z: Any, h: Any, positions: int 
     positions : how many entries stand first whose rates are the entries that follow them. What the method does to them
         is written in accelerations, as Nyström did: the same numbers in fewer operations.
     """
-    q, w = z[:positions], z[positions:]
-    dq = w[:positions]
+    q, w = z[:positions, 0], z[positions:, 0]  # columns, also of a single entry
+    dq = w[:positions, 0]
 
     def slope(q: Any, w: Any, halves: int) -> Any:
-        return rate(ca.vertcat(q, w), halves)[positions:]
+        return rate(ca.vertcat(q, w), halves)[positions:, 0]
 
     k1 = slope(q, w, 0)
     middle = q + h / 2 * dq
     k2 = slope(middle, w + h / 2 * k1, 1)
-    k3 = slope(middle + h * h / 4 * k1[:positions], w + h / 2 * k2, 1)
+    k3 = slope(middle + h * h / 4 * k1[:positions, 0], w + h / 2 * k2, 1)
     end = q + h * dq
-    k4 = slope(end + h * h / 2 * k2[:positions], w + h * k3, 2)
+    k4 = slope(end + h * h / 2 * k2[:positions, 0], w + h * k3, 2)
     late = k2 + k3
     early = k1 + late
-    return ca.vertcat(end + h * h / 6 * early[:positions], w + h / 6 * (early + late + k4))
+    return ca.vertcat(end + h * h / 6 * early[:positions, 0], w + h / 6 * (early + late + k4))
 
 
 def _axis_slope(

@@ -92,7 +92,10 @@ class Gains(NamedTuple):
 
 @on_one_thread
 def lqr(model: Linear, weights: Weights) -> FloatArray:
-    """Continuous LQR gain K, m x n: v = -K xi minimizes the integral of xi'Q xi + v'R v."""
+    """Continuous LQR gain K, m x n: v = -K xi minimizes the integral of xi'Q xi + v'R v.
+
+    The same as control.lqr(A, B, Q, R)[0].
+    """
     _check_sizes(model, weights)
     return care(model.A, model.B, weights.Q, weights.R, "LQR").K
 
@@ -102,6 +105,7 @@ def lqi(model: Linear, weights: Weights) -> tuple[FloatArray, FloatArray]:
     """Continuous LQR with the integrals of the measured errors: K (m x n) and Ki (m x p).
 
     v = K (xi* - xi) + Ki e, e' = p* - p. The Riccati gain on e acts as -K_e e, so Ki = -K_e; 0 where nothing weighs e.
+    The same as control.lqr(A, B, diag(Q, Q_i), R, integral_action=C)[0] = [K, Ki].
     Raises InputError and CheckError as riccati.care.
     """
     _check_sizes(model, weights)
@@ -118,7 +122,8 @@ def lqi(model: Linear, weights: Weights) -> tuple[FloatArray, FloatArray]:
 def kalman(model: Linear, weights: Weights) -> FloatArray:
     """Continuous steady-state Kalman gain L, n x p: xi_hat' = A xi_hat + B v + L (y - C xi_hat).
 
-    Only the ratio of process to sensor noise matters, so variances of a sample serve as intensities.
+    Only the ratio of process to sensor noise matters, so variances of a sample serve as intensities. The same as
+    control.lqe(A, B, C, W, V)[0], which loses digits in SI units: see riccati.py.
     """
     _check_sizes(model, weights)
     W = model.B * weights.process_variance @ model.B.T
@@ -168,7 +173,12 @@ def sampled_model(model: Linear, Ts: float, delay: int = 0) -> tuple[FloatArray,
 def gains(
     model: Linear, weights: Weights, Ts: float, discretization: Discretization, delay: int = 0
 ) -> Gains:
-    """LQR with integrals and Kalman filter of a model, sampled. Raises CheckError as riccati.dare."""
+    """LQR with integrals and Kalman filter of a model, sampled. Raises CheckError as riccati.dare.
+
+    Without delay, integrals and disturbances K is control.dlqr(Ad, Bd, Qd, Rd, Nd)[0] with the sampled weights of
+    riccati.sample_cost, and Ad L is the gain of control.dlqe(Ad, 1, Cd, Wd, V)[0], a predictor's. control.dlqr with
+    integral_action sums errors without Ts, and one sample late.
+    """
     if discretization == "backward-euler":
         return Gains(*_backward_euler(model, weights, Ts))
     integrated = discretization == "sampled-data"

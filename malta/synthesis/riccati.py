@@ -5,7 +5,10 @@ m2 beside forces of newtons spread the Hamiltonian over twenty decades. Of 300 r
 decades, control.care and control.dare refuse 4 and 1 %, and return 2 % of the gains wrong by more than 1 %, silently
 (slycot: 20, 32 and 15 %): scipy balances the pencil, and never looks at X. So R is made the identity, the states are
 scaled until the Hamiltonian is balanced and then until X has a diagonal of ones, and time is counted in its largest
-entry. What error is left, `_refine` takes off. Systems that do not touch each other are solved one by one, so that
+entry. The gains are those of control.lqr, dlqr, lqe and dlqe where these keep their digits. For the shipped designs in SI
+units the regulators agree to 1e-7 and better, the filters of dlqe to 1e-3; lqe refuses the planar motor. The filters
+agree to 1e-9, too, once a state counts in its standard deviation after a prediction, and a sensor in that of its noise:
+X then has a diagonal of ones. What error is left, `_refine` takes off. Systems that do not touch each other are solved one by one, so that
 gains between them are exactly zero.
 """
 

@@ -1,0 +1,322 @@
+"""Machines from plain matrices: design, margin, gain file, simulation and campaign in a few lines of Python."""
+
+from __future__ import annotations
+
+import json
+import pickle
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import casadi as ca
+import control
+import numpy as np
+import pytest
+from conftest import refusal
+
+import malta
+from malta.gains import encodings
+from malta.model.plant import Plant, Signal
+from malta.simulation.generic import jump
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from malta.model.linearize import LinearModel
+    from malta.synthesis.controller import Controller
+
+SUFFIXES = (".json", ".npz", ".mat")
+A = [[0, 1, 0], [0, -1, 2], [0, 0, -30]]  # a motor: angle, speed, current
+B = [[0], [0], [30]]
+C = [[1, 0, 0]]
+TURNED_BY = [[0, 0, 0], [0, 0, 1], [0, 0, 0]]
+LABELS: dict[str, Any] = {
+    "states": ["phi [rad]", "w [rad/s]", "i [A]"],
+    "inputs": ["u [V]"],
+    "outputs": ["phi [rad]"],
+}
+
+
+@pytest.fixture(scope="module")
+def motor() -> Plant:
+    """The motor; what the current turns it by is uncertain: 2 + k."""
+    return malta.linear_machine(
+        A, B, C, name="motor", **LABELS, nominal={"k": 0.5}, terms={"k": [TURNED_BY]}, noise=1e-6
+    )
+
+
+@pytest.fixture(scope="module")
+def driven(motor: Plant) -> Controller:
+    """Its LQG with an integral."""
+    model = malta.linearize(motor, motor.at())
+    return malta.lqg(model, malta.weights([10, 1, 0], [1], [1e-2], [1e-8], q_i=[10]), 1e-3, name="driven")
+
+
+def test_design_margin_and_gain_file_in_five_lines(tmp_path: Path) -> None:
+    """An unstable pole at 10 rad/s."""
+    plant = malta.linear_machine(
+        [[0, 1], [100, 0]], [[0], [1]], [[1, 0]], nominal={"k": 0}, terms={"k": [[[0, 0], [1, 0]]]}
+    )
+    model = malta.linearize(plant, plant.at())
+    controller = malta.lqg(model, malta.weights([1e4, 1], [1], [1], [1e-8]), Ts=1e-3)
+    margin = malta.robust_margin(
+        *malta.margins.verify.machine_system(plant, controller, ["k"], {}), {"k": (-50, 50)}
+    )
+    malta.gains.write(controller, malta.verify(model, controller), tmp_path / "plain.json")
+
+    assert margin.lower is not None
+    assert margin.lower <= margin.upper <= margin.lower * 1.001
+    content = json.loads((tmp_path / "plain.json").read_text())
+    assert (content["version"], content["law"], content["plant"]["name"]) == (
+        2,
+        {"tracks": "states"},
+        "linear",
+    )
+    assert content["plant"]["linear"]["matrices"] == {"A": [[0, 1], [100, 0]], "B": [[0], [1]], "C": [[1, 0]]}
+    assert malta.gains.read(tmp_path / "plain.json").parameters == plant.parameters
+
+
+def test_the_margin_is_lost_where_the_poles_say(motor: Plant, driven: Controller) -> None:
+    found = malta.verify(malta.linearize(motor, motor.at()), driven, {"k": 1.0}).robust
+    assert found is not None
+    assert found.lower == pytest.approx(found.upper, rel=1e-3)
+    (k,) = found.witness.values() if found.witness else (np.nan,)
+    lost = malta.linear_machine(A, B, C, nominal={"k": k}, terms={"k": [TURNED_BY]})
+    radius = malta.verify(malta.linearize(lost, lost.at()), driven).stages[-1].spectral_radius
+    assert radius == pytest.approx(1, abs=1e-7)
+    assert abs(k - 0.5) == pytest.approx(found.upper * 0.5, rel=1e-9)
+
+
+def test_matrices_of_a_shipped_machine_give_its_gains(model: LinearModel) -> None:
+    spec = malta.read_design("design/calibrated.toml")
+    shipped = malta.synthesize(spec, model)
+    plain = malta.linear_machine(model.sys, name="plain")
+    assert [s.name for s in plain.states] == [s.name for s in model.plant.design_states]
+    found = malta.lqg(malta.linearize(plain, plain.at()), spec.weights, spec.sample_time, spec.discretization)
+    for name in ("Ad", "Bd", "Cd", "K", "Ki", "L"):
+        assert np.array_equal(getattr(found, name), getattr(shipped, name)), name
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_a_gain_file_brings_the_machine_along(
+    motor: Plant, driven: Controller, suffix: str, tmp_path: Path
+) -> None:
+    path = tmp_path / f"driven{suffix}"
+    margins = malta.verify(malta.linearize(motor, motor.at()), driven, {"k": 0.5})
+    malta.gains.write(driven, margins, path)
+    found = malta.gains.read(path)
+    assert found.parameters == driven.parameters
+    assert malta.plant_of(found.parameters) is motor
+    assert malta.gains.document(found, margins)["sha256"] == encodings.decode(path)["sha256"]
+    assert found.limits.force == np.inf
+
+
+def test_pickle_keeps_the_parameters(motor: Plant) -> None:
+    assert pickle.loads(pickle.dumps(motor.parameters)) == motor.parameters
+
+
+def test_simulation_is_the_step_response_of_the_loop(motor: Plant, driven: Controller) -> None:
+    scenario = malta.Scenario("step", 0.4, partial(jump, output=0, size=1e-3, at=9.5e-3), fidelity="force")
+    run = malta.simulate(motor, driven, scenario)
+    first = int(np.argmax(run.reference[:, 0] > 0))
+    response = control.step_response(malta.loop_systems(motor, driven).tracking, run.t[:-first])
+    assert np.abs(run.p[first:, 0] - 1e-3 * response.outputs.ravel()).max() < 1e-12 * 1e-3
+    assert run.p[-1, 0] == pytest.approx(0.44e-3, abs=0.01e-3)
+
+
+def test_the_reference_is_the_rest_with_these_outputs(motor: Plant, driven: Controller) -> None:
+    """phi = 0.2 rad wants neither speed nor current: the machine that starts there stays."""
+
+    def aside(plant: Plant) -> Any:
+        return jump(plant, output=0, size=0.2, at=0)
+
+    run = malta.simulate(motor, driven, malta.Scenario("aside", 0.05, aside, fidelity="force"))
+    assert np.abs(run.x - [0.2, 0, 0]).max() < 1e-15
+    stable = malta.linear_machine([[-2.0, 1], [0, -3]], [[0], [3]], [[1, 0]])  # x2 = 2 y at rest
+    assert np.array(ca.DM(stable.position_of(ca.DM([0.5])))).ravel() == pytest.approx([0.5, 1.0], rel=1e-14)
+
+
+def test_a_campaign_varies_the_entries(driven: Controller) -> None:
+    plan = malta.Plan(driven, "step", {"k": 0.2}, samples=24, options={"time": 0.1})
+    found = malta.campaign(plan)
+    assert found.rate.passed == 24
+    one, values = found.batch.deviation[5, 0], dict(zip(found.names, found.values[5], strict=True))
+    other = malta.linear_machine(
+        A, B, C, name="motor", **LABELS, nominal=values, terms={"k": [TURNED_BY]}, noise=1e-6
+    )
+    assert not np.array_equal(found.batch.deviation, found.batch.deviation[:1].repeat(24, axis=0))
+    alone = malta.experiment("step", other, driven, time=0.1, noise=0.0).cases[0].run
+    assert np.abs(alone.p - alone.reference).max() == pytest.approx(one, rel=0.05)  # there with noise
+
+
+def test_machines_of_the_same_names_share_no_functions(motor: Plant, driven: Controller) -> None:
+    """What is compiled for one must not serve another whose matrices differ."""
+    doubled = np.array(A) * [[1], [2], [1]]
+    other = malta.linear_machine(
+        doubled, B, C, name="other", **LABELS, nominal={"k": 0.5}, terms={"k": [TURNED_BY]}
+    )
+    scenario = malta.Scenario("step", 0.1, partial(jump, output=0, size=1e-3, at=0.01), fidelity="force")
+    first, second = (malta.simulate(plant, driven, scenario) for plant in (motor, other))
+    expected = malta.simulate(other, driven, scenario, engine="virtual machine")
+    assert np.abs(second.p - expected.p).max() < 1e-12
+    assert np.abs(second.p - first.p).max() > 1e-6
+
+
+@pytest.mark.parametrize("engine", ["auto", "virtual machine"])
+def test_one_state_is_enough(engine: Any) -> None:
+    """x' = x + u, a column of one entry everywhere."""
+    plant = malta.linear_machine([[1]], [[1]], [[1]])
+    controller = malta.lqg(malta.linearize(plant, plant.at()), malta.weights([1], [1], [1], [1e-6]), 0.01)
+    scenario = malta.Scenario("let go", 1.0, malta.references.hold, start={"x1": 1.0}, fidelity="force")
+    run = malta.simulate(plant, controller, scenario, engine=engine)
+    expected = [1.0]
+    K, L, Ad, Bd = (float(M[0, 0]) for M in (controller.K, controller.L, controller.Ad, controller.Bd))
+    predicted = 1.0
+    for _ in run.t[1:]:
+        estimate = predicted + L * (expected[-1] - predicted)
+        v = -K * estimate
+        predicted = Ad * estimate + Bd * v
+        expected.append(np.exp(0.01) * expected[-1] + np.expm1(0.01) * v)
+    assert run.x[:, 0] == pytest.approx(expected, rel=1e-11)
+
+
+def test_what_needs_positions_and_rates_says_so(motor: Plant, driven: Controller) -> None:
+    model = malta.linearize(motor, motor.at())
+    assert not motor.second_order
+    assert set(malta.verify(model, driven).bandwidth) == {"sigma_max_T", "sigma_min_T", "crossover_max"}
+    assert driven.feedforward.rate.shape == (0, 1)
+    kalman = malta.Scenario("hold", 0.01, malta.references.hold, fidelity="force", estimator="kalman")
+    attraction = malta.Scenario(
+        "hold", 0.01, malta.references.hold, fidelity="force", feedforward="attraction"
+    )
+    pid = malta.synthesis.spec.Pid(np.ones(1), np.ones(1), np.ones(1), 0.0)
+    asked: dict[str, Callable[[], object]] = {
+        "stiffness": lambda: model.stiffness,
+        "pid": lambda: malta.synthesis.lqg.pid(model, pid, 1e-3),
+        "estimator kalman": lambda: malta.simulate(motor, driven, kalman),
+        "feedforward attraction": lambda: malta.simulate(motor, driven, attraction),
+    }
+    for field, ask in asked.items():
+        with pytest.raises(malta.InputError) as caught:
+            ask()
+        assert str(caught.value) == (
+            f"motor: {field}: found states that are not positions and then their rates, expected x = (q, q')"
+        )
+
+
+def test_robustness_finds_every_stage(motor: Plant, driven: Controller) -> None:
+    found = malta.robustness(motor, driven, {"k": 0.2}, proof=False)
+    assert [link.name for link in found.chain] == ["LQR", "LQI", "LQG", "LQGI", "sampled"]
+    assert found.chain[0].peak == pytest.approx(1, abs=1e-6)  # Kalman's inequality
+
+
+def test_every_shipped_machine_is_of_second_order() -> None:
+    for name in ("table2", "halbach", "planar"):
+        plant = malta.read_design(f"design/{name}.toml").plant
+        assert plant.second_order
+        assert 2 * plant.coordinates == len(plant.controlled)
+
+
+def test_labels_come_from_the_system() -> None:
+    named = control.ss(A, B, C, 0, states=["a", "b", "c"], inputs=["u"], outputs=["a"], name="named")
+    plant = malta.linear_machine(named)
+    assert plant.name == "named"
+    assert plant.states == (Signal("a", "1"), Signal("b", "1"), Signal("c", "1"))
+    numbered = malta.linear_machine(control.ss(A, B, C, 0))
+    assert numbered.name == "linear"
+    assert [s.name for s in numbered.states] == ["x1", "x2", "x3"]
+
+
+ONE = {"A": [[1.0]], "B": [[1.0]], "C": [[1.0]]}
+
+
+@pytest.mark.parametrize(
+    ("given", "sentence"),
+    [
+        ({"A": [[1, 2]]}, "A: found shape (1, 2), expected (1, 1), at least 1 x 1"),
+        ({"B": [1]}, "B: found 1 dimensions, expected a matrix of finite numbers, as [[0, 1], [2, 0]]"),
+        (
+            {"A": [[np.nan]]},
+            "A: found NaN or infinity, expected a matrix of finite numbers, as [[0, 1], [2, 0]]",
+        ),
+        ({"C": "no"}, "C: found a str, expected a matrix of numbers"),
+        ({"nominal": {"k": 1}}, "terms.k: found nothing, expected a nominal value and its terms"),
+        ({"terms": {"k": [[[1]]]}}, "nominal.k: found nothing, expected a nominal value and its terms"),
+        (
+            {"nominal": {"k": 1}, "terms": {"k": [[[1, 2]]]}},
+            "terms.k: A: found shape (1, 2), expected (1, 1)",
+        ),
+        (
+            {"nominal": {"a b": 1}, "terms": {"a b": []}},
+            "nominal.a b: found this name, expected a name as Python has them",
+        ),
+        (
+            {"nominal": {"k": "1"}, "terms": {"k": [[[1]]]}},
+            "k: found '1', expected a finite number in 1",
+        ),
+        ({"states": ["a", "b"]}, "states: found 2 names, expected 1 names in a list"),
+        ({"outputs": ["a.b"]}, "outputs: found 'a.b', expected a name without dots, or \"z [m]\""),
+        ({"limit": 0}, "limit: found 0, expected a number above 0, or 1 of them"),
+        ({"noise": -1}, "noise: found -1, expected a number of at least 0, or 1 of them"),
+        ({"name": "tubular"}, "name: found 'tubular', expected a name that no other machine has"),
+        (
+            {"nose": 1},
+            "nose: found an unknown detail, expected one of "
+            "name states inputs outputs nominal terms limit noise dead_time",
+        ),
+    ],
+)
+def test_bad_matrices_get_one_sentence(given: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(malta.InputError) as caught:
+        malta.linear_machine(**(ONE | given))
+    assert str(caught.value) == f"linear_machine: {sentence}"
+
+
+@pytest.mark.parametrize(
+    ("source", "field"),
+    [
+        (control.ss([[0.5]], [[1]], [[1]], 0, 0.1), "A: found a discrete system, dt = 0.1"),
+        (control.ss([[0.5]], [[1]], [[1]], 1), "D: found inputs that the outputs follow at once"),
+        (np.eye(2), "A: found a ndarray alone"),
+    ],
+)
+def test_bad_systems_get_one_sentence(source: Any, field: str) -> None:
+    with pytest.raises(malta.InputError, match=field):
+        malta.linear_machine(source)
+
+
+def test_names_of_shipped_machines_are_taken(model: LinearModel) -> None:
+    with pytest.raises(malta.InputError, match="name: found 'tubular'"):
+        malta.linear_machine(model.sys, name="tubular")
+
+
+def changed(edit: Callable[[dict[str, Any]], object], path: Path, sound: Path) -> Path:
+    content = json.loads(sound.read_text())
+    edit(content)
+    content["sha256"] = encodings.content_sha256(content)
+    path.write_text(json.dumps(content))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("edit", "field"),
+    [
+        (lambda d: d.update(version=1), "version"),
+        (lambda d: (d.pop("law"), d.update(version=1)), "plant.linear"),
+        (lambda d: d["law"].update(tracks="nothing"), "law.tracks"),
+        (lambda d: d["plant"].update(name="tubular"), "plant.linear"),
+        (lambda d: d["plant"].pop("linear"), "plant.name"),
+        (lambda d: d["plant"]["linear"]["matrices"]["A"].pop(), "plant.linear.A"),
+        (lambda d: d["plant"]["linear"]["terms"].pop("k"), "plant.linear.terms.k"),
+        (lambda d: d["plant"]["parameters"]["k"].update(unit="kg"), "plant.parameters.k.unit"),
+        (lambda d: d["feedforward"].update(rate=[[0.0]]), "feedforward.rate"),
+        (lambda d: d["limits"].update(force=[-1.0]), "limits.force"),
+    ],
+)
+def test_damaged_tables_get_one_sentence(
+    edit: Any, field: str, motor: Plant, driven: Controller, tmp_path: Path
+) -> None:
+    sound = tmp_path / "sound.json"
+    malta.gains.write(driven, malta.verify(malta.linearize(motor, motor.at()), driven), sound)
+    path = changed(edit, tmp_path / "changed.json", sound)
+    assert refusal(lambda: malta.gains.read(path), path).field == field
