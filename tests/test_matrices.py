@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import doctest
 import json
 import pickle
+import re
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import casadi as ca
@@ -20,7 +23,6 @@ from malta.simulation.generic import jump
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from pathlib import Path
 
     from malta.model.linearize import LinearModel
     from malta.synthesis.controller import Controller
@@ -74,6 +76,16 @@ def test_design_margin_and_gain_file_in_five_lines(tmp_path: Path) -> None:
     )
     assert content["plant"]["linear"]["matrices"] == {"A": [[0, 1], [100, 0]], "B": [[0], [1]], "C": [[1, 0]]}
     assert malta.gains.read(tmp_path / "plain.json").parameters == plant.parameters
+
+
+def test_the_lines_of_the_readme_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (block,) = (
+        b for b in re.findall(r"```pycon\n(.*?)```", Path("README.md").read_text(), re.S) if "by_k" in b
+    )
+    example = doctest.DocTestParser().get_doctest(block, {"malta": malta}, "README.md", None, 0)
+    monkeypatch.chdir(tmp_path)
+    assert doctest.DocTestRunner().run(example) == (0, 6)
+    assert malta.gains.read(tmp_path / "plain.json").integrating is False
 
 
 def test_the_margin_is_lost_where_the_poles_say(motor: Plant, driven: Controller) -> None:

@@ -1,15 +1,17 @@
 """Riccati equations, scaled before they are solved and checked after; and systems sampled exactly.
 
-python-control, by scipy or slycot, is not indifferent to units. Positions in micrometres and sensor variances of 1e-13
-m2 beside forces of newtons spread the Hamiltonian over twenty decades. Of 300 random systems in units over twelve
-decades, control.care and control.dare refuse 4 and 1 %, and return 2 % of the gains wrong by more than 1 %, silently
-(slycot: 20, 32 and 15 %): scipy balances the pencil, and never looks at X. So R is made the identity, the states are
-scaled until the Hamiltonian is balanced and then until X has a diagonal of ones, and time is counted in its largest
-entry. The gains are those of control.lqr, dlqr, lqe and dlqe where these keep their digits. For the shipped designs in SI
+python-control, by scipy or slycot, is not indifferent to units. Positions in micrometres and sensor variances of
+1e-13 m2 beside forces of newtons spread the Hamiltonian over twenty decades. Of 300 random systems in units over
+twelve decades, control.care and control.dare refuse 4 and 1 %, and return 2 % of the gains wrong by more than 1 %,
+silently (slycot: 20, 32 and 15 %): scipy balances the pencil, and never looks at X. So R is made the identity, the
+states are scaled until the Hamiltonian is balanced and then until X has a diagonal of ones, and time is counted in
+its largest entry. What error is left, `_refine` takes off. Systems that do not touch each other are solved one by
+one, so that gains between them are exactly zero.
+
+The gains are those of control.lqr, dlqr, lqe and dlqe where these keep their digits. For the shipped designs in SI
 units the regulators agree to 1e-7 and better, the filters of dlqe to 1e-3; lqe refuses the planar motor. The filters
-agree to 1e-9, too, once a state counts in its standard deviation after a prediction, and a sensor in that of its noise:
-X then has a diagonal of ones. What error is left, `_refine` takes off. Systems that do not touch each other are solved one by one, so that
-gains between them are exactly zero.
+agree to 1e-9, too, once a state counts in its standard deviation after a prediction, and a sensor in that of its
+noise: X then has a diagonal of ones.
 """
 
 from __future__ import annotations
