@@ -123,6 +123,15 @@ def test_a_gain_file_brings_the_machine_along(
     assert found.limits.force == np.inf
 
 
+@pytest.mark.parametrize("value", [2, 2.0, np.int64(2), np.float64(2)])
+def test_any_number_is_a_nominal_value(value: Any, tmp_path: Path) -> None:
+    plant = malta.linear_machine([[0]], [[1]], [[1]], nominal={"k": value}, terms={"k": [[[1]]]})
+    model = malta.linearize(plant, plant.at())
+    controller = malta.lqg(model, malta.weights([1], [1], [1], [1]), 0.01)
+    malta.gains.write(controller, malta.verify(model, controller), tmp_path / "k.json")
+    assert malta.gains.read(tmp_path / "k.json").parameters == plant.parameters
+
+
 def test_pickle_keeps_the_parameters(motor: Plant) -> None:
     assert pickle.loads(pickle.dumps(motor.parameters)) == motor.parameters
 

@@ -14,6 +14,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, make_dataclass
 from functools import cache
+from numbers import Real
 from typing import TYPE_CHECKING, Any, TypedDict, cast
 
 import casadi as ca
@@ -78,7 +79,8 @@ def linear_machine(A: Any, B: Any = None, C: Any = None, **details: Unpack[Detai
 
     Positions that stand first with their rates after them, A = [[0, I], ...], make a machine of second order as those
     that malta ships. Other states are as good for an LQG and a margin. Their reference is the rest at which the outputs
-    are what is asked for: [A B; C 0] (x*, u*) = (0, p*), in the least-squares sense.
+    are what is asked for: [A B; C 0] (x*, u*) = (0, p*), in the least-squares sense. u* is not fed forward: without
+    integrals, or observed disturbances, a machine that takes some stops short of it.
 
     Raises InputError for shapes and values that do not fit, a system that is discrete or passes its inputs on (D).
 
@@ -121,7 +123,7 @@ def record_of(system: LinearSystem, values: Mapping[str, float], name: str) -> P
     """The parameters of a linear machine: a field for each, the system, and the machine's name as the preset."""
     if not isinstance(name, str) or not name or name in machine_names():
         raise InputError(CALLER, "name", repr(name), "a name that no other machine has")
-    numbers = [float(v) if isinstance(v, int) and not isinstance(v, bool) else v for v in values.values()]
+    numbers = [float(v) if isinstance(v, Real) and not isinstance(v, bool) else v for v in values.values()]
     return cast("Parameters", _record(tuple(values))(*numbers, system, name))
 
 

@@ -296,8 +296,9 @@ def linear_law(c: Controller) -> LinearLaw:
     found = LinearLaw(
         *(np.array(M) for M in ca.Function("linear", list(args.values()), blocks)(*[0] * len(args)))
     )
-    if c.tracks == "errors":
-        k = len(c.states) - len(c.measurements)
+    k = len(c.states) - len(c.measurements)
+    kept = any(M[k:].any() for M in (found.A, found.B_y, found.B_r))
+    if c.tracks == "errors" and not kept:  # the last errors are new at every sample
         found = found._replace(A=found.A[:k, :k], B_y=found.B_y[:k], B_r=found.B_r[:k], C=found.C[:, :k])
     return LinearLaw(*map(readonly, found))
 
