@@ -56,13 +56,18 @@ def distributions_figure(found: Campaign, published: Published | None = None) ->
     for listed in figures_of(found, published):
         panels.setdefault((listed.kind, listed.unit), []).append(listed)
     figure = _campaign_figure(found, "figures of merit of the completed runs", hspace=0.44, wspace=0.28)
-    for axes, ((kind, _), group) in zip(figure.subplots(2, 3).ravel(), panels.items(), strict=False):
+    every = figure.subplots(2, 3).ravel()
+    for axes, ((kind, _), group) in zip(every, panels.items(), strict=False):
         _distribution(axes, kind, group)
+    for axes in every[len(panels) :]:
+        axes.set_visible(False)
     return figure
 
 
 def _distribution(axes: Axes, kind: str, listed: Sequence[Finding]) -> None:
     """Histograms of figures of one kind, on a logarithmic axis where they reach over decades."""
+    from matplotlib.ticker import LogLocator
+
     unit = listed[0].unit
     series = [in_unit(1.0, unit) * f.values[np.isfinite(f.values)] for f in listed]
     bound = in_unit(listed[0].published, unit)
@@ -90,6 +95,9 @@ def _distribution(axes: Axes, kind: str, listed: Sequence[Finding]) -> None:
         axes.stairs(share, edges, label=f.label.removeprefix(f"{kind} ") if len(listed) > 1 else None, **line)
     if logarithmic:
         axes.set_xscale("log")
+        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 3.0) if high > 100 * low else (1.0, 2.0, 5.0)))
+        axes.xaxis.set_major_formatter("{x:g}")
+        axes.xaxis.set_minor_formatter("")
     axes.set_xlim(edges[0], edges[-1])
     axes.set_ylim(0, None)
     if math.isfinite(bound):
@@ -100,7 +108,8 @@ def _distribution(axes: Axes, kind: str, listed: Sequence[Finding]) -> None:
         )
     if len(listed) > 1:
         where: dict[str, Any] = {"loc": "lower left", "bbox_to_anchor": (0, 1.06), "borderaxespad": 0.2}
-        axes.legend(ncols=len(listed), **where, **LEGEND)
+        close = {"handlelength": 1.4, "columnspacing": 0.8} if len(listed) > 3 else {}
+        axes.legend(ncols=len(listed), **where, **LEGEND | close)
 
 
 def yield_figure(found: Campaign, published: Published | None = None) -> Figure:
