@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from malta.model.plant import Plant
-    from malta.simulation.simulate import Scenario
+    from malta.simulation.scenario import Scenario
     from malta.synthesis.controller import Controller
 
 PHASES = (0.0, 2 * math.pi / 3, -2 * math.pi / 3)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from malta.machines.tubular.plant import Parameters
-from malta.simulation.engines import feedforward_table
+from malta.simulation.compiled import feedforward_table
 from malta.synthesis.controller import Controller
 
 if TYPE_CHECKING:

@@ -38,8 +38,9 @@ from malta.machines.planar import plant as planar
 from malta.machines.planar.experiments import CELLS, compiled
 from malta.machines.tubular import plant as tubular
 from malta.model.data import published_value
+from malta.simulation.engines import compiled_shape, engine_of
+from malta.simulation.inputs import feedforward
 from malta.simulation.period import state_reference
-from malta.simulation.simulate import compiled_shape, engine_of, feedforward
 
 ROOT = Path(__file__).parents[1]
 IMPORTS = "import numpy, scipy, control, casadi"

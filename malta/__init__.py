@@ -51,12 +51,12 @@ if TYPE_CHECKING:  # the contents page, as type checkers and readers see it
     from malta.simulation.batch import simulate_many as simulate_many
     from malta.simulation.experiments import Experiment as Experiment
     from malta.simulation.experiments import experiment as experiment
-    from malta.simulation.simulate import Fault as Fault
-    from malta.simulation.simulate import Scenario as Scenario
-    from malta.simulation.simulate import Trajectory as Trajectory
+    from malta.simulation.scenario import Fault as Fault
+    from malta.simulation.scenario import Scenario as Scenario
     from malta.simulation.simulate import simulate as simulate
-    from malta.simulation.simulate import stroke_figures as stroke_figures
     from malta.simulation.time_optimal import fastest_stroke as fastest_stroke
+    from malta.simulation.trajectory import Trajectory as Trajectory
+    from malta.simulation.trajectory import stroke_figures as stroke_figures
     from malta.synthesis.controller import Controller as Controller
     from malta.synthesis.design_file import read_design as read_design
     from malta.synthesis.lqg import calibrate as calibrate
@@ -91,7 +91,9 @@ _NAMES = {  # the same, for the first use of each name
     "margins.loop_systems": ("LoopSystems", "loop_systems"),
     "margins.robust": ("Margin", "margin_of_polynomial", "robust_margin"),
     "margins.systems": ("uncertain",),
-    "simulation.simulate": ("Fault", "Scenario", "Trajectory", "simulate", "stroke_figures"),
+    "simulation.scenario": ("Fault", "Scenario"),
+    "simulation.simulate": ("simulate",),
+    "simulation.trajectory": ("Trajectory", "stroke_figures"),
     "synthesis.design_file": ("read_design",),
     "synthesis.spec": ("Spec", "Weights"),
     "synthesis.lqg": ("calibrate", "kalman", "lqg", "lqi", "lqr", "synthesize", "weights"),

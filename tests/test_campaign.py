@@ -49,10 +49,10 @@ from malta.campaigns.statistics import (
 from malta.campaigns.store import MANIFEST, block_name
 from malta.machines.tubular.experiments import CASES, EXPERIMENTS
 from malta.report import figures
-from malta.simulation import engines as engine
+from malta.simulation import compiled
 from malta.simulation.batch import Batch, verdicts
+from malta.simulation.engines import compiled_shape, engine_of
 from malta.simulation.experiments import cases_of
-from malta.simulation.simulate import compiled_shape, engine_of
 
 if TYPE_CHECKING:
     from conftest import Design
@@ -701,7 +701,7 @@ def test_arguments_that_are_none_are_refused(
 @pytest.fixture
 def no_compiler(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """As on a system without one."""
-    monkeypatch.setattr(engine, "compiler", lambda: None)
+    monkeypatch.setattr(compiled, "compiler", lambda: None)
     remembered = (compiled_shape, engine_of)
     for memory in remembered:
         memory.cache_clear()

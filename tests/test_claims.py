@@ -23,7 +23,8 @@ from malta.margins.verify import machine_loop
 from malta.model.data import in_unit, plant_of, published_value
 from malta.report import ledger as claims
 from malta.report.ledger import Claim, Ledger, Row
-from malta.simulation.simulate import Scenario, simulate
+from malta.simulation.scenario import Scenario
+from malta.simulation.simulate import simulate
 
 if TYPE_CHECKING:
     from conftest import Design

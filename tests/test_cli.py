@@ -592,10 +592,10 @@ def test_the_number_of_substeps_comes_with_an_error(run: Run) -> None:
 
 
 def test_without_a_compiler_it_says_so(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    from malta.simulation import engines
-    from malta.simulation.simulate import compiled_shape, engine_of
+    from malta.simulation import compiled
+    from malta.simulation.engines import compiled_shape, engine_of
 
-    monkeypatch.setattr(engines, "compiler", lambda: None)
+    monkeypatch.setattr(compiled, "compiler", lambda: None)
     for cached in (compiled_shape, engine_of):
         cached.cache_clear()
     code, out, err = run("simulate", CALIBRATED)

@@ -20,18 +20,12 @@ from hypothesis import strategies as st
 
 import malta
 from malta import references
-from malta.simulation import engines as engine
-from malta.simulation.engines import LANES
+from malta.simulation import compiled, engines, translate
+from malta.simulation.compiled import LANES
+from malta.simulation.engines import compiled_shape, engine_of, shape_of
 from malta.simulation.period import FIDELITIES, Fidelity, Parts
-from malta.simulation.simulate import (
-    SERIES,
-    Fault,
-    Scenario,
-    compiled_shape,
-    engine_of,
-    setup_of,
-    shape_of,
-)
+from malta.simulation.scenario import Fault, Scenario, setup_of
+from malta.simulation.trajectory import SERIES
 
 if TYPE_CHECKING:
     from conftest import Design
@@ -46,7 +40,7 @@ OPERATIONS = """ADD SUB MUL DIV INV NEG SQ TWICE SQRT FABS FLOOR CEIL SIGN FMOD 
 IF_ELSE_ZERO SIN COS TAN ASIN ACOS ATAN ATAN2 SINH COSH TANH EXP LOG POW CONSTPOW HYPOT"""
 NO_NOISE = np.zeros((1, 1))
 NOT_FAST = np.zeros((0, 0))
-TABLE = engine.feedforward_table(np.array([-1.0, 0.0, 1.0]), np.array([[-1.0], [0.0], [3.0]]))
+TABLE = compiled.feedforward_table(np.array([-1.0, 0.0, 1.0]), np.array([[-1.0], [0.0], [3.0]]))
 
 
 class Trial(NamedTuple):
@@ -58,7 +52,7 @@ class Trial(NamedTuple):
     reference: ca.Function
 
 
-needs_compiler = pytest.mark.skipif(engine.compiler() is None, reason="no C compiler")
+needs_compiler = pytest.mark.skipif(compiled.compiler() is None, reason="no C compiler")
 
 
 def _values(n: int) -> Any:
@@ -86,7 +80,7 @@ def _parts(row: Callable[[Any, Any, Any], Any]) -> tuple[Parts, ca.Function]:
 
 
 def _library(text: str, lanes: int, folder: Path | None = None) -> Any:
-    lib = engine.library(text, lanes, folder)
+    lib = compiled.library(text, lanes, folder)
     if lib is None:
         pytest.skip("no C compiler")
     return lib
@@ -97,15 +91,15 @@ def _trial(row: Callable[[Any, Any, Any], Any]) -> Trial:
     state, around, *_, theta = _symbols()
     return Trial(
         parts,
-        _library(engine.source(parts, None), 1),
-        _library(engine.source(parts, digest), LANES),
+        _library(translate.source(parts, None), 1),
+        _library(translate.source(parts, digest), LANES),
         ca.Function("reference", [state[:STATES], around, theta], [row(state[:STATES], around, theta)]),
     )
 
 
 def _run_one(trial: Trial, state: Any, given: FloatArray, theta: Any) -> FloatArray:
     """The rows that one lane leaves, without the last column: v0 of the table."""
-    run = engine.compiled_engine(trial.one.run, trial.parts, np.array(theta, dtype=float), 1, TABLE)
+    run = engines.compiled_engine(trial.one.run, trial.parts, np.array(theta, dtype=float), 1, TABLE)
     begin = np.append(np.array(state, dtype=float), 0.0)
     _, rows = run.run(0, begin, given, np.zeros((len(given), 1)), NOT_FAST)
     return rows[:, :-1]
@@ -123,10 +117,10 @@ def _digests(
 ) -> FloatArray:
     states = np.hstack([states, np.zeros((LANES, 1))])
     theta, start, digests = (
-        engine.in_lanes(rows, 1)
+        compiled.in_lanes(rows, 1)
         for rows in (thetas, states, np.zeros((LANES, trial.parts.decide.size1_out(2))))
     )
-    engine.run_many(
+    compiled.run_many(
         trial.many,
         slice(0, 1),
         substeps=1,
@@ -233,12 +227,12 @@ def _everything(state: Any, around: Any, theta: Any) -> Any:
 def _parts_of(statements: int) -> Iterator[None]:
     """Every function that is longer is cut in parts of so many statements."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(engine, "WHOLE", statements)
-        patch.setattr(engine, "PART", statements)
+        patch.setattr(translate, "WHOLE", statements)
+        patch.setattr(translate, "PART", statements)
         yield
 
 
-@pytest.fixture(scope="module", params=[engine.WHOLE, 7], ids=["whole", "in parts"])
+@pytest.fixture(scope="module", params=[translate.WHOLE, 7], ids=["whole", "in parts"])
 def everything(request: pytest.FixtureRequest) -> Trial:
     """Some 130 expressions in every operation that the engine knows, in one library for each number of lanes."""
     with _parts_of(request.param):
@@ -337,7 +331,7 @@ def _tilts(state: Any, around: Any, _: Any) -> Any:
     return ca.vertcat(ca.sin(x), ca.cos(x), 1 / ca.cos(x), ca.tan(x))
 
 
-@pytest.fixture(scope="module", params=[engine.WHOLE, 1], ids=["whole", "in parts"])
+@pytest.fixture(scope="module", params=[translate.WHOLE, 1], ids=["whole", "in parts"])
 def tilted(request: pytest.FixtureRequest) -> Trial:
     """Sine, cosine and their quotients of a state and an input: angles of a mover, as the engine sees it."""
     with _parts_of(request.param):
@@ -375,7 +369,7 @@ def test_a_tilt_that_grows_is_done_over(tilted: Trial, lane: int) -> None:
 @pytest.mark.parametrize("z_grid", [[-1.0, 0.0, 1.0, 2.0], [-1.0, -0.9, 1.0, 2.0], [0.5, 3.0]])
 def test_lanes_look_up_even_grids_and_others(waves: Trial, z_grid: list[float]) -> None:
     v0 = np.random.default_rng(4).uniform(-3, 3, len(z_grid))
-    table = engine.feedforward_table(np.array(z_grid), v0[:, None])
+    table = compiled.feedforward_table(np.array(z_grid), v0[:, None])
     at = np.unique([*np.linspace(z_grid[0], z_grid[-1], 50), *z_grid])
     for z in at:
         given = np.array([[z, 0, 0]])
@@ -391,7 +385,7 @@ def test_sums_share_their_factor() -> None:
         state[1] * (1 / theta[0]) * theta[1],
         theta[1] * state[2] / theta[0],
     ]
-    _, moving, constants = engine.translate(ca.Function("f", [state, theta], [sum(apart)]), [], 0)
+    _, moving, constants = translate.translate(ca.Function("f", [state, theta], [sum(apart)]), [], 0)
     assert moving.count(" * ") == 1
     assert constants == 1
 
@@ -411,7 +405,7 @@ def _statements(text: str) -> list[tuple[str, str]]:
 def _engine_text(row: Callable[[Any, Any, Any], Any], name: str = "decide") -> str:
     """C of one function of the engine that `row` is tried in."""
     parts, _ = _parts(row)
-    return engine.translate(getattr(parts, name), [1], 0)[1]
+    return translate.translate(getattr(parts, name), [1], 0)[1]
 
 
 def test_only_long_functions_are_cut() -> None:
@@ -483,7 +477,7 @@ def test_parts_without_a_tilt_serve_near_and_far() -> None:
 
     with _parts_of(1):
         parts, _ = _parts(row)
-        text = engine.source(parts, None)
+        text = translate.source(parts, None)
     defined = re.findall(r"void (decide\w*)\((real \*range)?", text)
     near = {name.removesuffix("_near"): taken for name, taken in defined if name.endswith("_near")}
     tilts = {
@@ -510,7 +504,7 @@ def _long(state: Any, around: Any, theta: Any) -> Any:
 
 def test_a_long_function_is_compiled_in_parts() -> None:
     """With the limits as they are, near tilts and far ones."""
-    assert f"decide_{engine.WHOLE // engine.PART}(" in _engine_text(_long)
+    assert f"decide_{translate.WHOLE // translate.PART}(" in _engine_text(_long)
     trial = _trial(_long)
     rng = np.random.default_rng(5)
     for size in (1e-3, 1.0):
@@ -528,16 +522,16 @@ def test_an_operation_without_a_form_is_refused() -> None:
     state, _, theta = ca.SX.sym("state"), ca.SX.sym("given"), ca.SX.sym("theta")
     for unknown, name in ((ca.erf, "OP_ERF"), (ca.log1p, "OP_LOG1P"), (ca.acosh, "OP_ACOSH")):
         with pytest.raises(malta.CheckError, match=f"has no {name}"):
-            engine.translate(ca.Function("f", [state, theta], [unknown(state)]), [], 0)
+            translate.translate(ca.Function("f", [state, theta], [unknown(state)]), [], 0)
 
 
 def test_constants_are_any_numbers(tmp_path: Path) -> None:
     """Infinity, which is how an expression says "no limit", the smallest numbers and the largest."""
     numbers = [np.inf, -np.inf, 5e-324, -1.7976931348623157e308, 0.1, -3.0, 1e22]
     parts, _ = _parts(lambda s, g, _: ca.vertcat(*(ca.fmin(s[0] + g[0], n) for n in numbers)))
-    lib = engine.library(engine.source(parts, None), 1, tmp_path)
+    lib = compiled.library(translate.source(parts, None), 1, tmp_path)
     assert lib is not None, "it does not compile"
-    run = engine.compiled_engine(lib.run, parts, np.zeros(THETA), 1, TABLE).run
+    run = engines.compiled_engine(lib.run, parts, np.zeros(THETA), 1, TABLE).run
     for value in (-1e9, 0.0, 1e9):
         _, rows = run(0, np.array([value, 0, 0, 0]), np.zeros((1, GIVEN)), NO_NOISE, NOT_FAST)
         assert rows[0, :-1].tolist() == [min(value, n) for n in numbers]
@@ -547,7 +541,7 @@ def test_what_depends_on_constants_alone_is_computed_once() -> None:
     """A division by a number of the machine is a reciprocal in `prepare` and a product in the loop."""
     state, theta = ca.SX.sym("state"), ca.SX.sym("theta", 2)
     f = ca.Function("f", [state, theta], [state / theta[0] + ca.exp(theta[1]) * ca.sin(theta[0])])
-    prepare, moving, constants = engine.translate(f, [], 5)
+    prepare, moving, constants = translate.translate(f, [], 5)
     assert constants == 2
     assert "theta[0]" in prepare
     assert "exp(" in prepare
@@ -560,7 +554,7 @@ def test_what_depends_on_constants_alone_is_computed_once() -> None:
 @given(z=st.floats(-2, 2), start=st.floats(-2, 2))
 def test_the_table_is_linear_between_its_points(waves: Trial, z: float, start: float) -> None:
     """v0 of a grid that is looked up from wherever the search stood before: numpy's interpolation."""
-    run = engine.compiled_engine(waves.one.run, waves.parts, np.zeros(THETA), 1, TABLE).run
+    run = engines.compiled_engine(waves.one.run, waves.parts, np.zeros(THETA), 1, TABLE).run
     _, rows = run(0, np.zeros(STATES + 1), np.array([[start, 0, 0], [z, 0, 0.0]]), np.zeros((2, 1)), NOT_FAST)
     inside = [np.clip(at, -1, 1) for at in (start, z)]
     expected = np.interp(inside, [-1, 0, 1], [-1, 0, 3])
@@ -682,7 +676,7 @@ def test_one_library_serves_designs_and_machines(designs: dict[str, Design]) -> 
 def fresh(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Path]:
     """A cache folder of its own, nothing remembered; and again nothing afterwards."""
 
-    memories = (engine.compiler, engine._processor, compiled_shape, engine_of)
+    memories = (compiled.compiler, compiled._processor, compiled_shape, engine_of)
 
     def forget() -> None:
         for memory in memories:
@@ -704,7 +698,7 @@ def _hold(duration: float = 1e-3) -> Scenario:
 def test_the_folder_holds_one_file_for_two_designs(designs: dict[str, Design], fresh: Path) -> None:
     for design in designs.values():
         assert malta.simulate(design.plant, design.controller, _hold()).engine == "compiled"
-    assert engine.cache_folder() == fresh
+    assert compiled.cache_folder() == fresh
     assert [path.suffix for path in fresh.iterdir()] == [".so"]
 
 
@@ -712,11 +706,11 @@ def test_the_folder_holds_one_file_for_two_designs(designs: dict[str, Design], f
 def small() -> tuple[Parts, str]:
     """An engine that compiles at once: 3 s[0] + g[0], and sin(g[0])."""
     parts, _ = _parts(lambda s, g, _: ca.vertcat(3 * s[0] + g[0], ca.sin(g[0])))
-    return parts, engine.source(parts, None)
+    return parts, translate.source(parts, None)
 
 
 def _works(lib: Any, parts: Parts) -> bool:
-    run = engine.compiled_engine(lib.run, parts, np.zeros(THETA), 1, TABLE).run
+    run = engines.compiled_engine(lib.run, parts, np.zeros(THETA), 1, TABLE).run
     _, rows = run(0, np.array([2.0, 0, 0, 0]), np.array([[0.5, 0, 0]]), NO_NOISE, NOT_FAST)
     return bool(rows[0] == pytest.approx([6.5, np.sin(0.5), 1.5]))
 
@@ -737,16 +731,16 @@ def test_the_cache_knows_what_a_library_depends_on(
     _library(text + "/* otherwise */", 1, tmp_path)
     assert files() == 2
     parts8, digest = _parts(lambda s, *_: s)
-    _library(engine.source(parts8, digest), LANES, tmp_path)
+    _library(translate.source(parts8, digest), LANES, tmp_path)
     assert files() == 3
     for name, value in (
-        ("FLAGS", (*engine.FLAGS, "-DNOTHING")),
+        ("FLAGS", (*compiled.FLAGS, "-DNOTHING")),
         ("_processor", lambda: "another"),
         ("_version", lambda _: "another"),
     ):
         before = files()
         with monkeypatch.context() as patch:
-            patch.setattr(engine, name, value)
+            patch.setattr(compiled, name, value)
             assert _works(_library(text, 1, tmp_path), parts)
         assert files() == before + 1
     assert [path.name for path in tmp_path.iterdir() if path.is_file() and path.suffix != ".so"] == []
@@ -786,7 +780,7 @@ def test_a_library_that_was_cut_short_is_not_run(
     (folder / sound.name).write_bytes(whole[: int(share * len(whole))])
     (tmp_path / "text.c").write_text(text, encoding="utf-8")
     loading = (
-        "from pathlib import Path; from malta.simulation.engines import library; import sys\n"
+        "from pathlib import Path; from malta.simulation.compiled import library; import sys\n"
         "assert library(Path(sys.argv[1]).read_text(encoding='utf-8'), 1, Path(sys.argv[2])) is not None"
     )
     ended = subprocess.run(
@@ -830,7 +824,7 @@ def test_without_a_compiler_the_virtual_machine_runs(
     with_one = malta.simulate(design.plant, design.controller, _hold(5e-3))
     for cached in (compiled_shape, engine_of):
         cached.cache_clear()
-    monkeypatch.setattr(engine, "compiler", lambda: None)
+    monkeypatch.setattr(compiled, "compiler", lambda: None)
     run = malta.simulate(design.plant, design.controller, _hold(5e-3))
     assert (with_one.engine, run.engine) == ("compiled", "virtual machine")
     np.testing.assert_allclose(run.x, with_one.x, rtol=0, atol=1e-12 * np.abs(run.x).max())
@@ -846,7 +840,7 @@ def test_a_compiler_that_fails_is_no_compiler(
 ) -> None:
     monkeypatch.setenv("CC", "/bin/false")
     design = designs["calibrated"]
-    assert engine.compiler() == ("/bin/false",)
+    assert compiled.compiler() == ("/bin/false",)
     run = malta.simulate(design.plant, design.controller, _hold())
     assert (run.engine, run.verdict.completed) == ("virtual machine", True)
     assert not list(fresh.iterdir())
@@ -857,13 +851,13 @@ def test_a_compiler_that_fails_is_no_compiler(
 @pytest.mark.usefixtures("fresh")
 def test_a_compiler_that_does_not_exist_is_no_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("CC", "/nowhere/cc")
-    assert engine.compiler() is None
-    assert engine.library("", 1) is None
+    assert compiled.compiler() is None
+    assert compiled.library("", 1) is None
 
 
 def test_two_processes_may_compile_at_once(small: tuple[Parts, str], fresh: Path, tmp_path: Path) -> None:
     """A compiler that takes its time, so that both are at it: both succeed, one file is left and nothing else."""
-    cc = engine.compiler()
+    cc = compiled.compiler()
     if cc is None:
         pytest.skip("no C compiler")
     slow = tmp_path / "slow-cc"
@@ -873,7 +867,7 @@ def test_two_processes_may_compile_at_once(small: tuple[Parts, str], fresh: Path
     slow.chmod(0o755)
     (tmp_path / "text.c").write_text(small[1], encoding="utf-8")
     compiling = (
-        "from pathlib import Path; from malta.simulation.engines import library; import sys\n"
+        "from pathlib import Path; from malta.simulation.compiled import library; import sys\n"
         "assert library(Path(sys.argv[1]).read_text(encoding='utf-8'), 1) is not None"
     )
     environment = os.environ | {"CC": str(slow)}

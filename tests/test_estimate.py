@@ -11,13 +11,8 @@ import pytest
 
 import malta
 from malta import references
-from malta.simulation.simulate import (
-    ESTIMATORS,
-    Estimator,
-    Fault,
-    Scenario,
-    Trajectory,
-)
+from malta.simulation.scenario import ESTIMATORS, Estimator, Fault, Scenario
+from malta.simulation.trajectory import Trajectory
 from malta.synthesis.riccati import dare
 
 if TYPE_CHECKING:

@@ -28,14 +28,10 @@ from malta.simulation.experiments import (
     experiment,
 )
 from malta.simulation.responses import compliance
-from malta.simulation.simulate import (
-    ESTIMATORS,
-    Fault,
-    Scenario,
-    Trajectory,
-    Verdict,
-    simulate,
-)
+from malta.simulation.scenario import ESTIMATORS, Fault, Scenario
+from malta.simulation.simulate import simulate
+from malta.simulation.trajectory import Trajectory
+from malta.simulation.verdict import Verdict
 from malta.synthesis.lqg import lqr
 
 if TYPE_CHECKING:

@@ -35,9 +35,10 @@ from malta.machines.halbach.plant import IDEAL, Options, Parameters
 from malta.model.data import published_value
 from malta.model.plant import Plant
 from malta.report.ledger import ledger
-from malta.simulation.engines import compiler
+from malta.simulation.compiled import compiler
 from malta.simulation.experiments import cases_of, experiment
-from malta.simulation.simulate import Scenario, simulate
+from malta.simulation.scenario import Scenario
+from malta.simulation.simulate import simulate
 from malta.synthesis.controller import Controller, linear_law
 from malta.synthesis.lqg import sampled_model
 from malta.synthesis.riccati import sample_noise

@@ -34,7 +34,8 @@ from malta.model.data import plant_of
 from malta.model.linearize import LinearModel
 from malta.model.plant import Plant
 from malta.simulation.references import Motion
-from malta.simulation.simulate import Scenario, simulate
+from malta.simulation.scenario import Scenario
+from malta.simulation.simulate import simulate
 from malta.synthesis.controller import Controller, linear_law
 from malta.synthesis.lqg import (
     held,

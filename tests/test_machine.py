@@ -18,17 +18,10 @@ from malta import references
 from malta.machines.tubular import plant as tubular
 from malta.machines.tubular import windings
 from malta.simulation import period as machine
+from malta.simulation.engines import engine_of
+from malta.simulation.inputs import beginning, sampled
 from malta.simulation.references import Motion
-from malta.simulation.simulate import (
-    Correction,
-    Fault,
-    Scenario,
-    beginning,
-    engine_of,
-    sampled,
-    setup_of,
-    steps_of,
-)
+from malta.simulation.scenario import Correction, Fault, Scenario, setup_of, steps_of
 
 if TYPE_CHECKING:
     from conftest import Design

@@ -15,24 +15,18 @@ from hypothesis import strategies as st
 
 import malta
 from malta import references
-from malta.simulation import engines as engine
+from malta.simulation import compiled
 from malta.simulation.batch import (
     Batch,
     replayed,
     simulate_many,
     verdicts,
 )
+from malta.simulation.engines import compiled_shape, engine_of
 from malta.simulation.noise import keys, normals
 from malta.simulation.period import FIDELITIES, Fidelity
-from malta.simulation.simulate import (
-    Correction,
-    Fault,
-    Scenario,
-    Trajectory,
-    compiled_shape,
-    engine_of,
-    stroke_figures,
-)
+from malta.simulation.scenario import Correction, Fault, Scenario
+from malta.simulation.trajectory import Trajectory, stroke_figures
 
 if TYPE_CHECKING:
     from conftest import Design
@@ -397,7 +391,7 @@ def test_a_batch_is_read_only(calibrated: Design) -> None:
 @pytest.fixture
 def no_compiler(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """As on a system without one."""
-    monkeypatch.setattr(engine, "compiler", lambda: None)
+    monkeypatch.setattr(compiled, "compiler", lambda: None)
     remembered = (compiled_shape, engine_of)
     for memory in remembered:
         memory.cache_clear()

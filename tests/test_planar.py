@@ -27,8 +27,8 @@ from malta.model.data import published as read_published
 from malta.model.data import published_value
 from malta.model.plant import symbolic
 from malta.model.rigidbody import rotation
-from malta.simulation.engines import translate
 from malta.simulation.references import QUINTIC_DURATION, quintic
+from malta.simulation.translate import translate
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray

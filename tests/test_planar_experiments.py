@@ -304,7 +304,7 @@ def test_times_are_those_of_the_numbers(lqg: Design, flown: dict[str, Experiment
 
 
 def test_without_a_compiler_there_is_no_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("malta.simulation.engines.compiler", lambda: None)
+    monkeypatch.setattr("malta.simulation.compiled.compiler", lambda: None)
     x = ca.SX.sym("x")
     assert np.isnan(experiments.compiled_seconds(ca.Function("square", [x], [x * x]), np.ones(1)))
 

@@ -21,7 +21,8 @@ from malta.machines.tubular.experiments import EXPERIMENTS
 from malta.report import figures
 from malta.report.ledger import Claim, Ledger
 from malta.simulation.experiments import Case, Experiment, Merit
-from malta.simulation.simulate import Scenario, Verdict
+from malta.simulation.scenario import Scenario
+from malta.simulation.verdict import Verdict
 
 if TYPE_CHECKING:
     from collections.abc import Callable

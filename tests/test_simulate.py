@@ -15,13 +15,10 @@ from scipy.integrate import solve_ivp
 import malta
 from malta import references
 from malta.margins.verify import loop
+from malta.simulation.inputs import feedforward
 from malta.simulation.period import state_reference
-from malta.simulation.simulate import (
-    Scenario,
-    feedforward,
-    save,
-    stroke_figures,
-)
+from malta.simulation.scenario import Scenario
+from malta.simulation.trajectory import save, stroke_figures
 from malta.synthesis.controller import linear_law
 
 if TYPE_CHECKING:

@@ -38,7 +38,7 @@ from malta.campaigns.store import (
 from malta.errors import InputError
 from malta.files import replace_files
 from malta.model.plant import readonly
-from malta.simulation import engines as engine
+from malta.simulation import compiled
 from malta.simulation.batch import (
     Batch,
     is_compiled,
@@ -47,8 +47,8 @@ from malta.simulation.batch import (
     simulate_many,
     verdicts,
 )
+from malta.simulation.engines import EngineChoice
 from malta.simulation.experiments import Experiment, flown
-from malta.simulation.simulate import EngineChoice
 from malta.synthesis.controller import Controller
 
 if TYPE_CHECKING:
@@ -137,9 +137,9 @@ def campaign(
         raise InputError("campaign", "workers", str(workers), "none with a cluster, which has its own")
     if workers is not None and workers < 1:
         raise InputError("campaign", "workers", str(workers), "at least 1")
-    size = block or (BLOCK if engine.compiler() or cluster else SLOW_BLOCK)
-    if size < 1 or size % engine.LANES:
-        raise InputError("campaign", "block", f"{size} runs", f"a multiple of {engine.LANES}")
+    size = block or (BLOCK if compiled.compiler() or cluster else SLOW_BLOCK)
+    if size < 1 or size % compiled.LANES:
+        raise InputError("campaign", "block", f"{size} runs", f"a multiple of {compiled.LANES}")
     place = None if folder is None else Path(folder)
     if place is not None:
         size = opened(place, plan, size)

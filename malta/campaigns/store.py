@@ -27,7 +27,7 @@ from malta.campaigns.plan import (
 from malta.errors import InputError
 from malta.files import read_file, replace_files
 from malta.simulation.batch import Batch
-from malta.simulation.engines import LANES
+from malta.simulation.compiled import LANES
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray

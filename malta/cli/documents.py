@@ -93,7 +93,7 @@ def experiment_document(experiment: Experiment) -> dict[str, Any]:
     if experiment.name == "stroke":
         from dataclasses import asdict
 
-        from malta.simulation.simulate import stroke_figures
+        from malta.simulation.trajectory import stroke_figures
 
         document["stroke"] = asdict(stroke_figures(experiment.run))
     return document

@@ -37,8 +37,8 @@ from malta.cli.output import make_console, print_json, print_note, print_written
 from malta.errors import CheckError, InputError
 
 if TYPE_CHECKING:
+    from malta.simulation.engines import EngineChoice
     from malta.simulation.experiments import Experiment
-    from malta.simulation.simulate import EngineChoice
     from malta.synthesis.controller import Controller
 
 
@@ -177,7 +177,7 @@ def _replay(
 def _save(simulation: Simulation, folder: Path, published: Mapping[str, Any] | None) -> list[Path]:
     """Write the time series of every run, and the figure."""
     from malta import report
-    from malta.simulation.simulate import save as save_series
+    from malta.simulation.trajectory import save as save_series
 
     cases, stem = simulation.experiment.cases, simulation.stem
     stems = [stem] if len(cases) == 1 else [f"{stem}_{_slug(case.label)}" for case in cases]

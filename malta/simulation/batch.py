@@ -20,28 +20,13 @@ from malta.errors import InputError
 from malta.model.data import shaping, twins_of, units_of
 from malta.model.plant import Plant, readonly
 from malta.simulation import period as machine
-from malta.simulation.engines import (
-    LANES,
-    evaluate,
-    feedforward_table,
-    in_lanes,
-    run_many,
-)
+from malta.simulation.compiled import LANES, feedforward_table, in_lanes, run_many
+from malta.simulation.engines import BLOCK, compiled_shape, evaluate, shape_of
+from malta.simulation.inputs import beginning, sampled
 from malta.simulation.noise import GAMMA, keys
-from malta.simulation.simulate import (
-    BLOCK,
-    Scenario,
-    Trajectory,
-    beginning,
-    compiled_shape,
-    recorded,
-    sampled,
-    setup_of,
-    shape_of,
-    simulate,
-    steps_of,
-    stroke_figures,
-)
+from malta.simulation.scenario import Scenario, setup_of, steps_of
+from malta.simulation.simulate import simulate
+from malta.simulation.trajectory import Trajectory, recorded, stroke_figures
 from malta.synthesis.controller import Controller
 
 if TYPE_CHECKING:

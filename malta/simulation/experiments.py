@@ -38,13 +38,11 @@ from malta.errors import InputError
 from malta.model.data import in_unit
 from malta.model.machines import attribute_of
 from malta.model.plant import Plant
+from malta.simulation.engines import EngineChoice
 from malta.simulation.references import Reference
-from malta.simulation.simulate import (
-    EngineChoice,
-    Scenario,
-    Trajectory,
-    simulate,
-)
+from malta.simulation.scenario import Scenario
+from malta.simulation.simulate import simulate
+from malta.simulation.trajectory import Trajectory
 from malta.synthesis.controller import Controller
 
 if TYPE_CHECKING:

@@ -32,7 +32,7 @@ from malta.simulation.experiments import (
 from malta.simulation.period import fidelities
 from malta.simulation.references import Motion, Reference
 from malta.simulation.responses import step_wrench
-from malta.simulation.simulate import Trajectory
+from malta.simulation.trajectory import Trajectory
 from malta.synthesis.controller import Controller
 
 if TYPE_CHECKING:

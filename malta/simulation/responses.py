@@ -11,7 +11,7 @@ import numpy as np
 from malta.margins.verify import machine_loop
 from malta.model.linearize import linearize
 from malta.model.plant import Plant
-from malta.simulation.simulate import Trajectory
+from malta.simulation.trajectory import Trajectory
 from malta.synthesis.controller import Controller
 
 if TYPE_CHECKING:

@@ -91,7 +91,7 @@ class Design(Protocol):
         """Run an experiment of the machine by name: simulation.experiments.Experiment."""
 
     def simulate(self, parameters: Parameters, scenario: Any) -> Any:
-        """Run a scenario on a machine with other parameters: simulation.simulate.Trajectory."""
+        """Run a scenario on a machine with other parameters: simulation.trajectory.Trajectory."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,7 +15,8 @@ from malta.margins.verify import BANDWIDTHS, machine_loop, verify
 from malta.simulation import references
 from malta.simulation.experiments import experiment, scenario_of
 from malta.simulation.period import fidelities
-from malta.simulation.simulate import Scenario, simulate
+from malta.simulation.scenario import Scenario
+from malta.simulation.simulate import simulate
 from malta.synthesis.requirements import Figure, Noise, Requirement, ratio_of, requirements_for
 from malta.tuning.noise import noise_of
 from malta.tuning.pid import loads_of, loop_figures, whole_machine
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
     from malta.model.linearize import LinearModel
     from malta.model.plant import FloatArray, Parameters, Plant
     from malta.simulation.experiments import Experiment
-    from malta.simulation.simulate import Trajectory
+    from malta.simulation.trajectory import Trajectory
     from malta.synthesis.controller import Controller
     from malta.synthesis.spec import Spec
 

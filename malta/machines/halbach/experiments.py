@@ -43,7 +43,7 @@ from malta.simulation.experiments import (
     scenario_of,
 )
 from malta.simulation.references import Motion, Reference
-from malta.simulation.simulate import Trajectory
+from malta.simulation.trajectory import Trajectory
 from malta.synthesis.controller import Controller
 from malta.synthesis.riccati import sample
 

@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from malta.simulation.experiments import Case, Experiment
-    from malta.simulation.simulate import Trajectory
+    from malta.simulation.trajectory import Trajectory
 
 EACH: dict[str, Any] = {"color": "#b5b5b5", "linewidth": 0.7}
 ASKED: dict[str, Any] = {"color": "#c1440e", "linestyle": (0, (5, 2)), "linewidth": 1.2}

@@ -23,7 +23,7 @@ from malta.report.ledger import (
     peak_sensitivity,
 )
 from malta.simulation.experiments import Case, Experiment, Progress
-from malta.simulation.simulate import Trajectory
+from malta.simulation.trajectory import Trajectory
 from malta.synthesis.controller import Controller
 from malta.synthesis.spec import Spec
 

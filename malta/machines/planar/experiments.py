@@ -26,7 +26,7 @@ from malta.machines.planar import plant as planar
 from malta.machines.planar.field import COIL_ORDER
 from malta.model.linearize import linearize
 from malta.model.plant import Plant
-from malta.simulation import engines as engine
+from malta.simulation import compiled as engine
 from malta.simulation import references
 from malta.simulation.experiments import (
     QUIET,
@@ -40,7 +40,7 @@ from malta.simulation.experiments import (
     scenario_of,
 )
 from malta.simulation.references import Motion, Reference
-from malta.simulation.simulate import Trajectory
+from malta.simulation.trajectory import Trajectory
 from malta.synthesis.controller import Controller
 from malta.synthesis.lqg import lqg, weights_of
 

@@ -30,12 +30,9 @@ from malta.report.ledger import (
 )
 from malta.simulation.experiments import Experiment, Progress
 from malta.simulation.inverter import link_voltage, open_loop_gain
-from malta.simulation.simulate import (
-    Scenario,
-    StrokeFigures,
-    simulate,
-    stroke_figures,
-)
+from malta.simulation.scenario import Scenario
+from malta.simulation.simulate import simulate
+from malta.simulation.trajectory import StrokeFigures, stroke_figures
 from malta.synthesis.controller import Controller
 from malta.synthesis.lqg import lqr
 from malta.synthesis.riccati import add_integrals

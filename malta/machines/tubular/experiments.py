@@ -43,21 +43,14 @@ from malta.simulation.responses import (
     sine_wrench,
     step_wrench,
 )
-from malta.simulation.simulate import (
-    ESTIMATORS,
-    FEEDFORWARDS,
-    Correction,
-    Fault,
-    Scenario,
-    Trajectory,
-    stroke_figures,
-)
+from malta.simulation.scenario import ESTIMATORS, FEEDFORWARDS, Correction, Fault, Scenario
 from malta.simulation.time_optimal import (
     FastestStroke,
     SigmoidStroke,
     fastest_stroke,
     sigmoid_at_peak_current,
 )
+from malta.simulation.trajectory import Trajectory, stroke_figures
 from malta.synthesis.controller import Controller
 
 if TYPE_CHECKING:

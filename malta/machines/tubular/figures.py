@@ -43,7 +43,7 @@ from malta.report.figures.parts import (
     upright,
 )
 from malta.simulation.references import hold
-from malta.simulation.simulate import Trajectory, stroke_figures
+from malta.simulation.trajectory import Trajectory, stroke_figures
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

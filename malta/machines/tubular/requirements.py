@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from malta.simulation.simulate import Scenario, stroke_figures
+from malta.simulation.scenario import Scenario
+from malta.simulation.trajectory import stroke_figures
 from malta.synthesis.requirements import (
     Design,
     Figure,

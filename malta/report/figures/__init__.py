@@ -50,7 +50,7 @@ from malta.report.figures.parts import POINTS as POINTS
 from malta.report.figures.parts import STYLES as STYLES
 from malta.report.figures.parts import number as number
 from malta.simulation.experiments import Case, Experiment, experiments_of
-from malta.simulation.simulate import Trajectory
+from malta.simulation.trajectory import Trajectory
 from malta.synthesis.requirements import Trade
 
 if TYPE_CHECKING:

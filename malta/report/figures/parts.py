@@ -12,7 +12,7 @@ import numpy as np
 
 from malta.model.data import in_unit, published_value
 from malta.model.plant import Plant
-from malta.simulation.simulate import Trajectory
+from malta.simulation.trajectory import Trajectory
 from malta.synthesis.requirements import Trade, requirements_for
 
 if TYPE_CHECKING:

@@ -1,0 +1,154 @@
+"""Shared libraries of control periods: the system's C compiler, the cache of its results, and calls into them.
+
+A library stays in the user's cache folder under the SHA-256 of its text, the compiler, the options and the processor.
+Two processes that compile at once write the same file, each under a name of its own first."""
+
+from __future__ import annotations
+
+import ctypes
+import hashlib
+import os
+import platform
+import shlex
+import shutil
+import subprocess
+import tempfile
+from contextlib import suppress
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import platformdirs
+
+if TYPE_CHECKING:
+    from malta.model.plant import FloatArray
+
+LANES = 8
+
+
+FLAGS = (
+    *("-std=gnu11", "-O3", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math"),
+    *("-fschedule-insns", "-fsched-pressure", "-fPIC", "-shared"),
+)
+
+
+@cache
+def compiler() -> tuple[str, ...] | None:
+    """The system's C compiler, as a command: $CC (which may have options), or the first of cc, gcc and clang."""
+    chosen = shlex.split(os.environ.get("CC", ""))
+    for name, *options in [chosen] if chosen else [["cc"], ["gcc"], ["clang"]]:
+        path = shutil.which(name)
+        if path:
+            return path, *options
+    return None
+
+
+@cache
+def _processor() -> str:
+    """What `-march=native` depends on."""
+    with suppress(OSError):
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+        return "".join(sorted({x for x in lines if x.startswith(("flags", "model name", "Features"))}))
+    return platform.processor() + platform.machine()
+
+
+@cache
+def _version(cc: tuple[str, ...]) -> str:
+    return subprocess.run([*cc, "--version"], capture_output=True, text=True, check=False).stdout
+
+
+def library(text: str, lanes: int, folder: Path | None = None) -> ctypes.CDLL | None:
+    """The compiled text, from the cache folder or compiled now; None where no compiler can do it."""
+    cc = compiler()
+    if cc is None:
+        return None
+    key = "\n".join([text, str(lanes), *FLAGS, *cc, _version(cc), _processor(), platform.platform()])
+    name = f"{hashlib.sha256(key.encode()).hexdigest()}.so"
+    for place in (folder or cache_folder(), Path(tempfile.gettempdir()) / f"malta-{os.getuid()}"):
+        path = place / name
+        try:
+            place.mkdir(parents=True, exist_ok=True, mode=0o700)
+            if place.stat().st_uid != os.getuid():
+                continue  # code is loaded from here: nobody else's
+            if not _whole(path) and not _compiled(cc, text, lanes, path):
+                return None
+            return ctypes.CDLL(str(path))
+        except OSError:
+            continue
+    return None
+
+
+def _whole(path: Path) -> bool:
+    """Whether a library ends with the hash of what stands before: loading half of one would end the process."""
+    if not path.exists():
+        return False
+    content = path.read_bytes()
+    return len(content) > 32 and hashlib.sha256(content[:-32]).digest() == content[-32:]
+
+
+def cache_folder() -> Path:
+    """Where compiled engines stay; deleting it costs seconds of compilation."""
+    return platformdirs.user_cache_path("malta")
+
+
+def _compiled(cc: tuple[str, ...], text: str, lanes: int, path: Path) -> bool:
+    """Compile to `path`, whole or not at all."""
+    with tempfile.TemporaryDirectory(dir=path.parent) as scratch:
+        c, so = Path(scratch) / "engine.c", Path(scratch) / "engine.so"
+        c.write_text(text, encoding="utf-8")
+        for native in (["-march=native"], []):
+            command = [*cc, *FLAGS, *native, f"-DLANES={lanes}", str(c), "-o", str(so), "-lm"]
+            if subprocess.run(command, capture_output=True, check=False).returncode == 0:
+                content = so.read_bytes()
+                so.write_bytes(content + hashlib.sha256(content).digest())  # see _whole
+                so.replace(path)
+                return True
+    return False
+
+
+def _address(array: Any) -> ctypes.c_void_p:
+    return ctypes.c_void_p(array.ctypes.data)
+
+
+def feedforward_table(z_grid: FloatArray, v0: FloatArray) -> FloatArray:
+    """Rows of z, v0(z) and its slope up to the next row."""
+    slope = np.diff(v0, axis=0) / np.diff(z_grid)[:, None]
+    return np.ascontiguousarray(np.hstack([z_grid[:, None], v0, np.vstack([slope, slope[-1:]])]))
+
+
+def in_lanes(rows: FloatArray, groups: int) -> FloatArray:
+    """Rows of machines as groups x numbers x LANES; the last machine fills what is left of the last group."""
+    filled = np.concatenate([rows, np.repeat(rows[-1:], groups * LANES - len(rows), axis=0)])
+    return np.ascontiguousarray(filled.reshape(groups, LANES, -1).swapaxes(1, 2))
+
+
+def run_many(
+    lib: Any,
+    chosen: slice,
+    *,
+    substeps: int,
+    theta: FloatArray,
+    table: FloatArray,
+    states: FloatArray,
+    given: FloatArray,
+    uniform: bool,
+    sigma: FloatArray,
+    keys: Any,
+    digests: FloatArray,
+) -> None:
+    """Some groups of LANES machines (the first axis) through all samples of `given`; states and digests are changed."""
+    lib.run_many(
+        ctypes.c_long(len(range(*chosen.indices(len(theta))))),
+        ctypes.c_long(len(given)),
+        ctypes.c_long(substeps),
+        _address(theta[chosen]),
+        ctypes.c_long(len(table)),
+        _address(table),
+        _address(states[chosen]),
+        _address(given),
+        ctypes.c_long(uniform),
+        _address(sigma[chosen]),
+        _address(keys[chosen]),
+        _address(digests[chosen]),
+    )

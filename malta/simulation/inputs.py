@@ -1,0 +1,197 @@
+"""Inputs of every sample of a scenario: reference, feedforward, disturbances, faults and noise; and the first state."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any
+
+import casadi as ca
+import numpy as np
+from scipy.special import erf
+
+from malta.errors import InputError
+from malta.model.data import plant_of
+from malta.model.plant import Plant, position_in
+from malta.simulation import period as machine
+from malta.simulation import references
+from malta.simulation.engines import evaluate
+from malta.simulation.noise import keys, normals
+from malta.simulation.period import Setup
+from malta.simulation.scenario import Fault, FeedforwardChoice, Scenario
+from malta.synthesis.controller import Controller
+
+if TYPE_CHECKING:
+    from malta.model.plant import FloatArray
+
+LONGEST = 4_000_000  # samples: 200 s at 20 kHz, 2 GB of trajectory
+
+
+def sampled(
+    plant: Plant, c: Controller, scenario: Scenario, setup: Setup
+) -> tuple[FloatArray, references.Motion, FloatArray]:
+    """Times of the samples, the motion that is asked for, and what every sample is given."""
+    samples = max(1, round(scenario.duration / c.sample_time))
+    if samples > LONGEST:
+        raise InputError(f"scenario {scenario.name}", "duration", f"{samples} samples", f"at most {LONGEST}")
+    t = np.arange(samples) * c.sample_time
+    motion = scenario.reference(plant)(t)
+    return t, motion, _given(plant, c, scenario, setup, motion, t)
+
+
+def _given(
+    plant: Plant,
+    c: Controller,
+    scenario: Scenario,
+    setup: Setup,
+    motion: references.Motion,
+    t: FloatArray,
+) -> FloatArray:
+    """What every sample is given, in the order of machine.layout."""
+    v_ff = feedforward(c, motion, scenario.feedforward)
+    stored = v_ff
+    if c.delay:  # and what currents commutated for the reference make, in the row of the newest stored force
+        n, m = len(c.A), len(c.forces)
+        newest = n + m * (c.delay - 1)
+        states = evaluate(machine.state_reference(plant_of(c.parameters)).map(len(t)), motion.p, motion.dp)[0]
+        stored = v_ff + states @ c.Ad[newest : newest + m, :n].T
+    past = [np.vstack([np.repeat(stored[:1], age, axis=0), stored[:-age]]) for age in range(c.delay, 0, -1)]
+    if c.observed:
+        past.append(np.zeros_like(v_ff))
+    parts = {"p_ref": motion.p, "dp_ref": motion.dp, "v_ff": v_ff}
+    if past:
+        parts["v_past"] = np.hstack(past)
+    sizes = machine.layout(plant, c, setup).given
+    if scenario.disturbance is not None:
+        parts["w"] = _wrench(plant, scenario, t)
+    if setup.faulty:
+        parts |= _fault_flags(plant, scenario, sizes, t)
+    parts |= {name: np.zeros((len(t), size)) for name, size in sizes.items() if name not in parts}
+    return np.hstack([parts[name] for name in sizes])
+
+
+def feedforward(c: Controller, motion: references.Motion, choice: FeedforwardChoice = "axial") -> FloatArray:
+    """v_ff, N, k x m: inertia p*'' + speed p*'; "attraction" adds the forces that hold the mover at q*.
+
+    With state feedback alone a mover that is pulled with stiffness k and held with K1 goes to K1 / (K1 - k) of what is
+    asked, until the integrals have taken it back: twice as far at K1 = 2 k. From the file's own model q'' = k q + G v,
+    these forces are -G^-1 k q*.
+    """
+    believed = plant_of(c.parameters)
+    v_ff = c.feedforward.inertia * motion.ddp + motion.dp @ c.feedforward.speed.T
+    if choice == "attraction":
+        believed.require_second_order("feedforward attraction")
+        half = len(c.A) // 2
+        hold = -np.linalg.lstsq(c.B[half:], c.A[half:, :half], rcond=None)[0]
+        states = evaluate(machine.state_reference(believed).map(len(motion.p)), motion.p, motion.dp)[0]
+        v_ff += states[:, :half] @ hold.T
+    return v_ff
+
+
+def _wrench(plant: Plant, scenario: Scenario, t: FloatArray) -> FloatArray:
+    assert scenario.disturbance is not None
+    wrench = np.asarray(scenario.disturbance(t), dtype=float)
+    shape = (len(t), len(plant.disturbances))
+    if wrench.shape != shape or not np.isfinite(wrench).all():
+        found = f"shape {wrench.shape}"
+        raise InputError(f"scenario {scenario.name}", "disturbance", found, f"finite, shape {shape}")
+    return wrench
+
+
+def _during(fault: Fault, t: FloatArray) -> FloatArray:
+    return np.asarray((t >= fault.at) & (t < fault.until))
+
+
+def _index(scenario: Scenario, kind: str, name: str, known: tuple[Any, ...]) -> int:
+    names = [signal.name for signal in known]
+    if name not in names:
+        raise InputError(f"scenario {scenario.name}", kind, repr(name), "one of " + " ".join(names))
+    return names.index(name)
+
+
+def _fault_flags(
+    plant: Plant, scenario: Scenario, sizes: Mapping[str, int], t: FloatArray
+) -> dict[str, FloatArray]:
+    flags: dict[str, FloatArray] = {
+        name: np.zeros((len(t), sizes[name])) for name in ("stuck", "missed", "sag", "open")
+    }
+    for fault in scenario.faults:
+        during = _during(fault, t)
+        if fault.kind == "lost sample":
+            flags["stuck"][during] = 1
+        elif fault.kind == "stuck sensor":
+            flags["stuck"][during, _index(scenario, fault.kind, fault.what, plant.outputs)] = 1
+        elif fault.kind == "missed step":
+            flags["missed"][during] = 1
+        elif fault.kind == "link sag":
+            if not 0 <= fault.size < 1:
+                raise InputError(
+                    f"scenario {scenario.name}", fault.kind, f"{fault.size:g}", "a share from 0 to 1"
+                )
+            flags["sag"][during] = fault.size
+        elif fault.kind == "open phase":
+            flags["open"][during, _index(scenario, fault.kind, fault.what, plant.drive.phases)] = 1
+    return flags
+
+
+def _noise(stages: list[tuple[int, Plant]], scenario: Scenario, t: FloatArray) -> FloatArray:
+    """Sensor noise, with what faults add to it."""
+    plant = stages[0][1]
+    drawn: FloatArray = np.zeros((len(t), len(plant.outputs)))
+    if scenario.noise:
+        drawn = normals(keys(scenario.seed, np.array([scenario.run]))[0], *drawn.shape)
+        if plant.uniform:
+            drawn = math.sqrt(3) * erf(drawn / math.sqrt(2))
+        for k, (first, now) in enumerate(stages):
+            last = stages[k + 1][0] if k + 1 < len(stages) else len(t)
+            drawn[first:last] *= scenario.noise * np.array(now.noise)
+    for fault in scenario.faults:
+        if fault.kind in ("biased sensor", "noisy sensor"):
+            column = _index(scenario, fault.kind, fault.what, plant.outputs)
+            during = _during(fault, t)
+            if fault.kind == "noisy sensor":
+                drawn[during, column] *= fault.size
+            else:
+                drawn[during, column] += fault.size
+    return drawn
+
+
+def _fast_noise(plant: Plant, setup: Setup, scenario: Scenario, periods: int) -> FloatArray:
+    """Standard normal numbers for the electronics, a row for each of their periods."""
+    fast = machine.electronics_of(plant, setup)
+    if fast is None or not fast.noises:
+        return np.zeros((periods, 0))
+    return normals(keys(scenario.seed, np.array([-1 - scenario.run]))[0], periods, fast.noises)
+
+
+def beginning(plant: Plant, c: Controller, scenario: Scenario, first: FloatArray) -> tuple[FloatArray, ...]:
+    """x, xi_pred and the currents of the coils (A) at the start.
+
+    On the reference and moving with it, or as the scenario says; the observer knows it, and v0 acts, unless it is cold.
+    """
+    p, n = len(plant.outputs), len(c.states)
+    believed = plant_of(c.parameters)
+    design = [s.name for s in plant.design_states]
+    moving = evaluate(machine.state_reference(believed), first[:p], first[p : 2 * p])[0].ravel()
+    x = plant.state(dict(zip(design, moving.tolist(), strict=True)) | dict(scenario.start))
+    xi_pred, current = np.zeros(n), np.zeros(len(plant.actuator.coils))
+    if not scenario.cold:
+        if c.tracks == "states":
+            xi_pred[: len(design)] = x[list(plant.controlled)]
+        held = c.feedforward.at(position_in(plant, x))
+        if c.delay:  # what acted before, with currents that were commutated for here
+            n, m = len(design), len(held)
+            pull = c.Ad[n + m * (c.delay - 1) : n + m * c.delay, :n] @ (xi_pred[:n] - moving)
+            stored = first[2 * p + m :][: m * c.delay]
+            xi_pred[n : n + m * c.delay] = stored + np.tile(pull, c.delay)
+        current[:] = evaluate(_commutated(plant, believed), x, held)[0].ravel()
+    return x, xi_pred, current
+
+
+@lru_cache(maxsize=16)
+def _commutated(plant: Plant, believed: Plant) -> ca.Function:
+    """(x, v) -> currents of the coils that the controller holds a machine at x with, as a function of numbers."""
+    kind = ca.MX if believed.tabulated else ca.SX
+    x, v = kind.sym("x", len(plant.states)), kind.sym("v", len(plant.inputs))
+    return ca.Function("currents", [x, v], [ca.densify(believed.currents(plant.h(x, 0), v))])

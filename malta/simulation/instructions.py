@@ -1,0 +1,222 @@
+"""The straight line of scalar operations of a CasADi function, simplified on the way.
+
+What depends on the parameters theta alone is marked `fixed`: it is computed once a run. Every operation stands once.
+A fixed factor that the terms of a sum share is taken out of the sum."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import casadi as ca
+
+from malta.errors import CheckError
+
+_BINARY = {"ADD": "+", "SUB": "-", "MUL": "*"}
+
+
+_TRUTH = {"LT": "<", "LE": "<=", "EQ": "==", "NE": "!="}
+
+
+_EACH = [
+    "sqrt",
+    "floor",
+    "ceil",
+    "exp",
+    "log",
+    "tan",
+    "tanh",
+    "asin",
+    "acos",
+    "atan",
+    "sinh",
+    "cosh",
+    "sign",
+]
+
+
+_FORMS = (
+    {f"OP_{name}": f"{{0}} {sign} {{1}}" for name, sign in _BINARY.items()}
+    | {f"OP_{name.upper()}": f"each_{name}({{0}})" for name in _EACH}
+    | {f"OP_{name.upper()}": f"each_{name}({{0}}, {{1}})" for name in ("pow", "atan2", "hypot", "fmod")}
+    | {
+        "OP_ASSIGN": "{0}",
+        "OP_NEG": "-{0}",
+        "OP_SQ": "{0} * {0}",
+        "OP_TWICE": "{0} + {0}",
+        "OP_DIV": "{0} * inverse({1})",
+        "OP_INV": "inverse({0})",
+        "OP_FABS": "size({0})",
+        "OP_SIN": "sine({0})",
+        "OP_COS": "cosine({0})",
+        "OP_FMIN": "smaller({0}, {1})",
+        "OP_FMAX": "larger({0}, {1})",
+        "OP_CONSTPOW": "each_pow({0}, {1})",
+        "OP_IF_ELSE_ZERO": "where({0}, {1})",  # the first as a mask
+        "PICK": "pick({0}, {1}, {2})",  # likewise
+        "TILT": "tilt({0})",  # the square of an angle that is likely to be small, and its functions
+        "TILT_SINE": "tilt_sine({0}, {1})",
+        "TILT_COSINE": "tilt_cosine({0}, {1})",
+        "TILT_SECANT": "tilt_secant({0}, {1})",
+    }
+)
+
+
+# Truths are masks; they become 1 and 0 where they are calculated with.
+_MASKS = {f"OP_{name}": f"MASK({{0}} {sign} {{1}})" for name, sign in _TRUTH.items()} | {
+    "OP_NOT": "~{0}",
+    "OP_AND": "{0} & {1}",
+    "OP_OR": "{0} | {1}",
+}
+
+
+_NAMES = {getattr(ca, name): name for name in dir(ca) if name.startswith("OP_")}
+
+
+class _Node(NamedTuple):
+    """A scalar of the straight line: what it does with earlier nodes, or what it reads."""
+
+    op: str  # "" where `form` is read or written out in place
+    form: str
+    arguments: tuple[int, ...]
+    fixed: bool  # depends on theta and constants alone
+
+
+def _read(f: ca.Function, shared: Sequence[int]) -> tuple[list[_Node], list[tuple[int, int, int]]]:
+    """The instructions of an SX function, and which node is which entry of which result."""
+    theta = f.n_in() - 1
+    nodes = _Line()
+    slot: dict[int, int] = {}  # of CasADi's work vector: the node it holds
+    outputs: list[tuple[int, int, int]] = []
+    for k in range(f.n_instructions()):
+        op, reads, writes = f.instruction_id(k), f.instruction_input(k), f.instruction_output(k)
+        if op == ca.OP_OUTPUT:
+            outputs.append((writes[0], writes[1], slot[reads[0]]))
+            continue
+        if op == ca.OP_INPUT:
+            i, j = reads
+            text = f"theta[{j}]" if i == theta else f"a{i}[{j}]"
+            node = _Node("" if i != theta else "INPUT", f"K({text})" if i in shared else text, (), i == theta)
+            slot[writes[0]] = nodes.place(node)
+        elif op == ca.OP_CONST:
+            text = f"K({_number(f.instruction_constant(k))})"
+            slot[writes[0]] = nodes.place(_Node("", text, (), True))
+        else:
+            name = _NAMES[op]
+            if name not in _FORMS and name not in _MASKS:
+                raise CheckError(f"the compiled engine has no {name}")
+            slot[writes[0]] = nodes.add(name, *(slot[r] for r in reads))
+    return nodes.nodes, outputs
+
+
+def _number(value: float) -> str:
+    """A constant as C writes it."""
+    return repr(value).replace("inf", "INFINITY").replace("nan", "NAN")
+
+
+class _Line:
+    """Nodes, each of them once."""
+
+    def __init__(self) -> None:
+        self.nodes: list[_Node] = []
+        self._known: dict[_Node, int] = {}
+
+    def place(self, node: _Node) -> int:
+        """Where this very node stands, now or already."""
+        if node not in self._known:
+            self._known[node] = len(self.nodes)
+            self.nodes.append(node)
+        return self._known[node]
+
+    def add(self, name: str, *arguments: int) -> int:
+        """Where the result of an operation stands, in the form that costs least."""
+        made = getattr(self, f"_{name.removeprefix('OP_').lower()}", None)
+        found: int | None = made(*arguments) if made is not None else None
+        return self._plain(name, *arguments) if found is None else found
+
+    def _plain(self, name: str, *arguments: int) -> int:
+        if name in ("OP_ADD", "OP_MUL"):
+            arguments = tuple(sorted(arguments))
+        fixed = all(self.nodes[a].fixed for a in arguments)
+        return self.place(_Node(name, _MASKS.get(name) or _FORMS[name], arguments, fixed))
+
+    def _scaled(self, k: int) -> tuple[int, int] | None:
+        """The fixed factor and the moving one of a product."""
+        node = self.nodes[k]
+        if node.op != "OP_MUL" or node.fixed:
+            return None
+        one, other = node.arguments
+        if self.nodes[one].fixed:
+            return one, other
+        return (other, one) if self.nodes[other].fixed else None
+
+    def _mul(self, one: int, other: int) -> int | None:
+        """Fixed factors are multiplied with each other, once a run."""
+        for factor, product in ((one, other), (other, one)):
+            parts = self._scaled(product)
+            if self.nodes[factor].fixed and parts is not None:
+                return self._plain("OP_MUL", self._plain("OP_MUL", factor, parts[0]), parts[1])
+        return None
+
+    def _div(self, one: int, other: int) -> int | None:
+        """A reciprocal, which is computed once a run where it is fixed, and a product."""
+        return self.add("OP_MUL", one, self.add("OP_INV", other))
+
+    def _inv(self, k: int) -> int | None:
+        node = self.nodes[k]
+        if node.fixed:
+            return self.place(_Node("OP_INV", "1.0 / {0}", (k,), True))
+        return self._plain("TILT_SECANT", *node.arguments) if node.op == "TILT_COSINE" else None
+
+    def _add(self, one: int, other: int) -> int | None:
+        """if_else(c, x, y) comes as (c ? x : 0) + (not c ? y : 0)."""
+        first, second = self.nodes[one], self.nodes[other]
+        if first.op == second.op == "OP_IF_ELSE_ZERO":
+            condition = self.nodes[second.arguments[0]]
+            if condition.op == "OP_NOT" and condition.arguments == first.arguments[:1]:
+                return self._plain("PICK", *first.arguments, second.arguments[1])
+        return self._together("OP_ADD", one, other)
+
+    def _sub(self, one: int, other: int) -> int | None:
+        return self._together("OP_SUB", one, other)
+
+    def _together(self, name: str, one: int, other: int) -> int | None:
+        """The sum of two products that share their fixed factor."""
+        first, second = self._scaled(one), self._scaled(other)
+        if first is None or second is None or first[0] != second[0]:
+            return None
+        return self.add("OP_MUL", first[0], self.add(name, first[1], second[1]))
+
+    def _sin(self, k: int) -> int | None:
+        return self._tilt("TILT_SINE", k)
+
+    def _cos(self, k: int) -> int | None:
+        return self._tilt("TILT_COSINE", k)
+
+    def _tilt(self, name: str, k: int) -> int | None:
+        """The angle is taken for a tilt, radians of a mover in its air gap, where it is a state and what is added."""
+        return self._plain(name, k, self._plain("TILT", k)) if self._state(k) else None
+
+    def _state(self, k: int) -> bool:
+        node = self.nodes[k]
+        if node.op in ("OP_ADD", "OP_SUB"):
+            return any(self._state(a) for a in node.arguments)
+        return node.form.startswith("a0[")
+
+
+def _mask_arguments(node: _Node) -> range:
+    """Which arguments a node takes as masks."""
+    if node.op in ("OP_IF_ELSE_ZERO", "PICK"):
+        return range(1)
+    return range(2) if node.op in ("OP_NOT", "OP_AND", "OP_OR") else range(0)
+
+
+def _reached(nodes: list[_Node], roots: list[int]) -> list[int]:
+    """The nodes that the roots need, in order."""
+    needed, waiting = set(), list(roots)
+    while waiting:
+        k = waiting.pop()
+        if k not in needed:
+            needed.add(k)
+            waiting += nodes[k].arguments
+    return sorted(needed)

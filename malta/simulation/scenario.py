@@ -1,0 +1,228 @@
+"""Scenarios: the reference, the duration and everything that disturbs a machine on the way."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
+
+import numpy as np
+
+from malta.errors import InputError
+from malta.model.plant import Plant
+from malta.simulation import period as machine
+from malta.simulation import references
+from malta.simulation.period import FIDELITIES, Fidelity, Setup
+from malta.simulation.references import Profile, Reference
+from malta.synthesis.controller import Controller
+
+if TYPE_CHECKING:
+    from malta.model.plant import FloatArray
+
+Estimator = Literal["steady-state", "kalman", "extended"]
+
+
+ESTIMATORS: tuple[Estimator, ...] = get_args(Estimator)
+
+
+FeedforwardChoice = Literal["axial", "attraction"]
+
+
+FEEDFORWARDS: tuple[FeedforwardChoice, ...] = get_args(FeedforwardChoice)
+
+
+BearingAxes = Literal["fixed", "turning"]
+
+
+FaultKind = Literal[
+    "lost sample", "stuck sensor", "biased sensor", "noisy sensor", "open phase", "link sag", "missed step"
+]
+
+
+class Correction(NamedTuple):
+    """An outer loop, slower than the controller, that moves its reference: (t, true outputs) -> added to p*."""
+
+    every: float  # s
+    update: Callable[[float, FloatArray], FloatArray]
+
+
+class Fault(NamedTuple):
+    """Something that breaks at `at` (s) and is whole again at `until` (s)."""
+
+    kind: FaultKind
+    at: float  # s
+    until: float = math.inf  # s
+    what: str = ""  # the sensor (an output's name) or the phase that it concerns
+    size: float = (
+        0.0  # bias, in the output's unit; factor of the noise; share of the link voltage that is missing
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Scenario:
+    """What is asked of the machine, and what it has to stand."""
+
+    name: str
+    duration: float  # s
+    reference: Callable[[Plant], Reference]
+    start: Mapping[str, float] = field(default_factory=dict)  # states (SI) unlike the reference's first
+    cold: bool = False  # starts without current, and with an observer that takes the machine to be at zero
+    disturbance: Callable[[FloatArray], FloatArray] | None = None  # t (k,) -> wrench, k x 6, N and N m
+    noise: float = 0.0  # sensor noise in multiples of the plant's
+    quantize: bool = False  # sensors resolve what the plant's do
+    sensor_errors: Mapping[str, float] | None = None  # of the sensors' own signals; None: y = p exactly
+    seed: int = 0
+    run: int = 0  # of a campaign: its noise depends on seed and run alone
+    delay: int | None = None  # samples between measurement and force; None: the machine's own
+    substeps: int | None = (
+        None  # Runge–Kutta steps a sample; None: as many as the current loops ask for, at least 4
+    )
+    fidelity: Fidelity = "dq"  # what makes the forces, see machine.py
+    real_pwm: bool = False  # duty cycles in steps, dead time (fidelity phase)
+    bearing_axes: BearingAxes = "fixed"  # of the current controllers; "turning": (18) as printed
+    bearing: bool = False  # touchdown bearings push back; without, a touchdown ends the run
+    estimator: Estimator = "steady-state"
+    feedforward: FeedforwardChoice = (
+        "axial"  # "attraction" adds what holds the mover off centre, see `feedforward`
+    )
+    scheduled: bool = False  # C(z) of the measured z in the steady-state filter
+    faults: tuple[Fault, ...] = ()
+    correction: Correction | None = None
+    open_loop: bool = False  # no feedback: what is fed forward, commutated for the reference
+    electronics: Any = None  # options of the machine's own electronics (fidelity phase), where it has some
+    changes: tuple[
+        tuple[float, Mapping[str, float]], ...
+    ] = ()  # s: parameters of the machine (SI) from then on
+
+    def __post_init__(self) -> None:
+        where = f"scenario {self.name}"
+        for name, low, whole in (
+            ("duration", 1e-12, False),
+            ("noise", 0, False),
+            ("substeps", 1, True),
+            ("delay", 0, True),
+            ("seed", 0, True),
+            ("run", 0, True),
+        ):
+            value = getattr(self, name)
+            if whole and value is not None and not isinstance(value, int):
+                raise InputError(where, name, repr(value), "a whole number")
+            if value is not None and not isinstance(value, float | int | np.number):
+                raise InputError(where, name, repr(value), "a number")
+            if value is not None and not (math.isfinite(value) and value >= low):
+                raise InputError(where, name, str(value), "a number above 0" if low else "0 or more")
+        for name, known in (
+            ("fidelity", FIDELITIES),
+            ("estimator", ESTIMATORS),
+            ("feedforward", FEEDFORWARDS),
+            ("bearing_axes", get_args(BearingAxes)),
+        ):
+            if getattr(self, name) not in known:
+                raise InputError(where, name, repr(getattr(self, name)), "one of " + ", ".join(known))
+        for fault in self.faults:
+            if fault.kind not in get_args(FaultKind):
+                raise InputError(
+                    where, "faults", repr(fault.kind), "one of " + ", ".join(get_args(FaultKind))
+                )
+            if math.isnan(fault.at) or math.isnan(fault.until):
+                raise InputError(where, fault.kind, f"{fault.at} s to {fault.until} s", "times")
+        for at, _ in self.changes:
+            if not math.isfinite(at):
+                raise InputError(where, "changes", f"{at} s", "a time")
+        if self.correction is not None and not (0 < self.correction.every < math.inf):
+            raise InputError(where, "correction", f"{self.correction.every} s", "a time above 0 s")
+        if self.real_pwm and self.fidelity != "phase":
+            raise InputError(where, "real_pwm", f"fidelity {self.fidelity}", "fidelity phase")
+
+    @classmethod
+    def stroke(
+        cls,
+        distance: float = 10e-3,
+        *,
+        rise: float | None = None,
+        profile: Profile = "logistic",
+        duration: float | None = None,
+        **options: Any,
+    ) -> Scenario:
+        """Move by `distance` (m), symmetrically about the middle, in `rise` (s, 10-90 %).
+
+        rise : None: the machine's own, RISE of its experiments
+        duration : s; None gives six times the rise, at least 0.1 s, so that the move is whole
+        options : fields of the scenario, as noise=1.0
+        """
+        if rise is not None:
+            references.check_rise(rise)
+        if duration is None:
+            duration = max(0.1, 6 * (rise or 0.0))
+        if not (math.isfinite(distance) and distance != 0):
+            raise InputError("stroke", "distance", f"{distance} m", "a finite distance other than 0 m")
+        reference = partial(
+            references.stroke,
+            start=-distance / 2,
+            end=distance / 2,
+            rise=rise,
+            centre=duration / 2,
+            profile=profile,
+        )
+        return cls("stroke", duration, reference, **options)
+
+
+def setup_of(plant: Plant, c: Controller, s: Scenario) -> Setup:
+    """What of a scenario shapes the simulated functions."""
+    kinds = {fault.kind for fault in s.faults}
+    if "open phase" in kinds and s.fidelity != "phase":
+        found = f"an open phase at fidelity {s.fidelity}"
+        raise InputError(f"scenario {s.name}", "faults", found, "fidelity phase")
+    able = machine.fidelities(plant)
+    if s.fidelity not in able:
+        expected = "one of " + ", ".join(able) + f" for a {plant.name}"
+        raise InputError(f"scenario {s.name}", "fidelity", s.fidelity, expected)
+    own = plant.electronics is not None and s.fidelity == "phase"
+    if s.electronics is not None and not own:
+        found = f"options of electronics at fidelity {s.fidelity}"
+        raise InputError(f"scenario {s.name}", "electronics", found, "a machine that has some, at phase")
+    if own and s.estimator != "steady-state":
+        found = f"{s.estimator} with electronics of their own pace"
+        raise InputError(f"scenario {s.name}", "estimator", found, "steady-state, or fidelity force")
+    if own and (s.real_pwm or s.bearing_axes == "turning" or "open phase" in kinds or "link sag" in kinds):
+        raise InputError(f"scenario {s.name}", "fidelity", "options of a drive", "those of the electronics")
+    if s.scheduled and c.tracks == "errors":
+        raise InputError(f"scenario {s.name}", "scheduled", "a law of errors", "one with a filter of states")
+    known = [signal.name for signal in plant.sensor_errors]
+    for name, value in (s.sensor_errors or {}).items():
+        if name not in known:
+            where = f"scenario {s.name}"
+            raise InputError(where, f"sensor_errors.{name}", "an unknown error", "one of " + " ".join(known))
+        if not math.isfinite(value):
+            raise InputError(f"scenario {s.name}", f"sensor_errors.{name}", repr(value), "a finite number")
+    return Setup(
+        fidelity=s.fidelity,
+        delay=plant.actuator.delay(c.sample_time) if s.delay is None else s.delay,
+        quantize=s.quantize,
+        disturbed=s.disturbance is not None,
+        bearing=s.bearing,
+        sensed=s.sensor_errors is not None,
+        faulty=bool(kinds - {"biased sensor", "noisy sensor"}),
+        scheduled=s.scheduled,
+        real_pwm=s.real_pwm,
+        turning=s.bearing_axes == "turning" and s.fidelity != "force",
+        outside=s.estimator != "steady-state",
+        open_loop=s.open_loop,
+        electronics=s.electronics,
+    )
+
+
+def substeps_of(plant: Plant, c: Controller, setup: Setup, s: Scenario) -> float:
+    """Steps of the simulation in a sample: the scenario's, or the periods of the machine's electronics."""
+    fast = machine.electronics_of(plant, setup)
+    return steps_of(plant, c, s) if fast is None else c.sample_time / fast.period
+
+
+def steps_of(plant: Plant, c: Controller, s: Scenario) -> int:
+    """Runge–Kutta steps in a sample: the scenario's, or one for each time constant of the current loops, at least 4."""
+    if s.substeps is not None:
+        return s.substeps
+    lag = c.sample_time * plant.actuator.crossover
+    return max(4, math.ceil(lag)) if math.isfinite(lag) else 4

@@ -1,0 +1,217 @@
+"""Labelled time series of a simulation, the figures of a stroke, and the file that keeps them."""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import casadi as ca
+import numpy as np
+
+from malta.files import replace_files
+from malta.model.plant import Plant, Signal, readonly
+from malta.simulation import period as machine
+from malta.simulation.engines import evaluate
+from malta.simulation.period import Setup
+from malta.simulation.scenario import Scenario, setup_of
+from malta.simulation.verdict import Verdict, _judged, _touched
+from malta.synthesis.controller import Controller
+
+if TYPE_CHECKING:
+    from malta.model.plant import FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """Labelled time series, one row a sample, up to the verdict. SI.
+
+    Axis currents, their voltages and the link voltage are empty in fidelity `force`; phases in all but `phase`; of
+    machines with electronics of their own the phases are the coils.
+    """
+
+    plant: Plant
+    controller: Controller
+    scenario: Scenario
+    verdict: Verdict
+    engine: str  # what ran it: "compiled" or "virtual machine"
+    t: FloatArray  # k
+    reference: FloatArray  # k x p
+    p: FloatArray  # k x p, true outputs
+    y: FloatArray  # k x p, measured
+    x: FloatArray  # k x states, true
+    xi_hat: FloatArray  # k x n, estimated
+    v: FloatArray  # k x m, commanded forces, N
+    force: FloatArray  # k x m, acting forces, N
+    saturated: FloatArray  # k x m, 1 where the command was limited
+    contact: FloatArray  # k x contacts, share of each clearance that is used up
+    current: FloatArray  # k x coils, commanded, A
+    met: FloatArray  # k x limits, 1 where one was met: of the coil currents, then those of the electronics until then
+    i: FloatArray  # k x axes, A
+    u: FloatArray  # k x axes, V
+    link: FloatArray  # k x 1, V
+    i_phase: FloatArray  # k x phases, A
+    duty: FloatArray  # k x phases, 0 to 1
+
+    def __post_init__(self) -> None:
+        for name in ("t", "reference", *SERIES):
+            object.__setattr__(self, name, readonly(getattr(self, name)))
+
+    @property
+    def limits(self) -> tuple[str, ...]:
+        """The limits that were met on the way, by name."""
+        fast = machine.electronics_of(self.plant, setup_of(self.plant, self.controller, self.scenario))
+        names = ("current limit", *(fast.flags if fast is not None else ()))
+        met = [name for name, column in zip(names, self.met.T, strict=True) if column.any()]
+        return (*(["force limit"] if self.saturated.any() else []), *met)
+
+    @property
+    def copper_loss(self) -> FloatArray:
+        """Heat in the windings, W, k: sum of R i^2 over phases or, with its weights, over axes."""
+        if self.i_phase.size:
+            return np.asarray(self.plant.actuator.R * (self.i_phase**2).sum(axis=1))
+        if self.plant.windings is None:
+            return np.asarray(self.plant.actuator.R * (self.current**2).sum(axis=1))
+        return np.asarray(self.plant.actuator.R * self.axis_currents**2 @ np.array(self.plant.drive.weight))
+
+    @property
+    def electrical_power(self) -> FloatArray:
+        """Power into the windings, W, k; empty in fidelity `force`."""
+        if not self.i.size or self.plant.windings is None:
+            return np.empty(0)
+        delay = min(setup_of(self.plant, self.controller, self.scenario).delay, len(self.u) - 1)
+        acting = np.vstack([np.repeat(self.u[:1], delay, axis=0), self.u[: len(self.u) - delay]])
+        return np.asarray((acting * self.i) @ np.array(self.plant.drive.weight))
+
+    @property
+    def axis_currents(self) -> FloatArray:
+        """Currents of the transformation's axes, A, k x axes; in fidelity `force` what the forces take."""
+        if self.i.size or self.plant.windings is None:
+            return self.i
+        drive, constants = self.plant.drive, np.array(self.plant.actuator.force_constant)
+        symbol = ca.SX.sym("i", len(constants))
+        axes = ca.Function("axes", [symbol], [ca.densify(drive.command(symbol))])
+        return evaluate(axes.map(len(self.force)), self.force / constants)[0]
+
+
+SERIES = (
+    *("p", "y", "x", "xi_hat", "v", "force", "saturated", "contact", "current", "met"),
+    *("i", "u", "link", "i_phase", "duty"),
+)
+
+
+def recorded(
+    plant: Plant,
+    controller: Controller,
+    scenario: Scenario,
+    setup: Setup,
+    asked: tuple[FloatArray, FloatArray],
+    rows: FloatArray,
+    kind: str,
+) -> Trajectory:
+    """The trajectory of a run whose rows, one for each sample, are there already; `asked` as `sampled` gives them."""
+    rows, verdict = _judged(plant, controller, setup, rows, asked[0])
+    return _labelled(plant, controller, scenario, setup, asked, rows, verdict, kind)
+
+
+def _labelled(
+    plant: Plant,
+    controller: Controller,
+    scenario: Scenario,
+    setup: Setup,
+    asked: tuple[FloatArray, FloatArray],
+    table: FloatArray,
+    verdict: Verdict | None,
+    kind: str,
+) -> Trajectory:
+    """Rows up to the verdict as labelled series."""
+    (t, given), done = asked, len(table)
+    for array in (table, given, t):
+        array.flags.writeable = False  # the trajectory's series are views of them
+    sizes = machine.layout(plant, controller, setup).row
+    columns = dict(zip(sizes, np.split(table, np.cumsum([*sizes.values()])[:-1], axis=1), strict=True))
+    if setup.bearing and (verdict is None or verdict.name in plant.contacts):  # what it touched first
+        verdict = _touched(plant, columns["contact"], t) or verdict
+    return Trajectory(
+        plant,
+        controller,
+        scenario,
+        verdict or Verdict("completed", scenario.duration),
+        kind,
+        t=t[:done],
+        reference=given[:done, : len(plant.outputs)],
+        **{name: columns.get(name, np.empty((done, 0))) for name in SERIES},
+    )
+
+
+@dataclass(frozen=True)
+class StrokeFigures:
+    """What the published figures say of a stroke. SI."""
+
+    rise: float  # s, 10 to 90 % of the true position; NaN when it was not reached
+    overshoot: float  # beyond the end, as a share of the stroke; NaN when the run ended early
+    axial_error: float  # m, largest |z* - z|
+    radial: Mapping[str, float]  # m, largest deviation of each radial output
+    force: float  # N, largest commanded thrust
+    current: float  # A, largest commanded current of any axis
+
+
+def stroke_figures(run: Trajectory) -> StrokeFigures:
+    """Rise, overshoot, tracking error and deviation of a stroke; without one, of a move of the first output."""
+    names = [s.name for s in run.plant.outputs]
+    axis = run.plant.leading_output
+    z, z_ref = run.p[:, axis], run.reference[:, axis]
+    start, end = z_ref[0], z_ref[-1]
+    error = np.abs(run.p - run.reference)
+    whole = run.verdict.completed and end != start  # what ended early never saw where the stroke goes
+    share = (z - start) / (end - start) if whole else np.full(len(z), np.nan)
+    return StrokeFigures(
+        rise=_reached(run.t, share, 0.9) - _reached(run.t, share, 0.1) if whole else math.nan,
+        overshoot=max(float(share.max()) - 1, 0.0) if whole else math.nan,
+        axial_error=float(error[:, axis].max()),
+        radial={name: float(error[:, i].max()) for i, name in enumerate(names) if i != axis},
+        force=float(np.abs(run.v[:, run.plant.leading_input]).max()),
+        current=float(np.abs(run.current).max()),
+    )
+
+
+def _reached(t: FloatArray, share: FloatArray, level: float) -> float:
+    k = int(np.argmax(np.asarray(share) >= level))
+    if k == 0:
+        return math.nan
+    return float(np.interp(level, share[k - 1 : k + 1], t[k - 1 : k + 1]))
+
+
+def save(run: Trajectory, path: str | Path) -> Path:
+    """Write the time series as .npz: t, and a named array for every kind of signal with the names of its columns."""
+    path, drive = Path(path), run.plant.windings
+    axes, phases = ((), run.plant.actuator.coils) if drive is None else (drive.axes, drive.phases)
+    columns = {
+        "reference": run.plant.outputs,
+        "p": run.plant.outputs,
+        "y": run.plant.outputs,
+        "x": run.plant.states,
+        "xi_hat": run.controller.states,
+        "v": run.plant.inputs,
+        "force": run.plant.inputs,
+        "saturated": run.plant.inputs,
+        "current": run.plant.actuator.coils,
+        "i": axes,
+        "u": tuple(Signal(s.name.replace("i_", "u_"), "V") for s in axes),
+        "link": (Signal("V_link", "V"),),
+        "i_phase": phases,
+        "duty": tuple(Signal(s.name.replace("i_", "d_"), "1") for s in phases),
+    }
+    arrays: dict[str, Any] = {"t": run.t, "verdict": np.array([run.verdict.name])}
+    for name, signals in columns.items():
+        if not getattr(run, name).shape[1]:
+            continue  # not simulated at this fidelity
+        arrays[name] = getattr(run, name)
+        arrays[f"{name}_columns"] = np.array([f"{s.name} [{s.unit}]" for s in signals])
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **arrays)
+    replace_files({path: buffer.getvalue()})
+    return path
