@@ -23,7 +23,8 @@ from malta import references
 from malta.simulation import compiled, engines, translate
 from malta.simulation.compiled import LANES
 from malta.simulation.engines import compiled_shape, engine_of, shape_of
-from malta.simulation.period import FIDELITIES, Fidelity, Parts
+from malta.simulation.layout import FIDELITIES, Fidelity
+from malta.simulation.period import Period
 from malta.simulation.scenario import Fault, Scenario, setup_of
 from malta.simulation.trajectory import SERIES
 
@@ -46,7 +47,7 @@ TABLE = compiled.feedforward_table(np.array([-1.0, 0.0, 1.0]), np.array([[-1.0],
 class Trial(NamedTuple):
     """Expressions of (state, given, theta): compiled with one lane, with eight, and as CasADi evaluates them."""
 
-    parts: Parts
+    parts: Period
     one: Any
     many: Any
     reference: ca.Function
@@ -64,12 +65,12 @@ def _symbols() -> tuple[Any, ...]:
     return tuple(ca.SX.sym(name, size) for name, size in sizes.items())
 
 
-def _parts(row: Callable[[Any, Any, Any], Any]) -> tuple[Parts, ca.Function]:
+def _parts(row: Callable[[Any, Any, Any], Any]) -> tuple[Period, ca.Function]:
     """A machine that stands still and leaves `row` of its state, what it is given and its numbers; and its digest."""
     state, around, noise, y, v0, held, theta = _symbols()
     expression = ca.densify(row(state[:STATES], around, theta))
     rest = ca.SX.sym("row", expression.numel() + 1)
-    parts = Parts(
+    parts = Period(
         ca.Function("sense", [state, around, noise, theta], [noise, around[0]]),
         ca.Function("decide", [state, around, y, v0, theta], [state[STATES], v0, ca.vertcat(expression, v0)]),
         ca.Function("substep", [state[:STATES], held, around, ca.SX(0, 1), theta], [state[:STATES]]),
@@ -703,13 +704,13 @@ def test_the_folder_holds_one_file_for_two_designs(designs: dict[str, Design], f
 
 
 @pytest.fixture(scope="module")
-def small() -> tuple[Parts, str]:
+def small() -> tuple[Period, str]:
     """An engine that compiles at once: 3 s[0] + g[0], and sin(g[0])."""
     parts, _ = _parts(lambda s, g, _: ca.vertcat(3 * s[0] + g[0], ca.sin(g[0])))
     return parts, translate.source(parts, None)
 
 
-def _works(lib: Any, parts: Parts) -> bool:
+def _works(lib: Any, parts: Period) -> bool:
     run = engines.compiled_engine(lib.run, parts, np.zeros(THETA), 1, TABLE).run
     _, rows = run(0, np.array([2.0, 0, 0, 0]), np.array([[0.5, 0, 0]]), NO_NOISE, NOT_FAST)
     return bool(rows[0] == pytest.approx([6.5, np.sin(0.5), 1.5]))
@@ -717,7 +718,7 @@ def _works(lib: Any, parts: Parts) -> bool:
 
 @pytest.mark.usefixtures("fresh")
 def test_the_cache_knows_what_a_library_depends_on(
-    small: tuple[Parts, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    small: tuple[Period, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Text, lanes, options, processor and compiler: a file for each; the same again: none."""
     parts, text = small
@@ -748,7 +749,7 @@ def test_the_cache_knows_what_a_library_depends_on(
 
 @pytest.mark.parametrize("damage", ["empty", "no library", "its first bytes"])
 def test_a_damaged_library_is_replaced(
-    small: tuple[Parts, str], fresh: Path, tmp_path: Path, damage: str
+    small: tuple[Period, str], fresh: Path, tmp_path: Path, damage: str
 ) -> None:
     parts, text = small
     folder = tmp_path / "libraries"
@@ -768,7 +769,7 @@ def test_a_damaged_library_is_replaced(
 
 @pytest.mark.parametrize("share", [0.3, 0.6])
 def test_a_library_that_was_cut_short_is_not_run(
-    small: tuple[Parts, str], tmp_path: Path, share: float
+    small: tuple[Period, str], tmp_path: Path, share: float
 ) -> None:
     """What a power failure leaves of a file: loading it would end the process with a bus error."""
     _, text = small
@@ -794,7 +795,7 @@ def test_a_library_that_was_cut_short_is_not_run(
 
 
 def test_a_folder_that_cannot_be_written_is_passed_over(
-    small: tuple[Parts, str], fresh: Path, tmp_path: Path
+    small: tuple[Period, str], fresh: Path, tmp_path: Path
 ) -> None:
     """A file where the folder should be: the temporary folder serves."""
     parts, text = small
@@ -855,7 +856,7 @@ def test_a_compiler_that_does_not_exist_is_no_compiler(monkeypatch: pytest.Monke
     assert compiled.library("", 1) is None
 
 
-def test_two_processes_may_compile_at_once(small: tuple[Parts, str], fresh: Path, tmp_path: Path) -> None:
+def test_two_processes_may_compile_at_once(small: tuple[Period, str], fresh: Path, tmp_path: Path) -> None:
     """A compiler that takes its time, so that both are at it: both succeed, one file is left and nothing else."""
     cc = compiled.compiler()
     if cc is None:

@@ -17,9 +17,10 @@ import malta
 from malta import references
 from malta.machines.tubular import plant as tubular
 from malta.machines.tubular import windings
-from malta.simulation import period as machine
 from malta.simulation.engines import engine_of
 from malta.simulation.inputs import beginning, sampled
+from malta.simulation.layout import FIDELITIES, Fidelity, layout_of
+from malta.simulation.period import initial_state
 from malta.simulation.references import Motion
 from malta.simulation.scenario import Correction, Fault, Scenario, setup_of, steps_of
 
@@ -82,7 +83,7 @@ def _step_by_step(plant: Plant, c: Controller, scenario: Scenario) -> dict[str, 
     setup = setup_of(plant, c, scenario)
     t, _, given_ = sampled(plant, c, scenario, setup)
     start = [ca.DM(a) for a in beginning(plant, c, scenario, given_[0])]
-    state = np.array(ca.evalf(machine.initial(plant, c, setup, *start))).ravel()
+    state = np.array(ca.evalf(initial_state(plant, c, setup, *start))).ravel()
     engine = engine_of(plant, c, setup, steps_of(plant, c, scenario))
     states = []
     for k in range(len(t)):
@@ -90,7 +91,7 @@ def _step_by_step(plant: Plant, c: Controller, scenario: Scenario) -> dict[str, 
         state, _ = engine.run(
             k, state, given_[k : k + 1], np.zeros((1, len(plant.outputs))), np.zeros((0, 0))
         )
-    sizes = machine.layout(plant, c, setup)
+    sizes = layout_of(plant, c, setup)
     names = {**sizes.machine, **sizes.controller}
     columns = np.split(np.array(states), np.cumsum([*names.values()])[:-1], axis=1)
     return dict(zip(names, columns, strict=True))
@@ -141,7 +142,7 @@ def test_forces_are_the_same_at_rest_and_lag_alike_in_motion(calibrated: Design)
 
 @pytest.mark.parametrize("fidelity", ["dq", "phase"])
 def test_at_rest_currents_are_the_static_forces_over_their_constants(
-    calibrated: Design, par: tubular.Parameters, fidelity: machine.Fidelity
+    calibrated: Design, par: tubular.Parameters, fidelity: Fidelity
 ) -> None:
     """z = 3 mm: cogging on 0q of both modules, the weight on qd by the lever rule, nothing else."""
     z = 3e-3
@@ -187,7 +188,7 @@ def test_axes_are_sampled_windings_under_a_sampled_law(
 
 @pytest.mark.parametrize("fidelity", ["dq", "phase"])
 def test_the_feedforward_takes_the_induced_voltage_off_the_current_loop(
-    calibrated: Design, fidelity: machine.Fidelity
+    calibrated: Design, fidelity: Fidelity
 ) -> None:
     """At 0.5 m/s 0.87 V are induced. Known to the controller, they move the thrust's current by less than 1 mA; on a
     machine that induces twice as much the loop has to find the rest: 68 mA, for a few milliseconds."""
@@ -210,7 +211,7 @@ def test_the_feedforward_takes_the_induced_voltage_off_the_current_loop(
 
 @pytest.mark.parametrize("fidelity", ["dq", "phase"])
 def test_half_the_link_is_all_there_is_and_the_drive_lives_with_it(
-    calibrated: Design, fidelity: machine.Fidelity
+    calibrated: Design, fidelity: Fidelity
 ) -> None:
     """12 V instead of 45 V: limited for an eighth of the stroke, no phase beyond V/2, and it still arrives."""
     weak = _with(calibrated, V_dc=12.0)
@@ -234,7 +235,7 @@ def test_half_the_link_is_all_there_is_and_the_drive_lives_with_it(
 
 
 @pytest.mark.parametrize("fidelity", ["dq", "phase"])
-def test_integrals_of_limited_axes_wait(calibrated: Design, fidelity: machine.Fidelity) -> None:
+def test_integrals_of_limited_axes_wait(calibrated: Design, fidelity: Fidelity) -> None:
     """No integral moves on while its axis is limited, and every one moves when it is free."""
     weak = _with(calibrated, V_dc=12.0)
     states = _step_by_step(weak, calibrated.controller, _short_stroke(fidelity=fidelity))
@@ -332,7 +333,7 @@ def _integral(series: FloatArray) -> float:
 
 
 @pytest.mark.parametrize("fidelity", ["dq", "phase"])
-def test_the_link_balances(calibrated: Design, par: tubular.Parameters, fidelity: machine.Fidelity) -> None:
+def test_the_link_balances(calibrated: Design, par: tubular.Parameters, fidelity: Fidelity) -> None:
     """Change of C V^2 / 2 = what the supply gave - what the windings took, to 1e-4 of it, over a stroke; and that is
     heat, magnetic energy and what the induced voltage took (coupling carries no power)."""
     drive = calibrated.plant.drive
@@ -358,7 +359,7 @@ def test_the_link_balances(calibrated: Design, par: tubular.Parameters, fidelity
 
 @pytest.mark.parametrize("fidelity", ["dq", "phase"])
 def test_electrical_power_is_what_goes_into_the_windings(
-    calibrated: Design, par: tubular.Parameters, fidelity: machine.Fidelity
+    calibrated: Design, par: tubular.Parameters, fidelity: Fidelity
 ) -> None:
     """A step of 20 um at standstill: at every sample the power is that of the voltages that act then, which the
     currents of this sample and the next tell; not of those that are commanded for later."""
@@ -380,7 +381,7 @@ def test_copper_loss_is_the_same_in_phases_axes_and_forces(calibrated: Design) -
         fidelity: malta.simulate(
             calibrated.plant, calibrated.controller, Scenario.stroke(10e-3, fidelity=fidelity)
         )
-        for fidelity in machine.FIDELITIES
+        for fidelity in FIDELITIES
     }
     phase = runs["phase"]
     weighted = 2.2 * phase.i**2 @ np.array(calibrated.plant.drive.weight)
@@ -461,7 +462,7 @@ def test_a_sensor_may_stick_be_biased_or_noisy_and_only_that_one(calibrated: Des
 
 @pytest.mark.parametrize("fidelity", ["dq", "phase"])
 def test_a_sagging_link_has_so_much_less_voltage(
-    calibrated: Design, par: tubular.Parameters, fidelity: machine.Fidelity
+    calibrated: Design, par: tubular.Parameters, fidelity: Fidelity
 ) -> None:
     """Half of it is gone from sample 60 on: the command under way drives half of what it should, once; then the duty
     cycles make up for it."""
@@ -703,7 +704,7 @@ def test_a_change_at_the_start_is_another_machine(calibrated: Design) -> None:
 
 
 @pytest.mark.parametrize("fidelity", ["force", "dq"])
-def test_what_is_picked_up_weighs_from_then_on(calibrated: Design, fidelity: machine.Fidelity) -> None:
+def test_what_is_picked_up_weighs_from_then_on(calibrated: Design, fidelity: Fidelity) -> None:
     """0.1 kg at 10 ms: not a bit differs before; then it falls with what 0.981 N does to 0.46 kg, and is caught."""
     scenario = _hold(0.02, fidelity=fidelity)
     before, after = (
@@ -807,9 +808,7 @@ def test_a_scheduled_filter_measures_where_the_mover_is(calibrated: Design) -> N
 
 
 @pytest.mark.parametrize("fidelity", ["dq", "phase"])
-def test_the_integrator_has_fourth_order_with_windings_too(
-    calibrated: Design, fidelity: machine.Fidelity
-) -> None:
+def test_the_integrator_has_fourth_order_with_windings_too(calibrated: Design, fidelity: Fidelity) -> None:
     """Each halving divides the errors of places and currents by 16; four steps a sample leave a picometre, 1 nA."""
     runs = {
         n: malta.simulate(
@@ -824,10 +823,8 @@ def test_the_integrator_has_fourth_order_with_windings_too(
         assert errors[2] < largest
 
 
-@pytest.mark.parametrize("fidelity", machine.FIDELITIES)
-def test_nothing_happens_before_the_computation_is_done(
-    calibrated: Design, fidelity: machine.Fidelity
-) -> None:
+@pytest.mark.parametrize("fidelity", FIDELITIES)
+def test_nothing_happens_before_the_computation_is_done(calibrated: Design, fidelity: Fidelity) -> None:
     """A step of the reference at t = 0: what holds the mover flows on for `delay` samples to the bit of its trim, and
     the first sample after it the new command acts. Without a word the machine's own delay holds: 75 us, one sample."""
     scenario = _hold(1e-3, {"x1": 5e-6}, start={"x": 0.0, "beta": 0.0}, fidelity=fidelity)

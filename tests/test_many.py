@@ -23,8 +23,8 @@ from malta.simulation.batch import (
     verdicts,
 )
 from malta.simulation.engines import compiled_shape, engine_of
+from malta.simulation.layout import FIDELITIES, Fidelity
 from malta.simulation.noise import keys, normals
-from malta.simulation.period import FIDELITIES, Fidelity
 from malta.simulation.scenario import Correction, Fault, Scenario
 from malta.simulation.trajectory import Trajectory, stroke_figures
 

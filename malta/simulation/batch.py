@@ -19,11 +19,12 @@ import numpy as np
 from malta.errors import InputError
 from malta.model.data import shaping, twins_of, units_of
 from malta.model.plant import Plant, readonly
-from malta.simulation import period as machine
 from malta.simulation.compiled import LANES, feedforward_table, in_lanes, run_many
 from malta.simulation.engines import BLOCK, compiled_shape, evaluate, shape_of
 from malta.simulation.inputs import beginning, sampled
+from malta.simulation.layout import electronics_of, flatten, layout_of, numbers_of, with_symbols
 from malta.simulation.noise import GAMMA, keys
+from malta.simulation.period import initial_state
 from malta.simulation.scenario import Scenario, setup_of, steps_of
 from malta.simulation.simulate import simulate
 from malta.simulation.trajectory import Trajectory, recorded, stroke_figures
@@ -91,7 +92,7 @@ def simulate_many(
     setup = setup_of(plant, controller, scenario)
     if setup.outside:
         raise InputError(where, "estimator", scenario.estimator, "steady-state in a campaign")
-    if machine.electronics_of(plant, setup) is not None:
+    if electronics_of(plant, setup) is not None:
         raise InputError(where, "fidelity", "phase", f"force in a campaign of a {plant.name}")
     if workers is not None and workers < 1:
         raise InputError("campaign", "workers", str(workers), "at least 1")
@@ -163,7 +164,7 @@ def _prepared(
 ) -> _Ready:
     setup = setup_of(plant, controller, scenario)
     count = steps_of(plant, controller, scenario)
-    values = machine.numbers(plant, controller, count, scenario.sensor_errors)
+    values = numbers_of(plant, controller, count, scenario.sensor_errors)
     theta = _thetas(plant, values, changes, sensor_errors, runs)
     t, motion, given = sampled(plant, controller, scenario, setup)
     start = np.concatenate(beginning(plant, controller, scenario, given[0]))
@@ -208,7 +209,7 @@ def recorded_run(
         return None
     runs = _count(plant, group["changes"], group["errors"])
     ready = _prepared(plant, controller, scenario, group["changes"], group["errors"], begin, runs)
-    width = sum(machine.layout(plant, controller, setup).row.values())
+    width = sum(layout_of(plant, controller, setup).row.values())
     rows = np.empty((len(ready.t), width))
     stream = ready.keys.copy()
     kept = np.zeros((1, 2 * width, LANES))
@@ -236,10 +237,10 @@ def recorded_run(
 @lru_cache(maxsize=16)
 def _recorder(shape: Any) -> ca.Function:
     """A digest that keeps the last two rows as they are."""
-    sizes = machine.layout(shape.plant, shape.controller, shape.setup)
+    sizes = layout_of(shape.plant, shape.controller, shape.setup)
     width, given = sum(sizes.row.values()), sum(sizes.given.values())
     kept, row = ca.SX.sym("kept", 2 * width), ca.SX.sym("row", width)
-    theta = ca.SX.sym("theta", len(machine.flat(machine.numbers(shape.plant, shape.controller, 1))))
+    theta = ca.SX.sym("theta", len(flatten(numbers_of(shape.plant, shape.controller, 1))))
     arguments = [kept, row, ca.SX.sym("given", given), theta]
     return ca.Function("digest", arguments, [ca.vertcat(kept[width:], row)])
 
@@ -308,7 +309,7 @@ def _thetas(
     for name, value in values.items():
         place[name] = k
         k += value.nnz()
-    theta = np.tile(machine.flat(values), (runs, 1))
+    theta = np.tile(flatten(values), (runs, 1))
     for name, column in changes.items():
         column = np.asarray(column, dtype=float)
         for extreme in (column.min(), column.max()):  # NaN comes out of both
@@ -331,10 +332,10 @@ def _thetas(
 def _starts(shape: Any) -> ca.Function:
     """(theta, x, xi_pred, currents) -> the state in which a machine starts, and the noise of its sensors."""
     plant, c, setup = shape.plant, shape.controller, shape.setup
-    symbolic, _, theta = machine.numbered(plant, machine.numbers(plant, c, 1))
+    symbolic, _, theta = with_symbols(plant, numbers_of(plant, c, 1))
     sizes = {"x": len(plant.states), "xi_pred": len(c.states), "current": len(plant.actuator.coils)}
     beginning = [ca.SX.sym(name, size) for name, size in sizes.items()]
-    first = machine.initial(symbolic, c, setup, *beginning)
+    first = initial_state(symbolic, c, setup, *beginning)
     noise = ca.densify(ca.vertcat(*symbolic.noise))
     return ca.Function("start", [theta, ca.vertcat(*beginning)], [first, noise])
 
@@ -374,11 +375,11 @@ def _digest_sizes(plant: Plant) -> dict[str, int]:
 def _digest(shape: Any) -> ca.Function:
     """(kept, row, given, theta) -> kept: what a run leaves behind, sample by sample, until something is touched."""
     plant, c, setup = shape.plant, shape.controller, shape.setup
-    sizes = machine.layout(plant, c, setup)
+    sizes = layout_of(plant, c, setup)
     kept = {name: ca.SX.sym(name, size) for name, size in _digest_sizes(plant).items()}
     row = {name: ca.SX.sym(name, size) for name, size in sizes.row.items()}
     given = {name: ca.SX.sym(name, size) for name, size in sizes.given.items()}
-    theta = ca.SX.sym("theta", len(machine.flat(machine.numbers(plant, c, 1))))
+    theta = ca.SX.sym("theta", len(flatten(numbers_of(plant, c, 1))))
     largest = ca.fmax(kept["contact"], row["contact"])
     most, used = (_most(contact) for contact in (largest, row["contact"]))
     alive = kept["alive"]  # what follows adds nothing once it is 0

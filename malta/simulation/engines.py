@@ -15,9 +15,9 @@ import numpy as np
 from malta.errors import InputError
 from malta.model.data import plant_of, shaping, twins_of
 from malta.model.plant import Plant
-from malta.simulation import period as machine
 from malta.simulation.compiled import _address, feedforward_table, library
-from malta.simulation.period import Parts, Setup
+from malta.simulation.layout import Setup, electronics_of, flatten, numbers_of
+from malta.simulation.period import Period, chain, period_of
 from malta.simulation.translate import source
 from malta.synthesis.controller import Controller, gains_of
 
@@ -48,23 +48,23 @@ def engine_of(
     choice: EngineChoice = "auto",
 ) -> Engine:
     """What runs the control periods of this machine: compiled where possible, else CasADi's virtual machine."""
-    values = machine.numbers(plant, c, substeps, dict(errors))
+    values = numbers_of(plant, c, substeps, dict(errors))
     if choice != "virtual machine":
         found = compiled_shape(shape_of(plant, c, setup))
         if found is not None:
             lib, p = found
             ff = c.feedforward
             table = feedforward_table(ff.z_grid, ff.v0)
-            return compiled_engine(lib.run, p, machine.flat(values), substeps, table)
+            return compiled_engine(lib.run, p, flatten(values), substeps, table)
         if choice == "compiled":
             if plant_of(c.parameters).tabulated:
                 raise InputError(
                     "simulate", "engine", "a controller that looks up a table", "virtual machine"
                 )
             raise InputError("simulate", "engine", "no C compiler that works", "cc, gcc or clang, or $CC")
-    p = machine.parts(plant, c, setup, values, constant=True)
-    block = 1 if setup.outside or machine.electronics_of(plant, setup) is not None else BLOCK
-    return virtual_engine(cache(lambda count: machine.chained(p, c, count, block)), substeps)
+    p = period_of(plant, c, setup, values, constant=True)
+    block = 1 if setup.outside or electronics_of(plant, setup) is not None else BLOCK
+    return virtual_engine(cache(lambda count: chain(p, c, count, block)), substeps)
 
 
 @dataclass(frozen=True)
@@ -93,12 +93,12 @@ def shape_of(plant: Plant, c: Controller, setup: Setup) -> _Shape:
 @lru_cache(maxsize=32)
 def compiled_shape(
     shape: _Shape, lanes: int = 1, digest: ca.Function | None = None
-) -> tuple[Any, Parts] | None:
+) -> tuple[Any, Period] | None:
     """The library for a shape; None where it cannot be compiled."""
     c = shape.controller
     if plant_of(c.parameters).tabulated:
         return None
-    p = machine.parts(shape.plant, c, shape.setup, machine.numbers(shape.plant, c, 1), constant=False)
+    p = period_of(shape.plant, c, shape.setup, numbers_of(shape.plant, c, 1), constant=False)
     lib = library(source(p, digest), lanes)
     return None if lib is None else (lib, p)
 
@@ -108,7 +108,7 @@ def substeps_until(sample: int, substeps: float) -> int:
     return math.ceil(sample * substeps - 1e-6)
 
 
-def compiled_engine(run: Any, p: Parts, theta: FloatArray, substeps: float, table: FloatArray) -> Engine:
+def compiled_engine(run: Any, p: Period, theta: FloatArray, substeps: float, table: FloatArray) -> Engine:
     """`run` of a library with one lane. Rows per call are limited by memory alone."""
     width = p.decide.size1_out(2)
     theta, table = (np.ascontiguousarray(a, dtype=float) for a in (theta, table))

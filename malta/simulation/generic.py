@@ -29,7 +29,7 @@ from malta.simulation.experiments import (
     rms,
     scenario_of,
 )
-from malta.simulation.period import fidelities
+from malta.simulation.layout import fidelities
 from malta.simulation.references import Motion, Reference
 from malta.simulation.responses import step_wrench
 from malta.simulation.trajectory import Trajectory

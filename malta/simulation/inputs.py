@@ -14,11 +14,11 @@ from scipy.special import erf
 from malta.errors import InputError
 from malta.model.data import plant_of
 from malta.model.plant import Plant, position_in
-from malta.simulation import period as machine
 from malta.simulation import references
 from malta.simulation.engines import evaluate
+from malta.simulation.layout import Setup, electronics_of, layout_of
 from malta.simulation.noise import keys, normals
-from malta.simulation.period import Setup
+from malta.simulation.period import state_reference
 from malta.simulation.scenario import Fault, FeedforwardChoice, Scenario
 from malta.synthesis.controller import Controller
 
@@ -48,13 +48,13 @@ def _given(
     motion: references.Motion,
     t: FloatArray,
 ) -> FloatArray:
-    """What every sample is given, in the order of machine.layout."""
+    """What every sample is given, in the order of layout_of."""
     v_ff = feedforward(c, motion, scenario.feedforward)
     stored = v_ff
     if c.delay:  # and what currents commutated for the reference make, in the row of the newest stored force
         n, m = len(c.A), len(c.forces)
         newest = n + m * (c.delay - 1)
-        states = evaluate(machine.state_reference(plant_of(c.parameters)).map(len(t)), motion.p, motion.dp)[0]
+        states = evaluate(state_reference(plant_of(c.parameters)).map(len(t)), motion.p, motion.dp)[0]
         stored = v_ff + states @ c.Ad[newest : newest + m, :n].T
     past = [np.vstack([np.repeat(stored[:1], age, axis=0), stored[:-age]]) for age in range(c.delay, 0, -1)]
     if c.observed:
@@ -62,7 +62,7 @@ def _given(
     parts = {"p_ref": motion.p, "dp_ref": motion.dp, "v_ff": v_ff}
     if past:
         parts["v_past"] = np.hstack(past)
-    sizes = machine.layout(plant, c, setup).given
+    sizes = layout_of(plant, c, setup).given
     if scenario.disturbance is not None:
         parts["w"] = _wrench(plant, scenario, t)
     if setup.faulty:
@@ -84,7 +84,7 @@ def feedforward(c: Controller, motion: references.Motion, choice: FeedforwardCho
         believed.require_second_order("feedforward attraction")
         half = len(c.A) // 2
         hold = -np.linalg.lstsq(c.B[half:], c.A[half:, :half], rcond=None)[0]
-        states = evaluate(machine.state_reference(believed).map(len(motion.p)), motion.p, motion.dp)[0]
+        states = evaluate(state_reference(believed).map(len(motion.p)), motion.p, motion.dp)[0]
         v_ff += states[:, :half] @ hold.T
     return v_ff
 
@@ -159,7 +159,7 @@ def _noise(stages: list[tuple[int, Plant]], scenario: Scenario, t: FloatArray) -
 
 def _fast_noise(plant: Plant, setup: Setup, scenario: Scenario, periods: int) -> FloatArray:
     """Standard normal numbers for the electronics, a row for each of their periods."""
-    fast = machine.electronics_of(plant, setup)
+    fast = electronics_of(plant, setup)
     if fast is None or not fast.noises:
         return np.zeros((periods, 0))
     return normals(keys(scenario.seed, np.array([-1 - scenario.run]))[0], periods, fast.noises)
@@ -173,7 +173,7 @@ def beginning(plant: Plant, c: Controller, scenario: Scenario, first: FloatArray
     p, n = len(plant.outputs), len(c.states)
     believed = plant_of(c.parameters)
     design = [s.name for s in plant.design_states]
-    moving = evaluate(machine.state_reference(believed), first[:p], first[p : 2 * p])[0].ravel()
+    moving = evaluate(state_reference(believed), first[:p], first[p : 2 * p])[0].ravel()
     x = plant.state(dict(zip(design, moving.tolist(), strict=True)) | dict(scenario.start))
     xi_pred, current = np.zeros(n), np.zeros(len(plant.actuator.coils))
     if not scenario.cold:

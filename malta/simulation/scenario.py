@@ -12,9 +12,8 @@ import numpy as np
 
 from malta.errors import InputError
 from malta.model.plant import Plant
-from malta.simulation import period as machine
 from malta.simulation import references
-from malta.simulation.period import FIDELITIES, Fidelity, Setup
+from malta.simulation.layout import FIDELITIES, Fidelity, Setup, electronics_of, fidelities
 from malta.simulation.references import Profile, Reference
 from malta.synthesis.controller import Controller
 
@@ -175,7 +174,7 @@ def setup_of(plant: Plant, c: Controller, s: Scenario) -> Setup:
     if "open phase" in kinds and s.fidelity != "phase":
         found = f"an open phase at fidelity {s.fidelity}"
         raise InputError(f"scenario {s.name}", "faults", found, "fidelity phase")
-    able = machine.fidelities(plant)
+    able = fidelities(plant)
     if s.fidelity not in able:
         expected = "one of " + ", ".join(able) + f" for a {plant.name}"
         raise InputError(f"scenario {s.name}", "fidelity", s.fidelity, expected)
@@ -216,7 +215,7 @@ def setup_of(plant: Plant, c: Controller, s: Scenario) -> Setup:
 
 def substeps_of(plant: Plant, c: Controller, setup: Setup, s: Scenario) -> float:
     """Steps of the simulation in a sample: the scenario's, or the periods of the machine's electronics."""
-    fast = machine.electronics_of(plant, setup)
+    fast = electronics_of(plant, setup)
     return steps_of(plant, c, s) if fast is None else c.sample_time / fast.period
 
 

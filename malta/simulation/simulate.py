@@ -15,11 +15,11 @@ import numpy as np
 from malta.errors import InputError
 from malta.model.data import plant_of, shaping, units_of
 from malta.model.plant import Plant
-from malta.simulation import period as machine
 from malta.simulation import references
 from malta.simulation.engines import EngineChoice, engine_of, evaluate, substeps_until
 from malta.simulation.inputs import _fast_noise, _given, _noise, beginning, sampled
-from malta.simulation.period import Setup
+from malta.simulation.layout import Setup
+from malta.simulation.period import initial_state_function
 from malta.simulation.scenario import Scenario, setup_of, steps_of, substeps_of
 from malta.simulation.trajectory import Trajectory, _labelled
 from malta.simulation.verdict import Verdict, _columns, _judged
@@ -59,7 +59,7 @@ def simulate(
     steps = substeps_of(plant, controller, setup, scenario)
     fast = _fast_noise(plant, setup, scenario, substeps_until(samples, steps))
     x, xi_pred, current = beginning(plant, controller, scenario, given[0])
-    start = machine.initial_state(plant, controller, setup)
+    start = initial_state_function(plant, controller, setup)
     state = evaluate(start, x, xi_pred, current)[0].ravel()
     observer = _observer(plant, controller, scenario, setup) if setup.outside else None
     every = _every(scenario, controller.sample_time)

@@ -22,9 +22,10 @@ from malta.errors import InputError
 from malta.margins.uncertain import holds
 from malta.model.data import plant_of
 from malta.model.plant import Plant
-from malta.simulation import period as machine
 from malta.simulation.engines import Engine
-from malta.simulation.period import Setup
+from malta.simulation.layout import Setup, layout_of, numbers_of
+from malta.simulation.period import period_of
+from malta.simulation.substep import runge_kutta
 from malta.synthesis.controller import Controller, Noise
 
 if TYPE_CHECKING:
@@ -52,9 +53,9 @@ def observer(plant: Plant, c: Controller, setup: Setup, kind: str, substeps: int
 
     @cache
     def sensors(now: Plant) -> ca.Function:
-        return machine.parts(now, c, setup, machine.numbers(now, c, substeps, errors), constant=True).sense
+        return period_of(now, c, setup, numbers_of(now, c, substeps, errors), constant=True).sense
 
-    sizes = machine.layout(plant, c, setup).row
+    sizes = layout_of(plant, c, setup).row
     edges = dict(zip(sizes, np.cumsum([0, *sizes.values()]), strict=False))
     commands = slice(edges["v"], edges["v"] + sizes["v"])
     axis = plant_of(c.parameters).leading_output
@@ -141,7 +142,7 @@ def _nonlinear(c: Controller) -> Callable[..., tuple[FloatArray, FloatArray]]:
 
     z = x
     for _ in range(4):
-        z = machine.runge_kutta(rate, z, h)
+        z = runge_kutta(rate, z, h)
     chosen = list(believed.controlled)
     step = ca.Function("step", [x, u], [z[chosen], ca.jacobian(z, x)[chosen, chosen]])
 

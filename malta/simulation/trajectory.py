@@ -14,9 +14,8 @@ import numpy as np
 
 from malta.files import replace_files
 from malta.model.plant import Plant, Signal, readonly
-from malta.simulation import period as machine
 from malta.simulation.engines import evaluate
-from malta.simulation.period import Setup
+from malta.simulation.layout import Setup, electronics_of, layout_of
 from malta.simulation.scenario import Scenario, setup_of
 from malta.simulation.verdict import Verdict, _judged, _touched
 from malta.synthesis.controller import Controller
@@ -63,7 +62,7 @@ class Trajectory:
     @property
     def limits(self) -> tuple[str, ...]:
         """The limits that were met on the way, by name."""
-        fast = machine.electronics_of(self.plant, setup_of(self.plant, self.controller, self.scenario))
+        fast = electronics_of(self.plant, setup_of(self.plant, self.controller, self.scenario))
         names = ("current limit", *(fast.flags if fast is not None else ()))
         met = [name for name, column in zip(names, self.met.T, strict=True) if column.any()]
         return (*(["force limit"] if self.saturated.any() else []), *met)
@@ -131,7 +130,7 @@ def _labelled(
     (t, given), done = asked, len(table)
     for array in (table, given, t):
         array.flags.writeable = False  # the trajectory's series are views of them
-    sizes = machine.layout(plant, controller, setup).row
+    sizes = layout_of(plant, controller, setup).row
     columns = dict(zip(sizes, np.split(table, np.cumsum([*sizes.values()])[:-1], axis=1), strict=True))
     if setup.bearing and (verdict is None or verdict.name in plant.contacts):  # what it touched first
         verdict = _touched(plant, columns["contact"], t) or verdict

@@ -15,7 +15,7 @@ from itertools import pairwise
 import casadi as ca
 
 from malta.simulation.instructions import _MASKS, _mask_arguments, _Node, _reached, _read
-from malta.simulation.period import Parts
+from malta.simulation.period import Period
 
 WHOLE = 4000  # statements of the longest function that is not cut in parts
 
@@ -23,7 +23,7 @@ WHOLE = 4000  # statements of the longest function that is not cut in parts
 PART = 300  # statements of a part, at most
 
 
-def source(p: Parts, digest: ca.Function | None) -> str:
+def source(p: Period, digest: ca.Function | None) -> str:
     """The whole C text, but for the number of lanes."""
     prepares, functions, count = [], [], 0
     given = {"sense": [1], "decide": [1], "substep": [2], "digest": [2]}
@@ -160,7 +160,7 @@ def _assembled(name: str, arguments: list[tuple[str, str]], bodies: list[list[st
 def _near(function: str) -> str:
     """The function for small tilts alone, which tells by `range` whether they were: its code has no branches.
 
-    Parts without a tilt serve both.
+    Period without a tilt serve both.
     """
     end = "}\n"
     *parts, whole = function.removesuffix(end).split(end)

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from malta.model.plant import Plant
-from malta.simulation import period as machine
-from malta.simulation.period import Setup
+from malta.simulation.layout import Setup, layout_of
 from malta.synthesis.controller import Controller
 
 if TYPE_CHECKING:
@@ -59,6 +58,6 @@ def _touched(plant: Plant, contact: FloatArray, t: FloatArray) -> Verdict | None
 
 
 def _columns(plant: Plant, c: Controller, setup: Setup, rows: FloatArray, name: str) -> FloatArray:
-    sizes = machine.layout(plant, c, setup).row
+    sizes = layout_of(plant, c, setup).row
     first = sum(size for key, size in list(sizes.items())[: list(sizes).index(name)])
     return rows[..., first : first + sizes[name]]

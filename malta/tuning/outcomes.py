@@ -14,7 +14,7 @@ from malta.errors import InputError
 from malta.margins.verify import BANDWIDTHS, machine_loop, verify
 from malta.simulation import references
 from malta.simulation.experiments import experiment, scenario_of
-from malta.simulation.period import fidelities
+from malta.simulation.layout import fidelities
 from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate
 from malta.synthesis.requirements import Figure, Noise, Requirement, ratio_of, requirements_for

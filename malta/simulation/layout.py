@@ -1,0 +1,161 @@
+"""Setup of a simulation, and the names, sizes and order of all its numbers.
+
+A setup says which functions a control period consists of; all else is numbers. `layout_of` gives the order of the
+state, of the inputs of a sample and of the row that a sample leaves; `numbers_of` gives every number of machine,
+controller and sensors by name, and `flatten` puts them in one vector, theta."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
+
+import casadi as ca
+import numpy as np
+
+from malta.model.data import shaping, twins_of, units_of
+from malta.model.plant import Electronics, Plant, symbolic
+from malta.synthesis.controller import Controller, CurrentLoop, gains_of
+
+if TYPE_CHECKING:
+    from malta.model.plant import FloatArray
+
+Fidelity = Literal["force", "dq", "phase"]
+
+
+FIDELITIES: tuple[Fidelity, ...] = get_args(Fidelity)
+
+
+@dataclass(frozen=True)
+class Setup:
+    """What shapes the functions of a simulation; all else are numbers."""
+
+    fidelity: Fidelity
+    delay: int  # samples between measurement and command
+    quantize: bool = False  # sensors in steps
+    disturbed: bool = False  # an external wrench
+    bearing: bool = False  # touchdown bearings push back
+    sensed: bool = False  # sensors with their own errors, Hall sensors for the stroke
+    faulty: bool = False  # held measurements, missed steps, open phases, sagging link
+    scheduled: bool = False  # C(z) of the measured z in the filter
+    real_pwm: bool = False  # duty cycles in steps, dead time
+    turning: bool = False  # current controllers in axes that turn with the forces, as printed
+    outside: bool = False  # the estimate comes from outside
+    open_loop: bool = False  # no feedback: what is fed forward, commutated for the reference
+    electronics: Any = None  # options of the machine's own electronics
+
+
+class Layout(NamedTuple):
+    """Names and sizes, in order."""
+
+    machine: dict[str, int]
+    controller: dict[str, int]
+    given: dict[str, int]  # per sample, the same for every machine
+    row: dict[str, int]  # what one sample leaves behind
+
+
+@lru_cache(maxsize=64)
+def layout_of(plant: Plant, c: Controller, s: Setup) -> Layout:
+    """What stands where."""
+    n, m, p = len(c.states), len(c.forces), len(c.measurements)
+    coils, fast = len(plant.actuator.coils), electronics_of(plant, s)
+    axes, phases = _windings(plant)
+    driven = s.fidelity != "force" and fast is None
+    electric_state: dict[str, int] = {"i_coil": coils}
+    if fast is not None:
+        electric_state |= fast.state
+    elif s.fidelity != "force":
+        electric_state = {"i": axes, "link": 1} if s.fidelity == "dq" else {"i_phase": phases, "link": 1}
+    held = command_size(plant, s)
+    controller = {"xi_pred": n, "e": p, "frozen": p}
+    if driven:
+        controller |= {"u_integral": axes, "u_limited": axes}
+    if s.faulty:
+        controller |= {"y_last": p, "command": held}
+    controller |= {"under_way": held * s.delay}
+    given = {"p_ref": p, "dp_ref": p, "v_ff": m}
+    given["v_past"] = n - len(c.A) if c.tracks == "states" else 0  # and zero for disturbances
+    if s.disturbed:
+        given |= {"w": len(plant.disturbances)}
+    if s.faulty:
+        given |= {"stuck": p, "missed": 1, "sag": 1, "open": phases if s.fidelity == "phase" else 0}
+    if s.outside:
+        given |= {"xi_hat": n}
+    row = {"x": len(plant.states), "p": p, "y": p, "xi_hat": n, "v": m, "force": m, "saturated": p}
+    row |= {"contact": len(plant.contacts), "current": coils, "met": 1 + (len(fast.flags) if fast else 0)}
+    if driven:
+        row |= {"i": axes, "u": axes, "link": 1}
+    if s.fidelity == "phase":
+        row |= dict.fromkeys(("i_phase", "duty"), phases if driven else coils)
+    return Layout({"x": len(plant.states)} | electric_state, controller, given, row)
+
+
+def numbers_of(
+    plant: Plant, c: Controller, substeps: float, errors: Mapping[str, float] | None = None
+) -> dict[str, ca.DM]:
+    """Every number of machine, controller and sensors, by name."""
+    fixed = shaping(plant.parameters)
+    machine = {k: ca.DM(getattr(plant.parameters, k)) for k in units_of(plant.parameters) if k not in fixed}
+    loop = c.current_loop or CurrentLoop(0.0, 0.0, 0.0)
+    known = dict.fromkeys((signal.name for signal in plant.sensor_errors), 0.0) | dict(errors or {})
+    return {
+        **{f"machine.{name}": ca.DM(value) for name, value in machine.items()},
+        **gains_of(c),
+        "Kp": ca.DM(loop.Kp),
+        "Ki_current": ca.DM(loop.Ki),
+        "rate": ca.DM(c.feedforward.rate),
+        "grid_ends": ca.DM([c.feedforward.z_grid[0], c.feedforward.z_grid[-1]]),
+        "substep": ca.DM(c.sample_time / substeps),
+        "errors": ca.DM(list(known.values())),
+    }
+
+
+def flatten(values: Mapping[str, ca.DM]) -> FloatArray:
+    """The nonzeros of every number, in order: theta."""
+    return np.concatenate([np.array(value.nonzeros(), dtype=float) for value in values.values()])
+
+
+def with_symbols(plant: Plant, values: Mapping[str, ca.DM]) -> tuple[Plant, dict[str, Any], Any]:
+    """The machine with a symbol for every number, the symbols by name, and all of them: theta."""
+    g = {name: ca.SX.sym(name, value.sparsity()) for name, value in values.items()}
+    theta = ca.vertcat(*(ca.vertcat(*symbol.nonzeros()) for symbol in g.values()))
+    return plant.variant(_symbolic_parameters(plant, g)), g, theta
+
+
+def electronics_of(plant: Plant, s: Setup) -> Electronics | None:
+    """The machine's own electronics, where a setup has them."""
+    if s.fidelity != "phase" or plant.electronics is None:
+        return None
+    return plant.electronics(s.electronics)
+
+
+def fidelities(plant: Plant) -> tuple[Fidelity, ...]:
+    """The fidelities that there are of a machine."""
+    if plant.windings is not None:
+        return FIDELITIES
+    return ("force",) if plant.electronics is None else ("force", "phase")
+
+
+def _windings(plant: Plant) -> tuple[int, int]:
+    """Axes and phases of the drive."""
+    drive = plant.windings
+    return (0, 0) if drive is None else (len(drive.axes), len(drive.phases))
+
+
+def symbols_of(sizes: Mapping[str, int], kind: Any) -> dict[str, Any]:
+    return {name: kind.sym(name, size) for name, size in sizes.items()}
+
+
+def _symbolic_parameters(plant: Plant, g: Mapping[str, Any]) -> Any:
+    par, fixed = plant.parameters, shaping(plant.parameters)
+    symbols = {name: g[f"machine.{name}"] for name in units_of(par) if name not in fixed}
+    return symbolic(par, symbols | {name: symbols[twin] for name, twin in twins_of(par).items()})
+
+
+def command_size(plant: Plant, s: Setup) -> int:
+    fast = electronics_of(plant, s)
+    if fast is not None:
+        return fast.held_size
+    axes, phases = _windings(plant)
+    return {"force": len(plant.actuator.coils), "dq": axes, "phase": phases}[s.fidelity]

@@ -1,0 +1,116 @@
+"""Motion of the machine between two samples: one step of the classical Runge–Kutta method under held commands."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import casadi as ca
+
+from malta.model.plant import Plant
+from malta.simulation import inverter
+from malta.simulation.layout import Setup, electronics_of
+
+OPENING = 20e-6  # s, time constant with which the current of an opened phase dies
+
+
+def _moved(
+    plant: Plant,
+    s: Setup,
+    g: Mapping[str, Any],
+    machine: Mapping[str, Any],
+    given: Mapping[str, Any],
+    held: Any,
+    jitter: Any,
+) -> Any:
+    """One Runge–Kutta step of the machine under held commands, or a period of its electronics."""
+    h = g["substep"]
+    outside = (
+        given["w"] if s.disturbed else ca.SX(len(plant.disturbances), 1)
+    )  # structural zeros cost nothing
+
+    def motion(x: Any, inputs: Any) -> Any:
+        w = plant.load(x) + outside
+        return plant.f(x, inputs, w + plant.bearing(x) if s.bearing else w)
+
+    x, fast = machine["x"], electronics_of(plant, s)
+    if fast is not None:
+        own = {name: machine[name] for name in fast.state}
+        x, i, own = fast.move(x, machine["i_coil"], own, held, plant.load(x) + outside, jitter)
+        return ca.vertcat(x, i, *(own[name] for name in fast.state))
+    if s.fidelity == "force":
+        currents = _lagging(plant.actuator.crossover, machine["i_coil"], held, h)
+        half = len(plant.states) // 2 if plant.second_order else 0
+        moved = runge_kutta(lambda x, n: motion(x, plant.forces(x, currents[n])), x, h, half)
+        return ca.vertcat(moved, currents[2])
+    n, count = len(plant.states), machine["i" if s.fidelity == "dq" else "i_phase"].numel()
+    slope = _axis_slope if s.fidelity == "dq" else _phase_slope
+
+    def rate(z: Any, _: int) -> Any:
+        x, i, V = z[:n], z[n : n + count], z[n + count]
+        forces, electrics = slope(plant, s, given, x, i, V, held)
+        return ca.vertcat(motion(x, forces), electrics)
+
+    return runge_kutta(rate, ca.vertcat(*machine.values()), h, n // 2 if plant.second_order else 0)
+
+
+def _lagging(crossover: Any, i: Any, held: Any, h: Any) -> list[Any]:
+    """Currents at the beginning, the middle and the end of a step, exactly: i = held + (i_0 - held) e^(-w_c t)."""
+    if isinstance(crossover, float) and math.isinf(crossover):
+        return [held] * 3
+    lag, decay = i - held, ca.exp(-crossover * h / 2)
+    return [held + lag, held + decay * lag, held + decay**2 * lag]
+
+
+def runge_kutta(rate: Callable[[Any, int], Any], z: Any, h: Any, positions: int = 0) -> Any:
+    """One step of the classical method, fourth order. rate: (z, half steps since the beginning: 0, 1 or 2) -> z'.
+
+    positions : how many entries stand first whose rates are the entries that follow them. What the method does to them
+        is written in accelerations, as Nyström did: the same numbers in fewer operations.
+    """
+    q, w = z[:positions, 0], z[positions:, 0]  # columns, also of a single entry
+    dq = w[:positions, 0]
+
+    def slope(q: Any, w: Any, halves: int) -> Any:
+        return rate(ca.vertcat(q, w), halves)[positions:, 0]
+
+    k1 = slope(q, w, 0)
+    middle = q + h / 2 * dq
+    k2 = slope(middle, w + h / 2 * k1, 1)
+    k3 = slope(middle + h * h / 4 * k1[:positions, 0], w + h / 2 * k2, 1)
+    end = q + h * dq
+    k4 = slope(end + h * h / 2 * k2[:positions, 0], w + h * k3, 2)
+    late = k2 + k3
+    early = k1 + late
+    return ca.vertcat(end + h * h / 6 * early[:positions, 0], w + h / 6 * (early + late + k4))
+
+
+def _axis_slope(
+    plant: Plant, s: Setup, given: Mapping[str, Any], x: Any, i: Any, V: Any, m: Any
+) -> tuple[Any, Any]:
+    """Forces, and the slopes of axis currents and link voltage."""
+    drive, actuator = plant.drive, plant.actuator
+    u = m * V * (1 - given["sag"] if s.faulty else 1)
+    di = (u - actuator.R * i - drive.emf(x)) / actuator.L + drive.coupling(x, i)
+    power = ca.dot(ca.DM(list(drive.weight)), u * i)
+    return drive.force(i), ca.vertcat(di, inverter.link_slope(drive, V, power))
+
+
+def _phase_slope(
+    plant: Plant, s: Setup, given: Mapping[str, Any], x: Any, i: Any, V: Any, d: Any
+) -> tuple[Any, Any]:
+    """Forces, and the slopes of phase currents and link voltage. Phase-wise u = (d - 1/2) V."""
+    drive, actuator = plant.drive, plant.actuator
+    u = (d - 0.5) * V * (1 - given["sag"] if s.faulty else 1)
+    closed = 1 - given["open"] if s.faulty else ca.SX.ones(len(drive.phases))
+    flowing = closed * i
+    net = inverter.phase_voltages(drive, u - actuator.R * flowing - drive.to_phases(x) @ drive.emf(x), closed)
+    # An open phase loses its current within a sample, and so do the others what they carried for it: the arc is short.
+    lost = (1 - closed) * i
+    for star in drive.stars if s.faulty else ():
+        phases = list(star)
+        lost[phases] += closed[phases] * ca.sum1(flowing[phases]) / ca.fmax(ca.sum1(closed[phases]), 1)
+    di = net / actuator.L - lost / OPENING
+    power = ca.dot(u, flowing)
+    return drive.force(drive.to_axes(x) @ flowing), ca.vertcat(di, inverter.link_slope(drive, V, power))
