@@ -46,9 +46,9 @@ if TYPE_CHECKING:  # the contents page, as type checkers and readers see it
     from malta.model.plant import trim as trim
     from malta.report.ledger import ledger as ledger
     from malta.simulation import references as references
-    from malta.simulation.batch import Batch as Batch
     from malta.simulation.batch import replayed as replayed
     from malta.simulation.batch import simulate_many as simulate_many
+    from malta.simulation.digest import Batch as Batch
     from malta.simulation.experiments import Experiment as Experiment
     from malta.simulation.experiments import experiment as experiment
     from malta.simulation.scenario import Fault as Fault
@@ -82,7 +82,8 @@ _NAMES = {  # the same, for the first use of each name
     "simulation.time_optimal": ("fastest_stroke",),
     "model.linear": ("linear_machine",),
     "model.linearize": ("LinearModel", "linearize"),
-    "simulation.batch": ("Batch", "replayed", "simulate_many"),
+    "simulation.batch": ("replayed", "simulate_many"),
+    "simulation.digest": ("Batch",),
     "model.machines": ("machine",),
     "model.plant": ("OperatingPoint", "Plant", "Signal", "trim"),
     "margins.blocks": ("Dynamic",),

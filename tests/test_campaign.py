@@ -50,7 +50,7 @@ from malta.campaigns.store import MANIFEST, block_name
 from malta.machines.tubular.experiments import CASES, EXPERIMENTS
 from malta.report import figures
 from malta.simulation import compiled
-from malta.simulation.batch import Batch, verdicts
+from malta.simulation.digest import Batch, verdicts
 from malta.simulation.engines import compiled_shape, engine_of
 from malta.simulation.experiments import cases_of
 

@@ -27,7 +27,7 @@ from malta.campaigns.dask import (
     _task,
     blocks,
 )
-from malta.simulation.batch import Batch
+from malta.simulation.digest import Batch
 
 if TYPE_CHECKING:
     from conftest import Design

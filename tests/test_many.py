@@ -16,12 +16,8 @@ from hypothesis import strategies as st
 import malta
 from malta import references
 from malta.simulation import compiled
-from malta.simulation.batch import (
-    Batch,
-    replayed,
-    simulate_many,
-    verdicts,
-)
+from malta.simulation.batch import replayed, simulate_many
+from malta.simulation.digest import Batch, verdicts
 from malta.simulation.engines import compiled_shape, engine_of
 from malta.simulation.layout import FIDELITIES, Fidelity
 from malta.simulation.noise import keys, normals

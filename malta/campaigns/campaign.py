@@ -39,14 +39,8 @@ from malta.errors import InputError
 from malta.files import replace_files
 from malta.model.plant import readonly
 from malta.simulation import compiled
-from malta.simulation.batch import (
-    Batch,
-    is_compiled,
-    recorded_run,
-    replayed,
-    simulate_many,
-    verdicts,
-)
+from malta.simulation.batch import is_compiled, recorded_run, replayed, simulate_many
+from malta.simulation.digest import Batch, verdicts
 from malta.simulation.engines import EngineChoice
 from malta.simulation.experiments import Experiment, flown
 from malta.synthesis.controller import Controller

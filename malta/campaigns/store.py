@@ -26,8 +26,8 @@ from malta.campaigns.plan import (
 )
 from malta.errors import InputError
 from malta.files import read_file, replace_files
-from malta.simulation.batch import Batch
 from malta.simulation.compiled import LANES
+from malta.simulation.digest import Batch
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray

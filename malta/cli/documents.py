@@ -166,7 +166,7 @@ def _percentiles(campaign: Campaign, published: Mapping[str, Any] | None) -> dic
 
 def _run_document(campaign: Campaign, row: int) -> dict[str, Any]:
     """One run of a campaign, by its row in the campaign's arrays."""
-    from malta.simulation.batch import verdicts
+    from malta.simulation.digest import verdicts
 
     names = verdicts(campaign.plan.plant)
     return {

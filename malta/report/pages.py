@@ -529,7 +529,7 @@ PERCENTILES = (5, 50, 95, 99)
 def _worst_table(found: Campaign, count: int) -> Table:
     """The worst runs, each with what it was flown with: parameters off the middle of the box, errors of the sensors."""
     from malta.campaigns.statistics import worst_of
-    from malta.simulation.batch import verdicts
+    from malta.simulation.digest import verdicts
 
     plant = found.plan.plant
     names, groups = verdicts(plant), aside(plant)

@@ -115,7 +115,7 @@ def _distribution(axes: Axes, kind: str, listed: Sequence[Finding]) -> None:
 def yield_figure(found: Campaign, published: Published | None = None) -> Figure:
     """How runs end over each parameter that was varied, the others wherever they were drawn."""
     from malta.campaigns.statistics import kept
-    from malta.simulation.batch import verdicts
+    from malta.simulation.digest import verdicts
 
     names = [name for k, name in enumerate(found.names) if len(set(found.values[:, k])) > 1]
     shown = names[:9]
@@ -255,7 +255,7 @@ def _campaign_figure(found: Campaign, what: str, **places: float) -> Figure:
 
 def _ended(found: Campaign, row: int) -> str:
     """A run by its number, and what ended it."""
-    from malta.simulation.batch import verdicts
+    from malta.simulation.digest import verdicts
 
     name = verdicts(found.plan.plant)[int(found.batch.verdict[row])]
     text = f"run {found.index[row]}"

@@ -1,0 +1,180 @@
+"""Digests: the few numbers that a run of a batch leaves, updated at every sample, and the batch made of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any
+
+import casadi as ca
+import numpy as np
+
+from malta.model.plant import Plant, readonly
+from malta.simulation.layout import flatten, layout_of, numbers_of
+
+if TYPE_CHECKING:
+    from malta.model.plant import FloatArray
+
+LEVELS = (0.1, 0.9)  # of a stroke: its rise is between them
+
+
+@dataclass(frozen=True, eq=False)
+class Batch:
+    """What became of each run. SI; a row for each run."""
+
+    duration: FloatArray  # s, until the end or until something was touched
+    completed: FloatArray  # 1 or 0
+    deviation: FloatArray  # runs x outputs, largest |p - p*|
+    rms: FloatArray  # runs x outputs, root mean square of p - p*
+    force: FloatArray  # runs x inputs, N, largest |v|
+    contact: FloatArray  # runs x contacts, largest share of each clearance that was used up
+    rise: FloatArray  # s, 10-90 % of the stroke; NaN when it was not reached
+    overshoot: FloatArray  # beyond the end, as a share of the stroke; NaN when the run ended early
+    saturated: FloatArray  # runs x inputs, share of the samples whose command was limited
+    verdict: FloatArray  # how it ended: index into `verdicts` of the plant
+
+    def __post_init__(self) -> None:
+        for name in self.__dataclass_fields__:
+            object.__setattr__(self, name, readonly(getattr(self, name)))
+
+
+def verdicts(plant: Plant) -> tuple[str, ...]:
+    """How a run may end, the first of them as it should: the names of simulate.Verdict."""
+    return ("completed", "diverged", "not lifted", *plant.contacts)
+
+
+def _digest_sizes(plant: Plant) -> dict[str, int]:
+    p, m = len(plant.outputs), len(plant.inputs)
+    return {
+        "alive": 1,
+        "start": 1,  # of the stroke, and 1 / its length or 0: constant
+        "scale": 1,
+        "samples": 1,
+        "reached": len(LEVELS),  # sample at which each level was reached, -1 before
+        "below": len(LEVELS),  # share of the stroke one sample before
+        "above": len(LEVELS),  # and then
+        "share": 1,
+        "largest_share": 1,
+        "deviation": p,
+        "squares": p,
+        "force": m,
+        "limited": m,
+        "contact": len(plant.contacts),
+        "resting": 1,  # on the touchdown bearings at the start
+        "touching": 1,  # them at the end
+        "touched": 1,  # sample at which it first did, -1 before
+        "culprit": 1,  # index of what was touched first, -1 before
+    }
+
+
+@lru_cache(maxsize=16)
+def _digest(shape: Any) -> ca.Function:
+    """(kept, row, given, theta) -> kept: what a run leaves behind, sample by sample, until something is touched."""
+    plant, c, setup = shape.plant, shape.controller, shape.setup
+    sizes = layout_of(plant, c, setup)
+    kept = {name: ca.SX.sym(name, size) for name, size in _digest_sizes(plant).items()}
+    row = {name: ca.SX.sym(name, size) for name, size in sizes.row.items()}
+    given = {name: ca.SX.sym(name, size) for name, size in sizes.given.items()}
+    theta = ca.SX.sym("theta", len(flatten(numbers_of(plant, c, 1))))
+    largest = ca.fmax(kept["contact"], row["contact"])
+    most, used = (_most(contact) for contact in (largest, row["contact"]))
+    alive = kept["alive"]  # what follows adds nothing once it is 0
+    error = ca.if_else(alive, row["p"] - given["p_ref"], 0)
+    share = (row["p"][plant.leading_output] - kept["start"]) * kept["scale"]
+    now = ca.logic_and(ca.logic_and(alive, kept["reached"] < 0), share >= ca.DM(LEVELS))
+    after = {
+        "alive": ca.logic_and(alive, most < 1),
+        "start": kept["start"],
+        "scale": kept["scale"],
+        "samples": kept["samples"] + alive,
+        "reached": ca.if_else(now, kept["samples"], kept["reached"]),
+        "below": ca.if_else(now, kept["share"], kept["below"]),
+        "above": ca.if_else(now, share, kept["above"]),
+        "share": share,
+        "largest_share": ca.if_else(alive, ca.fmax(kept["largest_share"], share), kept["largest_share"]),
+        "deviation": ca.fmax(kept["deviation"], ca.fabs(error)),
+        "squares": kept["squares"] + error**2,
+        "force": ca.fmax(kept["force"], ca.if_else(alive, ca.fabs(row["v"]), 0)),
+        "limited": kept["limited"] + ca.if_else(alive, row["saturated"], 0),
+        "contact": ca.if_else(alive, largest, kept["contact"]),
+        "culprit": ca.if_else(
+            ca.logic_and(ca.logic_and(alive, kept["culprit"] < 0), used >= 1),
+            _largest(row["contact"]) if plant.contacts else -1,
+            kept["culprit"],
+        ),
+    }
+    if setup.bearing:
+        touching = used >= 1
+        ends = [row["contact"][i] for i, held in enumerate(plant.cushioned) if not held]
+        after["alive"] = ca.logic_and(alive, _most(ca.vertcat(*ends)) < 1)
+        first = kept["samples"] == 0
+        after["resting"] = ca.if_else(first, touching, kept["resting"])
+        after["touching"] = ca.if_else(alive, touching, kept["touching"])
+        now = ca.logic_and(touching, kept["touched"] < 0)
+        after["touched"] = ca.if_else(now, kept["samples"], kept["touched"])
+    result = ca.vertcat(*(after.get(name, kept[name]) for name in kept))
+    arguments = [ca.vertcat(*part.values()) for part in (kept, row, given)]
+    return ca.Function("digest", [*arguments, theta], [ca.densify(result)])
+
+
+@lru_cache(maxsize=16)
+def _recorder(shape: Any) -> ca.Function:
+    """A digest that keeps the last two rows as they are."""
+    sizes = layout_of(shape.plant, shape.controller, shape.setup)
+    width, given = sum(sizes.row.values()), sum(sizes.given.values())
+    kept, row = ca.SX.sym("kept", 2 * width), ca.SX.sym("row", width)
+    theta = ca.SX.sym("theta", len(flatten(numbers_of(shape.plant, shape.controller, 1))))
+    arguments = [kept, row, ca.SX.sym("given", given), theta]
+    return ca.Function("digest", arguments, [ca.vertcat(kept[width:], row)])
+
+
+def _batch(kept: FloatArray, samples: int, Ts: float, sizes: Mapping[str, int]) -> Batch:
+    columns = dict(zip(sizes, np.split(kept, np.cumsum([*sizes.values()])[:-1], axis=1), strict=True))
+    count = columns["samples"][:, 0]
+    resting, touching, touched = (columns[name][:, 0] for name in ("resting", "touching", "touched"))
+    held = np.where(resting == 1, touching == 0, touched < 0)
+    completed = (columns["alive"][:, 0] == 1) & np.isfinite(kept).all(axis=1) & (count == samples) & held
+    end = np.where((count == samples) & (resting == 0) & (touched >= 0), touched, np.maximum(count - 1, 0))
+    reached, below, above = (columns[name] for name in ("reached", "below", "above"))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        first, last = np.where(
+            reached > 0, reached - 1 + (np.array(LEVELS) - below) / (above - below), np.nan
+        ).T
+    # What follows the end is not guarded in "share" alone.
+    told = np.hstack([columns[name] for name in ("deviation", "squares", "contact")])
+    verdict = np.select(
+        [completed, ~np.isfinite(told).all(axis=1), resting == 1, columns["culprit"][:, 0] >= 0],
+        [0, 1, 2, 3 + columns["culprit"][:, 0]],
+        1,
+    )
+    return Batch(
+        duration=np.where(completed, samples, end) * Ts,
+        completed=completed,
+        deviation=columns["deviation"],
+        rms=np.sqrt(columns["squares"] / np.maximum(count, 1)[:, None]),
+        force=columns["force"],
+        contact=columns["contact"],
+        rise=np.where(completed, (last - first) * Ts, np.nan),
+        overshoot=np.where(
+            completed & (columns["scale"][:, 0] != 0),
+            np.maximum(columns["largest_share"][:, 0] - 1, 0),
+            np.nan,
+        ),
+        saturated=columns["limited"] / np.maximum(count, 1)[:, None],
+        verdict=verdict,
+    )
+
+
+def _most(contact: Any) -> Any:
+    """The largest share of a clearance that is used up; 0 for a machine that has nothing to touch."""
+    return ca.mmax(contact) if contact.numel() else ca.SX(0)
+
+
+def _largest(values: Any) -> Any:
+    """Index of the largest entry, the first of equals."""
+    found, index = values[0], ca.SX(0)
+    for k in range(1, values.numel()):
+        index = ca.if_else(values[k] > found, k, index)
+        found = ca.fmax(found, values[k])
+    return index
