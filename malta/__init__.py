@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:  # the contents page, as type checkers and readers see it
     from malta import gains as gains
     from malta import report as report
-    from malta.campaigns.campaign import Campaign as Campaign
-    from malta.campaigns.campaign import Plan as Plan
-    from malta.campaigns.campaign import campaign as campaign
+    from malta.campaigns.plan import Plan as Plan
+    from malta.campaigns.result import Campaign as Campaign
+    from malta.campaigns.run import campaign as campaign
     from malta.errors import CheckError as CheckError
     from malta.errors import InputError as InputError
     from malta.margins.blocks import Dynamic as Dynamic
@@ -72,7 +72,9 @@ if TYPE_CHECKING:  # the contents page, as type checkers and readers see it
     from malta.tuning.tune import tune as tune
 
 _NAMES = {  # the same, for the first use of each name
-    "campaigns.campaign": ("Campaign", "Plan", "campaign"),
+    "campaigns.plan": ("Plan",),
+    "campaigns.result": ("Campaign",),
+    "campaigns.run": ("campaign",),
     "margins.stages": ("Robustness", "robustness"),
     "report.ledger": ("ledger",),
     "synthesis.controller": ("Controller",),

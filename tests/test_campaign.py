@@ -26,27 +26,17 @@ from hypothesis import strategies as st
 import malta
 from malta import campaign as function
 from malta import report
-from malta.campaigns.campaign import (
-    SLOW_BLOCK,
-    Campaign,
-    Plan,
-    campaign,
-    read_plan,
-    replay,
-)
 from malta.campaigns.plan import (
     SAMPLERS,
+    Plan,
     box_of,
     drawn,
     wanted_of,
 )
-from malta.campaigns.statistics import (
-    figures_of,
-    kept,
-    rate,
-    worst_of,
-)
-from malta.campaigns.store import MANIFEST, block_name
+from malta.campaigns.result import Campaign, rate
+from malta.campaigns.run import SLOW_BLOCK, campaign, replay
+from malta.campaigns.statistics import figures_of, kept, worst_of
+from malta.campaigns.store import MANIFEST, block_name, read_plan
 from malta.machines.tubular.experiments import CASES, EXPERIMENTS
 from malta.report import figures
 from malta.simulation import compiled
@@ -60,7 +50,7 @@ if TYPE_CHECKING:
     from malta.synthesis.controller import Controller
 
 pytestmark = pytest.mark.usefixtures("proven_once")
-MODULE: Any = sys.modules["malta.campaigns.campaign"]  # `malta.campaign` is the function
+MODULE: Any = sys.modules["malta.campaigns.run"]
 BOX = {"m": 0.2, "K_A": 0.2, "K_D": 0.2, "K_B": 0.2}
 SHORT: dict[str, Any] = {"fidelity": "force", "duration": 0.02, "rise": 3e-3}
 SIZES = (8, 24, 1024)  # runs in a block

@@ -19,7 +19,7 @@ import pytest
 
 import malta
 from malta.campaigns import dask as cluster
-from malta.campaigns.campaign import Plan, campaign, fly
+from malta.campaigns.block import fly
 from malta.campaigns.dask import (
     _at_worker,
     _finished,
@@ -27,6 +27,8 @@ from malta.campaigns.dask import (
     _task,
     blocks,
 )
+from malta.campaigns.plan import Plan
+from malta.campaigns.run import campaign
 from malta.simulation.digest import Batch
 
 if TYPE_CHECKING:
@@ -183,7 +185,7 @@ def test_what_a_worker_refuses_comes_back_as_a_sentence(plan: Plan, monkeypatch:
     def none(*_: Any, **__: Any) -> Any:
         raise malta.InputError("campaign", "m", "lead", "iron")
 
-    monkeypatch.setattr(sys.modules["malta.campaigns.campaign"], "fly", none)
+    monkeypatch.setattr(cluster, "fly", none)
     refused = _at_worker(_task(plan, malta_version()), 0, 8)
     with pytest.raises(malta.InputError, match="campaign: m: found lead, expected iron"):
         _result(NOBODY, _future(refused))

@@ -12,12 +12,12 @@ from importlib.metadata import version
 from threading import Thread
 from typing import TYPE_CHECKING, Any
 
+from malta.campaigns.block import Block
 from malta.errors import InputError
 from malta.model.machines import load_sources, sources_of
 
 if TYPE_CHECKING:
     from malta.campaigns.plan import Plan
-    from malta.campaigns.store import Block
 
 ANSWER = 3.0  # s, within which a scheduler answers
 WAIT = 30.0  # s without any worker, after which the campaign stops
@@ -150,7 +150,7 @@ def _said(error: BaseException) -> str:
 
 def _at_worker(task: _Task, first: int, count: int) -> Block | tuple[str, str, str, str]:
     """A block, or the parts of the error that refuses it: one that names its fields does not travel by itself."""
-    from malta.campaigns.campaign import fly
+    from malta.campaigns.block import fly
 
     here = version("malta")
     if here != task.version:

@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from scipy.stats import binomtest
 
 from malta.model.data import in_unit, published_value, units_of
 from malta.model.plant import readonly
@@ -17,21 +16,9 @@ from malta.simulation.experiments import setting
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from malta.campaigns.campaign import Campaign
     from malta.campaigns.plan import Plan
+    from malta.campaigns.result import Campaign
     from malta.model.plant import FloatArray
-
-CONFIDENCE = 0.95  # of the interval about a share
-
-
-class Rate(NamedTuple):
-    """A share of runs with its two-sided interval (Clopper-Pearson) at CONFIDENCE."""
-
-    passed: int
-    runs: int
-    share: float  # NaN of no runs
-    low: float
-    high: float
 
 
 class Finding(NamedTuple):
@@ -48,14 +35,6 @@ class Finding(NamedTuple):
     def within(self) -> NDArray[np.bool_]:
         """Which runs were completed and keep the published bound."""
         return np.asarray(self.values <= self.published)
-
-
-def rate(count: int, runs: int) -> Rate:
-    """A share with the interval that holds the true one at least CONFIDENCE of the time."""
-    if not runs:
-        return Rate(0, 0, math.nan, 0.0, 1.0)
-    low, high = binomtest(count, runs).proportion_ci(CONFIDENCE, method="exact")
-    return Rate(count, runs, count / runs, float(low), float(high))
 
 
 def figures_of(found: Campaign, published: Mapping[str, Any] | None = None) -> list[Finding]:

@@ -13,34 +13,21 @@ import io
 import json
 import os
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from malta.campaigns.plan import (
-    SCHEMA,
-    VERSION,
-    Plan,
-    drawn,
-)
+from malta.campaigns.block import Block
+from malta.campaigns.plan import SCHEMA, VERSION, Plan, drawn, fingerprint
 from malta.errors import InputError
 from malta.files import read_file, replace_files
 from malta.simulation.compiled import LANES
 from malta.simulation.digest import Batch
-
-if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
+from malta.synthesis.controller import Controller
 
 MANIFEST = "campaign.json"
-
-
-class Block(NamedTuple):
-    """Some runs of a plan, from one index on."""
-
-    values: FloatArray  # runs x names, SI: what was drawn for them
-    batch: Batch
-    engine: str  # what flew them: "compiled" or "virtual machine"
 
 
 def block_name(first: int) -> str:
@@ -86,6 +73,54 @@ def read_manifest(path: Path) -> tuple[dict[str, Any], int]:
     if not isinstance(size, int) or size < 1 or size % LANES:
         raise InputError(path, "block", repr(size), f"a multiple of {LANES}")
     return content, size
+
+
+def read_plan(folder: str | Path, controller: Controller) -> Plan:
+    """The plan of the campaign in a folder. Raises InputError when it is not of this controller."""
+    path = Path(folder) / MANIFEST
+    content, _ = read_manifest(path)
+    own = fingerprint(controller)
+    try:
+        gains, scenario, machine = content["gains"], content["scenario"], content["machine"]
+        if gains["sha256"] != own:
+            found = f"a campaign of {gains['name']}, sha256 {short(gains['sha256'])}"
+            raise InputError(path, "gains", found, f"one of {controller.name}, sha256 {short(own)}")
+        values = {name: float(value) for name, value in machine["parameters"].items()}
+        plan = Plan(
+            controller,
+            scenario["name"],
+            content["spread"],
+            content["sensor_spread"],
+            content["samples"],
+            content["seed"],
+            content["sampler"],
+            replace(controller.parameters, **values, preset=machine["preset"]),
+            scenario["case"],
+            scenario["options"],
+        )
+    except InputError as error:
+        raise InputError(path, error.field, error.found, error.expected) from error
+    except (KeyError, TypeError, AttributeError, ValueError) as error:
+        raise InputError(
+            path, "", f"a damaged or foreign file ({error})", "the manifest of a campaign"
+        ) from error
+    require_same(path, content, plan.manifest)
+    return plan
+
+
+def _read(place: Path, plan: Plan, parts: Mapping[int, int], done: dict[int, Block]) -> list[Path]:
+    """Put the blocks of a folder into `done`; the files of those that are damaged."""
+    damaged = []
+    for first, count in parts.items():
+        path = place / block_name(first)
+        if not path.exists():
+            continue
+        found = read_block(path, plan, first, count)
+        if found is None:
+            damaged.append(path)
+        else:
+            done[first] = found
+    return damaged
 
 
 def require_same(path: Path, found: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:

@@ -34,8 +34,8 @@ from malta.cli.options import (
 from malta.cli.output import make_console, print_json, print_note, print_written, progress_bar
 
 if TYPE_CHECKING:
-    from malta.campaigns.campaign import Campaign
     from malta.campaigns.plan import Sampler
+    from malta.campaigns.result import Campaign
 
 
 def campaign(
@@ -98,8 +98,8 @@ def campaign(
     \b
     Example:  malta campaign design/gains/calibrated.json --samples 10000 --spread 20%
     """
-    from malta.campaigns.campaign import campaign as run_campaign
     from malta.campaigns.plan import Plan
+    from malta.campaigns.run import campaign as run_campaign
     from malta.model.data import plant_of, published_figures, units_of
     from malta.simulation.experiments import main_job
 

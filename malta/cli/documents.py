@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from malta.campaigns.campaign import Campaign
+    from malta.campaigns.result import Campaign
     from malta.margins.gain import Gain
     from malta.margins.robust import Margin
     from malta.margins.stages import Robustness

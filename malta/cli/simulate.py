@@ -160,8 +160,8 @@ def _replay(
 
     Raises InputError for another form, and for `others`, the names of options that the campaign decides.
     """
-    from malta.campaigns.campaign import read_plan
-    from malta.campaigns.campaign import replay as simulate_run
+    from malta.campaigns.run import replay as simulate_run
+    from malta.campaigns.store import read_plan
 
     folder, _, run = text.rpartition(":")
     if not folder or not run.isdecimal():

@@ -46,7 +46,7 @@ from malta.synthesis.requirements import Trade, requirements_for
 from malta.synthesis.spec import Spec
 
 if TYPE_CHECKING:
-    from malta.campaigns.campaign import Campaign
+    from malta.campaigns.result import Campaign
     from malta.margins.extent import Extent
     from malta.margins.gain import Gain
     from malta.margins.robust import Margin
@@ -483,7 +483,8 @@ def campaign_tables(found: Campaign, published: Published | None = None, worst: 
 
 
 def _ends_table(found: Campaign, published: Published | None) -> Table:
-    from malta.campaigns.statistics import kept, rate
+    from malta.campaigns.result import rate
+    from malta.campaigns.statistics import kept
 
     within, runs = kept(found, published), len(found.index)
     table = _table("How the runs end", "end", "runs", "share [%]", "95 % interval [%]")

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from malta.campaigns.campaign import Campaign
+    from malta.campaigns.result import Campaign
     from malta.campaigns.statistics import Finding
 
 

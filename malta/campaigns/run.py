@@ -12,99 +12,26 @@ import signal
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Any, get_args
+from typing import Any, get_args
 
-import numpy as np
-
-from malta.campaigns.plan import Plan as Plan
-from malta.campaigns.plan import drawn, fingerprint, wanted_of
-from malta.campaigns.statistics import Rate, rate
-from malta.campaigns.store import (
-    MANIFEST,
-    Block,
-    block_name,
-    encoded,
-    opened,
-    read_block,
-    read_manifest,
-    require_same,
-    shapes,
-    short,
-)
+from malta.campaigns.block import Block, fly
+from malta.campaigns.plan import Plan, drawn, wanted_of
+from malta.campaigns.result import Campaign, _gathered
+from malta.campaigns.store import _read, block_name, encoded, opened
 from malta.errors import InputError
 from malta.files import replace_files
-from malta.model.plant import readonly
 from malta.simulation import compiled
-from malta.simulation.batch import is_compiled, recorded_run, replayed, simulate_many
-from malta.simulation.digest import Batch, verdicts
+from malta.simulation.batch import recorded_run, replayed
 from malta.simulation.engines import EngineChoice
-from malta.simulation.experiments import Experiment, flown
-from malta.synthesis.controller import Controller
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from malta.model.plant import FloatArray
+from malta.simulation.experiments import Experiment, Progress, flown
 
 BLOCK = 1024  # runs in a block, a fraction of a second of work
+
+
 SLOW_BLOCK = 32  # without a C compiler
-
-Progress = Callable[[float], None]
-
-
-@dataclass(frozen=True, eq=False)
-class Campaign:
-    """What a campaign found: a row for each run that was flown. SI."""
-
-    plan: Plan
-    index: NDArray[np.int64]  # of each run
-    names: tuple[str, ...]  # of what was varied: parameters, then errors of the sensors
-    values: FloatArray  # runs x names, SI
-    batch: Batch
-    engines: tuple[str, ...]  # what flew them: "compiled" or "virtual machine"
-    interrupted: bool = False  # by Ctrl-C: the runs are those of the blocks that were done
-    damaged: tuple[Path, ...] = ()  # blocks that could not be read, and were flown again
-    folder: Path | None = None
-
-    @property
-    def completed(self) -> NDArray[np.bool_]:
-        """True where the run went to its end."""
-        return np.asarray(self.batch.completed == 1)
-
-    @property
-    def ends(self) -> dict[str, int]:
-        """How often runs ended in which way, by the names of simulate.Verdict."""
-        counts = np.bincount(self.batch.verdict.astype(int), minlength=len(verdicts(self.plan.plant)))
-        return {name: int(n) for name, n in zip(verdicts(self.plan.plant), counts, strict=True) if n}
-
-    @property
-    def rate(self) -> Rate:
-        """Share of the runs that were completed."""
-        return rate(int(self.completed.sum()), len(self.index))
-
-
-def fly(
-    plan: Plan, first: int, count: int, workers: int | None = None, progress: Progress | None = None
-) -> Block:
-    """Simulate runs `first` to `first + count` of a plan. `first` is a multiple of the lanes of the engine."""
-    machines = drawn(plan)
-    scenario, part = wanted_of(plan).scenario, slice(first, first + count)
-    batch = simulate_many(
-        plan.plant,
-        plan.controller,
-        scenario,
-        {name: column[part] for name, column in machines.changes.items()},
-        sensor_errors={name: column[part] for name, column in machines.sensor_errors.items()},
-        first=first,
-        workers=workers,
-        progress=progress,
-    )
-    compiled = is_compiled(plan.plant, plan.controller, scenario)
-    return Block(machines.values[part], batch, "compiled" if compiled else "virtual machine")
 
 
 def campaign(
@@ -187,21 +114,6 @@ def _noted() -> Iterator[list[int]]:
         signal.signal(signal.SIGINT, before)
 
 
-def _read(place: Path, plan: Plan, parts: Mapping[int, int], done: dict[int, Block]) -> list[Path]:
-    """Put the blocks of a folder into `done`; the files of those that are damaged."""
-    damaged = []
-    for first, count in parts.items():
-        path = place / block_name(first)
-        if not path.exists():
-            continue
-        found = read_block(path, plan, first, count)
-        if found is None:
-            damaged.append(path)
-        else:
-            done[first] = found
-    return damaged
-
-
 def _flown_blocks(
     plan: Plan, left: Mapping[int, int], workers: int | None, cluster: str | None, told: Progress
 ) -> Iterator[tuple[int, Block]]:
@@ -217,73 +129,6 @@ def _flown_blocks(
 
 def _told(told: Progress, count: int, share: float) -> None:
     told(share * count)
-
-
-def _gathered(
-    plan: Plan,
-    done: Mapping[int, Block],
-    parts: Mapping[int, int],
-    place: Path | None,
-    damaged: tuple[Path, ...],
-    interrupted: bool,
-) -> Campaign:
-    order = sorted(done)
-    blocks = [done[first] for first in order]
-    index = np.concatenate([np.empty(0, np.int64), *(np.arange(k, k + parts[k]) for k in order)])
-    index.flags.writeable = False
-    names = drawn(plan).names
-    return Campaign(
-        plan,
-        index,
-        names,
-        readonly(np.concatenate([b.values for b in blocks]) if blocks else np.empty((0, len(names)))),
-        _joined(plan, [b.batch for b in blocks]),
-        tuple(sorted({b.engine for b in blocks})),
-        interrupted,
-        damaged,
-        place,
-    )
-
-
-def _joined(plan: Plan, batches: list[Batch]) -> Batch:
-    columns = {
-        name: [getattr(batch, name) for batch in batches] or [np.empty((0, *shape))]
-        for name, shape in shapes(plan).items()
-    }
-    return Batch(**{name: np.concatenate(column) for name, column in columns.items()})
-
-
-def read_plan(folder: str | Path, controller: Controller) -> Plan:
-    """The plan of the campaign in a folder. Raises InputError when it is not of this controller."""
-    path = Path(folder) / MANIFEST
-    content, _ = read_manifest(path)
-    own = fingerprint(controller)
-    try:
-        gains, scenario, machine = content["gains"], content["scenario"], content["machine"]
-        if gains["sha256"] != own:
-            found = f"a campaign of {gains['name']}, sha256 {short(gains['sha256'])}"
-            raise InputError(path, "gains", found, f"one of {controller.name}, sha256 {short(own)}")
-        values = {name: float(value) for name, value in machine["parameters"].items()}
-        plan = Plan(
-            controller,
-            scenario["name"],
-            content["spread"],
-            content["sensor_spread"],
-            content["samples"],
-            content["seed"],
-            content["sampler"],
-            replace(controller.parameters, **values, preset=machine["preset"]),
-            scenario["case"],
-            scenario["options"],
-        )
-    except InputError as error:
-        raise InputError(path, error.field, error.found, error.expected) from error
-    except (KeyError, TypeError, AttributeError, ValueError) as error:
-        raise InputError(
-            path, "", f"a damaged or foreign file ({error})", "the manifest of a campaign"
-        ) from error
-    require_same(path, content, plan.manifest)
-    return plan
 
 
 def replay(
