@@ -38,7 +38,7 @@ from malta.machines.planar import plant as planar
 from malta.machines.planar.experiments import CELLS, compiled
 from malta.machines.tubular import plant as tubular
 from malta.model.data import published_value
-from malta.simulation.engines import compiled_shape, engine_of
+from malta.simulation.engines import engine_of, library_of
 from malta.simulation.inputs import feedforward
 from malta.simulation.period import state_reference
 
@@ -104,7 +104,7 @@ def stroke(runs: int) -> list[Result]:
 
     def anew() -> object:
         engine_of.cache_clear()
-        compiled_shape.cache_clear()
+        library_of.cache_clear()
         return malta.simulate(plant, controller, scenario)
 
     def fidelity(name: Any) -> Callable[[], object]:

@@ -30,18 +30,18 @@ from malta.campaigns.plan import (
     SAMPLERS,
     Plan,
     box_of,
-    drawn,
-    wanted_of,
+    draw_machines,
+    planned_run,
 )
 from malta.campaigns.result import Campaign, rate
 from malta.campaigns.run import SLOW_BLOCK, campaign, replay
-from malta.campaigns.statistics import figures_of, kept, worst_of
+from malta.campaigns.statistics import figures_of, runs_within_bounds, worst_of
 from malta.campaigns.store import MANIFEST, block_name, read_plan
 from malta.machines.tubular.experiments import CASES, EXPERIMENTS
 from malta.report import figures
 from malta.simulation import compiled
 from malta.simulation.digest import Batch, verdicts
-from malta.simulation.engines import compiled_shape, engine_of
+from malta.simulation.engines import engine_of, library_of
 from malta.simulation.experiments import cases_of
 
 if TYPE_CHECKING:
@@ -109,19 +109,19 @@ def test_machines_lie_in_the_box(
 ) -> None:
     """Within it on every axis; the same plan draws the same, however its box is written down."""
     plan = Plan(controller, "hold", shares, {}, samples, seed, sampler)
-    found = drawn(plan)
+    found = draw_machines(plan)
     assert found.values.shape == (samples, len(shares))
     for name, share in shares.items():
         middle = getattr(controller.parameters, name)
         assert (np.abs(found.changes[name] / middle - 1) <= share + 1e-12).all()
     again = replace(plan, spread=dict(reversed(shares.items())))
     assert again.identity == plan.identity
-    assert np.array_equal(drawn(again).values, found.values)
+    assert np.array_equal(draw_machines(again).values, found.values)
 
 
 def test_a_latin_hypercube_has_one_machine_in_each_row_and_column(controller: Controller) -> None:
     plan = _plan(controller, 100)
-    found = drawn(plan)
+    found = draw_machines(plan)
     assert found.names == ("m", "K_A", "K_B", "K_D", "gain_x1", "offset_y2")
     middle = [getattr(controller.parameters, name) for name in found.names[:4]] + [0, 0]
     half = [0.2 * m for m in middle[:4]] + [0.02, 5e-6]
@@ -133,24 +133,26 @@ def test_a_latin_hypercube_has_one_machine_in_each_row_and_column(controller: Co
 def test_a_sobol_sequence_is_balanced_and_its_beginning_is_kept(controller: Controller) -> None:
     """64 points: as many in each quarter of each plane; 50 are the first 50 of 64."""
     plan = _plan(controller, 64, sampler="sobol")
-    high = drawn(plan).values > np.median(drawn(plan).values, axis=0)
+    high = draw_machines(plan).values > np.median(draw_machines(plan).values, axis=0)
     for i in range(high.shape[1]):
         for j in range(i):
             assert (high[:, i] & high[:, j]).sum() == 16
-    assert np.array_equal(drawn(_plan(controller, 50, sampler="sobol")).values, drawn(plan).values[:50])
-    assert drawn(_plan(controller, 1, sampler="sobol")).values.shape == (1, 6)
+    assert np.array_equal(
+        draw_machines(_plan(controller, 50, sampler="sobol")).values, draw_machines(plan).values[:50]
+    )
+    assert draw_machines(_plan(controller, 1, sampler="sobol")).values.shape == (1, 6)
 
 
 def test_seeds_and_samplers_draw_other_machines(controller: Controller) -> None:
     plans = [_plan(controller), _plan(controller, seed=1), _plan(controller, sampler="sobol")]
     assert len({plan.identity for plan in plans}) == 3
-    assert len({float(drawn(plan).values[0, 0]) for plan in plans}) == 3
+    assert len({float(draw_machines(plan).values[0, 0]) for plan in plans}) == 3
 
 
 @pytest.mark.parametrize("named", [("I_xx",), ("I_yy",), ("I_xx", "I_yy")])
 def test_twins_move_together(controller: Controller, named: tuple[str, ...]) -> None:
     plan = _plan(controller, 8, spread=dict.fromkeys(named, 0.1), sensor_spread={})
-    found = drawn(plan)
+    found = draw_machines(plan)
     assert len(found.names) == 1
     assert np.array_equal(found.changes["I_xx"], found.changes["I_yy"])
     assert np.ptp(found.changes["I_xx"]) > 1e-4
@@ -269,8 +271,8 @@ def test_cases_are_those_that_the_experiment_flies(designs: dict[str, Design], n
 def test_a_case_is_chosen_by_its_label(controller: Controller) -> None:
     first = Plan(controller, "tilt", BOX)
     other = Plan(controller, "tilt", BOX, case="feedforward attraction")
-    assert wanted_of(first).scenario.feedforward == "axial"
-    assert wanted_of(other).scenario.feedforward == "attraction"
+    assert planned_run(first).scenario.feedforward == "axial"
+    assert planned_run(other).scenario.feedforward == "attraction"
     assert (
         first.identity == Plan(controller, "tilt", BOX, case="feedforward axial").identity != other.identity
     )
@@ -314,7 +316,7 @@ def test_without_spread_and_noise_all_are_the_nominal_machine(designs: dict[str,
     plan = _plan(design.controller, 16, spread={"m": 0.0}, sensor_spread={}, options=SHORT | {"noise": 0.0})
     found = campaign(plan)
     assert (np.ptp(found.batch.deviation, axis=0) == 0).all()
-    alone = malta.simulate(design.plant, design.controller, wanted_of(plan).scenario)
+    alone = malta.simulate(design.plant, design.controller, planned_run(plan).scenario)
     wanted = np.abs(alone.p - alone.reference).max(axis=0)
     np.testing.assert_allclose(found.batch.deviation[7], wanted, rtol=0, atol=1e-15)
 
@@ -405,14 +407,14 @@ def test_figures_count_completed_runs_and_bounds_of_the_published_stroke(
     assert listed["rise, 10-90 %"].relation == "about"
     for figure in listed.values():
         assert np.isnan(figure.values[~found.completed]).all()
-    within = kept(found, published)
+    within = runs_within_bounds(found, published)
     assert within is not None
     for row in range(64):
         bounded = [f for f in listed.values() if f.relation == "at most" and math.isfinite(f.published)]
         assert within[row] == all(f.values[row] <= f.published for f in bounded)
-    assert kept(found) is None
+    assert runs_within_bounds(found) is None
     other = campaign(Plan(shaky, "stroke", {"m": 0.0}, samples=8, options={"distance": 2e-3}))
-    assert kept(other, published) is None
+    assert runs_within_bounds(other, published) is None
     worst = worst_of(found, 64)
     ended = [row for row in worst if not found.completed[row]]
     assert worst[: len(ended)] == ended
@@ -692,7 +694,7 @@ def test_arguments_that_are_none_are_refused(
 def no_compiler(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """As on a system without one."""
     monkeypatch.setattr(compiled, "compiler", lambda: None)
-    remembered = (compiled_shape, engine_of)
+    remembered = (library_of, engine_of)
     for memory in remembered:
         memory.cache_clear()
     yield

@@ -298,13 +298,13 @@ def test_ctrl_c_keeps_and_shows_what_is_done(tmp_path: Path) -> None:
 @pytest.mark.usefixtures("undrawn")
 def test_without_a_compiler_it_says_so(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from malta.simulation import compiled
-    from malta.simulation.engines import compiled_shape, engine_of
+    from malta.simulation.engines import engine_of, library_of
 
     monkeypatch.setattr(compiled, "compiler", lambda: None)
-    for memory in (compiled_shape, engine_of):
+    for memory in (library_of, engine_of):
         memory.cache_clear()
     code, _, err = run("campaign", GAINS, "--samples", "2", *QUICK, "--out", tmp_path)
-    for memory in (compiled_shape, engine_of):
+    for memory in (library_of, engine_of):
         memory.cache_clear()
     assert code == 0
     assert "no C compiler" in _sentence(err)

@@ -593,10 +593,10 @@ def test_the_number_of_substeps_comes_with_an_error(run: Run) -> None:
 
 def test_without_a_compiler_it_says_so(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     from malta.simulation import compiled
-    from malta.simulation.engines import compiled_shape, engine_of
+    from malta.simulation.engines import engine_of, library_of
 
     monkeypatch.setattr(compiled, "compiler", lambda: None)
-    for cached in (compiled_shape, engine_of):
+    for cached in (library_of, engine_of):
         cached.cache_clear()
     code, out, err = run("simulate", CALIBRATED)
     assert (code, "completed" in out) == (0, True)
@@ -604,14 +604,14 @@ def test_without_a_compiler_it_says_so(run: Run, monkeypatch: pytest.MonkeyPatch
     code, _, err = run("simulate", CALIBRATED, "--engine", "compiled")
     assert code == 2
     assert "engine: found no C compiler that works" in one_sentence(err)
-    for cached in (compiled_shape, engine_of):
+    for cached in (library_of, engine_of):
         cached.cache_clear()
 
 
 def test_ctrl_c_leaves_what_was_computed(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     module = sys.modules["malta.simulation.simulate"]
     looked = 0
-    judged = module._judged
+    judged = module.judge
 
     def interrupted(*arguments: Any) -> Any:
         nonlocal looked
@@ -621,7 +621,7 @@ def test_ctrl_c_leaves_what_was_computed(run: Run, tmp_path: Path, monkeypatch: 
         return judged(*arguments)
 
     monkeypatch.setattr(module, "PORTION", 1000)
-    monkeypatch.setattr(module, "_judged", interrupted)
+    monkeypatch.setattr(module, "judge", interrupted)
     code, out, err = run("simulate", CALIBRATED, "--scenario", "hold", "--out", tmp_path)
     assert code == 130
     assert "interrupted at 0.09" in one_sentence(err)

@@ -22,7 +22,7 @@ from malta.campaigns import dask as cluster
 from malta.campaigns.block import fly
 from malta.campaigns.dask import (
     _at_worker,
-    _finished,
+    _collect,
     _result,
     _task,
     blocks,
@@ -168,7 +168,7 @@ def test_what_a_worker_does_is_what_is_done_here(plan: Plan) -> None:
     for name in Batch.__dataclass_fields__:
         assert np.array_equal(getattr(block[1], name), getattr(here.batch, name), equal_nan=True)
     again = _task(replace(plan), malta_version())  # as it comes with the next block
-    assert cluster._first_copy(again) is cluster._first_copy(task)
+    assert cluster._unpickle_plan(again) is cluster._unpickle_plan(task)
 
 
 def malta_version() -> str:
@@ -223,10 +223,10 @@ def test_a_scheduler_without_workers_is_not_waited_for_forever(
 
     monkeypatch.setattr(cluster, "WAIT", 3.0)
     with pytest.raises(malta.InputError, match="found no workers, expected a scheduler with some"):
-        list(_finished(SimpleNamespace(wait=wait), _Idle(), NOBODY, plan, {0: 8}))
+        list(_collect(SimpleNamespace(wait=wait), _Idle(), NOBODY, plan, {0: 8}))
 
 
 def test_nothing_left_asks_nobody(plan: Plan, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cluster, "_connected", lambda *_: SimpleNamespace(close=lambda **_: None))
+    monkeypatch.setattr(cluster, "_connect", lambda *_: SimpleNamespace(close=lambda **_: None))
     pytest.importorskip("distributed")
     assert list(blocks(NOBODY, plan, {})) == []

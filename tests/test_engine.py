@@ -22,7 +22,7 @@ import malta
 from malta import references
 from malta.simulation import compiled, engines, translate
 from malta.simulation.compiled import LANES
-from malta.simulation.engines import compiled_shape, engine_of, shape_of
+from malta.simulation.engines import engine_of, library_of, shape_of
 from malta.simulation.layout import FIDELITIES, Fidelity
 from malta.simulation.period import Period
 from malta.simulation.scenario import Fault, Scenario, setup_of
@@ -118,7 +118,7 @@ def _digests(
 ) -> FloatArray:
     states = np.hstack([states, np.zeros((LANES, 1))])
     theta, start, digests = (
-        compiled.in_lanes(rows, 1)
+        compiled.arrange_in_lanes(rows, 1)
         for rows in (thetas, states, np.zeros((LANES, trial.parts.decide.size1_out(2))))
     )
     compiled.run_many(
@@ -661,7 +661,7 @@ def test_one_library_serves_designs_and_machines(designs: dict[str, Design]) -> 
         (heavy, calibrated.controller),
     ]
     shapes = [shape_of(plant, c, setup_of(plant, c, scenario)) for plant, c in pairs]
-    libraries = [compiled_shape(shape) for shape in shapes]
+    libraries = [library_of(shape) for shape in shapes]
     assert libraries[0] is not None
     assert all(library is libraries[0] for library in libraries)
     for plant, c in pairs:
@@ -677,7 +677,7 @@ def test_one_library_serves_designs_and_machines(designs: dict[str, Design]) -> 
 def fresh(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Path]:
     """A cache folder of its own, nothing remembered; and again nothing afterwards."""
 
-    memories = (compiled.compiler, compiled._processor, compiled_shape, engine_of)
+    memories = (compiled.compiler, compiled._processor, library_of, engine_of)
 
     def forget() -> None:
         for memory in memories:
@@ -823,7 +823,7 @@ def test_without_a_compiler_the_virtual_machine_runs(
 ) -> None:
     design = designs["calibrated"]
     with_one = malta.simulate(design.plant, design.controller, _hold(5e-3))
-    for cached in (compiled_shape, engine_of):
+    for cached in (library_of, engine_of):
         cached.cache_clear()
     monkeypatch.setattr(compiled, "compiler", lambda: None)
     run = malta.simulate(design.plant, design.controller, _hold(5e-3))

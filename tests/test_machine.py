@@ -18,7 +18,7 @@ from malta import references
 from malta.machines.tubular import plant as tubular
 from malta.machines.tubular import windings
 from malta.simulation.engines import engine_of
-from malta.simulation.inputs import beginning, sampled
+from malta.simulation.inputs import initial_values, inputs_of
 from malta.simulation.layout import FIDELITIES, Fidelity, layout_of
 from malta.simulation.period import initial_state
 from malta.simulation.references import Motion
@@ -81,8 +81,8 @@ def _under_way(run: malta.Trajectory, series: FloatArray) -> FloatArray:
 def _step_by_step(plant: Plant, c: Controller, scenario: Scenario) -> dict[str, FloatArray]:
     """The state of machine and controller before every sample."""
     setup = setup_of(plant, c, scenario)
-    t, _, given_ = sampled(plant, c, scenario, setup)
-    start = [ca.DM(a) for a in beginning(plant, c, scenario, given_[0])]
+    t, _, given_ = inputs_of(plant, c, scenario, setup)
+    start = [ca.DM(a) for a in initial_values(plant, c, scenario, given_[0])]
     state = np.array(ca.evalf(initial_state(plant, c, setup, *start))).ravel()
     engine = engine_of(plant, c, setup, steps_of(plant, c, scenario))
     states = []

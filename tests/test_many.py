@@ -18,7 +18,7 @@ from malta import references
 from malta.simulation import compiled
 from malta.simulation.batch import replayed, simulate_many
 from malta.simulation.digest import Batch, verdicts
-from malta.simulation.engines import compiled_shape, engine_of
+from malta.simulation.engines import engine_of, library_of
 from malta.simulation.layout import FIDELITIES, Fidelity
 from malta.simulation.noise import keys, normals
 from malta.simulation.scenario import Correction, Fault, Scenario
@@ -388,7 +388,7 @@ def test_a_batch_is_read_only(calibrated: Design) -> None:
 def no_compiler(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """As on a system without one."""
     monkeypatch.setattr(compiled, "compiler", lambda: None)
-    remembered = (compiled_shape, engine_of)
+    remembered = (library_of, engine_of)
     for memory in remembered:
         memory.cache_clear()
     yield

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, NamedTuple
 
-from malta.campaigns.plan import Plan, drawn, wanted_of
+from malta.campaigns.plan import Plan, draw_machines, planned_run
 from malta.simulation.batch import is_compiled, simulate_many
 from malta.simulation.digest import Batch
 from malta.simulation.experiments import Progress
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 class Block(NamedTuple):
     """Some runs of a plan, from one index on."""
 
-    values: FloatArray  # runs x names, SI: what was drawn for them
+    values: FloatArray  # runs x names, SI: the values of what varies
     batch: Batch
     engine: str  # what flew them: "compiled" or "virtual machine"
 
@@ -25,8 +25,8 @@ def fly(
     plan: Plan, first: int, count: int, workers: int | None = None, progress: Progress | None = None
 ) -> Block:
     """Simulate runs `first` to `first + count` of a plan. `first` is a multiple of the lanes of the engine."""
-    machines = drawn(plan)
-    scenario, part = wanted_of(plan).scenario, slice(first, first + count)
+    machines = draw_machines(plan)
+    scenario, part = planned_run(plan).scenario, slice(first, first + count)
     batch = simulate_many(
         plan.plant,
         plan.controller,

@@ -51,15 +51,15 @@ def blocks(address: str, plan: Plan, left: Mapping[int, int]) -> Iterator[tuple[
         expected = "it installed: pip install 'malta[cluster]'"
         raise InputError("--cluster", "", f"no dask.distributed here ({error})", expected) from error
     dask: Any = distributed
-    with _quiet():
-        client = _connected(dask, address)
+    with _silence_loggers():
+        client = _connect(dask, address)
         try:
-            yield from _finished(dask, client, address, plan, left)
+            yield from _collect(dask, client, address, plan, left)
         finally:
             client.close(timeout=2)
 
 
-def _finished(
+def _collect(
     dask: Any, client: Any, address: str, plan: Plan, left: Mapping[int, int]
 ) -> Iterator[tuple[int, Block]]:
     task = _task(plan, version("malta"))
@@ -91,7 +91,7 @@ AGAIN = "the same command once more: it goes on with what is left"
 
 
 @contextmanager
-def _quiet() -> Iterator[None]:
+def _silence_loggers() -> Iterator[None]:
     """Without the library's own messages: that a worker is lost is no news, other failures become one sentence."""
     loggers = [
         logging.getLogger(name) for name in logging.root.manager.loggerDict if name.startswith("distributed")
@@ -106,7 +106,7 @@ def _quiet() -> Iterator[None]:
             logger.disabled = disabled
 
 
-def _connected(dask: Any, address: str) -> Any:
+def _connect(dask: Any, address: str) -> Any:
     """A client of the scheduler. In a thread: what accepts the connection and says nothing would hold it forever."""
     found: list[Any] = []
 
@@ -121,7 +121,7 @@ def _connected(dask: Any, address: str) -> Any:
     thread.join(3 * ANSWER)
     if found and not isinstance(found[0], Exception):
         return found[0]
-    reason = _said(found[0]) if found else "something that does not answer as one"
+    reason = _describe(found[0]) if found else "something that does not answer as one"
     raise InputError("--cluster", address, reason, "a Dask scheduler, as tcp://host:8786")
 
 
@@ -135,7 +135,7 @@ def _workers(client: Any) -> int:
 def _result(address: str, future: Any) -> Block:
     if future.status != "finished":
         error = future.exception() if future.status == "error" else None
-        found = "the connection lost" if error is None else f"a worker that fails ({_said(error)})"
+        found = "the connection lost" if error is None else f"a worker that fails ({_describe(error)})"
         raise InputError("--cluster", address, found, AGAIN)
     found = future.result()
     if isinstance(found, tuple) and len(found) == 4 and all(isinstance(part, str) for part in found):
@@ -144,7 +144,7 @@ def _result(address: str, future: Any) -> Block:
     return block
 
 
-def _said(error: BaseException) -> str:
+def _describe(error: BaseException) -> str:
     return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
 
 
@@ -156,13 +156,13 @@ def _at_worker(task: _Task, first: int, count: int) -> Block | tuple[str, str, s
     if here != task.version:
         return "--cluster", "a worker", f"malta {here}", f"malta {task.version}"
     try:
-        return fly(_first_copy(task), first, count, workers=1)
+        return fly(_unpickle_plan(task), first, count, workers=1)
     except InputError as error:
         return error.where, error.field, error.found, error.expected
 
 
 @lru_cache(maxsize=4)
-def _first_copy(task: _Task) -> Plan:
+def _unpickle_plan(task: _Task) -> Plan:
     """The plan, read once: what is computed for its machines and its scenario is kept by its place in memory."""
     if task.sources:
         load_sources(task.machine, task.sources)

@@ -84,7 +84,7 @@ class Plan:
                 )
             if not (math.isfinite(value) and value >= 0):
                 raise InputError("campaign", f"sensor {name}", f"{value:g}", "a finite spread of 0 or more")
-        wanted_of(self)
+        planned_run(self)
 
     @property
     def plant(self) -> Plant:
@@ -99,7 +99,7 @@ class Plan:
     @property
     def identity(self) -> str:
         """sha256 of the manifest."""
-        return hashlib.sha256(_compact(self.manifest)).hexdigest()
+        return hashlib.sha256(_compact_json(self.manifest)).hexdigest()
 
 
 def box_of(gains: str | Path, published: Mapping[str, Any] | None = None) -> dict[str, float]:
@@ -168,27 +168,27 @@ def _manifest(plan: Plan) -> dict[str, Any]:
             "preset": plan.parameters.preset,
             "parameters": {name: getattr(plan.parameters, name) for name in units_of(plan.parameters)},
         },
-        "scenario": {"name": plan.scenario, "case": wanted_of(plan).label, "options": dict(plan.options)},
+        "scenario": {"name": plan.scenario, "case": planned_run(plan).label, "options": dict(plan.options)},
         "spread": dict(plan.spread),
         "sensor_spread": dict(plan.sensor_spread),
         "samples": plan.samples,
         "seed": plan.seed,
         "sampler": plan.sampler,
     }
-    content: dict[str, Any] = _whole(json.loads(_compact(tables)))
+    content: dict[str, Any] = _use_integers(json.loads(_compact_json(tables)))
     return content
 
 
-def _whole(value: Any) -> Any:
+def _use_integers(value: Any) -> Any:
     """Whole numbers as such: noise 1 and noise 1.0 are the same plan."""
     if isinstance(value, dict):
-        return {key: _whole(entry) for key, entry in value.items()}
+        return {key: _use_integers(entry) for key, entry in value.items()}
     if isinstance(value, list):
-        return [_whole(entry) for entry in value]
+        return [_use_integers(entry) for entry in value]
     return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
-def _compact(content: Mapping[str, Any]) -> bytes:
+def _compact_json(content: Mapping[str, Any]) -> bytes:
     return json.dumps(content, sort_keys=True, separators=(",", ":"), allow_nan=False, default=float).encode()
 
 
@@ -217,7 +217,7 @@ def fingerprint(record: Any) -> str:
 
 
 @lru_cache(maxsize=8)
-def wanted_of(plan: Plan) -> Wanted:
+def planned_run(plan: Plan) -> Wanted:
     """The scenario of a plan, with its seed, and what single runs of it are looked at for."""
     cases = cases_of(plan.scenario, plan.plant, plan.controller, **plan.options)
     able = {case.label: case for case in cases if case.scenario.estimator == "steady-state"}
@@ -233,7 +233,7 @@ def wanted_of(plan: Plan) -> Wanted:
     return able[label]._replace(scenario=scenario)
 
 
-class Drawn(NamedTuple):
+class Machines(NamedTuple):
     """The machines of a plan: a value for each run."""
 
     changes: Mapping[str, FloatArray]  # parameters
@@ -243,7 +243,7 @@ class Drawn(NamedTuple):
 
 
 @lru_cache(maxsize=8)
-def drawn(plan: Plan) -> Drawn:
+def draw_machines(plan: Plan) -> Machines:
     """Draw all machines of a plan. The same plan gives the same machines."""
     twins = {name: twin for name, twin in twins_of(plan.parameters).items() if name in plan.spread}
     own = {name: twin for name, twin in twins.items() if twin in plan.spread}
@@ -261,7 +261,7 @@ def drawn(plan: Plan) -> Drawn:
         if twin in changes and name not in changes:
             changes[name] = changes[twin]
     errors = dict(zip(plan.sensor_spread, values.T[len(parameters) :], strict=True))
-    return Drawn(changes, errors, names, readonly(values))
+    return Machines(changes, errors, names, readonly(values))
 
 
 def _unit_box(plan: Plan, dimensions: int) -> FloatArray:

@@ -12,8 +12,8 @@ import numpy as np
 from scipy.stats import binomtest
 
 from malta.campaigns.block import Block
-from malta.campaigns.plan import Plan, drawn
-from malta.campaigns.store import shapes
+from malta.campaigns.plan import Plan, draw_machines
+from malta.campaigns.store import figure_shapes
 from malta.model.plant import readonly
 from malta.simulation.digest import Batch, verdicts
 
@@ -54,7 +54,7 @@ class Campaign:
         return rate(int(self.completed.sum()), len(self.index))
 
 
-def _gathered(
+def gather(
     plan: Plan,
     done: Mapping[int, Block],
     parts: Mapping[int, int],
@@ -66,13 +66,13 @@ def _gathered(
     blocks = [done[first] for first in order]
     index = np.concatenate([np.empty(0, np.int64), *(np.arange(k, k + parts[k]) for k in order)])
     index.flags.writeable = False
-    names = drawn(plan).names
+    names = draw_machines(plan).names
     return Campaign(
         plan,
         index,
         names,
         readonly(np.concatenate([b.values for b in blocks]) if blocks else np.empty((0, len(names)))),
-        _joined(plan, [b.batch for b in blocks]),
+        _join(plan, [b.batch for b in blocks]),
         tuple(sorted({b.engine for b in blocks})),
         interrupted,
         damaged,
@@ -80,10 +80,10 @@ def _gathered(
     )
 
 
-def _joined(plan: Plan, batches: list[Batch]) -> Batch:
+def _join(plan: Plan, batches: list[Batch]) -> Batch:
     columns = {
         name: [getattr(batch, name) for batch in batches] or [np.empty((0, *shape))]
-        for name, shape in shapes(plan).items()
+        for name, shape in figure_shapes(plan).items()
     }
     return Batch(**{name: np.concatenate(column) for name, column in columns.items()})
 

@@ -1,4 +1,4 @@
-"""A campaign: one scenario on thousands of machines, flown block by block and kept in a folder.
+"""A campaign: one scenario on thousands of machines, simulated block by block and kept in a folder.
 
     Plan -> fly() block by block, here or on a cluster -> Campaign
 
@@ -18,15 +18,15 @@ from types import FrameType
 from typing import Any, get_args
 
 from malta.campaigns.block import Block, fly
-from malta.campaigns.plan import Plan, drawn, wanted_of
-from malta.campaigns.result import Campaign, _gathered
-from malta.campaigns.store import _read, block_name, encoded, opened
+from malta.campaigns.plan import Plan, draw_machines, planned_run
+from malta.campaigns.result import Campaign, gather
+from malta.campaigns.store import block_name, encode_block, open_folder, read_blocks
 from malta.errors import InputError
 from malta.files import replace_files
 from malta.simulation import compiled
-from malta.simulation.batch import recorded_run, replayed
+from malta.simulation.batch import record_run, replayed
 from malta.simulation.engines import EngineChoice
-from malta.simulation.experiments import Experiment, Progress, flown
+from malta.simulation.experiments import Experiment, Progress, single_run
 
 BLOCK = 1024  # runs in a block, a fraction of a second of work
 
@@ -63,15 +63,15 @@ def campaign(
         raise InputError("campaign", "block", f"{size} runs", f"a multiple of {compiled.LANES}")
     place = None if folder is None else Path(folder)
     if place is not None:
-        size = opened(place, plan, size)
+        size = open_folder(place, plan, size)
     parts = {first: min(size, plan.samples - first) for first in range(0, plan.samples, size)}
     done: dict[int, Block] = {}
     damaged: list[Path] = []
     interrupted = False
     try:
-        with _noted() as pressed:
+        with _watch_interrupts() as pressed:
             if place is not None:
-                damaged += _read(place, plan, parts, done)
+                damaged += read_blocks(place, plan, parts, done)
             left = {first: count for first, count in parts.items() if first not in done}
             runs = plan.samples - sum(left.values())
 
@@ -79,9 +79,9 @@ def campaign(
                 if progress is not None:
                     progress((runs + more) / plan.samples)
 
-            for first, new in _flown_blocks(plan, left, workers, cluster, told):
+            for first, new in _fly_blocks(plan, left, workers, cluster, told):
                 if place is not None:
-                    replace_files({place / block_name(first): encoded(new, plan)})
+                    replace_files({place / block_name(first): encode_block(new, plan)})
                 done[first] = new
                 runs += parts[first]
                 told(0)
@@ -90,12 +90,12 @@ def campaign(
     except KeyboardInterrupt:
         interrupted = True
         if place is not None:  # one may have been kept, and not yet counted
-            _read(place, plan, {k: n for k, n in parts.items() if k not in done}, done)
-    return _gathered(plan, done, parts, place, tuple(damaged), interrupted)
+            read_blocks(place, plan, {k: n for k, n in parts.items() if k not in done}, done)
+    return gather(plan, done, parts, place, tuple(damaged), interrupted)
 
 
 @contextmanager
-def _noted() -> Iterator[list[int]]:
+def _watch_interrupts() -> Iterator[list[int]]:
     """Ctrl-C, noted as it comes: libraries that are called while it comes now and then drop the exception."""
     before, pressed = signal.getsignal(signal.SIGINT), list[int]()
     if threading.current_thread() is not threading.main_thread() or not callable(before):
@@ -114,7 +114,7 @@ def _noted() -> Iterator[list[int]]:
         signal.signal(signal.SIGINT, before)
 
 
-def _flown_blocks(
+def _fly_blocks(
     plan: Plan, left: Mapping[int, int], workers: int | None, cluster: str | None, told: Progress
 ) -> Iterator[tuple[int, Block]]:
     """Blocks as they are done; `told` the runs of those that are not."""
@@ -124,10 +124,10 @@ def _flown_blocks(
         yield from blocks(cluster, plan, left)
         return
     for first, count in left.items():
-        yield first, fly(plan, first, count, workers, partial(_told, told, count))
+        yield first, fly(plan, first, count, workers, partial(_report_runs, told, count))
 
 
-def _told(told: Progress, count: int, share: float) -> None:
+def _report_runs(told: Progress, count: int, share: float) -> None:
     told(share * count)
 
 
@@ -142,19 +142,19 @@ def replay(
         raise InputError("campaign", "run", str(index), f"0 to {plan.samples - 1}")
     if engine not in get_args(EngineChoice):
         raise InputError("campaign", "engine", repr(engine), "one of " + ", ".join(get_args(EngineChoice)))
-    machines, wanted = drawn(plan), wanted_of(plan)
+    machines, wanted = draw_machines(plan), planned_run(plan)
     changes, errors = machines.changes, machines.sensor_errors
     plant, scenario = replayed(plan.plant, wanted.scenario, changes, index, sensor_errors=errors)
     wanted = wanted._replace(scenario=scenario)
     if engine == "virtual machine":
-        return flown(plan.scenario, plant, plan.controller, wanted, engine, progress)
-    run = recorded_run(
+        return single_run(plan.scenario, plant, plan.controller, wanted, engine, progress)
+    run = record_run(
         plan.plant,
         plan.controller,
-        wanted_of(plan).scenario,
+        planned_run(plan).scenario,
         changes,
         index,
         sensor_errors=errors,
         progress=progress,
     )
-    return flown(plan.scenario, plant, plan.controller, wanted, engine, progress, run)
+    return single_run(plan.scenario, plant, plan.controller, wanted, engine, progress, run)

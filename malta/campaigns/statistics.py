@@ -91,7 +91,9 @@ def bounds_of(plan: Plan) -> Mapping[str, str]:
     return found
 
 
-def kept(found: Campaign, published: Mapping[str, Any] | None = None) -> NDArray[np.bool_] | None:
+def runs_within_bounds(
+    found: Campaign, published: Mapping[str, Any] | None = None
+) -> NDArray[np.bool_] | None:
     """Which runs were completed within every published bound; None where the paper has none."""
     bounds = [
         f for f in figures_of(found, published) if f.relation == "at most" and math.isfinite(f.published)
@@ -119,7 +121,7 @@ def unit_of(plan: Plan, name: str) -> str:
     return shown.get(errors[name], errors[name]) if name in errors else units_of(plan.parameters)[name]
 
 
-def half_text(plan: Plan, name: str) -> str:
+def spread_text(plan: Plan, name: str) -> str:
     """How far a value varies, either way."""
     if name in plan.spread:
         return f"±{100 * plan.spread[name]:.4g} %"

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from malta.campaigns.block import Block
-from malta.campaigns.plan import SCHEMA, VERSION, Plan, drawn, fingerprint
+from malta.campaigns.plan import SCHEMA, VERSION, Plan, draw_machines, fingerprint
 from malta.errors import InputError
 from malta.files import read_file, replace_files
 from malta.simulation.compiled import LANES
@@ -35,7 +35,7 @@ def block_name(first: int) -> str:
     return f"runs_{first:08d}.npz"
 
 
-def opened(folder: Path, plan: Plan, block: int) -> int:
+def open_folder(folder: Path, plan: Plan, block: int) -> int:
     """The folder with the manifest of a plan in it, found or written; the runs in a block."""
     path = folder / MANIFEST
     try:
@@ -83,8 +83,8 @@ def read_plan(folder: str | Path, controller: Controller) -> Plan:
     try:
         gains, scenario, machine = content["gains"], content["scenario"], content["machine"]
         if gains["sha256"] != own:
-            found = f"a campaign of {gains['name']}, sha256 {short(gains['sha256'])}"
-            raise InputError(path, "gains", found, f"one of {controller.name}, sha256 {short(own)}")
+            found = f"a campaign of {gains['name']}, sha256 {shorten(gains['sha256'])}"
+            raise InputError(path, "gains", found, f"one of {controller.name}, sha256 {shorten(own)}")
         values = {name: float(value) for name, value in machine["parameters"].items()}
         plan = Plan(
             controller,
@@ -108,7 +108,7 @@ def read_plan(folder: str | Path, controller: Controller) -> Plan:
     return plan
 
 
-def _read(place: Path, plan: Plan, parts: Mapping[int, int], done: dict[int, Block]) -> list[Path]:
+def read_blocks(place: Path, plan: Plan, parts: Mapping[int, int], done: dict[int, Block]) -> list[Path]:
     """Put the blocks of a folder into `done`; the files of those that are damaged."""
     damaged = []
     for first, count in parts.items():
@@ -129,8 +129,8 @@ def require_same(path: Path, found: Mapping[str, Any], wanted: Mapping[str, Any]
         raise InputError(
             path,
             key,
-            f"{short(one)}: another campaign",
-            f"{short(other)}, or a folder of its own for this one",
+            f"{shorten(one)}: another campaign",
+            f"{shorten(other)}, or a folder of its own for this one",
         )
 
 
@@ -143,15 +143,15 @@ def _differences(found: Any, wanted: Any, key: str = "") -> Iterator[tuple[str, 
         yield key, (found, wanted)
 
 
-def short(value: Any) -> str:
+def shorten(value: Any) -> str:
     text = value if isinstance(value, str) else json.dumps(value)
     return text if len(text) <= 40 else text[:12] + "..."
 
 
-def encoded(block: Block, plan: Plan) -> bytes:
+def encode_block(block: Block, plan: Plan) -> bytes:
     buffer = io.BytesIO()
     arrays: dict[str, Any] = {name: getattr(block.batch, name) for name in Batch.__dataclass_fields__}
-    names = np.array(drawn(plan).names)
+    names = np.array(draw_machines(plan).names)
     np.savez(
         buffer,
         campaign=np.array(plan.identity),
@@ -176,14 +176,14 @@ def read_block(path: Path, plan: Plan, first: int, count: int) -> Block | None:
         return None
     if identity != plan.identity:
         raise InputError(path, "", "a block of another campaign", f"one of that in {MANIFEST}")
-    sizes = shapes(plan)
+    sizes = figure_shapes(plan)
     whole = all(columns[name].shape == (count, *sizes[name]) for name in columns)
-    if not whole or not np.array_equal(values, drawn(plan).values[first : first + count]):
+    if not whole or not np.array_equal(values, draw_machines(plan).values[first : first + count]):
         return None
     return Block(values, Batch(**columns), kind)
 
 
-def shapes(plan: Plan) -> dict[str, tuple[int, ...]]:
+def figure_shapes(plan: Plan) -> dict[str, tuple[int, ...]]:
     """Of one run's figures in a batch."""
     plant = plan.plant
     p, m = len(plant.outputs), len(plant.inputs)

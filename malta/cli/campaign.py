@@ -189,9 +189,9 @@ def _print_tables(
 ) -> None:
     """Print what was flown, the yield, the distributions and the worst runs; only the first without runs."""
     from malta import report
-    from malta.campaigns.plan import wanted_of
+    from malta.campaigns.plan import planned_run
 
-    plan, console, wanted = campaign.plan, make_console(), wanted_of(campaign.plan)
+    plan, console, wanted = campaign.plan, make_console(), planned_run(campaign.plan)
     case = "" if wanted.label == plan.scenario else f" ({wanted.label})"
     console.print(
         f"{gains}: {plan.scenario}{case}, fidelity {wanted.scenario.fidelity}, "

@@ -58,11 +58,11 @@ def _compute_ledgers(specs: Sequence[Spec], progress: Callable[[float], None] | 
     """Compute the ledger of each machine, in the order in which the designs name the machines."""
     from malta.model.data import published
     from malta.report.ledger import ledger
-    from malta.simulation.experiments import part
+    from malta.simulation.experiments import progress_of_part
 
     machines = dict.fromkeys(spec.plant.name for spec in specs)
     groups = [[spec for spec in specs if spec.plant.name == name] for name in machines]
     return [
-        ledger(group, published(group[0].machine_file), part(progress, n, len(groups)))
+        ledger(group, published(group[0].machine_file), progress_of_part(progress, n, len(groups)))
         for n, group in enumerate(groups)
     ]

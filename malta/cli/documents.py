@@ -101,9 +101,9 @@ def experiment_document(experiment: Experiment) -> dict[str, Any]:
 
 def campaign_document(campaign: Campaign, published: Mapping[str, Any] | None, worst: int) -> dict[str, Any]:
     """The yield of a campaign, the distribution of each merit, and its worst runs."""
-    from malta.campaigns.statistics import kept, worst_of
+    from malta.campaigns.statistics import runs_within_bounds, worst_of
 
-    within = kept(campaign, published)
+    within = runs_within_bounds(campaign, published)
     return {
         "manifest": campaign.plan.manifest,
         "runs": len(campaign.index),

@@ -31,7 +31,7 @@ from malta.simulation.experiments import (
     Experiment,
     Progress,
     experiment,
-    part,
+    progress_of_part,
 )
 from malta.synthesis.lqg import synthesize
 
@@ -103,7 +103,7 @@ def designed(spec: Spec, names: Sequence[str], progress: Progress | None = None)
     model = linearize(plant, plant.at(**spec.operating_point))
     controller = synthesize(spec, model)
     flown = {
-        name: experiment(name, plant, controller, progress=part(progress, n, len(names)))
+        name: experiment(name, plant, controller, progress=progress_of_part(progress, n, len(names)))
         for n, name in enumerate(names)
     }
     return Designed(model, controller, verify(model, controller, spec.uncertainty), flown)
@@ -139,7 +139,8 @@ def ledger(specs: Sequence[Spec], published: Mapping[str, Any], progress: Progre
             raise InputError(spec.path, "machine", spec.plant.name, f"{machine}, as of {specs[0].path}")
     paper = require_part("claims", machine)
     found: list[Found] = [
-        paper.evidence(spec, published, part(progress, n, len(specs))) for n, spec in enumerate(specs)
+        paper.evidence(spec, published, progress_of_part(progress, n, len(specs)))
+        for n, spec in enumerate(specs)
     ]
     claims = [_claim(row, found, published) for row in paper.rows()]
     return Ledger(machine, paper.SOURCE, tuple(e.spec.name for e in found), tuple(claims))

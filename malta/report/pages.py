@@ -464,11 +464,11 @@ def claims_table(ledger: Ledger) -> Table:
 
 def box_text(found: Campaign) -> str:
     """What was varied, and how far either way."""
-    from malta.campaigns.statistics import half_text
+    from malta.campaigns.statistics import spread_text
 
     spreads: dict[str, list[str]] = {}
     for name in (*found.plan.spread, *found.plan.sensor_spread):
-        spreads.setdefault(half_text(found.plan, name), []).append(name)
+        spreads.setdefault(spread_text(found.plan, name), []).append(name)
     return ", ".join(f"{' '.join(names)} {width}" for width, names in spreads.items())
 
 
@@ -484,9 +484,9 @@ def campaign_tables(found: Campaign, published: Published | None = None, worst: 
 
 def _ends_table(found: Campaign, published: Published | None) -> Table:
     from malta.campaigns.result import rate
-    from malta.campaigns.statistics import kept
+    from malta.campaigns.statistics import runs_within_bounds
 
-    within, runs = kept(found, published), len(found.index)
+    within, runs = runs_within_bounds(found, published), len(found.index)
     table = _table("How the runs end", "end", "runs", "share [%]", "95 % interval [%]")
     rows = {"completed": found.rate} | {
         name: rate(count, runs) for name, count in found.ends.items() if name != "completed"

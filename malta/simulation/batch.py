@@ -19,16 +19,23 @@ import numpy as np
 from malta.errors import InputError
 from malta.model.data import shaping, twins_of, units_of
 from malta.model.plant import Plant
-from malta.simulation.compiled import LANES, feedforward_table, in_lanes, run_many
-from malta.simulation.digest import Batch, _batch, _digest, _digest_sizes, _recorder, verdicts
-from malta.simulation.engines import BLOCK, compiled_shape, evaluate, shape_of
-from malta.simulation.inputs import beginning, sampled
+from malta.simulation.compiled import LANES, arrange_in_lanes, feedforward_table, run_many
+from malta.simulation.digest import (
+    Batch,
+    batch_of,
+    digest_function,
+    digest_sizes,
+    recorder_function,
+    verdicts,
+)
+from malta.simulation.engines import BLOCK, evaluate, library_of, shape_of
+from malta.simulation.inputs import initial_values, inputs_of
 from malta.simulation.layout import electronics_of, flatten, layout_of, numbers_of, with_symbols
 from malta.simulation.noise import GAMMA, keys
 from malta.simulation.period import initial_state
 from malta.simulation.scenario import Scenario, setup_of, steps_of
 from malta.simulation.simulate import simulate
-from malta.simulation.trajectory import Trajectory, recorded, stroke_figures
+from malta.simulation.trajectory import Trajectory, stroke_figures, trajectory_of
 from malta.synthesis.controller import Controller
 
 if TYPE_CHECKING:
@@ -62,7 +69,7 @@ def simulate_many(
     for name in ("faults", "changes", "correction"):
         if getattr(scenario, name):
             raise InputError(where, name, "some", "none in a campaign")
-    scenario = _sensed(scenario, sensor_errors)
+    scenario = _with_sensor_errors(scenario, sensor_errors)
     setup = setup_of(plant, controller, scenario)
     if setup.outside:
         raise InputError(where, "estimator", scenario.estimator, "steady-state in a campaign")
@@ -70,23 +77,25 @@ def simulate_many(
         raise InputError(where, "fidelity", "phase", f"force in a campaign of a {plant.name}")
     if workers is not None and workers < 1:
         raise InputError("campaign", "workers", str(workers), "at least 1")
-    runs = _count(plant, changes, sensor_errors or {})
+    runs = _count_runs(plant, changes, sensor_errors or {})
     for name in set(changes) & set(shaping(plant.parameters)):
         raise InputError("campaign", name, "another one for each run", "one for all: it shapes the functions")
     shape = shape_of(plant, controller, setup)
-    digest = _digest(shape)
-    compiled = compiled_shape(shape, LANES, digest)
+    digest = digest_function(shape)
+    compiled = library_of(shape, LANES, digest)
     if compiled is None:
-        return _one_by_one(plant, controller, scenario, changes, sensor_errors, first, runs, progress)
+        return _simulate_one_by_one(
+            plant, controller, scenario, changes, sensor_errors, first, runs, progress
+        )
     lib, _ = compiled
-    ready = _prepared(plant, controller, scenario, changes, sensor_errors or {}, first, runs)
+    ready = _prepare(plant, controller, scenario, changes, sensor_errors or {}, first, runs)
     axis = plant.leading_output
     start, end = ready.p_ref[0, axis], ready.p_ref[-1, axis]
     scale = 1 / (end - start) if end != start else 0
     known = {"alive": 1.0, "start": start, "scale": scale, "reached": -1.0, "touched": -1.0, "culprit": -1.0}
-    sizes = _digest_sizes(plant)
+    sizes = digest_sizes(plant)
     kept = np.repeat([known.get(name, 0.0) for name in sizes], [*sizes.values()])
-    lanes = ready.lanes | {"digests": in_lanes(np.tile(kept, (runs, 1)), ready.groups)}
+    lanes = ready.lanes | {"digests": arrange_in_lanes(np.tile(kept, (runs, 1)), ready.groups)}
     groups = ready.groups
     workers = workers or os.cpu_count() or 1
     step = max(1, min(16, groups // (4 * workers)))  # groups in one call, for the progress bar
@@ -112,7 +121,7 @@ def simulate_many(
             pool.shutdown(cancel_futures=True)
             raise
     ends = lanes["digests"].swapaxes(1, 2).reshape(groups * LANES, -1)[:runs]
-    return _batch(ends, len(ready.t), controller.sample_time, sizes)
+    return batch_of(ends, len(ready.t), controller.sample_time, sizes)
 
 
 class _Ready(NamedTuple):
@@ -127,7 +136,7 @@ class _Ready(NamedTuple):
     keys: NDArray[np.uint64]
 
 
-def _prepared(
+def _prepare(
     plant: Plant,
     controller: Controller,
     scenario: Scenario,
@@ -140,19 +149,19 @@ def _prepared(
     count = steps_of(plant, controller, scenario)
     values = numbers_of(plant, controller, count, scenario.sensor_errors)
     theta = _thetas(plant, values, changes, sensor_errors, runs)
-    t, motion, given = sampled(plant, controller, scenario, setup)
-    start = np.concatenate(beginning(plant, controller, scenario, given[0]))
-    states, noise = _mapped(_starts(shape_of(plant, controller, setup)), theta, start)
+    t, motion, given = inputs_of(plant, controller, scenario, setup)
+    start = np.concatenate(initial_values(plant, controller, scenario, given[0]))
+    states, noise = _map_rows(_start_function(shape_of(plant, controller, setup)), theta, start)
     ff = controller.feedforward
     groups = -(-runs // LANES)
     rows = {"theta": theta, "states": states, "sigma": scenario.noise * noise}
-    lanes = {name: in_lanes(array, groups) for name, array in rows.items()}
+    lanes = {name: arrange_in_lanes(array, groups) for name, array in rows.items()}
     streams = keys(scenario.seed, first + np.minimum(np.arange(groups * LANES), runs - 1))
     table = feedforward_table(ff.z_grid, ff.v0)
     return _Ready(t, motion.p, given, table, groups, lanes, streams.reshape(groups, LANES))
 
 
-def recorded_run(
+def record_run(
     plant: Plant,
     controller: Controller,
     scenario: Scenario,
@@ -165,7 +174,7 @@ def recorded_run(
     """One run of `simulate_many` with its time series, the same to the bit; None without a C compiler.
 
     `simulate` computes one machine by itself, whose last digits differ; sensors in steps, and machines that barely fall
-    or barely do not, make more of them. Here the run's whole group is flown again, with everything recorded.
+    or barely do not, make more of them. Here the run's whole group is flown again, with every sample recorded.
 
     changes, sensor_errors : those of all runs, of which `simulate_many` had blocks that begin with a multiple of LANES
     """
@@ -175,14 +184,14 @@ def recorded_run(
         for kind, columns in (("changes", changes), ("errors", sensor_errors or {}))
     }
     own_plant, own_scenario = replayed(plant, scenario, changes, index, sensor_errors=sensor_errors)
-    scenario = _sensed(scenario, sensor_errors)
+    scenario = _with_sensor_errors(scenario, sensor_errors)
     setup = setup_of(plant, controller, scenario)
     shape = shape_of(plant, controller, setup)
-    compiled = compiled_shape(shape, LANES, _recorder(shape))
+    compiled = library_of(shape, LANES, recorder_function(shape))
     if compiled is None:
         return None
-    runs = _count(plant, group["changes"], group["errors"])
-    ready = _prepared(plant, controller, scenario, group["changes"], group["errors"], begin, runs)
+    runs = _count_runs(plant, group["changes"], group["errors"])
+    ready = _prepare(plant, controller, scenario, group["changes"], group["errors"], begin, runs)
     width = sum(layout_of(plant, controller, setup).row.values())
     rows = np.empty((len(ready.t), width))
     stream = ready.keys.copy()
@@ -205,7 +214,7 @@ def recorded_run(
         if progress is not None and k % 1000 == 0:
             progress(k / len(rows))
     asked = (ready.t, ready.given)
-    return recorded(own_plant, controller, own_scenario, setup, asked, rows, "compiled")
+    return trajectory_of(own_plant, controller, own_scenario, setup, asked, rows, "compiled")
 
 
 def replayed(
@@ -230,10 +239,10 @@ def replayed(
 def is_compiled(plant: Plant, controller: Controller, scenario: Scenario) -> bool:
     """Whether `simulate_many` runs these compiled; without a C compiler they run one by one."""
     shape = shape_of(plant, controller, setup_of(plant, controller, scenario))
-    return compiled_shape(shape, LANES, _digest(shape)) is not None
+    return library_of(shape, LANES, digest_function(shape)) is not None
 
 
-def _sensed(scenario: Scenario, sensor_errors: Mapping[str, FloatArray] | None) -> Scenario:
+def _with_sensor_errors(scenario: Scenario, sensor_errors: Mapping[str, FloatArray] | None) -> Scenario:
     """With sensors that may err where runs have errors of their own; none of them is known to be finite yet."""
     if not sensor_errors:
         return scenario
@@ -242,7 +251,9 @@ def _sensed(scenario: Scenario, sensor_errors: Mapping[str, FloatArray] | None) 
     )
 
 
-def _count(plant: Plant, changes: Mapping[str, FloatArray], sensor_errors: Mapping[str, FloatArray]) -> int:
+def _count_runs(
+    plant: Plant, changes: Mapping[str, FloatArray], sensor_errors: Mapping[str, FloatArray]
+) -> int:
     known = units_of(plant.parameters)
     sizes = {}
     for name, values in [*changes.items(), *sensor_errors.items()]:
@@ -292,25 +303,25 @@ def _thetas(
 
 
 @lru_cache(maxsize=16)
-def _starts(shape: Any) -> ca.Function:
+def _start_function(shape: Any) -> ca.Function:
     """(theta, x, xi_pred, currents) -> the state in which a machine starts, and the noise of its sensors."""
     plant, c, setup = shape.plant, shape.controller, shape.setup
     symbolic, _, theta = with_symbols(plant, numbers_of(plant, c, 1))
     sizes = {"x": len(plant.states), "xi_pred": len(c.states), "current": len(plant.actuator.coils)}
-    beginning = [ca.SX.sym(name, size) for name, size in sizes.items()]
-    first = initial_state(symbolic, c, setup, *beginning)
+    arguments = [ca.SX.sym(name, size) for name, size in sizes.items()]
+    first = initial_state(symbolic, c, setup, *arguments)
     noise = ca.densify(ca.vertcat(*symbolic.noise))
-    return ca.Function("start", [theta, ca.vertcat(*beginning)], [first, noise])
+    return ca.Function("start", [theta, ca.vertcat(*arguments)], [first, noise])
 
 
-def _mapped(function: ca.Function, rows: FloatArray, same: FloatArray) -> list[FloatArray]:
+def _map_rows(function: ca.Function, rows: FloatArray, same: FloatArray) -> list[FloatArray]:
     """A function of a row and of what is the same for all, on all rows: each of its results."""
     parts = np.array_split(rows, -(-len(rows) // BLOCK))
     found = [evaluate(function.map(len(part)), part, np.tile(same, (len(part), 1))) for part in parts]
     return [np.vstack(column) for column in zip(*found, strict=True)]
 
 
-def _one_by_one(
+def _simulate_one_by_one(
     plant: Plant,
     controller: Controller,
     scenario: Scenario,

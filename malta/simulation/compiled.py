@@ -71,7 +71,7 @@ def library(text: str, lanes: int, folder: Path | None = None) -> ctypes.CDLL | 
             place.mkdir(parents=True, exist_ok=True, mode=0o700)
             if place.stat().st_uid != os.getuid():
                 continue  # code is loaded from here: nobody else's
-            if not _whole(path) and not _compiled(cc, text, lanes, path):
+            if not _is_intact(path) and not _compile(cc, text, lanes, path):
                 return None
             return ctypes.CDLL(str(path))
         except OSError:
@@ -79,7 +79,7 @@ def library(text: str, lanes: int, folder: Path | None = None) -> ctypes.CDLL | 
     return None
 
 
-def _whole(path: Path) -> bool:
+def _is_intact(path: Path) -> bool:
     """Whether a library ends with the hash of what stands before: loading half of one would end the process."""
     if not path.exists():
         return False
@@ -92,7 +92,7 @@ def cache_folder() -> Path:
     return platformdirs.user_cache_path("malta")
 
 
-def _compiled(cc: tuple[str, ...], text: str, lanes: int, path: Path) -> bool:
+def _compile(cc: tuple[str, ...], text: str, lanes: int, path: Path) -> bool:
     """Compile to `path`, whole or not at all."""
     with tempfile.TemporaryDirectory(dir=path.parent) as scratch:
         c, so = Path(scratch) / "engine.c", Path(scratch) / "engine.so"
@@ -101,13 +101,13 @@ def _compiled(cc: tuple[str, ...], text: str, lanes: int, path: Path) -> bool:
             command = [*cc, *FLAGS, *native, f"-DLANES={lanes}", str(c), "-o", str(so), "-lm"]
             if subprocess.run(command, capture_output=True, check=False).returncode == 0:
                 content = so.read_bytes()
-                so.write_bytes(content + hashlib.sha256(content).digest())  # see _whole
+                so.write_bytes(content + hashlib.sha256(content).digest())  # see _is_intact
                 so.replace(path)
                 return True
     return False
 
 
-def _address(array: Any) -> ctypes.c_void_p:
+def address_of(array: Any) -> ctypes.c_void_p:
     return ctypes.c_void_p(array.ctypes.data)
 
 
@@ -117,7 +117,7 @@ def feedforward_table(z_grid: FloatArray, v0: FloatArray) -> FloatArray:
     return np.ascontiguousarray(np.hstack([z_grid[:, None], v0, np.vstack([slope, slope[-1:]])]))
 
 
-def in_lanes(rows: FloatArray, groups: int) -> FloatArray:
+def arrange_in_lanes(rows: FloatArray, groups: int) -> FloatArray:
     """Rows of machines as groups x numbers x LANES; the last machine fills what is left of the last group."""
     filled = np.concatenate([rows, np.repeat(rows[-1:], groups * LANES - len(rows), axis=0)])
     return np.ascontiguousarray(filled.reshape(groups, LANES, -1).swapaxes(1, 2))
@@ -142,13 +142,13 @@ def run_many(
         ctypes.c_long(len(range(*chosen.indices(len(theta))))),
         ctypes.c_long(len(given)),
         ctypes.c_long(substeps),
-        _address(theta[chosen]),
+        address_of(theta[chosen]),
         ctypes.c_long(len(table)),
-        _address(table),
-        _address(states[chosen]),
-        _address(given),
+        address_of(table),
+        address_of(states[chosen]),
+        address_of(given),
         ctypes.c_long(uniform),
-        _address(sigma[chosen]),
-        _address(keys[chosen]),
-        _address(digests[chosen]),
+        address_of(sigma[chosen]),
+        address_of(keys[chosen]),
+        address_of(digests[chosen]),
     )

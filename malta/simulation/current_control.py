@@ -14,7 +14,7 @@ from malta.simulation.layout import Setup
 from malta.synthesis.controller import Controller
 
 
-def _current_control(
+def control_currents(
     plant: Plant,
     c: Controller,
     s: Setup,
@@ -49,24 +49,24 @@ def _current_control(
     row: dict[str, Any] = {"link": V, "i": i}
     if s.fidelity == "dq":
         command, limited = inverter.modulation(drive, u, V)
-        command = _held_if_missed(s, given, controller, command)
+        command = keep_if_missed(s, given, controller, command)
         row |= {"u": command * V, "force": drive.force(i)}
     else:
         u_phase = believed.drive.to_phases(estimate) @ u
         command, limits = inverter.duty_cycles(drive, u_phase, V, i_phase, real_pwm=s.real_pwm)
-        limited = ca.vertcat(*_axes_limited(drive, limits))
-        command = _held_if_missed(s, given, controller, command)
+        limited = ca.vertcat(*_limited_axes(drive, limits))
+        command = keep_if_missed(s, given, controller, command)
         T = drive.to_axes(machine["x"])  # where the machine is, whatever the controller takes it to be
         true, applied = T @ i_phase, T @ ((command - 0.5) * V)
         row |= {"u": applied, "force": drive.force(true), "i": true, "i_phase": i_phase, "duty": command}
     return command, {"u_integral": integral, "u_limited": limited}, row
 
 
-def _held_if_missed(s: Setup, given: Mapping[str, Any], controller: Mapping[str, Any], command: Any) -> Any:
+def keep_if_missed(s: Setup, given: Mapping[str, Any], controller: Mapping[str, Any], command: Any) -> Any:
     return ca.if_else(given["missed"], controller["command"], command) if s.faulty else command
 
 
-def _axes_limited(drive: Any, limits: Any) -> list[Any]:
+def _limited_axes(drive: Any, limits: Any) -> list[Any]:
     """An axis waits when any phase of its group is limited."""
     share = len(drive.phases) // len(drive.groups)
     flags: list[Any] = [0] * len(drive.axes)

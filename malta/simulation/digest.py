@@ -44,7 +44,7 @@ def verdicts(plant: Plant) -> tuple[str, ...]:
     return ("completed", "diverged", "not lifted", *plant.contacts)
 
 
-def _digest_sizes(plant: Plant) -> dict[str, int]:
+def digest_sizes(plant: Plant) -> dict[str, int]:
     p, m = len(plant.outputs), len(plant.inputs)
     return {
         "alive": 1,
@@ -69,16 +69,16 @@ def _digest_sizes(plant: Plant) -> dict[str, int]:
 
 
 @lru_cache(maxsize=16)
-def _digest(shape: Any) -> ca.Function:
+def digest_function(shape: Any) -> ca.Function:
     """(kept, row, given, theta) -> kept: what a run leaves behind, sample by sample, until something is touched."""
     plant, c, setup = shape.plant, shape.controller, shape.setup
     sizes = layout_of(plant, c, setup)
-    kept = {name: ca.SX.sym(name, size) for name, size in _digest_sizes(plant).items()}
+    kept = {name: ca.SX.sym(name, size) for name, size in digest_sizes(plant).items()}
     row = {name: ca.SX.sym(name, size) for name, size in sizes.row.items()}
     given = {name: ca.SX.sym(name, size) for name, size in sizes.given.items()}
     theta = ca.SX.sym("theta", len(flatten(numbers_of(plant, c, 1))))
     largest = ca.fmax(kept["contact"], row["contact"])
-    most, used = (_most(contact) for contact in (largest, row["contact"]))
+    most, used = (_largest_share(contact) for contact in (largest, row["contact"]))
     alive = kept["alive"]  # what follows adds nothing once it is 0
     error = ca.if_else(alive, row["p"] - given["p_ref"], 0)
     share = (row["p"][plant.leading_output] - kept["start"]) * kept["scale"]
@@ -100,14 +100,14 @@ def _digest(shape: Any) -> ca.Function:
         "contact": ca.if_else(alive, largest, kept["contact"]),
         "culprit": ca.if_else(
             ca.logic_and(ca.logic_and(alive, kept["culprit"] < 0), used >= 1),
-            _largest(row["contact"]) if plant.contacts else -1,
+            _index_of_largest(row["contact"]) if plant.contacts else -1,
             kept["culprit"],
         ),
     }
     if setup.bearing:
         touching = used >= 1
         ends = [row["contact"][i] for i, held in enumerate(plant.cushioned) if not held]
-        after["alive"] = ca.logic_and(alive, _most(ca.vertcat(*ends)) < 1)
+        after["alive"] = ca.logic_and(alive, _largest_share(ca.vertcat(*ends)) < 1)
         first = kept["samples"] == 0
         after["resting"] = ca.if_else(first, touching, kept["resting"])
         after["touching"] = ca.if_else(alive, touching, kept["touching"])
@@ -119,7 +119,7 @@ def _digest(shape: Any) -> ca.Function:
 
 
 @lru_cache(maxsize=16)
-def _recorder(shape: Any) -> ca.Function:
+def recorder_function(shape: Any) -> ca.Function:
     """A digest that keeps the last two rows as they are."""
     sizes = layout_of(shape.plant, shape.controller, shape.setup)
     width, given = sum(sizes.row.values()), sum(sizes.given.values())
@@ -129,7 +129,7 @@ def _recorder(shape: Any) -> ca.Function:
     return ca.Function("digest", arguments, [ca.vertcat(kept[width:], row)])
 
 
-def _batch(kept: FloatArray, samples: int, Ts: float, sizes: Mapping[str, int]) -> Batch:
+def batch_of(kept: FloatArray, samples: int, Ts: float, sizes: Mapping[str, int]) -> Batch:
     columns = dict(zip(sizes, np.split(kept, np.cumsum([*sizes.values()])[:-1], axis=1), strict=True))
     count = columns["samples"][:, 0]
     resting, touching, touched = (columns[name][:, 0] for name in ("resting", "touching", "touched"))
@@ -166,12 +166,12 @@ def _batch(kept: FloatArray, samples: int, Ts: float, sizes: Mapping[str, int]) 
     )
 
 
-def _most(contact: Any) -> Any:
+def _largest_share(contact: Any) -> Any:
     """The largest share of a clearance that is used up; 0 for a machine that has nothing to touch."""
     return ca.mmax(contact) if contact.numel() else ca.SX(0)
 
 
-def _largest(values: Any) -> Any:
+def _index_of_largest(values: Any) -> Any:
     """Index of the largest entry, the first of equals."""
     found, index = values[0], ca.SX(0)
     for k in range(1, values.numel()):

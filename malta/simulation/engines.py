@@ -15,7 +15,7 @@ import numpy as np
 from malta.errors import InputError
 from malta.model.data import plant_of, shaping, twins_of
 from malta.model.plant import Plant
-from malta.simulation.compiled import _address, feedforward_table, library
+from malta.simulation.compiled import address_of, feedforward_table, library
 from malta.simulation.layout import Setup, electronics_of, flatten, numbers_of
 from malta.simulation.period import Period, chain, period_of
 from malta.simulation.translate import source
@@ -50,7 +50,7 @@ def engine_of(
     """What runs the control periods of this machine: compiled where possible, else CasADi's virtual machine."""
     values = numbers_of(plant, c, substeps, dict(errors))
     if choice != "virtual machine":
-        found = compiled_shape(shape_of(plant, c, setup))
+        found = library_of(shape_of(plant, c, setup))
         if found is not None:
             lib, p = found
             ff = c.feedforward
@@ -68,7 +68,7 @@ def engine_of(
 
 
 @dataclass(frozen=True)
-class _Shape:
+class Shape:
     """A plant and controller, equal to another one where the same compiled text serves both."""
 
     key: tuple[Any, ...]
@@ -77,7 +77,7 @@ class _Shape:
     setup: Setup
 
 
-def shape_of(plant: Plant, c: Controller, setup: Setup) -> _Shape:
+def shape_of(plant: Plant, c: Controller, setup: Setup) -> Shape:
     """What the compiled functions of a plant and a controller depend on, beside numbers that they are given."""
     variant, par = plant.variant, plant.parameters
     kin = (variant.func, *sorted(variant.keywords.items())) if isinstance(variant, partial) else (variant,)
@@ -87,13 +87,11 @@ def shape_of(plant: Plant, c: Controller, setup: Setup) -> _Shape:
         for m in gains_of(c).values()
     )
     fixed = tuple(shaping(par).items())
-    return _Shape((type(par), kin, twins, fixed, patterns, c.tracks, c.parameters), plant, c, setup)
+    return Shape((type(par), kin, twins, fixed, patterns, c.tracks, c.parameters), plant, c, setup)
 
 
 @lru_cache(maxsize=32)
-def compiled_shape(
-    shape: _Shape, lanes: int = 1, digest: ca.Function | None = None
-) -> tuple[Any, Period] | None:
+def library_of(shape: Shape, lanes: int = 1, digest: ca.Function | None = None) -> tuple[Any, Period] | None:
     """The library for a shape; None where it cannot be compiled."""
     c = shape.controller
     if plant_of(c.parameters).tabulated:
@@ -123,14 +121,14 @@ def compiled_engine(run: Any, p: Period, theta: FloatArray, substeps: float, tab
             ctypes.c_long(first),
             ctypes.c_long(len(given)),
             ctypes.c_double(substeps),
-            _address(theta),
+            address_of(theta),
             ctypes.c_long(len(table)),
-            _address(table),
-            _address(after),
-            _address(given),
-            _address(noise),
-            _address(fast),
-            _address(rows),
+            address_of(table),
+            address_of(after),
+            address_of(given),
+            address_of(noise),
+            address_of(fast),
+            address_of(rows),
         )
         return after, rows
 

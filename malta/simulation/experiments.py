@@ -155,7 +155,7 @@ def fly_all(
     """The same, each with a machine and a controller of its own."""
     cases: list[Case] = []
     for n, (plant, controller, (label, scenario, merits)) in enumerate(flights):
-        share = part(progress, n, len(flights))
+        share = progress_of_part(progress, n, len(flights))
         try:
             run = simulate(plant, controller, scenario, engine=options.get("engine", "auto"), progress=share)
         except KeyboardInterrupt:
@@ -168,7 +168,7 @@ def fly_all(
     return tuple(cases), False
 
 
-def part(progress: Progress | None, n: int, total: int) -> Progress | None:
+def progress_of_part(progress: Progress | None, n: int, total: int) -> Progress | None:
     """Progress of the n-th of so many parts."""
     return None if progress is None else lambda share: progress((n + share) / total)
 
@@ -223,7 +223,7 @@ def cases_of(name: str, plant: Plant, controller: Controller, **options: Any) ->
     return cases[name](plant, controller, **options_of(name, plant) | options)
 
 
-def flown(
+def single_run(
     name: str,
     plant: Plant,
     controller: Controller,
@@ -232,7 +232,10 @@ def flown(
     progress: Progress | None = None,
     run: Trajectory | None = None,
 ) -> Experiment:
-    """One run of an experiment by itself, flown now or before; those whose figure compares runs have a plain one."""
+    """An experiment of one run alone, simulated here unless `run` has it already.
+
+    Where the experiment's own figure compares several runs, the result is named "run" and has a plain figure.
+    """
     if run is None:
         cases, cut = fly(plant, controller, [wanted], progress, {"engine": engine})
     else:

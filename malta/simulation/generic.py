@@ -60,7 +60,9 @@ def hold(
 
 def hold_cases(plant: Plant, controller: Controller, *, time: float, **options: Any) -> list[Wanted]:
     """The run of `hold`."""
-    scenario = scenario_of("hold", _duration(controller, time), references.hold, _built(plant, options))
+    scenario = scenario_of(
+        "hold", _duration(controller, time), references.hold, _with_fidelity(plant, options)
+    )
     return [Wanted("hold", scenario, _rest_merits)]
 
 
@@ -85,10 +87,12 @@ def step_cases(
 ) -> list[Wanted]:
     """The runs of `step`."""
     duration, wanted = _duration(controller, time), []
-    for k in _chosen(plant.outputs, output, "output"):
+    for k in _choose(plant.outputs, output, "output"):
         signal, distance = plant.outputs[k], size or default_step(plant, k)
         reference = partial(jump, output=k, size=distance, at=BEFORE * duration)
-        scenario = scenario_of("step", duration, reference, _exact(_built(plant, options)))
+        scenario = scenario_of(
+            "step", duration, reference, _with_exact_sensors(_with_fidelity(plant, options))
+        )
         wanted.append(Wanted(signal.name, scenario, partial(_step_merits, output=k, size=distance)))
     return wanted
 
@@ -117,9 +121,9 @@ def disturbance_cases(
     if not plant.disturbances:
         raise InputError(plant.name, "disturbances", "none", "a machine on which forces act from outside")
     duration, wanted = _duration(controller, time), []
-    for k in _chosen(plant.disturbances, on, "on"):
+    for k in _choose(plant.disturbances, on, "on"):
         push = partial(step_wrench, column=k, size=size, at=BEFORE * duration, width=len(plant.disturbances))
-        given = _exact(_built(plant, options)) | {"disturbance": push}
+        given = _with_exact_sensors(_with_fidelity(plant, options)) | {"disturbance": push}
         scenario = scenario_of("disturbance", duration, references.hold, given)
         wanted.append(Wanted(plant.disturbances[k].name, scenario, _load_merits))
     return wanted
@@ -151,7 +155,7 @@ def default_step(plant: Plant, output: int) -> float:
     return probe
 
 
-def _chosen(signals: Sequence[Signal], name: str, option: str) -> list[int]:
+def _choose(signals: Sequence[Signal], name: str, option: str) -> list[int]:
     names = [s.name for s in signals]
     if name == "all":
         return list(range(len(names)))
@@ -164,12 +168,12 @@ def _duration(controller: Controller, time: float) -> float:
     return time or SAMPLES * controller.sample_time
 
 
-def _built(plant: Plant, options: Mapping[str, Any]) -> dict[str, Any]:
+def _with_fidelity(plant: Plant, options: Mapping[str, Any]) -> dict[str, Any]:
     """The options with the fidelity of the machine: currents that follow their commands, where it has no windings."""
     return {"fidelity": "dq" if "dq" in fidelities(plant) else "force"} | dict(options)
 
 
-def _exact(options: Mapping[str, Any]) -> dict[str, Any]:
+def _with_exact_sensors(options: Mapping[str, Any]) -> dict[str, Any]:
     return {"noise": 0.0, "quantize": False} | dict(options)
 
 

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 LONGEST = 4_000_000  # samples: 200 s at 20 kHz, 2 GB of trajectory
 
 
-def sampled(
+def inputs_of(
     plant: Plant, c: Controller, scenario: Scenario, setup: Setup
 ) -> tuple[FloatArray, references.Motion, FloatArray]:
     """Times of the samples, the motion that is asked for, and what every sample is given."""
@@ -37,10 +37,10 @@ def sampled(
         raise InputError(f"scenario {scenario.name}", "duration", f"{samples} samples", f"at most {LONGEST}")
     t = np.arange(samples) * c.sample_time
     motion = scenario.reference(plant)(t)
-    return t, motion, _given(plant, c, scenario, setup, motion, t)
+    return t, motion, sample_inputs(plant, c, scenario, setup, motion, t)
 
 
-def _given(
+def sample_inputs(
     plant: Plant,
     c: Controller,
     scenario: Scenario,
@@ -99,11 +99,11 @@ def _wrench(plant: Plant, scenario: Scenario, t: FloatArray) -> FloatArray:
     return wrench
 
 
-def _during(fault: Fault, t: FloatArray) -> FloatArray:
+def _active_samples(fault: Fault, t: FloatArray) -> FloatArray:
     return np.asarray((t >= fault.at) & (t < fault.until))
 
 
-def _index(scenario: Scenario, kind: str, name: str, known: tuple[Any, ...]) -> int:
+def _signal_index(scenario: Scenario, kind: str, name: str, known: tuple[Any, ...]) -> int:
     names = [signal.name for signal in known]
     if name not in names:
         raise InputError(f"scenario {scenario.name}", kind, repr(name), "one of " + " ".join(names))
@@ -117,11 +117,11 @@ def _fault_flags(
         name: np.zeros((len(t), sizes[name])) for name in ("stuck", "missed", "sag", "open")
     }
     for fault in scenario.faults:
-        during = _during(fault, t)
+        during = _active_samples(fault, t)
         if fault.kind == "lost sample":
             flags["stuck"][during] = 1
         elif fault.kind == "stuck sensor":
-            flags["stuck"][during, _index(scenario, fault.kind, fault.what, plant.outputs)] = 1
+            flags["stuck"][during, _signal_index(scenario, fault.kind, fault.what, plant.outputs)] = 1
         elif fault.kind == "missed step":
             flags["missed"][during] = 1
         elif fault.kind == "link sag":
@@ -131,11 +131,11 @@ def _fault_flags(
                 )
             flags["sag"][during] = fault.size
         elif fault.kind == "open phase":
-            flags["open"][during, _index(scenario, fault.kind, fault.what, plant.drive.phases)] = 1
+            flags["open"][during, _signal_index(scenario, fault.kind, fault.what, plant.drive.phases)] = 1
     return flags
 
 
-def _noise(stages: list[tuple[int, Plant]], scenario: Scenario, t: FloatArray) -> FloatArray:
+def sensor_noise(stages: list[tuple[int, Plant]], scenario: Scenario, t: FloatArray) -> FloatArray:
     """Sensor noise, with what faults add to it."""
     plant = stages[0][1]
     drawn: FloatArray = np.zeros((len(t), len(plant.outputs)))
@@ -148,8 +148,8 @@ def _noise(stages: list[tuple[int, Plant]], scenario: Scenario, t: FloatArray) -
             drawn[first:last] *= scenario.noise * np.array(now.noise)
     for fault in scenario.faults:
         if fault.kind in ("biased sensor", "noisy sensor"):
-            column = _index(scenario, fault.kind, fault.what, plant.outputs)
-            during = _during(fault, t)
+            column = _signal_index(scenario, fault.kind, fault.what, plant.outputs)
+            during = _active_samples(fault, t)
             if fault.kind == "noisy sensor":
                 drawn[during, column] *= fault.size
             else:
@@ -157,7 +157,7 @@ def _noise(stages: list[tuple[int, Plant]], scenario: Scenario, t: FloatArray) -
     return drawn
 
 
-def _fast_noise(plant: Plant, setup: Setup, scenario: Scenario, periods: int) -> FloatArray:
+def electronics_noise(plant: Plant, setup: Setup, scenario: Scenario, periods: int) -> FloatArray:
     """Standard normal numbers for the electronics, a row for each of their periods."""
     fast = electronics_of(plant, setup)
     if fast is None or not fast.noises:
@@ -165,7 +165,9 @@ def _fast_noise(plant: Plant, setup: Setup, scenario: Scenario, periods: int) ->
     return normals(keys(scenario.seed, np.array([-1 - scenario.run]))[0], periods, fast.noises)
 
 
-def beginning(plant: Plant, c: Controller, scenario: Scenario, first: FloatArray) -> tuple[FloatArray, ...]:
+def initial_values(
+    plant: Plant, c: Controller, scenario: Scenario, first: FloatArray
+) -> tuple[FloatArray, ...]:
     """x, xi_pred and the currents of the coils (A) at the start.
 
     On the reference and moving with it, or as the scenario says; the observer knows it, and v0 acts, unless it is cold.
@@ -185,12 +187,12 @@ def beginning(plant: Plant, c: Controller, scenario: Scenario, first: FloatArray
             pull = c.Ad[n + m * (c.delay - 1) : n + m * c.delay, :n] @ (xi_pred[:n] - moving)
             stored = first[2 * p + m :][: m * c.delay]
             xi_pred[n : n + m * c.delay] = stored + np.tile(pull, c.delay)
-        current[:] = evaluate(_commutated(plant, believed), x, held)[0].ravel()
+        current[:] = evaluate(_holding_currents(plant, believed), x, held)[0].ravel()
     return x, xi_pred, current
 
 
 @lru_cache(maxsize=16)
-def _commutated(plant: Plant, believed: Plant) -> ca.Function:
+def _holding_currents(plant: Plant, believed: Plant) -> ca.Function:
     """(x, v) -> currents of the coils that the controller holds a machine at x with, as a function of numbers."""
     kind = ca.MX if believed.tabulated else ca.SX
     x, v = kind.sym("x", len(plant.states)), kind.sym("v", len(plant.inputs))

@@ -63,7 +63,7 @@ _FORMS = (
 
 
 # Truths are masks; they become 1 and 0 where they are calculated with.
-_MASKS = {f"OP_{name}": f"MASK({{0}} {sign} {{1}})" for name, sign in _TRUTH.items()} | {
+MASKS = {f"OP_{name}": f"MASK({{0}} {sign} {{1}})" for name, sign in _TRUTH.items()} | {
     "OP_NOT": "~{0}",
     "OP_AND": "{0} & {1}",
     "OP_OR": "{0} | {1}",
@@ -73,7 +73,7 @@ _MASKS = {f"OP_{name}": f"MASK({{0}} {sign} {{1}})" for name, sign in _TRUTH.ite
 _NAMES = {getattr(ca, name): name for name in dir(ca) if name.startswith("OP_")}
 
 
-class _Node(NamedTuple):
+class Node(NamedTuple):
     """A scalar of the straight line: what it does with earlier nodes, or what it reads."""
 
     op: str  # "" where `form` is read or written out in place
@@ -82,10 +82,10 @@ class _Node(NamedTuple):
     fixed: bool  # depends on theta and constants alone
 
 
-def _read(f: ca.Function, shared: Sequence[int]) -> tuple[list[_Node], list[tuple[int, int, int]]]:
+def read_instructions(f: ca.Function, shared: Sequence[int]) -> tuple[list[Node], list[tuple[int, int, int]]]:
     """The instructions of an SX function, and which node is which entry of which result."""
     theta = f.n_in() - 1
-    nodes = _Line()
+    nodes = _StraightLine()
     slot: dict[int, int] = {}  # of CasADi's work vector: the node it holds
     outputs: list[tuple[int, int, int]] = []
     for k in range(f.n_instructions()):
@@ -96,14 +96,14 @@ def _read(f: ca.Function, shared: Sequence[int]) -> tuple[list[_Node], list[tupl
         if op == ca.OP_INPUT:
             i, j = reads
             text = f"theta[{j}]" if i == theta else f"a{i}[{j}]"
-            node = _Node("" if i != theta else "INPUT", f"K({text})" if i in shared else text, (), i == theta)
+            node = Node("" if i != theta else "INPUT", f"K({text})" if i in shared else text, (), i == theta)
             slot[writes[0]] = nodes.place(node)
         elif op == ca.OP_CONST:
             text = f"K({_number(f.instruction_constant(k))})"
-            slot[writes[0]] = nodes.place(_Node("", text, (), True))
+            slot[writes[0]] = nodes.place(Node("", text, (), True))
         else:
             name = _NAMES[op]
-            if name not in _FORMS and name not in _MASKS:
+            if name not in _FORMS and name not in MASKS:
                 raise CheckError(f"the compiled engine has no {name}")
             slot[writes[0]] = nodes.add(name, *(slot[r] for r in reads))
     return nodes.nodes, outputs
@@ -114,14 +114,14 @@ def _number(value: float) -> str:
     return repr(value).replace("inf", "INFINITY").replace("nan", "NAN")
 
 
-class _Line:
+class _StraightLine:
     """Nodes, each of them once."""
 
     def __init__(self) -> None:
-        self.nodes: list[_Node] = []
-        self._known: dict[_Node, int] = {}
+        self.nodes: list[Node] = []
+        self._known: dict[Node, int] = {}
 
-    def place(self, node: _Node) -> int:
+    def place(self, node: Node) -> int:
         """Where this very node stands, now or already."""
         if node not in self._known:
             self._known[node] = len(self.nodes)
@@ -132,15 +132,15 @@ class _Line:
         """Where the result of an operation stands, in the form that costs least."""
         made = getattr(self, f"_{name.removeprefix('OP_').lower()}", None)
         found: int | None = made(*arguments) if made is not None else None
-        return self._plain(name, *arguments) if found is None else found
+        return self._append(name, *arguments) if found is None else found
 
-    def _plain(self, name: str, *arguments: int) -> int:
+    def _append(self, name: str, *arguments: int) -> int:
         if name in ("OP_ADD", "OP_MUL"):
             arguments = tuple(sorted(arguments))
         fixed = all(self.nodes[a].fixed for a in arguments)
-        return self.place(_Node(name, _MASKS.get(name) or _FORMS[name], arguments, fixed))
+        return self.place(Node(name, MASKS.get(name) or _FORMS[name], arguments, fixed))
 
-    def _scaled(self, k: int) -> tuple[int, int] | None:
+    def _fixed_factor(self, k: int) -> tuple[int, int] | None:
         """The fixed factor and the moving one of a product."""
         node = self.nodes[k]
         if node.op != "OP_MUL" or node.fixed:
@@ -153,9 +153,9 @@ class _Line:
     def _mul(self, one: int, other: int) -> int | None:
         """Fixed factors are multiplied with each other, once a run."""
         for factor, product in ((one, other), (other, one)):
-            parts = self._scaled(product)
+            parts = self._fixed_factor(product)
             if self.nodes[factor].fixed and parts is not None:
-                return self._plain("OP_MUL", self._plain("OP_MUL", factor, parts[0]), parts[1])
+                return self._append("OP_MUL", self._append("OP_MUL", factor, parts[0]), parts[1])
         return None
 
     def _div(self, one: int, other: int) -> int | None:
@@ -165,8 +165,8 @@ class _Line:
     def _inv(self, k: int) -> int | None:
         node = self.nodes[k]
         if node.fixed:
-            return self.place(_Node("OP_INV", "1.0 / {0}", (k,), True))
-        return self._plain("TILT_SECANT", *node.arguments) if node.op == "TILT_COSINE" else None
+            return self.place(Node("OP_INV", "1.0 / {0}", (k,), True))
+        return self._append("TILT_SECANT", *node.arguments) if node.op == "TILT_COSINE" else None
 
     def _add(self, one: int, other: int) -> int | None:
         """if_else(c, x, y) comes as (c ? x : 0) + (not c ? y : 0)."""
@@ -174,15 +174,15 @@ class _Line:
         if first.op == second.op == "OP_IF_ELSE_ZERO":
             condition = self.nodes[second.arguments[0]]
             if condition.op == "OP_NOT" and condition.arguments == first.arguments[:1]:
-                return self._plain("PICK", *first.arguments, second.arguments[1])
-        return self._together("OP_ADD", one, other)
+                return self._append("PICK", *first.arguments, second.arguments[1])
+        return self._take_out_factor("OP_ADD", one, other)
 
     def _sub(self, one: int, other: int) -> int | None:
-        return self._together("OP_SUB", one, other)
+        return self._take_out_factor("OP_SUB", one, other)
 
-    def _together(self, name: str, one: int, other: int) -> int | None:
+    def _take_out_factor(self, name: str, one: int, other: int) -> int | None:
         """The sum of two products that share their fixed factor."""
-        first, second = self._scaled(one), self._scaled(other)
+        first, second = self._fixed_factor(one), self._fixed_factor(other)
         if first is None or second is None or first[0] != second[0]:
             return None
         return self.add("OP_MUL", first[0], self.add(name, first[1], second[1]))
@@ -195,23 +195,23 @@ class _Line:
 
     def _tilt(self, name: str, k: int) -> int | None:
         """The angle is taken for a tilt, radians of a mover in its air gap, where it is a state and what is added."""
-        return self._plain(name, k, self._plain("TILT", k)) if self._state(k) else None
+        return self._append(name, k, self._append("TILT", k)) if self._is_tilt(k) else None
 
-    def _state(self, k: int) -> bool:
+    def _is_tilt(self, k: int) -> bool:
         node = self.nodes[k]
         if node.op in ("OP_ADD", "OP_SUB"):
-            return any(self._state(a) for a in node.arguments)
+            return any(self._is_tilt(a) for a in node.arguments)
         return node.form.startswith("a0[")
 
 
-def _mask_arguments(node: _Node) -> range:
+def mask_arguments(node: Node) -> range:
     """Which arguments a node takes as masks."""
     if node.op in ("OP_IF_ELSE_ZERO", "PICK"):
         return range(1)
     return range(2) if node.op in ("OP_NOT", "OP_AND", "OP_OR") else range(0)
 
 
-def _reached(nodes: list[_Node], roots: list[int]) -> list[int]:
+def needed_nodes(nodes: list[Node], roots: list[int]) -> list[int]:
     """The nodes that the roots need, in order."""
     needed, waiting = set(), list(roots)
     while waiting:

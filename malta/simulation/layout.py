@@ -60,7 +60,7 @@ def layout_of(plant: Plant, c: Controller, s: Setup) -> Layout:
     """What stands where."""
     n, m, p = len(c.states), len(c.forces), len(c.measurements)
     coils, fast = len(plant.actuator.coils), electronics_of(plant, s)
-    axes, phases = _windings(plant)
+    axes, phases = _winding_counts(plant)
     driven = s.fidelity != "force" and fast is None
     electric_state: dict[str, int] = {"i_coil": coils}
     if fast is not None:
@@ -137,7 +137,7 @@ def fidelities(plant: Plant) -> tuple[Fidelity, ...]:
     return ("force",) if plant.electronics is None else ("force", "phase")
 
 
-def _windings(plant: Plant) -> tuple[int, int]:
+def _winding_counts(plant: Plant) -> tuple[int, int]:
     """Axes and phases of the drive."""
     drive = plant.windings
     return (0, 0) if drive is None else (len(drive.axes), len(drive.phases))
@@ -157,5 +157,5 @@ def command_size(plant: Plant, s: Setup) -> int:
     fast = electronics_of(plant, s)
     if fast is not None:
         return fast.held_size
-    axes, phases = _windings(plant)
+    axes, phases = _winding_counts(plant)
     return {"force": len(plant.actuator.coils), "dq": axes, "phase": phases}[s.fidelity]

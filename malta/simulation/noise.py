@@ -20,14 +20,14 @@ GAMMA = 0x9E3779B97F4A7C15
 
 def keys(seed: int, indices: NDArray[np.int64]) -> NDArray[np.uint64]:
     """The key of each run of a campaign: mixed from the campaign's seed and the run's index."""
-    stream = _mixed(np.array([(seed * GAMMA + 1) % 2**64], dtype=np.uint64))
-    return _mixed(stream + (indices.astype(np.uint64) + np.uint64(1)) * np.uint64(0xD1342543DE82EF95))
+    stream = _mix(np.array([(seed * GAMMA + 1) % 2**64], dtype=np.uint64))
+    return _mix(stream + (indices.astype(np.uint64) + np.uint64(1)) * np.uint64(0xD1342543DE82EF95))
 
 
 def normals(key: np.uint64, samples: int, channels: int) -> FloatArray:
     """Standard normal numbers, samples x channels. The first rows do not depend on how many follow."""
     pairs = (samples + 1) // 2 * channels
-    bits = _mixed(key + np.arange(pairs, dtype=np.uint64) * np.uint64(GAMMA))
+    bits = _mix(key + np.arange(pairs, dtype=np.uint64) * np.uint64(GAMMA))
     unit = 1 / 2**32
     radius = np.sqrt(-2 * np.log(((bits >> np.uint64(32)).astype(float) + 0.5) * unit))
     quadrant = ((bits >> np.uint64(30)) & np.uint64(3)).astype(float)
@@ -38,7 +38,7 @@ def normals(key: np.uint64, samples: int, channels: int) -> FloatArray:
     return drawn.reshape(-1, channels)[:samples]
 
 
-def _mixed(x: NDArray[np.uint64]) -> NDArray[np.uint64]:
+def _mix(x: NDArray[np.uint64]) -> NDArray[np.uint64]:
     x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
     return x ^ (x >> np.uint64(31))

@@ -31,7 +31,7 @@ import numpy as np
 
 from malta.model.data import plant_of
 from malta.model.plant import Plant
-from malta.simulation.current_control import _current_control, _held_if_missed
+from malta.simulation.current_control import control_currents, keep_if_missed
 from malta.simulation.layout import (
     Layout,
     Setup,
@@ -41,7 +41,7 @@ from malta.simulation.layout import (
     symbols_of,
     with_symbols,
 )
-from malta.simulation.substep import _moved
+from malta.simulation.substep import advance
 from malta.synthesis.controller import Controller, commanded, estimated, filtered
 
 
@@ -77,16 +77,16 @@ def period_of(
     jitter = ca.SX.sym("jitter", 0 if fast is None else fast.noises)
     x = machine["x"]
 
-    measured = _measured(plant, s, g, x, noise)
+    measured = _measurement(plant, s, g, x, noise)
     if s.faulty:
         measured = ca.if_else(given["stuck"], controller["y_last"], measured)
     first, last = g["grid_ends"][0], g["grid_ends"][1]
     at = ca.fmax(ca.fmin(measured[plant.stroke_output], last), first) if plant.has_stroke else first
     sense = ca.Function("sense", [state, around, noise, theta], ca.cse([ca.densify(measured), at]))
 
-    moved = ca.cse(ca.densify(_moved(plant, s, g, machine, given, held, jitter)))
+    moved = ca.cse(ca.densify(advance(plant, s, g, machine, given, held, jitter)))
     substep = ca.Function("substep", [ca.vertcat(*machine.values()), held, around, jitter, theta], [moved])
-    return Period(sense, _decide(plant, c, s, g, theta, sizes), substep, names)
+    return Period(sense, _decide_function(plant, c, s, g, theta, sizes), substep, names)
 
 
 def chain(p: Period, c: Controller, substeps: int, block: int) -> ca.Function:
@@ -144,7 +144,7 @@ def initial_state(plant: Plant, c: Controller, s: Setup, x: Any, xi_pred: Any, c
     return ca.densify(ca.vertcat(*(values.get(name, ca.SX.zeros(size)) for name, size in state.items())))
 
 
-def _decide(
+def _decide_function(
     plant: Plant, c: Controller, s: Setup, g: Mapping[str, Any], theta: Any, sizes: Layout
 ) -> ca.Function:
     """The function `decide` of Period: in CasADi's SX; in MX where the controller looks something up in a table."""
@@ -154,7 +154,7 @@ def _decide(
     machine, controller, given = (symbols_of(part, kind) for part in sizes[:3])
     y, v0 = kind.sym("y", len(plant.outputs)), kind.sym("v0", len(plant.inputs))
     x = machine["x"]
-    after, command, row = _decided(plant, c, s, g, machine, controller, given, y, v0)
+    after, command, row = _control_law(plant, c, s, g, machine, controller, given, y, v0)
     row = {"x": x, "p": plant.h(x, 0), "y": y, "contact": plant.contact(x)} | row
     decided = [
         ca.vertcat(*(after[name] for name in sizes.controller)),
@@ -176,7 +176,7 @@ def _decide(
     return ca.Function("decide", [*whole, y, v0, ca.MX.sym("theta", 0, 1)], decided)
 
 
-def _decided(
+def _control_law(
     plant: Plant,
     c: Controller,
     s: Setup,
@@ -206,18 +206,18 @@ def _decided(
     met = [ca.mmax(ca.fabs(current - wanted)) > 0]
     row: dict[str, Any] = {"xi_hat": xi_hat, "v": v, "saturated": frozen, "current": current}
     if fast is not None:
-        command = _held_if_missed(s, given, controller, fast.held(current, place))
+        command = keep_if_missed(s, given, controller, fast.held(current, place))
         electric_state = {name: machine[name] for name in fast.state}
         met.append(fast.met(electric_state))
         row |= {"i_phase": machine["i_coil"], "duty": fast.duty(electric_state)}
         row["force"] = plant.forces(machine["x"], machine["i_coil"])
     elif s.fidelity == "force":
-        command = _held_if_missed(s, given, controller, current)
+        command = keep_if_missed(s, given, controller, current)
         row["force"] = plant.forces(machine["x"], machine["i_coil"])
     else:
         # A law of errors knows no states: what is measured, moving as the reference does.
         known = xi_hat if c.tracks == "states" else state_reference(believed)(y, given["dp_ref"])
-        command, electrics, more = _current_control(
+        command, electrics, more = control_currents(
             plant, c, s, g, machine, controller, given, current, known
         )
         after |= electrics
@@ -265,7 +265,7 @@ def _scheduled_C(c: Controller, y: Any) -> Any:
     return ca.horzcat(at, ca.SX(at.shape[0], len(c.states) - at.shape[1]))
 
 
-def _measured(plant: Plant, s: Setup, g: Mapping[str, Any], x: Any, noise: Any) -> Any:
+def _measurement(plant: Plant, s: Setup, g: Mapping[str, Any], x: Any, noise: Any) -> Any:
     y = (plant.sense(x, g["errors"]) if s.sensed else plant.h(x, 0)) + noise
     if not s.quantize:
         return y

@@ -17,12 +17,12 @@ from malta.model.data import plant_of, shaping, units_of
 from malta.model.plant import Plant
 from malta.simulation import references
 from malta.simulation.engines import EngineChoice, engine_of, evaluate, substeps_until
-from malta.simulation.inputs import _fast_noise, _given, _noise, beginning, sampled
+from malta.simulation.inputs import electronics_noise, initial_values, inputs_of, sample_inputs, sensor_noise
 from malta.simulation.layout import Setup
 from malta.simulation.period import initial_state_function
 from malta.simulation.scenario import Scenario, setup_of, steps_of, substeps_of
-from malta.simulation.trajectory import Trajectory, _labelled
-from malta.simulation.verdict import Verdict, _columns, _judged
+from malta.simulation.trajectory import Trajectory, label_rows
+from malta.simulation.verdict import Verdict, columns_of, judge
 from malta.synthesis.controller import Controller
 
 if TYPE_CHECKING:
@@ -52,31 +52,31 @@ def simulate(
     if engine not in get_args(EngineChoice):
         raise InputError("simulate", "engine", repr(engine), "one of " + ", ".join(get_args(EngineChoice)))
     setup = setup_of(plant, controller, scenario)
-    t, motion, given = sampled(plant, controller, scenario, setup)
+    t, motion, given = inputs_of(plant, controller, scenario, setup)
     samples = len(t)
     stages = _stages(plant, scenario, controller.sample_time)
-    noise = _noise(stages, scenario, t)
+    noise = sensor_noise(stages, scenario, t)
     steps = substeps_of(plant, controller, setup, scenario)
-    fast = _fast_noise(plant, setup, scenario, substeps_until(samples, steps))
-    x, xi_pred, current = beginning(plant, controller, scenario, given[0])
+    fast = electronics_noise(plant, setup, scenario, substeps_until(samples, steps))
+    x, xi_pred, current = initial_values(plant, controller, scenario, given[0])
     start = initial_state_function(plant, controller, setup)
     state = evaluate(start, x, xi_pred, current)[0].ravel()
     observer = _observer(plant, controller, scenario, setup) if setup.outside else None
-    every = _every(scenario, controller.sample_time)
+    every = _samples_between_stops(scenario, controller.sample_time)
     stops = _stops(every, samples, [first for first, _ in stages])
     parts: list[FloatArray] = []
     verdict, kind, done = None, "", 0
     try:
         for stop in stops:
             now = next(p for first, p in reversed(stages) if first <= done)
-            run = engine_of(now, controller, setup, steps, _errors(scenario), engine)
+            run = engine_of(now, controller, setup, steps, _sensor_errors(scenario), engine)
             part = given[done:stop]
             jitter = fast[substeps_until(done, steps) : substeps_until(stop, steps)]
             if observer is None:
                 state, rows = run.run(done, state, part, noise[done:stop], jitter)
             else:
                 state, rows = observer(run, now, state, part, noise[done:stop])
-            rows, verdict = _judged(plant, controller, setup, rows, t[done:stop])
+            rows, verdict = judge(plant, controller, setup, rows, t[done:stop])
             parts.append(rows)
             kind, done = run.kind, done + len(rows)
             if verdict is not None:
@@ -86,7 +86,7 @@ def simulate(
             if scenario.correction is not None and done < samples and done % every == 0:
                 offset = np.asarray(
                     scenario.correction.update(
-                        float(t[done]), _columns(plant, controller, setup, rows[-1], "p")
+                        float(t[done]), columns_of(plant, controller, setup, rows[-1], "p")
                     ),
                     dtype=float,
                 )
@@ -101,14 +101,14 @@ def simulate(
                 p_ref = motion.p[ahead] + offset
                 p_ref[:before] = given[done - before : done, : len(offset)]  # as they were
                 shifted = references.Motion(*(part[ahead] for part in motion))._replace(p=p_ref)
-                new = _given(plant, controller, scenario, setup, shifted, t[ahead])
+                new = sample_inputs(plant, controller, scenario, setup, shifted, t[ahead])
                 given[done : done + every] = new[before:]
     except KeyboardInterrupt:
         if not parts:
             raise
         verdict = Verdict("interrupted", float(t[done - 1]))
     table = np.concatenate(parts) if len(parts) > 1 else parts[0]
-    return _labelled(plant, controller, scenario, setup, (t, given), table, verdict, kind)
+    return label_rows(plant, controller, scenario, setup, (t, given), table, verdict, kind)
 
 
 def integration_error(run: Trajectory) -> float:
@@ -123,7 +123,7 @@ def integration_error(run: Trajectory) -> float:
     return float(np.abs(run.p[:k] - finer.p[:k]).max()) * 16 / 15
 
 
-def _errors(scenario: Scenario) -> tuple[tuple[str, float], ...]:
+def _sensor_errors(scenario: Scenario) -> tuple[tuple[str, float], ...]:
     return tuple(sorted((scenario.sensor_errors or {}).items()))
 
 
@@ -155,7 +155,7 @@ def _stages(plant: Plant, scenario: Scenario, Ts: float) -> list[tuple[int, Plan
     return stages
 
 
-def _every(scenario: Scenario, Ts: float) -> int:
+def _samples_between_stops(scenario: Scenario, Ts: float) -> int:
     """Samples between corrections of the reference, or between looks at the run."""
     return PORTION if scenario.correction is None else max(1, round(scenario.correction.every / Ts))
 

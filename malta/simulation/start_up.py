@@ -47,8 +47,8 @@ def observer(plant: Plant, c: Controller, setup: Setup, kind: str, substeps: int
     if holds(believed):
         found = f"a {plant.name}, whose currents are held between samples"
         raise InputError("simulate", f"estimator {kind}", found, "steady-state, which knows of that")
-    filter_ = _filter(c, c.noise)
-    predict = _nonlinear(c) if kind == "extended" else _linear(c)
+    filter_ = _kalman_filter(c, c.noise)
+    predict = _nonlinear_prediction(c) if kind == "extended" else _linear_prediction(c)
     jacobian, output = _measurement(c)
 
     @cache
@@ -75,7 +75,7 @@ def observer(plant: Plant, c: Controller, setup: Setup, kind: str, substeps: int
         for k in range(len(given)):
             y = np.array(sense(state, given[k], noise[k], [])[0]).ravel()
             if not started:
-                _begin(filter_, c, y)
+                _start_filter(filter_, c, y)
                 started = True
             try:
                 filter_.update(y, jacobian, output)
@@ -99,7 +99,7 @@ def observer(plant: Plant, c: Controller, setup: Setup, kind: str, substeps: int
     return run
 
 
-def _filter(c: Controller, noise: Noise) -> Any:
+def _kalman_filter(c: Controller, noise: Noise) -> Any:
     n, p = len(c.A), len(c.measurements)
     kalman = ExtendedKalmanFilter(dim_x=n, dim_z=p, dim_u=len(c.forces))
     B = (c.Ad[:n, n : n + len(c.forces)] if c.delay else c.Bd)[:n]
@@ -109,7 +109,7 @@ def _filter(c: Controller, noise: Noise) -> Any:
     return kalman
 
 
-def _begin(kalman: Any, c: Controller, y: FloatArray) -> None:
+def _start_filter(kalman: Any, c: Controller, y: FloatArray) -> None:
     """One measurement: positions P^-1 y with its covariance, rates zero +- sqrt(2) of that a sample."""
     believed = plant_of(c.parameters)
     symbol = ca.SX.sym("y", len(y))
@@ -124,14 +124,14 @@ def _begin(kalman: Any, c: Controller, y: FloatArray) -> None:
     kalman.P[half:, half:] = 2 * np.diag(np.diag(spread)) / c.sample_time**2
 
 
-def _linear(c: Controller) -> Callable[..., tuple[FloatArray, FloatArray]]:
+def _linear_prediction(c: Controller) -> Callable[..., tuple[FloatArray, FloatArray]]:
     n, m = len(c.A), len(c.forces)
     A = c.Ad[:n, :n]
     B = c.Ad[:n, n : n + m] if c.delay else c.Bd
     return lambda x, v, _: (A @ x + B @ v, A)
 
 
-def _nonlinear(c: Controller) -> Callable[..., tuple[FloatArray, FloatArray]]:
+def _nonlinear_prediction(c: Controller) -> Callable[..., tuple[FloatArray, FloatArray]]:
     """A sample of the believed machine under v + v0, with its loads and bearings, and its Jacobian."""
     believed = plant_of(c.parameters)
     x, u = ca.SX.sym("x", len(believed.states)), ca.SX.sym("u", len(c.forces))

@@ -15,7 +15,7 @@ from malta.simulation.layout import Setup, electronics_of
 OPENING = 20e-6  # s, time constant with which the current of an opened phase dies
 
 
-def _moved(
+def advance(
     plant: Plant,
     s: Setup,
     g: Mapping[str, Any],
@@ -40,7 +40,7 @@ def _moved(
         x, i, own = fast.move(x, machine["i_coil"], own, held, plant.load(x) + outside, jitter)
         return ca.vertcat(x, i, *(own[name] for name in fast.state))
     if s.fidelity == "force":
-        currents = _lagging(plant.actuator.crossover, machine["i_coil"], held, h)
+        currents = _lagging_currents(plant.actuator.crossover, machine["i_coil"], held, h)
         half = len(plant.states) // 2 if plant.second_order else 0
         moved = runge_kutta(lambda x, n: motion(x, plant.forces(x, currents[n])), x, h, half)
         return ca.vertcat(moved, currents[2])
@@ -55,7 +55,7 @@ def _moved(
     return runge_kutta(rate, ca.vertcat(*machine.values()), h, n // 2 if plant.second_order else 0)
 
 
-def _lagging(crossover: Any, i: Any, held: Any, h: Any) -> list[Any]:
+def _lagging_currents(crossover: Any, i: Any, held: Any, h: Any) -> list[Any]:
     """Currents at the beginning, the middle and the end of a step, exactly: i = held + (i_0 - held) e^(-w_c t)."""
     if isinstance(crossover, float) and math.isinf(crossover):
         return [held] * 3

@@ -148,7 +148,7 @@ def fastest_stroke(
     s: FloatArray = np.linspace(0, 1, intervals + 1)
     guess = np.array([s**2 * (3 - 2 * s) - 0.5, 3 * s * (1 - s), 1 - 2 * s, 0 * s]) * scale[:, None]
     solve = partial(_optimum, rate, ends, scale, actuator.sample_time)
-    s, x, T = _on_refined_meshes(solve, s, math.copysign(1, distance) * guess, T)
+    s, x, T = _solve_on_refined_meshes(solve, s, math.copysign(1, distance) * guess, T)
     _check(rate, T * s, x, scale)
     a = np.array(rate(x))[1]
     a[[0, -1]] = 0.0  # at rest to the last digit
@@ -170,20 +170,20 @@ def sigmoid_at_peak_current(
     i_max, u_max = _limits(plant, distance, emf_constant, voltage_share, current_share)
     grid = np.linspace(-4, 4, 20_001)  # in rises: 2e-8 of the way is left outside
 
-    def needs(rise: float) -> tuple[FloatArray, FloatArray]:
+    def demand(rise: float) -> tuple[FloatArray, FloatArray]:
         s, ds, dds = references.logistic(grid * rise, rise)
         v = distance * ds
         return _current(plant, distance * (s - 0.5), v, distance * dds), v
 
     def excess(rise: float) -> float:
-        return float(np.abs(needs(rise)[0]).max()) - i_max
+        return float(np.abs(demand(rise)[0]).max()) - i_max
 
     # Without a load, |z''| peaks at d (2 ln 9 / rise)^2 / (6 sqrt 3). The load moves the rise between two bounds.
-    held, k = _held(plant, distance), plant.actuator.force_constant[plant.thrust_input]
+    held, k = _holding_current(plant, distance), plant.actuator.force_constant[plant.thrust_input]
     inertia = plant.mass * abs(distance) * (2 * math.log(9)) ** 2 / (6 * math.sqrt(3) * k)
     quickest, slowest = math.sqrt(inertia / (i_max + held)), math.sqrt(inertia / (i_max - held))
     rise = float(brentq(excess, 0.999 * quickest, 1.001 * slowest, xtol=1e-12))
-    i, v = needs(rise)
+    i, v = demand(rise)
     u = plant.actuator.L * np.gradient(i, grid * rise) + plant.actuator.R * i + emf_constant * v
     stroke = SigmoidStroke(rise, float(np.abs(i).max()), float(np.abs(u).max()))
     if not stroke.voltage <= u_max:
@@ -235,7 +235,7 @@ def _optimum(
     return scale[:, None] * np.array(opti.value(x)), T_guess * float(opti.value(T))
 
 
-def _on_refined_meshes(
+def _solve_on_refined_meshes(
     solve: Callable[[FloatArray, FloatArray, float], tuple[FloatArray, float]],
     s: FloatArray,
     x: FloatArray,
@@ -288,7 +288,7 @@ def _limits(
         if not 0 < share <= 1:
             raise InputError("stroke", name, str(share), "a share above 0, at most 1")
     i_max, u_max = current_share * plant.actuator.current_limit, voltage_share * plant.actuator.voltage_limit
-    held = _held(plant, distance)
+    held = _holding_current(plant, distance)
     if not (held < i_max and plant.actuator.R * held < u_max):
         expected = f"more than holds the load on the way: {held:.3g} A, {plant.actuator.R * held:.3g} V"
         raise InputError("stroke", "limits", f"{i_max:.3g} A, {u_max:.3g} V", expected)
@@ -319,7 +319,7 @@ def _current(plant: Plant, z: FloatArray, v: FloatArray, a: FloatArray) -> Float
     return np.asarray(plant.mass * (a - free) / plant.actuator.force_constant[plant.thrust_input])
 
 
-def _held(plant: Plant, distance: float) -> float:
+def _holding_current(plant: Plant, distance: float) -> float:
     """The largest |i| (A) that holds the load anywhere on the way."""
     z = distance * np.linspace(-0.5, 0.5, 2001)
     return float(np.abs(_current(plant, z, 0 * z, 0 * z)).max())

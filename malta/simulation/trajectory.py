@@ -17,7 +17,7 @@ from malta.model.plant import Plant, Signal, readonly
 from malta.simulation.engines import evaluate
 from malta.simulation.layout import Setup, electronics_of, layout_of
 from malta.simulation.scenario import Scenario, setup_of
-from malta.simulation.verdict import Verdict, _judged, _touched
+from malta.simulation.verdict import Verdict, bearing_verdict, judge
 from malta.synthesis.controller import Controller
 
 if TYPE_CHECKING:
@@ -102,7 +102,7 @@ SERIES = (
 )
 
 
-def recorded(
+def trajectory_of(
     plant: Plant,
     controller: Controller,
     scenario: Scenario,
@@ -112,11 +112,11 @@ def recorded(
     kind: str,
 ) -> Trajectory:
     """The trajectory of a run whose rows, one for each sample, are there already; `asked` as `sampled` gives them."""
-    rows, verdict = _judged(plant, controller, setup, rows, asked[0])
-    return _labelled(plant, controller, scenario, setup, asked, rows, verdict, kind)
+    rows, verdict = judge(plant, controller, setup, rows, asked[0])
+    return label_rows(plant, controller, scenario, setup, asked, rows, verdict, kind)
 
 
-def _labelled(
+def label_rows(
     plant: Plant,
     controller: Controller,
     scenario: Scenario,
@@ -133,7 +133,7 @@ def _labelled(
     sizes = layout_of(plant, controller, setup).row
     columns = dict(zip(sizes, np.split(table, np.cumsum([*sizes.values()])[:-1], axis=1), strict=True))
     if setup.bearing and (verdict is None or verdict.name in plant.contacts):  # what it touched first
-        verdict = _touched(plant, columns["contact"], t) or verdict
+        verdict = bearing_verdict(plant, columns["contact"], t) or verdict
     return Trajectory(
         plant,
         controller,
@@ -168,7 +168,7 @@ def stroke_figures(run: Trajectory) -> StrokeFigures:
     whole = run.verdict.completed and end != start  # what ended early never saw where the stroke goes
     share = (z - start) / (end - start) if whole else np.full(len(z), np.nan)
     return StrokeFigures(
-        rise=_reached(run.t, share, 0.9) - _reached(run.t, share, 0.1) if whole else math.nan,
+        rise=_crossing_time(run.t, share, 0.9) - _crossing_time(run.t, share, 0.1) if whole else math.nan,
         overshoot=max(float(share.max()) - 1, 0.0) if whole else math.nan,
         axial_error=float(error[:, axis].max()),
         radial={name: float(error[:, i].max()) for i, name in enumerate(names) if i != axis},
@@ -177,7 +177,7 @@ def stroke_figures(run: Trajectory) -> StrokeFigures:
     )
 
 
-def _reached(t: FloatArray, share: FloatArray, level: float) -> float:
+def _crossing_time(t: FloatArray, share: FloatArray, level: float) -> float:
     k = int(np.argmax(np.asarray(share) >= level))
     if k == 0:
         return math.nan

@@ -14,7 +14,7 @@ from itertools import pairwise
 
 import casadi as ca
 
-from malta.simulation.instructions import _MASKS, _mask_arguments, _Node, _reached, _read
+from malta.simulation.instructions import MASKS, Node, mask_arguments, needed_nodes, read_instructions
 from malta.simulation.period import Period
 
 WHOLE = 4000  # statements of the longest function that is not cut in parts
@@ -32,7 +32,7 @@ def source(p: Period, digest: ca.Function | None) -> str:
         prepares.append(prepare)
         functions.append(function)
         if f is not digest:
-            functions.append("#if LANES > 1\n" + _near(function) + "#endif\n")
+            functions.append("#if LANES > 1\n" + _small_tilt_version(function) + "#endif\n")
         count += more
     sizes = {
         "THETA": len(p.theta),
@@ -60,22 +60,22 @@ def translate(f: ca.Function, shared: Sequence[int], first_constant: int) -> tup
 
     Raises CheckError for an operation that has no C form here.
     """
-    nodes, outputs = _read(f, shared)
-    used = _reached(nodes, [k for *_, k in outputs])
+    nodes, outputs = read_instructions(f, shared)
+    used = needed_nodes(nodes, [k for *_, k in outputs])
     fixed = [k for k in used if nodes[k].fixed]
     # What the moving part reads of the fixed part goes through the array c.
     read = {a for k in used if not nodes[k].fixed for a in nodes[k].arguments} | {k for *_, k in outputs}
     kept = [k for k in fixed if k in read and nodes[k].op]
     place = {k: first_constant + index for index, k in enumerate(kept)}
     moving = [k for k in used if nodes[k].op and not nodes[k].fixed]
-    parts = _cut(moving)
+    parts = _cut_in_parts(moving)
     part = {k: index for index, members in enumerate(parts) for k in members}
     slot = _slots(nodes, parts, {k for *_, k in outputs})
 
     def text(k: int, *, at: int | None, mask: bool = False) -> str:
         """What a node is called in a part of the function, or in `prepare`; as a mask if that is asked for."""
         node = nodes[k]
-        is_mask = node.op in _MASKS
+        is_mask = node.op in MASKS
         if at is not None and k in place:
             plain, is_mask = f"c[{place[k]}]", False
         elif k in slot and part[k] != at:
@@ -88,13 +88,13 @@ def translate(f: ca.Function, shared: Sequence[int], first_constant: int) -> tup
 
     def line(k: int) -> str:
         node, at = nodes[k], part.get(k)
-        masks = _mask_arguments(node)
+        masks = mask_arguments(node)
         values = [text(a, at=at, mask=i in masks) for i, a in enumerate(node.arguments)]
-        kind = "whole" if node.op in _MASKS else "real"
+        kind = "whole" if node.op in MASKS else "real"
         return f"  const {kind} t{k} = {node.form.format(*values)};"
 
     def handed_over(k: int) -> str:
-        return f"  s[{slot[k]}] = {f'value(t{k})' if nodes[k].op in _MASKS else f't{k}'};"
+        return f"  s[{slot[k]}] = {f'value(t{k})' if nodes[k].op in MASKS else f't{k}'};"
 
     prepare = [line(k) for k in fixed if nodes[k].op]
     prepare += [f"  c[{place[k]}] = {text(k, at=None)};" for k in kept]
@@ -111,18 +111,18 @@ def translate(f: ca.Function, shared: Sequence[int], first_constant: int) -> tup
         *((f"const {kind} *{'restrict ' * (i > 0)}", f"a{i}") for i, kind in enumerate(kinds)),
         *((f"real *{'restrict ' * (i > 0)}", f"r{i}") for i in range(f.n_out())),
     ]
-    function = _assembled(f.name(), arguments, bodies, len(set(slot.values())))
+    function = _assemble(f.name(), arguments, bodies, len(set(slot.values())))
     return "\n".join(["  {", *prepare, "  }"]), function, len(kept)
 
 
-def _cut(statements: list[int]) -> list[list[int]]:
+def _cut_in_parts(statements: list[int]) -> list[list[int]]:
     """The statements of one function, or of parts of about the same length."""
     count = math.ceil(len(statements) / PART) if len(statements) > WHOLE else 1
     edges = [len(statements) * k // count for k in range(count + 1)]
     return [statements[begin:end] for begin, end in pairwise(edges)]
 
 
-def _slots(nodes: list[_Node], parts: list[list[int]], results: set[int]) -> dict[int, int]:
+def _slots(nodes: list[Node], parts: list[list[int]], results: set[int]) -> dict[int, int]:
     """Where the nodes that later parts read stand meanwhile; a place is taken again after the last part that reads."""
     last = {
         k: index for index, members in enumerate(parts) for reader in members for k in nodes[reader].arguments
@@ -143,7 +143,7 @@ def _slots(nodes: list[_Node], parts: list[list[int]], results: set[int]) -> dic
     return slot
 
 
-def _assembled(name: str, arguments: list[tuple[str, str]], bodies: list[list[str]], slots: int) -> str:
+def _assemble(name: str, arguments: list[tuple[str, str]], bodies: list[list[str]], slots: int) -> str:
     """The function; or its parts, which share the array s, and a function that calls one after the other."""
     taken, given = ", ".join(map("".join, arguments)), ", ".join(called for _, called in arguments)
     inline, apart = (
@@ -157,7 +157,7 @@ def _assembled(name: str, arguments: list[tuple[str, str]], bodies: list[list[st
     return "\n".join([*lines, f"{inline} {name}({taken}) {{", *body, "}", ""])
 
 
-def _near(function: str) -> str:
+def _small_tilt_version(function: str) -> str:
     """The function for small tilts alone, which tells by `range` whether they were: its code has no branches.
 
     Period without a tilt serve both.

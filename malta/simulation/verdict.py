@@ -25,11 +25,11 @@ class Verdict(NamedTuple):
         return self.name == "completed"
 
 
-def _judged(
+def judge(
     plant: Plant, c: Controller, setup: Setup, rows: FloatArray, t: FloatArray
 ) -> tuple[FloatArray, Verdict | None]:
     """The rows up to the first at which the machine touches something or its state is no number."""
-    contact = _columns(plant, c, setup, rows, "contact")
+    contact = columns_of(plant, c, setup, rows, "contact")
     if np.isfinite(rows[-1]).all() and contact.max(initial=0.0) < 1:
         return rows, None  # a state that is no number stays none
     lost = np.atleast_1d(~np.isfinite(rows).all(axis=1))
@@ -44,7 +44,7 @@ def _judged(
     return rows[: k + 1], Verdict(name, float(t[k]))
 
 
-def _touched(plant: Plant, contact: FloatArray, t: FloatArray) -> Verdict | None:
+def bearing_verdict(plant: Plant, contact: FloatArray, t: FloatArray) -> Verdict | None:
     """With touchdown bearings: None where the mover stayed off them, or lifted off and is free at the end."""
     touching = contact >= 1
     if not touching.any():
@@ -57,7 +57,7 @@ def _touched(plant: Plant, contact: FloatArray, t: FloatArray) -> Verdict | None
     return Verdict(plant.contacts[int(contact[k].argmax())], float(t[k]))
 
 
-def _columns(plant: Plant, c: Controller, setup: Setup, rows: FloatArray, name: str) -> FloatArray:
+def columns_of(plant: Plant, c: Controller, setup: Setup, rows: FloatArray, name: str) -> FloatArray:
     sizes = layout_of(plant, c, setup).row
     first = sum(size for key, size in list(sizes.items())[: list(sizes).index(name)])
     return rows[..., first : first + sizes[name]]

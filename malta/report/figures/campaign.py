@@ -114,13 +114,13 @@ def _distribution(axes: Axes, kind: str, listed: Sequence[Finding]) -> None:
 
 def yield_figure(found: Campaign, published: Published | None = None) -> Figure:
     """How runs end over each parameter that was varied, the others wherever they were drawn."""
-    from malta.campaigns.statistics import kept
+    from malta.campaigns.statistics import runs_within_bounds
     from malta.simulation.digest import verdicts
 
     names = [name for k, name in enumerate(found.names) if len(set(found.values[:, k])) > 1]
     shown = names[:9]
     limited = found.batch.saturated.max(axis=1, initial=0.0) > 0
-    within = kept(found, published)
+    within = runs_within_bounds(found, published)
     known = verdicts(found.plan.plant)
     band = np.array(known, dtype=object)[found.batch.verdict.astype(int)]
     band[found.completed & limited] = "completed, commands limited"
@@ -177,7 +177,7 @@ def _bands(axes: Axes, found: Campaign, name: str, band: Any) -> None:
 
 def worst_figure(found: Campaign, published: Published | None = None) -> Figure:
     """The worst runs: where in the box their machines lie, and how far off the reference they went."""
-    from malta.campaigns.statistics import bounds_of, half_text, worst_of
+    from malta.campaigns.statistics import bounds_of, spread_text, worst_of
 
     plan, plant = found.plan, found.plan.plant
     rows = worst_of(found, len(STYLES) + len(MORE))
@@ -206,7 +206,7 @@ def worst_figure(found: Campaign, published: Published | None = None) -> Figure:
             color=style["color"],
             clip_on=False,
         )
-    spreads = [half_text(found.plan, name) for name in found.names]
+    spreads = [spread_text(found.plan, name) for name in found.names]
     box.set_xticks(at, [f"{n}\n{s}" for n, s in zip(found.names, spreads, strict=True)], fontsize=9)
     box.set_yticks([-100, -50, 0, 50, 100])
     far.set_yticks(range(len(rows)), [_ended(found, row) for row in rows], fontsize=8)
@@ -237,13 +237,13 @@ def _campaign_figure(found: Campaign, what: str, **places: float) -> Figure:
     """A figure that says of which campaign it is, and its yield."""
     from matplotlib.figure import Figure
 
-    from malta.campaigns.plan import wanted_of
+    from malta.campaigns.plan import planned_run
 
     plan, share = found.plan, found.rate
     figure = Figure(figsize=(9.0, 6.0), dpi=120)
     usual = {"left": 0.085, "right": 0.98, "bottom": 0.085, "top": 0.86, "wspace": 0.25, "hspace": 0.3}
     figure.subplots_adjust(**usual | places)
-    wanted = wanted_of(plan)
+    wanted = planned_run(plan)
     flown = plan.scenario if wanted.label == plan.scenario else f"{plan.scenario} ({wanted.label})"
     title = f"{plan.controller.name}, {flown}, fidelity {wanted.scenario.fidelity}: {what}"
     figure.suptitle(title, fontsize=11, y=0.985)
