@@ -2,40 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import casadi as ca
 
 from malta.model.data import plant_of
-from malta.model.plant import Plant
 from malta.simulation import inverter
-from malta.simulation.layout import Setup
-from malta.synthesis.controller import Controller
+from malta.simulation.layout import Loop, Setup, Signals
 
 
 def control_currents(
-    plant: Plant,
-    c: Controller,
-    s: Setup,
-    g: Mapping[str, Any],
-    machine: Mapping[str, Any],
-    controller: Mapping[str, Any],
-    given: Mapping[str, Any],
-    current: Any,
-    known: Any,
+    loop: Loop, signals: Signals, current: Any, known: Any
 ) -> tuple[Any, dict[str, Any], dict[str, Any]]:
-    """PI controllers of the axes, integrals by backward Euler, waiting where the half-bridges are at their limit.
+    """PI control of the axis currents; `known` are the states that the controller takes for true.
 
-    They run once a control period, as on the machine, where both have 50 us. known: the states that they believe in.
+    Returns the command to hold, the controller's states after this sample, and entries of the row. The integrals follow
+    backward Euler and wait while the half-bridges are at their limit. The current controllers run once a control period,
+    as on the machine, where both have 50 us.
     """
+    plant, c, s, g = loop
+    machine, controller, given = signals
     believed, drive = plant_of(c.parameters), plant.drive
     estimate = ca.SX.zeros(len(believed.states))  # where the controller takes the machine to be
     for k, index in enumerate(believed.controlled):
         estimate[index] = known[k]
-    V = machine["link"] * (
-        1 - given["sag"] if s.faulty else 1
-    )  # measured: the modulators know of a sag at once
+    # The link voltage is measured: the modulators know of a sag at once.
+    V = machine["link"] * (1 - given["sag"] if s.faulty else 1)
     if s.fidelity == "dq":
         i, i_phase = machine["i"], None
     else:
@@ -49,25 +41,27 @@ def control_currents(
     row: dict[str, Any] = {"link": V, "i": i}
     if s.fidelity == "dq":
         command, limited = inverter.modulation(drive, u, V)
-        command = keep_if_missed(s, given, controller, command)
+        command = keep_if_missed(s, signals, command)
         row |= {"u": command * V, "force": drive.force(i)}
     else:
         u_phase = believed.drive.to_phases(estimate) @ u
         command, limits = inverter.duty_cycles(drive, u_phase, V, i_phase, real_pwm=s.real_pwm)
         limited = ca.vertcat(*_limited_axes(drive, limits))
-        command = keep_if_missed(s, given, controller, command)
-        T = drive.to_axes(machine["x"])  # where the machine is, whatever the controller takes it to be
+        command = keep_if_missed(s, signals, command)
+        T = drive.to_axes(machine["x"])  # at the true position, not at the estimate
         true, applied = T @ i_phase, T @ ((command - 0.5) * V)
         row |= {"u": applied, "force": drive.force(true), "i": true, "i_phase": i_phase, "duty": command}
     return command, {"u_integral": integral, "u_limited": limited}, row
 
 
-def keep_if_missed(s: Setup, given: Mapping[str, Any], controller: Mapping[str, Any], command: Any) -> Any:
+def keep_if_missed(s: Setup, signals: Signals, command: Any) -> Any:
+    """The command, or the last one where the controller misses this step (a fault)."""
+    given, controller = signals.given, signals.controller
     return ca.if_else(given["missed"], controller["command"], command) if s.faulty else command
 
 
 def _limited_axes(drive: Any, limits: Any) -> list[Any]:
-    """An axis waits when any phase of its group is limited."""
+    """1 for every axis of a group of which a phase is limited: the integrals of these axes wait."""
     share = len(drive.phases) // len(drive.groups)
     flags: list[Any] = [0] * len(drive.axes)
     for k, group in enumerate(drive.groups):

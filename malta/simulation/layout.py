@@ -55,9 +55,26 @@ class Layout(NamedTuple):
     row: dict[str, int]  # what one sample leaves behind
 
 
+class Loop(NamedTuple):
+    """The closed loop that a control period is built of."""
+
+    plant: Plant  # the simulated machine
+    controller: Controller
+    setup: Setup
+    numbers: Mapping[str, Any]  # of machine, controller and sensors by name: constants or symbols
+
+
+class Signals(NamedTuple):
+    """Symbols of one sample by name, sized by a layout."""
+
+    machine: Mapping[str, Any]
+    controller: Mapping[str, Any]
+    given: Mapping[str, Any]
+
+
 @lru_cache(maxsize=64)
 def layout_of(plant: Plant, c: Controller, s: Setup) -> Layout:
-    """What stands where."""
+    """Names and sizes of the state, of a sample's inputs and of the row that a sample leaves."""
     n, m, p = len(c.states), len(c.forces), len(c.measurements)
     coils, fast = len(plant.actuator.coils), electronics_of(plant, s)
     axes, phases = _winding_counts(plant)
@@ -143,8 +160,11 @@ def _winding_counts(plant: Plant) -> tuple[int, int]:
     return (0, 0) if drive is None else (len(drive.axes), len(drive.phases))
 
 
-def symbols_of(sizes: Mapping[str, int], kind: Any) -> dict[str, Any]:
-    return {name: kind.sym(name, size) for name, size in sizes.items()}
+def signals_of(sizes: Layout, kind: Any) -> Signals:
+    """Symbols of CasADi's `kind`, SX or MX, for every signal of a layout."""
+    return Signals(
+        *({name: kind.sym(name, size) for name, size in part.items()} for part in sizes[:3]),
+    )
 
 
 def _symbolic_parameters(plant: Plant, g: Mapping[str, Any]) -> Any:
@@ -154,6 +174,7 @@ def _symbolic_parameters(plant: Plant, g: Mapping[str, Any]) -> Any:
 
 
 def command_size(plant: Plant, s: Setup) -> int:
+    """How many numbers are held between samples: currents, voltages, duty cycles, or those of the electronics."""
     fast = electronics_of(plant, s)
     if fast is not None:
         return fast.held_size

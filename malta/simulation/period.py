@@ -34,11 +34,13 @@ from malta.model.plant import Plant
 from malta.simulation.current_control import control_currents, keep_if_missed
 from malta.simulation.layout import (
     Layout,
+    Loop,
     Setup,
+    Signals,
     command_size,
     electronics_of,
     layout_of,
-    symbols_of,
+    signals_of,
     with_symbols,
 )
 from malta.simulation.substep import advance
@@ -69,24 +71,24 @@ def period_of(
         plant, g, theta = with_symbols(plant, values)
         names = tuple(name for name, symbol in g.items() for _ in range(symbol.nnz()))
     sizes = layout_of(plant, c, s)
-    machine, controller, given = (symbols_of(part, ca.SX) for part in sizes[:3])
+    loop, signals = Loop(plant, c, s, g), signals_of(sizes, ca.SX)
+    machine, controller, given = signals
     state = ca.vertcat(*machine.values(), *controller.values())
     around = ca.vertcat(*given.values())
     noise, held = ca.SX.sym("noise", len(plant.outputs)), ca.SX.sym("held", command_size(plant, s))
     fast = electronics_of(plant, s)
     jitter = ca.SX.sym("jitter", 0 if fast is None else fast.noises)
-    x = machine["x"]
 
-    measured = _measurement(plant, s, g, x, noise)
+    measured = _measurement(loop, machine["x"], noise)
     if s.faulty:
         measured = ca.if_else(given["stuck"], controller["y_last"], measured)
     first, last = g["grid_ends"][0], g["grid_ends"][1]
     at = ca.fmax(ca.fmin(measured[plant.stroke_output], last), first) if plant.has_stroke else first
     sense = ca.Function("sense", [state, around, noise, theta], ca.cse([ca.densify(measured), at]))
 
-    moved = ca.cse(ca.densify(advance(plant, s, g, machine, given, held, jitter)))
+    moved = ca.cse(ca.densify(advance(loop, signals, held, jitter)))
     substep = ca.Function("substep", [ca.vertcat(*machine.values()), held, around, jitter, theta], [moved])
-    return Period(sense, _decide_function(plant, c, s, g, theta, sizes), substep, names)
+    return Period(sense, _decide_function(loop, theta, sizes), substep, names)
 
 
 def chain(p: Period, c: Controller, substeps: int, block: int) -> ca.Function:
@@ -144,17 +146,18 @@ def initial_state(plant: Plant, c: Controller, s: Setup, x: Any, xi_pred: Any, c
     return ca.densify(ca.vertcat(*(values.get(name, ca.SX.zeros(size)) for name, size in state.items())))
 
 
-def _decide_function(
-    plant: Plant, c: Controller, s: Setup, g: Mapping[str, Any], theta: Any, sizes: Layout
-) -> ca.Function:
+def _decide_function(loop: Loop, theta: Any, sizes: Layout) -> ca.Function:
     """The function `decide` of Period: in CasADi's SX; in MX where the controller looks something up in a table."""
-    kind = ca.MX if plant_of(c.parameters).tabulated else ca.SX
+    plant = loop.plant
+    kind = ca.MX if plant_of(loop.controller.parameters).tabulated else ca.SX
     if kind is ca.MX:
-        g, theta = {name: ca.MX(ca.DM(value)) for name, value in g.items()}, ca.MX(0, 1)
-    machine, controller, given = (symbols_of(part, kind) for part in sizes[:3])
+        constants = {name: ca.MX(ca.DM(value)) for name, value in loop.numbers.items()}
+        loop, theta = loop._replace(numbers=constants), ca.MX(0, 1)
+    signals = signals_of(sizes, kind)
+    machine, controller, given = signals
     y, v0 = kind.sym("y", len(plant.outputs)), kind.sym("v0", len(plant.inputs))
     x = machine["x"]
-    after, command, row = _control_law(plant, c, s, g, machine, controller, given, y, v0)
+    after, command, row = _control_law(loop, signals, y, v0)
     row = {"x": x, "p": plant.h(x, 0), "y": y, "contact": plant.contact(x)} | row
     decided = [
         ca.vertcat(*(after[name] for name in sizes.controller)),
@@ -176,18 +179,13 @@ def _decide_function(
     return ca.Function("decide", [*whole, y, v0, ca.MX.sym("theta", 0, 1)], decided)
 
 
-def _control_law(
-    plant: Plant,
-    c: Controller,
-    s: Setup,
-    g: Mapping[str, Any],
-    machine: Mapping[str, Any],
-    controller: Mapping[str, Any],
-    given: Mapping[str, Any],
-    y: Any,
-    v0: Any,
-) -> tuple[dict[str, Any], Any, dict[str, Any]]:
-    """The control law and the current controllers: controller state after, commands to hold, their part of the row."""
+def _control_law(loop: Loop, signals: Signals, y: Any, v0: Any) -> tuple[dict[str, Any], Any, dict[str, Any]]:
+    """The control law and the current controllers at measurements y.
+
+    Returns the controller's state after this sample, the commands to hold, and entries of the row.
+    """
+    plant, c, s, g = loop
+    machine, controller, given = signals
     C = _scheduled_C(c, y) if s.scheduled else None
     p_ref, v_ff = given["p_ref"], given["v_ff"]
     taken = filtered(c.tracks, y, p_ref)
@@ -206,20 +204,18 @@ def _control_law(
     met = [ca.mmax(ca.fabs(current - wanted)) > 0]
     row: dict[str, Any] = {"xi_hat": xi_hat, "v": v, "saturated": frozen, "current": current}
     if fast is not None:
-        command = keep_if_missed(s, given, controller, fast.held(current, place))
+        command = keep_if_missed(s, signals, fast.held(current, place))
         electric_state = {name: machine[name] for name in fast.state}
         met.append(fast.met(electric_state))
         row |= {"i_phase": machine["i_coil"], "duty": fast.duty(electric_state)}
         row["force"] = plant.forces(machine["x"], machine["i_coil"])
     elif s.fidelity == "force":
-        command = keep_if_missed(s, given, controller, current)
+        command = keep_if_missed(s, signals, current)
         row["force"] = plant.forces(machine["x"], machine["i_coil"])
     else:
-        # A law of errors knows no states: what is measured, moving as the reference does.
+        # A law of errors has no states: the measured outputs stand for them, moving as the reference does.
         known = xi_hat if c.tracks == "states" else state_reference(believed)(y, given["dp_ref"])
-        command, electrics, more = control_currents(
-            plant, c, s, g, machine, controller, given, current, known
-        )
+        command, electrics, more = control_currents(loop, signals, current, known)
         after |= electrics
         row |= more
     row["met"] = ca.vertcat(*met)
@@ -265,9 +261,11 @@ def _scheduled_C(c: Controller, y: Any) -> Any:
     return ca.horzcat(at, ca.SX(at.shape[0], len(c.states) - at.shape[1]))
 
 
-def _measurement(plant: Plant, s: Setup, g: Mapping[str, Any], x: Any, noise: Any) -> Any:
-    y = (plant.sense(x, g["errors"]) if s.sensed else plant.h(x, 0)) + noise
-    if not s.quantize:
+def _measurement(loop: Loop, x: Any, noise: Any) -> Any:
+    """y at a state x: outputs with the errors of the sensors, noise and, where the setup says so, resolution."""
+    plant = loop.plant
+    y = (plant.sense(x, loop.numbers["errors"]) if loop.setup.sensed else plant.h(x, 0)) + noise
+    if not loop.setup.quantize:
         return y
     steps = plant.resolution
     return ca.vertcat(

@@ -10,25 +10,17 @@ import casadi as ca
 
 from malta.model.plant import Plant
 from malta.simulation import inverter
-from malta.simulation.layout import Setup, electronics_of
+from malta.simulation.layout import Loop, Setup, Signals, electronics_of
 
 OPENING = 20e-6  # s, time constant with which the current of an opened phase dies
 
 
-def advance(
-    plant: Plant,
-    s: Setup,
-    g: Mapping[str, Any],
-    machine: Mapping[str, Any],
-    given: Mapping[str, Any],
-    held: Any,
-    jitter: Any,
-) -> Any:
-    """One Runge–Kutta step of the machine under held commands, or a period of its electronics."""
-    h = g["substep"]
-    outside = (
-        given["w"] if s.disturbed else ca.SX(len(plant.disturbances), 1)
-    )  # structural zeros cost nothing
+def advance(loop: Loop, signals: Signals, held: Any, jitter: Any) -> Any:
+    """The machine's state after one Runge–Kutta step under held commands, or after one period of its electronics."""
+    plant, s, h = loop.plant, loop.setup, loop.numbers["substep"]
+    machine, given = signals.machine, signals.given
+    # Structural zeros cost nothing.
+    outside = given["w"] if s.disturbed else ca.SX(len(plant.disturbances), 1)
 
     def motion(x: Any, inputs: Any) -> Any:
         w = plant.load(x) + outside
