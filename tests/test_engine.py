@@ -121,19 +121,11 @@ def _digests(
         compiled.arrange_in_lanes(rows, 1)
         for rows in (thetas, states, np.zeros((LANES, trial.parts.decide.size1_out(2))))
     )
-    compiled.run_many(
-        trial.many,
-        slice(0, 1),
-        substeps=1,
-        theta=theta,
-        table=table,
-        states=start,
-        given=np.ascontiguousarray(given),
-        uniform=False,
-        sigma=np.zeros((1, 1, LANES)),
-        keys=np.zeros((1, LANES), dtype=np.uint64),
-        digests=digests,
+    lanes = compiled.Lanes(
+        theta, start, np.zeros((1, 1, LANES)), np.zeros((1, LANES), dtype=np.uint64), digests
     )
+    shared = compiled.Shared(np.ascontiguousarray(given), table, 1, False)
+    compiled.run_many(trial.many, slice(0, 1), lanes, shared)
     return np.asarray(digests[0].T)
 
 

@@ -22,7 +22,7 @@ from malta.simulation.inputs import initial_values, inputs_of
 from malta.simulation.layout import FIDELITIES, Fidelity, layout_of
 from malta.simulation.period import initial_state
 from malta.simulation.references import Motion
-from malta.simulation.scenario import Correction, Fault, Scenario, setup_of, steps_of
+from malta.simulation.scenario import Correction, Fault, Scenario, Simulation, setup_of, steps_of
 
 if TYPE_CHECKING:
     from conftest import Design
@@ -81,8 +81,9 @@ def _under_way(run: malta.Trajectory, series: FloatArray) -> FloatArray:
 def _step_by_step(plant: Plant, c: Controller, scenario: Scenario) -> dict[str, FloatArray]:
     """The state of machine and controller before every sample."""
     setup = setup_of(plant, c, scenario)
-    t, _, given_ = inputs_of(plant, c, scenario, setup)
-    start = [ca.DM(a) for a in initial_values(plant, c, scenario, given_[0])]
+    simulation = Simulation(plant, c, scenario, setup)
+    t, _, given_ = inputs_of(simulation)
+    start = [ca.DM(a) for a in initial_values(simulation, given_[0])]
     state = np.array(ca.evalf(initial_state(plant, c, setup, *start))).ravel()
     engine = engine_of(plant, c, setup, steps_of(plant, c, scenario))
     states = []

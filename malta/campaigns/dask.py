@@ -12,7 +12,7 @@ from importlib.metadata import version
 from threading import Thread
 from typing import TYPE_CHECKING, Any
 
-from malta.campaigns.block import Block
+from malta.campaigns.block import Block, fly
 from malta.errors import InputError
 from malta.model.machines import load_sources, sources_of
 
@@ -150,8 +150,6 @@ def _describe(error: BaseException) -> str:
 
 def _at_worker(task: _Task, first: int, count: int) -> Block | tuple[str, str, str, str]:
     """A block, or the parts of the error that refuses it: one that names its fields does not travel by itself."""
-    from malta.campaigns.block import fly
-
     here = version("malta")
     if here != task.version:
         return "--cluster", "a worker", f"malta {here}", f"malta {task.version}"

@@ -1,7 +1,7 @@
 """Many machines at once: the same scenario and controller on plants that all differ, each with its own noise.
 
-Compiled, eight machines share a SIMD register and the cores share the rest; only a digest of each run is kept. Run i of
-a seed draws the same noise wherever and with whatever company it runs; `replayed` gives it back as a scenario.
+With a C compiler, LANES machines share a SIMD register and the groups share the cores; each run leaves a digest only.
+Run i of a seed does not depend on the other runs of its batch; `replayed` gives its machine and scenario.
 """
 
 from __future__ import annotations
@@ -19,28 +19,27 @@ import numpy as np
 from malta.errors import InputError
 from malta.model.data import shaping, twins_of, units_of
 from malta.model.plant import Plant
-from malta.simulation.compiled import LANES, arrange_in_lanes, feedforward_table, run_many
+from malta.simulation.compiled import LANES, Lanes, Shared, arrange_in_lanes, feedforward_table, run_many
 from malta.simulation.digest import (
     Batch,
     batch_of,
     digest_function,
     digest_sizes,
+    first_digest,
     recorder_function,
     verdicts,
 )
 from malta.simulation.engines import BLOCK, evaluate, library_of, shape_of
-from malta.simulation.inputs import initial_values, inputs_of
+from malta.simulation.inputs import Inputs, initial_values, inputs_of
 from malta.simulation.layout import electronics_of, flatten, layout_of, numbers_of, with_symbols
 from malta.simulation.noise import GAMMA, keys
 from malta.simulation.period import initial_state
-from malta.simulation.scenario import Scenario, setup_of, steps_of
+from malta.simulation.scenario import Scenario, Simulation, setup_of, simulation_of, steps_of
 from malta.simulation.simulate import simulate
 from malta.simulation.trajectory import Trajectory, stroke_figures, trajectory_of
 from malta.synthesis.controller import Controller
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from malta.model.plant import FloatArray
 
 
@@ -55,110 +54,91 @@ def simulate_many(
     workers: int | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Batch:
-    """Run a scenario on many machines.
+    """Run a scenario on many machines and keep the figures of each run.
 
     changes : parameters of the machine by name, SI, a value for each run
-    sensor_errors : errors of the sensors by name, likewise, in place of the scenario's
+    sensor_errors : errors of the sensors by name, SI, a value for each run, in place of the scenario's
     first : index of the first run; noise depends on scenario.seed and on the index
     workers : threads; None: one for each core
+    progress : called now and then with the share of the runs that is done
 
-    Raises InputError for an unknown parameter, values of different number, or a scenario with faults, changes, another
-    estimator or an outer loop, which are for `simulate`.
+    Raises InputError for an unknown parameter, for columns of different length, and for a scenario with faults,
+    changes, an outer loop or another estimator than "steady-state": `simulate` runs those.
+
+        masses = {"m": np.linspace(0.3, 0.4, 100)}
+        batch = malta.simulate_many(plant, controller, malta.Scenario.stroke(10e-3), masses)
     """
-    where = f"scenario {scenario.name}"
     for name in ("faults", "changes", "correction"):
         if getattr(scenario, name):
-            raise InputError(where, name, "some", "none in a campaign")
-    scenario = _with_sensor_errors(scenario, sensor_errors)
-    setup = setup_of(plant, controller, scenario)
-    if setup.outside:
-        raise InputError(where, "estimator", scenario.estimator, "steady-state in a campaign")
-    if electronics_of(plant, setup) is not None:
-        raise InputError(where, "fidelity", "phase", f"force in a campaign of a {plant.name}")
-    if workers is not None and workers < 1:
-        raise InputError("campaign", "workers", str(workers), "at least 1")
-    runs = _count_runs(plant, changes, sensor_errors or {})
+            raise InputError(f"scenario {scenario.name}", name, "some", "none in a campaign")
+    simulation = simulation_of(plant, controller, _with_sensor_errors(scenario, sensor_errors))
+    _check(simulation, workers)
+    variation = _variation(plant, changes, sensor_errors, first)
     for name in set(changes) & set(shaping(plant.parameters)):
         raise InputError("campaign", name, "another one for each run", "one for all: it shapes the functions")
-    shape = shape_of(plant, controller, setup)
-    digest = digest_function(shape)
-    compiled = library_of(shape, LANES, digest)
+    shape = shape_of(plant, controller, simulation.setup)
+    compiled = library_of(shape, LANES, digest_function(shape))
     if compiled is None:
-        return _simulate_one_by_one(
-            plant, controller, scenario, changes, sensor_errors, first, runs, progress
-        )
-    lib, _ = compiled
-    ready = _prepare(plant, controller, scenario, changes, sensor_errors or {}, first, runs)
-    axis = plant.leading_output
-    start, end = ready.p_ref[0, axis], ready.p_ref[-1, axis]
-    scale = 1 / (end - start) if end != start else 0
-    known = {"alive": 1.0, "start": start, "scale": scale, "reached": -1.0, "touched": -1.0, "culprit": -1.0}
-    sizes = digest_sizes(plant)
-    kept = np.repeat([known.get(name, 0.0) for name in sizes], [*sizes.values()])
-    lanes = ready.lanes | {"digests": arrange_in_lanes(np.tile(kept, (runs, 1)), ready.groups)}
-    groups = ready.groups
-    workers = workers or os.cpu_count() or 1
-    step = max(1, min(16, groups // (4 * workers)))  # groups in one call, for the progress bar
+        return _simulate_one_by_one(simulation, variation, progress)
+    inputs, shared, lanes = _prepare(simulation, variation)
+    digest = first_digest(plant, inputs.motion.p)
+    groups, runs = len(lanes.theta), variation.runs
+    lanes = lanes._replace(digests=arrange_in_lanes(np.tile(digest, (runs, 1)), groups))
+    _run_groups(compiled[0], lanes, shared, workers or os.cpu_count() or 1, progress)
+    ends = lanes.digests.swapaxes(1, 2).reshape(groups * LANES, -1)[:runs]
+    return batch_of(ends, len(inputs.t), controller.sample_time, digest_sizes(plant))
 
-    def fly(k: int) -> None:
-        run_many(
-            lib,
-            slice(k, min(k + step, groups)),
-            substeps=steps_of(plant, controller, scenario),
-            table=ready.table,
-            given=ready.given,
-            uniform=plant.uniform,
-            keys=ready.keys,
-            **lanes,
-        )
+
+class Variation(NamedTuple):
+    """The values in which the runs of a batch differ, one for each run."""
+
+    changes: Mapping[str, FloatArray]  # parameters of the machine by name, SI
+    sensor_errors: Mapping[str, FloatArray]
+    first: int  # index of the first run
+    runs: int
+
+
+def _run_groups(
+    lib: Any, lanes: Lanes, shared: Shared, workers: int, progress: Callable[[float], None] | None
+) -> None:
+    """Simulate all groups of machines on several threads; the digests change in place."""
+    groups = len(lanes.theta)
+    step = max(1, min(16, groups // (4 * workers)))  # groups in one call, so that progress comes often
+
+    def run(k: int) -> None:
+        run_many(lib, slice(k, min(k + step, groups)), lanes, shared)
 
     with ThreadPoolExecutor(workers) as pool:
         try:
-            for done, _ in enumerate(pool.map(fly, range(0, groups, step))):
+            for done, _ in enumerate(pool.map(run, range(0, groups, step))):
                 if progress is not None:
                     progress(min(1.0, (done + 1) * step / groups))
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise
-    ends = lanes["digests"].swapaxes(1, 2).reshape(groups * LANES, -1)[:runs]
-    return batch_of(ends, len(ready.t), controller.sample_time, sizes)
 
 
-class _Ready(NamedTuple):
-    """What flies many machines: those of LANES in a group, a group in the first axis."""
-
-    t: FloatArray
-    p_ref: FloatArray
-    given: FloatArray
-    table: FloatArray  # of v0(z)
-    groups: int
-    lanes: dict[str, FloatArray]
-    keys: NDArray[np.uint64]
-
-
-def _prepare(
-    plant: Plant,
-    controller: Controller,
-    scenario: Scenario,
-    changes: Mapping[str, FloatArray],
-    sensor_errors: Mapping[str, FloatArray],
-    first: int,
-    runs: int,
-) -> _Ready:
-    setup = setup_of(plant, controller, scenario)
-    count = steps_of(plant, controller, scenario)
+def _prepare(simulation: Simulation, variation: Variation) -> tuple[Inputs, Shared, Lanes]:
+    """Inputs that all machines share, and each machine's own numbers in lanes, still without digests."""
+    plant, controller, scenario, setup = simulation
+    count, runs = steps_of(plant, controller, scenario), variation.runs
     values = numbers_of(plant, controller, count, scenario.sensor_errors)
-    theta = _thetas(plant, values, changes, sensor_errors, runs)
-    t, motion, given = inputs_of(plant, controller, scenario, setup)
-    start = np.concatenate(initial_values(plant, controller, scenario, given[0]))
+    theta = _thetas(plant, values, variation)
+    inputs = inputs_of(simulation)
+    start = np.concatenate(initial_values(simulation, inputs.given[0]))
     states, noise = _map_rows(_start_function(shape_of(plant, controller, setup)), theta, start)
-    ff = controller.feedforward
     groups = -(-runs // LANES)
-    rows = {"theta": theta, "states": states, "sigma": scenario.noise * noise}
-    lanes = {name: arrange_in_lanes(array, groups) for name, array in rows.items()}
-    streams = keys(scenario.seed, first + np.minimum(np.arange(groups * LANES), runs - 1))
-    table = feedforward_table(ff.z_grid, ff.v0)
-    return _Ready(t, motion.p, given, table, groups, lanes, streams.reshape(groups, LANES))
+    streams = keys(scenario.seed, variation.first + np.minimum(np.arange(groups * LANES), runs - 1))
+    lanes = Lanes(
+        theta=arrange_in_lanes(theta, groups),
+        states=arrange_in_lanes(states, groups),
+        sigma=arrange_in_lanes(scenario.noise * noise, groups),
+        keys=streams.reshape(groups, LANES),
+        digests=np.empty((groups, 0, LANES)),
+    )
+    ff = controller.feedforward
+    shared = Shared(inputs.given, feedforward_table(ff.z_grid, ff.v0), count, plant.uniform)
+    return inputs, shared, lanes
 
 
 def record_run(
@@ -171,50 +151,39 @@ def record_run(
     sensor_errors: Mapping[str, FloatArray] | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Trajectory | None:
-    """One run of `simulate_many` with its time series, the same to the bit; None without a C compiler.
+    """The trajectory of one run of `simulate_many`, the same to the bit; None without a C compiler.
 
-    `simulate` computes one machine by itself, whose last digits differ; sensors in steps, and machines that barely fall
-    or barely do not, make more of them. Here the run's whole group is flown again, with every sample recorded.
+    `simulate` runs one machine alone, and its last digits differ from those of a lane. Quantized sensors amplify such a
+    difference, and so does a machine that barely falls. Therefore this function simulates the run's whole group of
+    LANES machines again and records every sample of the run.
 
-    changes, sensor_errors : those of all runs, of which `simulate_many` had blocks that begin with a multiple of LANES
+    changes, sensor_errors : columns of all runs; `simulate_many` had blocks of them that begin with a multiple of LANES
     """
     begin = index // LANES * LANES
-    group = {
-        kind: {name: column[begin : begin + LANES] for name, column in columns.items()}
-        for kind, columns in (("changes", changes), ("errors", sensor_errors or {}))
-    }
+    group, errors = (
+        {name: column[begin : begin + LANES] for name, column in columns.items()}
+        for columns in (changes, sensor_errors or {})
+    )
     own_plant, own_scenario = replayed(plant, scenario, changes, index, sensor_errors=sensor_errors)
-    scenario = _with_sensor_errors(scenario, sensor_errors)
-    setup = setup_of(plant, controller, scenario)
-    shape = shape_of(plant, controller, setup)
+    simulation = simulation_of(plant, controller, _with_sensor_errors(scenario, sensor_errors))
+    shape = shape_of(plant, controller, simulation.setup)
     compiled = library_of(shape, LANES, recorder_function(shape))
     if compiled is None:
         return None
-    runs = _count_runs(plant, group["changes"], group["errors"])
-    ready = _prepare(plant, controller, scenario, group["changes"], group["errors"], begin, runs)
-    width = sum(layout_of(plant, controller, setup).row.values())
-    rows = np.empty((len(ready.t), width))
-    stream = ready.keys.copy()
-    kept = np.zeros((1, 2 * width, LANES))
-    for k in range(0, len(rows), 2):  # the noise of two samples is drawn at once
-        part = ready.given[k : k + 2]
-        run_many(
-            compiled[0],
-            slice(0, 1),
-            substeps=steps_of(plant, controller, scenario),
-            table=ready.table,
-            given=part,
-            uniform=plant.uniform,
-            keys=stream,
-            digests=kept,
-            **ready.lanes,
-        )
-        rows[k : k + len(part)] = kept[0, :, index - begin].reshape(2, width)[2 - len(part) :]
+    inputs, shared, lanes = _prepare(simulation, _variation(plant, group, errors, begin))
+    width = sum(layout_of(plant, controller, simulation.setup).row.values())
+    rows = np.empty((len(inputs.t), width))
+    stream, last = lanes.keys.copy(), np.zeros((1, 2 * width, LANES))
+    lanes = lanes._replace(keys=stream, digests=last)
+    for k in range(0, len(rows), 2):  # the engine draws the noise of two samples at once
+        part = inputs.given[k : k + 2]
+        run_many(compiled[0], slice(0, 1), lanes, shared._replace(given=part))
+        rows[k : k + len(part)] = last[0, :, index - begin].reshape(2, width)[2 - len(part) :]
         stream += np.uint64(len(plant.outputs) * GAMMA % 2**64)
         if progress is not None and k % 1000 == 0:
             progress(k / len(rows))
-    asked = (ready.t, ready.given)
-    return trajectory_of(own_plant, controller, own_scenario, setup, asked, rows, "compiled")
+    own = Simulation(own_plant, controller, own_scenario, simulation.setup)
+    return trajectory_of(own, inputs, rows, "compiled")
 
 
 def replayed(
@@ -225,7 +194,10 @@ def replayed(
     first: int = 0,
     sensor_errors: Mapping[str, FloatArray] | None = None,
 ) -> tuple[Plant, Scenario]:
-    """Machine and scenario of one run of `simulate_many`, for `simulate`."""
+    """Machine and scenario of one run of `simulate_many`, for `simulate`.
+
+    index : of the run; changes and sensor_errors begin with run `first`
+    """
     own, errors = (
         {name: float(values[index - first]) for name, values in columns.items()}
         for columns in (changes, sensor_errors or {})
@@ -237,13 +209,13 @@ def replayed(
 
 
 def is_compiled(plant: Plant, controller: Controller, scenario: Scenario) -> bool:
-    """Whether `simulate_many` runs these compiled; without a C compiler they run one by one."""
+    """Whether `simulate_many` runs compiled; without a C compiler it simulates one run after the other."""
     shape = shape_of(plant, controller, setup_of(plant, controller, scenario))
     return library_of(shape, LANES, digest_function(shape)) is not None
 
 
 def _with_sensor_errors(scenario: Scenario, sensor_errors: Mapping[str, FloatArray] | None) -> Scenario:
-    """With sensors that may err where runs have errors of their own; none of them is known to be finite yet."""
+    """The scenario with errors of the sensors, 0 for those that differ from run to run."""
     if not sensor_errors:
         return scenario
     return replace(
@@ -251,9 +223,26 @@ def _with_sensor_errors(scenario: Scenario, sensor_errors: Mapping[str, FloatArr
     )
 
 
-def _count_runs(
-    plant: Plant, changes: Mapping[str, FloatArray], sensor_errors: Mapping[str, FloatArray]
-) -> int:
+def _check(simulation: Simulation, workers: int | None) -> None:
+    """InputError for a setup that a batch cannot simulate, or for no workers."""
+    plant, _, scenario, setup = simulation
+    where = f"scenario {scenario.name}"
+    if setup.outside:
+        raise InputError(where, "estimator", scenario.estimator, "steady-state in a campaign")
+    if electronics_of(plant, setup) is not None:
+        raise InputError(where, "fidelity", "phase", f"force in a campaign of a {plant.name}")
+    if workers is not None and workers < 1:
+        raise InputError("campaign", "workers", str(workers), "at least 1")
+
+
+def _variation(
+    plant: Plant,
+    changes: Mapping[str, FloatArray],
+    sensor_errors: Mapping[str, FloatArray] | None,
+    first: int,
+) -> Variation:
+    """The variation of a batch. Raises InputError for unknown parameters and for columns of different length."""
+    sensor_errors = sensor_errors or {}
     known = units_of(plant.parameters)
     sizes = {}
     for name, values in [*changes.items(), *sensor_errors.items()]:
@@ -268,17 +257,12 @@ def _count_runs(
             raise InputError("campaign", name, "an unknown parameter", "one of " + " ".join(known))
     if len(set(sizes.values())) != 1:
         raise InputError("campaign", "changes", f"{sizes or 'nothing'}", "as many values of each parameter")
-    return next(iter(sizes.values()))
+    return Variation(changes, sensor_errors, first, next(iter(sizes.values())))
 
 
-def _thetas(
-    plant: Plant,
-    values: Mapping[str, ca.DM],
-    changes: Mapping[str, FloatArray],
-    sensor_errors: Mapping[str, FloatArray],
-    runs: int,
-) -> FloatArray:
-    """theta of every run, a row each. Every record is checked as one that is read from a file."""
+def _thetas(plant: Plant, values: Mapping[str, ca.DM], variation: Variation) -> FloatArray:
+    """theta of every run, runs x numbers. Raises InputError for values that a data file may not have either."""
+    changes, sensor_errors, _, runs = variation
     place, k = {}, 0
     for name, value in values.items():
         place[name] = k
@@ -304,7 +288,7 @@ def _thetas(
 
 @lru_cache(maxsize=16)
 def _start_function(shape: Any) -> ca.Function:
-    """(theta, x, xi_pred, currents) -> the state in which a machine starts, and the noise of its sensors."""
+    """(theta, (x, xi_pred, currents)) -> the state of machine and controller at the start, and the sensors' noise."""
     plant, c, setup = shape.plant, shape.controller, shape.setup
     symbolic, _, theta = with_symbols(plant, numbers_of(plant, c, 1))
     sizes = {"x": len(plant.states), "xi_pred": len(c.states), "current": len(plant.actuator.coils)}
@@ -315,23 +299,18 @@ def _start_function(shape: Any) -> ca.Function:
 
 
 def _map_rows(function: ca.Function, rows: FloatArray, same: FloatArray) -> list[FloatArray]:
-    """A function of a row and of what is the same for all, on all rows: each of its results."""
+    """f(row, same) for every row, runs x size for each result of f. At most BLOCK rows are mapped in one call."""
     parts = np.array_split(rows, -(-len(rows) // BLOCK))
     found = [evaluate(function.map(len(part)), part, np.tile(same, (len(part), 1))) for part in parts]
     return [np.vstack(column) for column in zip(*found, strict=True)]
 
 
 def _simulate_one_by_one(
-    plant: Plant,
-    controller: Controller,
-    scenario: Scenario,
-    changes: Mapping[str, FloatArray],
-    sensor_errors: Mapping[str, FloatArray] | None,
-    first: int,
-    runs: int,
-    progress: Callable[[float], None] | None,
+    simulation: Simulation, variation: Variation, progress: Callable[[float], None] | None
 ) -> Batch:
-    """The same without a C compiler."""
+    """A batch without a C compiler: every run by `simulate` on CasADi's virtual machine."""
+    plant, controller, scenario, _ = simulation
+    changes, sensor_errors, first, runs = variation
     figures: dict[str, list[Any]] = {name: [] for name in Batch.__dataclass_fields__}
     for k in range(runs):
         machine_k, scenario_k = replayed(plant, scenario, changes, first + k, first, sensor_errors)

@@ -16,12 +16,14 @@ import tempfile
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import platformdirs
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from malta.model.plant import FloatArray
 
 LANES = 8
@@ -117,38 +119,47 @@ def feedforward_table(z_grid: FloatArray, v0: FloatArray) -> FloatArray:
     return np.ascontiguousarray(np.hstack([z_grid[:, None], v0, np.vstack([slope, slope[-1:]])]))
 
 
+class Lanes(NamedTuple):
+    """Machines of a batch in groups of LANES: every array is groups x numbers x LANES, keys are groups x LANES.
+
+    A run changes `states` and `digests` in place.
+    """
+
+    theta: FloatArray  # numbers of machine and controller
+    states: FloatArray
+    sigma: FloatArray  # standard deviations of the sensors' noise
+    keys: NDArray[np.uint64]  # of the noise
+    digests: FloatArray
+
+
+class Shared(NamedTuple):
+    """Inputs that all machines of a batch share."""
+
+    given: FloatArray  # samples x inputs of a sample
+    table: FloatArray  # of v0(z), see feedforward_table
+    substeps: int  # Runge–Kutta steps in a sample
+    uniform: bool  # noise of the sensors is uniform, not normal
+
+
 def arrange_in_lanes(rows: FloatArray, groups: int) -> FloatArray:
     """Rows of machines as groups x numbers x LANES; the last machine fills what is left of the last group."""
     filled = np.concatenate([rows, np.repeat(rows[-1:], groups * LANES - len(rows), axis=0)])
     return np.ascontiguousarray(filled.reshape(groups, LANES, -1).swapaxes(1, 2))
 
 
-def run_many(
-    lib: Any,
-    chosen: slice,
-    *,
-    substeps: int,
-    theta: FloatArray,
-    table: FloatArray,
-    states: FloatArray,
-    given: FloatArray,
-    uniform: bool,
-    sigma: FloatArray,
-    keys: Any,
-    digests: FloatArray,
-) -> None:
-    """Some groups of LANES machines (the first axis) through all samples of `given`; states and digests are changed."""
+def run_many(lib: ctypes.CDLL, chosen: slice, lanes: Lanes, shared: Shared) -> None:
+    """Simulate the `chosen` groups of machines through all samples; their states and digests change in place."""
     lib.run_many(
-        ctypes.c_long(len(range(*chosen.indices(len(theta))))),
-        ctypes.c_long(len(given)),
-        ctypes.c_long(substeps),
-        address_of(theta[chosen]),
-        ctypes.c_long(len(table)),
-        address_of(table),
-        address_of(states[chosen]),
-        address_of(given),
-        ctypes.c_long(uniform),
-        address_of(sigma[chosen]),
-        address_of(keys[chosen]),
-        address_of(digests[chosen]),
+        ctypes.c_long(len(range(*chosen.indices(len(lanes.theta))))),
+        ctypes.c_long(len(shared.given)),
+        ctypes.c_long(shared.substeps),
+        address_of(lanes.theta[chosen]),
+        ctypes.c_long(len(shared.table)),
+        address_of(shared.table),
+        address_of(lanes.states[chosen]),
+        address_of(shared.given),
+        ctypes.c_long(shared.uniform),
+        address_of(lanes.sigma[chosen]),
+        address_of(lanes.keys[chosen]),
+        address_of(lanes.digests[chosen]),
     )

@@ -17,8 +17,8 @@ def control_currents(
     """PI control of the axis currents; `known` are the states that the controller takes for true.
 
     Returns the command to hold, the controller's states after this sample, and entries of the row. The integrals follow
-    backward Euler and wait while the half-bridges are at their limit. The current controllers run once a control period,
-    as on the machine, where both have 50 us.
+    backward Euler and wait while the half-bridges are at their limit. Current controllers and control law have the same
+    period, as on the machine (50 us).
     """
     plant, c, s, g = loop
     machine, controller, given = signals

@@ -68,6 +68,15 @@ def digest_sizes(plant: Plant) -> dict[str, int]:
     }
 
 
+def first_digest(plant: Plant, p_ref: FloatArray) -> FloatArray:
+    """The digest before the first sample of a reference p_ref, k x p; the stroke is that of the leading output."""
+    start, end = p_ref[0, plant.leading_output], p_ref[-1, plant.leading_output]
+    scale = 1 / (end - start) if end != start else 0
+    known = {"alive": 1.0, "start": start, "scale": scale, "reached": -1.0, "touched": -1.0, "culprit": -1.0}
+    sizes = digest_sizes(plant)
+    return np.repeat([known.get(name, 0.0) for name in sizes], [*sizes.values()])
+
+
 @lru_cache(maxsize=16)
 def digest_function(shape: Any) -> ca.Function:
     """(kept, row, given, theta) -> kept: what a run leaves behind, sample by sample, until something is touched."""

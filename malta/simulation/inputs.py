@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -16,10 +16,10 @@ from malta.model.data import plant_of
 from malta.model.plant import Plant, position_in
 from malta.simulation import references
 from malta.simulation.engines import evaluate
-from malta.simulation.layout import Setup, electronics_of, layout_of
+from malta.simulation.layout import electronics_of, layout_of
 from malta.simulation.noise import keys, normals
 from malta.simulation.period import state_reference
-from malta.simulation.scenario import Fault, FeedforwardChoice, Scenario
+from malta.simulation.scenario import Fault, FeedforwardChoice, Scenario, Simulation
 from malta.synthesis.controller import Controller
 
 if TYPE_CHECKING:
@@ -28,30 +28,35 @@ if TYPE_CHECKING:
 LONGEST = 4_000_000  # samples: 200 s at 20 kHz, 2 GB of trajectory
 
 
-def inputs_of(
-    plant: Plant, c: Controller, scenario: Scenario, setup: Setup
-) -> tuple[FloatArray, references.Motion, FloatArray]:
-    """Times of the samples, the motion that is asked for, and what every sample is given."""
-    samples = max(1, round(scenario.duration / c.sample_time))
+class Inputs(NamedTuple):
+    """Inputs of k samples."""
+
+    t: FloatArray  # s, k
+    motion: references.Motion  # the reference
+    given: FloatArray  # k x inputs of a sample, in the order of layout_of(...).given
+
+
+def inputs_of(run: Simulation) -> Inputs:
+    """The inputs of every sample of a simulation. Raises InputError for more than LONGEST samples."""
+    scenario, Ts = run.scenario, run.controller.sample_time
+    samples = max(1, round(scenario.duration / Ts))
     if samples > LONGEST:
         raise InputError(f"scenario {scenario.name}", "duration", f"{samples} samples", f"at most {LONGEST}")
-    t = np.arange(samples) * c.sample_time
-    motion = scenario.reference(plant)(t)
-    return t, motion, sample_inputs(plant, c, scenario, setup, motion, t)
+    t = np.arange(samples) * Ts
+    motion = scenario.reference(run.plant)(t)
+    return Inputs(t, motion, sample_inputs(run, motion, t))
 
 
-def sample_inputs(
-    plant: Plant,
-    c: Controller,
-    scenario: Scenario,
-    setup: Setup,
-    motion: references.Motion,
-    t: FloatArray,
-) -> FloatArray:
-    """What every sample is given, in the order of layout_of."""
+def sample_inputs(run: Simulation, motion: references.Motion, t: FloatArray) -> FloatArray:
+    """The inputs of the samples at t for a reference, in the order of layout_of(...).given.
+
+    v_past holds the stored forces of the samples before: the feedforward, and the force that currents commutated for
+    the reference add to it, which is in the row of the newest stored force in Ad.
+    """
+    plant, c, scenario, setup = run
     v_ff = feedforward(c, motion, scenario.feedforward)
     stored = v_ff
-    if c.delay:  # and what currents commutated for the reference make, in the row of the newest stored force
+    if c.delay:
         n, m = len(c.A), len(c.forces)
         newest = n + m * (c.delay - 1)
         states = evaluate(state_reference(plant_of(c.parameters)).map(len(t)), motion.p, motion.dp)[0]
@@ -90,6 +95,7 @@ def feedforward(c: Controller, motion: references.Motion, choice: FeedforwardCho
 
 
 def _wrench(plant: Plant, scenario: Scenario, t: FloatArray) -> FloatArray:
+    """The scenario's disturbance at t, k x disturbances. Raises InputError for another shape, or NaN."""
     assert scenario.disturbance is not None
     wrench = np.asarray(scenario.disturbance(t), dtype=float)
     shape = (len(t), len(plant.disturbances))
@@ -100,10 +106,12 @@ def _wrench(plant: Plant, scenario: Scenario, t: FloatArray) -> FloatArray:
 
 
 def _active_samples(fault: Fault, t: FloatArray) -> FloatArray:
+    """True at the samples during which a fault lasts."""
     return np.asarray((t >= fault.at) & (t < fault.until))
 
 
 def _signal_index(scenario: Scenario, kind: str, name: str, known: tuple[Any, ...]) -> int:
+    """The index of a signal by its name; InputError for an unknown one."""
     names = [signal.name for signal in known]
     if name not in names:
         raise InputError(f"scenario {scenario.name}", kind, repr(name), "one of " + " ".join(names))
@@ -113,6 +121,7 @@ def _signal_index(scenario: Scenario, kind: str, name: str, known: tuple[Any, ..
 def _fault_flags(
     plant: Plant, scenario: Scenario, sizes: Mapping[str, int], t: FloatArray
 ) -> dict[str, FloatArray]:
+    """Inputs of the faults, k x size each: stuck sensors, missed steps, the share that the link sags, open phases."""
     flags: dict[str, FloatArray] = {
         name: np.zeros((len(t), sizes[name])) for name in ("stuck", "missed", "sag", "open")
     }
@@ -136,7 +145,10 @@ def _fault_flags(
 
 
 def sensor_noise(stages: list[tuple[int, Plant]], scenario: Scenario, t: FloatArray) -> FloatArray:
-    """Sensor noise, with what faults add to it."""
+    """Noise of the sensors, k x p, in their units, with biases and larger noise of faults.
+
+    stages : (first sample, machine), as the machine's parameters and so its noise may change on the way
+    """
     plant = stages[0][1]
     drawn: FloatArray = np.zeros((len(t), len(plant.outputs)))
     if scenario.noise:
@@ -157,21 +169,21 @@ def sensor_noise(stages: list[tuple[int, Plant]], scenario: Scenario, t: FloatAr
     return drawn
 
 
-def electronics_noise(plant: Plant, setup: Setup, scenario: Scenario, periods: int) -> FloatArray:
+def electronics_noise(run: Simulation, periods: int) -> FloatArray:
     """Standard normal numbers for the electronics, a row for each of their periods."""
-    fast = electronics_of(plant, setup)
+    fast, scenario = electronics_of(run.plant, run.setup), run.scenario
     if fast is None or not fast.noises:
         return np.zeros((periods, 0))
     return normals(keys(scenario.seed, np.array([-1 - scenario.run]))[0], periods, fast.noises)
 
 
-def initial_values(
-    plant: Plant, c: Controller, scenario: Scenario, first: FloatArray
-) -> tuple[FloatArray, ...]:
-    """x, xi_pred and the currents of the coils (A) at the start.
+def initial_values(run: Simulation, first: FloatArray) -> tuple[FloatArray, ...]:
+    """x, xi_pred and the currents of the coils (A) at the start; `first` is the first row of the inputs.
 
-    On the reference and moving with it, or as the scenario says; the observer knows it, and v0 acts, unless it is cold.
+    The machine moves along the reference, but for the states that the scenario starts elsewhere. Unless the start is
+    cold, the observer knows this state and the currents make v0.
     """
+    plant, c, scenario, _ = run
     p, n = len(plant.outputs), len(c.states)
     believed = plant_of(c.parameters)
     design = [s.name for s in plant.design_states]
@@ -182,7 +194,7 @@ def initial_values(
         if c.tracks == "states":
             xi_pred[: len(design)] = x[list(plant.controlled)]
         held = c.feedforward.at(position_in(plant, x))
-        if c.delay:  # what acted before, with currents that were commutated for here
+        if c.delay:  # the stored forces of the samples before, with currents commutated for this position
             n, m = len(design), len(held)
             pull = c.Ad[n + m * (c.delay - 1) : n + m * c.delay, :n] @ (xi_pred[:n] - moving)
             stored = first[2 * p + m :][: m * c.delay]
@@ -193,7 +205,7 @@ def initial_values(
 
 @lru_cache(maxsize=16)
 def _holding_currents(plant: Plant, believed: Plant) -> ca.Function:
-    """(x, v) -> currents of the coils that the controller holds a machine at x with, as a function of numbers."""
+    """(x, v) -> coil currents (A) that the controller commands for forces v while the machine is at x."""
     kind = ca.MX if believed.tabulated else ca.SX
     x, v = kind.sym("x", len(plant.states)), kind.sym("v", len(plant.inputs))
     return ca.Function("currents", [x, v], [ca.densify(believed.currents(plant.h(x, 0), v))])

@@ -168,8 +168,25 @@ class Scenario:
         return cls("stroke", duration, reference, **options)
 
 
+class Simulation(NamedTuple):
+    """A scenario on a machine under its controller, and the setup that follows from the three."""
+
+    plant: Plant
+    controller: Controller
+    scenario: Scenario
+    setup: Setup
+
+
+def simulation_of(plant: Plant, controller: Controller, scenario: Scenario) -> Simulation:
+    """The record of a simulation. Raises InputError as `setup_of` does."""
+    return Simulation(plant, controller, scenario, setup_of(plant, controller, scenario))
+
+
 def setup_of(plant: Plant, c: Controller, s: Scenario) -> Setup:
-    """What of a scenario shapes the simulated functions."""
+    """The setup of a scenario: the part of it that decides which functions are simulated.
+
+    Raises InputError for a fidelity, faults or options that the machine does not have.
+    """
     kinds = {fault.kind for fault in s.faults}
     if "open phase" in kinds and s.fidelity != "phase":
         found = f"an open phase at fidelity {s.fidelity}"

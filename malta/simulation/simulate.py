@@ -6,7 +6,7 @@ all that the simulation knows of the controller; the machine may have other para
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, get_args
 
@@ -17,18 +17,25 @@ from malta.model.data import plant_of, shaping, units_of
 from malta.model.plant import Plant
 from malta.simulation import references
 from malta.simulation.engines import EngineChoice, engine_of, evaluate, substeps_until
-from malta.simulation.inputs import electronics_noise, initial_values, inputs_of, sample_inputs, sensor_noise
-from malta.simulation.layout import Setup
+from malta.simulation.inputs import (
+    Inputs,
+    electronics_noise,
+    initial_values,
+    inputs_of,
+    sample_inputs,
+    sensor_noise,
+)
 from malta.simulation.period import initial_state_function
-from malta.simulation.scenario import Scenario, setup_of, steps_of, substeps_of
+from malta.simulation.scenario import Scenario, Simulation, simulation_of, steps_of, substeps_of
 from malta.simulation.trajectory import Trajectory, label_rows
 from malta.simulation.verdict import Verdict, columns_of, judge
 from malta.synthesis.controller import Controller
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
+    from malta.simulation.start_up import Observer
 
-PORTION = 20_000  # samples between looks at how the run goes
+PORTION = 20_000  # samples of the longest portion: between two portions progress is reported
 
 
 def simulate(
@@ -39,82 +46,100 @@ def simulate(
     engine: EngineChoice = "auto",
     progress: Callable[[float], None] | None = None,
 ) -> Trajectory:
-    """Run a scenario. Touchdown and divergence end it early and are named in the verdict, not raised.
+    """Simulate a scenario. Touchdown and divergence end it early; the verdict names them, and nothing is raised.
 
     engine : "auto" compiles where there is a C compiler
-    progress : told the share that is done, now and then; Ctrl-C ends the run there and keeps what was computed
+    progress : called now and then with the share of the samples that is done
+
+    Ctrl-C ends the simulation; the trajectory then has the samples that were computed, and the verdict "interrupted".
 
     Raises InputError when plant and controller do not belong together or the scenario does not fit the plant.
+
+        controller = malta.gains.read("design/gains/calibrated.json")
+        run = malta.simulate(malta.plant_of(controller.parameters), controller, malta.Scenario.stroke(10e-3))
     """
     believed = plant_of(controller.parameters)
     if (plant.inputs, plant.outputs) != (believed.inputs, believed.outputs):
         raise InputError("simulate", "controller", f"gains of a {believed.name}", f"gains of a {plant.name}")
     if engine not in get_args(EngineChoice):
         raise InputError("simulate", "engine", repr(engine), "one of " + ", ".join(get_args(EngineChoice)))
-    setup = setup_of(plant, controller, scenario)
-    t, motion, given = inputs_of(plant, controller, scenario, setup)
+    simulation = simulation_of(plant, controller, scenario)
+    inputs = inputs_of(simulation)
+    parts: list[FloatArray] = []
+    verdict: Verdict | None = None
+    kind, done = "", 0
+    try:
+        for rows, end, engine_kind in _portions(simulation, inputs, engine):
+            parts.append(rows)
+            verdict, kind, done = end, engine_kind, done + len(rows)
+            if verdict is not None:
+                break
+            if progress is not None:
+                progress(done / len(inputs.t))
+    except KeyboardInterrupt:
+        if not parts:
+            raise
+        verdict = Verdict("interrupted", float(inputs.t[done - 1]))
+    table = np.concatenate(parts) if len(parts) > 1 else parts[0]
+    return label_rows(simulation, inputs, table, verdict, kind)
+
+
+def _portions(
+    simulation: Simulation, inputs: Inputs, choice: EngineChoice
+) -> Iterator[tuple[FloatArray, Verdict | None, str]]:
+    """Simulate portion by portion: rows, the verdict if one ends the run there, and the engine's kind.
+
+    Between portions the machine's parameters may change, and an outer loop may correct the reference.
+    """
+    plant, controller, scenario, setup = simulation
+    t, _, given = inputs
     samples = len(t)
     stages = _stages(plant, scenario, controller.sample_time)
     noise = sensor_noise(stages, scenario, t)
     steps = substeps_of(plant, controller, setup, scenario)
-    fast = electronics_noise(plant, setup, scenario, substeps_until(samples, steps))
-    x, xi_pred, current = initial_values(plant, controller, scenario, given[0])
+    fast = electronics_noise(simulation, substeps_until(samples, steps))
     start = initial_state_function(plant, controller, setup)
-    state = evaluate(start, x, xi_pred, current)[0].ravel()
-    observer = _observer(plant, controller, scenario, setup) if setup.outside else None
+    state = evaluate(start, *initial_values(simulation, given[0]))[0].ravel()
+    observer = _observer(simulation) if setup.outside else None
     every = _samples_between_stops(scenario, controller.sample_time)
-    stops = _stops(every, samples, [first for first, _ in stages])
-    parts: list[FloatArray] = []
-    verdict, kind, done = None, "", 0
-    try:
-        for stop in stops:
-            now = next(p for first, p in reversed(stages) if first <= done)
-            run = engine_of(now, controller, setup, steps, _sensor_errors(scenario), engine)
-            part = given[done:stop]
+    done = 0
+    for stop in _stops(every, samples, [first for first, _ in stages]):
+        now = next(p for first, p in reversed(stages) if first <= done)
+        engine = engine_of(now, controller, setup, steps, _sensor_errors(scenario), choice)
+        part = slice(done, stop)
+        if observer is None:
             jitter = fast[substeps_until(done, steps) : substeps_until(stop, steps)]
-            if observer is None:
-                state, rows = run.run(done, state, part, noise[done:stop], jitter)
-            else:
-                state, rows = observer(run, now, state, part, noise[done:stop])
-            rows, verdict = judge(plant, controller, setup, rows, t[done:stop])
-            parts.append(rows)
-            kind, done = run.kind, done + len(rows)
-            if verdict is not None:
-                break
-            if progress is not None:
-                progress(done / samples)
-            if scenario.correction is not None and done < samples and done % every == 0:
-                offset = np.asarray(
-                    scenario.correction.update(
-                        float(t[done]), columns_of(plant, controller, setup, rows[-1], "p")
-                    ),
-                    dtype=float,
-                )
-                if offset.shape != motion.p.shape[1:]:
-                    expected = f"{motion.p.shape[1]} numbers"
-                    raise InputError(
-                        f"scenario {scenario.name}", "correction", f"shape {offset.shape}", expected
-                    )
-                # Up to the next correction; the samples before are there for the feedforward under way.
-                before = min(done, controller.delay)
-                ahead = slice(done - before, done + every)
-                p_ref = motion.p[ahead] + offset
-                p_ref[:before] = given[done - before : done, : len(offset)]  # as they were
-                shifted = references.Motion(*(part[ahead] for part in motion))._replace(p=p_ref)
-                new = sample_inputs(plant, controller, scenario, setup, shifted, t[ahead])
-                given[done : done + every] = new[before:]
-    except KeyboardInterrupt:
-        if not parts:
-            raise
-        verdict = Verdict("interrupted", float(t[done - 1]))
-    table = np.concatenate(parts) if len(parts) > 1 else parts[0]
-    return label_rows(plant, controller, scenario, setup, (t, given), table, verdict, kind)
+            state, rows = engine.run(done, state, given[part], noise[part], jitter)
+        else:
+            state, rows = observer(engine, now, state, given[part], noise[part])
+        rows, verdict = judge(simulation, rows, t[part])
+        done += len(rows)
+        yield rows, verdict, engine.kind
+        if scenario.correction is not None and done < samples and done % every == 0:
+            p = columns_of(simulation, rows[-1], "p")
+            offset = np.asarray(scenario.correction.update(float(t[done]), p), dtype=float)
+            _correct(simulation, inputs, slice(done, done + every), offset)
+
+
+def _correct(simulation: Simulation, inputs: Inputs, ahead: slice, offset: FloatArray) -> None:
+    """Add an outer loop's offset to the reference of the samples `ahead`, in place. Raises InputError for its shape."""
+    t, motion, given = inputs
+    if offset.shape != motion.p.shape[1:]:
+        where, expected = f"scenario {simulation.scenario.name}", f"{motion.p.shape[1]} numbers"
+        raise InputError(where, "correction", f"shape {offset.shape}", expected)
+    # The feedforward that is under way needs the samples before, with the reference that they had.
+    before = min(ahead.start, simulation.controller.delay)
+    span = slice(ahead.start - before, ahead.stop)
+    p_ref = motion.p[span] + offset
+    p_ref[:before] = given[span.start : ahead.start, : len(offset)]
+    shifted = references.Motion(*(part[span] for part in motion))._replace(p=p_ref)
+    given[ahead] = sample_inputs(simulation, shifted, t[span])[before:]
 
 
 def integration_error(run: Trajectory) -> float:
-    """Largest error of an output that the Runge–Kutta steps made, m: against the same run with twice as many.
+    """Largest error of an output (m) that the Runge–Kutta steps make, from a second run with twice as many steps.
 
-    Halving the steps of a fourth-order method leaves 1/16 of the error, so the difference is 15/16 of it.
+    Half the step of a fourth-order method leaves 1/16 of the error, so the runs differ by 15/16 of it.
     """
     s = run.scenario
     count = steps_of(run.plant, run.controller, s)
@@ -124,18 +149,22 @@ def integration_error(run: Trajectory) -> float:
 
 
 def _sensor_errors(scenario: Scenario) -> tuple[tuple[str, float], ...]:
+    """Errors of the sensors by name, as a key of `engine_of`'s memory."""
     return tuple(sorted((scenario.sensor_errors or {}).items()))
 
 
-def _observer(plant: Plant, c: Controller, scenario: Scenario, setup: Setup) -> Any:
+def _observer(simulation: Simulation) -> Observer:
+    """The Kalman filter of a scenario that asks for one."""
     from malta.simulation.start_up import observer  # filterpy takes a while to import
 
-    count = steps_of(plant, c, scenario)
-    return observer(plant, c, setup, scenario.estimator, count, scenario.sensor_errors)
+    return observer(simulation, steps_of(simulation.plant, simulation.controller, simulation.scenario))
 
 
 def _stages(plant: Plant, scenario: Scenario, Ts: float) -> list[tuple[int, Plant]]:
-    """From which sample on which machine is simulated."""
+    """(first sample, machine): the machine before and after every change of its parameters.
+
+    Raises InputError for unknown parameters, and for those that shape the machine's functions.
+    """
     stages = [(0, plant)]
     for at, values in sorted(scenario.changes, key=lambda change: change[0]):
         known = units_of(plant.parameters)
@@ -156,11 +185,11 @@ def _stages(plant: Plant, scenario: Scenario, Ts: float) -> list[tuple[int, Plan
 
 
 def _samples_between_stops(scenario: Scenario, Ts: float) -> int:
-    """Samples between corrections of the reference, or between looks at the run."""
+    """Samples of a portion: from one correction of the reference to the next, at most PORTION without corrections."""
     return PORTION if scenario.correction is None else max(1, round(scenario.correction.every / Ts))
 
 
 def _stops(every: int, samples: int, changes: list[int]) -> list[int]:
-    """Samples at which the run pauses: to look, to correct the reference, to change the machine."""
+    """Samples at which a portion ends: for progress, a correction of the reference, or a change of the machine."""
     marks = set(range(every, samples, every)) | set(range(PORTION, samples, PORTION)) | {samples}
     return sorted(marks | {k for k in changes if 0 < k < samples})

@@ -23,8 +23,9 @@ from malta.margins.uncertain import holds
 from malta.model.data import plant_of
 from malta.model.plant import Plant
 from malta.simulation.engines import Engine
-from malta.simulation.layout import Setup, layout_of, numbers_of
+from malta.simulation.layout import layout_of, numbers_of
 from malta.simulation.period import period_of
+from malta.simulation.scenario import Simulation
 from malta.simulation.substep import runge_kutta
 from malta.synthesis.controller import Controller, Noise
 
@@ -36,8 +37,15 @@ Observer = Callable[
 ]
 
 
-def observer(plant: Plant, c: Controller, setup: Setup, kind: str, substeps: int, errors: Any) -> Observer:
-    """Runs control periods one by one with an estimate of its own: (engine, state, given, noise) -> (state, rows)."""
+def observer(simulation: Simulation, substeps: int) -> Observer:
+    """A function that simulates sample by sample with the estimate of a Kalman filter of filterpy.
+
+    It takes (engine, machine, state, inputs, noise) and returns (state, rows), as an engine does.
+
+    Raises InputError for a controller that is no LQG with integrals, and for a machine whose currents are held.
+    """
+    plant, c, scenario, setup = simulation
+    kind, errors = scenario.estimator, scenario.sensor_errors
     if c.noise is None or c.observed:
         without = "a PID" if c.tracks == "states" else "a law of errors"
         found = without if c.noise is None else "forces of disturbance in its own"

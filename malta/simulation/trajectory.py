@@ -15,8 +15,9 @@ import numpy as np
 from malta.files import replace_files
 from malta.model.plant import Plant, Signal, readonly
 from malta.simulation.engines import evaluate
-from malta.simulation.layout import Setup, electronics_of, layout_of
-from malta.simulation.scenario import Scenario, setup_of
+from malta.simulation.inputs import Inputs
+from malta.simulation.layout import electronics_of, layout_of
+from malta.simulation.scenario import Scenario, Simulation, setup_of
 from malta.simulation.verdict import Verdict, bearing_verdict, judge
 from malta.synthesis.controller import Controller
 
@@ -102,37 +103,23 @@ SERIES = (
 )
 
 
-def trajectory_of(
-    plant: Plant,
-    controller: Controller,
-    scenario: Scenario,
-    setup: Setup,
-    asked: tuple[FloatArray, FloatArray],
-    rows: FloatArray,
-    kind: str,
-) -> Trajectory:
-    """The trajectory of a run whose rows, one for each sample, are there already; `asked` as `sampled` gives them."""
-    rows, verdict = judge(plant, controller, setup, rows, asked[0])
-    return label_rows(plant, controller, scenario, setup, asked, rows, verdict, kind)
+def trajectory_of(run: Simulation, inputs: Inputs, rows: FloatArray, kind: str) -> Trajectory:
+    """The trajectory of a run from rows that are there already, one for each sample of the inputs."""
+    rows, verdict = judge(run, rows, inputs.t)
+    return label_rows(run, inputs, rows, verdict, kind)
 
 
 def label_rows(
-    plant: Plant,
-    controller: Controller,
-    scenario: Scenario,
-    setup: Setup,
-    asked: tuple[FloatArray, FloatArray],
-    table: FloatArray,
-    verdict: Verdict | None,
-    kind: str,
+    run: Simulation, inputs: Inputs, rows: FloatArray, verdict: Verdict | None, kind: str
 ) -> Trajectory:
-    """Rows up to the verdict as labelled series."""
-    (t, given), done = asked, len(table)
-    for array in (table, given, t):
+    """The trajectory of rows up to a verdict; None: no contact and no divergence ended the run."""
+    plant, controller, scenario, setup = run
+    (t, _, given), done = inputs, len(rows)
+    for array in (rows, given, t):
         array.flags.writeable = False  # the trajectory's series are views of them
     sizes = layout_of(plant, controller, setup).row
-    columns = dict(zip(sizes, np.split(table, np.cumsum([*sizes.values()])[:-1], axis=1), strict=True))
-    if setup.bearing and (verdict is None or verdict.name in plant.contacts):  # what it touched first
+    columns = dict(zip(sizes, np.split(rows, np.cumsum([*sizes.values()])[:-1], axis=1), strict=True))
+    if setup.bearing and (verdict is None or verdict.name in plant.contacts):
         verdict = bearing_verdict(plant, columns["contact"], t) or verdict
     return Trajectory(
         plant,

@@ -7,15 +7,18 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from malta.model.plant import Plant
-from malta.simulation.layout import Setup, layout_of
-from malta.synthesis.controller import Controller
+from malta.simulation.layout import layout_of
+from malta.simulation.scenario import Simulation
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
 
 
 class Verdict(NamedTuple):
-    """How a simulation ended: "completed", "diverged", or what was touched; and when (s)."""
+    """How a simulation ended, and when (s).
+
+    The name is "completed", "diverged", "interrupted", "not lifted", or the contact that was touched.
+    """
 
     name: str
     time: float
@@ -25,16 +28,17 @@ class Verdict(NamedTuple):
         return self.name == "completed"
 
 
-def judge(
-    plant: Plant, c: Controller, setup: Setup, rows: FloatArray, t: FloatArray
-) -> tuple[FloatArray, Verdict | None]:
-    """The rows up to the first at which the machine touches something or its state is no number."""
-    contact = columns_of(plant, c, setup, rows, "contact")
+def judge(run: Simulation, rows: FloatArray, t: FloatArray) -> tuple[FloatArray, Verdict | None]:
+    """The rows up to the first contact or the first NaN, and the verdict; None where neither occurs.
+
+    A machine with touchdown bearings goes on after it touches one of them; only other contacts end its run.
+    """
+    plant, contact = run.plant, columns_of(run, rows, "contact")
     if np.isfinite(rows[-1]).all() and contact.max(initial=0.0) < 1:
         return rows, None  # a state that is no number stays none
     lost = np.atleast_1d(~np.isfinite(rows).all(axis=1))
     touching = contact >= 1
-    if setup.bearing:  # the touchdown bearings hold it: only what has no bearing ends the run
+    if run.setup.bearing:
         touching = touching & ~np.array(plant.cushioned)
     stopped = np.flatnonzero(lost | touching.any(axis=1))
     if not len(stopped):
@@ -45,7 +49,10 @@ def judge(
 
 
 def bearing_verdict(plant: Plant, contact: FloatArray, t: FloatArray) -> Verdict | None:
-    """With touchdown bearings: None where the mover stayed off them, or lifted off and is free at the end."""
+    """The verdict of a run with touchdown bearings.
+
+    None where the mover never touched them, or where it rested on them at the start and is free at the end.
+    """
     touching = contact >= 1
     if not touching.any():
         return None
@@ -57,7 +64,8 @@ def bearing_verdict(plant: Plant, contact: FloatArray, t: FloatArray) -> Verdict
     return Verdict(plant.contacts[int(contact[k].argmax())], float(t[k]))
 
 
-def columns_of(plant: Plant, c: Controller, setup: Setup, rows: FloatArray, name: str) -> FloatArray:
-    sizes = layout_of(plant, c, setup).row
+def columns_of(run: Simulation, rows: FloatArray, name: str) -> FloatArray:
+    """The columns of one signal of `layout_of(...).row`; rows has any number of leading axes."""
+    sizes = layout_of(run.plant, run.controller, run.setup).row
     first = sum(size for key, size in list(sizes.items())[: list(sizes).index(name)])
     return rows[..., first : first + sizes[name]]
