@@ -1,1 +1,4 @@
-"""Campaigns: plans of many runs, blocks in a folder, threads or a cluster, statistics."""
+"""Campaigns: one scenario on thousands of machines.
+
+plan -> block -> store -> result -> statistics, with run.py above them and dask.py for a cluster
+"""

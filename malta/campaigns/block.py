@@ -14,17 +14,21 @@ if TYPE_CHECKING:
 
 
 class Block(NamedTuple):
-    """Some runs of a plan, from one index on."""
+    """The runs of a block, a row for each."""
 
-    values: FloatArray  # runs x names, SI: the values of what varies
+    values: FloatArray  # runs x names, SI: drawn parameters and errors of the sensors
     batch: Batch
-    engine: str  # what flew them: "compiled" or "virtual machine"
+    engine: str  # that simulated them: "compiled" or "virtual machine"
 
 
 def fly(
     plan: Plan, first: int, count: int, workers: int | None = None, progress: Progress | None = None
 ) -> Block:
-    """Simulate runs `first` to `first + count` of a plan. `first` is a multiple of the lanes of the engine."""
+    """Simulate the `count` runs of a plan from run `first` on.
+
+    first : a multiple of LANES, so that a run has the same place in its group of machines in every block
+    workers : threads; None: one for each core
+    """
     machines = draw_machines(plan)
     scenario, part = planned_run(plan).scenario, slice(first, first + count)
     batch = simulate_many(

@@ -1,4 +1,4 @@
-"""Blocks of a campaign on a Dask cluster. The only module that imports dask.distributed, which is an extra."""
+"""Simulate the blocks of a campaign on a Dask cluster. Only this module imports dask.distributed, which is an extra."""
 
 from __future__ import annotations
 
@@ -25,25 +25,25 @@ WAIT = 30.0  # s without any worker, after which the campaign stops
 
 @dataclass(frozen=True)
 class _Task:
-    """A plan on its way to a worker, which keeps the first copy that it is sent.
+    """A plan as it is sent to a worker, which keeps the first copy.
 
-    A machine of the user's own goes along as the text of its modules: the worker has no file of it.
+    The text of the machine's modules is sent along for a machine of the user's own, of which the worker has no file.
     """
 
     identity: str
     version: str  # of malta
     machine: str
     sources: Mapping[str, str] = field(compare=False)  # of the machine's modules, by their names
-    plan: bytes = field(compare=False)  # pickled: it can be read once the machine is there
+    plan: bytes = field(compare=False)  # pickled: a worker loads the machine before it reads the plan
 
 
 def blocks(address: str, plan: Plan, left: Mapping[int, int]) -> Iterator[tuple[int, Block]]:
-    """Blocks as workers finish them; a block whose worker dies goes to another one.
+    """(first run, block) as workers finish them; the block of a worker that dies goes to another worker.
 
     left : first run -> number of runs
 
     Raises InputError when dask.distributed is not installed, nothing answers at the address, no worker comes, or a
-    worker cannot do it.
+    worker fails.
     """
     try:
         import distributed
@@ -74,7 +74,7 @@ def _collect(
             if alone >= WAIT:
                 raise InputError("--cluster", address, "no workers", "a scheduler with some") from None
             continue
-        except Exception as error:  # the scheduler is gone, and with it what was under way
+        except Exception as error:  # the scheduler is gone, and with it the blocks that were under way
             raise InputError(
                 "--cluster", address, f"the connection lost ({type(error).__name__})", AGAIN
             ) from error
@@ -92,7 +92,7 @@ AGAIN = "the same command once more: it goes on with what is left"
 
 @contextmanager
 def _silence_loggers() -> Iterator[None]:
-    """Without the library's own messages: that a worker is lost is no news, other failures become one sentence."""
+    """Silence the library's loggers: a lost worker is no failure here, and every failure becomes one sentence."""
     loggers = [
         logging.getLogger(name) for name in logging.root.manager.loggerDict if name.startswith("distributed")
     ]
@@ -107,13 +107,16 @@ def _silence_loggers() -> Iterator[None]:
 
 
 def _connect(dask: Any, address: str) -> Any:
-    """A client of the scheduler. In a thread: what accepts the connection and says nothing would hold it forever."""
+    """A client of the scheduler at an address; InputError where none answers.
+
+    The client connects in a thread: a server that accepts the connection and stays silent would block it forever.
+    """
     found: list[Any] = []
 
     def connect() -> None:
         try:
             found.append(dask.Client(address, timeout=ANSWER, set_as_default=False))
-        except Exception as error:  # what answers may be anything
+        except Exception as error:  # any kind of server may answer
             found.append(error)
 
     thread = Thread(target=connect, daemon=True)
@@ -128,7 +131,7 @@ def _connect(dask: Any, address: str) -> Any:
 def _workers(client: Any) -> int:
     try:
         return len(client.nthreads())
-    except Exception:  # a scheduler that is lost says so in many ways
+    except Exception:  # a lost scheduler raises many kinds of errors
         return 0
 
 
@@ -149,7 +152,7 @@ def _describe(error: BaseException) -> str:
 
 
 def _at_worker(task: _Task, first: int, count: int) -> Block | tuple[str, str, str, str]:
-    """A block, or the parts of the error that refuses it: one that names its fields does not travel by itself."""
+    """Simulate a block on a worker: the block, or the arguments of an InputError, which does not pickle."""
     here = version("malta")
     if here != task.version:
         return "--cluster", "a worker", f"malta {here}", f"malta {task.version}"
@@ -161,7 +164,7 @@ def _at_worker(task: _Task, first: int, count: int) -> Block | tuple[str, str, s
 
 @lru_cache(maxsize=4)
 def _unpickle_plan(task: _Task) -> Plan:
-    """The plan, read once: what is computed for its machines and its scenario is kept by its place in memory."""
+    """The plan of a task, unpickled once: results for its machines and its scenario are cached by the object's id."""
     if task.sources:
         load_sources(task.machine, task.sources)
     plan: Plan = pickle.loads(task.plan)

@@ -1,7 +1,7 @@
-"""What a campaign flies: one scenario on machines drawn from a box.
+"""Plans: one scenario on machines that are drawn from a box of parameters.
 
-A plan decides everything: run i has the same machine, sensor errors and noise whatever flies it, with whatever company
-and in whatever order. Its manifest names all that it depends on.
+A plan decides every run. Machine, errors of the sensors and noise of run i do not depend on the workers, on the order
+of the runs, or on the other runs of its block. The manifest of a plan lists everything that the runs depend on.
 """
 
 from __future__ import annotations
@@ -41,23 +41,27 @@ SAMPLERS: tuple[Sampler, ...] = get_args(Sampler)
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """Everything that decides what a campaign finds.
+    """The plan of a campaign: controller, scenario, and the box from which the machines are drawn.
 
-    Values are uniform in their boxes. Parameters that are declared twins (I_xx and I_yy) and equal stay equal.
+    Values are uniform in the box. Twins, parameters that a machine declares equal (I_xx and I_yy), stay equal.
 
-    Raises InputError for what cannot be flown: an unknown scenario, case, option, parameter or sensor error, a spread
-    that is no share from 0 to 1, a scenario that changes the machine in flight.
+    Raises InputError for an unknown scenario, case, option, parameter or error of a sensor, for a spread outside 0 to
+    1, and for a scenario that changes the machine on the way.
     """
 
     controller: Controller
-    scenario: str = "stroke"  # an experiment that many can fly, see experiments.CASES
-    spread: Mapping[str, float] = field(default_factory=dict)  # parameter -> share, either way
-    sensor_spread: Mapping[str, float] = field(default_factory=dict)  # error of a sensor -> SI, either way
+    scenario: str = "stroke"  # an experiment of the machine's CASES, see simulation/experiments.py
+    spread: Mapping[str, float] = field(
+        default_factory=dict
+    )  # parameter -> share of its value, to either side
+    sensor_spread: Mapping[str, float] = field(
+        default_factory=dict
+    )  # error of a sensor -> SI, to either side
     samples: int = 10_000
     seed: int = 0  # of the machines and of the noise
     sampler: Sampler = "latin-hypercube"
-    parameters: Any = None  # the machine in the middle of the box; None: the one in the gain file
-    case: str | None = None  # of a scenario with several, by its label; None: the first
+    parameters: Any = None  # of the machine in the middle of the box; None: those of the gain file
+    case: str | None = None  # label of one of the scenario's cases; None: the first
     options: Mapping[str, Any] = field(
         default_factory=dict
     )  # of the scenario, SI; the noise is 1 unless given
@@ -93,7 +97,7 @@ class Plan:
 
     @property
     def manifest(self) -> dict[str, Any]:
-        """The plan as plain tables; SI. Two plans with the same manifest are the same."""
+        """The plan as plain tables, SI. Plans with equal manifests have equal runs."""
         return _manifest(self)
 
     @property
@@ -103,7 +107,10 @@ class Plan:
 
 
 def box_of(gains: str | Path, published: Mapping[str, Any] | None = None) -> dict[str, float]:
-    """The uncertain parameters of a gain file and their spreads: its own, else those that the machine's paper names."""
+    """The uncertain parameters of a gain file with their spreads, else those that the machine's paper names.
+
+    Raises InputError where neither names any.
+    """
     robust = decode(Path(gains)).get("verification", {}).get("robust") or {}
     own = robust.get("uncertainty") or (published or {}).get("position_controller", {}).get("uncertainty")
     if not own:
@@ -114,6 +121,7 @@ def box_of(gains: str | Path, published: Mapping[str, Any] | None = None) -> dic
 
 
 def _check_counts(plan: Plan) -> None:
+    """InputError for numbers out of range, an unknown sampler, or options that the plan itself decides."""
     for name, least in (("samples", 1), ("seed", 0)):
         value = getattr(plan, name)
         if not isinstance(value, int) or isinstance(value, bool) or value < least:
@@ -133,6 +141,7 @@ MOST = 10_000_000  # runs: their digests fill 3 GB
 
 
 def _check_spread(plan: Plan, units: Mapping[str, str]) -> None:
+    """InputError for a spread of no parameter, of an unknown one, out of range, or different for twins."""
     if not plan.spread and not plan.sensor_spread:
         raise InputError("campaign", "spread", "nothing", "a parameter that varies, by 0 % if need be")
     for name, share in plan.spread.items():
@@ -180,7 +189,7 @@ def _manifest(plan: Plan) -> dict[str, Any]:
 
 
 def _use_integers(value: Any) -> Any:
-    """Whole numbers as such: noise 1 and noise 1.0 are the same plan."""
+    """The same tables with integers in place of whole floats: noise 1 and noise 1.0 are the same plan."""
     if isinstance(value, dict):
         return {key: _use_integers(entry) for key, entry in value.items()}
     if isinstance(value, list):
@@ -193,13 +202,15 @@ def _compact_json(content: Mapping[str, Any]) -> bytes:
 
 
 def fingerprint(record: Any) -> str:
-    """sha256 of every number and name in a controller: the same for a gain file's .json, .npz and .mat."""
+    """sha256 of every number and name in a record: equal for a gain file's .json, .npz and .mat."""
     marks = hashlib.sha256()
 
     def add(value: Any) -> None:
         if isinstance(value, np.ndarray | float | int):
             marks.update(f"{np.shape(value)}".encode())
-            marks.update((np.asarray(value, dtype="<f8") + 0.0).tobytes())  # a file keeps no negative zeros
+            marks.update(
+                (np.asarray(value, dtype="<f8") + 0.0).tobytes()
+            )  # files do not store the sign of a zero
         elif is_dataclass(value):
             for f in fields(value):
                 if f.metadata.get("later") and getattr(value, f.name) == f.default:
@@ -218,7 +229,10 @@ def fingerprint(record: Any) -> str:
 
 @lru_cache(maxsize=8)
 def planned_run(plan: Plan) -> Wanted:
-    """The scenario of a plan, with its seed, and what single runs of it are looked at for."""
+    """The case that a plan simulates: its label, its scenario with the plan's seed, its figures of merit.
+
+    Raises InputError for an unknown case, and where every case needs an estimator outside the controller.
+    """
     cases = cases_of(plan.scenario, plan.plant, plan.controller, **plan.options)
     able = {case.label: case for case in cases if case.scenario.estimator == "steady-state"}
     if not able:
@@ -228,7 +242,7 @@ def planned_run(plan: Plan) -> Wanted:
     if label not in able:
         raise InputError("campaign", f"{plan.scenario}: case", repr(label), "one of " + ", ".join(able))
     scenario = replace(able[label].scenario, seed=plan.seed)
-    if plan.sensor_spread:  # on top of what the scenario's sensors have
+    if plan.sensor_spread:  # added to the errors that the scenario's sensors have
         scenario = replace(scenario, sensor_errors=dict(scenario.sensor_errors or {}))
     return able[label]._replace(scenario=scenario)
 
@@ -238,13 +252,13 @@ class Machines(NamedTuple):
 
     changes: Mapping[str, FloatArray]  # parameters
     sensor_errors: Mapping[str, FloatArray]
-    names: tuple[str, ...]  # of what varies by itself, parameters first
+    names: tuple[str, ...]  # of the independent values, parameters first; twins follow
     values: FloatArray  # runs x names, SI
 
 
 @lru_cache(maxsize=8)
 def draw_machines(plan: Plan) -> Machines:
-    """Draw all machines of a plan. The same plan gives the same machines."""
+    """Draw all machines of a plan. The same plan always gives the same machines."""
     twins = {name: twin for name, twin in twins_of(plan.parameters).items() if name in plan.spread}
     own = {name: twin for name, twin in twins.items() if twin in plan.spread}
     parameters = [name for name in plan.spread if name not in own]
@@ -265,9 +279,9 @@ def draw_machines(plan: Plan) -> Machines:
 
 
 def _unit_box(plan: Plan, dimensions: int) -> FloatArray:
-    """Points of the unit box, runs x dimensions."""
+    """Points in the unit box, runs x dimensions, by the plan's sampler and seed."""
     if plan.sampler == "latin-hypercube":
         return np.asarray(qmc.LatinHypercube(dimensions, rng=plan.seed).random(plan.samples))
-    # A power of two keeps the sequence balanced; its first points are used.
+    # Sobol sequences are balanced for powers of two; the first points of such a sequence are used.
     points = qmc.Sobol(dimensions, rng=plan.seed).random_base2(math.ceil(math.log2(max(plan.samples, 2))))
     return np.asarray(points[: plan.samples])

@@ -25,26 +25,26 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Campaign:
-    """What a campaign found: a row for each run that was flown. SI."""
+    """The result of a campaign: a row for each run that was simulated. SI."""
 
     plan: Plan
     index: NDArray[np.int64]  # of each run
-    names: tuple[str, ...]  # of what was varied: parameters, then errors of the sensors
+    names: tuple[str, ...]  # of the values that vary: parameters, then errors of the sensors
     values: FloatArray  # runs x names, SI
     batch: Batch
-    engines: tuple[str, ...]  # what flew them: "compiled" or "virtual machine"
-    interrupted: bool = False  # by Ctrl-C: the runs are those of the blocks that were done
-    damaged: tuple[Path, ...] = ()  # blocks that could not be read, and were flown again
+    engines: tuple[str, ...]  # that simulated them: "compiled" or "virtual machine"
+    interrupted: bool = False  # Ctrl-C ended the campaign: it has the runs of the blocks before
+    damaged: tuple[Path, ...] = ()  # files of blocks that could not be read; their runs were simulated again
     folder: Path | None = None
 
     @property
     def completed(self) -> NDArray[np.bool_]:
-        """True where the run went to its end."""
+        """True for each run that reached the end of the scenario."""
         return np.asarray(self.batch.completed == 1)
 
     @property
     def ends(self) -> dict[str, int]:
-        """How often runs ended in which way, by the names of simulate.Verdict."""
+        """Number of runs by the name of their verdict."""
         counts = np.bincount(self.batch.verdict.astype(int), minlength=len(verdicts(self.plan.plant)))
         return {name: int(n) for name, n in zip(verdicts(self.plan.plant), counts, strict=True) if n}
 
@@ -54,17 +54,16 @@ class Campaign:
         return rate(int(self.completed.sum()), len(self.index))
 
 
-def gather(
-    plan: Plan,
-    done: Mapping[int, Block],
-    parts: Mapping[int, int],
-    place: Path | None,
-    damaged: tuple[Path, ...],
-    interrupted: bool,
-) -> Campaign:
+def gather(plan: Plan, done: Mapping[int, Block]) -> Campaign:
+    """The campaign of the blocks that are done, by their first runs, in order of the runs."""
     order = sorted(done)
     blocks = [done[first] for first in order]
-    index = np.concatenate([np.empty(0, np.int64), *(np.arange(k, k + parts[k]) for k in order)])
+    index = np.concatenate(
+        [
+            np.empty(0, np.int64),
+            *(np.arange(k, k + len(b.values)) for k, b in zip(order, blocks, strict=True)),
+        ]
+    )
     index.flags.writeable = False
     names = draw_machines(plan).names
     return Campaign(
@@ -74,13 +73,11 @@ def gather(
         readonly(np.concatenate([b.values for b in blocks]) if blocks else np.empty((0, len(names)))),
         _join(plan, [b.batch for b in blocks]),
         tuple(sorted({b.engine for b in blocks})),
-        interrupted,
-        damaged,
-        place,
     )
 
 
 def _join(plan: Plan, batches: list[Batch]) -> Batch:
+    """The runs of several batches in one."""
     columns = {
         name: [getattr(batch, name) for batch in batches] or [np.empty((0, *shape))]
         for name, shape in figure_shapes(plan).items()
@@ -96,13 +93,17 @@ class Rate(NamedTuple):
 
     passed: int
     runs: int
-    share: float  # NaN of no runs
+    share: float  # passed / runs; NaN without runs
     low: float
     high: float
 
 
 def rate(count: int, runs: int) -> Rate:
-    """A share with the interval that holds the true one at least CONFIDENCE of the time."""
+    """The rate count / runs with its interval, which contains the true rate with a probability of CONFIDENCE or more.
+
+    >>> rate(99, 100).low
+    0.9455...
+    """
     if not runs:
         return Rate(0, 0, math.nan, 0.0, 1.0)
     low, high = binomtest(count, runs).proportion_ci(CONFIDENCE, method="exact")

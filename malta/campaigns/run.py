@@ -1,9 +1,9 @@
-"""A campaign: one scenario on thousands of machines, simulated block by block and kept in a folder.
+"""Run a campaign, on this machine or on a cluster, and simulate single runs of it again.
 
-    Plan -> fly() block by block, here or on a cluster -> Campaign
+    Plan -> fly() block by block -> Campaign
 
-Every block is kept as soon as it is done, so that a campaign that was ended in the middle goes on where it was, and one
-that is done is read.
+Every block is stored as soon as it is done. A campaign that was interrupted goes on with the blocks that are missing,
+and a campaign that is complete is read from its folder.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import signal
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import FrameType
@@ -28,7 +29,7 @@ from malta.simulation.batch import record_run, replayed
 from malta.simulation.engines import EngineChoice
 from malta.simulation.experiments import Experiment, Progress, single_run
 
-BLOCK = 1024  # runs in a block, a fraction of a second of work
+BLOCK = 1024  # runs in a block: a fraction of a second of work
 
 
 SLOW_BLOCK = 32  # without a C compiler
@@ -43,24 +44,23 @@ def campaign(
     block: int | None = None,
     progress: Progress | None = None,
 ) -> Campaign:
-    """Fly a plan, or what is left of it.
+    """Simulate all runs of a plan, or those that its folder does not have yet.
 
-    folder : keeps every block as soon as it is done, and the manifest; None: nothing is written
+    folder : stores every block as soon as it is done, and the manifest; None: nothing is written
     workers : threads on this machine; None: one for each core
-    cluster : address of a Dask scheduler, as tcp://host:8786, whose workers fly the blocks
-    block : runs in a block, a multiple of 8; a folder that was begun keeps its own
-    progress : told the share that is done, now and then
+    cluster : address of a Dask scheduler, as tcp://host:8786, whose workers simulate the blocks
+    block : runs in a block, a multiple of 8; a folder that has a campaign keeps its own number
+    progress : called now and then with the share of the runs that is done
 
-    Ctrl-C keeps what is done: the result says `interrupted`. Raises InputError for a folder that holds another campaign
-    or cannot be written to, and for a scheduler that does not answer; blocks that are done stand.
+    After Ctrl-C the result has the blocks that are done, and says `interrupted`.
+
+    Raises InputError for a folder that has another campaign or cannot be written to, and for a scheduler that does not
+    answer; blocks that are done stay in the folder.
+
+        plan = malta.Plan(malta.gains.read("design/gains/calibrated.json"), spread={"m": 0.1}, samples=1000)
+        print(malta.campaign(plan, "build/campaigns/mass").rate)
     """
-    if cluster is not None and workers is not None:
-        raise InputError("campaign", "workers", str(workers), "none with a cluster, which has its own")
-    if workers is not None and workers < 1:
-        raise InputError("campaign", "workers", str(workers), "at least 1")
-    size = block or (BLOCK if compiled.compiler() or cluster else SLOW_BLOCK)
-    if size < 1 or size % compiled.LANES:
-        raise InputError("campaign", "block", f"{size} runs", f"a multiple of {compiled.LANES}")
+    size = _block_size(block, workers, cluster)
     place = None if folder is None else Path(folder)
     if place is not None:
         size = open_folder(place, plan, size)
@@ -75,28 +75,41 @@ def campaign(
             left = {first: count for first, count in parts.items() if first not in done}
             runs = plan.samples - sum(left.values())
 
-            def told(more: float) -> None:
+            def report(more: float) -> None:
                 if progress is not None:
                     progress((runs + more) / plan.samples)
 
-            for first, new in _fly_blocks(plan, left, workers, cluster, told):
+            for first, new in _fly_blocks(plan, left, workers, cluster, report):
                 if place is not None:
                     replace_files({place / block_name(first): encode_block(new, plan)})
                 done[first] = new
                 runs += parts[first]
-                told(0)
+                report(0)
                 if pressed:
                     raise KeyboardInterrupt
     except KeyboardInterrupt:
         interrupted = True
-        if place is not None:  # one may have been kept, and not yet counted
+        if place is not None:  # the last block may be in the folder and not yet in `done`
             read_blocks(place, plan, {k: n for k, n in parts.items() if k not in done}, done)
-    return gather(plan, done, parts, place, tuple(damaged), interrupted)
+    found = gather(plan, done)
+    return replace(found, interrupted=interrupted, damaged=tuple(damaged), folder=place)
+
+
+def _block_size(block: int | None, workers: int | None, cluster: str | None) -> int:
+    """Runs in a block. Raises InputError for workers beside a cluster, and for numbers out of range."""
+    if cluster is not None and workers is not None:
+        raise InputError("campaign", "workers", str(workers), "none with a cluster, which has its own")
+    if workers is not None and workers < 1:
+        raise InputError("campaign", "workers", str(workers), "at least 1")
+    size = block or (BLOCK if compiled.compiler() or cluster else SLOW_BLOCK)
+    if size < 1 or size % compiled.LANES:
+        raise InputError("campaign", "block", f"{size} runs", f"a multiple of {compiled.LANES}")
+    return size
 
 
 @contextmanager
 def _watch_interrupts() -> Iterator[list[int]]:
-    """Ctrl-C, noted as it comes: libraries that are called while it comes now and then drop the exception."""
+    """A list that is no longer empty after Ctrl-C: libraries under the campaign may drop the KeyboardInterrupt."""
     before, pressed = signal.getsignal(signal.SIGINT), list[int]()
     if threading.current_thread() is not threading.main_thread() or not callable(before):
         yield pressed
@@ -115,46 +128,54 @@ def _watch_interrupts() -> Iterator[list[int]]:
 
 
 def _fly_blocks(
-    plan: Plan, left: Mapping[int, int], workers: int | None, cluster: str | None, told: Progress
+    plan: Plan, left: Mapping[int, int], workers: int | None, cluster: str | None, report: Progress
 ) -> Iterator[tuple[int, Block]]:
-    """Blocks as they are done; `told` the runs of those that are not."""
+    """(first run, block) for every block that is left, as soon as it is done.
+
+    left : first run -> number of runs
+    report : called with the number of runs that are done of the block that is under way
+    """
     if cluster is not None and left:
         from malta.campaigns.dask import blocks  # dask.distributed is an extra
 
         yield from blocks(cluster, plan, left)
         return
     for first, count in left.items():
-        yield first, fly(plan, first, count, workers, partial(_report_runs, told, count))
+        yield first, fly(plan, first, count, workers, partial(_report_runs, report, count))
 
 
-def _report_runs(told: Progress, count: int, share: float) -> None:
-    told(share * count)
+def _report_runs(report: Progress, count: int, share: float) -> None:
+    report(share * count)
 
 
 def replay(
     plan: Plan, index: int, *, engine: EngineChoice = "auto", progress: Progress | None = None
 ) -> Experiment:
-    """One run of a campaign with all its time series: the same machine, sensor errors and noise, to the bit.
+    """Simulate one run of a campaign again, with all its time series.
 
-    engine : "virtual machine" gives the run by itself, without the C compiler, whose last digits differ
+    Machine, errors of the sensors and noise are those of the campaign, to the bit, and so are the series.
+
+    engine : "virtual machine" needs no C compiler; its last digits differ from those of the campaign
+
+    Raises InputError for an index that the plan does not have.
     """
     if not 0 <= index < plan.samples:
         raise InputError("campaign", "run", str(index), f"0 to {plan.samples - 1}")
     if engine not in get_args(EngineChoice):
         raise InputError("campaign", "engine", repr(engine), "one of " + ", ".join(get_args(EngineChoice)))
-    machines, wanted = draw_machines(plan), planned_run(plan)
+    machines, planned = draw_machines(plan), planned_run(plan)
     changes, errors = machines.changes, machines.sensor_errors
-    plant, scenario = replayed(plan.plant, wanted.scenario, changes, index, sensor_errors=errors)
-    wanted = wanted._replace(scenario=scenario)
+    plant, scenario = replayed(plan.plant, planned.scenario, changes, index, sensor_errors=errors)
+    own = planned._replace(scenario=scenario)
     if engine == "virtual machine":
-        return single_run(plan.scenario, plant, plan.controller, wanted, engine, progress)
+        return single_run(plan.scenario, plant, plan.controller, own, engine, progress)
     run = record_run(
         plan.plant,
         plan.controller,
-        planned_run(plan).scenario,
+        planned.scenario,
         changes,
         index,
         sensor_errors=errors,
         progress=progress,
     )
-    return single_run(plan.scenario, plant, plan.controller, wanted, engine, progress, run)
+    return single_run(plan.scenario, plant, plan.controller, own, engine, progress, run)

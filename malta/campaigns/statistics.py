@@ -1,4 +1,4 @@
-"""What a campaign found: shares of runs with their intervals, figures of merit beside the paper's, the worst runs."""
+"""Statistics of a campaign: figures of merit beside the paper's, runs within its bounds, the worst runs."""
 
 from __future__ import annotations
 
@@ -25,20 +25,20 @@ class Finding(NamedTuple):
     """A figure of merit over all completed runs, SI."""
 
     label: str
-    kind: str  # figures of a kind are drawn together
-    unit: str  # to show it in
+    kind: str  # figures of one kind share a diagram
+    unit: str  # for display
     values: FloatArray  # a row for each run of the campaign; NaN where it has none
     published: float = math.nan  # SI; NaN where the paper has none
     relation: str = "at most"  # of ours to the published: "about" or "at most"
 
     @property
     def within(self) -> NDArray[np.bool_]:
-        """Which runs were completed and keep the published bound."""
+        """True for runs that were completed within the published bound."""
         return np.asarray(self.values <= self.published)
 
 
 def figures_of(found: Campaign, published: Mapping[str, Any] | None = None) -> list[Finding]:
-    """The figures of merit of a campaign, with the bounds that the paper prints of this very scenario."""
+    """The figures of merit of a campaign, with the bounds that the paper prints for this scenario."""
     plan, batch = found.plan, found.batch
     plant, done = plan.plant, found.completed
     names = [signal.name for signal in plant.outputs]
@@ -85,7 +85,7 @@ def figures_of(found: Campaign, published: Mapping[str, Any] | None = None) -> l
 
 
 def bounds_of(plan: Plan) -> Mapping[str, str]:
-    """What the machine's paper prints of this very scenario, as keys of data/published/."""
+    """The bounds that the machine's paper prints for the scenario of a plan, as keys of data/published/."""
     bounds = setting(plan.plant, "bounds", None)
     found: Mapping[str, str] = {} if bounds is None else bounds(plan.scenario, plan.options)
     return found
@@ -94,7 +94,7 @@ def bounds_of(plan: Plan) -> Mapping[str, str]:
 def runs_within_bounds(
     found: Campaign, published: Mapping[str, Any] | None = None
 ) -> NDArray[np.bool_] | None:
-    """Which runs were completed within every published bound; None where the paper has none."""
+    """True for runs that were completed within every published bound; None where the paper has no bounds."""
     bounds = [
         f for f in figures_of(found, published) if f.relation == "at most" and math.isfinite(f.published)
     ]
@@ -102,9 +102,9 @@ def runs_within_bounds(
 
 
 def worst_of(found: Campaign, count: int) -> list[int]:
-    """Rows of the worst runs, the worst first: those that ended early, then those that came closest to a touch.
+    """Rows of the worst runs, the worst first: runs that ended early, then runs that came closest to a contact.
 
-    How close is measured from the median run, which may have to go near an end stop.
+    Closeness is relative to the median run, because the scenario itself may come near an end stop.
     """
     batch = found.batch
     if not len(found.index):
@@ -115,14 +115,14 @@ def worst_of(found: Campaign, count: int) -> list[int]:
 
 
 def unit_of(plan: Plan, name: str) -> str:
-    """The unit to show a varied value in."""
+    """The unit in which a varied value is displayed."""
     errors = {signal.name: signal.unit for signal in plan.plant.sensor_errors}
     shown = {"1": "percent", "m": "um", "rad": "deg"}
     return shown.get(errors[name], errors[name]) if name in errors else units_of(plan.parameters)[name]
 
 
 def spread_text(plan: Plan, name: str) -> str:
-    """How far a value varies, either way."""
+    """The spread of a value to either side as text, as "±10 %"."""
     if name in plan.spread:
         return f"±{100 * plan.spread[name]:.4g} %"
     unit = unit_of(plan, name)

@@ -1,10 +1,11 @@
 """The folder of a campaign: its manifest, and a file for each block of runs that is done.
 
-    campaign.json        the plan's manifest, and the runs in a block
-    runs_00000000.npz    the block that begins with run 0: what became of its runs, and their machines
+    campaign.json        the plan's manifest, and the number of runs in a block
+    runs_00000000.npz    the block that begins with run 0: the machines of its runs and their figures
     runs_00001024.npz    ...
 
-Files are whole or not there. Blocks name the plan that they belong to; a damaged one is flown again.
+Every file is written whole or not at all. A block names the plan that it belongs to. The runs of a damaged block are
+simulated again.
 """
 
 from __future__ import annotations
@@ -36,10 +37,13 @@ def block_name(first: int) -> str:
 
 
 def open_folder(folder: Path, plan: Plan, block: int) -> int:
-    """The folder with the manifest of a plan in it, found or written; the runs in a block."""
+    """Make sure that a folder has the manifest of a plan; the number of runs in its blocks.
+
+    Raises InputError for a folder that has another campaign, or blocks without a manifest, or cannot be written to.
+    """
     path = folder / MANIFEST
     try:
-        for stale in folder.glob(f".*.npz.{os.getpid()}"):  # of a killed process that had this one's number
+        for stale in folder.glob(f".*.npz.{os.getpid()}"):  # left by a killed process that had the same id
             stale.unlink(missing_ok=True)
         begun = path.exists()
     except OSError as error:
@@ -61,6 +65,7 @@ def open_folder(folder: Path, plan: Plan, block: int) -> int:
 
 
 def read_manifest(path: Path) -> tuple[dict[str, Any], int]:
+    """A manifest, and the number of runs in a block. Raises InputError for any other file."""
     text = read_file(path, "campaign's manifest", lambda p: p.read_text(encoding="utf-8"))
     try:
         content = json.loads(text)
@@ -76,7 +81,10 @@ def read_manifest(path: Path) -> tuple[dict[str, Any], int]:
 
 
 def read_plan(folder: str | Path, controller: Controller) -> Plan:
-    """The plan of the campaign in a folder. Raises InputError when it is not of this controller."""
+    """The plan of the campaign in a folder.
+
+    Raises InputError for a folder without a campaign, a damaged manifest, or a campaign of another controller.
+    """
     path = Path(folder) / MANIFEST
     content, _ = read_manifest(path)
     own = fingerprint(controller)
@@ -109,7 +117,7 @@ def read_plan(folder: str | Path, controller: Controller) -> Plan:
 
 
 def read_blocks(place: Path, plan: Plan, parts: Mapping[int, int], done: dict[int, Block]) -> list[Path]:
-    """Put the blocks of a folder into `done`; the files of those that are damaged."""
+    """Read the blocks `parts` (first run -> number of runs) into `done`; the result lists the damaged files."""
     damaged = []
     for first, count in parts.items():
         path = place / block_name(first)
@@ -124,7 +132,7 @@ def read_blocks(place: Path, plan: Plan, parts: Mapping[int, int], done: dict[in
 
 
 def require_same(path: Path, found: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
-    """InputError that names the first entry of the manifest in which two campaigns differ."""
+    """InputError that names the first entry in which two manifests differ."""
     for key, (one, other) in _differences(found, wanted):
         raise InputError(
             path,
@@ -135,6 +143,7 @@ def require_same(path: Path, found: Mapping[str, Any], wanted: Mapping[str, Any]
 
 
 def _differences(found: Any, wanted: Any, key: str = "") -> Iterator[tuple[str, tuple[Any, Any]]]:
+    """(key, (found, wanted)) for every entry in which two nested tables differ."""
     if isinstance(found, Mapping) and isinstance(wanted, Mapping):
         for name in {**wanted, **found}:
             inner = f"{key}.{name}" if key else name
@@ -144,11 +153,13 @@ def _differences(found: Any, wanted: Any, key: str = "") -> Iterator[tuple[str, 
 
 
 def shorten(value: Any) -> str:
+    """A value as text of at most 40 characters."""
     text = value if isinstance(value, str) else json.dumps(value)
     return text if len(text) <= 40 else text[:12] + "..."
 
 
 def encode_block(block: Block, plan: Plan) -> bytes:
+    """A block as an .npz archive, with the identity of its plan."""
     buffer = io.BytesIO()
     arrays: dict[str, Any] = {name: getattr(block.batch, name) for name in Batch.__dataclass_fields__}
     names = np.array(draw_machines(plan).names)
@@ -164,11 +175,14 @@ def encode_block(block: Block, plan: Plan) -> bytes:
 
 
 def read_block(path: Path, plan: Plan, first: int, count: int) -> Block | None:
-    """A block; None where it is damaged. InputError where it belongs to another campaign."""
+    """The block of `count` runs from `first` on; None for a damaged file.
+
+    Raises InputError for a block of another campaign.
+    """
     data = read_file(path, "block of a campaign", Path.read_bytes)
     try:
         with np.load(io.BytesIO(data), allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}  # checks the sums of the archive
+            arrays = {name: file[name] for name in file.files}  # checks the archive's checksums
         identity, kind = str(arrays["campaign"]), str(arrays["engine"])
         columns = {name: arrays[name] for name in Batch.__dataclass_fields__}
         values = arrays["values"]
@@ -184,7 +198,7 @@ def read_block(path: Path, plan: Plan, first: int, count: int) -> Block | None:
 
 
 def figure_shapes(plan: Plan) -> dict[str, tuple[int, ...]]:
-    """Of one run's figures in a batch."""
+    """The shape of each figure of one run, by the names of Batch."""
     plant = plan.plant
     p, m = len(plant.outputs), len(plant.inputs)
     rows = {

@@ -1,8 +1,9 @@
 """Setup of a simulation, and the names, sizes and order of all its numbers.
 
-A setup says which functions a control period consists of; all else is numbers. `layout_of` gives the order of the
-state, of the inputs of a sample and of the row that a sample leaves; `numbers_of` gives every number of machine,
-controller and sensors by name, and `flatten` puts them in one vector, theta."""
+A setup decides which functions a control period consists of; everything else is a number. `layout_of` gives the order
+of the state, of the inputs of a sample and of the row that a sample leaves. `numbers_of` gives every number of machine,
+controller and sensors by name, and `flatten` puts them in one vector, theta.
+"""
 
 from __future__ import annotations
 
@@ -29,30 +30,30 @@ FIDELITIES: tuple[Fidelity, ...] = get_args(Fidelity)
 
 @dataclass(frozen=True)
 class Setup:
-    """What shapes the functions of a simulation; all else are numbers."""
+    """The choices that decide which functions are simulated; everything else is a number."""
 
     fidelity: Fidelity
     delay: int  # samples between measurement and command
-    quantize: bool = False  # sensors in steps
-    disturbed: bool = False  # an external wrench
+    quantize: bool = False  # sensors with a resolution
+    disturbed: bool = False  # an external wrench acts
     bearing: bool = False  # touchdown bearings push back
-    sensed: bool = False  # sensors with their own errors, Hall sensors for the stroke
+    sensed: bool = False  # sensors with errors, Hall sensors for the stroke
     faulty: bool = False  # held measurements, missed steps, open phases, sagging link
-    scheduled: bool = False  # C(z) of the measured z in the filter
-    real_pwm: bool = False  # duty cycles in steps, dead time
-    turning: bool = False  # current controllers in axes that turn with the forces, as printed
-    outside: bool = False  # the estimate comes from outside
-    open_loop: bool = False  # no feedback: what is fed forward, commutated for the reference
+    scheduled: bool = False  # the filter uses C at the measured z
+    real_pwm: bool = False  # duty cycles with a resolution, dead time
+    turning: bool = False  # current controllers in axes that turn with the forces, eq. (18) as printed
+    outside: bool = False  # a Kalman filter of start_up.py makes the estimate
+    open_loop: bool = False  # feedforward alone, commutated for the reference
     electronics: Any = None  # options of the machine's own electronics
 
 
 class Layout(NamedTuple):
-    """Names and sizes, in order."""
+    """Names and sizes of all signals, in order."""
 
     machine: dict[str, int]
     controller: dict[str, int]
-    given: dict[str, int]  # per sample, the same for every machine
-    row: dict[str, int]  # what one sample leaves behind
+    given: dict[str, int]  # inputs of a sample, the same for every machine
+    row: dict[str, int]  # outputs of a sample: a row of the trajectory
 
 
 class Loop(NamedTuple):
@@ -92,7 +93,8 @@ def layout_of(plant: Plant, c: Controller, s: Setup) -> Layout:
         controller |= {"y_last": p, "command": held}
     controller |= {"under_way": held * s.delay}
     given = {"p_ref": p, "dp_ref": p, "v_ff": m}
-    given["v_past"] = n - len(c.A) if c.tracks == "states" else 0  # and zero for disturbances
+    # v_past: the stored forces, and zeros for observed disturbances.
+    given["v_past"] = n - len(c.A) if c.tracks == "states" else 0
     if s.disturbed:
         given |= {"w": len(plant.disturbances)}
     if s.faulty:
@@ -111,7 +113,11 @@ def layout_of(plant: Plant, c: Controller, s: Setup) -> Layout:
 def numbers_of(
     plant: Plant, c: Controller, substeps: float, errors: Mapping[str, float] | None = None
 ) -> dict[str, ca.DM]:
-    """Every number of machine, controller and sensors, by name."""
+    """Every number of machine, controller and sensors, by name.
+
+    substeps : of the simulation in a sample
+    errors : of the sensors, by name; 0 where none is given
+    """
     fixed = shaping(plant.parameters)
     machine = {k: ca.DM(getattr(plant.parameters, k)) for k in units_of(plant.parameters) if k not in fixed}
     loop = c.current_loop or CurrentLoop(0.0, 0.0, 0.0)
@@ -129,33 +135,33 @@ def numbers_of(
 
 
 def flatten(values: Mapping[str, ca.DM]) -> FloatArray:
-    """The nonzeros of every number, in order: theta."""
+    """theta: the nonzeros of all numbers, in order."""
     return np.concatenate([np.array(value.nonzeros(), dtype=float) for value in values.values()])
 
 
 def with_symbols(plant: Plant, values: Mapping[str, ca.DM]) -> tuple[Plant, dict[str, Any], Any]:
-    """The machine with a symbol for every number, the symbols by name, and all of them: theta."""
+    """The machine with a symbol for every number, the symbols by name, and theta, the vector of them all."""
     g = {name: ca.SX.sym(name, value.sparsity()) for name, value in values.items()}
     theta = ca.vertcat(*(ca.vertcat(*symbol.nonzeros()) for symbol in g.values()))
     return plant.variant(_symbolic_parameters(plant, g)), g, theta
 
 
 def electronics_of(plant: Plant, s: Setup) -> Electronics | None:
-    """The machine's own electronics, where a setup has them."""
+    """The electronics of the machine in fidelity `phase`; None where it has none, and in other fidelities."""
     if s.fidelity != "phase" or plant.electronics is None:
         return None
     return plant.electronics(s.electronics)
 
 
 def fidelities(plant: Plant) -> tuple[Fidelity, ...]:
-    """The fidelities that there are of a machine."""
+    """The fidelities in which a machine can be simulated."""
     if plant.windings is not None:
         return FIDELITIES
     return ("force",) if plant.electronics is None else ("force", "phase")
 
 
 def _winding_counts(plant: Plant) -> tuple[int, int]:
-    """Axes and phases of the drive."""
+    """Number of axes and phases of the drive."""
     drive = plant.windings
     return (0, 0) if drive is None else (len(drive.axes), len(drive.phases))
 
@@ -168,6 +174,7 @@ def signals_of(sizes: Layout, kind: Any) -> Signals:
 
 
 def _symbolic_parameters(plant: Plant, g: Mapping[str, Any]) -> Any:
+    """The parameters with symbols in place of numbers; twins share a symbol, shaping parameters stay numbers."""
     par, fixed = plant.parameters, shaping(plant.parameters)
     symbols = {name: g[f"machine.{name}"] for name in units_of(par) if name not in fixed}
     return symbolic(par, symbols | {name: symbols[twin] for name, twin in twins_of(par).items()})

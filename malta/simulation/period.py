@@ -1,23 +1,23 @@
-"""One control period of machine and controller, as CasADi functions: everything that simulates is made of them.
+"""One control period of machine and controller as CasADi functions. Every engine runs these functions.
 
     given, noise --> [ sense ] --> y --> [ decide ] --> commands held --> [ substep ] x n --> machine
                         ^                 ^  |  ^                                                |
                         |        v0(z) ---+  |  +-- controller <--                               |
                         +--------------------|---------------------------------------------------+
 
-The state is (machine, controller). What stands in them depends on the fidelity, i.e. on what makes the forces:
+The state is (machine, controller). Its entries depend on the fidelity, the model of how forces arise:
 
     force   currents of the coils follow their commands as first-order lags at the current loops' crossover, exactly
     dq      PI loops and windings in the axes of the transformation; voltage limit of the half-bridges, induced
             voltage and its feedforward, DC link
-    phase   the same controllers, on every winding: phase currents, duty cycles, star points; or the machine's own
-            electronics, where these run many times in a sample
+    phase   the same controllers on every winding: phase currents, duty cycles, star points; or the machine's own
+            electronics, which run many times in a sample
 
     machine     x; then coil currents | axis currents, link voltage | phase currents, link voltage or electronics
     controller  xi_pred, e, frozen; PI integrals and their limits; last y and held commands (faults); commands under way
 
 The one sample of delay stands between the control law and the coils in `force`, and between the current
-controllers and the windings in `dq` and `phase`, where computation really takes its time.
+controllers and the windings in `dq` and `phase`, as on the machine, where computation takes this time.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ from malta.synthesis.controller import Controller, commanded, estimated, filtere
 
 
 class Period(NamedTuple):
-    """The functions of one control period; theta is empty where all numbers are constants."""
+    """The functions of one control period; theta has no entries where all numbers are constants."""
 
     sense: ca.Function  # (state, given, noise, theta) -> y, position for v0(z)
     decide: ca.Function  # (state, given, y, v0, theta) -> controller, held, row
@@ -61,8 +61,9 @@ def period_of(
 ) -> Period:
     """The functions of one control period.
 
-    constant: with the numbers in them, which is faster on CasADi's virtual machine; otherwise they are arguments, and
-    one set of functions serves every machine and controller of the same shape.
+    values : every number of machine, controller and sensors, see numbers_of
+    constant : True puts the numbers into the functions, which is faster on CasADi's virtual machine. False makes them
+        the argument theta, so that one set of functions serves every machine and controller of the same shape.
     """
     g: dict[str, Any] = {name: ca.SX(value) for name, value in values.items()}
     theta: Any = ca.SX(0, 1)
@@ -92,9 +93,9 @@ def period_of(
 
 
 def chain(p: Period, c: Controller, substeps: int, block: int) -> ca.Function:
-    """A block of samples on CasADi's virtual machine: (state, inputs) -> (states, rows).
+    """`block` samples in one call of CasADi's virtual machine: (state, inputs) -> (states, rows), a column a sample.
 
-    inputs = given, noise, and the fast noise of all substeps.
+    inputs : given, noise, and the electronics' noise of all substeps, one below the other
     """
     state, given = ca.MX.sym("state", p.sense.size1_in(0)), ca.MX.sym("given", p.sense.size1_in(1))
     noise = ca.MX.sym("noise", p.sense.size1_in(2))
@@ -104,7 +105,7 @@ def chain(p: Period, c: Controller, substeps: int, block: int) -> ca.Function:
     edges = np.cumsum([0, given.numel(), noise.numel(), *(j.numel() for j in jitters)]).tolist()
     given, noise, *jitters = ca.vertsplit(U, edges)
     measured, at = p.sense(S, given, noise, ca.DM(0, 1))
-    # v0(z) is a table, which scalar expressions cannot look up.
+    # v0(z) is a table, and SX expressions have no look-up.
     table = ca.interpolant("table", "linear", [c.feedforward.z_grid], c.feedforward.v0.ravel())
     controller, held, row = p.decide(S, given, measured, table(at), ca.DM(0, 1))
     machine = S[: p.substep.size1_in(0)]
@@ -116,14 +117,17 @@ def chain(p: Period, c: Controller, substeps: int, block: int) -> ca.Function:
 
 @lru_cache(maxsize=32)
 def initial_state_function(plant: Plant, c: Controller, s: Setup) -> ca.Function:
-    """`initial` as a function of numbers: (x, xi_pred, current) -> state."""
+    """`initial_state` as a function of numbers: (x, xi_pred, current) -> state."""
     sizes = (len(plant.states), len(c.states), len(plant.actuator.coils))
     arguments = [ca.SX.sym(name, size) for name, size in zip(("x", "xi_pred", "current"), sizes, strict=True)]
     return ca.Function("initial", arguments, [initial_state(plant, c, s, *arguments)])
 
 
 def initial_state(plant: Plant, c: Controller, s: Setup, x: Any, xi_pred: Any, current: Any) -> Any:
-    """State with the machine at x, these currents of the coils (A) flowing, and the observer at xi_pred."""
+    """The state with the machine at x, coil currents `current` (A), and the observer at xi_pred.
+
+    The current controllers are at rest: their integrals hold these currents, and the commands under way do too.
+    """
     actuator, fast = plant.actuator, electronics_of(plant, s)
     x, current = ca.SX(x), ca.SX(current)
     values: dict[str, Any] = {"x": x, "i_coil": current, "xi_pred": xi_pred}
@@ -164,12 +168,14 @@ def _decide_function(loop: Loop, theta: Any, sizes: Layout) -> ca.Function:
         command,
         ca.vertcat(*(row[name] for name in sizes.row)),
     ]
-    decided = [ca.densify(values) for values in decided]  # engines read every entry: no zero may be left out
+    decided = [
+        ca.densify(values) for values in decided
+    ]  # engines read every entry, so structural zeros are not allowed
     state = ca.vertcat(*machine.values(), *controller.values())
     arguments = [state, ca.vertcat(*given.values()), y, v0, theta]
     if kind is ca.SX:
         return ca.Function("decide", arguments, ca.cse(decided))
-    # Functions of MX take symbols: the parts are cut out of whole vectors.
+    # The arguments of an MX function are symbols, so the signals are cut out of whole vectors.
     whole = [ca.MX.sym("state", *arguments[0].shape), ca.MX.sym("given", *arguments[1].shape)]
     pieces = []
     for vector, sizes_of in zip(whole, ({**sizes.machine, **sizes.controller}, sizes.given), strict=True):
@@ -195,9 +201,9 @@ def _control_law(loop: Loop, signals: Signals, y: Any, v0: Any) -> tuple[dict[st
     e_now, frozen_now = controller["e"], controller["frozen"]
     xi_pred, e, frozen, v = commanded(g, xi_hat, e_now, frozen_now, y, p_ref, xi_ref, v_ff, v0)
     if s.open_loop:
-        v, frozen = v_ff + v0, 0 * frozen  # no limit of the feedback is met
+        v, frozen = v_ff + v0, 0 * frozen  # open loop: no limit of the feedback is reached
     after: dict[str, Any] = {"xi_pred": xi_pred, "e": e, "frozen": frozen}
-    # The gain file's machine turns forces into currents, the simulated one limits those and makes its own forces.
+    # The controller commutates with the machine of its gain file; the simulated machine limits the currents.
     place = p_ref if s.open_loop else y
     wanted = believed.currents(place, v)
     current, fast = plant.limited(wanted), electronics_of(plant, s)
@@ -224,12 +230,12 @@ def _control_law(loop: Loop, signals: Signals, y: Any, v0: Any) -> tuple[dict[st
         after |= {"y_last": y, "command": command}
     queue = ca.vertcat(controller["under_way"], command)
     size = command.numel()
-    after["under_way"] = queue[size:, 0]  # a column, also where nothing is left of a single entry
+    after["under_way"] = queue[size:, 0]  # a column, also where no entry is left
     return after, queue[:size], row
 
 
 def _law_reference(c: Controller, believed: Plant, g: Mapping[str, Any], given: Mapping[str, Any]) -> Any:
-    """xi*: what the states of the law should be; 0 of a law of errors."""
+    """xi*, the reference of the control law's states; 0 for a law of errors."""
     if c.tracks == "errors":
         return ca.DM(len(c.states), 1)
     p_ref, dp_ref, rates = given["p_ref"], given["dp_ref"], len(c.feedforward.rate)
@@ -239,9 +245,9 @@ def _law_reference(c: Controller, believed: Plant, g: Mapping[str, Any], given: 
 
 @lru_cache(maxsize=16)
 def state_reference(believed: Plant) -> ca.Function:
-    """(p*, p*') -> (P(z*)^-1 p*, its derivative): what the mechanical states should be.
+    """(p*, p*') -> reference of the mechanical states: P(z*)^-1 p* and its derivative.
 
-    Of a machine whose states are not (q, q') the states at rest with the outputs p*.
+    For a machine whose states are not (q, q'): the states at rest with the outputs p*.
     """
     p, dp = ca.SX.sym("p", len(believed.outputs)), ca.SX.sym("dp", len(believed.outputs))
     q = believed.position_of(p)
@@ -250,7 +256,7 @@ def state_reference(believed: Plant) -> ca.Function:
 
 
 def _scheduled_C(c: Controller, y: Any) -> Any:
-    """C at the measured stroke position, on the believed machine at rest there."""
+    """C of the controller's machine at rest at the measured stroke position."""
     believed = plant_of(c.parameters)
     x = ca.SX.sym("x", len(believed.states))
     rest = ca.SX.zeros(len(believed.states))

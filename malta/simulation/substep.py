@@ -12,7 +12,7 @@ from malta.model.plant import Plant
 from malta.simulation import inverter
 from malta.simulation.layout import Loop, Setup, Signals, electronics_of
 
-OPENING = 20e-6  # s, time constant with which the current of an opened phase dies
+OPENING = 20e-6  # s, time constant with which the current of an open phase decays
 
 
 def advance(loop: Loop, signals: Signals, held: Any, jitter: Any) -> Any:
@@ -48,7 +48,7 @@ def advance(loop: Loop, signals: Signals, held: Any, jitter: Any) -> Any:
 
 
 def _lagging_currents(crossover: Any, i: Any, held: Any, h: Any) -> list[Any]:
-    """Currents at the beginning, the middle and the end of a step, exactly: i = held + (i_0 - held) e^(-w_c t)."""
+    """Currents at the beginning, the middle and the end of a step: i = held + (i_0 - held) e^(-w_c t), exactly."""
     if isinstance(crossover, float) and math.isinf(crossover):
         return [held] * 3
     lag, decay = i - held, ca.exp(-crossover * h / 2)
@@ -56,10 +56,11 @@ def _lagging_currents(crossover: Any, i: Any, held: Any, h: Any) -> list[Any]:
 
 
 def runge_kutta(rate: Callable[[Any, int], Any], z: Any, h: Any, positions: int = 0) -> Any:
-    """One step of the classical method, fourth order. rate: (z, half steps since the beginning: 0, 1 or 2) -> z'.
+    """z after one step h of the classical Runge–Kutta method of fourth order.
 
-    positions : how many entries stand first whose rates are the entries that follow them. What the method does to them
-        is written in accelerations, as Nyström did: the same numbers in fewer operations.
+    rate : (z, half steps since the beginning: 0, 1 or 2) -> z'
+    positions : number of leading entries of z whose rates are the next entries of z. Their update is written in
+        accelerations (Nyström), which gives the same result in fewer operations.
     """
     q, w = z[:positions, 0], z[positions:, 0]  # columns, also of a single entry
     dq = w[:positions, 0]
@@ -81,7 +82,7 @@ def runge_kutta(rate: Callable[[Any, int], Any], z: Any, h: Any, positions: int 
 def _axis_slope(
     plant: Plant, s: Setup, given: Mapping[str, Any], x: Any, i: Any, V: Any, m: Any
 ) -> tuple[Any, Any]:
-    """Forces, and the slopes of axis currents and link voltage."""
+    """Forces, and d/dt of axis currents and link voltage: L i' = m V - R i - emf, with the coupling of the axes."""
     drive, actuator = plant.drive, plant.actuator
     u = m * V * (1 - given["sag"] if s.faulty else 1)
     di = (u - actuator.R * i - drive.emf(x)) / actuator.L + drive.coupling(x, i)
@@ -92,13 +93,13 @@ def _axis_slope(
 def _phase_slope(
     plant: Plant, s: Setup, given: Mapping[str, Any], x: Any, i: Any, V: Any, d: Any
 ) -> tuple[Any, Any]:
-    """Forces, and the slopes of phase currents and link voltage. Phase-wise u = (d - 1/2) V."""
+    """Forces, and d/dt of phase currents and link voltage. The voltage of a phase is u = (d - 1/2) V."""
     drive, actuator = plant.drive, plant.actuator
     u = (d - 0.5) * V * (1 - given["sag"] if s.faulty else 1)
     closed = 1 - given["open"] if s.faulty else ca.SX.ones(len(drive.phases))
     flowing = closed * i
     net = inverter.phase_voltages(drive, u - actuator.R * flowing - drive.to_phases(x) @ drive.emf(x), closed)
-    # An open phase loses its current within a sample, and so do the others what they carried for it: the arc is short.
+    # The arc is short: an open phase loses its current within a sample, and the other phases lose their part of it.
     lost = (1 - closed) * i
     for star in drive.stars if s.faulty else ():
         phases = list(star)
