@@ -1,7 +1,8 @@
 """Shared libraries of control periods: the system's C compiler, the cache of its results, and calls into them.
 
-A library stays in the user's cache folder under the SHA-256 of its text, the compiler, the options and the processor.
-Two processes that compile at once write the same file, each under a name of its own first."""
+The user's cache folder keeps a library under the SHA-256 of its text, the compiler, the options and the processor. Two
+processes that compile the same text at once write to different names first, and the last rename wins.
+"""
 
 from __future__ import annotations
 
@@ -48,7 +49,7 @@ def compiler() -> tuple[str, ...] | None:
 
 @cache
 def _processor() -> str:
-    """What `-march=native` depends on."""
+    """Model and features of the processor, on which `-march=native` depends."""
     with suppress(OSError):
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
         return "".join(sorted({x for x in lines if x.startswith(("flags", "model name", "Features"))}))
@@ -61,7 +62,7 @@ def _version(cc: tuple[str, ...]) -> str:
 
 
 def library(text: str, lanes: int, folder: Path | None = None) -> ctypes.CDLL | None:
-    """The compiled text, from the cache folder or compiled now; None where no compiler can do it."""
+    """The library of a C text, from the cache folder or compiled now; None where no compiler can make it."""
     cc = compiler()
     if cc is None:
         return None
@@ -72,7 +73,7 @@ def library(text: str, lanes: int, folder: Path | None = None) -> ctypes.CDLL | 
         try:
             place.mkdir(parents=True, exist_ok=True, mode=0o700)
             if place.stat().st_uid != os.getuid():
-                continue  # code is loaded from here: nobody else's
+                continue  # loading another user's code would be unsafe
             if not _is_intact(path) and not _compile(cc, text, lanes, path):
                 return None
             return ctypes.CDLL(str(path))
@@ -82,7 +83,7 @@ def library(text: str, lanes: int, folder: Path | None = None) -> ctypes.CDLL | 
 
 
 def _is_intact(path: Path) -> bool:
-    """Whether a library ends with the hash of what stands before: loading half of one would end the process."""
+    """Whether a library ends with the hash of its content. Loading half of a file would end the process."""
     if not path.exists():
         return False
     content = path.read_bytes()
@@ -90,12 +91,12 @@ def _is_intact(path: Path) -> bool:
 
 
 def cache_folder() -> Path:
-    """Where compiled engines stay; deleting it costs seconds of compilation."""
+    """The folder of compiled engines. Deleting it costs seconds of compilation."""
     return platformdirs.user_cache_path("malta")
 
 
 def _compile(cc: tuple[str, ...], text: str, lanes: int, path: Path) -> bool:
-    """Compile to `path`, whole or not at all."""
+    """Compile a text to `path`, whole or not at all; False where the compiler fails."""
     with tempfile.TemporaryDirectory(dir=path.parent) as scratch:
         c, so = Path(scratch) / "engine.c", Path(scratch) / "engine.so"
         c.write_text(text, encoding="utf-8")
@@ -114,7 +115,7 @@ def address_of(array: Any) -> ctypes.c_void_p:
 
 
 def feedforward_table(z_grid: FloatArray, v0: FloatArray) -> FloatArray:
-    """Rows of z, v0(z) and its slope up to the next row."""
+    """Rows of z, v0(z) and the slope of v0 up to the next row: the table that the engine interpolates."""
     slope = np.diff(v0, axis=0) / np.diff(z_grid)[:, None]
     return np.ascontiguousarray(np.hstack([z_grid[:, None], v0, np.vstack([slope, slope[-1:]])]))
 
@@ -142,7 +143,7 @@ class Shared(NamedTuple):
 
 
 def arrange_in_lanes(rows: FloatArray, groups: int) -> FloatArray:
-    """Rows of machines as groups x numbers x LANES; the last machine fills what is left of the last group."""
+    """Rows of machines as groups x numbers x LANES; copies of the last machine fill the last group."""
     filled = np.concatenate([rows, np.repeat(rows[-1:], groups * LANES - len(rows), axis=0)])
     return np.ascontiguousarray(filled.reshape(groups, LANES, -1).swapaxes(1, 2))
 

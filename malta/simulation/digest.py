@@ -1,4 +1,4 @@
-"""Digests: the few numbers that a run of a batch leaves, updated at every sample, and the batch made of them."""
+"""Digests: figures of a run that are updated at every sample, and the batch that is made of them."""
 
 from __future__ import annotations
 
@@ -16,23 +16,23 @@ from malta.simulation.layout import flatten, layout_of, numbers_of
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
 
-LEVELS = (0.1, 0.9)  # of a stroke: its rise is between them
+LEVELS = (0.1, 0.9)  # shares of a stroke between which its rise is measured
 
 
 @dataclass(frozen=True, eq=False)
 class Batch:
-    """What became of each run. SI; a row for each run."""
+    """Figures of each run of a batch, a row for each. SI."""
 
-    duration: FloatArray  # s, until the end or until something was touched
+    duration: FloatArray  # s, until the end or the first contact
     completed: FloatArray  # 1 or 0
     deviation: FloatArray  # runs x outputs, largest |p - p*|
     rms: FloatArray  # runs x outputs, root mean square of p - p*
     force: FloatArray  # runs x inputs, N, largest |v|
-    contact: FloatArray  # runs x contacts, largest share of each clearance that was used up
+    contact: FloatArray  # runs x contacts, largest share of each clearance; 1: touch
     rise: FloatArray  # s, 10-90 % of the stroke; NaN when it was not reached
     overshoot: FloatArray  # beyond the end, as a share of the stroke; NaN when the run ended early
     saturated: FloatArray  # runs x inputs, share of the samples whose command was limited
-    verdict: FloatArray  # how it ended: index into `verdicts` of the plant
+    verdict: FloatArray  # index into `verdicts` of the plant
 
     def __post_init__(self) -> None:
         for name in self.__dataclass_fields__:
@@ -40,20 +40,21 @@ class Batch:
 
 
 def verdicts(plant: Plant) -> tuple[str, ...]:
-    """How a run may end, the first of them as it should: the names of simulate.Verdict."""
+    """Names of the verdicts that a run may end with; the first is that of success."""
     return ("completed", "diverged", "not lifted", *plant.contacts)
 
 
 def digest_sizes(plant: Plant) -> dict[str, int]:
+    """Names and sizes of the numbers of a digest, in order."""
     p, m = len(plant.outputs), len(plant.inputs)
     return {
         "alive": 1,
-        "start": 1,  # of the stroke, and 1 / its length or 0: constant
-        "scale": 1,
+        "start": 1,  # of the stroke: constant
+        "scale": 1,  # 1 / length of the stroke, or 0: constant
         "samples": 1,
         "reached": len(LEVELS),  # sample at which each level was reached, -1 before
         "below": len(LEVELS),  # share of the stroke one sample before
-        "above": len(LEVELS),  # and then
+        "above": len(LEVELS),  # share of the stroke at that sample
         "share": 1,
         "largest_share": 1,
         "deviation": p,
@@ -61,10 +62,10 @@ def digest_sizes(plant: Plant) -> dict[str, int]:
         "force": m,
         "limited": m,
         "contact": len(plant.contacts),
-        "resting": 1,  # on the touchdown bearings at the start
-        "touching": 1,  # them at the end
-        "touched": 1,  # sample at which it first did, -1 before
-        "culprit": 1,  # index of what was touched first, -1 before
+        "resting": 1,  # 1 where the mover rests on its touchdown bearings at the start
+        "touching": 1,  # 1 where it touches them at the end
+        "touched": 1,  # sample at which it first touched them, -1 before
+        "culprit": 1,  # index of the first contact, -1 before
     }
 
 
@@ -79,7 +80,7 @@ def first_digest(plant: Plant, p_ref: FloatArray) -> FloatArray:
 
 @lru_cache(maxsize=16)
 def digest_function(shape: Any) -> ca.Function:
-    """(kept, row, given, theta) -> kept: what a run leaves behind, sample by sample, until something is touched."""
+    """(digest, row, given, theta) -> digest after one more sample. The first contact ends its updates."""
     plant, c, setup = shape.plant, shape.controller, shape.setup
     sizes = layout_of(plant, c, setup)
     kept = {name: ca.SX.sym(name, size) for name, size in digest_sizes(plant).items()}
@@ -88,7 +89,7 @@ def digest_function(shape: Any) -> ca.Function:
     theta = ca.SX.sym("theta", len(flatten(numbers_of(plant, c, 1))))
     largest = ca.fmax(kept["contact"], row["contact"])
     most, used = (_largest_share(contact) for contact in (largest, row["contact"]))
-    alive = kept["alive"]  # what follows adds nothing once it is 0
+    alive = kept["alive"]  # 0 after the first contact: nothing below changes then
     error = ca.if_else(alive, row["p"] - given["p_ref"], 0)
     share = (row["p"][plant.leading_output] - kept["start"]) * kept["scale"]
     now = ca.logic_and(ca.logic_and(alive, kept["reached"] < 0), share >= ca.DM(LEVELS))
@@ -129,7 +130,7 @@ def digest_function(shape: Any) -> ca.Function:
 
 @lru_cache(maxsize=16)
 def recorder_function(shape: Any) -> ca.Function:
-    """A digest that keeps the last two rows as they are."""
+    """A digest that consists of the last two rows: the engine draws noise for two samples at once."""
     sizes = layout_of(shape.plant, shape.controller, shape.setup)
     width, given = sum(sizes.row.values()), sum(sizes.given.values())
     kept, row = ca.SX.sym("kept", 2 * width), ca.SX.sym("row", width)
@@ -139,6 +140,7 @@ def recorder_function(shape: Any) -> ca.Function:
 
 
 def batch_of(kept: FloatArray, samples: int, Ts: float, sizes: Mapping[str, int]) -> Batch:
+    """The batch of digests after the last sample, runs x numbers."""
     columns = dict(zip(sizes, np.split(kept, np.cumsum([*sizes.values()])[:-1], axis=1), strict=True))
     count = columns["samples"][:, 0]
     resting, touching, touched = (columns[name][:, 0] for name in ("resting", "touching", "touched"))
@@ -150,7 +152,7 @@ def batch_of(kept: FloatArray, samples: int, Ts: float, sizes: Mapping[str, int]
         first, last = np.where(
             reached > 0, reached - 1 + (np.array(LEVELS) - below) / (above - below), np.nan
         ).T
-    # What follows the end is not guarded in "share" alone.
+    # "share" also changes after the end, so it says nothing about divergence.
     told = np.hstack([columns[name] for name in ("deviation", "squares", "contact")])
     verdict = np.select(
         [completed, ~np.isfinite(told).all(axis=1), resting == 1, columns["culprit"][:, 0] >= 0],
@@ -176,12 +178,12 @@ def batch_of(kept: FloatArray, samples: int, Ts: float, sizes: Mapping[str, int]
 
 
 def _largest_share(contact: Any) -> Any:
-    """The largest share of a clearance that is used up; 0 for a machine that has nothing to touch."""
+    """The largest share of a clearance that is taken; 0 for a machine without contacts."""
     return ca.mmax(contact) if contact.numel() else ca.SX(0)
 
 
 def _index_of_largest(values: Any) -> Any:
-    """Index of the largest entry, the first of equals."""
+    """Index of the largest entry; of equal ones the first."""
     found, index = values[0], ca.SX(0)
     for k in range(1, values.numel()):
         index = ca.if_else(values[k] > found, k, index)

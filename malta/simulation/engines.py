@@ -32,7 +32,11 @@ BLOCK = 250  # samples in one call of the virtual machine's chain
 
 @dataclass(frozen=True, eq=False)
 class Engine:
-    """Runs control periods of one machine: (first, state, given, noise, fast noise) -> (state, rows)."""
+    """A function that simulates samples of one machine: (first, state, given, noise, fast noise) -> (state, rows).
+
+    first : index of the first sample
+    given, noise, rows : samples x size; fast noise : substeps x size
+    """
 
     kind: str  # "compiled" or "virtual machine"
     run: Callable[[int, FloatArray, FloatArray, FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
@@ -47,7 +51,12 @@ def engine_of(
     errors: tuple[tuple[str, float], ...] = (),
     choice: EngineChoice = "auto",
 ) -> Engine:
-    """What runs the control periods of this machine: compiled where possible, else CasADi's virtual machine."""
+    """The engine of a machine under a controller: compiled where possible, else CasADi's virtual machine.
+
+    errors : of the sensors, (name, SI)
+
+    Raises InputError for the choice "compiled" without a C compiler, or for a controller that looks up a table.
+    """
     values = numbers_of(plant, c, substeps, dict(errors))
     if choice != "virtual machine":
         found = library_of(shape_of(plant, c, setup))
@@ -69,7 +78,7 @@ def engine_of(
 
 @dataclass(frozen=True)
 class Shape:
-    """A plant and controller, equal to another one where the same compiled text serves both."""
+    """The shape of a plant and a controller. Two shapes are equal where the same compiled text serves both."""
 
     key: tuple[Any, ...]
     plant: Plant = field(compare=False)
@@ -78,7 +87,7 @@ class Shape:
 
 
 def shape_of(plant: Plant, c: Controller, setup: Setup) -> Shape:
-    """What the compiled functions of a plant and a controller depend on, beside numbers that they are given."""
+    """The shape of a plant and a controller: all that their functions depend on, except numbers."""
     variant, par = plant.variant, plant.parameters
     kin = (variant.func, *sorted(variant.keywords.items())) if isinstance(variant, partial) else (variant,)
     twins = tuple(twins_of(par).items())
@@ -92,7 +101,10 @@ def shape_of(plant: Plant, c: Controller, setup: Setup) -> Shape:
 
 @lru_cache(maxsize=32)
 def library_of(shape: Shape, lanes: int = 1, digest: ca.Function | None = None) -> tuple[Any, Period] | None:
-    """The library for a shape; None where it cannot be compiled."""
+    """The library and the functions of a shape; None where it cannot be compiled.
+
+    digest : the function that updates a run's digest; for several lanes
+    """
     c = shape.controller
     if plant_of(c.parameters).tabulated:
         return None
@@ -102,12 +114,13 @@ def library_of(shape: Shape, lanes: int = 1, digest: ca.Function | None = None) 
 
 
 def substeps_until(sample: int, substeps: float) -> int:
-    """Substeps before a sample, where it takes so many: each sample begins with the first substep after it."""
+    """Number of substeps before a sample. `substeps` a sample may be no integer: a sample then begins with the first
+    substep after it."""
     return math.ceil(sample * substeps - 1e-6)
 
 
 def compiled_engine(run: Any, p: Period, theta: FloatArray, substeps: float, table: FloatArray) -> Engine:
-    """`run` of a library with one lane. Rows per call are limited by memory alone."""
+    """The engine of a library with one lane; `run` is the library's function."""
     width = p.decide.size1_out(2)
     theta, table = (np.ascontiguousarray(a, dtype=float) for a in (theta, table))
 
@@ -136,9 +149,9 @@ def compiled_engine(run: Any, p: Period, theta: FloatArray, substeps: float, tab
 
 
 def virtual_engine(chain_of: Callable[[int], ca.Function], substeps: float) -> Engine:
-    """The chained functions of machine.py on CasADi's virtual machine; a short last block is padded.
+    """The engine of CasADi's virtual machine; the last samples of a run are padded to a whole block.
 
-    chain_of : the chain for samples of so many substeps
+    chain_of : number of substeps -> the function `chain` of period.py for samples of so many substeps
     """
 
     def call(
@@ -164,7 +177,10 @@ def virtual_engine(chain_of: Callable[[int], ca.Function], substeps: float) -> E
 
 
 def evaluate(function: ca.Function, *arguments: FloatArray) -> list[FloatArray]:
-    """Call a dense CasADi function on numpy's own memory, a row for each of its columns: no conversion to DM."""
+    """Call a dense CasADi function on numpy arrays: a row of an array is a column of the function's argument or result.
+
+    The function reads and writes the arrays' memory, which is faster than a conversion to DM.
+    """
     results = [np.empty(function.size_out(i)[::-1]) for i in range(function.n_out())]
     buffer, run = function.buffer()
     inputs = [np.ascontiguousarray(array, dtype=float) for array in arguments]

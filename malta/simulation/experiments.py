@@ -1,27 +1,27 @@
-"""Experiments on a machine, each by name: what is run, and its figures of merit.
+"""Experiments on a machine by name: simulated runs and their figures of merit.
 
-An experiment is a function (plant, controller, *, progress=None, **options) -> Experiment. Options are fields of
-simulate.Scenario that replace the experiment's own (fidelity, noise, seed, estimator, ...), and those that its
-signature names: numbers in SI, words, true or false, tuples of numbers; their defaults say which.
+An experiment is a function (plant, controller, *, progress=None, **options) -> Experiment. Its options are fields of
+Scenario that replace the experiment's own (fidelity, noise, seed, estimator, ...), and the keywords of its signature:
+numbers in SI, words, true or false, or tuples of numbers, as their defaults are.
 
-A machine without experiments of its own has those of simulation/generic.py. Others define them beside their model, in
-the module of the plant or in a module `experiments` beside it:
+A machine without experiments of its own has those of simulation/generic.py. Other machines define, in the module of the
+plant or in a module `experiments` beside it,
 
     EXPERIMENTS   name -> experiment; the first is the machine's main job, which every design has to complete
 
 and, where they differ from the defaults,
 
-    CASES         name -> (plant, controller, **options) -> list[Wanted]: experiments that many machines can fly
-    FINDINGS      names of experiments that ask where it ends: a touchdown is no failure
-    ALONE         names of experiments whose figure shows one run by itself
+    CASES         name -> (plant, controller, **options) -> list[Wanted]: experiments for campaigns
+    FINDINGS      names of experiments in which a touchdown is an expected result and no failure
+    ALONE         names of experiments whose figure shows a single run
     OPTION_UNITS  option -> SI unit
-    check         (experiment, option, value): raises InputError for a value that the experiment does not stand
-    WORDS         what the machine calls its "stroke" and "thrust", and by unit ("m", "rad", "N", "N m") its other
+    check         (experiment, option, value): raises InputError for a value that the experiment does not accept
+    WORDS         the machine's words for its "stroke" and "thrust", and by unit ("m", "rad", "N", "N m") for its other
                   outputs and inputs; without a word the names of the signals are used
-    RISE          s, 10-90 %, of a stroke that says nothing else
-    STROKE_UNIT   what deviations along the stroke are shown in, if not in um
-    bounds        (scenario, options) -> what the paper prints of this very scenario, as keys of data/published/:
-                  "rise" and "overshoot" of the stroke, largest deviations "stroke" along it, "m" and "rad" else
+    RISE          s, 10-90 %, of a stroke without a rise of its own
+    STROKE_UNIT   unit in which deviations along the stroke are displayed, if not um
+    bounds        (scenario, options) -> bounds that the paper prints for this scenario, as keys of data/published/:
+                  "rise" and "overshoot" of the stroke, largest deviations "stroke" along it, "m" and "rad" of others
 """
 
 from __future__ import annotations
@@ -49,16 +49,16 @@ if TYPE_CHECKING:
     from malta.model.plant import FloatArray
 
 Progress = Callable[[float], None]
-# Fields of a scenario that make the experiment, all others may replace its own; and the engine.
+# Fields of a scenario that the experiment itself decides. All others are options, and so is the engine.
 MADE = {"name", "reference", "start", "cold", "disturbance", "faults", "correction", "changes"}
 OPTIONS = {f.name for f in fields(Scenario)} - MADE | {"engine"}
-# Sensors as built, without errors of their own; and such that say the truth.
+# Sensors as built, without systematic errors; and exact sensors.
 REAL: dict[str, Any] = {"noise": 1.0, "quantize": True, "sensor_errors": {}}
 QUIET: dict[str, Any] = {"noise": 0.0, "quantize": False, "sensor_errors": None}
 
 
 class Merit(NamedTuple):
-    """A figure of merit: SI value, the unit to show it in, and where the paper prints its own."""
+    """A figure of merit: value in SI, unit for display, and the key of the paper's value."""
 
     label: str
     value: float
@@ -72,7 +72,7 @@ class Merit(NamedTuple):
 
 
 class Case(NamedTuple):
-    """One of several runs of an experiment."""
+    """A run of an experiment with its figures of merit."""
 
     label: str
     run: Trajectory
@@ -80,7 +80,7 @@ class Case(NamedTuple):
 
 
 class Wanted(NamedTuple):
-    """A run that an experiment wants, and what is to be found in it."""
+    """A run that an experiment is going to simulate, and the function that evaluates its trajectory."""
 
     label: str
     scenario: Scenario
@@ -89,14 +89,14 @@ class Wanted(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Experiment:
-    """What an experiment found."""
+    """The result of an experiment."""
 
     name: str
     question: str
     cases: tuple[Case, ...]
     merits: tuple[Merit, ...]
-    curves: Mapping[str, FloatArray] = field(default_factory=dict)  # what is drawn beside the runs
-    interrupted: bool = False  # by Ctrl-C: the cases are those that were begun
+    curves: Mapping[str, FloatArray] = field(default_factory=dict)  # drawn beside the runs
+    interrupted: bool = False  # Ctrl-C ended the experiment: it has the cases up to then
 
     def __str__(self) -> str:
         cases = ("; ".join([case.label, *map(str, case.merits)]) for case in self.cases)
@@ -109,14 +109,14 @@ class Experiment:
 
     @property
     def failed(self) -> bool:
-        """Whether a run ended that should not have; where touchdown is a finding, it is none."""
+        """Whether a run ended early, except in experiments in which a touchdown is an expected result."""
         ends = {case.run.verdict.name for case in self.cases}
         findings = setting(self.run.plant, "FINDINGS", ())
         return self.name not in findings and not ends <= {"completed", "interrupted"}
 
     @property
     def outcome(self) -> str:
-        """How its runs ended, in words."""
+        """How the runs ended, in words."""
         ends = [case for case in self.cases if not case.run.verdict.completed]
         if not ends and self.interrupted:
             return f"interrupted after {len(self.cases)} runs"
@@ -131,7 +131,7 @@ class Experiment:
 def scenario_of(
     name: str, duration: float, reference: Callable[[Plant], Reference], options: Mapping[str, Any]
 ) -> Scenario:
-    """An experiment's scenario: real sensors unless the options say otherwise."""
+    """The scenario of an experiment, with sensors as built unless the options differ."""
     fields = REAL | {key: value for key, value in options.items() if key != "engine"}
     return replace(Scenario(name, duration, reference), **fields)
 
@@ -143,7 +143,7 @@ def fly(
     progress: Progress | None,
     options: Mapping[str, Any],
 ) -> tuple[tuple[Case, ...], bool]:
-    """Run scenarios one after the other. Ctrl-C ends the series with what there is: the second result."""
+    """Simulate runs one after the other: the cases, and whether Ctrl-C ended the series before its last run."""
     return fly_all([(plant, controller, one) for one in wanted], progress, options)
 
 
@@ -152,7 +152,7 @@ def fly_all(
     progress: Progress | None,
     options: Mapping[str, Any],
 ) -> tuple[tuple[Case, ...], bool]:
-    """The same, each with a machine and a controller of its own."""
+    """`fly` for runs with different machines and controllers."""
     cases: list[Case] = []
     for n, (plant, controller, (label, scenario, merits)) in enumerate(flights):
         share = progress_of_part(progress, n, len(flights))
@@ -169,16 +169,17 @@ def fly_all(
 
 
 def progress_of_part(progress: Progress | None, n: int, total: int) -> Progress | None:
-    """Progress of the n-th of so many parts."""
+    """The progress function of part n of `total` equal parts."""
     return None if progress is None else lambda share: progress((n + share) / total)
 
 
 def rms(values: FloatArray) -> float:
+    """Root mean square."""
     return float(np.sqrt(np.mean(np.square(values))))
 
 
 def experiments_of(plant: Plant) -> Mapping[str, Callable[..., Experiment]]:
-    """A machine's experiments by name, its main job first. Raises InputError for a machine that has none."""
+    """The experiments of a machine by name, its main job first."""
     from malta.simulation.generic import EXPERIMENTS
 
     found: Mapping[str, Callable[..., Experiment]] = setting(plant, "EXPERIMENTS", EXPERIMENTS)
@@ -186,7 +187,7 @@ def experiments_of(plant: Plant) -> Mapping[str, Callable[..., Experiment]]:
 
 
 def series_of(plant: Plant) -> Mapping[str, Callable[..., list[Wanted]]]:
-    """The experiments that many machines can fly, by name."""
+    """The functions that list the runs of an experiment for campaigns, by the experiment's name."""
     from malta.simulation import generic
 
     own: Mapping[str, Callable[..., list[Wanted]]] | None = setting(plant, "CASES", None)
@@ -196,25 +197,30 @@ def series_of(plant: Plant) -> Mapping[str, Callable[..., list[Wanted]]]:
 
 
 def setting(plant: Plant, name: str, default: Any) -> Any:
-    """A name that the machine defines for its experiments (the module's docstring lists them)."""
+    """The value of a name that the machine's module may define, see the list at the top of this file."""
     return attribute_of(plant, "experiments", name, default)
 
 
 def main_job(plant: Plant) -> str:
-    """The experiment that stands for all."""
+    """The name of the experiment that every design has to complete."""
     return next(iter(experiments_of(plant)))
 
 
 def experiment(
     name: str, plant: Plant, controller: Controller, *, progress: Progress | None = None, **options: Any
 ) -> Experiment:
-    """Run an experiment by name. Raises InputError for an unknown one, or an option that it does not take."""
+    """Run an experiment by name.
+
+    Raises InputError for an unknown experiment, and for options that it does not have.
+
+        print(malta.experiment("hold", plant, controller, seed=1))
+    """
     _check(name, plant, options)
     return experiments_of(plant)[name](plant, controller, progress=progress, **options)
 
 
 def cases_of(name: str, plant: Plant, controller: Controller, **options: Any) -> list[Wanted]:
-    """What one of the machine's CASES would fly, without flying it. Raises InputError as `experiment` does."""
+    """The runs of one of the machine's CASES, before they are simulated. Raises InputError as `experiment` does."""
     _check(name, plant, options)
     cases = series_of(plant)
     if name not in cases:
@@ -246,7 +252,7 @@ def single_run(
 
 
 def options_of(name: str, plant: Plant) -> dict[str, Any]:
-    """The options that an experiment has of its own, with their defaults. Raises InputError for an unknown one."""
+    """The options of an experiment's own signature with their defaults. Raises InputError for an unknown experiment."""
     known = experiments_of(plant)
     if name not in known:
         raise InputError("simulate", "scenario", repr(name), "one of " + ", ".join(known))
@@ -255,7 +261,7 @@ def options_of(name: str, plant: Plant) -> dict[str, Any]:
 
 
 def option_of(name: str, plant: Plant, option: str) -> Any:
-    """The default of one of them. Raises InputError for an option that the experiment does not have."""
+    """The default of one of these options. Raises InputError for an option that the experiment does not have."""
     mine = options_of(name, plant)
     if option not in mine:
         others = {o for other in experiments_of(plant) for o in options_of(other, plant)}
@@ -266,7 +272,7 @@ def option_of(name: str, plant: Plant, option: str) -> Any:
 
 
 def _check(name: str, plant: Plant, options: Mapping[str, Any]) -> None:
-    """InputError for an unknown experiment, or an option that it does not take."""
+    """InputError for an unknown experiment, an unknown option, or a value of the wrong kind."""
     mine, check = options_of(name, plant), setting(plant, "check", None)
     for option, value in options.items():
         if option in OPTIONS and option not in mine:
@@ -279,7 +285,7 @@ def _check(name: str, plant: Plant, options: Mapping[str, Any]) -> None:
 
 
 def _expected(value: Any, default: Any) -> str:
-    """What an option takes whose default is of this kind, unless it is this value."""
+    """The kind of value that an option with this default takes; "" where the value is of that kind."""
     if isinstance(default, bool):
         return "" if isinstance(value, bool) else "true or false"
     if isinstance(default, Real):

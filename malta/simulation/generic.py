@@ -1,10 +1,10 @@
 """Experiments of any machine: hold still, step an output, push.
 
-hold         sensors as built: motion and commands at rest
-step         one output after the other to a step and back to its reference
-disturbance  a constant force or torque, on each input of disturbance in turn
+hold         motion and commands at rest, with sensors as built
+step         a step of one output after the other
+disturbance  a constant force or torque on each input of disturbance in turn
 
-These are the experiments of a machine that defines none of its own; their options are in SI.
+A machine that defines no experiments has these. Their options are in SI.
 """
 
 from __future__ import annotations
@@ -38,10 +38,10 @@ from malta.synthesis.controller import Controller
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
 
-SAMPLES = 2000  # of a run whose time is not given
-BEFORE = 0.1  # share of the run that passes before a step or a push
-CLEARANCE = 0.1  # share of the clearance that a step of default size takes
-SIZE = 1e-5  # SI, of a step where no clearance and no noise says more
+SAMPLES = 2000  # of a run without a `time`
+BEFORE = 0.1  # share of the run before a step or a load
+CLEARANCE = 0.1  # of a step of default size, as a share of the clearance
+SIZE = 1e-5  # SI, of a step of a machine without contacts and without noise
 
 
 def hold(
@@ -76,7 +76,7 @@ def step(
     progress: Progress | None = None,
     **options: Any,
 ) -> Experiment:
-    """Step one output, or each in turn, by `size` (SI; 0: a tenth of the clearance), with exact sensors."""
+    """A step of one output, or of each in turn, by `size` (SI; 0: a tenth of the clearance), with exact sensors."""
     wanted = step_cases(plant, controller, output=output, size=size, time=time, **options)
     cases, cut = fly(plant, controller, wanted, progress, options)
     return Experiment("step", "Does it go where it is sent?", cases, cases[0].merits, interrupted=cut)
@@ -107,7 +107,7 @@ def disturbance(
     progress: Progress | None = None,
     **options: Any,
 ) -> Experiment:
-    """A constant force or torque of `size` (N or N m) from outside, on one input of disturbance or on each in turn."""
+    """A constant force or torque of `size` (N or N m) on one input of disturbance, or on each in turn."""
     wanted = disturbance_cases(plant, controller, on=on, size=size, time=time, **options)
     cases, cut = fly(plant, controller, wanted, progress, options)
     question = "How far does a load move it, and does it come back?"
@@ -141,7 +141,7 @@ def jump(plant: Plant, output: int, size: float, at: float) -> Reference:
 
 
 def default_step(plant: Plant, output: int) -> float:
-    """The step that takes a tenth of the clearance; ten times the sensor's noise where nothing is touched."""
+    """A tenth of the clearance of an output, SI; without contacts, ten times the sensor's noise."""
     y = np.zeros(len(plant.outputs))
     probe = max(10 * plant.noise[output], SIZE)
     y[output] = probe
@@ -156,6 +156,7 @@ def default_step(plant: Plant, output: int) -> float:
 
 
 def _choose(signals: Sequence[Signal], name: str, option: str) -> list[int]:
+    """The index of a signal, or all indices for "all". Raises InputError for an unknown name."""
     names = [s.name for s in signals]
     if name == "all":
         return list(range(len(names)))
@@ -169,7 +170,7 @@ def _duration(controller: Controller, time: float) -> float:
 
 
 def _with_fidelity(plant: Plant, options: Mapping[str, Any]) -> dict[str, Any]:
-    """The options with the fidelity of the machine: currents that follow their commands, where it has no windings."""
+    """The options with the default fidelity: "dq" for machines with windings, else "force"."""
     return {"fidelity": "dq" if "dq" in fidelities(plant) else "force"} | dict(options)
 
 
@@ -207,7 +208,7 @@ def _step_merits(run: Trajectory, output: int, size: float) -> tuple[Merit, ...]
 
 
 def _load_merits(run: Trajectory) -> tuple[Merit, ...]:
-    """Of the output that moves furthest, by its unit."""
+    """Figures of the output that moves furthest."""
     error = np.abs(run.p - run.reference)
     k = int(error.max(axis=0).argmax())
     signal = run.plant.outputs[k]

@@ -77,11 +77,12 @@ def sample_inputs(run: Simulation, motion: references.Motion, t: FloatArray) -> 
 
 
 def feedforward(c: Controller, motion: references.Motion, choice: FeedforwardChoice = "axial") -> FloatArray:
-    """v_ff, N, k x m: inertia p*'' + speed p*'; "attraction" adds the forces that hold the mover at q*.
+    """Feedforward forces v_ff = inertia p*'' + speed p*', N, k x m.
 
-    With state feedback alone a mover that is pulled with stiffness k and held with K1 goes to K1 / (K1 - k) of what is
-    asked, until the integrals have taken it back: twice as far at K1 = 2 k. From the file's own model q'' = k q + G v,
-    these forces are -G^-1 k q*.
+    choice : "attraction" adds the forces that hold the mover at q*, -G^-1 k q* of the gain file's model q'' = k q + G v
+
+    Without them, a mover under attraction k and feedback K1 goes to K1 / (K1 - k) of its reference, twice as far at
+    K1 = 2 k, until the integrals correct it.
     """
     believed = plant_of(c.parameters)
     v_ff = c.feedforward.inertia * motion.ddp + motion.dp @ c.feedforward.speed.T

@@ -1,4 +1,4 @@
-"""The straight line of scalar operations of a CasADi function, simplified on the way.
+"""The instructions of a CasADi function as a simplified straight line of scalar operations.
 
 What depends on the parameters theta alone is marked `fixed`: it is computed once a run. Every operation stands once.
 A fixed factor that the terms of a sum share is taken out of the sum."""
@@ -52,9 +52,9 @@ _FORMS = (
         "OP_FMIN": "smaller({0}, {1})",
         "OP_FMAX": "larger({0}, {1})",
         "OP_CONSTPOW": "each_pow({0}, {1})",
-        "OP_IF_ELSE_ZERO": "where({0}, {1})",  # the first as a mask
-        "PICK": "pick({0}, {1}, {2})",  # likewise
-        "TILT": "tilt({0})",  # the square of an angle that is likely to be small, and its functions
+        "OP_IF_ELSE_ZERO": "where({0}, {1})",  # the first argument is a mask
+        "PICK": "pick({0}, {1}, {2})",  # the first argument is a mask
+        "TILT": "tilt({0})",  # the square of an angle that is probably small; sine, cosine and secant of it
         "TILT_SINE": "tilt_sine({0}, {1})",
         "TILT_COSINE": "tilt_cosine({0}, {1})",
         "TILT_SECANT": "tilt_secant({0}, {1})",
@@ -62,7 +62,7 @@ _FORMS = (
 )
 
 
-# Truths are masks; they become 1 and 0 where they are calculated with.
+# Truth values are masks; they become 1 and 0 where an arithmetic operation reads them.
 MASKS = {f"OP_{name}": f"MASK({{0}} {sign} {{1}})" for name, sign in _TRUTH.items()} | {
     "OP_NOT": "~{0}",
     "OP_AND": "{0} & {1}",
@@ -74,19 +74,24 @@ _NAMES = {getattr(ca, name): name for name in dir(ca) if name.startswith("OP_")}
 
 
 class Node(NamedTuple):
-    """A scalar of the straight line: what it does with earlier nodes, or what it reads."""
+    """A scalar of the straight line: an operation on earlier nodes, an argument, or a constant."""
 
-    op: str  # "" where `form` is read or written out in place
-    form: str
+    op: str  # "" for arguments and constants, whose form stands in place of a variable
+    form: str  # in C, with {0}, {1}, ... for the arguments
     arguments: tuple[int, ...]
-    fixed: bool  # depends on theta and constants alone
+    fixed: bool  # depends on theta and constants only: computed once a run
 
 
 def read_instructions(f: ca.Function, shared: Sequence[int]) -> tuple[list[Node], list[tuple[int, int, int]]]:
-    """The instructions of an SX function, and which node is which entry of which result."""
+    """The nodes of an SX function, and (result, entry, node) for every entry of its results.
+
+    shared : arguments that have the same value in every lane
+
+    Raises CheckError for an operation that has no form in C.
+    """
     theta = f.n_in() - 1
     nodes = _StraightLine()
-    slot: dict[int, int] = {}  # of CasADi's work vector: the node it holds
+    slot: dict[int, int] = {}  # place in CasADi's work vector -> the node there
     outputs: list[tuple[int, int, int]] = []
     for k in range(f.n_instructions()):
         op, reads, writes = f.instruction_id(k), f.instruction_input(k), f.instruction_output(k)
@@ -110,26 +115,26 @@ def read_instructions(f: ca.Function, shared: Sequence[int]) -> tuple[list[Node]
 
 
 def _number(value: float) -> str:
-    """A constant as C writes it."""
+    """A constant in C."""
     return repr(value).replace("inf", "INFINITY").replace("nan", "NAN")
 
 
 class _StraightLine:
-    """Nodes, each of them once."""
+    """Nodes in order, each of them once. Methods named after an operation return a simpler form, or None."""
 
     def __init__(self) -> None:
         self.nodes: list[Node] = []
         self._known: dict[Node, int] = {}
 
     def place(self, node: Node) -> int:
-        """Where this very node stands, now or already."""
+        """The index of a node, which is appended unless it is there already."""
         if node not in self._known:
             self._known[node] = len(self.nodes)
             self.nodes.append(node)
         return self._known[node]
 
     def add(self, name: str, *arguments: int) -> int:
-        """Where the result of an operation stands, in the form that costs least."""
+        """The index of an operation's result, in the cheapest form that is known for it."""
         made = getattr(self, f"_{name.removeprefix('OP_').lower()}", None)
         found: int | None = made(*arguments) if made is not None else None
         return self._append(name, *arguments) if found is None else found
@@ -141,7 +146,7 @@ class _StraightLine:
         return self.place(Node(name, MASKS.get(name) or _FORMS[name], arguments, fixed))
 
     def _fixed_factor(self, k: int) -> tuple[int, int] | None:
-        """The fixed factor and the moving one of a product."""
+        """(fixed factor, other factor) of a product; None for other nodes and for fixed products."""
         node = self.nodes[k]
         if node.op != "OP_MUL" or node.fixed:
             return None
@@ -151,7 +156,7 @@ class _StraightLine:
         return (other, one) if self.nodes[other].fixed else None
 
     def _mul(self, one: int, other: int) -> int | None:
-        """Fixed factors are multiplied with each other, once a run."""
+        """f (g x) = (f g) x for fixed f and g: their product is computed once a run."""
         for factor, product in ((one, other), (other, one)):
             parts = self._fixed_factor(product)
             if self.nodes[factor].fixed and parts is not None:
@@ -159,7 +164,7 @@ class _StraightLine:
         return None
 
     def _div(self, one: int, other: int) -> int | None:
-        """A reciprocal, which is computed once a run where it is fixed, and a product."""
+        """x / y = x (1 / y): the reciprocal of a fixed y is computed once a run."""
         return self.add("OP_MUL", one, self.add("OP_INV", other))
 
     def _inv(self, k: int) -> int | None:
@@ -169,7 +174,7 @@ class _StraightLine:
         return self._append("TILT_SECANT", *node.arguments) if node.op == "TILT_COSINE" else None
 
     def _add(self, one: int, other: int) -> int | None:
-        """if_else(c, x, y) comes as (c ? x : 0) + (not c ? y : 0)."""
+        """(c ? x : 0) + (not c ? y : 0), as CasADi writes if_else(c, x, y), becomes one operation."""
         first, second = self.nodes[one], self.nodes[other]
         if first.op == second.op == "OP_IF_ELSE_ZERO":
             condition = self.nodes[second.arguments[0]]
@@ -181,7 +186,7 @@ class _StraightLine:
         return self._take_out_factor("OP_SUB", one, other)
 
     def _take_out_factor(self, name: str, one: int, other: int) -> int | None:
-        """The sum of two products that share their fixed factor."""
+        """f x + f y = f (x + y) for a fixed f; the same for differences."""
         first, second = self._fixed_factor(one), self._fixed_factor(other)
         if first is None or second is None or first[0] != second[0]:
             return None
@@ -194,7 +199,7 @@ class _StraightLine:
         return self._tilt("TILT_COSINE", k)
 
     def _tilt(self, name: str, k: int) -> int | None:
-        """The angle is taken for a tilt, radians of a mover in its air gap, where it is a state and what is added."""
+        """Sine or cosine of an angle that is probably small: a state, or a state with something added to it."""
         return self._append(name, k, self._append("TILT", k)) if self._is_tilt(k) else None
 
     def _is_tilt(self, k: int) -> bool:
@@ -205,14 +210,14 @@ class _StraightLine:
 
 
 def mask_arguments(node: Node) -> range:
-    """Which arguments a node takes as masks."""
+    """Indices of the arguments that a node takes as masks."""
     if node.op in ("OP_IF_ELSE_ZERO", "PICK"):
         return range(1)
     return range(2) if node.op in ("OP_NOT", "OP_AND", "OP_OR") else range(0)
 
 
 def needed_nodes(nodes: list[Node], roots: list[int]) -> list[int]:
-    """The nodes that the roots need, in order."""
+    """The nodes on which the roots depend, in order."""
     needed, waiting = set(), list(roots)
     while waiting:
         k = waiting.pop()

@@ -1,4 +1,4 @@
-"""Half-bridges on a DC link: what voltages and duty cycles they make of those that are asked for."""
+"""Half-bridges on a DC link: voltages and duty cycles within their limits, star points, the link voltage."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ def open_loop_gain(actuator: Actuator, Kp: float, Ki: float, delay: float, w: Fl
 
 
 def modulation(drive: Drive, u: Any, V: Any) -> tuple[Any, Any]:
-    """Axis voltages as shares of the link voltage V, within what its half-bridges can make, and who was limited.
+    """Axis voltages u as shares of the link voltage V within the limits of the half-bridges, and 1 for limited axes.
 
-    Where the largest phase voltage of a group of axes would pass V/2, the group is scaled down: its direction stays.
+    Where the largest phase voltage of a group of axes exceeds V/2, the whole group is scaled: its direction stays.
     """
     peak = drive.peak(u)
     m, limited = ca.SX(u / V), ca.SX.zeros(len(drive.axes))
@@ -36,25 +36,26 @@ def modulation(drive: Drive, u: Any, V: Any) -> tuple[Any, Any]:
 
 
 def duty_cycles(drive: Drive, u_phase: Any, V: Any, i_phase: Any, *, real_pwm: bool) -> tuple[Any, Any]:
-    """Duty cycles of the half-bridges, 0 to 1, and who was limited: d = 1/2 + u / V.
+    """Duty cycles of the half-bridges, d = 1/2 + u / V within 0 to 1, and 1 for limited phases.
 
-    real_pwm: duty cycles in the steps of the modulator's counter, and the voltage that dead time costs,
-    dead_share V against the current's direction.
+    real_pwm : with the resolution of the modulator's counter, and with the loss of voltage by dead time, dead_share V
+        against the direction of the current
     """
     wanted = 0.5 + u_phase / V
     d = ca.fmax(ca.fmin(wanted, 1), 0)
     limited = d != wanted
     if real_pwm:
         d = drive.pwm_step * ca.floor(d / drive.pwm_step + 0.5) - drive.dead_share * ca.sign(i_phase)
-        d = ca.fmax(ca.fmin(d, 1), 0)  # one that does not switch has no dead time
+        d = ca.fmax(ca.fmin(d, 1), 0)  # a half-bridge that does not switch has no dead time
     return d, limited
 
 
 def phase_voltages(drive: Drive, drop: Any, closed: Any) -> Any:
-    """What drives the current of each winding, V: `drop` = u - R i - emf, less the star point that it hangs on.
+    """The voltage L i' of each winding: `drop` = u - R i - emf minus the potential of its star point.
 
-    The star point floats so that the currents of its phases keep adding to zero. closed: 1 per phase, 0 where it is
-    open; an open phase drives nothing.
+    A star point floats so that the currents of its phases add up to zero.
+
+    closed : 1 for every phase, 0 for an open one, whose voltage is zero
     """
     net = ca.SX(drop)
     for star in drive.stars:
@@ -65,11 +66,11 @@ def phase_voltages(drive: Drive, drop: Any, closed: Any) -> Any:
 
 
 def link_slope(drive: Drive, V: Any, power: Any) -> Any:
-    """V' of the DC link, V/s: the supply's current through its resistance, never backwards, less power / V."""
+    """V' of the DC link, V/s: C V' = i_supply - power / V. The supply's current never reverses."""
     supply = ca.fmax(drive.link_voltage - V, 0) / drive.supply_resistance
     return (supply - power / V) / drive.link_capacitance
 
 
 def link_voltage(V: float, C: float, energy: float) -> float:
-    """Voltage of a link of C (F) at V (V) after it took up `energy` (J) without loss."""
+    """Voltage of a link with capacitance C (F) at V (V) after it has absorbed `energy` (J) without loss."""
     return math.sqrt(V**2 + 2 * energy / C)

@@ -1,7 +1,7 @@
-"""Reproducible white noise by plant and sample: the same numbers here and in the compiled engine's lanes.
+"""Reproducible white noise: the same numbers here and in the lanes of the compiled engine.
 
-SplitMix64 (Steele, Lea, Flood 2014) of a key and a counter gives 64 bits: 32 for the radius, 32 for the angle of two
-normals (Box–Muller). Counter-based, so that a run's noise depends on its seed and index alone, not on workers or order.
+SplitMix64 (Steele, Lea, Flood 2014) of a key and a counter gives 64 bits: 32 for the radius and 32 for the angle of two
+normal numbers (Box–Muller). The noise of a run depends on its seed and index only, not on workers or order.
 """
 
 from __future__ import annotations
@@ -19,19 +19,23 @@ GAMMA = 0x9E3779B97F4A7C15
 
 
 def keys(seed: int, indices: NDArray[np.int64]) -> NDArray[np.uint64]:
-    """The key of each run of a campaign: mixed from the campaign's seed and the run's index."""
+    """The key of each run of a campaign, from the campaign's seed and the run's index."""
     stream = _mix(np.array([(seed * GAMMA + 1) % 2**64], dtype=np.uint64))
     return _mix(stream + (indices.astype(np.uint64) + np.uint64(1)) * np.uint64(0xD1342543DE82EF95))
 
 
 def normals(key: np.uint64, samples: int, channels: int) -> FloatArray:
-    """Standard normal numbers, samples x channels. The first rows do not depend on how many follow."""
+    """Standard normal numbers, samples x channels. A row does not depend on the number of samples.
+
+    >>> normals(keys(0, np.array([0]))[0], 2, 3).shape
+    (2, 3)
+    """
     pairs = (samples + 1) // 2 * channels
     bits = _mix(key + np.arange(pairs, dtype=np.uint64) * np.uint64(GAMMA))
     unit = 1 / 2**32
     radius = np.sqrt(-2 * np.log(((bits >> np.uint64(32)).astype(float) + 0.5) * unit))
     quadrant = ((bits >> np.uint64(30)) & np.uint64(3)).astype(float)
-    middle = 536870911.5  # of the 30 bits within a quadrant
+    middle = 536870911.5  # of the range of the 30 bits within a quadrant
     within = ((bits & np.uint64(0x3FFFFFFF)).astype(float) - middle) / 2**30
     angle = (quadrant + within) * (np.pi / 2)
     drawn = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
@@ -39,6 +43,7 @@ def normals(key: np.uint64, samples: int, channels: int) -> FloatArray:
 
 
 def _mix(x: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    """The output function of SplitMix64."""
     x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
     return x ^ (x >> np.uint64(31))

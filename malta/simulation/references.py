@@ -1,4 +1,4 @@
-"""References with their derivatives: what a machine is asked to follow.
+"""References: outputs that a machine shall follow, with their derivatives.
 
 A reference is a function of time (s, shape (k,)) that returns p*, its first and its second derivative, each k x p in
 the order of the plant's outputs.
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from malta.model.plant import FloatArray
 
 Profile = Literal["logistic", "quintic"]
-RISE = 20e-3  # s, of machines that say nothing else
+RISE = 20e-3  # s, of machines without a RISE of their own
 
 
 class Motion(NamedTuple):
@@ -37,7 +37,7 @@ Reference = Callable[["FloatArray"], Motion]
 def logistic(t: FloatArray, rise: float) -> tuple[FloatArray, FloatArray, FloatArray]:
     """s = 1 / (1 + e^(-k t)), centred at t = 0, from 10 to 90 % in `rise` (s): k = 2 ln 9 / rise."""
     k = 2 * math.log(9) / rise
-    s = 0.5 * (1 + np.tanh(k * t / 2))  # the same, without overflow
+    s = 0.5 * (1 + np.tanh(k * t / 2))  # 1 / (1 + e^(-k t)) without overflow
     ds = k * s * (1 - s)
     return s, ds, k * ds * (1 - 2 * s)
 
@@ -64,9 +64,11 @@ PROFILES = {"logistic": logistic, "quintic": quintic}
 def stroke(
     plant: Plant, start: float, end: float, rise: float | None, centre: float, profile: Profile = "logistic"
 ) -> Reference:
-    """The stroke axis from `start` to `end` (m), half-way at `centre` (s), the other outputs held at zero.
+    """A move of the stroke axis from `start` to `end` (m), half-way at `centre` (s); the other outputs stay at zero.
 
     rise : s, 10-90 %; None: the machine's own, RISE of its experiments, or 20 ms
+
+    Raises InputError for an unknown profile, a rise out of range, and positions beyond the travel.
     """
     if profile not in PROFILES:
         raise InputError("stroke", "profile", repr(profile), "one of " + ", ".join(PROFILES))
@@ -91,13 +93,16 @@ def stroke(
 
 
 def check_rise(rise: float) -> None:
-    """InputError unless `rise` is a time that a stroke may take."""
+    """InputError for a rise outside 1e-6 to 1e6 s."""
     if not 1e-6 <= rise <= 1e6:
         raise InputError("stroke", "rise", f"{rise} s", "a time from 1e-6 to 1e6 s")
 
 
 def hold(plant: Plant, **outputs: float) -> Reference:
-    """Outputs held constant (SI), the ones not named at zero."""
+    """Constant outputs (SI); those without a value stay at zero. Raises InputError for unknown names.
+
+    malta.Scenario("hold", 0.1, partial(malta.references.hold, x1=1e-6))
+    """
     names = [s.name for s in plant.outputs]
     for name in outputs:
         if name not in names:
@@ -112,7 +117,7 @@ def hold(plant: Plant, **outputs: float) -> Reference:
 
 
 def circle(plant: Plant, radius: float, frequency: float) -> Reference:
-    """The first two outputs on a circle of `radius` (m) at `frequency` (Hz), the others at zero."""
+    """A circle of the first two outputs, of `radius` (m) at `frequency` (Hz); the others stay at zero."""
     w = 2 * math.pi * frequency
 
     def at(t: FloatArray) -> Motion:

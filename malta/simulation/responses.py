@@ -1,4 +1,4 @@
-"""What experiments of several machines push and read: steps and sines of force, amplitudes, compliance."""
+"""Forces and readings that experiments of several machines use: steps and sines, amplitudes, compliance."""
 
 from __future__ import annotations
 
@@ -41,19 +41,21 @@ def compliance(
 
 
 def step_wrench(t: FloatArray, column: int, size: float, at: float, width: int) -> FloatArray:
+    """A wrench, k x width, whose entry `column` steps to `size` (N or N m) at `at` (s)."""
     wrench = np.zeros((len(t), width))
     wrench[t >= at, column] = size
     return wrench
 
 
 def sine_wrench(t: FloatArray, column: int, size: float, frequency: float, width: int) -> FloatArray:
+    """A wrench, k x width, whose entry `column` is a sine of amplitude `size` (N or N m) at `frequency` (Hz)."""
     wrench = np.zeros((len(t), width))
     wrench[:, column] = size * np.sin(2 * math.pi * frequency * t)
     return wrench
 
 
 def amplitude(run: Trajectory, output: int, frequency: float) -> float:
-    """Amplitude of an output at a frequency (Hz), over the last whole periods of the second half of a run."""
+    """Amplitude of an output at a frequency (Hz): a fit to the last whole periods in the second half of a run."""
     Ts = run.controller.sample_time
     period = 1 / frequency
     periods = max(1, int(len(run.t) / 2 * Ts / period))

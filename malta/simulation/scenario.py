@@ -1,4 +1,4 @@
-"""Scenarios: the reference, the duration and everything that disturbs a machine on the way."""
+"""Scenarios: the reference, the duration, and everything that disturbs the machine on the way."""
 
 from __future__ import annotations
 
@@ -41,59 +41,65 @@ FaultKind = Literal[
 
 
 class Correction(NamedTuple):
-    """An outer loop, slower than the controller, that moves its reference: (t, true outputs) -> added to p*."""
+    """An outer loop, slower than the controller, that moves its reference.
+
+    update : (t, true outputs) -> offset of the reference p* until the next update
+    """
 
     every: float  # s
     update: Callable[[float, FloatArray], FloatArray]
 
 
 class Fault(NamedTuple):
-    """Something that breaks at `at` (s) and is whole again at `until` (s)."""
+    """A fault that begins at `at` (s) and ends at `until` (s)."""
 
     kind: FaultKind
     at: float  # s
     until: float = math.inf  # s
-    what: str = ""  # the sensor (an output's name) or the phase that it concerns
+    what: str = ""  # name of the output whose sensor fails, or of the phase
     size: float = (
-        0.0  # bias, in the output's unit; factor of the noise; share of the link voltage that is missing
+        0.0  # bias in the output's unit, factor of the noise, or share of the link voltage that sags
     )
 
 
 @dataclass(frozen=True, eq=False)
 class Scenario:
-    """What is asked of the machine, and what it has to stand."""
+    """A reference for a machine, with start, disturbances, noise, faults and the fidelity of the simulation.
+
+    Raises InputError for values out of range or unknown words.
+
+        malta.Scenario("hold", 0.1, malta.references.hold, noise=1.0, fidelity="force")
+    """
 
     name: str
     duration: float  # s
     reference: Callable[[Plant], Reference]
-    start: Mapping[str, float] = field(default_factory=dict)  # states (SI) unlike the reference's first
-    cold: bool = False  # starts without current, and with an observer that takes the machine to be at zero
+    start: Mapping[str, float] = field(default_factory=dict)  # states (SI) that do not start on the reference
+    cold: bool = False  # starts without current, with the observer at zero
     disturbance: Callable[[FloatArray], FloatArray] | None = None  # t (k,) -> wrench, k x 6, N and N m
-    noise: float = 0.0  # sensor noise in multiples of the plant's
-    quantize: bool = False  # sensors resolve what the plant's do
-    sensor_errors: Mapping[str, float] | None = None  # of the sensors' own signals; None: y = p exactly
+    noise: float = 0.0  # standard deviation of the sensors in multiples of the plant's
+    quantize: bool = False  # sensors with the plant's resolution
+    sensor_errors: Mapping[str, float] | None = (
+        None  # by the names of the plant's sensor_errors; None: y = p exactly
+    )
     seed: int = 0
-    run: int = 0  # of a campaign: its noise depends on seed and run alone
+    run: int = 0  # index in a campaign: the noise depends on seed and run only
     delay: int | None = None  # samples between measurement and force; None: the machine's own
-    substeps: int | None = (
-        None  # Runge–Kutta steps a sample; None: as many as the current loops ask for, at least 4
-    )
-    fidelity: Fidelity = "dq"  # what makes the forces, see machine.py
-    real_pwm: bool = False  # duty cycles in steps, dead time (fidelity phase)
-    bearing_axes: BearingAxes = "fixed"  # of the current controllers; "turning": (18) as printed
-    bearing: bool = False  # touchdown bearings push back; without, a touchdown ends the run
+    substeps: int | None = None  # Runge–Kutta steps in a sample; None: see steps_of
+    fidelity: Fidelity = "dq"  # how forces arise, see period.py
+    real_pwm: bool = False  # duty cycles with a resolution, dead time (fidelity phase)
+    bearing_axes: BearingAxes = "fixed"  # of the current controllers; "turning": eq. (18) as printed
+    bearing: bool = False  # touchdown bearings push back; without them a touchdown ends the run
     estimator: Estimator = "steady-state"
-    feedforward: FeedforwardChoice = (
-        "axial"  # "attraction" adds what holds the mover off centre, see `feedforward`
-    )
-    scheduled: bool = False  # C(z) of the measured z in the steady-state filter
+    feedforward: FeedforwardChoice = "axial"  # see the function `feedforward` of inputs.py
+    scheduled: bool = False  # the steady-state filter uses C at the measured z
     faults: tuple[Fault, ...] = ()
     correction: Correction | None = None
-    open_loop: bool = False  # no feedback: what is fed forward, commutated for the reference
-    electronics: Any = None  # options of the machine's own electronics (fidelity phase), where it has some
+    open_loop: bool = False  # no feedback: feedforward alone, commutated for the reference
+    electronics: Any = None  # options of the machine's own electronics (fidelity phase)
     changes: tuple[
         tuple[float, Mapping[str, float]], ...
-    ] = ()  # s: parameters of the machine (SI) from then on
+    ] = ()  # (s, parameters of the machine (SI) from then on)
 
     def __post_init__(self) -> None:
         where = f"scenario {self.name}"
@@ -145,11 +151,13 @@ class Scenario:
         duration: float | None = None,
         **options: Any,
     ) -> Scenario:
-        """Move by `distance` (m), symmetrically about the middle, in `rise` (s, 10-90 %).
+        """A stroke by `distance` (m), symmetric about the middle, in `rise` (s, 10-90 %).
 
         rise : None: the machine's own, RISE of its experiments
-        duration : s; None gives six times the rise, at least 0.1 s, so that the move is whole
+        duration : s; None: six times the rise, at least 0.1 s, so that the move fits
         options : fields of the scenario, as noise=1.0
+
+        Raises InputError for a distance of 0 m, or a rise that no stroke may have.
         """
         if rise is not None:
             references.check_rise(rise)
@@ -231,13 +239,13 @@ def setup_of(plant: Plant, c: Controller, s: Scenario) -> Setup:
 
 
 def substeps_of(plant: Plant, c: Controller, setup: Setup, s: Scenario) -> float:
-    """Steps of the simulation in a sample: the scenario's, or the periods of the machine's electronics."""
+    """Substeps of the simulation in a sample: Runge–Kutta steps, or periods of the machine's electronics."""
     fast = electronics_of(plant, setup)
     return steps_of(plant, c, s) if fast is None else c.sample_time / fast.period
 
 
 def steps_of(plant: Plant, c: Controller, s: Scenario) -> int:
-    """Runge–Kutta steps in a sample: the scenario's, or one for each time constant of the current loops, at least 4."""
+    """Runge–Kutta steps in a sample: the scenario's, else one a time constant of the current loops, at least 4."""
     if s.substeps is not None:
         return s.substeps
     lag = c.sample_time * plant.actuator.crossover

@@ -1,11 +1,11 @@
-"""Kalman filters for a start that the steady-state filter knows nothing of: filterpy's, on the machine's CasADi model.
+"""Kalman filters for a start with an unknown state: filterpy's, on the CasADi model of the machine.
 
-    kalman     time-varying: the gain file's model, the gain still large while nothing is known
-    extended   the nonlinear machine as the controller believes it to be: gravity, cogging, touchdown bearings; so it
-               knows what holds a mover that rests on its bearing
+    kalman     time-varying, on the linear model of the gain file; its gain is large at first
+    extended   on the nonlinear machine of the gain file, with gravity, cogging and touchdown bearings, so that it
+               accounts for the force of a bearing on a mover that rests there
 
-Both start from the first measurement: positions as measured, rates zero with the variance that the difference of two
-measurements would have. Covariances of forces and sensors are those of the filter in the gain file.
+Both start from the first measurement: positions as measured, and zero rates with the variance that a difference of two
+measurements would have. Covariances of forces and sensors are those of the gain file's filter.
 """
 
 from __future__ import annotations
@@ -46,16 +46,7 @@ def observer(simulation: Simulation, substeps: int) -> Observer:
     """
     plant, c, scenario, setup = simulation
     kind, errors = scenario.estimator, scenario.sensor_errors
-    if c.noise is None or c.observed:
-        without = "a PID" if c.tracks == "states" else "a law of errors"
-        found = without if c.noise is None else "forces of disturbance in its own"
-        raise InputError("simulate", f"estimator {kind}", found, "an LQG with integrals")
-    believed = plant_of(c.parameters)
-    believed.require_second_order(f"estimator {kind}")
-    if holds(believed):
-        found = f"a {plant.name}, whose currents are held between samples"
-        raise InputError("simulate", f"estimator {kind}", found, "steady-state, which knows of that")
-    filter_ = _kalman_filter(c, c.noise)
+    filter_ = _kalman_filter(c, _noise_of(plant, c, kind))
     predict = _nonlinear_prediction(c) if kind == "extended" else _linear_prediction(c)
     jacobian, output = _measurement(c)
 
@@ -68,18 +59,18 @@ def observer(simulation: Simulation, substeps: int) -> Observer:
     commands = slice(edges["v"], edges["v"] + sizes["v"])
     axis = plant_of(c.parameters).leading_output
     n = len(c.A)
-    # v - v0 of the last samples, the oldest first
+    # v - v0 and v0 of the last samples, the oldest first
     sent: list[FloatArray] = [np.zeros(len(c.forces))] * c.delay
     loads: list[FloatArray] = []
     started = False
 
-    @np.errstate(all="ignore")  # what is lost ends the run with a verdict
+    @np.errstate(all="ignore")  # a filter that diverges ends the run with a verdict
     def run(
-        engine: Engine, flown: Plant, state: FloatArray, given: FloatArray, noise: FloatArray
+        engine: Engine, machine: Plant, state: FloatArray, given: FloatArray, noise: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         nonlocal started
         rows = []
-        sense, none = sensors(flown), np.zeros((0, 0))
+        sense, none = sensors(machine), np.zeros((0, 0))
         for k in range(len(given)):
             y = np.array(sense(state, given[k], noise[k], [])[0]).ravel()
             if not started:
@@ -87,7 +78,7 @@ def observer(simulation: Simulation, substeps: int) -> Observer:
                 started = True
             try:
                 filter_.update(y, jacobian, output)
-            except (np.linalg.LinAlgError, ValueError):  # of no numbers
+            except (np.linalg.LinAlgError, ValueError):  # NaN in the estimate or its covariance
                 filter_.x = np.full(n, np.nan)
             now = given[k : k + 1].copy()
             now[0, -len(c.states) :] = np.concatenate([filter_.x, *sent])
@@ -107,7 +98,22 @@ def observer(simulation: Simulation, substeps: int) -> Observer:
     return run
 
 
+def _noise_of(plant: Plant, c: Controller, kind: str) -> Noise:
+    """The covariances of a controller; InputError for one that these filters do not fit."""
+    if c.noise is None or c.observed:
+        without = "a PID" if c.tracks == "states" else "a law of errors"
+        found = without if c.noise is None else "forces of disturbance in its own"
+        raise InputError("simulate", f"estimator {kind}", found, "an LQG with integrals")
+    believed = plant_of(c.parameters)
+    believed.require_second_order(f"estimator {kind}")
+    if holds(believed):
+        found = f"a {plant.name}, whose currents are held between samples"
+        raise InputError("simulate", f"estimator {kind}", found, "steady-state, which knows of that")
+    return c.noise
+
+
 def _kalman_filter(c: Controller, noise: Noise) -> Any:
+    """filterpy's filter with the covariances of the gain file: process noise acts through B, as the forces do."""
     n, p = len(c.A), len(c.measurements)
     kalman = ExtendedKalmanFilter(dim_x=n, dim_z=p, dim_u=len(c.forces))
     B = (c.Ad[:n, n : n + len(c.forces)] if c.delay else c.Bd)[:n]
@@ -118,7 +124,7 @@ def _kalman_filter(c: Controller, noise: Noise) -> Any:
 
 
 def _start_filter(kalman: Any, c: Controller, y: FloatArray) -> None:
-    """One measurement: positions P^-1 y with its covariance, rates zero +- sqrt(2) of that a sample."""
+    """Start from one measurement: positions P^-1 y with their covariance S, zero rates with 2 diag(S) / Ts^2."""
     believed = plant_of(c.parameters)
     symbol = ca.SX.sym("y", len(y))
     q = believed.position_of(symbol)
@@ -133,6 +139,7 @@ def _start_filter(kalman: Any, c: Controller, y: FloatArray) -> None:
 
 
 def _linear_prediction(c: Controller) -> Callable[..., tuple[FloatArray, FloatArray]]:
+    """(x, v, v0) -> A x + B v, and A."""
     n, m = len(c.A), len(c.forces)
     A = c.Ad[:n, :n]
     B = c.Ad[:n, n : n + m] if c.delay else c.Bd
@@ -140,7 +147,7 @@ def _linear_prediction(c: Controller) -> Callable[..., tuple[FloatArray, FloatAr
 
 
 def _nonlinear_prediction(c: Controller) -> Callable[..., tuple[FloatArray, FloatArray]]:
-    """A sample of the believed machine under v + v0, with its loads and bearings, and its Jacobian."""
+    """(x, v, v0) -> one sample of the controller's machine under v + v0, with loads and bearings; and its Jacobian."""
     believed = plant_of(c.parameters)
     x, u = ca.SX.sym("x", len(believed.states)), ca.SX.sym("u", len(c.forces))
     h = c.sample_time / 4
@@ -164,6 +171,7 @@ def _nonlinear_prediction(c: Controller) -> Callable[..., tuple[FloatArray, Floa
 
 
 def _measurement(c: Controller) -> tuple[Callable[..., FloatArray], Callable[..., FloatArray]]:
+    """The functions x -> dh/dx and x -> h(x) of the controller's machine."""
     believed = plant_of(c.parameters)
     x = ca.SX.sym("x", len(c.A))
     full = ca.SX.zeros(len(believed.states))

@@ -4,17 +4,17 @@
                                 |i| <= i_max,   |u| <= u_max,   |u'| <= 2 u_max / Ts,
                                 and rest at both ends: v = 0, i holds the load, u = R i
 
-a is the plant's own equation of the stroke axis, cogging included. i and u are the axis quantities of one module, k is
-the thrust of all modules over i, and Ts the period of the current controllers, which take u from limit to limit in no
-less. So u is continuous, i and z'' are smooth, and the optimum belongs to the machine, not to the mesh.
+a is the plant's own equation of the stroke axis, cogging included. i and u are the axis quantities of one module, and k
+is the thrust of all modules over i. The current controllers, with period Ts, take at least one period to move u from
+limit to limit. So u is continuous, i and z'' are smooth, and the optimum does not depend on the mesh.
 
 Transcription: Hermite–Simpson collocation (fourth order), u linear in each interval, |i| limited at the Bézier points
-of its cubics and so between the nodes too. The mesh is a fixed division of the free T: without cogging, the strokes of
-a given T are then a convex set. IPOPT solves; the mesh is refined where u changes, and solved again, until T stands
-still.
+of its cubics and so between the nodes too. The mesh divides the free T in fixed shares: without cogging, the strokes of
+a given T are then a convex set. IPOPT solves the problem; the mesh is refined where u changes, and the problem solved
+again, until T converges.
 
-Left out is the voltage that the moving axes of a winding induce in each other, at right angles to u: a voltage_share
-below 1 leaves room for it, a current_share for the controller.
+The model neglects the voltage that the moving axes of a winding induce in each other, at right angles to u. A
+voltage_share below 1 leaves room for this voltage, and a current_share below 1 leaves room for the controller.
 """
 
 from __future__ import annotations
@@ -41,14 +41,14 @@ if TYPE_CHECKING:
     from malta.model.plant import FloatArray
 
 ROUNDS = 8  # meshes, at most
-STILL = 5e-4  # share of T by which the last mesh may still change it
+STILL = 5e-4  # share of T by which the last mesh may still change T
 TOLERANCE = 1e-3  # of a state's range and of the current limit, between the nodes
 IPOPT = {"print_level": 0, "sb": "yes", "max_iter": 500, "mu_strategy": "adaptive"}
 
 
 @dataclass(frozen=True, eq=False)
 class FastestStroke:
-    """A stroke at the nodes of its mesh, at rest at the first and the last. Between them u is linear."""
+    """A stroke at the nodes of its mesh, at rest at the first and at the last node; u is linear between nodes."""
 
     t: FloatArray  # s, from 0
     z: FloatArray  # m
@@ -78,15 +78,15 @@ class FastestStroke:
 
     @cached_property
     def path(self) -> PPoly:
-        """z(t), m: quintics that meet z, v and a at the nodes, so that the second derivative is continuous."""
+        """z(t), m: quintics through z, v and a at the nodes, so that the second derivative is continuous."""
         nodes = np.column_stack([self.z, self.v, self.a])
         return PPoly.from_bernstein_basis(BPoly.from_derivatives(self.t, nodes))
 
     def reference(self, plant: Plant, centre: float) -> references.Reference:
-        """The stroke as a reference: half-way at `centre` (s), at rest outside, the other outputs held at zero.
+        """The stroke as a reference: half-way at `centre` (s), at rest outside; the other outputs stay at zero.
 
-        The feedforward m z'' + v0(z) of a gain file is then the optimum's thrust k i: z'' holds what cogging does to
-        the mover, and v0(z) takes it out. `partial(stroke.reference, centre=0.05)` is what a Scenario asks for.
+        The feedforward m z'' + v0(z) of a gain file is then the optimum's thrust k i: z'' contains the effect of
+        cogging, and v0(z) cancels it. A Scenario takes `partial(stroke.reference, centre=0.05)`.
         """
         start = centre - self._reaches(0.5)
         return partial(_motion, self.path, start, plant.stroke_output, len(plant.outputs))
@@ -140,7 +140,7 @@ def fastest_stroke(
     z_ends, rest = np.array([-distance / 2, distance / 2]), np.zeros(2)
     i_ends = _current(plant, z_ends, rest, rest)
     ends = np.array([z_ends, rest, i_ends, actuator.R * i_ends])
-    # To begin with: bang-bang at a current that the voltage allows, and what inductance and induced voltage add.
+    # First guess of T: bang-bang at a current that the voltage allows, plus terms of inductance and induced voltage.
     i_typical = i_max * u_max / (u_max + actuator.R * i_max)
     T = 2 * math.sqrt(abs(distance) * plant.mass / (k * i_typical))
     T += (4 * actuator.L * i_typical + emf_constant * abs(distance)) / u_max
@@ -151,7 +151,7 @@ def fastest_stroke(
     s, x, T = _solve_on_refined_meshes(solve, s, math.copysign(1, distance) * guess, T)
     _check(rate, T * s, x, scale)
     a = np.array(rate(x))[1]
-    a[[0, -1]] = 0.0  # at rest to the last digit
+    a[[0, -1]] = 0.0  # exactly at rest
     return FastestStroke(T * s, x[0], x[1], a, x[2], x[3])
 
 
@@ -168,7 +168,7 @@ def sigmoid_at_peak_current(
     Raises InputError for arguments that do not fit the plant, CheckError when the stroke needs more than the voltage.
     """
     i_max, u_max = _limits(plant, distance, emf_constant, voltage_share, current_share)
-    grid = np.linspace(-4, 4, 20_001)  # in rises: 2e-8 of the way is left outside
+    grid = np.linspace(-4, 4, 20_001)  # in rises: 2e-8 of the way lies outside
 
     def demand(rise: float) -> tuple[FloatArray, FloatArray]:
         s, ds, dds = references.logistic(grid * rise, rise)
@@ -241,10 +241,10 @@ def _solve_on_refined_meshes(
     x: FloatArray,
     T: float,
 ) -> tuple[FloatArray, FloatArray, float]:
-    """Nodes, x and T on the first mesh that leaves T as the one before had it."""
+    """Nodes, x and T on the first mesh that changes T by less than STILL of it. CheckError after ROUNDS meshes."""
     x, T = solve(s, x, T)
     for _ in range(ROUNDS - 1):
-        # As many nodes, half of them spread over T and half over the changes of u.
+        # The same number of nodes: half of them spread over T, half over the changes of u.
         change = np.abs(np.diff(x[3]))
         weight = np.concatenate([[0.0], np.cumsum(np.diff(s) + change / change.sum())])
         finer = np.interp(np.linspace(0, 1, len(s)), weight / weight[-1], s)
@@ -257,7 +257,7 @@ def _solve_on_refined_meshes(
 
 
 def _check(rate: ca.Function, t: FloatArray, x: FloatArray, scale: FloatArray) -> None:
-    """Integrate from each node to the next, side by side: CheckError for gaps, or for a current beyond its limit."""
+    """Integrate from each node to the next. CheckError for gaps at the nodes, or a current beyond its limit."""
     h, n = np.diff(t), len(t) - 1
 
     def slopes(s: float, flat: FloatArray) -> FloatArray:
@@ -278,7 +278,7 @@ def _check(rate: ca.Function, t: FloatArray, x: FloatArray, scale: FloatArray) -
 def _limits(
     plant: Plant, distance: float, emf_constant: float, voltage_share: float, current_share: float
 ) -> tuple[float, float]:
-    """i_max (A) and u_max (V); InputError for arguments out of range, or when the load cannot be held within them."""
+    """i_max (A) and u_max (V). InputError for arguments out of range, or limits that cannot hold the load."""
     if not 0 < abs(distance) <= 2 * plant.travel:
         expected = f"one other than 0 m within the travel of +-{plant.travel} m"
         raise InputError("stroke", "distance", f"{distance} m", expected)
@@ -296,12 +296,13 @@ def _limits(
 
 
 def _check_share(share: float) -> None:
+    """InputError for a share of the travel outside 0 to 0.5."""
     if not 0 < share < 0.5:
         raise InputError("travel_time", "share", str(share), "a share of the travel above 0, below 0.5")
 
 
 def _axis(plant: Plant) -> ca.Function:
-    """(z, v, F) -> z'' of the stroke under its load, the other states zero. No other input may push along it."""
+    """(z, v, F) -> z'' of the stroke under its load, other states zero. InputError where other inputs act along it."""
     z, v, u = ca.SX.sym("z"), ca.SX.sym("v"), ca.SX.sym("u", len(plant.inputs))
     x, rate = ca.SX.zeros(len(plant.states)), plant.stroke_state + len(plant.states) // 2
     x[plant.stroke_state], x[rate] = z, v
@@ -320,12 +321,13 @@ def _current(plant: Plant, z: FloatArray, v: FloatArray, a: FloatArray) -> Float
 
 
 def _holding_current(plant: Plant, distance: float) -> float:
-    """The largest |i| (A) that holds the load anywhere on the way."""
+    """The largest |i| (A) that is needed to hold the load along the way."""
     z = distance * np.linspace(-0.5, 0.5, 2001)
     return float(np.abs(_current(plant, z, 0 * z, 0 * z)).max())
 
 
 def _motion(path: PPoly, start: float, axis: int, outputs: int, t: FloatArray) -> references.Motion:
+    """The motion of output `axis` along a path that begins at `start` (s)."""
     s = np.clip(np.asarray(t) - start, path.x[0], path.x[-1])
     moving = (s > path.x[0]) & (s < path.x[-1])
     motion = [np.zeros((len(s), outputs)) for _ in range(3)]

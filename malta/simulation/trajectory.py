@@ -29,15 +29,15 @@ if TYPE_CHECKING:
 class Trajectory:
     """Labelled time series, one row a sample, up to the verdict. SI.
 
-    Axis currents, their voltages and the link voltage are empty in fidelity `force`; phases in all but `phase`; of
-    machines with electronics of their own the phases are the coils.
+    i, u and link are empty in fidelity `force`, i_phase and duty in all fidelities but `phase`. The phases of a machine
+    with electronics of its own are its coils.
     """
 
     plant: Plant
     controller: Controller
     scenario: Scenario
     verdict: Verdict
-    engine: str  # what ran it: "compiled" or "virtual machine"
+    engine: str  # that simulated it: "compiled" or "virtual machine"
     t: FloatArray  # k
     reference: FloatArray  # k x p
     p: FloatArray  # k x p, true outputs
@@ -47,9 +47,9 @@ class Trajectory:
     v: FloatArray  # k x m, commanded forces, N
     force: FloatArray  # k x m, acting forces, N
     saturated: FloatArray  # k x m, 1 where the command was limited
-    contact: FloatArray  # k x contacts, share of each clearance that is used up
+    contact: FloatArray  # k x contacts, share of each clearance that the mover takes; 1: touch
     current: FloatArray  # k x coils, commanded, A
-    met: FloatArray  # k x limits, 1 where one was met: of the coil currents, then those of the electronics until then
+    met: FloatArray  # k x limits, 1 where a limit was reached: the coil currents', then those of the electronics
     i: FloatArray  # k x axes, A
     u: FloatArray  # k x axes, V
     link: FloatArray  # k x 1, V
@@ -62,7 +62,7 @@ class Trajectory:
 
     @property
     def limits(self) -> tuple[str, ...]:
-        """The limits that were met on the way, by name."""
+        """Names of the limits that were reached on the way."""
         fast = electronics_of(self.plant, setup_of(self.plant, self.controller, self.scenario))
         names = ("current limit", *(fast.flags if fast is not None else ()))
         met = [name for name, column in zip(names, self.met.T, strict=True) if column.any()]
@@ -70,7 +70,7 @@ class Trajectory:
 
     @property
     def copper_loss(self) -> FloatArray:
-        """Heat in the windings, W, k: sum of R i^2 over phases or, with its weights, over axes."""
+        """Heat in the windings, W, shape (k,): R i^2 summed over phases, or over axes with their weights."""
         if self.i_phase.size:
             return np.asarray(self.plant.actuator.R * (self.i_phase**2).sum(axis=1))
         if self.plant.windings is None:
@@ -79,7 +79,7 @@ class Trajectory:
 
     @property
     def electrical_power(self) -> FloatArray:
-        """Power into the windings, W, k; empty in fidelity `force`."""
+        """Power into the windings, W, shape (k,); empty in fidelity `force`."""
         if not self.i.size or self.plant.windings is None:
             return np.empty(0)
         delay = min(setup_of(self.plant, self.controller, self.scenario).delay, len(self.u) - 1)
@@ -88,7 +88,7 @@ class Trajectory:
 
     @property
     def axis_currents(self) -> FloatArray:
-        """Currents of the transformation's axes, A, k x axes; in fidelity `force` what the forces take."""
+        """Currents of the transformation's axes, A, k x axes; in fidelity `force` those that make the acting forces."""
         if self.i.size or self.plant.windings is None:
             return self.i
         drive, constants = self.plant.drive, np.array(self.plant.actuator.force_constant)
@@ -135,7 +135,7 @@ def label_rows(
 
 @dataclass(frozen=True)
 class StrokeFigures:
-    """What the published figures say of a stroke. SI."""
+    """Figures of a stroke, as papers publish them. SI."""
 
     rise: float  # s, 10 to 90 % of the true position; NaN when it was not reached
     overshoot: float  # beyond the end, as a share of the stroke; NaN when the run ended early
@@ -146,13 +146,18 @@ class StrokeFigures:
 
 
 def stroke_figures(run: Trajectory) -> StrokeFigures:
-    """Rise, overshoot, tracking error and deviation of a stroke; without one, of a move of the first output."""
+    """Rise, overshoot, tracking error and deviations of a stroke; of a machine without a stroke, of its leading output.
+
+    malta.stroke_figures(run).rise
+    """
     names = [s.name for s in run.plant.outputs]
     axis = run.plant.leading_output
     z, z_ref = run.p[:, axis], run.reference[:, axis]
     start, end = z_ref[0], z_ref[-1]
     error = np.abs(run.p - run.reference)
-    whole = run.verdict.completed and end != start  # what ended early never saw where the stroke goes
+    whole = (
+        run.verdict.completed and end != start
+    )  # a run that ended early did not reach the end of its reference
     share = (z - start) / (end - start) if whole else np.full(len(z), np.nan)
     return StrokeFigures(
         rise=_crossing_time(run.t, share, 0.9) - _crossing_time(run.t, share, 0.1) if whole else math.nan,
@@ -165,6 +170,7 @@ def stroke_figures(run: Trajectory) -> StrokeFigures:
 
 
 def _crossing_time(t: FloatArray, share: FloatArray, level: float) -> float:
+    """The time (s) at which a share first reaches a level, by linear interpolation; NaN if it never does."""
     k = int(np.argmax(np.asarray(share) >= level))
     if k == 0:
         return math.nan
@@ -172,7 +178,10 @@ def _crossing_time(t: FloatArray, share: FloatArray, level: float) -> float:
 
 
 def save(run: Trajectory, path: str | Path) -> Path:
-    """Write the time series as .npz: t, and a named array for every kind of signal with the names of its columns."""
+    """Write the time series as .npz.
+
+    The archive has t, verdict, and for every series an array and its columns as "name [unit]" in <series>_columns.
+    """
     path, drive = Path(path), run.plant.windings
     axes, phases = ((), run.plant.actuator.coils) if drive is None else (drive.axes, drive.phases)
     columns = {

@@ -17,14 +17,17 @@ import casadi as ca
 from malta.simulation.instructions import MASKS, Node, mask_arguments, needed_nodes, read_instructions
 from malta.simulation.period import Period
 
-WHOLE = 4000  # statements of the longest function that is not cut in parts
+WHOLE = 4000  # statements: a longer function is cut into parts
 
 
-PART = 300  # statements of a part, at most
+PART = 300  # statements of a part at most
 
 
 def source(p: Period, digest: ca.Function | None) -> str:
-    """The whole C text, but for the number of lanes."""
+    """The whole C text of an engine; the number of lanes is a macro of the compilation.
+
+    digest : the function that updates a run's digest, see digest.py; None for an engine of one lane
+    """
     prepares, functions, count = [], [], 0
     given = {"sense": [1], "decide": [1], "substep": [2], "digest": [2]}
     for f in (p.sense, p.decide, p.substep, *([digest] if digest else [])):
@@ -54,16 +57,17 @@ def source(p: Period, digest: ca.Function | None) -> str:
 
 
 def translate(f: ca.Function, shared: Sequence[int], first_constant: int) -> tuple[str, str, int]:
-    """C of an SX function whose last argument is theta: lines of `prepare`, the function, and how many constants.
+    """C text of an SX function whose last argument is theta: lines of `prepare`, the function, number of constants.
 
-    shared : arguments that are the same in every lane.
+    shared : arguments that have the same value in every lane
+    first_constant : index of the function's first entry in the array c of constants
 
     Raises CheckError for an operation that has no C form here.
     """
     nodes, outputs = read_instructions(f, shared)
     used = needed_nodes(nodes, [k for *_, k in outputs])
     fixed = [k for k in used if nodes[k].fixed]
-    # What the moving part reads of the fixed part goes through the array c.
+    # `prepare` stores the fixed nodes that the function reads in the array c.
     read = {a for k in used if not nodes[k].fixed for a in nodes[k].arguments} | {k for *_, k in outputs}
     kept = [k for k in fixed if k in read and nodes[k].op]
     place = {k: first_constant + index for index, k in enumerate(kept)}
@@ -73,7 +77,7 @@ def translate(f: ca.Function, shared: Sequence[int], first_constant: int) -> tup
     slot = _slots(nodes, parts, {k for *_, k in outputs})
 
     def text(k: int, *, at: int | None, mask: bool = False) -> str:
-        """What a node is called in a part of the function, or in `prepare`; as a mask if that is asked for."""
+        """The C name of a node in part `at` of the function, or in `prepare` (None); as a mask on request."""
         node = nodes[k]
         is_mask = node.op in MASKS
         if at is not None and k in place:
@@ -105,7 +109,7 @@ def translate(f: ca.Function, shared: Sequence[int], first_constant: int) -> tup
     bodies[-1] += [f"  const real o{n} = {found};" for n, (_, found) in enumerate(results)]
     bodies[-1] += [f"  {place} = o{n};" for n, (place, _) in enumerate(results)]
     kinds = ["double" if i in shared else "real" for i in range(f.n_in() - 1)]
-    # The first argument may be the first result: what is read is read before anything is written.
+    # The first argument and the first result may be the same array: all entries are read before one is written.
     arguments = [
         ("const real *restrict ", "c"),
         *((f"const {kind} *{'restrict ' * (i > 0)}", f"a{i}") for i, kind in enumerate(kinds)),
@@ -116,18 +120,18 @@ def translate(f: ca.Function, shared: Sequence[int], first_constant: int) -> tup
 
 
 def _cut_in_parts(statements: list[int]) -> list[list[int]]:
-    """The statements of one function, or of parts of about the same length."""
+    """The statements of one function in parts of about the same length; one part for a short function."""
     count = math.ceil(len(statements) / PART) if len(statements) > WHOLE else 1
     edges = [len(statements) * k // count for k in range(count + 1)]
     return [statements[begin:end] for begin, end in pairwise(edges)]
 
 
 def _slots(nodes: list[Node], parts: list[list[int]], results: set[int]) -> dict[int, int]:
-    """Where the nodes that later parts read stand meanwhile; a place is taken again after the last part that reads."""
+    """Places in the array s of nodes that later parts read. A place is free again after its last reader."""
     last = {
         k: index for index, members in enumerate(parts) for reader in members for k in nodes[reader].arguments
     }
-    last |= dict.fromkeys(results, len(parts) - 1)  # the last part writes them
+    last |= dict.fromkeys(results, len(parts) - 1)  # the last part writes the results
     slot: dict[int, int] = {}
     leaving: list[list[int]] = [[] for _ in parts]  # places by the last part that reads them
     free: list[int] = []
@@ -144,7 +148,7 @@ def _slots(nodes: list[Node], parts: list[list[int]], results: set[int]) -> dict
 
 
 def _assemble(name: str, arguments: list[tuple[str, str]], bodies: list[list[str]], slots: int) -> str:
-    """The function; or its parts, which share the array s, and a function that calls one after the other."""
+    """The text of a function; of several parts, also a function that calls them in turn with the array s."""
     taken, given = ", ".join(map("".join, arguments)), ", ".join(called for _, called in arguments)
     inline, apart = (
         f"static {x}void" for x in ("inline __attribute__((always_inline)) ", "__attribute__((noinline)) ")
@@ -158,9 +162,9 @@ def _assemble(name: str, arguments: list[tuple[str, str]], bodies: list[list[str
 
 
 def _small_tilt_version(function: str) -> str:
-    """The function for small tilts alone, which tells by `range` whether they were: its code has no branches.
+    """The version of a function for small tilts, without branches. `range` returns the largest squared tilt.
 
-    Period without a tilt serve both.
+    A sample whose range is too large is computed again by the general version. Parts without a tilt serve both.
     """
     end = "}\n"
     *parts, whole = function.removesuffix(end).split(end)
