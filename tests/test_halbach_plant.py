@@ -291,7 +291,7 @@ def test_300_periods_against_the_ones_written_out(par: Parameters, o: Options) -
 
 @pytest.mark.parametrize("offset", [0.0, 1e-3])
 def test_what_loops_are_told(par: Parameters, plant: Plant, offset: float) -> None:
-    """Wanted Id and Iq, and the Park angle; an error of the reading is one of the angle, k times as large."""
+    """PlannedRun Id and Iq, and the Park angle; an error of the reading is one of the angle, k times as large."""
     y = plant.sense(ca.DM([2e-3, 0]), ca.DM([offset]))
     told = halbach.electronics(par).held(plant.currents(y, ca.DM(0.7)), y)
     angle = par.k * (2e-3 + offset)

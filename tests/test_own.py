@@ -30,7 +30,7 @@ from malta.simulation.experiments import (
     Case,
     Experiment,
     Merit,
-    Wanted,
+    PlannedRun,
     cases_of,
     fly,
     main_job,
@@ -62,7 +62,7 @@ def rest(
 ) -> Experiment:
     """Rest."""
     wanted = [
-        Wanted(how, scenario_of("rest", wait * often, hold, options), lambda _: (Merit("a", 1.0, "1"),))
+        PlannedRun(how, scenario_of("rest", wait * often, hold, options), lambda _: (Merit("a", 1.0, "1"),))
     ]
     cases, cut = fly(plant, controller, wanted * (2 if twice else len(axes)), progress, options)
     return Experiment("rest", "Does it rest?", cases, cases[0].merits, interrupted=cut)

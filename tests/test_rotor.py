@@ -31,7 +31,7 @@ from malta.model import machines
 from malta.model.checks import check_plant
 from malta.model.machines import machine
 from malta.model.plant import Plant
-from malta.simulation.experiments import cases_of
+from malta.simulation.catalogue import cases_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

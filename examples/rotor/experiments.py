@@ -25,14 +25,14 @@ from malta.simulation.experiments import (
     QUIET,
     Experiment,
     Merit,
+    PlannedRun,
     Progress,
-    Wanted,
     fly,
     fly_all,
     scenario_of,
 )
 from malta.simulation.responses import amplitude
-from malta.simulation.simulate import Trajectory
+from malta.simulation.trajectory import Trajectory
 from malta.synthesis.controller import Controller
 
 if TYPE_CHECKING:
@@ -73,11 +73,13 @@ def at_speed(plant: Plant, speed: float) -> Plant:
     return plant.variant(replace(par, Omega=speed, Omega_max=max(speed, par.Omega_max)))
 
 
-def _turning(machine: Plant, speed: float, expected: FloatArray, options: Mapping[str, Any]) -> Wanted:
+def _turning(machine: Plant, speed: float, expected: FloatArray, options: Mapping[str, Any]) -> PlannedRun:
     duration = max(2 * SETTLING, SETTLING + 4 * 2 * math.pi / speed)
     given = FORCES | QUIET | {"disturbance": partial(rotating, machine)} | dict(options)
     scenario = scenario_of("unbalance", duration, references.hold, given)
-    return Wanted(f"{speed:g} rad/s", scenario, partial(_unbalance_merits, speed=speed, expected=expected))
+    return PlannedRun(
+        f"{speed:g} rad/s", scenario, partial(_unbalance_merits, speed=speed, expected=expected)
+    )
 
 
 def rotating(machine: Plant, t: FloatArray) -> FloatArray:
@@ -144,13 +146,15 @@ def lift_off(
     return Experiment("lift-off", "Does it leave its bearings?", cases, cases[0].merits, interrupted=cut)
 
 
-def lift_off_cases(plant: Plant, _: Controller, *, time: float, **options: Any) -> list[Wanted]:
+def lift_off_cases(plant: Plant, _: Controller, *, time: float, **options: Any) -> list[PlannedRun]:
     """The run of `lift_off`, at the machine's own speed."""
     par = _parameters(plant)
     lying = par.c_r + par.m * par.g / par.k_r  # a little more than the spring of both bearings gives
     start = {"x": -lying * math.sin(par.slope), "y": -lying * math.cos(par.slope)}
     given = FORCES | {"start": start, "cold": True, "bearing": True} | options
-    return [Wanted("from its bearings", scenario_of("lift-off", time, references.hold, given), _lift_merits)]
+    return [
+        PlannedRun("from its bearings", scenario_of("lift-off", time, references.hold, given), _lift_merits)
+    ]
 
 
 def _lift_merits(run: Trajectory) -> tuple[Merit, ...]:
@@ -179,7 +183,7 @@ def drop(
     return Experiment("drop", question, cases, cases[0].merits, interrupted=cut)
 
 
-def _drop_cases(plant: Plant, *, off: float, time: float, **options: Any) -> list[Wanted]:
+def _drop_cases(plant: Plant, *, off: float, time: float, **options: Any) -> list[PlannedRun]:
     """Raises InputError where the power would not be back before the end."""
     par, at = _parameters(plant), time / 10
     if not 0 < off < time - at:
@@ -190,7 +194,7 @@ def _drop_cases(plant: Plant, *, off: float, time: float, **options: Any) -> lis
     )
     given = FORCES | {"changes": changes, "bearing": True} | options
     scenario = scenario_of("drop", time, references.hold, given)
-    return [Wanted(f"{off * 1e3:g} ms without power", scenario, partial(_drop_merits, back=at + off))]
+    return [PlannedRun(f"{off * 1e3:g} ms without power", scenario, partial(_drop_merits, back=at + off))]
 
 
 def _drop_merits(run: Trajectory, back: float) -> tuple[Merit, ...]:

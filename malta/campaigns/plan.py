@@ -28,7 +28,7 @@ from malta.model.data import (
     units_of,
 )
 from malta.model.plant import Plant, readonly
-from malta.simulation.experiments import Wanted, cases_of
+from malta.simulation.experiments import PlannedRun, cases_of
 from malta.synthesis.controller import Controller
 
 if TYPE_CHECKING:
@@ -228,7 +228,7 @@ def fingerprint(record: Any) -> str:
 
 
 @lru_cache(maxsize=8)
-def planned_run(plan: Plan) -> Wanted:
+def planned_run(plan: Plan) -> PlannedRun:
     """The case that a plan simulates: its label, its scenario with the plan's seed, its figures of merit.
 
     Raises InputError for an unknown case, and where every case needs an estimator outside the controller.

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
     from malta.model.plant import FloatArray
 
+CONFIDENCE = 0.95  # of the interval about a share
+
 
 @dataclass(frozen=True, eq=False)
 class Campaign:
@@ -83,9 +85,6 @@ def _join(plan: Plan, batches: list[Batch]) -> Batch:
         for name, shape in figure_shapes(plan).items()
     }
     return Batch(**{name: np.concatenate(column) for name, column in columns.items()})
-
-
-CONFIDENCE = 0.95  # of the interval about a share
 
 
 class Rate(NamedTuple):

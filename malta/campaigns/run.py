@@ -30,8 +30,6 @@ from malta.simulation.engines import EngineChoice
 from malta.simulation.experiments import Experiment, Progress, single_run
 
 BLOCK = 1024  # runs in a block: a fraction of a second of work
-
-
 SLOW_BLOCK = 32  # without a C compiler
 
 

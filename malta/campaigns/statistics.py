@@ -44,7 +44,7 @@ def figures_of(found: Campaign, published: Mapping[str, Any] | None = None) -> l
     names = [signal.name for signal in plant.outputs]
     keys = {} if published is None else bounds_of(plan)
 
-    def of(
+    def finding(
         name: str, kind: str, unit: str, values: FloatArray, key: str = "", relation: str = "at most"
     ) -> Finding:
         bound = published_value(published or {}, keys[key]) if key in keys else math.nan
@@ -59,28 +59,28 @@ def figures_of(found: Campaign, published: Mapping[str, Any] | None = None) -> l
     listed = []
     if np.isfinite(batch.rise).any():
         listed += [
-            of("", "rise, 10-90 %", "ms", batch.rise, "rise", "about"),
-            of("", "overshoot", "percent", batch.overshoot, "overshoot"),
+            finding("", "rise, 10-90 %", "ms", batch.rise, "rise", "about"),
+            finding("", "overshoot", "percent", batch.overshoot, "overshoot"),
         ]
     listed += [
-        of("", f"deviation of {names[k]}", stroke_unit(plant), batch.deviation[:, k], "stroke")
+        finding("", f"deviation of {names[k]}", stroke_unit(plant), batch.deviation[:, k], "stroke")
         for k, _ in lengthwise
     ]
-    listed += [of(names[k], "deviation", g.fine, batch.deviation[:, k], g.unit) for k, g in sides]
+    listed += [finding(names[k], "deviation", g.fine, batch.deviation[:, k], g.unit) for k, g in sides]
     if plan.scenario == "hold":
-        listed += [of("", f"rms of {names[k]}", g.fine, batch.rms[:, k]) for k, g in lengthwise]
-        listed += [of(names[k], "rms", g.fine, batch.rms[:, k]) for k, g in sides]
+        listed += [finding("", f"rms of {names[k]}", g.fine, batch.rms[:, k]) for k, g in lengthwise]
+        listed += [finding(names[k], "rms", g.fine, batch.rms[:, k]) for k, g in sides]
     listed += [
-        of("", f"largest {g.name}", g.unit, batch.force[:, g.columns].max(axis=1, initial=0.0))
+        finding("", f"largest {g.name}", g.unit, batch.force[:, g.columns].max(axis=1, initial=0.0))
         for g in (*efforts, *thrusts)
     ]
     listed += [
-        of(name.removeprefix("touchdown at "), "clearance:", "percent", batch.contact[:, k])
+        finding(name.removeprefix("touchdown at "), "clearance:", "percent", batch.contact[:, k])
         for k, name in enumerate(plant.contacts)
     ]
     return [
         *listed,
-        of("", "limited commands", "percent", batch.saturated.max(axis=1, initial=0.0)),
+        finding("", "limited commands", "percent", batch.saturated.max(axis=1, initial=0.0)),
     ]
 
 

@@ -72,9 +72,9 @@ def read_manifest(path: Path) -> tuple[dict[str, Any], int]:
         size = content.pop("block")
     except (ValueError, RecursionError, AttributeError, KeyError, TypeError) as error:
         raise InputError(path, "", "a damaged or foreign file", "the manifest of a campaign") from error
-    for key, wanted in (("schema", SCHEMA), ("version", VERSION)):
-        if content.get(key) != wanted:
-            raise InputError(path, key, repr(content.get(key, "nothing")), repr(wanted))
+    for key, expected in (("schema", SCHEMA), ("version", VERSION)):
+        if content.get(key) != expected:
+            raise InputError(path, key, repr(content.get(key, "nothing")), repr(expected))
     if not isinstance(size, int) or size < 1 or size % LANES:
         raise InputError(path, "block", repr(size), f"a multiple of {LANES}")
     return content, size
@@ -131,9 +131,9 @@ def read_blocks(place: Path, plan: Plan, parts: Mapping[int, int], done: dict[in
     return damaged
 
 
-def require_same(path: Path, found: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
+def require_same(path: Path, found: Mapping[str, Any], expected: Mapping[str, Any]) -> None:
     """InputError that names the first entry in which two manifests differ."""
-    for key, (one, other) in _differences(found, wanted):
+    for key, (one, other) in _differences(found, expected):
         raise InputError(
             path,
             key,
@@ -142,14 +142,14 @@ def require_same(path: Path, found: Mapping[str, Any], wanted: Mapping[str, Any]
         )
 
 
-def _differences(found: Any, wanted: Any, key: str = "") -> Iterator[tuple[str, tuple[Any, Any]]]:
-    """(key, (found, wanted)) for every entry in which two nested tables differ."""
-    if isinstance(found, Mapping) and isinstance(wanted, Mapping):
-        for name in {**wanted, **found}:
+def _differences(found: Any, expected: Any, key: str = "") -> Iterator[tuple[str, tuple[Any, Any]]]:
+    """(key, (found, expected)) for every entry in which two nested tables differ."""
+    if isinstance(found, Mapping) and isinstance(expected, Mapping):
+        for name in {**expected, **found}:
             inner = f"{key}.{name}" if key else name
-            yield from _differences(found.get(name, "nothing"), wanted.get(name, "nothing"), inner)
-    elif found != wanted:
-        yield key, (found, wanted)
+            yield from _differences(found.get(name, "nothing"), expected.get(name, "nothing"), inner)
+    elif found != expected:
+        yield key, (found, expected)
 
 
 def shorten(value: Any) -> str:

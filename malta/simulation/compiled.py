@@ -28,8 +28,6 @@ if TYPE_CHECKING:
     from malta.model.plant import FloatArray
 
 LANES = 8
-
-
 FLAGS = (
     *("-std=gnu11", "-O3", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math"),
     *("-fschedule-insns", "-fsched-pressure", "-fPIC", "-shared"),

@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     from malta.model.plant import FloatArray
 
 EngineChoice = Literal["auto", "compiled", "virtual machine"]
-
-
 BLOCK = 250  # samples in one call of the virtual machine's chain
 
 

@@ -11,7 +11,7 @@ plant or in a module `experiments` beside it,
 
 and, where they differ from the defaults,
 
-    CASES         name -> (plant, controller, **options) -> list[Wanted]: experiments for campaigns
+    CASES         name -> (plant, controller, **options) -> list[PlannedRun]: experiments for campaigns
     FINDINGS      names of experiments in which a touchdown is an expected result and no failure
     ALONE         names of experiments whose figure shows a single run
     OPTION_UNITS  option -> SI unit
@@ -79,7 +79,7 @@ class Case(NamedTuple):
     merits: tuple[Merit, ...]
 
 
-class Wanted(NamedTuple):
+class PlannedRun(NamedTuple):
     """A run that an experiment is going to simulate, and the function that evaluates its trajectory."""
 
     label: str
@@ -139,16 +139,16 @@ def scenario_of(
 def fly(
     plant: Plant,
     controller: Controller,
-    wanted: Sequence[Wanted],
+    planned: Sequence[PlannedRun],
     progress: Progress | None,
     options: Mapping[str, Any],
 ) -> tuple[tuple[Case, ...], bool]:
     """Simulate runs one after the other: the cases, and whether Ctrl-C ended the series before its last run."""
-    return fly_all([(plant, controller, one) for one in wanted], progress, options)
+    return fly_all([(plant, controller, one) for one in planned], progress, options)
 
 
 def fly_all(
-    flights: Sequence[tuple[Plant, Controller, Wanted]],
+    flights: Sequence[tuple[Plant, Controller, PlannedRun]],
     progress: Progress | None,
     options: Mapping[str, Any],
 ) -> tuple[tuple[Case, ...], bool]:
@@ -186,11 +186,11 @@ def experiments_of(plant: Plant) -> Mapping[str, Callable[..., Experiment]]:
     return found
 
 
-def series_of(plant: Plant) -> Mapping[str, Callable[..., list[Wanted]]]:
+def series_of(plant: Plant) -> Mapping[str, Callable[..., list[PlannedRun]]]:
     """The functions that list the runs of an experiment for campaigns, by the experiment's name."""
     from malta.simulation import generic
 
-    own: Mapping[str, Callable[..., list[Wanted]]] | None = setting(plant, "CASES", None)
+    own: Mapping[str, Callable[..., list[PlannedRun]]] | None = setting(plant, "CASES", None)
     if own is None:
         return {} if experiments_of(plant) is not generic.EXPERIMENTS else generic.CASES
     return own
@@ -219,7 +219,7 @@ def experiment(
     return experiments_of(plant)[name](plant, controller, progress=progress, **options)
 
 
-def cases_of(name: str, plant: Plant, controller: Controller, **options: Any) -> list[Wanted]:
+def cases_of(name: str, plant: Plant, controller: Controller, **options: Any) -> list[PlannedRun]:
     """The runs of one of the machine's CASES, before they are simulated. Raises InputError as `experiment` does."""
     _check(name, plant, options)
     cases = series_of(plant)
@@ -233,7 +233,7 @@ def single_run(
     name: str,
     plant: Plant,
     controller: Controller,
-    wanted: Wanted,
+    planned: PlannedRun,
     engine: EngineChoice = "auto",
     progress: Progress | None = None,
     run: Trajectory | None = None,
@@ -243,11 +243,11 @@ def single_run(
     Where the experiment's own figure compares several runs, the result is named "run" and has a plain figure.
     """
     if run is None:
-        cases, cut = fly(plant, controller, [wanted], progress, {"engine": engine})
+        cases, cut = fly(plant, controller, [planned], progress, {"engine": engine})
     else:
-        cases, cut = (Case(wanted.label, run, wanted.merits(run)),), False
+        cases, cut = (Case(planned.label, run, planned.merits(run)),), False
     shown = name if name in setting(plant, "ALONE", ()) else "run"
-    what = name if wanted.label == name else f"{name}: {wanted.label}"
+    what = name if planned.label == name else f"{name}: {planned.label}"
     return Experiment(shown, what, cases, cases[0].merits, interrupted=cut)
 
 

@@ -23,8 +23,8 @@ from malta.simulation import references
 from malta.simulation.experiments import (
     Experiment,
     Merit,
+    PlannedRun,
     Progress,
-    Wanted,
     fly,
     rms,
     scenario_of,
@@ -53,17 +53,17 @@ def hold(
     **options: Any,
 ) -> Experiment:
     """Hold still for `time` (s; 0: 2000 samples), with the noise of the sensors as built."""
-    wanted = hold_cases(plant, controller, time=time, **options)
-    cases, cut = fly(plant, controller, wanted, progress, options)
+    planned = hold_cases(plant, controller, time=time, **options)
+    cases, cut = fly(plant, controller, planned, progress, options)
     return Experiment("hold", "How still does it stand?", cases, cases[0].merits, interrupted=cut)
 
 
-def hold_cases(plant: Plant, controller: Controller, *, time: float, **options: Any) -> list[Wanted]:
+def hold_cases(plant: Plant, controller: Controller, *, time: float, **options: Any) -> list[PlannedRun]:
     """The run of `hold`."""
     scenario = scenario_of(
         "hold", _duration(controller, time), references.hold, _with_fidelity(plant, options)
     )
-    return [Wanted("hold", scenario, _rest_merits)]
+    return [PlannedRun("hold", scenario, _rest_merits)]
 
 
 def step(
@@ -77,24 +77,24 @@ def step(
     **options: Any,
 ) -> Experiment:
     """A step of one output, or of each in turn, by `size` (SI; 0: a tenth of the clearance), with exact sensors."""
-    wanted = step_cases(plant, controller, output=output, size=size, time=time, **options)
-    cases, cut = fly(plant, controller, wanted, progress, options)
+    planned = step_cases(plant, controller, output=output, size=size, time=time, **options)
+    cases, cut = fly(plant, controller, planned, progress, options)
     return Experiment("step", "Does it go where it is sent?", cases, cases[0].merits, interrupted=cut)
 
 
 def step_cases(
     plant: Plant, controller: Controller, *, output: str, size: float, time: float, **options: Any
-) -> list[Wanted]:
+) -> list[PlannedRun]:
     """The runs of `step`."""
-    duration, wanted = _duration(controller, time), []
+    duration, planned = _duration(controller, time), []
     for k in _choose(plant.outputs, output, "output"):
         signal, distance = plant.outputs[k], size or default_step(plant, k)
         reference = partial(jump, output=k, size=distance, at=BEFORE * duration)
         scenario = scenario_of(
             "step", duration, reference, _with_exact_sensors(_with_fidelity(plant, options))
         )
-        wanted.append(Wanted(signal.name, scenario, partial(_step_merits, output=k, size=distance)))
-    return wanted
+        planned.append(PlannedRun(signal.name, scenario, partial(_step_merits, output=k, size=distance)))
+    return planned
 
 
 def disturbance(
@@ -108,25 +108,25 @@ def disturbance(
     **options: Any,
 ) -> Experiment:
     """A constant force or torque of `size` (N or N m) on one input of disturbance, or on each in turn."""
-    wanted = disturbance_cases(plant, controller, on=on, size=size, time=time, **options)
-    cases, cut = fly(plant, controller, wanted, progress, options)
+    planned = disturbance_cases(plant, controller, on=on, size=size, time=time, **options)
+    cases, cut = fly(plant, controller, planned, progress, options)
     question = "How far does a load move it, and does it come back?"
     return Experiment("disturbance", question, cases, cases[0].merits, interrupted=cut)
 
 
 def disturbance_cases(
     plant: Plant, controller: Controller, *, on: str, size: float, time: float, **options: Any
-) -> list[Wanted]:
+) -> list[PlannedRun]:
     """The runs of `disturbance`. Raises InputError for a machine without inputs of disturbance."""
     if not plant.disturbances:
         raise InputError(plant.name, "disturbances", "none", "a machine on which forces act from outside")
-    duration, wanted = _duration(controller, time), []
+    duration, planned = _duration(controller, time), []
     for k in _choose(plant.disturbances, on, "on"):
         push = partial(step_wrench, column=k, size=size, at=BEFORE * duration, width=len(plant.disturbances))
         given = _with_exact_sensors(_with_fidelity(plant, options)) | {"disturbance": push}
         scenario = scenario_of("disturbance", duration, references.hold, given)
-        wanted.append(Wanted(plant.disturbances[k].name, scenario, _load_merits))
-    return wanted
+        planned.append(PlannedRun(plant.disturbances[k].name, scenario, _load_merits))
+    return planned
 
 
 def jump(plant: Plant, output: int, size: float, at: float) -> Reference:
@@ -224,7 +224,7 @@ EXPERIMENTS: Mapping[str, Callable[..., Experiment]] = {
     "step": step,
     "disturbance": disturbance,
 }
-CASES: Mapping[str, Callable[..., list[Wanted]]] = {
+CASES: Mapping[str, Callable[..., list[PlannedRun]]] = {
     "hold": hold_cases,
     "step": step_cases,
     "disturbance": disturbance_cases,

@@ -13,11 +13,7 @@ import casadi as ca
 from malta.errors import CheckError
 
 _BINARY = {"ADD": "+", "SUB": "-", "MUL": "*"}
-
-
 _TRUTH = {"LT": "<", "LE": "<=", "EQ": "==", "NE": "!="}
-
-
 _EACH = [
     "sqrt",
     "floor",
@@ -33,8 +29,6 @@ _EACH = [
     "cosh",
     "sign",
 ]
-
-
 _FORMS = (
     {f"OP_{name}": f"{{0}} {sign} {{1}}" for name, sign in _BINARY.items()}
     | {f"OP_{name.upper()}": f"each_{name}({{0}})" for name in _EACH}
@@ -68,8 +62,6 @@ MASKS = {f"OP_{name}": f"MASK({{0}} {sign} {{1}})" for name, sign in _TRUTH.item
     "OP_AND": "{0} & {1}",
     "OP_OR": "{0} | {1}",
 }
-
-
 _NAMES = {getattr(ca, name): name for name in dir(ca) if name.startswith("OP_")}
 
 

@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from malta.model.plant import FloatArray
 
 Fidelity = Literal["force", "dq", "phase"]
-
-
 FIDELITIES: tuple[Fidelity, ...] = get_args(Fidelity)
 
 

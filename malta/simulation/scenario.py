@@ -21,20 +21,10 @@ if TYPE_CHECKING:
     from malta.model.plant import FloatArray
 
 Estimator = Literal["steady-state", "kalman", "extended"]
-
-
 ESTIMATORS: tuple[Estimator, ...] = get_args(Estimator)
-
-
 FeedforwardChoice = Literal["axial", "attraction"]
-
-
 FEEDFORWARDS: tuple[FeedforwardChoice, ...] = get_args(FeedforwardChoice)
-
-
 BearingAxes = Literal["fixed", "turning"]
-
-
 FaultKind = Literal[
     "lost sample", "stuck sensor", "biased sensor", "noisy sensor", "open phase", "link sag", "missed step"
 ]

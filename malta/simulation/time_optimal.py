@@ -74,7 +74,7 @@ class FastestStroke:
     def travel_time(self, share: float) -> float:
         """From `share` of the travel to 1 - `share`, s."""
         _check_share(share)
-        return self._reaches(1 - share) - self._reaches(share)
+        return self._time_at(1 - share) - self._time_at(share)
 
     @cached_property
     def path(self) -> PPoly:
@@ -88,10 +88,11 @@ class FastestStroke:
         The feedforward m z'' + v0(z) of a gain file is then the optimum's thrust k i: z'' contains the effect of
         cogging, and v0(z) cancels it. A Scenario takes `partial(stroke.reference, centre=0.05)`.
         """
-        start = centre - self._reaches(0.5)
+        start = centre - self._time_at(0.5)
         return partial(_motion, self.path, start, plant.stroke_output, len(plant.outputs))
 
-    def _reaches(self, share: float) -> float:
+    def _time_at(self, share: float) -> float:
+        """The time (s) at which the mover reaches a share of the travel."""
         level = self.z[0] + share * (self.z[-1] - self.z[0])
         return float(self.path.solve(level, extrapolate=False)[0])
 

@@ -18,8 +18,6 @@ from malta.simulation.instructions import MASKS, Node, mask_arguments, needed_no
 from malta.simulation.period import Period
 
 WHOLE = 4000  # statements: a longer function is cut into parts
-
-
 PART = 300  # statements of a part at most
 
 
@@ -97,13 +95,13 @@ def translate(f: ca.Function, shared: Sequence[int], first_constant: int) -> tup
         kind = "whole" if node.op in MASKS else "real"
         return f"  const {kind} t{k} = {node.form.format(*values)};"
 
-    def handed_over(k: int) -> str:
+    def store(k: int) -> str:
         return f"  s[{slot[k]}] = {f'value(t{k})' if nodes[k].op in MASKS else f't{k}'};"
 
     prepare = [line(k) for k in fixed if nodes[k].op]
     prepare += [f"  c[{place[k]}] = {text(k, at=None)};" for k in kept]
     bodies = [
-        [x for k in members for x in (line(k), *([handed_over(k)] if k in slot else []))] for members in parts
+        [x for k in members for x in (line(k), *([store(k)] if k in slot else []))] for members in parts
     ]
     results = [(f"r{i}[{j}]", text(k, at=len(parts) - 1)) for i, j, k in outputs]
     bodies[-1] += [f"  const real o{n} = {found};" for n, (_, found) in enumerate(results)]

@@ -35,8 +35,8 @@ from malta.simulation.experiments import (
     REAL,
     Experiment,
     Merit,
+    PlannedRun,
     Progress,
-    Wanted,
     fly,
     fly_all,
     rms,
@@ -80,19 +80,19 @@ def step(
 
 def _step_cases(
     _: Plant, controller: Controller, *, distance: float, rise: float, count: int, **options: Any
-) -> list[Wanted]:
+) -> list[PlannedRun]:
     return _step_wanted(controller, distance, rise, count, _many(options))
 
 
 def _step_wanted(
     controller: Controller, distance: float, rise: float, count: int, options: Mapping[str, Any]
-) -> list[Wanted]:
+) -> list[PlannedRun]:
     Ts = controller.sample_time
     wanted = []
     for label, taken in (("jumps", 0.0), ("quintics", rise)):
         reference = partial(there_and_back, distance=distance, rise=taken, count=count, Ts=Ts)
         scenario = scenario_of("step", (BEFORE + PAUSE * count + REST) * Ts, reference, options)
-        wanted.append(Wanted(label, scenario, partial(_step_merits, distance=distance, count=count)))
+        wanted.append(PlannedRun(label, scenario, partial(_step_merits, distance=distance, count=count)))
     return wanted
 
 
@@ -199,7 +199,7 @@ def stairs(
             parts = replace(IDEAL, pwm=pwm, current_loops=False)
             own = {"fidelity": "phase", "electronics": parts, "open_loop": law == "open loop"}
             scenario = scenario_of("stairs", LEVELS * STAY * Ts, reference, QUIET | own | options)
-            wanted.append(Wanted(f"{law}, {name}", scenario, merits))
+            wanted.append(PlannedRun(f"{law}, {name}", scenario, merits))
     cases, cut = fly(plant, controller, wanted, progress, options)
     believed: Any = controller.parameters
     printed = {"plain": "smallest_motion", "fine": "smallest_motion_fine"}
@@ -266,20 +266,20 @@ def ramp(
 
 def _ramp_cases(
     _: Plant, controller: Controller, *, distance: float, speeds: tuple[float, ...], **options: Any
-) -> list[Wanted]:
+) -> list[PlannedRun]:
     return _ramp_wanted(controller, distance, speeds, _many(options))
 
 
 def _ramp_wanted(
     controller: Controller, distance: float, speeds: tuple[float, ...], options: Mapping[str, Any]
-) -> list[Wanted]:
+) -> list[PlannedRun]:
     still, wanted = STILL * controller.sample_time, []
     for speed in speeds:
         moving = abs(distance) / speed
         reference = partial(pass_through, distance=distance, speed=speed, start=still)
         scenario = scenario_of("ramp", moving + 2 * still, reference, options)
         merits = partial(_ramp_merits, start=still, moving=moving)
-        wanted.append(Wanted(f"{1e3 * speed:g} mm/s", scenario, merits))
+        wanted.append(PlannedRun(f"{1e3 * speed:g} mm/s", scenario, merits))
     return wanted
 
 
@@ -362,7 +362,7 @@ def _move(
     distance: float,
     rise: float,
     options: Mapping[str, Any],
-) -> tuple[Plant, Controller, Wanted]:
+) -> tuple[Plant, Controller, PlannedRun]:
     """The machine, what commands it and what is asked: nothing waits for the laser where nothing is fed back."""
     par: Any = plant.parameters
     (position, vector), faulty = LAWS[law], dict(FAULTS[fault])
@@ -382,7 +382,7 @@ def _move(
     printed = f"figure_10.{PRINTED[law]}" if fault == "sound" and distance == MOVE else ""
     merits = partial(_move_merits, begin=begin, printed=printed)
     label = law if fault == "sound" else f"{law}, {fault}"
-    return machine, controller, Wanted(label, scenario_of("force", end, reference, own), merits)
+    return machine, controller, PlannedRun(label, scenario_of("force", end, reference, own), merits)
 
 
 def move(_: Plant, distance: float, rise: float, begin: float) -> Reference:
@@ -458,7 +458,7 @@ def budget(
         own = {"fidelity": "phase", "electronics": parts} | sensors
         reference = partial(references.hold, x=x)
         scenario = scenario_of("budget", LASTING * controller.sample_time, reference, own | options)
-        wanted.append(Wanted(label, scenario, _rest_merits))
+        wanted.append(PlannedRun(label, scenario, _rest_merits))
     flown, cut = fly(plant, controller, wanted, progress, options)
     shown, along = flown[: len(SOURCES)], flown[len(SOURCES) :]
     found = np.array([case.merits[0].value for case in along])
@@ -508,7 +508,7 @@ def identify(
     scenario = scenario_of(
         "identify", LASTS, partial(move, distance=distance, rise=0.0, begin=0.0), QUIET | own | options
     )
-    wanted = Wanted("motor", replace(scenario, start={"x": 0.0}), lambda _: ())
+    wanted = PlannedRun("motor", replace(scenario, start={"x": 0.0}), lambda _: ())
     (case,), cut = fly(plant, commanding, [wanted], progress, options)
     E, G = sample(*halbach.servo(par, F_z, distance), fast)
     states = [np.zeros(2)]
@@ -540,7 +540,7 @@ EXPERIMENTS: dict[str, Callable[..., Experiment]] = {
     "budget": budget,
     "identify": identify,
 }
-CASES: dict[str, Callable[..., list[Wanted]]] = {"step": _step_cases, "ramp": _ramp_cases}
+CASES: dict[str, Callable[..., list[PlannedRun]]] = {"step": _step_cases, "ramp": _ramp_cases}
 ALONE = ("step", "ramp")
 WORDS = {"stroke": "position", "thrust": "force"}
 OPTION_UNITS = {"distance": "m", "rise": "s", "speeds": "m/s", "place": "m", "F_z": "N"}

@@ -33,8 +33,8 @@ from malta.simulation.experiments import (
     Case,
     Experiment,
     Merit,
+    PlannedRun,
     Progress,
-    Wanted,
     fly,
     fly_all,
     scenario_of,
@@ -112,7 +112,7 @@ def _step_cases(
     distance: float,
     cells: int = CELLS,  # noqa: ARG001 - the controller's own coil model flies
     **options: Any,
-) -> list[Wanted]:
+) -> list[PlannedRun]:
     if len(place) != 2:
         raise InputError("simulate", "step: place", f"{len(place)} numbers", "x and y")
     wanted = []
@@ -120,7 +120,7 @@ def _step_cases(
         reference = partial(steps, place=(x, y), gap=gap, lift=lift, distance=distance)
         reference(plant)  # raises where it leaves the travel
         scenario = scenario_of("step", DURATION, reference, FORCES | options)
-        wanted.append(Wanted(f"from ({x * 1e3:g}, {y * 1e3:g}) mm", scenario, step_merits))
+        wanted.append(PlannedRun(f"from ({x * 1e3:g}, {y * 1e3:g}) mm", scenario, step_merits))
     return wanted
 
 
@@ -242,7 +242,7 @@ def errors(
         error = coil_wrench(par, model, current, x, y) - exact
         curves[name] = error
         merits = partial(_error_merits, largest=np.abs(error).max(axis=(0, 1)))
-        flights.append((plant, believing(controller, name, cells), Wanted(name, scenario, merits)))
+        flights.append((plant, believing(controller, name, cells), PlannedRun(name, scenario, merits)))
     cases, cut = fly_all(flights, progress, options)
     curves |= {"step": par.tau_n / np.array(NODES), "by step": _by_step(par, truth, current)}
     amplitude = np.abs(exact).max(axis=(0, 1))
@@ -368,7 +368,7 @@ def timing(
     """How long K(p) and its pseudo-inverse take on this computer, by numpy and compiled, beside a hover of 10 ms."""
     par = _parameters(plant)
     scenario = scenario_of("timing", 0.01, references.hold, FORCES | options)
-    cases, cut = fly(plant, controller, [Wanted("hover", scenario, _no_merits)], progress, options)
+    cases, cut = fly(plant, controller, [PlannedRun("hover", scenario, _no_merits)], progress, options)
     models: dict[str, planar.CoilModel] = {
         "table": planar.table(par, planar.simulated(par), cells),
         "exact": planar.simulated(par),
@@ -462,7 +462,9 @@ EXPERIMENTS: dict[str, Callable[..., Experiment]] = {
     "delay": delay,
     "timing": timing,
 }
-CASES: dict[str, Callable[..., list[Wanted]]] = {"step": _step_cases}  # with the controller's own coil model
+CASES: dict[str, Callable[..., list[PlannedRun]]] = {
+    "step": _step_cases
+}  # with the controller's own coil model
 FINDINGS = ("delay",)
 WORDS = {
     "stroke": "y",

@@ -29,8 +29,8 @@ from malta.simulation.experiments import (
     QUIET,
     Experiment,
     Merit,
+    PlannedRun,
     Progress,
-    Wanted,
     fly,
     rms,
     scenario_of,
@@ -77,11 +77,11 @@ def stroke(
 
 def _stroke_cases(
     _: Plant, __: Controller, *, distance: float, rise: float, profile: Profile, **options: Any
-) -> list[Wanted]:
+) -> list[PlannedRun]:
     asked = {name: value for name, value in options.items() if name != "engine"}
     scenario = Scenario.stroke(distance, rise=rise, profile=profile, **asked)
     published = distance == DISTANCE and rise == RISE
-    return [Wanted("stroke", scenario, partial(stroke_merits, published=published))]
+    return [PlannedRun("stroke", scenario, partial(stroke_merits, published=published))]
 
 
 def stroke_merits(run: Trajectory, *, published: bool = True) -> tuple[Merit, ...]:
@@ -139,9 +139,9 @@ def hold(
     return Experiment("hold", "How still does it stand?", cases, cases[0].merits, interrupted=cut)
 
 
-def _hold_cases(_: Plant, controller: Controller, **options: Any) -> list[Wanted]:
+def _hold_cases(_: Plant, controller: Controller, **options: Any) -> list[PlannedRun]:
     scenario = scenario_of("hold", (RESTING + 6000) * controller.sample_time, references.hold, options)
-    return [Wanted("hold", scenario, _rest_merits)]
+    return [PlannedRun("hold", scenario, _rest_merits)]
 
 
 RESTING = 2000  # samples, Table III
@@ -183,12 +183,14 @@ def tilt(
     return Experiment("tilt", "Does it tilt about sensor plane 2?", cases, (), interrupted=cut)
 
 
-def _tilt_cases(_: Plant, __: Controller, *, radius: float, frequency: float, **options: Any) -> list[Wanted]:
+def _tilt_cases(
+    _: Plant, __: Controller, *, radius: float, frequency: float, **options: Any
+) -> list[PlannedRun]:
     kinds = [options["feedforward"]] if "feedforward" in options else list(FEEDFORWARDS)
     reference = partial(references.circle, radius=radius, frequency=frequency)
     merits = partial(_tilt_merits, settled=1 / frequency)
     return [
-        Wanted(
+        PlannedRun(
             f"feedforward {kind}",
             scenario_of(
                 "tilt", 2 / frequency, reference, {"start": AT_REST} | options | {"feedforward": kind}
@@ -227,13 +229,13 @@ def lift_off(
     return Experiment("lift-off", "Does it rise from its bearing?", cases, (needed,), interrupted=cut)
 
 
-def _lift_cases(plant: Plant, _: Controller, **options: Any) -> list[Wanted]:
+def _lift_cases(plant: Plant, _: Controller, **options: Any) -> list[PlannedRun]:
     resting = rest_on_bearing(plant)
     kinds = [options["estimator"]] if "estimator" in options else list(ESTIMATORS)
     own = {"start": resting, "cold": True, "bearing": True}
     reference = partial(rise_from, start=resting)
     return [
-        Wanted(
+        PlannedRun(
             kind, scenario_of("lift-off", 0.15, reference, own | options | {"estimator": kind}), _lift_merits
         )
         for kind in kinds
@@ -318,7 +320,7 @@ def payload(
     for extra in masses:
         own = {"changes": ((PICKED, {"m": plant.mass + extra}),), "bearing": True}
         scenario = scenario_of("payload", WAIT + 0.15, reference, own | options)
-        wanted.append(Wanted(f"{extra * 1e3:.0f} g", scenario, _payload_merits))
+        wanted.append(PlannedRun(f"{extra * 1e3:.0f} g", scenario, _payload_merits))
     cases, cut = fly(plant, controller, wanted, progress, options)
     carried = max((m for m, c in zip(masses, cases, strict=False) if c.run.verdict.completed), default=0.0)
     merit = Merit("largest of these carried and moved", carried, "kg", "position_controller.payload")
@@ -368,7 +370,7 @@ def thermal(
         scenario = scenario_of(
             "thermal", duration, references.hold, {"correction": Correction(every, laser)} | options
         )
-        wanted.append(Wanted(label, scenario, merits))
+        wanted.append(PlannedRun(label, scenario, merits))
     cases, cut = fly(plant, controller, wanted, progress, options)
     lag = drift / duration * every / gain
     found = (
@@ -432,27 +434,27 @@ def disturbance(
     return Experiment("disturbance", "How stiff is it?", steps, found, curves, interrupted=cut)
 
 
-def _disturbance_cases(plant: Plant, _: Controller, **options: Any) -> list[Wanted]:
+def _disturbance_cases(plant: Plant, _: Controller, **options: Any) -> list[PlannedRun]:
     names = [s.name for s in plant.disturbances]
     outputs = [s.name for s in plant.outputs]
-    wanted: list[Wanted] = []
+    wanted: list[PlannedRun] = []
     for name, size, seen in (("F_x", 1.0, "x1"), ("F_z", 1.0, plant.stroke), ("T_y", 0.05, "x1")):
         push = partial(step_wrench, column=names.index(name), size=size, at=0.02, width=len(names))
         scenario = scenario_of("disturbance", 0.4, references.hold, QUIET | {"disturbance": push} | options)
         unit = plant.disturbances[names.index(name)].unit
         merits = partial(_step_merits, output=outputs.index(seen))
-        wanted.append(Wanted(f"step of {size:g} {unit} {name}", scenario, merits))
+        wanted.append(PlannedRun(f"step of {size:g} {unit} {name}", scenario, merits))
     shake = partial(sine_wrench, column=names.index("F_y"), size=plant.mass, frequency=50.0, width=len(names))
     vibration = scenario_of("vibration", 0.3, references.hold, QUIET | {"disturbance": shake} | options)
     shaken = partial(_sine_merits, output=outputs.index("y1"), frequency=50.0)
-    wanted.append(Wanted("housing shaken by 1 m/s2 at 50 Hz along y", vibration, shaken))
+    wanted.append(PlannedRun("housing shaken by 1 m/s2 at 50 Hz along y", vibration, shaken))
     for f in TONES:
         push = partial(sine_wrench, column=names.index("F_x"), size=TONE_FORCE, frequency=f, width=len(names))
         scenario = scenario_of(
             "sine", 2 * max(0.1, 4 / f), references.hold, QUIET | {"disturbance": push} | options
         )
         found = partial(_sine_merits, output=outputs.index("x1"), frequency=f)
-        wanted.append(Wanted(f"{f:g} Hz", scenario, found))
+        wanted.append(PlannedRun(f"{f:g} Hz", scenario, found))
     return wanted
 
 
@@ -513,7 +515,7 @@ def faults(
         if any(fault.kind == "open phase" for fault in struck):
             own["fidelity"] = "phase"
         scenario = scenario_of("faults", 0.3, reference, own)
-        wanted.append(Wanted(label, scenario, partial(_fault_merits, at=at)))
+        wanted.append(PlannedRun(label, scenario, partial(_fault_merits, at=at)))
     cases, cut = fly(plant, controller, wanted, progress, options)
     survived = float(sum(case.run.verdict.completed for case in cases))
     merit = Merit(f"survived, of {len(cases)}", survived, "1")
@@ -578,15 +580,15 @@ def _limit_strokes(
 
 def _limit_cases(
     best: FastestStroke, sigmoid: SigmoidStroke, distance: float, options: dict[str, Any]
-) -> list[Wanted]:
+) -> list[PlannedRun]:
     duration = max(0.1, 6 * sigmoid.rise)
     ends: dict[str, Any] = {"start": -distance / 2, "end": distance / 2}
     logistic = partial(references.stroke, **ends, rise=sigmoid.rise, centre=duration / 2)
     fast = partial(best.reference, centre=duration / 2)
-    wanted: list[Wanted] = []
+    wanted: list[PlannedRun] = []
     for label, reference, found in (("fastest", fast, best), ("sigmoid", logistic, sigmoid)):
         scenario = scenario_of("drive-limits", duration, reference, QUIET | options)
-        wanted.append(Wanted(label, scenario, partial(_limit_merits, found=found)))
+        wanted.append(PlannedRun(label, scenario, partial(_limit_merits, found=found)))
     return wanted
 
 
@@ -598,7 +600,7 @@ def _limits(
     current_share: float,
     voltage_share: float,
     **options: Any,
-) -> list[Wanted]:
+) -> list[PlannedRun]:
     return _limit_cases(*_limit_strokes(plant, distance, current_share, voltage_share), distance, options)
 
 
@@ -628,7 +630,7 @@ EXPERIMENTS: dict[str, Callable[..., Experiment]] = {
     "drive-limits": drive_limits,
 }
 # Their cases ask the same of the machine from beginning to end.
-CASES: dict[str, Callable[..., list[Wanted]]] = {
+CASES: dict[str, Callable[..., list[PlannedRun]]] = {
     "stroke": _stroke_cases,
     "hold": _hold_cases,
     "tilt": _tilt_cases,
