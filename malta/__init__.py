@@ -48,9 +48,9 @@ if TYPE_CHECKING:  # the contents page, as type checkers and readers see it
     from malta.simulation import references as references
     from malta.simulation.batch import replayed as replayed
     from malta.simulation.batch import simulate_many as simulate_many
+    from malta.simulation.catalogue import experiment as experiment
     from malta.simulation.digest import Batch as Batch
     from malta.simulation.experiments import Experiment as Experiment
-    from malta.simulation.experiments import experiment as experiment
     from malta.simulation.scenario import Fault as Fault
     from malta.simulation.scenario import Scenario as Scenario
     from malta.simulation.simulate import simulate as simulate
@@ -80,7 +80,8 @@ _NAMES = {  # the same, for the first use of each name
     "synthesis.controller": ("Controller",),
     "model.data": ("in_unit", "plant_of", "published", "read"),
     "errors": ("CheckError", "InputError"),
-    "simulation.experiments": ("Experiment", "experiment"),
+    "simulation.catalogue": ("experiment",),
+    "simulation.experiments": ("Experiment",),
     "simulation.time_optimal": ("fastest_stroke",),
     "model.linear": ("linear_machine",),
     "model.linearize": ("LinearModel", "linearize"),

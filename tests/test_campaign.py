@@ -40,9 +40,9 @@ from malta.campaigns.store import MANIFEST, block_name, read_plan
 from malta.machines.tubular.experiments import CASES, EXPERIMENTS
 from malta.report import figures
 from malta.simulation import compiled
+from malta.simulation.catalogue import cases_of
 from malta.simulation.digest import Batch, verdicts
 from malta.simulation.engines import engine_of, library_of
-from malta.simulation.experiments import cases_of
 
 if TYPE_CHECKING:
     from conftest import Design

@@ -21,12 +21,8 @@ from malta.machines.tubular import experiments as tubular
 from malta.machines.tubular.experiments import EXPERIMENTS
 from malta.margins.verify import loop, machine_loop
 from malta.model.data import plant_of, published_value
-from malta.simulation.experiments import (
-    Case,
-    Experiment,
-    Merit,
-    experiment,
-)
+from malta.simulation.catalogue import experiment
+from malta.simulation.experiments import Case, Experiment, Merit
 from malta.simulation.responses import compliance
 from malta.simulation.scenario import ESTIMATORS, Fault, Scenario
 from malta.simulation.simulate import simulate

@@ -35,8 +35,8 @@ from malta.machines.halbach.plant import IDEAL, Options, Parameters
 from malta.model.data import published_value
 from malta.model.plant import Plant
 from malta.report.ledger import ledger
+from malta.simulation.catalogue import cases_of, experiment
 from malta.simulation.compiled import compiler
-from malta.simulation.experiments import cases_of, experiment
 from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate
 from malta.synthesis.controller import Controller, linear_law

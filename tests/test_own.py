@@ -26,17 +26,8 @@ from malta.model.signals import (
     stroke_unit,
 )
 from malta.report import figures
-from malta.simulation.experiments import (
-    Case,
-    Experiment,
-    Merit,
-    PlannedRun,
-    cases_of,
-    fly,
-    main_job,
-    options_of,
-    scenario_of,
-)
+from malta.simulation.catalogue import cases_of, main_job, options_of
+from malta.simulation.experiments import Case, Experiment, Merit, PlannedRun, fly, scenario_of
 from malta.simulation.references import hold
 
 if TYPE_CHECKING:

@@ -23,7 +23,8 @@ from malta.model.data import published as read_published
 from malta.model.data import published_value
 from malta.report.figures import experiment_figure
 from malta.report.ledger import ledger
-from malta.simulation.experiments import Experiment, cases_of, experiments_of
+from malta.simulation.catalogue import cases_of, experiments_of
+from malta.simulation.experiments import Experiment
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray, Plant

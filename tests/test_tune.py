@@ -18,7 +18,7 @@ import malta
 from malta import gains, report
 from malta.machines.tubular.requirements import DRIVE
 from malta.margins.verify import BANDWIDTHS, loop, machine_loop
-from malta.simulation.experiments import experiment
+from malta.simulation.catalogue import experiment
 from malta.synthesis.controller import linear_law, linear_law_of
 from malta.synthesis.requirements import requirements_for
 from malta.synthesis.riccati import eigenvalues

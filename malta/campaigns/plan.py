@@ -28,7 +28,8 @@ from malta.model.data import (
     units_of,
 )
 from malta.model.plant import Plant, readonly
-from malta.simulation.experiments import PlannedRun, cases_of
+from malta.simulation.catalogue import cases_of
+from malta.simulation.experiments import PlannedRun
 from malta.synthesis.controller import Controller
 
 if TYPE_CHECKING:

@@ -26,8 +26,9 @@ from malta.errors import InputError
 from malta.files import replace_files
 from malta.simulation import compiled
 from malta.simulation.batch import record_run, replayed
+from malta.simulation.catalogue import single_run
 from malta.simulation.engines import EngineChoice
-from malta.simulation.experiments import Experiment, Progress, single_run
+from malta.simulation.experiments import Experiment, Progress
 
 BLOCK = 1024  # runs in a block: a fraction of a second of work
 SLOW_BLOCK = 32  # without a C compiler

@@ -87,7 +87,8 @@ def add_own_options(
 
     Raises InputError for an unknown option, one that is given twice, or a value of another type.
     """
-    from malta.simulation.experiments import option_of, setting
+    from malta.simulation.catalogue import option_of
+    from malta.simulation.experiments import setting
 
     units = setting(plant, "OPTION_UNITS", {})
     merged = dict(options)

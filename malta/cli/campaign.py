@@ -101,7 +101,7 @@ def campaign(
     from malta.campaigns.plan import Plan
     from malta.campaigns.run import campaign as run_campaign
     from malta.model.data import plant_of, published_figures, units_of
-    from malta.simulation.experiments import main_job
+    from malta.simulation.catalogue import main_job
 
     controller = read_controller(gains, machine)
     parameters = change_machine(controller.parameters, change)

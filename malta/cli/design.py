@@ -64,7 +64,7 @@ def _run_design(
     from malta.margins.verify import verify as compute_margins
     from malta.model.data import published_beside
     from malta.model.linearize import linearize
-    from malta.simulation.experiments import main_job
+    from malta.simulation.catalogue import main_job
     from malta.synthesis.design_file import read_design
     from malta.synthesis.lqg import synthesize
 
@@ -107,7 +107,7 @@ def _simulate_gain_file(
     import tempfile
 
     from malta import gains
-    from malta.simulation.experiments import experiment
+    from malta.simulation.catalogue import experiment
 
     with tempfile.TemporaryDirectory() as scratch:
         trial = Path(scratch) / f"{spec.name}.json"

@@ -77,6 +77,6 @@ def change_machine(parameters: Parameters, changes: list[str] | None) -> Paramet
 def print_scenarios(plant: Plant, *, campaigns: bool = False) -> None:
     """Print the scenarios of a machine: all of them, or those that campaigns can run."""
     from malta import report
-    from malta.simulation.experiments import series_of
+    from malta.simulation.catalogue import series_of
 
     make_console().print(report.scenarios_table(plant, series_of(plant) if campaigns else None))

@@ -103,7 +103,7 @@ def simulate(
     Example:  malta simulate design/gains/calibrated.json --scenario stroke --set m=0.56 --noise 1 --out build
     """
     from malta.model.data import plant_of, published_figures
-    from malta.simulation.experiments import experiment, main_job
+    from malta.simulation.catalogue import experiment, main_job
 
     controller = read_controller(gains, machine)
     plant = plant_of(change_machine(controller.parameters, change))

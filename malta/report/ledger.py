@@ -27,12 +27,8 @@ from malta.margins.verify import Margins, verify
 from malta.model.data import in_unit, published_value
 from malta.model.linearize import LinearModel, linearize
 from malta.model.machines import require_part
-from malta.simulation.experiments import (
-    Experiment,
-    Progress,
-    experiment,
-    progress_of_part,
-)
+from malta.simulation.catalogue import experiment
+from malta.simulation.experiments import Experiment, Progress, progress_of_part
 from malta.synthesis.lqg import synthesize
 
 if TYPE_CHECKING:

@@ -39,7 +39,8 @@ from malta.report.figures import yield_figure as yield_figure
 from malta.report.figures.margins import chain_figure as chain_figure
 from malta.report.figures.parts import STYLES as STYLES
 from malta.report.figures.parts import UNITS, Published, front_lines, number, read_out
-from malta.simulation.experiments import experiments_of, options_of, setting
+from malta.simulation.catalogue import experiments_of, options_of
+from malta.simulation.experiments import setting
 from malta.simulation.trajectory import Trajectory
 from malta.synthesis.lqg import continuous_poles
 from malta.synthesis.requirements import Trade, requirements_for

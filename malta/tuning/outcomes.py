@@ -13,7 +13,8 @@ import numpy as np
 from malta.errors import InputError
 from malta.margins.verify import BANDWIDTHS, machine_loop, verify
 from malta.simulation import references
-from malta.simulation.experiments import experiment, scenario_of
+from malta.simulation.catalogue import experiment
+from malta.simulation.experiments import scenario_of
 from malta.simulation.layout import fidelities
 from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate

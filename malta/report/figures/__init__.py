@@ -49,7 +49,8 @@ from malta.report.figures.parts import MORE as MORE
 from malta.report.figures.parts import POINTS as POINTS
 from malta.report.figures.parts import STYLES as STYLES
 from malta.report.figures.parts import number as number
-from malta.simulation.experiments import Case, Experiment, experiments_of
+from malta.simulation.catalogue import experiments_of
+from malta.simulation.experiments import Case, Experiment
 from malta.simulation.trajectory import Trajectory
 from malta.synthesis.requirements import Trade
 
