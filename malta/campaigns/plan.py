@@ -51,21 +51,15 @@ class Plan:
     """
 
     controller: Controller
-    scenario: str = "stroke"  # an experiment of the machine's CASES, see simulation/experiments.py
-    spread: Mapping[str, float] = field(
-        default_factory=dict
-    )  # parameter -> share of its value, to either side
-    sensor_spread: Mapping[str, float] = field(
-        default_factory=dict
-    )  # error of a sensor -> SI, to either side
+    scenario: str = "stroke"  # an experiment of the machine's CASES, see simulation/catalogue.py
+    spread: Mapping[str, float] = field(default_factory=dict)  # parameter -> share, to either side
+    sensor_spread: Mapping[str, float] = field(default_factory=dict)  # error -> SI, to either side
     samples: int = 10_000
     seed: int = 0  # of the machines and of the noise
     sampler: Sampler = "latin-hypercube"
     parameters: Any = None  # of the machine in the middle of the box; None: those of the gain file
     case: str | None = None  # label of one of the scenario's cases; None: the first
-    options: Mapping[str, Any] = field(
-        default_factory=dict
-    )  # of the scenario, SI; the noise is 1 unless given
+    options: Mapping[str, Any] = field(default_factory=dict)  # of the scenario, SI; noise: 1 by default
 
     def __post_init__(self) -> None:
         machine = self.controller.parameters if self.parameters is None else self.parameters
@@ -209,9 +203,8 @@ def fingerprint(record: Any) -> str:
     def add(value: Any) -> None:
         if isinstance(value, np.ndarray | float | int):
             marks.update(f"{np.shape(value)}".encode())
-            marks.update(
-                (np.asarray(value, dtype="<f8") + 0.0).tobytes()
-            )  # files do not store the sign of a zero
+            # Files do not store the sign of a zero: + 0.0 drops it.
+            marks.update((np.asarray(value, dtype="<f8") + 0.0).tobytes())
         elif is_dataclass(value):
             for f in fields(value):
                 if f.metadata.get("later") and getattr(value, f.name) == f.default:

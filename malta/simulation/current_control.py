@@ -14,16 +14,18 @@ from malta.simulation.layout import Loop, Setup, Signals
 def control_currents(
     loop: Loop, signals: Signals, current: Any, known: Any
 ) -> tuple[Any, dict[str, Any], dict[str, Any]]:
-    """PI control of the axis currents; `known` are the states that the controller takes for true.
+    """PI control of the axis currents: u = Kp e + Q' I + emf(x), I' = Ki Q e, with the error e of the axis currents.
 
-    Returns the command to hold, the controller's states after this sample, and entries of the row. The integrals follow
-    backward Euler and wait while the half-bridges are at their limit. Current controllers and control law have the same
-    period, as on the machine (50 us).
+    x are the states `known` to the controller, and Q turns the axes with the forces where the setup says so. The
+    integrals I follow backward Euler and wait while the half-bridges are at their limit. Current controllers and
+    control law have the same period, as on the machine (50 us).
+
+    Returns the command to hold, the controller's states after this sample, and entries of the row.
     """
     plant, c, s, g = loop
     machine, controller, given = signals
     believed, drive = plant_of(c.parameters), plant.drive
-    estimate = ca.SX.zeros(len(believed.states))  # where the controller takes the machine to be
+    estimate = ca.SX.zeros(len(believed.states))
     for k, index in enumerate(believed.controlled):
         estimate[index] = known[k]
     # The link voltage is measured: the modulators know of a sag at once.
@@ -65,7 +67,7 @@ def _limited_axes(drive: Any, limits: Any) -> list[Any]:
     share = len(drive.phases) // len(drive.groups)
     flags: list[Any] = [0] * len(drive.axes)
     for k, group in enumerate(drive.groups):
-        anyone = ca.mmax(limits[k * share : (k + 1) * share])
+        any_limited = ca.mmax(limits[k * share : (k + 1) * share])
         for axis in group:
-            flags[axis] = anyone
+            flags[axis] = any_limited
     return flags

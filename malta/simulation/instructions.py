@@ -1,6 +1,7 @@
 """The instructions of a CasADi function as a simplified straight line of scalar operations.
 
-What depends on the parameters theta alone is marked `fixed`: it is computed once a run. Every operation stands once.
+A scalar that depends on the parameters theta only is marked `fixed`: it is computed once a run. Every operation
+stands once.
 A fixed factor that the terms of a sum share is taken out of the sum."""
 
 from __future__ import annotations

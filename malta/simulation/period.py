@@ -168,9 +168,8 @@ def _decide_function(loop: Loop, theta: Any, sizes: Layout) -> ca.Function:
         command,
         ca.vertcat(*(row[name] for name in sizes.row)),
     ]
-    decided = [
-        ca.densify(values) for values in decided
-    ]  # engines read every entry, so structural zeros are not allowed
+    # Engines read every entry, so structural zeros are not allowed.
+    decided = [ca.densify(values) for values in decided]
     state = ca.vertcat(*machine.values(), *controller.values())
     arguments = [state, ca.vertcat(*given.values()), y, v0, theta]
     if kind is ca.SX:

@@ -47,9 +47,7 @@ class Fault(NamedTuple):
     at: float  # s
     until: float = math.inf  # s
     what: str = ""  # name of the output whose sensor fails, or of the phase
-    size: float = (
-        0.0  # bias in the output's unit, factor of the noise, or share of the link voltage that sags
-    )
+    size: float = 0.0  # bias (the output's unit), factor of the noise, or missing share of the link voltage
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,9 +67,7 @@ class Scenario:
     disturbance: Callable[[FloatArray], FloatArray] | None = None  # t (k,) -> wrench, k x 6, N and N m
     noise: float = 0.0  # standard deviation of the sensors in multiples of the plant's
     quantize: bool = False  # sensors with the plant's resolution
-    sensor_errors: Mapping[str, float] | None = (
-        None  # by the names of the plant's sensor_errors; None: y = p exactly
-    )
+    sensor_errors: Mapping[str, float] | None = None  # names: plant.sensor_errors; None: y = p exactly
     seed: int = 0
     run: int = 0  # index in a campaign: the noise depends on seed and run only
     delay: int | None = None  # samples between measurement and force; None: the machine's own
@@ -87,9 +83,8 @@ class Scenario:
     correction: Correction | None = None
     open_loop: bool = False  # no feedback: feedforward alone, commutated for the reference
     electronics: Any = None  # options of the machine's own electronics (fidelity phase)
-    changes: tuple[
-        tuple[float, Mapping[str, float]], ...
-    ] = ()  # (s, parameters of the machine (SI) from then on)
+    # Times (s), and parameters of the machine (SI) from then on.
+    changes: tuple[tuple[float, Mapping[str, float]], ...] = ()
 
     def __post_init__(self) -> None:
         where = f"scenario {self.name}"

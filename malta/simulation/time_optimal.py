@@ -218,10 +218,8 @@ def _optimum(
     opti.minimize(T)
     opti.subject_to(T >= 1e-3)
     opti.subject_to(ca.vec((x1 - x0)[:3, :] - H / 6 * (f0 + 4 * slopes(middle) + f1)) == 0)
-    bezier = (
-        x0[2, :] + h / 3 * f0[2, :],
-        x1[2, :] - h / 3 * f1[2, :],
-    )  # with the ends, the hull of the cubic i
+    # With the ends, these points span the hull of the cubic i.
+    bezier = (x0[2, :] + h / 3 * f0[2, :], x1[2, :] - h / 3 * f1[2, :])
     for limited in (inner[2:, :], *bezier):
         opti.subject_to(opti.bounded(-1, ca.vec(limited), 1))
     for change in ((x1 - x0)[3, :], (x0 - x1)[3, :]):

@@ -155,9 +155,8 @@ def stroke_figures(run: Trajectory) -> StrokeFigures:
     z, z_ref = run.p[:, axis], run.reference[:, axis]
     start, end = z_ref[0], z_ref[-1]
     error = np.abs(run.p - run.reference)
-    whole = (
-        run.verdict.completed and end != start
-    )  # a run that ended early did not reach the end of its reference
+    # A run that ended early did not reach the end of its reference.
+    whole = run.verdict.completed and end != start
     share = (z - start) / (end - start) if whole else np.full(len(z), np.nan)
     return StrokeFigures(
         rise=_crossing_time(run.t, share, 0.9) - _crossing_time(run.t, share, 0.1) if whole else math.nan,

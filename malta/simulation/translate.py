@@ -1,9 +1,10 @@
 """C text of CasADi functions: the control period inside the loop of engine.c.
 
-Every number of machine and controller is an argument, so that one compilation serves all machines and gain files of a
-shape. The function `prepare` computes what depends on these numbers alone, once a run. A long function is cut into
-parts that hand numbers over in an array: compilers need far more than twice the time for twice the text in one piece.
-With several lanes, each function has a second version for small tilts, which has no branches."""
+Every number of machine and controller is an entry of theta, so that one compilation serves all machines and gain files
+of a shape. The function `prepare` computes, once a run, all scalars that depend on theta only. A long function is cut
+into parts that hand numbers over in an array: compilers need far more than twice the time for twice the text in one
+piece. With several lanes, each function has a second version for small tilts, which has no branches.
+"""
 
 from __future__ import annotations
 
@@ -106,15 +107,19 @@ def translate(f: ca.Function, shared: Sequence[int], first_constant: int) -> tup
     results = [(f"r{i}[{j}]", text(k, at=len(parts) - 1)) for i, j, k in outputs]
     bodies[-1] += [f"  const real o{n} = {found};" for n, (_, found) in enumerate(results)]
     bodies[-1] += [f"  {place} = o{n};" for n, (place, _) in enumerate(results)]
+    function = _assemble(f.name(), _arguments(f, shared), bodies, len(set(slot.values())))
+    return "\n".join(["  {", *prepare, "  }"]), function, len(kept)
+
+
+def _arguments(f: ca.Function, shared: Sequence[int]) -> list[tuple[str, str]]:
+    """(type, name) of the arguments of a function in C: constants c, arguments a0, a1, ..., results r0, r1, ..."""
     kinds = ["double" if i in shared else "real" for i in range(f.n_in() - 1)]
     # The first argument and the first result may be the same array: all entries are read before one is written.
-    arguments = [
+    return [
         ("const real *restrict ", "c"),
         *((f"const {kind} *{'restrict ' * (i > 0)}", f"a{i}") for i, kind in enumerate(kinds)),
         *((f"real *{'restrict ' * (i > 0)}", f"r{i}") for i in range(f.n_out())),
     ]
-    function = _assemble(f.name(), arguments, bodies, len(set(slot.values())))
-    return "\n".join(["  {", *prepare, "  }"]), function, len(kept)
 
 
 def _cut_in_parts(statements: list[int]) -> list[list[int]]:
