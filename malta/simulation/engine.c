@@ -1,7 +1,7 @@
 /* The loop around one control period of machine and controller: the frame of every compiled engine.
 
    The functions `prepare`, `sense`, `decide`, `substep` and `digest` are generated from the CasADi expressions of
-   machine.py and stand at the mark below; the sizes are #defines before it. LANES machines run side by side, one in
+   period.py and stand at the mark below; the sizes are #defines before it. LANES machines run side by side, one in
    each lane of a SIMD register; with LANES 1 a `real` is a double and the rows of every sample are kept.           */
 
 #include <math.h>
