@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from scipy.special import erf
 
-from malta.machines.halbach.plant import MEAN_OF, Parameters, current_loop
+from malta.machines.halbach.electronics import MEAN_OF, current_loop
+from malta.machines.halbach.plant import Parameters
 from malta.simulation.noise import keys, normals
 
 if TYPE_CHECKING:

@@ -33,9 +33,11 @@ from rich.table import Table
 from timing import Result, medians, optional
 
 import malta
-from malta.machines.halbach.experiments import there_and_back
+from malta.machines.halbach.experiments.motions import steps_reference
+from malta.machines.planar import coils, commutation
 from malta.machines.planar import plant as planar
-from malta.machines.planar.experiments import CELLS, compiled
+from malta.machines.planar.experiments.motions import CELLS
+from malta.machines.planar.experiments.timings import compile_function
 from malta.machines.tubular import plant as tubular
 from malta.model.data import published_value
 from malta.simulation.engines import engine_of, library_of
@@ -239,21 +241,23 @@ def decoupling(runs: int) -> list[Result]:
     peer = importlib.import_module("peer_planar")
     par = malta.read(ROOT / "data" / "planar.toml")
     assert isinstance(par, planar.Parameters)
-    exact = planar.simulated(par)
-    models: dict[str, planar.CoilModel] = {
-        "table": planar.table(par, exact, CELLS),
+    exact = coils.simulation_model(par)
+    models: dict[str, coils.CoilModel] = {
+        "table": coils.table(par, exact, CELLS),
         "exact": exact,
-        "analytical": planar.Analytical(par),
+        "analytical": coils.Analytical(par),
     }
     arms, calls, few = peer.coils(par), 2000, 50
-    codes = {name: compiled(planar.decoupling(par, model)) for name, model in models.items()}
+    codes = {name: compile_function(commutation.decoupling(par, model)) for name, model in models.items()}
     p, W = np.array([6e-3, 4e-3, par.h]), np.array([10.0, 200, 400, 1, 2, 3])
 
     def by_hand() -> Any:
         return [peer.currents(par, models["table"], arms, p, W) for _ in range(few)][-1]
 
     def by_malta() -> Any:
-        return [planar.currents(planar.wrench_matrix(par, models["table"], p), W) for _ in range(few)][-1]
+        return [
+            commutation.currents(commutation.wrench_matrix(par, models["table"], p), W) for _ in range(few)
+        ][-1]
 
     def calling(code: Any) -> Callable[[], Any]:
         return lambda: code(calls, p, W)[1]
@@ -285,7 +289,7 @@ def halbach(runs: int) -> list[Result]:
     peer = importlib.import_module("peer_halbach")
     controller = malta.gains.read(ROOT / "design" / "gains" / "halbach.json")
     plant = malta.plant_of(controller.parameters)
-    reference = partial(there_and_back, distance=100e-6, rise=0.0, count=8, Ts=controller.sample_time)
+    reference = partial(steps_reference, distance=100e-6, rise=0.0, count=8, Ts=controller.sample_time)
     scenario = malta.Scenario("steps", 20.0, reference, fidelity="phase", noise=1.0, quantize=True)
     found = malta.simulate(plant, controller, scenario)
     given = peer.given(plant, controller, scenario)

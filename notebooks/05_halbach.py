@@ -15,6 +15,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import malta
+from malta.machines.halbach import electronics, motor
 from malta.machines.halbach import plant as halbach
 from malta.synthesis.lqg import sampled_model
 
@@ -38,7 +39,7 @@ print(f"A = {par.A} N/A, k = {par.k} rad/m, m = {par.m} kg, b = {par.b} N s/m, F
 # %%
 x = np.linspace(0, 2 * np.pi / par.k, 361)
 currents = np.array([0.0, -0.3593, 0.3593])
-F = np.array([np.array(halbach.forces(par, place, currents)).ravel() for place in x])
+F = np.array([np.array(motor.forces(par, place, currents)).ravel() for place in x])
 print(f"largest force {F.max():.4f} N")
 assert abs(F.max() - 1) < 1e-3
 
@@ -48,8 +49,8 @@ assert abs(F.max() - 1) < 1e-3
 # References within a dead zone make the same duty cycles.
 
 # %%
-places = halbach.settled(par, 10e-6 * np.arange(5), par.F_z, "plain")
-zones = {pwm: halbach.dead_zones(par, par.F_z, pwm)[1].max() for pwm in ("plain", "fine")}
+places = electronics.resting_positions(par, 10e-6 * np.arange(5), par.F_z, "plain")
+zones = {pwm: electronics.dead_zones(par, par.F_z, pwm)[1].max() for pwm in ("plain", "fine")}
 print("stairs of 10 µm end at", (1e6 * places).round(2), "µm")
 print(", ".join(f"{pwm}: {1e6 * zone:.3f} µm" for pwm, zone in zones.items()))
 assert abs(places[1] - places[2]) < 1e-12

@@ -17,6 +17,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import malta
+from malta.machines.planar import coils, commutation
 from malta.machines.planar import field as planar_field
 from malta.machines.planar import plant as planar
 
@@ -44,7 +45,7 @@ over_a_pole = planar_field.flux_density(field, np.array([par.tau_n, 0, par.h]))[
 print(f"B_z over a pole at {par.h * 1e3:g} mm: {over_a_pole:.3f} T")
 assert abs(over_a_pole - par.B_z) < 5e-3
 
-truth = planar.truth(par)
+truth = coils.exact_model(par)
 x, y = np.meshgrid(*[np.linspace(0, 2 * par.tau_n, 121)] * 2, indexing="ij")
 wrench = 3 * truth(x, y, np.full_like(x, par.h))  # 3 A in one coil, N and N m
 largest = np.abs(wrench).max(axis=(0, 1))
@@ -59,8 +60,8 @@ assert abs(largest[0] - 12.39) < 0.1 < 25.67 - largest[2]
 # The factor C of (23) and (24), fitted to data of any kind, and the bilinear table (25)-(29) of such data.
 
 # %%
-fitted = planar.Analytical(replace(par, C=planar.compensation(par, truth)))
-table = planar.table(par, truth, 35)
+fitted = coils.Analytical(replace(par, C=coils.compensation(par, truth)))
+table = coils.table(par, truth, 35)
 
 heights = np.full_like(x, par.h)
 errors = {name: 3 * model(x, y, heights) - wrench for name, model in (("fitted", fitted), ("table", table))}
@@ -89,19 +90,19 @@ figure.savefig("build/06_planar_errors.png", dpi=120)
 # i = K^T (K K^T)^-1 W. At a pitch of 4 pole pitches all coils are in phase and K(p) is singular everywhere.
 
 # %%
-exact = planar.simulated(par)
+exact = coils.simulation_model(par)
 p, W = np.array([6e-3, 4e-3, par.h]), np.array([10.0, 200, 400, 1, 2, 3])
-K = planar.wrench_matrix(par, exact, p)
-i = planar.currents(K, W)
+K = commutation.wrench_matrix(par, exact, p)
+i = commutation.currents(K, W)
 print(f"largest current {np.abs(i).max():.1f} A, K i - W {np.abs(K @ i - W).max():.0e} N")
 assert np.abs(K @ i - W).max() < 1e-11 * np.abs(W).max()
 
 ratios = np.arange(44, 66) / 12  # of the coil pitch to the pole pitch
 conditions = [
-    planar.conditioning(replace(par, coil_pitch=ratio * par.tau_n), exact, 6).max() for ratio in ratios
+    commutation.conditioning(replace(par, coil_pitch=ratio * par.tau_n), exact, 6).max() for ratio in ratios
 ]
 assert np.isinf(conditions[ratios.tolist().index(4.0)])
-assert planar.check_pitch(par, exact) < 2.6
+assert commutation.check_pitch(par, exact) < 2.6
 
 # %%
 figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.4), layout="constrained")
@@ -110,7 +111,9 @@ left.axvline(par.coil_pitch / par.tau_n, color="0.6", linestyle="--", linewidth=
 left.annotate("ours, 16/3", (5.31, 2e3), rotation=90, ha="right", fontsize=8, color="0.4")
 left.set(xlabel="coil pitch [pole pitches]", ylabel="worst condition of K(p), singular: 1e4 [1]")
 steps = np.arange(24) * 2 * par.tau_n / 24 * 1e3
-drawn = right.pcolormesh(steps, steps, planar.conditioning(par, exact, 24).T, cmap="Greys", shading="nearest")
+drawn = right.pcolormesh(
+    steps, steps, commutation.conditioning(par, exact, 24).T, cmap="Greys", shading="nearest"
+)
 figure.colorbar(drawn, ax=right, label="condition of K(p) [1]")
 right.set(xlabel="x [mm]", ylabel="y [mm]", aspect="equal")
 figure.savefig("build/06_planar_pitch.png", dpi=120)

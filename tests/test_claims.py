@@ -18,7 +18,7 @@ from scipy.linalg import expm
 import malta
 from malta import references
 from malta.machines.tubular import claims as tubular
-from malta.machines.tubular.claims import Evidence
+from malta.machines.tubular.evidence import EXPERIMENT_NAMES, Evidence
 from malta.margins.verify import machine_loop
 from malta.model.data import in_unit, plant_of, published_value
 from malta.report import ledger as claims
@@ -501,7 +501,7 @@ def test_what_the_notes_say_is_so(found: Found, designs: dict[str, Design]) -> N
     weight = found.claim("weight carried")
     assert weight.ours == (f"{par.m * par.g:.2f}",) * 2 == ("3.53",) * 2
     for evidence in found.evidence:  # statics at z = 5 mm: (l_B + z) / (2 l_B) of it on module 2
-        v = evidence.flown["stroke"].run.v[-1]
+        v = evidence.experiments["stroke"].run.v[-1]
         assert v[3] / (v[1] + v[3]) == pytest.approx((par.l_B + 5e-3) / (2 * par.l_B), rel=0.02)
     assert found.claim("thermal: growth").ours == ("65", "65")
     white = math.hypot(par.s_r, par.dp / math.sqrt(12))
@@ -541,7 +541,7 @@ def test_cogging_pushes_a_soft_axis_aside(found: Found) -> None:
 def test_figures_are_those_of_the_experiments(found: Found) -> None:
     """What a user sees of `malta simulate` is what the ledger says."""
     for name, evidence in zip(NAMES, found.evidence, strict=True):
-        assert set(evidence.flown) == set(tubular.FLOWN)
+        assert set(evidence.experiments) == set(EXPERIMENT_NAMES)
         for start, experiment, label in (
             ("stroke: f/i", "stroke", "drive constant per module, f / i"),
             ("stroke: rise", "stroke", "rise, 10-90 %"),
@@ -550,15 +550,15 @@ def test_figures_are_those_of_the_experiments(found: Found) -> None:
             ("payload carried", "payload", "largest of these carried and moved"),
             ("at rest: z", "hold", "measured z, std"),
         ):
-            merit = next(m for m in evidence.flown[experiment].merits if m.label == label)
+            merit = next(m for m in evidence.experiments[experiment].merits if m.label == label)
             assert found.value(start, name) == pytest.approx(in_unit(merit.value, merit.unit), rel=1e-12)
         for start, experiment, number, label in (
             ("tilt: SP2 deviates", "tilt", 0, "feedforward axial"),
             ("tilt: SP2, attraction", "tilt", 1, "feedforward attraction"),
             ("thermal: left", "thermal", 0, "compensated"),
         ):
-            case = evidence.flown[experiment].cases[number]
+            case = evidence.experiments[experiment].cases[number]
             assert case.label == label
             assert found.value(start, name) == pytest.approx(case.merits[0].value * 1e6)
-        assert "largest deviation" in evidence.flown["thermal"].cases[0].merits[0].label
-        assert evidence.flown["tilt"].cases[0].merits[0].label == "SP2: largest deviation, true"
+        assert "largest deviation" in evidence.experiments["thermal"].cases[0].merits[0].label
+        assert evidence.experiments["tilt"].cases[0].merits[0].label == "SP2: largest deviation, true"

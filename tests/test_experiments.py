@@ -17,8 +17,7 @@ from scipy.linalg import expm
 
 import malta
 from malta import references
-from malta.machines.tubular import experiments as tubular
-from malta.machines.tubular.experiments import EXPERIMENTS
+from malta.machines.tubular.experiments import EXPERIMENTS, forces, lifting, rest, strokes
 from malta.margins.verify import loop, machine_loop
 from malta.model.data import plant_of, published_value
 from malta.simulation.catalogue import experiment
@@ -78,8 +77,8 @@ def test_defaults_are_the_published_figures(plant: Plant, published: dict[str, A
     for found, key in (
         (default("stroke", "distance"), "figure_12.stroke"),
         (default("stroke", "rise"), "figure_12.rise_time"),
-        (tubular.RISE, "figure_12.rise_time"),
-        (inspect.signature(tubular.late_stroke).parameters["distance"].default, "figure_12.stroke"),
+        (strokes.RISE, "figure_12.rise_time"),
+        (inspect.signature(strokes.delayed_stroke).parameters["distance"].default, "figure_12.stroke"),
         (default("drive-limits", "distance"), "figure_12.stroke"),
         (default("tilt", "radius"), "figure_16.radius"),
         (default("thermal", "drift"), "thermal.drift"),
@@ -91,7 +90,7 @@ def test_defaults_are_the_published_figures(plant: Plant, published: dict[str, A
     ):
         assert found == pytest.approx(published_value(published, key), rel=1e-12), key
     assert default("tilt", "frequency") == published["figure_16"]["frequency"]["value"]  # Hz, not rad/s
-    assert published["table_III"]["samples"] == tubular.RESTING
+    assert published["table_III"]["samples"] == rest.RESTING
 
 
 @pytest.mark.parametrize("name", ["stroke", "hold", "tilt", "payload", "thermal"])
@@ -133,7 +132,7 @@ def test_the_drive_constant_is_read_back(design: Design, flown: Flown, fidelity:
     assert read == pytest.approx(design.plant.parameters.K_D, rel=1e-9)  # type: ignore[attr-defined]
     weaker = plant_of(replace(design.spec.parameters, K_D=4.7))
     other = experiment("stroke", weaker, design.controller, fidelity=fidelity)
-    assert tubular.drive_constant(other.run) == pytest.approx(4.7, rel=1e-9)
+    assert strokes.drive_constant(other.run) == pytest.approx(4.7, rel=1e-9)
 
 
 def test_heat_is_the_same_in_phases_and_in_axes(design: Design, flown: Flown) -> None:
@@ -164,7 +163,7 @@ def test_efficiency_is_what_the_energies_make_it(design: Design, flown: Flown) -
     stored = np.gradient(par.L / 2 * run.i**2 @ weight)
     apart = 4.5 * par.K_ind / par.K_D
     drawn = heat + apart * mechanical + float(stored[driving].sum())
-    found = tubular.efficiency(run)
+    found = strokes.efficiency(run)
     assert found == pytest.approx(mechanical / drawn, rel=0.01)
     assert 0.05 < found < 1 / apart < 1
     assert apart == pytest.approx(1.506, abs=5e-4)
@@ -235,10 +234,10 @@ def _rest(design: Design) -> Rest:
     B = np.vstack([B, np.eye(5)])
     P, W = np.pad(P, (0, 5)), B @ np.diag(white) @ B.T
     true = np.zeros(5)
-    for _ in range(tubular.RESTING):
+    for _ in range(rest.RESTING):
         true += np.diag(C @ P[:n, :n] @ C.T)
         P = A @ P @ A.T + W
-    samples = tubular.RESTING
+    samples = rest.RESTING
     return Rest(np.sqrt(white), np.sqrt(true / samples), np.sqrt(np.diag(P)[n:]) / samples)
 
 
@@ -350,7 +349,7 @@ def test_the_printed_law_breaks_the_published_bound_and_the_attraction_keeps_it(
 
 def test_rest_on_the_bearing_is_an_equilibrium(plant: Plant, par: Any) -> None:
     """Two bearings of k_t carry m g and what 2 K_A pulls: penetration (m g + 2 K_A r_max) / (2 k_t - 2 K_A)."""
-    resting = tubular.rest_on_bearing(plant)
+    resting = lifting.rest_on_bearing(plant)
     assert list(resting) == ["y"]
     pull = 2 * par.K_A
     depth = (par.m * par.g + pull * par.r_max) / (2 * par.k_t - pull)
@@ -363,14 +362,14 @@ def test_rest_on_the_bearing_is_an_equilibrium(plant: Plant, par: Any) -> None:
 
 def test_the_current_that_lifts_is_what_statics_need(plant: Plant, par: Any) -> None:
     """(2 K_A r + m g) / (2 K_B) = 1.34 A, a quarter of the limit; the attraction is three quarters of it."""
-    resting = tubular.rest_on_bearing(plant)
-    found = tubular.break_away_current(plant, resting)
+    resting = lifting.rest_on_bearing(plant)
+    found = lifting.break_away_current(plant, resting)
     assert found == pytest.approx((2 * par.K_A * -resting["y"] + par.m * par.g) / (2 * par.K_B), rel=1e-12)
     assert found == pytest.approx(1.34, abs=0.005)
     free = plant_of(replace(par, K_A=0.0))  # only its weight
-    down = tubular.rest_on_bearing(free)
+    down = lifting.rest_on_bearing(free)
     assert -down["y"] - par.r_max == pytest.approx(par.m * par.g / (2 * par.k_t), rel=1e-6)
-    assert tubular.break_away_current(free, down) == pytest.approx(par.m * par.g / (2 * par.K_B))
+    assert lifting.break_away_current(free, down) == pytest.approx(par.m * par.g / (2 * par.K_B))
 
 
 def test_every_estimator_lifts_the_mover(design: Design, flown: Flown) -> None:
@@ -416,7 +415,7 @@ def test_an_observer_that_knows_nothing_pays_for_the_start(flown: Flown) -> None
 
 
 def test_the_rise_is_a_quintic_to_the_centre(plant: Plant) -> None:
-    reference = tubular.rise_from(plant, {"y": -0.6e-3})
+    reference = lifting.rise_reference(plant, {"y": -0.6e-3})
     t = np.arange(0, 40e-3, 1e-5)
     p, dp, ddp = reference(t)
     assert p[0] == pytest.approx([0, -0.6e-3, 0, -0.6e-3, 0], abs=1e-15)
@@ -493,9 +492,9 @@ def test_before_the_pick_nothing_moves(design: Design, flown: Flown) -> None:
     for options, limit in ((QUIET, 1e-11), ({}, 1e-6)):
         for case in flown(design.spec.name, "payload", **options).cases:
             run = case.run
-            before = run.t <= tubular.PICKED
+            before = run.t <= lifting.PICKED
             assert np.abs(run.p - run.reference)[before][:, :4].max() < limit
-            after = (run.t > tubular.PICKED + 5e-3) & (run.t < 0.1)
+            after = (run.t > lifting.PICKED + 5e-3) & (run.t < 0.1)
             assert np.abs(run.p)[after][:, [1, 3]].max() > 15e-6
             assert np.abs(run.p)[after][:, [0, 2]].max() < 2e-6  # weight does not push sideways
 
@@ -504,7 +503,7 @@ def test_the_integrals_lift_the_mass_again(flown: Flown) -> None:
     """After 0.45 s `calibrated` holds 0.2 kg within a tenth of the sag; table2's integrals take minutes."""
     for name, low, high in (("calibrated", 0.0, 0.1), ("table2", 0.85, 1.0)):
         case = _case(flown(name, "payload", **QUIET), "100 g")
-        held = np.abs(case.run.p[case.run.t < tubular.WAIT][-1, [1, 3]]).max()
+        held = np.abs(case.run.p[case.run.t < lifting.WAIT][-1, [1, 3]]).max()
         share = held / _merit(case.merits, "largest sag after the pick")
         assert low < share < high
 
@@ -574,7 +573,7 @@ def test_simulated_sines_are_on_the_compliance_curve(design: Design, flown: Flow
     """With forces as the linear loop has them, to 0.1 %."""
     found = flown(design.spec.name, "disturbance", **LINEAR)
     tones = found.curves["tones"]
-    assert tones.tolist() == list(tubular.TONES)
+    assert tones.tolist() == list(forces.TONES)
     curve = compliance(design.plant, design.controller, 2 * math.pi * tones)
     assert found.curves["simulated"] == pytest.approx(curve, rel=1e-3)
 
@@ -903,7 +902,7 @@ def test_limit_merits_are_not_compared_with_the_paper(flown: Flown) -> None:
 
 
 def test_induced_voltage_per_speed_is_the_machines(plant: Plant, par: Any) -> None:
-    assert tubular.induced_per_speed(plant) == pytest.approx(par.K_ind, rel=1e-12)
+    assert strokes.induced_per_speed(plant) == pytest.approx(par.K_ind, rel=1e-12)
 
 
 # By name

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
 import malta
+from malta.machines.halbach import electronics, motor
 from malta.machines.halbach import plant as halbach
 from malta.machines.halbach.plant import Parameters
 from malta.model.data import published_value
@@ -59,12 +60,12 @@ def _flat(value: Any) -> FloatArray:
 
 
 def test_the_two_presets_hold_the_same_damping(par: Parameters, emf: Parameters) -> None:
-    assert halbach.emf_damping(par) == 0
-    assert halbach.emf_damping(emf) == pytest.approx(3.87, abs=0.005)
-    assert emf.b + halbach.emf_damping(emf) == pytest.approx(par.b, rel=1e-5)
+    assert motor.emf_damping(par) == 0
+    assert motor.emf_damping(emf) == pytest.approx(3.87, abs=0.005)
+    assert emf.b + motor.emf_damping(emf) == pytest.approx(par.b, rel=1e-5)
     assert emf.b == pytest.approx(5.54, abs=0.005)
     assert emf.K_e == emf.A
-    assert halbach.emf_damping(emf) / par.b == pytest.approx(0.41, abs=0.005)
+    assert motor.emf_damping(emf) / par.b == pytest.approx(0.41, abs=0.005)
 
 
 def test_derived_data_agree_with_what_is_printed(par: Parameters, printed: dict[str, Any]) -> None:
@@ -73,14 +74,14 @@ def test_derived_data_agree_with_what_is_printed(par: Parameters, printed: dict[
 
     assert 2 * math.pi / par.k == pytest.approx(value("motor.pitch"), rel=1e-5)
     assert par.f_pwm == pytest.approx(value("pwm.frequency"), abs=10)
-    assert halbach.pwm_step(par, "plain") == pytest.approx(5.859e-3, abs=5e-7)
-    assert round(halbach.pwm_step(par, "plain"), 3) == value("pwm.step")
-    assert round(halbach.adc_step(par), 2) == value("current_sampling.step")
+    assert electronics.pwm_step(par, "plain") == pytest.approx(5.859e-3, abs=5e-7)
+    assert round(electronics.pwm_step(par, "plain"), 3) == value("pwm.step")
+    assert round(electronics.adc_step(par), 2) == value("current_sampling.step")
     micro_edge = par.V_dc * value("pwm.micro_edge") * par.f_pwm
     assert micro_edge == pytest.approx(
         2.637e-5, rel=1e-3
     )  # the printed 2.62e-5 V is 0.6 % less than its own 150 ps
-    assert halbach.pwm_step(par, "fine") == pytest.approx(micro_edge, rel=1e-2)
+    assert electronics.pwm_step(par, "fine") == pytest.approx(micro_edge, rel=1e-2)
 
 
 # The motor law and its transform
@@ -88,7 +89,7 @@ def test_derived_data_agree_with_what_is_printed(par: Parameters, printed: dict[
 
 @given(x=PLACE, d=CURRENT, q=CURRENT)
 def test_the_two_transforms_are_inverse_among_currents_of_a_star(x: float, d: float, q: float) -> None:
-    P, U = _array(halbach.park(x, 211.0001)), _array(halbach.unpark(x, 211.0001))
+    P, U = _array(motor.park(x, 211.0001)), _array(motor.unpark(x, 211.0001))
     np.testing.assert_allclose(P @ U, np.eye(2), rtol=0, atol=1e-14)
     np.testing.assert_allclose(U @ P, np.eye(3) - 1 / 3, rtol=0, atol=1e-14)
     np.testing.assert_allclose(U, np.linalg.pinv(P), rtol=0, atol=1e-14)
@@ -102,21 +103,21 @@ def test_the_two_transforms_are_inverse_among_currents_of_a_star(x: float, d: fl
 @given(x=PLACE, F_x=FORCE, F_z=FORCE)
 def test_currents_make_the_forces_they_are_made_for(x: float, F_x: float, F_z: float) -> None:
     par = malta.read("data/halbach.toml")
-    i = halbach.phase_currents(par, x, F_x, F_z)
-    np.testing.assert_allclose(_flat(halbach.forces(par, x, i)), [F_x, F_z], rtol=0, atol=1e-13)
+    i = motor.phase_currents(par, x, F_x, F_z)
+    np.testing.assert_allclose(_flat(motor.forces(par, x, i)), [F_x, F_z], rtol=0, atol=1e-13)
 
 
 def test_lift_of_many_positions(par: Parameters) -> None:
     rng = np.random.default_rng(0)
     x, i = 0.05 * rng.standard_normal(5), rng.standard_normal((5, 3))
-    expected = [_flat(halbach.forces(par, *pair))[1] for pair in zip(x, i, strict=True)]
-    np.testing.assert_allclose(halbach.lift(par, x, i), expected, rtol=1e-14)
+    expected = [_flat(motor.forces(par, *pair))[1] for pair in zip(x, i, strict=True)]
+    np.testing.assert_allclose(motor.vertical_force(par, x, i), expected, rtol=1e-14)
 
 
 def test_figure_2(par: Parameters, printed: dict[str, Any]) -> None:
     i = [published_value(printed, f"figure_2.I_{p}") for p in "abc"]
     pitch = 2 * math.pi / par.k
-    F = np.array([_flat(halbach.forces(par, x, i)) for x in np.linspace(0, pitch, 361)])
+    F = np.array([_flat(motor.forces(par, x, i)) for x in np.linspace(0, pitch, 361)])
     waves = np.fft.rfft(F[:-1], axis=0) / 180
     assert np.abs(waves[1]) == pytest.approx(published_value(printed, "figure_2.force"), rel=1e-3)
     assert np.abs(waves[2:]).max() < 1e-12
@@ -135,11 +136,11 @@ def test_power_balance(x: float, v: float, i_a: float, i_b: float, V: list[float
     """Electrical power is heat, magnetic and mechanical power; where the star point floats does not matter."""
     par = malta.read("data/halbach.toml", preset="emf")
     i = np.array([i_a, i_b, -i_a - i_b])
-    rate = _flat(halbach.rates(par, [x, v, *i], ca.DM(V)))
-    F_x = _flat(halbach.forces(par, x, i))[0]
+    rate = _flat(motor.rates(par, [x, v, *i], ca.DM(V)))
+    F_x = _flat(motor.forces(par, x, i))[0]
     assert rate[:2] == pytest.approx([v, (F_x - par.b * v) / par.m])
     assert i @ V == pytest.approx(par.R * i @ i + par.L * i @ rate[2:] + F_x * v, abs=1e-9)
-    lifted = _flat(halbach.rates(par, [x, v, *i], ca.DM(V) + 3.0))
+    lifted = _flat(motor.rates(par, [x, v, *i], ca.DM(V) + 3.0))
     np.testing.assert_allclose(rate, lifted, rtol=0, atol=1e-9)
     assert abs(rate[2:].sum()) < 1e-9
 
@@ -147,11 +148,11 @@ def test_power_balance(x: float, v: float, i_a: float, i_b: float, V: list[float
 def test_one_step_a_period_is_enough(emf: Parameters) -> None:
     state, V = np.array([1e-3, 0.2, 1.0, -2.0, 1.0]), ca.DM([3, -1, 2])
     symbol = ca.SX.sym("s", 5)
-    rates = ca.Function("rates", [symbol], [halbach.rates(emf, symbol, V)])
+    rates = ca.Function("rates", [symbol], [motor.rates(emf, symbol, V)])
     exact = solve_ivp(
         lambda _, s: rates(s).full().ravel(), (0, 1 / emf.f_pwm), state, rtol=1e-12, atol=1e-14
     ).y[:, -1]
-    np.testing.assert_allclose(_flat(halbach.moved(emf, state, V)), exact, rtol=1e-7, atol=1e-8)
+    np.testing.assert_allclose(_flat(motor.advance(emf, state, V)), exact, rtol=1e-7, atol=1e-8)
 
 
 # Servo system
@@ -159,11 +160,11 @@ def test_one_step_a_period_is_enough(emf: Parameters) -> None:
 
 def test_stiffness_is_the_secant_of_the_identification(par: Parameters, printed: dict[str, Any]) -> None:
     displacement, F_z = published_value(printed, "servo.step"), published_value(printed, "servo.F_z")
-    assert halbach.stiffness(par, F_z, displacement) == pytest.approx(204.8, abs=0.5)
-    assert halbach.stiffness(par, F_z, displacement) == pytest.approx(
+    assert motor.stiffness(par, F_z, displacement) == pytest.approx(204.8, abs=0.5)
+    assert motor.stiffness(par, F_z, displacement) == pytest.approx(
         published_value(printed, "servo.K"), abs=0.5
     )
-    assert halbach.stiffness(par, F_z) == pytest.approx(211.0, abs=0.05)
+    assert motor.stiffness(par, F_z) == pytest.approx(211.0, abs=0.05)
 
 
 def _sampled(p: Parameters, delay: int = 0) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -186,10 +187,10 @@ def test_design_model_is_the_motor_law_about_the_last_reading(par: Parameters, l
     """Small motions of m x'' = F_x(held currents, x) - b x', integrated, against the matrices."""
     Ad, Bd, Cd = _sampled(par, late)
     x, v, last, F = 2e-6, 3e-5, 1.2e-6, 2e-3
-    i = _flat(halbach.phase_currents(par, last if late else x, F, F_Z))
+    i = _flat(motor.phase_currents(par, last if late else x, F, F_Z))
 
     def rate(_: float, s: FloatArray) -> list[float]:
-        F_x = _flat(halbach.forces(par, s[0], i))[0]
+        F_x = _flat(motor.forces(par, s[0], i))[0]
         return [s[1], (F_x - par.b * s[1]) / par.m]
 
     exact = solve_ivp(rate, (0, par.T_laser), [x, v], rtol=1e-10, atol=1e-16).y[:, -1]
@@ -207,13 +208,11 @@ def test_design_model_is_the_motor_law_about_the_last_reading(par: Parameters, l
 
 def test_duty_cycles(par: Parameters, printed: dict[str, Any]) -> None:
     x = np.linspace(0, 2 * math.pi / par.k, 721)
-    duty = np.array(
-        [_flat(halbach.duty_cycles(par, par.R * halbach.phase_currents(par, r, 0, F_Z))) for r in x]
-    )
+    duty = np.array([_flat(motor.duty_cycles(par, par.R * motor.phase_currents(par, r, 0, F_Z))) for r in x])
     assert 100 * np.array([duty.min(), duty.max()]) == pytest.approx([32.7, 67.3], abs=0.05)
     assert np.abs(duty.sum(axis=1) - 1.5).max() < 1e-14
     limit = published_value(printed, "pwm.current")
-    ends = _flat(halbach.duty_cycles(par, par.R * ca.DM([-limit, limit])))
+    ends = _flat(motor.duty_cycles(par, par.R * ca.DM([-limit, limit])))
     assert ends == pytest.approx([published_value(printed, f"pwm.duty_{end}") for end in ("low", "high")])
 
 
@@ -222,7 +221,7 @@ def test_duty_cycles_come_in_steps_and_within_0_to_1(V: list[float]) -> None:
     par = malta.read("data/halbach.toml")
     wanted = 0.5 + np.array(V) / par.V_dc
     for pwm, step in (("plain", 1 / 2048), ("fine", par.dV_fine / par.V_dc)):
-        d, limited = halbach.modulated(par, ca.DM(V), pwm)  # type: ignore[arg-type]
+        d, limited = electronics.modulate(par, ca.DM(V), pwm)  # type: ignore[arg-type]
         inside = np.clip(wanted, 0, 1)
         assert np.abs(_flat(d) - inside).max() <= step / 2 + 1e-15
         part = _flat(d) / step
@@ -232,7 +231,7 @@ def test_duty_cycles_come_in_steps_and_within_0_to_1(V: list[float]) -> None:
 
 def test_current_sampling(par: Parameters, printed: dict[str, Any]) -> None:
     for i, code in ((-20.625, 0), (20.625, 4095), (0.006, 2048), (-0.006, 2047), (30.0, 4095)):
-        found, out = halbach.sampled_current(par, i, steps=True)
+        found, out = electronics.sample_current(par, i, steps=True)
         assert (float(found), bool(out)) == (code, abs(i) > 20.625)
     white = par.s_adc / math.sqrt(published_value(printed, "current_sampling.samples"))
     assert white == pytest.approx(3.9e-3, abs=5e-5)
@@ -242,7 +241,7 @@ def test_current_sampling(par: Parameters, printed: dict[str, Any]) -> None:
 
 
 def test_smallest_motion_of_the_open_loop(par: Parameters, printed: dict[str, Any]) -> None:
-    plain, fine = (halbach.dead_zones(par, F_Z, pwm)[1].max() for pwm in ("plain", "fine"))
+    plain, fine = (electronics.dead_zones(par, F_Z, pwm)[1].max() for pwm in ("plain", "fine"))
     assert plain == pytest.approx(15.3e-6, rel=0.03)
     assert plain == pytest.approx(published_value(printed, "open_loop.smallest_motion"), rel=0.03)
     assert fine == pytest.approx(69e-9, rel=0.03)
@@ -251,13 +250,13 @@ def test_smallest_motion_of_the_open_loop(par: Parameters, printed: dict[str, An
 
 
 def test_dead_zones_are_where_duty_cycles_stand_still(par: Parameters) -> None:
-    starts, lengths = halbach.dead_zones(par, F_Z, "plain")
+    starts, lengths = electronics.dead_zones(par, F_Z, "plain")
     assert lengths.sum() == pytest.approx(2 * math.pi / par.k)
     for k in (lengths.argmax(), 100, 1000):
         inside = starts[k] + lengths[k] * np.array([0.001, 0.3, 0.6, 0.999])
-        assert np.ptp(halbach.settled(par, inside, F_Z, "plain")) < 1e-12
+        assert np.ptp(electronics.resting_positions(par, inside, F_Z, "plain")) < 1e-12
         around = starts[k] + lengths[k] * np.array([-0.001, 0.5, 1.001])
-        assert np.abs(np.diff(halbach.settled(par, around, F_Z, "plain"))).min() > 1e-9
+        assert np.abs(np.diff(electronics.resting_positions(par, around, F_Z, "plain"))).min() > 1e-9
 
 
 STAIRS = (
@@ -271,15 +270,15 @@ STAIRS = (
 
 def test_stairs_of_the_open_loop(par: Parameters, printed: dict[str, Any]) -> None:
     stair = published_value(printed, "open_loop.stair")
-    places = halbach.settled(par, stair * np.arange(5), F_Z, "plain")
+    places = electronics.resting_positions(par, stair * np.arange(5), F_Z, "plain")
     assert 1e6 * places == pytest.approx(STAIRS, abs=0.005)
-    fine = halbach.settled(par, stair * np.arange(5), F_Z, "fine")
+    fine = electronics.resting_positions(par, stair * np.arange(5), F_Z, "fine")
     assert np.abs(fine - stair * np.arange(5)).max() < 35e-9
 
 
 def test_current_of_a_motion_of_1_um(par: Parameters, printed: dict[str, Any]) -> None:
     step = published_value(printed, "sensitivity.displacement")
-    i = [halbach.phase_currents(par, x, 0, F_Z) for x in (0, step)]
+    i = [motor.phase_currents(par, x, 0, F_Z) for x in (0, step)]
     assert np.abs(_flat(i[1] - i[0])).max() == pytest.approx(4.4e-4, rel=0.01)
     # The paper's 1e-4 A would make the 6 mA of one PWM step a motion of 60 um, four times its own 15 um.
     by_the_paper = 6e-3 / published_value(printed, "sensitivity.current") * step
@@ -288,12 +287,12 @@ def test_current_of_a_motion_of_1_um(par: Parameters, printed: dict[str, Any]) -
 
 @pytest.mark.parametrize("mean_of", [1, 32])
 def test_current_loop_has_its_phase_margin(par: Parameters, mean_of: int) -> None:
-    gains, delay = halbach.current_loop(par, mean_of), halbach.current_delay(par, mean_of)
+    gains, delay = electronics.current_loop(par, mean_of), electronics.current_delay(par, mean_of)
     w = gains.Kp / par.L
     loop = (gains.Kp + gains.Ki / (1j * w)) / (1j * w * par.L + par.R) * np.exp(-1j * w * delay)
     assert abs(loop) == pytest.approx(1)
     assert math.pi + np.angle(loop) == pytest.approx(par.pm_cc)
-    spring = math.sqrt(halbach.stiffness(par, F_Z) / par.m)
+    spring = math.sqrt(motor.stiffness(par, F_Z) / par.m)
     assert w == pytest.approx({1: 5113, 32: 451}[mean_of], rel=1e-3)
     assert w > 25 * spring
 
@@ -317,7 +316,7 @@ def test_unequal_windings_lower_the_force_more_under_position_control(
     G = np.diag(1 / np.array(winding)) - np.outer(1 / np.array(winding), 1 / np.array(winding)) / sum(
         1 / w for w in winding
     )
-    P = _array(halbach.park(x, 211.0001))
+    P = _array(motor.park(x, 211.0001))
     Y = P @ G @ (2 / 3 * P.T)
     open_loop, position = np.hypot(*Y[:, 1]), 1 / np.linalg.inv(Y)[1, 1]
     assert position <= open_loop * (1 + 1e-12)
@@ -331,13 +330,13 @@ def test_bad_input_is_refused_in_one_sentence(par: Parameters) -> None:
         (lambda: replace(par, A=math.nan), "halbach.Parameters: A: found nan"),
         (lambda: replace(par, m=-1.0), "m: found -1.0 kg, expected a finite number above 0"),
         (
-            lambda: halbach.settled(par, 0.0, 20.0, "plain"),
+            lambda: electronics.resting_positions(par, 0.0, 20.0, "plain"),
             "settled: found 20 N at 0 m, expected forces of 0 to 14.5 N",
         ),
-        (lambda: halbach.settled(par, 0.0, -5.0, "plain"), "settled: found -5 N"),
-        (lambda: halbach.settled(par, math.nan, 5.0, "plain"), "settled: found 5 N at nan m"),
-        (lambda: halbach.dead_zones(par, F_Z, "exact"), "dead_zones: found pwm 'exact' at 5 N"),
-        (lambda: halbach.dead_zones(par, 0.0, "plain"), "dead_zones: found pwm 'plain' at 0 N"),
+        (lambda: electronics.resting_positions(par, 0.0, -5.0, "plain"), "settled: found -5 N"),
+        (lambda: electronics.resting_positions(par, math.nan, 5.0, "plain"), "settled: found 5 N at nan m"),
+        (lambda: electronics.dead_zones(par, F_Z, "exact"), "dead_zones: found pwm 'exact' at 5 N"),
+        (lambda: electronics.dead_zones(par, 0.0, "plain"), "dead_zones: found pwm 'plain' at 0 N"),
     ]
     for call, sentence in refused:
         with pytest.raises(malta.InputError) as caught:

@@ -22,16 +22,14 @@ from scipy.linalg import solve_discrete_lyapunov
 
 import malta
 from malta.machines.halbach import claims as claims
+from malta.machines.halbach import electronics, motor
 from malta.machines.halbach import plant as halbach
-from malta.machines.halbach.experiments import (
-    FAULTS,
-    LAWS,
-    lift_of,
-    move,
-    places,
-    there_and_back,
-)
-from malta.machines.halbach.plant import IDEAL, Options, Parameters
+from malta.machines.halbach.electronics import IDEAL, Options
+from malta.machines.halbach.evidence import Evidence
+from malta.machines.halbach.experiments.lift import FAULTS, LAWS, lift_force, move_reference
+from malta.machines.halbach.experiments.motions import steps_reference
+from malta.machines.halbach.experiments.open_loop import positions_at_rest
+from malta.machines.halbach.plant import Parameters
 from malta.model.data import published_value
 from malta.model.plant import Plant
 from malta.report.ledger import ledger
@@ -59,7 +57,7 @@ def printed() -> dict[str, Any]:
 
 
 @pytest.fixture(scope="module")
-def evidence(printed: dict[str, Any]) -> Mapping[str, claims.Evidence]:
+def evidence(printed: dict[str, Any]) -> Mapping[str, Evidence]:
     """Both designs, from their files through all experiments."""
     specs = (malta.read_design(ROOT / "design" / f"{name}.toml") for name in DESIGNS)
     return {spec.name: claims.evidence(spec, printed) for spec in specs}
@@ -90,7 +88,7 @@ def found(e: Experiment, case: int | str, label: str) -> float:
 
 
 @pytest.mark.parametrize("name", DESIGNS)
-def test_gain_files_are_of_their_design_files(evidence: Mapping[str, claims.Evidence], name: str) -> None:
+def test_gain_files_are_of_their_design_files(evidence: Mapping[str, Evidence], name: str) -> None:
     made, read = evidence[name].controller, controller_of(name)
     assert read.spec_sha256 == made.spec_sha256
     for matrix in ("Ad", "Bd", "Cd", "K", "Ki", "L"):
@@ -105,11 +103,11 @@ def test_gain_files_are_of_their_design_files(evidence: Mapping[str, claims.Evid
 def test_noise_of_the_design_is_that_of_the_sensors() -> None:
     par = malta.read("data/halbach.toml")
     weights = malta.read_design("design/halbach.toml").weights
-    assert weights.process_variance[0] == pytest.approx(halbach.force_noise(par) / par.T_laser, rel=1e-3)
+    assert weights.process_variance[0] == pytest.approx(electronics.force_noise(par) / par.T_laser, rel=1e-3)
     assert math.sqrt(weights.sensor_variance[0]) == pytest.approx(halbach.plant(par).noise[0], rel=1e-3)
 
 
-def _closed(e: claims.Evidence) -> tuple[FloatArray, FloatArray]:
+def _closed(e: Evidence) -> tuple[FloatArray, FloatArray]:
     """The sampled loop, the motor's states first, and how an error of a reading enters it: angle and law."""
     law, H = linear_law(e.controller), e.par.k * e.par.F_z
     Ad, Bd, C = sampled_model(e.model, e.par.T_laser)
@@ -123,7 +121,7 @@ def _closed(e: claims.Evidence) -> tuple[FloatArray, FloatArray]:
 def test_20_readings_against_plain_python(controller: Controller) -> None:
     """All quantizers and all noise: 16 000 PWM periods, equal to rounding."""
     plant = plant_for(controller)
-    reference = partial(there_and_back, distance=100e-6, rise=0.0, count=1, Ts=controller.sample_time)
+    reference = partial(steps_reference, distance=100e-6, rise=0.0, count=1, Ts=controller.sample_time)
     scenario = Scenario("step", 1.1, reference, fidelity="phase", noise=1.0, quantize=True, seed=3)
     run = simulate(plant, controller, scenario)
     rows = peer.run(controller, *peer.given(plant, controller, scenario))
@@ -137,14 +135,12 @@ def test_20_readings_against_plain_python(controller: Controller) -> None:
     assert run.y.std() > 10e-6
 
 
-def test_small_steps_against_matrices(
-    controller: Controller, evidence: Mapping[str, claims.Evidence]
-) -> None:
+def test_small_steps_against_matrices(controller: Controller, evidence: Mapping[str, Evidence]) -> None:
     """On the held model; it knows nothing of the current loops, whose 2 ms are the difference."""
     e, step = evidence[controller.name], 1e-6
     law = linear_law(controller)
     Ad, Bd, C = sampled_model(e.model, e.par.T_laser)
-    reference = partial(move, distance=step, rise=0.0, begin=2 * e.par.T_laser)
+    reference = partial(move_reference, distance=step, rise=0.0, begin=2 * e.par.T_laser)
     run = simulate(
         plant_for(controller),
         controller,
@@ -162,7 +158,7 @@ def test_small_steps_against_matrices(
 
 
 @pytest.mark.parametrize("name", DESIGNS)
-def test_noise_by_source_against_covariances(evidence: Mapping[str, claims.Evidence], name: str) -> None:
+def test_noise_by_source_against_covariances(evidence: Mapping[str, Evidence], name: str) -> None:
     """Of the sampled loop; where the motor stands sets how noise of the phases adds up."""
     e = evidence[name]
     M, reading = _closed(e)
@@ -172,13 +168,13 @@ def test_noise_by_source_against_covariances(evidence: Mapping[str, claims.Evide
     def rms(W: FloatArray) -> float:
         return math.sqrt(solve_discrete_lyapunov(M, W)[0, 0])
 
-    budget = e.flown["budget"]
+    budget = e.experiments["budget"]
     laser = rms(reading @ reading.T * e.par.n_laser**2 / 3)
     assert found(budget, "laser", "position, rms") == pytest.approx(laser, rel=0.15)
     expected = []
     for x in budget.curves["place"]:
         W = np.zeros_like(M)
-        W[:2, :2] = sample_noise(A, B @ B.T, e.par.T_laser) * halbach.force_noise(e.par, float(x))
+        W[:2, :2] = sample_noise(A, B @ B.T, e.par.T_laser) * electronics.force_noise(e.par, float(x))
         expected.append(rms(W))
     np.testing.assert_allclose(budget.curves["rms"], expected, rtol=0.15)
 
@@ -187,9 +183,9 @@ def test_noise_by_source_against_covariances(evidence: Mapping[str, claims.Evide
 
 
 @pytest.mark.parametrize("name", DESIGNS)
-def test_step_of_100_um_with_all_errors(evidence: Mapping[str, claims.Evidence], name: str) -> None:
+def test_step_of_100_um_with_all_errors(evidence: Mapping[str, Evidence], name: str) -> None:
     """Fig. 9. The PID has no set-point weight, and overshoots a jump by 78 %: its reference is a quintic."""
-    step, case = evidence[name].flown["step"], {"halbach": "jumps", "halbach_pid": "quintics"}[name]
+    step, case = evidence[name].experiments["step"], {"halbach": "jumps", "halbach_pid": "quintics"}[name]
     assert step.run.scenario.fidelity == "phase"
     assert found(step, case, "mean overshoot") < 0.10
     # NOTE: the PID's gains are for loads: behind a quintic of 0.3 s it is 33 ms over the half second.
@@ -197,17 +193,17 @@ def test_step_of_100_um_with_all_errors(evidence: Mapping[str, claims.Evidence],
     assert found(step, case, "at rest, rms") < 3e-6
     assert found(step, case, "at rest, mean error") < 0.1e-6
     assert all(case.run.limits == () for case in step.cases)
-    jumped = found(evidence["halbach_pid"].flown["step"], "jumps", "mean overshoot")
+    jumped = found(evidence["halbach_pid"].experiments["step"], "jumps", "mean overshoot")
     assert 0.7 < jumped < 0.85
 
 
 @pytest.mark.parametrize("name", DESIGNS)
-def test_stairs(evidence: Mapping[str, claims.Evidence], printed: dict[str, Any], name: str) -> None:
+def test_stairs(evidence: Mapping[str, Evidence], printed: dict[str, Any], name: str) -> None:
     """Fig. 7: the second step is dead; closed, it switches between what voltages there are; fine ones are not seen."""
-    stairs = evidence[name].flown["stairs"]
-    stands, _ = places(stairs.cases[0].run)
+    stairs = evidence[name].experiments["stairs"]
+    stands, _ = positions_at_rest(stairs.cases[0].run)
     assert 1e6 * stands == pytest.approx([0, 13.39, 13.39, 26.74, 40.17], abs=0.05)
-    fine, _ = places(stairs.cases[1].run)
+    fine, _ = positions_at_rest(stairs.cases[1].run)
     assert np.abs(fine - published_value(printed, "open_loop.stair") * np.arange(5)).max() < 35e-9
     for case, off, swing in ((2, 5e-6, 60e-6), (3, 0.03e-6, 0.2e-6)):
         assert found(stairs, case, "off its stair by") < off
@@ -218,15 +214,15 @@ def test_stairs(evidence: Mapping[str, claims.Evidence], printed: dict[str, Any]
 
 
 @pytest.mark.parametrize("name", DESIGNS)
-def test_ramps_through_the_travel(evidence: Mapping[str, claims.Evidence], name: str) -> None:
+def test_ramps_through_the_travel(evidence: Mapping[str, Evidence], name: str) -> None:
     """Fig. 8: 50 mm at 1, 2 and 5 mm/s."""
-    ramp = evidence[name].flown["ramp"]
+    ramp = evidence[name].experiments["ramp"]
     assert [case.label for case in ramp.cases] == ["1 mm/s", "2 mm/s", "5 mm/s"]
     for case in ramp.cases:
         assert case.run.limits == ()
         assert case.run.p[-1, 0] - case.run.p[0, 0] == pytest.approx(50e-3, abs=20e-6)
         assert case.merits[0].value < 1e-6  # mean lag
-        assert lift_of(case.run) == pytest.approx(5.0, rel=0.01)
+        assert lift_force(case.run) == pytest.approx(5.0, rel=0.01)
 
 
 def test_ramps_without_feedforward_start_later(controller: Controller) -> None:
@@ -240,9 +236,9 @@ def test_ramps_without_feedforward_start_later(controller: Controller) -> None:
 
 
 @pytest.mark.parametrize("name", DESIGNS)
-def test_error_budget(evidence: Mapping[str, claims.Evidence], name: str) -> None:
+def test_error_budget(evidence: Mapping[str, Evidence], name: str) -> None:
     """Sec. 5.1: current sampling decides; how much depends on where in a pitch the motor stands."""
-    budget = evidence[name].flown["budget"]
+    budget = evidence[name].experiments["budget"]
     rms = {case.label: 1e6 * case.merits[0].value for case in budget.cases}
     best, worst = (1e6 * merit.value for merit in budget.merits)
     assert rms["laser"] == pytest.approx(0.07, abs=0.01)
@@ -254,9 +250,9 @@ def test_error_budget(evidence: Mapping[str, claims.Evidence], name: str) -> Non
 
 
 @pytest.mark.parametrize("name", DESIGNS)
-def test_vertical_force_of_a_move(evidence: Mapping[str, claims.Evidence], name: str) -> None:
+def test_vertical_force_of_a_move(evidence: Mapping[str, Evidence], name: str) -> None:
     """Fig. 10, sound: only the jump of the open loop disturbs the vertical force, and not for good."""
-    force = evidence[name].flown["force"]
+    force = evidence[name].experiments["force"]
     assert found(force, "open loop", "lowest") == pytest.approx(-0.503, abs=1e-3)
     assert abs(found(force, "open loop", "steady change")) < 1e-3
     for law in ("position control", "vector control"):
@@ -276,14 +272,14 @@ def test_vertical_force_with_the_induced_voltage() -> None:
 
 @pytest.mark.parametrize("name", DESIGNS)
 def test_no_fault_explains_figure_10(
-    evidence: Mapping[str, claims.Evidence], printed: dict[str, Any], name: str
+    evidence: Mapping[str, Evidence], printed: dict[str, Any], name: str
 ) -> None:
     """The paper's steady -18 % (open loop) and +7 % (position controller) with 0 under vector control.
 
     Unequal magnets show under vector control, too. An angle error, or a force from outside, changes nothing between two
     places at rest. Unequal windings are left: vector control takes them out, but the two others go one way.
     """
-    force = evidence[name].flown["force"]
+    force = evidence[name].experiments["force"]
 
     def steady(fault: str) -> list[float]:
         return [found(force, f"{law}, {fault}", "steady change") for law in LAWS]
@@ -307,7 +303,7 @@ def test_linear_servo_against_the_motor_on_a_step_of_2_mm(preset: str) -> None:
     assert 0.005e-3 < rms < first < 0.03e-3
     assert secant == pytest.approx(204.8, abs=0.5)
     assert tangent == pytest.approx(211.0, abs=0.05)
-    A, _ = halbach.servo(par, 1.0, 2e-3)
+    A, _ = motor.servo(par, 1.0, 2e-3)
     assert np.linalg.eigvals(A).real == pytest.approx([-9.41 / 3.75 / 2] * 2, rel=1e-5)
 
 
@@ -315,7 +311,7 @@ def test_lqg_of_a_mass_with_friction_falls_into_a_limit_cycle() -> None:
     """With a late reading the spring that it does not know of makes it unstable; the limit of the force holds it."""
     late: Parameters = malta.read("data/halbach.toml", preset="late")
     spec = malta.read_design("design/halbach.toml")
-    reference = partial(move, distance=100e-6, rise=0.0, begin=1.1)
+    reference = partial(move_reference, distance=100e-6, rise=0.0, begin=1.1)
     scenario = Scenario("step", 20.0, reference, fidelity="phase", electronics=IDEAL)
     swing, limits = [], []
     for F_z in (0.0, late.F_z):  # commutation without vertical force holds no spring
@@ -346,7 +342,7 @@ def test_100_times_faster_than_the_motor() -> None:
     if compiler() is None:
         pytest.skip("no C compiler here")
     c = controller_of("halbach")
-    reference = partial(there_and_back, distance=100e-6, rise=0.0, count=8, Ts=c.sample_time)
+    reference = partial(steps_reference, distance=100e-6, rise=0.0, count=8, Ts=c.sample_time)
     scenario = Scenario("steps", 20.0, reference, fidelity="phase", noise=1.0, quantize=True)
     taken = math.inf
     for _ in range(5):
@@ -361,7 +357,7 @@ def test_100_times_faster_than_the_motor() -> None:
 
 
 def test_every_row_of_the_ledger_has_its_verdict(
-    evidence: Mapping[str, claims.Evidence], printed: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+    evidence: Mapping[str, Evidence], printed: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(claims, "evidence", lambda spec, *_: evidence[spec.name])
     rows = {claim.subject: claim for claim in ledger([e.spec for e in evidence.values()], printed).claims}
@@ -415,7 +411,9 @@ def _pressed(F_z: float, **changes: float) -> tuple[Plant, Controller]:
 
 def test_limits_are_named_and_nothing_is_nan() -> None:
     hold = Scenario("hold", 1.1, malta.references.hold, fidelity="phase", noise=1.0, quantize=True)
-    jump = replace(hold, reference=partial(move, distance=20e-3, rise=0.0, begin=0.0), start={"x": 0.0})
+    jump = replace(
+        hold, reference=partial(move_reference, distance=20e-3, rise=0.0, begin=0.0), start={"x": 0.0}
+    )
     for (plant, c), scenario, limit in (
         (_pressed(20.0), hold, "duty limit"),
         (_pressed(5.0), jump, "force limit"),

@@ -13,13 +13,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import malta
+from malta.machines.halbach import electronics, motor
 from malta.machines.halbach import plant as halbach
-from malta.machines.halbach.plant import (
-    IDEAL,
-    REAL,
-    Options,
-    Parameters,
-)
+from malta.machines.halbach.electronics import IDEAL, REAL, Options
+from malta.machines.halbach.plant import Parameters
 from malta.model.data import shaping
 from malta.model.plant import Electronics, Plant, symbolic
 
@@ -140,7 +137,7 @@ def test_held_currents_are_a_spring(par: Parameters, plant: Plant, place: float,
         for s in (-1, 1)
     ]
     assert (F[1] - F[0]) / (2 * d) == pytest.approx(H, rel=1e-6)
-    assert H * (1 + error) == pytest.approx(halbach.stiffness(par, par.F_z))
+    assert H * (1 + error) == pytest.approx(motor.stiffness(par, par.F_z))
 
 
 def test_a_weak_phase_leaves_a_stiffness_that_goes_with_the_place(par: Parameters) -> None:
@@ -191,7 +188,7 @@ def _random(
 
 
 def _period(e: Electronics) -> ca.Function:
-    """`move` as a function of flat vectors: (x, i, states, told, w, noise) -> (x, i, states)."""
+    """`move_reference` as a function of flat vectors: (x, i, states, told, w, noise) -> (x, i, states)."""
     x, i, w, noise = (ca.SX.sym(n, k) for n, k in (("x", 2), ("i", 3), ("w", 1), ("noise", e.noises)))
     told, s = ca.SX.sym("told", e.held_size), {name: ca.SX.sym(name, size) for name, size in e.state.items()}
     after_x, after_i, after = e.move(x, i, s, told, w, noise)
@@ -260,7 +257,7 @@ def _by_hand(
 @pytest.mark.parametrize("o", OPTIONS, ids=str)
 def test_a_period_against_one_written_out_in_numbers(par: Parameters, o: Options) -> None:
     faulty = replace(par, **FAULTY)
-    e = halbach.electronics(faulty, o)
+    e = electronics.electronics(faulty, o)
     assert e.noises == (2 if o.current_loops and o.adc_noise else 0)
     period = _period(e)
     for seed in range(20):
@@ -276,7 +273,7 @@ def test_a_period_against_one_written_out_in_numbers(par: Parameters, o: Options
 @pytest.mark.parametrize("o", OPTIONS, ids=str)
 def test_300_periods_against_the_ones_written_out(par: Parameters, o: Options) -> None:
     faulty = replace(par, **FAULTY)
-    e = halbach.electronics(faulty, o)
+    e = electronics.electronics(faulty, o)
     x, i, s, told = _random(par, o, 0)
     told[:2] /= 3
     z = [x, i, np.concatenate([s[name] for name in e.state])]
@@ -293,7 +290,7 @@ def test_300_periods_against_the_ones_written_out(par: Parameters, o: Options) -
 def test_what_loops_are_told(par: Parameters, plant: Plant, offset: float) -> None:
     """PlannedRun Id and Iq, and the Park angle; an error of the reading is one of the angle, k times as large."""
     y = plant.sense(ca.DM([2e-3, 0]), ca.DM([offset]))
-    told = halbach.electronics(par).held(plant.currents(y, ca.DM(0.7)), y)
+    told = electronics.electronics(par).held(plant.currents(y, ca.DM(0.7)), y)
     angle = par.k * (2e-3 + offset)
     expected = [0.7 / par.A, par.F_z / par.A, math.cos(angle), math.sin(angle)]
     np.testing.assert_allclose(_flat(told), expected, rtol=0, atol=1e-12)
@@ -302,7 +299,7 @@ def test_what_loops_are_told(par: Parameters, plant: Plant, offset: float) -> No
 @pytest.mark.parametrize("o", OPTIONS, ids=str)
 def test_it_starts_with_rolling_means_full_of_what_flows(par: Parameters, plant: Plant, o: Options) -> None:
     i = plant.currents(ca.DM([2e-3]), ca.DM([0]))
-    e = halbach.electronics(par, o)
+    e = electronics.electronics(par, o)
     found = _arrays(e.start(ca.DM([2e-3, 0]), i))
     assert {name: len(value) for name, value in found.items()} == dict(e.state)
     assert found["met"].tolist() == [0, 0]
@@ -324,9 +321,9 @@ def test_it_starts_in_a_steady_state(par: Parameters, loops: bool) -> None:
     """With exact parts nothing moves; with loops not even where windings are unequal."""
     o = replace(IDEAL, current_loops=loops)
     p = replace(par, r_a=0.9, r_c=1.3) if loops else par
-    e, motor = halbach.electronics(p, o), halbach.plant(p)
+    e, machine = electronics.electronics(p, o), halbach.plant(p)
     y = ca.DM([4e-3])
-    x, i = ca.DM([4e-3, 0]), motor.currents(y, ca.DM([0]))
+    x, i = ca.DM([4e-3, 0]), machine.currents(y, ca.DM([0]))
     state, told = e.start(x, i), e.held(i, y)
     period = _period(e)
     at = [_flat(x), _flat(i), np.concatenate([_flat(state[name]) for name in e.state])]
@@ -338,17 +335,17 @@ def test_it_starts_in_a_steady_state(par: Parameters, loops: bool) -> None:
 
 
 def test_limits_are_kept_in_mind(par: Parameters) -> None:
-    e = halbach.electronics(par, IDEAL)
+    e = electronics.electronics(par, IDEAL)
     period, place = _period(e), ca.DM([0.0])
-    motor = halbach.plant(par)
+    machine = halbach.plant(par)
     for forces, flags in (
         ((0.0, 5.0), [0, 0]),
         ((40.0, 0.0), [1, 0]),
         ((60.0, 0.0), [1, 1]),
         ((0.0, 60.0), [1, 1]),
     ):
-        i = halbach.phase_currents(par, 0.0, *forces)
-        far = ca.DM(i) if flags[1] else motor.currents(place, ca.DM([0]))
+        i = motor.phase_currents(par, 0.0, *forces)
+        far = ca.DM(i) if flags[1] else machine.currents(place, ca.DM([0]))
         state = e.start(ca.DM([0, 0]), far)
         z = [np.zeros(2), _flat(far), np.concatenate([_flat(state[name]) for name in e.state])]
         for _ in range(3):
@@ -405,9 +402,9 @@ def test_plant_in_symbols_of_its_parameters(par: Parameters) -> None:
 def test_electronics_in_symbols_of_the_parameters(par: Parameters, o: Options) -> None:
     numeric = replace(par, **FAULTY)
     record, symbols, values = _symbols(numeric)
-    electronics = halbach.plant(record).electronics
-    assert electronics is not None
-    e = electronics(o)
+    build = halbach.plant(record).electronics
+    assert build is not None
+    e = build(o)
     x, i, state, told = _random(par, o, 5)
     noise = ca.DM([0.4, -1.2])[: e.noises]
 
@@ -423,7 +420,7 @@ def test_electronics_in_symbols_of_the_parameters(par: Parameters, o: Options) -
     assert isinstance(e.period, float)
     found = ca.Function("found", symbols, [all_of(e)])(*values)
     np.testing.assert_allclose(
-        _flat(found), _flat(all_of(halbach.electronics(numeric, o))), rtol=1e-12, atol=1e-12
+        _flat(found), _flat(all_of(electronics.electronics(numeric, o))), rtol=1e-12, atol=1e-12
     )
 
 

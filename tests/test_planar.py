@@ -20,6 +20,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import malta
+from malta.machines.planar import coils, commutation
 from malta.machines.planar import field as planar_field
 from malta.machines.planar import plant as planar
 from malta.machines.planar.field import ODD_X, ODD_Y, Series
@@ -53,7 +54,7 @@ def paper() -> dict[str, Any]:
 @pytest.fixture(scope="module")
 def truth(par: planar.Parameters) -> Series:
     """Every harmonic up to the 16th."""
-    return planar.truth(par)
+    return coils.exact_model(par)
 
 
 @pytest.fixture(scope="module")
@@ -63,8 +64,8 @@ def exact(par: planar.Parameters, truth: Series) -> Series:
 
 
 @pytest.fixture(scope="module")
-def table(par: planar.Parameters, truth: Series) -> planar.Table:
-    return planar.table(par, truth, 35)
+def table(par: planar.Parameters, truth: Series) -> coils.Table:
+    return coils.table(par, truth, 35)
 
 
 def quarter(par: planar.Parameters, n: int = 140) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -77,7 +78,7 @@ def largest(values: FloatArray) -> FloatArray:
     return np.asarray(np.abs(values).max(axis=(0, 1)))
 
 
-def single(model: planar.CoilModel, p: FloatArray) -> FloatArray:
+def single(model: coils.CoilModel, p: FloatArray) -> FloatArray:
     values: FloatArray = model(*(np.array([v]) for v in p))[0]
     return values
 
@@ -246,7 +247,7 @@ def test_equations_17_to_21_are_the_quadrature(par: planar.Parameters) -> None:
     coil = planar_field.winding(par, rectangles=True, nodes=40)
     for p in np.random.default_rng(5).uniform([-0.05, -0.05, 0], [0.05, 0.05, 5e-3], (4, 3)):
         expected = planar_field.quadrature(par, field, coil, p)
-        found = single(planar.Analytical(plain), p)
+        found = single(coils.Analytical(plain), p)
         for part in (slice(0, 3), slice(3, 6)):
             size = np.abs(expected[part]).max()
             np.testing.assert_allclose(found[part], expected[part], rtol=0, atol=1e-9 * size)
@@ -266,7 +267,7 @@ def test_amplitudes_of_the_assumed_magnets_and_coil(
 
 
 def test_the_compensation_factor_is_the_fitted_one(par: planar.Parameters, truth: Series) -> None:
-    assert planar.compensation(par, truth) == pytest.approx(par.C, abs=5e-5)
+    assert coils.compensation(par, truth) == pytest.approx(par.C, abs=5e-5)
 
 
 def test_the_fundamental_fits_the_forces(
@@ -275,7 +276,7 @@ def test_the_fundamental_fits_the_forces(
     """0.04 N in F_x, 0.08 N in F_z at 3 A: the paper's 0.83 and 2.38 N are wrong amplitudes, not missing harmonics."""
     x, y, z = quarter(par)
     expected = truth(x, y, z)
-    error = AMPERES * largest(planar.Analytical(par)(x, y, z) - expected)
+    error = AMPERES * largest(coils.Analytical(par)(x, y, z) - expected)
     assert error[:3] == pytest.approx([0.043, 0.043, 0.076], abs=2e-3)
     for key, low, high in (("F_x", 0.06, 0.08), ("F_z", 0.08, 0.10)):
         shares = [published_value(paper, f"model.{part}.{key}") for part in ("error_analytical", "amplitude")]
@@ -285,17 +286,17 @@ def test_the_fundamental_fits_the_forces(
 def test_overlapping_rectangles_make_too_much_torque(par: planar.Parameters, truth: Series) -> None:
     """C_1 - C_2 of (20), (21) is 3.8 times what the rounded coil has: 28 mN m at 3 A, where 7 are."""
     p = np.array([par.tau_n / 2, par.tau_n / 2, par.h])
-    paper, ours = single(planar.Analytical(par), p)[3:5], single(truth, p)[3:5]
+    paper, ours = single(coils.Analytical(par), p)[3:5], single(truth, p)[3:5]
     assert AMPERES * paper == pytest.approx([-0.0276] * 2, abs=1e-4)
     assert paper / ours == pytest.approx([3.84] * 2, abs=0.01)
 
 
 @pytest.mark.parametrize("kind", ["truth", "analytical", "table"])
-def test_mirror_images(par: planar.Parameters, truth: Series, table: planar.Table, kind: str) -> None:
+def test_mirror_images(par: planar.Parameters, truth: Series, table: coils.Table, kind: str) -> None:
     """Mirrored in x: F_x, T_y, T_z turn their signs; in y: F_y, T_x, T_z. And 2 tau_n is a period."""
-    models: dict[str, planar.CoilModel] = {
+    models: dict[str, coils.CoilModel] = {
         "truth": truth,
-        "analytical": planar.Analytical(par),
+        "analytical": coils.Analytical(par),
         "table": table,
     }
     model = models[kind]
@@ -317,7 +318,7 @@ def test_mirror_images(par: planar.Parameters, truth: Series, table: planar.Tabl
 def test_bilinear_errors(par: planar.Parameters, truth: Series, n: int, F_x: float, F_z: float) -> None:
     """At 3 A: 0.15 N in F_x with tau_n / 10, 0.0125 N with tau_n / 35, and about the double in F_z, which is a sum."""
     x, y, z = quarter(par, 140)
-    error = AMPERES * largest(planar.table(par, truth, n)(x, y, z) - truth(x, y, z))
+    error = AMPERES * largest(coils.table(par, truth, n)(x, y, z) - truth(x, y, z))
     assert error[0] == pytest.approx(F_x, rel=0.01)
     assert error[0] == pytest.approx(error[1], rel=1e-9)
     assert error[2] == pytest.approx(F_z, rel=0.01)
@@ -326,14 +327,14 @@ def test_bilinear_errors(par: planar.Parameters, truth: Series, n: int, F_x: flo
 def test_bilinear_errors_fall_fourfold(par: planar.Parameters, truth: Series) -> None:
     x, y, z = quarter(par, 160)
     expected = truth(x, y, z)
-    errors = [largest(planar.table(par, truth, n)(x, y, z) - expected)[0] for n in (10, 20, 40)]
+    errors = [largest(coils.table(par, truth, n)(x, y, z) - expected)[0] for n in (10, 20, 40)]
     assert errors[0] / errors[1] == pytest.approx(4.0, abs=0.05)
     assert errors[1] / errors[2] == pytest.approx(4.0, abs=0.05)
 
 
 def test_equation_27_as_printed(par: planar.Parameters, truth: Series) -> None:
     """With the two weights in each other's place a table of tau_n / 10 errs by 3.8 N instead of 0.15."""
-    printed = planar.table(par, truth, 10)
+    printed = coils.table(par, truth, 10)
     printed = replace(printed, cells=printed.cells[:, [0, 2, 1, 3]])
     x, y, z = quarter(par, 140)
     assert AMPERES * largest(printed(x, y, z) - truth(x, y, z))[0] == pytest.approx(3.8, abs=0.1)
@@ -349,7 +350,7 @@ def test_eight_harmonics_beat_the_table(par: planar.Parameters, truth: Series) -
     )
 
 
-def test_height_goes_with_the_fundamental(par: planar.Parameters, truth: Series, table: planar.Table) -> None:
+def test_height_goes_with_the_fundamental(par: planar.Parameters, truth: Series, table: coils.Table) -> None:
     """e^(-pi z / tau_n) is exact for the fundamental alone: 0.014 N at 2 mm, 0.032 N on the magnets, at the nodes."""
     x, y, _ = quarter(par, 35)
     errors = []
@@ -363,18 +364,18 @@ def test_height_goes_with_the_fundamental(par: planar.Parameters, truth: Series,
 @pytest.mark.parametrize("n", [0, -3])
 def test_a_table_has_cells(par: planar.Parameters, truth: Series, n: int) -> None:
     with pytest.raises(malta.InputError, match="at least one cell"):
-        planar.table(par, truth, n)
+        coils.table(par, truth, n)
 
 
 def test_a_table_is_made_of_samples_that_mirror(par: planar.Parameters, truth: Series) -> None:
     """A model without the parities, or with a hole, is refused: three quarters would be wrong without a word."""
     with pytest.raises(malta.InputError, match="mirror"):
-        planar.table(par, lambda x, y, z: truth(x + 1e-3, y, z), 4)
+        coils.table(par, lambda x, y, z: truth(x + 1e-3, y, z), 4)
     with pytest.raises(malta.InputError, match="finite"):
-        planar.table(par, lambda x, y, z: truth(x, y, z) * np.nan, 4)
+        coils.table(par, lambda x, y, z: truth(x, y, z) * np.nan, 4)
 
 
-def test_the_traced_table_is_the_table(par: planar.Parameters, table: planar.Table) -> None:
+def test_the_traced_table_is_the_table(par: planar.Parameters, table: coils.Table) -> None:
     """CasADi's interpolant and numpy's gather, over every quarter and on the edges of cells."""
     p = ca.MX.sym("p", 3)
     traced = ca.Function("traced", [p], [table(p[0], p[1], p[2])])
@@ -390,19 +391,21 @@ def test_the_traced_table_is_the_table(par: planar.Parameters, table: planar.Tab
 
 def test_the_coil_pitch_decides(par: planar.Parameters, truth: Series) -> None:
     """16/3 and 14/3 tau_n are well conditioned, 4, 5 and 6 tau_n singular, other thirds have a condition above 20."""
-    assert planar.check_pitch(par, truth) == pytest.approx(2.106, abs=2e-3)
-    assert planar.check_pitch(malta.read(FILE, preset="pitch_14_3"), truth) == pytest.approx(2.045, abs=2e-3)
+    assert commutation.check_pitch(par, truth) == pytest.approx(2.106, abs=2e-3)
+    assert commutation.check_pitch(malta.read(FILE, preset="pitch_14_3"), truth) == pytest.approx(
+        2.045, abs=2e-3
+    )
     # With torques at 0.1 m, as an independent computation counted them: 2.1 and 2.4.
     for preset, worst in (("pitch_14_3", 2.11), ("pitch_16_3", 2.44)):
         lever = replace(malta.read(FILE, preset=preset), I_x=par.m * 0.1**2)
-        assert planar.conditioning(lever, truth, 16).max() == pytest.approx(worst, abs=0.01)
+        assert commutation.conditioning(lever, truth, 16).max() == pytest.approx(worst, abs=0.01)
     for turns in (4, 5, 6):
         with pytest.raises(malta.CheckError, match=rf"= {turns} tau_n, K\(p\) is singular"):
-            planar.check_pitch(replace(par, coil_pitch=turns * par.tau_n), truth)
+            commutation.check_pitch(replace(par, coil_pitch=turns * par.tau_n), truth)
     for thirds in (11, 13, 17):
         pitch = thirds / 3 * par.tau_n * (1 + 1e-12)
         with pytest.raises(malta.CheckError, match="condition of 2"):
-            planar.check_pitch(replace(par, coil_pitch=pitch), truth)
+            commutation.check_pitch(replace(par, coil_pitch=pitch), truth)
 
 
 @settings(deadline=None, max_examples=50)
@@ -414,25 +417,25 @@ def test_the_currents_give_the_wrench(
     par: planar.Parameters, truth: Series, p: tuple[float, float, float], W: list[float]
 ) -> None:
     """K K^+ W = W to 1e-12, and i lies in the rows of K: no other currents do it with less heat."""
-    K = planar.wrench_matrix(par, truth, np.array(p))
-    i = planar.currents(K, np.array(W))
+    K = commutation.wrench_matrix(par, truth, np.array(p))
+    i = commutation.currents(K, np.array(W))
     assert np.abs(K @ i - W).max() <= 1e-12 * max(map(abs, W))
     np.testing.assert_allclose(i, np.linalg.pinv(K) @ W, rtol=0, atol=1e-11 * np.abs(i).max())
 
 
 def test_weights_spare_a_coil(par: planar.Parameters, truth: Series) -> None:
     """A coil of infinite weight gets no current, and fifteen coils still give the wrench; CasADi agrees."""
-    K, W = planar.wrench_matrix(par, truth, AT), np.array([10.0, 20, 196, 1, 2, 3])
+    K, W = commutation.wrench_matrix(par, truth, AT), np.array([10.0, 20, 196, 1, 2, 3])
     weights = np.ones(16)
     weights[5] = 4.0
-    warm = planar.currents(K, W, weights)
+    warm = commutation.currents(K, W, weights)
     weights[5] = np.inf
-    spared = planar.currents(K, W, weights)
+    spared = commutation.currents(K, W, weights)
     assert spared[5] == 0
-    assert abs(warm[5]) < abs(planar.currents(K, W)[5])
+    assert abs(warm[5]) < abs(commutation.currents(K, W)[5])
     for i in (warm, spared):
         np.testing.assert_allclose(K @ i, W, rtol=0, atol=1e-10)
-    traced = np.array(ca.evalf(planar.currents(ca.SX(K), ca.SX(W), ca.SX(weights)))).ravel()
+    traced = np.array(ca.evalf(commutation.currents(ca.SX(K), ca.SX(W), ca.SX(weights)))).ravel()
     np.testing.assert_allclose(traced, spared, rtol=0, atol=1e-11)
 
 
@@ -443,11 +446,11 @@ def test_a_kilonewton_is_within_the_currents(par: planar.Parameters, truth: Seri
         found = 0.0
         for x in np.linspace(0, 2 * par.tau_n, 12, endpoint=False):
             for y in np.linspace(0, 2 * par.tau_n, 12, endpoint=False):
-                K = planar.wrench_matrix(parameters, truth, np.array([x, y, par.h]))
+                K = commutation.wrench_matrix(parameters, truth, np.array([x, y, par.h]))
                 for axis in range(2):
                     W = np.array([0, 0, par.m * par.g, 0, 0, 0])
                     W[axis] = 1000.0
-                    found = max(found, float(np.abs(planar.currents(K, W)).max()))
+                    found = max(found, float(np.abs(commutation.currents(K, W)).max()))
         return found
 
     assert 40 < worst(par) < par.I_max
@@ -455,12 +458,12 @@ def test_a_kilonewton_is_within_the_currents(par: planar.Parameters, truth: Seri
 
 
 def test_limited_currents_keep_the_direction_of_the_wrench(par: planar.Parameters, truth: Series) -> None:
-    K, W = planar.wrench_matrix(par, truth, AT), np.array([3000.0, 0, 196, 0, 0, 0])
-    i = planar.limited(par, planar.currents(K, W))
+    K, W = commutation.wrench_matrix(par, truth, AT), np.array([3000.0, 0, 196, 0, 0, 0])
+    i = commutation.limit_currents(par, commutation.currents(K, W))
     assert np.abs(i).max() == pytest.approx(par.I_max)
     assert K @ i == pytest.approx(W * (K @ i)[0] / W[0], abs=1e-9)
-    few = planar.currents(K, W / 10)
-    np.testing.assert_array_equal(planar.limited(par, few), few)
+    few = commutation.currents(K, W / 10)
+    np.testing.assert_array_equal(commutation.limit_currents(par, few), few)
 
 
 @pytest.mark.parametrize(
@@ -474,24 +477,24 @@ def test_limited_currents_keep_the_direction_of_the_wrench(par: planar.Parameter
     ],
 )
 def test_a_position_outside_is_refused(
-    par: planar.Parameters, table: planar.Table, name: str, p: list[float]
+    par: planar.Parameters, table: coils.Table, name: str, p: list[float]
 ) -> None:
     """In one sentence that names the coordinate, before any NaN."""
-    for use in (planar.wrench_matrix, planar.hover):
+    for use in (commutation.wrench_matrix, commutation.hover):
         with pytest.raises(malta.InputError, match="expected a position from") as caught:
             use(par, table, np.array(p))
         assert caught.value.field == name
 
 
 def test_what_no_currents_can_do_is_said(par: planar.Parameters, truth: Series) -> None:
-    K = planar.wrench_matrix(replace(par, coil_pitch=4 * par.tau_n), truth, AT)
+    K = commutation.wrench_matrix(replace(par, coil_pitch=4 * par.tau_n), truth, AT)
     with pytest.raises(malta.CheckError, match="singular: no coil currents give this wrench"):
-        planar.currents(K, np.array([0, 0, 196.0, 1, 1, 1]))
-    K = planar.wrench_matrix(par, truth, AT)
+        commutation.currents(K, np.array([0, 0, 196.0, 1, 1, 1]))
+    K = commutation.wrench_matrix(par, truth, AT)
     with pytest.raises(malta.InputError, match="finite wrench"):
-        planar.currents(K, np.full(6, np.nan))
+        commutation.currents(K, np.full(6, np.nan))
     with pytest.raises(malta.InputError, match="positive weight"):
-        planar.currents(K, np.ones(6), np.zeros(16))
+        commutation.currents(K, np.ones(6), np.zeros(16))
 
 
 # --- The mover ---
@@ -508,7 +511,7 @@ def test_free_fall(par: planar.Parameters, exact: Series) -> None:
 
 def test_hover_holds(par: planar.Parameters, exact: Series) -> None:
     """At the currents of `hover` nothing moves: 6.6 A at most, 171 A^2 in all coils together."""
-    i = planar.hover(par, exact, AT)
+    i = commutation.hover(par, exact, AT)
     rate = np.array(planar.dynamics(par, exact)([*AT, *np.zeros(9)], i, np.zeros(6))).ravel()
     assert np.abs(rate).max() < 1e-12
     assert np.abs(i).max() == pytest.approx(6.62, abs=0.01)
@@ -521,7 +524,7 @@ def test_parameters_may_be_symbols(par: planar.Parameters, exact: Series) -> Non
     symbols = {name: ca.SX.sym(name) for name in names}
     record = symbolic(par, symbols | {"I_y": symbols["I_x"]})
     x, i = ca.SX.sym("x", 12), ca.SX.sym("i", 16)
-    W = planar.wrench_matrix(record, exact, x[:3], x[3:6]) @ i
+    W = commutation.wrench_matrix(record, exact, x[:3], x[3:6]) @ i
     rate = planar.motion(record, x, W, planar.load(record))
     f = ca.Function("f", [x, i, ca.vertcat(*symbols.values())], [rate])
     at, currents = np.linspace(1e-3, 2e-3, 12), np.linspace(-3, 3, 16)
@@ -533,17 +536,26 @@ def test_parameters_may_be_symbols(par: planar.Parameters, exact: Series) -> Non
 def test_the_compiled_engine_can_read_it(par: planar.Parameters, exact: Series) -> None:
     """K(p), its pseudo-inverse and the mover, from a Fourier series, are straight lines of operations it has."""
     p, W, theta = ca.SX.sym("p", 3), ca.SX.sym("W", 6), ca.SX.sym("theta", 1)
-    i = planar.currents(planar.wrench_matrix(par, exact.above(1e-3, par.h), p), W)
+    i = commutation.currents(commutation.wrench_matrix(par, exact.above(1e-3, par.h), p), W)
     _, text, _ = translate(ca.Function("allocate", [p, W, theta], [ca.cse(i)]), [], 0)
     assert "void allocate(" in text
 
 
+def _linear(f: ca.Function, x: FloatArray, i: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """A = df/dx, 12 x 12, and B = df/di, 12 x 16, at constant currents."""
+    symbols = f.sx_in()
+    rate = f(*symbols)
+    slopes = [ca.jacobian(rate, symbol) for symbol in symbols[:2]]
+    A, B = ca.Function("jacobians", symbols, slopes)(x, i, np.zeros(6))
+    return np.array(A), np.array(B)
+
+
 def test_linear_model(par: planar.Parameters, exact: Series) -> None:
     """B is M^-1 K, the stiffnesses of a hovering mover add up to zero (Earnshaw), and held currents do not hold it."""
-    f, i = planar.dynamics(par, exact), planar.hover(par, exact, AT)
-    A, B = planar.linear(f, np.array([*AT, *np.zeros(9)]), i)
+    f, i = planar.dynamics(par, exact), commutation.hover(par, exact, AT)
+    A, B = _linear(f, np.array([*AT, *np.zeros(9)]), i)
     inertia = np.array([par.m] * 3 + [par.I_x, par.I_y, par.I_z])
-    K = planar.wrench_matrix(par, exact, AT)
+    K = commutation.wrench_matrix(par, exact, AT)
     np.testing.assert_allclose(B[6:], K / inertia[:, None], rtol=0, atol=1e-12)
     np.testing.assert_array_equal(A[:6], np.hstack([np.zeros((6, 6)), np.eye(6)]))
     stiffness = np.diag(A[6:9, :3])
@@ -554,14 +566,14 @@ def test_linear_model(par: planar.Parameters, exact: Series) -> None:
 
 def test_tilt_stiffness_against_tilted_coils(par: planar.Parameters, exact: Series) -> None:
     """What `wrench_matrix` leaves out: 5 % of the stiffness in tilt, 2 % in yaw, of coils that turn in the field."""
-    i, step = planar.hover(par, exact, AT), 1e-5
-    A, _ = planar.linear(planar.dynamics(par, exact), np.array([*AT, *np.zeros(9)]), i)
+    i, step = commutation.hover(par, exact, AT), 1e-5
+    A, _ = _linear(planar.dynamics(par, exact), np.array([*AT, *np.zeros(9)]), i)
     field, coil = planar_field.modes(par, 5), planar_field.winding(par, nodes=16)
 
     def torque(q_r: FloatArray) -> FloatArray:
         R = np.array(ca.DM(rotation(ca.DM(q_r))))
         total = np.zeros(3)
-        for arm, current in zip(planar.coil_centres(par), i, strict=True):
+        for arm, current in zip(commutation.coil_centres(par), i, strict=True):
             place = AT - [0, 0, par.r_z] + R.T @ arm
             own = planar_field.quadrature(par, field, coil, place, R) * current
             total += own[3:] + np.cross(arm, own[:3])
@@ -614,7 +626,7 @@ def pid(crossover: float) -> tuple[float, float, float]:
 def fly_continuously(
     par: planar.Parameters,
     plant: Series,
-    model: planar.CoilModel,
+    model: coils.CoilModel,
     start: tuple[float, float],
     reference: Reference,
 ) -> FloatArray:
@@ -628,7 +640,9 @@ def fly_continuously(
     e = r[:6] - s[:6]
     W = M * (Kp * e + Ki * s[12:] + Kd * (r[6:12] - s[6:12]) + r[12:]) + ca.DM([0, 0, par.m * par.g, 0, 0, 0])
     held = ca.fmin(ca.fmax(W, -top), top)
-    moved = planar.dynamics(par, plant)(s[:12], planar.decoupling(par, model)(s[:3], held), ca.DM.zeros(6))
+    moved = planar.dynamics(par, plant)(
+        s[:12], commutation.decoupling(par, model)(s[:3], held), ca.DM.zeros(6)
+    )
     wound = ca.if_else(ca.fabs(W) > top, 0, e)
     rate = ca.Function("rate", [s, r], [ca.vertcat(moved, wound)])
     state, step, rows = np.zeros(18), 2e-4, []
@@ -652,7 +666,7 @@ def test_a_symmetric_start_stays_symmetric(
     par: planar.Parameters, paper: dict[str, Any], exact: Series
 ) -> None:
     """From (0, 0) a wrong model never moves x, theta and psi: the paper, which shows them move, started elsewhere."""
-    worst = fly_continuously(par, exact, planar.Analytical(par), (0.0, 0.0), profiled(paper, (0.0, 0.0)))
+    worst = fly_continuously(par, exact, coils.Analytical(par), (0.0, 0.0), profiled(paper, (0.0, 0.0)))
     assert worst[[0, 4, 5]].max() < 1e-9  # um and urad
     assert worst[3] > 0.1
 
@@ -663,11 +677,11 @@ def test_what_a_model_error_moves(par: planar.Parameters, paper: dict[str, Any],
     The last is the torque of overlapping rectangles, see above; with the fitted one phi stays below 0.3 urad.
     """
     reference = profiled(paper, START)
-    models: dict[str, planar.CoilModel] = {
+    models: dict[str, coils.CoilModel] = {
         "exact": exact,
-        "table": planar.table(par, exact, 35),
-        "fundamental": planar.truth(par, order=1),
-        "printed": planar.Analytical(par),
+        "table": coils.table(par, exact, 35),
+        "fundamental": coils.exact_model(par, order=1),
+        "printed": coils.Analytical(par),
     }
     worst = {name: fly_continuously(par, exact, model, START, reference) for name, model in models.items()}
     assert worst["exact"][3:].max() < 1e-9

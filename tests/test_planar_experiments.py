@@ -16,8 +16,10 @@ from scipy.integrate import solve_ivp
 
 import malta
 from malta.machines.planar import claims as claims
+from malta.machines.planar import coils, commutation
 from malta.machines.planar import experiments as experiments
 from malta.machines.planar import plant as planar
+from malta.machines.planar.experiments import models, motions, timings
 from malta.margins.verify import Margins
 from malta.model.data import published as read_published
 from malta.model.data import published_value
@@ -119,7 +121,7 @@ def test_the_pid_is_one_of_a_double_integrator(pid: Design) -> None:
 # --- The steps ---
 
 
-@pytest.mark.parametrize("model", experiments.MODELS)
+@pytest.mark.parametrize("model", motions.MODELS)
 @pytest.mark.parametrize("place", ["(6, 4)", "(0, 0)"])
 def test_the_steps_meet_the_table(flown: dict[str, Experiment], model: str, place: str) -> None:
     """y within 10 um in 60 ms, overshoot below 1 um, z within 1.5 um 20 ms after its step, forces within 1000 N."""
@@ -134,7 +136,7 @@ def test_the_steps_meet_the_table(flown: dict[str, Experiment], model: str, plac
 
 def test_a_symmetric_start_stays_symmetric(flown: dict[str, Experiment]) -> None:
     """From (0, 0) no model moves x, theta and psi by 1e-9 um or urad: the paper, where they move, started elsewhere."""
-    for model in experiments.MODELS:
+    for model in motions.MODELS:
         found = merits(flown["step"], f"{model}, from (0, 0)")
         assert max(found[f"{name}, deviation"] for name in ("x", "theta", "psi")) < 1e-15
 
@@ -187,8 +189,8 @@ def test_the_run_by_another_integrator(lqg: Design, flown: dict[str, Experiment]
 
     The currents of a sample are those for the reading before, limited together, and they are held.
     """
-    run, par = flown["step"].run, experiments._parameters(lqg.plant)
-    model = planar.simulated(par)
+    run, par = flown["step"].run, motions.parameters_of(lqg.plant)
+    model = coils.simulation_model(par)
     f = planar.dynamics(par, model)
     shift = np.array([0, 0, par.h, *np.zeros(9)])
 
@@ -199,7 +201,9 @@ def test_the_run_by_another_integrator(lqg: Design, flown: dict[str, Experiment]
     x = run.x[first] + shift
     for k in range(first, first + 20):
         read = (run.x[k - 1] + shift)[:3]
-        i = planar.limited(par, planar.currents(planar.wrench_matrix(par, model, read), run.v[k - 1]))
+        i = commutation.limit_currents(
+            par, commutation.currents(commutation.wrench_matrix(par, model, read), run.v[k - 1])
+        )
         np.testing.assert_allclose(run.current[k - 1], i, rtol=0, atol=1e-9)
         x = solve_ivp(rate, (0, par.T_s), x, args=(i,), rtol=1e-10, atol=1e-14).y[:, -1]
         np.testing.assert_allclose(run.p[k + 1], (x - shift)[:6], rtol=0, atol=1e-12)
@@ -216,11 +220,11 @@ def test_one_runge_kutta_step_a_sample_is_enough(lqg: Design) -> None:
 
 
 def test_the_believed_model_is_a_parameter(lqg: Design) -> None:
-    """`believing` changes what the controller commutates by, and no gain; the machine stays the same."""
-    table = experiments.believing(lqg.controller, "table", 20)
-    assert (experiments._parameters(table).order, experiments._parameters(table).cells) == (16, 20)
+    """`with_coil_model` changes what the controller commutates by, and no gain; the machine stays the same."""
+    table = motions.with_coil_model(lqg.controller, "table", 20)
+    assert (motions.parameters_of(table).order, motions.parameters_of(table).cells) == (16, 20)
     assert table.K is lqg.controller.K
-    assert experiments.believing(table, "exact").parameters == lqg.controller.parameters
+    assert motions.with_coil_model(table, "exact").parameters == lqg.controller.parameters
 
 
 # --- Errors of the coil models ---
@@ -243,7 +247,7 @@ def test_errors_of_the_models(flown: dict[str, Experiment], paper: dict[str, Any
 def test_amplitudes_and_step_of_the_table(flown: dict[str, Experiment]) -> None:
     """12.40 and 24.70 N; tau_n / 10 errs by 0.155 N, and four times less with every halving."""
     e = flown["errors"]
-    found, n = merits(e), experiments.NODES
+    found, n = merits(e), models.NODES
     assert found["F_x, amplitude"] == pytest.approx(12.39, abs=0.1)
     assert found["F_z, amplitude"] == pytest.approx(24.7, abs=0.1)
     assert found["fitted C of the analytical model"] == pytest.approx(1.138, abs=1e-3)
@@ -259,16 +263,14 @@ def test_a_hover_corrects_what_the_model_misses(flown: dict[str, Experiment]) ->
 
 def test_a_coil_off_the_centre_has_arms(lqg: Design) -> None:
     """T about the centre of gravity is the coil's own and arm x F, as in K(p)."""
-    par = experiments._parameters(lqg.plant)
-    model = planar.truth(par)
+    par = motions.parameters_of(lqg.plant)
+    model = coils.exact_model(par)
     x, y = np.array([3e-3]), np.array([5e-3])
     centre = np.array([x[0] - par.coil_pitch / 2, y[0] - par.coil_pitch / 2, par.h])
-    column = planar.wrench_matrix(par, model, centre)[
+    column = commutation.wrench_matrix(par, model, centre)[
         :, 10
     ]  # the third of the third row: half a pitch along both
-    np.testing.assert_allclose(
-        experiments.coil_wrench(par, model, 2.0, x, y)[0], 2 * column, rtol=0, atol=1e-11
-    )
+    np.testing.assert_allclose(models.coil_wrench(par, model, 2.0, x, y)[0], 2 * column, rtol=0, atol=1e-11)
 
 
 # --- Delay and time ---
@@ -287,19 +289,19 @@ def test_the_filter_has_to_know_of_the_delay(flown: dict[str, Experiment]) -> No
 
 def test_times_are_those_of_the_numbers(lqg: Design, flown: dict[str, Experiment]) -> None:
     """The timed C code gives numpy's currents. Times themselves are for bench/run.py."""
-    par = experiments._parameters(lqg.plant)
+    par = motions.parameters_of(lqg.plant)
     p, W = np.array([6e-3, 4e-3, par.h]), np.array([10.0, 200, 400, 1, 2, 3])
     for model in (
-        planar.table(par, planar.simulated(par), 35),
-        planar.simulated(par),
-        planar.Analytical(par),
+        coils.table(par, coils.simulation_model(par), 35),
+        coils.simulation_model(par),
+        coils.Analytical(par),
     ):
-        compiled = experiments.compiled(planar.decoupling(par, model))
+        compiled = timings.compile_function(commutation.decoupling(par, model))
         if compiled is None:
             pytest.skip("no C compiler")
         seconds, i = compiled(10, p, W)
         assert seconds > 0
-        expected = planar.currents(planar.wrench_matrix(par, model, p), W)
+        expected = commutation.currents(commutation.wrench_matrix(par, model, p), W)
         np.testing.assert_allclose(i, expected, rtol=0, atol=1e-11)
     assert {m.label for m in flown["timing"].merits} >= {"table, numpy", "table, compiled"}
 
@@ -307,7 +309,7 @@ def test_times_are_those_of_the_numbers(lqg: Design, flown: dict[str, Experiment
 def test_without_a_compiler_there_is_no_time(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("malta.simulation.compiled.compiler", lambda: None)
     x = ca.SX.sym("x")
-    assert np.isnan(experiments.compiled_seconds(ca.Function("square", [x], [x * x]), np.ones(1)))
+    assert np.isnan(timings.compiled_seconds(ca.Function("square", [x], [x * x]), np.ones(1)))
 
 
 # --- Figures and claims ---

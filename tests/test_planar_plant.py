@@ -14,6 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import malta
+from malta.machines.planar import coils, commutation
 from malta.machines.planar import plant as planar
 from malta.model.data import plant_of, shaping, units_of
 from malta.model.plant import Plant, symbolic, trim
@@ -68,7 +69,7 @@ def test_the_state_counts_height_from_the_working_height(par: planar.Parameters,
     i = np.linspace(-3, 3, 16)
     for z in (-par.h, 0.0, 1e-3):
         x = np.array([6e-3, 4e-3, z, *np.zeros(9)])
-        K = planar.wrench_matrix(par, planar.simulated(par), x[:3] + np.array([0, 0, par.h]))
+        K = commutation.wrench_matrix(par, coils.simulation_model(par), x[:3] + np.array([0, 0, par.h]))
         np.testing.assert_allclose(column(machine.forces(x, i)), K @ i, rtol=0, atol=1e-11)
 
 
@@ -139,13 +140,15 @@ def test_the_named_coil_model_commutates(par: planar.Parameters, order: int, cel
     own = replace(par, order=order, cells=cells)
     machine = plant_of(own)
     assert machine.tabulated == (cells > 0)
-    model: planar.CoilModel = planar.Analytical(par) if order == 1 else planar.simulated(par, order)
+    model: coils.CoilModel = coils.Analytical(par) if order == 1 else coils.simulation_model(par, order)
     if cells:
-        model = planar.table(par, model, cells)
+        model = coils.table(par, model, cells)
     y, W = ca.MX.sym("y", 6), ca.MX.sym("W", 6)
     given = ca.Function("given", [y, W], [machine.currents(y, W)])
     for p in np.random.default_rng(1).uniform([-0.1, -0.1, -1e-3], [0.1, 0.1, 4e-3], (10, 3)):
-        expected = planar.currents(planar.wrench_matrix(par, model, p + np.array([0, 0, par.h])), WRENCH)
+        expected = commutation.currents(
+            commutation.wrench_matrix(par, model, p + np.array([0, 0, par.h])), WRENCH
+        )
         np.testing.assert_allclose(column(given([*p, 0, 0, 0], WRENCH)), expected, rtol=0, atol=1e-9)
 
 
@@ -184,7 +187,7 @@ def test_no_machine_has_such_a_model(par: planar.Parameters, name: str, value: f
 
 def test_simulated_forces_are_the_truth(par: planar.Parameters) -> None:
     """22 harmonics instead of 144: within 0.2 mN/A of 8.2 N/A at the working height, 0.9 of 9.9 on the magnets."""
-    few, whole = planar.simulated(par), planar.truth(par)
+    few, whole = coils.simulation_model(par), coils.exact_model(par)
     assert (len(few.m), len(whole.m)) == (22, 144)
     x, y = np.meshgrid(*[np.linspace(0, par.tau_n, 61)] * 2, indexing="ij")
     for z, force, torque in ((0.0, 0.9e-3, 0.07e-3), (par.h, 0.19e-3, 0.02e-3)):
@@ -251,7 +254,7 @@ def test_currents_are_limited_together(par: planar.Parameters, machine: Plant) -
     """Twice the limit becomes the limit, in the same direction, as numpy has it; less is left as it is."""
     i = np.linspace(-1, 1, 16) * 2 * par.I_max
     np.testing.assert_allclose(column(machine.limited(ca.DM(i))), i / 2, rtol=1e-15)
-    np.testing.assert_allclose(planar.limited(par, i), i / 2, rtol=1e-15)
+    np.testing.assert_allclose(commutation.limit_currents(par, i), i / 2, rtol=1e-15)
     np.testing.assert_array_equal(column(machine.limited(ca.DM(i / 4))), i / 4)
 
 

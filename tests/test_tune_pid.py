@@ -16,6 +16,7 @@ from conftest import ROOT, Run, refusal
 from scipy import linalg
 
 import malta
+from malta.machines.halbach import electronics
 from malta.machines.halbach import plant as halbach
 from malta.margins.verify import machine_loop
 from malta.synthesis.riccati import sample, sample_noise
@@ -198,7 +199,9 @@ def test_the_motion_from_noise_by_two_ways(motor: Spec) -> None:
     """The motor's own model, where currents follow at once; a PID that takes plain differences."""
     par, Ts = motor.parameters, motor.sample_time
     assert isinstance(par, halbach.Parameters)
-    assert loads_of(motor).force_noise[0] == pytest.approx(math.sqrt(halbach.force_noise(par) / Ts), rel=1e-3)
+    assert loads_of(motor).force_noise[0] == pytest.approx(
+        math.sqrt(electronics.force_noise(par) / Ts), rel=1e-3
+    )
     assert loads_of(motor).sensor_noise[0] == pytest.approx(par.n_laser / math.sqrt(3), rel=1e-5)
     Kp, Ki, Kd = 340.0, 923.3, 16.43  # three poles of the motor between readings at one place
     spring = par.k * par.F_z  # of the Park angle that is held
@@ -211,7 +214,7 @@ def test_the_motion_from_noise_by_two_ways(motor: Spec) -> None:
     M[:2, 2:] = G @ [[Ki, Kd / Ts]]
     M[2, [0, 2]], M[3, 0] = (-Ts, 1), 1
     reading = np.array([*(pull - proportional * G[:, 0]), -Ts, 1])
-    pushed = linalg.block_diag(sample_noise(A, B @ B.T, Ts) * halbach.force_noise(par), np.zeros((2, 2)))
+    pushed = linalg.block_diag(sample_noise(A, B @ B.T, Ts) * electronics.force_noise(par), np.zeros((2, 2)))
     noise = pushed + np.outer(reading, reading) * par.n_laser**2 / 3
     quick = replace(par, L=par.L / 100, pm_cc=0.1)
     terms = Pid(np.array([Kp]), np.array([Ki]), np.array([Kd]), 0.0)

@@ -1,6 +1,7 @@
-"""Whether gain files hold the numbers of a design already, so that nothing but their provenance would change.
+"""Comparison of gain files with a design: a file whose numbers agree need not be written again.
 
-Another processor or another patch version of a library moves last digits. Such a file is left as it is.
+Another processor or another patch version of a library changes last digits. A file that differs only in them, or in its
+provenance, is left as it is.
 """
 
 from __future__ import annotations
@@ -22,36 +23,37 @@ if TYPE_CHECKING:
 
 CLOSE = 1e-9  # of the largest number in the same array
 CLOSE_VERIFIED = 1e-6  # of poles and bandwidths, which magnify what moves a matrix
-NARROWER = 1.01
-APART = {"provenance", "sha256", "verification"}
+NARROWER = 1.01  # largest ratio by which the new bounds of a margin may be tighter
+APART = {"provenance", "sha256", "verification"}  # tables that are not compared with CLOSE
 
 
 def agrees(controller: Controller, margins: Margins, *paths: str | Path) -> bool:
     """Whether all of these gain files exist, are sound, and hold this controller to 1e-9 of each array's largest entry.
 
     Poles and bandwidths have to agree to 1e-6. The bounds of the margin must not contradict those in the file, nor be
-    narrower by more than 1 %: how far a proof gets in its time is the machine's.
+    narrower by more than 1 %: a slower computer proves less in the same time.
 
-    Raises CheckError as gains.document.
+    Raises CheckError when the loop is not stable, as `document` does.
     """
     wanted = document(controller, margins)
     with suppress(InputError):
-        return all(_same(wanted, content_of(Path(path))[1]) for path in paths)
+        return all(_agree(wanted, content_of(Path(path))[1]) for path in paths)
     return False
 
 
-def _same(wanted: Mapping[str, Any], found: dict[str, Any]) -> bool:
+def _agree(wanted: Mapping[str, Any], found: dict[str, Any]) -> bool:
+    """Whether two documents hold the same controller and margins that do not contradict each other."""
     if set(wanted) != set(found) or not all(
         _close(wanted[key], found[key], CLOSE) for key in set(wanted) - APART
     ):
         return False
     verified, before = (dict(content["verification"]) for content in (wanted, found))
     robust, earlier = verified.pop("robust"), before.pop("robust")
-    return _close(verified, before, CLOSE_VERIFIED) and _no_better(robust, earlier)
+    return _close(verified, before, CLOSE_VERIFIED) and _hardly_narrower(robust, earlier)
 
 
-def _no_better(now: Mapping[str, Any] | None, before: Mapping[str, Any] | None) -> bool:
-    """Whether the bounds of a margin agree with earlier ones and are hardly narrower: a proof may run out of time."""
+def _hardly_narrower(now: Mapping[str, Any] | None, before: Mapping[str, Any] | None) -> bool:
+    """Whether the bounds of a margin agree with earlier ones and are at most NARROWER times as tight."""
     if now is None or before is None or now["uncertainty"] != before["uncertainty"]:
         return now == before
     lower, upper = _bounds(now)
@@ -62,6 +64,7 @@ def _no_better(now: Mapping[str, Any] | None, before: Mapping[str, Any] | None) 
 
 
 def _bounds(robust: Mapping[str, Any]) -> tuple[float, float]:
+    """Lower and upper bound; 0 and infinity where the file has null."""
     lower, upper = robust["lower"], robust["upper"]
     return 0.0 if lower is None else lower, math.inf if upper is None else upper
 

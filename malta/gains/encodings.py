@@ -1,7 +1,6 @@
 """The three forms of a gain file: .json, .npz and .mat, all holding the same tables.
 
-A document is nested tables of lists, numbers, texts and nulls. What comes back from a file has been taken apart, not
-checked: that is gains.py's part.
+A document is nested tables of lists, numbers, texts and nulls. Decoding does not check the content: schema.py does.
 """
 
 from __future__ import annotations
@@ -46,13 +45,13 @@ _Form = tuple[Callable[[Mapping[str, Any]], bytes], Callable[[bytes], Any]]
 
 
 def encode(content: Mapping[str, Any], path: Path) -> bytes:
-    """The bytes of a document in the form that the suffix names; the same document gives the same bytes."""
+    """The bytes of a document in the encoding that the suffix names; equal documents give equal bytes."""
     write, _ = _form(path)
     return write(content)
 
 
 def decode(path: Path) -> dict[str, Any]:
-    """The document in a file. InputError when it is missing, unreadable, damaged or of another kind."""
+    """The document in a file. Raises InputError for a missing, unreadable, damaged or foreign file."""
     _, read = _form(path)
     data = read_file(path, "gain file", Path.read_bytes)
     try:
@@ -73,13 +72,13 @@ def content_sha256(content: Mapping[str, Any]) -> str:
 
 def _to_json(content: Mapping[str, Any]) -> bytes:
     text = json.dumps(content, indent=1, allow_nan=False)
-    return _INNERMOST.sub(_joined, text).encode() + b"\n"
+    return _INNERMOST.sub(_on_one_line, text).encode() + b"\n"
 
 
 _INNERMOST = re.compile(r"([\[{])\s*([^][{}]*?)\s*([\]}])")
 
 
-def _joined(innermost: re.Match[str]) -> str:
+def _on_one_line(innermost: re.Match[str]) -> str:
     """A matrix row or a small table on one line."""
     line = f"{innermost[1]}{' '.join(innermost[2].split())}{innermost[3]}"
     return line if innermost[1] == "[" or len(line) <= 80 else innermost[0]
@@ -129,7 +128,7 @@ def _to_mat(content: Mapping[str, Any]) -> bytes:
 
 
 def mat_header(body: bytes) -> bytes:
-    """In the place of date and platform, the sha256 of what follows."""
+    """The 116 bytes that open a MAT-file: instead of date and platform, the sha256 of the bytes that follow."""
     return f"MATLAB 5.0 MAT-file, malta gain file, sha256 {hashlib.sha256(body).hexdigest()}".encode().ljust(
         MAT_HEADER
     )
@@ -157,6 +156,7 @@ def _columns(content: Any) -> Any:
 
 
 def _flat(tables: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested tables as one, names joined by dots."""
     flat: dict[str, Any] = {}
     for key, value in tables.items():
         flat |= _flat(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
@@ -173,7 +173,7 @@ def _cells(value: Any) -> Any:
 
 
 def _uncell(value: Any, name: str) -> Any:
-    """MATLAB holds everything as a matrix: tables, texts, vectors and numbers are told apart by their names."""
+    """A value of a MAT-file, where everything is a matrix: its name tells whether it is a matrix, vector or number."""
     if value.dtype.names:
         return {key: _uncell(value[key][0, 0], f"{name}.{key}") for key in value.dtype.names}
     if value.dtype == object:
@@ -198,6 +198,7 @@ SUFFIXES = tuple(_FORMS)
 
 
 def _form(path: Path) -> _Form:
+    """Writer and reader for a suffix."""
     if path.suffix not in _FORMS:
         raise InputError(path, "", f"suffix {path.suffix!r}", "one of " + ", ".join(SUFFIXES))
     return _FORMS[path.suffix]

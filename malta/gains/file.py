@@ -20,25 +20,25 @@
     sha256           of the rest as compact JSON with sorted keys
 
 n = n0 + m d where the design models a delay of d samples: the mechanical states first, then stored forces; m more where
-the filter observes forces of disturbance. The control law is in controller.py. For a PID controller, which is the same
-law, cost and noise are null, as its poles of regulator and filter; current_loop is null where currents follow
-their commands at once, limits.voltage where there are none.
+the filter observes forces of disturbance. The control law is stated in synthesis/controller.py. A PID controller has
+the same law; its cost, its noise and its poles of regulator and filter are null. current_loop is null where currents
+follow their commands at once, limits.voltage is null where voltages have no limit.
 
-Version 2 is what has one more table, and may have another:
+A file of version 2 has one more table, and may have another:
 
-    law              tracks "states" or "errors": what the control law takes, see controller.py
+    law              tracks "states" or "errors": the signals that the control law takes, see synthesis/controller.py
     plant.linear     of a machine from plain matrices, whose name is "linear" and whose preset its own name:
                      states, inputs, outputs: signals; matrices A, B, C; terms {parameter: A, B, C}; limit [m],
                      noise [p], dead_time [s], as model/linear.py takes them
 
 There plant.parameters and its terms are null without parameters, feedforward.rate without rates among the states, and
 limits.current and limits.force without limits. The states of a law of errors are its own, then its last errors.
-All else stays version 1, and readers of it read these files.
+Files without these tables keep version 1.
 
 The JSON is the specification: matrices row by row with round-trip precision, no time stamp, so the same inputs give the
 same file. The .npz has the same names joined by dots ("gains.K"), the .mat the same names as nested structs; in both a
-list of signals is two lists, name and unit, and null is an empty array. The sha256 has a damaged or edited file refused
-rather than flown; a .mat holds one of its bytes in its header too.
+list of signals is two lists, name and unit, and null is an empty array. A file whose content does not match its sha256
+is refused; a .mat also has a sha256 of its bytes in its header.
 """
 
 from __future__ import annotations
@@ -47,40 +47,31 @@ import platform
 from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from malta.errors import CheckError, InputError
 from malta.files import located, replace_files
+from malta.gains.contents import controller_of
 from malta.gains.encodings import SUFFIXES as SUFFIXES
 from malta.gains.encodings import content_sha256, decode, encode
-from malta.gains.linear import LINEAR, linear_parameters, linear_table, signal_tables
-from malta.gains.schema import GainFile, PlantTable
+from malta.gains.linear import LINEAR, linear_table, signal_tables
+from malta.gains.schema import GainFile
 from malta.margins.verify import require_stable, unstable_gain
 from malta.model.data import (
-    parameters_record,
     plant_of,
     units_of,
     validated,
 )
 from malta.model.linear import is_linear
-from malta.model.machines import machine
-from malta.model.plant import Signal
 from malta.synthesis.controller import (
     Controller,
-    Cost,
-    CurrentLoop,
-    Feedforward,
-    Limits,
-    Noise,
-    disturbances,
-    stored_forces,
 )
 
 if TYPE_CHECKING:
     from malta.margins.verify import Margins
-    from malta.model.plant import FloatArray, Parameters
+
 
 SCHEMA = "malta-gains"
 
@@ -88,7 +79,7 @@ SCHEMA = "malta-gains"
 def document(controller: Controller, margins: Margins) -> dict[str, Any]:
     """The content of the gain file of a controller, as plain tables, lists and numbers.
 
-    Raises CheckError when the loop is not stable: such gains are for no file.
+    Raises CheckError when the loop is not stable.
     """
     require_stable(margins, controller.name)
     c = controller
@@ -133,11 +124,12 @@ def document(controller: Controller, margins: Margins) -> dict[str, Any]:
 
 
 def _table(record: Any, *keys: str) -> dict[str, Any] | None:
+    """Some fields of a record; None for None."""
     return None if record is None else {key: getattr(record, key) for key in keys}
 
 
 def _robust(margins: Margins) -> dict[str, Any] | None:
-    """The bounds over the travel: lower is null where nothing is proven, upper where no witness is known."""
+    """Bounds of the margin: lower is null if nothing is proven, upper is null without a witness."""
     margin = margins.robust
     if margin is None:
         return None
@@ -150,7 +142,7 @@ def _robust(margins: Margins) -> dict[str, Any] | None:
 
 
 def write(controller: Controller, margins: Margins, *paths: str | Path) -> None:
-    """Write a controller to gain files; the suffix (.json, .npz, .mat) says which form.
+    """Write a controller to gain files; the suffix (.json, .npz, .mat) gives the encoding.
 
     All files are completed beside their targets before any is renamed into place, so a failure leaves the old ones.
 
@@ -169,7 +161,7 @@ def read(path: str | Path) -> Controller:
     """
     path = located(path)
     file, _ = content_of(path)
-    controller = _controller(file, path)
+    controller = controller_of(file, path)
     try:
         with np.errstate(all="ignore"):
             unstable = unstable_gain(controller)
@@ -188,7 +180,7 @@ def read(path: str | Path) -> Controller:
 def content_of(path: Path) -> tuple[GainFile, dict[str, Any]]:
     """The document in a gain file, of the right schema and with its own sha256; and the same as plain tables.
 
-    Raises InputError as `read`; whether the gains fit the machine and stabilize it is not looked at.
+    Raises InputError as `read` does. It does not check that the gains fit the machine and stabilize it.
     """
     content = decode(path)
     for key, wanted in (("schema", SCHEMA), ("version", 2 if "law" in content else 1)):
@@ -201,175 +193,6 @@ def content_of(path: Path) -> tuple[GainFile, dict[str, Any]]:
             path, "sha256", "content that was changed or damaged", "the content that was written"
         )
     return file, plain
-
-
-def _controller(file: GainFile, path: str | Path) -> Controller:
-    if file.plant.linear is not None and file.law is None:
-        raise InputError(path, "plant.linear", "a table", "none without a table law, as version 2 has it")
-    par = _parameters(file.plant, path)
-    try:
-        plant = plant_of(par)
-    except CheckError as error:
-        raise InputError(path, "plant.parameters", str(error), "a machine that can be controlled") from error
-    states, forces, measurements = (
-        tuple(Signal(s.name, s.unit) for s in getattr(file.signals, key))
-        for key in ("states", "forces", "measurements")
-    )
-    mechanical, errors = plant.design_states, file.law is not None and file.law.tracks == "errors"
-    for key, found, wanted in (
-        ("states", states[: len(mechanical)], states[: len(mechanical)] if errors else mechanical),
-        ("forces", forces, plant.inputs),
-        ("measurements", measurements, plant.outputs),
-    ):
-        if found != wanted:
-            raise InputError(path, f"signals.{key}", _names(found), f"{_names(wanted)} of the {plant.name}")
-    n, n0, m, p = len(states), len(mechanical), len(forces), len(measurements)
-    g, coils = len(file.feedforward.z_grid), len(plant.actuator.coils)
-    observed = () if errors else _observed(file, states, forces, n0, path)
-    if (file.cost is None) != (file.noise is None):
-        raise InputError(path, "noise", "null" if file.noise is None else "some", "null where cost is null")
-    shapes: dict[str, dict[str, tuple[int, ...]]] = {
-        "model": {"A": (n0, n0), "B": (n0, m), "C": (p, n0), "Ad": (n, n), "Bd": (n, m), "Cd": (p, n)},
-        "gains": {"K": (m, n), "Ki": (m, p), "L": (n, p)},
-        "operating_point": {"x": (n0,), "u": (m,)},
-        "feedforward": {
-            "inertia": (m,),
-            "speed": (m, p),
-            "rate": (plant.coordinates, p),
-            "z_grid": (g,),
-            "v0": (g, m),
-        },
-        "limits": {"current": (coils,), "force": (m,), "voltage": (coils,)},
-    }
-    unlimited = {key: np.full(size, np.inf) for key, size in shapes["limits"].items() if _endless(file, key)}
-    for key in unlimited:
-        del shapes["limits"][key]
-    if file.cost is not None:
-        shapes["cost"] = {"state": (n0,), "input": (m,), "integral": (p,)}
-    if file.noise is not None:
-        shapes["noise"] = {"process": (m,), "sensor": (p,), "drift": (len(observed),)}
-    arrays: dict[str, dict[str, FloatArray]] = {
-        table: {
-            key: _array(getattr(getattr(file, table), key) or [], shape, path, f"{table}.{key}")
-            for key, shape in keys.items()
-        }
-        for table, keys in shapes.items()
-    }
-    z_grid = arrays["feedforward"]["z_grid"]
-    if g < 2 or not (np.diff(z_grid) > 0).all():
-        raise InputError(
-            path, "feedforward.z_grid", "values that do not rise", "at least two rising positions"
-        )
-    for key, limit in arrays["limits"].items():
-        if not (limit > 0).all():
-            raise InputError(path, f"limits.{key}", str(limit.tolist()), "limits above 0")
-    for key, variance in arrays.get("noise", {}).items():
-        if not (variance > 0).all():
-            raise InputError(path, f"noise.{key}", str(variance.tolist()), "variances above 0")
-    for key, weight in arrays.get("cost", {}).items():
-        if (weight < 0).any() or (key == "input" and not (weight > 0).all()):
-            raise InputError(
-                path,
-                f"cost.{key}",
-                str(weight.tolist()),
-                "weights above 0" if key == "input" else "none below 0",
-            )
-    if errors:
-        _check_error_law(file, arrays, path)
-    return Controller(
-        name=file.design.name,
-        spec_sha256=file.design.spec_sha256,
-        parameters=par,
-        operating_point=(arrays["operating_point"]["x"], arrays["operating_point"]["u"]),
-        sample_time=file.sample_time,
-        states=states,
-        forces=forces,
-        measurements=measurements,
-        **cast("dict[str, Any]", arrays["model"] | arrays["gains"]),
-        cost=Cost(**arrays["cost"]) if "cost" in arrays else None,
-        noise=Noise(**arrays["noise"]) if "noise" in arrays else None,
-        feedforward=Feedforward(**arrays["feedforward"]),
-        current_loop=None if file.current_loop is None else CurrentLoop(**file.current_loop.model_dump()),
-        limits=Limits(**(unlimited | arrays["limits"])),
-        tracks="errors" if errors else "states",
-    )
-
-
-def _observed(
-    file: GainFile, states: tuple[Signal, ...], forces: tuple[Signal, ...], n0: int, path: str | Path
-) -> tuple[Signal, ...]:
-    """The disturbances among the states, after stored forces. InputError for others."""
-    n, m = len(states), len(forces)
-    if (n - n0) % m:
-        raise InputError(path, "signals.states", f"{n} states", f"{n0} and a multiple of {m} stored forces")
-    observed = disturbances(forces) if states[-m:] == disturbances(forces) else ()
-    stored = stored_forces(forces, (n - n0 - len(observed)) // m) + observed
-    if states[n0:] != stored:
-        raise InputError(path, "signals.states", _names(states[n0:]), f"stored forces, as {_names(stored)}")
-    if observed and any(any(row) for row in file.gains.Ki):
-        both = "sums of errors beside observed disturbances"
-        raise InputError(path, "gains.Ki", both, "zeros: one of them takes off loads")
-    return observed
-
-
-def _check_error_law(
-    file: GainFile, arrays: Mapping[str, Mapping[str, FloatArray]], path: str | Path
-) -> None:
-    """InputError where the matrices are not those of a law of errors, as controller.py has them."""
-    model, gains = arrays["model"], arrays["gains"]
-    n, p = gains["L"].shape
-    if n < p:
-        raise InputError(path, "signals.states", f"{n} states", f"{p} at least, the last errors")
-    zeros = {"model.Bd": model["Bd"], "model.Cd": model["Cd"], "gains.Ki": gains["Ki"]}
-    zeros["model.Ad"] = model["Ad"][n - p :]
-    zeros["gains.L"] = gains["L"] - np.eye(n, p, p - n)
-    for key, M in zeros.items():
-        if M.any():
-            raise InputError(path, key, "other entries", "those of a law that tracks errors")
-    if file.cost is not None:
-        raise InputError(path, "cost", "some", "null of a law that tracks errors")
-
-
-def _endless(file: GainFile, key: str) -> bool:
-    """Whether there is no such limit, as a file may say."""
-    return getattr(file.limits, key) is None and (key == "voltage" or file.law is not None)
-
-
-def _parameters(plant: PlantTable, path: str | Path) -> Parameters:
-    if plant.linear is not None:
-        return linear_parameters(plant, plant.linear, path)
-    try:
-        record = parameters_record(machine(plant.name), path)
-    except InputError as error:
-        if error.where != "machine":
-            raise
-        raise InputError(path, "plant.name", error.found, error.expected) from error
-    units, given = units_of(record), plant.parameters or {}
-    if set(given) != set(units):
-        odd = sorted(set(given) ^ set(units))
-        raise InputError(path, "plant.parameters", f"{odd[0]} missing or unknown", " ".join(units))
-    for key, q in given.items():
-        if q.unit != units[key]:
-            raise InputError(path, f"plant.parameters.{key}.unit", repr(q.unit), repr(units[key]))
-    try:
-        return record(**{k: q.value for k, q in given.items()}, preset=plant.preset)  # type: ignore[call-arg]
-    except InputError as error:
-        raise InputError(path, f"plant.parameters.{error.field}", error.found, error.expected) from error
-
-
-def _array(value: list[Any], shape: tuple[int, ...], path: str | Path, field: str) -> FloatArray:
-    if not value and 0 in shape:
-        return np.zeros(shape)
-    rows = {len(row) for row in value} if len(shape) == 2 else set()
-    found = (len(value), *rows) if len(rows) <= 1 else None
-    if found != shape:
-        text = "rows of unequal length" if found is None else f"shape {found}"
-        raise InputError(path, field, text, f"shape {shape}")
-    return np.array(value, dtype=float)
-
-
-def _names(signals: tuple[Signal, ...]) -> str:
-    return " ".join(f"{s.name} [{s.unit}]" for s in signals) or "nothing"
 
 
 def _plain(value: Any) -> Any:

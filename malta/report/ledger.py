@@ -1,17 +1,17 @@
 """The ledger: every number that a source paper publishes, ours for each design, and a verdict. Computed, not typed.
 
-What the paper prints is read from data/published/, ours comes from the same functions that a user calls: model, gains,
+Published numbers are read from data/published/. Ours come from the same functions that a user calls: model, gains,
 margins, and the experiments on the simulated machine. A verdict follows from the numbers:
 
     reproduced          equal to the printed digits, within the printed bound, or within 5 % of an "about"
     within x %          of the published figure, x up to 20
     not reproduced      else, with the reason
 
-It is said by design where the designs differ, and with the reading where the paper leaves a definition open. The claims
-on a machine are in the module of its name here, which has
+Where the designs differ, each has its verdict; where the paper leaves a definition open, the verdict names the one that
+we use. The claims on a machine are in the module `claims` beside its plant, which has
 
     SOURCE        the paper
-    evidence      (spec, published, progress) -> what is known of a design: Found, and what its rows ask for besides
+    evidence      (spec, published, progress) -> Evidence of a design, with all that the rows need besides
     rows          () -> list[Row]
 """
 
@@ -23,7 +23,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 from malta.errors import InputError
-from malta.margins.verify import Margins, verify
+from malta.margins.verify import ZONES, Margins, verify
 from malta.model.data import in_unit, published_value
 from malta.model.linearize import LinearModel, linearize
 from malta.model.machines import require_part
@@ -36,8 +36,9 @@ if TYPE_CHECKING:
     from malta.synthesis.controller import Controller
     from malta.synthesis.spec import Spec
 
-CLOSE, NEAR = 0.05, 0.2  # of the published figure: reproduced; within x %
+CLOSE, NEAR = 0.05, 0.2  # largest relative differences that are "reproduced" and "within x %"
 ROUNDING = 1e-9
+ZONE_NOTE = f"ISO 14839-3 zone {ZONES[0][1]} ends at {ZONES[0][0]:g}"
 
 
 class Claim(NamedTuple):
@@ -71,8 +72,8 @@ class Ledger:
         return "\n".join([lines[0], "|---" * len(header) + "|", *lines[1:]]) + "\n"
 
 
-class Found(Protocol):
-    """What is known of one design; a machine's evidence may hold more."""
+class Evidence(Protocol):
+    """A design, its margins and its experiments; a machine's own record may have more fields."""
 
     @property
     def spec(self) -> Spec: ...
@@ -81,49 +82,52 @@ class Found(Protocol):
     @property
     def margins(self) -> Margins: ...
     @property
-    def flown(self) -> Mapping[str, Experiment]: ...
+    def experiments(self) -> Mapping[str, Experiment]: ...
 
 
-class Designed(NamedTuple):
-    """A design from its file to the runs that claims are made of."""
+class DesignRuns(NamedTuple):
+    """A design and the experiments that claims are about."""
 
     model: LinearModel
     controller: Controller
     margins: Margins
-    flown: dict[str, Experiment]
+    experiments: dict[str, Experiment]
 
 
-def designed(spec: Spec, names: Sequence[str], progress: Progress | None = None) -> Designed:
-    """Design, prove and fly the experiments of these names."""
+def run_design(spec: Spec, names: Sequence[str], progress: Progress | None = None) -> DesignRuns:
+    """Design a controller, prove its margins, and run the experiments of these names.
+
+    progress : called with the share that is done
+    """
     plant = spec.plant
     model = linearize(plant, plant.at(**spec.operating_point))
     controller = synthesize(spec, model)
-    flown = {
+    experiments = {
         name: experiment(name, plant, controller, progress=progress_of_part(progress, n, len(names)))
         for n, name in enumerate(names)
     }
-    return Designed(model, controller, verify(model, controller, spec.uncertainty), flown)
+    return DesignRuns(model, controller, verify(model, controller, spec.uncertainty), experiments)
 
 
 class Row(NamedTuple):
-    """A figure that the paper publishes, and how to find ours."""
+    """A figure that the paper publishes, and the function of a design's evidence that computes ours."""
 
     subject: str
-    unit: str  # that both are shown in
+    unit: str  # shown for both figures
     form: str
     value: Callable[[Any], float]  # of the machine's evidence; SI
     published: str | float | None = (
-        None  # key of data/published/, or a figure that its text implies; None: ours alone
+        None  # key of data/published/, or a figure that the text implies; None: ours alone
     )
     relation: str = "about"  # "equal" to the printed digits, "at most", "at least", "about"
     note: str = ""  # where the paper leaves a definition open, or what explains the figures
-    why: str = ""  # the reason for whatever is not reproduced
+    why: str = ""  # the reason why a figure is not reproduced
 
 
 def ledger(specs: Sequence[Spec], published: Mapping[str, Any], progress: Progress | None = None) -> Ledger:
     """Compute every claim of the paper on a machine for these designs of it.
 
-    progress : told the share that is done
+    progress : called with the share that is done
 
     Raises InputError for designs of another machine, of one without claims, or when the published figures lack one.
     """
@@ -134,7 +138,7 @@ def ledger(specs: Sequence[Spec], published: Mapping[str, Any], progress: Progre
         if spec.plant.name != machine:
             raise InputError(spec.path, "machine", spec.plant.name, f"{machine}, as of {specs[0].path}")
     paper = require_part("claims", machine)
-    found: list[Found] = [
+    found: list[Evidence] = [
         paper.evidence(spec, published, progress_of_part(progress, n, len(specs)))
         for n, spec in enumerate(specs)
     ]
@@ -142,7 +146,8 @@ def ledger(specs: Sequence[Spec], published: Mapping[str, Any], progress: Progre
     return Ledger(machine, paper.SOURCE, tuple(e.spec.name for e in found), tuple(claims))
 
 
-def _claim(row: Row, found: Sequence[Found], published: Mapping[str, Any]) -> Claim:
+def _claim(row: Row, found: Sequence[Evidence], published: Mapping[str, Any]) -> Claim:
+    """The line of the ledger for a row and the evidence of all designs."""
     values = [in_unit(row.value(e), row.unit) for e in found]
     ours = tuple("–" if math.isnan(value) else row.form.format(value) for value in values)
     unit = {"1": "", "percent": " [%]", "um": " [µm]", "urad": " [µrad]", "deg": " [°]"}.get(
@@ -161,7 +166,7 @@ def _claim(row: Row, found: Sequence[Found], published: Mapping[str, Any]) -> Cl
 
 
 def _verdict(row: Row, target: float, values: Sequence[float], names: Sequence[str]) -> str:
-    """What the figures of all designs say together."""
+    """The verdict on the figures of all designs."""
     words = [_word(row, target, value) for value in values]
     note = f"; {row.note}" if row.note else ""
     if len(set(words)) == 1:
@@ -172,6 +177,7 @@ def _verdict(row: Row, target: float, values: Sequence[float], names: Sequence[s
 
 
 def _word(row: Row, target: float, value: float) -> str:
+    """The verdict on the figure of one design."""
     if math.isnan(value):
         return "not reproduced"
     if row.relation in ("at most", "at least"):
@@ -187,31 +193,35 @@ def _word(row: Row, target: float, value: float) -> str:
     return f"within {math.ceil((off - ROUNDING) * 100)} %" if off <= NEAR + ROUNDING else "not reproduced"
 
 
-def machine_share(e: Found) -> float:
-    """Of the machine's own loop: the share of the design's uncertainty that is proven."""
-    return math.nan if e.margins.robust is None else proven(e.margins.robust)
+def machine_share(e: Evidence) -> float:
+    """The proven margin of the machine's own loop, as a share of the design's uncertainty; NaN without a proof."""
+    return math.nan if e.margins.robust is None else proven_share(e.margins.robust)
 
 
-def proven(margin: Margin) -> float:
-    """NaN where nothing is."""
+def proven_share(margin: Margin) -> float:
+    """The proven lower bound of a margin; NaN where nothing is proven."""
     return math.nan if margin.lower is None else margin.lower
 
 
-def bandwidth(definition: str, e: Found) -> float:
-    """By one of the definitions of verify."""
+def bandwidth(definition: str, e: Evidence) -> float:
+    """The bandwidth by one of the definitions in BANDWIDTHS, rad/s."""
     return e.margins.bandwidth[definition]
 
 
-def peak_sensitivity(e: Found) -> float:
-    """Of the worst sensor."""
+def peak_sensitivity(e: Evidence) -> float:
+    """The largest peak sensitivity of all sensors."""
     return max(v for name, v in e.margins.peak_sensitivity.items() if name != "sigma_max")
 
 
-def merit(name: str, label: str, e: Found) -> float:
-    """A figure of merit of an experiment."""
-    return next(merit.value for merit in e.flown[name].merits if merit.label == label)
+def merit(name: str, label: str, e: Evidence) -> float:
+    """A figure of merit of an experiment, by its label; SI."""
+    return next(merit.value for merit in e.experiments[name].merits if merit.label == label)
 
 
-def first_merit(name: str, number: int, e: Found) -> float:
-    """The first figure of merit of a case."""
-    return e.flown[name].cases[number].merits[0].value
+def case_merit(name: str, case: int | str, figure: int | str, e: Evidence) -> float:
+    """A figure of merit of one case of an experiment; case and figure are named by number or by label."""
+    cases = e.experiments[name].cases
+    chosen = cases[case] if isinstance(case, int) else next(one for one in cases if one.label == case)
+    if isinstance(figure, int):
+        return chosen.merits[figure].value
+    return next(one.value for one in chosen.merits if one.label == figure)

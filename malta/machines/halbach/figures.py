@@ -8,37 +8,35 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from malta.machines.halbach.experiments import (
+from malta.machines.halbach.experiments.lift import (
     AFTER,
-    BEFORE,
     CALM,
     FAULTS,
     LAWS,
-    PAUSE,
     PRINTED,
-    lift_of,
-    responses,
-    wanted_lift,
+    commanded_lift,
+    lift_force,
 )
+from malta.machines.halbach.experiments.motions import BEFORE, PAUSE, responses
 from malta.model.data import in_unit
 from malta.report.figures.parts import (
     MORE,
     NOTE,
     STYLES,
     Published,
-    bound_line,
-    ending,
-    finish,
-    line,
+    add_shared_legend,
+    draw_bound,
+    draw_grid,
+    draw_line,
+    ending_text,
+    finish_axes,
+    merit_phrase,
+    merits_phrase,
     micro,
+    new_page,
     number,
-    page,
-    plain,
-    read_out,
+    published_in_unit,
     runs_of,
-    said,
-    shared_legend,
-    told,
 )
 
 if TYPE_CHECKING:
@@ -55,32 +53,33 @@ ASKED: dict[str, Any] = {"color": "#c1440e", "linestyle": (0, (5, 2)), "linewidt
 def step_figure(e: Experiment, _: Published | None = None) -> Figure:
     """All steps on top of each other with their mean, the position at rest, and the vertical force. Fig. 9."""
     run = e.run
-    merits = "; ".join(f"{m.label} {said(m)}" for m in e.cases[0].merits[:4])
-    figure = page([run], f"steps{ending(run)}", f"{e.cases[0].label}: {micro(merits)}")
+    merits = "; ".join(f"{m.label} {merit_phrase(m)}" for m in e.cases[0].merits[:4])
+    figure = new_page([run], f"steps{ending_text(run)}", f"{e.cases[0].label}: {micro(merits)}")
     grid = figure.add_gridspec(2, 2)
     if len(e.cases) > 1:
         panels = [figure.add_subplot(grid[0, k]) for k in range(2)]
     else:
         panels = [figure.add_subplot(grid[0, :])]
     for axes, case in zip(panels, e.cases, strict=False):
-        _steps(axes, case)
+        _draw_steps(axes, case)
     rest, lift = figure.add_subplot(grid[1, 0]), figure.add_subplot(grid[1, 1])
-    last = slice(_resting(run), None)
-    line(rest, run.t[last], 1e6 * (run.p - run.reference)[last, 0], **STYLES[0] | {"linewidth": 0.9})
-    line(lift, run.t, lift_of(run), **STYLES[0] | {"linewidth": 0.9})
-    finish(rest, "time [s]", "off reference, at rest [µm]")
-    finish(lift, "time [s]", "vertical force [N]")
-    shared_legend(figure)
+    last = slice(_first_sample_at_rest(run), None)
+    draw_line(rest, run.t[last], 1e6 * (run.p - run.reference)[last, 0], **STYLES[0] | {"linewidth": 0.9})
+    draw_line(lift, run.t, lift_force(run), **STYLES[0] | {"linewidth": 0.9})
+    finish_axes(rest, "time [s]", "off reference, at rest [µm]")
+    finish_axes(lift, "time [s]", "vertical force [N]")
+    add_shared_legend(figure)
     return figure
 
 
-def _resting(run: Trajectory) -> int:
-    """The reading from which nothing is asked any more."""
+def _first_sample_at_rest(run: Trajectory) -> int:
+    """The first reading after the last step has settled."""
     moving = np.flatnonzero(np.diff(run.reference[:, 0]))
     return min(int(moving[-1]) + PAUSE // 2 if len(moving) else 0, len(run.t) - 1)
 
 
-def _steps(axes: Axes, case: Case) -> None:
+def _draw_steps(axes: Axes, case: Case) -> None:
+    """All responses of a case and their mean, over the time after a step."""
     run = case.run
     moved = run.scenario.reference(run.plant)(run.t).p[:, 0]
     distance = float(moved[np.abs(moved).argmax()])
@@ -95,76 +94,79 @@ def _steps(axes: Axes, case: Case) -> None:
     axes.plot(ms[shown], 1e6 * distance * shares.mean(axis=0)[shown], label="mean", **STYLES[0])
     asked = run.reference[BEFORE : BEFORE + PAUSE, 0]
     axes.plot(ms[shown][: len(asked)], 1e6 * asked[shown[: len(asked)]], label="reference", **ASKED)
-    finish(axes, "time after the step begins [ms]", f"position, {case.label} [µm]")
+    finish_axes(axes, "time after the step begins [ms]", f"position, {case.label} [µm]")
 
 
 def stairs_figure(e: Experiment, published: Published | None = None) -> Figure:
     """Every law with either PWM: reference and position. Fig. 7."""
-    text = told(e.cases[:2], 2)
+    text = merits_phrase(e.cases[:2], 2)
     if len(e.merits) > 1:
-        zones = "; ".join(f"{m.label} {said(m)}" for m in e.merits)
-        text = zones if published is None else f"{zones} (published: {_printed(e, published)})"
-    figure = page(runs_of(e), "stairs", micro(text), top=0.83, hspace=0.28)
+        zones = "; ".join(f"{m.label} {merit_phrase(m)}" for m in e.merits)
+        text = zones if published is None else f"{zones} (published: {_published_text(e, published)})"
+    figure = new_page(runs_of(e), "stairs", micro(text), top=0.83, hspace=0.28)
     panels = figure.subplots(2, 2, sharex=True, sharey=True).ravel()
     for k, (axes, case) in enumerate(zip(panels, e.cases, strict=False)):
         run = case.run
         axes.plot(run.t, 1e6 * run.reference[:, 0], label="reference", drawstyle="steps-post", **ASKED)
-        line(axes, run.t, 1e6 * run.p[:, 0], label="position", **STYLES[0])
+        draw_line(axes, run.t, 1e6 * run.p[:, 0], label="position", **STYLES[0])
         axes.set_title(case.label, fontsize=9, loc="left")
-        finish(axes, "time [s]" if k > 1 else "", "position [µm]")
-    shared_legend(figure)
+        finish_axes(axes, "time [s]" if k > 1 else "", "position [µm]")
+    add_shared_legend(figure)
     return figure
 
 
-def _printed(e: Experiment, published: Published) -> str:
-    values = (f"{number(read_out(published, m.published, m.unit), 3)} {micro(m.unit)}" for m in e.merits)
+def _published_text(e: Experiment, published: Published) -> str:
+    """The published values of an experiment's figures of merit."""
+    values = (
+        f"{number(published_in_unit(published, m.published, m.unit), 3)} {micro(m.unit)}" for m in e.merits
+    )
     return " and ".join(values)
 
 
 def ramp_figure(e: Experiment, _: Published | None = None) -> Figure:
     """Position and error over time, error and vertical force along the travel, for each speed. Fig. 8."""
-    figure = page(runs_of(e), f"ramps{ending(e.run)}", told(e.cases, 0))
+    figure = new_page(runs_of(e), f"ramps{ending_text(e.run)}", merits_phrase(e.cases, 0))
     (position, begin), (along, lift) = figure.subplots(2, 2)
     for case, style in zip(e.cases, cycle((*STYLES, *MORE))):
         run = case.run
         error, place = 1e6 * (run.p - run.reference)[:, 0], 1e3 * run.reference[:, 0]
         moving = np.diff(run.reference[:, 0], append=run.reference[-1, 0]) != 0
         first = run.t - (run.t[moving][0] if moving.any() else 0.0)
-        line(position, run.t, 1e3 * run.p[:, 0], label=case.label, **style)
+        draw_line(position, run.t, 1e3 * run.p[:, 0], label=case.label, **style)
         started = (first > -0.5) & (first < 3)
         begin.plot(first[started], error[started], **style)
         steady = moving & (first > 2)
         along.plot(place[steady], error[steady], **style | {"linewidth": 0.8})
-        lift.plot(place[moving], lift_of(run)[moving], **style | {"linewidth": 0.8})
-    finish(position, "time [s]", "position [mm]")
-    finish(begin, "time after the begin [s]", "off reference [µm]")
-    finish(along, "position [mm]", "off reference, after 2 s [µm]")
-    finish(lift, "position [mm]", "vertical force [N]")
-    shared_legend(figure)
+        lift.plot(place[moving], lift_force(run)[moving], **style | {"linewidth": 0.8})
+    finish_axes(position, "time [s]", "position [mm]")
+    finish_axes(begin, "time after the begin [s]", "off reference [µm]")
+    finish_axes(along, "position [mm]", "off reference, after 2 s [µm]")
+    finish_axes(lift, "position [mm]", "vertical force [N]")
+    add_shared_legend(figure)
     return figure
 
 
 def force_figure(e: Experiment, published: Published | None = None) -> Figure:
-    """Vertical force and position over time for each law, and what faults leave for good. Fig. 10."""
+    """Vertical force and position over time for each law, and the steady changes with faults. Fig. 10."""
     sound = [case for case in e.cases if case.label in LAWS]
-    figure = page(runs_of(e), "vertical force of a move", told(sound, 0), left=0.085, wspace=0.3)
+    figure = new_page(runs_of(e), "vertical force of a move", merits_phrase(sound, 0), left=0.085, wspace=0.3)
     grid = figure.add_gridspec(2, 2, width_ratios=(1.15, 1))
     lift, position = figure.add_subplot(grid[0, 0]), figure.add_subplot(grid[1, 0])
     for case, style in zip(sound, STYLES, strict=False):
         run = case.run
         start = run.scenario.duration * CALM / (CALM + AFTER)
         shown = (run.t > start - 0.5) & (run.t < start + 5)
-        line(lift, run.t[shown] - start, lift_of(run)[shown], label=case.label, **style)
-        line(position, run.t[shown] - start, 1e3 * run.p[shown, 0], **style)
-    bound_line(lift, wanted_lift(e.run), "wanted", where="below right")
-    finish(lift, "", "vertical force [N]")
-    finish(position, "time after the begin [s]", "position [mm]")
-    _faults(figure.add_subplot(grid[:, 1]), e, published)
-    shared_legend(figure)
+        draw_line(lift, run.t[shown] - start, lift_force(run)[shown], label=case.label, **style)
+        draw_line(position, run.t[shown] - start, 1e3 * run.p[shown, 0], **style)
+    draw_bound(lift, commanded_lift(e.run), "wanted", where="below right")
+    finish_axes(lift, "", "vertical force [N]")
+    finish_axes(position, "time after the begin [s]", "position [mm]")
+    _draw_faults(figure.add_subplot(grid[:, 1]), e, published)
+    add_shared_legend(figure)
     return figure
 
 
-def _faults(axes: Axes, e: Experiment, published: Published | None) -> None:
+def _draw_faults(axes: Axes, e: Experiment, published: Published | None) -> None:
     """Steady changes of the vertical force: a group for each fault, a mark for each law."""
     found = {case.label: case.merits[0].value for case in e.cases if case.merits}
     for k, (law, style) in enumerate(zip(LAWS, STYLES, strict=False)):
@@ -177,29 +179,33 @@ def _faults(axes: Axes, e: Experiment, published: Published | None) -> None:
         mark = {"marker": "osD"[k], "markersize": 6, "linestyle": "none", "color": style["color"]}
         axes.plot(changes, heights, **mark)
         if published is not None:
-            value = read_out(published, f"figure_10.{PRINTED[law]}", "percent")
+            value = published_in_unit(published, f"figure_10.{PRINTED[law]}", "percent")
             axes.axvline(value, color=style["color"], linewidth=0.9, linestyle=style["linestyle"])
     if published is not None:
         where: dict[str, Any] = {"xycoords": "axes fraction", "ha": "center", "va": "bottom"}
         axes.annotate("lines: as\nthe paper\nmeasured", (0.27, 0.01), **where, **NOTE)
-    axes.set_yticks([-row for row in range(len(FAULTS))], [_broken(fault) for fault in FAULTS], fontsize=8)
+    axes.set_yticks(
+        [-row for row in range(len(FAULTS))], [_on_two_lines(fault) for fault in FAULTS], fontsize=8
+    )
     axes.set_ylim(-len(FAULTS) + 0.35, 0.5)
     axes.set_xlabel("steady change of the vertical force [%]")
-    plain(axes)
+    draw_grid(axes)
 
 
-def _broken(text: str) -> str:
-    """A name on two lines."""
+def _on_two_lines(text: str) -> str:
+    """A text, broken after its first word."""
     words = text.split(" ", 1)
     return "\n".join(words)
 
 
 def budget_figure(e: Experiment, _: Published | None = None) -> Figure:
     """The error at rest by source, and current noise along half a pitch. Sec. 5.1."""
-    figure = page(runs_of(e), "error of the position at rest, by source", told(e.cases, 0), wspace=0.3)
+    figure = new_page(
+        runs_of(e), "error of the position at rest, by source", merits_phrase(e.cases, 0), wspace=0.3
+    )
     bars, along = figure.subplots(1, 2, width_ratios=(1.2, 1))
     values = [in_unit(case.merits[0].value, "um") for case in e.cases]
-    floor = 1e-3  # um: what is less is nothing beside a reading of 1 nm
+    floor = 1e-3  # um, end of the logarithmic axis: the resolution of the laser is 1 nm
     for k, value in enumerate(values):
         bars.bar(
             k, max(value, floor) - floor, bottom=floor, color="#d4d4d4", edgecolor="#000000", linewidth=0.9
@@ -210,12 +216,12 @@ def budget_figure(e: Experiment, _: Published | None = None) -> Figure:
         )
     bars.set_yscale("log")
     bars.set_ylim(floor, 3 * max(*values, floor))
-    bars.set_xticks(range(len(e.cases)), [_broken(case.label) for case in e.cases], fontsize=8)
+    bars.set_xticks(range(len(e.cases)), [_on_two_lines(case.label) for case in e.cases], fontsize=8)
     bars.set_ylabel("position, rms [µm]")
-    plain(bars)
+    draw_grid(bars)
     along.plot(1e3 * e.curves["place"], 1e6 * e.curves["rms"], marker="o", markersize=5, **STYLES[0])
     along.set_ylim(0, None)
-    finish(along, "place [mm], half a pitch", "current noise alone: position, rms [µm]")
+    finish_axes(along, "place [mm], half a pitch", "current noise alone: position, rms [µm]")
     along.margins(x=0.03)
     return figure
 
@@ -223,15 +229,15 @@ def budget_figure(e: Experiment, _: Published | None = None) -> Figure:
 def identify_figure(e: Experiment, _: Published | None = None) -> Figure:
     """The motor's step beside the linear servo's, and their difference. Sec. 2.3."""
     run, linear = e.run, e.curves["linear"]
-    text = ", ".join(f"{m.label.replace(', ', ' ')} {said(m)}" for m in e.merits)
-    figure = page([run], f"a step of the open loop{ending(run)}", micro(text), hspace=0.2)
+    text = ", ".join(f"{m.label.replace(', ', ' ')} {merit_phrase(m)}" for m in e.merits)
+    figure = new_page([run], f"a step of the open loop{ending_text(run)}", micro(text), hspace=0.2)
     position, difference = figure.subplots(2, 1, sharex=True)
-    line(position, run.t, 1e3 * run.p[:, 0], label="motor", **STYLES[0])
-    line(position, run.t, 1e3 * linear, label="linear servo, eq. (5)", **ASKED)
-    line(difference, run.t, 1e3 * (linear - run.p[:, 0]), **STYLES[0])
-    finish(position, "", "position [mm]")
-    finish(difference, "time [s]", "linear servo less motor [mm]")
-    shared_legend(figure)
+    draw_line(position, run.t, 1e3 * run.p[:, 0], label="motor", **STYLES[0])
+    draw_line(position, run.t, 1e3 * linear, label="linear servo, eq. (5)", **ASKED)
+    draw_line(difference, run.t, 1e3 * (linear - run.p[:, 0]), **STYLES[0])
+    finish_axes(position, "", "position [mm]")
+    finish_axes(difference, "time [s]", "linear servo less motor [mm]")
+    add_shared_legend(figure)
     return figure
 
 

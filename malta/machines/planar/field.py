@@ -6,7 +6,7 @@ axes x', y' lie at 45 degrees to x, y; poles alternate every tau = sqrt(2) tau_n
     B = -grad sum b / K cos(m k x) cos(n k y) e^(-K z),    k = pi / tau_n, K = k sqrt(m^2 + n^2), m + n odd.
 
 A north pole stands at (tau_n, 0): with it a current that is positive counter-clockwise, seen from above, gives the
-signs of (17)-(24). Equation numbers are those of the paper named in planar.py.
+signs of (17)-(24). Equation numbers are those of the paper named in plant.py.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from malta.machines.planar.plant import Parameters
     from malta.model.plant import FloatArray
 
-ORDER = 60  # field: e^-K z is 2e-5 of the last harmonic kept at z = 1 mm
-COIL_ORDER = 16  # wrench: a coil averages the rest away; see test_planar.py
+ORDER = 60  # of the field: the last harmonic has decayed to 2e-5 at z = 1 mm
+COIL_ORDER = 16  # of the wrench: the mean over a coil makes higher ones negligible; see test_planar.py
 # Harmonic orders in x and y are `sin` (1) or `cos` (0) in the coil's position: mirroring the coil at x = 0 turns the
 # signs of F_x, T_y and T_z, mirroring it at y = 0 those of F_y, T_x and T_z.
 ODD_X = (1, 0, 0, 0, 1, 1)
@@ -34,7 +34,7 @@ ODD_Y = (0, 1, 0, 1, 0, 1)
 
 
 class Shape(NamedTuple):
-    """The parameters that harmonics are computed from, with one turn and one tesla: those are factors."""
+    """The parameters that harmonics are computed from; turns and remanence are 1, as they are factors of the wrench."""
 
     tau_n: float
     w_c: float
@@ -53,7 +53,7 @@ class Modes(NamedTuple):
     m: FloatArray
     n: FloatArray
     b: FloatArray  # T
-    k: float  # of the fundamental, rad/m
+    k: float  # wave number of the fundamental, rad/m
 
     @property
     def K(self) -> FloatArray:
@@ -93,13 +93,13 @@ def modes(par: Parameters | Shape, order: int = ORDER) -> Modes:
 
 
 def fundamental(par: Parameters, B_z: float) -> Modes:
-    """The field that (17)-(24) are written for, of amplitude B_z at z = 0: -B_z / 2 (cos k x - cos k y) e^(-k z)."""
+    """The field of (17)-(24), of amplitude B_z at z = 0: -B_z / 2 (cos k x - cos k y) e^(-k z)."""
     m, n, b = np.array([1.0, 0.0]), np.array([0.0, 1.0]), np.array([-B_z / 2, B_z / 2])
     return Modes(readonly(m), readonly(n), readonly(b), math.pi / par.tau_n)
 
 
 def flux_density(field: Modes, points: FloatArray) -> FloatArray:
-    """B at points (..., 3) above the magnets: T."""
+    """B at points (..., 3) above the magnets, T."""
     x, y, z = (points[..., i, None] for i in range(3))
     kx, ky = field.m * field.k, field.n * field.k
     decay = field.b * np.exp(-field.K * z)
@@ -109,7 +109,7 @@ def flux_density(field: Modes, points: FloatArray) -> FloatArray:
 
 
 class Winding(NamedTuple):
-    """Where a coil's current flows: nodes of a quadrature over its plan, about its centre."""
+    """The current of a coil: nodes of a quadrature over its plan, about its centre."""
 
     x: FloatArray  # m
     y: FloatArray
@@ -151,7 +151,7 @@ def _gauss(nodes: int) -> tuple[FloatArray, FloatArray]:
 
 
 def centre_of_force(par: Parameters | Shape) -> float:
-    """Height of the centre of the fundamental's force above a coil's lower face, m: r_z counts from there."""
+    """Height of the centre of the fundamental's force above a coil's lower face, m: the reference of r_z."""
     k = math.pi / par.tau_n
     return 1 / k - par.h_c / math.expm1(k * par.h_c)
 
@@ -161,8 +161,8 @@ def quadrature(
 ) -> FloatArray:
     """(12), (13) for 1 A in one coil by quadrature: F and T about the coil's centre of force, in the coil's frame.
 
-    position : of the coil's axis, and the height of its lower face there, m
-    turn : its R_RI where it is not level; it turns about its centre of force
+    position : of the coil's axis and of its lower face, if level, m
+    turn : rotation R_RI of a tilted coil about its centre of force
     """
     z, w_z = _gauss(12)
     R = np.eye(3) if turn is None else turn
@@ -186,7 +186,7 @@ def quadrature(
 
 @dataclass(frozen=True, eq=False)
 class Series:
-    """Wrench of 1 A in a level coil, about its centre of force: exact where the field is.
+    """Wrench of 1 A in a level coil, about its centre of force: exact within the harmonics of the field.
 
     Component c is `scale` times the sum of G[c] e^(-K z) sin or cos(m k x) sin or cos(n k y), see ODD_X and ODD_Y.
     """
@@ -224,10 +224,10 @@ class Series:
         return self.scale * ca.vertcat(*parts)
 
     def above(self, force: float, z: float) -> Series:
-        """Without the harmonics whose forces stay below `force` (N/A) at the height z, and without such torques.
+        """The series without harmonics whose forces are below `force` (N/A) at the height z, and without such torques.
 
-        A harmonic's three forces stay or go together, as without curl and divergence. Each of its torques counts as a
-        force at three pole pitches, a coil's size: the arms of the coils' forces are as long.
+        The three forces of a harmonic are kept or left out together, so that the field has no curl and no divergence.
+        A torque counts as a force at three pole pitches, the size of a coil: the arms of the coils' forces are as long.
         """
         size = np.abs(self.scale * self.G * np.exp(-self.K * z))
         kept = size[:3].max(axis=0) >= force
@@ -254,7 +254,7 @@ def unit_series(shape: Shape, order: int) -> Series:
 def series(par: Parameters | Shape, field: Modes, coil: Winding) -> Series:
     """(12), (13) harmonic by harmonic: plan by quadrature, height in closed form, position by addition theorems.
 
-    The terms that a coil of four-fold symmetry does not have are left out.
+    Terms that vanish for a coil of four-fold symmetry are left out.
     """
     m, n, K = field.m[:, None], field.n[:, None], field.K
     kappa = np.hypot(m, n)
@@ -277,7 +277,7 @@ def series(par: Parameters | Shape, field: Modes, coil: Winding) -> Series:
     G = G * zeroth
     G[3:5] += torque
     G *= par.N_c / (par.w_c * par.h_c) * field.b
-    G[np.abs(G) < 1e-13 * np.abs(G).max()] = 0  # rounding of what symmetry makes zero
+    G[np.abs(G) < 1e-13 * np.abs(G).max()] = 0  # these are zero by symmetry, but for rounding
     kept = np.abs(G).max(axis=0) > 0
     m_n = readonly(field.m[kept]), readonly(field.n[kept])
     return Series(*m_n, k=field.k, K=readonly(K[kept]), G=readonly(G[:, kept]))

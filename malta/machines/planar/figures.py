@@ -11,18 +11,18 @@ import numpy as np
 from malta.report.figures.parts import (
     STYLES,
     Published,
-    bound_line,
-    finish,
-    line,
-    mark,
+    add_shared_legend,
+    draw_bound,
+    draw_grid,
+    draw_line,
+    draw_published,
+    finish_axes,
+    mark_end,
+    merit_phrase,
+    new_page,
     number,
-    page,
-    plain,
-    published_line,
-    read_out,
+    published_in_unit,
     runs_of,
-    said,
-    shared_legend,
 )
 
 if TYPE_CHECKING:
@@ -34,13 +34,13 @@ if TYPE_CHECKING:
 
 
 def step_figure(e: Experiment, published: Published | None = None) -> Figure:
-    """Figs 9 to 12: motion, forces, and what moves that should not, from the place without symmetry."""
+    """Figs 9 to 12: motion, forces, and deviations of the other outputs, from the place without symmetry."""
     cases = [case for case in e.cases if case.label.endswith(e.cases[0].label.split(", ", 1)[1])]
     run, inputs = e.run, [s.name for s in e.run.plant.inputs]
-    merits = {merit.label: said(merit) for merit in e.merits}
+    merits = {merit.label: merit_phrase(merit) for merit in e.merits}
     names = {"table moves phi by": "table", "analytical moves phi by": "analytical"}
     told = [f"{short} {merits[label]}" for label, short in names.items() if label in merits]
-    figure = page(
+    figure = new_page(
         runs_of(e),
         f"steps in z and y {cases[0].label.split(', ', 1)[1]}, by coil model of the controller",
         "phi moved by the coil model: " + ", ".join(told) if told else e.outcome,
@@ -51,9 +51,9 @@ def step_figure(e: Experiment, published: Published | None = None) -> Figure:
     (motion, across, forces), *below = figure.subplots(2, 3, sharex=True)
     for k, style in ((1, STYLES[0]), (2, STYLES[3])):
         moved = (run.p[:, k] - run.reference[0, k]) * 1e3
-        line(motion, run.t * 1e3, moved, label=run.plant.outputs[k].name, **style)
+        draw_line(motion, run.t * 1e3, moved, label=run.plant.outputs[k].name, **style)
         name = f"F_{run.plant.outputs[k].name}"
-        line(forces, run.t * 1e3, run.v[:, inputs.index(name)], label=name, **style)
+        draw_line(forces, run.t * 1e3, run.v[:, inputs.index(name)], label=name, **style)
     for axes, k, scale in (
         (across, 0, 1e9),
         (below[0][0], 3, 1e6),
@@ -63,26 +63,26 @@ def step_figure(e: Experiment, published: Published | None = None) -> Figure:
         for case, style in zip(cases, STYLES, strict=False):
             ms, error = case.run.t * 1e3, (case.run.p - case.run.reference)[:, k] * scale
             label = {"label": case.label.split(",")[0]} if axes is across else {}
-            line(axes, ms, error, **label, **style)
-            mark(axes, case.run, ms, error)
+            draw_line(axes, ms, error, **label, **style)
+            mark_end(axes, case.run, ms, error)
         unit = "nm" if k == 0 else "µrad"
-        finish(axes, "time [ms]" if k else "", f"{run.plant.outputs[k].name}, off reference [{unit}]")
-    published_line(forces, published, "steps.force_limit", "N", "published limit", both=True)
-    finish(motion, "", "moved [mm]", legend=2)
-    finish(forces, "", "commanded force [N]", legend=2)
-    finish(across, "", "x, off reference [nm]", legend=3)
+        finish_axes(axes, "time [ms]" if k else "", f"{run.plant.outputs[k].name}, off reference [{unit}]")
+    draw_published(forces, published, "steps.force_limit", "N", "published limit", both=True)
+    finish_axes(motion, "", "moved [mm]", legend=2)
+    finish_axes(forces, "", "commanded force [N]", legend=2)
+    finish_axes(across, "", "x, off reference [nm]", legend=3)
     return figure
 
 
 def errors_figure(e: Experiment, published: Published | None = None) -> Figure:
-    """Figs 7, 8 and 13: maps of what the models miss, over the table's step, and along x."""
+    """Figs 7, 8 and 13: maps of the models' errors, errors over the table's step, and errors along x."""
     from matplotlib.ticker import FixedLocator, NullLocator
 
     c, models = e.curves, [case.label for case in e.cases]
     mm = c["x"] * 1e3
     row = len(mm) // 8  # a quarter of a pole pitch
-    largest = (f"{case.label} {said(case.merits[2])}" for case in e.cases)
-    figure = page(
+    largest = (f"{case.label} {merit_phrase(case.merits[2])}" for case in e.cases)
+    figure = new_page(
         runs_of(e),
         "one inner coil, coil models against its exact wrench",
         "largest error of F_z: " + ", ".join(largest),
@@ -93,33 +93,33 @@ def errors_figure(e: Experiment, published: Published | None = None) -> Figure:
     )
     (*maps, steps), (forces, missed, torque) = figure.subplots(2, 3)
     for axes, name in zip(maps, models, strict=False):
-        _map(axes, mm, np.abs(c[name][..., 2]) * 1e3, f"{name}: error of F_z [mN]")
+        _draw_map(axes, mm, np.abs(c[name][..., 2]) * 1e3, f"{name}: error of F_z [mN]")
     for axes in maps[len(models) :]:
         axes.set_visible(False)
     for k, (force, style) in enumerate(zip(("F_x", "F_z"), STYLES, strict=False)):
         steps.loglog(c["step"] * 1e3, c["by step"][:, k], marker="o", markersize=3, label=force, **style)
         if published is not None:
-            bound = read_out(published, f"model.error_interpolation.{force}", "N")
-            bound_line(steps, bound, f"published {force}", where=f"{('below', 'above')[k]} left")
+            bound = published_in_unit(published, f"model.error_interpolation.{force}", "N")
+            draw_bound(steps, bound, f"published {force}", where=f"{('below', 'above')[k]} left")
     names = [s.name for s in e.run.plant.inputs]
     for k, style in zip((0, 1, 2), STYLES, strict=False):
-        line(forces, mm, c["exact"][:, row, k], label=names[k], **style)
+        draw_line(forces, mm, c["exact"][:, row, k], label=names[k], **style)
     for axes, k, scale in ((missed, 0, 1e3), (torque, 3, 1e3)):
         for name, style in zip(models, (STYLES[0], STYLES[2]), strict=False):
-            line(axes, mm, c[name][:, row, k] * scale, label=name, **style)
-    finish(steps, "step of the table [mm]", "largest error [N]", legend=2)
+            draw_line(axes, mm, c[name][:, row, k] * scale, label=name, **style)
+    finish_axes(steps, "step of the table [mm]", "largest error [N]", legend=2)
     steps.xaxis.set_major_locator(FixedLocator([0.3, 0.5, 1, 2, 3]))
     steps.xaxis.set_major_formatter("{x:g}")
     steps.xaxis.set_minor_locator(NullLocator())
     where = f"x [mm], y = {number(c['x'][row] * 1e3, 3)} mm"
-    finish(forces, where, "exact force [N]", legend=3)
-    finish(missed, where, "error of F_x [mN]", legend=2)
-    finish(torque, where, "error of T_x [mN m]", legend=2)
+    finish_axes(forces, where, "exact force [N]", legend=3)
+    finish_axes(missed, where, "error of F_x [mN]", legend=2)
+    finish_axes(torque, where, "error of T_x [mN m]", legend=2)
     return figure
 
 
-def _map(axes: Axes, mm: FloatArray, values: FloatArray, text: str) -> None:
-    """Grey levels over x and y, with their scale."""
+def _draw_map(axes: Axes, mm: FloatArray, values: FloatArray, text: str) -> None:
+    """A map over x and y in grey levels, with its scale."""
     drawn = axes.pcolormesh(mm, mm, values.T, cmap="Greys", shading="gouraud", rasterized=True)
     bar = axes.figure.colorbar(drawn, ax=axes, fraction=0.05, pad=0.03)
     bar.outline.set_visible(False)
@@ -133,8 +133,10 @@ def _map(axes: Axes, mm: FloatArray, values: FloatArray, text: str) -> None:
 def delay_figure(e: Experiment, _: Published | None = None) -> Figure:
     """The largest of the three angles over time, by speed of the controller."""
     speeds = list(dict.fromkeys(case.label.split(", ")[1] for case in e.cases))
-    left = (f"{case.label} {said(case.merits[1])}" for case in e.cases if case.label.endswith(speeds[-1]))
-    figure = page(
+    left = (
+        f"{case.label} {merit_phrase(case.merits[1])}" for case in e.cases if case.label.endswith(speeds[-1])
+    )
+    figure = new_page(
         runs_of(e),
         "filters with and without the delay in their model",
         "angles left at rest: " + ", ".join(left),
@@ -148,26 +150,26 @@ def delay_figure(e: Experiment, _: Published | None = None) -> Figure:
             off = np.abs(case.run.p - case.run.reference)[:, 3:].max(axis=1) * 1e6
             off = np.maximum(off, LEAST)
             style = STYLES[0] if knows == "with" else STYLES[1]
-            line(axes, case.run.t * 1e3, off, label=f"{knows} the delay", **style)
-            mark(axes, case.run, case.run.t * 1e3, off)
+            draw_line(axes, case.run.t * 1e3, off, label=f"{knows} the delay", **style)
+            mark_end(axes, case.run, case.run.t * 1e3, off)
         axes.set_title(f"{speed} as fast as designed", fontsize=9)
-        finish(axes, "time [ms]", "largest angle, off reference [µrad]" if axes is panels[0] else "")
+        finish_axes(axes, "time [ms]", "largest angle, off reference [µrad]" if axes is panels[0] else "")
     panels[0].set_yscale("log")
     panels[0].set_ylim(bottom=LEAST)
-    shared_legend(figure)
+    add_shared_legend(figure)
     return figure
 
 
-LEAST = 1e-4  # urad, that is drawn
+LEAST = 1e-4  # urad, smallest value on the logarithmic axis
 
 
 def timing_figure(e: Experiment, published: Published | None = None) -> Figure:
-    """Times of one current decoupling as bars, beside the control period."""
+    """Computing times of one commutation as bars, beside the control period."""
     timed = [merit for merit in e.merits if merit.unit == "us" and math.isfinite(merit.value)]
     bars = {merit.label: merit.value * 1e6 for merit in timed}
     if published is not None:
-        bars["the paper's whole loop"] = read_out(published, "real_time.mean", "us")
-    figure = page(
+        bars["the paper's whole loop"] = published_in_unit(published, "real_time.mean", "us")
+    figure = new_page(
         runs_of(e),
         "K(p) and its pseudo-inverse",
         "on this computer; the paper's on an NI PXI-1042Q",
@@ -185,7 +187,7 @@ def timing_figure(e: Experiment, published: Published | None = None) -> Figure:
     axes.axvline(period, color="#9a9a9a", linestyle=(0, (8, 3)), linewidth=0.9)
     axes.set_xlim(0.1, 4 * period)
     axes.set_xlabel(f"time of one decoupling [µs]; dashed: control period, {period:g} µs")
-    plain(axes)
+    draw_grid(axes)
     return figure
 
 

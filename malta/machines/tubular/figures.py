@@ -1,4 +1,4 @@
-"""The figures of the experiments on MALTA, as its paper draws them."""
+"""The figures of the experiments on MALTA, similar to those of its paper."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import casadi as ca
 import numpy as np
 
-from malta.machines.tubular.experiments import RESTING
+from malta.machines.tubular.experiments.rest import RESTING
 from malta.model.data import plant_of
 from malta.report.figures.parts import (
     BOUND,
@@ -20,27 +20,27 @@ from malta.report.figures.parts import (
     NOTE,
     STYLES,
     Published,
-    bound_line,
-    callipers,
+    add_shared_legend,
     clearance,
+    draw_bound,
+    draw_histograms,
+    draw_line,
+    draw_published,
+    draw_spreads,
     end_of,
-    ending,
-    finish,
-    histogram,
-    line,
-    mark,
+    ended_early,
+    ending_text,
+    finish_axes,
+    label_upright,
+    mark_end,
+    merit_phrase,
+    merits_phrase,
     micro,
+    new_page,
     number,
-    page,
-    published_line,
-    read_out,
+    published_in_unit,
     runs_of,
-    said,
-    shared_legend,
-    square,
-    told,
-    touched,
-    upright,
+    square_axes,
 )
 from malta.simulation.references import hold
 from malta.simulation.trajectory import Trajectory, stroke_figures
@@ -60,31 +60,31 @@ def stroke_figure(run: Trajectory, published: Published | None = None) -> Figure
         f"axial error {f.axial_error * 1e3:.2f} mm, radial deviation {max(f.radial.values()) * 1e6:.1f} µm"
     )
     tracked = f"rise {number(f.rise * 1e3, 3)} ms, overshoot {f.overshoot * 100:.1f} %, "
-    figure = page(
+    figure = new_page(
         [run],
-        f"stroke of {(last - first) * 1e3:.3g} mm{ending(run)}",
+        f"stroke of {(last - first) * 1e3:.3g} mm{ending_text(run)}",
         (tracked if run.verdict.completed else "") + errors,
         right=0.925,
         hspace=0.24,
     )
     (position, radial), (error, current) = figure.subplots(2, 2, sharex=True)
     names = [s.name for s in plant.outputs]
-    line(position, ms, run.reference[:, axis] * 1e3, label="reference z*", **STYLES[2])
-    line(position, ms, run.p[:, axis] * 1e3, label="position z", **STYLES[0])
-    line(error, ms, (run.reference[:, axis] - run.p[:, axis]) * 1e3, **STYLES[0])
+    draw_line(position, ms, run.reference[:, axis] * 1e3, label="reference z*", **STYLES[2])
+    draw_line(position, ms, run.p[:, axis] * 1e3, label="position z", **STYLES[0])
+    draw_line(error, ms, (run.reference[:, axis] - run.p[:, axis]) * 1e3, **STYLES[0])
     for i, style in zip((k for k in range(len(names)) if k != axis), (1, 0, 3, 2), strict=False):
-        line(radial, ms, (run.p[:, i] - run.reference[:, i]) * 1e6, label=names[i], **STYLES[style])
+        draw_line(radial, ms, (run.p[:, i] - run.reference[:, i]) * 1e6, label=names[i], **STYLES[style])
     for name, style, i in _widest_currents(run):
-        line(current, ms, run.current[:, i], label=name, **STYLES[style])
-    published_line(error, published, "figure_12.axial_error", "mm", both=True)
-    published_line(radial, published, "figure_13.radial_deviation", "um", both=True)
+        draw_line(current, ms, run.current[:, i], label=name, **STYLES[style])
+    draw_published(error, published, "figure_12.axial_error", "mm", both=True)
+    draw_published(radial, published, "figure_13.radial_deviation", "um", both=True)
     reached = np.array([first, last, run.p[:, axis].min(), run.p[:, axis].max()]) * 1e3
-    margin = 0.05 * (reached.max() - reached.min())  # about the whole stroke, whatever became of it
+    margin = 0.05 * (reached.max() - reached.min())  # around the whole stroke, even if the run ended early
     position.set_ylim(reached.min() - margin, reached.max() + margin)
-    finish(position, "", "axial position z [mm]", legend=2)
-    finish(radial, "", "radial deviation [µm]", legend=4)
-    finish(error, "time [ms]", "axial error z* - z [mm]")
-    finish(current, "time [ms]", "current per module [A]", legend=3)
+    finish_axes(position, "", "axial position z [mm]", legend=2)
+    finish_axes(radial, "", "radial deviation [µm]", legend=4)
+    finish_axes(error, "time [ms]", "axial error z* - z [mm]")
+    finish_axes(current, "time [ms]", "current per module [A]", legend=3)
     constant = plant_of(run.controller.parameters).actuator.force_constant[plant.thrust_input]
     thrust = current.secondary_yaxis("right", functions=(lambda i: i * constant, lambda f: f / constant))
     thrust.set_ylabel("thrust [N]")
@@ -108,9 +108,9 @@ def hold_figure(e: Experiment, published: Published | None = None) -> Figure:
     bins = [1e6 * (r or s / 3) or 1.0 for r, s in zip(run.plant.resolution, run.plant.noise, strict=True)]
     rms, widest = np.sqrt((p**2).mean(axis=0)), np.abs(y).max(axis=0)
     radial = [k for k in range(len(names)) if k != axis]
-    figure = page(
+    figure = new_page(
         [run],
-        f"{len(y)} samples at rest{ending(run)}",
+        f"{len(y)} samples at rest{ending_text(run)}",
         "mean and standard deviation of what is measured above the bars; "
         f"true motion {number(rms[radial].max(), 2)} µm rms radially, {number(rms[axis], 2)} µm axially",
         wspace=0.33,
@@ -124,23 +124,25 @@ def hold_figure(e: Experiment, published: Published | None = None) -> Figure:
     spreads = [[("ours", float(y[:, k].mean()), float(y[:, k].std()))] for k in range(len(names))]
     if published is not None:
         for name, found in zip(names, spreads, strict=True):
-            mean, std = (read_out(published, f"table_III.{what}.{name}", "um") for what in ("mean", "std"))
+            mean, std = (
+                published_in_unit(published, f"table_III.{what}.{name}", "um") for what in ("mean", "std")
+            )
             found.append(("Table III", mean, std))
     for k, axes in enumerate(panels):
         reach = 1.4 * max(float(widest[k] if k == axis else widest[radial].max()), bins[k])
         told = [2.4 * (abs(mean) + std) for _, mean, std in spreads[k][1:]]
-        histogram(axes, (y[:, k], p[:, k]), labels, bins[k], max([min(reach, 60 * bins[k]), *told]))
-        finish(axes, f"{names[k]} [µm]", "share of samples [%]")
+        draw_histograms(axes, (y[:, k], p[:, k]), labels, bins[k], max([min(reach, 60 * bins[k]), *told]))
+        finish_axes(axes, f"{names[k]} [µm]", "share of samples [%]")
     highest = max(panels[k].dataLim.y1 for k in radial)
     for k, axes in enumerate(panels):
-        callipers(axes, spreads[k], float(axes.dataLim.y1) if k == axis else highest)
-    shared_legend(figure)
+        draw_spreads(axes, spreads[k], float(axes.dataLim.y1) if k == axis else highest)
+    add_shared_legend(figure)
     return figure
 
 
 def tilt_figure(e: Experiment, published: Published | None = None) -> Figure:
-    """The circle in sensor plane 1, what it leaves in sensor plane 2, and both over time. Fig. 16, eq. (21)."""
-    figure = page(runs_of(e), "circle in sensor plane 1, sensor plane 2 held", told(e.cases, 0))
+    """The circle in sensor plane 1, the deviation in sensor plane 2, and both over time. Fig. 16, eq. (21)."""
+    figure = new_page(runs_of(e), "circle in sensor plane 1, sensor plane 2 held", merits_phrase(e.cases, 0))
     (circle, tracking), (blow_up, deviation) = figure.subplots(2, 2, width_ratios=(1, 1.6))
     for case, style in zip(e.cases, STYLES, strict=False):
         run, error = case.run, (case.run.p - case.run.reference) * 1e6
@@ -149,57 +151,60 @@ def tilt_figure(e: Experiment, published: Published | None = None) -> Figure:
         blow_up.plot(error[late, 2], error[late, 3], **style)
         for axes, k in ((tracking, 0), (deviation, 2)):
             distance = np.hypot(error[:, k], error[:, k + 1])
-            line(axes, run.t, distance, **style)
-            mark(axes, run, run.t, distance)
+            draw_line(axes, run.t, distance, **style)
+            mark_end(axes, run, run.t, distance)
     asked = e.run.reference * 1e6
     circle.plot(
         asked[:, 0], asked[:, 1], label="reference", **STYLES[2] | {"color": "#000000", "linewidth": 0.9}
     )
     bound = 0.0
     if published is not None:
-        bound, angle = read_out(published, "figure_16.deviation", "um"), np.linspace(0, 2 * math.pi, 181)
+        bound, angle = (
+            published_in_unit(published, "figure_16.deviation", "um"),
+            np.linspace(0, 2 * math.pi, 181),
+        )
         blow_up.plot(bound * np.cos(angle), bound * np.sin(angle), **BOUND)
         blow_up.annotate("published bound", (0, -1.08 * bound), ha="center", va="top", **NOTE)
     for axes in (tracking, deviation):
         axes.set_yscale("log")
         axes.set_ylim(bottom=0.1)
-    published_line(deviation, published, "figure_16.deviation", "um", where="below right")
-    square(circle)
-    square(blow_up, least=1.4 * bound)
-    late_part = "second half" if any(map(touched, runs_of(e))) else "last period"
-    finish(circle, f"x1, {late_part} [µm]", "y1 [µm]")
-    finish(blow_up, f"x2, {late_part} [µm]", "y2 [µm]")
-    finish(tracking, "time [s]", "plane 1, off reference [µm]")
-    finish(deviation, "time [s]", "plane 2, off centre [µm]")
-    shared_legend(figure)
+    draw_published(deviation, published, "figure_16.deviation", "um", where="below right")
+    square_axes(circle)
+    square_axes(blow_up, least=1.4 * bound)
+    late_part = "second half" if any(map(ended_early, runs_of(e))) else "last period"
+    finish_axes(circle, f"x1, {late_part} [µm]", "y1 [µm]")
+    finish_axes(blow_up, f"x2, {late_part} [µm]", "y2 [µm]")
+    finish_axes(tracking, "time [s]", "plane 1, off reference [µm]")
+    finish_axes(deviation, "time [s]", "plane 2, off centre [µm]")
+    add_shared_legend(figure)
     return figure
 
 
 def lift_off_figure(e: Experiment, _: Published | None = None) -> Figure:
     """From the touchdown bearing to the centre, and the bearing currents, for each start-up estimator."""
     plant, runs = e.run.plant, runs_of(e)
-    figure = page(runs, "lift-off from the touchdown bearing", told(e.cases, 1), hspace=0.2)
+    figure = new_page(runs, "lift-off from the touchdown bearing", merits_phrase(e.cases, 1), hspace=0.2)
     panels = figure.subplots(2, 2, sharex=True, sharey="row")
     for k, (height, current) in zip((1, 3), panels.T, strict=True):
         for case, style in zip(e.cases, STYLES, strict=False):
             ms, y = case.run.t * 1e3, case.run.p[:, k] * 1e6
-            line(height, ms, y, label=case.label, **style)
-            mark(height, case.run, ms, y)
-            line(current, ms, case.run.force[:, k] / plant.actuator.force_constant[k], **style)
-        bound_line(height, -clearance(plant) * 1e6, "touchdown bearing")
-        bound_line(current, e.merits[0].value, "lifts it by statics")
-        finish(height, "", f"{plant.outputs[k].name} [µm]")
-        finish(current, "time [ms]", f"current of {plant.inputs[k].name} [A]")
+            draw_line(height, ms, y, label=case.label, **style)
+            mark_end(height, case.run, ms, y)
+            draw_line(current, ms, case.run.force[:, k] / plant.actuator.force_constant[k], **style)
+        draw_bound(height, -clearance(plant) * 1e6, "touchdown bearing")
+        draw_bound(current, e.merits[0].value, "lifts it by statics")
+        finish_axes(height, "", f"{plant.outputs[k].name} [µm]")
+        finish_axes(current, "time [ms]", f"current of {plant.inputs[k].name} [A]")
     moving = max(float(run.t[np.flatnonzero(np.abs(run.p[:, 1]) > 20e-6)].max(initial=0.0)) for run in runs)
     panels[0, 0].set_xlim(0, 1e3 * min(1.6 * moving, max(float(run.t[-1]) for run in runs)) or None)
-    shared_legend(figure)
+    add_shared_legend(figure)
     return figure
 
 
 def payload_figure(e: Experiment, published: Published | None = None) -> Figure:
     """Sag after the pick and the stroke that follows, for each mass; touchdowns are marked."""
     plant, runs = e.run.plant, runs_of(e)
-    figure = page(runs, "masses picked during a hold, then moved", told(e.cases, 0))
+    figure = new_page(runs, "masses picked during a hold, then moved", merits_phrase(e.cases, 0))
     (sag, axial), (largest, radial) = figure.subplots(2, 2)
     t, picked = e.run.t, e.run.scenario.changes[0][0]
     begin = _half_way(e.run) - 0.05
@@ -212,71 +217,71 @@ def payload_figure(e: Experiment, published: Published | None = None) -> Figure:
         run, y = case.run, case.run.p[:, lowest] * 1e6
         last = int(np.searchsorted(run.t, begin))
         shown = slice(0, min(last, end_of(run) + 1))
-        line(sag, (run.t[shown] - picked) * 1e3, y[shown], label=case.label, **style)
-        mark(sag, run, (run.t - picked) * 1e3, y)
-        largest.plot(mass, case.merits[0].value * 1e6, **(CROSS if touched(run) else DOT))
-        if not touched(run):
+        draw_line(sag, (run.t[shown] - picked) * 1e3, y[shown], label=case.label, **style)
+        mark_end(sag, run, (run.t - picked) * 1e3, y)
+        largest.plot(mass, case.merits[0].value * 1e6, **(CROSS if ended_early(run) else DOT))
+        if not ended_early(run):
             ms, error = (run.t[last:] - begin) * 1e3, (run.reference - run.p)[last:]
-            line(axial, ms, error[:, plant.stroke_output] * 1e3, **style)
-            line(radial, ms, np.abs(error[:, :4]).max(axis=1) * 1e6, **style)
-    if all(map(touched, runs)):
+            draw_line(axial, ms, error[:, plant.stroke_output] * 1e3, **style)
+            draw_line(radial, ms, np.abs(error[:, :4]).max(axis=1) * 1e6, **style)
+    if all(map(ended_early, runs)):
         axial.annotate("none is carried", (0.5, 0.5), xycoords="axes fraction", ha="center", **NOTE)
-    bound_line(sag, -clearance(plant) * 1e6, "touchdown bearing")
-    bound_line(largest, clearance(plant) * 1e6, "touchdown bearing", where="above left")
+    draw_bound(sag, -clearance(plant) * 1e6, "touchdown bearing")
+    draw_bound(largest, clearance(plant) * 1e6, "touchdown bearing", where="above left")
     if published is not None:
-        payload = read_out(published, "position_controller.payload", "kg") * 1e3
+        payload = published_in_unit(published, "position_controller.payload", "kg") * 1e3
         largest.axvline(payload, **BOUND)
-        upright(largest, payload, 0.26, "published payload", ha="right")
-    published_line(axial, published, "figure_12.axial_error", "mm", EMPTY, both=True, where="above left")
-    published_line(radial, published, "figure_13.radial_deviation", "um", EMPTY, where="above left")
-    finish(sag, "time after the pick [ms]", f"sag {plant.outputs[lowest].name} [µm]")
-    finish(largest, "picked mass [g]", "largest sag [µm]")
+        label_upright(largest, payload, 0.26, "published payload", ha="right")
+    draw_published(axial, published, "figure_12.axial_error", "mm", EMPTY, both=True, where="above left")
+    draw_published(radial, published, "figure_13.radial_deviation", "um", EMPTY, where="above left")
+    finish_axes(sag, "time after the pick [ms]", f"sag {plant.outputs[lowest].name} [µm]")
+    finish_axes(largest, "picked mass [g]", "largest sag [µm]")
     largest.set(xlim=(0, 1.1 * max(masses)), ylim=(0, None))
     radial.set_ylim(0, None)
-    finish(axial, "time of the stroke [ms]", "axial error z* - z [mm]")
-    finish(radial, "time of the stroke [ms]", "largest radial deviation [µm]")
-    shared_legend(figure)
+    finish_axes(axial, "time of the stroke [ms]", "axial error z* - z [mm]")
+    finish_axes(radial, "time of the stroke [ms]", "largest radial deviation [µm]")
+    add_shared_legend(figure)
     return figure
 
 
-EMPTY = "published, empty"  # the paper's bounds are of a stroke without payload
+EMPTY = "published, empty"  # the paper's bounds hold for a stroke without payload
 
 
 def _half_way(run: Trajectory) -> float:
-    """When the reference of the stroke axis is fastest, s; of the whole scenario."""
+    """Time at which the reference of the stroke is fastest, s, in the whole scenario."""
     t = np.arange(0, run.scenario.duration, run.controller.sample_time)
     return float(t[np.abs(run.scenario.reference(run.plant)(t).dp[:, run.plant.stroke_output]).argmax()])
 
 
 def thermal_figure(e: Experiment, published: Published | None = None) -> Figure:
-    """The drift of the support, and the mover's place in space with and without the outer loop. Fig. 15."""
-    _, now, true = (said(merit) for merit in e.merits)
-    found = f"{told(e.cases, 0)}; lag {now}, at true speed {true}"
-    figure = page(runs_of(e), "support drifts by thermal expansion", found, hspace=0.18)
+    """The drift of the support, and the mover's position in space with and without the outer loop. Fig. 15."""
+    _, now, true = (merit_phrase(merit) for merit in e.merits)
+    found = f"{merits_phrase(e.cases, 0)}; lag {now}, at true speed {true}"
+    figure = new_page(runs_of(e), "support drifts by thermal expansion", found, hspace=0.18)
     space, blow_up = figure.subplots(2, 1, sharex=True)
     t, drift = e.run.t, e.curves["drift"]
-    line(space, t, drift * 1e6, label="drift of the support", color="#cfcfcf", linewidth=6)
+    draw_line(space, t, drift * 1e6, label="drift of the support", color="#cfcfcf", linewidth=6)
     for case, style in zip(e.cases, STYLES, strict=False):
         size = min(len(t), len(case.run.t))
         place = (case.run.p[:size, 2] + drift[:size]) * 1e6
-        line(space, t[:size], place, label=f"mover in space, {case.label}", **style)
-        mark(space, case.run, t[:size], place)
+        draw_line(space, t[:size], place, label=f"mover in space, {case.label}", **style)
+        mark_end(space, case.run, t[:size], place)
         if case is e.cases[0]:
-            line(blow_up, t, place, **style | {"linewidth": 0.8})
+            draw_line(blow_up, t, place, **style | {"linewidth": 0.8})
     read = ("figure_14.resolution", "um", "published resolution of the sensors")
-    published_line(blow_up, published, *read, both=True, where="under right")
-    finish(space, "", "x2 in space [µm]")
-    finish(blow_up, "simulated time [s]", f"{e.cases[0].label}, enlarged [µm]")
-    shared_legend(figure)
+    draw_published(blow_up, published, *read, both=True, where="under right")
+    finish_axes(space, "", "x2 in space [µm]")
+    finish_axes(blow_up, "simulated time [s]", f"{e.cases[0].label}, enlarged [µm]")
+    add_shared_legend(figure)
     return figure
 
 
 def disturbance_figure(e: Experiment, _: Published | None = None) -> Figure:
     """Compliance over frequency with simulated points, and the responses to steps and to vibration."""
     plant, c = e.run.plant, e.curves
-    worst, at, stiffness = (said(merit) for merit in e.merits)
+    worst, at, stiffness = (merit_phrase(merit) for merit in e.merits)
     found = f"largest compliance {worst} at {at}, smallest dynamic stiffness {stiffness}"
-    figure = page(runs_of(e), "forces and torques on the mover", found, hspace=0.44)
+    figure = new_page(runs_of(e), "forces and torques on the mover", found, hspace=0.44)
     (compliance, radial), (axial, vibration) = figure.subplots(2, 2)
     compliance.loglog(
         c["frequency"], c["compliance"] * 1e6, label="linear loop, currents as lags", **STYLES[0]
@@ -288,18 +293,18 @@ def disturbance_figure(e: Experiment, _: Published | None = None) -> Figure:
         run, ms = case.run, case.run.t * 1e3
         if not case.label.startswith("step"):
             late = run.t > run.t[-1] - 0.1
-            line(vibration, ms[late], run.p[late, 1] * 1e6, label=case.label, **STYLES[0])
+            draw_line(vibration, ms[late], run.p[late, 1] * 1e6, label=case.label, **STYLES[0])
             continue
         if "F_z" in case.label:
             axes, deflection, style = axial, run.p[:, plant.stroke_output] * 1e3, STYLES[0]
         else:
             axes, deflection, style = radial, run.p[:, 0] * 1e6, next(sideways)
-        line(axes, ms, deflection, label=case.label.removeprefix("step of "), **style)
-        mark(axes, run, ms, deflection)
-    finish(compliance, "frequency [Hz]", "x1 over F_x [µm/N]", legend=2)
-    finish(radial, "time [ms]", f"{plant.outputs[0].name} [µm]", legend=3)
-    finish(axial, "time [ms]", f"{plant.stroke} [mm]", legend=2)
-    finish(vibration, "time [ms]", f"{plant.outputs[1].name} [µm]", legend=1)
+        draw_line(axes, ms, deflection, label=case.label.removeprefix("step of "), **style)
+        mark_end(axes, run, ms, deflection)
+    finish_axes(compliance, "frequency [Hz]", "x1 over F_x [µm/N]", legend=2)
+    finish_axes(radial, "time [ms]", f"{plant.outputs[0].name} [µm]", legend=3)
+    finish_axes(axial, "time [ms]", f"{plant.stroke} [mm]", legend=2)
+    finish_axes(vibration, "time [ms]", f"{plant.outputs[1].name} [µm]", legend=1)
     return figure
 
 
@@ -308,12 +313,12 @@ def faults_figure(e: Experiment, _: Published | None = None) -> Figure:
     edge = clearance(e.run.plant) * 1e6
     survived = f"{e.merits[0].value:.0f} of {len(e.cases)} survived"
     during = "stroke" if e.run.scenario.reference is not hold else "hold"
-    figure = page(runs_of(e), f"faults during a {during}", survived, left=0.245, wspace=0.24)
+    figure = new_page(runs_of(e), f"faults during a {during}", survived, left=0.245, wspace=0.24)
     bars, traces = figure.subplots(1, 2, width_ratios=(1, 1.25))
     for place, case in enumerate(e.cases):
-        down, deviation = touched(case.run), case.merits[0].value * 1e6
+        down, deviation = ended_early(case.run), case.merits[0].value * 1e6
         bars.barh(place, deviation, height=0.62, color="#2b2b2b" if down else "#c9c9c9")
-        text = _when(case.merits[1]) if down else f"{number(deviation, 2)} µm"
+        text = _touchdown_text(case.merits[1]) if down else f"{number(deviation, 2)} µm"
         inside = deviation > edge / 10
         style = NOTE | {"color": "#ffffff" if down else NOTE["color"], "ha": "right" if inside else "left"}
         bars.annotate(text, (deviation * (0.88 if inside else 1.1), place), va="center", **style)
@@ -322,7 +327,7 @@ def faults_figure(e: Experiment, _: Published | None = None) -> Figure:
     bars.set_xscale("log")
     bars.set_xlim(0.1, 2 * edge)
     bars.axvline(edge, **BOUND)
-    upright(bars, 1.1 * edge, 0.02, "touchdown bearing", ha="left")
+    label_upright(bars, 1.1 * edge, 0.02, "touchdown bearing", ha="left")
     struck = e.run.scenario.faults[0].at
     traces.set_xlim(-20, (e.run.scenario.duration - struck) * 1e3)
     worst = sorted(e.cases, key=lambda case: -case.merits[0].value)[: len(STYLES)]
@@ -330,38 +335,41 @@ def faults_figure(e: Experiment, _: Published | None = None) -> Figure:
         run, last = case.run, end_of(case.run) + 1
         ms = (run.t[:last] - struck) * 1e3
         deviation = np.maximum(np.abs(run.p[:last, :4]).max(axis=1) * 1e6, 1e-3)
-        line(traces, ms, deviation, label=micro(case.label), **style)
-        mark(traces, run, ms, deviation, named=False)
+        draw_line(traces, ms, deviation, label=micro(case.label), **style)
+        mark_end(traces, run, ms, deviation, named=False)
     traces.set_yscale("log")
     traces.set_ylim(bottom=0.1)
-    bound_line(traces, edge, "touchdown bearing")
-    finish(bars, "largest radial deviation [µm]", "")
-    finish(traces, "time after the fault [ms]", "radial deviation of the worst [µm]", legend=2, side="right")
+    draw_bound(traces, edge, "touchdown bearing")
+    finish_axes(bars, "largest radial deviation [µm]", "")
+    finish_axes(
+        traces, "time after the fault [ms]", "radial deviation of the worst [µm]", legend=2, side="right"
+    )
     return figure
 
 
-def _when(after: Merit) -> str:
-    return f"touchdown after {said(after)}" if after.value >= 0 else "touchdown before it"
+def _touchdown_text(after: Merit) -> str:
+    """When a fault led to a touchdown."""
+    return f"touchdown after {merit_phrase(after)}" if after.value >= 0 else "touchdown before it"
 
 
 def drive_limits_figure(e: Experiment, _: Published | None = None) -> Figure:
     """Position, speed, current and voltage of the fastest stroke and of the sigmoid, against the limits."""
     plant, actuator = e.run.plant, e.run.plant.actuator
     what = "fastest stroke, and sigmoid of the same peak current"
-    what += "".join(f", {case.label}{ending(case.run)}" for case in e.cases if ending(case.run))
-    figure = page(runs_of(e), what, told(e.cases, 1), hspace=0.2)
+    what += "".join(f", {case.label}{ending_text(case.run)}" for case in e.cases if ending_text(case.run))
+    figure = new_page(runs_of(e), what, merits_phrase(e.cases, 1), hspace=0.2)
     (position, current), (speed, voltage) = figure.subplots(2, 2, sharex=True)
     half = 0.75e3 * e.cases[-1].merits[1].value
     position.set_xlim(-half, half)
     thrust, rate = _thrust_axis(plant), len(plant.states) // 2 + plant.stroke_state
     for case, style in zip(e.cases, STYLES, strict=False):
         run, ms = case.run, (case.run.t - case.run.scenario.duration / 2) * 1e3
-        line(position, ms, run.p[:, plant.stroke_output] * 1e3, label=case.label, **style)
-        mark(position, run, ms, run.p[:, plant.stroke_output] * 1e3)
-        line(speed, ms, run.x[:, rate], **style)
-        line(current, ms, run.axis_currents[:, thrust], **style)
+        draw_line(position, ms, run.p[:, plant.stroke_output] * 1e3, label=case.label, **style)
+        mark_end(position, run, ms, run.p[:, plant.stroke_output] * 1e3)
+        draw_line(speed, ms, run.x[:, rate], **style)
+        draw_line(current, ms, run.axis_currents[:, thrust], **style)
         if run.u.size:
-            line(voltage, ms, run.u[:, thrust], **style)
+            draw_line(voltage, ms, run.u[:, thrust], **style)
     if not e.run.u.size:
         note = f"none at fidelity {e.run.scenario.fidelity}"
         voltage.annotate(note, (0.5, 0.5), xycoords="axes fraction", ha="center", **NOTE)
@@ -369,25 +377,25 @@ def drive_limits_figure(e: Experiment, _: Published | None = None) -> Figure:
         (current, e.merits[0], actuator.current_limit),
         (voltage, e.merits[1], actuator.voltage_limit),
     ):
-        bound_line(axes, merit.value, "for the reference", both=True, where="below left")
-        bound_line(axes, limit, "limit of the drive", both=True, where="above left")
-    finish(position, "", "position z [mm]")
-    finish(current, "", "current per module [A]")
-    finish(speed, "time from half-way [ms]", "speed [m/s]")
-    finish(voltage, "time from half-way [ms]", "voltage per module [V]")
-    shared_legend(figure)
+        draw_bound(axes, merit.value, "for the reference", both=True, where="below left")
+        draw_bound(axes, limit, "limit of the drive", both=True, where="above left")
+    finish_axes(position, "", "position z [mm]")
+    finish_axes(current, "", "current per module [A]")
+    finish_axes(speed, "time from half-way [ms]", "speed [m/s]")
+    finish_axes(voltage, "time from half-way [ms]", "voltage per module [V]")
+    add_shared_legend(figure)
     return figure
 
 
 def _thrust_axis(plant: Plant) -> int:
-    """The first axis that carries the thrust current."""
+    """The first axis with a thrust current."""
     unit = np.zeros(len(plant.inputs))
     unit[plant.thrust_input] = 1.0
     return int(np.flatnonzero(np.array(ca.DM(plant.drive.command(ca.DM(unit)))))[0])
 
 
 def _published_stroke(e: Experiment, published: Published | None) -> Figure:
-    """Bounds only where the paper shows this very stroke."""
+    """`stroke_figure`, with published bounds only for the published stroke."""
     return stroke_figure(e.run, published if any(merit.published for merit in e.merits) else None)
 
 

@@ -8,24 +8,17 @@ Two modules act at z = -l_B and z = +l_B, two radial sensor planes sit at z = -l
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 import casadi as ca
 
-from malta.machines.tubular.windings import (
-    AXES,
-    WEIGHT,
-    hall_position,
-    to_axes,
-    to_phases,
-)
+from malta.machines.tubular.drive import drive
+from malta.machines.tubular.windings import hall_position
 from malta.model.data import check_parameters, si
 from malta.model.plant import (
     Actuator,
-    Drive,
     Plant,
     Signal,
     traced,
@@ -44,7 +37,7 @@ from malta.model.rigidbody import (
 
 @dataclass(frozen=True)
 class Parameters:
-    """Physical parameters, SI; where each comes from is said in data/tubular.toml."""
+    """Physical parameters, SI. data/tubular.toml has the source of each."""
 
     m: float = si("kg", above=0)  # mover with magnets
     I_xx: float = si("kg m^2", above=0)  # moments of inertia in frame R
@@ -70,7 +63,7 @@ class Parameters:
     f_pwm: float = si("Hz", above=0)
     T_cc: float = si("s", above=0)  # period of the current controllers
     w_cc: float = si("rad/s", above=0)  # crossover of the current loops
-    pm_cc: float = si("rad", above=0)  # their phase margin
+    pm_cc: float = si("rad", above=0)  # phase margin of the current loops
     T_d: float = si("s", at_least=0, shapes=True)  # dead time of computation and hold
     z_max: float = si("m", above=0)  # axial travel, either way
     r_max: float = si("m", above=0)  # radial travel, either way: touchdown
@@ -136,20 +129,7 @@ def plant(par: Parameters, *, small_angle: bool = False) -> Plant:
         forces=lambda _, i: ca.vertcat(*constants) * i,
         limited=lambda i: ca.fmax(ca.fmin(i, par.I_max), -par.I_max),
         tabulated=False,
-        actuator=Actuator(
-            coils=COILS,
-            force_limit=tuple(par.I_max * constant for constant in constants),
-            force_constant=constants,
-            current_limit=par.I_max,
-            voltage_limit=par.V_max,
-            R=par.R,
-            L=par.L,
-            crossover=par.w_cc,
-            phase_margin=par.pm_cc,
-            sample_time=par.T_cc,
-            loop_delay=par.T_d,
-            dead_time=par.T_d,
-        ),
+        actuator=_actuator(par, constants),
         windings=drive(par),
         electronics=None,
         contacts=("touchdown at sensor plane 1", "touchdown at sensor plane 2", "axial end stop"),
@@ -170,6 +150,24 @@ def plant(par: Parameters, *, small_angle: bool = False) -> Plant:
     )
 
 
+def _actuator(par: Parameters, constants: tuple[float, ...]) -> Actuator:
+    """The current loops and their limits; `constants` are N/A of each input."""
+    return Actuator(
+        coils=COILS,
+        force_limit=tuple(par.I_max * constant for constant in constants),
+        force_constant=constants,
+        current_limit=par.I_max,
+        voltage_limit=par.V_max,
+        R=par.R,
+        L=par.L,
+        crossover=par.w_cc,
+        phase_margin=par.pm_cc,
+        sample_time=par.T_cc,
+        loop_delay=par.T_d,
+        dead_time=par.T_d,
+    )
+
+
 def _wrench(par: Parameters, x: Any, u: Any, n: Any, *, conservative: bool) -> tuple[Any, Any]:
     """Sums of F_i and of l_i F_i over the modules, in frame I: eqs (5)-(14). n: x and y of the mover's axis.
 
@@ -184,7 +182,7 @@ def _wrench(par: Parameters, x: Any, u: Any, n: Any, *, conservative: bool) -> t
     F_xy = f_1 + f_2 + F_A
     M_xy = par.l_B * (f_2 - f_1) + 2 * par.K_A * (par.l_B * par.l_B) * n - z * F_xy
     # The potential -K_A |P_i,xy|^2 / 2 has an axial slope too, because l_i falls as z grows. The paper's (9), (10)
-    # leave it out: second order, absent from every linearization, but without it a moving mover loses or wins energy.
+    # leave it out. It is of second order and absent from every linearization, but without it energy is not conserved.
     F_z = f_D - ca.dot(F_A, n) if conservative else f_D
     return ca.vertcat(F_xy, F_z), ca.vertcat(M_xy, -z * f_D)
 
@@ -196,7 +194,7 @@ def load(par: Parameters, x: Any) -> Any:
 
 
 def measured(par: Parameters, x: Any, trig: Trig = EXACT) -> Any:
-    """p = (x1, y1, x2, y2, z): where the mover's axis pierces the planes z = -l_S and z = +l_S.
+    """p = (x1, y1, x2, y2, z): where the mover's axis intersects the planes z = -l_S and z = +l_S.
 
     With small angles this is p = P_0(z) q, eq. (15).
     """
@@ -206,14 +204,14 @@ def measured(par: Parameters, x: Any, trig: Trig = EXACT) -> Any:
 
 
 def contact(par: Parameters, x: Any, trig: Trig = EXACT) -> Any:
-    """Share of the clearance that is used up, 1 at contact; the touchdown bearings are taken at the sensor planes."""
+    """Shares of the clearances that are used up, 1 at contact; touchdown bearings are in the sensor planes."""
     p = measured(par, x, trig)
     radii = [ca.sqrt(p[i] ** 2 + p[i + 1] ** 2) / par.r_max for i in (0, 2)]
     return ca.vertcat(*radii, ca.fabs(p[4]) / par.z_max)
 
 
 def touchdown_bearing(par: Parameters, x: Any, trig: Trig = EXACT) -> Any:
-    """Wrench of the touchdown bearings, taken at the sensor planes: k_t delta + d_t delta', pushing only, no friction.
+    """Wrench of the touchdown bearings in the sensor planes: k_t delta + d_t delta', never pulling, without friction.
 
     delta is how far the mover's axis is beyond the clearance r_max at the plane. `x` is a CasADi SX symbol.
     """
@@ -233,79 +231,11 @@ def touchdown_bearing(par: Parameters, x: Any, trig: Trig = EXACT) -> Any:
 
 
 def sensed(par: Parameters, x: Any, errors: Any, trig: Trig = EXACT) -> Any:
-    """What the sensors give before noise: eddy currents with gain and offset errors, Hall sensors for z."""
+    """Sensor signals before noise: eddy-current sensors with gain and offset errors, Hall sensors for z."""
     p = measured(par, x, trig)
     radial = [(1 + errors[i]) * p[i] + errors[4 + i] for i in range(4)]
     z = hall_position(p[4], (p[0], p[2]), (p[1], p[3]), par.L_p, (errors[8], errors[9], errors[10]))
     return ca.vertcat(*radial, z)
-
-
-def drive(par: Parameters) -> Drive:
-    """Two modules of 3 x 3 coils on 18 half-bridges; star points along the machine.
-
-    NOTE: K_D = 5.2 N/A is 2.99 K_ind, where the power balance of an amplitude-invariant transformation asks for
-    4.5 K_ind. Both are the paper's measured constants and kept as such: electrical and mechanical power do not balance.
-    """
-
-    def modules(make: Callable[[Any], Any], x: Any) -> Any:
-        theta = math.pi * x[2] / par.L_p
-        return ca.diagcat(make(theta), make(theta))
-
-    def command(i: Any) -> Any:  # of fx_B1 fy_B1 fx_B2 fy_B2 f_D
-        return ca.vertcat(0, i[4], i[0], 0, i[1], 0, 0, i[4], i[2], 0, i[3], 0)
-
-    def force(i: Any) -> Any:
-        return ca.vertcat(
-            par.K_B * i[2], par.K_B * i[4], par.K_B * i[8], par.K_B * i[10], par.K_D * (i[1] + i[7])
-        )
-
-    def emf(x: Any) -> Any:
-        return ca.vertcat(0, par.K_ind * x[8], ca.SX(5, 1), par.K_ind * x[8], ca.SX(4, 1))
-
-    def coupling(
-        x: Any, i: Any
-    ) -> Any:  # d' gets theta' q and q' gets -theta' d: the axes move, the windings do not
-        turned = [part for d in range(0, 12, 2) for part in (i[d + 1], -i[d])]
-        return math.pi / par.L_p * x[8] * ca.vertcat(*turned)
-
-    def turned(v: Any) -> Any:
-        """Bearing axes at phi = atan2(f_y, f_x) of each module: (18), with its atan2 of two arguments."""
-        blocks = []
-        for f_x, f_y in ((v[0], v[1]), (v[2], v[3])):
-            phi = ca.atan2(f_y, f_x)
-            c, s = ca.cos(phi) * ca.SX.eye(2), ca.sin(phi) * ca.SX.eye(2)
-            blocks += [ca.SX.eye(2), ca.vertcat(ca.horzcat(c, s), ca.horzcat(-s, c))]
-        return ca.diagcat(*blocks)
-
-    def peak(u: Any) -> Any:
-        """A bound of the phase quantities at any position: both sequences' amplitudes, as if they met in one."""
-        sizes = []
-        for k in (0, 6):
-            sizes.append(ca.sqrt(ca.sumsqr(u[k : k + 2])) + ca.sqrt(ca.sumsqr(u[k + 2 : k + 6])))
-        return ca.vertcat(*sizes)
-
-    return Drive(
-        axes=tuple(Signal(f"i_{axis}{module}", "A") for module in (1, 2) for axis in AXES),
-        phases=tuple(
-            Signal(f"i_{r}{c}_{module}", "A") for module in (1, 2) for r in (1, 2, 3) for c in (1, 2, 3)
-        ),
-        command=command,
-        force=force,
-        emf=emf,
-        coupling=coupling,
-        to_phases=lambda x: modules(to_phases, x),
-        to_axes=lambda x: modules(to_axes, x),
-        turned=turned,
-        peak=peak,
-        groups=(tuple(range(6)), tuple(range(6, 12))),
-        stars=tuple(tuple(range(k, k + 3)) for k in range(0, 18, 3)),
-        weight=2 * WEIGHT,
-        link_voltage=par.V_dc,
-        link_capacitance=par.C_dc,
-        supply_resistance=par.R_dc,
-        pwm_step=par.f_pwm / par.f_clk,
-        dead_share=par.t_dead * par.f_pwm,
-    )
 
 
 def position_of(par: Parameters, p: Any) -> Any:

@@ -1,4 +1,4 @@
-"""What MALTA's designs can be asked for, beside what every machine can: rest, strokes, tilts, payload and lift-off."""
+"""Requirements on designs of MALTA, besides those of every machine: rest, strokes, tilts, payload and lift-off."""
 
 from __future__ import annotations
 
@@ -28,22 +28,26 @@ if TYPE_CHECKING:
 DRIVE = "K_D"  # the force constant of the drive, which scales the thrust and no other force
 DRIVE_ERROR = 0.05  # of the drive's force constant, in the strokes of tracking_error
 TILT, TILTING = 200e-6, 2.0  # m, Hz: the tilt of the experiment
-SIGMAS = 4.5  # the largest of 10 000 samples
+SIGMAS = 4.5  # the largest of 10 000 normal samples, in standard deviations
 
 
 def _radial(plant: Plant) -> list[int]:
+    """Columns of the radial outputs."""
     return [k for k in range(len(plant.outputs)) if k != plant.stroke_output]
 
 
 def _axial(plant: Plant) -> list[int]:
+    """Column of the axial output."""
     return [plant.stroke_output]
 
 
 def _bearings(plant: Plant) -> list[int]:
+    """Columns of the bearing forces."""
     return [k for k in range(len(plant.inputs)) if k != plant.thrust_input]
 
 
 def _thrust(plant: Plant) -> list[int]:
+    """Column of the thrust."""
     return [plant.thrust_input]
 
 
@@ -63,6 +67,8 @@ def _strokes(design: Design) -> tuple[float, float]:
 
 
 def _of_strokes(index: int) -> Callable[[Design, float, str], list[Figure]]:
+    """The measurement of one figure of `_strokes`."""
+
     def measure(design: Design, _asked: float, _signal: str) -> list[Figure]:
         return [Figure(_strokes(design)[index], f"strokes with {DRIVE} {100 * DRIVE_ERROR:g} % off")]
 
@@ -70,9 +76,9 @@ def _of_strokes(index: int) -> Callable[[Design, float, str], list[Figure]]:
 
 
 def _tilt_estimate(loop: TrialLoop, _signal: str) -> float | None:
-    """How far the other sensor planes move, m, while the first follows the tilt's circle and they are held still.
+    """Estimated deviation of the other sensor planes, m, while the first follows the circle of the tilt.
 
-    Beside it SIGMAS times the motion at rest.
+    The response of the linear loop, and SIGMAS times the motion at rest. None for a loop that is not the radial one.
     """
     if len(loop.outputs) == 1 or loop.plant.stroke_output in loop.outputs:
         return None
@@ -87,11 +93,13 @@ def _tilt_estimate(loop: TrialLoop, _signal: str) -> float | None:
 
 
 def _payload(design: Design, asked: float, _signal: str) -> list[Figure]:
+    """The mass asked for if the mover carries it through a stroke, else 0, kg."""
     picked = design.fly("payload", masses=(asked,))
     return [Figure(asked if picked.cases[0].run.verdict.completed else 0.0, "hold and stroke")]
 
 
 def _lift_off(design: Design, _asked: float, _signal: str) -> list[Figure]:
+    """1 if every start-up estimator lifts the mover off, else 0."""
     return [Figure(float(not design.fly("lift-off").failed), "every estimator")]
 
 
@@ -102,7 +110,7 @@ REQUIREMENTS = (
     force_noise_of("thrust_noise", _thrust, "thrust"),
     Requirement("tracking_error", _of_strokes(0), "m"),
     Requirement("radial_deviation", _of_strokes(1), "m"),
-    # of the sensor plane that a tilt holds
+    # deviation of the sensor plane that is to stand still
     merit_of("tilt_deviation", "tilt", "m", "tilt, either feedforward", estimate=_tilt_estimate),
     Requirement("payload", _payload, "kg", at_least=True),  # picked up and carried through the stroke
     Requirement("lift_off", _lift_off, at_least=True, form="switch"),  # from rest, by every estimator

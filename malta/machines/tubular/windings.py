@@ -6,10 +6,10 @@ A module has 3 x 3 coils, r around and c along the machine; x_rc is any phase qu
     K_L(theta) = 2/3 [cos(theta - 2 pi c / 3), -sin(theta - 2 pi c / 3)],   theta = pi z / L_p
 
 The paper does not print the two; these map pure currents to single entries of 1 (amplitude-invariant). Both have rank
-2 and inverses in the Moore-Penrose sense only: five of the nine modes carry nothing.
+2 and inverses in the Moore-Penrose sense only: five of the nine modes carry no current.
 
 NOTE: (18) commands a magnitude and an angle phi = atan2(f_y, f_x) (the paper prints a quotient in it). That angle is
-undefined at zero force and jumps by pi through it. Here phi stands still at 0 and at pi/2: two fixed bearing axes,
+undefined at zero force and jumps by pi through it. Here phi is constant, 0 and pi/2: two fixed bearing axes,
 d along x and q along y, whose currents are f_x / K_B and f_y / K_B. The axes of a module are AXES, rotary letter first.
 """
 
@@ -64,7 +64,7 @@ def to_phases(theta: Any) -> Any:
 
 
 def magnitude_and_angle(f_x: float, f_y: float, K_B: float, phi_before: float = 0.0) -> tuple[float, float]:
-    """i_bd (A) and phi (rad) of the printed form (18). At zero force the angle is undefined: the one before stays.
+    """i_bd (A) and phi (rad) of the printed form (18). At zero force, where the angle is undefined, it is `phi_before`.
 
     A force that passes through zero turns phi by pi within one sample, faster than any current can follow.
     """
@@ -89,4 +89,4 @@ def hall_position(z: Any, x: Any, y: Any, pole: Any, errors: Any) -> Any:
     )
     angle = ca.atan2((1 + amplitude) * sine * ca.sin(k * z + phase), cosine * ca.cos(k * z))
     turns = (k * z - angle) / (2 * math.pi)
-    return (angle + 2 * math.pi * ca.floor(turns + 0.5)) / k  # counted periods: never a pole off
+    return (angle + 2 * math.pi * ca.floor(turns + 0.5)) / k  # counts periods: never wrong by one

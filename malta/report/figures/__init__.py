@@ -1,12 +1,12 @@
-"""Records -> figures, as a report has them. What draws imports matplotlib, and only there.
+"""Records -> figures of a report. Functions import matplotlib when they draw, not when a module is loaded.
 
-Every figure names the design and the fidelity behind it, and holds what the paper prints of the same experiment. A
-machine's own figures are in the module of its name here, which has
+Every figure names its design and fidelity, and shows published figures of the same experiment. A machine's own figures
+are in the module `figures` beside its plant, which has
 
     FIGURES        name of an experiment -> (experiment, published or None) -> figure
     stroke_figure  (run, published or None) -> figure, of a machine whose main job is a stroke
 
-An experiment without a figure of its own has that of its first run: `run_figure`.
+An experiment without a figure of its own is drawn by `run_figure`: its first run.
 """
 
 from __future__ import annotations
@@ -37,13 +37,13 @@ from malta.report.figures.parts import (
     BOUND,
     DOT,
     Published,
-    bound_line,
-    ending,
-    finish,
+    draw_bound,
+    draw_line,
+    ending_text,
+    finish_axes,
     front_lines,
-    line,
     micro,
-    page,
+    new_page,
 )
 from malta.report.figures.parts import MORE as MORE
 from malta.report.figures.parts import POINTS as POINTS
@@ -62,7 +62,10 @@ if TYPE_CHECKING:
 
 
 def experiment_figure(e: Experiment, published: Published | None = None) -> Figure:
-    """The figure of an experiment, beside what the paper prints of it."""
+    """The figure of an experiment, beside published figures.
+
+    Raises InputError for an experiment that the machine does not have.
+    """
     plant = e.run.plant
     drawn: dict[str, Callable[[Experiment, Published | None], Figure]] = {
         **dict.fromkeys(experiments_of(plant), run_figure),
@@ -75,7 +78,7 @@ def experiment_figure(e: Experiment, published: Published | None = None) -> Figu
 
 
 def stroke_figure(run: Trajectory, published: Published | None = None) -> Figure:
-    """The machine's figure of a stroke, or of a run."""
+    """The machine's figure of a stroke; of a machine without one, that of a run."""
     draw = attribute_of(run.plant, "figures", "stroke_figure")
     if draw is None:
         return run_figure(Experiment("run", run.scenario.name, (Case(run.scenario.name, run, ()),), ()))
@@ -96,7 +99,7 @@ def save(figure: Figure, path: str | Path) -> Path:
         if path.suffix == ".svg":
             figure.savefig(buffer, format="svg", metadata={"Date": None})
         else:
-            # Figure.savefig lays everything out in a draw of its own first, which only tight boxes need.
+            # Figure.savefig first draws once for the layout, which only tight bounding boxes need.
             canvas: Any = FigureCanvasAgg(figure)
             canvas.print_png(buffer, metadata={"Software": None}, pil_kwargs={"compress_level": 1})
     replace_files({path: buffer.getvalue()})
@@ -104,24 +107,27 @@ def save(figure: Figure, path: str | Path) -> Path:
 
 
 def run_figure(e: Experiment, _: Published | None = None) -> Figure:
-    """One run: how far every output is off its reference, the forces, and the way to what it could touch."""
+    """One run: errors of all outputs, forces, and the clearance that is used up."""
     run = e.run
     stroke, *others = outputs_of(run.plant)
     panels: list[Callable[[Axes, str], None]] = [
-        *(partial(_errors, run=run, group=group, unit=group.fine) for group in others),
-        *(partial(_forces, run=run, unit=unit) for unit in dict.fromkeys(s.unit for s in run.plant.inputs)),
-        partial(_errors, run=run, group=stroke, unit=_stroke_unit(run)),
-        partial(_ways if run.plant.contacts else _currents, run=run),
+        *(partial(_draw_errors, run=run, group=group, unit=group.fine) for group in others),
+        *(
+            partial(_draw_forces, run=run, unit=unit)
+            for unit in dict.fromkeys(s.unit for s in run.plant.inputs)
+        ),
+        partial(_draw_errors, run=run, group=stroke, unit=_stroke_unit(run)),
+        partial(_draw_clearances if run.plant.contacts else _draw_currents, run=run),
     ]
-    furthest = [(group.name, _furthest(run, group), group.fine) for group in others]
-    furthest.append((stroke.name, _furthest(run, stroke), _stroke_unit(run)))
+    furthest = [(group.name, _largest_error(run, group), group.fine) for group in others]
+    furthest.append((stroke.name, _largest_error(run, stroke), _stroke_unit(run)))
     told = (f"{name} {number(in_unit(size, unit), 3)} {micro(unit)}" for name, size, unit in furthest)
     what = e.question if len(e.cases) == 1 else f"{e.question} {e.cases[0].label}, one of {len(e.cases)}"
     text = "furthest off its reference: " + ", ".join(told)
     rows = 2 if len(panels) > 3 else len(panels)
     columns = math.ceil(len(panels) / rows)
     places = {"hspace": 0.24, "wspace": 0.25 if columns < 3 else 0.42}
-    figure = page([run], f"{micro(what)}{ending(run)}", text, **places)
+    figure = new_page([run], f"{micro(what)}{ending_text(run)}", text, **places)
     grid = figure.subplots(rows, columns, sharex=True, squeeze=False).ravel()
     last = len(panels) - columns
     for k, (axes, draw) in enumerate(zip(grid, panels, strict=False)):
@@ -132,58 +138,61 @@ def run_figure(e: Experiment, _: Published | None = None) -> Figure:
     return figure
 
 
-def _furthest(run: Trajectory, group: Group) -> float:
+def _largest_error(run: Trajectory, group: Group) -> float:
+    """Largest error of a group of outputs, SI."""
     return float(np.abs((run.p - run.reference)[:, group.columns]).max())
 
 
 def _stroke_unit(run: Trajectory) -> str:
-    """A unit in which the error along the stroke is neither long nor short."""
+    """A unit in which the error along the stroke has few digits."""
     stroke = outputs_of(run.plant)[0]
-    small = _furthest(run, stroke) < 1e-4
+    small = _largest_error(run, stroke) < 1e-4
     return stroke.fine if small else {"m": "mm", "rad": "mrad"}.get(stroke.unit, stroke.unit)
 
 
-def _errors(axes: Axes, x: str, run: Trajectory, group: Group, unit: str) -> None:
+def _draw_errors(axes: Axes, x: str, run: Trajectory, group: Group, unit: str) -> None:
+    """Errors of the outputs of a group."""
     error = in_unit(1.0, unit) * (run.p - run.reference)
     styles = cycle((1, 0, 3, 2)) if len(group.columns) > 1 else (0,)
     for k, style in zip(group.columns, styles, strict=False):
-        line(axes, run.t * 1e3, error[:, k], label=run.plant.outputs[k].name, **STYLES[style])
+        draw_line(axes, run.t * 1e3, error[:, k], label=run.plant.outputs[k].name, **STYLES[style])
     several = len(group.columns) if len(group.columns) > 1 else 0
     name = group.name if several else run.plant.outputs[group.columns[0]].name
-    finish(axes, x, f"{name}, off reference [{micro(unit)}]", legend=several)
+    finish_axes(axes, x, f"{name}, off reference [{micro(unit)}]", legend=several)
 
 
-def _forces(axes: Axes, x: str, run: Trajectory, unit: str) -> None:
-    """The thrust and the two others that go furthest."""
+def _draw_forces(axes: Axes, x: str, run: Trajectory, unit: str) -> None:
+    """The leading input and the two others of this unit that are largest."""
     plant = run.plant
     widest = np.argsort(-np.abs(run.v).max(axis=0), kind="stable").tolist()
     others = [k for k in widest if plant.inputs[k].unit == unit and k != plant.leading_input]
     first = [plant.leading_input] if plant.inputs[plant.leading_input].unit == unit else []
     shown = [*first, *sorted(others[: 3 - len(first)])]
     for k, style in zip(shown, STYLES, strict=False):
-        line(axes, run.t * 1e3, run.v[:, k], label=plant.inputs[k].name, **style)
-    finish(axes, x, f"commanded {KINDS.get(unit, 'input')} [{unit}]", legend=3)
+        draw_line(axes, run.t * 1e3, run.v[:, k], label=plant.inputs[k].name, **style)
+    finish_axes(axes, x, f"commanded {KINDS.get(unit, 'input')} [{unit}]", legend=3)
 
 
-def _ways(axes: Axes, x: str, run: Trajectory) -> None:
+def _draw_clearances(axes: Axes, x: str, run: Trajectory) -> None:
+    """Shares of the clearances that are used up, on a logarithmic axis."""
     for name, used, style in zip(run.plant.contacts, run.contact.T, cycle(STYLES)):
         way = np.maximum(used * 100, 1e-3)
-        line(axes, run.t * 1e3, way, label=name.removeprefix("touchdown at sensor "), **style)
+        draw_line(axes, run.t * 1e3, way, label=name.removeprefix("touchdown at sensor "), **style)
     axes.set_yscale("log")
     axes.set_ylim(bottom=0.01)
-    bound_line(axes, 100, "touched")
-    finish(axes, x, "clearance used up [%]", legend=3, side="right")
+    draw_bound(axes, 100, "touched")
+    finish_axes(axes, x, "clearance used up [%]", legend=3, side="right")
 
 
-def _currents(axes: Axes, x: str, run: Trajectory) -> None:
-    """The largest and the smallest of all, where there is nothing to touch."""
+def _draw_currents(axes: Axes, x: str, run: Trajectory) -> None:
+    """The largest and the smallest of all currents, for a machine without contacts."""
     for values, style in zip((run.current.max(axis=1), run.current.min(axis=1)), STYLES, strict=False):
-        line(axes, run.t * 1e3, values, **style)
-    finish(axes, x, "currents, from least to largest [A]")
+        draw_line(axes, run.t * 1e3, values, **style)
+    finish_axes(axes, x, "currents, from least to largest [A]")
 
 
 def front_figure(tuned: Tuned) -> Figure:
-    """Noise of the forces and motion against the proven margin: what the search found, and what it took."""
+    """The Pareto front of a search: force noise and motion against the proven margin, the chosen trial ringed."""
     from matplotlib.figure import Figure
     from matplotlib.ticker import LogLocator
 
@@ -215,6 +224,6 @@ def front_figure(tuned: Tuned) -> Figure:
             axes.plot(*where, **DOT | ring)
         if "margin" in asked:
             axes.axvline(100 * asked["margin"], **BOUND)
-        finish(axes, "robust margin over the travel, proven [% of the box]", y, legend=2)
+        finish_axes(axes, "robust margin over the travel, proven [% of the box]", y, legend=2)
         axes.margins(x=0.04)
     return figure

@@ -19,10 +19,10 @@ from malta.report.figures.parts import (
     STYLES,
     Published,
     clearance,
-    entries,
-    finish,
+    finish_axes,
+    legend_entries,
     micro,
-    read_out,
+    published_in_unit,
 )
 
 if TYPE_CHECKING:
@@ -33,7 +33,9 @@ if TYPE_CHECKING:
     from malta.campaigns.statistics import Finding
 
 
-FINE: Mapping[str, dict[str, Any]] = {  # how runs end, the best first, light to dark; what is touched follows
+FINE: Mapping[
+    str, dict[str, Any]
+] = {  # ways in which runs end, the best first, light to dark; contacts follow
     "within the published bounds": {"facecolor": "#f0f0f0"},
     "completed": {"facecolor": "#d0d0d0"},
     "completed, commands limited": {"facecolor": "#d0d0d0", "hatch": "////"},
@@ -49,22 +51,22 @@ BINS = 40  # of a distribution
 
 
 def distributions_figure(found: Campaign, published: Published | None = None) -> Figure:
-    """How the figures of merit of the completed runs are distributed, with the published bounds."""
+    """Distributions of the figures of merit over the completed runs, with the published bounds."""
     from malta.campaigns.statistics import figures_of
 
-    panels: dict[tuple[str, str], list[Finding]] = {}  # what is of a kind and a unit goes into one
+    panels: dict[tuple[str, str], list[Finding]] = {}  # one panel for each kind and unit
     for listed in figures_of(found, published):
         panels.setdefault((listed.kind, listed.unit), []).append(listed)
     figure = _campaign_figure(found, "figures of merit of the completed runs", hspace=0.44, wspace=0.28)
     every = figure.subplots(2, 3).ravel()
     for axes, ((kind, _), group) in zip(every, panels.items(), strict=False):
-        _distribution(axes, kind, group)
+        _draw_distribution(axes, kind, group)
     for axes in every[len(panels) :]:
         axes.set_visible(False)
     return figure
 
 
-def _distribution(axes: Axes, kind: str, listed: Sequence[Finding]) -> None:
+def _draw_distribution(axes: Axes, kind: str, listed: Sequence[Finding]) -> None:
     """Histograms of figures of one kind, on a logarithmic axis where they reach over decades."""
     from matplotlib.ticker import LogLocator
 
@@ -73,7 +75,7 @@ def _distribution(axes: Axes, kind: str, listed: Sequence[Finding]) -> None:
     bound = in_unit(listed[0].published, unit)
     every = np.concatenate(series)
     told = "%" if unit == "percent" else micro(unit)
-    finish(axes, f"{kind} [{told}]", "share of runs [%]")
+    finish_axes(axes, f"{kind} [{told}]", "share of runs [%]")
     if not every.size:
         axes.annotate("no run completed", (0.5, 0.5), xycoords="axes fraction", ha="center", **NOTE)
         return
@@ -113,7 +115,7 @@ def _distribution(axes: Axes, kind: str, listed: Sequence[Finding]) -> None:
 
 
 def yield_figure(found: Campaign, published: Published | None = None) -> Figure:
-    """How runs end over each parameter that was varied, the others wherever they were drawn."""
+    """Shares of the ways in which runs end, over each parameter that was varied."""
     from malta.campaigns.statistics import runs_within_bounds
     from malta.simulation.digest import verdicts
 
@@ -132,19 +134,19 @@ def yield_figure(found: Campaign, published: Published | None = None) -> Figure:
     figure = _campaign_figure(found, f"how runs end over the parameters{more}", hspace=0.5, top=0.8)
     panels = figure.subplots(rows, columns, squeeze=False, sharey=True).ravel()
     for axes, name in zip(panels, shown, strict=False):
-        _bands(axes, found, name, band)
+        _draw_bands(axes, found, name, band)
     for axes in panels[len(shown) :]:
         axes.set_visible(False)
     for axes in panels[: len(shown) : columns]:
         axes.set_ylabel("share of runs [%]")
-    handles, labels = entries(list(panels))
+    handles, labels = legend_entries(list(panels))
     where: dict[str, Any] = {"loc": "upper center", "bbox_to_anchor": (0.5, 0.91)}
     if handles:
         figure.legend(handles, labels, ncols=min(4, len(labels)), **where, **LEGEND)
     return figure
 
 
-def _bands(axes: Axes, found: Campaign, name: str, band: Any) -> None:
+def _draw_bands(axes: Axes, found: Campaign, name: str, band: Any) -> None:
     """Shares of the ways in which runs end, stacked, in bins of one parameter."""
     from malta.campaigns.statistics import unit_of
 
@@ -170,13 +172,13 @@ def _bands(axes: Axes, found: Campaign, name: str, band: Any) -> None:
             **style,
         )
         base += share
-    finish(axes, f"{name} [{'%' if unit == 'percent' else micro(unit)}]", "")
+    finish_axes(axes, f"{name} [{'%' if unit == 'percent' else micro(unit)}]", "")
     axes.set_xlim(edges[0], edges[-1])
     axes.set_ylim(0, 100)
 
 
 def worst_figure(found: Campaign, published: Published | None = None) -> Figure:
-    """The worst runs: where in the box their machines lie, and how far off the reference they went."""
+    """The worst runs: the places of their machines in the box, and their largest errors."""
     from malta.campaigns.statistics import bounds_of, spread_text, worst_of
 
     plan, plant = found.plan, found.plan.plant
@@ -209,7 +211,7 @@ def worst_figure(found: Campaign, published: Published | None = None) -> Figure:
     spreads = [spread_text(found.plan, name) for name in found.names]
     box.set_xticks(at, [f"{n}\n{s}" for n, s in zip(found.names, spreads, strict=True)], fontsize=9)
     box.set_yticks([-100, -50, 0, 50, 100])
-    far.set_yticks(range(len(rows)), [_ended(found, row) for row in rows], fontsize=8)
+    far.set_yticks(range(len(rows)), [_run_label(found, row) for row in rows], fontsize=8)
     far.invert_yaxis()
     offs = found.batch.deviation[rows][:, across.columns] * fine
     far.set_xscale("log")
@@ -217,7 +219,7 @@ def worst_figure(found: Campaign, published: Published | None = None) -> Figure:
     bounds = {"clearance": clearance(plant) * fine} if across.unit == "m" else {}
     key = bounds_of(plan).get(across.unit)
     if published is not None and key is not None:
-        bounds["published bound"] = read_out(published, key, across.fine)
+        bounds["published bound"] = published_in_unit(published, key, across.fine)
     bounds = {text: value for text, value in bounds.items() if math.isfinite(value)}
     most = float(offs.max()) if len(rows) else 1.0
     far.set_xlim(min([least, *bounds.values()]) / 2, 1.6 * max([most, *bounds.values()]))
@@ -226,15 +228,15 @@ def worst_figure(found: Campaign, published: Published | None = None) -> Figure:
         far.annotate(
             text, (value, 1.01), xycoords=("data", "axes fraction"), ha="center", va="bottom", **NOTE
         )
-    finish(box, "", "place in the box [% of half its width]")
-    finish(far, f"largest {across.name} deviation [{micro(across.fine)}]", "")
+    finish_axes(box, "", "place in the box [% of half its width]")
+    finish_axes(far, f"largest {across.name} deviation [{micro(across.fine)}]", "")
     box.set_xlim(-0.3, len(at) - 0.7)
     box.set_ylim(-108, 108)
     return figure
 
 
 def _campaign_figure(found: Campaign, what: str, **places: float) -> Figure:
-    """A figure that says of which campaign it is, and its yield."""
+    """An empty figure whose title names the campaign, with its yield."""
     from matplotlib.figure import Figure
 
     from malta.campaigns.plan import planned_run
@@ -253,8 +255,8 @@ def _campaign_figure(found: Campaign, what: str, **places: float) -> Figure:
     return figure
 
 
-def _ended(found: Campaign, row: int) -> str:
-    """A run by its number, and what ended it."""
+def _run_label(found: Campaign, row: int) -> str:
+    """The number of a run, and how it ended."""
     from malta.simulation.digest import verdicts
 
     name = verdicts(found.plan.plant)[int(found.batch.verdict[row])]

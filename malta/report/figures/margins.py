@@ -1,18 +1,20 @@
-"""Figures of robustness: where the margin goes, and the machine's loop along its travel."""
+"""Figures of robustness: margins stage by stage, and the machine's loop along its travel."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from malta.margins.verify import ZONES
 from malta.report.figures.parts import (
     BOUND,
     NOTE,
     STYLES,
-    plain,
+    draw_grid,
 )
 
 if TYPE_CHECKING:
@@ -22,8 +24,6 @@ if TYPE_CHECKING:
     from malta.margins.gain import Gain
     from malta.margins.stages import Robustness
 
-LIMITS = ((3.0, "A | B"), (4.0, "B | C"), (5.0, "C | D"))  # ISO 14839-3
-
 
 def chain_figure(
     found: Robustness,
@@ -32,11 +32,12 @@ def chain_figure(
     position: str = "position",
     worst: Mapping[str, Gain] | None = None,
 ) -> Figure:
-    """The chain as bars, proven part and witness; peak sensitivities beside them; both along the travel below.
+    """Margins and peak sensitivities of all stages as bars, and below them both along the travel.
 
     A machine without a travel has the first parameter that its proofs cover in its place, or nothing below.
 
-    position : what the machine calls it, as "position z"
+    found : the analysis; name : of the design; uncertainty : half-widths of the box, as shares
+    position : the machine's word for its travel, as "position z"
     worst : the largest |S| of each sensor over the uncertainty and all that the margin covers
     """
     from matplotlib.figure import Figure
@@ -51,7 +52,19 @@ def chain_figure(
         2 if extent.course else 1, 2, height_ratios=(1.6, 1) if extent.course else None
     )
     left, right = figure.add_subplot(grid[0, 0]), figure.add_subplot(grid[0, 1])
+    _draw_stages(left, right, found)
+    if extent.course:
+        along = figure.add_subplot(grid[1, 0]), figure.add_subplot(grid[1, 1])
+        _draw_along_course(*along, found, _bound(worst))
+        for axes in along:
+            axes.set_xlabel(f"{position} [mm]" if extent.stroke else f"{extent.course} [{extent.unit}]")
+    return figure
+
+
+def _draw_stages(left: Axes, right: Axes, found: Robustness) -> None:
+    """Bars of all stages: the proven margin with its witness, and the peak sensitivity with the zones of its limits."""
     rows = [(link.name, link.margin, link.peak) for link in found.chain]
+    extent = found.extent
     if extent.course:
         everything = "all of the travel" if extent.stroke else f"every {extent.course}"
         rows.append((everything, found.travel, max(place.peak for place in found.places)))
@@ -79,23 +92,17 @@ def chain_figure(
     left.set_xlabel("parametric margin [% of the box]")
     right.set_yticks(range(len(rows)), [""] * len(rows))
     right.set_xlim(0, max(5.6, 1.15 * max(link.peak for link in found.chain if not math.isnan(link.peak))))
-    for limit, text in LIMITS:
+    for (limit, zone), (_, worse) in pairwise(ZONES):
         right.axvline(limit, **BOUND)
-        right.text(limit, -0.75, text, ha="center", va="bottom", **NOTE)
+        right.text(limit, -0.75, f"{zone} | {worse}", ha="center", va="bottom", **NOTE)
     right.set_xlabel("peak sensitivity |S|: zones of ISO 14839-3")
     for axes in (left, right):
-        plain(axes)
+        draw_grid(axes)
         axes.set_ylim(len(rows) - 0.4, -0.8)
-    if extent.course:
-        along = figure.add_subplot(grid[1, 0]), figure.add_subplot(grid[1, 1])
-        _along_course(*along, found, _bound(worst))
-        for axes in along:
-            axes.set_xlabel(f"{position} [mm]" if extent.stroke else f"{extent.course} [{extent.unit}]")
-    return figure
 
 
-def _along_course(left: Axes, right: Axes, found: Robustness, bound: float) -> None:
-    """Of a position the worse of both sides, drawn on both."""
+def _draw_along_course(left: Axes, right: Axes, found: Robustness, bound: float) -> None:
+    """Margin and peak sensitivity over the position; each value is the worse of +z and -z, so both sides are alike."""
     places, even = found.places, bool(found.extent.stroke)
     z = np.array([p.position for p in places]) * (1e3 if even else 1.0)
     both = np.concatenate([-z[:0:-1], z]) if even else z
@@ -117,31 +124,35 @@ def _along_course(left: Axes, right: Axes, found: Robustness, bound: float) -> N
     left.set_ylabel("margin [%]")
     right.plot(both, mirrored([p.peak for p in places]), marker="o", markersize=3.5, **STYLES[0])
     peaks = [p.peak for p in places if not math.isnan(p.peak)] + ([bound] if math.isfinite(bound) else [])
-    right.set_ylim(0, max(3.5, 1.2 * max([*peaks, 1.0])))
+    limit, zone = ZONES[0]
+    right.set_ylim(0, max(limit + 0.5, 1.2 * max([*peaks, 1.0])))
     if math.isfinite(bound):
         right.axhline(bound, **STYLES[1])
         right.annotate(
             "no more for any parameters of the box", (0.02, bound), xycoords=("axes fraction", "data"),
             xytext=(0, 3), textcoords="offset points", va="bottom", **NOTE,
         )  # fmt: skip
-    right.axhline(3, **BOUND)
-    right.annotate("zone A", (0.985, 3), xycoords=("axes fraction", "data"), ha="right", va="top", **NOTE)
+    right.axhline(limit, **BOUND)
+    where: dict[str, Any] = {"xycoords": ("axes fraction", "data"), "ha": "right", "va": "top"}
+    right.annotate(f"zone {zone}", (0.985, limit), **where, **NOTE)
     right.set_ylabel("peak |S|")
     for axes in (left, right):
-        plain(axes)
+        draw_grid(axes)
 
 
 def _bound(worst: Mapping[str, Gain] | None) -> float:
-    """What no |S| exceeds; NaN where that is not known of every sensor."""
+    """The proven upper bound of |S| of all sensors; NaN where a sensor has none."""
     found = [gain.upper for gain in (worst or {}).values()]
     return max([bound for bound in found if bound is not None]) if found and None not in found else math.nan
 
 
 def _percent(t: float | None) -> float:
+    """A share in percent; 0 for None."""
     return 0.0 if t is None else 100 * t
 
 
 def _legend(axes: Axes) -> None:
+    """A legend of two columns above the axes."""
     axes.legend(
         loc="lower left", bbox_to_anchor=(0, 1), ncols=2, borderaxespad=0.2, frameon=False, fontsize=8
     )

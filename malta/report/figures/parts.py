@@ -1,4 +1,4 @@
-"""What figures are made of: styles, pages, lines, bounds, legends, numbers."""
+"""Parts of figures: styles, pages, lines, bounds, legends, numbers."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ if TYPE_CHECKING:
 
 Published = Mapping[str, Any]  # a file of data/published/
 
-STYLES: Sequence[dict[str, Any]] = (  # told apart without colour: by darkness and by dash
+STYLES: Sequence[dict[str, Any]] = (  # distinct without colour: by darkness and dashes
     {"color": "#000000", "linestyle": "-", "linewidth": 1.6},
     {"color": "#c1440e", "linestyle": "-", "linewidth": 1.4},
     {"color": "#1f77b4", "linestyle": (0, (5, 2)), "linewidth": 1.4},
     {"color": "#8a8a8a", "linestyle": (0, (1.5, 1.5)), "linewidth": 1.6},
 )
-MORE: Sequence[dict[str, Any]] = (  # after those
+MORE: Sequence[dict[str, Any]] = (  # used after STYLES
     {"color": "#000000", "linestyle": (0, (7, 2, 1.5, 2)), "linewidth": 1.4},
     {"color": "#c1440e", "linestyle": (0, (1.5, 1.5)), "linewidth": 1.6},
     {"color": "#1f77b4", "linestyle": (0, (9, 2, 1.5, 2, 1.5, 2)), "linewidth": 1.4},
@@ -41,15 +41,16 @@ NOTE: dict[str, Any] = {"fontsize": 8, "color": "#5a5a5a"}
 DOT: dict[str, Any] = {"marker": "o", "markersize": 6, "linestyle": "none", "color": "#000000"}
 CROSS: dict[str, Any] = DOT | {"marker": "X", "markersize": 9, "markeredgecolor": "#ffffff", "clip_on": False}
 LEGEND: dict[str, Any] = {"frameon": False, "fontsize": 8, "handlelength": 2.4, "columnspacing": 1.5}
-POINTS = 3000  # of a line: more than a page resolves
+POINTS = 3000  # of a line; a page does not resolve more
 
 
 def runs_of(e: Experiment) -> list[Trajectory]:
+    """The runs of an experiment's cases."""
     return [case.run for case in e.cases]
 
 
-def page(runs: Sequence[Trajectory], what: str, found: str, **places: float) -> Figure:
-    """A figure that says which design and fidelity drew it, and what was found."""
+def new_page(runs: Sequence[Trajectory], what: str, found: str, **places: float) -> Figure:
+    """An empty figure whose title names the design, the fidelity and the subject; `found` is its line of results."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(9.0, 6.0), dpi=120)
@@ -61,14 +62,14 @@ def page(runs: Sequence[Trajectory], what: str, found: str, **places: float) -> 
     return figure
 
 
-def ending(run: Trajectory) -> str:
-    """How a run ended, if not completed."""
+def ending_text(run: Trajectory) -> str:
+    """How a run ended, in brackets; empty if it was completed."""
     end = run.verdict
     return "" if end.completed else f" ({end.name} at {end.time * 1e3:.0f} ms)"
 
 
-def line(axes: Axes, t: FloatArray, values: FloatArray, **style: Any) -> None:
-    """A line; of more samples than the page resolves, the least and the greatest of each stretch."""
+def draw_line(axes: Axes, t: FloatArray, values: FloatArray, **style: Any) -> None:
+    """Draw a line. Of more samples than a page resolves, it has the smallest and the largest of each stretch."""
     size = math.ceil(2 * len(t) / POINTS)
     if size > 2:
         first = np.arange(0, len(t) - size + 1, size)
@@ -79,9 +80,9 @@ def line(axes: Axes, t: FloatArray, values: FloatArray, **style: Any) -> None:
     axes.plot(t, values, **style)
 
 
-def mark(axes: Axes, run: Trajectory, t: FloatArray, values: FloatArray, *, named: bool = True) -> None:
-    """A cross where the run touched something; `named` in the legend."""
-    if touched(run):
+def mark_end(axes: Axes, run: Trajectory, t: FloatArray, values: FloatArray, *, named: bool = True) -> None:
+    """Draw a cross where a run ended early; `named`: with an entry in the legend."""
+    if ended_early(run):
         k = min(end_of(run), len(t) - 1)
         low, high = axes.get_xlim()
         if not (axes.get_autoscalex_on() or low <= t[k] <= high):
@@ -93,17 +94,17 @@ def mark(axes: Axes, run: Trajectory, t: FloatArray, values: FloatArray, *, name
 TOUCHED = "touchdown"
 
 
-def touched(run: Trajectory) -> bool:
-    """Whether something ended the run, other than time and Ctrl-C."""
+def ended_early(run: Trajectory) -> bool:
+    """Whether a run ended by a touchdown or another event, and not by time or Ctrl-C."""
     return run.verdict.name not in ("completed", "interrupted")
 
 
 def end_of(run: Trajectory) -> int:
-    """The sample of the verdict."""
+    """The sample at which a run ended."""
     return min(int(np.searchsorted(run.t, run.verdict.time)), len(run.t) - 1)
 
 
-def published_line(
+def draw_published(
     axes: Axes,
     published: Published | None,
     key: str,
@@ -111,16 +112,17 @@ def published_line(
     text: str = "published bound",
     **drawn: Any,
 ) -> None:
+    """`draw_bound` at a published value; nothing without published figures."""
     if published is not None:
-        bound_line(axes, read_out(published, key, unit), text, **drawn)
+        draw_bound(axes, published_in_unit(published, key, unit), text, **drawn)
 
 
-def bound_line(
+def draw_bound(
     axes: Axes, value: float, text: str, *, both: bool = False, where: str = "above right"
 ) -> None:
-    """A line at a value, or at both signs; the axes reach beyond it.
+    """Draw a line at a value, or at both signs of it, and extend the axes beyond it.
 
-    where : of its name: above, below, or under the lower line of both; left or right
+    where : place of its text: above, below, or under the lower line of both; left or right
     """
     lines = [np.asarray(line.get_ydata(), dtype=float) for line in axes.lines]
     reach = max((float(np.abs(y[np.isfinite(y)]).max(initial=0.0)) for y in lines), default=0.0)
@@ -146,14 +148,14 @@ def bound_line(
         axes.set_ylim(top=room)
 
 
-def upright(axes: Axes, x: float, height: float, text: str, *, ha: str) -> None:
-    """A name along an upright line, from a share of the axes' height."""
+def label_upright(axes: Axes, x: float, height: float, text: str, *, ha: str) -> None:
+    """Write a text along an upright line at x, beginning at a share `height` of the axes."""
     where: dict[str, Any] = {"xycoords": ("data", "axes fraction"), "rotation": 90, "va": "bottom", "ha": ha}
     axes.annotate(text, (x, height), **where, **NOTE)
 
 
-def square(axes: Axes, *, least: float = 0.0) -> None:
-    """Equal axes about the centre that hold all that is drawn, and at least so much."""
+def square_axes(axes: Axes, *, least: float = 0.0) -> None:
+    """Make axes equal and square about the centre, with all data inside, and at least `least` wide to either side."""
     from matplotlib.ticker import MaxNLocator
 
     box = axes.dataLim
@@ -166,35 +168,35 @@ def square(axes: Axes, *, least: float = 0.0) -> None:
         side.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10]))
 
 
-def plain(axes: Axes) -> None:
-    """A light grid behind the data, no frame on the far sides."""
+def draw_grid(axes: Axes) -> None:
+    """Draw a light grid behind the data, and no frame at the top and on the right."""
     axes.grid(color="#e4e4e4", linewidth=0.6)
     axes.set_axisbelow(True)
     for edge in ("top", "right"):
         axes.spines[edge].set_visible(False)
 
 
-def finish(axes: Axes, x: str, y: str, *, legend: int = 0, side: str = "left") -> None:
-    """Labels, grid, and a legend of so many columns above the axes, where it covers no data."""
+def finish_axes(axes: Axes, x: str, y: str, *, legend: int = 0, side: str = "left") -> None:
+    """Set labels and grid, and a legend with `legend` columns above the axes, where it covers no data."""
     axes.set_xlabel(x)
     axes.set_ylabel(y)
-    plain(axes)
+    draw_grid(axes)
     axes.margins(x=0)
     if legend:
         where: dict[str, Any] = {"loc": f"lower {side}", "bbox_to_anchor": ({"left": 0, "right": 1}[side], 1)}
-        handles, labels = entries([axes])
+        handles, labels = legend_entries([axes])
         axes.legend(handles, labels, ncols=legend, borderaxespad=0.2, **where, **LEGEND)
 
 
-def shared_legend(figure: Figure) -> None:
-    """One legend for all panels, below the title."""
-    handles, labels = entries(figure.axes)
+def add_shared_legend(figure: Figure) -> None:
+    """Add one legend for all panels below the title."""
+    handles, labels = legend_entries(figure.axes)
     where: dict[str, Any] = {"loc": "upper center", "bbox_to_anchor": (0.5, 0.925)}
     figure.legend(handles, labels, ncols=len(labels), **where, **LEGEND)
 
 
-def entries(panels: Sequence[Axes]) -> tuple[list[Any], list[str]]:
-    """Handles and labels, each label once, crosses last."""
+def legend_entries(panels: Sequence[Axes]) -> tuple[list[Any], list[str]]:
+    """Handles and labels of panels, each label once, crosses last."""
     found: dict[str, Any] = {}
     for axes in panels:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
@@ -203,9 +205,10 @@ def entries(panels: Sequence[Axes]) -> tuple[list[Any], list[str]]:
     return [found[label] for label in labels], labels
 
 
-def histogram(
+def draw_histograms(
     axes: Axes, series: Sequence[FloatArray], labels: Sequence[str], bins: float, reach: float
 ) -> None:
+    """Draw shares of samples in bins of this width, and those of the second series in bins of a tenth of it."""
     styles: tuple[dict[str, Any], ...] = (
         {"fill": True, "facecolor": "#d4d4d4", "edgecolor": "#8a8a8a", "linewidth": 0.8},
         {"edgecolor": "#000000", "linewidth": 1.2},
@@ -217,8 +220,8 @@ def histogram(
     axes.set_xlim(-reach, reach)
 
 
-def callipers(axes: Axes, spreads: Sequence[tuple[str, float, float]], top: float) -> None:
-    """Mean and standard deviation above the data."""
+def draw_spreads(axes: Axes, spreads: Sequence[tuple[str, float, float]], top: float) -> None:
+    """Draw means and standard deviations above histograms: label, mean and deviation of each."""
     for n, (label, mean, std) in enumerate(spreads):
         height = top * (1.26 - 0.13 * n)
         style = {"color": STYLES[n]["color"], "marker": "|", "markersize": 7}
@@ -230,7 +233,7 @@ def callipers(axes: Axes, spreads: Sequence[tuple[str, float, float]], top: floa
 
 
 def clearance(plant: Plant) -> float:
-    """The shortest way across the stroke that ends in a touch, m; infinite where there is none."""
+    """The shortest displacement across the stroke that ends in a contact, m; infinite without contacts."""
     way, half = 1e-6, len(plant.states) // 2
     across = [
         s.name
@@ -246,13 +249,13 @@ def clearance(plant: Plant) -> float:
     return way / most if most else math.inf
 
 
-def read_out(published: Published, key: str, unit: str) -> float:
-    """A published quantity in the unit to show it in."""
+def published_in_unit(published: Published, key: str, unit: str) -> float:
+    """A published quantity in the unit that it is shown in."""
     return in_unit(published_value(published, key), unit)
 
 
 def number(value: float, digits: int = 4) -> str:
-    """A number in so many digits, without exponent; "-" for NaN."""
+    """A number with so many significant digits, without exponent; "-" for NaN."""
     if not math.isfinite(value):
         return "-" if math.isnan(value) else f"{value}"
     decimals = digits - 1 - math.floor(math.log10(abs(value))) if value else 0
@@ -260,20 +263,20 @@ def number(value: float, digits: int = 4) -> str:
     return text if float(text) else "0"
 
 
-def said(merit: Merit, digits: int = 3) -> str:
-    """A figure of merit in its unit, as a sentence has it."""
+def merit_phrase(merit: Merit, digits: int = 3) -> str:
+    """The value of a figure of merit with its unit, for a sentence."""
     unit = {"percent": " %", "1": ""}.get(merit.unit, f" {micro(merit.unit)}")
     return number(in_unit(merit.value, merit.unit), digits) + unit
 
 
-def told(cases: Sequence[Case], which: int) -> str:
-    """One merit of every case, in a line."""
-    found = ", ".join(f"{case.label} {said(case.merits[which])}" for case in cases)
+def merits_phrase(cases: Sequence[Case], which: int) -> str:
+    """One figure of merit of all cases, in a line."""
+    found = ", ".join(f"{case.label} {merit_phrase(case.merits[which])}" for case in cases)
     return micro(f"{cases[0].merits[which].label.replace(': ', ', ')}: {found}")
 
 
 def micro(text: str) -> str:
-    """um as µm."""
+    """A text with µm for um, and other units alike."""
     return re.sub(r"\bu(?=(?:rad|[msANV])\b)", "µ", text)
 
 
@@ -290,7 +293,7 @@ UNITS = {
 
 
 def front_lines(plant: Plant, names: Iterable[str], trade: Trade) -> list[tuple[str, str, float, str]]:
-    """List those figures of a Pareto front that are noise of the "force", or "motion": name, label, factor, unit."""
+    """Figures of a Pareto front of one trade, "force" noise or "motion": name, label, factor, unit of each."""
     known, found = requirements_for(plant), []
     for name in names:
         base, _, signal = name.partition(" ")

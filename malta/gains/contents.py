@@ -1,0 +1,244 @@
+"""The document of a gain file -> the controller in it, with every check that the schema cannot make."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
+
+import numpy as np
+
+from malta.errors import CheckError, InputError
+from malta.gains.linear import linear_parameters
+from malta.gains.schema import GainFile, PlantTable
+from malta.model.data import (
+    parameters_record,
+    plant_of,
+    units_of,
+)
+from malta.model.machines import machine
+from malta.model.plant import Plant, Signal
+from malta.synthesis.controller import (
+    Controller,
+    Cost,
+    CurrentLoop,
+    Feedforward,
+    Limits,
+    Noise,
+    disturbances,
+    stored_forces,
+)
+
+if TYPE_CHECKING:
+    from malta.model.plant import FloatArray, Parameters
+
+
+class _Layout(NamedTuple):
+    """The signals of a controller, as its file names them and its machine has them."""
+
+    plant: Plant
+    states: tuple[Signal, ...]  # mechanical states, forces stored for the delay, observed disturbances
+    observed: tuple[Signal, ...]  # the last of the states: disturbances that the filter observes
+    grid: int  # positions of the table of v0
+
+    def shapes(self) -> dict[str, dict[str, tuple[int, ...]]]:
+        """Shapes of all arrays of a file, by table and key."""
+        plant = self.plant
+        n, n0 = len(self.states), len(plant.design_states)
+        m, p = len(plant.inputs), len(plant.outputs)
+        g, coils = self.grid, len(plant.actuator.coils)
+        return {
+            "model": {"A": (n0, n0), "B": (n0, m), "C": (p, n0), "Ad": (n, n), "Bd": (n, m), "Cd": (p, n)},
+            "gains": {"K": (m, n), "Ki": (m, p), "L": (n, p)},
+            "operating_point": {"x": (n0,), "u": (m,)},
+            "feedforward": {
+                "inertia": (m,),
+                "speed": (m, p),
+                "rate": (plant.coordinates, p),
+                "z_grid": (g,),
+                "v0": (g, m),
+            },
+            "limits": {"current": (coils,), "force": (m,), "voltage": (coils,)},
+            "cost": {"state": (n0,), "input": (m,), "integral": (p,)},
+            "noise": {"process": (m,), "sensor": (p,), "drift": (len(self.observed),)},
+        }
+
+
+def controller_of(file: GainFile, path: str | Path) -> Controller:
+    """The controller in a gain file.
+
+    Raises InputError, naming file and field, for an unknown machine, parameters or signals that the machine does not
+    have, arrays of the wrong shape, a grid of positions that does not rise, and values of the wrong sign.
+    """
+    if file.plant.linear is not None and file.law is None:
+        raise InputError(path, "plant.linear", "a table", "none without a table law, as version 2 has it")
+    par = _parameters(file.plant, path)
+    layout = _layout(file, par, path)
+    if (file.cost is None) != (file.noise is None):
+        raise InputError(path, "noise", "null" if file.noise is None else "some", "null where cost is null")
+    arrays, unlimited = _arrays(file, layout, path)
+    _check_values(arrays, path)
+    errors = _tracks_errors(file)
+    if errors:
+        _check_error_law(file, arrays, path)
+    return Controller(
+        name=file.design.name,
+        spec_sha256=file.design.spec_sha256,
+        parameters=par,
+        operating_point=(arrays["operating_point"]["x"], arrays["operating_point"]["u"]),
+        sample_time=file.sample_time,
+        states=layout.states,
+        forces=layout.plant.inputs,
+        measurements=layout.plant.outputs,
+        **cast("dict[str, Any]", arrays["model"] | arrays["gains"]),
+        cost=Cost(**arrays["cost"]) if "cost" in arrays else None,
+        noise=Noise(**arrays["noise"]) if "noise" in arrays else None,
+        feedforward=Feedforward(**arrays["feedforward"]),
+        current_loop=None if file.current_loop is None else CurrentLoop(**file.current_loop.model_dump()),
+        limits=Limits(**(unlimited | arrays["limits"])),
+        tracks="errors" if errors else "states",
+    )
+
+
+def _tracks_errors(file: GainFile) -> bool:
+    """Whether the control law takes errors, and not states."""
+    return file.law is not None and file.law.tracks == "errors"
+
+
+def _layout(file: GainFile, par: Parameters, path: str | Path) -> _Layout:
+    """The signals of a file, compared with those of its machine; the states of a law of errors are its own."""
+    try:
+        plant = plant_of(par)
+    except CheckError as error:
+        raise InputError(path, "plant.parameters", str(error), "a machine that can be controlled") from error
+    states, forces, measurements = (
+        tuple(Signal(s.name, s.unit) for s in getattr(file.signals, key))
+        for key in ("states", "forces", "measurements")
+    )
+    mechanical, errors = plant.design_states, _tracks_errors(file)
+    for key, found, wanted in (
+        ("states", states[: len(mechanical)], states[: len(mechanical)] if errors else mechanical),
+        ("forces", forces, plant.inputs),
+        ("measurements", measurements, plant.outputs),
+    ):
+        if found != wanted:
+            raise InputError(path, f"signals.{key}", _names(found), f"{_names(wanted)} of the {plant.name}")
+    observed = () if errors else _observed(file, states, forces, len(mechanical), path)
+    return _Layout(plant, states, observed, len(file.feedforward.z_grid))
+
+
+Arrays = dict[str, dict[str, "FloatArray"]]  # by table and key
+
+
+def _arrays(file: GainFile, layout: _Layout, path: str | Path) -> tuple[Arrays, dict[str, FloatArray]]:
+    """The arrays of a file without the tables that are null, and infinite limits for those that are null."""
+    shapes = layout.shapes()
+    unlimited = {key: np.full(size, np.inf) for key, size in shapes["limits"].items() if _endless(file, key)}
+    for key in unlimited:
+        del shapes["limits"][key]
+    arrays = {
+        table: {
+            key: _array(getattr(getattr(file, table), key) or [], shape, path, f"{table}.{key}")
+            for key, shape in keys.items()
+        }
+        for table, keys in shapes.items()
+        if getattr(file, table) is not None
+    }
+    return arrays, unlimited
+
+
+def _check_values(arrays: Mapping[str, Mapping[str, FloatArray]], path: str | Path) -> None:
+    """Raise InputError for a grid that does not rise, and for limits, variances and weights of the wrong sign."""
+    z_grid = arrays["feedforward"]["z_grid"]
+    if len(z_grid) < 2 or not (np.diff(z_grid) > 0).all():
+        raise InputError(
+            path, "feedforward.z_grid", "values that do not rise", "at least two rising positions"
+        )
+    for table, expected in (("limits", "limits above 0"), ("noise", "variances above 0")):
+        for key, values in arrays.get(table, {}).items():
+            if not (values > 0).all():
+                raise InputError(path, f"{table}.{key}", str(values.tolist()), expected)
+    for key, weight in arrays.get("cost", {}).items():
+        if (weight < 0).any() or (key == "input" and not (weight > 0).all()):
+            expected = "weights above 0" if key == "input" else "none below 0"
+            raise InputError(path, f"cost.{key}", str(weight.tolist()), expected)
+
+
+def _observed(
+    file: GainFile, states: tuple[Signal, ...], forces: tuple[Signal, ...], n0: int, path: str | Path
+) -> tuple[Signal, ...]:
+    """The disturbances among the states, after stored forces. Raises InputError for other states."""
+    n, m = len(states), len(forces)
+    if (n - n0) % m:
+        raise InputError(path, "signals.states", f"{n} states", f"{n0} and a multiple of {m} stored forces")
+    observed = disturbances(forces) if states[-m:] == disturbances(forces) else ()
+    stored = stored_forces(forces, (n - n0 - len(observed)) // m) + observed
+    if states[n0:] != stored:
+        raise InputError(path, "signals.states", _names(states[n0:]), f"stored forces, as {_names(stored)}")
+    if observed and any(any(row) for row in file.gains.Ki):
+        both = "sums of errors beside observed disturbances"
+        raise InputError(path, "gains.Ki", both, "zeros: one of them takes off loads")
+    return observed
+
+
+def _check_error_law(
+    file: GainFile, arrays: Mapping[str, Mapping[str, FloatArray]], path: str | Path
+) -> None:
+    """Raise InputError for matrices that are not those of a law of errors, as synthesis/controller.py has them."""
+    model, gains = arrays["model"], arrays["gains"]
+    n, p = gains["L"].shape
+    if n < p:
+        raise InputError(path, "signals.states", f"{n} states", f"{p} at least, the last errors")
+    zeros = {"model.Bd": model["Bd"], "model.Cd": model["Cd"], "gains.Ki": gains["Ki"]}
+    zeros["model.Ad"] = model["Ad"][n - p :]
+    zeros["gains.L"] = gains["L"] - np.eye(n, p, p - n)
+    for key, M in zeros.items():
+        if M.any():
+            raise InputError(path, key, "other entries", "those of a law that tracks errors")
+    if file.cost is not None:
+        raise InputError(path, "cost", "some", "null of a law that tracks errors")
+
+
+def _endless(file: GainFile, key: str) -> bool:
+    """Whether the file has null for a limit that may be null."""
+    return getattr(file.limits, key) is None and (key == "voltage" or file.law is not None)
+
+
+def _parameters(plant: PlantTable, path: str | Path) -> Parameters:
+    """The machine's record of the parameters in a file, whose names and units have to be the machine's."""
+    if plant.linear is not None:
+        return linear_parameters(plant, plant.linear, path)
+    try:
+        record = parameters_record(machine(plant.name), path)
+    except InputError as error:
+        if error.where != "machine":
+            raise
+        raise InputError(path, "plant.name", error.found, error.expected) from error
+    units, given = units_of(record), plant.parameters or {}
+    if set(given) != set(units):
+        odd = sorted(set(given) ^ set(units))
+        raise InputError(path, "plant.parameters", f"{odd[0]} missing or unknown", " ".join(units))
+    for key, q in given.items():
+        if q.unit != units[key]:
+            raise InputError(path, f"plant.parameters.{key}.unit", repr(q.unit), repr(units[key]))
+    try:
+        return record(**{k: q.value for k, q in given.items()}, preset=plant.preset)  # type: ignore[call-arg]
+    except InputError as error:
+        raise InputError(path, f"plant.parameters.{error.field}", error.found, error.expected) from error
+
+
+def _array(value: list[Any], shape: tuple[int, ...], path: str | Path, field: str) -> FloatArray:
+    """A vector or matrix of the expected shape."""
+    if not value and 0 in shape:
+        return np.zeros(shape)
+    rows = {len(row) for row in value} if len(shape) == 2 else set()
+    found = (len(value), *rows) if len(rows) <= 1 else None
+    if found != shape:
+        text = "rows of unequal length" if found is None else f"shape {found}"
+        raise InputError(path, field, text, f"shape {shape}")
+    return np.array(value, dtype=float)
+
+
+def _names(signals: tuple[Signal, ...]) -> str:
+    """Signals with their units, as a message lists them."""
+    return " ".join(f"{s.name} [{s.unit}]" for s in signals) or "nothing"

@@ -1,0 +1,285 @@
+"""Electronics of the Halbach motor: half-bridges, current sensors and current loops, period by period."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
+
+import casadi as ca
+import numpy as np
+
+from malta.errors import InputError
+from malta.machines.halbach.motor import (
+    PHASES,
+    advance,
+    duty_cycles,
+    park,
+    park_of_angle,
+    phase_currents,
+    resistive_drop,
+)
+from malta.model.plant import (
+    Electronics,
+)
+
+if TYPE_CHECKING:
+    from malta.machines.halbach.plant import Parameters
+    from malta.model.plant import FloatArray
+
+
+Pwm = Literal["exact", "plain", "fine"]
+MEAN_OF = 32  # samples in the rolling mean of a current, Sec. 4.2
+
+
+@dataclass(frozen=True)
+class Options:
+    """What the electronics consist of; each source of error can be switched off."""
+
+    pwm: Pwm = (
+        "plain"  # duty cycles: exact, or in steps of the counter, or in those of the high-resolution PWM
+    )
+    adc_steps: bool = True
+    adc_noise: bool = True
+    mean_of: int = MEAN_OF  # samples in the rolling mean of a current
+    current_loops: bool = True  # vector control; without loops, voltages are R times the wanted currents
+
+    def __post_init__(self) -> None:
+        if self.pwm not in get_args(Pwm):
+            raise InputError("halbach.Options", "pwm", repr(self.pwm), _one_of(Pwm))
+        if isinstance(self.mean_of, bool) or self.mean_of not in range(1, 4097):
+            raise InputError("halbach.Options", "mean_of", repr(self.mean_of), "1 to 4096 samples")
+        for name in ("adc_steps", "adc_noise", "current_loops"):
+            if not isinstance(getattr(self, name), bool):
+                raise InputError("halbach.Options", name, repr(getattr(self, name)), "True or False")
+
+
+def _one_of(choices: Any) -> str:
+    return "one of " + ", ".join(get_args(choices))
+
+
+REAL = Options()
+IDEAL = Options("exact", adc_steps=False, adc_noise=False)
+
+
+def pwm_step(par: Parameters, pwm: Pwm) -> Any:
+    """Smallest change of a phase voltage, V; 0 where duty cycles are exact."""
+    return {"exact": 0.0, "plain": par.V_dc / par.counts, "fine": par.dV_fine}[pwm]
+
+
+def adc_step(par: Parameters) -> Any:
+    """Current of one code of the current sensors, A."""
+    return 2 * par.I_adc / par.codes
+
+
+def modulate(par: Parameters, V: Any, pwm: Pwm) -> tuple[Any, Any]:
+    """Duty cycles of the half-bridges for wanted phase voltages (V), and whether one was limited to 0 or 1."""
+    wanted = duty_cycles(par, V)
+    d = ca.fmin(ca.fmax(wanted, 0), 1)
+    limited = ca.mmax(ca.fabs(d - wanted)) > 0
+    if pwm == "exact":
+        return d, limited
+    step = pwm_step(par, pwm) / par.V_dc
+    return ca.fmin(_round_half_up(d / step) * step, 1), limited
+
+
+def sample_current(par: Parameters, i: Any, *, steps: bool) -> tuple[Any, Any]:
+    """The code of a current (A), and whether the current was out of range. Code 0 is -I_adc.
+
+    steps : codes are whole numbers
+    """
+    code = (i + par.I_adc) / adc_step(par)
+    inside = ca.fmin(ca.fmax(_round_half_up(code) if steps else code, 0), par.codes)
+    return inside, ca.fabs(i) > par.I_adc
+
+
+def _round_half_up(x: Any) -> Any:
+    return ca.floor(x + 0.5)
+
+
+def resting_positions(par: Parameters, references: Any, F_z: float, pwm: Pwm) -> FloatArray:
+    """Positions at which the open-loop motor comes to rest for these references, m.
+
+    The half-bridges round the voltages of a reference; the motor rests at the angle of the rounded voltages.
+
+    Raises InputError for a vertical force F_z (N) that is not above 0, or larger than the supply can drive.
+    """
+    places = []
+    for r in np.atleast_1d(np.asarray(references, dtype=float)):
+        d, limited = modulate(par, par.R * phase_currents(par, r, 0, F_z), pwm)
+        if not (F_z > 0 and math.isfinite(r)) or bool(limited):
+            most = 0.75 * par.V_dc * par.A / par.R
+            raise InputError("halbach", "settled", f"{F_z:g} N at {r:g} m", f"forces of 0 to {most:.1f} N")
+        V_d, V_q = np.array(park(r, par.k) @ (par.V_dc * (d - 0.5))).ravel()
+        places.append(r + math.atan2(V_d, V_q) / par.k)
+    return np.array(places)
+
+
+def dead_zones(par: Parameters, F_z: float, pwm: Pwm) -> tuple[FloatArray, FloatArray]:
+    """Dead zones of the open-loop motor over a pitch: their beginnings and their lengths, m.
+
+    All references within a dead zone have the same duty cycles. The longest zone is the smallest step of the reference
+    that moves the motor wherever it begins.
+
+    Raises InputError for exact duty cycles, and without a vertical force.
+    """
+    step = pwm_step(par, pwm)
+    if not (step and F_z):
+        raise InputError("halbach", "dead_zones", f"pwm {pwm!r} at {F_z:g} N", "steps, and a vertical force")
+    amplitude = 2 / 3 * par.R * abs(F_z) / par.A / step  # of a phase voltage, in steps
+    edges = np.arange(math.ceil(-amplitude - 0.5), math.floor(amplitude - 0.5) + 1) + 0.5
+    rise = np.arcsin(edges[np.abs(edges) <= amplitude] / amplitude)
+    angles = [np.concatenate([rise, math.pi - rise]) + phase for phase in PHASES]
+    switched = np.sort(np.mod(np.concatenate(angles), 2 * math.pi))
+    return switched / par.k, np.diff(np.concatenate([switched, switched[:1] + 2 * math.pi])) / par.k
+
+
+class CurrentLoop(NamedTuple):
+    """PI controller of Id and of Iq, u = Kp e + Ki integral of e."""
+
+    Kp: float  # V/A
+    Ki: float  # V/(A s)
+    crossover: float  # rad/s
+
+
+def current_delay(par: Parameters, mean_of: int) -> float:
+    """Delay from a current to its voltage, s: 1.5 periods of computation and hold, and the rolling mean's."""
+    return (1.5 + (mean_of - 1) / 2) / par.f_pwm
+
+
+def current_loop(par: Parameters, mean_of: int) -> CurrentLoop:
+    """Gains of the current loops for a rolling mean of `mean_of` samples.
+
+    The zero of the controller cancels the winding's pole, which leaves w e^(-s delay) / s; the crossover w follows from
+    the phase margin pm_cc. The paper prints no gains. With its mean of 32 samples the delay is 1.16 ms and w is 451
+    rad/s, 27 times faster than the motor on its spring.
+    """
+    w = (math.pi / 2 - par.pm_cc) / current_delay(par, mean_of)
+    return CurrentLoop(w * par.L, w * par.R, w)
+
+
+def force_noise(par: Parameters, x: float | None = None) -> float:
+    """Intensity of the horizontal force noise that current sensors cause within the bandwidth of the loops, N^2/Hz.
+
+    Two samples of equal noise make Id, as the third current is computed: its variance is 1.5 to 4.5 times theirs as the
+    Park angle goes, 3 times on average (x=None).
+    """
+    share = 3.0
+    if x is not None:
+        d = np.array(park(x, par.k))[0]
+        share = float((d[0] - d[2]) ** 2 + (d[1] - d[2]) ** 2)
+    return share * (par.A * par.s_adc) ** 2 / par.f_pwm
+
+
+FLAGS = ("duty limit", "current range")
+
+
+def electronics(par: Parameters, options: Options | None = None) -> Electronics:
+    """Current loops on Id and Iq, their sensors and the half-bridges, as they run in every PWM period.
+
+        i*, y --> [ hold ] --> Id*, Iq*, cos, sin --> [ move: loops, modulator, windings, motor ] --> x, i
+                               until the next reading     ^ two phase currents, rolling means ----------|
+
+    The duty cycles computed in a period act in the next one. The loops know R, L and k, but not that the phases differ.
+
+    options : what the electronics consist of; None: REAL, as in the paper
+    """
+    parts = _Parts(par, REAL if options is None else options)
+    o = parts.options
+    return Electronics(
+        period=1 / par.f_pwm,
+        state=_state_sizes(o),
+        noises=2 if o.current_loops and o.adc_noise else 0,
+        flags=FLAGS,
+        held_size=4,
+        held=partial(_references, par),
+        start=partial(_start, parts),
+        move=partial(_move, parts),
+        met=lambda state: state["met"],
+        duty=lambda state: state["duty"],
+    )
+
+
+class _Parts(NamedTuple):
+    """The electronics' parameters, and the options of what they consist of."""
+
+    par: Parameters
+    options: Options
+
+
+def _state_sizes(o: Options) -> dict[str, int]:
+    """Sizes of the electronics' state: duty cycles, limits met, integrals, and the rolling means of two currents."""
+    sizes = {"duty": 3, "met": len(FLAGS)}
+    if o.current_loops:
+        sizes |= {"u": 2, "sums": 2, "ring_a": o.mean_of, "ring_b": o.mean_of}
+    return sizes
+
+
+def _references(par: Parameters, i: Any, y: Any) -> Any:
+    """(Id*, Iq*, cos k y, sin k y) of wanted phase currents i at a reading y: constant until the next reading."""
+    c, s = ca.cos(par.k * y[0]), ca.sin(par.k * y[0])
+    return ca.vertcat(park_of_angle(c, s) @ i, c, s)
+
+
+def _start(parts: _Parts, x: Any, i: Any) -> dict[str, Any]:
+    """The electronics' state in a steady state at the position x[0] with phase currents i."""
+    par, o = parts
+    P, n = park(x[0], par.k), o.mean_of
+    drop = (
+        resistive_drop(par, i) if o.current_loops else par.R * i
+    )  # integrals have found each phase's resistance
+    u = P @ drop
+    codes = sample_current(par, i[0:2], steps=o.adc_steps)[0]
+    state = {
+        "duty": modulate(par, 2 / 3 * P.T @ u, o.pwm)[0],
+        "met": ca.DM.zeros(len(FLAGS)),
+        "u": u,
+        "sums": n * codes,
+        "ring_a": ca.repmat(codes[0], n, 1),
+        "ring_b": ca.repmat(codes[1], n, 1),
+    }
+    return {name: state[name] for name in _state_sizes(o)}
+
+
+def _move(
+    parts: _Parts, x: Any, i: Any, state: Mapping[str, Any], held: Any, w: Any, noise: Any
+) -> tuple[Any, Any, dict[str, Any]]:
+    """One PWM period: (x, i, state) at its end. held: `_references`; w: outer force; noise: of two current samples."""
+    par, o = parts
+    P, wanted = park_of_angle(held[2], held[3]), held[0:2]
+    if o.current_loops:
+        V, out_of_range, loops = _control_currents(parts, i, state, P, wanted, noise)
+    else:
+        V, out_of_range, loops = 2 / 3 * P.T @ (par.R * wanted), 0, lambda _: {}
+    duty, limited = modulate(par, V, o.pwm)
+    met = ca.fmax(state["met"], ca.vertcat(limited, out_of_range))
+    z = advance(par, ca.vertcat(x, i), par.V_dc * (state["duty"] - 0.5), w[0])
+    return z[0:2], z[2:5], dict(state) | loops(limited) | {"duty": duty, "met": met}
+
+
+def _control_currents(
+    parts: _Parts, i: Any, state: Mapping[str, Any], P: Any, wanted: Any, noise: Any
+) -> tuple[Any, Any, Callable[[Any], dict[str, Any]]]:
+    """PI control of Id and Iq: phase voltages, whether a sample was out of range, and the state for a limit flag.
+
+    The integrals stand still while the modulator is at its limit.
+    """
+    par, o = parts
+    gains = current_loop(par, o.mean_of)
+    codes, out = sample_current(par, i[0:2] + (par.s_adc * noise if o.adc_noise else 0), steps=o.adc_steps)
+    oldest = ca.vertcat(state["ring_a"][0], state["ring_b"][0])
+    sums = state["sums"] + codes - oldest
+    mean = sums / o.mean_of * adc_step(par) - par.I_adc
+    e = wanted - P @ ca.vertcat(mean, -ca.sum1(mean))  # (8): the third current is computed
+
+    def after(limited: Any) -> dict[str, Any]:
+        return {
+            "sums": sums,
+            "ring_a": ca.vertcat(*ca.vertsplit(state["ring_a"])[1:], codes[0]),
+            "ring_b": ca.vertcat(*ca.vertsplit(state["ring_b"])[1:], codes[1]),
+            "u": state["u"] + ca.if_else(limited, 0, gains.Ki / par.f_pwm) * e,
+        }
+
+    return 2 / 3 * P.T @ (state["u"] + gains.Kp * e), ca.mmax(out), after

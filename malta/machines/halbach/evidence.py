@@ -1,0 +1,118 @@
+"""Figures of a design that the claims on the Halbach motor are about: from its experiments, margins and model."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from malta.machines.halbach import electronics, motor
+from malta.machines.halbach.experiments.lift import LAWS
+from malta.machines.halbach.experiments.motions import COUNT, PAUSE, STEP, responses
+from malta.machines.halbach.experiments.open_loop import positions_at_rest
+from malta.machines.halbach.plant import Parameters
+from malta.margins.verify import Margins
+from malta.model.data import published_value
+from malta.model.linearize import LinearModel
+from malta.report.ledger import case_merit, run_design
+from malta.simulation.experiments import Experiment, Progress
+from malta.synthesis.controller import Controller
+from malta.synthesis.lqg import sampled_model
+from malta.synthesis.spec import Spec
+
+if TYPE_CHECKING:
+    from malta.model.plant import FloatArray
+
+EXPERIMENT_NAMES = ("step", "stairs", "ramp", "force", "budget", "identify")
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """A design, its margins and its experiments, beside the published figures."""
+
+    spec: Spec
+    published: Mapping[str, Any]
+    model: LinearModel
+    controller: Controller
+    margins: Margins
+    experiments: Mapping[str, Experiment]
+
+    @property
+    def par(self) -> Parameters:
+        """The machine's parameters."""
+        parameters = self.spec.parameters
+        assert isinstance(parameters, Parameters)
+        return parameters
+
+    def value(self, key: str) -> float:
+        """A published quantity, SI."""
+        return published_value(self.published, key)
+
+
+def evidence(spec: Spec, published: Mapping[str, Any], progress: Progress | None = None) -> Evidence:
+    """Design a controller, prove its margins and run all experiments."""
+    found = run_design(spec, EXPERIMENT_NAMES, progress)
+    return Evidence(spec, published, found.model, found.controller, found.margins, found.experiments)
+
+
+def figure_2(e: Evidence) -> tuple[float, float]:
+    """Amplitude of the forces along a pitch at the currents of Fig. 2, N, and their phase difference, rad."""
+    i = np.array([e.value(f"figure_2.I_{phase}") for phase in "abc"])
+    places = np.arange(360) / 360 * 2 * math.pi / e.par.k
+    F = np.array([np.array(motor.forces(e.par, x, i)).ravel() for x in places])
+    waves = np.fft.rfft(F, axis=0)[1] / 180
+    return float(np.abs(waves).max()), abs(float(np.angle(waves[1] / waves[0])))
+
+
+def sampled_pole(e: Evidence) -> float:
+    """The smaller pole of the motor over the time between readings, with the Park angle constant."""
+    Ad = sampled_model(e.model, e.par.T_laser)[0]
+    return float(min(np.linalg.eigvals(Ad).real))
+
+
+def current_for_step(e: Evidence) -> float:
+    """Largest change of a phase current for the paper's example of a displacement, A."""
+    step, F_z = e.value("sensitivity.displacement"), e.value("sensitivity.F_z")
+    i = [np.array(motor.phase_currents(e.par, x, 0, F_z)) for x in (0.0, step)]
+    return float(np.abs(i[1] - i[0]).max())
+
+
+def pwm_step_of(pwm: electronics.Pwm) -> Callable[[Evidence], float]:
+    """A function of the evidence: the step of a phase voltage, V."""
+    return lambda e: float(electronics.pwm_step(e.par, pwm))
+
+
+def duty(e: Evidence, sign: int) -> float:
+    """Duty cycle at the paper's example of a current, or at its negative."""
+    return float(motor.duty_cycles(e.par, e.par.R * sign * e.value("pwm.current")))
+
+
+def duty_at_force(e: Evidence) -> FloatArray:
+    """Duty cycles of the three half-bridges along a pitch at rest, 361 x 3."""
+    places = np.linspace(0, 2 * math.pi / e.par.k, 361)
+    V = [e.par.R * motor.phase_currents(e.par, x, 0, e.par.F_z) for x in places]
+    return np.array([np.array(motor.duty_cycles(e.par, v)).ravel() for v in V])
+
+
+def first_stair(e: Evidence) -> float:
+    """Position on the first stair in the open loop with plain PWM, m."""
+    return float(positions_at_rest(e.experiments["stairs"].cases[0].run)[0][1])
+
+
+def ramp_distance(e: Evidence) -> float:
+    """Distance of the first ramp, m."""
+    run = e.experiments["ramp"].run
+    return float(run.p[-1, 0] - run.p[0, 0])
+
+
+def mean_step(e: Evidence) -> float:
+    """Mean motion from a second after a jump of the reference, m."""
+    return STEP * float(responses(e.experiments["step"].run, STEP, COUNT)[:, PAUSE // 2 :].mean())
+
+
+def largest_lift_change(fault: str, e: Evidence) -> float:
+    """Largest change of the vertical force with a fault, over the three laws, as a share."""
+    return max(abs(case_merit("force", f"{law}, {fault}", 0, e)) for law in LAWS)

@@ -1,0 +1,204 @@
+"""Motions of the Halbach motor under position control: steps and ramps."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from malta.errors import InputError
+from malta.machines.halbach.electronics import MEAN_OF, Pwm
+from malta.machines.halbach.experiments.lift import lift_deviation
+from malta.machines.halbach.experiments.options import campaign_options, electronics_options
+from malta.model.plant import Plant
+from malta.simulation import references
+from malta.simulation.experiments import (
+    Experiment,
+    Merit,
+    PlannedRun,
+    Progress,
+    fly,
+    rms,
+    scenario_of,
+)
+from malta.simulation.references import Motion, Reference
+from malta.simulation.trajectory import Trajectory
+from malta.synthesis.controller import Controller
+
+if TYPE_CHECKING:
+    from malta.model.plant import FloatArray
+
+
+STEP, COUNT = 100e-6, 20  # m, Fig. 9
+BEFORE, PAUSE, REST = 5, 40, 400  # readings before the steps, between them, after the last
+
+
+def step(
+    plant: Plant,
+    controller: Controller,
+    *,
+    distance: float = STEP,
+    rise: float = 0.3,
+    count: int = COUNT,
+    pwm: Pwm = "plain",
+    adc_noise: bool = True,
+    adc_steps: bool = True,
+    mean_of: int = MEAN_OF,
+    current_loops: bool = True,
+    progress: Progress | None = None,
+    **options: Any,
+) -> Experiment:
+    """Steps there and back, `count` of them, then 22 s of rest: as jumps, and as quintics with a rise of `rise` (s)."""
+    parts = electronics_options(pwm, adc_noise, adc_steps, mean_of, current_loops)
+    wanted = _step_wanted(
+        controller, distance, rise, count, {"fidelity": "phase", "electronics": parts} | options
+    )
+    cases, cut = fly(plant, controller, wanted, progress, options)
+    return Experiment("step", "Does it go where it is sent, and stay?", cases, (), interrupted=cut)
+
+
+def step_cases(
+    _: Plant, controller: Controller, *, distance: float, rise: float, count: int, **options: Any
+) -> list[PlannedRun]:
+    """The runs of `step` for a campaign."""
+    return _step_wanted(controller, distance, rise, count, campaign_options(options))
+
+
+def _step_wanted(
+    controller: Controller, distance: float, rise: float, count: int, options: Mapping[str, Any]
+) -> list[PlannedRun]:
+    """The runs of `step`: jumps, and quintics."""
+    Ts = controller.sample_time
+    wanted = []
+    for label, taken in (("jumps", 0.0), ("quintics", rise)):
+        reference = partial(steps_reference, distance=distance, rise=taken, count=count, Ts=Ts)
+        scenario = scenario_of("step", (BEFORE + PAUSE * count + REST) * Ts, reference, options)
+        wanted.append(PlannedRun(label, scenario, partial(_step_merits, distance=distance, count=count)))
+    return wanted
+
+
+def steps_reference(_: Plant, distance: float, rise: float, count: int, Ts: float) -> Reference:
+    """`count` steps of `distance` (m) away from 0 and back, with a rise of `rise` (s); 0: jumps at readings."""
+    begin = (BEFORE + PAUSE * np.arange(count)) * Ts
+
+    def at(t: FloatArray) -> Motion:
+        later = np.asarray(t)[:, None] - begin
+        signs = distance * (-1.0) ** np.arange(count)
+        if not rise:
+            jumped = (later > -Ts / 2) @ signs
+            return Motion(*(column[:, None] for column in (jumped, 0 * jumped, 0 * jumped)))
+        middle = references.QUINTIC_DURATION * rise / 2
+        return Motion(*(s @ signs[:, None] for s in references.quintic(later - middle, rise)))
+
+    return at
+
+
+def responses(run: Trajectory, distance: float, count: int) -> FloatArray:
+    """Responses to the steps of `steps_reference`, count x readings: 0 before a step, 1 after, NaN after the run."""
+    wanted = BEFORE + PAUSE * count
+    x = np.full(wanted, np.nan)
+    x[: min(wanted, len(run.p))] = run.p[:wanted, 0]
+    shares = x[BEFORE:].reshape(count, PAUSE) / distance
+    shares[1::2] = 1 - shares[1::2]
+    return shares
+
+
+def _step_merits(run: Trajectory, distance: float, count: int) -> tuple[Merit, ...]:
+    """Overshoot and settling time of the mean response, the error at rest, and the vertical force."""
+    mean, Ts = responses(run, distance, count).mean(axis=0), run.controller.sample_time
+    outside = np.flatnonzero(~(np.abs(mean - 1) <= 0.05))
+    settled = math.nan
+    if 0 < len(outside) < PAUSE and outside[-1] + 1 < PAUSE:
+        k = int(outside[-1])
+        edge = 1 + math.copysign(0.05, mean[k] - 1)
+        settled = (k + float((mean[k] - edge) / (mean[k] - mean[k + 1]))) * Ts
+    tail = (run.p - run.reference)[BEFORE + PAUSE * count - PAUSE // 2 :, 0]
+    if len(tail) == 0:
+        tail = np.array([math.nan])
+    return (
+        Merit("mean overshoot", max(float(mean.max()) - 1, 0.0), "percent"),
+        Merit("mean within 5 % after", settled, "ms"),
+        Merit("at rest, rms", float(tail.std()), "um"),
+        Merit("at rest, mean error", abs(float(tail.mean())), "um"),
+        Merit("vertical force off by", lift_deviation(run), "percent"),
+    )
+
+
+STILL, SETTLING = 20, 2.0  # readings before and after the ramp; s, until the start at full speed has decayed
+
+
+def ramp(
+    plant: Plant,
+    controller: Controller,
+    *,
+    distance: float = 50e-3,
+    speeds: tuple[float, ...] = (1e-3, 2e-3, 5e-3),
+    pwm: Pwm = "plain",
+    adc_noise: bool = True,
+    adc_steps: bool = True,
+    mean_of: int = MEAN_OF,
+    current_loops: bool = True,
+    progress: Progress | None = None,
+    **options: Any,
+) -> Experiment:
+    """Through the travel, half of `distance` to either side of the middle, at each of the speeds (m/s)."""
+    parts = electronics_options(pwm, adc_noise, adc_steps, mean_of, current_loops)
+    wanted = _ramp_wanted(controller, distance, speeds, {"fidelity": "phase", "electronics": parts} | options)
+    cases, cut = fly(plant, controller, wanted, progress, options)
+    return Experiment("ramp", "Does it follow through the whole travel?", cases, (), interrupted=cut)
+
+
+def ramp_cases(
+    _: Plant, controller: Controller, *, distance: float, speeds: tuple[float, ...], **options: Any
+) -> list[PlannedRun]:
+    """The runs of `ramp` for a campaign."""
+    return _ramp_wanted(controller, distance, speeds, campaign_options(options))
+
+
+def _ramp_wanted(
+    controller: Controller, distance: float, speeds: tuple[float, ...], options: Mapping[str, Any]
+) -> list[PlannedRun]:
+    """The runs of `ramp`: one for each speed."""
+    still, wanted = STILL * controller.sample_time, []
+    for speed in speeds:
+        moving = abs(distance) / speed
+        reference = partial(ramp_reference, distance=distance, speed=speed, start=still)
+        scenario = scenario_of("ramp", moving + 2 * still, reference, options)
+        merits = partial(_ramp_merits, start=still, moving=moving)
+        wanted.append(PlannedRun(f"{1e3 * speed:g} mm/s", scenario, merits))
+    return wanted
+
+
+def ramp_reference(plant: Plant, distance: float, speed: float, start: float) -> Reference:
+    """From -distance / 2 (m) to distance / 2 at a constant speed (m/s), beginning at `start` (s).
+
+    Raises InputError for a distance that is longer than twice the travel.
+    """
+    if not abs(distance) / 2 <= plant.travel:
+        found, most = f"{distance:g} m", f"at most {2 * plant.travel:g} m, the travel to both sides"
+        raise InputError("halbach", "ramp: distance", found, most)
+
+    def at(t: FloatArray) -> Motion:
+        passed = np.clip((np.asarray(t) - start) * speed / abs(distance), 0, 1)[:, None]
+        moving = (passed > 0) & (passed < 1)
+        return Motion(
+            distance * (passed - 0.5), math.copysign(speed, distance) * moving, np.zeros(passed.shape)
+        )
+
+    return at
+
+
+def _ramp_merits(run: Trajectory, start: float, moving: float) -> tuple[Merit, ...]:
+    """Lag and error while the speed is constant, the largest error, and the vertical force."""
+    error = (run.reference - run.p)[:, 0]
+    steady = (run.t > start + SETTLING) & (run.t < start + moving)
+    lag = abs(float(error[steady].mean())) if steady.any() else math.nan
+    return (
+        Merit("mean lag", lag, "um"),
+        Merit("error on the way, rms", rms(error[steady]) if steady.any() else math.nan, "um"),
+        Merit("largest error", float(np.abs(error).max()), "um"),
+        Merit("vertical force off by", lift_deviation(run), "percent"),
+    )

@@ -1,0 +1,53 @@
+"""The experiments on the planar motor.
+
+step     the paper's steps in z and y, Figs 9 to 12, with each coil model in the controller
+errors   errors of the coil models against the exact wrench, Figs 7, 8 and 13
+delay    filters with the sample of computation in their model, and without
+timing   K(p) and its pseudo-inverse within the control period, Table 2
+
+The coil models are the controller's; the simulated machine always has the exact wrench of the field.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+from malta.errors import InputError
+from malta.machines.planar.experiments.models import errors
+from malta.machines.planar.experiments.motions import delay, step, step_cases
+from malta.machines.planar.experiments.timings import timing
+from malta.simulation.experiments import (
+    Experiment,
+    PlannedRun,
+)
+
+EXPERIMENTS: dict[str, Callable[..., Experiment]] = {
+    "step": step,
+    "errors": errors,
+    "delay": delay,
+    "timing": timing,
+}
+CASES: dict[str, Callable[..., list[PlannedRun]]] = {
+    "step": step_cases
+}  # with the controller's own coil model
+FINDINGS = ("delay",)
+WORDS = {
+    "stroke": "y",
+    "m": "x and z",
+    "rad": "angles",
+    "thrust": "F_y",
+    "N": "F_x and F_z",
+    "N m": "torques",
+}
+OPTION_UNITS = {"place": "m", "gap": "m", "lift": "m", "distance": "m", "current": "A"}
+
+
+def check(name: str, option: str, value: Any) -> None:
+    """Raise InputError for a number outside the range of an option. `steps_reference` checks positions."""
+    numbers = value if isinstance(value, tuple | list) else (value,)
+    if option in ("cells", "speeds", "current") and not all(math.isfinite(v) and v > 0 for v in numbers):
+        raise InputError("simulate", f"{name}: {option}", repr(value), "finite, above 0")
+    if option == "cells" and value != int(value):
+        raise InputError("simulate", f"{name}: cells", repr(value), "a whole number")

@@ -1,0 +1,262 @@
+"""The published steps of the planar motor, with each coil model and with filters of different speeds."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from malta.errors import InputError
+from malta.machines.planar import commutation
+from malta.machines.planar import plant as planar
+from malta.machines.planar.field import COIL_ORDER
+from malta.model.linearize import linearize
+from malta.model.plant import Plant
+from malta.simulation import references
+from malta.simulation.experiments import (
+    QUIET,
+    Case,
+    Experiment,
+    Merit,
+    PlannedRun,
+    Progress,
+    fly_all,
+    scenario_of,
+)
+from malta.simulation.references import Motion, Reference
+from malta.simulation.trajectory import Trajectory
+from malta.synthesis.controller import Controller
+from malta.synthesis.lqg import lqg, weights_of
+
+if TYPE_CHECKING:
+    from malta.model.plant import FloatArray
+
+
+MODELS = ("exact", "table", "analytical")  # coil models of the controller
+PLACE = (6e-3, 4e-3)  # m, x and y of a place without symmetry; the paper does not print its own
+CELLS = 35  # of the table over tau_n, along x and along y; the paper does not print its number
+# Sec. 4.2: sizes and beginnings of the steps. Ours are quintics of these durations: steps would saturate at 1000 N.
+LIFT, LIFT_AT, LIFTING = 1e-3, 0.01, 0.02  # m, s, s
+DISTANCE, MOVE_AT, MOVING = 10e-3, 0.03, 0.04
+DURATION = 0.1  # s
+GAP = 50e-6  # m, over the magnets at the start. NOTE: the paper starts on them, where this machine has touched down
+WITHIN = 10e-6  # m: y has arrived
+
+
+def with_coil_model(controller: Controller, model: str, cells: int = CELLS) -> Controller:
+    """The same controller with another coil model in its commutation: one of MODELS."""
+    known: dict[str, dict[str, float]] = {
+        "exact": {"order": COIL_ORDER, "cells": 0},
+        "table": {"order": COIL_ORDER, "cells": cells},
+        "analytical": {"order": 1, "cells": 0},
+    }
+    par: Any = controller.parameters
+    return replace(controller, parameters=replace(par, **known[model]))
+
+
+def parameters_of(of: Controller | Plant) -> planar.Parameters:
+    """The parameters of a machine, or those that a controller is designed for."""
+    par = of.parameters
+    assert isinstance(par, planar.Parameters)
+    return par
+
+
+def step(
+    plant: Plant,
+    controller: Controller,
+    *,
+    place: tuple[float, ...] = PLACE,
+    gap: float = GAP,
+    lift: float = LIFT,
+    distance: float = DISTANCE,
+    cells: int = CELLS,
+    progress: Progress | None = None,
+    **options: Any,
+) -> Experiment:
+    """The published steps: up by `lift` (m) from `gap` (m), then `distance` (m) along y, from `place` (m) and (0, 0).
+
+    Once with each coil model in the controller; `cells` of the table over tau_n.
+    """
+    wanted = step_cases(plant, controller, place=place, gap=gap, lift=lift, distance=distance, **options)
+    flights = [
+        (plant, with_coil_model(controller, model, cells), one._replace(label=f"{model}, {one.label}"))
+        for model in MODELS
+        for one in wanted
+    ]
+    cases, cut = fly_all(flights, progress, options)
+    merits = cases[0].merits if cut else _path_deviations(cases)
+    return Experiment("step", "What does the coil model move?", cases, merits, interrupted=cut)
+
+
+def step_cases(
+    plant: Plant,
+    _: Controller,
+    *,
+    place: tuple[float, ...],
+    gap: float,
+    lift: float,
+    distance: float,
+    cells: int = CELLS,  # noqa: ARG001 - the controller's own coil model flies
+    **options: Any,
+) -> list[PlannedRun]:
+    """The runs of `step` with the controller's own coil model.
+
+    Raises InputError for a place that is not two numbers, and for steps beyond the travel.
+    """
+    if len(place) != 2:
+        raise InputError("simulate", "step: place", f"{len(place)} numbers", "x and y")
+    wanted = []
+    for x, y in ((place[0], place[1]), (0.0, 0.0)):
+        reference = partial(steps_reference, place=(x, y), gap=gap, lift=lift, distance=distance)
+        reference(plant)  # raises where it leaves the travel
+        scenario = scenario_of("step", DURATION, reference, FORCES | options)
+        wanted.append(PlannedRun(f"from ({x * 1e3:g}, {y * 1e3:g}) mm", scenario, step_merits))
+    return wanted
+
+
+FORCES: dict[str, Any] = QUIET | {"fidelity": "force", "substeps": 1}  # the error of one substep is 1e-13 m
+
+
+def steps_reference(
+    plant: Plant, place: tuple[float, float], gap: float, lift: float, distance: float
+) -> Reference:
+    """Two quintics: z from `gap` (m) over the magnets up by `lift` (m), then y by `distance` (m).
+
+    Raises InputError for a position outside the travel.
+    """
+    par = parameters_of(plant)
+    first = np.array([*place, gap])
+    last = first + np.array([0, distance, lift])
+    for p in (first, last):
+        commutation.check_position(par, p)
+    moves = ((2, lift, LIFT_AT, LIFTING), (1, distance, MOVE_AT, MOVING))
+
+    def at(t: FloatArray) -> Motion:
+        motion = [np.zeros((len(t), 6)) for _ in range(3)]
+        motion[0][:, :3] = first - [0, 0, par.h]
+        for axis, size, begin, duration in moves:
+            rise = duration / references.QUINTIC_DURATION
+            for column, s in zip(
+                motion, references.quintic(np.asarray(t) - begin - duration / 2, rise), strict=True
+            ):
+                column[:, axis] += size * s
+        return Motion(*motion)
+
+    return at
+
+
+def step_merits(run: Trajectory) -> tuple[Merit, ...]:
+    """Arrival and overshoot of y, error of z, deviations of the other outputs, forces and currents."""
+    Ts, error = run.controller.sample_time, np.abs(run.p - run.reference)
+    target = run.scenario.reference(run.plant)(np.array([run.scenario.duration])).p[0]
+    late = run.t >= LIFT_AT + 0.02 - Ts / 2
+    beyond = (run.p[:, 1] - target[1]) * np.sign(target[1] - run.reference[0, 1])
+    return (
+        Merit("y within 10 um after its step", _arrival(run, target[1]), "ms"),
+        Merit("y, overshoot", max(float(beyond.max()), 0.0), "um"),
+        Merit("z, from 20 ms after its step", _largest(np.abs(run.p[late, 2] - target[2])), "um"),
+        *(
+            Merit(f"{signal.name}, deviation", float(error[:, k].max()), "um" if k < 3 else "urad")
+            for k, signal in enumerate(run.plant.outputs)
+            if signal.name not in "yz"
+        ),
+        Merit("largest force", float(np.abs(run.v[:, :3]).max()), "N", "steps.force_limit", "at most"),
+        Merit("largest coil current", float(np.abs(run.current).max()), "A"),
+    )
+
+
+def _arrival(run: Trajectory, target: float) -> float:
+    """Time from the step in y until y stays within WITHIN of the target, s; NaN if it does not."""
+    off = np.flatnonzero(np.abs(run.p[:, 1] - target) > WITHIN)
+    if not len(off) or off[-1] + 1 == len(run.t):
+        return math.nan
+    return float(run.t[off[-1] + 1]) - MOVE_AT
+
+
+def _largest(values: FloatArray) -> float:
+    """The largest value; NaN without any."""
+    return float(values.max()) if values.size else math.nan
+
+
+def _path_deviations(cases: Sequence[Case]) -> tuple[Merit, ...]:
+    """Largest distance of the runs with each coil model from the run with the exact one, from the first place.
+
+    The error of the run with the exact model comes from currents that are constant for a sample and a sample late; the
+    paper's runs have neither.
+    """
+    exact = cases[0].run
+    merits = []
+    for case in cases[2::2]:
+        size = min(len(exact.p), len(case.run.p))
+        off = np.abs(case.run.p[:size] - exact.p[:size]).max(axis=0)
+        model = case.label.split(",")[0]
+        for k, signal in enumerate(exact.plant.outputs):
+            if k != 1:
+                merits.append(
+                    Merit(f"{model} moves {signal.name} by", float(off[k]), "um" if k < 3 else "urad")
+                )
+    return tuple(merits)
+
+
+def delay(
+    plant: Plant,
+    controller: Controller,
+    *,
+    speeds: tuple[float, ...] = (1.0, 2.0, 3.0),
+    place: tuple[float, ...] = PLACE,
+    progress: Progress | None = None,
+    **options: Any,
+) -> Experiment:
+    """The steps with filters that know of the sample of computation and with such that do not.
+
+    speeds : of the regulator and the filter, in multiples of the controller's own
+
+    Raises InputError for a PID, which predicts nothing.
+    """
+    if controller.cost is None or controller.noise is None:
+        raise InputError("simulate", "scenario", "'delay' with a PID, which predicts nothing", "an LQG")
+    moves: dict[str, Any] = {"place": place, "gap": GAP, "lift": LIFT, "distance": DISTANCE}
+    wanted = step_cases(plant, controller, **moves, **options)[0]._replace(merits=_rest_merits)
+    flights = [
+        (
+            plant,
+            scale_speed(controller, speed, controller.delay if knows else 0),
+            wanted._replace(label=f"{'with' if knows else 'without'}, {speed:g} x"),
+        )
+        for speed in speeds
+        for knows in (True, False)
+    ]
+    cases, cut = fly_all(flights, progress, options)
+    return Experiment("delay", "Does the filter have to know of the delay?", cases, (), interrupted=cut)
+
+
+def scale_speed(controller: Controller, speed: float, delay: int) -> Controller:
+    """The LQG of the same cost and noise, `speed` times as fast, with `delay` samples in its design model.
+
+    Natural frequencies of a double integrator go with the fourth root of q / r, those of its filter with the fourth
+    root of the ratio of variances; the filter then follows disturbances `speed` times as fast.
+    """
+    plant, own = planar.plant(parameters_of(controller)), weights_of(controller)
+    weights = replace(
+        own,
+        q=own.q * speed**4,
+        process_variance=own.process_variance * speed**4,
+        drift_variance=own.drift_variance * speed**6,
+    )
+    model = linearize(plant, plant.point(controller.operating_point[0]))
+    return lqg(model, weights, controller.sample_time, "sampled-data", delay, name=controller.name)
+
+
+def _rest_merits(run: Trajectory) -> tuple[Merit, ...]:
+    """Largest deviation of the angles, and the errors in the last tenth of the run."""
+    error = np.abs(run.p - run.reference)
+    late = error[run.t >= 0.9 * run.scenario.duration]
+    return (
+        Merit("angles, largest deviation", float(error[:, 3:].max()), "urad"),
+        Merit("angles, left at rest", _largest(late[:, 3:]), "urad"),
+        Merit("position, left at rest", _largest(late[:, :3]), "um"),
+    )

@@ -1,0 +1,156 @@
+"""Figures of a design that the claims on MALTA are about: from its experiments, margins and model."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy.optimize import brentq
+
+from malta.machines.tubular.experiments.strokes import delayed_stroke
+from malta.margins.plants import of_plant
+from malta.margins.robust import robust_margin
+from malta.margins.stages import compensators
+from malta.margins.verify import Margins
+from malta.model.data import published_value
+from malta.model.linearize import LinearModel, linearize
+from malta.report.ledger import (
+    merit,
+    proven_share,
+    run_design,
+)
+from malta.simulation.experiments import Experiment, Progress
+from malta.simulation.inverter import link_voltage, open_loop_gain
+from malta.simulation.scenario import Scenario
+from malta.simulation.simulate import simulate
+from malta.simulation.trajectory import StrokeFigures, stroke_figures
+from malta.synthesis.controller import Controller
+from malta.synthesis.lqg import lqr
+from malta.synthesis.riccati import add_integrals
+from malta.synthesis.spec import Spec
+
+if TYPE_CHECKING:
+    from malta.model.plant import FloatArray
+
+EXPERIMENT_NAMES = ("stroke", "hold", "tilt", "payload", "thermal")
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """A design, its margins, its experiments and some more runs for the claims."""
+
+    spec: Spec
+    model: LinearModel
+    controller: Controller
+    margins: Margins
+    K: FloatArray  # gain of the LQR without integrals
+    experiments: Mapping[str, Experiment]
+    uncompensated: StrokeFigures  # of the stroke with cogging left out of v0(z)
+    braked: float  # m/s, published speed from which the mover is braked into the DC link
+    growth: float  # m, thermal growth of the published arm
+
+
+def evidence(spec: Spec, published: Mapping[str, Any], progress: Progress | None = None) -> Evidence:
+    """Design a controller, prove its margins and run the experiments, and a stroke without cogging in v0(z)."""
+    plant = spec.plant
+    model, controller, margins, experiments = run_design(spec, EXPERIMENT_NAMES, progress)
+    v0 = controller.feedforward.v0.copy()
+    v0[:, plant.thrust_input] = 0
+    without = replace(controller, feedforward=replace(controller.feedforward, v0=v0))
+    slow = simulate(plant, without, Scenario("stroke", 0.4, partial(delayed_stroke, wait=0.0)))
+    return Evidence(
+        spec,
+        model,
+        controller,
+        margins,
+        lqr(model, spec.weights),
+        experiments,
+        stroke_figures(slow),
+        published_value(published, "dc_link.speed"),
+        published_value(published, "thermal.length") * published_value(published, "thermal.strain"),
+    )
+
+
+def pole(name: str, e: Evidence) -> float:
+    """Square root of a diagonal element of the stiffness, by its position's name, rad/s."""
+    names = [s.name for s in e.model.plant.design_states]
+    return math.sqrt(max(float(e.model.stiffness.diagonal()[names.index(name)]), 0.0))
+
+
+def pole_change(e: Evidence) -> float:
+    """Relative change of the fastest open-loop pole from the middle to the end of the travel."""
+    plant = e.model.plant
+    middle, end = (linearize(plant, plant.at(z=z)).sys.poles().real.max() for z in (0.0, plant.travel))
+    return float(end / middle - 1)
+
+
+def stiffness_ratio(e: Evidence) -> float:
+    """Stiffness of the LQR along x over that of the attraction."""
+    half = len(e.model.stiffness)
+    return float((e.model.force_map @ e.K[:, :half])[0, 0] / e.model.stiffness[0, 0])
+
+
+def full_state_share(e: Evidence) -> float:
+    """Proven margin of the LQR with all states measured, as a share of the design's uncertainty."""
+    law, states = compensators(e.model.plant, e.controller)["LQR"]
+    system = of_plant(e.model.plant, list(e.spec.uncertainty), at=e.spec.operating_point, states=states)
+    return proven_share(robust_margin(system, law, e.spec.uncertainty))
+
+
+def slowest_radial(e: Evidence) -> float:
+    """The slowest pole of the regulator with integrals in which x1 takes part, rad/s."""
+    A, B = add_integrals(e.controller.Ad, e.controller.Bd, e.controller.Cd, e.controller.sample_time)
+    values, shapes = np.linalg.eig(A - B @ np.hstack([e.controller.K, -e.controller.Ki]))
+    part = np.abs(shapes[len(e.controller.Ad)]) > 1e-9 * np.abs(shapes).max(axis=0)
+    return float((np.log(values[part]) / e.controller.sample_time).real.max())
+
+
+def axial_stiffness(e: Evidence) -> float:
+    """Thrust of the feedback per axial position, N/m."""
+    plant = e.model.plant
+    return float(e.controller.K[plant.thrust_input, plant.stroke_state])
+
+
+def current_loop_margin(e: Evidence) -> tuple[float, float]:
+    """Crossover, rad/s, and phase margin, rad, of the current loop with the gain file's Kp and Ki."""
+    loop, actuator = e.controller.current_loop, e.model.plant.actuator
+    if loop is None:
+        return math.nan, math.nan
+    delay = actuator.loop_delay if e.spec.current_loop_delay else 0.0
+
+    def gain(w: float) -> complex:
+        return complex(open_loop_gain(actuator, loop.Kp, loop.Ki, delay, np.array([w]))[0])
+
+    crossover = float(brentq(lambda w: abs(gain(w)) - 1, 1.0, 1e5))
+    return crossover, math.pi + float(np.angle(gain(crossover)))
+
+
+def link_rise(e: Evidence) -> float:
+    """Rise of the DC link's voltage, V, when the mover is braked from the published speed."""
+    par: Any = e.spec.parameters
+    return float(link_voltage(par.V_dc, par.C_dc, par.m * e.braked**2 / 2) - par.V_dc)
+
+
+def published_stroke(e: Evidence) -> StrokeFigures:
+    """Figures of the stroke of Fig. 12."""
+    return stroke_figures(e.experiments["stroke"].run)
+
+
+def stroke_across(e: Evidence) -> float:
+    """Largest deviation of x1 and x2 during the stroke, m."""
+    return max(published_stroke(e).radial[name] for name in ("x1", "x2"))
+
+
+def carried_weight(e: Evidence) -> float:
+    """Sum of the vertical bearing forces at the end of the stroke, N."""
+    v = e.experiments["stroke"].run.v[-1]
+    return float(v[1] + v[3])
+
+
+def true_radial(e: Evidence) -> float:
+    """Largest rms of the true radial motion at rest, m."""
+    return max(merit("hold", f"true {name}, rms", e) for name in ("x1", "y1", "x2", "y2"))

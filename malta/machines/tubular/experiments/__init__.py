@@ -1,0 +1,91 @@
+"""The experiments on MALTA.
+
+stroke        the published move, Figs 12 and 13
+hold          2000 samples at rest with sensor noise, Fig. 14 and Table III
+tilt          a circle in sensor plane 1, sensor plane 2 held, Fig. 16 and eq. (21)
+lift-off      from rest on the touchdown bearing, by each start-up estimator
+payload       masses picked during a hold, and a stroke with them
+thermal       a drifting support, seen by an outside laser and compensated, Fig. 15
+disturbance   force and torque steps, vibration of the housing, compliance over frequency
+faults        of sensors, samples, a phase and the DC link: survival or touchdown
+drive-limits  the fastest stroke that the drive allows, against the sigmoid at the same peak current
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from malta.errors import InputError
+from malta.machines.tubular.experiments.failures import faults
+from malta.machines.tubular.experiments.forces import disturbance, disturbance_cases
+from malta.machines.tubular.experiments.lifting import lift_cases, lift_off, payload
+from malta.machines.tubular.experiments.rest import hold, hold_cases, thermal, tilt, tilt_cases
+from malta.machines.tubular.experiments.strokes import (
+    DISTANCE,
+    RISE,
+    drive_limit_cases,
+    drive_limits,
+    stroke,
+    stroke_cases,
+)
+from malta.simulation.experiments import (
+    Experiment,
+    PlannedRun,
+)
+
+EXPERIMENTS: dict[str, Callable[..., Experiment]] = {
+    "stroke": stroke,
+    "hold": hold,
+    "tilt": tilt,
+    "lift-off": lift_off,
+    "payload": payload,
+    "thermal": thermal,
+    "disturbance": disturbance,
+    "faults": faults,
+    "drive-limits": drive_limits,
+}
+# Experiments that campaigns can run: nothing but the machine differs between the runs of a case.
+CASES: dict[str, Callable[..., list[PlannedRun]]] = {
+    "stroke": stroke_cases,
+    "hold": hold_cases,
+    "tilt": tilt_cases,
+    "lift-off": lift_cases,
+    "disturbance": disturbance_cases,
+    "drive-limits": drive_limit_cases,
+}
+FINDINGS = ("payload", "disturbance", "faults")
+ALONE = ("stroke", "hold", "tilt")
+WORDS = {"stroke": "axial", "m": "radial", "thrust": "thrust", "N": "bearing force"}
+STROKE_UNIT = "mm"
+OPTION_UNITS = {
+    "distance": "m",
+    "rise": "s",
+    "radius": "m",
+    "frequency": "Hz",
+    "masses": "kg",
+    "drift": "m",
+    "minute": "s",
+}
+
+
+def check(name: str, option: str, value: Any) -> None:
+    """Raise InputError for a number that is zero or not finite. Strokes check their own options."""
+    if option in ("distance", "rise", "profile", "during"):
+        return
+    if not all(math.isfinite(v) and v for v in (value if option == "masses" else (value,))):
+        raise InputError("simulate", f"{name}: {option}", repr(value), "finite, other than 0")
+
+
+def bounds(scenario: str, options: Mapping[str, Any]) -> dict[str, str]:
+    """Keys of the published figures for a scenario, if it is the published stroke."""
+    asked = {"distance": DISTANCE, "rise": RISE, "profile": "logistic"}
+    if scenario != "stroke" or any(options.get(name, value) != value for name, value in asked.items()):
+        return {}
+    return {
+        "rise": "figure_12.rise_time",
+        "overshoot": "figure_12.overshoot",
+        "stroke": "figure_12.axial_error",
+        "m": "figure_13.radial_deviation",
+    }

@@ -1,0 +1,97 @@
+"""Outer forces on MALTA: steps, vibration of the housing, and compliance over frequency."""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from malta.model.plant import Plant
+from malta.simulation import references
+from malta.simulation.experiments import (
+    QUIET,
+    Experiment,
+    Merit,
+    PlannedRun,
+    Progress,
+    fly,
+    scenario_of,
+)
+from malta.simulation.responses import (
+    amplitude,
+    compliance,
+    sine_wrench,
+    step_wrench,
+)
+from malta.simulation.trajectory import Trajectory
+from malta.synthesis.controller import Controller
+
+
+def disturbance(
+    plant: Plant, controller: Controller, *, progress: Progress | None = None, **options: Any
+) -> Experiment:
+    """Steps of force and torque, vibration of the housing, sines of force; the linear loop's compliance beside them."""
+    wanted = disturbance_cases(plant, controller, **options)
+    cases, cut = fly(plant, controller, wanted, progress, options)
+    steps, sines = cases[:4], cases[4:]
+    w = np.geomspace(0.01, 2000, 600) * 2 * math.pi
+    curve = compliance(plant, controller, w)
+    worst = int(curve.argmax())
+    found = (
+        Merit("largest compliance, x1 to F_x", float(curve[worst]), "um/N"),
+        Merit("at", float(w[worst] / (2 * math.pi)), "Hz"),
+        Merit("smallest dynamic stiffness", float(1 / curve[worst]), "N/um"),
+    )
+    curves = {
+        "frequency": w / (2 * math.pi),
+        "compliance": curve,
+        "tones": np.array(TONES[: len(sines)]),
+        "simulated": np.array(
+            [case.merits[0].value / TONE_FORCE if case.run.verdict.completed else np.nan for case in sines]
+        ),
+    }
+    return Experiment("disturbance", "How stiff is it?", steps, found, curves, interrupted=cut)
+
+
+def disturbance_cases(plant: Plant, _: Controller, **options: Any) -> list[PlannedRun]:
+    """The runs of `disturbance`: steps, vibration, and sines of TONES."""
+    names = [s.name for s in plant.disturbances]
+    outputs = [s.name for s in plant.outputs]
+    wanted: list[PlannedRun] = []
+    for name, size, seen in (("F_x", 1.0, "x1"), ("F_z", 1.0, plant.stroke), ("T_y", 0.05, "x1")):
+        push = partial(step_wrench, column=names.index(name), size=size, at=0.02, width=len(names))
+        scenario = scenario_of("disturbance", 0.4, references.hold, QUIET | {"disturbance": push} | options)
+        unit = plant.disturbances[names.index(name)].unit
+        merits = partial(_step_merits, output=outputs.index(seen))
+        wanted.append(PlannedRun(f"step of {size:g} {unit} {name}", scenario, merits))
+    shake = partial(sine_wrench, column=names.index("F_y"), size=plant.mass, frequency=50.0, width=len(names))
+    vibration = scenario_of("vibration", 0.3, references.hold, QUIET | {"disturbance": shake} | options)
+    shaken = partial(_sine_merits, output=outputs.index("y1"), frequency=50.0)
+    wanted.append(PlannedRun("housing shaken by 1 m/s2 at 50 Hz along y", vibration, shaken))
+    for f in TONES:
+        push = partial(sine_wrench, column=names.index("F_x"), size=TONE_FORCE, frequency=f, width=len(names))
+        scenario = scenario_of(
+            "sine", 2 * max(0.1, 4 / f), references.hold, QUIET | {"disturbance": push} | options
+        )
+        found = partial(_sine_merits, output=outputs.index("x1"), frequency=f)
+        wanted.append(PlannedRun(f"{f:g} Hz", scenario, found))
+    return wanted
+
+
+TONES, TONE_FORCE = (5.0, 20.0, 60.0, 150.0, 400.0), 0.5  # Hz, N: the sines of force
+
+
+def _step_merits(run: Trajectory, output: int) -> tuple[Merit, ...]:
+    """Largest and last deflection of an output."""
+    error = np.abs(run.p[:, output])
+    return (
+        Merit(f"largest deflection of {run.plant.outputs[output].name}", float(error.max()), "um"),
+        Merit("left at the end", float(error[-1]), "um"),
+    )
+
+
+def _sine_merits(run: Trajectory, output: int, frequency: float) -> tuple[Merit, ...]:
+    """Amplitude of an output at a frequency (Hz)."""
+    return (Merit(f"amplitude of {run.plant.outputs[output].name}", amplitude(run, output, frequency), "um"),)

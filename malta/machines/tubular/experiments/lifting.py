@@ -1,0 +1,160 @@
+"""MALTA against its weight: lift-off from the touchdown bearing, and payloads."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import casadi as ca
+import numpy as np
+from scipy.optimize import brentq
+
+from malta.machines.tubular.experiments.strokes import delayed_stroke
+from malta.model.plant import Plant
+from malta.simulation import references
+from malta.simulation.experiments import (
+    Experiment,
+    Merit,
+    PlannedRun,
+    Progress,
+    fly,
+    scenario_of,
+)
+from malta.simulation.references import Motion, Reference
+from malta.simulation.scenario import ESTIMATORS
+from malta.simulation.trajectory import Trajectory
+from malta.synthesis.controller import Controller
+
+if TYPE_CHECKING:
+    from malta.model.plant import FloatArray
+
+
+def lift_off(
+    plant: Plant, controller: Controller, *, progress: Progress | None = None, **options: Any
+) -> Experiment:
+    """From rest on the touchdown bearing, without current; the observer takes the mover to be at the centre.
+
+    One run for each start-up estimator, or the one that options name.
+    """
+    wanted = lift_cases(plant, controller, **options)
+    cases, cut = fly(plant, controller, wanted, progress, options)
+    current = break_away_current(plant, wanted[0].scenario.start)
+    needed = Merit("current per module that lifts it, statics", current, "A")
+    return Experiment("lift-off", "Does it rise from its bearing?", cases, (needed,), interrupted=cut)
+
+
+def lift_cases(plant: Plant, _: Controller, **options: Any) -> list[PlannedRun]:
+    """The runs of `lift-off`: one for each start-up estimator."""
+    resting = rest_on_bearing(plant)
+    kinds = [options["estimator"]] if "estimator" in options else list(ESTIMATORS)
+    own = {"start": resting, "cold": True, "bearing": True}
+    reference = partial(rise_reference, start=resting)
+    return [
+        PlannedRun(
+            kind, scenario_of("lift-off", 0.15, reference, own | options | {"estimator": kind}), _lift_merits
+        )
+        for kind in kinds
+    ]
+
+
+def rise_reference(plant: Plant, start: Mapping[str, float], duration: float = 30e-3) -> Reference:
+    """From the state `start` to the centre, a quintic of `duration` (s)."""
+    first = np.array(plant.h(ca.DM(plant.at(**start).x), 0)).ravel()
+
+    def at(t: FloatArray) -> Motion:
+        s, ds, dds = references.quintic(np.asarray(t) - duration / 2, duration / references.QUINTIC_DURATION)
+        return Motion(np.outer(1 - s, first), np.outer(-ds, first), np.outer(-dds, first))
+
+    return at
+
+
+def rest_on_bearing(plant: Plant) -> dict[str, float]:
+    """The state in which the mover lies on its touchdown bearings, without current."""
+    names = [s.name for s in plant.states]
+    downward = int(np.argmax(np.abs(np.array(ca.evalf(plant.load(ca.SX(ca.DM(plant.at().x)))))[:3, 0])))
+    free = plant.states[downward].name
+    x = ca.SX.sym("x", len(names))
+    force = ca.Function(
+        "force", [x], [plant.f(x, ca.SX.zeros(len(plant.inputs)), plant.load(x) + plant.bearing(x))]
+    )
+
+    def net(depth: float) -> float:
+        return float(force(plant.at(**{free: -depth}).x)[len(names) // 2 + downward])
+
+    edge = brentq(
+        lambda depth: float(ca.evalf(plant.contact(ca.SX(ca.DM(plant.at(**{free: -depth}).x))))[0]) - 1, 0, 1
+    )
+    return {free: -float(brentq(net, edge, 1.5 * edge, xtol=1e-15))}
+
+
+def break_away_current(plant: Plant, resting: Mapping[str, float]) -> float:
+    """Current of each bearing axis, A, whose forces balance weight and attraction in the state of rest."""
+    x, u = ca.SX.sym("x", len(plant.states)), ca.SX.sym("u", len(plant.inputs))
+    rate = ca.Function(
+        "rate", [x, u], [plant.f(x, u, plant.load(x)), ca.jacobian(plant.f(x, u, plant.load(x)), u)]
+    )
+    pull, G = (np.array(value) for value in rate(plant.at(**resting).x, 0))
+    forces = np.linalg.lstsq(G, -pull, rcond=None)[0].ravel()
+    return float(np.abs(forces / np.array(plant.actuator.force_constant)).max())
+
+
+def _lift_merits(run: Trajectory) -> tuple[Merit, ...]:
+    """Times of lift-off and settling, overshoot, deviation from the path, and current."""
+    free = (run.contact[:, :2] < 1).all(axis=1)
+    lifted = float(run.t[int(np.argmax(free))]) if free.any() else math.nan
+    late = np.flatnonzero(np.abs(run.p[:, :4]).max(axis=1) > 20e-6)
+    settled = float(run.t[late[-1]]) if len(late) and late[-1] + 1 < len(run.t) else math.nan
+    return (
+        Merit("off the bearing after", lifted, "ms"),
+        Merit("within 20 um after", settled, "ms"),
+        Merit("beyond the centre", max(float(run.p[:, [1, 3]].max()), 0.0), "um"),
+        Merit("off its path", float(np.abs(run.p - run.reference)[:, :4].max()), "um"),
+        Merit("largest bearing current", _bearing_current(run), "A"),
+    )
+
+
+def _bearing_current(run: Trajectory) -> float:
+    """Largest acting current of a bearing axis, A."""
+    others = [k for k in range(len(run.plant.inputs)) if k != run.plant.thrust_input]
+    return float(np.abs(run.force[:, others] / np.array(run.plant.actuator.force_constant)[others]).max())
+
+
+def payload(
+    plant: Plant,
+    controller: Controller,
+    *,
+    masses: tuple[float, ...] = (0.05, 0.1, 0.15, 0.2),
+    progress: Progress | None = None,
+    **options: Any,
+) -> Experiment:
+    """A mass (kg) picked at the centre of gravity after 50 ms of a hold, carried, and moved through the stroke.
+
+    The controller does not learn of it. The integrals have 0.45 s before the stroke begins.
+    """
+    reference = partial(delayed_stroke, wait=WAIT)
+    wanted = []
+    for extra in masses:
+        own = {"changes": ((PICKED, {"m": plant.mass + extra}),), "bearing": True}
+        scenario = scenario_of("payload", WAIT + 0.15, reference, own | options)
+        wanted.append(PlannedRun(f"{extra * 1e3:.0f} g", scenario, _payload_merits))
+    cases, cut = fly(plant, controller, wanted, progress, options)
+    carried = max((m for m, c in zip(masses, cases, strict=False) if c.run.verdict.completed), default=0.0)
+    merit = Merit("largest of these carried and moved", carried, "kg", "position_controller.payload")
+    return Experiment("payload", "What can it pick and move?", cases, (merit,), interrupted=cut)
+
+
+PICKED, WAIT = 0.05, 0.5  # s: the mass is picked, the stroke begins
+
+
+def _payload_merits(run: Trajectory) -> tuple[Merit, ...]:
+    """Sag after the pick, and the errors of the stroke."""
+    error, axis = np.abs(run.p - run.reference), run.plant.stroke_output
+    carrying, moving = (run.t >= PICKED) & (run.t < WAIT), run.t >= WAIT
+    radial = [k for k in range(error.shape[1]) if k != axis]
+    return (
+        Merit("largest sag after the pick", float(error[carrying][:, radial].max(initial=0.0)), "um"),
+        Merit("stroke: axial error", float(error[moving][:, axis].max(initial=0.0)), "mm"),
+        Merit("stroke: radial deviation", float(error[moving][:, radial].max(initial=0.0)), "um"),
+    )

@@ -1,0 +1,1 @@
+"""Tables of everything that malta computes, for a terminal."""

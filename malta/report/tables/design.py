@@ -1,0 +1,127 @@
+"""Tables of a design's loop: poles, bandwidths, peak sensitivity."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, TypeGuard
+
+import numpy as np
+from rich.table import Table
+from scipy.optimize import linear_sum_assignment
+
+from malta.margins.verify import (
+    BANDWIDTHS,
+    ZONES,
+    Margins,
+    zone,
+)
+from malta.model.data import published_value
+from malta.model.linearize import LinearModel
+from malta.report.figures.parts import Published, published_in_unit
+from malta.report.tables.parts import add_row, new_table
+
+if TYPE_CHECKING:
+    from malta.model.plant import ComplexArray, FloatArray
+
+
+def poles_table(model: LinearModel, published: Published | None) -> Table:
+    """Open-loop poles by mode; beside them the paper's Table I, which holds at the middle of the travel.
+
+    A damped plant has no pairs of opposite poles: all its poles are listed.
+    """
+    n = len(model.A) // 2
+    if np.any(model.A[n:, n:]):
+        table = new_table("Open-loop poles [rad/s]", "of", "poles")
+        poles = np.linalg.eigvals(model.A).astype(complex)
+        add_row(table, "ours", _pole_text(np.where(np.abs(poles) < 1e-9 * np.abs(poles).max(), 0, poles)))
+        return table
+    names, squares = _modes(model)
+    table = new_table("Open-loop poles [rad/s]", "mode", *names)
+    add_row(table, "ours, +-", *(f"{math.sqrt(abs(s)):.2f}{'j' if s < 0 else ''}" for s in squares))
+    at_centre = not np.any(model.operating_point.x)
+    if publishes(published, "table_I", "poles") and at_centre:
+        printed = [published_value(published, f"table_I.poles.{name}") for name in names]
+        digits = published["table_I"]["digits"]
+        add_row(table, "Table I, +-", *(f"{value:.{digits}f}" for value in printed))
+    return table
+
+
+def publishes(published: Published | None, table: str, key: str) -> TypeGuard[Published]:
+    """Whether a file of published figures has this table and this key in it."""
+    return published is not None and key in published.get(table, {})
+
+
+def loop_poles_table(margins: Margins, continuous: Mapping[str, ComplexArray] | None = None) -> Table:
+    """Poles of the continuous design, if given, and of the sampled loop as ln(lambda) / Ts, rad/s.
+
+    continuous : poles by the name of their row
+    """
+    table = new_table("Poles [rad/s]; of sampled systems ln(lambda) / Ts", "of", "poles")
+    for what, poles in (continuous or {}).items():
+        add_row(table, what, _pole_text(poles))
+    for what, key in (
+        ("sampled regulator", "regulator"),
+        ("sampled Kalman filter", "filter"),
+        ("closed loop of the machine", "closed_loop"),
+    ):
+        if (found := getattr(margins.poles, key)).size:
+            add_row(table, what, _pole_text(found))
+    return table
+
+
+def bandwidth_table(margins: Margins, published: Published | None) -> Table:
+    """The bandwidth by each definition; a paper may print one figure without saying which it is."""
+    table = new_table("Bandwidth by definition", "definition", "rad/s", "Hz")
+    for key, meaning in BANDWIDTHS.items():
+        if key not in margins.bandwidth:  # a machine or a law without natural frequencies
+            continue
+        value = margins.bandwidth[key]
+        add_row(table, meaning, f"{value:.1f}", f"{value / (2 * math.pi):.2f}")
+    if publishes(published, "position_controller", "bandwidth"):
+        value = published_in_unit(published, "position_controller.bandwidth", "rad/s")
+        add_row(
+            table, "published, without a definition", f"about {value:.0f}", f"{value / (2 * math.pi):.0f}"
+        )
+    return table
+
+
+def sensitivity_table(margins: Margins) -> Table:
+    """Peak sensitivity at each sensor with its ISO 14839-3 zone, for each stage of the analysis."""
+    sensors = [k for k in margins.peak_sensitivity if k != "sigma_max"]
+    limits = ", ".join(f"{name} < {limit:g}" for limit, name in ZONES if math.isfinite(limit))
+    table = new_table(
+        f"Peak sensitivity (ISO 14839-3 zone: {limits})", "loop", *sensors, "sigma_max", "at rad/s"
+    )
+    for stage in margins.stages:
+        peaks = [f"{stage.peak_sensitivity[s]:.2f} {zone(stage.peak_sensitivity[s])}" for s in sensors]
+        add_row(
+            table,
+            stage.name,
+            *peaks,
+            f"{stage.peak_sensitivity['sigma_max']:.2f}",
+            f"{stage.peak_frequency:.3g}",
+        )
+    return table
+
+
+def _modes(model: LinearModel) -> tuple[list[str], FloatArray]:
+    """Squares of the poles +-s of an undamped plant, each named by the position that takes part most in its mode."""
+    names = [s.name for s in model.plant.design_states[: len(model.stiffness)]]
+    squares, shapes = np.linalg.eig(model.stiffness)
+    participation = np.abs(shapes * np.linalg.inv(shapes).T)  # of position i in mode j, free of units
+    _, mode = linear_sum_assignment(-participation)
+    found = squares.real[mode]
+    return names, np.where(np.abs(found) < 1e-12 * np.abs(found).max(initial=0.0), 0.0, found)
+
+
+def _pole_text(poles: ComplexArray) -> str:
+    """Poles in one line: a conjugate pair once, a repeated pole with its multiplicity."""
+    counted: dict[str, int] = {}
+    for pole in poles:
+        if pole.imag < -1e-6 * abs(pole):
+            continue
+        real = f"{pole.real:.4g}"
+        text = f"{real}+-{pole.imag:.4g}j" if pole.imag > 1e-6 * abs(pole) else real
+        counted[text] = counted.get(text, 0) + 1
+    return "  ".join(text if count == 1 else f"{text} (x{count})" for text, count in counted.items())

@@ -1,0 +1,228 @@
+"""Tables of a robustness analysis: margins stage by stage and along the travel, disks, tolerances, worst cases."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+from rich.table import Table
+
+from malta.margins.verify import (
+    NOT_BETWEEN,
+    NOT_PROVEN,
+    zone,
+)
+from malta.model.signals import (
+    compliance_unit,
+    stiffness_unit,
+)
+from malta.report.tables.parts import add_row, new_table
+
+if TYPE_CHECKING:
+    from malta.margins.extent import Extent
+    from malta.margins.gain import Gain
+    from malta.margins.robust import Margin
+    from malta.margins.stages import Robustness
+    from malta.model.plant import Plant
+
+
+def chain_table(found: Robustness) -> Table:
+    """Parametric margin and peak sensitivity of each stage, from the ideal loop to the machine's."""
+    table = new_table(
+        "Where the margin goes: multiples of the uncertainty that no parameter set may exceed",
+        "stage", "proven", "lost at", "rad/s", "first to give", "peak |S|", "of",
+    )  # fmt: skip
+    for link in found.chain:
+        peak = "unstable" if math.isnan(link.peak) else f"{link.peak:.2f}"
+        if link.broken_at == "sensors" and not math.isnan(link.peak):
+            peak += f" {zone(link.peak)}"
+        add_row(
+            table,
+            link.name,
+            *_margin_cells(link.margin),
+            _limiting_parameters(link.margin),
+            peak,
+            link.broken_at,
+        )
+    if found.extent.intervals:
+        add_row(
+            table,
+            _coverage_text(found),
+            *_margin_cells(found.travel),
+            _limiting_parameters(found.travel),
+            "",
+            "",
+        )
+    return table
+
+
+def _coverage_text(found: Robustness) -> str:
+    """The positions and parameters that the margin over the extent covers, as a row of a table."""
+    if not is_of_whole_travel(found.travel):
+        return "middle and end of it"
+    parts = ["all of the travel"] if found.extent.stroke else []
+    return ", ".join([*parts, found.extent.values] if found.extent.over else parts)
+
+
+def _margin_cells(margin: Margin) -> tuple[str, str, str]:
+    """Proven share, share at which the loop is lost, frequency in rad/s."""
+    if margin is NOT_PROVEN:
+        return "not asked", "", ""
+    low = "nothing" if margin.lower is None else f"{100 * margin.lower:.2f} %"
+    high = "not found" if margin.exhausted else f"{100 * margin.upper:.2f} %"
+    return low, high, "" if margin.frequency is None else f"{margin.frequency:.4g}"
+
+
+def _limiting_parameters(margin: Margin) -> str:
+    """The parameters that the margin depends on most, with the sign of their change; or why nothing is proven."""
+    if margin.witness is None:
+        return "" if margin is NOT_PROVEN else margin.reason
+    largest = sorted(margin.sensitivity, key=lambda name: -margin.sensitivity[name])
+    return " ".join(
+        f"{name}{'+' if margin.moved[name] > 0 else '-'}"
+        for name in largest
+        if margin.sensitivity[name] > 0.02
+    )
+
+
+def disk_table(found: Robustness, Ts: float) -> Table:
+    """Disk margins of the machine's loop, and the delay margin of each sensor's loop.
+
+    Ts : sample time, s
+    """
+    table = new_table(
+        f"Margins of the sampled loop without parameters{_places_text(found)}",
+        "factor in",
+        "disk",
+        "gain",
+        "phase [deg]",
+        "rad/s",
+    )
+    for disk in found.disks:
+        add_row(
+            table,
+            disk.channels,
+            f"{disk.size:.3f}",
+            f"{1 / disk.gain:.2f} .. {disk.gain:.2f}",
+            f"+-{math.degrees(disk.phase):.1f}",
+            f"{disk.frequency:.4g}",
+        )
+    for name, delay in found.delay.items():
+        add_row(table, f"delay at {name} alone", *_delay_cells(delay, Ts), "", "")
+    return table
+
+
+def _places_text(found: Robustness) -> str:
+    """The end of a title: the places of which a table has the smallest value."""
+    course = found.extent.course
+    along = "along the travel" if found.extent.stroke else f"of {len(found.places)} values of {course}"
+    return f", the smallest {along}" if course else ""
+
+
+def _delay_cells(delay: float, Ts: float) -> tuple[str, str]:
+    """A delay margin (s) as time and in samples."""
+    if math.isnan(delay):
+        return "unstable", ""
+    return (f"{delay * 1e6:.0f} us", f"{delay / Ts:.1f} samples") if math.isfinite(delay) else ("any", "")
+
+
+def gang_table(found: Robustness, plant: Plant) -> Table:
+    """Gang of four: the largest gains of S, T, PS and FS at each sensor."""
+    units = {signal.name: signal.unit for signal in plant.outputs}
+    one = next(iter(set(units.values()))) if len(set(units.values())) == 1 else ""
+    heads = (f" [{per(one)}]" if one else "" for per in (compliance_unit, stiffness_unit))
+    extent = found.extent
+    title = f"Gang of four, largest over frequency{f' and {_course_text(extent)}' if extent.course else ''}"
+    forces = (f"{what}{unit}" for what, unit in zip(("from force |SP|", "to force |FS|"), heads, strict=True))
+    table = new_table(title, "sensor", "|S|", "|T|", *forces)
+    for name, (S, T, PS, FS) in found.gang.items():
+        unit = units[name]
+        cells = f"{PS * 1e6:.1f}", f"{FS * 1e-6:.3f}"
+        if not one:
+            cells = f"{cells[0]} {compliance_unit(unit)}", f"{cells[1]} {stiffness_unit(unit)}"
+        add_row(table, name, f"{S:.2f}", f"{T:.2f}", *cells)
+    return table
+
+
+def _course_text(extent: Extent) -> str:
+    """The word for the travel, or for the parameter in its place."""
+    return "travel" if extent.stroke else extent.course
+
+
+def tolerance_table(found: Robustness, uncertainty: Mapping[str, float]) -> Table:
+    """The proven range of each parameter alone, and its share in the margin of all together."""
+    anywhere = ["anywhere in the travel"] if found.extent.stroke else []
+    anywhere += [f"for {found.extent.values}"] if found.extent.over else []
+    where = " and ".join(anywhere) if is_of_whole_travel(found.travel) else "in its middle and at its end"
+    table = new_table(
+        f"One at a time, proven {where}".rstrip(), "parameter", "down to", "up to", "share in the margin"
+    )
+    shares = found.chain[-1].margin.sensitivity
+    for name, (down, up) in found.tolerance.items():
+        cells = []
+        for margin, sign in ((down, -1), (up, 1)):
+            t = margin.lower
+            change = "nothing proven" if t is None else f"{100 * sign * t * uncertainty[name]:+.1f} %"
+            cells.append(f"{change} and further" if t is not None and margin.exhausted else change)
+        add_row(table, name, *cells, f"{100 * shares.get(name, 0):.0f} %")
+    if found.payload is not None:
+        t = found.payload.lower
+        more = " and more" if found.payload.exhausted else ""
+        add_row(table, "payload", "", "nothing proven" if t is None else f"{t:.3g} kg{more}", "")
+    return table
+
+
+def worst_case_table(gains: Mapping[str, Gain]) -> Table:
+    """The largest |S| of each sensor over all that the margin covers: found, and proven upper bound."""
+    title = "Worst-case peak |S| over the uncertainty and all that the margin covers"
+    table = new_table(title, "sensor", "found", "at rad/s", "proven below", "zone")
+    for name, gain in gains.items():
+        high = "nothing proven" if gain.upper is None else f"{gain.upper:.3f}"
+        add_row(table, name, f"{gain.lower:.3f}", f"{gain.frequency:.4g}", high, zone(gain.upper or math.inf))
+    return table
+
+
+def places_table(found: Robustness, Ts: float) -> Table:
+    """Margins of the machine's loop along the travel, where each holds at a position and at its negative.
+
+    A machine without a travel has the first parameter that its proofs cover in its place.
+    """
+    extent = found.extent
+    if not extent.stroke:
+        title = f"Along {extent.course}" if extent.course else "The machine's loop"
+    elif is_of_whole_travel(found.travel):
+        title = "Along the travel, either way"
+    else:
+        title = "In the middle of the travel and at its ends (margin: at the positive one)"
+    table = new_table(
+        title,
+        f"at [{'mm' if extent.stroke else extent.unit}]" if extent.course else "at",
+        "proven",
+        "lost at",
+        "rad/s",
+        "peak |S|",
+        "disk, all",
+        "delay",
+    )
+    for place in found.places:
+        peak = "unstable" if math.isnan(place.peak) else f"{place.peak:.2f} {zone(place.peak)}"
+        add_row(
+            table,
+            f"{place.position * 1e3:.1f}" if extent.stroke else _position_text(extent, place.position),
+            *_margin_cells(place.margin),
+            peak,
+            "none" if math.isnan(place.disk) else f"{place.disk:.3f}",
+            ", ".join(cell for cell in _delay_cells(place.delay, Ts) if cell),
+        )
+    return table
+
+
+def _position_text(extent: Extent, position: float) -> str:
+    """A place along a parameter."""
+    return f"{position:.4g}" if extent.course else "its values"
+
+
+def is_of_whole_travel(margin: Margin) -> bool:
+    """Whether a margin of the travel holds at every position, and not only at some."""
+    return NOT_BETWEEN not in margin.reason

@@ -1,0 +1,81 @@
+"""Tables of a search: requirements and what a design reaches of them, and the Pareto front."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from rich.table import Table
+
+from malta.report.figures.parts import UNITS, front_lines
+from malta.report.tables.parts import add_row, new_table
+from malta.synthesis.requirements import Trade, requirements_for
+
+if TYPE_CHECKING:
+    from malta.tuning.outcomes import Outcome
+    from malta.tuning.tune import Tuned
+
+
+def requirements_table(requirements: Sequence[Outcome]) -> Table:
+    """Each requirement of a design: the limit, the value found, and their ratio."""
+    table = new_table("Requirements", "requirement", "asked", "found", "of the limit", "", "from")
+    for r in requirements:
+        scale, unit = UNITS.get(r.unit, (1.0, ""))
+        found = f"{r.found * scale:.4g} {unit}".rstrip()
+        if r.asked is None:
+            add_row(table, r.name.replace("_", " "), "least", found, "", "", r.how)
+            continue
+        bound = ">=" if r.at_least else "<="
+        add_row(
+            table,
+            r.name.replace("_", " "),
+            f"{bound} {r.asked * scale:.4g} {unit}".rstrip(),
+            found,
+            f"{100 * r.ratio:.1f} %",
+            "holds" if r.holds else "FAILS",
+            r.how,
+        )
+    return table
+
+
+def _front_columns(tuned: Tuned) -> dict[str, tuple[str, float, str]]:
+    """Columns of the front by figure: heading, factor from SI to the unit shown, unit."""
+    names = dict.fromkeys(name for one in tuned.front for name in one.figures)
+    columns = {"margin": ("margin, proven", 100.0, "%")}
+    sides: tuple[tuple[Trade, str], ...] = (("force", ""), ("motion", " motion"))
+    for trade, what in sides:
+        for name, label, scale, unit in front_lines(tuned.spec.plant, names, trade):
+            columns[name] = (f"{label}{what}", scale, f"{unit} rms")
+    for name, r in requirements_for(tuned.spec.plant).items():
+        if name in names and r.heading and not r.trade:
+            columns[name] = (r.heading, *UNITS.get(r.unit, (1.0, "")))
+    return columns
+
+
+def front_rows(tuned: Tuned) -> tuple[list[str], list[list[str]]]:
+    """The Pareto front as headings and cells: a row for each trial, the chosen one with a star."""
+    columns = _front_columns(tuned)
+    shown = [name for name in columns if any(name in one.figures for one in tuned.front)]
+    heads = [f"{columns[k][0]} [{columns[k][2]}]".removesuffix(" []") for k in shown]
+    rows = [
+        [f"{one.figures[k] * columns[k][1]:.4g}" if k in one.figures else "" for k in shown]
+        + ["*" if one.values == tuned.trial.values else ""]
+        for one in tuned.front
+    ]
+    return [*heads, ""], rows
+
+
+def front_table(tuned: Tuned) -> Table:
+    """The Pareto front of margin, force noise and motion, in the order of margins."""
+    heads, rows = front_rows(tuned)
+    table = new_table("What the margin costs (* chosen)", *heads)
+    for row in rows:
+        add_row(table, *row)
+    return table
+
+
+def front_markdown(tuned: Tuned) -> str:
+    """The Pareto front as a Markdown table."""
+    heads, rows = front_rows(tuned)
+    lines = ["| " + " | ".join(row) + " |" for row in (heads, ["---:"] * len(heads), *rows)]
+    return "\n".join([*lines, ""])
