@@ -62,11 +62,7 @@ def _findings_table(found: Campaign, published: Published | None) -> Table:
 
     listed = figures_of(found, published)
     bounds = any(math.isfinite(f.published) for f in listed)
-    heads = [
-        *(f"{p} %" for p in PERCENTILES),
-        "largest",
-        *(["published", "kept [%]"] if bounds else []),
-    ]
+    heads = [*(f"{p} %" for p in PERCENTILES), "largest", *(["published", "kept [%]"] if bounds else [])]
     table = new_table("Figures of merit: percentiles of the completed runs", "figure", *heads)
     table.columns[0].no_wrap = True
     for f in listed:
