@@ -141,6 +141,38 @@ def test_wrong_data_is_one_sentence(folder: Path, run: Run) -> None:
         assert expected in one_sentence(err)
 
 
+def test_a_plant_is_written_about_its_operating_point(folder: Path, run: Run) -> None:
+    """1 mm above the middle: another stiffness, a pull that the current has to balance, and it stands there."""
+    file = folder / "lev.py"
+    text = file.read_text(encoding="utf-8").replace("magnets(par, x[0], i)", "magnets(par, 1e-3 + x[0], i)")
+    file.write_text(text, encoding="utf-8")
+    par = malta.read(folder / "lev.toml")
+    plant = malta.plant_of(par)
+    closer, wider = par.s - 1e-3, par.s + 1e-3
+    k_s = 2 * par.C * par.I_0**2 * (closer**-3 + wider**-3)
+    model = malta.linearize(plant, plant.at())
+    assert model.A[1, 0] * par.m == pytest.approx(k_s, rel=1e-12)
+    spec = malta.read_design(folder / "design" / "lev.toml")
+    controller = malta.synthesize(spec, model)
+    (v0,) = set(controller.feedforward.v0.ravel().tolist())
+    current = v0 * par.s**2 / (4 * par.C * par.I_0)
+    force = par.C * (((par.I_0 + current) / closer) ** 2 - ((par.I_0 - current) / wider) ** 2)
+    assert force == pytest.approx(par.m * par.g, rel=1e-12)
+    assert v0 < 0.5 * par.m * par.g  # the nearer magnet carries most of the weight
+    still = malta.experiment("hold", plant, controller, noise=0.0)
+    assert np.abs(still.run.p).max() < 1e-12
+    design = folder / "design" / "lev.toml"
+    design.write_text(
+        design.read_text(encoding="utf-8").replace(
+            "operating_point = {}", 'operating_point = { q = { value = 1, unit = "mm" } }'
+        ),
+        encoding="utf-8",
+    )
+    code, _, err = run("design", "design/lev.toml")
+    assert code == 2
+    assert "operating_point.q: found another state, expected none, as there is no stroke" in one_sentence(err)
+
+
 def test_a_gain_file_runs_no_code_that_was_not_named(folder: Path, run: Run) -> None:
     """Beside a module of the machine's name, in the folder that the command runs in."""
     assert run("design", "design/lev.toml")[0] == 0

@@ -384,6 +384,34 @@ def load_balance(plant: Plant, states: FloatArray) -> FloatArray:
     return _hold(plant, states, loads_alone=True)
 
 
+def holding_forces(plant: Plant) -> FloatArray:
+    """The forces v to command at the states' zero, so that their currents hold the machine there at rest.
+
+    Solves 0 = f(0, forces(0, currents(h(0), v)), load(0)) by Newton's method, in the least-squares sense. A plant that
+    is written about a point off its centre is thus held there, whatever its magnets pull with.
+
+    Raises CheckError when no forces hold it.
+    """
+    kind = ca.MX if plant.tabulated else ca.SX
+    x, v = kind(ca.DM.zeros(len(plant.states))), kind.sym("v", len(plant.inputs))
+    i = plant.currents(plant.h(x, kind.zeros(len(plant.inputs))), v)
+    rate = ca.densify(plant.f(x, plant.forces(x, i), plant.load(x)))
+    residual = ca.Function("residual", [v], [rate, ca.jacobian(rate, v)])
+    found, left = np.zeros(len(plant.inputs)), math.inf
+    for _ in range(30):
+        r, J = (np.array(value) for value in residual(found))
+        left = float(np.abs(r).max())
+        if not math.isfinite(left) or left == 0:
+            break
+        found -= np.linalg.lstsq(J, r, rcond=None)[0].ravel()
+    left = float(np.abs(np.array(residual(found)[0])).max())
+    if not left <= 1e-9:  # m/s, rad/s, m/s2 or rad/s2
+        raise CheckError(
+            f"{plant.name}: no input holds it at rest: it changes at up to {left:.3g} (SI) a second"
+        )
+    return found
+
+
 def _hold(plant: Plant, states: FloatArray, *, loads_alone: bool = False) -> FloatArray:
     x, u = ca.SX.sym("x", len(plant.states)), ca.SX.sym("u", len(plant.inputs))
     rate = plant.f(x, u, plant.load(x))

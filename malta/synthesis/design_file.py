@@ -317,14 +317,16 @@ def _resolve(
 
 
 def _operating_point(entries: Mapping[str, Quantity], plant: Plant, where: Path) -> dict[str, float]:
-    """Along the stroke only: elsewhere v0(z) knows no equilibrium."""
+    """Along the stroke only: elsewhere v0(z) knows no equilibrium, and a plant is written about its point."""
     units = {s.name: s.unit for s in plant.design_states if s.name == plant.stroke}
     values = {}
     for name, q in entries.items():
         if name not in units:
-            raise InputError(
-                where, f"operating_point.{name}", "another state", f"{plant.stroke}, the stroke, alone"
+            alone = (
+                f"{plant.stroke}, the stroke, alone" if plant.has_stroke else "none, as there is no stroke"
             )
+            expected = f"{alone}; a plant is written about another point, as its states' zero"
+            raise InputError(where, f"operating_point.{name}", "another state", expected)
         values[name] = to_si(q.value, q.unit, units[name], where, f"operating_point.{name}")
         if not math.isfinite(values[name]):
             raise InputError(where, f"operating_point.{name}", str(values[name]), "a finite number")

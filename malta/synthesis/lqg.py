@@ -28,7 +28,7 @@ from scipy import linalg
 
 from malta.errors import CheckError, InputError
 from malta.model.linearize import LinearModel
-from malta.model.plant import Actuator, Plant, load_balance
+from malta.model.plant import Actuator, Plant, holding_forces, load_balance
 from malta.synthesis.controller import (
     Controller,
     Cost,
@@ -483,11 +483,10 @@ def static_feedforward(plant: Plant) -> Feedforward:
     if plant.has_stroke:
         half = max(V0_STEPS, round(plant.travel / V0_STEP))
         z_grid = np.linspace(-plant.travel, plant.travel, 2 * half + 1)
-        states = np.array([plant.at(**{plant.stroke: z}).x for z in z_grid])
+        v0 = load_balance(plant, np.array([plant.at(**{plant.stroke: z}).x for z in z_grid]))
     else:
         z_grid = np.array([0.0, 1.0])
-        states = np.tile(plant.at().x, (2, 1))
-    v0 = load_balance(plant, states)
+        v0 = np.tile(holding_forces(plant), (2, 1))
     return Feedforward(np.array(plant.inertia), np.zeros((m, p)), np.zeros((rates, p)), z_grid, v0)
 
 
