@@ -39,7 +39,7 @@ from malta.machines.planar import plant as planar
 from malta.machines.planar.experiments.motions import CELLS
 from malta.machines.planar.experiments.timings import compile_function
 from malta.machines.tubular import plant as tubular
-from malta.model.data import published_value
+from malta.model.published import published_value
 from malta.simulation.engines import engine_of, library_of
 from malta.simulation.inputs import feedforward
 from malta.simulation.period import state_reference

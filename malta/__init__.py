@@ -32,9 +32,7 @@ if TYPE_CHECKING:  # the contents page, as type checkers and readers see it
     from malta.margins.uncertain import UncertainSystem as UncertainSystem
     from malta.margins.verify import Margins as Margins
     from malta.margins.verify import verify as verify
-    from malta.model.data import in_unit as in_unit
     from malta.model.data import plant_of as plant_of
-    from malta.model.data import published as published
     from malta.model.data import read as read
     from malta.model.linear import linear_machine as linear_machine
     from malta.model.linearize import LinearModel as LinearModel
@@ -44,6 +42,7 @@ if TYPE_CHECKING:  # the contents page, as type checkers and readers see it
     from malta.model.plant import Plant as Plant
     from malta.model.plant import Signal as Signal
     from malta.model.plant import trim as trim
+    from malta.model.published import published as published
     from malta.report.ledger import ledger as ledger
     from malta.simulation import references as references
     from malta.simulation.batch import replayed as replayed
@@ -70,6 +69,7 @@ if TYPE_CHECKING:  # the contents page, as type checkers and readers see it
     from malta.synthesis.spec import Weights as Weights
     from malta.synthesis.state_space import controller_of as controller_of
     from malta.tuning.tune import tune as tune
+    from malta.units import in_unit as in_unit
 
 _NAMES = {  # the same, for the first use of each name
     "campaigns.plan": ("Plan",),

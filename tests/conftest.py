@@ -17,7 +17,7 @@ from malta.cli import main as cli
 from malta.machines.tubular import plant as tubular
 from malta.margins import robust
 from malta.margins.problem import OfLoop, OfSeveral, Problem
-from malta.model.data import published as read_published
+from malta.model.published import published as read_published
 
 if TYPE_CHECKING:
     from malta.margins.box import Box

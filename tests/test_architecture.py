@@ -18,6 +18,7 @@ ORDER = (
         "errors",
         "units",
         "files",
+        "tables",
         "threads",
         "model",
         "synthesis",

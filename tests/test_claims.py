@@ -20,11 +20,13 @@ from malta import references
 from malta.machines.tubular import claims as tubular
 from malta.machines.tubular.evidence import EXPERIMENT_NAMES, Evidence
 from malta.margins.verify import machine_loop
-from malta.model.data import in_unit, plant_of, published_value
+from malta.model.data import plant_of
+from malta.model.published import published_value
 from malta.report import ledger as claims
 from malta.report.ledger import Claim, Ledger, Row
 from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate
+from malta.units import in_unit
 
 if TYPE_CHECKING:
     from conftest import Design

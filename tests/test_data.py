@@ -14,8 +14,10 @@ from conftest import refusal
 
 import malta
 from malta.machines.tubular import plant as tubular
-from malta.model.data import load_toml, to_si, units_of
-from malta.model.data import published as read_published
+from malta.model.parameters import units_of
+from malta.model.published import published as read_published
+from malta.tables import load_toml
+from malta.units import to_si
 
 if TYPE_CHECKING:
     pass

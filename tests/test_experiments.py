@@ -19,7 +19,8 @@ import malta
 from malta import references
 from malta.machines.tubular.experiments import EXPERIMENTS, forces, lifting, rest, strokes
 from malta.margins.verify import loop, machine_loop
-from malta.model.data import plant_of, published_value
+from malta.model.data import plant_of
+from malta.model.published import published_value
 from malta.simulation.catalogue import experiment
 from malta.simulation.experiments import Case, Experiment, Merit
 from malta.simulation.responses import compliance

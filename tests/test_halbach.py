@@ -17,7 +17,7 @@ import malta
 from malta.machines.halbach import electronics, motor
 from malta.machines.halbach import plant as halbach
 from malta.machines.halbach.plant import Parameters
-from malta.model.data import published_value
+from malta.model.published import published_value
 from malta.synthesis.lqg import sampled_model
 
 if TYPE_CHECKING:

@@ -30,8 +30,8 @@ from malta.machines.halbach.experiments.lift import FAULTS, LAWS, lift_force, mo
 from malta.machines.halbach.experiments.motions import steps_reference
 from malta.machines.halbach.experiments.open_loop import positions_at_rest
 from malta.machines.halbach.plant import Parameters
-from malta.model.data import published_value
 from malta.model.plant import Plant
+from malta.model.published import published_value
 from malta.report.ledger import ledger
 from malta.simulation.catalogue import cases_of, experiment
 from malta.simulation.compiled import compiler

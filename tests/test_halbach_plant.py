@@ -17,8 +17,9 @@ from malta.machines.halbach import electronics, motor
 from malta.machines.halbach import plant as halbach
 from malta.machines.halbach.electronics import IDEAL, REAL, Options
 from malta.machines.halbach.plant import Parameters
-from malta.model.data import shaping
-from malta.model.plant import Electronics, Plant, symbolic
+from malta.model.drive import Electronics
+from malta.model.parameters import shape_parameters
+from malta.model.plant import Plant, symbolic
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
@@ -65,7 +66,7 @@ def test_signals_and_numbers_of_the_record(par: Parameters, plant: Plant) -> Non
     assert plant.actuator.crossover == pytest.approx(451, rel=1e-3)
     assert plant.actuator.force_limit == (2.0,)
     assert plant.actuator.voltage_limit == 6.0
-    assert shaping(par) == {"f_pwm": par.f_pwm, "T_laser": par.T_laser, "latency": 0}
+    assert shape_parameters(par) == {"f_pwm": par.f_pwm, "T_laser": par.T_laser, "latency": 0}
     for latency in (0, 1):
         late = halbach.plant(replace(par, latency=latency))
         assert late.actuator.delay(par.T_laser) == latency
@@ -362,7 +363,7 @@ def test_limits_are_kept_in_mind(par: Parameters) -> None:
 
 
 def _symbols(par: Parameters) -> tuple[Parameters, list[Any], list[float]]:
-    names = [f.name for f in fields(par) if "unit" in f.metadata and f.name not in shaping(par)]
+    names = [f.name for f in fields(par) if "unit" in f.metadata and f.name not in shape_parameters(par)]
     symbols = {name: ca.SX.sym(name) for name in names}
     return symbolic(par, symbols), list(symbols.values()), [getattr(par, name) for name in names]
 

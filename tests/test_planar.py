@@ -24,9 +24,9 @@ from malta.machines.planar import coils, commutation
 from malta.machines.planar import field as planar_field
 from malta.machines.planar import plant as planar
 from malta.machines.planar.field import ODD_X, ODD_Y, Series
-from malta.model.data import published as read_published
-from malta.model.data import published_value
 from malta.model.plant import symbolic
+from malta.model.published import published as read_published
+from malta.model.published import published_value
 from malta.model.rigidbody import rotation
 from malta.simulation.references import QUINTIC_DURATION, quintic
 from malta.simulation.translate import translate
@@ -88,7 +88,7 @@ def single(model: coils.CoilModel, p: FloatArray) -> FloatArray:
 
 def test_every_printed_value_is_tagged_so(par: planar.Parameters, paper: dict[str, Any]) -> None:
     """Table 1 is in the data file, value by value; nothing else but the force limit is called printed."""
-    entries = malta.model.data.load_toml(FILE)["parameters"]
+    entries = malta.tables.load_toml(FILE)["parameters"]
     printed = {name for name, entry in entries.items() if entry["tag"] == "printed"}
     assert printed == {*paper["table_1"]["parameters"], "F_max"}
     assert par.coil_pitch == pytest.approx(16 / 3 * par.tau_n, rel=1e-12)

@@ -21,8 +21,8 @@ from malta.machines.planar import experiments as experiments
 from malta.machines.planar import plant as planar
 from malta.machines.planar.experiments import models, motions, timings
 from malta.margins.verify import Margins
-from malta.model.data import published as read_published
-from malta.model.data import published_value
+from malta.model.published import published as read_published
+from malta.model.published import published_value
 from malta.report.figures import experiment_figure
 from malta.report.ledger import ledger
 from malta.simulation.catalogue import cases_of, experiments_of

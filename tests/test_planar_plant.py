@@ -16,7 +16,8 @@ from hypothesis import strategies as st
 import malta
 from malta.machines.planar import coils, commutation
 from malta.machines.planar import plant as planar
-from malta.model.data import plant_of, shaping, units_of
+from malta.model.data import plant_of
+from malta.model.parameters import shape_parameters, units_of
 from malta.model.plant import Plant, symbolic, trim
 
 if TYPE_CHECKING:
@@ -204,7 +205,7 @@ def test_simulated_forces_are_the_truth(par: planar.Parameters) -> None:
 def test_symbols_give_the_numbers(par: planar.Parameters, order: int) -> None:
     """One model in symbols of everything that does not shape it, evaluated at two machines, is their own models."""
     par = replace(par, order=order)
-    names = [name for name in units_of(par) if name not in shaping(par)]
+    names = [name for name in units_of(par) if name not in shape_parameters(par)]
     assert {"B_r", "N_c", "coil_pitch", "r_z", "h", "m", "I_x", "g", "I_max"} <= {*names}
     symbols = {name: ca.SX.sym(name) for name in names}
     record = symbolic(par, symbols | {"I_y": symbols["I_x"]})
@@ -235,7 +236,7 @@ def test_symbols_give_the_numbers(par: planar.Parameters, order: int) -> None:
 def test_shaping_parameters_stay_numbers(par: planar.Parameters) -> None:
     """What harmonics, delays and tables are made of; none of them is a factor of the model."""
     shapes = {"tau_n", "w_c", "h_c", "l_c", "r_c", "h_m", "upright", "T_s", "T_d", "order", "cells"}
-    assert {*shaping(par)} == shapes
+    assert {*shape_parameters(par)} == shapes
     assert {f.name for f in fields(par)} >= shapes
 
 

@@ -136,7 +136,7 @@ from dataclasses import dataclass
 
 import casadi as ca
 
-from malta.model.data import si
+from malta.model.parameters import si
 from malta.model.plant import Actuator, Plant, Signal
 from malta.synthesis.requirements import Figure, Requirement
 

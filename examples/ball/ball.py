@@ -10,7 +10,7 @@ from typing import Any
 
 import casadi as ca
 
-from malta.model.data import check_parameters, si
+from malta.model.parameters import check_parameters, si
 from malta.model.plant import Actuator, Plant, Signal
 
 

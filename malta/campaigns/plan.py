@@ -21,12 +21,8 @@ from scipy.stats import qmc
 
 from malta.errors import InputError
 from malta.gains.encodings import decode
-from malta.model.data import (
-    plant_of,
-    shaping,
-    twins_of,
-    units_of,
-)
+from malta.model.data import plant_of
+from malta.model.parameters import shape_parameters, twins_of, units_of
 from malta.model.plant import Plant, readonly
 from malta.simulation.catalogue import cases_of
 from malta.simulation.experiments import PlannedRun
@@ -145,7 +141,7 @@ def _check_spread(plan: Plan, units: Mapping[str, str]) -> None:
             raise InputError("campaign", where, "an unknown parameter", "one of " + " ".join(units))
         if not 0 <= share < 1:
             raise InputError("campaign", where, f"{100 * share:g} %", "from 0 % to less than 100 %")
-        if name in shaping(plan.parameters):
+        if name in shape_parameters(plan.parameters):
             raise InputError(
                 "campaign", where, "another one for each run", "one for all: it shapes the functions"
             )

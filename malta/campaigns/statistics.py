@@ -8,10 +8,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from malta.model.data import in_unit, published_value, units_of
+from malta.model.parameters import units_of
 from malta.model.plant import readonly
+from malta.model.published import published_value
 from malta.model.signals import inputs_of, outputs_of, stroke_unit
 from malta.simulation.experiments import setting
+from malta.units import in_unit
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

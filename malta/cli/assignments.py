@@ -129,7 +129,7 @@ def _split(text: str) -> tuple[str, str]:
 
 def _in_si(number: re.Match[str], si_unit: str, option: str, name: str) -> float:
     """The value in SI of a match of NUMBER."""
-    from malta.model.data import to_si
+    from malta.units import to_si
 
     value, unit = float(number[1]), number[2]
     if si_unit != "1":

@@ -100,7 +100,9 @@ def campaign(
     """
     from malta.campaigns.plan import Plan
     from malta.campaigns.run import campaign as run_campaign
-    from malta.model.data import plant_of, published_figures, units_of
+    from malta.model.data import plant_of
+    from malta.model.parameters import units_of
+    from malta.model.published import published_figures
     from malta.simulation.catalogue import main_job
 
     controller = read_controller(gains, machine)

@@ -56,7 +56,7 @@ def claims(
 
 def _compute_ledgers(specs: Sequence[Spec], progress: Callable[[float], None] | None) -> list[Ledger]:
     """Compute the ledger of each machine, in the order in which the designs name the machines."""
-    from malta.model.data import published
+    from malta.model.published import published
     from malta.report.ledger import ledger
     from malta.simulation.experiments import progress_of_part
 

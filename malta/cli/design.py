@@ -62,8 +62,8 @@ def _run_design(
     from malta import gains, report
     from malta.margins.verify import require_stable
     from malta.margins.verify import verify as compute_margins
-    from malta.model.data import published_beside
     from malta.model.linearize import linearize
+    from malta.model.published import published_beside
     from malta.simulation.catalogue import main_job
     from malta.synthesis.design_file import read_design
     from malta.synthesis.lqg import synthesize

@@ -60,7 +60,8 @@ def change_machine(parameters: Parameters, changes: list[str] | None) -> Paramet
     """
     from dataclasses import replace
 
-    from malta.model.data import plant_of, units_of
+    from malta.model.data import plant_of
+    from malta.model.parameters import units_of
 
     values = read_assignments("--set", changes, units_of(parameters))
     try:

@@ -102,7 +102,8 @@ def simulate(
     \b
     Example:  malta simulate design/gains/calibrated.json --scenario stroke --set m=0.56 --noise 1 --out build
     """
-    from malta.model.data import plant_of, published_figures
+    from malta.model.data import plant_of
+    from malta.model.published import published_figures
     from malta.simulation.catalogue import experiment, main_job
 
     controller = read_controller(gains, machine)

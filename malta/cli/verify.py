@@ -94,8 +94,10 @@ def verify(
     Example:  malta verify design/gains/calibrated.json --set m=0.56
     """
     from malta.margins.verify import require_stable
-    from malta.model.data import plant_of, published_figures, units_of
+    from malta.model.data import plant_of
     from malta.model.linearize import linearize
+    from malta.model.parameters import units_of
+    from malta.model.published import published_figures
 
     controller = read_controller(gains, machine)
     plant = plant_of(change_machine(controller.parameters, change))

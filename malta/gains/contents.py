@@ -11,12 +11,9 @@ import numpy as np
 from malta.errors import CheckError, InputError
 from malta.gains.linear import linear_parameters
 from malta.gains.schema import GainFile, PlantTable
-from malta.model.data import (
-    parameters_record,
-    plant_of,
-    units_of,
-)
+from malta.model.data import parameters_record, plant_of
 from malta.model.machines import machine
+from malta.model.parameters import units_of
 from malta.model.plant import Plant, Signal
 from malta.synthesis.controller import (
     Controller,

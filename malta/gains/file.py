@@ -59,15 +59,13 @@ from malta.gains.encodings import content_sha256, decode, encode
 from malta.gains.linear import LINEAR, linear_table, signal_tables
 from malta.gains.schema import GainFile
 from malta.margins.verify import require_stable, unstable_gain
-from malta.model.data import (
-    plant_of,
-    units_of,
-    validated,
-)
+from malta.model.data import plant_of
 from malta.model.linear import is_linear
+from malta.model.parameters import units_of
 from malta.synthesis.controller import (
     Controller,
 )
+from malta.tables import validate
 
 if TYPE_CHECKING:
     from malta.margins.verify import Margins
@@ -186,7 +184,7 @@ def content_of(path: Path) -> tuple[GainFile, dict[str, Any]]:
     for key, wanted in (("schema", SCHEMA), ("version", 2 if "law" in content else 1)):
         if content.get(key) != wanted:
             raise InputError(path, key, repr(content[key]) if key in content else "nothing", repr(wanted))
-    file = validated(GainFile, content, path)
+    file = validate(GainFile, content, path)
     plain = file.model_dump(by_alias=True, exclude_unset=True)
     if content_sha256(plain) != file.sha256:
         raise InputError(

@@ -6,8 +6,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, StrictInt, StrictStr
 
-from malta.model.data import Finite, Quantity, Record
 from malta.synthesis.controller import Tracks
+from malta.tables import Finite, Quantity, Record
 
 Vector = list[Finite]
 Matrix = list[list[Finite]]

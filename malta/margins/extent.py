@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
-from malta.model.data import units_of
+from malta.model.parameters import units_of
 
 if TYPE_CHECKING:
     from malta.model.plant import Plant

@@ -20,7 +20,7 @@ from malta.margins.uncertain import (
     lowest,
     model_of,
 )
-from malta.model.data import shaping, units_of
+from malta.model.parameters import shape_parameters, units_of
 from malta.model.plant import Plant, position_in, readonly
 
 if TYPE_CHECKING:
@@ -55,7 +55,7 @@ def of_plant(
     for name in names:
         if name not in known:
             raise InputError("uncertain", f"{name}", "an unknown parameter", "one of " + " ".join(known))
-    for name in set(names) & set(shaping(par)):
+    for name in set(names) & set(shape_parameters(par)):
         raise InputError("uncertain", name, "a parameter that shapes the model", "one that enters it")
     if believed is not None and believed.tabulated:
         found = "a controller that looks up a table"

@@ -43,8 +43,9 @@ from malta.margins.verify import (
     places_along,
     travel_margin,
 )
-from malta.model.data import plant_of, units_of
+from malta.model.data import plant_of
 from malta.model.linearize import linearize
+from malta.model.parameters import units_of
 from malta.model.plant import Plant, position_at
 from malta.synthesis.controller import Controller
 from malta.synthesis.lqg import (

@@ -87,7 +87,7 @@ def held_at(plant: Plant, position: float) -> FloatArray:
 @lru_cache(maxsize=16)  # plants compare by identity, and are built once for their parameters
 def model_of(plant: Plant, believed: Plant, names: tuple[str, ...]) -> ca.Function:
     """(parameters, position along the stroke, inputs wanted) -> what `jacobians` gives, and the preload that acts."""
-    from malta.model.data import twins_of
+    from malta.model.parameters import twins_of
 
     par = plant.parameters
     p, z, v = ca.SX.sym("p", len(names)), ca.SX.sym("z"), ca.SX.sym("v", len(plant.inputs))

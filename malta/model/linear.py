@@ -21,8 +21,9 @@ import casadi as ca
 import numpy as np
 
 from malta.errors import InputError
-from malta.model.data import check_parameters, plant_of, si
+from malta.model.data import plant_of
 from malta.model.machines import machine_names
+from malta.model.parameters import check_parameters, si
 from malta.model.plant import Actuator, Parameters, Plant, Signal
 
 if TYPE_CHECKING:

@@ -18,6 +18,7 @@ import numpy as np
 
 from malta.errors import CheckError, InputError
 from malta.model.checks import DEFAULT, defaults
+from malta.model.drive import CasadiFn, Drive, Electronics
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
@@ -25,11 +26,9 @@ if TYPE_CHECKING:
     FloatArray = NDArray[np.floating[Any]]
     ComplexArray = NDArray[np.complexfloating[Any, Any]]
 
-CasadiFn = Callable[..., Any]  # takes and returns casadi SX, MX or DM
-
 
 class Parameters(Protocol):
-    """A frozen dataclass whose physical fields are declared with data.si(unit)."""
+    """A frozen dataclass whose physical fields are declared with `parameters.si(unit)`."""
 
     __dataclass_fields__: ClassVar[dict[str, Any]]
 
@@ -77,53 +76,6 @@ class Actuator:
     def delay(self, Ts: float) -> int:
         """Whole samples between measurement and force: the dead time less the half sample that a hold takes."""
         return max(0, round(self.dead_time / Ts - 0.5))
-
-
-@dataclass(frozen=True, eq=False)
-class Drive:
-    """The windings behind the inputs: in the axes of their transformation, and as phases on an inverter.
-
-    In every axis u = R i + L (i' - coupling(x, i)) + emf(x), with R and L of the actuator. T(x), phases x axes, turns
-    axis quantities into phase quantities; its pseudo-inverse turns them back.
-    """
-
-    axes: tuple[Signal, ...]  # currents, A
-    phases: tuple[Signal, ...]  # currents, A
-    command: CasadiFn  # currents of the inputs, A -> currents of the axes, A
-    force: CasadiFn  # currents of the axes, A -> inputs
-    emf: CasadiFn  # x -> induced voltages of the axes, V
-    coupling: CasadiFn  # (x, i) -> what moving axes add to i', A/s
-    to_phases: CasadiFn  # x -> T(x)
-    to_axes: CasadiFn  # x -> T(x)^+
-    turned: CasadiFn  # inputs -> Q: Q i are the currents in axes that turn with the forces, as the paper commands them
-    peak: CasadiFn  # axis quantities -> a bound of the phase quantities of each group of axes
-    groups: tuple[tuple[int, ...], ...]  # axes that share phases
-    stars: tuple[tuple[int, ...], ...]  # phases that share a star point
-    weight: tuple[float, ...]  # power = sum of weight u i over the axes
-    link_voltage: float  # V, of the supply
-    link_capacitance: float  # F
-    supply_resistance: float  # ohm
-    pwm_step: float  # smallest change of a duty cycle
-    dead_share: float  # share of a PWM period that dead time takes
-
-
-@dataclass(frozen=True, eq=False)
-class Electronics:
-    """Current loops, their sensors and modulators, where they run many times in a sample of the control law.
-
-    A period of theirs is a step of the simulation. `state` stands beside the mover's state and the coil currents.
-    """
-
-    period: float  # s
-    state: Mapping[str, int]  # names and sizes
-    noises: int  # standard normal numbers that a period takes
-    flags: tuple[str, ...]  # limits that may be met, as a result names them
-    held_size: int
-    held: CasadiFn  # (currents commanded, y) -> what the loops are told until the next sample
-    start: CasadiFn  # (x, i) -> state by name, at rest
-    move: CasadiFn  # (x, i, state by name, held, w, noise) -> x, i, state by name, a period later
-    met: CasadiFn  # state by name -> 1 for each flag that was met so far
-    duty: CasadiFn  # state by name -> duty cycle of each coil
 
 
 @dataclass(frozen=True, eq=False)
@@ -346,7 +298,7 @@ def readonly(array: ArrayLike) -> FloatArray:
     return copy
 
 
-def traced(name: str, arguments: list[Any], expression: Any) -> CasadiFn:
+def trace(name: str, arguments: list[Any], expression: Any) -> CasadiFn:
     """A CasADi function, called with its arguments alone, of an expression that may hold symbols of parameters."""
     body = ca.cse(expression)
     known = {symbol.__hash__() for a in arguments for symbol in ca.symvar(a)}

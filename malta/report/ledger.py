@@ -24,12 +24,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 from malta.errors import InputError
 from malta.margins.verify import ZONES, Margins, verify
-from malta.model.data import in_unit, published_value
 from malta.model.linearize import LinearModel, linearize
 from malta.model.machines import require_part
+from malta.model.published import published_value
 from malta.simulation.catalogue import experiment
 from malta.simulation.experiments import Experiment, Progress, progress_of_part
 from malta.synthesis.lqg import synthesize
+from malta.units import in_unit
 
 if TYPE_CHECKING:
     from malta.margins.robust import Margin

@@ -17,7 +17,7 @@ import casadi as ca
 import numpy as np
 
 from malta.errors import InputError
-from malta.model.data import shaping, twins_of, units_of
+from malta.model.parameters import shape_parameters, twins_of, units_of
 from malta.model.plant import Plant
 from malta.simulation.compiled import LANES, Lanes, Shared, arrange_in_lanes, feedforward_table, run_many
 from malta.simulation.digest import (
@@ -74,7 +74,7 @@ def simulate_many(
     simulation = simulation_of(plant, controller, _with_sensor_errors(scenario, sensor_errors))
     _check(simulation, workers)
     variation = _variation(plant, changes, sensor_errors, first)
-    for name in set(changes) & set(shaping(plant.parameters)):
+    for name in set(changes) & set(shape_parameters(plant.parameters)):
         raise InputError("campaign", name, "another one for each run", "one for all: it shapes the functions")
     shape = shape_of(plant, controller, simulation.setup)
     compiled = library_of(shape, LANES, digest_function(shape))

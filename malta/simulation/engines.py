@@ -13,7 +13,8 @@ import casadi as ca
 import numpy as np
 
 from malta.errors import InputError
-from malta.model.data import plant_of, shaping, twins_of
+from malta.model.data import plant_of
+from malta.model.parameters import shape_parameters, twins_of
 from malta.model.plant import Plant
 from malta.simulation.compiled import address_of, feedforward_table, library
 from malta.simulation.layout import Setup, electronics_of, flatten, numbers_of
@@ -93,7 +94,7 @@ def shape_of(plant: Plant, c: Controller, setup: Setup) -> Shape:
         (m.shape, *m.sparsity().get_triplet()[0], *m.sparsity().get_triplet()[1])
         for m in gains_of(c).values()
     )
-    fixed = tuple(shaping(par).items())
+    fixed = tuple(shape_parameters(par).items())
     return Shape((type(par), kin, twins, fixed, patterns, c.tracks, c.parameters), plant, c, setup)
 
 

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from malta.model.data import in_unit
 from malta.model.machines import attribute_of
 from malta.model.plant import Plant
 from malta.simulation.references import Reference
@@ -22,6 +21,7 @@ from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate
 from malta.simulation.trajectory import Trajectory
 from malta.synthesis.controller import Controller
+from malta.units import in_unit
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 import casadi as ca
 import numpy as np
 
-from malta.model.plant import Actuator, Drive
+from malta.model.drive import Drive
+from malta.model.plant import Actuator
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray

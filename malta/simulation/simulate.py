@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any, get_args
 import numpy as np
 
 from malta.errors import InputError
-from malta.model.data import plant_of, shaping, units_of
+from malta.model.data import plant_of
+from malta.model.parameters import shape_parameters, units_of
 from malta.model.plant import Plant
 from malta.simulation import references
 from malta.simulation.engines import EngineChoice, engine_of, evaluate, substeps_until
@@ -173,7 +174,7 @@ def _stages(plant: Plant, scenario: Scenario, Ts: float) -> list[tuple[int, Plan
                 raise InputError(
                     f"scenario {scenario.name}", f"changes.{name}", "an unknown parameter", " ".join(known)
                 )
-            if name in shaping(plant.parameters):
+            if name in shape_parameters(plant.parameters):
                 found = "a parameter that shapes the machine's functions"
                 raise InputError(
                     f"scenario {scenario.name}", f"changes.{name}", found, "one that enters them"

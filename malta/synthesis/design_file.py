@@ -21,17 +21,10 @@ import numpy as np
 
 from malta.errors import CheckError, InputError
 from malta.files import located
-from malta.model.data import (
-    Quantity,
-    load_toml,
-    plant_of,
-    published,
-    read,
-    to_si,
-    units_of,
-    validated,
-)
+from malta.model.data import plant_of, read
+from malta.model.parameters import units_of
 from malta.model.plant import Plant, Signal
+from malta.model.published import published
 from malta.synthesis.design_tables import (
     DesignFile,
     PidTable,
@@ -49,6 +42,8 @@ from malta.synthesis.spec import (
     pid_signals,
     place_of,
 )
+from malta.tables import Quantity, load_toml, validate
+from malta.units import to_si
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
@@ -67,7 +62,7 @@ def read_design(path: str | Path) -> Spec:
         raise InputError(path, "machine", found, "the path of the machine's data file")
     machine_file = Path(os.path.normpath(path.parent / machine))
     printed = cache(partial(published, machine_file))  # read once, and only where something refers to it
-    content = validated(DesignFile, _resolve(raw, printed, machine_file, path), path)
+    content = validate(DesignFile, _resolve(raw, printed, machine_file, path), path)
     _require_law(content, raw, path)
     par = read(machine_file, content.preset)
     try:

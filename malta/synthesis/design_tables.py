@@ -8,9 +8,9 @@ from typing import Annotated, Any
 
 from pydantic import BeforeValidator, Field, StrictBool, StrictInt, StrictStr, create_model
 
-from malta.model.data import Finite, Quantity, Record, validated
 from malta.synthesis.requirements import Requirement
 from malta.synthesis.spec import Discretization
+from malta.tables import Finite, Quantity, Record, validate
 
 
 def _table_or_SI(value: Any) -> Any:
@@ -109,7 +109,7 @@ def specification_table(requirements: Iterable[Requirement], given: Mapping[str,
     keys: dict[str, Any] = {r.name: (_kind(r) | None, None) for r in requirements}
     table = create_model("Specification", __base__=Record, **keys)
     whole = create_model("DesignFile", __base__=Record, specification=(table, ...))
-    checked: Any = validated(whole, {"specification": given}, path)
+    checked: Any = validate(whole, {"specification": given}, path)
     found: Record = checked.specification
     return found
 

@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from malta.errors import InputError
-from malta.model.data import Quantity, to_si
 from malta.model.plant import Signal
+from malta.tables import Quantity
+from malta.units import to_si
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray

@@ -18,8 +18,9 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import numpy as np
 
 from malta.errors import InputError
-from malta.model.data import plant_of, to_si
+from malta.model.data import plant_of
 from malta.model.plant import Plant, Signal, readonly
+from malta.units import to_si
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray, Parameters

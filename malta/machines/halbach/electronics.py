@@ -21,9 +21,7 @@ from malta.machines.halbach.motor import (
     phase_currents,
     resistive_drop,
 )
-from malta.model.plant import (
-    Electronics,
-)
+from malta.model.drive import Electronics
 
 if TYPE_CHECKING:
     from malta.machines.halbach.plant import Parameters

@@ -15,8 +15,8 @@ from malta.machines.halbach.experiments.motions import COUNT, PAUSE, STEP, respo
 from malta.machines.halbach.experiments.open_loop import positions_at_rest
 from malta.machines.halbach.plant import Parameters
 from malta.margins.verify import Margins
-from malta.model.data import published_value
 from malta.model.linearize import LinearModel
+from malta.model.published import published_value
 from malta.report.ledger import case_merit, run_design
 from malta.simulation.experiments import Experiment, Progress
 from malta.synthesis.controller import Controller

@@ -18,7 +18,6 @@ from malta.machines.halbach.experiments.lift import (
     lift_force,
 )
 from malta.machines.halbach.experiments.motions import BEFORE, PAUSE, responses
-from malta.model.data import in_unit
 from malta.report.figures.parts import (
     MORE,
     NOTE,
@@ -38,6 +37,7 @@ from malta.report.figures.parts import (
     published_in_unit,
     runs_of,
 )
+from malta.units import in_unit
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

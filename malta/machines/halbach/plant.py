@@ -26,7 +26,7 @@ import casadi as ca
 from malta.errors import InputError
 from malta.machines.halbach.electronics import MEAN_OF, current_delay, current_loop, electronics
 from malta.machines.halbach.motor import forces, motion, phase_currents
-from malta.model.data import check_parameters, si
+from malta.model.parameters import check_parameters, si
 from malta.model.plant import (
     Actuator,
     Plant,

@@ -14,7 +14,7 @@ from malta.machines.planar import field as planar_field
 from malta.machines.planar import plant as planar
 from malta.machines.planar.experiments.models import CURRENT
 from malta.margins.verify import Margins
-from malta.model.data import published_value
+from malta.model.published import published_value
 from malta.report.ledger import (
     case_merit,
     merit,

@@ -32,12 +32,12 @@ from malta.machines.planar.field import (
     COIL_ORDER,
     centre_of_force,
 )
-from malta.model.data import check_parameters, si
+from malta.model.parameters import check_parameters, si
 from malta.model.plant import (
     Actuator,
     Plant,
     Signal,
-    traced,
+    trace,
 )
 from malta.model.rigidbody import (
     acceleration,
@@ -137,7 +137,7 @@ def plant(par: Parameters) -> Plant:
         outputs=POSITIONS,
         disturbances=WRENCH,
         uncontrolled=(),
-        f=traced("f", [x, u, w], motion(par, x, u, w)),
+        f=trace("f", [x, u, w], motion(par, x, u, w)),
         h=lambda x, _: x[:6],
         load=lambda _: load(par),
         position_of=lambda y: y,

@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Any
 import casadi as ca
 
 from malta.machines.tubular.windings import AXES, WEIGHT, to_axes, to_phases
-from malta.model.plant import Drive, Signal
+from malta.model.drive import Drive
+from malta.model.plant import Signal
 
 if TYPE_CHECKING:
     from collections.abc import Callable

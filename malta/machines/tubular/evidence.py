@@ -16,8 +16,8 @@ from malta.margins.plants import of_plant
 from malta.margins.robust import robust_margin
 from malta.margins.stages import compensators
 from malta.margins.verify import Margins
-from malta.model.data import published_value
 from malta.model.linearize import LinearModel, linearize
+from malta.model.published import published_value
 from malta.report.ledger import (
     merit,
     proven_share,

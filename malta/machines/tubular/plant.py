@@ -16,12 +16,12 @@ import casadi as ca
 
 from malta.machines.tubular.drive import drive
 from malta.machines.tubular.windings import hall_position
-from malta.model.data import check_parameters, si
+from malta.model.parameters import check_parameters, si
 from malta.model.plant import (
     Actuator,
     Plant,
     Signal,
-    traced,
+    trace,
 )
 from malta.model.rigidbody import (
     EXACT,
@@ -120,7 +120,7 @@ def plant(par: Parameters, *, small_angle: bool = False) -> Plant:
         outputs=OUTPUTS,
         disturbances=WRENCH,
         uncontrolled=("gamma", "gamma_dot"),
-        f=traced("f", [x, u, w], ca.vertcat(x[6:], q_t_ddot, q_r_ddot)),
+        f=trace("f", [x, u, w], ca.vertcat(x[6:], q_t_ddot, q_r_ddot)),
         h=lambda x, _: measured(par, x, trig),
         load=lambda x: load(par, x),
         position_of=lambda p: position_of(par, p),
@@ -135,7 +135,7 @@ def plant(par: Parameters, *, small_angle: bool = False) -> Plant:
         contacts=("touchdown at sensor plane 1", "touchdown at sensor plane 2", "axial end stop"),
         contact=lambda x: contact(par, x, trig),
         cushioned=(True, True, False),
-        bearing=traced("bearing", [x], touchdown_bearing(par, x, trig)),
+        bearing=trace("bearing", [x], touchdown_bearing(par, x, trig)),
         sense=lambda x, errors: sensed(par, x, errors, trig),
         sensor_errors=SENSOR_ERRORS,
         travel=par.z_max,

@@ -23,7 +23,6 @@ import numpy as np
 
 from malta.errors import InputError
 from malta.files import replace_files
-from malta.model.data import in_unit
 from malta.model.machines import attribute_of
 from malta.model.signals import (
     KINDS,
@@ -53,6 +52,7 @@ from malta.simulation.catalogue import experiments_of
 from malta.simulation.experiments import Case, Experiment
 from malta.simulation.trajectory import Trajectory
 from malta.synthesis.requirements import Trade
+from malta.units import in_unit
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from malta.model.data import in_unit
 from malta.model.signals import aside
 from malta.report.figures.parts import (
     BOUND,
@@ -24,6 +23,7 @@ from malta.report.figures.parts import (
     micro,
     published_in_unit,
 )
+from malta.units import in_unit
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

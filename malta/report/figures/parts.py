@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING, Any
 import casadi as ca
 import numpy as np
 
-from malta.model.data import in_unit, published_value
 from malta.model.plant import Plant
+from malta.model.published import published_value
 from malta.simulation.trajectory import Trajectory
 from malta.synthesis.requirements import Trade, requirements_for
+from malta.units import in_unit
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

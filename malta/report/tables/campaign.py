@@ -9,12 +9,12 @@ import numpy as np
 from rich.console import Group
 from rich.table import Table
 
-from malta.model.data import in_unit
 from malta.model.signals import (
     aside,
 )
 from malta.report.figures.parts import Published, number
 from malta.report.tables.parts import add_row, new_table
+from malta.units import in_unit
 
 if TYPE_CHECKING:
     from malta.campaigns.result import Campaign

@@ -16,8 +16,8 @@ from malta.margins.verify import (
     Margins,
     zone,
 )
-from malta.model.data import published_value
 from malta.model.linearize import LinearModel
+from malta.model.published import published_value
 from malta.report.figures.parts import Published, published_in_unit
 from malta.report.tables.parts import add_row, new_table
 

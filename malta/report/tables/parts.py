@@ -8,8 +8,8 @@ from rich import box
 from rich.table import Table
 from rich.text import Text
 
-from malta.model.data import in_unit
 from malta.report.figures.parts import Published, number, published_in_unit
+from malta.units import in_unit
 
 if TYPE_CHECKING:
     from malta.simulation.experiments import Merit

@@ -1,0 +1,80 @@
+"""The parameters of a machine: fields of a frozen dataclass, declared with their SI units and ranges."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import Field, field, fields
+from numbers import Real
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from malta.errors import InputError
+
+if TYPE_CHECKING:
+    from malta.model.plant import Parameters
+
+
+def si(
+    unit: str,
+    *,
+    above: float | None = None,
+    at_least: float | None = None,
+    twin: str | None = None,
+    shapes: bool = False,
+) -> Any:
+    """Declare a parameter of a machine: a field of its frozen dataclass Parameters.
+
+    unit : the SI unit, "1" for a pure number
+    above, at_least : the lower limit of the value, exclusive or inclusive
+    twin : the name of another parameter; where both have the same value, symbolic models use one symbol for the two
+    shapes : the parameter sets the size of the model (a delay, a number of harmonics), so it is never a symbol
+
+    Example: `m: float = si("kg", above=0)  # mover with magnets, Table IV`
+    """
+    return field(
+        metadata={"unit": unit, "above": above, "at_least": at_least, "twin": twin, "shapes": shapes}
+    )
+
+
+def units_of(record: type[Parameters] | Parameters) -> dict[str, str]:
+    """The SI unit of every physical field of a parameter record."""
+    return {f.name: f.metadata["unit"] for f in fields(record) if "unit" in f.metadata}
+
+
+def twins_of(record: Parameters) -> dict[str, str]:
+    """The parameters that share the symbol of another one, {name: twin}: declared twins of equal value."""
+    declared = {f.name: f.metadata.get("twin") for f in fields(record)}
+    return {k: twin for k, twin in declared.items() if twin and getattr(record, k) == getattr(record, twin)}
+
+
+def shape_parameters(record: Parameters) -> dict[str, float]:
+    """The values of the parameters that set the size of the model, by name: those declared with `shapes`."""
+    return {f.name: getattr(record, f.name) for f in fields(record) if f.metadata.get("shapes")}
+
+
+def check_parameters(record: Parameters, where: str | Path = "parameters") -> None:
+    """Check every physical field of a record. Raises InputError for NaN, infinity and values out of range."""
+    for f in fields(record):
+        if "unit" in f.metadata:
+            check_range(f, getattr(record, f.name), where, f.name)
+
+
+def check_range(f: Field[Any], value: object, where: str | Path, name: str) -> None:
+    """Check one value against the unit and the limits that its field declares.
+
+    where, name : the file and the key that an error names
+
+    Raises InputError for anything but a finite number within the limits.
+    """
+    unit, above, least = f.metadata["unit"], f.metadata["above"], f.metadata["at_least"]
+    low = f" above {above:g}" if above is not None else ""
+    low = f" of at least {least:g}" if least is not None else low
+    real = isinstance(value, Real) and not isinstance(value, bool)
+    try:
+        number = float(value) if real else math.nan  # type: ignore[arg-type]
+    except OverflowError:  # an integer beyond any float
+        number = math.inf
+    inside = (above is None or number > above) and (least is None or number >= least)
+    if not (math.isfinite(number) and inside):
+        found = f"{number} {unit}" if real else repr(value)
+        raise InputError(where, name, found, f"a finite number{low} in {unit}")

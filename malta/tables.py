@@ -1,0 +1,64 @@
+"""Tables: the content of TOML and JSON files, checked against pydantic models; every refusal is one sentence."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+from pydantic import BaseModel, ConfigDict, StrictStr, ValidationError
+from pydantic import Field as Checked
+
+from malta.errors import InputError
+from malta.files import read_file
+
+_Model = TypeVar("_Model", bound=BaseModel)
+Finite = Annotated[float, Checked(strict=True, allow_inf_nan=False)]
+
+
+class Record(BaseModel):
+    """One table of a file: immutable, without unknown keys; subclasses use strict types, which convert nothing."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Quantity(Record):
+    """A number with its unit: `{ value = 0.36, unit = "kg" }`."""
+
+    value: Finite
+    unit: StrictStr
+
+
+def load_toml(path: str | Path) -> dict[str, Any]:
+    """Read a TOML file. Raises InputError when the file is missing, unreadable, not text or not TOML."""
+    text = read_file(Path(path), "TOML file", lambda p: p.read_text(encoding="utf-8"))
+    try:
+        return tomllib.loads(text)
+    except (ValueError, RecursionError) as error:  # TOMLDecodeError, endless digits, endless nesting
+        raise InputError(path, "", f"a TOML error ({error})", "a complete TOML file") from error
+
+
+def validate(model: type[_Model], content: object, where: str | Path) -> _Model:
+    """Check `content` against a pydantic model. Raises InputError, which states the first fault in one sentence."""
+    try:
+        return model.model_validate(content)
+    except ValidationError as error:
+        raise explain(error, where) from error
+
+
+def explain(error: ValidationError, where: str | Path) -> InputError:
+    """Turn the first fault that pydantic found into one sentence; `where` is the file that it names."""
+    first = error.errors(include_url=False)[0]
+    name = ".".join(str(part) for part in first["loc"] if not str(part).startswith("function-"))
+    kind, message = first["type"], first["msg"]
+    if kind == "missing":
+        return InputError(where, name, "nothing", "this key")
+    if kind == "extra_forbidden":
+        return InputError(where, name, "an unknown key", "only the keys of its format")
+    if kind in ("model_type", "model_attributes_type", "dict_type"):
+        message = "a table"
+    if kind == "string_pattern_mismatch":
+        message = "a name of letters, digits, - and _"
+    found = repr(first["input"])
+    expected = message.removeprefix("Value error, ").removeprefix("Input should be ")
+    return InputError(where, name, found if len(found) <= 60 else found[:57] + "...", expected)

@@ -1,0 +1,101 @@
+"""Units: quantities converted to SI when they are read, and back to a unit of choice when they are shown."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from malta.errors import InputError
+
+# The units of machine data, as pint reads them. Angle is a dimension of its own: libraries that take a radian as 1
+# accept Hz for rad/s, an error of 2 pi.
+UNITS = """
+nano- = 1e-9 = n-
+micro- = 1e-6 = u- = µ- = μ-
+milli- = 1e-3 = m-
+centi- = 1e-2 = c-
+kilo- = 1e3 = k-
+mega- = 1e6 = M-
+gram = [mass] = g
+meter = [length] = m = metre
+second = [time] = s
+ampere = [current] = A
+radian = [angle] = rad
+degree = 0.017453292519943295 * radian = deg
+turn = 6.283185307179586 * radian = revolution
+inch = 0.0254 * meter
+minute = 60 * second = min
+rpm = turn / minute
+hertz = 1 / second = Hz
+newton = kilogram * meter / second ** 2 = N
+joule = newton * meter = J
+watt = joule / second = W
+volt = watt / ampere = V
+ohm = volt / ampere
+henry = volt * second / ampere = H
+farad = ampere * second / volt = F
+weber = volt * second = Wb
+tesla = weber / meter ** 2 = T
+percent = 0.01
+"""
+
+
+@cache
+def _units() -> Any:
+    import pint  # here, because `malta --help` must not wait for it
+
+    registry: Any = pint.UnitRegistry(None)
+    registry.load_definitions(UNITS.strip().splitlines())
+    return registry
+
+
+@cache
+def _root_units(unit: str) -> Any:
+    return _units().get_root_units(_units().parse_units(unit))
+
+
+def to_si(value: float, unit: str, si_unit: str, where: str | Path, name: str) -> float:
+    """Convert a value to `si_unit` ("kg", "m/s", "N m", ...).
+
+    where, name : the file and the key that an error names
+
+    Raises InputError when the unit is unknown or of another dimension.
+
+    >>> to_si(50, "us", "s", "rotor.toml", "T_s")
+    5e-05
+    """
+    expected = f"a unit of {si_unit}"
+    try:
+        factor, found_root = _root_units(unit)
+    except Exception as error:  # pint raises many kinds, tokenizer errors among them
+        raise InputError(where, f"{name}.unit", repr(unit), expected) from error
+    si_factor, si_root = _root_units(si_unit)
+    if found_root != si_root:
+        raise InputError(where, f"{name}.unit", repr(unit), expected)
+    ratio = float(factor) / float(si_factor)
+    whole = round(1 / ratio) if ratio < 1 else 0
+    # Dividing by a power of ten is exact where multiplying is not: 50 us is 5e-05, not 4.9999...e-05.
+    return value / whole if whole and abs(whole * ratio - 1) < 1e-12 else value * ratio
+
+
+def in_unit(value: float, unit: str) -> float:
+    """Convert an SI value to `unit`. Raises InputError for an unknown unit.
+
+    >>> round(in_unit(16.2e-3, "ms"), 9)
+    16.2
+    """
+    return value / unit_factor(unit, unit)
+
+
+@cache
+def unit_factor(unit: str, name: str) -> float:
+    """The size of one `unit` in SI units: 0.001 for "ms". Raises InputError, which names the key `name`."""
+    registry = _units()
+    try:
+        factor, root = registry.get_root_units(registry.parse_units("" if unit == "1" else unit))
+    except Exception as error:  # pint raises many kinds, tokenizer errors among them
+        raise InputError("data", name, repr(unit), "a unit") from error
+    grams = registry.get_dimensionality(root).get("[mass]", 0)  # pint's root of mass is the gram
+    scale: float = float(factor) / 1000.0 ** float(grams)
+    return scale
