@@ -17,12 +17,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from malta.margins.uncertain import (
-    Compensator,
-    UncertainSystem,
-    instability,
-    responses,
-)
+from malta.margins.responses import responses
+from malta.margins.uncertain import Compensator, UncertainSystem, instability
 
 if TYPE_CHECKING:
     from malta.model.plant import ComplexArray, FloatArray
@@ -88,7 +84,7 @@ def ab13md(matrices: Iterable[ComplexArray], kinds: list[int]) -> float:
 def machine_modes(problem: Problem, frequencies: int = 300) -> Iterator[list[ComplexArray]]:
     """M of each mode: z = M d, d = diag(reals of size 1) z. N q = -d_m + d_A + d_B with N = m s^2 - k - h."""
     w = np.geomspace(1e-2, 6e4, frequencies)
-    P, F = responses(problem.system, problem.law, problem.system.nominal, w)
+    P, _, _, F = responses(problem.system, problem.law, problem.system.nominal, w)
     A, _, C = (matrix[0] for matrix in problem.system.at(problem.system.nominal))
     half = len(A) // 2
     to_modes = np.linalg.inv(C[:, :half])

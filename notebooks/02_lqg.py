@@ -14,7 +14,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import malta
-from malta.margins.verify import machine_loop
+from malta.margins.loops import machine_loop
 
 # The project's root, wherever Jupyter was started.
 os.chdir(next(p for p in (Path.cwd(), *Path.cwd().parents) if (p / "design").is_dir()))

@@ -16,12 +16,8 @@ import malta
 from malta import Dynamic
 from malta.errors import InputError
 from malta.margins.blocks import Block, probe
-from malta.margins.transfer import (
-    mu_bound,
-    performance,
-    responses,
-    transfer,
-)
+from malta.margins.responses import responses
+from malta.margins.transfer import mu_bound, performance, transfer
 from malta.margins.weight import weight_of
 
 ONE = weight_of(1.0, "")
@@ -189,7 +185,7 @@ def test_compliance_and_effort_of_a_mass_in_closed_form() -> None:
 def test_compliance_of_the_flagship_in_its_travel() -> None:
     """Axial compliance of the sampled loop, by frequency responses of 60 machines."""
     from malta import gains
-    from malta.margins.verify import travel_loops
+    from malta.margins.travel import travel_loops
     from malta.model.data import plant_of
 
     c = gains.read("design/gains/robust.json")

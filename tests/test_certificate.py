@@ -22,8 +22,8 @@ from malta.errors import CheckError, InputError
 from malta.margins import certificate, checked_file
 from malta.margins.check import check, tiled
 from malta.margins.checked_loop import determinant_bounds
+from malta.margins.travel import travel_loops, travel_margin
 from malta.margins.uncertain import Compensator
-from malta.margins.verify import travel_loops, travel_margin
 
 pytestmark = pytest.mark.usefixtures("proven_once")
 

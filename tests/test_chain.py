@@ -19,27 +19,14 @@ import malta
 from malta import gains
 from malta.cli.main import app, main
 from malta.errors import InputError
+from malta.margins.classical import _balanced_norm, classical_margins, delay_margins, disk_margin
 from malta.margins.gain import Gain
+from malta.margins.loops import machine_law
+from malta.margins.responses import responses
 from malta.margins.robust import robust_margin
-from malta.margins.stages import (
-    SAMPLED,
-    Robustness,
-    _balanced,
-    _classical,
-    compensators,
-    delay_margins,
-    disk_margin,
-    robustness,
-)
+from malta.margins.stages import SAMPLED, Robustness, compensators, robustness
 from malta.margins.systems import uncertain
-from malta.margins.uncertain import (
-    Compensator,
-    UncertainSystem,
-    closed_loop,
-    instability,
-    responses,
-)
-from malta.margins.verify import machine_law
+from malta.margins.uncertain import Compensator, UncertainSystem, closed_loop, instability
 from malta.model.data import plant_of
 from malta.report.figures.margins import chain_figure
 
@@ -115,11 +102,11 @@ def test_places_stand_for_both_sides_of_the_travel(name: str) -> None:
 def test_gang_of_four_by_its_definition(name: str) -> None:
     system, law = _sampled(name)
     w = np.geomspace(1e-2, np.pi / 50e-6, 400)
-    P, F = responses(system, law, system.nominal, w)
+    P, _, _, F = responses(system, law, system.nominal, w)
     S = np.linalg.inv(np.eye(5) - P @ F)
     T = -P @ F @ S
     assert np.abs(S + T - np.eye(5)).max() < 1e-7
-    for i, figures in enumerate(_classical(system, law, SENSORS).gang.values()):
+    for i, figures in enumerate(classical_margins(system, law, SENSORS).gang.values()):
         expected = (
             np.abs(S[:, i, i]).max(),
             np.abs(T[:, i, i]).max(),
@@ -133,7 +120,7 @@ def test_gang_of_four_by_its_definition(name: str) -> None:
 def test_disks_are_stood_and_the_one_channel_disk_is_exact(name: str) -> None:
     """Real factors within the disk, in all channels at once, leave it stable; one channel's is reached by a factor."""
     system, law = _sampled(name)
-    disks = {d.channels: d for d in _classical(system, law, SENSORS).disks}
+    disks = {d.channels: d for d in classical_margins(system, law, SENSORS).disks}
     assert list(disks)[:3] == ["forces", "sensors", "forces and sensors"]
     assert disks["forces and sensors"].size <= min(disks["forces"].size, disks["sensors"].size)
     rng = np.random.default_rng(0)
@@ -154,7 +141,7 @@ def test_disks_are_stood_and_the_one_channel_disk_is_exact(name: str) -> None:
     for i, sensor in enumerate(SENSORS):
         disk = disks[f"{sensor} alone"]
         w = np.array([disk.frequency])
-        P, F = responses(system, law, system.nominal, w)
+        P, _, _, F = responses(system, law, system.nominal, w)
         S = np.linalg.inv(np.eye(5) - P @ F)[0, i, i]
         assert 1 / abs(S - 0.5) == pytest.approx(disk.size, rel=1e-6)
         smallest = []
@@ -173,7 +160,7 @@ def test_disks_are_stood_and_the_one_channel_disk_is_exact(name: str) -> None:
 def test_a_single_loop_has_the_disk_of_its_peak() -> None:
     """One channel: 1 / max |S - 1/2|, on a grid thirty times as dense."""
     system, law = _sampled("calibrated")
-    P, F = responses(system, law, system.nominal, np.geomspace(1e-2, np.pi / 50e-6, 12_000))
+    P, _, _, F = responses(system, law, system.nominal, np.geomspace(1e-2, np.pi / 50e-6, 12_000))
     S = np.linalg.inv(np.eye(5) - P @ F)
     for i in range(5):
         expected = 1 / np.abs(S[:, i, i] - 0.5).max()
@@ -187,11 +174,11 @@ def test_a_balanced_matrix_bounds_mu() -> None:
     M *= 10.0 ** rng.uniform(-3, 3, (20, 4, 1)) * 10.0 ** rng.uniform(-3, 3, (20, 1, 4))
     U = np.exp(2j * np.pi * rng.uniform(size=(500, 1, 4, 1)))
     below = np.abs(np.linalg.eigvals(U * M)).max(axis=(0, 2))
-    above = _balanced(M)
+    above = _balanced_norm(M)
     assert (below <= above * (1 + 1e-9)).all()
     assert np.median(above / below) < 1.3
     a, b = rng.normal(size=(5, 4)) + 1j, rng.normal(size=(5, 4)) - 1j
-    assert _balanced(a[:, :, None] * b[:, None, :]) == pytest.approx(np.abs(a * b).sum(axis=1), rel=1e-3)
+    assert _balanced_norm(a[:, :, None] * b[:, None, :]) == pytest.approx(np.abs(a * b).sum(axis=1), rel=1e-3)
 
 
 @pytest.mark.parametrize("name", DESIGNS)
@@ -199,7 +186,7 @@ def test_delay_margins_in_whole_samples(name: str) -> None:
     """One sensor late by whole samples: stable up to the margin, unstable beyond."""
     system, law = _sampled(name)
     T, n = 50e-6, len(law.A)
-    for i, (_, margin) in enumerate(_classical(system, law, SENSORS).delay.items()):
+    for i, (_, margin) in enumerate(classical_margins(system, law, SENSORS).delay.items()):
         if margin > 200 * T:  # as many states more
             continue
         stable = {}
@@ -437,7 +424,7 @@ def test_bad_input_gets_one_sentence(
 @pytest.mark.parametrize("name", CHAINED)
 def test_margins_without_parameters_are_the_smallest_along_the_travel(name: str) -> None:
     places = [
-        _classical(*_sampled(name, z), sensors=SENSORS)
+        classical_margins(*_sampled(name, z), sensors=SENSORS)
         for z in (-15e-3, -10e-3, -5e-3, 0.0, 5e-3, 10e-3, 15e-3)
     ]
     found = chain_of(name)

@@ -19,7 +19,7 @@ import malta
 from malta import references
 from malta.machines.tubular import claims as tubular
 from malta.machines.tubular.evidence import EXPERIMENT_NAMES, Evidence
-from malta.margins.verify import machine_loop
+from malta.margins.loops import machine_loop
 from malta.model.data import plant_of
 from malta.model.published import published_value
 from malta.report import ledger as claims

@@ -18,7 +18,7 @@ from scipy import linalg
 import malta
 from malta.campaigns.plan import fingerprint
 from malta.gains import encodings
-from malta.margins.verify import machine_loop
+from malta.margins.loops import machine_loop
 from malta.simulation.generic import jump
 from malta.synthesis import lqg, riccati
 
@@ -326,7 +326,7 @@ def test_a_law_of_errors_is_the_law_of_states_at_rest(
     assert second.peak_sensitivity == pytest.approx(first.peak_sensitivity, rel=1e-9)
     assert "w_n_max" not in second.bandwidth
     ranges = {"m": 0.1}
-    one, other = (malta.margins.verify.travel_margin(plant, c, ranges, time=20.0) for c in (table2, again))
+    one, other = (malta.margins.travel.travel_margin(plant, c, ranges, time=20.0) for c in (table2, again))
     assert one.upper == pytest.approx(other.upper, rel=2e-3)
     assert other.lower is not None
     scenario = malta.Scenario("hold", 0.01, malta.references.hold, noise=1.0, fidelity="force")

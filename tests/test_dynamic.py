@@ -12,8 +12,8 @@ from published_cases import ROBSTAB, Loop, pid
 import malta
 from malta import Dynamic, dynamic_margin, gains
 from malta.errors import InputError
-from malta.margins.uncertain import responses
-from malta.margins.verify import travel_loops
+from malta.margins.responses import responses
+from malta.margins.travel import travel_loops
 from malta.model.data import plant_of
 
 
@@ -84,7 +84,7 @@ def test_dynamics_of_a_machine_over_its_travel() -> None:
     for _ in range(60):
         p = s.nominal * (1 + m.lower * np.array([0.2, 0.2, 0]) * rng.uniform(-1, 1, 3))
         p[-1] = rng.uniform(-plant.travel, plant.travel)
-        P, F = responses(s, law, p, w)
+        P, _, _, F = responses(s, law, p, w)
         T = np.linalg.inv(np.eye(5) - P @ F) - np.eye(5)
         assert m.lower * 0.2 * np.abs(T[:, 4, 4]).max() < 1
 

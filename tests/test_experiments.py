@@ -18,7 +18,7 @@ from scipy.linalg import expm
 import malta
 from malta import references
 from malta.machines.tubular.experiments import EXPERIMENTS, forces, lifting, rest, strokes
-from malta.margins.verify import loop, machine_loop
+from malta.margins.loops import loop, machine_loop
 from malta.model.data import plant_of
 from malta.model.published import published_value
 from malta.simulation.catalogue import experiment

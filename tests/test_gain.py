@@ -15,8 +15,8 @@ import malta
 from malta import gains
 from malta.errors import InputError
 from malta.margins.family import aligned, combined, family
-from malta.margins.uncertain import responses
-from malta.margins.verify import travel_loops
+from malta.margins.responses import responses
+from malta.margins.travel import travel_loops
 from malta.model.data import plant_of
 
 
@@ -74,7 +74,7 @@ def test_no_machine_of_the_box_exceeds_what_is_proven(at: Any) -> None:
     for _ in range(200):
         p = s.nominal * (1 + np.array([*box.values(), 0]) * np.clip(rng.uniform(-2, 2, 5), -1, 1))
         p[-1] = rng.uniform(-plant.travel, plant.travel)
-        P, F = responses(s, law, p, w)
+        P, _, _, F = responses(s, law, p, w)
         S = np.linalg.inv(np.eye(5) - (P @ F if at == "sensors" else F @ P))
         worst = max(worst, float(np.abs(S[:, 4, 4]).max()))
     assert 0.8 * m.lower < worst <= m.upper
@@ -92,8 +92,8 @@ def test_random_loops_stay_below_what_is_proven(seed: int) -> None:
         return
     w = np.geomspace(1e-2, 1e2, 300)
     for k, d in rng.uniform([0.6, 0.25], [1.4, 0.75], (30, 2)):
-        P, F = responses(s, malta.Compensator(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), np.array([[0.3]])),
-                         np.array([k, d]), w)  # fmt: skip
+        law = malta.Compensator(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), np.array([[0.3]]))
+        P, _, _, F = responses(s, law, np.array([k, d]), w)
         assert (np.abs(1 / (1 - (P @ F)[:, 0, 0])) <= m.upper).all()
 
 

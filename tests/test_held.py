@@ -14,22 +14,12 @@ from scipy import linalg
 
 import malta
 from malta import gains
+from malta.margins.loops import loop, machine_loop, machine_system
+from malta.margins.responses import responses
 from malta.margins.systems import uncertain
-from malta.margins.uncertain import (
-    UncertainSystem,
-    closed_loop,
-    responses,
-    sampled_law,
-)
-from malta.margins.verify import (
-    loop,
-    machine_loop,
-    machine_system,
-    own_poles,
-    travel_margin,
-    unstable_gain,
-    verify,
-)
+from malta.margins.travel import travel_margin
+from malta.margins.uncertain import UncertainSystem, closed_loop, sampled_law
+from malta.margins.verify import controller_poles, unstable_gain, verify
 from malta.model.data import plant_of
 from malta.model.linearize import LinearModel
 from malta.model.plant import Plant
@@ -184,7 +174,7 @@ def test_regulator_and_filter_are_stable_by_the_separation_principle(machine: st
     assert c.observed == 1
     assert c.delay == delay
     assert not c.integrating
-    regulator, observer = own_poles(c)
+    regulator, observer = controller_poles(c)
     assert unstable_gain(c) is None
     # x+ = Ad x + Bd v, y = Cd x on the model without the disturbances, which are the filter's alone
     k = len(c.Ad) - len(c.forces)
@@ -234,7 +224,7 @@ def test_sums_stand_last_and_the_law_is_the_same(machine: str, delay: int) -> No
     z = np.exp(1j * w * c.sample_time)[:, None, None]
     plain = law.C @ np.linalg.solve(z * np.eye(len(law.A)) - law.A, law.B_y) + law.D_y
     system = UncertainSystem(("p",), np.zeros(1), _nothing(len(c.forces)), ((-1.0, 1.0),))
-    _, F = responses(system, c1, np.zeros(1), w)
+    F = responses(system, c1, np.zeros(1), w).F
     assert np.abs(F - plain).max() < 1e-7 * np.abs(plain).max()
 
 

@@ -11,7 +11,8 @@ import pytest
 from filterpy.kalman import KalmanFilter
 
 import malta
-from malta.margins.verify import loop, own_poles
+from malta.margins.loops import loop
+from malta.margins.verify import controller_poles
 from malta.synthesis.controller import law, linear_law
 from malta.synthesis.riccati import eigenvalues, sample, sample_noise
 
@@ -40,7 +41,7 @@ def test_separation_principle(designs: dict[str, Design], way: Discretization, d
     """Closed-loop eigenvalues are the regulator's and the filter's, each where it was placed."""
     design = designs["calibrated"]
     controller = malta.lqg(design.model, design.spec.weights, 50e-6, way, delay)
-    regulator, observer = own_poles(controller)
+    regulator, observer = controller_poles(controller)
     closed = eigenvalues(loop(design.model, controller, delay=delay).closed)
     expected = np.concatenate([regulator, observer])
     # The filter's copy of the stored forces and the machine's own make multiple eigenvalues at zero: compare the rest.
@@ -61,7 +62,7 @@ def test_backward_euler_separates_on_its_own_model(designs: dict[str, Design]) -
     )  # xi_hat = implicit (xi_hat_old + Ts B v + Ts L y)
     assert (np.eye(10) - c.L @ C) @ c.Ad == pytest.approx(implicit, abs=1e-12)
     assert pytest.approx(implicit @ (Ts * L), rel=1e-9, abs=1e-15) == c.L
-    _, observer = own_poles(c)
+    _, observer = controller_poles(c)
     assert _matched(1 / observer, 1 - Ts * eigenvalues(A - L @ C)) < 1e-10
 
 
@@ -182,7 +183,7 @@ def test_integrals_remove_the_error_of_a_wrong_machine(
 def test_delay_in_the_design_keeps_the_poles(designs: dict[str, Design]) -> None:
     """A modelled delay costs the regulator nothing but itself: the same poles, and zeros for the stored forces."""
     design = designs["calibrated"]
-    plain, _ = own_poles(malta.lqg(design.model, design.spec.weights, 50e-6, "sampled-data", 0))
-    late, _ = own_poles(malta.lqg(design.model, design.spec.weights, 50e-6, "sampled-data", 2))
+    plain, _ = controller_poles(malta.lqg(design.model, design.spec.weights, 50e-6, "sampled-data", 0))
+    late, _ = controller_poles(malta.lqg(design.model, design.spec.weights, 50e-6, "sampled-data", 2))
     assert (np.abs(late) < 1e-3).sum() == 10
     assert _matched(plain, late[np.abs(late) > 0.5]) < 2e-5

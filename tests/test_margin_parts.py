@@ -11,7 +11,7 @@ from flint import arb, ctx
 import malta
 from malta.margins import (
     family,
-    loop,
+    groups,
     minors,
     robust,
 )
@@ -76,7 +76,7 @@ def test_another_law_of_the_same_plant_has_the_margin_that_it_has_alone(sample_t
         found = []
         for own in laws:
             if anew:
-                for kept in (robust.problem_of, minors._known, loop._program, loop._symbolic):
+                for kept in (robust.problem_of, minors._known, groups._program, groups._symbolic):
                     kept.cache_clear()
             margin = malta.robust_margin(system, own, {"m": 0.2, "d": 1.0})
             found.append((margin.lower, margin.upper))

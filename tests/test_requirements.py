@@ -13,7 +13,7 @@ from conftest import ROOT, refusal
 
 import malta
 from malta.machines.tubular.requirements import REQUIREMENTS
-from malta.margins.verify import machine_loop
+from malta.margins.loops import machine_loop
 from malta.synthesis.requirements import GENERIC, requirements_for
 from malta.synthesis.spec import Loads, Pid, Spec
 from malta.tuning.groups import figures_of, groups_of

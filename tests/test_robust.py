@@ -17,17 +17,13 @@ from hypothesis import strategies as st
 
 from malta import gains
 from malta.errors import InputError
+from malta.margins.loops import machine_law
+from malta.margins.responses import responses
 from malta.margins.robust import robust_margin
 from malta.margins.stages import compensators
 from malta.margins.systems import uncertain
-from malta.margins.uncertain import (
-    Compensator,
-    UncertainSystem,
-    critical,
-    instability,
-    responses,
-)
-from malta.margins.verify import machine_law, travel_margin
+from malta.margins.travel import travel_margin
+from malta.margins.uncertain import Compensator, UncertainSystem, critical, instability
 from malta.model.data import plant_of
 
 if TYPE_CHECKING:
@@ -215,7 +211,7 @@ def test_the_published_observer_keeps_a_fifth_of_it() -> None:
     m = robust_margin(uncertain(plant, list(BOX)), law, BOX)
     assert m.lower == pytest.approx(0.334, abs=0.005)
     assert m.upper == pytest.approx(0.334, abs=0.005)
-    P, F = responses(uncertain(plant, []), law, np.zeros(0), np.geomspace(1, 1e4, 2000))
+    P, _, _, F = responses(uncertain(plant, []), law, np.zeros(0), np.geomspace(1, 1e4, 2000))
     assert np.linalg.norm(np.linalg.inv(np.eye(5) - P @ F), 2, axis=(1, 2)).max() == pytest.approx(
         7, rel=0.05
     )

@@ -25,8 +25,9 @@ from malta import report
 from malta.campaigns.statistics import figures_of
 from malta.margins.extent import NOWHERE, Extent, extent_of, positions_of
 from malta.margins.stages import robustness
+from malta.margins.travel import travel_loops, travel_margin
 from malta.margins.uncertain import instability
-from malta.margins.verify import Margins, travel_loops, travel_margin, zone
+from malta.margins.verify import Margins, zone
 from malta.model import machines
 from malta.model.checks import check_plant
 from malta.model.machines import machine

@@ -14,7 +14,7 @@ from scipy.integrate import solve_ivp
 
 import malta
 from malta import references
-from malta.margins.verify import loop
+from malta.margins.loops import loop
 from malta.simulation.inputs import feedforward
 from malta.simulation.period import state_reference
 from malta.simulation.scenario import Scenario

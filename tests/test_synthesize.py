@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import malta
-from malta.margins.verify import own_poles
+from malta.margins.verify import controller_poles
 from malta.synthesis.lqg import pi_current_loop, sampled_model, static_feedforward
 
 if TYPE_CHECKING:
@@ -166,7 +166,7 @@ def test_delay_can_be_designed_for_at_any_sample_time(
     """What Van Loan's integral leaves beside the stored force stays positive semidefinite."""
     design = designs["calibrated"]
     weights = replace(design.spec.weights, q_base=design.spec.weights.q_base * scale)
-    regulator, observer = own_poles(malta.lqg(design.model, weights, Ts, "sampled-data", 1))
+    regulator, observer = controller_poles(malta.lqg(design.model, weights, Ts, "sampled-data", 1))
     assert np.abs(regulator).max() < 1
     assert np.abs(observer).max() < 1
 

@@ -17,7 +17,8 @@ from conftest import ROOT, Run, refusal
 import malta
 from malta import gains, report
 from malta.machines.tubular.requirements import DRIVE
-from malta.margins.verify import BANDWIDTHS, loop, machine_loop
+from malta.margins.loops import loop, machine_loop
+from malta.margins.verify import BANDWIDTHS
 from malta.simulation.catalogue import experiment
 from malta.synthesis.controller import linear_law, linear_law_of
 from malta.synthesis.requirements import requirements_for

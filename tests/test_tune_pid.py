@@ -18,7 +18,7 @@ from scipy import linalg
 import malta
 from malta.machines.halbach import electronics
 from malta.machines.halbach import plant as halbach
-from malta.margins.verify import machine_loop
+from malta.margins.loops import machine_loop
 from malta.synthesis.riccati import sample, sample_noise
 from malta.synthesis.spec import Pid
 from malta.tuning import outcomes

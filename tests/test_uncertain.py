@@ -12,16 +12,11 @@ from scipy import linalg
 import malta
 from malta import gains
 from malta.errors import InputError
+from malta.margins.loops import loop, machine_law
+from malta.margins.responses import responses
 from malta.margins.robust import robust_margin
 from malta.margins.systems import uncertain
-from malta.margins.uncertain import (
-    closed_loop,
-    critical,
-    instability,
-    responses,
-    sampled_law,
-)
-from malta.margins.verify import loop, machine_law
+from malta.margins.uncertain import closed_loop, critical, instability, sampled_law
 from malta.model.data import plant_of
 from malta.synthesis.controller import linear_law
 
@@ -77,7 +72,7 @@ def test_a_machine_that_the_controller_does_not_know(designs: dict[str, Design])
     system = uncertain(weak, ["m"], believed=design.plant)
     expected = loop(malta.linearize(weak, weak.at()), design.controller, delay=1, current_loops=True)
     w = np.geomspace(1, 6e4, 30)
-    P, F = responses(system, law, system.nominal, w)
+    P, _, _, F = responses(system, law, system.nominal, w)
     assert np.linalg.inv(np.eye(5) - P @ F) == pytest.approx(expected.sensitivity(w), rel=1e-6, abs=1e-8)
 
 
@@ -101,7 +96,7 @@ def test_the_closed_loop_is_verifys(design: Design) -> None:
         np.log(radius) / 50e-6, rel=1e-5, abs=1e-5
     )
     w = np.geomspace(1, 6e4, 30)
-    P, F = responses(system, law, system.nominal, w)
+    P, _, _, F = responses(system, law, system.nominal, w)
     assert np.abs(-P @ F - expected.loop_gain(w)).max() < 1e-6
 
 

@@ -10,13 +10,8 @@ import numpy as np
 import pytest
 
 import malta
-from malta.margins.verify import (
-    BANDWIDTHS,
-    loop,
-    machine_loop,
-    require_stable,
-    zone,
-)
+from malta.margins.loops import loop, machine_loop
+from malta.margins.verify import BANDWIDTHS, require_stable, zone
 from malta.synthesis.riccati import eigenvalues
 
 if TYPE_CHECKING:

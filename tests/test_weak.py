@@ -22,8 +22,8 @@ from malta.margins.axes import members_of, state_matrix
 from malta.margins.box import box_of
 from malta.margins.expressions import NotAnalytic, program
 from malta.margins.held import HeldMachine, dominating, held_machine
+from malta.margins.travel import NOT_BETWEEN, _anywhere, loop_at, travel_margin
 from malta.margins.uncertain import closed_loop, instability, model_of
-from malta.margins.verify import NOT_BETWEEN, _anywhere, loop_at, travel_margin
 from malta.margins.weak import AnywhereHeld, _beside
 from malta.model.data import plant_of
 

@@ -17,7 +17,7 @@ import casadi as ca
 import numpy as np
 
 from malta.errors import InputError
-from malta.margins.verify import machine_loop
+from malta.margins.loops import machine_loop
 from malta.model.linearize import linearize
 from malta.model.plant import Plant, trim
 from malta.simulation import generic, references

@@ -12,7 +12,7 @@ from malta.cli.options import AsJson, MachineFile
 from malta.cli.output import make_console, print_json, print_note
 
 if TYPE_CHECKING:
-    from malta.margins.verify import CurrentLoops
+    from malta.margins.loops import CurrentLoops
     from malta.synthesis.controller import Controller
 
 
@@ -63,7 +63,7 @@ def _matches_gains(certificate: Path, controller: Controller) -> bool:
     """Whether a certificate's loops are those of a gain file, with either kind of current loops."""
     from malta.margins import checked_file
     from malta.margins.certificate import matches
-    from malta.margins.verify import travel_loops
+    from malta.margins.travel import travel_loops
     from malta.model.data import plant_of
 
     plant = plant_of(controller.parameters)

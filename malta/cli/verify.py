@@ -18,9 +18,10 @@ from malta.errors import CheckError, InputError
 
 if TYPE_CHECKING:
     from malta.margins.gain import Gain
+    from malta.margins.loops import CurrentLoops
     from malta.margins.robust import Margin
     from malta.margins.stages import Robustness
-    from malta.margins.verify import CurrentLoops, Margins
+    from malta.margins.verify import Margins
     from malta.model.linearize import LinearModel
     from malta.model.plant import Plant
     from malta.synthesis.controller import Controller
@@ -149,7 +150,7 @@ def _analyse(
     Raises CheckError, naming the gain file, when a result fails its own check.
     """
     from malta.margins.stages import robustness
-    from malta.margins.verify import covers_travel, worst_sensitivities
+    from malta.margins.travel import covers_travel, worst_sensitivities
     from malta.margins.verify import verify as compute_margins
 
     plant, controller, box, current_loops = loop.plant, loop.controller, loop.box, loop.current_loops
@@ -171,7 +172,7 @@ def _analyse(
 def _write_certificate(path: Path, loop: Loop, margin: Margin) -> Path:
     """Write the certificate of the margin over the travel."""
     from malta.margins import certificate
-    from malta.margins.verify import travel_loops
+    from malta.margins.travel import travel_loops
 
     places, over = travel_loops(loop.plant, loop.controller, tuple(loop.box), loop.current_loops)
     return certificate.write(path, places, loop.box, over, margin, loop.gains)

@@ -21,8 +21,8 @@ from malta.margins.characteristic import mapped, turned_table
 from malta.margins.enclosure import precision
 from malta.margins.expressions import exact
 from malta.margins.family import EPS, binary
+from malta.margins.groups import rational
 from malta.margins.held import HeldMachine
-from malta.margins.loop import rational
 
 if TYPE_CHECKING:
     from malta.margins.uncertain import Compensator

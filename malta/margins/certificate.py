@@ -21,7 +21,6 @@ from flint import arb, ctx
 from malta.errors import CheckError, InputError
 from malta.files import replace_files
 from malta.margins import checked_file
-from malta.margins import loop as loops
 from malta.margins.box import Box, box_of
 from malta.margins.certificate_groups import divides, groups_of, units_of
 from malta.margins.check import BITS, MOST_NODES, balls, bernstein, interpolated, within
@@ -29,6 +28,7 @@ from malta.margins.checked_loop import Polynomial, Refused, expressions, height,
 from malta.margins.exclusion import Growth, advance, start
 from malta.margins.expressions import FIELD, exact
 from malta.margins.family import Family, binary
+from malta.margins.groups import E, UncertainLoop, loop_of
 from malta.margins.systems import compensator_of
 
 if TYPE_CHECKING:
@@ -121,7 +121,7 @@ def matches(path: str | Path, places: Places) -> bool:
     """Whether a certificate's loops and nominal values are these, to the last digit."""
     content = checked_file.content_of(Path(path))
     found = content["loops"]
-    own = [_described(loops.loop_of(s, _law(s, law))) for s, law in places]
+    own = [_described(loop_of(s, _law(s, law))) for s, law in places]
     nominal = [float(x).hex() for x in places[0][0].nominal]
     return (
         len(found) == len(own)
@@ -134,15 +134,13 @@ def _law(system: UncertainSystem, law: Any) -> Compensator:
     return compensator_of(law, system.matrices.size1_out(2), system.matrices.size2_out(1))
 
 
-def _described(loop: loops.Loop) -> dict[str, Any]:
+def _described(loop: UncertainLoop) -> dict[str, Any]:
     """A loop as it stands in a certificate, without its groups."""
     law, program = loop.law, loop.program
     n = loop.states
     if loop.direct:
         raise InputError("certificate", "system", "a matrix D", "outputs y = C x alone")
-    if loop.descriptor and sorted((i, j) for i, j, _ in program.entries[loops.E]) != [
-        (i, i) for i in range(n)
-    ]:
+    if loop.descriptor and sorted((i, j) for i, j, _ in program.entries[E]) != [(i, i) for i in range(n)]:
         raise InputError("certificate", "system", "a matrix E that couples states", "a diagonal E, or none")
     if not program.rational:
         foreign = sorted({name for name, *_ in program.steps} - {*FIELD, "const", "input", "constpow"})
@@ -165,7 +163,7 @@ def _described(loop: loops.Loop) -> dict[str, Any]:
 
 def _loop(system: UncertainSystem, law: Any, box: Box, lower: float) -> dict[str, Any]:
     """One loop with the proof of each of its groups. Raises InputError, CheckError."""
-    described = _described(loops.loop_of(system, _law(system, law)))
+    described = _described(loop_of(system, _law(system, law)))
     count, before = len(box.names), ctx.prec
 
     def read() -> checked_file.Loop:

@@ -40,16 +40,7 @@ from malta.margins.expressions import (
     NotAnalytic,
     finite,
 )
-from malta.margins.loop import (
-    A,
-    B,
-    C,
-    D,
-    E,
-    Group,
-    Loop,
-    divided,
-)
+from malta.margins.groups import A, B, C, D, E, Group, UncertainLoop, divided
 from malta.margins.majorant import coefficient_bounds
 from malta.margins.minors import Minors, minors
 
@@ -60,7 +51,7 @@ MOST = 50_000  # places that are remembered
 class Characteristic:
     """The characteristic polynomial of one group of a loop."""
 
-    loop: Loop
+    loop: UncertainLoop
     group: Group
     names: tuple[str, ...]
 
@@ -340,12 +331,12 @@ def pair(c: Any) -> tuple[float, int]:
 
 
 @lru_cache(maxsize=64)
-def _denominators(loop: Loop, g: Group) -> tuple[Any, ...]:
+def _denominators(loop: UncertainLoop, g: Group) -> tuple[Any, ...]:
     assert loop.symbolic is not None
     return tuple(row[None] for row in cleared(loop, g, loop.symbolic) if None in row)
 
 
-def _multiplier(loop: Loop, g: Group, p: Sequence[Any]) -> Any:
+def _multiplier(loop: UncertainLoop, g: Group, p: Sequence[Any]) -> Any:
     found = fmpq(1)
     for den in _denominators(loop, g):
         found *= den(*p)

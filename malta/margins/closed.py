@@ -9,25 +9,14 @@ import numpy as np
 from flint import acb_mat, arb
 
 from malta.margins.expressions import NotAnalytic, exact
-from malta.margins.loop import (
-    A,
-    B,
-    C,
-    D,
-    E,
-    Group,
-    Loop,
-    held,
-    rational,
-    upper,
-)
+from malta.margins.groups import A, B, C, D, E, Group, UncertainLoop, hold_bounds, rational, upper
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
 
 
 def parts(
-    loop: Loop, g: Group, entries: list[list[tuple[int, int, Any]]], matrix: Any
+    loop: UncertainLoop, g: Group, entries: list[list[tuple[int, int, Any]]], matrix: Any
 ) -> tuple[tuple[Any, ...], Any]:
     """What `_closed` takes, and det E: the driven system (lag, hold, delay included), what acts on it, the law."""
     law, x = loop.law, {state: k for k, state in enumerate(g.states)}
@@ -185,7 +174,7 @@ def coefficients(closed: tuple[Any, Any]) -> list[Any]:
     return [c * factor for c in found]
 
 
-def majorant_matrix(loop: Loop, g: Group, entries: list[list[tuple[int, int, Any]]]) -> FloatArray:
+def majorant_matrix(loop: UncertainLoop, g: Group, entries: list[list[tuple[int, int, Any]]]) -> FloatArray:
     """Entrywise bounds of the closed loop's state matrix (of differences where discrete), from balls of the entries.
 
     Raises NotAnalytic where numbers overflow, or the direct feedthrough is too large.
@@ -246,14 +235,14 @@ def majorant_matrix(loop: Loop, g: Group, entries: list[list[tuple[int, int, Any
 Bounds = tuple["FloatArray", "FloatArray", "FloatArray", "FloatArray | None"]
 
 
-def driven_bounds(loop: Loop, abcd: Bounds, diagonal: FloatArray) -> Bounds:
+def driven_bounds(loop: UncertainLoop, abcd: Bounds, diagonal: FloatArray) -> Bounds:
     """Bounds of the system with its lag, held and sampled (as differences), from those of A, B, C and D."""
     law, (a, b, c, d) = loop.law, abcd
     r, p = b.shape[1], len(c)
     rate = law.lag
     if loop.sampled:
         assert law.sample_time is not None
-        a, V = held(a, diagonal, law.sample_time)
+        a, V = hold_bounds(a, diagonal, law.sample_time)
         b = V @ b
         if rate is not None:  # both parts of the held input, the lag's state and the rest, are below V
             rate = float(-np.expm1(-rate * law.sample_time)) * (1 + 1e-12)

@@ -7,15 +7,7 @@ from typing import Any
 from flint import fmpq, fmpq_mat
 
 from malta.margins.algebra import Ratio, Symbolic
-from malta.margins.loop import (
-    A,
-    B,
-    C,
-    D,
-    E,
-    Group,
-    Loop,
-)
+from malta.margins.groups import A, B, C, D, E, Group, UncertainLoop
 
 
 def degree(polynomial: Any, i: int) -> int:
@@ -45,7 +37,7 @@ def depends(s: Symbolic, atom: int, i: int) -> bool:
     return False
 
 
-def cleared(loop: Loop, g: Group, s: Symbolic) -> list[dict[Any, Any]]:
+def cleared(loop: UncertainLoop, g: Group, s: Symbolic) -> list[dict[Any, Any]]:
     """Rows of the polynomial matrix whose determinant is a: those of x, then those of y; columns x, u, y."""
     rows: list[dict[Any, Ratio]] = []
     for i in g.states:

@@ -19,17 +19,7 @@ from scipy import linalg, sparse
 
 from malta.margins.algebra import Ratio, Symbolic, value
 from malta.margins.expressions import BALLS, NotAnalytic, finite
-from malta.margins.loop import (
-    A,
-    B,
-    C,
-    Group,
-    Loop,
-    divided,
-    groups,
-    held,
-    upper,
-)
+from malta.margins.groups import A, B, C, Group, UncertainLoop, divided, groups, hold_bounds, upper
 from malta.margins.majorant import coefficient_bounds
 
 if TYPE_CHECKING:
@@ -42,7 +32,7 @@ SMALL = 1e-11  # couplings below this, relative, may be rounding
 class Couplings:
     """The closed loop's couplings as exact expressions: x from x, what acts on x, the compensator from y."""
 
-    loop: Loop
+    loop: UncertainLoop
     symbolic: Symbolic
 
     @cached_property
@@ -90,7 +80,7 @@ class Couplings:
         size[n:, n:] = np.abs(law.A - (0 if law.sample_time is None else np.eye(k)))
         if loop.sampled:
             assert law.sample_time is not None
-            own, V = held(own, diagonal, law.sample_time)
+            own, V = hold_bounds(own, diagonal, law.sample_time)
             size[:n] = V @ size[:n]
         elif law.sample_time is not None:
             own = own + np.eye(n)
@@ -111,7 +101,7 @@ class Part:
     moves: tuple[Any, ...]
 
 
-def parts(loop: Loop, couplings: Couplings | None, p: Sequence[Any]) -> list[Part]:
+def parts(loop: UncertainLoop, couplings: Couplings | None, p: Sequence[Any]) -> list[Part]:
     """The loop's groups over real balls p, split further where they only touch by rounding."""
     exact = groups(loop)
     if couplings is None or loop.direct or not any(len(g.states) > 1 for g in exact):
@@ -129,7 +119,7 @@ def parts(loop: Loop, couplings: Couplings | None, p: Sequence[Any]) -> list[Par
     return found
 
 
-def _split(loop: Loop, g: Group, members: list[int], size: FloatArray) -> list[Part]:
+def _split(loop: UncertainLoop, g: Group, members: list[int], size: FloatArray) -> list[Part]:
     _, (units, _) = linalg.matrix_balance(size, permute=False, separate=True)
     size = size * units / units[:, None]
     rows, columns = size.max(axis=1), size.max(axis=0)

@@ -27,7 +27,7 @@ from malta.margins.blocks import (
 from malta.margins.box import Box, box_of
 from malta.margins.enclosure import Unproven
 from malta.margins.given import positive
-from malta.margins.loop import loop_of
+from malta.margins.groups import loop_of
 from malta.margins.loss import first_loss
 from malta.margins.peaks import (
     Peak,
@@ -37,6 +37,7 @@ from malta.margins.peaks import (
 )
 from malta.margins.polydisc import Size, is_zero_free
 from malta.margins.problem import OfLoop
+from malta.margins.responses import responses
 from malta.margins.robust import (
     Margin,
     deadline,
@@ -44,7 +45,7 @@ from malta.margins.robust import (
     problem_of,
 )
 from malta.margins.search import Job
-from malta.margins.transfer import mu_bound, responses, transfer
+from malta.margins.transfer import mu_bound, transfer
 from malta.margins.uncertain import Compensator, UncertainSystem
 from malta.margins.weight import Expanded, Weight
 from malta.threads import on_one_thread

@@ -82,11 +82,11 @@ def positions_of(plant: Plant, extent: Extent, shares: Iterable[float]) -> tuple
     """The places of a machine, SI: at shares of its travel either way; of a parameter both ends and its own value."""
     if extent.stroke:
         return tuple(tuple(dict.fromkeys((share * plant.travel, -share * plant.travel))) for share in shares)
-    own = standing(plant, extent, {})
+    own = own_position(plant, extent, {})
     return tuple((value,) for value in sorted({own, *extent.over.get(extent.course, ())}))
 
 
-def standing(plant: Plant, extent: Extent, states: Mapping[str, float]) -> float:
+def own_position(plant: Plant, extent: Extent, states: Mapping[str, float]) -> float:
     """The position of the machine itself along its course, at these states."""
     if extent.stroke or not extent.course:
         return states.get(extent.stroke, 0.0)

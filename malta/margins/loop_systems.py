@@ -6,7 +6,7 @@
     +-----------------------------+
 
 P is the machine as it runs, sampled: hold, delay, current loops, the loads against v0(z). F is the law, with negative
-feedback inside. They are those of verify.machine_loop.
+feedback inside. They are those of loops.machine_loop.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from malta.margins.verify import machine_loop
+from malta.margins.loops import machine_loop
 from malta.model.linearize import linearize
 from malta.model.plant import Plant
 from malta.synthesis.controller import Controller

@@ -28,16 +28,7 @@ from malta.margins.closed import (
     solved,
 )
 from malta.margins.expressions import NotAnalytic, Program, exact
-from malta.margins.loop import (
-    A,
-    B,
-    C,
-    E,
-    Group,
-    Loop,
-    rational,
-    upper,
-)
+from malta.margins.groups import A, B, C, E, Group, UncertainLoop, rational, upper
 from malta.margins.majorant import all_bounds, coefficient_bounds
 
 if TYPE_CHECKING:
@@ -52,7 +43,7 @@ Pair = tuple[tuple[int, ...], tuple[int, ...]]
 class Minors:
     """A group's rows that inputs act on, its inputs, its outputs, and the compensator's minors between these."""
 
-    loop: Loop
+    loop: UncertainLoop
     group: Group
     rows: tuple[int, ...]  # states, by their number in the group
     inputs: tuple[int, ...]
@@ -246,7 +237,7 @@ class Sizes(NamedTuple):
     beta: dict[Pair, float]
 
 
-def minors(loop: Loop, g: Group) -> Minors | None:
+def minors(loop: UncertainLoop, g: Group) -> Minors | None:
     """None where the closed loop's own matrix is the better way: direct feedthrough, or too many minors."""
     if loop.direct or not g.states:
         return None

@@ -23,7 +23,7 @@ from malta.margins.expansion import (
     stacked,
     table,
 )
-from malta.margins.loop import C, Group, Loop
+from malta.margins.groups import C, Group, UncertainLoop
 from malta.margins.series import held, square_held
 
 if TYPE_CHECKING:
@@ -64,7 +64,7 @@ class Pencil:
 class Rows:
     """The rows of one group of a loop as polynomials in p, from which pencils over boxes are made."""
 
-    def __init__(self, loop: Loop, group: Group) -> None:
+    def __init__(self, loop: UncertainLoop, group: Group) -> None:
         s, law = loop.symbolic, loop.law
         assert s is not None
         self.loop, self.group, self.count = loop, group, loop.program.inputs

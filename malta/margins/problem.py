@@ -31,7 +31,7 @@ from malta.margins.expressions import (
     exact,
 )
 from malta.margins.family import binary
-from malta.margins.loop import Group, Loop
+from malta.margins.groups import Group, UncertainLoop
 from malta.margins.uncertain import closed_loop as closed_matrices
 from malta.margins.uncertain import critical, instability
 
@@ -79,7 +79,7 @@ class Problem(Protocol):
 class OfLoop:
     """A closed loop."""
 
-    loop: Loop
+    loop: UncertainLoop
     names: tuple[str, ...]
     known: dict[Any, Characteristic] = field(default_factory=dict)
     neglect: bool = True  # whether couplings that are only rounding are taken as zero, and accounted for

@@ -32,7 +32,7 @@ from malta.margins.given import (
     number,
     positive,
 )
-from malta.margins.loop import loop_of
+from malta.margins.groups import loop_of
 from malta.margins.problem import (
     OfCoefficients,
     OfLoop,
@@ -98,6 +98,9 @@ class Margin:
             return f"{low}: stable as far as was looked, or as the parameters exist"
         where = "" if self.frequency is None else f" at {self.frequency:.4g} rad/s"
         return f"{low}, lost at {100 * self.upper:.2f} %{where}"
+
+
+NOT_PROVEN = Margin(None, math.inf, None, None, {}, {}, (), 0.0, "not asked")
 
 
 @on_one_thread

@@ -1,70 +1,56 @@
-"""Where the margin goes, from full state feedback to the machine's own loop; and the classical margins of that loop.
+"""The margin at each stage of a design, from full state feedback to the machine's own loop.
 
     LQR -> LQI -> LQG -> LQGI -> with current loops -> sampled: the gain file's own gains, with hold and delay
 
-A PID has the last one alone; without weights on integrals the second and the fourth are left out.
+A PID has the last stage alone. A design without weights on integrals has no LQI and no LQGI.
 
-The first five are continuous, synthesized from the cost and the noise that the file names. Each has its parametric
-margin (robust.py) and its peak sensitivity: at the forces for state feedback, where the LQR promises at most 1, at the
-sensors for output feedback, as ISO 14839-3 measures it.
-Everything here is the design model at a position, without preload: what loads add is in verify's last stage.
+The first five stages are continuous; they are synthesized from the cost and the noise in the gain file. Each stage
+has its parametric margin (robust.py) and its peak sensitivity: at the forces for state feedback, where an LQR
+guarantees at most 1, at the sensors for output feedback, as ISO 14839-3 measures it.
+All stages use the design model at a position, without the loads; the last stage of verify.py includes these.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import itertools
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from functools import cached_property
+from typing import Literal
 
 import numpy as np
 
 from malta.errors import InputError
-from malta.margins.extent import NOWHERE, Extent, extent_of, standing
+from malta.margins.classical import Classical, Disk, classical_margins, is_stable, peak_sensitivity, worst_of
+from malta.margins.extent import NOWHERE, Extent, extent_of, own_position
+from malta.margins.loops import CurrentLoops, machine_law
 from malta.margins.plants import of_plant
-from malta.margins.robust import Margin, robust_margin
-from malta.margins.uncertain import (
-    Compensator,
-    UncertainSystem,
-    instability,
-    responses,
-)
-from malta.margins.verify import (
+from malta.margins.robust import NOT_PROVEN, Margin, Progress, Ranges, robust_margin
+from malta.margins.travel import (
     EACH,
-    NOT_PROVEN,
     PLACES,
-    CurrentLoops,
-    course_enters,
     covers_travel,
-    largest,
+    depends_on_course,
     loop_at,
-    machine_law,
     place_margin,
     places_along,
     travel_margin,
 )
+from malta.margins.uncertain import Compensator, UncertainSystem
 from malta.model.data import plant_of
 from malta.model.linearize import linearize
 from malta.model.parameters import units_of
 from malta.model.plant import Plant, position_at
 from malta.synthesis.controller import Controller
-from malta.synthesis.lqg import (
-    kalman,
-    lqi,
-    lqr,
-    weights_of,
-)
+from malta.synthesis.lqg import kalman, lqi, lqr, weights_of
 from malta.threads import on_one_thread
-
-if TYPE_CHECKING:
-    from malta.model.plant import ComplexArray, FloatArray
 
 SAMPLED = "sampled"  # the last link: the machine's own loop
 
 
 @dataclass(frozen=True, eq=False)
 class Link:
-    """One stage of the chain."""
+    """One stage of the chain, with its margin and its peak sensitivity."""
 
     name: str
     margin: Margin
@@ -73,59 +59,45 @@ class Link:
 
 
 @dataclass(frozen=True)
-class Disk:
-    """A loop stands any factor (1 + d/2) / (1 - d/2) with |d| < size in each channel that it names."""
-
-    channels: str
-    size: float
-    frequency: float  # rad/s
-
-    @property
-    def gain(self) -> float:
-        """The factor of gain that it stands, up or down; infinite from size 2 on."""
-        return (1 + self.size / 2) / (1 - self.size / 2) if self.size < 2 else float("inf")
-
-    @property
-    def phase(self) -> float:
-        """rad"""
-        return float(2 * np.arctan(self.size / 2))
-
-
-@dataclass(frozen=True)
 class Place:
-    """Figures at a position of the stroke, the worse of both sides: the machine is even in it, a law need not be.
+    """Figures at a place of the stroke: each is the worse of +position and -position.
 
     A machine without a stroke has its places along the first parameter of `plant.over`, as the speed of a rotor.
     """
 
-    position: float  # SI: m, or the unit of that parameter
+    position: float  # m, or the SI unit of the parameter
     margin: Margin
     peak: float
-    disk: float  # all forces and sensors at once; NaN where unstable, as the peak and the delay
-    delay: float  # s
+    disk: float  # size of the disk margin of all forces and sensors at once
+    delay: float  # s, smallest delay margin; NaN where unstable, as peak and disk
 
 
 @dataclass(frozen=True, eq=False)
 class Robustness:
-    """What `robustness` found of a controller on a machine."""
+    """The result of `robustness`."""
 
     chain: tuple[Link, ...]
-    travel: Margin  # the last link, anywhere in `extent`, in one proof
-    # The smallest or largest of `places`; none where one of them is unstable:
+    travel: Margin  # of the last link, anywhere in `extent`
+    # The worst of all places; empty or NaN where the loop is unstable at one of them:
     disks: tuple[Disk, ...]
-    delay: Mapping[str, float]  # s, that each sensor's loop stands alone, the others closed
-    gang: Mapping[str, tuple[float, ...]]  # by sensor: |S|, |T|, m/N, N/m: largest in its row
-    # Proven anywhere in the extent, in multiples of the range:
+    delay: Mapping[str, float]  # s, delay margin of each sensor's loop, the others closed
+    gang: Mapping[str, tuple[float, ...]]  # by sensor: largest |S|, |T|, |S P| (m/N), |F S| (N/m)
+    # Anywhere in the extent, in multiples of the range:
     tolerance: Mapping[str, tuple[Margin, Margin]]  # each parameter alone, down and up
     payload: Margin | None  # in kg; None for a machine without a mass m
-    places: tuple[Place, ...]  # along the course; in a travel everything is even
-    extent: Extent = NOWHERE  # what the proof covers beside the uncertainty
+    places: tuple[Place, ...]  # along the course; +z and -z count as one place
+    extent: Extent = NOWHERE  # the intervals that the proof covers beside the uncertainty
 
 
 def compensators(
     plant: Plant, controller: Controller, current_loops: CurrentLoops = "lag"
 ) -> dict[str, tuple[Compensator, bool]]:
-    """The stages by name, and whether they feed back the states; `plant` is the machine, which has the delays."""
+    """The control laws of the stages by name, each with whether it feeds back the states.
+
+    plant : the machine, whose delay and current loops the last stages have
+
+    State feedback reads [y, x]; the other laws read y.
+    """
     own = {SAMPLED: (machine_law(plant, controller, current_loops), False)}
     if controller.cost is None:
         return own
@@ -163,6 +135,69 @@ def compensators(
     return stages | own
 
 
+@dataclass(frozen=True, eq=False)
+class _Question:
+    """The arguments of `robustness`, and what its parts derive from them."""
+
+    plant: Plant
+    controller: Controller
+    uncertainty: Mapping[str, float]
+    current_loops: CurrentLoops
+    time: float | None
+    proof: bool
+    report: Callable[[], None]  # called after each part
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """The uncertain parameters, and the mass for the payload: one model answers all questions."""
+        own = tuple(self.uncertainty)
+        return (*own, *({"m"} & set(units_of(self.plant.parameters)) - set(own)))
+
+    @cached_property
+    def extent(self) -> Extent:
+        return extent_of(self.plant, self.names)
+
+    @cached_property
+    def whole(self) -> bool:
+        """Whether one proof covers the travel."""
+        return covers_travel(self.plant, self.controller, self.names, self.current_loops)
+
+    @cached_property
+    def _place_margins(self) -> dict[float, Margin]:
+        return {}
+
+    @cached_property
+    def _travel_margins(self) -> dict[tuple[object, float | None], Margin]:
+        return {}
+
+    @cached_property
+    def _moves(self) -> bool:
+        return depends_on_course(self.plant, self.controller, self.names, self.current_loops)
+
+    def loop_at(self, position: float) -> tuple[UncertainSystem, Compensator]:
+        return loop_at(self.plant, self.controller, self.names, position, self.current_loops)
+
+    def margin_at(self, position: float) -> Margin:
+        """The margin at a position along the course; computed once where the loop does not depend on it."""
+        z, known = position if self._moves else 0.0, self._place_margins
+        if z not in known:
+            known[z] = place_margin(
+                self.plant, self.controller, self.uncertainty, z, self.current_loops, self.names
+            )
+        return known[z]
+
+    def margin_over(self, ranges: Ranges, time: float | None, progress: Progress | None = None) -> Margin:
+        """The margin anywhere in the extent; computed once for equal ranges: +1 kg may be the range of the mass."""
+        known, key = self._travel_margins, (tuple(ranges.items()), time)
+        if key not in known:
+            known[key] = travel_margin(
+                self.plant, self.controller, ranges, self.current_loops, self.names,
+                time=time, progress=progress,
+            )  # fmt: skip
+        self.report()
+        return known[key]
+
+
 @on_one_thread
 def robustness(
     plant: Plant,
@@ -171,259 +206,104 @@ def robustness(
     *,
     current_loops: CurrentLoops = "lag",
     progress: Callable[[float], None] | None = None,
-    bounds: Callable[[float, float], None] | None = None,
+    bounds: Progress | None = None,
     time: float | None = None,
     proof: bool = True,
 ) -> Robustness:
     """Parametric and classical margins of a controller on a machine.
 
-    uncertainty : relative half range of each parameter, e.g. {"m": 0.2}; the margins count in it
-    current_loops : lag, as verify takes them, or pi, the sampled controllers of the gain file on the windings
-    bounds : called with the bounds of the margin over the travel so far
-    time : s, of each proof over the travel; proof: whether there is any
+    uncertainty : relative half range of each parameter, e.g. {"m": 0.2}; margins are multiples of it
+    current_loops : "lag", first-order lags at the crossover, or "pi", the sampled controllers of the gain file
+    progress : called with the share of the work that is done, 0 to 1
+    bounds : called with the lower and upper bound of the margin over the travel so far
+    time : s, longest search of the margin over the travel; None: 120
+    proof : False: without parametric margins, in a fraction of the time
 
     Raises InputError for unknown parameters or none.
+
+    Example: `malta.robustness(plant, controller, {"m": 0.2, "K_A": 0.1}).travel.lower`
     """
     if not uncertainty:
         raise InputError("robustness", "uncertainty", "no parameters", 'some, as {"m": 0.2}')
-    steps = iter(range(1, 100))
-    total = 8 + 2 * len(uncertainty) + len(PLACES)
+    steps, total = itertools.count(1), 8 + 2 * len(uncertainty) + len(PLACES)
 
-    def done() -> None:
+    def report() -> None:
         if progress is not None:
             progress(min(1.0, next(steps) / total))
 
-    names = list(uncertainty)
-    every = [*names, *({"m"} & set(units_of(plant.parameters)) - set(names))]
-    at = position_at(plant, plant.point(controller.operating_point[0]).x)
-    extent = extent_of(plant, every)
-    position = standing(plant, extent, at)
-    believed = plant_of(controller.parameters)
-    along = places_along(plant, controller, tuple(every), current_loops)
-    whole = covers_travel(plant, controller, tuple(every), current_loops)
-    moves = course_enters(plant, controller, tuple(every), current_loops)
-    proven = cache(lambda z: place_margin(plant, controller, uncertainty, z, current_loops, every))
-
-    def here(z: float) -> Margin:  # the operating point is one of the places
-        return proven(z if moves else 0.0)
-
-    links = []
-    stages = compensators(plant, controller, current_loops)
-    for name, (law, states) in stages.items():
-        if name == SAMPLED:
-            system, law = loop_at(plant, controller, tuple(every), position, current_loops)
-            margin = here(position) if proof else NOT_PROVEN
-        else:
-            system = of_plant(plant, names, states=states, at=at, believed=believed)
-            margin = robust_margin(system, law, uncertainty, time=time) if proof else NOT_PROVEN
-        links.append(Link(name, margin, _peak(system, law, states), "forces" if states else "sensors"))
-        done()
-
-    known: dict[tuple[object, float | None], Margin] = {}
-
-    def anywhere(
-        ranges: Mapping[str, float | tuple[float, float]],
-        longest: float | None,
-        report: Callable[[float, float], None] | None = None,
-    ) -> Margin:
-        key = tuple(ranges.items()), longest  # a payload of 1 kg may be the range of the mass
-        if key not in known:
-            known[key] = travel_margin(
-                plant, controller, ranges, current_loops, every, time=longest, progress=report
-            )
-        done()
-        return known[key]
-
-    travel = anywhere(uncertainty, time, bounds) if proof else NOT_PROVEN
-    brief = time if whole else min(time or EACH, EACH)
-    tolerance = {}
-    for name, share in uncertainty.items() if proof else ():
-        nominal = getattr(plant.parameters, name)
-        down = anywhere({name: (nominal * (1 - share), nominal)}, brief)
-        tolerance[name] = down, anywhere({name: (nominal, nominal * (1 + share))}, brief)
-    payload = None
-    if proof and "m" in units_of(plant.parameters):
-        m: float = getattr(plant.parameters, "m")  # noqa: B009  a machine's own field
-        payload = anywhere({"m": (m, m + 1.0)}, brief)
+    question = _Question(plant, controller, uncertainty, current_loops, time, proof, report)
+    links = _links(question)
+    travel = question.margin_over(uncertainty, time, bounds) if proof else NOT_PROVEN
+    tolerance, payload = _tolerances(question) if proof else ({}, None)
+    places, worst = _places(question)
     sensors = [s.name for s in plant.outputs]
-    places: list[Place] = []
-    classical: list[_Classical | None] = []
-    for positions in along:
-        loops = [loop_at(plant, controller, tuple(every), z, current_loops) for z in positions]
-        asked = positions if whole else positions[:1]  # a place takes as long as a travel there
-        margin = _smallest([here(z) for z in asked]) if proof else NOT_PROVEN
-        peaks, sides = [], []
-        for system, law in loops:
-            peaks.append(_peak(system, law, states=False))
-            sides.append(_classical(system, law, sensors) if _stable(system, law) else None)
-        classical += sides
-        disk, delay = np.nan, np.nan
-        if all(sides):
-            both = _worst([found for found in sides if found is not None])
-            disk, delay = both.disks[2].size, min(both.delay.values())
-        places.append(Place(positions[0], margin, float(np.max(peaks)), disk, delay))
-        done()
-    worst = _worst([found for found in classical if found is not None]) if all(classical) else None
     return Robustness(
-        tuple(links),
+        links,
         travel,
         worst.disks if worst else (),
         worst.delay if worst else dict.fromkeys(sensors, float("nan")),
         worst.gang if worst else {},
         tolerance,
         payload,
-        tuple(places),
-        extent,
+        places,
+        question.extent,
     )
 
 
-def _smallest(found: list[Margin]) -> Margin:
-    """The smallest lower and the smallest upper bound of margins that all shall hold."""
-    lower = None if any(m.lower is None for m in found) else min(m.lower or 0.0 for m in found)
-    reason = "; ".join(dict.fromkeys(m.reason for m in found if m.reason))
-    return replace(min(found, key=lambda m: m.upper), lower=lower, reason=reason)
-
-
-class _Classical(NamedTuple):
-    """Margins without parameters at one position, or the worst of several."""
-
-    disks: tuple[Disk, ...]
-    delay: dict[str, float]
-    gang: dict[str, tuple[float, ...]]
-
-
-def _classical(system: UncertainSystem, law: Compensator, sensors: list[str]) -> _Classical:
-    w = _frequencies(law)
-    P, F = _at_nominal(system, law, w)
-    disks = [disk_margin(system, law, kind) for kind in ("forces", "sensors", "forces and sensors")]
-    for k, name in enumerate(sensors):
-        disks.append(replace(disk_margin(system, law, "sensors", only=k), channels=f"{name} alone"))
-    delays = delay_margins(P @ F, w).tolist()
-    return _Classical(
-        tuple(disks), dict(zip(sensors, delays, strict=True)), dict(zip(sensors, _gang(P, F), strict=True))
-    )
-
-
-def _worst(found: list[_Classical]) -> _Classical:
-    disks = tuple(min(same, key=lambda d: d.size) for same in zip(*(one.disks for one in found), strict=True))
-    first = found[0]
-    return _Classical(
-        disks,
-        {name: min(one.delay[name] for one in found) for name in first.delay},
-        {
-            name: tuple(max(values) for values in zip(*(one.gang[name] for one in found), strict=True))
-            for name in first.gang
-        },
-    )
-
-
-def disk_margin(
-    system: UncertainSystem,
-    law: Compensator,
-    kind: Literal["forces", "sensors", "forces and sensors"],
-    only: int | None = None,
-) -> Disk:
-    """The symmetric disk margin of the nominal loop: all channels at once, each with its own factor, or one alone.
-
-    Factors (1 + d/2) / (1 - d/2) in the signals of Q, around which the loop is closed, leave it stable while
-    |d| < 1 / mu(M), M = (1 - Q)^-1 - 1/2 (Seiler, Packard, Gahinet 2020). mu is bounded above by a balanced D M D^-1,
-    so several channels stand at least this much; one channel is exact.
-    """
-    w = _frequencies(law)
-
-    def sizes(w: FloatArray) -> FloatArray:
-        P, F = _at_nominal(system, law, w)
-        if kind == "forces":
-            Q = F @ P
-        elif kind == "sensors":
-            Q = P @ F
+def _links(q: _Question) -> tuple[Link, ...]:
+    """The stages of the chain, each with its margin and its peak sensitivity."""
+    at = position_at(q.plant, q.plant.point(q.controller.operating_point[0]).x)
+    believed = plant_of(q.controller.parameters)
+    links = []
+    for name, (law, states) in compensators(q.plant, q.controller, q.current_loops).items():
+        if name == SAMPLED:
+            position = own_position(q.plant, q.extent, at)
+            system, law = q.loop_at(position)
+            margin = q.margin_at(position) if q.proof else NOT_PROVEN
         else:
-            zero = np.zeros((len(w), P.shape[1], P.shape[1])), np.zeros((len(w), F.shape[1], F.shape[1]))
-            Q = np.block([[zero[0], P], [F, zero[1]]])
-        eye = np.eye(Q.shape[-1])
-        M = np.linalg.inv(eye - Q) - eye / 2
-        mu = _balanced(M) if only is None else np.abs(M[:, only, only])
-        return np.asarray(mu[:, None])
-
-    (mu,), (at,) = largest(sizes, w)
-    channels = kind if only is None else f"{kind[:-1]} {only + 1}"
-    return Disk(channels, float(1 / mu), float(at))
+            system = of_plant(q.plant, list(q.uncertainty), states=states, at=at, believed=believed)
+            margin = robust_margin(system, law, q.uncertainty, time=q.time) if q.proof else NOT_PROVEN
+        where: Literal["forces", "sensors"] = "forces" if states else "sensors"
+        links.append(Link(name, margin, peak_sensitivity(system, law, where), where))
+        q.report()
+    return tuple(links)
 
 
-def _balanced(M: ComplexArray) -> FloatArray:
-    """sigma_max of D M D^-1 with the diagonal D that equals rows and columns (Osborne): an upper bound of mu."""
-    size = np.abs(M)
-    d = np.ones(size.shape[:2])
-    off = size * (1 - np.eye(size.shape[-1]))
-    for _ in range(60):
-        scaled = off * d[:, :, None] / d[:, None, :]
-        rows, columns = np.sqrt((scaled**2).sum(2)), np.sqrt((scaled**2).sum(1))
-        both = (rows > 0) & (columns > 0)
-        d = d * np.where(both, columns / np.where(both, rows, 1), 1) ** 0.25
-    return np.asarray(np.linalg.svd(M * d[:, :, None] / d[:, None, :], compute_uv=False)[:, 0])
+def _tolerances(q: _Question) -> tuple[dict[str, tuple[Margin, Margin]], Margin | None]:
+    """How far each parameter alone may go, down and up; and the payload of a machine with a mass m."""
+    time = q.time if q.whole else min(q.time or EACH, EACH)
+    tolerance = {}
+    for name, share in q.uncertainty.items():
+        nominal = getattr(q.plant.parameters, name)
+        down = q.margin_over({name: (nominal * (1 - share), nominal)}, time)
+        tolerance[name] = down, q.margin_over({name: (nominal, nominal * (1 + share))}, time)
+    if "m" not in units_of(q.plant.parameters):
+        return tolerance, None
+    m: float = getattr(q.plant.parameters, "m")  # noqa: B009  a machine's own field
+    return tolerance, q.margin_over({"m": (m, m + 1.0)}, time)
 
 
-def delay_margins(L: ComplexArray, w: FloatArray) -> FloatArray:
-    """The delay that each channel stands alone, s: min of phi(w) / w over the gain crossovers, the others closed.
-
-    L : k x p x p, y = L y around the loop. Infinite where a channel has no crossover.
-    """
-    eye = np.eye(L.shape[-1])
-    S = np.einsum("kii->ki", np.linalg.inv(eye - L))
-    alone = 1 / S - 1  # the open loop of one channel, negative feedback
-    size = np.log(np.abs(alone))
-    phase = np.unwrap(np.angle(alone), axis=0)
-    found = np.full(L.shape[-1], np.inf)
-    for i in range(len(found)):
-        k = np.flatnonzero(np.sign(size[1:, i]) != np.sign(size[:-1, i]))
-        share = size[k, i] / (size[k, i] - size[k + 1, i])
-        at = w[k] * (w[k + 1] / w[k]) ** share
-        angle = phase[k, i] + share * (phase[k + 1, i] - phase[k, i])
-        if len(k):
-            found[i] = (np.mod(angle + np.pi, 2 * np.pi) / at).min()
-    return found
+def _places(q: _Question) -> tuple[tuple[Place, ...], Classical | None]:
+    """The places along the course, and the worst of their classical margins; None where one of them is unstable."""
+    sensors = [s.name for s in q.plant.outputs]
+    places: list[Place] = []
+    classical: list[Classical | None] = []
+    for positions in places_along(q.plant, q.controller, q.names, q.current_loops):
+        proven_at = positions if q.whole else positions[:1]  # else a place takes as long as the whole travel
+        margin = _smallest([q.margin_at(z) for z in proven_at]) if q.proof else NOT_PROVEN
+        loops = [q.loop_at(z) for z in positions]
+        peak = float(np.max([peak_sensitivity(*loop, "sensors") for loop in loops]))
+        sides = [classical_margins(*loop, sensors) if is_stable(*loop) else None for loop in loops]
+        classical += sides
+        worst = worst_of(sides)
+        disk, delay = (worst.disks[2].size, min(worst.delay.values())) if worst else (np.nan, np.nan)
+        places.append(Place(positions[0], margin, peak, disk, delay))
+        q.report()
+    return tuple(places), worst_of(classical)
 
 
-def _frequencies(law: Compensator) -> FloatArray:
-    top = 1e5 if law.sample_time is None else np.pi / law.sample_time
-    return np.geomspace(1e-2, top, 400)
-
-
-def _at_nominal(
-    system: UncertainSystem, law: Compensator, w: FloatArray
-) -> tuple[ComplexArray, ComplexArray]:
-    return responses(system, law, system.nominal, w)
-
-
-def _stable(system: UncertainSystem, law: Compensator) -> bool:
-    return bool(instability(system, law, system.nominal)[0] < 0)
-
-
-def _peak(system: UncertainSystem, law: Compensator, states: bool) -> float:
-    """Largest |S_ii|, at the forces of state feedback, else at the sensors."""
-    if not _stable(system, law):
-        return float("nan")
-
-    def sizes(w: FloatArray) -> FloatArray:
-        P, F = _at_nominal(system, law, w)
-        Q = F @ P if states else P @ F
-        S = np.linalg.inv(np.eye(Q.shape[-1]) - Q)
-        return np.asarray(np.abs(np.einsum("kii->ki", S)))
-
-    return float(largest(sizes, _frequencies(law))[0].max())
-
-
-def _gang(P: ComplexArray, F: ComplexArray) -> list[tuple[float, ...]]:
-    """For each sensor: |S_ii|, |T_ii|, the largest |(S P)_ij| (m/N) and |(F S)_ji| (N/m)."""
-    S = np.linalg.inv(np.eye(P.shape[1]) - P @ F)
-    T = np.eye(P.shape[1]) - S
-    compliance, noise = np.abs(S @ P), np.abs(F @ S)
-    return [
-        (
-            float(np.abs(S[:, i, i]).max()),
-            float(np.abs(T[:, i, i]).max()),
-            float(compliance[:, i].max()),
-            float(noise[:, :, i].max()),
-        )
-        for i in range(P.shape[1])
-    ]
+def _smallest(margins: Sequence[Margin]) -> Margin:
+    """One margin that holds at several places: the smallest lower and the smallest upper bound."""
+    lower = None if any(m.lower is None for m in margins) else min(m.lower or 0.0 for m in margins)
+    reason = "; ".join(dict.fromkeys(m.reason for m in margins if m.reason))
+    return replace(min(margins, key=lambda m: m.upper), lower=lower, reason=reason)

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from scipy import linalg
 
-from malta.margins.loop import groups
+from malta.margins.groups import groups
 from malta.margins.multipliers import Blocks, Multiplier, multiplier
 from malta.margins.pencil import Rows
 from malta.margins.problem import OfLoop, OfSeveral, Problem

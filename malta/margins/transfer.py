@@ -13,13 +13,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from malta.margins.blocks import Block
-from malta.margins.uncertain import Compensator, UncertainSystem, differences
-from malta.synthesis.riccati import sample
+from malta.margins.responses import Responses
 
 if TYPE_CHECKING:
     from malta.model.plant import ComplexArray, FloatArray
@@ -28,51 +27,6 @@ STEPS = 24  # of the power iteration
 STARTS = 3
 ROUNDS = 40
 ZOOMS = 7
-
-
-class Responses(NamedTuple):
-    """Frequency responses at rows of w."""
-
-    G_y: ComplexArray  # sensors x forces
-    G_d: ComplexArray
-    H: ComplexArray  # forces x forces
-    F: ComplexArray  # forces x sensors
-
-
-def responses(system: UncertainSystem, law: Compensator, p: FloatArray, w: FloatArray) -> Responses:
-    """What plant and compensator answer at parameters p and frequencies w, rad/s."""
-    A, B, C, *more = (np.array(M) for M in system.matrices(p))
-    n, m = B.shape
-    D = more[0] if more else np.zeros((len(C), m))
-    if len(more) > 1:
-        both = np.linalg.solve(more[1], np.hstack([A, B]))
-        A, B = both[:, :n], both[:, n:]
-    eye, none = np.eye(m), np.zeros((m, m))
-    if law.lag is not None:
-        A = np.block([[A, B], [np.zeros((m, n)), -law.lag * eye]])
-        B = np.block([[np.zeros((n, m)), B], [law.lag * eye, none]])
-        C = np.block([[C, D], [np.zeros((m, n)), eye]])
-        D = np.block([[np.zeros_like(D), D], [none, none]])
-    else:
-        B = np.hstack([B, B])
-        C = np.vstack([C, np.zeros((m, n))])
-        D = np.block([[D, D], [eye, none]])
-    T = law.sample_time
-    s: ComplexArray = 1j * np.asarray(w, dtype=float)
-    turned = np.ones_like(s)
-    if T is not None:
-        turned, s = np.exp(-s * T * law.delay), np.expm1(s * T) / T
-        if system.sample_time is None:
-            _, Phi = sample(A, np.eye(len(A)), T)  # (e^AT - 1) / T = A Phi / T
-            A, B = A @ Phi / T, Phi @ B / T
-        else:
-            A, B = (A - np.eye(len(A))) / T, B / T
-    F_A, F_B = differences(law)
-    at = s[:, None, None]
-    G = (C @ np.linalg.solve(at * np.eye(len(A)) - A, B) + D) * turned[:, None, None]
-    F = law.C @ np.linalg.solve(at * np.eye(len(F_A)) - F_A, F_B) + law.D
-    q = len(C) - m
-    return Responses(G[:, :q, :m], G[:, :q, m:], G[:, q:, :m], np.asarray(F, dtype=complex))
 
 
 def transfer(r: Responses, blocks: Sequence[Block]) -> ComplexArray:

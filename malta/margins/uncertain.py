@@ -29,7 +29,7 @@ from malta.synthesis.controller import (
 from malta.synthesis.riccati import add_lags, delay_inputs, sample
 
 if TYPE_CHECKING:
-    from malta.model.plant import ComplexArray, FloatArray
+    from malta.model.plant import FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -267,20 +267,6 @@ def closed_loop(system: UncertainSystem, c: Compensator, p: FloatArray) -> Float
         s = _sides(c, *plant)
         matrices.append(np.block([[s.A + s.B @ c.D @ s.C, s.B @ c.C], [s.F_B @ s.C, s.F_A]]))
     return np.array(matrices)
-
-
-def responses(
-    system: UncertainSystem, c: Compensator, p: FloatArray, w: FloatArray
-) -> tuple[ComplexArray, ComplexArray]:
-    """P H and F at one row of parameters and frequencies w (rad/s): k x outputs x inputs, k x inputs x outputs."""
-    s = _sides(c, *(M[0] for M in system.at(p)))
-    jw: ComplexArray = 1j * np.asarray(w, dtype=float)
-    if c.sample_time is not None:
-        jw = np.expm1(jw * c.sample_time) / c.sample_time
-    jw = jw[:, None, None]
-    P: ComplexArray = s.C @ np.linalg.solve(jw * np.eye(len(s.A)) - s.A, s.B)
-    F = c.C @ np.linalg.solve(jw * np.eye(len(s.F_A)) - s.F_A, s.F_B) + c.D
-    return P, np.asarray(F, dtype=complex)
 
 
 def instability(system: UncertainSystem, c: Compensator, p: FloatArray) -> FloatArray:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import casadi as ca
 import numpy as np
 
-from malta.margins.verify import machine_loop
+from malta.margins.loops import machine_loop
 from malta.model.linearize import linearize
 from malta.model.plant import Plant
 from malta.simulation.trajectory import Trajectory

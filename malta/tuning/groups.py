@@ -22,7 +22,7 @@ from scipy import sparse
 
 from malta.errors import CheckError, InputError
 from malta.margins.plants import of_plant
-from malta.margins.verify import crossing
+from malta.margins.responses import crossing
 from malta.model.linearize import linearize
 from malta.model.plant import trim
 from malta.synthesis.controller import linear_law_of

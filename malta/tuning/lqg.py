@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, get_args
 import numpy as np
 
 from malta.errors import InputError
-from malta.margins.verify import travel_margin
+from malta.margins.travel import travel_margin
 from malta.model.plant import Plant
 from malta.synthesis.requirements import Trade, ratio_of, requirements_for
 from malta.synthesis.spec import Spec, Weights

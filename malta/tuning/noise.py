@@ -9,7 +9,7 @@ import numpy as np
 from malta.synthesis.requirements import Noise
 
 if TYPE_CHECKING:
-    from malta.margins.verify import Loop
+    from malta.margins.loops import Loop
     from malta.model.plant import FloatArray, Plant
 
 

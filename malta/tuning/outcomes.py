@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from malta.errors import InputError
-from malta.margins.verify import BANDWIDTHS, machine_loop, verify
+from malta.margins.loops import machine_loop
+from malta.margins.verify import BANDWIDTHS, verify
 from malta.simulation import references
 from malta.simulation.catalogue import experiment
 from malta.simulation.experiments import scenario_of

@@ -25,7 +25,8 @@ import numpy as np
 from scipy import optimize, sparse
 
 from malta.errors import InputError
-from malta.margins.verify import Loop, crossing, machine_loop
+from malta.margins.loops import Loop, machine_loop
+from malta.margins.responses import crossing
 from malta.model.linearize import linearize
 from malta.model.plant import position_at, position_in, trim
 from malta.synthesis.controller import handed_on, linear_law_of

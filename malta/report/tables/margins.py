@@ -8,11 +8,9 @@ from typing import TYPE_CHECKING
 
 from rich.table import Table
 
-from malta.margins.verify import (
-    NOT_BETWEEN,
-    NOT_PROVEN,
-    zone,
-)
+from malta.margins.robust import NOT_PROVEN
+from malta.margins.travel import NOT_BETWEEN
+from malta.margins.verify import zone
 from malta.model.signals import (
     compliance_unit,
     stiffness_unit,

@@ -39,7 +39,7 @@ A, B, C, D, E = range(5)
 
 
 @dataclass(frozen=True, eq=False)
-class Loop:
+class UncertainLoop:
     """A system and a compensator, checked, with the system's program."""
 
     system: UncertainSystem
@@ -82,7 +82,7 @@ class Group:
     inputs: tuple[int, ...] | None
 
 
-def loop_of(system: UncertainSystem, law: Compensator) -> Loop:
+def loop_of(system: UncertainSystem, law: Compensator) -> UncertainLoop:
     """Check that system and compensator fit.
 
     Raises InputError for shapes that do not, entries that are not finite, sample times that differ, a loop without
@@ -121,7 +121,7 @@ def loop_of(system: UncertainSystem, law: Compensator) -> Loop:
     if system.sample_time is not None and law.sample_time != system.sample_time:
         found = "a continuous compensator" if law.sample_time is None else f"{law.sample_time:g} s"
         raise InputError("compensator", "sample_time", found, f"that of the system, {system.sample_time:g} s")
-    return Loop(system, law, _program(system))
+    return UncertainLoop(system, law, _program(system))
 
 
 @lru_cache(maxsize=32)  # laws change, the system stays; records compare by identity
@@ -137,7 +137,7 @@ def _symbolic(program: Program) -> Symbolic | None:
         return None
 
 
-def groups(loop: Loop) -> list[Group]:
+def groups(loop: UncertainLoop) -> list[Group]:
     """The strongly connected parts of the closed loop: its characteristic polynomial is the product of theirs."""
     law, n = loop.law, loop.states
     if loop.direct:
@@ -158,7 +158,7 @@ def groups(loop: Loop) -> list[Group]:
     return found
 
 
-def _touching(loop: Loop) -> Any:
+def _touching(loop: UncertainLoop) -> Any:
     """Couplings by patterns alone, where terms that cancel count."""
     law, (n, m), p = loop.law, loop.program.shapes[B], loop.program.shapes[C][0]
     a, b, c = np.zeros((n, n), dtype=bool), np.zeros((n, m), dtype=bool), np.zeros((p, n), dtype=bool)
@@ -169,7 +169,7 @@ def _touching(loop: Loop) -> Any:
     return np.block([[a | (b @ (law.D != 0) @ c), b @ (law.C != 0)], [(law.B != 0) @ c, own]])
 
 
-def _coupled(loop: Loop, s: Symbolic) -> Any:
+def _coupled(loop: UncertainLoop, s: Symbolic) -> Any:
     """Couplings that are not zero as exact expressions."""
     law, n, k = loop.law, loop.states, len(loop.law.A)
     touch = np.zeros((n + k, n + k), dtype=bool)
@@ -204,7 +204,7 @@ def _coupled(loop: Loop, s: Symbolic) -> Any:
     return touch
 
 
-def held(size: FloatArray, diagonal: FloatArray, T: float) -> tuple[FloatArray, FloatArray]:
+def hold_bounds(size: FloatArray, diagonal: FloatArray, T: float) -> tuple[FloatArray, FloatArray]:
     """Entrywise bounds of e^(A T) - I and of V, the integral of e^(A t) over a sample.
 
     |e^(A t)| <= e^(M t) with M the moduli of A beside the real parts of its diagonal, and e^(A T) - I = A V.
@@ -234,7 +234,7 @@ def upper(z: Any) -> float:
     return x + 1e-9 * abs(x)
 
 
-def divided(loop: Loop, s: Symbolic) -> tuple[dict[tuple[int, int], Ratio], ...]:
+def divided(loop: UncertainLoop, s: Symbolic) -> tuple[dict[tuple[int, int], Ratio], ...]:
     """Entries of A and B, over the diagonal of E; as they are where E is not diagonal."""
     if not loop.descriptor or any(i != j for i, j in s.entries[E]):
         return s.entries

@@ -1,0 +1,168 @@
+"""The loop of a machine and a controller, sampled; and the machine's loop with uncertain parameters.
+
+P is the machine from forces to measurements under a zero-order hold, exactly; F is the control law from measurements
+to forces (v = F y), as in the block diagram of synthesis/controller.py. At the sensors
+
+    S = (I - P F)^-1,   T = I - S,   L = -P F.
+
+Coil currents are commutated for the last reading and held for a sample. Where the machine moves on meanwhile, the
+reading is a further input of P, and F passes it on.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING, Literal, get_args
+
+import numpy as np
+
+from malta.errors import InputError
+from malta.margins.plants import of_plant
+from malta.margins.uncertain import Compensator, UncertainSystem, held_at, holds, sampled_law
+from malta.model.data import plant_of
+from malta.model.linearize import LinearModel, linearize
+from malta.model.plant import position_at, position_in, trim
+from malta.synthesis.controller import Controller, LinearLaw, handed_on, linear_law
+from malta.synthesis.riccati import add_lags, delay_inputs, sample
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from malta.model.plant import ComplexArray, FloatArray, Plant
+
+CurrentLoops = Literal["lag", "pi"]
+
+
+@dataclass(frozen=True, eq=False)
+class Loop:
+    """Sampled machine x+ = Ad x + Bd v, y = Cd x, closed by the linear control law v = F y."""
+
+    Ad: FloatArray
+    Bd: FloatArray
+    Cd: FloatArray
+    control: LinearLaw
+    sample_time: float  # s
+
+    @property
+    def closed(self) -> FloatArray:
+        """State matrix of the closed loop, states of the machine first."""
+        c = self.control
+        return np.block(
+            [
+                [self.Ad + self.Bd @ c.D_y @ self.Cd, self.Bd @ c.C],
+                [c.B_y @ self.Cd, c.A],
+            ]
+        )
+
+    def loop_gain(self, w: FloatArray) -> ComplexArray:
+        """L = -P F at the frequencies w (rad/s): k x p x p."""
+        z = np.exp(1j * np.asarray(w) * self.sample_time)[:, None, None]
+        P = self.Cd @ np.linalg.solve(z * np.eye(len(self.Ad)) - self.Ad, self.Bd)
+        c = self.control
+        F = c.C @ np.linalg.solve(z * np.eye(len(c.A)) - c.A, c.B_y) + c.D_y
+        return np.asarray(-P @ F)
+
+    def sensitivity(self, w: FloatArray) -> ComplexArray:
+        """S = (I + L)^-1 at the sensors, k x p x p: also what noise becomes of in y."""
+        return np.asarray(np.linalg.inv(np.eye(len(self.Cd)) + self.loop_gain(w)))
+
+
+def loop(
+    model: LinearModel,
+    controller: Controller,
+    *,
+    delay: int = 0,
+    current_loops: bool = False,
+    feedforward: bool = False,
+) -> Loop:
+    """The sampled loop of a machine and a controller.
+
+    delay : samples between measurement and force
+    current_loops : forces follow their commands as a first-order lag at the loops' crossover
+    feedforward : v0(z) acts by its slope; for models at their trim, where the loads act by theirs
+
+    The controller commutates as the machine that it believes in, the machine's currents make their own forces.
+    """
+    model, law = commanded_model(model, controller), linear_law(controller)
+    A, B, C = model.A, model.B, model.C
+    if model.E.any():
+        A, B = A - model.E @ C, np.hstack([B, model.E])
+    lag = model.plant.actuator.crossover
+    if current_loops and math.isfinite(lag):
+        A, B = add_lags(A, B, lag)
+    Ad, Bd = delay_inputs(*sample(A, B, controller.sample_time), delay)
+    Cd = np.hstack([C, np.zeros((len(C), len(Ad) - C.shape[1]))])
+    if feedforward:
+        m, plant = len(controller.forces), model.plant
+        slope = np.zeros((m, len(C)))
+        if plant.has_stroke:
+            position = float(model.operating_point.x[plant.stroke_state])
+            slope[:, plant.stroke_output] = controller.feedforward.slope(position)
+        law = law._replace(B_y=law.B_y + law.B_r[:, -m:] @ slope, D_y=law.D_y + law.D_r[:, -m:] @ slope)
+    if model.E.any():
+        law = handed_on(law)
+    return Loop(Ad, Bd, Cd, law, controller.sample_time)
+
+
+def machine_loop(model: LinearModel, controller: Controller) -> Loop:
+    """The loop as the machine runs it: hold, its own delay, current loops, loads against v0(z) at the trim.
+
+    Raises CheckError when no input holds the machine at the model's operating point.
+    """
+    plant = model.plant
+    loaded = linearize(plant, trim(plant, **position_at(plant, model.operating_point.x)))
+    delay = plant.actuator.delay(controller.sample_time)
+    return loop(loaded, controller, delay=delay, current_loops=True, feedforward=True)
+
+
+@lru_cache(maxsize=8)  # every stage asks for it; records compare by identity, so no hit is stale
+def commanded_model(model: LinearModel, controller: Controller) -> LinearModel:
+    """The model whose inputs are the forces that the controller wants of the machine it believes in."""
+    believed = plant_of(controller.parameters)
+    if believed is model.plant:
+        return model
+    return linearize(model.plant, model.operating_point, believed)
+
+
+def machine_law(
+    plant: Plant,
+    controller: Controller,
+    current_loops: CurrentLoops = "lag",
+    *,
+    held: FloatArray | None = None,
+    handed: bool = False,
+) -> Compensator:
+    """The control law with the machine's hold, delay and current loops: lags at their crossover, or the PI loops.
+
+    held, handed : as sampled_law takes them
+
+    Raises InputError for other current loops, or PI loops that do not run with the control law.
+    """
+    if current_loops not in get_args(CurrentLoops):
+        raise InputError("verify", "current_loops", repr(current_loops), "lag or pi")
+    a = plant.actuator
+    delay = a.delay(controller.sample_time)
+    if current_loops == "lag" or controller.current_loop is None:
+        return sampled_law(controller, delay, a.crossover, held=held, handed=handed)
+    if plant.windings is None:
+        raise InputError("verify", "current_loops", "pi", f"lag: those of a {plant.name} run much faster")
+    return sampled_law(controller, delay, a.R / a.L, controller.current_loop, a.R)
+
+
+def machine_system(
+    plant: Plant,
+    controller: Controller,
+    names: Sequence[str],
+    at: Mapping[str, float],
+    current_loops: CurrentLoops = "lag",
+) -> tuple[UncertainSystem, Compensator]:
+    """The machine at a position in parameters by name, and its law: what its margin is asked of. See `machine_law`."""
+    believed = plant_of(controller.parameters)
+    if not holds(believed):
+        return of_plant(plant, names, at=at, believed=believed), machine_law(plant, controller, current_loops)
+    H = held_at(believed, position_in(believed, believed.at(**at).x))
+    system = of_plant(plant, names, at=at, believed=believed, held=H)
+    handed = system.matrices.size2_out(1) > len(H)
+    return system, machine_law(plant, controller, current_loops, held=H, handed=handed)

@@ -1,0 +1,93 @@
+"""Frequency responses of a loop's parts, and the peaks and crossings of what is computed from them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from malta.margins.uncertain import Compensator, UncertainSystem, differences
+from malta.synthesis.riccati import sample
+
+if TYPE_CHECKING:
+    from malta.model.plant import ComplexArray, FloatArray
+
+
+class Responses(NamedTuple):
+    """Frequency responses, one matrix for each frequency."""
+
+    G_y: ComplexArray  # k x p x m: commands -> sensors, with lag, hold and delay
+    G_d: ComplexArray  # k x p x m: forces on the plant -> sensors
+    H: ComplexArray  # k x m x m: commands -> forces
+    F: ComplexArray  # k x m x p: sensors -> commands
+
+
+def responses(system: UncertainSystem, law: Compensator, p: FloatArray, w: FloatArray) -> Responses:
+    """The responses of system and compensator at one row of parameters p and at frequencies w, rad/s.
+
+    G(s) = C (s E - A)^-1 B + D behind a lag w_c / (s + w_c); of a sampled loop the exact discrete system under a
+    zero-order hold at z = e^(j w T), times z^-delay. Differences (z - 1) / T keep the digits of slow modes.
+    """
+    A, B, C, *more = (np.array(M) for M in system.matrices(p))
+    n, m = B.shape
+    D = more[0] if more else np.zeros((len(C), m))
+    if len(more) > 1:
+        both = np.linalg.solve(more[1], np.hstack([A, B]))
+        A, B = both[:, :n], both[:, n:]
+    eye, none = np.eye(m), np.zeros((m, m))
+    if law.lag is not None:
+        A = np.block([[A, B], [np.zeros((m, n)), -law.lag * eye]])
+        B = np.block([[np.zeros((n, m)), B], [law.lag * eye, none]])
+        C = np.block([[C, D], [np.zeros((m, n)), eye]])
+        D = np.block([[np.zeros_like(D), D], [none, none]])
+    else:
+        B = np.hstack([B, B])
+        C = np.vstack([C, np.zeros((m, n))])
+        D = np.block([[D, D], [eye, none]])
+    T = law.sample_time
+    s: ComplexArray = 1j * np.asarray(w, dtype=float)
+    turned = np.ones_like(s)
+    if T is not None:
+        turned, s = np.exp(-s * T * law.delay), np.expm1(s * T) / T
+        if system.sample_time is None:
+            _, Phi = sample(A, np.eye(len(A)), T)  # (e^AT - 1) / T = A Phi / T
+            A, B = A @ Phi / T, Phi @ B / T
+        else:
+            A, B = (A - np.eye(len(A))) / T, B / T
+    F_A, F_B = differences(law)
+    at = s[:, None, None]
+    G = (C @ np.linalg.solve(at * np.eye(len(A)) - A, B) + D) * turned[:, None, None]
+    F = law.C @ np.linalg.solve(at * np.eye(len(F_A)) - F_A, F_B) + law.D
+    q = len(C) - m
+    return Responses(G[:, :q, :m], G[:, :q, m:], G[:, q:, :m], np.asarray(F, dtype=complex))
+
+
+def largest(sizes: Callable[[FloatArray], FloatArray], w: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The largest value of each column of sizes(w) (k x n) over the frequencies w, and where it lies (rad/s).
+
+    The grid is refined three times around each peak.
+    """
+    around, values = np.tile(w, (sizes(w[:1]).shape[1], 1)), sizes(w).T
+    for _ in range(3):
+        k = values.argmax(axis=1)
+        rows = np.arange(len(k))
+        low, high = around[rows, np.maximum(k - 1, 0)], around[rows, np.minimum(k + 1, around.shape[1] - 1)]
+        around = np.geomspace(low, high, 17, axis=1)
+        found = sizes(around.ravel()).reshape(*around.shape, -1)
+        values = found[rows, :, rows]
+    return values.max(axis=1), around[rows, values.argmax(axis=1)]
+
+
+def crossing(w: FloatArray, size: FloatArray, level: float, *, last: bool = False) -> float:
+    """The frequency at which `size` falls below `level` for the first or the last time, rad/s.
+
+    It is interpolated on a log-log line between grid points: 0 when `size` never reaches the level, the last entry of
+    w when it never falls below.
+    """
+    falls = np.flatnonzero((size[:-1] >= level) & (size[1:] < level))
+    if not len(falls):
+        return float(w[-1] if size[-1] >= level else 0.0)
+    k = falls[-1 if last else 0]
+    (a, b), (wa, wb) = np.log(size[k : k + 2] / level), np.log(w[k : k + 2])
+    return float(np.exp(wa + (wb - wa) * a / (a - b)))

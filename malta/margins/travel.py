@@ -1,0 +1,241 @@
+"""Margins of the machine's loop over its travel, and at places along it.
+
+The course of a machine is its stroke, or the first parameter of `plant.over`, as the speed of a rotor. Where the
+matrices have a short form along the course, the position is one more interval of the proof. Where they have not, the
+axes of the machine are proven by themselves and their coupling is bounded (weak.py), or places stand for the travel.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache
+from typing import TYPE_CHECKING
+
+from malta.margins.box import Box, box_of
+from malta.margins.expressions import NotAnalytic
+from malta.margins.extent import extent_of, machine_at, positions_of
+from malta.margins.gain import Gain, worst_case_gain
+from malta.margins.held import held_machine
+from malta.margins.loops import CurrentLoops, machine_law, machine_system
+from malta.margins.plants import LONGEST
+from malta.margins.problem import OfSeveral
+from malta.margins.robust import (
+    TOLERANCE,
+    Effort,
+    Margin,
+    Progress,
+    Ranges,
+    common_margin,
+    margin_at,
+    margin_of,
+    problem_of,
+    robust_margin,
+)
+from malta.margins.uncertain import Compensator, UncertainSystem, holds, model_of
+from malta.margins.weak import AnywhereHeld
+from malta.model.data import plant_of
+from malta.threads import on_one_thread
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from malta.model.plant import Plant
+    from malta.synthesis.controller import Controller
+
+NOT_BETWEEN = "not between them"  # what a margin of several places says
+LONG = 5000  # operations of matrices that are not enclosed over an interval of positions
+PLACES = (0.0, 1 / 3, 2 / 3, 1.0)  # shares of the travel, either way
+EACH = 6.0  # s, of the margin at a position for itself
+ENDS = (0.0, 1.0)  # of those, where no interval is enclosed
+
+
+@on_one_thread
+def travel_margin(
+    plant: Plant,
+    controller: Controller,
+    ranges: Ranges,
+    current_loops: CurrentLoops = "lag",
+    names: Sequence[str] = (),
+    *,
+    time: float | None = None,
+    progress: Progress | None = None,
+) -> Margin:
+    """The margin of the machine's loop anywhere in its travel: the position is one more interval of the proof.
+
+    So are the parameters of `plant.over` that are not uncertain: a rotor is proven for every speed at once.
+    Where the matrices have no short form along the travel, as those of the planar motor's held currents, its axes are
+    proven by themselves, with a bound of what couples them anywhere in the travel (`weak`). Where that fails too, the
+    margin is that in the middle and at the end, and says so.
+
+    ranges : of the parameters, as robust_margin takes them
+    names : parameters of the model, where others stand still beside those of `ranges`: one model for several questions
+    time : s, of the whole search; None: 120
+    """
+    names = tuple(names or ranges)
+    along, over = travel_loops(plant, controller, names, current_loops)
+    alone = plant.has_stroke and not over  # places of the travel, and no other interval
+    if alone and (problem := _anywhere(plant, controller, names, current_loops)) is not None:
+        found = margin_of(problem, _box(along[0][0], ranges), Effort(time=time, progress=progress))
+        if found.lower is not None:
+            return found
+    found = common_margin(along, ranges, over, time=time, progress=progress)
+    if len(along) == 1:
+        return found
+    here = f"at {len(along)} places of the travel, {NOT_BETWEEN}"
+    return replace(found, reason=f"{here}; {found.reason}" if found.reason else here)
+
+
+def travel_loops(
+    plant: Plant, controller: Controller, names: tuple[str, ...], current_loops: CurrentLoops = "lag"
+) -> tuple[list[tuple[UncertainSystem, Compensator]], dict[str, tuple[float, float]]]:
+    """The loops of which travel_margin proves a margin, and the intervals that do not grow."""
+    along, extent = _along(plant, controller, names, current_loops), extent_of(plant, names)
+    return along, extent.intervals if len(along) == 1 else dict(extent.over)
+
+
+@lru_cache(maxsize=8)  # several questions are asked of the same loops; records compare by identity
+def _along(
+    plant: Plant, controller: Controller, names: tuple[str, ...], current_loops: CurrentLoops
+) -> list[tuple[UncertainSystem, Compensator]]:
+    """The machine's loop with its position as a parameter; its loops in the middle and at the end where not."""
+    extent = extent_of(plant, names)
+    if not (plant.has_stroke and _is_long(plant, controller, names)):
+        at = {plant.stroke: 0.0} if plant.has_stroke else {}
+        whole = machine_system(plant, controller, [*names, *extent.intervals], at, current_loops)
+        if not plant.has_stroke or whole[0].matrices.n_instructions() < LONG:
+            return [whole]
+    every = (*names, *extent.over)
+    return [loop_at(plant, controller, every, share * plant.travel, current_loops) for share in ENDS]
+
+
+def _is_long(plant: Plant, controller: Controller, names: tuple[str, ...]) -> bool:
+    """Whether the model along the travel is too long to be written out."""
+    believed = plant_of(controller.parameters)
+    held = holds(believed) and not believed.tabulated
+    return held and model_of(plant, believed, names).n_instructions() > LONGEST
+
+
+@lru_cache(maxsize=8)
+def _anywhere(
+    plant: Plant,
+    controller: Controller,
+    names: tuple[str, ...],
+    current_loops: CurrentLoops,
+    position: float | None = None,
+) -> AnywhereHeld | None:
+    """The loop anywhere in the travel, or at a position, as `weak` takes it; None where it has not that form."""
+    law = machine_law(plant, controller, current_loops)
+    if not _is_long(plant, controller, names) or law.delay != 1 or law.lag is not None:
+        return None
+    along = _along(plant, controller, names, current_loops)
+    try:
+        if position is None:
+            travel = (-plant.travel, plant.travel)
+            machine = held_machine(plant, plant_of(controller.parameters), names, travel)
+        else:
+            whole = _anywhere(plant, controller, names, current_loops)
+            if whole is None:
+                return None
+            machine = whole.machine.at(position)
+            along = [loop_at(plant, controller, names, position, current_loops)]
+    except NotAnalytic:
+        return None
+    places = OfSeveral(tuple(problem_of(*loop) for loop in along))
+    return AnywhereHeld(machine, replace(law, delay=0), places)
+
+
+def _box(system: UncertainSystem, ranges: Ranges) -> Box:
+    return box_of(system.names, system.nominal, system.limits, ranges, {}, caller="travel_margin")
+
+
+@on_one_thread
+def place_margin(
+    plant: Plant,
+    controller: Controller,
+    ranges: Ranges,
+    position: float,
+    current_loops: CurrentLoops = "lag",
+    names: Sequence[str] = (),
+) -> Margin:
+    """The margin of the machine's loop at a position along its course; arguments as travel_margin takes them.
+
+    The course is the stroke, or the first parameter of `plant.over`, as the speed of a rotor (`Extent.course`). Where
+    there is no proof along the travel the search takes EACH at most.
+    """
+    names = tuple(names or ranges)
+    if not plant.has_stroke:
+        return robust_margin(*loop_at(plant, controller, names, position, current_loops), ranges)
+    along, over = travel_loops(plant, controller, names, current_loops)
+    if plant.stroke in over:
+        return margin_at(*along[0], ranges, {plant.stroke: position}, over, tolerance=TOLERANCE)
+    loop = loop_at(plant, controller, names, position, current_loops)
+    if (problem := _anywhere(plant, controller, names, current_loops, position)) is not None:
+        found = margin_of(problem, _box(loop[0], ranges), Effort(time=EACH))
+        if found.lower is not None:
+            return found
+    return robust_margin(*loop, ranges, time=EACH)
+
+
+@on_one_thread
+def worst_sensitivities(
+    plant: Plant,
+    controller: Controller,
+    ranges: Ranges,
+    current_loops: CurrentLoops = "lag",
+    *,
+    time: float | None = None,
+) -> dict[str, Gain]:
+    """The largest |S| of each sensor, the other loops closed, over the modelled box, the travel and `plant.over`.
+
+    Arguments as travel_margin takes them; where there is no proof along the travel, in its middle and at its end.
+    """
+    along, over = travel_loops(plant, controller, tuple(ranges), current_loops)
+    found = {}
+    for k, sensor in enumerate(plant.outputs):
+        each = [worst_case_gain(*loop, ranges, over, channel=k, time=time) for loop in along]
+        worst = max(each, key=lambda gain: gain.lower)
+        proven = [gain.upper for gain in each if gain.upper is not None]
+        found[sensor.name] = replace(worst, upper=max(proven) if len(proven) == len(each) else None)
+    return found
+
+
+def places_along(
+    plant: Plant, controller: Controller, names: tuple[str, ...], current_loops: CurrentLoops = "lag"
+) -> tuple[tuple[float, ...], ...]:
+    """Positions along the course at which a margin of its own is worth its time; each place has one, or both signs."""
+    shares = PLACES if covers_travel(plant, controller, names, current_loops) else ENDS
+    return positions_of(plant, extent_of(plant, names), shares)
+
+
+def covers_travel(
+    plant: Plant, controller: Controller, names: tuple[str, ...], current_loops: CurrentLoops = "lag"
+) -> bool:
+    """Whether one proof covers the travel, and not places of it."""
+    return len(_along(plant, controller, names, current_loops)) == 1
+
+
+def depends_on_course(
+    plant: Plant, controller: Controller, names: tuple[str, ...], current_loops: CurrentLoops = "lag"
+) -> bool:
+    """Whether the machine's loop depends on the position along its course; names as places_along takes them."""
+    along, course = _along(plant, controller, names, current_loops), extent_of(plant, names).course
+    if len(along) > 1:
+        return True
+    if not course:
+        return False
+    system, law = along[0]
+    index = system.names.index(course)
+    return any(index in on for on in problem_of(system, law).loop.program.depends)
+
+
+@lru_cache(maxsize=32)
+def loop_at(
+    plant: Plant,
+    controller: Controller,
+    names: tuple[str, ...],
+    position: float,
+    current_loops: CurrentLoops = "lag",
+) -> tuple[UncertainSystem, Compensator]:
+    """The machine's loop at a position along its course; the same records for the same question."""
+    there, at = machine_at(plant, extent_of(plant, names).course, position)
+    return machine_system(there, controller, names, at, current_loops)
