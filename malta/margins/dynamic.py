@@ -26,6 +26,7 @@ from malta.margins.blocks import (
 )
 from malta.margins.box import Box, box_of
 from malta.margins.enclosure import Unproven
+from malta.margins.families import is_nominal_stable
 from malta.margins.given import positive
 from malta.margins.groups import loop_of
 from malta.margins.loss import first_loss
@@ -44,7 +45,6 @@ from malta.margins.robust import (
     law_of,
     problem_of,
 )
-from malta.margins.search import Job
 from malta.margins.transfer import mu_bound, transfer
 from malta.margins.uncertain import Compensator, UncertainSystem
 from malta.margins.weight import Expanded, Weight
@@ -147,9 +147,9 @@ class Blocks:
         scale = np.array([b.weight.at(w) for b in self.blocks for _ in b.columns])
         return np.asarray(M * scale.T[:, :, None])
 
-    def stable(self, until: float) -> bool:
-        """Whether the nominal loops are proven stable."""
-        return Job(self.problem, self.box, 1e-3, True, until, 60_000, None).stable()
+    def stable(self) -> bool:
+        """Whether the nominal loop is proven stable."""
+        return is_nominal_stable(self.problem, self.box)
 
     def sizes(self, share: float) -> list[Size]:
         """share W_k on cells, of each block."""
@@ -291,5 +291,5 @@ def _proven(asked: Blocks, upper: float, tolerance: float, until: float) -> tupl
             reason = str(error)
             continue
         if is_zero_free(parts, t, asked.sizes(t), until)[0]:
-            return (t, "") if asked.stable(until) else (None, "the nominal loop is not proven stable")
+            return (t, "") if asked.stable() else (None, "the nominal loop is not proven stable")
     return None, reason or "not settled"

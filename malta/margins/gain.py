@@ -172,7 +172,7 @@ def _proven(asked: Blocks, lower: float, tolerance: float, until: float) -> tupl
         if found:
             return (
                 (bound, count, "")
-                if asked.stable(until)
+                if asked.stable()
                 else (None, count, "the nominal loop is not proven stable")
             )
         if clock.monotonic() > until:

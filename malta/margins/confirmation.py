@@ -1,0 +1,70 @@
+"""Witnesses confirmed by the poles of the loop, and the share of each parameter in them."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from malta.errors import CheckError
+from malta.margins.loss import corner_of
+from malta.margins.weak import AnywhereHeld
+from malta.margins.witness import Zero, gradients
+
+if TYPE_CHECKING:
+    from malta.margins.box import Box
+    from malta.margins.loss import Loss
+    from malta.margins.parts import Part
+    from malta.margins.problem import Problem
+    from malta.model.plant import FloatArray
+
+BISECTIONS = 16  # of the way to a witness
+
+
+def confirm(problem: Problem, box: Box, zero: Zero, part: Part) -> Loss | None:
+    """The t, frequency and p just beyond a zero at which the poles are unstable; None where they stay stable."""
+    p = part.growth.parameters(zero.u)
+    w = problem.physical(zero.frequency(part.family))
+    for share in 1 + 10.0 ** np.arange(-9, -1.5, 0.5):
+        there = box.stretched(p, share)
+        if _is_unstable(problem, there):
+            if isinstance(problem, AnywhereHeld):  # the zero is that of uncoupled axes
+                p = corner_of(problem, box, there)
+                there = box.stretched(p, _first_unstable(problem, box, p))
+                return float(box.margin(there)), w, there
+            return float(zero.t * share), w, there
+    return None
+
+
+def _first_unstable(problem: Problem, box: Box, p: FloatArray) -> float:
+    """The share of the way to p, which is unstable, from which on the loop is unstable: bisected from 0.95."""
+    low, high = 0.95, 1.0
+    for _ in range(BISECTIONS):
+        middle = (low + high) / 2
+        low, high = (low, middle) if _is_unstable(problem, box.stretched(p, middle)) else (middle, high)
+    return high
+
+
+def _is_unstable(problem: Problem, p: FloatArray) -> bool:
+    """Whether the poles at p are unstable; False where the loop has no poles there."""
+    try:
+        return bool(problem.instability(p[None])[0] > 0)
+    except (CheckError, np.linalg.LinAlgError):
+        return False
+
+
+def contributions(zero: Zero, part: Part, names: tuple[str, ...]) -> dict[str, float]:
+    """The share of each parameter in reaching the boundary: d ln(margin) = -sum of share x d ln(range).
+
+    Along f(jw, p) = 0 the margin moves by Im(conj(f_w) f_p dp); at the witness all parameters pull the same way.
+    """
+    g = part.growth
+    p = g.parameters(zero.u)
+    moved = np.where(g.grows, p - g.nominal, 0)
+    by_u, by_x = gradients(part.family, zero)
+    slope = g.slopes(zero.u)
+    pulls = by_u / np.where(slope == 0, 1, slope) * moved
+    size = pulls.real if zero.x == 0 else (np.conj(by_x) * pulls).imag
+    total = size.sum()
+    used = [i for i in range(len(p)) if abs(moved[i]) > 1e-9 * abs(p[i]) and size[i] != 0]
+    return {names[i]: float(size[i] / total) for i in used} if total else {}

@@ -1,0 +1,92 @@
+"""The families of a problem over a box, one for each group of states and part of the box; and the nominal loop."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+from weakref import WeakKeyDictionary
+
+import numpy as np
+from flint import arb
+
+from malta.margins.characteristic import pair
+from malta.margins.enclosure import Unproven, over_box, precision
+from malta.margins.exclusion import growth_over
+from malta.margins.expressions import NotAnalytic, exact
+from malta.margins.family import Family, narrowed
+from malta.margins.parts import Part, cut, without_twins
+from malta.margins.problem import Polynomial, Problem, hurwitz
+from malta.margins.weak import AnywhereHeld
+
+if TYPE_CHECKING:
+    from malta.margins.box import Box
+    from malta.model.plant import FloatArray
+
+REMEMBERED = 4_000_000  # numbers in the families of a polynomial, beyond which the oldest are forgotten
+MOST_BITS = 5120  # of the ball arithmetic in which Routh's scheme is tried
+
+FAMILIES: WeakKeyDictionary[Polynomial, dict[Any, Family]] = WeakKeyDictionary()
+
+
+def parts_over(problem: Problem, box: Box, reach: float, last: float) -> list[Part]:
+    """The families of all groups over box(reach), cut into parts where one expansion does not do.
+
+    last : time.monotonic() at which the search gives up
+
+    Raises Unproven when a matrix has no value on the box, or when time is up.
+    """
+    sides = box.framed(reach)
+    if isinstance(problem, AnywhereHeld):
+        return problem.enclosed(box, reach)
+    parts: list[Part] = []
+    try:
+        for polynomial, moves in problem.parts([arb(a).union(arb(b)) for a, b in sides.tolist()]):
+            parts += _parts_of(polynomial, box, sides, moves, last)
+    except NotAnalytic as error:
+        raise Unproven(f"the matrices have no value on the box: {error}") from error
+    return without_twins(parts)
+
+
+def _parts_of(f: Polynomial, box: Box, sides: FloatArray, moves: tuple[Any, ...], last: float) -> list[Part]:
+    """The parts of one polynomial."""
+    return cut(sides, box.nominal, last, lambda own: _part(f, box, own, moves, last))
+
+
+def _part(f: Polynomial, box: Box, sides: FloatArray, moves: tuple[Any, ...], last: float) -> list[Part]:
+    """The part of the box that lies in the frame's part `sides`, if any."""
+    family = _family(f, sides, moves, last)
+    whole = growth_over(sides, f.inverted, box)
+    own = sides.copy()
+    for i in box.frame:
+        own[i] = box.nominal[i] + box.over[i]
+        if not sides[i, 0] <= own[i, 0] <= own[i, 1] <= sides[i, 1]:
+            return []
+        ends = [float(whole.shares(np.where(np.arange(len(own)) == i, p, box.nominal))[i]) for p in own[i]]
+        family = narrowed(family, i, min(ends), max(ends))
+    return [Part(f, own, family, growth_over(own, f.inverted, box))]
+
+
+def _family(f: Polynomial, sides: FloatArray, moves: tuple[Any, ...], last: float) -> Family:
+    """The family of a polynomial over `sides`, remembered: several margins need it over the same box."""
+    known = FAMILIES.setdefault(f, {})
+    key = (sides.tobytes(), tuple(pair(m) for m in moves))
+    if key not in known:
+        family = over_box(f, sides, moves, last)
+        while sum(other.values.size for other in known.values()) > REMEMBERED:
+            known.pop(next(iter(known)))
+        known[key] = family
+    return known[key]
+
+
+def is_nominal_stable(problem: Problem, box: Box) -> bool:
+    """Whether the nominal loop is proven stable, by Routh's scheme in exact numbers or balls."""
+    for f, _ in problem.parts([arb(x) for x in box.nominal.tolist()]):
+        bits, stable = 160, None
+        while stable is None and bits <= MOST_BITS:
+            with precision(bits):
+                v = [exact(x) for x in box.nominal.tolist()]
+                v = [1 / x if inverted else x for x, inverted in zip(v, f.inverted, strict=True)]
+                stable = hurwitz(f.at(v))
+            bits *= 2
+        if not stable:
+            return False
+    return True
