@@ -325,7 +325,7 @@ def turned(content: dict[str, Any]) -> None:
         cell[4], cell[5] = -cell[5], cell[4]
 
 
-def narrowed(content: dict[str, Any]) -> None:
+def narrow(content: dict[str, Any]) -> None:
     side = first(content)["box"][0]
     side[0] = (float.fromhex(side[0]) * 1.001).hex()
 
@@ -358,7 +358,7 @@ def stripped(content: dict[str, Any]) -> None:
         (raised, "parts of the box leave a gap"),
         (raised_with_its_box, "zero is not excluded"),
         (turned, "zero is not excluded"),
-        (narrowed, "parts of the box leave a gap"),
+        (narrow, "parts of the box leave a gap"),
         (kept_less, "zero is not excluded"),
         (interpolated_less, "zero is not excluded"),
         (gain_changed, "not shown to be stable|zero is not excluded"),

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 import malta
 from malta import gains
 from malta.errors import InputError
-from malta.margins.family import aligned, combined, family
+from malta.margins.family import align, combine, family
 from malta.margins.responses import responses
 from malta.margins.travel import travel_loops
 from malta.model.data import plant_of
@@ -111,9 +111,9 @@ def test_families_add_up() -> None:
 
     f = family([2, 1], [False, False], [[fmpq(1), fmpq(2)], [fmpq(3), fmpq(5)]])
     g = family([3, 1], [False, False], [[fmpq(x * x), fmpq(1000 * x)] for x in (1, 2, 4)])
-    f, g = aligned(f, g)
+    f, g = align(f, g)
     assert f.shape == g.shape == (3, 1)
-    N = combined(f, g, 2.0, -1.0)
+    N = combine(f, g, 2.0, -1.0)
     middle = np.array([0.25, 0.5, 0.25])  # Bernstein's basis of degree 2 at 1/2
     for k, value in enumerate((2 * 2 - 4, 2 * 3.5 - 2000)):
         unit = 2.0 ** (N.exponents[k] - N.scale * k)

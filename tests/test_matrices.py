@@ -148,10 +148,10 @@ def test_simulation_is_the_step_response_of_the_loop(motor: Plant, driven: Contr
 def test_the_reference_is_the_rest_with_these_outputs(motor: Plant, driven: Controller) -> None:
     """phi = 0.2 rad wants neither speed nor current: the machine that starts there stays."""
 
-    def aside(plant: Plant) -> Any:
+    def lateral_outputs(plant: Plant) -> Any:
         return jump(plant, output=0, size=0.2, at=0)
 
-    run = malta.simulate(motor, driven, malta.Scenario("aside", 0.05, aside, fidelity="force"))
+    run = malta.simulate(motor, driven, malta.Scenario("aside", 0.05, lateral_outputs, fidelity="force"))
     assert np.abs(run.x - [0.2, 0, 0]).max() < 1e-15
     stable = malta.linear_machine([[-2.0, 1], [0, -3]], [[0], [3]], [[1, 0]])  # x2 = 2 y at rest
     assert np.array(ca.DM(stable.position_of(ca.DM([0.5])))).ravel() == pytest.approx([0.5, 1.0], rel=1e-14)

@@ -20,8 +20,8 @@ from malta.model import machines
 from malta.model.machines import part_of, require_part
 from malta.model.plant import Signal
 from malta.model.signals import (
-    aside,
     inputs_of,
+    lateral_outputs,
     outputs_of,
     stroke_unit,
 )
@@ -190,7 +190,7 @@ def test_the_words_of_a_machine(plant: Plant, toy: Plant) -> None:
     assert [group.name for group in inputs_of(plant)] == ["thrust", "bearing force"]
     assert (stroke_unit(plant), stroke_unit(toy)) == ("mm", "um")
     one = replace(toy, outputs=(toy.outputs[0],), stroke="x1")
-    assert [group.name for group in aside(one)] == ["x1"]
+    assert [group.name for group in lateral_outputs(one)] == ["x1"]
 
 
 def test_only_what_the_paper_shows_has_its_bounds(toy: Plant, plant: Plant) -> None:

@@ -19,7 +19,7 @@ from malta.model.rigidbody import (
     Trig,
     acceleration,
     cardan_rates,
-    principal,
+    principal_angles,
     rate_map,
     rotation,
 )
@@ -46,7 +46,7 @@ def _skew(a: FloatArray) -> FloatArray:
 def _angular(inertia: tuple[float, float, float]) -> Callable[..., FloatArray]:
     """(q_r, q_r', T in frame R) -> q_r''."""
     q, dq, T_R = (ca.SX.sym(name, 3) for name in ("q", "dq", "T_R"))
-    T_B = rotation(principal(q, inertia)) @ rotation(q).T @ T_R
+    T_B = rotation(principal_angles(q, inertia)) @ rotation(q).T @ T_R
     _, ddq = acceleration(1.0, inertia, q, dq, ca.SX.zeros(3), T_B)
     function = ca.Function("angular", [q, dq, T_R], [ddq])
     return lambda *values: _array(function(*values))
@@ -188,15 +188,15 @@ def test_nearly_equal_inertias_accelerate_as_equal_ones(axis: int) -> None:
 def test_principal_drops_gamma_of_a_symmetric_body_only() -> None:
     """Every axis across a symmetric body is a principal one."""
     q = ca.DM([0.1, 0.2, 0.3])
-    assert _array(principal(q, INERTIA)).tolist() == [0.1, 0.2, 0.0]
-    assert _array(principal(q, LOPSIDED)).tolist() == [0.1, 0.2, 0.3]
+    assert _array(principal_angles(q, INERTIA)).tolist() == [0.1, 0.2, 0.0]
+    assert _array(principal_angles(q, LOPSIDED)).tolist() == [0.1, 0.2, 0.3]
 
 
 @pytest.mark.parametrize("inertia", [INERTIA, LOPSIDED])
 def test_acceleration_is_newtons_and_eulers(inertia: tuple[float, float, float]) -> None:
     """m q_t'' = F, and I omega' + omega x I omega = T with omega' from the rate map by finite differences."""
     q, dq, F, T_R = (ca.SX.sym(name, 3) for name in ("q", "dq", "F", "T_R"))
-    T_B = rotation(principal(q, inertia)) @ rotation(q).T @ T_R
+    T_B = rotation(principal_angles(q, inertia)) @ rotation(q).T @ T_R
     both = ca.Function("both", [q, dq, F, T_R], list(acceleration(0.36, inertia, q, dq, F, T_B)))
     rng = np.random.default_rng(1)
     for _ in range(20):

@@ -23,7 +23,7 @@ from malta.margins.robust import robust_margin
 from malta.margins.stages import compensators
 from malta.margins.systems import uncertain
 from malta.margins.travel import travel_margin
-from malta.margins.uncertain import Compensator, UncertainSystem, critical, instability
+from malta.margins.uncertain import Compensator, UncertainSystem, critical_frequency, instability
 from malta.model.data import plant_of
 
 if TYPE_CHECKING:
@@ -240,7 +240,7 @@ def test_shipped_designs_have_the_margin_that_is_proven(name: str, current_loops
     assert (instability(s, c, samples(s, m, BOX, {}, 1000)) < 0).all()
     assert m.frequency is not None
     p = np.array(list((m.witness or {}).values()))
-    assert critical(s, c, p) == pytest.approx(m.frequency, rel=1e-3)
+    assert critical_frequency(s, c, p) == pytest.approx(m.frequency, rel=1e-3)
 
 
 @pytest.mark.parametrize("name", [pytest.param("table2", marks=pytest.mark.slow), "calibrated", "robust"])

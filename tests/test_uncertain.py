@@ -16,7 +16,7 @@ from malta.margins.loops import loop, machine_law
 from malta.margins.responses import responses
 from malta.margins.robust import robust_margin
 from malta.margins.systems import uncertain
-from malta.margins.uncertain import closed_loop, critical, instability, sampled_law
+from malta.margins.uncertain import closed_loop, critical_frequency, instability, sampled_law
 from malta.model.data import plant_of
 from malta.synthesis.controller import linear_law
 
@@ -106,7 +106,7 @@ def test_the_worst_pole_has_a_frequency(designs: dict[str, Design]) -> None:
     m = robust_margin(system, law, {"m": 0.2, "K_A": 0.2, "K_B": 0.2})
     assert m.witness is not None
     p = np.array([m.witness[name] for name in system.names])
-    assert critical(system, law, p) == pytest.approx(m.frequency, rel=1e-3)
+    assert critical_frequency(system, law, p) == pytest.approx(m.frequency, rel=1e-3)
 
 
 @pytest.mark.parametrize("name", ["calibrated", "table2", "robust"])

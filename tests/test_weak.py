@@ -17,14 +17,14 @@ from scipy import linalg
 
 from malta import gains
 from malta.margins import taylor
-from malta.margins.along import Evaluation, Laurent
 from malta.margins.axes import members_of, state_matrix
 from malta.margins.box import box_of
 from malta.margins.expressions import NotAnalytic, program
-from malta.margins.held import HeldMachine, dominating, held_machine
+from malta.margins.held_currents import HeldMachine, dominating_solution, held_machine
+from malta.margins.laurent import Evaluation, Laurent
 from malta.margins.travel import NOT_BETWEEN, _anywhere, loop_at, travel_margin
 from malta.margins.uncertain import closed_loop, instability, model_of
-from malta.margins.weak import AnywhereHeld, _beside
+from malta.margins.weak_coupling import HeldLoop, coupling_bounds
 from malta.model.data import plant_of
 
 NAMES = ("m", "I_x", "I_z", "B_r", "r_z")
@@ -32,7 +32,7 @@ BOX = {"m": 0.05, "I_x": 0.1, "I_z": 0.1, "B_r": 0.05, "r_z": 0.2}
 
 
 @cache
-def machine(name: str = "planar") -> tuple[Any, Any, AnywhereHeld]:
+def machine(name: str = "planar") -> tuple[Any, Any, HeldLoop]:
     controller = gains.read(f"design/gains/{name}.json")
     plant = plant_of(controller.parameters)
     found = _anywhere(plant, controller, NAMES, "lag")
@@ -40,7 +40,7 @@ def machine(name: str = "planar") -> tuple[Any, Any, AnywhereHeld]:
     return plant, controller, found
 
 
-def box_at(problem: AnywhereHeld) -> Any:
+def box_at(problem: HeldLoop) -> Any:
     h = problem.machine
     return box_of(h.names, h.nominal, [(0.0, math.inf)] * len(h.names), BOX, {})
 
@@ -109,9 +109,9 @@ def test_no_laurent_polynomial() -> None:
 def test_dominating_bounds_every_power() -> None:
     rng = np.random.default_rng(1)
     M, r = rng.uniform(0, 0.15, (5, 5)), rng.uniform(0, 1, (5, 2))
-    assert (dominating(M, r) >= np.linalg.solve(np.eye(5) - M, r)).all()
+    assert (dominating_solution(M, r) >= np.linalg.solve(np.eye(5) - M, r)).all()
     with pytest.raises(NotAnalytic):
-        dominating(8 * M, r)
+        dominating_solution(8 * M, r)
 
 
 @pytest.mark.parametrize("name", ["planar", "planar_pid"])
@@ -159,7 +159,7 @@ def test_the_loop_is_what_is_bounded() -> None:
     rng, sides = np.random.default_rng(3), box_at(problem).sides(3.5)
     bounds = h.bounds([arb(low).union(arb(high)) for low, high in sides.tolist()])
     none = [np.zeros(s) for s in ((24, 24), (24, 6), (6, 24), (6, 6))]
-    W, V, _ = _beside(*bounds, T, tuple(none))
+    W, V, _ = coupling_bounds(*bounds, T, tuple(none))
     gamma = np.vstack([T**2 / 2 * np.eye(n), T * np.eye(n)])
     law = problem.law
     for y in (0.0, 0.031, -0.0873):

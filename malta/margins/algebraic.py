@@ -11,10 +11,10 @@ from __future__ import annotations
 import casadi as ca
 
 from malta.errors import InputError
-from malta.margins.given import counted
+from malta.margins.arguments import plural
 
 
-def solved_algebraic(matrices: list[ca.SX]) -> list[ca.SX]:
+def eliminate_algebraic(matrices: list[ca.SX]) -> list[ca.SX]:
     """A, B, C, D, E without algebraic states; as they are where E has no row of zeros.
 
     Raises InputError where the equations do not give their states: zero columns of E other in number than its zero
@@ -29,7 +29,7 @@ def solved_algebraic(matrices: list[ca.SX]) -> list[ca.SX]:
     algebraic, free = sorted(set(range(n)) - rows), sorted(set(range(n)) - columns)
     if not algebraic and not free:
         return matrices
-    found = f"{counted(len(algebraic), 'row')} and {counted(len(free), 'column')} of zeros"
+    found = f"{plural(len(algebraic), 'row')} and {plural(len(free), 'column')} of zeros"
     if len(algebraic) != len(free):
         raise InputError(
             "uncertain", "E", found, "as many of one as of the other: algebraic states of index 1"

@@ -17,12 +17,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from flint import arb, arb_mat, fmpq, fmpq_mat
 
-from malta.margins.characteristic import mapped, turned_table
+from malta.margins.characteristic import bilinear_table, map_bilinear
 from malta.margins.enclosure import precision
 from malta.margins.expressions import exact
 from malta.margins.family import EPS, binary
 from malta.margins.groups import rational
-from malta.margins.held import HeldMachine
+from malta.margins.held_currents import HeldMachine
 
 if TYPE_CHECKING:
     from malta.margins.uncertain import Compensator
@@ -178,7 +178,7 @@ def _stored(
     adjugates: list[list[Any]],
 ) -> Axes:
     """Turned from g to v."""
-    turned = [mapped(f) for f in determinants]
+    turned = [map_bilinear(f) for f in determinants]
     heights = []
     for k in range(len(turned[0])):
         sizes = [binary(f[k]) for f in turned]
@@ -187,7 +187,7 @@ def _stored(
     found, slack = np.zeros((2, len(turned), len(heights), n, n))
     for s, N in enumerate(adjugates):
         flat = arb_mat([m.entries() for m in N] + [[arb(0)] * (n * n)])
-        rows = turned_table(len(heights) - 1) * flat
+        rows = bilinear_table(len(heights) - 1) * flat
         for k, height in enumerate(heights):
             values, radii = _doubles([[rows[k, i] for i in range(n * n)]], [height] * (n * n))
             found[s, k], slack[s, k] = values.reshape(n, n), radii.reshape(n, n)

@@ -19,7 +19,7 @@ from malta.margins.blocks import Block
 from malta.margins.box import Box
 from malta.margins.enclosure import over_box
 from malta.margins.exclusion import Growth, growth_over
-from malta.margins.family import Family, aligned, combined
+from malta.margins.family import Family, align, combine
 from malta.margins.parts import PATCHES, cut
 
 if TYPE_CHECKING:
@@ -134,7 +134,7 @@ def _part(
             for i in range(len(b.rows))
         ]
     made = _common(sums, entries, known)
-    growth = _widened(growth_over(np.asarray(sides), f.inverted[: len(sides)], box), len(scalars))
+    growth = _widen(growth_over(np.asarray(sides), f.inverted[: len(sides)], box), len(scalars))
     flat = iter(made)
     sets = tuple(next(flat) for _ in sums)
     matrix = tuple(tuple(tuple(next(flat) for _ in plain) for _ in row) for row in entries)
@@ -178,20 +178,20 @@ def _common(
     """The sums of families, all on the same degrees and scale."""
     base = known[frozenset()]
     for g in known.values():
-        base = aligned(base, g)[0]
-    raised = {at: aligned(base, g)[1] for at, g in known.items()}
+        base = align(base, g)[0]
+    raised = {at: align(base, g)[1] for at, g in known.items()}
 
     def summed(weights: dict[frozenset[int], float]) -> Family:
         (first, a), *rest = weights.items()
-        total = raised[first] if a == 1.0 else combined(raised[first], raised[first], a, 0.0)
+        total = raised[first] if a == 1.0 else combine(raised[first], raised[first], a, 0.0)
         for at, weight in rest:
-            total = combined(total, raised[at], 1.0, weight)
+            total = combine(total, raised[at], 1.0, weight)
         return total
 
     return [summed(s) for s in [*sums, *(s for row in entries for cell in row for s in cell)]]
 
 
-def _widened(growth: Growth, phases: int) -> Growth:
+def _widen(growth: Growth, phases: int) -> Growth:
     """With phases of blocks as axes that do not grow, in turns."""
     none, one = np.zeros(phases), np.ones(phases)
     return Growth(

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from malta.errors import InputError
-from malta.margins.given import (
+from malta.margins.arguments import (
     LARGEST,
     by_name,
-    described,
+    describe,
     is_number,
     is_pair,
 )
@@ -62,21 +62,21 @@ class Box:
         """Low and high of every parameter: names x 2."""
         return np.column_stack([self.nominal - t * self.down, self.nominal + t * self.up]) + self.over
 
-    def framed(self, t: float) -> FloatArray:
+    def frame_sides(self, t: float) -> FloatArray:
         """`sides`, those of the frame as wide as that: what several boxes have in common."""
         sides = self.sides(t)
         for i, interval in self.frame.items():
             sides[i] = interval
         return sides
 
-    def standing(self) -> FloatArray:
+    def nominal_places(self) -> FloatArray:
         """Nominal values, at both ends and the middle of everything that stays; the nominal ones first."""
         sides = (np.unique([0.0, low, (low + high) / 2, high]) for low, high in self.over)
         places = np.array(list(itertools.islice(itertools.product(*sides), 4096)))
         order = np.argsort(np.abs(places).sum(axis=1), kind="stable")
         return np.asarray(self.nominal + places[order])
 
-    def stretched(self, p: FloatArray, share: float) -> FloatArray:
+    def stretch(self, p: FloatArray, share: float) -> FloatArray:
         """Parameters that deviate `share` times as far, those that stay as they are."""
         return np.where(self.down + self.up > 0, self.nominal + share * (p - self.nominal), p)
 
@@ -134,7 +134,7 @@ def _sides(caller: str, name: str, value: Any, nominal: float) -> tuple[float, f
         low, high = nominal - abs(nominal) * float(value), nominal + abs(nominal) * float(value)
     if not (low <= nominal <= high and low < high):
         wanted = f"a share above 0, or (low, high) about the nominal {nominal:g}"
-        raise InputError(caller, name, described(value), wanted)
+        raise InputError(caller, name, describe(value), wanted)
     if max(-low, high) > LARGEST:
-        raise InputError(caller, name, described(value), f"values between -{LARGEST:g} and {LARGEST:g}")
+        raise InputError(caller, name, describe(value), f"values between -{LARGEST:g} and {LARGEST:g}")
     return low, high

@@ -82,7 +82,7 @@ def certificate_of(
         raise CheckError(f"no certificate: nothing is proven ({margin.reason})")
     system = places[0][0]
     box = box_of(system.names, system.nominal, system.limits, ranges, over or {})
-    lower, proven = _proven(places, box, margin.lower)
+    lower, proven = _prove(places, box, margin.lower)
     content: dict[str, Any] = {
         "format": checked_file.FORMAT,
         "version": checked_file.VERSION,
@@ -107,7 +107,7 @@ def certificate_of(
     return content | {"sha256": checked_file.digest(content)}
 
 
-def _proven(places: Places, box: Box, margin: float) -> tuple[float, list[dict[str, Any]]]:
+def _prove(places: Places, box: Box, margin: float) -> tuple[float, list[dict[str, Any]]]:
     """The claim, and the loops with their proofs. Raises CheckError, InputError."""
     for share in SHARES:
         try:
@@ -121,7 +121,7 @@ def matches(path: str | Path, places: Places) -> bool:
     """Whether a certificate's loops and nominal values are these, to the last digit."""
     content = checked_file.content_of(Path(path))
     found = content["loops"]
-    own = [_described(loop_of(s, _law(s, law))) for s, law in places]
+    own = [_description(loop_of(s, _law(s, law))) for s, law in places]
     nominal = [float(x).hex() for x in places[0][0].nominal]
     return (
         len(found) == len(own)
@@ -134,7 +134,7 @@ def _law(system: UncertainSystem, law: Any) -> Compensator:
     return compensator_of(law, system.matrices.size1_out(2), system.matrices.size2_out(1))
 
 
-def _described(loop: UncertainLoop) -> dict[str, Any]:
+def _description(loop: UncertainLoop) -> dict[str, Any]:
     """A loop as it stands in a certificate, without its groups."""
     law, program = loop.law, loop.program
     n = loop.states
@@ -163,7 +163,7 @@ def _described(loop: UncertainLoop) -> dict[str, Any]:
 
 def _loop(system: UncertainSystem, law: Any, box: Box, lower: float) -> dict[str, Any]:
     """One loop with the proof of each of its groups. Raises InputError, CheckError."""
-    described = _described(loop_of(system, _law(system, law)))
+    described = _description(loop_of(system, _law(system, law)))
     count, before = len(box.names), ctx.prec
 
     def read() -> checked_file.Loop:

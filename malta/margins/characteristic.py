@@ -27,7 +27,7 @@ from malta.margins.closed import (
     parts,
 )
 from malta.margins.degrees import (
-    cleared,
+    clear_denominators,
     degree,
     depends,
     determinant_degree,
@@ -40,7 +40,7 @@ from malta.margins.expressions import (
     NotAnalytic,
     finite,
 )
-from malta.margins.groups import A, B, C, D, E, Group, UncertainLoop, divided
+from malta.margins.groups import A, B, C, D, E, Group, UncertainLoop, divide_by_descriptor
 from malta.margins.majorant import coefficient_bounds
 from malta.margins.minors import Minors, minors
 
@@ -80,7 +80,7 @@ class Characteristic:
         s = self.loop.symbolic
         if self.exact or s is None:
             return (False,) * len(self.names)
-        found, entries, g = [], divided(self.loop, s), set(self.group.states)
+        found, entries, g = [], divide_by_descriptor(self.loop, s), set(self.group.states)
         own = [r for (k, j), r in entries[A].items() if k in g and j in g]
         own += [r for (k, _), r in entries[B].items() if k in g]
         own += [r for (_, j), r in entries[C].items() if j in g]
@@ -98,17 +98,17 @@ class Characteristic:
         """The degree in each parameter, an upper bound read from the entries; None where it is no polynomial."""
         if self.exact:
             assert self.loop.symbolic is not None
-            rows = cleared(self.loop, self.group, self.loop.symbolic)
+            rows = clear_denominators(self.loop, self.group, self.loop.symbolic)
             return tuple(determinant_degree(rows, i) for i in range(len(self.names)))
-        return tuple(self._degree_beside(i) for i in range(len(self.names)))
+        return tuple(self._degree_by_minors(i) for i in range(len(self.names)))
 
-    def _degree_beside(self, i: int) -> int | None:
+    def _degree_by_minors(self, i: int) -> int | None:
         """Of a parameter that enters B and C alone, by minors (Cauchy, Binet); 0 where it does not enter."""
         s, g, program = self.loop.symbolic, self.group, self.loop.program
         if not any(i in on for on in program.depends):
             return 0
         if s is None or i in program.depends[A] or self.loop.direct or self.loop.descriptor:
-            return None if s is None or self._enters(s, i) else 0
+            return None if s is None or self._depends_on(s, i) else 0
         if any(depends(s, k, i) for k in range(len(s.atoms))):
             return None
         into = {at: r for at, r in s.entries[B].items() if at[0] in g.states}
@@ -123,7 +123,7 @@ class Characteristic:
                 total += order * max(d for d, _ in rows[0])
         return total
 
-    def _enters(self, s: Symbolic, i: int) -> bool:
+    def _depends_on(self, s: Symbolic, i: int) -> bool:
         """Whether the group's own entries depend on a parameter, atoms included."""
         g = set(self.group.states)
         rows: list[tuple[int, int | None]] = [(A, 0), (B, 0), (C, 1)]
@@ -150,7 +150,7 @@ class Characteristic:
         Raises NotAnalytic where the matrices have no value there.
         """
         p = [1 / x if inverted else x for x, inverted in zip(v, self.inverted, strict=True)]
-        a = self._mapped(self._coefficients(p, fmpq_mat if self.exact else arb_mat))
+        a = self._map_to_v(self._coefficients(p, fmpq_mat if self.exact else arb_mat))
         if not self.exact:
             return a
         scale = _multiplier(self.loop, self.group, p)
@@ -171,7 +171,7 @@ class Characteristic:
                 known[own] = pi = self.minors.plant(entries, matrix)
             beta = self.minors.forces(entries, matrix)
             known[place] = pi, beta
-        found = self.minors.joined(pi, beta, matrix)
+        found = self.minors.combine(pi, beta, matrix)
         zero = 0 * found[0]
         return found + [zero] * (self.minors.degree + 1 - len(found))
 
@@ -187,8 +187,8 @@ class Characteristic:
         on = self.loop.program.depends
         return tuple(sorted(frozenset().union(*(on[k] for k in (A, C, E) if k < len(on)))))
 
-    def _mapped(self, a: list[Any]) -> list[Any]:
-        return mapped(a) if self.discrete else a
+    def _map_to_v(self, a: list[Any]) -> list[Any]:
+        return map_bilinear(a) if self.discrete else a
 
     # bounds
 
@@ -198,21 +198,21 @@ class Characteristic:
         assert self.loop.symbolic is not None
         picked = [i for i, inverted in enumerate(self.inverted) if inverted]
         found, g = [], set(self.group.states)
-        for which, matrix in enumerate(divided(self.loop, self.loop.symbolic)[: D + 1]):
+        for which, matrix in enumerate(divide_by_descriptor(self.loop, self.loop.symbolic)[: D + 1]):
             turned = {}
             for at, r in matrix.items():
                 if (which in (A, B) and at[0] not in g) or (which in (A, C) and at[1] not in g):
                     continue
                 powers = {i: sole_power(r.den, i) or 0 for i in picked}
 
-                def flipped(polynomial: Any, powers: dict[int, int]) -> dict[Any, Any]:
+                def flip(polynomial: Any, powers: dict[int, int]) -> dict[Any, Any]:
                     return {
                         tuple(powers[i] - e if i in powers else e for i, e in enumerate(m)): c
                         for m, c in polynomial.to_dict().items()
                     }
 
-                den = None if r.den is None else flipped(r.den, powers)
-                turned[at] = flipped(r.num, powers), den
+                den = None if r.den is None else flip(r.den, powers)
+                turned[at] = flip(r.num, powers), den
             found.append(turned)
         return tuple(found)
 
@@ -249,10 +249,13 @@ class Characteristic:
             for matrix in self._polynomials
         ]
 
-    def neglected(
+    def coupling_bounds(
         self, moves: Sequence[Any], sides: Sequence[tuple[Any, Any]]
     ) -> list[tuple[float, int]] | None:
-        """Bounds of what neglected couplings (`dust`) change the coefficients by, over a box: (mantissa, exponent)."""
+        """Bounds of the change of each coefficient by neglected couplings (rounding.py): (mantissa, exponent).
+
+        moves : bounds by powers of s or g; sides : the box, ends of each parameter
+        """
         if not moves:
             return None
         law, total = self.loop.law, list(moves)
@@ -262,7 +265,7 @@ class Characteristic:
         if self.discrete:  # |z - a| <= 2 of a lag, |z| = 1 of stored inputs
             degree += lags + law.delay * (self.minors.order if self.minors is not None else len(acting))
             total = [c * 2**lags for c in total] + [arb(0)] * (degree + 1 - len(total))
-            return [pair(c) for c in outward(total)]
+            return [pair(c) for c in map_bounds(total)]
         for _ in range(lags):
             rate = arb(law.lag)
             total = [
@@ -301,10 +304,10 @@ class Characteristic:
             if where not in known:
                 known[where] = self.minors.sizes(self._balls(v))
             product = self.minors.majorant(known[where])
-        return [pair(c) for c in (outward(product) if self.discrete else product)]
+        return [pair(c) for c in (map_bounds(product) if self.discrete else product)]
 
 
-def outward(product: list[Any]) -> list[Any]:
+def map_bounds(product: list[Any]) -> list[Any]:
     """Bounds of the coefficients of g -> those of v."""
     n = len(product) - 1
     turned = [arb(0)] * (n + 1)
@@ -333,7 +336,7 @@ def pair(c: Any) -> tuple[float, int]:
 @lru_cache(maxsize=64)
 def _denominators(loop: UncertainLoop, g: Group) -> tuple[Any, ...]:
     assert loop.symbolic is not None
-    return tuple(row[None] for row in cleared(loop, g, loop.symbolic) if None in row)
+    return tuple(row[None] for row in clear_denominators(loop, g, loop.symbolic) if None in row)
 
 
 def _multiplier(loop: UncertainLoop, g: Group, p: Sequence[Any]) -> Any:
@@ -353,12 +356,12 @@ def _bilinear(n: int) -> Any:
     return fmpq_mat(table)
 
 
-def turned_table(n: int) -> Any:
+def bilinear_table(n: int) -> Any:
     """What turns coefficients of g into those of v, as balls."""
     return arb_mat(_bilinear(n))
 
 
-def mapped(a: list[Any]) -> list[Any]:
+def map_bilinear(a: list[Any]) -> list[Any]:
     table = _bilinear(len(a) - 1)
     if isinstance(a[-1], fmpq) or isinstance(a[0], fmpq):
         return list((table * fmpq_mat(len(a), 1, a)).entries())

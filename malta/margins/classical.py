@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 
-from malta.margins.responses import largest, responses
+from malta.margins.responses import find_peaks, responses
 from malta.margins.uncertain import Compensator, UncertainSystem, instability
 
 if TYPE_CHECKING:
@@ -104,7 +104,7 @@ def disk_margin(
         mu = _balanced_norm(M) if only is None else np.abs(M[:, only, only])
         return np.asarray(mu[:, None])
 
-    (mu,), (at,) = largest(sizes, w)
+    (mu,), (at,) = find_peaks(sizes, w)
     channels = kind if only is None else f"{kind[:-1]} {only + 1}"
     return Disk(channels, float(1 / mu), float(at))
 
@@ -171,7 +171,7 @@ def peak_sensitivity(system: UncertainSystem, law: Compensator, at: Literal["for
         S = np.linalg.inv(np.eye(Q.shape[-1]) - Q)
         return np.asarray(np.abs(np.einsum("kii->ki", S)))
 
-    return float(largest(sizes, _frequencies(law))[0].max())
+    return float(find_peaks(sizes, _frequencies(law))[0].max())
 
 
 def gang_of_four(P: ComplexArray, F: ComplexArray) -> list[tuple[float, ...]]:

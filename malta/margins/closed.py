@@ -29,7 +29,7 @@ def parts(
     if loop.descriptor:
         e = dense(matrix, n, n, ((x[i], x[j], r) for i, j, r in entries[E] if i in x and j in x))
         factor = e.det()
-        ab = solved(e, beside(matrix, a, b))
+        ab = solve(e, join_columns(matrix, a, b))
         a, b = columns(matrix, ab, range(n)), columns(matrix, ab, range(n, n + m))
     out, through = matrix(rational(law.C[:, list(g.own)])) if g.own else None, matrix(rational(law.D))
     if g.inputs is not None:
@@ -40,15 +40,15 @@ def parts(
         b = dense(matrix, n, len(picked), ((k, j, 1) for j, k in enumerate(picked)))
     if loop.sampled:
         if law.lag is not None:
-            a, b, c, d = lagged(matrix, a, b, c, d, arb(law.lag))
+            a, b, c, d = add_lag(matrix, a, b, c, d, arb(law.lag))
         a, b = hold(matrix, a, b, arb(law.sample_time))
-        a, b, c, d = _delayed(matrix, a, b, c, d, law.delay)
+        a, b, c, d = add_delay(matrix, a, b, c, d, law.delay)
     else:
         if law.lag is not None:
-            a, b, c, d = lagged(matrix, a, b, c, d, exact(law.lag))
+            a, b, c, d = add_lag(matrix, a, b, c, d, exact(law.lag))
         if law.sample_time is not None:
-            a = a - _eye(matrix, a.nrows())
-            a, b, c, d = _delayed(matrix, a, b, c, d, law.delay)
+            a = a - _identity(matrix, a.nrows())
+            a, b, c, d = add_delay(matrix, a, b, c, d, law.delay)
     own = list(g.own)
     f_a = rational(law.A[np.ix_(own, own)])
     if law.sample_time is not None:
@@ -64,7 +64,7 @@ def dense(matrix: Any, rows: int, columns: int, entries: Any) -> Any:
     return matrix(rows, columns, [value for row in table for value in row])
 
 
-def _eye(matrix: Any, n: int) -> Any:
+def _identity(matrix: Any, n: int) -> Any:
     return dense(matrix, n, n, ((i, i, 1) for i in range(n)))
 
 
@@ -76,14 +76,14 @@ def columns(matrix: Any, m: Any, picked: Sequence[int]) -> Any:
     return matrix(m.nrows(), len(picked), [m[i, j] for i in range(m.nrows()) for j in picked])
 
 
-def beside(matrix: Any, *parts: Any) -> Any:
+def join_columns(matrix: Any, *parts: Any) -> Any:
     n = parts[0].nrows()
     values = [part[i, j] for i in range(n) for part in parts for j in range(part.ncols())]
     return matrix(n, sum(part.ncols() for part in parts), values)
 
 
 def _stack(matrix: Any, blocks: list[list[Any]]) -> Any:
-    rows = [beside(matrix, *row) for row in blocks if row[0].nrows()]
+    rows = [join_columns(matrix, *row) for row in blocks if row[0].nrows()]
     if not rows:
         return matrix(0, 0, [])
     columns = rows[0].ncols()
@@ -95,20 +95,20 @@ def zeros(matrix: Any, n: int, m: int) -> Any:
     return matrix(n, m, [0] * (n * m))
 
 
-def solved(e: Any, right: Any) -> Any:
+def solve(e: Any, right: Any) -> Any:
     try:
         return e.solve(right)
     except ZeroDivisionError as error:
         raise NotAnalytic("E(p) that is singular") from error
 
 
-def lagged(matrix: Any, a: Any, b: Any, c: Any, d: Any, rate: Any) -> tuple[Any, Any, Any, Any]:
+def add_lag(matrix: Any, a: Any, b: Any, c: Any, d: Any, rate: Any) -> tuple[Any, Any, Any, Any]:
     """With the inputs as first-order lags, which are states after x."""
     n, m = a.nrows(), b.ncols()
-    eye, p = _eye(matrix, m), c.nrows()
+    eye, p = _identity(matrix, m), c.nrows()
     a = _stack(matrix, [[a, b], [zeros(matrix, m, n), eye * (-rate)]])
     b = _stack(matrix, [[zeros(matrix, n, m)], [eye * rate]])
-    return a, b, beside(matrix, c, zeros(matrix, p, m) if d is None else d), None
+    return a, b, join_columns(matrix, c, zeros(matrix, p, m) if d is None else d), None
 
 
 def hold(matrix: Any, a: Any, b: Any, T: Any) -> tuple[Any, Any]:
@@ -122,7 +122,7 @@ def hold(matrix: Any, a: Any, b: Any, T: Any) -> tuple[Any, Any]:
     return phi, gamma
 
 
-def _delayed(matrix: Any, phi: Any, gamma: Any, c: Any, d: Any, delay: int) -> tuple[Any, Any, Any, Any]:
+def add_delay(matrix: Any, phi: Any, gamma: Any, c: Any, d: Any, delay: int) -> tuple[Any, Any, Any, Any]:
     """With inputs that act `delay` samples late, stored oldest first: differences x+ - x."""
     if delay == 0:
         return phi, gamma, c, d
@@ -137,7 +137,9 @@ def _delayed(matrix: Any, phi: Any, gamma: Any, c: Any, d: Any, delay: int) -> t
         [[phi, gamma, zeros(matrix, n, stored - m)], [zeros(matrix, stored, n), shift]],
     )
     b = dense(matrix, n + stored, m, ((n + stored - m + j, j, 1) for j in range(m)))
-    late = beside(matrix, c, *([d] if d is not None else [zeros(matrix, p, m)]), zeros(matrix, p, stored - m))
+    late = join_columns(
+        matrix, c, *([d] if d is not None else [zeros(matrix, p, m)]), zeros(matrix, p, stored - m)
+    )
     return a, b, late, None
 
 
@@ -148,10 +150,10 @@ def closed_loop(
     k = len(f_a)
     factor: Any = 1
     if d is not None:
-        w = _eye(matrix, b.ncols()) - through * d
+        w = _identity(matrix, b.ncols()) - through * d
         factor = w.det()
-        right = through * c if out is None else beside(matrix, through * c, out)
-        both = solved(w, right)
+        right = through * c if out is None else join_columns(matrix, through * c, out)
+        both = solve(w, right)
         into = columns(matrix, both, range(c.ncols()))
         out = None if out is None else columns(matrix, both, range(c.ncols(), both.ncols()))
     else:
@@ -192,7 +194,7 @@ def majorant_matrix(loop: UncertainLoop, g: Group, entries: list[list[tuple[int,
     b_balls = [(x[i], j, r) for i, j, r in entries[B] if i in x]
     if len(entries) > E:
         e = dense(acb_mat, n, n, ((x[i], x[j], r) for i, j, r in entries[E] if i in x and j in x))
-        ab = solved(e, beside(acb_mat, dense(acb_mat, n, n, a_balls), dense(acb_mat, n, m, b_balls)))
+        ab = solve(e, join_columns(acb_mat, dense(acb_mat, n, n, a_balls), dense(acb_mat, n, m, b_balls)))
         a_balls = [(i, j, ab[i, j]) for i in range(n) for j in range(n)]
         b_balls = [(i, j, ab[i, n + j]) for i in range(n) for j in range(m)]
     diagonal = np.zeros(n)
@@ -223,8 +225,8 @@ def majorant_matrix(loop: UncertainLoop, g: Group, entries: list[list[tuple[int,
         loops = through @ d
         if not np.abs(np.linalg.eigvals(loops)).max(initial=0.0) < 0.99:
             raise NotAnalytic("a direct feedthrough around the loop that may reach one")
-        solve = np.linalg.inv(np.eye(len(loops)) - loops)
-        out, through = solve @ out, solve @ through
+        inverse = np.linalg.inv(np.eye(len(loops)) - loops)
+        out, through = inverse @ out, inverse @ through
     f_a, f_b = law.A[np.ix_(g.own, g.own)], np.abs(law.B[list(g.own)])
     own = np.abs(f_a - (0 if law.sample_time is None else np.eye(len(f_a))))
     y_x = c if d is None else c + d @ through @ c

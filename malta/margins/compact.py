@@ -25,7 +25,7 @@ ROUNDING = 1e-11  # terms below this, relative, are rounding of the model's own 
 Table = dict[tuple[int, int], Ratio]
 
 
-def written_out(function: ca.Function, nominal: FloatArray) -> tuple[Symbolic, list[Table]]:
+def expand_matrices(function: ca.Function, nominal: FloatArray) -> tuple[Symbolic, list[Table]]:
     """The matrices of a function of one vector as exact rational functions, without terms that are rounding.
 
     nominal : values at which terms are weighed
@@ -34,7 +34,10 @@ def written_out(function: ca.Function, nominal: FloatArray) -> tuple[Symbolic, l
     s = symbolic(program(function))
     scales = np.concatenate([nominal, np.ones(len(s.atoms))])
     circles = _circles(s)
-    return s, [rounded(s, {at: _turned(s, r, circles) for at, r in t.items()}, scales) for t in s.entries]
+    return s, [
+        drop_rounding(s, {at: _replace_cosines(s, r, circles) for at, r in t.items()}, scales)
+        for t in s.entries
+    ]
 
 
 def _circles(s: Symbolic) -> list[tuple[int, int]]:
@@ -46,7 +49,7 @@ def _circles(s: Symbolic) -> list[tuple[int, int]]:
     return [(pair["sin"], pair["cos"]) for pair in found.values() if {"sin", "cos"} <= set(pair)]
 
 
-def _turned(s: Symbolic, r: Ratio, circles: list[tuple[int, int]]) -> Ratio:
+def _replace_cosines(s: Symbolic, r: Ratio, circles: list[tuple[int, int]]) -> Ratio:
     """With cos^2 as 1 - sin^2 of the same angle, so that equal expressions look alike."""
     if not circles:
         return r
@@ -65,7 +68,7 @@ def _turned(s: Symbolic, r: Ratio, circles: list[tuple[int, int]]) -> Ratio:
     return Ratio(turn(r.num), None if r.den is None else turn(r.den))
 
 
-def free_of_functions(s: Symbolic, tables: Sequence[Table]) -> bool:
+def is_free_of_functions(s: Symbolic, tables: Sequence[Table]) -> bool:
     """Whether nothing but p itself is left in the entries."""
     for table in tables:
         for r in table.values():
@@ -75,7 +78,7 @@ def free_of_functions(s: Symbolic, tables: Sequence[Table]) -> bool:
     return True
 
 
-def rounded(s: Symbolic, table: Table, nominal: FloatArray, *beside: Table) -> Table:
+def drop_rounding(s: Symbolic, table: Table, nominal: FloatArray, *beside: Table) -> Table:
     """A table without the terms that are rounding beside the largest in their row and column (of other tables)."""
     weights = [abs(float(x)) or 1.0 for x in nominal]
     rows: dict[int, float] = {}
@@ -90,11 +93,11 @@ def rounded(s: Symbolic, table: Table, nominal: FloatArray, *beside: Table) -> T
         kept = {m: _double(c) for m, c in r.num.to_dict().items() if sizes[m] > limit}
         if kept:
             num = Ratio(s.context.from_dict(kept))
-            found[i, j] = num if r.den is None else num / Ratio(_plain(s, r.den, weights))
+            found[i, j] = num if r.den is None else num / Ratio(_drop_rounding_terms(s, r.den, weights))
     return found
 
 
-def _plain(s: Symbolic, polynomial: Any, weights: list[float]) -> Any:
+def _drop_rounding_terms(s: Symbolic, polynomial: Any, weights: list[float]) -> Any:
     """A polynomial without the terms that are rounding beside its largest."""
     sizes = _sizes(Ratio(polynomial), weights)
     limit = ROUNDING * max(sizes.values())
@@ -136,7 +139,7 @@ def _double(c: Any) -> Any:
     return exact(int(c.p) / int(c.q))
 
 
-def substituted(s: Symbolic, r: Ratio, values: Mapping[int, Ratio]) -> Ratio:
+def substitute(s: Symbolic, r: Ratio, values: Mapping[int, Ratio]) -> Ratio:
     """r with variables replaced by rational functions."""
 
     def turn(polynomial: Any) -> Ratio:

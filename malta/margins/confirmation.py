@@ -8,7 +8,7 @@ import numpy as np
 
 from malta.errors import CheckError
 from malta.margins.loss import corner_of
-from malta.margins.weak import AnywhereHeld
+from malta.margins.weak_coupling import HeldLoop
 from malta.margins.witness import Zero, gradients
 
 if TYPE_CHECKING:
@@ -26,11 +26,11 @@ def confirm(problem: Problem, box: Box, zero: Zero, part: Part) -> Loss | None:
     p = part.growth.parameters(zero.u)
     w = problem.physical(zero.frequency(part.family))
     for share in 1 + 10.0 ** np.arange(-9, -1.5, 0.5):
-        there = box.stretched(p, share)
+        there = box.stretch(p, share)
         if _is_unstable(problem, there):
-            if isinstance(problem, AnywhereHeld):  # the zero is that of uncoupled axes
+            if isinstance(problem, HeldLoop):  # the zero is that of uncoupled axes
                 p = corner_of(problem, box, there)
-                there = box.stretched(p, _first_unstable(problem, box, p))
+                there = box.stretch(p, _first_unstable(problem, box, p))
                 return float(box.margin(there)), w, there
             return float(zero.t * share), w, there
     return None
@@ -41,7 +41,7 @@ def _first_unstable(problem: Problem, box: Box, p: FloatArray) -> float:
     low, high = 0.95, 1.0
     for _ in range(BISECTIONS):
         middle = (low + high) / 2
-        low, high = (low, middle) if _is_unstable(problem, box.stretched(p, middle)) else (middle, high)
+        low, high = (low, middle) if _is_unstable(problem, box.stretch(p, middle)) else (middle, high)
     return high
 
 

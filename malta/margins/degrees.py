@@ -37,7 +37,7 @@ def depends(s: Symbolic, atom: int, i: int) -> bool:
     return False
 
 
-def cleared(loop: UncertainLoop, g: Group, s: Symbolic) -> list[dict[Any, Any]]:
+def clear_denominators(loop: UncertainLoop, g: Group, s: Symbolic) -> list[dict[Any, Any]]:
     """Rows of the polynomial matrix whose determinant is a: those of x, then those of y; columns x, u, y."""
     rows: list[dict[Any, Ratio]] = []
     for i in g.states:

@@ -39,11 +39,11 @@ class _Place(NamedTuple):
 
 def nearest(f: Family, g: Growth, branch: int, x: float, u: FloatArray, below: float) -> Zero | None:
     """Descend to a zero of f of smallest t from a start; None where none is found with t below `below`."""
-    here = _begun(f, g, branch, x, u, below)
+    here = _find_root(f, g, branch, x, u, below)
     trust, widest, best = 0.5, 1.0, None
     for k in range(MOST if here is not None else 0):
         assert here is not None
-        found = _reached(f, g, here, trust)
+        found = _smallest_step(f, g, here, trust)
         if found is None:  # nothing within the trust region solves the equation
             if trust >= widest:
                 break
@@ -53,10 +53,10 @@ def nearest(f: Family, g: Growth, branch: int, x: float, u: FloatArray, below: f
         left = here.t + cost * abs(here.value) - t
         if (k > 2 and t > BEYOND * below) or t - 3 * left > below:
             break
-        there = _followed(f, g, branch, here.x, np.clip(here.u + du, 0, 1))
+        there = _follow_root(f, g, branch, here.x, np.clip(here.u + du, 0, 1))
         gain = -np.inf if there is None else left - (there.t + cost * abs(there.value) - t)
         if abs(here.value) < 1e-9:
-            zero = _settled(f, branch, here)
+            zero = _as_zero(f, branch, here)
             best = zero if zero is not None and (best is None or zero.t < best.t) else best
             if zero is not None and left <= CLOSE * here.t:
                 break
@@ -71,21 +71,21 @@ def nearest(f: Family, g: Growth, branch: int, x: float, u: FloatArray, below: f
     return best if best is None or best.t < below else None
 
 
-def _settled(f: Family, branch: int, here: _Place) -> Zero | None:
+def _as_zero(f: Family, branch: int, here: _Place) -> Zero | None:
     """A place as a zero, where f vanishes there to rounding."""
     x = abs(here.x)
     a, _ = coefficients_at(f, here.u)
     rows, _ = rows_and_slopes(f, branch, x)
-    small = _length(complex((rows @ a)[0])) <= 1e-11 * float((np.abs(rows) @ f.size())[0])
+    small = _modulus(complex((rows @ a)[0])) <= 1e-11 * float((np.abs(rows) @ f.size())[0])
     return Zero(here.t, branch, x, here.u) if small else None
 
 
-def _begun(f: Family, g: Growth, branch: int, x: complex, u: FloatArray, below: float) -> _Place | None:
+def _find_root(f: Family, g: Growth, branch: int, x: complex, u: FloatArray, below: float) -> _Place | None:
     """The root next to x, where it is next to the boundary; or one that the linearized equation leads to."""
     if x == 0:
-        return _followed(f, g, branch, 0.0, u)
+        return _follow_root(f, g, branch, 0.0, u)
     for _ in range(12):
-        here = _followed(f, g, branch, x, u, NEAR)
+        here = _follow_root(f, g, branch, x, u, NEAR)
         if here is not None:
             return here
         a, slopes = coefficients_at(f, u)
@@ -94,7 +94,7 @@ def _begun(f: Family, g: Growth, branch: int, x: complex, u: FloatArray, below: 
         turn = np.conj(1j * turned)
         t = float(g.margin(g.parameters(u)))
         place = _Place(x, u, t, float((turn * value).real), (turn * moved).real)
-        found = _reached(f, g, place, 0.5)
+        found = _smallest_step(f, g, place, 0.5)
         if found is None or found[0] > below:
             return None
         u = np.clip(u + found[2], 0, 1)
@@ -102,7 +102,7 @@ def _begun(f: Family, g: Growth, branch: int, x: complex, u: FloatArray, below: 
     return None
 
 
-def _followed(
+def _follow_root(
     f: Family, g: Growth, branch: int, x: complex, u: FloatArray, far: float = FAR
 ) -> _Place | None:
     """The root next to x at u, by Newton's method in ln x, which changes by `far` at most; None where there is none."""
@@ -143,7 +143,9 @@ def _sides(g: Growth, u: FloatArray, free: Any) -> _Sides:
     return _Sides(grows, (g.nominal - g.parameters(u)) / unit, below / np.abs(unit), above / np.abs(unit))
 
 
-def _reached(f: Family, g: Growth, here: _Place, trust: float) -> tuple[float, float, FloatArray] | None:
+def _smallest_step(
+    f: Family, g: Growth, here: _Place, trust: float
+) -> tuple[float, float, FloatArray] | None:
     """The smallest t that solves the linearized equation, t per unit of the value, du; None where none does.
 
     The equation is s du = h, and the largest s du in box(t) is piecewise linear in t.
@@ -173,9 +175,9 @@ def _reached(f: Family, g: Growth, here: _Place, trust: float) -> tuple[float, f
 
     most, least = end(t, s), end(t, -s)
     if s @ most < h:
-        t, du = _grown(t, s, h, end, sides, (low, high))
+        t, du = _grow_box(t, s, h, end, sides, (low, high))
     elif s @ least > h:
-        t, du = _grown(t, -s, -h, end, sides, (low, high))
+        t, du = _grow_box(t, -s, -h, end, sides, (low, high))
     else:
         span = float(s @ (most - least))
         du = least + (most - least) * ((h - s @ least) / span if span > 0 else 0.5)
@@ -185,7 +187,7 @@ def _reached(f: Family, g: Growth, here: _Place, trust: float) -> tuple[float, f
     return t, 2 / max(pull, 1e-9), du
 
 
-def _grown(
+def _grow_box(
     t: float, s: FloatArray, h: float, end: Any, sides: _Sides, room: tuple[FloatArray, FloatArray]
 ) -> tuple[float, FloatArray]:
     """The smallest t from which on box(t) holds a du with s du = h; infinite where the trust region ends before."""
@@ -212,7 +214,7 @@ def from_cell(f: Family, g: Growth, cell: Cell, below: float) -> Zero | None:
     low, high = cell.interval
     u, best = cell.box.mean(axis=1), None
     for x in ((low + high) / 2, *([0.0] if low == 0 else [])):
-        near = projected(f, g, cell.branch, x, u)
+        near = project(f, g, cell.branch, x, u)
         if near is not None and near.t < (best.t if best is not None else below):
             best = near
     if best is None:
@@ -223,14 +225,14 @@ def from_cell(f: Family, g: Growth, cell: Cell, below: float) -> Zero | None:
     return further if further is not None and further.t < best.t else best
 
 
-def projected(f: Family, g: Growth, branch: int, x: float, u: FloatArray) -> Zero | None:
+def project(f: Family, g: Growth, branch: int, x: float, u: FloatArray) -> Zero | None:
     """The zero next to a place, by Newton's method with steps of least norm; None where it leads out of the box."""
     free = np.array([n > 1 for n in f.shape])
     for _ in range(30):
         a, slopes = coefficients_at(f, u)
         rows, along = rows_and_slopes(f, branch, x)
         value, size = complex((rows @ a)[0]), float((np.abs(rows) @ f.size())[0])
-        if _length(value) <= 1e-12 * size:
+        if _modulus(value) <= 1e-12 * size:
             return Zero(float(g.margin(g.parameters(u))), branch, x, u)
         moved, turned = (rows @ slopes.T)[0] * free, complex((along @ a)[0])
         columns = moved if x == 0 else np.append(moved, turned)
@@ -249,6 +251,6 @@ def projected(f: Family, g: Growth, branch: int, x: float, u: FloatArray) -> Zer
     return None
 
 
-def _length(z: complex) -> float:
+def _modulus(z: complex) -> float:
     """|z|; infinite where that overflows, which abs() takes for an error."""
     return math.hypot(z.real, z.imag)

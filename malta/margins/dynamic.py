@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from malta.errors import InputError
+from malta.margins.arguments import positive
 from malta.margins.block_parts import Part, parts_of
 from malta.margins.blocks import (
     Block,
@@ -27,7 +28,6 @@ from malta.margins.blocks import (
 from malta.margins.box import Box, box_of
 from malta.margins.enclosure import Unproven
 from malta.margins.families import is_nominal_stable
-from malta.margins.given import positive
 from malta.margins.groups import loop_of
 from malta.margins.loss import first_loss
 from malta.margins.peaks import (
@@ -106,7 +106,7 @@ def dynamic_margin(
     with np.errstate(all="ignore"):  # what is not finite excludes nothing
         lost = _loss(asked, begun + SEARCH * (until - begun))
         t = math.inf if lost is None else _size(asked, lost)
-        lower, reason = _proven(asked, min(t, asked.box.limit), tolerance, until)
+        lower, reason = _prove(asked, min(t, asked.box.limit), tolerance, until)
     spent, names = clock.monotonic() - begun, box.names
     if lost is None:
         return Margin(lower, math.inf, None, None, {}, {}, (), spent, reason)
@@ -133,13 +133,13 @@ class Blocks:
         """Raises InputError for blocks that cannot be taken together."""
         check_blocks(blocks, where)
         problem = problem_of(system, law)
-        scaled = tuple(_scaled(system, law, box.nominal, b, problem) for b in blocks)
+        scaled = tuple(_scale_probe(system, law, box.nominal, b, problem) for b in blocks)
         more, wider = probe(system, law, scaled)
         return cls(system, law, box, scaled, problem, OfLoop(loop_of(more, wider), more.names))
 
     def unstable(self) -> bool:
         """Whether a loop that nothing has moved yet is unstable."""
-        return bool((self.problem.instability(self.box.standing()) >= 0).any())
+        return bool((self.problem.instability(self.box.nominal_places()) >= 0).any())
 
     def transfer(self, p: FloatArray, w: FloatArray) -> ComplexArray:
         """M with rows in units of the blocks' sizes."""
@@ -171,7 +171,7 @@ class Blocks:
         return [sides.mean(axis=1) + x * (sides[:, 1] - sides[:, 0]) / 2 for x in chosen]
 
 
-def _scaled(
+def _scale_probe(
     system: UncertainSystem, law: Compensator, nominal: FloatArray, b: Block, problem: OfLoop
 ) -> Block:
     """A block probed by entries that count about as much as the loop's own gain, by powers of two."""
@@ -277,7 +277,7 @@ def _pattern(box: Box, t: float, p: FloatArray) -> FloatArray:
     return np.array([np.clip(x, -1, 1), 0 * x])
 
 
-def _proven(asked: Blocks, upper: float, tolerance: float, until: float) -> tuple[float | None, str]:
+def _prove(asked: Blocks, upper: float, tolerance: float, until: float) -> tuple[float | None, str]:
     """The largest t of those tried for which stability is proven, and why there is none."""
     parts: list[Part] = []
     reason = ""

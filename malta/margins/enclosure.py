@@ -67,7 +67,7 @@ class Side:
 
 
 def over_box(f: Polynomial, sides: FloatArray, moves: Sequence[Any] = (), until: float = math.inf) -> Family:
-    """The family over a box (P x 2, of p); moves: what couplings that are neglected can do (`dust`).
+    """The family over a box (P x 2, of p); moves: what couplings that are neglected can do (rounding.py).
 
     Raises TooWide where a narrower box may do, and Unproven.
     """
@@ -88,7 +88,7 @@ def over_box(f: Polynomial, sides: FloatArray, moves: Sequence[Any] = (), until:
         for i, side in enumerate(plan)
     ]
     points = _values(f, list(itertools.product(*grid)), until)
-    tails = _added(_summed(plan), f.neglected(moves, _real(sides)))
+    tails = _add_bounds(_sum_tails(plan), f.coupling_bounds(moves, _real(sides)))
     return family([s.degree + 1 for s in plan], [s.chebyshev for s in plan], points, tails)
 
 
@@ -96,7 +96,7 @@ def _real(sides: FloatArray) -> list[tuple[Any, Any]]:
     return [(arb(a), arb(b)) for a, b in sides.tolist()]
 
 
-def _added(
+def _add_bounds(
     one: list[tuple[float, int]] | None, two: list[tuple[float, int]] | None
 ) -> list[tuple[float, int]] | None:
     """Sums of bounds."""
@@ -130,7 +130,7 @@ def _share(side: Side, k: int) -> Any:
 def _values(f: Polynomial, places: list[tuple[Any, ...]], until: float = math.inf) -> list[list[Any]]:
     """Coefficients at the places, balls to 60 bits each."""
 
-    def timed(place: tuple[Any, ...]) -> list[Any]:
+    def evaluate(place: tuple[Any, ...]) -> list[Any]:
         if time.monotonic() > until:
             raise Unproven("time was up before the coefficients were found")
         return f.at(place)
@@ -144,14 +144,14 @@ def _values(f: Polynomial, places: list[tuple[Any, ...]], until: float = math.in
                 spent = time.monotonic() - begun
                 if time.monotonic() + HOPE * spent * len(places) > until:
                     raise Unproven("time would be up before the coefficients were found")
-                if f.exact or bits >= MOST_BITS or all(_accurate(c) for c in first):
-                    return [timed(place) for place in places]
+                if f.exact or bits >= MOST_BITS or all(_is_accurate(c) for c in first):
+                    return [evaluate(place) for place in places]
         except NotAnalytic as error:
             raise Unproven(f"the matrices have no value on the box: {error}") from error
         bits *= 2
 
 
-def _accurate(c: Any) -> bool:
+def _is_accurate(c: Any) -> bool:
     return bool(c.rel_accuracy_bits() >= 66) if hasattr(c, "rel_accuracy_bits") else True
 
 
@@ -167,7 +167,7 @@ def _plan(f: Polynomial, low: list[Any], high: list[Any], known: tuple[int | Non
     plan: list[Side] = []
     for tail in TAILS:
         plan = [
-            _interpolated(f.names[i], i, discs[i], tail) if i in discs
+            _interpolation_side(f.names[i], i, discs[i], tail) if i in discs
             else Side(0 if low[i] == high[i] else d or 0, False, None)
             for i, d in enumerate(known)
         ]  # fmt: skip
@@ -221,7 +221,7 @@ def _degree(disc: Disc, tail: float) -> int:
     return math.ceil((disc.share + 3 - math.log2(disc.radius - 1) - math.log2(tail)) / math.log2(disc.radius))
 
 
-def _interpolated(name: str, axis: int, discs: list[Disc], tail: float) -> Side:
+def _interpolation_side(name: str, axis: int, discs: list[Disc], tail: float) -> Side:
     """The lowest degree whose tail is small enough, by any of the discs; or the smallest tail there is."""
     best, best_rank = None, (True, 0, math.inf)
     for disc in discs:
@@ -245,7 +245,7 @@ def _log2(pair: tuple[float, int]) -> float:
     return math.log2(pair[0]) + pair[1] if pair[0] > 0 else -math.inf
 
 
-def _summed(plan: list[Side]) -> list[tuple[float, int]] | None:
+def _sum_tails(plan: list[Side]) -> list[tuple[float, int]] | None:
     """Tails of all axes; each with the Lebesgue constants of those before it, below 3."""
     parts = [(side.tails, 3.0**k) for k, side in enumerate(s for s in plan if s.tails is not None)]
     if not parts:

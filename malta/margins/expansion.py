@@ -48,7 +48,7 @@ def constant(matrix: FloatArray, count: int) -> Expansion:
     return Expansion(matrix, np.zeros((count, *matrix.shape)), np.zeros(matrix.shape))
 
 
-def stacked(rows: Sequence[Sequence[Expansion]]) -> Expansion:
+def stack(rows: Sequence[Sequence[Expansion]]) -> Expansion:
     """Blocks side by side, and rows of them below each other."""
     return Expansion(
         np.vstack([np.hstack([part.middle for part in row]) for row in rows]),
@@ -77,14 +77,14 @@ class Table:
             if r[i] > 0 and (e[:, i] > 0).any():
                 rest = np.delete(each, i, axis=1).prod(axis=1)
                 own = self.gains * rest * e[:, i] * c[i] ** np.maximum(e[:, i] - 1, 0) * r[i]
-                slopes[i] = self._summed(own)
+                slopes[i] = self._sum_terms(own)
                 linear = linear + np.abs(own)
         # (|c| + r)^e less its value and slopes: terms of second order, none of them negative
         beyond = np.where(e.sum(axis=1) > 1, np.maximum(size - linear, 0), 0)
         rounding = 8 * (count + int(e.max(initial=1)) + 4) * EPS * size
-        return Expansion(self._summed(middle), slopes, self._summed(beyond + rounding))
+        return Expansion(self._sum_terms(middle), slopes, self._sum_terms(beyond + rounding))
 
-    def _summed(self, values: FloatArray) -> FloatArray:
+    def _sum_terms(self, values: FloatArray) -> FloatArray:
         found = np.zeros(self.shape)
         np.add.at(found, (self.places[:, 0], self.places[:, 1]), values)
         return found

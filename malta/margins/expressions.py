@@ -128,14 +128,14 @@ class Arithmetic:
         return self.others["pow"](base, self.constant(exponent))
 
 
-def _off_the_cut(z: Any) -> Any:
+def _require_off_cut(z: Any) -> Any:
     """z, where its ball keeps off the negative real axis and zero."""
     if z.imag.contains(0) and not z.real > 0:
         raise NotAnalytic("a root or logarithm at zero or below")
     return z
 
 
-def _within_unit(z: Any) -> Any:
+def _require_within_unit(z: Any) -> Any:
     if not abs(z) < 1:
         raise NotAnalytic("an inverse sine or tangent beyond 1")
     return z
@@ -157,14 +157,14 @@ _BALLS: dict[str, Callable[..., Any]] = {
     "sinh": lambda z: z.sinh(),
     "cosh": lambda z: z.cosh(),
     "tanh": lambda z: finite(z.sinh() / z.cosh()),
-    "sqrt": lambda z: _off_the_cut(z).sqrt(),
-    "log": lambda z: _off_the_cut(z).log(),
-    "log1p": lambda z: _off_the_cut(z + 1).log(),
-    "pow": lambda z, w: (_off_the_cut(z).log() * w).exp(),
-    "asin": lambda z: _within_unit(z).asin(),
-    "acos": lambda z: _within_unit(z).acos(),
-    "atan": lambda z: _within_unit(z).atan(),
-    "hypot": lambda a, b: _off_the_cut(a * a + b * b).sqrt(),
+    "sqrt": lambda z: _require_off_cut(z).sqrt(),
+    "log": lambda z: _require_off_cut(z).log(),
+    "log1p": lambda z: _require_off_cut(z + 1).log(),
+    "pow": lambda z, w: (_require_off_cut(z).log() * w).exp(),
+    "asin": lambda z: _require_within_unit(z).asin(),
+    "acos": lambda z: _require_within_unit(z).acos(),
+    "atan": lambda z: _require_within_unit(z).atan(),
+    "hypot": lambda a, b: _require_off_cut(a * a + b * b).sqrt(),
 }
 _POINTS = _BALLS | {  # on the real axis no branch is near
     "atan": lambda x: x.atan(),
@@ -196,10 +196,10 @@ class _Checked(Arithmetic):
 def _at_points(functions: dict[str, Callable[..., Any]]) -> dict[str, Callable[..., Any]]:
     """Functions of real balls by those of complex ones: real where the argument is."""
 
-    def wrapped(function: Callable[..., Any]) -> Callable[..., Any]:
+    def wrap(function: Callable[..., Any]) -> Callable[..., Any]:
         return lambda *z: function(*(acb(x) for x in z)).real
 
-    return {name: wrapped(function) for name, function in functions.items()}
+    return {name: wrap(function) for name, function in functions.items()}
 
 
 POINTS = _Checked(_real, _at_points(_POINTS))

@@ -12,10 +12,10 @@ from malta.margins.characteristic import pair
 from malta.margins.enclosure import Unproven, over_box, precision
 from malta.margins.exclusion import growth_over
 from malta.margins.expressions import NotAnalytic, exact
-from malta.margins.family import Family, narrowed
-from malta.margins.parts import Part, cut, without_twins
+from malta.margins.family import Family, narrow
+from malta.margins.parts import Part, cut, merge_twins
 from malta.margins.problem import Polynomial, Problem, hurwitz
-from malta.margins.weak import AnywhereHeld
+from malta.margins.weak_coupling import HeldLoop
 
 if TYPE_CHECKING:
     from malta.margins.box import Box
@@ -34,16 +34,16 @@ def parts_over(problem: Problem, box: Box, reach: float, last: float) -> list[Pa
 
     Raises Unproven when a matrix has no value on the box, or when time is up.
     """
-    sides = box.framed(reach)
-    if isinstance(problem, AnywhereHeld):
-        return problem.enclosed(box, reach)
+    sides = box.frame_sides(reach)
+    if isinstance(problem, HeldLoop):
+        return problem.enclose(box, reach)
     parts: list[Part] = []
     try:
         for polynomial, moves in problem.parts([arb(a).union(arb(b)) for a, b in sides.tolist()]):
             parts += _parts_of(polynomial, box, sides, moves, last)
     except NotAnalytic as error:
         raise Unproven(f"the matrices have no value on the box: {error}") from error
-    return without_twins(parts)
+    return merge_twins(parts)
 
 
 def _parts_of(f: Polynomial, box: Box, sides: FloatArray, moves: tuple[Any, ...], last: float) -> list[Part]:
@@ -61,7 +61,7 @@ def _part(f: Polynomial, box: Box, sides: FloatArray, moves: tuple[Any, ...], la
         if not sides[i, 0] <= own[i, 0] <= own[i, 1] <= sides[i, 1]:
             return []
         ends = [float(whole.shares(np.where(np.arange(len(own)) == i, p, box.nominal))[i]) for p in own[i]]
-        family = narrowed(family, i, min(ends), max(ends))
+        family = narrow(family, i, min(ends), max(ends))
     return [Part(f, own, family, growth_over(own, f.inverted, box))]
 
 

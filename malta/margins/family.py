@@ -121,11 +121,11 @@ def family(
         table[b] = row
     for axis, (n, cheb) in enumerate(zip(shape, chebyshev, strict=True)):
         if n > 2 or (cheb and n > 1):
-            table = _transformed(table, tuple(shape), axis, to_bernstein(n - 1, cheb))
-    return _in_doubles(shape, table, tails)
+            table = _transform(table, tuple(shape), axis, to_bernstein(n - 1, cheb))
+    return _round_to_doubles(shape, table, tails)
 
 
-def narrowed(f: Family, axis: int, low: float, high: float) -> Family:
+def narrow(f: Family, axis: int, low: float, high: float) -> Family:
     """The family over [low, high] of one parameter's side; of one value where these are equal."""
     n = f.shape[axis]
     boxes = np.tile([0.0, 1.0], (1, len(f.shape), 1))
@@ -140,15 +140,17 @@ def narrowed(f: Family, axis: int, low: float, high: float) -> Family:
     return Family(tuple(shape), values, f.radius + slack, f.exponents, f.scale)
 
 
-def aligned(f: Family, g: Family) -> tuple[Family, Family]:
+def align(f: Family, g: Family) -> tuple[Family, Family]:
     """Both with the same degrees, and s counted on f's scale."""
     shape = tuple(max(n, m) for n, m in zip(f.shape, g.shape, strict=True))
     count = max(len(f.values), len(g.values))
     moved = tuple(e + (f.scale - g.scale) * k for k, e in enumerate(g.exponents))
-    return _raised(f, shape, count), _raised(replace(g, exponents=moved, scale=f.scale), shape, count)
+    return _raise_degrees(f, shape, count), _raise_degrees(
+        replace(g, exponents=moved, scale=f.scale), shape, count
+    )
 
 
-def _raised(f: Family, shape: tuple[int, ...], count: int) -> Family:
+def _raise_degrees(f: Family, shape: tuple[int, ...], count: int) -> Family:
     """With higher degrees in the parameters, and coefficients that are zero up to `count`."""
     values, slack = f.values.reshape(len(f.values), *f.shape), 0.0
     for axis, (n, m) in enumerate(zip(f.shape, shape, strict=True)):
@@ -170,7 +172,7 @@ def _raised(f: Family, shape: tuple[int, ...], count: int) -> Family:
     )
 
 
-def combined(f: Family, g: Family, a: float, b: float) -> Family:
+def combine(f: Family, g: Family, a: float, b: float) -> Family:
     """a f + b g of aligned families."""
     top = np.maximum(np.array(f.exponents), np.array(g.exponents))
     x = np.ldexp(1.0, np.clip(np.array(f.exponents) - top, -1070, 0))
@@ -181,7 +183,7 @@ def combined(f: Family, g: Family, a: float, b: float) -> Family:
     return Family(f.shape, values, radius, tuple(int(e) for e in top), f.scale)
 
 
-def _in_doubles(shape: Sequence[int], table: Any, tails: Any) -> Family:
+def _round_to_doubles(shape: Sequence[int], table: Any, tails: Any) -> Family:
     """Bernstein coefficients (nodes x k, exact or balls) as a family."""
     each, count = table.shape
     mantissas, radii, powers = (np.zeros((count, each)) for _ in range(3))
@@ -200,10 +202,10 @@ def _in_doubles(shape: Sequence[int], table: Any, tails: Any) -> Family:
             math.ldexp(m, max(min(e - x, 1000), -1020)) for (m, e), x in zip(tails, exponents, strict=True)
         ]
     moved = tuple(e + scale * k for k, e in enumerate(exponents))
-    return _reduced(Family(tuple(shape), values, np.asarray(radius), moved, scale))
+    return _reduce(Family(tuple(shape), values, np.asarray(radius), moved, scale))
 
 
-def _transformed(table: Any, shape: tuple[int, ...], axis: int, M: Any) -> Any:
+def _transform(table: Any, shape: tuple[int, ...], axis: int, M: Any) -> Any:
     """An exact matrix along one parameter of a tensor of exact values."""
     from flint import arb_mat, fmpq, fmpq_mat
 
@@ -227,7 +229,7 @@ def scale_of(top: FloatArray) -> int:
     return round(float(top[first] - top[last]) / int(last - first))
 
 
-def _reduced(f: Family) -> Family:
+def _reduce(f: Family) -> Family:
     """Degrees that contribute less than rounding become part of the radius."""
     shape, values, radius = list(f.shape), f.values, f.radius.copy()
     size = np.abs(values).max(axis=1)
@@ -240,7 +242,7 @@ def _reduced(f: Family) -> Family:
             # u^d less its best approximation of a lower degree is below 2^(1 - 2 d) on [0, 1]
             if not (lead * 2.0 ** (1 - 2 * d) <= 64 * EPS * 4**d * size).all():
                 break
-            array, error = _lowered(array, d)
+            array, error = _lower_degree(array, d)
             values = np.moveaxis(array, -1, axis + 1).reshape(len(values), -1)
             shape[axis] = d
             radius += error
@@ -248,7 +250,7 @@ def _reduced(f: Family) -> Family:
     return Family(tuple(shape), values, radius, f.exponents, f.scale)
 
 
-def _lowered(array: FloatArray, d: int) -> tuple[FloatArray, FloatArray]:
+def _lower_degree(array: FloatArray, d: int) -> tuple[FloatArray, FloatArray]:
     """Bernstein coefficients of degree d -> d - 1, and what that leaves out: the degree raised again, compared."""
     raise_ = np.zeros((d + 1, d))
     for i in range(d):

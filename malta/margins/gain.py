@@ -126,11 +126,11 @@ def worst_case_gain(
         worst = asked.problem.instability(np.array(starts))
         if worst.max() >= 0:
             p = starts[int(worst.argmax())]
-            lower, w = math.inf, asked.problem.critical(p)
+            lower, w = math.inf, asked.problem.critical_frequency(p)
         else:
             last_climb = begun + SEARCH * (until - begun)
             lower, w, p = climb(value, asked.problem, box.sides(1.0), starts, last_climb)
-        upper, cells, reason = _proven(asked, lower, tolerance, until)
+        upper, cells, reason = _prove(asked, lower, tolerance, until)
     named = dict(zip(box.names, p.tolist(), strict=True))
     return Gain(lower, upper, w, named, cells, clock.monotonic() - begun, reason)
 
@@ -156,7 +156,7 @@ def _performance_block(system: UncertainSystem, of: Of, at: At, channel: Any) ->
     return Block(of, "sensors", driven, read, one)  # type: ignore[arg-type]
 
 
-def _proven(asked: Blocks, lower: float, tolerance: float, until: float) -> tuple[float | None, int, str]:
+def _prove(asked: Blocks, lower: float, tolerance: float, until: float) -> tuple[float | None, int, str]:
     """The smallest bound of those tried that holds, the cells that were looked at, and why there is none."""
     if not math.isfinite(lower):
         return None, 0, "the box holds an unstable loop"

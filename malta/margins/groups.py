@@ -23,13 +23,13 @@ from malta.margins.algebra import (
     TooLarge,
     symbolic,
 )
+from malta.margins.arguments import plural
 from malta.margins.expressions import (
     NotAnalytic,
     Program,
     exact,
     program,
 )
-from malta.margins.given import counted
 from malta.margins.uncertain import Compensator, UncertainSystem
 
 if TYPE_CHECKING:
@@ -108,7 +108,7 @@ def loop_of(system: UncertainSystem, law: Compensator) -> UncertainLoop:
                 "compensator",
                 name,
                 f"shape {matrix.shape}",
-                f"{shape}: {counted(p, 'output')}, {counted(m, 'input')}",
+                f"{shape}: {plural(p, 'output')}, {plural(m, 'input')}",
             )
         if not np.isfinite(matrix).all():
             raise InputError("compensator", name, "NaN or infinity", "finite numbers")
@@ -143,7 +143,7 @@ def groups(loop: UncertainLoop) -> list[Group]:
     if loop.direct:
         return [Group(tuple(range(n)), tuple(range(len(law.A))), None)]
     s = loop.symbolic
-    touch = _touching(loop) if s is None else _coupled(loop, s)
+    touch = _coupling_pattern(loop) if s is None else _nonzero_couplings(loop, s)
     if loop.descriptor:
         for i, j, _ in loop.program.entries[E]:
             touch[i, j] = touch[j, i] = True
@@ -158,7 +158,7 @@ def groups(loop: UncertainLoop) -> list[Group]:
     return found
 
 
-def _touching(loop: UncertainLoop) -> Any:
+def _coupling_pattern(loop: UncertainLoop) -> Any:
     """Couplings by patterns alone, where terms that cancel count."""
     law, (n, m), p = loop.law, loop.program.shapes[B], loop.program.shapes[C][0]
     a, b, c = np.zeros((n, n), dtype=bool), np.zeros((n, m), dtype=bool), np.zeros((p, n), dtype=bool)
@@ -169,7 +169,7 @@ def _touching(loop: UncertainLoop) -> Any:
     return np.block([[a | (b @ (law.D != 0) @ c), b @ (law.C != 0)], [(law.B != 0) @ c, own]])
 
 
-def _coupled(loop: UncertainLoop, s: Symbolic) -> Any:
+def _nonzero_couplings(loop: UncertainLoop, s: Symbolic) -> Any:
     """Couplings that are not zero as exact expressions."""
     law, n, k = loop.law, loop.states, len(loop.law.A)
     touch = np.zeros((n + k, n + k), dtype=bool)
@@ -182,7 +182,7 @@ def _coupled(loop: UncertainLoop, s: Symbolic) -> Any:
     for (b, j), r in s.entries[C].items():
         columns.setdefault(j, []).append((b, r))
 
-    def stays(parts: list[Ratio]) -> bool:
+    def is_nonzero(parts: list[Ratio]) -> bool:
         if len(parts) < 2:
             return bool(parts)
         total = parts[0]
@@ -192,14 +192,14 @@ def _coupled(loop: UncertainLoop, s: Symbolic) -> Any:
 
     for i, row in rows.items():
         for j, column in columns.items():
-            touch[i, j] |= stays(
+            touch[i, j] |= is_nonzero(
                 [r * s.constant(law.D[a, b]) * q for a, r in row for b, q in column if law.D[a, b]]
             )
         for j in range(k):
-            touch[i, n + j] = stays([r * s.constant(law.C[a, j]) for a, r in row if law.C[a, j]])
+            touch[i, n + j] = is_nonzero([r * s.constant(law.C[a, j]) for a, r in row if law.C[a, j]])
     for j, column in columns.items():
         for i in range(k):
-            touch[n + i, j] = stays([q * s.constant(law.B[i, b]) for b, q in column if law.B[i, b]])
+            touch[n + i, j] = is_nonzero([q * s.constant(law.B[i, b]) for b, q in column if law.B[i, b]])
     touch[n:, n:] = law.A != 0
     return touch
 
@@ -234,7 +234,7 @@ def upper(z: Any) -> float:
     return x + 1e-9 * abs(x)
 
 
-def divided(loop: UncertainLoop, s: Symbolic) -> tuple[dict[tuple[int, int], Ratio], ...]:
+def divide_by_descriptor(loop: UncertainLoop, s: Symbolic) -> tuple[dict[tuple[int, int], Ratio], ...]:
     """Entries of A and B, over the diagonal of E; as they are where E is not diagonal."""
     if not loop.descriptor or any(i != j for i, j in s.entries[E]):
         return s.entries

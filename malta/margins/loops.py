@@ -20,7 +20,7 @@ import numpy as np
 
 from malta.errors import InputError
 from malta.margins.plants import of_plant
-from malta.margins.uncertain import Compensator, UncertainSystem, held_at, holds, sampled_law
+from malta.margins.uncertain import Compensator, UncertainSystem, held_gain, is_commutated, sampled_law
 from malta.model.data import plant_of
 from malta.model.linearize import LinearModel, linearize
 from malta.model.plant import position_at, position_in, trim
@@ -160,9 +160,9 @@ def machine_system(
 ) -> tuple[UncertainSystem, Compensator]:
     """The machine at a position in parameters by name, and its law: what its margin is asked of. See `machine_law`."""
     believed = plant_of(controller.parameters)
-    if not holds(believed):
+    if not is_commutated(believed):
         return of_plant(plant, names, at=at, believed=believed), machine_law(plant, controller, current_loops)
-    H = held_at(believed, position_in(believed, believed.at(**at).x))
+    H = held_gain(believed, position_in(believed, believed.at(**at).x))
     system = of_plant(plant, names, at=at, believed=believed, held=H)
     handed = system.matrices.size2_out(1) > len(H)
     return system, machine_law(plant, controller, current_loops, held=H, handed=handed)

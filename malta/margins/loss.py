@@ -23,7 +23,7 @@ STEP = 1e-6  # of a range, for slopes of the worst root
 ROUNDS = 6  # from corner to corner
 
 
-def loss_of_one(problem: Problem, box: Box, reach: float) -> float | None:
+def single_parameter_loss(problem: Problem, box: Box, reach: float) -> float | None:
     """About the first t up to `reach` at which the loop is unstable, where one parameter grows to one side alone.
 
     From above; infinite where there is none, None where several parameters grow.
@@ -33,7 +33,7 @@ def loss_of_one(problem: Problem, box: Box, reach: float) -> float | None:
         return None
     d = np.zeros(len(box.names))
     d[ends[0][0]] = ends[0][1]
-    places = box.standing()[:3]
+    places = box.nominal_places()[:3]
 
     def unstable(t: FloatArray) -> FloatArray:
         rows = (places[None] + t[:, None, None] * d).reshape(-1, len(d))
@@ -56,7 +56,7 @@ def first_loss(problem: Problem, box: Box, reach: float) -> Loss:
     free = [i for i in range(len(box.names)) if box.down[i] + box.up[i] > 0]
     signs = np.array(list(itertools.islice(itertools.product((-1, 1), repeat=len(free)), 256)))
     best: Loss = (math.inf, None, None)
-    for place in box.standing()[:27]:
+    for place in box.nominal_places()[:27]:
         for sign in signs:
             d = np.zeros(len(box.names))
             d[free] = np.where(sign > 0, box.up[free], -box.down[free])
@@ -64,11 +64,11 @@ def first_loss(problem: Problem, box: Box, reach: float) -> Loss:
             if t < best[0]:
                 p = place + t * d
                 best = (t, _critical(problem, p, place), p)
-        best = _turned(problem, box, place, best)
+        best = _improve_corner(problem, box, place, best)
     return best
 
 
-def _turned(problem: Problem, box: Box, place: FloatArray, best: Loss) -> Loss:
+def _improve_corner(problem: Problem, box: Box, place: FloatArray, best: Loss) -> Loss:
     """The loss at the corner that the slopes of the worst root point to, as long as that comes nearer."""
     for _ in range(ROUNDS):
         t, _, p = best
@@ -104,7 +104,7 @@ def _critical(problem: Problem, p: FloatArray, place: FloatArray) -> float | Non
     """Frequency of the worst root, a little beyond p where the loop has none there (a mass of zero)."""
     for share in (1.0, 1 + 1e-9, 1 + 1e-6):
         try:
-            found = problem.critical(place + share * (p - place))
+            found = problem.critical_frequency(place + share * (p - place))
         except (CheckError, np.linalg.LinAlgError, NotAnalytic):
             continue
         if np.isfinite(found):

@@ -18,14 +18,14 @@ import numpy as np
 from flint import acb_mat, arb, arb_mat, arb_poly, fmpq_mat, fmpq_poly
 
 from malta.margins.closed import (
-    beside,
+    add_lag,
     columns,
     dense,
     driven_bounds,
     hold,
-    lagged,
+    join_columns,
     rows_of,
-    solved,
+    solve,
 )
 from malta.margins.expressions import NotAnalytic, Program, exact
 from malta.margins.groups import A, B, C, E, Group, UncertainLoop, rational, upper
@@ -107,10 +107,10 @@ class Minors:
         b = dense(matrix, a.nrows(), r, ((i, k, 1) for k, i in enumerate(self.rows)))
         if self.loop.sampled:
             if law.lag is not None:
-                a, b, c, _ = lagged(matrix, a, b, c, None, arb(law.lag))
+                a, b, c, _ = add_lag(matrix, a, b, c, None, arb(law.lag))
             a, b = hold(matrix, a, b, arb(law.sample_time))
         elif law.lag is not None:
-            a, b, c, _ = lagged(matrix, a, b, c, None, exact(law.lag))
+            a, b, c, _ = add_lag(matrix, a, b, c, None, exact(law.lag))
         elif law.sample_time is not None:
             a = a - dense(matrix, a.nrows(), a.nrows(), ((i, i, 1) for i in range(a.nrows())))
         found = _minors(a, b, c, len(self.rows), len(self.outputs), self.order)
@@ -125,7 +125,7 @@ class Minors:
         if self.loop.descriptor:
             e = dense(matrix, n, n, ((x[i], x[j], r) for i, j, r in entries[E] if i in x and j in x))
             factor = e.det()
-            a = solved(e, a)
+            a = solve(e, a)
         return a, c, factor
 
     def forces(self, entries: list[list[tuple[int, int, Any]]], matrix: Any) -> dict[Pair, Any]:
@@ -135,7 +135,7 @@ class Minors:
         own = {(x[i], u[j]): r for i, j, r in entries[B] if i in x and j in u}
         if self.loop.descriptor:
             e = dense(matrix, n, n, ((x[i], x[j], r) for i, j, r in entries[E] if i in x and j in x))
-            b = solved(e, dense(matrix, n, len(u), ((*at, r) for at, r in own.items())))
+            b = solve(e, dense(matrix, n, len(u), ((*at, r) for at, r in own.items())))
             own = {(i, j): b[i, j] for i in range(n) for j in range(len(u))}
         found: dict[Pair, Any] = {}
         for k in range(1, self.order + 1):
@@ -147,7 +147,7 @@ class Minors:
                         found[R, T] = det
         return found
 
-    def joined(self, pi: dict[Pair, Any], beta: dict[Pair, Any], matrix: Any) -> list[Any]:
+    def combine(self, pi: dict[Pair, Any], beta: dict[Pair, Any], matrix: Any) -> list[Any]:
         """a_0 ... a_N from the minors."""
         kappa = self.balls[0 if matrix is fmpq_mat else 1]
         total = pi[(), ()] * kappa[(), ()]
@@ -202,16 +202,16 @@ class Minors:
         result: list[Any] = []
         for (S, R), pi in sizes.pi.items():
             names = tuple(self.outputs[s] for s in S)
-            weight = [] if R else self._absolute[(), ()]
+            weight = [] if R else self._absolute_kappa[(), ()]
             for T in itertools.combinations(self.inputs, len(R)) if R else ():
                 if sizes.beta[R, T]:
-                    weight = _sum(weight, [arb(sizes.beta[R, T]) * x for x in self._absolute[T, names]])
+                    weight = _sum(weight, [arb(sizes.beta[R, T]) * x for x in self._absolute_kappa[T, names]])
             if weight:
                 result = _sum(result, _product(pi, weight))
         return result
 
     @cached_property
-    def _absolute(self) -> dict[Pair, list[Any]]:
+    def _absolute_kappa(self) -> dict[Pair, list[Any]]:
         return {pair: [arb(abs(x)) for x in p.coeffs()] for pair, p in self.balls[0].items()}
 
     @property
@@ -306,8 +306,8 @@ def _sizes(
     b_balls = [(x[i], u[j], z) for i, j, z in entries[B] if i in x and j in u]
     if len(entries) > E:
         e = dense(acb_mat, n, n, ((x[i], x[j], z) for i, j, z in entries[E] if i in x and j in x))
-        both = beside(acb_mat, dense(acb_mat, n, n, a_balls), dense(acb_mat, n, len(u), b_balls))
-        ab = solved(e, both)
+        both = join_columns(acb_mat, dense(acb_mat, n, n, a_balls), dense(acb_mat, n, len(u), b_balls))
+        ab = solve(e, both)
         a_balls = [(i, j, ab[i, j]) for i in range(n) for j in range(n)]
         b_balls = [(i, j, ab[i, n + j]) for i in range(n) for j in range(len(u))]
 

@@ -74,12 +74,12 @@ def _halves(sides: FloatArray, axis: int, nominal: float) -> list[FloatArray]:
     return found
 
 
-def without_twins(parts: list[Part]) -> list[Part]:
+def merge_twins(parts: list[Part]) -> list[Part]:
     """One family for groups whose coefficients agree to rounding, as those of a round body's planes do."""
     kept: list[Part] = []
     for part in parts:
         for k, other in enumerate(kept):
-            both = _together(other, part)
+            both = _merge(other, part)
             if both is not None:
                 kept[k] = both
                 break
@@ -88,7 +88,7 @@ def without_twins(parts: list[Part]) -> list[Part]:
     return kept
 
 
-def _together(one: Part, two: Part) -> Part | None:
+def _merge(one: Part, two: Part) -> Part | None:
     """A part whose radius covers both families; None where they differ by more than rounding."""
     f, g = one.family, two.family
     if one.around is not None or two.around is not None:

@@ -15,16 +15,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from malta.margins.degrees import cleared
+from malta.margins.degrees import clear_denominators
 from malta.margins.expansion import (
     EPS,
     Expansion,
     constant,
-    stacked,
+    stack,
     table,
 )
 from malta.margins.groups import C, Group, UncertainLoop
-from malta.margins.series import held, square_held
+from malta.margins.series import hold_series, square_hold_series
 
 if TYPE_CHECKING:
     from malta.margins.expansion import Table
@@ -49,7 +49,7 @@ class Pencil:
             return self.constant, self.linear
         d = self.dynamic
 
-        def picked(one: Expansion, two: Expansion | None, sign: float) -> Expansion:
+        def pick(one: Expansion, two: Expansion | None, sign: float) -> Expansion:
             zero = np.zeros_like(one.middle)
             return Expansion(
                 np.where(d[:, None], sign * one.middle, zero if two is None else two.middle),
@@ -58,7 +58,7 @@ class Pencil:
             )
 
         # P_1 + P_0 / (j x) = P_1 - j (1 / x) P_0
-        return picked(self.linear, self.constant, 1.0), picked(self.constant, None, -1.0)
+        return pick(self.linear, self.constant, 1.0), pick(self.constant, None, -1.0)
 
 
 class Rows:
@@ -69,7 +69,7 @@ class Rows:
         assert s is not None
         self.loop, self.group, self.count = loop, group, loop.program.inputs
         n, p = len(group.states), self.count
-        found, one = cleared(loop, group, s), s.context.constant(1)
+        found, one = clear_denominators(loop, group, s), s.context.constant(1)
         state = {j: k for k, j in enumerate(group.states)}
         self.inputs = sorted({at[1] for row in found for at in row if at is not None and at[0] == "u"})
         u = {j: k for k, j in enumerate(self.inputs)}
@@ -80,7 +80,7 @@ class Rows:
         ]  # fmt: skip
         y, m = len(self.reads), len(self.inputs)
 
-        def picked(rows: list[dict[Any, Any]], kind: str, columns: dict[int, int]) -> Table:
+        def pick(rows: list[dict[Any, Any]], kind: str, columns: dict[int, int]) -> Table:
             entries = {
                 (i, columns[at[1]]): polynomial
                 for i, row in enumerate(rows)
@@ -93,9 +93,9 @@ class Rows:
             return table((len(rows),) * 2, {(i, i): row.get(None, one) for i, row in enumerate(rows)}, p)
 
         own, out = found[:n], [found[n + k] for k in self.reads]
-        self.A, self.B, self.dens = picked(own, "x", state), picked(own, "u", u), below(own)
-        self.E = picked(own, "e", state) if loop.descriptor else self.dens
-        self.C, self.D, self.below = picked(out, "x", state), picked(out, "u", u), below(out)
+        self.A, self.B, self.dens = pick(own, "x", state), pick(own, "u", u), below(own)
+        self.E = pick(own, "e", state) if loop.descriptor else self.dens
+        self.C, self.D, self.below = pick(out, "x", state), pick(out, "u", u), below(out)
         assert (self.C.shape, self.D.shape) == ((y, n), (y, m))
 
     @property
@@ -122,7 +122,7 @@ class Rows:
             if not (least > 1e-9 * np.abs(np.diag(d.middle))).all():
                 return None
         plant = self._plant(dens, c, r)
-        return None if plant is None else self._joined(plant, below, c, r)
+        return None if plant is None else self._join(plant, below, c, r)
 
     def _lifts(self, c: FloatArray) -> bool:
         """Whether a hold's square, Y^2 / 12 of c(Y), is written out by w = Y x, as more rows, each of them linear.
@@ -133,7 +133,7 @@ class Rows:
         if T is None or not self.liftable:
             return False
         A, dens = self.A.over(c, r), self.dens.over(c, r)
-        whole, beyond = square_held(A, dens, T), square_held(A, dens, T, beyond=True)
+        whole, beyond = square_hold_series(A, dens, T), square_hold_series(A, dens, T, beyond=True)
         return whole is not None and beyond is not None and beyond.rest.sum() < LESS * whole.rest.sum()
 
     @property
@@ -150,19 +150,19 @@ class Rows:
             n, m = B.middle.shape
             own, none = constant(law.lag * np.eye(m), self.count), constant(np.zeros((m, n)), self.count)
             unit, beside = constant(np.eye(m), self.count), constant(np.zeros((n, m)), self.count)
-            A = stacked([[A, B], [none, own.times(-1)]])
-            E, dens = (stacked([[part, beside], [none, unit]]) for part in (E, dens))
-            B = stacked([[beside], [own]])
+            A = stack([[A, B], [none, own.times(-1)]])
+            E, dens = (stack([[part, beside], [none, unit]]) for part in (E, dens))
+            B = stack([[beside], [own]])
         if T is None:
             return A.times(-1), E, B.times(-1), B.times(0)
         if not loop.sampled:
             return E + A.times(-1), E + A, B.times(-1), B
         lifted = self._lifts(c)
-        curved = square_held(A, dens, T, beyond=lifted)
+        curved = square_hold_series(A, dens, T, beyond=lifted)
         if curved is not None:
             lift = (A.times(T / 6), dens) if lifted else ()
             return A.times(-T), curved, B.times(-T), B.times(T), *lift
-        found = held(A, B, dens, T)
+        found = hold_series(A, B, dens, T)
         if found is None:
             return None
         change, driven = found
@@ -173,7 +173,7 @@ class Rows:
             driven,
         )
 
-    def _joined(self, plant: tuple[Expansion, ...], below: Expansion, c: FloatArray, r: FloatArray) -> Pencil:
+    def _join(self, plant: tuple[Expansion, ...], below: Expansion, c: FloatArray, r: FloatArray) -> Pencil:
         """Columns: x with lags, the compensator's states, stored inputs, y, and Y x where the hold is lifted."""
         law, own, late = self.loop.law, list(self.group.own), self.loop.law.delay
         n, k, m, y = len(plant[0].middle), len(own), len(self.inputs), len(self.reads)

@@ -13,11 +13,11 @@ import numpy as np
 from malta.errors import InputError
 from malta.margins import compact
 from malta.margins.algebra import Ratio, TooLarge
-from malta.margins.given import described
+from malta.margins.arguments import describe
 from malta.margins.uncertain import (
     UncertainSystem,
-    holds,
-    lowest,
+    is_commutated,
+    lower_limit,
     model_of,
 )
 from malta.model.parameters import shape_parameters, units_of
@@ -51,7 +51,7 @@ def of_plant(
     par = plant.parameters
     known = [*units_of(par), *((plant.stroke,) if plant.has_stroke else ())]
     if not isinstance(names, tuple | list):
-        raise InputError("uncertain", "names", described(names), "names of parameters, as a tuple or a list")
+        raise InputError("uncertain", "names", describe(names), "names of parameters, as a tuple or a list")
     for name in names:
         if name not in known:
             raise InputError("uncertain", f"{name}", "an unknown parameter", "one of " + " ".join(known))
@@ -67,13 +67,15 @@ def of_plant(
     own = [k for k, name in enumerate(names) if name != plant.stroke]
     z = p[names.index(plant.stroke)] if plant.stroke in names else position
     nominal = [position if name == plant.stroke else getattr(par, name) for name in names]
-    short = _written_out(of, p, z, np.array(nominal, dtype=float), held) if holds(plant) else None
+    short = (
+        _expanded_matrices(of, p, z, np.array(nominal, dtype=float), held) if is_commutated(plant) else None
+    )
     if short is not None:
         A, B, C = short
     else:
         acting = of(p[own], z, ca.DM.zeros(len(plant.inputs)))[-1]
         v = acting
-        if holds(plant):  # what has to be wanted so that the preload acts
+        if is_commutated(plant):  # what has to be wanted so that the preload acts
             made, ratio = of(p[own], z, acting)[4:6]
             v = acting + ca.solve(ratio, acting - made)
         A, B, C, E = of(p[own], z, v)[:4]
@@ -82,13 +84,13 @@ def of_plant(
             B = ca.horzcat(B, left)
     if states:
         C = ca.vertcat(C, ca.DM.eye(len(plant.controlled)))
-    bounds = {f.name: lowest(f.metadata) for f in fields(par)}
+    bounds = {f.name: lower_limit(f.metadata) for f in fields(par)}
     limits = tuple((bounds.get(name, -math.inf), math.inf) for name in names)
     matrices = ca.Function("matrices", [p], [A, B, C])
     return UncertainSystem(tuple(names), readonly(nominal), matrices, limits=limits)
 
 
-def _written_out(
+def _expanded_matrices(
     of: ca.Function, p: Any, z: Any, nominal: FloatArray, held: FloatArray | None
 ) -> tuple[Any, Any, Any] | None:
     """A, B, C of held currents as the short rational functions of p that they are; None where they are none."""
@@ -102,27 +104,27 @@ def _written_out(
         return None
     scales = np.concatenate([nominal, np.array(model(np.r_[nominal, np.zeros(m)])[-1]).ravel()])
     try:
-        s, tables = compact.written_out(model, scales)
+        s, tables = compact.expand_matrices(model, scales)
     except TooLarge:
         return None
     A, B, C, E, made, ratio, preload = tables
     zero = Ratio(s.context.constant(0))
     acting = {k + i: preload.get((i, 0), zero) for i in range(m)}
-    left = {i: acting[k + i] - compact.substituted(s, made.get((i, 0), zero), acting) for i in range(m)}
-    ratio = {at: compact.substituted(s, r, acting) for at, r in ratio.items()}
+    left = {i: acting[k + i] - compact.substitute(s, made.get((i, 0), zero), acting) for i in range(m)}
+    ratio = {at: compact.substitute(s, r, acting) for at, r in ratio.items()}
     moved = compact.solution(
         s, ratio, left, m
     )  # what has to be wanted beyond the preload so that the preload acts
     wanted = {k + i: acting[k + i] + moved[i] for i in range(m)}
-    A, B, C, E = ({at: compact.substituted(s, r, wanted) for at, r in t.items()} for t in (A, B, C, E))
+    A, B, C, E = ({at: compact.substitute(s, r, wanted) for at, r in t.items()} for t in (A, B, C, E))
     n, outputs = of.size1_out(0), of.size1_out(2)
     rest: compact.Table = {}
     if held is not None:
         carried = compact.product(E, C)
-        A = compact.rounded(s, compact.difference(A, carried), scales, A, carried)
+        A = compact.drop_rounding(s, compact.difference(A, carried), scales, A, carried)
         gains = {(i, j): s.constant(float(x)) for (i, j), x in np.ndenumerate(held) if x}
-        rest = compact.rounded(s, compact.difference(E, compact.product(B, gains)), scales, E)
-    if not compact.free_of_functions(s, (A, B, C, rest)):
+        rest = compact.drop_rounding(s, compact.difference(E, compact.product(B, gains)), scales, E)
+    if not compact.is_free_of_functions(s, (A, B, C, rest)):
         return None
     b = compact.matrix_of(B, (n, m), p)
     if rest:

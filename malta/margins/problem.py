@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from flint import acb, arb, arb_mat, fmpq
 
-from malta.margins import dust
+from malta.margins import rounding
 from malta.margins.algebra import Symbolic, TooLarge, symbolic
 from malta.margins.characteristic import (
     Characteristic,
-    mapped,
-    outward,
+    map_bilinear,
+    map_bounds,
     pair,
 )
 from malta.margins.closed import closed_loop
@@ -33,7 +33,7 @@ from malta.margins.expressions import (
 from malta.margins.family import binary
 from malta.margins.groups import Group, UncertainLoop
 from malta.margins.uncertain import closed_loop as closed_matrices
-from malta.margins.uncertain import critical, instability
+from malta.margins.uncertain import critical_frequency, instability
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
@@ -54,7 +54,7 @@ class Polynomial(Protocol):
     def degrees(self) -> tuple[int | None, ...]: ...
     def at(self, v: Sequence[Any]) -> list[Any]: ...
     def majorant(self, v: Sequence[Any]) -> list[tuple[float, int]]: ...
-    def neglected(
+    def coupling_bounds(
         self, moves: Sequence[Any], sides: Sequence[tuple[Any, Any]]
     ) -> list[tuple[float, int]] | None: ...
 
@@ -68,7 +68,7 @@ class Problem(Protocol):
     def instability(self, rows: FloatArray) -> FloatArray:
         """How far the worst root is beyond the boundary at rows of parameters, in floating point."""
 
-    def critical(self, p: FloatArray) -> float:
+    def critical_frequency(self, p: FloatArray) -> float:
         """Frequency of the worst root, rad/s."""
 
     def physical(self, x: float) -> float:
@@ -85,14 +85,14 @@ class OfLoop:
     neglect: bool = True  # whether couplings that are only rounding are taken as zero, and accounted for
 
     @cached_property
-    def couplings(self) -> dust.Couplings | None:
+    def couplings(self) -> rounding.Couplings | None:
         if self.loop.symbolic is None or not self.neglect:
             return None
-        return dust.Couplings(self.loop, self.loop.symbolic)
+        return rounding.Couplings(self.loop, self.loop.symbolic)
 
     def parts(self, p: Sequence[Any]) -> list[tuple[Polynomial, tuple[Any, ...]]]:
         found: list[tuple[Polynomial, tuple[Any, ...]]] = []
-        for part in dust.parts(self.loop, self.couplings, p):
+        for part in rounding.parts(self.loop, self.couplings, p):
             key = (part.group.states, part.group.own)
             if key not in self.known:
                 self.known[key] = Characteristic(self.loop, part.group, self.names)
@@ -142,9 +142,9 @@ class OfLoop:
         with np.errstate(divide="ignore"):
             return np.log(1 + found.astype(complex)) / T
 
-    def critical(self, p: FloatArray) -> float:
+    def critical_frequency(self, p: FloatArray) -> float:
         if self._plain:
-            return critical(self.loop.system, self.loop.law, p)
+            return critical_frequency(self.loop.system, self.loop.law, p)
         poles, T = self._poles(p), self.loop.law.sample_time
         if T is None:
             return float(abs(poles[poles.real.argmax()].imag))
@@ -167,9 +167,11 @@ class OfSeveral:
     def instability(self, rows: FloatArray) -> FloatArray:
         return np.asarray(np.max([problem.instability(rows) for problem in self.problems], axis=0))
 
-    def critical(self, p: FloatArray) -> float:
+    def critical_frequency(self, p: FloatArray) -> float:
         rows = p[None]
-        return max(self.problems, key=lambda problem: float(problem.instability(rows)[0])).critical(p)
+        return max(self.problems, key=lambda problem: float(problem.instability(rows)[0])).critical_frequency(
+            p
+        )
 
     def physical(self, x: float) -> float:
         return self.problems[0].physical(x)
@@ -246,7 +248,7 @@ class OfCoefficients:
         scale = self._common(*v) if self.exact and self._common is not None else 1
         for i, _, x in entries:
             a[i] = x * scale
-        return mapped(_about_one(a)) if self.discrete else a
+        return map_bilinear(_about_one(a)) if self.discrete else a
 
     def majorant(self, v: Sequence[Any]) -> list[tuple[float, int]]:
         (entries,) = self.program.run([acb(x) for x in v], BALLS)
@@ -254,12 +256,12 @@ class OfCoefficients:
         for i, _, x in entries:
             a[i] = abs(x)
         if self.discrete:  # z = 1 + g
-            a = outward(
+            a = map_bounds(
                 [sum((c * math.comb(k, j) for k, c in enumerate(a) if k >= j), arb(0)) for j in range(len(a))]
             )
         return [pair(x) for x in a]
 
-    def neglected(
+    def coupling_bounds(
         self, moves: Sequence[Any], sides: Sequence[tuple[Any, Any]]
     ) -> list[tuple[float, int]] | None:
         del moves, sides
@@ -310,7 +312,7 @@ class OfPolynomial:
             found.append(float(sizes.max(initial=-math.inf)))
         return np.array(found)
 
-    def critical(self, p: FloatArray) -> float:
+    def critical_frequency(self, p: FloatArray) -> float:
         roots = self._roots(p)
         if self.polynomial.discrete:
             return float(abs(np.angle(roots[np.abs(roots).argmax()])))

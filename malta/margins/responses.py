@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from malta.margins.uncertain import Compensator, UncertainSystem, differences
+from malta.margins.uncertain import Compensator, UncertainSystem, difference_form
 from malta.synthesis.riccati import sample
 
 if TYPE_CHECKING:
@@ -55,7 +55,7 @@ def responses(system: UncertainSystem, law: Compensator, p: FloatArray, w: Float
             A, B = A @ Phi / T, Phi @ B / T
         else:
             A, B = (A - np.eye(len(A))) / T, B / T
-    F_A, F_B = differences(law)
+    F_A, F_B = difference_form(law)
     at = s[:, None, None]
     G = (C @ np.linalg.solve(at * np.eye(len(A)) - A, B) + D) * turned[:, None, None]
     F = law.C @ np.linalg.solve(at * np.eye(len(F_A)) - F_A, F_B) + law.D
@@ -63,7 +63,7 @@ def responses(system: UncertainSystem, law: Compensator, p: FloatArray, w: Float
     return Responses(G[:, :q, :m], G[:, :q, m:], G[:, q:, :m], np.asarray(F, dtype=complex))
 
 
-def largest(sizes: Callable[[FloatArray], FloatArray], w: FloatArray) -> tuple[FloatArray, FloatArray]:
+def find_peaks(sizes: Callable[[FloatArray], FloatArray], w: FloatArray) -> tuple[FloatArray, FloatArray]:
     """The largest value of each column of sizes(w) (k x n) over the frequencies w, and where it lies (rad/s).
 
     The grid is refined three times around each peak.

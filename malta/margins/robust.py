@@ -22,16 +22,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from malta.errors import InputError
-from malta.margins.box import Box, box_of
-from malta.margins.expressions import program
-from malta.margins.given import (
+from malta.margins.arguments import (
     by_name,
-    described,
+    describe,
     interval,
     is_pair,
     number,
     positive,
 )
+from malta.margins.box import Box, box_of
+from malta.margins.expressions import program
 from malta.margins.groups import loop_of
 from malta.margins.problem import (
     OfCoefficients,
@@ -181,7 +181,7 @@ def _pairs(places: Any) -> list[tuple[UncertainSystem, Any]]:
     found = list(places) if isinstance(places, Iterable) and not isinstance(places, str) else []
     if not found or not all(is_pair(place) for place in found):
         wanted = "pairs of a system and its compensator, at least one"
-        raise InputError("common_margin", "places", described(places), wanted)
+        raise InputError("common_margin", "places", describe(places), wanted)
     return [(system, law) for system, law in found]
 
 
@@ -211,7 +211,7 @@ def margin_at(
 def law_of(system: UncertainSystem, compensator: Any, caller: str = "robust_margin") -> Compensator:
     """A compensator as a record, on the system's clock. Raises InputError, also where the system is none."""
     if not isinstance(system, UncertainSystem):
-        raise InputError(caller, "system", described(system), "a malta.uncertain system")
+        raise InputError(caller, "system", describe(system), "a malta.uncertain system")
     f = system.matrices
     law = compensator_of(compensator, f.size1_out(2), f.size2_out(1)) if f.n_out() >= 3 else compensator
     if system.sample_time is not None and law.sample_time is None and not len(law.A):
@@ -312,9 +312,9 @@ def margin_of(problem: Problem, box: Box, effort: Effort) -> Margin:
     from malta.margins.search import Job
 
     begun = clock.monotonic()
-    unstable = problem.instability(box.standing()) >= 0
+    unstable = problem.instability(box.nominal_places()) >= 0
     if unstable.any():
-        where = dict(zip(box.names, box.standing()[unstable.argmax()].tolist(), strict=True))
+        where = dict(zip(box.names, box.nominal_places()[unstable.argmax()].tolist(), strict=True))
         spent = clock.monotonic() - begun
         return Margin(0.0, 0.0, None, where, {}, {}, (), spent, "the nominal loop is unstable")
     until = deadline(begun, effort.time)

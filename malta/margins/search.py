@@ -18,12 +18,12 @@ from malta.margins.descent import from_cell, nearest
 from malta.margins.enclosure import Unproven
 from malta.margins.exclusion import Search, advance, start
 from malta.margins.families import is_nominal_stable, parts_over
-from malta.margins.loss import first_loss, loss_of_one
+from malta.margins.loss import first_loss, single_parameter_loss
 from malta.margins.parts import Part
 from malta.margins.problem import Problem
 from malta.margins.robust import Certificate, Margin, Progress
 from malta.margins.structured import Structured, rows_of
-from malta.margins.weak import AnywhereHeld
+from malta.margins.weak_coupling import HeldLoop
 from malta.margins.witness import Zero, starts
 
 if TYPE_CHECKING:
@@ -130,7 +130,7 @@ class Job:
             self.reasons.append(
                 why or f"nothing beyond {done:.3g} was looked at: the model is dear to enclose"
             )
-        room = NEAR if isinstance(self.problem, AnywhereHeld) else 1.05  # couplings grow with the box
+        room = NEAR if isinstance(self.problem, HeldLoop) else 1.05  # couplings grow with the box
         if self.upper < done / (3 if room > NEAR else room) and not self.late():
             with suppress(Unproven):  # narrower families over a smaller box; the larger ones remain valid
                 parts = parts_over(self.problem, self.box, room * self.upper, self.until)
@@ -139,7 +139,7 @@ class Job:
 
     def _first(self) -> float:
         """The size of the first box: for a single parameter a little beyond the loss by the poles, else FIRST."""
-        t = loss_of_one(self.problem, self.box, self.limit)
+        t = single_parameter_loss(self.problem, self.box, self.limit)
         return min(self.limit, FIRST if t is None else 1.02 * t)
 
     def _descend(self, part: Part) -> None:
@@ -265,7 +265,7 @@ class Job:
         worst = min((s for _, s in searches), key=lambda s: s.lower)
         if worst.lower >= self.upper * (1 - self.asked):
             return
-        if isinstance(self.problem, AnywhereHeld):
+        if isinstance(self.problem, HeldLoop):
             self.reasons.append(BOUNDED)
             return
         count = sum(s.count for _, s in searches)

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy import linalg
 
-from malta.margins.expansion import EPS, Expansion, stacked
+from malta.margins.expansion import EPS, Expansion, stack
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
@@ -56,7 +56,7 @@ def quotient(A: Expansion, dens: Expansion) -> Expansion | None:
     return Expansion(middle, slopes, (rest + (linear + rest) * share / (1 - share)) * (1 + 1e-12))
 
 
-def square_held(A: Expansion, dens: Expansion, T: float, *, beyond: bool = False) -> Expansion | None:
+def square_hold_series(A: Expansion, dens: Expansion, T: float, *, beyond: bool = False) -> Expansion | None:
     """dens (1 + c(Y)) 2 + ... = 2 dens + 2 dens c(T A / dens); None where the series does not do.
 
     beyond : c(Y) - Y^2 / 12 in place of c(Y), and no slopes of it but a bound
@@ -85,14 +85,14 @@ def square_held(A: Expansion, dens: Expansion, T: float, *, beyond: bool = False
     return (dens + curved).times(2.0)
 
 
-def held(A: Expansion, B: Expansion, dens: Expansion, T: float) -> tuple[Expansion, Expansion] | None:
+def hold_series(A: Expansion, B: Expansion, dens: Expansion, T: float) -> tuple[Expansion, Expansion] | None:
     """e^(A T) - 1 and what u does over a sample, of A / dens and B / dens; None where they are too steep."""
     n, m, count = len(A.middle), B.middle.shape[1], len(A.slopes)
     one, two = quotient(A, dens), quotient(B, dens)
     if one is None or two is None:
         return None
     none = Expansion(np.zeros((m, n + m)), np.zeros((count, m, n + m)), np.zeros((m, n + m)))
-    Y = stacked([[one, two], [none]]).times(T)
+    Y = stack([[one, two], [none]]).times(T)
     found = _function(Y, [1 / math.factorial(k) for k in range(1, EXPONENTIAL + 1)], STEEPEST, even=False)
     if found is None:
         return None

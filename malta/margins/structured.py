@@ -116,17 +116,17 @@ class Structured:
     def raise_bound(self, target: float) -> float:
         """Prove box(target), or larger boxes on the way to it where that takes too long; called again, it goes on."""
         if not self.lower:
-            self._order = self._whole(target)
+            self._order = self._prove_whole(target)
         t, begun = self._next(target), self._open
         while self.lower < t and (t == target or t > LAST_STEP * self.lower) and not self.late():
             if begun is not None and self.lower < begun[0] <= target:
                 t, cells = begun
             else:
-                cells = self._on(self._order or self.cover(t), t)
+                cells = self._cells_on(self._order or self.cover(t), t)
             begun, now = None, clock.monotonic()
             found = self._prove(cells, now + PATIENCE * (self.until - now), split=True)
             if found.cell is None:
-                self._stands(t)
+                self._raise_to(t)
                 t = self._next(target)
             elif not self.lower:
                 break
@@ -142,16 +142,16 @@ class Structured:
             return target / 64
         return target if target <= NOT_FAR * self.lower else FIRST_STEP * self.lower
 
-    def _stands(self, t: float) -> None:
+    def _raise_to(self, t: float) -> None:
         self.lower = max(self.lower, t)
         if self.report is not None:
             self.report(self.lower)
 
-    def _on(self, cells: list[Cell], t: float) -> list[Cell]:
+    def _cells_on(self, cells: list[Cell], t: float) -> list[Cell]:
         sides = self.box.sides(t)
         return [replace(cell, sides=sides) for cell in cells]
 
-    def _whole(self, target: float) -> list[Cell]:
+    def _prove_whole(self, target: float) -> list[Cell]:
         """The largest box that is proven without a cut; the cells of all frequencies, those that resist first."""
         t, (beta, cells) = target, self._survey(target)
         while not cells and not self.late() and t > SMALLEST * target:
@@ -161,9 +161,9 @@ class Structured:
         now = clock.monotonic()
         last = now + 0.7 * (self.until - now)
         while cells and not self.late(last) and t > SMALLEST * target:
-            found = self._prove(self._on(cells, t), last, split=False)
+            found = self._prove(self._cells_on(cells, t), last, split=False)
             if found.cell is None:
-                self._stands(t)
+                self._raise_to(t)
                 break
             cells = [found.cell, *cells]
             t *= min(0.9, max(0.9 / found.beta, 0.3))

@@ -17,15 +17,15 @@ import casadi as ca
 import numpy as np
 
 from malta.errors import InputError
-from malta.margins.algebraic import solved_algebraic
-from malta.margins.given import (
+from malta.margins.algebraic import eliminate_algebraic
+from malta.margins.arguments import (
     by_name,
-    counted,
-    described,
+    describe,
     interval,
     is_number,
     matrix,
     number,
+    plural,
     positive,
 )
 from malta.model.plant import Plant, readonly
@@ -86,49 +86,49 @@ def from_source(
     period = None if sample_time is None else positive("uncertain", "sample_time", sample_time)
     p = ca.SX.sym("p", len(names))
     if not callable(source):
-        found = _affine(source, p, names, {} if terms is None else terms)
+        found = _affine_matrices(source, p, names, {} if terms is None else terms)
     elif terms:
         raise InputError("uncertain", "terms", "beside a function", "matrices A0, B0, C0 as the source")
     else:
-        found = _several(_returned(source, p, names, "uncertain"))
-    matrices = ca.Function("matrices", [p], _checked(found))
+        found = _as_list(_evaluate(source, p, names, "uncertain"))
+    matrices = ca.Function("matrices", [p], _check_matrices(found))
     return UncertainSystem(names, readonly(values), matrices, limits=bounds, sample_time=period)
 
 
 def _limits(names: tuple[str, ...], limits: Mapping[str, Any]) -> tuple[tuple[float, float], ...]:
     for name in by_name("uncertain", "limits", limits, '{"k": (0, 2)}'):
-        _known("limits", name, names)
+        _check_name("limits", name, names)
     free = (-math.inf, math.inf)
     return tuple(interval("uncertain", f"limits.{name}", limits.get(name, free)) for name in names)
 
 
-def _known(field: str, name: str, names: tuple[str, ...]) -> None:
+def _check_name(field: str, name: str, names: tuple[str, ...]) -> None:
     if name not in names:
         raise InputError("uncertain", f"{field}.{name}", "an unknown parameter", "one of " + " ".join(names))
 
 
-def _returned(source: Callable[..., Any], p: Any, names: tuple[str, ...], caller: str) -> Any:
+def _evaluate(source: Callable[..., Any], p: Any, names: tuple[str, ...], caller: str) -> Any:
     """What a function of the parameters returns for symbols. Raises InputError."""
-    return (_called if isinstance(source, ca.Function) else _traced)(source, p, names, caller)
+    return (_call if isinstance(source, ca.Function) else _trace)(source, p, names, caller)
 
 
-def _called(source: ca.Function, p: Any, names: tuple[str, ...], caller: str) -> Any:
+def _call(source: ca.Function, p: Any, names: tuple[str, ...], caller: str) -> Any:
     if source.n_in() == 1 and source.numel_in(0) == len(names):
         return source(p)
     if source.n_in() == len(names) and all(source.numel_in(i) == 1 for i in range(len(names))):
         return source(*ca.vertsplit(p))
     found = " ".join(f"{source.name_in(i)} ({source.numel_in(i)})" for i in range(source.n_in()))
-    wanted = f"one vector of {counted(len(names), 'parameter')}"
+    wanted = f"one vector of {plural(len(names), 'parameter')}"
     raise InputError(caller, source.name(), f"inputs {found}" if found else "no inputs", wanted)
 
 
-def _several(found: Any) -> list[Any]:
+def _as_list(found: Any) -> list[Any]:
     if found is None or isinstance(found, str):
-        raise InputError("uncertain", "source", f"a function that returns {described(found)}", "A, B, C")
+        raise InputError("uncertain", "source", f"a function that returns {describe(found)}", "A, B, C")
     return list(found) if isinstance(found, tuple | list) else [found]
 
 
-def _traced(source: Callable[..., Any], p: Any, names: tuple[str, ...], caller: str) -> Any:
+def _trace(source: Callable[..., Any], p: Any, names: tuple[str, ...], caller: str) -> Any:
     symbols = dict(zip(names, ca.vertsplit(p), strict=True))
     try:
         own = inspect.signature(source).parameters.values()
@@ -149,20 +149,20 @@ def _traced(source: Callable[..., Any], p: Any, names: tuple[str, ...], caller: 
     raise InputError(caller, "source", found, "the parameters " + " ".join(names))
 
 
-def _affine(source: Any, p: Any, names: tuple[str, ...], terms: Mapping[str, Any]) -> list[Any]:
+def _affine_matrices(source: Any, p: Any, names: tuple[str, ...], terms: Mapping[str, Any]) -> list[Any]:
     if not isinstance(source, Iterable) or isinstance(source, str | Mapping):
-        raise InputError("uncertain", "source", described(source), "a function, or matrices A, B, C")
+        raise InputError("uncertain", "source", describe(source), "a function, or matrices A, B, C")
     base = [
-        matrix("uncertain", letter, M) for letter, M in zip(LETTERS, _counted(list(source)), strict=False)
+        matrix("uncertain", letter, M) for letter, M in zip(LETTERS, _check_count(list(source)), strict=False)
     ]
     found = [ca.SX(ca.DM(M)) for M in base]
     for name, parts in by_name("uncertain", "terms", terms, '{"k": (A1, B1, C1)}').items():
-        _known("terms", name, names)
+        _check_name("terms", name, names)
         if not isinstance(parts, tuple | list):
-            raise InputError("uncertain", f"terms.{name}", described(parts), "matrices (A1, B1, C1)")
+            raise InputError("uncertain", f"terms.{name}", describe(parts), "matrices (A1, B1, C1)")
         if len(parts) > len(base):
             most = f"at most {len(base)}"
-            raise InputError("uncertain", f"terms.{name}", counted(len(parts), "matrix", "matrices"), most)
+            raise InputError("uncertain", f"terms.{name}", plural(len(parts), "matrix", "matrices"), most)
         for k, part in enumerate(parts):
             if part is None:
                 continue
@@ -175,27 +175,27 @@ def _affine(source: Any, p: Any, names: tuple[str, ...], terms: Mapping[str, Any
     return found
 
 
-def _counted(found: list[Any]) -> list[Any]:
+def _check_count(found: list[Any]) -> list[Any]:
     if not 3 <= len(found) <= len(LETTERS):
-        count = counted(len(found), "matrix", "matrices")
+        count = plural(len(found), "matrix", "matrices")
         raise InputError("uncertain", "source", count, "A, B, C, or with D, or with D and E")
     return found
 
 
-def _checked(found: list[Any]) -> list[Any]:
+def _check_matrices(found: list[Any]) -> list[Any]:
     """SX matrices, D only where it is not zero."""
-    matrices = [_matrix(M, LETTERS[k]) for k, M in enumerate(_counted(found))]
+    matrices = [_matrix(M, LETTERS[k]) for k, M in enumerate(_check_count(found))]
     n, m, q = matrices[0].shape[0], matrices[1].shape[1], matrices[2].shape[0]
     shapes = [(n, n), (n, m), (q, n), (q, m), (n, n)]
     for letter, M, shape in zip(LETTERS, matrices, shapes, strict=False):
         if M.shape != shape:
             raise InputError("uncertain", letter, f"shape {M.shape}", f"{shape}")
-    return solved_algebraic(matrices)
+    return eliminate_algebraic(matrices)
 
 
 def _matrix(M: Any, letter: str) -> Any:
     if isinstance(M, ca.SX | ca.DM):
-        return _finite(ca.SX(M), "uncertain", letter)
+        return _check_finite(ca.SX(M), "uncertain", letter)
     try:
         array = np.array(M, dtype=object)
     except ValueError as error:
@@ -203,7 +203,7 @@ def _matrix(M: Any, letter: str) -> Any:
     if array.ndim < 2:
         array = np.atleast_2d(array)
     if array.ndim != 2:
-        raise InputError("uncertain", letter, counted(array.ndim, "dimension"), "a matrix")
+        raise InputError("uncertain", letter, plural(array.ndim, "dimension"), "a matrix")
     if any(isinstance(x, tuple | list) for x in array.flat):
         raise InputError("uncertain", letter, "rows of different lengths", "a matrix")
     rows = [ca.horzcat(*(_entry(x, "uncertain", letter) for x in row)) for row in array.tolist()]
@@ -215,13 +215,13 @@ def _entry(x: Any, caller: str, field: str) -> Any:
     if isinstance(x, ca.MX):
         raise InputError(caller, field, "a CasADi MX", "SX expressions, numbers, or a casadi.Function")
     if isinstance(x, ca.SX | ca.DM):
-        return _finite(ca.SX(x), caller, field)
+        return _check_finite(ca.SX(x), caller, field)
     if isinstance(x, bool | np.bool_) or is_number(x):
         return ca.SX(float(x))
-    raise InputError(caller, field, described(x), "finite numbers, and expressions of the parameters")
+    raise InputError(caller, field, describe(x), "finite numbers, and expressions of the parameters")
 
 
-def _finite(M: Any, caller: str, field: str) -> Any:
+def _check_finite(M: Any, caller: str, field: str) -> Any:
     """The same, where no entry is NaN or infinite by itself. Raises InputError."""
     for x in M.nonzeros():
         if x.is_constant() and not math.isfinite(float(x)):
@@ -254,7 +254,7 @@ def compensator_of(law: Any, outputs: int, inputs: int) -> Compensator:
         A, B, C, D = (np.asarray(M, dtype=float) for M in (law.A, law.B, law.C, law.D))
         found = Compensator(A, B.reshape(len(A), -1), C.reshape(-1, len(A)), D, sample_time=T)
     elif hasattr(law, "ninputs") or isinstance(law, bool | None):  # a response, which has no states
-        raise InputError("compensator", "law", described(law), wanted)
+        raise InputError("compensator", "law", describe(law), wanted)
     else:
         D = matrix("compensator", "law", law, wanted)
         found = Compensator(np.zeros((0, 0)), np.zeros((0, D.shape[1])), np.zeros((len(D), 0)), D)
@@ -263,7 +263,7 @@ def compensator_of(law: Any, outputs: int, inputs: int) -> Compensator:
             "compensator",
             "D",
             f"shape {found.D.shape}",
-            f"{(inputs, outputs)}: {counted(inputs, 'input')} u from {counted(outputs, 'output')} y",
+            f"{(inputs, outputs)}: {plural(inputs, 'input')} u from {plural(outputs, 'output')} y",
         )
     return found
 
@@ -275,9 +275,9 @@ def polynomial_system(coefficients: Callable[..., Any], names: tuple[str, ...]) 
     """
     caller, field = "margin_of_polynomial", "coefficients"
     if not callable(coefficients):
-        raise InputError(caller, field, described(coefficients), "a function of the parameters")
+        raise InputError(caller, field, describe(coefficients), "a function of the parameters")
     p = ca.SX.sym("p", len(names))
-    found = _returned(coefficients, p, names, caller)
+    found = _evaluate(coefficients, p, names, caller)
     flat: list[Any] = []
     for entry in found if isinstance(found, tuple | list | np.ndarray) else [found]:
         for x in entry.flat if isinstance(entry, np.ndarray) else [entry]:
@@ -285,6 +285,6 @@ def polynomial_system(coefficients: Callable[..., Any], names: tuple[str, ...]) 
     while flat and flat[0].is_constant() and float(flat[0]) == 0:
         flat = flat[1:]
     if len(flat) < 2:
-        found = counted(len(flat), "coefficient")
+        found = plural(len(flat), "coefficient")
         raise InputError(caller, field, found, "a polynomial of degree 1 or more")
     return ca.Function("coefficients", [p], [ca.vertcat(*reversed(flat))]), len(flat) - 1

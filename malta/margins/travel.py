@@ -1,8 +1,8 @@
 """Margins of the machine's loop over its travel, and at places along it.
 
-The course of a machine is its stroke, or the first parameter of `plant.over`, as the speed of a rotor. Where the
-matrices have a short form along the course, the position is one more interval of the proof. Where they have not, the
-axes of the machine are proven by themselves and their coupling is bounded (weak.py), or places stand for the travel.
+The course of a machine is its stroke, or the first parameter of `plant.over`, as the speed of a rotor. The position
+along it is one more interval of the proof when the model along the course is short enough. When it is not, either each
+axis is proven alone and the coupling of the axes is bounded (weak_coupling.py), or a few places stand for the travel.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from malta.margins.box import Box, box_of
 from malta.margins.expressions import NotAnalytic
 from malta.margins.extent import extent_of, machine_at, positions_of
 from malta.margins.gain import Gain, worst_case_gain
-from malta.margins.held import held_machine
+from malta.margins.held_currents import held_machine
 from malta.margins.loops import CurrentLoops, machine_law, machine_system
 from malta.margins.plants import LONGEST
 from malta.margins.problem import OfSeveral
@@ -31,8 +31,8 @@ from malta.margins.robust import (
     problem_of,
     robust_margin,
 )
-from malta.margins.uncertain import Compensator, UncertainSystem, holds, model_of
-from malta.margins.weak import AnywhereHeld
+from malta.margins.uncertain import Compensator, UncertainSystem, is_commutated, model_of
+from malta.margins.weak_coupling import HeldLoop
 from malta.model.data import plant_of
 from malta.threads import on_one_thread
 
@@ -62,14 +62,19 @@ def travel_margin(
 ) -> Margin:
     """The margin of the machine's loop anywhere in its travel: the position is one more interval of the proof.
 
-    So are the parameters of `plant.over` that are not uncertain: a rotor is proven for every speed at once.
-    Where the matrices have no short form along the travel, as those of the planar motor's held currents, its axes are
-    proven by themselves, with a bound of what couples them anywhere in the travel (`weak`). Where that fails too, the
-    margin is that in the middle and at the end, and says so.
+    The parameters of `plant.over` that are not uncertain are intervals too: a rotor is proven for every speed at once.
+    Where the model along the travel is too long, as that of held currents in a planar motor, each axis is proven alone
+    with a bound of its coupling to the others (weak_coupling.py). Where that fails too, the margin is the one in the
+    middle and at the end of the travel, and its `reason` says so.
 
-    ranges : of the parameters, as robust_margin takes them
-    names : parameters of the model, where others stand still beside those of `ranges`: one model for several questions
-    time : s, of the whole search; None: 120
+    ranges : by parameter: 0.2 is +-20 % of the nominal value, (low, high) an interval in SI
+    names : parameters of the model, a superset of `ranges`; one model can then answer several questions
+    time : s, longest search; None: 120
+    progress : called with the lower and upper bound so far
+
+    Raises InputError for unknown parameters and empty ranges.
+
+    Example: `travel_margin(plant, controller, {"m": 0.2}).lower`
     """
     names = tuple(names or ranges)
     along, over = travel_loops(plant, controller, names, current_loops)
@@ -88,16 +93,16 @@ def travel_margin(
 def travel_loops(
     plant: Plant, controller: Controller, names: tuple[str, ...], current_loops: CurrentLoops = "lag"
 ) -> tuple[list[tuple[UncertainSystem, Compensator]], dict[str, tuple[float, float]]]:
-    """The loops of which travel_margin proves a margin, and the intervals that do not grow."""
+    """The loops whose common margin travel_margin proves, and the intervals that do not grow with the margin."""
     along, extent = _along(plant, controller, names, current_loops), extent_of(plant, names)
     return along, extent.intervals if len(along) == 1 else dict(extent.over)
 
 
-@lru_cache(maxsize=8)  # several questions are asked of the same loops; records compare by identity
+@lru_cache(maxsize=8)  # several margins need the same loops; records compare by identity
 def _along(
     plant: Plant, controller: Controller, names: tuple[str, ...], current_loops: CurrentLoops
 ) -> list[tuple[UncertainSystem, Compensator]]:
-    """The machine's loop with its position as a parameter; its loops in the middle and at the end where not."""
+    """The machine's loop with its position as a parameter; where that is too long, its loops at ENDS of the travel."""
     extent = extent_of(plant, names)
     if not (plant.has_stroke and _is_long(plant, controller, names)):
         at = {plant.stroke: 0.0} if plant.has_stroke else {}
@@ -109,9 +114,9 @@ def _along(
 
 
 def _is_long(plant: Plant, controller: Controller, names: tuple[str, ...]) -> bool:
-    """Whether the model along the travel is too long to be written out."""
+    """Whether the model along the travel is too long for an expansion."""
     believed = plant_of(controller.parameters)
-    held = holds(believed) and not believed.tabulated
+    held = is_commutated(believed) and not believed.tabulated
     return held and model_of(plant, believed, names).n_instructions() > LONGEST
 
 
@@ -122,8 +127,8 @@ def _anywhere(
     names: tuple[str, ...],
     current_loops: CurrentLoops,
     position: float | None = None,
-) -> AnywhereHeld | None:
-    """The loop anywhere in the travel, or at a position, as `weak` takes it; None where it has not that form."""
+) -> HeldLoop | None:
+    """The loop as weakly coupled axes, anywhere in the travel or at a position; None where it has not that form."""
     law = machine_law(plant, controller, current_loops)
     if not _is_long(plant, controller, names) or law.delay != 1 or law.lag is not None:
         return None
@@ -141,7 +146,7 @@ def _anywhere(
     except NotAnalytic:
         return None
     places = OfSeveral(tuple(problem_of(*loop) for loop in along))
-    return AnywhereHeld(machine, replace(law, delay=0), places)
+    return HeldLoop(machine, replace(law, delay=0), places)
 
 
 def _box(system: UncertainSystem, ranges: Ranges) -> Box:
@@ -157,10 +162,9 @@ def place_margin(
     current_loops: CurrentLoops = "lag",
     names: Sequence[str] = (),
 ) -> Margin:
-    """The margin of the machine's loop at a position along its course; arguments as travel_margin takes them.
+    """The margin of the machine's loop at a position along its course (`Extent.course`), SI.
 
-    The course is the stroke, or the first parameter of `plant.over`, as the speed of a rotor (`Extent.course`). Where
-    there is no proof along the travel the search takes EACH at most.
+    The other arguments are those of travel_margin. Without a proof along the travel the search takes EACH at most.
     """
     names = tuple(names or ranges)
     if not plant.has_stroke:
@@ -187,7 +191,7 @@ def worst_sensitivities(
 ) -> dict[str, Gain]:
     """The largest |S| of each sensor, the other loops closed, over the modelled box, the travel and `plant.over`.
 
-    Arguments as travel_margin takes them; where there is no proof along the travel, in its middle and at its end.
+    The arguments are those of travel_margin. Without a proof along the travel, it covers the middle and the end alone.
     """
     along, over = travel_loops(plant, controller, tuple(ranges), current_loops)
     found = {}
@@ -202,7 +206,7 @@ def worst_sensitivities(
 def places_along(
     plant: Plant, controller: Controller, names: tuple[str, ...], current_loops: CurrentLoops = "lag"
 ) -> tuple[tuple[float, ...], ...]:
-    """Positions along the course at which a margin of its own is worth its time; each place has one, or both signs."""
+    """The places along the course that a report shows: for each its position, or +position and -position (SI)."""
     shares = PLACES if covers_travel(plant, controller, names, current_loops) else ENDS
     return positions_of(plant, extent_of(plant, names), shares)
 
@@ -210,14 +214,14 @@ def places_along(
 def covers_travel(
     plant: Plant, controller: Controller, names: tuple[str, ...], current_loops: CurrentLoops = "lag"
 ) -> bool:
-    """Whether one proof covers the travel, and not places of it."""
+    """Whether one proof covers the whole travel."""
     return len(_along(plant, controller, names, current_loops)) == 1
 
 
 def depends_on_course(
     plant: Plant, controller: Controller, names: tuple[str, ...], current_loops: CurrentLoops = "lag"
 ) -> bool:
-    """Whether the machine's loop depends on the position along its course; names as places_along takes them."""
+    """Whether the machine's loop depends on the position along its course."""
     along, course = _along(plant, controller, names, current_loops), extent_of(plant, names).course
     if len(along) > 1:
         return True
@@ -236,6 +240,6 @@ def loop_at(
     position: float,
     current_loops: CurrentLoops = "lag",
 ) -> tuple[UncertainSystem, Compensator]:
-    """The machine's loop at a position along its course; the same records for the same question."""
+    """The machine's loop at a position along its course (SI); equal arguments return the same records."""
     there, at = machine_at(plant, extent_of(plant, names).course, position)
     return machine_system(there, controller, names, at, current_loops)

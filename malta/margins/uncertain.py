@@ -76,7 +76,7 @@ class Compensator:
     lag: float | None = None  # rad/s
 
 
-def held_at(plant: Plant, position: float) -> FloatArray:
+def held_gain(plant: Plant, position: float) -> FloatArray:
     """H of the currents that are held at a position along the stroke, where E = B H."""
     of, none = model_of(plant, plant, ()), ca.DM(0, 1)
     acting = of(none, position, 0)[-1]
@@ -107,14 +107,14 @@ def model_of(plant: Plant, believed: Plant, names: tuple[str, ...]) -> ca.Functi
 
 
 @lru_cache(maxsize=64)  # writing out the currents takes longer than most that is asked of the answer
-def holds(plant: Plant) -> bool:
+def is_commutated(plant: Plant) -> bool:
     """Whether the currents of a machine depend on where they were commutated, so that holding them matters."""
     kind = ca.MX if plant.tabulated else ca.SX
     y, v = kind.sym("y", len(plant.outputs)), kind.sym("v", len(plant.inputs))
     return bool(ca.which_depends(plant.currents(y, v), y, 1, True) != [False] * len(plant.actuator.coils))
 
 
-def lowest(declared: Mapping[str, Any]) -> float:
+def lower_limit(declared: Mapping[str, Any]) -> float:
     """What a parameter is above; the float below what it is at least."""
     above, least = declared.get("above"), declared.get("at_least")
     found = [] if above is None else [float(above)]
@@ -227,7 +227,7 @@ def _with_current_control(c: Compensator, loop: CurrentLoop, R: float, B2: Float
     return replace(c, A=full, B=driven, C=out, D=c.D * D / R)
 
 
-def differences(c: Compensator) -> tuple[FloatArray, FloatArray]:
+def difference_form(c: Compensator) -> tuple[FloatArray, FloatArray]:
     """A, B of x' or of (x+ - x) / T."""
     T = c.sample_time
     return (c.A, c.B) if T is None else ((c.A - np.eye(len(c.A))) / T, c.B / T)
@@ -254,7 +254,7 @@ def _sides(c: Compensator, A: FloatArray, B: FloatArray, C: FloatArray) -> _Side
         stored = np.arange(n, len(A))  # of these, delay_inputs gives the next values
         A[n:], B[n:] = A[n:] / T, B[n:] / T
         A[stored, stored] -= 1 / T
-    return _Sides(A, B, np.hstack([C, np.zeros((len(C), len(A) - C.shape[1]))]), *differences(c))
+    return _Sides(A, B, np.hstack([C, np.zeros((len(C), len(A) - C.shape[1]))]), *difference_form(c))
 
 
 def closed_loop(system: UncertainSystem, c: Compensator, p: FloatArray) -> FloatArray:
@@ -279,7 +279,7 @@ def instability(system: UncertainSystem, c: Compensator, p: FloatArray) -> Float
     return np.asarray(poles.real.max(axis=1))
 
 
-def critical(system: UncertainSystem, c: Compensator, p: FloatArray) -> float:
+def critical_frequency(system: UncertainSystem, c: Compensator, p: FloatArray) -> float:
     """Frequency of the worst pole at one row of parameters, rad/s."""
     (poles,) = np.linalg.eigvals(closed_loop(system, c, p))
     if c.sample_time is None:

@@ -16,7 +16,7 @@ import numpy as np
 from malta.errors import CheckError
 from malta.margins.extent import NOWHERE, Extent, extent_of
 from malta.margins.loops import Loop, commanded_model, loop, machine_loop
-from malta.margins.responses import crossing, largest
+from malta.margins.responses import crossing, find_peaks
 from malta.margins.robust import Margin
 from malta.margins.travel import NOT_BETWEEN, travel_margin
 from malta.model.data import plant_of
@@ -212,7 +212,7 @@ def _stage(name: str, stage: Loop, sensors: list[str]) -> Stage:
         S = stage.sensitivity(w)
         return np.column_stack([np.abs(np.einsum("kii->ki", S)), _singular_values(S)[:, 0]])
 
-    peaks, at = largest(sizes, _grid(stage.sample_time))
+    peaks, at = find_peaks(sizes, _grid(stage.sample_time))
     return Stage(name, dict(zip([*sensors, "sigma_max"], peaks.tolist(), strict=True)), float(at[-1]), radius)
 
 

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from malta.errors import InputError
-from malta.margins.given import described, is_number
+from malta.margins.arguments import describe, is_number
 
 if TYPE_CHECKING:
     from malta.model.plant import ComplexArray, FloatArray
@@ -113,7 +113,7 @@ def weight_of(weight: Any, where: str) -> Weight:
     expected = "a number above zero, or a transfer function"
     if is_number(weight):
         if not float(weight) > 0:
-            raise InputError(where, "weight", described(weight), expected)
+            raise InputError(where, "weight", describe(weight), expected)
         return Weight(np.array([float(weight)]), np.ones(1))
     if type(weight).__name__ == "StateSpace":
         weight = _transfer_function(weight)
@@ -123,7 +123,7 @@ def weight_of(weight: Any, where: str) -> Weight:
         with np.errstate(all="ignore"):
             stable, continuous = bool((weight.poles().real < 0).all()), not weight.dt
     except (AttributeError, TypeError, ValueError, IndexError, np.linalg.LinAlgError):
-        raise InputError(where, "weight", described(weight), expected) from None
+        raise InputError(where, "weight", describe(weight), expected) from None
     if not single:
         raise InputError(where, "weight", "several inputs or outputs", "one of each")
     num, den = np.trim_zeros(num, "f"), np.trim_zeros(den, "f")

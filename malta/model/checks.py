@@ -25,7 +25,7 @@ def defaults(plant: Plant) -> dict[str, Any]:
     constants, limit = actuator.force_constant, actuator.current_limit
     return {
         "load": partial(_zeros, w),
-        "position_of": _same,
+        "position_of": _identity,
         "preload": lambda _: ca.DM.zeros(m),
         "currents": lambda _, v: v / ca.vertcat(*constants),
         "forces": lambda _, i: ca.vertcat(*constants) * i,
@@ -44,7 +44,7 @@ def _zeros(size: int, x: Any) -> Any:
     return type(x).zeros(size) if isinstance(x, ca.SX | ca.MX | ca.DM) else ca.DM.zeros(size)
 
 
-def _same(y: Any) -> Any:
+def _identity(y: Any) -> Any:
     return y
 
 
@@ -81,7 +81,7 @@ def check_signals(plant: Plant) -> None:
 
 def _check_intervals(plant: Plant) -> None:
     """InputError where `over` names no parameter, one that shapes the model, or an interval without its own value."""
-    entering = _entering(plant)
+    entering = _symbolic_names(plant)
     for name, interval in plant.over.items():
         if name not in entering:
             raise InputError(plant.name, "over", repr(name), "one of " + " ".join(entering))
@@ -90,7 +90,7 @@ def _check_intervals(plant: Plant) -> None:
             raise InputError(plant.name, f"over.{name}", f"{ends}", f"(low, high) about its value, {value:g}")
 
 
-def _entering(plant: Plant) -> list[str]:
+def _symbolic_names(plant: Plant) -> list[str]:
     """The parameters that may be symbols."""
     declared = {f.name: f.metadata for f in fields(plant.parameters) if "unit" in f.metadata}
     return [name for name, metadata in declared.items() if not metadata["shapes"]]
@@ -142,14 +142,16 @@ def check_symbols(plant: Plant) -> None:
     """
     if plant.tabulated:  # it holds numbers, and says so where it is asked for more
         return
-    bad = _without_symbols(plant, _entering(plant))
+    bad = _fault_with_symbols(plant, _symbolic_names(plant))
     if bad:
-        name = next((name for name in _entering(plant) if _without_symbols(plant, [name])), "its parameters")
+        name = next(
+            (name for name in _symbolic_names(plant) if _fault_with_symbols(plant, [name])), "its parameters"
+        )
         expected = f"CasADi's functions of it, as ca.sin, or si(..., shapes=True) where {name} stays a number"
         raise InputError(plant.name, bad, f"{name}, taken for a number", expected)
 
 
-def _without_symbols(plant: Plant, names: Sequence[str]) -> str:
+def _fault_with_symbols(plant: Plant, names: Sequence[str]) -> str:
     """The function of a plant that fails, or gives NaN, where these parameters are symbols; "" for none."""
     from malta.model.plant import symbolic  # which imports this module
 

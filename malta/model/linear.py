@@ -137,12 +137,12 @@ def _record(names: tuple[str, ...]) -> Callable[..., Any]:
     own = {
         "__module__": __name__,  # where `plant` stands
         "__post_init__": lambda record: check_parameters(record, CALLER),
-        "__reduce__": _reduced,
+        "__reduce__": _reduce,
     }
     return make_dataclass("Parameters", entries, frozen=True, namespace=own)
 
 
-def _reduced(record: Any) -> tuple[Any, ...]:
+def _reduce(record: Any) -> tuple[Any, ...]:
     """How pickle makes a record again, whose class has no name in this module."""
     values = {name: getattr(record, name) for name, _ in record.system.terms}
     return record_of, (record.system, values, record.preset)
@@ -163,7 +163,7 @@ def plant(par: Any) -> Plant:
 
     def position_of(y: Any) -> Any:
         a, b, c = (np.array(ca.DM(M)) for M in (A, B, C))
-        return ca.DM(_rest(a, b, c, made.coordinates)) @ y
+        return ca.DM(_states_at_rest(a, b, c, made.coordinates)) @ y
 
     made = Plant(
         name=par.preset,
@@ -189,7 +189,7 @@ def plant(par: Any) -> Plant:
     return made
 
 
-def _rest(A: FloatArray, B: FloatArray, C: FloatArray, coordinates: int) -> FloatArray:
+def _states_at_rest(A: FloatArray, B: FloatArray, C: FloatArray, coordinates: int) -> FloatArray:
     """The states at rest by the outputs there; of (q, q') the positions."""
     n, p, half = len(A), len(C), coordinates
     if half and p == half and np.linalg.matrix_rank(C[:, :half]) == half:

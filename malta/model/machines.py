@@ -58,7 +58,7 @@ def machine(name: str | Path | ModuleType) -> ModuleType:
     Raises InputError for an unknown name, a file that cannot be imported, or a module without Parameters and plant.
     """
     if isinstance(name, ModuleType):
-        return _complete(name, str(getattr(name, "__file__", name.__name__)))
+        return _require_plant(name, str(getattr(name, "__file__", name.__name__)))
     if isinstance(name, Path) or name.endswith(".py"):
         return _from_file(Path(name))
     if name in _files:
@@ -71,7 +71,7 @@ def machine(name: str | Path | ModuleType) -> ModuleType:
         module = import_module(installed[name])
     except ImportError as error:
         raise InputError("machine", name, _reason(error), "a module that can be imported") from error
-    return _complete(module, installed[name])
+    return _require_plant(module, installed[name])
 
 
 def name_of(module: ModuleType) -> str:
@@ -182,7 +182,7 @@ def _from_file(path: Path) -> ModuleType:
     sys.modules[spec.name] = module
     try:
         spec.loader.exec_module(module)
-        _complete(module, where)
+        _require_plant(module, where)
     except BaseException as error:
         del sys.modules[spec.name]
         if isinstance(error, InputError) or not isinstance(error, Exception):
@@ -192,7 +192,7 @@ def _from_file(path: Path) -> ModuleType:
     return module
 
 
-def _complete(module: ModuleType, where: str | Path) -> ModuleType:
+def _require_plant(module: ModuleType, where: str | Path) -> ModuleType:
     """The module. InputError where it lacks Parameters or plant."""
     for name, kind in (("Parameters", "a frozen dataclass"), ("plant", "a function of Parameters -> Plant")):
         if not callable(getattr(module, name, None)):

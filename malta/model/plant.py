@@ -238,15 +238,15 @@ class Plant:
 
         The loads are taken as cancelled at every position, as v0(z) does. `plant.at(z=5e-3)`
         """
-        return self._preloaded(self.state(positions))
+        return self._operating_point(self.state(positions))
 
     def point(self, design: ArrayLike) -> OperatingPoint:
         """The same at these states of the design model (SI), the uncontrolled ones zero."""
         x = np.zeros(len(self.states))
         x[list(self.controlled)] = design
-        return self._preloaded(x)
+        return self._operating_point(x)
 
-    def _preloaded(self, x: FloatArray) -> OperatingPoint:
+    def _operating_point(self, x: FloatArray) -> OperatingPoint:
         u = np.array(ca.DM(self.preload(ca.DM(x))), dtype=float).ravel()
         return OperatingPoint(x, u, loaded=False)
 

@@ -45,15 +45,15 @@ def rate_map(q_r: Any, trig: Trig = EXACT) -> Any:
     return _matrix([[cg * cb, sg, 0], [-sg * cb, cg, 0], [sb, 0, 1]])
 
 
-def principal(q_r: Any, inertia: Sequence[float]) -> Any:
+def principal_angles(q_r: Any, inertia: Sequence[float]) -> Any:
     """Cardan angles of the frame B that the equations are written in: R, or R before gamma.
 
     Every axis across a body with Ixx = Iyy is a principal one, so its equations need no gamma.
     """
-    return ca.vertcat(q_r[:2], 0) if round_body(inertia) else q_r
+    return ca.vertcat(q_r[:2], 0) if is_round(inertia) else q_r
 
 
-def round_body(inertia: Sequence[Any]) -> bool:
+def is_round(inertia: Sequence[Any]) -> bool:
     """Whether Ixx = Iyy, as numbers or as one symbol."""
     return bool(ca.is_equal(ca.SX(inertia[0]), ca.SX(inertia[1])))
 
@@ -76,11 +76,11 @@ def acceleration(
     (Ixx, Iyy, Izz) in kg m2. With Omega the angular velocity of B and omega that of the body, both in B:
     I omega' + Omega x I omega = T_B and omega' = E q_r'' + (d omega / d q_r) q_r'.
     """
-    if round_body(inertia) and trig is EXACT:
+    if is_round(inertia) and trig is EXACT:
         return F_I / m, _top_acceleration(inertia, q_r, dq_r, T_B)
-    q_B = principal(q_r, inertia)
+    q_B = principal_angles(q_r, inertia)
     omega = rate_map(q_B, trig) @ dq_r
-    spin = ca.vertcat(0, 0, dq_r[2] if round_body(inertia) else 0)
+    spin = ca.vertcat(0, 0, dq_r[2] if is_round(inertia) else 0)
     I_m = ca.vertcat(*inertia)
     domega = (T_B - ca.cross(omega - spin, I_m * omega)) / I_m
     return F_I / m, cardan_rates(q_B, domega - ca.jtimes(omega, q_r, dq_r), trig)
@@ -101,7 +101,7 @@ def _top_acceleration(inertia: Sequence[Any], q_r: Any, dq_r: Any, T_B: Any) -> 
     return ca.vertcat(ddalpha, ddbeta, T_B[2] / inertia[2] - omega_1 * dbeta - sb * ddalpha)
 
 
-def turned(q_r: Any, a_I: Any, trig: Trig = EXACT) -> Any:
+def rotate(q_r: Any, a_I: Any, trig: Trig = EXACT) -> Any:
     """R_RI a_I, one rotation after the other: fewer operations than the matrix."""
     (sa, sb, sg), (ca_, cb, cg) = ([fn(q_r[i]) for i in range(3)] for fn in trig)
     x, y, z = a_I[0], ca_ * a_I[1] + sa * a_I[2], ca_ * a_I[2] - sa * a_I[1]

@@ -45,7 +45,7 @@ def stiffness_unit(unit: str) -> str:
     return {"m": "N/um", "rad": "N m/urad"}[unit]
 
 
-def aside(plant: Plant) -> tuple[Group, ...]:
+def lateral_outputs(plant: Plant) -> tuple[Group, ...]:
     """Outputs other than the stroke; of a machine with one output that one."""
     found = outputs_of(plant)
     return (found[1:] or found) if plant.has_stroke else found

@@ -19,7 +19,7 @@ import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
 
 from malta.errors import InputError
-from malta.margins.uncertain import holds
+from malta.margins.uncertain import is_commutated
 from malta.model.data import plant_of
 from malta.model.plant import Plant
 from malta.simulation.engines import Engine
@@ -106,7 +106,7 @@ def _noise_of(plant: Plant, c: Controller, kind: str) -> Noise:
         raise InputError("simulate", f"estimator {kind}", found, "an LQG with integrals")
     believed = plant_of(c.parameters)
     believed.require_second_order(f"estimator {kind}")
-    if holds(believed):
+    if is_commutated(believed):
         found = f"a {plant.name}, whose currents are held between samples"
         raise InputError("simulate", f"estimator {kind}", found, "steady-state, which knows of that")
     return c.noise

@@ -267,16 +267,16 @@ def test_turning_the_machine_about_its_axis_turns_the_answer(par: tubular.Parame
         turn = _about_z(psi)
         twice = np.kron(np.eye(2), turn[:2, :2])
         R, dR, _ = motion(x[3:6], x[9:12], np.zeros(3))
-        turned = np.zeros(12)
-        turned[:3], turned[6:9], turned[3:6] = turn @ x[:3], turn @ x[6:9], _angles(R @ turn.T)
+        rotate = np.zeros(12)
+        rotate[:3], rotate[6:9], rotate[3:6] = turn @ x[:3], turn @ x[6:9], _angles(R @ turn.T)
         # The mover turns along, so its angular velocity has the same components in frame R.
-        turned[9:] = np.array(cardan_rates(ca.DM(turned[3:6]), ca.DM(_vector(-dR @ R.T)))).ravel()
+        rotate[9:] = np.array(cardan_rates(ca.DM(rotate[3:6]), ca.DM(_vector(-dR @ R.T)))).ravel()
         here = rate(x, u, w)
-        there = rate(turned, np.append(twice @ u[:4], u[4]), np.kron(np.eye(2), turn) @ w)
-        bend, bend_turned = motion(x[3:6], x[9:], here[9:])[2], motion(turned[3:6], turned[9:], there[9:])[2]
+        there = rate(rotate, np.append(twice @ u[:4], u[4]), np.kron(np.eye(2), turn) @ w)
+        bend, bend_turned = motion(x[3:6], x[9:], here[9:])[2], motion(rotate[3:6], rotate[9:], there[9:])[2]
         np.testing.assert_allclose(there[6:9], turn @ here[6:9], rtol=0, atol=1e-11 * abs(here[6:9]).max())
         np.testing.assert_allclose(bend_turned, bend @ turn.T, rtol=0, atol=1e-11 * abs(bend).max())
-        p, p_turned = sensed(x), sensed(turned)
+        p, p_turned = sensed(x), sensed(rotate)
         np.testing.assert_allclose(p_turned, np.append(twice @ p[:4], p[4]), rtol=0, atol=1e-14)
 
 

@@ -41,9 +41,9 @@ from malta.model.plant import (
 )
 from malta.model.rigidbody import (
     acceleration,
-    principal,
+    principal_angles,
+    rotate,
     rotation,
-    turned,
 )
 
 
@@ -204,7 +204,7 @@ def motion(par: Parameters, x: Any, W: Any, w: Any) -> Any:
     NOTE: (39) prints roll twice, and (36) leaves out the products of rates; with them the angles are those of eq. (7).
     """
     inertia = (par.I_x, par.I_y, par.I_z)
-    T_B = turned(principal(x[3:6], inertia), W[3:] + w[3:])
+    T_B = rotate(principal_angles(x[3:6], inertia), W[3:] + w[3:])
     q_t_ddot, q_r_ddot = acceleration(par.m, inertia, x[3:6], x[9:12], W[:3] + w[:3], T_B)
     return ca.vertcat(x[6:12], q_t_ddot, q_r_ddot)
 

@@ -28,10 +28,10 @@ from malta.model.rigidbody import (
     SMALL_ANGLE,
     Trig,
     acceleration,
-    principal,
+    principal_angles,
     rate_map,
+    rotate,
     rotation,
-    turned,
 )
 
 
@@ -107,10 +107,10 @@ def plant(par: Parameters, *, small_angle: bool = False) -> Plant:
     trig = SMALL_ANGLE if small_angle else EXACT
     constants = (par.K_B, par.K_B, par.K_B, par.K_B, 2 * par.K_D)  # f_D = f_D1 + f_D2, eq. (17)
     inertia = (par.I_xx, par.I_yy, par.I_zz)
-    q_B = principal(x[3:6], inertia)
+    q_B = principal_angles(x[3:6], inertia)
     F_I, M_I = _wrench(par, x, u, rotation(x[3:6], trig)[2, :2].T, conservative=not small_angle)
     # The points of force lie on the mover's axis: T_B = sum of l_i e_z x F_i, in frame B, from the moment sum l_i F_i.
-    T_B = ca.cross(ca.SX([0, 0, 1]), turned(q_B, M_I, trig)) + turned(q_B, w[3:], trig)
+    T_B = ca.cross(ca.SX([0, 0, 1]), rotate(q_B, M_I, trig)) + rotate(q_B, w[3:], trig)
     q_t_ddot, q_r_ddot = acceleration(par.m, inertia, x[3:6], x[9:12], F_I + w[:3], T_B, trig)
     return Plant(
         name="tubular",

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from malta.model.signals import aside
+from malta.model.signals import lateral_outputs
 from malta.report.figures.parts import (
     BOUND,
     LEGEND,
@@ -193,7 +193,7 @@ def worst_figure(found: Campaign, published: Published | None = None) -> Figure:
             for n in found.names
         ]
     )
-    across = aside(plant)[0]
+    across = lateral_outputs(plant)[0]
     fine = in_unit(1.0, across.fine)
     for place, (row, style) in enumerate(zip(rows, (*STYLES, *MORE), strict=False)):
         where = 100 * (found.values[row] - middle) / np.where(half == 0, 1, half)

@@ -10,7 +10,7 @@ from rich.console import Group
 from rich.table import Table
 
 from malta.model.signals import (
-    aside,
+    lateral_outputs,
 )
 from malta.report.figures.parts import Published, number
 from malta.report.tables.parts import add_row, new_table
@@ -91,7 +91,7 @@ def _worst_table(found: Campaign, count: int) -> Table:
     from malta.simulation.digest import verdicts
 
     plant = found.plan.plant
-    names, groups = verdicts(plant), aside(plant)
+    names, groups = verdicts(plant), lateral_outputs(plant)
     far = [f"{group.name} [{group.fine}]" for group in groups]
     table = new_table("The worst runs", "run", "end", "at [ms]", *far, "off the middle of the box")
     table.columns[0].justify = "right"

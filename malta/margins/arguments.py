@@ -17,7 +17,7 @@ LARGEST = 1e150  # of what a parameter may be: squares of multiples of it are nu
 LONG = 60  # characters of a value that a message shows
 
 
-def described(value: Any) -> str:
+def describe(value: Any) -> str:
     """A value as a message shows it: as it is written where that is short, else by its kind."""
     text = repr(value) if isinstance(value, complex | float | int | str | tuple | list | dict) else ""
     if text and len(text) <= LONG:
@@ -40,7 +40,7 @@ def is_number(value: Any) -> bool:
 def number(caller: str, name: str, value: Any) -> float:
     """A finite number. Raises InputError."""
     if not is_number(value):
-        raise InputError(caller, name, described(value), "a finite number")
+        raise InputError(caller, name, describe(value), "a finite number")
     return float(value)
 
 
@@ -50,7 +50,7 @@ def positive(caller: str, name: str, value: Any, below: float = math.inf, *, end
         return value
     if not (is_number(value) and 0 < float(value) < below):
         wanted = "a number above zero" + ("" if math.isinf(below) else f" and below {below:g}")
-        raise InputError(caller, name, described(value), wanted)
+        raise InputError(caller, name, describe(value), wanted)
     return float(value)
 
 
@@ -67,16 +67,16 @@ def interval(caller: str, name: str, value: Any) -> tuple[float, float]:
         )
         if low < high:
             return low, high
-    raise InputError(caller, name, described(value), "(low, high), two numbers, the lower one first")
+    raise InputError(caller, name, describe(value), "(low, high), two numbers, the lower one first")
 
 
 def by_name(caller: str, name: str, value: Any, example: str) -> Mapping[str, Any]:
     """Values by name. Raises InputError."""
     if not isinstance(value, Mapping):
-        raise InputError(caller, name, described(value), f"values by name, as {example}")
+        raise InputError(caller, name, describe(value), f"values by name, as {example}")
     for key in value:
         if not isinstance(key, str):
-            raise InputError(caller, name, f"{described(key)} as a name", f"strings as names, as {example}")
+            raise InputError(caller, name, f"{describe(key)} as a name", f"strings as names, as {example}")
     return value
 
 
@@ -88,12 +88,12 @@ def matrix(caller: str, name: str, value: Any, wanted: str = "a matrix of number
     except (TypeError, ValueError, RuntimeError, NotImplementedError):
         read = None
     if read is None or read.ndim != 2:
-        raise InputError(caller, name, described(value), wanted)
+        raise InputError(caller, name, describe(value), wanted)
     if not np.isfinite(read).all():
         raise InputError(caller, name, "NaN or infinity", "finite numbers")
     return read
 
 
-def counted(count: int, one: str, many: str = "") -> str:
+def plural(count: int, one: str, many: str = "") -> str:
     """1 input, 2 inputs; 1 matrix, 2 matrices."""
     return f"{count} {one if count == 1 else many or one + 's'}"

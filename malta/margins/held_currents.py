@@ -4,7 +4,7 @@
 
 B is close to a diagonal of monomials b_i(p), and Z and E are the stiffness that currents made for one place have
 elsewhere: of the state equation of `jacobians`, A = [[0, 1], [Z, 0]]. All of it is enclosed for every y of the travel
-at once (`along`), as sums of monomials of p with coefficients in intervals.
+at once (`laurent`), as sums of monomials of p with coefficients in intervals.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ import numpy as np
 from flint import arb
 
 from malta.margins import taylor
-from malta.margins.along import Evaluation, Laurent, Monomial, Value
 from malta.margins.expressions import NotAnalytic, program
+from malta.margins.laurent import Evaluation, Laurent, Monomial, Value
 from malta.margins.uncertain import model_of
 
 if TYPE_CHECKING:
@@ -94,7 +94,7 @@ class HeldMachine:
         Z, E, shares, ratios, rest = (size(t) for t in (self.Z, self.E, self.shares, self.ratios, self.rest))
         if not all(np.isfinite(M).all() for M in (Z, E, shares, ratios, rest, b)):
             raise NotAnalytic("a parameter that divides reaches zero")
-        if self.rest and not (dominating(ratios, rest[:, :1]) <= 1).all():
+        if self.rest and not (dominating_solution(ratios, rest[:, :1]) <= 1).all():
             raise NotAnalytic("forces at rest that are not what they were taken for")
         return Z, E, shares, b
 
@@ -107,7 +107,7 @@ class HeldMachine:
         return replace(self, Z=Z, E=E, shares=shares, ratios=ratios, rest=rest)
 
 
-def dominating(M: FloatArray, right: FloatArray) -> FloatArray:
+def dominating_solution(M: FloatArray, right: FloatArray) -> FloatArray:
     """At least (1 + M + M^2 + ...) right, entrywise, for what is not negative.
 
     Any S > M S + right is, and shows the sum to be finite.
@@ -133,11 +133,11 @@ def held_machine(
     of = model_of(plant, believed, names)
     q = ca.SX.sym("q", k + 1 + n)
     outputs = of(q[:k], q[k], q[k + 1 :])
-    _require(outputs, q[k + 1 :], of(q[:k], q[k], ca.SX.zeros(n))[4])
+    _require_linear(outputs, q[k + 1 :], of(q[:k], q[k], ca.SX.zeros(n))[4])
     nominal = np.array([getattr(plant.parameters, name) for name in names], dtype=float)
-    wanted, room = _wanted(of, nominal, sum(travel) / 2, n)
+    wanted, room = _forces_at_rest(of, nominal, sum(travel) / 2, n)
     run = Evaluation(k, *travel, INTERVALS)
-    v = [_about(run, x, room) for x in wanted]
+    v = [_interval_about(run, x, room) for x in wanted]
     model = program(ca.Function("model", [q], list(outputs)))
     entries = run.run(model, [*map(run.parameter, range(k)), run.y, *v])
     A, B, C, E, _, ratio, preload = ({(i, j): x for i, j, x in matrix} for matrix in entries)
@@ -152,10 +152,10 @@ def held_machine(
     def lower(matrix: dict[tuple[int, int], Value], columns: int) -> dict[tuple[int, int], Value]:
         return {(i - n, j): x for (i, j), x in matrix.items() if i >= n and j < columns}
 
-    lead, shares = _shares(run, lower(B, n), nominal, n)
-    by, ratios = _shares(run, ratio, nominal, n)
-    rest = _rest(run, ratio, preload, wanted, by)
-    rest = {at: _over(run, x, room) for at, x in rest.items()} if room.coefficient else {}
+    lead, shares = _relative_shares(run, lower(B, n), nominal, n)
+    by, ratios = _relative_shares(run, ratio, nominal, n)
+    rest = _residual_forces(run, ratio, preload, wanted, by)
+    rest = {at: _divide(run, x, room) for at, x in rest.items()} if room.coefficient else {}
     models = tuple(
         {at: run.laurent(x) for at, x in table.items()}
         for table in (lower(A, n), lower(E, n), shares, ratios, rest)
@@ -163,7 +163,7 @@ def held_machine(
     return HeldMachine(names, nominal, lead, *_tables(models), travel, models)
 
 
-def _require(outputs: Sequence[Any], v: Any, at_zero: Any) -> None:
+def _require_linear(outputs: Sequence[Any], v: Any, at_zero: Any) -> None:
     """That what is wanted enters linearly, and makes nothing where it is zero."""
     for k, order in ((0, 2), (3, 2), (4, 2), (1, 1), (5, 1)):
         if any(ca.which_depends(ca.vec(outputs[k]), v, order, False)):
@@ -172,7 +172,7 @@ def _require(outputs: Sequence[Any], v: Any, at_zero: Any) -> None:
         raise NotAnalytic("forces where none are wanted")
 
 
-def _wanted(of: ca.Function, nominal: FloatArray, y: float, n: int) -> tuple[list[Lead], Lead]:
+def _forces_at_rest(of: ca.Function, nominal: FloatArray, y: float, n: int) -> tuple[list[Lead], Lead]:
     """About what has to be wanted so that the preload acts, as monomials of p; and how far it may be off."""
 
     def at(p: FloatArray) -> FloatArray:
@@ -194,7 +194,7 @@ def _wanted(of: ca.Function, nominal: FloatArray, y: float, n: int) -> tuple[lis
     return found, Lead(SURE * abs(top.coefficient), top.monomial)
 
 
-def _about(run: Evaluation, wanted: Lead, room: Lead) -> Value:
+def _interval_about(run: Evaluation, wanted: Lead, room: Lead) -> Value:
     if not room.coefficient:
         return 0.0
     none = taylor.constant(0.0, run.count)
@@ -203,7 +203,7 @@ def _about(run: Evaluation, wanted: Lead, room: Lead) -> Value:
     return run.sum(value, open_) if wanted.coefficient else open_
 
 
-def _shares(
+def _relative_shares(
     run: Evaluation, matrix: dict[tuple[int, int], Value], nominal: FloatArray, n: int
 ) -> tuple[tuple[Lead, ...], dict[tuple[int, int], Value]]:
     """The largest monomial of each diagonal entry, and the matrix over these, column by column, less one."""
@@ -219,17 +219,17 @@ def _shares(
             raise NotAnalytic("a force that does not act on its own axis")
     found: dict[tuple[int, int], Value] = {}
     for (i, j), x in matrix.items():
-        over = _over(run, x, leads[j])
+        over = _divide(run, x, leads[j])
         found[i, j] = run.sum(over, -1.0) if i == j else over
     return tuple(leads), found
 
 
-def _over(run: Evaluation, x: Value, lead: Lead) -> Value:
+def _divide(run: Evaluation, x: Value, lead: Lead) -> Value:
     one = taylor.constant(lead.coefficient, run.count)
     return run.product(x, Laurent({tuple(-e for e in lead.monomial): taylor.inverse(one)}))
 
 
-def _rest(
+def _residual_forces(
     run: Evaluation,
     ratio: dict[tuple[int, int], Value],
     preload: dict[tuple[int, int], Value],
@@ -243,7 +243,7 @@ def _rest(
         if c:
             made = run.product(x, Laurent({m: taylor.constant(-c, run.count)}))
             found[i, 0] = run.sum(found[i, 0], made) if (i, 0) in found else made
-    return {(i, 0): _over(run, x, by[i]) for (i, _), x in found.items()}
+    return {(i, 0): _divide(run, x, by[i]) for (i, _), x in found.items()}
 
 
 def _tables(
@@ -251,8 +251,8 @@ def _tables(
 ) -> tuple[Table, Table, Table, Table, Table]:
     """Intervals of the coefficients, on all pieces of the travel or on some."""
 
-    def ranged(x: Laurent) -> Ranged:
+    def ranges_of(x: Laurent) -> Ranged:
         return Ranged(tuple((m, *c.bounds(pieces)) for m, c in x.terms.items()))
 
-    Z, E, shares, ratios, rest = ({at: ranged(x) for at, x in table.items()} for table in models)
+    Z, E, shares, ratios, rest = ({at: ranges_of(x) for at, x in table.items()} for table in models)
     return Z, E, shares, ratios, rest

@@ -19,7 +19,17 @@ from scipy import linalg, sparse
 
 from malta.margins.algebra import Ratio, Symbolic, value
 from malta.margins.expressions import BALLS, NotAnalytic, finite
-from malta.margins.groups import A, B, C, Group, UncertainLoop, divided, groups, hold_bounds, upper
+from malta.margins.groups import (
+    A,
+    B,
+    C,
+    Group,
+    UncertainLoop,
+    divide_by_descriptor,
+    groups,
+    hold_bounds,
+    upper,
+)
 from malta.margins.majorant import coefficient_bounds
 
 if TYPE_CHECKING:
@@ -40,7 +50,7 @@ class Couplings:
         """Of A; of B (D_c C, C_c); of B_c C. Sums are added up before they are bounded."""
         loop, s, law = self.loop, self.symbolic, self.loop.law
         n, k = loop.states, len(law.A)
-        own, into, out = divided(loop, s)[A], divided(loop, s)[B], s.entries[C]
+        own, into, out = divide_by_descriptor(loop, s)[A], divide_by_descriptor(loop, s)[B], s.entries[C]
         held: dict[tuple[int, int], Ratio] = {}
         measured: dict[tuple[int, int], Ratio] = {}
 

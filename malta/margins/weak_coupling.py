@@ -1,16 +1,17 @@
-"""Loops of machines with held currents, anywhere in their travel: axes by themselves, and what couples them bounded.
+"""Loops of machines with held currents anywhere in their travel: each axis alone, and a bound of their coupling.
 
-Without Z, E and B b^-1 - 1 of `held` the sampled loop is M0 = diag(M_g), groups of a few axes whose determinants are
-multi-affine in the b_i. The loop is M0 - e(z). On |z| = 1 it is not singular where for some weights d > 0
+Without Z, E and B b^-1 - 1 (held_currents.py) the sampled loop is M0 = diag(M_g): groups of a few axes, whose
+determinants are multi-affine in the b_i. The loop is M0 - e(z). On |z| = 1 it is regular if for some weights d > 0
 
-    sum_i |(M0^-1)_ji| sum_k |e_ik| d_k < d_j   for every state j,
+    sum_i |(M0^-1)_ji| sum_k |e_ik| d_k < d_j   for every state j.
 
-whatever y and however small a share of e acts: all of these loops are as stable as M0 at the nominal values. States are
-positions q, rates q' and accelerations a = b v stored for a sample, of each axis, and the compensator's xi:
+This holds for every y and for every share of e, so all of these loops are as stable as M0 at the nominal values. The
+states of an axis are its position q, its rate q' and the acceleration a = b v stored for a sample; the compensator has
+the states xi:
 
     q+, q'+ = Phi0 (q, q') + Gamma0 a + e,   e = Gamma0 W (q, q', a) + (V (q, q', a), 0),   Gamma0 = (T^2 / 2, T)
 
-M0^-1 e is followed along frequency; what digits of gains that should cancel leave is bounded by coefficients.
+M0^-1 e is expanded along frequency. Gains that differ from zero by rounding alone are bounded by coefficients.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from malta.margins.enclosure import Unproven
 from malta.margins.exclusion import Beside, growth_over, on_boxes
 from malta.margins.expressions import NotAnalytic
 from malta.margins.family import Family, scale_of
-from malta.margins.held import HeldMachine, dominating
+from malta.margins.held_currents import HeldMachine, dominating_solution
 from malta.margins.parts import Part
 from malta.margins.problem import Problem, physical
 
@@ -67,17 +68,17 @@ class Coupling:
     T: float
 
     def acting(self, g: Axes, N: FloatArray, off: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """What acts on a group: M0^-1 e in rows of q, q' and a, bounds by coefficients, how far the first are off.
+        """The coupling to a group: M0^-1 e in rows of q, q' and a; bounds by coefficients; errors of the first.
 
-        N, off : K x states x states x nodes, how far these are off
+        N, off : adjugates, K x states x states x nodes, and bounds of their errors
         """
         n, r = len(self.W), len(g.axes)
         members, axes, T = members_of(g, n), list(g.axes), self.T
         d = self.weights[members][:, None]
         by_force, by_place = ((M @ self.weights)[axes] * SAFE / d for M in (self.W, self.V))
         by_state = (self.rest @ self.weights)[members] * SAFE / d
-        through = _through(N, r, T, 2)
-        loose = _through(off, r, T, 2)
+        through = _response_to_moves(N, r, T, 2)
+        loose = _response_to_moves(off, r, T, 2)
         own = np.concatenate([by_force, by_place], axis=1)
         scaled, loose = through * own[..., None], loose * own * SAFE
         beyond = ((np.abs(N).max(axis=3) + off) * by_state).sum(axis=2)
@@ -88,15 +89,15 @@ class Coupling:
         return scaled[:, : 3 * r], more * SAFE, loose[:, : 3 * r].max(axis=(1, 2))
 
 
-def _through(N: FloatArray, r: int, T: float, axis: int) -> FloatArray:
-    """What forces on the axes and moves of their positions make, of what moves of each state make."""
+def _response_to_moves(N: FloatArray, r: int, T: float, axis: int) -> FloatArray:
+    """The response to forces on the axes and to moves of their positions, from the response N to moves of states."""
     q, rate = np.take(N, range(r), axis=axis), np.take(N, range(r, 2 * r), axis=axis)
     return np.concatenate([q * (T**2 / 2) + rate * T, q], axis=axis)
 
 
 @dataclass(frozen=True, eq=False)
-class _Coupled:
-    """A group's polynomial over a box, on cells of it with what the coupling adds: found when it is first asked for."""
+class _CoupledGroup:
+    """A group's polynomial over a box with the coupling to the other groups, which is computed when first used."""
 
     group: Axes
     sides: FloatArray
@@ -105,7 +106,7 @@ class _Coupled:
 
     @cached_property
     def families(self) -> tuple[Family, Family, tuple[int, ...]]:
-        """The polynomial with bounds by coefficients, and what is followed: rows x inputs x nodes on one axis."""
+        """The polynomial with bounds by coefficients; M0^-1 e as a family; its rows x inputs x nodes."""
         f = self.plain
         _, _, N, off = self.group.over(self.sides)
         main, more, off = self.coupling().acting(self.group, N, off)
@@ -124,22 +125,22 @@ class _Coupled:
 
 
 def _part(g: Axes, coupling: Callable[[], Coupling], sides: FloatArray, box: Box) -> Part:
-    """A group's polynomial over a box, with what the coupling adds to it."""
+    """A group's polynomial over a box, with its coupling."""
     values, radius, _, _ = g.over(sides)
     with np.errstate(divide="ignore"):
         scale = scale_of(np.log2(np.abs(values).max(axis=1)) + np.array(g.heights))
     exponents = tuple(h + scale * k for k, h in enumerate(g.heights))
     family = Family(tuple(d + 1 for d in g.degrees), values, radius, exponents, scale)
-    group: Any = g  # of which a part asks `inverted` alone
-    around = _Coupled(g, sides, family, coupling).on
+    group: Any = g  # a part uses `inverted` alone
+    around = _CoupledGroup(g, sides, family, coupling).on
     return Part(group, sides, family, growth_over(sides, g.inverted, box), around)
 
 
 @dataclass(frozen=True, eq=False)
-class AnywhereHeld:
-    """A loop with held currents and a sample of delay, anywhere in its travel: what a margin is asked of.
+class HeldLoop:
+    """A loop with held currents and a sample of delay, anywhere in its travel: a Problem for `margin_of`.
 
-    law : on the readings alone, without its delay; places: loops that are looked at for what is lost
+    law : the compensator without its delay; places : the loops at places of the travel, for the loss of stability
     """
 
     machine: HeldMachine
@@ -153,7 +154,10 @@ class AnywhereHeld:
 
     @cached_property
     def groups(self) -> tuple[Axes, ...]:
-        """Raises Unproven for groups of many axes, and for states of the compensator that are in none."""
+        """The axes in groups that share loops.
+
+        Raises Unproven for a group of more than LARGEST axes, and for states of the compensator outside all groups.
+        """
         n, label = len(self.machine.lead), _labels(self.law)
         if not set(label[n:].tolist()) <= set(label[:n].tolist()):
             raise Unproven("states of the compensator that act on no axis")
@@ -169,8 +173,8 @@ class AnywhereHeld:
     def instability(self, rows: FloatArray) -> FloatArray:
         return self.places.instability(rows)
 
-    def critical(self, p: FloatArray) -> float:
-        return self.places.critical(p)
+    def critical_frequency(self, p: FloatArray) -> float:
+        return self.places.critical_frequency(p)
 
     def physical(self, x: float) -> float:
         return physical(x, self.T)
@@ -179,13 +183,13 @@ class AnywhereHeld:
         del p
         return [(g, ()) for g in self.groups]
 
-    def enclosed(self, box: Box, reach: float) -> list[Part]:
-        """The groups over a box, coupled. Raises Unproven."""
+    def enclose(self, box: Box, reach: float) -> list[Part]:
+        """The groups with their coupling over box(reach). Raises Unproven when it cannot be bounded."""
         sides = box.sides(reach)
         try:
             bounds = self.machine.bounds([arb(low).union(arb(high)) for low, high in sides.tolist()])
             with np.errstate(over="ignore", invalid="ignore"):  # bounds that overflow are refused
-                W, V, rest = _beside(*bounds, self.T, self._dropped)
+                W, V, rest = coupling_bounds(*bounds, self.T, self._dropped_gains)
         except NotAnalytic as error:
             raise Unproven(f"the matrices have no value on the box: {error}") from error
 
@@ -198,25 +202,25 @@ class AnywhereHeld:
     # coupling
 
     @cached_property
-    def _dropped(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    def _dropped_gains(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """|A|, |B|, |C|, |D| of the compensator between groups."""
         law = self.law
         own, axis = np.zeros(len(law.A), dtype=int), np.zeros(len(law.C), dtype=int)
         for k, g in enumerate(self.groups):
             own[list(g.own)], axis[list(g.axes)] = k, k
 
-        def between(M: FloatArray, rows: FloatArray, columns: FloatArray) -> FloatArray:
+        def mask_groups(M: FloatArray, rows: FloatArray, columns: FloatArray) -> FloatArray:
             return np.where(rows[:, None] != columns[None], np.abs(M), 0)
 
         return (
-            between(law.A, own, own), between(law.B, own, axis),
-            between(law.C, axis, own), between(law.D, axis, axis),
+            mask_groups(law.A, own, own), mask_groups(law.B, own, axis),
+            mask_groups(law.C, axis, own), mask_groups(law.D, axis, axis),
         )  # fmt: skip
 
     def _weights(self, forces: FloatArray, rest: FloatArray, box: Box, reach: float) -> FloatArray:
-        """Weights for which the largest row of |M0^-1| |e| is below one as far out as possible, at corners of boxes.
+        """Weights for which the largest row of |M0^-1| |e| stays below one up to a box as large as possible.
 
-        Any positive weights are right; these are only good ones.
+        The proof is valid for any positive weights; the choice decides how far it reaches.
         """
         low, high = 0.0, reach
         best, rho = self._perron(forces, rest, box.sides(0.0))
@@ -234,7 +238,7 @@ class AnywhereHeld:
         return best
 
     def _perron(self, forces: FloatArray, rest: FloatArray, sides: FloatArray) -> tuple[FloatArray, float]:
-        """Perron's vector of what is seen of |M0^-1| |e|, and its value; infinite where M0 is not stable."""
+        """Perron's vector and value of |M0^-1| |e| at sampled frequencies; infinite where M0 is unstable."""
         n, T = len(forces) // 2, self.T
         seen = np.zeros((len(rest), len(rest)))
         for g in self.groups:
@@ -249,7 +253,7 @@ class AnywhereHeld:
                 z = np.exp(1j * np.concatenate([np.geomspace(1e-3, 1, SWEEP) * np.pi, angles]))
                 G = np.linalg.inv(z[:, None, None] * eye - A)
                 own = forces[[*g.axes, *(n + i for i in g.axes)]]
-                one = (np.abs(_through(G, r, T, 2)) @ own).max(axis=0)
+                one = (np.abs(_response_to_moves(G, r, T, 2)) @ own).max(axis=0)
                 one += (np.abs(G) @ rest[members]).max(axis=0) * LOOSE
                 one[3 * r :] *= LOOSE
                 seen[members] = np.maximum(seen[members], one)
@@ -262,7 +266,7 @@ class AnywhereHeld:
         return np.exp2(np.round(8 * np.log2(d * units)) / 8), float((balanced @ d / d).max())
 
     def _corners(self, g: Axes, sides: FloatArray) -> FloatArray:
-        """The extreme b of a group at corners of a box: rows."""
+        """The values of b of a group at the corners of a box: one row for each."""
         lead = [self.machine.lead[i] for i in g.axes]
         corners = np.array(list(itertools.product(*[(0, 1)] * len(sides))))
         p = sides[np.arange(len(sides)), corners]
@@ -275,22 +279,22 @@ def _labels(law: Compensator) -> Any:
     """The group of each axis and of each state of the compensator."""
     n, k = len(law.C), len(law.A)
 
-    def joins(M: FloatArray) -> Any:
+    def is_joined(M: FloatArray) -> Any:
         size = np.abs(M)
         if not size.size:
             return size > 0
         return size > SMALL * np.sqrt(size.max(axis=1, keepdims=True) * size.max(axis=0, keepdims=True))
 
     touch = np.zeros((n + k, n + k), dtype=bool)
-    touch[:n, :n], touch[:n, n:] = joins(law.D), joins(law.C)
-    touch[n:, :n], touch[n:, n:] = joins(law.B), joins(law.A)
+    touch[:n, :n], touch[:n, n:] = is_joined(law.D), is_joined(law.C)
+    touch[n:, :n], touch[n:, n:] = is_joined(law.B), is_joined(law.A)
     return sparse.csgraph.connected_components(touch, directed=False)[1]
 
 
-def _beside(
+def coupling_bounds(
     Z: FloatArray, E: FloatArray, shares: FloatArray, b: FloatArray, T: float, dropped: tuple[FloatArray, ...]
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Bounds of W, of V, and of what the compensator's dropped gains do, from those of Z, E, B b^-1 - 1 and b.
+    """Bounds of W, of V and of the compensator's dropped gains, from those of Z, E, B b^-1 - 1 and b.
 
     X = Z - E C is the stiffness of held currents, |X| <= |Z| + |E|. With Gamma(X) = (sum X^k T^(2k + 2) / (2k + 2)!,
     sum X^k T^(2k + 1) / (2k + 1)!), and e_q the part of e in q+,
@@ -298,9 +302,9 @@ def _beside(
         e = Gamma(X) (Z q + B b^-1 a - E (q - r)) - Gamma0 a + (Phi(X) - Phi0) q'
         q - r = (T q' + T^2 / 2 a + e_q) / z
 
-    which has a solution for all |z| >= 1, as |Gamma E| has no eigenvalue of one or more (`dominating`): e is analytic
-    there, and what is stable stays so. The second row of e is T W; V is the first one less T / 2 times the second, term
-    by term of the series.
+    This has a solution for all |z| >= 1, because |Gamma E| has no eigenvalue of one or more (`dominating_solution`):
+    e is analytic there, and a stable loop stays stable. The second row of e is T W; V is the first row less T / 2 times
+    the second, term by term of the series.
     """
     n = len(Z)
     X, eye = Z + E, np.eye(n)
@@ -325,7 +329,7 @@ def _beside(
     up = W * (T**2 / 2) + less @ driven
     up[:, rate] += short / T
     whole = eye * (T**2 / 2) + less  # of Gamma(X), the first part
-    moved = dominating(whole @ E * SAFE, up * SAFE)
+    moved = dominating_solution(whole @ E * SAFE, up * SAFE)
     W = W + (short @ driven + (eye * T**2 + short) @ E @ moved) / T**2
     W[:, rate] += whole @ X / T
     V = skew @ driven + skew @ E @ moved
