@@ -1,9 +1,9 @@
-"""Algebraic equations of a descriptor system: rows of E that are zero, solved for the states that E does not hold.
+"""Algebraic equations of a descriptor system: zero rows of E, solved for the states of its zero columns.
 
     E_1 x_1' = A_11 x_1 + A_12 x_2 + B_1 u
            0 = A_21 x_1 + A_22 x_2 + B_2 u        x_2 = -A_22^-1 (A_21 x_1 + B_2 u)
 
-Which rows and columns these are is read from the expressions. The finite poles stay as they are.
+The zero rows and columns are read from the expressions. The finite poles do not change.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from malta.margins.arguments import plural
 
 
 def eliminate_algebraic(matrices: list[ca.SX]) -> list[ca.SX]:
-    """A, B, C, D, E without algebraic states; as they are where E has no row of zeros.
+    """A, B, C, D, E without algebraic states; unchanged when E has no zero row.
 
-    Raises InputError where the equations do not give their states: zero columns of E other in number than its zero
-    rows, or A_22 singular (an index above one).
+    Raises InputError when the equations do not determine these states: E has more zero rows than zero columns or fewer,
+    or A_22 is singular (an index above one).
     """
     if len(matrices) < 5:
         return matrices

@@ -1,4 +1,4 @@
-"""What a caller gives, read as what it should be: numbers, intervals, values by name, matrices. Else InputError."""
+"""Arguments of a caller, read as numbers, intervals, values by name or matrices. Raises InputError otherwise."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from malta.errors import InputError
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
 
-LARGEST = 1e150  # of what a parameter may be: squares of multiples of it are numbers still
+LARGEST = 1e150  # size of a parameter at most, so that squares of its multiples do not overflow
 LONG = 60  # characters of a value that a message shows
 
 
 def describe(value: Any) -> str:
-    """A value as a message shows it: as it is written where that is short, else by its kind."""
+    """A value as a message shows it: its text when that is short, else its type."""
     text = repr(value) if isinstance(value, complex | float | int | str | tuple | list | dict) else ""
     if text and len(text) <= LONG:
         return text
@@ -26,7 +26,7 @@ def describe(value: Any) -> str:
 
 
 def is_number(value: Any) -> bool:
-    """Whether it is one finite real number of any kind; strings and truth values are none."""
+    """Whether a value is one finite real number; strings and truth values are not."""
     if isinstance(value, bool | np.bool_ | str | bytes | complex | np.complexfloating):
         return False
     if isinstance(value, np.ndarray) and (value.ndim or value.dtype.kind not in "iuf"):
@@ -45,7 +45,7 @@ def number(caller: str, name: str, value: Any) -> float:
 
 
 def positive(caller: str, name: str, value: Any, below: float = math.inf, *, endless: bool = False) -> float:
-    """A number above zero, and below a bound; `endless`: or infinity. Raises InputError."""
+    """A number above zero and below a bound, or infinity when `endless`. Raises InputError."""
     if endless and isinstance(value, float) and value == math.inf:
         return value
     if not (is_number(value) and 0 < float(value) < below):
@@ -55,12 +55,12 @@ def positive(caller: str, name: str, value: Any, below: float = math.inf, *, end
 
 
 def is_pair(value: Any) -> bool:
-    """Whether it is a tuple or a list of two."""
+    """Whether a value is a tuple or a list of two."""
     return isinstance(value, tuple | list) and len(value) == 2
 
 
 def interval(caller: str, name: str, value: Any) -> tuple[float, float]:
-    """(low, high), of which either may be infinite. Raises InputError."""
+    """An interval (low, high); either end may be infinite. Raises InputError."""
     if is_pair(value):
         low, high = (
             float(v) if is_number(v) or (isinstance(v, float) and math.isinf(v)) else math.nan for v in value
@@ -95,5 +95,5 @@ def matrix(caller: str, name: str, value: Any, wanted: str = "a matrix of number
 
 
 def plural(count: int, one: str, many: str = "") -> str:
-    """1 input, 2 inputs; 1 matrix, 2 matrices."""
+    """A count with its noun: "1 input", "2 inputs"; "1 matrix", "2 matrices"."""
     return f"{count} {one if count == 1 else many or one + 's'}"

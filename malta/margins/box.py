@@ -1,4 +1,4 @@
-"""Boxes of parameters: what grows with the margin t, and what stays."""
+"""Boxes of parameters: ranges that grow with the margin t, and intervals that do not."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 FAR = 1e2  # search limit, in multiples of the modelled box
-EDGE = 1e-4  # distance that the search keeps from the end of what a parameter can be, relative
+EDGE = 1e-4  # relative distance of the search from the limits of parameters
 
 
 def smallest_t(p: FloatArray, nominal: FloatArray, down: FloatArray, up: FloatArray) -> FloatArray:
@@ -37,21 +37,21 @@ def smallest_t(p: FloatArray, nominal: FloatArray, down: FloatArray, up: FloatAr
 
 @dataclass(frozen=True, eq=False)
 class Box:
-    """Nominal values and how far each grows downwards and upwards with t; `over` stays."""
+    """Nominal values, how far each parameter moves down and up per unit of t, and intervals that do not grow."""
 
     names: tuple[str, ...]
     nominal: FloatArray
     down: FloatArray
     up: FloatArray
-    over: FloatArray  # names x 2: added to nominal, whatever t
-    most: float  # t at which a parameter leaves what it can be
+    over: FloatArray  # P x 2, intervals that do not grow, relative to nominal
+    most: float  # t at which a parameter reaches its limit
     frame: Mapping[int, tuple[float, float]] = field(
         default_factory=dict
-    )  # by index: an interval around `over`
+    )  # by index: an interval around `over`, shared by several boxes
 
     @property
     def limit(self) -> float:
-        """How far a search goes: near the end of what a parameter can be, or far beyond what is modelled."""
+        """The largest t that a search tries: close to the limit of a parameter, FAR at most."""
         return min(self.most * (1 - EDGE), FAR)
 
     def margin(self, p: FloatArray) -> FloatArray:
@@ -59,25 +59,25 @@ class Box:
         return smallest_t(p, self.nominal, self.down, self.up)
 
     def sides(self, t: float) -> FloatArray:
-        """Low and high of every parameter: names x 2."""
+        """The ends (low, high) of every parameter in box(t): P x 2."""
         return np.column_stack([self.nominal - t * self.down, self.nominal + t * self.up]) + self.over
 
     def frame_sides(self, t: float) -> FloatArray:
-        """`sides`, those of the frame as wide as that: what several boxes have in common."""
+        """The sides of box(t) with those of the frame in place of the own ones: equal for several boxes."""
         sides = self.sides(t)
         for i, interval in self.frame.items():
             sides[i] = interval
         return sides
 
     def nominal_places(self) -> FloatArray:
-        """Nominal values, at both ends and the middle of everything that stays; the nominal ones first."""
+        """The nominal values at the ends and the middle of the intervals that do not grow; rows, nominal first."""
         sides = (np.unique([0.0, low, (low + high) / 2, high]) for low, high in self.over)
         places = np.array(list(itertools.islice(itertools.product(*sides), 4096)))
         order = np.argsort(np.abs(places).sum(axis=1), kind="stable")
         return np.asarray(self.nominal + places[order])
 
     def stretch(self, p: FloatArray, share: float) -> FloatArray:
-        """Parameters that deviate `share` times as far, those that stay as they are."""
+        """The parameters p with `share` times their deviation on the axes that grow."""
         return np.where(self.down + self.up > 0, self.nominal + share * (p - self.nominal), p)
 
 
@@ -91,12 +91,12 @@ def box_of(
     empty: bool = False,
     caller: str = "robust_margin",
 ) -> Box:
-    """The box of ranges (that grow) and of intervals that stay, about the nominal values `at`.
+    """The box of ranges that grow with t and of intervals `over` that do not, about the nominal values `at`.
 
-    empty : whether there may be no ranges at all
-    caller : the function whose input this is
+    empty : whether `ranges` may be empty
+    caller : the function that an error names
 
-    Raises InputError for names that are not known and ranges that are none.
+    Raises InputError for unknown names and invalid ranges.
     """
     by_name(caller, "ranges", ranges, '{"k": 0.2} or {"k": (1, 2)}')
     by_name(caller, "over", over, '{"k": (1, 2)}')

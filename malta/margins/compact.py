@@ -1,8 +1,8 @@
-"""Long expressions of p written out as the short rational functions that they are.
+"""Long expressions of p expanded to short rational functions.
 
-The planar motor's matrices at a place come from sums over sixteen coils: ten thousand operations that amount to
-polynomials of a few terms. Written out exactly, then rounded to doubles once, what symmetry makes zero is zero but for
-that rounding: terms below 1e-11 of the largest in their row and column are left out of the model.
+The matrices of a planar motor at a place are sums over many coils: ten thousand operations that equal polynomials of a
+few terms. They are expanded exactly, then rounded to doubles once. Entries that symmetry makes zero differ from zero by
+that rounding alone: terms below 1e-11 of the largest in their row and column are left out of the model.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from malta.margins.expressions import exact, program
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
 
-ROUNDING = 1e-11  # terms below this, relative, are rounding of the model's own arithmetic
+ROUNDING = 1e-11  # relative size below which a term is rounding of the model's arithmetic
 
 Table = dict[tuple[int, int], Ratio]
 
@@ -28,8 +28,9 @@ Table = dict[tuple[int, int], Ratio]
 def expand_matrices(function: ca.Function, nominal: FloatArray) -> tuple[Symbolic, list[Table]]:
     """The matrices of a function of one vector as exact rational functions, without terms that are rounding.
 
-    nominal : values at which terms are weighed
-    Raises TooLarge, NotAnalytic.
+    nominal : values at which the sizes of terms are compared
+
+    Raises TooLarge or NotAnalytic when the function has no short expansion.
     """
     s = symbolic(program(function))
     scales = np.concatenate([nominal, np.ones(len(s.atoms))])
@@ -41,7 +42,7 @@ def expand_matrices(function: ca.Function, nominal: FloatArray) -> tuple[Symboli
 
 
 def _circles(s: Symbolic) -> list[tuple[int, int]]:
-    """Variables that are sine and cosine of the same angle."""
+    """The pairs of variables that are sine and cosine of the same angle."""
     found: dict[tuple[int, ...], dict[str, int]] = {}
     for k, step in enumerate(s.atoms):
         name, _, operands, _ = s.program.steps[step]
@@ -50,7 +51,7 @@ def _circles(s: Symbolic) -> list[tuple[int, int]]:
 
 
 def _replace_cosines(s: Symbolic, r: Ratio, circles: list[tuple[int, int]]) -> Ratio:
-    """With cos^2 as 1 - sin^2 of the same angle, so that equal expressions look alike."""
+    """Replace cos^2 by 1 - sin^2 of the same angle, so that equal expressions have equal polynomials."""
     if not circles:
         return r
 
@@ -69,7 +70,7 @@ def _replace_cosines(s: Symbolic, r: Ratio, circles: list[tuple[int, int]]) -> R
 
 
 def is_free_of_functions(s: Symbolic, tables: Sequence[Table]) -> bool:
-    """Whether nothing but p itself is left in the entries."""
+    """Whether the entries depend on p alone, without sines, roots and other functions."""
     for table in tables:
         for r in table.values():
             for polynomial in (r.num, r.den):
@@ -79,7 +80,7 @@ def is_free_of_functions(s: Symbolic, tables: Sequence[Table]) -> bool:
 
 
 def drop_rounding(s: Symbolic, table: Table, nominal: FloatArray, *beside: Table) -> Table:
-    """A table without the terms that are rounding beside the largest in their row and column (of other tables)."""
+    """A table without terms that are negligible against the largest in their row and column, of `beside` if given."""
     weights = [abs(float(x)) or 1.0 for x in nominal]
     rows: dict[int, float] = {}
     columns: dict[int, float] = {}
@@ -98,14 +99,14 @@ def drop_rounding(s: Symbolic, table: Table, nominal: FloatArray, *beside: Table
 
 
 def _drop_rounding_terms(s: Symbolic, polynomial: Any, weights: list[float]) -> Any:
-    """A polynomial without the terms that are rounding beside its largest."""
+    """A polynomial without terms that are negligible against its largest."""
     sizes = _sizes(Ratio(polynomial), weights)
     limit = ROUNDING * max(sizes.values())
     return s.context.from_dict({m: _double(c) for m, c in polynomial.to_dict().items() if sizes[m] > limit})
 
 
 def _sizes(r: Ratio, weights: list[float]) -> dict[Any, float]:
-    """Of each term of the numerator, over the denominator's."""
+    """The size of each term of the numerator, relative to the denominator."""
 
     def weigh(monomial: Sequence[int], c: Any) -> float:
         size = abs(int(c.p) / int(c.q))
@@ -140,7 +141,7 @@ def _double(c: Any) -> Any:
 
 
 def substitute(s: Symbolic, r: Ratio, values: Mapping[int, Ratio]) -> Ratio:
-    """r with variables replaced by rational functions."""
+    """Substitute rational functions for variables of r."""
 
     def turn(polynomial: Any) -> Ratio:
         total = Ratio(s.context.constant(0))
@@ -158,9 +159,9 @@ def substitute(s: Symbolic, r: Ratio, values: Mapping[int, Ratio]) -> Ratio:
 
 
 def solution(s: Symbolic, matrix: Table, right: Mapping[int, Ratio], n: int) -> list[Ratio]:
-    """x of M x = b, by elimination in exact rational functions; pivots with the fewest terms first.
+    """Solve M x = b by elimination in exact rational functions; pivots with the fewest terms first.
 
-    Raises ZeroDivisionError where M is singular for all p.
+    Raises ZeroDivisionError when M is singular for all p.
     """
     zero = Ratio(s.context.constant(0))
     rows = [{j: matrix[i, j] for j in range(n) if (i, j) in matrix} for i in range(n)]
@@ -196,7 +197,7 @@ def solution(s: Symbolic, matrix: Table, right: Mapping[int, Ratio], n: int) -> 
 
 
 def expression(r: Ratio, p: Any) -> Any:
-    """As a CasADi expression of the vector p."""
+    """r as a CasADi expression of the vector p."""
 
     def turn(polynomial: Any) -> Any:
         total: Any = ca.SX(0)
@@ -212,7 +213,7 @@ def expression(r: Ratio, p: Any) -> Any:
 
 
 def matrix_of(table: Table, shape: tuple[int, int], p: Any) -> Any:
-    """A CasADi matrix, structurally zero where the table has no entry."""
+    """The table as a CasADi matrix, structurally zero without an entry."""
     found = ca.SX(*shape)
     for (i, j), r in table.items():
         found[i, j] = expression(r, p)

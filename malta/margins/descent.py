@@ -1,8 +1,8 @@
 """The descent to the nearest loss of stability: the smallest t with a(jw; p) = 0 for some w and some p in box(t).
 
-A root x of a(jx; p) is followed as p moves. Its angle Im ln x, zero on the boundary of stability, is a smooth function
-of p: one real equation. It is linearized, and the smallest t that solves it within a trust region found in closed form;
-repeated, that is Newton's method with the freedom that is left used to make t small. At w = 0 and at infinity (the
+A root x of a(jx; p) is followed as p moves. Its angle Im ln x is zero on the boundary of stability and a smooth
+function of p: one real equation. Each step linearizes this equation and finds in closed form the smallest t that solves
+it within a trust region: Newton's method, which uses its free directions to reduce t. At w = 0 and at infinity (the
 Nyquist frequency) the equation is that of one real coefficient.
 """
 
@@ -21,9 +21,9 @@ if TYPE_CHECKING:
     from malta.model.plant import FloatArray
 
 MOST = 60  # steps of a descent
-BEYOND = 1.2  # of the smallest t known: descents that lead further out are given up
-CLOSE = 1e-9  # what a step may still gain where a descent ends, relative
-FAR = 1.5  # |change of ln x| with which a root is another one
+BEYOND = 1.2  # a descent ends beyond this multiple of the smallest t known
+CLOSE = 1e-9  # relative gain of a step below which a descent ends
+FAR = 1.5  # |change of ln x| beyond which a root counts as another one
 NEAR = 0.3  # |change of ln x| within which a root belongs to its start
 
 
@@ -38,7 +38,7 @@ class _Place(NamedTuple):
 
 
 def nearest(f: Family, g: Growth, branch: int, x: float, u: FloatArray, below: float) -> Zero | None:
-    """Descend to a zero of f of smallest t from a start; None where none is found with t below `below`."""
+    """Descend from a start to a zero of f of smallest t; None when none with t below `below` is found."""
     here = _find_root(f, g, branch, x, u, below)
     trust, widest, best = 0.5, 1.0, None
     for k in range(MOST if here is not None else 0):
@@ -72,7 +72,7 @@ def nearest(f: Family, g: Growth, branch: int, x: float, u: FloatArray, below: f
 
 
 def _as_zero(f: Family, branch: int, here: _Place) -> Zero | None:
-    """A place as a zero, where f vanishes there to rounding."""
+    """The place as a zero if f vanishes there to rounding, else None."""
     x = abs(here.x)
     a, _ = coefficients_at(f, here.u)
     rows, _ = rows_and_slopes(f, branch, x)
@@ -81,7 +81,7 @@ def _as_zero(f: Family, branch: int, here: _Place) -> Zero | None:
 
 
 def _find_root(f: Family, g: Growth, branch: int, x: complex, u: FloatArray, below: float) -> _Place | None:
-    """The root next to x, where it is next to the boundary; or one that the linearized equation leads to."""
+    """The root next to x if it is near the boundary, else one near a place that the linearized equation leads to."""
     if x == 0:
         return _follow_root(f, g, branch, 0.0, u)
     for _ in range(12):
@@ -105,7 +105,7 @@ def _find_root(f: Family, g: Growth, branch: int, x: complex, u: FloatArray, bel
 def _follow_root(
     f: Family, g: Growth, branch: int, x: complex, u: FloatArray, far: float = FAR
 ) -> _Place | None:
-    """The root next to x at u, by Newton's method in ln x, which changes by `far` at most; None where there is none."""
+    """The root next to x at u, by Newton's method in ln x; None when ln x changes by more than `far`."""
     a, slopes = coefficients_at(f, u)
     t = float(g.margin(g.parameters(u)))
     if x == 0:
@@ -121,14 +121,14 @@ def _follow_root(
         if not np.isfinite(step) or abs(np.log(x / first)) > far:
             return None
         x = x * np.exp(-step if abs(step) < 0.5 else -0.5 * step / abs(step))
-        if abs(step) < 1e-9:  # the next one would be below rounding
+        if abs(step) < 1e-9:  # the next step would be below rounding
             moved = -(rows @ slopes.T)[0] / turned
             return _Place(complex(x), u, t, float(np.angle(x)), moved.imag)
     return None
 
 
 class _Sides(NamedTuple):
-    """Of box(t) as seen from u: middle - t below <= du <= middle + t above on the axes that grow."""
+    """The sides of box(t) seen from u: middle - t below <= du <= middle + t above on the axes that grow."""
 
     grows: Any
     middle: FloatArray
@@ -146,9 +146,9 @@ def _sides(g: Growth, u: FloatArray, free: Any) -> _Sides:
 def _smallest_step(
     f: Family, g: Growth, here: _Place, trust: float
 ) -> tuple[float, float, FloatArray] | None:
-    """The smallest t that solves the linearized equation, t per unit of the value, du; None where none does.
+    """The smallest t whose box contains a solution du of the linearized equation, t per unit of the value, and du.
 
-    The equation is s du = h, and the largest s du in box(t) is piecewise linear in t.
+    The equation is s du = h, and the largest s du in box(t) is piecewise linear in t. None: no t solves it.
     """
     free = np.array([n > 1 for n in f.shape], dtype=bool)
     u, sides = here.u, _sides(g, here.u, free)
@@ -168,9 +168,7 @@ def _smallest_step(
         """du of the largest s du in box(t)."""
         top = np.where(grows, np.minimum(high, middle + t * above), high)
         bottom = np.where(grows, np.maximum(low, middle - t * below), low)
-        rest = np.clip(
-            np.where(grows, middle, 0), bottom, top
-        )  # what does not act stays nominal, or where it is
+        rest = np.clip(np.where(grows, middle, 0), bottom, top)  # axes without effect stay nominal, or at u
         return np.asarray(np.where(s > 0, top, np.where(s < 0, bottom, rest)))
 
     most, least = end(t, s), end(t, -s)
@@ -190,12 +188,12 @@ def _smallest_step(
 def _grow_box(
     t: float, s: FloatArray, h: float, end: Any, sides: _Sides, room: tuple[FloatArray, FloatArray]
 ) -> tuple[float, FloatArray]:
-    """The smallest t from which on box(t) holds a du with s du = h; infinite where the trust region ends before."""
+    """The smallest t whose box contains a du with s du = h; infinite when the trust region ends before."""
     (low, high), (grows, middle, below, above) = room, sides
     with np.errstate(all="ignore"):
         full = np.where(
             s > 0, (high - middle) / above, (middle - low) / below
-        )  # where an axis has no more room
+        )  # t at which an axis reaches the trust region
         rate = np.where(grows & (s != 0), np.abs(s) * np.where(s > 0, above, below), 0)
     for stop in [*np.sort(full[(rate > 0) & (full > t)]).tolist(), np.inf]:
         pull = float(rate[full > t].sum())
@@ -210,7 +208,7 @@ def _grow_box(
 
 
 def from_cell(f: Family, g: Growth, cell: Cell, below: float) -> Zero | None:
-    """A zero of t below `below` out of a cell where zero was not excluded: the next one, and the descent from there."""
+    """A zero with t below `below` in a cell that resists: the zero next to its middle, and the descent from there."""
     low, high = cell.interval
     u, best = cell.box.mean(axis=1), None
     for x in ((low + high) / 2, *([0.0] if low == 0 else [])):
@@ -226,7 +224,7 @@ def from_cell(f: Family, g: Growth, cell: Cell, below: float) -> Zero | None:
 
 
 def project(f: Family, g: Growth, branch: int, x: float, u: FloatArray) -> Zero | None:
-    """The zero next to a place, by Newton's method with steps of least norm; None where it leads out of the box."""
+    """The zero next to a place, by Newton's method with steps of least norm; None when it leaves the box."""
     free = np.array([n > 1 for n in f.shape])
     for _ in range(30):
         a, slopes = coefficients_at(f, u)
@@ -252,5 +250,5 @@ def project(f: Family, g: Growth, branch: int, x: float, u: FloatArray) -> Zero 
 
 
 def _modulus(z: complex) -> float:
-    """|z|; infinite where that overflows, which abs() takes for an error."""
+    """|z|; infinite on overflow, for which abs() raises an error."""
     return math.hypot(z.real, z.imag)

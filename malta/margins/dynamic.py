@@ -1,7 +1,8 @@
-"""Dynamics that nobody modelled, beside real parameters: stable blocks Delta_k with |Delta_k(jw)| <= t |W_k(jw)|.
+"""Unmodelled dynamics beside real parameters: stable blocks Delta_k with |Delta_k(jw)| <= t |W_k(jw)|.
 
-The loop is lost at the smallest t with det(1 - M(jw; p) Delta) = 0 for some p of box(t), some Delta of that size and
-some frequency; one block alone is lost where |W M| = 1 / t. `polydisc` proves the rest zero-free.
+The loop loses stability at the smallest t with det(1 - M(jw; p) Delta) = 0 for some p of box(t), some Delta of that
+size and some frequency; for one block alone that is |W M| = 1 / t. polydisc.py proves the determinant free of zeros
+for smaller t.
 """
 
 from __future__ import annotations
@@ -55,10 +56,10 @@ if TYPE_CHECKING:
     from malta.model.plant import ComplexArray, FloatArray
 
 TOLERANCE = 1e-3
-STEPS = (1, 3, 10, 30, 100, 300, 1000, 3000, 10_000)  # multiples of the tolerance that are tried
+STEPS = (1, 3, 10, 30, 100, 300, 1000, 3000, 10_000)  # bounds that are tried, in multiples of the tolerance
 ROUNDS = 3
 ROUNDS_OF_SECANT = 40
-SEARCH = 0.4  # of the time, for what is lost; the rest is for the proof
+SEARCH = 0.4  # share of the time for the search of a loss; the rest is for the proof
 
 
 @on_one_thread
@@ -72,19 +73,19 @@ def dynamic_margin(
     tolerance: float = TOLERANCE,
     time: float | None = None,
 ) -> Margin:
-    """How far real parameters and blocks of unmodelled dynamics may go together, as robstab takes ureal and ultidyn.
+    """The margin of real parameters and blocks of unmodelled dynamics together, as robstab with ureal and ultidyn.
 
     Parameters
     ----------
-    compensator, ranges, over : as robust_margin takes them; ranges may be empty
-    dynamic : a block, or up to four that act in this order, at most one of them full; t times their weights belongs to
-        t times the ranges
-    tolerance : how close the proven bound shall come to the loss that was found, relative
-    time : s, after which what stands is returned; 120 where None is given
+    compensator, ranges, over : as in robust_margin; ranges may be empty
+    dynamic : a block, or up to four that act in this order, at most one of them full; their weights grow with t as the
+        ranges do
+    tolerance : relative distance between the proven bound and the loss that was found
+    time : s, longest search, which then returns the bounds found so far; None: 120
 
     `witness` holds the parameters; the blocks' sizes there are t |W| at `frequency`.
 
-    Raises InputError as robust_margin does, for channels that the loop does not have and weights that are none.
+    Raises InputError as robust_margin does, for channels that the loop does not have and for invalid weights.
 
     >>> import malta
     >>> motor = malta.uncertain(lambda k: ([[-1.0]], [[k]], [[1.0]]), {"k": 1.0})
@@ -103,7 +104,7 @@ def dynamic_margin(
         reason = "the nominal loop is unstable"
         return Margin(0.0, 0.0, None, None, {}, {}, (), clock.monotonic() - begun, reason)
     until = deadline(begun, time)
-    with np.errstate(all="ignore"):  # what is not finite excludes nothing
+    with np.errstate(all="ignore"):  # a cell with infinite bounds excludes nothing
         lost = _loss(asked, begun + SEARCH * (until - begun))
         t = math.inf if lost is None else _size(asked, lost)
         lower, reason = _prove(asked, min(t, asked.box.limit), tolerance, until)
@@ -130,7 +131,10 @@ class Blocks:
     def of(
         cls, system: UncertainSystem, law: Compensator, box: Box, blocks: Sequence[Block], where: str
     ) -> Blocks:
-        """Raises InputError for blocks that cannot be taken together."""
+        """The loop of a system and a compensator with blocks.
+
+        Raises InputError for blocks that cannot be combined.
+        """
         check_blocks(blocks, where)
         problem = problem_of(system, law)
         scaled = tuple(_scale_probe(system, law, box.nominal, b, problem) for b in blocks)
@@ -138,11 +142,11 @@ class Blocks:
         return cls(system, law, box, scaled, problem, OfLoop(loop_of(more, wider), more.names))
 
     def unstable(self) -> bool:
-        """Whether a loop that nothing has moved yet is unstable."""
+        """Whether the nominal loop is unstable anywhere in the intervals that do not grow."""
         return bool((self.problem.instability(self.box.nominal_places()) >= 0).any())
 
     def transfer(self, p: FloatArray, w: FloatArray) -> ComplexArray:
-        """M with rows in units of the blocks' sizes."""
+        """M at parameters p and frequencies w (rad/s), its rows times the blocks' weights: k x columns x rows."""
         M = transfer(responses(self.system, self.law, p, w), self.blocks)
         scale = np.array([b.weight.at(w) for b in self.blocks for _ in b.columns])
         return np.asarray(M * scale.T[:, :, None])
@@ -152,7 +156,7 @@ class Blocks:
         return is_nominal_stable(self.problem, self.box)
 
     def sizes(self, share: float) -> list[Size]:
-        """share W_k on cells, of each block."""
+        """The size of each block on cells, as a function: share times its weight."""
         T = self.law.sample_time
 
         def on(weight: Weight, cells: FloatArray, scale: int) -> Expanded:
@@ -161,12 +165,15 @@ class Blocks:
         return [partial(on, b.weight) for b in self.blocks]
 
     def parts(self, reach: float, shares: Sequence[float], until: float) -> list[Part]:
-        """The groups' polynomials over box(reach), for blocks of these shares of their weights. Raises Unproven."""
+        """The groups' polynomials over box(reach), for blocks of these shares of their weights.
+
+        Raises Unproven when they cannot be enclosed.
+        """
         most = [share * b.weight.most for share, b in zip(shares, self.blocks, strict=True)]
         return parts_of(self.with_blocks, self.blocks, self.box, reach, most, until)
 
     def starts(self, t: float, chosen: FloatArray) -> list[FloatArray]:
-        """Parameters at patterns of -1 to 1 in box(t)."""
+        """The parameters in box(t) at relative places `chosen` (rows, -1 to 1)."""
         sides = self.box.sides(t)
         return [sides.mean(axis=1) + x * (sides[:, 1] - sides[:, 0]) / 2 for x in chosen]
 
@@ -174,7 +181,7 @@ class Blocks:
 def _scale_probe(
     system: UncertainSystem, law: Compensator, nominal: FloatArray, b: Block, problem: OfLoop
 ) -> Block:
-    """A block probed by entries that count about as much as the loop's own gain, by powers of two."""
+    """A block with its unit scaled by a power of two to about the loop's own gain."""
     if b.kind in ("multiplicative", "feedback"):
         return b
     M = transfer(responses(system, law, nominal, frequencies(problem, nominal)), [b])
@@ -185,7 +192,7 @@ def _scale_probe(
 def question_of(
     caller: str, system: Any, compensator: Any, ranges: Any, over: Any
 ) -> tuple[Compensator, Box]:
-    """The law as a record and the box. Raises InputError."""
+    """The compensator as a record, and the box. Raises InputError as robust_margin does."""
     law = law_of(system, compensator, caller)
     none = {} if over is None else over
     box = box_of(system.names, system.nominal, system.limits, ranges, none, empty=True, caller=caller)
@@ -193,19 +200,19 @@ def question_of(
 
 
 def check_effort(caller: str, tolerance: Any, time: Any) -> None:
-    """Raise InputError for what is no tolerance, from 0 to 1, and no time."""
+    """Raise InputError unless the tolerance lies between 0 and 1 and the time is positive or None."""
     positive(caller, "tolerance", tolerance, below=1.0)
     if time is not None:
         positive(caller, "time", time, endless=True)
 
 
 def _size(asked: Blocks, place: Peak) -> float:
-    """The smallest t that holds a place's parameters and blocks."""
+    """The smallest t whose box and blocks contain the parameters and blocks of a peak."""
     return max(float(asked.box.margin(place.p)), 1 / place.value if place.value > 0 else math.inf)
 
 
 def _loss(asked: Blocks, until: float) -> Peak | None:
-    """The smallest t that was found to lose stability; none within what the parameters can be."""
+    """The peak at the smallest t for which a loss of stability was found; None within the limits of the parameters."""
     box, every = asked.box, patterns(len(asked.box.names))
     seen: list[Peak] = []
 
@@ -243,7 +250,7 @@ def _loss(asked: Blocks, until: float) -> Peak | None:
 
 
 def _narrow(peak: Callable[[float, FloatArray], Peak], high: float, chosen: FloatArray, until: float) -> None:
-    """Bisect t, in its logarithm, between where t |M| is below one and `high`, where it is not."""
+    """Search the t with t |M| = 1 below `high`, where t |M| > 1, by secants in log t."""
 
     def excess(x: float) -> float:
         return math.log(max(peak(math.exp(x), chosen).value, 1e-300)) + x
@@ -270,7 +277,7 @@ def _narrow(peak: Callable[[float, FloatArray], Peak], high: float, chosen: Floa
 
 
 def _pattern(box: Box, t: float, p: FloatArray) -> FloatArray:
-    """Where in box(t) p lies, -1 to 1; and the middle."""
+    """The relative place of p in box(t), -1 to 1, and the middle: two rows."""
     sides = box.sides(t)
     half = (sides[:, 1] - sides[:, 0]) / 2
     x = np.where(half > 0, (p - sides.mean(axis=1)) / np.where(half > 0, half, 1), 0)
@@ -278,7 +285,7 @@ def _pattern(box: Box, t: float, p: FloatArray) -> FloatArray:
 
 
 def _prove(asked: Blocks, upper: float, tolerance: float, until: float) -> tuple[float | None, str]:
-    """The largest t of those tried for which stability is proven, and why there is none."""
+    """The largest t for which stability is proven, and the reason when there is none."""
     parts: list[Part] = []
     reason = ""
     for step in STEPS:

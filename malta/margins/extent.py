@@ -1,4 +1,4 @@
-"""What one proof covers beside the uncertainty: the travel of the machine, and intervals of its parameters."""
+"""The intervals that one proof covers beside the uncertainty: the travel of the machine, and some parameters."""
 
 from __future__ import annotations
 
@@ -16,25 +16,25 @@ Interval = tuple[float, float]
 
 @dataclass(frozen=True)
 class Extent:
-    """The intervals that every proof covers, in SI, and the one that places of the machine lie along.
+    """The intervals that every proof covers (SI), and the course, along which the places of the machine lie.
 
     Example: `str(extent_of(rotor))` is "for all Omega in 0 .. 2094 rad/s" where `rotor.over` is {"Omega": (0, 2094)}.
     """
 
     stroke: str = ""  # a state; "": the machine has no travel
-    travel: float = 0.0  # of it, either way, m
-    over: Mapping[str, Interval] = field(default_factory=dict)  # of parameters
-    units: Mapping[str, str] = field(default_factory=dict)  # theirs
+    travel: float = 0.0  # of the stroke, either way, m
+    over: Mapping[str, Interval] = field(default_factory=dict)  # intervals of parameters, SI
+    units: Mapping[str, str] = field(default_factory=dict)  # SI units of these parameters
 
     @property
     def intervals(self) -> dict[str, Interval]:
-        """All of them by name."""
+        """All intervals by name."""
         along = {self.stroke: (-self.travel, self.travel)} if self.stroke else {}
         return along | dict(self.over)
 
     @property
     def course(self) -> str:
-        """What places lie along: the stroke, else the first of the parameters; "" where there is neither."""
+        """The name of the course: the stroke, else the first of the parameters; "" without either."""
         return self.stroke or next(iter(self.over), "")
 
     @property
@@ -56,11 +56,11 @@ class Extent:
         return " and ".join([*everywhere, *([f"for {self.values}"] if self.over else [])])
 
 
-NOWHERE = Extent()  # a point: a machine without a travel, whose parameters stand
+NOWHERE = Extent()  # a machine without a travel and without intervals of parameters
 
 
 def extent_of(plant: Plant, names: Iterable[str] = ()) -> Extent:
-    """What proofs of a plant cover; a parameter of `names` is uncertain, and grows with the margin instead."""
+    """The extent of a plant's proofs, without the uncertain parameters `names`, whose ranges grow with the margin."""
     uncertain = set(names)
     over = {name: interval for name, interval in plant.over.items() if name not in uncertain}
     units = units_of(plant.parameters)
@@ -69,7 +69,7 @@ def extent_of(plant: Plant, names: Iterable[str] = ()) -> Extent:
 
 
 def machine_at(plant: Plant, course: str, position: float) -> tuple[Plant, dict[str, float]]:
-    """The machine at a position of its course: the plant, and the states that are not zero there."""
+    """The plant at a position of its course (SI), and the states that are not zero there."""
     if plant.has_stroke:
         return plant, {plant.stroke: position}
     if not course:
@@ -79,7 +79,7 @@ def machine_at(plant: Plant, course: str, position: float) -> tuple[Plant, dict[
 
 
 def positions_of(plant: Plant, extent: Extent, shares: Iterable[float]) -> tuple[tuple[float, ...], ...]:
-    """The places of a machine, SI: at shares of its travel either way; of a parameter both ends and its own value."""
+    """The places of a machine (SI): +- each share of its travel; else the ends and the own value of a parameter."""
     if extent.stroke:
         return tuple(tuple(dict.fromkeys((share * plant.travel, -share * plant.travel))) for share in shares)
     own = own_position(plant, extent, {})
@@ -87,7 +87,7 @@ def positions_of(plant: Plant, extent: Extent, shares: Iterable[float]) -> tuple
 
 
 def own_position(plant: Plant, extent: Extent, states: Mapping[str, float]) -> float:
-    """The position of the machine itself along its course, at these states."""
+    """The position of the machine along its course (SI): the stroke in `states`, else the value of the parameter."""
     if extent.stroke or not extent.course:
         return states.get(extent.stroke, 0.0)
     return float(getattr(plant.parameters, extent.course))

@@ -1,6 +1,6 @@
 """A characteristic polynomial over a box of parameters: a(s; p) = sum_k a_k(p) s^k.
 
-Each a_k is a Bernstein polynomial in p over the box, with a radius for what that polynomial leaves out (rounding,
+Each a_k is a Bernstein polynomial in p over the box, with a radius for the errors of that polynomial (rounding,
 truncation, couplings taken as zero). The coefficients of different k spread over hundreds of decades, so each k has a
 power of two of its own, and s counts in a power of two: nothing here has a unit, and no scale changes an answer.
 """
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from malta.model.plant import FloatArray
 
 EPS = 2.0**-52
-WIDE = 8  # nodes of the axes that follow, from which on they are multiplied where they stand
+WIDE = 8  # nodes of the following axes from which on values are multiplied in place
 FEW = 6  # degree up to which a restriction is one product of matrices
 
 
@@ -63,7 +63,7 @@ class Family:
 
 
 def nodes(degree: int, *, chebyshev: bool = False) -> list[float]:
-    """Where a polynomial of this degree on [0, 1] is sampled."""
+    """The points at which a polynomial of this degree on [0, 1] is sampled."""
     if degree == 0:
         return [0.5]
     if chebyshev:
@@ -73,7 +73,7 @@ def nodes(degree: int, *, chebyshev: bool = False) -> list[float]:
 
 @lru_cache(maxsize=64)
 def to_bernstein(degree: int, chebyshev: bool) -> Any:
-    """Values at the nodes -> Bernstein coefficients, exactly."""
+    """The exact matrix from values at the nodes to Bernstein coefficients."""
     from flint import fmpq, fmpq_mat
 
     u = [fmpq(*x.as_integer_ratio()) for x in nodes(degree, chebyshev=chebyshev)]
@@ -113,7 +113,7 @@ def family(
 ) -> Family:
     """The family through exact values (rationals or balls): points[node][k] = a_k at the tensor grid's nodes.
 
-    tails : bound of what a_k has beyond these degrees, for each k as (mantissa, exponent), where not polynomial
+    tails : bounds of the terms of a_k beyond these degrees, (mantissa, exponent) for each k; None for polynomials
     """
     count = len(points[0])
     table = np.empty((len(points), count), dtype=object)
@@ -126,7 +126,7 @@ def family(
 
 
 def narrow(f: Family, axis: int, low: float, high: float) -> Family:
-    """The family over [low, high] of one parameter's side; of one value where these are equal."""
+    """The family over the part [low, high] of one side; over a single value when these are equal."""
     n = f.shape[axis]
     boxes = np.tile([0.0, 1.0], (1, len(f.shape), 1))
     boxes[0, axis] = low, high
@@ -141,7 +141,7 @@ def narrow(f: Family, axis: int, low: float, high: float) -> Family:
 
 
 def align(f: Family, g: Family) -> tuple[Family, Family]:
-    """Both with the same degrees, and s counted on f's scale."""
+    """Both families with the same degrees and with f's scale of s."""
     shape = tuple(max(n, m) for n, m in zip(f.shape, g.shape, strict=True))
     count = max(len(f.values), len(g.values))
     moved = tuple(e + (f.scale - g.scale) * k for k, e in enumerate(g.exponents))
@@ -151,7 +151,7 @@ def align(f: Family, g: Family) -> tuple[Family, Family]:
 
 
 def _raise_degrees(f: Family, shape: tuple[int, ...], count: int) -> Family:
-    """With higher degrees in the parameters, and coefficients that are zero up to `count`."""
+    """Raise the degrees in the parameters to `shape`, and append zero coefficients up to `count`."""
     values, slack = f.values.reshape(len(f.values), *f.shape), 0.0
     for axis, (n, m) in enumerate(zip(f.shape, shape, strict=True)):
         if m > n:
@@ -206,7 +206,7 @@ def _round_to_doubles(shape: Sequence[int], table: Any, tails: Any) -> Family:
 
 
 def _transform(table: Any, shape: tuple[int, ...], axis: int, M: Any) -> Any:
-    """An exact matrix along one parameter of a tensor of exact values."""
+    """Multiply a tensor of exact values along one parameter by an exact matrix."""
     from flint import arb_mat, fmpq, fmpq_mat
 
     kind = fmpq_mat if all(isinstance(x, fmpq) for x in table.ravel().tolist()) else arb_mat
@@ -221,7 +221,7 @@ def _transform(table: Any, shape: tuple[int, ...], axis: int, M: Any) -> Any:
 
 
 def scale_of(top: FloatArray) -> int:
-    """The power of two that s counts in: the geometric mean of the roots' sizes; top: log2 of the coefficients."""
+    """The scale of s: log2 of the geometric mean of the roots' sizes; top: log2 of the coefficients."""
     known = np.flatnonzero(np.isfinite(top))
     if len(known) < 2:
         return 0
@@ -230,7 +230,7 @@ def scale_of(top: FloatArray) -> int:
 
 
 def _reduce(f: Family) -> Family:
-    """Degrees that contribute less than rounding become part of the radius."""
+    """Lower the degrees whose terms are below rounding; these terms become part of the radius."""
     shape, values, radius = list(f.shape), f.values, f.radius.copy()
     size = np.abs(values).max(axis=1)
     for axis, count in enumerate(f.shape):
@@ -251,7 +251,7 @@ def _reduce(f: Family) -> Family:
 
 
 def _lower_degree(array: FloatArray, d: int) -> tuple[FloatArray, FloatArray]:
-    """Bernstein coefficients of degree d -> d - 1, and what that leaves out: the degree raised again, compared."""
+    """Bernstein coefficients of degree d - 1 for those of degree d, and a bound of the difference."""
     raise_ = np.zeros((d + 1, d))
     for i in range(d):
         raise_[i, i] = (d - i) / d
@@ -277,7 +277,7 @@ def basis(degree: int, u: FloatArray) -> FloatArray:
 
 
 def restriction(degree: int, low: FloatArray, high: FloatArray) -> FloatArray:
-    """Bernstein coefficients over [0, 1] -> over [low, high]: cells x (d + 1) x (d + 1), no entry negative.
+    """Matrices from Bernstein coefficients over [0, 1] to those over [low, high]: cells x (d + 1) x (d + 1), all >= 0.
 
     Row i holds the blossom at (d - i) times low and i times high.
     """
@@ -306,14 +306,14 @@ def _blossoms(degree: int) -> tuple[Any, ...]:
 
 
 def restrict(values: Any, shape: tuple[int, ...], boxes: FloatArray) -> Any:
-    """Cells x nodes over [0, 1]^P -> over each cell's box (cells x P x 2)."""
+    """Bernstein coefficients (cells x nodes) over [0, 1]^P, restricted to the box of each cell (cells x P x 2)."""
     cells, before = len(values), 1
     for axis, count in enumerate(shape):
         low, high = boxes[:, axis, 0], boxes[:, axis, 1]
         if count > 1 and not ((low == 0).all() and (high == 1).all()):
             M = restriction(count - 1, low, high)
             array = values.reshape(cells, before, count, -1)
-            if array.shape[3] >= WIDE:  # nothing needs to be moved
+            if array.shape[3] >= WIDE:  # wide enough to multiply in place
                 flat = np.ascontiguousarray(array).view(float)
                 values = (M[:, None] @ flat).view(values.dtype)
             else:

@@ -1,7 +1,7 @@
 """The largest gain of a loop anywhere in a box of parameters: a peak of sensitivity that no plant exceeds.
 
-A gain below G, with unmodelled dynamics of their size or without, is robust stability against one more complex block of
-size 1 / G that reads the gain's output and drives its input: a fictitious one, the last of `polydisc`.
+A gain stays below G exactly when the loop is robustly stable against one more complex block, of size 1 / G, from the
+gain's output to its input. This fictitious block is the last one of polydisc.py.
 """
 
 from __future__ import annotations
@@ -45,15 +45,18 @@ if TYPE_CHECKING:
 
 Of = Literal["sensitivity", "complementary", "compliance", "effort"]
 
-TOLERANCE = 3e-3  # how close the proven bound comes to the largest gain found, relative
-STEPS = (1, 3, 10, 30, 100, 300, 1000)  # multiples of the tolerance that are tried
-LEAST = 1e-12  # below which a gain is taken as none, and one of these bounds is proven
+TOLERANCE = 3e-3  # relative distance between the proven bound and the largest gain found
+STEPS = (1, 3, 10, 30, 100, 300, 1000)  # bounds that are tried, in multiples of the tolerance
+LEAST = 1e-12  # a gain below this counts as zero, and one of the bounds NOTHING is proven
 NOTHING = (1e-12, 1e-9, 1e-6, 1e-3, 1.0)
 
 
 @dataclass(frozen=True, eq=False)
 class Gain:
-    """The largest gain over a box. lower: reached by `witness`; upper: proven, None where nothing is (`reason`)."""
+    """The largest gain over a box.
+
+    lower : reached by `witness`; upper : proven, None when nothing is proven, and `reason` says why
+    """
 
     lower: float
     upper: float | None
@@ -86,16 +89,16 @@ def worst_case_gain(
 
     Parameters
     ----------
-    compensator, ranges, over : as robust_margin takes them; the box is the modelled one, t = 1
+    compensator, ranges, over : as in robust_margin; the box is the modelled one, t = 1
     of : sensitivity S = 1 / (1 - L) or complementary sensitivity T = L / (1 - L), L around the loop from the channel
         back to it, the other channels closed; compliance (1 - P F)^-1 P from a force on the plant to a sensor; effort
         F (1 - P F)^-1 from a sensor's noise to a command. Forces of a sampled loop are held for a sample.
     at : sensors or forces, of S and T
     channel : counted from 0; several of them as a tuple, all as None: the largest singular value; of compliance
         (sensors, forces), of effort (forces, sensors)
-    dynamics : blocks of unmodelled dynamics of their full size beside the parameters
-    tolerance : how close the proven bound shall come to the gain that was found, relative
-    time : s, after which what stands is returned; 120 where None is given
+    dynamics : blocks of unmodelled dynamics, of their full size, beside the parameters
+    tolerance : relative distance between the proven bound and the gain that was found
+    time : s, longest search, which then returns the bounds found so far; None: 120
 
     Raises InputError as robust_margin does, and for channels that the loop does not have.
 
@@ -121,7 +124,7 @@ def worst_case_gain(
     def value(p: FloatArray, w: FloatArray) -> FloatArray:
         return performance(asked.transfer(p, w), asked.blocks)
 
-    with np.errstate(all="ignore"):  # what is not finite excludes nothing
+    with np.errstate(all="ignore"):  # a cell with infinite bounds excludes nothing
         starts = asked.starts(1.0, patterns(len(box.names)))
         worst = asked.problem.instability(np.array(starts))
         if worst.max() >= 0:
@@ -136,7 +139,7 @@ def worst_case_gain(
 
 
 def _performance_block(system: UncertainSystem, of: Of, at: At, channel: Any) -> Block:
-    """The fictitious block of a gain. Raises InputError for gains and channels that there are not."""
+    """The fictitious block of a gain. Raises InputError for unknown gains and channels."""
     if of not in ("sensitivity", "complementary", "compliance", "effort") or at not in ("sensors", "forces"):
         expected = "sensitivity, complementary, compliance or effort; sensors or forces"
         raise InputError("worst_case_gain", "of, at", f"{of}, {at}", expected)
@@ -157,7 +160,7 @@ def _performance_block(system: UncertainSystem, of: Of, at: At, channel: Any) ->
 
 
 def _prove(asked: Blocks, lower: float, tolerance: float, until: float) -> tuple[float | None, int, str]:
-    """The smallest bound of those tried that holds, the cells that were looked at, and why there is none."""
+    """The smallest bound that is proven, the number of cells, and the reason when nothing is proven."""
     if not math.isfinite(lower):
         return None, 0, "the box holds an unstable loop"
     try:

@@ -1,8 +1,8 @@
-"""The closed loop, checked, and split into groups of states that close loops by themselves.
+"""The closed loop of a proof, checked and split into groups of states that close loops by themselves.
 
-    E(p) x' = A(p) x + B(p) u,  y = C(p) x + D(p) u,  u = h F y          h: lag, hold, delay, the same for each input
+    E(p) x' = A(p) x + B(p) u,  y = C(p) x + D(p) u,  u = h F y          h: lag, hold and delay, equal for all inputs
 
-Couplings that are zero as expressions, with exact numbers, split the loop; those that are only small do not.
+Only couplings that are zero as exact expressions split the loop; small ones do not (rounding.py).
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ A, B, C, D, E = range(5)
 
 @dataclass(frozen=True, eq=False)
 class UncertainLoop:
-    """A system and a compensator, checked, with the system's program."""
+    """A system and a compensator that fit each other, with the system's program."""
 
     system: UncertainSystem
     law: Compensator
@@ -48,7 +48,7 @@ class UncertainLoop:
 
     @property
     def symbolic(self) -> Symbolic | None:
-        """None where the expressions are too large to be written out."""
+        """The matrices as exact rational functions; None when these are too large."""
         return _symbolic(self.program)
 
     @property
@@ -74,7 +74,7 @@ class UncertainLoop:
 class Group:
     """States of the system and of the compensator that close a loop by themselves.
 
-    inputs : the rows of B that are not zero, where these are fewer than the inputs: what acts on the group; else None
+    inputs : the states on which inputs act, when these are fewer than the inputs; else None
     """
 
     states: tuple[int, ...]
@@ -83,10 +83,10 @@ class Group:
 
 
 def loop_of(system: UncertainSystem, law: Compensator) -> UncertainLoop:
-    """Check that system and compensator fit.
+    """The loop of a system and a compensator.
 
-    Raises InputError for shapes that do not, entries that are not finite, sample times that differ, a loop without
-    states.
+    Raises InputError for shapes that do not fit, entries that are not finite, different sample times, and a loop
+    without states.
     """
     f: ca.Function = system.matrices
     if f.n_out() < 3 or f.n_out() > 5:
@@ -159,7 +159,7 @@ def groups(loop: UncertainLoop) -> list[Group]:
 
 
 def _coupling_pattern(loop: UncertainLoop) -> Any:
-    """Couplings by patterns alone, where terms that cancel count."""
+    """The couplings by the patterns of the matrices alone; terms that cancel count as couplings."""
     law, (n, m), p = loop.law, loop.program.shapes[B], loop.program.shapes[C][0]
     a, b, c = np.zeros((n, n), dtype=bool), np.zeros((n, m), dtype=bool), np.zeros((p, n), dtype=bool)
     for matrix, entries in zip((a, b, c), loop.program.entries, strict=False):
@@ -170,7 +170,7 @@ def _coupling_pattern(loop: UncertainLoop) -> Any:
 
 
 def _nonzero_couplings(loop: UncertainLoop, s: Symbolic) -> Any:
-    """Couplings that are not zero as exact expressions."""
+    """The couplings that are not zero as exact expressions."""
     law, n, k = loop.law, loop.states, len(loop.law.A)
     touch = np.zeros((n + k, n + k), dtype=bool)
     rows: dict[int, list[tuple[int, Ratio]]] = {}
@@ -210,7 +210,7 @@ def hold_bounds(size: FloatArray, diagonal: FloatArray, T: float) -> tuple[Float
     |e^(A t)| <= e^(M t) with M the moduli of A beside the real parts of its diagonal, and e^(A T) - I = A V.
 
     size : bounds of |A|; diagonal : upper bounds of the diagonal's real parts
-    Raises NotAnalytic where numbers overflow.
+    Raises NotAnalytic when numbers overflow.
     """
     n = len(size)
     if not (np.isfinite(size).all() and np.isfinite(diagonal).all()):
@@ -229,13 +229,13 @@ def hold_bounds(size: FloatArray, diagonal: FloatArray, T: float) -> tuple[Float
 
 
 def upper(z: Any) -> float:
-    """At least the real part of a ball."""
+    """An upper bound of the real part of a ball."""
     x = float(z.real.upper())
     return x + 1e-9 * abs(x)
 
 
 def divide_by_descriptor(loop: UncertainLoop, s: Symbolic) -> tuple[dict[tuple[int, int], Ratio], ...]:
-    """Entries of A and B, over the diagonal of E; as they are where E is not diagonal."""
+    """The entries of A and B divided by a diagonal E; unchanged for another E."""
     if not loop.descriptor or any(i != j for i, j in s.entries[E]):
         return s.entries
     diagonal = {i: r for (i, _), r in s.entries[E].items()}

@@ -1,10 +1,10 @@
-"""Machines whose currents are held between samples, anywhere in their travel: double integrators and what is beside.
+"""Machines with currents held between samples, anywhere in their travel, as perturbed double integrators.
 
-    q'' = Z(p, y) q - E(p, y) (q - r) + B(p, y) v,    r: the reading that the currents were made for
+    q'' = Z(p, y) q - E(p, y) (q - r) + B(p, y) v,    r: the reading at which the currents were commutated
 
-B is close to a diagonal of monomials b_i(p), and Z and E are the stiffness that currents made for one place have
-elsewhere: of the state equation of `jacobians`, A = [[0, 1], [Z, 0]]. All of it is enclosed for every y of the travel
-at once (`laurent`), as sums of monomials of p with coefficients in intervals.
+B is close to a diagonal of monomials b_i(p). Z and E are the stiffness of currents at another place than that of their
+commutation; Z is the lower left block of A = [[0, 1], [Z, 0]] in `jacobians`. The matrices are enclosed for every y of
+the travel at once (laurent.py), as sums of monomials of p with coefficients in intervals.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from malta.margins.uncertain import model_of
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray, Plant
 
-INTERVALS = 160  # that the travel is cut into
-SURE = 1e-5  # what is left open of the forces that are wanted at rest, of the largest; checked over each box
+INTERVALS = 160  # pieces of the travel
+SURE = 1e-5  # half width of the forces at rest, relative to the largest one; checked over each box
 
 
 class Ranged(NamedTuple):
-    """A sum of monomials of p whose coefficients lie in intervals, whatever y."""
+    """A sum of monomials of p whose coefficients lie in intervals for every y."""
 
     terms: tuple[tuple[Monomial, float, float], ...]
 
@@ -51,9 +51,9 @@ class HeldMachine:
     """A machine anywhere in an interval of positions, in n axes.
 
     lead : b_i of each axis
-    Z, E, shares : as above; B b^-1 - 1
-    ratios, rest : of the forces wanted at rest, v = v0 + (1 + K)^-1 x with K in ratios, x in rest, over what was left
-        open of v
+    Z, E, shares : Z and E as above, B b^-1 - 1
+    ratios, rest : of the forces at rest, v = v0 + (1 + K)^-1 x, K in `ratios` and x in `rest`, relative to the half
+        width that was assumed of v
     """
 
     names: tuple[str, ...]
@@ -65,12 +65,12 @@ class HeldMachine:
     ratios: Table
     rest: Table
     travel: tuple[float, float]
-    models: tuple[Mapping[tuple[int, int], Laurent], ...]  # what the tables are the ranges of
+    models: tuple[Mapping[tuple[int, int], Laurent], ...]  # Z, E, shares, ratios and rest as functions of y
 
     def bounds(self, p: Sequence[Any]) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """Entrywise bounds of Z, of E, of B b^-1 - 1 and of b over real balls p.
 
-        Raises NotAnalytic where there are none.
+        Raises NotAnalytic when a bound is infinite, or when the forces at rest leave their assumed range.
         """
         n, powers = len(self.lead), dict[tuple[int, int], Any]()
 
@@ -102,16 +102,17 @@ class HeldMachine:
         """The machine at one position of the interval, enclosed as on the piece that holds it."""
         low, high = self.travel
         k = min(max(math.floor((y - low) / (high - low) * INTERVALS), 0), INTERVALS - 1)
-        pieces = range(max(k - 1, 0), k + 2)  # whatever rounding makes of k
+        pieces = range(max(k - 1, 0), k + 2)  # k may be off by one from rounding
         Z, E, shares, ratios, rest = _tables(self.models, pieces)
         return replace(self, Z=Z, E=E, shares=shares, ratios=ratios, rest=rest)
 
 
 def dominating_solution(M: FloatArray, right: FloatArray) -> FloatArray:
-    """At least (1 + M + M^2 + ...) right, entrywise, for what is not negative.
+    """An upper bound of (1 + M + M^2 + ...) right, entrywise, for M and right without negative entries.
 
-    Any S > M S + right is, and shows the sum to be finite.
-    Raises NotAnalytic where there is none.
+    Any S > M S + right is such a bound and shows that the sum is finite.
+
+    Raises NotAnalytic when no such S is found.
     """
     floor = 1e-9 * right.max(axis=1, keepdims=True, initial=0.0) + 1e-290
     with np.errstate(all="ignore"):
@@ -125,9 +126,9 @@ def dominating_solution(M: FloatArray, right: FloatArray) -> FloatArray:
 def held_machine(
     plant: Plant, believed: Plant, names: Sequence[str], travel: tuple[float, float]
 ) -> HeldMachine:
-    """Enclose a plant whose controller commutates as `believed` at every position of an interval.
+    """Enclose a plant whose controller commutates with the parameters of `believed`, for all positions of an interval.
 
-    Raises NotAnalytic where its model has not this form.
+    Raises NotAnalytic when the model has not this form.
     """
     names, n, k = tuple(names), len(plant.inputs), len(names)
     of = model_of(plant, believed, names)
@@ -164,7 +165,7 @@ def held_machine(
 
 
 def _require_linear(outputs: Sequence[Any], v: Any, at_zero: Any) -> None:
-    """That what is wanted enters linearly, and makes nothing where it is zero."""
+    """Raise NotAnalytic unless forces are proportional to the commands v."""
     for k, order in ((0, 2), (3, 2), (4, 2), (1, 1), (5, 1)):
         if any(ca.which_depends(ca.vec(outputs[k]), v, order, False)):
             raise NotAnalytic("forces that are not proportional to what is wanted")
@@ -173,7 +174,7 @@ def _require_linear(outputs: Sequence[Any], v: Any, at_zero: Any) -> None:
 
 
 def _forces_at_rest(of: ca.Function, nominal: FloatArray, y: float, n: int) -> tuple[list[Lead], Lead]:
-    """About what has to be wanted so that the preload acts, as monomials of p; and how far it may be off."""
+    """The commands at which the preload acts, as approximate monomials of p, and the half width assumed of them."""
 
     def at(p: FloatArray) -> FloatArray:
         found = of(p, y, np.zeros(n))
@@ -236,7 +237,7 @@ def _residual_forces(
     wanted: list[Lead],
     by: tuple[Lead, ...],
 ) -> dict[tuple[int, int], Value]:
-    """b^-1 (preload - ratio v0), b the diagonal of the ratio: what the forces wanted at rest still miss."""
+    """b^-1 (preload - ratio v0), b the diagonal of the ratio: the error of the commands v0 at rest."""
     found: dict[tuple[int, int], Value] = {(i, 0): x for (i, _), x in preload.items()}
     for (i, j), x in ratio.items():
         c, m = wanted[j]
@@ -249,7 +250,7 @@ def _residual_forces(
 def _tables(
     models: Sequence[Mapping[tuple[int, int], Laurent]], pieces: range | None = None
 ) -> tuple[Table, Table, Table, Table, Table]:
-    """Intervals of the coefficients, on all pieces of the travel or on some."""
+    """The ranges of the coefficients on all pieces of the travel, or on some."""
 
     def ranges_of(x: Laurent) -> Ranged:
         return Ranged(tuple((m, *c.bounds(pieces)) for m, c in x.terms.items()))

@@ -57,7 +57,7 @@ class Loop:
         )
 
     def loop_gain(self, w: FloatArray) -> ComplexArray:
-        """L = -P F at the frequencies w (rad/s): k x p x p."""
+        """The loop gain at the sensors, L = -P F, at the frequencies w (rad/s): k x p x p."""
         z = np.exp(1j * np.asarray(w) * self.sample_time)[:, None, None]
         P = self.Cd @ np.linalg.solve(z * np.eye(len(self.Ad)) - self.Ad, self.Bd)
         c = self.control
@@ -65,7 +65,7 @@ class Loop:
         return np.asarray(-P @ F)
 
     def sensitivity(self, w: FloatArray) -> ComplexArray:
-        """S = (I + L)^-1 at the sensors, k x p x p: also what noise becomes of in y."""
+        """The sensitivity S = (I + L)^-1 at the sensors, k x p x p; it also takes noise to the outputs."""
         return np.asarray(np.linalg.inv(np.eye(len(self.Cd)) + self.loop_gain(w)))
 
 
@@ -80,10 +80,10 @@ def loop(
     """The sampled loop of a machine and a controller.
 
     delay : samples between measurement and force
-    current_loops : forces follow their commands as a first-order lag at the loops' crossover
-    feedforward : v0(z) acts by its slope; for models at their trim, where the loads act by theirs
+    current_loops : whether forces follow their commands with a first-order lag at the loops' crossover
+    feedforward : whether the slope of v0(z) acts, for models at their trim, where the slope of the loads acts
 
-    The controller commutates as the machine that it believes in, the machine's currents make their own forces.
+    The controller commutates with its own parameters, and the currents produce forces with the machine's parameters.
     """
     model, law = commanded_model(model, controller), linear_law(controller)
     A, B, C = model.A, model.B, model.C
@@ -107,7 +107,7 @@ def loop(
 
 
 def machine_loop(model: LinearModel, controller: Controller) -> Loop:
-    """The loop as the machine runs it: hold, its own delay, current loops, loads against v0(z) at the trim.
+    """The loop as the machine runs it: hold, the machine's delay, current loops, loads against v0(z) at the trim.
 
     Raises CheckError when no input holds the machine at the model's operating point.
     """
@@ -117,9 +117,9 @@ def machine_loop(model: LinearModel, controller: Controller) -> Loop:
     return loop(loaded, controller, delay=delay, current_loops=True, feedforward=True)
 
 
-@lru_cache(maxsize=8)  # every stage asks for it; records compare by identity, so no hit is stale
+@lru_cache(maxsize=8)  # every stage needs it; records compare by identity, so no entry is stale
 def commanded_model(model: LinearModel, controller: Controller) -> LinearModel:
-    """The model whose inputs are the forces that the controller wants of the machine it believes in."""
+    """The model with the forces as inputs that the controller commands with its own parameters."""
     believed = plant_of(controller.parameters)
     if believed is model.plant:
         return model
@@ -134,11 +134,12 @@ def machine_law(
     held: FloatArray | None = None,
     handed: bool = False,
 ) -> Compensator:
-    """The control law with the machine's hold, delay and current loops: lags at their crossover, or the PI loops.
+    """The control law with the machine's hold, delay and current loops.
 
-    held, handed : as sampled_law takes them
+    current_loops : "lag", first-order lags at the crossover, or "pi", the PI controllers on the windings
+    held, handed : as in sampled_law
 
-    Raises InputError for other current loops, or PI loops that do not run with the control law.
+    Raises InputError for other current loops, and for PI loops that run faster than the control law.
     """
     if current_loops not in get_args(CurrentLoops):
         raise InputError("verify", "current_loops", repr(current_loops), "lag or pi")
@@ -158,7 +159,7 @@ def machine_system(
     at: Mapping[str, float],
     current_loops: CurrentLoops = "lag",
 ) -> tuple[UncertainSystem, Compensator]:
-    """The machine at a position in parameters by name, and its law: what its margin is asked of. See `machine_law`."""
+    """The machine at the states `at` in parameters by name, and its control law: the arguments of robust_margin."""
     believed = plant_of(controller.parameters)
     if not is_commutated(believed):
         return of_plant(plant, names, at=at, believed=believed), machine_law(plant, controller, current_loops)

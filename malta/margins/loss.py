@@ -1,4 +1,4 @@
-"""Where stability is lost along lines through a box, by the poles in floating point: estimates, no proofs."""
+"""The loss of stability along lines through a box, by the poles in floating point: estimates, no proofs."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ ROUNDS = 6  # from corner to corner
 
 
 def single_parameter_loss(problem: Problem, box: Box, reach: float) -> float | None:
-    """About the first t up to `reach` at which the loop is unstable, where one parameter grows to one side alone.
+    """The first t up to `reach` at which the loop is unstable, for one parameter that grows to one side alone.
 
-    From above; infinite where there is none, None where several parameters grow.
+    The estimate comes from above; infinite without a loss. None when several parameters or sides grow.
     """
     ends = [(i, sign * rate[i]) for sign, rate in ((-1, box.down), (1, box.up)) for i in np.flatnonzero(rate)]
     if len(ends) != 1:
@@ -52,7 +52,7 @@ def single_parameter_loss(problem: Problem, box: Box, reach: float) -> float | N
 
 
 def first_loss(problem: Problem, box: Box, reach: float) -> Loss:
-    """t, w, p at the first loss of stability along the diagonals of the box, by the poles; or infinity."""
+    """The first loss of stability along the diagonals of the box, by the poles: t, w (rad/s) and p; else infinity."""
     free = [i for i in range(len(box.names)) if box.down[i] + box.up[i] > 0]
     signs = np.array(list(itertools.islice(itertools.product((-1, 1), repeat=len(free)), 256)))
     best: Loss = (math.inf, None, None)
@@ -69,7 +69,7 @@ def first_loss(problem: Problem, box: Box, reach: float) -> Loss:
 
 
 def _improve_corner(problem: Problem, box: Box, place: FloatArray, best: Loss) -> Loss:
-    """The loss at the corner that the slopes of the worst root point to, as long as that comes nearer."""
+    """Move a loss to the corner that the slopes of the worst root point to, as long as t decreases."""
     for _ in range(ROUNDS):
         t, _, p = best
         if p is None or not np.isfinite(t):
@@ -84,14 +84,14 @@ def _improve_corner(problem: Problem, box: Box, place: FloatArray, best: Loss) -
 
 
 def corner_of(problem: Problem, box: Box, p: FloatArray) -> FloatArray:
-    """The corner, of the box with p on its edge, that the slopes of the worst root point to; p where that is stable."""
+    """The corner that the slopes of the worst root point to, of the box with p on its edge; p when it is stable."""
     d = _uphill(problem, box, p)
     corner = np.where(box.down + box.up > 0, box.nominal + float(box.margin(p)) * d, p)
     return corner if float(_instability(problem, corner[None], -math.inf)[0]) > 0 else p
 
 
 def _uphill(problem: Problem, box: Box, p: FloatArray) -> FloatArray:
-    """How each parameter moves the worst root outwards the fastest, as far as box(1) goes."""
+    """The side of box(1), for each parameter, towards which the worst root moves outwards."""
     steps = STEP * (box.up + box.down)
     rows = p + np.diag(steps)[steps > 0]
     with np.errstate(all="ignore"):
@@ -101,7 +101,7 @@ def _uphill(problem: Problem, box: Box, p: FloatArray) -> FloatArray:
 
 
 def _critical(problem: Problem, p: FloatArray, place: FloatArray) -> float | None:
-    """Frequency of the worst root, a little beyond p where the loop has none there (a mass of zero)."""
+    """The frequency of the worst root (rad/s), just beyond p when the loop has none at p (a mass of zero)."""
     for share in (1.0, 1 + 1e-9, 1 + 1e-6):
         try:
             found = problem.critical_frequency(place + share * (p - place))
@@ -113,7 +113,7 @@ def _critical(problem: Problem, p: FloatArray, place: FloatArray) -> float | Non
 
 
 def _instability(problem: Problem, rows: FloatArray, unknown: float) -> FloatArray:
-    """How far the worst root is beyond the boundary; `unknown` for all rows where one of them has no loop."""
+    """The distance of the worst root beyond the boundary; `unknown` for all rows when one of them has no loop."""
     try:
         return np.asarray(problem.instability(rows))
     except (CheckError, np.linalg.LinAlgError, NotAnalytic):
@@ -121,7 +121,7 @@ def _instability(problem: Problem, rows: FloatArray, unknown: float) -> FloatArr
 
 
 def _along(problem: Problem, p: FloatArray, d: FloatArray, reach: float) -> float:
-    """The first t of a grid up to reach at which p + t d is unstable, bisected; infinite where there is none."""
+    """The first t of a grid up to `reach` at which p + t d is unstable, bisected; infinite for none."""
 
     def unstable(t: Sequence[float] | FloatArray) -> FloatArray:
         return np.asarray(_instability(problem, p + np.asarray(t)[:, None] * d, -math.inf) >= 0)

@@ -1,4 +1,4 @@
-"""Parts of a box with the characteristic polynomials on them; alike ones are proven once."""
+"""Parts of a box with the characteristic polynomials on them; equal ones are proven once."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from malta.model.plant import FloatArray
 
 
-PATCHES = 64  # parts that a box is cut into where one expansion does not do
+PATCHES = 64  # parts of a box at most
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +29,7 @@ class Part:
     sides: FloatArray
     family: Family
     growth: Growth
-    # the family with what couples it to others, on cells and boxes:
+    # the family with its coupling to other groups, on cells and boxes:
     around: Callable[[FloatArray, FloatArray], Beside] | None = None
 
 
@@ -40,9 +40,9 @@ def cut(
     made: Callable[[FloatArray], list[Any]],
     most: int = PATCHES,
 ) -> list[Any]:
-    """Parts of a box, cut where one expansion does not do, `most` of them; made: what a part of it gives.
+    """Apply `made` to a box, or to parts of it where the box is too wide; `most` parts at most.
 
-    Raises Unproven, also where time is up.
+    Raises Unproven when the parts are too many or time is up.
     """
     todo, found = [sides], list[Any]()
     while todo:
@@ -59,7 +59,7 @@ def cut(
 
 
 def _halves(sides: FloatArray, axis: int, nominal: float) -> list[FloatArray]:
-    """A box cut across one axis, at the nominal value where that is well inside."""
+    """The halves of a box across one axis, cut at the nominal value if that is well inside."""
     low, high = sides[axis]
     at = (
         nominal
@@ -75,7 +75,7 @@ def _halves(sides: FloatArray, axis: int, nominal: float) -> list[FloatArray]:
 
 
 def merge_twins(parts: list[Part]) -> list[Part]:
-    """One family for groups whose coefficients agree to rounding, as those of a round body's planes do."""
+    """Merge groups whose coefficients agree to rounding, as those of the two planes of a round body."""
     kept: list[Part] = []
     for part in parts:
         for k, other in enumerate(kept):
@@ -89,7 +89,7 @@ def merge_twins(parts: list[Part]) -> list[Part]:
 
 
 def _merge(one: Part, two: Part) -> Part | None:
-    """A part whose radius covers both families; None where they differ by more than rounding."""
+    """A part whose radius covers both families; None when they differ by more than rounding."""
     f, g = one.family, two.family
     if one.around is not None or two.around is not None:
         return None

@@ -26,7 +26,7 @@ from malta.model.plant import Plant, position_in, readonly
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
 
-LONGEST = 20_000  # operations of a model beyond which it is not written out
+LONGEST = 20_000  # operations up to which a model is expanded
 
 
 def of_plant(
@@ -40,13 +40,17 @@ def of_plant(
 ) -> UncertainSystem:
     """The design model of a plant at a position along its stroke, in parameters by name, at its preload.
 
-    The stroke itself may be one of the names (`z` for MALTA): its nominal value is the position.
-    Inputs are commanded forces: a controller commutates as the machine it knows, the plant's currents make their own.
-    at: the position, SI; states: the states follow the outputs in y; believed: the machine that the controller knows,
-    where it is another one; held: H of currents that are held between samples (`held_at`): the inputs are
-    v + H y, and where the parameters leave more of the reading than that, it is a further input.
+    names : parameters; the stroke itself may be one of them, with the position as its nominal value
+    at : the position, SI
+    states : whether y contains the states after the outputs
+    believed : the machine with the controller's parameters; None: the plant itself
+    held : the gain H of currents that are held between samples (`held_gain`): the inputs are v + H y, and the reading y
+        is a further input when the parameters change its gain
 
-    Raises InputError for names that are none, or not known.
+    The inputs are commanded forces: the controller commutates with its own parameters, and the currents produce forces
+    with the plant's parameters.
+
+    Raises InputError for unknown names and for parameters that set the size of the model.
     """
     par = plant.parameters
     known = [*units_of(par), *((plant.stroke,) if plant.has_stroke else ())]
@@ -75,7 +79,7 @@ def of_plant(
     else:
         acting = of(p[own], z, ca.DM.zeros(len(plant.inputs)))[-1]
         v = acting
-        if is_commutated(plant):  # what has to be wanted so that the preload acts
+        if is_commutated(plant):  # the forces to be commanded so that the preload acts
             made, ratio = of(p[own], z, acting)[4:6]
             v = acting + ca.solve(ratio, acting - made)
         A, B, C, E = of(p[own], z, v)[:4]
@@ -93,7 +97,7 @@ def of_plant(
 def _expanded_matrices(
     of: ca.Function, p: Any, z: Any, nominal: FloatArray, held: FloatArray | None
 ) -> tuple[Any, Any, Any] | None:
-    """A, B, C of held currents as the short rational functions of p that they are; None where they are none."""
+    """A, B and C of held currents as short rational functions of p; None when they are not such functions."""
     k, m = p.numel(), of.numel_in(2)
     q = ca.SX.sym("q", k + m)
     fixed = isinstance(z, float)

@@ -1,13 +1,13 @@
-"""Robust stability against real parameters: how far they may all deviate before the loop can become unstable.
+"""Robust stability against real parameters: how far all of them may deviate before the loop can become unstable.
 
     margin = the largest t for which every p with  nominal - t (nominal - low) <= p <= nominal + t (high - nominal)
              is stable; 1: the whole modelled box; 3: three times it ("300 %"), as MATLAB's robstab counts.
 
 A stable loop becomes unstable only where its characteristic polynomial a(jw; p) = 0 for some w, infinity included.
-`upper` is a p at which it does, checked by the poles of the loop. `lower` is proven: the nominal loop is stable by
-Routh's scheme, and zero is excluded from a(jw; p) over the whole box and all frequencies. Structure is read from the
-expressions, coefficients are exact rationals or balls before they are rounded, and what rounding, interpolation and
-neglected couplings can do is part of the enclosure.
+`upper` belongs to a p at which it does, confirmed by the poles of the loop. `lower` is proven: the nominal loop is
+stable by Routh's scheme, and a(jw; p) is not zero anywhere on the box at any frequency. Structure is read from the
+expressions, coefficients are exact rationals or balls before they are rounded, and the enclosure contains the errors of
+rounding, of interpolation and of neglected couplings.
 """
 
 from __future__ import annotations
@@ -47,22 +47,22 @@ from malta.threads import on_one_thread
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
 
-TOLERANCE = 9e-4  # how close the proven bound comes to the witness, relative
+TOLERANCE = 9e-4  # relative distance between the proven bound and the witness
 MOST_CELLS = 300_000
-LONGEST = 120.0  # s, unless a time is asked for: an answer comes anyway
+LONGEST = 120.0  # s, default time of a search
 
 Ranges = Mapping[str, "float | tuple[float, float] | list[float]"]
-Progress = Callable[[float, float], None]  # called with lower and upper so far
+Progress = Callable[[float, float], None]  # called with the lower and upper bound so far
 
 
 @dataclass(frozen=True, eq=False)
 class Certificate:
-    """What proves the lower bound for one group of states on one part of the box: zero is excluded on each cell."""
+    """The proof of the lower bound for one group of states on one part of the box: zero is excluded on each cell."""
 
-    cells: int  # that were looked at
+    cells: int  # number of cells that were searched
     frequencies: tuple[float, float]  # rad/s, covered without a gap
     intervals: FloatArray  # of each cell: branch (0: of x, 1: of 1 / x), from, to; s = j x 2^scale
-    boxes: FloatArray  # of each cell: of the parameters, as shares of the part of the box
+    boxes: FloatArray  # of each cell: ends of the parameters, as shares of the part of the box
     directions: FloatArray  # angle of c, rad: Re(conj(c) f) > 0 on the cell
     sides: FloatArray  # the part of the box: parameters x 2
     inverted: tuple[bool, ...]  # parameters whose shares are of 1 / p
@@ -73,15 +73,15 @@ class Certificate:
 class Margin:
     """A robust stability margin in multiples of the modelled box.
 
-    lower: proven; None where nothing is, `reason` says why. upper: reached by `witness`; infinite where no parameter
-    of the range that exists destabilizes.
+    lower : proven; None when nothing is proven, and `reason` says why
+    upper : reached by `witness`; infinite when no admissible parameters make the loop unstable
     """
 
     lower: float | None
     upper: float
-    frequency: float | None  # rad/s, at which the witness loses stability
+    frequency: float | None  # rad/s, of the loss of stability at the witness
     witness: Mapping[str, float] | None  # SI
-    moved: Mapping[str, float]  # the witness less the nominal values
+    moved: Mapping[str, float]  # SI, the witness minus the nominal values
     sensitivity: Mapping[str, float]  # share of each parameter in the margin; they add up to 1
     certificate: tuple[Certificate, ...] = field(repr=False)
     seconds: float
@@ -89,7 +89,7 @@ class Margin:
 
     @property
     def exhausted(self) -> bool:
-        """Stable as far as the parameters exist (a mass above zero)."""
+        """Whether no loss of stability was found within the limits of the parameters (a mass above zero)."""
         return math.isinf(self.upper)
 
     def __str__(self) -> str:
@@ -123,13 +123,12 @@ def robust_margin(
     ranges : by name; 0.2 is +-20 % of the nominal value, (low, high) an interval in SI. With t the lower side is
         nominal - t (nominal - low), the upper one nominal + t (high - nominal): linear on each side.
     over : intervals that do not grow with t, in SI: the bound holds anywhere in them (`z` over the travel)
-    tolerance : how close the proven bound shall come to the witness, relative; None: 9e-4,
-        and closer where that costs little
-    time : s, after which the bounds found so far are returned; None: 120
-    most_cells : where the proof is given up
-    progress : called with the bounds so far
+    tolerance : relative distance between the proven bound and the witness; None: 9e-4, and less where that is cheap
+    time : s, longest search, which then returns the bounds found so far; None: 120
+    most_cells : number of cells after which the proof is given up
+    progress : called with the lower and upper bound so far
 
-    Raises InputError for names that the system does not have, ranges that are none, and shapes that do not fit.
+    Raises InputError for names that the system does not have, ranges that are not valid, and shapes that do not fit.
 
     >>> import malta
     >>> def cart(m, k):
@@ -155,12 +154,13 @@ def common_margin(
     time: float | None = None,
     progress: Progress | None = None,
 ) -> Margin:
-    """The margin of several loops in the same parameters, as of one machine at several places: all stay stable.
+    """The margin within which several loops in the same parameters all stay stable, as one machine at several places.
 
-    places: systems with the same names, nominal values and limits, and their compensators, on the same sample time.
-    Further as robust_margin, whose witness is the first one of all the loops.
+    places : pairs of a system and its compensator, with equal names, nominal values, limits and sample times
 
-    Raises InputError for loops that differ in these.
+    The other arguments are those of robust_margin. The witness is the nearest one of all loops.
+
+    Raises InputError for loops that differ in parameters or sample times.
     """
     effort = Effort(tolerance, time, MOST_CELLS, progress, "common_margin")
     loops = [(system, law_of(system, law, "common_margin")) for system, law in _pairs(places)]
@@ -177,7 +177,7 @@ def common_margin(
 
 
 def _pairs(places: Any) -> list[tuple[UncertainSystem, Any]]:
-    """Loops as pairs. Raises InputError."""
+    """The loops as a list of pairs. Raises InputError for anything else."""
     found = list(places) if isinstance(places, Iterable) and not isinstance(places, str) else []
     if not found or not all(is_pair(place) for place in found):
         wanted = "pairs of a system and its compensator, at least one"
@@ -196,9 +196,10 @@ def margin_at(
     tolerance: float | None = None,
     time: float | None = None,
 ) -> Margin:
-    """robust_margin where parameters stand at other values than the nominal ones, each within an interval.
+    """The margin with some parameters fixed at the values `at` in place of the nominal ones.
 
-    The coefficients are enclosed over these intervals, once for all margins in them.
+    within : an interval around each of these values, SI; the coefficients are enclosed once over the intervals, which
+        several margins share
     """
     nominal = system.nominal.copy()
     for name, value in at.items():
@@ -209,7 +210,7 @@ def margin_at(
 
 
 def law_of(system: UncertainSystem, compensator: Any, caller: str = "robust_margin") -> Compensator:
-    """A compensator as a record, on the system's clock. Raises InputError, also where the system is none."""
+    """A compensator as a record, with the system's sample time. Raises InputError for invalid systems and laws."""
     if not isinstance(system, UncertainSystem):
         raise InputError(caller, "system", describe(system), "a malta.uncertain system")
     f = system.matrices
@@ -219,9 +220,9 @@ def law_of(system: UncertainSystem, compensator: Any, caller: str = "robust_marg
     return law
 
 
-@lru_cache(maxsize=32)  # several questions are asked of the same loops; records compare by identity
+@lru_cache(maxsize=32)  # several margins need the same loops; records compare by identity
 def problem_of(system: UncertainSystem, law: Compensator) -> OfLoop:
-    """The closed loop, with what is known of it so far."""
+    """The closed loop as a problem, which remembers its polynomials."""
     return OfLoop(loop_of(system, law), system.names)
 
 
@@ -244,8 +245,9 @@ def margin_of_polynomial(
     coefficients : a function of the parameters by name (or of one array p), or a casadi.Function: the coefficients,
         highest power first
     box : intervals (low, high) by name, or shares of the nominal value
-    nominal : values by name; the middle of the interval where none is given
-    discrete : whether the roots shall be in the unit disc, in place of the left half plane
+    nominal : values by name; the middle of the interval for a parameter without one
+    discrete : whether stable roots lie in the unit disc, in place of the left half plane
+    over, tolerance, time, progress : as in robust_margin
 
     Raises InputError as robust_margin does.
 
@@ -265,7 +267,7 @@ def margin_of_polynomial(
 
 
 def _middles(ranges: Mapping[str, Any], nominal: Any) -> dict[str, float]:
-    """The nominal values of a polynomial's parameters, the middle of the interval where none is given."""
+    """The nominal values of a polynomial's parameters: as given, else the middle of the interval."""
     caller = "margin_of_polynomial"
     given = by_name(caller, "nominal", {} if nominal is None else nominal, '{"k": 1.5}')
     for name in given:
@@ -287,7 +289,7 @@ def _middles(ranges: Mapping[str, Any], nominal: Any) -> dict[str, float]:
 
 @dataclass(frozen=True)
 class Effort:
-    """How far to go. Raises InputError for a tolerance or time that is none."""
+    """The limits of a search. Raises InputError for an invalid tolerance or time."""
 
     tolerance: float | None = None
     time: float | None = None
@@ -303,12 +305,12 @@ class Effort:
 
 
 def deadline(begun: float, time: float | None) -> float:
-    """When a search that began then has to end."""
+    """The end of a search that began at `begun` and may take `time` seconds; None: LONGEST."""
     return begun + (LONGEST if time is None else time)
 
 
 def margin_of(problem: Problem, box: Box, effort: Effort) -> Margin:
-    """The margin of a problem over a box."""
+    """The margin of a problem over a box; zero when the nominal loop is unstable."""
     from malta.margins.search import Job
 
     begun = clock.monotonic()
@@ -327,5 +329,5 @@ def margin_of(problem: Problem, box: Box, effort: Effort) -> Margin:
         effort.most_cells,
         effort.progress,
     )
-    with np.errstate(all="ignore"):  # what is not finite excludes nothing
+    with np.errstate(all="ignore"):  # a cell with infinite bounds excludes nothing
         return job.margin(begun)

@@ -1,9 +1,9 @@
-"""Couplings that are only rounding, as digits of gains that should cancel leave them: taken as zero, and accounted for.
+"""Couplings of the size of rounding, as gains leave them that should cancel: taken as zero, and bounded.
 
 On the boundary of stability the loop is M = diag(M_k) + e with small e. det M is not zero where the row sums of
 |diag(M_k)^-1 e| are below one: where |det M_k| > sum_i |cofactor_ij| e_i for every k and column j, e_i row sums of e.
-That is the determinant of M_k with e in column j, bounded as coefficients are (`majorant`), and becomes part of the
-radius of det M_k. Lag, hold and delay have |h| <= 1 there, and are left out of M.
+The sum is the determinant of M_k with e in column j. It is bounded like coefficients (majorant.py) and becomes part of
+the radius of det M_k. Lag, hold and delay have |h| <= 1 there and are left out of M.
 """
 
 from __future__ import annotations
@@ -35,19 +35,19 @@ from malta.margins.majorant import coefficient_bounds
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
 
-SMALL = 1e-11  # couplings below this, relative, may be rounding
+SMALL = 1e-11  # relative size below which a coupling may be rounding
 
 
 @dataclass(frozen=True, eq=False)
 class Couplings:
-    """The closed loop's couplings as exact expressions: x from x, what acts on x, the compensator from y."""
+    """The couplings of a closed loop as exact expressions: x to x, commands to x, y to the compensator."""
 
     loop: UncertainLoop
     symbolic: Symbolic
 
     @cached_property
     def entries(self) -> tuple[dict[tuple[int, int], Ratio], ...]:
-        """Of A; of B (D_c C, C_c); of B_c C. Sums are added up before they are bounded."""
+        """The entries of A, of B (D_c C, C_c) and of B_c C; sums are added before they are bounded."""
         loop, s, law = self.loop, self.symbolic, self.loop.law
         n, k = loop.states, len(law.A)
         own, into, out = divide_by_descriptor(loop, s)[A], divide_by_descriptor(loop, s)[B], s.entries[C]
@@ -71,7 +71,7 @@ class Couplings:
 
     @np.errstate(over="ignore", invalid="ignore")  # bounds that overflow are refused
     def bounds(self, p: Sequence[Any]) -> FloatArray:
-        """Entrywise bounds of M less its diagonal s (or g), x first, over real balls p."""
+        """Entrywise bounds of M without its diagonal s (or g) over real balls p; the states x come first."""
         loop, law = self.loop, self.loop.law
         n, k = loop.states, len(law.A)
         values = [acb(x) for x in p]
@@ -112,7 +112,7 @@ class Part:
 
 
 def parts(loop: UncertainLoop, couplings: Couplings | None, p: Sequence[Any]) -> list[Part]:
-    """The loop's groups over real balls p, split further where they only touch by rounding."""
+    """The groups of a loop over real balls p, split further at couplings of the size of rounding."""
     exact = groups(loop)
     if couplings is None or loop.direct or not any(len(g.states) > 1 for g in exact):
         return [Part(g, ()) for g in exact]
@@ -135,7 +135,7 @@ def _split(loop: UncertainLoop, g: Group, members: list[int], size: FloatArray) 
     rows, columns = size.max(axis=1), size.max(axis=0)
     touch = size > SMALL * np.sqrt(rows[:, None] * columns[None, :])
     n = loop.states
-    if loop.sampled or loop.descriptor:  # nothing is neglected within the exponential
+    if loop.sampled or loop.descriptor:  # couplings inside the exponential are all kept
         s = loop.symbolic
         assert s is not None
         place = {state: k for k, state in enumerate(members)}
@@ -143,7 +143,7 @@ def _split(loop: UncertainLoop, g: Group, members: list[int], size: FloatArray) 
             for i, j in s.entries[which]:
                 if i in place and j in place:
                     touch[place[i], place[j]] = True
-    # a coupling that counts one way, with dust back, joins two groups
+    # a coupling above rounding in one direction joins two groups
     _, label = sparse.csgraph.connected_components(touch, directed=False)
     if label.max() == 0:
         return [Part(g, ())]
@@ -161,7 +161,7 @@ def _split(loop: UncertainLoop, g: Group, members: list[int], size: FloatArray) 
 
 
 def _moves(size: FloatArray, outside: FloatArray) -> tuple[Any, ...]:
-    """The largest over columns j of the bounds of det(g I + M) with `outside` in column j; coefficients of g."""
+    """Bounds of the coefficients of det(g I + M) with `outside` in column j, the largest over all j."""
     n = len(size)
     if not outside.any():
         return ()

@@ -1,4 +1,4 @@
-"""Uncertain systems and compensators from what an engineer has at hand: functions, matrices, control.StateSpace.
+"""Uncertain systems and compensators from functions, matrices and control.StateSpace.
 
       +---------+  u  +-----------+
 +---->|    F    |---->|   P(p)    |----+--> y        u = F y: positive feedback, so that
@@ -39,6 +39,10 @@ LETTERS = "ABCDE"
 def uncertain(source: Any, names: Any, **options: Any) -> UncertainSystem:
     """A linear system in parameters by name: of a plant (`of_plant`), or of functions and matrices (`from_source`).
 
+    options : the keyword arguments of these functions
+
+    Raises InputError for unknown options, and as these functions do.
+
     >>> import malta
     >>> motor = malta.uncertain(lambda J, b: ([[0, 1], [0, -b / J]], [[0], [1 / J]], [[1, 0]]), {"J": 2e-3, "b": 0.1})
     >>> motor.names
@@ -70,9 +74,9 @@ def from_source(
         A, B, C, or with D, or with D and E (rows of zeros in E are algebraic equations); a casadi.Function of the
         vector p; or matrices A0, B0, C0[, D0[, E0]]
     nominal : values of the parameters by name
-    terms : with matrices, what each parameter multiplies: {"k": (A1, B1, C1)}, None for a zero; A0 + sum p_i A_i
-    limits : what a parameter can be at all, (above, below); infinite where none are given
-    sample_time : s, where the matrices give x+ in place of x'
+    terms : with matrices, the factors of each parameter: {"k": (A1, B1, C1)}, None for zeros; A0 + sum p_i A_i
+    limits : of a parameter, (above, below), exclusive; infinite for parameters without
+    sample_time : s, of matrices that give x+ in place of x'
 
     Raises InputError for names, shapes and values that do not fit.
     """
@@ -108,7 +112,7 @@ def _check_name(field: str, name: str, names: tuple[str, ...]) -> None:
 
 
 def _evaluate(source: Callable[..., Any], p: Any, names: tuple[str, ...], caller: str) -> Any:
-    """What a function of the parameters returns for symbols. Raises InputError."""
+    """Call a function of the parameters with symbols. Raises InputError when it cannot be traced."""
     return (_call if isinstance(source, ca.Function) else _trace)(source, p, names, caller)
 
 
@@ -141,7 +145,7 @@ def _trace(source: Callable[..., Any], p: Any, names: tuple[str, ...], caller: s
             return source(**symbols)
         if len(wanted) == 1:
             return source(np.array(list(symbols.values()), dtype=object))
-    except Exception as error:  # whatever a function of numbers does with symbols
+    except Exception as error:  # a function of numbers may raise anything for symbols
         first = f"{type(error).__name__}: {error}".strip().split("\n")[0]
         found = f"a function that cannot be traced ({first})"
         raise InputError(caller, "source", found, "numpy and CasADi operations") from error
@@ -183,7 +187,7 @@ def _check_count(found: list[Any]) -> list[Any]:
 
 
 def _check_matrices(found: list[Any]) -> list[Any]:
-    """SX matrices, D only where it is not zero."""
+    """The matrices as SX. Raises InputError for shapes that do not fit."""
     matrices = [_matrix(M, LETTERS[k]) for k, M in enumerate(_check_count(found))]
     n, m, q = matrices[0].shape[0], matrices[1].shape[1], matrices[2].shape[0]
     shapes = [(n, n), (n, m), (q, n), (q, m), (n, n)]
@@ -211,7 +215,7 @@ def _matrix(M: Any, letter: str) -> Any:
 
 
 def _entry(x: Any, caller: str, field: str) -> Any:
-    """One number, or expression of the parameters. Raises InputError."""
+    """One number or expression of the parameters as SX. Raises InputError."""
     if isinstance(x, ca.MX):
         raise InputError(caller, field, "a CasADi MX", "SX expressions, numbers, or a casadi.Function")
     if isinstance(x, ca.SX | ca.DM):
@@ -222,7 +226,7 @@ def _entry(x: Any, caller: str, field: str) -> Any:
 
 
 def _check_finite(M: Any, caller: str, field: str) -> Any:
-    """The same, where no entry is NaN or infinite by itself. Raises InputError."""
+    """The same matrix. Raises InputError when a constant entry is NaN or infinite."""
     for x in M.nonzeros():
         if x.is_constant() and not math.isfinite(float(x)):
             raise InputError(caller, field, "NaN or infinity", "finite numbers")
@@ -230,9 +234,9 @@ def _check_finite(M: Any, caller: str, field: str) -> Any:
 
 
 def compensator_of(law: Any, outputs: int, inputs: int) -> Compensator:
-    """A compensator from a control.StateSpace or TransferFunction, a gain matrix, or as it is.
+    """A compensator as a record, from a Compensator, a control.StateSpace or TransferFunction, or a gain matrix.
 
-    Raises InputError where it has another number of inputs and outputs than the system, or an unspecified sample time.
+    Raises InputError when its inputs and outputs do not fit the system, or its sample time is unspecified.
     """
     from malta.margins.uncertain import Compensator
 
@@ -244,7 +248,7 @@ def compensator_of(law: Any, outputs: int, inputs: int) -> Compensator:
 
         try:
             law = control.ss(law)
-        except Exception as error:  # improper, or of several inputs and outputs: as the library has it
+        except Exception as error:  # improper, or of several inputs and outputs
             first = str(error).strip().split("\n")[0]
             raise InputError("compensator", "law", f"a TransferFunction ({first})", wanted) from error
     if all(hasattr(law, name) for name in ("A", "B", "C", "D", "dt")):
@@ -269,9 +273,9 @@ def compensator_of(law: Any, outputs: int, inputs: int) -> Compensator:
 
 
 def polynomial_system(coefficients: Callable[..., Any], names: tuple[str, ...]) -> tuple[ca.Function, int]:
-    """Coefficients of s, lowest first, as a CasADi function of p; and the degree.
+    """The coefficients of s, lowest first, as a CasADi function of p; and the degree.
 
-    Raises InputError for what is no function of the parameters, and coefficients that are no expressions of them.
+    Raises InputError for anything but a function of the parameters that returns expressions of them.
     """
     caller, field = "margin_of_polynomial", "coefficients"
     if not callable(coefficients):

@@ -1,4 +1,4 @@
-"""The transfer M from what complex blocks give to what they read, and the smallest blocks that close a loop with it.
+"""The transfer M from the outputs of complex blocks to their inputs, and the smallest blocks that destabilize it.
 
 With F the compensator, G_y and G_d the plant from commands (lag, hold and delay included) and from forces on it, H the
 commands behind lag, hold and delay, and S = (1 - G_y F)^-1, outputs and commands follow from what is added to sensors
@@ -30,21 +30,21 @@ ZOOMS = 7
 
 
 def transfer(r: Responses, blocks: Sequence[Block]) -> ComplexArray:
-    """M from what the blocks give, in their order, to what they read: frequencies x columns x rows."""
+    """M from the outputs of the blocks, in their order, to their inputs: frequencies x columns x rows."""
     q, m = r.G_y.shape[1:]
     S = np.linalg.inv(np.eye(q) - r.G_y @ r.F)
     y = S @ np.concatenate([r.G_y @ r.F, r.G_y, r.G_d], axis=2)
     u = r.F @ (y + np.eye(q, q + 2 * m))
     total = sum(len(b.rows) for b in blocks)
     into = np.zeros((q + 2 * m, total))
-    passed = {0: np.zeros((q, total)), q: np.zeros((m, total))}  # what a signal took up on its way
+    passed = {0: np.zeros((q, total)), q: np.zeros((m, total))}  # additions to a signal by earlier blocks
     found, k = [], 0
     for b in blocks:
         own, rows, columns = slice(k, k + len(b.rows)), list(b.rows), list(b.columns)
         k += len(rows)
         first = q + m if b.kind == "compliance" else q if b.kind in _LOOPS and b.at == "forces" else 0
         into[[first + i for i in rows], own] = np.eye(len(rows))
-        if b.kind == "feedback":  # it reads what it has added itself
+        if b.kind == "feedback":  # it reads its own addition
             passed[first][rows, own] += np.eye(len(rows))
         signal = {"additive": r.H @ u, "effort": u, "compliance": y}.get(b.kind, u if first else y)
         beside = passed[first][columns].copy() if b.kind in _LOOPS else 0.0
@@ -113,21 +113,21 @@ def _unit(v: ComplexArray) -> ComplexArray:
 
 
 def _parts(blocks: Sequence[Block]) -> list[tuple[slice, slice]]:
-    """Where each block's rows and columns stand."""
+    """The rows and columns of each block, as slices."""
     rows = np.cumsum([0, *(len(b.rows) for b in blocks)]).tolist()
     columns = np.cumsum([0, *(len(b.columns) for b in blocks)]).tolist()
     return [(slice(*i), slice(*j)) for i, j in zip(pairwise(rows), pairwise(columns), strict=True)]
 
 
 def _balanced(a: ComplexArray, w: ComplexArray, blocks: Sequence[Block]) -> tuple[ComplexArray, ComplexArray]:
-    """a with the norms of w block by block, and w with those of a."""
+    """Scale a to the norms of w block by block, and w to those of a."""
     rows, columns = [len(b.rows) for b in blocks], [len(b.columns) for b in blocks]
     read, given = _norms(a, columns), _norms(w, rows)
     return a * np.repeat(given / read, columns, axis=1), w * np.repeat(read / given, rows, axis=1)
 
 
 def _norms(v: ComplexArray, counts: list[int]) -> FloatArray:
-    """Norms of a vector's parts."""
+    """Norms of the parts of a vector, `counts` entries each."""
     first = np.cumsum([0, *counts[:-1]])
     return np.maximum(np.sqrt(np.add.reduceat(np.abs(v) ** 2, first, axis=1)), 1e-300)
 

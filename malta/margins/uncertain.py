@@ -1,7 +1,7 @@
-"""Linear models and control laws with uncertain parameters: what a robustness margin is asked of.
+"""The records of a robust margin: a linear system with uncertain parameters, and its compensator.
 
 x' = A(p) x + B(p) u,  y = C(p) x        derived from a plant's CasADi model, parameters by name
-u = H F y                                 a control law F, and what stands between it and the plant: H
+u = H F y                                 a control law F, and the lag, hold and delay H before the plant
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ if TYPE_CHECKING:
 class UncertainSystem:
     """E(p) x' = A(p) x + B(p) u, y = C(p) x + D(p) u with parameters p by name.
 
-    matrices: p -> A, B, C, or with D, or with D and E. All structure is read from its expressions.
-    limits: what each parameter may be at all, (above, below), exclusive; anything where none are given.
-    sample_time: s, where x+ stands in place of x'.
+    matrices : p -> A, B, C, or with D, or with D and E; their structure is read from the expressions
+    limits : of each parameter, (above, below), exclusive; none: infinite
+    sample_time : s, of a discrete system, with x+ in place of x'; None: continuous
     """
 
     names: tuple[str, ...]
@@ -48,7 +48,7 @@ class UncertainSystem:
     sample_time: float | None = None
 
     def at(self, p: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """A, B, C at rows of parameters: arrays of k matrices."""
+        """A, B and C at k rows of parameters: arrays of k matrices each."""
         rows = np.atleast_2d(p)
         found = self.matrices.map(len(rows))(rows.T)
         shapes = [self.matrices.size_out(i) for i in range(3)]
@@ -60,10 +60,10 @@ class UncertainSystem:
 
 @dataclass(frozen=True, eq=False)
 class Compensator:
-    """u = F y: x+ = A x + B y (x' where sample_time is None), u = C x + D y; the last states integrate alone.
+    """u = F y: x+ = A x + B y (x' when sample_time is None), u = C x + D y; the last states are plain integrals.
 
-    What stands between u and the plant: a whole number of samples of delay, a zero-order hold where sampled, and a
-    first-order lag w_c / (s + w_c) where `lag` is given.
+    Between u and the plant stand a delay of whole samples, a zero-order hold when sampled, and a first-order lag
+    w_c / (s + w_c) when `lag` is given.
     """
 
     A: FloatArray
@@ -77,7 +77,7 @@ class Compensator:
 
 
 def held_gain(plant: Plant, position: float) -> FloatArray:
-    """H of the currents that are held at a position along the stroke, where E = B H."""
+    """The gain H of held currents at a position along the stroke, from E = B H: v + H y acts (forces x sensors)."""
     of, none = model_of(plant, plant, ()), ca.DM(0, 1)
     acting = of(none, position, 0)[-1]
     _, B, _, E = (np.array(M) for M in of(none, position, acting)[:4])
@@ -86,7 +86,10 @@ def held_gain(plant: Plant, position: float) -> FloatArray:
 
 @lru_cache(maxsize=16)  # plants compare by identity, and are built once for their parameters
 def model_of(plant: Plant, believed: Plant, names: tuple[str, ...]) -> ca.Function:
-    """(parameters, position along the stroke, inputs wanted) -> what `jacobians` gives, and the preload that acts."""
+    """The design model as a CasADi function of parameters, position along the stroke and wanted inputs v.
+
+    Its outputs are those of `jacobians` on the controlled states (A, B, C, E, forces, their ratio) and the preload.
+    """
     from malta.model.parameters import twins_of
 
     par = plant.parameters
@@ -106,16 +109,16 @@ def model_of(plant: Plant, believed: Plant, names: tuple[str, ...]) -> ca.Functi
     return ca.Function("model", [p, z, v], ca.cse([ca.densify(part) for part in parts]))
 
 
-@lru_cache(maxsize=64)  # writing out the currents takes longer than most that is asked of the answer
+@lru_cache(maxsize=64)  # tracing the currents is slow
 def is_commutated(plant: Plant) -> bool:
-    """Whether the currents of a machine depend on where they were commutated, so that holding them matters."""
+    """Whether a machine's currents depend on the measured position, so that holding them changes the loop."""
     kind = ca.MX if plant.tabulated else ca.SX
     y, v = kind.sym("y", len(plant.outputs)), kind.sym("v", len(plant.inputs))
     return bool(ca.which_depends(plant.currents(y, v), y, 1, True) != [False] * len(plant.actuator.coils))
 
 
 def lower_limit(declared: Mapping[str, Any]) -> float:
-    """What a parameter is above; the float below what it is at least."""
+    """The exclusive lower limit of a declared parameter; for `at_least` the float just below."""
     above, least = declared.get("above"), declared.get("at_least")
     found = [] if above is None else [float(above)]
     found += [] if least is None else [math.nextafter(float(least), -math.inf)]
@@ -134,9 +137,10 @@ def sampled_law(
 ) -> Compensator:
     """The control law of a gain file as the machine runs it: hold, `delay` samples, current loops.
 
-    lag : rad/s, crossover of the current loops, taken as first-order lags; with `loop`, the windings' own R / L
+    lag : rad/s, crossover of the current loops, as first-order lags; with `loop`, the R / L of the windings
     loop : PI controllers of the currents, for windings of resistance R (ohm), sampled with the control law
-    held : H of currents that are held: v + H y acts; handed: the reading itself is a further input of the system
+    held : the gain H of held currents: v + H y acts
+    handed : whether the reading y is a further input of the system
     """
     law, T = linear_law(controller), controller.sample_time
     n, m = len(controller.states), len(controller.forces)
@@ -165,9 +169,9 @@ def sampled_law(
 
 
 def _integrals_last(law: LinearLaw, count: int) -> LinearLaw:
-    """A law that takes off disturbances d integrates: d + X xi is a plain sum of the readings, in the place of d, last.
+    """Transform a law that cancels observed disturbances d: its last states d + X xi become plain sums of the readings.
 
-    With A = [[M, N], [G, 1]] that is X (M - 1) = -G; then X N = 0, as the law leaves no constant disturbance in xi.
+    With A = [[M, N], [G, 1]], X solves X (M - 1) = -G. Then X N = 0, because the law leaves no constant disturbance.
     """
     A, k = law.A, len(law.A) - count
     try:
@@ -191,7 +195,7 @@ def _integrals_last(law: LinearLaw, count: int) -> LinearLaw:
 
 
 def _with_current_control(c: Compensator, loop: CurrentLoop, R: float, B2: FloatArray) -> Compensator:
-    """In series: the voltages that PI controllers ask for, over R, so that the lag R / L makes currents of them.
+    """The law in series with PI controllers of the currents; their voltages over R are the inputs of the lag R / L.
 
     Each axis: e = v - i, I+ = I + Ki T e, u = Kp e + I+, i+ = a i + (1 - a) u[k - d] / R with a = e^(-T R / L).
     """
@@ -228,13 +232,13 @@ def _with_current_control(c: Compensator, loop: CurrentLoop, R: float, B2: Float
 
 
 def difference_form(c: Compensator) -> tuple[FloatArray, FloatArray]:
-    """A, B of x' or of (x+ - x) / T."""
+    """A and B of x', or of (x+ - x) / T for a sampled law."""
     T = c.sample_time
     return (c.A, c.B) if T is None else ((c.A - np.eye(len(c.A))) / T, c.B / T)
 
 
 class _Sides(NamedTuple):
-    """Both sides of the loop as the eigenvalues and responses want them: x' = A x + B u, or of sampled (x+ - x) / T."""
+    """Both sides of a loop: x' = A x + B u, or (x+ - x) / T = A x + B u when sampled."""
 
     A: FloatArray  # plant, lags, stored inputs
     B: FloatArray
@@ -244,23 +248,23 @@ class _Sides(NamedTuple):
 
 
 def _sides(c: Compensator, A: FloatArray, B: FloatArray, C: FloatArray) -> _Sides:
-    """Differences, as poles of slow modes stand close to 1, where A of x+ = A x itself has lost their digits."""
+    """Both sides in differences: slow poles lie close to 1, where the A of x+ = A x has lost their digits."""
     if c.lag is not None:
         A, B = add_lags(A, B, c.lag)
     if c.sample_time is not None:
         n, T = len(A), c.sample_time
         _, Phi = sample(A, np.eye(n), T)  # (e^AT - 1) / T = A Phi / T
         A, B = delay_inputs(A @ Phi / T, Phi @ B / T, c.delay)
-        stored = np.arange(n, len(A))  # of these, delay_inputs gives the next values
+        stored = np.arange(n, len(A))  # delay_inputs gives the next values of these
         A[n:], B[n:] = A[n:] / T, B[n:] / T
         A[stored, stored] -= 1 / T
     return _Sides(A, B, np.hstack([C, np.zeros((len(C), len(A) - C.shape[1]))]), *difference_form(c))
 
 
 def closed_loop(system: UncertainSystem, c: Compensator, p: FloatArray) -> FloatArray:
-    """State matrices of the closed loop at rows of parameters, exactly; of sampled loops (A - 1) / T.
+    """State matrices of the closed loop at k rows of parameters; of sampled loops (A - 1) / T.
 
-    States: plant, lags, stored inputs, compensator.
+    The states are those of plant, lags, stored inputs and compensator.
     """
     matrices = []
     for plant in zip(*system.at(p), strict=True):
@@ -270,7 +274,7 @@ def closed_loop(system: UncertainSystem, c: Compensator, p: FloatArray) -> Float
 
 
 def instability(system: UncertainSystem, c: Compensator, p: FloatArray) -> FloatArray:
-    """How far the worst pole is beyond the boundary, 1/s: its real part, of sampled loops ln|lambda| / T."""
+    """The real part of the worst pole at k rows of parameters, 1/s; of sampled loops ln|lambda| / T."""
     poles = np.linalg.eigvals(closed_loop(system, c, p))
     if c.sample_time is not None:
         T = c.sample_time
@@ -280,7 +284,7 @@ def instability(system: UncertainSystem, c: Compensator, p: FloatArray) -> Float
 
 
 def critical_frequency(system: UncertainSystem, c: Compensator, p: FloatArray) -> float:
-    """Frequency of the worst pole at one row of parameters, rad/s."""
+    """The frequency of the worst pole at one row of parameters, rad/s."""
     (poles,) = np.linalg.eigvals(closed_loop(system, c, p))
     if c.sample_time is None:
         return float(abs(poles[poles.real.argmax()].imag))

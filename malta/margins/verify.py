@@ -1,9 +1,6 @@
 """Linear verification of a controller on a machine: poles, sensitivities, bandwidths, stage by stage.
 
-The loop is the block diagram of controller.py, sampled: P is the machine from forces to measurements under a
-zero-order hold, exactly; F the control law from measurements to forces (v = F y). At the sensors
-    S = (I - P F)^-1,   T = I - S,   L = -P F.
-Where currents are held that were commutated for the last reading, that is one more input of P, and F hands it on.
+The loops and their signals are those of loops.py; at the sensors S = (I - P F)^-1, T = I - S, L = -P F.
 """
 
 from __future__ import annotations
@@ -36,11 +33,11 @@ ZONES = ((3.0, "A"), (4.0, "B"), (5.0, "C"), (np.inf, "D"))
 
 @dataclass(frozen=True, eq=False)
 class Poles:
-    """Poles in rad/s; of sampled systems ln(lambda) / Ts, poles of pure delay left out."""
+    """Poles in rad/s; of sampled systems ln(lambda) / Ts, without the poles of pure delay."""
 
     open_loop: ComplexArray  # of the continuous model
-    regulator: ComplexArray  # of the file's own sampled model with K, Ki; none of a PID
-    filter: ComplexArray  # of the file's own sampled observer; none of a PID
+    regulator: ComplexArray  # of the controller's own sampled model with K, Ki; empty for a PID
+    filter: ComplexArray  # of the controller's own sampled observer; empty for a PID
     closed_loop: ComplexArray  # of the machine: hold, delay, current loops, controller
 
     def pairs(self) -> dict[str, list[list[float]]]:
@@ -50,7 +47,7 @@ class Poles:
 
 @dataclass(frozen=True)
 class Stage:
-    """One loop, from the ideal one to the machine's: what it costs in sensitivity."""
+    """The peak sensitivity and stability of one loop, from the ideal one to the machine's."""
 
     name: str
     peak_sensitivity: Mapping[str, float]  # by sensor, and sigma_max of all
@@ -64,23 +61,23 @@ class Stage:
 
 @dataclass(frozen=True, eq=False)
 class Margins:
-    """What verify found. The last stage is the machine; bandwidths are of that loop."""
+    """The result of `verify`. The last stage is the machine's loop, whose bandwidths these are."""
 
     poles: Poles
     stages: tuple[Stage, ...]
     bandwidth: Mapping[str, float]  # rad/s, by definition
-    uncertainty: Mapping[str, float]  # the relative box, by parameter, that the design is meant for
-    robust: Margin | None  # in multiples of it, anywhere in `extent`; None without a box
-    extent: Extent = NOWHERE  # what the margin covers beside the box
+    uncertainty: Mapping[str, float]  # relative half range of each parameter
+    robust: Margin | None  # in multiples of these ranges, anywhere in `extent`; None without ranges
+    extent: Extent = NOWHERE  # the intervals that the margin covers beside the ranges
 
     @property
     def stable(self) -> bool:
-        """The machine's loop is stable."""
+        """Whether the machine's loop is stable."""
         return self.stages[-1].stable
 
     @property
     def peak_sensitivity(self) -> Mapping[str, float]:
-        """Of the machine's loop, by sensor and as sigma_max."""
+        """The peak sensitivity of the machine's loop, by sensor and as sigma_max."""
         return self.stages[-1].peak_sensitivity
 
     def __str__(self) -> str:
@@ -120,7 +117,7 @@ def zone(peak: float) -> str:
 def controller_poles(c: Controller) -> tuple[ComplexArray, ComplexArray]:
     """Eigenvalues in z of regulator and filter on the controller's own model (separation principle).
 
-    Forces of disturbance are for the filter to follow, not for the regulator to move.
+    The regulator has no poles for observed disturbance forces, which only the filter estimates.
     """
     k = len(c.Ad) - c.observed * len(c.forces)
     A, B, K = c.Ad[:k, :k], c.Bd[:k], c.K[:, :k]
@@ -132,9 +129,9 @@ def controller_poles(c: Controller) -> tuple[ComplexArray, ComplexArray]:
 
 @on_one_thread
 def unstable_gain(c: Controller) -> tuple[str, float] | None:
-    """Which gains leave the file's own model unstable, and the size of the worst eigenvalue; None: none do.
+    """The name of a gain that leaves the controller's own model unstable, and the worst |lambda|; None: all are stable.
 
-    An LQG is judged by its regulator and its filter. A PID or a law of errors has no model: it is judged on the machine
+    An LQG is judged by its regulator and its filter. A PID or a law of errors has no model and is judged on the machine
     that it names.
     """
     if c.cost is None:
@@ -156,10 +153,16 @@ def verify(
 ) -> Margins:
     """Poles, peak sensitivities and bandwidths of a controller on a machine's linear model.
 
-    Stages: the sampled loop as designed; with the current loops; the machine (`machine_loop`). An unstable loop is
-    reported, not raised; its sensitivities are NaN. `uncertainty` is the relative half range of each parameter, which
-    the margin counts in, which covers the travel and the intervals of `plant.over`.
-    Raises CheckError where numbers overflow or no input holds the machine.
+    Stages: the sampled loop as designed; with the current loops; the machine (`machine_loop`).
+
+    uncertainty : relative half range of each parameter, the unit of the robust margin, as {"m": 0.2}; None: no margin
+
+    The robust margin covers the travel and the intervals of `plant.over`. The peak sensitivities of an unstable loop
+    are NaN; instability raises nothing.
+
+    Raises CheckError when numbers overflow or no input holds the machine.
+
+    Example: `print(malta.verify(model, controller, {"m": 0.2}))`
     """
     try:
         with np.errstate(over="ignore", invalid="ignore"):
@@ -191,7 +194,7 @@ def _verify(model: LinearModel, controller: Controller, uncertainty: Mapping[str
 
 
 def require_stable(margins: Margins, name: str) -> None:
-    """Raise CheckError when the machine's loop is unstable: such gains are not to be written."""
+    """Raise CheckError when a stage is unstable: such gains are not written to files."""
     for stage in margins.stages:
         if not stage.stable:
             raise CheckError(
@@ -236,7 +239,7 @@ def _bandwidths(
 
 
 def _natural_frequencies(model: LinearModel, controller: Controller) -> dict[str, float]:
-    """Of q'' = (k - G K1) q, rad/s; none where the states are not (q, q'), or nothing is fed back of them."""
+    """Natural frequencies of q'' = (k - G K1) q, rad/s; none unless the controller feeds back states (q, q')."""
     n = model.plant.coordinates
     if not n or controller.tracks == "errors":
         return {}
