@@ -1,4 +1,4 @@
-"""What a plant is where its optional fields are not given, and whether its fields fit each other."""
+"""The defaults of a plant's optional fields, and checks that its fields fit each other."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from malta.errors import InputError
 if TYPE_CHECKING:
     from malta.model.plant import Plant
 
-DEFAULT: Any = None  # in place of a function that follows from the other fields
+DEFAULT: Any = None  # stands for a function that follows from the other fields
 
 
 def defaults(plant: Plant) -> dict[str, Any]:
-    """What the optional fields of a plant are where they are not given."""
+    """The defaults of a plant's optional fields, by name."""
     m, p, w = len(plant.inputs), len(plant.outputs), len(plant.disturbances)
     actuator = plant.actuator
     constants, limit = actuator.force_constant, actuator.current_limit
@@ -49,7 +49,7 @@ def _identity(y: Any) -> Any:
 
 
 def check_signals(plant: Plant) -> None:
-    """InputError where the fields of a plant do not fit each other, by their lengths and names."""
+    """Raise InputError unless the names and lengths of a plant's fields fit each other."""
     names = {
         key: [s.name for s in getattr(plant, key)]
         for key in ("states", "inputs", "outputs", "disturbances", "sensor_errors")
@@ -80,7 +80,7 @@ def check_signals(plant: Plant) -> None:
 
 
 def _check_intervals(plant: Plant) -> None:
-    """InputError where `over` names no parameter, one that shapes the model, or an interval without its own value."""
+    """Raise InputError unless every interval of `over` contains the value of a parameter that may be a symbol."""
     entering = _symbolic_names(plant)
     for name, interval in plant.over.items():
         if name not in entering:
@@ -91,20 +91,20 @@ def _check_intervals(plant: Plant) -> None:
 
 
 def _symbolic_names(plant: Plant) -> list[str]:
-    """The parameters that may be symbols."""
+    """The names of the parameters that may be symbols."""
     declared = {f.name: f.metadata for f in fields(plant.parameters) if "unit" in f.metadata}
     return [name for name, metadata in declared.items() if not metadata["shapes"]]
 
 
 def check_plant(plant: Plant) -> None:
-    """InputError where a plant's signals do not fit each other, or a function of it has the wrong size or fails."""
+    """Check a plant. Raises InputError when its fields do not fit, or a function of it fails or has a wrong size."""
     check_signals(plant)
     check_equations(plant)
     check_symbols(plant)
 
 
 def check_equations(plant: Plant) -> None:
-    """InputError where f or h of a plant cannot be evaluated, or gives another number of entries than it should."""
+    """Raise InputError when a function of a plant fails or returns a wrong number of entries."""
     kind = ca.MX if plant.tabulated else ca.SX
     x, u = kind.sym("x", len(plant.states)), kind.sym("u", len(plant.inputs))
     w, y = kind.sym("w", len(plant.disturbances)), kind.sym("y", len(plant.outputs))
@@ -136,11 +136,11 @@ def _check_size(plant: Plant, name: str, evaluate: Callable[[], Any], size: int,
 
 
 def check_symbols(plant: Plant) -> None:
-    """InputError where a plant cannot be built of symbols: margins and simulations put them in place of parameters.
+    """Raise InputError when a plant cannot be built from symbols, which margins and simulations use for parameters.
 
-    CasADi gives NaN where a symbol is taken for a number, as `math.sin(par.slope)` does, and says nothing.
+    CasADi returns NaN without an error when a function takes a symbol for a number, as `math.sin(par.slope)` does.
     """
-    if plant.tabulated:  # it holds numbers, and says so where it is asked for more
+    if plant.tabulated:  # its table holds numbers; using symbols raises an error there
         return
     bad = _fault_with_symbols(plant, _symbolic_names(plant))
     if bad:
@@ -152,7 +152,7 @@ def check_symbols(plant: Plant) -> None:
 
 
 def _fault_with_symbols(plant: Plant, names: Sequence[str]) -> str:
-    """The function of a plant that fails, or gives NaN, where these parameters are symbols; "" for none."""
+    """The name of a plant's function that fails or returns NaN when these parameters are symbols; "" for none."""
     from malta.model.plant import symbolic  # which imports this module
 
     symbols = {name: ca.SX.sym(name) for name in names}

@@ -1,10 +1,10 @@
 """Plant at an operating point -> linear model, by CasADi's exact derivatives.
 
-xi' = A xi + B v,   p = C xi          eq. (19), xi = (q, q'), the uncontrolled states dropped
+xi' = A xi + B v,   p = C xi          eq. (19), xi = (q, q') without the uncontrolled states
 
-Between samples currents are held that were commutated for the last reading y_k, and the machine moves on: then
+Between samples the machine moves on, while the currents commutated for the last reading y_k are held:
 
-xi' = A xi + B v + E (y_k - C xi)     E = 0 where forces do not depend on the position, as MALTA's in its own axes
+xi' = A xi + B v + E (y_k - C xi)     E = 0 when forces do not depend on the position
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class LinearModel:
-    """xi' = A xi + B v, p = C xi, about `operating_point`. A is n x n, B n x m, C p x n, E n x p."""
+    """xi' = A xi + B v + E (y_k - C xi), p = C xi about `operating_point`: A n x n, B n x m, C p x n, E n x p."""
 
     plant: Plant
     operating_point: OperatingPoint
@@ -63,14 +63,14 @@ class LinearModel:
 
     @property
     def stiffness(self) -> FloatArray:
-        """q'' per q: the lower left block of A, 1/s2. M^-1 S in the paper's letters. InputError without (q, q')."""
+        """The lower left block of A, q'' per q (1/s2): M^-1 S in the paper. Raises InputError for other states."""
         self.plant.require_second_order("stiffness")
         n = len(self.A) // 2
         return self.A[n:, :n]
 
     @property
     def force_map(self) -> FloatArray:
-        """q'' per v: the lower half of B. M^-1 V in the paper's letters. InputError without (q, q')."""
+        """The lower half of B, q'' per v (1/kg): M^-1 V in the paper. Raises InputError for other states."""
         self.plant.require_second_order("force_map")
         return self.B[len(self.A) // 2 :]
 
@@ -78,13 +78,17 @@ class LinearModel:
 def linearize(plant: Plant, point: OperatingPoint, believed: Plant | None = None) -> LinearModel:
     """Linearize x' = f(x, u, w), y = h(x, u) at an operating point.
 
-    At `plant.at(z=...)` the loads are left out, as v0(z) cancels them; at `trim(plant, z=...)` they act, which
-    adds the slopes of the loads and of their balance (for MALTA: m g / Ixx from z into alpha'', the cogging's slope in
-    z'', and off the centre z f_D / Ixx in alpha'' and beta'').
+    At `plant.at(z=...)` the loads are left out, because v0(z) cancels them. At `trim(plant, z=...)` they act, and the
+    model has the slopes of the loads and of the inputs that balance them (for the tubular machine m g / Ixx from z to
+    alpha'', the slope of the cogging in z'', and off the centre z f_D / Ixx in alpha'' and beta'').
 
-    believed : the machine that commutates, where it is another one; the inputs are the forces that it wants
+    point : the operating point, from `plant.at`, `plant.point` or `trim`
+    believed : the machine with the controller's parameters; None: the plant itself. The inputs are the forces that the
+        controller commands with these parameters.
 
     Raises InputError when the point has the wrong size, CheckError when the Jacobian is not finite.
+
+    Example: `malta.linearize(plant, plant.at(z=5e-3)).A`
     """
     n, m = len(plant.states), len(plant.inputs)
     if point.x.shape != (n,) or point.u.shape != (m,):
@@ -96,7 +100,7 @@ def linearize(plant: Plant, point: OperatingPoint, believed: Plant | None = None
     w = plant.load(x) if point.loaded else kind.zeros(len(plant.disturbances))
     derivatives = ca.Function("derivatives", [x, u, v], list(jacobians(plant, believed, x, u, v, w)))
     A, B, C, E, made, G = (np.array(value) for value in derivatives(point.x, point.u, point.u))
-    if believed is not None:  # what has to be wanted so that these inputs act
+    if believed is not None:  # the commands at which these inputs act
         wanted = point.u + np.linalg.lstsq(G, point.u - made.ravel(), rcond=None)[0]
         A, B, C, E, *_ = (np.array(value) for value in derivatives(point.x, point.u, wanted))
     keep = list(plant.controlled)
@@ -109,12 +113,12 @@ def linearize(plant: Plant, point: OperatingPoint, believed: Plant | None = None
 def jacobians(
     plant: Plant, believed: Plant | None, x: Any, u: Any, v: Any, w: Any
 ) -> tuple[Any, Any, Any, Any, Any, Any]:
-    """A, B, C, E for all states; the inputs that `v` makes, and their derivatives by it: expressions of x, u, v.
+    """A, B, C and E for all states, the forces on the machine, and their ratio to the commands: expressions of x, u, v.
 
-    u acts, and v is what the controller wants. A machine that knows itself makes just that, so B is that of f; another
-    one's currents make other forces, and B holds their ratio. A has the stiffness of what commutation that follows does
-    not cancel: that of coordinates which it leaves out of account, as the planar motor's tilt, or takes from another
-    machine.
+    The inputs u act; the controller commands the forces v. With equal parameters of machine and controller the two
+    are equal, and B is the Jacobian of f. With other parameters the currents produce other forces, and B contains
+    their ratio. A contains the stiffness that commutation does not cancel: of coordinates that it ignores, as the tilt
+    of a planar motor, or of parameters that differ.
     """
     C = ca.jacobian(plant.h(x, u), x)
     kind = type(x)
@@ -128,6 +132,6 @@ def jacobians(
 
     from_i, rate = ca.jacobian(made, i), plant.f(x, u, w)
     G, ratio = ca.jacobian(rate, u), at(from_i @ ca.jacobian(wanted, v))
-    turned = at(from_i @ ca.jacobian(wanted, y))  # forces from the reading
+    turned = at(from_i @ ca.jacobian(wanted, y))  # slope of the forces in the reading
     A = ca.jacobian(rate, x) + G @ (at(ca.jacobian(made, x)) + turned @ C)
     return A, G if believed is None else G @ ratio, C, G @ turned, at(made), ratio

@@ -1,4 +1,4 @@
-"""Machines by name: the one place that finds one.
+"""Machines by name: the one module that finds and loads them.
 
 A machine is a Python module with `Parameters` and `plant(par) -> Plant`. It comes from
   - an entry point of the group `malta.machines`: `tubular = "malta.machines.tubular.plant"` (malta's own and those of
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 
 class _File(NamedTuple):
-    """A machine's file, and the module that was made of it: its name holds a hash of the text."""
+    """A machine's file and the name of its module, which contains a hash of the text."""
 
     path: Path
     module: str
@@ -49,11 +49,10 @@ _files: dict[str, _File] = {}  # machines that the user named by their files, by
 
 
 def machine(name: str | Path | ModuleType) -> ModuleType:
-    """The module of a machine: by its name, by the file that models it, or the module itself.
+    """The module of a machine, by its name or by its file; a module is returned unchanged.
 
-    The machine of a file is known by the file's stem from then on: `malta.machine("rotor.py")` lets
-    `malta.gains.read("design/gains/rotor.json")` find the machine `rotor`. A file is loaded again when its text
-    changed; the last one of a name counts, and records of an earlier one keep their plant.
+    After `malta.machine("rotor.py")` the name `rotor` finds this machine, as `malta.gains.read` does. A file is loaded
+    again after its text has changed; the last file of a name counts, and records of an earlier one keep their plant.
 
     Raises InputError for an unknown name, a file that cannot be imported, or a module without Parameters and plant.
     """
@@ -75,7 +74,7 @@ def machine(name: str | Path | ModuleType) -> ModuleType:
 
 
 def name_of(module: ModuleType) -> str:
-    """The name under which a machine's module is known."""
+    """The machine's name: of its entry point, or the stem of its file."""
     if module.__name__.startswith(FILES + "."):
         return module.__name__.removeprefix(FILES + ".").split(".")[0].rpartition("_")[0]
     for name, target in _installed().items():
@@ -85,17 +84,17 @@ def name_of(module: ModuleType) -> str:
 
 
 def machine_names() -> list[str]:
-    """The machines that can be found by their names now."""
+    """The names of all machines: of installed packages and of files loaded so far."""
     return sorted({*_installed(), *_files})
 
 
 def file_of(name: str) -> Path | None:
-    """The file of a machine that the user named by it."""
+    """The file of a machine that was loaded from a file; None for others."""
     return _files[name].path if name in _files else None
 
 
 def sources_of(name: str) -> dict[str, str]:
-    """The text of the modules that a machine of the user's own was loaded from, by their names; none for others."""
+    """The texts of the modules of a machine that was loaded from a file, by module name; empty for others."""
     if name not in _files:
         return {}
     own = _files[name].module
@@ -105,7 +104,7 @@ def sources_of(name: str) -> dict[str, str]:
 
 
 def load_sources(name: str, sources: Mapping[str, str]) -> ModuleType:
-    """The module of a machine from the text of its modules, as `sources_of` gives them, where there are no files."""
+    """Load a machine from the texts of its modules, as `sources_of` returns them, on a computer without its files."""
     own = min(sources, key=len)
     if own in sys.modules:
         return sys.modules[own]
@@ -118,7 +117,7 @@ def load_sources(name: str, sources: Mapping[str, str]) -> ModuleType:
 
 
 def part_of(part: Part, name: str) -> ModuleType | None:
-    """The module of a machine's optional part; None where there is none, or no such machine."""
+    """The module of a machine's optional part; None without such a part or machine."""
     if name not in _files and name not in _installed():
         return None
     module = machine(name)
@@ -133,7 +132,7 @@ def part_of(part: Part, name: str) -> ModuleType | None:
 
 
 def attribute_of(plant: Plant, part: Part, name: str, default: Any = None) -> Any:
-    """A name that a machine may define, in the module of its plant or in that of the part."""
+    """The value of an optional name, from the module of the plant or of the part; else `default`."""
     model = sys.modules.get(type(plant.parameters).__module__)
     if model is not None and hasattr(model, name):
         return getattr(model, name)
@@ -141,7 +140,7 @@ def attribute_of(plant: Plant, part: Part, name: str, default: Any = None) -> An
 
 
 def require_part(part: Part, name: str) -> ModuleType:
-    """The module of a machine's part. Raises InputError where the machine has none."""
+    """The module of a machine's part. Raises InputError when the machine has none."""
     module = part_of(part, name)
     if module is None:
         known = ", ".join(other for other in machine_names() if part_of(part, other) is not None)
@@ -151,12 +150,12 @@ def require_part(part: Part, name: str) -> ModuleType:
 
 @cache
 def _installed() -> dict[str, str]:
-    """Names and modules of the machines that installed packages offer."""
+    """The machines of installed packages: names and modules."""
     return {point.name: point.value for point in entry_points(group=GROUP)}
 
 
 def _from_file(path: Path) -> ModuleType:
-    """The module of a machine's file. Modules beside it are imported as `from . import NAME`."""
+    """Load the module of a machine's file, which imports modules beside it by `from . import NAME`."""
     where, name = path, path.stem
     path = path.resolve()
     if not re.fullmatch(r"[A-Za-z_]\w*", name):
@@ -193,7 +192,7 @@ def _from_file(path: Path) -> ModuleType:
 
 
 def _require_plant(module: ModuleType, where: str | Path) -> ModuleType:
-    """The module. InputError where it lacks Parameters or plant."""
+    """The same module. Raises InputError when it lacks Parameters or plant."""
     for name, kind in (("Parameters", "a frozen dataclass"), ("plant", "a function of Parameters -> Plant")):
         if not callable(getattr(module, name, None)):
             raise InputError(where, name, "nothing", f"{kind} of this name")
@@ -201,6 +200,7 @@ def _require_plant(module: ModuleType, where: str | Path) -> ModuleType:
 
 
 def _reason(error: BaseException) -> str:
+    """The error in one line, with its line of the file."""
     line = " ".join(str(error).split())[:160]
     at = ""
     trace = error.__traceback__

@@ -1,8 +1,8 @@
 """The records of a machine: signals, plant, operating point; and trim().
 
-A plant is x' = f(x, u, w), y = h(x, u). w is an external force and torque. The known static loads of the
-machine (gravity, cogging) are kept apart in load(x), because the controller's feedforward v0(z) cancels
-them: the machine moves by f(x, u, w + load(x)), and the controller is designed on f(x, u, 0).
+A plant is x' = f(x, u, w), y = h(x, u), with external forces and torques w. The known static loads of the machine
+(gravity, cogging) are a separate function load(x), because the feedforward v0(z) of the controller cancels them: the
+machine moves by f(x, u, w + load(x)), and the controller is designed for f(x, u, 0).
 """
 
 from __future__ import annotations
@@ -50,15 +50,15 @@ class Actuator:
     """The coils that make the inputs: their current loops and limits.
 
     The current loop is a PI controller on 1 / (L s + R), designed for `crossover` and `phase_margin`. Without a
-    crossover currents follow their commands at once, and nothing after `current_limit` is needed but the dead time.
+    crossover currents follow their commands at once, and of the fields after `current_limit` only `dead_time` counts.
 
     Example: `Actuator(coils=(Signal("i", "A"),), force_constant=(38.0,), current_limit=3.0)`
     """
 
     coils: tuple[Signal, ...]  # their currents, A
-    force_constant: tuple[float, ...]  # N/A, of each input; empty where several share their coils
+    force_constant: tuple[float, ...]  # N/A, of each input; empty when inputs share coils
     current_limit: float  # A, of each coil
-    force_limit: tuple[float, ...] = ()  # of each input, N or N m; none: those of the current limit
+    force_limit: tuple[float, ...] = ()  # of each input, N or N m; (): by the current limit
     voltage_limit: float = math.inf  # V; inf: none
     R: float = 0.0  # ohm
     L: float = 0.0  # H
@@ -74,7 +74,7 @@ class Actuator:
             object.__setattr__(self, "force_limit", limits)
 
     def delay(self, Ts: float) -> int:
-        """Whole samples between measurement and force: the dead time less the half sample that a hold takes."""
+        """Whole samples of delay from measurement to force: the dead time minus the half sample of the hold."""
         return max(0, round(self.dead_time / Ts - 0.5))
 
 
@@ -82,16 +82,16 @@ class Actuator:
 class Plant:
     """A machine: equations of motion that CasADi can trace, and the names and units of its signals.
 
-    `states` are positions, then their rates in the same order (`second_order`); a machine whose states are others has
-    no natural frequencies, no PID and no feedforward of speeds. `uncontrolled` are states that no input reaches, as the
-    rotation of a round mover: they are simulated, and left out of the design.
+    `states` are positions, then their rates in the same order (`second_order`); a machine with other states has no
+    natural frequencies, no PID and no feedforward of speeds. `uncontrolled` are states that no input reaches, as the
+    rotation of a round mover: they are simulated, but not part of the design model.
 
-    The inputs are forces. `currents(y, v)` gives the coil currents for the forces v at the measured position y; they
-    are held for one sample, while `forces(x, i)`, the forces that these currents make, follow the machine.
+    The inputs are forces. `currents(y, v)` returns the coil currents for the forces v at the measured position y. They
+    are held for one sample, while the forces of these currents, `forces(x, i)`, change with the state.
 
-    A machine needs the fields without a default; the others say what it has beyond these. A machine without a `stroke`
-    has no travel, and its thrust and mass are not asked for. What runs at any value of a parameter, as a rotor at any
-    speed, names the interval in `over`: margins are then proven for all of it at once, as they are for the travel.
+    Only the fields without a default are required. A machine without a `stroke` has no travel, thrust and mass. A
+    machine that runs at any value of a parameter, as a rotor at any speed, gives the interval in `over`: margins are
+    proven for the whole interval, as they are for the travel.
 
     `data.plant_of` checks that the fields fit each other. Examples: malta/machines/, the module of `malta new`.
     """
@@ -107,33 +107,35 @@ class Plant:
     variant: Callable[[Any], Plant]  # the same machine with other parameters: its own function `plant`
     disturbances: tuple[Signal, ...] = ()  # w: forces and torques from outside
     uncontrolled: tuple[str, ...] = ()
-    load: CasadiFn = DEFAULT  # x -> w of gravity and cogging; none
-    # y -> controlled positions, the inverse of h at rest; y itself. Of states that are no (q, q'): all of them at rest
+    load: CasadiFn = DEFAULT  # x -> w of gravity and cogging; default: zero
+    # y -> controlled positions at rest (of other states than (q, q'): all states), the inverse of h; default: y
     position_of: CasadiFn = DEFAULT
-    preload: CasadiFn = DEFAULT  # x -> inputs that the design model stands on; none
-    currents: CasadiFn = DEFAULT  # (y, inputs) -> currents of the coils, A; by the force constants
-    forces: CasadiFn = DEFAULT  # (x, currents of the coils) -> inputs; by the force constants
-    limited: CasadiFn = DEFAULT  # currents of the coils -> the same within their limits
-    tabulated: bool = False  # `currents` looks something up in a table: CasADi MX alone
-    windings: Drive | None = None  # None: fidelity force, and phase where there are electronics
-    electronics: Callable[[Any], Electronics] | None = None  # by the machine's options; None: the drive's
-    contacts: tuple[str, ...] = ()  # surfaces that the moving part may touch
-    contact: CasadiFn = DEFAULT  # x -> share of each clearance that is used up; 1 at contact
-    cushioned: tuple[bool, ...] = ()  # which contacts the touchdown bearings carry
+    preload: CasadiFn = DEFAULT  # x -> inputs at the operating point of the design model; default: zero
+    currents: CasadiFn = DEFAULT  # (y, inputs) -> coil currents, A; default: by the force constants
+    forces: CasadiFn = DEFAULT  # (x, coil currents) -> inputs; default: by the force constants
+    limited: CasadiFn = DEFAULT  # coil currents -> coil currents within their limits
+    tabulated: bool = False  # whether `currents` uses a look-up table, so that only CasADi MX works
+    windings: Drive | None = None  # None: no model of the windings
+    electronics: Callable[[Any], Electronics] | None = (
+        None  # options of the machine -> electronics; None: those of the drive
+    )
+    contacts: tuple[str, ...] = ()  # surfaces that the mover may touch
+    contact: CasadiFn = DEFAULT  # x -> used share of each clearance; 1 at contact
+    cushioned: tuple[bool, ...] = ()  # of each contact: whether a touchdown bearing carries it
     bearing: CasadiFn = DEFAULT  # x -> w of the touchdown bearings; zero without contact
-    sense: CasadiFn = DEFAULT  # (x, errors) -> y as the sensors' own signals give it, before noise; h
+    sense: CasadiFn = DEFAULT  # (x, sensor errors) -> y without noise; default: h
     sensor_errors: tuple[Signal, ...] = ()
-    noise: tuple[float, ...] = ()  # of each sensor, rms of a sample, in the unit of each output; none
-    uniform: bool = False  # whether it is uniform, or else normal
-    resolution: tuple[float, ...] = ()  # of each sensor; 0 where it has none to speak of
-    inertia: tuple[float, ...] = ()  # of each input: times p*'' of the same output, fed forward; 0: not
-    mass: float = 0.0  # moved by the `thrust` input
+    noise: tuple[float, ...] = ()  # of each sensor, rms of a sample, in the unit of the output; default: zero
+    uniform: bool = False  # whether the noise is uniform; else normal
+    resolution: tuple[float, ...] = ()  # of each sensor, in the unit of the output; 0: not quantized
+    inertia: tuple[float, ...] = ()  # of each input: factor of p*'' of the same output in the feedforward
+    mass: float = 0.0  # kg, moved by the `thrust` input
     thrust: str = ""  # the input that drives the stroke
     stroke: str = ""  # the output that the stroke moves; "": the machine has no stroke
-    travel: float = 0.0  # of that output, either way, m
+    travel: float = 0.0  # of the stroke, either way, m
     over: Mapping[str, tuple[float, float]] = field(
         default_factory=dict
-    )  # parameters: intervals that proofs cover
+    )  # intervals of parameters that proofs cover, SI
 
     def __post_init__(self) -> None:
         for name, value in defaults(self).items():
@@ -143,7 +145,7 @@ class Plant:
 
     @property
     def drive(self) -> Drive:
-        """The windings. InputError for a machine without a model of them."""
+        """The windings. Raises InputError for a machine without a model of them."""
         if self.windings is None:
             raise InputError(self.name, "drive", "none", "a machine whose windings are modelled")
         return self.windings
@@ -160,7 +162,7 @@ class Plant:
 
     @cached_property
     def second_order(self) -> bool:
-        """Whether the states are (q, q'): the first half of f is, expression by expression, the second half of x."""
+        """Whether the states are (q, q'): the first half of f equals the second half of x as expressions."""
         half, odd = divmod(len(self.states), 2)
         x, u = ca.SX.sym("x", len(self.states)), ca.SX.sym("u", len(self.inputs))
         rate = ca.SX(ca.vertcat(self.f(x, u, ca.SX.sym("w", len(self.disturbances)))))
@@ -168,11 +170,11 @@ class Plant:
 
     @property
     def coordinates(self) -> int:
-        """How many positions stand first in the design model's states (q, q'); 0 where these are others."""
+        """The number of positions q in the design model's states (q, q'); 0 for other states."""
         return len(self.controlled) // 2 if self.second_order else 0
 
     def require_second_order(self, what: str) -> None:
-        """InputError where the states are not (q, q'), which `what` is made for."""
+        """Raise InputError unless the states are (q, q'), which `what` requires."""
         if not self.second_order:
             found = "states that are not positions and then their rates"
             raise InputError(self.name, what, found, "x = (q, q')")
@@ -184,39 +186,39 @@ class Plant:
 
     @property
     def stroke_output(self) -> int:
-        """Index of the output that the stroke moves. InputError for a machine without a stroke."""
+        """The index of the stroke among the outputs. Raises InputError for a machine without a stroke."""
         if not self.stroke:
             raise InputError(self.name, "stroke", "none", "a machine with a stroke")
         return [s.name for s in self.outputs].index(self.stroke)
 
     @property
     def leading_output(self) -> int:
-        """Index of the stroke among the outputs; of a machine without one the first."""
+        """The index of the stroke among the outputs; 0 for a machine without a stroke."""
         return self.stroke_output if self.stroke else 0
 
     @property
     def leading_input(self) -> int:
-        """Index of the thrust among the inputs; of a machine without a stroke the first."""
+        """The index of the thrust among the inputs; 0 for a machine without a stroke."""
         return self.thrust_input if self.stroke else 0
 
     @property
     def stroke_state(self) -> int:
-        """Index of the state that the stroke moves. InputError for a machine without a stroke."""
+        """The index of the stroke among the states. Raises InputError for a machine without a stroke."""
         if not self.stroke:
             raise InputError(self.name, "stroke", "none", "a machine with a stroke")
         return [s.name for s in self.states].index(self.stroke)
 
     @property
     def thrust_input(self) -> int:
-        """Index of the input that drives the stroke. InputError for a machine without a stroke."""
+        """The index of the thrust among the inputs. Raises InputError for a machine without a stroke."""
         if not self.thrust:
             raise InputError(self.name, "thrust", "none", "a machine with a stroke")
         return [s.name for s in self.inputs].index(self.thrust)
 
     def nlsys(self) -> Any:
-        """The machine as a continuous control.NonlinearIOSystem with names; CasADi computes its rates and outputs.
+        """The machine as a continuous control.NonlinearIOSystem with named signals, evaluated by CasADi.
 
-        x' = f(x, u, w + load(x)), y = h(x, u): its inputs are those of the machine, then the disturbances w.
+        x' = f(x, u, w + load(x)), y = h(x, u); the inputs of the machine come first, then the disturbances w.
         """
         import control  # imports matplotlib and takes a second: only where it is used
 
@@ -234,14 +236,16 @@ class Plant:
         )
 
     def at(self, /, **positions: float) -> OperatingPoint:
-        """The operating point at these states (SI), the others zero, at the preload of the design model.
+        """The operating point at these states (SI), the others zero, with the preload of the design model.
 
-        The loads are taken as cancelled at every position, as v0(z) does. `plant.at(z=5e-3)`
+        The loads do not act, because v0(z) cancels them at every position. Raises InputError for unknown states.
+
+        Example: `plant.at(z=5e-3)`
         """
         return self._operating_point(self.state(positions))
 
     def point(self, design: ArrayLike) -> OperatingPoint:
-        """The same at these states of the design model (SI), the uncontrolled ones zero."""
+        """The operating point at these states of the design model (SI), the uncontrolled states zero."""
         x = np.zeros(len(self.states))
         x[list(self.controlled)] = design
         return self._operating_point(x)
@@ -251,7 +255,10 @@ class Plant:
         return OperatingPoint(x, u, loaded=False)
 
     def state(self, values: Mapping[str, float]) -> FloatArray:
-        """The state with these entries (SI), the others zero."""
+        """The state vector with these entries (SI), the others zero.
+
+        Raises InputError for unknown names and values that are not finite.
+        """
         names = [s.name for s in self.states]
         x = np.zeros(len(names))
         for name, value in values.items():
@@ -272,13 +279,13 @@ def position_in(plant: Plant, x: ArrayLike) -> float:
 
 
 def position_at(plant: Plant, x: ArrayLike) -> dict[str, float]:
-    """The same by its name, as `plant.at` takes it; none for a machine without a stroke."""
+    """The position along the stroke by name, an argument of `plant.at`; empty for a machine without a stroke."""
     return {plant.stroke: position_in(plant, x)} if plant.has_stroke else {}
 
 
 @dataclass(frozen=True, eq=False)
 class OperatingPoint:
-    """State and input to linearize at. `loaded`: the loads act and u balances them (trim)."""
+    """A state and inputs to linearize at; `loaded`: whether the loads act and u balances them (trim)."""
 
     x: FloatArray
     u: FloatArray
@@ -290,7 +297,7 @@ class OperatingPoint:
 
 
 def readonly(array: ArrayLike) -> FloatArray:
-    """A private copy that cannot be written to; what already cannot be is taken as it is."""
+    """A read-only copy as floats; a read-only array of floats is returned unchanged."""
     if isinstance(array, np.ndarray) and array.dtype == float and not array.flags.writeable:
         return array
     copy = np.array(array, dtype=float)
@@ -299,7 +306,7 @@ def readonly(array: ArrayLike) -> FloatArray:
 
 
 def trace(name: str, arguments: list[Any], expression: Any) -> CasadiFn:
-    """A CasADi function, called with its arguments alone, of an expression that may hold symbols of parameters."""
+    """A function of `arguments` for an expression; symbols of parameters in the expression stay symbols."""
     body = ca.cse(expression)
     known = {symbol.__hash__() for a in arguments for symbol in ca.symvar(a)}
     free = [symbol for symbol in ca.symvar(body) if symbol.__hash__() not in known]
@@ -308,7 +315,7 @@ def trace(name: str, arguments: list[Any], expression: Any) -> CasadiFn:
 
 
 def symbolic(parameters: Any, symbols: Mapping[str, Any]) -> Any:
-    """The record with CasADi symbols in place of numbers; its checks do not apply to them."""
+    """A parameter record with CasADi symbols in place of numbers, without the checks of its class."""
     record = object.__new__(type(parameters))
     for f in fields(parameters):
         object.__setattr__(record, f.name, symbols.get(f.name, getattr(parameters, f.name)))
@@ -320,16 +327,18 @@ def trim(plant: Plant, /, **positions: float) -> OperatingPoint:
 
     Solves 0 = f(x, u, load(x)) for u, in the least-squares sense, by Newton's method.
 
-    Raises CheckError when no input holds the machine there.
+    Raises InputError for unknown states, CheckError when no input holds the machine there.
+
+    Example: `malta.trim(plant, z=5e-3).u`
     """
     x = plant.at(**positions).x
     return OperatingPoint(x, _hold(plant, x[None, :])[0], loaded=True)
 
 
 def load_balance(plant: Plant, states: FloatArray) -> FloatArray:
-    """The inputs that cancel the loads at rest, and nothing else: f(x, u, load(x)) = f(x, 0, 0); a row for each state.
+    """The inputs that cancel the loads alone at rest: f(x, u, load(x)) = f(x, 0, 0); one row for each row of states.
 
-    Where the machine itself pulls, as a magnetic bearing off its centre does, that pull is left to the controller.
+    The controller balances the other forces, as the pull of a magnetic bearing off its centre.
 
     Raises CheckError when no input cancels the loads.
     """

@@ -6,7 +6,7 @@ Frames: I is fixed to the stator, R to the mover. q_r = (alpha, beta, gamma) tur
     omega_R = (0, 0, gamma') + R_z (0, beta', 0) + R_z R_y (alpha', 0, 0)                      eq. (4)
     m q_t'' = F_I          I omega_R' + omega_R x I omega_R = T_R                              eq. (3)
 
-`rotation`, `rate_map` and `cardan_rates` take the angles of whichever frame is wanted.
+`rotation`, `rate_map` and `cardan_rates` hold for any frame; their first argument is its angles.
 
 NOTE: eq. (4) writes the Cardan rates as components of an angular velocity in frame I; they are not.
 """
@@ -31,7 +31,7 @@ SMALL_ANGLE = Trig(lambda angle: angle, lambda _: 1)
 
 
 def rotation(q_r: Any, trig: Trig = EXACT) -> Any:
-    """R_RI, 3 x 3: turns components in I into components in R."""
+    """R_RI, 3 x 3, from components in I to components in R."""
     (sa, sb, sg), (ca_, cb, cg) = ([fn(q_r[i]) for i in range(3)] for fn in trig)
     R_x = _matrix([[1, 0, 0], [0, ca_, sa], [0, -sa, ca_]])
     R_y = _matrix([[cb, 0, -sb], [0, 1, 0], [sb, 0, cb]])
@@ -46,9 +46,9 @@ def rate_map(q_r: Any, trig: Trig = EXACT) -> Any:
 
 
 def principal_angles(q_r: Any, inertia: Sequence[float]) -> Any:
-    """Cardan angles of the frame B that the equations are written in: R, or R before gamma.
+    """The Cardan angles of the frame B of the equations: R, or R before the rotation by gamma.
 
-    Every axis across a body with Ixx = Iyy is a principal one, so its equations need no gamma.
+    With Ixx = Iyy every axis across the body is a principal axis, so the equations need no gamma.
     """
     return ca.vertcat(q_r[:2], 0) if is_round(inertia) else q_r
 
@@ -72,7 +72,7 @@ def acceleration(
 ) -> tuple[Any, Any]:
     """q_t'' and q_r'' under the force F_I (N) and the torque T_B about the centre of gravity (N m).
 
-    B is the frame with the angles principal(q_r, inertia); `q_r` and `dq_r` are CasADi SX symbols; inertia is
+    B is the frame with the angles `principal_angles(q_r, inertia)`; `q_r` and `dq_r` are CasADi SX symbols; inertia is
     (Ixx, Iyy, Izz) in kg m2. With Omega the angular velocity of B and omega that of the body, both in B:
     I omega' + Omega x I omega = T_B and omega' = E q_r'' + (d omega / d q_r) q_r'.
     """
@@ -87,7 +87,7 @@ def acceleration(
 
 
 def _top_acceleration(inertia: Sequence[Any], q_r: Any, dq_r: Any, T_B: Any) -> Any:
-    """q_r'' of a body with Ixx = Iyy: the same equations, solved by hand for what a simulation does most often.
+    """q_r'' of a body with Ixx = Iyy: the same equations solved by hand, because simulations evaluate them most often.
 
     With turn = sin(beta) alpha', omega = (cos(beta) alpha', beta', turn + gamma') and lean = Izz / Ixx omega_3 - turn:
     alpha'' = (T_1 / Ixx - beta' (lean - turn)) / cos(beta),     beta'' = T_2 / Ixx + omega_1 lean.
@@ -102,7 +102,7 @@ def _top_acceleration(inertia: Sequence[Any], q_r: Any, dq_r: Any, T_B: Any) -> 
 
 
 def rotate(q_r: Any, a_I: Any, trig: Trig = EXACT) -> Any:
-    """R_RI a_I, one rotation after the other: fewer operations than the matrix."""
+    """R_RI a_I by one rotation after the other, in fewer operations than by the matrix."""
     (sa, sb, sg), (ca_, cb, cg) = ([fn(q_r[i]) for i in range(3)] for fn in trig)
     x, y, z = a_I[0], ca_ * a_I[1] + sa * a_I[2], ca_ * a_I[2] - sa * a_I[1]
     x, z = cb * x - sb * z, sb * x + cb * z

@@ -1,4 +1,4 @@
-"""How a machine's signals are shown: in groups of one unit, by the words that its experiments have for them."""
+"""Groups of a machine's signals for figures and tables: one unit each, named by the WORDS of its experiments."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from typing import NamedTuple
 from malta.model.machines import attribute_of
 from malta.model.plant import Plant, Signal
 
-FINE: Mapping[str, str] = {"m": "um", "rad": "urad"}  # what deviations are shown in
+FINE: Mapping[str, str] = {"m": "um", "rad": "urad"}  # units of deviations
 KINDS: Mapping[str, str] = {"N": "force", "N m": "torque"}
 
 
 class Group(NamedTuple):
-    """Signals that are shown together."""
+    """Signals of one unit that a figure shows together."""
 
     name: str
     unit: str  # SI
@@ -21,7 +21,7 @@ class Group(NamedTuple):
 
     @property
     def fine(self) -> str:
-        """The unit that deviations are shown in."""
+        """The unit of deviations."""
         return FINE.get(self.unit, self.unit)
 
 
@@ -36,23 +36,23 @@ def inputs_of(plant: Plant) -> tuple[Group, ...]:
 
 
 def compliance_unit(unit: str) -> str:
-    """Of an output to the force or torque that moves it."""
+    """The unit of an output over the force or torque that moves it."""
     return {"m": "um/N", "rad": "urad/(N m)"}[unit]
 
 
 def stiffness_unit(unit: str) -> str:
-    """The other way round."""
+    """The unit of a force or torque over the output that it moves."""
     return {"m": "N/um", "rad": "N m/urad"}[unit]
 
 
 def lateral_outputs(plant: Plant) -> tuple[Group, ...]:
-    """Outputs other than the stroke; of a machine with one output that one."""
+    """The outputs across the stroke; of a machine with one output this output."""
     found = outputs_of(plant)
     return (found[1:] or found) if plant.has_stroke else found
 
 
 def stroke_unit(plant: Plant) -> str:
-    """The unit that deviations along the stroke are shown in."""
+    """The unit of deviations along the stroke."""
     unit: str = attribute_of(plant, "experiments", "STROKE_UNIT", outputs_of(plant)[0].fine)
     return unit
 
