@@ -1,7 +1,6 @@
 """Entries of matrices as exact rational functions of p: degrees, denominators, and bounds in which terms cancel.
 
-Operations that are no field operations (a sine, a root) stand as further variables, so that what multiplies them still
-cancels exactly.
+Operations outside the field (a sine, a root) become further variables, so that their factors still cancel exactly.
 """
 
 from __future__ import annotations
@@ -19,15 +18,15 @@ from malta.margins.expressions import (
     exact,
 )
 
-LARGEST = 4000  # terms of an expression beyond which it is not written out
+LARGEST = 4000  # terms of an expression at most
 
 
 class TooLarge(Exception):
-    """A rational function of more terms than are worth writing out."""
+    """A rational function has too many terms."""
 
 
 class Ratio:
-    """num / den, polynomials over the rationals; den is one where it is constant."""
+    """num / den, polynomials over the rationals; a constant den is one."""
 
     __slots__ = ("den", "num")
 
@@ -100,7 +99,7 @@ class Symbolic:
     entries: tuple[dict[tuple[int, int], Ratio], ...]
     context: Any
     inputs: int
-    atoms: tuple[int, ...]  # the program's steps that are further variables
+    atoms: tuple[int, ...]  # steps of the program that are further variables
     program: Program
 
     def constant(self, x: float) -> Ratio:
@@ -108,7 +107,7 @@ class Symbolic:
 
 
 def value(polynomial: Any, p: Sequence[Any]) -> Any:
-    """A polynomial at complex balls."""
+    """The value of a polynomial at complex balls."""
     total = acb(0)
     for monomial, c in polynomial.to_dict().items():
         term = acb(c)
@@ -120,7 +119,10 @@ def value(polynomial: Any, p: Sequence[Any]) -> Any:
 
 
 def symbolic(program: Program) -> Symbolic:
-    """Raises TooLarge, and NotAnalytic for a division by an expression that is identically zero."""
+    """The matrices of a program as rational functions.
+
+    Raises TooLarge for too many terms, and NotAnalytic for a division by an expression that is identically zero.
+    """
     atoms = tuple(
         k
         for k, (name, _, _, value) in enumerate(program.steps)

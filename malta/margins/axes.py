@@ -1,8 +1,9 @@
 """A few axes as double integrators under their share of a compensator: determinants and adjugates over a box.
 
 A group's sampled loop has q+ = q + T q' + T^2 / 2 a, q'+ = q' + T a, a+ = b v: its matrix M0 = z - A0 is affine in each
-of the b_i, which are monomials of p. So are its determinant and its adjugate: sums over subsets of the b_i, found once,
-that any box of p only weighs. Polynomials in g = z - 1 are turned to v as those of `characteristic` are.
+of the b_i, which are monomials of p. Its determinant and its adjugate are therefore sums over subsets of the b_i. The
+terms are computed once; a box of p changes their weights alone. Polynomials in g = z - 1 are mapped to v as in
+characteristic.py.
 """
 
 from __future__ import annotations
@@ -33,9 +34,9 @@ BITS = 320
 
 @dataclass(frozen=True, eq=False)
 class Axes:
-    """A group of axes with its states of the compensator, in the polynomials of g = z - 1 turned to v.
+    """A group of axes with its states of the compensator; polynomials of g = z - 1 are mapped to v.
 
-    subsets : of the b_i, at one each and the others at zero, what the determinant and the adjugate are made of
+    subsets : of the b_i; a term has the b_i of its subset at one and the others at zero
     """
 
     axes: tuple[int, ...]
@@ -43,7 +44,7 @@ class Axes:
     machine: HeldMachine
     determinants: tuple[list[Any], ...]  # exact
     adjugates: FloatArray  # subsets x K x states x states, over 2^heights
-    slack: FloatArray  # how far these are off
+    slack: FloatArray  # bounds of their errors
     heights: tuple[int, ...]
 
     @property
@@ -56,7 +57,7 @@ class Axes:
 
     @cached_property
     def powers(self) -> list[tuple[int, ...]]:
-        """Of each subset, the monomial of p that it comes with, denominators cleared."""
+        """The monomial of p that multiplies the term of each subset, with denominators cleared."""
         found = []
         for chosen in itertools.product((0, 1), repeat=len(self.axes)):
             total = [0] * len(self.names)
@@ -81,7 +82,7 @@ class Axes:
         return total
 
     def over(self, sides: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """The determinant and the adjugate over a box, denominators cleared, and how far each may be off.
+        """The determinant and the adjugate over a box, with denominators cleared, and bounds of their errors.
 
         K x nodes and K; K x states x states x nodes and K x states x states, over 2^heights.
         """
@@ -96,12 +97,12 @@ class Axes:
 
 
 def members_of(g: Axes, n: int) -> list[int]:
-    """A group's states among all: positions, rates, accelerations, the compensator's."""
+    """The indices of a group's states among all: positions, rates, accelerations, states of the compensator."""
     return [*(k * n + i for k in range(3) for i in g.axes), *(3 * n + k for k in g.own)]
 
 
 def state_matrix(law: Compensator, axes: Sequence[int], own: Sequence[int], b: Sequence[Any]) -> FloatArray:
-    """M0's state matrix of a group, at values of b."""
+    """The state matrix A0 of a group at values of b."""
     r, T = len(axes), float(law.sample_time or 0)
     A = np.zeros((3 * r + len(own),) * 2)
     eye = np.eye(r)
@@ -177,7 +178,7 @@ def _stored(
     determinants: list[list[Any]],
     adjugates: list[list[Any]],
 ) -> Axes:
-    """Turned from g to v."""
+    """The terms mapped from g to v."""
     turned = [map_bilinear(f) for f in determinants]
     heights = []
     for k in range(len(turned[0])):
@@ -195,7 +196,7 @@ def _stored(
 
 
 def _doubles(a: Sequence[list[Any]], heights: Sequence[int]) -> tuple[FloatArray, FloatArray]:
-    """Balls over 2^heights in floating point, and how far these may be off."""
+    """Balls over 2^heights as doubles, and bounds of their errors."""
     values, radii = np.zeros((2, len(a), len(heights)))
     for s, row in enumerate(a):
         for k, (c, height) in enumerate(zip(row, heights, strict=True)):

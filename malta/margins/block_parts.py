@@ -1,7 +1,7 @@
-"""What complex blocks add to a loop's characteristic polynomials, over a box of parameters.
+"""The characteristic polynomials of a loop with complex blocks, over a box of parameters.
 
-With the entries of blocks as further parameters (`blocks.probe`), a polynomial is affine in each of them: its values
-where some of them are at zero and some at -unit give a_S of `polydisc`, for every set S of the blocks.
+The entries of blocks are further parameters (`blocks.probe`), and a polynomial is affine in each of them: its values
+with some of them at zero and some at -unit give a_S of polydisc.py, for every set S of the blocks.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ Matrix = tuple[tuple[tuple[Family, ...], ...], ...]  # rows x columns of a_{S + 
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """One group's polynomial over a part of the box, and what the blocks that act on the group add to it.
+    """One group's polynomial over a part of the box, with the terms of the blocks that act on the group.
 
     scalars: indices of blocks; sets: a_S, S a number whose binary digits say which of the scalars
     full: index of a full block; entries: rows x columns of a_{S + ij}
@@ -50,10 +50,10 @@ def parts_of(
 ) -> list[Part]:
     """The groups' polynomials over parts of box(reach); the problem's last parameters are the blocks' entries.
 
-    most : how large each block will be asked for, as far as that is known; couplings that are only rounding are then
-        taken as zero, and accounted for
+    most : the largest size of each block, if it is known; couplings of the size of rounding are then taken as zero and
+        bounded
 
-    Raises Unproven.
+    Raises Unproven when a polynomial cannot be enclosed.
     """
     sides, pins, first = box.sides(reach), [], len(box.names)
     for b in blocks:
@@ -81,7 +81,7 @@ def parts_of(
 
 
 def _owners(groups: Sequence[Polynomial], blocks: Sequence[Block], pins: list[list[int]]) -> list[list[int]]:
-    """Which blocks each group's polynomial may depend on; a feedback around nothing is counted with the first."""
+    """The blocks on which each group's polynomial may depend; a feedback around no group belongs to the first."""
     found: list[list[int]] = [[] for _ in groups]
     for k, b in enumerate(blocks):
         touched = [n for n, f in enumerate(groups) if any(f.degrees[i] != 0 for i in pins[k])]
@@ -105,7 +105,7 @@ def _part(
     count = len(f.names) - len(sides)
 
     def family(at: frozenset[int]) -> Family:
-        """With the entries `at` (parameters) at -unit, all others at zero."""
+        """The family with the entries `at` (parameters) at -unit and all others at zero."""
         if at not in known:
             fixed = np.zeros((count, 2))
             for _, b, pins in acting:
@@ -175,7 +175,7 @@ def _common(
     entries: list[list[list[dict[frozenset[int], float]]]],
     known: dict[frozenset[int], Family],
 ) -> list[Family]:
-    """The sums of families, all on the same degrees and scale."""
+    """The weighted sums of families, with equal degrees and scales."""
     base = known[frozenset()]
     for g in known.values():
         base = align(base, g)[0]
@@ -192,7 +192,7 @@ def _common(
 
 
 def _widen(growth: Growth, phases: int) -> Growth:
-    """With phases of blocks as axes that do not grow, in turns."""
+    """The growth with the phases of blocks as further axes, which do not grow; phases are in turns."""
     none, one = np.zeros(phases), np.ones(phases)
     return Growth(
         np.append(growth.low, none), np.append(growth.high, one), (*growth.inverted, *[False] * phases),

@@ -1,4 +1,4 @@
-"""Complex blocks in a loop: unmodelled dynamics, and the fictitious ones that ask for a gain.
+"""Complex blocks in a loop: unmodelled dynamics, and the fictitious blocks of gains.
 
 A block Delta reads a signal z of the loop and adds w = Delta z to another:
 
@@ -9,7 +9,7 @@ A block Delta reads a signal z of the loop and adds w = Delta z to another:
     effort           from commands to the sensors: its gain is F (1 - P F)^-1
 
 With entry (i, j) of a block as one more parameter of the plant, the loop's characteristic polynomial is affine in it,
-as a determinant is in an entry of rank one; where it leads from zero to -unit says M_ji f, M the transfer from w to z.
+as a determinant is in an entry of rank one; its change from zero to -unit gives M_ji f, M the transfer from w to z.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ class Dynamic:
     """Unmodelled dynamics: Delta stable, of largest singular value |Delta(jw)| <= |W(jw)| in the modelled set.
 
     In a sampled loop Delta acts on samples, of readings or of held commands: a discrete-time system with
-    |Delta(e^jwT)| <= |W(jw)| up to Nyquist's frequency. What a continuous one between hold and sampler folds back from
-    beyond it is not covered; of a Delta that is small there that is little.
+    |Delta(e^jwT)| <= |W(jw)| up to the Nyquist frequency. Aliases of a continuous Delta between hold and sampler are
+    not covered; they are small when Delta is small above that frequency.
 
     weight: W, a number or a control.TransferFunction in s (additive: units of the sensor over those of the force)
     kind: multiplicative (a gain 1 + Delta), feedback (1 / (1 - Delta)) or additive (P + Delta)
@@ -56,7 +56,7 @@ class Dynamic:
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """A block as the proofs take it: w enters at `rows`, z is read at `columns`; unit: its entries' probes."""
+    """A block of a proof: w enters at `rows`, z is read at `columns`; unit: size of the probes of its entries."""
 
     kind: Literal["multiplicative", "feedback", "additive", "compliance", "effort"]
     at: At
@@ -76,14 +76,14 @@ class Block:
 
 
 def shape_of(system: UncertainSystem) -> tuple[int, int]:
-    """Sensors and forces."""
+    """The numbers of sensors and forces."""
     return system.matrices.size1_out(2), system.matrices.size2_out(1)
 
 
 def blocks_of(system: UncertainSystem, declared: Any, where: str) -> list[Block]:
-    """Declared blocks, one or several; where: the function that was asked.
+    """The blocks of one or several declared dynamics; where: the function that an error names.
 
-    Raises InputError for weights, kinds and channels that there are not.
+    Raises InputError for invalid weights, kinds and channels.
     """
     several = [declared] if isinstance(declared, Dynamic) else declared
     if not isinstance(several, (list, tuple)) or not all(isinstance(d, Dynamic) for d in several):
@@ -126,7 +126,7 @@ def channels_of(channel: Any, count: int, name: str, where: str) -> tuple[int, .
 
 
 def check_blocks(blocks: Sequence[Block], where: str) -> None:
-    """Raise InputError for more blocks than are proven together."""
+    """Raise InputError for more blocks, or more full ones, than a proof supports."""
     full = sum(b.full for b in blocks)
     if len(blocks) > MOST or full > 1:
         found = f"{len(blocks)} complex blocks, {full} of them full"
@@ -190,7 +190,7 @@ class _Wiring:
         return replace(self, G=gain @ self.G, H=gain @ self.H)
 
     def with_lags(self) -> _Wiring:
-        """Lags as states, so that what comes and goes beside the commands does not pass them."""
+        """Turn lags into states, so that they act on commands alone and not on the signals of blocks."""
         A, B, C, D, *E = self.made
         n, m = B.shape
         rate = float(self.law.lag or 0.0)
@@ -200,7 +200,7 @@ class _Wiring:
         return replace(self, made=made, law=replace(self.law, lag=None), lags=m)
 
     def close(self) -> tuple[list[ca.SX], Compensator]:
-        """A, B, C, D (and E where there is one) and the law; D is left out where it is zero and last."""
+        """A, B, C, D, perhaps E, and the law; a last D of zeros is left out."""
         A, B, C, D, *E = self.made
         n, m, q = A.shape[0], B.shape[1], C.shape[0]
         drive, read, through, direct = B @ self.F, C, self.G @ D @ self.F + self.H, D @ self.F
@@ -231,7 +231,7 @@ class _Wiring:
 
 
 def _add(matrix: ca.SX, b: Block, delta: ca.SX) -> ca.SX:
-    """A matrix plus a block's entries at its rows and columns."""
+    """Add a block's entries to a matrix at its rows and columns."""
     found = ca.SX(matrix)
     for i, j in b.entries:
         found[b.rows[i], b.columns[j]] += delta[i, j]
@@ -241,7 +241,7 @@ def _add(matrix: ca.SX, b: Block, delta: ca.SX) -> ca.SX:
 def _widen(
     law: Compensator, outputs: int = 0, reads: FloatArray | None = None, echoes: Sequence[int] = ()
 ) -> Compensator:
-    """A law that hands further readings on as further inputs, or gives some of its commands twice."""
+    """A law that passes further readings on as further inputs, or repeats some of its commands."""
     A, B, C, D = law.A, law.B, law.C, law.D
     if echoes:
         return replace(law, C=np.vstack([C, C[list(echoes)]]), D=np.vstack([D, D[list(echoes)]]))

@@ -1,7 +1,7 @@
 """The proof of a margin as a file, which `check` confirms: matrices, parameters, claim, and the cells of each group.
 
-The cells are found here, by the same branch and bound as the margin but for the polynomial that `check` builds by
-itself: a claim a little below the margin's own lower bound, or the largest of a few shares of it that is proven.
+The cells come from the same branch and bound as the margin, for the polynomial that check.py builds by itself. The
+claim is a little below the lower bound of the margin: the largest of a few shares that is proven.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ SHARES = (
     0.5,
     0.25,
 )  # of the margin's lower bound: the first that is proven is claimed
-MOST_CELLS = 20_000  # that are looked at for one group
+MOST_CELLS = 20_000  # cells of one group at most
 MOST_PARTS = 64
 HIGHEST = 24  # degree of an interpolant along one parameter
 TAIL = -26.0  # log2 of what interpolation should leave out, relative to each coefficient
@@ -61,9 +61,9 @@ def write(
     margin: Margin,
     gains: str | Path | None = None,
 ) -> Path:
-    """Write the certificate of a margin; `places`: its loops, several where it holds at several places.
+    """Write the certificate of a margin; places: its loops, one, or one for each place at which it holds.
 
-    Raises InputError for loops that certificates do not cover, CheckError where nothing is proven or no proof found.
+    Raises InputError for loops that certificates do not cover, CheckError when nothing is proven.
     """
     content = certificate_of(places, ranges, over, margin, gains)
     replace_files({Path(path): (json.dumps(content, separators=(",", ":")) + "\n").encode()})
@@ -77,7 +77,7 @@ def certificate_of(
     margin: Margin,
     gains: str | Path | None = None,
 ) -> dict[str, Any]:
-    """What `write` writes, as one JSON document."""
+    """The certificate of a margin as a JSON document."""
     if margin.lower is None:
         raise CheckError(f"no certificate: nothing is proven ({margin.reason})")
     system = places[0][0]
@@ -118,7 +118,7 @@ def _prove(places: Places, box: Box, margin: float) -> tuple[float, list[dict[st
 
 
 def matches(path: str | Path, places: Places) -> bool:
-    """Whether a certificate's loops and nominal values are these, to the last digit."""
+    """Whether a certificate has these loops and nominal values, to the last digit."""
     content = checked_file.content_of(Path(path))
     found = content["loops"]
     own = [_description(loop_of(s, _law(s, law))) for s, law in places]
@@ -135,7 +135,7 @@ def _law(system: UncertainSystem, law: Any) -> Compensator:
 
 
 def _description(loop: UncertainLoop) -> dict[str, Any]:
-    """A loop as it stands in a certificate, without its groups."""
+    """The description of a loop in a certificate, without its groups."""
     law, program = loop.law, loop.program
     n = loop.states
     if loop.direct:
@@ -188,7 +188,7 @@ def _loop(system: UncertainSystem, law: Any, box: Box, lower: float) -> dict[str
 
 
 def _parts(f: Polynomial, box: Box, lower: float) -> list[dict[str, Any]]:
-    """The box cut where one enclosure does not do, each part with its cells. Raises InputError, CheckError, Refused."""
+    """The parts of the box with their cells, cut where it is too wide. Raises InputError, CheckError, Refused."""
     t = exact(lower)
     todo = [
         np.array([
@@ -239,9 +239,9 @@ def _widest(f: Polynomial, sides: FloatArray) -> int:
 
 
 def _enclosed(f: Polynomial, v: list[tuple[Any, Any]], box: Box, lower: float) -> dict[str, Any]:
-    """How one part is enclosed, and its cells.
+    """The enclosure of one part, and its cells.
 
-    Raises Refused where it cannot be enclosed, CheckError where zero is not excluded.
+    Raises Refused when it cannot be enclosed, CheckError when zero is not excluded.
     """
     ctx.prec = BITS
     size = [height(x) for x in f.at([arb((a + b) / 2) for a, b in v])]
@@ -302,7 +302,7 @@ def _cells(
 
 
 def _family(bernstein: list[Any], shape: tuple[int, ...], dust: list[Any]) -> Family:
-    """An enclosure in doubles, with what couplings between groups can do as part of its radius."""
+    """An enclosure in doubles; bounds of the couplings between groups are part of its radius."""
     each = math.prod(shape)
     count = len(bernstein) // each
     beside = [arb(0, x.upper()) for x in dust] + [arb(0)] * (count - len(dust))

@@ -57,7 +57,7 @@ class Characteristic:
 
     @property
     def foreign(self) -> tuple[str, ...]:
-        """Operations of the model that have no enclosure."""
+        """The operations of the model without an enclosure."""
         return self.loop.program.foreign
 
     @property
@@ -76,7 +76,7 @@ class Characteristic:
 
     @cached_property
     def inverted(self) -> tuple[bool, ...]:
-        """Parameters that enter sampled loops as polynomials of 1 / p, as masses do: interpolated in 1 / p."""
+        """Whether a parameter enters a sampled loop as a polynomial of 1 / p, as a mass does."""
         s = self.loop.symbolic
         if self.exact or s is None:
             return (False,) * len(self.names)
@@ -95,7 +95,7 @@ class Characteristic:
 
     @cached_property
     def degrees(self) -> tuple[int | None, ...]:
-        """The degree in each parameter, an upper bound read from the entries; None where it is no polynomial."""
+        """An upper bound of the degree in each parameter, read from the entries; None for no polynomial."""
         if self.exact:
             assert self.loop.symbolic is not None
             rows = clear_denominators(self.loop, self.group, self.loop.symbolic)
@@ -103,7 +103,7 @@ class Characteristic:
         return tuple(self._degree_by_minors(i) for i in range(len(self.names)))
 
     def _degree_by_minors(self, i: int) -> int | None:
-        """Of a parameter that enters B and C alone, by minors (Cauchy, Binet); 0 where it does not enter."""
+        """The degree in a parameter of B and C alone, by minors (Cauchy, Binet); 0 when it enters no matrix."""
         s, g, program = self.loop.symbolic, self.group, self.loop.program
         if not any(i in on for on in program.depends):
             return 0
@@ -145,9 +145,9 @@ class Characteristic:
     # values
 
     def at(self, v: Sequence[Any]) -> list[Any]:
-        """a_0 ... a_N at p = v (or 1 / v where inverted), exact rationals.
+        """a_0 ... a_N at p = v (1 / v of inverted parameters), as exact rationals or balls.
 
-        Raises NotAnalytic where the matrices have no value there.
+        Raises NotAnalytic when the matrices have no value there.
         """
         p = [1 / x if inverted else x for x, inverted in zip(v, self.inverted, strict=True)]
         a = self._map_to_v(self._coefficients(p, fmpq_mat if self.exact else arb_mat))
@@ -194,7 +194,7 @@ class Characteristic:
 
     @cached_property
     def _polynomials(self) -> tuple[dict[tuple[int, int], tuple[dict[Any, Any], dict[Any, Any] | None]], ...]:
-        """Entries as polynomials of v over polynomials without the inverted parameters."""
+        """The entries as polynomials of v over polynomials without the inverted parameters."""
         assert self.loop.symbolic is not None
         picked = [i for i, inverted in enumerate(self.inverted) if inverted]
         found, g = [], set(self.group.states)
@@ -217,7 +217,7 @@ class Characteristic:
         return tuple(found)
 
     def _balls(self, v: Sequence[Any]) -> list[list[tuple[int, int, Any]]]:
-        """Entries of the matrices over balls of v."""
+        """The entries of the matrices over balls of v."""
         if not any(self.inverted):
             return self.loop.program.run(v, BALLS)
         s = self.loop.symbolic
@@ -292,9 +292,9 @@ class Characteristic:
 
     @np.errstate(over="ignore", invalid="ignore")  # bounds that overflow are refused
     def majorant(self, v: Sequence[Any]) -> list[tuple[float, int]]:
-        """At least |a_k| for all complex v in these balls: (mantissa, exponent) of each.
+        """Upper bounds of |a_k| for all complex v in these balls: (mantissa, exponent) of each.
 
-        Raises NotAnalytic where the matrices are not analytic on them.
+        Raises NotAnalytic when the matrices are not analytic on them.
         """
         if self.minors is None:
             size = majorant_matrix(self.loop, self.group, self._balls(v))
@@ -308,7 +308,7 @@ class Characteristic:
 
 
 def map_bounds(product: list[Any]) -> list[Any]:
-    """Bounds of the coefficients of g -> those of v."""
+    """Bounds of the coefficients of v from those of g."""
     n = len(product) - 1
     turned = [arb(0)] * (n + 1)
     for k, c in enumerate(product):
@@ -318,12 +318,12 @@ def map_bounds(product: list[Any]) -> list[Any]:
 
 
 def _ends_of(x: Any) -> tuple[Any, ...]:
-    """A complex ball as numbers that compare."""
+    """A complex ball as exact numbers, which can be compared and hashed."""
     return tuple(part.man_exp() for one in (x.real, x.imag) for part in (one.mid(), one.rad()))
 
 
 def pair(c: Any) -> tuple[float, int]:
-    """At least |c|: mantissa and exponent. Raises NotAnalytic where it is not finite."""
+    """An upper bound of |c|: mantissa and exponent. Raises NotAnalytic when c is not finite."""
     if not c.is_finite():
         raise NotAnalytic("numbers that overflow")
     m, e = (int(i) for i in c.abs_upper().man_exp())
@@ -348,7 +348,7 @@ def _multiplier(loop: UncertainLoop, g: Group, p: Sequence[Any]) -> Any:
 
 @lru_cache(maxsize=64)
 def _bilinear(n: int) -> Any:
-    """Coefficients of sum a_k g^k -> those of (1 - v)^n sum a_k (2 v / (1 - v))^k."""
+    """The matrix from the coefficients a_k of sum a_k g^k to those of (1 - v)^n sum a_k (2 v / (1 - v))^k."""
     table = [[fmpq(0)] * (n + 1) for _ in range(n + 1)]
     for k in range(n + 1):
         for j in range(n - k + 1):
@@ -357,7 +357,7 @@ def _bilinear(n: int) -> Any:
 
 
 def bilinear_table(n: int) -> Any:
-    """What turns coefficients of g into those of v, as balls."""
+    """The matrix from coefficients of g to those of v, as balls."""
     return arb_mat(_bilinear(n))
 
 

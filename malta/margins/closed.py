@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 def parts(
     loop: UncertainLoop, g: Group, entries: list[list[tuple[int, int, Any]]], matrix: Any
 ) -> tuple[tuple[Any, ...], Any]:
-    """What `_closed` takes, and det E: the driven system (lag, hold, delay included), what acts on it, the law."""
+    """The arguments of `closed_loop`, and det E: the system with lag, hold and delay, its inputs, and the law."""
     law, x = loop.law, {state: k for k, state in enumerate(g.states)}
     m, p, n = loop.program.shapes[B][1], loop.program.shapes[C][0], len(x)
     a = dense(matrix, n, n, ((x[i], x[j], r) for i, j, r in entries[A] if i in x and j in x))
@@ -103,7 +103,7 @@ def solve(e: Any, right: Any) -> Any:
 
 
 def add_lag(matrix: Any, a: Any, b: Any, c: Any, d: Any, rate: Any) -> tuple[Any, Any, Any, Any]:
-    """With the inputs as first-order lags, which are states after x."""
+    """The system behind first-order lags of its inputs; the states of the lags follow x."""
     n, m = a.nrows(), b.ncols()
     eye, p = _identity(matrix, m), c.nrows()
     a = _stack(matrix, [[a, b], [zeros(matrix, m, n), eye * (-rate)]])
@@ -112,7 +112,7 @@ def add_lag(matrix: Any, a: Any, b: Any, c: Any, d: Any, rate: Any) -> tuple[Any
 
 
 def hold(matrix: Any, a: Any, b: Any, T: Any) -> tuple[Any, Any]:
-    """Held and sampled exactly: e^(A T) - I and the integral of e^(A t) B."""
+    """The system under a zero-order hold, exactly: e^(A T) - I and the integral of e^(A t) B."""
     n, m = a.nrows(), b.ncols()
     both = (_stack(matrix, [[a, b], [zeros(matrix, m, n), zeros(matrix, m, m)]]) * T).exp()
     phi = matrix(n, n, [both[i, j] - (1 if i == j else 0) for i in range(n) for j in range(n)])
@@ -123,7 +123,7 @@ def hold(matrix: Any, a: Any, b: Any, T: Any) -> tuple[Any, Any]:
 
 
 def add_delay(matrix: Any, phi: Any, gamma: Any, c: Any, d: Any, delay: int) -> tuple[Any, Any, Any, Any]:
-    """With inputs that act `delay` samples late, stored oldest first: differences x+ - x."""
+    """The system, in differences x+ - x, behind a delay of `delay` samples; stored inputs are oldest first."""
     if delay == 0:
         return phi, gamma, c, d
     n, m, p = phi.nrows(), gamma.ncols(), c.nrows()
@@ -179,7 +179,7 @@ def coefficients(closed: tuple[Any, Any]) -> list[Any]:
 def majorant_matrix(loop: UncertainLoop, g: Group, entries: list[list[tuple[int, int, Any]]]) -> FloatArray:
     """Entrywise bounds of the closed loop's state matrix (of differences where discrete), from balls of the entries.
 
-    Raises NotAnalytic where numbers overflow, or the direct feedthrough is too large.
+    Raises NotAnalytic when numbers overflow, or the direct feedthrough is too large.
     """
     law, x = loop.law, {state: k for k, state in enumerate(g.states)}
     m, p, n = loop.program.shapes[B][1], loop.program.shapes[C][0], len(x)
@@ -246,7 +246,7 @@ def driven_bounds(loop: UncertainLoop, abcd: Bounds, diagonal: FloatArray) -> Bo
         assert law.sample_time is not None
         a, V = hold_bounds(a, diagonal, law.sample_time)
         b = V @ b
-        if rate is not None:  # both parts of the held input, the lag's state and the rest, are below V
+        if rate is not None:  # V bounds both parts of the held input, the state of the lag and the rest
             rate = float(-np.expm1(-rate * law.sample_time)) * (1 + 1e-12)
             b_late = np.vstack([b, rate * np.eye(r)])
     elif rate is not None:

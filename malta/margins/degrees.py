@@ -15,7 +15,7 @@ def degree(polynomial: Any, i: int) -> int:
 
 
 def sole_power(den: Any, i: int) -> int | None:
-    """k where den is p_i^k times what has no p_i in it; None where it is not."""
+    """k when den is p_i^k times a factor without p_i, else None."""
     if den is None:
         return 0
     powers = {monomial[i] for monomial in den.monoms()}
@@ -38,7 +38,7 @@ def depends(s: Symbolic, atom: int, i: int) -> bool:
 
 
 def clear_denominators(loop: UncertainLoop, g: Group, s: Symbolic) -> list[dict[Any, Any]]:
-    """Rows of the polynomial matrix whose determinant is a: those of x, then those of y; columns x, u, y."""
+    """The rows of the polynomial matrix with determinant a: first those of x, then those of y; columns x, u, y."""
     rows: list[dict[Any, Ratio]] = []
     for i in g.states:
         row: dict[Any, Ratio] = {("u", j): r for (k, j), r in s.entries[B].items() if k == i}
@@ -59,7 +59,7 @@ def clear_denominators(loop: UncertainLoop, g: Group, s: Symbolic) -> list[dict[
 
 
 def _row(row: dict[Any, Ratio]) -> dict[Any, Any]:
-    """Numerators over the row's common denominator, which is entry None."""
+    """The numerators of a row over its common denominator, which is the entry None."""
     common = None
     for r in row.values():
         if r.den is None:
@@ -75,7 +75,7 @@ def _row(row: dict[Any, Ratio]) -> dict[Any, Any]:
 
 
 def determinant_degree(rows: list[dict[Any, Any]], i: int) -> int:
-    """An upper bound of the degree in p_i: by rows, by columns, or by the rank of what multiplies p_i."""
+    """An upper bound of the degree in p_i: by rows, by columns, or by the rank of the factors of p_i."""
     by_row = [max((degree(entry, i) for entry in row.values()), default=0) for row in rows]
     columns: dict[Any, int] = {}
     for k, row in enumerate(rows):
@@ -92,7 +92,7 @@ def determinant_degree(rows: list[dict[Any, Any]], i: int) -> int:
 
 
 def _rank(rows: list[dict[Any, Any]], i: int) -> int:
-    """Rank of the coefficients of p_i where these are numbers; the number of rows that have them elsewhere."""
+    """The rank of the coefficients of p_i when these are numbers; else the number of rows that have them."""
     parts: list[dict[Any, Any]] = []
     constant = True
     for row in rows:

@@ -1,7 +1,8 @@
-"""A characteristic polynomial enclosed over a box of parameters: interpolated, and what that leaves out bounded.
+"""A characteristic polynomial enclosed over a box of parameters: an interpolation and a bound of its error.
 
 With |a_k| <= M on the disc of radius R about the middle of a side (of half width 1), interpolation of degree d at
-Chebyshev nodes leaves out at most (1 + Lambda_d) M R^-d / (R - 1): Cauchy's estimate, Lambda_d the Lebesgue constant.
+Chebyshev nodes has an error of at most (1 + Lambda_d) M R^-d / (R - 1): Cauchy's estimate with the Lebesgue constant
+Lambda_d.
 """
 
 from __future__ import annotations
@@ -37,11 +38,11 @@ HOPE = 0.4  # of what the first place took, at least, the others take
 
 
 class Unproven(Exception):
-    """Why no enclosure of the characteristic polynomial was found."""
+    """No enclosure of the characteristic polynomial was found; the message says why."""
 
 
 class TooWide(Unproven):
-    """The box is too wide along this axis for one enclosure; narrower ones may have it."""
+    """The box is too wide along this axis for one enclosure; a narrower box may have one."""
 
     def __init__(self, axis: int, reason: str) -> None:
         super().__init__(reason)
@@ -59,7 +60,7 @@ def precision(bits: int) -> Iterator[None]:
 
 @dataclass(frozen=True, eq=False)
 class Side:
-    """How one parameter's side is sampled: degree, Chebyshev nodes or uniform ones, and the bounds of the rest."""
+    """The sampling of one parameter's side: degree, Chebyshev or uniform nodes, and bounds of the error."""
 
     degree: int
     chebyshev: bool
@@ -67,9 +68,9 @@ class Side:
 
 
 def over_box(f: Polynomial, sides: FloatArray, moves: Sequence[Any] = (), until: float = math.inf) -> Family:
-    """The family over a box (P x 2, of p); moves: what couplings that are neglected can do (rounding.py).
+    """The family over a box (P x 2, of p); moves: bounds of the effect of neglected couplings (rounding.py).
 
-    Raises TooWide where a narrower box may do, and Unproven.
+    Raises TooWide when a narrower box may have an enclosure, else Unproven.
     """
     if f.foreign:
         raise Unproven(f"the model has {f.foreign[0]}, which has no enclosure")
@@ -99,7 +100,7 @@ def _real(sides: FloatArray) -> list[tuple[Any, Any]]:
 def _add_bounds(
     one: list[tuple[float, int]] | None, two: list[tuple[float, int]] | None
 ) -> list[tuple[float, int]] | None:
-    """Sums of bounds."""
+    """The sums of two lists of bounds."""
     if one is None or two is None:
         return one if two is None else two
     total = []
@@ -110,7 +111,7 @@ def _add_bounds(
 
 
 def _ends(f: Polynomial, sides: FloatArray) -> tuple[list[Any], list[Any]]:
-    """The box in v, exactly."""
+    """The ends of the box in v, exactly."""
     low, high = [], []
     for (a, b), inverted in zip(sides.tolist(), f.inverted, strict=True):
         if inverted and a <= 0 <= b:
@@ -128,7 +129,7 @@ def _share(side: Side, k: int) -> Any:
 
 
 def _values(f: Polynomial, places: list[tuple[Any, ...]], until: float = math.inf) -> list[list[Any]]:
-    """Coefficients at the places, balls to 60 bits each."""
+    """The coefficients at the places, as balls accurate to 60 bits."""
 
     def evaluate(place: tuple[Any, ...]) -> list[Any]:
         if time.monotonic() > until:
@@ -156,7 +157,7 @@ def _is_accurate(c: Any) -> bool:
 
 
 def _plan(f: Polynomial, low: list[Any], high: list[Any], known: tuple[int | None, ...]) -> list[Side]:
-    """How each side is sampled; less is left out where that takes few places."""
+    """The sampling of each side; the error is smaller when that needs few places."""
     free = [i for i, d in enumerate(known) if d is None and low[i] < high[i]]
     discs: dict[int, list[Disc]] = {}
     if free:
@@ -187,9 +188,9 @@ class Disc(NamedTuple):
 def _discs(
     f: Polynomial, i: int, low: list[Any], high: list[Any], size: list[tuple[float, int]]
 ) -> list[Disc]:
-    """Bounds over discs along one parameter on which the matrices are analytic, from the largest on.
+    """Bounds on discs along one parameter on which the matrices are analytic, the largest disc first.
 
-    Raises TooWide where they are not even a little beyond the side.
+    Raises TooWide when they are not analytic a little beyond the side.
     """
     found: list[Disc] = []
     refused = NotAnalytic("no disc about its range")
@@ -217,12 +218,12 @@ def _discs(
 
 
 def _degree(disc: Disc, tail: float) -> int:
-    """The lowest degree that leaves out no more than this by a disc's bound."""
+    """The lowest degree with an error of at most `tail` by the bound of a disc."""
     return math.ceil((disc.share + 3 - math.log2(disc.radius - 1) - math.log2(tail)) / math.log2(disc.radius))
 
 
 def _interpolation_side(name: str, axis: int, discs: list[Disc], tail: float) -> Side:
-    """The lowest degree whose tail is small enough, by any of the discs; or the smallest tail there is."""
+    """The sampling of the lowest degree with an error of at most `tail` by any disc; else the one of least error."""
     best, best_rank = None, (True, 0, math.inf)
     for disc in discs:
         radius, share, most = disc
@@ -246,7 +247,7 @@ def _log2(pair: tuple[float, int]) -> float:
 
 
 def _sum_tails(plan: list[Side]) -> list[tuple[float, int]] | None:
-    """Tails of all axes; each with the Lebesgue constants of those before it, below 3."""
+    """The sum of the errors of all axes, each times the Lebesgue constants (below 3) of the axes before it."""
     parts = [(side.tails, 3.0**k) for k, side in enumerate(s for s in plan if s.tails is not None)]
     if not parts:
         return None

@@ -31,7 +31,7 @@ STUCK = 14  # splits beyond the first of a cell that holds a candidate for the w
 
 @dataclass(frozen=True, eq=False)
 class Growth:
-    """Where u in [0, 1]^P lies in the boxes that grow with t: nominal - t down <= p <= nominal + t up.
+    """The map between u in [0, 1]^P and the boxes that grow with t: nominal - t down <= p <= nominal + t up.
 
     p = v or 1 / v (inverted), v = low + (high - low) u. Axes with neither down nor up do not grow.
     """
@@ -66,7 +66,7 @@ class Growth:
         return np.asarray(np.clip(np.where(self.high > self.low, (v - self.low) / width, 0.5), 0, 1))
 
     def inside(self, t: float) -> FloatArray:
-        """Sides in u that hold box(t), from 0 to 1 where that is not within: P x 2."""
+        """The sides of box(t) in u, clipped to [0, 1]: P x 2."""
         with np.errstate(all="ignore"):
             ends = np.array([self.nominal - t * self.down, self.nominal + t * self.up])
             sides = np.sort([self.shares(p) for p in ends], axis=0).T + np.array([-1e-9, 1e-9])
@@ -85,7 +85,7 @@ class Growth:
 
 
 def growth_over(sides: FloatArray, inverted: tuple[bool, ...], box: Box) -> Growth:
-    """Of a box's growth seen from a part of it: sides of p, P x 2."""
+    """The growth of a box in the coordinates of a part of it with these sides of p (P x 2)."""
     low, high = sides[:, 0], sides[:, 1]
     v_low = np.where(inverted, 1 / np.where(inverted, high, 1), low)
     v_high = np.where(inverted, 1 / np.where(inverted, low, 1), high)
@@ -94,7 +94,7 @@ def growth_over(sides: FloatArray, inverted: tuple[bool, ...], box: Box) -> Grow
 
 @dataclass(frozen=True, eq=False)
 class Cell:
-    """Where zero was not excluded: an interval of frequency and a part of the box."""
+    """A cell from which zero is not excluded: an interval of frequency and a part of the box."""
 
     branch: int
     interval: tuple[float, float]
@@ -103,7 +103,7 @@ class Cell:
 
 
 class Beside(NamedTuple):
-    """f on cells where more than the family acts on it: expansions, discs about them, what each further axis moves."""
+    """f on cells with more than its family: expansions, discs around them, and terms of further axes."""
 
     terms: list[ComplexArray]
     radius: FloatArray
@@ -159,7 +159,7 @@ class Search:
         return Cell(int(b), (float(lo), float(hi)), self.boxes[k], float(self.smallest[k]))
 
     def hardest(self) -> Cell | None:
-        """The open cell of smallest t that has been split the most, if it looks stuck."""
+        """The open cell of smallest t that was split most often, if further splits seem useless."""
         stuck = (self.depth >= STUCK) & (self.smallest < self.target)
         if not stuck.any():
             return None
@@ -169,7 +169,7 @@ class Search:
 
 
 def start(family: Family, growth: Growth, target: float, until: float = np.inf) -> Search:
-    """A search up to `target`; until: what the target may be later."""
+    """A search up to `target`, which may later rise to `until`."""
     cells = cover(family)
     boxes = np.tile(growth.inside(max(target, until)), (len(cells), 1, 1))
     zero = np.zeros(len(cells))
@@ -216,7 +216,7 @@ def advance(s: Search) -> None:
 
 
 def _spread(terms: list[ComplexArray]) -> FloatArray:
-    """How far f varies on each cell, about."""
+    """The approximate variation of f on each cell."""
     b0 = terms[0]
     return np.asarray(np.abs(b0 - b0[:, :1]).max(axis=1) + sum(np.abs(t).max(axis=1) for t in terms[1:]))
 
@@ -241,7 +241,7 @@ def _expanded(s: Search, cells: FloatArray, boxes: FloatArray) -> Beside:
 
 
 def half_plane(terms: list[ComplexArray], radius: FloatArray) -> ComplexArray:
-    """c of unit size with Re(conj(c) f) > 0 on the cell; zero where none was found."""
+    """c of unit size with Re(conj(c) f) > 0 on the cell; zero when none was found."""
     b0, b1 = terms[:2]
     beside = (
         radius[:, None] + sum(np.abs(b) for b in terms[2:]) + 1e-14 * np.abs(b0).max(axis=1, keepdims=True)
@@ -271,7 +271,7 @@ def _split(
     depth: FloatArray,
     found: Beside,
 ) -> None:
-    """Each cell in two, across what moves f most: frequency, a parameter, or what acts beside them."""
+    """Split each cell in two across the axis that moves f most: frequency, a parameter or a further axis."""
     shape, terms, radius = s.family.shape, found.terms, found.radius
     count = terms[0].shape[1]
     width = np.abs(terms[1]).sum(axis=1) + sum(2 * np.abs(t).sum(axis=1) for t in terms[2:])
@@ -310,12 +310,12 @@ def _split(
 
 
 def _rounds(count: int) -> int:
-    """How often cells are cut at once: few cost as much time as one."""
+    """The number of cuts at once: a few cells take as much time as one."""
     return 1 if count > MANY else 2 if count > FEW else 3
 
 
 def _middles(boxes: FloatArray, growth: Growth) -> FloatArray:
-    """Where to split, axes x cells: the nominal value first, so that parts away from it need no proof at small t."""
+    """The places of splits (axes x cells): first the nominal value, as parts beside it need no proof at small t."""
     low, high = boxes[..., 0], boxes[..., 1]
     c = growth.shares(growth.nominal)
     inside = (low < c) & (c < high) & (high - low == (high - low).max(axis=0)) & growth.grows

@@ -16,7 +16,7 @@ EPS = 2.0**-52
 
 @dataclass(frozen=True, eq=False)
 class Expansion:
-    """The value in the middle of the box, slopes per half side, and an entrywise bound of all else, rounding too."""
+    """The value in the middle of the box, slopes per half side, and an entrywise bound of the error with rounding."""
 
     middle: FloatArray  # n x m
     slopes: FloatArray  # P x n x m
@@ -35,7 +35,7 @@ class Expansion:
         return Expansion(a * self.middle, a * self.slopes, rest * (1 + 4 * EPS))
 
     def columns(self, gains: FloatArray) -> Expansion:
-        """Times a constant matrix from the right."""
+        """The product with a constant matrix from the right."""
         rest = (self.rest + 4 * (len(gains) + 1) * EPS * self.size) @ np.abs(gains)
         return Expansion(self.middle @ gains, self.slopes @ gains, rest * (1 + 1e-12))
 
@@ -49,7 +49,7 @@ def constant(matrix: FloatArray, count: int) -> Expansion:
 
 
 def stack(rows: Sequence[Sequence[Expansion]]) -> Expansion:
-    """Blocks side by side, and rows of them below each other."""
+    """A matrix from rows of blocks."""
     return Expansion(
         np.vstack([np.hstack([part.middle for part in row]) for row in rows]),
         np.concatenate([np.concatenate([part.slopes for part in row], axis=2) for row in rows], axis=1),
@@ -67,7 +67,7 @@ class Table:
     gains: FloatArray
 
     def over(self, c: FloatArray, r: FloatArray) -> Expansion:
-        """On |p - c| <= r."""
+        """The expansion on |p - c| <= r."""
         e, count = self.powers, len(c)
         each = np.where(e > 0, c, 1.0) ** e
         middle = self.gains * each.prod(axis=1)
@@ -91,7 +91,7 @@ class Table:
 
 
 def table(shape: tuple[int, int], entries: dict[tuple[int, int], Any], count: int) -> Table:
-    """Of polynomials over the rationals in the first `count` of their variables."""
+    """The table of polynomials over the rationals in the first `count` of their variables."""
     places, powers, gains = [], [], []
     for at, polynomial in entries.items():
         for monomial, gain in polynomial.to_dict().items():

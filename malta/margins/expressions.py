@@ -32,10 +32,10 @@ FIELD: dict[str, Callable[..., Any]] = {  # operations of any field
 
 
 class NotAnalytic(Exception):
-    """An operation that has no value, or is not analytic, where it was asked for."""
+    """An operation has no value, or is not analytic, at its arguments."""
 
 
-@lru_cache(maxsize=4096)  # constants of programs, and gains, are asked for at every place
+@lru_cache(maxsize=4096)  # constants and gains are needed at every place
 def exact(x: float) -> Any:
     """The rational number that a float is."""
     if not abs(x) < float("inf"):
@@ -67,7 +67,7 @@ class Program:
 
     @cached_property
     def depends(self) -> tuple[frozenset[int], ...]:
-        """Of each matrix, the parameters that it depends on."""
+        """The parameters on which each matrix depends."""
         on: list[frozenset[int]] = []
         for name, target, operands, _ in self.steps:
             if name == "input":
@@ -77,12 +77,12 @@ class Program:
         return tuple(frozenset().union(*(on[k] for _, _, k in entries)) for entries in self.entries)
 
     def run(self, p: Sequence[Any], field: Arithmetic) -> list[list[tuple[int, int, Any]]]:
-        """Entries (row, column, value) of each matrix at p; those that are structurally zero are left out."""
+        """The entries (row, column, value) of each matrix at p, without structural zeros."""
         cells = self.cells(p, field)
         return [[(i, j, cells[k]) for i, j, k in entries] for entries in self.entries]
 
     def cells(self, p: Sequence[Any], field: Arithmetic) -> list[Any]:
-        """What each step makes of p."""
+        """The results of all steps at p."""
         cells: list[Any] = []
         for name, target, operands, value in self.steps:
             if name == "mul":  # nine of ten steps are these
@@ -101,7 +101,7 @@ class Program:
 
 
 class Arithmetic:
-    """Field operations of its numbers, and a table of others."""
+    """An arithmetic: the field operations of its numbers, and a table of other operations."""
 
     def __init__(self, constant: Callable[[float], Any], others: dict[str, Callable[..., Any]]) -> None:
         self.constant = constant
@@ -129,7 +129,7 @@ class Arithmetic:
 
 
 def _require_off_cut(z: Any) -> Any:
-    """z, where its ball keeps off the negative real axis and zero."""
+    """z. Raises NotAnalytic when its ball touches the negative real axis or zero."""
     if z.imag.contains(0) and not z.real > 0:
         raise NotAnalytic("a root or logarithm at zero or below")
     return z
@@ -142,7 +142,7 @@ def _require_within_unit(z: Any) -> Any:
 
 
 def finite(z: Any) -> Any:
-    """z, where it is no quotient by what may be zero."""
+    """z. Raises NotAnalytic when it is not finite, after a division by a ball that contains zero."""
     if not z.is_finite():
         raise NotAnalytic("a division by what may be zero")
     return z
@@ -186,7 +186,7 @@ def _ball(x: float) -> Any:
 
 
 class _Checked(Arithmetic):
-    """Balls: a quotient must be finite."""
+    """The arithmetic of balls, in which quotients must be finite."""
 
     def apply(self, name: str, operands: list[Any], value: float) -> Any:
         found = super().apply(name, operands, value)
@@ -194,7 +194,7 @@ class _Checked(Arithmetic):
 
 
 def _at_points(functions: dict[str, Callable[..., Any]]) -> dict[str, Callable[..., Any]]:
-    """Functions of real balls by those of complex ones: real where the argument is."""
+    """Functions of complex balls that return real balls for real arguments."""
 
     def wrap(function: Callable[..., Any]) -> Callable[..., Any]:
         return lambda *z: function(*(acb(x) for x in z)).real
@@ -207,9 +207,9 @@ BALLS = _Checked(_ball, _BALLS)
 
 
 def program(function: ca.Function) -> Program:
-    """The instructions of a function p -> matrices.
+    """The instructions of a CasADi function p -> matrices.
 
-    Raises InputError where the function calls others that cannot be written out, as interpolation tables are.
+    Raises InputError when the function calls one without scalar instructions, as an interpolation table.
     """
     try:
         flat = function.expand() if not function.is_a("SXFunction") else function

@@ -23,11 +23,11 @@ ORDER = 4
 
 
 class Expansion(NamedTuple):
-    """f on intervals of frequency: b_m at the nodes of the family, and a radius for all else; rows are intervals."""
+    """f on intervals of frequency (rows): b_m at the nodes of the family, and a bound of the error."""
 
     terms: tuple[ComplexArray, ...]  # b_0, b_1, b_2, b_3: cells x nodes
     radius: FloatArray  # cells
-    lasting: FloatArray  # cells: what of it narrower intervals leave
+    lasting: FloatArray  # cells: the part of the radius that narrower intervals do not reduce
 
 
 def cover(f: Family) -> FloatArray:

@@ -2,8 +2,8 @@
 
     value = sum over monomials of p: c(y) p^m,    c by Taylor models on intervals that cover those of y
 
-What depends on y alone may be long (the planar motor's coils at a position: ten thousand operations), as it is
-evaluated in floating point with a bound of the rest. In p only products and quotients by monomials have this form.
+Terms of y alone may be long (the coils of a planar motor at a position: ten thousand operations), because they are
+evaluated in floating point with a bound of the error. In p only products and quotients by monomials have this form.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class Evaluation:
         return Laurent({exponents: taylor.constant(1.0, self.count)})
 
     def run(self, program: Program, inputs: Sequence[Value]) -> list[list[tuple[int, int, Value]]]:
-        """Entries (row, column, value) of each matrix. Raises NotAnalytic for what has not this form."""
+        """The entries (row, column, value) of each matrix. Raises NotAnalytic for expressions without this form."""
         cells: list[Value] = []
         for name, target, operands, x in program.steps:
             if name == "input":

@@ -1,4 +1,4 @@
-"""The characteristic polynomial by minors (Cauchy, Binet): what does not depend on p is computed once.
+"""The characteristic polynomial by minors (Cauchy, Binet): factors that do not depend on p are computed once.
 
     d_P d_F det(I - F P) = sum_k (-1)^k sum_(S, R, T) pi_SR  beta_RT  kappa_TS        |S| = |R| = |T| = k
 
@@ -41,7 +41,7 @@ Pair = tuple[tuple[int, ...], tuple[int, ...]]
 
 @dataclass(frozen=True, eq=False)
 class Minors:
-    """A group's rows that inputs act on, its inputs, its outputs, and the compensator's minors between these."""
+    """The minors of a group: its rows with inputs, its inputs and outputs, and the compensator between these."""
 
     loop: UncertainLoop
     group: Group
@@ -55,7 +55,7 @@ class Minors:
 
     @property
     def count(self) -> int:
-        """Polynomials to be found at each place."""
+        """The number of polynomials to be computed at each place."""
         return sum(
             math.comb(len(self.rows), k) * math.comb(len(self.outputs), k) for k in range(self.order + 1)
         )
@@ -129,7 +129,7 @@ class Minors:
         return a, c, factor
 
     def forces(self, entries: list[list[tuple[int, int, Any]]], matrix: Any) -> dict[Pair, Any]:
-        """beta_RT at given p, where they are not zero by their entries."""
+        """beta_RT at given p, without structural zeros."""
         x = {state: k for k, state in enumerate(self.group.states)}
         n, u = len(x), {t: k for k, t in enumerate(self.inputs)}
         own = {(x[i], u[j]): r for i, j, r in entries[B] if i in x and j in u}
@@ -148,7 +148,7 @@ class Minors:
         return found
 
     def combine(self, pi: dict[Pair, Any], beta: dict[Pair, Any], matrix: Any) -> list[Any]:
-        """a_0 ... a_N from the minors."""
+        """The coefficients a_0 ... a_N from the minors."""
         kappa = self.balls[0 if matrix is fmpq_mat else 1]
         total = pi[(), ()] * kappa[(), ()]
         for (S, R), p in pi.items():
@@ -175,7 +175,7 @@ class Minors:
     def sizes(self, entries: list[list[tuple[int, int, Any]]]) -> Sizes:
         """Bounds of the system's minors from balls of the entries.
 
-        Raises NotAnalytic where numbers overflow.
+        Raises NotAnalytic when numbers overflow.
         """
         a, b, c, diagonal = _sizes(self, entries)
         a, into, c, _ = driven_bounds(self.loop, (a, np.eye(len(a))[:, list(self.rows)], c, None), diagonal)
@@ -198,7 +198,7 @@ class Minors:
         return Sizes(pi, beta)
 
     def majorant(self, sizes: Sizes) -> list[Any]:
-        """At least the coefficients (of s or g) of each power."""
+        """Upper bounds of the coefficients of s or g."""
         result: list[Any] = []
         for (S, R), pi in sizes.pi.items():
             names = tuple(self.outputs[s] for s in S)
@@ -216,7 +216,7 @@ class Minors:
 
     @property
     def known(self) -> dict[Any, Any]:
-        """What was found of the system at places and on discs: the compensator has no part in it."""
+        """The remembered minors of the system at places and on discs, which do not depend on the compensator."""
         g, law = self.group, self.loop.law
         return _known(
             self.loop.program, g.states, self.rows, self.inputs, self.outputs,
@@ -238,7 +238,7 @@ class Sizes(NamedTuple):
 
 
 def minors(loop: UncertainLoop, g: Group) -> Minors | None:
-    """None where the closed loop's own matrix is the better way: direct feedthrough, or too many minors."""
+    """The minors of a group; None for direct feedthrough or too many minors, where the matrix itself is cheaper."""
     if loop.direct or not g.states:
         return None
     x = {state: k for k, state in enumerate(g.states)}
@@ -256,7 +256,7 @@ def minors(loop: UncertainLoop, g: Group) -> Minors | None:
 
 
 def _determinant(m: list[list[Any]]) -> Any:
-    """By the first row; None stands for zero."""
+    """The determinant by its first row; None stands for zero."""
     if len(m) == 1:
         return m[0][0]
     total = None
@@ -326,7 +326,7 @@ def _sizes(
 
 
 def _bounds(a: FloatArray, sides: list[tuple[FloatArray, FloatArray]]) -> list[list[Any]]:
-    """Above the coefficients of det [[g - A, B], [C, 0]], from entrywise bounds of A and of each B and C."""
+    """Upper bounds of the coefficients of det [[g - A, B], [C, 0]], from entrywise bounds of A and of each B and C."""
     k = len(sides[0][1])
     m = np.array([np.block([[a, b], [c, np.zeros((k, k))]]) for b, c in sides])
     return all_bounds(m, np.where(np.arange(m.shape[1]) < len(a), 1.0, 0.0))

@@ -1,4 +1,4 @@
-"""Multipliers of real parameters: what shows that 1 - N Delta is not singular, whatever Delta in the unit box is.
+"""Multipliers of real parameters: proofs that 1 - N Delta is regular for every Delta in the unit box.
 
 Delta = diag(delta_i 1, Psi) with real delta_i of at most 1, each repeated, and perhaps one complex block |Psi| <= 1.
 With D = diag(D_i, d 1) > 0, G = diag(G_i, 0), all Hermitian,
@@ -6,7 +6,7 @@ With D = diag(D_i, d 1) > 0, G = diag(G_i, 0), all Hermitian,
     F = D - N* D N - j (G N - N* G) > 0
 
 excludes it: with w = Delta z and z = N w, w* F w = w* D w - z* D z + j (z* G w - w* G z) <= 0. The smallest beta for
-which beta^2 D - N* D N - j (G N - N* G) > 0 has a solution is sought by Newton's method, through analytic centres.
+which beta^2 D - N* D N - j (G N - N* G) > 0 has a solution is computed by Newton's method, through analytic centres.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ SLACK = 1e-6  # what keeps G within thousands of D where nothing else does
 
 @dataclass(frozen=True)
 class Blocks:
-    """Sizes of the real blocks, and of a complex one at the end, which may be empty."""
+    """The sizes of the real blocks, and of a complex block at the end, which may be empty."""
 
     real: tuple[int, ...]
     other: int = 0
@@ -42,7 +42,7 @@ class Blocks:
 
 
 class Multiplier(NamedTuple):
-    """D and G at a frequency x, and their slopes along it."""
+    """D and G at a frequency x, and their slopes along the frequency."""
 
     D: ComplexArray
     G: ComplexArray
@@ -51,7 +51,7 @@ class Multiplier(NamedTuple):
     slopes: tuple[ComplexArray, ComplexArray] | None = None  # none: constant
 
     def at(self, x: float) -> Multiplier:
-        """The same ones, continued to another frequency."""
+        """The multiplier continued to another frequency by its slopes."""
         if self.slopes is None:
             return self._replace(x=x)
         D, G = (M + (x - self.x) * S for M, S in zip((self.D, self.G), self.slopes, strict=True))
@@ -108,10 +108,10 @@ def multiplier(
     *,
     hasty: bool = False,
 ) -> tuple[Multiplier, float]:
-    """D and G with the smallest beta found, and it; the centre for beta = 1 where beta is below `wanted`.
+    """D and G with the smallest beta found, and this beta; the centre for beta = 1 if beta is below `wanted`.
 
-    along : slopes of N along frequency, to which the centre's own are wanted
-    hasty : whether to leave it at `first` where beta is not below `wanted` there
+    along : slopes of N along frequency, for the slopes of D and G
+    hasty : whether to stop at `first` when its beta is not below `wanted`
     """
     scale = units(N, blocks)
     turn = scale[:, None] / scale
@@ -144,7 +144,7 @@ class _Centres:
         self.start = (self.trace > 0) * 1.0
 
     def _matrix(self, x: FloatArray) -> ComplexArray:
-        """D, or G, of its coordinates."""
+        """The matrix D or G from its coordinates."""
         a, b, own, off, _ = self.basis
         entries: ComplexArray = x[:own].astype(complex)
         entries[off] += 1j * x[own : self.own]
@@ -202,7 +202,7 @@ class _Centres:
         return np.asarray(x * (self.trace @ self.start) / max(float(self.trace @ x), 1e-300))
 
     def slopes(self, x: FloatArray, along: ComplexArray) -> tuple[ComplexArray, ComplexArray] | None:
-        """How D and G of the centre for beta = 1 move as N does, about: its gradient stays zero."""
+        """The approximate slopes of D and G of the centre for beta = 1 along those of N: its gradient stays zero."""
         step = STEP * float(np.abs(self.N).max()) / max(float(np.abs(along).max()), 1e-300)
         try:
             inverses = self._inverses(x, 1.0)
@@ -214,7 +214,7 @@ class _Centres:
         return self._matrix(found[: self.count]), self._matrix(found[self.count :])
 
     def _inverses(self, x: FloatArray, b: float) -> tuple[ComplexArray, ComplexArray]:
-        """Of b D - S and of D. Raises LinAlgError."""
+        """The inverses of b D - S and of D. Raises LinAlgError."""
         D, _, S = self.matrices(x)
         return np.linalg.inv(b * D - S), np.linalg.inv(D)
 
@@ -236,7 +236,7 @@ class _Centres:
         return x
 
     def _gradient(self, x: FloatArray, b: float, P: ComplexArray, V: ComplexArray) -> FloatArray:
-        """Of -log det (b D - S) - log det D, of whose matrices P and V are the inverses; with the trace's equation."""
+        """The gradient of -log det (b D - S) - log det D, P and V their inverses; with the equation of the trace."""
         own, off, weights = self.basis.own, self.basis.off, 2 * self.basis.weights
         at = self.basis.a, self.basis.b
         Q = self.N @ P

@@ -1,6 +1,6 @@
-"""Where a gain is largest over a box of parameters and all frequencies: a grid at corners, and uphill from there.
+"""The largest gain over a box of parameters and all frequencies: a grid at corners, and ascents from there.
 
-What is found is true of a plant of the box, so that it bounds from below; nothing here says that it is the largest.
+The result is the gain of one plant of the box, so it is a lower bound; it need not be the largest gain.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from malta.model.plant import ComplexArray, FloatArray
 
 CORNERS = 32
-PLACES = 4  # that are climbed from
+PLACES = 4  # starts of ascents at most
 AROUND = np.array([0.5, 0.8, 0.9, 0.95, 0.98, 1.0, 1.02, 1.05, 1.1, 1.25, 2.0])
 ENDS = (0.01, 100.0)  # beyond the slowest and the fastest pole
 FAR_ENDS = (1e-5, 1e4)  # that stand for zero and for infinity
@@ -35,7 +35,7 @@ class Peak(NamedTuple):
 
 
 def patterns(count: int) -> FloatArray:
-    """Where in a box the climb starts, -1 to 1: the middle, corners; some of these where they are many."""
+    """Relative places in a box (-1 to 1) at which ascents start: the middle and corners, CORNERS at most."""
     if 2**count <= CORNERS:
         corners = np.array(list(itertools.product((-1.0, 1.0), repeat=count))).reshape(-1, count)
     else:
@@ -59,7 +59,7 @@ def frequencies(problem: OfLoop, p: FloatArray) -> FloatArray:
 
 
 def _top(problem: OfLoop) -> float:
-    """The highest frequency that a loop knows, rad/s."""
+    """The Nyquist frequency of a loop, rad/s; infinite for a continuous loop."""
     T = problem.loop.law.sample_time
     return math.inf if T is None else math.pi / T
 
@@ -89,7 +89,7 @@ def climb(
 
 
 def _uphill(value: Value, place: Peak, sides: FloatArray, top: float, until: float) -> Peak:
-    """From a place to the top nearby, by L-BFGS in parameters and log frequency, then in frequency alone."""
+    """Ascend from a place to the next maximum, by L-BFGS in parameters and log frequency, then in frequency alone."""
     free = np.flatnonzero(sides[:, 1] > sides[:, 0])
     low, width = sides[free, 0], sides[free, 1] - sides[free, 0]
     best = place

@@ -1,4 +1,4 @@
-"""The closed loop as a pencil in v that is linear in the parameters, but for a bound of what is left.
+"""The closed loop as a pencil in v that is linear in the parameters, with bounds of the nonlinear terms.
 
     M(v) = P_0 + sum_i delta_i P_0i + R_0 + v (P_1 + sum_i delta_i P_1i + R_1),   |delta_i| <= 1, |R_k| <= bounds
 
@@ -30,21 +30,21 @@ if TYPE_CHECKING:
     from malta.margins.expansion import Table
     from malta.model.plant import FloatArray
 
-LIFTED = 8  # states up to which the square of a hold is written out
-LESS = 0.05  # of the bound of what is left, at most, where it is
+LIFTED = 8  # states up to which the square of a hold has rows of its own
+LESS = 0.05  # largest ratio of bounds with and without these rows for which they are used
 
 
 @dataclass(frozen=True, eq=False)
 class Pencil:
-    """M on a box. dynamic: rows that are multiplied by 1 / v towards infinity; others hold no v."""
+    """M on a box. dynamic: rows with v, which are multiplied by 1 / v towards infinity."""
 
     constant: Expansion
     linear: Expansion
     dynamic: Any
-    curved: bool  # by a hold: neither slopes of low rank nor nothing beyond them
+    curved: bool  # whether a hold makes slopes of full rank and terms beyond them
 
     def branch(self, k: int) -> tuple[Expansion, Expansion]:
-        """M, or M / v in its dynamic rows where k is 1: the constant part and that of jx, of 1 / x there."""
+        """The constant part and the factor of jx (k = 1: of 1 / x) of M, for k = 1 of M / v in the dynamic rows."""
         if k == 0:
             return self.constant, self.linear
         d = self.dynamic
@@ -100,18 +100,18 @@ class Rows:
 
     @property
     def size(self) -> int:
-        """Rows of the pencil."""
+        """The number of rows of the pencil."""
         law, m = self.loop.law, len(self.inputs)
         driven = len(self.group.states) + (m if law.lag is not None else 0)
         return driven * (2 if self.liftable else 1) + len(self.group.own) + m * law.delay + len(self.reads)
 
     @property
     def cost(self) -> int:
-        """Terms of all entries."""
+        """The number of terms of all entries."""
         return sum(len(t.gains) for t in (self.A, self.B, self.C, self.D, self.E))
 
     def over(self, sides: FloatArray) -> Pencil | None:
-        """The pencil on a box (P x 2); None where a denominator may vanish on it, or a sample is too long."""
+        """The pencil on a box (P x 2); None when a denominator may vanish on it, or the sample is too long."""
         c = sides.mean(axis=1)
         r = np.where(
             sides[:, 1] > sides[:, 0], np.maximum(sides[:, 1] - c, c - sides[:, 0]) * (1 + 4 * EPS), 0
@@ -125,9 +125,9 @@ class Rows:
         return None if plant is None else self._join(plant, below, c, r)
 
     def _lifts(self, c: FloatArray) -> bool:
-        """Whether a hold's square, Y^2 / 12 of c(Y), is written out by w = Y x, as more rows, each of them linear.
+        """Whether the square of a hold, Y^2 / 12 of c(Y), gets linear rows of its own, w = Y x.
 
-        So it is where slopes of c(Y) alone leave out much more, over a tenth of the parameters to both sides.
+        It does when slopes of c(Y) alone have a much larger error over a tenth of the range of the parameters.
         """
         T, r = self.loop.law.sample_time, 0.1 * np.abs(c)
         if T is None or not self.liftable:
@@ -138,11 +138,11 @@ class Rows:
 
     @property
     def liftable(self) -> bool:
-        """Whether there are few enough states for twice as many rows."""
+        """Whether the states are few enough for twice as many rows."""
         return self.loop.sampled and len(self.group.states) <= LIFTED
 
     def _plant(self, dens: Expansion, c: FloatArray, r: FloatArray) -> tuple[Expansion, ...] | None:
-        """P_0 and P_1 of the rows of x and of the lags: for these states, then for what acts on them."""
+        """P_0 and P_1 of the rows of x and of the lags: the columns of these states, then of their inputs."""
         law, loop, T = self.loop.law, self.loop, self.loop.law.sample_time
         A, B = self.A.over(c, r), self.B.over(c, r)
         E = self.E.over(c, r) if loop.descriptor else dens
@@ -174,7 +174,7 @@ class Rows:
         )
 
     def _join(self, plant: tuple[Expansion, ...], below: Expansion, c: FloatArray, r: FloatArray) -> Pencil:
-        """Columns: x with lags, the compensator's states, stored inputs, y, and Y x where the hold is lifted."""
+        """The whole pencil; its columns are x with lags, the compensator's states, stored inputs, y and perhaps Y x."""
         law, own, late = self.loop.law, list(self.group.own), self.loop.law.delay
         n, k, m, y = len(plant[0].middle), len(own), len(self.inputs), len(self.reads)
         edges = np.cumsum([0, n, k, m * late, y, n if len(plant) > 4 else 0]).tolist()

@@ -1,6 +1,6 @@
-"""A characteristic polynomial that has no zero for any complex blocks of a size, on boxes of parameters.
+"""Proofs that a characteristic polynomial has no zero for complex blocks up to a size, on boxes of parameters.
 
-For scalar blocks delta_1 .. delta_K and what `blocks` says of M, f is affine in each of them:
+With M of blocks.py, f is affine in each of the scalar blocks delta_1 .. delta_K:
 
     f(delta) = sum over sets S of the blocks: (-1)^|S| delta^S a_S,    a_S = f times the minor of M of S.
 
@@ -45,7 +45,7 @@ Size = Callable[["FloatArray", int], Expanded]  # of a block, on cells of a scal
 def is_zero_free(
     parts: Sequence[Part], target: float, sizes: Sequence[Size], until: float
 ) -> tuple[bool, int]:
-    """Whether no polynomial has a zero on box(target) with blocks of these radii; and the cells that were looked at."""
+    """Whether no polynomial has a zero on box(target) with blocks of these radii, and the number of cells."""
     count = 0
     for part in parts:
         levels = range(max(1, len(part.scalars) + (part.full is not None)))
@@ -58,7 +58,7 @@ def is_zero_free(
 
 
 def _level(part: Part, level: int, target: float, sizes: Sequence[Size], until: float) -> tuple[bool, int]:
-    """Blocks before `level` on their circles, that of `level` anywhere in its disc, the later ones zero."""
+    """One step of the induction: blocks before `level` on circles, block `level` in its disc, the later ones zero."""
     growth = part.growth
     axes = len(growth.low) - len(part.scalars)
     keep = axes + level
@@ -78,7 +78,7 @@ def _level(part: Part, level: int, target: float, sizes: Sequence[Size], until: 
 
 @dataclass(frozen=True, eq=False)
 class _Circles:
-    """f on cells with the blocks before `level` on circles and that of `level` in a disc; phases follow `axes`."""
+    """f on cells with the blocks before `level` on circles and block `level` in a disc; phases follow `axes`."""
 
     part: Part
     level: int
@@ -110,9 +110,9 @@ class _Circles:
 
 
 def _half_plane(f: _Sum, g: _Sum) -> ComplexArray:
-    """c where Re(conj(c) f) > |g| on the whole cell, c the direction of f in the middle; zero elsewhere.
+    """The direction c of f in the middle if Re(conj(c) f) > |g| on the whole cell, else zero.
 
-    All of g lies within an angle e of d, so that |g| <= Re(conj(d) g) / cos(e): what is left is linear in both.
+    All of g lies within an angle e of d, so that |g| <= Re(conj(d) g) / cos(e): the condition is linear in f and g.
     """
     c, d = (x / np.maximum(np.abs(x), 1e-300) for x in (f.terms[0].mean(axis=1), g.terms[0].mean(axis=1)))
     beside = sum(np.abs(x) for x in (*g.terms[1:], *g.slopes)) + g.disc + g.radius[:, None]
@@ -142,14 +142,16 @@ class _Circle(NamedTuple):
 
     value: ComplexArray  # sets x cells: in the middle of the cell
     slope: ComplexArray  # sets x cells: along the cell's frequencies
-    rest: FloatArray  # sets x cells: what these leave out
+    rest: FloatArray  # sets x cells: bounds of the error
     spread: FloatArray  # sets x blocks x cells: half the interval of each phase that the set holds, rad
 
 
 def _circle(sizes: list[Expanded], phases: FloatArray, last: Expanded | None) -> _Circle:
-    """sizes: of the blocks on circles; phases: cells x blocks x 2, in turns; last: what every set is multiplied by.
+    """The products on cells.
 
-    W itself stands for its size, as the circle holds every phase; so a circle is the same whichever cells hold it.
+    sizes : of the blocks on circles; phases : cells x blocks x 2, in turns; last : a factor of all sets
+
+    W may replace |W|, because a circle contains every phase.
     """
     cells = len(phases)
     middle = np.exp(1j * math.pi * phases.sum(axis=2))
@@ -177,7 +179,7 @@ def _circle(sizes: list[Expanded], phases: FloatArray, last: Expanded | None) ->
 
 
 class _Sum(NamedTuple):
-    """A sum over sets of blocks, on cells: expansions in frequency and in phases, and how far they may be off."""
+    """A sum over sets of blocks, on cells: expansions in frequency and in phases, and bounds of their errors."""
 
     terms: list[ComplexArray]  # in frequency: cells x nodes
     slopes: list[ComplexArray]  # in each phase
@@ -188,7 +190,7 @@ class _Sum(NamedTuple):
 def _sum_over(
     families: Sequence[Family], circle: _Circle, cells: FloatArray, boxes: FloatArray, like: Family
 ) -> _Sum:
-    """With e^(j x) = 1 + j x + rest, |rest| <= x^2 / 2, x the sum of a set's phases less their middles."""
+    """The sum, by e^(j x) = 1 + j x + rest, |rest| <= x^2 / 2, x the sum of a set's phases minus their middles."""
     terms: list[Any] = [0.0] * 4
     slopes: list[Any] = [0.0] * circle.spread.shape[1]
     disc: Any = 0.0
@@ -202,7 +204,7 @@ def _sum_over(
         for m, (y, before) in enumerate(zip(found, moved, strict=False)):
             terms[m] = terms[m] + value[:, None] * y + slope[:, None] * before
         slopes = [m + (1j * value * s)[:, None] * found[0] for m, s in zip(slopes, spread, strict=True)]
-        # what the products of expansions in frequency, weights and phases leave out
+        # errors of the products of expansions in frequency, weights and phases
         beyond = size * np.minimum(x**2 / 2, x + 2) + left * (1 + x) + steep * x
         disc = disc + beyond[:, None] * (np.abs(found[0]) + high) + (np.abs(value) * x)[:, None] * high
         disc = disc + steep[:, None] * np.abs(found[-1])
@@ -211,7 +213,7 @@ def _sum_over(
 
 
 def _largest(matrix: list[list[_Sum]]) -> FloatArray:
-    """At least the largest singular value of the matrix at each node: cells x nodes."""
+    """An upper bound of the largest singular value of the matrix at each node: cells x nodes."""
     if len(matrix) == len(matrix[0]) == 1:
         (one,) = matrix[0]
         return np.asarray(sum(np.abs(t) for t in (*one.terms, *one.slopes)) + one.disc + one.radius[:, None])

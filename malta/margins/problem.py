@@ -1,4 +1,4 @@
-"""What a margin is asked of: a loop, or a polynomial with coefficients in p. Both give characteristic polynomials."""
+"""The problems of a margin, a loop or a polynomial with coefficients in p: both have characteristic polynomials."""
 
 from __future__ import annotations
 
@@ -60,16 +60,16 @@ class Polynomial(Protocol):
 
 
 class Problem(Protocol):
-    """Where a margin is asked for."""
+    """The interface of a problem that has a margin."""
 
     def parts(self, p: Sequence[Any]) -> list[tuple[Polynomial, tuple[Any, ...]]]:
-        """The characteristic polynomials over real balls p, and what neglected couplings can do to each."""
+        """The characteristic polynomials over real balls p, each with bounds of the effect of neglected couplings."""
 
     def instability(self, rows: FloatArray) -> FloatArray:
-        """How far the worst root is beyond the boundary at rows of parameters, in floating point."""
+        """The distance of the worst root beyond the boundary at rows of parameters, in floating point."""
 
     def critical_frequency(self, p: FloatArray) -> float:
-        """Frequency of the worst root, rad/s."""
+        """The frequency of the worst root at parameters p, rad/s."""
 
     def physical(self, x: float) -> float:
         """s / j of the polynomials -> rad/s."""
@@ -82,7 +82,7 @@ class OfLoop:
     loop: UncertainLoop
     names: tuple[str, ...]
     known: dict[Any, Characteristic] = field(default_factory=dict)
-    neglect: bool = True  # whether couplings that are only rounding are taken as zero, and accounted for
+    neglect: bool = True  # whether couplings of the size of rounding are taken as zero and bounded
 
     @cached_property
     def couplings(self) -> rounding.Couplings | None:
@@ -105,7 +105,7 @@ class OfLoop:
         return not (self.loop.direct or self.loop.descriptor or self.loop.system.sample_time)
 
     def _poles(self, p: FloatArray) -> Any:
-        """Of x' = A x, or of differences x+ - x; none where the matrices have no value."""
+        """The poles of x' = A x, or of differences x+ - x; empty when the matrices have no value."""
         n, k = self.loop.states, len(self.loop.law.A)
         whole = Group(tuple(range(n)), tuple(range(k)), None)
         try:
@@ -157,7 +157,7 @@ class OfLoop:
 
 @dataclass(frozen=True, eq=False)
 class OfSeveral:
-    """Loops in the same parameters, of which all shall be stable, on one clock."""
+    """Several loops in the same parameters, with equal sample times, which must all be stable."""
 
     problems: tuple[Problem, ...]
 
@@ -215,7 +215,7 @@ class OfCoefficients:
 
     @cached_property
     def _common(self) -> Any:
-        """The common denominator of the coefficients; None where it is one."""
+        """The common denominator of the coefficients; None for one."""
         assert self._symbolic is not None
         found = None
         for r in self._symbolic.entries[0].values():
@@ -269,13 +269,13 @@ class OfCoefficients:
 
 
 def _about_one(a: list[Any]) -> list[Any]:
-    """Coefficients of z -> those of g = z - 1."""
+    """The coefficients of g = z - 1 from those of z."""
     return [sum((c * math.comb(k, j) for k, c in enumerate(a) if k >= j), 0 * a[0]) for j in range(len(a))]
 
 
 @dataclass(frozen=True, eq=False)
 class OfPolynomial:
-    """A polynomial, given as it is."""
+    """A given characteristic polynomial."""
 
     polynomial: OfCoefficients
 
@@ -284,7 +284,7 @@ class OfPolynomial:
         return [(self.polynomial, ())]
 
     def _roots(self, p: FloatArray) -> Any:
-        """Roots, on a scale of the coefficients' own."""
+        """The roots, computed on a scale that the coefficients determine."""
         a = [binary(x) for x in self._values([exact(x) for x in p.tolist()])]
         logs = {k: math.log2(abs(m)) + e for k, (m, _, e) in enumerate(a) if m}
         if not logs:  # zero, whatever s
@@ -325,7 +325,7 @@ class OfPolynomial:
 def hurwitz(a: Sequence[Any]) -> bool | None:
     """Whether all roots of a_0 + a_1 s + ... lie left of the axis, by Routh's scheme in exact numbers or balls.
 
-    None where balls are too wide to tell.
+    None when the balls are too wide to decide.
     """
     rows = [list(reversed(a))[::2], list(reversed(a))[1::2]]
     lead = rows[0][0]

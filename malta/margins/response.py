@@ -59,12 +59,12 @@ class Branch:
 
     @cached_property
     def finite(self) -> bool:
-        """Whether no number overflows."""
+        """Whether all numbers are finite."""
         return all(np.isfinite(M).all() for p in self.parts for M in (p.middle, p.slopes, p.rest))
 
     @cached_property
     def channels(self) -> tuple[Channels, FloatArray, FloatArray]:
-        """Channels, and what is left beside them of the constant part and of that of x."""
+        """The channels, and the rest of the constant part and of the factor of x."""
         one, two = self.parts
         n = len(one.middle)
         rest = [one.rest.copy(), two.rest.copy()]
@@ -128,7 +128,7 @@ class Response(NamedTuple):
 
 
 def response(branch: Branch, low: float, high: float) -> Response | None:
-    """On an interval of frequency; None where it is too wide for that."""
+    """The response on an interval of frequency; None when the interval is too wide."""
     one, two = branch.parts
     channels, rest0, rest1 = branch.channels
     n, x, h = len(one.middle), (low + high) / 2, (high - low) / 2 + 4 * EPS * high
@@ -153,9 +153,7 @@ def response(branch: Branch, low: float, high: float) -> Response | None:
     bound = wide @ (np.abs(channels.B[0]) + high * np.abs(channels.B[1]))
     grown = np.abs(g0) + np.abs(g1) + np.abs(g2)
     y = np.abs(S @ g2) + H @ grown + 32 * n * EPS * (bound + np.abs(S) @ (bound + grown)) + 1e-280
-    y = np.hstack(
-        [y, np.ones((n, 1))]
-    )  # that M is not singular at the middle of the box, where nothing else acts
+    y = np.hstack([y, np.ones((n, 1))])  # that M is regular in the middle of the box
     K = np.abs(S) + H
     try:
         W = np.linalg.solve(np.eye(n) - K, y) * (1 + 1e-6)
@@ -170,7 +168,7 @@ def response(branch: Branch, low: float, high: float) -> Response | None:
 
 
 def positive(M: Any, beside: float) -> bool:
-    """Whether a Hermitian matrix less `beside` times 1 is, by Cholesky's factors with room for their rounding."""
+    """Whether a Hermitian matrix minus `beside` times 1 is positive, by a Cholesky factor with room for rounding."""
     n = len(M)
     room = beside + 8 * (n + 4) * EPS * float(np.trace(M).real)
     try:

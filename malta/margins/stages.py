@@ -137,7 +137,7 @@ def compensators(
 
 @dataclass(frozen=True, eq=False)
 class _Question:
-    """The arguments of `robustness`, and what its parts derive from them."""
+    """The arguments of `robustness`, and results that its parts share."""
 
     plant: Plant
     controller: Controller
@@ -178,7 +178,7 @@ class _Question:
         return loop_at(self.plant, self.controller, self.names, position, self.current_loops)
 
     def margin_at(self, position: float) -> Margin:
-        """The margin at a position along the course; computed once where the loop does not depend on it."""
+        """The margin at a position along the course; computed once if the loop does not depend on the position."""
         z, known = position if self._moves else 0.0, self._place_margins
         if z not in known:
             known[z] = place_margin(

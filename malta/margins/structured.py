@@ -60,7 +60,7 @@ class Cell:
 
 
 class Attempt(NamedTuple):
-    """What became of cells: beta of one that was not excluded, if any, and those that time did not do for."""
+    """The result for cells: beta of one that was not excluded, if any, and the cells left when time was up."""
 
     beta: float
     cell: Cell | None
@@ -68,19 +68,19 @@ class Attempt(NamedTuple):
 
 
 class Step(NamedTuple):
-    """How wide the next interval of frequency is taken on a part of the box, relative to its end."""
+    """The width of the next interval of frequency on a part of the box, relative to its end."""
 
     sides: FloatArray | None = None
     share: float = math.inf
-    good: float = math.inf  # of the last one that was excluded
+    good: float = math.inf  # width of the last excluded interval
 
     def hasty(self, cell: Cell) -> bool:
-        """Whether the interval is about as wide as one that was excluded next to it: a narrower one is, surely."""
+        """Whether the interval is about as wide as an excluded neighbour, so that a narrower one will be excluded."""
         wide = cell.high - cell.low > HASTY * self.good * cell.high
         return cell.sides is self.sides and cell.low > 0 and wide
 
     def cut(self, cell: Cell) -> tuple[Cell, list[Cell]]:
-        """The cell's first part of that width, and the rest of it, if any."""
+        """The first part of the cell of that width, and the rest, if any."""
         width = self.share * cell.high
         if cell.sides is not self.sides or cell.low == 0 or not cell.low + 1.2 * width < cell.high:
             return cell, []
@@ -96,7 +96,7 @@ class Step(NamedTuple):
 
 @dataclass(eq=False)
 class Structured:
-    """The groups of loops, and the largest t for which all of box(t) is shown to be as stable as the nominal values."""
+    """The groups of loops, and the largest t for which box(t) is proven as stable as the nominal values."""
 
     rows: list[Rows]
     box: Box
@@ -114,7 +114,7 @@ class Structured:
         return clock.monotonic() > min(until, self.until) or self.count >= self.most
 
     def raise_bound(self, target: float) -> float:
-        """Prove box(target), or larger boxes on the way to it where that takes too long; called again, it goes on."""
+        """Prove box(target), or smaller boxes when that takes too long; a further call continues the work."""
         if not self.lower:
             self._order = self._prove_whole(target)
         t, begun = self._next(target), self._open
@@ -137,7 +137,7 @@ class Structured:
         return self.lower
 
     def _next(self, target: float) -> float:
-        """The box to be tried: the target where that is not far, else one a little larger than what stands."""
+        """The next box to be tried: the target if it is near, else one a little larger than the proven one."""
         if not self.lower:
             return target / 64
         return target if target <= NOT_FAR * self.lower else FIRST_STEP * self.lower
@@ -152,7 +152,7 @@ class Structured:
         return [replace(cell, sides=sides) for cell in cells]
 
     def _prove_whole(self, target: float) -> list[Cell]:
-        """The largest box that is proven without a cut; the cells of all frequencies, those that resist first."""
+        """Prove the largest box possible without a cut, and return the cells of all frequencies, the hardest first."""
         t, (beta, cells) = target, self._survey(target)
         while not cells and not self.late() and t > SMALLEST * target:
             t /= 2
@@ -170,7 +170,7 @@ class Structured:
         return cells
 
     def _survey(self, t: float) -> tuple[float, list[Cell]]:
-        """The largest beta on box(t) at a grid of frequencies, and cells of all of them by falling beta; none: no t."""
+        """The largest beta on box(t) at a grid of frequencies, and the cells by falling beta; none: t is too large."""
         found, near = [], None
         for cell in self.cover(t):
             for part in [cell] if cell.low == 0 else across_frequency(cell):
@@ -181,7 +181,7 @@ class Structured:
                 r, beta = response(own, at, at), math.inf
                 if r is not None and own.channels[0].blocks.real and not self.late():
                     try:
-                        # slopes alone: what is beyond them is dear, and counts where boxes are large
+                        # slopes alone: higher terms are slow, and matter in large boxes only
                         blocks = Blocks(own.channels[0].blocks.real)
                         N = r.terms[0][: blocks.size, : blocks.size]
                         near, beta = multiplier(N, blocks, near, 0.0, ROUGH)
@@ -194,7 +194,7 @@ class Structured:
         ]
 
     def _prove(self, cells: list[Cell], last: float, *, split: bool) -> Attempt:
-        """Exclude all cells, next to each other along frequency by intervals that are as wide as the last ones were."""
+        """Exclude all cells in order of frequency, by intervals as wide as the last excluded ones."""
         todo, step = list(reversed(cells)), Step()
         inner = self.box.sides(self.lower) if self.lower else None
         while todo:
@@ -236,7 +236,7 @@ class Structured:
         return found if found.finite else None
 
     def cover(self, t: float) -> list[Cell]:
-        """All frequencies of all groups on box(t)."""
+        """The cells of all frequencies and all groups on box(t)."""
         found, sides = [], self.box.sides(t)
         for k, rows in enumerate(self.rows):
             for branch, low, high in intervals(rows, self.box.nominal):
@@ -244,7 +244,7 @@ class Structured:
         return found
 
     def _level(self, cell: Cell, *, hasty: bool = False) -> tuple[float, Multiplier | None, bool]:
-        """beta in the middle of a cell, its multiplier, and whether the cell is excluded."""
+        """The beta in the middle of a cell, its multiplier, and whether the cell is excluded."""
         self.count += 1
         own = self._branch(cell)
         if own is None:
@@ -296,7 +296,7 @@ def _within(sides: FloatArray, outer: FloatArray) -> bool:
 
 
 def _beside(cell: Cell, other: Cell) -> bool:
-    """Whether the other one goes on along frequency."""
+    """Whether the other cell is the next one along frequency."""
     return cell.sides is other.sides and cell.branch == other.branch and cell.high == other.low
 
 
@@ -309,7 +309,7 @@ def across_frequency(cell: Cell) -> list[Cell]:
 
 
 def worst(N: Any, m: Multiplier, owners: Any, count: int, other: int) -> int:
-    """The parameter that moves most in the direction that is excluded least."""
+    """The parameter with the largest effect in the direction that is excluded least."""
     D, G = m.D, m.G
     H = N.conj().T
     S = H @ D @ N + 1j * (G @ N - H @ G)
@@ -325,7 +325,7 @@ def worst(N: Any, m: Multiplier, owners: Any, count: int, other: int) -> int:
 
 
 def intervals(rows: Rows, nominal: FloatArray) -> list[tuple[int, float, float]]:
-    """Frequencies from zero to infinity, octaves about the poles."""
+    """Intervals of frequency from zero to infinity, octaves around the poles."""
     pencil = rows.over(np.column_stack([nominal, nominal]))
     known = np.ones(1)
     if pencil is not None:
@@ -342,7 +342,7 @@ def intervals(rows: Rows, nominal: FloatArray) -> list[tuple[int, float, float]]
 
 
 def rows_of(problem: Problem) -> list[Rows] | None:
-    """Of all groups of the loops; None where they are no rational functions of p, or too large."""
+    """The rows of all groups of the loops; None when they are too large or no rational functions of p."""
     if isinstance(problem, OfSeveral):
         parts = [rows_of(part) for part in problem.problems]
         return None if any(part is None for part in parts) else [r for part in parts for r in part or []]

@@ -1,4 +1,4 @@
-"""Taylor models of one variable y on many intervals at once: polynomials in floating point, and what they leave out.
+"""Taylor models of one variable y on many intervals at once: polynomials in floating point, and error bounds.
 
     f(middle + half u) = sum_k c_k u^k +- radius,    |u| <= 1        rows of c: powers; columns: intervals
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 ORDER = 6
 EPS = 2.0**-52
-TINY = 1e-300  # what underflow leaves out
+TINY = 1e-300  # error of underflow
 
 
 class Taylor(NamedTuple):
@@ -31,7 +31,7 @@ class Taylor(NamedTuple):
     radius: FloatArray
 
     def size(self) -> FloatArray:
-        """At least |f| on each interval."""
+        """An upper bound of |f| on each interval."""
         return np.asarray((np.abs(self.c).sum(axis=0) + self.radius) * (1 + 16 * EPS))
 
     def bounds(self, pieces: range | None = None) -> tuple[float, float]:

@@ -1,4 +1,4 @@
-"""How large unmodelled dynamics are: a weight W(s), expanded on intervals of frequency.
+"""The size of unmodelled dynamics: a weight W(s), expanded on intervals of frequency.
 
 On a cell (branch, from, to) of the search, x = x0 + h t with -1 <= t <= 1 is v / 2^scale or its inverse, and
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 class Expanded(NamedTuple):
-    """W on cells: W_0 + W_1 t, and a bound of what that leaves out."""
+    """W on cells: W_0 + W_1 t, and a bound of the error."""
 
     value: ComplexArray
     slope: ComplexArray
@@ -43,7 +43,7 @@ class Weight:
 
     @property
     def most(self) -> float:
-        """At least |W| anywhere; infinite where it is not a number."""
+        """An upper bound of |W| at all frequencies; infinite when it is not a number."""
         return float(abs(self.num[0] / self.den[0])) if len(self.den) == 1 else math.inf
 
     def at(self, w: FloatArray) -> FloatArray:
@@ -109,7 +109,7 @@ def _taylor(c: ComplexArray, z: FloatArray, slope: ComplexArray, bent: FloatArra
 
 
 def weight_of(weight: Any, where: str) -> Weight:
-    """W as a record. Raises InputError for what is neither a positive number nor a stable, proper W(s)."""
+    """W as a record. Raises InputError for anything but a positive number or a stable, proper W(s)."""
     expected = "a number above zero, or a transfer function"
     if is_number(weight):
         if not float(weight) > 0:

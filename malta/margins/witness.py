@@ -1,4 +1,4 @@
-"""Where a(jw; p) may vanish first: a family's values and derivatives at points, and starts for a descent to a zero."""
+"""Zeros of a(jw; p): the values and derivatives of a family at points, and starts for a descent to a zero."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ ENDS = ((0, 0.0), (1, 0.0))  # w = 0 and w = infinity
 
 @dataclass(frozen=True, eq=False)
 class Zero:
-    """f = 0 at frequency x of a branch and parameters u, which first are in box(t)."""
+    """A zero of f at frequency x of a branch and parameters u; t is the smallest box that contains them."""
 
     t: float
     branch: int
@@ -78,7 +78,7 @@ def rows_and_slopes(f: Family, branch: int, x: Any) -> tuple[ComplexArray, Compl
 
 
 def linear_distance(f: Family, g: Growth, u: FloatArray, branch: int, x: FloatArray) -> FloatArray:
-    """t at which the linearization about u first vanishes, at each of the frequencies x."""
+    """The smallest t at which the linearization about u vanishes, at each of the frequencies x."""
     a, slopes = coefficients_at(f, u)
     rows, by_x = rows_and_slopes(f, branch, x)
     value, moved = rows @ a, rows @ slopes.T
@@ -102,7 +102,7 @@ def linear_distance(f: Family, g: Growth, u: FloatArray, branch: int, x: FloatAr
 
 
 def starts(f: Family, g: Growth, most: int = 6) -> list[tuple[float, int, float, FloatArray]]:
-    """Where to begin (t as it looks, branch, x, u): small linear distances along frequency, and unstable corners."""
+    """Starts of descents (estimated t, branch, x, u): small linear distances along frequency, and unstable corners."""
     cells = cover(f)
     inner = cells[(cells[:, 0] == 0) & (cells[:, 1] > 0)]
     found: list[tuple[float, int, float, FloatArray]] = []
@@ -126,7 +126,7 @@ def starts(f: Family, g: Growth, most: int = 6) -> list[tuple[float, int, float,
 
 
 def _corners(f: Family, g: Growth, most: int) -> list[tuple[float, int, float, FloatArray]]:
-    """Where stability is first lost on the way from the nominal values to corners of the box, by the roots."""
+    """The first loss of stability, by the roots, on the ways from the nominal values to corners of the box."""
     free = [i for i, n in enumerate(f.shape) if n > 1]
     if not free:
         return []
@@ -158,7 +158,7 @@ def _corners(f: Family, g: Growth, most: int) -> list[tuple[float, int, float, F
 
 
 def _worst_root(f: Family, u: FloatArray) -> tuple[float, float]:
-    """Real part of the rightmost root, over its size, and |imaginary part|, in units of x."""
+    """The real part of the rightmost root over its size, and |imaginary part| in units of x."""
     a, _ = coefficients_at(f, u)
     exponents = np.array(f.exponents) - max(f.exponents)
     roots = np.roots(np.ldexp(a, np.maximum(exponents, -1000))[::-1])
@@ -169,7 +169,7 @@ def _worst_root(f: Family, u: FloatArray) -> tuple[float, float]:
 
 
 def gradients(f: Family, zero: Zero) -> tuple[ComplexArray, complex]:
-    """Derivatives of f at a zero: by u, and by ln w."""
+    """The derivatives of f at a zero, with respect to u and to ln w."""
     a, slopes = coefficients_at(f, zero.u)
     rows, along = rows_and_slopes(f, zero.branch, np.array([zero.x]))
     by_x = complex((along @ a)[0]) * (-1 if zero.branch else 1)

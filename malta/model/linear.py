@@ -38,28 +38,28 @@ CALLER = "linear_machine"
 
 @dataclass(frozen=True)
 class LinearSystem:
-    """All of a linear machine but the values of its parameters: what its gain file holds. Equal by content."""
+    """A linear machine without the values of its parameters, as its gain file stores it. Equal by content."""
 
     states: tuple[Signal, ...]  # n
     inputs: tuple[Signal, ...]  # m
     outputs: tuple[Signal, ...]  # p
     matrices: tuple[Rows, Rows, Rows]  # A0 n x n, B0 n x m, C0 p x n
-    terms: tuple[tuple[str, tuple[Rows, Rows, Rows]], ...]  # by parameter: what it multiplies in A, B, C
+    terms: tuple[tuple[str, tuple[Rows, Rows, Rows]], ...]  # by parameter: its factors in A, B, C
     limit: tuple[float, ...]  # m, of each input, its unit; inf: none
     noise: tuple[float, ...]  # p, rms of a sample, the unit of each output
     dead_time: float  # s, from measurement to force
 
 
 class Details(TypedDict, total=False):
-    """What of a linear machine has a default.
+    """The optional arguments of `linear_machine`.
 
     name : the machine's own name
     states, inputs, outputs : names, "z [m]" with a unit, or Signals; those of a StateSpace, else x1 x2 ..., u1, y1
     nominal : values of the parameters, as {"k": 1.5}
-    terms : what each parameter multiplies, as {"k": (A1, B1, C1)}; None, or left out at the end: zeros
-    limit : of the inputs: a number for all of them, or one for each; none
-    noise : of the sensors, rms of a sample, likewise; none
-    dead_time : s, from measurement to force; none
+    terms : the factors of each parameter, as {"k": (A1, B1, C1)}; None, or left out at the end: zeros
+    limit : of the inputs, one number for all or one for each; default: infinite
+    noise : of the sensors, rms of a sample, one number for all or one for each; default: 0
+    dead_time : s, from measurement to force; default: 0
     """
 
     name: str
@@ -78,12 +78,12 @@ def linear_machine(A: Any, B: Any = None, C: Any = None, **details: Unpack[Detai
 
     A : n x n, B : n x m, C : m x n, as many outputs as inputs for a design; details : see `Details`
 
-    Positions that stand first with their rates after them, A = [[0, I], ...], make a machine of second order as those
-    that malta ships. Other states are as good for an LQG and a margin. Their reference is the rest at which the outputs
-    are what is asked for: [A B; C 0] (x*, u*) = (0, p*), in the least-squares sense. u* is not fed forward: without
-    integrals, or observed disturbances, a machine that takes some stops short of it.
+    States of positions and then their rates, A = [[0, I], ...], make a machine of second order. An LQG and a margin
+    work for other states as well. Their reference is the rest at which the outputs have the wanted values:
+    [A B; C 0] (x*, u*) = (0, p*), in the least-squares sense. u* is not fed forward: a machine that needs some stops
+    short of the reference without integrals or observed disturbances.
 
-    Raises InputError for shapes and values that do not fit, a system that is discrete or passes its inputs on (D).
+    Raises InputError for shapes and values that do not fit, a discrete system, and a system with D.
 
     >>> import malta
     >>> cart = malta.linear_machine([[0, 1], [0, -0.1]], [[0], [2]], [[1, 0]], name="cart", states=["z [m]", "v [m/s]"])
@@ -130,7 +130,7 @@ def record_of(system: LinearSystem, values: Mapping[str, float], name: str) -> P
 
 @cache
 def _record(names: tuple[str, ...]) -> Callable[..., Any]:
-    """The class of the parameters with these names; one for all machines that have the same."""
+    """The class of parameters with these names, one for all machines with equal names."""
     entries: list[Any] = [(name, float, si("1")) for name in names]
     entries.append(("system", LinearSystem, field(metadata={"shapes": True})))
     entries.append(("preset", str, "linear"))
@@ -143,7 +143,7 @@ def _record(names: tuple[str, ...]) -> Callable[..., Any]:
 
 
 def _reduce(record: Any) -> tuple[Any, ...]:
-    """How pickle makes a record again, whose class has no name in this module."""
+    """The arguments with which pickle rebuilds a record, because its class has no name in this module."""
     values = {name: getattr(record, name) for name, _ in record.system.terms}
     return record_of, (record.system, values, record.preset)
 
@@ -190,7 +190,7 @@ def plant(par: Any) -> Plant:
 
 
 def _states_at_rest(A: FloatArray, B: FloatArray, C: FloatArray, coordinates: int) -> FloatArray:
-    """The states at rest by the outputs there; of (q, q') the positions."""
+    """The matrix from outputs to states at rest; to the positions q of states (q, q')."""
     n, p, half = len(A), len(C), coordinates
     if half and p == half and np.linalg.matrix_rank(C[:, :half]) == half:
         return np.asarray(np.linalg.inv(C[:, :half]))
@@ -238,7 +238,7 @@ def _rows(matrices: Sequence[FloatArray]) -> tuple[Rows, Rows, Rows]:
 def _terms(
     nominal: Any, terms: Any, base: Sequence[FloatArray]
 ) -> tuple[tuple[str, tuple[Rows, Rows, Rows]], ...]:
-    """The terms in the order of the nominal values. Raises InputError."""
+    """The terms in the order of the nominal values. Raises InputError for names and shapes that do not fit."""
     for what, given in (("nominal", nominal), ("terms", terms)):
         if not isinstance(given, Mapping):
             raise InputError(CALLER, what, f"a {type(given).__name__}", "a table by parameter")
@@ -287,7 +287,7 @@ def _signal(what: str, given: Any) -> Signal:
 
 
 def _numbers(what: str, given: Any, count: int, *, zero: bool = True) -> tuple[float, ...]:
-    """Numbers of at least, or above, 0: one for all, or as many as `count`. Raises InputError."""
+    """`count` numbers of at least 0, or above 0 unless `zero`; one number stands for all. Raises InputError."""
     wanted = f"a number {'of at least' if zero else 'above'} 0, or {count} of them"
     try:
         found = np.broadcast_to(np.asarray(given, dtype=float), (count,))

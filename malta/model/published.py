@@ -14,9 +14,9 @@ from malta.units import unit_factor
 
 
 def published(machine_file: str | Path) -> dict[str, Any]:
-    """The figures that the machine's paper prints: published/NAME.toml, or published.toml, beside its data file.
+    """Read the figures that a machine's paper prints: published/NAME.toml or published.toml beside its data file.
 
-    Raises InputError where there is neither; `published_beside` gives None then.
+    Raises InputError when neither file exists; `published_beside` returns None instead.
     """
     return load_toml(_published_file(Path(machine_file)))
 
