@@ -20,12 +20,7 @@ import numpy as np
 from flint import acb, arb, arb_mat, ctx, fmpq, fmpq_mat
 
 from malta.margins.algebra import Symbolic, value
-from malta.margins.closed import (
-    closed_loop,
-    coefficients,
-    majorant_matrix,
-    parts,
-)
+from malta.margins.closed import closed_loop, coefficients, driven_group, majorant_matrix
 from malta.margins.degrees import (
     clear_denominators,
     degree,
@@ -158,8 +153,8 @@ class Characteristic:
 
     def _coefficients(self, p: list[Any], matrix: Any) -> list[Any]:
         if self.minors is None:
-            driven, factor = parts(self.loop, self.group, self._entries(p), matrix)
-            return [c * factor for c in coefficients(closed_loop(*driven))]
+            driven = driven_group(self.loop, self.group, self._entries(p), matrix)
+            return [c * driven.det_E for c in coefficients(closed_loop(driven))]
         known, place = self.minors.known, (ctx.prec, tuple(p))
         pi, beta = known.get(place, (None, None))
         if beta is None:

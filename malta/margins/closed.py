@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from flint import acb_mat, arb
@@ -15,10 +15,28 @@ if TYPE_CHECKING:
     from malta.model.plant import FloatArray
 
 
-def parts(
+class DrivenGroup(NamedTuple):
+    """A group of a loop at given parameters: its system with lag, hold and delay, and its law, as flint matrices."""
+
+    matrix: Any  # their type
+    a: Any
+    b: Any
+    c: Any
+    d: Any  # None for none
+    f_a: list[list[Any]]  # rows of the law's A and B (of differences where discrete)
+    f_b: list[list[Any]]
+    out: Any  # C of the law, to the inputs of the group; None for a law without states
+    through: Any  # D of the law
+    det_E: Any
+
+
+def driven_group(
     loop: UncertainLoop, g: Group, entries: list[list[tuple[int, int, Any]]], matrix: Any
-) -> tuple[tuple[Any, ...], Any]:
-    """The arguments of `closed_loop`, and det E: the system with lag, hold and delay, its inputs, and the law."""
+) -> DrivenGroup:
+    """A group with its law, from the entries of A, B, C, D and E as numbers of `matrix`, a type of flint.
+
+    Raises NotAnalytic when E is singular or numbers overflow.
+    """
     law, x = loop.law, {state: k for k, state in enumerate(g.states)}
     m, p, n = loop.program.shapes[B][1], loop.program.shapes[C][0], len(x)
     a = dense(matrix, n, n, ((x[i], x[j], r) for i, j, r in entries[A] if i in x and j in x))
@@ -54,7 +72,7 @@ def parts(
     if law.sample_time is not None:
         f_a = [[v - (i == j) for j, v in enumerate(row)] for i, row in enumerate(f_a)]
     f_b = rational(law.B[own])
-    return (matrix, a, b, c, d, f_a, f_b, out, through), factor
+    return DrivenGroup(matrix, a, b, c, d, f_a, f_b, out, through, factor)
 
 
 def dense(matrix: Any, rows: int, columns: int, entries: Any) -> Any:
@@ -143,11 +161,10 @@ def add_delay(matrix: Any, phi: Any, gamma: Any, c: Any, d: Any, delay: int) -> 
     return a, b, late, None
 
 
-def closed_loop(
-    matrix: Any, a: Any, b: Any, c: Any, d: Any, f_a: Any, f_b: Any, out: Any, through: Any
-) -> tuple[Any, Any]:
+def closed_loop(group: DrivenGroup) -> tuple[Any, Any]:
     """The closed loop's state matrix (of differences where discrete), and det(I - D_c D)."""
-    k = len(f_a)
+    matrix, a, b, c, d, *_ = group
+    out, through, k = group.out, group.through, len(group.f_a)
     factor: Any = 1
     if d is not None:
         w = _identity(matrix, b.ncols()) - through * d
@@ -161,7 +178,7 @@ def closed_loop(
     plant = a + b * into
     if not k:
         return plant, factor
-    f_a, f_b = matrix(f_a), matrix(f_b)
+    f_a, f_b = matrix(group.f_a), matrix(group.f_b)
     y_x = c if d is None else c + d * into
     own = f_a if d is None else f_a + f_b * (d * out)
     return _stack(matrix, [[plant, b * out], [f_b * y_x, own]]), factor

@@ -31,7 +31,7 @@ from malta.margins.dynamic import (
     question_of,
 )
 from malta.margins.enclosure import Unproven
-from malta.margins.peaks import climb, patterns
+from malta.margins.peaks import Peak, climb, patterns
 from malta.margins.polydisc import is_zero_free
 from malta.margins.robust import deadline
 from malta.margins.transfer import performance
@@ -121,18 +121,8 @@ def worst_case_gain(
         return Gain(math.inf, None, math.nan, {}, 0, clock.monotonic() - begun, reason)
     until = deadline(begun, time)
 
-    def value(p: FloatArray, w: FloatArray) -> FloatArray:
-        return performance(asked.transfer(p, w), asked.blocks)
-
     with np.errstate(all="ignore"):  # a cell with infinite bounds excludes nothing
-        starts = asked.starts(1.0, patterns(len(box.names)))
-        worst = asked.problem.instability(np.array(starts))
-        if worst.max() >= 0:
-            p = starts[int(worst.argmax())]
-            lower, w = math.inf, asked.problem.critical_frequency(p)
-        else:
-            last_climb = begun + SEARCH * (until - begun)
-            lower, w, p = climb(value, asked.problem, box.sides(1.0), starts, last_climb)
+        lower, w, p = _largest(asked, begun + SEARCH * (until - begun))
         upper, cells, reason = _prove(asked, lower, tolerance, until)
     named = dict(zip(box.names, p.tolist(), strict=True))
     return Gain(lower, upper, w, named, cells, clock.monotonic() - begun, reason)
@@ -157,6 +147,20 @@ def _performance_block(system: UncertainSystem, of: Of, at: At, channel: Any) ->
         channels_of(c, counts[name], name, "worst_case_gain") for c, name in zip(both, names, strict=True)
     )
     return Block(of, "sensors", driven, read, one)  # type: ignore[arg-type]
+
+
+def _largest(asked: Blocks, until: float) -> Peak:
+    """The largest gain that a search until a time finds; infinite at an unstable plant of the box."""
+
+    def value(p: FloatArray, w: FloatArray) -> FloatArray:
+        return performance(asked.transfer(p, w), asked.blocks)
+
+    starts = asked.starts(1.0, patterns(len(asked.box.names)))
+    worst = asked.problem.instability(np.array(starts))
+    if worst.max() >= 0:
+        p = starts[int(worst.argmax())]
+        return Peak(math.inf, asked.problem.critical_frequency(p), p)
+    return climb(value, asked.problem, asked.box.sides(1.0), starts, until)
 
 
 def _prove(asked: Blocks, lower: float, tolerance: float, until: float) -> tuple[float | None, int, str]:

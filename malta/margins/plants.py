@@ -53,14 +53,7 @@ def of_plant(
     Raises InputError for unknown names and for parameters that set the size of the model.
     """
     par = plant.parameters
-    known = [*units_of(par), *((plant.stroke,) if plant.has_stroke else ())]
-    if not isinstance(names, tuple | list):
-        raise InputError("uncertain", "names", describe(names), "names of parameters, as a tuple or a list")
-    for name in names:
-        if name not in known:
-            raise InputError("uncertain", f"{name}", "an unknown parameter", "one of " + " ".join(known))
-    for name in set(names) & set(shape_parameters(par)):
-        raise InputError("uncertain", name, "a parameter that shapes the model", "one that enters it")
+    _check_names(plant, names)
     if believed is not None and believed.tabulated:
         found = "a controller that looks up a table"
         raise InputError("uncertain", "believed", found, "one whose currents are a formula")
@@ -92,6 +85,18 @@ def of_plant(
     limits = tuple((bounds.get(name, -math.inf), math.inf) for name in names)
     matrices = ca.Function("matrices", [p], [A, B, C])
     return UncertainSystem(tuple(names), readonly(nominal), matrices, limits=limits)
+
+
+def _check_names(plant: Plant, names: Any) -> None:
+    """Raise InputError unless the names are those of parameters that may be symbols, or of the stroke."""
+    known = [*units_of(plant.parameters), *((plant.stroke,) if plant.has_stroke else ())]
+    if not isinstance(names, tuple | list):
+        raise InputError("uncertain", "names", describe(names), "names of parameters, as a tuple or a list")
+    for name in names:
+        if name not in known:
+            raise InputError("uncertain", f"{name}", "an unknown parameter", "one of " + " ".join(known))
+    for name in set(names) & set(shape_parameters(plant.parameters)):
+        raise InputError("uncertain", name, "a parameter that shapes the model", "one that enters it")
 
 
 def _expanded_matrices(

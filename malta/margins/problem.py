@@ -20,8 +20,7 @@ from malta.margins.characteristic import (
     map_bounds,
     pair,
 )
-from malta.margins.closed import closed_loop
-from malta.margins.closed import parts as driven
+from malta.margins.closed import closed_loop, driven_group
 from malta.margins.expressions import (
     BALLS,
     EXACT,
@@ -110,7 +109,7 @@ class OfLoop:
         whole = Group(tuple(range(n)), tuple(range(k)), None)
         try:
             entries = self.loop.program.run([arb(x) for x in p.tolist()], POINTS)
-            matrix, _ = closed_loop(*driven(self.loop, whole, entries, arb_mat)[0])
+            matrix, _ = closed_loop(driven_group(self.loop, whole, entries, arb_mat))
         except NotAnalytic:
             return np.zeros(0)
         found = np.array(
