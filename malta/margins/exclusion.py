@@ -102,7 +102,7 @@ class Cell:
     smallest: float
 
 
-class Beside(NamedTuple):
+class CellBounds(NamedTuple):
     """f on cells with more than its family: expansions, discs around them, and terms of further axes."""
 
     terms: list[ComplexArray]
@@ -127,7 +127,7 @@ class Search:
     depth: FloatArray
     target: float
     count: int = 0
-    beside: Callable[[FloatArray, FloatArray], Beside] | None = (
+    around: Callable[[FloatArray, FloatArray], CellBounds] | None = (
         None  # f by more than its family, on cells and boxes
     )
     hasty: bool = False  # whether few cells are cut several times at once
@@ -211,7 +211,7 @@ def advance(s: Search) -> None:
         )
         s.blocked = min(s.blocked, float(s.growth.smallest(boxes[hopeless]).min(initial=np.inf)))
         moves = [m[bad] for m in found.moves]
-        kept = Beside([t[bad] for t in terms], radius[bad], found.lasting[bad], found.discs[bad], moves)
+        kept = CellBounds([t[bad] for t in terms], radius[bad], found.lasting[bad], found.discs[bad], moves)
         _split(s, cells[bad], boxes[bad], depth[bad], kept)
 
 
@@ -233,11 +233,11 @@ def on_boxes(f: Family, cells: FloatArray, boxes: FloatArray, like: Family | Non
     return Expansion(tuple(np.moveaxis(cut, 1, 0)), e.radius[index], e.lasting[index])
 
 
-def _expanded(s: Search, cells: FloatArray, boxes: FloatArray) -> Beside:
-    if s.beside is not None:
-        return s.beside(cells, boxes)
+def _expanded(s: Search, cells: FloatArray, boxes: FloatArray) -> CellBounds:
+    if s.around is not None:
+        return s.around(cells, boxes)
     e = on_boxes(s.family, cells, boxes)
-    return Beside(list(e.terms), e.radius, e.lasting, np.zeros((len(cells), 1), dtype=complex), [])
+    return CellBounds(list(e.terms), e.radius, e.lasting, np.zeros((len(cells), 1), dtype=complex), [])
 
 
 def half_plane(terms: list[ComplexArray], radius: FloatArray) -> ComplexArray:
@@ -269,7 +269,7 @@ def _split(
     cells: FloatArray,
     boxes: FloatArray,
     depth: FloatArray,
-    found: Beside,
+    found: CellBounds,
 ) -> None:
     """Split each cell in two across the axis that moves f most: frequency, a parameter or a further axis."""
     shape, terms, radius = s.family.shape, found.terms, found.radius

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from malta.margins.enclosure import TooWide, Unproven
-from malta.margins.exclusion import Beside, Growth
+from malta.margins.exclusion import CellBounds, Growth
 from malta.margins.family import Family
 from malta.margins.problem import Polynomial
 
@@ -30,7 +30,7 @@ class Part:
     family: Family
     growth: Growth
     # the family with its coupling to other groups, on cells and boxes:
-    around: Callable[[FloatArray, FloatArray], Beside] | None = None
+    around: Callable[[FloatArray, FloatArray], CellBounds] | None = None
 
 
 def cut(

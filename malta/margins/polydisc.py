@@ -26,7 +26,7 @@ import numpy as np
 
 from malta.margins.block_parts import Matrix, Part
 from malta.margins.exclusion import (
-    Beside,
+    CellBounds,
     Growth,
     advance,
     on_boxes,
@@ -68,7 +68,7 @@ def _level(part: Part, level: int, target: float, sizes: Sequence[Size], until: 
     )  # fmt: skip
     search = start(part.sets[0], growth, target if growth.grows.any() else 1.0)
     if part.scalars or part.full is not None:
-        search = replace(search, beside=_Circles(part, level, axes, sizes).beside)
+        search = replace(search, around=_Circles(part, level, axes, sizes).on)
     while not search.finished:
         if search.count > MOST_CELLS or clock.monotonic() > until:
             return False, search.count
@@ -85,7 +85,7 @@ class _Circles:
     axes: int
     sizes: Sequence[Size]
 
-    def beside(self, cells: FloatArray, boxes: FloatArray) -> Beside:
+    def on(self, cells: FloatArray, boxes: FloatArray) -> CellBounds:
         part, level = self.part, self.level
         phases = boxes[:, self.axes :]
         on_circles = [self.sizes[k](cells, part.scale) for k in part.scalars[:level]]
@@ -106,7 +106,7 @@ class _Circles:
         ]
         sure = _half_plane(f, g[0][0]) if len(g) == len(g[0]) == 1 else None
         none = np.zeros(len(cells))
-        return Beside(f.terms, f.radius, none, discs.astype(complex), moves, sure)
+        return CellBounds(f.terms, f.radius, none, discs.astype(complex), moves, sure)
 
 
 def _half_plane(f: _Sum, g: _Sum) -> ComplexArray:

@@ -212,7 +212,7 @@ class Job:
             (part, replace(start(part.family, part.growth, target, until), hasty=True)) for part in parts
         ]
         for part, search in begun:
-            search.beside = part.around
+            search.around = part.around
         return begun
 
     def _is_open(self, searches: Searches) -> bool:

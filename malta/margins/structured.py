@@ -208,7 +208,7 @@ class Structured:
             beta, m, done = self._level(cell, hasty=step.hasty(cell))
             if done:
                 step = step.after(cell, True)
-                if todo and (todo[-1].near is None or _beside(cell, todo[-1])):
+                if todo and (todo[-1].near is None or _is_next(cell, todo[-1])):
                     todo[-1] = replace(todo[-1], near=m)
             elif beta < NEAR:
                 if cell.high - cell.low < NARROWEST * cell.high or cell.high < LOWEST * cell.top:
@@ -295,7 +295,7 @@ def _within(sides: FloatArray, outer: FloatArray) -> bool:
     return bool((sides[:, 0] >= outer[:, 0]).all() and (sides[:, 1] <= outer[:, 1]).all())
 
 
-def _beside(cell: Cell, other: Cell) -> bool:
+def _is_next(cell: Cell, other: Cell) -> bool:
     """Whether the other cell is the next one along frequency."""
     return cell.sides is other.sides and cell.branch == other.branch and cell.high == other.low
 

@@ -29,7 +29,7 @@ from scipy import linalg, sparse
 
 from malta.margins.axes import Axes, axes_of, members_of, state_matrix
 from malta.margins.enclosure import Unproven
-from malta.margins.exclusion import Beside, growth_over, on_boxes
+from malta.margins.exclusion import CellBounds, growth_over, on_boxes
 from malta.margins.expressions import NotAnalytic
 from malta.margins.family import Family, scale_of
 from malta.margins.held_currents import HeldMachine, dominating_solution
@@ -114,14 +114,14 @@ class _CoupledGroup:
         beside = Family((rows * inputs, *f.shape), main.reshape(K, -1), off, f.exponents, f.scale)
         return replace(f, radius=f.radius + more), beside, (rows, inputs, nodes)
 
-    def on(self, cells: FloatArray, boxes: FloatArray) -> Beside:
+    def on(self, cells: FloatArray, boxes: FloatArray) -> CellBounds:
         family, beside, shape = self.families
         f = on_boxes(family, cells, boxes)
         whole = np.broadcast_to([0.0, 1.0], (len(cells), 1, 2))
         e = on_boxes(beside, cells, np.concatenate([whole, boxes], axis=1), family)
         size = sum(np.abs(t) for t in e.terms) + e.radius[:, None]
         discs = size.reshape(len(cells), *shape).sum(axis=2).max(axis=1) * SAFE
-        return Beside(list(f.terms), f.radius, f.lasting, discs.astype(complex), [])
+        return CellBounds(list(f.terms), f.radius, f.lasting, discs.astype(complex), [])
 
 
 def _part(g: Axes, coupling: Callable[[], Coupling], sides: FloatArray, box: Box) -> Part:
