@@ -12,6 +12,8 @@ from pathlib import Path
 
 from conftest import ROOT
 
+import malta
+
 # Each may import those before it; machines stand where nobody generic imports them.
 ORDER = (
     *(
@@ -136,3 +138,8 @@ def test_a_machine_is_a_folder() -> None:
     assert [path.name for path in folders] == ["halbach", "planar", "tubular"]
     for folder in folders:
         assert {"experiments", "figures", "claims"} <= {path.stem for path in folder.iterdir()}
+
+
+def test_every_name_of_the_contents_page_is_there() -> None:
+    for name in malta.__all__:
+        assert getattr(malta, name) is not None
