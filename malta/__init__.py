@@ -38,6 +38,9 @@ if TYPE_CHECKING:  # the contents page, as type checkers and readers see it
     from malta.model.linearize import LinearModel as LinearModel
     from malta.model.linearize import linearize as linearize
     from malta.model.machines import machine as machine
+    from malta.model.parameters import check_parameters as check_parameters
+    from malta.model.parameters import si as si
+    from malta.model.plant import Actuator as Actuator
     from malta.model.plant import OperatingPoint as OperatingPoint
     from malta.model.plant import Plant as Plant
     from malta.model.plant import Signal as Signal
@@ -90,7 +93,8 @@ _NAMES = {  # the same, for the first use of each name
     "simulation.batch": ("replayed", "simulate_many"),
     "simulation.digest": ("Batch",),
     "model.machines": ("machine",),
-    "model.plant": ("OperatingPoint", "Plant", "Signal", "trim"),
+    "model.parameters": ("check_parameters", "si"),
+    "model.plant": ("Actuator", "OperatingPoint", "Plant", "Signal", "trim"),
     "margins.blocks": ("Dynamic",),
     "margins.dynamic": ("dynamic_margin",),
     "margins.gain": ("Gain", "worst_case_gain"),

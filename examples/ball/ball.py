@@ -1,6 +1,7 @@
 """A steel sphere between two electromagnets: one axis, open-loop unstable.
 
     m q'' = f + w - m g        f = C ((I_0 + i)^2 / (s - q)^2 - (I_0 - i)^2 / (s + q)^2)
+
 q points up from the middle, s is the gap there; the controller adds i to the bias current I_0 of the upper magnet and
 takes it from the lower one: f = k_i i + k_s q about the middle, and the force command f takes i = f / k_i.
 """
@@ -10,8 +11,7 @@ from typing import Any
 
 import casadi as ca
 
-from malta.model.parameters import check_parameters, si
-from malta.model.plant import Actuator, Plant, Signal
+from malta import Actuator, Plant, Signal, check_parameters, si
 
 
 @dataclass(frozen=True)

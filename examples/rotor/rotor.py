@@ -32,9 +32,7 @@ from typing import Any
 
 import casadi as ca
 
-from malta.errors import InputError
-from malta.model.parameters import check_parameters, si
-from malta.model.plant import Actuator, Plant, Signal
+from malta import Actuator, InputError, Plant, Signal, check_parameters, si
 
 MU_0 = 4e-7 * math.pi  # V s/(A m)
 

@@ -97,7 +97,9 @@ class Plan:
         return hashlib.sha256(_compact_json(self.manifest)).hexdigest()
 
 
-def box_of(gains: str | Path, published: Mapping[str, Any] | None = None) -> dict[str, float]:
+def box_of(
+    gains: str | Path, published: Mapping[str, Any] | None = None, option: str = "--spread"
+) -> dict[str, float]:
     """The uncertain parameters of a gain file with their spreads, else those that the machine's paper names.
 
     Raises InputError where neither names any.
@@ -106,7 +108,7 @@ def box_of(gains: str | Path, published: Mapping[str, Any] | None = None) -> dic
     own = robust.get("uncertainty") or (published or {}).get("position_controller", {}).get("uncertainty")
     if not own:
         raise InputError(
-            gains, "verification.robust", "no uncertain parameters", "them, or --spread NAME=10%"
+            gains, "verification.robust", "no uncertain parameters", f"them, or {option} NAME=10%"
         )
     return {name: float(value) for name, value in own.items()}
 

@@ -66,7 +66,7 @@ def read_shares(
         raise InputError(option, "", " and ".join(general), "one share for all, others as NAME=SHARE")
     shares: dict[str, float] = {}
     if general or not named:
-        shares = box_of(gains, published)
+        shares = box_of(gains, published, option)
     if general:
         share = read_assignments(option, [f"all={general[0]}"], {"all": "1"})["all"]
         shares = dict.fromkeys(shares, share)
