@@ -22,6 +22,8 @@ if TYPE_CHECKING:  # the contents page, as type checkers and readers see it
     from malta.margins.gain import worst_case_gain as worst_case_gain
     from malta.margins.loop_systems import LoopSystems as LoopSystems
     from malta.margins.loop_systems import loop_systems as loop_systems
+    from malta.margins.recovery import Recovery as Recovery
+    from malta.margins.recovery import recovery as recovery
     from malta.margins.robust import Margin as Margin
     from malta.margins.robust import margin_of_polynomial as margin_of_polynomial
     from malta.margins.robust import robust_margin as robust_margin
@@ -99,6 +101,7 @@ _NAMES = {  # the same, for the first use of each name
     "margins.dynamic": ("dynamic_margin",),
     "margins.gain": ("Gain", "worst_case_gain"),
     "margins.loop_systems": ("LoopSystems", "loop_systems"),
+    "margins.recovery": ("Recovery", "recovery"),
     "margins.robust": ("Margin", "margin_of_polynomial", "robust_margin"),
     "margins.systems": ("uncertain",),
     "simulation.scenario": ("Fault", "Scenario"),

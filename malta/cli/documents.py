@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from malta.campaigns.result import Campaign
     from malta.margins.gain import Gain
+    from malta.margins.recovery import Recovery
     from malta.margins.robust import Margin
     from malta.margins.stages import Robustness
     from malta.margins.verify import Margins
@@ -23,6 +24,21 @@ def margins_document(margins: Margins) -> dict[str, Any]:
         "bandwidth": dict(margins.bandwidth),
         "peak_sensitivity": {stage.name: dict(stage.peak_sensitivity) for stage in margins.stages},
     }
+
+
+def recovery_document(found: Recovery) -> dict[str, Any]:
+    """The answer to a constant load, by output; times in s."""
+    outputs = {
+        d.output: {
+            "largest": d.largest,
+            "left": [{"after": t, "value": left} for t, left in zip(found.after, d.left, strict=True)],
+            "settled": d.settled,
+            "final": d.final,
+            "compliance": {"peak": d.compliance, "frequency": d.frequency},
+        }
+        for d in found.outputs
+    }
+    return {"load": dict(found.load), "outputs": outputs}
 
 
 def robustness_document(

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, cast
 import typer
 
 from malta.cli.assignments import read_shares
-from malta.cli.documents import margins_document, robustness_document
+from malta.cli.documents import margins_document, recovery_document, robustness_document
 from malta.cli.inputs import change_machine, read_controller
 from malta.cli.options import AsJson, Changes, GainFile, MachineFile
 from malta.cli.output import make_console, margin_progress, print_json, print_written
@@ -19,6 +19,7 @@ from malta.errors import CheckError, InputError
 if TYPE_CHECKING:
     from malta.margins.gain import Gain
     from malta.margins.loops import CurrentLoops
+    from malta.margins.recovery import Recovery
     from malta.margins.robust import Margin
     from malta.margins.stages import Robustness
     from malta.margins.verify import Margins
@@ -44,6 +45,9 @@ class Analysis(NamedTuple):
     margins: Margins
     robustness: Robustness
     worst: Mapping[str, Gain]  # the largest |S| of each sensor; empty where it was not asked for
+    recovered: Sequence[
+        Recovery
+    ]  # of each disturbance; none of an unstable loop, or where no load acts from outside
 
 
 def verify(
@@ -86,7 +90,7 @@ def verify(
 
     Poles, bandwidths by definition, peak sensitivities with their ISO 14839-3 zones; real parametric margins with
     their proof, from full state feedback to the sampled loop, and over the travel; disk and delay margins, gang of
-    four, tolerance of each parameter.
+    four, tolerance of each parameter; what a constant load of 1 N or 1 N m from outside does.
 
     The machine is the one in the file, with the changes given by --set, as far as they shape the linear loop (on MALTA
     m, K_A, K_B, l_B, F_c, T_d; windings and DC link do not).
@@ -149,6 +153,7 @@ def _analyse(
 
     Raises CheckError, naming the gain file, when a result fails its own check.
     """
+    from malta.margins.recovery import recovery
     from malta.margins.stages import robustness
     from malta.margins.travel import covers_travel, worst_sensitivities
     from malta.margins.verify import verify as compute_margins
@@ -164,9 +169,10 @@ def _analyse(
         if worst_case is None:
             worst_case = proof and covers_travel(plant, controller, tuple(box), current_loops)
         worst = worst_sensitivities(plant, controller, box, current_loops, time=time) if worst_case else {}
+        recovered = recovery(plant, controller) if margins.stable and plant.disturbances else ()
     except CheckError as error:
         raise CheckError(f"{loop.gains}: {error}") from error
-    return Analysis(margins, robust, worst)
+    return Analysis(margins, robust, worst, recovered)
 
 
 def _write_certificate(path: Path, loop: Loop, margin: Margin) -> Path:
@@ -195,7 +201,8 @@ def _document(loop: Loop, analysis: Analysis, files: Sequence[Path]) -> dict[str
         "files": [str(file) for file in files],
     }
     robust = robustness_document(analysis.robustness, loop.box, analysis.worst)
-    return design | margins_document(analysis.margins) | {"robust": robust}
+    recovered = [recovery_document(one) for one in analysis.recovered]
+    return design | margins_document(analysis.margins) | {"recovery": recovered, "robust": robust}
 
 
 def _print_tables(
@@ -220,6 +227,7 @@ def _print_tables(
         report.loop_poles_table(margins),
         report.bandwidth_table(margins, published),
         report.sensitivity_table(margins),
+        *([report.recovery_table(analysis.recovered, loop.plant)] if analysis.recovered else []),
         f"Uncertainty: {box}\n",
         report.chain_table(robust),
         report.disk_table(robust, controller.sample_time),

@@ -35,3 +35,4 @@ from malta.report.tables.tuning import front_markdown as front_markdown
 from malta.report.tables.tuning import front_rows as front_rows
 from malta.report.tables.tuning import front_table as front_table
 from malta.report.tables.tuning import requirements_table as requirements_table
+from malta.report.recovery import recovery_table as recovery_table

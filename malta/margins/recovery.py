@@ -1,0 +1,239 @@
+"""How a machine takes a load: its answer to a constant force or torque from outside, and its compliance.
+
+         w (constant, from t = 0)
+         |
+         v         y
+    [ machine ] ------> [ law ] --+        the loop of verify.machine_loop: hold, delay, current loops, loads
+         ^                        |        against v0(z) at the trim
+         +------------------------+
+
+The load acts between samples, as a constant of the continuous machine: x' = A x + B v + B_w w, sampled exactly. Outputs
+are read at the samples.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import casadi as ca
+import numpy as np
+
+from malta.errors import CheckError, InputError
+from malta.margins.verify import Loop, largest, machine_loop
+from malta.model.linearize import LinearModel, linearize
+from malta.model.plant import position_at, trim
+from malta.synthesis.riccati import add_lags, sample
+from malta.synthesis.step_response import StepResponse, step_response
+from malta.threads import on_one_thread
+
+if TYPE_CHECKING:
+    from malta.model.plant import ComplexArray, FloatArray, Plant
+    from malta.synthesis.controller import Controller
+
+AFTER = (0.1, 0.3)  # s
+SHARE = 0.01  # of the largest deviation
+PLACES = 9  # of the travel, its ends among them
+
+
+@dataclass(frozen=True, eq=False)
+class Deviation:
+    """What a constant load does to one output. SI."""
+
+    output: str
+    unit: str
+    largest: float
+    left: tuple[float, ...]  # the largest from each time of Recovery.after on
+    settled: float  # s, from which it stays within SHARE of the largest; inf: never
+    final: float  # what stays
+    compliance: float  # the largest amplitude over frequency that a load of this amplitude makes
+    frequency: float  # rad/s, of it
+
+
+@dataclass(frozen=True, eq=False)
+class Recovery:
+    """The answer of a machine's loop to a constant load from outside."""
+
+    name: str
+    load: Mapping[str, float]  # N or N m, by disturbance
+    after: tuple[float, ...]  # s
+    outputs: tuple[Deviation, ...]
+
+
+@on_one_thread
+def recovery(
+    plant: Plant,
+    controller: Controller,
+    loads: Mapping[str, Mapping[str, float]] | None = None,
+    *,
+    position: float | None = None,
+    after: tuple[float, ...] = AFTER,
+) -> tuple[Recovery, ...]:
+    """Answer constant loads from outside with the machine's linear loop.
+
+    loads : sizes in N or N m by disturbance, for each name; None: 1 N or 1 N m of each of the plant's disturbances
+    position : of the stroke, m; None: the controller's operating point
+    after : s, times after which what is left is looked at
+
+    Raises InputError for a machine without disturbances or a load of an unknown one, and CheckError for an unstable
+    loop.
+
+    >>> import malta
+    >>> controller = malta.gains.read("design/gains/calibrated.json")
+    >>> found = malta.recovery(malta.plant_of(controller.parameters), controller)
+    >>> load, output = furthest(found)[0]
+    >>> f"{load.name} moves {output.output} by {output.largest * 1e6:.1f} um"
+    'F_x moves x2 by 52.9 um'
+    """
+    known = [s.name for s in plant.disturbances]
+    if not known:
+        raise InputError(plant.name, "disturbances", "none", "a machine on which forces act from outside")
+    loads = {name: {name: 1.0} for name in known} if loads is None else loads
+    sizes = [load_vector(plant, name, load) for name, load in loads.items()]
+    pushed = PushedLoop.of(plant, controller, position)
+    unit_loads = pushed.answer()
+    return tuple(
+        Recovery(name, dict(load), after, _deviations(plant, pushed, unit_loads, size, after))
+        for (name, load), size in zip(loads.items(), sizes, strict=True)
+    )
+
+
+def furthest(found: Sequence[Recovery]) -> tuple[tuple[Recovery, Deviation], ...]:
+    """Pick the output that each load moves furthest; a load that moves none is left out.
+
+    Outputs of different units are compared by their share of what any of the loads does to their unit.
+    """
+    units: dict[str, float] = {}
+    for d in (d for r in found for d in r.outputs):
+        units[d.unit] = max(units.get(d.unit, 0.0), d.largest)
+    picked = []
+    for r in found:
+        moved = [d for d in r.outputs if d.largest > 0]
+        if moved:
+            picked.append((r, max(moved, key=lambda d: d.largest / units[d.unit])))
+    return tuple(picked)
+
+
+def load_vector(plant: Plant, name: str, load: Mapping[str, float]) -> FloatArray:
+    """Return a load as a number for each of a plant's disturbances. Raises InputError for an unknown disturbance."""
+    known = [s.name for s in plant.disturbances]
+    for disturbance in load:
+        if disturbance not in known:
+            raise InputError("recovery", name, disturbance, "one of " + (" ".join(known) or "none"))
+    return np.array([load.get(disturbance, 0.0) for disturbance in known])
+
+
+def disturbance_map(model: LinearModel) -> FloatArray:
+    """B_w of xi' = A xi + B v + B_w w: n states of the design model x disturbances."""
+    plant, point = model.plant, model.operating_point
+    kind = ca.MX if plant.tabulated else ca.SX
+    x, w = kind.sym("x", len(plant.states)), kind.sym("w", len(plant.disturbances))
+    acting = w + plant.load(x) if point.loaded else w
+    rate = plant.f(x, kind(ca.DM(point.u)), acting)
+    found = ca.Function("B_w", [x, w], [ca.densify(ca.jacobian(rate, w))])(point.x, 0)
+    return np.array(found)[list(plant.controlled)]
+
+
+@dataclass(frozen=True, eq=False)
+class PushedLoop:
+    """A machine's loop with what its disturbances leave in the machine's states in one sample, n x w."""
+
+    loop: Loop
+    pushed: FloatArray
+
+    @classmethod
+    def of(cls, plant: Plant, controller: Controller, position: float | None = None) -> PushedLoop:
+        """Build the loop at a position of the stroke; None: at the controller's operating point."""
+        point = plant.point(controller.operating_point[0])
+        if position is not None:
+            point = plant.at(**{plant.states[plant.stroke_state].name: position})
+        loop = machine_loop(linearize(plant, point), controller)
+        # Between samples the machine is itself, whoever commutates: A - E C of either model.
+        loaded = linearize(plant, trim(plant, **position_at(plant, point.x)))
+        return cls(loop, sampled_push(loaded, controller.sample_time, len(loop.Ad)))
+
+    def answer(self) -> StepResponse:
+        """Answer a unit step of every disturbance. Raises CheckError for an unstable loop."""
+        law, k = self.loop.control, len(self.loop.control.A)
+        g = np.vstack([self.pushed, np.zeros((k, self.pushed.shape[1]))])
+        C = np.hstack([self.loop.Cd, np.zeros((len(self.loop.Cd), len(law.A)))])
+        return step_response(self.loop.closed, g, C, self.loop.sample_time)
+
+    def compliance(self, w: FloatArray, load: FloatArray) -> ComplexArray:
+        """Outputs per load at frequencies w, rad/s, of a load that is constant throughout each sample: k x p."""
+        z = np.exp(1j * np.asarray(w) * self.loop.sample_time)[:, None, None]
+        loop, law = self.loop, self.loop.control
+        P = np.linalg.solve(
+            z * np.eye(len(loop.Ad)) - loop.Ad, np.hstack([loop.Bd, self.pushed @ load[:, None]])
+        )
+        P = loop.Cd @ P
+        F = law.C @ np.linalg.solve(z * np.eye(len(law.A)) - law.A, law.B_y) + law.D_y
+        m = loop.Bd.shape[1]
+        return np.asarray(np.linalg.solve(np.eye(len(loop.Cd)) - P[..., :m] @ F, P[..., m:])[..., 0])
+
+
+def sampled_push(model: LinearModel, Ts: float, size: int) -> FloatArray:
+    """What unit disturbances leave in a machine's sampled states, of which there are `size`, in one sample.
+
+    A model at its trim, its currents held; stored forces and lags take nothing from outside.
+    """
+    A, B_w, lag = model.A, disturbance_map(model), model.plant.actuator.crossover
+    if model.E.any():
+        A = A - model.E @ model.C
+    if math.isfinite(lag):
+        A, _ = add_lags(A, model.B, lag)
+    B_w = np.vstack([B_w, np.zeros((len(A) - len(B_w), B_w.shape[1]))])
+    _, pushed = sample(A, B_w, Ts)
+    return np.vstack([pushed, np.zeros((size - len(pushed), B_w.shape[1]))])
+
+
+@on_one_thread
+def worst_along(
+    plant: Plant,
+    controller: Controller,
+    load: Mapping[str, float],
+    after: float | None,
+    outputs: tuple[str, ...],
+) -> tuple[float, float]:
+    """The largest deviation of some outputs under a load at PLACES of the travel, and the position, m, of the worst.
+
+    after : s, what is left from then on; None: the largest at all
+    An unstable loop deviates without limit.
+    """
+    size = load_vector(plant, "load", load)
+    chosen = [k for k, s in enumerate(plant.outputs) if s.name in outputs]
+    found = []
+    for position in np.linspace(-plant.travel, plant.travel, PLACES).tolist():
+        try:
+            answer = PushedLoop.of(plant, controller, position).answer().of(size)
+        except CheckError:
+            return math.inf, position
+        reached = answer.largest if after is None else answer.left(after)
+        found.append((float(reached[chosen].max()), position))
+    return max(found)
+
+
+def _deviations(
+    plant: Plant, pushed: PushedLoop, unit_loads: StepResponse, load: FloatArray, after: tuple[float, ...]
+) -> tuple[Deviation, ...]:
+    """What a load does to each output."""
+    answer, Ts = unit_loads.of(load), pushed.loop.sample_time
+    w = np.geomspace(1e-2, np.pi / Ts, 240)
+    peaks, at = largest(lambda some: np.abs(pushed.compliance(some, load)), w)
+    reached, settled, left = answer.largest, answer.within(SHARE), [answer.left(t) for t in after]
+    rounding = 1e-12 * float(reached.max())
+    return tuple(
+        Deviation(
+            output=s.name,
+            unit=s.unit,
+            largest=float(reached[k, 0]) if reached[k, 0] > rounding else 0.0,
+            left=tuple(float(rest[k, 0]) for rest in left),
+            settled=float(settled[k, 0]),
+            final=float(answer.final[k, 0]),
+            compliance=float(peaks[k]),
+            frequency=float(at[k]),
+        )
+        for k, s in enumerate(plant.outputs)
+    )

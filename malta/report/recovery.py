@@ -1,0 +1,49 @@
+"""The table of constant loads from outside: how far they move a machine, and how fast it comes back."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from rich import box
+from rich.table import Table
+from rich.text import Text
+
+from malta.margins.recovery import SHARE, furthest
+from malta.model.data import in_unit
+from malta.model.signals import FINE
+from malta.report.figures.parts import number
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from malta.margins.recovery import Recovery
+    from malta.model.plant import Plant
+
+
+def recovery_table(found: Sequence[Recovery], plant: Plant) -> Table:
+    """Tabulate the output that each load moves furthest: largest deviation, what is left, settling, compliance.
+
+    The peak over frequency is the amplitude of the output under a load of this amplitude.
+
+    Example: `recovery_table(malta.recovery(plant, controller), plant)`
+    """
+    units = {s.name: s.unit for s in plant.disturbances}
+    title = Text("A constant load from outside, and the output that it moves furthest")
+    table = Table(title=title, title_justify="left", title_style="", box=box.SIMPLE_HEAD, pad_edge=False)
+    after = [f"left after {t:g} s" for t in (found[0].after if found else ())]
+    heads = ("load", "output", "moves by", *after, f"{100 * SHARE:g} % after [s]", "peak over w", "at rad/s")
+    for i, head in enumerate(heads):
+        table.add_column(Text(head), justify="left" if i < 2 else "right", no_wrap=i < 2)
+    for recovered, d in furthest(found):
+        load = ", ".join(f"{size:g} {units[name]} {name}" for name, size in recovered.load.items())
+        fine = FINE.get(d.unit, d.unit)
+        # Below a millionth of the largest nothing is left.
+        left = (value if value > 1e-6 * d.largest else 0.0 for value in d.left)
+        lengths = [number(in_unit(value, fine)) for value in (d.largest, *left)]
+        settled = "never" if math.isinf(d.settled) else f"{d.settled:.3g}"
+        peak = number(in_unit(d.compliance, fine))
+        table.add_row(
+            *map(Text, (load, f"{d.output} [{fine}]", *lengths, settled, peak, f"{d.frequency:.3g}"))
+        )
+    return table
