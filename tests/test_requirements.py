@@ -241,3 +241,89 @@ def test_generic_code_names_no_machines_requirements() -> None:
             found = names.findall(file.read_text(encoding="utf-8"))
             allowed = {"payload"}  # a margin in kg, and the example of how to write a requirement
             assert set(found) <= allowed, file
+
+
+LOADS = """
+[specification.recovery.F_x]
+largest = { value = 20, unit = "um" }
+left = [
+    { value = 10, unit = "um", after = { value = 100, unit = "ms" } },
+    { value = 9, unit = "um", after = { value = 0.3, unit = "s" } },
+]
+anywhere = { largest = { value = 25, unit = "um" } }
+
+[specification.recovery.bearing]
+load = { F_y = { value = 1, unit = "N" }, T_x = { value = 45, unit = "mN m" } }
+outputs = ["y1", "y2"]
+largest = { value = 12, unit = "um" }
+
+[specification.recovery.F_z]
+largest = { value = 0.5, unit = "mm" }
+"""
+
+
+def robust_file(folder: Path, specification: str) -> Path:
+    """The flagship with a specification of its own."""
+    text = (ROOT / "design" / "robust.toml").read_text(encoding="utf-8")
+    text = text.replace('"../data/', f'"{(ROOT / "data").as_posix()}/')
+    path = folder / "robust.toml"
+    path.write_text(text[: text.index("[specification]")] + specification, encoding="utf-8")
+    return path
+
+
+def test_loads_from_outside_are_bounded_and_the_search_sees_them_as_the_judge_does(tmp_path: Path) -> None:
+    spec = malta.read_design(robust_file(tmp_path, LOADS))
+    names = [f"recovery F_x {what}" for what in ("largest", "left 0.1 s", "left 0.3 s", "largest anywhere")]
+    assert list(spec.specification) == [*names, "recovery bearing largest", "recovery F_z largest"]
+    assert spec.specification["recovery F_x left 0.1 s"] == pytest.approx(1e-5)
+    bearing = spec.recovery["bearing largest"]
+    assert bearing.load == pytest.approx((0, 1, 0, 0.045, 0, 0))
+    assert bearing.outputs == ("y1", "y2")
+    rows = {r.name: r for r in judge(spec)}
+    (pushed,) = malta.recovery(spec.plant, model_and_controller(spec)[1], {"": {"F_x": 1.0}})
+    assert rows[names[0]].found == pytest.approx(max(d.largest for d in pushed.outputs), rel=1e-9)
+    assert rows[names[2]].found == pytest.approx(max(d.left[1] for d in pushed.outputs), rel=1e-9)
+    assert rows[names[3]].found > 1.02 * rows[names[0]].found
+    assert "at" in rows[names[3]].how
+    assert rows[names[0]].holds
+    assert rows["recovery F_x left 0.1 s"].unit == "m"
+    groups = groups_of(spec)
+    assert len({g.picture for g in groups}) == 3  # no longer mirror images: their bounds differ
+    figures = merge([figures_of(spec, g, spec.weights, 0) for g in groups], at_least_of(spec.plant))
+    for name in spec.specification:  # groups do not see how gravity couples a stroke to a tilt
+        assert figures[name] == pytest.approx(rows[name].found, rel=1e-2), name
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "field"),
+    [
+        ("recovery.F_x]", "recovery.F_w]", "recovery.F_w.load"),
+        ("F_y = {", "F_w = {", "recovery.bearing.load.F_w"),
+        ('"y1", "y2"', '"y1", "w"', "recovery.bearing.outputs"),
+        ('value = 20, unit = "um"', 'value = 20, unit = "N"', "recovery.F_x.largest.unit"),
+        ('value = 20, unit = "um"', 'value = 0, unit = "um"', "recovery.F_x.largest"),
+        ('unit = "ms"', 'unit = "m"', "recovery.F_x.left[0].after.unit"),
+        ("{ largest = { value = 25", "{ largst = { value = 25", "recovery.F_x.anywhere.largst"),
+        ('anywhere = { largest = { value = 25, unit = "um" } }', "anywhere = {}", "recovery.F_x.anywhere"),
+        ("value = 1,", "value = 0,", None),
+    ],
+)
+def test_a_wrong_load_gets_one_sentence(tmp_path: Path, old: str, new: str, field: str | None) -> None:
+    assert old in LOADS
+    path = robust_file(tmp_path, LOADS.replace(old, new))
+    if field is None:  # a torque alone is a load, too
+        assert malta.read_design(path).recovery["bearing largest"].load[1] == 0
+        return
+    assert refusal(lambda: malta.read_design(path), path).field == f"specification.{field}"
+
+
+def test_a_pid_is_judged_by_loads_too(tmp_path: Path) -> None:
+    text = (ROOT / "design" / "halbach_pid.toml").read_text(encoding="utf-8")
+    text = text.replace('"../data/', f'"{(ROOT / "data").as_posix()}/')
+    text = text[: text.index("[specification]")] if "[specification]" in text else text
+    path = tmp_path / "motor.toml"
+    bound = '[specification.recovery.F_x]\nlargest = { value = 1, unit = "mm" }\n'
+    path.write_text(f"{text}\n{bound}", encoding="utf-8")
+    row = next(r for r in judge(malta.read_design(path)) if r.name.startswith("recovery"))
+    assert row.found == pytest.approx(1221e-6, rel=1e-3)
+    assert not row.holds

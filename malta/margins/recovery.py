@@ -22,16 +22,18 @@ import casadi as ca
 import numpy as np
 
 from malta.errors import CheckError, InputError
-from malta.margins.verify import Loop, largest, machine_loop
+from malta.margins.loops import Loop, machine_loop
+from malta.margins.responses import find_peaks
 from malta.model.linearize import LinearModel, linearize
 from malta.model.plant import position_at, trim
-from malta.synthesis.riccati import add_lags, sample
+from malta.synthesis.riccati import sample
 from malta.synthesis.step_response import StepResponse, step_response
 from malta.threads import on_one_thread
 
 if TYPE_CHECKING:
     from malta.model.plant import ComplexArray, FloatArray, Plant
     from malta.synthesis.controller import Controller
+    from malta.synthesis.recovery import RecoveryBound
 
 AFTER = (0.1, 0.3)  # s
 SHARE = 0.01  # of the largest deviation
@@ -177,42 +179,36 @@ class PushedLoop:
 def sampled_push(model: LinearModel, Ts: float, size: int) -> FloatArray:
     """What unit disturbances leave in a machine's sampled states, of which there are `size`, in one sample.
 
-    A model at its trim, its currents held; stored forces and lags take nothing from outside.
+    model : at its trim; between samples its currents are held
     """
-    A, B_w, lag = model.A, disturbance_map(model), model.plant.actuator.crossover
-    if model.E.any():
-        A = A - model.E @ model.C
-    if math.isfinite(lag):
-        A, _ = add_lags(A, model.B, lag)
-    B_w = np.vstack([B_w, np.zeros((len(A) - len(B_w), B_w.shape[1]))])
+    A = model.A - model.E @ model.C if model.E.any() else model.A
+    return push_through(A, disturbance_map(model), Ts, size)
+
+
+def push_through(A: FloatArray, B_w: FloatArray, Ts: float, size: int) -> FloatArray:
+    """Sample x' = A x + B_w w. Lagging and stored forces follow x, `size` states in all, and take nothing from w."""
     _, pushed = sample(A, B_w, Ts)
     return np.vstack([pushed, np.zeros((size - len(pushed), B_w.shape[1]))])
 
 
 @on_one_thread
-def worst_along(
-    plant: Plant,
-    controller: Controller,
-    load: Mapping[str, float],
-    after: float | None,
-    outputs: tuple[str, ...],
-) -> tuple[float, float]:
-    """The largest deviation of some outputs under a load at PLACES of the travel, and the position, m, of the worst.
+def bounded_deviation(
+    plant: Plant, controller: Controller, bound: RecoveryBound, position: float | None = None
+) -> float:
+    """Compute what a bound is of at a position of the stroke; an unstable loop deviates without limit."""
+    chosen = [k for k, s in enumerate(plant.outputs) if s.name in bound.outputs]
+    try:
+        answer = PushedLoop.of(plant, controller, position).answer().of(bound.sizes)
+    except CheckError:
+        return math.inf
+    reached = answer.largest if bound.after is None else answer.left(bound.after)
+    return float(reached[chosen].max())
 
-    after : s, what is left from then on; None: the largest at all
-    An unstable loop deviates without limit.
-    """
-    size = load_vector(plant, "load", load)
-    chosen = [k for k, s in enumerate(plant.outputs) if s.name in outputs]
-    found = []
-    for position in np.linspace(-plant.travel, plant.travel, PLACES).tolist():
-        try:
-            answer = PushedLoop.of(plant, controller, position).answer().of(size)
-        except CheckError:
-            return math.inf, position
-        reached = answer.largest if after is None else answer.left(after)
-        found.append((float(reached[chosen].max()), position))
-    return max(found)
+
+def worst_along(plant: Plant, controller: Controller, bound: RecoveryBound) -> tuple[float, float]:
+    """The same at the worst of PLACES positions of the travel, and that position, m."""
+    positions = np.linspace(-plant.travel, plant.travel, PLACES).tolist()
+    return max((bounded_deviation(plant, controller, bound, z), z) for z in positions)
 
 
 def _deviations(
@@ -221,7 +217,7 @@ def _deviations(
     """What a load does to each output."""
     answer, Ts = unit_loads.of(load), pushed.loop.sample_time
     w = np.geomspace(1e-2, np.pi / Ts, 240)
-    peaks, at = largest(lambda some: np.abs(pushed.compliance(some, load)), w)
+    peaks, at = find_peaks(lambda some: np.abs(pushed.compliance(some, load)), w)
     reached, settled, left = answer.largest, answer.within(SHARE), [answer.left(t) for t in after]
     rounding = 1e-12 * float(reached.max())
     return tuple(

@@ -15,6 +15,7 @@ from malta.report.pages import experiment as experiment
 from malta.report.pages import front as front
 from malta.report.pages import robustness as robustness
 from malta.report.pages import stroke as stroke
+from malta.report.recovery import recovery_table as recovery_table
 from malta.report.tables.campaign import box_text as box_text
 from malta.report.tables.campaign import campaign_tables as campaign_tables
 from malta.report.tables.claims import claims_table as claims_table
@@ -35,4 +36,3 @@ from malta.report.tables.tuning import front_markdown as front_markdown
 from malta.report.tables.tuning import front_rows as front_rows
 from malta.report.tables.tuning import front_table as front_table
 from malta.report.tables.tuning import requirements_table as requirements_table
-from malta.report.recovery import recovery_table as recovery_table

@@ -10,9 +10,9 @@ from rich.table import Table
 from rich.text import Text
 
 from malta.margins.recovery import SHARE, furthest
-from malta.model.data import in_unit
 from malta.model.signals import FINE
 from malta.report.figures.parts import number
+from malta.units import in_unit
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

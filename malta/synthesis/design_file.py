@@ -32,6 +32,7 @@ from malta.synthesis.design_tables import (
     specification_table,
 )
 from malta.synthesis.quantities import bases, numbers, ordered, positive, variances
+from malta.synthesis.recovery import RecoveryBound, recovery_bounds
 from malta.synthesis.requirements import Requirement, requirements_for
 from malta.synthesis.spec import (
     Loads,
@@ -90,7 +91,7 @@ def read_design(path: str | Path) -> Spec:
     return replace(
         spec,
         loads=_loads(content, spec),
-        specification=_specification(content, spec),
+        **_specification(content, spec),
         **_search(content.search, raw, spec),
     )
 
@@ -191,8 +192,11 @@ def _loads(content: DesignFile, spec: Spec) -> Loads | None:
     return Loads(tuple(load.tolist()), tuple(force.tolist()), tuple(sensor.tolist()))
 
 
-def _specification(content: DesignFile, spec: Spec) -> dict[str, float]:
-    """What is asked for, in SI; InputError for what no design could reach or what contradicts itself."""
+def _specification(content: DesignFile, spec: Spec) -> dict[str, Any]:
+    """What is asked for, in SI, and of which loads.
+
+    InputError for what no design could reach or what contradicts itself.
+    """
     table, path = content.specification, spec.path
     if table is None:
         return {}
@@ -207,12 +211,19 @@ def _specification(content: DesignFile, spec: Spec) -> dict[str, float]:
             raise InputError(path, f"specification.{name}", "an unknown requirement", " ".join(able))
     given = specification_table(able.values(), table, path)
     asked: dict[str, float] = {}
+    recovery: dict[str, RecoveryBound] = {}
     for name, requirement in able.items():
-        asked |= _bounds(requirement, getattr(given, name), spec)
+        entry = getattr(given, name)
+        if requirement.form == "loads":
+            bounds = recovery_bounds(entry or {}, spec.plant, path, f"specification.{name}")
+            recovery |= {bound.name: bound for bound in bounds}
+            asked |= {f"{name} {bound.name}": bound.limit for bound in bounds}
+        else:
+            asked |= _bounds(requirement, entry, spec)
     if not asked:
         raise InputError(path, "specification", "nothing to reach", "at least one of " + " ".join(able))
     _require_possible(asked, spec)
-    return asked
+    return {"specification": asked, "recovery": recovery}
 
 
 def _bounds(requirement: Requirement, given: Any, spec: Spec) -> dict[str, float]:

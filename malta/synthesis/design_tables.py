@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 from pydantic import BeforeValidator, Field, StrictBool, StrictInt, StrictStr, create_model
 
+from malta.synthesis.recovery import RecoveryTable
 from malta.synthesis.requirements import Requirement
 from malta.synthesis.spec import Discretization
 from malta.tables import Finite, Quantity, Record, validate
@@ -118,6 +119,8 @@ def _kind(requirement: Requirement) -> Any:
     """What stands in the file behind the key of a requirement."""
     if requirement.form == "switch":
         return StrictBool
+    if requirement.form == "loads":
+        return dict[StrictStr, RecoveryTable]
     if requirement.form in ("outputs", "inputs"):
         return dict[StrictStr, Quantity]
     if requirement.unit == "1":

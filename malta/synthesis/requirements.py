@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol
 
 import numpy as np
@@ -27,11 +27,13 @@ if TYPE_CHECKING:
     from malta.model.plant import ComplexArray, FloatArray, Parameters
     from malta.synthesis.controller import Controller
     from malta.synthesis.lqg import Gains, Linear
+    from malta.synthesis.recovery import RecoveryBound
     from malta.synthesis.spec import Spec
+    from malta.synthesis.step_response import StepResponse
 
 Law = Literal["LQG", "PID"]
 Trade = Literal["force", "motion"]
-Form = Literal["number", "switch", "outputs", "inputs"]
+Form = Literal["number", "switch", "outputs", "inputs", "loads"]
 Indices = Callable[[Plant], Sequence[int]]  # of some of a plant's outputs, or inputs
 
 
@@ -87,6 +89,9 @@ class Design(Protocol):
     def __hash__(self) -> int:
         """By identity, so that a machine's requirements may share what they compute."""
 
+    def deviation(self, bound: RecoveryBound) -> Figure:
+        """Under a constant load from outside, of the machine's linear loop: what the bound is of."""
+
     def fly(self, name: str, **options: Any) -> Any:
         """Run an experiment of the machine by name: simulation.experiments.Experiment."""
 
@@ -114,6 +119,9 @@ class TrialLoop:
     margin: float | None  # None: not asked for
     peak_sensitivity: float
     bandwidth: float  # rad/s
+    # Of a unit load on each of the plant's disturbances: at the operating point, then at places along the travel.
+    answers: tuple[StepResponse, ...] = ()
+    recovery: Mapping[str, RecoveryBound] = field(default_factory=dict)  # what is asked of them
 
     def follow(self, w: float, p: FloatArray, x: ComplexArray) -> ComplexArray:
         """Return the true outputs as complex amplitudes while the reference is p exp(jwt), with states x exp(jwt).
@@ -141,7 +149,7 @@ class Requirement:
     unit : SI; of a requirement by signal each signal's own
     at_least : bounds from below; otherwise from above
     laws : the kinds of controllers that can be asked for it
-    form : what the file holds: a number with its unit, true, or a table of outputs or inputs
+    form : what the file holds: a number with its unit, true, a table of outputs or inputs, or of loads (recovery.py)
     above : numbers without a unit must be larger
     estimate : (loop, signal) -> figure of a trial; None: the search does not look at it
     needs_stability : an unstable loop has no such figure, and fails
@@ -165,6 +173,12 @@ class Requirement:
         """Return the signals that can be bounded one by one; none for one bound of the whole machine."""
         tables = {"outputs": tuple(plant.outputs), "inputs": tuple(plant.inputs)}
         return tables.get(self.form, ())
+
+    def unit_of(self, spec: Spec, signal: str) -> str:
+        """Return the SI unit of a bound: that of its signal, of its load's outputs, or the requirement's own."""
+        if self.form == "loads":
+            return spec.recovery[signal].unit
+        return next((s.unit for s in self.signals(spec.plant) if s.name == signal), self.unit)
 
 
 def requirements_for(plant: Plant) -> dict[str, Requirement]:
@@ -278,6 +292,22 @@ def _force_estimate(loop: TrialLoop, signal: str) -> float | None:
     return _largest(loop.noise.force, loop.inputs, _index(loop.plant.inputs, signal))
 
 
+def _recovery(design: Design, _asked: float, signal: str) -> list[Figure]:
+    return [design.deviation(design.spec.recovery[signal])]
+
+
+def _recovery_estimate(loop: TrialLoop, signal: str) -> float | None:
+    """The deviation of the loop's own outputs; at the ends of the travel where it is asked for anywhere."""
+    bound = loop.recovery[signal]
+    names = [loop.plant.outputs[k].name for k in loop.outputs]
+    chosen = [k for k, name in enumerate(names) if name in bound.outputs]
+    answers = [one.of(bound.sizes) for one in (loop.answers if bound.anywhere else loop.answers[:1])]
+    if not chosen or not any(one.y.any() for one in answers):
+        return None
+    reached = [one.largest if bound.after is None else one.left(bound.after) for one in answers]
+    return max(float(deviation[chosen].max()) for deviation in reached)
+
+
 def _index(signals: Sequence[Signal], name: str) -> list[int]:
     return [k for k, s in enumerate(signals) if s.name == name]
 
@@ -312,6 +342,9 @@ GENERIC = (
         estimate=lambda loop, _: loop.bandwidth,
         needs_stability=False,
         heading="bandwidth",
+    ),
+    Requirement(  # of a constant load from outside: see recovery.py
+        "recovery", _recovery, laws=("LQG", "PID"), form="loads", estimate=_recovery_estimate
     ),
     Requirement("motion", _motion, form="outputs", estimate=_motion_estimate, trade="motion"),
     Requirement("force_noise", _force_noise, form="inputs", estimate=_force_estimate, trade="force"),

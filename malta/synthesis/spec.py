@@ -24,6 +24,7 @@ from malta.units import to_si
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray, Parameters
+    from malta.synthesis.recovery import RecoveryBound
 
 Discretization = Literal["backward-euler", "zoh", "sampled-data"]
 
@@ -148,6 +149,9 @@ class Spec:
     specification: Mapping[str, float] = dataclass_field(
         default_factory=dict
     )  # SI, by requirement: "margin"; by requirement and signal: "noise_motion x"
+    recovery: Mapping[str, RecoveryBound] = dataclass_field(
+        default_factory=dict
+    )  # what the entries "recovery NAME" of the specification bound, by NAME
     search: tuple[Variable, ...] = ()
     delays: tuple[int, ...] = ()  # that the search may choose from
 

@@ -22,6 +22,7 @@ from scipy import sparse
 
 from malta.errors import CheckError, InputError
 from malta.margins.plants import of_plant
+from malta.margins.recovery import disturbance_map, push_through
 from malta.margins.responses import crossing
 from malta.model.linearize import linearize
 from malta.model.plant import trim
@@ -30,13 +31,16 @@ from malta.synthesis.lqg import gains, static_feedforward
 from malta.synthesis.requirements import Noise, TrialLoop, requirements_for
 from malta.synthesis.riccati import add_lags, delay_inputs, sample
 from malta.synthesis.spec import Spec, Weights
+from malta.synthesis.step_response import step_response
 from malta.tuning.noise import covariance, noise_variance
 
 if TYPE_CHECKING:
-    from malta.model.plant import ComplexArray, FloatArray
+    from malta.model.linearize import LinearModel
+    from malta.model.plant import ComplexArray, FloatArray, Plant
     from malta.synthesis.controller import LinearLaw
     from malta.synthesis.lqg import Gains
     from malta.synthesis.requirements import Requirement
+    from malta.synthesis.step_response import StepResponse
 
 STEP = 0.15  # of the multiples of the box at which the machine is sampled; linear between them
 
@@ -71,6 +75,14 @@ class SampledMachine:
         return M
 
 
+class Place(NamedTuple):
+    """The nominal machine at a position of its stroke, with its loads at their trim, and loads from outside."""
+
+    machine: SampledMachine
+    slope: FloatArray  # of v0(z): inputs x outputs
+    pushed: FloatArray  # what unit disturbances leave in the machine's states in a sample
+
+
 @dataclass(frozen=True, eq=False)
 class Group:
     """Some states, inputs and outputs of the machine that close loops by themselves."""
@@ -85,6 +97,9 @@ class Group:
     w: FloatArray  # rad/s
     response: ComplexArray  # of the nominal machine at w
     variance: FloatArray  # of a measurement, m2
+    places: tuple[
+        Place, ...
+    ]  # where loads act from outside: operating point and ends; none where not asked for
     role: tuple[Any, ...]  # what the requirements see in it: stroke, thrust, bounds of its signals
     requirements: tuple[
         tuple[str, str, Requirement], ...
@@ -123,16 +138,16 @@ def groups_of(spec: Spec) -> list[Group]:
     position = spec.operating_point.get(plant.stroke, 0.0)
     along = sorted({position, -plant.travel, plant.travel}) if plant.has_stroke else []
     positions: list[dict[str, float]] = [{plant.stroke: z} for z in along] or [{}]
-    slope = np.zeros((model.B.shape[1], len(model.C)))
-    if plant.has_stroke:
-        slope[:, plant.stroke_output] = static_feedforward(plant).slope(position)
+    slope = _slope(plant, position)
     names = tuple(spec.uncertainty)
     proven = "margin" in spec.specification
     systems = [of_plant(plant, names, at=place) for place in positions] if proven else []
+    trims = _loaded_places(spec)
     found = []
     for i, j, o in _components(spec, positions):
         part = Part(model.A[np.ix_(i, i)], model.B[np.ix_(i, j)], model.C[np.ix_(o, i)])
         nominal = _sample(spec, Part(loaded.A[np.ix_(i, i)], part.B, part.C))
+        places = tuple(_place(spec, *at, i, j, o) for at in trims)
         w = _frequencies(spec.sample_time)
         lag = np.exp(1j * w * spec.sample_time)[:, None, None] * np.eye(len(nominal.Ad)) - nominal.Ad
         found.append(
@@ -147,7 +162,8 @@ def groups_of(spec: Spec) -> list[Group]:
                 w,
                 np.asarray(nominal.Cd @ np.linalg.solve(lag, nominal.Bd)),
                 noise_variance(plant)[o],
-                _role(spec, j, o),
+                places,
+                (*_role(spec, j, o), *_pushes(spec, o, places)),
                 _estimates(spec),
             )
         )
@@ -197,6 +213,43 @@ def _role(spec: Spec, inputs: Any, outputs: Any) -> tuple[Any, ...]:
     if not plant.has_stroke:
         return bounds
     return plant.stroke_output in outputs, plant.thrust_input in inputs, bounds
+
+
+def _slope(plant: Plant, position: float) -> FloatArray:
+    """dv0/dp at a position of the stroke, m x p."""
+    slope = np.zeros((len(plant.inputs), len(plant.outputs)))
+    if plant.has_stroke:
+        slope[:, plant.stroke_output] = static_feedforward(plant).slope(position)
+    return slope
+
+
+def _loaded_places(spec: Spec) -> list[tuple[LinearModel, FloatArray]]:
+    """The machine at its trims where bounds of [specification.recovery] are estimated, each with the slope of v0."""
+    plant = spec.plant
+    along: list[Mapping[str, float]] = [spec.operating_point] if spec.recovery else []
+    if any(bound.anywhere for bound in spec.recovery.values()):
+        along += [{plant.stroke: -plant.travel}, {plant.stroke: plant.travel}]
+    return [(linearize(plant, trim(plant, **at)), _slope(plant, at.get(plant.stroke, 0.0))) for at in along]
+
+
+def _place(spec: Spec, model: LinearModel, slope: FloatArray, i: Any, j: Any, o: Any) -> Place:
+    """The group's part of a place."""
+    part = Part(model.A[np.ix_(i, i)], model.B[np.ix_(i, j)], model.C[np.ix_(o, i)])
+    machine = _sample(spec, part)
+    pushed = push_through(part.A, disturbance_map(model)[i], spec.sample_time, len(machine.Ad))
+    return Place(machine, slope[np.ix_(j, o)], pushed)
+
+
+def _pushes(spec: Spec, outputs: Any, places: Sequence[Place]) -> tuple[Any, ...]:
+    """What differs between mirror images where loads from outside are bounded: loads, bounds, places."""
+    names = {spec.plant.outputs[k].name for k in outputs}
+    bounds = []
+    for bound in spec.recovery.values():
+        push = np.abs(places[0].pushed @ bound.sizes).round(15)
+        if push.any() and names & set(bound.outputs):
+            bounds.append((bound.after or 0.0, bound.anywhere, bound.limit, push.tobytes()))
+    machines = (np.abs(place.machine.Ad).round(12).tobytes() for place in places)
+    return (*sorted(bounds), *machines)
 
 
 def _estimates(spec: Spec) -> tuple[tuple[str, str, Requirement], ...]:
@@ -277,6 +330,10 @@ def figures_of(spec: Spec, group: Group, weights: Weights, delay: int) -> dict[s
     if not (np.isfinite(closed).all() and np.abs(np.linalg.eigvals(closed)).max() < 1):
         return {}
     peak, bandwidth = _response(group, g, steady, Ts)
+    try:
+        answers = tuple(_answer(place, law, Ts) for place in group.places)
+    except CheckError:
+        return {}
     loop = TrialLoop(
         plant=spec.plant,
         sample_time=Ts,
@@ -291,6 +348,8 @@ def figures_of(spec: Spec, group: Group, weights: Weights, delay: int) -> dict[s
         margin=None if group.corners is None else _margin(group.corners, law),
         peak_sensitivity=peak,
         bandwidth=bandwidth,
+        answers=answers,
+        recovery=spec.recovery,
     )
     figures = {}
     for name, signal, requirement in group.requirements:
@@ -299,6 +358,15 @@ def figures_of(spec: Spec, group: Group, weights: Weights, delay: int) -> dict[s
         if value is not None:
             figures[name] = value
     return figures
+
+
+def _answer(place: Place, law: LinearLaw, Ts: float) -> StepResponse:
+    """Outputs of a group under a unit step of each load from outside. Raises CheckError for an unstable loop."""
+    closed = place.machine.close(law._replace(D_y=law.D_y + place.slope))
+    k = len(law.A)
+    pushed = np.vstack([place.pushed, np.zeros((k, place.pushed.shape[1]))])
+    C = np.hstack([place.machine.Cd, np.zeros((len(place.machine.Cd), k))])
+    return step_response(closed, pushed, C, Ts)
 
 
 def _response(group: Group, g: Gains, law: LinearLaw, Ts: float) -> tuple[float, float]:

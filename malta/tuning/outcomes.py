@@ -12,6 +12,7 @@ import numpy as np
 
 from malta.errors import InputError
 from malta.margins.loops import machine_loop
+from malta.margins.recovery import bounded_deviation, worst_along
 from malta.margins.verify import BANDWIDTHS, verify
 from malta.simulation import references
 from malta.simulation.catalogue import experiment
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
     from malta.simulation.experiments import Experiment
     from malta.simulation.trajectory import Trajectory
     from malta.synthesis.controller import Controller
+    from malta.synthesis.recovery import RecoveryBound
     from malta.synthesis.spec import Spec
 
 HOLD, SAMPLES = 1.0, 2000  # s, and samples at the least, of the simulated rest; its second half counts
@@ -114,6 +116,13 @@ class SynthesizedDesign:
         whole = whole_machine(self.model, self.controller, loads_of(self.spec))
         return loop_figures(self.spec, whole, machine_loop(self.model, self.controller))
 
+    def deviation(self, bound: RecoveryBound) -> Figure:
+        """Under a constant load from outside, at the operating point or at the worst of some places of the travel."""
+        if bound.anywhere:
+            worst, position = worst_along(self.plant, self.controller, bound)
+            return Figure(worst, f"linear loop, at {1e3 * position:.3g} mm")
+        return Figure(bounded_deviation(self.plant, self.controller, bound), "linear loop")
+
     def fly(self, name: str, **options: Any) -> Experiment:
         """Run an experiment of the machine. Raises KeyboardInterrupt when Ctrl-C cut the experiment short."""
         e = experiment(name, self.plant, self.controller, **options)
@@ -143,7 +152,7 @@ def judge(spec: Spec) -> tuple[Outcome, ...]:
         if base_of(name) not in known:
             raise InputError(spec.path, f"specification.{name}", "an unknown requirement", " ".join(known))
         requirement, signal = known[base_of(name)], name.partition(" ")[2]
-        unit = next((s.unit for s in requirement.signals(spec.plant) if s.name == signal), requirement.unit)
+        unit = requirement.unit_of(spec, signal)
         outcomes += [
             Outcome(name, asked, figure.value, unit, figure.source, requirement.at_least)
             for figure in _measure(requirement, design, asked, signal)

@@ -77,6 +77,7 @@ def problem_sha256(spec: Spec) -> str:
     """Digest everything that the figures of a trial depend on, and what is searched."""
     asked, searched = dict(spec.specification), (spec.search, spec.delays)
     loads = asdict(spec.loads) if spec.loads else None
+    pushes = [asdict(bound) for bound in spec.recovery.values()]
     settings = (lqg.FRONT, DIGITS, groups.STEP)
-    content = [repr(spec.parameters), asked, loads, searched, spec.sha256, *settings]
+    content = [repr(spec.parameters), asked, loads, pushes, searched, spec.sha256, *settings]
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()

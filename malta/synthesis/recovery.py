@@ -1,0 +1,161 @@
+"""[specification.recovery]: how far a constant load from outside may move a machine, and what may be left of it.
+
+[specification.recovery.F_x]                  # the name of a disturbance: 1 N or 1 N m of it
+largest = { value = 9, unit = "um" }          # of every output that has such a unit
+left = [{ value = 0.5, unit = "um", after = { value = 0.1, unit = "s" } }]
+
+[specification.recovery.F_x.anywhere]         # the same anywhere in the travel
+largest = { value = 10, unit = "um" }
+
+[specification.recovery.bearing]              # any other name: a load at a point is forces and torques together
+load = { F_x = { value = 1, unit = "N" }, T_y = { value = -45, unit = "mN m" } }
+outputs = ["x1", "x2"]                        # these alone
+largest = { value = 11, unit = "um" }
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import numpy as np
+from pydantic import Field, StrictStr
+
+from malta.errors import InputError
+from malta.synthesis.quantities import positive
+from malta.tables import Quantity, Record
+from malta.units import to_si
+
+if TYPE_CHECKING:
+    from malta.model.plant import FloatArray, Plant, Signal
+
+
+class LeftTable(Quantity):
+    """An entry of `left`: a bound, and from when on it holds."""
+
+    after: Quantity
+
+
+class BoundsTable(Record):
+    """[specification.recovery.NAME.anywhere]: bounds of the deviation."""
+
+    largest: Quantity | None = None
+    left: list[LeftTable] = Field(default_factory=list)
+
+
+class RecoveryTable(BoundsTable):
+    """[specification.recovery.NAME]: a load, and what it may do."""
+
+    load: Annotated[dict[StrictStr, Quantity], Field(min_length=1)] | None = None
+    outputs: Annotated[list[StrictStr], Field(min_length=1)] | None = None
+    anywhere: BoundsTable | None = None
+
+
+@dataclass(frozen=True)
+class RecoveryBound:
+    """A bound of what a constant load from outside does to some outputs."""
+
+    name: str  # as "F_x left 0.1 s anywhere"
+    load: tuple[float, ...]  # N or N m, of each of the plant's disturbances
+    after: float | None  # s, the largest deviation from then on; None: the largest at all
+    anywhere: bool  # in the travel; else at the operating point
+    outputs: tuple[str, ...]  # each of these
+    unit: str  # of the bound and the outputs, SI
+    limit: float
+
+    @property
+    def sizes(self) -> FloatArray:
+        """The load as an array."""
+        return np.array(self.load)
+
+
+def recovery_bounds(
+    given: Mapping[str, RecoveryTable], plant: Plant, path: Path, field: str
+) -> list[RecoveryBound]:
+    """Read the tables of [specification.recovery], in SI units.
+
+    Raises InputError for an unknown disturbance or output, a bound in a unit of no output, nothing to bound, and
+    bounds in the travel of a machine without a stroke.
+    """
+    return [
+        bound
+        for name, table in given.items()
+        for bound in _bounds_of(name, table, plant, path, f"{field}.{name}")
+    ]
+
+
+def _bounds_of(
+    name: str, table: RecoveryTable, plant: Plant, path: Path, field: str
+) -> Iterator[RecoveryBound]:
+    """The bounds of one load."""
+    if not re.fullmatch(r"\S+", name):
+        raise InputError(path, field, repr(name), "a name without spaces")
+    load, signals = _load(name, table, plant, path, field), _outputs(table, plant, path, field)
+    if table.anywhere is not None and not plant.has_stroke:
+        raise InputError(path, f"{field}.anywhere", f"a {plant.name}", "a machine with a stroke")
+    tables: list[tuple[BoundsTable, str, bool]] = [(table, field, False)]
+    tables += [] if table.anywhere is None else [(table.anywhere, f"{field}.anywhere", True)]
+    for bounds, where, anywhere in tables:
+        if bounds.largest is None and not bounds.left:
+            raise InputError(path, where, "nothing to bound", "largest, left or both")
+        for quantity, after, at in _entries(bounds, path, where):
+            unit = _unit(quantity, signals, path, at)
+            limit = positive(to_si(quantity.value, quantity.unit, unit, path, at), path, at, unit)
+            words = [name, "largest" if after is None else f"left {after:g} s", *["anywhere"] * anywhere]
+            bounded = tuple(s.name for s in signals if s.unit == unit)
+            yield RecoveryBound(" ".join(words), load, after, anywhere, bounded, unit, limit)
+
+
+def _entries(bounds: BoundsTable, path: Path, field: str) -> Iterator[tuple[Quantity, float | None, str]]:
+    """Each bound with the time, s, from when on it holds, and its place in the file."""
+    if bounds.largest is not None:
+        yield bounds.largest, None, f"{field}.largest"
+    for k, left in enumerate(bounds.left):
+        at = f"{field}.left[{k}]"
+        after = to_si(left.after.value, left.after.unit, "s", path, f"{at}.after")
+        yield left, positive(after, path, f"{at}.after", "s"), at
+
+
+def _load(name: str, table: RecoveryTable, plant: Plant, path: Path, field: str) -> tuple[float, ...]:
+    """The load by disturbance: that of the table, or 1 of the disturbance whose name it has."""
+    units = {s.name: s.unit for s in plant.disturbances}
+    known = " ".join(units) or "none"
+    if table.load is None:
+        if name not in units:
+            raise InputError(
+                path, f"{field}.load", "nothing", f"a load, or the name of a disturbance: {known}"
+            )
+        return tuple(float(disturbance == name) for disturbance in units)
+    sizes = {}
+    for disturbance, q in table.load.items():
+        if disturbance not in units:
+            raise InputError(path, f"{field}.load.{disturbance}", "an unknown disturbance", f"one of {known}")
+        sizes[disturbance] = to_si(q.value, q.unit, units[disturbance], path, f"{field}.load.{disturbance}")
+    if not any(sizes.values()):
+        raise InputError(path, f"{field}.load", "nothing but zeros", "a load")
+    return tuple(sizes.get(disturbance, 0.0) for disturbance in units)
+
+
+def _outputs(table: RecoveryTable, plant: Plant, path: Path, field: str) -> Sequence[Signal]:
+    """The outputs that are bounded."""
+    known = {s.name: s for s in plant.outputs}
+    for name in table.outputs or ():
+        if name not in known:
+            raise InputError(path, f"{field}.outputs", repr(name), "outputs: " + " ".join(known))
+    return [known[name] for name in table.outputs or known]
+
+
+def _unit(quantity: Quantity, signals: Sequence[Signal], path: Path, field: str) -> str:
+    """The SI unit of the outputs that a bound is of: the one that its own unit converts to."""
+    units = list(dict.fromkeys(s.unit for s in signals))
+    for unit in units[:-1]:
+        try:
+            to_si(1.0, quantity.unit, unit, path, field)
+        except InputError:
+            continue
+        return unit
+    to_si(1.0, quantity.unit, units[-1], path, field)
+    return units[-1]
