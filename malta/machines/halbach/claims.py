@@ -197,7 +197,7 @@ CLOSED_LOOP: tuple[Row, ...] = (
     ),
     Row("the same of a quintic in 0.3 s", "percent", "{:.1f}", partial(case_merit, "step", 1, 0)),
     Row(
-        "Fig. 9: a JUMP is within 5 % after",
+        "Fig. 9: a jump is within 5 % after",
         "s",
         "{:.2f}",
         partial(case_merit, "step", 0, 1),
