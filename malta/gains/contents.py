@@ -23,6 +23,7 @@ from malta.synthesis.controller import (
     Limits,
     Noise,
     disturbances,
+    lagging_forces,
     stored_forces,
 )
 
@@ -34,7 +35,7 @@ class _Layout(NamedTuple):
     """The signals of a controller, as its file names them and its machine has them."""
 
     plant: Plant
-    states: tuple[Signal, ...]  # mechanical states, forces stored for the delay, observed disturbances
+    states: tuple[Signal, ...]  # mechanical states, lagging forces, those stored for the delay, disturbances
     observed: tuple[Signal, ...]  # the last of the states: disturbances that the filter observes
     grid: int  # positions of the table of v0
 
@@ -169,7 +170,10 @@ def _observed(
     if (n - n0) % m:
         raise InputError(path, "signals.states", f"{n} states", f"{n0} and a multiple of {m} stored forces")
     observed = disturbances(forces) if states[-m:] == disturbances(forces) else ()
-    stored = stored_forces(forces, (n - n0 - len(observed)) // m) + observed
+    lagging = lagging_forces(forces) if states[n0 : n0 + m] == lagging_forces(forces) else ()
+    if lagging and file.law is None:
+        raise InputError(path, "signals.states", _names(lagging), "a table law, as version 2 has it")
+    stored = lagging + stored_forces(forces, (n - n0 - len(lagging + observed)) // m) + observed
     if states[n0:] != stored:
         raise InputError(path, "signals.states", _names(states[n0:]), f"stored forces, as {_names(stored)}")
     if observed and any(any(row) for row in file.gains.Ki):

@@ -32,7 +32,8 @@ A file of version 2 has one more table, and may have another:
                      noise [p], dead_time [s], as model/linear.py takes them
 
 There plant.parameters and its terms are null without parameters, feedforward.rate without rates among the states, and
-limits.current and limits.force without limits. The states of a law of errors are its own, then its last errors.
+limits.current and limits.force without limits. The states of a law of errors are its own, then its last errors. An
+LQG's may hold forces behind the lag of the current loops, as fx_B1[i], between the mechanical states and stored forces.
 Files without these tables keep version 1.
 
 The JSON is the specification: matrices row by row with round-trip precision, no time stamp, so the same inputs give the
@@ -82,7 +83,7 @@ def document(controller: Controller, margins: Margins) -> dict[str, Any]:
     require_stable(margins, controller.name)
     c = controller
     units, linear = units_of(c.parameters), is_linear(c.parameters)
-    extended = linear or c.tracks == "errors" or not c.feedforward.rate.size
+    extended = linear or c.tracks == "errors" or not c.feedforward.rate.size or bool(c.lagging)
     tables: dict[str, Any] = {
         "schema": SCHEMA,
         "version": 2 if extended else 1,

@@ -243,7 +243,12 @@ def _natural_frequencies(model: LinearModel, controller: Controller) -> dict[str
     n = model.plant.coordinates
     if not n or controller.tracks == "errors":
         return {}
-    closed = model.force_map @ controller.K[:, :n] - model.stiffness
+    K = controller.K[:, :n]
+    if controller.lagging:  # at rest forces are what is commanded: v = -K q - K_f v
+        m, known = len(K), controller.lagging + controller.delay
+        under_way = controller.K[:, len(controller.A) :][:, : m * known]
+        K = np.linalg.solve(np.eye(m) + under_way.reshape(m, known, m).sum(axis=1), K)
+    closed = model.force_map @ K - model.stiffness
     w_n = np.sqrt(np.maximum(eigenvalues(closed).real, 0))
     return {"w_n_max": float(w_n.max()), "w_n_min": float(w_n.min())}
 

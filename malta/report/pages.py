@@ -42,6 +42,7 @@ def design_page(
 ) -> Group:
     """A page about a design: its loop, its margins, and the experiment that is the machine's main job."""
     made = f"{spec.discretization}, {_rate_text(spec.sample_time)}, delay {spec.delay} in the design model"
+    made += ", with the lag of the current loops" if spec.current_lag else ""
     if spec.pid is not None:
         made = f"PID, {_rate_text(spec.sample_time)}"
     return Group(

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import casadi as ca
 import numpy as np
+from scipy.signal import lfilter
 from scipy.special import erf
 
 from malta.errors import InputError
@@ -50,18 +51,21 @@ def inputs_of(run: Simulation) -> Inputs:
 def sample_inputs(run: Simulation, motion: references.Motion, t: FloatArray) -> FloatArray:
     """The inputs of the samples at t for a reference, in the order of layout_of(...).given.
 
-    v_past holds the stored forces of the samples before: the feedforward, and the force that currents commutated for
-    the reference add to it, which is in the row of the newest stored force in Ad.
+    v_past holds the forces behind the lag of the design model, then the stored forces of the samples before: the
+    feedforward, and the force that currents commutated for the reference add to it, which is in the row of the newest
+    stored force in Ad.
     """
     plant, c, scenario, setup = run
     v_ff = feedforward(c, motion, scenario.feedforward)
     stored = v_ff
     if c.delay:
         n, m = len(c.A), len(c.forces)
-        newest = n + m * (c.delay - 1)
+        newest = n + m * (c.lagging + c.delay - 1)
         states = evaluate(state_reference(plant_of(c.parameters)).map(len(t)), motion.p, motion.dp)[0]
         stored = v_ff + states @ c.Ad[newest : newest + m, :n].T
     past = [np.vstack([np.repeat(stored[:1], age, axis=0), stored[:-age]]) for age in range(c.delay, 0, -1)]
+    if c.lagging:
+        past.insert(0, lagging_references(c, v_ff))
     if c.observed:
         past.append(np.zeros_like(v_ff))
     parts = {"p_ref": motion.p, "dp_ref": motion.dp, "v_ff": v_ff}
@@ -74,6 +78,24 @@ def sample_inputs(run: Simulation, motion: references.Motion, t: FloatArray) -> 
         parts |= _fault_flags(plant, scenario, sizes, t)
     parts |= {name: np.zeros((len(t), size)) for name, size in sizes.items() if name not in parts}
     return np.hstack([parts[name] for name in sizes])
+
+
+def lagging_references(c: Controller, v_ff: FloatArray) -> FloatArray:
+    """The forces behind the lag of the design model while v_ff is commanded, k x m; at rest before the first sample."""
+    decay = _decay(c)
+    acting = np.vstack([np.repeat(v_ff[:1], c.delay, axis=0), v_ff])[: len(v_ff)]
+    lagging: FloatArray = lfilter([0.0, 1 - decay], [1.0, -decay], acting, axis=0, zi=v_ff[:1])[0]
+    return lagging
+
+
+def _decay(c: Controller) -> float:
+    """The share of a lagging force that is left after a sample."""
+    return float(c.Ad[len(c.A), len(c.A)])
+
+
+def samples_of_memory(c: Controller) -> int:
+    """Samples after which a command no longer shows in the references of the states."""
+    return c.delay + (math.ceil(math.log(1e-12) / math.log(_decay(c))) if c.lagging else 0)
 
 
 def feedforward(c: Controller, motion: references.Motion, choice: FeedforwardChoice = "axial") -> FloatArray:
@@ -195,11 +217,12 @@ def initial_values(run: Simulation, first: FloatArray) -> tuple[FloatArray, ...]
         if c.tracks == "states":
             xi_pred[: len(design)] = x[list(plant.controlled)]
         held = c.feedforward.at(position_in(plant, x))
-        if c.delay:  # the stored forces of the samples before, with currents commutated for this position
-            n, m = len(design), len(held)
-            pull = c.Ad[n + m * (c.delay - 1) : n + m * c.delay, :n] @ (xi_pred[:n] - moving)
-            stored = first[2 * p + m :][: m * c.delay]
-            xi_pred[n : n + m * c.delay] = stored + np.tile(pull, c.delay)
+        n, m, known = len(design), len(held), c.lagging + c.delay
+        if known:  # the forces of the samples before, with currents commutated for this position
+            newest = n + m * (known - 1)
+            pull = c.Ad[newest : newest + m, :n] @ (xi_pred[:n] - moving)
+            stored = first[2 * p + m :][: m * known]
+            xi_pred[n : n + m * known] = stored + np.tile(pull, known)
         current[:] = evaluate(_holding_currents(plant, believed), x, held)[0].ravel()
     return x, xi_pred, current
 

@@ -24,6 +24,7 @@ from malta.simulation.inputs import (
     initial_values,
     inputs_of,
     sample_inputs,
+    samples_of_memory,
     sensor_noise,
 )
 from malta.simulation.period import initial_state_function
@@ -129,7 +130,7 @@ def _correct(simulation: Simulation, inputs: Inputs, ahead: slice, offset: Float
         where, expected = f"scenario {simulation.scenario.name}", f"{motion.p.shape[1]} numbers"
         raise InputError(where, "correction", f"shape {offset.shape}", expected)
     # The feedforward that is under way needs the samples before, with the reference that they had.
-    before = min(ahead.start, simulation.controller.delay)
+    before = min(ahead.start, samples_of_memory(simulation.controller))
     span = slice(ahead.start - before, ahead.stop)
     p_ref = motion.p[span] + offset
     p_ref[:before] = given[span.start : ahead.start, : len(offset)]

@@ -28,6 +28,7 @@ from malta.simulation.period import period_of
 from malta.simulation.scenario import Simulation
 from malta.simulation.substep import runge_kutta
 from malta.synthesis.controller import Controller, Noise
+from malta.synthesis.riccati import sample
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
@@ -47,6 +48,7 @@ def observer(simulation: Simulation, substeps: int) -> Observer:
     plant, c, scenario, setup = simulation
     kind, errors = scenario.estimator, scenario.sensor_errors
     filter_ = _kalman_filter(c, _noise_of(plant, c, kind))
+    force = _acting_force(c)
     predict = _nonlinear_prediction(c) if kind == "extended" else _linear_prediction(c)
     jacobian, output = _measurement(c)
 
@@ -59,16 +61,15 @@ def observer(simulation: Simulation, substeps: int) -> Observer:
     commands = slice(edges["v"], edges["v"] + sizes["v"])
     axis = plant_of(c.parameters).leading_output
     n = len(c.A)
-    # v - v0 and v0 of the last samples, the oldest first
-    sent: list[FloatArray] = [np.zeros(len(c.forces))] * c.delay
-    loads: list[FloatArray] = []
+    under_way = np.zeros(len(c.Ad) - n)  # v - v0 behind the lag, and of the last samples, the oldest first
+    loads: list[FloatArray] = []  # v0 of the last samples
     started = False
 
     @np.errstate(all="ignore")  # a filter that diverges ends the run with a verdict
     def run(
         engine: Engine, machine: Plant, state: FloatArray, given: FloatArray, noise: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        nonlocal started
+        nonlocal started, under_way
         rows = []
         sense, none = sensors(machine), np.zeros((0, 0))
         for k in range(len(given)):
@@ -81,17 +82,17 @@ def observer(simulation: Simulation, substeps: int) -> Observer:
             except (np.linalg.LinAlgError, ValueError):  # NaN in the estimate or its covariance
                 filter_.x = np.full(n, np.nan)
             now = given[k : k + 1].copy()
-            now[0, -len(c.states) :] = np.concatenate([filter_.x, *sent])
+            now[0, -len(c.states) :] = np.concatenate([filter_.x, under_way])
             state, row = engine.run(0, state, now, noise[k : k + 1], none)
             rows.append(row)
             if not np.isfinite(row).all():
                 break
             v0 = c.feedforward.at(y[axis])
-            sent.append(row[0, commands] - v0)
+            sent = row[0, commands] - v0
+            acting = force(under_way, sent)
+            under_way = c.Ad[n:, n:] @ under_way + c.Bd[n:] @ sent
             loads.append(v0)
-            filter_.x, filter_.F = predict(
-                filter_.x, sent.pop(0), loads.pop(0) if len(loads) > c.delay else v0
-            )
+            filter_.x, filter_.F = predict(filter_.x, acting, loads.pop(0) if len(loads) > c.delay else v0)
             filter_.P = filter_.F @ filter_.P @ filter_.F.T + filter_.Q
         return state, np.concatenate(rows)
 
@@ -116,7 +117,7 @@ def _kalman_filter(c: Controller, noise: Noise) -> Any:
     """filterpy's filter with the covariances of the gain file: process noise acts through B, as the forces do."""
     n, p = len(c.A), len(c.measurements)
     kalman = ExtendedKalmanFilter(dim_x=n, dim_z=p, dim_u=len(c.forces))
-    B = (c.Ad[:n, n : n + len(c.forces)] if c.delay else c.Bd)[:n]
+    B = _constant_force_map(c)
     kalman.Q = B * noise.process @ B.T
     kalman.R = np.diag(noise.sensor)
     kalman.x = np.zeros(n)
@@ -140,10 +141,27 @@ def _start_filter(kalman: Any, c: Controller, y: FloatArray) -> None:
 
 def _linear_prediction(c: Controller) -> Callable[..., tuple[FloatArray, FloatArray]]:
     """(x, v, v0) -> A x + B v, and A."""
-    n, m = len(c.A), len(c.forces)
+    n, B = len(c.A), _constant_force_map(c)
     A = c.Ad[:n, :n]
-    B = c.Ad[:n, n : n + m] if c.delay else c.Bd
     return lambda x, v, _: (A @ x + B @ v, A)
+
+
+def _constant_force_map(c: Controller) -> FloatArray:
+    """What forces that are constant over a sample add to the mechanical states: n x m."""
+    n, m = len(c.A), len(c.forces)
+    if c.lagging:
+        return sample(c.A, c.B, c.sample_time)[1]
+    return c.Ad[:n, n : n + m] if c.delay else c.Bd[:n]
+
+
+def _acting_force(c: Controller) -> Callable[[FloatArray, FloatArray], FloatArray]:
+    """(forces under way, force sent) -> forces over the next sample; of lagging forces a constant equivalent."""
+    n, m = len(c.A), len(c.forces)
+    if not c.lagging:
+        return lambda under_way, sent: under_way[:m] if c.delay else sent
+    back = np.linalg.pinv(_constant_force_map(c))
+    A, B = back @ c.Ad[:n, n:], back @ c.Bd[:n]
+    return lambda under_way, sent: A @ under_way + B @ sent
 
 
 def _nonlinear_prediction(c: Controller) -> Callable[..., tuple[FloatArray, FloatArray]]:

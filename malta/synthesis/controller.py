@@ -13,10 +13,11 @@ At every sample:
   4. v = saturate(v_fb + v_ff + v0(z)),         v_ff = inertia p*'' + speed p*', z the measured stroke
   5. currents = those that make v where y says the machine is, held until the next sample
   6. xi_pred = Ad xi_hat + Bd (v - v0(z))
-The mechanical states stand first in xi. Where the design models a delay of d samples, forces of the last d samples
-follow, the oldest first: v - v0, and what currents commutated for an old reading make beside it. Their reference is
-what was commanded then. Last come constant forces of disturbance, where the filter observes them, with zero for a
-reference.
+The mechanical states stand first in xi. Where the design models the lag of the current loops, the forces that act at
+the sample follow: v - v0 behind first-order lags. Where it models a delay of d samples, forces of the last d samples
+follow, the oldest first: v - v0, and what currents commutated for an old reading make beside it. The reference of both
+is what was commanded then, lagging. Last come constant forces of disturbance, where the filter observes them, with
+zero for a reference.
 
 A PID controller is the same law: its filter takes positions as measured and rates as filtered differences,
 Ad = diag(1, a), Bd = 0, L = (P^-1, (1 - a) P^-1 / Ts), and it has neither a cost nor noise that it was designed for.
@@ -170,7 +171,8 @@ class Controller:
     def __repr__(self) -> str:
         return (
             f"Controller({self.name!r}, preset {self.parameters.preset!r}, {len(self.states)} states, "
-            f"{len(self.forces)} forces, {1e-3 / self.sample_time:g} kHz, delay {self.delay})"
+            f"{len(self.forces)} forces, {1e-3 / self.sample_time:g} kHz, delay {self.delay}"
+            f"{', current lag' if self.lagging else ''})"
         )
 
     @property
@@ -178,7 +180,13 @@ class Controller:
         """Samples of delay in the design model; 0 of a law of errors, which says nothing of its model."""
         if self.tracks == "errors":
             return 0
-        return (len(self.Ad) - len(self.A)) // len(self.forces) - self.observed
+        return (len(self.Ad) - len(self.A)) // len(self.forces) - self.lagging - self.observed
+
+    @property
+    def lagging(self) -> int:
+        """1 where forces behind the lag of the current loops are among the states, else 0."""
+        n, lagging = len(self.A), lagging_forces(self.forces)
+        return int(self.tracks == "states" and self.states[n : n + len(lagging)] == lagging)
 
     @property
     def observed(self) -> int:
@@ -216,6 +224,11 @@ class LinearLaw(NamedTuple):
 def stored_forces(inputs: tuple[Signal, ...], delay: int) -> tuple[Signal, ...]:
     """The states that hold the forces of the last `delay` samples, the oldest first."""
     return tuple(Signal(f"{s.name}[k-{age}]", s.unit) for age in range(delay, 0, -1) for s in inputs)
+
+
+def lagging_forces(inputs: tuple[Signal, ...]) -> tuple[Signal, ...]:
+    """The states that hold the forces behind the lag of the current loops."""
+    return tuple(Signal(f"{s.name}[i]", s.unit) for s in inputs)
 
 
 def disturbances(inputs: tuple[Signal, ...]) -> tuple[Signal, ...]:

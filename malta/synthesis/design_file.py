@@ -85,6 +85,7 @@ def read_design(path: str | Path) -> Spec:
         discretization=content.discretization,
         delay=content.delay,
         current_loop_delay=content.current_loop_delay,
+        current_lag=content.current_lag,
         law=_law(content, plant, path),
         uncertainty=dict(content.uncertainty),
     )
@@ -99,6 +100,7 @@ def read_design(path: str | Path) -> Spec:
 def _fingerprint(content: DesignFile) -> str:
     """SHA-256 of all that shapes the design."""
     other = {"summary", "machine", "cost", "specification", "search"}
+    other |= set() if content.current_lag else {"current_lag"}  # it came later, and changes no older design
     shaping = json.dumps(content.model_dump(exclude=other, exclude_none=True), sort_keys=True)
     return hashlib.sha256(shaping.encode()).hexdigest()
 
@@ -122,12 +124,13 @@ def _law(content: DesignFile, plant: Plant, path: Path) -> Weights | Pid:
 
 
 LQG = ("discretization", "delay", "weights", "bases", "noise")
+ONLY_LQG = (*LQG, "current_lag")
 
 
 def _require_law(content: DesignFile, raw: Mapping[str, Any], path: Path) -> None:
     """InputError unless the file describes an LQG or a PID, whole and alone."""
-    for name in LQG:
-        if content.pid is None and name not in raw:
+    for name in ONLY_LQG:
+        if content.pid is None and name in LQG and name not in raw:
             raise InputError(path, name, "nothing", "this key")
         if content.pid is not None and name in raw:
             raise InputError(path, name, "this key beside [pid]", "one of them: an LQG, or a PID")

@@ -91,6 +91,7 @@ class DesignFile(Record):
     discretization: Discretization = "sampled-data"
     delay: Annotated[StrictInt, Field(ge=0, le=10)] = 0
     current_loop_delay: StrictBool
+    current_lag: StrictBool = False
     operating_point: dict[StrictStr, Quantity]
     weights: WeightsTable | None = None
     bases: BasesTable | None = None

@@ -11,6 +11,9 @@ Three ways to a sampled controller:
 The integrals are the controller's own sums, e+ = e + Ts (p* - y), so their weight is a sum in both sampled ways.
 Noise is given for one sample; held over it (forces) or spread over it (intensity = variance x Ts).
 
+Both sampled ways may have the lag of the current loops in the model: forces are then states, which the regulator feeds
+back and the filter knows from the commands.
+
 Both sampled ways know what is held between samples: the currents, commutated for the last reading (E of the linear
 model), so that the sampled machine hangs on their spring. In place of integrals the filter may observe a constant force
 of disturbance on each input, which the regulator takes off again.
@@ -37,10 +40,12 @@ from malta.synthesis.controller import (
     Limits,
     Noise,
     disturbances,
+    lagging_forces,
     stored_forces,
 )
 from malta.synthesis.riccati import (
     add_integrals,
+    add_lags,
     care,
     dare,
     delay_inputs,
@@ -144,6 +149,22 @@ def continuous_poles(model: LinearModel, weights: Weights) -> dict[str, ComplexA
     return {name: np.sort_complex(values) for name, values in poles.items()}
 
 
+class Lagged(NamedTuple):
+    """A linear model whose forces follow their commands as first-order lags, and are states after x."""
+
+    A: FloatArray
+    B: FloatArray
+    C: FloatArray
+    E: FloatArray
+
+
+def with_lags(model: Linear, rate: float) -> Lagged:
+    """The model with lags rate / (s + rate) before its inputs, rate in rad/s."""
+    A, B = add_lags(model.A, model.B, rate)
+    C = np.hstack([model.C, np.zeros((len(model.C), B.shape[1]))])
+    return Lagged(A, B, C, np.zeros((len(A), len(C))))
+
+
 class Held(NamedTuple):
     """A machine between samples, its currents held: x' = A x + B (v + H y_k), y_k the last reading."""
 
@@ -171,27 +192,38 @@ def sampled_model(model: Linear, Ts: float, delay: int = 0) -> tuple[FloatArray,
 
 
 def gains(
-    model: Linear, weights: Weights, Ts: float, discretization: Discretization, delay: int = 0
+    model: Linear,
+    weights: Weights,
+    Ts: float,
+    discretization: Discretization,
+    delay: int = 0,
+    lag: float | None = None,
 ) -> Gains:
     """LQR with integrals and Kalman filter of a model, sampled. Raises CheckError as riccati.dare.
 
-    Without delay, integrals and disturbances K is control.dlqr(Ad, Bd, Qd, Rd, Nd)[0] with the sampled weights of
+    lag : rad/s, of the forces behind their commands, which are then states of the design model; None: no lag
+
+    Without delay, lag, integrals and disturbances K is control.dlqr(Ad, Bd, Qd, Rd, Nd)[0] with the sampled weights of
     riccati.sample_cost, and Ad L is the gain of control.dlqe(Ad, 1, Cd, Wd, V)[0], a predictor's. control.dlqr with
     integral_action sums errors without Ts, and one sample late.
     """
     if discretization == "backward-euler":
         return Gains(*_backward_euler(model, weights, Ts))
-    integrated = discretization == "sampled-data"
-    Ad, Bd, Cd = sampled_model(model, Ts, delay)
-    K, Ki = _sampled_regulator(model, weights, Ts, delay, integrated=integrated)
-    L = _sampled_filter(model, weights, Ts, delay, integrated=integrated)
-    if weights.drift_variance.size:  # x+ = Ad x + Bd (v + d), d+ = d; v takes d off, as stored forces have
-        n, m, p = len(model.A), model.B.shape[1], len(Cd)
-        pushed = np.zeros((len(Ad), m))
-        pushed[:n] = Ad[:n, n : n + m] if delay else Bd
+    integrated, n, m = discretization == "sampled-data", len(model.A), model.B.shape[1]
+    driven, cost, known = model, weights, delay  # blocks of forces that are known, as what was commanded is
+    if lag is not None:
+        driven, known = with_lags(model, lag), delay + 1
+        free = np.zeros(m)
+        cost = replace(weights, q=np.append(weights.q, free), q_base=np.append(weights.q_base, free + 1))
+    Ad, Bd, Cd = sampled_model(driven, Ts, delay)
+    K, Ki = _sampled_regulator(driven, cost, Ts, delay, integrated=integrated)
+    L = _sampled_filter(model, weights, Ts, known, integrated=integrated)
+    if weights.drift_variance.size:  # x+ = Ad x + Bd (v + d), d+ = d; v takes d off, as forces under way have
+        p, pushed = len(Cd), np.zeros((len(Ad), m))
+        pushed[:n] = sample(held(model).A, model.B, Ts)[1]
         Ad = np.block([[Ad, pushed], [np.zeros((m, len(Ad))), np.eye(m)]])
         Bd, Cd = np.vstack([Bd, np.zeros((m, m))]), np.hstack([Cd, np.zeros((p, m))])
-        K = np.hstack([K, np.eye(m) + K[:, n:].reshape(m, delay, m).sum(axis=1)])
+        K = np.hstack([K, np.eye(m) + K[:, n:].reshape(m, known, m).sum(axis=1)])
     return Gains(Ad, Bd, Cd, K, Ki, L)
 
 
@@ -206,6 +238,7 @@ def lqg(
     *,
     name: str = "lqg",
     current_loop_delay: bool = True,
+    current_lag: bool = False,
 ) -> Controller:
     """Design the controller: LQR with integrals, steady-state Kalman filter, feedforward, current loop.
 
@@ -214,6 +247,7 @@ def lqg(
     Ts : sample time, s
     delay : samples between measurement and force in the design model (not with backward-euler)
     current_loop_delay : design the current loop with the machine's dead time
+    current_lag : forces are states of the design model, first-order lags at the current loops' crossover behind v
 
     Raises InputError for arguments that do not fit, CheckError when an equation has no sound solution.
     """
@@ -241,21 +275,42 @@ def lqg(
             "lqg", "drift", "integrals with a weight", "weights.integral all 0: one of them takes off loads"
         )
     _check_sizes(model, weights)
-    found = gains(model, weights, Ts, discretization, delay)
+    lag = model.plant.actuator.crossover if current_lag else None
+    _require_lag(model, lag, discretization)
+    found = gains(model, weights, Ts, discretization, delay, lag)
     if not all(np.isfinite(M).all() for M in found):
         raise CheckError("lqg: the gains overflow")
     plant = model.plant
     observed = disturbances(plant.inputs) if weights.drift_variance.size else ()
+    lagging = lagging_forces(plant.inputs) if current_lag else ()
     return Controller(
         **machine_part(model, Ts, delay, current_loop_delay=current_loop_delay),
         **found._asdict(),
         name=name,
-        states=plant.design_states + stored_forces(plant.inputs, delay) + observed,
+        states=plant.design_states + lagging + stored_forces(plant.inputs, delay) + observed,
         cost=Cost(
             weights.q / weights.q_base**2, weights.r / weights.r_base**2, weights.q_i / weights.q_i_base**2
         ),
         noise=Noise(weights.process_variance, weights.sensor_variance, weights.drift_variance),
     )
+
+
+def _require_lag(model: LinearModel, lag: float | None, discretization: Discretization) -> None:
+    """InputError for a lag in the design of a machine without one, of held currents, or by backward Euler."""
+    if lag is None:
+        return
+    found, expected = "", "a machine with current loops"
+    if not math.isfinite(lag):
+        found = f"a {model.plant.name}, whose currents follow their commands at once"
+    elif model.E.any():
+        found, expected = (
+            f"a {model.plant.name}, whose currents are held between samples",
+            "one whose forces do not depend on where it is",
+        )
+    elif discretization == "backward-euler":
+        found, expected = discretization, "zoh or sampled-data"
+    if found:
+        raise InputError("lqg", "current_lag", found, expected)
 
 
 def weights(
@@ -387,6 +442,7 @@ def synthesize(spec: Spec, model: LinearModel) -> Controller:
         if spec.pid is not None:
             controller = pid(model, spec.pid, spec.sample_time, **named)
         else:
+            named["current_lag"] = spec.current_lag
             controller = lqg(model, spec.weights, spec.sample_time, spec.discretization, spec.delay, **named)
     except InputError as error:
         raise InputError(spec.path, f"{error.where}: {error.field}", error.found, error.expected) from error

@@ -145,6 +145,7 @@ class Spec:
     current_loop_delay: bool  # whether the current loops are designed with the machine's dead time
     law: Weights | Pid  # of an LQG, or the gains of a PID
     uncertainty: Mapping[str, float]  # relative, either way, by parameter
+    current_lag: bool = False  # whether the lag of the current loops is in the design model
     loads: Loads | None = None  # what a PID is judged by
     specification: Mapping[str, float] = dataclass_field(
         default_factory=dict
@@ -159,6 +160,11 @@ class Spec:
     def plant(self) -> Plant:
         """The machine that the controller is designed for."""
         return plant_of(self.parameters)
+
+    @property
+    def lag(self) -> float | None:
+        """The lag in the design model, rad/s; None: none."""
+        return self.plant.actuator.crossover if self.current_lag else None
 
     @property
     def weights(self) -> Weights:

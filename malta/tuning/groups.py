@@ -321,7 +321,7 @@ def figures_of(spec: Spec, group: Group, weights: Weights, delay: int) -> dict[s
     Ts = spec.sample_time
     try:
         with np.errstate(all="ignore"):
-            g = gains(group.model, group.part(weights), Ts, spec.discretization, delay)
+            g = gains(group.model, group.part(weights), Ts, spec.discretization, delay, spec.lag)
     except CheckError:
         return {}
     law = linear_law_of(g, Ts)
