@@ -254,8 +254,10 @@ anywhere = { largest = { value = 25, unit = "um" } }
 
 [specification.recovery.bearing]
 load = { F_y = { value = 1, unit = "N" }, T_x = { value = 45, unit = "mN m" } }
+load_slope = { T_x = { value = 1, unit = "N m / m" } }
 outputs = ["y1", "y2"]
 largest = { value = 12, unit = "um" }
+anywhere = { largest = { value = 13, unit = "um" } }
 
 [specification.recovery.F_z]
 largest = { value = 0.5, unit = "mm" }
@@ -274,11 +276,17 @@ def robust_file(folder: Path, specification: str) -> Path:
 def test_loads_from_outside_are_bounded_and_the_search_sees_them_as_the_judge_does(tmp_path: Path) -> None:
     spec = malta.read_design(robust_file(tmp_path, LOADS))
     names = [f"recovery F_x {what}" for what in ("largest", "left 0.1 s", "left 0.3 s", "largest anywhere")]
-    assert list(spec.specification) == [*names, "recovery bearing largest", "recovery F_z largest"]
+    assert list(spec.specification) == [
+        *names,
+        "recovery bearing largest",
+        "recovery bearing largest anywhere",
+        "recovery F_z largest",
+    ]
     assert spec.specification["recovery F_x left 0.1 s"] == pytest.approx(1e-5)
     bearing = spec.recovery["bearing largest"]
     assert bearing.load == pytest.approx((0, 1, 0, 0.045, 0, 0))
     assert bearing.outputs == ("y1", "y2")
+    assert bearing.load_at(15e-3) == pytest.approx((0, 1, 0, 0.060, 0, 0))
     rows = {r.name: r for r in judge(spec)}
     (pushed,) = malta.recovery(spec.plant, model_and_controller(spec)[1], {"": {"F_x": 1.0}})
     assert rows[names[0]].found == pytest.approx(max(d.largest for d in pushed.outputs), rel=1e-9)
@@ -299,13 +307,14 @@ def test_loads_from_outside_are_bounded_and_the_search_sees_them_as_the_judge_do
     [
         ("recovery.F_x]", "recovery.F_w]", "recovery.F_w.load"),
         ("F_y = {", "F_w = {", "recovery.bearing.load.F_w"),
+        ("load_slope = { T_x", "load_slope = { T_w", "recovery.bearing.load_slope.T_w"),
         ('"y1", "y2"', '"y1", "w"', "recovery.bearing.outputs"),
         ('value = 20, unit = "um"', 'value = 20, unit = "N"', "recovery.F_x.largest.unit"),
         ('value = 20, unit = "um"', 'value = 0, unit = "um"', "recovery.F_x.largest"),
         ('unit = "ms"', 'unit = "m"', "recovery.F_x.left[0].after.unit"),
         ("{ largest = { value = 25", "{ largst = { value = 25", "recovery.F_x.anywhere.largst"),
         ('anywhere = { largest = { value = 25, unit = "um" } }', "anywhere = {}", "recovery.F_x.anywhere"),
-        ("value = 1,", "value = 0,", None),
+        ("F_y = { value = 1,", "F_y = { value = 0,", None),
     ],
 )
 def test_a_wrong_load_gets_one_sentence(tmp_path: Path, old: str, new: str, field: str | None) -> None:

@@ -25,7 +25,7 @@ from malta.errors import CheckError, InputError
 from malta.margins.loops import Loop, machine_loop
 from malta.margins.responses import find_peaks
 from malta.model.linearize import LinearModel, linearize
-from malta.model.plant import position_at, trim
+from malta.model.plant import position_at, position_in, trim
 from malta.synthesis.riccati import sample
 from malta.synthesis.step_response import StepResponse, step_response
 from malta.threads import on_one_thread
@@ -197,8 +197,9 @@ def bounded_deviation(
 ) -> float:
     """Compute what a bound is of at a position of the stroke; an unstable loop deviates without limit."""
     chosen = [k for k, s in enumerate(plant.outputs) if s.name in bound.outputs]
+    at = position_in(plant, plant.point(controller.operating_point[0]).x) if position is None else position
     try:
-        answer = PushedLoop.of(plant, controller, position).answer().of(bound.sizes)
+        answer = PushedLoop.of(plant, controller, position).answer().of(bound.load_at(at))
     except CheckError:
         return math.inf
     reached = answer.largest if bound.after is None else answer.left(bound.after)

@@ -9,6 +9,7 @@ largest = { value = 10, unit = "um" }
 
 [specification.recovery.bearing]              # any other name: a load at a point is forces and torques together
 load = { F_x = { value = 1, unit = "N" }, T_y = { value = -45, unit = "mN m" } }
+load_slope = { T_y = { value = -1, unit = "N m / m" } }   # with the stroke: the point stays, the machine moves
 outputs = ["x1", "x2"]                        # these alone
 largest = { value = 11, unit = "um" }
 """
@@ -50,6 +51,7 @@ class RecoveryTable(BoundsTable):
     """[specification.recovery.NAME]: a load, and what it may do."""
 
     load: Annotated[dict[StrictStr, Quantity], Field(min_length=1)] | None = None
+    load_slope: dict[StrictStr, Quantity] = Field(default_factory=dict)
     outputs: Annotated[list[StrictStr], Field(min_length=1)] | None = None
     anywhere: BoundsTable | None = None
 
@@ -60,16 +62,16 @@ class RecoveryBound:
 
     name: str  # as "F_x left 0.1 s anywhere"
     load: tuple[float, ...]  # N or N m, of each of the plant's disturbances
+    slope: tuple[float, ...]  # N / m or N m / m, what they change by with the stroke
     after: float | None  # s, the largest deviation from then on; None: the largest at all
     anywhere: bool  # in the travel; else at the operating point
     outputs: tuple[str, ...]  # each of these
     unit: str  # of the bound and the outputs, SI
     limit: float
 
-    @property
-    def sizes(self) -> FloatArray:
-        """The load as an array."""
-        return np.array(self.load)
+    def load_at(self, position: float) -> FloatArray:
+        """The load at a position of the stroke, m: a number for each disturbance."""
+        return np.array(self.load) + position * np.array(self.slope)
 
 
 def recovery_bounds(
@@ -93,7 +95,8 @@ def _bounds_of(
     """The bounds of one load."""
     if not re.fullmatch(r"\S+", name):
         raise InputError(path, field, repr(name), "a name without spaces")
-    load, signals = _load(name, table, plant, path, field), _outputs(table, plant, path, field)
+    load, slope = _load(name, table, plant, path, field)
+    signals = _outputs(table, plant, path, field)
     if table.anywhere is not None and not plant.has_stroke:
         raise InputError(path, f"{field}.anywhere", f"a {plant.name}", "a machine with a stroke")
     tables: list[tuple[BoundsTable, str, bool]] = [(table, field, False)]
@@ -106,7 +109,7 @@ def _bounds_of(
             limit = positive(to_si(quantity.value, quantity.unit, unit, path, at), path, at, unit)
             words = [name, "largest" if after is None else f"left {after:g} s", *["anywhere"] * anywhere]
             bounded = tuple(s.name for s in signals if s.unit == unit)
-            yield RecoveryBound(" ".join(words), load, after, anywhere, bounded, unit, limit)
+            yield RecoveryBound(" ".join(words), load, slope, after, anywhere, bounded, unit, limit)
 
 
 def _entries(bounds: BoundsTable, path: Path, field: str) -> Iterator[tuple[Quantity, float | None, str]]:
@@ -119,23 +122,36 @@ def _entries(bounds: BoundsTable, path: Path, field: str) -> Iterator[tuple[Quan
         yield left, positive(after, path, f"{at}.after", "s"), at
 
 
-def _load(name: str, table: RecoveryTable, plant: Plant, path: Path, field: str) -> tuple[float, ...]:
-    """The load by disturbance: that of the table, or 1 of the disturbance whose name it has."""
+def _load(
+    name: str, table: RecoveryTable, plant: Plant, path: Path, field: str
+) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """The load by disturbance, that of the table or 1 of the disturbance whose name it has; and its slope."""
     units = {s.name: s.unit for s in plant.disturbances}
-    known = " ".join(units) or "none"
-    if table.load is None:
-        if name not in units:
-            raise InputError(
-                path, f"{field}.load", "nothing", f"a load, or the name of a disturbance: {known}"
-            )
-        return tuple(float(disturbance == name) for disturbance in units)
+    if table.load_slope and not plant.has_stroke:
+        raise InputError(path, f"{field}.load_slope", f"a {plant.name}", "a machine with a stroke")
+    per_stroke = {disturbance: f"({unit}) / m" for disturbance, unit in units.items()}
+    slope = _by_disturbance(table.load_slope, per_stroke, path, f"{field}.load_slope")
+    if table.load is not None:
+        load = _by_disturbance(table.load, units, path, f"{field}.load")
+        if not any(load):
+            raise InputError(path, f"{field}.load", "nothing but zeros", "a load")
+        return load, slope
+    if name not in units:
+        known = " ".join(units) or "none"
+        raise InputError(path, f"{field}.load", "nothing", f"a load, or the name of a disturbance: {known}")
+    return tuple(float(disturbance == name) for disturbance in units), slope
+
+
+def _by_disturbance(
+    given: Mapping[str, Quantity], units: Mapping[str, str], path: Path, field: str
+) -> tuple[float, ...]:
+    """A number for each disturbance, in these units; zero for those that are not given."""
     sizes = {}
-    for disturbance, q in table.load.items():
+    for disturbance, q in given.items():
+        where = f"{field}.{disturbance}"
         if disturbance not in units:
-            raise InputError(path, f"{field}.load.{disturbance}", "an unknown disturbance", f"one of {known}")
-        sizes[disturbance] = to_si(q.value, q.unit, units[disturbance], path, f"{field}.load.{disturbance}")
-    if not any(sizes.values()):
-        raise InputError(path, f"{field}.load", "nothing but zeros", "a load")
+            raise InputError(path, where, "an unknown disturbance", "one of " + (" ".join(units) or "none"))
+        sizes[disturbance] = to_si(q.value, q.unit, units[disturbance], path, where)
     return tuple(sizes.get(disturbance, 0.0) for disturbance in units)
 
 

@@ -119,8 +119,8 @@ class TrialLoop:
     margin: float | None  # None: not asked for
     peak_sensitivity: float
     bandwidth: float  # rad/s
-    # Of a unit load on each of the plant's disturbances: at the operating point, then at places along the travel.
-    answers: tuple[StepResponse, ...] = ()
+    # Of a unit load on each of the plant's disturbances, at positions of the stroke, m, the operating point first.
+    answers: tuple[tuple[float, StepResponse], ...] = ()
     recovery: Mapping[str, RecoveryBound] = field(default_factory=dict)  # what is asked of them
 
     def follow(self, w: float, p: FloatArray, x: ComplexArray) -> ComplexArray:
@@ -301,7 +301,8 @@ def _recovery_estimate(loop: TrialLoop, signal: str) -> float | None:
     bound = loop.recovery[signal]
     names = [loop.plant.outputs[k].name for k in loop.outputs]
     chosen = [k for k, name in enumerate(names) if name in bound.outputs]
-    answers = [one.of(bound.sizes) for one in (loop.answers if bound.anywhere else loop.answers[:1])]
+    places = loop.answers if bound.anywhere else loop.answers[:1]
+    answers = [one.of(bound.load_at(position)) for position, one in places]
     if not chosen or not any(one.y.any() for one in answers):
         return None
     reached = [one.largest if bound.after is None else one.left(bound.after) for one in answers]

@@ -25,7 +25,7 @@ from malta.margins.plants import of_plant
 from malta.margins.recovery import disturbance_map, push_through
 from malta.margins.responses import crossing
 from malta.model.linearize import linearize
-from malta.model.plant import trim
+from malta.model.plant import position_in, trim
 from malta.synthesis.controller import linear_law_of
 from malta.synthesis.lqg import gains, static_feedforward
 from malta.synthesis.requirements import Noise, TrialLoop, requirements_for
@@ -78,6 +78,7 @@ class SampledMachine:
 class Place(NamedTuple):
     """The nominal machine at a position of its stroke, with its loads at their trim, and loads from outside."""
 
+    position: float  # m
     machine: SampledMachine
     slope: FloatArray  # of v0(z): inputs x outputs
     pushed: FloatArray  # what unit disturbances leave in the machine's states in a sample
@@ -237,7 +238,7 @@ def _place(spec: Spec, model: LinearModel, slope: FloatArray, i: Any, j: Any, o:
     part = Part(model.A[np.ix_(i, i)], model.B[np.ix_(i, j)], model.C[np.ix_(o, i)])
     machine = _sample(spec, part)
     pushed = push_through(part.A, disturbance_map(model)[i], spec.sample_time, len(machine.Ad))
-    return Place(machine, slope[np.ix_(j, o)], pushed)
+    return Place(position_in(model.plant, model.operating_point.x), machine, slope[np.ix_(j, o)], pushed)
 
 
 def _pushes(spec: Spec, outputs: Any, places: Sequence[Place]) -> tuple[Any, ...]:
@@ -245,7 +246,7 @@ def _pushes(spec: Spec, outputs: Any, places: Sequence[Place]) -> tuple[Any, ...
     names = {spec.plant.outputs[k].name for k in outputs}
     bounds = []
     for bound in spec.recovery.values():
-        push = np.abs(places[0].pushed @ bound.sizes).round(15)
+        push = np.abs([place.pushed @ bound.load_at(place.position) for place in places]).round(15)
         if push.any() and names & set(bound.outputs):
             bounds.append((bound.after or 0.0, bound.anywhere, bound.limit, push.tobytes()))
     machines = (np.abs(place.machine.Ad).round(12).tobytes() for place in places)
@@ -331,7 +332,7 @@ def figures_of(spec: Spec, group: Group, weights: Weights, delay: int) -> dict[s
         return {}
     peak, bandwidth = _response(group, g, steady, Ts)
     try:
-        answers = tuple(_answer(place, law, Ts) for place in group.places)
+        answers = tuple((place.position, _answer(place, law, Ts)) for place in group.places)
     except CheckError:
         return {}
     loop = TrialLoop(
