@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy.optimize import linear_sum_assignment
 
 from malta.errors import InputError
 from malta.gains.file import content_of, document
@@ -49,7 +50,22 @@ def _agree(wanted: Mapping[str, Any], found: dict[str, Any]) -> bool:
         return False
     verified, before = (dict(content["verification"]) for content in (wanted, found))
     robust, earlier = verified.pop("robust"), before.pop("robust")
-    return _close(verified, before, CLOSE_VERIFIED) and _hardly_narrower(robust, earlier)
+    poles, others = verified.pop("poles"), before.pop("poles")
+    return (
+        _close(verified, before, CLOSE_VERIFIED)
+        and all(_same_poles(poles[name], others[name]) for name in poles)
+        and _hardly_narrower(robust, earlier)
+    )
+
+
+def _same_poles(one: Any, two: Any) -> bool:
+    """Whether two lists of poles agree in any order: rounding orders neighbours, and signs of +-j pi / Ts, anew."""
+    if not one or not two or len(one) != len(two):
+        return bool(one == two)
+    first, second = (np.array(rows)[:, 0] + 1j * np.abs(np.array(rows)[:, 1]) for rows in (one, two))
+    apart = np.abs(first[:, None] - second)
+    pairs = linear_sum_assignment(apart)
+    return bool(apart[pairs].max() <= CLOSE_VERIFIED * np.abs(first).max())
 
 
 def _hardly_narrower(now: Mapping[str, Any] | None, before: Mapping[str, Any] | None) -> bool:
