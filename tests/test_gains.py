@@ -328,8 +328,11 @@ def close(found: Any, wanted: Any, name: str = "") -> list[str]:
 def test_committed_gains_are_what_the_designs_give(designs: dict[str, Design], name: str) -> None:
     regenerated = gains.document(designs[name].controller, designs[name].margins)
     committed = json.loads((COMMITTED / f"{name}.json").read_bytes())
+    elsewhere = committed["provenance"] != regenerated["provenance"]
     for document in (regenerated, committed):
         del document["provenance"], document["sha256"]
+        if elsewhere:  # a loss at w = 0 does not depend on the position: rounding picks that of the witness
+            del document["verification"]["robust"]["witness"]["z"]
     assert close(committed, regenerated) == []
 
 
