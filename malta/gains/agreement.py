@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from malta.errors import InputError
 from malta.gains.file import content_of, document
@@ -63,9 +62,13 @@ def _same_poles(one: Any, two: Any) -> bool:
     if not one or not two or len(one) != len(two):
         return bool(one == two)
     first, second = (np.array(rows)[:, 0] + 1j * np.abs(np.array(rows)[:, 1]) for rows in (one, two))
-    apart = np.abs(first[:, None] - second)
-    pairs = linear_sum_assignment(apart)
-    return bool(apart[pairs].max() <= CLOSE_VERIFIED * np.abs(first).max())
+    room, left = CLOSE_VERIFIED * np.abs(first).max(), second.tolist()
+    for pole in first.tolist():  # each takes the nearest that is left
+        nearest = min(left, key=lambda other: abs(other - pole))
+        if abs(nearest - pole) > room:
+            return False
+        left.remove(nearest)
+    return True
 
 
 def _hardly_narrower(now: Mapping[str, Any] | None, before: Mapping[str, Any] | None) -> bool:
