@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING
 from malta.margins.box import Box, box_of
 from malta.margins.expressions import NotAnalytic
 from malta.margins.extent import extent_of, machine_at, positions_of
-from malta.margins.gain import Gain, worst_case_gain
 from malta.margins.held_currents import held_machine
 from malta.margins.loops import CurrentLoops, machine_law, machine_system
 from malta.margins.plants import LONGEST
@@ -39,6 +38,7 @@ from malta.threads import on_one_thread
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from malta.margins.gain import Gain
     from malta.model.plant import Plant
     from malta.synthesis.controller import Controller
 
@@ -193,6 +193,10 @@ def worst_sensitivities(
 
     The arguments are those of travel_margin. Without a proof along the travel, it covers the middle and the end alone.
     """
+    from malta.margins.gain import (
+        worst_case_gain,  # with all that dynamics take, which a design does not ask for
+    )
+
     along, over = travel_loops(plant, controller, tuple(ranges), current_loops)
     found = {}
     for k, sensor in enumerate(plant.outputs):
