@@ -15,8 +15,8 @@ FOLDERS = ("data", "design", "notebooks", "examples")  # that come with malta
 _Content = TypeVar("_Content", str, bytes)
 
 
-def shipped(*parts: str) -> Path:
-    """A file or folder that comes with malta, as `shipped("data", "tubular.toml")`.
+def shipped_path(*parts: str) -> Path:
+    """A file or folder that comes with malta, as `shipped_path("data", "tubular.toml")`.
 
     An installed package holds data/, design/, notebooks/ and examples/ in its folder `shipped`; in a checkout they
     stand beside the package.
@@ -25,7 +25,7 @@ def shipped(*parts: str) -> Path:
     return (inside if inside.is_dir() else PACKAGE.parent).joinpath(*parts)
 
 
-def located(path: str | Path) -> Path:
+def locate(path: str | Path) -> Path:
     """The file that a user names: where he says, or of the same name among those that come with malta.
 
     `design/gains/robust.json` is thus found from any folder, and a file of the user's own goes first.
@@ -33,7 +33,7 @@ def located(path: str | Path) -> Path:
     path = Path(path)
     if path.is_absolute() or (path.parts[:1] and path.parts[0] not in FOLDERS) or _exists(path):
         return path
-    other = shipped(*path.parts)
+    other = shipped_path(*path.parts)
     return other if _exists(other) else path
 
 

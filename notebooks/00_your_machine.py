@@ -18,11 +18,11 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import malta
-from malta.files import shipped
+from malta.files import shipped_path
 
 # A folder as `malta new` writes it, outside of malta.
 folder = Path(tempfile.mkdtemp())
-shutil.copytree(shipped("examples", "ball"), folder, dirs_exist_ok=True)
+shutil.copytree(shipped_path("examples", "ball"), folder, dirs_exist_ok=True)
 os.chdir(folder)
 print(
     *sorted(str(path.relative_to(folder)) for path in folder.rglob("*.*") if path.suffix != ".pyc"), sep="\n"

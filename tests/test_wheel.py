@@ -121,7 +121,7 @@ def test_the_rotor_of_the_examples(program: Path, tmp_path: Path) -> None:
         tmp_path,
         "python",
         "-c",
-        "from malta.files import shipped; print(shipped('examples', 'rotor'))",
+        "from malta.files import shipped_path; print(shipped_path('examples', 'rotor'))",
     )
     folder = tmp_path / "rotor"
     shutil.copytree(where.stdout.strip(), folder)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from malta.cli.assignments import read_assignments
 from malta.cli.output import make_console
 from malta.errors import CheckError, InputError
-from malta.files import located, shipped
+from malta.files import locate, shipped_path
 
 if TYPE_CHECKING:
     from malta.model.plant import Parameters, Plant
@@ -26,7 +26,7 @@ def design_files(
     """
     folder = Path("design")
     if or_shipped and not folder.is_dir():
-        folder = shipped("design")
+        folder = shipped_path("design")
     files = named or sorted(folder.glob("*.toml"), reverse=reverse)
     if not files:
         raise InputError(
@@ -37,7 +37,7 @@ def design_files(
 
 def gains_folder(design_file: Path) -> Path:
     """Where the gain files of a design go: gains/ beside it; design/gains/ here, where it comes with malta."""
-    return design_file.parent / "gains" if located(design_file) == design_file else Path("design", "gains")
+    return design_file.parent / "gains" if locate(design_file) == design_file else Path("design", "gains")
 
 
 def read_controller(gains: Path, machine_file: Path | None) -> Controller:

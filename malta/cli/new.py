@@ -10,7 +10,7 @@ import typer
 
 from malta.cli.output import make_console, print_written
 from malta.errors import InputError
-from malta.files import replace_files, shipped
+from malta.files import replace_files, shipped_path
 
 EXAMPLE = "ball"  # the folder of examples/ that a new machine begins as
 NEXT = """
@@ -47,7 +47,7 @@ def new(
         )
     if folder.exists():
         raise InputError(folder, "", "a file or folder of that name", "a name that is free here")
-    source = shipped("examples", EXAMPLE)
+    source = shipped_path("examples", EXAMPLE)
     files = [
         path for path in sorted(source.rglob("*")) if path.suffix in (".py", ".toml") and _is_source(path)
     ]
@@ -68,4 +68,6 @@ def new(
 
 
 def _is_source(path: Path) -> bool:
-    return not {"build", "gains", "__pycache__"} & set(path.parts[len(shipped("examples", EXAMPLE).parts) :])
+    return not {"build", "gains", "__pycache__"} & set(
+        path.parts[len(shipped_path("examples", EXAMPLE).parts) :]
+    )

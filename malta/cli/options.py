@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from malta.files import located
+from malta.files import locate
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON document instead of tables.")]
 Changes = Annotated[
@@ -66,7 +66,7 @@ Substeps = Annotated[
 ]
 Seed = Annotated[int | None, typer.Option(help="Seed of the noise. [0]")]
 GainFile = Annotated[
-    Path, typer.Argument(metavar="GAINS", help="A gain file: .json, .npz or .mat.", callback=located)
+    Path, typer.Argument(metavar="GAINS", help="A gain file: .json, .npz or .mat.", callback=locate)
 ]
 MachineFile = Annotated[
     Path | None,

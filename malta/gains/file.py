@@ -53,7 +53,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from malta.errors import CheckError, InputError
-from malta.files import located, replace_files
+from malta.files import locate, replace_files
 from malta.gains.contents import controller_of
 from malta.gains.encodings import SUFFIXES as SUFFIXES
 from malta.gains.encodings import content_sha256, decode, encode
@@ -158,7 +158,7 @@ def read(path: str | Path) -> Controller:
     wrong shape, NaN or infinity, a non-positive sample time, content that does not match its sha256, gains that do not
     stabilize the file's own model.
     """
-    path = located(path)
+    path = locate(path)
     file, _ = content_of(path)
     controller = controller_of(file, path)
     try:

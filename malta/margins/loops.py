@@ -24,7 +24,7 @@ from malta.margins.uncertain import Compensator, UncertainSystem, held_gain, is_
 from malta.model.data import plant_of
 from malta.model.linearize import LinearModel, linearize
 from malta.model.plant import position_at, position_in, trim
-from malta.synthesis.controller import Controller, LinearLaw, handed_on, linear_law
+from malta.synthesis.controller import Controller, LinearLaw, linear_law, with_readings
 from malta.synthesis.riccati import add_lags, delay_inputs, sample
 
 if TYPE_CHECKING:
@@ -102,7 +102,7 @@ def loop(
             slope[:, plant.stroke_output] = controller.feedforward.slope(position)
         law = law._replace(B_y=law.B_y + law.B_r[:, -m:] @ slope, D_y=law.D_y + law.D_r[:, -m:] @ slope)
     if model.E.any():
-        law = handed_on(law)
+        law = with_readings(law)
     return Loop(Ad, Bd, Cd, law, controller.sample_time)
 
 

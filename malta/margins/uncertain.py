@@ -23,8 +23,8 @@ from malta.synthesis.controller import (
     Controller,
     CurrentLoop,
     LinearLaw,
-    handed_on,
     linear_law,
+    with_readings,
 )
 from malta.synthesis.riccati import add_lags, delay_inputs, sample
 
@@ -160,7 +160,7 @@ def sampled_law(
     if held is not None:
         law = law._replace(D_y=law.D_y + held)
     if handed:
-        law = handed_on(law)
+        law = with_readings(law)
     c = Compensator(
         law.A, law.B_y, law.C, law.D_y,
         integrals=p, sample_time=T, delay=delay, lag=lag if math.isfinite(lag) else None,

@@ -21,7 +21,7 @@ from pydantic import Field as Checked
 from pydantic import StrictStr
 
 from malta.errors import InputError
-from malta.files import located
+from malta.files import locate
 from malta.model.checks import check_plant
 from malta.model.machines import file_of, machine, machine_names, name_of
 from malta.model.parameters import check_range
@@ -63,7 +63,7 @@ def read(path: str | Path, preset: str | None = None) -> Any:
 
     Example: `malta.read("data/tubular.toml").m`
     """
-    path = located(path)
+    path = locate(path)
     content = validate(_MachineFile, load_toml(path), path)
     presets = content.presets or {ONLY_PRESET: {}}
     if content.presets and not content.default_preset:

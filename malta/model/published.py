@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from malta.errors import InputError
-from malta.files import located, shipped
+from malta.files import locate, shipped_path
 from malta.model.machines import file_of
 from malta.tables import load_toml
 from malta.units import unit_factor
@@ -23,18 +23,20 @@ def published(machine_file: str | Path) -> dict[str, Any]:
 
 def published_beside(machine_file: str | Path) -> dict[str, Any] | None:
     """Read the published figures beside a data file; None when there is no such file."""
-    file = _published_file(located(machine_file))
+    file = _published_file(locate(machine_file))
     return load_toml(file) if file.exists() else None
 
 
 def published_figures(machine: str) -> dict[str, Any] | None:
     """Read the published figures of a machine by its name, from malta's data or beside the user's own machine file."""
     file = file_of(machine)
-    return published_beside(shipped("data", f"{machine}.toml") if file is None else file.with_suffix(".toml"))
+    return published_beside(
+        shipped_path("data", f"{machine}.toml") if file is None else file.with_suffix(".toml")
+    )
 
 
 def _published_file(data_file: Path) -> Path:
-    data_file = located(data_file)
+    data_file = locate(data_file)
     alone = data_file.parent / "published.toml"
     of_its_name = data_file.parent / "published" / data_file.name
     return alone if alone.exists() and not of_its_name.exists() else of_its_name

@@ -350,7 +350,7 @@ def _blocks(args: Mapping[str, Any], out: Mapping[str, Any], *, integrating: boo
     return [ca.jacobian(of, by) for of in (s_next, out["v"]) for by in (s, args["y"], r)]
 
 
-def handed_on(law: LinearLaw) -> LinearLaw:
+def with_readings(law: LinearLaw) -> LinearLaw:
     """The same law with the reading itself as further outputs: what currents are commutated for."""
     p, n, r = law.B_y.shape[1], len(law.A), law.D_r.shape[1]
     return law._replace(

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from malta.errors import CheckError, InputError
-from malta.files import located
+from malta.files import locate
 from malta.model.data import plant_of, read
 from malta.model.parameters import units_of
 from malta.model.plant import Plant, Signal
@@ -55,7 +55,7 @@ def read_design(path: str | Path) -> Spec:
 
     Raises InputError, naming file and field, for anything missing, unknown, of a wrong unit or out of range.
     """
-    path = located(path)
+    path = locate(path)
     raw = load_toml(path)
     machine = raw.get("machine")
     if not isinstance(machine, str):

@@ -29,7 +29,7 @@ from malta.margins.loops import Loop, machine_loop
 from malta.margins.responses import crossing
 from malta.model.linearize import linearize
 from malta.model.plant import position_at, position_in, trim
-from malta.synthesis.controller import handed_on, linear_law_of
+from malta.synthesis.controller import linear_law_of, with_readings
 from malta.synthesis.lqg import pid_gains
 from malta.synthesis.requirements import ratio_of
 from malta.synthesis.riccati import sample, sample_noise
@@ -129,7 +129,7 @@ def close_loop(part: Part, terms: Pid, Ts: float) -> Loop:
     few = Pid(terms.Kp[own], terms.Ki[own], terms.Kd[own], terms.filter)
     law = linear_law_of(pid_gains(np.eye(k), few, Ts), Ts)
     linear = law._replace(D_y=law.D_y + part.slope)
-    return Loop(part.Ad, part.Bd, part.Cd, linear if part.Bd.shape[1] == k else handed_on(linear), Ts)
+    return Loop(part.Ad, part.Bd, part.Cd, linear if part.Bd.shape[1] == k else with_readings(linear), Ts)
 
 
 def loop_figures(spec: Spec, part: Part, loop: Loop) -> dict[str, float]:
