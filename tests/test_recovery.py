@@ -17,7 +17,7 @@ import malta
 from malta.errors import CheckError, InputError
 from malta.margins.recovery import PushedLoop, disturbance_map, furthest, load_vector, recovery
 from malta.model.linearize import linearize
-from malta.report.recovery import recovery_table
+from malta.report.tables.recovery import recovery_table
 from malta.simulation import responses
 from malta.synthesis.step_response import step_response
 

@@ -15,7 +15,6 @@ from malta.report.pages import experiment as experiment
 from malta.report.pages import front as front
 from malta.report.pages import robustness as robustness
 from malta.report.pages import stroke as stroke
-from malta.report.recovery import recovery_table as recovery_table
 from malta.report.tables.campaign import box_text as box_text
 from malta.report.tables.campaign import campaign_tables as campaign_tables
 from malta.report.tables.claims import claims_table as claims_table
@@ -32,6 +31,7 @@ from malta.report.tables.margins import gang_table as gang_table
 from malta.report.tables.margins import places_table as places_table
 from malta.report.tables.margins import tolerance_table as tolerance_table
 from malta.report.tables.margins import worst_case_table as worst_case_table
+from malta.report.tables.recovery import recovery_table as recovery_table
 from malta.report.tables.tuning import front_markdown as front_markdown
 from malta.report.tables.tuning import front_rows as front_rows
 from malta.report.tables.tuning import front_table as front_table

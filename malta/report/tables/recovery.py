@@ -5,17 +5,16 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-from rich import box
-from rich.table import Table
-from rich.text import Text
-
 from malta.margins.recovery import SHARE, furthest
 from malta.model.signals import FINE
 from malta.report.figures.parts import number
+from malta.report.tables.parts import add_row, new_table
 from malta.units import in_unit
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
+    from rich.table import Table
 
     from malta.margins.recovery import Recovery
     from malta.model.plant import Plant
@@ -29,12 +28,11 @@ def recovery_table(found: Sequence[Recovery], plant: Plant) -> Table:
     Example: `recovery_table(malta.recovery(plant, controller), plant)`
     """
     units = {s.name: s.unit for s in plant.disturbances}
-    title = Text("A constant load from outside, and the output that it moves furthest")
-    table = Table(title=title, title_justify="left", title_style="", box=box.SIMPLE_HEAD, pad_edge=False)
     after = [f"left after {t:g} s" for t in (found[0].after if found else ())]
     heads = ("load", "output", "moves by", *after, f"{100 * SHARE:g} % after [s]", "peak over w", "at rad/s")
-    for i, head in enumerate(heads):
-        table.add_column(Text(head), justify="left" if i < 2 else "right", no_wrap=i < 2)
+    table = new_table("A constant load from outside, and the output that it moves furthest", *heads)
+    for column in table.columns[:2]:  # words
+        column.justify, column.no_wrap = "left", True
     for recovered, d in furthest(found):
         load = ", ".join(f"{size:g} {units[name]} {name}" for name, size in recovered.load.items())
         fine = FINE.get(d.unit, d.unit)
@@ -43,7 +41,5 @@ def recovery_table(found: Sequence[Recovery], plant: Plant) -> Table:
         lengths = [number(in_unit(value, fine)) for value in (d.largest, *left)]
         settled = "never" if math.isinf(d.settled) else f"{d.settled:.3g}"
         peak = number(in_unit(d.compliance, fine))
-        table.add_row(
-            *map(Text, (load, f"{d.output} [{fine}]", *lengths, settled, peak, f"{d.frequency:.3g}"))
-        )
+        add_row(table, load, f"{d.output} [{fine}]", *lengths, settled, peak, f"{d.frequency:.3g}")
     return table
