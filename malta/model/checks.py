@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import fields
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import casadi as ca
 
 from malta.errors import InputError
+from malta.model.parameters import symbolic_names
 
 if TYPE_CHECKING:
     from malta.model.plant import Plant
@@ -81,19 +81,13 @@ def check_signals(plant: Plant) -> None:
 
 def _check_intervals(plant: Plant) -> None:
     """Raise InputError unless every interval of `over` contains the value of a parameter that may be a symbol."""
-    entering = _symbolic_names(plant)
+    entering = symbolic_names(plant.parameters)
     for name, interval in plant.over.items():
         if name not in entering:
             raise InputError(plant.name, "over", repr(name), "one of " + " ".join(entering))
         value, ends = getattr(plant.parameters, name), tuple(interval)
         if not (len(ends) == 2 and -math.inf < ends[0] <= value <= ends[1] < math.inf and ends[0] < ends[1]):
             raise InputError(plant.name, f"over.{name}", f"{ends}", f"(low, high) about its value, {value:g}")
-
-
-def _symbolic_names(plant: Plant) -> list[str]:
-    """The names of the parameters that may be symbols."""
-    declared = {f.name: f.metadata for f in fields(plant.parameters) if "unit" in f.metadata}
-    return [name for name, metadata in declared.items() if not metadata["shapes"]]
 
 
 def check_plant(plant: Plant) -> None:
@@ -142,11 +136,10 @@ def check_symbols(plant: Plant) -> None:
     """
     if plant.tabulated:  # its table holds numbers; using symbols raises an error there
         return
-    bad = _fault_with_symbols(plant, _symbolic_names(plant))
+    names = symbolic_names(plant.parameters)
+    bad = _fault_with_symbols(plant, names)
     if bad:
-        name = next(
-            (name for name in _symbolic_names(plant) if _fault_with_symbols(plant, [name])), "its parameters"
-        )
+        name = next((name for name in names if _fault_with_symbols(plant, [name])), "its parameters")
         expected = f"CasADi's functions of it, as ca.sin, or si(..., shapes=True) where {name} stays a number"
         raise InputError(plant.name, bad, f"{name}, taken for a number", expected)
 

@@ -52,6 +52,11 @@ def shape_parameters(record: Parameters) -> dict[str, float]:
     return {f.name: getattr(record, f.name) for f in fields(record) if f.metadata.get("shapes")}
 
 
+def symbolic_names(record: type[Parameters] | Parameters) -> list[str]:
+    """The names of the parameters that symbolic models hold as symbols: all but those declared with `shapes`."""
+    return [f.name for f in fields(record) if "unit" in f.metadata and not f.metadata["shapes"]]
+
+
 def check_parameters(record: Parameters, where: str | Path = "parameters") -> None:
     """Check every physical field of a record. Raises InputError for NaN, infinity and values out of range."""
     for f in fields(record):

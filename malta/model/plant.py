@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
-from functools import cached_property
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Protocol
 
 import casadi as ca
@@ -358,19 +358,7 @@ def holding_forces(plant: Plant) -> FloatArray:
     i = plant.currents(plant.h(x, kind.zeros(len(plant.inputs))), v)
     rate = ca.densify(plant.f(x, plant.forces(x, i), plant.load(x)))
     residual = ca.Function("residual", [v], [rate, ca.jacobian(rate, v)])
-    found, left = np.zeros(len(plant.inputs)), math.inf
-    for _ in range(30):
-        r, J = (np.array(value) for value in residual(found))
-        left = float(np.abs(r).max())
-        if not math.isfinite(left) or left == 0:
-            break
-        found -= np.linalg.lstsq(J, r, rcond=None)[0].ravel()
-    left = float(np.abs(np.array(residual(found)[0])).max())
-    if not left <= 1e-9:  # m/s, rad/s, m/s2 or rad/s2
-        raise CheckError(
-            f"{plant.name}: no input holds it at rest: it changes at up to {left:.3g} (SI) a second"
-        )
-    return found
+    return _inputs_at_rest(plant, residual, "it at rest", steps=30)
 
 
 def _hold(plant: Plant, states: FloatArray, *, loads_alone: bool = False) -> FloatArray:
@@ -379,14 +367,29 @@ def _hold(plant: Plant, states: FloatArray, *, loads_alone: bool = False) -> Flo
     if loads_alone:
         rate -= plant.f(x, ca.SX.zeros(len(plant.inputs)), ca.SX.zeros(len(plant.disturbances)))
     residual = ca.Function("residual", [x, u], [rate, ca.jacobian(rate, u)])
-    held = np.zeros((len(states), len(plant.inputs)))
-    for i, state in enumerate(states):
-        for _ in range(2):  # f is affine in the inputs of every machine here: the second step only polishes
-            r, J = (np.array(value) for value in residual(state, held[i]))
-            held[i] -= np.linalg.lstsq(J, r, rcond=None)[0].ravel()
-        left = float(np.abs(np.array(residual(state, held[i])[0])).max())
-        if not left <= 1e-9:  # m/s, rad/s, m/s2 or rad/s2
-            raise CheckError(
-                f"{plant.name}: no input holds the state {state.tolist()}: it changes at up to {left:.3g} (SI) a second"
-            )
-    return held
+    return np.array(
+        [
+            # f is affine in the inputs of most machines: the second step only polishes
+            _inputs_at_rest(plant, partial(residual, state), f"the state {state.tolist()}", steps=2)
+            for state in states
+        ]
+    )
+
+
+def _inputs_at_rest(plant: Plant, residual: CasadiFn, held: str, *, steps: int) -> FloatArray:
+    """The inputs where the rates vanish, by at most so many steps of Newton's method.
+
+    residual : inputs -> rates and their derivatives by the inputs
+
+    Raises CheckError, which names what is `held`, when some rate is left.
+    """
+    u = np.zeros(len(plant.inputs))
+    for _ in range(steps):
+        r, J = (np.array(value) for value in residual(u))
+        if not r.any() or not np.isfinite(r).all():
+            break
+        u -= np.linalg.lstsq(J, r, rcond=None)[0].ravel()
+    left = float(np.abs(np.array(residual(u)[0])).max())
+    if not left <= 1e-9:  # m/s, rad/s, m/s2 or rad/s2
+        raise CheckError(f"{plant.name}: no input holds {held}: it changes at up to {left:.3g} (SI) a second")
+    return u
