@@ -29,7 +29,7 @@ from malta.machines.tubular.windings import (
     to_phases,
 )
 from malta.simulation import inverter
-from malta.synthesis.lqg import pi_current_loop
+from malta.synthesis.feedforward import pi_current_loop
 
 if TYPE_CHECKING:
     from malta.machines.tubular import plant as tubular

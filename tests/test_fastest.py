@@ -27,7 +27,7 @@ from malta.machines.tubular import plant as tubular
 from malta.model.plant import load_balance
 from malta.simulation import time_optimal as fastest
 from malta.simulation.time_optimal import FastestStroke, fastest_stroke, sigmoid_at_peak_current
-from malta.synthesis.lqg import static_feedforward
+from malta.synthesis.feedforward import static_feedforward
 
 if TYPE_CHECKING:
     from collections.abc import Callable

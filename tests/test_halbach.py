@@ -18,7 +18,7 @@ from malta.machines.halbach import electronics, motor
 from malta.machines.halbach import plant as halbach
 from malta.machines.halbach.plant import Parameters
 from malta.model.published import published_value
-from malta.synthesis.lqg import sampled_model
+from malta.synthesis.sampled import sampled_model
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray

@@ -38,8 +38,8 @@ from malta.simulation.compiled import compiler
 from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate
 from malta.synthesis.controller import Controller, linear_law
-from malta.synthesis.lqg import sampled_model
 from malta.synthesis.riccati import sample_noise
+from malta.synthesis.sampled import sampled_model
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray

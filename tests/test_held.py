@@ -27,13 +27,10 @@ from malta.simulation.references import Motion
 from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate
 from malta.synthesis.controller import Controller, linear_law
-from malta.synthesis.lqg import (
-    held,
-    lqg,
-    pid,
-    sampled_model,
-)
+from malta.synthesis.lqg import lqg
+from malta.synthesis.pid import pid
 from malta.synthesis.riccati import sample
+from malta.synthesis.sampled import held, sampled_model
 from malta.synthesis.spec import Pid, Weights
 
 ROOT = Path(__file__).parent.parent

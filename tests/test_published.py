@@ -12,7 +12,7 @@ import pytest
 import malta
 from malta.machines.tubular import plant as tubular
 from malta.machines.tubular.experiments.strokes import RISE
-from malta.synthesis.lqg import pi_current_loop
+from malta.synthesis.feedforward import pi_current_loop
 
 if TYPE_CHECKING:
     from conftest import Design

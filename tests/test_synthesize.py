@@ -10,7 +10,8 @@ import pytest
 
 import malta
 from malta.margins.verify import controller_poles
-from malta.synthesis.lqg import pi_current_loop, sampled_model, static_feedforward
+from malta.synthesis.feedforward import pi_current_loop, static_feedforward
+from malta.synthesis.sampled import sampled_model
 
 if TYPE_CHECKING:
     from conftest import Design

@@ -42,7 +42,7 @@ from malta.model.plant import Parameters, Signal, readonly
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
-    from malta.synthesis.lqg import Gains
+    from malta.synthesis.sampled import Gains
 
 
 Tracks = Literal["states", "errors"]

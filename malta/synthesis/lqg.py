@@ -24,39 +24,35 @@ from __future__ import annotations
 import math
 from contextlib import suppress
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, get_args
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 from scipy import linalg
 
 from malta.errors import CheckError, InputError
 from malta.model.linearize import LinearModel
-from malta.model.plant import Actuator, Plant, holding_forces, load_balance
 from malta.synthesis.controller import (
     Controller,
     Cost,
-    CurrentLoop,
-    Feedforward,
-    Limits,
     Noise,
     disturbances,
     lagging_forces,
     stored_forces,
 )
+from malta.synthesis.feedforward import machine_part
+from malta.synthesis.pid import pid
 from malta.synthesis.riccati import (
     add_integrals,
-    add_lags,
     care,
     dare,
-    delay_inputs,
     eigenvalues,
     sample,
     sample_cost,
     sample_noise,
 )
+from malta.synthesis.sampled import Gains, Linear, held, sampled_model, with_lags
 from malta.synthesis.spec import (
     Discretization,
-    Pid,
     Spec,
     Weights,
 )
@@ -66,33 +62,6 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from malta.model.plant import ComplexArray, FloatArray
-
-V0_STEP = 0.25e-3  # m, longest step of the grid of v0(z)
-V0_STEPS = 16  # at least, either way
-
-
-class Linear(Protocol):
-    """xi' = A xi + B v + E (y_k - p), p = C xi: a LinearModel, or the part of one that nothing joins to the rest."""
-
-    @property
-    def A(self) -> FloatArray: ...
-    @property
-    def B(self) -> FloatArray: ...
-    @property
-    def C(self) -> FloatArray: ...
-    @property
-    def E(self) -> FloatArray: ...
-
-
-class Gains(NamedTuple):
-    """The sampled design model with its gains, as the controller runs them."""
-
-    Ad: FloatArray
-    Bd: FloatArray
-    Cd: FloatArray
-    K: FloatArray
-    Ki: FloatArray
-    L: FloatArray
 
 
 @on_one_thread
@@ -147,48 +116,6 @@ def continuous_poles(model: LinearModel, weights: Weights) -> dict[str, ComplexA
         poles["LQR with integrals"] = eigenvalues(integrating)
     poles["Kalman filter"] = eigenvalues(model.A - kalman(model, weights) @ model.C)
     return {name: np.sort_complex(values) for name, values in poles.items()}
-
-
-class Lagged(NamedTuple):
-    """A linear model whose forces follow their commands as first-order lags, and are states after x."""
-
-    A: FloatArray
-    B: FloatArray
-    C: FloatArray
-    E: FloatArray
-
-
-def with_lags(model: Linear, rate: float) -> Lagged:
-    """The model with lags rate / (s + rate) before its inputs, rate in rad/s."""
-    A, B = add_lags(model.A, model.B, rate)
-    C = np.hstack([model.C, np.zeros((len(model.C), B.shape[1]))])
-    return Lagged(A, B, C, np.zeros((len(A), len(C))))
-
-
-class Held(NamedTuple):
-    """A machine between samples, its currents held: x' = A x + B (v + H y_k), y_k the last reading."""
-
-    A: FloatArray
-    H: FloatArray  # m x p, N/m
-
-
-def held(model: Linear) -> Held:
-    """What a linear model is between samples; E is in the reach of the inputs."""
-    if not model.E.any():
-        return Held(model.A, np.zeros((model.B.shape[1], len(model.C))))
-    return Held(model.A - model.E @ model.C, np.linalg.lstsq(model.B, model.E, rcond=None)[0])
-
-
-def sampled_model(model: Linear, Ts: float, delay: int = 0) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Ad, Bd, Cd under held currents, with the forces of the last `delay` samples as states."""
-    still = held(model)
-    Ad, Bd = delay_inputs(*sample(still.A, model.B, Ts), delay)
-    n, pull = len(model.A), still.H @ model.C
-    if delay:
-        Ad[-len(pull) :, :n] = pull
-    else:
-        Ad = Ad + Bd @ pull
-    return Ad, Bd, np.hstack([model.C, np.zeros((len(model.C), len(Ad) - n))])
 
 
 def gains(
@@ -358,82 +285,6 @@ def _without_bases(
     return Weights(q, one(q), r, one(r), q_i, one(q_i), w, v, drift)
 
 
-def machine_part(model: LinearModel, Ts: float, delay: int, *, current_loop_delay: bool) -> dict[str, Any]:
-    """What of a controller its machine decides, not its law."""
-    plant, actuator = model.plant, model.plant.actuator
-    loop = None
-    if math.isfinite(actuator.crossover):
-        dead_time = actuator.loop_delay if current_loop_delay else 0.0
-        loop = CurrentLoop(*pi_current_loop(actuator, dead_time), actuator.sample_time)
-    coils = len(actuator.coils)
-    return {
-        "spec_sha256": "",
-        "parameters": plant.parameters,
-        "operating_point": (model.operating_point.x[list(plant.controlled)], model.operating_point.u),
-        "sample_time": Ts,
-        "forces": plant.inputs,
-        "measurements": plant.outputs,
-        "A": model.A,
-        "B": model.B,
-        "C": model.C,
-        "feedforward": feedforward(model, Ts, delay),
-        "current_loop": loop,
-        "limits": Limits(
-            current=np.full(coils, actuator.current_limit),
-            voltage=np.full(coils, actuator.voltage_limit),
-            force=np.array(actuator.force_limit),
-        ),
-    }
-
-
-@on_one_thread
-def pid(
-    model: LinearModel,
-    terms: Pid,
-    Ts: float,
-    *,
-    name: str = "pid",
-    current_loop_delay: bool = True,
-) -> Controller:
-    """A PID controller of each output with the input of the same index.
-
-    v = Kp (p* - y) + Ki e + Kd (p*' - d),  d+ = a d + (1 - a) (y - y_last) / Ts,  a = e^(-Ts / filter)
-
-    Raises InputError for a sample time that is none, terms of another number than the inputs, states that are not
-    positions and their rates.
-    """
-    if not (math.isfinite(Ts) and Ts > 0):
-        raise InputError("pid", "Ts", f"{Ts} s", "a sample time above 0 s")
-    plant, half = model.plant, len(model.A) // 2
-    plant.require_second_order("pid")
-    if len(terms.Kp) != len(plant.inputs):
-        raise InputError("pid", "Kp", f"{len(terms.Kp)} gains", f"{len(plant.inputs)}, one for each input")
-    part = machine_part(model, Ts, plant.actuator.delay(Ts), current_loop_delay=current_loop_delay)
-    # Differences of readings are the mean rate between them, whatever the rate at the readings is.
-    part["feedforward"] = replace(part["feedforward"], rate=np.zeros((half, len(plant.outputs))))
-    return Controller(
-        **part,
-        **pid_gains(model.C[:, :half], terms, Ts)._asdict(),
-        name=name,
-        states=plant.design_states,
-        cost=None,
-        noise=None,
-    )
-
-
-def pid_gains(P: FloatArray, terms: Pid, Ts: float) -> Gains:
-    """A PID as the control law runs it, for positions q with p = P q: these and their rates come from the outputs."""
-    n, back, a = len(P), np.linalg.inv(P), math.exp(-Ts / terms.filter) if terms.filter else 0.0
-    return Gains(
-        Ad=linalg.block_diag(np.eye(n), a * np.eye(n)),
-        Bd=np.zeros((2 * n, n)),
-        Cd=np.hstack([P, np.zeros((n, n))]),
-        K=np.hstack([terms.Kp[:, None] * P, terms.Kd[:, None] * P]),
-        Ki=np.diag(terms.Ki),
-        L=np.vstack([back, (1 - a) / Ts * back]),
-    )
-
-
 @on_one_thread
 def synthesize(spec: Spec, model: LinearModel) -> Controller:
     """The controller that a design file asks for. Errors name the file."""
@@ -491,59 +342,6 @@ def calibrate(
     own = {s.name: i for i, s in enumerate(model.plant.design_states[:n])}
     integral_base = [base[own.get(s.name, 0)] * integral_time for s in model.plant.outputs]
     return replace(weights, q_base=np.concatenate([base, base * w_n]), q_i_base=np.array(integral_base))
-
-
-def pi_current_loop(actuator: Actuator, delay: float = 0.0) -> tuple[float, float]:
-    """Kp (V/A) and Ki (V/(A s)) that give 1/(L s + R) e^(-s delay) its crossover and phase margin, exactly.
-
-    |C G| = 1 and arg C G = margin - pi at s = j crossover. Cancelling the winding's pole instead would give 90
-    degrees, which is not the paper's design.
-    """
-    w = actuator.crossover
-    gain = abs(actuator.R + 1j * w * actuator.L)
-    phase = actuator.phase_margin - math.pi + w * delay + math.atan2(w * actuator.L, actuator.R)
-    Kp, Ki = gain * math.cos(phase), -w * gain * math.sin(phase)
-    if not (Kp > 0 and Ki > 0):
-        raise CheckError(
-            f"current loop: no PI controller reaches a phase margin of {math.degrees(actuator.phase_margin):.0f} deg "
-            f"at {w:.0f} rad/s with {delay * 1e6:.0f} us of delay"
-        )
-    return Kp, Ki
-
-
-def feedforward(model: LinearModel, Ts: float, delay: int = 0) -> Feedforward:
-    """v0 along the travel, inertias, and what a steady ramp takes where held currents pull back.
-
-    With x = (q, w) at a sample, q going on by Ts P^-1 p*', and currents that are `delay` samples old:
-        Ad (0, w) + Bd (f - H Ts delay p*') = (Ts P^-1 p*', w)
-    """
-    static, half = static_feedforward(model.plant), len(model.A) // 2
-    if not model.E.any():
-        return static
-    model.plant.require_second_order("held currents")
-    still = held(model)
-    Ad, Bd = sample(still.A, model.B, Ts)
-    back = np.linalg.inv(model.C[:, :half])
-    moved = np.vstack([Ts * back, np.zeros_like(back)]) + Bd @ still.H * (Ts * delay)
-    unknown = np.hstack([Ad[:, half:] - np.eye(2 * half)[:, half:], Bd])
-    found = np.linalg.solve(unknown, moved)
-    return replace(static, speed=found[half:], rate=found[:half] - back)
-
-
-def static_feedforward(plant: Plant) -> Feedforward:
-    """Inertias, and v0(z): the forces that hold the machine along its travel against gravity and cogging.
-
-    Without a stroke v0 is a constant; it stands at two positions of a grid that nothing looks up.
-    """
-    m, p, rates = len(plant.inputs), len(plant.outputs), plant.coordinates
-    if plant.has_stroke:
-        half = max(V0_STEPS, round(plant.travel / V0_STEP))
-        z_grid = np.linspace(-plant.travel, plant.travel, 2 * half + 1)
-        v0 = load_balance(plant, np.array([plant.at(**{plant.stroke: z}).x for z in z_grid]))
-    else:
-        z_grid = np.array([0.0, 1.0])
-        v0 = np.tile(holding_forces(plant), (2, 1))
-    return Feedforward(np.array(plant.inertia), np.zeros((m, p)), np.zeros((rates, p)), z_grid, v0)
 
 
 def _backward_euler(

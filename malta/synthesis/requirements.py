@@ -26,8 +26,8 @@ from malta.model.plant import Plant, Signal
 if TYPE_CHECKING:
     from malta.model.plant import ComplexArray, FloatArray, Parameters
     from malta.synthesis.controller import Controller
-    from malta.synthesis.lqg import Gains, Linear
     from malta.synthesis.recovery import RecoveryBound
+    from malta.synthesis.sampled import Gains, Linear
     from malta.synthesis.spec import Spec
     from malta.synthesis.step_response import StepResponse
 

@@ -20,7 +20,7 @@ from malta.model.data import plant_of
 from malta.model.linearize import linearize
 from malta.model.plant import OperatingPoint, Plant, Signal
 from malta.synthesis.controller import Controller, linear_law
-from malta.synthesis.lqg import machine_part
+from malta.synthesis.feedforward import machine_part
 from malta.threads import on_one_thread
 
 if TYPE_CHECKING:

@@ -27,7 +27,8 @@ from malta.margins.responses import crossing
 from malta.model.linearize import linearize
 from malta.model.plant import position_in, trim
 from malta.synthesis.controller import linear_law_of
-from malta.synthesis.lqg import gains, static_feedforward
+from malta.synthesis.feedforward import static_feedforward
+from malta.synthesis.lqg import gains
 from malta.synthesis.requirements import Noise, TrialLoop, requirements_for
 from malta.synthesis.riccati import add_lags, delay_inputs, sample
 from malta.synthesis.spec import Spec, Weights
@@ -38,8 +39,8 @@ if TYPE_CHECKING:
     from malta.model.linearize import LinearModel
     from malta.model.plant import ComplexArray, FloatArray, Plant
     from malta.synthesis.controller import LinearLaw
-    from malta.synthesis.lqg import Gains
     from malta.synthesis.requirements import Requirement
+    from malta.synthesis.sampled import Gains
     from malta.synthesis.step_response import StepResponse
 
 STEP = 0.15  # of the multiples of the box at which the machine is sampled; linear between them

@@ -30,7 +30,7 @@ from malta.margins.responses import crossing
 from malta.model.linearize import linearize
 from malta.model.plant import position_at, position_in, trim
 from malta.synthesis.controller import linear_law_of, with_readings
-from malta.synthesis.lqg import pid_gains
+from malta.synthesis.pid import pid_gains
 from malta.synthesis.requirements import ratio_of
 from malta.synthesis.riccati import sample, sample_noise
 from malta.synthesis.spec import Loads, Pid, Spec

@@ -20,7 +20,7 @@ from malta.model.published import published_value
 from malta.report.ledger import case_merit, run_design
 from malta.simulation.experiments import Experiment, Progress
 from malta.synthesis.controller import Controller
-from malta.synthesis.lqg import sampled_model
+from malta.synthesis.sampled import sampled_model
 from malta.synthesis.spec import Spec
 
 if TYPE_CHECKING:

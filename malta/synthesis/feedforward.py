@@ -1,0 +1,110 @@
+"""What the machine decides of a controller, whatever its law: feedforward, current loops, limits."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from malta.errors import CheckError
+from malta.model.linearize import LinearModel
+from malta.model.plant import Actuator, Plant, holding_forces, load_balance
+from malta.synthesis.controller import (
+    CurrentLoop,
+    Feedforward,
+    Limits,
+)
+from malta.synthesis.riccati import sample
+from malta.synthesis.sampled import held
+
+if TYPE_CHECKING:
+    pass
+
+
+V0_STEP = 0.25e-3  # m, longest step of the grid of v0(z)
+
+
+V0_STEPS = 16  # at least, either way
+
+
+def machine_part(model: LinearModel, Ts: float, delay: int, *, current_loop_delay: bool) -> dict[str, Any]:
+    """What of a controller its machine decides, not its law."""
+    plant, actuator = model.plant, model.plant.actuator
+    loop = None
+    if math.isfinite(actuator.crossover):
+        dead_time = actuator.loop_delay if current_loop_delay else 0.0
+        loop = CurrentLoop(*pi_current_loop(actuator, dead_time), actuator.sample_time)
+    coils = len(actuator.coils)
+    return {
+        "spec_sha256": "",
+        "parameters": plant.parameters,
+        "operating_point": (model.operating_point.x[list(plant.controlled)], model.operating_point.u),
+        "sample_time": Ts,
+        "forces": plant.inputs,
+        "measurements": plant.outputs,
+        "A": model.A,
+        "B": model.B,
+        "C": model.C,
+        "feedforward": feedforward(model, Ts, delay),
+        "current_loop": loop,
+        "limits": Limits(
+            current=np.full(coils, actuator.current_limit),
+            voltage=np.full(coils, actuator.voltage_limit),
+            force=np.array(actuator.force_limit),
+        ),
+    }
+
+
+def pi_current_loop(actuator: Actuator, delay: float = 0.0) -> tuple[float, float]:
+    """Kp (V/A) and Ki (V/(A s)) that give 1/(L s + R) e^(-s delay) its crossover and phase margin, exactly.
+
+    |C G| = 1 and arg C G = margin - pi at s = j crossover. Cancelling the winding's pole instead would give 90
+    degrees, which is not the paper's design.
+    """
+    w = actuator.crossover
+    gain = abs(actuator.R + 1j * w * actuator.L)
+    phase = actuator.phase_margin - math.pi + w * delay + math.atan2(w * actuator.L, actuator.R)
+    Kp, Ki = gain * math.cos(phase), -w * gain * math.sin(phase)
+    if not (Kp > 0 and Ki > 0):
+        raise CheckError(
+            f"current loop: no PI controller reaches a phase margin of {math.degrees(actuator.phase_margin):.0f} deg "
+            f"at {w:.0f} rad/s with {delay * 1e6:.0f} us of delay"
+        )
+    return Kp, Ki
+
+
+def feedforward(model: LinearModel, Ts: float, delay: int = 0) -> Feedforward:
+    """v0 along the travel, inertias, and what a steady ramp takes where held currents pull back.
+
+    With x = (q, w) at a sample, q going on by Ts P^-1 p*', and currents that are `delay` samples old:
+        Ad (0, w) + Bd (f - H Ts delay p*') = (Ts P^-1 p*', w)
+    """
+    static, half = static_feedforward(model.plant), len(model.A) // 2
+    if not model.E.any():
+        return static
+    model.plant.require_second_order("held currents")
+    still = held(model)
+    Ad, Bd = sample(still.A, model.B, Ts)
+    back = np.linalg.inv(model.C[:, :half])
+    moved = np.vstack([Ts * back, np.zeros_like(back)]) + Bd @ still.H * (Ts * delay)
+    unknown = np.hstack([Ad[:, half:] - np.eye(2 * half)[:, half:], Bd])
+    found = np.linalg.solve(unknown, moved)
+    return replace(static, speed=found[half:], rate=found[:half] - back)
+
+
+def static_feedforward(plant: Plant) -> Feedforward:
+    """Inertias, and v0(z): the forces that hold the machine along its travel against gravity and cogging.
+
+    Without a stroke v0 is a constant; it stands at two positions of a grid that nothing looks up.
+    """
+    m, p, rates = len(plant.inputs), len(plant.outputs), plant.coordinates
+    if plant.has_stroke:
+        half = max(V0_STEPS, round(plant.travel / V0_STEP))
+        z_grid = np.linspace(-plant.travel, plant.travel, 2 * half + 1)
+        v0 = load_balance(plant, np.array([plant.at(**{plant.stroke: z}).x for z in z_grid]))
+    else:
+        z_grid = np.array([0.0, 1.0])
+        v0 = np.tile(holding_forces(plant), (2, 1))
+    return Feedforward(np.array(plant.inertia), np.zeros((m, p)), np.zeros((rates, p)), z_grid, v0)
