@@ -19,7 +19,7 @@ from malta.margins.loops import loop, machine_loop
 from malta.margins.verify import controller_poles
 from malta.simulation.inputs import lagging_references
 from malta.synthesis.controller import Controller
-from malta.synthesis.lqg import gains, lqg, weights
+from malta.synthesis.lqg import gains, integral_weight, lqg, weights
 from malta.synthesis.riccati import add_integrals, delay_inputs, eigenvalues, sample, sample_cost
 from malta.synthesis.sampled import with_lags
 from malta.synthesis.spec import Spec
@@ -60,7 +60,8 @@ def test_the_gains_are_those_of_the_model_with_lags_and_delay(made: Made) -> Non
     assert (c.lagging, c.delay, c.observed) == (1, 1, 0)
     Q, N, R = sample_cost(A, B, linalg.block_diag(w.Q, np.zeros((5, 5))), w.R, TS)
     zeros = np.zeros((5, 5))
-    full = np.block([[Q, N, np.zeros((15, 5))], [N.T, R - w.R * TS, zeros], [np.zeros((5, 20)), w.Q_i * TS]])
+    Q_i = integral_weight(made.model, w) * TS
+    full = np.block([[Q, N, np.zeros((15, 5))], [N.T, R - w.R * TS, zeros], [np.zeros((5, 20)), Q_i]])
     Ai, Bi = add_integrals(c.Ad, c.Bd, c.Cd, TS)
     X, _, _ = control.dare(Ai, Bi, full, w.R * TS, method="scipy")
     K = np.linalg.solve(w.R * TS + Bi.T @ X @ Bi, Bi.T @ X @ Ai)
@@ -105,7 +106,7 @@ def test_the_gain_file_says_so(made: Made, tmp_path: Path) -> None:
         assert (back.lagging, back.delay) == (1, 1)
     content = json.loads(files[0].read_text(encoding="utf-8"))
     assert content["version"] == 2
-    assert content["law"] == {"tracks": "states"}
+    assert content["law"] == {"tracks": "states", "coordinates": "positions"}
 
 
 def test_where_there_is_no_such_lag_it_is_refused(made: Made, tmp_path: Path) -> None:
@@ -151,10 +152,11 @@ def test_a_stroke_goes_as_with_the_flagship(made: Made, estimator: str) -> None:
     assert max(figures.radial.values()) < 1.2 * max(flown.radial.values())
 
 
-def test_gains_without_a_lag_are_as_they_were(made: Made) -> None:
+def test_gains_without_a_lag_are_as_they_were() -> None:
     """A design file that says nothing of a lag keeps its gains and its fingerprint."""
-    spec = malta.read_design(ROOT / "design" / "robust.toml")
-    shipped = malta.gains.read(ROOT / "design" / "gains" / "robust.json")
+    spec = malta.read_design(ROOT / "design" / "calibrated.toml")
+    shipped = malta.gains.read(ROOT / "design" / "gains" / "calibrated.json")
     assert spec.sha256 == shipped.spec_sha256
-    found = gains(made.model, spec.weights, TS, "sampled-data", 0)
+    model = malta.linearize(spec.plant, spec.plant.at())
+    found = gains(model, spec.weights, spec.sample_time, spec.discretization, 0)
     np.testing.assert_allclose(found.K, shipped.K, rtol=1e-9, atol=1e-9 * np.abs(shipped.K).max())

@@ -134,7 +134,7 @@ def test_weights_refuse_what_is_no_weight(designs: dict[str, Design]) -> None:
     weights = designs["table2"].spec.weights
     for field, value in (("q", -1.0), ("r", 0.0), ("q_base", 0.0), ("sensor_variance", np.nan)):
         with pytest.raises(malta.InputError, match=f"Weights: {field}: found"):
-            replace(weights, **{field: np.full(len(getattr(weights, field)), value)})
+            replace(weights, **{field: np.full(len(getattr(weights, field)), value)})  # type: ignore[arg-type]
     with pytest.raises(malta.InputError, match="bases"):
         replace(weights, q_base=weights.q_base[:4])
 

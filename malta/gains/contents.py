@@ -29,6 +29,7 @@ from malta.synthesis.controller import (
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray, Parameters
+    from malta.synthesis.spec import Coordinates
 
 
 class _Layout(NamedTuple):
@@ -38,6 +39,9 @@ class _Layout(NamedTuple):
     states: tuple[Signal, ...]  # mechanical states, lagging forces, those stored for the delay, disturbances
     observed: tuple[Signal, ...]  # the last of the states: disturbances that the filter observes
     grid: int  # positions of the table of v0
+    coordinates: Coordinates  # of the integrals and of process noise
+    correlated: int  # correlations of noise
+    holding: int  # rows of feedforward.position
 
     def shapes(self) -> dict[str, dict[str, tuple[int, ...]]]:
         """Shapes of all arrays of a file, by table and key."""
@@ -45,6 +49,7 @@ class _Layout(NamedTuple):
         n, n0 = len(self.states), len(plant.design_states)
         m, p = len(plant.inputs), len(plant.outputs)
         g, coils = self.grid, len(plant.actuator.coils)
+        in_positions, half = self.coordinates == "positions", n0 // 2
         return {
             "model": {"A": (n0, n0), "B": (n0, m), "C": (p, n0), "Ad": (n, n), "Bd": (n, m), "Cd": (p, n)},
             "gains": {"K": (m, n), "Ki": (m, p), "L": (n, p)},
@@ -55,10 +60,16 @@ class _Layout(NamedTuple):
                 "rate": (plant.coordinates, p),
                 "z_grid": (g,),
                 "v0": (g, m),
+                "position": (m, half) if self.holding else (0, 0),
             },
             "limits": {"current": (coils,), "force": (m,), "voltage": (coils,)},
-            "cost": {"state": (n0,), "input": (m,), "integral": (p,)},
-            "noise": {"process": (m,), "sensor": (p,), "drift": (len(self.observed),)},
+            "cost": {"state": (n0,), "input": (m,), "integral": (half if in_positions else p,)},
+            "noise": {
+                "process": (half if in_positions else m,),
+                "sensor": (p,),
+                "drift": (len(self.observed),),
+                "correlation": (half if self.correlated else 0,),
+            },
         }
 
 
@@ -89,7 +100,7 @@ def controller_of(file: GainFile, path: str | Path) -> Controller:
         forces=layout.plant.inputs,
         measurements=layout.plant.outputs,
         **cast("dict[str, Any]", arrays["model"] | arrays["gains"]),
-        cost=Cost(**arrays["cost"]) if "cost" in arrays else None,
+        cost=Cost(**arrays["cost"], coordinates=layout.coordinates) if "cost" in arrays else None,
         noise=Noise(**arrays["noise"]) if "noise" in arrays else None,
         feedforward=Feedforward(**arrays["feedforward"]),
         current_loop=None if file.current_loop is None else CurrentLoop(**file.current_loop.model_dump()),
@@ -122,7 +133,22 @@ def _layout(file: GainFile, par: Parameters, path: str | Path) -> _Layout:
         if found != wanted:
             raise InputError(path, f"signals.{key}", _names(found), f"{_names(wanted)} of the {plant.name}")
     observed = () if errors else _observed(file, states, forces, len(mechanical), path)
-    return _Layout(plant, states, observed, len(file.feedforward.z_grid))
+    correlated = len((file.noise and file.noise.correlation) or ())
+    coordinates: Coordinates = file.law.coordinates if file.law else "signals"
+    if coordinates == "positions" or correlated:
+        _require_positions(file, plant, path)
+    holding = len(file.feedforward.position or ())
+    return _Layout(plant, states, observed, len(file.feedforward.z_grid), coordinates, correlated, holding)
+
+
+def _require_positions(file: GainFile, plant: Plant, path: str | Path) -> None:
+    """InputError for positions' coordinates of a machine without, of a law without a cost; correlations need them."""
+    if file.law is None or file.law.coordinates != "positions":
+        raise InputError(path, "noise.correlation", "some", 'none without law.coordinates "positions"')
+    if file.cost is None:
+        raise InputError(path, "law.coordinates", "positions", "signals where cost is null")
+    if not plant.second_order:
+        raise InputError(path, "law.coordinates", "positions", f"signals of the {plant.name}")
 
 
 Arrays = dict[str, dict[str, "FloatArray"]]  # by table and key
@@ -154,7 +180,12 @@ def _check_values(arrays: Mapping[str, Mapping[str, FloatArray]], path: str | Pa
         )
     for table, expected in (("limits", "limits above 0"), ("noise", "variances above 0")):
         for key, values in arrays.get(table, {}).items():
-            if not (values > 0).all():
+            if key == "correlation":
+                if not (np.abs(values) < 1).all():
+                    raise InputError(
+                        path, "noise.correlation", str(values.tolist()), "numbers between -1 and 1"
+                    )
+            elif not (values > 0).all():
                 raise InputError(path, f"{table}.{key}", str(values.tolist()), expected)
     for key, weight in arrays.get("cost", {}).items():
         if (weight < 0).any() or (key == "input" and not (weight > 0).all()):

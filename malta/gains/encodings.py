@@ -26,6 +26,7 @@ MATRICES = (
     "feedforward.v0",
     "feedforward.speed",
     "feedforward.rate",
+    "feedforward.position",
     "verification.poles.",
     "plant.linear.matrices.",
     "plant.linear.terms.",

@@ -26,7 +26,9 @@ follow their commands at once, limits.voltage is null where voltages have no lim
 
 A file of version 2 has one more table, and may have another:
 
-    law              tracks "states" or "errors": the signals that the control law takes, see synthesis/controller.py
+    law              tracks "states" or "errors": the signals that the control law takes, see synthesis/controller.py;
+                     coordinates "signals", or "positions" where cost.integral [n0/2] is of the errors of q and
+                     noise.process [n0/2, m^2/s^4] of its accelerations, see synthesis/kalman.py
     plant.linear     of a machine from plain matrices, whose name is "linear" and whose preset its own name:
                      states, inputs, outputs: signals; matrices A, B, C; terms {parameter: A, B, C}; limit [m],
                      noise [p], dead_time [s], as model/linear.py takes them
@@ -34,6 +36,7 @@ A file of version 2 has one more table, and may have another:
 There plant.parameters and its terms are null without parameters, feedforward.rate without rates among the states, and
 limits.current and limits.force without limits. The states of a law of errors are its own, then its last errors. An
 LQG's may hold forces behind the lag of the current loops, as fx_B1[i], between the mechanical states and stored forces.
+Its noise may have correlation [n0/2] of readings with accelerations, and any feedforward position m x n0/2 [N/m].
 Files without these tables keep version 1.
 
 The JSON is the specification: matrices row by row with round-trip precision, no time stamp, so the same inputs give the
@@ -83,7 +86,10 @@ def document(controller: Controller, margins: Margins) -> dict[str, Any]:
     require_stable(margins, controller.name)
     c = controller
     units, linear = units_of(c.parameters), is_linear(c.parameters)
+    in_positions = c.cost is not None and c.cost.coordinates == "positions"
     extended = linear or c.tracks == "errors" or not c.feedforward.rate.size or bool(c.lagging)
+    extended = extended or in_positions or bool(c.feedforward.position.size)
+    law = {"tracks": c.tracks} | ({"coordinates": "positions"} if in_positions else {})
     tables: dict[str, Any] = {
         "schema": SCHEMA,
         "version": 2 if extended else 1,
@@ -96,13 +102,13 @@ def document(controller: Controller, margins: Margins) -> dict[str, Any]:
         },
         "operating_point": {"x": c.operating_point[0], "u": c.operating_point[1]},
         "sample_time": c.sample_time,
-        **({"law": {"tracks": c.tracks}} if extended else {}),
+        **({"law": law} if extended else {}),
         "signals": signal_tables(c, "states", "forces", "measurements"),
         "model": {key: getattr(c, key) for key in ("A", "B", "C", "Ad", "Bd", "Cd")},
         "gains": {key: getattr(c, key) for key in ("K", "Ki", "L")},
         "cost": _table(c.cost, "state", "input", "integral"),
-        "noise": _table(c.noise, "process", "sensor", "drift"),
-        "feedforward": _table(c.feedforward, "inertia", "speed", "rate", "z_grid", "v0"),
+        "noise": _table(c.noise, "process", "sensor", "drift", later=("correlation",)),
+        "feedforward": _table(c.feedforward, "inertia", "speed", "rate", "z_grid", "v0", later=("position",)),
         "current_loop": _table(c.current_loop, "Kp", "Ki", "sample_time"),
         "limits": _table(c.limits, "current", "voltage", "force"),
         "verification": {
@@ -122,9 +128,12 @@ def document(controller: Controller, margins: Margins) -> dict[str, Any]:
     return plain
 
 
-def _table(record: Any, *keys: str) -> dict[str, Any] | None:
-    """Some fields of a record; None for None."""
-    return None if record is None else {key: getattr(record, key) for key in keys}
+def _table(record: Any, *keys: str, later: tuple[str, ...] = ()) -> dict[str, Any] | None:
+    """Some fields of a record, and those that came later where they are not empty; None for None."""
+    if record is None:
+        return None
+    used = tuple(key for key in later if getattr(record, key).size)
+    return {key: getattr(record, key) for key in keys + used}
 
 
 def _robust(margins: Margins) -> dict[str, Any] | None:

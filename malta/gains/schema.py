@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Field, StrictInt, StrictStr
 
 from malta.synthesis.controller import Tracks
+from malta.synthesis.spec import Coordinates
 from malta.tables import Finite, Quantity, Record
 
 Vector = list[Finite]
@@ -61,6 +62,7 @@ class PlantTable(Record):
 
 class _Law(Record):
     tracks: Tracks
+    coordinates: Coordinates = "signals"
 
 
 class _OperatingPoint(Record):
@@ -99,6 +101,7 @@ class _Noise(Record):
     process: Vector
     sensor: Vector
     drift: Vector | None
+    correlation: Vector | None = None
 
 
 class _Feedforward(Record):
@@ -107,6 +110,7 @@ class _Feedforward(Record):
     rate: Matrix | None
     z_grid: Vector
     v0: Matrix
+    position: Matrix | None = None
 
 
 class _CurrentLoop(Record):

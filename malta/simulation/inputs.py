@@ -22,6 +22,7 @@ from malta.simulation.noise import keys, normals
 from malta.simulation.period import state_reference
 from malta.simulation.scenario import Fault, FeedforwardChoice, Scenario, Simulation
 from malta.synthesis.controller import Controller
+from malta.synthesis.feedforward import holding_gain
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
@@ -98,22 +99,24 @@ def samples_of_memory(c: Controller) -> int:
     return c.delay + (math.ceil(math.log(1e-12) / math.log(_decay(c))) if c.lagging else 0)
 
 
-def feedforward(c: Controller, motion: references.Motion, choice: FeedforwardChoice = "axial") -> FloatArray:
-    """Feedforward forces v_ff = inertia p*'' + speed p*', N, k x m.
+def feedforward(c: Controller, motion: references.Motion, choice: FeedforwardChoice = "own") -> FloatArray:
+    """Feedforward forces v_ff = inertia p*'' + speed p*' + position q*, N, k x m.
 
-    choice : "attraction" adds the forces that hold the mover at q*, -G^-1 k q* of the gain file's model q'' = k q + G v
+    choice : "own", as the gain file has it; "axial", without the forces that hold the mover at q*; "attraction", with
+        those, -G^-1 k q* of the gain file's model q'' = k q + G v
 
     Without them, a mover under attraction k and feedback K1 goes to K1 / (K1 - k) of its reference, twice as far at
     K1 = 2 k, until the integrals correct it.
     """
     believed = plant_of(c.parameters)
     v_ff = c.feedforward.inertia * motion.ddp + motion.dp @ c.feedforward.speed.T
+    hold = c.feedforward.position
     if choice == "attraction":
         believed.require_second_order("feedforward attraction")
-        half = len(c.A) // 2
-        hold = -np.linalg.lstsq(c.B[half:], c.A[half:, :half], rcond=None)[0]
+        hold = holding_gain(c.A, c.B)
+    if hold.size and choice != "axial":
         states = evaluate(state_reference(believed).map(len(motion.p)), motion.p, motion.dp)[0]
-        v_ff += states[:, :half] @ hold.T
+        v_ff += states[:, : hold.shape[1]] @ hold.T
     return v_ff
 
 

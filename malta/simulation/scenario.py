@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 Estimator = Literal["steady-state", "kalman", "extended"]
 ESTIMATORS: tuple[Estimator, ...] = get_args(Estimator)
-FeedforwardChoice = Literal["axial", "attraction"]
+FeedforwardChoice = Literal["own", "axial", "attraction"]
 FEEDFORWARDS: tuple[FeedforwardChoice, ...] = get_args(FeedforwardChoice)
 BearingAxes = Literal["fixed", "turning"]
 FaultKind = Literal[
@@ -77,7 +77,7 @@ class Scenario:
     bearing_axes: BearingAxes = "fixed"  # of the current controllers; "turning": eq. (18) as printed
     bearing: bool = False  # touchdown bearings push back; without them a touchdown ends the run
     estimator: Estimator = "steady-state"
-    feedforward: FeedforwardChoice = "axial"  # see the function `feedforward` of inputs.py
+    feedforward: FeedforwardChoice = "own"  # see the function `feedforward` of inputs.py
     scheduled: bool = False  # the steady-state filter uses C at the measured z
     faults: tuple[Fault, ...] = ()
     correction: Correction | None = None

@@ -28,6 +28,7 @@ from malta.simulation.period import period_of
 from malta.simulation.scenario import Simulation
 from malta.simulation.substep import runge_kutta
 from malta.synthesis.controller import Controller, Noise
+from malta.synthesis.kalman import noise_input
 from malta.synthesis.riccati import sample
 
 if TYPE_CHECKING:
@@ -114,11 +115,17 @@ def _noise_of(plant: Plant, c: Controller, kind: str) -> Noise:
 
 
 def _kalman_filter(c: Controller, noise: Noise) -> Any:
-    """filterpy's filter with the covariances of the gain file: process noise acts through B, as the forces do."""
+    """filterpy's filter with the covariances of the gain file, process noise held over a sample.
+
+    Correlations of readings with accelerations are left out: they shape the filter in steady state.
+    """
     n, p = len(c.A), len(c.measurements)
     kalman = ExtendedKalmanFilter(dim_x=n, dim_z=p, dim_u=len(c.forces))
-    B = _constant_force_map(c)
-    kalman.Q = B * noise.process @ B.T
+    coordinates = c.cost.coordinates if c.cost else "signals"
+    G = _constant_force_map(c)
+    if coordinates != "signals":
+        G = sample(c.A, noise_input(c.B, coordinates), c.sample_time)[1]
+    kalman.Q = G * noise.process @ G.T
     kalman.R = np.diag(noise.sensor)
     kalman.x = np.zeros(n)
     return kalman

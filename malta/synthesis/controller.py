@@ -10,7 +10,7 @@ At every sample:
   1. y = measured outputs;                      e += Ts (p* - y), frozen on the axes that saturated last
   2. xi_hat = xi_pred + L (y - Cd xi_pred)                                     (steady-state Kalman filter)
   3. v_fb = K (xi* - xi_hat) + Ki e             with xi* = (P(z*)^-1 p*, its derivative)
-  4. v = saturate(v_fb + v_ff + v0(z)),         v_ff = inertia p*'' + speed p*', z the measured stroke
+  4. v = saturate(v_fb + v_ff + v0(z)),         v_ff = inertia p*'' + speed p*' + position q*, z the measured stroke
   5. currents = those that make v where y says the machine is, held until the next sample
   6. xi_pred = Ad xi_hat + Bd (v - v0(z))
 The mechanical states stand first in xi. Where the design models the lag of the current loops, the forces that act at
@@ -43,6 +43,7 @@ from malta.model.plant import Parameters, Signal, readonly
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
     from malta.synthesis.sampled import Gains
+    from malta.synthesis.spec import Coordinates
 
 
 Tracks = Literal["states", "errors"]
@@ -50,7 +51,7 @@ Tracks = Literal["states", "errors"]
 
 @dataclass(frozen=True, eq=False)
 class Feedforward:
-    """v_ff = inertia p*'' + speed p*'; v0(z) of the stroke z, linear between the grid points, constant beyond them.
+    """v_ff = inertia p*'' + speed p*' + position q*; v0(z), linear between grid points, constant beyond.
 
     Where currents are held that were commutated for the last reading, what they pull back with is periodic with the
     samples: a steady ramp then takes a force, and passes the readings faster than on average.
@@ -61,9 +62,11 @@ class Feedforward:
     rate: FloatArray  # n0 / 2 x p (none without q'), rates at the samples beyond P^-1 p*', per unit of p*'
     z_grid: FloatArray  # m, g points
     v0: FloatArray  # N, g x m
+    # m x n0 / 2, N/m: forces that hold the machine at q* = P^-1 p*; none: nothing is fed forward of q*
+    position: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
 
     def __post_init__(self) -> None:
-        for name in ("inertia", "speed", "rate", "z_grid", "v0"):
+        for name in ("inertia", "speed", "rate", "z_grid", "v0", "position"):
             object.__setattr__(self, name, readonly(getattr(self, name)))
 
     def at(self, z: float) -> FloatArray:
@@ -104,12 +107,13 @@ class Limits:
 class Noise:
     """Variances that the filter was designed for: white over a sample."""
 
-    process: FloatArray  # N^2, m forces
+    process: FloatArray  # N^2, m forces; in the coordinates of the positions m^2 / s^4, n0 / 2 accelerations
     sensor: FloatArray  # m^2, p measurements
-    drift: FloatArray  # N^2, of a constant force of disturbance from sample to sample: m, or none
+    drift: FloatArray  # the same, of a constant force of disturbance from sample to sample: m, or none
+    correlation: FloatArray = field(default_factory=lambda: np.zeros(0))  # n0 / 2, or none: see kalman.py
 
     def __post_init__(self) -> None:
-        for name in ("process", "sensor", "drift"):
+        for name in ("process", "sensor", "drift", "correlation"):
             object.__setattr__(self, name, readonly(getattr(self, name)))
 
 
@@ -119,7 +123,8 @@ class Cost:
 
     state: FloatArray  # n0 mechanical states
     input: FloatArray  # m forces, 1/N^2
-    integral: FloatArray  # p integrals of errors
+    integral: FloatArray  # p integrals of errors, or n0 / 2 in the coordinates of the positions
+    coordinates: Coordinates = "signals"  # of the integrals and of the process noise
 
     def __post_init__(self) -> None:
         for name in ("state", "input", "integral"):

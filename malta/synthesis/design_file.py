@@ -23,7 +23,7 @@ from malta.errors import CheckError, InputError
 from malta.files import locate
 from malta.model.data import plant_of, read
 from malta.model.parameters import units_of
-from malta.model.plant import Plant, Signal
+from malta.model.plant import Plant
 from malta.model.published import published
 from malta.synthesis.design_tables import (
     DesignFile,
@@ -40,8 +40,9 @@ from malta.synthesis.spec import (
     Spec,
     Variable,
     Weights,
+    integral_signals,
     pid_signals,
-    place_of,
+    process_signals,
 )
 from malta.tables import Quantity, load_toml, validate
 from malta.units import to_si
@@ -86,6 +87,7 @@ def read_design(path: str | Path) -> Spec:
         delay=content.delay,
         current_loop_delay=content.current_loop_delay,
         current_lag=content.current_lag,
+        position_feedforward=content.position_feedforward,
         law=_law(content, plant, path),
         uncertainty=dict(content.uncertainty),
     )
@@ -97,10 +99,13 @@ def read_design(path: str | Path) -> Spec:
     )
 
 
+LATER = ("current_lag", "coordinates", "position_feedforward")  # keys that change no design without them
+
+
 def _fingerprint(content: DesignFile) -> str:
     """SHA-256 of all that shapes the design."""
     other = {"summary", "machine", "cost", "specification", "search"}
-    other |= set() if content.current_lag else {"current_lag"}  # it came later, and changes no older design
+    other |= {name for name in LATER if getattr(content, name) == DesignFile.model_fields[name].default}
     shaping = json.dumps(content.model_dump(exclude=other, exclude_none=True), sort_keys=True)
     return hashlib.sha256(shaping.encode()).hexdigest()
 
@@ -124,7 +129,7 @@ def _law(content: DesignFile, plant: Plant, path: Path) -> Weights | Pid:
 
 
 LQG = ("discretization", "delay", "weights", "bases", "noise")
-ONLY_LQG = (*LQG, "current_lag")
+ONLY_LQG = (*LQG, "current_lag", "coordinates")
 
 
 def _require_law(content: DesignFile, raw: Mapping[str, Any], path: Path) -> None:
@@ -138,24 +143,42 @@ def _require_law(content: DesignFile, raw: Mapping[str, Any], path: Path) -> Non
 
 def _weights(content: DesignFile, plant: Plant, path: Path) -> Weights:
     states, inputs, outputs = plant.design_states, plant.inputs, plant.outputs
-    integrals = [Signal(s.name, f"{s.unit} s") for s in outputs]
+    in_positions = content.coordinates == "positions"
+    if in_positions:
+        plant.require_second_order("coordinates")
+    integrals = integral_signals(plant, content.coordinates)
+    forces = process_signals(plant, content.coordinates)
+    each = "positions" if in_positions else "measured signals"
     q, base, noise = content.weights, content.bases, content.noise
     assert q is not None
     assert base is not None
     assert noise is not None
-    drift = {}
+    given: dict[str, Any] = {}
     if noise.drift is not None:
-        drift["drift_variance"] = variances(noise.drift, inputs, path, "noise.drift", "inputs")
+        given["drift_variance"] = variances(
+            noise.drift, forces, path, "noise.drift", "positions" if in_positions else "inputs"
+        )
+    if noise.correlation is not None:
+        if not in_positions:
+            raise InputError(
+                path, "noise.correlation", "this table", 'it with coordinates = "positions" alone'
+            )
+        given["correlation"] = np.array(
+            ordered(noise.correlation, forces, path, "noise.correlation", "positions"), dtype=float
+        )
     return Weights(
         q=numbers(q.state, states, path, "weights.state", "states"),
         q_base=bases(base.state, states, path, "bases.state", "states"),
         r=numbers(q.input, inputs, path, "weights.input", "inputs", above=True),
         r_base=bases(base.input, inputs, path, "bases.input", "inputs"),
-        q_i=numbers(q.integral, outputs, path, "weights.integral", "measured signals"),
-        q_i_base=bases(base.integral, integrals, path, "bases.integral", "measured signals"),
-        process_variance=variances(noise.process, inputs, path, "noise.process", "inputs"),
+        q_i=numbers(q.integral, integrals, path, "weights.integral", each),
+        q_i_base=bases(base.integral, integrals, path, "bases.integral", each),
+        process_variance=variances(
+            noise.process, forces, path, "noise.process", "positions" if in_positions else "inputs"
+        ),
         sensor_variance=variances(noise.sensor, outputs, path, "noise.sensor", "measured signals"),
-        **drift,
+        coordinates=content.coordinates,
+        **given,
     )
 
 
@@ -276,7 +299,7 @@ def _search(table: SearchTable | None, raw: Mapping[str, Any], spec: Spec) -> di
     for name, given in table.numbers.items():
         where = f"search.numbers.{name}"
         for entry in given.vary:
-            _, _, unit, _ = place_of(entry, spec.plant, path, f"{where}.vary")
+            _, _, unit, _ = spec.place_of(entry, f"{where}.vary")
             if unit == "1" and given.unit != "1":
                 raise InputError(path, f"{where}.unit", repr(given.unit), f"no unit, as {entry} has none")
             if unit != "1":

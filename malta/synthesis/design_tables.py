@@ -10,7 +10,7 @@ from pydantic import BeforeValidator, Field, StrictBool, StrictInt, StrictStr, c
 
 from malta.synthesis.recovery import RecoveryTable
 from malta.synthesis.requirements import Requirement
-from malta.synthesis.spec import Discretization
+from malta.synthesis.spec import Coordinates, Discretization
 from malta.tables import Finite, Quantity, Record, validate
 
 
@@ -40,9 +40,10 @@ class BasesTable(Record):
 
 
 class NoiseTable(Record):
-    """[noise]: of one sample, as standard deviations or variances."""
+    """[noise]: of one sample, as standard deviations or variances; correlations of positions with accelerations."""
 
     process: dict[StrictStr, Quantity]
+    correlation: dict[StrictStr, Annotated[Finite, Field(gt=-1, lt=1)]] | None = None
     sensor: dict[StrictStr, Quantity]
     drift: dict[StrictStr, Quantity] | None = None
 
@@ -92,6 +93,8 @@ class DesignFile(Record):
     delay: Annotated[StrictInt, Field(ge=0, le=10)] = 0
     current_loop_delay: StrictBool
     current_lag: StrictBool = False
+    coordinates: Coordinates = "signals"
+    position_feedforward: StrictBool = False
     operating_point: dict[StrictStr, Quantity]
     weights: WeightsTable | None = None
     bases: BasesTable | None = None

@@ -20,7 +20,7 @@ from malta.synthesis.riccati import sample
 from malta.synthesis.sampled import held
 
 if TYPE_CHECKING:
-    pass
+    from malta.model.plant import FloatArray
 
 
 V0_STEP = 0.25e-3  # m, longest step of the grid of v0(z)
@@ -29,14 +29,23 @@ V0_STEP = 0.25e-3  # m, longest step of the grid of v0(z)
 V0_STEPS = 16  # at least, either way
 
 
-def machine_part(model: LinearModel, Ts: float, delay: int, *, current_loop_delay: bool) -> dict[str, Any]:
-    """What of a controller its machine decides, not its law."""
+def machine_part(
+    model: LinearModel, Ts: float, delay: int, *, current_loop_delay: bool, position_feedforward: bool = False
+) -> dict[str, Any]:
+    """What of a controller its machine decides, not its law.
+
+    position_feedforward : feed forward the forces that hold the machine at its reference
+    """
     plant, actuator = model.plant, model.plant.actuator
     loop = None
     if math.isfinite(actuator.crossover):
         dead_time = actuator.loop_delay if current_loop_delay else 0.0
         loop = CurrentLoop(*pi_current_loop(actuator, dead_time), actuator.sample_time)
     coils = len(actuator.coils)
+    forward = feedforward(model, Ts, delay)
+    if position_feedforward:
+        plant.require_second_order("position_feedforward")
+        forward = replace(forward, position=holding_gain(model.A, model.B))
     return {
         "spec_sha256": "",
         "parameters": plant.parameters,
@@ -47,7 +56,7 @@ def machine_part(model: LinearModel, Ts: float, delay: int, *, current_loop_dela
         "A": model.A,
         "B": model.B,
         "C": model.C,
-        "feedforward": feedforward(model, Ts, delay),
+        "feedforward": forward,
         "current_loop": loop,
         "limits": Limits(
             current=np.full(coils, actuator.current_limit),
@@ -73,6 +82,12 @@ def pi_current_loop(actuator: Actuator, delay: float = 0.0) -> tuple[float, floa
             f"at {w:.0f} rad/s with {delay * 1e6:.0f} us of delay"
         )
     return Kp, Ki
+
+
+def holding_gain(A: FloatArray, B: FloatArray) -> FloatArray:
+    """Forces that hold q'' = k q + G v at rest at a position: -G^-1 k, m x n / 2, N/m."""
+    half = len(A) // 2
+    return np.asarray(-np.linalg.lstsq(B[half:], A[half:, :half], rcond=None)[0])
 
 
 def feedforward(model: LinearModel, Ts: float, delay: int = 0) -> Feedforward:

@@ -40,6 +40,8 @@ from malta.synthesis.controller import (
     stored_forces,
 )
 from malta.synthesis.feedforward import machine_part
+from malta.synthesis.kalman import kalman as kalman
+from malta.synthesis.kalman import positions_from, sampled_filter
 from malta.synthesis.pid import pid
 from malta.synthesis.riccati import (
     add_integrals,
@@ -48,7 +50,6 @@ from malta.synthesis.riccati import (
     eigenvalues,
     sample,
     sample_cost,
-    sample_noise,
 )
 from malta.synthesis.sampled import Gains, Linear, held, sampled_model, with_lags
 from malta.synthesis.spec import (
@@ -88,20 +89,16 @@ def lqi(model: Linear, weights: Weights) -> tuple[FloatArray, FloatArray]:
         return lqr(model, weights), np.zeros((model.B.shape[1], p))
     A = np.block([[model.A, np.zeros((n, p))], [-model.C, np.zeros((p, p))]])
     B = np.vstack([model.B, np.zeros((p, model.B.shape[1]))])
-    gain = care(A, B, linalg.block_diag(weights.Q, weights.Q_i), weights.R, "LQI").K
+    gain = care(A, B, linalg.block_diag(weights.Q, integral_weight(model, weights)), weights.R, "LQI").K
     return gain[:, :n], -gain[:, n:]
 
 
-@on_one_thread
-def kalman(model: Linear, weights: Weights) -> FloatArray:
-    """Continuous steady-state Kalman gain L, n x p: xi_hat' = A xi_hat + B v + L (y - C xi_hat).
-
-    Only the ratio of process to sensor noise matters, so variances of a sample serve as intensities. The same as
-    control.lqe(A, B, C, W, V)[0], which loses digits in SI units: see riccati.py.
-    """
-    _check_sizes(model, weights)
-    W = model.B * weights.process_variance @ model.B.T
-    return care(model.A.T, model.C.T, W, np.diag(weights.sensor_variance), "Kalman filter").K.T
+def integral_weight(model: Linear, weights: Weights) -> FloatArray:
+    """Q_i of the integrals of the errors p* - p, p x p; in positions those are C_q^-1 (p* - p)."""
+    if weights.coordinates == "signals":
+        return weights.Q_i
+    to_positions = positions_from(model)
+    return np.asarray(to_positions.T @ weights.Q_i @ to_positions)
 
 
 def continuous_poles(model: LinearModel, weights: Weights) -> dict[str, ComplexArray]:
@@ -143,8 +140,9 @@ def gains(
         free = np.zeros(m)
         cost = replace(weights, q=np.append(weights.q, free), q_base=np.append(weights.q_base, free + 1))
     Ad, Bd, Cd = sampled_model(driven, Ts, delay)
-    K, Ki = _sampled_regulator(driven, cost, Ts, delay, integrated=integrated)
-    L = _sampled_filter(model, weights, Ts, known, integrated=integrated)
+    Q_i = integral_weight(model, weights)
+    K, Ki = _sampled_regulator(driven, cost, Q_i, Ts, delay, integrated=integrated)
+    L = sampled_filter(model, weights, Ts, known, integrated=integrated)
     if weights.drift_variance.size:  # x+ = Ad x + Bd (v + d), d+ = d; v takes d off, as forces under way have
         p, pushed = len(Cd), np.zeros((len(Ad), m))
         pushed[:n] = sample(held(model).A, model.B, Ts)[1]
@@ -166,6 +164,7 @@ def lqg(
     name: str = "lqg",
     current_loop_delay: bool = True,
     current_lag: bool = False,
+    position_feedforward: bool = False,
 ) -> Controller:
     """Design the controller: LQR with integrals, steady-state Kalman filter, feedforward, current loop.
 
@@ -175,6 +174,7 @@ def lqg(
     delay : samples between measurement and force in the design model (not with backward-euler)
     current_loop_delay : design the current loop with the machine's dead time
     current_lag : forces are states of the design model, first-order lags at the current loops' crossover behind v
+    position_feedforward : feed forward the forces that hold the machine at its reference, so that a tilt meets no error
 
     Raises InputError for arguments that do not fit, CheckError when an equation has no sound solution.
     """
@@ -211,14 +211,25 @@ def lqg(
     observed = disturbances(plant.inputs) if weights.drift_variance.size else ()
     lagging = lagging_forces(plant.inputs) if current_lag else ()
     return Controller(
-        **machine_part(model, Ts, delay, current_loop_delay=current_loop_delay),
+        **machine_part(
+            model,
+            Ts,
+            delay,
+            current_loop_delay=current_loop_delay,
+            position_feedforward=position_feedforward,
+        ),
         **found._asdict(),
         name=name,
         states=plant.design_states + lagging + stored_forces(plant.inputs, delay) + observed,
         cost=Cost(
-            weights.q / weights.q_base**2, weights.r / weights.r_base**2, weights.q_i / weights.q_i_base**2
+            weights.q / weights.q_base**2,
+            weights.r / weights.r_base**2,
+            weights.q_i / weights.q_i_base**2,
+            weights.coordinates,
         ),
-        noise=Noise(weights.process_variance, weights.sensor_variance, weights.drift_variance),
+        noise=Noise(
+            weights.process_variance, weights.sensor_variance, weights.drift_variance, weights.correlation
+        ),
     )
 
 
@@ -275,7 +286,8 @@ def weights_of(controller: Controller) -> Weights:
     cost, noise = controller.cost, controller.noise
     if cost is None or noise is None:
         raise InputError(controller.name, "cost", "none, as a PID has", "an LQG")
-    return _without_bases(cost.state, cost.input, cost.integral, noise.process, noise.sensor, noise.drift)
+    found = _without_bases(cost.state, cost.input, cost.integral, noise.process, noise.sensor, noise.drift)
+    return replace(found, coordinates=cost.coordinates, correlation=noise.correlation)
 
 
 def _without_bases(
@@ -288,7 +300,11 @@ def _without_bases(
 @on_one_thread
 def synthesize(spec: Spec, model: LinearModel) -> Controller:
     """The controller that a design file asks for. Errors name the file."""
-    named: dict[str, Any] = {"name": spec.name, "current_loop_delay": spec.current_loop_delay}
+    named: dict[str, Any] = {
+        "name": spec.name,
+        "current_loop_delay": spec.current_loop_delay,
+        "position_feedforward": spec.position_feedforward,
+    }
     try:
         if spec.pid is not None:
             controller = pid(model, spec.pid, spec.sample_time, **named)
@@ -360,7 +376,7 @@ def _backward_euler(
 
 
 def _sampled_regulator(
-    model: Linear, weights: Weights, Ts: float, delay: int, *, integrated: bool
+    model: Linear, weights: Weights, Q_i: FloatArray, Ts: float, delay: int, *, integrated: bool
 ) -> tuple[FloatArray, FloatArray]:
     """K, Ki of the sampled model. With delay, a force acts on the states d samples after it is commanded.
 
@@ -385,42 +401,17 @@ def _sampled_regulator(
     if not weights.q_i.any():
         return dare(Ad, Bd, Q, R, N, "sampled LQR").K, np.zeros((m, p))
     A, B = add_integrals(Ad, Bd, Cd, Ts)
-    gain = dare(
-        A, B, linalg.block_diag(Q, weights.Q_i * Ts), R, np.vstack([N, np.zeros((p, m))]), "sampled LQI"
-    ).K
+    gain = dare(A, B, linalg.block_diag(Q, Q_i * Ts), R, np.vstack([N, np.zeros((p, m))]), "sampled LQI").K
     return gain[:, : n + m * d], -gain[:, n + m * d :]
-
-
-def _sampled_filter(
-    model: Linear, weights: Weights, Ts: float, delay: int, *, integrated: bool
-) -> FloatArray:
-    """Filter-form Kalman gain. The stored forces are known, so their rows are zero; disturbances stand last.
-
-    L = P C' (C P C' + V)^-1 with the covariance P of the prediction. The noise of a reading is in the currents that are
-    commutated for it, too; beside what it does through the law that is next to nothing, and left out.
-    """
-    n, m, p = len(model.A), model.B.shape[1], len(model.C)
-    V, C, still = np.diag(weights.sensor_variance), model.C, held(model)
-    Ad, Bd = sample(still.A, model.B, Ts)
-    if integrated:
-        W = sample_noise(still.A, model.B * (weights.process_variance * Ts) @ model.B.T, Ts)
-    else:
-        W = Bd * weights.process_variance @ Bd.T
-    if not delay:
-        Ad = Ad + Bd @ still.H @ C
-    drift = weights.drift_variance
-    if drift.size:
-        Ad = np.block([[Ad, Bd], [np.zeros((m, n)), np.eye(m)]])
-        W = np.asarray(linalg.block_diag(W, np.diag(drift)))
-        C = np.hstack([C, np.zeros((p, m))])
-    P = dare(Ad.T, C.T, W, V, what="sampled Kalman filter").X
-    L = np.linalg.solve(C @ P @ C.T + V, C @ P).T
-    return np.vstack([L[:n], np.zeros((delay * m, p)), L[n:]])
 
 
 def _check_sizes(model: Linear, weights: Weights) -> None:
     n, m, p = len(model.A), model.B.shape[1], len(model.C)
-    for field, what, size in (("q", "states", n), ("r", "inputs", m), ("q_i", "measured signals", p)):
+    half, in_positions = n // 2, weights.coordinates == "positions"
+    if in_positions:
+        positions_from(model)
+    integrals = ("q_i", "positions", half) if in_positions else ("q_i", "measured signals", p)
+    for field, what, size in (("q", "states", n), ("r", "inputs", m), integrals):
         if len(getattr(weights, field)) != size:
             raise InputError(
                 "Weights",
@@ -429,6 +420,7 @@ def _check_sizes(model: Linear, weights: Weights) -> None:
                 f"{size}, one for each of the {what}",
             )
     drifts = m if weights.drift_variance.size else 0
-    for field, size in (("process_variance", m), ("sensor_variance", p), ("drift_variance", drifts)):
+    sources = half if in_positions else m
+    for field, size in (("process_variance", sources), ("sensor_variance", p), ("drift_variance", drifts)):
         if len(getattr(weights, field)) != size:
             raise InputError("Weights", field, f"{len(getattr(weights, field))} entries", f"{size}")

@@ -29,6 +29,7 @@ def pid(
     *,
     name: str = "pid",
     current_loop_delay: bool = True,
+    position_feedforward: bool = False,
 ) -> Controller:
     """A PID controller of each output with the input of the same index.
 
@@ -43,7 +44,13 @@ def pid(
     plant.require_second_order("pid")
     if len(terms.Kp) != len(plant.inputs):
         raise InputError("pid", "Kp", f"{len(terms.Kp)} gains", f"{len(plant.inputs)}, one for each input")
-    part = machine_part(model, Ts, plant.actuator.delay(Ts), current_loop_delay=current_loop_delay)
+    part = machine_part(
+        model,
+        Ts,
+        plant.actuator.delay(Ts),
+        current_loop_delay=current_loop_delay,
+        position_feedforward=position_feedforward,
+    )
     # Differences of readings are the mean rate between them, whatever the rate at the readings is.
     part["feedforward"] = replace(part["feedforward"], rate=np.zeros((half, len(plant.outputs))))
     return Controller(

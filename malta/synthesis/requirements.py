@@ -122,15 +122,21 @@ class TrialLoop:
     # Of a unit load on each of the plant's disturbances, at positions of the stroke, m, the operating point first.
     answers: tuple[tuple[float, StepResponse], ...] = ()
     recovery: Mapping[str, RecoveryBound] = field(default_factory=dict)  # what is asked of them
+    # m x n / 2, N/m: fed forward of the positions at the reference; none: nothing
+    hold: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
 
     def follow(self, w: float, p: FloatArray, x: ComplexArray) -> ComplexArray:
         """Return the true outputs as complex amplitudes while the reference is p exp(jwt), with states x exp(jwt).
 
         p : p outputs;  x : n states;  w : rad/s
         """
-        g, Ts = self.gains, self.sample_time
-        xi = np.concatenate([x, np.zeros(len(g.Ad) - len(x))])
-        v = g.K @ xi + Ts * g.Ki @ p
+        g, Ts, forces = self.gains, self.sample_time, self.Bd.shape[1]
+        v_ff = self.hold @ x[: len(x) // 2] if self.hold.size else np.zeros(forces)
+        under_way = (
+            len(g.Ad) - len(x)
+        ) // forces  # blocks of forces; what is fed forward is slow beside them
+        xi = np.concatenate([x, np.tile(v_ff, under_way)])
+        v = g.K @ xi + Ts * g.Ki @ p + v_ff
         driven = np.concatenate([self.Bd @ v, g.Bd @ v, Ts * p])[: len(self.closed)]
         states = np.linalg.solve(np.exp(1j * w * Ts) * np.eye(len(self.closed)) - self.closed, driven)
         return np.asarray(self.Cd @ states[: self.Cd.shape[1]])

@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from dataclasses import field as dataclass_field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
@@ -27,13 +27,18 @@ if TYPE_CHECKING:
     from malta.synthesis.recovery import RecoveryBound
 
 Discretization = Literal["backward-euler", "zoh", "sampled-data"]
+# What integrals are taken of and process noise acts on: errors of outputs and forces of inputs, or errors of positions
+# and their accelerations.
+Coordinates = Literal["signals", "positions"]
 
 
 @dataclass(frozen=True, eq=False)
 class Weights:
     """Dimensionless weights with their bases, and the noise of one sample.
 
-    Q = diag(q / q_base^2) and so on; n states, m inputs, p outputs, in the order of the plant's signals.
+    Q = diag(q / q_base^2) and so on; n states, m inputs, p outputs, in the order of the plant's signals. Where
+    `coordinates` are positions, q_i is of the integrals of the first n / 2 states, q, and process_variance and
+    drift_variance are of their accelerations.
     """
 
     q: FloatArray  # n, states
@@ -47,9 +52,16 @@ class Weights:
     drift_variance: FloatArray = dataclass_field(
         default_factory=lambda: np.zeros(0)
     )  # m, N2: how far a constant force of disturbance goes in a sample; none: the filter observes none
+    coordinates: Coordinates = "signals"
+    correlation: FloatArray = dataclass_field(
+        default_factory=lambda: np.zeros(0)
+    )  # n / 2, of the noise of each position with the acceleration that led to it; none: no correlation
 
     def __post_init__(self) -> None:
+        self._check_correlation()
         for name in self.__dataclass_fields__:
+            if name in ("coordinates", "correlation"):
+                continue
             value = readonly(getattr(self, name))
             zero_allowed = name in ("q", "q_i")
             if (
@@ -73,6 +85,23 @@ class Weights:
                 if not (np.isfinite(size) & ((size > 0) | (weight == 0))).all():
                     raise InputError("Weights", "bases", str(base.tolist()), "bases whose square is a number")
 
+    def _check_correlation(self) -> None:
+        """InputError unless the coordinates are known, and correlations are those of positions, between -1 and 1."""
+        if self.coordinates not in get_args(Coordinates):
+            expected = " or ".join(get_args(Coordinates))
+            raise InputError("Weights", "coordinates", repr(self.coordinates), expected)
+        value = readonly(self.correlation)
+        object.__setattr__(self, "correlation", value)
+        if value.size and (self.coordinates != "positions" or value.shape != np.shape(self.process_variance)):
+            raise InputError(
+                "Weights",
+                "correlation",
+                f"{value.size} entries",
+                "one for each position, in their coordinates",
+            )
+        if not (np.abs(value) < 1).all():
+            raise InputError("Weights", "correlation", str(value.tolist()), "numbers between -1 and 1")
+
     @property
     def Q(self) -> FloatArray:
         """State weight, n x n."""
@@ -85,7 +114,7 @@ class Weights:
 
     @property
     def Q_i(self) -> FloatArray:
-        """Weight of the error integrals, p x p, 1/(m s)2."""
+        """Weight of the error integrals in their own coordinates, p x p, 1/(m s)2."""
         return np.diag(self.q_i / self.q_i_base**2)
 
 
@@ -146,6 +175,9 @@ class Spec:
     law: Weights | Pid  # of an LQG, or the gains of a PID
     uncertainty: Mapping[str, float]  # relative, either way, by parameter
     current_lag: bool = False  # whether the lag of the current loops is in the design model
+    position_feedforward: bool = (
+        False  # whether the forces that hold the machine at its reference are fed forward
+    )
     loads: Loads | None = None  # what a PID is judged by
     specification: Mapping[str, float] = dataclass_field(
         default_factory=dict
@@ -178,20 +210,26 @@ class Spec:
         """Gains of a PID; None for an LQG."""
         return self.law if isinstance(self.law, Pid) else None
 
+    def place_of(self, entry: str, field: str = "search") -> Place:
+        """Find where an entry of the file stands in the law. Raises InputError for an entry that no design file has."""
+        coordinates: Coordinates = "signals" if isinstance(self.law, Pid) else self.law.coordinates
+        return place_of(entry, self.plant, self.path, field, coordinates)
+
     def vary(self, values: Sequence[float]) -> Spec:
         """Return the design with other numbers: one value for each variable of the search, in its own unit."""
-        fields = {name: np.array(getattr(self.law, name)) for name in self.law.__dataclass_fields__}
+        arrays = (name for name in self.law.__dataclass_fields__ if name != "coordinates")
+        fields = {name: np.array(getattr(self.law, name)) for name in arrays}
         for variable, value in zip(self.search, values, strict=True):
             for entry in variable.entries:
-                field, index, unit, squared = place_of(entry, self.plant, self.path)
+                field, index, unit, squared = self.place_of(entry)
                 si = value if unit == "1" else to_si(value, variable.unit, unit, self.path, entry)
                 fields[field][index] = si * si if squared else si
-        law: Any = type(self.law)
-        return replace(self, law=law(**fields))
+        law: Any = self.law
+        return replace(self, law=replace(law, **fields))
 
     def value_of(self, variable: Variable) -> float:
         """Return the number that the file holds for a variable of the search, in the variable's unit."""
-        field, index, unit, squared = place_of(variable.entries[0], self.plant, self.path)
+        field, index, unit, squared = self.place_of(variable.entries[0])
         si = float(np.asarray(getattr(self.law, field))[index])
         si = math.sqrt(si) if squared else si
         return si if unit == "1" else si / to_si(1.0, variable.unit, unit, self.path, variable.name)
@@ -207,26 +245,46 @@ def pid_signals(plant: Plant) -> dict[str, list[Signal]]:
     }
 
 
+Place = tuple[
+    str, int | tuple[()], str, bool
+]  # field of Weights or Pid, index, SI unit, whether as its square
+
+
+def integral_signals(plant: Plant, coordinates: Coordinates) -> list[Signal]:
+    """Name the integrals that can be weighed, with the units of their bases."""
+    of = plant.outputs if coordinates == "signals" else plant.design_states[: plant.coordinates]
+    return [Signal(s.name, f"{s.unit} s") for s in of]
+
+
+def process_signals(plant: Plant, coordinates: Coordinates) -> list[Signal]:
+    """Name the sources of process noise with their units: forces of the inputs, or accelerations of the positions."""
+    if coordinates == "signals":
+        return list(plant.inputs)
+    return [Signal(s.name, f"{s.unit} / s^2") for s in plant.design_states[: plant.coordinates]]
+
+
 def place_of(
-    entry: str, plant: Plant, where: Path, field: str = "search"
-) -> tuple[str, int | tuple[()], str, bool]:
-    """Find where an entry of the design file stands in Weights or Pid: field, index, SI unit, whether as its square.
+    entry: str, plant: Plant, where: Path, field: str = "search", coordinates: Coordinates = "signals"
+) -> Place:
+    """Find where an entry of the design file stands in Weights or Pid.
 
     Raises InputError for an entry that no design file has.
     """
-    integrals = [Signal(s.name, f"{s.unit} s") for s in plant.outputs]
+    integrals = integral_signals(plant, coordinates)
     plain = [Signal(s.name, "1") for s in plant.design_states + plant.inputs + plant.outputs]
     tables: dict[str, tuple[str, Sequence[Signal], bool]] = {
         "bases.state": ("q_base", plant.design_states, False),
         "bases.input": ("r_base", plant.inputs, False),
         "bases.integral": ("q_i_base", integrals, False),
-        "noise.process": ("process_variance", plant.inputs, True),
+        "noise.process": ("process_variance", process_signals(plant, coordinates), True),
         "noise.sensor": ("sensor_variance", plant.outputs, True),
         "weights.state": ("q", plain[: len(plant.design_states)], False),
         "weights.input": ("r", plain[len(plant.design_states) :][: len(plant.inputs)], False),
-        "weights.integral": ("q_i", plain[-len(plant.outputs) :], False),
-        "noise.drift": ("drift_variance", plant.inputs, True),
+        "weights.integral": ("q_i", [Signal(s.name, "1") for s in integrals], False),
+        "noise.drift": ("drift_variance", process_signals(plant, coordinates), True),
     }
+    if coordinates == "positions":
+        tables["noise.correlation"] = ("correlation", [Signal(s.name, "1") for s in integrals], False)
     tables |= {f"pid.{name}": (name, signals, False) for name, signals in pid_signals(plant).items()}
     if entry == "pid.filter":
         return "filter", (), "s", False

@@ -27,7 +27,7 @@ from malta.margins.responses import crossing
 from malta.model.linearize import linearize
 from malta.model.plant import position_in, trim
 from malta.synthesis.controller import linear_law_of
-from malta.synthesis.feedforward import static_feedforward
+from malta.synthesis.feedforward import holding_gain, static_feedforward
 from malta.synthesis.lqg import gains
 from malta.synthesis.requirements import Noise, TrialLoop, requirements_for
 from malta.synthesis.riccati import add_lags, delay_inputs, sample
@@ -117,9 +117,14 @@ class Group:
         """Pick the weights of the group's states, inputs and outputs."""
         i, j, o = (list(index) for index in (self.states, self.inputs, self.outputs))
         drift = w.drift_variance[j] if w.drift_variance.size else w.drift_variance
+        e, f = o, j
+        if w.coordinates == "positions":
+            half = len(w.q) // 2
+            e = f = [k for k in i if k < half]
+        correlation = w.correlation[f] if w.correlation.size else w.correlation
         return Weights(
-            w.q[i], w.q_base[i], w.r[j], w.r_base[j], w.q_i[o], w.q_i_base[o],
-            w.process_variance[j], w.sensor_variance[o], drift,
+            w.q[i], w.q_base[i], w.r[j], w.r_base[j], w.q_i[e], w.q_i_base[e],
+            w.process_variance[f], w.sensor_variance[o], drift, w.coordinates, correlation,
         )  # fmt: skip
 
 
@@ -352,6 +357,7 @@ def figures_of(spec: Spec, group: Group, weights: Weights, delay: int) -> dict[s
         bandwidth=bandwidth,
         answers=answers,
         recovery=spec.recovery,
+        hold=holding_gain(group.model.A, group.model.B) if spec.position_feedforward else np.zeros((0, 0)),
     )
     figures = {}
     for name, signal, requirement in group.requirements:

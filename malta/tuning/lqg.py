@@ -73,7 +73,10 @@ def _clusters(spec: Spec) -> list[_Cluster]:
             g = groups[k]
             # Mirror images stay so under every weight that the search tries.
             same = tuple(
-                tuple(tuple(getattr(g.part(w), name).tolist()) for name in Weights.__dataclass_fields__)
+                tuple(
+                    tuple(np.ravel(getattr(g.part(w), name)).tolist())
+                    for name in Weights.__dataclass_fields__
+                )
                 for w in (base, spec.vary(middle).weights)
             )
             distinct.setdefault((g.picture, same), g)
@@ -83,7 +86,7 @@ def _clusters(spec: Spec) -> list[_Cluster]:
 
 def _differ(a: Weights, b: Weights) -> bool:
     """Whether they may give other gains: bases of weights that are zero do not matter."""
-    names = ("Q", "R", "Q_i", "process_variance", "sensor_variance", "drift_variance")
+    names = ("Q", "R", "Q_i", "process_variance", "sensor_variance", "drift_variance", "correlation")
     return any((getattr(a, name) != getattr(b, name)).any() for name in names)
 
 

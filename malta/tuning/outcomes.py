@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from malta.synthesis.recovery import RecoveryBound
     from malta.synthesis.spec import Spec
 
-HOLD, SAMPLES = 1.0, 2000  # s, and samples at the least, of the simulated rest; its second half counts
+HOLD, SAMPLES = 2.0, 2000  # s, and samples at the least, of the simulated rest; its second half counts
 
 
 class Outcome(NamedTuple):

@@ -20,7 +20,7 @@ from malta.simulation.experiments import (
     scenario_of,
 )
 from malta.simulation.noise import keys, normals
-from malta.simulation.scenario import FEEDFORWARDS, Correction
+from malta.simulation.scenario import Correction
 from malta.simulation.trajectory import Trajectory
 from malta.synthesis.controller import Controller
 
@@ -86,7 +86,7 @@ def tilt_cases(
     _: Plant, __: Controller, *, radius: float, frequency: float, **options: Any
 ) -> list[PlannedRun]:
     """The runs of `tilt`: one for each feedforward."""
-    kinds = [options["feedforward"]] if "feedforward" in options else list(FEEDFORWARDS)
+    kinds = [options["feedforward"]] if "feedforward" in options else ["axial", "attraction"]
     reference = partial(references.circle, radius=radius, frequency=frequency)
     merits = partial(_tilt_merits, settled=1 / frequency)
     return [

@@ -1,0 +1,112 @@
+"""The steady-state Kalman filter of a linear model, continuous and sampled.
+
+    x' = A x + B v + G w,  y = C x + n          W, V: variances of w and n, of one sample
+
+G = B: noise on the forces of the inputs. In the coordinates of the positions G = [0; I]: noise on their accelerations,
+and the noise of a reading, as positions q = C_q^-1 y, may correlate with the acceleration that led to it:
+
+    E[w q'] = diag(rho sigma_w sigma_q),    sigma_q^2 = diag(C_q^-1 V C_q^-T)
+
+With rho > 0 the filter takes part of a deviation for the noise of the reading, and corrects positions less than rates:
+its poles are less damped, and delay the loop less.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy import linalg
+
+from malta.errors import InputError
+from malta.synthesis.riccati import care, dare, sample, sample_noise
+from malta.synthesis.sampled import Linear, held
+from malta.synthesis.spec import Coordinates, Weights
+from malta.threads import on_one_thread
+
+if TYPE_CHECKING:
+    from malta.model.plant import FloatArray
+
+
+@on_one_thread
+def kalman(model: Linear, weights: Weights) -> FloatArray:
+    """Continuous steady-state Kalman gain L, n x p: xi_hat' = A xi_hat + B v + L (y - C xi_hat).
+
+    Only the ratio of process to sensor noise matters, so variances of a sample serve as intensities. The same as
+    control.lqe(A, B, C, W, V)[0], which loses digits in SI units: see riccati.py.
+    """
+    G = noise_input(model.B, weights.coordinates)
+    W, V = G * weights.process_variance @ G.T, np.diag(weights.sensor_variance)
+    if not weights.correlation.any():
+        return care(model.A.T, model.C.T, W, V, "Kalman filter").K.T
+    along = G @ _correlated(model, weights) / weights.sensor_variance  # S V^-1
+    rest = W - along @ V @ along.T
+    return care((model.A - along @ model.C).T, model.C.T, rest, V, "Kalman filter").K.T + along
+
+
+def sampled_filter(model: Linear, weights: Weights, Ts: float, delay: int, *, integrated: bool) -> FloatArray:
+    """Filter-form Kalman gain. The stored forces are known, so their rows are zero; disturbances stand last.
+
+    L = (P C' + S) (C P C' + C S + S' C' + V)^-1 with the covariance P of the prediction, and S of what acted over the
+    last sample with the reading. The noise of a reading is in the currents that are commutated for it, too; beside what
+    it does through the law that is next to nothing, and left out.
+
+    integrated : process noise is white within a sample; otherwise held over it
+    """
+    n, m, p = len(model.A), model.B.shape[1], len(model.C)
+    V, C, still = np.diag(weights.sensor_variance), model.C, held(model)
+    G = noise_input(model.B, weights.coordinates)
+    Ad, Bd = sample(still.A, model.B, Ts)
+    Gd = Bd if weights.coordinates == "signals" else sample(still.A, G, Ts)[1]
+    if integrated:
+        W = sample_noise(still.A, G * (weights.process_variance * Ts) @ G.T, Ts)
+    else:
+        W = Gd * weights.process_variance @ Gd.T
+    S = np.zeros((n, p))
+    if weights.correlation.any():
+        S = Gd @ _correlated(model, weights)
+    if not delay:
+        Ad = Ad + Bd @ still.H @ C
+    if weights.drift_variance.size:
+        drift = np.diag(weights.drift_variance)
+        if weights.coordinates == "positions":  # forces that make these accelerations
+            back = np.linalg.inv(model.B[n // 2 :])
+            drift = back @ drift @ back.T
+        Ad = np.block([[Ad, Bd], [np.zeros((m, n)), np.eye(m)]])
+        W = np.asarray(linalg.block_diag(W, drift))
+        C, S = np.hstack([C, np.zeros((p, m))]), np.vstack([S, np.zeros((m, p))])
+    if S.any():
+        V = V + C @ S + S.T @ C.T
+        P = dare(Ad.T, C.T, W, V, Ad @ S, "sampled Kalman filter").X
+        L = np.linalg.solve(C @ P @ C.T + V, C @ P + S.T).T
+    else:
+        P = dare(Ad.T, C.T, W, V, what="sampled Kalman filter").X
+        L = np.linalg.solve(C @ P @ C.T + V, C @ P).T
+    return np.vstack([L[:n], np.zeros((delay * m, p)), L[n:]])
+
+
+def noise_input(B: FloatArray, coordinates: Coordinates) -> FloatArray:
+    """G of x' = A x + B v + G w: the map of the inputs, or of accelerations of the positions, n x n / 2."""
+    half = len(B) // 2
+    return B if coordinates == "signals" else np.vstack([np.zeros((half, half)), np.eye(half)])
+
+
+def positions_from(model: Linear) -> FloatArray:
+    """C_q^-1 of p = C_q q: n / 2 x p.
+
+    Raises InputError where the outputs are not as many as the positions, or do not give them.
+    """
+    half = len(model.A) // 2
+    C_q = model.C[:, :half]
+    if C_q.shape[0] != half or np.linalg.cond(C_q) > 1e12:
+        found = f"{len(C_q)} measured signals for {half} positions"
+        raise InputError("weights", "coordinates", found, "signals, or measurements that give all positions")
+    return np.asarray(np.linalg.inv(C_q))
+
+
+def _correlated(model: Linear, weights: Weights) -> FloatArray:
+    """E[w n'] of accelerations and readings, n / 2 x p."""
+    to_positions = positions_from(model)
+    sigma_q = np.sqrt(np.square(to_positions) @ weights.sensor_variance)
+    back = np.linalg.inv(to_positions)
+    return np.asarray((weights.correlation * np.sqrt(weights.process_variance) * sigma_q)[:, None] * back.T)
