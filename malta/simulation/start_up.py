@@ -100,9 +100,14 @@ def observer(simulation: Simulation, substeps: int) -> Observer:
     return run
 
 
+def fits_kalman_filter(c: Controller) -> bool:
+    """Whether a controller has covariances for a filter of the mechanical states: an LQG with integrals."""
+    return c.noise is not None and not c.observed
+
+
 def _noise_of(plant: Plant, c: Controller, kind: str) -> Noise:
     """The covariances of a controller; InputError for one that these filters do not fit."""
-    if c.noise is None or c.observed:
+    if c.noise is None or not fits_kalman_filter(c):
         without = "a PID" if c.tracks == "states" else "a law of errors"
         found = without if c.noise is None else "forces of disturbance in its own"
         raise InputError("simulate", f"estimator {kind}", found, "an LQG with integrals")

@@ -3,7 +3,7 @@
 stroke        the published move, Figs 12 and 13
 hold          2000 samples at rest with sensor noise, Fig. 14 and Table III
 tilt          a circle in sensor plane 1, sensor plane 2 held, Fig. 16 and eq. (21)
-lift-off      from rest on the touchdown bearing, by each start-up estimator
+lift-off      from rest on the touchdown bearing, by each start-up estimator that fits the controller
 payload       masses picked during a hold, and a stroke with them
 thermal       a drifting support, seen by an outside laser and compensated, Fig. 15
 disturbance   force and torque steps, vibration of the housing, compliance over frequency
