@@ -21,8 +21,9 @@
 
 n = n0 + m d where the design models a delay of d samples: the mechanical states first, then stored forces; m more where
 the filter observes forces of disturbance. The control law is stated in synthesis/controller.py. A PID controller has
-the same law; its cost, its noise and its poles of regulator and filter are null. current_loop is null where currents
-follow their commands at once, limits.voltage is null where voltages have no limit.
+the same law, with a diagonal Ki where each output has its own input (synthesis/pid.py); its cost, its noise and its
+poles of regulator and filter are null. current_loop is null where currents follow their commands at once,
+limits.voltage is null where voltages have no limit.
 
 A file of version 2 has one more table, and may have another:
 

@@ -37,6 +37,7 @@ from malta.synthesis.requirements import Requirement, requirements_for
 from malta.synthesis.spec import (
     Loads,
     Pid,
+    PidAxes,
     Spec,
     Variable,
     Weights,
@@ -183,16 +184,27 @@ def _weights(content: DesignFile, plant: Plant, path: Path) -> Weights:
 
 
 def _pid(table: PidTable, plant: Plant, path: Path) -> Pid:
+    axes: PidAxes = table.axes or "decentralized"
     gains = {}
-    for name, signals in pid_signals(plant).items():
-        entries = ordered(getattr(table, name), signals, path, f"pid.{name}", "inputs")
+    for name, signals in pid_signals(plant, axes).items():
+        given = getattr(table, name)
+        if given is None:
+            continue
+        entries = ordered(given, signals, path, f"pid.{name}", "axes" if table.axes else "inputs")
         gains[name] = np.array(
             [
                 to_si(q.value, q.unit, s.unit, path, f"pid.{name}.{s.name}")
                 for q, s in zip(entries, signals, strict=True)
             ]
         )
-    return Pid(**gains, filter=to_si(table.filter.value, table.filter.unit, "s", path, "pid.filter"))
+    if (table.filter is None) == (table.filters is None):
+        found = "nothing" if table.filter is None else "this key beside [pid.filters]"
+        raise InputError(path, "pid.filter", found, "one time of all axes, or [pid.filters] with one of each")
+    times = gains.pop("filters", None)
+    if table.filter is not None:
+        times = np.array(to_si(table.filter.value, table.filter.unit, "s", path, "pid.filter"))
+    assert times is not None
+    return Pid(**gains, filter=times, axes=axes)
 
 
 def _loads(content: DesignFile, spec: Spec) -> Loads | None:
@@ -204,7 +216,7 @@ def _loads(content: DesignFile, spec: Spec) -> Loads | None:
         raise InputError(
             path, "cost", "this table without [pid]", "the weights of an LQG, which are its cost"
         )
-    for signal, gain in zip(plant.inputs, terms.Ki, strict=True):
+    for signal, gain in zip(pid_signals(plant, terms.axes)["Ki"], terms.Ki, strict=True):
         if not gain:
             expected = "an integral gain, as a constant force leaves an error without one"
             raise InputError(path, "cost.load", f"pid.Ki.{signal.name} of 0", expected)

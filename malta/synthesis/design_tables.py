@@ -10,7 +10,7 @@ from pydantic import BeforeValidator, Field, StrictBool, StrictInt, StrictStr, c
 
 from malta.synthesis.recovery import RecoveryTable
 from malta.synthesis.requirements import Requirement
-from malta.synthesis.spec import Coordinates, Discretization
+from malta.synthesis.spec import Coordinates, Discretization, PidAxes
 from malta.tables import Finite, Quantity, Record, validate
 
 
@@ -49,12 +49,14 @@ class NoiseTable(Record):
 
 
 class PidTable(Record):
-    """[pid]: gains by input, and the time constant of the measured rate."""
+    """[pid]: gains by axis, and the time constant of the measured rates: one of all, or one of each axis."""
 
+    axes: PidAxes | None = None
     Kp: dict[StrictStr, Quantity]
     Ki: dict[StrictStr, Quantity]
     Kd: dict[StrictStr, Quantity]
-    filter: Quantity
+    filter: Quantity | None = None
+    filters: dict[StrictStr, Quantity] | None = None
 
 
 class CostTable(Record):

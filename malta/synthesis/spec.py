@@ -30,6 +30,7 @@ Discretization = Literal["backward-euler", "zoh", "sampled-data"]
 # What integrals are taken of and process noise acts on: errors of outputs and forces of inputs, or errors of positions
 # and their accelerations.
 Coordinates = Literal["signals", "positions"]
+PidAxes = Literal["decentralized", "centre-of-gravity"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,12 +121,20 @@ class Weights:
 
 @dataclass(frozen=True, eq=False)
 class Pid:
-    """Gains of a PID controller for each output and the input of the same index."""
+    """Gains of a PID controller of each axis.
 
-    Kp: FloatArray  # m, N/m
-    Ki: FloatArray  # m, N/(m s)
-    Kd: FloatArray  # m, N s/m
-    filter: float  # s, time constant of the measured rate; 0: plain differences
+    axes : "decentralized": output k with input k, gains in N/m, N/(m s), N s/m (of a torque N m/rad and so on).
+        "centre-of-gravity": coordinate k with the acceleration that all inputs together give it, gains in 1/s^2,
+        1/s^3 and 1/s.
+
+    Raises InputError for gains that are not finite or not as many as axes, and for a time below 0 s.
+    """
+
+    Kp: FloatArray  # m
+    Ki: FloatArray  # m
+    Kd: FloatArray  # m
+    filter: FloatArray | float  # s, of the measured rates: m, or one of all; 0: plain differences
+    axes: PidAxes = "decentralized"
 
     def __post_init__(self) -> None:
         for name in ("Kp", "Ki", "Kd"):
@@ -133,9 +142,17 @@ class Pid:
             object.__setattr__(self, name, value)
             if value.ndim != 1 or not np.isfinite(value).all() or value.shape != np.shape(self.Kp):
                 raise InputError("Pid", name, str(value.tolist()), "finite numbers, one for each input")
-        object.__setattr__(self, "filter", float(self.filter))
-        if not 0 <= self.filter < math.inf:
-            raise InputError("Pid", "filter", f"{self.filter} s", "a time of 0 s or more")
+        times = float(self.filter) if np.ndim(self.filter) == 0 else readonly(np.asarray(self.filter))
+        object.__setattr__(self, "filter", times)
+        if np.shape(times) not in ((), self.Kp.shape):
+            raise InputError("Pid", "filter", f"{np.size(times)} times", "one, or one for each axis")
+        if not (np.isfinite(times) & (np.asarray(times) >= 0)).all():
+            raise InputError("Pid", "filter", f"{np.asarray(times).tolist()} s", "a time of 0 s or more")
+
+    @property
+    def filters(self) -> FloatArray:
+        """Time constant of each axis, s, m of them."""
+        return np.broadcast_to(np.asarray(self.filter, dtype=float), self.Kp.shape)
 
 
 @dataclass(frozen=True)
@@ -210,22 +227,25 @@ class Spec:
         """Gains of a PID; None for an LQG."""
         return self.law if isinstance(self.law, Pid) else None
 
+    @property
+    def axes(self) -> PidAxes:
+        """What the axes of a PID are; of an LQG, which has none, as of a PID that does not say."""
+        return self.law.axes if isinstance(self.law, Pid) else "decentralized"
+
     def place_of(self, entry: str, field: str = "search") -> Place:
         """Find where an entry of the file stands in the law. Raises InputError for an entry that no design file has."""
-        coordinates: Coordinates = "signals" if isinstance(self.law, Pid) else self.law.coordinates
-        return place_of(entry, self.plant, self.path, field, coordinates)
+        return place_of(entry, self.plant, self.path, field, self.law)
 
     def vary(self, values: Sequence[float]) -> Spec:
         """Return the design with other numbers: one value for each variable of the search, in its own unit."""
-        arrays = (name for name in self.law.__dataclass_fields__ if name != "coordinates")
-        fields = {name: np.array(getattr(self.law, name)) for name in arrays}
+        numbers = [name for name in self.law.__dataclass_fields__ if name not in ("axes", "coordinates")]
+        fields: dict[str, Any] = {name: np.array(getattr(self.law, name)) for name in numbers}
         for variable, value in zip(self.search, values, strict=True):
             for entry in variable.entries:
                 field, index, unit, squared = self.place_of(entry)
                 si = value if unit == "1" else to_si(value, variable.unit, unit, self.path, entry)
                 fields[field][index] = si * si if squared else si
-        law: Any = self.law
-        return replace(self, law=replace(law, **fields))
+        return replace(self, law=replace(self.law, **fields))
 
     def value_of(self, variable: Variable) -> float:
         """Return the number that the file holds for a variable of the search, in the variable's unit."""
@@ -235,13 +255,21 @@ class Spec:
         return si if unit == "1" else si / to_si(1.0, variable.unit, unit, self.path, variable.name)
 
 
-def pid_signals(plant: Plant) -> dict[str, list[Signal]]:
-    """Name the gains of a PID: Kp, Ki and Kd, each with one signal for every input and the gain's unit."""
+def pid_signals(plant: Plant, axes: PidAxes = "decentralized") -> dict[str, list[Signal]]:
+    """Name the gains of a PID, and its filters: each table with one signal for every axis, and the gain's unit.
+
+    An axis bears the name of its input; at the centre of gravity, the name of its coordinate.
+    """
+    if axes == "centre-of-gravity":
+        names = [s.name for s in plant.design_states[: plant.coordinates]]
+        units = {"Kp": "1/s^2", "Ki": "1/s^3", "Kd": "1/s", "filters": "s"}
+        return {table: [Signal(name, unit) for name in names] for table, unit in units.items()}
     pairs = list(zip(plant.inputs, plant.outputs, strict=True))
     return {
         "Kp": [Signal(i.name, f"({i.unit}) / ({o.unit})") for i, o in pairs],
         "Ki": [Signal(i.name, f"({i.unit}) / ({o.unit}) / s") for i, o in pairs],
         "Kd": [Signal(i.name, f"({i.unit}) s / ({o.unit})") for i, o in pairs],
+        "filters": [Signal(i.name, "s") for i, _ in pairs],
     }
 
 
@@ -264,12 +292,16 @@ def process_signals(plant: Plant, coordinates: Coordinates) -> list[Signal]:
 
 
 def place_of(
-    entry: str, plant: Plant, where: Path, field: str = "search", coordinates: Coordinates = "signals"
+    entry: str, plant: Plant, where: Path, field: str = "search", law: Weights | Pid | None = None
 ) -> Place:
     """Find where an entry of the design file stands in Weights or Pid.
 
+    law : whose coordinates or axes count; None: signals and single sensors
+
     Raises InputError for an entry that no design file has.
     """
+    coordinates: Coordinates = law.coordinates if isinstance(law, Weights) else "signals"
+    axes: PidAxes = law.axes if isinstance(law, Pid) else "decentralized"
     integrals = integral_signals(plant, coordinates)
     plain = [Signal(s.name, "1") for s in plant.design_states + plant.inputs + plant.outputs]
     tables: dict[str, tuple[str, Sequence[Signal], bool]] = {
@@ -285,7 +317,8 @@ def place_of(
     }
     if coordinates == "positions":
         tables["noise.correlation"] = ("correlation", [Signal(s.name, "1") for s in integrals], False)
-    tables |= {f"pid.{name}": (name, signals, False) for name, signals in pid_signals(plant).items()}
+    for name, gains in pid_signals(plant, axes).items():
+        tables[f"pid.{name}"] = ("filter" if name == "filters" else name, gains, False)
     if entry == "pid.filter":
         return "filter", (), "s", False
     table, _, name = entry.rpartition(".")

@@ -30,10 +30,10 @@ from malta.margins.responses import crossing
 from malta.model.linearize import linearize
 from malta.model.plant import position_at, position_in, trim
 from malta.synthesis.controller import linear_law_of, with_readings
-from malta.synthesis.pid import pid_gains
+from malta.synthesis.pid import Axes, axes_of, law_of_outputs, pid_gains
 from malta.synthesis.requirements import ratio_of
 from malta.synthesis.riccati import sample, sample_noise
-from malta.synthesis.spec import Loads, Pid, Spec
+from malta.synthesis.spec import Loads, Pid, Spec, pid_signals
 from malta.tuning.noise import covariance
 from malta.tuning.search import (
     UNSTABLE,
@@ -123,11 +123,15 @@ def parts_of(whole: Part) -> list[Part]:
     return parts
 
 
-def close_loop(part: Part, terms: Pid, Ts: float) -> Loop:
-    """Close a part's loop with gains, as `machine_loop` closes the whole machine's."""
-    own, k = list(part.outputs), len(part.outputs)
-    few = Pid(terms.Kp[own], terms.Ki[own], terms.Kd[own], terms.filter)
-    law = linear_law_of(pid_gains(np.eye(k), few, Ts), Ts)
+def close_loop(part: Part, terms: Pid, Ts: float, axes: Axes | None = None) -> Loop:
+    """Close a part's loop with gains, as `machine_loop` closes the whole machine's.
+
+    axes : of the whole machine; None: each output with the input of its index
+    """
+    k = len(part.outputs)
+    one = np.eye(len(terms.Kp))
+    few, own = law_of_outputs(terms, axes or Axes(one, one, one), part.outputs)
+    law = linear_law_of(pid_gains(np.eye(k), few, Ts, own), Ts)
     linear = law._replace(D_y=law.D_y + part.slope)
     return Loop(part.Ad, part.Bd, part.Cd, linear if part.Bd.shape[1] == k else with_readings(linear), Ts)
 
@@ -253,9 +257,11 @@ def search_gains(
 
     In a part of several outputs each is searched by itself, twice around, then all together from there.
     """
-    parts = parts_of(whole_machine(*model_and_controller(spec), loads_of(spec)))
-    axis = {s.name: {k} for k, s in enumerate(spec.plant.inputs)}
-    everything = set(range(len(axis)))  # what the filter touches
+    model, controller = model_and_controller(spec)
+    parts, axes = parts_of(whole_machine(model, controller, loads_of(spec))), axes_of(model, spec.axes)
+    named = zip(pid_signals(spec.plant, spec.axes)["Kp"], axes.of_outputs, strict=True)
+    axis = {s.name: set(np.flatnonzero(row).tolist()) for s, row in named}
+    everything = set(range(len(axis)))  # what the filter of all axes touches
     outputs = [
         set[int]().union(*(axis.get(entry.rpartition(".")[2], everything) for entry in variable.entries))
         for variable in spec.search
@@ -272,7 +278,7 @@ def search_gains(
         def compute(design: Spec, members: tuple[int, ...] = members) -> dict[str, float]:
             terms, Ts = design.pid, design.sample_time
             assert terms is not None
-            figures = [loop_figures(spec, parts[k], close_loop(parts[k], terms, Ts)) for k in members]
+            figures = [loop_figures(spec, parts[k], close_loop(parts[k], terms, Ts, axes)) for k in members]
             return merge(figures, at_least)
 
         own = [block for block in blocks if block[0] and set(block[0]) <= set(variables)]
@@ -281,8 +287,8 @@ def search_gains(
             rounds += [(*block, 0) for block in own]
             rounds.append((variables, tuple(o for k in members for o in parts[k].outputs), 0))
         there = spec
-        for some, axes, generations in rounds:
-            names = [spec.plant.outputs[o].name for o in axes]
+        for some, chosen, generations in rounds:
+            names = [spec.plant.outputs[o].name for o in chosen]
             search = Search(there, some, spec.delay, journal, compute, among=variables)
             u = search.evolve(partial(_goal, search, outputs=names), generations)
             u = _polish(search, u, 3 * effort.polish * len(some), names)
