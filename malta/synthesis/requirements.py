@@ -215,7 +215,9 @@ def motion_of(name: str, outputs: Indices, heading: str) -> Requirement:
     def estimate(loop: TrialLoop, _signal: str) -> float | None:
         return _largest(loop.noise.motion, loop.outputs, outputs(loop.plant))
 
-    return Requirement(name, measure, "m", estimate=estimate, trade="motion", heading=heading)
+    return Requirement(
+        name, measure, "m", laws=("LQG", "PID"), estimate=estimate, trade="motion", heading=heading
+    )
 
 
 def force_noise_of(name: str, inputs: Indices, heading: str) -> Requirement:
@@ -227,7 +229,9 @@ def force_noise_of(name: str, inputs: Indices, heading: str) -> Requirement:
     def estimate(loop: TrialLoop, _signal: str) -> float | None:
         return _largest(loop.noise.force, loop.inputs, inputs(loop.plant))
 
-    return Requirement(name, measure, "N", estimate=estimate, trade="force", heading=heading)
+    return Requirement(
+        name, measure, "N", laws=("LQG", "PID"), estimate=estimate, trade="force", heading=heading
+    )
 
 
 def merit_of(
@@ -244,7 +248,7 @@ def merit_of(
         worst = max(case.merits[merit].value for case in e.cases)
         return [Figure(math.inf if e.failed else worst, source)]
 
-    return Requirement(name, measure, unit, estimate=estimate)
+    return Requirement(name, measure, unit, laws=("LQG", "PID"), estimate=estimate)
 
 
 def _worst(design: Design, kind: Trade, indices: Sequence[int]) -> list[Figure]:
@@ -353,6 +357,15 @@ GENERIC = (
     Requirement(  # of a constant load from outside: see recovery.py
         "recovery", _recovery, laws=("LQG", "PID"), form="loads", estimate=_recovery_estimate
     ),
-    Requirement("motion", _motion, form="outputs", estimate=_motion_estimate, trade="motion"),
-    Requirement("force_noise", _force_noise, form="inputs", estimate=_force_estimate, trade="force"),
+    Requirement(
+        "motion", _motion, laws=("LQG", "PID"), form="outputs", estimate=_motion_estimate, trade="motion"
+    ),
+    Requirement(
+        "force_noise",
+        _force_noise,
+        laws=("LQG", "PID"),
+        form="inputs",
+        estimate=_force_estimate,
+        trade="force",
+    ),
 )

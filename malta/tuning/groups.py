@@ -325,12 +325,19 @@ def _margin(table: SampledMachine, F: LinearLaw) -> float:
 
 def figures_of(spec: Spec, group: Group, weights: Weights, delay: int) -> dict[str, float]:
     """Compute the linear figures of a group in a trial, by requirement; none where its loop is unstable."""
-    Ts = spec.sample_time
     try:
         with np.errstate(all="ignore"):
-            g = gains(group.model, group.part(weights), Ts, spec.discretization, delay, spec.lag)
+            g = gains(
+                group.model, group.part(weights), spec.sample_time, spec.discretization, delay, spec.lag
+            )
     except CheckError:
         return {}
+    return figures_of_gains(spec, group, g)
+
+
+def figures_of_gains(spec: Spec, group: Group, g: Gains) -> dict[str, float]:
+    """Compute the linear figures of a group under gains, by requirement; none where its loop is unstable."""
+    Ts = spec.sample_time
     law = linear_law_of(g, Ts)
     steady = law._replace(D_y=law.D_y + group.slope)
     closed = group.nominal.close(steady)

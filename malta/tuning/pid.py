@@ -9,8 +9,9 @@ On the machine's own sampled loop (hold, held currents, delay, current loops), w
 
 The root of the sum of J_i^2 is minimized, in SI units, so that the forces weigh the axes; [specification] bounds the
 rest. Integral gains become as large as that allows. Parts of the machine that nothing joins are searched by themselves.
-Differential evolution finds the region, COBYQA (Ragonneau and Zhang) the place on the bounds. A margin over the travel
-and the regulator's natural frequencies are judged, but not searched for.
+Differential evolution finds the region, COBYQA (Ragonneau and Zhang) the place on the bounds. What else is asked for
+is estimated in each trial (pid_estimates.py) where forces do not depend on where the machine is; elsewhere a margin
+over the travel is only judged, as the regulator's natural frequencies are everywhere.
 """
 
 from __future__ import annotations
@@ -35,6 +36,7 @@ from malta.synthesis.requirements import ratio_of
 from malta.synthesis.riccati import sample, sample_noise
 from malta.synthesis.spec import Loads, Pid, Spec, pid_signals
 from malta.tuning.noise import covariance
+from malta.tuning.pid_estimates import estimates_of, name_of, outputs_of
 from malta.tuning.search import (
     UNSTABLE,
     Effort,
@@ -59,6 +61,7 @@ if TYPE_CHECKING:
 
 JOINS = 1e-9  # of the largest entries of its row and column: smaller ones are rounding
 STEEP = 30.0  # cost of a bound's logarithm in that of the load error: far beyond what any bound is worth
+LEAST = 1e-6  # ratio to a bound that counts; nearer to nothing is as good
 ROOM = 1e-5  # below a bound, for what a part's grid and rounding may hide of the whole machine
 RADII = ((0.05, 1e-3), (0.01, 1e-4))  # of COBYQA's trust region at first and last, in the unit cube
 
@@ -196,13 +199,17 @@ def loads_of(spec: Spec) -> Loads:
 
 
 def _ratios(spec: Spec, figures: Mapping[str, float]) -> list[float]:
-    """How near their bounds the figures are: each output's by its own bound, or by one of all outputs."""
-    asked, ratios = spec.specification, []
-    for name, value in figures.items():
-        base = base_of(name)
-        bound = asked.get(name, asked.get(base))
+    """How near their bounds the figures are: each output's by its own bound, or by one of all outputs.
+
+    A load that is carried to the last digit has a ratio of 0, no margin an infinite one; logarithms need numbers.
+    """
+    asked, ratios, at_least = spec.specification, [], at_least_of(spec.plant)
+    for figure, value in figures.items():
+        name = name_of(figure)
+        bound = asked.get(name, asked.get(base_of(name)))
         if bound is not None:
-            ratios.append(ratio_of(bound, value, at_least=base == "bandwidth"))
+            ratio = ratio_of(bound, value, at_least=base_of(name) in at_least)
+            ratios.append(min(max(ratio, LEAST), 1 / LEAST))
     return ratios
 
 
@@ -222,7 +229,12 @@ def _goal(search: Search, u: FloatArray, outputs: Collection[str]) -> float:
 
 def _of(figures: Mapping[str, float], outputs: Collection[str]) -> dict[str, float]:
     """Those of some outputs, and of all together."""
-    return {name: value for name, value in figures.items() if name.partition(" ")[2] in ("", *outputs)}
+    found = {}
+    for name, value in figures.items():
+        own = outputs_of(name)
+        if not own or not set(own).isdisjoint(outputs):
+            found[name] = value
+    return found
 
 
 def _polish(search: Search, u: FloatArray, trials: int, outputs: Collection[str]) -> FloatArray:
@@ -266,6 +278,7 @@ def search_gains(
         set[int]().union(*(axis.get(entry.rpartition(".")[2], everything) for entry in variable.entries))
         for variable in spec.search
     ]
+    estimates = estimates_of(spec, outputs)
     touched = [{k for k, part in enumerate(parts) if own & set(part.outputs)} for own in outputs]
     clusters, blocks = separate(touched, len(parts)), separate(outputs, len(axis))
     numbers = [len(own) for own, _ in blocks if own]
@@ -279,6 +292,8 @@ def search_gains(
             terms, Ts = design.pid, design.sample_time
             assert terms is not None
             figures = [loop_figures(spec, parts[k], close_loop(parts[k], terms, Ts, axes)) for k in members]
+            if all(figures):
+                figures += estimates.figures(terms, [o for k in members for o in parts[k].outputs])
             return merge(figures, at_least)
 
         own = [block for block in blocks if block[0] and set(block[0]) <= set(variables)]
