@@ -123,6 +123,7 @@ class Row(NamedTuple):
     relation: str = "about"  # "equal" to the printed digits, "at most", "at least", "about"
     note: str = ""  # where the paper leaves a definition open, or what explains the figures
     why: str = ""  # the reason why a figure is not reproduced
+    of_lqg: bool = False  # a PID has no such figure: it shows a dash, and no verdict
 
 
 def ledger(specs: Sequence[Spec], published: Mapping[str, Any], progress: Progress | None = None) -> Ledger:
@@ -149,7 +150,8 @@ def ledger(specs: Sequence[Spec], published: Mapping[str, Any], progress: Progre
 
 def _claim(row: Row, found: Sequence[Evidence], published: Mapping[str, Any]) -> Claim:
     """The line of the ledger for a row and the evidence of all designs."""
-    values = [in_unit(row.value(e), row.unit) for e in found]
+    judged = [e for e in found if not (row.of_lqg and e.spec.pid)]
+    values = [in_unit(row.value(e), row.unit) if e in judged else math.nan for e in found]
     ours = tuple("–" if math.isnan(value) else row.form.format(value) for value in values)
     unit = {"1": "", "percent": " [%]", "um": " [µm]", "urad": " [µrad]", "deg": " [°]"}.get(
         row.unit, f" [{row.unit}]"
@@ -163,7 +165,10 @@ def _claim(row: Row, found: Sequence[Evidence], published: Mapping[str, Any]) ->
     )
     printed = row.form.format(target) if row.relation == "equal" else f"{target:.4g}"
     mark = {"at most": "≤ ", "at least": "≥ "}.get(row.relation, "")
-    return Claim(subject, mark + printed, ours, _verdict(row, target, values, [e.spec.name for e in found]))
+    if not judged:
+        return Claim(subject, mark + printed, ours, "of an LQG only")
+    own = [value for value, e in zip(values, found, strict=True) if e in judged]
+    return Claim(subject, mark + printed, ours, _verdict(row, target, own, [e.spec.name for e in judged]))
 
 
 def _verdict(row: Row, target: float, values: Sequence[float], names: Sequence[str]) -> str:

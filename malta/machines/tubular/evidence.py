@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -12,7 +12,9 @@ import numpy as np
 from scipy.optimize import brentq
 
 from malta.machines.tubular.experiments.strokes import delayed_stroke
+from malta.margins.loops import machine_loop
 from malta.margins.plants import of_plant
+from malta.margins.recovery import PLACES, recovery
 from malta.margins.robust import robust_margin
 from malta.margins.stages import compensators
 from malta.margins.verify import Margins
@@ -32,6 +34,7 @@ from malta.synthesis.controller import Controller
 from malta.synthesis.lqg import lqr
 from malta.synthesis.riccati import add_integrals
 from malta.synthesis.spec import Spec
+from malta.tuning.noise import noise_of
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
@@ -47,7 +50,7 @@ class Evidence:
     model: LinearModel
     controller: Controller
     margins: Margins
-    K: FloatArray  # gain of the LQR without integrals
+    K: FloatArray | None  # gain of the LQR without integrals; None: a PID
     experiments: Mapping[str, Experiment]
     uncompensated: StrokeFigures  # of the stroke with cogging left out of v0(z)
     braked: float  # m/s, published speed from which the mover is braked into the DC link
@@ -67,7 +70,7 @@ def evidence(spec: Spec, published: Mapping[str, Any], progress: Progress | None
         model,
         controller,
         margins,
-        lqr(model, spec.weights),
+        None if spec.pid else lqr(model, spec.weights),
         experiments,
         stroke_figures(slow),
         published_value(published, "dc_link.speed"),
@@ -89,20 +92,26 @@ def pole_change(e: Evidence) -> float:
 
 
 def stiffness_ratio(e: Evidence) -> float:
-    """Stiffness of the LQR along x over that of the attraction."""
+    """Stiffness of the LQR along x over that of the attraction; NaN for a PID."""
+    if e.K is None:
+        return math.nan
     half = len(e.model.stiffness)
     return float((e.model.force_map @ e.K[:, :half])[0, 0] / e.model.stiffness[0, 0])
 
 
 def full_state_share(e: Evidence) -> float:
-    """Proven margin of the LQR with all states measured, as a share of the design's uncertainty."""
+    """Proven margin of the LQR with all states measured, as a share of the design's uncertainty; NaN for a PID."""
+    if e.K is None:
+        return math.nan
     law, states = compensators(e.model.plant, e.controller)["LQR"]
     system = of_plant(e.model.plant, list(e.spec.uncertainty), at=e.spec.operating_point, states=states)
     return proven_share(robust_margin(system, law, e.spec.uncertainty))
 
 
 def slowest_radial(e: Evidence) -> float:
-    """The slowest pole of the regulator with integrals in which x1 takes part, rad/s."""
+    """The slowest pole of the regulator with integrals in which x1 takes part, rad/s; NaN for a PID."""
+    if e.K is None:
+        return math.nan
     A, B = add_integrals(e.controller.Ad, e.controller.Bd, e.controller.Cd, e.controller.sample_time)
     values, shapes = np.linalg.eig(A - B @ np.hstack([e.controller.K, -e.controller.Ki]))
     part = np.abs(shapes[len(e.controller.Ad)]) > 1e-9 * np.abs(shapes).max(axis=0)
@@ -154,3 +163,41 @@ def carried_weight(e: Evidence) -> float:
 def true_radial(e: Evidence) -> float:
     """Largest rms of the true radial motion at rest, m."""
     return max(merit("hold", f"true {name}, rms", e) for name in ("x1", "y1", "x2", "y2"))
+
+
+def noise_forces(e: Evidence) -> tuple[float, float]:
+    """Rms of the worst commanded bearing force and of the thrust at rest, N: covariance of the linear loop."""
+    plant = e.model.plant
+    force = noise_of(machine_loop(e.model, e.controller), plant).force
+    return float(np.delete(force, plant.thrust_input).max()), float(force[plant.thrust_input])
+
+
+def load_deviation(name: str, after: float | None, e: Evidence) -> float:
+    """How far a load of LOADS moves an output, m: at most, or from `after` (s) on; at the operating point."""
+    plant, par = e.model.plant, e.spec.parameters
+    load = {key: size(par) for key, size in LOADS[name].items()}
+    (found,) = recovery(plant, e.controller, {name: load}, after=() if after is None else (after,))
+    return max(d.largest if after is None else d.left[0] for d in found.outputs)
+
+
+# N and N m by disturbance, of the parameters: 1 N at a point of the mover.
+LOADS: dict[str, dict[str, Callable[[Any], float]]] = {
+    "centre of gravity": {"F_x": lambda _: 1.0},
+    "bearing": {"F_x": lambda _: 1.0, "T_y": lambda par: par.l_B},
+    "thrust": {"F_z": lambda _: 1.0},
+}
+
+
+def axis_coupling(e: Evidence) -> float:
+    """What a bearing's force does to the other bearing's sensor, over what the other's own does; worst of the travel.
+
+    Accelerations C B of the linear model, without attraction: both are the larger, the faster the motion.
+    """
+    plant, worst = e.model.plant, 0.0
+    for z in np.linspace(-plant.travel, plant.travel, PLACES):
+        model = linearize(plant, plant.at(z=float(z)))
+        half = len(model.A) // 2
+        moved = np.abs(model.C[:, :half] @ model.force_map)
+        own = np.diag(moved)
+        worst = max(worst, float((moved / own[:, None] - np.eye(half)).max()))
+    return worst
