@@ -537,7 +537,9 @@ def test_a_long_proof_says_where_it_is(run: Run, monkeypatch: pytest.MonkeyPatch
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["table2", "calibrated", "robust", "halbach", "halbach_late", "halbach_pid"])
+@pytest.mark.parametrize(
+    "name", ["table2", "calibrated", "robust", "tubular_pid", "halbach", "halbach_late", "halbach_pid"]
+)
 def test_shipped_designs(tmp_path: Path, name: str) -> None:
     path, content = shipped(name, tmp_path)
     found = check(path, ROOT / "design" / "gains" / f"{name}.json")
