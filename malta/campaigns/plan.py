@@ -22,7 +22,7 @@ from scipy.stats import qmc
 from malta.errors import InputError
 from malta.gains.encodings import decode
 from malta.model.data import plant_of
-from malta.model.parameters import shape_parameters, twins_of, units_of
+from malta.model.parameters import shape_parameters, twins_of, units_of, values_of
 from malta.model.plant import Plant, readonly
 from malta.simulation.catalogue import cases_of
 from malta.simulation.experiments import PlannedRun
@@ -168,7 +168,7 @@ def _manifest(plan: Plan) -> dict[str, Any]:
         "machine": {
             "name": plan.plant.name,
             "preset": plan.parameters.preset,
-            "parameters": {name: getattr(plan.parameters, name) for name in units_of(plan.parameters)},
+            "parameters": values_of(plan.parameters),
         },
         "scenario": {"name": plan.scenario, "case": planned_run(plan).label, "options": dict(plan.options)},
         "spread": dict(plan.spread),

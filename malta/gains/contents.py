@@ -13,7 +13,7 @@ from malta.gains.linear import linear_parameters
 from malta.gains.schema import GainFile, PlantTable
 from malta.model.data import parameters_record, plant_of
 from malta.model.machines import machine
-from malta.model.parameters import units_of
+from malta.model.parameters import later_parameters, units_of
 from malta.model.plant import Plant, Signal
 from malta.synthesis.controller import (
     Controller,
@@ -247,8 +247,9 @@ def _parameters(plant: PlantTable, path: str | Path) -> Parameters:
             raise
         raise InputError(path, "plant.name", error.found, error.expected) from error
     units, given = units_of(record), plant.parameters or {}
-    if set(given) != set(units):
-        odd = sorted(set(given) ^ set(units))
+    needed = set(units) - set(later_parameters(record))
+    odd = sorted(set(given) - set(units) | needed - set(given))
+    if odd:
         raise InputError(path, "plant.parameters", f"{odd[0]} missing or unknown", " ".join(units))
     for key, q in given.items():
         if q.unit != units[key]:

@@ -66,7 +66,7 @@ from malta.gains.schema import GainFile
 from malta.margins.verify import require_stable, unstable_gain
 from malta.model.data import plant_of
 from malta.model.linear import is_linear
-from malta.model.parameters import units_of
+from malta.model.parameters import units_of, values_of
 from malta.synthesis.controller import (
     Controller,
 )
@@ -98,7 +98,7 @@ def document(controller: Controller, margins: Margins) -> dict[str, Any]:
         "plant": {
             "name": LINEAR if linear else plant_of(c.parameters).name,
             "preset": c.parameters.preset,
-            "parameters": {k: {"value": getattr(c.parameters, k), "unit": u} for k, u in units.items()},
+            "parameters": {k: {"value": v, "unit": units[k]} for k, v in values_of(c.parameters).items()},
             **({"linear": linear_table(c.parameters)} if linear else {}),
         },
         "operating_point": {"x": c.operating_point[0], "u": c.operating_point[1]},

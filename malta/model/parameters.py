@@ -21,6 +21,7 @@ def si(
     at_least: float | None = None,
     twin: str | None = None,
     shapes: bool = False,
+    default: float | None = None,
 ) -> Any:
     """Declare a parameter of a machine: a field of its frozen dataclass Parameters.
 
@@ -28,17 +29,31 @@ def si(
     above, at_least : the lower limit of the value, exclusive or inclusive
     twin : the name of another parameter; where both have the same value, symbolic models use one symbol for the two
     shapes : the parameter sets the size of the model (a delay, a number of harmonics), so it is never a symbol
+    default : the value of a parameter that came later: gain files do not mention the parameter while it has this value
 
     Example: `m: float = si("kg", above=0)  # mover with magnets, Table IV`
     """
-    return field(
-        metadata={"unit": unit, "above": above, "at_least": at_least, "twin": twin, "shapes": shapes}
-    )
+    metadata = {"unit": unit, "above": above, "at_least": at_least, "twin": twin, "shapes": shapes}
+    if default is None:
+        return field(metadata=metadata)
+    return field(default=default, metadata=metadata | {"later": True})
 
 
 def units_of(record: type[Parameters] | Parameters) -> dict[str, str]:
     """The SI unit of every physical field of a parameter record."""
     return {f.name: f.metadata["unit"] for f in fields(record) if "unit" in f.metadata}
+
+
+def later_parameters(record: type[Parameters] | Parameters) -> dict[str, float]:
+    """The default values of the parameters that came later, by name: older files do not mention them."""
+    return {f.name: float(f.default) for f in fields(record) if f.metadata.get("later")}  # type: ignore[arg-type]
+
+
+def values_of(record: Parameters) -> dict[str, float]:
+    """The values of all parameters by name (SI), without those that came later and have their default values."""
+    later = later_parameters(record)
+    values = {name: getattr(record, name) for name in units_of(record)}
+    return {name: value for name, value in values.items() if value != later.get(name)}
 
 
 def twins_of(record: Parameters) -> dict[str, str]:

@@ -16,6 +16,7 @@ from malta.machines.halbach.motor import (
     PHASES,
     advance,
     duty_cycles,
+    motor_constant,
     park,
     park_of_angle,
     phase_currents,
@@ -108,7 +109,7 @@ def resting_positions(par: Parameters, references: Any, F_z: float, pwm: Pwm) ->
     for r in np.atleast_1d(np.asarray(references, dtype=float)):
         d, limited = modulate(par, par.R * phase_currents(par, r, 0, F_z), pwm)
         if not (F_z > 0 and math.isfinite(r)) or bool(limited):
-            most = 0.75 * par.V_dc * par.A / par.R
+            most = 0.75 * par.V_dc * float(motor_constant(par)) / par.R
             raise InputError("halbach", "settled", f"{F_z:g} N at {r:g} m", f"forces of 0 to {most:.1f} N")
         V_d, V_q = np.array(park(r, par.k) @ (par.V_dc * (d - 0.5))).ravel()
         places.append(r + math.atan2(V_d, V_q) / par.k)
@@ -126,7 +127,7 @@ def dead_zones(par: Parameters, F_z: float, pwm: Pwm) -> tuple[FloatArray, Float
     step = pwm_step(par, pwm)
     if not (step and F_z):
         raise InputError("halbach", "dead_zones", f"pwm {pwm!r} at {F_z:g} N", "steps, and a vertical force")
-    amplitude = 2 / 3 * par.R * abs(F_z) / par.A / step  # of a phase voltage, in steps
+    amplitude = 2 / 3 * par.R * abs(F_z) / float(motor_constant(par)) / step  # of a phase voltage, in steps
     edges = np.arange(math.ceil(-amplitude - 0.5), math.floor(amplitude - 0.5) + 1) + 0.5
     rise = np.arcsin(edges[np.abs(edges) <= amplitude] / amplitude)
     angles = [np.concatenate([rise, math.pi - rise]) + phase for phase in PHASES]
@@ -168,7 +169,7 @@ def force_noise(par: Parameters, x: float | None = None) -> float:
     if x is not None:
         d = np.array(park(x, par.k))[0]
         share = float((d[0] - d[2]) ** 2 + (d[1] - d[2]) ** 2)
-    return share * (par.A * par.s_adc) ** 2 / par.f_pwm
+    return float(share * (motor_constant(par) * par.s_adc) ** 2 / par.f_pwm)
 
 
 FLAGS = ("duty limit", "current range")

@@ -10,6 +10,8 @@ SCALING. The transform is the paper's (6), P(x), with its inverse (9): they carr
 and Iq are 1.5 x the amplitude of the phase currents, and F = A (Id, Iq) without a factor. Voltages are transformed
 alike, so u = R i + L i' holds in these axes as it stands; power is 2/3 (Vd Id + Vq Iq).
 
+AIR GAP. A is that of a gap of 400 um; at another gap the motor has A(z_0) = A e^(-k (z_0 - 400 um)), by (2).
+
 HELD ANGLE. Between two readings of the laser the Park angle is constant, and so are the phase currents. At a distance d
 from the position of the reading the motor has the horizontal force F_x cos(k d) - F_z sin(k d), which contains a spring
 of stiffness k F_z. Every model that a position controller is designed on contains that spring.
@@ -25,7 +27,7 @@ import casadi as ca
 
 from malta.errors import InputError
 from malta.machines.halbach.electronics import MEAN_OF, current_delay, current_loop, electronics
-from malta.machines.halbach.motor import forces, motion, phase_currents
+from malta.machines.halbach.motor import GAP, forces, motion, motor_constant, phase_currents
 from malta.model.parameters import check_parameters, si
 from malta.model.plant import (
     Actuator,
@@ -66,6 +68,7 @@ class Parameters:
     a_a: float = si("1", above=0)  # motor constant of each phase in A, which is what commutation knows
     a_b: float = si("1", above=0)
     a_c: float = si("1", above=0)
+    z_0: float = si("m", above=0, default=GAP)  # air gap
     preset: str = "custom"
 
     def __post_init__(self) -> None:
@@ -105,7 +108,7 @@ def plant(par: Parameters) -> Plant:
         actuator=Actuator(
             coils=COILS,
             force_limit=(par.F_max,),
-            force_constant=(par.A,),
+            force_constant=(motor_constant(par),),
             current_limit=par.I_adc,
             voltage_limit=par.V_dc / 2,
             R=par.R,
