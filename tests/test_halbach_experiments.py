@@ -245,6 +245,7 @@ def test_error_budget(evidence: Mapping[str, Evidence], name: str) -> None:
     assert 1.6 < best < rms["current noise"] < worst < {"halbach": 3.1, "halbach_pid": 3.7}[name]
     assert rms["current steps"] < 0.05
     assert rms["PWM"] < 0.01
+    assert rms["angle of 24 bits"] < 0.001
     assert rms["all"] == pytest.approx(rms["current noise"], rel=0.1)
     assert rms["all, fine PWM"] == pytest.approx(rms["all"], rel=0.1)
 
@@ -365,6 +366,8 @@ def test_every_row_of_the_ledger_has_its_verdict(
     assert missed == {
         "current for 1 µm at 5 N, peak [mA]",
         "current sensor: noise after the rolling mean [mA]",
+        "current sensor: range of 32 samples [A]",
+        "bits that the rolling mean adds",
         "smallest motion, high-resolution PWM [µm]",
         "Fig. 10: open loop, steady change [%]",
         "Fig. 10: position control, steady change [%]",

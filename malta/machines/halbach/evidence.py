@@ -26,6 +26,7 @@ from malta.synthesis.spec import Spec
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
 
+DEAD_FORCE = 14.45  # N, between the largest with fine steps everywhere, 14.42 N, and the supply's 14.46 N
 EXPERIMENT_NAMES = ("step", "stairs", "ramp", "force", "budget", "identify")
 
 
@@ -95,6 +96,32 @@ def duty_at_force(e: Evidence) -> FloatArray:
     places = np.linspace(0, 2 * math.pi / e.par.k, 361)
     V = [e.par.R * motor.phase_currents(e.par, x, 0, e.par.F_z) for x in places]
     return np.array([np.array(motor.duty_cycles(e.par, v)).ravel() for v in V])
+
+
+def bits_of_mean(e: Evidence) -> float:
+    """Bits that the rolling mean adds to a current sample: log2 of the errors' ratio, over the printed range."""
+    rng, most = np.random.default_rng(0), e.value("pwm.current")
+    i = rng.uniform(-most, most, (4000, 1))
+    noisy = i + e.par.s_adc * rng.standard_normal((len(i), electronics.MEAN_OF))
+    codes = np.array(electronics.sample_current(e.par, noisy, steps=True)[0])
+    error = codes * electronics.adc_step(e.par) - e.par.I_adc - i
+    return math.log2(float(error.std() / error.mean(axis=1).std()))
+
+
+def samples_of_range(e: Evidence) -> float:
+    """The number of samples whose range is the printed one, on average."""
+    wanted, low, high = e.value("current_sampling.range"), 2, 100_000
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (middle, high) if electronics.expected_range(e.par, middle) < wanted else (low, middle)
+    return float(high)
+
+
+def rest_in_dead_ends(dead_ends: int, e: Evidence) -> float:
+    """Largest error of the resting place at DEAD_FORCE with high-resolution PWM, m."""
+    places = np.linspace(0, math.pi / 3 / e.par.k, 1001)  # a sixth of a pitch: the phases take turns
+    found = electronics.resting_positions(e.par, places, DEAD_FORCE, "fine", dead_ends)
+    return float(np.abs(found - places).max())
 
 
 def first_stair(e: Evidence) -> float:
