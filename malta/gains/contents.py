@@ -16,6 +16,7 @@ from malta.model.machines import machine
 from malta.model.parameters import later_parameters, units_of
 from malta.model.plant import Plant, Signal
 from malta.synthesis.controller import (
+    Commutation,
     Controller,
     Cost,
     CurrentLoop,
@@ -64,6 +65,7 @@ class _Layout(NamedTuple):
             },
             "limits": {"current": (coils,), "force": (m,), "voltage": (coils,)},
             "cost": {"state": (n0,), "input": (m,), "integral": (half if in_positions else p,)},
+            "commutation": {"pull": (m, p)},
             "noise": {
                 "process": (half if in_positions else m,),
                 "sensor": (p,),
@@ -81,6 +83,8 @@ def controller_of(file: GainFile, path: str | Path) -> Controller:
     """
     if file.plant.linear is not None and file.law is None:
         raise InputError(path, "plant.linear", "a table", "none without a table law, as version 2 has it")
+    if file.commutation is not None and file.law is None:
+        raise InputError(path, "commutation", "a table", "none without a table law, as version 2 has it")
     par = _parameters(file.plant, path)
     layout = _layout(file, par, path)
     if (file.cost is None) != (file.noise is None):
@@ -106,6 +110,9 @@ def controller_of(file: GainFile, path: str | Path) -> Controller:
         current_loop=None if file.current_loop is None else CurrentLoop(**file.current_loop.model_dump()),
         limits=Limits(**(unlimited | arrays["limits"])),
         tracks="errors" if errors else "states",
+        commutation=None
+        if file.commutation is None
+        else Commutation(file.commutation.lead, **arrays["commutation"]),
     )
 
 

@@ -27,6 +27,7 @@ MATRICES = (
     "feedforward.speed",
     "feedforward.rate",
     "feedforward.position",
+    "commutation.pull",
     "verification.poles.",
     "plant.linear.matrices.",
     "plant.linear.terms.",

@@ -25,7 +25,7 @@ the same law, with a diagonal Ki where each output has its own input (synthesis/
 poles of regulator and filter are null. current_loop is null where currents follow their commands at once,
 limits.voltage is null where voltages have no limit.
 
-A file of version 2 has one more table, and may have another:
+A file of version 2 has one more table, and may have others:
 
     law              tracks "states" or "errors": the signals that the control law takes, see synthesis/controller.py;
                      coordinates "signals", or "positions" where cost.integral [n0/2] is of the errors of q and
@@ -33,6 +33,7 @@ A file of version 2 has one more table, and may have another:
     plant.linear     of a machine from plain matrices, whose name is "linear" and whose preset its own name:
                      states, inputs, outputs: signals; matrices A, B, C; terms {parameter: A, B, C}; limit [m],
                      noise [p], dead_time [s], as model/linear.py takes them
+    commutation      lead [s], pull m x p [N/m]: currents are commutated for y + lead p*', see synthesis/controller.py
 
 There plant.parameters and its terms are null without parameters, feedforward.rate without rates among the states, and
 limits.current and limits.force without limits. The states of a law of errors are its own, then its last errors. An
@@ -88,7 +89,8 @@ def document(controller: Controller, margins: Margins) -> dict[str, Any]:
     c = controller
     units, linear = units_of(c.parameters), is_linear(c.parameters)
     in_positions = c.cost is not None and c.cost.coordinates == "positions"
-    extended = linear or c.tracks == "errors" or not c.feedforward.rate.size or bool(c.lagging)
+    ahead = c.commutation is not None
+    extended = linear or c.tracks == "errors" or not c.feedforward.rate.size or bool(c.lagging) or ahead
     extended = extended or in_positions or bool(c.feedforward.position.size)
     law = {"tracks": c.tracks} | ({"coordinates": "positions"} if in_positions else {})
     tables: dict[str, Any] = {
@@ -111,6 +113,7 @@ def document(controller: Controller, margins: Margins) -> dict[str, Any]:
         "noise": _table(c.noise, "process", "sensor", "drift", later=("correlation",)),
         "feedforward": _table(c.feedforward, "inertia", "speed", "rate", "z_grid", "v0", later=("position",)),
         "current_loop": _table(c.current_loop, "Kp", "Ki", "sample_time"),
+        **({"commutation": _table(c.commutation, "lead", "pull")} if ahead else {}),
         "limits": _table(c.limits, "current", "voltage", "force"),
         "verification": {
             "poles": margins.poles.pairs(),

@@ -119,6 +119,11 @@ class _CurrentLoop(Record):
     sample_time: Annotated[Finite, Field(gt=0)]
 
 
+class _Commutation(Record):
+    lead: Annotated[Finite, Field(gt=0)]
+    pull: Matrix
+
+
 class _Limits(Record):
     current: Vector | None
     voltage: Vector | None
@@ -172,6 +177,7 @@ class GainFile(Record):
     noise: _Noise | None
     feedforward: _Feedforward
     current_loop: _CurrentLoop | None
+    commutation: _Commutation | None = None
     limits: _Limits
     verification: _Verification
     provenance: _Provenance

@@ -45,6 +45,7 @@ def design_page(
     made += ", with the lag of the current loops" if spec.current_lag else ""
     if spec.pid is not None:
         made = f"PID, {_rate_text(spec.sample_time)}"
+    made += ", commutated for the predicted place" if spec.commutation == "predicted" else ""
     return Group(
         Text(f"{spec.name}: {spec.summary}", style="bold"),
         f"{model.plant.name}, preset {spec.parameters.preset}, {made}",

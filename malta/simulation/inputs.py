@@ -54,7 +54,7 @@ def sample_inputs(run: Simulation, motion: references.Motion, t: FloatArray) -> 
 
     v_past holds the forces behind the lag of the design model, then the stored forces of the samples before: the
     feedforward, and the force that currents commutated for the reference add to it, which is in the row of the newest
-    stored force in Ad.
+    stored force in Ad, and ahead of the reference as the controller's `commutation` says.
     """
     plant, c, scenario, setup = run
     v_ff = feedforward(c, motion, scenario.feedforward)
@@ -64,6 +64,8 @@ def sample_inputs(run: Simulation, motion: references.Motion, t: FloatArray) -> 
         newest = n + m * (c.lagging + c.delay - 1)
         states = evaluate(state_reference(plant_of(c.parameters)).map(len(t)), motion.p, motion.dp)[0]
         stored = v_ff + states @ c.Ad[newest : newest + m, :n].T
+        if c.commutation is not None:
+            stored += motion.dp @ (c.commutation.lead * c.commutation.pull).T
     past = [np.vstack([np.repeat(stored[:1], age, axis=0), stored[:-age]]) for age in range(c.delay, 0, -1)]
     if c.lagging:
         past.insert(0, lagging_references(c, v_ff))

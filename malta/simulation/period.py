@@ -44,7 +44,7 @@ from malta.simulation.layout import (
     with_symbols,
 )
 from malta.simulation.substep import advance
-from malta.synthesis.controller import Controller, commanded, estimated, filtered
+from malta.synthesis.controller import Controller, commanded, estimated, filtered, looking_ahead
 
 
 class Period(NamedTuple):
@@ -201,9 +201,9 @@ def _control_law(loop: Loop, signals: Signals, y: Any, v0: Any) -> tuple[dict[st
     xi_pred, e, frozen, v = commanded(g, xi_hat, e_now, frozen_now, y, p_ref, xi_ref, v_ff, v0)
     if s.open_loop:
         v, frozen = v_ff + v0, 0 * frozen  # open loop: no limit of the feedback is reached
+    xi_pred, place = looking_ahead(g, xi_pred, p_ref if s.open_loop else y, given["dp_ref"])
     after: dict[str, Any] = {"xi_pred": xi_pred, "e": e, "frozen": frozen}
     # The controller commutates with the machine of its gain file; the simulated machine limits the currents.
-    place = p_ref if s.open_loop else y
     wanted = believed.currents(place, v)
     current, fast = plant.limited(wanted), electronics_of(plant, s)
     met = [ca.mmax(ca.fabs(current - wanted)) > 0]

@@ -19,6 +19,10 @@ follow, the oldest first: v - v0, and what currents commutated for an old readin
 is what was commanded then, lagging. Last come constant forces of disturbance, where the filter observes them, with
 zero for a reference.
 
+Where the controller has a `commutation`, the currents of step 5 are those of y + lead p*', the place where they will
+act on the way of the reference. The filter knows what that does to the forces that pull back between readings:
+xi_pred = Ad xi_hat + Bd (v - v0 + pull lead p*'). The reference is not fed back, so the loop stays the same.
+
 A PID controller is the same law: its filter takes positions as measured and rates as filtered differences,
 Ad = diag(1, a), Bd = 0, L = (P^-1, (1 - a) P^-1 / Ts), and it has neither a cost nor noise that it was designed for.
 
@@ -88,6 +92,21 @@ class CurrentLoop:
     Kp: float  # V/A
     Ki: float  # V/(A s)
     sample_time: float  # s
+
+
+@dataclass(frozen=True, eq=False)
+class Commutation:
+    """Currents are commutated for y + lead p*', the place in the middle of the time for which they will be held.
+
+    Currents that are held pull back to the place that they were commutated for. With y alone that place is lead p*'
+    behind the machine, on average: a force of pull lead p*' that the reference does not want.
+    """
+
+    lead: float  # s, from a reading to the middle of the time for which its currents are held
+    pull: FloatArray  # m x p, N/m: what currents that are commutated further by p add to the design model's forces
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "pull", readonly(self.pull))
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,6 +180,7 @@ class Controller:
     current_loop: CurrentLoop | None  # None: currents follow their commands at once
     limits: Limits
     tracks: Tracks = field(default="states", metadata={"later": True})  # what the filter takes: y, or y - p*
+    commutation: Commutation | None = field(default=None, metadata={"later": True})  # None: for the place y
 
     def __post_init__(self) -> None:
         for f in fields(self):
@@ -244,7 +264,11 @@ def disturbances(inputs: tuple[Signal, ...]) -> tuple[Signal, ...]:
 def gains_of(c: Controller) -> dict[str, ca.DM]:
     """What the law computes with, sparse: exact zeros cost nothing at run time."""
     matrices = {name: ca.sparsify(ca.DM(getattr(c, name))) for name in ("Ad", "Bd", "Cd", "K", "Ki", "L")}
-    return matrices | {"force_limit": ca.DM(c.limits.force), "control_time": ca.DM(c.sample_time)}
+    matrices |= {"force_limit": ca.DM(c.limits.force), "control_time": ca.DM(c.sample_time)}
+    if c.commutation is None:
+        return matrices
+    lead = c.commutation.lead
+    return matrices | {"lead": ca.DM(lead), "ahead": ca.sparsify(ca.DM(lead * c.commutation.pull))}
 
 
 def filtered(tracks: Tracks, y: Any, p_ref: Any) -> Any:
@@ -275,8 +299,15 @@ def commanded(
     return g["Ad"] @ xi_hat + g["Bd"] @ (v - v0), e, v != wanted, v
 
 
+def looking_ahead(g: Mapping[str, Any], xi_pred: Any, place: Any, dp_ref: Any) -> tuple[Any, Any]:
+    """Steps 5 and 6 of a law with a `commutation`, else unchanged: (xi_pred, place) for a reference of rate p*'."""
+    if "lead" not in g:
+        return xi_pred, place
+    return xi_pred + g["Bd"] @ (g["ahead"] @ dp_ref), place + g["lead"] * dp_ref
+
+
 def law(c: Controller) -> ca.Function:
-    """The control law of one sample as a CasADi function.
+    """The control law of one sample as a CasADi function; with a `commutation` while p*' is zero.
 
     (xi_pred, e, frozen, y, p_ref, xi_ref, v_ff, v0) -> (xi_pred, e, frozen, v, xi_hat)
     """

@@ -89,6 +89,7 @@ def read_design(path: str | Path) -> Spec:
         current_loop_delay=content.current_loop_delay,
         current_lag=content.current_lag,
         position_feedforward=content.position_feedforward,
+        commutation=content.commutation,
         law=_law(content, plant, path),
         uncertainty=dict(content.uncertainty),
     )
@@ -100,7 +101,12 @@ def read_design(path: str | Path) -> Spec:
     )
 
 
-LATER = ("current_lag", "coordinates", "position_feedforward")  # keys that change no design without them
+LATER = (
+    "current_lag",
+    "coordinates",
+    "position_feedforward",
+    "commutation",
+)  # keys that change no design without them
 
 
 def _fingerprint(content: DesignFile) -> str:

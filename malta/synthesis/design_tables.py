@@ -10,7 +10,7 @@ from pydantic import BeforeValidator, Field, StrictBool, StrictInt, StrictStr, c
 
 from malta.synthesis.recovery import RecoveryTable
 from malta.synthesis.requirements import Requirement
-from malta.synthesis.spec import Coordinates, Discretization, PidAxes
+from malta.synthesis.spec import Coordinates, Discretization, PidAxes, Place
 from malta.tables import Finite, Quantity, Record, validate
 
 
@@ -97,6 +97,7 @@ class DesignFile(Record):
     current_lag: StrictBool = False
     coordinates: Coordinates = "signals"
     position_feedforward: StrictBool = False
+    commutation: Place = "measured"
     operating_point: dict[StrictStr, Quantity]
     weights: WeightsTable | None = None
     bases: BasesTable | None = None

@@ -8,10 +8,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from malta.errors import CheckError
+from malta.errors import CheckError, InputError
 from malta.model.linearize import LinearModel
 from malta.model.plant import Actuator, Plant, holding_forces, load_balance
 from malta.synthesis.controller import (
+    Commutation,
+    Controller,
     CurrentLoop,
     Feedforward,
     Limits,
@@ -90,11 +92,12 @@ def holding_gain(A: FloatArray, B: FloatArray) -> FloatArray:
     return np.asarray(-np.linalg.lstsq(B[half:], A[half:, :half], rcond=None)[0])
 
 
-def feedforward(model: LinearModel, Ts: float, delay: int = 0) -> Feedforward:
+def feedforward(model: LinearModel, Ts: float, delay: int = 0, lead: float = 0.0) -> Feedforward:
     """v0 along the travel, inertias, and what a steady ramp takes where held currents pull back.
 
-    With x = (q, w) at a sample, q going on by Ts P^-1 p*', and currents that are `delay` samples old:
-        Ad (0, w) + Bd (f - H Ts delay p*') = (Ts P^-1 p*', w)
+    With x = (q, w) at a sample, q going on by Ts P^-1 p*', and currents that are `delay` samples old, which were
+    commutated for a place `lead` (s) ahead:
+        Ad (0, w) + Bd (f - H (Ts delay - lead) p*') = (Ts P^-1 p*', w)
     """
     static, half = static_feedforward(model.plant), len(model.A) // 2
     if not model.E.any():
@@ -103,10 +106,39 @@ def feedforward(model: LinearModel, Ts: float, delay: int = 0) -> Feedforward:
     still = held(model)
     Ad, Bd = sample(still.A, model.B, Ts)
     back = np.linalg.inv(model.C[:, :half])
-    moved = np.vstack([Ts * back, np.zeros_like(back)]) + Bd @ still.H * (Ts * delay)
+    moved = np.vstack([Ts * back, np.zeros_like(back)]) + Bd @ still.H * (Ts * delay - lead)
     unknown = np.hstack([Ad[:, half:] - np.eye(2 * half)[:, half:], Bd])
     found = np.linalg.solve(unknown, moved)
     return replace(static, speed=found[half:], rate=found[:half] - back)
+
+
+def commutate_ahead(controller: Controller, model: LinearModel) -> Controller:
+    """The same controller, whose currents are those of the place where they will act on the way of the reference.
+
+    The currents of a reading act from `delay` to `delay` + 1 samples later: in the middle of that time the reference
+    has gone on by (delay + 1/2) Ts p*'. Feedforward is that of such currents; gains and loop stay the same.
+
+    model : the design model of the controller
+
+    Raises InputError for a machine whose currents do not depend on where it is, and for a law of errors.
+
+    Example: `commutate_ahead(malta.gains.read("design/gains/planar.json"), model).commutation.lead`
+    """
+    plant, Ts = model.plant, controller.sample_time
+    if not model.E.any():
+        found = f"a {plant.name}, whose currents do not depend on where it is"
+        raise InputError(controller.name, "commutation", found, "a machine with held currents")
+    if controller.tracks == "errors":
+        raise InputError(controller.name, "commutation", "a law of errors", "an LQG or a PID")
+    predicts = controller.cost is not None  # the delay is in its design model
+    delay = controller.delay if predicts else plant.actuator.delay(Ts)
+    lead, old = (delay + 0.5) * Ts, controller.feedforward
+    new = feedforward(model, Ts, delay, lead)
+    return replace(
+        controller,
+        feedforward=replace(old, speed=new.speed, rate=new.rate if predicts else old.rate),
+        commutation=Commutation(lead, held(model).H),
+    )
 
 
 def static_feedforward(plant: Plant) -> Feedforward:

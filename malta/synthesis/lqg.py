@@ -39,7 +39,7 @@ from malta.synthesis.controller import (
     lagging_forces,
     stored_forces,
 )
-from malta.synthesis.feedforward import machine_part
+from malta.synthesis.feedforward import commutate_ahead, machine_part
 from malta.synthesis.kalman import kalman as kalman
 from malta.synthesis.kalman import positions_from, sampled_filter
 from malta.synthesis.pid import pid
@@ -315,6 +315,11 @@ def synthesize(spec: Spec, model: LinearModel) -> Controller:
         raise InputError(spec.path, f"{error.where}: {error.field}", error.found, error.expected) from error
     except (CheckError, np.linalg.LinAlgError) as error:
         raise CheckError(f"{spec.path}: {error}") from error
+    if spec.commutation == "predicted":
+        try:
+            controller = commutate_ahead(controller, model)
+        except InputError as error:
+            raise InputError(spec.path, error.field, error.found, error.expected) from error
     return replace(controller, spec_sha256=spec.sha256)
 
 

@@ -31,6 +31,7 @@ Discretization = Literal["backward-euler", "zoh", "sampled-data"]
 # and their accelerations.
 Coordinates = Literal["signals", "positions"]
 PidAxes = Literal["decentralized", "centre-of-gravity"]
+Place = Literal["measured", "predicted"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,9 +193,8 @@ class Spec:
     law: Weights | Pid  # of an LQG, or the gains of a PID
     uncertainty: Mapping[str, float]  # relative, either way, by parameter
     current_lag: bool = False  # whether the lag of the current loops is in the design model
-    position_feedforward: bool = (
-        False  # whether the forces that hold the machine at its reference are fed forward
-    )
+    position_feedforward: bool = False  # whether the forces that hold it at its reference are fed forward
+    commutation: Place = "measured"  # for which currents are commutated
     loads: Loads | None = None  # what a PID is judged by
     specification: Mapping[str, float] = dataclass_field(
         default_factory=dict
@@ -232,7 +232,7 @@ class Spec:
         """What the axes of a PID are; of an LQG, which has none, as of a PID that does not say."""
         return self.law.axes if isinstance(self.law, Pid) else "decentralized"
 
-    def place_of(self, entry: str, field: str = "search") -> Place:
+    def place_of(self, entry: str, field: str = "search") -> Entry:
         """Find where an entry of the file stands in the law. Raises InputError for an entry that no design file has."""
         return place_of(entry, self.plant, self.path, field, self.law)
 
@@ -273,9 +273,7 @@ def pid_signals(plant: Plant, axes: PidAxes = "decentralized") -> dict[str, list
     }
 
 
-Place = tuple[
-    str, int | tuple[()], str, bool
-]  # field of Weights or Pid, index, SI unit, whether as its square
+Entry = tuple[str, int | tuple[()], str, bool]  # field of the law, index, SI unit, whether as its square
 
 
 def integral_signals(plant: Plant, coordinates: Coordinates) -> list[Signal]:
@@ -293,7 +291,7 @@ def process_signals(plant: Plant, coordinates: Coordinates) -> list[Signal]:
 
 def place_of(
     entry: str, plant: Plant, where: Path, field: str = "search", law: Weights | Pid | None = None
-) -> Place:
+) -> Entry:
     """Find where an entry of the design file stands in Weights or Pid.
 
     law : whose coordinates or axes count; None: signals and single sensors

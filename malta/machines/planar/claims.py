@@ -13,6 +13,7 @@ from malta.machines.planar.evidence import (
     force_ratio,
     formula_error,
     implied_step,
+    largest_deviation,
     misprint_error,
     phi_ratio,
     pole_field,
@@ -21,6 +22,7 @@ from malta.machines.planar.evidence import (
     symmetric_deviation,
 )
 from malta.machines.planar.evidence import evidence as evidence
+from malta.machines.planar.experiments.motions import AHEAD
 from malta.report.ledger import (
     ZONE_NOTE,
     Row,
@@ -199,6 +201,7 @@ MOVER: tuple[Row, ...] = (
 MISSING = (
     "start, gains and pitch are missing; ours holds currents for 200 µs, a sample late, its Simulink does not"
 )
+ELSEWHERE = "start, gains and pitch are missing; what holds currents for 200 µs, a sample late, is predicted"
 RECTANGLES = f"{MISSING}; and the overlapping rectangles of (23), (24) make too much torque"
 STEPS: tuple[Row, ...] = (
     Row(
@@ -272,6 +275,28 @@ def _step_rows() -> list[Row]:
     return found
 
 
+def _ahead_rows() -> list[Row]:
+    """Rows of the steps with currents for the place where they will act, beside those for the place that was read."""
+    exact, table = (f"{model}, {AHEAD}" for model in ("exact", "table"))
+    found = [
+        Row(
+            f"{text}: {name}, largest",
+            "urad",
+            "{:.3f}",
+            partial(largest_deviation, model, name),
+            note=note,
+        )
+        for name in ("phi", "theta", "psi")
+        for text, model, note in (
+            ("exact, place as read", "exact", "currents are those of a place 300 µs old, on average"),
+            (exact, exact, "same loop, same margins: the prediction is the reference's"),
+        )
+    ]
+    for name, unit in (("x", "um"), ("phi", "urad"), ("theta", "urad"), ("psi", "urad")):
+        found += _range(table, "interpolation", name, unit, "p", ELSEWHERE)
+    return found
+
+
 def _range(model: str, key: str, name: str, unit: str, series: str, why: str) -> list[Row]:
     """Rows of the lowest and the highest value of a deviation or a force: ours within the paper's."""
     sides = (("lowest", "at least", np.min), ("highest", "at most", np.max))
@@ -320,4 +345,4 @@ LOOP: tuple[Row, ...] = (
 
 def rows() -> list[Row]:
     """All claims of the paper, in the order of the ledger."""
-    return [*COIL, *TABLE, *MOVER, *STEPS, *_step_rows(), *LOOP]
+    return [*COIL, *TABLE, *MOVER, *STEPS, *_step_rows(), *_ahead_rows(), *LOOP]

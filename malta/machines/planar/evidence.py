@@ -13,6 +13,7 @@ from malta.machines.planar import coils, commutation
 from malta.machines.planar import field as planar_field
 from malta.machines.planar import plant as planar
 from malta.machines.planar.experiments.models import CURRENT
+from malta.machines.planar.experiments.motions import steps_ahead
 from malta.margins.verify import Margins
 from malta.model.published import published_value
 from malta.report.ledger import (
@@ -40,14 +41,18 @@ class Evidence:
     parameters: planar.Parameters
     controller: Controller
     margins: Margins
-    experiments: Mapping[str, Experiment]  # without "delay" for a PID, which predicts nothing
+    experiments: Mapping[str, Experiment]  # with "ahead"; without "delay" for a PID, which predicts nothing
 
 
 def evidence(spec: Spec, published: Mapping[str, Any], progress: Progress | None = None) -> Evidence:
     """Design a controller, prove its margins and run the experiments."""
     found = run_design(spec, EXPERIMENT_NAMES[: 3 if spec.pid is not None else 4], progress)
     par: Any = spec.parameters
-    return Evidence(spec, published, par, found.controller, found.margins, found.experiments)
+    ahead = steps_ahead(
+        spec.plant, found.controller, engine="virtual machine"
+    )  # two runs, and nothing to compile
+    experiments = found.experiments | {"ahead": ahead}
+    return Evidence(spec, published, par, found.controller, found.margins, experiments)
 
 
 def pole_field(e: Evidence) -> float:
@@ -118,8 +123,9 @@ def residual(e: Evidence) -> float:
 
 
 def flight(model: str, e: Evidence) -> Trajectory:
-    """The steps with a coil model, from the place without symmetry."""
-    return next(case.run for case in e.experiments["step"].cases if case.label.startswith(model))
+    """The steps with a coil model, from the place without symmetry; with AHEAD in the label the predicted ones."""
+    cases = (*e.experiments["step"].cases, *e.experiments["ahead"].cases)
+    return next(case.run for case in cases if case.label.startswith(model))
 
 
 def symmetric_deviation(e: Evidence) -> float:
@@ -135,6 +141,11 @@ def extreme(model: str, name: str, series: str, of: Callable[[FloatArray], Any],
         return float(of(run.v[:, [s.name for s in run.plant.inputs].index(name)]))
     k = [s.name for s in run.plant.outputs].index(name)
     return float(of((run.p - run.reference)[:, k]))
+
+
+def largest_deviation(model: str, name: str, e: Evidence) -> float:
+    """Largest deviation of an output from the reference in the steps with a coil model, SI."""
+    return max(-extreme(model, name, "p", np.min, e), extreme(model, name, "p", np.max, e))
 
 
 def phi_ratio(e: Evidence) -> float:

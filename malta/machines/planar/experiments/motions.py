@@ -30,6 +30,7 @@ from malta.simulation.experiments import (
 from malta.simulation.references import Motion, Reference
 from malta.simulation.trajectory import Trajectory
 from malta.synthesis.controller import Controller
+from malta.synthesis.feedforward import commutate_ahead
 from malta.synthesis.lqg import lqg, weights_of
 
 if TYPE_CHECKING:
@@ -116,6 +117,26 @@ def step_cases(
         scenario = scenario_of("step", DURATION, reference, FORCES | options)
         wanted.append(PlannedRun(f"from ({x * 1e3:g}, {y * 1e3:g}) mm", scenario, step_merits))
     return wanted
+
+
+AHEAD = "place predicted"
+
+
+def steps_ahead(plant: Plant, controller: Controller, **options: Any) -> Experiment:
+    """The published steps from PLACE with currents for where they will act, by the exact coils and by the table.
+
+    The same controller, but for its commutation (`commutate_ahead`); design files ask for it by `commutation`.
+    """
+    moves: dict[str, Any] = {"place": PLACE, "gap": GAP, "lift": LIFT, "distance": DISTANCE}
+    wanted = step_cases(plant, controller, **moves, **options)[0]
+    believed = planar.plant(parameters_of(controller))
+    ahead = commutate_ahead(controller, linearize(believed, believed.point(controller.operating_point[0])))
+    flights = [
+        (plant, with_coil_model(ahead, model), wanted._replace(label=f"{model}, {AHEAD}"))
+        for model in ("exact", "table")
+    ]
+    cases, cut = fly_all(flights, None, options)
+    return Experiment("step", "What is left when currents are where they act?", cases, (), interrupted=cut)
 
 
 FORCES: dict[str, Any] = QUIET | {"fidelity": "force", "substeps": 1}  # the error of one substep is 1e-13 m
