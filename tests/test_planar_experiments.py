@@ -375,7 +375,7 @@ def test_every_printed_number_is_claimed(paper: dict[str, Any]) -> None:
         "steps.y_step",
         "steps.y_time",
     }
-    assert {key for key in printed(paper) if key} - keys == inputs | {"real_time.longest"}
+    assert {key for key in printed(paper) if key} - keys == inputs
 
 
 # --- The command line ---

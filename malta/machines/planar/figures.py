@@ -186,7 +186,7 @@ def timing_figure(e: Experiment, published: Published | None = None) -> Figure:
     period = e.run.controller.sample_time * 1e6
     axes.axvline(period, color="#9a9a9a", linestyle=(0, (8, 3)), linewidth=0.9)
     axes.set_xlim(0.1, 4 * period)
-    axes.set_xlabel(f"time of one decoupling [µs]; dashed: control period, {period:g} µs")
+    axes.set_xlabel(f"time of one call [µs]; dashed: control period, {period:g} µs")
     draw_grid(axes)
     return figure
 
