@@ -84,7 +84,10 @@ def simulate(
     seed: Seed = None,
     engine: Annotated[str, typer.Option(help="auto, compiled or virtual-machine.")] = "auto",
     out: Annotated[
-        Path | None, typer.Option(help="Folder for the figure (.png) and the time series (.npz).")
+        Path | None,
+        typer.Option(
+            help="Folder for the figure (.png), the time series (.npz) and, of record-v0, the gain files."
+        ),
     ] = None,
     replay: Annotated[
         str | None,
@@ -140,7 +143,7 @@ def simulate(
             others = [*options, *(["scenario"] if scenario else []), *(["set"] if change else [])]
             simulation = _replay(replay, controller, others, choice, progress)
     published = published_figures(plant.name)
-    files = [] if out is None else _save(simulation, out, published)
+    files = [] if out is None else _save(simulation, out, published) + _save_gains(simulation, gains, out)
     if as_json:
         document = {"gains": str(gains), "scenario": simulation.scenario, "files": [str(f) for f in files]}
         print_json(document | experiment_document(simulation.experiment))
@@ -184,6 +187,29 @@ def _save(simulation: Simulation, folder: Path, published: Mapping[str, Any] | N
     stems = [stem] if len(cases) == 1 else [f"{stem}_{_slug(case.label)}" for case in cases]
     series = [save_series(case.run, folder / f"{name}.npz") for name, case in zip(stems, cases, strict=True)]
     return [*series, report.experiment(simulation.experiment, folder / f"{stem}.png", published)]
+
+
+def _save_gains(simulation: Simulation, gains: Path, folder: Path) -> list[Path]:
+    """Verify the controller that an experiment has found, over the uncertainty of the gain file, and write it."""
+    from malta import gains as gain_files
+    from malta.gains.file import content_of
+    from malta.margins.verify import verify
+    from malta.model.data import plant_of
+    from malta.model.linearize import linearize
+
+    controller = simulation.experiment.controller
+    if controller is None:
+        return []
+    plant = plant_of(controller.parameters)
+    robust = content_of(gains)[0].verification.robust
+    margins = verify(
+        linearize(plant, plant.point(controller.operating_point[0])),
+        controller,
+        {} if robust is None else robust.uncertainty,
+    )
+    paths = [folder / f"{controller.name}{suffix}" for suffix in gain_files.SUFFIXES]
+    gain_files.write(controller, margins, *paths)
+    return paths
 
 
 def _slug(label: str) -> str:

@@ -73,6 +73,7 @@ class Experiment:
     merits: tuple[Merit, ...]
     curves: Mapping[str, FloatArray] = field(default_factory=dict)  # drawn beside the runs
     interrupted: bool = False  # Ctrl-C ended the experiment: it has the cases up to then
+    controller: Controller | None = None  # that the experiment has found, for a gain file
 
     def __str__(self) -> str:
         cases = ("; ".join([case.label, *map(str, case.merits)]) for case in self.cases)

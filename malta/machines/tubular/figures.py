@@ -11,6 +11,7 @@ import casadi as ca
 import numpy as np
 
 from malta.machines.tubular.experiments.rest import RESTING
+from malta.machines.tubular.recording_figure import recording_figure
 from malta.model.data import plant_of
 from malta.report.figures.parts import (
     BOUND,
@@ -409,4 +410,5 @@ FIGURES: dict[str, Callable[[Experiment, Published | None], Figure]] = {
     "disturbance": disturbance_figure,
     "faults": faults_figure,
     "drive-limits": drive_limits_figure,
+    "record-v0": recording_figure,
 }

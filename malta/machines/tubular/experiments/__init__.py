@@ -9,6 +9,7 @@ thermal       a drifting support, seen by an outside laser and compensated, Fig.
 disturbance   force and torque steps, vibration of the housing, compliance over frequency
 faults        of sensors, samples, a phase and the DC link: survival or touchdown
 drive-limits  the fastest stroke that the drive allows, against the sigmoid at the same peak current
+record-v0     v0(z) recorded by a slow stroke or from a log, beside the computed one
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from malta.errors import InputError
 from malta.machines.tubular.experiments.failures import faults
 from malta.machines.tubular.experiments.forces import disturbance, disturbance_cases
 from malta.machines.tubular.experiments.lifting import lift_cases, lift_off, payload
+from malta.machines.tubular.experiments.recording import record_v0
 from malta.machines.tubular.experiments.rest import hold, hold_cases, thermal, tilt, tilt_cases
 from malta.machines.tubular.experiments.strokes import (
     DISTANCE,
@@ -45,6 +47,7 @@ EXPERIMENTS: dict[str, Callable[..., Experiment]] = {
     "disturbance": disturbance,
     "faults": faults,
     "drive-limits": drive_limits,
+    "record-v0": record_v0,
 }
 # Experiments that campaigns can run: nothing but the machine differs between the runs of a case.
 CASES: dict[str, Callable[..., list[PlannedRun]]] = {
@@ -55,6 +58,7 @@ CASES: dict[str, Callable[..., list[PlannedRun]]] = {
     "disturbance": disturbance_cases,
     "drive-limits": drive_limit_cases,
 }
+SHORTEST, LONGEST = 0.5, 60.0  # s, of one way of the slow stroke
 FINDINGS = ("payload", "disturbance", "faults")
 ALONE = ("stroke", "hold", "tilt")
 WORDS = {"stroke": "axial", "m": "radial", "thrust": "thrust", "N": "bearing force"}
@@ -67,13 +71,21 @@ OPTION_UNITS = {
     "masses": "kg",
     "drift": "m",
     "minute": "s",
+    "way": "s",
+    "phase_error": "rad",
 }
 
 
 def check(name: str, option: str, value: Any) -> None:
-    """Raise InputError for a number that is zero or not finite. Strokes check their own options."""
-    if option in ("distance", "rise", "profile", "during"):
+    """Raise InputError for a number that is zero or not finite. Strokes and logs check their own options."""
+    if option in ("distance", "rise", "profile", "during", "log"):
         return
+    if option == "way" and not SHORTEST <= value <= LONGEST:
+        raise InputError(
+            "simulate", f"{name}: way", f"{value:g} s", f"a time from {SHORTEST:g} to {LONGEST:g} s"
+        )
+    if option == "phase_error" and value == 0:
+        return  # no machines with displaced cogging
     if not all(math.isfinite(v) and v for v in (value if option == "masses" else (value,))):
         raise InputError("simulate", f"{name}: {option}", repr(value), "finite, other than 0")
 
