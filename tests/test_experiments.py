@@ -958,7 +958,10 @@ def test_every_experiment_bears_its_name_and_tells_its_progress(designs: dict[st
     design = designs["calibrated"]
     for name in EXPERIMENTS:
         shares: list[float] = []
-        options = {"estimator": "steady-state"} if name == "lift-off" else {}  # the others take seconds
+        options: dict[str, Any] = (
+            {"estimator": "steady-state"} if name == "lift-off" else {}
+        )  # others take seconds
+        options |= {"points": 5} if name == "capture" else {}
         found = experiment(name, design.plant, design.controller, progress=shares.append, **options)
         assert found.name == name
         assert found.question.endswith("?")
@@ -988,7 +991,7 @@ def test_failure_is_a_run_that_should_not_have_ended(flown: Flown) -> None:
     run = flown("calibrated", "stroke").run
     good, bad = _ended(run, "completed"), _ended(run, "touchdown at sensor plane 1", 0.0724)
     for name in EXPERIMENTS:
-        finding = name in ("payload", "disturbance", "faults")
+        finding = name in ("payload", "disturbance", "faults", "capture")
         assert Experiment(name, "?", (good, bad), ()).failed is not finding
         assert not Experiment(name, "?", (good, good), ()).failed
     assert Experiment("stroke", "?", (good,), ()).outcome == "completed at 0.1 s"

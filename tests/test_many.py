@@ -68,6 +68,7 @@ def _expected(run: Trajectory) -> dict[str, Any]:
         "overshoot": stroke.overshoot,
         "saturated": run.saturated.mean(axis=0),
         "verdict": verdicts(run.plant).index(run.verdict.name),
+        "last": error[-1],
     }
 
 
@@ -357,6 +358,7 @@ def test_a_lift_off_is_a_scenario_for_many(calibrated: Design) -> None:
             "rise": math.nan,
             "overshoot": np.nan,
             "saturated": run.saturated.mean(axis=0),
+            "last": run.p[-1] - run.reference[-1],
             "verdict": verdicts(run.plant).index(run.verdict.name),
         }
 

@@ -38,7 +38,11 @@ if TYPE_CHECKING:
 pytestmark = pytest.mark.usefixtures("proven_once")
 
 
-SHORT: dict[str, dict[str, Any]] = {"lift-off": {"duration": 0.06}, "thermal": {"faster": 100.0}}
+SHORT: dict[str, dict[str, Any]] = {
+    "lift-off": {"duration": 0.06},
+    "thermal": {"faster": 100.0},
+    "capture": {"points": 9},
+}
 
 
 @pytest.fixture(scope="session")

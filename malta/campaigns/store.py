@@ -204,6 +204,7 @@ def figure_shapes(plan: Plan) -> dict[str, tuple[int, ...]]:
     rows = {
         "deviation": (p,),
         "rms": (p,),
+        "last": (p,),
         "force": (m,),
         "saturated": (m,),
         "contact": (len(plant.contacts),),

@@ -50,14 +50,16 @@ def simulate_many(
     changes: Mapping[str, FloatArray],
     *,
     sensor_errors: Mapping[str, FloatArray] | None = None,
+    starts: Mapping[str, FloatArray] | None = None,
     first: int = 0,
     workers: int | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Batch:
-    """Run a scenario on many machines and keep the figures of each run.
+    """Run a scenario on many machines, or from many starts, and keep the figures of each run.
 
     changes : parameters of the machine by name, SI, a value for each run
     sensor_errors : errors of the sensors by name, SI, a value for each run, in place of the scenario's
+    starts : states by name, SI, a value for each run, in place of the scenario's
     first : index of the first run; noise depends on scenario.seed and on the index
     workers : threads; None: one for each core
     progress : called now and then with the share of the runs that is done
@@ -73,7 +75,7 @@ def simulate_many(
             raise InputError(f"scenario {scenario.name}", name, "some", "none in a campaign")
     simulation = simulation_of(plant, controller, _with_sensor_errors(scenario, sensor_errors))
     _check(simulation, workers)
-    variation = _variation(plant, changes, sensor_errors, first)
+    variation = _variation(plant, changes, sensor_errors, starts, first)
     for name in set(changes) & set(shape_parameters(plant.parameters)):
         raise InputError("campaign", name, "another one for each run", "one for all: it shapes the functions")
     shape = shape_of(plant, controller, simulation.setup)
@@ -94,6 +96,7 @@ class Variation(NamedTuple):
 
     changes: Mapping[str, FloatArray]  # parameters of the machine by name, SI
     sensor_errors: Mapping[str, FloatArray]
+    starts: Mapping[str, FloatArray]  # states by name, SI
     first: int  # index of the first run
     runs: int
 
@@ -125,7 +128,7 @@ def _prepare(simulation: Simulation, variation: Variation) -> tuple[Inputs, Shar
     values = numbers_of(plant, controller, count, scenario.sensor_errors)
     theta = _thetas(plant, values, variation)
     inputs = inputs_of(simulation)
-    start = np.concatenate(initial_values(simulation, inputs.given[0]))
+    start = _starts(simulation, inputs.given[0], variation.starts)
     states, noise = _map_rows(_start_function(shape_of(plant, controller, setup)), theta, start)
     groups = -(-runs // LANES)
     streams = keys(scenario.seed, variation.first + np.minimum(np.arange(groups * LANES), runs - 1))
@@ -170,7 +173,7 @@ def record_run(
     compiled = library_of(shape, LANES, recorder_function(shape))
     if compiled is None:
         return None
-    inputs, shared, lanes = _prepare(simulation, _variation(plant, group, errors, begin))
+    inputs, shared, lanes = _prepare(simulation, _variation(plant, group, errors, None, begin))
     width = sum(layout_of(plant, controller, simulation.setup).row.values())
     rows = np.empty((len(inputs.t), width))
     stream, last = lanes.keys.copy(), np.zeros((1, 2 * width, LANES))
@@ -239,13 +242,14 @@ def _variation(
     plant: Plant,
     changes: Mapping[str, FloatArray],
     sensor_errors: Mapping[str, FloatArray] | None,
+    starts: Mapping[str, FloatArray] | None,
     first: int,
 ) -> Variation:
     """The variation of a batch. Raises InputError for unknown parameters and for columns of different length."""
-    sensor_errors = sensor_errors or {}
+    sensor_errors, starts = sensor_errors or {}, starts or {}
     known = units_of(plant.parameters)
     sizes = {}
-    for name, values in [*changes.items(), *sensor_errors.items()]:
+    for name, values in [*changes.items(), *sensor_errors.items(), *starts.items()]:
         column = np.asarray(values)
         if column.ndim != 1 or not column.size or column.dtype.kind not in "fiu":
             raise InputError(
@@ -257,12 +261,12 @@ def _variation(
             raise InputError("campaign", name, "an unknown parameter", "one of " + " ".join(known))
     if len(set(sizes.values())) != 1:
         raise InputError("campaign", "changes", f"{sizes or 'nothing'}", "as many values of each parameter")
-    return Variation(changes, sensor_errors, first, next(iter(sizes.values())))
+    return Variation(changes, sensor_errors, starts, first, next(iter(sizes.values())))
 
 
 def _thetas(plant: Plant, values: Mapping[str, ca.DM], variation: Variation) -> FloatArray:
     """theta of every run, runs x numbers. Raises InputError for values that a data file may not have either."""
-    changes, sensor_errors, _, runs = variation
+    changes, sensor_errors, _, _, runs = variation
     place, k = {}, 0
     for name, value in values.items():
         place[name] = k
@@ -298,10 +302,25 @@ def _start_function(shape: Any) -> ca.Function:
     return ca.Function("start", [theta, ca.vertcat(*arguments)], [first, noise])
 
 
-def _map_rows(function: ca.Function, rows: FloatArray, same: FloatArray) -> list[FloatArray]:
-    """f(row, same) for every row, runs x size for each result of f. At most BLOCK rows are mapped in one call."""
-    parts = np.array_split(rows, -(-len(rows) // BLOCK))
-    found = [evaluate(function.map(len(part)), part, np.tile(same, (len(part), 1))) for part in parts]
+def _starts(simulation: Simulation, given: FloatArray, starts: Mapping[str, FloatArray]) -> FloatArray:
+    """x, xi_pred and currents at the start: a row for each run, or one row where all runs start alike."""
+    names = list(starts)
+    rows: list[FloatArray] = []
+    for values in zip(*starts.values(), strict=True) if names else [()]:
+        own = dict(simulation.scenario.start) | dict(zip(names, map(float, values), strict=True))
+        one = simulation._replace(scenario=replace(simulation.scenario, start=own))
+        rows.append(np.concatenate(initial_values(one, given)))
+    return np.array(rows)
+
+
+def _map_rows(function: ca.Function, rows: FloatArray, others: FloatArray) -> list[FloatArray]:
+    """f(row, other) for every row, runs x size for each result of f. At most BLOCK rows are mapped in one call."""
+    count = -(-len(rows) // BLOCK)
+    pairs = zip(
+        *(np.array_split(a, count) for a in (rows, np.broadcast_to(others, (len(rows), others.shape[1])))),
+        strict=True,
+    )
+    found = [evaluate(function.map(len(part)), part, other) for part, other in pairs]
     return [np.vstack(column) for column in zip(*found, strict=True)]
 
 
@@ -310,11 +329,12 @@ def _simulate_one_by_one(
 ) -> Batch:
     """A batch without a C compiler: every run by `simulate` on CasADi's virtual machine."""
     plant, controller, scenario, _ = simulation
-    changes, sensor_errors, first, runs = variation
+    changes, sensor_errors, starts, first, runs = variation
     figures: dict[str, list[Any]] = {name: [] for name in Batch.__dataclass_fields__}
     for k in range(runs):
         machine_k, scenario_k = replayed(plant, scenario, changes, first + k, first, sensor_errors)
-        run = simulate(machine_k, controller, scenario_k, engine="virtual machine")
+        own = dict(scenario_k.start) | {name: float(column[k]) for name, column in starts.items()}
+        run = simulate(machine_k, controller, replace(scenario_k, start=own), engine="virtual machine")
         stroke = stroke_figures(run)
         error = run.p - run.reference
         row = {
@@ -328,6 +348,7 @@ def _simulate_one_by_one(
             "overshoot": stroke.overshoot,
             "saturated": run.saturated.mean(axis=0),
             "verdict": verdicts(plant).index(run.verdict.name),
+            "last": error[-1],
         }
         for name, value in row.items():
             figures[name].append(value)

@@ -33,6 +33,7 @@ class Batch:
     overshoot: FloatArray  # beyond the end, as a share of the stroke; NaN when the run ended early
     saturated: FloatArray  # runs x inputs, share of the samples whose command was limited
     verdict: FloatArray  # index into `verdicts` of the plant
+    last: FloatArray  # runs x outputs, p - p* at the last sample, or before the first contact
 
     def __post_init__(self) -> None:
         for name in self.__dataclass_fields__:
@@ -66,6 +67,7 @@ def digest_sizes(plant: Plant) -> dict[str, int]:
         "touching": 1,  # 1 where it touches them at the end
         "touched": 1,  # sample at which it first touched them, -1 before
         "culprit": 1,  # index of the first contact, -1 before
+        "last": p,
     }
 
 
@@ -105,6 +107,7 @@ def digest_function(shape: Any) -> ca.Function:
         "largest_share": ca.if_else(alive, ca.fmax(kept["largest_share"], share), kept["largest_share"]),
         "deviation": ca.fmax(kept["deviation"], ca.fabs(error)),
         "squares": kept["squares"] + error**2,
+        "last": ca.if_else(alive, error, kept["last"]),
         "force": ca.fmax(kept["force"], ca.if_else(alive, ca.fabs(row["v"]), 0)),
         "limited": kept["limited"] + ca.if_else(alive, row["saturated"], 0),
         "contact": ca.if_else(alive, largest, kept["contact"]),
@@ -174,6 +177,7 @@ def batch_of(kept: FloatArray, samples: int, Ts: float, sizes: Mapping[str, int]
         ),
         saturated=columns["limited"] / np.maximum(count, 1)[:, None],
         verdict=verdict,
+        last=columns["last"],
     )
 
 

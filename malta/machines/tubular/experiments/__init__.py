@@ -10,6 +10,7 @@ disturbance   force and torque steps, vibration of the housing, compliance over 
 faults        of sensors, samples, a phase and the DC link: survival or touchdown
 drive-limits  the fastest stroke that the drive allows, against the sigmoid at the same peak current
 record-v0     v0(z) recorded by a slow stroke or from a log, beside the computed one
+capture       displacements and tilts from which the mover returns, beside what the force limit allows
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from malta.errors import InputError
+from malta.machines.tubular.experiments.capture import capture
 from malta.machines.tubular.experiments.failures import faults
 from malta.machines.tubular.experiments.forces import disturbance, disturbance_cases
 from malta.machines.tubular.experiments.lifting import lift_cases, lift_off, payload
@@ -48,6 +50,7 @@ EXPERIMENTS: dict[str, Callable[..., Experiment]] = {
     "faults": faults,
     "drive-limits": drive_limits,
     "record-v0": record_v0,
+    "capture": capture,
 }
 # Experiments that campaigns can run: nothing but the machine differs between the runs of a case.
 CASES: dict[str, Callable[..., list[PlannedRun]]] = {
@@ -59,7 +62,8 @@ CASES: dict[str, Callable[..., list[PlannedRun]]] = {
     "drive-limits": drive_limit_cases,
 }
 SHORTEST, LONGEST = 0.5, 60.0  # s, of one way of the slow stroke
-FINDINGS = ("payload", "disturbance", "faults")
+MOST_POINTS = 201  # of a side of a map
+FINDINGS = ("payload", "disturbance", "faults", "capture")
 ALONE = ("stroke", "hold", "tilt")
 WORDS = {"stroke": "axial", "m": "radial", "thrust": "thrust", "N": "bearing force"}
 STROKE_UNIT = "mm"
@@ -83,6 +87,10 @@ def check(name: str, option: str, value: Any) -> None:
     if option == "way" and not SHORTEST <= value <= LONGEST:
         raise InputError(
             "simulate", f"{name}: way", f"{value:g} s", f"a time from {SHORTEST:g} to {LONGEST:g} s"
+        )
+    if option == "points" and not (isinstance(value, int) and 3 <= value <= MOST_POINTS):
+        raise InputError(
+            "simulate", f"{name}: points", f"{value:g}", f"a whole number from 3 to {MOST_POINTS}"
         )
     if option == "phase_error" and value == 0:
         return  # no machines with displaced cogging
