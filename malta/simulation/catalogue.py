@@ -38,7 +38,7 @@ from malta.simulation.trajectory import Trajectory
 from malta.synthesis.controller import Controller
 
 # Fields of a scenario that the experiment itself decides. All others are options, and so is the engine.
-MADE = {"name", "reference", "start", "cold", "disturbance", "faults", "correction", "changes"}
+MADE = {"name", "reference", "start", "cold", "disturbance", "anticipated", "faults", "correction", "changes"}
 OPTIONS = {f.name for f in fields(Scenario)} - MADE | {"engine"}
 
 

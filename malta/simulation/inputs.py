@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -16,6 +16,7 @@ from malta.errors import InputError
 from malta.model.data import plant_of
 from malta.model.plant import Plant, position_in
 from malta.simulation import references
+from malta.simulation.anticipation import countering_forces
 from malta.simulation.engines import evaluate
 from malta.simulation.layout import electronics_of, layout_of
 from malta.simulation.noise import keys, normals
@@ -76,7 +77,10 @@ def sample_inputs(run: Simulation, motion: references.Motion, t: FloatArray) -> 
         parts["v_past"] = np.hstack(past)
     sizes = layout_of(plant, c, setup).given
     if scenario.disturbance is not None:
-        parts["w"] = _wrench(plant, scenario, t)
+        parts["w"] = _wrench(plant, scenario, "disturbance", t)
+    if scenario.anticipated is not None:
+        known = _wrench(plant, scenario, "anticipated", t)
+        parts["v_known"] = countering_forces(plant_of(c.parameters), motion, known)
     if setup.faulty:
         parts |= _fault_flags(plant, scenario, sizes, t)
     parts |= {name: np.zeros((len(t), size)) for name, size in sizes.items() if name not in parts}
@@ -122,14 +126,15 @@ def feedforward(c: Controller, motion: references.Motion, choice: FeedforwardCho
     return v_ff
 
 
-def _wrench(plant: Plant, scenario: Scenario, t: FloatArray) -> FloatArray:
-    """The scenario's disturbance at t, k x disturbances. Raises InputError for another shape, or NaN."""
-    assert scenario.disturbance is not None
-    wrench = np.asarray(scenario.disturbance(t), dtype=float)
+def _wrench(
+    plant: Plant, scenario: Scenario, name: Literal["disturbance", "anticipated"], t: FloatArray
+) -> FloatArray:
+    """One of the scenario's wrenches at t, k x disturbances. Raises InputError for another shape, or NaN."""
+    wrench = np.asarray(getattr(scenario, name)(t), dtype=float)
     shape = (len(t), len(plant.disturbances))
     if wrench.shape != shape or not np.isfinite(wrench).all():
         found = f"shape {wrench.shape}"
-        raise InputError(f"scenario {scenario.name}", "disturbance", found, f"finite, shape {shape}")
+        raise InputError(f"scenario {scenario.name}", name, found, f"finite, shape {shape}")
     return wrench
 
 

@@ -42,6 +42,7 @@ class Setup:
     real_pwm: bool = False  # duty cycles with a resolution, dead time
     turning: bool = False  # current controllers in axes that turn with the forces, eq. (18) as printed
     outside: bool = False  # a Kalman filter of start_up.py makes the estimate
+    anticipated: bool = False  # forces beside v0 counter a disturbance that is known in advance
     open_loop: bool = False  # feedforward alone, commutated for the reference
     electronics: Any = None  # options of the machine's own electronics
 
@@ -96,6 +97,8 @@ def layout_of(plant: Plant, c: Controller, s: Setup) -> Layout:
     given["v_past"] = n - len(c.A) if c.tracks == "states" else 0
     if s.disturbed:
         given |= {"w": len(plant.disturbances)}
+    if s.anticipated:
+        given |= {"v_known": m}
     if s.faulty:
         given |= {"stuck": p, "missed": 1, "sag": 1, "open": phases if s.fidelity == "phase" else 0}
     if s.outside:

@@ -195,6 +195,8 @@ def _control_law(loop: Loop, signals: Signals, y: Any, v0: Any) -> tuple[dict[st
     p_ref, v_ff = given["p_ref"], given["v_ff"]
     taken = filtered(c.tracks, y, p_ref)
     xi_hat = given["xi_hat"] if s.outside else estimated(g, controller["xi_pred"], taken, C)
+    if s.anticipated:  # like v0, these forces cancel a load and move nothing: the filter is not told of them
+        v0 = v0 + given["v_known"]
     believed = plant_of(c.parameters)
     xi_ref = _law_reference(c, believed, g, given)
     e_now, frozen_now = controller["e"], controller["frozen"]

@@ -65,6 +65,7 @@ class Scenario:
     start: Mapping[str, float] = field(default_factory=dict)  # states (SI) that do not start on the reference
     cold: bool = False  # starts without current, with the observer at zero
     disturbance: Callable[[FloatArray], FloatArray] | None = None  # t (k,) -> wrench, k x 6, N and N m
+    anticipated: Callable[[FloatArray], FloatArray] | None = None  # likewise: what the controller knows of it
     noise: float = 0.0  # standard deviation of the sensors in multiples of the plant's
     quantize: bool = False  # sensors with the plant's resolution
     sensor_errors: Mapping[str, float] | None = None  # names: plant.sensor_errors; None: y = p exactly
@@ -197,6 +198,8 @@ def setup_of(plant: Plant, c: Controller, s: Scenario) -> Setup:
         raise InputError(f"scenario {s.name}", "estimator", found, "steady-state, or fidelity force")
     if own and (s.real_pwm or s.bearing_axes == "turning" or "open phase" in kinds or "link sag" in kinds):
         raise InputError(f"scenario {s.name}", "fidelity", "options of a drive", "those of the electronics")
+    if s.anticipated is not None and s.estimator != "steady-state":
+        raise InputError(f"scenario {s.name}", "anticipated", f"estimator {s.estimator}", "steady-state")
     if s.scheduled and c.tracks == "errors":
         raise InputError(f"scenario {s.name}", "scheduled", "a law of errors", "one with a filter of states")
     known = [signal.name for signal in plant.sensor_errors]
@@ -218,6 +221,7 @@ def setup_of(plant: Plant, c: Controller, s: Scenario) -> Setup:
         real_pwm=s.real_pwm,
         turning=s.bearing_axes == "turning" and s.fidelity != "force",
         outside=s.estimator != "steady-state",
+        anticipated=s.anticipated is not None,
         open_loop=s.open_loop,
         electronics=s.electronics,
     )

@@ -17,7 +17,7 @@ The mechanical states stand first in xi. Where the design models the lag of the 
 the sample follow: v - v0 behind first-order lags. Where it models a delay of d samples, forces of the last d samples
 follow, the oldest first: v - v0, and what currents commutated for an old reading make beside it. The reference of both
 is what was commanded then, lagging. Last come constant forces of disturbance, where the filter observes them, with
-zero for a reference.
+zero for a reference. Where a disturbance is known in advance, the forces that cancel it are added to v0(z).
 
 Where the controller has a `commutation`, the currents of step 5 are those of y + lead p*', the place where they will
 act on the way of the reference. The filter knows what that does to the forces that pull back between readings:

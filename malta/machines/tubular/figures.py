@@ -11,6 +11,7 @@ import casadi as ca
 import numpy as np
 
 from malta.machines.tubular.capture_figure import capture_figure
+from malta.machines.tubular.carrier_figure import carrier_figure
 from malta.machines.tubular.experiments.rest import RESTING
 from malta.machines.tubular.recording_figure import recording_figure
 from malta.model.data import plant_of
@@ -412,5 +413,6 @@ FIGURES: dict[str, Callable[[Experiment, Published | None], Figure]] = {
     "faults": faults_figure,
     "drive-limits": drive_limits_figure,
     "record-v0": recording_figure,
+    "carrier": carrier_figure,
     "capture": capture_figure,
 }

@@ -10,6 +10,7 @@ disturbance   force and torque steps, vibration of the housing, compliance over 
 faults        of sensors, samples, a phase and the DC link: survival or touchdown
 drive-limits  the fastest stroke that the drive allows, against the sigmoid at the same peak current
 record-v0     v0(z) recorded by a slow stroke or from a log, beside the computed one
+carrier       the stator moves sideways, its acceleration fed forward or not, Sec. IV-A
 capture       displacements and tilts from which the mover returns, beside what the force limit allows
 """
 
@@ -21,6 +22,7 @@ from typing import Any
 
 from malta.errors import InputError
 from malta.machines.tubular.experiments.capture import capture
+from malta.machines.tubular.experiments.carrier import carrier, carrier_cases
 from malta.machines.tubular.experiments.failures import faults
 from malta.machines.tubular.experiments.forces import disturbance, disturbance_cases
 from malta.machines.tubular.experiments.lifting import lift_cases, lift_off, payload
@@ -50,6 +52,7 @@ EXPERIMENTS: dict[str, Callable[..., Experiment]] = {
     "faults": faults,
     "drive-limits": drive_limits,
     "record-v0": record_v0,
+    "carrier": carrier,
     "capture": capture,
 }
 # Experiments that campaigns can run: nothing but the machine differs between the runs of a case.
@@ -60,10 +63,11 @@ CASES: dict[str, Callable[..., list[PlannedRun]]] = {
     "lift-off": lift_cases,
     "disturbance": disturbance_cases,
     "drive-limits": drive_limit_cases,
+    "carrier": carrier_cases,
 }
 SHORTEST, LONGEST = 0.5, 60.0  # s, of one way of the slow stroke
 MOST_POINTS = 201  # of a side of a map
-FINDINGS = ("payload", "disturbance", "faults", "capture")
+FINDINGS = ("payload", "disturbance", "faults", "carrier", "capture")
 ALONE = ("stroke", "hold", "tilt")
 WORDS = {"stroke": "axial", "m": "radial", "thrust": "thrust", "N": "bearing force"}
 STROKE_UNIT = "mm"
@@ -76,6 +80,8 @@ OPTION_UNITS = {
     "drift": "m",
     "minute": "s",
     "way": "s",
+    "carried": "m",
+    "within": "s",
     "phase_error": "rad",
 }
 
