@@ -564,3 +564,45 @@ def test_figures_are_those_of_the_experiments(found: Found) -> None:
             assert found.value(start, name) == pytest.approx(case.merits[0].value * 1e6)
         assert "largest deviation" in evidence.experiments["thermal"].cases[0].merits[0].label
         assert evidence.experiments["tilt"].cases[0].merits[0].label == "SP2: largest deviation, true"
+
+
+def test_the_rule_of_thumb_by_hand(found: Found) -> None:
+    """The paper asks for twice the largest unstable pole, 218.92 rad/s, and has 400 rad/s."""
+    for name in NAMES:
+        for kind in ("−3", "0"):
+            ratio = found.value(f"bandwidth over unstable pole: last {kind} dB", name)
+            assert ratio * 218.92 == pytest.approx(found.value(f"bandwidth: last {kind} dB", name), rel=1e-4)
+    claim = found.claim("bandwidth over unstable pole: last −3")
+    assert claim.verdict.startswith("table2: not reproduced; calibrated: reproduced")
+    assert f"{400 / 218.92:.2f} times its 218.92" in claim.verdict
+
+
+def test_the_braking_resistor_holds_the_link(found: Found) -> None:
+    """Braked at the force limit from 5 m/s, the resistor switched by the sample: the link stays below 46.12 V."""
+    resistance = found.value("braking resistor: largest resistance", "calibrated")
+    capacitance = found.value("braking resistor: capacitance", "calibrated") * 1e-3
+    link, speed, highest, fine = 45.0, 5.0, 45.0, 50
+    while speed > 0:
+        on = link > 45.0
+        for _ in range(fine):
+            speed -= 52 / 0.36 * 50e-6 / fine
+            link += (52 * speed / link - on * link / resistance) / capacitance * 50e-6 / fine
+        highest = max(highest, link)
+    assert 45 + 0.9 * 1.12 < highest < 45 + 1.01 * 1.12
+    assert found.claim("braking resistor: capacitance").published == "≤ 88"
+
+
+def test_means_at_rest_are_of_the_order_that_the_paper_prints(
+    found: Found, published: dict[str, Any]
+) -> None:
+    printed = {name: abs(entry["value"]) for name, entry in published["table_III"]["mean"].items()}
+    note = found.claim("at rest, mean of z").verdict
+    assert f"{max(printed[name] for name in ('x1', 'y1', 'x2', 'y2')):.2f} radially" in note
+    assert f"{printed['z']:.2f} along z" in note
+    for name, size in printed.items():
+        assert found.value(f"at rest, mean of {name}", "calibrated") < 1
+        assert size < 1
+        merit = next(
+            m for m in found.evidence[1].experiments["hold"].merits if m.label == f"measured {name}, mean"
+        )
+        assert found.value(f"at rest, mean of {name}", "calibrated") == pytest.approx(abs(merit.value) * 1e6)

@@ -22,6 +22,7 @@ from malta.machines.tubular.evidence import (
     true_radial,
 )
 from malta.machines.tubular.evidence import evidence as evidence
+from malta.machines.tubular.further_claims import BRAKE, MEANS, RULE_OF_THUMB
 from malta.report.ledger import (
     ZONE_NOTE,
     Row,
@@ -328,7 +329,17 @@ COMPARISON: tuple[Row, ...] = (
     Row("of which is left after 0.1 s", "um", "{:.2f}", partial(load_deviation, "bearing", 0.1), note=HERE),
     Row("1 N along z moves it by", "um", "{:.0f}", partial(load_deviation, "thrust", None), note=HERE),
 )
-ROWS = (*POLES_AND_LQR, *LOOPS, *STROKE, *REST, *OTHER_EXPERIMENTS, *COMPARISON)
+ROWS = (
+    *POLES_AND_LQR,
+    *LOOPS,
+    *RULE_OF_THUMB,
+    *BRAKE,
+    *STROKE,
+    *REST,
+    *MEANS,
+    *OTHER_EXPERIMENTS,
+    *COMPARISON,
+)
 
 
 def rows() -> list[Row]:
