@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 WIDTH = 100  # columns of tables on wide terminals, in files and in pipes
 PATIENCE = 5.0  # s, from the first bounds of a margin to the first line about them
 INTERVAL = 2.0  # s, between the lines
+LINES = 10.0  # s, between lines of how far other work is
 
 
 def make_console() -> Console:
@@ -76,12 +77,16 @@ def track_files(files: list[Path], what: str, *, quiet: bool) -> Iterable[Path]:
 
 @contextmanager
 def progress_bar(what: str, *, quiet: bool) -> Iterator[Callable[[float], None] | None]:
-    """Show a progress bar with the time left on a terminal's standard error while the work goes on.
+    """Show how far the work is on standard error: a bar with the time left on a terminal, elsewhere lines.
 
-    Yields the function that takes the share done, 0 to 1, or None where no bar is shown.
+    Yields the function that takes the share done, 0 to 1, or None where nothing is shown. A line comes every LINES,
+    once the work has taken PATIENCE.
     """
-    if quiet or not sys.stderr.isatty():
+    if quiet:
         yield None
+        return
+    if not sys.stderr.isatty():
+        yield _progress_lines(what)
         return
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
@@ -90,6 +95,23 @@ def progress_bar(what: str, *, quiet: bool) -> Iterator[Callable[[float], None] 
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task(what, total=1.0)
         yield lambda share: bar.update(task, completed=share)
+
+
+def _progress_lines(what: str) -> Callable[[float], None]:
+    """The function that takes the share done and prints a line of it now and then."""
+    started = time.monotonic()
+    due = started + PATIENCE
+
+    def show(share: float) -> None:
+        nonlocal due
+        now = time.monotonic()
+        if now < due or not 0 < share < 1:
+            return
+        due = now + LINES
+        spent = now - started
+        print_note(f"{what}: {100 * share:.0f} %, {spent:.0f} s, about {spent * (1 / share - 1):.0f} s left")
+
+    return show
 
 
 @contextmanager
@@ -114,7 +136,7 @@ def margin_progress(
         due = time.monotonic() + INTERVAL
         print_note(f"{what}: {_bounds_text(lower, upper)}")
 
-    with progress_bar(what, quiet=quiet) as progress:
+    with progress_bar(what, quiet=quiet or not terminal) as progress:
         try:
             yield progress, show
         except KeyboardInterrupt:

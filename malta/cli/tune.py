@@ -32,10 +32,10 @@ def tune(
     ] = False,
     generations: Annotated[
         int, typer.Option(min=0, help="Of the global search; 0 starts from the file's numbers.")
-    ] = 20,
+    ] = 8,
     front: Annotated[
         int, typer.Option(min=0, help="Trials for each number and point of the Pareto front; 0: no front.")
-    ] = 40,
+    ] = 12,
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace a design file of that name.")
     ] = False,

@@ -3,7 +3,7 @@
 The figures come from the machine's own loop (hold, delay, current loops):
 
     margin             box of the parameters at which a corner of it becomes unstable, at the middle and the ends
-    peak sensitivity   largest |S_ii|; bandwidth: the smallest of verify's definitions, in every group
+    peak sensitivity   largest |S_ii|; bandwidth: the smallest of those of verify's definitions that bind every group
     motion, noise      discrete Lyapunov equation with the sensors' noise and the steps' q^2 / 12
 
 What the requirements make of them is theirs: Requirement.estimate.
@@ -33,6 +33,7 @@ from malta.synthesis.requirements import Noise, TrialLoop, requirements_for
 from malta.synthesis.riccati import add_lags, delay_inputs, sample
 from malta.synthesis.spec import Spec, Weights
 from malta.synthesis.step_response import step_response
+from malta.tuning.corners import STEP, SampledMachine, corner_margins
 from malta.tuning.noise import covariance, noise_variance
 
 if TYPE_CHECKING:
@@ -42,8 +43,6 @@ if TYPE_CHECKING:
     from malta.synthesis.requirements import Requirement
     from malta.synthesis.sampled import Gains
     from malta.synthesis.step_response import StepResponse
-
-STEP = 0.15  # of the multiples of the box at which the machine is sampled; linear between them
 
 
 class Part(NamedTuple):
@@ -57,23 +56,6 @@ class Part(NamedTuple):
     def E(self) -> FloatArray:
         """Nothing is held between samples here: `groups_of` refuses other machines."""
         return np.zeros((len(self.A), len(self.C)))
-
-
-@dataclass(frozen=True, eq=False)
-class SampledMachine:
-    """Sampled machines with hold, delay and current loops; leading axes are corners of the box."""
-
-    Ad: FloatArray
-    Bd: FloatArray
-    Cd: FloatArray
-
-    def close(self, F: LinearLaw) -> FloatArray:
-        """Close the loops with a law, without its references."""
-        n, k = self.Ad.shape[-1], len(F.A)
-        M = np.zeros((*self.Ad.shape[:-2], n + k, n + k))
-        M[..., :n, :n], M[..., :n, n:] = self.Ad + self.Bd @ F.D_y @ self.Cd, self.Bd @ F.C
-        M[..., n:, :n], M[..., n:, n:] = F.B_y @ self.Cd, F.A
-        return M
 
 
 class Place(NamedTuple):
@@ -303,28 +285,11 @@ def _corners(spec: Spec, systems: list[Any], i: Any, j: Any, o: Any) -> SampledM
     return SampledMachine(*(M.swapaxes(0, 1) for M in stacked))
 
 
-def _margin(table: SampledMachine, F: LinearLaw) -> float:
-    """Where the first corner of the growing box becomes unstable, by bisection."""
-    last = len(table.Ad) - 1
-    which = np.arange(table.Ad.shape[1])
-    low, high = 0.0, STEP * last
-    for _ in range(13):
-        t = (low + high) / 2
-        k = min(int(t / STEP), last - 1)
-        share = t / STEP - k
-        between = SampledMachine(
-            *((1 - share) * M[k, which] + share * M[k + 1, which] for M in (table.Ad, table.Bd, table.Cd))
-        )
-        lost = np.abs(np.linalg.eigvals(between.close(F))).max(axis=1) >= 1
-        if lost.any():
-            high, which = t, which[lost]  # the others are lost later
-        else:
-            low = t
-    return low
-
-
 def figures_of(spec: Spec, group: Group, weights: Weights, delay: int) -> dict[str, float]:
-    """Compute the linear figures of a group in a trial, by requirement; none where its loop is unstable."""
+    """Compute the linear figures of a group in a trial, by requirement; none where its loop is unstable.
+
+    Beside the margin stands that of every corner, "margin 3": a search that sees one alone runs into the next.
+    """
     try:
         with np.errstate(all="ignore"):
             g = gains(
@@ -343,11 +308,13 @@ def figures_of_gains(spec: Spec, group: Group, g: Gains) -> dict[str, float]:
     closed = group.nominal.close(steady)
     if not (np.isfinite(closed).all() and np.abs(np.linalg.eigvals(closed)).max() < 1):
         return {}
-    peak, bandwidth = _response(group, g, steady, Ts)
+    alone = len(group.outputs) == len(spec.plant.outputs)
+    peak, bandwidth = _response(group, g, steady, Ts, alone=alone)
     try:
         answers = tuple((place.position, _answer(place, law, Ts)) for place in group.places)
     except CheckError:
         return {}
+    margins = None if group.corners is None else corner_margins(group.corners, law)
     loop = TrialLoop(
         plant=spec.plant,
         sample_time=Ts,
@@ -359,7 +326,7 @@ def figures_of_gains(spec: Spec, group: Group, g: Gains) -> dict[str, float]:
         Cd=group.nominal.Cd,
         closed=closed,
         noise=_noise(group, steady, closed),
-        margin=None if group.corners is None else _margin(group.corners, law),
+        margin=None if margins is None else float(margins.min()),
         peak_sensitivity=peak,
         bandwidth=bandwidth,
         answers=answers,
@@ -372,6 +339,8 @@ def figures_of_gains(spec: Spec, group: Group, g: Gains) -> dict[str, float]:
         value = requirement.estimate(loop, signal)
         if value is not None:
             figures[name] = value
+    if margins is not None:
+        figures |= {f"margin {k}": value for k, value in enumerate(margins.tolist())}
     return figures
 
 
@@ -384,19 +353,24 @@ def _answer(place: Place, law: LinearLaw, Ts: float) -> StepResponse:
     return step_response(closed, pushed, C, Ts)
 
 
-def _response(group: Group, g: Gains, law: LinearLaw, Ts: float) -> tuple[float, float]:
-    """Peak sensitivity and bandwidth, rad/s."""
+def _response(group: Group, g: Gains, law: LinearLaw, Ts: float, *, alone: bool) -> tuple[float, float]:
+    """Peak sensitivity and bandwidth, rad/s.
+
+    Of several groups, the loop gain's last crossing is that of the widest: it binds a group that stands alone.
+    """
     z = np.exp(1j * group.w * Ts)[:, None, None]
     F = law.C @ np.linalg.solve(z * np.eye(len(law.A)) - law.A, law.B_y) + law.D_y
     eye = np.eye(len(group.outputs))
     S = np.linalg.inv(eye - group.response @ F)
     T = np.linalg.svd(eye - S, compute_uv=False)
-    L = np.linalg.svd(group.response @ F, compute_uv=False)
     half = len(group.states) // 2
     stiffness = group.model.B[half:] @ g.K[:, :half] - group.model.A[half:, :half]
     w_n = math.sqrt(max(float(np.linalg.eigvals(stiffness).real.min()), 0.0))
-    falls = crossing(group.w, T[:, -1], math.sqrt(0.5)), crossing(group.w, L[:, 0], 1.0, last=True)
-    return float(np.abs(np.einsum("kii->ki", S)).max()), min(*falls, w_n)
+    bandwidth = min(crossing(group.w, T[:, -1], math.sqrt(0.5)), w_n)
+    if alone:
+        L = np.linalg.svd(group.response @ F, compute_uv=False)
+        bandwidth = min(bandwidth, crossing(group.w, L[:, 0], 1.0, last=True))
+    return float(np.abs(np.einsum("kii->ki", S)).max()), bandwidth
 
 
 def _noise(group: Group, law: LinearLaw, closed: FloatArray) -> Noise:

@@ -3,7 +3,7 @@
 Each group of states that nothing joins to the others is searched by itself; groups that are each other's mirror image
 are computed once. One number is minimized: the worst ratio of what is found to what is asked for (asked to found where
 more is better), so 1 is reached where everything holds, and what binds has a name. Differential evolution finds the
-region, Nelder-Mead the place.
+region, a descent by linear programs the place (minimax.py).
 """
 
 from __future__ import annotations
@@ -20,7 +20,9 @@ from malta.margins.travel import travel_margin
 from malta.model.plant import Plant
 from malta.synthesis.requirements import Trade, ratio_of, requirements_for
 from malta.synthesis.spec import Spec, Weights
-from malta.tuning.groups import STEP, Group, figures_of, groups_of
+from malta.tuning.corners import STEP
+from malta.tuning.groups import Group, figures_of, groups_of
+from malta.tuning.minimax import Merit, descend
 from malta.tuning.search import (
     UNSTABLE,
     Effort,
@@ -42,6 +44,8 @@ if TYPE_CHECKING:
     from malta.model.plant import FloatArray
 
 FRONT = (0.6, 0.7, 0.8, 0.9, 0.95, 1.0, 1.05, 1.1)  # of the margin that is asked for
+LEAST = 1e-3  # ratio below which a figure counts as nothing
+FRUGAL = Merit(steep=100.0, floor=0.0)  # what noise can gain beside a bound that is missed
 TRADES: tuple[Trade, ...] = get_args(Trade)  # what the front has against the margin
 
 
@@ -106,16 +110,33 @@ def _worst(search: Search, u: FloatArray) -> float:
     return (max(ratios) + 0.01 * sum(ratios) / len(ratios) if ratios else UNSTABLE) + distance_outside(u)
 
 
-def _frugal(search: Search, u: FloatArray, margin: float, kinds: Collection[str]) -> float:
-    """The logarithm of noise or motion at a margin, with everything else as it is asked for."""
+def _look_worst(search: Search, u: FloatArray) -> tuple[float, FloatArray] | None:
+    """The logarithms of all ratios; None for an unstable loop."""
+    figures = search.figures(u)
+    return (0.0, _logs(search.spec, figures, search.spec.specification)) if figures else None
+
+
+def _look_frugal(
+    search: Search, u: FloatArray, margin: float, kinds: Collection[str]
+) -> tuple[float, FloatArray] | None:
+    """The logarithm of noise or motion, and of the ratios at a margin with everything else as it is asked for."""
     figures = search.figures(u)
     if not figures:
-        return UNSTABLE
-    worst = max(
-        ratio_of(margin, figures.get("margin", math.inf), at_least=True), _beside_noise(search.spec, figures)
-    )
-    beyond = max(worst - 1, 0.0) + distance_outside(u)
-    return sum(math.log(figures[kind]) for kind in figures if base_of(kind) in kinds) + 100 * beyond
+        return None
+    free = {name for trade in TRADES for name in _names_of(search.spec.plant, trade)}
+    asked = {k: v for k, v in search.spec.specification.items() if base_of(k) not in free}
+    size = sum(math.log(figures[kind]) for kind in figures if base_of(kind) in kinds)
+    return size, _logs(search.spec, figures, asked | {"margin": margin})
+
+
+def _logs(spec: Spec, figures: Mapping[str, float], asked: Mapping[str, float]) -> FloatArray:
+    """Logarithms of ratios, each corner's margin among them; LEAST for what is next to nothing."""
+    ratios, at_least = [], at_least_of(spec.plant)
+    for name, value in figures.items():
+        bound = asked.get("margin" if base_of(name) == "margin" else name)
+        if bound is not None:
+            ratios.append(ratio_of(bound, value, at_least=base_of(name) in at_least))
+    return np.asarray(np.log(np.clip(ratios or [LEAST], LEAST, 1 / LEAST)))
 
 
 def _ratios(spec: Spec, figures: Mapping[str, float]) -> list[float]:
@@ -153,7 +174,8 @@ def search_weights(
         for search in (_search(spec, cluster, delay, journal) for cluster in clusters):
             goal = partial(_worst, search)
             u = search.evolve(goal, effort.generations)
-            found[delay].append((search, search.polish(goal, u, effort.polish * len(search.low))))
+            look = partial(_look_worst, search)
+            found[delay].append((search, descend(look, u, Merit(), effort.polish * len(search.low))))
     worst = {delay: max(_worst(s, u) for s, u in places) for delay, places in found.items()}
     # More states are worth it only where they help.
     delay = min(d for d, ratio in worst.items() if ratio <= 1.01 * min(worst.values()))
@@ -186,8 +208,10 @@ def _front(
             if share * margin > most:
                 continue
             for k, (search, _) in enumerate(places):
-                goal = partial(_frugal, search, margin=share * margin, kinds=_names_of(spec.plant, trade))
-                around[k] = search.polish(goal, around[k], effort.front * len(search.low))
+                look = partial(
+                    _look_frugal, search, margin=share * margin, kinds=_names_of(spec.plant, trade)
+                )
+                around[k] = descend(look, around[k], FRUGAL, effort.front * len(search.low))
             trials.append(combine(spec, [(s, u) for (s, _), u in zip(places, around, strict=True)]))
     proven = []
     for one in trials:

@@ -46,9 +46,9 @@ class Trial(NamedTuple):
 class Effort(NamedTuple):
     """How long to search."""
 
-    generations: int = 20  # of differential evolution
+    generations: int = 8  # of differential evolution
     polish: int = 40  # trials for each variable, of the best point
-    front: int = 40  # and of each point of the front
+    front: int = 12  # and of each point of the front
 
 
 def apply_trial(spec: Spec, trial: Trial) -> Spec:
@@ -197,18 +197,6 @@ class Search:
         found = optimize.differential_evolution(
             goal, optimize.Bounds(np.zeros(k), np.ones(k)), maxiter=generations, init=cube, seed=0,
             tol=1e-6, polish=False, mutation=(0.4, 0.9), recombination=0.8,
-        )  # fmt: skip
-        best: FloatArray = np.asarray(found.x, dtype=float)
-        return best
-
-    def polish(self, goal: Callable[[FloatArray], float], u: FloatArray, trials: int) -> FloatArray:
-        """Find the place: Nelder-Mead from steps of 5 % of a decade or so."""
-        if not (trials and len(u)):
-            return u
-        simplex = np.vstack([u, u + np.diag(np.where(u < 0.5, 1, -1) * 0.1 / self.width)])
-        found = optimize.minimize(
-            goal, u, method="Nelder-Mead",
-            options={"initial_simplex": simplex, "maxfev": trials, "xatol": 1e-4, "fatol": 1e-5, "adaptive": True},
         )  # fmt: skip
         best: FloatArray = np.asarray(found.x, dtype=float)
         return best

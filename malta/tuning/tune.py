@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING
 
 from malta.errors import InputError
-from malta.tuning import groups, lqg, pid
+from malta.tuning import corners, lqg, pid
 from malta.tuning.outcomes import judge
 from malta.tuning.search import DIGITS, Effort, Journal, apply_trial
 
@@ -78,6 +78,6 @@ def problem_sha256(spec: Spec) -> str:
     asked, searched = dict(spec.specification), (spec.search, spec.delays)
     loads = asdict(spec.loads) if spec.loads else None
     pushes = [asdict(bound) for bound in spec.recovery.values()]
-    settings = (lqg.FRONT, DIGITS, groups.STEP)
+    settings = (lqg.FRONT, DIGITS, corners.STEP, corners.NEAR)
     content = [repr(spec.parameters), asked, loads, pushes, searched, spec.sha256, *settings]
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
