@@ -18,7 +18,7 @@ from scipy.linalg import expm
 import malta
 from malta import references
 from malta.machines.tubular import claims as tubular
-from malta.machines.tubular.evidence import EXPERIMENT_NAMES, Evidence
+from malta.machines.tubular.evidence import EXPERIMENT_NAMES, Evidence, is_solved_for_ratio
 from malta.margins.loops import machine_loop
 from malta.model.data import plant_of
 from malta.model.published import published_value
@@ -149,6 +149,7 @@ def test_rows_are_well_formed(published: dict[str, Any]) -> None:
     assert len({row.subject for row in rows}) == len(rows)
     for row in rows:
         assert row.relation in ("equal", "at most", "at least", "about")
+        assert row.note or not row.by_construction, row.subject  # which says by what
         assert row.form.format(1.0)
         assert math.isfinite(in_unit(1.0, row.unit))
         if isinstance(row.published, str):
@@ -185,8 +186,53 @@ def test_about_is_5_percent_or_says_how_far(off: float, word: str) -> None:
 
 @given(value=st.floats(-1e3, 1e3), target=st.floats(-1e3, 1e3))
 def test_at_most_is_at_most(value: float, target: float) -> None:
-    expected = "reproduced" if value <= target else "not reproduced"
-    assert claims._word(_row("at most"), target, value) == expected
+    for relation, sign in (("at most", 1), ("at least", -1)):
+        word = claims._word(_row(relation), sign * target, sign * value)
+        assert word.startswith("not reproduced") == (value > target)
+        if word == "reproduced":
+            assert value == pytest.approx(target, rel=0.0501, abs=0)
+
+
+@pytest.mark.parametrize(
+    ("relation", "bound", "value", "word"),
+    [
+        ("at most", 0.83, 0.043, "smaller, x 19"),
+        ("at most", 0.83, 0.0868, "smaller, x 9.6"),
+        ("at most", 0.83, 0.82, "reproduced"),
+        ("at most", 0.83, 0.0, "smaller, x > 1000"),
+        ("at most", 0.83, -0.02, "on the other side of zero"),
+        ("at most", 4.0, 12.3, "not reproduced: larger, x 3.1"),
+        ("at most", 4.0, 4.1, "not reproduced"),
+        ("at least", 6.08, 380.0, "larger, x 62"),
+        ("at least", -0.081, -0.004, "smaller, x 20"),
+        ("at least", -0.003, -0.805, "not reproduced: larger, x 268"),
+        ("at least", 0.2, 0.1, "not reproduced: smaller, x 2.0"),
+    ],
+)
+def test_a_bound_says_how_far_it_is(relation: str, bound: float, value: float, word: str) -> None:
+    assert claims._word(_row(relation), bound, value) == word
+
+
+@pytest.mark.parametrize(
+    ("relation", "value", "word"),
+    [
+        ("equal", 1.0, "by construction"),
+        ("equal", 1.01, "not reproduced"),
+        ("about", 1.04, "by construction"),
+        ("about", 1.12, "by construction, within 12 %"),
+        ("about", 1.3, "not reproduced"),
+        ("at most", 0.5, "by construction"),
+        ("at most", 1.5, "not reproduced: larger, x 1.5"),
+        ("about", math.nan, "not reproduced"),
+    ],
+)
+def test_what_is_so_by_construction_still_has_to_agree(relation: str, value: float, word: str) -> None:
+    assert claims._word(_row(relation), 1.0, value, by_construction=True) == word
+
+
+def test_what_is_beside_is_not_compared() -> None:
+    for value in (1e-9, 1.0, 1e9):
+        assert claims._word(_row("beside"), 1.0, value, by_construction=True) == "not compared"
 
 
 @given(digits=st.integers(0, 4), value=st.floats(0, 1e4), target=st.floats(0, 1e4))
@@ -219,6 +265,16 @@ def test_the_verdict_of_several_designs() -> None:
         "a: reproduced; b: within 10 %; c: not reproduced; so; bad"
     )
     assert verdict(math.nan, 1.0) == "a: not reproduced; b: reproduced"
+    built = claims._verdict(_row(note="so"), 1.0, (1.0, 1.0, 2.0), "abc", (True, False, True))
+    assert built == "a: by construction; b: reproduced; c: not reproduced; so"
+
+    def bound(*values: float) -> str:
+        return claims._verdict(_row("at most"), 1.0, values, ["a", "b"])
+
+    assert bound(0.5, 0.125) == "smaller, x 2.0, x 8.0"
+    assert bound(0.5, 0.99) == "a: smaller, x 2.0; b: reproduced"
+    assert bound(4.0, 2.0) == "not reproduced: larger, x 4.0, x 2.0"
+    assert bound(0.5, 2.0) == "a: smaller, x 2.0; b: not reproduced: larger, x 2.0"
 
 
 def test_a_claim_shows_its_figures(found: Found, published: dict[str, Any]) -> None:
@@ -232,7 +288,7 @@ def test_a_claim_shows_its_figures(found: Found, published: dict[str, Any]) -> N
         "rise [ms]", "16.2", ("16.20", "–"), "table2: reproduced; calibrated: not reproduced"
     )
     at_most = claim(relation="at most", published="figure_13.radial_deviation", unit="um", form="{:.0f}")
-    assert at_most == Claim("rise [µm]", "≤ 20", ("17000", "17000"), "not reproduced")
+    assert at_most == Claim("rise [µm]", "≤ 20", ("17000", "17000"), "not reproduced: larger, x 850")
     values = iter([0.5, 0.25] * 3)
     assert claim(published=None, unit="percent", note="so") == Claim(
         "rise [%]", "–", ("50.00", "25.00"), "ours: so"
@@ -306,34 +362,46 @@ BOTH, FIRST, SECOND = (
     "calibrated: not reproduced",
     "table2: not reproduced; calibrated: reproduced",
 )
+BUILT, SOLVED = "by construction; ", "table2: not reproduced; calibrated: by construction"
 VERDICTS = {
-    "poles of x, y": BOTH,
-    "poles of alpha, beta": BOTH,
-    "poles of z": BOTH,
-    "change of the poles": BOTH,
-    "LQR: stiffness over attraction": SECOND,
-    "LQR: share of the 20 % box": SECOND,
+    "poles of x, y": BUILT,
+    "poles of alpha, beta": BUILT,
+    "poles of z": BUILT,
+    "change of the poles": "smaller, x 1.9; ",
+    "LQR: stiffness over attraction": SOLVED,
+    "LQR: share of the 20 % box": SOLVED,
     "bandwidth: last −3 dB": "table2: within 9 %; " + FIRST,
     "bandwidth: last 0 dB": SECOND,
     "bandwidth: regulator's fastest": SECOND,
-    "current loops: crossover": BOTH,
-    "current loops: phase margin": BOTH,
-    "DC link": BOTH,
-    "stroke: rise": BOTH,
-    "stroke: overshoot": BOTH,
-    "stroke: axial error": BOTH,
-    "stroke: radial deviation": BOTH,
-    "stroke: deviation of x1": BOTH,
-    "stroke: f/i": BOTH,
-    "stroke, cogging not compensated: rise": SECOND,
-    "stroke, cogging not compensated: error": SECOND,
+    "current loops: crossover": BUILT,
+    "current loops: phase margin": BUILT,
+    "DC link": BUILT,
+    "stroke: rise": BUILT,
+    "stroke: overshoot": "smaller, x 6.7, x > 1000",
+    "stroke: axial error": "smaller, x 7.2, x 7.0",
+    "stroke: radial deviation": "smaller, x 8.2, x 34",
+    "stroke: deviation of x1": BUILT,
+    "stroke: f/i": BUILT,
+    "stroke, cogging not compensated: rise": SOLVED,
+    "stroke, cogging not compensated: error": "table2: not reproduced: larger, x 9.0; calibrated: smaller, x 3.1",
     "weight carried": "not reproduced",
     "at rest: x1": "not reproduced",
-    "tilt: SP2 deviates": "not reproduced",
-    "tilt: SP2, attraction": BOTH,
-    "thermal: growth": BOTH,
-    "payload carried": SECOND,
+    "tilt: SP2 deviates": "not reproduced: larger, x ",
+    "tilt: SP2, attraction": "smaller, x ",
+    "thermal: growth": BUILT,
+    "at rest: z measured": BUILT,
+    "at rest: y1 measured": "table2: by construction, within ",
+    "payload carried": "table2: not reproduced: smaller, x 2.0; calibrated: reproduced",
 }
+
+
+def test_what_a_design_was_solved_for_is_found_by_its_bases(found: Found) -> None:
+    """K1 / k = 4 of other bases would be a finding; of bases that were solved for 4 it is none."""
+    first, second = found.evidence
+    assert (is_solved_for_ratio(first), is_solved_for_ratio(second)) == (False, True)
+    weights = second.spec.weights
+    stiffer: Any = SimpleNamespace(pid=None, weights=replace(weights, q_base=weights.q_base * 0.99))
+    assert not is_solved_for_ratio(replace(second, spec=stiffer))
 
 
 @pytest.mark.parametrize("start", list(VERDICTS))

@@ -3,8 +3,11 @@
 Published numbers are read from data/published/. Ours come from the same functions that a user calls: model, gains,
 margins, and the experiments on the simulated machine. A verdict follows from the numbers:
 
-    reproduced          equal to the printed digits, within the printed bound, or within 5 % of an "about"
+    reproduced          equal to the printed digits, or within 5 % of an "about" or of a bound, on its right side
+    smaller, x 19       within a bound, and 19 times smaller than the bound; "larger" likewise
     within x %          of the published figure, x up to 20
+    by construction     agrees, and could not differ: the row restates an input, or what the design was solved for
+    not compared        ours is of something else: another method, or another computer
     not reproduced      else, with the reason
 
 Where the designs differ, each has its verdict; where the paper leaves a definition open, the verdict names the one that
@@ -38,6 +41,7 @@ if TYPE_CHECKING:
     from malta.synthesis.spec import Spec
 
 CLOSE, NEAR = 0.05, 0.2  # largest relative differences that are "reproduced" and "within x %"
+FACTOR, FAR = ", x ", 1000.0  # in front of a factor from a bound, and the largest one that is shown
 ROUNDING = 1e-9
 ZONE_NOTE = f"ISO 14839-3 zone {ZONES[0][1]} ends at {ZONES[0][0]:g}"
 
@@ -120,10 +124,14 @@ class Row(NamedTuple):
     published: str | float | None = (
         None  # key of data/published/, or a figure that the text implies; None: ours alone
     )
-    relation: str = "about"  # "equal" to the printed digits, "at most", "at least", "about"
+    relation: str = (
+        "about"  # "equal" to the printed digits, "at most", "at least", "about"; "beside": not compared
+    )
     note: str = ""  # where the paper leaves a definition open, or what explains the figures
     why: str = ""  # the reason why a figure is not reproduced
     of_lqg: bool = False  # a PID has no such figure: it shows a dash, and no verdict
+    # Whether the figure restates an input, or what a design was solved for; of the machine's evidence.
+    by_construction: bool | Callable[[Any], bool] = False
 
 
 def ledger(specs: Sequence[Spec], published: Mapping[str, Any], progress: Progress | None = None) -> Ledger:
@@ -168,27 +176,51 @@ def _claim(row: Row, found: Sequence[Evidence], published: Mapping[str, Any]) ->
     if not judged:
         return Claim(subject, mark + printed, ours, "of an LQG only")
     own = [value for value, e in zip(values, found, strict=True) if e in judged]
-    return Claim(subject, mark + printed, ours, _verdict(row, target, own, [e.spec.name for e in judged]))
+    built = [row.by_construction(e) if callable(row.by_construction) else row.by_construction for e in judged]
+    verdict = _verdict(row, target, own, [e.spec.name for e in judged], built)
+    return Claim(subject, mark + printed, ours, verdict)
 
 
-def _verdict(row: Row, target: float, values: Sequence[float], names: Sequence[str]) -> str:
-    """The verdict on the figures of all designs."""
-    words = [_word(row, target, value) for value in values]
+def _verdict(
+    row: Row, target: float, values: Sequence[float], names: Sequence[str], built: Sequence[bool] = ()
+) -> str:
+    """The verdict on the figures of all designs.
+
+    built : for each design whether its figure is so by construction
+    """
+    judged = zip(values, built or [False] * len(values), strict=True)
+    words = [_word(row, target, value, by_construction=one) for value, one in judged]
     note = f"; {row.note}" if row.note else ""
+    kinds = {word.partition(FACTOR)[0] for word in words}
     if len(set(words)) == 1:
         text = words[0] + note
+    elif len(kinds) == 1 and all(FACTOR in word for word in words):
+        text = kinds.pop() + "".join(FACTOR + word.partition(FACTOR)[2] for word in words) + note
     else:
         text = "; ".join(f"{name}: {word}" for name, word in zip(names, words, strict=True)) + note
     return text + (f"; {row.why}" if row.why and "not reproduced" in text else "")
 
 
-def _word(row: Row, target: float, value: float) -> str:
+def _word(row: Row, target: float, value: float, *, by_construction: bool = False) -> str:
     """The verdict on the figure of one design."""
+    word = _comparison(row, target, value)
+    if not by_construction or word.startswith("not"):
+        return word
+    return f"by construction, {word}" if word.endswith("%") else "by construction"
+
+
+def _comparison(row: Row, target: float, value: float) -> str:
+    """What the numbers say, wherever the figure comes from."""
+    if row.relation == "beside":
+        return "not compared"
     if math.isnan(value):
         return "not reproduced"
     if row.relation in ("at most", "at least"):
-        within = value <= target if row.relation == "at most" else value >= target
-        return "reproduced" if within else "not reproduced"
+        kept = value <= target if row.relation == "at most" else value >= target
+        distance = _distance(target, value)
+        if kept:
+            return distance or "reproduced"
+        return f"not reproduced: {distance}" if distance else "not reproduced"
     if row.relation == "equal":
         if row.form.format(value) == row.form.format(target):
             return "reproduced"
@@ -197,6 +229,24 @@ def _word(row: Row, target: float, value: float) -> str:
     if off <= CLOSE + ROUNDING:
         return "reproduced"
     return f"within {math.ceil((off - ROUNDING) * 100)} %" if off <= NEAR + ROUNDING else "not reproduced"
+
+
+def _distance(bound: float, value: float) -> str:
+    """How far a figure is from its bound, in size; "" for one that is close to it.
+
+    >>> _distance(0.83, 0.043), _distance(0.2, 0.2)
+    ('smaller, x 19', '')
+    """
+    if value == bound:
+        return ""
+    if bound == 0 or value * bound < 0:
+        return "on the other side of zero" if bound else "other than zero"
+    ratio = abs(value / bound)
+    if abs(ratio - 1) <= CLOSE + ROUNDING:
+        return ""
+    size = max(ratio, 1 / ratio) if ratio else math.inf
+    shown = f"> {FAR:.0f}" if size > FAR else f"{size:.1f}" if size < 10 else f"{size:.0f}"
+    return f"{'larger' if ratio > 1 else 'smaller'}{FACTOR}{shown}"
 
 
 def machine_share(e: Evidence) -> float:

@@ -42,7 +42,16 @@ SOURCE = "L. C. Díaz-Pérez et al., Actuators 7(4), 2018"
 
 
 MOTOR: tuple[Row, ...] = (
-    Row("pitch, 2π/k", "mm", "{:.3f}", lambda e: 2 * math.pi / e.par.k, "motor.pitch", "equal"),
+    Row(
+        "pitch, 2π/k",
+        "mm",
+        "{:.3f}",
+        lambda e: 2 * math.pi / e.par.k,
+        "motor.pitch",
+        "equal",
+        "k, an input",
+        by_construction=True,
+    ),
     Row(
         "more air gap that costs a tenth of A, (2)",
         "mm",
@@ -51,7 +60,16 @@ MOTOR: tuple[Row, ...] = (
         note="A e^(-k z₀), z₀ = 0.4 mm as printed; the proven box of 10 % of A covers it",
     ),
     Row("Fig. 2: largest force", "N", "{:.3f}", lambda e: figure_2(e)[0], "figure_2.force", "equal"),
-    Row("Fig. 2: between F_x and F_z", "deg", "{:.1f}", lambda e: figure_2(e)[1], math.pi / 2, "equal"),
+    Row(
+        "Fig. 2: between F_x and F_z",
+        "deg",
+        "{:.1f}",
+        lambda e: figure_2(e)[1],
+        math.pi / 2,
+        "equal",
+        "the motor law has a sine and a cosine",
+        by_construction=True,
+    ),
     Row(
         "stiffness at 1 N: secant over 2 mm",
         "N/m",
@@ -93,7 +111,8 @@ ELECTRONICS: tuple[Row, ...] = (
         "{:.2f}",
         pwm_step_of("plain"),
         "pwm.step",
-        note="printed rounded",
+        note="V_dc over the counts of the PWM; printed rounded",
+        by_construction=True,
     ),
     Row(
         "high-resolution PWM: 150 ps of a period at 12 V",
@@ -101,9 +120,22 @@ ELECTRONICS: tuple[Row, ...] = (
         "{:.4f}",
         lambda e: e.par.V_dc * e.value("pwm.micro_edge") * e.par.f_pwm,
         "pwm.fine_step",
+        note="a product of inputs",
+        by_construction=True,
     ),
-    Row("duty cycle at −2.1 A", "percent", "{:.1f}", lambda e: duty(e, -1), "pwm.duty_low", "equal"),
-    Row("duty cycle at +2.1 A", "percent", "{:.1f}", lambda e: duty(e, 1), "pwm.duty_high", "equal"),
+    *(
+        Row(
+            f"duty cycle at {sign}2.1 A",
+            "percent",
+            "{:.1f}",
+            partial(duty, sign=factor),
+            key,
+            "equal",
+            "1/2 + R i / V_dc, of inputs",
+            by_construction=True,
+        )
+        for sign, factor, key in (("−", -1, "pwm.duty_low"), ("+", 1, "pwm.duty_high"))
+    ),
     Row("least duty cycle at 5 N", "percent", "{:.1f}", lambda e: duty_at_force(e).min(), "pwm.duty_low"),
     Row(
         "greatest duty cycle at 5 N",
@@ -119,6 +151,8 @@ ELECTRONICS: tuple[Row, ...] = (
         lambda e: electronics.adc_step(e.par),
         "current_sampling.step",
         "equal",
+        "the range over the codes, both inputs",
+        by_construction=True,
     ),
     Row(
         "current sensor: noise after the rolling mean",
@@ -230,7 +264,16 @@ CLOSED_LOOP: tuple[Row, ...] = (
         partial(case_merit, "stairs", 3, 3),
         note="“imperceptible”",
     ),
-    Row("Fig. 8: way at constant speed", "mm", "{:.1f}", ramp_distance, "closed_loop.travel", "equal"),
+    Row(
+        "Fig. 8: way at constant speed",
+        "mm",
+        "{:.1f}",
+        ramp_distance,
+        "closed_loop.travel",
+        "equal",
+        "an input: the reference has it",
+        by_construction=True,
+    ),
     Row(
         "Fig. 8: mean lag, worst of 1, 2, 5 mm/s",
         "um",
@@ -243,7 +286,15 @@ CLOSED_LOOP: tuple[Row, ...] = (
         "{:.2f}",
         lambda e: max(case.merits[3].value for case in e.experiments["ramp"].cases),
     ),
-    Row("Fig. 9: step", "um", "{:.1f}", mean_step, "closed_loop.step"),
+    Row(
+        "Fig. 9: step",
+        "um",
+        "{:.1f}",
+        mean_step,
+        "closed_loop.step",
+        note="an input: the reference has it",
+        by_construction=True,
+    ),
     Row(
         "Fig. 9: mean overshoot of a jump",
         "percent",

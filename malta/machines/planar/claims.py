@@ -47,7 +47,16 @@ ERRORS = {
     "N m": "of an inner coil; the rectangles of (23), (24) overlap: 3.8 times a rounded coil's own torque",
 }
 COIL: tuple[Row, ...] = (
-    Row("field over a pole at 1 mm", "T", "{:.2f}", pole_field, "field.B_z", "equal", BOTH),
+    Row(
+        "field over a pole at 1 mm",
+        "T",
+        "{:.2f}",
+        pole_field,
+        "field.B_z",
+        "equal",
+        BOTH,
+        by_construction=True,
+    ),
     *(
         Row(
             f"one coil at 3 A: {name}",
@@ -58,6 +67,7 @@ COIL: tuple[Row, ...] = (
             "about",
             NOTES.get(name, "4 % less; see the ratio"),
             ARM,
+            by_construction=NOTES.get(name) == BOTH,
         )
         for name, unit in WRENCH
     ),
@@ -121,7 +131,8 @@ TABLE: tuple[Row, ...] = (
         "{:.2f}",
         partial(merit, "errors", "error of the table, each halving of its step"),
         4.0,
-        note="bilinear",
+        note="bilinear interpolation has it",
+        by_construction=True,
     ),
     *(
         Row(
@@ -167,7 +178,7 @@ MOVER: tuple[Row, ...] = (
         "{:.1f}",
         partial(merit, "timing", "table, compiled"),
         "table_2.interpolation",
-        "at most",
+        "beside",
         "compiled, on this computer; the paper's on an NI PXI-1042Q",
     ),
     Row(
@@ -176,7 +187,8 @@ MOVER: tuple[Row, ...] = (
         "{:.1f}",
         partial(merit, "timing", "analytical, compiled"),
         "table_2.analytical",
-        "at most",
+        "beside",
+        "on another computer, as above",
     ),
     Row(
         "K(p) and pseudo-inverse, exact field",
@@ -184,8 +196,9 @@ MOVER: tuple[Row, ...] = (
         "{:.0e}",
         partial(merit, "timing", "exact, compiled"),
         "table_2.fem",
-        "at most",
-        "22 harmonics; the paper has FEM for it",
+        "beside",
+        "ours sums 22 harmonics of an endless array's field at one place; the paper's hour is a finite-element "
+        "model's, whose mesh and number of places it does not print",
     ),
     Row(
         "K(p) and pseudo-inverse with filter and law, table",
@@ -211,7 +224,8 @@ MOVER: tuple[Row, ...] = (
         lambda e: e.controller.sample_time,
         "real_time.mean",
         "equal",
-        "taken",
+        "an input: taken from it",
+        by_construction=True,
     ),
 )
 
@@ -246,6 +260,8 @@ STEPS: tuple[Row, ...] = (
         partial(case_merit, "step", 0, "largest force"),
         "steps.force_limit",
         "at most",
+        "an input: commands are limited there",
+        by_construction=True,
     ),
     Row(
         "x, theta, psi from (0, 0)",

@@ -31,7 +31,7 @@ from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate
 from malta.simulation.trajectory import StrokeFigures, stroke_figures
 from malta.synthesis.controller import Controller
-from malta.synthesis.lqg import lqr
+from malta.synthesis.lqg import calibrate, lqr
 from malta.synthesis.riccati import add_integrals
 from malta.synthesis.spec import Spec
 from malta.tuning.noise import noise_of
@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from malta.model.plant import FloatArray
 
 EXPERIMENT_NAMES = ("stroke", "hold", "tilt", "payload", "thermal")
+IMPLIED_RATIO = 4.0  # K1 / k at which the LQR stands the published 300 % of a 20 % box
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,6 +98,17 @@ def stiffness_ratio(e: Evidence) -> float:
         return math.nan
     half = len(e.model.stiffness)
     return float((e.model.force_map @ e.K[:, :half])[0, 0] / e.model.stiffness[0, 0])
+
+
+def is_solved_for_ratio(e: Evidence) -> bool:
+    """Whether the bases of a design are those that `calibrate` solves for K1 / k = IMPLIED_RATIO."""
+    if e.spec.pid is not None:
+        return False
+    plant = e.model.plant
+    solved = calibrate(linearize(plant, plant.at()), e.spec.weights, IMPLIED_RATIO).q_base
+    half = len(solved) // 2
+    radial = [k for k, s in enumerate(plant.design_states[:half]) if s.name != plant.stroke]
+    return bool(np.allclose(e.spec.weights.q_base[radial], solved[radial], rtol=1e-4))
 
 
 def full_state_share(e: Evidence) -> float:
