@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -24,6 +25,7 @@ from malta.model.data import plant_of
 from malta.model.published import published_value
 from malta.report import ledger as claims
 from malta.report.ledger import Claim, Ledger, Row
+from malta.simulation.responses import step_wrench
 from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate
 from malta.units import in_unit
@@ -566,7 +568,7 @@ def test_the_link_by_hand(found: Found) -> None:
 
 def test_what_the_notes_say_is_so(found: Found, designs: dict[str, Design]) -> None:
     par: Any = designs["table2"].spec.parameters
-    assert f"{2 * math.pi / par.L_p * par.F_c:.0f} N/m" in found.claim("axial stiffness").verdict
+    assert f"{2 * math.pi / par.L_p * par.F_c:.0f} N/m" in found.claim("1 N along z").verdict
     assert par.F_c == 0.5
     weight = found.claim("weight carried")
     assert weight.ours == (f"{par.m * par.g:.2f}",) * 2 == ("3.53",) * 2
@@ -594,18 +596,33 @@ def test_the_slowest_radial_pole_is_among_the_regulators(found: Found) -> None:
 
 
 def test_cogging_pushes_a_soft_axis_aside(found: Found) -> None:
-    """F_c |sin| at 5 mm is 0.43 N: against the axial stiffness of `calibrated` some micrometres, in table2 no hold."""
+    """F_c |sin| at 5 mm is 0.43 N: `calibrated` yields to it by a sixth of a millimetre, table2 beyond its stops."""
     held = 0.5 * abs(math.sin(2 * math.pi * 5 / 15))
     for name in NAMES:
-        sag = held / found.value("axial stiffness", name) * 1e3  # mm
+        sag = held * found.value("1 N along z", name)  # mm
         error = found.value("stroke, cogging not compensated: error", name)
         with_v0 = found.value("stroke: axial error", name)
         if name == "calibrated":
-            assert sag < 0.01
+            assert 0.1 < sag < 0.2
             assert with_v0 < error < 0.6
         else:
             assert sag > 15  # beyond the end stop
             assert error > 5
+
+
+def test_what_a_newton_along_z_meets_is_what_the_machine_does(found: Found) -> None:
+    """The simulated mover, with lags as the linear loop has them and without noise; not 1 / K[z, z], 19 um."""
+    second = found.evidence[1]
+    K_z = second.controller.K[second.model.plant.thrust_input, second.model.plant.stroke_state]
+    push = partial(step_wrench, column=2, size=0.1, at=0.0, width=6)
+    scenario = Scenario("push", 0.2, references.hold, fidelity="force", disturbance=push)
+    run = simulate(second.spec.plant, second.controller, scenario)
+    moved = 10 * np.abs(run.p - run.reference)[:, second.model.plant.stroke_output].max()
+    assert 1e3 * moved == pytest.approx(found.value("1 N along z", "calibrated"), rel=0.02)
+    assert moved > 15 / K_z
+    for name in NAMES:
+        ratio = found.value("the same at the worst frequency", name) / found.value("1 N along z", name)
+        assert 1 < ratio < 2
 
 
 def test_figures_are_those_of_the_experiments(found: Found) -> None:

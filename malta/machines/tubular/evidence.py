@@ -14,7 +14,7 @@ from scipy.optimize import brentq
 from malta.machines.tubular.experiments.strokes import delayed_stroke
 from malta.margins.loops import machine_loop
 from malta.margins.plants import of_plant
-from malta.margins.recovery import PLACES, recovery
+from malta.margins.recovery import PLACES, Deviation, recovery
 from malta.margins.robust import robust_margin
 from malta.margins.stages import compensators
 from malta.margins.verify import Margins
@@ -130,10 +130,11 @@ def slowest_radial(e: Evidence) -> float:
     return float((np.log(values[part]) / e.controller.sample_time).real.max())
 
 
-def axial_stiffness(e: Evidence) -> float:
-    """Thrust of the feedback per axial position, N/m."""
+def axial_deviation(e: Evidence) -> Deviation:
+    """What a constant 1 N along z from outside does to z: the sampled loop under its loads, at the operating point."""
     plant = e.model.plant
-    return float(e.controller.K[plant.thrust_input, plant.stroke_state])
+    (pushed,) = recovery(plant, e.controller, {"axial": {"F_z": 1.0}})
+    return pushed.outputs[plant.stroke_output]
 
 
 def current_loop_margin(e: Evidence) -> tuple[float, float]:
@@ -196,7 +197,6 @@ def load_deviation(name: str, after: float | None, e: Evidence) -> float:
 LOADS: dict[str, dict[str, Callable[[Any], float]]] = {
     "centre of gravity": {"F_x": lambda _: 1.0},
     "bearing": {"F_x": lambda _: 1.0, "T_y": lambda par: par.l_B},
-    "thrust": {"F_z": lambda _: 1.0},
 }
 
 
