@@ -231,11 +231,11 @@ def test_each_parameter_alone(name: str) -> None:
                 assert margin.witness is not None
                 beyond = np.r_[beyond, margin.witness["z"]]
                 assert instability(there, law, beyond)[0] > 0
-    payload = chain_of(name).payload
-    assert payload is not None
-    assert payload.lower is not None
-    assert instability(system, law, system.nominal + np.array([payload.lower, 0, 0, 0]))[0] < 0
-    assert payload.lower / 0.072 == pytest.approx(chain_of(name).tolerance["m"][1].lower, rel=1e-3)
+    heavier = chain_of(name).mass
+    assert heavier is not None
+    assert heavier.lower is not None
+    assert instability(system, law, system.nominal + np.array([heavier.lower, 0, 0, 0]))[0] < 0
+    assert heavier.lower / 0.072 == pytest.approx(chain_of(name).tolerance["m"][1].lower, rel=1e-3)
 
 
 def test_force_constants_that_the_controller_does_not_know() -> None:

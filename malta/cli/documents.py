@@ -72,7 +72,7 @@ def robustness_document(
             name: {"down": _margin_document(down), "up": _margin_document(up)}
             for name, (down, up) in robustness.tolerance.items()
         },
-        "payload": None if robustness.payload is None else _margin_document(robustness.payload),
+        "mass_margin": None if robustness.mass is None else _margin_document(robustness.mass),
         "places": [
             {
                 "position": place.position,

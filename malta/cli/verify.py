@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from malta.margins.verify import Margins
     from malta.model.linearize import LinearModel
     from malta.model.plant import Plant
+    from malta.simulation.payload import Payload
     from malta.synthesis.controller import Controller
 
 
@@ -48,6 +49,7 @@ class Analysis(NamedTuple):
     recovered: Sequence[
         Recovery
     ]  # of each disturbance; none of an unstable loop, or where no load acts from outside
+    payload: Payload | None  # None for an unstable loop, and for a machine without a mass m
 
 
 def verify(
@@ -90,7 +92,8 @@ def verify(
 
     Poles, bandwidths by definition, peak sensitivities with their ISO 14839-3 zones; real parametric margins with
     their proof, from full state feedback to the sampled loop, and over the travel; disk and delay margins, gang of
-    four, tolerance of each parameter; what a constant load of 1 N or 1 N m from outside does.
+    four, tolerance of each parameter; what a constant load of 1 N or 1 N m from outside does; the payload that the
+    forces hold and the mover carries in flight.
 
     The machine is the one in the file, with the changes given by --set, as far as they shape the linear loop (on MALTA
     m, K_A, K_B, l_B, F_c, T_d; windings and DC link do not).
@@ -157,6 +160,7 @@ def _analyse(
     from malta.margins.stages import robustness
     from malta.margins.travel import covers_travel, worst_sensitivities
     from malta.margins.verify import verify as compute_margins
+    from malta.simulation.payload import payload
 
     plant, controller, box, current_loops = loop.plant, loop.controller, loop.box, loop.current_loops
     try:
@@ -170,9 +174,10 @@ def _analyse(
             worst_case = proof and covers_travel(plant, controller, tuple(box), current_loops)
         worst = worst_sensitivities(plant, controller, box, current_loops, time=time) if worst_case else {}
         recovered = recovery(plant, controller) if margins.stable and plant.disturbances else ()
+        carried = payload(plant, controller) if margins.stable and proof else None
     except CheckError as error:
         raise CheckError(f"{loop.gains}: {error}") from error
-    return Analysis(margins, robust, worst, recovered)
+    return Analysis(margins, robust, worst, recovered, carried)
 
 
 def _write_certificate(path: Path, loop: Loop, margin: Margin) -> Path:
@@ -202,7 +207,12 @@ def _document(loop: Loop, analysis: Analysis, files: Sequence[Path]) -> dict[str
     }
     robust = robustness_document(analysis.robustness, loop.box, analysis.worst)
     recovered = [recovery_document(one) for one in analysis.recovered]
-    return design | margins_document(analysis.margins) | {"recovery": recovered, "robust": robust}
+    carried = None if analysis.payload is None else analysis.payload._asdict()
+    return (
+        design
+        | margins_document(analysis.margins)
+        | {"recovery": recovered, "robust": robust, "payload": carried}
+    )
 
 
 def _print_tables(
@@ -232,7 +242,7 @@ def _print_tables(
         report.chain_table(robust),
         report.disk_table(robust, controller.sample_time),
         report.gang_table(robust, loop.plant),
-        report.tolerance_table(robust, loop.box),
+        report.tolerance_table(robust, loop.box, analysis.payload),
         report.places_table(robust, controller.sample_time),
         *([report.worst_case_table(analysis.worst)] if analysis.worst else []),
     ):

@@ -84,7 +84,7 @@ class Robustness:
     gang: Mapping[str, tuple[float, ...]]  # by sensor: largest |S|, |T|, |S P| (m/N), |F S| (N/m)
     # Anywhere in the extent, in multiples of the range:
     tolerance: Mapping[str, tuple[Margin, Margin]]  # each parameter alone, down and up
-    payload: Margin | None  # in kg; None for a machine without a mass m
+    mass: Margin | None  # of the linear loop alone, in kg on top of m; None for a machine without a mass m
     places: tuple[Place, ...]  # along the course; +z and -z count as one place
     extent: Extent = NOWHERE  # the intervals that the proof covers beside the uncertainty
 
@@ -149,7 +149,7 @@ class _Question:
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """The uncertain parameters, and the mass for the payload: one model answers all questions."""
+        """The uncertain parameters, and the mass for its margin: one model answers all questions."""
         own = tuple(self.uncertainty)
         return (*own, *({"m"} & set(units_of(self.plant.parameters)) - set(own)))
 
@@ -234,7 +234,7 @@ def robustness(
     question = _Question(plant, controller, uncertainty, current_loops, time, proof, report)
     links = _links(question)
     travel = question.margin_over(uncertainty, time, bounds) if proof else NOT_PROVEN
-    tolerance, payload = _tolerances(question) if proof else ({}, None)
+    tolerance, mass = _tolerances(question) if proof else ({}, None)
     places, worst = _places(question)
     sensors = [s.name for s in plant.outputs]
     return Robustness(
@@ -244,7 +244,7 @@ def robustness(
         worst.delay if worst else dict.fromkeys(sensors, float("nan")),
         worst.gang if worst else {},
         tolerance,
-        payload,
+        mass,
         places,
         question.extent,
     )
@@ -270,7 +270,7 @@ def _links(q: _Question) -> tuple[Link, ...]:
 
 
 def _tolerances(q: _Question) -> tuple[dict[str, tuple[Margin, Margin]], Margin | None]:
-    """How far each parameter alone may go, down and up; and the payload of a machine with a mass m."""
+    """How far each parameter alone may go, down and up; and the mass margin of a machine with a mass m, kg."""
     time = q.time if q.whole else min(q.time or EACH, EACH)
     tolerance = {}
     for name, share in q.uncertainty.items():

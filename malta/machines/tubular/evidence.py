@@ -56,6 +56,7 @@ class Evidence:
     uncompensated: StrokeFigures  # of the stroke with cogging left out of v0(z)
     braked: float  # m/s, published speed from which the mover is braked into the DC link
     growth: float  # m, thermal growth of the published arm
+    published: Mapping[str, Any]
 
 
 def evidence(spec: Spec, published: Mapping[str, Any], progress: Progress | None = None) -> Evidence:
@@ -76,6 +77,7 @@ def evidence(spec: Spec, published: Mapping[str, Any], progress: Progress | None
         stroke_figures(slow),
         published_value(published, "dc_link.speed"),
         published_value(published, "thermal.length") * published_value(published, "thermal.strain"),
+        published,
     )
 
 
@@ -171,6 +173,21 @@ def carried_weight(e: Evidence) -> float:
     """Sum of the vertical bearing forces at the end of the stroke, N."""
     v = e.experiments["stroke"].run.v[-1]
     return float(v[1] + v[3])
+
+
+def precise_payload(e: Evidence) -> float:
+    """The largest payload, kg, with which the stroke keeps the bounds of Figs 12 and 13; 0: none of those tried."""
+    bounds = {
+        "stroke: axial error": published_value(e.published, "figure_12.axial_error"),
+        "stroke: radial deviation": published_value(e.published, "figure_13.radial_deviation"),
+    }
+    kept = [
+        case.run.scenario.changes[0][1]["m"] - case.run.plant.mass
+        for case in e.experiments["payload"].cases
+        if case.run.verdict.completed
+        and all(merit.value <= bounds.get(merit.label, math.inf) for merit in case.merits)
+    ]
+    return max(kept, default=0.0)
 
 
 def true_radial(e: Evidence) -> float:

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from malta.margins.robust import Margin
     from malta.margins.stages import Robustness
     from malta.model.plant import Plant
+    from malta.simulation.payload import Payload
 
 
 def chain_table(found: Robustness) -> Table:
@@ -148,8 +149,13 @@ def _course_text(extent: Extent) -> str:
     return "travel" if extent.stroke else extent.course
 
 
-def tolerance_table(found: Robustness, uncertainty: Mapping[str, float]) -> Table:
-    """The proven range of each parameter alone, and its share in the margin of all together."""
+def tolerance_table(
+    found: Robustness, uncertainty: Mapping[str, float], payload: Payload | None = None
+) -> Table:
+    """The proven range of each parameter alone, and its share in the margin of all together.
+
+    The mass margin is that of the linear loop; the payload below it is bounded by limits of forces and by flight.
+    """
     anywhere = ["anywhere in the travel"] if found.extent.stroke else []
     anywhere += [f"for {found.extent.values}"] if found.extent.over else []
     where = " and ".join(anywhere) if is_of_whole_travel(found.travel) else "in its middle and at its end"
@@ -164,10 +170,18 @@ def tolerance_table(found: Robustness, uncertainty: Mapping[str, float]) -> Tabl
             change = "nothing proven" if t is None else f"{100 * sign * t * uncertainty[name]:+.1f} %"
             cells.append(f"{change} and further" if t is not None and margin.exhausted else change)
         add_row(table, name, *cells, f"{100 * shares.get(name, 0):.0f} %")
-    if found.payload is not None:
-        t = found.payload.lower
-        more = " and more" if found.payload.exhausted else ""
-        add_row(table, "payload", "", "nothing proven" if t is None else f"{t:.3g} kg{more}", "")
+    table.columns[0].no_wrap = True
+    if found.mass is not None:
+        t = found.mass.lower
+        more = " and more" if found.mass.exhausted else ""
+        shown = "nothing proven" if t is None else f"{t:.3g} kg{more}"
+        add_row(table, "mass margin, linear loop", "", shown, "")
+    if payload is not None:
+        held = "any" if math.isinf(payload.held) else f"{payload.held:.2g} kg"
+        add_row(table, "payload held at rest", "", held, "")
+        if not math.isnan(payload.carried):
+            dropped = "" if math.isinf(payload.dropped) else f", not {payload.dropped:.2g}"
+            add_row(table, "payload in flight", "", f"{payload.carried:.2g} kg{dropped}", "")
     return table
 
 

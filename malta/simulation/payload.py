@@ -1,0 +1,92 @@
+"""The payload of a machine, bounded by statics and by flight.
+
+    statics   at rest the commanded forces stay within their limits, anywhere in the travel
+    flight    the machine's experiment `payload` ends without touchdown: the mass is picked up and moved
+
+The mass margin of the linear loop (margins/stages.py) knows no limits of forces and no clearances, and is far larger.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from scipy.optimize import brentq
+
+from malta.model.parameters import units_of
+from malta.model.plant import trim
+from malta.simulation.catalogue import experiment
+from malta.simulation.experiments import setting
+
+if TYPE_CHECKING:
+    from malta.model.plant import Plant
+    from malta.synthesis.controller import Controller
+
+EXPERIMENT = "payload"
+PLACES = (-1.0, 0.0, 1.0)  # of the travel
+HEAVIEST = 1e6  # kg; what holds that is not limited by its forces
+STEP = 0.02  # of a mass: how finely the flight is bisected
+
+
+class Payload(NamedTuple):
+    """How much a machine carries beside its mover, kg."""
+
+    held: float  # by the forces at rest; inf: its weight loads no input
+    carried: float  # the largest that was flown; NaN: the machine has no experiment of it
+    dropped: float  # the smallest that was dropped; inf: none
+
+
+def payload(plant: Plant, controller: Controller) -> Payload | None:
+    """Bound the payload of a machine; None for a machine without a mass m.
+
+    >>> import malta
+    >>> controller = malta.gains.read("design/gains/calibrated.json")
+    >>> found = payload(malta.plant_of(controller.parameters), controller)
+    >>> f"forces hold {found.held:.1f} kg, the mover carries {found.carried:.1f} kg"
+    'forces hold 3.6 kg, the mover carries 0.7 kg'
+    """
+    if "m" not in units_of(plant.parameters):
+        return None
+    held = held_payload(plant)
+    return Payload(held, *flown_payload(plant, controller, held))
+
+
+def held_payload(plant: Plant) -> float:
+    """Find the mass, kg, at which a force reaches its limit at rest in the middle or at an end of the travel."""
+    par: Any = plant.parameters
+    limits = np.array(plant.actuator.force_limit)
+    places = [{plant.stroke: share * plant.travel} for share in PLACES] if plant.has_stroke else [{}]
+
+    def used(extra: float) -> float:
+        heavier = plant.variant(replace(par, m=par.m + extra))
+        return max(float(np.abs(trim(heavier, **at).u / limits).max()) for at in places)
+
+    if used(0.0) >= 1:
+        return 0.0
+    high = par.m
+    while used(high) < 1:
+        high *= 2
+        if high > HEAVIEST:
+            return math.inf
+    return float(brentq(lambda extra: used(extra) - 1, 0.0, high, xtol=1e-9))
+
+
+def flown_payload(plant: Plant, controller: Controller, most: float) -> tuple[float, float]:
+    """Find the largest mass, kg, up to `most` that the experiment `payload` carries, and the smallest that it drops."""
+    if EXPERIMENT not in setting(plant, "EXPERIMENTS", {}):
+        return math.nan, math.inf
+
+    def carries(mass: float) -> bool:
+        return experiment(EXPERIMENT, plant, controller, masses=(mass,)).cases[0].run.verdict.completed
+
+    most = most if math.isfinite(most) else HEAVIEST
+    low, high = 0.0, math.inf
+    if carries(most):
+        return most, high
+    high = most
+    while high - low > STEP * high and high > 1e-6 * most:
+        middle = (low + high) / 2
+        low, high = (middle, high) if carries(middle) else (low, middle)
+    return low, high
