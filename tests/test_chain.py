@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import matplotlib.text
 import numpy as np
 import pytest
-from conftest import Run, numbers
+from conftest import ROOT, Run, numbers
 from matplotlib.patches import Rectangle
 from typer.testing import CliRunner
 
@@ -19,9 +19,15 @@ import malta
 from malta import gains
 from malta.cli.main import app, main
 from malta.errors import InputError
-from malta.margins.classical import _balanced_norm, classical_margins, delay_margins, disk_margin
+from malta.margins.classical import (
+    _balanced_norm,
+    classical_margins,
+    delay_margins,
+    disk_margin,
+    is_stable,
+)
 from malta.margins.gain import Gain
-from malta.margins.loops import machine_law
+from malta.margins.loops import loaded_system, machine_law
 from malta.margins.responses import responses
 from malta.margins.robust import robust_margin
 from malta.margins.stages import SAMPLED, Robustness, compensators, robustness
@@ -238,6 +244,42 @@ def test_each_parameter_alone(name: str) -> None:
     assert heavier.lower / 0.072 == pytest.approx(chain_of(name).tolerance["m"][1].lower, rel=1e-3)
 
 
+SHIPPED = sorted(path.stem for path in (ROOT / "design" / "gains").glob("*.json"))
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=[] if name in ("table2", "halbach") else [pytest.mark.slow])
+        for name in SHIPPED
+    ],
+)
+def test_the_last_stage_is_the_machine_of_verify(name: str) -> None:
+    """With its loads, for every shipped design: the figure of the chain and the table beside it show one number."""
+    c = gains.read(f"design/gains/{name}.json")
+    plant = plant_of(c.parameters)
+    margins = malta.verify(malta.linearize(plant, plant.point(c.operating_point[0])), c)
+    largest = max(v for k, v in margins.peak_sensitivity.items() if k != "sigma_max")
+    found = robustness(plant, c, malta.read_design(f"design/{name}.toml").uncertainty, proof=False)
+    assert found.chain[-1].peak == pytest.approx(largest, rel=1e-6)
+    assert [link.loaded for link in found.chain] == [False] * (len(found.chain) - 1) + [True]
+    assert found.places[0].peak == pytest.approx(largest, rel=1e-6)  # the middle
+
+
+def test_cogging_that_is_stiffer_than_the_axial_loop_shows() -> None:
+    """table2: |S| of z is 1.3 without its loads and 36 with them; the places where v0(z) misfits are unstable."""
+    c = gains.read("design/gains/table2.json")
+    plant = plant_of(c.parameters)
+    found = robustness(plant, c, BOX, proof=False)
+    by_name = {link.name: link.peak for link in found.chain}
+    assert by_name["+ current loops"] == pytest.approx(6.93, abs=0.01)
+    assert by_name[SAMPLED] == pytest.approx(36.0, abs=0.1)
+    assert [math.isnan(place.peak) for place in found.places] == [False, False, True, True]
+    quiet = plant_of(replace(c.parameters, F_c=0.0))
+    smooth = replace(c, feedforward=replace(c.feedforward, v0=c.feedforward.v0 * [1, 1, 1, 1, 0]))
+    assert robustness(quiet, smooth, BOX, proof=False).chain[-1].peak == pytest.approx(6.93, abs=0.02)
+
+
 def test_force_constants_that_the_controller_does_not_know() -> None:
     """--set K_B: the last stage peaks as verify's machine, which has the slope of its loads too."""
     c = gains.read("design/gains/calibrated.json")
@@ -423,11 +465,17 @@ def test_bad_input_gets_one_sentence(
 
 @pytest.mark.parametrize("name", CHAINED)
 def test_margins_without_parameters_are_the_smallest_along_the_travel(name: str) -> None:
-    places = [
-        classical_margins(*_sampled(name, z), sensors=SENSORS)
+    c = gains.read(f"design/gains/{name}.json")
+    loops = [
+        loaded_system(plant_of(c.parameters), c, {"z": z})
         for z in (-15e-3, -10e-3, -5e-3, 0.0, 5e-3, 10e-3, 15e-3)
     ]
     found = chain_of(name)
+    if name == "table2":  # unstable at 10 and 15 mm under its cogging
+        assert [is_stable(*loop) for loop in loops[3:]] == [True, True, False, False]
+        assert (found.disks, found.gang) == ((), {})
+        return
+    places = [classical_margins(*loop, sensors=SENSORS) for loop in loops]
     assert found.delay == pytest.approx({key: min(p.delay[key] for p in places) for key in SENSORS})
     for k, disk in enumerate(found.disks):
         assert disk.size == pytest.approx(min(p.disks[k].size for p in places))

@@ -48,7 +48,7 @@ def robustness_document(
     document = {
         "uncertainty": dict(box),
         "chain": [
-            {"stage": link.name, "peak_sensitivity": link.peak, "at": link.broken_at}
+            {"stage": link.name, "peak_sensitivity": link.peak, "at": link.broken_at, "loads": link.loaded}
             | _margin_document(link.margin)
             for link in robustness.chain
         ],

@@ -16,15 +16,23 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING, Literal, get_args
 
+import casadi as ca
 import numpy as np
 
 from malta.errors import InputError
 from malta.margins.plants import of_plant
-from malta.margins.uncertain import Compensator, UncertainSystem, held_gain, is_commutated, sampled_law
+from malta.margins.uncertain import (
+    Compensator,
+    ReadingUse,
+    UncertainSystem,
+    held_gain,
+    is_commutated,
+    sampled_law,
+)
 from malta.model.data import plant_of
 from malta.model.linearize import LinearModel, linearize
 from malta.model.plant import position_at, position_in, trim
-from malta.synthesis.controller import Controller, LinearLaw, linear_law, with_readings
+from malta.synthesis.controller import Controller, LinearLaw, linear_law, with_readings, with_slope
 from malta.synthesis.riccati import add_lags, delay_inputs, sample
 
 if TYPE_CHECKING:
@@ -33,6 +41,7 @@ if TYPE_CHECKING:
     from malta.model.plant import ComplexArray, FloatArray, Plant
 
 CurrentLoops = Literal["lag", "pi"]
+ROUNDING = 1e-9  # of the largest entry
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,12 +104,7 @@ def loop(
     Ad, Bd = delay_inputs(*sample(A, B, controller.sample_time), delay)
     Cd = np.hstack([C, np.zeros((len(C), len(Ad) - C.shape[1]))])
     if feedforward:
-        m, plant = len(controller.forces), model.plant
-        slope = np.zeros((m, len(C)))
-        if plant.has_stroke:
-            position = float(model.operating_point.x[plant.stroke_state])
-            slope[:, plant.stroke_output] = controller.feedforward.slope(position)
-        law = law._replace(B_y=law.B_y + law.B_r[:, -m:] @ slope, D_y=law.D_y + law.D_r[:, -m:] @ slope)
+        law = with_slope(law, feedforward_slope(model, controller))
     if model.E.any():
         law = with_readings(law)
     return Loop(Ad, Bd, Cd, law, controller.sample_time)
@@ -131,13 +135,12 @@ def machine_law(
     controller: Controller,
     current_loops: CurrentLoops = "lag",
     *,
-    held: FloatArray | None = None,
-    handed: bool = False,
+    use: ReadingUse | None = None,
 ) -> Compensator:
     """The control law with the machine's hold, delay and current loops.
 
     current_loops : "lag", first-order lags at the crossover, or "pi", the PI controllers on the windings
-    held, handed : as in sampled_law
+    use : of the reading besides the law
 
     Raises InputError for other current loops, and for PI loops that run faster than the control law.
     """
@@ -146,10 +149,10 @@ def machine_law(
     a = plant.actuator
     delay = a.delay(controller.sample_time)
     if current_loops == "lag" or controller.current_loop is None:
-        return sampled_law(controller, delay, a.crossover, held=held, handed=handed)
+        return sampled_law(controller, delay, a.crossover, use=use)
     if plant.windings is None:
         raise InputError("verify", "current_loops", "pi", f"lag: those of a {plant.name} run much faster")
-    return sampled_law(controller, delay, a.R / a.L, controller.current_loop, a.R)
+    return sampled_law(controller, delay, a.R / a.L, controller.current_loop, a.R, use=use)
 
 
 def machine_system(
@@ -166,4 +169,35 @@ def machine_system(
     H = held_gain(believed, position_in(believed, believed.at(**at).x))
     system = of_plant(plant, names, at=at, believed=believed, held=H)
     handed = system.matrices.size2_out(1) > len(H)
-    return system, machine_law(plant, controller, current_loops, held=H, handed=handed)
+    return system, machine_law(plant, controller, current_loops, use=ReadingUse(H, handed))
+
+
+def loaded_system(
+    plant: Plant, controller: Controller, at: Mapping[str, float], current_loops: CurrentLoops = "lag"
+) -> tuple[UncertainSystem, Compensator]:
+    """The machine under its loads against v0(z), and its law: `machine_loop` in the form of `machine_system`.
+
+    at : the states of the position, SI. The system has no uncertain parameters.
+
+    Raises CheckError when no input holds the machine there.
+    """
+    model = commanded_model(linearize(plant, trim(plant, **at)), controller)
+    A, B, C, use = model.A, model.B, model.C, ReadingUse(slope=feedforward_slope(model, controller))
+    if model.E.any():
+        H = np.linalg.lstsq(B, model.E, rcond=None)[0]
+        A, left = A - model.E @ C, model.E - B @ H
+        handed = bool(np.abs(left).max() > ROUNDING * np.abs(model.E).max())
+        B, use = np.hstack([B, left]) if handed else B, use._replace(held=H, handed=handed)
+    none = ca.SX.sym("p", 0)
+    matrices = ca.Function("matrices", [none], [ca.SX(ca.DM(M)) for M in (A, B, C)])
+    return UncertainSystem((), np.zeros(0), matrices), machine_law(plant, controller, current_loops, use=use)
+
+
+def feedforward_slope(model: LinearModel, controller: Controller) -> FloatArray:
+    """dv0/dy at a model's position, m x p: v0(z) follows the reading of the stroke."""
+    plant = model.plant
+    slope = np.zeros((len(controller.forces), len(model.C)))
+    if plant.has_stroke:
+        position = float(model.operating_point.x[plant.stroke_state])
+        slope[:, plant.stroke_output] = controller.feedforward.slope(position)
+    return slope

@@ -7,7 +7,9 @@ A PID has the last stage alone. A design without weights on integrals has no LQI
 The first five stages are continuous; they are synthesized from the cost and the noise in the gain file. Each stage
 has its parametric margin (robust.py) and its peak sensitivity: at the forces for state feedback, where an LQR
 guarantees at most 1, at the sensors for output feedback, as ISO 14839-3 measures it.
-All stages use the design model at a position, without the loads; the last stage of verify.py includes these.
+The parametric margins of all stages are of the design model at a position, without the loads, which v0(z) cancels. The
+peak sensitivity of the last stage, and the disk margins, delay margins and the gang of four, are of the machine's loop
+under its loads against v0(z), as in verify.py: a cogging that is stiffer than the axial loop shows there.
 """
 
 from __future__ import annotations
@@ -31,7 +33,7 @@ from malta.margins.travel import (
     PLACES,
     covers_travel,
     depends_on_course,
-    loop_at,
+    loaded_loop_at,
     place_margin,
     places_along,
     travel_margin,
@@ -56,6 +58,7 @@ class Link:
     margin: Margin
     peak: float  # largest |S_ii|; NaN where unstable
     broken_at: Literal["forces", "sensors"]  # where S is taken
+    loaded: bool = False  # whether S is that of the machine under its loads
 
 
 @dataclass(frozen=True)
@@ -174,8 +177,8 @@ class _Question:
     def _moves(self) -> bool:
         return depends_on_course(self.plant, self.controller, self.names, self.current_loops)
 
-    def loop_at(self, position: float) -> tuple[UncertainSystem, Compensator]:
-        return loop_at(self.plant, self.controller, self.names, position, self.current_loops)
+    def loaded_loop_at(self, position: float) -> tuple[UncertainSystem, Compensator]:
+        return loaded_loop_at(self.plant, self.controller, self.names, position, self.current_loops)
 
     def margin_at(self, position: float) -> Margin:
         """The margin at a position along the course; computed once if the loop does not depend on the position."""
@@ -258,13 +261,13 @@ def _links(q: _Question) -> tuple[Link, ...]:
     for name, (law, states) in compensators(q.plant, q.controller, q.current_loops).items():
         if name == SAMPLED:
             position = own_position(q.plant, q.extent, at)
-            system, law = q.loop_at(position)
+            system, law = q.loaded_loop_at(position)
             margin = q.margin_at(position) if q.proof else NOT_PROVEN
         else:
             system = of_plant(q.plant, list(q.uncertainty), states=states, at=at, believed=believed)
             margin = robust_margin(system, law, q.uncertainty, time=q.time) if q.proof else NOT_PROVEN
         where: Literal["forces", "sensors"] = "forces" if states else "sensors"
-        links.append(Link(name, margin, peak_sensitivity(system, law, where), where))
+        links.append(Link(name, margin, peak_sensitivity(system, law, where), where, loaded=name == SAMPLED))
         q.report()
     return tuple(links)
 
@@ -291,7 +294,7 @@ def _places(q: _Question) -> tuple[tuple[Place, ...], Classical | None]:
     for positions in places_along(q.plant, q.controller, q.names, q.current_loops):
         proven_at = positions if q.whole else positions[:1]  # else a place takes as long as the whole travel
         margin = _smallest([q.margin_at(z) for z in proven_at]) if q.proof else NOT_PROVEN
-        loops = [q.loop_at(z) for z in positions]
+        loops = [q.loaded_loop_at(z) for z in positions]
         peak = float(np.max([peak_sensitivity(*loop, "sensors") for loop in loops]))
         sides = [classical_margins(*loop, sensors) if is_stable(*loop) else None for loop in loops]
         classical += sides

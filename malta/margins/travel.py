@@ -15,7 +15,7 @@ from malta.margins.box import Box, box_of
 from malta.margins.expressions import NotAnalytic
 from malta.margins.extent import extent_of, machine_at, positions_of
 from malta.margins.held_currents import held_machine
-from malta.margins.loops import CurrentLoops, machine_law, machine_system
+from malta.margins.loops import CurrentLoops, loaded_system, machine_law, machine_system
 from malta.margins.plants import LONGEST
 from malta.margins.problem import OfSeveral
 from malta.margins.robust import (
@@ -247,3 +247,18 @@ def loop_at(
     """The machine's loop at a position along its course (SI); equal arguments return the same records."""
     there, at = machine_at(plant, extent_of(plant, names).course, position)
     return machine_system(there, controller, names, at, current_loops)
+
+
+def loaded_loop_at(
+    plant: Plant,
+    controller: Controller,
+    names: tuple[str, ...],
+    position: float,
+    current_loops: CurrentLoops = "lag",
+) -> tuple[UncertainSystem, Compensator]:
+    """The machine's loop under its loads at a position along its course (SI), without uncertain parameters.
+
+    names : the uncertain parameters, which are no course
+    """
+    there, at = machine_at(plant, extent_of(plant, names).course, position)
+    return loaded_system(there, controller, at, current_loops)

@@ -25,6 +25,7 @@ from malta.synthesis.controller import (
     LinearLaw,
     linear_law,
     with_readings,
+    with_slope,
 )
 from malta.synthesis.riccati import add_lags, delay_inputs, sample
 
@@ -125,6 +126,14 @@ def lower_limit(declared: Mapping[str, Any]) -> float:
     return max(found, default=-math.inf)
 
 
+class ReadingUse(NamedTuple):
+    """What a reading y does besides entering the control law."""
+
+    held: FloatArray | None = None  # the gain H of held currents: v + H y acts
+    handed: bool = False  # whether y is a further input of the system
+    slope: FloatArray | None = None  # dv0/dy, m x p: v0 follows the reading; None: it stands still
+
+
 def sampled_law(
     controller: Controller,
     delay: int,
@@ -132,17 +141,17 @@ def sampled_law(
     loop: CurrentLoop | None = None,
     R: float = 1.0,
     *,
-    held: FloatArray | None = None,
-    handed: bool = False,
+    use: ReadingUse | None = None,
 ) -> Compensator:
     """The control law of a gain file as the machine runs it: hold, `delay` samples, current loops.
 
     lag : rad/s, crossover of the current loops, as first-order lags; with `loop`, the R / L of the windings
     loop : PI controllers of the currents, for windings of resistance R (ohm), sampled with the control law
-    held : the gain H of held currents: v + H y acts
-    handed : whether the reading y is a further input of the system
     """
     law, T = linear_law(controller), controller.sample_time
+    held, handed, slope = use or ReadingUse()
+    if slope is not None:
+        law = with_slope(law, slope)
     n, m = len(controller.states), len(controller.forces)
     half = plant_of(controller.parameters).coordinates
     p = len(controller.measurements) if controller.integrating else 0

@@ -386,6 +386,12 @@ def _blocks(args: Mapping[str, Any], out: Mapping[str, Any], *, integrating: boo
     return [ca.jacobian(of, by) for of in (s_next, out["v"]) for by in (s, args["y"], r)]
 
 
+def with_slope(law: LinearLaw, slope: FloatArray) -> LinearLaw:
+    """The same law with forces v0 that follow the reading: slope is dv0/dy, m x p."""
+    columns = slice(-len(slope), None)  # of v0 in r
+    return law._replace(B_y=law.B_y + law.B_r[:, columns] @ slope, D_y=law.D_y + law.D_r[:, columns] @ slope)
+
+
 def with_readings(law: LinearLaw) -> LinearLaw:
     """The same law with the reading itself as further outputs: what currents are commutated for."""
     p, n, r = law.B_y.shape[1], len(law.A), law.D_r.shape[1]

@@ -25,6 +25,9 @@ if TYPE_CHECKING:
     from malta.margins.stages import Robustness
 
 
+CROWDED = 12.0  # peak |S| up to which the names of the zones have room
+
+
 def chain_figure(
     found: Robustness,
     name: str,
@@ -67,7 +70,7 @@ def _draw_stages(left: Axes, right: Axes, found: Robustness) -> None:
     extent = found.extent
     if extent.course:
         everything = "all of the travel" if extent.stroke else f"every {extent.course}"
-        rows.append((everything, found.travel, max(place.peak for place in found.places)))
+        rows.append((everything, found.travel, float(np.max([place.peak for place in found.places]))))
     most = max([_percent(m.lower) for _, m, _ in rows if m.lower is not None] + [100.0])
     for k, (_, margin, peak) in enumerate(rows):
         proven = _percent(margin.lower)
@@ -83,19 +86,23 @@ def _draw_stages(left: Axes, right: Axes, found: Robustness) -> None:
         )
         if not math.isnan(peak):
             right.barh(k, peak, height=0.6, color="#c9c9c9" if k < len(found.chain) - 1 else "#5a5a5a")
-            right.text(peak + 0.08, k, f"{peak:.2f}", va="center", **NOTE)
+        stable = not math.isnan(peak)
+        right.text(
+            peak + 0.08 if stable else 0.08, k, f"{peak:.2f}" if stable else "unstable", va="center", **NOTE
+        )
     left.set_xlim(0, 1.2 * most)
     left.set_yticks(range(len(rows)), [row[0] for row in rows])
     left.plot([], [], color="#c1440e", linewidth=1.6, label="witness: unstable there")
     left.bar(0, 0, color="#5a5a5a", label="proven, the machine's loop")
     _legend(left)
-    left.set_xlabel("parametric margin [% of the box]")
+    left.set_xlabel("margin without loads [% of the box]")
     right.set_yticks(range(len(rows)), [""] * len(rows))
     right.set_xlim(0, max(5.6, 1.15 * max(link.peak for link in found.chain if not math.isnan(link.peak))))
     for (limit, zone), (_, worse) in pairwise(ZONES):
         right.axvline(limit, **BOUND)
-        right.text(limit, -0.75, f"{zone} | {worse}", ha="center", va="bottom", **NOTE)
-    right.set_xlabel("peak sensitivity |S|: zones of ISO 14839-3")
+        if right.get_xlim()[1] < CROWDED:
+            right.text(limit, -0.75, f"{zone} | {worse}", ha="center", va="bottom", **NOTE)
+    right.set_xlabel("peak |S|, dark: under its loads; zones of ISO 14839-3", fontsize=9)
     for axes in (left, right):
         draw_grid(axes)
         axes.set_ylim(len(rows) - 0.4, -0.8)
@@ -123,6 +130,13 @@ def _draw_along_course(left: Axes, right: Axes, found: Robustness, bound: float)
     left.set_ylim(0, 1.25 * max([_percent(p.margin.lower) for p in places] + [1.0]))
     left.set_ylabel("margin [%]")
     right.plot(both, mirrored([p.peak for p in places]), marker="o", markersize=3.5, **STYLES[0])
+    right.set_xlim(left.get_xlim())
+    for place, peak in zip(both, mirrored([p.peak for p in places]), strict=True):
+        if math.isnan(peak):
+            right.annotate(
+                "unstable", (float(place), 0.5), xycoords=("data", "axes fraction"), rotation=90, ha="center",
+                va="center", **NOTE,
+            )  # fmt: skip
     peaks = [p.peak for p in places if not math.isnan(p.peak)] + ([bound] if math.isfinite(bound) else [])
     limit, zone = ZONES[0]
     right.set_ylim(0, max(limit + 0.5, 1.2 * max([*peaks, 1.0])))

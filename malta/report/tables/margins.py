@@ -27,7 +27,10 @@ if TYPE_CHECKING:
 
 
 def chain_table(found: Robustness) -> Table:
-    """Parametric margin and peak sensitivity of each stage, from the ideal loop to the machine's."""
+    """Parametric margin and peak sensitivity of each stage, from the ideal loop to the machine's.
+
+    Margins are without the loads; |S| of the last stage is that of the machine under its loads.
+    """
     table = new_table(
         "Where the margin goes: multiples of the uncertainty that no parameter set may exceed",
         "stage", "proven", "lost at", "rad/s", "first to give", "peak |S|", "of",
@@ -42,7 +45,7 @@ def chain_table(found: Robustness) -> Table:
             *_margin_cells(link.margin),
             _limiting_parameters(link.margin),
             peak,
-            link.broken_at,
+            f"{link.broken_at}, loaded" if link.loaded else link.broken_at,
         )
     if found.extent.intervals:
         add_row(
@@ -187,7 +190,7 @@ def tolerance_table(
 
 def worst_case_table(gains: Mapping[str, Gain]) -> Table:
     """The largest |S| of each sensor over all that the margin covers: found, and proven upper bound."""
-    title = "Worst-case peak |S| over the uncertainty and all that the margin covers"
+    title = "Worst-case peak |S| over the uncertainty and all that the margin covers, without loads"
     table = new_table(title, "sensor", "found", "at rad/s", "proven below", "zone")
     for name, gain in gains.items():
         high = "nothing proven" if gain.upper is None else f"{gain.upper:.3f}"
@@ -207,6 +210,7 @@ def places_table(found: Robustness, Ts: float) -> Table:
         title = "Along the travel, either way"
     else:
         title = "In the middle of the travel and at its ends (margin: at the positive one)"
+    title += ": margins without the loads, the rest under them"
     table = new_table(
         title,
         f"at [{'mm' if extent.stroke else extent.unit}]" if extent.course else "at",
