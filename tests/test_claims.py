@@ -19,6 +19,7 @@ from scipy.linalg import expm
 import malta
 from malta import references
 from malta.machines.tubular import claims as tubular
+from malta.machines.tubular import evidence as tubular_evidence
 from malta.machines.tubular.evidence import EXPERIMENT_NAMES, Evidence, is_solved_for_ratio
 from malta.margins.loops import machine_loop
 from malta.model.data import plant_of
@@ -95,6 +96,7 @@ def found(designs: dict[str, Design], published: dict[str, Any]) -> Found:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(tubular, "evidence", kept)
+        patch.setattr(tubular_evidence, "MACHINES", 256)
         ledger = claims.ledger([designs[name].spec for name in NAMES], published, shares.append)
     return Found(ledger, tuple(made), tuple(shares), {})
 

@@ -630,7 +630,8 @@ def test_ctrl_c_leaves_what_was_computed(run: Run, tmp_path: Path, monkeypatch: 
     assert "measured x1, std" in out
 
 
-def test_claims_prints_the_ledger(run: Run) -> None:
+def test_claims_prints_the_ledger(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("malta.machines.tubular.evidence.MACHINES", 64)
     code, out, err = run("claims", "design/table2.toml")
     assert (code, err) == (0, "")
     assert max(map(len, out.splitlines())) <= WIDTH
@@ -642,7 +643,9 @@ def test_claims_prints_the_ledger(run: Run) -> None:
     assert (code, err) == (0, "")
     (ledger,) = json.loads(out)
     assert (ledger["machine"], ledger["designs"]) == ("tubular", ["table2"])
-    assert ledger["claims"][0]["ours"] == ["±218.92"]
+    ours = {claim["subject"]: claim["ours"] for claim in ledger["claims"]}
+    assert ours["poles of x, y [rad/s]"] == ["±218.92"]
+    assert next(iter(ours)) == "machines ±20 %: stroke within the published bounds [%]"
     code, out, err = run("claims", "design/table2.toml", "--markdown")
     heading, empty, header = out.splitlines()[:3]
     assert (heading, empty) == (f"### tubular, {ledger['source']}", "")

@@ -6,8 +6,11 @@ import re
 
 import pytest
 from conftest import ROOT
+from scipy.stats import binomtest
 
 import malta
+from malta.campaigns.yields import main_yields
+from malta.machines.tubular.claims import SOURCE
 
 pytestmark = pytest.mark.usefixtures("proven_once")
 
@@ -17,6 +20,8 @@ DESIGNS = {
     "halbach": ("halbach_late", "halbach", "halbach_pid"),
     "planar": ("planar", "planar_pid"),
 }
+DRAWN = "machines ±20 %"  # rows that are shares of machines drawn at random
+FEW = 1000  # machines in the fast test
 TIMED = "K(p) and pseudo-inverse"  # rows that are measured on the computer that computes them
 ROUNDING = 1e-9  # figures below it are what floating point leaves
 
@@ -53,7 +58,9 @@ def _is_noisy(machine: str, subject: str) -> bool:
         pytest.param("planar", marks=[pytest.mark.slow, pytest.mark.xdist_group("planar")]),
     ],
 )
-def test_the_table_of_claims_is_computed(machine: str) -> None:
+def test_the_table_of_claims_is_computed(machine: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Yields, of 10 000 machines in the README, are computed of FEW: they lie within the interval of these."""
+    monkeypatch.setattr("malta.machines.tubular.evidence.MACHINES", FEW)
     specs = [malta.read_design(f"design/{name}.toml") for name in DESIGNS[machine]]
     ledger = malta.ledger(specs, malta.published(f"data/{machine}.toml"))
     found, shown = _cells(ledger.markdown()), _shown(ledger.title)
@@ -64,10 +71,37 @@ def test_the_table_of_claims_is_computed(machine: str) -> None:
         if subject.startswith(TIMED):
             continue
         numbers = [[_number(cell) for cell in row[1:-1]] for row in (shown[subject], cells)]
+        if subject.startswith(DRAWN):
+            assert shown[subject][-1] == cells[-1]
+            assert [_is_of_sample(*pair) for pair in zip(*numbers, strict=True)] == [True] * len(numbers[0])
+            continue
         if _is_noisy(machine, subject) and None not in numbers[0]:
             assert numbers[0] == pytest.approx(numbers[1], rel=0.2, abs=0.02)
         elif not all(n is not None and abs(n) < ROUNDING for row in numbers for n in row):
             assert shown[subject][1:] == cells[1:]
+
+
+def _is_of_sample(shown: float | None, found: float | None) -> bool:
+    """Whether a share in percent lies in the interval, 99.9 %, of a share of FEW machines; no share, no sample."""
+    if shown is None or found is None:
+        return shown is found
+    low, high = binomtest(round(found / 100 * FEW), FEW).proportion_ci(0.999, method="exact")
+    return bool(low - 1e-3 <= shown / 100 <= high + 1e-3)
+
+
+@pytest.mark.slow
+def test_yields_are_those_of_ten_thousand_machines() -> None:
+    """All of them; the last digits of the arithmetic decide for machines at a bound."""
+    shown = _shown(f"tubular, {SOURCE}")
+    published = malta.published("data/tubular.toml")
+    for k, name in enumerate(DESIGNS["tubular"]):
+        controller = malta.gains.read(f"design/gains/{name}.json")
+        found = main_yields(controller, malta.read_design(f"design/{name}.toml"), published)
+        within = shown[f"{DRAWN}: stroke within the published bounds [%]"][1 + k]
+        assert found.published is not None
+        assert float(within) == pytest.approx(100 * found.published.share, abs=0.2)
+        completed = shown[f"{DRAWN}: stroke without touchdown [%]"][1 + k]
+        assert float(completed) == pytest.approx(100 * found.completed.share, abs=0.2)
 
 
 def _number(cell: str) -> float | None:

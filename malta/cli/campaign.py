@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, cast
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, cast
 
 import typer
 
 from malta.cli.assignments import add_own_options, read_sensor_errors, read_shares, scenario_options
 from malta.cli.documents import campaign_document
-from malta.cli.inputs import change_machine, print_scenarios, read_controller
+from malta.cli.inputs import change_machine, design_of, print_scenarios, read_controller
 from malta.cli.options import (
     SCENARIOS,
     AsJson,
@@ -36,6 +36,7 @@ from malta.cli.output import make_console, print_json, print_note, print_written
 if TYPE_CHECKING:
     from malta.campaigns.plan import Sampler
     from malta.campaigns.result import Campaign
+    from malta.synthesis.spec import Spec
 
 
 def campaign(
@@ -87,6 +88,13 @@ def campaign(
         Path | None,
         typer.Option(help="Folder of blocks and figures. [build/campaigns/, one for each campaign]"),
     ] = None,
+    design: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Design file whose [specification] bounds the runs too. [NAME.toml beside the gain file's folder]",
+        ),
+    ] = None,
     machine: MachineFile = None,
     as_json: AsJson = False,
 ) -> None:
@@ -94,6 +102,9 @@ def campaign(
 
     Every block of runs is kept in the folder. The same command goes on where it was ended, and reads what is done;
     `malta simulate GAINS --replay FOLDER:RUN` shows one of the runs. Whatever the yield is, the exit code is 0.
+
+    Three yields: runs that were completed, those within what the machine's paper prints, and those within what
+    [specification] asks of the same motion.
 
     \b
     Example:  malta campaign design/gains/calibrated.json --samples 10000 --spread 20%
@@ -141,27 +152,33 @@ def campaign(
         case,
         options,
     )
+    spec = design_of(gains, controller, design)
     folder = out or Path("build") / "campaigns" / f"{controller.name}_{scenario}_{plan.identity[:8]}"
     with progress_bar(scenario, quiet=as_json) as progress:
         result = run_campaign(plan, folder, workers=workers, cluster=cluster, progress=progress)
-    _report(gains, result, published, worst, as_json=as_json)
+    _report(gains, result, Bounds(published, spec), worst, as_json=as_json)
 
 
-def _report(
-    gains: Path, campaign: Campaign, published: Mapping[str, Any] | None, worst: int, *, as_json: bool
-) -> None:
+class Bounds(NamedTuple):
+    """What bounds the runs of a campaign."""
+
+    published: Mapping[str, Any] | None
+    spec: Spec | None
+
+
+def _report(gains: Path, campaign: Campaign, bounds: Bounds, worst: int, *, as_json: bool) -> None:
     """Draw and print a campaign and note what went wrong; exit with code 130 after Ctrl-C."""
     from malta.model.data import plant_of
 
     for file in campaign.damaged:
         print_note(f"{file}: a damaged block, flown again")
-    files = _draw(campaign, published)
+    files = _draw(campaign, bounds.published)
     if as_json:
         names = [str(file) for file in files]
         document = {"gains": str(gains), "folder": str(campaign.folder), "files": names}
-        print_json(document | campaign_document(campaign, published, worst))
+        print_json(document | campaign_document(campaign, bounds.published, worst, bounds.spec))
     else:
-        _print_tables(gains, campaign, published, worst, files)
+        _print_tables(gains, campaign, bounds, worst, files)
     plan = campaign.plan
     if "virtual machine" in campaign.engines and not plant_of(plan.controller.parameters).tabulated:
         print_note("no C compiler: simulated on CasADi's virtual machine, some hundred times slower")
@@ -185,7 +202,7 @@ def _draw(campaign: Campaign, published: Mapping[str, Any] | None) -> list[Path]
 def _print_tables(
     gains: Path,
     campaign: Campaign,
-    published: Mapping[str, Any] | None,
+    bounds: Bounds,
     worst: int,
     files: Sequence[Path],
 ) -> None:
@@ -202,7 +219,7 @@ def _print_tables(
     console.print(f"{report.box_text(campaign)}; {plan.sampler}, seed {plan.seed}")
     if not len(campaign.index):
         return
-    console.print(report.campaign_tables(campaign, published, worst))
+    console.print(report.campaign_tables(campaign, bounds.published, worst, bounds.spec))
     if worst:
         console.print(
             f"one of them again: malta simulate {gains} --replay {campaign.folder}:RUN", soft_wrap=True

@@ -10,7 +10,8 @@ import typer
 
 from malta.cli.inputs import design_files
 from malta.cli.options import AsJson
-from malta.cli.output import make_console, print_json, progress_bar
+from malta.cli.output import make_console, print_json, print_written, progress_bar
+from malta.errors import InputError
 
 if TYPE_CHECKING:
     from malta.report.ledger import Ledger
@@ -25,6 +26,13 @@ def claims(
     markdown: Annotated[
         bool, typer.Option("--markdown", help="Print the table as the README holds it.")
     ] = False,
+    update: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Compute the tables of a Markdown file anew, each for the designs that its header names.",
+        ),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Print the ledger: every number that a machine's paper publishes, ours for each design, and a verdict.
@@ -33,8 +41,13 @@ def claims(
 
     \b
     Example:  malta claims design/table2.toml
+              malta claims --update README.md
     """
     from malta.synthesis.design_file import read_design
+
+    if update is not None:
+        _update(update, designs or [], quiet=as_json)
+        return
 
     specs = [read_design(file) for file in design_files("claims", designs, reverse=True, or_shipped=True)]
     if not designs:
@@ -56,13 +69,42 @@ def claims(
 
 def _compute_ledgers(specs: Sequence[Spec], progress: Callable[[float], None] | None) -> list[Ledger]:
     """Compute the ledger of each machine, in the order in which the designs name the machines."""
+    machines = dict.fromkeys(spec.plant.name for spec in specs)
+    return _compute_each([[spec for spec in specs if spec.plant.name == name] for name in machines], progress)
+
+
+def _compute_each(groups: Sequence[Sequence[Spec]], progress: Callable[[float], None] | None) -> list[Ledger]:
+    """Compute the ledger of each group of designs of one machine."""
     from malta.model.published import published
     from malta.report.ledger import ledger
     from malta.simulation.experiments import progress_of_part
 
-    machines = dict.fromkeys(spec.plant.name for spec in specs)
-    groups = [[spec for spec in specs if spec.plant.name == name] for name in machines]
     return [
         ledger(group, published(group[0].machine_file), progress_of_part(progress, n, len(groups)))
         for n, group in enumerate(groups)
     ]
+
+
+def _update(file: Path, designs: Sequence[Path], *, quiet: bool) -> None:
+    """Compute the tables of a Markdown file anew.
+
+    Raises InputError for designs beside the file, a table of a design that is not there, and a file without tables.
+    """
+    from malta.files import read_file, replace_files
+    from malta.report.markdown import find_tables, replace_tables
+    from malta.synthesis.design_file import read_design
+
+    if designs:
+        raise InputError("--update", "designs", str(designs[0]), "none: the file's tables name theirs")
+    text = read_file(file, "Markdown file", lambda path: path.read_text(encoding="utf-8"))
+    known = {path.stem: path for path in design_files("claims", None, or_shipped=True)}
+    specs = []
+    for place in find_tables(text, str(file)):
+        for name in place.designs:
+            if name not in known:
+                raise InputError(file, place.machine, name, "one of " + " ".join(sorted(known)))
+        specs.append([read_design(known[name]) for name in place.designs])
+    with progress_bar("claims", quiet=quiet) as progress:
+        ledgers = _compute_each(specs, progress)
+    replace_files({file: replace_tables(text, ledgers, str(file)).encode()})
+    print_written(make_console(), [file])

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from malta.margins.stages import Robustness
     from malta.margins.verify import Margins
     from malta.simulation.experiments import Experiment
+    from malta.synthesis.spec import Spec
     from malta.tuning.outcomes import Outcome
 
 
@@ -115,18 +116,22 @@ def experiment_document(experiment: Experiment) -> dict[str, Any]:
     return document
 
 
-def campaign_document(campaign: Campaign, published: Mapping[str, Any] | None, worst: int) -> dict[str, Any]:
+def campaign_document(
+    campaign: Campaign, published: Mapping[str, Any] | None, worst: int, spec: Spec | None = None
+) -> dict[str, Any]:
     """The yield of a campaign, the distribution of each merit, and its worst runs."""
-    from malta.campaigns.statistics import runs_within_bounds, worst_of
+    from malta.campaigns.statistics import worst_of
+    from malta.campaigns.yields import yields_of
 
-    within = runs_within_bounds(campaign, published)
+    completed, within, specified = yields_of(campaign, published, spec)
     return {
         "manifest": campaign.plan.manifest,
         "runs": len(campaign.index),
         "interrupted": campaign.interrupted,
         "engines": list(campaign.engines),
-        "yield": campaign.rate._asdict(),
-        "within_published": None if within is None else int(within.sum()),
+        "yield": completed._asdict(),
+        "within_published": None if within is None else within.passed,
+        "within_specification": None if specified is None else specified.passed,
         "ends": campaign.ends,
         "merits": _percentiles(campaign, published),
         "worst": [_run_document(campaign, row) for row in worst_of(campaign, worst)],

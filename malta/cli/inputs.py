@@ -13,6 +13,7 @@ from malta.files import locate, shipped_path
 if TYPE_CHECKING:
     from malta.model.plant import Parameters, Plant
     from malta.synthesis.controller import Controller
+    from malta.synthesis.spec import Spec
 
 
 def design_files(
@@ -51,6 +52,27 @@ def read_controller(gains: Path, machine_file: Path | None) -> Controller:
     if machine_file is not None:
         machine(machine_file)
     return gain_files.read(gains)
+
+
+def design_of(gains: Path, controller: Controller, named: Path | None) -> Spec | None:
+    """The design of a gain file: the file that was named, else NAME.toml beside its folder; None where there is none.
+
+    Raises InputError for a named file that is no design of the machine.
+    """
+    from malta.synthesis.design_file import read_design
+
+    try:
+        spec = read_design(named or gains.parent.parent / f"{controller.name}.toml")
+    except InputError:
+        if named is None:
+            return None
+        raise
+    own, other = controller.parameters, spec.parameters
+    if type(own) is type(other):
+        return spec
+    if named is None:
+        return None
+    raise InputError(named, "machine", spec.plant.name, "that of the gain file")
 
 
 def change_machine(parameters: Parameters, changes: list[str] | None) -> Parameters:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.optimize import brentq
 
+from malta.campaigns.yields import Yields, main_yields
 from malta.machines.tubular.experiments.strokes import delayed_stroke
 from malta.margins.loops import machine_loop
 from malta.margins.plants import of_plant
@@ -25,6 +26,7 @@ from malta.report.ledger import (
     proven_share,
     run_design,
 )
+from malta.simulation.compiled import compiler
 from malta.simulation.experiments import Experiment, Progress
 from malta.simulation.inverter import link_voltage, open_loop_gain
 from malta.simulation.scenario import Scenario
@@ -37,9 +39,11 @@ from malta.synthesis.spec import Spec
 from malta.tuning.noise import noise_of
 
 if TYPE_CHECKING:
+    from malta.campaigns.result import Rate
     from malta.model.plant import FloatArray
 
 EXPERIMENT_NAMES = ("stroke", "hold", "tilt", "payload", "thermal")
+MACHINES, FEW = 10_000, 200  # of the yields, with and without a C compiler
 IMPLIED_RATIO = 4.0  # K1 / k at which the LQR stands the published 300 % of a 20 % box
 
 
@@ -57,6 +61,7 @@ class Evidence:
     braked: float  # m/s, published speed from which the mover is braked into the DC link
     growth: float  # m, thermal growth of the published arm
     published: Mapping[str, Any]
+    yields: Yields  # of MACHINES that differ, in the stroke
 
 
 def evidence(spec: Spec, published: Mapping[str, Any], progress: Progress | None = None) -> Evidence:
@@ -78,6 +83,7 @@ def evidence(spec: Spec, published: Mapping[str, Any], progress: Progress | None
         published_value(published, "dc_link.speed"),
         published_value(published, "thermal.length") * published_value(published, "thermal.strain"),
         published,
+        main_yields(controller, spec, published, machines=MACHINES if compiler() else FEW),
     )
 
 
@@ -157,6 +163,12 @@ def link_rise(e: Evidence) -> float:
     """Rise of the DC link's voltage, V, when the mover is braked from the published speed."""
     par: Any = e.spec.parameters
     return float(link_voltage(par.V_dc, par.C_dc, par.m * e.braked**2 / 2) - par.V_dc)
+
+
+def yield_share(kind: str, e: Evidence) -> float:
+    """A share of the machines that differ, by a field of Yields; NaN without bounds."""
+    found: Rate | None = getattr(e.yields, kind)
+    return math.nan if found is None else found.share
 
 
 def published_stroke(e: Evidence) -> StrokeFigures:

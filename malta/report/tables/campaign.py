@@ -18,6 +18,7 @@ from malta.units import in_unit
 
 if TYPE_CHECKING:
     from malta.campaigns.result import Campaign
+    from malta.synthesis.spec import Spec
 
 
 def box_text(found: Campaign) -> str:
@@ -30,9 +31,14 @@ def box_text(found: Campaign) -> str:
     return ", ".join(f"{' '.join(names)} {width}" for width, names in spreads.items())
 
 
-def campaign_tables(found: Campaign, published: Published | None = None, worst: int = 5) -> Group:
-    """How the runs of a campaign end, their figures of merit beside the published bounds, and the worst runs."""
-    tables: list[Table | str] = [_ends_table(found, published)]
+def campaign_tables(
+    found: Campaign, published: Published | None = None, worst: int = 5, spec: Spec | None = None
+) -> Group:
+    """How the runs of a campaign end, their figures of merit beside the published bounds, and the worst runs.
+
+    spec : the design whose [specification] bounds the runs as well
+    """
+    tables: list[Table | str] = [_ends_table(found, published, spec)]
     if found.completed.any():
         tables.append(_findings_table(found, published))
     if worst and len(found.index):
@@ -40,17 +46,19 @@ def campaign_tables(found: Campaign, published: Published | None = None, worst: 
     return Group(*tables)
 
 
-def _ends_table(found: Campaign, published: Published | None) -> Table:
+def _ends_table(found: Campaign, published: Published | None, spec: Spec | None) -> Table:
     from malta.campaigns.result import rate
-    from malta.campaigns.statistics import runs_within_bounds
+    from malta.campaigns.yields import yields_of
 
-    within, runs = runs_within_bounds(found, published), len(found.index)
+    yields, runs = yields_of(found, published, spec), len(found.index)
     table = new_table("How the runs end", "end", "runs", "share [%]", "95 % interval [%]")
-    rows = {"completed": found.rate} | {
+    rows = {"completed": yields.completed} | {
         name: rate(count, runs) for name, count in found.ends.items() if name != "completed"
     }
-    if within is not None:
-        rows["completed within the published bounds"] = rate(int(within.sum()), runs)
+    if yields.published is not None:
+        rows["completed within the published bounds"] = yields.published
+    if yields.specified is not None:
+        rows["completed within the [specification]"] = yields.specified
     for name, share in rows.items():
         interval = f"{number(100 * share.low)} to {number(100 * share.high)}"
         add_row(table, name, f"{share.passed}", number(100 * share.share), interval)

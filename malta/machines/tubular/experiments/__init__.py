@@ -106,8 +106,7 @@ def check(name: str, option: str, value: Any) -> None:
 
 def bounds(scenario: str, options: Mapping[str, Any]) -> dict[str, str]:
     """Keys of the published figures for a scenario, if it is the published stroke."""
-    asked = {"distance": DISTANCE, "rise": RISE, "profile": "logistic"}
-    if scenario != "stroke" or any(options.get(name, value) != value for name, value in asked.items()):
+    if not _is_published(scenario, options):
         return {}
     return {
         "rise": "figure_12.rise_time",
@@ -115,3 +114,14 @@ def bounds(scenario: str, options: Mapping[str, Any]) -> dict[str, str]:
         "stroke": "figure_12.axial_error",
         "m": "figure_13.radial_deviation",
     }
+
+
+def specified(scenario: str, options: Mapping[str, Any]) -> dict[str, str]:
+    """Names in [specification] that bound the deviations in a scenario, if it is the published stroke."""
+    return {"stroke": "tracking_error", "m": "radial_deviation"} if _is_published(scenario, options) else {}
+
+
+def _is_published(scenario: str, options: Mapping[str, Any]) -> bool:
+    """Whether a scenario is the stroke that the paper flies."""
+    asked = {"distance": DISTANCE, "rise": RISE, "profile": "logistic"}
+    return scenario == "stroke" and all(options.get(name, value) == value for name, value in asked.items())
