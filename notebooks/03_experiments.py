@@ -21,18 +21,19 @@ Path("build").mkdir(exist_ok=True)
 
 # %% [markdown]
 # ## Parameters
-# Two gain files: the printed weights as plain SI numbers, and the same weights on bases that the claims ask for.
+# Three gain files: the printed weights as plain SI numbers, the same weights on bases that the claims ask for, and our
+# own design for the loop as it is.
 
 # %%
-controllers = {name: malta.gains.read(f"design/gains/{name}.json") for name in ("table2", "calibrated")}
+NAMES = ("table2", "calibrated", "robust")
+controllers = {name: malta.gains.read(f"design/gains/{name}.json") for name in NAMES}
 published = malta.published("data/tubular.toml")
 plants = {name: malta.plant_of(c.parameters) for name, c in controllers.items()}
 
 # %% [markdown]
 # ## Figs 12 and 13: the stroke
-# The first-order lag that linear models put in place of the current loops costs 0.2 mm of tracking error; PI loops
-# follow a ramp better, and less than 0.1 mm is left. The paper measures up to 0.6 mm, with a cogging that its look-
-# up table met only on average.
+# The first-order lag that linear models put in place of the current loops costs tracking error; PI loops follow a ramp
+# better. The paper measures up to 0.6 mm, with a cogging that its look-up table met only on average.
 
 # %%
 strokes = {}
@@ -42,7 +43,11 @@ for key, controller in controllers.items():
     print(f"{key}, {e}")
 lagged = malta.experiment("stroke", plants["calibrated"], controllers["calibrated"], fidelity="force")
 figures = malta.stroke_figures(lagged.run)
-print(f"with first-order lags: axial error {figures.axial_error * 1e3:.2f} mm")
+with_pi = malta.stroke_figures(strokes["calibrated"].run).axial_error
+print(
+    f"calibrated: axial error {figures.axial_error * 1e3:.2f} mm with first-order lags, {with_pi * 1e3:.2f} mm with PI"
+)
+assert figures.axial_error > 2 * with_pi
 for e in strokes.values():
     f = malta.stroke_figures(e.run)
     assert f.overshoot < 0.015
@@ -74,8 +79,13 @@ for e in rests.values():
 
 # %% [markdown]
 # **Judgement.** The measured statistics have the size of Table III because noise of that size was put in; what the
-# table cannot say, and the simulation can, is how still the mover really stands: four to six times stiller than its
-# sensors say.
+# table cannot say, and the simulation can, is how still the mover really stands:
+
+# %%
+for key, e in rests.items():
+    stiller = e.run.y[-2000:, :4].std(axis=0) / e.run.p[-2000:, :4].std(axis=0)
+    print(f"{key}: {stiller.min():.1f} to {stiller.max():.1f} times stiller than its sensors say")
+    assert stiller.min() > 2
 
 # %% [markdown]
 # ## Fig. 15: a drifting support, compensated
@@ -92,7 +102,12 @@ for e in drifts.values():
     assert left < 2e-6 < 60e-6 < raw
 
 # %% [markdown]
-# **Judgement.** The concept holds. What is left is the lag of the outer loop, which at the true speed is 0.02 µm.
+# **Judgement.** The concept holds. What is left is the lag of the outer loop, which shrinks with the speed, and noise.
+
+# %%
+for key, e in drifts.items():
+    lag, slow = (next(m.value for m in e.merits if m.label.startswith(word)) for word in ("lag", "the same"))
+    print(f"{key}: lag {lag * 1e6:.2f} µm, {slow * 1e6:.3f} µm at the true speed")
 
 # %% [markdown]
 # ## Fig. 16: tilting about sensor plane 2
@@ -108,31 +123,64 @@ for key, e in tilts.items():
     print(
         f"{key}: SP2 deviates by {as_printed:.1f} µm as printed, {held:.2f} µm with the attraction fed forward"
     )
-    assert held < 1.0 < 4.0 < as_printed
+    assert held < 1.0 < 4.0
+    assert as_printed > 4.0 or key == "robust"
 
 # %% [markdown]
 # **Judgement.** With the control law as printed the state feedback pulls a mover that the attraction pulls too: it
-# goes to K1 / (K1 - k) of what is asked, twice as far with the printed weights, and the slow integrals take it back
-# only in part. 4 µm are missed by a little. The law's own feedforward, which the paper keeps for "known radial
-# disturbances", mends it: the attraction at the reference is known.
+# goes to K1 / (K1 - k) of what is asked, and the integrals take it back only in part. Neither set of printed weights
+# keeps 4 µm so. The law's own feedforward, which the paper keeps for "known radial disturbances", mends it: the
+# attraction at the reference is known.
+
+# %%
+for key, e in tilts.items():
+    off = {merit.label: merit.value for merit in e.cases[0].merits}
+    print(
+        f"{key}, as printed: SP1 {off['SP1: largest tracking error, true'] * 1e6:.0f} µm off its circle of 200 µm, SP2 "
+        f"{off['SP2: largest deviation, true'] / 4e-6:.1f} times the published 4 µm"
+    )
 
 # %% [markdown]
 # ## Lift-off, payload, faults
 # Not shown in the paper, or only in words.
 
 # %%
+others: dict[str, dict[str, malta.Experiment]] = {}
 for name in ("lift-off", "payload", "faults"):
+    others[name] = {}
     for key, controller in controllers.items():
-        e = malta.experiment(name, plants[key], controller)
+        e = others[name][key] = malta.experiment(name, plants[key], controller)
         malta.report.experiment(e, f"build/03_{key}_{name}.png", published)
         print(f"{key}, {e}")
 
 # %% [markdown]
-# **Judgement.** Every estimator lifts the mover; a filter that knows it lies on its bearing does so with hardly
-# more than the 1.34 A that statics ask for. 0.2 kg are carried by the calibrated design and dropped by the printed
-# weights. Struck where the stroke accelerates most, both survive 2.5 ms without samples or control steps; a stuck
-# radial sensor ends in the touchdown bearing within some 40 ms, a link at a tenth of its voltage within 20 ms, an open
-# phase that carries weight within 10 ms.
+# **Judgement.** Every estimator lifts the mover; a filter that knows it lies on its bearing needs somewhat more current
+# than statics ask for. 0.2 kg are dropped by the printed weights as plain SI numbers; the other designs carry them, not
+# as precisely as the empty stroke. Struck where the stroke accelerates most, all survive lost samples and control
+# steps. A stuck radial sensor and a link at a tenth of its voltage end in the touchdown bearing:
+
+# %%
+for key in controllers:
+    lift, load, fault = (others[name][key] for name in ("lift-off", "payload", "faults"))
+    amperes = {case.label: case.merits[-1].value for case in lift.cases}
+    aware = max(amperes["kalman"], amperes["extended"])
+    print(
+        f"{key}: lift-off takes {aware:.2f} A, {aware / lift.merits[0].value:.2f} times what statics ask for"
+    )
+    heaviest = load.cases[-1]
+    error = heaviest.merits[1].value * 1e3
+    print(
+        f"{key}: with {heaviest.label} {heaviest.run.verdict.name}, axial error {error:.2f} mm (published: 0.6 mm)"
+    )
+    lost = {c.label: c.merits[1].value * 1e3 for c in fault.cases if not c.run.verdict.completed}
+    touched = {c.label: c.merits[1].value * 1e3 for c in fault.cases if np.isfinite(c.merits[1].value)}
+    print(f"{key}: touchdown", ", ".join(f"{label} after {ms:.0f} ms" for label, ms in touched.items()))
+    assert len(lift.cases) == sum(case.run.verdict.completed for case in lift.cases)
+    assert heaviest.run.verdict.completed == (key != "table2")
+    assert error > 0.6 or key == "robust"
+    assert set(lost) <= set(touched)
+    assert not any("lost" in label or "missed" in label for label in touched)
+    assert "y1 stuck" in touched
 
 # %% [markdown]
 # ## How stiff, how fast
@@ -154,12 +202,13 @@ print(f"rise {fastest * 1e3:.1f} ms against {sigmoid * 1e3:.1f} ms of the sigmoi
 assert fastest < 0.85 * sigmoid
 
 # %% [markdown]
-# **Summary.** Every bound of Figs 12 to 14 is met; Fig. 16 needs the attraction fed forward; the payload and the
-# 300 % need the calibrated bases. The whole ledger, computed: `malta claims`.
+# **Summary.** Every bound of Figs 12 and 13 is met; Table III is as noisy as the noise that is put in; with the printed
+# weights Fig. 16 needs the attraction fed forward; the payload and the 300 % need other bases than SI units, and the
+# payload costs precision. The whole ledger, computed: `malta claims`.
 
 # %%
 fig, ax = plt.subplots()
-for (key, e), style in zip(stiff.items(), ("-", "--"), strict=True):
+for (key, e), style in zip(stiff.items(), ("-", "--", ":"), strict=True):
     ax.loglog(e.curves["frequency"], e.curves["compliance"] * 1e6, style, color="black", label=key)
     ax.loglog(e.curves["tones"], e.curves["simulated"] * 1e6, "o", color="black", fillstyle="none")
 ax.set_xlabel("frequency [Hz]")
