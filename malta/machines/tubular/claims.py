@@ -114,7 +114,7 @@ POLES_AND_LQR: tuple[Row, ...] = (
         "percent",
         "{:.0f}",
         machine_share,
-        note="proven anywhere in the travel; the paper's is of full state feedback",
+        note="proven anywhere in the travel, without loads; the paper's is of full state feedback",
     ),
 )
 LOOPS: tuple[Row, ...] = (
