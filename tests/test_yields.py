@@ -22,12 +22,12 @@ if TYPE_CHECKING:
     from malta.synthesis.spec import Spec
 
 BOX = dict.fromkeys(("m", "K_A", "K_D", "K_B"), 0.2)
-LOADS = "design/gains/robust_loads.json"
+LOADS = "design/gains/robust.json"
 
 
 @pytest.fixture(scope="module")
 def spec() -> Spec:
-    return malta.read_design("design/robust_loads.toml")
+    return malta.read_design("design/robust.toml")
 
 
 @pytest.fixture(scope="module")
@@ -101,7 +101,7 @@ def test_a_campaign_shows_all_yields(run: Run, tmp_path: Path) -> None:
     code, out, err = run(*common)
     assert (code, err) == (0, "")
     assert "completed within the published bounds" in out
-    assert "completed within the [specification]" in out  # of design/robust_loads.toml, which stands beside
+    assert "completed within the [specification]" in out  # of design/robust.toml, which stands beside
     code, out, err = run(*common, "--json")
     document = json.loads(out)
     assert document["yield"]["passed"] >= document["within_published"] >= document["within_specification"]
