@@ -22,7 +22,7 @@ from scipy.stats import qmc
 from malta.errors import InputError
 from malta.gains.encodings import decode
 from malta.model.data import plant_of
-from malta.model.parameters import shape_parameters, twins_of, units_of, values_of
+from malta.model.parameters import differences, shape_parameters, twins_of, units_of, values_of
 from malta.model.plant import Plant, readonly
 from malta.simulation.catalogue import cases_of
 from malta.simulation.experiments import PlannedRun
@@ -40,7 +40,8 @@ SAMPLERS: tuple[Sampler, ...] = get_args(Sampler)
 class Plan:
     """The plan of a campaign: controller, scenario, and the box from which the machines are drawn.
 
-    Values are uniform in the box. Twins, parameters that a machine declares equal (I_xx and I_yy), stay equal.
+    Values are uniform in the box. Twins, parameters that a machine declares equal (I_xx and I_yy), stay equal. The
+    spread of a difference or an offset (`differences`, as dK_A) is in its own unit, SI.
 
     Raises InputError for an unknown scenario, case, option, parameter or error of a sensor, for a spread outside 0 to
     1, and for a scenario that changes the machine on the way.
@@ -48,7 +49,7 @@ class Plan:
 
     controller: Controller
     scenario: str = "stroke"  # an experiment of the machine's CASES, see simulation/catalogue.py
-    spread: Mapping[str, float] = field(default_factory=dict)  # parameter -> share, to either side
+    spread: Mapping[str, float] = field(default_factory=dict)  # parameter -> share or SI, to either side
     sensor_spread: Mapping[str, float] = field(default_factory=dict)  # error -> SI, to either side
     samples: int = 10_000
     seed: int = 0  # of the machines and of the noise
@@ -141,13 +142,16 @@ def _check_spread(plan: Plan, units: Mapping[str, str]) -> None:
         where = f"spread {name}"
         if name not in units:
             raise InputError("campaign", where, "an unknown parameter", "one of " + " ".join(units))
-        if not 0 <= share < 1:
+        own = name in differences(plan.parameters)
+        if own and not (math.isfinite(share) and share >= 0):
+            raise InputError("campaign", where, f"{share:g}", "a finite spread of 0 or more")
+        if not (own or 0 <= share < 1):
             raise InputError("campaign", where, f"{100 * share:g} %", "from 0 % to less than 100 %")
         if name in shape_parameters(plan.parameters):
             raise InputError(
                 "campaign", where, "another one for each run", "one for all: it shapes the functions"
             )
-        if share and not getattr(plan.parameters, name):
+        if share and not (own or getattr(plan.parameters, name)):
             raise InputError(
                 "campaign", where, f"{name} = 0", "a parameter other than 0: spreads are relative"
             )
@@ -239,6 +243,14 @@ def planned_run(plan: Plan) -> PlannedRun:
     return able[label]._replace(scenario=scenario)
 
 
+def half_width(plan: Plan, name: str) -> float:
+    """How far a varied value goes to either side of its middle, SI."""
+    if name not in plan.spread:
+        return plan.sensor_spread[name]
+    middle = 1.0 if name in differences(plan.parameters) else getattr(plan.parameters, name)
+    return float(middle * plan.spread[name])
+
+
 class Machines(NamedTuple):
     """The machines of a plan: a value for each run."""
 
@@ -259,8 +271,8 @@ def draw_machines(plan: Plan) -> Machines:
     middle = np.array(
         [getattr(plan.parameters, name) for name in parameters] + [0.0] * len(plan.sensor_spread)
     )
-    half = [getattr(plan.parameters, name) * plan.spread[name] for name in parameters]
-    values = middle + unit * np.array([*half, *plan.sensor_spread.values()])
+    half = [half_width(plan, name) for name in names]
+    values = middle + unit * np.array(half)
     changes = dict(zip(parameters, values.T, strict=False))
     pairs = [*twins_of(plan.parameters).items()]
     for name, twin in [*pairs, *((twin, name) for name, twin in pairs)]:

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from malta.model.parameters import units_of
+from malta.campaigns.plan import half_width
+from malta.model.parameters import differences, units_of
 from malta.model.plant import readonly
 from malta.model.published import published_value
 from malta.model.signals import inputs_of, outputs_of, stroke_unit
@@ -118,15 +119,15 @@ def worst_of(found: Campaign, count: int) -> list[int]:
 
 def unit_of(plan: Plan, name: str) -> str:
     """The unit in which a varied value is displayed."""
-    errors = {signal.name: signal.unit for signal in plan.plant.sensor_errors}
+    errors = {signal.name: signal.unit for signal in plan.plant.sensor_errors} | differences(plan.parameters)
     shown = {"1": "percent", "m": "um", "rad": "deg"}
     return shown.get(errors[name], errors[name]) if name in errors else units_of(plan.parameters)[name]
 
 
 def spread_text(plan: Plan, name: str) -> str:
     """The spread of a value to either side as text, as "±10 %"."""
-    if name in plan.spread:
+    if name in plan.spread and name not in differences(plan.parameters):
         return f"±{100 * plan.spread[name]:.4g} %"
     unit = unit_of(plan, name)
-    size = f"±{in_unit(plan.sensor_spread[name], unit):.4g}"
+    size = f"±{in_unit(half_width(plan, name), unit):.4g}"
     return f"{size} %" if unit == "percent" else f"{size} {unit.replace('um', 'µm')}"

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from malta.errors import InputError
 
 if TYPE_CHECKING:
-    from malta.model.plant import Plant
+    from malta.model.plant import Parameters, Plant
 
 NUMBER = r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)"  # a number, and the unit that may follow it
 EXAMPLES = {"--set": "m=0.56 or l_B=45mm", "--spread": "20% or m=10%"}  # in the errors of these options
@@ -48,17 +48,18 @@ def read_sensor_errors(texts: list[str] | None, plant: Plant) -> dict[str, float
 def read_shares(
     gains: Path,
     texts: list[str] | None,
-    units: Mapping[str, str],
+    parameters: Parameters,
     published: Mapping[str, Any] | None,
     option: str = "--spread",
 ) -> dict[str, float]:
     """Read how far parameters vary: `SHARE` for all that are uncertain, `NAME=SHARE` for one.
 
-    Without a text these are the shares in the gain file. units : of the parameters that may be named
+    Without a text these are the shares in the gain file. The spread of a difference or an offset is in its own unit.
 
     Raises InputError for two shares for all, and as `read_assignments` does.
     """
     from malta.campaigns.plan import box_of
+    from malta.model.parameters import differences, units_of
 
     named = [text for text in texts or () if "=" in text]
     general = [text for text in texts or () if "=" not in text]
@@ -70,7 +71,9 @@ def read_shares(
     if general:
         share = read_assignments(option, [f"all={general[0]}"], {"all": "1"})["all"]
         shares = dict.fromkeys(shares, share)
-    return shares | read_assignments(option, named, dict.fromkeys(units, "1"))
+    own = differences(parameters) if option == "--spread" else {}
+    units = dict.fromkeys(units_of(parameters), "1") | own
+    return shares | read_assignments(option, named, units)
 
 
 def scenario_options(distance: float | None, rise: float | None, **others: Any) -> dict[str, Any]:

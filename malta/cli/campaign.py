@@ -112,7 +112,6 @@ def campaign(
     from malta.campaigns.plan import Plan
     from malta.campaigns.run import campaign as run_campaign
     from malta.model.data import plant_of
-    from malta.model.parameters import units_of
     from malta.model.published import published_figures
     from malta.simulation.catalogue import main_job
 
@@ -143,7 +142,7 @@ def campaign(
     plan = Plan(
         controller,
         scenario,
-        read_shares(gains, spread, units_of(parameters), published),
+        read_shares(gains, spread, parameters, published),
         read_sensor_errors(sensor, plant),
         samples,
         seed,

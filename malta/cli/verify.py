@@ -104,14 +104,13 @@ def verify(
     from malta.margins.verify import require_stable
     from malta.model.data import plant_of
     from malta.model.linearize import linearize
-    from malta.model.parameters import units_of
     from malta.model.published import published_figures
 
     controller = read_controller(gains, machine)
     plant = plant_of(change_machine(controller.parameters, change))
     model = linearize(plant, plant.point(controller.operating_point[0]))
     published = published_figures(plant.name)
-    box = read_shares(gains, uncertain, units_of(plant.parameters), published, option="--uncertain")
+    box = read_shares(gains, uncertain, plant.parameters, published, option="--uncertain")
     _require_options(box, time, certificate, proof=not no_proof)
     loop = Loop(gains, controller, plant, model, box, cast("CurrentLoops", current_loops))
     analysis = _analyse(loop, time, proof=not no_proof, worst_case=worst_case, quiet=as_json)

@@ -2,7 +2,7 @@
 
     schema "malta-gains", version 1; 2 with what is below
     design           name, spec_sha256
-    plant            name, preset, parameters {name: {value, unit}}
+    plant            name, preset, parameters {name: {value, unit}}, without those that have their defaults
     operating_point  x [n0], u [m]
     sample_time      s
     signals          states [n], forces [m], measurements [p]: {name, unit} each, SI

@@ -19,6 +19,7 @@ from malta.margins.uncertain import (
     is_commutated,
     lower_limit,
     model_of,
+    upper_limit,
 )
 from malta.model.parameters import shape_parameters, units_of
 from malta.model.plant import Plant, position_in, readonly
@@ -81,8 +82,8 @@ def of_plant(
             B = ca.horzcat(B, left)
     if states:
         C = ca.vertcat(C, ca.DM.eye(len(plant.controlled)))
-    bounds = {f.name: lower_limit(f.metadata) for f in fields(par)}
-    limits = tuple((bounds.get(name, -math.inf), math.inf) for name in names)
+    bounds = {f.name: (lower_limit(f.metadata), upper_limit(f.metadata)) for f in fields(par)}
+    limits = tuple(bounds.get(name, (-math.inf, math.inf)) for name in names)
     matrices = ca.Function("matrices", [p], [A, B, C])
     return UncertainSystem(tuple(names), readonly(nominal), matrices, limits=limits)
 

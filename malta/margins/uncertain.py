@@ -126,6 +126,12 @@ def lower_limit(declared: Mapping[str, Any]) -> float:
     return max(found, default=-math.inf)
 
 
+def upper_limit(declared: Mapping[str, Any]) -> float:
+    """The exclusive upper limit of a declared parameter."""
+    below = declared.get("below")
+    return math.inf if below is None else float(below)
+
+
 class ReadingUse(NamedTuple):
     """What a reading y does besides entering the control law."""
 

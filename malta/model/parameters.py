@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import Field, field, fields
+from dataclasses import MISSING, Field, field, fields
 from numbers import Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,6 +19,7 @@ def si(
     *,
     above: float | None = None,
     at_least: float | None = None,
+    below: float | None = None,
     twin: str | None = None,
     shapes: bool = False,
     default: float | None = None,
@@ -27,16 +28,19 @@ def si(
 
     unit : the SI unit, "1" for a pure number
     above, at_least : the lower limit of the value, exclusive or inclusive
+    below : the upper limit of the value, exclusive
     twin : the name of another parameter; where both have the same value, symbolic models use one symbol for the two
     shapes : the parameter sets the size of the model (a delay, a number of harmonics), so it is never a symbol
-    default : the value of a parameter that came later: gain files do not mention the parameter while it has this value
+    default : the value that leaves an effect out, as 0 of a difference. Gain files and manifests do not list a
+        parameter with its default, so a machine may get new ones and its old files stay as they are.
 
     Example: `m: float = si("kg", above=0)  # mover with magnets, Table IV`
     """
-    metadata = {"unit": unit, "above": above, "at_least": at_least, "twin": twin, "shapes": shapes}
+    limits = {"above": above, "at_least": at_least, "below": below}
+    known = {"unit": unit, **limits, "twin": twin, "shapes": shapes}
     if default is None:
-        return field(metadata=metadata)
-    return field(default=default, metadata=metadata | {"later": True})
+        return field(metadata=known)
+    return field(default=float(default), metadata=known | {"later": True})
 
 
 def units_of(record: type[Parameters] | Parameters) -> dict[str, str]:
@@ -51,9 +55,7 @@ def later_parameters(record: type[Parameters] | Parameters) -> dict[str, float]:
 
 def values_of(record: Parameters) -> dict[str, float]:
     """The values of all parameters by name (SI), without those that came later and have their default values."""
-    later = later_parameters(record)
-    values = {name: getattr(record, name) for name in units_of(record)}
-    return {name: value for name, value in values.items() if value != later.get(name)}
+    return {name: getattr(record, name) for name in units_of(record) if not is_default(record, name)}
 
 
 def twins_of(record: Parameters) -> dict[str, str]:
@@ -72,6 +74,31 @@ def symbolic_names(record: type[Parameters] | Parameters) -> list[str]:
     return [f.name for f in fields(record) if "unit" in f.metadata and not f.metadata["shapes"]]
 
 
+def is_default(record: Parameters, name: str) -> bool:
+    """Whether a parameter has the default that its field declares; False for fields without a default."""
+    default = next(f.default for f in fields(record) if f.name == name)
+    return default is not MISSING and bool(getattr(record, name) == default)
+
+
+def acting_names(record: Parameters) -> list[str]:
+    """The names of the parameters that are symbols in simulations: those of `symbolic_names` without their defaults."""
+    return [name for name in symbolic_names(record) if not is_default(record, name)]
+
+
+def differences(record: type[Parameters] | Parameters) -> dict[str, str]:
+    """The SI units of the parameters that scatter about 0, by name: those of either sign with the default 0.
+
+    Such a parameter is a difference or an offset. How far it varies is given in its own unit, not as a share of 0.
+    """
+    units = {}
+    for f in fields(record):
+        if "unit" in f.metadata and f.default is not MISSING and f.default == 0:
+            above, least = f.metadata["above"], f.metadata["at_least"]
+            if all(limit is None or limit < 0 for limit in (above, least)):
+                units[f.name] = f.metadata["unit"]
+    return units
+
+
 def check_parameters(record: Parameters, where: str | Path = "parameters") -> None:
     """Check every physical field of a record. Raises InputError for NaN, infinity and values out of range."""
     for f in fields(record):
@@ -87,14 +114,16 @@ def check_range(f: Field[Any], value: object, where: str | Path, name: str) -> N
     Raises InputError for anything but a finite number within the limits.
     """
     unit, above, least = f.metadata["unit"], f.metadata["above"], f.metadata["at_least"]
+    below = f.metadata.get("below")
     low = f" above {above:g}" if above is not None else ""
     low = f" of at least {least:g}" if least is not None else low
+    high = "" if below is None else f"{' and' if low else ''} below {below:g}"
     real = isinstance(value, Real) and not isinstance(value, bool)
     try:
         number = float(value) if real else math.nan  # type: ignore[arg-type]
     except OverflowError:  # an integer beyond any float
         number = math.inf
     inside = (above is None or number > above) and (least is None or number >= least)
-    if not (math.isfinite(number) and inside):
+    if not (math.isfinite(number) and inside and (below is None or number < below)):
         found = f"{number} {unit}" if real else repr(value)
-        raise InputError(where, name, found, f"a finite number{low} in {unit}")
+        raise InputError(where, name, found, f"a finite number{low}{high} in {unit}")

@@ -325,7 +325,8 @@ def symbolic(parameters: Any, symbols: Mapping[str, Any]) -> Any:
 def trim(plant: Plant, /, **positions: float) -> OperatingPoint:
     """The inputs that hold the machine at rest at these states (SI) against its loads.
 
-    Solves 0 = f(x, u, load(x)) for u, in the least-squares sense, by Newton's method.
+    Solves 0 = f(x, u, load(x)) for u, in the least-squares sense, by Newton's method. Accelerations of uncontrolled
+    states are left: a mover whose centre of gravity is off its axis rolls.
 
     Raises InputError for unknown states, CheckError when no input holds the machine there.
 
@@ -366,6 +367,9 @@ def _hold(plant: Plant, states: FloatArray, *, loads_alone: bool = False) -> Flo
     rate = plant.f(x, u, plant.load(x))
     if loads_alone:
         rate -= plant.f(x, ca.SX.zeros(len(plant.inputs)), ca.SX.zeros(len(plant.disturbances)))
+    if plant.second_order:
+        for index in set(range(len(plant.states) // 2, len(plant.states))) - set(plant.controlled):
+            rate[index] = 0  # an acceleration that no input holds
     residual = ca.Function("residual", [x, u], [rate, ca.jacobian(rate, u)])
     return np.array(
         [

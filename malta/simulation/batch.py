@@ -17,7 +17,7 @@ import casadi as ca
 import numpy as np
 
 from malta.errors import InputError
-from malta.model.parameters import shape_parameters, twins_of, units_of
+from malta.model.parameters import is_default, shape_parameters, twins_of, units_of
 from malta.model.plant import Plant
 from malta.simulation.compiled import LANES, Lanes, Shared, arrange_in_lanes, feedforward_table, run_many
 from malta.simulation.digest import (
@@ -78,10 +78,12 @@ def simulate_many(
     variation = _variation(plant, changes, sensor_errors, starts, first)
     for name in set(changes) & set(shape_parameters(plant.parameters)):
         raise InputError("campaign", name, "another one for each run", "one for all: it shapes the functions")
+    alone, plant = simulation, with_varied(plant, changes)
+    simulation = simulation_of(plant, controller, simulation.scenario)
     shape = shape_of(plant, controller, simulation.setup)
     compiled = library_of(shape, LANES, digest_function(shape))
     if compiled is None:
-        return _simulate_one_by_one(simulation, variation, progress)
+        return _simulate_one_by_one(alone, variation, progress)
     inputs, shared, lanes = _prepare(simulation, variation)
     digest = first_digest(plant, inputs.motion.p)
     groups, runs = len(lanes.theta), variation.runs
@@ -168,6 +170,7 @@ def record_run(
         for columns in (changes, sensor_errors or {})
     )
     own_plant, own_scenario = replayed(plant, scenario, changes, index, sensor_errors=sensor_errors)
+    plant = with_varied(plant, changes)
     simulation = simulation_of(plant, controller, _with_sensor_errors(scenario, sensor_errors))
     shape = shape_of(plant, controller, simulation.setup)
     compiled = library_of(shape, LANES, recorder_function(shape))
@@ -209,6 +212,13 @@ def replayed(
     if errors:
         scenario = replace(scenario, sensor_errors=dict(scenario.sensor_errors or {}) | errors)
     return plant.variant(par), replace(scenario, run=index)
+
+
+def with_varied(plant: Plant, changes: Mapping[str, FloatArray]) -> Plant:
+    """The machine with a value that is no default for every parameter that varies, so that its functions contain it."""
+    par: Any = plant.parameters
+    furthest = {name: float(max(changes[name], key=abs)) for name in changes if is_default(par, name)}
+    return plant.variant(replace(par, **furthest)) if furthest else plant
 
 
 def is_compiled(plant: Plant, controller: Controller, scenario: Scenario) -> bool:
@@ -276,7 +286,8 @@ def _thetas(plant: Plant, values: Mapping[str, ca.DM], variation: Variation) -> 
         column = np.asarray(column, dtype=float)
         for extreme in (column.min(), column.max()):  # NaN comes out of both
             replace(plant.parameters, **{name: float(extreme)})
-        theta[:, place[f"machine.{name}"]] = column
+        if f"machine.{name}" in place:  # else every run has the default
+            theta[:, place[f"machine.{name}"]] = column
     names = [signal.name for signal in plant.sensor_errors]
     for name, column in sensor_errors.items():
         column = np.asarray(column, dtype=float)

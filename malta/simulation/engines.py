@@ -14,7 +14,7 @@ import numpy as np
 
 from malta.errors import InputError
 from malta.model.data import plant_of
-from malta.model.parameters import shape_parameters, twins_of
+from malta.model.parameters import acting_names, shape_parameters, twins_of
 from malta.model.plant import Plant
 from malta.simulation.compiled import address_of, feedforward_table, library
 from malta.simulation.layout import Setup, electronics_of, flatten, numbers_of
@@ -94,7 +94,7 @@ def shape_of(plant: Plant, c: Controller, setup: Setup) -> Shape:
         (m.shape, *m.sparsity().get_triplet()[0], *m.sparsity().get_triplet()[1])
         for m in gains_of(c).values()
     )
-    fixed = tuple(shape_parameters(par).items())
+    fixed = (*shape_parameters(par).items(), *acting_names(par))
     return Shape((type(par), kin, twins, fixed, patterns, c.tracks, c.parameters), plant, c, setup)
 
 

@@ -16,7 +16,7 @@ import casadi as ca
 import numpy as np
 
 from malta.model.drive import Electronics
-from malta.model.parameters import symbolic_names, twins_of
+from malta.model.parameters import acting_names, twins_of
 from malta.model.plant import Plant, symbolic
 from malta.synthesis.controller import Controller, CurrentLoop, gains_of
 
@@ -120,7 +120,7 @@ def numbers_of(
     substeps : of the simulation in a sample
     errors : of the sensors, by name; 0 where none is given
     """
-    machine = {k: ca.DM(getattr(plant.parameters, k)) for k in symbolic_names(plant.parameters)}
+    machine = {k: ca.DM(getattr(plant.parameters, k)) for k in acting_names(plant.parameters)}
     loop = c.current_loop or CurrentLoop(0.0, 0.0, 0.0)
     known = dict.fromkeys((signal.name for signal in plant.sensor_errors), 0.0) | dict(errors or {})
     return {
@@ -175,9 +175,12 @@ def signals_of(sizes: Layout, kind: Any) -> Signals:
 
 
 def _symbolic_parameters(plant: Plant, g: Mapping[str, Any]) -> Any:
-    """The parameters with symbols in place of numbers; twins share a symbol, shaping parameters stay numbers."""
+    """The parameters with symbols in place of numbers; twins share a symbol.
+
+    Parameters that shape the model, and those with their defaults, stay numbers.
+    """
     par = plant.parameters
-    symbols = {name: g[f"machine.{name}"] for name in symbolic_names(par)}
+    symbols = {name: g[f"machine.{name}"] for name in acting_names(par)}
     return symbolic(par, symbols | {name: symbols[twin] for name, twin in twins_of(par).items()})
 
 

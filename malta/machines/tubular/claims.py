@@ -26,6 +26,7 @@ from malta.machines.tubular.evidence import (
     yield_share,
 )
 from malta.machines.tubular.evidence import evidence as evidence
+from malta.machines.tubular.figure_13 import ROWS as FIGURE_13
 from malta.machines.tubular.further_claims import BRAKE, MEANS, RULE_OF_THUMB
 from malta.report.ledger import (
     ZONE_NOTE,
@@ -422,6 +423,7 @@ ROWS = (
     *MEANS,
     *OTHER_EXPERIMENTS,
     *COMPARISON,
+    *FIGURE_13,
 )
 
 

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import casadi as ca
 
+from malta.machines.tubular.modules import bearing_constants
 from malta.machines.tubular.windings import AXES, WEIGHT, to_axes, to_phases
 from malta.model.drive import Drive
 from malta.model.plant import Signal
@@ -62,9 +63,8 @@ def _axis_currents(i: Any) -> Any:
 
 def _forces(par: Parameters, i: Any) -> Any:
     """The five forces of 12 axis currents."""
-    return ca.vertcat(
-        par.K_B * i[2], par.K_B * i[4], par.K_B * i[8], par.K_B * i[10], par.K_D * (i[1] + i[7])
-    )
+    K_B1, K_B2 = bearing_constants(par)
+    return ca.vertcat(K_B1 * i[2], K_B1 * i[4], K_B2 * i[8], K_B2 * i[10], par.K_D * (i[1] + i[7]))
 
 
 def _emf(par: Parameters, x: Any) -> Any:

@@ -2,7 +2,8 @@
 
 Source: S. Miric et al., IEEE Trans. Ind. Electron. 68(1), 2021; equation and table numbers are its own.
 State: x y z, the Cardan angles alpha beta gamma, and their rates. The mover's axis is z, gravity is along -y.
-Two modules act at z = -l_B and z = +l_B, two radial sensor planes sit at z = -l_S and z = +l_S.
+Two modules act at z = -l_B and z = +l_B, two radial sensor planes sit at z = -l_S and z = +l_S. Modules that differ and
+a mover out of balance are those of modules.py and unbalance.py.
 """
 
 from __future__ import annotations
@@ -15,6 +16,15 @@ from typing import Any
 import casadi as ca
 
 from malta.machines.tubular.drive import drive
+from malta.machines.tubular.modules import (
+    SIDES,
+    attraction,
+    bearing_constants,
+    difference_of_attraction,
+    levers,
+    potential,
+)
+from malta.machines.tubular.unbalance import centre_of_gravity, second_derivative
 from malta.machines.tubular.windings import hall_position
 from malta.model.parameters import check_parameters, si
 from malta.model.plant import (
@@ -75,6 +85,13 @@ class Parameters:
     R_dc: float = si("ohm", above=0)  # supply and cable in front of the DC link
     f_clk: float = si("Hz", above=0)  # clock of the pulse-width modulators
     t_dead: float = si("s", at_least=0)  # dead time of the half-bridges
+    dK_A: float = si("1", above=-1, below=1, default=0)  # K_A (1 - dK_A) of module 1, K_A (1 + dK_A) of 2
+    dK_B: float = si("1", above=-1, below=1, default=0)  # the same of K_B
+    kappa: float = si("1", at_least=0, default=0)  # growth of K_A up to touchdown, over K_A
+    e_x: float = si("m", default=0)  # magnetic centre, as the sensors see it
+    e_y: float = si("m", default=0)
+    c_x: float = si("m", default=0)  # centre of gravity off the mover's axis, in frame R
+    c_y: float = si("m", default=0)
     preset: str = "custom"
 
     def __post_init__(self) -> None:
@@ -105,13 +122,8 @@ def plant(par: Parameters, *, small_angle: bool = False) -> Plant:
     """
     x, u, w = ca.SX.sym("x", 12), ca.SX.sym("u", 5), ca.SX.sym("w", 6)
     trig = SMALL_ANGLE if small_angle else EXACT
-    constants = (par.K_B, par.K_B, par.K_B, par.K_B, 2 * par.K_D)  # f_D = f_D1 + f_D2, eq. (17)
-    inertia = (par.I_xx, par.I_yy, par.I_zz)
-    q_B = principal_angles(x[3:6], inertia)
-    F_I, M_I = _wrench(par, x, u, rotation(x[3:6], trig)[2, :2].T, conservative=not small_angle)
-    # The points of force lie on the mover's axis: T_B = sum of l_i e_z x F_i, in frame B, from the moment sum l_i F_i.
-    T_B = ca.cross(ca.SX([0, 0, 1]), rotate(q_B, M_I, trig)) + rotate(q_B, w[3:], trig)
-    q_t_ddot, q_r_ddot = acceleration(par.m, inertia, x[3:6], x[9:12], F_I + w[:3], T_B, trig)
+    K_B1, K_B2 = bearing_constants(par)
+    constants = (K_B1, K_B1, K_B2, K_B2, 2 * par.K_D)  # f_D = f_D1 + f_D2, eq. (17)
     return Plant(
         name="tubular",
         parameters=par,
@@ -120,9 +132,9 @@ def plant(par: Parameters, *, small_angle: bool = False) -> Plant:
         outputs=OUTPUTS,
         disturbances=WRENCH,
         uncontrolled=("gamma", "gamma_dot"),
-        f=trace("f", [x, u, w], ca.vertcat(x[6:], q_t_ddot, q_r_ddot)),
+        f=trace("f", [x, u, w], ca.vertcat(x[6:], _acceleration(par, x, u, w, trig))),
         h=lambda x, _: measured(par, x, trig),
-        load=lambda x: load(par, x),
+        load=lambda x: load(par, x, trig),
         position_of=lambda p: position_of(par, p),
         preload=lambda _: ca.DM.zeros(5),
         currents=lambda _, v: v / ca.vertcat(*constants),
@@ -168,12 +180,24 @@ def _actuator(par: Parameters, constants: tuple[float, ...]) -> Actuator:
     )
 
 
+def _acceleration(par: Parameters, x: Any, u: Any, w: Any, trig: Trig) -> Any:
+    """(x y z)'' of the mover's axis and (alpha beta gamma)'' under forces u of the modules and a wrench w."""
+    inertia, q_r, dq_r = (par.I_xx, par.I_yy, par.I_zz), x[3:6], x[9:12]
+    q_B = principal_angles(q_r, inertia)
+    n, r = rotation(q_r, trig)[2, :2].T, centre_of_gravity(par, q_r, trig)
+    F_I, M_I = _wrench(par, x, u, n, conservative=trig is EXACT)
+    # The points of force lie on the mover's axis: T_B = sum of l_i e_z x F_i, in frame B, from the moment sum l_i F_i.
+    T_B = ca.cross(ca.SX([0, 0, 1]), rotate(q_B, M_I, trig)) + rotate(q_B, w[3:] - ca.cross(r, F_I), trig)
+    a_O, ddq_r = acceleration(par.m, inertia, q_r, dq_r, F_I + w[:3], T_B, trig)
+    return ca.vertcat(a_O - second_derivative(r, q_r, dq_r, ddq_r), ddq_r)
+
+
 def _wrench(par: Parameters, x: Any, u: Any, n: Any, *, conservative: bool) -> tuple[Any, Any]:
     """Sums of F_i and of l_i F_i over the modules, in frame I: eqs (5)-(14). n: x and y of the mover's axis.
 
     F_i = (fx_i, fy_i, f_D / 2) + K_A P_i,xy acts at P_i = O + l_i n with l_1 = -(l_B + z), l_2 = l_B - z. As
     l_1 + l_2 = -2 z and l_1^2 + l_2^2 = 2 (l_B^2 + z^2), the attraction sums up to F_A = 2 K_A (O - z n) and its moment
-    to 2 K_A l_B^2 n - z F_A.
+    to 2 K_A l_B^2 n - z F_A. Modules that differ add their differences, and their pull at P = 0 is a load.
     NOTE: eq. (12) prints (l_B + z) in the second lever arm; eq. (5) gives (l_B - z), and only with that is the
     linearized stiffness symmetric.
     """
@@ -181,16 +205,30 @@ def _wrench(par: Parameters, x: Any, u: Any, n: Any, *, conservative: bool) -> t
     F_A = 2 * par.K_A * (x[0:2] - z * n)
     F_xy = f_1 + f_2 + F_A
     M_xy = par.l_B * (f_2 - f_1) + 2 * par.K_A * (par.l_B * par.l_B) * n - z * F_xy
+    for side, l_i in zip(SIDES, levers(par, z), strict=True):
+        more = difference_of_attraction(par, side, x[0:2] + l_i * n)
+        F_A, F_xy, M_xy = F_A + more, F_xy + more, M_xy + l_i * more
     # The potential -K_A |P_i,xy|^2 / 2 has an axial slope too, because l_i falls as z grows. The paper's (9), (10)
     # leave it out. It is of second order and absent from every linearization, but without it energy is not conserved.
     F_z = f_D - ca.dot(F_A, n) if conservative else f_D
     return ca.vertcat(F_xy, F_z), ca.vertcat(M_xy, -z * f_D)
 
 
-def load(par: Parameters, x: Any) -> Any:
-    """Gravity (missing from eq. (6)) and cogging, as a wrench at the centre of gravity."""
+def load(par: Parameters, x: Any, trig: Trig = EXACT) -> Any:
+    """Gravity (missing from eq. (6)), cogging and the pull of magnets off the centre, as a wrench at the centre of
+    gravity.
+
+    The magnets act on the mover's axis; their pull has an axial part there, as in _wrench.
+    """
     cogging = par.F_c * ca.sin(2 * math.pi / par.L_p * x[2] + par.phi_c)
-    return ca.vertcat(0, -par.m * par.g, cogging, 0, 0, 0)
+    n = rotation(x[3:6], trig)[2, :].T
+    force, torque = ca.vertcat(0, 0, cogging), ca.DM.zeros(3)
+    for side, l_i in zip(SIDES, levers(par, x[2]), strict=True):
+        F = attraction(par, side, ca.DM.zeros(2))
+        force += ca.vertcat(F, -ca.dot(F, n[:2]) if trig is EXACT else 0)
+        torque += ca.cross(l_i * n, ca.vertcat(F, 0))
+    torque -= ca.cross(centre_of_gravity(par, x[3:6], trig), force)
+    return ca.vertcat(force + ca.vertcat(0, -par.m * par.g, 0), torque)
 
 
 def measured(par: Parameters, x: Any, trig: Trig = EXACT) -> Any:
@@ -219,6 +257,7 @@ def touchdown_bearing(par: Parameters, x: Any, trig: Trig = EXACT) -> Any:
     p = measured(par, x, trig)
     dp = ca.jtimes(p, x, rates)
     force, torque = ca.SX.zeros(3), ca.SX.zeros(3)
+    middle = x[0:3] + centre_of_gravity(par, x[3:6], trig)
     for i, plane in ((0, -par.l_S), (2, par.l_S)):
         r, dr = p[i : i + 2], dp[i : i + 2]
         size = ca.sqrt(ca.sumsqr(r) + 1e-24)
@@ -226,7 +265,7 @@ def touchdown_bearing(par: Parameters, x: Any, trig: Trig = EXACT) -> Any:
         push = ca.if_else(delta > 0, ca.fmax(par.k_t * delta + par.d_t * outwards, 0), 0)
         F = ca.vertcat(-push * r / size, 0)
         force += F
-        torque += ca.cross(ca.vertcat(r - x[0:2], plane - x[2]), F)
+        torque += ca.cross(ca.vertcat(r, plane) - middle, F)
     return ca.vertcat(force, torque)
 
 
@@ -251,9 +290,11 @@ def energy(par: Parameters, x: Any) -> Any:
     """Kinetic plus potential energy, J: constant without inputs and disturbances."""
     n = rotation(x[3:6])[2, :].T
     omega = rate_map(x[3:6]) @ x[9:12]
-    kinetic = par.m / 2 * ca.sumsqr(x[6:9]) + ca.dot(ca.vertcat(par.I_xx, par.I_yy, par.I_zz), omega**2) / 2
+    r = centre_of_gravity(par, x[3:6])
+    velocity = x[6:9] + ca.jtimes(r, x[3:6], x[9:12])
+    kinetic = par.m / 2 * ca.sumsqr(velocity) + ca.dot(ca.vertcat(par.I_xx, par.I_yy, par.I_zz), omega**2) / 2
     wave = 2 * math.pi / par.L_p
-    potential = par.m * par.g * x[1] + par.F_c / wave * ca.cos(wave * x[2] + par.phi_c)
-    for l_i in (-(par.l_B + x[2]), par.l_B - x[2]):
-        potential -= par.K_A / 2 * ca.sumsqr(x[0:2] + l_i * n[0:2])
-    return kinetic + potential
+    stored = par.m * par.g * (x[1] + r[1]) + par.F_c / wave * ca.cos(wave * x[2] + par.phi_c)
+    for side, l_i in zip(SIDES, levers(par, x[2]), strict=True):
+        stored += potential(par, side, x[0:2] + l_i * n[0:2])
+    return kinetic + stored

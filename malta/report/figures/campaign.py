@@ -179,6 +179,7 @@ def _draw_bands(axes: Axes, found: Campaign, name: str, band: Any) -> None:
 
 def worst_figure(found: Campaign, published: Published | None = None) -> Figure:
     """The worst runs: the places of their machines in the box, and their largest errors."""
+    from malta.campaigns.plan import half_width
     from malta.campaigns.statistics import bounds_of, spread_text, worst_of
 
     plan, plant = found.plan, found.plan.plant
@@ -187,12 +188,7 @@ def worst_figure(found: Campaign, published: Published | None = None) -> Figure:
     box, far = figure.subplots(1, 2, width_ratios=(1.7, 1))
     at = np.arange(len(found.names))
     middle = np.array([getattr(plan.parameters, n) if n in plan.spread else 0.0 for n in found.names])
-    half = np.array(
-        [
-            getattr(plan.parameters, n) * plan.spread[n] if n in plan.spread else plan.sensor_spread[n]
-            for n in found.names
-        ]
-    )
+    half = np.array([half_width(plan, n) for n in found.names])
     across = lateral_outputs(plant)[0]
     fine = in_unit(1.0, across.fine)
     for place, (row, style) in enumerate(zip(rows, (*STYLES, *MORE), strict=False)):

@@ -9,6 +9,7 @@ import numpy as np
 from rich.console import Group
 from rich.table import Table
 
+from malta.model.parameters import differences
 from malta.model.signals import (
     lateral_outputs,
 )
@@ -122,7 +123,7 @@ def _deviation_text(found: Campaign, row: int, k: int) -> str:
     from malta.campaigns.statistics import unit_of
 
     name, value = found.names[k], float(found.values[row, k])
-    if name in found.plan.spread:
+    if name in found.plan.spread and name not in differences(found.plan.parameters):
         middle = getattr(found.plan.parameters, name)
         return f"{name}={100 * (value / middle - 1):+.1f}%" if middle else f"{name}={value:+.3g}"
     unit = unit_of(found.plan, name)
