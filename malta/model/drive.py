@@ -13,6 +13,15 @@ CasadiFn = Callable[..., Any]  # takes and returns casadi SX, MX or DM
 
 
 @dataclass(frozen=True, eq=False)
+class CurrentSensors:
+    """Sensors of the phase currents. The current controllers read i + offset + noise, rounded to steps."""
+
+    noise: Any  # A, rms of a sample
+    offset: tuple[Any, ...]  # A, of each phase
+    step: Any  # A; 0: none
+
+
+@dataclass(frozen=True, eq=False)
 class Drive:
     """The windings behind the inputs, in transformed axes (as dq) and as phases on an inverter.
 
@@ -38,6 +47,7 @@ class Drive:
     supply_resistance: float  # ohm
     pwm_step: float  # smallest change of a duty cycle
     dead_share: float  # share of a PWM period that dead time takes
+    sensors: CurrentSensors | None = None  # None: the current controllers know the currents
 
 
 @dataclass(frozen=True, eq=False)

@@ -31,7 +31,7 @@ from malta.simulation.digest import (
 )
 from malta.simulation.engines import BLOCK, evaluate, library_of, shape_of
 from malta.simulation.inputs import Inputs, initial_values, inputs_of
-from malta.simulation.layout import electronics_of, flatten, layout_of, numbers_of, with_symbols
+from malta.simulation.layout import electronics_of, flatten, layout_of, noise_scales, numbers_of, with_symbols
 from malta.simulation.noise import GAMMA, keys
 from malta.simulation.period import initial_state
 from malta.simulation.scenario import Scenario, Simulation, setup_of, simulation_of, steps_of
@@ -180,12 +180,13 @@ def record_run(
     width = sum(layout_of(plant, controller, simulation.setup).row.values())
     rows = np.empty((len(inputs.t), width))
     stream, last = lanes.keys.copy(), np.zeros((1, 2 * width, LANES))
+    sensors = len(noise_scales(plant, simulation.setup))
     lanes = lanes._replace(keys=stream, digests=last)
     for k in range(0, len(rows), 2):  # the engine draws the noise of two samples at once
         part = inputs.given[k : k + 2]
         run_many(compiled[0], slice(0, 1), lanes, shared._replace(given=part))
         rows[k : k + len(part)] = last[0, :, index - begin].reshape(2, width)[2 - len(part) :]
-        stream += np.uint64(len(plant.outputs) * GAMMA % 2**64)
+        stream += np.uint64(sensors * GAMMA % 2**64)
         if progress is not None and k % 1000 == 0:
             progress(k / len(rows))
     own = Simulation(own_plant, controller, own_scenario, simulation.setup)
@@ -309,7 +310,7 @@ def _start_function(shape: Any) -> ca.Function:
     sizes = {"x": len(plant.states), "xi_pred": len(c.states), "current": len(plant.actuator.coils)}
     arguments = [ca.SX.sym(name, size) for name, size in sizes.items()]
     first = initial_state(symbolic, c, setup, *arguments)
-    noise = ca.densify(ca.vertcat(*symbolic.noise))
+    noise = ca.densify(ca.vertcat(*noise_scales(symbolic, setup)))
     return ca.Function("start", [theta, ca.vertcat(*arguments)], [first, noise])
 
 

@@ -12,13 +12,13 @@ from malta.simulation.layout import Loop, Setup, Signals
 
 
 def control_currents(
-    loop: Loop, signals: Signals, current: Any, known: Any
+    loop: Loop, signals: Signals, current: Any, known: Any, errors: Any
 ) -> tuple[Any, dict[str, Any], dict[str, Any]]:
     """PI control of the axis currents: u = Kp e + Q' I + emf(x), I' = Ki Q e, with the error e of the axis currents.
 
-    x are the states `known` to the controller, and Q turns the axes with the forces where the setup says so. The
-    integrals I follow backward Euler and wait while the half-bridges are at their limit. Current controllers and
-    control law have the same period, as on the machine (50 us).
+    x are the states `known` to the controller, `errors` those of the currents that it reads, and Q turns the axes with
+    the forces where the setup says so. The integrals I follow backward Euler and wait while the half-bridges are at
+    their limit. Current controllers and control law have the same period, as on the machine (50 us).
 
     Returns the command to hold, the controller's states after this sample, and entries of the row.
     """
@@ -32,10 +32,12 @@ def control_currents(
     V = machine["link"] * (1 - given["sag"] if s.faulty else 1)
     if s.fidelity == "dq":
         i, i_phase = machine["i"], None
+        read = i + drive.to_axes(machine["x"]) @ errors if s.current_sensors else i
     else:
         i_phase = machine["i_phase"]
-        i = believed.drive.to_axes(estimate) @ i_phase
-    error = believed.drive.command(current) - i
+        read = believed.drive.to_axes(estimate) @ (i_phase + errors if s.current_sensors else i_phase)
+        i = read
+    error = believed.drive.command(current) - read
     Q = believed.drive.turned(believed.forces(estimate, current)) if s.turning else ca.SX.eye(len(drive.axes))
     waiting = controller["u_limited"]
     integral = controller["u_integral"] + g["Ki_current"] * g["control_time"] * (1 - waiting) * (Q @ error)
@@ -54,6 +56,18 @@ def control_currents(
         true, applied = T @ i_phase, T @ ((command - 0.5) * V)
         row |= {"u": applied, "force": drive.force(true), "i": true, "i_phase": i_phase, "duty": command}
     return command, {"u_integral": integral, "u_limited": limited}, row
+
+
+def reading_errors(loop: Loop, machine: Any, noise: Any) -> Any:
+    """What the sensors of the phase currents read, less the currents, A. noise: of each sensor, A."""
+    drive = loop.plant.drive
+    if drive.sensors is None:
+        return ca.SX.zeros(len(drive.phases))
+    i = machine["i_phase"] if loop.setup.fidelity == "phase" else drive.to_phases(machine["x"]) @ machine["i"]
+    read, step = i + ca.vertcat(*drive.sensors.offset) + noise, drive.sensors.step
+    if not (isinstance(step, float) and step == 0):
+        read = ca.if_else(step > 0, step * ca.floor(read / step + 0.5), read)
+    return read - i
 
 
 def keep_if_missed(s: Setup, signals: Signals, command: Any) -> Any:

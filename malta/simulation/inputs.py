@@ -18,7 +18,7 @@ from malta.model.plant import Plant, position_in
 from malta.simulation import references
 from malta.simulation.anticipation import countering_forces
 from malta.simulation.engines import evaluate
-from malta.simulation.layout import electronics_of, layout_of
+from malta.simulation.layout import electronics_of, layout_of, noise_scales
 from malta.simulation.noise import keys, normals
 from malta.simulation.period import state_reference
 from malta.simulation.scenario import Fault, FeedforwardChoice, Scenario, Simulation
@@ -177,20 +177,20 @@ def _fault_flags(
     return flags
 
 
-def sensor_noise(stages: list[tuple[int, Plant]], scenario: Scenario, t: FloatArray) -> FloatArray:
-    """Noise of the sensors, k x p, in their units, with biases and larger noise of faults.
+def sensor_noise(run: Simulation, stages: list[tuple[int, Plant]], t: FloatArray) -> FloatArray:
+    """Noise of the sensors of outputs and phase currents, k x sensors, in their units, with biases and noise of faults.
 
     stages : (first sample, machine), as the machine's parameters and so its noise may change on the way
     """
-    plant = stages[0][1]
-    drawn: FloatArray = np.zeros((len(t), len(plant.outputs)))
+    plant, _, scenario, setup = run
+    drawn: FloatArray = np.zeros((len(t), len(noise_scales(plant, setup))))
     if scenario.noise:
         drawn = normals(keys(scenario.seed, np.array([scenario.run]))[0], *drawn.shape)
         if plant.uniform:
             drawn = math.sqrt(3) * erf(drawn / math.sqrt(2))
         for k, (first, now) in enumerate(stages):
             last = stages[k + 1][0] if k + 1 < len(stages) else len(t)
-            drawn[first:last] *= scenario.noise * np.array(now.noise)
+            drawn[first:last] *= scenario.noise * np.array(noise_scales(now, setup))
     for fault in scenario.faults:
         if fault.kind in ("biased sensor", "noisy sensor"):
             column = _signal_index(scenario, fault.kind, fault.what, plant.outputs)

@@ -44,6 +44,7 @@ class Setup:
     outside: bool = False  # a Kalman filter of start_up.py makes the estimate
     anticipated: bool = False  # forces beside v0 counter a disturbance that is known in advance
     open_loop: bool = False  # feedforward alone, commutated for the reference
+    current_sensors: bool = False  # the current controllers read sensors with noise, offsets and steps
     electronics: Any = None  # options of the machine's own electronics
 
 
@@ -159,6 +160,21 @@ def fidelities(plant: Plant) -> tuple[Fidelity, ...]:
     if plant.windings is not None:
         return FIDELITIES
     return ("force",) if plant.electronics is None else ("force", "phase")
+
+
+def read_currents(plant: Plant, s: Setup) -> int:
+    """The number of phase currents that are read by sensors which are not ideal."""
+    return len(plant.drive.phases) if s.current_sensors else 0
+
+
+def noise_scales(plant: Plant, s: Setup) -> tuple[Any, ...]:
+    """Standard deviations of the noise of all sensors: of the outputs, then of the phase currents.
+
+    A run draws as many numbers a sample. So the noise of the outputs is another one where currents are read.
+    """
+    if not s.current_sensors or plant.drive.sensors is None:
+        return (*plant.noise, *[0.0] * read_currents(plant, s))
+    return (*plant.noise, *[plant.drive.sensors.noise] * read_currents(plant, s))
 
 
 def _winding_counts(plant: Plant) -> tuple[int, int]:

@@ -31,7 +31,7 @@ import numpy as np
 
 from malta.model.data import plant_of
 from malta.model.plant import Plant
-from malta.simulation.current_control import control_currents, keep_if_missed
+from malta.simulation.current_control import control_currents, keep_if_missed, reading_errors
 from malta.simulation.layout import (
     Layout,
     Loop,
@@ -40,6 +40,7 @@ from malta.simulation.layout import (
     command_size,
     electronics_of,
     layout_of,
+    read_currents,
     signals_of,
     with_symbols,
 )
@@ -50,7 +51,7 @@ from malta.synthesis.controller import Controller, commanded, estimated, filtere
 class Period(NamedTuple):
     """The functions of one control period; theta has no entries where all numbers are constants."""
 
-    sense: ca.Function  # (state, given, noise, theta) -> y, position for v0(z)
+    sense: ca.Function  # (state, given, noise, theta) -> y (then errors of read currents), position for v0(z)
     decide: ca.Function  # (state, given, y, v0, theta) -> controller, held, row
     substep: ca.Function  # (machine, held, given, fast noise, theta) -> machine
     theta: tuple[str, ...]  # names of the numbers, an entry for each
@@ -76,15 +77,19 @@ def period_of(
     machine, controller, given = signals
     state = ca.vertcat(*machine.values(), *controller.values())
     around = ca.vertcat(*given.values())
-    noise, held = ca.SX.sym("noise", len(plant.outputs)), ca.SX.sym("held", command_size(plant, s))
+    outputs = len(plant.outputs)
+    noise = ca.SX.sym("noise", outputs + read_currents(plant, s))
+    held = ca.SX.sym("held", command_size(plant, s))
     fast = electronics_of(plant, s)
     jitter = ca.SX.sym("jitter", 0 if fast is None else fast.noises)
 
-    measured = _measurement(loop, machine["x"], noise)
+    measured = _measurement(loop, machine["x"], noise[:outputs])
     if s.faulty:
         measured = ca.if_else(given["stuck"], controller["y_last"], measured)
     first, last = g["grid_ends"][0], g["grid_ends"][1]
     at = ca.fmax(ca.fmin(measured[plant.stroke_output], last), first) if plant.has_stroke else first
+    if s.current_sensors:
+        measured = ca.vertcat(measured, reading_errors(loop, machine, noise[outputs:]))
     sense = ca.Function("sense", [state, around, noise, theta], ca.cse([ca.densify(measured), at]))
 
     moved = ca.cse(ca.densify(advance(loop, signals, held, jitter)))
@@ -159,9 +164,11 @@ def _decide_function(loop: Loop, theta: Any, sizes: Layout) -> ca.Function:
         loop, theta = loop._replace(numbers=constants), ca.MX(0, 1)
     signals = signals_of(sizes, kind)
     machine, controller, given = signals
-    y, v0 = kind.sym("y", len(plant.outputs)), kind.sym("v0", len(plant.inputs))
+    outputs = len(plant.outputs)
+    read = kind.sym("y", outputs + read_currents(plant, loop.setup))
+    y, v0 = read[:outputs], kind.sym("v0", len(plant.inputs))
     x = machine["x"]
-    after, command, row = _control_law(loop, signals, y, v0)
+    after, command, row = _control_law(loop, signals, y, v0, read[outputs:])
     row = {"x": x, "p": plant.h(x, 0), "y": y, "contact": plant.contact(x)} | row
     decided = [
         ca.vertcat(*(after[name] for name in sizes.controller)),
@@ -171,7 +178,7 @@ def _decide_function(loop: Loop, theta: Any, sizes: Layout) -> ca.Function:
     # Engines read every entry, so structural zeros are not allowed.
     decided = [ca.densify(values) for values in decided]
     state = ca.vertcat(*machine.values(), *controller.values())
-    arguments = [state, ca.vertcat(*given.values()), y, v0, theta]
+    arguments = [state, ca.vertcat(*given.values()), read, v0, theta]
     if kind is ca.SX:
         return ca.Function("decide", arguments, ca.cse(decided))
     # The arguments of an MX function are symbols, so the signals are cut out of whole vectors.
@@ -181,11 +188,13 @@ def _decide_function(loop: Loop, theta: Any, sizes: Layout) -> ca.Function:
         pieces += ca.vertsplit(vector, np.cumsum([0, *sizes_of.values()]).tolist())
     symbols = [*machine.values(), *controller.values(), *given.values()]
     decided = ca.substitute(decided, symbols, pieces)
-    return ca.Function("decide", [*whole, y, v0, ca.MX.sym("theta", 0, 1)], decided)
+    return ca.Function("decide", [*whole, read, v0, ca.MX.sym("theta", 0, 1)], decided)
 
 
-def _control_law(loop: Loop, signals: Signals, y: Any, v0: Any) -> tuple[dict[str, Any], Any, dict[str, Any]]:
-    """The control law and the current controllers at measurements y.
+def _control_law(
+    loop: Loop, signals: Signals, y: Any, v0: Any, errors: Any
+) -> tuple[dict[str, Any], Any, dict[str, Any]]:
+    """The control law and the current controllers at measurements y and with errors of read currents.
 
     Returns the controller's state after this sample, the commands to hold, and entries of the row.
     """
@@ -222,7 +231,7 @@ def _control_law(loop: Loop, signals: Signals, y: Any, v0: Any) -> tuple[dict[st
     else:
         # A law of errors has no states: the measured outputs stand for them, moving as the reference does.
         known = xi_hat if c.tracks == "states" else state_reference(believed)(y, given["dp_ref"])
-        command, electrics, more = control_currents(loop, signals, current, known)
+        command, electrics, more = control_currents(loop, signals, current, known, errors)
         after |= electrics
         row |= more
     row["met"] = ca.vertcat(*met)

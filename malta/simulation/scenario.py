@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
 from malta.errors import InputError
+from malta.model.parameters import units_of
 from malta.model.plant import Plant
 from malta.simulation import references
 from malta.simulation.layout import FIDELITIES, Fidelity, Setup, electronics_of, fidelities
@@ -209,6 +210,7 @@ def setup_of(plant: Plant, c: Controller, s: Scenario) -> Setup:
             raise InputError(where, f"sensor_errors.{name}", "an unknown error", "one of " + " ".join(known))
         if not math.isfinite(value):
             raise InputError(f"scenario {s.name}", f"sensor_errors.{name}", repr(value), "a finite number")
+    driven = s.fidelity != "force" and not own
     return Setup(
         fidelity=s.fidelity,
         delay=plant.actuator.delay(c.sample_time) if s.delay is None else s.delay,
@@ -223,8 +225,20 @@ def setup_of(plant: Plant, c: Controller, s: Scenario) -> Setup:
         outside=s.estimator != "steady-state",
         anticipated=s.anticipated is not None,
         open_loop=s.open_loop,
+        current_sensors=driven
+        and any(machine.drive.sensors is not None for machine in machines_of(plant, s)),
         electronics=s.electronics,
     )
+
+
+def machines_of(plant: Plant, s: Scenario) -> list[Plant]:
+    """The machine before and after every change of its parameters in a scenario."""
+    machines = [plant]
+    for _, values in sorted(s.changes, key=lambda change: change[0]):
+        known = {name: value for name, value in values.items() if name in units_of(plant.parameters)}
+        par: Any = replace(machines[-1].parameters, **known)
+        machines.append(plant.variant(par))
+    return machines
 
 
 def substeps_of(plant: Plant, c: Controller, setup: Setup, s: Scenario) -> float:

@@ -97,7 +97,7 @@ def _portions(
     t, _, given = inputs
     samples = len(t)
     stages = _stages(plant, scenario, controller.sample_time)
-    noise = sensor_noise(stages, scenario, t)
+    noise = sensor_noise(simulation, stages, t)
     steps = substeps_of(plant, controller, setup, scenario)
     fast = electronics_noise(simulation, substeps_until(samples, steps))
     start = initial_state_function(plant, controller, setup)

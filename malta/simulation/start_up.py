@@ -74,7 +74,7 @@ def observer(simulation: Simulation, substeps: int) -> Observer:
         rows = []
         sense, none = sensors(machine), np.zeros((0, 0))
         for k in range(len(given)):
-            y = np.array(sense(state, given[k], noise[k], [])[0]).ravel()
+            y = np.array(sense(state, given[k], noise[k], [])[0]).ravel()[: len(c.measurements)]
             if not started:
                 _start_filter(filter_, c, y)
                 started = True

@@ -15,13 +15,18 @@ import casadi as ca
 
 from malta.machines.tubular.modules import bearing_constants
 from malta.machines.tubular.windings import AXES, WEIGHT, to_axes, to_phases
-from malta.model.drive import Drive
+from malta.model.drive import CurrentSensors, Drive
 from malta.model.plant import Signal
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from malta.machines.tubular.plant import Parameters
+
+
+# Signs of the offsets of the 18 current sensors, i_11 i_12 ... of module 1, then of module 2: 1 where k is a square
+# modulo 19. This pattern shows in every axis that makes a force; equal offsets would cancel at the star points.
+SIGNS = tuple(1 if any((n * n - k) % 19 == 0 for n in range(19)) else -1 for k in range(1, 19))
 
 
 def drive(par: Parameters) -> Drive:
@@ -47,7 +52,15 @@ def drive(par: Parameters) -> Drive:
         supply_resistance=par.R_dc,
         pwm_step=par.f_pwm / par.f_clk,
         dead_share=par.t_dead * par.f_pwm,
+        sensors=_current_sensors(par),
     )
+
+
+def _current_sensors(par: Parameters) -> CurrentSensors | None:
+    """The sensors of the phase currents; None where they are ideal."""
+    if all(isinstance(value, float) and value == 0 for value in (par.s_i, par.d_i, par.q_i)):
+        return None
+    return CurrentSensors(par.s_i, tuple(sign * par.d_i for sign in SIGNS), par.q_i)
 
 
 def _of_both_modules(par: Parameters, transform: Callable[[Any], Any], x: Any) -> Any:

@@ -92,6 +92,9 @@ class Parameters:
     e_y: float = si("m", default=0)
     c_x: float = si("m", default=0)  # centre of gravity off the mover's axis, in frame R
     c_y: float = si("m", default=0)
+    s_i: float = si("A", at_least=0, default=0)  # noise of a current sensor, rms of a sample
+    d_i: float = si("A", default=0)  # offset of each current sensor, with signs of drive.py
+    q_i: float = si("A", at_least=0, default=0)  # steps of a current sensor
     preset: str = "custom"
 
     def __post_init__(self) -> None:
