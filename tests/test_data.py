@@ -26,7 +26,7 @@ DATA = Path("data/tubular.toml")
 ASSUMED = {"l_S", "g", "F_c", "phi_c", "V_max", "I_max", "T_d", "s_r", "s_z"} | {  # where the paper is silent
     "k_t", "d_t", "R_dc", "f_clk", "t_dead",
     "dK_A", "dK_B", "kappa", "e_x", "e_y", "c_x", "c_y",
-    "s_i", "d_i", "q_i",
+    "s_i", "d_i", "q_i", "tau_s", "T_s",
 }  # fmt: skip
 TRUNCATION_STEP = 7  # bytes
 

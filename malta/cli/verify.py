@@ -96,7 +96,7 @@ def verify(
     forces hold and the mover carries in flight.
 
     The machine is the one in the file, with the changes given by --set, as far as they shape the linear loop (on MALTA
-    m, K_A, K_B, l_B, F_c, T_d; windings and DC link do not).
+    m, K_A, K_B, dK_A, l_B, F_c, T_d, tau_s; windings and DC link do not).
 
     \b
     Example:  malta verify design/gains/calibrated.json --set m=0.56

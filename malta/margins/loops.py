@@ -32,6 +32,7 @@ from malta.margins.uncertain import (
 from malta.model.data import plant_of
 from malta.model.linearize import LinearModel, linearize
 from malta.model.plant import position_at, position_in, trim
+from malta.model.sensors import whole_samples, with_lags
 from malta.synthesis.controller import Controller, LinearLaw, linear_law, with_readings, with_slope
 from malta.synthesis.riccati import add_lags, delay_inputs, sample
 
@@ -53,6 +54,12 @@ class Loop:
     Cd: FloatArray
     control: LinearLaw
     sample_time: float  # s
+    true: FloatArray | None = None  # outputs of the states, where sensors read them late; None: Cd
+
+    @property
+    def outputs(self) -> FloatArray:
+        """The matrix of the true outputs, which Cd reads."""
+        return self.Cd if self.true is None else self.true
 
     @property
     def closed(self) -> FloatArray:
@@ -85,12 +92,14 @@ def loop(
     delay: int = 0,
     current_loops: bool = False,
     feedforward: bool = False,
+    sensors: bool = False,
 ) -> Loop:
     """The sampled loop of a machine and a controller.
 
     delay : samples between measurement and force
     current_loops : whether forces follow their commands with a first-order lag at the loops' crossover
     feedforward : whether the slope of v0(z) acts, for models at their trim, where the slope of the loads acts
+    sensors : whether the machine's sensors read late; their readings are states after the machine's
 
     The controller commutates with its own parameters, and the currents produce forces with the machine's parameters.
     """
@@ -98,27 +107,36 @@ def loop(
     A, B, C = model.A, model.B, model.C
     if model.E.any():
         A, B = A - model.E @ C, np.hstack([B, model.E])
-    lag = model.plant.actuator.crossover
+    lag, true = model.plant.actuator.crossover, None
+    if sensors and model.plant.sensors is not None:
+        true = C
+        A, B, C = (np.array(ca.DM(M)) for M in with_lags(model.plant.sensors, A, B, C))
     if current_loops and math.isfinite(lag):
         A, B = add_lags(A, B, lag)
     Ad, Bd = delay_inputs(*sample(A, B, controller.sample_time), delay)
-    Cd = np.hstack([C, np.zeros((len(C), len(Ad) - C.shape[1]))])
+    Cd, true = _padded(C, len(Ad)), None if true is None else _padded(true, len(Ad))
     if feedforward:
         law = with_slope(law, feedforward_slope(model, controller))
     if model.E.any():
         law = with_readings(law)
-    return Loop(Ad, Bd, Cd, law, controller.sample_time)
+    return Loop(Ad, Bd, Cd, law, controller.sample_time, true)
+
+
+def _padded(C: FloatArray, n: int) -> FloatArray:
+    """C of the first states as a matrix of all n."""
+    return np.hstack([C, np.zeros((len(C), n - C.shape[1]))])
 
 
 def machine_loop(model: LinearModel, controller: Controller) -> Loop:
-    """The loop as the machine runs it: hold, the machine's delay, current loops, loads against v0(z) at the trim.
+    """The loop as the machine runs it: hold, delay, current loops, late sensors, loads against v0(z) at the trim.
 
-    Raises CheckError when no input holds the machine at the model's operating point.
+    Raises CheckError when no input holds the machine at the model's operating point, and InputError for a dead time of
+    its sensors that is not whole samples.
     """
     plant = model.plant
     loaded = linearize(plant, trim(plant, **position_at(plant, model.operating_point.x)))
-    delay = plant.actuator.delay(controller.sample_time)
-    return loop(loaded, controller, delay=delay, current_loops=True, feedforward=True)
+    delay = plant.actuator.delay(controller.sample_time) + whole_samples(plant, controller.sample_time)
+    return loop(loaded, controller, delay=delay, current_loops=True, feedforward=True, sensors=True)
 
 
 @lru_cache(maxsize=8)  # every stage needs it; records compare by identity, so no entry is stale
@@ -142,12 +160,13 @@ def machine_law(
     current_loops : "lag", first-order lags at the crossover, or "pi", the PI controllers on the windings
     use : of the reading besides the law
 
-    Raises InputError for other current loops, and for PI loops that run faster than the control law.
+    Raises InputError for other current loops, for PI loops that run faster than the control law, and for a dead time
+    of the sensors that is not whole samples.
     """
     if current_loops not in get_args(CurrentLoops):
         raise InputError("verify", "current_loops", repr(current_loops), "lag or pi")
     a = plant.actuator
-    delay = a.delay(controller.sample_time)
+    delay = a.delay(controller.sample_time) + whole_samples(plant, controller.sample_time)
     if current_loops == "lag" or controller.current_loop is None:
         return sampled_law(controller, delay, a.crossover, use=use)
     if plant.windings is None:
@@ -165,9 +184,10 @@ def machine_system(
     """The machine at the states `at` in parameters by name, and its control law: the arguments of robust_margin."""
     believed = plant_of(controller.parameters)
     if not is_commutated(believed):
-        return of_plant(plant, names, at=at, believed=believed), machine_law(plant, controller, current_loops)
+        system = of_plant(plant, names, at=at, believed=believed, late=True)
+        return system, machine_law(plant, controller, current_loops)
     H = held_gain(believed, position_in(believed, believed.at(**at).x))
-    system = of_plant(plant, names, at=at, believed=believed, held=H)
+    system = of_plant(plant, names, at=at, believed=believed, held=H, late=True)
     handed = system.matrices.size2_out(1) > len(H)
     return system, machine_law(plant, controller, current_loops, use=ReadingUse(H, handed))
 
@@ -188,6 +208,8 @@ def loaded_system(
         A, left = A - model.E @ C, model.E - B @ H
         handed = bool(np.abs(left).max() > ROUNDING * np.abs(model.E).max())
         B, use = np.hstack([B, left]) if handed else B, use._replace(held=H, handed=handed)
+    if plant.sensors is not None:
+        A, B, C = (np.array(ca.DM(M)) for M in with_lags(plant.sensors, A, B, C))
     none = ca.SX.sym("p", 0)
     matrices = ca.Function("matrices", [none], [ca.SX(ca.DM(M)) for M in (A, B, C)])
     return UncertainSystem((), np.zeros(0), matrices), machine_law(plant, controller, current_loops, use=use)

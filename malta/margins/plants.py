@@ -22,7 +22,8 @@ from malta.margins.uncertain import (
     upper_limit,
 )
 from malta.model.parameters import shape_parameters, units_of
-from malta.model.plant import Plant, position_in, readonly
+from malta.model.plant import Plant, position_in, readonly, symbolic
+from malta.model.sensors import LateSensors, with_lags
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
@@ -38,6 +39,7 @@ def of_plant(
     states: bool = False,
     believed: Plant | None = None,
     held: FloatArray | None = None,
+    late: bool = False,
 ) -> UncertainSystem:
     """The design model of a plant at a position along its stroke, in parameters by name, at its preload.
 
@@ -47,6 +49,7 @@ def of_plant(
     believed : the machine with the controller's parameters; None: the plant itself
     held : the gain H of currents that are held between samples (`held_gain`): the inputs are v + H y, and the reading y
         is a further input when the parameters change its gain
+    late : whether the outputs are read behind the lags of the plant's sensors, as further states
 
     The inputs are commanded forces: the controller commutates with its own parameters, and the currents produce forces
     with the plant's parameters.
@@ -80,12 +83,31 @@ def of_plant(
         if held is not None:
             A, left = A - E @ C, E - B @ ca.DM(held)
             B = ca.horzcat(B, left)
+    if late:
+        A, B, C = with_lags(_sensors_in(plant, p, names), A, B, C)
     if states:
         C = ca.vertcat(C, ca.DM.eye(len(plant.controlled)))
     bounds = {f.name: (lower_limit(f.metadata), upper_limit(f.metadata)) for f in fields(par)}
     limits = tuple(bounds.get(name, (-math.inf, math.inf)) for name in names)
     matrices = ca.Function("matrices", [p], [A, B, C])
     return UncertainSystem(tuple(names), readonly(nominal), matrices, limits=limits)
+
+
+def _sensors_in(plant: Plant, p: Any, names: Sequence[str]) -> LateSensors | None:
+    """The sensors of a plant in symbols p of these parameters.
+
+    Raises InputError for an uncertain lag whose nominal value is none.
+    """
+    symbols = {name: p[k] for k, name in enumerate(names) if name != plant.stroke}
+    if plant.sensors is None and all(getattr(plant.parameters, name) for name in symbols):
+        return None  # no uncertain parameter is a lag of 0 s
+    sensors: LateSensors | None = plant.variant(symbolic(plant.parameters, symbols)).sensors
+    nominal = [] if plant.sensors is None else plant.sensors.lagging
+    if sensors is not None and sensors.lagging != nominal:
+        raise InputError(
+            "uncertain", "sensors", "an uncertain lag of 0 s", "one above 0 s, set in the machine"
+        )
+    return sensors
 
 
 def _check_names(plant: Plant, names: Any) -> None:

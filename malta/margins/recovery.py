@@ -8,7 +8,7 @@
          +------------------------+
 
 The load acts between samples, as a constant of the continuous machine: x' = A x + B v + B_w w, sampled exactly. Outputs
-are read at the samples.
+are the true ones at the samples, also where sensors read them late.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from malta.margins.loops import Loop, machine_loop
 from malta.margins.responses import find_peaks
 from malta.model.linearize import LinearModel, linearize
 from malta.model.plant import position_at, position_in, trim
+from malta.model.sensors import with_lags
 from malta.synthesis.riccati import sample
 from malta.synthesis.step_response import StepResponse, step_response
 from malta.threads import on_one_thread
@@ -160,7 +161,7 @@ class PushedLoop:
         """Answer a unit step of every disturbance. Raises CheckError for an unstable loop."""
         law, k = self.loop.control, len(self.loop.control.A)
         g = np.vstack([self.pushed, np.zeros((k, self.pushed.shape[1]))])
-        C = np.hstack([self.loop.Cd, np.zeros((len(self.loop.Cd), len(law.A)))])
+        C = np.hstack([self.loop.outputs, np.zeros((len(self.loop.Cd), len(law.A)))])
         return step_response(self.loop.closed, g, C, self.loop.sample_time)
 
     def compliance(self, w: FloatArray, load: FloatArray) -> ComplexArray:
@@ -170,10 +171,13 @@ class PushedLoop:
         P = np.linalg.solve(
             z * np.eye(len(loop.Ad)) - loop.Ad, np.hstack([loop.Bd, self.pushed @ load[:, None]])
         )
-        P = loop.Cd @ P
+        P, true = loop.Cd @ P, loop.outputs @ P
         F = law.C @ np.linalg.solve(z * np.eye(len(law.A)) - law.A, law.B_y) + law.D_y
         m = loop.Bd.shape[1]
-        return np.asarray(np.linalg.solve(np.eye(len(loop.Cd)) - P[..., :m] @ F, P[..., m:])[..., 0])
+        read = np.linalg.solve(np.eye(len(loop.Cd)) - P[..., :m] @ F, P[..., m:])
+        if loop.true is None:
+            return np.asarray(read[..., 0])
+        return np.asarray((true[..., m:] + true[..., :m] @ F @ read)[..., 0])
 
 
 def sampled_push(model: LinearModel, Ts: float, size: int) -> FloatArray:
@@ -182,7 +186,10 @@ def sampled_push(model: LinearModel, Ts: float, size: int) -> FloatArray:
     model : at its trim; between samples its currents are held
     """
     A = model.A - model.E @ model.C if model.E.any() else model.A
-    return push_through(A, disturbance_map(model), Ts, size)
+    A, B_w, _ = (
+        np.array(ca.DM(M)) for M in with_lags(model.plant.sensors, A, disturbance_map(model), model.C)
+    )
+    return push_through(A, B_w, Ts, size)
 
 
 def push_through(A: FloatArray, B_w: FloatArray, Ts: float, size: int) -> FloatArray:

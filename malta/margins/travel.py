@@ -132,6 +132,8 @@ def _anywhere(
     law = machine_law(plant, controller, current_loops)
     if not _is_long(plant, controller, names) or law.delay != 1 or law.lag is not None:
         return None
+    if plant.sensors is not None:  # the axes have no states for readings
+        return None
     along = _along(plant, controller, names, current_loops)
     try:
         if position is None:

@@ -80,6 +80,16 @@ def is_default(record: Parameters, name: str) -> bool:
     return default is not MISSING and bool(getattr(record, name) == default)
 
 
+def describe(record: Parameters) -> str:
+    """The text of a record, as repr has it, without the parameters that have their defaults."""
+    entries = [
+        f"{f.name}={getattr(record, f.name)!r}"
+        for f in fields(record)
+        if "unit" not in f.metadata or not is_default(record, f.name)
+    ]
+    return f"{type(record).__qualname__}({', '.join(entries)})"
+
+
 def acting_names(record: Parameters) -> list[str]:
     """The names of the parameters that are symbols in simulations: those of `symbolic_names` without their defaults."""
     return [name for name in symbolic_names(record) if not is_default(record, name)]

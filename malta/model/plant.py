@@ -19,6 +19,7 @@ import numpy as np
 from malta.errors import CheckError, InputError
 from malta.model.checks import DEFAULT, defaults
 from malta.model.drive import CasadiFn, Drive, Electronics
+from malta.model.sensors import LateSensors
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
@@ -125,6 +126,7 @@ class Plant:
     bearing: CasadiFn = DEFAULT  # x -> w of the touchdown bearings; zero without contact
     sense: CasadiFn = DEFAULT  # (x, sensor errors) -> y without noise; default: h
     sensor_errors: tuple[Signal, ...] = ()
+    sensors: LateSensors | None = None  # None: they read at once
     noise: tuple[float, ...] = ()  # of each sensor, rms of a sample, in the unit of the output; default: zero
     uniform: bool = False  # whether the noise is uniform; else normal
     resolution: tuple[float, ...] = ()  # of each sensor, in the unit of the output; 0: not quantized

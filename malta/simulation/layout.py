@@ -44,6 +44,8 @@ class Setup:
     outside: bool = False  # a Kalman filter of start_up.py makes the estimate
     anticipated: bool = False  # forces beside v0 counter a disturbance that is known in advance
     open_loop: bool = False  # feedforward alone, commutated for the reference
+    lagging: bool = False  # sensors with a lag
+    late: int | None = None  # sensors with a dead time, of so many whole samples and a rest; None: without
     current_sensors: bool = False  # the current controllers read sensors with noise, offsets and steps
     electronics: Any = None  # options of the machine's own electronics
 
@@ -86,6 +88,8 @@ def layout_of(plant: Plant, c: Controller, s: Setup) -> Layout:
         electric_state |= fast.state
     elif s.fidelity != "force":
         electric_state = {"i": axes, "link": 1} if s.fidelity == "dq" else {"i_phase": phases, "link": 1}
+    electric_state |= {"lagged": p} if s.lagging else {}
+    electric_state |= {} if s.late is None else {"late": p * (s.late + 2), "clock": 1}
     held = command_size(plant, s)
     controller = {"xi_pred": n, "e": p, "frozen": p}
     if driven:

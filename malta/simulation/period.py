@@ -44,6 +44,7 @@ from malta.simulation.layout import (
     signals_of,
     with_symbols,
 )
+from malta.simulation.readings import initial_readings, measurement
 from malta.simulation.substep import advance
 from malta.synthesis.controller import Controller, commanded, estimated, filtered, looking_ahead
 
@@ -83,7 +84,7 @@ def period_of(
     fast = electronics_of(plant, s)
     jitter = ca.SX.sym("jitter", 0 if fast is None else fast.noises)
 
-    measured = _measurement(loop, machine["x"], noise[:outputs])
+    measured = measurement(loop, machine, noise[:outputs])
     if s.faulty:
         measured = ca.if_else(given["stuck"], controller["y_last"], measured)
     first, last = g["grid_ends"][0], g["grid_ends"][1]
@@ -135,7 +136,7 @@ def initial_state(plant: Plant, c: Controller, s: Setup, x: Any, xi_pred: Any, c
     """
     actuator, fast = plant.actuator, electronics_of(plant, s)
     x, current = ca.SX(x), ca.SX(current)
-    values: dict[str, Any] = {"x": x, "i_coil": current, "xi_pred": xi_pred}
+    values: dict[str, Any] = {"x": x, "i_coil": current, "xi_pred": xi_pred} | initial_readings(plant, s, x)
     values |= {"y_last": plant.h(x, 0), "command": current}
     if fast is not None:
         values |= fast.start(x, current) | {"command": fast.held(current, plant.h(x, 0))}
@@ -275,22 +276,3 @@ def _scheduled_C(c: Controller, y: Any) -> Any:
     C = ca.jacobian(believed.h(x, 0), x)[:, list(believed.controlled)]
     at = ca.substitute(C, x, rest)
     return ca.horzcat(at, ca.SX(at.shape[0], len(c.states) - at.shape[1]))
-
-
-def _measurement(loop: Loop, x: Any, noise: Any) -> Any:
-    """y at a state x: outputs with the errors of the sensors, noise and, where the setup says so, resolution."""
-    plant = loop.plant
-    y = (plant.sense(x, loop.numbers["errors"]) if loop.setup.sensed else plant.h(x, 0)) + noise
-    if not loop.setup.quantize:
-        return y
-    steps = plant.resolution
-    return ca.vertcat(
-        *(
-            y[i] if _is_zero(step) else ca.if_else(step > 0, step * ca.floor(y[i] / step + 0.5), y[i])
-            for i, step in enumerate(steps)
-        )
-    )
-
-
-def _is_zero(step: Any) -> bool:
-    return isinstance(step, float | int) and step == 0

@@ -13,6 +13,7 @@ import numpy as np
 from malta.errors import InputError
 from malta.model.parameters import units_of
 from malta.model.plant import Plant
+from malta.model.sensors import split_dead_time
 from malta.simulation import references
 from malta.simulation.layout import FIDELITIES, Fidelity, Setup, electronics_of, fidelities
 from malta.simulation.references import Profile, Reference
@@ -210,7 +211,12 @@ def setup_of(plant: Plant, c: Controller, s: Scenario) -> Setup:
             raise InputError(where, f"sensor_errors.{name}", "an unknown error", "one of " + " ".join(known))
         if not math.isfinite(value):
             raise InputError(f"scenario {s.name}", f"sensor_errors.{name}", repr(value), "a finite number")
-    driven = s.fidelity != "force" and not own
+    driven, machines = s.fidelity != "force" and not own, machines_of(plant, s)
+    dead_time = 0.0 if plant.sensors is None else plant.sensors.dead_time
+    if dead_time and own:
+        found = "sensors with a dead time beside electronics of their own pace"
+        raise InputError(f"scenario {s.name}", "fidelity", found, "force, or sensors without dead time")
+    late = split_dead_time(dead_time, c.sample_time)[0] if dead_time else None
     return Setup(
         fidelity=s.fidelity,
         delay=plant.actuator.delay(c.sample_time) if s.delay is None else s.delay,
@@ -225,8 +231,9 @@ def setup_of(plant: Plant, c: Controller, s: Scenario) -> Setup:
         outside=s.estimator != "steady-state",
         anticipated=s.anticipated is not None,
         open_loop=s.open_loop,
-        current_sensors=driven
-        and any(machine.drive.sensors is not None for machine in machines_of(plant, s)),
+        lagging=any(machine.sensors is not None and bool(machine.sensors.lagging) for machine in machines),
+        late=late,
+        current_sensors=driven and any(machine.drive.sensors is not None for machine in machines),
         electronics=s.electronics,
     )
 

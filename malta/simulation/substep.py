@@ -11,12 +11,22 @@ import casadi as ca
 from malta.model.plant import Plant
 from malta.simulation import inverter
 from malta.simulation.layout import Loop, Setup, Signals, electronics_of
+from malta.simulation.readings import step_readings
 
 OPENING = 20e-6  # s, time constant with which the current of an open phase decays
 
 
 def advance(loop: Loop, signals: Signals, held: Any, jitter: Any) -> Any:
     """The machine's state after one Runge–Kutta step under held commands, or after one period of its electronics."""
+    sensors = ("lagged", "late", "clock")
+    own = {name: value for name, value in signals.machine.items() if name not in sensors}
+    moved = _move(loop, signals._replace(machine=own), held, jitter)
+    after = step_readings(loop, signals.machine, moved[: len(loop.plant.states)])
+    return ca.vertcat(moved, *(after[name] for name in signals.machine if name in sensors))
+
+
+def _move(loop: Loop, signals: Signals, held: Any, jitter: Any) -> Any:
+    """The same without the sensors' states."""
     plant, s, h = loop.plant, loop.setup, loop.numbers["substep"]
     machine, given = signals.machine, signals.given
     # Structural zeros cost nothing.

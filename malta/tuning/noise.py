@@ -36,5 +36,5 @@ def noise_of(loop: Loop, plant: Plant) -> Noise:
     noise = np.vstack([loop.Bd @ c.D_y, c.B_y])
     X, n = covariance(loop.closed, noise * V @ noise.T), len(loop.Ad)
     command = np.hstack([c.D_y @ loop.Cd, c.C])
-    out = np.diag(loop.Cd @ X[:n, :n] @ loop.Cd.T)
+    out = np.diag(loop.outputs @ X[:n, :n] @ loop.outputs.T)
     return Noise(np.sqrt(out), np.sqrt(np.diag(command @ X @ command.T + c.D_y * V @ c.D_y.T)))

@@ -12,6 +12,7 @@ from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING
 
 from malta.errors import InputError
+from malta.model.parameters import describe
 from malta.tuning import corners, lqg, pid
 from malta.tuning.outcomes import judge
 from malta.tuning.search import DIGITS, Effort, Journal, apply_trial
@@ -57,10 +58,14 @@ def tune(
 
     journal : file of the trials; what is in it is not computed again
 
-    Raises InputError when the design file asks for nothing or lets nothing vary, or the journal is another search's.
+    Raises InputError when the design file asks for nothing or lets nothing vary, for a machine whose sensors read late,
+    and when the journal is another search's.
     """
     if not spec.specification:
         raise InputError(spec.path, "specification", "nothing", "a table of what the design shall reach")
+    if spec.plant.sensors is not None:
+        found = "sensors that read late"
+        raise InputError(spec.path, "machine", found, "sensors without lag: verify takes the lag of a design")
     if not spec.search:
         raise InputError(spec.path, "search", "nothing", "a table of the numbers that may vary")
     trials = Journal(journal, problem_sha256(spec), restart=restart)
@@ -79,5 +84,5 @@ def problem_sha256(spec: Spec) -> str:
     loads = asdict(spec.loads) if spec.loads else None
     pushes = [asdict(bound) for bound in spec.recovery.values()]
     settings = (lqg.FRONT, DIGITS, corners.STEP, corners.NEAR)
-    content = [repr(spec.parameters), asked, loads, pushes, searched, spec.sha256, *settings]
+    content = [describe(spec.parameters), asked, loads, pushes, searched, spec.sha256, *settings]
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()

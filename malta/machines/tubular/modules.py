@@ -65,4 +65,4 @@ def potential(par: Parameters, side: int, P: Any) -> Any:
 
 def _growth(par: Parameters) -> Any:
     """kappa / r_max^2, 1/m^2."""
-    return par.kappa / par.r_max**2
+    return par.kappa / (par.r_max * par.r_max)

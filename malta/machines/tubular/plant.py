@@ -43,6 +43,7 @@ from malta.model.rigidbody import (
     rotate,
     rotation,
 )
+from malta.model.sensors import late_sensors
 
 
 @dataclass(frozen=True)
@@ -95,6 +96,8 @@ class Parameters:
     s_i: float = si("A", at_least=0, default=0)  # noise of a current sensor, rms of a sample
     d_i: float = si("A", default=0)  # offset of each current sensor, with signs of drive.py
     q_i: float = si("A", at_least=0, default=0)  # steps of a current sensor
+    tau_s: float = si("s", at_least=0, default=0)  # lag of the radial sensors and their demodulation
+    T_s: float = si("s", at_least=0, shapes=True, default=0)  # dead time of all position sensors
     preset: str = "custom"
 
     def __post_init__(self) -> None:
@@ -153,6 +156,7 @@ def plant(par: Parameters, *, small_angle: bool = False) -> Plant:
         bearing=trace("bearing", [x], touchdown_bearing(par, x, trig)),
         sense=lambda x, errors: sensed(par, x, errors, trig),
         sensor_errors=SENSOR_ERRORS,
+        sensors=late_sensors((*[par.tau_s] * 4, 0.0), par.T_s),
         travel=par.z_max,
         noise=(par.s_r, par.s_r, par.s_r, par.s_r, par.s_z),
         uniform=False,
