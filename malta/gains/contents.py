@@ -110,10 +110,22 @@ def controller_of(file: GainFile, path: str | Path) -> Controller:
         current_loop=None if file.current_loop is None else CurrentLoop(**file.current_loop.model_dump()),
         limits=Limits(**(unlimited | arrays["limits"])),
         tracks="errors" if errors else "states",
+        pause=_pause(file, layout.plant, path),
         commutation=None
         if file.commutation is None
         else Commutation(file.commutation.lead, **arrays["commutation"]),
     )
+
+
+def _pause(file: GainFile, plant: Plant, path: str | Path) -> FloatArray:
+    """Rates of the references above which sums of errors wait; none where the file has none."""
+    given = None if file.law is None else file.law.pause
+    if given is None:
+        return np.zeros(0)
+    found = _array(given, (len(plant.outputs),), path, "law.pause")
+    if (found < 0).any():
+        raise InputError(path, "law.pause", str(found.tolist()), "rates of at least 0")
+    return found
 
 
 def _tracks_errors(file: GainFile) -> bool:

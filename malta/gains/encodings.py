@@ -33,6 +33,7 @@ MATRICES = (
     "plant.linear.terms.",
 )
 VECTORS = (
+    "law.pause",
     "operating_point.",
     "feedforward.inertia",
     "feedforward.z_grid",

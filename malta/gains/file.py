@@ -29,7 +29,8 @@ A file of version 2 has one more table, and may have others:
 
     law              tracks "states" or "errors": the signals that the control law takes, see synthesis/controller.py;
                      coordinates "signals", or "positions" where cost.integral [n0/2] is of the errors of q and
-                     noise.process [n0/2, m^2/s^4] of its accelerations, see synthesis/kalman.py
+                     noise.process [n0/2, m^2/s^4] of its accelerations, see synthesis/kalman.py;
+                     pause [p, m/s]: sums of errors wait while the reference is faster; 0: never
     plant.linear     of a machine from plain matrices, whose name is "linear" and whose preset its own name:
                      states, inputs, outputs: signals; matrices A, B, C; terms {parameter: A, B, C}; limit [m],
                      noise [p], dead_time [s], as model/linear.py takes them
@@ -91,8 +92,9 @@ def document(controller: Controller, margins: Margins) -> dict[str, Any]:
     in_positions = c.cost is not None and c.cost.coordinates == "positions"
     ahead = c.commutation is not None
     extended = linear or c.tracks == "errors" or not c.feedforward.rate.size or bool(c.lagging) or ahead
-    extended = extended or in_positions or bool(c.feedforward.position.size)
-    law = {"tracks": c.tracks} | ({"coordinates": "positions"} if in_positions else {})
+    extended = extended or in_positions or bool(c.feedforward.position.size) or bool(c.pause.size)
+    law: dict[str, Any] = {"tracks": c.tracks} | ({"coordinates": "positions"} if in_positions else {})
+    law |= {"pause": c.pause} if c.pause.size else {}
     tables: dict[str, Any] = {
         "schema": SCHEMA,
         "version": 2 if extended else 1,

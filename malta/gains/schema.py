@@ -63,6 +63,7 @@ class PlantTable(Record):
 class _Law(Record):
     tracks: Tracks
     coordinates: Coordinates = "signals"
+    pause: Vector | None = None
 
 
 class _OperatingPoint(Record):

@@ -20,6 +20,7 @@ from malta.model.data import plant_of
 from malta.model.linearize import LinearModel, linearize
 from malta.synthesis.controller import Controller
 from malta.synthesis.riccati import add_integrals, eigenvalues
+from malta.synthesis.sampled import gain_at_rest
 from malta.threads import on_one_thread
 
 if TYPE_CHECKING:
@@ -244,10 +245,8 @@ def _natural_frequencies(model: LinearModel, controller: Controller) -> dict[str
     if not n or controller.tracks == "errors":
         return {}
     K = controller.K[:, :n]
-    if controller.lagging:  # at rest forces are what is commanded: v = -K q - K_f v
-        m, known = len(K), controller.lagging + controller.delay
-        under_way = controller.K[:, len(controller.A) :][:, : m * known]
-        K = np.linalg.solve(np.eye(m) + under_way.reshape(m, known, m).sum(axis=1), K)
+    if controller.lagging:
+        K = gain_at_rest(controller.K, len(controller.A), controller.lagging + controller.delay)
     closed = model.force_map @ K - model.stiffness
     w_n = np.sqrt(np.maximum(eigenvalues(closed).real, 0))
     return {"w_n_max": float(w_n.max()), "w_n_min": float(w_n.min())}

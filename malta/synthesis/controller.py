@@ -7,7 +7,8 @@
                 +------------------------ y = p + noise <-------------+
 
 At every sample:
-  1. y = measured outputs;                      e += Ts (p* - y), frozen on the axes that saturated last
+  1. y = measured outputs;                      e += Ts (p* - y), frozen on the axes that saturated last, and on
+                                                those whose reference moves faster than `pause`, where there is one
   2. xi_hat = xi_pred + L (y - Cd xi_pred)                                     (steady-state Kalman filter)
   3. v_fb = K (xi* - xi_hat) + Ki e             with xi* = (P(z*)^-1 p*, its derivative)
   4. v = saturate(v_fb + v_ff + v0(z)),         v_ff = inertia p*'' + speed p*' + position q*, z the measured stroke
@@ -179,6 +180,9 @@ class Controller:
     feedforward: Feedforward
     current_loop: CurrentLoop | None  # None: currents follow their commands at once
     limits: Limits
+    # p, m/s: sums of errors wait while |p*'| is above it, 0: never; none: nothing waits. A stroke that the machine
+    # follows late or early by its own mass and force constants would charge them, and they would push it past its end.
+    pause: FloatArray = field(default_factory=lambda: np.zeros(0), metadata={"later": True})
     tracks: Tracks = field(default="states", metadata={"later": True})  # what the filter takes: y, or y - p*
     commutation: Commutation | None = field(default=None, metadata={"later": True})  # None: for the place y
 
@@ -265,6 +269,8 @@ def gains_of(c: Controller) -> dict[str, ca.DM]:
     """What the law computes with, sparse: exact zeros cost nothing at run time."""
     matrices = {name: ca.sparsify(ca.DM(getattr(c, name))) for name in ("Ad", "Bd", "Cd", "K", "Ki", "L")}
     matrices |= {"force_limit": ca.DM(c.limits.force), "control_time": ca.DM(c.sample_time)}
+    if c.pause.any():
+        matrices["pause"] = ca.sparsify(ca.DM(c.pause))
     if c.commutation is None:
         return matrices
     lead = c.commutation.lead
@@ -297,6 +303,19 @@ def commanded(
     wanted = g["K"] @ (xi_ref - xi_hat) + g["Ki"] @ e + v_ff + v0
     v = ca.fmax(ca.fmin(wanted, g["force_limit"]), -g["force_limit"])
     return g["Ad"] @ xi_hat + g["Bd"] @ (v - v0), e, v != wanted, v
+
+
+def paused(g: Mapping[str, Any], frozen: Any, dp_ref: Any) -> Any:
+    """The axes whose sums of errors wait: those that saturated, and where p*' is faster than the pause of a law."""
+    if "pause" not in g:
+        return frozen
+    rows = [
+        ca.if_else(ca.fabs(dp_ref[k]) > g["pause"][k], 1, frozen[k])
+        if g["pause"].sparsity().has_nz(k, 0)
+        else frozen[k]
+        for k in range(frozen.numel())
+    ]
+    return ca.vertcat(*rows)
 
 
 def looking_ahead(g: Mapping[str, Any], xi_pred: Any, place: Any, dp_ref: Any) -> tuple[Any, Any]:

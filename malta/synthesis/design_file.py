@@ -89,6 +89,7 @@ def read_design(path: str | Path) -> Spec:
         current_loop_delay=content.current_loop_delay,
         current_lag=content.current_lag,
         position_feedforward=content.position_feedforward,
+        pause=_pause(content.pause, plant, path),
         commutation=content.commutation,
         law=_law(content, plant, path),
         uncertainty=dict(content.uncertainty),
@@ -115,6 +116,20 @@ def _fingerprint(content: DesignFile) -> str:
     other |= {name for name in LATER if getattr(content, name) == DesignFile.model_fields[name].default}
     shaping = json.dumps(content.model_dump(exclude=other, exclude_none=True), sort_keys=True)
     return hashlib.sha256(shaping.encode()).hexdigest()
+
+
+def _pause(given: Mapping[str, Quantity] | None, plant: Plant, path: Path) -> tuple[float, ...]:
+    """Rates of the references above which sums of errors wait, of each output; 0 where none is given."""
+    if given is None:
+        return ()
+    units = {s.name: f"{s.unit} / s" for s in plant.outputs}
+    rates = dict.fromkeys(units, 0.0)
+    for name, q in given.items():
+        if name not in units:
+            raise InputError(path, f"pause.{name}", "an unknown output", "one of " + " ".join(units))
+        si = to_si(q.value, q.unit, units[name], path, f"pause.{name}")
+        rates[name] = positive(si, path, f"pause.{name}", units[name])
+    return tuple(rates.values())
 
 
 def _sample_time(content: DesignFile, path: Path) -> float:

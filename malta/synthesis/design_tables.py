@@ -97,6 +97,7 @@ class DesignFile(Record):
     current_lag: StrictBool = False
     coordinates: Coordinates = "signals"
     position_feedforward: StrictBool = False
+    pause: dict[StrictStr, Quantity] | None = None
     commutation: Place = "measured"
     operating_point: dict[StrictStr, Quantity]
     weights: WeightsTable | None = None

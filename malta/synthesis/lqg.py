@@ -320,7 +320,11 @@ def synthesize(spec: Spec, model: LinearModel) -> Controller:
             controller = commutate_ahead(controller, model)
         except InputError as error:
             raise InputError(spec.path, error.field, error.found, error.expected) from error
-    return replace(controller, spec_sha256=spec.sha256)
+    if spec.pause and not controller.integrating:
+        raise InputError(
+            spec.path, "pause", "a law without sums of errors", "one with integrals, or no pause"
+        )
+    return replace(controller, spec_sha256=spec.sha256, pause=np.array(spec.pause))
 
 
 @on_one_thread

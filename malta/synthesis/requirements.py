@@ -122,6 +122,7 @@ class TrialLoop:
     # Of a unit load on each of the plant's disturbances, at positions of the stroke, m, the operating point first.
     answers: tuple[tuple[float, StepResponse], ...] = ()
     recovery: Mapping[str, RecoveryBound] = field(default_factory=dict)  # what is asked of them
+    known: int = 0  # blocks of forces behind the lag and of the delay among the states of the law
     # m x n / 2, N/m: fed forward of the positions at the reference; none: nothing
     hold: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
 
@@ -132,10 +133,9 @@ class TrialLoop:
         """
         g, Ts, forces = self.gains, self.sample_time, self.Bd.shape[1]
         v_ff = self.hold @ x[: len(x) // 2] if self.hold.size else np.zeros(forces)
-        under_way = (
-            len(g.Ad) - len(x)
-        ) // forces  # blocks of forces; what is fed forward is slow beside them
-        xi = np.concatenate([x, np.tile(v_ff, under_way)])
+        xi = np.zeros(len(g.Ad), dtype=complex)
+        xi[: len(x)] = x
+        xi[len(x) :][: self.known * forces] = np.tile(v_ff, self.known)  # slow beside lag and delay
         v = g.K @ xi + Ts * g.Ki @ p + v_ff
         driven = np.concatenate([self.Bd @ v, g.Bd @ v, Ts * p])[: len(self.closed)]
         states = np.linalg.solve(np.exp(1j * w * Ts) * np.eye(len(self.closed)) - self.closed, driven)

@@ -59,6 +59,16 @@ def held(model: Linear) -> Held:
     return Held(model.A - model.E @ model.C, np.linalg.lstsq(model.B, model.E, rcond=None)[0])
 
 
+def gain_at_rest(K: FloatArray, n: int, known: int) -> FloatArray:
+    """K of the n / 2 positions where forces are what is commanded: v = -K q - K_f v, m x n / 2.
+
+    known : blocks of forces under way among the states, after n mechanical states
+    """
+    m = len(K)
+    under_way = K[:, n : n + m * known].reshape(m, known, m).sum(axis=1)
+    return np.asarray(np.linalg.solve(np.eye(m) + under_way, K[:, : n // 2]))
+
+
 def sampled_model(model: Linear, Ts: float, delay: int = 0) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Ad, Bd, Cd under held currents, with the forces of the last `delay` samples as states."""
     still = held(model)

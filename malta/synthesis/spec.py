@@ -193,6 +193,7 @@ class Spec:
     law: Weights | Pid  # of an LQG, or the gains of a PID
     uncertainty: Mapping[str, float]  # relative, either way, by parameter
     current_lag: bool = False  # whether the lag of the current loops is in the design model
+    pause: tuple[float, ...] = ()  # p, m/s: of the reference, above which sums of errors wait; 0: never
     position_feedforward: bool = False  # whether the forces that hold it at its reference are fed forward
     commutation: Place = "measured"  # for which currents are commutated
     loads: Loads | None = None  # what a PID is judged by

@@ -31,6 +31,7 @@ from malta.synthesis.feedforward import holding_gain, static_feedforward
 from malta.synthesis.lqg import gains
 from malta.synthesis.requirements import Noise, TrialLoop, requirements_for
 from malta.synthesis.riccati import add_lags, delay_inputs, sample
+from malta.synthesis.sampled import gain_at_rest
 from malta.synthesis.spec import Spec, Weights
 from malta.synthesis.step_response import step_response
 from malta.tuning.corners import STEP, SampledMachine, corner_margins
@@ -98,11 +99,11 @@ class Group:
     def part(self, w: Weights) -> Weights:
         """Pick the weights of the group's states, inputs and outputs."""
         i, j, o = (list(index) for index in (self.states, self.inputs, self.outputs))
-        drift = w.drift_variance[j] if w.drift_variance.size else w.drift_variance
         e, f = o, j
         if w.coordinates == "positions":
             half = len(w.q) // 2
             e = f = [k for k in i if k < half]
+        drift = w.drift_variance[f] if w.drift_variance.size else w.drift_variance
         correlation = w.correlation[f] if w.correlation.size else w.correlation
         return Weights(
             w.q[i], w.q_base[i], w.r[j], w.r_base[j], w.q_i[e], w.q_i_base[e],
@@ -309,7 +310,11 @@ def figures_of_gains(spec: Spec, group: Group, g: Gains) -> dict[str, float]:
     if not (np.isfinite(closed).all() and np.abs(np.linalg.eigvals(closed)).max() < 1):
         return {}
     alone = len(group.outputs) == len(spec.plant.outputs)
-    peak, bandwidth = _response(group, g, steady, Ts, alone=alone)
+    known = 0
+    if spec.pid is None:
+        known = (len(g.Ad) - len(group.states)) // len(group.inputs) - bool(spec.weights.drift_variance.size)
+    resting = known if spec.current_lag else 0
+    peak, bandwidth = _response(group, g, steady, Ts, known=resting, alone=alone)
     try:
         answers = tuple((place.position, _answer(place, law, Ts)) for place in group.places)
     except CheckError:
@@ -331,6 +336,7 @@ def figures_of_gains(spec: Spec, group: Group, g: Gains) -> dict[str, float]:
         bandwidth=bandwidth,
         answers=answers,
         recovery=spec.recovery,
+        known=known,
         hold=holding_gain(group.model.A, group.model.B) if spec.position_feedforward else np.zeros((0, 0)),
     )
     figures = {}
@@ -353,8 +359,10 @@ def _answer(place: Place, law: LinearLaw, Ts: float) -> StepResponse:
     return step_response(closed, pushed, C, Ts)
 
 
-def _response(group: Group, g: Gains, law: LinearLaw, Ts: float, *, alone: bool) -> tuple[float, float]:
-    """Peak sensitivity and bandwidth, rad/s.
+def _response(
+    group: Group, g: Gains, law: LinearLaw, Ts: float, *, known: int, alone: bool
+) -> tuple[float, float]:
+    """Peak sensitivity and bandwidth, rad/s; known: blocks of forces under way that count at rest.
 
     Of several groups, the loop gain's last crossing is that of the widest: it binds a group that stands alone.
     """
@@ -363,8 +371,9 @@ def _response(group: Group, g: Gains, law: LinearLaw, Ts: float, *, alone: bool)
     eye = np.eye(len(group.outputs))
     S = np.linalg.inv(eye - group.response @ F)
     T = np.linalg.svd(eye - S, compute_uv=False)
-    half = len(group.states) // 2
-    stiffness = group.model.B[half:] @ g.K[:, :half] - group.model.A[half:, :half]
+    n = len(group.states)
+    half = n // 2
+    stiffness = group.model.B[half:] @ gain_at_rest(g.K, n, known) - group.model.A[half:, :half]
     w_n = math.sqrt(max(float(np.linalg.eigvals(stiffness).real.min()), 0.0))
     bandwidth = min(crossing(group.w, T[:, -1], math.sqrt(0.5)), w_n)
     if alone:
