@@ -167,7 +167,7 @@ def test_the_gain_file_keeps_what_is_new(flagship: Flagship, tmp_path: Path) -> 
     gains.write(shipped, malta.verify(model, shipped), *files)
     for file in files:
         back = gains.read(file)
-        assert back.pause.tolist() == [0, 0, 0, 0, 3e-3]
+        assert back.pause.tolist() == [0, 0, 0, 0, 20e-3]
         assert back.cost is not None
         assert back.noise is not None
         assert back.cost.coordinates == "positions"
@@ -180,9 +180,9 @@ def test_the_gain_file_keeps_what_is_new(flagship: Flagship, tmp_path: Path) -> 
     [
         ('coordinates = "positions"', 'coordinates = "modes"', "coordinates"),
         ('coordinates = "positions"', 'coordinates = "signals"', ""),
-        ('pause = { z = { value = 3, unit = "mm/s" } }', 'pause = { z = { value = 3, unit = "mm" } }', "pause.z"),
-        ('pause = { z = { value = 3, unit = "mm/s" } }', 'pause = { w = { value = 3, unit = "mm/s" } }', "pause.w"),
-        ('pause = { z = { value = 3, unit = "mm/s" } }', 'pause = { z = { value = 0, unit = "mm/s" } }', "pause.z"),
+        ('pause = { z = { value = 20, unit = "mm/s" } }', 'pause = { z = { value = 3, unit = "mm" } }', "pause.z"),
+        ('pause = { z = { value = 20, unit = "mm/s" } }', 'pause = { w = { value = 3, unit = "mm/s" } }', "pause.w"),
+        ('pause = { z = { value = 20, unit = "mm/s" } }', 'pause = { z = { value = 0, unit = "mm/s" } }', "pause.z"),
         ("correlation = { x = 0.6719", "correlation = { x = 1.5", "noise.correlation.x"),
     ],
 )  # fmt: skip
@@ -199,7 +199,7 @@ def test_a_pause_without_sums_is_refused(tmp_path: Path) -> None:
     text = (ROOT / "design" / "robust_observer.toml").read_text(encoding="utf-8")
     text = text.replace('"../data/', f'"{(ROOT / "data").as_posix()}/')
     path = tmp_path / "observer.toml"
-    path.write_text('pause = { z = { value = 3, unit = "mm/s" } }\n' + text, encoding="utf-8")
+    path.write_text('pause = { z = { value = 20, unit = "mm/s" } }\n' + text, encoding="utf-8")
     spec = malta.read_design(path)
     found = refusal(lambda: malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at())), path)
     assert found.field == "pause"
@@ -234,7 +234,7 @@ def test_both_engines_wait_alike(flagship: Flagship, monkeypatch: pytest.MonkeyP
     from malta.simulation import compiled as compiling
 
     spec, _, shipped = flagship
-    scenario = replace(malta.Scenario.stroke(noise=0.0, quantize=False, fidelity="force"), duration=0.04)
+    scenario = replace(malta.Scenario.stroke(noise=0.0, quantize=False, fidelity="force"), duration=0.08)
     compiled = malta.simulate(spec.plant, shipped, scenario)
     monkeypatch.setattr(compiling, "compiler", lambda: None)
     interpreted = malta.simulate(spec.plant, shipped, scenario)

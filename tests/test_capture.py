@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from malta.model.linearize import LinearModel
     from malta.model.plant import Plant
 
-ROBUST = "design/gains/robust_loads.json"
+ROBUST = "design/gains/robust.json"
 STILL = np.zeros(10)
 
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from malta.machines.tubular.plant import Parameters
     from malta.model.plant import Plant
 
-ROBUST = "design/gains/robust_loads.json"
+ROBUST = "design/gains/robust.json"
 
 
 def test_the_carrier_goes_as_far_as_it_should() -> None:

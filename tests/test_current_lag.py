@@ -106,7 +106,7 @@ def test_the_gain_file_says_so(made: Made, tmp_path: Path) -> None:
         assert (back.lagging, back.delay) == (1, 1)
     content = json.loads(files[0].read_text(encoding="utf-8"))
     assert content["version"] == 2
-    assert content["law"] == {"tracks": "states", "coordinates": "positions", "pause": [0, 0, 0, 0, 0.003]}
+    assert content["law"] == {"tracks": "states", "coordinates": "positions", "pause": [0, 0, 0, 0, 0.02]}
 
 
 def test_where_there_is_no_such_lag_it_is_refused(made: Made, tmp_path: Path) -> None:

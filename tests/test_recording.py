@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from malta.model.plant import FloatArray, Plant
     from malta.synthesis.controller import Controller
 
-ROBUST = "design/gains/robust_loads.json"
+ROBUST = "design/gains/robust.json"
 FORCES = np.array([0.1, 1.0, -0.2, 2.0, 0.5])
 
 
@@ -90,7 +90,7 @@ def test_the_simulated_record_is_the_machines_statics() -> None:
 
 @pytest.mark.slow
 def test_observed_disturbances_record_as_well() -> None:
-    spec = malta.read_design("design/robust_loads.toml")
+    spec = malta.read_design("design/robust.toml")
     weights = replace(spec.weights, q_i=np.zeros(5), drift_variance=np.full(5, 1e-3))
     model = malta.linearize(spec.plant, spec.plant.at())
     observing = malta.lqg(model, weights, spec.sample_time, delay=1, current_lag=True)
@@ -189,19 +189,19 @@ def recorded() -> Experiment:
     return malta.experiment("record-v0", malta.plant_of(controller.parameters), controller)
 
 
-def _rms(e: Experiment, label: str) -> float:
+def _axial_error(e: Experiment, label: str) -> float:
     case = next(case for case in e.cases if case.label == label)
-    return next(merit.value for merit in case.merits if merit.label == "axial error, rms")
+    return next(merit.value for merit in case.merits if merit.label == "axial error")
 
 
 def test_the_recorded_v0_takes_an_error_of_the_cogging_off(recorded: Experiment) -> None:
     """The stroke is as good as with the right v0, whichever way the cogging is displaced."""
-    right = _rms(recorded, OWN)
-    assert _rms(recorded, RECORDED) == pytest.approx(right, rel=0.05)
+    right = _axial_error(recorded, OWN)
+    assert _axial_error(recorded, RECORDED) == pytest.approx(right, rel=0.05)
     for side in ("more", "less"):
-        known = _rms(recorded, f"phi_c 0.5 rad {side}: {RECORDED}")
+        known = _axial_error(recorded, f"phi_c 0.5 rad {side}: {RECORDED}")
         assert known == pytest.approx(right, rel=0.05)
-        assert abs(_rms(recorded, f"phi_c 0.5 rad {side}: {OWN}") / right - 1) > 0.1
+        assert abs(_axial_error(recorded, f"phi_c 0.5 rad {side}: {OWN}") / right - 1) > 0.1
     assert [case.label for case in recorded.cases[:3]] == [SLOW, OWN, RECORDED]
     assert recorded.merits[4].value < 0.05  # N of thrust, of a cogging of 0.5 N
 
@@ -224,14 +224,14 @@ def test_the_gain_file_holds_the_recorded_v0(run: Run, recorded: Experiment, tmp
     code, out, err = run(*once, "--option", f"log={log}")
     assert (code, err) == (0, "")
     assert "slow stroke" not in out
-    c = malta.gains.read(tmp_path / "robust_loads_recorded.json")
+    c = malta.gains.read(tmp_path / "robust_recorded.json")
     wanted = recorded.controller
     assert wanted is not None
-    assert c.name == wanted.name == "robust_loads_recorded"
+    assert c.name == wanted.name == "robust_recorded"
     assert np.array_equal(c.feedforward.v0, wanted.feedforward.v0)
     assert np.array_equal(c.feedforward.z_grid, wanted.feedforward.z_grid)
     assert np.array_equal(c.K, malta.gains.read(ROBUST).K)
-    assert f"wrote {tmp_path}/robust_loads_recorded.mat" in out
+    assert f"wrote {tmp_path}/robust_recorded.mat" in out
     code, out, err = run(*once[:6], "--option", "log=none.csv")
     assert (code, out) == (2, "")
     assert err == "malta: none.csv: found no such file, expected a log of a run\n"

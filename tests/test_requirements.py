@@ -100,7 +100,7 @@ def test_a_search_sees_a_filter_that_observes_forces(robust: Spec) -> None:
     """In place of integrals: the figures of a trial are those of the judged design."""
     weights = replace(robust.weights, q_i=np.zeros(5), drift_variance=np.full(5, 1e-3))
     asked = {name: robust.specification[name] for name in ("radial_motion", "axial_motion", "force_noise")}
-    spec = replace(robust, law=weights, specification=asked)
+    spec = replace(robust, law=weights, specification=asked, pause=())
     figures = merge([figures_of(spec, g, weights, 0) for g in groups_of(spec)], at_least_of(spec.plant))
     rows = {r.name: r.found for r in judge(spec) if r.how == "covariance"}
     assert figures["thrust_noise"] > 0
