@@ -676,7 +676,7 @@ def test_the_rule_of_thumb_by_hand(found: Found) -> None:
             ratio = found.value(f"bandwidth over unstable pole: last {kind} dB", name)
             assert ratio * 218.92 == pytest.approx(found.value(f"bandwidth: last {kind} dB", name), rel=1e-4)
     claim = found.claim("bandwidth over unstable pole: last −3")
-    assert claim.verdict.startswith("table2: not reproduced; calibrated: reproduced")
+    assert claim.verdict.startswith("table2: not reproduced; calibrated: larger, x 2.0")
     assert f"{400 / 218.92:.2f} times its 218.92" in claim.verdict
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import warnings
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -20,6 +21,7 @@ from malta.campaigns.plan import fingerprint
 from malta.gains import encodings
 from malta.margins.loops import machine_loop
 from malta.simulation.generic import jump
+from malta.synthesis import kalman as kalman_filter
 from malta.synthesis import lqg, riccati
 
 if TYPE_CHECKING:
@@ -73,10 +75,12 @@ def shipped(request: pytest.FixtureRequest) -> Design:
     with pytest.MonkeyPatch.context() as patch:
         for name in asked:
             patch.setattr(lqg, name, partial(noted, name))
-        lqg.lqr(model, spec.weights)
-        lqg.kalman(model, spec.weights)
-        lqg.gains(model, spec.weights, spec.sample_time, "sampled-data", spec.delay)
-    return Design(model, spec.weights, asked["care"], asked["dare"])
+            patch.setattr(kalman_filter, name, partial(noted, name))
+        weights = replace(spec.weights, correlation=np.zeros(0))  # which python-control does not know
+        lqg.lqr(model, weights)
+        lqg.kalman(model, weights)
+        lqg.gains(model, weights, spec.sample_time, "sampled-data", spec.delay)
+    return Design(model, weights, asked["care"], asked["dare"])
 
 
 def apart(found: FloatArray, expected: FloatArray) -> float:
@@ -90,7 +94,7 @@ def test_control_lqr_gives_the_continuous_gains(shipped: Design) -> None:
     K = control.lqr(m.A, m.B, w.Q, w.R, method="scipy")[0]
     assert apart(K, malta.lqr(m, w)) < 1e-9
     if w.q_i.any():
-        Q = linalg.block_diag(w.Q, w.Q_i)
+        Q = linalg.block_diag(w.Q, lqg.integral_weight(m, w))
         K = control.lqr(m.A, m.B, Q, w.R, integral_action=m.C, method="scipy")[0]
         assert apart(K, np.hstack(malta.lqi(m, w))) < 1e-12
 

@@ -16,7 +16,7 @@ pytestmark = pytest.mark.usefixtures("proven_once")
 
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 DESIGNS = {
-    "tubular": ("table2", "calibrated", "robust"),
+    "tubular": ("table2", "calibrated", "robust", "tubular_pid"),
     "halbach": ("halbach_late", "halbach", "halbach_pid"),
     "planar": ("planar", "planar_pid"),
 }

@@ -17,6 +17,7 @@ import malta
 from malta.errors import CheckError, InputError
 from malta.margins.recovery import PushedLoop, disturbance_map, furthest, load_vector, recovery
 from malta.model.linearize import linearize
+from malta.report.figures.recovery import recovery_figure
 from malta.report.tables.recovery import recovery_table
 from malta.simulation import responses
 from malta.synthesis.step_response import step_response
@@ -205,3 +206,21 @@ def test_verify_prints_loads_and_writes_them_as_json(run: Run) -> None:
     assert one["load"] == {"F_x": 1.0}
     assert one["outputs"]["x"]["largest"] == pytest.approx(1443e-6, rel=1e-3)
     assert [left["after"] for left in one["outputs"]["x"]["left"]] == [0.1, 0.3]
+
+
+@pytest.mark.parametrize("file", ["robust", "halbach", "planar"])
+def test_the_figure_of_loads_shows_what_the_table_says(file: str) -> None:
+    """Each line's height is the largest deviation, each compliance's that of its peak; axes have units."""
+    plant, c = machine_of(file)
+    figure = recovery_figure(plant, c)
+    heights = {
+        line.get_label(): float(np.abs(line.get_ydata()).max())
+        for axes in figure.axes[::2]
+        for line in axes.get_lines()
+    }
+    for load, output in furthest(recovery(plant, c)):
+        assert heights[f"{load.name}: {output.output}"] == pytest.approx(1e6 * output.largest, rel=1e-9)
+    for axes in figure.axes:
+        assert axes.get_lines()
+        assert axes.get_xlabel() in ("time [ms]", "frequency [Hz]")
+        assert "µ" in axes.get_ylabel()

@@ -10,7 +10,7 @@ import hashlib
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, is_dataclass, replace
+from dataclasses import MISSING, Field, dataclass, field, fields, is_dataclass, replace
 from functools import lru_cache
 from importlib.metadata import version
 from pathlib import Path
@@ -209,7 +209,7 @@ def fingerprint(record: Any) -> str:
             marks.update((np.asarray(value, dtype="<f8") + 0.0).tobytes())
         elif is_dataclass(value):
             for f in fields(value):
-                if f.metadata.get("later") and getattr(value, f.name) == f.default:
+                if f.metadata.get("later") and _is_usual(f, getattr(value, f.name)):
                     continue  # a field that came later: campaigns that were begun before it go on
                 marks.update(f.name.encode())
                 add(getattr(value, f.name))
@@ -221,6 +221,12 @@ def fingerprint(record: Any) -> str:
 
     add(record)
     return marks.hexdigest()
+
+
+def _is_usual(f: Field[Any], value: Any) -> bool:
+    """Whether a field has its default."""
+    usual: Any = f.default if f.default_factory is MISSING else f.default_factory()
+    return np.array_equal(value, usual) if isinstance(value, np.ndarray) else bool(value == usual)
 
 
 @lru_cache(maxsize=8)

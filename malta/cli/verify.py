@@ -84,7 +84,7 @@ def verify(
     certificate: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Write the proof of the margin, for `malta check`.")
     ] = None,
-    out: Annotated[Path | None, typer.Option(help="Folder for the figure (.png).")] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder for the figures (.png).")] = None,
     machine: MachineFile = None,
     as_json: AsJson = False,
 ) -> None:
@@ -122,7 +122,7 @@ def verify(
         except (InputError, CheckError) as error:
             refusal = error  # the tables come first
     if out is not None:
-        files.append(_draw(loop, analysis, out))
+        files += _draw(loop, analysis, out)
     if as_json:
         print_json(_document(loop, analysis, files))
     else:
@@ -188,13 +188,16 @@ def _write_certificate(path: Path, loop: Loop, margin: Margin) -> Path:
     return certificate.write(path, places, loop.box, over, margin, loop.gains)
 
 
-def _draw(loop: Loop, analysis: Analysis, folder: Path) -> Path:
-    """Draw the margins stage by stage and over the travel."""
+def _draw(loop: Loop, analysis: Analysis, folder: Path) -> list[Path]:
+    """Draw the margins stage by stage and over the travel, and how loads are carried where there are any."""
     from malta import report
 
     name = loop.controller.name
     picture, position = folder / f"{name}_margins.png", f"position {loop.plant.stroke}"
-    return report.robustness(analysis.robustness, name, loop.box, picture, position, analysis.worst)
+    files = [report.robustness(analysis.robustness, name, loop.box, picture, position, analysis.worst)]
+    if analysis.recovered:
+        files.append(report.loads(loop.plant, loop.controller, folder / f"{name}_loads.png"))
+    return files
 
 
 def _document(loop: Loop, analysis: Analysis, files: Sequence[Path]) -> dict[str, Any]:

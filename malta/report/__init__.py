@@ -13,6 +13,7 @@ from malta.report.pages import campaign as campaign
 from malta.report.pages import design_page as design_page
 from malta.report.pages import experiment as experiment
 from malta.report.pages import front as front
+from malta.report.pages import loads as loads
 from malta.report.pages import robustness as robustness
 from malta.report.pages import stroke as stroke
 from malta.report.tables.campaign import box_text as box_text

@@ -22,6 +22,7 @@ from malta.report.figures import (
 )
 from malta.report.figures.margins import chain_figure
 from malta.report.figures.parts import Published
+from malta.report.figures.recovery import recovery_figure
 from malta.report.tables.design import bandwidth_table, loop_poles_table, poles_table, sensitivity_table
 from malta.report.tables.experiments import experiment_table
 from malta.report.tables.margins import is_of_whole_travel
@@ -33,7 +34,9 @@ if TYPE_CHECKING:
     from malta.campaigns.result import Campaign
     from malta.margins.gain import Gain
     from malta.margins.stages import Robustness
+    from malta.model.plant import Plant
     from malta.simulation.experiments import Experiment
+    from malta.synthesis.controller import Controller
     from malta.tuning.tune import Tuned
 
 
@@ -103,6 +106,14 @@ def robustness(
 ) -> Path:
     """Draw the margins of a design stage by stage and save the figure; arguments as those of `chain_figure`."""
     return save(chain_figure(found, name, uncertainty, position, worst), Path(path))
+
+
+def loads(plant: Plant, controller: Controller, path: str | Path) -> Path:
+    """Draw the answer to a constant load from outside and the compliance over frequency, and save the figure.
+
+    Example: `malta.report.loads(plant, controller, "build/robust_loads.png")`
+    """
+    return save(recovery_figure(plant, controller), Path(path))
 
 
 def campaign(found: Campaign, folder: str | Path, published: Published | None = None) -> list[Path]:

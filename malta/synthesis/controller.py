@@ -68,7 +68,7 @@ class Feedforward:
     z_grid: FloatArray  # m, g points
     v0: FloatArray  # N, g x m
     # m x n0 / 2, N/m: forces that hold the machine at q* = P^-1 p*; none: nothing is fed forward of q*
-    position: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
+    position: FloatArray = field(default_factory=lambda: np.zeros((0, 0)), metadata={"later": True})
 
     def __post_init__(self) -> None:
         for name in ("inertia", "speed", "rate", "z_grid", "v0", "position"):
@@ -130,7 +130,8 @@ class Noise:
     process: FloatArray  # N^2, m forces; in the coordinates of the positions m^2 / s^4, n0 / 2 accelerations
     sensor: FloatArray  # m^2, p measurements
     drift: FloatArray  # the same, of a constant force of disturbance from sample to sample: m, or none
-    correlation: FloatArray = field(default_factory=lambda: np.zeros(0))  # n0 / 2, or none: see kalman.py
+    # n0 / 2, or none: see kalman.py
+    correlation: FloatArray = field(default_factory=lambda: np.zeros(0), metadata={"later": True})
 
     def __post_init__(self) -> None:
         for name in ("process", "sensor", "drift", "correlation"):
@@ -144,7 +145,8 @@ class Cost:
     state: FloatArray  # n0 mechanical states
     input: FloatArray  # m forces, 1/N^2
     integral: FloatArray  # p integrals of errors, or n0 / 2 in the coordinates of the positions
-    coordinates: Coordinates = "signals"  # of the integrals and of the process noise
+    # of the integrals and of the process noise
+    coordinates: Coordinates = field(default="signals", metadata={"later": True})
 
     def __post_init__(self) -> None:
         for name in ("state", "input", "integral"):

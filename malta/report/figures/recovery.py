@@ -1,0 +1,103 @@
+"""The figure of how a machine takes loads from outside: deviation over time, and compliance over frequency."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from malta.margins.recovery import PushedLoop, furthest, load_vector, recovery
+from malta.report.figures.parts import MORE, STYLES, finish_axes, micro
+from malta.units import unit_factor
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from malta.margins.recovery import Deviation, Recovery
+    from malta.model.plant import FloatArray, Plant
+    from malta.synthesis.controller import Controller
+
+FINE = {"m": "um", "rad": "urad"}  # units that outputs are drawn in
+SHOWN = 1.5  # times the longest time to 1 %
+POINTS = 400  # of frequency
+
+
+def recovery_figure(plant: Plant, controller: Controller) -> Figure:
+    """Deviation after a unit step of every disturbance, and compliance over frequency, of the output furthest off.
+
+    A row for each pair of units, as um under N. Raises CheckError for an unstable loop.
+    """
+    from matplotlib.figure import Figure
+
+    picked = furthest(recovery(plant, controller))
+    units = {s.name: s.unit for s in plant.disturbances}
+    rows: dict[tuple[str, str], list[tuple[Recovery, Deviation]]] = {}
+    for load, output in picked:
+        rows.setdefault((output.unit, units[load.name]), []).append((load, output))
+    figure = Figure(figsize=(9.0, 0.9 + 2.4 * len(rows)), dpi=120)
+    top = 1 - 0.62 / (0.9 + 2.4 * len(rows))
+    figure.subplots_adjust(
+        left=0.09, right=0.98, bottom=0.6 / (0.9 + 2.4 * len(rows)), top=top - 0.03, hspace=0.5, wspace=0.24
+    )
+    figure.suptitle(f"{controller.name}: how a load from outside is carried", fontsize=11, y=0.99)
+    panels = figure.subplots(len(rows), 2, squeeze=False)
+    loop = PushedLoop.of(plant, controller)
+    for (left, right), ((unit, of), lines) in zip(panels, rows.items(), strict=True):
+        _draw_steps(left, plant, loop, lines, FINE.get(unit, unit), of)
+        _draw_compliance(right, plant, loop, lines, FINE.get(unit, unit), of)
+    return figure
+
+
+def _draw_steps(
+    axes: Axes,
+    plant: Plant,
+    loop: PushedLoop,
+    lines: Sequence[tuple[Recovery, Deviation]],
+    unit: str,
+    of: str,
+) -> None:
+    """Deviation over time of the output furthest off, after 1 N or 1 N m at t = 0."""
+    names = [s.name for s in plant.outputs]
+    answer = loop.answer()
+    settled = max(output.settled for _, output in lines)
+    end = min(SHOWN * settled, float(answer.t[-1])) if np.isfinite(settled) else float(answer.t[-1])
+    shown = answer.t <= end
+    for (load, output), style in zip(lines, _styles(len(lines)), strict=True):
+        y = answer.of(load_vector(plant, load.name, load.load)).y[shown, names.index(output.output), 0]
+        axes.plot(
+            1e3 * answer.t[shown],
+            y * np.sign(y[np.abs(y).argmax()]) / unit_factor(unit, unit),
+            label=f"{load.name}: {output.output}",
+            **style,
+        )
+    finish_axes(axes, "time [ms]", f"deviation under 1 {of} [{micro(unit)}]", legend=len(lines))
+
+
+def _draw_compliance(
+    axes: Axes,
+    plant: Plant,
+    loop: PushedLoop,
+    lines: Sequence[tuple[Recovery, Deviation]],
+    unit: str,
+    of: str,
+) -> None:
+    """Amplitude of the same outputs over frequency, under a load of amplitude 1 N or 1 N m."""
+    names = [s.name for s in plant.outputs]
+    w: FloatArray = np.geomspace(1.0, 0.3 * np.pi / loop.loop.sample_time, POINTS)
+    for (load, output), style in zip(lines, _styles(len(lines)), strict=True):
+        amplitude = np.abs(loop.compliance(w, load_vector(plant, load.name, load.load)))
+        axes.loglog(
+            w / (2 * np.pi), amplitude[:, names.index(output.output)] / unit_factor(unit, unit), **style
+        )
+    finish_axes(axes, "frequency [Hz]", f"compliance [{micro(unit)} / {of}]")
+
+
+def _styles(count: int) -> list[dict[str, Any]]:
+    """Styles of lines that may cover each other, as those of mirror images: the first are wider."""
+    chosen = [dict(style) for style in (*STYLES, *MORE)[:count]]
+    for k, style in enumerate(chosen):
+        style["linewidth"] += 1.3 * (count - 1 - k)
+    return chosen
