@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import cycle
 from pathlib import Path
@@ -201,10 +201,12 @@ def front_figure(tuned: Tuned) -> Figure:
     figure.subplots_adjust(left=0.1, right=0.98, bottom=0.115, top=0.8, wspace=0.25)
     taken = next((one for one in front if one.values == chosen.values), chosen)
     others = [one for one in front if one is not taken] or [taken]
-    found = f"{tuned.trials} trials; taken: margin {100 * taken.figures['margin']:.0f} %, which keeps a reserve in all"
+    kept = (
+        "keeps all that is asked for" if tuned.reached else f"misses {tuned.binding.name.replace('_', ' ')}"
+    )
+    found = f"{tuned.trials} trials; taken: margin {100 * taken.figures['margin']:.0f} %, which {kept}"
     figure.suptitle(f"{tuned.spec.name}: margin against noise", fontsize=11, y=0.985)
     figure.text(0.5, 0.925, found, fontsize=9, color="#4a4a4a", ha="center", va="top")
-    margins = [100 * one.figures["margin"] for one in others]
     panels: Any = figure.subplots(1, 2)
     sides = (front_lines(tuned.spec.plant, taken.figures, trade) for trade in get_args(Trade))
     for axes, lines, y in zip(
@@ -217,8 +219,11 @@ def front_figure(tuned: Tuned) -> Figure:
         for (name, label, scale, _), style in zip(lines, cycle((0, 2, 1)), strict=False):
             if not all(name in one.figures for one in front):
                 continue
-            sizes = [scale * one.figures[name] for one in others]
-            axes.plot(margins, sizes, marker="o", markersize=4, label=label, **STYLES[style])
+            every = sorted((one.figures["margin"], one.figures[name]) for one in others)
+            best = _undominated(every)
+            drawn = STYLES[style] if len(best) > 2 else STYLES[style] | {"linestyle": "none"}
+            margins, sizes = np.array(best if len(best) > 2 else every).T
+            axes.plot(100 * margins, scale * sizes, marker="o", markersize=4, label=label, **drawn)
             where = 100 * taken.figures["margin"], scale * taken.figures[name]
             ring = {"markersize": 9, "markerfacecolor": "none", "markeredgecolor": STYLES[style]["color"]}
             axes.plot(*where, **DOT | ring)
@@ -227,3 +232,12 @@ def front_figure(tuned: Tuned) -> Figure:
         finish_axes(axes, "robust margin over the travel, proven [% of the box]", y, legend=2)
         axes.margins(x=0.04)
     return figure
+
+
+def _undominated(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
+    """The points (margin, size) that no other beats in both, by margin."""
+    found: list[tuple[float, float]] = []
+    for margin, size in sorted(points, key=lambda point: (-point[0], point[1])):
+        if not found or size < found[-1][1]:
+            found.append((margin, size))
+    return found[::-1]
