@@ -61,9 +61,9 @@ if TYPE_CHECKING:  # the contents page, as type checkers and readers see it
     from malta.simulation.time_optimal import fastest_stroke as fastest_stroke
     from malta.simulation.trajectory import Trajectory as Trajectory
     from malta.simulation.trajectory import stroke_figures as stroke_figures
+    from malta.synthesis.calibrate import calibrate as calibrate
     from malta.synthesis.controller import Controller as Controller
     from malta.synthesis.design_file import read_design as read_design
-    from malta.synthesis.lqg import calibrate as calibrate
     from malta.synthesis.lqg import kalman as kalman
     from malta.synthesis.lqg import lqg as lqg
     from malta.synthesis.lqg import lqi as lqi
@@ -109,7 +109,8 @@ _NAMES = {  # the same, for the first use of each name
     "simulation.trajectory": ("Trajectory", "stroke_figures"),
     "synthesis.design_file": ("read_design",),
     "synthesis.spec": ("Spec", "Weights"),
-    "synthesis.lqg": ("calibrate", "kalman", "lqg", "lqi", "lqr", "synthesize", "weights"),
+    "synthesis.calibrate": ("calibrate",),
+    "synthesis.lqg": ("kalman", "lqg", "lqi", "lqr", "synthesize", "weights"),
     "synthesis.state_space": ("controller_of",),
     "tuning.tune": ("tune",),
     "margins.uncertain": ("Compensator", "UncertainSystem"),

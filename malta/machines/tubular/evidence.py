@@ -32,8 +32,9 @@ from malta.simulation.inverter import link_voltage, open_loop_gain
 from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate
 from malta.simulation.trajectory import StrokeFigures, stroke_figures
+from malta.synthesis.calibrate import calibrate
 from malta.synthesis.controller import Controller
-from malta.synthesis.lqg import calibrate, lqr
+from malta.synthesis.lqg import lqr
 from malta.synthesis.riccati import add_integrals
 from malta.synthesis.spec import Spec
 from malta.tuning.noise import noise_of

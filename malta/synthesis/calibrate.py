@@ -1,0 +1,54 @@
+"""Bases of the weights on which an LQR has the stiffness that is asked for."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from malta.errors import InputError
+from malta.model.linearize import LinearModel
+from malta.synthesis.spec import Weights
+from malta.threads import on_one_thread
+
+
+@on_one_thread
+def calibrate(
+    model: LinearModel,
+    weights: Weights,
+    stiffness_ratio: float,
+    axial_ratio: float = 1.0,
+    integral_time: float = 1.0,
+) -> Weights:
+    """Bases on which the LQR (without integrals) has the stiffness K1 = stiffness_ratio k in every unstable mode.
+
+    Where the modes decouple, q'' = k q + u with input weight 1/g gives K1 = k + sqrt(k^2 + q g / base^2), so the
+    base follows. The natural frequency is then w_n = sqrt((stiffness_ratio - 1) k). Modes without stiffness get
+    axial_ratio times the w_n of the first mode. A rate's base is w_n times its position's, an error integral's is
+    `integral_time` (s) times that of the first position (radial) or of its own (modes without stiffness).
+
+    k, K1 and g are per unit of mass or inertia (1/s2). Integral action makes the exported controller a little stiffer.
+    Raises InputError when stiffness_ratio <= 2 (2 is reached at zero weight), axial_ratio or integral_time <= 0, the
+    first mode has no stiffness, or the modes couple.
+    """
+    k, G = model.stiffness, model.force_map
+    n = len(k)
+    coupling = k - np.diag(np.diag(k))
+    if np.abs(coupling).max() > 1e-9 * np.abs(k).max():
+        raise InputError("calibrate", "model", "coupled modes", "decoupled ones: z_ss = 0, zero preload")
+    if not stiffness_ratio > 2:
+        raise InputError("calibrate", "stiffness_ratio", f"{stiffness_ratio:g}", "more than 2")
+    for name, value in (("axial_ratio", axial_ratio), ("integral_time", integral_time)):
+        if not value > 0:
+            raise InputError("calibrate", name, f"{value:g}", "more than 0")
+    stiffness = np.diag(k)
+    if not (stiffness[0] > 0 and (stiffness >= 0).all()):
+        raise InputError("calibrate", "model", f"stiffness {stiffness[0]:g} 1/s2", "an unstable first mode")
+    g = np.diag(G * (weights.r_base**2 / weights.r) @ G.T)
+    free = stiffness == 0
+    w_n = np.sqrt((stiffness_ratio - 1) * np.where(free, stiffness[0] * axial_ratio**2, stiffness))
+    K1 = w_n**2 + stiffness
+    base = np.sqrt(weights.q[:n] * g / ((K1 - stiffness) ** 2 - stiffness**2))
+    own = {s.name: i for i, s in enumerate(model.plant.design_states[:n])}
+    integral_base = [base[own.get(s.name, 0)] * integral_time for s in model.plant.outputs]
+    return replace(weights, q_base=np.concatenate([base, base * w_n]), q_i_base=np.array(integral_base))
