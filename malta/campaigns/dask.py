@@ -157,7 +157,10 @@ def _at_worker(task: _Task, first: int, count: int) -> Block | tuple[str, str, s
     if here != task.version:
         return "--cluster", "a worker", f"malta {here}", f"malta {task.version}"
     try:
-        return fly(_unpickle_plan(task), first, count, workers=1)
+        plan = _unpickle_plan(task)
+        if plan.identity != task.identity:
+            return "--cluster", "a worker", "another revision of malta or of the machine", "the same as here"
+        return fly(plan, first, count, workers=1)
     except InputError as error:
         return error.where, error.field, error.found, error.expected
 

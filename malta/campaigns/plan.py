@@ -10,7 +10,7 @@ import hashlib
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import MISSING, Field, dataclass, field, fields, is_dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from importlib.metadata import version
 from pathlib import Path
@@ -19,6 +19,8 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 import numpy as np
 from scipy.stats import qmc
 
+from malta.campaigns.identity import fingerprint as fingerprint
+from malta.campaigns.identity import revision_of
 from malta.errors import InputError
 from malta.gains.encodings import decode
 from malta.model.data import plant_of
@@ -168,11 +170,13 @@ def _manifest(plan: Plan) -> dict[str, Any]:
         "schema": SCHEMA,
         "version": VERSION,
         "malta": version("malta"),
+        "revision": revision_of(plan.plant, plan.controller, planned_run(plan).scenario),
         "gains": {"name": plan.controller.name, "sha256": fingerprint(plan.controller)},
         "machine": {
             "name": plan.plant.name,
             "preset": plan.parameters.preset,
             "parameters": values_of(plan.parameters),
+            "sha256": fingerprint(plan.parameters),  # of matrices too, which are no parameters with a unit
         },
         "scenario": {"name": plan.scenario, "case": planned_run(plan).label, "options": dict(plan.options)},
         "spread": dict(plan.spread),
@@ -196,37 +200,6 @@ def _use_integers(value: Any) -> Any:
 
 def _compact_json(content: Mapping[str, Any]) -> bytes:
     return json.dumps(content, sort_keys=True, separators=(",", ":"), allow_nan=False, default=float).encode()
-
-
-def fingerprint(record: Any) -> str:
-    """sha256 of every number and name in a record: equal for a gain file's .json, .npz and .mat."""
-    marks = hashlib.sha256()
-
-    def add(value: Any) -> None:
-        if isinstance(value, np.ndarray | float | int):
-            marks.update(f"{np.shape(value)}".encode())
-            # Files do not store the sign of a zero: + 0.0 drops it.
-            marks.update((np.asarray(value, dtype="<f8") + 0.0).tobytes())
-        elif is_dataclass(value):
-            for f in fields(value):
-                if f.metadata.get("later") and _is_usual(f, getattr(value, f.name)):
-                    continue  # a field that came later: campaigns that were begun before it go on
-                marks.update(f.name.encode())
-                add(getattr(value, f.name))
-        elif isinstance(value, tuple):
-            for entry in value:
-                add(entry)
-        else:
-            marks.update(f"{value!r};".encode())
-
-    add(record)
-    return marks.hexdigest()
-
-
-def _is_usual(f: Field[Any], value: Any) -> bool:
-    """Whether a field has its default."""
-    usual: Any = f.default if f.default_factory is MISSING else f.default_factory()
-    return np.array_equal(value, usual) if isinstance(value, np.ndarray) else bool(value == usual)
 
 
 @lru_cache(maxsize=8)

@@ -80,7 +80,7 @@ def campaign(
 
             for first, new in _fly_blocks(plan, left, workers, cluster, report):
                 if place is not None:
-                    replace_files({place / block_name(first): encode_block(new, plan)})
+                    replace_files({place / block_name(first): encode_block(new, plan, first)})
                 done[first] = new
                 runs += parts[first]
                 report(0)

@@ -4,12 +4,14 @@
     runs_00000000.npz    the block that begins with run 0: the machines of its runs and their figures
     runs_00001024.npz    ...
 
-Every file is written whole or not at all. A block names the plan that it belongs to. The runs of a damaged block are
-simulated again.
+Every file is written whole or not at all. A block names the plan that it belongs to, and ends with a seal: the sha256
+of the plan's identity, the index of the first run and all arrays. The runs of a damaged block, whose seal does not fit
+or whose numbers no run can have, are simulated again.
 """
 
 from __future__ import annotations
 
+import hashlib
 import io
 import json
 import os
@@ -21,11 +23,11 @@ from typing import Any
 import numpy as np
 
 from malta.campaigns.block import Block
-from malta.campaigns.plan import SCHEMA, VERSION, Plan, draw_machines, fingerprint
+from malta.campaigns.plan import SCHEMA, VERSION, Plan, draw_machines, fingerprint, planned_run
 from malta.errors import InputError
 from malta.files import read_file, replace_files
 from malta.simulation.compiled import LANES
-from malta.simulation.digest import Batch
+from malta.simulation.digest import Batch, verdicts
 from malta.synthesis.controller import Controller
 
 MANIFEST = "campaign.json"
@@ -132,8 +134,10 @@ def read_blocks(place: Path, plan: Plan, parts: Mapping[int, int], done: dict[in
 
 
 def require_same(path: Path, found: Mapping[str, Any], expected: Mapping[str, Any]) -> None:
-    """InputError that names the first entry in which two manifests differ."""
-    for key, (one, other) in _differences(found, expected):
+    """InputError that names the first entry in which two manifests differ; the revision last, as it follows others."""
+    for key, (one, other) in sorted(
+        _differences(found, expected), key=lambda entry: entry[0].startswith("revision")
+    ):
         raise InputError(
             path,
             key,
@@ -158,20 +162,26 @@ def shorten(value: Any) -> str:
     return text if len(text) <= 40 else text[:12] + "..."
 
 
-def encode_block(block: Block, plan: Plan) -> bytes:
-    """A block as an .npz archive, with the identity of its plan."""
+def encode_block(block: Block, plan: Plan, first: int) -> bytes:
+    """The block that begins with run `first` as an .npz archive, with the identity of its plan and its seal."""
     buffer = io.BytesIO()
-    arrays: dict[str, Any] = {name: getattr(block.batch, name) for name in Batch.__dataclass_fields__}
-    names = np.array(draw_machines(plan).names)
-    np.savez(
-        buffer,
-        campaign=np.array(plan.identity),
-        engine=np.array(block.engine),
-        names=names,
-        values=block.values,
-        **arrays,
-    )
+    arrays: dict[str, Any] = {
+        "campaign": np.array(plan.identity),
+        "engine": np.array(block.engine),
+        "names": np.array(draw_machines(plan).names),
+        "values": block.values,
+    } | {name: getattr(block.batch, name) for name in Batch.__dataclass_fields__}
+    np.savez(buffer, **arrays, seal=np.array(seal(arrays, first)))
     return buffer.getvalue()
+
+
+def seal(arrays: Mapping[str, Any], first: int) -> str:
+    """sha256 of the arrays of the block that begins with run `first`: names, types, shapes and contents."""
+    marks = hashlib.sha256(f"malta block {first};".encode())
+    for name, array in sorted(arrays.items()):
+        marks.update(f"{name} {array.dtype.str} {array.shape};".encode())
+        marks.update(np.ascontiguousarray(array).tobytes())
+    return marks.hexdigest()
 
 
 def read_block(path: Path, plan: Plan, first: int, count: int) -> Block | None:
@@ -183,18 +193,47 @@ def read_block(path: Path, plan: Plan, first: int, count: int) -> Block | None:
     try:
         with np.load(io.BytesIO(data), allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}  # checks the archive's checksums
-        identity, kind = str(arrays["campaign"]), str(arrays["engine"])
+        identity, kind, sealed = (str(arrays[name]) for name in ("campaign", "engine", "seal"))
         columns = {name: arrays[name] for name in Batch.__dataclass_fields__}
         values = arrays["values"]
     except Exception:  # a damaged archive makes its reader raise nearly anything
         return None
     if identity != plan.identity:
         raise InputError(path, "", "a block of another campaign", f"one of that in {MANIFEST}")
-    sizes = figure_shapes(plan)
-    whole = all(columns[name].shape == (count, *sizes[name]) for name in columns)
-    if not whole or not np.array_equal(values, draw_machines(plan).values[first : first + count]):
-        return None
-    return Block(values, Batch(**columns), kind)
+    machines = draw_machines(plan)
+    rest = {name: array for name, array in arrays.items() if name != "seal"}
+    whole = (
+        sealed == seal(rest, first)
+        and kind in ENGINES
+        and tuple(arrays.get("names", ())) == machines.names
+        and np.array_equal(values, machines.values[first : first + count])
+        and _are_possible(columns, plan, count)
+    )
+    return Block(values, Batch(**columns), kind) if whole else None
+
+
+ENGINES = ("compiled", "virtual machine")
+
+
+def _are_possible(columns: Mapping[str, Any], plan: Plan, count: int) -> bool:
+    """Whether `count` runs of a plan can leave these figures: shapes, ranges, and verdicts that fit the rest."""
+    for name, shape in figure_shapes(plan).items():
+        if columns[name].dtype != np.float64 or columns[name].shape != (count, *shape):
+            return False
+    verdict, completed = columns["verdict"], columns["completed"]
+    longest = planned_run(plan).scenario.duration + plan.controller.sample_time
+    ranges = {"duration": (0, longest), "saturated": (0, 1), "verdict": (0, len(verdicts(plan.plant)) - 1)}
+    inside = [
+        ((columns[name] >= low) & (columns[name] <= high)).all() for name, (low, high) in ranges.items()
+    ]
+    # Figures of a run that diverged may be infinite or NaN, and rise and overshoot of a run that ended early are NaN.
+    positive = [not (columns[name] < 0).any() for name in ("deviation", "rms", "force", "rise", "overshoot")]
+    finite = [np.isfinite(columns[name][completed == 1]).all() for name in FINITE]
+    codes = (verdict == np.floor(verdict)).all() and np.array_equal(completed, verdict == 0)
+    return all(inside) and all(positive) and all(finite) and bool(codes)
+
+
+FINITE = ("deviation", "rms", "force", "contact", "last")  # where a run was completed
 
 
 def figure_shapes(plan: Plan) -> dict[str, tuple[int, ...]]:

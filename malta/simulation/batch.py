@@ -17,6 +17,7 @@ import casadi as ca
 import numpy as np
 
 from malta.errors import InputError
+from malta.model.data import plant_of
 from malta.model.parameters import is_default, shape_parameters, twins_of, units_of
 from malta.model.plant import Plant
 from malta.simulation.compiled import LANES, Lanes, Shared, arrange_in_lanes, feedforward_table, run_many
@@ -33,10 +34,11 @@ from malta.simulation.engines import BLOCK, evaluate, library_of, shape_of
 from malta.simulation.inputs import Inputs, initial_values, inputs_of
 from malta.simulation.layout import electronics_of, flatten, layout_of, noise_scales, numbers_of, with_symbols
 from malta.simulation.noise import GAMMA, keys
-from malta.simulation.period import initial_state
+from malta.simulation.period import initial_state, period_of
 from malta.simulation.scenario import Scenario, Simulation, setup_of, simulation_of, steps_of
 from malta.simulation.simulate import simulate
 from malta.simulation.trajectory import Trajectory, stroke_figures, trajectory_of
+from malta.simulation.translate import source
 from malta.synthesis.controller import Controller
 
 if TYPE_CHECKING:
@@ -226,6 +228,17 @@ def is_compiled(plant: Plant, controller: Controller, scenario: Scenario) -> boo
     """Whether `simulate_many` runs compiled; without a C compiler it simulates one run after the other."""
     shape = shape_of(plant, controller, setup_of(plant, controller, scenario))
     return library_of(shape, LANES, digest_function(shape)) is not None
+
+
+def functions_text(plant: Plant, controller: Controller, scenario: Scenario) -> str:
+    """The functions that `simulate_many` runs as text: in C, or as CasADi stores those that have no form in C."""
+    shape = shape_of(plant, controller, setup_of(plant, controller, scenario))
+    tabulated = plant_of(controller.parameters).tabulated
+    values = numbers_of(plant, controller, 1)
+    period = period_of(plant, controller, shape.setup, values, constant=tabulated)
+    if not tabulated:
+        return source(period, digest_function(shape))
+    return "\n".join(f.serialize() for f in (period.sense, period.decide, period.substep))
 
 
 def _with_sensor_errors(scenario: Scenario, sensor_errors: Mapping[str, FloatArray] | None) -> Scenario:
