@@ -25,6 +25,7 @@ from malta.simulation.compiled import LANES
 from malta.simulation.engines import engine_of, library_of, shape_of
 from malta.simulation.layout import FIDELITIES, Fidelity
 from malta.simulation.period import Period
+from malta.simulation.private_folders import process_folder
 from malta.simulation.scenario import Fault, Scenario, setup_of
 from malta.simulation.trajectory import SERIES
 
@@ -669,7 +670,7 @@ def test_one_library_serves_designs_and_machines(designs: dict[str, Design]) -> 
 def fresh(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Path]:
     """A cache folder of its own, nothing remembered; and again nothing afterwards."""
 
-    memories = (compiled.compiler, compiled._processor, library_of, engine_of)
+    memories = (compiled.compiler, compiled._processor, library_of, engine_of, process_folder)
 
     def forget() -> None:
         for memory in memories:
@@ -748,7 +749,7 @@ def test_a_damaged_library_is_replaced(
     _library(text, 1, tmp_path / "sound")
     (sound,) = (tmp_path / "sound").iterdir()
     whole = sound.read_bytes()
-    folder.mkdir()
+    folder.mkdir(0o700)
     damaged = folder / sound.name
     damaged.write_bytes(
         {"empty": b"", "no library": b"#!/bin/sh\n" * 900, "its first bytes": whole[:64]}[damage]
@@ -768,7 +769,7 @@ def test_a_library_that_was_cut_short_is_not_run(
     _library(text, 1, tmp_path / "sound")
     (sound,) = (tmp_path / "sound").iterdir()
     folder = tmp_path / "libraries"
-    folder.mkdir()
+    folder.mkdir(0o700)
     whole = sound.read_bytes()
     (folder / sound.name).write_bytes(whole[: int(share * len(whole))])
     (tmp_path / "text.c").write_text(text, encoding="utf-8")

@@ -1,7 +1,8 @@
 """Shared libraries of control periods: the system's C compiler, the cache of its results, and calls into them.
 
-The user's cache folder keeps a library under the SHA-256 of its text, the compiler, the options and the processor. Two
-processes that compile the same text at once write to different names first, and the last rename wins.
+The user's cache folder keeps a library under the SHA-256 of its text, the compiler, the options and the processor. If
+others can write to that folder, one in the temporary folder serves, or else one of this process alone. Two processes
+that compile the same text at once write to different names first, and the last rename wins.
 """
 
 from __future__ import annotations
@@ -21,6 +22,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import platformdirs
+
+from malta.simulation.private_folders import is_private, open_private, process_folder
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -66,13 +69,15 @@ def library(text: str, lanes: int, folder: Path | None = None) -> ctypes.CDLL | 
         return None
     key = "\n".join([text, str(lanes), *FLAGS, *cc, _version(cc), _processor(), platform.platform()])
     name = f"{hashlib.sha256(key.encode()).hexdigest()}.so"
-    for place in (folder or cache_folder(), Path(tempfile.gettempdir()) / f"malta-{os.getuid()}"):
-        path = place / name
+    temporary = Path(tempfile.gettempdir()) / f"malta-{os.getuid()}"
+    for wanted in (folder or cache_folder(), temporary, None):
         try:
-            place.mkdir(parents=True, exist_ok=True, mode=0o700)
-            if place.stat().st_uid != os.getuid():
-                continue  # loading another user's code would be unsafe
-            if not _is_intact(path) and not _compile(cc, text, lanes, path):
+            place = process_folder() if wanted is None else open_private(wanted)
+            if place is None:
+                continue
+            path = place / name
+            sound = is_private(path) and _is_intact(path)
+            if not sound and not _compile(cc, text, lanes, path):
                 return None
             return ctypes.CDLL(str(path))
         except OSError:
@@ -82,8 +87,6 @@ def library(text: str, lanes: int, folder: Path | None = None) -> ctypes.CDLL | 
 
 def _is_intact(path: Path) -> bool:
     """Whether a library ends with the hash of its content. Loading half of a file would end the process."""
-    if not path.exists():
-        return False
     content = path.read_bytes()
     return len(content) > 32 and hashlib.sha256(content[:-32]).digest() == content[-32:]
 
@@ -103,6 +106,7 @@ def _compile(cc: tuple[str, ...], text: str, lanes: int, path: Path) -> bool:
             if subprocess.run(command, capture_output=True, check=False).returncode == 0:
                 content = so.read_bytes()
                 so.write_bytes(content + hashlib.sha256(content).digest())  # see _is_intact
+                so.chmod(0o600)  # whatever the umask: see is_private
                 so.replace(path)
                 return True
     return False
