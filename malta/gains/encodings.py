@@ -18,6 +18,7 @@ import numpy as np
 
 from malta.errors import InputError
 from malta.files import read_file
+from malta.gains.mat import read_mat
 
 MAT_HEADER = 116  # bytes of descriptive text that open a MAT-file
 MATRICES = (
@@ -138,15 +139,9 @@ def mat_header(body: bytes) -> bytes:
 
 
 def _from_mat(data: bytes) -> dict[str, Any]:
-    from scipy.io import loadmat
-
-    body = data[MAT_HEADER:]
-    if data[:MAT_HEADER] != mat_header(body):  # before loadmat, which a damaged file can crash
+    if data[:MAT_HEADER] != mat_header(data[MAT_HEADER:]):
         raise ValueError("its header does not hold the sha256 of its content")
-    buffer: Any = io.BytesIO(data)  # any: scipy's stubs know only file names
-    content = loadmat(buffer, struct_as_record=True, squeeze_me=False)
-    tree: dict[str, Any] = {k: _uncell(v, k) for k, v in content.items() if not k.startswith("__")}
-    return tree
+    return {name: _unshaped(value, name) for name, value in read_mat(data).items()}
 
 
 def _columns(content: Any) -> Any:
@@ -175,14 +170,12 @@ def _cells(value: Any) -> Any:
     return np.zeros((0, 0)) if value is None else value
 
 
-def _uncell(value: Any, name: str) -> Any:
-    """A value of a MAT-file, where everything is a matrix: its name tells whether it is a matrix, vector or number."""
-    if value.dtype.names:
-        return {key: _uncell(value[key][0, 0], f"{name}.{key}") for key in value.dtype.names}
-    if value.dtype == object:
-        return [str(cell[0]) for cell in value.ravel()]
-    if value.dtype.kind == "U":
-        return str(value[0]) if value.size else ""
+def _unshaped(value: Any, name: str) -> Any:
+    """A value of a MAT-file, where every number is a matrix: its name tells if it is a matrix, vector or number."""
+    if isinstance(value, dict):
+        return {key: _unshaped(entry, f"{name}.{key}") for key, entry in value.items()}
+    if isinstance(value, list | str):
+        return value
     if not value.size:
         return None
     if name.startswith(MATRICES):
