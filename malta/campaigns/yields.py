@@ -39,7 +39,7 @@ class Yields(NamedTuple):
 
 def specified_bounds(plan: Plan, spec: Spec) -> dict[str, float]:
     """The bounds of a design's [specification] on the scenario of a plan, SI: by "stroke", or by unit of the others."""
-    names: Callable[..., Mapping[str, str]] | None = setting(plan.plant, "specified", None)
+    names: Callable[..., Mapping[str, str]] | None = setting(plan.plant, "bounds_in_specification", None)
     if names is None:
         return {}
     found = names(plan.scenario, plan.options)

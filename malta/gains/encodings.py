@@ -141,7 +141,7 @@ def mat_header(body: bytes) -> bytes:
 def _from_mat(data: bytes) -> dict[str, Any]:
     if data[:MAT_HEADER] != mat_header(data[MAT_HEADER:]):
         raise ValueError("its header does not hold the sha256 of its content")
-    return {name: _unshaped(value, name) for name, value in read_mat(data).items()}
+    return {name: _without_shape(value, name) for name, value in read_mat(data).items()}
 
 
 def _columns(content: Any) -> Any:
@@ -170,10 +170,10 @@ def _cells(value: Any) -> Any:
     return np.zeros((0, 0)) if value is None else value
 
 
-def _unshaped(value: Any, name: str) -> Any:
+def _without_shape(value: Any, name: str) -> Any:
     """A value of a MAT-file, where every number is a matrix: its name tells if it is a matrix, vector or number."""
     if isinstance(value, dict):
-        return {key: _unshaped(entry, f"{name}.{key}") for key, entry in value.items()}
+        return {key: _without_shape(entry, f"{name}.{key}") for key, entry in value.items()}
     if isinstance(value, list | str):
         return value
     if not value.size:

@@ -55,7 +55,7 @@ def read_mat(data: bytes) -> dict[str, Any]:
     room = LARGEST
     for kind, content in _elements(memoryview(data)[HEADER:]):
         if kind == COMPRESSED:
-            kind, content = _decompressed(content, room)
+            kind, content = _decompress(content, room)
             room -= len(content)  # never 0, which zlib takes for no limit: the tag is not counted
         if kind != MATRIX:
             raise ValueError(f"an element of type {kind} in place of a matrix")
@@ -85,7 +85,7 @@ def _elements(data: memoryview) -> Iterator[tuple[int, memoryview]]:
         at = begin + padded
 
 
-def _decompressed(content: memoryview, room: int) -> tuple[int, memoryview]:
+def _decompress(content: memoryview, room: int) -> tuple[int, memoryview]:
     """The one element that a compressed element consists of; at most `room` bytes."""
     unpacker = zlib.decompressobj()
     try:

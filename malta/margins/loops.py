@@ -114,7 +114,7 @@ def loop(
     if current_loops and math.isfinite(lag):
         A, B = add_lags(A, B, lag)
     Ad, Bd = delay_inputs(*sample(A, B, controller.sample_time), delay)
-    Cd, true = _padded(C, len(Ad)), None if true is None else _padded(true, len(Ad))
+    Cd, true = _pad(C, len(Ad)), None if true is None else _pad(true, len(Ad))
     if feedforward:
         law = with_slope(law, feedforward_slope(model, controller))
     if model.E.any():
@@ -122,7 +122,7 @@ def loop(
     return Loop(Ad, Bd, Cd, law, controller.sample_time, true)
 
 
-def _padded(C: FloatArray, n: int) -> FloatArray:
+def _pad(C: FloatArray, n: int) -> FloatArray:
     """C of the first states as a matrix of all n."""
     return np.hstack([C, np.zeros((len(C), n - C.shape[1]))])
 

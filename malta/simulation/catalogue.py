@@ -18,7 +18,8 @@ and, where they differ from the defaults,
     STROKE_UNIT   unit in which deviations along the stroke are displayed, if not um
     bounds        (scenario, options) -> bounds that the paper prints for this scenario, as keys of data/published/:
                   "rise" and "overshoot" of the stroke, largest deviations "stroke" along it, "m" and "rad" of others
-    specified     (scenario, options) -> names in [specification] that bound the same deviations in this scenario
+    bounds_in_specification
+                  (scenario, options) -> names in [specification] that bound the same deviations in this scenario
 """
 
 from __future__ import annotations

@@ -59,18 +59,18 @@ def held_payload(plant: Plant) -> float:
     limits = np.array(plant.actuator.force_limit)
     places = [{plant.stroke: share * plant.travel} for share in PLACES] if plant.has_stroke else [{}]
 
-    def used(extra: float) -> float:
+    def share_used(extra: float) -> float:
         heavier = plant.variant(replace(par, m=par.m + extra))
         return max(float(np.abs(trim(heavier, **at).u / limits).max()) for at in places)
 
-    if used(0.0) >= 1:
+    if share_used(0.0) >= 1:
         return 0.0
     high = par.m
-    while used(high) < 1:
+    while share_used(high) < 1:
         high *= 2
         if high > HEAVIEST:
             return math.inf
-    return float(brentq(lambda extra: used(extra) - 1, 0.0, high, xtol=1e-9))
+    return float(brentq(lambda extra: share_used(extra) - 1, 0.0, high, xtol=1e-9))
 
 
 def flown_payload(plant: Plant, controller: Controller, most: float) -> tuple[float, float]:

@@ -46,7 +46,7 @@ from malta.simulation.layout import (
 )
 from malta.simulation.readings import initial_readings, measurement
 from malta.simulation.substep import advance
-from malta.synthesis.controller import Controller, commanded, estimated, filtered, looking_ahead, paused
+from malta.synthesis.controller import Controller, commanded, estimated, filtered, freeze_moving, look_ahead
 
 
 class Period(NamedTuple):
@@ -209,11 +209,11 @@ def _control_law(
         v0 = v0 + given["v_known"]
     believed = plant_of(c.parameters)
     xi_ref = _law_reference(c, believed, g, given)
-    e_now, frozen_now = controller["e"], paused(g, controller["frozen"], given["dp_ref"])
+    e_now, frozen_now = controller["e"], freeze_moving(g, controller["frozen"], given["dp_ref"])
     xi_pred, e, frozen, v = commanded(g, xi_hat, e_now, frozen_now, y, p_ref, xi_ref, v_ff, v0)
     if s.open_loop:
         v, frozen = v_ff + v0, 0 * frozen  # open loop: no limit of the feedback is reached
-    xi_pred, place = looking_ahead(g, xi_pred, p_ref if s.open_loop else y, given["dp_ref"])
+    xi_pred, place = look_ahead(g, xi_pred, p_ref if s.open_loop else y, given["dp_ref"])
     after: dict[str, Any] = {"xi_pred": xi_pred, "e": e, "frozen": frozen}
     # The controller commutates with the machine of its gain file; the simulated machine limits the currents.
     wanted = believed.currents(place, v)

@@ -60,7 +60,7 @@ def step_readings(loop: Loop, machine: Mapping[str, Any], x: Any) -> dict[str, A
     if s.lagging:
         sensors = loop.plant.sensors
         lags = (0.0,) * after.numel() if sensors is None else sensors.lag
-        after = _lagged(machine["lagged"], before, after, lags, h)
+        after = _lag_outputs(machine["lagged"], before, after, lags, h)
         before, states = machine["lagged"], {"lagged": after}
     if s.late is not None:
         states |= _late(loop, machine, before, after)
@@ -73,7 +73,7 @@ def initial_readings(plant: Plant, s: Setup, x: Any) -> dict[str, Any]:
     return {"lagged": p, "late": p if s.late is None else ca.repmat(p, s.late + 2, 1)}
 
 
-def _lagged(s: Any, before: Any, after: Any, lags: tuple[Any, ...], h: Any) -> Any:
+def _lag_outputs(s: Any, before: Any, after: Any, lags: tuple[Any, ...], h: Any) -> Any:
     """Readings behind lags after a step h, exactly for signals that grow evenly in it: s' = (p - s) / lag."""
     found = []
     for k, lag in enumerate(lags):

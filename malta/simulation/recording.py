@@ -82,7 +82,7 @@ def record(log: ForceLog, plant: Plant) -> Recorded:
         )
     half = max(V0_STEPS, math.ceil(reach / V0_STEP))
     z_grid = np.linspace(-reach, reach, 2 * half + 1)
-    means = _averaged(log)
+    means = _average(log)
     _require_slow(means, plant)
     rising = _rising(means.z, TURN * plant.travel)
     there, back = (
@@ -106,7 +106,7 @@ def require_integral_action(c: Controller) -> None:
         raise InputError("record-v0", "gains", f"{c.name}, without integral action", expected)
 
 
-def _averaged(log: ForceLog) -> ForceLog:
+def _average(log: ForceLog) -> ForceLog:
     """Means of neighbouring samples; the last samples are left out where they do not fill a mean."""
     size = max(1, len(log.z) // POINTS)
     count = len(log.z) // size * size

@@ -307,7 +307,7 @@ def commanded(
     return g["Ad"] @ xi_hat + g["Bd"] @ (v - v0), e, v != wanted, v
 
 
-def paused(g: Mapping[str, Any], frozen: Any, dp_ref: Any) -> Any:
+def freeze_moving(g: Mapping[str, Any], frozen: Any, dp_ref: Any) -> Any:
     """The axes whose sums of errors wait: those that saturated, and where p*' is faster than the pause of a law."""
     if "pause" not in g:
         return frozen
@@ -320,7 +320,7 @@ def paused(g: Mapping[str, Any], frozen: Any, dp_ref: Any) -> Any:
     return ca.vertcat(*rows)
 
 
-def looking_ahead(g: Mapping[str, Any], xi_pred: Any, place: Any, dp_ref: Any) -> tuple[Any, Any]:
+def look_ahead(g: Mapping[str, Any], xi_pred: Any, place: Any, dp_ref: Any) -> tuple[Any, Any]:
     """Steps 5 and 6 of a law with a `commutation`, else unchanged: (xi_pred, place) for a reference of rate p*'."""
     if "lead" not in g:
         return xi_pred, place

@@ -39,7 +39,7 @@ def kalman(model: Linear, weights: Weights) -> FloatArray:
     W, V = G * weights.process_variance @ G.T, np.diag(weights.sensor_variance)
     if not weights.correlation.any():
         return care(model.A.T, model.C.T, W, V, "Kalman filter").K.T
-    along = G @ _correlated(model, weights) / weights.sensor_variance  # S V^-1
+    along = G @ _cross_covariance(model, weights) / weights.sensor_variance  # S V^-1
     rest = W - along @ V @ along.T
     return care((model.A - along @ model.C).T, model.C.T, rest, V, "Kalman filter").K.T + along
 
@@ -64,7 +64,7 @@ def sampled_filter(model: Linear, weights: Weights, Ts: float, delay: int, *, in
         W = Gd * weights.process_variance @ Gd.T
     S = np.zeros((n, p))
     if weights.correlation.any():
-        S = Gd @ _correlated(model, weights)
+        S = Gd @ _cross_covariance(model, weights)
     if not delay:
         Ad = Ad + Bd @ still.H @ C
     if weights.drift_variance.size:
@@ -104,7 +104,7 @@ def positions_from(model: Linear) -> FloatArray:
     return np.asarray(np.linalg.inv(C_q))
 
 
-def _correlated(model: Linear, weights: Weights) -> FloatArray:
+def _cross_covariance(model: Linear, weights: Weights) -> FloatArray:
     """E[w n'] of accelerations and readings, n / 2 x p."""
     to_positions = positions_from(model)
     sigma_q = np.sqrt(np.square(to_positions) @ weights.sensor_variance)

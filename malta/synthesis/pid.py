@@ -105,12 +105,12 @@ def axes_of(model: LinearModel, axes: PidAxes) -> Axes:
 
 def _lagging_inertia(terms: Pid, Ts: float, axes: Axes) -> FloatArray:
     """What each input pushes per unit of its output's p*'', as filtered rates lag, kg or kg m^2."""
-    a = _forgetting(terms, Ts)
+    a = _decay(terms, Ts)
     pushed = axes.inputs @ ((terms.Kd * Ts * a / (1 - a))[:, None] * axes.of_outputs)
     return np.asarray(np.diag(pushed))
 
 
-def _forgetting(terms: Pid, Ts: float) -> FloatArray:
+def _decay(terms: Pid, Ts: float) -> FloatArray:
     """a = e^(-Ts / filter) of each axis; 0 for plain differences."""
     return np.array([math.exp(-Ts / time) if time else 0.0 for time in terms.filters])
 
@@ -120,7 +120,7 @@ def pid_gains(P: FloatArray, terms: Pid, Ts: float, axes: Axes) -> Gains:
 
     The rate of each axis has its own filter: in positions that is M^-1 diag(a) M, with s = M q.
     """
-    n, M, a = len(P), axes.of_positions, _forgetting(terms, Ts)
+    n, M, a = len(P), axes.of_positions, _decay(terms, Ts)
     back = np.linalg.inv(M)
     # a_0 is taken out: what is equal on all axes passes through M^-1 M without rounding.
     rates = a[0] * np.eye(n) + back @ ((a - a[0])[:, None] * M)

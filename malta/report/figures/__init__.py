@@ -220,7 +220,7 @@ def front_figure(tuned: Tuned) -> Figure:
             if not all(name in one.figures for one in front):
                 continue
             every = sorted((one.figures["margin"], one.figures[name]) for one in others)
-            best = _undominated(every)
+            best = _pareto_front(every)
             drawn = STYLES[style] if len(best) > 2 else STYLES[style] | {"linestyle": "none"}
             margins, sizes = np.array(best if len(best) > 2 else every).T
             axes.plot(100 * margins, scale * sizes, marker="o", markersize=4, label=label, **drawn)
@@ -234,7 +234,7 @@ def front_figure(tuned: Tuned) -> Figure:
     return figure
 
 
-def _undominated(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
+def _pareto_front(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
     """The points (margin, size) that no other beats in both, by margin."""
     found: list[tuple[float, float]] = []
     for margin, size in sorted(points, key=lambda point: (-point[0], point[1])):

@@ -116,7 +116,7 @@ def bounds(scenario: str, options: Mapping[str, Any]) -> dict[str, str]:
     }
 
 
-def specified(scenario: str, options: Mapping[str, Any]) -> dict[str, str]:
+def bounds_in_specification(scenario: str, options: Mapping[str, Any]) -> dict[str, str]:
     """Names in [specification] that bound the deviations in a scenario, if it is the published stroke."""
     return {"stroke": "tracking_error", "m": "radial_deviation"} if _is_published(scenario, options) else {}
 

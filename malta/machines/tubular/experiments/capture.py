@@ -57,7 +57,7 @@ class _Released:
     scenario: Scenario
     clearance: float  # m, of the touchdown bearings as built
 
-    def returning(self, starts: Mapping[str, FloatArray], progress: Progress | None = None) -> FloatArray:
+    def which_return(self, starts: Mapping[str, FloatArray], progress: Progress | None = None) -> FloatArray:
         """1 for each start from which the mover returns without touching anything, else 0."""
         found = simulate_many(
             self.plant, self.controller, self.scenario, {}, starts=starts, progress=progress
@@ -93,7 +93,7 @@ def capture(
         name: reach(bounds[_plane_of(state)], _along(state, sign)) for name, (state, sign) in RAYS.items()
     }
     found = _furthest_returning(free, allowed, parts.until(0.9))
-    inside = replace(free, plant=plant).returning(_starts_inside(plant), parts.until(0.95))
+    inside = replace(free, plant=plant).which_return(_starts_inside(plant), parts.until(0.95))
     wanted = _examples(plant, free, found, options)
     cases, cut = fly_all(wanted, parts.until(1.0), options)
     curves = axes | maps | _clearances(plant) | {f"bound {' '.join(plane)}": b for plane, b in bounds.items()}
@@ -164,7 +164,7 @@ def _maps(
     for n, (plane, grid) in enumerate(zip(PLANES, grids, strict=True)):
         for name, values in zip(plane, grid, strict=True):
             starts[name][n * points**2 : (n + 1) * points**2] = values.ravel()
-    found = free.returning(starts, progress).reshape(len(PLANES), points, points)
+    found = free.which_return(starts, progress).reshape(len(PLANES), points, points)
     return {f"map {' '.join(plane)}": one for plane, one in zip(PLANES, found, strict=True)}, axes
 
 
@@ -180,7 +180,7 @@ def _furthest_returning(
         for k, (ray, (state, sign)) in enumerate(RAYS.items()):
             starts[state][k] = sign * allowed[ray] * shares[k]
         flat = {name: values.ravel() for name, values in starts.items()}
-        found = free.returning(flat, parts.until(n / REFINED)).reshape(shares.shape)
+        found = free.which_return(flat, parts.until(n / REFINED)).reshape(shares.shape)
         first = np.where(found.all(axis=1), FINE - 1, np.argmin(found, axis=1))  # that does not return
         rows = np.arange(len(RAYS))
         low, high = shares[rows, np.maximum(first - 1, 0)], shares[rows, first]

@@ -70,7 +70,7 @@ def record_v0(
     """
     require_integral_action(controller)
     measured = read_log(log, plant) if log else None
-    machines = {"": plant} | dict(_displaced(plant, phase_error))
+    machines = {"": plant} | dict(_displace(plant, phase_error))
     found: dict[str, _Found] = {}
     for n, (label, machine) in enumerate(machines.items()):
         share = progress_of_part(progress, n, len(machines))
@@ -91,7 +91,7 @@ def record_v0(
     )
 
 
-def _displaced(plant: Plant, error: float) -> Iterator[tuple[str, Plant]]:
+def _displace(plant: Plant, error: float) -> Iterator[tuple[str, Plant]]:
     """The machine with its cogging displaced either way, by the labels of the cases."""
     par: Any = plant.parameters
     for sign, side in ((1, "more"), (-1, "less")) if error else ():
