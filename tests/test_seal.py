@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import fields, is_dataclass, replace
 from functools import partial
@@ -308,6 +309,8 @@ def _variants(value: Any) -> Iterator[tuple[str, Any]]:
                 yield f"[{k}]{way}", make((*value[:k], other, *value[k + 1 :]))
     elif isinstance(value, np.ndarray):
         yield "", np.append(value, 1.0) if not value.size else _nudged(value)
+    elif isinstance(value, float):  # by a last digit: parameters have ranges
+        yield "", math.nextafter(value, math.inf)
     else:
         yield "", 1.0 if value is None else value + ("x" if isinstance(value, str) else 1)
 
