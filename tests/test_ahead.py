@@ -169,8 +169,8 @@ def test_the_margin_is_the_same(pairs: dict[str, Pair]) -> None:
     one, other = (malta.verify(p.model, c, spec.uncertainty) for c in (p.usual, p.ahead))
     assert one.robust is not None
     assert other.robust is not None
-    assert one.robust.lower == other.robust.lower
-    assert one.robust.lower is not None
+    assert one.robust.lower is not None  # a search by the clock ends where the clock says
+    assert one.robust.lower == pytest.approx(other.robust.lower, rel=1e-3)
 
 
 def test_compiled_is_the_virtual_machine(pairs: dict[str, Pair]) -> None:
