@@ -20,6 +20,7 @@ ORDER = (
         "errors",
         "units",
         "files",
+        "archives",
         "tables",
         "threads",
         "model",

@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 
+from malta.archives import read_npz
 from malta.campaigns.block import Block
 from malta.campaigns.plan import SCHEMA, VERSION, Plan, draw_machines, fingerprint, planned_run
 from malta.errors import InputError
@@ -191,12 +192,11 @@ def read_block(path: Path, plan: Plan, first: int, count: int) -> Block | None:
     """
     data = read_file(path, "block of a campaign", Path.read_bytes)
     try:
-        with np.load(io.BytesIO(data), allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}  # checks the archive's checksums
+        arrays = read_npz(data)  # checks the archive's checksums
         identity, kind, sealed = (str(arrays[name]) for name in ("campaign", "engine", "seal"))
         columns = {name: arrays[name] for name in Batch.__dataclass_fields__}
         values = arrays["values"]
-    except Exception:  # a damaged archive makes its reader raise nearly anything
+    except (ValueError, KeyError):  # a damaged archive, or one without an array
         return None
     if identity != plan.identity:
         raise InputError(path, "", "a block of another campaign", f"one of that in {MANIFEST}")

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from malta.archives import read_npz
 from malta.errors import InputError
 from malta.files import read_file
 from malta.gains.mat import read_mat
@@ -112,13 +113,12 @@ def _to_npz(content: Mapping[str, Any]) -> bytes:
 
 def _from_npz(data: bytes) -> dict[str, Any]:
     tree: dict[str, Any] = {}
-    with np.load(io.BytesIO(data), allow_pickle=False) as archive:
-        for name in archive.files:
-            *tables, key = name.split(".")
-            table = tree
-            for part in tables:
-                table = table.setdefault(part, {})
-            table[key] = archive[name].tolist() if archive[name].size else None
+    for name, array in read_npz(data).items():
+        *tables, key = name.split(".")
+        table = tree
+        for part in tables:
+            table = table.setdefault(part, {})
+        table[key] = array.tolist() if array.size else None
     return tree
 
 

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import csv
-import io
 import re
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from malta.archives import read_npz
 from malta.errors import InputError
 from malta.files import read_file
 from malta.units import to_si
@@ -91,14 +90,15 @@ def _number(cell: str) -> float:
 def _npz_columns(content: bytes, path: Path) -> dict[str, FloatArray]:
     """The times, measured outputs and commanded forces of a saved run by their headings."""
     try:
-        with np.load(io.BytesIO(content), allow_pickle=False) as archive:
-            columns = {"t [s]": archive["t"]} if "t" in archive else {}
-            for name in ("y", "v"):
-                if name in archive and f"{name}_columns" in archive:
-                    headings = archive[f"{name}_columns"].tolist()
-                    columns |= dict(zip(headings, np.atleast_2d(archive[name]).T, strict=False))
-    except (zipfile.BadZipFile, ValueError, EOFError) as error:
-        raise InputError(path, "", "a file that numpy cannot read", "an .npz archive of a run") from error
+        arrays = read_npz(content)
+    except ValueError as error:
+        found = f"a file that numpy cannot read safely ({error})"
+        raise InputError(path, "", found, "an .npz archive of a run, not compressed") from error
+    columns = {"t [s]": arrays["t"]} if "t" in arrays else {}
+    for name in ("y", "v"):
+        if name in arrays and f"{name}_columns" in arrays:
+            headings = arrays[f"{name}_columns"].tolist()
+            columns |= dict(zip(headings, np.atleast_2d(arrays[name]).T, strict=False))
     return columns
 
 

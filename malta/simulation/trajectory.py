@@ -206,6 +206,6 @@ def save(run: Trajectory, path: str | Path) -> Path:
         arrays[name] = getattr(run, name)
         arrays[f"{name}_columns"] = np.array([f"{s.name} [{s.unit}]" for s in signals])
     buffer = io.BytesIO()
-    np.savez_compressed(buffer, **arrays)
+    np.savez(buffer, **arrays)
     replace_files({path: buffer.getvalue()})
     return path
