@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -50,9 +51,36 @@ def _units() -> Any:
     return registry
 
 
+# pint evaluates numbers and powers of powers, so that a short text could keep it busy for ever. It gets products of
+# names and 1 with powers of one digit, in few parentheses: "kg m^2", "N m / (rad/s)", "1/s".
+LONGEST = 200  # characters
+DEEPEST = 3  # parentheses in parentheses
+HUGE = 1e100  # of SI units
+_FACTOR = r"(?:[^\W\d_]{1,30}|1|%)(?:\s*(?:\^|\*\*)\s*-?[1-9])?"
+_PRODUCT = rf"\s*{_FACTOR}(?:(?:\s*[*/]\s*|\s+){_FACTOR})*\s*"
+
+
+def _is_unit(text: str) -> bool:
+    """Whether a text has the form of a unit, whatever its names mean; no text at all is the unit of a plain number."""
+    if len(text) > LONGEST:
+        return False
+    for _ in range(DEEPEST):
+        text = re.sub(rf"\({_PRODUCT}\)", "group", text)
+    return not text.strip() or re.fullmatch(_PRODUCT, text) is not None
+
+
 @cache
 def _root_units(unit: str) -> Any:
-    return _units().get_root_units(_units().parse_units(unit))
+    if not _is_unit(unit):
+        raise ValueError("a text that is no product of units")
+    factor, root = _units().get_root_units(_units().parse_units(unit))
+    if not 1 / HUGE < factor < HUGE:
+        raise ValueError("a unit beyond all measure")
+    return float(factor), root
+
+
+def _quoted(unit: str) -> str:
+    return repr(unit if len(unit) <= 40 else f"{unit[:37]}...")
 
 
 def to_si(value: float, unit: str, si_unit: str, where: str | Path, name: str) -> float:
@@ -60,7 +88,8 @@ def to_si(value: float, unit: str, si_unit: str, where: str | Path, name: str) -
 
     where, name : the file and the key that an error names
 
-    Raises InputError when the unit is unknown or of another dimension.
+    Units are products of names with powers, as "kg m^2", "N s/m" or "m / (s * A)". Raises InputError for any other
+    text, and when the unit is unknown or of another dimension.
 
     >>> to_si(50, "us", "s", "rotor.toml", "T_s")
     5e-05
@@ -69,11 +98,11 @@ def to_si(value: float, unit: str, si_unit: str, where: str | Path, name: str) -
     try:
         factor, found_root = _root_units(unit)
     except Exception as error:  # pint raises many kinds, tokenizer errors among them
-        raise InputError(where, f"{name}.unit", repr(unit), expected) from error
+        raise InputError(where, f"{name}.unit", _quoted(unit), expected) from error
     si_factor, si_root = _root_units(si_unit)
     if found_root != si_root:
-        raise InputError(where, f"{name}.unit", repr(unit), expected)
-    ratio = float(factor) / float(si_factor)
+        raise InputError(where, f"{name}.unit", _quoted(unit), expected)
+    ratio: float = factor / si_factor
     whole = round(1 / ratio) if ratio < 1 else 0
     # Dividing by a power of ten is exact where multiplying is not: 50 us is 5e-05, not 4.9999...e-05.
     return value / whole if whole and abs(whole * ratio - 1) < 1e-12 else value * ratio
@@ -85,17 +114,15 @@ def in_unit(value: float, unit: str) -> float:
     >>> round(in_unit(16.2e-3, "ms"), 9)
     16.2
     """
-    return value / unit_factor(unit, unit)
+    return value / unit_factor(unit, "unit")
 
 
 @cache
 def unit_factor(unit: str, name: str) -> float:
     """The size of one `unit` in SI units: 0.001 for "ms". Raises InputError, which names the key `name`."""
-    registry = _units()
     try:
-        factor, root = registry.get_root_units(registry.parse_units("" if unit == "1" else unit))
+        factor, root = _root_units("" if unit == "1" else unit)
+        grams = _units().get_dimensionality(root).get("[mass]", 0)  # pint's root of mass is the gram
+        return float(factor / 1000.0 ** float(grams))
     except Exception as error:  # pint raises many kinds, tokenizer errors among them
-        raise InputError("data", name, repr(unit), "a unit") from error
-    grams = registry.get_dimensionality(root).get("[mass]", 0)  # pint's root of mass is the gram
-    scale: float = float(factor) / 1000.0 ** float(grams)
-    return scale
+        raise InputError("data", name, _quoted(unit), "a unit") from error

@@ -17,7 +17,7 @@ from malta.machines.tubular import plant as tubular
 from malta.model.parameters import units_of
 from malta.model.published import published as read_published
 from malta.tables import load_toml
-from malta.units import to_si
+from malta.units import to_si, unit_factor
 
 if TYPE_CHECKING:
     pass
@@ -214,6 +214,54 @@ def test_decimal_prefixes_convert_exactly(value: float) -> None:
 def test_unit_of_another_kind_is_refused(unit: str, si_unit: str) -> None:
     error = refusal(lambda: to_si(1.0, unit, si_unit, "file.toml", "name"), Path("file.toml"))
     assert (error.field, error.found, error.expected) == ("name.unit", repr(unit), f"a unit of {si_unit}")
+
+
+@pytest.mark.parametrize(
+    "unit",
+    [
+        "10**10**10 us",
+        "1 9**9**9**9",
+        "us^9^9",
+        "s^10",
+        "s**(2)",
+        "m^0.5",
+        "(((min^9)^9)^9)^9",
+        "((((min^9)^9)^9)^9)^9",
+        "(nm^9)^9",
+        "min^9 " * 33,
+        "g^9 " * 40,
+        "(" * 150,
+        "m " * 99 + "!",
+        "m " * 100_000,
+        "m_s",
+    ],
+)
+def test_text_that_is_no_product_of_units_is_refused_at_once(unit: str) -> None:
+    with pytest.raises(
+        malta.InputError, match=r"^file.toml: name.unit: found '.{1,50}, expected a unit of s$"
+    ):
+        to_si(1.0, unit, "s", "file.toml", "name")
+    with pytest.raises(malta.InputError, match=r"^data: unit: found '.{1,50}, expected a unit$"):
+        malta.in_unit(1.0, unit)
+
+
+@pytest.mark.parametrize(
+    ("unit", "factor"),
+    [
+        ("(m/s^2)^2", 1),
+        ("(N) s / (m)", 1),
+        ("N m / (m)", 1),
+        ("kg*mm/s**2", 1e-3),
+        ("m s^-2", 1),
+        ("((mm))", 1e-3),
+        ("1/ms", 1e3),
+        ("µm", 1e-6),
+        ("%", 0.01),
+        ("1", 1),
+    ],
+)
+def test_units_are_products_with_powers(unit: str, factor: float) -> None:
+    assert unit_factor(unit, "name") == pytest.approx(factor, rel=1e-12)
 
 
 # --- files that are wrong ---
