@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import stat
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -12,6 +13,7 @@ from malta.errors import InputError
 
 PACKAGE = Path(__file__).resolve().parent
 FOLDERS = ("data", "design", "notebooks", "examples")  # that come with malta
+LARGEST = 100_000_000  # bytes of a file to read
 _Content = TypeVar("_Content", str, bytes)
 
 
@@ -79,10 +81,23 @@ def replace_files(contents: Mapping[Path, bytes]) -> None:
                 temporary.unlink(missing_ok=True)
 
 
-def read_file(path: Path, kind: str, read: Callable[[Path], _Content]) -> _Content:
-    """What `read` makes of a file; InputError when it is missing or unreadable. `kind` as "TOML file"."""
+def read_file(
+    path: Path, kind: str, read: Callable[[Path], _Content], largest: int | None = None
+) -> _Content:
+    """What `read` makes of a file; InputError when it is missing or unreadable. `kind` as "TOML file".
+
+    Pipes and devices, which may never end, are refused, and so are files of more than `largest` bytes; None: LARGEST.
+    """
     try:
+        status = path.stat()
+        if not (stat.S_ISREG(status.st_mode) or stat.S_ISDIR(status.st_mode)):
+            raise InputError(path, "", "a pipe or a device", f"a {kind}")
+        size, most = status.st_size, LARGEST if largest is None else largest
+        if size > most and stat.S_ISREG(status.st_mode):
+            raise InputError(path, "", f"{size} bytes", f"a {kind} of at most {most}")
         return read(path)
+    except InputError:
+        raise
     except FileNotFoundError as error:
         raise InputError(path, "", "no such file", f"a {kind}") from error
     except UnicodeDecodeError as error:

@@ -13,6 +13,7 @@ from malta.errors import InputError
 from malta.files import read_file
 
 _Model = TypeVar("_Model", bound=BaseModel)
+DEEPEST = 30  # tables and lists in others; files of malta have 6 at most
 Finite = Annotated[float, Checked(strict=True, allow_inf_nan=False)]
 
 
@@ -33,9 +34,21 @@ def load_toml(path: str | Path) -> dict[str, Any]:
     """Read a TOML file. Raises InputError when the file is missing, unreadable, not text or not TOML."""
     text = read_file(Path(path), "TOML file", lambda p: p.read_text(encoding="utf-8"))
     try:
-        return tomllib.loads(text)
+        content = tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # TOMLDecodeError, endless digits, endless nesting
         raise InputError(path, "", f"a TOML error ({error})", "a complete TOML file") from error
+    require_shallow(content, path)
+    return content
+
+
+def require_shallow(content: object, where: str | Path) -> None:
+    """Raise InputError for tables and lists in more than DEEPEST others: what is done to each takes the stack."""
+    level, depth = [content], 0
+    while level:
+        if depth > DEEPEST:
+            raise InputError(where, "", f"tables in more than {DEEPEST} others", "the tables of its format")
+        inner = (x.values() if isinstance(x, dict) else x for x in level if isinstance(x, dict | list))
+        level, depth = [value for values in inner for value in values], depth + 1
 
 
 def validate(model: type[_Model], content: object, where: str | Path) -> _Model:

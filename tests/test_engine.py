@@ -6,6 +6,7 @@ import os
 import re
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -847,6 +848,45 @@ def test_a_compiler_that_does_not_exist_is_no_compiler(monkeypatch: pytest.Monke
     monkeypatch.setenv("CC", "/nowhere/cc")
     assert compiled.compiler() is None
     assert compiled.library("", 1) is None
+
+
+@pytest.mark.parametrize("hangs_at", ["--version", "-shared"])
+def test_a_compiler_that_hangs_is_stopped_with_all_that_it_started(
+    hangs_at: str,
+    fresh: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    started = tmp_path / "started"
+    cc = tmp_path / "cc"
+    cc.write_text(f'#!/bin/sh\ncase "$*" in *{hangs_at}*) sleep 60 & echo $! > {started}; wait;; esac\n')
+    cc.chmod(0o700)
+    monkeypatch.setenv("CC", str(cc))
+    monkeypatch.setattr(compiled, "PATIENCE", 0.3)
+    begun = time.monotonic()
+    assert compiled.library("", 1) is None
+    assert time.monotonic() - begun < 10
+    assert [r.getMessage() for r in caplog.records] == [
+        f"malta: found {cc} without an answer for 0.3 s, expected a C compiler"
+    ]
+    assert not list(fresh.rglob("*.so"))
+    child = Path(f"/proc/{started.read_text().strip()}/stat")
+    for _ in range(100):
+        if not child.exists() or child.read_text().split()[2] == "Z":
+            break
+        time.sleep(0.02)
+    else:
+        pytest.fail("what the compiler started goes on")
+
+
+@pytest.mark.usefixtures("fresh")
+def test_a_command_with_an_open_quotation_mark_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CC", '"gcc')
+    with pytest.raises(
+        malta.InputError, match=r"^\$CC: found '\"gcc', expected a command, as a shell takes it$"
+    ):
+        compiled.library("", 1)
 
 
 def test_two_processes_may_compile_at_once(small: tuple[Period, str], fresh: Path, tmp_path: Path) -> None:

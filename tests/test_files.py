@@ -1,14 +1,20 @@
-"""Writing files: all or none, nothing half-written, nothing left behind."""
+"""Writing files: all or none, nothing half-written, nothing left behind. Reading them: no pipes, no end in sight."""
 
 from __future__ import annotations
 
+import os
 import re
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 import malta
+from malta.campaigns.store import read_manifest
 from malta.files import replace_files
+from malta.margins import checked_file
+from malta.simulation.force_log import read_log
+from malta.tables import load_toml
 
 
 def names(folder: Path) -> list[str]:
@@ -131,3 +137,62 @@ def test_rename_that_fails_leaves_no_temporary_files(
     assert caught.value.where == str(blocked)
     assert [path.read_bytes() for path in paths] == [b"old"] * 3
     assert names(tmp_path) == ["a.bin", "b.bin", "c.bin"]
+
+
+def readers(path: Path) -> list[Callable[[], object]]:
+    """All that reads a file which a user names."""
+    plant = malta.plant_of(malta.read("data/tubular.toml", "table1"))
+    return [
+        lambda: load_toml(path),
+        lambda: malta.read_design(path),
+        lambda: malta.gains.read(path.with_suffix(".json")),
+        lambda: malta.gains.read(path.with_suffix(".npz")),
+        lambda: malta.gains.read(path.with_suffix(".mat")),
+        lambda: read_log(path.with_suffix(".csv"), plant),
+        lambda: read_log(path.with_suffix(".npz"), plant),
+        lambda: read_manifest(path),
+        lambda: checked_file.content_of(path),
+    ]
+
+
+def test_pipes_and_devices_are_refused(tmp_path: Path) -> None:
+    for kind, suffix in enumerate((".toml", ".json", ".npz", ".mat", ".csv")):
+        os.mkfifo(tmp_path / f"pipe{suffix}")
+        (tmp_path / f"device{suffix}").symlink_to("/dev/zero" if kind else "/dev/null")
+    for stem in ("pipe", "device"):
+        for read in readers(tmp_path / f"{stem}.toml"):
+            with pytest.raises(malta.InputError, match="found a pipe or a device, expected a "):
+                read()
+
+
+def test_links_to_files_are_read(tmp_path: Path) -> None:
+    (tmp_path / "file.toml").write_text("a = 1")
+    (tmp_path / "link.toml").symlink_to(tmp_path / "file.toml")
+    assert load_toml(tmp_path / "link.toml") == {"a": 1}
+
+
+def test_files_without_end_are_refused(tmp_path: Path) -> None:
+    for suffix in (".toml", ".json", ".npz", ".mat", ".csv"):
+        with (tmp_path / f"large{suffix}").open("wb") as file:
+            file.truncate(10**12)  # a sparse file
+    for read in readers(tmp_path / "large.toml"):
+        with pytest.raises(malta.InputError, match=r"found 1000000000000 bytes, expected a .* of at most "):
+            read()
+
+
+@pytest.mark.parametrize("key", ["a" + 2000 * ".a", "machine" + 2000 * ".a", "a" + 31 * ".a"])
+def test_tables_in_countless_others_are_refused(tmp_path: Path, key: str) -> None:
+    path = tmp_path / "deep.toml"
+    path.write_text(f"{key} = 1\n")
+    for read in (lambda: malta.read_design(path), lambda: malta.read(path)):
+        with pytest.raises(
+            malta.InputError, match=r"deep\.toml: found tables in more than 30 others, expected"
+        ):
+            read()
+
+
+def test_lists_in_countless_others_are_refused_in_gain_files(tmp_path: Path) -> None:
+    path = tmp_path / "deep.json"
+    path.write_text('{"schema": ' + 500 * "[" + 500 * "]" + "}")
+    with pytest.raises(malta.InputError, match=r"deep\.json: found tables in more than 30 others, expected"):
+        malta.gains.read(path)

@@ -14,6 +14,7 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import math
 import os
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
@@ -32,6 +33,7 @@ from malta.simulation.digest import Batch, verdicts
 from malta.synthesis.controller import Controller
 
 MANIFEST = "campaign.json"
+HEADERS = 1_000_000  # bytes of a block beside its numbers, at most
 
 
 def block_name(first: int) -> str:
@@ -190,7 +192,10 @@ def read_block(path: Path, plan: Plan, first: int, count: int) -> Block | None:
 
     Raises InputError for a block of another campaign.
     """
-    data = read_file(path, "block of a campaign", Path.read_bytes)
+    machines = draw_machines(plan)
+    figures = sum(math.prod(shape) for shape in figure_shapes(plan).values())
+    largest = 16 * count * (figures + machines.values.shape[1]) + HEADERS  # twice what it takes
+    data = read_file(path, "block of a campaign", Path.read_bytes, largest)
     try:
         arrays = read_npz(data)  # checks the archive's checksums
         identity, kind, sealed = (str(arrays[name]) for name in ("campaign", "engine", "seal"))
@@ -200,7 +205,6 @@ def read_block(path: Path, plan: Plan, first: int, count: int) -> Block | None:
         return None
     if identity != plan.identity:
         raise InputError(path, "", "a block of another campaign", f"one of that in {MANIFEST}")
-    machines = draw_machines(plan)
     rest = {name: array for name, array in arrays.items() if name != "seal"}
     whole = (
         sealed == seal(rest, first)

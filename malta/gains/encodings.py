@@ -20,6 +20,7 @@ from malta.archives import read_npz
 from malta.errors import InputError
 from malta.files import read_file
 from malta.gains.mat import read_mat
+from malta.tables import require_shallow
 
 MAT_HEADER = 116  # bytes of descriptive text that open a MAT-file
 MATRICES = (
@@ -66,6 +67,7 @@ def decode(path: Path) -> dict[str, Any]:
         raise InputError(path, "", found, f"a complete {path.suffix} gain file") from error
     if not isinstance(content, dict):
         raise InputError(path, "", f"a {type(content).__name__}", "the tables of a gain file")
+    require_shallow(content, path)
     return content
 
 

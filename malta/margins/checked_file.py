@@ -17,7 +17,8 @@ from flint import fmpq
 from malta.errors import InputError
 
 FORMAT, VERSION = "malta margin certificate", 1
-LARGEST = 4_000_000  # bytes
+LARGEST = 4_000_000  # bytes of a certificate
+LARGEST_GAINS = 100_000_000  # bytes of its gain file
 ARITY = {
     "assign": 1, "neg": 1, "sq": 1, "twice": 1, "inv": 1, "constpow": 1,
     "add": 2, "sub": 2, "mul": 2, "div": 2, "input": 0, "const": 0,
@@ -256,14 +257,25 @@ def digest(content: dict[str, object]) -> str:
     return hashlib.sha256(json.dumps(rest, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
 
 
+def _bytes(path: Path, kind: str, largest: int) -> bytes:
+    """The content of a file. Raises InputError for one that is missing or too large, and for pipes and devices."""
+    try:
+        if not (path.is_file() or path.is_dir()) and path.exists():
+            raise InputError(path, "", "a pipe or a device", f"a {kind}")
+        size = path.stat().st_size
+        if size > largest:
+            raise InputError(path, "", f"{size} bytes", f"a {kind} of at most {largest}")
+        return path.read_bytes()
+    except OSError as error:
+        raise InputError(path, "", error.strerror or "an unreadable file", f"a {kind}") from error
+
+
 def content_of(path: Path) -> dict[str, Any]:
     """The JSON of a certificate. Raises InputError for what is none."""
     try:
-        if path.stat().st_size > LARGEST:
-            raise InputError(path, "", "a file that is too large", f"at most {LARGEST} bytes")
-        content = json.loads(path.read_bytes().decode())
-    except OSError as error:
-        raise InputError(path, "", error.strerror or "an unreadable file", "a certificate") from error
+        content = json.loads(_bytes(path, "certificate", LARGEST).decode())
+    except InputError:
+        raise
     except (ValueError, RecursionError) as error:
         raise InputError(path, "", f"no JSON ({str(error)[:80]})", "a certificate") from error
     f = Field(path, "", content)
@@ -284,10 +296,7 @@ def read(path: Path, gains: Path | None) -> tuple[Document, str]:
     if f["sha256"].value != digest(content):
         refused = "the file was changed after it was written (sha256)"
     elif gains is not None:
-        try:
-            found = hashlib.sha256(gains.read_bytes()).hexdigest()
-        except OSError as error:
-            raise InputError(gains, "", error.strerror or "an unreadable file", "a gain file") from error
+        found = hashlib.sha256(_bytes(gains, "gain file", LARGEST_GAINS)).hexdigest()
         if found != of:
             refused = f"the certificate is of another gain file than {gains} (sha256)"
     parameters = tuple(parameter(x) for x in f["parameters"].items(1, 20))

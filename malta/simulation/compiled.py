@@ -9,10 +9,12 @@ from __future__ import annotations
 
 import ctypes
 import hashlib
+import logging
 import os
 import platform
 import shlex
 import shutil
+import signal
 import subprocess
 import tempfile
 from contextlib import suppress
@@ -23,6 +25,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import platformdirs
 
+from malta.errors import InputError
 from malta.simulation.private_folders import is_private, open_private, process_folder
 
 if TYPE_CHECKING:
@@ -31,6 +34,7 @@ if TYPE_CHECKING:
     from malta.model.plant import FloatArray
 
 LANES = 8
+PATIENCE = 300.0  # s for a compilation, which takes some seconds
 FLAGS = (
     *("-std=gnu11", "-O3", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math"),
     *("-fschedule-insns", "-fsched-pressure", "-fPIC", "-shared"),
@@ -39,8 +43,15 @@ FLAGS = (
 
 @cache
 def compiler() -> tuple[str, ...] | None:
-    """The system's C compiler, as a command: $CC (which may have options), or the first of cc, gcc and clang."""
-    chosen = shlex.split(os.environ.get("CC", ""))
+    """The system's C compiler, as a command: $CC (which may have options), or the first of cc, gcc and clang.
+
+    Raises InputError for a $CC with a quotation mark that is not closed.
+    """
+    given = os.environ.get("CC", "")
+    try:
+        chosen = shlex.split(given)
+    except ValueError as error:
+        raise InputError("$CC", "", repr(given[:60]), "a command, as a shell takes it") from error
     for name, *options in [chosen] if chosen else [["cc"], ["gcc"], ["clang"]]:
         path = shutil.which(name)
         if path:
@@ -58,16 +69,45 @@ def _processor() -> str:
 
 
 @cache
-def _version(cc: tuple[str, ...]) -> str:
-    return subprocess.run([*cc, "--version"], capture_output=True, text=True, check=False).stdout
+def _version(cc: tuple[str, ...]) -> str | None:
+    """What a compiler says of itself; None for one that does not answer."""
+    found = _answer([*cc, "--version"])
+    return None if found is None else found[1]
+
+
+def _answer(command: list[str]) -> tuple[int, str] | None:
+    """A compiler's exit code and what it prints; None where it cannot be started, or is stopped after PATIENCE."""
+    try:
+        process = subprocess.Popen(
+            command,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            errors="replace",
+            start_new_session=True,
+        )
+    except OSError:
+        return None
+    with process:
+        try:
+            printed, _ = process.communicate(timeout=PATIENCE)
+        except BaseException as error:  # also Ctrl-C, which does not reach a session of its own
+            with suppress(OSError):
+                os.killpg(process.pid, signal.SIGKILL)  # with the programs that it started
+            if not isinstance(error, subprocess.TimeoutExpired):
+                raise
+            found = f"{command[0]} without an answer for {PATIENCE:g} s"
+            logging.getLogger("malta").warning(f"malta: found {found}, expected a C compiler")
+            return None
+    return process.returncode, str(printed)
 
 
 def library(text: str, lanes: int, folder: Path | None = None) -> ctypes.CDLL | None:
     """The library of a C text, from the cache folder or compiled now; None where no compiler can make it."""
     cc = compiler()
-    if cc is None:
+    version = None if cc is None else _version(cc)
+    if cc is None or version is None:
         return None
-    key = "\n".join([text, str(lanes), *FLAGS, *cc, _version(cc), _processor(), platform.platform()])
+    key = "\n".join([text, str(lanes), *FLAGS, *cc, version, _processor(), platform.platform()])
     name = f"{hashlib.sha256(key.encode()).hexdigest()}.so"
     temporary = Path(tempfile.gettempdir()) / f"malta-{os.getuid()}"
     for wanted in (folder or cache_folder(), temporary, None):
@@ -103,7 +143,10 @@ def _compile(cc: tuple[str, ...], text: str, lanes: int, path: Path) -> bool:
         c.write_text(text, encoding="utf-8")
         for native in (["-march=native"], []):
             command = [*cc, *FLAGS, *native, f"-DLANES={lanes}", str(c), "-o", str(so), "-lm"]
-            if subprocess.run(command, capture_output=True, check=False).returncode == 0:
+            found = _answer(command)
+            if found is None:
+                return False
+            if found[0] == 0:
                 content = so.read_bytes()
                 so.write_bytes(content + hashlib.sha256(content).digest())  # see _is_intact
                 so.chmod(0o600)  # whatever the umask: see is_private

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from malta.model.plant import FloatArray, Plant, Signal
     from malta.simulation.trajectory import Trajectory
 
+LARGEST = 1_000_000_000  # bytes of a log: ten minutes of ten columns at 20 kHz
 SUFFIXES = (".csv", ".npz")
 
 
@@ -51,10 +52,10 @@ def read_log(path: str | Path, plant: Plant) -> ForceLog:
     if path.suffix not in SUFFIXES:
         raise InputError(path, "", f"suffix {path.suffix!r}", "one of " + ", ".join(SUFFIXES))
     if path.suffix == ".csv":
-        text = read_file(path, "log of a run", lambda p: p.read_text(encoding="utf-8-sig"))
+        text = read_file(path, "log of a run", lambda p: p.read_text(encoding="utf-8-sig"), LARGEST)
         columns = _csv_columns(text, path)
     else:
-        columns = _npz_columns(read_file(path, "log of a run", Path.read_bytes), path)
+        columns = _npz_columns(read_file(path, "log of a run", Path.read_bytes, LARGEST), path)
     stroke = plant.outputs[plant.stroke_output]
     t = _series(columns, "t", "s", path)
     if len(t) < 2 or not (np.diff(t) > 0).all():
