@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import os
+import re
+import secrets
+import socket
 import stat
 from collections.abc import Callable, Mapping
 from contextlib import suppress
@@ -49,6 +52,7 @@ def _exists(path: Path) -> bool:
 def replace_files(contents: Mapping[Path, bytes]) -> None:
     """Write files, all or none: each is completed beside its target before any is renamed into place.
 
+    Content and names are on the disk when the function returns, so that no power failure leaves a file half-written.
     Folders are made as needed. Raises InputError when one cannot be written to; the old files then stand.
     """
     staged: list[tuple[Path, Path]] = []
@@ -56,12 +60,14 @@ def replace_files(contents: Mapping[Path, bytes]) -> None:
         for path, data in contents.items():
             try:
                 path.parent.mkdir(parents=True, exist_ok=True)
-                temporary = path.with_name(f".{path.name}.{os.getpid()}")
+                if path.exists() and not path.is_file():
+                    raise IsADirectoryError(0, _obstacle(path), str(path))
+                temporary = temporary_name(path)
                 staged.append((temporary, path))
                 with temporary.open("xb") as file:
                     file.write(data)
-                if path.is_dir():
-                    raise IsADirectoryError(0, "a folder of that name", str(path))
+                    file.flush()
+                    os.fsync(file.fileno())
             except (OSError, ValueError) as error:
                 raise _refused(path, error) from error
         before = {path: path.read_bytes() if path.exists() else None for _, path in staged}
@@ -75,10 +81,36 @@ def replace_files(contents: Mapping[Path, bytes]) -> None:
                     other.unlink() if old is None else other.write_bytes(old)
                 raise _refused(path, error) from error
             replaced.append(path)
+        for folder in {path.parent for path in replaced}:
+            _sync_folder(folder)
     finally:
         for temporary, _ in staged:
             with suppress(OSError):
                 temporary.unlink(missing_ok=True)
+
+
+def temporary_name(path: Path) -> Path:
+    """A hidden name beside a file that no other process takes, on this computer or on one that shares the volume."""
+    return path.with_name(f".{path.name[:50]}.{writer()}.{secrets.token_hex(4)}")
+
+
+def writer() -> str:
+    """Computer and process, as they stand in temporary names."""
+    return f"{re.sub('[^A-Za-z0-9-]', '_', socket.gethostname())[:40]}.{os.getpid()}"
+
+
+def _obstacle(path: Path) -> str:
+    return "a folder of that name" if path.is_dir() else "a pipe or a device of that name"
+
+
+def _sync_folder(folder: Path) -> None:
+    """Bring the names in a folder to the disk, on file systems that can."""
+    with suppress(OSError):
+        opened = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(opened)
+        finally:
+            os.close(opened)
 
 
 def read_file(

@@ -37,6 +37,7 @@ from malta.campaigns.result import Campaign, rate
 from malta.campaigns.run import SLOW_BLOCK, campaign, replay
 from malta.campaigns.statistics import figures_of, runs_within_bounds, worst_of
 from malta.campaigns.store import MANIFEST, block_name, read_plan
+from malta.files import temporary_name
 from malta.machines.tubular.experiments import CASES, EXPERIMENTS
 from malta.report import figures
 from malta.simulation import compiled
@@ -667,7 +668,7 @@ def test_a_folder_that_may_not_be_looked_into_is_refused(
 
 def test_what_a_killed_process_left_is_no_obstacle(controller: Controller, tmp_path: Path) -> None:
     """Half a block under a temporary name, by a process that had the same number: as in a container, started anew."""
-    stale = tmp_path / f".{block_name(0)}.{os.getpid()}"
+    stale = temporary_name(tmp_path / block_name(0))
     stale.write_bytes(b"half")
     assert campaign(_plan(controller, 8), tmp_path).completed.all()
     assert not stale.exists()

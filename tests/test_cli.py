@@ -845,3 +845,22 @@ def test_published_figures_are_found_from_any_folder(
     code, out, err = run("simulate", gains)
     assert (code, err) == (0, "")
     assert "<=" in out
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")
+@pytest.mark.parametrize("buffered", ["", "1"])
+def test_full_device_is_refused_in_a_sentence(buffered: str) -> None:
+    environment = os.environ | {"PYTHONUNBUFFERED": buffered}
+    command = [sys.executable, "-m", "malta", "--version"]
+    sentence = b"malta: standard output: found No space left on device, expected a place to write to\n"
+    with Path("/dev/full").open("wb") as full:
+        ended = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, env=environment, check=False)
+        assert (ended.returncode, ended.stderr) == (2, sentence)
+        command = [sys.executable, "-m", "malta", "check", "nothing"]
+        assert subprocess.run(command, stdout=full, stderr=full, env=environment, check=False).returncode == 2
+
+
+def test_reader_that_has_read_enough_is_no_error() -> None:
+    command = f"{sys.executable} -m malta --help | head -1"
+    ended = subprocess.run(["sh", "-c", command], capture_output=True, text=True, check=False)
+    assert (ended.stdout.count("Usage"), ended.stderr) == (1, "")

@@ -6,6 +6,7 @@ import os
 import re
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -887,6 +888,16 @@ def test_a_command_with_an_open_quotation_mark_is_refused(monkeypatch: pytest.Mo
         malta.InputError, match=r"^\$CC: found '\"gcc', expected a command, as a shell takes it$"
     ):
         compiled.library("", 1)
+
+
+def test_a_user_without_a_home_has_engines_in_the_temporary_folder(monkeypatch: pytest.MonkeyPatch) -> None:
+    def homeless(_: int) -> None:
+        raise KeyError("getpwuid(): uid not found")
+
+    monkeypatch.setattr("pwd.getpwuid", homeless)
+    for name in ("HOME", "XDG_CACHE_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    assert compiled.cache_folder() == Path(tempfile.gettempdir()) / f"malta-{os.getuid()}"
 
 
 def test_two_processes_may_compile_at_once(small: tuple[Period, str], fresh: Path, tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import stat
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import pytest
 
 import malta
 from malta.campaigns.store import read_manifest
-from malta.files import replace_files
+from malta.files import replace_files, temporary_name
 from malta.margins import checked_file
 from malta.simulation.force_log import read_log
 from malta.tables import load_toml
@@ -196,3 +197,49 @@ def test_lists_in_countless_others_are_refused_in_gain_files(tmp_path: Path) -> 
     path.write_text('{"schema": ' + 500 * "[" + 500 * "]" + "}")
     with pytest.raises(malta.InputError, match=r"deep\.json: found tables in more than 30 others, expected"):
         malta.gains.read(path)
+
+
+def test_temporary_names_are_of_a_computer_and_a_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two computers that share a volume may have processes of one number."""
+    path = Path("folder/runs.npz")
+    monkeypatch.setattr("os.getpid", lambda: 4711)
+    names_of = []
+    for host in ("one", "../other", "one"):
+        monkeypatch.setattr("socket.gethostname", lambda host=host: host)
+        names_of.append(temporary_name(path))
+    assert {name.parent for name in names_of} == {path.parent}
+    assert [name.name.rpartition(".")[0] for name in names_of] == [
+        ".runs.npz.one.4711",
+        ".runs.npz.___other.4711",
+        ".runs.npz.one.4711",
+    ]
+    assert len(set(names_of)) == 3
+
+
+def test_files_are_on_the_disk_before_they_are_renamed_and_names_after(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    done: list[str] = []
+    sync, rename = os.fsync, Path.replace
+
+    def note_sync(opened: int) -> None:
+        done.append("folder" if stat.S_ISDIR(os.fstat(opened).st_mode) else "file")
+        sync(opened)
+
+    def note_rename(self: Path, target: Path) -> Path:
+        done.append(f"rename {target.name}")
+        return rename(self, target)
+
+    monkeypatch.setattr(os, "fsync", note_sync)
+    monkeypatch.setattr(Path, "replace", note_rename)
+    replace_files({tmp_path / "a.bin": b"1", tmp_path / "b.bin": b"2"})
+    assert done == ["file", "file", "rename a.bin", "rename b.bin", "folder"]
+
+
+def test_pipe_in_the_place_of_a_file_stays(tmp_path: Path) -> None:
+    pipe = tmp_path / "x.bin"
+    os.mkfifo(pipe)
+    with pytest.raises(malta.InputError, match=r"x\.bin: found a pipe or a device of that name, expected"):
+        replace_files({pipe: b"1"})
+    assert pipe.is_fifo()
+    assert names(tmp_path) == ["x.bin"]

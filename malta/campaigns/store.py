@@ -15,7 +15,6 @@ import hashlib
 import io
 import json
 import math
-import os
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -27,7 +26,7 @@ from malta.archives import read_npz
 from malta.campaigns.block import Block
 from malta.campaigns.plan import SCHEMA, VERSION, Plan, draw_machines, fingerprint, planned_run
 from malta.errors import InputError
-from malta.files import read_file, replace_files
+from malta.files import read_file, replace_files, writer
 from malta.simulation.compiled import LANES
 from malta.simulation.digest import Batch, verdicts
 from malta.synthesis.controller import Controller
@@ -48,7 +47,7 @@ def open_folder(folder: Path, plan: Plan, block: int) -> int:
     """
     path = folder / MANIFEST
     try:
-        for stale in folder.glob(f".*.npz.{os.getpid()}"):  # left by a killed process that had the same id
+        for stale in folder.glob(f".*.npz.{writer()}.*"):  # left by a killed process that had the same id
             stale.unlink(missing_ok=True)
         begun = path.exists()
     except OSError as error:

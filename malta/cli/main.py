@@ -18,7 +18,7 @@ from malta.cli.check import check
 from malta.cli.claims import claims
 from malta.cli.design import design
 from malta.cli.new import new
-from malta.cli.output import print_error
+from malta.cli.output import print_error, silence
 from malta.cli.simulate import simulate
 from malta.cli.tune import tune
 from malta.cli.verify import verify
@@ -65,13 +65,28 @@ def main() -> None:
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # a terminal without Greek letters shows ? and goes on
     try:
-        app()
+        try:
+            app()
+        finally:
+            if sys.stdout is not None:
+                sys.stdout.flush()  # now: at the end of the process nobody could say what went wrong
+    except OSError as error:  # of standard output: files that are read or written have errors of their own
+        sys.exit(_end_output(error))
     except (InputError, CheckError) as error:
         sys.exit(print_error(error))
     except ArithmeticError as error:
         sys.exit(print_error(CheckError(f"numbers beyond what can be computed ({error})")))
     finally:
         gc.freeze()  # the process ends: no last walk through what the system takes back at once
+
+
+def _end_output(error: OSError) -> int:
+    """Say why output cannot be written, write no more of it, and return the exit code."""
+    where, found = error.filename or "standard output", error.strerror or type(error).__name__
+    silence(sys.stdout)
+    if isinstance(error, BrokenPipeError):  # whoever read has read enough
+        return 1
+    return print_error(InputError(where, "", found, "a place to write to"))
 
 
 if __name__ == "__main__":

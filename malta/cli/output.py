@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+import os
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TextIO
 
 import typer
 
@@ -55,7 +56,18 @@ def print_json(content: Any) -> None:
 
 def print_note(text: str) -> None:
     """Print one line on standard error, after the name of the program."""
-    print(f"malta: {text}", file=sys.stderr, flush=True)
+    try:
+        print(f"malta: {text}", file=sys.stderr, flush=True)
+    except OSError:  # a full device: nobody can be told
+        silence(sys.stderr)
+
+
+def silence(stream: TextIO) -> None:
+    """Drop what a stream still holds, and all that is written to it from now on."""
+    with suppress(OSError, ValueError, AttributeError):  # a stream without a file
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, stream.fileno())
+        os.close(nowhere)
 
 
 def print_error(error: InputError | CheckError, file: Path | None = None) -> int:

@@ -109,8 +109,7 @@ def library(text: str, lanes: int, folder: Path | None = None) -> ctypes.CDLL | 
         return None
     key = "\n".join([text, str(lanes), *FLAGS, *cc, version, _processor(), platform.platform()])
     name = f"{hashlib.sha256(key.encode()).hexdigest()}.so"
-    temporary = Path(tempfile.gettempdir()) / f"malta-{os.getuid()}"
-    for wanted in (folder or cache_folder(), temporary, None):
+    for wanted in (folder or cache_folder(), _temporary_folder(), None):
         try:
             place = process_folder() if wanted is None else open_private(wanted)
             if place is None:
@@ -132,8 +131,15 @@ def _is_intact(path: Path) -> bool:
 
 
 def cache_folder() -> Path:
-    """The folder of compiled engines. Deleting it costs seconds of compilation."""
-    return platformdirs.user_cache_path("malta")
+    """The folder of compiled engines. Deleting it costs seconds of compilation. A user without a home has another."""
+    try:
+        return platformdirs.user_cache_path("malta")
+    except RuntimeError:  # neither $HOME nor an entry of the user in the system
+        return _temporary_folder()
+
+
+def _temporary_folder() -> Path:
+    return Path(tempfile.gettempdir()) / f"malta-{os.getuid()}"
 
 
 def _compile(cc: tuple[str, ...], text: str, lanes: int, path: Path) -> bool:
