@@ -316,6 +316,23 @@ def test_the_link_settles_where_the_supply_gives_what_is_drawn(plant: Plant) -> 
 # Half-bridges
 
 
+@given(u=EIGHTEEN, V=st.floats(5, 60), limit=st.floats(0.01, 40))
+def test_voltages_keep_the_smaller_limit(plant: Plant, u: list[float], V: float, limit: float) -> None:
+    """Of half-bridges, machine and gain file: by axes and by phases."""
+    most = inverter.largest_voltage(V, limit, math.inf)
+    assert float(most) == min(V / 2, limit)
+    assert inverter.largest_voltage(V, math.inf) == V / 2
+    d, limited = (
+        _flat(value)
+        for value in inverter.duty_cycles(plant.drive, ca.DM(u), V, ca.DM(u), real_pwm=False, most=most)
+    )
+    np.testing.assert_allclose((d - 0.5) * V, np.clip(u, -most, most), rtol=0, atol=1e-12)
+    assert np.array_equal(limited == 0, d == 0.5 + np.array(u) / V)
+    axes = ca.DM(u[: len(plant.drive.axes)])
+    m, _ = inverter.modulation(plant.drive, axes, V, most)
+    assert float(ca.mmax(plant.drive.peak(ca.DM(m) * V))) <= float(most) * (1 + 1e-12)
+
+
 @given(u=EIGHTEEN, i=EIGHTEEN, V=st.floats(5, 60))
 def test_duty_cycles_are_half_plus_u_over_V_within_0_and_1(
     plant: Plant, u: list[float], i: list[float], V: float

@@ -464,6 +464,14 @@ def faults() -> dict[str, tuple[Edit, str, str, str]]:
             lambda d: (put("feedforward.z_grid", [0.0])(d), put("feedforward.v0", [[0.0] * 5])(d)),
             "feedforward.z_grid", "", "two rising positions",
         ),
+        "v0 beyond all measure": (
+            change("feedforward.v0", lambda v: [*v[:-1], [*v[-1][:4], 1e308]]), "feedforward.v0", "1e+308]",
+            "at most limits.force, [26.0",
+        ),
+        "v0 beyond the limit": (
+            change("feedforward.v0", lambda v: [[-26.1, *v[0][1:]], *v[1:]]), "feedforward.v0", "[26.1, ",
+            "at most limits.force, [26.0",
+        ),
         "limit of 0": (change("limits.force", poked(0.0)), "limits.force", "[0.0, 26.0", "above 0"),
         "negative limit": (change("limits.current", poked(-5.0)), "limits.current", "[-5.0, 5.0", "above 0"),
     }  # fmt: skip

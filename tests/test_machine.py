@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 import casadi as ca
 import numpy as np
@@ -838,3 +838,31 @@ def test_nothing_happens_before_the_computation_is_done(calibrated: Design, fide
         assert pushed.argmax() == delay + 1
         own = malta.simulate(calibrated.plant, calibrated.controller, scenario, engine=VIRTUAL)
         assert np.array_equal(run.x, own.x) == (delay == 1)
+
+
+@pytest.mark.parametrize("fidelity", ["dq", "phase"])
+def test_the_smaller_limit_counts_of_the_machine_and_of_its_gain_file(
+    designs: dict[str, Design], fidelity: Literal["dq", "phase"]
+) -> None:
+    """Voltages of 2 V and currents of 0.5 A, where the stroke takes 6.6 V and 2.6 A."""
+    plant, c = designs["calibrated"].plant, designs["calibrated"].controller
+    scenario = malta.Scenario.stroke(fidelity=fidelity)
+    weak = plant.variant(replace(plant.parameters, V_max=2.0))
+    cautious = replace(c, limits=replace(c.limits, voltage=np.full(5, 2.0)))
+    free, by_machine, by_file = (
+        malta.simulate(*pair, scenario) for pair in ((plant, c), (weak, c), (plant, cautious))
+    )
+    assert _largest_phase_voltage(free, fidelity) > 5
+    assert _largest_phase_voltage(by_machine, fidelity) == pytest.approx(2, rel=1e-9)
+    np.testing.assert_array_equal(by_machine.x, by_file.x)
+    careful = replace(c, limits=replace(c.limits, current=np.full(5, 0.5)))
+    run = malta.simulate(plant, careful, scenario)
+    assert np.abs(run.current).max() == 0.5
+    assert run.limits == ("current limit",)
+
+
+def _largest_phase_voltage(run: malta.Trajectory, fidelity: str) -> float:
+    """V, of all phases; from the axes their upper bound, by which they are limited."""
+    if fidelity == "phase":
+        return float(np.abs((run.duty - 0.5) * run.link).max())
+    return max(float(ca.mmax(run.plant.drive.peak(ca.DM(u)))) for u in run.u)

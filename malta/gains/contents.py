@@ -191,7 +191,8 @@ def _arrays(file: GainFile, layout: _Layout, path: str | Path) -> tuple[Arrays, 
 
 
 def _check_values(arrays: Mapping[str, Mapping[str, FloatArray]], path: str | Path) -> None:
-    """Raise InputError for a grid that does not rise, and for limits, variances and weights of the wrong sign."""
+    """Raise InputError for a grid that does not rise, for limits, variances and weights of the wrong sign, and for
+    forces v0 beyond the limits."""
     z_grid = arrays["feedforward"]["z_grid"]
     if len(z_grid) < 2 or not (np.diff(z_grid) > 0).all():
         raise InputError(
@@ -210,6 +211,12 @@ def _check_values(arrays: Mapping[str, Mapping[str, FloatArray]], path: str | Pa
         if (weight < 0).any() or (key == "input" and not (weight > 0).all()):
             expected = "weights above 0" if key == "input" else "none below 0"
             raise InputError(path, f"cost.{key}", str(weight.tolist()), expected)
+    force = arrays["limits"].get("force")
+    if force is not None and not (np.abs(arrays["feedforward"]["v0"]) <= force).all():
+        largest = np.abs(arrays["feedforward"]["v0"]).max(axis=0).tolist()
+        raise InputError(
+            path, "feedforward.v0", f"up to {largest}", f"at most limits.force, {force.tolist()}"
+        )
 
 
 def _observed(

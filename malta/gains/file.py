@@ -12,7 +12,7 @@
     noise            process [N^2] m, sensor [m^2] p: variances that the filter was designed for; drift [N^2] m or null
     feedforward      inertia [kg or kg m^2] m, speed m x p [N s/m], rate n0/2 x p, z_grid [g] [m], v0 g x m [N]
     current_loop     Kp [V/A], Ki [V/(A s)], sample_time [s]
-    limits           current [A], voltage [V]: of each of c coils; force [N or N m]: m
+    limits           current [A], voltage [V]: of each of c coils; force [N or N m]: m, which bounds v0 too
     verification     poles {open_loop, regulator, filter, closed_loop} as rows [re, im] in rad/s, bandwidth [rad/s],
                      peak_sensitivity, robust {uncertainty, lower, upper, witness [SI]} or null: the margin over
                      the travel in multiples of the uncertainty; lower null: not proven, upper null: no witness
@@ -23,7 +23,9 @@ n = n0 + m d where the design models a delay of d samples: the mechanical states
 the filter observes forces of disturbance. The control law is stated in synthesis/controller.py. A PID controller has
 the same law, with a diagonal Ki where each output has its own input (synthesis/pid.py); its cost, its noise and its
 poles of regulator and filter are null. current_loop is null where currents follow their commands at once,
-limits.voltage is null where voltages have no limit.
+limits.voltage is null where voltages have no limit. A simulation keeps the smaller limit of the machine and its file:
+of forces and currents always, of voltages where it has windings (fidelities dq and phase; the smallest of the file's).
+A machine with electronics of its own keeps its own voltages.
 
 A file of version 2 has one more table, and may have others:
 

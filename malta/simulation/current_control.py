@@ -20,6 +20,9 @@ def control_currents(
     the forces where the setup says so. The integrals I follow backward Euler and wait while the half-bridges are at
     their limit. Current controllers and control law have the same period, as on the machine (50 us).
 
+    The voltage of a phase is at most that of the half-bridges, V/2; the machine's own limit, as --set V_max changes it;
+    and the smallest of limits.voltage in the gain file.
+
     Returns the command to hold, the controller's states after this sample, and entries of the row.
     """
     plant, c, s, g = loop
@@ -42,14 +45,15 @@ def control_currents(
     waiting = controller["u_limited"]
     integral = controller["u_integral"] + g["Ki_current"] * g["control_time"] * (1 - waiting) * (Q @ error)
     u = g["Kp"] * error + Q.T @ integral + believed.drive.emf(estimate)
+    most = inverter.largest_voltage(V, plant.actuator.voltage_limit, g["voltage_limit"])
     row: dict[str, Any] = {"link": V, "i": i}
     if s.fidelity == "dq":
-        command, limited = inverter.modulation(drive, u, V)
+        command, limited = inverter.modulation(drive, u, V, most)
         command = keep_if_missed(s, signals, command)
         row |= {"u": command * V, "force": drive.force(i)}
     else:
         u_phase = believed.drive.to_phases(estimate) @ u
-        command, limits = inverter.duty_cycles(drive, u_phase, V, i_phase, real_pwm=s.real_pwm)
+        command, limits = inverter.duty_cycles(drive, u_phase, V, i_phase, real_pwm=s.real_pwm, most=most)
         limited = ca.vertcat(*_limited_axes(drive, limits))
         command = keep_if_missed(s, signals, command)
         T = drive.to_axes(machine["x"])  # at the true position, not at the estimate

@@ -21,29 +21,44 @@ def open_loop_gain(actuator: Actuator, Kp: float, Ki: float, delay: float, w: Fl
     return (Kp + Ki / s) * np.exp(-s * delay) / (actuator.L * s + actuator.R)
 
 
-def modulation(drive: Drive, u: Any, V: Any) -> tuple[Any, Any]:
+def largest_voltage(V: Any, *limits: Any) -> Any:
+    """The largest voltage of a phase, V/2 of the link or the smallest of the limits (V); infinite ones are none."""
+    most = V / 2
+    for limit in limits:
+        if not (isinstance(limit, float) and math.isinf(limit)):
+            most = ca.fmin(most, limit)
+    return most
+
+
+def modulation(drive: Drive, u: Any, V: Any, most: Any = None) -> tuple[Any, Any]:
     """Axis voltages u as shares of the link voltage V within the limits of the half-bridges, and 1 for limited axes.
 
-    Where the largest phase voltage of a group of axes exceeds V/2, the whole group is scaled: its direction stays.
+    Where the largest phase voltage of a group of axes exceeds `most`, the whole group is scaled: its direction stays.
+
+    most : V, see `largest_voltage`; None: V/2
     """
+    most = largest_voltage(V) if most is None else most
     peak = drive.peak(u)
     m, limited = ca.SX(u / V), ca.SX.zeros(len(drive.axes))
     for k, group in enumerate(drive.groups):
-        fits = 2 * peak[k] <= V
-        scale = ca.if_else(fits, 1, V / (2 * ca.fmax(peak[k], 1e-12)))
+        fits = peak[k] <= most
+        scale = ca.if_else(fits, 1, most / ca.fmax(peak[k], 1e-12))
         for axis in group:
             m[axis], limited[axis] = m[axis] * scale, ca.logic_not(fits)
     return m, limited
 
 
-def duty_cycles(drive: Drive, u_phase: Any, V: Any, i_phase: Any, *, real_pwm: bool) -> tuple[Any, Any]:
-    """Duty cycles of the half-bridges, d = 1/2 + u / V within 0 to 1, and 1 for limited phases.
+def duty_cycles(
+    drive: Drive, u_phase: Any, V: Any, i_phase: Any, *, real_pwm: bool, most: Any = None
+) -> tuple[Any, Any]:
+    """Duty cycles of the half-bridges, d = 1/2 + u / V with |u| at most `most`, and 1 for limited phases.
 
+    most : V, see `largest_voltage`; None: V/2
     real_pwm : with the resolution of the modulator's counter, and with the loss of voltage by dead time, dead_share V
         against the direction of the current
     """
-    wanted = 0.5 + u_phase / V
-    d = ca.fmax(ca.fmin(wanted, 1), 0)
+    wanted, share = 0.5 + u_phase / V, (largest_voltage(V) if most is None else most) / V
+    d = ca.fmax(ca.fmin(wanted, 0.5 + share), 0.5 - share)
     limited = d != wanted
     if real_pwm:
         d = drive.pwm_step * ca.floor(d / drive.pwm_step + 0.5) - drive.dead_share * ca.sign(i_phase)

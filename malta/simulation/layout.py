@@ -7,6 +7,7 @@ controller and sensors by name, and `flatten` puts them in one vector, theta.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
@@ -133,6 +134,8 @@ def numbers_of(
         **gains_of(c),
         "Kp": ca.DM(loop.Kp),
         "Ki_current": ca.DM(loop.Ki),
+        "current_limit": ca.DM(c.limits.current),
+        "voltage_limit": ca.DM(c.limits.voltage.min(initial=math.inf)),
         "rate": ca.DM(c.feedforward.rate),
         "grid_ends": ca.DM([c.feedforward.z_grid[0], c.feedforward.z_grid[-1]]),
         "substep": ca.DM(c.sample_time / substeps),

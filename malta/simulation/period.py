@@ -215,9 +215,11 @@ def _control_law(
         v, frozen = v_ff + v0, 0 * frozen  # open loop: no limit of the feedback is reached
     xi_pred, place = look_ahead(g, xi_pred, p_ref if s.open_loop else y, given["dp_ref"])
     after: dict[str, Any] = {"xi_pred": xi_pred, "e": e, "frozen": frozen}
-    # The controller commutates with the machine of its gain file; the simulated machine limits the currents.
+    # The controller commutates with the machine of its gain file. The simulated machine limits the currents, and the
+    # gain file does: the smaller limit counts.
     wanted = believed.currents(place, v)
     current, fast = plant.limited(wanted), electronics_of(plant, s)
+    current = ca.fmax(ca.fmin(current, g["current_limit"]), -g["current_limit"])
     met = [ca.mmax(ca.fabs(current - wanted)) > 0]
     row: dict[str, Any] = {"xi_hat": xi_hat, "v": v, "saturated": frozen, "current": current}
     if fast is not None:
