@@ -76,7 +76,8 @@ def test_the_table_of_claims_is_computed(machine: str, monkeypatch: pytest.Monke
             assert [_is_of_sample(*pair) for pair in zip(*numbers, strict=True)] == [True] * len(numbers[0])
             continue
         if _is_noisy(machine, subject) and None not in numbers[0]:
-            assert numbers[0] == pytest.approx(numbers[1], rel=0.2, abs=0.02)
+            # A mean of noise around zero has no size of its own, but that of its scatter.
+            assert numbers[0] == pytest.approx(numbers[1], rel=0.2, abs=0.3 if "mean of" in subject else 0.02)
         elif not all(n is not None and abs(n) < ROUNDING for row in numbers for n in row):
             assert shown[subject][1:] == cells[1:]
 
