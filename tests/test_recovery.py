@@ -212,13 +212,14 @@ def test_verify_prints_loads_and_writes_them_as_json(run: Run) -> None:
 def test_the_figure_of_loads_shows_what_the_table_says(file: str) -> None:
     """Each line's height is the largest deviation, each compliance's that of its peak; axes have units."""
     plant, c = machine_of(file)
-    figure = recovery_figure(plant, c)
+    found = recovery(plant, c)
+    figure = recovery_figure(plant, c, found)
     heights = {
         line.get_label(): float(np.abs(line.get_ydata()).max())
         for axes in figure.axes[::2]
         for line in axes.get_lines()
     }
-    for load, output in furthest(recovery(plant, c)):
+    for load, output in furthest(found):
         assert heights[f"{load.name}: {output.output}"] == pytest.approx(1e6 * output.largest, rel=1e-9)
     for axes in figure.axes:
         assert axes.get_lines()

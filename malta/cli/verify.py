@@ -196,7 +196,9 @@ def _draw(loop: Loop, analysis: Analysis, folder: Path) -> list[Path]:
     picture, position = folder / f"{name}_margins.png", f"position {loop.plant.stroke}"
     files = [report.robustness(analysis.robustness, name, loop.box, picture, position, analysis.worst)]
     if analysis.recovered:
-        files.append(report.loads(loop.plant, loop.controller, folder / f"{name}_loads.png"))
+        files.append(
+            report.loads(loop.plant, loop.controller, folder / f"{name}_loads.png", analysis.recovered)
+        )
     return files
 
 

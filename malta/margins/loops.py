@@ -35,6 +35,7 @@ from malta.model.plant import position_at, position_in, trim
 from malta.model.sensors import whole_samples, with_lags
 from malta.synthesis.controller import Controller, LinearLaw, linear_law, with_readings, with_slope
 from malta.synthesis.riccati import add_lags, delay_inputs, sample
+from malta.synthesis.sampled import held
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -204,8 +205,8 @@ def loaded_system(
     model = commanded_model(linearize(plant, trim(plant, **at)), controller)
     A, B, C, use = model.A, model.B, model.C, ReadingUse(slope=feedforward_slope(model, controller))
     if model.E.any():
-        H = np.linalg.lstsq(B, model.E, rcond=None)[0]
-        A, left = A - model.E @ C, model.E - B @ H
+        A, H = held(model)
+        left = model.E - B @ H
         handed = bool(np.abs(left).max() > ROUNDING * np.abs(model.E).max())
         B, use = np.hstack([B, left]) if handed else B, use._replace(held=H, handed=handed)
     if plant.sensors is not None:

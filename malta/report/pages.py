@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rich.console import Group
 from rich.text import Text
 
+from malta.margins.recovery import recovery
 from malta.margins.verify import Margins
 from malta.model.linearize import LinearModel
 from malta.report.figures import (
@@ -33,6 +34,7 @@ from malta.synthesis.spec import Spec
 if TYPE_CHECKING:
     from malta.campaigns.result import Campaign
     from malta.margins.gain import Gain
+    from malta.margins.recovery import Recovery
     from malta.margins.stages import Robustness
     from malta.model.plant import Plant
     from malta.simulation.experiments import Experiment
@@ -108,12 +110,17 @@ def robustness(
     return save(chain_figure(found, name, uncertainty, position, worst), Path(path))
 
 
-def loads(plant: Plant, controller: Controller, path: str | Path) -> Path:
+def loads(
+    plant: Plant, controller: Controller, path: str | Path, found: Sequence[Recovery] | None = None
+) -> Path:
     """Draw the answer to a constant load from outside and the compliance over frequency, and save the figure.
+
+    found : malta.recovery(plant, controller), where it is known already
 
     Example: `malta.report.loads(plant, controller, "build/robust_loads.png")`
     """
-    return save(recovery_figure(plant, controller), Path(path))
+    found = recovery(plant, controller) if found is None else found
+    return save(recovery_figure(plant, controller, found), Path(path))
 
 
 def campaign(found: Campaign, folder: str | Path, published: Published | None = None) -> list[Path]:

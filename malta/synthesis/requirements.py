@@ -234,21 +234,13 @@ def force_noise_of(name: str, inputs: Indices, heading: str) -> Requirement:
     )
 
 
-def merit_of(
-    name: str, experiment: str, unit: str, source: str, *, merit: int = 0, estimate: Estimate | None = None
-) -> Requirement:
-    """Bound a figure of merit of an experiment from above: the worst of the experiment's cases.
+def worst_merit(experiment: Any, merit: int = 0) -> float:
+    """Take the largest of a figure of merit over an experiment's cases; infinite where the experiment failed.
 
-    experiment : its name among the machine's EXPERIMENTS;  source : words that say so in the report
-    merit : the index of the figure among each case's;  an experiment that failed does not hold
+    merit : the index of the figure among each case's
     """
-
-    def measure(design: Design, _asked: float, _signal: str) -> list[Figure]:
-        e = design.fly(experiment)
-        worst = max(case.merits[merit].value for case in e.cases)
-        return [Figure(math.inf if e.failed else worst, source)]
-
-    return Requirement(name, measure, unit, laws=("LQG", "PID"), estimate=estimate)
+    worst = max(case.merits[merit].value for case in experiment.cases)
+    return math.inf if experiment.failed else float(worst)
 
 
 def _worst(design: Design, kind: Trade, indices: Sequence[int]) -> list[Figure]:

@@ -106,7 +106,7 @@ def _search(spec: Spec, cluster: _Cluster, delay: int, journal: Journal) -> Sear
 
 def _worst(search: Search, u: FloatArray) -> float:
     """What is minimized: the worst ratio, and a little of all of them."""
-    ratios = _ratios(search.spec, search.figures(u))
+    ratios = _ratios(search.spec, search.figures(u), search.spec.specification)
     return (max(ratios) + 0.01 * sum(ratios) / len(ratios) if ratios else UNSTABLE) + distance_outside(u)
 
 
@@ -123,24 +123,21 @@ def _look_frugal(
     figures = search.figures(u)
     if not figures:
         return None
-    free = {name for trade in TRADES for name in _names_of(search.spec.plant, trade)}
-    asked = {k: v for k, v in search.spec.specification.items() if base_of(k) not in free}
+    asked = _beside_trades(search.spec)
     size = sum(math.log(figures[kind]) for kind in figures if base_of(kind) in kinds)
     return size, _logs(search.spec, figures, asked | {"margin": margin})
 
 
 def _logs(spec: Spec, figures: Mapping[str, float], asked: Mapping[str, float]) -> FloatArray:
     """Logarithms of ratios, each corner's margin among them; LEAST for what is next to nothing."""
-    ratios, at_least = [], at_least_of(spec.plant)
-    for name, value in figures.items():
-        bound = asked.get("margin" if base_of(name) == "margin" else name)
-        if bound is not None:
-            ratios.append(ratio_of(bound, value, at_least=base_of(name) in at_least))
+    corners = {name: asked["margin"] for name in figures if "margin" in asked and base_of(name) == "margin"}
+    ratios = _ratios(spec, figures, {**asked, **corners})
     return np.asarray(np.log(np.clip(ratios or [LEAST], LEAST, 1 / LEAST)))
 
 
-def _ratios(spec: Spec, figures: Mapping[str, float]) -> list[float]:
-    asked, at_least = spec.specification, at_least_of(spec.plant)
+def _ratios(spec: Spec, figures: Mapping[str, float], asked: Mapping[str, float]) -> list[float]:
+    """How near the figures are to what is asked for of them."""
+    at_least = at_least_of(spec.plant)
     return [
         ratio_of(asked[name], value, at_least=base_of(name) in at_least)
         for name, value in figures.items()
@@ -155,8 +152,14 @@ def _names_of(plant: Plant, trade: Trade) -> list[str]:
 
 def _beside_noise(spec: Spec, figures: Mapping[str, float]) -> float:
     """The worst ratio of what is no axis of the front."""
-    free = {"margin", *(name for trade in TRADES for name in _names_of(spec.plant, trade))}
-    return max(_ratios(spec, {k: v for k, v in figures.items() if base_of(k) not in free}), default=0.0)
+    asked = {k: v for k, v in _beside_trades(spec).items() if base_of(k) != "margin"}
+    return max(_ratios(spec, figures, asked), default=0.0)
+
+
+def _beside_trades(spec: Spec) -> dict[str, float]:
+    """What is asked for beside noise and motion, which the front has against the margin."""
+    free = {name for trade in TRADES for name in _names_of(spec.plant, trade)}
+    return {k: v for k, v in spec.specification.items() if base_of(k) not in free}
 
 
 def search_weights(

@@ -20,6 +20,7 @@ from malta.synthesis.requirements import (
     TrialLoop,
     force_noise_of,
     motion_of,
+    worst_merit,
 )
 
 if TYPE_CHECKING:
@@ -102,8 +103,7 @@ def _tilt(design: Design, _asked: float, _signal: str) -> list[Figure]:
         e, source = design.fly("tilt", feedforward="own"), "tilt, attraction fed forward"
     else:
         e, source = design.fly("tilt"), "tilt, either feedforward"
-    worst = max(case.merits[0].value for case in e.cases)
-    return [Figure(math.inf if e.failed else worst, source)]
+    return [Figure(worst_merit(e), source)]
 
 
 def _payload(design: Design, asked: float, _signal: str) -> list[Figure]:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from malta.margins.recovery import PushedLoop, furthest, load_vector, recovery
+from malta.margins.recovery import PushedLoop, furthest, load_vector
 from malta.report.figures.parts import MORE, STYLES, finish_axes, micro
 from malta.units import unit_factor
 
@@ -19,34 +19,38 @@ if TYPE_CHECKING:
     from malta.margins.recovery import Deviation, Recovery
     from malta.model.plant import FloatArray, Plant
     from malta.synthesis.controller import Controller
+    from malta.synthesis.step_response import StepResponse
 
 FINE = {"m": "um", "rad": "urad"}  # units that outputs are drawn in
 SHOWN = 1.5  # times the longest time to 1 %
 POINTS = 400  # of frequency
 
 
-def recovery_figure(plant: Plant, controller: Controller) -> Figure:
+def recovery_figure(plant: Plant, controller: Controller, found: Sequence[Recovery]) -> Figure:
     """Deviation after a unit step of every disturbance, and compliance over frequency, of the output furthest off.
+
+    found : the answers of this machine to its disturbances, as malta.recovery(plant, controller) gives them
 
     A row for each pair of units, as um under N. Raises CheckError for an unstable loop.
     """
     from matplotlib.figure import Figure
 
-    picked = furthest(recovery(plant, controller))
+    picked = furthest(found)
     units = {s.name: s.unit for s in plant.disturbances}
     rows: dict[tuple[str, str], list[tuple[Recovery, Deviation]]] = {}
     for load, output in picked:
         rows.setdefault((output.unit, units[load.name]), []).append((load, output))
-    figure = Figure(figsize=(9.0, 0.9 + 2.4 * len(rows)), dpi=120)
-    top = 1 - 0.62 / (0.9 + 2.4 * len(rows))
+    height = 0.9 + 2.4 * len(rows)
+    figure = Figure(figsize=(9.0, height), dpi=120)
     figure.subplots_adjust(
-        left=0.09, right=0.98, bottom=0.6 / (0.9 + 2.4 * len(rows)), top=top - 0.03, hspace=0.5, wspace=0.24
+        left=0.09, right=0.98, bottom=0.6 / height, top=0.97 - 0.62 / height, hspace=0.5, wspace=0.24
     )
     figure.suptitle(f"{controller.name}: how a load from outside is carried", fontsize=11, y=0.99)
     panels = figure.subplots(len(rows), 2, squeeze=False)
     loop = PushedLoop.of(plant, controller)
+    answer = loop.answer()
     for (left, right), ((unit, of), lines) in zip(panels, rows.items(), strict=True):
-        _draw_steps(left, plant, loop, lines, FINE.get(unit, unit), of)
+        _draw_steps(left, plant, answer, lines, FINE.get(unit, unit), of)
         _draw_compliance(right, plant, loop, lines, FINE.get(unit, unit), of)
     return figure
 
@@ -54,14 +58,13 @@ def recovery_figure(plant: Plant, controller: Controller) -> Figure:
 def _draw_steps(
     axes: Axes,
     plant: Plant,
-    loop: PushedLoop,
+    answer: StepResponse,
     lines: Sequence[tuple[Recovery, Deviation]],
     unit: str,
     of: str,
 ) -> None:
     """Deviation over time of the output furthest off, after 1 N or 1 N m at t = 0."""
     names = [s.name for s in plant.outputs]
-    answer = loop.answer()
     settled = max(output.settled for _, output in lines)
     end = min(SHOWN * settled, float(answer.t[-1])) if np.isfinite(settled) else float(answer.t[-1])
     shown = answer.t <= end
