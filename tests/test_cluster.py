@@ -27,6 +27,7 @@ from malta.campaigns.dask import (
     _result,
     _task,
     blocks,
+    require_malta,
 )
 from malta.campaigns.plan import Plan
 from malta.campaigns.run import campaign
@@ -192,6 +193,64 @@ def test_what_a_worker_refuses_comes_back_as_a_sentence(plan: Plan, monkeypatch:
     refused = _at_worker(_task(plan, malta_version()), 0, 8)
     with pytest.raises(malta.InputError, match="campaign: m: found lead, expected iron"):
         _result(NOBODY, _future(refused))
+
+
+def _clients_answers(worker: Any, scheduler: Any) -> Any:
+    """A client whose worker and scheduler answer so, or with the exception, to every question."""
+
+    def of_scheduler(*_: Any) -> Any:
+        if isinstance(scheduler, Exception):
+            raise scheduler
+        return scheduler
+
+    return SimpleNamespace(run=lambda *_, **__: {"tcp://w:1": worker}, run_on_scheduler=of_scheduler)
+
+
+NO_MALTA = ModuleNotFoundError("No module named 'malta'")
+
+
+@pytest.mark.parametrize(
+    ("worker", "scheduler", "said"),
+    [
+        (
+            NO_MALTA,
+            "9",
+            "--cluster: the worker tcp://w:1: found a Python without malta, expected malta 9 there",
+        ),
+        ("9", NO_MALTA, "--cluster: the scheduler: found a Python without malta, expected malta 9 there"),
+        ("8", "9", "--cluster: the worker tcp://w:1: found malta 8, expected malta 9"),
+    ],
+)
+def test_a_python_without_this_malta_is_named(worker: Any, scheduler: Any, said: str) -> None:
+    with pytest.raises(malta.InputError) as caught:
+        require_malta(_clients_answers(worker, scheduler), "9")
+    assert str(caught.value) == said
+
+
+def test_who_is_lost_while_it_is_asked_is_no_failure() -> None:
+    require_malta(_clients_answers(OSError("gone"), OSError("gone")), "9")
+
+
+@pytest.mark.slow
+def test_a_worker_of_a_python_without_malta_is_one_sentence(loopback: Loopback, tmp_path: Path) -> None:
+    hidden = "import sys; sys.modules['malta'] = None; from distributed.cli.dask_worker import main; main()"
+    own = ("--nthreads", "1", "--no-nanny", "--no-dashboard", "--local-directory", str(tmp_path))
+    worker = subprocess.Popen([sys.executable, "-c", hidden, loopback.address, *own], stderr=subprocess.PIPE)
+    try:
+        assert worker.stderr is not None
+        while b"Starting established connection" not in worker.stderr.readline():
+            assert worker.poll() is None
+        found = _malta(tmp_path / "there", 24, "--cluster", loopback.address)
+        out, err = found.communicate(timeout=60)
+    finally:
+        worker.kill()
+        worker.communicate()
+    assert (found.returncode, out) == (2, "")
+    assert re.fullmatch(
+        r"malta: --cluster: the worker tcp://127.0.0.1:\d+: found a Python without malta, "
+        rf"expected malta {re.escape(malta_version())} there\n",
+        err,
+    )
 
 
 def _future(result: Any, status: str = "finished") -> Any:

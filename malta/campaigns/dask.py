@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import logging
 import pickle
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import lru_cache
 from importlib.metadata import version
+from pkgutil import resolve_name
 from threading import Thread
 from typing import TYPE_CHECKING, Any
 
@@ -54,6 +55,8 @@ def blocks(address: str, plan: Plan, left: Mapping[int, int]) -> Iterator[tuple[
     with _silence_loggers():
         client = _connect(dask, address)
         try:
+            if left:
+                require_malta(client, version("malta"))
             yield from _collect(dask, client, address, plan, left)
         finally:
             client.close(timeout=2)
@@ -104,6 +107,36 @@ def _silence_loggers() -> Iterator[None]:
     finally:
         for logger, disabled in zip(loggers, before, strict=True):
             logger.disabled = disabled
+
+
+def require_malta(client: Any, expected: str) -> None:
+    """Raise InputError where the scheduler or a worker has no malta, or another version than the `expected` one.
+
+    The questions are functions of the standard library: any Python can answer. Who is lost meanwhile is no failure.
+    """
+    for question, name in ((resolve_name, "malta.campaigns:__doc__"), (version, "malta")):
+        for who, answer in _ask_all(client, question, name).items():
+            if isinstance(answer, ImportError):  # PackageNotFoundError is one
+                raise InputError("--cluster", who, "a Python without malta", f"malta {expected} there")
+            if question is version and answer != expected and isinstance(answer, str):
+                raise InputError("--cluster", who, f"malta {answer}", f"malta {expected}")
+
+
+def _ask_all(client: Any, question: Callable[[str], Any], name: str) -> dict[str, Any]:
+    """The answers of the scheduler and of all workers, or their exceptions."""
+    answers: dict[str, Any] = {}
+    with suppress(*LOST):
+        found = client.run(question, name, on_error="return")
+        answers |= {f"the worker {k}": v for k, v in found.items()}
+    try:
+        with suppress(*LOST):
+            answers["the scheduler"] = client.run_on_scheduler(question, name)
+    except ImportError as error:
+        answers["the scheduler"] = error
+    return answers
+
+
+LOST = (OSError, TimeoutError)  # connections of Dask end with them
 
 
 def _connect(dask: Any, address: str) -> Any:
