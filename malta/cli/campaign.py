@@ -30,8 +30,10 @@ from malta.cli.options import (
     Rise,
     Scheduled,
     Substeps,
+    Yes,
 )
 from malta.cli.output import make_console, print_json, print_note, print_written, progress_bar
+from malta.cli.patience import limit_time
 
 if TYPE_CHECKING:
     from malta.campaigns.plan import Sampler
@@ -96,6 +98,7 @@ def campaign(
         ),
     ] = None,
     machine: MachineFile = None,
+    yes: Yes = False,
     as_json: AsJson = False,
 ) -> None:
     """Simulate many machines that differ, each with noise of its own: the yield, and what goes wrong where.
@@ -153,7 +156,8 @@ def campaign(
     )
     spec = design_of(gains, controller, design)
     folder = out or Path("build") / "campaigns" / f"{controller.name}_{scenario}_{plan.identity[:8]}"
-    with progress_bar(scenario, quiet=as_json) as progress:
+    with progress_bar(scenario, quiet=as_json) as bar:
+        progress = limit_time(bar, f"{scenario}, {samples} runs", agreed=yes)
         result = run_campaign(plan, folder, workers=workers, cluster=cluster, progress=progress)
     _report(gains, result, Bounds(published, spec), worst, as_json=as_json)
 

@@ -64,6 +64,7 @@ Substeps = Annotated[
     int | None,
     typer.Option(help="Runge-Kutta steps a sample; the error is estimated. [4, more for slow samples]"),
 ]
+Yes = Annotated[bool, typer.Option("--yes", help="Start work of more than ten minutes too.")]
 Seed = Annotated[int | None, typer.Option(help="Seed of the noise. [0]")]
 GainFile = Annotated[
     Path, typer.Argument(metavar="GAINS", help="A gain file: .json, .npz or .mat.", callback=locate)

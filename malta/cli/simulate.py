@@ -32,8 +32,10 @@ from malta.cli.options import (
     Scheduled,
     Seed,
     Substeps,
+    Yes,
 )
 from malta.cli.output import make_console, print_json, print_note, print_written, progress_bar
+from malta.cli.patience import limit_time
 from malta.errors import CheckError, InputError
 
 if TYPE_CHECKING:
@@ -96,6 +98,7 @@ def simulate(
         ),
     ] = None,
     machine: MachineFile = None,
+    yes: Yes = False,
     as_json: AsJson = False,
 ) -> None:
     """Simulate the nonlinear machine and its drive with a gain file.
@@ -135,7 +138,9 @@ def simulate(
         seed=seed,
     )
     options = add_own_options(options, option, chosen, plant)
-    with progress_bar(scenario or "simulating", quiet=as_json) as progress:
+    with progress_bar(scenario or "simulating", quiet=as_json) as bar:
+        # With --substeps a second run, with twice as many, follows for the estimate of the error.
+        progress = limit_time(bar, chosen, agreed=yes, times=3.0 if substeps else 1.0)
         if replay is None:
             result = experiment(chosen, plant, controller, progress=progress, engine=choice, **options)
             simulation = Simulation(chosen, result, f"{controller.name}_{chosen}")

@@ -95,6 +95,9 @@ def simulate_many(
     return batch_of(ends, len(inputs.t), controller.sample_time, digest_sizes(plant))
 
 
+WORK = 2_000_000  # substeps of the groups in one call of the engine, at most: a fraction of a second
+
+
 class Variation(NamedTuple):
     """The values in which the runs of a batch differ, one for each run."""
 
@@ -110,7 +113,8 @@ def _run_groups(
 ) -> None:
     """Simulate all groups of machines on several threads; the digests change in place."""
     groups = len(lanes.theta)
-    step = max(1, min(16, groups // (4 * workers)))  # groups in one call, so that progress comes often
+    work = len(shared.given) * shared.substeps
+    step = max(1, min(16, groups // (4 * workers), WORK // work))  # groups in one call: progress comes often
 
     def run(k: int) -> None:
         run_many(lib, slice(k, min(k + step, groups)), lanes, shared)

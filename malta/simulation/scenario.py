@@ -26,6 +26,7 @@ Estimator = Literal["steady-state", "kalman", "extended"]
 ESTIMATORS: tuple[Estimator, ...] = get_args(Estimator)
 FeedforwardChoice = Literal["own", "axial", "attraction"]
 FEEDFORWARDS: tuple[FeedforwardChoice, ...] = get_args(FeedforwardChoice)
+MOST_SUBSTEPS = 10_000  # in a sample: long before, rounding is larger than the error of the steps
 BearingAxes = Literal["fixed", "turning"]
 FaultKind = Literal[
     "lost sample", "stuck sensor", "biased sensor", "noisy sensor", "open phase", "link sag", "missed step"
@@ -106,6 +107,8 @@ class Scenario:
                 raise InputError(where, name, repr(value), "a number")
             if value is not None and not (math.isfinite(value) and value >= low):
                 raise InputError(where, name, str(value), "a number above 0" if low else "0 or more")
+        if self.substeps is not None and self.substeps > MOST_SUBSTEPS:
+            raise InputError(where, "substeps", str(self.substeps), f"at most {MOST_SUBSTEPS}")
         for name, known in (
             ("fidelity", FIDELITIES),
             ("estimator", ESTIMATORS),

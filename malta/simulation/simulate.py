@@ -28,7 +28,14 @@ from malta.simulation.inputs import (
     sensor_noise,
 )
 from malta.simulation.period import initial_state_function
-from malta.simulation.scenario import Scenario, Simulation, simulation_of, steps_of, substeps_of
+from malta.simulation.scenario import (
+    MOST_SUBSTEPS,
+    Scenario,
+    Simulation,
+    simulation_of,
+    steps_of,
+    substeps_of,
+)
 from malta.simulation.trajectory import Trajectory, label_rows
 from malta.simulation.verdict import Verdict, columns_of, judge
 from malta.synthesis.controller import Controller
@@ -38,6 +45,7 @@ if TYPE_CHECKING:
     from malta.simulation.start_up import Observer
 
 PORTION = 20_000  # samples of the longest portion: between two portions progress is reported
+WORK = 200_000  # substeps of the longest portion
 
 
 def simulate(
@@ -104,8 +112,9 @@ def _portions(
     state = evaluate(start, *initial_values(simulation, given[0]))[0].ravel()
     observer = _observer(simulation) if setup.outside else None
     every = _samples_between_stops(scenario, controller.sample_time)
+    longest = max(1, min(PORTION, int(WORK / steps)))
     done = 0
-    for stop in _stops(every, samples, [first for first, _ in stages]):
+    for stop in _stops(every, longest, samples, [first for first, _ in stages]):
         now = next(p for first, p in reversed(stages) if first <= done)
         engine = engine_of(now, controller, setup, steps, _sensor_errors(scenario), choice)
         part = slice(done, stop)
@@ -141,13 +150,15 @@ def _correct(simulation: Simulation, inputs: Inputs, ahead: slice, offset: Float
 def integration_error(run: Trajectory) -> float:
     """Largest error of an output (m) that the Runge–Kutta steps make, from a second run with twice as many steps.
 
-    Half the step of a fourth-order method leaves 1/16 of the error, so the runs differ by 15/16 of it.
+    Half the step of a fourth-order method leaves 1/16 of the error, so the runs differ by 15/16 of it. Where twice as
+    many are too many, the second run has half as many steps and differs by 15 times the error.
     """
     s = run.scenario
     count = steps_of(run.plant, run.controller, s)
-    finer = simulate(run.plant, run.controller, replace(s, substeps=2 * count))
-    k = min(len(run.p), len(finer.p))
-    return float(np.abs(run.p[:k] - finer.p[:k]).max()) * 16 / 15
+    finer = 2 * count <= MOST_SUBSTEPS
+    other = simulate(run.plant, run.controller, replace(s, substeps=2 * count if finer else count // 2))
+    k = min(len(run.p), len(other.p))
+    return float(np.abs(run.p[:k] - other.p[:k]).max()) * (16 / 15 if finer else 1 / 15)
 
 
 def _sensor_errors(scenario: Scenario) -> tuple[tuple[str, float], ...]:
@@ -187,11 +198,11 @@ def _stages(plant: Plant, scenario: Scenario, Ts: float) -> list[tuple[int, Plan
 
 
 def _samples_between_stops(scenario: Scenario, Ts: float) -> int:
-    """Samples of a portion: from one correction of the reference to the next, at most PORTION without corrections."""
+    """Samples from one correction of the reference to the next, or PORTION without corrections."""
     return PORTION if scenario.correction is None else max(1, round(scenario.correction.every / Ts))
 
 
-def _stops(every: int, samples: int, changes: list[int]) -> list[int]:
+def _stops(every: int, longest: int, samples: int, changes: list[int]) -> list[int]:
     """Samples at which a portion ends: for progress, a correction of the reference, or a change of the machine."""
-    marks = set(range(every, samples, every)) | set(range(PORTION, samples, PORTION)) | {samples}
+    marks = set(range(every, samples, every)) | set(range(longest, samples, longest)) | {samples}
     return sorted(marks | {k for k in changes if 0 < k < samples})
