@@ -20,6 +20,7 @@ from typer.testing import CliRunner
 
 from malta import gains
 from malta.cli import main as cli
+from malta.errors import InputError
 
 pytestmark = pytest.mark.usefixtures("proven_once")
 
@@ -287,6 +288,33 @@ def test_figures_that_cannot_be_written_leave_old_gains(run: Run, tmp_path: Path
     assert one_sentence(err).startswith(f"{blocked}/table2_stroke.png: found ")
     assert {path: path.read_bytes() for path in old} == old
     assert sorted(path.name for path in (tmp_path / "gains").iterdir()) == list(NAMES)
+
+
+def test_gains_that_cannot_be_written_leave_the_old_figure(run: Run, tmp_path: Path) -> None:
+    figures = tmp_path / "figures"
+    figures.mkdir()
+    (figures / "table2_stroke.png").write_bytes(b"old")
+    (tmp_path / "gains" / "table2.mat").mkdir(parents=True)
+    code, _, err = run("design", "design/table2.toml", "--out", tmp_path / "gains", "--figures", figures)
+    assert code == 2
+    assert one_sentence(err).startswith(f"{tmp_path / 'gains' / 'table2.mat'}: found a folder of that name")
+    assert (figures / "table2_stroke.png").read_bytes() == b"old"
+    assert [path.name for path in (tmp_path / "gains").iterdir()] == ["table2.mat"]
+
+
+def test_numbers_that_no_gain_file_may_have_are_those_of_the_design(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The file that the simulation is tried with is nobody's business."""
+
+    def refuse(path: Path) -> None:
+        raise InputError(path, "feedforward.v0", "up to [9.0]", "at most limits.force, [8.0]")
+
+    monkeypatch.setattr(gains, "read", refuse)
+    code, _, err = run("design", "design/table2.toml", "--out", tmp_path, "--figures", tmp_path)
+    said = "design/table2.toml: feedforward.v0: found up to [9.0], expected at most limits.force, [8.0]"
+    assert (code, one_sentence(err)) == (2, said)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_gains_are_replaced_by_a_design_that_ends_well_and_by_no_other(run: Run, tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import sys
 from dataclasses import replace
 from functools import partial
@@ -300,6 +301,16 @@ def test_a_search_that_was_interrupted_ends_where_it_would_have(small: Spec, tmp
     before = journal.read_bytes()
     same(tuned(small, journal, effort=QUICK), whole)
     assert journal.read_bytes() == before
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes with names here")
+@pytest.mark.parametrize("restart", [False, True])
+def test_a_pipe_is_no_journal(small: Spec, tmp_path: Path, restart: bool) -> None:
+    os.mkfifo(tmp_path / "trials")
+    found = refusal(
+        lambda: Journal(tmp_path / "trials", problem_sha256(small), restart=restart), tmp_path / "trials"
+    )
+    assert "a pipe or a device" in found.found
 
 
 def test_the_journal_of_another_search_is_refused(small: Spec, tmp_path: Path) -> None:

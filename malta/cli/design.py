@@ -12,6 +12,7 @@ from malta.cli.inputs import design_files, gains_folder
 from malta.cli.options import AsJson
 from malta.cli.output import make_console, print_error, print_json, print_written, track_files
 from malta.errors import CheckError, InputError
+from malta.files import replace_files
 
 if TYPE_CHECKING:
     from malta.margins.verify import Margins
@@ -82,10 +83,13 @@ def _run_design(
     result = _simulate_gain_file(file, spec, controller, margins, job)
     published = published_beside(spec.machine_file)
     page = report.design_page(spec, model, margins, result, published)
-    report.experiment(result, picture, published)
+    contents = {picture: report.encode_figure(report.experiment_figure(result, published), picture)}
     unchanged = gains.agrees(controller, margins, *paths)
     if not unchanged:
-        gains.write(controller, margins, *paths)  # last: whatever fails before leaves the old files
+        contents |= gains.file_contents(controller, margins, *paths)
+    replace_files(
+        contents
+    )  # last, and all at once: whatever fails leaves the old gain files and their figure
     if not quiet:
         console = make_console()
         console.print(page)
@@ -112,7 +116,11 @@ def _simulate_gain_file(
     with tempfile.TemporaryDirectory() as scratch:
         trial = Path(scratch) / f"{spec.name}.json"
         gains.write(controller, margins, trial)
-        result = experiment(job, spec.plant, gains.read(trial))
+        try:
+            written = gains.read(trial)
+        except InputError as error:  # of numbers in the design: the user knows of no other file
+            raise InputError(file, error.field, error.found, error.expected) from error
+        result = experiment(job, spec.plant, written)
     for case in result.cases:
         end = case.run.verdict
         if not end.completed:

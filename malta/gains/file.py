@@ -164,8 +164,13 @@ def write(controller: Controller, margins: Margins, *paths: str | Path) -> None:
 
     Raises InputError for an unknown suffix or a folder that cannot be written to.
     """
+    replace_files(file_contents(controller, margins, *paths))
+
+
+def file_contents(controller: Controller, margins: Margins, *paths: str | Path) -> dict[Path, bytes]:
+    """The contents of the gain files that `write` writes, by their paths. Raises InputError for an unknown suffix."""
     content = document(controller, margins)
-    replace_files({Path(path): encode(content, Path(path)) for path in paths})
+    return {Path(path): encode(content, Path(path)) for path in paths}
 
 
 def read(path: str | Path) -> Controller:

@@ -1,6 +1,7 @@
 """Tables and figures of everything that malta computes."""
 
 from malta.report.figures import distributions_figure as distributions_figure
+from malta.report.figures import encode_figure as encode_figure
 from malta.report.figures import experiment_figure as experiment_figure
 from malta.report.figures import front_figure as front_figure
 from malta.report.figures import save as save

@@ -19,7 +19,7 @@ import numpy as np
 from scipy import optimize, sparse
 
 from malta.errors import InputError
-from malta.files import read_file
+from malta.files import read_file, replace_files
 from malta.model.linearize import linearize
 from malta.synthesis.lqg import synthesize
 from malta.synthesis.requirements import requirements_for
@@ -114,9 +114,7 @@ class Journal:
                 continue
             self.known[key] = figures
             whole.append(line)
-        with self._writing(path):
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_text("\n".join([*whole, ""]), encoding="utf-8")
+        replace_files({path: "\n".join([*whole, ""]).encode()})
 
     @staticmethod
     @contextmanager

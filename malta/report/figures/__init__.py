@@ -88,10 +88,16 @@ def stroke_figure(run: Trajectory, published: Published | None = None) -> Figure
 
 def save(figure: Figure, path: str | Path) -> Path:
     """Write a figure as .png or .svg, whole or not at all; the same figure gives the same bytes."""
+    path = Path(path)
+    replace_files({path: encode_figure(figure, path)})
+    return path
+
+
+def encode_figure(figure: Figure, path: Path) -> bytes:
+    """The content of a .png or .svg file of a figure. Raises InputError for another suffix of its path."""
     import matplotlib
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-    path = Path(path)
     if path.suffix not in (".png", ".svg"):
         raise InputError(path, "", f"suffix {path.suffix!r}", "one of .png, .svg")
     buffer = io.BytesIO()
@@ -102,8 +108,7 @@ def save(figure: Figure, path: str | Path) -> Path:
             # Figure.savefig first draws once for the layout, which only tight bounding boxes need.
             canvas: Any = FigureCanvasAgg(figure)
             canvas.print_png(buffer, metadata={"Software": None}, pil_kwargs={"compress_level": 1})
-    replace_files({path: buffer.getvalue()})
-    return path
+    return buffer.getvalue()
 
 
 def run_figure(e: Experiment, _: Published | None = None) -> Figure:
