@@ -117,6 +117,22 @@ except SystemExit as ended:
     assert "Usage: " in done.stdout
 
 
+def test_a_simulation_imports_what_it_needs_alone() -> None:
+    """Modules that take long to import stay out of the commands that do without them."""
+    program = """
+import sys
+from malta.cli.main import main
+try:
+    main()
+except SystemExit as ended:
+    late = {"control", "filterpy", "matplotlib.pyplot", "scipy.signal", "scipy.stats"}
+    print("exit", ended.code, "loaded", *sorted(set(sys.modules) & late))
+"""
+    command = [sys.executable, "-c", program, "simulate", TABLE2, "--fidelity", "force"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
+    assert done.stdout.splitlines()[-1] == "exit 0 loaded"
+
+
 # --- design ---
 
 

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import casadi as ca
 import numpy as np
-from scipy.signal import lfilter
 from scipy.special import erf
 
 from malta.errors import InputError
@@ -89,6 +88,8 @@ def sample_inputs(run: Simulation, motion: references.Motion, t: FloatArray) -> 
 
 def lagging_references(c: Controller, v_ff: FloatArray) -> FloatArray:
     """The forces behind the lag of the design model while v_ff is commanded, k x m; at rest before the first sample."""
+    from scipy.signal import lfilter  # a third of a second to import, for the few designs that need it
+
     decay = _decay(c)
     acting = np.vstack([np.repeat(v_ff[:1], c.delay, axis=0), v_ff])[: len(v_ff)]
     lagging: FloatArray = lfilter([0.0, 1 - decay], [1.0, -decay], acting, axis=0, zi=v_ff[:1])[0]

@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from scipy.linalg import solveh_banded
-from scipy.signal import find_peaks
 
 from malta.errors import InputError
 from malta.simulation.references import QUINTIC_DURATION, Motion, Reference, quintic
@@ -116,6 +115,8 @@ def _average(log: ForceLog) -> ForceLog:
 
 def _rising(z: FloatArray, turn: float) -> NDArray[np.bool_]:
     """True on a way towards positive z; a way back that is shorter than `turn` counts as noise."""
+    from scipy.signal import find_peaks  # a third of a second to import
+
     turns = np.concatenate([find_peaks(sign * z, prominence=turn)[0] for sign in (1, -1)])
     edges = [0, *sorted(turns.tolist()), len(z)]
     rising = np.zeros(len(z), dtype=bool)

@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any
 
 import casadi as ca
 import numpy as np
-from filterpy.kalman import ExtendedKalmanFilter
 
 from malta.errors import InputError
 from malta.margins.uncertain import is_commutated
@@ -124,6 +123,8 @@ def _kalman_filter(c: Controller, noise: Noise) -> Any:
 
     Correlations of readings with accelerations are left out: they shape the filter in steady state.
     """
+    from filterpy.kalman import ExtendedKalmanFilter  # brings scipy.stats: half a second to import
+
     n, p = len(c.A), len(c.measurements)
     kalman = ExtendedKalmanFilter(dim_x=n, dim_z=p, dim_u=len(c.forces))
     coordinates = c.cost.coordinates if c.cost else "signals"

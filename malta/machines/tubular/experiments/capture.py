@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any
 
 import casadi as ca
 import numpy as np
-from scipy.stats import qmc
 
 from malta.errors import InputError
 from malta.model.linearize import linearize
@@ -189,6 +188,8 @@ def _furthest_returning(
 
 def _starts_inside(plant: Plant) -> dict[str, FloatArray]:
     """Starts inside the clearance of both touchdown bearings and the travel, evenly spread over all five positions."""
+    from scipy.stats import qmc  # a third of a second to import, for this experiment alone
+
     par: Any = plant.parameters
     u = np.asarray(qmc.Sobol(5, rng=0).random_base2(round(math.log2(RANDOM))))
     radius, angle = 0.99 * par.r_max * np.sqrt(u[:, :2]), 2 * math.pi * u[:, 2:4]
