@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 import pickle
 import sys
@@ -14,9 +15,11 @@ import pytest
 
 import malta
 from malta.cli import main as cli
+from malta.files import replace_files
 from malta.machines.tubular import plant as tubular
-from malta.margins import robust
+from malta.margins import gain, robust
 from malta.margins.problem import OfLoop, OfSeveral, Problem
+from malta.margins.uncertain import Compensator, UncertainSystem
 from malta.model.published import published as read_published
 
 if TYPE_CHECKING:
@@ -97,52 +100,85 @@ def _in_the_root(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(ROOT)
 
 
+class Answers:
+    """What is proven so far, by question: in a folder that all workers of a session share."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.known = folder, dict[str, Any]()
+
+    def of(self, question: bytes, find: Callable[[], Any], lasts: Callable[[Any], bool]) -> Any:
+        """The answer to a question, found once. One that does not last, as where the time was up, is forgotten."""
+        key = hashlib.sha256(question).hexdigest()
+        if key not in self.known:
+            file = self.folder / key
+            if file.exists():
+                self.known[key] = pickle.loads(file.read_bytes())
+            else:
+                found = find()
+                if not lasts(found):
+                    return found
+                self.known[key] = found
+                replace_files({file: pickle.dumps(found)})
+        return self.known[key]
+
+
+def _loop(system: UncertainSystem, law: Any) -> Any:
+    """All that a loop consists of."""
+    matrices = system.matrices.serialize()
+    return system.names, system.nominal, matrices, system.limits, system.sample_time, vars(law)
+
+
 def _question(problem: Problem, box: Box, effort: robust.Effort) -> bytes | None:
     """All that a margin depends on; None of polynomials."""
     loops = []
     for one in problem.problems if isinstance(problem, OfSeveral) else (problem,):
         if not isinstance(one, OfLoop):
             return None
-        s = one.loop.system
-        matrices = s.matrices.serialize()
-        loops.append((s.names, s.nominal, matrices, s.limits, s.sample_time, vars(one.loop.law)))
+        loops.append(_loop(one.loop.system, one.loop.law))
     return pickle.dumps((loops, vars(box), effort.tolerance, effort.time, effort.most_cells))
 
 
 @contextmanager
-def _remembering(proofs: dict[bytes, malta.Margin]) -> Iterator[None]:
+def _remembering(answers: Answers) -> Iterator[None]:
     """Questions that are answered already are not searched again."""
-    searched = robust.margin_of
+    searched, largest = robust.margin_of, gain.worst_case_gain
 
     def margin_of(problem: Problem, box: Box, effort: robust.Effort) -> malta.Margin:
         question = _question(problem, box, effort)
         if question is None:
             return searched(problem, box, effort)
-        if question not in proofs:
-            found = searched(problem, box, effort)
-            if found.reason:  # as where the time was up
-                return found
-            proofs[question] = found
-        found = proofs[question]
+        found: malta.Margin = answers.of(
+            question, lambda: searched(problem, box, effort), lambda margin: not margin.reason
+        )
         if effort.progress is not None:
             effort.progress(found.lower or 0.0, found.upper)
         return found
 
+    def worst_case_gain(system: UncertainSystem, law: Any, *of: Any, **options: Any) -> malta.Gain:
+        if not isinstance(law, Compensator):
+            return largest(system, law, *of, **options)
+        question = pickle.dumps((_loop(system, law), of, options))
+        found: malta.Gain = answers.of(
+            question, lambda: largest(system, law, *of, **options), lambda found: not found.reason
+        )
+        return found
+
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(robust, "margin_of", margin_of)
+        patch.setattr(gain, "worst_case_gain", worst_case_gain)
         yield
 
 
 @pytest.fixture(scope="session")
-def _proofs() -> dict[bytes, malta.Margin]:
-    """What is proven so far, by question."""
-    return {}
+def _answers(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest) -> Answers:
+    folder = tmp_path_factory.getbasetemp()
+    return Answers((folder.parent if hasattr(request.config, "workerinput") else folder) / "answers")
 
 
 @pytest.fixture(scope="module")
-def proven_once(_proofs: dict[bytes, malta.Margin]) -> Iterator[None]:
+def proven_once(_answers: Answers) -> Iterator[None]:
     """For modules that are about what is done with margins: one search for each question."""
-    with _remembering(_proofs):
+    with _remembering(_answers):
         yield
 
 
@@ -172,7 +208,7 @@ def published() -> dict[str, Any]:
 
 
 @pytest.fixture(scope="session")
-def designs(_proofs: dict[bytes, malta.Margin]) -> dict[str, Design]:
+def designs(_answers: Answers) -> dict[str, Design]:
     """The shipped designs by name."""
     made = {}
     for name in DESIGNS:
@@ -180,7 +216,7 @@ def designs(_proofs: dict[bytes, malta.Margin]) -> dict[str, Design]:
         plant = spec.plant
         model = malta.linearize(plant, plant.at(**spec.operating_point))
         controller = malta.synthesize(spec, model)
-        with _remembering(_proofs):
+        with _remembering(_answers):
             margins = malta.verify(model, controller, spec.uncertainty)
         made[name] = Design(spec, plant, model, controller, margins)
     return made

@@ -533,6 +533,7 @@ def test_other_estimators_know_nothing_of_held_currents(fidelity: Any, found: st
         simulate(plant, c, Scenario("hold", 1.0, _still, fidelity=fidelity, estimator="kalman"))
 
 
+@pytest.mark.slow
 def test_a_margin_says_where_stability_is_lost_where_the_first_guess_was_wrong() -> None:
     """A hold of 0.1 s: the search neglects images, and looks again by the poles of the loop."""
     plant = _plant("halbach", b=0.5, T_laser=0.1)

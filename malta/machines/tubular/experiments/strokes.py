@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any
 
 import casadi as ca
@@ -141,6 +141,7 @@ def drive_limits(
     return Experiment("drive-limits", "How fast could it be?", cases, merits, curves, interrupted=cut)
 
 
+@lru_cache(maxsize=16)  # the optimum takes a second, and every design of a machine has the same
 def _limit_strokes(
     plant: Plant, distance: float, current_share: float, voltage_share: float
 ) -> tuple[FastestStroke, SigmoidStroke]:
