@@ -208,7 +208,7 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "an endless sensor error": ({"sensor_spread": {"gain_x1": math.inf}}, "sensor gain_x1: found inf"),
     "no samples": ({"samples": 0}, "samples: found 0"),
     "half a sample": ({"samples": 1.5}, "samples: found 1.5"),
-    "too many": ({"samples": 10**9}, "samples: found 1000000000, expected at most 10000000"),
+    "too many": ({"samples": 10**10}, "samples: found 10000000000, expected at most 1000000000"),
     "a negative seed": ({"seed": -1}, "seed: found -1"),
     "a sampler": ({"sampler": "dice"}, "sampler: found 'dice', expected one of latin-hypercube, sobol"),
     "a scenario": ({"scenario": "loop"}, "scenario: found 'loop', expected one of stroke"),

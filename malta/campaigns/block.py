@@ -29,17 +29,17 @@ def fly(
     first : a multiple of LANES, so that a run has the same place in its group of machines in every block
     workers : threads; None: one for each core
     """
-    machines = draw_machines(plan)
-    scenario, part = planned_run(plan).scenario, slice(first, first + count)
+    machines = draw_machines(plan, first, count)
+    scenario = planned_run(plan).scenario
     batch = simulate_many(
         plan.plant,
         plan.controller,
         scenario,
-        {name: column[part] for name, column in machines.changes.items()},
-        sensor_errors={name: column[part] for name, column in machines.sensor_errors.items()},
+        machines.changes,
+        sensor_errors=machines.sensor_errors,
         first=first,
         workers=workers,
         progress=progress,
     )
     compiled = is_compiled(plan.plant, plan.controller, scenario)
-    return Block(machines.values[part], batch, "compiled" if compiled else "virtual machine")
+    return Block(machines.values, batch, "compiled" if compiled else "virtual machine")

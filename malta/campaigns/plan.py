@@ -17,10 +17,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
 import numpy as np
-from scipy.stats import qmc
 
 from malta.campaigns.identity import fingerprint as fingerprint
 from malta.campaigns.identity import revision_of
+from malta.campaigns.sampling import latin_hypercube, sobol
 from malta.errors import InputError
 from malta.gains.encodings import decode
 from malta.model.data import plant_of
@@ -36,6 +36,9 @@ if TYPE_CHECKING:
 SCHEMA, VERSION = "malta-campaign", 1
 Sampler = Literal["latin-hypercube", "sobol"]
 SAMPLERS: tuple[Sampler, ...] = get_args(Sampler)
+DRAWING = (
+    2  # how samplers make points of a seed, see sampling.py; a folder of another version has other machines
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +100,7 @@ class Plan:
     @property
     def identity(self) -> str:
         """sha256 of the manifest."""
-        return hashlib.sha256(_compact_json(self.manifest)).hexdigest()
+        return _identity(self)
 
 
 def box_of(
@@ -133,7 +136,7 @@ def _check_counts(plan: Plan) -> None:
             )
 
 
-MOST = 10_000_000  # runs: their digests fill 3 GB
+MOST = 1_000_000_000  # runs: below 2**30, so that a place in a stratum of the design has some bits too
 
 
 def _check_spread(plan: Plan, units: Mapping[str, str]) -> None:
@@ -184,9 +187,15 @@ def _manifest(plan: Plan) -> dict[str, Any]:
         "samples": plan.samples,
         "seed": plan.seed,
         "sampler": plan.sampler,
+        "sampler_version": DRAWING,
     }
     content: dict[str, Any] = _use_integers(json.loads(_compact_json(tables)))
     return content
+
+
+@lru_cache(maxsize=8)
+def _identity(plan: Plan) -> str:
+    return hashlib.sha256(_compact_json(plan.manifest)).hexdigest()
 
 
 def _use_integers(value: Any) -> Any:
@@ -231,7 +240,7 @@ def half_width(plan: Plan, name: str) -> float:
 
 
 class Machines(NamedTuple):
-    """The machines of a plan: a value for each run."""
+    """Consecutive machines of a plan: a value for each run."""
 
     changes: Mapping[str, FloatArray]  # parameters
     sensor_errors: Mapping[str, FloatArray]
@@ -239,19 +248,32 @@ class Machines(NamedTuple):
     values: FloatArray  # runs x names, SI
 
 
-@lru_cache(maxsize=8)
-def draw_machines(plan: Plan) -> Machines:
-    """Draw all machines of a plan. The same plan always gives the same machines."""
-    twins = {name: twin for name, twin in twins_of(plan.parameters).items() if name in plan.spread}
-    own = {name: twin for name, twin in twins.items() if twin in plan.spread}
-    parameters = [name for name in plan.spread if name not in own]
-    names = (*parameters, *plan.sensor_spread)
-    unit = 2 * _unit_box(plan, len(names)) - 1
-    middle = np.array(
-        [getattr(plan.parameters, name) for name in parameters] + [0.0] * len(plan.sensor_spread)
+def varied_names(plan: Plan) -> tuple[str, ...]:
+    """Names of the values that a plan varies independently: parameters, then errors of the sensors. Twins follow."""
+    twins = twins_of(plan.parameters)
+    own = {name for name, twin in twins.items() if name in plan.spread and twin in plan.spread}
+    return (*(name for name in plan.spread if name not in own), *plan.sensor_spread)
+
+
+def middle_of(plan: Plan, name: str) -> float:
+    """The middle of a varied value, SI."""
+    return float(getattr(plan.parameters, name)) if name in plan.spread else 0.0
+
+
+def draw_machines(plan: Plan, first: int = 0, count: int | None = None) -> Machines:
+    """Draw the `count` machines of a plan from run `first` on; None: all that follow.
+
+    The machine of a run is the same, whichever others are drawn with it.
+    """
+    names = varied_names(plan)
+    parameters = names[: len(names) - len(plan.sensor_spread)]
+    draw = latin_hypercube if plan.sampler == "latin-hypercube" else sobol
+    points = draw(
+        plan.seed, plan.samples, len(names), first, plan.samples - first if count is None else count
     )
-    half = [half_width(plan, name) for name in names]
-    values = middle + unit * np.array(half)
+    middle = np.array([middle_of(plan, name) for name in names])
+    half = np.array([half_width(plan, name) for name in names])
+    values = middle + (2 * points - 1) * half
     changes = dict(zip(parameters, values.T, strict=False))
     pairs = [*twins_of(plan.parameters).items()]
     for name, twin in [*pairs, *((twin, name) for name, twin in pairs)]:
@@ -259,12 +281,3 @@ def draw_machines(plan: Plan) -> Machines:
             changes[name] = changes[twin]
     errors = dict(zip(plan.sensor_spread, values.T[len(parameters) :], strict=True))
     return Machines(changes, errors, names, readonly(values))
-
-
-def _unit_box(plan: Plan, dimensions: int) -> FloatArray:
-    """Points in the unit box, runs x dimensions, by the plan's sampler and seed."""
-    if plan.sampler == "latin-hypercube":
-        return np.asarray(qmc.LatinHypercube(dimensions, rng=plan.seed).random(plan.samples))
-    # Sobol sequences are balanced for powers of two; the first points of such a sequence are used.
-    points = qmc.Sobol(dimensions, rng=plan.seed).random_base2(math.ceil(math.log2(max(plan.samples, 2))))
-    return np.asarray(points[: plan.samples])

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.stats import binomtest
 
 from malta.campaigns.block import Block
-from malta.campaigns.plan import Plan, draw_machines
+from malta.campaigns.plan import Plan, varied_names
 from malta.campaigns.store import figure_shapes
 from malta.model.plant import readonly
 from malta.simulation.digest import Batch, verdicts
@@ -67,7 +67,7 @@ def gather(plan: Plan, done: Mapping[int, Block]) -> Campaign:
         ]
     )
     index.flags.writeable = False
-    names = draw_machines(plan).names
+    names = varied_names(plan)
     return Campaign(
         plan,
         index,

@@ -162,9 +162,10 @@ def replay(
         raise InputError("campaign", "run", str(index), f"0 to {plan.samples - 1}")
     if engine not in get_args(EngineChoice):
         raise InputError("campaign", "engine", repr(engine), "one of " + ", ".join(get_args(EngineChoice)))
-    machines, planned = draw_machines(plan), planned_run(plan)
-    changes, errors = machines.changes, machines.sensor_errors
-    plant, scenario = replayed(plan.plant, planned.scenario, changes, index, sensor_errors=errors)
+    first = index // compiled.LANES * compiled.LANES
+    machines = draw_machines(plan, first, min(compiled.LANES, plan.samples - first))
+    planned, changes, errors = planned_run(plan), machines.changes, machines.sensor_errors
+    plant, scenario = replayed(plan.plant, planned.scenario, changes, index, first, errors)
     own = planned._replace(scenario=scenario)
     if engine == "virtual machine":
         return single_run(plan.scenario, plant, plan.controller, own, engine, progress)
@@ -174,6 +175,7 @@ def replay(
         planned.scenario,
         changes,
         index,
+        first=first,
         sensor_errors=errors,
         progress=progress,
     )

@@ -24,7 +24,15 @@ import numpy as np
 
 from malta.archives import read_npz
 from malta.campaigns.block import Block
-from malta.campaigns.plan import SCHEMA, VERSION, Plan, draw_machines, fingerprint, planned_run
+from malta.campaigns.plan import (
+    SCHEMA,
+    VERSION,
+    Plan,
+    draw_machines,
+    fingerprint,
+    planned_run,
+    varied_names,
+)
 from malta.errors import InputError
 from malta.files import read_file, replace_files, writer
 from malta.simulation.compiled import LANES
@@ -170,7 +178,7 @@ def encode_block(block: Block, plan: Plan, first: int) -> bytes:
     arrays: dict[str, Any] = {
         "campaign": np.array(plan.identity),
         "engine": np.array(block.engine),
-        "names": np.array(draw_machines(plan).names),
+        "names": np.array(varied_names(plan)),
         "values": block.values,
     } | {name: getattr(block.batch, name) for name in Batch.__dataclass_fields__}
     np.savez(buffer, **arrays, seal=np.array(seal(arrays, first)))
@@ -191,7 +199,7 @@ def read_block(path: Path, plan: Plan, first: int, count: int) -> Block | None:
 
     Raises InputError for a block of another campaign.
     """
-    machines = draw_machines(plan)
+    machines = draw_machines(plan, first, count)
     figures = sum(math.prod(shape) for shape in figure_shapes(plan).values())
     largest = 16 * count * (figures + machines.values.shape[1]) + HEADERS  # twice what it takes
     data = read_file(path, "block of a campaign", Path.read_bytes, largest)
@@ -209,7 +217,7 @@ def read_block(path: Path, plan: Plan, first: int, count: int) -> Block | None:
         sealed == seal(rest, first)
         and kind in ENGINES
         and tuple(arrays.get("names", ())) == machines.names
-        and np.array_equal(values, machines.values[first : first + count])
+        and np.array_equal(values, machines.values)
         and _are_possible(columns, plan, count)
     )
     return Block(values, Batch(**columns), kind) if whole else None

@@ -159,6 +159,7 @@ def record_run(
     changes: Mapping[str, FloatArray],
     index: int,
     *,
+    first: int = 0,
     sensor_errors: Mapping[str, FloatArray] | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Trajectory | None:
@@ -168,14 +169,15 @@ def record_run(
     difference, and so does a machine that barely falls. Therefore this function simulates the run's whole group of
     LANES machines again and records every sample of the run.
 
-    changes, sensor_errors : columns of all runs; `simulate_many` had blocks of them that begin with a multiple of LANES
+    changes, sensor_errors : columns of the runs from `first` on, a multiple of LANES as for the blocks of
+        `simulate_many`; at least those of the run's group
     """
     begin = index // LANES * LANES
     group, errors = (
-        {name: column[begin : begin + LANES] for name, column in columns.items()}
+        {name: column[begin - first : begin - first + LANES] for name, column in columns.items()}
         for columns in (changes, sensor_errors or {})
     )
-    own_plant, own_scenario = replayed(plant, scenario, changes, index, sensor_errors=sensor_errors)
+    own_plant, own_scenario = replayed(plant, scenario, changes, index, first, sensor_errors)
     plant = with_varied(plant, changes)
     simulation = simulation_of(plant, controller, _with_sensor_errors(scenario, sensor_errors))
     shape = shape_of(plant, controller, simulation.setup)

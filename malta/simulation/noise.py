@@ -20,8 +20,8 @@ GAMMA = 0x9E3779B97F4A7C15
 
 def keys(seed: int, indices: NDArray[np.int64]) -> NDArray[np.uint64]:
     """The key of each run of a campaign, from the campaign's seed and the run's index."""
-    stream = _mix(np.array([(seed * GAMMA + 1) % 2**64], dtype=np.uint64))
-    return _mix(stream + (indices.astype(np.uint64) + np.uint64(1)) * np.uint64(0xD1342543DE82EF95))
+    stream = mix(np.array([(seed * GAMMA + 1) % 2**64], dtype=np.uint64))
+    return mix(stream + (indices.astype(np.uint64) + np.uint64(1)) * np.uint64(0xD1342543DE82EF95))
 
 
 def normals(key: np.uint64, samples: int, channels: int) -> FloatArray:
@@ -31,7 +31,7 @@ def normals(key: np.uint64, samples: int, channels: int) -> FloatArray:
     (2, 3)
     """
     pairs = (samples + 1) // 2 * channels
-    bits = _mix(key + np.arange(pairs, dtype=np.uint64) * np.uint64(GAMMA))
+    bits = mix(key + np.arange(pairs, dtype=np.uint64) * np.uint64(GAMMA))
     unit = 1 / 2**32
     radius = np.sqrt(-2 * np.log(((bits >> np.uint64(32)).astype(float) + 0.5) * unit))
     quadrant = ((bits >> np.uint64(30)) & np.uint64(3)).astype(float)
@@ -42,7 +42,7 @@ def normals(key: np.uint64, samples: int, channels: int) -> FloatArray:
     return drawn.reshape(-1, channels)[:samples]
 
 
-def _mix(x: NDArray[np.uint64]) -> NDArray[np.uint64]:
+def mix(x: NDArray[np.uint64]) -> NDArray[np.uint64]:
     """The output function of SplitMix64."""
     x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
