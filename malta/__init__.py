@@ -14,6 +14,8 @@ if TYPE_CHECKING:  # the contents page, as type checkers and readers see it
     from malta.campaigns.plan import Plan as Plan
     from malta.campaigns.result import Campaign as Campaign
     from malta.campaigns.run import campaign as campaign
+    from malta.campaigns.summary import Summary as Summary
+    from malta.campaigns.survey import summarize as summarize
     from malta.errors import CheckError as CheckError
     from malta.errors import InputError as InputError
     from malta.margins.blocks import Dynamic as Dynamic
@@ -80,6 +82,8 @@ _NAMES = {  # the same, for the first use of each name
     "campaigns.plan": ("Plan",),
     "campaigns.result": ("Campaign",),
     "campaigns.run": ("campaign",),
+    "campaigns.summary": ("Summary",),
+    "campaigns.survey": ("summarize",),
     "margins.stages": ("Robustness", "robustness"),
     "report.ledger": ("ledger",),
     "synthesis.controller": ("Controller",),

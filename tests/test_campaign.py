@@ -35,8 +35,9 @@ from malta.campaigns.plan import (
 )
 from malta.campaigns.result import Campaign, rate
 from malta.campaigns.run import SLOW_BLOCK, campaign, replay
-from malta.campaigns.statistics import figures_of, runs_within_bounds, worst_of
+from malta.campaigns.statistics import figures_of, runs_within_bounds
 from malta.campaigns.store import MANIFEST, block_name, read_plan
+from malta.campaigns.summary import worst_of
 from malta.files import temporary_name
 from malta.machines.tubular.experiments import CASES, EXPERIMENTS
 from malta.report import figures

@@ -15,7 +15,9 @@ from malta.campaigns.sketch import ACCURACY, EXACT, Sketch, histogram, merge, qu
 
 SHARES = (0.0, 0.01, 0.05, 0.5, 0.95, 0.99, 0.999, 1.0)
 LIMIT = 50  # values that are kept in these tests
-finite = st.floats(allow_nan=False, allow_infinity=False, allow_subnormal=False, min_value=-1e300, max_value=1e300)
+finite = st.floats(
+    allow_nan=False, allow_infinity=False, allow_subnormal=False, min_value=-1e300, max_value=1e300
+)
 
 
 @pytest.fixture(autouse=True)
@@ -25,7 +27,13 @@ def few(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def _content(sketch: Sketch) -> Any:
     values = np.sort(np.concatenate([*sketch.values, np.empty(0)])).tobytes()
-    return sketch.count, sketch.smallest, sketch.largest, values, {k: v.tobytes() for k, v in sketch.counts.items()}
+    return (
+        sketch.count,
+        sketch.smallest,
+        sketch.largest,
+        values,
+        {k: v.tobytes() for k, v in sketch.counts.items()},
+    )
 
 
 @settings(max_examples=100, deadline=None)

@@ -1,6 +1,7 @@
 """Run a campaign, on this machine or on a cluster, and simulate single runs of it again.
 
-    Plan -> fly() block by block -> Campaign
+    Plan -> fly() block by block -> Campaign, which has the figures of every run
+                                 -> Summary, see survey.py, which has those of no run
 
 Every block is stored as soon as it is done. A campaign that was interrupted goes on with the blocks that are missing,
 and a campaign that is complete is read from its folder.
@@ -16,7 +17,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import FrameType
-from typing import Any, get_args
+from typing import Any, NamedTuple, Protocol, get_args
 
 from malta.campaigns.block import Block, fly
 from malta.campaigns.plan import Plan, draw_machines, planned_run
@@ -31,7 +32,36 @@ from malta.simulation.engines import EngineChoice
 from malta.simulation.experiments import Experiment, Progress
 
 BLOCK = 1024  # runs in a block: a fraction of a second of work
+LARGE_BLOCK = (
+    16_384  # of a large campaign: seconds of work, 5 MB in a file and some 50 MB while it is simulated
+)
 SLOW_BLOCK = 32  # without a C compiler
+FILES = 256  # blocks that a campaign has before they grow
+IN_MEMORY = 10_000_000  # runs whose figures `campaign` returns: 3 GB
+
+
+class Session(NamedTuple):
+    """How the runs that are missing are simulated."""
+
+    workers: int | None = None  # threads on this machine; None: one for each core
+    cluster: str | None = None  # address of a Dask scheduler, as tcp://host:8786
+    block: int | None = None  # runs in a block; None: see `block_size`
+    progress: Progress | None = None  # called now and then with the share of the runs that is done
+
+
+class Ending(NamedTuple):
+    """How a session ended."""
+
+    interrupted: bool  # by Ctrl-C
+    damaged: tuple[Path, ...]  # files of blocks that could not be read; their runs were simulated again
+
+
+class Blocks(Protocol):
+    """What takes the blocks of a campaign, by their first runs, and knows which ones it has: a dict, or a sum."""
+
+    def __setitem__(self, first: int, block: Block, /) -> None: ...
+
+    def __contains__(self, first: object, /) -> bool: ...
 
 
 def campaign(
@@ -43,7 +73,7 @@ def campaign(
     block: int | None = None,
     progress: Progress | None = None,
 ) -> Campaign:
-    """Simulate all runs of a plan, or those that its folder does not have yet.
+    """Simulate all runs of a plan, or those that its folder does not have yet, and return the figures of each run.
 
     folder : stores every block as soon as it is done, and the manifest; None: nothing is written
     workers : threads on this machine; None: one for each core
@@ -53,32 +83,59 @@ def campaign(
 
     After Ctrl-C the result has the blocks that are done, and says `interrupted`.
 
-    Raises InputError for a folder that has another campaign or cannot be written to, and for a scheduler that does not
-    answer; blocks that are done stay in the folder.
+    Raises InputError for more than IN_MEMORY runs, which `malta.summarize` takes; for a folder that has another
+    campaign or cannot be written to, and for a scheduler that does not answer; blocks that are done stay in the folder.
 
         plan = malta.Plan(malta.gains.read("design/gains/calibrated.json"), spread={"m": 0.1}, samples=1000)
         print(malta.campaign(plan, "build/campaigns/mass").rate)
     """
-    size = _block_size(block, workers, cluster)
-    place = None if folder is None else Path(folder)
-    if place is not None:
-        size = open_folder(place, plan, size)
-    parts = {first: min(size, plan.samples - first) for first in range(0, plan.samples, size)}
+    if plan.samples > IN_MEMORY:
+        expected = f"at most {IN_MEMORY} in memory; malta.summarize needs none for its runs"
+        raise InputError("campaign", "samples", str(plan.samples), expected)
     done: dict[int, Block] = {}
+    place, size = open_campaign(plan, folder, session := Session(workers, cluster, block, progress))
+    ending = run_blocks(plan, place, size, session, done)
+    return replace(gather(plan, done), **ending._asdict(), folder=place)
+
+
+def open_campaign(
+    plan: Plan, folder: str | Path | None, session: Session, gains: Path | None = None
+) -> tuple[Path | None, int]:
+    """The folder of a campaign, with its manifest, and the number of runs in a block.
+
+    gains : file of the controller, which the manifest of a new folder notes
+    """
+    size = block_size(plan, session)
+    if folder is None:
+        return None, size
+    return Path(folder), open_folder(Path(folder), plan, size, gains)
+
+
+def run_blocks(plan: Plan, place: Path | None, size: int, session: Session, done: Blocks) -> Ending:
+    """Put all blocks of a plan into `done`: those that a folder has, then those that are missing, as they are flown.
+
+    A block is forgotten here once `done` has it and the folder too.
+    """
+    parts = {first: min(size, plan.samples - first) for first in range(0, plan.samples, size)}
     damaged: list[Path] = []
-    interrupted = False
+    runs = 0
+
+    def report(more: float) -> None:
+        if session.progress is not None:
+            session.progress((runs + more) / plan.samples)
+
     try:
         with _watch_interrupts() as pressed:
+            left = dict(parts)
             if place is not None:
-                damaged += read_blocks(place, plan, parts, done)
-            left = {first: count for first, count in parts.items() if first not in done}
-            runs = plan.samples - sum(left.values())
-
-            def report(more: float) -> None:
-                if progress is not None:
-                    progress((runs + more) / plan.samples)
-
-            for first, new in _fly_blocks(plan, left, workers, cluster, report):
+                for first, path, found in read_blocks(place, plan, parts):
+                    if found is None:
+                        damaged.append(path)
+                        continue
+                    done[first] = found
+                    runs += left.pop(first)
+                    report(0)
+            for first, new in _fly_blocks(plan, left, session, report):
                 if place is not None:
                     replace_files({place / block_name(first): encode_block(new, plan, first)})
                 done[first] = new
@@ -87,15 +144,21 @@ def campaign(
                 if pressed:
                     raise KeyboardInterrupt
     except KeyboardInterrupt:
-        interrupted = True
         if place is not None:  # the last block may be in the folder and not yet in `done`
-            read_blocks(place, plan, {k: n for k, n in parts.items() if k not in done}, done)
-    found = gather(plan, done)
-    return replace(found, interrupted=interrupted, damaged=tuple(damaged), folder=place)
+            missing = {first: count for first, count in parts.items() if first not in done}
+            for first, _, found in read_blocks(place, plan, missing):
+                if found is not None:
+                    done[first] = found
+        return Ending(True, tuple(damaged))
+    return Ending(False, tuple(damaged))
 
 
-def _block_size(block: int | None, workers: int | None, cluster: str | None) -> int:
-    """Runs in a block. Raises InputError for workers beside a cluster, and for numbers out of range."""
+def block_size(plan: Plan, session: Session) -> int:
+    """Runs in a block: BLOCK, doubled up to LARGE_BLOCK where a campaign would have more than FILES blocks.
+
+    Raises InputError for workers beside a cluster, and for numbers out of range.
+    """
+    workers, cluster, block, _ = session
     if cluster is not None and workers is not None:
         raise InputError("campaign", "workers", str(workers), "none with a cluster, which has its own")
     if workers is not None and workers < 1:
@@ -103,6 +166,8 @@ def _block_size(block: int | None, workers: int | None, cluster: str | None) -> 
     size = block or (BLOCK if compiled.compiler() or cluster else SLOW_BLOCK)
     if size < 1 or size % compiled.LANES:
         raise InputError("campaign", "block", f"{size} runs", f"a multiple of {compiled.LANES}")
+    while not block and BLOCK <= size < LARGE_BLOCK and plan.samples > FILES * size:
+        size *= 2
     return size
 
 
@@ -127,20 +192,20 @@ def _watch_interrupts() -> Iterator[list[int]]:
 
 
 def _fly_blocks(
-    plan: Plan, left: Mapping[int, int], workers: int | None, cluster: str | None, report: Progress
+    plan: Plan, left: Mapping[int, int], session: Session, report: Progress
 ) -> Iterator[tuple[int, Block]]:
     """(first run, block) for every block that is left, as soon as it is done.
 
     left : first run -> number of runs
     report : called with the number of runs that are done of the block that is under way
     """
-    if cluster is not None and left:
+    if session.cluster is not None and left:
         from malta.campaigns.dask import blocks  # dask.distributed is an extra
 
-        yield from blocks(cluster, plan, left)
+        yield from blocks(session.cluster, plan, left)
         return
     for first, count in left.items():
-        yield first, fly(plan, first, count, workers, partial(_report_runs, report, count))
+        yield first, fly(plan, first, count, session.workers, partial(_report_runs, report, count))
 
 
 def _report_runs(report: Progress, count: int, share: float) -> None:

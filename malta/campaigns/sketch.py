@@ -7,8 +7,8 @@ they are counted: what is merged in whatever order is the same to the bit.
 
     values of a block -> sketch_of -> merge -> quantiles, histogram
 
-Sources: C. Masson, J. E. Rim, H. K. Lee, DDSketch, Proc. VLDB 12(12), 2019 (quantiles of a relative accuracy from counts
-that add). Its buckets are powers of a base; these are read from the bits of a number, so that no logarithm is rounded.
+Source: C. Masson, J. E. Rim, H. K. Lee, DDSketch, Proc. VLDB 12(12), 2019: quantiles of a relative accuracy from counts
+that add. Its buckets are powers of a base; these are read from the bits of a number, so that no logarithm is rounded.
 """
 
 from __future__ import annotations

@@ -40,8 +40,18 @@ class Finding(NamedTuple):
         return np.asarray(self.values <= self.published)
 
 
+CLEARANCE = "clearance:"  # kind of the figures that tell how close a run came to each contact
+RISE = ("rise, 10-90 %", "overshoot")  # of a stroke: a scenario without one has them at no run
+
+
 def figures_of(found: Campaign, published: Mapping[str, Any] | None = None) -> list[Finding]:
     """The figures of merit of a campaign, with the bounds that the paper prints for this scenario."""
+    rose = np.isfinite(found.batch.rise).any()
+    return [f for f in every_figure(found, published) if rose or f.kind not in RISE]
+
+
+def every_figure(found: Campaign, published: Mapping[str, Any] | None = None) -> list[Finding]:
+    """The same for every block of a campaign: also the figures of a stroke where no run has made one."""
     plan, batch = found.plan, found.batch
     plant, done = plan.plant, found.completed
     names = [signal.name for signal in plant.outputs]
@@ -59,12 +69,10 @@ def figures_of(found: Campaign, published: Mapping[str, Any] | None = None) -> l
     thrusts, efforts = inputs_of(plant)[:first], inputs_of(plant)[first:]
     lengthwise = [(k, group) for group in strokes for k in group.columns]
     sides = [(k, group) for group in others for k in group.columns]
-    listed = []
-    if np.isfinite(batch.rise).any():
-        listed += [
-            finding("", "rise, 10-90 %", "ms", batch.rise, "rise", "about"),
-            finding("", "overshoot", "percent", batch.overshoot, "overshoot"),
-        ]
+    listed = [
+        finding("", RISE[0], "ms", batch.rise, "rise", "about"),
+        finding("", RISE[1], "percent", batch.overshoot, "overshoot"),
+    ]
     listed += [
         finding("", f"deviation of {names[k]}", stroke_unit(plant), batch.deviation[:, k], "stroke")
         for k, _ in lengthwise
@@ -78,7 +86,7 @@ def figures_of(found: Campaign, published: Mapping[str, Any] | None = None) -> l
         for g in (*efforts, *thrusts)
     ]
     listed += [
-        finding(name.removeprefix("touchdown at "), "clearance:", "percent", batch.contact[:, k])
+        finding(name.removeprefix("touchdown at "), CLEARANCE, "percent", batch.contact[:, k])
         for k, name in enumerate(plant.contacts)
     ]
     return [
@@ -99,22 +107,9 @@ def runs_within_bounds(
 ) -> NDArray[np.bool_] | None:
     """True for runs that were completed within every published bound; None where the paper has no bounds."""
     bounds = [
-        f for f in figures_of(found, published) if f.relation == "at most" and math.isfinite(f.published)
+        f for f in every_figure(found, published) if f.relation == "at most" and math.isfinite(f.published)
     ]
     return np.all([f.within for f in bounds], axis=0) if bounds else None
-
-
-def worst_of(found: Campaign, count: int) -> list[int]:
-    """Rows of the worst runs, the worst first: runs that ended early, then runs that came closest to a contact.
-
-    Closeness is relative to the median run, because the scenario itself may come near an end stop.
-    """
-    batch = found.batch
-    if not len(found.index):
-        return []
-    closest = -(batch.contact - np.median(batch.contact, axis=0)).max(axis=1, initial=0.0)
-    order = np.lexsort((found.index, np.where(found.completed, closest, batch.duration), found.completed))
-    return [int(k) for k in order[:count]]
 
 
 def unit_of(plan: Plan, name: str) -> str:

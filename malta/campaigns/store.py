@@ -1,6 +1,6 @@
 """The folder of a campaign: its manifest, and a file for each block of runs that is done.
 
-    campaign.json        the plan's manifest, and the number of runs in a block
+    campaign.json        the plan's manifest, the number of runs in a block, and which gain file was read
     runs_00000000.npz    the block that begins with run 0: the machines of its runs and their figures
     runs_00001024.npz    ...
 
@@ -39,7 +39,7 @@ from malta.simulation.compiled import LANES
 from malta.simulation.digest import Batch, verdicts
 from malta.synthesis.controller import Controller
 
-MANIFEST = "campaign.json"
+MANIFEST, GAINS = "campaign.json", "gains_file"
 HEADERS = 1_000_000  # bytes of a block beside its numbers, at most
 
 
@@ -48,8 +48,10 @@ def block_name(first: int) -> str:
     return f"runs_{first:08d}.npz"
 
 
-def open_folder(folder: Path, plan: Plan, block: int) -> int:
+def open_folder(folder: Path, plan: Plan, block: int, gains: Path | None = None) -> int:
     """Make sure that a folder has the manifest of a plan; the number of runs in its blocks.
+
+    gains : file of the controller, noted in a new folder for those who look into it later
 
     Raises InputError for a folder that has another campaign, or blocks without a manifest, or cannot be written to.
     """
@@ -71,17 +73,18 @@ def open_folder(folder: Path, plan: Plan, block: int) -> int:
         raise InputError(
             folder, "", f"{blocks[0].name} without {MANIFEST}", "a campaign's folder or an empty one"
         )
-    text = json.dumps(plan.manifest | {"block": block}, indent=1) + "\n"
+    noted = {} if gains is None else {GAINS: str(gains.absolute())}
+    text = json.dumps(plan.manifest | {"block": block} | noted, indent=1) + "\n"
     replace_files({path: text.encode()})
     return block
 
 
 def read_manifest(path: Path) -> tuple[dict[str, Any], int]:
     """A manifest, and the number of runs in a block. Raises InputError for any other file."""
-    text = read_file(path, "campaign's manifest", lambda p: p.read_text(encoding="utf-8"))
+    text = _manifest_text(path)
     try:
         content = json.loads(text)
-        size = content.pop("block")
+        size, _ = content.pop("block"), content.pop(GAINS, None)
     except (ValueError, RecursionError, AttributeError, KeyError, TypeError) as error:
         raise InputError(path, "", "a damaged or foreign file", "the manifest of a campaign") from error
     for key, expected in (("schema", SCHEMA), ("version", VERSION)):
@@ -90,6 +93,20 @@ def read_manifest(path: Path) -> tuple[dict[str, Any], int]:
     if not isinstance(size, int) or size < 1 or size % LANES:
         raise InputError(path, "block", repr(size), f"a multiple of {LANES}")
     return content, size
+
+
+def _manifest_text(path: Path) -> str:
+    return read_file(path, "campaign's manifest", lambda p: p.read_text(encoding="utf-8"))
+
+
+def noted_gains(folder: str | Path) -> Path:
+    """The gain file of the campaign in a folder. Raises InputError where none is noted."""
+    path = Path(folder) / MANIFEST
+    read_manifest(path)
+    noted = json.loads(_manifest_text(path)).get(GAINS)
+    if not isinstance(noted, str):
+        raise InputError(path, GAINS, "none noted", "the campaign's gain file as an argument")
+    return Path(noted)
 
 
 def read_plan(folder: str | Path, controller: Controller) -> Plan:
@@ -128,19 +145,17 @@ def read_plan(folder: str | Path, controller: Controller) -> Plan:
     return plan
 
 
-def read_blocks(place: Path, plan: Plan, parts: Mapping[int, int], done: dict[int, Block]) -> list[Path]:
-    """Read the blocks `parts` (first run -> number of runs) into `done`; the result lists the damaged files."""
-    damaged = []
+def read_blocks(
+    place: Path, plan: Plan, parts: Mapping[int, int]
+) -> Iterator[tuple[int, Path, Block | None]]:
+    """(first run, file, block) for each of the blocks `parts`, first run -> number of runs, that a folder has.
+
+    None stands for the block of a damaged file.
+    """
     for first, count in parts.items():
         path = place / block_name(first)
-        if not path.exists():
-            continue
-        found = read_block(path, plan, first, count)
-        if found is None:
-            damaged.append(path)
-        else:
-            done[first] = found
-    return damaged
+        if path.exists():
+            yield first, path, read_block(path, plan, first, count)
 
 
 def require_same(path: Path, found: Mapping[str, Any], expected: Mapping[str, Any]) -> None:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, cast
+from typing import TYPE_CHECKING, Annotated, NamedTuple, cast
 
 import typer
 
 from malta.cli.assignments import add_own_options, read_sensor_errors, read_shares, scenario_options
-from malta.cli.documents import campaign_document
+from malta.cli.documents import campaign_document, status_document
 from malta.cli.inputs import change_machine, design_of, print_scenarios, read_controller
 from malta.cli.options import (
     SCENARIOS,
@@ -21,7 +20,7 @@ from malta.cli.options import (
     Distance,
     Feedforward,
     FidelityName,
-    GainFile,
+    GainFileOrNone,
     MachineFile,
     OwnOptions,
     ProfileName,
@@ -34,15 +33,17 @@ from malta.cli.options import (
 )
 from malta.cli.output import make_console, print_json, print_note, print_written, progress_bar
 from malta.cli.patience import limit_time
+from malta.errors import InputError
 
 if TYPE_CHECKING:
     from malta.campaigns.plan import Sampler
-    from malta.campaigns.result import Campaign
-    from malta.synthesis.spec import Spec
+    from malta.campaigns.status import Status
+    from malta.campaigns.summary import Summary
 
 
 def campaign(
-    gains: GainFile,
+    ctx: typer.Context,
+    gains: GainFileOrNone = None,
     samples: Annotated[int, typer.Option(help="Machines.")] = 10_000,
     scenario: Annotated[str | None, typer.Option(help=f"What each one does: {SCENARIOS}")] = None,
     case: Annotated[
@@ -85,7 +86,7 @@ def campaign(
         str | None,
         typer.Option(metavar="ADDRESS", help="Fly on the workers of a Dask scheduler: tcp://host:8786."),
     ] = None,
-    worst: Annotated[int, typer.Option(min=0, help="How many of the worst runs to list.")] = 5,
+    worst: Annotated[int, typer.Option(min=0, max=1000, help="How many of the worst runs to list.")] = 5,
     out: Annotated[
         Path | None,
         typer.Option(help="Folder of blocks and figures. [build/campaigns/, one for each campaign]"),
@@ -99,6 +100,13 @@ def campaign(
     ] = None,
     machine: MachineFile = None,
     yes: Yes = False,
+    status: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FOLDER",
+            help="Fly nothing: show how far the campaign in a folder is, also while another process flies it.",
+        ),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Simulate many machines that differ, each with noise of its own: the yield, and what goes wrong where.
@@ -109,11 +117,21 @@ def campaign(
     Three yields: runs that were completed, those within what the machine's paper prints, and those within what
     [specification] asks of the same motion.
 
+    Memory does not grow with the machines: beyond 100 000 of them percentiles are counted, to 0.006 % of their values.
+
     \b
     Example:  malta campaign design/gains/calibrated.json --samples 10000 --spread 20%
+              malta campaign --status build/campaigns/calibrated_stroke_1a2b3c4d
     """
+    if status is not None:
+        _show_status(ctx, status, gains, Looking(design, machine, worst, as_json))
+        return
+    if gains is None:
+        raise InputError("campaign", "GAINS", "nothing", "a gain file, or --status FOLDER")
     from malta.campaigns.plan import Plan
-    from malta.campaigns.run import campaign as run_campaign
+    from malta.campaigns.run import Session, open_campaign
+    from malta.campaigns.summary import Bounds
+    from malta.campaigns.survey import summarize
     from malta.model.data import plant_of
     from malta.model.published import published_figures
     from malta.simulation.catalogue import main_job
@@ -154,77 +172,123 @@ def campaign(
         case,
         options,
     )
-    spec = design_of(gains, controller, design)
+    bounds = Bounds(published, design_of(gains, controller, design))
     folder = out or Path("build") / "campaigns" / f"{controller.name}_{scenario}_{plan.identity[:8]}"
+    open_campaign(plan, folder, Session(workers, cluster), gains)
     with progress_bar(scenario, quiet=as_json) as bar:
         progress = limit_time(bar, f"{scenario}, {samples} runs", agreed=yes)
-        result = run_campaign(plan, folder, workers=workers, cluster=cluster, progress=progress)
-    _report(gains, result, Bounds(published, spec), worst, as_json=as_json)
+        result = summarize(plan, folder, bounds, workers=workers, cluster=cluster, progress=progress)
+    _report(gains, result, worst, as_json=as_json)
 
 
-class Bounds(NamedTuple):
-    """What bounds the runs of a campaign."""
-
-    published: Mapping[str, Any] | None
-    spec: Spec | None
-
-
-def _report(gains: Path, campaign: Campaign, bounds: Bounds, worst: int, *, as_json: bool) -> None:
+def _report(gains: Path, found: Summary, worst: int, *, as_json: bool) -> None:
     """Draw and print a campaign and note what went wrong; exit with code 130 after Ctrl-C."""
     from malta.model.data import plant_of
 
-    for file in campaign.damaged:
+    for file in found.damaged:
         print_note(f"{file}: a damaged block, flown again")
-    files = _draw(campaign, bounds.published)
+    files = _draw(found)
     if as_json:
         names = [str(file) for file in files]
-        document = {"gains": str(gains), "folder": str(campaign.folder), "files": names}
-        print_json(document | campaign_document(campaign, bounds.published, worst, bounds.spec))
+        document = {"gains": str(gains), "folder": str(found.folder), "files": names}
+        print_json(document | campaign_document(found, worst))
     else:
-        _print_tables(gains, campaign, bounds, worst, files)
-    plan = campaign.plan
-    if "virtual machine" in campaign.engines and not plant_of(plan.controller.parameters).tabulated:
+        _print_tables(gains, found, worst)
+        print_written(make_console(), files)
+    plan = found.plan
+    if "virtual machine" in found.engines and not plant_of(plan.controller.parameters).tabulated:
         print_note("no C compiler: simulated on CasADi's virtual machine, some hundred times slower")
-    if campaign.interrupted:
+    if found.interrupted:
         print_note(
-            f"interrupted after {len(campaign.index)} of {plan.samples} runs, which {campaign.folder} keeps; "
+            f"interrupted after {found.runs} of {plan.samples} runs, which {found.folder} keeps; "
             "the same command goes on"
         )
         raise typer.Exit(130)
 
 
-def _draw(campaign: Campaign, published: Mapping[str, Any] | None) -> list[Path]:
+def _draw(found: Summary) -> list[Path]:
     """Draw the figures of a campaign into its folder; none without runs."""
-    if campaign.folder is None or not len(campaign.index):
+    if found.folder is None or not found.runs:
         return []
     from malta import report
 
-    return report.campaign(campaign, campaign.folder, published)
+    return report.campaign(found, found.folder)
 
 
-def _print_tables(
-    gains: Path,
-    campaign: Campaign,
-    bounds: Bounds,
-    worst: int,
-    files: Sequence[Path],
-) -> None:
+def _print_tables(gains: Path, found: Summary, worst: int) -> None:
     """Print what was flown, the yield, the distributions and the worst runs; only the first without runs."""
     from malta import report
     from malta.campaigns.plan import planned_run
 
-    plan, console, wanted = campaign.plan, make_console(), planned_run(campaign.plan)
+    plan, console, wanted = found.plan, make_console(), planned_run(found.plan)
     case = "" if wanted.label == plan.scenario else f" ({wanted.label})"
     console.print(
         f"{gains}: {plan.scenario}{case}, fidelity {wanted.scenario.fidelity}, "
-        f"{len(campaign.index)} of {plan.samples} machines"
+        f"{found.runs} of {plan.samples} machines"
     )
-    console.print(f"{report.box_text(campaign)}; {plan.sampler}, seed {plan.seed}")
-    if not len(campaign.index):
+    console.print(f"{report.box_text(found)}; {plan.sampler}, seed {plan.seed}")
+    if not found.runs:
         return
-    console.print(report.campaign_tables(campaign, bounds.published, worst, bounds.spec))
+    console.print(report.campaign_tables(found, worst=worst))
     if worst:
         console.print(
-            f"one of them again: malta simulate {gains} --replay {campaign.folder}:RUN", soft_wrap=True
+            f"one of them again: malta simulate {gains} --replay {found.folder}:RUN", soft_wrap=True
         )
-    print_written(console, files)
+
+
+class Looking(NamedTuple):
+    """Options of a campaign that say how its status is looked at."""
+
+    design: Path | None
+    machine: Path | None
+    worst: int
+    as_json: bool
+
+
+def _show_status(ctx: typer.Context, folder: Path, gains: Path | None, options: Looking) -> None:
+    """Print the status of the campaign in a folder. Raises InputError for options that the campaign decides."""
+    from malta.campaigns.status import status as status_of
+    from malta.campaigns.store import noted_gains
+    from malta.campaigns.summary import Bounds
+    from malta.model.data import plant_of
+    from malta.model.published import published_figures
+
+    sources = {param: ctx.get_parameter_source(str(param.name)) for param in ctx.command.params}
+    given = [param for param, source in sources.items() if source and source.name == "COMMANDLINE"]
+    others = [param.opts[0] for param in given if param.name not in ("status", "gains", *Looking._fields)]
+    if others:
+        raise InputError(
+            "--status", "", f"{', '.join(others)} too", "none of them: the folder has its campaign"
+        )
+    gains = noted_gains(folder) if gains is None else gains
+    controller = read_controller(gains, options.machine)
+    published = published_figures(plant_of(controller.parameters).name)
+    bounds = Bounds(published, design_of(gains, controller, options.design))
+    with progress_bar("status", quiet=options.as_json) as progress:
+        found = status_of(folder, controller, bounds, progress)
+    if options.as_json:
+        document = {"gains": str(gains), "folder": str(folder)} | status_document(found)
+        print_json(document | campaign_document(found.summary, options.worst))
+        return
+    for file in found.summary.damaged:
+        print_note(f"{file}: a damaged block, which the campaign will fly again")
+    console = make_console()
+    for line in _status_lines(found):
+        console.print(line, soft_wrap=True)
+    _print_tables(gains, found.summary, options.worst)
+
+
+def _status_lines(found: Status) -> list[str]:
+    """Blocks in the folder, and whether others seem to come."""
+    summary = found.summary
+    lines = [
+        f"{summary.folder}: {found.blocks} of {found.of} blocks of {found.size} runs, "
+        f"{found.stored / 1e6:.1f} MB, {len(summary.damaged)} damaged"
+    ]
+    if found.running:
+        left = "" if found.left is None else f", about {found.left:.0f} s left"
+        lines.append(f"running: the last block came {found.age:.0f} s ago{left}")
+    elif found.blocks < found.of:
+        age = "" if found.age is None else f": the last block came {found.age:.0f} s ago"
+        lines.append(f"not running{age}; the same command goes on")
+    return lines

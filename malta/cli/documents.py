@@ -6,14 +6,14 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from malta.campaigns.result import Campaign
+    from malta.campaigns.status import Status
+    from malta.campaigns.summary import Merit, Runs, Summary
     from malta.margins.gain import Gain
     from malta.margins.recovery import Recovery
     from malta.margins.robust import Margin
     from malta.margins.stages import Robustness
     from malta.margins.verify import Margins
     from malta.simulation.experiments import Experiment
-    from malta.synthesis.spec import Spec
     from malta.tuning.outcomes import Outcome
 
 
@@ -116,25 +116,37 @@ def experiment_document(experiment: Experiment) -> dict[str, Any]:
     return document
 
 
-def campaign_document(
-    campaign: Campaign, published: Mapping[str, Any] | None, worst: int, spec: Spec | None = None
-) -> dict[str, Any]:
+def campaign_document(found: Summary, worst: int) -> dict[str, Any]:
     """The yield of a campaign, the distribution of each merit, and its worst runs."""
-    from malta.campaigns.statistics import worst_of
-    from malta.campaigns.yields import yields_of
+    from malta.campaigns.sketch import ACCURACY
+    from malta.campaigns.summary import worst_runs
 
-    completed, within, specified = yields_of(campaign, published, spec)
+    completed, within, specified = found.yields
+    runs = worst_runs(found, worst)
     return {
-        "manifest": campaign.plan.manifest,
-        "runs": len(campaign.index),
-        "interrupted": campaign.interrupted,
-        "engines": list(campaign.engines),
+        "manifest": found.plan.manifest,
+        "runs": found.runs,
+        "interrupted": found.interrupted,
+        "engines": list(found.engines),
         "yield": completed._asdict(),
         "within_published": None if within is None else within.passed,
         "within_specification": None if specified is None else specified.passed,
-        "ends": campaign.ends,
-        "merits": _percentiles(campaign, published),
-        "worst": [_run_document(campaign, row) for row in worst_of(campaign, worst)],
+        "ends": found.ends,
+        "percentiles": {"exact": found.exact, "relative_error": 0.0 if found.exact else ACCURACY},
+        "merits": {merit.label: _merit_document(merit) for merit in found.merits},
+        "worst": [_run_document(found, runs, row) for row in range(len(runs.index))],
+    }
+
+
+def status_document(found: Status) -> dict[str, Any]:
+    """How far a campaign is; times in s."""
+    return {
+        "blocks": {"done": found.blocks, "all": found.of, "runs": found.size, "bytes": found.stored},
+        "damaged": [str(file) for file in found.summary.damaged],
+        "running": found.running,
+        "pace": found.pace,
+        "age": found.age,
+        "left": found.left,
     }
 
 
@@ -168,34 +180,28 @@ def _gain_document(gain: Gain) -> dict[str, Any]:
     }
 
 
-def _percentiles(campaign: Campaign, published: Mapping[str, Any] | None) -> dict[str, Any]:
-    """Percentiles of each merit over the runs that have it, and its published figure."""
-    import numpy as np
-
-    from malta.campaigns.statistics import figures_of
-
-    merits = {}
-    for figure in figures_of(campaign, published):
-        values = figure.values[np.isfinite(figure.values)]
-        marks = np.percentile(values, (5, 50, 95, 99, 100)) if values.size else [float("nan")] * 5
-        names = ("p5", "p50", "p95", "p99", "largest")
-        merits[figure.label] = dict(zip(names, map(float, marks), strict=True)) | {
-            "published": figure.published
-        }
-    return merits
+def _merit_document(merit: Merit) -> dict[str, Any]:
+    """The distribution of a merit over the runs that have it, and its published figure."""
+    marks = merit.percentiles((5, 50, 95, 99, 100)).tolist()
+    return dict(zip(("p5", "p50", "p95", "p99", "largest"), marks, strict=True)) | {
+        "smallest": merit.sketch.smallest,
+        "mean": merit.mean,
+        "deviation": merit.deviation,
+        "published": merit.published,
+    }
 
 
-def _run_document(campaign: Campaign, row: int) -> dict[str, Any]:
-    """One run of a campaign, by its row in the campaign's arrays."""
+def _run_document(found: Summary, runs: Runs, row: int) -> dict[str, Any]:
+    """One run of a campaign, by its row among some runs."""
+    from malta.campaigns.plan import varied_names
     from malta.simulation.digest import verdicts
 
-    names = verdicts(campaign.plan.plant)
     return {
-        "run": int(campaign.index[row]),
-        "end": names[int(campaign.batch.verdict[row])],
-        "time": float(campaign.batch.duration[row]),
-        "values": dict(zip(campaign.names, campaign.values[row].tolist(), strict=True)),
-        "deviation": campaign.batch.deviation[row].tolist(),
-        "contact": campaign.batch.contact[row].tolist(),
-        "replay": f"{campaign.folder}:{campaign.index[row]}",
+        "run": int(runs.index[row]),
+        "end": verdicts(found.plan.plant)[int(runs.batch.verdict[row])],
+        "time": float(runs.batch.duration[row]),
+        "values": dict(zip(varied_names(found.plan), runs.values[row].tolist(), strict=True)),
+        "deviation": runs.batch.deviation[row].tolist(),
+        "contact": runs.batch.contact[row].tolist(),
+        "replay": f"{found.folder}:{runs.index[row]}",
     }

@@ -69,6 +69,15 @@ Seed = Annotated[int | None, typer.Option(help="Seed of the noise. [0]")]
 GainFile = Annotated[
     Path, typer.Argument(metavar="GAINS", help="A gain file: .json, .npz or .mat.", callback=locate)
 ]
+GainFileOrNone = Annotated[
+    Path | None,
+    typer.Argument(
+        metavar="[GAINS]",
+        help="A gain file: .json, .npz or .mat. With --status: [the campaign's own]",
+        callback=lambda path: None if path is None else locate(path),
+        show_default=False,
+    ),
+]
 MachineFile = Annotated[
     Path | None,
     typer.Option(

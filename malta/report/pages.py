@@ -33,6 +33,7 @@ from malta.synthesis.spec import Spec
 
 if TYPE_CHECKING:
     from malta.campaigns.result import Campaign
+    from malta.campaigns.summary import Summary
     from malta.margins.gain import Gain
     from malta.margins.recovery import Recovery
     from malta.margins.stages import Robustness
@@ -123,10 +124,16 @@ def loads(
     return save(recovery_figure(plant, controller, found), Path(path))
 
 
-def campaign(found: Campaign, folder: str | Path, published: Published | None = None) -> list[Path]:
-    """Draw the results of a campaign: distributions.png, yield.png and worst.png in a folder. Returns their paths."""
+def campaign(found: Campaign | Summary, folder: str | Path, published: Published | None = None) -> list[Path]:
+    """Draw the results of a campaign: distributions.png, yield.png and worst.png in a folder. Returns their paths.
+
+    published : figures of the machine's paper; a summary has its own
+    """
+    from malta.campaigns.summary import Bounds, as_summary
+
+    summary = as_summary(found, Bounds(published))
     return [
-        save(draw(found, published), Path(folder) / name)
+        save(draw(summary), Path(folder) / name)
         for name, draw in (
             ("distributions.png", distributions_figure),
             ("yield.png", yield_figure),

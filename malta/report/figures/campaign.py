@@ -29,8 +29,9 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    from malta.campaigns.plan import Plan
     from malta.campaigns.result import Campaign
-    from malta.campaigns.statistics import Finding
+    from malta.campaigns.summary import Merit, Summary
 
 
 FINE: Mapping[
@@ -50,14 +51,15 @@ TOUCHES: Sequence[dict[str, Any]] = (
 BINS = 40  # of a distribution
 
 
-def distributions_figure(found: Campaign, published: Published | None = None) -> Figure:
+def distributions_figure(found: Campaign | Summary, published: Published | None = None) -> Figure:
     """Distributions of the figures of merit over the completed runs, with the published bounds."""
-    from malta.campaigns.statistics import figures_of
+    from malta.campaigns.summary import Bounds, as_summary
 
-    panels: dict[tuple[str, str], list[Finding]] = {}  # one panel for each kind and unit
-    for listed in figures_of(found, published):
+    summary = as_summary(found, Bounds(published))
+    panels: dict[tuple[str, str], list[Merit]] = {}  # one panel for each kind and unit
+    for listed in summary.merits:
         panels.setdefault((listed.kind, listed.unit), []).append(listed)
-    figure = _campaign_figure(found, "figures of merit of the completed runs", hspace=0.44, wspace=0.28)
+    figure = _campaign_figure(summary, "figures of merit of the completed runs", hspace=0.44, wspace=0.28)
     every = figure.subplots(2, 3).ravel()
     for axes, ((kind, _), group) in zip(every, panels.items(), strict=False):
         _draw_distribution(axes, kind, group)
@@ -66,20 +68,21 @@ def distributions_figure(found: Campaign, published: Published | None = None) ->
     return figure
 
 
-def _draw_distribution(axes: Axes, kind: str, listed: Sequence[Finding]) -> None:
+def _draw_distribution(axes: Axes, kind: str, listed: Sequence[Merit]) -> None:
     """Histograms of figures of one kind, on a logarithmic axis where they reach over decades."""
     from matplotlib.ticker import LogLocator
 
+    from malta.campaigns.sketch import histogram
+
     unit = listed[0].unit
-    series = [in_unit(1.0, unit) * f.values[np.isfinite(f.values)] for f in listed]
-    bound = in_unit(listed[0].published, unit)
-    every = np.concatenate(series)
+    bound, scale = in_unit(listed[0].published, unit), in_unit(1.0, unit)
     told = "%" if unit == "percent" else micro(unit)
     finish_axes(axes, f"{kind} [{told}]", "share of runs [%]")
-    if not every.size:
+    if not any(m.sketch.count for m in listed):
         axes.annotate("no run completed", (0.5, 0.5), xycoords="axes fraction", ha="center", **NOTE)
         return
-    low, high = float(every.min()), float(every.max())
+    low = scale * min(m.sketch.smallest for m in listed)
+    high = scale * max(m.sketch.largest for m in listed)
     if math.isfinite(bound):
         low, high = min(low, bound), max(high, bound)
     logarithmic = low > 0 and high > 30 * low
@@ -89,12 +92,12 @@ def _draw_distribution(axes: Axes, kind: str, listed: Sequence[Finding]) -> None
         if logarithmic
         else np.linspace(max(low - room, 0.0) if low >= 0 else low - room, high + room, BINS + 1)
     )
-    for f, values, style in zip(listed, series, cycle((1, 0, 3, 2)), strict=False):
-        share = 100 * np.histogram(values, edges)[0] / max(len(values), 1)
+    for m, style in zip(listed, cycle((1, 0, 3, 2)), strict=False):
+        share = 100 * histogram(m.sketch, edges / scale) / max(m.sketch.count, 1)
         line = {"color": STYLES[0]["color"], "linewidth": 1.2} if len(listed) == 1 else STYLES[style]
         if len(listed) == 1:
             axes.stairs(share, edges, fill=True, facecolor="#d4d4d4")
-        axes.stairs(share, edges, label=f.label.removeprefix(f"{kind} ") if len(listed) > 1 else None, **line)
+        axes.stairs(share, edges, label=m.label.removeprefix(f"{kind} ") if len(listed) > 1 else None, **line)
     if logarithmic:
         axes.set_xscale("log")
         axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 3.0) if high > 100 * low else (1.0, 2.0, 5.0)))
@@ -114,27 +117,22 @@ def _draw_distribution(axes: Axes, kind: str, listed: Sequence[Finding]) -> None
         axes.legend(ncols=len(listed), **where, **LEGEND | close)
 
 
-def yield_figure(found: Campaign, published: Published | None = None) -> Figure:
+def yield_figure(found: Campaign | Summary, published: Published | None = None) -> Figure:
     """Shares of the ways in which runs end, over each parameter that was varied."""
-    from malta.campaigns.statistics import runs_within_bounds
-    from malta.simulation.digest import verdicts
+    from malta.campaigns.plan import half_width, varied_names
+    from malta.campaigns.summary import Bounds, as_summary
 
-    names = [name for k, name in enumerate(found.names) if len(set(found.values[:, k])) > 1]
+    summary = as_summary(found, Bounds(published))
+    every = varied_names(summary.plan)
+    names = [name for name in every if half_width(summary.plan, name) and summary.runs > 1]
     shown = names[:9]
-    limited = found.batch.saturated.max(axis=1, initial=0.0) > 0
-    within = runs_within_bounds(found, published)
-    known = verdicts(found.plan.plant)
-    band = np.array(known, dtype=object)[found.batch.verdict.astype(int)]
-    band[found.completed & limited] = "completed, commands limited"
-    if within is not None:
-        band[within] = "within the published bounds"
     columns = min(3, max(1, len(shown))) if len(shown) != 4 else 2
     rows = max(1, -(-len(shown) // columns))
     more = f", {len(shown)} of {len(names)} shown" if len(shown) < len(names) else ""
-    figure = _campaign_figure(found, f"how runs end over the parameters{more}", hspace=0.5, top=0.8)
+    figure = _campaign_figure(summary, f"how runs end over the parameters{more}", hspace=0.5, top=0.8)
     panels = figure.subplots(rows, columns, squeeze=False, sharey=True).ravel()
     for axes, name in zip(panels, shown, strict=False):
-        _draw_bands(axes, found, name, band)
+        _draw_bands(axes, summary.plan, name, summary.bands[every.index(name)])
     for axes in panels[len(shown) :]:
         axes.set_visible(False)
     for axes in panels[: len(shown) : columns]:
@@ -146,20 +144,20 @@ def yield_figure(found: Campaign, published: Published | None = None) -> Figure:
     return figure
 
 
-def _draw_bands(axes: Axes, found: Campaign, name: str, band: Any) -> None:
-    """Shares of the ways in which runs end, stacked, in bins of one parameter."""
+def _draw_bands(axes: Axes, plan: Plan, name: str, counts: Any) -> None:
+    """Shares of the ways in which runs end, stacked, in bins of one parameter. counts : ways x bins."""
     from malta.campaigns.statistics import unit_of
+    from malta.campaigns.summary import bin_edges, ways_to_end
 
-    unit = unit_of(found.plan, name)
-    values = found.values[:, found.names.index(name)] * in_unit(1.0, unit)
-    edges = np.linspace(values.min(), values.max(), 11 if len(values) >= 200 else 6)
-    total = np.histogram(values, edges)[0]
+    unit = unit_of(plan, name)
+    edges = bin_edges(plan, name) * in_unit(1.0, unit)
+    total = counts.sum(axis=0)
     base = np.zeros(len(total))
-    styles = dict(FINE) | dict(zip(found.plan.plant.contacts, cycle(TOUCHES)))
-    for label, style in styles.items():
-        if not (band == label).any():
+    by_way = dict(zip(ways_to_end(plan), counts, strict=True))
+    for label, style in (dict(FINE) | dict(zip(plan.plant.contacts, cycle(TOUCHES)))).items():
+        if not by_way[label].any():
             continue
-        share = 100 * np.histogram(values[band == label], edges)[0] / np.maximum(total, 1)
+        share = 100 * by_way[label] / np.maximum(total, 1)
         axes.bar(
             edges[:-1],
             share,
@@ -177,47 +175,52 @@ def _draw_bands(axes: Axes, found: Campaign, name: str, band: Any) -> None:
     axes.set_ylim(0, 100)
 
 
-def worst_figure(found: Campaign, published: Published | None = None) -> Figure:
+def worst_figure(found: Campaign | Summary, published: Published | None = None) -> Figure:
     """The worst runs: the places of their machines in the box, and their largest errors."""
-    from malta.campaigns.plan import half_width
-    from malta.campaigns.statistics import bounds_of, spread_text, worst_of
+    from malta.campaigns.plan import half_width, middle_of, varied_names
+    from malta.campaigns.statistics import bounds_of, spread_text
+    from malta.campaigns.summary import Bounds, as_summary, worst_runs
 
-    plan, plant = found.plan, found.plan.plant
-    rows = worst_of(found, len(STYLES) + len(MORE))
-    figure = _campaign_figure(found, "the worst runs and their machines", wspace=0.34, top=0.84, bottom=0.13)
+    summary = as_summary(found, Bounds(published))
+    plan, plant, published = summary.plan, summary.plan.plant, summary.bounds.published
+    names, runs = varied_names(plan), worst_runs(summary, len(STYLES) + len(MORE))
+    completed = runs.batch.completed == 1
+    figure = _campaign_figure(
+        summary, "the worst runs and their machines", wspace=0.34, top=0.84, bottom=0.13
+    )
     box, far = figure.subplots(1, 2, width_ratios=(1.7, 1))
-    at = np.arange(len(found.names))
-    middle = np.array([getattr(plan.parameters, n) if n in plan.spread else 0.0 for n in found.names])
-    half = np.array([half_width(plan, n) for n in found.names])
+    at = np.arange(len(names))
+    middle = np.array([middle_of(plan, name) for name in names])
+    half = np.array([half_width(plan, name) for name in names])
     across = lateral_outputs(plant)[0]
     fine = in_unit(1.0, across.fine)
-    for place, (row, style) in enumerate(zip(rows, (*STYLES, *MORE), strict=False)):
-        where = 100 * (found.values[row] - middle) / np.where(half == 0, 1, half)
+    for row, (_, style) in enumerate(zip(runs.index, (*STYLES, *MORE), strict=False)):
+        where = 100 * (runs.values[row] - middle) / np.where(half == 0, 1, half)
         box.plot(at, where, marker="o", markersize=4, **style)
-        off = float(found.batch.deviation[row, across.columns].max()) * fine
-        far.plot([1e-3, off], [place, place], **style)
+        off = float(runs.batch.deviation[row, across.columns].max()) * fine
+        far.plot([1e-3, off], [row, row], **style)
         far.plot(
             off,
-            place,
-            marker="o" if found.completed[row] else "X",
+            row,
+            marker="o" if completed[row] else "X",
             markersize=7,
             color=style["color"],
             clip_on=False,
         )
-    spreads = [spread_text(found.plan, name) for name in found.names]
-    box.set_xticks(at, [f"{n}\n{s}" for n, s in zip(found.names, spreads, strict=True)], fontsize=9)
+    box.set_xticks(at, [f"{name}\n{spread_text(plan, name)}" for name in names], fontsize=9)
     box.set_yticks([-100, -50, 0, 50, 100])
-    far.set_yticks(range(len(rows)), [_run_label(found, row) for row in rows], fontsize=8)
+    labels = [_run_label(plan, index, end) for index, end in zip(runs.index, runs.batch.verdict, strict=True)]
+    far.set_yticks(range(len(labels)), labels, fontsize=8)
     far.invert_yaxis()
-    offs = found.batch.deviation[rows][:, across.columns] * fine
+    offs = runs.batch.deviation[:, across.columns] * fine
     far.set_xscale("log")
-    least = float(offs.max(axis=1).min()) if len(rows) else 1.0
+    least = float(offs.max(axis=1).min()) if len(labels) else 1.0
     bounds = {"clearance": clearance(plant) * fine} if across.unit == "m" else {}
     key = bounds_of(plan).get(across.unit)
     if published is not None and key is not None:
         bounds["published bound"] = published_in_unit(published, key, across.fine)
     bounds = {text: value for text, value in bounds.items() if math.isfinite(value)}
-    most = float(offs.max()) if len(rows) else 1.0
+    most = float(offs.max()) if len(labels) else 1.0
     far.set_xlim(min([least, *bounds.values()]) / 2, 1.6 * max([most, *bounds.values()]))
     for text, value in bounds.items():
         far.axvline(value, **BOUND)
@@ -231,7 +234,7 @@ def worst_figure(found: Campaign, published: Published | None = None) -> Figure:
     return figure
 
 
-def _campaign_figure(found: Campaign, what: str, **places: float) -> Figure:
+def _campaign_figure(found: Summary, what: str, **places: float) -> Figure:
     """An empty figure whose title names the campaign, with its yield."""
     from matplotlib.figure import Figure
 
@@ -251,10 +254,10 @@ def _campaign_figure(found: Campaign, what: str, **places: float) -> Figure:
     return figure
 
 
-def _run_label(found: Campaign, row: int) -> str:
+def _run_label(plan: Plan, index: int, verdict: float) -> str:
     """The number of a run, and how it ended."""
     from malta.simulation.digest import verdicts
 
-    name = verdicts(found.plan.plant)[int(found.batch.verdict[row])]
-    text = f"run {found.index[row]}"
+    name = verdicts(plan.plant)[int(verdict)]
+    text = f"run {index}"
     return text if name == "completed" else f"{text}\n{name.replace(' at ', chr(10) + 'at ')}"

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-import numpy as np
 from rich.console import Group
 from rich.table import Table
 
@@ -18,11 +17,13 @@ from malta.report.tables.parts import add_row, new_table
 from malta.units import in_unit
 
 if TYPE_CHECKING:
+    from malta.campaigns.plan import Plan
     from malta.campaigns.result import Campaign
+    from malta.campaigns.summary import Summary
     from malta.synthesis.spec import Spec
 
 
-def box_text(found: Campaign) -> str:
+def box_text(found: Campaign | Summary) -> str:
     """The parameters that a campaign varies, with their half-widths."""
     from malta.campaigns.statistics import spread_text
 
@@ -33,28 +34,34 @@ def box_text(found: Campaign) -> str:
 
 
 def campaign_tables(
-    found: Campaign, published: Published | None = None, worst: int = 5, spec: Spec | None = None
+    found: Campaign | Summary,
+    published: Published | None = None,
+    worst: int = 5,
+    spec: Spec | None = None,
 ) -> Group:
     """How the runs of a campaign end, their figures of merit beside the published bounds, and the worst runs.
 
-    spec : the design whose [specification] bounds the runs as well
+    published, spec : figures of the machine's paper, and the design whose [specification] bounds the runs as well;
+        a summary has its own
     """
-    tables: list[Table | str] = [_ends_table(found, published, spec)]
-    if found.completed.any():
-        tables.append(_findings_table(found, published))
-    if worst and len(found.index):
-        tables.append(_worst_table(found, worst))
+    from malta.campaigns.summary import Bounds, as_summary
+
+    summary = as_summary(found, Bounds(published, spec))
+    tables: list[Table | str] = [_ends_table(summary)]
+    if summary.rate.passed:
+        tables.append(_findings_table(summary))
+    if worst and summary.runs:
+        tables.append(_worst_table(summary, worst))
     return Group(*tables)
 
 
-def _ends_table(found: Campaign, published: Published | None, spec: Spec | None) -> Table:
+def _ends_table(found: Summary) -> Table:
     from malta.campaigns.result import rate
-    from malta.campaigns.yields import yields_of
 
-    yields, runs = yields_of(found, published, spec), len(found.index)
+    yields = found.yields
     table = new_table("How the runs end", "end", "runs", "share [%]", "95 % interval [%]")
     rows = {"completed": yields.completed} | {
-        name: rate(count, runs) for name, count in found.ends.items() if name != "completed"
+        name: rate(count, found.runs) for name, count in found.ends.items() if name != "completed"
     }
     if yields.published is not None:
         rows["completed within the published bounds"] = yields.published
@@ -66,65 +73,69 @@ def _ends_table(found: Campaign, published: Published | None, spec: Spec | None)
     return table
 
 
-def _findings_table(found: Campaign, published: Published | None) -> Table:
-    from malta.campaigns.statistics import figures_of
+def _findings_table(found: Summary) -> Table:
+    from malta.campaigns.sketch import ACCURACY
 
-    listed = figures_of(found, published)
-    bounds = any(math.isfinite(f.published) for f in listed)
+    bounds = any(math.isfinite(m.published) for m in found.merits)
     heads = [*(f"{p} %" for p in PERCENTILES), "largest", *(["published", "kept [%]"] if bounds else [])]
-    table = new_table("Figures of merit: percentiles of the completed runs", "figure", *heads)
+    accuracy = "" if found.exact else f", within {100 * ACCURACY:.1g} % of their values"
+    table = new_table(
+        f"Figures of merit: percentiles of the completed runs{accuracy}",
+        "figure",
+        *heads,
+    )
     table.columns[0].no_wrap = True
-    for f in listed:
-        values = in_unit(1.0, f.unit) * f.values[np.isfinite(f.values)]
-        if not values.size:
+    for m in found.merits:
+        if not m.sketch.count:
             continue
-        cells = [number(float(v), 3) for v in (*np.percentile(values, PERCENTILES), values.max())]
-        if bounds and math.isfinite(f.published):
-            bound = f"{in_unit(f.published, f.unit):.6g}"
-            at_most = f.relation == "at most"
+        unit = in_unit(1.0, m.unit)
+        cells = [number(float(v) * unit, 3) for v in (*m.percentiles(PERCENTILES), m.sketch.largest)]
+        if bounds and math.isfinite(m.published):
+            bound = f"{in_unit(m.published, m.unit):.6g}"
+            at_most = m.relation == "at most"
             cells += [
                 f"<= {bound}" if at_most else bound,
-                number(100 * float(f.within.mean())) if at_most else "",
+                number(100 * m.within / found.runs) if at_most else "",
             ]
-        unit = "%" if f.unit == "percent" else f.unit
-        add_row(table, f"{f.label} [{unit}]", *cells, *([""] * (len(heads) - len(cells))))
+        shown = "%" if m.unit == "percent" else m.unit
+        add_row(table, f"{m.label} [{shown}]", *cells, *([""] * (len(heads) - len(cells))))
     return table
 
 
 PERCENTILES = (5, 50, 95, 99)
 
 
-def _worst_table(found: Campaign, count: int) -> Table:
+def _worst_table(found: Summary, count: int) -> Table:
     """The worst runs, each with its parameters relative to the middle of the box and its sensor errors."""
-    from malta.campaigns.statistics import worst_of
+    from malta.campaigns.plan import varied_names
+    from malta.campaigns.summary import worst_runs
     from malta.simulation.digest import verdicts
 
-    plant = found.plan.plant
-    names, groups = verdicts(plant), lateral_outputs(plant)
+    plan, runs = found.plan, worst_runs(found, count)
+    ends, groups = verdicts(plan.plant), lateral_outputs(plan.plant)
     far = [f"{group.name} [{group.fine}]" for group in groups]
     table = new_table("The worst runs", "run", "end", "at [ms]", *far, "off the middle of the box")
     table.columns[0].justify = "right"
     table.columns[1].justify = table.columns[-1].justify = "left"
-    for row in worst_of(found, count):
-        off = [_deviation_text(found, row, k) for k in range(len(found.names))]
+    for row, index in enumerate(runs.index):
+        values = zip(varied_names(plan), runs.values[row].tolist(), strict=True)
         add_row(
             table,
-            f"{found.index[row]}",
-            names[int(found.batch.verdict[row])],
-            f"{found.batch.duration[row] * 1e3:.1f}",
-            *(number(in_unit(float(found.batch.deviation[row, g.columns].max()), g.fine), 3) for g in groups),
-            " ".join(off),
+            f"{index}",
+            ends[int(runs.batch.verdict[row])],
+            f"{runs.batch.duration[row] * 1e3:.1f}",
+            *(number(in_unit(float(runs.batch.deviation[row, g.columns].max()), g.fine), 3) for g in groups),
+            " ".join(_deviation_text(plan, name, value) for name, value in values),
         )
     return table
 
 
-def _deviation_text(found: Campaign, row: int, k: int) -> str:
-    """The k-th varied quantity of a run: a parameter in percent of its middle, a sensor error in its unit."""
+def _deviation_text(plan: Plan, name: str, value: float) -> str:
+    """A varied quantity of a run: a parameter in percent of its middle, a sensor error in its unit."""
     from malta.campaigns.statistics import unit_of
 
-    name, value = found.names[k], float(found.values[row, k])
-    if name in found.plan.spread and name not in differences(found.plan.parameters):
-        middle = getattr(found.plan.parameters, name)
+    if name in plan.spread and name not in differences(plan.parameters):
+        middle = getattr(plan.parameters, name)
         return f"{name}={100 * (value / middle - 1):+.1f}%" if middle else f"{name}={value:+.3g}"
-    unit = unit_of(found.plan, name)
+    unit = unit_of(plan, name)
     return f"{name}={in_unit(value, unit):+.2f}{'%' if unit == 'percent' else unit}"

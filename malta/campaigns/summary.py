@@ -1,0 +1,295 @@
+"""The summary of a campaign: all that its tables and figures show, in memory that does not grow with the runs.
+
+    block -> summary_of -> join -> Summary
+
+Numbers of runs add, distributions are sketches, sums of values are exact fractions, and of the worst runs KEPT stay.
+Therefore blocks may be joined in any order: the summary is the same to the bit.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from fractions import Fraction
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from malta.campaigns.plan import Plan, half_width, middle_of
+from malta.campaigns.result import Campaign, Rate, rate
+from malta.campaigns.sketch import Sketch, merge, quantiles, sketch_of
+from malta.campaigns.statistics import CLEARANCE, RISE, Finding, every_figure, runs_within_bounds
+from malta.campaigns.yields import Yields, runs_within_specification
+from malta.simulation.digest import Batch, verdicts
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from malta.model.plant import FloatArray
+    from malta.synthesis.spec import Spec
+
+    IntArray = NDArray[np.int64]
+
+KEPT = 1000  # of the worst runs, by each measure of badness
+WITHIN, LIMITED = "within the published bounds", "completed, commands limited"
+
+
+class Bounds(NamedTuple):
+    """What bounds the runs of a campaign, beside the scenario itself."""
+
+    published: Mapping[str, Any] | None = None  # figures of the machine's paper
+    spec: Spec | None = None  # whose [specification] counts
+
+
+@dataclass(frozen=True, eq=False)
+class Runs:
+    """Some runs of a campaign, a row for each."""
+
+    index: IntArray
+    values: FloatArray  # runs x names, SI
+    batch: Batch
+
+    def take(self, rows: Any) -> Runs:
+        """The runs in these rows."""
+        batch = Batch(**{name: getattr(self.batch, name)[rows] for name in Batch.__dataclass_fields__})
+        return Runs(self.index[rows], self.values[rows], batch)
+
+
+@dataclass(frozen=True, eq=False)
+class Merit:
+    """The distribution of a figure of merit over the completed runs, SI."""
+
+    label: str
+    kind: str  # figures of one kind share a diagram
+    unit: str  # for display
+    published: float  # NaN where the paper has none
+    relation: str  # of ours to the published: "about" or "at most"
+    sketch: Sketch
+    within: int  # runs that were completed within the published bound
+    total: Fraction  # of the values
+    squares: Fraction  # of the values
+
+    @property
+    def mean(self) -> float:
+        return float(self.total / self.sketch.count) if self.sketch.count else math.nan
+
+    @property
+    def deviation(self) -> float:
+        """Standard deviation, of the values themselves: divided by their number."""
+        n = self.sketch.count
+        return math.sqrt(max(float(self.squares / n - (self.total / n) ** 2), 0.0)) if n else math.nan
+
+    def percentiles(self, marks: Iterable[float]) -> FloatArray:
+        """Percentiles, exact or to `sketch.ACCURACY`: see `Summary.exact`."""
+        return quantiles(self.sketch, [mark / 100 for mark in marks])
+
+
+@dataclass(frozen=True, eq=False)
+class Summary:
+    """What a campaign found, without its runs."""
+
+    plan: Plan
+    bounds: Bounds
+    runs: int
+    verdicts: IntArray  # number of runs with each verdict
+    within: int | None  # runs that were completed within every published bound; None where the paper has none
+    specified: (
+        int | None
+    )  # runs that were completed within [specification]; None where it has no bounds for them
+    engines: tuple[str, ...]  # that simulated them: "compiled" or "virtual machine"
+    listed: tuple[Merit, ...]  # those of a stroke also where there is none
+    bands: IntArray  # names x ways to end x bins over the box; the ways are those of `ways_to_end`
+    kept: Runs  # among which the worst runs are, ascending
+    interrupted: bool = False  # Ctrl-C ended the campaign: the summary is of the blocks before
+    damaged: tuple[Path, ...] = ()  # files of blocks that could not be read; their runs were simulated again
+    folder: Path | None = None
+
+    @property
+    def merits(self) -> tuple[Merit, ...]:
+        """The figures of merit of the scenario."""
+        rose = any(m.kind == RISE[0] and m.sketch.count for m in self.listed)
+        return tuple(m for m in self.listed if rose or m.kind not in RISE)
+
+    @property
+    def exact(self) -> bool:
+        """Whether all percentiles are those of the values; else they are within `sketch.ACCURACY` of them."""
+        return all(merit.sketch.exact for merit in self.listed)
+
+    @property
+    def ends(self) -> dict[str, int]:
+        """Number of runs by the name of their verdict."""
+        names = verdicts(self.plan.plant)
+        return {name: int(n) for name, n in zip(names, self.verdicts, strict=True) if n}
+
+    @property
+    def rate(self) -> Rate:
+        """Share of the runs that were completed."""
+        return rate(int(self.verdicts[0]), self.runs)
+
+    @property
+    def yields(self) -> Yields:
+        """Shares of the runs that were completed, within the published bounds, within [specification]."""
+        published, specified = (
+            None if count is None else rate(count, self.runs) for count in (self.within, self.specified)
+        )
+        return Yields(self.rate, published, specified)
+
+
+def summary_of(found: Campaign, bounds: Bounds = Bounds()) -> Summary:  # noqa: B008  (a tuple never changes)
+    """The summary of a campaign whose runs are in memory, or of one block of it.
+
+    found = malta.campaign(plan)
+    print(summary_of(found).rate)
+    """
+    within = runs_within_bounds(found, bounds.published)
+    specified = runs_within_specification(found, bounds.spec)
+    return Summary(
+        found.plan,
+        bounds,
+        len(found.index),
+        np.bincount(found.batch.verdict.astype(int), minlength=len(verdicts(found.plan.plant))),
+        None if within is None else int(within.sum()),
+        None if specified is None else int(specified.sum()),
+        found.engines,
+        tuple(_merit(figure) for figure in every_figure(found, bounds.published)),
+        _bands(found, within),
+        _keep(Runs(found.index, found.values, found.batch)),
+        found.interrupted,
+        found.damaged,
+        found.folder,
+    )
+
+
+def as_summary(found: Campaign | Summary, bounds: Bounds) -> Summary:
+    """A summary, which has its own bounds, or that of a campaign in memory."""
+    return found if isinstance(found, Summary) else summary_of(found, bounds)
+
+
+def join(one: Summary, other: Summary) -> Summary:
+    """The summary of the runs of two summaries of one plan."""
+
+    def add(first: int | None, second: int | None) -> int | None:
+        return None if first is None or second is None else first + second
+
+    return replace(
+        one,
+        runs=one.runs + other.runs,
+        verdicts=one.verdicts + other.verdicts,
+        within=add(one.within, other.within),
+        specified=add(one.specified, other.specified),
+        engines=tuple(sorted({*one.engines, *other.engines})),
+        listed=tuple(map(_join_merits, one.listed, other.listed)),
+        bands=one.bands + other.bands,
+        kept=_keep(_join_runs(one.kept, other.kept)),
+    )
+
+
+def _merit(figure: Finding) -> Merit:
+    values = figure.values[np.isfinite(figure.values)]
+    return Merit(
+        figure.label,
+        figure.kind,
+        figure.unit,
+        figure.published,
+        figure.relation,
+        sketch_of(values),
+        int(figure.within.sum()),
+        Fraction(float(values.sum())),
+        Fraction(float((values**2).sum())),
+    )
+
+
+def _join_merits(one: Merit, other: Merit) -> Merit:
+    return replace(
+        one,
+        sketch=merge(one.sketch, other.sketch),
+        within=one.within + other.within,
+        total=one.total + other.total,
+        squares=one.squares + other.squares,
+    )
+
+
+# --- ways to end, over the box ---
+
+
+def ways_to_end(plan: Plan) -> tuple[str, ...]:
+    """Names of the ways in which a run may end, the best first: verdicts, with success in three grades."""
+    names = verdicts(plan.plant)
+    return (WITHIN, LIMITED, *names)
+
+
+def bin_edges(plan: Plan, name: str) -> FloatArray:
+    """Edges of the bins of a varied value: ten over its box, five where few runs would fill each."""
+    middle, half = middle_of(plan, name), abs(half_width(plan, name))
+    return np.linspace(middle - half, middle + half, 11 if plan.samples >= 200 else 6)
+
+
+def _bands(found: Campaign, within: NDArray[np.bool_] | None) -> IntArray:
+    """Number of runs by varied value, way to end, and bin."""
+    way = 2 + found.batch.verdict.astype(int)
+    way[found.completed & (found.batch.saturated.max(axis=1, initial=0.0) > 0)] = 1
+    if within is not None:
+        way[within] = 0
+    ways, counts = len(ways_to_end(found.plan)), []
+    for name, values in zip(found.names, found.values.T, strict=True):
+        edges = bin_edges(found.plan, name)
+        bins = len(edges) - 1
+        place = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, bins - 1)
+        counts.append(np.bincount(way * bins + place, minlength=ways * bins).reshape(ways, bins))
+    return np.array(counts)
+
+
+# --- the worst runs ---
+
+
+def worst_runs(summary: Summary, count: int) -> Runs:
+    """The worst runs, the worst first, at most KEPT: those that ended early, then those closest to a contact.
+
+    Closeness is relative to the median of the completed runs, because the scenario itself may come near an end stop.
+    """
+    runs = summary.kept
+    medians = [m.percentiles([50])[0] for m in summary.listed if m.kind == CLEARANCE]
+    away = runs.batch.contact - np.array(medians)
+    closest = -away.max(axis=1) if away.shape[1] else np.zeros(len(runs.index))
+    completed = runs.batch.completed == 1
+    order = np.lexsort((runs.index, np.where(completed, closest, runs.batch.duration), completed))
+    return runs.take(order[: min(count, KEPT)])
+
+
+def worst_of(found: Campaign, count: int) -> list[int]:
+    """Rows of the worst runs of a campaign in memory, as `worst_runs` orders them."""
+    rows: list[int] = np.searchsorted(found.index, worst_runs(summary_of(found), count).index).tolist()
+    return rows
+
+
+def _keep(runs: Runs) -> Runs:
+    """The runs of which the worst may be: the first KEPT that ended early, and the closest to each contact.
+
+    A run among the KEPT worst is among the KEPT closest to that contact to which it is closest relative to the median:
+    every run before it there is worse.
+    """
+    if len(runs.index) <= KEPT:
+        return runs
+    completed = runs.batch.completed == 1
+    measures = [np.where(completed, np.inf, runs.batch.duration)]
+    measures += [np.where(completed, -column, np.inf) for column in runs.batch.contact.T]
+    if not runs.batch.contact.shape[1]:
+        measures.append(np.where(completed, 0.0, np.inf))
+    rows = [np.lexsort((runs.index, measure))[:KEPT] for measure in measures]
+    return runs.take(np.unique(np.concatenate(rows)))
+
+
+def _join_runs(one: Runs, other: Runs) -> Runs:
+    """The runs of two selections, ascending."""
+    columns = {
+        name: np.concatenate([getattr(part.batch, name) for part in (one, other)])
+        for name in Batch.__dataclass_fields__
+    }
+    joined = Runs(
+        np.concatenate([one.index, other.index]),
+        np.concatenate([one.values, other.values]),
+        Batch(**columns),
+    )
+    return joined.take(np.argsort(joined.index))

@@ -1,0 +1,58 @@
+"""Run a campaign of any size: blocks are simulated, stored, added to the summary, and forgotten."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from malta.campaigns.result import gather
+from malta.campaigns.run import Session, open_campaign, run_blocks
+from malta.campaigns.summary import Bounds, Summary, join, summary_of
+
+if TYPE_CHECKING:
+    from malta.campaigns.block import Block
+    from malta.campaigns.plan import Plan
+    from malta.simulation.experiments import Progress
+
+
+class Sum:
+    """The summary of the blocks so far, and which ones they are."""
+
+    def __init__(self, plan: Plan, size: int, bounds: Bounds) -> None:
+        self.size = size  # runs in a block
+        # One pair, so that Ctrl-C between two statements leaves no block that is counted and not noted.
+        self.state = summary_of(gather(plan, {}), bounds), 0  # a bit for each block
+
+    def __setitem__(self, first: int, block: Block) -> None:
+        summary, noted = self.state
+        own = summary_of(gather(summary.plan, {first: block}), summary.bounds)
+        self.state = join(summary, own), noted | 1 << first // self.size
+
+    def __contains__(self, first: object) -> bool:
+        return isinstance(first, int) and bool(self.state[1] >> first // self.size & 1)
+
+
+def summarize(
+    plan: Plan,
+    folder: str | Path | None = None,
+    bounds: Bounds = Bounds(),  # noqa: B008  (a tuple never changes)
+    *,
+    workers: int | None = None,
+    cluster: str | None = None,
+    block: int | None = None,
+    progress: Progress | None = None,
+) -> Summary:
+    """Simulate all runs of a plan, or those that its folder does not have yet, and return what they have in common.
+
+    As `malta.campaign`, whose arguments these are, but in memory that does not grow with the runs.
+
+    bounds : figures of a paper and the design whose bounds the summary counts
+
+        plan = malta.Plan(malta.gains.read("design/gains/calibrated.json"), spread={"m": 0.1}, samples=1_000_000)
+        print(malta.summarize(plan, "build/campaigns/masses").rate)
+    """
+    place, size = open_campaign(plan, folder, session := Session(workers, cluster, block, progress))
+    found = Sum(plan, size, bounds)
+    ending = run_blocks(plan, place, size, session, found)
+    return replace(found.state[0], **ending._asdict(), folder=place)
