@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import pickle
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     from malta.campaigns.plan import Plan
 
 ANSWER = 3.0  # s, within which a scheduler answers
+AHEAD = 4  # blocks under way for each thread of the workers
 WAIT = 30.0  # s without any worker, after which the campaign stops
 
 
@@ -66,14 +68,18 @@ def _collect(
     dask: Any, client: Any, address: str, plan: Plan, left: Mapping[int, int]
 ) -> Iterator[tuple[int, Block]]:
     task = _task(plan, version("malta"))
-    waiting = {client.submit(_at_worker, task, *part, pure=False): part[0] for part in left.items()}
-    alone = 0.0  # s
-    while waiting:
+    parts, alone = deque(left.items()), 0.0  # s
+    waiting: dict[Any, int] = {}
+    while waiting or parts:
+        room = AHEAD * max(_threads(client), 1) - len(waiting)
         try:
+            # Few at a time: a block that is done stays in the memory of its worker until it is fetched.
+            for part in [parts.popleft() for _ in range(min(len(parts), room))]:
+                waiting[client.submit(_at_worker, task, *part, pure=False)] = part[0]
             with client.as_current():
                 done = dask.wait(list(waiting), timeout=1.0, return_when="FIRST_COMPLETED").done
         except TimeoutError:
-            alone = 0.0 if _workers(client) else alone + 1.0
+            alone = 0.0 if _threads(client) else alone + 1.0
             if alone >= WAIT:
                 raise InputError("--cluster", address, "no workers", "a scheduler with some") from None
             continue
@@ -161,9 +167,10 @@ def _connect(dask: Any, address: str) -> Any:
     raise InputError("--cluster", address, reason, "a Dask scheduler, as tcp://host:8786")
 
 
-def _workers(client: Any) -> int:
+def _threads(client: Any) -> int:
+    """Threads of all workers; 0 where none has come, or the scheduler is gone."""
     try:
-        return len(client.nthreads())
+        return sum(client.nthreads().values())
     except Exception:  # a lost scheduler raises many kinds of errors
         return 0
 
