@@ -115,8 +115,9 @@ def test_a_worker_is_killed_and_then_the_scheduler(loopback: Loopback, tmp_path:
     said = [line for line in err.splitlines() if not PROGRESS.match(line)]
     assert (found.returncode, said) == (0, [])
     assert out.startswith(f"{GAINS}: stroke, fidelity force, 12288 of 12288 machines\n")
-    assert whole.wait(timeout=120) == 0
-    whole.communicate()
+    tables, _ = whole.communicate(timeout=120)
+    assert whole.returncode == 0
+    assert out == tables.replace(str(tmp_path / "here"), str(tmp_path / "there"))
     assert len(_blocks(tmp_path / "here")) == 12
     assert _blocks(tmp_path / "here") == _blocks(tmp_path / "there")
 

@@ -18,10 +18,10 @@ from rich.console import Console
 import malta
 from malta import report
 from malta.campaigns import sketch, summary
-from malta.campaigns.block import Block
-from malta.campaigns.plan import Plan, draw_machines
+from malta.campaigns.block import Block, fly
+from malta.campaigns.plan import SAMPLERS, Plan, draw_machines
 from malta.campaigns.result import Campaign, gather
-from malta.campaigns.run import BLOCK, FILES, LARGE_BLOCK, Session, block_size, campaign
+from malta.campaigns.run import BLOCK, FILES, LARGE_BLOCK, Session, block_size, campaign, replay
 from malta.campaigns.statistics import figures_of, runs_within_bounds
 from malta.campaigns.store import MANIFEST, block_name, figure_shapes
 from malta.campaigns.summary import Bounds, Summary, join, summary_of, worst_of, worst_runs
@@ -37,6 +37,7 @@ if TYPE_CHECKING:
 pytestmark = pytest.mark.usefixtures("proven_once")
 MODULE: Any = sys.modules["malta.campaigns.run"]
 BOX = dict.fromkeys(("m", "K_A", "K_D", "K_B"), 0.6)
+QUICK = {"fidelity": "force", "duration": 0.01, "rise": 3e-3}
 
 
 @pytest.fixture(scope="module")
@@ -130,7 +131,7 @@ def test_a_summary_by_hand(flown: Campaign, bounds: Bounds) -> None:
         assert merit.label == figure.label
         assert np.array_equal(merit.percentiles([5, 50, 99]), np.percentile(values, [5, 50, 99]))
         assert merit.mean == pytest.approx(values.mean(), rel=1e-13)
-        assert merit.deviation == pytest.approx(values.std(), rel=1e-9, abs=1e-15)
+        assert merit.standard_deviation == pytest.approx(values.std(), rel=1e-9, abs=1e-15)
         assert merit.within == figure.within.sum()
     names, limited = verdicts(flown.plan.plant), flown.batch.saturated.max(axis=1) > 0
     ways = dict(zip(summary.ways_to_end(flown.plan), found.bands[0], strict=True))  # over m
@@ -155,6 +156,8 @@ def test_blocks_join_in_any_order_to_the_bit(
     ]
     wanted = _content(reduce(join, parts))
     assert _content(reduce(join, parts))["worst"] == _content(summary_of(flown, bounds))["worst"]
+    page = _page(reduce(join, parts), bounds)
+    assert ("percentiles of the completed runs, within 0.006 % of their values" in page) == few
     rng = np.random.default_rng(1)
     for _ in range(5):
         left = [parts[k] for k in rng.permutation(len(parts))]
@@ -235,6 +238,17 @@ def test_blocks_grow_with_the_campaign(plan: Plan) -> None:
         for samples in (1, 10_000, FILES * BLOCK, FILES * BLOCK + 1, 1_000_000, 100_000_000)
     }
     assert [*sizes.values()] == [BLOCK, BLOCK, BLOCK, 2 * BLOCK, 4 * BLOCK, LARGE_BLOCK]
+
+
+def test_the_last_run_of_a_hundred_million_is_simulated_alone(shaky: Controller) -> None:
+    """Its block of eight, and the run again, without a design of all in memory."""
+    count = 100_000_000
+    for sampler in SAMPLERS:
+        plan = Plan(shaky, "stroke", BOX, samples=count, sampler=sampler, options=QUICK)
+        block = fly(plan, count - 8, 8)
+        single = replay(plan, count - 1).run
+        assert np.array_equal(block.batch.deviation[7], np.abs(single.p - single.reference).max(axis=0))
+        assert single.scenario.run == count - 1
 
 
 def test_more_runs_than_arrays_take_are_refused(plan: Plan) -> None:

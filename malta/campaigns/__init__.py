@@ -1,4 +1,5 @@
-"""Campaigns: one scenario on thousands of machines.
+"""Campaigns: one scenario on thousands of machines, or on a hundred million.
 
-plan -> block -> store -> result -> statistics, with run.py above them and dask.py for a cluster
+sampling -> plan -> block -> store -> result -> statistics, with run.py above them and dask.py for a cluster
+                                   -> sketch -> summary -> survey, status: of any size, without the figures of each run
 """

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from malta.campaigns.store import MANIFEST, read_blocks, read_manifest, read_plan
-from malta.campaigns.summary import Bounds, Summary
+from malta.campaigns.summary import UNBOUNDED, Bounds, Summary
 from malta.campaigns.survey import Sum
 
 if TYPE_CHECKING:
@@ -52,7 +52,7 @@ class Status:
 def status(
     folder: str | Path,
     controller: Controller,
-    bounds: Bounds = Bounds(),  # noqa: B008  (a tuple never changes)
+    bounds: Bounds = UNBOUNDED,
     progress: Progress | None = None,
 ) -> Status:
     """The status of the campaign in a folder. Every block is read and its seal checked; nothing is written.

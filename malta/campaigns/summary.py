@@ -43,6 +43,9 @@ class Bounds(NamedTuple):
     spec: Spec | None = None  # whose [specification] counts
 
 
+UNBOUNDED = Bounds()
+
+
 @dataclass(frozen=True, eq=False)
 class Runs:
     """Some runs of a campaign, a row for each."""
@@ -76,7 +79,7 @@ class Merit:
         return float(self.total / self.sketch.count) if self.sketch.count else math.nan
 
     @property
-    def deviation(self) -> float:
+    def standard_deviation(self) -> float:
         """Standard deviation, of the values themselves: divided by their number."""
         n = self.sketch.count
         return math.sqrt(max(float(self.squares / n - (self.total / n) ** 2), 0.0)) if n else math.nan
@@ -137,7 +140,7 @@ class Summary:
         return Yields(self.rate, published, specified)
 
 
-def summary_of(found: Campaign, bounds: Bounds = Bounds()) -> Summary:  # noqa: B008  (a tuple never changes)
+def summary_of(found: Campaign, bounds: Bounds = UNBOUNDED) -> Summary:
     """The summary of a campaign whose runs are in memory, or of one block of it.
 
     found = malta.campaign(plan)

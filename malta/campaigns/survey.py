@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from malta.campaigns.result import gather
 from malta.campaigns.run import Session, open_campaign, run_blocks
-from malta.campaigns.summary import Bounds, Summary, join, summary_of
+from malta.campaigns.summary import UNBOUNDED, Bounds, Summary, join, summary_of
 
 if TYPE_CHECKING:
     from malta.campaigns.block import Block
@@ -36,7 +36,7 @@ class Sum:
 def summarize(
     plan: Plan,
     folder: str | Path | None = None,
-    bounds: Bounds = Bounds(),  # noqa: B008  (a tuple never changes)
+    bounds: Bounds = UNBOUNDED,
     *,
     workers: int | None = None,
     cluster: str | None = None,

@@ -124,7 +124,7 @@ def campaign(
               malta campaign --status build/campaigns/calibrated_stroke_1a2b3c4d
     """
     if status is not None:
-        _show_status(ctx, status, gains, Looking(design, machine, worst, as_json))
+        _show_status(ctx, status, gains, StatusOptions(design, machine, worst, as_json))
         return
     if gains is None:
         raise InputError("campaign", "GAINS", "nothing", "a gain file, or --status FOLDER")
@@ -236,7 +236,7 @@ def _print_tables(gains: Path, found: Summary, worst: int) -> None:
         )
 
 
-class Looking(NamedTuple):
+class StatusOptions(NamedTuple):
     """Options of a campaign that say how its status is looked at."""
 
     design: Path | None
@@ -245,7 +245,7 @@ class Looking(NamedTuple):
     as_json: bool
 
 
-def _show_status(ctx: typer.Context, folder: Path, gains: Path | None, options: Looking) -> None:
+def _show_status(ctx: typer.Context, folder: Path, gains: Path | None, options: StatusOptions) -> None:
     """Print the status of the campaign in a folder. Raises InputError for options that the campaign decides."""
     from malta.campaigns.status import status as status_of
     from malta.campaigns.store import noted_gains
@@ -255,7 +255,9 @@ def _show_status(ctx: typer.Context, folder: Path, gains: Path | None, options: 
 
     sources = {param: ctx.get_parameter_source(str(param.name)) for param in ctx.command.params}
     given = [param for param, source in sources.items() if source and source.name == "COMMANDLINE"]
-    others = [param.opts[0] for param in given if param.name not in ("status", "gains", *Looking._fields)]
+    others = [
+        param.opts[0] for param in given if param.name not in ("status", "gains", *StatusOptions._fields)
+    ]
     if others:
         raise InputError(
             "--status", "", f"{', '.join(others)} too", "none of them: the folder has its campaign"

@@ -186,7 +186,7 @@ def _merit_document(merit: Merit) -> dict[str, Any]:
     return dict(zip(("p5", "p50", "p95", "p99", "largest"), marks, strict=True)) | {
         "smallest": merit.sketch.smallest,
         "mean": merit.mean,
-        "deviation": merit.deviation,
+        "standard_deviation": merit.standard_deviation,
         "published": merit.published,
     }
 
