@@ -17,7 +17,7 @@ from conftest import Run
 import malta
 from malta.campaigns.plan import Plan
 from malta.campaigns.run import campaign
-from malta.campaigns.status import QUIET, status
+from malta.campaigns.status import status
 from malta.campaigns.store import MANIFEST, block_name, noted_gains
 
 if TYPE_CHECKING:
@@ -74,20 +74,20 @@ def test_half_a_campaign_that_runs_and_one_that_does_not(run: Run, tmp_path: Pat
     assert document["manifest"]["spread"] == {"m": 0.2, "K_A": 0.2, "K_B": 0.2, "K_D": 0.2}
     assert document["percentiles"] == {"exact": True, "relative_error": 0}
     _, out, _ = run("campaign", "--status", tmp_path)
-    assert re.search(r"^running: the last block came \d+ s ago, about 8 s left$", out, re.MULTILINE)
+    assert re.search(
+        r"^running: the last block came [\d.]+ s ago, about [78][\d.]* s left$", out, re.MULTILINE
+    )
     assert "24 of 40 machines" in out
 
     damaged = tmp_path / block_name(8)
     damaged.write_bytes(damaged.read_bytes()[:-9])
-    _touch(tmp_path, {0: 1000.0 + QUIET, 16: QUIET + 1000.0})
+    _touch(tmp_path, {0: 7300.0, 16: 7200.0})
     code, out, err = run("campaign", "--status", tmp_path)
     assert code == 0
     assert err == f"malta: {damaged}: a damaged block, which the campaign will fly again\n"
     assert "2 of 5 blocks of 8 runs" in out
     assert "1 damaged" in out
-    assert re.search(
-        r"^not running: the last block came 10\d\d s ago; the same command goes on$", out, re.MULTILINE
-    )
+    assert "not running: the last block came 2 h ago; the same command goes on\n" in out
     assert "16 of 40 machines" in out
     run("campaign", GAINS, *COMMON, "--out", tmp_path)
     assert "5 of 5 blocks" in run("campaign", "--status", tmp_path)[1]

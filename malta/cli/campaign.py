@@ -32,7 +32,7 @@ from malta.cli.options import (
     Yes,
 )
 from malta.cli.output import make_console, print_json, print_note, print_written, progress_bar
-from malta.cli.patience import limit_time
+from malta.cli.patience import duration_text, limit_time
 from malta.errors import InputError
 
 if TYPE_CHECKING:
@@ -287,10 +287,10 @@ def _status_lines(found: Status) -> list[str]:
         f"{summary.folder}: {found.blocks} of {found.of} blocks of {found.size} runs, "
         f"{found.stored / 1e6:.1f} MB, {len(summary.damaged)} damaged"
     ]
+    last = "" if found.age is None else f": the last block came {duration_text(found.age)} ago"
     if found.running:
-        left = "" if found.left is None else f", about {found.left:.0f} s left"
-        lines.append(f"running: the last block came {found.age:.0f} s ago{left}")
+        left = "" if found.left is None else f", about {duration_text(found.left)} left"
+        lines.append(f"running{last}{left}")
     elif found.blocks < found.of:
-        age = "" if found.age is None else f": the last block came {found.age:.0f} s ago"
-        lines.append(f"not running{age}; the same command goes on")
+        lines.append(f"not running{last}; the same command goes on")
     return lines
