@@ -73,9 +73,9 @@ def given(plant: Plant, c: Controller, s: Scenario) -> tuple[list[Any], Vector, 
     """What `run` takes, as a scenario has it: the reference, malta's noise of the laser, and of the current sensors."""
     count = round(s.duration / c.sample_time)
     motion = s.reference(plant)(np.arange(count) * c.sample_time)
-    uniform = math.sqrt(3) * erf(normals(keys(s.seed, np.array([s.run]))[0], count, 1) / math.sqrt(2))
+    uniform = math.sqrt(3) * erf(normals(keys(s.seed, np.atleast_1d(s.run))[0], count, 1) / math.sqrt(2))
     periods = _periods(count, c)
-    noise = normals(keys(s.seed, np.array([-1 - s.run]))[0], periods, 2)
+    noise = normals(keys(s.seed, -1 - np.atleast_1d(s.run))[0], periods, 2)
     return np.hstack(motion).tolist(), (uniform[:, 0] * plant.noise[0]).tolist(), noise.tolist()
 
 

@@ -17,7 +17,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -219,21 +219,10 @@ def campaigns(runs: int) -> list[Result]:
         with tempfile.TemporaryDirectory() as folder:
             return malta.summarize(replace(plan, samples=MANY), folder)
 
-    factors = 1 + 0.2 * np.random.default_rng(0).uniform(-1, 1, (4, len(names)))
     peers: dict[str, tuple[int, Callable[[], object]]] = {}
-    if optional("joblib"):
-        joblib = importlib.import_module("joblib")
-        start = malta.simulate(plant, work.controller, SCENARIO)
-        inputs = np.hstack([work.p_ref, work.xi_ref, work.v_ff]).T
-        first = np.concatenate([start.x[0], start.force[0], work.xi_ref[0], np.zeros(10)])
-        pars = [
-            replace(
-                work.par, **{n: getattr(work.par, n) * f for n, f in zip(names, row.tolist(), strict=True)}
-            )
-            for row in factors
-        ]
-        jobs = [joblib.delayed(documented_run)(par, work.controller, inputs, first) for par in pars]
-        peers["python-control in a joblib loop"] = 4, lambda: joblib.Parallel(n_jobs=-1)(jobs)
+    loop = joblib_loop(plant, work, names)
+    if loop is not None:
+        peers[LOOP] = LOOPED, loop
     found = optional("peer_numba_plain")
     if found:
         some = 1 + 0.2 * np.random.default_rng(0).uniform(-1, 1, (512, len(names)))
@@ -252,6 +241,68 @@ def campaigns(runs: int) -> list[Result]:
         for what, own in measured.items()
         for (name, (count, _)), seconds in zip(peers.items(), theirs, strict=True)
     ]
+
+
+def joblib_loop(plant: malta.Plant, work: Workload, names: Sequence[str]) -> Callable[[], object] | None:
+    """LOOPED different machines in python-control, on all cores; None without joblib."""
+    if not optional("joblib"):
+        return None
+    joblib = importlib.import_module("joblib")
+    factors = 1 + 0.2 * np.random.default_rng(0).uniform(-1, 1, (LOOPED, len(names)))
+    start = malta.simulate(plant, work.controller, SCENARIO)
+    inputs = np.hstack([work.p_ref, work.xi_ref, work.v_ff]).T
+    first = np.concatenate([start.x[0], start.force[0], work.xi_ref[0], np.zeros(10)])
+    pars = [
+        replace(work.par, **{n: getattr(work.par, n) * f for n, f in zip(names, row.tolist(), strict=True)})
+        for row in factors
+    ]
+    jobs = [joblib.delayed(documented_run)(par, work.controller, inputs, first) for par in pars]
+    return lambda: joblib.Parallel(n_jobs=-1)(jobs)
+
+
+LOOP, LOOPED = "python-control in a joblib loop", 4
+
+
+def studies(runs: int) -> list[Result]:
+    """A rare touchdown beside plain sampling, Sobol indices beside SALib around loops; loops from LOOPED of their runs.
+
+    Plain sampling has as many runs as its coefficient of variation needs to be that of the subset simulation.
+    """
+    plant, work = workload("table2")
+    names, options = ("m", "K_A", "K_B", "K_D"), {"fidelity": "force", "delay": 0}
+    loop = joblib_loop(plant, work, names)
+    single = [] if loop is None else medians(loop, runs=runs, what="python-control")
+    rows: list[Result] = []
+    for spread in (0.06, 0.055):
+        plan = malta.Plan(
+            work.controller, "stroke", dict.fromkeys(names, spread), samples=2000, options=options
+        )
+        limit = malta.limit_of(plan, "touchdown")
+        found = malta.rare_event(plan, limit).found
+        ours, plain = medians(
+            partial(malta.rare_event, plan, limit),
+            partial(malta.campaign, replace(plan, samples=4096)),
+            runs=runs,
+            what="rare event",
+        )
+        what = f"rare, {found.probability:.0e} ± {100 * found.cov:.0f} %"
+        rows.append(Result(what, ours, "plain sampling, malta", plain / 4096 * found.plain, ""))
+        rows += [Result(what, ours, LOOP, seconds / LOOPED * found.plain, "") for seconds in single]
+    if optional("SALib"):
+        plan = malta.Plan(
+            work.controller, "stroke", dict.fromkeys(names, 0.05), samples=4096, options=options
+        )
+        count = malta.sensitivity(plan, limit).runs
+        ours, alone = medians(
+            partial(malta.sensitivity, plan, limit),
+            partial(malta.simulate, plant, work.controller, SCENARIO),
+            runs=runs,
+            what="Sobol indices",
+        )
+        what = f"Sobol indices, {count} runs"
+        rows.append(Result(what, ours, "SALib, a loop over malta.simulate", alone * count, ""))
+        rows += [Result(what, ours, f"SALib, {LOOP}", seconds / LOOPED * count, "") for seconds in single]
+    return rows
 
 
 def decoupling(runs: int) -> list[Result]:
@@ -335,6 +386,7 @@ WORKLOADS: dict[str, Callable[[int], list[Result]]] = {
     "margin": margin,
     "published": published,
     "campaign": campaigns,
+    "studies": studies,
     "planar": decoupling,
     "halbach": halbach,
 }

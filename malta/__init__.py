@@ -11,11 +11,15 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:  # the contents page, as type checkers and readers see it
     from malta import gains as gains
     from malta import report as report
+    from malta.campaigns.limits import limit_of as limit_of
     from malta.campaigns.plan import Plan as Plan
+    from malta.campaigns.rare import rare_event as rare_event
     from malta.campaigns.result import Campaign as Campaign
     from malta.campaigns.run import campaign as campaign
+    from malta.campaigns.sensitivity import sensitivity as sensitivity
     from malta.campaigns.summary import Summary as Summary
     from malta.campaigns.survey import summarize as summarize
+    from malta.campaigns.tolerance import tolerances as tolerances
     from malta.errors import CheckError as CheckError
     from malta.errors import InputError as InputError
     from malta.margins.blocks import Dynamic as Dynamic
@@ -79,11 +83,15 @@ if TYPE_CHECKING:  # the contents page, as type checkers and readers see it
     from malta.units import in_unit as in_unit
 
 _NAMES = {  # the same, for the first use of each name
+    "campaigns.limits": ("limit_of",),
     "campaigns.plan": ("Plan",),
+    "campaigns.rare": ("rare_event",),
     "campaigns.result": ("Campaign",),
     "campaigns.run": ("campaign",),
+    "campaigns.sensitivity": ("sensitivity",),
     "campaigns.summary": ("Summary",),
     "campaigns.survey": ("summarize",),
+    "campaigns.tolerance": ("tolerances",),
     "margins.stages": ("Robustness", "robustness"),
     "report.ledger": ("ledger",),
     "synthesis.controller": ("Controller",),

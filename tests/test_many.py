@@ -16,11 +16,11 @@ from hypothesis import strategies as st
 import malta
 from malta import references
 from malta.simulation import compiled
-from malta.simulation.batch import replayed, simulate_many
+from malta.simulation.batch import record_run, replayed, simulate_many
 from malta.simulation.digest import Batch, verdicts
 from malta.simulation.engines import engine_of, library_of
 from malta.simulation.layout import FIDELITIES, Fidelity
-from malta.simulation.noise import keys, normals
+from malta.simulation.noise import keys, normals, starts_of_parts
 from malta.simulation.scenario import Correction, Fault, Scenario
 from malta.simulation.trajectory import Trajectory, stroke_figures
 
@@ -364,6 +364,35 @@ def test_a_lift_off_is_a_scenario_for_many(calibrated: Design) -> None:
 
     runs = _assert_replayed(calibrated, batch, scenario, changes, expected=expected)
     assert all(run.verdict.completed for run in runs)
+
+
+def test_parts_of_a_run_have_the_noise_of_other_runs(calibrated: Design) -> None:
+    """One run's noise in all parts is that run's; other noise in the last third changes nothing before it."""
+    changes, scenario = _spread(calibrated, 3), _stroke(fidelity="force", seed=3)
+    plant, controller = calibrated.plant, calibrated.controller
+    own = np.repeat(np.arange(3)[:, None], 7, axis=1)
+    _same(
+        simulate_many(plant, controller, scenario, changes, noise=own),
+        simulate_many(plant, controller, scenario, changes),
+    )
+    parts = np.array([[4, 4, 4], [4, 4, 9], [2, 7, 1]])
+    batch = simulate_many(plant, controller, scenario, changes, noise=parts)
+    runs = []
+    for k, row in enumerate(parts):
+        machine, scenario_k = replayed(plant, scenario, changes, k)
+        runs.append(malta.simulate(machine, controller, replace(scenario_k, run=tuple(row.tolist()))))
+        np.testing.assert_allclose(batch.deviation[k], _expected(runs[k])["deviation"], rtol=1e-9)
+        recorded = record_run(plant, controller, scenario, changes, k, noise=parts)
+        if recorded is not None:
+            np.testing.assert_array_equal(
+                abs(recorded.p - recorded.reference).max(axis=0), batch.deviation[k]
+            )
+    noise = [run.y - run.p for run in runs]
+    third = starts_of_parts(len(noise[0]), 3)[2]
+    np.testing.assert_allclose(noise[1][:third], noise[0][:third], rtol=0, atol=1e-18)
+    assert (np.abs(noise[1] - noise[0])[third:] > 1e-9).any(axis=1).mean() > 0.99
+    with pytest.raises(malta.InputError, match="runs x parts"):
+        simulate_many(plant, controller, scenario, changes, noise=parts[:2])
 
 
 def test_indices_beyond_the_first_are_replayed(calibrated: Design) -> None:

@@ -2,4 +2,5 @@
 
 sampling -> plan -> block -> store -> result -> statistics, with run.py above them and dask.py for a cluster
                                    -> sketch -> summary -> survey, status: of any size, without the figures of each run
+limits -> rare, sensitivity, tolerance: studies on the box of a plan
 """

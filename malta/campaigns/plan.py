@@ -265,19 +265,32 @@ def draw_machines(plan: Plan, first: int = 0, count: int | None = None) -> Machi
 
     The machine of a run is the same, whichever others are drawn with it.
     """
-    names = varied_names(plan)
-    parameters = names[: len(names) - len(plan.sensor_spread)]
     draw = latin_hypercube if plan.sampler == "latin-hypercube" else sobol
-    points = draw(
-        plan.seed, plan.samples, len(names), first, plan.samples - first if count is None else count
-    )
+    count = plan.samples - first if count is None else count
+    return machines_at(plan, draw(plan.seed, plan.samples, len(varied_names(plan)), first, count))
+
+
+def varied(plan: Plan) -> list[int]:
+    """Places among varied_names(plan) of the values that vary: a spread of 0 is none."""
+    return [k for k, name in enumerate(varied_names(plan)) if half_width(plan, name)]
+
+
+def machines_at(plan: Plan, points: FloatArray) -> Machines:
+    """The machines at points of the unit box, runs x varied_names(plan): 0.5 is the middle of the plan's box."""
+    names = varied_names(plan)
     middle = np.array([middle_of(plan, name) for name in names])
     half = np.array([half_width(plan, name) for name in names])
-    values = middle + (2 * points - 1) * half
-    changes = dict(zip(parameters, values.T, strict=False))
+    return machines_of(plan, middle + (2 * points - 1) * half)
+
+
+def machines_of(plan: Plan, values: FloatArray) -> Machines:
+    """The machines with these values, runs x varied_names(plan), SI; twins follow."""
+    names = varied_names(plan)
+    count = len(names) - len(plan.sensor_spread)
+    changes = dict(zip(names[:count], values.T, strict=False))
     pairs = [*twins_of(plan.parameters).items()]
     for name, twin in [*pairs, *((twin, name) for name, twin in pairs)]:
         if twin in changes and name not in changes:
             changes[name] = changes[twin]
-    errors = dict(zip(plan.sensor_spread, values.T[len(parameters) :], strict=True))
+    errors = dict(zip(plan.sensor_spread, values.T[count:], strict=True))
     return Machines(changes, errors, names, readonly(values))

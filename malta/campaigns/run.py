@@ -17,10 +17,10 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import FrameType
-from typing import Any, NamedTuple, Protocol, get_args
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, get_args
 
 from malta.campaigns.block import Block, fly
-from malta.campaigns.plan import Plan, draw_machines, planned_run
+from malta.campaigns.plan import Machines, Plan, draw_machines, planned_run
 from malta.campaigns.result import Campaign, gather
 from malta.campaigns.store import block_name, encode_block, open_folder, read_blocks
 from malta.errors import InputError
@@ -30,6 +30,10 @@ from malta.simulation.batch import record_run, replayed
 from malta.simulation.catalogue import single_run
 from malta.simulation.engines import EngineChoice
 from malta.simulation.experiments import Experiment, Progress
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
 BLOCK = 1024  # runs in a block: a fraction of a second of work
 LARGE_BLOCK = (
@@ -229,8 +233,28 @@ def replay(
         raise InputError("campaign", "engine", repr(engine), "one of " + ", ".join(get_args(EngineChoice)))
     first = index // compiled.LANES * compiled.LANES
     machines = draw_machines(plan, first, min(compiled.LANES, plan.samples - first))
-    planned, changes, errors = planned_run(plan), machines.changes, machines.sensor_errors
+    return replay_machine(plan, machines, index, first=first, engine=engine, progress=progress)
+
+
+def replay_machine(
+    plan: Plan,
+    machines: Machines,
+    index: int,
+    noise: NDArray[np.int64] | None = None,
+    *,
+    first: int = 0,
+    engine: EngineChoice = "auto",
+    progress: Progress | None = None,
+) -> Experiment:
+    """Simulate a plan's run on machine `index` with all its time series.
+
+    machines : those of the runs from `first` on, a multiple of LANES; noise : theirs, as in `simulate_many`
+    """
+    planned = planned_run(plan)
+    changes, errors = machines.changes, machines.sensor_errors
     plant, scenario = replayed(plan.plant, planned.scenario, changes, index, first, errors)
+    if noise is not None:
+        scenario = replace(scenario, run=tuple(noise[index - first].tolist()))
     own = planned._replace(scenario=scenario)
     if engine == "virtual machine":
         return single_run(plan.scenario, plant, plan.controller, own, engine, progress)
@@ -242,6 +266,7 @@ def replay(
         index,
         first=first,
         sensor_errors=errors,
+        noise=noise,
         progress=progress,
     )
     return single_run(plan.scenario, plant, plan.controller, own, engine, progress, run)

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NamedTuple, cast
+from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
 from malta.cli.assignments import add_own_options, read_sensor_errors, read_shares, scenario_options
-from malta.cli.documents import campaign_document, status_document
+from malta.cli.documents import campaign_document
 from malta.cli.inputs import change_machine, design_of, print_scenarios, read_controller
 from malta.cli.options import (
     SCENARIOS,
@@ -31,20 +31,28 @@ from malta.cli.options import (
     Substeps,
     Yes,
 )
-from malta.cli.output import make_console, print_json, print_note, print_written, progress_bar
-from malta.cli.patience import duration_text, limit_time
+from malta.cli.output import (
+    NO_COMPILER,
+    make_console,
+    print_json,
+    print_note,
+    print_written,
+    progress_bar,
+)
+from malta.cli.patience import limit_time
+from malta.cli.status import StatusOptions, print_tables, show_status
+from malta.cli.studies import Setting, run_study, study_of
 from malta.errors import InputError
 
 if TYPE_CHECKING:
     from malta.campaigns.plan import Sampler
-    from malta.campaigns.status import Status
     from malta.campaigns.summary import Summary
 
 
 def campaign(
     ctx: typer.Context,
     gains: GainFileOrNone = None,
-    samples: Annotated[int, typer.Option(help="Machines.")] = 10_000,
+    samples: Annotated[int, typer.Option(help="Machines; of --rare in each level.")] = 10_000,
     scenario: Annotated[str | None, typer.Option(help=f"What each one does: {SCENARIOS}")] = None,
     case: Annotated[
         str | None, typer.Option(help="Of a scenario with several runs: which one. [the first]")
@@ -86,6 +94,27 @@ def campaign(
         str | None,
         typer.Option(metavar="ADDRESS", help="Fly on the workers of a Dask scheduler: tcp://host:8786."),
     ] = None,
+    rare: Annotated[
+        str | None,
+        typer.Option(
+            metavar="LIMIT",
+            help="Probability of a rare event, by subset simulation: touchdown, published, specification, or a merit "
+            "above a bound, as deviation-y1=40um. `help` lists them.",
+        ),
+    ] = None,
+    sobol: Annotated[
+        bool, typer.Option("--sobol", help="Which parameter costs yield: Sobol indices (needs SALib).")
+    ] = False,
+    tolerance: Annotated[
+        str | None,
+        typer.Option(metavar="YIELD", help="The largest spread of each parameter that keeps a yield: 99%."),
+    ] = None,
+    limit: Annotated[
+        str | None,
+        typer.Option(
+            metavar="LIMIT", help="What ends the yield of --sobol and --tolerance, as in --rare. [touchdown]"
+        ),
+    ] = None,
     worst: Annotated[int, typer.Option(min=0, max=1000, help="How many of the worst runs to list.")] = 5,
     out: Annotated[
         Path | None,
@@ -117,14 +146,16 @@ def campaign(
     Three yields: runs that were completed, those within what the machine's paper prints, and those within what
     [specification] asks of the same motion.
 
+    --rare, --sobol and --tolerance study the same box in place of plain runs, and write into the same folder.
     Memory does not grow with the machines: beyond 100 000 of them percentiles are counted, to 0.006 % of their values.
 
     \b
     Example:  malta campaign design/gains/calibrated.json --samples 10000 --spread 20%
               malta campaign --status build/campaigns/calibrated_stroke_1a2b3c4d
+              malta campaign design/gains/table2.json --spread 6% --rare touchdown --samples 2000
     """
     if status is not None:
-        _show_status(ctx, status, gains, StatusOptions(design, machine, worst, as_json))
+        show_status(ctx, status, gains, StatusOptions(design, machine, worst, as_json))
         return
     if gains is None:
         raise InputError("campaign", "GAINS", "nothing", "a gain file, or --status FOLDER")
@@ -144,6 +175,7 @@ def campaign(
         raise typer.Exit
     scenario = scenario or main_job(plant)
     published = published_figures(plant.name)
+    study = study_of(rare, tolerance, limit, cluster, sobol=sobol)
     options = scenario_options(
         distance,
         rise,
@@ -174,6 +206,9 @@ def campaign(
     )
     bounds = Bounds(published, design_of(gains, controller, design))
     folder = out or Path("build") / "campaigns" / f"{controller.name}_{scenario}_{plan.identity[:8]}"
+    if study is not None:
+        run_study(study, Setting(gains, plan, bounds, folder, workers, as_json, yes))
+        return
     open_campaign(plan, folder, Session(workers, cluster), gains)
     with progress_bar(scenario, quiet=as_json) as bar:
         progress = limit_time(bar, f"{scenario}, {samples} runs", agreed=yes)
@@ -193,11 +228,11 @@ def _report(gains: Path, found: Summary, worst: int, *, as_json: bool) -> None:
         document = {"gains": str(gains), "folder": str(found.folder), "files": names}
         print_json(document | campaign_document(found, worst))
     else:
-        _print_tables(gains, found, worst)
+        print_tables(gains, found, worst)
         print_written(make_console(), files)
     plan = found.plan
     if "virtual machine" in found.engines and not plant_of(plan.controller.parameters).tabulated:
-        print_note("no C compiler: simulated on CasADi's virtual machine, some hundred times slower")
+        print_note(NO_COMPILER)
     if found.interrupted:
         print_note(
             f"interrupted after {found.runs} of {plan.samples} runs, which {found.folder} keeps; "
@@ -213,84 +248,3 @@ def _draw(found: Summary) -> list[Path]:
     from malta import report
 
     return report.campaign(found, found.folder)
-
-
-def _print_tables(gains: Path, found: Summary, worst: int) -> None:
-    """Print what was flown, the yield, the distributions and the worst runs; only the first without runs."""
-    from malta import report
-    from malta.campaigns.plan import planned_run
-
-    plan, console, wanted = found.plan, make_console(), planned_run(found.plan)
-    case = "" if wanted.label == plan.scenario else f" ({wanted.label})"
-    console.print(
-        f"{gains}: {plan.scenario}{case}, fidelity {wanted.scenario.fidelity}, "
-        f"{found.runs} of {plan.samples} machines"
-    )
-    console.print(f"{report.box_text(found)}; {plan.sampler}, seed {plan.seed}")
-    if not found.runs:
-        return
-    console.print(report.campaign_tables(found, worst=worst))
-    if worst:
-        console.print(
-            f"one of them again: malta simulate {gains} --replay {found.folder}:RUN", soft_wrap=True
-        )
-
-
-class StatusOptions(NamedTuple):
-    """Options of a campaign that say how its status is looked at."""
-
-    design: Path | None
-    machine: Path | None
-    worst: int
-    as_json: bool
-
-
-def _show_status(ctx: typer.Context, folder: Path, gains: Path | None, options: StatusOptions) -> None:
-    """Print the status of the campaign in a folder. Raises InputError for options that the campaign decides."""
-    from malta.campaigns.status import status as status_of
-    from malta.campaigns.store import noted_gains
-    from malta.campaigns.summary import Bounds
-    from malta.model.data import plant_of
-    from malta.model.published import published_figures
-
-    sources = {param: ctx.get_parameter_source(str(param.name)) for param in ctx.command.params}
-    given = [param for param, source in sources.items() if source and source.name == "COMMANDLINE"]
-    others = [
-        param.opts[0] for param in given if param.name not in ("status", "gains", *StatusOptions._fields)
-    ]
-    if others:
-        raise InputError(
-            "--status", "", f"{', '.join(others)} too", "none of them: the folder has its campaign"
-        )
-    gains = noted_gains(folder) if gains is None else gains
-    controller = read_controller(gains, options.machine)
-    published = published_figures(plant_of(controller.parameters).name)
-    bounds = Bounds(published, design_of(gains, controller, options.design))
-    with progress_bar("status", quiet=options.as_json) as progress:
-        found = status_of(folder, controller, bounds, progress)
-    if options.as_json:
-        document = {"gains": str(gains), "folder": str(folder)} | status_document(found)
-        print_json(document | campaign_document(found.summary, options.worst))
-        return
-    for file in found.summary.damaged:
-        print_note(f"{file}: a damaged block, which the campaign will fly again")
-    console = make_console()
-    for line in _status_lines(found):
-        console.print(line, soft_wrap=True)
-    _print_tables(gains, found.summary, options.worst)
-
-
-def _status_lines(found: Status) -> list[str]:
-    """Blocks in the folder, and whether others seem to come."""
-    summary = found.summary
-    lines = [
-        f"{summary.folder}: {found.blocks} of {found.of} blocks of {found.size} runs, "
-        f"{found.stored / 1e6:.1f} MB, {len(summary.damaged)} damaged"
-    ]
-    last = "" if found.age is None else f": the last block came {duration_text(found.age)} ago"
-    if found.running:
-        left = "" if found.left is None else f", about {duration_text(found.left)} left"
-        lines.append(f"running{last}{left}")
-    elif found.blocks < found.of:
-        lines.append(f"not running{last}; the same command goes on")
-    return lines

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 import typer
 
 from malta.errors import CheckError, InputError
+from malta.files import json_text
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
 WIDTH = 100  # columns of tables on wide terminals, in files and in pipes
 PATIENCE = 5.0  # s, from the first bounds of a margin to the first line about them
 INTERVAL = 2.0  # s, between the lines
+NO_COMPILER = "no C compiler: simulated on CasADi's virtual machine, some hundred times slower"
 LINES = 10.0  # s, between lines of how far other work is
 
 
@@ -42,16 +44,7 @@ def print_written(console: Console, files: Iterable[Path]) -> None:
 
 def print_json(content: Any) -> None:
     """Print one JSON document; numbers that are not finite become null."""
-    import json
-
-    def finite(value: Any) -> Any:
-        if isinstance(value, dict):
-            return {key: finite(entry) for key, entry in value.items()}
-        if isinstance(value, list):
-            return [finite(entry) for entry in value]
-        return None if isinstance(value, float) and not math.isfinite(value) else value
-
-    print(json.dumps(finite(content), indent=1, allow_nan=False))
+    print(json_text(content))
 
 
 def print_note(text: str) -> None:

@@ -94,7 +94,8 @@ def simulate(
     replay: Annotated[
         str | None,
         typer.Option(
-            metavar="FOLDER:RUN", help="One run of a campaign again: its machine, sensors and noise."
+            metavar="FOLDER:RUN",
+            help="One run of a campaign again, or a rare event's design point: its machine, sensors and noise.",
         ),
     ] = None,
     machine: MachineFile = None,
@@ -165,22 +166,30 @@ def _replay(
     engine: str,
     progress: Callable[[float], None] | None,
 ) -> Simulation:
-    """Simulate one run of a campaign, `FOLDER:RUN`, again.
+    """Simulate one run of a campaign, `FOLDER:RUN`, or the design point of a rare event, `FOLDER:rare_LIMIT`, again.
 
     Raises InputError for another form, and for `others`, the names of options that the campaign decides.
     """
+    from malta.campaigns.rare import read_design_point, replay_design_point
     from malta.campaigns.run import replay as simulate_run
     from malta.campaigns.store import read_plan
 
     folder, _, run = text.rpartition(":")
-    if not folder or not run.isdecimal():
-        raise InputError("--replay", "", repr(text), "FOLDER:RUN, as build/campaigns/mine:17")
+    event = run.startswith("rare_") and Path(run).name == run
+    if not folder or not (run.isdecimal() or event):
+        expected = "FOLDER:RUN, as build/campaigns/mine:17 or build/campaigns/mine:rare_touchdown"
+        raise InputError("--replay", "", repr(text), expected)
     if others:
         names = ", ".join("--" + name.replace("_", "-") for name in others)
         raise InputError("--replay", "", f"{names} too", "none of them: the campaign says how it runs")
     plan = read_plan(folder, controller)
-    result = simulate_run(plan, int(run), engine=cast("EngineChoice", engine), progress=progress)
-    return Simulation(plan.scenario, result, f"{controller.name}_{plan.scenario}_run_{int(run)}")
+    choice = cast("EngineChoice", engine)
+    if event:
+        point = read_design_point(Path(folder) / f"{run}.json", plan)
+        result, name = replay_design_point(plan, point, engine=choice, progress=progress), run
+    else:
+        result, name = simulate_run(plan, int(run), engine=choice, progress=progress), f"run_{int(run)}"
+    return Simulation(plan.scenario, result, f"{controller.name}_{plan.scenario}_{name}")
 
 
 def _save(simulation: Simulation, folder: Path, published: Mapping[str, Any] | None) -> list[Path]:

@@ -16,9 +16,11 @@ from malta.report.pages import experiment as experiment
 from malta.report.pages import front as front
 from malta.report.pages import loads as loads
 from malta.report.pages import robustness as robustness
+from malta.report.pages import sensitivity as sensitivity
 from malta.report.pages import stroke as stroke
 from malta.report.tables.campaign import box_text as box_text
 from malta.report.tables.campaign import campaign_tables as campaign_tables
+from malta.report.tables.campaign import run_text as run_text
 from malta.report.tables.claims import claims_table as claims_table
 from malta.report.tables.design import bandwidth_table as bandwidth_table
 from malta.report.tables.design import loop_poles_table as loop_poles_table
@@ -34,6 +36,12 @@ from malta.report.tables.margins import places_table as places_table
 from malta.report.tables.margins import tolerance_table as tolerance_table
 from malta.report.tables.margins import worst_case_table as worst_case_table
 from malta.report.tables.recovery import recovery_table as recovery_table
+from malta.report.tables.studies import rare_event_sentence as rare_event_sentence
+from malta.report.tables.studies import rare_event_tables as rare_event_tables
+from malta.report.tables.studies import sensitivity_sentence as sensitivity_sentence
+from malta.report.tables.studies import sensitivity_tables as sensitivity_tables
+from malta.report.tables.studies import spreads_table as spreads_table
+from malta.report.tables.studies import tolerance_sentence as tolerance_sentence
 from malta.report.tables.tuning import front_markdown as front_markdown
 from malta.report.tables.tuning import front_rows as front_rows
 from malta.report.tables.tuning import front_table as front_table

@@ -24,6 +24,7 @@ from malta.report.figures import (
 from malta.report.figures.margins import chain_figure
 from malta.report.figures.parts import Published
 from malta.report.figures.recovery import recovery_figure
+from malta.report.figures.sensitivity import sensitivity_figure
 from malta.report.tables.design import bandwidth_table, loop_poles_table, poles_table, sensitivity_table
 from malta.report.tables.experiments import experiment_table
 from malta.report.tables.margins import is_of_whole_travel
@@ -33,6 +34,7 @@ from malta.synthesis.spec import Spec
 
 if TYPE_CHECKING:
     from malta.campaigns.result import Campaign
+    from malta.campaigns.sensitivity import Sensitivity
     from malta.campaigns.summary import Summary
     from malta.margins.gain import Gain
     from malta.margins.recovery import Recovery
@@ -122,6 +124,11 @@ def loads(
     """
     found = recovery(plant, controller) if found is None else found
     return save(recovery_figure(plant, controller, found), Path(path))
+
+
+def sensitivity(found: Sensitivity, path: str | Path) -> Path:
+    """Draw the Sobol indices of a campaign's yield and merits, and save the figure."""
+    return save(sensitivity_figure(found), Path(path))
 
 
 def campaign(found: Campaign | Summary, folder: str | Path, published: Published | None = None) -> list[Path]:

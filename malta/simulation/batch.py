@@ -7,7 +7,7 @@ Run i of a seed does not depend on the other runs of its batch; `replayed` gives
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import lru_cache
@@ -20,7 +20,15 @@ from malta.errors import InputError
 from malta.model.data import plant_of
 from malta.model.parameters import is_default, shape_parameters, twins_of, units_of
 from malta.model.plant import Plant
-from malta.simulation.compiled import LANES, Lanes, Shared, arrange_in_lanes, feedforward_table, run_many
+from malta.simulation.compiled import (
+    LANES,
+    Lanes,
+    Part,
+    Shared,
+    arrange_in_lanes,
+    feedforward_table,
+    run_many,
+)
 from malta.simulation.digest import (
     Batch,
     batch_of,
@@ -33,7 +41,7 @@ from malta.simulation.digest import (
 from malta.simulation.engines import BLOCK, evaluate, library_of, shape_of
 from malta.simulation.inputs import Inputs, initial_values, inputs_of
 from malta.simulation.layout import electronics_of, flatten, layout_of, noise_scales, numbers_of, with_symbols
-from malta.simulation.noise import GAMMA, keys
+from malta.simulation.noise import advanced, keys, starts_of_parts
 from malta.simulation.period import initial_state, period_of
 from malta.simulation.scenario import Scenario, Simulation, setup_of, simulation_of, steps_of
 from malta.simulation.simulate import simulate
@@ -42,6 +50,8 @@ from malta.simulation.translate import source
 from malta.synthesis.controller import Controller
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from malta.model.plant import FloatArray
 
 
@@ -54,6 +64,7 @@ def simulate_many(
     sensor_errors: Mapping[str, FloatArray] | None = None,
     starts: Mapping[str, FloatArray] | None = None,
     first: int = 0,
+    noise: NDArray[np.int64] | None = None,
     workers: int | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Batch:
@@ -63,6 +74,7 @@ def simulate_many(
     sensor_errors : errors of the sensors by name, SI, a value for each run, in place of the scenario's
     starts : states by name, SI, a value for each run, in place of the scenario's
     first : index of the first run; noise depends on scenario.seed and on the index
+    noise : runs x parts: each of these equal parts of a run has the noise of the run of this index; None: its own
     workers : threads; None: one for each core
     progress : called now and then with the share of the runs that is done
 
@@ -77,7 +89,7 @@ def simulate_many(
             raise InputError(f"scenario {scenario.name}", name, "some", "none in a campaign")
     simulation = simulation_of(plant, controller, _with_sensor_errors(scenario, sensor_errors))
     _check(simulation, workers)
-    variation = _variation(plant, changes, sensor_errors, starts, first)
+    variation = _variation(plant, changes, sensor_errors, starts, first, noise)
     for name in set(changes) & set(shape_parameters(plant.parameters)):
         raise InputError("campaign", name, "another one for each run", "one for all: it shapes the functions")
     alone, plant = simulation, with_varied(plant, changes)
@@ -86,11 +98,12 @@ def simulate_many(
     compiled = library_of(shape, LANES, digest_function(shape))
     if compiled is None:
         return _simulate_one_by_one(alone, variation, progress)
-    inputs, shared, lanes = _prepare(simulation, variation)
+    inputs, shared, lanes, parts = _prepare(simulation, variation)
     digest = first_digest(plant, inputs.motion.p)
     groups, runs = len(lanes.theta), variation.runs
     lanes = lanes._replace(digests=arrange_in_lanes(np.tile(digest, (runs, 1)), groups))
-    _run_groups(compiled[0], lanes, shared, workers or os.cpu_count() or 1, progress)
+    work = _Work(lanes, shared, parts)
+    _run_groups(compiled[0], work, workers or os.cpu_count() or 1, progress)
     ends = lanes.digests.swapaxes(1, 2).reshape(groups * LANES, -1)[:runs]
     return batch_of(ends, len(inputs.t), controller.sample_time, digest_sizes(plant))
 
@@ -104,20 +117,29 @@ class Variation(NamedTuple):
     changes: Mapping[str, FloatArray]  # parameters of the machine by name, SI
     sensor_errors: Mapping[str, FloatArray]
     starts: Mapping[str, FloatArray]  # states by name, SI
-    first: int  # index of the first run
+    noise: NDArray[np.int64]  # runs x parts, index of the run whose noise a part has
     runs: int
 
 
-def _run_groups(
-    lib: Any, lanes: Lanes, shared: Shared, workers: int, progress: Callable[[float], None] | None
-) -> None:
+class _Work(NamedTuple):
+    """The runs of a batch, ready for the compiled engine; the lanes' keys are those of the parts."""
+
+    lanes: Lanes
+    shared: Shared
+    parts: Sequence[Part]
+
+
+def _run_groups(lib: Any, work: _Work, workers: int, progress: Callable[[float], None] | None) -> None:
     """Simulate all groups of machines on several threads; the digests change in place."""
+    lanes, shared, parts = work
     groups = len(lanes.theta)
-    work = len(shared.given) * shared.substeps
-    step = max(1, min(16, groups // (4 * workers), WORK // work))  # groups in one call: progress comes often
+    most = max(1, WORK // (len(shared.given) * shared.substeps))
+    step = max(1, min(16, groups // (4 * workers), most))  # groups in one call: progress comes often
+    if len(parts) > 1:  # calls of short parts: the more groups in each, the less it counts
+        step = max(step, min(64, -(-groups // workers), most))
 
     def run(k: int) -> None:
-        run_many(lib, slice(k, min(k + step, groups)), lanes, shared)
+        run_many(lib, slice(k, min(k + step, groups)), lanes, shared, parts)
 
     with ThreadPoolExecutor(workers) as pool:
         try:
@@ -129,8 +151,8 @@ def _run_groups(
             raise
 
 
-def _prepare(simulation: Simulation, variation: Variation) -> tuple[Inputs, Shared, Lanes]:
-    """Inputs that all machines share, and each machine's own numbers in lanes, still without digests."""
+def _prepare(simulation: Simulation, variation: Variation) -> tuple[Inputs, Shared, Lanes, Sequence[Part]]:
+    """Inputs that all machines share, each machine's own numbers in lanes, still without digests, and the noise."""
     plant, controller, scenario, setup = simulation
     count, runs = steps_of(plant, controller, scenario), variation.runs
     values = numbers_of(plant, controller, count, scenario.sensor_errors)
@@ -139,17 +161,24 @@ def _prepare(simulation: Simulation, variation: Variation) -> tuple[Inputs, Shar
     start = _starts(simulation, inputs.given[0], variation.starts)
     states, noise = _map_rows(_start_function(shape_of(plant, controller, setup)), theta, start)
     groups = -(-runs // LANES)
-    streams = keys(scenario.seed, variation.first + np.minimum(np.arange(groups * LANES), runs - 1))
+    indices = variation.noise[np.minimum(np.arange(groups * LANES), runs - 1)]
+    streams = np.moveaxis(keys(scenario.seed, indices).reshape(groups, LANES, -1), 2, 0)
+    starts = starts_of_parts(len(inputs.t), len(streams))
+    parts = [
+        Part(slice(start, end), np.ascontiguousarray(advanced(stream, start, noise.shape[1])))
+        for start, end, stream in zip(starts, [*starts[1:], len(inputs.t)], streams, strict=True)
+        if end > start
+    ]
     lanes = Lanes(
         theta=arrange_in_lanes(theta, groups),
         states=arrange_in_lanes(states, groups),
         sigma=arrange_in_lanes(scenario.noise * noise, groups),
-        keys=streams.reshape(groups, LANES),
+        keys=parts[0].keys,
         digests=np.empty((groups, 0, LANES)),
     )
     ff = controller.feedforward
     shared = Shared(inputs.given, feedforward_table(ff.z_grid, ff.v0), count, plant.uniform)
-    return inputs, shared, lanes
+    return inputs, shared, lanes, parts
 
 
 def record_run(
@@ -161,6 +190,7 @@ def record_run(
     *,
     first: int = 0,
     sensor_errors: Mapping[str, FloatArray] | None = None,
+    noise: NDArray[np.int64] | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Trajectory | None:
     """The trajectory of one run of `simulate_many`, the same to the bit; None without a C compiler.
@@ -171,6 +201,7 @@ def record_run(
 
     changes, sensor_errors : columns of the runs from `first` on, a multiple of LANES as for the blocks of
         `simulate_many`; at least those of the run's group
+    noise : of the same runs, as in `simulate_many`
     """
     begin = index // LANES * LANES
     group, errors = (
@@ -178,25 +209,29 @@ def record_run(
         for columns in (changes, sensor_errors or {})
     )
     own_plant, own_scenario = replayed(plant, scenario, changes, index, first, sensor_errors)
+    if noise is not None:
+        noise = noise[begin - first : begin - first + LANES]
+        own_scenario = replace(own_scenario, run=tuple(noise[index - begin].tolist()))
     plant = with_varied(plant, changes)
     simulation = simulation_of(plant, controller, _with_sensor_errors(scenario, sensor_errors))
     shape = shape_of(plant, controller, simulation.setup)
     compiled = library_of(shape, LANES, recorder_function(shape))
     if compiled is None:
         return None
-    inputs, shared, lanes = _prepare(simulation, _variation(plant, group, errors, None, begin))
+    variation = _variation(plant, group, errors, None, begin, noise)
+    inputs, shared, lanes, parts = _prepare(simulation, variation)
     width = sum(layout_of(plant, controller, simulation.setup).row.values())
     rows = np.empty((len(inputs.t), width))
-    stream, last = lanes.keys.copy(), np.zeros((1, 2 * width, LANES))
+    last = np.zeros((1, 2 * width, LANES))
     sensors = len(noise_scales(plant, simulation.setup))
-    lanes = lanes._replace(keys=stream, digests=last)
-    for k in range(0, len(rows), 2):  # the engine draws the noise of two samples at once
-        part = inputs.given[k : k + 2]
-        run_many(compiled[0], slice(0, 1), lanes, shared._replace(given=part))
-        rows[k : k + len(part)] = last[0, :, index - begin].reshape(2, width)[2 - len(part) :]
-        stream += np.uint64(sensors * GAMMA % 2**64)
-        if progress is not None and k % 1000 == 0:
-            progress(k / len(rows))
+    for samples, streams in parts:
+        for k in range(samples.start, samples.stop, 2):  # the engine draws the noise of two samples at once
+            given = inputs.given[k : min(k + 2, samples.stop)]
+            now = lanes._replace(keys=advanced(streams, k - samples.start, sensors), digests=last)
+            run_many(compiled[0], slice(0, 1), now, shared._replace(given=given))
+            rows[k : k + len(given)] = last[0, :, index - begin].reshape(2, width)[2 - len(given) :]
+            if progress is not None and k % 1000 == 0:
+                progress(k / len(rows))
     own = Simulation(own_plant, controller, own_scenario, simulation.setup)
     return trajectory_of(own, inputs, rows, "compiled")
 
@@ -274,6 +309,7 @@ def _variation(
     sensor_errors: Mapping[str, FloatArray] | None,
     starts: Mapping[str, FloatArray] | None,
     first: int,
+    noise: NDArray[np.int64] | None,
 ) -> Variation:
     """The variation of a batch. Raises InputError for unknown parameters and for columns of different length."""
     sensor_errors, starts = sensor_errors or {}, starts or {}
@@ -291,7 +327,11 @@ def _variation(
             raise InputError("campaign", name, "an unknown parameter", "one of " + " ".join(known))
     if len(set(sizes.values())) != 1:
         raise InputError("campaign", "changes", f"{sizes or 'nothing'}", "as many values of each parameter")
-    return Variation(changes, sensor_errors, starts, first, next(iter(sizes.values())))
+    runs = next(iter(sizes.values()))
+    own = first + np.arange(runs)[:, None] if noise is None else np.asarray(noise)
+    if own.ndim != 2 or len(own) != runs or not own.size or own.dtype.kind not in "iu":
+        raise InputError("campaign", "noise", f"{own.dtype} of shape {own.shape}", "indices, runs x parts")
+    return Variation(changes, sensor_errors, starts, own, runs)
 
 
 def _thetas(plant: Plant, values: Mapping[str, ca.DM], variation: Variation) -> FloatArray:
@@ -360,12 +400,13 @@ def _simulate_one_by_one(
 ) -> Batch:
     """A batch without a C compiler: every run by `simulate` on CasADi's virtual machine."""
     plant, controller, scenario, _ = simulation
-    changes, sensor_errors, starts, first, runs = variation
+    changes, sensor_errors, starts, noise, runs = variation
     figures: dict[str, list[Any]] = {name: [] for name in Batch.__dataclass_fields__}
     for k in range(runs):
-        machine_k, scenario_k = replayed(plant, scenario, changes, first + k, first, sensor_errors)
+        machine_k, scenario_k = replayed(plant, scenario, changes, k, sensor_errors=sensor_errors)
         own = dict(scenario_k.start) | {name: float(column[k]) for name, column in starts.items()}
-        run = simulate(machine_k, controller, replace(scenario_k, start=own), engine="virtual machine")
+        scenario_k = replace(scenario_k, start=own, run=tuple(noise[k].tolist()))
+        run = simulate(machine_k, controller, scenario_k, engine="virtual machine")
         stroke = stroke_figures(run)
         error = run.p - run.reference
         row = {

@@ -17,6 +17,7 @@ import shutil
 import signal
 import subprocess
 import tempfile
+from collections.abc import Sequence
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
@@ -199,19 +200,39 @@ def arrange_in_lanes(rows: FloatArray, groups: int) -> FloatArray:
     return np.ascontiguousarray(filled.reshape(groups, LANES, -1).swapaxes(1, 2))
 
 
-def run_many(lib: ctypes.CDLL, chosen: slice, lanes: Lanes, shared: Shared) -> None:
-    """Simulate the `chosen` groups of machines through all samples; their states and digests change in place."""
-    lib.run_many(
-        ctypes.c_long(len(range(*chosen.indices(len(lanes.theta))))),
-        ctypes.c_long(len(shared.given)),
-        ctypes.c_long(shared.substeps),
-        address_of(lanes.theta[chosen]),
-        ctypes.c_long(len(shared.table)),
-        address_of(shared.table),
-        address_of(lanes.states[chosen]),
-        address_of(shared.given),
-        ctypes.c_long(shared.uniform),
-        address_of(lanes.sigma[chosen]),
-        address_of(lanes.keys[chosen]),
-        address_of(lanes.digests[chosen]),
+class Part(NamedTuple):
+    """A part of the time of all runs, which has noise of its own."""
+
+    samples: slice
+    keys: NDArray[np.uint64]  # groups x LANES
+
+
+def run_many(
+    lib: ctypes.CDLL, chosen: slice, lanes: Lanes, shared: Shared, parts: Sequence[Part] | None = None
+) -> None:
+    """Simulate the `chosen` groups of machines; their states and digests change in place.
+
+    parts : of the time, one after the other; None: all samples with the keys of the lanes
+    """
+    theta, states, sigma, digests = (
+        address_of(array[chosen]) for array in (lanes.theta, lanes.states, lanes.sigma, lanes.digests)
     )
+    groups, rows = ctypes.c_long(len(lanes.theta[chosen])), ctypes.c_long(len(shared.table))
+    substeps, uniform = ctypes.c_long(shared.substeps), ctypes.c_long(shared.uniform)
+    table = address_of(shared.table)
+    for samples, keys in parts or [Part(slice(None), lanes.keys)]:
+        given = shared.given[samples]
+        lib.run_many(
+            groups,
+            ctypes.c_long(len(given)),
+            substeps,
+            theta,
+            rows,
+            table,
+            states,
+            address_of(given),
+            uniform,
+            sigma,
+            address_of(keys[chosen]),
+            digests,
+        )

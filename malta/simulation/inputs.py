@@ -18,7 +18,7 @@ from malta.simulation import references
 from malta.simulation.anticipation import countering_forces
 from malta.simulation.engines import evaluate
 from malta.simulation.layout import electronics_of, layout_of, noise_scales
-from malta.simulation.noise import keys, normals
+from malta.simulation.noise import keys, normals, normals_of_parts
 from malta.simulation.period import state_reference
 from malta.simulation.scenario import Fault, FeedforwardChoice, Scenario, Simulation
 from malta.synthesis.controller import Controller
@@ -186,7 +186,7 @@ def sensor_noise(run: Simulation, stages: list[tuple[int, Plant]], t: FloatArray
     plant, _, scenario, setup = run
     drawn: FloatArray = np.zeros((len(t), len(noise_scales(plant, setup))))
     if scenario.noise:
-        drawn = normals(keys(scenario.seed, np.array([scenario.run]))[0], *drawn.shape)
+        drawn = normals_of_parts(keys(scenario.seed, np.atleast_1d(scenario.run)), *drawn.shape)
         if plant.uniform:
             drawn = math.sqrt(3) * erf(drawn / math.sqrt(2))
         for k, (first, now) in enumerate(stages):
@@ -208,7 +208,7 @@ def electronics_noise(run: Simulation, periods: int) -> FloatArray:
     fast, scenario = electronics_of(run.plant, run.setup), run.scenario
     if fast is None or not fast.noises:
         return np.zeros((periods, 0))
-    return normals(keys(scenario.seed, np.array([-1 - scenario.run]))[0], periods, fast.noises)
+    return normals(keys(scenario.seed, -1 - np.atleast_1d(scenario.run))[0], periods, fast.noises)
 
 
 def initial_values(run: Simulation, first: FloatArray) -> tuple[FloatArray, ...]:

@@ -6,7 +6,7 @@ normal numbers (Box–Muller). The noise of a run depends on its seed and index 
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
     from malta.model.plant import FloatArray
 
+_Keys = TypeVar("_Keys", np.uint64, "NDArray[np.uint64]")
 GAMMA = 0x9E3779B97F4A7C15
 
 
@@ -40,6 +41,32 @@ def normals(key: np.uint64, samples: int, channels: int) -> FloatArray:
     angle = (quadrant + within) * (np.pi / 2)
     drawn = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
     return drawn.reshape(-1, channels)[:samples]
+
+
+def starts_of_parts(samples: int, parts: int) -> list[int]:
+    """The first sample of each of `parts` nearly equal parts of a run: even numbers, as samples are drawn in pairs."""
+    pairs = (samples + 1) // 2
+    return [2 * (k * pairs // parts) for k in range(parts)]
+
+
+def advanced(stream: _Keys, sample: int, channels: int) -> _Keys:
+    """The key, or keys, whose first row of `normals` is row `sample`, an even number, of the given ones."""
+    with np.errstate(over="ignore"):  # modulo 2^64 is meant
+        return stream + np.uint64(sample // 2 * channels * GAMMA % 2**64)
+
+
+def normals_of_parts(streams: NDArray[np.uint64], samples: int, channels: int) -> FloatArray:
+    """Standard normal numbers, samples x channels: the rows of part k of the run are those of `normals(streams[k])`.
+
+    >>> streams = keys(0, np.array([7, 7]))
+    >>> np.array_equal(normals_of_parts(streams, 100, 3), normals(streams[0], 100, 3))
+    True
+    """
+    starts = starts_of_parts(samples, len(streams))
+    parts = zip(streams, starts, [*starts[1:], samples], strict=True)
+    return np.concatenate(
+        [normals(advanced(key, start, channels), end - start, channels) for key, start, end in parts]
+    )
 
 
 def mix(x: NDArray[np.uint64]) -> NDArray[np.uint64]:

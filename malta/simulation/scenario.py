@@ -73,7 +73,8 @@ class Scenario:
     quantize: bool = False  # sensors with the plant's resolution
     sensor_errors: Mapping[str, float] | None = None  # names: plant.sensor_errors; None: y = p exactly
     seed: int = 0
-    run: int = 0  # index in a campaign: the noise depends on seed and run only
+    # Index in a campaign: the noise depends on seed and run only. Several: equal parts of the time have their noise.
+    run: int | tuple[int, ...] = 0
     delay: int | None = None  # samples between measurement and force; None: the machine's own
     substeps: int | None = None  # Runge–Kutta steps in a sample; None: see steps_of
     fidelity: Fidelity = "dq"  # how forces arise, see period.py
@@ -101,6 +102,7 @@ class Scenario:
             ("run", 0, True),
         ):
             value = getattr(self, name)
+            value = min(value, default=-1) if isinstance(value, tuple) else value
             if whole and value is not None and not isinstance(value, int):
                 raise InputError(where, name, repr(value), "a whole number")
             if value is not None and not isinstance(value, float | int | np.number):

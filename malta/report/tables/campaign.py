@@ -23,13 +23,22 @@ if TYPE_CHECKING:
     from malta.synthesis.spec import Spec
 
 
-def box_text(found: Campaign | Summary) -> str:
-    """The parameters that a campaign varies, with their half-widths."""
+def run_text(plan: Plan) -> str:
+    """What each machine of a plan does: its scenario, with the case, and the fidelity."""
+    from malta.campaigns.plan import planned_run
+
+    wanted = planned_run(plan)
+    case = "" if wanted.label == plan.scenario else f" ({wanted.label})"
+    return f"{plan.scenario}{case}, fidelity {wanted.scenario.fidelity}"
+
+
+def box_text(plan: Plan) -> str:
+    """The parameters that a plan varies, with their half-widths."""
     from malta.campaigns.statistics import spread_text
 
     spreads: dict[str, list[str]] = {}
-    for name in (*found.plan.spread, *found.plan.sensor_spread):
-        spreads.setdefault(spread_text(found.plan, name), []).append(name)
+    for name in (*plan.spread, *plan.sensor_spread):
+        spreads.setdefault(spread_text(plan, name), []).append(name)
     return ", ".join(f"{' '.join(names)} {width}" for width, names in spreads.items())
 
 

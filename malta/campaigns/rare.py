@@ -1,0 +1,209 @@
+"""Rare events of a campaign: the probability of exceeding a limit, and the machine and the noise that cause it.
+
+plan, limit -> rare_event -> RareEvent -> write_event -> read_design_point -> replay_design_point
+
+The machines are uniform in the plan's box, as in a campaign, and every run has noise of its own, which changes part by
+part where a chain takes a step: see subset.py.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from scipy.special import ndtr
+
+from malta.campaigns.limits import Limit
+from malta.campaigns.plan import (
+    Machines,
+    Plan,
+    machines_at,
+    machines_of,
+    planned_run,
+    varied,
+    varied_names,
+)
+from malta.campaigns.run import replay_machine
+from malta.campaigns.subset import Runs, Subset, subset_simulation
+from malta.errors import InputError
+from malta.files import json_text, read_file, replace_files
+from malta.simulation.batch import simulate_many
+from malta.simulation.digest import verdicts
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from malta.model.plant import FloatArray
+    from malta.simulation.digest import Batch
+    from malta.simulation.engines import EngineChoice
+    from malta.simulation.experiments import Experiment, Progress
+
+PARTS = 100  # of a run, whose noise changes independently
+SCHEMA, VERSION = "malta-rare-event", 1
+FEW = 10  # ancestors of the failures: with fewer, the coefficient of variation is itself uncertain
+
+
+class DesignPoint(NamedTuple):
+    """The failed run whose machine is nearest the middle of the box."""
+
+    values: Mapping[str, float]  # of what varies, SI
+    distance: float  # from the middle, in standard normal coordinates
+    noise: tuple[int, ...]  # index of the run whose noise each part has
+    end: str  # verdict
+    time: float  # s, of the end
+
+
+@dataclass(frozen=True, eq=False)
+class RareEvent:
+    """The probability that a run exceeds a limit. `found` says how it was estimated."""
+
+    plan: Plan
+    limit: Limit
+    found: Subset
+    design_point: DesignPoint | None  # None where no run failed
+
+    @property
+    def uncertain(self) -> bool:
+        """Whether the failures descend from so few first runs that their coefficient of variation is a guess."""
+        return self.found.reached and len(self.found.levels) > 1 and self.found.ancestors < FEW
+
+
+def rare_event(
+    plan: Plan, limit: Limit, *, workers: int | None = None, progress: Progress | None = None
+) -> RareEvent:
+    """Estimate the probability that a run of a plan exceeds a limit, by subset simulation.
+
+    plan.samples is the number of runs in each level, plan.seed decides machines and noise, plan.sampler does not count.
+
+    Raises InputError where nothing is random, and as `subset_simulation` does.
+
+        plan = malta.Plan(malta.gains.read("design/gains/table2.json"), spread={"m": 0.05}, samples=2000)
+        print(malta.rare_event(plan, malta.limit_of(plan, "touchdown")).found.probability)
+    """
+    noisy = planned_run(plan).scenario.noise > 0
+    dimensions = len(varied(plan))
+    if not (dimensions or noisy):
+        raise InputError("rare event", "spread", "nothing random", "parameters that vary, or noise")
+
+    def severity(u: FloatArray, noise: NDArray[np.int64]) -> FloatArray:
+        return limit.severity(_simulate(plan, u, noise, workers))
+
+    found = subset_simulation(
+        severity,
+        dimensions,
+        PARTS if noisy else 1,
+        samples=plan.samples,
+        seed=plan.seed,
+        progress=progress,
+    )
+    return RareEvent(plan, limit, found, _design_point(plan, found.failures))
+
+
+def _machines(plan: Plan, u: FloatArray) -> Machines:
+    """The machines at standard normal points, runs x the names that vary."""
+    points = np.full((len(u), len(varied_names(plan))), 0.5)
+    points[:, varied(plan)] = ndtr(u)
+    return machines_at(plan, points)
+
+
+def _simulate(plan: Plan, u: FloatArray, noise: NDArray[np.int64], workers: int | None = None) -> Batch:
+    machines = _machines(plan, u)
+    return simulate_many(
+        plan.plant,
+        plan.controller,
+        planned_run(plan).scenario,
+        machines.changes,
+        sensor_errors=machines.sensor_errors,
+        noise=noise,
+        workers=workers,
+    )
+
+
+def _design_point(plan: Plan, failures: Runs) -> DesignPoint | None:
+    if not len(failures.severity):
+        return None
+    far = np.sqrt((failures.u**2).sum(axis=1))
+    nearest = failures.chosen(np.array([far.argmin()]))
+    batch, machines = _simulate(plan, nearest.u, nearest.noise), _machines(plan, nearest.u)
+    return DesignPoint(
+        dict(zip(machines.names, machines.values[0].tolist(), strict=True)),
+        float(far.min()),
+        tuple(nearest.noise[0].tolist()),
+        verdicts(plan.plant)[int(batch.verdict[0])],
+        float(batch.duration[0]),
+    )
+
+
+def event_document(event: RareEvent) -> dict[str, Any]:
+    """A rare event as plain tables, SI."""
+    found = event.found
+    low, high = found.interval()
+    point = event.design_point
+    return {
+        "schema": SCHEMA,
+        "version": VERSION,
+        "limit": event.limit.name,
+        "text": event.limit.text,
+        "probability": found.probability if found.reached else None,
+        "bound": None if found.reached else high,
+        "cov": found.cov,
+        "low": low if found.reached else None,
+        "high": high,
+        "simulated": found.simulated,
+        "plain_sampling": found.plain if found.reached else None,
+        "ancestors": found.ancestors,
+        "worst_severity": found.worst,
+        "interrupted": found.interrupted,
+        "levels": [level._asdict() for level in found.levels],
+        "design_point": None if point is None else point._asdict(),
+    }
+
+
+def event_name(limit: Limit) -> str:
+    """The name of a rare event in its folder: rare_touchdown."""
+    return f"rare_{limit.slug}"
+
+
+def write_event(event: RareEvent, folder: Path) -> Path:
+    """Write a rare event beside the manifest of its plan."""
+    path = folder / f"{event_name(event.limit)}.json"
+    replace_files({path: (json_text(event_document(event)) + "\n").encode()})
+    return path
+
+
+def read_design_point(path: Path, plan: Plan) -> DesignPoint:
+    """The design point of a file that `write_event` wrote.
+
+    Raises InputError for any other file, and for an event without a failure.
+    """
+    text = read_file(path, "rare event", partial(Path.read_text, encoding="utf-8"))
+    try:
+        content = json.loads(text)
+        if (content["schema"], content["version"]) != (SCHEMA, VERSION):
+            raise ValueError("another kind of file")
+        point = content["design_point"]
+        if point is None:
+            raise InputError(path, "design_point", "none", "an event in which a run failed")
+        values = {name: float(point["values"][name]) for name in varied_names(plan)}
+        noise = tuple(int(index) for index in point["noise"])
+        if not noise or min(noise) < 0 or not all(map(math.isfinite, values.values())):
+            raise ValueError("numbers that no run has")
+        return DesignPoint(values, float(point["distance"]), noise, str(point["end"]), float(point["time"]))
+    except InputError:
+        raise
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError, OverflowError) as error:
+        raise InputError(path, "", "a damaged or foreign file", "a rare event of a campaign") from error
+
+
+def replay_design_point(
+    plan: Plan, point: DesignPoint, *, engine: EngineChoice = "auto", progress: Progress | None = None
+) -> Experiment:
+    """Simulate a design point again, with all its time series: the same to the bit by the compiled engine."""
+    machines = machines_of(plan, np.array([[point.values[name] for name in varied_names(plan)]]))
+    return replay_machine(plan, machines, 0, np.array([point.noise]), engine=engine, progress=progress)

@@ -1,0 +1,146 @@
+"""Which parameter costs yield: Sobol indices over the box of a campaign, by SALib, which is an extra.
+
+    first-order index   Var(E[Y | x_i]) / Var(Y)       what fixing x_i alone would take away of Y's variance
+    total index         E[Var(Y | x_not i)] / Var(Y)   what is left when everything but x_i is fixed
+
+Y is a figure of merit, or the yield: 1 for a run within the limit, 0 for one beyond it. The noise of the runs is a
+factor like the parameters: its index says what part of the variance no tolerance of a machine can change.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from malta.campaigns.limits import Limit, findings_of
+from malta.campaigns.plan import Plan, machines_at, planned_run, varied, varied_names
+from malta.campaigns.result import Rate, rate
+from malta.errors import InputError
+from malta.simulation.batch import simulate_many
+
+if TYPE_CHECKING:
+    from malta.model.plant import FloatArray
+    from malta.simulation.experiments import Progress
+
+NOISE = "noise"  # the name of its factor
+LEAST = 16  # points of each of the two samples
+DRAWS = 2**40  # of the noise, among which its factor chooses
+
+
+class Index(NamedTuple):
+    """The Sobol indices of one factor, with half the width of their 95 % intervals (bootstrap)."""
+
+    first: float
+    first_half: float
+    total: float
+    total_half: float
+
+
+@dataclass(frozen=True, eq=False)
+class Sensitivity:
+    """Sobol indices of a campaign's figures of merit and of its yield."""
+
+    plan: Plan
+    limit: Limit  # that ends the yield
+    factors: tuple[str, ...]  # what varies, and NOISE
+    runs: int  # simulated
+    within: Rate  # of the independent runs: share within the limit
+    of_yield: tuple[Index, ...]  # by factor; empty where all runs, or none, are within the limit
+    of_merits: Mapping[
+        str, tuple[Index, ...]
+    ]  # by label; empty where a run has no value, or all have the same
+
+
+def sensitivity(
+    plan: Plan, limit: Limit, *, workers: int | None = None, progress: Progress | None = None
+) -> Sensitivity:
+    """The Sobol indices over a plan's box, from Saltelli's design: at most plan.samples runs, n (factors + 2).
+
+    n is a power of two; plan.seed decides machines and noise, plan.sampler does not count.
+
+    Raises InputError where SALib is not installed, for a box in which nothing varies, and for too few samples.
+
+        plan = malta.Plan(malta.gains.read("design/gains/robust.json"), spread={"m": 0.2, "K_A": 0.2}, samples=4096)
+        print(malta.sensitivity(plan, malta.limit_of(plan, "touchdown")).of_merits["deviation y1"])
+    """
+    sampling, analysis = _salib()
+    names = [varied_names(plan)[k] for k in varied(plan)]
+    if not names:
+        raise InputError("campaign", "spread", "nothing that varies", "parameters that vary")
+    noisy = planned_run(plan).scenario.noise > 0
+    factors = (*names, *([NOISE] if noisy else []))
+    size = 2 ** int(math.log2(max(plan.samples / (len(factors) + 2), 1)))
+    if size < LEAST:
+        expected = f"at least {LEAST * (len(factors) + 2)} for {len(factors)} factors"
+        raise InputError("campaign", "samples", str(plan.samples), expected)
+    problem = {"num_vars": len(factors), "names": list(factors), "bounds": [[0.0, 1.0]] * len(factors)}
+    points = sampling.sample(problem, size, calc_second_order=False, seed=plan.seed)
+    unit = np.full((len(points), len(varied_names(plan))), 0.5)
+    unit[:, varied(plan)] = points[:, : len(names)]
+    machines = machines_at(plan, unit)
+    draws = (points[:, -1] * DRAWS).astype(np.int64) if noisy else np.zeros(len(points), np.int64)
+    batch = simulate_many(
+        plan.plant,
+        plan.controller,
+        planned_run(plan).scenario,
+        machines.changes,
+        sensor_errors=machines.sensor_errors,
+        noise=draws[:, None],
+        workers=workers,
+        progress=progress,
+    )
+    within = limit.severity(batch) < 1
+
+    def indices(values: FloatArray) -> tuple[Index, ...]:
+        if not np.isfinite(values).all() or np.ptp(values) == 0:
+            return ()
+        found = analysis.analyze(problem, values, calc_second_order=False, seed=plan.seed + 1)
+        columns = (found[name].tolist() for name in ("S1", "S1_conf", "ST", "ST_conf"))
+        return tuple(Index(*row) for row in zip(*columns, strict=True))
+
+    independent = within.reshape(size, -1)[
+        :, [0, -1]
+    ]  # the other columns differ from the first in one factor
+    return Sensitivity(
+        plan,
+        limit,
+        factors,
+        len(points),
+        rate(int(independent.sum()), independent.size),
+        indices(within.astype(float)),
+        {f.label: indices(f.values) for f in findings_of(plan, batch)},
+    )
+
+
+def _salib() -> tuple[Any, Any]:
+    """SALib's modules for sampling and analysis. Raises InputError where it is not installed."""
+    try:
+        from SALib.analyze import sobol as analysis
+        from SALib.sample import sobol as sampling
+    except ImportError as error:
+        expected = "it installed: pip install 'malta[sensitivity]'"
+        raise InputError("--sobol", "", f"no SALib here ({error})", expected) from error
+    return sampling, analysis
+
+
+def sensitivity_document(found: Sensitivity) -> dict[str, Any]:
+    """Sobol indices as plain tables; null where there are none."""
+
+    def table(indices: tuple[Index, ...]) -> dict[str, Any] | None:
+        rows = zip(found.factors, indices, strict=True) if indices else ()
+        return {name: index._asdict() for name, index in rows} or None
+
+    return {
+        "schema": "malta-sensitivity",
+        "version": 1,
+        "limit": found.limit.name,
+        "factors": list(found.factors),
+        "runs": found.runs,
+        "within": found.within._asdict(),
+        "yield": table(found.of_yield),
+        "merits": {label: table(indices) for label, indices in found.of_merits.items()},
+    }

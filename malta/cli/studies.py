@@ -1,0 +1,222 @@
+"""Studies of `malta campaign` on its box, in place of plain runs: --rare, --sobol and --tolerance."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import typer
+
+from malta.cli.assignments import NUMBER, read_assignments
+from malta.cli.output import (
+    NO_COMPILER,
+    make_console,
+    print_json,
+    print_note,
+    print_written,
+    progress_bar,
+)
+from malta.cli.patience import limit_time
+from malta.errors import InputError
+from malta.files import json_text, replace_files
+
+if TYPE_CHECKING:
+    from malta.campaigns.limits import Limit
+    from malta.campaigns.plan import Plan
+    from malta.campaigns.summary import Bounds
+    from malta.simulation.experiments import Progress
+
+
+class Study(NamedTuple):
+    """A study and its option."""
+
+    option: str  # "--rare", "--sobol" or "--tolerance"
+    limit: str  # "touchdown", "deviation-y1=20um", "help"
+    wanted: float = 1.0  # yield to keep
+
+
+class Setting(NamedTuple):
+    """What the studies have in common."""
+
+    gains: Path
+    plan: Plan
+    bounds: Bounds
+    folder: Path
+    workers: int | None
+    as_json: bool
+    yes: bool  # to work of any length
+
+
+def study_of(
+    rare: str | None, tolerance: str | None, limit: str | None, cluster: str | None, *, sobol: bool
+) -> Study | None:
+    """The study that the options ask for; None for a plain campaign.
+
+    Raises InputError for several studies, for a cluster, and for a limit or a yield that is none.
+    """
+    chosen = [
+        option
+        for option, given in (("--rare", rare), ("--sobol", sobol), ("--tolerance", tolerance))
+        if given
+    ]
+    if len(chosen) > 1:
+        raise InputError("malta campaign", "", " and ".join(chosen), "one of them")
+    if limit is not None and chosen not in (["--sobol"], ["--tolerance"]):
+        raise InputError("--limit", "", repr(limit), "it with --sobol or --tolerance")
+    if not chosen:
+        return None
+    if cluster is not None:
+        raise InputError(chosen[0], "", "--cluster too", "it without: it runs on this machine")
+    if rare is not None:
+        return Study("--rare", rare)
+    if tolerance is None:
+        return Study("--sobol", limit or "touchdown")
+    wanted = read_assignments("--tolerance", [f"yield={tolerance}"], {"yield": "1"})["yield"]
+    if not 0 < wanted <= 1:
+        raise InputError("--tolerance", "", repr(tolerance), "a yield above 0 % and up to 100 %, as 99%")
+    return Study("--tolerance", limit or "touchdown", wanted)
+
+
+class Outcome(NamedTuple):
+    """What a study leaves behind."""
+
+    document: dict[str, Any]
+    files: list[Path]
+    parts: list[Any]  # tables and lines for the console
+    notes: list[str]
+    interrupted: bool = False
+
+
+def run_study(study: Study, setting: Setting) -> None:
+    """Run a study, write it into the campaign's folder and print it; exit with code 130 after Ctrl-C."""
+    from malta import report
+    from malta.campaigns.plan import planned_run
+    from malta.campaigns.run import Session, open_campaign
+    from malta.simulation.batch import is_compiled
+
+    option = "--rare" if study.option == "--rare" else "--limit"
+    if study.limit == "help":
+        _print_limits(setting.plan)
+        raise typer.Exit
+    limit = read_limit(option, study.limit, setting.plan, setting.bounds)
+    open_campaign(setting.plan, setting.folder, Session(setting.workers), setting.gains)
+    what = f"{setting.plan.scenario} {study.option}"
+    with progress_bar(what, quiet=setting.as_json) as bar:
+        progress = limit_time(bar, what, agreed=setting.yes)
+        try:
+            outcome = STUDIES[study.option](limit, study.wanted, setting, progress)
+        except KeyboardInterrupt:
+            print_note("interrupted before anything was known")
+            raise typer.Exit(130) from None
+    if setting.as_json:
+        head = {"gains": str(setting.gains), "folder": str(setting.folder)}
+        names = [str(file) for file in outcome.files]
+        print_json(head | {"files": names, "manifest": setting.plan.manifest} | outcome.document)
+    else:
+        console = make_console()
+        console.print(f"{setting.gains}: {report.run_text(setting.plan)}")
+        console.print(f"{report.box_text(setting.plan)}; seed {setting.plan.seed}")
+        for part in outcome.parts:
+            console.print(part, soft_wrap=isinstance(part, str))
+        print_written(console, outcome.files)
+    for note in outcome.notes:
+        print_note(note)
+    plan = setting.plan
+    if not (plan.plant.tabulated or is_compiled(plan.plant, plan.controller, planned_run(plan).scenario)):
+        print_note(NO_COMPILER)
+    if outcome.interrupted:
+        raise typer.Exit(130)
+
+
+def _rare(limit: Limit, _: float, setting: Setting, progress: Progress | None) -> Outcome:
+    """The probability of exceeding a limit."""
+    from malta import report
+    from malta.campaigns.rare import event_document, event_name, rare_event, write_event
+
+    event = rare_event(setting.plan, limit, workers=setting.workers, progress=progress)
+    files = [write_event(event, setting.folder)]
+    parts: list[Any] = [report.rare_event_tables(event)]
+    if event.design_point is not None:
+        place = f"{setting.folder}:{event_name(limit)}"
+        parts.append(f"the design point again: malta simulate {setting.gains} --replay {place}")
+    notes = [text for text in (report.rare_event_sentence(event),) if text]
+    if event.uncertain:
+        notes.append(
+            f"the failures descend from {event.found.ancestors} of the first runs: the coefficient of variation is "
+            "itself uncertain, more --samples make it certain"
+        )
+    return Outcome(event_document(event), files, parts, notes, event.found.interrupted)
+
+
+def _sobol(limit: Limit, _: float, setting: Setting, progress: Progress | None) -> Outcome:
+    """Which parameter costs yield."""
+    from malta import report
+    from malta.campaigns.sensitivity import sensitivity, sensitivity_document
+
+    found = sensitivity(setting.plan, limit, workers=setting.workers, progress=progress)
+    document = sensitivity_document(found)
+    files = [_write(setting, f"sobol_{limit.slug}.json", document)]
+    if found.of_yield or any(found.of_merits.values()):
+        files.append(report.sensitivity(found, setting.folder / f"sobol_{limit.slug}.png"))
+    notes = [text for text in (report.sensitivity_sentence(found),) if text]
+    return Outcome(document, files, [report.sensitivity_tables(found)], notes)
+
+
+def _tolerance(limit: Limit, wanted: float, setting: Setting, progress: Progress | None) -> Outcome:
+    """The largest spreads that keep a yield."""
+    from malta import report
+    from malta.campaigns.tolerance import tolerance_document, tolerances
+
+    found = tolerances(setting.plan, limit, wanted, workers=setting.workers, progress=progress)
+    document = tolerance_document(found)
+    files = [_write(setting, f"tolerance_{limit.slug}.json", document)]
+    notes = [text for text in (report.tolerance_sentence(found),) if text]
+    return Outcome(document, files, [report.spreads_table(found)], notes)
+
+
+STUDIES = {"--rare": _rare, "--sobol": _sobol, "--tolerance": _tolerance}
+
+
+def _write(setting: Setting, name: str, document: dict[str, Any]) -> Path:
+    path = setting.folder / name
+    replace_files({path: (json_text(document) + "\n").encode()})
+    return path
+
+
+def read_limit(option: str, text: str, plan: Plan, bounds: Bounds) -> Limit:
+    """Read a limit: "touchdown", "published", "specification", or a merit with its bound, as "deviation-y1=20um".
+
+    A bound without a unit is in SI. Raises InputError, which names the option, for any other text.
+    """
+    from malta.campaigns.limits import limit_of, merits_of, slug
+    from malta.units import to_si, unit_factor
+
+    name, sign, value = (part.strip() for part in text.partition("="))
+    bound = None
+    try:
+        if sign:
+            number = re.fullmatch(NUMBER, value)
+            if number is None:
+                raise InputError(option, name, repr(value), "a number with its unit, as 20um")
+            _, shown = merits_of(plan).get(slug(name), ("", "percent"))
+            bound = float(number[1])
+            if number[2]:
+                unit = number[2].replace("%", "percent")
+                bound = to_si(bound, unit, shown, option, name) * unit_factor(shown, name)
+        return limit_of(plan, name, bound, bounds)
+    except InputError as error:
+        raise InputError(
+            option, error.field.removeprefix("limit").strip(), error.found, error.expected
+        ) from None
+
+
+def _print_limits(plan: Plan) -> None:
+    """Print the names of the limits, with the units of those that take a bound."""
+    from malta.campaigns.limits import EVENTS, merits_of
+
+    console = make_console()
+    for name in EVENTS:
+        console.print(name)
+    for name, (label, unit) in merits_of(plan).items():
+        console.print(f"{name}=VALUE  {label} [{'%' if unit == 'percent' else unit}]")

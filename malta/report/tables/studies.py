@@ -1,0 +1,181 @@
+"""Tables of the studies on a campaign's box: rare events, sensitivities, tolerances."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from rich.console import Group
+from rich.table import Table
+
+from malta.report.tables.parts import add_row, new_table
+from malta.units import in_unit
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from malta.campaigns.plan import Plan
+    from malta.campaigns.rare import RareEvent
+    from malta.campaigns.result import Rate
+    from malta.campaigns.sensitivity import Index, Sensitivity
+    from malta.campaigns.tolerance import Spread, Tolerances
+
+COLUMNS = 5  # of factors in one table
+
+
+def rare_event_tables(event: RareEvent) -> Group:
+    """The probability of a rare event with its interval, the levels on the way to it, and its design point."""
+    parts: list[Table | str] = [_probability_table(event), _levels_table(event)]
+    if event.design_point is not None:
+        parts.append(_design_point_table(event))
+    return Group(*parts)
+
+
+def rare_event_sentence(event: RareEvent) -> str:
+    """What is known of a rare event where no run failed; empty where runs did."""
+    found = event.found
+    if found.reached:
+        return ""
+    _, high = found.interval()
+    ending = "interrupted" if found.interrupted else "no run failed"
+    return (
+        f"{ending}: {event.limit.text} has a probability below {high:.2g}, as a severity of "
+        f"{found.levels[-1].threshold:.3g} has; the most severe of {found.simulated} runs reached {found.worst:.3g}"
+    )
+
+
+def _probability_table(event: RareEvent) -> Table:
+    found = event.found
+    table = new_table(f"Rare event: {event.limit.text}", "", "")
+    table.show_header = False
+    if not found.reached:
+        add_row(table, "probability", f"below {found.interval()[1]:.2g}")
+        add_row(table, "simulated runs", f"{found.simulated}")
+        return table
+    low, high = found.interval()
+    add_row(table, "probability", f"{found.probability:.3g}")
+    add_row(table, "coefficient of variation [%]", f"{100 * found.cov:.3g}")
+    add_row(table, "95 % interval", f"{low:.3g} to {high:.3g}")
+    add_row(table, "simulated runs", f"{found.simulated}")
+    add_row(table, "plain sampling needs, for the same coefficient", f"{found.plain:.2g}")
+    return table
+
+
+def _levels_table(event: RareEvent) -> Table:
+    """One row for each level; a severity of 1 is the limit."""
+    heads = ("level", "severity", "passed [%]", "c.o.v. [%]", "accepted [%]", "probability")
+    table = new_table("Levels: 1 is the limit", *heads)
+    table.columns[0].justify = "right"
+    probability = 1.0
+    for k, level in enumerate(event.found.levels):
+        probability *= level.share
+        accepted = "" if math.isnan(level.acceptance) else f"{100 * level.acceptance:.0f}"
+        cells = [f"{k + 1}", f"{level.threshold:.4g}", f"{100 * level.share:.3g}", f"{100 * level.cov:.3g}"]
+        add_row(table, *cells, accepted, f"{probability:.3g}")
+    return table
+
+
+def _design_point_table(event: RareEvent) -> Table:
+    """The machine of the design point: each value, and how far it is off the middle."""
+    from malta.campaigns.plan import half_width
+
+    plan, point = event.plan, event.design_point
+    assert point is not None
+    title = f"Design point: {point.end} at {point.time * 1e3:.1f} ms, {point.distance:.3g} standard deviations off"
+    table = new_table(title, "parameter", "value", "off the middle [% of the spread]")
+    for name, value in point.values.items():
+        half = half_width(plan, name)
+        middle = getattr(plan.parameters, name) if name in plan.spread else 0.0
+        off = f"{100 * (value - middle) / half:+.1f}" if half else "0"
+        add_row(table, name, value_text(plan, name, value), off)
+    return table
+
+
+def sensitivity_tables(found: Sensitivity) -> Group:
+    """Total and first-order Sobol indices of the yield and of each figure of merit, by what varies."""
+    parts: list[Table | str] = [
+        f"yield: {share_text(found.within)} of the machines {found.limit.kept}; {found.runs} runs"
+    ]
+    if not (found.of_yield or any(found.of_merits.values())):
+        return Group(*parts)
+    for k in range(0, len(found.factors), COLUMNS):
+        columns = range(k, min(k + COLUMNS, len(found.factors)))
+        parts.append(
+            _index_table("Total indices: a parameter, alone and with others", found, columns, total=True)
+        )
+        parts.append(_index_table("First-order indices: a parameter alone", found, columns, total=False))
+    return Group(*parts)
+
+
+def sensitivity_sentence(found: Sensitivity) -> str:
+    """Why figures have no indices; empty where all have."""
+    if not found.of_yield:
+        every = "every" if found.within.share == 1 else "no"
+        return f"{every} run is {found.limit.kept}: the yield has no indices"
+    if not all(found.of_merits.values()):
+        return "figures that some runs have no value of, as they were not completed, have no indices"
+    return ""
+
+
+def _index_table(title: str, found: Sensitivity, columns: Sequence[int], *, total: bool) -> Table:
+    table = new_table(f"{title}, with 95 % intervals", "figure", *(found.factors[k] for k in columns))
+    table.columns[0].no_wrap = True
+
+    def cell(index: Index) -> str:
+        value, half = (index.total, index.total_half) if total else (index.first, index.first_half)
+        return f"{max(value, 0.0):.2f} ±{half:.2f}" if abs(value) < 0.005 else f"{value:.2f} ±{half:.2f}"
+
+    for label, indices in {"yield": found.of_yield, **found.of_merits}.items():
+        if indices:
+            add_row(table, label, *(cell(indices[k]) for k in columns))
+    return table
+
+
+def spreads_table(found: Tolerances) -> Table:
+    """The largest spread of each parameter that keeps the wanted yield, beside today's."""
+    from malta.campaigns.statistics import spread_text
+
+    wanted = f"{100 * found.wanted:.6g} %"
+    title = f"Largest spreads that keep {wanted} {found.limit.kept}; today {share_text(found.today)}"
+    table = new_table(title, "parameter", "today", "largest", "times", "yield [%]", "95 % interval [%]")
+    for spread in found.spreads:
+        alone = spread.name in found.plan.spread or spread.name in found.plan.sensor_spread
+        today = spread_text(found.plan, spread.name) if alone else ""
+        if spread.within is None:
+            add_row(table, spread.name, today, "none", "0", "", "")
+            continue
+        more = ">= " if spread.factor == spread.widest else ""
+        times = f"{more}{spread.factor:.3g}"
+        largest = more + spread_text(_with_spread(found, spread), spread.name) if alone else ""
+        interval = f"{100 * spread.within.low:.4g} to {100 * spread.within.high:.4g}"
+        add_row(table, spread.name, today, largest, times, f"{100 * spread.within.share:.4g}", interval)
+    return table
+
+
+def tolerance_sentence(found: Tolerances) -> str:
+    """Which parameters keep the yield again with a wider spread; empty where none does."""
+    names = " ".join(spread.name for spread in found.spreads if not spread.monotone)
+    return f"a wider spread keeps the yield again: {names}" if names else ""
+
+
+def _with_spread(found: Tolerances, spread: Spread) -> Plan:
+    """The plan with the largest spread of one parameter."""
+    plan = found.plan
+    own = {name: width * (spread.factor if name == spread.name else 1) for name, width in plan.spread.items()}
+    errors = plan.sensor_spread
+    wider = {name: width * (spread.factor if name == spread.name else 1) for name, width in errors.items()}
+    return replace(plan, spread=own, sensor_spread=wider)
+
+
+def share_text(share: Rate) -> str:
+    """A rate in percent with its interval."""
+    return f"{100 * share.share:.4g} % ({100 * share.low:.4g} to {100 * share.high:.4g} %)"
+
+
+def value_text(plan: Plan, name: str, value: float) -> str:
+    """A varied value with its unit."""
+    from malta.campaigns.statistics import unit_of
+
+    unit = unit_of(plan, name)
+    return f"{in_unit(value, unit):.6g} {'%' if unit == 'percent' else unit}"
