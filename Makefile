@@ -1,6 +1,8 @@
 # make design   set up ./.venv and run the main job: every design, verified, exported, simulated, reported
 # make test     set up ./.venv and run the tests that take seconds
 # make slow     the tests that take longer
+# make fuzz     damaged input of every kind, for FUZZ_SECONDS (600): see tests/fuzz
+# make mutants  faults in the code that refuses, proves, seals and limits: tests have to notice each; see tests/mutants
 # make check    what CI runs: lint, format, types, both kinds of tests
 PYTHON ?= python3
 VENV := .venv
@@ -11,7 +13,7 @@ export PIP_CONSTRAINT := $(CURDIR)/constraints.txt
 export OPENBLAS_NUM_THREADS ?= 1
 export MPLCONFIGDIR ?= $(CURDIR)/$(VENV)/matplotlib
 
-.PHONY: design test slow check lint types notebooks bench figures clean
+.PHONY: design test slow fuzz mutants check lint types notebooks bench figures clean
 
 design: $(VENV)/runtime
 	$(BIN)/malta design
@@ -21,6 +23,12 @@ test: $(VENV)/dev
 
 slow: $(VENV)/dev
 	$(BIN)/python -m pytest -n auto --dist loadgroup -m slow
+
+fuzz: $(VENV)/dev
+	PYTHONPATH=tests $(BIN)/python -m fuzz
+
+mutants: $(VENV)/dev
+	PYTHONPATH=tests $(BIN)/python -m mutants
 
 check: lint types test slow
 

@@ -4,19 +4,45 @@ from __future__ import annotations
 
 from pathlib import Path
 
+LONGEST = 300  # characters of a sentence
+MOST_OF_FILE, MOST_OF_FIELD = 150, 60  # characters of it that name the file and the field
+
+
+def on_one_line(text: str) -> str:
+    """A text in one printable line, whatever a key or a library's message holds."""
+    return "".join(c if c.isprintable() else repr(c)[1:-1] for c in " ".join(text.split()))
+
+
+def shorten(text: str, most: int = LONGEST, *, head: float = 0.75) -> str:
+    """A text in one line of at most `most` characters; dots stand for what is left out behind a share `head` of them.
+
+    >>> shorten("expected one of m K_A K_B K_D l_B", 25)
+    'expected one of ..._D l_B'
+    """
+    line = on_one_line(text)
+    if len(line) <= most:
+        return line
+    begin = int(head * (most - 3))
+    return f"{line[:begin]}...{line[len(line) - (most - 3 - begin) :]}"
+
 
 class InputError(ValueError):
     """Input that cannot be used: one sentence with file, field, what was found and what was expected.
+
+    The sentence has at most LONGEST characters: what is longer is cut in its middle.
 
     The command line prints it without a traceback and exits with code 2.
     """
 
     def __init__(self, where: str | Path, field: str, found: str, expected: str) -> None:
-        self.where, self.field, self.found, self.expected = str(where), field, found, expected
-        subject = f"{where}: {field}" if field else str(where)
-        # One line, whatever a key or a library's message holds.
-        line = " ".join(f"{subject}: found {found}, expected {expected}".split())
-        super().__init__("".join(c if c.isprintable() else repr(c)[1:-1] for c in line))
+        self.where, self.field = str(where), field
+        file = shorten(self.where, MOST_OF_FILE, head=0.25)
+        subject = ": ".join(filter(None, (file, shorten(field, MOST_OF_FIELD))))
+        room = LONGEST - len(f"{subject}: found , expected ")
+        whole = len(on_one_line(expected))
+        self.found = shorten(found, max(room // 2, room - whole))
+        self.expected = shorten(expected, room - len(self.found))
+        super().__init__(f"{subject}: found {self.found}, expected {self.expected}")
 
 
 class CheckError(ArithmeticError):

@@ -37,16 +37,24 @@ def locate(path: str | Path) -> Path:
     `design/gains/robust.json` is thus found from any folder, and a file of the user's own goes first.
     """
     path = Path(path)
-    if path.is_absolute() or (path.parts[:1] and path.parts[0] not in FOLDERS) or _exists(path):
+    if path.is_absolute() or (path.parts[:1] and path.parts[0] not in FOLDERS) or file_exists(path):
         return path
     other = shipped_path(*path.parts)
-    return other if _exists(other) else path
+    return other if file_exists(other) else path
 
 
-def _exists(path: Path) -> bool:
+def require_plain_name(name: str, where: str | Path, field: str) -> None:
+    """Raise InputError for a name that is to be part of a file's name and could lead to another folder."""
+    if not re.fullmatch(r"\w[\w .,()+-]{0,79}", name):
+        expected = "letters, digits, spaces and . , ( ) + - _, at most 80, as in the name of a file"
+        raise InputError(where, field, repr(name), expected)
+
+
+def file_exists(path: Path) -> bool:
+    """Whether there is a file or folder of a name; False for a name that no file can have."""
     try:
         return path.exists()
-    except (OSError, ValueError):  # a name that no file can have
+    except (OSError, ValueError):  # too long, with a null byte, in a folder that may not be looked into
         return False
 
 

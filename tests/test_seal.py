@@ -188,6 +188,12 @@ def test_changed_outcomes_are_named_and_not_reported(
 # --- the revision of engine and law ---
 
 
+def test_hashes_tell_where_a_part_ends() -> None:
+    """A line that moves from one module to the next changes the revision."""
+    assert identity._sha256([b"ab", b"c"]) != identity._sha256([b"a", b"bc"])
+    assert identity._sha256([b"ab", b"c"]) == identity._sha256([b"ab", b"c"])
+
+
 def test_a_folder_of_another_engine_is_refused(
     whole: tuple[Campaign, dict[str, bytes]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

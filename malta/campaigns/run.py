@@ -22,9 +22,16 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, get_args
 from malta.campaigns.block import Block, fly
 from malta.campaigns.plan import Machines, Plan, draw_machines, planned_run
 from malta.campaigns.result import Campaign, gather
-from malta.campaigns.store import block_name, encode_block, open_folder, read_blocks
+from malta.campaigns.store import (
+    MANIFEST,
+    block_name,
+    encode_block,
+    forget_folder,
+    open_folder,
+    read_blocks,
+)
 from malta.errors import InputError
-from malta.files import replace_files
+from malta.files import file_exists, replace_files
 from malta.simulation import compiled
 from malta.simulation.batch import record_run, replayed
 from malta.simulation.catalogue import single_run
@@ -97,22 +104,35 @@ def campaign(
         expected = f"at most {IN_MEMORY} in memory; malta.summarize needs none for its runs"
         raise InputError("campaign", "samples", str(plan.samples), expected)
     done: dict[int, Block] = {}
-    place, size = open_campaign(plan, folder, session := Session(workers, cluster, block, progress))
-    ending = run_blocks(plan, place, size, session, done)
+    session = Session(workers, cluster, block, progress)
+    with campaign_folder(plan, folder, session) as (place, size):
+        ending = run_blocks(plan, place, size, session, done)
     return replace(gather(plan, done), **ending._asdict(), folder=place)
 
 
-def open_campaign(
+@contextmanager
+def campaign_folder(
     plan: Plan, folder: str | Path | None, session: Session, gains: Path | None = None
-) -> tuple[Path | None, int]:
+) -> Iterator[tuple[Path | None, int]]:
     """The folder of a campaign, with its manifest, and the number of runs in a block.
 
     gains : file of the controller, which the manifest of a new folder notes
+
+    Where an InputError ends the campaign before it has a block, the manifest that was made here is deleted again.
     """
     size = block_size(plan, session)
     if folder is None:
-        return None, size
-    return Path(folder), open_folder(Path(folder), plan, size, gains)
+        yield None, size
+        return
+    place = Path(folder)
+    fresh = not file_exists(place / MANIFEST)
+    size = open_folder(place, plan, size, gains)
+    try:
+        yield place, size
+    except InputError:
+        if fresh and not list(place.glob("runs_*.npz")):
+            forget_folder(place)
+        raise
 
 
 def run_blocks(plan: Plan, place: Path | None, size: int, session: Session, done: Blocks) -> Ending:

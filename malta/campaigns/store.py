@@ -16,6 +16,7 @@ import io
 import json
 import math
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -34,9 +35,9 @@ from malta.campaigns.plan import (
     varied_names,
 )
 from malta.errors import InputError
-from malta.files import read_file, replace_files, writer
+from malta.files import file_exists, read_file, replace_files, writer
 from malta.simulation.compiled import LANES
-from malta.simulation.digest import Batch, verdicts
+from malta.simulation.digest import LARGEST_FIGURE, Batch, verdicts
 from malta.synthesis.controller import Controller
 
 MANIFEST, GAINS = "campaign.json", "gains_file"
@@ -77,6 +78,13 @@ def open_folder(folder: Path, plan: Plan, block: int, gains: Path | None = None)
     text = json.dumps(plan.manifest | {"block": block} | noted, indent=1) + "\n"
     replace_files({path: text.encode()})
     return block
+
+
+def forget_folder(folder: Path) -> None:
+    """Delete the manifest of a campaign that was refused before it had any run, and the folder if it is empty."""
+    (folder / MANIFEST).unlink(missing_ok=True)
+    with suppress(OSError):
+        folder.rmdir()
 
 
 def read_manifest(path: Path) -> tuple[dict[str, Any], int]:
@@ -154,7 +162,7 @@ def read_blocks(
     """
     for first, count in parts.items():
         path = place / block_name(first)
-        if path.exists():
+        if file_exists(path):
             yield first, path, read_block(path, plan, first, count)
 
 
@@ -231,7 +239,7 @@ def read_block(path: Path, plan: Plan, first: int, count: int) -> Block | None:
     whole = (
         sealed == seal(rest, first)
         and kind in ENGINES
-        and tuple(arrays.get("names", ())) == machines.names
+        and np.array_equal(arrays.get("names", ""), machines.names)
         and np.array_equal(values, machines.values)
         and _are_possible(columns, plan, count)
     )
@@ -254,7 +262,11 @@ def _are_possible(columns: Mapping[str, Any], plan: Plan, count: int) -> bool:
     ]
     # Figures of a run that diverged may be infinite or NaN, and rise and overshoot of a run that ended early are NaN.
     positive = [not (columns[name] < 0).any() for name in ("deviation", "rms", "force", "rise", "overshoot")]
-    finite = [np.isfinite(columns[name][completed == 1]).all() for name in FINITE]
+    finite = [(np.abs(columns[name][completed == 1]) < LARGEST_FIGURE).all() for name in FINITE]
+    finite += [
+        not (np.isfinite(columns[name]) & (columns[name] >= LARGEST_FIGURE)).any()
+        for name in ("rise", "overshoot")
+    ]
     codes = (verdict == np.floor(verdict)).all() and np.array_equal(completed, verdict == 0)
     return all(inside) and all(positive) and all(finite) and bool(codes)
 

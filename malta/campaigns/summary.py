@@ -22,7 +22,7 @@ from malta.campaigns.result import Campaign, Rate, rate
 from malta.campaigns.sketch import Sketch, merge, quantiles, sketch_of
 from malta.campaigns.statistics import CLEARANCE, RISE, Finding, every_figure, runs_within_bounds
 from malta.campaigns.yields import Yields, runs_within_specification
-from malta.simulation.digest import Batch, verdicts
+from malta.simulation.digest import LARGEST_FIGURE, Batch, verdicts
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -254,7 +254,10 @@ def worst_runs(summary: Summary, count: int) -> Runs:
     """
     runs = summary.kept
     medians = [m.percentiles([50])[0] for m in summary.listed if m.kind == CLEARANCE]
-    away = runs.batch.contact - np.array(medians)
+    contact = np.nan_to_num(runs.batch.contact, posinf=LARGEST_FIGURE, neginf=-LARGEST_FIGURE)
+    away = np.clip(contact, -LARGEST_FIGURE, LARGEST_FIGURE) - np.array(
+        medians
+    )  # a run that diverged may have any
     closest = -away.max(axis=1) if away.shape[1] else np.zeros(len(runs.index))
     completed = runs.batch.completed == 1
     order = np.lexsort((runs.index, np.where(completed, closest, runs.batch.duration), completed))

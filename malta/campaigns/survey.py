@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from malta.campaigns.result import gather
-from malta.campaigns.run import Session, open_campaign, run_blocks
+from malta.campaigns.run import Session, campaign_folder, run_blocks
 from malta.campaigns.summary import UNBOUNDED, Bounds, Summary, join, summary_of
 
 if TYPE_CHECKING:
@@ -52,7 +52,8 @@ def summarize(
         plan = malta.Plan(malta.gains.read("design/gains/calibrated.json"), spread={"m": 0.1}, samples=1_000_000)
         print(malta.summarize(plan, "build/campaigns/masses").rate)
     """
-    place, size = open_campaign(plan, folder, session := Session(workers, cluster, block, progress))
-    found = Sum(plan, size, bounds)
-    ending = run_blocks(plan, place, size, session, found)
+    session = Session(workers, cluster, block, progress)
+    with campaign_folder(plan, folder, session) as (place, size):
+        found = Sum(plan, size, bounds)
+        ending = run_blocks(plan, place, size, session, found)
     return replace(found.state[0], **ending._asdict(), folder=place)

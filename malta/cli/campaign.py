@@ -160,7 +160,7 @@ def campaign(
     if gains is None:
         raise InputError("campaign", "GAINS", "nothing", "a gain file, or --status FOLDER")
     from malta.campaigns.plan import Plan
-    from malta.campaigns.run import Session, open_campaign
+    from malta.campaigns.run import Session, campaign_folder
     from malta.campaigns.summary import Bounds
     from malta.campaigns.survey import summarize
     from malta.model.data import plant_of
@@ -209,8 +209,8 @@ def campaign(
     if study is not None:
         run_study(study, Setting(gains, plan, bounds, folder, workers, as_json, yes))
         return
-    open_campaign(plan, folder, Session(workers, cluster), gains)
-    with progress_bar(scenario, quiet=as_json) as bar:
+    session = Session(workers, cluster)
+    with campaign_folder(plan, folder, session, gains), progress_bar(scenario, quiet=as_json) as bar:
         progress = limit_time(bar, f"{scenario}, {samples} runs", agreed=yes)
         result = summarize(plan, folder, bounds, workers=workers, cluster=cluster, progress=progress)
     _report(gains, result, worst, as_json=as_json)

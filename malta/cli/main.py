@@ -9,7 +9,7 @@ import gc
 import io
 import os
 import sys
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -18,11 +18,15 @@ from malta.cli.check import check
 from malta.cli.claims import claims
 from malta.cli.design import design
 from malta.cli.new import new
-from malta.cli.output import print_error, silence
+from malta.cli.output import print_error, print_note, silence
 from malta.cli.simulate import simulate
 from malta.cli.tune import tune
 from malta.cli.verify import verify
-from malta.errors import CheckError, InputError
+from malta.errors import CheckError, InputError, shorten
+
+UsageError: Any = (
+    typer.BadParameter.__base__
+)  # of click, or of the copy of click that newer versions of typer have
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -66,18 +70,34 @@ def main() -> None:
             stream.reconfigure(errors="replace")  # a terminal without Greek letters shows ? and goes on
     try:
         try:
-            app()
+            sys.exit(app(prog_name="malta", standalone_mode=False) or 0)
         finally:
             if sys.stdout is not None:
                 sys.stdout.flush()  # now: at the end of the process nobody could say what went wrong
+    except UsageError as error:
+        sys.exit(_print_usage(error))
+    except typer.Abort:
+        sys.exit(130)
     except OSError as error:  # of standard output: files that are read or written have errors of their own
         sys.exit(_end_output(error))
     except (InputError, CheckError) as error:
         sys.exit(print_error(error))
+    except MemoryError:
+        sys.exit(print_error(CheckError("more was asked for than this computer has memory for")))
     except ArithmeticError as error:
         sys.exit(print_error(CheckError(f"numbers beyond what can be computed ({error})")))
     finally:
         gc.freeze()  # the process ends: no last walk through what the system takes back at once
+
+
+def _print_usage(error: Any) -> int:
+    """Say in one sentence what is wrong with the arguments, and return the exit code; no arguments get the help."""
+    if not sys.argv[1:]:
+        error.show()
+    else:
+        command = error.ctx.command_path if error.ctx is not None else "malta"
+        print_note(shorten(f"{error.format_message().rstrip('.')}; see {command} --help"))
+    return 2
 
 
 def _end_output(error: OSError) -> int:

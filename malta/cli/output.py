@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 
 import typer
 
-from malta.errors import CheckError, InputError
+from malta.errors import CheckError, InputError, shorten
 from malta.files import json_text
 
 if TYPE_CHECKING:
@@ -66,7 +66,7 @@ def silence(stream: TextIO) -> None:
 def print_error(error: InputError | CheckError, file: Path | None = None) -> int:
     """Print an error as one line and return the exit code; a failed check is printed with its file."""
     failed, text = isinstance(error, CheckError), str(error)
-    print_note(f"{file}: {text}" if failed and file and str(file) not in text else text)
+    print_note(shorten(f"{file}: {text}" if failed and file and str(file) not in text else text))
     return 1 if failed else 2
 
 

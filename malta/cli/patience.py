@@ -8,7 +8,7 @@ from time import monotonic
 from malta.errors import InputError
 
 LONGEST = 600.0  # s, without --yes
-ENOUGH = 5.0  # s, from the first report to an estimate
+ENOUGH = 5.0  # s, between the two reports that an estimate is made of
 SURE = 60.0  # s, from the first report to the last estimate: who has waited longer is not refused
 
 
@@ -20,24 +20,29 @@ def limit_time(
     what : the work, for the sentence;  agreed : whether the user said --yes: nothing is refused
     times : the work that follows, as a multiple of the one that reports
 
-    Estimates begin at the first report: what comes before it, as a compiler, is not in them.
+    Estimates begin at the first report, and each counts the pace since the one before: what comes earlier, as a
+    compiler or parts that were done already, is not in them.
 
     Raises InputError from the call that tells.
     """
     if agreed:
         return show
-    begun: tuple[float, float] | None = None
+    begun: float | None = None
+    looked = 0.0, 0.0  # time and share of the last estimate
 
     def report(share: float) -> None:
-        nonlocal begun
+        nonlocal begun, looked
         if show is not None:
             show(share)
         now = monotonic()
         if begun is None:
-            begun = now, share
-        since, done = now - begun[0], share - begun[1]
-        total = times * since / done if done > 0 else 0.0
-        if ENOUGH <= since <= SURE and total > LONGEST:
+            begun, looked = now, (now, share)
+        since, done = now - looked[0], share - looked[1]
+        if since < ENOUGH or done <= 0 or now - begun > SURE:
+            return
+        looked = now, share
+        total = times * (now - begun + (1 - share) * since / done)
+        if total > LONGEST:
             found, most = f"about {duration_text(total)} of work", duration_text(LONGEST)
             raise InputError(what, "", found, f"at most {most}, or --yes")
 

@@ -44,6 +44,9 @@ if TYPE_CHECKING:
     from malta.synthesis.controller import Controller
 
 
+LONGEST_NUMBER = 20  # digits of a run; Python refuses thousands of them
+
+
 class Simulation(NamedTuple):
     """A simulated scenario."""
 
@@ -176,7 +179,7 @@ def _replay(
 
     folder, _, run = text.rpartition(":")
     event = run.startswith("rare_") and Path(run).name == run
-    if not folder or not (run.isdecimal() or event):
+    if not folder or not ((run.isdecimal() and len(run) <= LONGEST_NUMBER) or event):
         expected = "FOLDER:RUN, as build/campaigns/mine:17 or build/campaigns/mine:rare_touchdown"
         raise InputError("--replay", "", repr(text), expected)
     if others:

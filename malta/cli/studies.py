@@ -92,7 +92,7 @@ def run_study(study: Study, setting: Setting) -> None:
     """Run a study, write it into the campaign's folder and print it; exit with code 130 after Ctrl-C."""
     from malta import report
     from malta.campaigns.plan import planned_run
-    from malta.campaigns.run import Session, open_campaign
+    from malta.campaigns.run import Session, campaign_folder
     from malta.simulation.batch import is_compiled
 
     option = "--rare" if study.option == "--rare" else "--limit"
@@ -100,9 +100,9 @@ def run_study(study: Study, setting: Setting) -> None:
         _print_limits(setting.plan)
         raise typer.Exit
     limit = read_limit(option, study.limit, setting.plan, setting.bounds)
-    open_campaign(setting.plan, setting.folder, Session(setting.workers), setting.gains)
-    what = f"{setting.plan.scenario} {study.option}"
-    with progress_bar(what, quiet=setting.as_json) as bar:
+    what, session = f"{setting.plan.scenario} {study.option}", Session(setting.workers)
+    folder = campaign_folder(setting.plan, setting.folder, session, setting.gains)
+    with folder, progress_bar(what, quiet=setting.as_json) as bar:
         progress = limit_time(bar, what, agreed=setting.yes)
         try:
             outcome = STUDIES[study.option](limit, study.wanted, setting, progress)

@@ -55,6 +55,7 @@ def tune(
     \b
     Example:  malta tune design/robust.toml --out build/tuned
     """
+    from malta.files import file_exists
     from malta.synthesis.design_file import read_design
     from malta.tuning.search import Effort
 
@@ -65,7 +66,7 @@ def tune(
     target, journal = out / f"{spec.name}.toml", out / f"{spec.name}_trials.jsonl"
     if target.resolve() == spec.path.resolve() and not overwrite:
         raise InputError(target, "", "the design file that was given", "another --out, or --overwrite")
-    if target.exists() and not overwrite:
+    if file_exists(target) and not overwrite:
         raise InputError(target, "", "a design file", "another --out, or --overwrite")
     effort = Effort(generations=generations, front=front)
     tuned = _search(spec, journal, effort, restart=restart, quiet=as_json)

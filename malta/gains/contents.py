@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, cast
 import numpy as np
 
 from malta.errors import CheckError, InputError
+from malta.files import require_plain_name
 from malta.gains.linear import linear_parameters
 from malta.gains.schema import GainFile, PlantTable
 from malta.model.data import parameters_record, plant_of
@@ -85,6 +86,7 @@ def controller_of(file: GainFile, path: str | Path) -> Controller:
         raise InputError(path, "plant.linear", "a table", "none without a table law, as version 2 has it")
     if file.commutation is not None and file.law is None:
         raise InputError(path, "commutation", "a table", "none without a table law, as version 2 has it")
+    require_plain_name(file.design.name, path, "design.name")
     par = _parameters(file.plant, path)
     layout = _layout(file, par, path)
     if (file.cost is None) != (file.noise is None):

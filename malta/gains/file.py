@@ -61,7 +61,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from malta.errors import CheckError, InputError
-from malta.files import locate, replace_files
+from malta.files import locate, replace_files, require_plain_name
 from malta.gains.contents import controller_of
 from malta.gains.encodings import SUFFIXES as SUFFIXES
 from malta.gains.encodings import content_sha256, decode, encode
@@ -86,11 +86,14 @@ SCHEMA = "malta-gains"
 def document(controller: Controller, margins: Margins) -> dict[str, Any]:
     """The content of the gain file of a controller, as plain tables, lists and numbers.
 
-    Raises CheckError when the loop is not stable.
+    Raises CheckError when the loop is not stable, InputError for a name that no file could have.
     """
     require_stable(margins, controller.name)
     c = controller
     units, linear = units_of(c.parameters), is_linear(c.parameters)
+    require_plain_name(c.name, "gain file", "design.name")
+    if linear:
+        require_plain_name(c.parameters.preset, "gain file", "plant.preset")
     in_positions = c.cost is not None and c.cost.coordinates == "positions"
     ahead = c.commutation is not None
     extended = linear or c.tracks == "errors" or not c.feedforward.rate.size or bool(c.lagging) or ahead

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from malta.errors import InputError
+from malta.files import require_plain_name
 from malta.gains.schema import LinearTable, PlantTable
 from malta.model.linear import LinearSystem, linear_machine
 from malta.model.plant import Signal
@@ -45,6 +46,7 @@ def linear_parameters(plant: PlantTable, given: LinearTable, path: str | Path) -
     """The parameters of a machine from plain matrices."""
     if plant.name != LINEAR:
         raise InputError(path, "plant.linear", f"matrices of a {plant.name}", f"those of {LINEAR!r}")
+    require_plain_name(plant.preset, path, "plant.preset")
     parameters, terms = plant.parameters or {}, given.terms or {}
     for key, q in parameters.items():
         if q.unit != "1":

@@ -29,7 +29,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from malta.errors import InputError
-from malta.files import read_file
+from malta.files import file_exists, read_file
 
 if TYPE_CHECKING:
     from malta.model.plant import Plant
@@ -162,7 +162,7 @@ def _from_file(path: Path) -> ModuleType:
         raise InputError(
             where, "", f"a file called {path.name!r}", "a name that Python can import, as rotor.py"
         )
-    if not path.is_file():
+    if not (file_exists(path) and path.is_file()):
         raise InputError(where, "", "no such file", "a Python module with Parameters and plant")
     if name in _installed():
         found = f"a machine {name!r}, as an installed package has one"

@@ -19,7 +19,7 @@ import numpy as np
 from malta.errors import CheckError, InputError
 from malta.model.checks import DEFAULT, defaults
 from malta.model.drive import CasadiFn, Drive, Electronics
-from malta.model.sensors import LateSensors
+from malta.model.sensors import LateSensors, require_short
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
@@ -75,8 +75,11 @@ class Actuator:
             object.__setattr__(self, "force_limit", limits)
 
     def delay(self, Ts: float) -> int:
-        """Whole samples of delay from measurement to force: the dead time minus the half sample of the hold."""
-        return max(0, round(self.dead_time / Ts - 0.5))
+        """Whole samples of delay from measurement to force: the dead time minus the half sample of the hold.
+
+        Raises InputError for more than MOST_DELAY.
+        """
+        return require_short("machine", "dead time", max(0, round(self.dead_time / Ts - 0.5)))
 
 
 @dataclass(frozen=True, eq=False)

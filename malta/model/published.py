@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from malta.errors import InputError
-from malta.files import locate, shipped_path
+from malta.files import file_exists, locate, shipped_path
 from malta.model.machines import file_of
 from malta.tables import load_toml
 from malta.units import unit_factor
@@ -24,7 +24,7 @@ def published(machine_file: str | Path) -> dict[str, Any]:
 def published_beside(machine_file: str | Path) -> dict[str, Any] | None:
     """Read the published figures beside a data file; None when there is no such file."""
     file = _published_file(locate(machine_file))
-    return load_toml(file) if file.exists() else None
+    return load_toml(file) if file_exists(file) else None
 
 
 def published_figures(machine: str) -> dict[str, Any] | None:
@@ -39,7 +39,7 @@ def _published_file(data_file: Path) -> Path:
     data_file = locate(data_file)
     alone = data_file.parent / "published.toml"
     of_its_name = data_file.parent / "published" / data_file.name
-    return alone if alone.exists() and not of_its_name.exists() else of_its_name
+    return alone if file_exists(alone) and not file_exists(of_its_name) else of_its_name
 
 
 def published_value(content: Mapping[str, Any], key: str) -> float:

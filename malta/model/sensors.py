@@ -38,9 +38,19 @@ def late_sensors(lag: tuple[Any, ...], dead_time: float) -> LateSensors | None:
     return sensors if sensors.lagging or dead_time else None
 
 
+MOST_DELAY = 100  # samples: each one has states of its own in the loop and in what is compiled
+
+
+def require_short(where: str, name: str, samples: int) -> int:
+    """The same number of samples of delay. Raises InputError for more than MOST_DELAY."""
+    if samples > MOST_DELAY:
+        raise InputError(where, name, f"{samples} samples", f"at most {MOST_DELAY}")
+    return samples
+
+
 def split_dead_time(dead_time: float, Ts: float) -> tuple[int, float]:
-    """Whole samples of a dead time, and the rest of it, s."""
-    whole = int(dead_time / Ts + 1e-9)
+    """Whole samples of a dead time, and the rest of it, s. Raises InputError for more than MOST_DELAY samples."""
+    whole = require_short("machine", "dead time of its sensors", int(dead_time / Ts + 1e-9))
     rest = dead_time - whole * Ts
     return whole, rest if rest > 1e-9 * Ts else 0.0
 

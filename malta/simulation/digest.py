@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from malta.model.plant import FloatArray
 
 LEVELS = (0.1, 0.9)  # shares of a stroke between which its rise is measured
+LARGEST_FIGURE = 1e30  # of a run that was completed, SI
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,8 +14,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from malta.errors import InputError
 from malta.model.machines import attribute_of
 from malta.model.plant import Plant
+from malta.simulation.inputs import LONGEST
 from malta.simulation.references import Reference
 from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate
@@ -129,8 +131,15 @@ def fly_all(
     progress: Progress | None,
     options: Mapping[str, Any],
 ) -> tuple[tuple[Case, ...], bool]:
-    """`fly` for runs with different machines and controllers."""
+    """`fly` for runs with different machines and controllers. Raises InputError for more than LONGEST samples."""
     cases: list[Case] = []
+    samples = sum(one.scenario.duration / controller.sample_time for _, controller, one in flights)
+    if samples > LONGEST:
+        where, found = (
+            f"scenario {flights[0][2].scenario.name}",
+            f"{len(flights)} of {samples:.4g} samples in all",
+        )
+        raise InputError(where, "runs", found, f"at most {LONGEST} samples")
     for n, (plant, controller, (label, scenario, merits)) in enumerate(flights):
         share = progress_of_part(progress, n, len(flights))
         try:

@@ -6,7 +6,7 @@ import csv
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -95,12 +95,23 @@ def _npz_columns(content: bytes, path: Path) -> dict[str, FloatArray]:
     except ValueError as error:
         found = f"a file that numpy cannot read safely ({error})"
         raise InputError(path, "", found, "an .npz archive of a run, not compressed") from error
-    columns = {"t [s]": arrays["t"]} if "t" in arrays else {}
+    t = arrays.get("t", np.zeros(0))
+    columns = {"t [s]": _of_numbers(t, (len(t) if t.ndim else 0,), "t", path)}
     for name in ("y", "v"):
-        if name in arrays and f"{name}_columns" in arrays:
-            headings = arrays[f"{name}_columns"].tolist()
-            columns |= dict(zip(headings, np.atleast_2d(arrays[name]).T, strict=False))
+        headings = arrays.get(f"{name}_columns")
+        if name in arrays and headings is not None:
+            if headings.dtype.kind != "U" or headings.ndim != 1:
+                found = f"an array of {headings.dtype}, {headings.shape}"
+                raise InputError(path, f"{name}_columns", found, "a list of headings")
+            table = _of_numbers(arrays[name], (len(t), len(headings)), name, path)
+            columns |= dict(zip(headings.tolist(), table.T, strict=True))
     return columns
+
+
+def _of_numbers(array: Any, shape: tuple[int, ...], name: str, path: Path) -> FloatArray:
+    if array.dtype.kind not in "fiu" or array.shape != shape:
+        raise InputError(path, name, f"an array of {array.dtype}, {array.shape}", f"numbers, {shape}")
+    return np.asarray(array, dtype=float)
 
 
 def _series(columns: Mapping[str, FloatArray], name: str, unit: str, path: Path) -> FloatArray:

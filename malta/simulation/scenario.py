@@ -13,7 +13,7 @@ import numpy as np
 from malta.errors import InputError
 from malta.model.parameters import units_of
 from malta.model.plant import Plant
-from malta.model.sensors import split_dead_time
+from malta.model.sensors import require_short, split_dead_time
 from malta.simulation import references
 from malta.simulation.layout import FIDELITIES, Fidelity, Setup, electronics_of, fidelities
 from malta.simulation.references import Profile, Reference
@@ -222,9 +222,11 @@ def setup_of(plant: Plant, c: Controller, s: Scenario) -> Setup:
         found = "sensors with a dead time beside electronics of their own pace"
         raise InputError(f"scenario {s.name}", "fidelity", found, "force, or sensors without dead time")
     late = split_dead_time(dead_time, c.sample_time)[0] if dead_time else None
+    delay = plant.actuator.delay(c.sample_time) if s.delay is None else s.delay
+    require_short(f"scenario {s.name}", "delay", delay)
     return Setup(
         fidelity=s.fidelity,
-        delay=plant.actuator.delay(c.sample_time) if s.delay is None else s.delay,
+        delay=delay,
         quantize=s.quantize,
         disturbed=s.disturbance is not None,
         bearing=s.bearing,
@@ -254,14 +256,29 @@ def machines_of(plant: Plant, s: Scenario) -> list[Plant]:
 
 
 def substeps_of(plant: Plant, c: Controller, setup: Setup, s: Scenario) -> float:
-    """Substeps of the simulation in a sample: Runge–Kutta steps, or periods of the machine's electronics."""
+    """Substeps of the simulation in a sample: Runge–Kutta steps, or periods of the machine's electronics.
+
+    Raises InputError for more than MOST_SUBSTEPS.
+    """
     fast = electronics_of(plant, setup)
-    return steps_of(plant, c, s) if fast is None else c.sample_time / fast.period
+    if fast is None:
+        return steps_of(plant, c, s)
+    return _require_few(c.sample_time / fast.period, s, "periods of the electronics in a sample")
 
 
 def steps_of(plant: Plant, c: Controller, s: Scenario) -> int:
-    """Runge–Kutta steps in a sample: the scenario's, else one a time constant of the current loops, at least 4."""
+    """Runge–Kutta steps in a sample: the scenario's, else one a time constant of the current loops, at least 4.
+
+    Raises InputError for more than MOST_SUBSTEPS.
+    """
     if s.substeps is not None:
         return s.substeps
     lag = c.sample_time * plant.actuator.crossover
-    return max(4, math.ceil(lag)) if math.isfinite(lag) else 4
+    few = _require_few(lag, s, "time constants of the current loops in a sample") if math.isfinite(lag) else 0
+    return max(4, math.ceil(few))
+
+
+def _require_few(count: float, s: Scenario, what: str) -> float:
+    if count > MOST_SUBSTEPS:
+        raise InputError(f"scenario {s.name}", "substeps", f"{count:.3g} {what}", f"at most {MOST_SUBSTEPS}")
+    return count

@@ -16,10 +16,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from pydantic import StrictFloat, StrictStr, TypeAdapter
 from scipy import optimize, sparse
 
 from malta.errors import InputError
-from malta.files import read_file, replace_files
+from malta.files import file_exists, read_file, replace_files
 from malta.model.linearize import linearize
 from malta.synthesis.lqg import synthesize
 from malta.synthesis.requirements import requirements_for
@@ -87,6 +88,19 @@ def _text(path: Path) -> str:
     return path.read_text(encoding="utf-8")
 
 
+def _trial_of(line: str) -> tuple[str, dict[str, float]] | None:
+    """The key and the figures of a trial in a line; None for a line that was cut off or edited."""
+    try:
+        return _TRIAL.validate_json(line)
+    except ValueError:
+        return None
+
+
+_TRIAL: TypeAdapter[tuple[str, dict[str, float]]] = TypeAdapter(
+    tuple[StrictStr, dict[StrictStr, StrictFloat]]
+)
+
+
 class Journal:
     """Trials by what was tried: in memory, and one line each in a file."""
 
@@ -97,7 +111,7 @@ class Journal:
         head = json.dumps({"malta-tune": 1, "problem": problem})
         if path is None:
             return
-        old = "" if restart or not path.exists() else read_file(path, "file of trials", _text)
+        old = "" if restart or not file_exists(path) else read_file(path, "file of trials", _text)
         lines = old.split("\n") if old else []
         if lines and lines[0] != head:
             raise InputError(
@@ -108,12 +122,10 @@ class Journal:
             )
         whole = [head]
         for line in lines[1:]:
-            try:
-                key, figures = json.loads(line)
-            except ValueError:  # cut off while it was written
-                continue
-            self.known[key] = figures
-            whole.append(line)
+            trial = _trial_of(line)
+            if trial is not None:
+                self.known[trial[0]] = trial[1]
+                whole.append(line)
         replace_files({path: "\n".join([*whole, ""]).encode()})
 
     @staticmethod

@@ -23,6 +23,7 @@ from malta.report.figures.parts import (
     micro,
     published_in_unit,
 )
+from malta.simulation.digest import LARGEST_FIGURE
 from malta.units import in_unit
 
 if TYPE_CHECKING:
@@ -49,6 +50,7 @@ TOUCHES: Sequence[dict[str, Any]] = (
     {"facecolor": "#202020", "hatch": "xx"},
 )
 BINS = 40  # of a distribution
+LEFT = 1e-3  # where the lines of the worst runs begin, in the fine unit of their deviation
 
 
 def distributions_figure(found: Campaign | Summary, published: Published | None = None) -> Figure:
@@ -194,11 +196,13 @@ def worst_figure(found: Campaign | Summary, published: Published | None = None) 
     half = np.array([half_width(plan, name) for name in names])
     across = lateral_outputs(plant)[0]
     fine = in_unit(1.0, across.fine)
+    known = np.nan_to_num(runs.batch.deviation[:, across.columns], nan=np.inf)  # of runs that diverged
+    offs = np.clip(np.minimum(known, LARGEST_FIGURE) * fine, LEFT, None)
     for row, (_, style) in enumerate(zip(runs.index, (*STYLES, *MORE), strict=False)):
         where = 100 * (runs.values[row] - middle) / np.where(half == 0, 1, half)
         box.plot(at, where, marker="o", markersize=4, **style)
-        off = float(runs.batch.deviation[row, across.columns].max()) * fine
-        far.plot([1e-3, off], [row, row], **style)
+        off = float(offs[row].max())
+        far.plot([LEFT, off], [row, row], **style)
         far.plot(
             off,
             row,
@@ -212,7 +216,6 @@ def worst_figure(found: Campaign | Summary, published: Published | None = None) 
     labels = [_run_label(plan, index, end) for index, end in zip(runs.index, runs.batch.verdict, strict=True)]
     far.set_yticks(range(len(labels)), labels, fontsize=8)
     far.invert_yaxis()
-    offs = runs.batch.deviation[:, across.columns] * fine
     far.set_xscale("log")
     least = float(offs.max(axis=1).min()) if len(labels) else 1.0
     bounds = {"clearance": clearance(plant) * fine} if across.unit == "m" else {}

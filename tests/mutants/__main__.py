@@ -1,0 +1,92 @@
+"""`make mutants`: run the tests of every mutant on a copy of the project, and list those that no test notices.
+
+MUTANTS=gains,margins runs the lists of these names alone, MUTANT_JOBS=1 one mutant at a time. The tests have to pass
+without a mutant first. Exit code 1 where a mutant survives without a reason, or is noticed in spite of one.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from queue import Queue
+
+from mutants import ROOT, Mutant, mutants
+
+SECONDS = 600  # of the tests of a mutant; one that does not end is noticed
+PARTS = ("malta", "tests", "bench", "data", "design", "examples", "notebooks", "pyproject.toml", "README.md")
+
+
+def main() -> int:
+    """Run the mutants; print a line for each, and how many were noticed."""
+    lists = os.environ.get("MUTANTS", "").split(",")
+    chosen = [one for one in mutants() if lists == [""] or one.name.partition(".")[0] in lists]
+    jobs = int(os.environ.get("MUTANT_JOBS") or os.cpu_count() or 1)
+    begun = time.monotonic()
+    with tempfile.TemporaryDirectory() as scratch:
+        folders: Queue[Path] = Queue()
+        for k in range(jobs):
+            folders.put(_copy(Path(scratch) / str(k)))
+        if not _pass(folders.queue[0], sorted({test for one in chosen for test in one.tests})):
+            print("mutants: the tests fail without any")
+            return 1
+        with ThreadPoolExecutor(jobs) as pool:
+            noticed = list(pool.map(lambda one: _try(one, folders), chosen))
+    wrong = [one for one, seen in zip(chosen, noticed, strict=True) if seen == bool(one.equivalent)]
+    print(f"mutants: {sum(noticed)} of {len(chosen)} noticed, {time.monotonic() - begun:.0f} s")
+    for one in wrong:
+        print(f"mutants: {one.name}: {'noticed in spite of its reason' if one.equivalent else 'survives'}")
+    return int(bool(wrong))
+
+
+def _copy(target: Path) -> Path:
+    target.mkdir()
+    for part in PARTS:
+        source = ROOT / part
+        if source.is_dir():
+            shutil.copytree(source, target / part, ignore=shutil.ignore_patterns("__pycache__"))
+        else:
+            shutil.copy(source, target / part)
+    return target
+
+
+def _try(mutant: Mutant, folders: Queue[Path]) -> bool:
+    """Whether the tests notice a mutant."""
+    folder = folders.get()
+    path = folder / mutant.file
+    text = path.read_text(encoding="utf-8")
+    begun = time.monotonic()
+    try:
+        path.write_text(mutant.applied(text), encoding="utf-8")
+        noticed = not _pass(folder, mutant.tests)
+    finally:
+        path.write_text(text, encoding="utf-8")
+        folders.put(folder)
+    said = "noticed" if noticed else "equivalent" if mutant.equivalent else "SURVIVES"
+    print(f"{said:10} {mutant.name:16} {time.monotonic() - begun:5.0f} s  {mutant.file}", flush=True)
+    return noticed
+
+
+def _pass(folder: Path, tests: Sequence[str]) -> bool:
+    """Whether tests pass in a folder, whose malta is imported."""
+    command = [sys.executable, "-B", "-m", "pytest", "-q", "-x", "-n0", "-p", "no:cacheprovider", *tests]
+    environment = os.environ | {"PYTHONPATH": str(folder), "PYTHONDONTWRITEBYTECODE": "1"}
+    try:
+        done = subprocess.run(
+            command, cwd=folder, env=environment, timeout=SECONDS, capture_output=True, check=False
+        )
+    except subprocess.TimeoutExpired:
+        return False
+    if done.returncode not in (0, 1, 2, 3):  # 2: not even collected; 4, 5: no such tests
+        raise RuntimeError(f"pytest ended with {done.returncode}: {done.stdout[-2000:].decode()}")
+    return done.returncode == 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

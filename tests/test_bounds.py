@@ -1,0 +1,339 @@
+"""Bounds that proofs rest on, each against what it bounds: remainders, half planes, degrees, couplings, minima."""
+
+from __future__ import annotations
+
+import copy
+import itertools
+import json
+import math
+import time
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from flint import Ordering, arb, fmpq, fmpq_mpoly_ctx
+
+import malta
+from malta.margins import certificate, check, checked_file, checked_loop, degrees, enclosure, exclusion
+from malta.margins.groups import loop_of
+from malta.margins.problem import OfLoop
+from malta.margins.robust import Margin
+from malta.margins.rounding import parts
+from malta.margins.stages import _smallest
+from malta.margins.uncertain import Compensator, closed_loop
+from malta.margins.verify import Stage
+
+RANGES = {"m": 0.3, "k": 0.3}
+
+
+def _spring() -> Any:
+    def matrices(m: Any, k: Any) -> Any:
+        return [[0, 1], [-k / m, -0.2 / m]], [[0], [1 / m]], [[1, 0]]
+
+    return malta.uncertain(matrices, {"m": 1.0, "k": 4.0})
+
+
+def _sampled() -> Compensator:
+    """Samples so far apart that e^(A T) is far from linear in the parameters."""
+    none = np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), np.array([[-0.1]])
+    return Compensator(*none, sample_time=0.8)
+
+
+def _polynomial(sides: Any) -> tuple[Any, tuple[Any, ...]]:
+    problem = OfLoop(loop_of(_spring(), _sampled()), ("m", "k"))
+    ((f, moves),) = problem.parts([arb((a + b) / 2, (b - a) / 2) for a, b in sides])
+    return f, moves
+
+
+SIDES = np.array([[0.6, 1.4], [2.5, 5.5]])
+
+
+# The enclosure of the search
+
+
+def test_coefficients_lie_in_their_family() -> None:
+    f, moves = _polynomial(SIDES.tolist())
+    assert not f.exact
+    found = enclosure.over_box(f, SIDES, moves)
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        p = SIDES[:, 0] + (SIDES[:, 1] - SIDES[:, 0]) * rng.uniform(size=2)
+        v = [1 / x if inv else x for x, inv in zip(p.tolist(), f.inverted, strict=True)]
+        ends = [1 / s[::-1] if inv else s for s, inv in zip(SIDES, f.inverted, strict=True)]
+        u = [(x - a) / (b - a) for x, (a, b) in zip(v, ends, strict=True)]
+        bases = [
+            [math.comb(n - 1, k) * x**k * (1 - x) ** (n - 1 - k) for k in range(n)]
+            for n, x in zip(found.shape, u, strict=True)
+        ]
+        weights = np.array([math.prod(row) for row in itertools.product(*bases)])
+        exact = f.at([fmpq(*x.as_integer_ratio()) for x in v])
+        for k, x in enumerate(exact):
+            scaled = float(x * arb(2) ** (found.scale * k - found.exponents[k]))
+            assert abs(scaled - found.values[k] @ weights) <= found.radius[k] + 1e-12
+
+
+@pytest.mark.parametrize("degree_of", [1e-1, 1e-3, 1e-6, 1e-9])
+def test_the_remainder_of_an_interpolation_is_bounded(degree_of: float) -> None:
+    """1 / (a - x), whose pole is a little beyond the disc: what is left out at Chebyshev nodes, and its bound."""
+    radius = 4.0
+    a = 1.01 * radius
+    disc = enclosure.Disc(radius, 0.0, [(1 / (a - radius), 0)])
+    side = enclosure._interpolation_side("x", 0, [disc], min(degree_of, 1e-5))
+    if degree_of > 1e-5:
+        side = replace(side, degree=1, tails=((3.5 / radius / (radius - 1) / (a - radius), 0),))
+    d = side.degree
+    nodes = np.cos(np.pi * (np.arange(d + 1) + 0.5) / (d + 1))
+    x = np.linspace(-1, 1, 1001)
+    fitted = np.polynomial.chebyshev.Chebyshev.fit(nodes, 1 / (a - nodes), d, domain=[-1, 1])(x)
+    assert side.tails is not None
+    ((bound, exponent),) = side.tails
+    constant = 1 + 2 / math.pi * math.log(d + 1)
+    largest = 1 / (a - radius)
+    cauchy = (1 + constant) * largest * radius**-d / (radius - 1)
+    assert np.abs(fitted - 1 / (a - x)).max() <= 0.99 * cauchy + 1e-15
+    # 3.5 covers 1 + Lambda up to this degree; HIGHEST and the constants of the axes before cover the rest
+    assert (
+        math.ldexp(bound, exponent) >= min((1 + constant), 3.5) * largest * radius**-d / (radius - 1) * 0.999
+    )
+
+
+def test_bounds_add_up() -> None:
+    one, two = [(1.0, 3), (2.0, -1)], [(3.0, 0), (1.0, 2)]
+    assert enclosure._add_bounds(one, None) == one
+    assert enclosure._add_bounds(None, two) == two
+    assert enclosure._add_bounds(None, None) is None
+    both = enclosure._add_bounds(one, two)
+    assert both is not None
+    assert [math.ldexp(m, e) for m, e in both] == [11.0, 5.0]
+
+
+def test_neglected_couplings_widen_the_family() -> None:
+    f, _ = _polynomial(SIDES.tolist())
+    plain = enclosure.over_box(f, SIDES)
+    moved = enclosure.over_box(f, SIDES, [arb(1e-3)] * 3)
+    assert (moved.radius > plain.radius).all()
+    size = np.ldexp(moved.radius - plain.radius, moved.powers)
+    assert size.max() >= 1e-3
+
+
+def test_a_parameter_that_divides_must_not_reach_zero() -> None:
+    f, _ = _polynomial(SIDES.tolist())
+    assert f.inverted == (True, False)
+    with pytest.raises(enclosure.Unproven, match="divides reaches zero"):
+        enclosure.over_box(f, np.array([[-0.5, 1.4], [2.5, 5.5]]))
+
+
+def test_an_enclosure_ends_in_time() -> None:
+    f, _ = _polynomial(SIDES.tolist())
+    with pytest.raises(enclosure.Unproven, match="time"):
+        enclosure.over_box(f, SIDES, until=time.monotonic() - 1)
+
+
+# Exclusion of zero
+
+
+def test_a_half_plane_holds_all_discs() -> None:
+    """Whatever direction is found, every disc about b0 +- b1 lies beyond zero in it; some are found."""
+    rng = np.random.default_rng(1)
+    count = 4000
+    spread = 10.0 ** rng.uniform(-2, 0.5, (count, 1))
+    b0: Any = np.exp(2j * np.pi * rng.uniform(size=(count, 1))) + spread * (
+        rng.normal(size=(count, 3)) + 1j * rng.normal(size=(count, 3))
+    )
+    b1: Any = 10.0 ** rng.uniform(-3, 0.3, (count, 1)) * (
+        rng.normal(size=(count, 3)) + 1j * rng.normal(size=(count, 3))
+    )
+    radius = 10.0 ** rng.uniform(-4, 0.5, count)
+    beside: Any = 0.1 * radius[:, None] * np.ones((count, 3), dtype=complex)
+    c = exclusion.half_plane([b0, b1, beside], 0.9 * radius)
+    found = c != 0
+    assert 200 < found.sum() < count - 200
+    for sign in (1, -1):
+        inner = (np.conj(c)[:, None] * (b0 + sign * b1)).real - radius[:, None] * np.abs(c)[:, None]
+        assert (inner[found] > 0).all()
+
+
+def _search(smallest: list[float], target: float) -> exclusion.Search:
+    nothing: Any = None
+    return exclusion.Search(
+        nothing, nothing, np.zeros((0, 3)), np.zeros((0, 1, 2)), np.array(smallest), np.zeros(0), target
+    )
+
+
+def test_what_is_proven_ends_at_the_nearest_open_cell() -> None:
+    assert _search([0.3, 0.7], 1.0).lower == 0.3
+    assert _search([1.5], 1.0).lower == 1.0
+    assert _search([], 1.0).lower == 1.0
+    assert not _search([0.3, 1.5], 1.0).finished
+    assert _search([1.5], 1.0).finished
+
+
+def test_a_box_that_reaches_zero_of_what_divides_is_whole() -> None:
+    one = np.array([1.0])
+    growth = exclusion.Growth(np.array([0.2]), np.array([2.0]), (True,), one, one, one)
+    assert growth.inside(0.5).tolist() == pytest.approx(np.array([[(2 / 3 - 0.2) / 1.8, 1.0]]))
+    assert growth.inside(2.0).tolist() == [[0.0, 1.0]]
+
+
+# Degrees
+
+
+def test_degrees_are_not_below_those_of_the_determinant() -> None:
+    context = fmpq_mpoly_ctx.get(["p", "q"], Ordering.lex)
+    p, q = context.gens()
+    one = context.constant(1)
+    pool = [one, p, q, p * q, p + q, p * p, one + p, p * q + one, context.constant(0)]
+    rng = np.random.default_rng(2)
+    tables = [[[p * q, p], [p, p * q]], [[p, p], [p, p]], [[one + p, p], [p, one + p]]]
+    tables += [[[pool[k] for k in row] for row in rng.integers(len(pool), size=(3, 3))] for _ in range(200)]
+    for table in tables:
+        n = len(table)
+        determinant = context.constant(0)
+        for order in itertools.permutations(range(n)):
+            sign = round(np.linalg.det(np.eye(n)[list(order)]))
+            determinant += sign * math.prod((table[i][j] for i, j in enumerate(order)), start=one)
+        rows = [{("x", j): x for j, x in enumerate(row) if not x.is_zero()} for row in table]
+        for i in (0, 1):
+            assert degrees.determinant_degree(rows, i) >= degrees.degree(determinant, i)
+
+
+# Couplings of the size of rounding
+
+
+def _coupled(coupling: float) -> tuple[Any, Compensator]:
+    def matrices(k: Any) -> Any:
+        A = [[0, 1, 0, 0], [-k, -0.2, coupling, 0], [0, 0, 0, 1], [coupling, 0, -2 * k, -0.2]]
+        return A, [[0, 0], [1, 0], [0, 0], [0, 1]], [[1, 0, 0, 0], [0, 0, 1, 0]]
+
+    none = np.zeros((0, 0)), np.zeros((0, 2)), np.zeros((2, 0)), np.eye(2)
+    return malta.uncertain(matrices, {"k": 4.0}), Compensator(*none)
+
+
+def test_couplings_that_are_taken_as_zero_are_bounded() -> None:
+    system, law = _coupled(1e-14)
+    problem = OfLoop(loop_of(system, law), ("k",))
+    found = parts(problem.loop, problem.couplings, [arb(4.0, 0.5)])
+    assert [part.group.states for part in found] == [(0, 1), (2, 3)]
+    for part in found:
+        assert part.moves
+        assert max(float(x) for x in part.moves) >= 1e-15
+
+
+def test_sizes_of_couplings_are_bounds() -> None:
+    """Of every entry of the closed loop, at parameters throughout the balls."""
+    system, law = _coupled(0.3)
+    problem = OfLoop(loop_of(system, law), ("k",))
+    assert problem.couplings is not None
+    size = problem.couplings.bounds([arb(4.0, 1.5)])
+    for k in (2.5, 3.3, 5.5):
+        assert (np.abs(closed_loop(system, law, np.array([k]))) <= size).all()
+
+
+# Certificates
+
+
+@cache
+def _certificate() -> dict[str, Any]:
+    """The certificate of a spring with a gain, in continuous time."""
+    system, law = _spring(), replace(_sampled(), sample_time=None)
+    margin = malta.robust_margin(system, law, RANGES)
+    return certificate.certificate_of([(system, law)], RANGES, None, margin)
+
+
+def _loop() -> Any:
+    """The loop of that certificate, sampled."""
+    content = copy.deepcopy(_certificate())
+    content["loops"][0]["sample_time"] = (0.8).hex()
+    return checked_file.loop(checked_file.Field(Path("c"), "", content["loops"][0]), 2)
+
+
+def test_what_interpolation_leaves_out_is_in_the_radius() -> None:
+    """Coefficients over a box, interpolated far too coarsely and cut further: still within their Bernstein balls."""
+    (f,) = checked_loop.split(_loop())
+    box = [(1 / fmpq(b), 1 / fmpq(a)) if i in inverted else (fmpq(a), fmpq(b)) for i, inverted, (a, b) in (
+        (0, {0} if f.group.inverted[0] else set(), (fmpq(6, 10), fmpq(14, 10))),
+        (1, {1} if f.group.inverted[1] else set(), (fmpq(25, 10), fmpq(55, 10))),
+    )]  # fmt: skip
+    for degree, kept in ((1, 0), (2, 1), (4, 1), (4, 4)):
+        axes = [checked_file.Axis(degree, fmpq(3, 2), kept)] * 2
+        values, left = check.interpolated(f, box, axes)
+        balls, shape = check.bernstein(values, left, axes)
+        each = math.prod(shape)
+        for at in itertools.product((0.0, 0.21, 0.5, 0.83, 1.0), repeat=2):
+            exact = f.at([a + (b - a) * arb(u) for (a, b), u in zip(box, at, strict=True)])
+            for k, x in enumerate(exact):
+                own = balls[k * each : (k + 1) * each]
+                assert float(min(y.lower() for y in own)) <= float(x.upper()) + 1e-12
+                assert float(max(y.upper() for y in own)) >= float(x.lower()) - 1e-12
+
+
+def test_what_is_left_out_is_at_least_the_error_of_the_interpolant() -> None:
+    (f,) = checked_loop.split(_loop())
+    box = [(fmpq(7, 10), fmpq(17, 10)), (fmpq(25, 10), fmpq(55, 10))]
+    axes = [checked_file.Axis(1, fmpq(3, 2), 1)] * 2
+    values, left = check.interpolated(f, box, axes)
+    for at in itertools.product((0.0, 0.5, 1.0), repeat=2):
+        exact = f.at([a + (b - a) * arb(u) for (a, b), u in zip(box, at, strict=True)])
+        t = [[1.0, 1 - 2 * u] for u in at]
+        for k, x in enumerate(exact):
+            own = sum(float(values[4 * k + 2 * i + j]) * t[0][i] * t[1][j] for i in (0, 1) for j in (0, 1))
+            assert abs(float(x) - own) <= float(left[k].upper()) + 1e-12
+
+
+def test_a_claim_in_which_a_mass_vanishes_is_refused(tmp_path: Path) -> None:
+    content = copy.deepcopy(_certificate())
+    content["lower"] = (4.0).hex()
+    for part in content["loops"][0]["groups"][0]["parts"]:
+        part["box"] = [[(-0.3).hex(), (2.3).hex()], [(-0.9).hex(), (8.9).hex()]]
+    content["sha256"] = checked_file.digest(content)
+    path = tmp_path / "c.json"
+    path.write_text(json.dumps(content))
+    found = check.check(path)
+    assert not found.ok
+    assert "a parameter that divides reaches zero" in found.failures[0]
+
+
+def test_sizes_are_those_of_whole_balls() -> None:
+    assert float(checked_loop.upper(arb(1, 0.5))) >= 1.5
+    assert float(checked_loop.upper(arb(-2, 0.5))) >= 2.5
+
+
+def test_doubles_below_exact_numbers() -> None:
+    rng = np.random.default_rng(3)
+    for p, q in rng.integers(1, 10**12, (500, 2)).tolist():
+        for x in (fmpq(p, q), fmpq(-p, q)):
+            low = certificate._below(x)
+            assert fmpq(*low.as_integer_ratio()) <= x
+            assert low == pytest.approx(p / q if x > 0 else -p / q, rel=1e-15)
+
+
+def test_expressions_have_a_length() -> None:
+    context = fmpq_mpoly_ctx.get(["p", "q"], Ordering.lex)
+    p, q = context.gens()
+    with pytest.raises(checked_loop.Refused, match="too long"):
+        checked_loop.Ratio((1 + p + q) ** 80, context.constant(1))
+
+
+# What counts as proven
+
+
+def _margin(lower: float | None, upper: float, reason: str = "") -> Margin:
+    return Margin(lower, upper, None, None, {}, {}, (), 0.0, reason)
+
+
+def test_the_margin_of_several_places_is_the_smallest() -> None:
+    found = _smallest([_margin(1.0, 2.0), _margin(0.5, 3.0)])
+    assert (found.lower, found.upper) == (0.5, 2.0)
+
+
+def test_a_place_without_a_proof_leaves_nothing_proven() -> None:
+    found = _smallest([_margin(1.0, 2.0), _margin(None, 3.0, "too wide"), _margin(0.5, 4.0)])
+    assert (found.lower, found.upper, found.reason) == (None, 2.0, "too wide")
+
+
+@pytest.mark.parametrize(("radius", "stable"), [(0.999, True), (1.0, False), (1.5, False), (math.nan, False)])
+def test_a_loop_is_stable_below_one(radius: float, stable: bool) -> None:
+    assert Stage("loop", {}, 0.0, radius).stable is stable
