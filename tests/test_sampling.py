@@ -37,8 +37,8 @@ def test_every_stratum_has_one_point_and_blocks_change_none(
 
 @pytest.mark.parametrize("size", [3, 4, pytest.param(7, marks=pytest.mark.slow)])
 def test_all_permutations_come_equally_often(size: int) -> None:
-    """Chi-squared of 20 keys for each: with 12 rounds, or with both sides odd, 7 numbers fail by far."""
-    numbers, times = np.arange(size, dtype=np.uint64), 20
+    """Chi-squared of so many keys for each: 7 numbers fail with 12 rounds, and with both sides odd."""
+    numbers, times = np.arange(size, dtype=np.uint64), 6
     every = math.factorial(size)
     found = Counter(tuple(permute(numbers, size, key).tolist()) for key in keys(3, np.arange(times * every)))
     squares = sum((n - times) ** 2 for n in found.values()) + (every - len(found)) * times**2
