@@ -270,6 +270,26 @@ def test_what_interpolation_leaves_out_is_in_the_radius() -> None:
                 assert float(max(y.upper() for y in own)) >= float(x.lower()) - 1e-12
 
 
+def test_terms_that_are_not_kept_are_in_the_radius() -> None:
+    """Interpolation leaves out next to nothing here: what the balls have to cover are the terms that are cut."""
+    (f,) = checked_loop.split(_loop())
+    box = [(fmpq(9, 10), fmpq(11, 10)), (fmpq(36, 10), fmpq(44, 10))]
+    axes = [checked_file.Axis(8, fmpq(3), 0)] * 2
+    balls, shape = check.bernstein(*check.interpolated(f, box, axes), axes)
+    assert shape == (1, 1)
+    for at in itertools.product((0.0, 1.0), repeat=2):
+        exact = f.at([a + (b - a) * arb(u) for (a, b), u in zip(box, at, strict=True)])
+        assert all(ball.contains(x.mid()) for ball, x in zip(balls, exact, strict=True))
+
+
+def test_cells_that_overlap_tile_nothing() -> None:
+    """Their volumes add up to that of the box, and half of it is not covered."""
+    half, whole = fmpq(1, 2), [(fmpq(0), fmpq(1))] * 2
+    left = ((fmpq(0), half), (fmpq(0), fmpq(1)))
+    assert not check.tiled([left, left], whole)
+    assert check.tiled([left, ((half, fmpq(1)), (fmpq(0), fmpq(1)))], whole)
+
+
 def test_what_is_left_out_is_at_least_the_error_of_the_interpolant() -> None:
     (f,) = checked_loop.split(_loop())
     box = [(fmpq(7, 10), fmpq(17, 10)), (fmpq(25, 10), fmpq(55, 10))]
@@ -337,3 +357,50 @@ def test_a_place_without_a_proof_leaves_nothing_proven() -> None:
 @pytest.mark.parametrize(("radius", "stable"), [(0.999, True), (1.0, False), (1.5, False), (math.nan, False)])
 def test_a_loop_is_stable_below_one(radius: float, stable: bool) -> None:
     assert Stage("loop", {}, 0.0, radius).stable is stable
+
+
+def test_an_unstable_loop_is_refused_though_zero_is_excluded(tmp_path: Path) -> None:
+    """With the damping's sign turned, a(jw) is conjugate to that of the stable loop: every cell still excludes zero."""
+    content = copy.deepcopy(_certificate())
+    loop = content["loops"][0]
+    turned = [step for step in loop["steps"] if step[0] == "const" and abs(float.fromhex(step[3])) == 0.2]
+    assert turned
+    for step in turned:
+        step[3] = (-float.fromhex(step[3])).hex()
+    for part in loop["groups"][0]["parts"]:
+        for cell in part["cells"]:
+            cell[5] = -cell[5]
+    content["sha256"] = checked_file.digest(content)
+    path = tmp_path / "c.json"
+    path.write_text(json.dumps(content))
+    assert check.check(path).failures == ("loop, group 1: the nominal loop is not shown to be stable",)
+
+
+def _field(value: Any) -> checked_file.Field:
+    return checked_file.Field(Path("c"), "x", value)
+
+
+def test_fields_of_certificates_have_bounds() -> None:
+    for value in (1e-91, -1e-300, 1e91, math.inf, math.nan, 2**53 + 1, "0x1p-400", "x" * 41, True):
+        with pytest.raises(malta.InputError):
+            _field(value).number()
+    assert _field(0).number() == _field("0x0p0").number() == 0
+    for power in (33.0, -33.0, 0.5):
+        with pytest.raises(malta.InputError, match="a whole power up to 32"):
+            checked_file.step(_field(["constpow", 0, [0], power]), 1, 1)
+    assert checked_file.step(_field(["constpow", 0, [0], 32.0]), 1, 1)[0] == "constpow"
+    several: tuple[Any, ...] = ([1], [1, 2, 3], {}, None)
+    for items in several:
+        with pytest.raises(malta.InputError, match="a list of 2 to 2 items"):
+            _field(items).items(2)
+    with pytest.raises(malta.InputError, match="low, high"):
+        _field([2.0, 1.0]).pair()
+
+
+def test_certificates_have_a_size(tmp_path: Path) -> None:
+    path = tmp_path / "c.json"
+    path.write_bytes(b" " * (checked_file.LARGEST + 1))
+    with pytest.raises(
+        malta.InputError, match="found 4000001 bytes, expected a certificate of at most 4000000"
+    ):
+        check.check(path)

@@ -1,0 +1,119 @@
+"""Gain files in their three forms, with seals renewed."""
+
+from __future__ import annotations
+
+import io
+import json
+import zipfile
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import ValidationError
+
+import malta
+from fuzz.cases import ROOT, Case, require_finite
+from fuzz.edits import cut, edited
+from fuzz.oracle import Defect, Ended, line, observe
+from malta.campaigns.plan import box_of
+from malta.gains import encodings
+from malta.gains.file import content_of
+from malta.gains.schema import GainFile
+
+
+@cache
+def gain_document(name: str) -> dict[str, Any]:
+    """The document of a gain file; "linear": of a loop of plain matrices."""
+    if name != "linear":
+        return encodings.decode(ROOT / "design" / "gains" / f"{name}.json")
+    plant = malta.linear_machine(
+        [[0, 1], [100, -1]], [[0], [2]], [[1, 0]],
+        name="cart", states=["z [m]", "v [m/s]"], inputs=["u [N]"], outputs=["z [m]"],
+        nominal={"k": 1.0}, terms={"k": [[[0, 0], [1, 0]]]}, noise=1e-6, limit=10.0,
+    )  # fmt: skip
+    model = malta.linearize(plant, plant.at())
+    weights = malta.weights([10, 1], [1], [1e-2], [1e-8], q_i=[10])
+    controller = malta.lqg(model, weights, 1e-3, name="cart")
+    return malta.gains.document(controller, malta.verify(model, controller))
+
+
+def _signed(document: Any) -> Any:
+    """A document with the sha256 of what its reader makes of it."""
+    if not isinstance(document, dict):
+        return document
+    try:
+        plain = GainFile.model_validate(document).model_dump(by_alias=True, exclude_unset=True)
+    except (ValidationError, RecursionError, ValueError):
+        return document
+    return document | {"sha256": encodings.content_sha256(plain)}
+
+
+def _gain_json(document: Any, case: Case) -> bytes:
+    return cut(json.dumps(document).encode(errors="surrogatepass"), case.cuts)
+
+
+def _gain_npz(document: Any, case: Case) -> bytes:
+    """Cuts change the members before their checksums are made."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:
+        entries = list(encodings._flat(encodings._columns(document)).items())
+        chosen = int(case.cuts[0].at * len(entries)) if case.cuts and case.sealed else -1
+        for k, (name, value) in enumerate(entries):
+            member = io.BytesIO()
+            np.lib.format.write_array(member, np.zeros(0) if value is None else np.array(value))
+            data = cut(member.getvalue(), case.cuts[1:] or case.cuts) if k == chosen else member.getvalue()
+            archive.writestr(zipfile.ZipInfo(f"{name}.npy"), data)
+    return buffer.getvalue() if case.sealed else cut(buffer.getvalue(), case.cuts)
+
+
+def _gain_mat(document: Any, case: Case) -> bytes:
+    body = cut(encodings._to_mat(document)[encodings.MAT_HEADER :], case.cuts)
+    return encodings.mat_header(body) + body
+
+
+_FORMS: dict[str, Callable[[Any, Case], bytes]] = {
+    ".json": _gain_json,
+    ".npz": _gain_npz,
+    ".mat": _gain_mat,
+}
+
+
+def read_gain_file(case: Case, folder: Path, suffix: str) -> Ended | None:
+    """Read a gain file; None where this form cannot hold the edited document. What was read is finite."""
+    document = edited(gain_document(case.base), case.edits)
+    path = folder / f"mine{suffix}"
+    try:
+        path.write_bytes(_FORMS[suffix](_signed(document) if case.sealed else document, case))
+    except Exception:  # numpy and scipy do not write every document
+        return None
+    ended = observe(lambda: malta.gains.read(path), folder, [str(path)])
+    if ended.code == 0:
+        require_finite(ended.value)
+        if not case.sealed and not case.cuts and content_of(path)[1] != _content(case.base):
+            raise Defect("a changed document with the old seal was read")
+    return ended
+
+
+@cache
+def _content(name: str) -> dict[str, Any]:
+    """The document of a gain file as its reader returns it."""
+    return GainFile.model_validate(gain_document(name)).model_dump(by_alias=True, exclude_unset=True)
+
+
+def read_shares_of(case: Case, folder: Path) -> Ended | None:
+    """Read the spread of a campaign from a gain file."""
+    path = folder / "mine.json"
+    document = edited(gain_document(case.base), case.edits)
+    path.write_bytes(_gain_json(_signed(document), case))
+    read = observe(lambda: malta.gains.read(path), folder, [str(path)])
+    return observe(lambda: box_of(path), folder, [str(path)]) if read.code == 0 else read
+
+
+def show_scenarios(case: Case, folder: Path) -> Ended | None:
+    """`malta simulate FILE --scenario help`, which reads a gain file as every command does."""
+    path = folder / "mine.json"
+    document = edited(gain_document(case.base), case.edits)
+    path.write_bytes(_gain_json(_signed(document), case))
+    return observe(line("simulate", str(path), "--scenario", "help"), folder, [str(path)])

@@ -1,0 +1,207 @@
+"""What malta keeps or measures: campaigns, certificates, logs, trials."""
+
+from __future__ import annotations
+
+import io
+import json
+import tempfile
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import malta
+from fuzz.cases import ROOT, Case
+from fuzz.edits import cut, edited
+from fuzz.oracle import Defect, Ended, observe
+from malta.campaigns.plan import Plan
+from malta.campaigns.run import campaign
+from malta.campaigns.store import MANIFEST, block_name, read_plan, seal
+from malta.margins import certificate, checked_file
+from malta.margins.check import check
+from malta.margins.uncertain import Compensator
+from malta.report import campaign_tables
+from malta.simulation.force_log import columns_of_log, read_log
+from malta.simulation.recording import record
+from malta.tuning.search import Journal
+
+PATIENCE = 3.0  # s for the check of a certificate
+
+
+QUICK: dict[str, Any] = {"fidelity": "force", "duration": 0.01, "rise": 3e-3}
+
+
+@cache
+def _plan() -> Plan:
+    controller = malta.gains.read(ROOT / "design" / "gains" / "calibrated.json")
+    return Plan(controller, spread={"m": 0.2, "K_A": 0.2}, samples=16, options=QUICK)
+
+
+@cache
+def _campaign_files() -> dict[str, bytes]:
+    """The files of a sound campaign of two blocks."""
+    with tempfile.TemporaryDirectory() as folder:
+        campaign(_plan(), folder, block=8)
+        return {path.name: path.read_bytes() for path in Path(folder).iterdir()}
+
+
+def read_campaign(case: Case, folder: Path) -> Ended | None:
+    """Go on with a campaign whose manifest or second block was edited."""
+    files = dict(_campaign_files())
+    name = block_name(8) if case.base == "block" else MANIFEST
+    try:
+        files[name] = _block(files[name], case) if case.base == "block" else _manifest(files[name], case)
+    except Exception:  # numpy does not write every array
+        return None
+    for key, data in files.items():
+        (folder / key).write_bytes(data)
+    path = str(folder / name)
+    if case.base != "block":
+        ended = observe(lambda: read_plan(folder, _plan().controller), folder, [path])
+        if ended.code == 0 and ended.value.manifest != _without_block(files[MANIFEST]):
+            raise Defect("a plan of another manifest was read")
+        return ended
+    ended = observe(lambda: _go_on(folder), None, [path])
+    left = {entry.name for entry in folder.iterdir()} - set(files)
+    if left:
+        raise Defect(f"files left behind: {left}")
+    return ended
+
+
+def _without_block(manifest: bytes) -> dict[str, Any]:
+    content: dict[str, Any] = json.loads(manifest)
+    return {key: value for key, value in content.items() if key != "block"}
+
+
+def _go_on(folder: Path) -> Any:
+    found = campaign(_plan(), folder)
+    if len(found.index) != 16 or not np.isfinite(found.batch.duration).all():
+        raise Defect("runs that no campaign can leave")
+    campaign_tables(found, None, 3)
+    return found
+
+
+def _manifest(data: bytes, case: Case) -> bytes:
+    return cut(json.dumps(edited(json.loads(data), case.edits)).encode(), case.cuts)
+
+
+def _block(data: bytes, case: Case) -> bytes:
+    """A block with edited arrays and a new seal; cuts change the file, and the old seal stays."""
+    if case.cuts:
+        return cut(data, case.cuts)
+    with np.load(io.BytesIO(data)) as file:
+        tree = {name: file[name].tolist() for name in file.files}
+    arrays: dict[str, Any] = {name: np.array(value) for name, value in edited(tree, case.edits).items()}
+    if case.sealed:
+        arrays["seal"] = np.array(seal({k: v for k, v in arrays.items() if k != "seal"}, 8))
+    buffer = io.BytesIO()
+    np.savez(buffer, **arrays)
+    return buffer.getvalue()
+
+
+@cache
+def _certificate(name: str) -> dict[str, Any]:
+    def matrices(m: Any, k: Any) -> Any:
+        return [[0, 1], [-k / m, -0.2 / m]], [[0], [1 / m]], [[1, 0]]
+
+    system = malta.uncertain(matrices, {"m": 1.0, "k": 4.0})
+    none = np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), np.array([[1.0]])
+    own = np.array([[0.5]]), np.array([[1.0]]), np.array([[0.3]]), np.array([[-0.4]])
+    law = (
+        Compensator(*none) if name == "continuous" else Compensator(*own, sample_time=0.05, delay=1, lag=50.0)
+    )
+    ranges = {"m": 0.1, "k": 0.1}
+    margin = malta.robust_margin(system, law, ranges)
+    return certificate.certificate_of([(system, law)], ranges, None, margin)
+
+
+def check_certificate(case: Case, folder: Path) -> Ended | None:
+    """Check an edited certificate; one that claims more than the loop has must not hold."""
+    original = _certificate(case.base)
+    content = edited(original, case.edits)
+    if case.sealed and isinstance(content, dict):
+        content["sha256"] = checked_file.digest(content)
+    path = folder / "mine.json"
+    path.write_bytes(cut(json.dumps(content).encode(errors="surrogatepass"), case.cuts))
+    ended = observe(lambda: check(path, seconds=PATIENCE), folder, [str(path)])
+    if ended.code == 0 and ended.value.ok and isinstance(content, dict):
+        _require_true(content, original, ended.value.claim)
+    return ended
+
+
+def _require_true(content: dict[str, Any], original: dict[str, Any], claim: float) -> None:
+    """Raise Defect where a certificate of the same loop and the same box holds for more than the margin."""
+    same = all(content.get(key) == original[key] for key in ("parameters", "gains"))
+    described = [key for key in original["loops"][0] if key not in ("groups", "units")]
+    loops: Any = content.get("loops")
+    same = same and isinstance(loops, list) and len(loops) == 1 and isinstance(loops[0], dict)
+    same = same and all(loops[0].get(key) == original["loops"][0][key] for key in described)
+    if same and claim > 1.002 * float.fromhex(original["lower"]):
+        raise Defect(f"{claim} is proven, where the margin is {float.fromhex(original['lower'])}")
+
+
+@cache
+def _log_rows() -> tuple[tuple[str, ...], Any]:
+    """The columns of a slow stroke there and back of the tubular machine."""
+    plant = _plan().plant
+    t = np.linspace(0, 6, 1200)
+    z = -0.99 * plant.travel * np.cos(np.pi * t / 3)
+    forces = np.outer(1 + z / plant.travel, [0.1, 1.0, -0.2, 2.0, 0.5])
+    return columns_of_log(plant), np.column_stack([t, z, forces])
+
+
+def read_log_file(case: Case, folder: Path) -> Ended | None:
+    """Read a log as .csv or .npz and record v0(z) from it where it can be read."""
+    headings, rows = _log_rows()
+    path = folder / f"mine.{case.base}"
+    tree = {"headings": list(headings), "rows": rows.tolist()}
+    try:
+        tree = edited(tree, case.edits)
+        path.write_bytes(_csv(tree, case) if case.base == "csv" else _log_npz(tree, case))
+    except Exception:  # numpy does not write every array
+        return None
+    plant = _plan().plant
+
+    def recorded() -> Any:
+        return record(read_log(path, plant), plant)
+
+    ended = observe(recorded, folder, [str(path)])
+    if ended.code == 0 and not np.isfinite(ended.value.v0).all():
+        raise Defect(f"v0 was recorded as {ended.value.v0}")
+    return ended
+
+
+def _csv(tree: Any, case: Case) -> bytes:
+    lines = [",".join(map(str, row)) for row in (tree["headings"], *tree["rows"])]
+    return cut("\n".join(lines).encode(errors="surrogatepass"), case.cuts)
+
+
+def _log_npz(tree: Any, case: Case) -> bytes:
+    buffer = io.BytesIO()
+    rows = np.array(tree["rows"])
+    headings = np.array(tree["headings"])
+    arrays: dict[str, Any] = {"t": rows[:, 0], "y": rows[:, 1:2], "y_columns": headings[1:2]}
+    np.savez(buffer, **arrays, v=rows[:, 2:], v_columns=headings[2:])
+    return cut(buffer.getvalue(), case.cuts)
+
+
+def read_trials(case: Case, folder: Path) -> Ended | None:
+    """Read the journal of a search."""
+    lines: list[Any] = [
+        {"malta-tune": 1, "problem": "p"},
+        ["a", {"margin": 3.0, "motion y": 1e-6}],
+        ["b", {}],
+    ]
+    changed = edited(lines, case.edits)
+    if not isinstance(changed, list):
+        return None
+    path = folder / "mine_trials.jsonl"
+    path.write_bytes(cut("\n".join(json.dumps(entry) for entry in [*changed, ""]).encode(), case.cuts))
+    ended = observe(lambda: Journal(path, "p", restart=False), None, [str(path)])
+    if ended.code == 0:
+        for key, figures in ended.value.known.items():
+            sound = isinstance(key, str) and isinstance(figures, dict)
+            if not sound or not all(isinstance(x, int | float) for x in figures.values()):
+                raise Defect(f"a trial {key!r}: {figures!r}")
+    return ended
