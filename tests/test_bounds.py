@@ -132,6 +132,15 @@ def test_an_enclosure_ends_in_time() -> None:
         enclosure.over_box(f, SIDES, until=time.monotonic() - 1)
 
 
+def test_an_enclosure_ends_in_time_where_later_places_take_longer(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first place says nothing of the others: the clock stands until it is estimated what they take."""
+    f, _ = _polynomial(SIDES.tolist())
+    clock = iter([0.0, 0.0, 0.0])
+    monkeypatch.setattr(time, "monotonic", lambda: next(clock, 1e9))
+    with pytest.raises(enclosure.Unproven, match="time was up before the coefficients were found"):
+        enclosure._values(f, [(fmpq(1), fmpq(4))] * 3, until=1.0)
+
+
 # Exclusion of zero
 
 
