@@ -109,3 +109,23 @@ def test_bombs_are_refused_by_all_that_read_archives(tmp_path: Path) -> None:
     plant = malta.plant_of(malta.read(ROOT / "data" / "tubular.toml", "table1"))
     assert "compressed" in refusal(lambda: gains.read(path), path).found
     assert refusal(lambda: read_log(path, plant), path).expected == "an .npz archive of a run, not compressed"
+
+
+def test_an_array_that_stands_twice_is_refused() -> None:
+    """Readers would differ in which of the two they take."""
+    with pytest.warns(UserWarning, match="Duplicate name"):
+        data = archive(("t.npy", npy("(1,)", content=bytes(8))), ("t.npy", npy("(1,)", content=bytes(8))))
+    with pytest.raises(ValueError, match="t stands twice"):
+        read_npz(data)
+
+
+@pytest.mark.parametrize("kind", ["<M8[s]", "<m8[s]", "|S8", "|V8"])
+def test_arrays_of_neither_numbers_nor_text_are_refused(kind: str) -> None:
+    with pytest.raises(ValueError, match="t is an array of "):
+        read_npz(archive(("t.npy", npy("(1,)", kind, bytes(8)))))
+
+
+def test_another_version_of_the_format_is_refused() -> None:
+    data = npy("(1,)", content=bytes(8))
+    with pytest.raises(ValueError, match=r"t has the version \(3, 0\) of its format"):
+        read_npz(archive(("t.npy", data[:6] + b"\x03\x00" + data[8:])))

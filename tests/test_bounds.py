@@ -413,3 +413,13 @@ def test_certificates_have_a_size(tmp_path: Path) -> None:
         malta.InputError, match="found 4000001 bytes, expected a certificate of at most 4000000"
     ):
         check.check(path)
+
+
+def test_nothing_is_proven_unless_the_nominal_loop_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Poles in floating point say that it is stable; without the proof of that, cells prove nothing."""
+    law = replace(_sampled(), sample_time=None)
+    assert malta.robust_margin(_spring(), law, RANGES).lower is not None
+    monkeypatch.setattr("malta.margins.search.is_nominal_stable", lambda *_: False)
+    found = malta.robust_margin(_spring(), law, RANGES)
+    assert found.lower is None
+    assert "the nominal loop is not proven stable" in found.reason

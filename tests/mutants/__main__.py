@@ -19,7 +19,7 @@ from queue import Queue
 
 from mutants import ROOT, Mutant, mutants
 
-SECONDS = 600  # of the tests of a mutant; one that does not end is noticed
+SECONDS = 300  # of the tests of a mutant; one that does not end is noticed
 PARTS = ("malta", "tests", "bench", "data", "design", "examples", "notebooks", "pyproject.toml", "README.md")
 
 
