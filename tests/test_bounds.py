@@ -423,3 +423,15 @@ def test_nothing_is_proven_unless_the_nominal_loop_is(monkeypatch: pytest.Monkey
     found = malta.robust_margin(_spring(), law, RANGES)
     assert found.lower is None
     assert "the nominal loop is not proven stable" in found.reason
+
+
+def test_frequencies_that_no_cell_covers_are_missed(tmp_path: Path) -> None:
+    """Without the cells of the highest s = jx, those of s = j / x begin beyond the gap."""
+    content = copy.deepcopy(_certificate())
+    for part in content["loops"][0]["groups"][0]["parts"]:
+        low = [cell[1] for cell in part["cells"] if cell[0] == 0]
+        part["cells"] = [cell for cell in part["cells"] if cell[0] == 1 or cell[1] < max(low)]
+    content["sha256"] = checked_file.digest(content)
+    path = tmp_path / "c.json"
+    path.write_text(json.dumps(content))
+    assert check.check(path).failures == ("loop, group 1: frequencies between the two branches are missing",)

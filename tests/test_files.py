@@ -9,10 +9,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from conftest import refusal
 
 import malta
 from malta.campaigns.store import read_manifest
-from malta.files import replace_files, temporary_name
+from malta.files import read_file, replace_files, temporary_name
 from malta.margins import checked_file
 from malta.simulation.force_log import read_log
 from malta.tables import load_toml
@@ -243,3 +244,11 @@ def test_pipe_in_the_place_of_a_file_stays(tmp_path: Path) -> None:
         replace_files({pipe: b"1"})
     assert pipe.is_fifo()
     assert names(tmp_path) == ["x.bin"]
+
+
+def test_a_reader_may_have_a_limit_of_its_own(tmp_path: Path) -> None:
+    path = tmp_path / "block"
+    path.write_bytes(b"0123456789")
+    assert read_file(path, "block", Path.read_bytes, 10) == b"0123456789"
+    error = refusal(lambda: read_file(path, "block", Path.read_bytes, 9), path)
+    assert (error.found, error.expected) == ("10 bytes", "a block of at most 9")
