@@ -394,6 +394,9 @@ def test_fields_of_certificates_have_bounds() -> None:
         with pytest.raises(malta.InputError):
             _field(value).number()
     assert _field(0).number() == _field("0x0p0").number() == 0
+    for whole in (-1, 5, 10**9, 1.0, True):
+        with pytest.raises(malta.InputError, match="a whole number from 0 to 4"):
+            _field(whole).whole(0, 4)
     for power in (33.0, -33.0, 0.5):
         with pytest.raises(malta.InputError, match="a whole power up to 32"):
             checked_file.step(_field(["constpow", 0, [0], power]), 1, 1)

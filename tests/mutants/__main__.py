@@ -1,7 +1,8 @@
 """`make mutants`: run the tests of every mutant on a copy of the project, and list those that no test notices.
 
-MUTANTS=gains,margins runs the lists of these names alone, MUTANT_JOBS=1 one mutant at a time. The tests have to pass
-without a mutant first. Exit code 1 where a mutant survives without a reason, or is noticed in spite of one.
+MUTANTS=gains,margins runs the lists of these names alone, MUTANT_JOBS=1 one mutant at a time; MUTANT_SECONDS=60 ends
+the tests of a mutant that hangs. The tests have to pass without a mutant first. Exit code 1 where a mutant survives
+without a reason, or is noticed in spite of one.
 """
 
 from __future__ import annotations
@@ -19,7 +20,9 @@ from queue import Queue
 
 from mutants import ROOT, Mutant, mutants
 
-SECONDS = 300  # of the tests of a mutant; one that does not end is noticed
+SECONDS = float(
+    os.environ.get("MUTANT_SECONDS") or 300
+)  # of the tests of a mutant: those that do not end notice it
 PARTS = ("malta", "tests", "bench", "data", "design", "examples", "notebooks", "pyproject.toml", "README.md")
 
 
@@ -33,7 +36,7 @@ def main() -> int:
         folders: Queue[Path] = Queue()
         for k in range(jobs):
             folders.put(_copy(Path(scratch) / str(k)))
-        if not _pass(folders.queue[0], sorted({test for one in chosen for test in one.tests})):
+        if not _pass(folders.queue[0], sorted({test for one in chosen for test in one.tests}), None):
             print("mutants: the tests fail without any")
             return 1
         with ThreadPoolExecutor(jobs) as pool:
@@ -64,7 +67,7 @@ def _try(mutant: Mutant, folders: Queue[Path]) -> bool:
     begun = time.monotonic()
     try:
         path.write_text(mutant.applied(text), encoding="utf-8")
-        noticed = not _pass(folder, mutant.tests)
+        noticed = not _pass(folder, mutant.tests, SECONDS)
     finally:
         path.write_text(text, encoding="utf-8")
         folders.put(folder)
@@ -73,13 +76,13 @@ def _try(mutant: Mutant, folders: Queue[Path]) -> bool:
     return noticed
 
 
-def _pass(folder: Path, tests: Sequence[str]) -> bool:
-    """Whether tests pass in a folder, whose malta is imported."""
+def _pass(folder: Path, tests: Sequence[str], seconds: float | None) -> bool:
+    """Whether tests pass in time in a folder, whose malta is imported."""
     command = [sys.executable, "-B", "-m", "pytest", "-q", "-x", "-n0", "-p", "no:cacheprovider", *tests]
     environment = os.environ | {"PYTHONPATH": str(folder), "PYTHONDONTWRITEBYTECODE": "1"}
     try:
         done = subprocess.run(
-            command, cwd=folder, env=environment, timeout=SECONDS, capture_output=True, check=False
+            command, cwd=folder, env=environment, timeout=seconds, capture_output=True, check=False
         )
     except subprocess.TimeoutExpired:
         return False
