@@ -25,6 +25,7 @@ from malta.simulation.experiments import PlannedRun, fly_all
 from malta.simulation.force_log import columns_of_log, read_log
 from malta.simulation.scenario import Scenario
 from malta.tuning.search import Journal
+from malta.units import to_si
 
 TABLE2 = "design/gains/table2.json"
 LONG = "w" * 5000
@@ -310,3 +311,21 @@ def test_trials_that_are_none_are_tried_again(tmp_path: Path, line: str) -> None
     journal = Journal(path, "p", restart=False)
     assert journal.known == {"b": {"margin": 3.0, "motion": np.inf}}
     assert path.read_text(encoding="utf-8") == f"{head}\n{whole}\n"
+
+
+HUGE = f"{'km^9 ' * 6}m / ({'m^9 ' * 5}m^9)"  # 1e162 m
+
+
+@pytest.mark.parametrize(
+    "unit",
+    ["2 m", "m^99", "m^-12", "((((m))))", "1 " * 100 + "m", HUGE, "m + m", "m.real", "kg", "Hz", "(", "1/"],
+)  # fmt: skip
+def test_what_is_no_unit_of_a_length_is_refused(unit: str) -> None:
+    """Numbers, high powers, deep parentheses, long texts, sizes beyond all measure, other dimensions."""
+    with pytest.raises(InputError, match=r"x\.unit: found .*, expected a unit of m"):
+        to_si(1.0, unit, "m", "a.toml", "x")
+
+
+def test_products_of_units_are_read() -> None:
+    assert to_si(1.0, "(((m)))", "m", "a.toml", "x") == 1.0
+    assert to_si(1.0, "m^9 / m^8", "m", "a.toml", "x") == 1.0
