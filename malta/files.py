@@ -45,8 +45,8 @@ def locate(path: str | Path) -> Path:
 
 def require_plain_name(name: str, where: str | Path, field: str) -> None:
     """Raise InputError for a name that is to be part of a file's name and could lead to another folder."""
-    if not re.fullmatch(r"\w[\w .,()+-]{0,79}", name):
-        expected = "letters, digits, spaces and . , ( ) + - _, at most 80, as in the name of a file"
+    if not re.fullmatch(r"\w[\w .,()\[\]$+-]{0,79}", name):
+        expected = "letters, digits, spaces and . , ( ) [ ] $ + - _, at most 80, as in the name of a file"
         raise InputError(where, field, repr(name), expected)
 
 

@@ -482,8 +482,9 @@ def test_a_variable_without_effect_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.fixture
-def run(run: Run) -> Run:
-    """Run `malta tune ARGUMENTS`."""
+def run(run: Run, monkeypatch: pytest.MonkeyPatch) -> Run:
+    """Run `malta tune ARGUMENTS`, without a word on how far it is, however slow the machine."""
+    monkeypatch.setattr("malta.cli.output.PATIENCE", math.inf)
     return partial(run, "tune")
 
 
@@ -566,7 +567,7 @@ def test_a_trial_keeps_what_is_not_varied(spec: Spec) -> None:
 
 def test_trials_that_cannot_be_kept_or_read_are_one_sentence(spec: Spec, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("", encoding="utf-8")
-    with pytest.raises(malta.InputError, match="a place to keep the trials"):
+    with pytest.raises(malta.InputError, match="a place to write the file to"):
         Journal(tmp_path / "file" / "trials.jsonl", problem_sha256(spec), restart=False)
     foreign = tmp_path / "foreign.jsonl"
     foreign.write_bytes(b"\xff\xfe\x00")
