@@ -52,9 +52,8 @@ def sketch_of(values: FloatArray) -> Sketch:
     """The sketch of some finite values."""
     if not len(values):
         return Sketch()
-    return _settled(
-        Sketch(len(values), float(values.min()), float(values.max()), (np.array(values, dtype=float),))
-    )
+    values = np.asarray(values, dtype=float) + 0.0  # -0.0 is 0.0: of the two, sorting and merging may find either
+    return _settled(Sketch(len(values), float(values.min()), float(values.max()), (values,)))
 
 
 def merge(one: Sketch, other: Sketch) -> Sketch:
@@ -88,7 +87,7 @@ def _added(one: Mapping[int, IntArray], other: Mapping[int, IntArray]) -> Mappin
 
 def _count(parts: Iterable[FloatArray]) -> dict[int, IntArray]:
     """The counts of values: magnitudes by the bits of their numbers, those of negative numbers in reverse."""
-    values = np.concatenate([*parts]) + 0.0  # -0.0 is 0.0
+    values = np.concatenate([*parts])
     magnitudes = (np.abs(values).view(np.int64)) >> (52 - BITS)
     buckets = np.where(values < 0, ~magnitudes, magnitudes)
     exponents, places = buckets >> BITS, buckets & (2**BITS - 1)
