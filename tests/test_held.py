@@ -277,6 +277,11 @@ def test_a_pid_is_judged_on_its_machine() -> None:
     wild = pid(model, replace(TERMS, Kd=np.array([500.0])), 55e-3)
     name, radius = unstable_gain(wild) or ("", 0.0)
     assert (name, radius > 1) == ("K", True)
+
+
+@pytest.mark.slow
+def test_a_pid_has_a_margin_on_its_machine() -> None:
+    model = _model("halbach")
     found = verify(model, pid(model, TERMS, 55e-3), {"m": 0.2})
     assert found.stable
     assert found.poles.regulator.size == 0

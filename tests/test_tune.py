@@ -277,6 +277,7 @@ def same(a: Tuned, b: Tuned) -> None:
     assert a.trials == b.trials
 
 
+@pytest.mark.slow
 def test_a_search_that_was_interrupted_ends_where_it_would_have(small: Spec, tmp_path: Path) -> None:
     whole = tuned(small, tmp_path / "whole.jsonl", effort=QUICK)
     journal = tmp_path / "cut.jsonl"
