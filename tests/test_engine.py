@@ -381,9 +381,9 @@ def test_sums_share_their_factor() -> None:
         state[1] * (1 / theta[0]) * theta[1],
         theta[1] * state[2] / theta[0],
     ]
-    _, moving, constants = translate.translate(ca.Function("f", [state, theta], [sum(apart)]), [], 0)
+    _, moving, counts, _ = translate.translate(ca.Function("f", [state, theta], [sum(apart)]), [])
     assert moving.count(" * ") == 1
-    assert constants == 1
+    assert counts.c == 1
 
 
 # Long functions in parts
@@ -401,7 +401,7 @@ def _statements(text: str) -> list[tuple[str, str]]:
 def _engine_text(row: Callable[[Any, Any, Any], Any], name: str = "decide") -> str:
     """C of one function of the engine that `row` is tried in."""
     parts, _ = _parts(row)
-    return translate.translate(getattr(parts, name), [1], 0)[1]
+    return translate.translate(getattr(parts, name), [1]).function
 
 
 def test_only_long_functions_are_cut() -> None:
@@ -518,7 +518,7 @@ def test_an_operation_without_a_form_is_refused() -> None:
     state, _, theta = ca.SX.sym("state"), ca.SX.sym("given"), ca.SX.sym("theta")
     for unknown, name in ((ca.erf, "OP_ERF"), (ca.log1p, "OP_LOG1P"), (ca.acosh, "OP_ACOSH")):
         with pytest.raises(malta.CheckError, match=f"has no {name}"):
-            translate.translate(ca.Function("f", [state, theta], [unknown(state)]), [], 0)
+            translate.translate(ca.Function("f", [state, theta], [unknown(state)]), [])
 
 
 def test_constants_are_any_numbers(tmp_path: Path) -> None:
@@ -537,8 +537,8 @@ def test_what_depends_on_constants_alone_is_computed_once() -> None:
     """A division by a number of the machine is a reciprocal in `prepare` and a product in the loop."""
     state, theta = ca.SX.sym("state"), ca.SX.sym("theta", 2)
     f = ca.Function("f", [state, theta], [state / theta[0] + ca.exp(theta[1]) * ca.sin(theta[0])])
-    prepare, moving, constants = translate.translate(f, [], 5)
-    assert constants == 2
+    prepare, moving, counts, _ = translate.translate(f, [], translate.Counts(c=5))
+    assert counts.c == 2
     assert "theta[0]" in prepare
     assert "exp(" in prepare
     assert "c[5]" in moving

@@ -537,7 +537,7 @@ def test_the_compiled_engine_can_read_it(par: planar.Parameters, exact: Series) 
     """K(p), its pseudo-inverse and the mover, from a Fourier series, are straight lines of operations it has."""
     p, W, theta = ca.SX.sym("p", 3), ca.SX.sym("W", 6), ca.SX.sym("theta", 1)
     i = commutation.currents(commutation.wrench_matrix(par, exact.above(1e-3, par.h), p), W)
-    _, text, _ = translate(ca.Function("allocate", [p, W, theta], [ca.cse(i)]), [], 0)
+    text = translate(ca.Function("allocate", [p, W, theta], [ca.cse(i)]), []).function
     assert "void allocate(" in text
 
 

@@ -32,6 +32,7 @@ from malta.simulation.compiled import (
 from malta.simulation.digest import (
     Batch,
     batch_of,
+    cruise_functions,
     digest_function,
     digest_sizes,
     first_digest,
@@ -95,7 +96,7 @@ def simulate_many(
     alone, plant = simulation, with_varied(plant, changes)
     simulation = simulation_of(plant, controller, simulation.scenario)
     shape = shape_of(plant, controller, simulation.setup)
-    compiled = library_of(shape, LANES, digest_function(shape))
+    compiled = library_of(shape, LANES, digest_function(shape), cruise_functions(shape))
     if compiled is None:
         return _simulate_one_by_one(alone, variation, progress)
     inputs, shared, lanes, parts = _prepare(simulation, variation)
@@ -268,7 +269,7 @@ def with_varied(plant: Plant, changes: Mapping[str, FloatArray]) -> Plant:
 def is_compiled(plant: Plant, controller: Controller, scenario: Scenario) -> bool:
     """Whether `simulate_many` runs compiled; without a C compiler it simulates one run after the other."""
     shape = shape_of(plant, controller, setup_of(plant, controller, scenario))
-    return library_of(shape, LANES, digest_function(shape)) is not None
+    return library_of(shape, LANES, digest_function(shape), cruise_functions(shape)) is not None
 
 
 def functions_text(plant: Plant, controller: Controller, scenario: Scenario) -> str:

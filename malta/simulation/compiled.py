@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 LANES = 8
 PATIENCE = 300.0  # s for a compilation, which takes some seconds
 FLAGS = (
-    *("-std=gnu11", "-O3", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math"),
+    *("-std=gnu11", "-O2", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math"),
     *("-fschedule-insns", "-fsched-pressure", "-fPIC", "-shared"),
 )
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
@@ -84,43 +84,22 @@ def first_digest(plant: Plant, p_ref: FloatArray) -> FloatArray:
 @lru_cache(maxsize=16)
 def digest_function(shape: Any) -> ca.Function:
     """(digest, row, given, theta) -> digest after one more sample. The first contact ends its updates."""
-    plant, c, setup = shape.plant, shape.controller, shape.setup
-    sizes = layout_of(plant, c, setup)
-    kept = {name: ca.SX.sym(name, size) for name, size in digest_sizes(plant).items()}
-    row = {name: ca.SX.sym(name, size) for name, size in sizes.row.items()}
-    given = {name: ca.SX.sym(name, size) for name, size in sizes.given.items()}
-    theta = ca.SX.sym("theta", len(flatten(numbers_of(plant, c, 1))))
-    largest = ca.fmax(kept["contact"], row["contact"])
-    most, used = (_largest_share(contact) for contact in (largest, row["contact"]))
-    alive = kept["alive"]  # 0 after the first contact: nothing below changes then
-    error = ca.if_else(alive, row["p"] - given["p_ref"], 0)
-    share = (row["p"][plant.leading_output] - kept["start"]) * kept["scale"]
-    now = ca.logic_and(ca.logic_and(alive, kept["reached"] < 0), share >= ca.DM(LEVELS))
-    after = {
+    kept, row, given, arguments = _symbols(shape)
+    after = _flying(shape, kept, row, given, lambda now, before: ca.if_else(kept["alive"], now, before))
+    most, used = (_largest_share(c) for c in (ca.fmax(kept["contact"], row["contact"]), row["contact"]))
+    alive = kept["alive"]  # 0 after the first contact: nothing else changes then
+    after |= {
         "alive": ca.logic_and(alive, most < 1),
-        "start": kept["start"],
-        "scale": kept["scale"],
         "samples": kept["samples"] + alive,
-        "reached": ca.if_else(now, kept["samples"], kept["reached"]),
-        "below": ca.if_else(now, kept["share"], kept["below"]),
-        "above": ca.if_else(now, share, kept["above"]),
-        "share": share,
-        "largest_share": ca.if_else(alive, ca.fmax(kept["largest_share"], share), kept["largest_share"]),
-        "deviation": ca.fmax(kept["deviation"], ca.fabs(error)),
-        "squares": kept["squares"] + error**2,
-        "last": ca.if_else(alive, error, kept["last"]),
-        "force": ca.fmax(kept["force"], ca.if_else(alive, ca.fabs(row["v"]), 0)),
-        "limited": kept["limited"] + ca.if_else(alive, row["saturated"], 0),
-        "contact": ca.if_else(alive, largest, kept["contact"]),
         "culprit": ca.if_else(
             ca.logic_and(ca.logic_and(alive, kept["culprit"] < 0), used >= 1),
-            _index_of_largest(row["contact"]) if plant.contacts else -1,
+            _index_of_largest(row["contact"]) if shape.plant.contacts else -1,
             kept["culprit"],
         ),
     }
-    if setup.bearing:
+    if shape.setup.bearing:
         touching = used >= 1
-        ends = [row["contact"][i] for i, held in enumerate(plant.cushioned) if not held]
+        ends = [row["contact"][i] for i, held in enumerate(shape.plant.cushioned) if not held]
         after["alive"] = ca.logic_and(alive, _largest_share(ca.vertcat(*ends)) < 1)
         first = kept["samples"] == 0
         after["resting"] = ca.if_else(first, touching, kept["resting"])
@@ -128,8 +107,64 @@ def digest_function(shape: Any) -> ca.Function:
         now = ca.logic_and(touching, kept["touched"] < 0)
         after["touched"] = ca.if_else(now, kept["samples"], kept["touched"])
     result = ca.vertcat(*(after.get(name, kept[name]) for name in kept))
-    arguments = [ca.vertcat(*part.values()) for part in (kept, row, given)]
-    return ca.Function("digest", [*arguments, theta], [ca.densify(result)])
+    return ca.Function("digest", arguments, [ca.densify(result)])
+
+
+@lru_cache(maxsize=16)
+def cruise_functions(shape: Any) -> tuple[ca.Function, ...]:
+    """Whether nothing happens in a sample, and the update of the digest if so: the same as that of digest_function.
+
+    Nothing happens: the run flies without contact, no command is limited and no level of the stroke is reached.
+    Empty for a setup with touchdown bearings, whose digests change at contacts too.
+    """
+    if shape.setup.bearing:
+        return ()
+    kept, row, given, arguments = _symbols(shape)
+    after = _flying(shape, kept, row, given, lambda now, _: now) | {"samples": kept["samples"] + 1}
+    reached = ca.logic_and(kept["reached"] < 0, after["share"] >= ca.DM(LEVELS))
+    events = ca.mmax(ca.vertcat(row["saturated"], reached))
+    premise = ca.logic_and(ca.logic_and(kept["alive"], _largest_share(row["contact"]) < 1), events <= 0)
+    idle = ("limited", "reached", "below", "above")
+    result = ca.vertcat(*(kept[name] if name in idle else after.get(name, kept[name]) for name in kept))
+    return (
+        ca.Function("cruises", arguments, [premise]),
+        ca.Function("cruise", arguments, [ca.densify(result)]),
+    )
+
+
+def _symbols(shape: Any) -> tuple[Any, ...]:
+    """Symbols of the digest, the row and the sample's inputs by name, and the arguments of a digest's function."""
+    plant, c, setup = shape.plant, shape.controller, shape.setup
+    sizes = layout_of(plant, c, setup)
+    parts = [
+        {name: ca.SX.sym(name, size) for name, size in part.items()}
+        for part in (digest_sizes(plant), sizes.row, sizes.given)
+    ]
+    theta = ca.SX.sym("theta", len(flatten(numbers_of(plant, c, 1))))
+    return *parts, [*(ca.vertcat(*part.values()) for part in parts), theta]
+
+
+def _flying(shape: Any, kept: Any, row: Any, given: Any, alive: Callable[[Any, Any], Any]) -> dict[str, Any]:
+    """What a sample changes in the digest of a run that flies.
+
+    alive : (value after the sample, another) -> the first where no contact ended the run
+    """
+    error = alive(row["p"] - given["p_ref"], 0)
+    share = (row["p"][shape.plant.leading_output] - kept["start"]) * kept["scale"]
+    now = ca.logic_and(alive(kept["reached"] < 0, 0), share >= ca.DM(LEVELS))
+    return {
+        "reached": ca.if_else(now, kept["samples"], kept["reached"]),
+        "below": ca.if_else(now, kept["share"], kept["below"]),
+        "above": ca.if_else(now, share, kept["above"]),
+        "share": share,
+        "largest_share": alive(ca.fmax(kept["largest_share"], share), kept["largest_share"]),
+        "deviation": ca.fmax(kept["deviation"], ca.fabs(error)),
+        "squares": kept["squares"] + error**2,
+        "last": alive(error, kept["last"]),
+        "force": ca.fmax(kept["force"], alive(ca.fabs(row["v"]), 0)),
+        "limited": kept["limited"] + alive(row["saturated"], 0),
+        "contact": alive(ca.fmax(kept["contact"], row["contact"]), kept["contact"]),
+    }
 
 
 @lru_cache(maxsize=16)

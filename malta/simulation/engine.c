@@ -1,8 +1,9 @@
 /* The loop around one control period of machine and controller: the frame of every compiled engine.
 
-   The functions `prepare`, `sense`, `decide`, `substep` and `digest` are generated from the CasADi expressions of
-   period.py and stand at the mark below; the sizes are #defines before it. LANES machines run side by side, one in
-   each lane of a SIMD register; with LANES 1 a `real` is a double and the rows of every sample are kept.           */
+   The functions `prepare`, `foresee`, `sense`, `decide`, `substep` and those of the digest are generated from CasADi
+   expressions by translate.py, which explains c, d and g, and stand at the mark below; the sizes are #defines before it.
+   LANES machines run side by side, one in each lane of a SIMD register; with LANES 1 a `real` is a double and the rows
+   of every sample are kept.                                                                                         */
 
 #include <math.h>
 #include <stdint.h>
@@ -99,9 +100,11 @@ static inline real inverse(real x) { return 1.0 / x; }
 #define ELEVEN -2.505188203572492e-08
 #define THIRTEEN 1.6048170941500553e-10
 #define FIFTEEN -7.37441787774225e-13
-static inline real sine_of_part(real x, real half) { /* sin of x + half pi */
+static inline real sine_of_part(real x, int halves) { /* sin of x + halves pi / 2; halves is 0 or 1 */
   const double shift = 6755399441055744.0; /* 1.5 * 2^52: its last bits are the nearest whole number */
-  real counted = x * 0.31830988618379067154 + half + shift, n = counted - shift - half;
+  real turns = x * 0.31830988618379067154;
+  real counted = (halves ? turns + 0.5 : turns) + shift, n = counted - shift;
+  if (halves) n -= 0.5;
   real r = (x - n * 3.14159265358979311600) - n * 1.22464679914735317723e-16;
   real t = r * r;
 #if LANES == 1
@@ -112,22 +115,40 @@ static inline real sine_of_part(real x, real half) { /* sin of x + half pi */
 #endif
   return value(bits(r * s) ^ (bits(counted) << 63));
 }
+static inline real odd(real t) { /* sin(pi r) / r of t = r^2, |r| up to 1/2; absolute error below 4e-16 */
+  const double one = 3.1415926535897927, three = -5.167712780049786, five = 2.550164039861884, seven = -0.5992645288256148;
+  const double nine = 0.08214587882077493, eleven = -0.007370364352718201, thirteen = 0.0004659870919775173;
+  const double fifteen = -2.1133714397960184e-05;
+#if LANES == 1
+  real t2 = t * t, a = one + t * three, b = five + t * seven, c = nine + t * eleven, d = thirteen + t * fifteen;
+  return (a + t2 * b) + t2 * t2 * (c + t2 * d);
+#else
+  return one + t * (three + t * (five + t * (seven + t * (nine + t * (eleven + t * (thirteen + t * fifteen))))));
+#endif
+}
+static inline real sine_of_pi(real turns, int halves) { /* sin of pi (turns + halves / 2) */
+  const double shift = 6755399441055744.0;
+  real counted = (halves ? turns + 0.5 : turns) + shift, n = counted - shift;
+  real r = halves ? turns - (n - 0.5) : turns - n;
+  return value(bits(r * odd(r * r)) ^ (bits(counted) << 63));
+}
+static inline real sine(real x) { return sine_of_part(x, 0); }
+static inline real cosine(real x) { return sine_of_part(x, 1); }
 /* A mover in its air gap tilts by milliradians: there these terms of the series are right to the last bit. */
 #define TINY(x) __builtin_expect(nowhere(MASK((x) * (x) > 4e-4)), 1)
 static inline real tilt_sine(real x, real z) {
   if (TINY(x)) return x + x * z * (-1.0 / 6 + z * (1.0 / 120 + z * (-1.0 / 5040)));
-  return sine_of_part(x, (real){0});
+  return sine(x);
 }
 static inline real tilt_cosine(real x, real z) {
   if (TINY(x)) return 1.0 + z * (-1.0 / 2 + z * (1.0 / 24 + z * (-1.0 / 720)));
-  return sine_of_part(x, (real){0} + 0.5);
+  return cosine(x);
 }
 #define tilt(x) ((x) * (x))
 #define tilt_secant(x, z) inverse(tilt_cosine(x, z))
-static inline real sine(real x) { return sine_of_part(x, (real){0}); }
-static inline real cosine(real x) { return sine_of_part(x, (real){0} + 0.5); }
-/* The same where it is known to be within the square root of NEAR; `range` is the largest square that was met. */
-#define NEAR 1e-4
+/* The same where it is known to be within the square root of NEAR, with the terms that are above half a unit in the last
+   place there; `range` is the largest square that was met.                                                         */
+#define NEAR 2.5e-5
 static inline real near_square(real *range, real x) {
   real z = x * x;
   *range = larger(*range, z);
@@ -135,38 +156,124 @@ static inline real near_square(real *range, real x) {
 }
 #define near(x) near_square(range, x)
 #define near_sine(x, z) ((x) + (x) * (z) * (-1.0 / 6 + (z) * (1.0 / 120)))
-#define near_cosine(x, z) (1.0 + (z) * (-1.0 / 2 + (z) * (1.0 / 24 + (z) * (-1.0 / 720))))
+#define near_cosine(x, z) (1.0 + (z) * (-1.0 / 2 + (z) * (1.0 / 24)))
 #define near_secant(x, z) (1.0 + (z) * (1.0 / 2 + (z) * (5.0 / 24 + (z) * (61.0 / 720))))
 
 /*MODEL*/
 
-/* v0(z), linear between the points of the grid: rows of `table` are z, v0 and dv0/dz. */
+/* v0(z), linear between the points of the grid: rows of the table are z, v0 and dv0/dz. Only columns that are not zero
+   are looked up.                                                                                                    */
 enum { WIDTH = 1 + 2 * FORCES };
+static const int column[COLUMNS + 1] = {COLUMN};
 #if LANES == 1
-static inline void look_up(long n, const double *table, long *hint, double at, double *v) {
-  long k = *hint; /* where the search stood before */
-  while (k > 0 && !(at >= table[k * WIDTH])) k--;
-  while (k < n - 2 && at > table[(k + 1) * WIDTH]) k++;
-  const double *row = table + (*hint = k) * WIDTH;
-  for (int j = 0; j < FORCES; j++) v[j] = row[1 + j] + (at - row[0]) * row[1 + FORCES + j];
+typedef struct { long n, hint; const double *table; } Grid;
+static inline void look_up(Grid *g, double at, double *v) {
+  long k = g->hint; /* where the search stood before */
+  while (k > 0 && !(at >= g->table[k * WIDTH])) k--;
+  while (k < g->n - 2 && at > g->table[(k + 1) * WIDTH]) k++;
+  const double *row = g->table + (g->hint = k) * WIDTH + 1;
+  for (int j = 0; j < COLUMNS; j++)
+    v[column[j]] = row[column[j]] + (at - row[-1]) * row[FORCES + column[j]];
 }
+#else
+/* In lanes: each lane's row at its z, in parts of LANES numbers, and the rows transposed: values, then slopes. */
+typedef struct { long n, even; const double *table; double first, step, per_metre, *rows; } Grid;
+enum { PADDED = (2 * COLUMNS + LANES - 1) / LANES * LANES };
 
+#ifdef __clang__
+#define MIXED(x, y, ...) __builtin_shufflevector(x, y, __VA_ARGS__)
+#else
+#define MIXED(x, y, ...) __builtin_shuffle(x, y, (whole){__VA_ARGS__})
+#endif
+#define TURN(i, j, low, high) { \
+    real x = row[i], y = row[j]; \
+    row[i] = MIXED(x, y, low), row[j] = MIXED(x, y, high); \
+  }
+#define EVEN 0, 8, 2, 10, 4, 12, 6, 14
+#define ODD 1, 9, 3, 11, 5, 13, 7, 15
+#define PAIRS 0, 1, 8, 9, 4, 5, 12, 13
+#define OTHERS 2, 3, 10, 11, 6, 7, 14, 15
+#define FRONT 0, 1, 2, 3, 8, 9, 10, 11
+#define BACK 4, 5, 6, 7, 12, 13, 14, 15
+static inline void transpose(real *row) { /* LANES is 8 */
+  TURN(0, 1, EVEN, ODD) TURN(2, 3, EVEN, ODD) TURN(4, 5, EVEN, ODD) TURN(6, 7, EVEN, ODD)
+  TURN(0, 2, PAIRS, OTHERS) TURN(1, 3, PAIRS, OTHERS) TURN(4, 6, PAIRS, OTHERS) TURN(5, 7, PAIRS, OTHERS)
+  TURN(0, 4, FRONT, BACK) TURN(1, 5, FRONT, BACK) TURN(2, 6, FRONT, BACK) TURN(3, 7, FRONT, BACK)
+}
+static inline void look_up(const Grid *g, real at, real *v) {
+  real u = larger(smaller((at - g->first) * g->per_metre, (real){0} + (double)(g->n - 2)), (real){0});
+  whole index = __builtin_convertvector(u, whole);
+  real beyond = at - (g->first + g->step * __builtin_convertvector(index, real)), row[PADDED + 1];
+  if (!g->even)
+    for (int i = 0; i < LANES; i++) {
+      long low = 0, high = g->n - 1;
+      while (high - low > 1) {
+        long k = (low + high) / 2;
+        if (at[i] >= g->table[k * WIDTH]) low = k;
+        else high = k;
+      }
+      index[i] = low, beyond[i] = at[i] - g->table[low * WIDTH];
+    }
+  index *= PADDED;
+#pragma GCC unroll 8
+  for (int part = 0; part < PADDED; part += LANES) {
+#pragma GCC unroll 8
+    for (int i = 0; i < LANES; i++) memcpy(row + part + i, g->rows + index[i] + part, sizeof *row);
+    transpose(row + part);
+  }
+  for (int j = 0; j < COLUMNS; j++) v[column[j]] = row[j] + beyond * row[COLUMNS + j];
+}
+#endif
+
+/* One sample: the control law, and the machine's motion until the next sample. 0 where `near` turns out not to hold, and
+   what was written means nothing. Which of the two a sample is computed by depends on nothing but that sample, so that
+   it can be computed again to the bit.                                                                              */
+#define COLD __attribute__((noinline, cold))
+#define SAMPLE(near, attributes, ...) \
+  static attributes int control##near(const real *c, const double *d, const double *g, const real *state, Grid *grid, \
+                                      const double *given, const real *noise, real *next, real *held, real *row) { \
+    real range = {0}, at, y[OUTPUTS], v[FORCES]; \
+    sense##near(__VA_ARGS__ c, d, g, state, given, noise, y, &at); \
+    look_up(grid, at, v); \
+    decide##near(__VA_ARGS__ c, d, g, state, given, y, v, next, held, row); \
+    return nowhere(MASK(range > NEAR)); \
+  } \
+  static attributes int motion##near(const real *c, const double *d, const double *g, long substeps, const real *from, \
+                                     const real *held, const double *given, const real *fast, real *after) { \
+    real range = {0}; \
+    for (long i = 0; i < substeps; i++, from = after, fast += JITTER) \
+      substep##near(__VA_ARGS__ c, d, g, from, held, given, fast, after); \
+    return nowhere(MASK(range > NEAR)); \
+  }
+#if TILTED
+SAMPLE(_near, inline, &range, )
+SAMPLE(, COLD, )
+#else
+SAMPLE(, inline, )
+#define control_near control
+#define motion_near motion
+#endif
+
+#if LANES == 1
 /* Rows of `samples` control periods from the one of number `first` on; `state` is taken and left behind. Where a sample is
    no whole number of substeps, it begins with the first substep after it.                                             */
-void run(long first, long samples, double substeps, const double *theta, long grid, const double *table, double *state,
+void run(long first, long samples, double substeps, const double *theta, long points, const double *table, double *state,
          const double *given, const double *noise, const double *fast, double *rows) {
-  double c[CONSTANTS + 1], y[OUTPUTS], v[FORCES], held[HELD], next[STATES];
-  long hint = 0, done = (long)ceil((double)first * substeps - 1e-6);
-  prepare(theta, c);
+  double c[CONSTANTS + 1], d[SHARED + 1], g[FORESEEN + 1], held[HELD], m[2][STATES], *now = m[0], *after = m[1], *before;
+  Grid grid = {points, 0, table};
+  long done = (long)ceil((double)first * substeps - 1e-6);
+  prepare(theta, c, d);
+  memcpy(now, state, sizeof *m);
   for (long k = first; k < first + samples; k++, given += GIVEN, noise += OUTPUTS, rows += ROW) {
-    double at;
-    sense(c, state, given, noise, y, &at);
-    look_up(grid, table, &hint, at, v);
-    decide(c, state, given, y, v, next + MACHINE, held, rows);
-    const long end = (long)ceil((double)(k + 1) * substeps - 1e-6);
-    for (; done < end; done++, fast += JITTER) substep(c, state, held, given, fast, state);
-    memcpy(state + MACHINE, next + MACHINE, (STATES - MACHINE) * sizeof *state);
+    const long end = (long)ceil((double)(k + 1) * substeps - 1e-6), count = end - done;
+    foresee(d, given, g);
+    int near = control_near(c, d, g, now, &grid, given, noise, after + MACHINE, held, rows);
+    if (!near) control(c, d, g, now, &grid, given, noise, after + MACHINE, held, rows);
+    if (!near || !motion_near(c, d, g, count, now, held, given, fast, after))
+      motion(c, d, g, count, now, held, given, fast, after);
+    before = now, now = after, after = before, done = end, fast += count * JITTER;
   }
+  memcpy(state, now, sizeof *m);
 }
 #else
 /* Noise: SplitMix64 of a lane's key and a counter, 32 bits for the radius and 32 for the angle of Box-Muller. The
@@ -214,96 +321,63 @@ static inline void two_normals(bits64 key, uint64_t count, real *a, real *b) {
   *b = value(((bits(c) & odd) | (bits(s) & ~odd)) ^ ((q & 2) << 62));
 }
 
-/* In lanes: each lane's row of v0 at its z, in parts of LANES forces, and the rows transposed. */
-typedef struct { long n, even; const double *table; double first, step, per_metre, *values, *slopes; } Grid;
-enum { PADDED = (FORCES + LANES - 1) / LANES * LANES };
-
-#ifdef __clang__
-#define MIXED(x, y, ...) __builtin_shufflevector(x, y, __VA_ARGS__)
-#else
-#define MIXED(x, y, ...) __builtin_shuffle(x, y, (whole){__VA_ARGS__})
+#if CRUISE
+static COLD void count(const real *c, const double *d, const double *g, real *kept, const real *row,
+                       const double *given) {
+  digest(c, d, g, kept, row, given, kept);
+}
 #endif
-#define TURN(i, j, low, high) { \
-    real x = row[i], y = row[j]; \
-    row[i] = MIXED(x, y, low), row[j] = MIXED(x, y, high); \
-  }
-#define EVEN 0, 8, 2, 10, 4, 12, 6, 14
-#define ODD 1, 9, 3, 11, 5, 13, 7, 15
-#define PAIRS 0, 1, 8, 9, 4, 5, 12, 13
-#define OTHERS 2, 3, 10, 11, 6, 7, 14, 15
-#define FRONT 0, 1, 2, 3, 8, 9, 10, 11
-#define BACK 4, 5, 6, 7, 12, 13, 14, 15
-static inline void transpose(real *row) { /* LANES is 8 */
-  TURN(0, 1, EVEN, ODD) TURN(2, 3, EVEN, ODD) TURN(4, 5, EVEN, ODD) TURN(6, 7, EVEN, ODD)
-  TURN(0, 2, PAIRS, OTHERS) TURN(1, 3, PAIRS, OTHERS) TURN(4, 6, PAIRS, OTHERS) TURN(5, 7, PAIRS, OTHERS)
-  TURN(0, 4, FRONT, BACK) TURN(1, 5, FRONT, BACK) TURN(2, 6, FRONT, BACK) TURN(3, 7, FRONT, BACK)
+/* A sample by the general functions. */
+static COLD void sample(const real *c, const double *d, const double *g, const real *now, Grid *grid, long substeps,
+                        const double *given, const real *noise, real *kept, real *after) {
+  real held[HELD], row[ROW];
+  control(c, d, g, now, grid, given, noise, after + MACHINE, held, row);
+  digest(c, d, g, kept, row, given, kept);
+  motion(c, d, g, substeps, now, held, given, 0, after);
 }
-static inline void look_up(const Grid *g, real at, real *v) {
-  real u = larger(smaller((at - g->first) * g->per_metre, (real){0} + (double)(g->n - 2)), (real){0});
-  whole index = __builtin_convertvector(u, whole);
-  real beyond = at - (g->first + g->step * __builtin_convertvector(index, real));
-  if (!g->even)
-    for (int i = 0; i < LANES; i++) {
-      long low = 0, high = g->n - 1;
-      while (high - low > 1) {
-        long k = (low + high) / 2;
-        if (at[i] >= g->table[k * WIDTH]) low = k;
-        else high = k;
-      }
-      index[i] = low, beyond[i] = at[i] - g->table[low * WIDTH];
-    }
-  for (int part = 0; part < PADDED; part += LANES) {
-    real row[LANES], base, slope;
-#pragma GCC unroll 8
-    for (int i = 0; i < LANES; i++) {
-      long k = index[i];
-      memcpy(&base, g->values + k * PADDED + part, sizeof base);
-      memcpy(&slope, g->slopes + k * PADDED + part, sizeof slope);
-      row[i] = base + beyond[i] * slope;
-    }
-    transpose(row);
-    for (int j = part; j < FORCES && j < part + LANES; j++) v[j] = row[j - part];
+/* A sample by the short ones where they hold. What is rare takes copies, so that the arrays themselves stay registers. */
+static inline void sample_near(const real *c, const double *d, const double *g, const real *now, Grid *grid,
+                               long substeps, const double *given, const real *noise, real *kept, real *after) {
+  real held[HELD], row[ROW];
+  if (!control_near(c, d, g, now, grid, given, noise, after + MACHINE, held, row)) {
+    sample(c, d, g, now, grid, substeps, given, noise, kept, after);
+    return;
+  }
+#if CRUISE
+  real flies;
+  cruises(c, d, g, kept, row, given, &flies);
+  if (__builtin_expect(nowhere(MASK(flies == 0.0)), 1)) {
+    cruise(c, d, g, kept, row, given, kept);
+  } else {
+    real copy[ROW];
+    memcpy(copy, row, sizeof copy);
+    count(c, d, g, kept, copy, given);
+  }
+#else
+  digest(c, d, g, kept, row, given, kept);
+#endif
+  if (!motion_near(c, d, g, substeps, now, held, given, 0, after)) {
+    real copy[HELD];
+    memcpy(copy, held, sizeof copy);
+    motion(c, d, g, substeps, now, copy, given, 0, after);
   }
 }
 
-/* What a group of machines is between two samples. */
-typedef struct { real state[STATES], kept[DIGEST + 1]; } Group;
-
-/* One sample: 0 where `near` turns out not to hold, and `after` means nothing. Mostly the first look tells. Which of the
-   two a sample is computed by depends on nothing but that sample, so that it can be computed again to the bit.       */
-#define SAMPLE(name, near, attributes, ...) \
-  static attributes int name(const real *c, const Group *m, Group *after, const Grid *grid, long substeps, \
-                             const double *given, const real *noise) { \
-    real range = {0}, at, y[OUTPUTS], v[FORCES], held[HELD], row[ROW]; \
-    const real *from = m->state; \
-    sense##near(__VA_ARGS__ c, m->state, given, noise, y, &at); \
-    if (!nowhere(MASK(range > NEAR))) return 0; \
-    look_up(grid, at, v); \
-    decide##near(__VA_ARGS__ c, m->state, given, y, v, after->state + MACHINE, held, row); \
-    digest(c, m->kept, row, given, after->kept); \
-    for (long i = 0; i < substeps; i++, from = after->state) \
-      substep##near(__VA_ARGS__ c, from, held, given, 0, after->state); \
-    return nowhere(MASK(range > NEAR)); \
-  }
-SAMPLE(sample_near, _near, inline, &range, )
-SAMPLE(sample, , __attribute__((noinline, cold)), )
-
-/* LANES machines at once: only digests are kept. */
-static void run_group(long samples, long substeps, const double *theta, const Grid *grid, double *states,
-                      const double *given, long uniform, const double *scales, const uint64_t *keys, double *digests) {
-  Group m[2], *now = m, *after = m + 1, *before;
-  real c[CONSTANTS + 1], sigma[OUTPUTS], t[THETA + 1], noise[2 * OUTPUTS];
+/* LANES machines at once: only digests are kept. g: of all samples. */
+static void run_group(long samples, long substeps, const real *c, const double *d, const double *g, Grid *grid,
+                      double *states, const double *given, long uniform, const double *scales, const uint64_t *keys,
+                      double *digests) {
+  real m[2][STATES], *now = m[0], *after = m[1], *before, kept[DIGEST + 1];
+  real sigma[OUTPUTS], noise[2 * OUTPUTS];
   int noisy = 0;
   bits64 key;
   memcpy(&key, keys, sizeof key);
-  memcpy(t, theta, sizeof(real) * THETA);
-  memcpy(now->state, states, sizeof now->state);
-  memcpy(now->kept, digests, sizeof(real) * DIGEST);
-  prepare(t, c);
+  memcpy(now, states, sizeof *m);
+  memcpy(kept, digests, sizeof(real) * DIGEST);
   memcpy(sigma, scales, sizeof sigma);
   for (int j = 0; j < OUTPUTS * LANES; j++) noisy |= scales[j] != 0;
   memset(noise, 0, sizeof noise);
-  for (long k = 0; k < samples; k++, given += GIVEN) {
+  for (long k = 0; k < samples; k++, given += GIVEN, g += FORESEEN) {
     const real *drawn = noise + k % 2 * OUTPUTS;
     if (noisy && k % 2 == 0) {
       for (int j = 0; j < OUTPUTS; j++)
@@ -311,32 +385,39 @@ static void run_group(long samples, long substeps, const double *theta, const Gr
       for (int j = 0; j < 2 * OUTPUTS; j++)
         noise[j] = (uniform ? each_uniform(noise[j]) : noise[j]) * sigma[j % OUTPUTS];
     }
-    if (!sample_near(c, now, after, grid, substeps, given, drawn))
-      sample(c, now, after, grid, substeps, given, drawn);
+    __asm__("" : "+r"(d)); /* else numbers in every lane are kept from sample to sample, in more memory than is near */
+    sample_near(c, d, g, now, grid, substeps, given, drawn, kept, after);
     before = now, now = after, after = before;
   }
-  memcpy(states, now->state, sizeof now->state);
-  memcpy(digests, now->kept, sizeof(real) * DIGEST);
+  memcpy(states, now, sizeof *m);
+  memcpy(digests, kept, sizeof(real) * DIGEST);
 }
 
 /* Groups of LANES machines, one after the other; states and digests are taken and left behind. */
 void run_many(long groups, long samples, long substeps, const double *theta, long points, const double *table,
               double *states, const double *given, long uniform, const double *sigma, const uint64_t *keys,
               double *digests) {
-  const size_t size = (size_t)points * PADDED * sizeof(double);
-  double *rows = aligned_alloc(64, 2 * size), first = table[0];
-  if (!rows) abort();
-  double step = (table[(points - 1) * WIDTH] - first) / (double)(points - 1);
-  Grid grid = {points, 1, table, first, step, 1 / step, rows, rows + points * PADDED};
-  memset(rows, 0, 2 * size);
+  const size_t size = (size_t)(points * PADDED + LANES) * sizeof(double);
+  double *rows = aligned_alloc(64, size), *g = malloc((size_t)(samples * FORESEEN + 1) * sizeof *g), first = table[0];
+  if (!rows || !g) abort();
+  double step = (table[(points - 1) * WIDTH] - first) / (double)(points - 1), d[SHARED + 1];
+  Grid grid = {points, 1, table, first, step, 1 / step, rows};
+  memset(rows, 0, size);
   for (long k = 0; k < points; k++) {
     grid.even &= fabs((table[k * WIDTH] - first) * grid.per_metre - (double)k) < 1e-9;
-    memcpy(rows + k * PADDED, table + k * WIDTH + 1, FORCES * sizeof(double));
-    memcpy(rows + (points + k) * PADDED, table + k * WIDTH + 1 + FORCES, FORCES * sizeof(double));
+    for (int j = 0; j < COLUMNS; j++)
+      for (int part = 0; part < 2; part++)
+        rows[k * PADDED + part * COLUMNS + j] = table[k * WIDTH + 1 + part * FORCES + column[j]];
   }
-  for (long g = 0; g < groups; g++)
-    run_group(samples, substeps, theta + g * THETA * LANES, &grid, states + g * STATES * LANES, given, uniform,
-              sigma + g * OUTPUTS * LANES, keys + g * LANES, digests + g * DIGEST * LANES);
+  for (long i = 0; i < groups; i++) {
+    real c[CONSTANTS + 1], t[THETA + 1];
+    memcpy(t, theta + i * THETA * LANES, sizeof(real) * THETA);
+    prepare(t, c, d); /* d is the same for all groups */
+    for (long k = 0; k < samples && !i; k++) foresee(d, given + k * GIVEN, g + k * FORESEEN);
+    run_group(samples, substeps, c, d, g, &grid, states + i * STATES * LANES, given, uniform,
+              sigma + i * OUTPUTS * LANES, keys + i * LANES, digests + i * DIGEST * LANES);
+  }
   free(rows);
+  free(g);
 }
 #endif

@@ -18,7 +18,7 @@ from malta.model.parameters import acting_names, shape_parameters, twins_of
 from malta.model.plant import Plant
 from malta.simulation.compiled import address_of, feedforward_table, library
 from malta.simulation.layout import Setup, electronics_of, flatten, numbers_of
-from malta.simulation.period import Period, chain, period_of
+from malta.simulation.period import Period, chain, columns_of, period_of, without_zeros
 from malta.simulation.translate import source
 from malta.synthesis.controller import Controller, gains_of
 
@@ -95,20 +95,25 @@ def shape_of(plant: Plant, c: Controller, setup: Setup) -> Shape:
         for m in gains_of(c).values()
     )
     fixed = (*shape_parameters(par).items(), *acting_names(par))
-    return Shape((type(par), kin, twins, fixed, patterns, c.tracks, c.parameters), plant, c, setup)
+    columns = columns_of(c)
+    return Shape((type(par), kin, twins, fixed, patterns, columns, c.tracks, c.parameters), plant, c, setup)
 
 
 @lru_cache(maxsize=32)
-def library_of(shape: Shape, lanes: int = 1, digest: ca.Function | None = None) -> tuple[Any, Period] | None:
+def library_of(
+    shape: Shape, lanes: int = 1, digest: ca.Function | None = None, cruise: tuple[ca.Function, ...] = ()
+) -> tuple[Any, Period] | None:
     """The library and the functions of a shape; None where it cannot be compiled.
 
     digest : the function that updates a run's digest; for several lanes
+    cruise : see digest.cruise_functions
     """
     c = shape.controller
     if plant_of(c.parameters).tabulated:
         return None
     p = period_of(shape.plant, c, shape.setup, numbers_of(shape.plant, c, 1), constant=False)
-    lib = library(source(p, digest), lanes)
+    p = without_zeros(p, columns_of(c))
+    lib = library(source(p, digest, cruise), lanes)
     return None if lib is None else (lib, p)
 
 

@@ -6,7 +6,9 @@ A fixed factor that the terms of a sum share is taken out of the sum."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Collection, Sequence
+from functools import reduce
 from typing import NamedTuple
 
 import casadi as ca
@@ -53,6 +55,8 @@ _FORMS = (
         "TILT_SINE": "tilt_sine({0}, {1})",
         "TILT_COSINE": "tilt_cosine({0}, {1})",
         "TILT_SECANT": "tilt_secant({0}, {1})",
+        "SINE_OF_PI": "sine_of_pi({0}, 0)",  # of an angle in half turns
+        "COSINE_OF_PI": "sine_of_pi({0}, 1)",
     }
 )
 
@@ -73,12 +77,16 @@ class Node(NamedTuple):
     form: str  # in C, with {0}, {1}, ... for the arguments
     arguments: tuple[int, ...]
     fixed: bool  # depends on theta and constants only: computed once a run
+    common: bool  # has the same value in every lane
 
 
-def read_instructions(f: ca.Function, shared: Sequence[int]) -> tuple[list[Node], list[tuple[int, int, int]]]:
+def read_instructions(
+    f: ca.Function, shared: Sequence[int], common: Collection[int] = ()
+) -> tuple[list[Node], list[tuple[int, int, int]]]:
     """The nodes of an SX function, and (result, entry, node) for every entry of its results.
 
     shared : arguments that have the same value in every lane
+    common : entries of theta that have the same value in every lane
 
     Raises CheckError for an operation that has no form in C.
     """
@@ -93,12 +101,16 @@ def read_instructions(f: ca.Function, shared: Sequence[int]) -> tuple[list[Node]
             continue
         if op == ca.OP_INPUT:
             i, j = reads
-            text = f"theta[{j}]" if i == theta else f"a{i}[{j}]"
-            node = Node("" if i != theta else "INPUT", f"K({text})" if i in shared else text, (), i == theta)
+            if i == theta:
+                node = Node("INPUT", f"theta[{j}]", (), True, j in common)
+            elif i in shared:
+                node = Node("", f"K(a{i}[{j}])", (), False, True)
+            else:
+                node = Node("", f"a{i}[{j}]", (), False, False)
             slot[writes[0]] = nodes.place(node)
         elif op == ca.OP_CONST:
             text = f"K({_number(f.instruction_constant(k))})"
-            slot[writes[0]] = nodes.place(Node("", text, (), True))
+            slot[writes[0]] = nodes.place(Node("", text, (), True, True))
         else:
             name = _NAMES[op]
             if name not in _FORMS and name not in MASKS:
@@ -135,8 +147,8 @@ class _StraightLine:
     def _append(self, name: str, *arguments: int) -> int:
         if name in ("OP_ADD", "OP_MUL"):
             arguments = tuple(sorted(arguments))
-        fixed = all(self.nodes[a].fixed for a in arguments)
-        return self.place(Node(name, MASKS.get(name) or _FORMS[name], arguments, fixed))
+        fixed, common = (all(getattr(self.nodes[a], each) for a in arguments) for each in ("fixed", "common"))
+        return self.place(Node(name, MASKS.get(name) or _FORMS[name], arguments, fixed, common))
 
     def _fixed_factor(self, k: int) -> tuple[int, int] | None:
         """(fixed factor, other factor) of a product; None for other nodes and for fixed products."""
@@ -154,7 +166,28 @@ class _StraightLine:
             parts = self._fixed_factor(product)
             if self.nodes[factor].fixed and parts is not None:
                 return self._append("OP_MUL", self._append("OP_MUL", factor, parts[0]), parts[1])
+        return self._cancelled(one, other)
+
+    def _cancelled(self, one: int, other: int) -> int | None:
+        """A product without the pairs of a tilt's cosine and secant among its factors; None if there is no pair."""
+        first, second = self._factors(one), self._factors(other)
+        for k in first + second:
+            node = self.nodes[k]
+            inverse = {"TILT_COSINE": "TILT_SECANT", "TILT_SECANT": "TILT_COSINE"}.get(node.op)
+            pair = [j for j in first + second if (self.nodes[j].op, self.nodes[j].arguments) == (inverse, node.arguments)]
+            if pair:
+                rest = first + second
+                rest.remove(k)
+                rest.remove(pair[0])
+                return reduce(lambda a, b: self.add("OP_MUL", a, b), rest) if rest else None
         return None
+
+    def _factors(self, k: int) -> list[int]:
+        """The factors of a product of products."""
+        node = self.nodes[k]
+        if node.op != "OP_MUL" or node.fixed:
+            return [k]
+        return [factor for a in node.arguments for factor in self._factors(a)]
 
     def _div(self, one: int, other: int) -> int | None:
         """x / y = x (1 / y): the reciprocal of a fixed y is computed once a run."""
@@ -163,8 +196,12 @@ class _StraightLine:
     def _inv(self, k: int) -> int | None:
         node = self.nodes[k]
         if node.fixed:
-            return self.place(Node("OP_INV", "1.0 / {0}", (k,), True))
-        return self._append("TILT_SECANT", *node.arguments) if node.op == "TILT_COSINE" else None
+            return self.place(Node("OP_INV", "1.0 / {0}", (k,), True, node.common))
+        factors = self._factors(k)
+        if any(self.nodes[a].op != "TILT_COSINE" for a in factors):
+            return None
+        secants = [self._append("TILT_SECANT", *self.nodes[a].arguments) for a in factors]
+        return reduce(lambda a, b: self.add("OP_MUL", a, b), secants)
 
     def _add(self, one: int, other: int) -> int | None:
         """(c ? x : 0) + (not c ? y : 0), as CasADi writes if_else(c, x, y), becomes one operation."""
@@ -186,10 +223,25 @@ class _StraightLine:
         return self.add("OP_MUL", first[0], self.add(name, first[1], second[1]))
 
     def _sin(self, k: int) -> int | None:
-        return self._tilt("TILT_SINE", k)
+        return self._tilt("TILT_SINE", k) or self._wave("SINE_OF_PI", k)
 
     def _cos(self, k: int) -> int | None:
-        return self._tilt("TILT_COSINE", k)
+        return self._tilt("TILT_COSINE", k) or self._wave("COSINE_OF_PI", k)
+
+    def _wave(self, name: str, k: int) -> int | None:
+        """Sine or cosine of f x + g with fixed f and g, as of pi ((f / pi) x + g / pi): half turns are whole numbers."""
+        node = self.nodes[k]
+        product, shift = k, None
+        if node.op == "OP_ADD":
+            shift, product = sorted(node.arguments, key=lambda a: not self.nodes[a].fixed)
+        parts = self._fixed_factor(product)
+        if parts is None or not (shift is None or self.nodes[shift].fixed):
+            return None
+        per_pi = self.place(Node("", f"K({1 / math.pi!r})", (), True, True))
+        turns = self._append("OP_MUL", self.add("OP_MUL", per_pi, parts[0]), parts[1])
+        if shift is not None:
+            turns = self._append("OP_ADD", turns, self.add("OP_MUL", per_pi, shift))
+        return self._append(name, turns)
 
     def _tilt(self, name: str, k: int) -> int | None:
         """Sine or cosine of an angle that is probably small: a state, or a state with something added to it."""

@@ -24,6 +24,12 @@ from malta.synthesis.controller import Controller, CurrentLoop, gains_of
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
 
+# Names of numbers_of that all machines of a batch share: those of the controller and of its samples.
+SHARED = (
+    *("Ad", "Bd", "Cd", "K", "Ki", "L", "force_limit", "control_time", "Kp", "Ki_current", "rate"),
+    *("grid_ends", "substep"),
+)
+
 Fidelity = Literal["force", "dq", "phase"]
 FIDELITIES: tuple[Fidelity, ...] = get_args(Fidelity)
 

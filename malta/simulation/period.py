@@ -48,7 +48,6 @@ from malta.simulation.readings import initial_readings, measurement
 from malta.simulation.substep import advance
 from malta.synthesis.controller import Controller, commanded, estimated, filtered, freeze_moving, look_ahead
 
-
 class Period(NamedTuple):
     """The functions of one control period; theta has no entries where all numbers are constants."""
 
@@ -56,6 +55,7 @@ class Period(NamedTuple):
     decide: ca.Function  # (state, given, y, v0, theta) -> controller, held, row
     substep: ca.Function  # (machine, held, given, fast noise, theta) -> machine
     theta: tuple[str, ...]  # names of the numbers, an entry for each
+    columns: tuple[int, ...] | None = None  # entries of v0(z) that are not zero; None: all of them
 
 
 def period_of(
@@ -96,6 +96,20 @@ def period_of(
     moved = ca.cse(ca.densify(advance(loop, signals, held, jitter)))
     substep = ca.Function("substep", [ca.vertcat(*machine.values()), held, around, jitter, theta], [moved])
     return Period(sense, _decide_function(loop, theta, sizes), substep, names)
+
+
+def columns_of(c: Controller) -> tuple[int, ...]:
+    """The forces whose v0(z) is not zero at every point. Below the rounding of rounding errors of the forces is zero."""
+    size, limit = np.abs(c.feedforward.v0).max(axis=0), np.abs(c.limits.force).max()
+    return tuple(np.flatnonzero(size > np.finfo(float).eps ** 2 * limit).tolist())
+
+
+def without_zeros(p: Period, columns: tuple[int, ...]) -> Period:
+    """The same functions where only these entries of v0(z) are not zero: the others drop out of the expressions."""
+    state, given, y, v0, theta = p.decide.sx_in()
+    known = ca.vertcat(*(v0[j] if j in columns else 0 for j in range(v0.numel())))
+    decided = ca.cse(list(p.decide(state, given, y, known, theta)))
+    return p._replace(decide=ca.Function("decide", [state, given, y, v0, theta], decided), columns=columns)
 
 
 def chain(p: Period, c: Controller, substeps: int, block: int) -> ca.Function:

@@ -1,76 +1,126 @@
 """C text of CasADi functions: the control period inside the loop of engine.c.
 
 Every number of machine and controller is an entry of theta, so that one compilation serves all machines and gain files
-of a shape. The function `prepare` computes, once a run, all scalars that depend on theta only. A long function is cut
-into parts that hand numbers over in an array: compilers need far more than twice the time for twice the text in one
-piece. With several lanes, each function has a second version for small tilts, which has no branches.
+of a shape. What is the same for long is computed once, and kept in an array:
+
+    c   once a run, in every lane: depends on theta only
+    d   once a run for all lanes: depends only on the numbers that they share, those of the controller
+    g   once a sample for all lanes: depends on these and on the inputs of the sample, as K xi* + v_ff does
+
+A long function is cut into parts that hand numbers over in an array: compilers need far more than twice the time for
+twice the text in one piece. Each function has a second version for small tilts, which has no branches.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+import re
+from collections.abc import Collection, Sequence
 from importlib.resources import files
 from itertools import pairwise
+from typing import NamedTuple
 
 import casadi as ca
 
 from malta.simulation.instructions import MASKS, Node, mask_arguments, needed_nodes, read_instructions
+from malta.simulation.layout import SHARED
 from malta.simulation.period import Period
 
 WHOLE = 4000  # statements: a longer function is cut into parts
 PART = 300  # statements of a part at most
+PLAIN = ("OP_ADD", "OP_SUB", "OP_MUL", "OP_SQ", "OP_NEG", "OP_TWICE")  # the same text for one number and for lanes
 
 
-def source(p: Period, digest: ca.Function | None) -> str:
+class Counts(NamedTuple):
+    """Entries of the arrays of what is computed once."""
+
+    c: int = 0
+    d: int = 0
+    g: int = 0
+
+
+class Text(NamedTuple):
+    """A CasADi function in C."""
+
+    prepare: str  # lines that compute its entries of c and d
+    function: str
+    counts: Counts  # of its own entries
+    foresee: str  # lines that compute its entries of g
+
+
+def source(p: Period, digest: ca.Function | None, cruise: Sequence[ca.Function] = ()) -> str:
     """The whole C text of an engine; the number of lanes is a macro of the compilation.
 
     digest : the function that updates a run's digest, see digest.py; None for an engine of one lane
+    cruise : when a shorter update does the same, and that update
     """
-    prepares, functions, count = [], [], 0
-    given = {"sense": [1], "decide": [1], "substep": [2], "digest": [2]}
-    for f in (p.sense, p.decide, p.substep, *([digest] if digest else [])):
-        prepare, function, more = translate(f, given[f.name()], count)
-        prepares.append(prepare)
-        functions.append(function)
-        if f is not digest:
-            functions.append("#if LANES > 1\n" + _small_tilt_version(function) + "#endif\n")
-        count += more
+    texts, functions, counts = [], [], Counts()
+    given = {"sense": 1, "decide": 1, "substep": 2, "digest": 2, "cruises": 2, "cruise": 2}
+    common = [k for k, name in enumerate(p.theta) if name in SHARED]
+    for f in (p.sense, p.decide, p.substep, *([digest] if digest else []), *cruise):
+        text = translate(f, [given[f.name()]], counts, common)
+        functions.append(text.function)
+        if given[f.name()] == 1 or f is p.substep:
+            functions.append(_small_tilt_version(text.function))
+        texts.append(text)
+        counts = Counts(*(have + more for have, more in zip(counts, text.counts, strict=True)))
+    columns = range(p.decide.size1_in(3)) if p.columns is None else p.columns
     sizes = {
         "THETA": len(p.theta),
-        "CONSTANTS": count,
+        "CONSTANTS": counts.c,
+        "SHARED": counts.d,
+        "FORESEEN": counts.g,
         "STATES": p.sense.size1_in(0),
         "MACHINE": p.substep.size1_in(0),
         "GIVEN": p.sense.size1_in(1),
         "OUTPUTS": p.sense.size1_in(2),
         "FORCES": p.decide.size1_in(3),
+        "COLUMNS": len(columns),
+        "COLUMN": ", ".join(map(str, columns)),
+        "TILTED": int(any("tilt" in function for function in functions)),
         "HELD": p.substep.size1_in(1),
         "JITTER": p.substep.size1_in(3),
         "ROW": p.decide.size1_out(2),
         "DIGEST": digest.size1_in(0) if digest else 0,
+        "CRUISE": int(bool(cruise)),
     }
     defines = "".join(f"#define {name} {value}\n" for name, value in sizes.items())
-    prepare = "static void prepare(const real *theta, real *c) {\n" + "\n".join(prepares) + "\n}\n"
+    prepare = _once("prepare(const real *theta, real *c, double *d)", [text.prepare for text in texts])
+    foresee = _once("foresee(const double *d, const double *given, double *g)", [x.foresee for x in texts])
     frame = files("malta.simulation").joinpath("engine.c").read_text(encoding="utf-8")
-    return defines + frame.replace("/*MODEL*/", prepare + "".join(functions))
+    return defines + frame.replace("/*MODEL*/", prepare + foresee + "".join(functions))
 
 
-def translate(f: ca.Function, shared: Sequence[int], first_constant: int) -> tuple[str, str, int]:
-    """C text of an SX function whose last argument is theta: lines of `prepare`, the function, number of constants.
+def _once(name: str, blocks: list[str]) -> str:
+    """The text of a function of several blocks."""
+    return f"static void {name} {{\n" + "\n".join(f"  {{\n{lines}\n  }}" for lines in blocks) + "\n}\n"
+
+
+def translate(
+    f: ca.Function, shared: Sequence[int], first: Counts = Counts(), common: Collection[int] = ()
+) -> Text:
+    """C text of an SX function whose last argument is theta.
 
     shared : arguments that have the same value in every lane
-    first_constant : index of the function's first entry in the array c of constants
+    first : entries of c, d and g before those of this function
+    common : entries of theta that have the same value in every lane
 
     Raises CheckError for an operation that has no C form here.
     """
-    nodes, outputs = read_instructions(f, shared)
+    nodes, outputs = read_instructions(f, shared, common)
     used = needed_nodes(nodes, [k for *_, k in outputs])
     fixed = [k for k in used if nodes[k].fixed]
-    # `prepare` stores the fixed nodes that the function reads in the array c.
-    read = {a for k in used if not nodes[k].fixed for a in nodes[k].arguments} | {k for *_, k in outputs}
-    kept = [k for k in fixed if k in read and nodes[k].op]
-    place = {k: first_constant + index for index, k in enumerate(kept)}
-    moving = [k for k in used if nodes[k].op and not nodes[k].fixed]
+    foreseen = _foreseen(nodes, used)
+    moving = [k for k in used if nodes[k].op and not nodes[k].fixed and k not in foreseen]
+    # The arrays of what is computed once: what the others read of it.
+    read = {a for k in moving for a in nodes[k].arguments} | {k for *_, k in outputs}
+    early = {a for k in foreseen for a in nodes[k].arguments}
+    kept = [k for k in fixed if k in read | early and nodes[k].op]
+    place = {
+        **_places("c", [k for k in kept if not nodes[k].common], first.c),
+        **_places("d", [k for k in kept if nodes[k].common], first.d),
+        **_places("g", [k for k in used if k in foreseen and k in read], first.g),
+    }
     parts = _cut_in_parts(moving)
     part = {k: index for index, members in enumerate(parts) for k in members}
     slot = _slots(nodes, parts, {k for *_, k in outputs})
@@ -80,7 +130,7 @@ def translate(f: ca.Function, shared: Sequence[int], first_constant: int) -> tup
         node = nodes[k]
         is_mask = node.op in MASKS
         if at is not None and k in place:
-            plain, is_mask = f"c[{place[k]}]", False
+            plain, is_mask = place[k] if place[k].startswith("c") else f"K({place[k]})", False
         elif k in slot and part[k] != at:
             plain = f"bits(s[{slot[k]}])" if is_mask else f"s[{slot[k]}]"
         else:
@@ -100,15 +150,56 @@ def translate(f: ca.Function, shared: Sequence[int], first_constant: int) -> tup
         return f"  s[{slot[k]}] = {f'value(t{k})' if nodes[k].op in MASKS else f't{k}'};"
 
     prepare = [line(k) for k in fixed if nodes[k].op]
-    prepare += [f"  c[{place[k]}] = {text(k, at=None)};" for k in kept]
+    prepare += [
+        f"  {place[k]} = {text(k, at=None)};" if place[k].startswith("c") else f"  {place[k]} = LANE({text(k, at=None)}, 0);"
+        for k in kept
+    ]
     bodies = [
         [x for k in members for x in (line(k), *([store(k)] if k in slot else []))] for members in parts
     ]
+    in_place = f.name() in ("digest", "cruise")
     results = [(f"r{i}[{j}]", text(k, at=len(parts) - 1)) for i, j, k in outputs]
+    results = [(to, value) for to, value in results if not (in_place and value == to.replace("r0", "a0"))]
     bodies[-1] += [f"  const real o{n} = {found};" for n, (_, found) in enumerate(results)]
-    bodies[-1] += [f"  {place} = o{n};" for n, (place, _) in enumerate(results)]
+    bodies[-1] += [f"  {to} = o{n};" for n, (to, _) in enumerate(results)]
     function = _assemble(f.name(), _arguments(f, shared), bodies, len(set(slot.values())))
-    return "\n".join(["  {", *prepare, "  }"]), function, len(kept)
+    counts = Counts(*(sum(x.startswith(array) for x in place.values()) for array in "cdg"))
+    return Text("\n".join(prepare), function, counts, "\n".join(_foresee(nodes, used, foreseen, place)))
+
+
+def _places(array: str, members: list[int], first: int) -> dict[int, str]:
+    """The entry of an array for each node."""
+    return {k: f"{array}[{first + index}]" for index, k in enumerate(members)}
+
+
+def _foreseen(nodes: list[Node], used: list[int]) -> set[int]:
+    """The nodes that are computed once a sample for all lanes: plain operations on inputs of the sample and numbers
+    that the lanes share."""
+    found: set[int] = set()
+    for k in used:
+        node = nodes[k]
+        if node.op in PLAIN and node.common and not node.fixed:
+            if all(nodes[a].fixed or not nodes[a].op or a in found for a in node.arguments):
+                found.add(k)
+    return found
+
+
+def _foresee(nodes: list[Node], used: list[int], foreseen: set[int], place: dict[int, str]) -> list[str]:
+    """Lines that compute the entries of g from the inputs of a sample, in numbers rather than lanes."""
+
+    def text(k: int) -> str:
+        if k in foreseen:
+            return f"t{k}"
+        return place[k] if nodes[k].op else re.sub(r"^K\((?:a\d+(\[\d+\])|(.*))\)$", _of_one_lane, nodes[k].form)
+
+    members = [k for k in used if k in foreseen]
+    lines = [f"  const double t{k} = {nodes[k].form.format(*map(text, nodes[k].arguments))};" for k in members]
+    return lines + [f"  {place[k]} = t{k};" for k in members if k in place]
+
+
+def _of_one_lane(found: re.Match[str]) -> str:
+    """An input of the sample, or a constant, without its repetition in every lane."""
+    return f"given{found[1]}" if found[1] else f"({found[2]})"
 
 
 def _arguments(f: ca.Function, shared: Sequence[int]) -> list[tuple[str, str]]:
@@ -117,6 +208,7 @@ def _arguments(f: ca.Function, shared: Sequence[int]) -> list[tuple[str, str]]:
     # The first argument and the first result may be the same array: all entries are read before one is written.
     return [
         ("const real *restrict ", "c"),
+        *(("const double *restrict ", array) for array in "dg"),
         *((f"const {kind} *{'restrict ' * (i > 0)}", f"a{i}") for i, kind in enumerate(kinds)),
         *((f"real *{'restrict ' * (i > 0)}", f"r{i}") for i in range(f.n_out())),
     ]
@@ -169,6 +261,9 @@ def _small_tilt_version(function: str) -> str:
 
     A sample whose range is too large is computed again by the general version. Parts without a tilt serve both.
     """
+    if "tilt" not in function:
+        name = function.rpartition("void ")[2].partition("(")[0]
+        return f"#define {name}_near(range, ...) {name}(__VA_ARGS__)\n"
     end = "}\n"
     *parts, whole = function.removesuffix(end).split(end)
     tilted = [part for part in parts if "tilt" in part]

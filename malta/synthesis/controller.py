@@ -302,7 +302,8 @@ def commanded(
 ) -> tuple[Any, Any, Any, Any]:
     """Steps 1, 3, 4 and 6: (xi_pred, e, frozen, v) from the estimate."""
     e = e + g["control_time"] * (1 - frozen) * (p_ref - y)
-    wanted = g["K"] @ (xi_ref - xi_hat) + g["Ki"] @ e + v_ff + v0
+    # The first sum is the same for all machines under one reference: engines compute it once a sample.
+    wanted = (g["K"] @ xi_ref + v_ff) + (g["Ki"] @ e - g["K"] @ xi_hat) + v0
     v = ca.fmax(ca.fmin(wanted, g["force_limit"]), -g["force_limit"])
     return g["Ad"] @ xi_hat + g["Bd"] @ (v - v0), e, v != wanted, v
 
