@@ -33,7 +33,7 @@ def drawn() -> FloatArray:
 
 def test_the_numbers_are_split_mix_and_box_muller() -> None:
     """By hand, with Python's integers and the constants of Steele, Lea and Flood: 32 bits make the radius of each pair,
-    the other 32 its angle, evenly all around."""
+    the other 32 its angle, evenly all around. The pairs are made in single precision, of which 24 bits are left."""
 
     def mixed(x: int) -> int:
         x = (x ^ (x >> 30)) * 0xBF58476D1CE4E5B9 % 2**64
@@ -46,10 +46,10 @@ def test_the_numbers_are_split_mix_and_box_muller() -> None:
     a, b = normals(np.uint64(GAMMA), 4000, 1).reshape(2, -1, 2)[0].T
     bits = [mixed((1 + count) * GAMMA % 2**64) for count in range(len(a))]
     radius = [math.sqrt(-2 * math.log(((x >> 32) + 0.5) / 2**32)) for x in bits]
-    assert np.hypot(a, b) == pytest.approx(radius, rel=1e-12)
+    assert np.hypot(a, b) == pytest.approx(radius, rel=3e-7, abs=2e-6)
     turned = np.arctan2(b, a) / (math.pi / 2) - np.array([(x & 0xFFFFFFFF) / 2**30 for x in bits])
-    assert np.std((turned - turned[0] + 0.5) % 1) < 1e-8  # the same for all: where the angle starts is free
-    assert np.std((turned - turned[0] + 2) % 4) < 1e-8
+    assert np.std((turned - turned[0] + 0.5) % 1) < 3e-7  # the same for all: where the angle starts is free
+    assert np.std((turned - turned[0] + 2) % 4) < 3e-7
 
 
 def test_moments_are_those_of_the_normal_distribution(drawn: FloatArray) -> None:

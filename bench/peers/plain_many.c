@@ -65,20 +65,31 @@ static inline real wave_sine(real x)
 #endif
 #include "plain.h"
 
-/* Two normals by Box and Muller from SplitMix64 of a key and a counter: malta/noise.py. */
-static inline void normals(words key, uint64_t count, real *a, real *b)
+/* Two normals by Box and Muller from SplitMix64 of a key and a counter, in single precision: malta/simulation/noise.py.
+ * To the bit, so nothing is contracted. */
+typedef uint32_t halves __attribute__((vector_size(4 * W)));
+typedef int32_t indices __attribute__((vector_size(4 * W)));
+typedef float singles __attribute__((vector_size(4 * W)));
+static __attribute__((noinline, optimize("fp-contract=off"))) void normals(words key, uint64_t count, real *a, real *b)
 {
     words x = key + count * 0x9e3779b97f4a7c15;
     x = (x ^ (x >> 30)) * 0xbf58476d1ce4e5b9;
     x = (x ^ (x >> 27)) * 0x94d049bb133111eb;
     x ^= x >> 31;
-    real radius = -2 * MVEC(log)((__builtin_convertvector(x >> 32, real) + 0.5) * 0x1p-32);
-    EACH radius[i] = sqrt(radius[i]);
-    /* the quadrant that counts from its middle */
-    real quadrant = __builtin_convertvector((x >> 30) & 3, real);
-    real within = (__builtin_convertvector(x & 0x3fffffff, real) - 536870911.5) * 0x1p-30;
-    real angle = (quadrant + within) * 1.57079632679489662;
-    *a = radius * MVEC(cos)(angle), *b = radius * MVEC(sin)(angle);
+    halves high = __builtin_convertvector(x >> 32, halves), low = __builtin_convertvector(x, halves);
+    halves bits = (halves)__builtin_convertvector(high | 1, singles);
+    indices k = (indices)(bits - 0x3f3504f3u) >> 23;
+    singles f = (singles)(bits - ((halves)k << 23)) - 1;
+    singles log_u = f * (0.99999992f + f * (-0.50000344f + f * (0.33335607f + f * (-0.24971558f + f * (0.19884252f
+        + f * (-0.17212471f + f * (0.16338027f + f * -0.10378417f)))))))
+        + 0.69314718f * __builtin_convertvector(k - 32, singles);
+    singles radius = -2 * log_u;
+    EACH radius[i] = sqrtf(radius[i]);
+    singles turn = __builtin_convertvector((indices)((low << 1) ^ 0x80000000u), singles) * 0x1p-32f, t = turn * turn;
+    radius = (singles)((halves)radius ^ (low & 0x80000000u));
+    singles s = turn * (3.14159264f + t * (-5.1677101f + t * (2.5500775f + t * (-0.59829129f + t * 0.07765766f))));
+    singles c = 0.99999995f + t * (-4.93479283f + t * (4.05841135f + t * (-1.33187657f + t * 0.21968961f)));
+    *a = __builtin_convertvector(radius * c, real), *b = __builtin_convertvector(radius * s, real);
 }
 
 static inline void look_up(long points, const double *grid, real z, real *v0)

@@ -42,7 +42,7 @@ from malta.simulation.digest import (
 from malta.simulation.engines import BLOCK, evaluate, library_of, shape_of
 from malta.simulation.inputs import Inputs, initial_values, inputs_of
 from malta.simulation.layout import electronics_of, flatten, layout_of, noise_scales, numbers_of, with_symbols
-from malta.simulation.noise import advanced, keys, starts_of_parts
+from malta.simulation.noise import TOGETHER, advanced, keys, starts_of_parts
 from malta.simulation.period import initial_state, period_of
 from malta.simulation.scenario import Scenario, Simulation, setup_of, simulation_of, steps_of
 from malta.simulation.simulate import simulate
@@ -223,14 +223,14 @@ def record_run(
     inputs, shared, lanes, parts = _prepare(simulation, variation)
     width = sum(layout_of(plant, controller, simulation.setup).row.values())
     rows = np.empty((len(inputs.t), width))
-    last = np.zeros((1, 2 * width, LANES))
+    last = np.zeros((1, TOGETHER * width, LANES))
     sensors = len(noise_scales(plant, simulation.setup))
     for samples, streams in parts:
-        for k in range(samples.start, samples.stop, 2):  # the engine draws the noise of two samples at once
-            given = inputs.given[k : min(k + 2, samples.stop)]
+        for k in range(samples.start, samples.stop, TOGETHER):
+            given = inputs.given[k : min(k + TOGETHER, samples.stop)]
             now = lanes._replace(keys=advanced(streams, k - samples.start, sensors), digests=last)
             run_many(compiled[0], slice(0, 1), now, shared._replace(given=given))
-            rows[k : k + len(given)] = last[0, :, index - begin].reshape(2, width)[2 - len(given) :]
+            rows[k : k + len(given)] = last[0, :, index - begin].reshape(TOGETHER, width)[-len(given) :]
             if progress is not None and k % 1000 == 0:
                 progress(k / len(rows))
     own = Simulation(own_plant, controller, own_scenario, simulation.setup)

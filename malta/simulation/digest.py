@@ -12,6 +12,7 @@ import numpy as np
 
 from malta.model.plant import Plant, readonly
 from malta.simulation.layout import flatten, layout_of, numbers_of
+from malta.simulation.noise import TOGETHER
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
@@ -169,10 +170,10 @@ def _flying(shape: Any, kept: Any, row: Any, given: Any, alive: Callable[[Any, A
 
 @lru_cache(maxsize=16)
 def recorder_function(shape: Any) -> ca.Function:
-    """A digest that consists of the last two rows: the engine draws noise for two samples at once."""
+    """A digest that consists of the last rows: as many as the engine draws noise for at once."""
     sizes = layout_of(shape.plant, shape.controller, shape.setup)
     width, given = sum(sizes.row.values()), sum(sizes.given.values())
-    kept, row = ca.SX.sym("kept", 2 * width), ca.SX.sym("row", width)
+    kept, row = ca.SX.sym("kept", TOGETHER * width), ca.SX.sym("row", width)
     theta = ca.SX.sym("theta", len(flatten(numbers_of(shape.plant, shape.controller, 1))))
     arguments = [kept, row, ca.SX.sym("given", given), theta]
     return ca.Function("digest", arguments, [ca.vertcat(kept[width:], row)])

@@ -276,49 +276,78 @@ void run(long first, long samples, double substeps, const double *theta, long po
   memcpy(state, now, sizeof *m);
 }
 #else
-/* Noise: SplitMix64 of a lane's key and a counter, 32 bits for the radius and 32 for the angle of Box-Muller. The
-   same numbers as noise.py, whatever the lane.                                                                     */
+/* Noise: SplitMix64 of a lane's key and a counter, 32 bits for the radius and 32 for the angle of Box-Muller, in single
+   precision. Every operation rounds as those of noise.py do, so none may be contracted: the same numbers to the bit.  */
 typedef uint64_t bits64 __attribute__((vector_size(8 * LANES)));
-static inline real logarithm(real x) { /* of 2^-33 < x < 1; fdlibm's */
-  whole b = bits(x) - 0x3fe6a09e667f3bcdLL; /* from sqrt(1/2) on */
-  whole e = b >> 52;
-  real f = value((b & 0xfffffffffffffLL) + 0x3fe6a09e667f3bcdLL) - 1.0;
-  real s = f * inverse(2.0 + f), z = s * s, half = 0.5 * f * f;
-  real tail = z * (6.666666666666735130e-01 + z * (3.999999999940941908e-01 + z * (2.857142874366239149e-01
-    + z * (2.222219843214978396e-01 + z * (1.818357216161805012e-01 + z * (1.531383769920937332e-01
-    + z * 1.479819860511658591e-01))))));
-  real n = __builtin_convertvector(e, real);
-  return n * 6.93147180369123816490e-01 - ((half - (s * (half + tail) + n * 1.90821492927058770002e-10)) - f);
-}
-/* Within an eighth of a turn: fdlibm's polynomials. */
-static inline real sin_near(real r) {
-  real z = r * r, w = z * z;
-  real low = -1.66666666666666324348e-01 + z * 8.33333333332248946124e-03;
-  real mid = -1.98412698298579493134e-04 + z * 2.75573137070700676789e-06;
-  real top = -2.50507602534068634195e-08 + z * 1.58969099521155010221e-10;
-  return r + r * z * (low + w * (mid + w * top));
-}
-static inline real cos_near(real r) {
-  real z = r * r, w = z * z;
-  real low = 4.16666666666666019037e-02 + z * -1.38888888888741095749e-03;
-  real mid = 2.48015872894767294178e-05 + z * -2.75573143513906633035e-07;
-  real top = 2.08757232129817482790e-09 + z * -1.13596475577881948265e-11;
-  return (1.0 - 0.5 * z) + w * (low + w * (mid + w * top));
-}
-static inline void two_normals(bits64 key, uint64_t count, real *a, real *b) {
+typedef uint32_t bits32 __attribute__((vector_size(8 * LANES))); /* twice as many */
+typedef int32_t whole32 __attribute__((vector_size(8 * LANES)));
+typedef float single __attribute__((vector_size(8 * LANES)));
+typedef float half_singles __attribute__((vector_size(4 * LANES)));
+enum { TOGETHER = 4 }; /* samples whose noise is drawn at once */
+
+static bits64 split_mix(bits64 key, uint64_t count) {
   bits64 x = key + count * 0x9e3779b97f4a7c15ULL;
   x = (x ^ (x >> 30)) * 0xbf58476d1ce4e5b9ULL;
   x = (x ^ (x >> 27)) * 0x94d049bb133111ebULL;
-  x = x ^ (x >> 31);
-  const double unit = 1.0 / 4294967296.0, quarter = 1.57079632679489661923 / 1073741824.0;
-  real u = (__builtin_convertvector((whole)(x >> 32), real) + 0.5) * unit;
-  /* The angle: a quadrant, and 30 bits within it about its middle. */
-  whole q = (whole)((x >> 30) & 3);
-  real r = (__builtin_convertvector((whole)(x & 0x3fffffff), real) - 536870911.5) * quarter;
-  real radius = each_sqrt(-2.0 * logarithm(u)), s = sin_near(r) * radius, c = cos_near(r) * radius;
-  whole odd = -(q & 1);
-  *a = value(((bits(s) & odd) | (bits(c) & ~odd)) ^ (((q + 1) & 2) << 62));
-  *b = value(((bits(c) & odd) | (bits(s) & ~odd)) ^ ((q & 2) << 62));
+  return x ^ (x >> 31);
+}
+#ifdef __clang__
+#define CHOSEN(x, y, ...) __builtin_shufflevector(x, y, __VA_ARGS__)
+#define UNCONTRACTED __attribute__((noinline))
+#else
+#define CHOSEN(x, y, ...) __builtin_shuffle(x, y, (bits32){__VA_ARGS__})
+#define UNCONTRACTED __attribute__((noinline, optimize("fp-contract=off")))
+#endif
+#if defined(__AVX512F__) && LANES == 8 /* macros: nothing is inlined where other options hold */
+#define ROOT(x) ((single)_mm512_sqrt_ps((__m512)(x)))
+#define WIDENED(x) ((real)_mm512_cvtps_pd((__m256)(x)))
+#else
+static single root(single x) {
+  for (int i = 0; i < 2 * LANES; i++) x[i] = sqrtf(x[i]);
+  return x;
+}
+#define ROOT(x) root(x)
+#define WIDENED(x) __builtin_convertvector(x, real)
+#endif
+/* Normal numbers of TOGETHER samples from `count` on, a multiple of it, times their scales: two of each counter. */
+static UNCONTRACTED void draw(bits64 key, uint64_t count, const real *scale, real *noise) {
+#ifdef __clang__
+#pragma clang fp contract(off)
+#endif
+  count = count / 2 * OUTPUTS;
+  for (int j = 0; j < 2 * OUTPUTS; j += 2) {
+    bits32 x = (bits32)split_mix(key, count + j), w = (bits32)split_mix(key, count + j + 1);
+    bits32 high = CHOSEN(x, w, 1, 3, 5, 7, 9, 11, 13, 15, 17, 19, 21, 23, 25, 27, 29, 31);
+    bits32 low = CHOSEN(x, w, 0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30);
+    /* u = m 2^k with m from sqrt(1/2) to sqrt(2); log m by a polynomial, relative error 2e-7 */
+    bits32 m = (bits32)__builtin_convertvector(high | 1, single);
+    whole32 k = (whole32)(m - 0x3f3504f3u) >> 23;
+    single f = (single)(m - ((bits32)k << 23)) - 1.0f;
+    single p = 0.16338027f + f * -0.10378417f;
+    p = -0.17212471f + f * p;
+    p = 0.19884252f + f * p;
+    p = -0.24971558f + f * p;
+    p = 0.33335607f + f * p;
+    p = -0.50000344f + f * p;
+    p = 0.99999992f + f * p;
+    single radius = ROOT(-2.0f * (f * p + 0.69314718f * __builtin_convertvector(k - 32, single)));
+    /* the right half of the circle in half turns, and either sign */
+    single a = __builtin_convertvector((whole32)((low << 1) ^ 0x80000000u), single) * 0x1p-32f, t = a * a;
+    radius = (single)((bits32)radius ^ (low & 0x80000000u));
+    single s = -0.59829129f + t * 0.07765766f, c = -1.33187657f + t * 0.21968961f;
+    s = 2.5500775f + t * s, c = 4.05841135f + t * c;
+    s = -5.1677101f + t * s, c = -4.93479283f + t * c;
+    s = 3.14159264f + t * s, c = 0.99999995f + t * c;
+    single pair[2] = {radius * c, radius * (a * s)};
+    half_singles part[2];
+    for (int i = 0; i < 2; i++) {
+      memcpy(part, &pair[i], sizeof part);
+      for (int each = 0; each < 2; each++) {
+        const int at = 2 * (j + each) + i;
+        noise[at] = WIDENED(part[each]) * scale[at];
+      }
+    }
+  }
 }
 
 #if CRUISE
@@ -368,22 +397,21 @@ static void run_group(long samples, long substeps, const real *c, const double *
                       double *states, const double *given, long uniform, const double *scales, const uint64_t *keys,
                       double *digests) {
   real m[2][STATES], *now = m[0], *after = m[1], *before, kept[DIGEST + 1];
-  real sigma[OUTPUTS], noise[2 * OUTPUTS];
+  real sigma[TOGETHER * OUTPUTS], noise[TOGETHER * OUTPUTS], ones[TOGETHER * OUTPUTS];
   int noisy = 0;
   bits64 key;
+  for (int j = 0; j < TOGETHER * OUTPUTS; j++) ones[j] = (real){0} + 1.0;
   memcpy(&key, keys, sizeof key);
   memcpy(now, states, sizeof *m);
   memcpy(kept, digests, sizeof(real) * DIGEST);
-  memcpy(sigma, scales, sizeof sigma);
+  for (int k = 0; k < TOGETHER; k++) memcpy(sigma + k * OUTPUTS, scales, sizeof sigma / TOGETHER);
   for (int j = 0; j < OUTPUTS * LANES; j++) noisy |= scales[j] != 0;
   memset(noise, 0, sizeof noise);
   for (long k = 0; k < samples; k++, given += GIVEN, g += FORESEEN) {
-    const real *drawn = noise + k % 2 * OUTPUTS;
-    if (noisy && k % 2 == 0) {
-      for (int j = 0; j < OUTPUTS; j++)
-        two_normals(key, (uint64_t)(k / 2 * OUTPUTS + j), noise + 2 * j, noise + 2 * j + 1);
-      for (int j = 0; j < 2 * OUTPUTS; j++)
-        noise[j] = (uniform ? each_uniform(noise[j]) : noise[j]) * sigma[j % OUTPUTS];
+    const real *drawn = noise + k % TOGETHER * OUTPUTS;
+    if (noisy && k % TOGETHER == 0) {
+      draw(key, (uint64_t)k, uniform ? ones : sigma, noise);
+      for (int j = 0; j < TOGETHER * OUTPUTS && uniform; j++) noise[j] = each_uniform(noise[j]) * sigma[j];
     }
     __asm__("" : "+r"(d)); /* else numbers in every lane are kept from sample to sample, in more memory than is near */
     sample_near(c, d, g, now, grid, substeps, given, drawn, kept, after);

@@ -1,7 +1,8 @@
-"""Reproducible white noise: the same numbers here and in the lanes of the compiled engine.
+"""Reproducible white noise: the same numbers to the bit here and in the lanes of the compiled engine.
 
 SplitMix64 (Steele, Lea, Flood 2014) of a key and a counter gives 64 bits: 32 for the radius and 32 for the angle of two
-normal numbers (Box–Muller). The noise of a run depends on its seed and index only, not on workers or order.
+normal numbers (Box–Muller), which are computed in single precision. The noise of a run depends on its seed and index
+only, not on workers or order.
 """
 
 from __future__ import annotations
@@ -17,6 +18,12 @@ if TYPE_CHECKING:
 
 _Keys = TypeVar("_Keys", np.uint64, "NDArray[np.uint64]")
 GAMMA = 0x9E3779B97F4A7C15
+TOGETHER = 4  # samples whose noise the engine draws at once
+_SIGN = np.uint32(0x80000000)
+# log(1 + f) / f, cos(pi a) and sin(pi a) / a of a^2: minimax, errors about 1e-7
+_LOG = (0.99999992, -0.50000344, 0.33335607, -0.24971558, 0.19884252, -0.17212471, 0.16338027, -0.10378417)
+_COSINE = (0.99999995, -4.93479283, 4.05841135, -1.33187657, 0.21968961)
+_SINE = (3.14159264, -5.1677101, 2.5500775, -0.59829129, 0.07765766)
 
 
 def keys(seed: int, indices: NDArray[np.int64]) -> NDArray[np.uint64]:
@@ -33,14 +40,31 @@ def normals(key: np.uint64, samples: int, channels: int) -> FloatArray:
     """
     pairs = (samples + 1) // 2 * channels
     bits = mix(key + np.arange(pairs, dtype=np.uint64) * np.uint64(GAMMA))
-    unit = 1 / 2**32
-    radius = np.sqrt(-2 * np.log(((bits >> np.uint64(32)).astype(float) + 0.5) * unit))
-    quadrant = ((bits >> np.uint64(30)) & np.uint64(3)).astype(float)
-    middle = 536870911.5  # of the range of the 30 bits within a quadrant
-    within = ((bits & np.uint64(0x3FFFFFFF)).astype(float) - middle) / 2**30
-    angle = (quadrant + within) * (np.pi / 2)
-    drawn = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
-    return drawn.reshape(-1, channels)[:samples]
+    radius = np.sqrt(np.float32(-2) * _log_of_share((bits >> np.uint64(32)).astype(np.uint32)))
+    low = bits.astype(np.uint32)  # the angle: the right half of the circle in half turns, and either sign
+    half_turns = ((low << np.uint32(1)) ^ _SIGN).view(np.int32).astype(np.float32) * np.float32(2**-32)
+    radius = (radius.view(np.uint32) ^ (low & _SIGN)).view(np.float32)
+    square = half_turns * half_turns
+    drawn = np.stack(
+        [radius * _polynomial(square, _COSINE), radius * (half_turns * _polynomial(square, _SINE))], axis=1
+    )
+    return drawn.astype(float).reshape(-1, channels)[:samples]
+
+
+def _log_of_share(whole: NDArray[np.uint32]) -> NDArray[np.float32]:
+    """log(u / 2^32) of odd numbers u: u = m 2^k with m from sqrt(1/2) to sqrt(2), and log m by a polynomial."""
+    u = (whole | np.uint32(1)).astype(np.float32).view(np.int32)
+    k = (u - np.int32(0x3F3504F3)) >> np.int32(23)
+    f = (u - (k << np.int32(23))).view(np.float32) - np.float32(1)
+    return f * _polynomial(f, _LOG) + np.float32(0.69314718) * (k - np.int32(32)).astype(np.float32)
+
+
+def _polynomial(x: NDArray[np.float32], coefficients: tuple[float, ...]) -> NDArray[np.float32]:
+    """A polynomial by Horner's scheme, the highest power last; every operation is rounded to single precision."""
+    value = np.float32(coefficients[-1])
+    for coefficient in coefficients[-2::-1]:
+        value = np.float32(coefficient) + x * value
+    return np.asarray(value)
 
 
 def starts_of_parts(samples: int, parts: int) -> list[int]:
