@@ -10,7 +10,7 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from functools import lru_cache
+from functools import cache, lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import casadi as ca
@@ -392,7 +392,8 @@ def _map_rows(function: ca.Function, rows: FloatArray, others: FloatArray) -> li
         *(np.array_split(a, count) for a in (rows, np.broadcast_to(others, (len(rows), others.shape[1])))),
         strict=True,
     )
-    found = [evaluate(function.map(len(part)), part, other) for part, other in pairs]
+    mapped = cache(function.map)
+    found = [evaluate(mapped(len(part)), part, other) for part, other in pairs]
     return [np.vstack(column) for column in zip(*found, strict=True)]
 
 

@@ -36,10 +36,8 @@ if TYPE_CHECKING:
 
 LANES = 8
 PATIENCE = 300.0  # s for a compilation, which takes some seconds
-FLAGS = (
-    *("-std=gnu11", "-O2", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math"),
-    *("-fschedule-insns", "-fsched-pressure", "-fPIC", "-shared"),
-)
+FLAGS = ("-std=gnu11", "-O2", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math", "-fPIC", "-shared")
+IN_LANES = ("-fschedule-insns", "-fsched-pressure")  # one machine waits for its chain of operations, and not for loads
 
 
 @cache
@@ -108,7 +106,7 @@ def library(text: str, lanes: int, folder: Path | None = None) -> ctypes.CDLL | 
     version = None if cc is None else _version(cc)
     if cc is None or version is None:
         return None
-    key = "\n".join([text, str(lanes), *FLAGS, *cc, version, _processor(), platform.platform()])
+    key = "\n".join([text, str(lanes), *FLAGS, *IN_LANES, *cc, version, _processor(), platform.platform()])
     name = f"{hashlib.sha256(key.encode()).hexdigest()}.so"
     for wanted in (folder or cache_folder(), _temporary_folder(), None):
         try:
@@ -149,8 +147,8 @@ def _compile(cc: tuple[str, ...], text: str, lanes: int, path: Path) -> bool:
         c, so = Path(scratch) / "engine.c", Path(scratch) / "engine.so"
         c.write_text(text, encoding="utf-8")
         for native in (["-march=native"], []):
-            command = [*cc, *FLAGS, *native, f"-DLANES={lanes}", str(c), "-o", str(so), "-lm"]
-            found = _answer(command)
+            command = [*cc, *FLAGS, *(IN_LANES if lanes > 1 else ()), *native, f"-DLANES={lanes}"]
+            found = _answer([*command, str(c), "-o", str(so), "-lm"])
             if found is None:
                 return False
             if found[0] == 0:

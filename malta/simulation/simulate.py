@@ -17,17 +17,15 @@ from malta.model.data import plant_of
 from malta.model.parameters import shape_parameters, units_of
 from malta.model.plant import Plant
 from malta.simulation import references
-from malta.simulation.engines import EngineChoice, engine_of, evaluate, substeps_until
+from malta.simulation.engines import EngineChoice, engine_of, substeps_until
 from malta.simulation.inputs import (
     Inputs,
     electronics_noise,
-    initial_values,
-    inputs_of,
     sample_inputs,
     samples_of_memory,
     sensor_noise,
 )
-from malta.simulation.period import initial_state_function
+from malta.simulation.prepared import Prepared, prepare
 from malta.simulation.scenario import (
     MOST_SUBSTEPS,
     Scenario,
@@ -74,12 +72,13 @@ def simulate(
     if engine not in get_args(EngineChoice):
         raise InputError("simulate", "engine", repr(engine), "one of " + ", ".join(get_args(EngineChoice)))
     simulation = simulation_of(plant, controller, scenario)
-    inputs = inputs_of(simulation)
+    ready = prepare(simulation)
+    inputs = ready.inputs
     parts: list[FloatArray] = []
     verdict: Verdict | None = None
     kind, done = "", 0
     try:
-        for rows, end, engine_kind in _portions(simulation, inputs, engine):
+        for rows, end, engine_kind in _portions(ready, engine):
             parts.append(rows)
             verdict, kind, done = end, engine_kind, done + len(rows)
             if verdict is not None:
@@ -95,12 +94,13 @@ def simulate(
 
 
 def _portions(
-    simulation: Simulation, inputs: Inputs, choice: EngineChoice
+    ready: Prepared, choice: EngineChoice
 ) -> Iterator[tuple[FloatArray, Verdict | None, str]]:
     """Simulate portion by portion: rows, the verdict if one ends the run there, and the engine's kind.
 
     Between portions the machine's parameters may change, and an outer loop may correct the reference.
     """
+    simulation, inputs, state = ready
     plant, controller, scenario, setup = simulation
     t, _, given = inputs
     samples = len(t)
@@ -108,8 +108,6 @@ def _portions(
     noise = sensor_noise(simulation, stages, t)
     steps = substeps_of(plant, controller, setup, scenario)
     fast = electronics_noise(simulation, substeps_until(samples, steps))
-    start = initial_state_function(plant, controller, setup)
-    state = evaluate(start, *initial_values(simulation, given[0]))[0].ravel()
     observer = _observer(simulation) if setup.outside else None
     every = _samples_between_stops(scenario, controller.sample_time)
     longest = max(1, min(PORTION, int(WORK / steps)))

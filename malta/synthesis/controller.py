@@ -206,20 +206,20 @@ class Controller:
             f"{', current lag' if self.lagging else ''})"
         )
 
-    @property
+    @cached_property
     def delay(self) -> int:
         """Samples of delay in the design model; 0 of a law of errors, which says nothing of its model."""
         if self.tracks == "errors":
             return 0
         return (len(self.Ad) - len(self.A)) // len(self.forces) - self.lagging - self.observed
 
-    @property
+    @cached_property
     def lagging(self) -> int:
         """1 where forces behind the lag of the current loops are among the states, else 0."""
         n, lagging = len(self.A), lagging_forces(self.forces)
         return int(self.tracks == "states" and self.states[n : n + len(lagging)] == lagging)
 
-    @property
+    @cached_property
     def observed(self) -> int:
         """1 where forces of disturbance are among the states, else 0."""
         return int(self.tracks == "states" and self.states[-len(self.forces) :] == disturbances(self.forces))
