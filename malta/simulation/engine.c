@@ -229,6 +229,13 @@ static inline void look_up(const Grid *g, real at, real *v) {
    what was written means nothing. Which of the two a sample is computed by depends on nothing but that sample, so that
    it can be computed again to the bit.                                                                              */
 #define COLD __attribute__((noinline, cold))
+#if COORDINATES
+#define ENTER(near, ...) enter##near(__VA_ARGS__ c, d, g, from, held, work);
+#define LEAVE(near, ...) leave##near(__VA_ARGS__ c, d, g, work, from, held, after);
+#else
+#define ENTER(near, ...) memcpy(work, from, sizeof work);
+#define LEAVE(near, ...) memcpy(after, work, sizeof work);
+#endif
 #define SAMPLE(near, attributes, ...) \
   static attributes int control##near(const real *c, const double *d, const double *g, const real *state, Grid *grid, \
                                       const double *given, const real *noise, real *next, real *held, real *row) { \
@@ -240,9 +247,11 @@ static inline void look_up(const Grid *g, real at, real *v) {
   } \
   static attributes int motion##near(const real *c, const double *d, const double *g, long substeps, const real *from, \
                                      const real *held, const double *given, const real *fast, real *after) { \
-    real range = {0}; \
-    for (long i = 0; i < substeps; i++, from = after, fast += JITTER) \
-      substep##near(__VA_ARGS__ c, d, g, from, held, given, fast, after); \
+    real range = {0}, work[WORKING]; \
+    ENTER(near, __VA_ARGS__) \
+    for (long i = 0; i < substeps; i++, fast += JITTER) \
+      substep##near(__VA_ARGS__ c, d, g, work, held, given, fast, work); \
+    LEAVE(near, __VA_ARGS__) \
     return nowhere(MASK(range > NEAR)); \
   }
 #if TILTED

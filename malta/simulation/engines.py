@@ -20,6 +20,7 @@ from malta.simulation.compiled import address_of, feedforward_table, library
 from malta.simulation.layout import Setup, electronics_of, flatten, numbers_of
 from malta.simulation.period import Period, chain, columns_of, period_of, without_zeros
 from malta.simulation.translate import source
+from malta.simulation.working import with_working_state
 from malta.synthesis.controller import Controller, gains_of
 
 if TYPE_CHECKING:
@@ -112,7 +113,7 @@ def library_of(
     if plant_of(c.parameters).tabulated:
         return None
     p = period_of(shape.plant, c, shape.setup, numbers_of(shape.plant, c, 1), constant=False)
-    p = without_zeros(p, columns_of(c))
+    p = with_working_state(without_zeros(p, columns_of(c)), shape.plant, c, shape.setup)
     lib = library(source(p, digest, cruise), lanes)
     return None if lib is None else (lib, p)
 

@@ -56,6 +56,10 @@ class Period(NamedTuple):
     substep: ca.Function  # (machine, held, given, fast noise, theta) -> machine
     theta: tuple[str, ...]  # names of the numbers, an entry for each
     columns: tuple[int, ...] | None = None  # entries of v0(z) that are not zero; None: all of them
+    # With a working state, see working.py: (machine, held, theta) -> working, (working, machine, held, theta) -> machine;
+    # `substep` takes and returns the working state in place of the machine's.
+    enter: ca.Function | None = None
+    leave: ca.Function | None = None
 
 
 def period_of(

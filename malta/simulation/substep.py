@@ -14,37 +14,44 @@ from malta.simulation.layout import Loop, Setup, Signals, electronics_of
 from malta.simulation.readings import step_readings
 
 OPENING = 20e-6  # s, time constant with which the current of an open phase decays
+SENSORS = ("lagged", "late", "clock")  # states of the machine that belong to its sensors
 
 
 def advance(loop: Loop, signals: Signals, held: Any, jitter: Any) -> Any:
     """The machine's state after one Runge–Kutta step under held commands, or after one period of its electronics."""
-    sensors = ("lagged", "late", "clock")
-    own = {name: value for name, value in signals.machine.items() if name not in sensors}
+    own = {name: value for name, value in signals.machine.items() if name not in SENSORS}
     moved = _move(loop, signals._replace(machine=own), held, jitter)
     after = step_readings(loop, signals.machine, moved[: len(loop.plant.states)])
-    return ca.vertcat(moved, *(after[name] for name in signals.machine if name in sensors))
+    return ca.vertcat(moved, *(after[name] for name in signals.machine if name in SENSORS))
+
+
+def motion(loop: Loop, signals: Signals, x: Any, inputs: Any) -> Any:
+    """x' under the inputs, the machine's loads and what acts from outside."""
+    plant, s = loop.plant, loop.setup
+    w = plant.load(x) + _outside(loop, signals)
+    return plant.f(x, inputs, w + plant.bearing(x) if s.bearing else w)
+
+
+def _outside(loop: Loop, signals: Signals) -> Any:
+    """The disturbance; structural zeros, which cost nothing, where there is none."""
+    return signals.given["w"] if loop.setup.disturbed else ca.SX(len(loop.plant.disturbances), 1)
 
 
 def _move(loop: Loop, signals: Signals, held: Any, jitter: Any) -> Any:
     """The same without the sensors' states."""
     plant, s, h = loop.plant, loop.setup, loop.numbers["substep"]
     machine, given = signals.machine, signals.given
-    # Structural zeros cost nothing.
-    outside = given["w"] if s.disturbed else ca.SX(len(plant.disturbances), 1)
-
-    def motion(x: Any, inputs: Any) -> Any:
-        w = plant.load(x) + outside
-        return plant.f(x, inputs, w + plant.bearing(x) if s.bearing else w)
-
     x, fast = machine["x"], electronics_of(plant, s)
     if fast is not None:
         own = {name: machine[name] for name in fast.state}
-        x, i, own = fast.move(x, machine["i_coil"], own, held, plant.load(x) + outside, jitter)
+        x, i, own = fast.move(x, machine["i_coil"], own, held, plant.load(x) + _outside(loop, signals), jitter)
         return ca.vertcat(x, i, *(own[name] for name in fast.state))
     if s.fidelity == "force":
         currents = _lagging_currents(plant.actuator.crossover, machine["i_coil"], held, h)
         half = len(plant.states) // 2 if plant.second_order else 0
-        moved = runge_kutta(lambda x, n: motion(x, plant.forces(x, currents[n])), x, h, half)
+        moved = runge_kutta(
+            lambda x, n: motion(loop, signals, x, plant.forces(x, currents[n])), x, h, half
+        )
         return ca.vertcat(moved, currents[2])
     n, count = len(plant.states), machine["i" if s.fidelity == "dq" else "i_phase"].numel()
     slope = _axis_slope if s.fidelity == "dq" else _phase_slope
@@ -52,16 +59,22 @@ def _move(loop: Loop, signals: Signals, held: Any, jitter: Any) -> Any:
     def rate(z: Any, _: int) -> Any:
         x, i, V = z[:n], z[n : n + count], z[n + count]
         forces, electrics = slope(plant, s, given, x, i, V, held)
-        return ca.vertcat(motion(x, forces), electrics)
+        return ca.vertcat(motion(loop, signals, x, forces), electrics)
 
     return runge_kutta(rate, ca.vertcat(*machine.values()), h, n // 2 if plant.second_order else 0)
+
+
+def half_step_decay(crossover: Any, h: Any) -> Any:
+    """What is left of a current's deviation from its command after half a step h; 0 where currents follow at once."""
+    at_once = isinstance(crossover, float) and math.isinf(crossover)
+    return ca.SX(0) if at_once else ca.exp(-crossover * h / 2)
 
 
 def _lagging_currents(crossover: Any, i: Any, held: Any, h: Any) -> list[Any]:
     """Currents at the beginning, the middle and the end of a step: i = held + (i_0 - held) e^(-w_c t), exactly."""
     if isinstance(crossover, float) and math.isinf(crossover):
         return [held] * 3
-    lag, decay = i - held, ca.exp(-crossover * h / 2)
+    lag, decay = i - held, half_step_decay(crossover, h)
     return [held + lag, held + decay * lag, held + decay**2 * lag]
 
 

@@ -28,6 +28,7 @@ from malta.simulation.period import Period
 
 WHOLE = 4000  # statements: a longer function is cut into parts
 PART = 300  # statements of a part at most
+IN_PLACE = ("digest", "cruise", "substep")  # an entry that stays as it is is not written
 PLAIN = ("OP_ADD", "OP_SUB", "OP_MUL", "OP_SQ", "OP_NEG", "OP_TWICE")  # the same text for one number and for lanes
 
 
@@ -57,10 +58,11 @@ def source(p: Period, digest: ca.Function | None, cruise: Sequence[ca.Function] 
     texts, functions, counts = [], [], Counts()
     given = {"sense": 1, "decide": 1, "substep": 2, "digest": 2, "cruises": 2, "cruise": 2}
     common = [k for k, name in enumerate(p.theta) if name in SHARED]
-    for f in (p.sense, p.decide, p.substep, *([digest] if digest else []), *cruise):
-        text = translate(f, [given[f.name()]], counts, common)
+    motion = (p.substep,) if p.enter is None or p.leave is None else (p.enter, p.substep, p.leave)
+    for f in (p.sense, p.decide, *motion, *([digest] if digest else []), *cruise):
+        text = translate(f, [given[f.name()]] if f.name() in given else [], counts, common)
         functions.append(text.function)
-        if given[f.name()] == 1 or f is p.substep:
+        if f in (p.sense, p.decide, *motion):
             functions.append(_small_tilt_version(text.function))
         texts.append(text)
         counts = Counts(*(have + more for have, more in zip(counts, text.counts, strict=True)))
@@ -71,7 +73,9 @@ def source(p: Period, digest: ca.Function | None, cruise: Sequence[ca.Function] 
         "SHARED": counts.d,
         "FORESEEN": counts.g,
         "STATES": p.sense.size1_in(0),
-        "MACHINE": p.substep.size1_in(0),
+        "MACHINE": (p.enter or p.substep).size1_in(0),
+        "WORKING": p.substep.size1_in(0),
+        "COORDINATES": int(p.enter is not None),
         "GIVEN": p.sense.size1_in(1),
         "OUTPUTS": p.sense.size1_in(2),
         "FORCES": p.decide.size1_in(3),
@@ -157,7 +161,7 @@ def translate(
     bodies = [
         [x for k in members for x in (line(k), *([store(k)] if k in slot else []))] for members in parts
     ]
-    in_place = f.name() in ("digest", "cruise")
+    in_place = f.name() in IN_PLACE
     results = [(f"r{i}[{j}]", text(k, at=len(parts) - 1)) for i, j, k in outputs]
     results = [(to, value) for to, value in results if not (in_place and value == to.replace("r0", "a0"))]
     bodies[-1] += [f"  const real o{n} = {found};" for n, (_, found) in enumerate(results)]
