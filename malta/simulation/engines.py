@@ -128,6 +128,11 @@ def compiled_engine(run: Any, p: Period, theta: FloatArray, substeps: float, tab
     """The engine of a library with one lane; `run` is the library's function."""
     width = p.decide.size1_out(2)
     theta, table = (np.ascontiguousarray(a, dtype=float) for a in (theta, table))
+    numbers, points, rows_of_table = (  # these addresses keep their arrays alive
+        theta.ctypes.data_as(ctypes.c_void_p),
+        ctypes.c_long(len(table)),
+        table.ctypes.data_as(ctypes.c_void_p),
+    )
 
     def call(
         first: int, state: FloatArray, given: FloatArray, noise: FloatArray, fast: FloatArray
@@ -139,9 +144,9 @@ def compiled_engine(run: Any, p: Period, theta: FloatArray, substeps: float, tab
             ctypes.c_long(first),
             ctypes.c_long(len(given)),
             ctypes.c_double(substeps),
-            address_of(theta),
-            ctypes.c_long(len(table)),
-            address_of(table),
+            numbers,
+            points,
+            rows_of_table,
             address_of(after),
             address_of(given),
             address_of(noise),

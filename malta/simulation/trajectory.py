@@ -6,6 +6,7 @@ import io
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import accumulate
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -118,7 +119,8 @@ def label_rows(
     for array in (rows, given, t):
         array.flags.writeable = False  # the trajectory's series are views of them
     sizes = layout_of(plant, controller, setup).row
-    columns = dict(zip(sizes, np.split(rows, np.cumsum([*sizes.values()])[:-1], axis=1), strict=True))
+    ends = accumulate(sizes.values())
+    columns = {name: rows[:, end - sizes[name] : end] for name, end in zip(sizes, ends, strict=True)}
     if setup.bearing and (verdict is None or verdict.name in plant.contacts):
         verdict = bearing_verdict(plant, columns["contact"], t) or verdict
     return Trajectory(
