@@ -26,6 +26,7 @@ from malta.simulation import compiled, engines, translate
 from malta.simulation.compiled import LANES
 from malta.simulation.engines import engine_of, library_of, shape_of
 from malta.simulation.layout import FIDELITIES, Fidelity
+from malta.simulation.once import Counts
 from malta.simulation.period import Period
 from malta.simulation.private_folders import process_folder
 from malta.simulation.scenario import Fault, Scenario, setup_of
@@ -537,7 +538,7 @@ def test_what_depends_on_constants_alone_is_computed_once() -> None:
     """A division by a number of the machine is a reciprocal in `prepare` and a product in the loop."""
     state, theta = ca.SX.sym("state"), ca.SX.sym("theta", 2)
     f = ca.Function("f", [state, theta], [state / theta[0] + ca.exp(theta[1]) * ca.sin(theta[0])])
-    prepare, moving, counts, _ = translate.translate(f, [], translate.Counts(c=5))
+    prepare, moving, counts, _ = translate.translate(f, [], Counts(c=5))
     assert counts.c == 2
     assert "theta[0]" in prepare
     assert "exp(" in prepare

@@ -39,7 +39,7 @@ from malta.simulation.digest import (
     recorder_function,
     verdicts,
 )
-from malta.simulation.engines import BLOCK, evaluate, library_of, shape_of
+from malta.simulation.engines import BLOCK, compiled_period, evaluate, library_of, shape_of
 from malta.simulation.inputs import Inputs, initial_values, inputs_of
 from malta.simulation.layout import electronics_of, flatten, layout_of, noise_scales, numbers_of, with_symbols
 from malta.simulation.noise import TOGETHER, advanced, keys, starts_of_parts
@@ -275,11 +275,9 @@ def is_compiled(plant: Plant, controller: Controller, scenario: Scenario) -> boo
 def functions_text(plant: Plant, controller: Controller, scenario: Scenario) -> str:
     """The functions that `simulate_many` runs as text: in C, or as CasADi stores those that have no form in C."""
     shape = shape_of(plant, controller, setup_of(plant, controller, scenario))
-    tabulated = plant_of(controller.parameters).tabulated
-    values = numbers_of(plant, controller, 1)
-    period = period_of(plant, controller, shape.setup, values, constant=tabulated)
-    if not tabulated:
-        return source(period, digest_function(shape))
+    if not plant_of(controller.parameters).tabulated:
+        return source(compiled_period(shape), digest_function(shape), cruise_functions(shape))
+    period = period_of(plant, controller, shape.setup, numbers_of(plant, controller, 1), constant=True)
     return "\n".join(f.serialize() for f in (period.sense, period.decide, period.substep))
 
 

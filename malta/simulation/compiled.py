@@ -36,8 +36,19 @@ if TYPE_CHECKING:
 
 LANES = 8
 PATIENCE = 300.0  # s for a compilation, which takes some seconds
-FLAGS = ("-std=gnu11", "-O2", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math", "-fPIC", "-shared")
-IN_LANES = ("-fschedule-insns", "-fsched-pressure")  # one machine waits for its chain of operations, and not for loads
+FLAGS = (
+    "-std=gnu11",
+    "-O2",
+    "-ffp-contract=fast",
+    "-fno-math-errno",
+    "-fno-trapping-math",
+    "-fPIC",
+    "-shared",
+)
+IN_LANES = (
+    "-fschedule-insns",
+    "-fsched-pressure",
+)  # one machine waits for its chain of operations, and not for loads
 
 
 @cache

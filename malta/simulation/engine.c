@@ -1,9 +1,9 @@
 /* The loop around one control period of machine and controller: the frame of every compiled engine.
 
    The functions `prepare`, `foresee`, `sense`, `decide`, `substep` and those of the digest are generated from CasADi
-   expressions by translate.py, which explains c, d and g, and stand at the mark below; the sizes are #defines before it.
-   LANES machines run side by side, one in each lane of a SIMD register; with LANES 1 a `real` is a double and the rows
-   of every sample are kept.                                                                                         */
+   expressions by translate.py, and stand at the mark below; the sizes are #defines before it. c, d and g are those of
+   once.py. LANES machines run side by side, one in each lane of a SIMD register; with LANES 1 a `real` is a double and
+   the rows of every sample are kept.                                                                                */
 
 #include <math.h>
 #include <stdint.h>

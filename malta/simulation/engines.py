@@ -112,10 +112,16 @@ def library_of(
     c = shape.controller
     if plant_of(c.parameters).tabulated:
         return None
-    p = period_of(shape.plant, c, shape.setup, numbers_of(shape.plant, c, 1), constant=False)
-    p = with_working_state(without_zeros(p, columns_of(c)), shape.plant, c, shape.setup)
+    p = compiled_period(shape)
     lib = library(source(p, digest, cruise), lanes)
     return None if lib is None else (lib, p)
+
+
+def compiled_period(shape: Shape) -> Period:
+    """The functions of a control period as they are compiled: with numbers as arguments, without what drops out."""
+    plant, c, setup = shape.plant, shape.controller, shape.setup
+    p = period_of(plant, c, setup, numbers_of(plant, c, 1), constant=False)
+    return with_working_state(without_zeros(p, columns_of(c)), plant, c, setup)
 
 
 def substeps_until(sample: int, substeps: float) -> int:

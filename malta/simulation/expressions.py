@@ -32,7 +32,9 @@ class Identities:
 
     def __init__(self) -> None:
         self._numbers: dict[Any, int] = {}
-        self._known: dict[int, tuple[int, Any]] = {}  # by CasADi's hash; the expression is kept, so that it stays unique
+        self._known: dict[
+            int, tuple[int, Any]
+        ] = {}  # by CasADi's hash; the expression is kept, so that it stays unique
 
     def number(self, e: Any) -> int:
         mark = e.element_hash()
@@ -50,8 +52,7 @@ class Identities:
     def polynomial(self, e: Any) -> Polynomial:
         """The expression as a sum of products. Raises OverflowError for more than TERMS of them."""
         if e.is_constant():
-            value = float(e)
-            return {(): Fraction(value)} if value else {}
+            return {(): Fraction(float(e))} if float(e) else {}
         op = -1 if e.is_symbolic() else e.op()
         if op in _SUMS:
             total: Polynomial = {}
@@ -91,7 +92,7 @@ def conserved(x: Any, rate: Any) -> list[Conserved]:
     momentum of a round body about its own axis is one, where no torque acts about that axis.
     """
     half, same, found = x.numel() // 2, Identities(), []
-    q, taken = x[:half], set()
+    q, taken = x[:half], set[int]()
     for k in range(half, 2 * half):
         for sign, term in _terms(rate[k]):
             for j, s in _candidates(same, term, rate, k, half):
@@ -168,7 +169,9 @@ class _Linear:
         if kinds <= {"fixed", "free"}:
             return "free"
         sum_of_linear = e.op() in _SUMS and kinds == {"linear"}
-        return "linear" if sum_of_linear or (e.op() == ca.OP_MUL and kinds == {"fixed", "linear"}) else "mixed"
+        return (
+            "linear" if sum_of_linear or (e.op() == ca.OP_MUL and kinds == {"fixed", "linear"}) else "mixed"
+        )
 
     def rewritten(self, e: Any) -> Any:
         """The expression with a name in place of every largest linear part."""

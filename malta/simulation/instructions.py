@@ -174,7 +174,11 @@ class _StraightLine:
         for k in first + second:
             node = self.nodes[k]
             inverse = {"TILT_COSINE": "TILT_SECANT", "TILT_SECANT": "TILT_COSINE"}.get(node.op)
-            pair = [j for j in first + second if (self.nodes[j].op, self.nodes[j].arguments) == (inverse, node.arguments)]
+            pair = [
+                j
+                for j in first + second
+                if (self.nodes[j].op, self.nodes[j].arguments) == (inverse, node.arguments)
+            ]
             if pair:
                 rest = first + second
                 rest.remove(k)
@@ -229,7 +233,7 @@ class _StraightLine:
         return self._tilt("TILT_COSINE", k) or self._wave("COSINE_OF_PI", k)
 
     def _wave(self, name: str, k: int) -> int | None:
-        """Sine or cosine of f x + g with fixed f and g, as of pi ((f / pi) x + g / pi): half turns are whole numbers."""
+        """Sine or cosine of f x + g with fixed f and g, as of pi ((f / pi) x + g / pi): half turns are integers."""
         node = self.nodes[k]
         product, shift = k, None
         if node.op == "OP_ADD":

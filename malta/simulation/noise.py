@@ -61,10 +61,10 @@ def _log_of_share(whole: NDArray[np.uint32]) -> NDArray[np.float32]:
 
 def _polynomial(x: NDArray[np.float32], coefficients: tuple[float, ...]) -> NDArray[np.float32]:
     """A polynomial by Horner's scheme, the highest power last; every operation is rounded to single precision."""
-    value = np.float32(coefficients[-1])
+    value: NDArray[np.float32] = np.full_like(x, coefficients[-1])
     for coefficient in coefficients[-2::-1]:
         value = np.float32(coefficient) + x * value
-    return np.asarray(value)
+    return value
 
 
 def starts_of_parts(samples: int, parts: int) -> list[int]:

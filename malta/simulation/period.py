@@ -48,6 +48,7 @@ from malta.simulation.readings import initial_readings, measurement
 from malta.simulation.substep import advance
 from malta.synthesis.controller import Controller, commanded, estimated, filtered, freeze_moving, look_ahead
 
+
 class Period(NamedTuple):
     """The functions of one control period; theta has no entries where all numbers are constants."""
 
@@ -56,8 +57,8 @@ class Period(NamedTuple):
     substep: ca.Function  # (machine, held, given, fast noise, theta) -> machine
     theta: tuple[str, ...]  # names of the numbers, an entry for each
     columns: tuple[int, ...] | None = None  # entries of v0(z) that are not zero; None: all of them
-    # With a working state, see working.py: (machine, held, theta) -> working, (working, machine, held, theta) -> machine;
-    # `substep` takes and returns the working state in place of the machine's.
+    # With a working state, see working.py, which `substep` takes and returns in place of the machine's:
+    # (machine, held, theta) -> working, and (working, machine, held, theta) -> machine.
     enter: ca.Function | None = None
     leave: ca.Function | None = None
 
@@ -103,7 +104,7 @@ def period_of(
 
 
 def columns_of(c: Controller) -> tuple[int, ...]:
-    """The forces whose v0(z) is not zero at every point. Below the rounding of rounding errors of the forces is zero."""
+    """The forces whose v0(z) is not zero at every point; below the rounding of the forces' rounding is zero."""
     size, limit = np.abs(c.feedforward.v0).max(axis=0), np.abs(c.limits.force).max()
     return tuple(np.flatnonzero(size > np.finfo(float).eps ** 2 * limit).tolist())
 

@@ -58,5 +58,5 @@ def is_repeatable(s: Scenario) -> bool:
         reference = reference.func
     own = str(getattr(reference, "__module__", "")).partition(".")[0] == __name__.partition(".")[0]
     plain = all(isinstance(value, int | float | str | None) for value in arguments)
-    touched = s.disturbance or s.correction or s.faults or s.start or s.electronics
+    touched = s.disturbance or s.anticipated or s.correction or s.faults or s.start or s.electronics
     return own and plain and not touched

@@ -93,9 +93,7 @@ def simulate(
     return label_rows(simulation, inputs, table, verdict, kind)
 
 
-def _portions(
-    ready: Prepared, choice: EngineChoice
-) -> Iterator[tuple[FloatArray, Verdict | None, str]]:
+def _portions(ready: Prepared, choice: EngineChoice) -> Iterator[tuple[FloatArray, Verdict | None, str]]:
     """Simulate portion by portion: rows, the verdict if one ends the run there, and the engine's kind.
 
     Between portions the machine's parameters may change, and an outer loop may correct the reference.

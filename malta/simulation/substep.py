@@ -44,14 +44,14 @@ def _move(loop: Loop, signals: Signals, held: Any, jitter: Any) -> Any:
     x, fast = machine["x"], electronics_of(plant, s)
     if fast is not None:
         own = {name: machine[name] for name in fast.state}
-        x, i, own = fast.move(x, machine["i_coil"], own, held, plant.load(x) + _outside(loop, signals), jitter)
+        x, i, own = fast.move(
+            x, machine["i_coil"], own, held, plant.load(x) + _outside(loop, signals), jitter
+        )
         return ca.vertcat(x, i, *(own[name] for name in fast.state))
     if s.fidelity == "force":
         currents = _lagging_currents(plant.actuator.crossover, machine["i_coil"], held, h)
         half = len(plant.states) // 2 if plant.second_order else 0
-        moved = runge_kutta(
-            lambda x, n: motion(loop, signals, x, plant.forces(x, currents[n])), x, h, half
-        )
+        moved = runge_kutta(lambda x, n: motion(loop, signals, x, plant.forces(x, currents[n])), x, h, half)
         return ca.vertcat(moved, currents[2])
     n, count = len(plant.states), machine["i" if s.fidelity == "dq" else "i_phase"].numel()
     slope = _axis_slope if s.fidelity == "dq" else _phase_slope

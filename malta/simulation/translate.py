@@ -1,20 +1,14 @@
 """C text of CasADi functions: the control period inside the loop of engine.c.
 
 Every number of machine and controller is an entry of theta, so that one compilation serves all machines and gain files
-of a shape. What is the same for long is computed once, and kept in an array:
-
-    c   once a run, in every lane: depends on theta only
-    d   once a run for all lanes: depends only on the numbers that they share, those of the controller
-    g   once a sample for all lanes: depends on these and on the inputs of the sample, as K xi* + v_ff does
-
-A long function is cut into parts that hand numbers over in an array: compilers need far more than twice the time for
-twice the text in one piece. Each function has a second version for small tilts, which has no branches.
+of a shape. What is the same for a run or for all lanes is computed once, see once.py. A long function is cut into
+parts that hand numbers over in an array: compilers need far more than twice the time for twice the text in one piece.
+Each function has a second version for small tilts, which has no branches.
 """
 
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Collection, Sequence
 from importlib.resources import files
 from itertools import pairwise
@@ -24,20 +18,20 @@ import casadi as ca
 
 from malta.simulation.instructions import MASKS, Node, mask_arguments, needed_nodes, read_instructions
 from malta.simulation.layout import SHARED
+from malta.simulation.once import NONE, Counts, counts_of, foresee, foreseen, places
 from malta.simulation.period import Period
 
 WHOLE = 4000  # statements: a longer function is cut into parts
 PART = 300  # statements of a part at most
 IN_PLACE = ("digest", "cruise", "substep")  # an entry that stays as it is is not written
-PLAIN = ("OP_ADD", "OP_SUB", "OP_MUL", "OP_SQ", "OP_NEG", "OP_TWICE")  # the same text for one number and for lanes
-
-
-class Counts(NamedTuple):
-    """Entries of the arrays of what is computed once."""
-
-    c: int = 0
-    d: int = 0
-    g: int = 0
+PLAIN = (
+    "OP_ADD",
+    "OP_SUB",
+    "OP_MUL",
+    "OP_SQ",
+    "OP_NEG",
+    "OP_TWICE",
+)  # the same text for one number and for lanes
 
 
 class Text(NamedTuple):
@@ -55,7 +49,7 @@ def source(p: Period, digest: ca.Function | None, cruise: Sequence[ca.Function] 
     digest : the function that updates a run's digest, see digest.py; None for an engine of one lane
     cruise : when a shorter update does the same, and that update
     """
-    texts, functions, counts = [], [], Counts()
+    texts, functions, counts = [], [], NONE
     given = {"sense": 1, "decide": 1, "substep": 2, "digest": 2, "cruises": 2, "cruise": 2}
     common = [k for k, name in enumerate(p.theta) if name in SHARED]
     motion = (p.substep,) if p.enter is None or p.leave is None else (p.enter, p.substep, p.leave)
@@ -90,9 +84,9 @@ def source(p: Period, digest: ca.Function | None, cruise: Sequence[ca.Function] 
     }
     defines = "".join(f"#define {name} {value}\n" for name, value in sizes.items())
     prepare = _once("prepare(const real *theta, real *c, double *d)", [text.prepare for text in texts])
-    foresee = _once("foresee(const double *d, const double *given, double *g)", [x.foresee for x in texts])
+    ahead = _once("foresee(const double *d, const double *given, double *g)", [x.foresee for x in texts])
     frame = files("malta.simulation").joinpath("engine.c").read_text(encoding="utf-8")
-    return defines + frame.replace("/*MODEL*/", prepare + foresee + "".join(functions))
+    return defines + frame.replace("/*MODEL*/", prepare + ahead + "".join(functions))
 
 
 def _once(name: str, blocks: list[str]) -> str:
@@ -100,8 +94,46 @@ def _once(name: str, blocks: list[str]) -> str:
     return f"static void {name} {{\n" + "\n".join(f"  {{\n{lines}\n  }}" for lines in blocks) + "\n}\n"
 
 
+class Names(NamedTuple):
+    """The C names of nodes."""
+
+    nodes: list[Node]
+    place: dict[int, str]  # of nodes that are computed once
+    slot: dict[int, int]  # of nodes that one part of a function leaves to another
+    part: dict[int, int]  # of the function, that computes a node
+
+    def text(self, k: int, *, at: int | None, mask: bool = False) -> str:
+        """The name of a node in part `at` of the function, or in `prepare` (None); as a mask on request."""
+        node, place = self.nodes[k], self.place.get(k, "")
+        is_mask = node.op in MASKS
+        if at is not None and place:
+            plain, is_mask = place if place.startswith("c") else f"K({place})", False
+        elif k in self.slot and self.part[k] != at:
+            plain = f"bits(s[{self.slot[k]}])" if is_mask else f"s[{self.slot[k]}]"
+        else:
+            plain = f"t{k}" if node.op else node.form
+        if mask:
+            return plain if is_mask else f"MASK({plain} != 0.0)"
+        return f"truth({plain})" if is_mask else plain
+
+    def lines(self, k: int) -> list[str]:
+        """The statement that computes a node, and the one that leaves it to other parts."""
+        node, at, masks = self.nodes[k], self.part.get(k), mask_arguments(self.nodes[k])
+        values = [self.text(a, at=at, mask=i in masks) for i, a in enumerate(node.arguments)]
+        kind = "whole" if node.op in MASKS else "real"
+        line = f"  const {kind} t{k} = {node.form.format(*values)};"
+        if k not in self.slot:
+            return [line]
+        return [line, f"  s[{self.slot[k]}] = {f'value(t{k})' if kind == 'whole' else f't{k}'};"]
+
+    def keep(self, k: int) -> str:
+        """The statement that stores a number that is computed once a run."""
+        place, value = self.place[k], self.text(k, at=None)
+        return f"  {place} = {value if place.startswith('c') else f'LANE({value}, 0)'};"
+
+
 def translate(
-    f: ca.Function, shared: Sequence[int], first: Counts = Counts(), common: Collection[int] = ()
+    f: ca.Function, shared: Sequence[int], first: Counts = NONE, common: Collection[int] = ()
 ) -> Text:
     """C text of an SX function whose last argument is theta.
 
@@ -113,97 +145,22 @@ def translate(
     """
     nodes, outputs = read_instructions(f, shared, common)
     used = needed_nodes(nodes, [k for *_, k in outputs])
-    fixed = [k for k in used if nodes[k].fixed]
-    foreseen = _foreseen(nodes, used)
-    moving = [k for k in used if nodes[k].op and not nodes[k].fixed and k not in foreseen]
-    # The arrays of what is computed once: what the others read of it.
-    read = {a for k in moving for a in nodes[k].arguments} | {k for *_, k in outputs}
-    early = {a for k in foreseen for a in nodes[k].arguments}
-    kept = [k for k in fixed if k in read | early and nodes[k].op]
-    place = {
-        **_places("c", [k for k in kept if not nodes[k].common], first.c),
-        **_places("d", [k for k in kept if nodes[k].common], first.d),
-        **_places("g", [k for k in used if k in foreseen and k in read], first.g),
-    }
+    early = foreseen(nodes, used)
+    moving = [k for k in used if nodes[k].op and not nodes[k].fixed and k not in early]
+    place = places(nodes, used, early, {k for *_, k in outputs}, first)
     parts = _cut_in_parts(moving)
     part = {k: index for index, members in enumerate(parts) for k in members}
-    slot = _slots(nodes, parts, {k for *_, k in outputs})
-
-    def text(k: int, *, at: int | None, mask: bool = False) -> str:
-        """The C name of a node in part `at` of the function, or in `prepare` (None); as a mask on request."""
-        node = nodes[k]
-        is_mask = node.op in MASKS
-        if at is not None and k in place:
-            plain, is_mask = place[k] if place[k].startswith("c") else f"K({place[k]})", False
-        elif k in slot and part[k] != at:
-            plain = f"bits(s[{slot[k]}])" if is_mask else f"s[{slot[k]}]"
-        else:
-            plain = f"t{k}" if node.op else node.form
-        if mask:
-            return plain if is_mask else f"MASK({plain} != 0.0)"
-        return f"truth({plain})" if is_mask else plain
-
-    def line(k: int) -> str:
-        node, at = nodes[k], part.get(k)
-        masks = mask_arguments(node)
-        values = [text(a, at=at, mask=i in masks) for i, a in enumerate(node.arguments)]
-        kind = "whole" if node.op in MASKS else "real"
-        return f"  const {kind} t{k} = {node.form.format(*values)};"
-
-    def store(k: int) -> str:
-        return f"  s[{slot[k]}] = {f'value(t{k})' if nodes[k].op in MASKS else f't{k}'};"
-
-    prepare = [line(k) for k in fixed if nodes[k].op]
-    prepare += [
-        f"  {place[k]} = {text(k, at=None)};" if place[k].startswith("c") else f"  {place[k]} = LANE({text(k, at=None)}, 0);"
-        for k in kept
-    ]
-    bodies = [
-        [x for k in members for x in (line(k), *([store(k)] if k in slot else []))] for members in parts
-    ]
-    in_place = f.name() in IN_PLACE
-    results = [(f"r{i}[{j}]", text(k, at=len(parts) - 1)) for i, j, k in outputs]
-    results = [(to, value) for to, value in results if not (in_place and value == to.replace("r0", "a0"))]
+    names = Names(nodes, place, _slots(nodes, parts, {k for *_, k in outputs}), part)
+    fixed = [k for k in used if nodes[k].fixed and nodes[k].op]
+    prepare = [line for k in fixed for line in names.lines(k)] + [names.keep(k) for k in fixed if k in place]
+    bodies = [[line for k in members for line in names.lines(k)] for members in parts]
+    results = [(f"r{i}[{j}]", names.text(k, at=len(parts) - 1)) for i, j, k in outputs]
+    if f.name() in IN_PLACE:
+        results = [(to, value) for to, value in results if value != to.replace("r0", "a0")]
     bodies[-1] += [f"  const real o{n} = {found};" for n, (_, found) in enumerate(results)]
     bodies[-1] += [f"  {to} = o{n};" for n, (to, _) in enumerate(results)]
-    function = _assemble(f.name(), _arguments(f, shared), bodies, len(set(slot.values())))
-    counts = Counts(*(sum(x.startswith(array) for x in place.values()) for array in "cdg"))
-    return Text("\n".join(prepare), function, counts, "\n".join(_foresee(nodes, used, foreseen, place)))
-
-
-def _places(array: str, members: list[int], first: int) -> dict[int, str]:
-    """The entry of an array for each node."""
-    return {k: f"{array}[{first + index}]" for index, k in enumerate(members)}
-
-
-def _foreseen(nodes: list[Node], used: list[int]) -> set[int]:
-    """The nodes that are computed once a sample for all lanes: plain operations on inputs of the sample and numbers
-    that the lanes share."""
-    found: set[int] = set()
-    for k in used:
-        node = nodes[k]
-        if node.op in PLAIN and node.common and not node.fixed:
-            if all(nodes[a].fixed or not nodes[a].op or a in found for a in node.arguments):
-                found.add(k)
-    return found
-
-
-def _foresee(nodes: list[Node], used: list[int], foreseen: set[int], place: dict[int, str]) -> list[str]:
-    """Lines that compute the entries of g from the inputs of a sample, in numbers rather than lanes."""
-
-    def text(k: int) -> str:
-        if k in foreseen:
-            return f"t{k}"
-        return place[k] if nodes[k].op else re.sub(r"^K\((?:a\d+(\[\d+\])|(.*))\)$", _of_one_lane, nodes[k].form)
-
-    members = [k for k in used if k in foreseen]
-    lines = [f"  const double t{k} = {nodes[k].form.format(*map(text, nodes[k].arguments))};" for k in members]
-    return lines + [f"  {place[k]} = t{k};" for k in members if k in place]
-
-
-def _of_one_lane(found: re.Match[str]) -> str:
-    """An input of the sample, or a constant, without its repetition in every lane."""
-    return f"given{found[1]}" if found[1] else f"({found[2]})"
+    function = _assemble(f.name(), _arguments(f, shared), bodies, len(set(names.slot.values())))
+    return Text("\n".join(prepare), function, counts_of(place), "\n".join(foresee(nodes, used, early, place)))
 
 
 def _arguments(f: ca.Function, shared: Sequence[int]) -> list[tuple[str, str]]:

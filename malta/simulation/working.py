@@ -4,8 +4,8 @@
 
 It is another set of coordinates of the same motion, in which a step takes fewer operations:
 
-- A rate that belongs to a conserved quantity G = x_k + s(q) x_j is not integrated: x_k = G - s(q) x_j. G is proven to be
-  constant, whatever its value (expressions.conserved); a torque from outside leaves the rate among the others.
+- A rate that belongs to a conserved quantity G = x_k + s(q) x_j is not integrated: x_k = G - s(q) x_j. G is proven to
+  be constant, whatever its value (expressions.conserved); a torque from outside leaves the rate among the others.
 - Forces enter the motion as a few linear combinations of the coils' currents. Currents follow their commands as
   first-order lags, so the combinations do, and no step needs the currents themselves.
 """
@@ -18,7 +18,15 @@ import casadi as ca
 
 from malta.model.plant import Plant
 from malta.simulation.expressions import Conserved, conserved, linear_parts
-from malta.simulation.layout import Loop, Setup, electronics_of, layout_of, numbers_of, signals_of, with_symbols
+from malta.simulation.layout import (
+    Loop,
+    Setup,
+    electronics_of,
+    layout_of,
+    numbers_of,
+    signals_of,
+    with_symbols,
+)
 from malta.simulation.period import Period
 from malta.simulation.readings import step_readings
 from malta.simulation.substep import SENSORS, half_step_decay, motion, runge_kutta
@@ -108,4 +116,4 @@ def with_working_state(p: Period, plant: Plant, c: Controller, s: Setup) -> Peri
 
 
 def _dense(parts: list[Any]) -> list[Any]:
-    return ca.cse([ca.densify(ca.vertcat(*parts))])
+    return [ca.cse(ca.densify(ca.vertcat(*parts)))]
