@@ -80,7 +80,10 @@ def workload(name: str) -> tuple[malta.Plant, Workload]:
 
 
 def stroke(runs: int) -> list[Result]:
-    """0.1 s of the stroke: 2000 control steps of four Runge–Kutta steps, the loops built beforehand on all sides."""
+    """0.1 s of the stroke: 2000 control steps of four Runge–Kutta steps, the loops built beforehand on all sides.
+
+    The references too: peers are given theirs, and malta remembers those of a scenario that can only repeat.
+    """
     plant, work = workload("table2")
     controller, scenario = work.controller, SCENARIO
     start = malta.simulate(plant, controller, scenario)
@@ -127,7 +130,7 @@ def stroke(runs: int) -> list[Result]:
         runs=runs,
         what="stroke",
     )
-    wanted = ["at least 300", "", "at least 0.5", "", ""]
+    wanted = ["at least 300", "", "at least 0.5", "at least 0.9", ""]
     rows = [Result("stroke, 0.1 s", ours, *rest) for rest in zip(peers, theirs, wanted, strict=False)]
     slowest = next(iter(peers))
     return [
@@ -158,7 +161,7 @@ PEERS = (
     Peer("numba prange, same equations", "peer_numba_plain", "many", "at least 4"),
     Peer("jax vmap, same equations", "peer_jax_plain", "many", "at least 10"),
     Peer("numpy over machines, reformulated", "peer_numpy", "many", "at least 10"),
-    Peer("C, SIMD, OpenMP, reformulated", "peer_c", "many", ""),
+    Peer("C, SIMD, OpenMP, reformulated", "peer_c", "many", "at least 0.9"),
     Peer("the same, scalar noise", "peer_c", "many", "", {"scalar_noise": True}),
     Peer("numba prange, reformulated, lanes by hand", "peer_numba", "many", ""),
     Peer("the same, np.random", "peer_numba", "many", "", {"scalar_noise": True}),

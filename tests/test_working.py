@@ -16,7 +16,7 @@ from malta.machines.tubular import plant as tubular
 from malta.simulation import compiled, prepared
 from malta.simulation.batch import simulate_many
 from malta.simulation.digest import cruise_functions, digest_function
-from malta.simulation.engines import compiled_period, shape_of
+from malta.simulation.engines import EngineChoice, compiled_period, shape_of
 from malta.simulation.expressions import Identities, conserved, linear_parts
 from malta.simulation.layout import numbers_of, with_symbols
 from malta.simulation.once import Counts
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 
 needs_compiler = pytest.mark.skipif(compiled.compiler() is None, reason="no C compiler")
 SPIN = 11  # the state gamma'
+_ENGINES: tuple[EngineChoice, ...] = ("compiled", "virtual machine")
 
 
 def _stroke(**options: Any) -> Scenario:
@@ -58,8 +59,7 @@ def _agreement(design: Design, scenario: Scenario, plant: Plant | None = None) -
     """The compiled run, and its largest difference from that of CasADi's virtual machine, as a share of each state."""
     plant = plant or design.plant
     found, expected = (
-        malta.simulate(plant, design.controller, scenario, engine=engine)  # type: ignore[arg-type]
-        for engine in ("compiled", "virtual machine")
+        malta.simulate(plant, design.controller, scenario, engine=engine) for engine in _ENGINES
     )
     assert found.verdict == expected.verdict
     size = np.abs(expected.x).max(axis=0)
@@ -308,12 +308,12 @@ def test_what_may_change_is_prepared_anew(designs: dict[str, Design]) -> None:
     for size[0] in (1e-3, 2e-3):
         runs.append(malta.simulate(design.plant, design.controller, scenario).reference)
     assert np.ptp([run[0, 4] for run in runs]) == pytest.approx(1e-3)
-    own = partial(references.hold, z=1e-3)
+    own, array = partial(references.hold, z=1e-3), np.array(1e-3)
     assert prepared.is_repeatable(Scenario("hold", 0.005, own))
     for touched in (
         {"start": {"z": 1e-3}},
         {"disturbance": _torque(0.0)},
-        {"reference": partial(references.hold, z=np.array(1e-3))},
+        {"reference": partial(references.hold, z=array)},  # type: ignore[arg-type]
         {"reference": moved},
     ):
         options: Any = {"reference": own} | touched

@@ -1,9 +1,12 @@
 """Nonlinear simulation: control period, engines, scenarios, batches and experiments.
 
 layout, current_control, substep, period    one control period of machine and controller as CasADi functions
-instructions, translate, compiled, engines  these functions as C, or on CasADi's virtual machine
+expressions, working                        what is proven to be conserved or linear, and steps that make use of it
+instructions, once, translate               these functions as C
+compiled, engines                           libraries of C, or CasADi's virtual machine
 scenario, references, noise, inputs         the reference, and everything that disturbs the machine
-simulate, verdict, trajectory, start_up     one machine, with all time series
+prepared, simulate, verdict                 one machine
+trajectory, start_up                        its time series, and its observer at the start
 batch, digest                               thousands of machines, with the figures of each run
 experiments, generic, responses             scenarios with figures of merit
 time_optimal, inverter                      the fastest stroke, and half-bridges on a DC link

@@ -205,8 +205,12 @@ class Shared(NamedTuple):
 
 def arrange_in_lanes(rows: FloatArray, groups: int) -> FloatArray:
     """Rows of machines as groups x numbers x LANES; copies of the last machine fill the last group."""
-    filled = np.concatenate([rows, np.repeat(rows[-1:], groups * LANES - len(rows), axis=0)])
-    return np.ascontiguousarray(filled.reshape(groups, LANES, -1).swapaxes(1, 2))
+    lanes, whole = np.empty((groups, rows.shape[1], LANES)), len(rows) // LANES
+    lanes[:whole] = rows[: whole * LANES].reshape(whole, LANES, -1).swapaxes(1, 2)
+    if whole < groups:
+        rest = rows[whole * LANES :]
+        lanes[whole] = np.concatenate([rest, np.repeat(rows[-1:], LANES - len(rest), axis=0)]).T
+    return lanes
 
 
 class Part(NamedTuple):
