@@ -1,4 +1,4 @@
-"""C text of CasADi functions: the control period inside the loop of engine.c.
+"""C text of CasADi functions: the control period inside the loop of engine.c, on the numbers of numbers.c.
 
 Every number of machine and controller is an entry of theta, so that one compilation serves all machines and gain files
 of a shape. What is the same for a run or for all lanes is computed once, see once.py. A long function is cut into
@@ -85,8 +85,12 @@ def source(p: Period, digest: ca.Function | None, cruise: Sequence[ca.Function] 
     defines = "".join(f"#define {name} {value}\n" for name, value in sizes.items())
     prepare = _once("prepare(const real *theta, real *c, double *d)", [text.prepare for text in texts])
     ahead = _once("foresee(const double *d, const double *given, double *g)", [x.foresee for x in texts])
-    frame = files("malta.simulation").joinpath("engine.c").read_text(encoding="utf-8")
-    return defines + frame.replace("/*MODEL*/", prepare + ahead + "".join(functions))
+    numbers, noise, loop = (
+        files("malta.simulation").joinpath(f"{name}.c").read_text(encoding="utf-8")
+        for name in ("numbers", "noise", "engine")
+    )
+    noise = f"#if LANES > 1\n{noise}#endif\n"
+    return "".join([defines, numbers, prepare, ahead, *functions, noise, loop])
 
 
 def _once(name: str, blocks: list[str]) -> str:
