@@ -384,15 +384,23 @@ def _starts(simulation: Simulation, given: FloatArray, starts: Mapping[str, Floa
 
 
 def _map_rows(function: ca.Function, rows: FloatArray, others: FloatArray) -> list[FloatArray]:
-    """f(row, other) for every row, runs x size for each result of f. At most BLOCK rows are mapped in one call."""
+    """f(row, other) for every row, runs x size for each result of f. At most BLOCK rows are mapped in one call.
+
+    Where the rows agree in all that f depends on, it is evaluated once.
+    """
+    results = range(function.n_out())
+    read = np.unique(np.concatenate([function.jac_sparsity(i, 0).get_col() for i in results])).astype(int)
+    if len(others) == 1 and (rows[:, read] == rows[0, read]).all():
+        found = evaluate(function, rows[0], others[0])
+        return [np.repeat(value.reshape(1, -1), len(rows), axis=0) for value in found]
     count = -(-len(rows) // BLOCK)
     pairs = zip(
         *(np.array_split(a, count) for a in (rows, np.broadcast_to(others, (len(rows), others.shape[1])))),
         strict=True,
     )
     mapped = cache(function.map)
-    found = [evaluate(mapped(len(part)), part, other) for part, other in pairs]
-    return [np.vstack(column) for column in zip(*found, strict=True)]
+    blocks = [evaluate(mapped(len(part)), part, other) for part, other in pairs]
+    return [np.vstack(column) for column in zip(*blocks, strict=True)]
 
 
 def _simulate_one_by_one(
