@@ -22,7 +22,7 @@ SOURCES = Path(__file__).parent / "peers"
 GCC = shutil.which("gcc")
 if GCC is None:
     raise ImportError("no gcc")
-FLAGS = "-std=gnu17 -O3 -march=native -ffp-contract=fast -fno-math-errno"
+FLAGS = "-std=gnu17 -O3 -march=native -mtune=generic -ffp-contract=fast -fno-math-errno"
 FLAGS += " -fno-trapping-math -fschedule-insns -fsched-pressure -Wno-psabi"
 
 

@@ -37,18 +37,10 @@ if TYPE_CHECKING:
 LANES = 8
 PATIENCE = 300.0  # s for a compilation, which takes some seconds
 FLAGS = (
-    "-std=gnu11",
-    "-O2",
-    "-ffp-contract=fast",
-    "-fno-math-errno",
-    "-fno-trapping-math",
-    "-fPIC",
-    "-shared",
+    *("-std=gnu11", "-O2", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math"),
+    *("-fschedule-insns", "-fsched-pressure", "-fPIC", "-shared"),
 )
-IN_LANES = (
-    "-fschedule-insns",
-    "-fsched-pressure",
-)  # one machine waits for its chain of operations, and not for loads
+NATIVE = ("-march=native", "-mtune=generic")  # tuned for a compiler's guess of a processor, text is slower
 
 
 @cache
@@ -117,7 +109,7 @@ def library(text: str, lanes: int, folder: Path | None = None) -> ctypes.CDLL | 
     version = None if cc is None else _version(cc)
     if cc is None or version is None:
         return None
-    key = "\n".join([text, str(lanes), *FLAGS, *IN_LANES, *cc, version, _processor(), platform.platform()])
+    key = "\n".join([text, str(lanes), *FLAGS, *NATIVE, *cc, version, _processor(), platform.platform()])
     name = f"{hashlib.sha256(key.encode()).hexdigest()}.so"
     for wanted in (folder or cache_folder(), _temporary_folder(), None):
         try:
@@ -157,8 +149,8 @@ def _compile(cc: tuple[str, ...], text: str, lanes: int, path: Path) -> bool:
     with tempfile.TemporaryDirectory(dir=path.parent) as scratch:
         c, so = Path(scratch) / "engine.c", Path(scratch) / "engine.so"
         c.write_text(text, encoding="utf-8")
-        for native in (["-march=native"], []):
-            command = [*cc, *FLAGS, *(IN_LANES if lanes > 1 else ()), *native, f"-DLANES={lanes}"]
+        for native in (NATIVE, ()):
+            command = [*cc, *FLAGS, *native, f"-DLANES={lanes}"]
             found = _answer([*command, str(c), "-o", str(so), "-lm"])
             if found is None:
                 return False
@@ -206,7 +198,7 @@ class Shared(NamedTuple):
 def arrange_in_lanes(rows: FloatArray, groups: int) -> FloatArray:
     """Rows of machines as groups x numbers x LANES; copies of the last machine fill the last group."""
     lanes, whole = np.empty((groups, rows.shape[1], LANES)), len(rows) // LANES
-    lanes[:whole] = rows[: whole * LANES].reshape(whole, LANES, -1).swapaxes(1, 2)
+    lanes[:whole] = rows[: whole * LANES].reshape(whole, LANES, rows.shape[1]).swapaxes(1, 2)
     if whole < groups:
         rest = rows[whole * LANES :]
         lanes[whole] = np.concatenate([rest, np.repeat(rows[-1:], LANES - len(rest), axis=0)]).T
