@@ -27,6 +27,7 @@ from malta.simulation.compiled import (
     Shared,
     arrange_in_lanes,
     feedforward_table,
+    repeat_in_lanes,
     run_many,
 )
 from malta.simulation.digest import (
@@ -157,10 +158,12 @@ def _prepare(simulation: Simulation, variation: Variation) -> tuple[Inputs, Shar
     plant, controller, scenario, setup = simulation
     count, runs = steps_of(plant, controller, scenario), variation.runs
     values = numbers_of(plant, controller, count, scenario.sensor_errors)
-    theta = _thetas(plant, values, variation)
+    same, own = flatten(values), _own_numbers(plant, values, variation)
     inputs = inputs_of(simulation)
     start = _starts(simulation, inputs.given[0], variation.starts)
-    states, noise = _map_rows(_start_function(shape_of(plant, controller, setup)), theta, start)
+    states, noise = _starts_and_noise(
+        _start_function(shape_of(plant, controller, setup)), (same, own), start, runs
+    )
     groups = -(-runs // LANES)
     indices = variation.noise[np.minimum(np.arange(groups * LANES), runs - 1)]
     streams = np.moveaxis(keys(scenario.seed, indices).reshape(groups, LANES, -1), 2, 0)
@@ -171,7 +174,7 @@ def _prepare(simulation: Simulation, variation: Variation) -> tuple[Inputs, Shar
         if end > start
     ]
     lanes = Lanes(
-        theta=arrange_in_lanes(theta, groups),
+        theta=repeat_in_lanes(same, own, groups),
         states=arrange_in_lanes(states, groups),
         sigma=arrange_in_lanes(scenario.noise * noise, groups),
         keys=parts[0].keys,
@@ -333,31 +336,35 @@ def _variation(
     return Variation(changes, sensor_errors, starts, own, runs)
 
 
-def _thetas(plant: Plant, values: Mapping[str, ca.DM], variation: Variation) -> FloatArray:
-    """theta of every run, runs x numbers. Raises InputError for values that a data file may not have either."""
+def _own_numbers(plant: Plant, values: Mapping[str, ca.DM], variation: Variation) -> dict[int, FloatArray]:
+    """The entries of theta that are each run's own, by index. Raises InputError for values that a data file may not
+    have either."""
     changes, sensor_errors, _, _, runs = variation
     place, k = {}, 0
     for name, value in values.items():
         place[name] = k
         k += value.nnz()
-    theta = np.tile(flatten(values), (runs, 1))
+    own: dict[int, FloatArray] = {}
     for name, column in changes.items():
         column = np.asarray(column, dtype=float)
         for extreme in (column.min(), column.max()):  # NaN comes out of both
             replace(plant.parameters, **{name: float(extreme)})
         if f"machine.{name}" in place:  # else every run has the default
-            theta[:, place[f"machine.{name}"]] = column
+            own[place[f"machine.{name}"]] = column
     names = [signal.name for signal in plant.sensor_errors]
     for name, column in sensor_errors.items():
         column = np.asarray(column, dtype=float)
         if not np.isfinite(column).all():
             raise InputError("campaign", name, "NaN or infinity", "finite errors of a sensor")
-        theta[:, place["errors"] + names.index(name)] = column
+        own[place["errors"] + names.index(name)] = column
     for name, twin in twins_of(plant.parameters).items():
-        pair = theta[:, place[f"machine.{name}"]], theta[:, place[f"machine.{twin}"]]
-        if not np.array_equal(*pair):
+        one, other = (
+            own.get(place[key], np.full(runs, float(values[key])))
+            for key in (f"machine.{name}", f"machine.{twin}")
+        )
+        if not np.array_equal(one, other):
             raise InputError("campaign", name, f"values unlike {twin}", f"the same, as in {plant.name}")
-    return theta
+    return own
 
 
 @lru_cache(maxsize=16)
@@ -383,16 +390,22 @@ def _starts(simulation: Simulation, given: FloatArray, starts: Mapping[str, Floa
     return np.array(rows)
 
 
-def _map_rows(function: ca.Function, rows: FloatArray, others: FloatArray) -> list[FloatArray]:
-    """f(row, other) for every row, runs x size for each result of f. At most BLOCK rows are mapped in one call.
+def _starts_and_noise(
+    function: ca.Function, theta: tuple[FloatArray, Mapping[int, FloatArray]], others: FloatArray, runs: int
+) -> list[FloatArray]:
+    """f(theta, other) for every run, runs x size for each result of f. At most BLOCK runs are mapped in one call.
 
-    Where the rows agree in all that f depends on, it is evaluated once.
+    theta : the numbers of all runs, and those that are each run's own
+    others : a row for each run, or one row. Where f reads nothing of a run's own, it is evaluated once.
     """
-    results = range(function.n_out())
-    read = np.unique(np.concatenate([function.jac_sparsity(i, 0).get_col() for i in results])).astype(int)
-    if len(others) == 1 and (rows[:, read] == rows[0, read]).all():
-        found = evaluate(function, rows[0], others[0])
-        return [np.repeat(value.reshape(1, -1), len(rows), axis=0) for value in found]
+    same, own = theta
+    read = {k for i in range(function.n_out()) for k in function.jac_sparsity(i, 0).get_col()}
+    if len(others) == 1 and not read & set(own):
+        found = evaluate(function, same, others[0])
+        return [np.repeat(value.reshape(1, -1), runs, axis=0) for value in found]
+    rows = np.tile(same, (runs, 1))
+    for k, column in own.items():
+        rows[:, k] = column
     count = -(-len(rows) // BLOCK)
     pairs = zip(
         *(np.array_split(a, count) for a in (rows, np.broadcast_to(others, (len(rows), others.shape[1])))),

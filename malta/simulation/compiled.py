@@ -17,7 +17,7 @@ import shutil
 import signal
 import subprocess
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
@@ -202,6 +202,18 @@ def arrange_in_lanes(rows: FloatArray, groups: int) -> FloatArray:
     if whole < groups:
         rest = rows[whole * LANES :]
         lanes[whole] = np.concatenate([rest, np.repeat(rows[-1:], LANES - len(rest), axis=0)]).T
+    return lanes
+
+
+def repeat_in_lanes(same: FloatArray, own: Mapping[int, FloatArray], groups: int) -> FloatArray:
+    """Numbers of machines as groups x numbers x LANES: the same for all but for those that are each machine's own.
+
+    own : a number for each machine, by index
+    """
+    lanes = np.empty((groups, len(same), LANES))
+    lanes[:] = same[:, None]
+    for k, column in own.items():
+        lanes[:, k] = np.pad(column, (0, groups * LANES - len(column)), mode="edge").reshape(groups, LANES)
     return lanes
 
 
