@@ -21,7 +21,7 @@ from malta.simulation.expressions import Identities, conserved, linear_parts
 from malta.simulation.layout import numbers_of, with_symbols
 from malta.simulation.once import Counts
 from malta.simulation.period import Period, columns_of
-from malta.simulation.scenario import Scenario, Simulation, setup_of, simulation_of
+from malta.simulation.scenario import Scenario, setup_of
 from malta.simulation.translate import source, translate
 
 if TYPE_CHECKING:
@@ -284,8 +284,7 @@ def _columns(shape: Any, name: str) -> slice:
 
 
 def _ready(design: Design, scenario: Scenario) -> prepared.Prepared:
-    simulation: Simulation = simulation_of(design.plant, design.controller, scenario)
-    return prepared.prepare(simulation)
+    return prepared.prepare(design.plant, design.controller, scenario)
 
 
 def test_what_can_only_repeat_is_prepared_once(designs: dict[str, Design]) -> None:

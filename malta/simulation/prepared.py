@@ -1,4 +1,4 @@
-"""Inputs and first state of a simulation, remembered for runs that can only have the same ones again."""
+"""What a simulation begins with, remembered for runs that can only begin with the same again."""
 
 from __future__ import annotations
 
@@ -6,10 +6,12 @@ from collections import OrderedDict
 from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
+from malta.model.plant import Plant
 from malta.simulation.engines import evaluate
 from malta.simulation.inputs import Inputs, initial_values, inputs_of
 from malta.simulation.period import initial_state_function
-from malta.simulation.scenario import Scenario, Simulation
+from malta.simulation.scenario import Scenario, Simulation, simulation_of
+from malta.synthesis.controller import Controller
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
@@ -29,19 +31,20 @@ class Prepared(NamedTuple):
 _memory: OrderedDict[tuple[int, ...], Prepared] = OrderedDict()
 
 
-def prepare(run: Simulation) -> Prepared:
+def prepare(plant: Plant, controller: Controller, scenario: Scenario) -> Prepared:
     """The inputs of every sample and the first state; those of the last runs of the same records are remembered.
 
-    Raises InputError as `inputs_of` does.
+    Raises InputError as `simulation_of` and `inputs_of` do.
     """
-    key = (id(run.plant), id(run.controller), id(run.scenario))
+    key = (id(plant), id(controller), id(scenario))
     found = _memory.get(key)
     if found is None:
+        run = simulation_of(plant, controller, scenario)
         inputs = inputs_of(run)
         start = initial_state_function(run.plant, run.controller, run.setup)
         state = evaluate(start, *initial_values(run, inputs.given[0]))[0].ravel()
         found = Prepared(run, inputs, state)
-        if is_repeatable(run.scenario) and len(inputs.t) <= LONGEST:
+        if is_repeatable(scenario) and len(inputs.t) <= LONGEST:
             _memory[key] = found
             if len(_memory) > REMEMBERED:
                 _memory.popitem(last=False)
@@ -58,5 +61,6 @@ def is_repeatable(s: Scenario) -> bool:
         reference = reference.func
     own = str(getattr(reference, "__module__", "")).partition(".")[0] == __name__.partition(".")[0]
     plain = all(isinstance(value, int | float | str | None) for value in arguments)
-    touched = s.disturbance or s.anticipated or s.correction or s.faults or s.start or s.electronics
-    return own and plain and not touched
+    functions = s.disturbance or s.anticipated or s.correction or s.electronics
+    written = s.faults or s.start or s.changes or s.sensor_errors
+    return own and plain and not functions and not written

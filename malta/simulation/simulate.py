@@ -30,7 +30,6 @@ from malta.simulation.scenario import (
     MOST_SUBSTEPS,
     Scenario,
     Simulation,
-    simulation_of,
     steps_of,
     substeps_of,
 )
@@ -71,9 +70,8 @@ def simulate(
         raise InputError("simulate", "controller", f"gains of a {believed.name}", f"gains of a {plant.name}")
     if engine not in get_args(EngineChoice):
         raise InputError("simulate", "engine", repr(engine), "one of " + ", ".join(get_args(EngineChoice)))
-    simulation = simulation_of(plant, controller, scenario)
-    ready = prepare(simulation)
-    inputs = ready.inputs
+    ready = prepare(plant, controller, scenario)
+    simulation, inputs, _ = ready
     parts: list[FloatArray] = []
     verdict: Verdict | None = None
     kind, done = "", 0
