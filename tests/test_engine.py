@@ -924,3 +924,17 @@ def test_two_processes_may_compile_at_once(small: tuple[Period, str], fresh: Pat
     assert [process.wait(timeout=60) for process in both] == [0, 0]
     assert (tmp_path / "calls").read_text().splitlines() in ([""], ["", ""])
     assert [path.suffix for path in fresh.iterdir()] == [".so"]
+
+
+@pytest.mark.parametrize("runs", [1, 7, 8, 21])
+def test_machines_are_dealt_out_to_lanes(runs: int) -> None:
+    """Machine k stands in lane k mod 8 of group k / 8; copies of the last one fill the last group."""
+    groups = -(-runs // LANES)
+    rows = np.random.default_rng(0).normal(size=(runs, 3))
+    rows[:, 1] = 0.5
+    arranged = compiled.arrange_in_lanes(rows, groups)
+    assert arranged.shape == (groups, 3, LANES)
+    for k in range(groups * LANES):
+        assert arranged[k // LANES, :, k % LANES].tolist() == rows[min(k, runs - 1)].tolist()
+    own = {0: rows[:, 0], 2: rows[:, 2]}
+    assert np.array_equal(compiled.repeat_in_lanes(np.array([9.0, 0.5, 9.0]), own, groups), arranged)

@@ -72,7 +72,7 @@ static inline void look_up(const Grid *g, real at, real *v) {
 /* One sample: the control law, and the machine's motion until the next sample. 0 where `near` turns out not to hold, and
    what was written means nothing. Which of the two a sample is computed by depends on nothing but that sample, so that
    it can be computed again to the bit.                                                                              */
-#define COLD __attribute__((noinline, cold))
+#define RARE __attribute__((noinline)) /* rare for a mover in its air gap, and all there is for a pendulum */
 #if COORDINATES
 #define ENTER(near, ...) enter##near(__VA_ARGS__ c, d, g, from, held, work);
 #define LEAVE(near, ...) leave##near(__VA_ARGS__ c, d, g, work, from, held, after);
@@ -85,6 +85,7 @@ static inline void look_up(const Grid *g, real at, real *v) {
                                       const double *given, const real *noise, real *next, real *held, real *row) { \
     real range = {0}, at, y[OUTPUTS], v[FORCES]; \
     sense##near(__VA_ARGS__ c, d, g, state, given, noise, y, &at); \
+    if (!nowhere(MASK(range > NEAR))) return 0; /* mostly the first look tells */ \
     look_up(grid, at, v); \
     decide##near(__VA_ARGS__ c, d, g, state, given, y, v, next, held, row); \
     return nowhere(MASK(range > NEAR)); \
@@ -100,7 +101,7 @@ static inline void look_up(const Grid *g, real at, real *v) {
   }
 #if TILTED
 SAMPLE(_near, inline, &range, )
-SAMPLE(, COLD, )
+SAMPLE(, RARE, )
 #else
 SAMPLE(, inline, )
 #define control_near control
@@ -131,13 +132,13 @@ void run(long first, long samples, double substeps, const double *theta, long po
 #else
 #if CRUISE
 /* The digest after a sample in which something happens. */
-static COLD void count(const real *c, const double *d, const double *g, real *kept, const real *row,
+static RARE void count(const real *c, const double *d, const double *g, real *kept, const real *row,
                        const double *given) {
   digest(c, d, g, kept, row, given, kept);
 }
 #endif
 /* A sample by the general functions. */
-static COLD void sample(const real *c, const double *d, const double *g, const real *now, Grid *grid, long substeps,
+static RARE void sample(const real *c, const double *d, const double *g, const real *now, Grid *grid, long substeps,
                         const double *given, const real *noise, real *kept, real *after) {
   real held[HELD], row[ROW];
   control(c, d, g, now, grid, given, noise, after + MACHINE, held, row);
