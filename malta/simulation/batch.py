@@ -27,6 +27,7 @@ from malta.simulation.compiled import (
     Shared,
     arrange_in_lanes,
     feedforward_table,
+    foreseen,
     repeat_in_lanes,
     run_many,
 )
@@ -103,7 +104,8 @@ def simulate_many(
     inputs, shared, lanes, parts = _prepare(simulation, variation)
     digest = first_digest(plant, inputs.motion.p)
     groups, runs = len(lanes.theta), variation.runs
-    lanes = lanes._replace(digests=arrange_in_lanes(np.tile(digest, (runs, 1)), groups))
+    lanes = lanes._replace(digests=arrange_in_lanes(digest[None], groups))
+    shared = shared._replace(foreseen=foreseen(compiled[0], lanes, shared))
     work = _Work(lanes, shared, parts)
     _run_groups(compiled[0], work, workers or os.cpu_count() or 1, progress)
     ends = lanes.digests.swapaxes(1, 2).reshape(groups * LANES, -1)[:runs]
@@ -136,7 +138,7 @@ def _run_groups(lib: Any, work: _Work, workers: int, progress: Callable[[float],
     lanes, shared, parts = work
     groups = len(lanes.theta)
     most = max(1, WORK // (len(shared.given) * shared.substeps))
-    step = max(1, min(16, groups // (4 * workers), most))  # groups in one call: progress comes often
+    step = max(1, min(8, groups // (4 * workers), most))  # groups in one call: progress comes often
     if len(parts) > 1:  # calls of short parts: the more groups in each, the less it counts
         step = max(step, min(64, -(-groups // workers), most))
 
@@ -393,7 +395,7 @@ def _starts(simulation: Simulation, given: FloatArray, starts: Mapping[str, Floa
 def _starts_and_noise(
     function: ca.Function, theta: tuple[FloatArray, Mapping[int, FloatArray]], others: FloatArray, runs: int
 ) -> list[FloatArray]:
-    """f(theta, other) for every run, runs x size for each result of f. At most BLOCK runs are mapped in one call.
+    """f(theta, other), a row for each run or one for all, for each result of f. At most BLOCK runs go in one call.
 
     theta : the numbers of all runs, and those that are each run's own
     others : a row for each run, or one row. Where f reads nothing of a run's own, it is evaluated once.
@@ -402,7 +404,7 @@ def _starts_and_noise(
     read = {k for i in range(function.n_out()) for k in function.jac_sparsity(i, 0).get_col()}
     if len(others) == 1 and not read & set(own):
         found = evaluate(function, same, others[0])
-        return [np.repeat(value.reshape(1, -1), runs, axis=0) for value in found]
+        return [value.reshape(1, -1) for value in found]
     rows = np.tile(same, (runs, 1))
     for k, column in own.items():
         rows[:, k] = column

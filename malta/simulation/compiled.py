@@ -19,7 +19,7 @@ import subprocess
 import tempfile
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -193,10 +193,13 @@ class Shared(NamedTuple):
     table: FloatArray  # of v0(z), see feedforward_table
     substeps: int  # Runge–Kutta steps in a sample
     uniform: bool  # noise of the sensors is uniform, not normal
+    foreseen: FloatArray | None = None  # what `foreseen` computes of them; None: every call does
 
 
 def arrange_in_lanes(rows: FloatArray, groups: int) -> FloatArray:
-    """Rows of machines as groups x numbers x LANES; copies of the last machine fill the last group."""
+    """Rows of machines, or one row of all, as groups x numbers x LANES; copies of the last fill the last group."""
+    if len(rows) == 1:
+        return repeat_in_lanes(rows[0], {}, groups)
     lanes, whole = np.empty((groups, rows.shape[1], LANES)), len(rows) // LANES
     lanes[:whole] = rows[: whole * LANES].reshape(whole, LANES, rows.shape[1]).swapaxes(1, 2)
     if whole < groups:
@@ -215,6 +218,14 @@ def repeat_in_lanes(same: FloatArray, own: Mapping[int, FloatArray], groups: int
     for k, column in own.items():
         lanes[:, k] = np.pad(column, (0, groups * LANES - len(column)), mode="edge").reshape(groups, LANES)
     return lanes
+
+
+def foreseen(lib: ctypes.CDLL, lanes: Lanes, shared: Shared) -> FloatArray:
+    """What all machines of a batch share at every sample, samples x numbers: see once.py."""
+    call = partial(lib.foresee_all, ctypes.c_long(len(shared.given)), address_of(lanes.theta))
+    numbers = np.empty((len(shared.given), call(address_of(shared.given), None)))
+    call(address_of(shared.given), address_of(numbers))
+    return numbers
 
 
 class Part(NamedTuple):
@@ -237,6 +248,7 @@ def run_many(
     groups, rows = ctypes.c_long(len(lanes.theta[chosen])), ctypes.c_long(len(shared.table))
     substeps, uniform = ctypes.c_long(shared.substeps), ctypes.c_long(shared.uniform)
     table = address_of(shared.table)
+    ahead = foreseen(lib, lanes, shared) if shared.foreseen is None else shared.foreseen
     for samples, keys in parts or [Part(slice(None), lanes.keys)]:
         given = shared.given[samples]
         lib.run_many(
@@ -248,6 +260,7 @@ def run_many(
             table,
             states,
             address_of(given),
+            address_of(ahead[samples]),
             uniform,
             sigma,
             address_of(keys[chosen]),

@@ -202,13 +202,24 @@ static void run_group(long samples, long substeps, const real *c, const double *
   memcpy(digests, kept, sizeof(real) * DIGEST);
 }
 
-/* Groups of LANES machines, one after the other; states and digests are taken and left behind. */
+/* g of all samples, from the numbers of any group; without a place for it, how many numbers a sample has. */
+long foresee_all(long samples, const double *theta, const double *given, double *g) {
+  real c[CONSTANTS + 1], t[THETA + 1];
+  double d[SHARED + 1];
+  if (!g) return FORESEEN;
+  memcpy(t, theta, sizeof(real) * THETA);
+  prepare(t, c, d);
+  for (long k = 0; k < samples; k++) foresee(d, given + k * GIVEN, g + k * FORESEEN);
+  return FORESEEN;
+}
+
+/* Groups of LANES machines, one after the other; states and digests are taken and left behind. g: of foresee_all. */
 void run_many(long groups, long samples, long substeps, const double *theta, long points, const double *table,
-              double *states, const double *given, long uniform, const double *sigma, const uint64_t *keys,
-              double *digests) {
+              double *states, const double *given, const double *g, long uniform, const double *sigma,
+              const uint64_t *keys, double *digests) {
   const size_t size = (size_t)(points * PADDED + LANES) * sizeof(double);
-  double *rows = aligned_alloc(64, size), *g = malloc((size_t)(samples * FORESEEN + 1) * sizeof *g), first = table[0];
-  if (!rows || !g) abort();
+  double *rows = aligned_alloc(64, size), first = table[0];
+  if (!rows) abort();
   double step = (table[(points - 1) * WIDTH] - first) / (double)(points - 1), d[SHARED + 1];
   Grid grid = {points, 1, table, first, step, 1 / step, rows};
   memset(rows, 0, size);
@@ -221,12 +232,10 @@ void run_many(long groups, long samples, long substeps, const double *theta, lon
   for (long i = 0; i < groups; i++) {
     real c[CONSTANTS + 1], t[THETA + 1];
     memcpy(t, theta + i * THETA * LANES, sizeof(real) * THETA);
-    prepare(t, c, d); /* d is the same for all groups */
-    for (long k = 0; k < samples && !i; k++) foresee(d, given + k * GIVEN, g + k * FORESEEN);
+    prepare(t, c, d);
     run_group(samples, substeps, c, d, g, &grid, states + i * STATES * LANES, given, uniform,
               sigma + i * OUTPUTS * LANES, keys + i * LANES, digests + i * DIGEST * LANES);
   }
   free(rows);
-  free(g);
 }
 #endif
