@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import hashlib
 import math
 import pickle
@@ -29,6 +30,9 @@ if TYPE_CHECKING:
     from malta.model.plant import Plant
     from malta.synthesis.controller import Controller
     from malta.synthesis.spec import Spec
+
+# As in the program: numeric libraries make many lasting objects, and going through them again and again costs time.
+gc.set_threshold(200_000, 50, 50)
 
 ROOT = Path(__file__).parents[1]
 DESIGNS = ("table2", "calibrated")
