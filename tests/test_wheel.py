@@ -32,6 +32,11 @@ SHORTER = {  # commands of the README that take minutes, as the same commands wi
     "--spread 20% --samples 32 --out campaign",
     "malta simulate design/gains/calibrated.json --replay FOLDER:17": "malta simulate design/gains/calibrated.json "
     "--replay campaign:17",
+    "malta campaign --status FOLDER": "malta campaign --status campaign",
+    "malta campaign design/gains/table2.json --spread 5.5% --rare touchdown": "malta campaign design/gains/table2.json "
+    "--spread 10% --rare touchdown --samples 400",
+    "malta campaign design/gains/robust.json --tolerance 95% --limit published": "malta campaign "
+    "design/gains/robust.json --tolerance 95% --limit published --samples 64",
     "malta claims": "malta claims design/table2.toml",
 }
 
@@ -95,7 +100,8 @@ def test_the_readmes_lines_and_commands(program: Path, tmp_path: Path) -> None:
     for line in lines:
         done = run(program, tmp_path, *SHORTER.get(line, line).split())
         missed = line == "malta tune design/robust.toml" and "not reached: radial_motion is 1." in done.stderr
-        assert done.returncode == int(missed), (line, done.stderr)
+        apart = "--sobol" in line and "pip install 'malta[sensitivity]'" in done.stderr  # an extra
+        assert done.returncode == (2 if apart else int(missed)), (line, done.stderr)
         assert "Traceback" not in done.stderr
     assert (tmp_path / "design" / "gains" / "table2.json").is_file()
     assert (tmp_path / "build" / "robust_margins.png").is_file()

@@ -52,7 +52,9 @@ def sketch_of(values: FloatArray) -> Sketch:
     """The sketch of some finite values."""
     if not len(values):
         return Sketch()
-    values = np.asarray(values, dtype=float) + 0.0  # -0.0 is 0.0: of the two, sorting and merging may find either
+    values = (
+        np.asarray(values, dtype=float) + 0.0
+    )  # -0.0 is 0.0: of the two, sorting and merging may find either
     return _settled(Sketch(len(values), float(values.min()), float(values.max()), (values,)))
 
 

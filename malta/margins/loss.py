@@ -23,31 +23,32 @@ STEP = 1e-6  # of a range, for slopes of the worst root
 ROUNDS = 6  # from corner to corner
 
 
-def single_parameter_loss(problem: Problem, box: Box, reach: float) -> float | None:
-    """The first t up to `reach` at which the loop is unstable, for one parameter that grows to one side alone.
+CORNERS = 64  # of a box that are looked at before its families are made
 
-    The estimate comes from above; infinite without a loss. None when several parameters or sides grow.
+
+def corner_loss(problem: Problem, box: Box, reach: float) -> float | None:
+    """The first t up to `reach` at which a corner of the box is unstable, by the poles.
+
+    The estimate comes from above; infinite without a loss. None where the box has more than CORNERS.
     """
-    ends = [(i, sign * rate[i]) for sign, rate in ((-1, box.down), (1, box.up)) for i in np.flatnonzero(rate)]
-    if len(ends) != 1:
+    sides = [
+        [rate for rate in (-down, up) if rate] or [0.0]
+        for down, up in zip(box.down.tolist(), box.up.tolist(), strict=True)
+    ]
+    if math.prod(map(len, sides)) > CORNERS:
         return None
-    d = np.zeros(len(box.names))
-    d[ends[0][0]] = ends[0][1]
-    places = box.nominal_places()[:3]
-
-    def unstable(t: FloatArray) -> FloatArray:
-        rows = (places[None] + t[:, None, None] * d).reshape(-1, len(d))
-        bad = _instability(problem, rows, -math.inf) >= 0
-        return np.asarray(bad.reshape(len(t), -1).any(axis=1))
-
-    high, low = reach, 0.0
-    for steps in (np.geomspace(1e-2, 1, 15) * reach, *[np.linspace(0, 1, 6)[1:]] * 2):
-        grid = low + (high - low) * steps if low or high < reach else steps
-        bad = unstable(grid)
+    corners = np.array(list(itertools.product(*sides)))
+    rays = [(place, corner) for place in box.nominal_places()[:3] for corner in corners]
+    low, high = 0.0, reach
+    for steps in (np.geomspace(1e-2, 1, 10), *[np.linspace(0, 1, 6)[1:]] * 3):
+        grid = low + (high - low) * steps
+        rows = [place + t * corner for t in grid for place, corner in rays]
+        bad = (_instability(problem, np.array(rows), -math.inf) >= 0).reshape(len(grid), -1)
         if not bad.any():
             return math.inf
-        k = int(bad.argmax())
+        k = int(bad.any(axis=1).argmax())
         low, high = (float(grid[k - 1]) if k else low), float(grid[k])
+        rays = [ray for ray, lost in zip(rays, bad[k], strict=True) if lost]
     return high
 
 

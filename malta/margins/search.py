@@ -18,7 +18,7 @@ from malta.margins.descent import from_cell, nearest
 from malta.margins.enclosure import Unproven
 from malta.margins.exclusion import Search, advance, start
 from malta.margins.families import is_nominal_stable, parts_over
-from malta.margins.loss import first_loss, single_parameter_loss
+from malta.margins.loss import corner_loss, first_loss
 from malta.margins.parts import Part
 from malta.margins.problem import Problem
 from malta.margins.robust import Certificate, Margin, Progress
@@ -138,9 +138,14 @@ class Job:
         return parts, done
 
     def _first(self) -> float:
-        """The size of the first box: for a single parameter a little beyond the loss by the poles, else FIRST."""
-        t = single_parameter_loss(self.problem, self.box, self.limit)
-        return min(self.limit, FIRST if t is None else 1.02 * t)
+        """The size of the first box: a little beyond the loss by the poles of its corners.
+
+        Of several parameters at most FIRST: families of a larger box are dear, and the nearest loss may be no corner.
+        """
+        one = np.count_nonzero(self.box.down) + np.count_nonzero(self.box.up) == 1
+        most = self.limit if one else min(self.limit, FIRST)
+        t = corner_loss(self.problem, self.box, most)
+        return most if t is None else min(most, 1.02 * t)
 
     def _descend(self, part: Part) -> None:
         misses = 0
