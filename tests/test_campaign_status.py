@@ -21,7 +21,7 @@ from malta.campaigns.status import status
 from malta.campaigns.store import MANIFEST, block_name, noted_gains
 
 if TYPE_CHECKING:
-    from conftest import Design
+    pass
 
 pytestmark = pytest.mark.usefixtures("proven_once")
 GAINS = "design/gains/calibrated.json"
@@ -93,9 +93,9 @@ def test_half_a_campaign_that_runs_and_one_that_does_not(run: Run, tmp_path: Pat
     assert "5 of 5 blocks" in run("campaign", "--status", tmp_path)[1]
 
 
-def test_a_campaign_without_a_block(designs: dict[str, Design], run: Run, tmp_path: Path) -> None:
+def test_a_campaign_without_a_block(run: Run, tmp_path: Path) -> None:
     """Just begun, by a program that noted no gain file: it is named, and the same as by the library."""
-    controller = designs["calibrated"].controller
+    controller = malta.gains.read(GAINS)
     plan = Plan(controller, spread={"m": 0.1}, samples=8, options={"fidelity": "force", "duration": 0.01})
     campaign(plan, tmp_path)
     (tmp_path / block_name(0)).unlink()
@@ -176,9 +176,9 @@ def test_a_campaign_is_looked_at_while_it_runs(run: Run, tmp_path: Path) -> None
     }
 
 
-def test_the_pace_is_that_of_the_last_blocks(designs: dict[str, Design], tmp_path: Path) -> None:
+def test_the_pace_is_that_of_the_last_blocks(tmp_path: Path) -> None:
     """A night between two sessions is no pace."""
-    controller = designs["calibrated"].controller
+    controller = malta.gains.read(GAINS)
     plan = Plan(controller, spread={"m": 0.1}, samples=48, options={"fidelity": "force", "duration": 0.01})
     campaign(plan, tmp_path, block=8)
     (tmp_path / block_name(40)).unlink()

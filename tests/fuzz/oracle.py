@@ -121,10 +121,11 @@ def _judge(ended: Ended, named: Sequence[str]) -> None:
 
 
 def _files(folder: Path | None) -> dict[str, int]:
-    """The files of a folder with hashes of what is in them."""
+    """The files of a folder with hashes of what is in them; without what Python keeps of modules that it imports."""
     if folder is None:
         return {}
-    return {str(path): hash(path.read_bytes()) for path in folder.rglob("*") if path.is_file()}
+    files = (path for path in folder.rglob("*") if path.is_file() and "__pycache__" not in path.parts)
+    return {str(path): hash(path.read_bytes()) for path in files}
 
 
 @contextlib.contextmanager
