@@ -225,6 +225,19 @@ REFUSED: dict[str, tuple[bytes, str]] = {
     "half an element": (_file(NUMBER[:-8]), "an element of"),
     "half a tag": (_file(NUMBER, b"\0" * 4), "4 bytes in place of an element"),
     "negative dimensions": (_file(_array(6, -1, -1, ONE, name="x")), "-1 x -1 entries"),
+    "negative columns": (_file(_array(6, 1, -1, ONE, name="x")), "1 x -1 entries"),
+    "more numbers than entries": (
+        _file(_array(6, 1, 1, _element(9, struct.pack("<dd", 1.0, 2.0)), name="x")),
+        "16 bytes of numbers",
+    ),
+    "more text than entries": (
+        _file(_array(4, 1, 1, _element(16, b"ab"), name="x")),
+        "2 characters in place of",
+    ),
+    "names of another length": (
+        _file(_array(2, 1, 1, _element(5, struct.pack("<i", 2)), _element(1, b"a\0b"), NUMBER, name="x")),
+        "3 bytes of names of 2 bytes each",
+    ),
     "large dimensions": (_file(_array(6, 2**31 - 1, 2**31 - 1, ONE, name="x")), "8 bytes of numbers"),
     "a large cell": (
         _file(_array(1, 2**31 - 1, 2**31 - 1, name="x")),

@@ -158,10 +158,11 @@ def test_a_file_that_is_no_log_is_refused(plant: Plant, tmp_path: Path) -> None:
     assert "one, with the heading f_D [N]" in str(refused(missing))
     wrong = _write_csv(log, tmp_path / "b.csv", ("t [s]", "z [N]", *headings[2:]))
     assert refused(wrong).field == "z.unit"
-    log.v[17, 1] = np.nan
-    assert "fy_B1: found no finite number in row 18" in str(
-        refused(_write_csv(log, tmp_path / "c.csv", headings))
-    )
+    for value in (np.nan, np.inf):
+        log.v[17, 1] = value
+        assert "fy_B1: found no finite number in row 18" in str(
+            refused(_write_csv(log, tmp_path / "c.csv", headings))
+        )
     log.v[17, 1], first = 1.0, log.t[5]
     log.t[5] = 0.0
     assert "times that do not rise" in str(refused(_write_csv(log, tmp_path / "d.csv", headings)))
