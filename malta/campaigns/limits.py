@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from malta.campaigns.block import simulate_machines
 from malta.campaigns.plan import Plan, machines_at, planned_run, varied_names
 from malta.campaigns.result import Campaign
 from malta.campaigns.statistics import Finding, figures_of
@@ -25,7 +26,6 @@ from malta.campaigns.summary import UNBOUNDED, Bounds
 from malta.campaigns.yields import specified_bounds
 from malta.errors import InputError
 from malta.model.signals import outputs_of
-from malta.simulation.batch import simulate_many
 from malta.units import in_unit
 
 if TYPE_CHECKING:
@@ -107,13 +107,7 @@ def slug(text: str) -> str:
 def middle_run(plan: Plan) -> Batch:
     """The figures of the machine in the middle of the box, without noise."""
     machines = machines_at(plan, np.full((1, len(varied_names(plan))), 0.5))
-    return simulate_many(
-        plan.plant,
-        plan.controller,
-        replace(planned_run(plan).scenario, noise=0.0),
-        machines.changes,
-        sensor_errors=machines.sensor_errors,
-    )
+    return simulate_machines(plan, machines, replace(planned_run(plan).scenario, noise=0.0))
 
 
 def _touchdown(plan: Plan, _: Bounds) -> Callable[[Batch], FloatArray]:

@@ -270,7 +270,7 @@ def draw_machines(plan: Plan, first: int = 0, count: int | None = None) -> Machi
     return machines_at(plan, draw(plan.seed, plan.samples, len(varied_names(plan)), first, count))
 
 
-def varied(plan: Plan) -> list[int]:
+def varying_columns(plan: Plan) -> list[int]:
     """Places among varied_names(plan) of the values that vary: a spread of 0 is none."""
     return [k for k, name in enumerate(varied_names(plan)) if half_width(plan, name)]
 
@@ -281,6 +281,13 @@ def machines_at(plan: Plan, points: FloatArray) -> Machines:
     middle = np.array([middle_of(plan, name) for name in names])
     half = np.array([half_width(plan, name) for name in names])
     return machines_of(plan, middle + (2 * points - 1) * half)
+
+
+def machines_in_box(plan: Plan, shares: FloatArray) -> Machines:
+    """The machines at points of the box of what varies, runs x varying_columns(plan); the rest is in its middle."""
+    points = np.full((len(shares), len(varied_names(plan))), 0.5)
+    points[:, varying_columns(plan)] = shares
+    return machines_at(plan, points)
 
 
 def machines_of(plan: Plan, values: FloatArray) -> Machines:

@@ -19,21 +19,20 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from scipy.special import ndtr
 
+from malta.campaigns.block import simulate_machines
 from malta.campaigns.limits import Limit
 from malta.campaigns.plan import (
-    Machines,
     Plan,
-    machines_at,
+    machines_in_box,
     machines_of,
     planned_run,
-    varied,
     varied_names,
+    varying_columns,
 )
 from malta.campaigns.run import replay_machine
 from malta.campaigns.subset import Runs, Subset, subset_simulation
 from malta.errors import InputError
 from malta.files import json_text, read_file, replace_files
-from malta.simulation.batch import simulate_many
 from malta.simulation.digest import verdicts
 
 if TYPE_CHECKING:
@@ -87,7 +86,7 @@ def rare_event(
         print(malta.rare_event(plan, malta.limit_of(plan, "touchdown")).found.probability)
     """
     noisy = planned_run(plan).scenario.noise > 0
-    dimensions = len(varied(plan))
+    dimensions = len(varying_columns(plan))
     if not (dimensions or noisy):
         raise InputError("rare event", "spread", "nothing random", "parameters that vary, or noise")
 
@@ -105,24 +104,9 @@ def rare_event(
     return RareEvent(plan, limit, found, _design_point(plan, found.failures))
 
 
-def _machines(plan: Plan, u: FloatArray) -> Machines:
-    """The machines at standard normal points, runs x the names that vary."""
-    points = np.full((len(u), len(varied_names(plan))), 0.5)
-    points[:, varied(plan)] = ndtr(u)
-    return machines_at(plan, points)
-
-
 def _simulate(plan: Plan, u: FloatArray, noise: NDArray[np.int64], workers: int | None = None) -> Batch:
-    machines = _machines(plan, u)
-    return simulate_many(
-        plan.plant,
-        plan.controller,
-        planned_run(plan).scenario,
-        machines.changes,
-        sensor_errors=machines.sensor_errors,
-        noise=noise,
-        workers=workers,
-    )
+    """The figures at standard normal points, runs x the names that vary."""
+    return simulate_machines(plan, machines_in_box(plan, ndtr(u)), noise=noise, workers=workers)
 
 
 def _design_point(plan: Plan, failures: Runs) -> DesignPoint | None:
@@ -130,7 +114,8 @@ def _design_point(plan: Plan, failures: Runs) -> DesignPoint | None:
         return None
     far = np.sqrt((failures.u**2).sum(axis=1))
     nearest = failures.chosen(np.array([far.argmin()]))
-    batch, machines = _simulate(plan, nearest.u, nearest.noise), _machines(plan, nearest.u)
+    machines = machines_in_box(plan, ndtr(nearest.u))
+    batch = simulate_machines(plan, machines, noise=nearest.noise)
     return DesignPoint(
         dict(zip(machines.names, machines.values[0].tolist(), strict=True)),
         float(far.min()),

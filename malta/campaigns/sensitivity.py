@@ -16,11 +16,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from malta.campaigns.block import simulate_machines
 from malta.campaigns.limits import Limit, findings_of
-from malta.campaigns.plan import Plan, machines_at, planned_run, varied, varied_names
+from malta.campaigns.plan import Plan, machines_in_box, planned_run, varied_names, varying_columns
 from malta.campaigns.result import Rate, rate
 from malta.errors import InputError
-from malta.simulation.batch import simulate_many
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
@@ -68,7 +68,7 @@ def sensitivity(
         print(malta.sensitivity(plan, malta.limit_of(plan, "touchdown")).of_merits["deviation y1"])
     """
     sampling, analysis = _salib()
-    names = [varied_names(plan)[k] for k in varied(plan)]
+    names = [varied_names(plan)[k] for k in varying_columns(plan)]
     if not names:
         raise InputError("campaign", "spread", "nothing that varies", "parameters that vary")
     noisy = planned_run(plan).scenario.noise > 0
@@ -79,20 +79,9 @@ def sensitivity(
         raise InputError("campaign", "samples", str(plan.samples), expected)
     problem = {"num_vars": len(factors), "names": list(factors), "bounds": [[0.0, 1.0]] * len(factors)}
     points = sampling.sample(problem, size, calc_second_order=False, seed=plan.seed)
-    unit = np.full((len(points), len(varied_names(plan))), 0.5)
-    unit[:, varied(plan)] = points[:, : len(names)]
-    machines = machines_at(plan, unit)
+    machines = machines_in_box(plan, points[:, : len(names)])
     draws = (points[:, -1] * DRAWS).astype(np.int64) if noisy else np.zeros(len(points), np.int64)
-    batch = simulate_many(
-        plan.plant,
-        plan.controller,
-        planned_run(plan).scenario,
-        machines.changes,
-        sensor_errors=machines.sensor_errors,
-        noise=draws[:, None],
-        workers=workers,
-        progress=progress,
-    )
+    batch = simulate_machines(plan, machines, noise=draws[:, None], workers=workers, progress=progress)
     within = limit.severity(batch) < 1
 
     def indices(values: FloatArray) -> tuple[Index, ...]:

@@ -55,7 +55,7 @@ def sketch_of(values: FloatArray) -> Sketch:
     values = (
         np.asarray(values, dtype=float) + 0.0
     )  # -0.0 is 0.0: of the two, sorting and merging may find either
-    return _settled(Sketch(len(values), float(values.min()), float(values.max()), (values,)))
+    return _count_if_many(Sketch(len(values), float(values.min()), float(values.max()), (values,)))
 
 
 def merge(one: Sketch, other: Sketch) -> Sketch:
@@ -64,26 +64,26 @@ def merge(one: Sketch, other: Sketch) -> Sketch:
     >>> quantiles(merge(sketch_of(np.array([1.0, 2.0])), sketch_of(np.array([9.0]))), [0.5]).tolist()
     [2.0]
     """
-    return _settled(
+    return _count_if_many(
         Sketch(
             one.count + other.count,
             min(one.smallest, other.smallest),
             max(one.largest, other.largest),
             one.values + other.values,
-            _added(one.counts, other.counts),
+            _add_counts(one.counts, other.counts),
         )
     )
 
 
-def _settled(sketch: Sketch) -> Sketch:
+def _count_if_many(sketch: Sketch) -> Sketch:
     """The same sketch, its values counted where they are too many."""
     if sketch.exact or not sketch.values:
         return sketch
-    counts = _added(sketch.counts, _count(sketch.values))
+    counts = _add_counts(sketch.counts, _count(sketch.values))
     return Sketch(sketch.count, sketch.smallest, sketch.largest, (), counts)
 
 
-def _added(one: Mapping[int, IntArray], other: Mapping[int, IntArray]) -> Mapping[int, IntArray]:
+def _add_counts(one: Mapping[int, IntArray], other: Mapping[int, IntArray]) -> Mapping[int, IntArray]:
     return {**one, **{k: one[k] + new if k in one else new for k, new in other.items()}}
 
 

@@ -13,20 +13,19 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from malta.campaigns.block import simulate_machines
 from malta.campaigns.limits import Limit
 from malta.campaigns.plan import (
     Plan,
     draw_machines,
     machines_at,
     machines_of,
-    planned_run,
-    varied,
     varied_names,
+    varying_columns,
 )
 from malta.campaigns.result import Rate, rate
 from malta.errors import InputError
 from malta.model.parameters import differences
-from malta.simulation.batch import simulate_many
 from malta.simulation.experiments import progress_of_part
 
 if TYPE_CHECKING:
@@ -82,7 +81,7 @@ def tolerances(
     """
     if not 0 < wanted <= 1:
         raise InputError("campaign", "tolerance", f"{wanted:g}", "a yield above 0 and up to 1")
-    names, columns = varied_names(plan), varied(plan)
+    names, columns = varied_names(plan), varying_columns(plan)
     if not columns:
         raise InputError("campaign", "spread", "nothing that varies", "parameters that vary")
     searches = {names[k]: [k] for k in columns} | ({ALL: columns} if len(columns) > 1 else {})
@@ -149,15 +148,7 @@ def _yield(plan: Plan, limit: Limit, widths: FloatArray, wanted: float, workers:
     failed = 0
     for first in range(0, plan.samples, CHUNK):
         machines = machines_of(plan, values[first : first + CHUNK])
-        batch = simulate_many(
-            plan.plant,
-            plan.controller,
-            planned_run(plan).scenario,
-            machines.changes,
-            sensor_errors=machines.sensor_errors,
-            first=first,
-            workers=workers,
-        )
+        batch = simulate_machines(plan, machines, first=first, workers=workers)
         failed += int((limit.severity(batch) >= 1).sum())
         if failed > allowed:
             return None

@@ -27,7 +27,7 @@ from malta.simulation.compiled import (
     Shared,
     arrange_in_lanes,
     feedforward_table,
-    foreseen,
+    foresee_samples,
     repeat_in_lanes,
     run_many,
 )
@@ -44,7 +44,7 @@ from malta.simulation.digest import (
 from malta.simulation.engines import BLOCK, compiled_period, evaluate, library_of, shape_of
 from malta.simulation.inputs import Inputs, initial_values, inputs_of
 from malta.simulation.layout import electronics_of, flatten, layout_of, noise_scales, numbers_of, with_symbols
-from malta.simulation.noise import TOGETHER, advanced, keys, starts_of_parts
+from malta.simulation.noise import TOGETHER, advance_keys, keys, starts_of_parts
 from malta.simulation.period import initial_state, period_of
 from malta.simulation.scenario import Scenario, Simulation, setup_of, simulation_of, steps_of
 from malta.simulation.simulate import simulate
@@ -105,7 +105,7 @@ def simulate_many(
     digest = first_digest(plant, inputs.motion.p)
     groups, runs = len(lanes.theta), variation.runs
     lanes = lanes._replace(digests=arrange_in_lanes(digest[None], groups))
-    shared = shared._replace(foreseen=foreseen(compiled[0], lanes, shared))
+    shared = shared._replace(foreseen=foresee_samples(compiled[0], lanes, shared))
     work = _Work(lanes, shared, parts)
     _run_groups(compiled[0], work, workers or os.cpu_count() or 1, progress)
     ends = lanes.digests.swapaxes(1, 2).reshape(groups * LANES, -1)[:runs]
@@ -171,7 +171,7 @@ def _prepare(simulation: Simulation, variation: Variation) -> tuple[Inputs, Shar
     streams = np.moveaxis(keys(scenario.seed, indices).reshape(groups, LANES, -1), 2, 0)
     starts = starts_of_parts(len(inputs.t), len(streams))
     parts = [
-        Part(slice(start, end), np.ascontiguousarray(advanced(stream, start, noise.shape[1])))
+        Part(slice(start, end), np.ascontiguousarray(advance_keys(stream, start, noise.shape[1])))
         for start, end, stream in zip(starts, [*starts[1:], len(inputs.t)], streams, strict=True)
         if end > start
     ]
@@ -233,7 +233,7 @@ def record_run(
     for samples, streams in parts:
         for k in range(samples.start, samples.stop, TOGETHER):
             given = inputs.given[k : min(k + TOGETHER, samples.stop)]
-            now = lanes._replace(keys=advanced(streams, k - samples.start, sensors), digests=last)
+            now = lanes._replace(keys=advance_keys(streams, k - samples.start, sensors), digests=last)
             run_many(compiled[0], slice(0, 1), now, shared._replace(given=given))
             rows[k : k + len(given)] = last[0, :, index - begin].reshape(TOGETHER, width)[-len(given) :]
             if progress is not None and k % 1000 == 0:

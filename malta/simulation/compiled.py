@@ -220,7 +220,7 @@ def repeat_in_lanes(same: FloatArray, own: Mapping[int, FloatArray], groups: int
     return lanes
 
 
-def foreseen(lib: ctypes.CDLL, lanes: Lanes, shared: Shared) -> FloatArray:
+def foresee_samples(lib: ctypes.CDLL, lanes: Lanes, shared: Shared) -> FloatArray:
     """What all machines of a batch share at every sample, samples x numbers: see once.py."""
     call = partial(lib.foresee_all, ctypes.c_long(len(shared.given)), address_of(lanes.theta))
     numbers = np.empty((len(shared.given), call(address_of(shared.given), None)))
@@ -248,7 +248,7 @@ def run_many(
     groups, rows = ctypes.c_long(len(lanes.theta[chosen])), ctypes.c_long(len(shared.table))
     substeps, uniform = ctypes.c_long(shared.substeps), ctypes.c_long(shared.uniform)
     table = address_of(shared.table)
-    ahead = foreseen(lib, lanes, shared) if shared.foreseen is None else shared.foreseen
+    ahead = foresee_samples(lib, lanes, shared) if shared.foreseen is None else shared.foreseen
     for samples, keys in parts or [Part(slice(None), lanes.keys)]:
         given = shared.given[samples]
         lib.run_many(

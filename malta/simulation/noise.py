@@ -73,7 +73,7 @@ def starts_of_parts(samples: int, parts: int) -> list[int]:
     return [2 * (k * pairs // parts) for k in range(parts)]
 
 
-def advanced(stream: _Keys, sample: int, channels: int) -> _Keys:
+def advance_keys(stream: _Keys, sample: int, channels: int) -> _Keys:
     """The key, or keys, whose first row of `normals` is row `sample`, an even number, of the given ones."""
     with np.errstate(over="ignore"):  # modulo 2^64 is meant
         return stream + np.uint64(sample // 2 * channels * GAMMA % 2**64)
@@ -89,7 +89,7 @@ def normals_of_parts(streams: NDArray[np.uint64], samples: int, channels: int) -
     starts = starts_of_parts(samples, len(streams))
     parts = zip(streams, starts, [*starts[1:], samples], strict=True)
     return np.concatenate(
-        [normals(advanced(key, start, channels), end - start, channels) for key, start, end in parts]
+        [normals(advance_keys(key, start, channels), end - start, channels) for key, start, end in parts]
     )
 
 

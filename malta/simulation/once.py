@@ -38,7 +38,7 @@ def counts_of(place: dict[int, str]) -> Counts:
     return Counts(*(sum(entry.startswith(array) for entry in place.values()) for array in "cdg"))
 
 
-def foreseen(nodes: list[Node], used: list[int]) -> set[int]:
+def find_common(nodes: list[Node], used: list[int]) -> set[int]:
     """The nodes that are computed once a sample for all lanes: plain operations on inputs of the sample and numbers
     that the lanes share."""
     found: set[int] = set()
@@ -55,7 +55,7 @@ def places(
 ) -> dict[int, str]:
     """The entries of nodes that are computed once and read later.
 
-    early : the nodes that `foreseen` found
+    early : the nodes that `find_common` found
     results : of the function
     first : entries before those of this function
     """

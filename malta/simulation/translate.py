@@ -18,20 +18,12 @@ import casadi as ca
 
 from malta.simulation.instructions import MASKS, Node, mask_arguments, needed_nodes, read_instructions
 from malta.simulation.layout import SHARED
-from malta.simulation.once import NONE, Counts, counts_of, foresee, foreseen, places
+from malta.simulation.once import NONE, Counts, counts_of, find_common, foresee, places
 from malta.simulation.period import Period
 
 WHOLE = 4000  # statements: a longer function is cut into parts
 PART = 300  # statements of a part at most
 IN_PLACE = ("digest", "cruise", "substep")  # an entry that stays as it is is not written
-PLAIN = (
-    "OP_ADD",
-    "OP_SUB",
-    "OP_MUL",
-    "OP_SQ",
-    "OP_NEG",
-    "OP_TWICE",
-)  # the same text for one number and for lanes
 
 
 class Text(NamedTuple):
@@ -149,7 +141,7 @@ def translate(
     """
     nodes, outputs = read_instructions(f, shared, common)
     used = needed_nodes(nodes, [k for *_, k in outputs])
-    early = foreseen(nodes, used)
+    early = find_common(nodes, used)
     moving = [k for k in used if nodes[k].op and not nodes[k].fixed and k not in early]
     place = places(nodes, used, early, {k for *_, k in outputs}, first)
     parts = _cut_in_parts(moving)
