@@ -202,6 +202,21 @@ def test_a_name_of_an_installed_machine_is_refused(folder: Path, tmp_path: Path)
         malta.machine(tmp_path / "tubular.py")
 
 
+def test_a_copy_of_a_machine_has_the_modules_beside_itself(folder: Path, tmp_path: Path) -> None:
+    """The same text in two folders, of which one has experiments: each finds its own."""
+    copy = tmp_path / "copy"
+    shutil.copytree(folder, copy)
+    (folder / "experiments.py").write_text("def fly() -> int:\n    return 1\n", encoding="utf-8")
+    (copy / "experiments.py").write_text("def fly() -> int:\n    return 2\n", encoding="utf-8")
+    for where, value in ((copy, 2), (folder, 1), (copy, 2)):
+        module = malta.machine(where / "lev.py")
+        plant = module.plant(malta.read(where / "lev.toml"))
+        assert machines.attribute_of(plant, "experiments", "fly")() == value
+        assert machines.name_of(module) == "lev"
+    shutil.rmtree(copy)
+    assert malta.machine(folder / "lev.py").__file__ == str((folder / "lev.py").resolve())
+
+
 def test_the_text_of_a_machine_goes_to_a_worker(folder: Path) -> None:
     """Loaded from the text of its module where there is no file: the same plant."""
     malta.machine(folder / "lev.py")

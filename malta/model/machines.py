@@ -113,7 +113,8 @@ def load_sources(name: str, sources: Mapping[str, str]) -> ModuleType:
     for key, text in sources.items():
         stem = name if key == own else key.rpartition(".")[2]
         (folder / f"{stem}.py").write_text(text, encoding="utf-8")
-    return machine(folder / f"{name}.py")
+    path = folder / f"{name}.py"
+    return _load(path, _File(path.resolve(), own))  # under the name that records from elsewhere bear
 
 
 def part_of(part: Part, name: str) -> ModuleType | None:
@@ -168,26 +169,35 @@ def _from_file(path: Path) -> ModuleType:
         found = f"a machine {name!r}, as an installed package has one"
         raise InputError(where, "", found, "another file name")
     text = read_file(where, "Python module", Path.read_bytes)
-    file = _File(path, f"{FILES}.{name}_{hashlib.sha256(text).hexdigest()[:12]}")
-    known = sys.modules.get(file.module)
-    if known is not None:
-        _files[name] = file
-        return known
-    sys.modules.setdefault(FILES, ModuleType(FILES))
-    spec = spec_from_file_location(file.module, path, submodule_search_locations=[str(path.parent)])
-    assert spec is not None
-    assert spec.loader is not None
-    module = module_from_spec(spec)
-    sys.modules[spec.name] = module
-    try:
-        spec.loader.exec_module(module)
-        _require_plant(module, where)
-    except BaseException as error:
-        del sys.modules[spec.name]
-        if isinstance(error, InputError) or not isinstance(error, Exception):
-            raise
-        raise InputError(where, "", _reason(error), "a module that can be imported") from error
-    _files[name] = file
+    module = f"{FILES}.{name}_{hashlib.sha256(text).hexdigest()[:12]}"
+    known = sys.modules.get(module)
+    if (
+        known is not None and Path(str(known.__file__)) != path
+    ):  # a copy of the text, perhaps beside other modules
+        module += hashlib.sha256(str(path).encode()).hexdigest()[:12]
+    return _load(where, _File(path, module))
+
+
+def _load(where: Path, file: _File) -> ModuleType:
+    """The module of a machine's file, which counts from now on; loaded unless it is already."""
+    module = sys.modules.get(file.module)
+    if module is None:
+        sys.modules.setdefault(FILES, ModuleType(FILES))
+        folder = str(file.path.parent)
+        spec = spec_from_file_location(file.module, file.path, submodule_search_locations=[folder])
+        assert spec is not None
+        assert spec.loader is not None
+        module = module_from_spec(spec)
+        sys.modules[spec.name] = module
+        try:
+            spec.loader.exec_module(module)
+            _require_plant(module, where)
+        except BaseException as error:
+            del sys.modules[spec.name]
+            if isinstance(error, InputError) or not isinstance(error, Exception):
+                raise
+            raise InputError(where, "", _reason(error), "a module that can be imported") from error
+    _files[file.path.stem] = file
     return module
 
 
