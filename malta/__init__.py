@@ -22,6 +22,7 @@ if TYPE_CHECKING:  # the contents page, as type checkers and readers see it
     from malta.campaigns.tolerance import tolerances as tolerances
     from malta.errors import CheckError as CheckError
     from malta.errors import InputError as InputError
+    from malta.firmware.flight import engine_of_c as engine_of_c
     from malta.margins.blocks import Dynamic as Dynamic
     from malta.margins.dynamic import dynamic_margin as dynamic_margin
     from malta.margins.gain import Gain as Gain
@@ -93,6 +94,7 @@ _NAMES = {  # the same, for the first use of each name
     "campaigns.survey": ("summarize",),
     "campaigns.tolerance": ("tolerances",),
     "margins.stages": ("Robustness", "robustness"),
+    "firmware.flight": ("engine_of_c",),
     "report.ledger": ("ledger",),
     "synthesis.controller": ("Controller",),
     "model.data": ("plant_of", "read"),

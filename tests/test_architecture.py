@@ -28,6 +28,7 @@ ORDER = (
         "margins",
         "gains",
         "simulation",
+        "firmware",
         "campaigns",
     ),
     *("tuning", "report", "machines", "cli"),

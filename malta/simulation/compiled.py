@@ -103,13 +103,15 @@ def _answer(command: list[str]) -> tuple[int, str] | None:
     return process.returncode, str(printed)
 
 
-def library(text: str, lanes: int, folder: Path | None = None) -> ctypes.CDLL | None:
+def library(
+    text: str, lanes: int, folder: Path | None = None, flags: tuple[str, ...] = FLAGS
+) -> ctypes.CDLL | None:
     """The library of a C text, from the cache folder or compiled now; None where no compiler can make it."""
     cc = compiler()
     version = None if cc is None else _version(cc)
     if cc is None or version is None:
         return None
-    key = "\n".join([text, str(lanes), *FLAGS, *NATIVE, *cc, version, _processor(), platform.platform()])
+    key = "\n".join([text, str(lanes), *flags, *NATIVE, *cc, version, _processor(), platform.platform()])
     name = f"{hashlib.sha256(key.encode()).hexdigest()}.so"
     for wanted in (folder or cache_folder(), _temporary_folder(), None):
         try:
@@ -118,7 +120,7 @@ def library(text: str, lanes: int, folder: Path | None = None) -> ctypes.CDLL | 
                 continue
             path = place / name
             sound = is_private(path) and _is_intact(path)
-            if not sound and not _compile(cc, text, lanes, path):
+            if not sound and not _compile(cc, text, lanes, path, flags):
                 return None
             return ctypes.CDLL(str(path))
         except OSError:
@@ -144,13 +146,13 @@ def _temporary_folder() -> Path:
     return Path(tempfile.gettempdir()) / f"malta-{os.getuid()}"
 
 
-def _compile(cc: tuple[str, ...], text: str, lanes: int, path: Path) -> bool:
+def _compile(cc: tuple[str, ...], text: str, lanes: int, path: Path, flags: tuple[str, ...]) -> bool:
     """Compile a text to `path`, whole or not at all; False where the compiler fails."""
     with tempfile.TemporaryDirectory(dir=path.parent) as scratch:
         c, so = Path(scratch) / "engine.c", Path(scratch) / "engine.so"
         c.write_text(text, encoding="utf-8")
         for native in (NATIVE, ()):
-            command = [*cc, *FLAGS, *native, f"-DLANES={lanes}"]
+            command = [*cc, *flags, *native, f"-DLANES={lanes}"]
             found = _answer([*command, str(c), "-o", str(so), "-lm"])
             if found is None:
                 return False

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from typing import Any
 
 import casadi as ca
@@ -9,10 +10,11 @@ import casadi as ca
 from malta.model.data import plant_of
 from malta.simulation import inverter
 from malta.simulation.layout import Loop, Setup, Signals
+from malta.synthesis.controller import Add
 
 
 def control_currents(
-    loop: Loop, signals: Signals, current: Any, known: Any, errors: Any
+    loop: Loop, signals: Signals, current: Any, known: Any, errors: Any, add: Add = operator.add
 ) -> tuple[Any, dict[str, Any], dict[str, Any]]:
     """PI control of the axis currents: u = Kp e + Q' I + emf(x), I' = Ki Q e, with the error e of the axis currents.
 
@@ -22,6 +24,8 @@ def control_currents(
 
     The voltage of a phase is at most that of the half-bridges, V/2; the machine's own limit, as --set V_max changes it;
     and the smallest of limits.voltage in the gain file.
+
+    add: how the integrals take what is added to them, see `controller.Add`.
 
     Returns the command to hold, the controller's states after this sample, and entries of the row.
     """
@@ -43,7 +47,8 @@ def control_currents(
     error = believed.drive.command(current) - read
     Q = believed.drive.turned(believed.forces(estimate, current)) if s.turning else ca.SX.eye(len(drive.axes))
     waiting = controller["u_limited"]
-    integral = controller["u_integral"] + g["Ki_current"] * g["control_time"] * (1 - waiting) * (Q @ error)
+    step = g["Ki_current"] * g["control_time"] * (1 - waiting) * (Q @ error)
+    integral = add(controller["u_integral"], step)
     u = g["Kp"] * error + Q.T @ integral + believed.drive.emf(estimate)
     most = inverter.largest_voltage(V, plant.actuator.voltage_limit, g["voltage_limit"])
     row: dict[str, Any] = {"link": V, "i": i}

@@ -46,7 +46,15 @@ from malta.simulation.layout import (
 )
 from malta.simulation.readings import initial_readings, measurement
 from malta.simulation.substep import advance
-from malta.synthesis.controller import Controller, commanded, estimated, filtered, freeze_moving, look_ahead
+from malta.synthesis.controller import (
+    Controller,
+    commanded,
+    estimated,
+    filtered,
+    freeze_moving,
+    look_ahead,
+    sum_errors,
+)
 
 
 class Period(NamedTuple):
@@ -227,9 +235,10 @@ def _control_law(
     if s.anticipated:  # like v0, these forces cancel a load and move nothing: the filter is not told of them
         v0 = v0 + given["v_known"]
     believed = plant_of(c.parameters)
-    xi_ref = _law_reference(c, believed, g, given)
-    e_now, frozen_now = controller["e"], freeze_moving(g, controller["frozen"], given["dp_ref"])
-    xi_pred, e, frozen, v = commanded(g, xi_hat, e_now, frozen_now, y, p_ref, xi_ref, v_ff, v0)
+    xi_ref = law_reference(c, believed, g, given)
+    frozen_now = freeze_moving(g, controller["frozen"], given["dp_ref"])
+    e = sum_errors(g, controller["e"], frozen_now, y, p_ref)
+    xi_pred, frozen, v = commanded(g, xi_hat, e, xi_ref, v_ff, v0)
     if s.open_loop:
         v, frozen = v_ff + v0, 0 * frozen  # open loop: no limit of the feedback is reached
     xi_pred, place = look_ahead(g, xi_pred, p_ref if s.open_loop else y, given["dp_ref"])
@@ -266,7 +275,7 @@ def _control_law(
     return after, queue[:size], row
 
 
-def _law_reference(c: Controller, believed: Plant, g: Mapping[str, Any], given: Mapping[str, Any]) -> Any:
+def law_reference(c: Controller, believed: Plant, g: Mapping[str, Any], given: Mapping[str, Any]) -> Any:
     """xi*, the reference of the control law's states; 0 for a law of errors."""
     if c.tracks == "errors":
         return ca.DM(len(c.states), 1)

@@ -17,7 +17,7 @@ from malta.model.data import plant_of
 from malta.model.parameters import shape_parameters, units_of
 from malta.model.plant import Plant
 from malta.simulation import references
-from malta.simulation.engines import EngineChoice, engine_of, substeps_until
+from malta.simulation.engines import Engine, EngineChoice, engine_of, substeps_until
 from malta.simulation.inputs import (
     Inputs,
     electronics_noise,
@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from malta.model.plant import FloatArray
     from malta.simulation.start_up import Observer
 
+EngineOf = Callable[[Prepared, Plant, float], Engine]  # (what a run begins with, machine, substeps) -> engine
 PORTION = 20_000  # samples of the longest portion: between two portions progress is reported
 WORK = 200_000  # substeps of the longest portion
 
@@ -50,12 +51,12 @@ def simulate(
     controller: Controller,
     scenario: Scenario,
     *,
-    engine: EngineChoice = "auto",
+    engine: EngineChoice | EngineOf = "auto",
     progress: Callable[[float], None] | None = None,
 ) -> Trajectory:
     """Simulate a scenario. Touchdown and divergence end it early; the verdict names them, and nothing is raised.
 
-    engine : "auto" compiles where there is a C compiler
+    engine : "auto" compiles where there is a C compiler; a function makes the engine of a run, as `malta.engine_of_c`
     progress : called now and then with the share of the samples that is done
 
     Ctrl-C ends the simulation; the trajectory then has the samples that were computed, and the verdict "interrupted".
@@ -68,7 +69,7 @@ def simulate(
     believed = plant_of(controller.parameters)
     if (plant.inputs, plant.outputs) != (believed.inputs, believed.outputs):
         raise InputError("simulate", "controller", f"gains of a {believed.name}", f"gains of a {plant.name}")
-    if engine not in get_args(EngineChoice):
+    if not callable(engine) and engine not in get_args(EngineChoice):
         raise InputError("simulate", "engine", repr(engine), "one of " + ", ".join(get_args(EngineChoice)))
     ready = prepare(plant, controller, scenario)
     simulation, inputs, _ = ready
@@ -91,7 +92,9 @@ def simulate(
     return label_rows(simulation, inputs, table, verdict, kind)
 
 
-def _portions(ready: Prepared, choice: EngineChoice) -> Iterator[tuple[FloatArray, Verdict | None, str]]:
+def _portions(
+    ready: Prepared, choice: EngineChoice | EngineOf
+) -> Iterator[tuple[FloatArray, Verdict | None, str]]:
     """Simulate portion by portion: rows, the verdict if one ends the run there, and the engine's kind.
 
     Between portions the machine's parameters may change, and an outer loop may correct the reference.
@@ -110,7 +113,10 @@ def _portions(ready: Prepared, choice: EngineChoice) -> Iterator[tuple[FloatArra
     done = 0
     for stop in _stops(every, longest, samples, [first for first, _ in stages]):
         now = next(p for first, p in reversed(stages) if first <= done)
-        engine = engine_of(now, controller, setup, steps, _sensor_errors(scenario), choice)
+        if callable(choice):
+            engine = choice(ready, now, steps)
+        else:
+            engine = engine_of(now, controller, setup, steps, _sensor_errors(scenario), choice)
         part = slice(done, stop)
         if observer is None:
             jitter = fast[substeps_until(done, steps) : substeps_until(stop, steps)]

@@ -34,7 +34,8 @@ xi = (s, y - p*), Ad = [[A, -B], [0, 0]], Bd = 0, Cd = 0, L = (0, 1), K = (-C, D
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import operator
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
 from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
@@ -52,6 +53,8 @@ if TYPE_CHECKING:
 
 
 Tracks = Literal["states", "errors"]
+# How a sum takes what is added to it: plainly here, with what rounding loses in firmware of single precision.
+Add = Callable[[Any, Any], Any]
 
 
 @dataclass(frozen=True, eq=False)
@@ -284,28 +287,29 @@ def filtered(tracks: Tracks, y: Any, p_ref: Any) -> Any:
     return y - p_ref if tracks == "errors" else y
 
 
-def estimated(g: Mapping[str, Any], xi_pred: Any, y: Any, C: Any = None) -> Any:
-    """Step 2, the filter: xi_hat. C: in place of Cd where it is scheduled."""
-    return xi_pred + g["L"] @ (y - (g["Cd"] if C is None else C) @ xi_pred)
+def sum_errors(g: Mapping[str, Any], e: Any, frozen: Any, y: Any, p_ref: Any, add: Add = operator.add) -> Any:
+    """Step 1: e, the sums of errors at this sample. add: how a sum takes what is added to it, see Add."""
+    return add(e, g["control_time"] * (1 - frozen) * (p_ref - y))
+
+
+def estimated(g: Mapping[str, Any], xi_pred: Any, y: Any, C: Any = None, add: Add = operator.add) -> Any:
+    """Step 2, the filter: xi_hat. C: in place of Cd where it is scheduled; add: see Add."""
+    return add(xi_pred, g["L"] @ (y - (g["Cd"] if C is None else C) @ xi_pred))
 
 
 def commanded(
     g: Mapping[str, Any],
     xi_hat: Any,
     e: Any,
-    frozen: Any,
-    y: Any,
-    p_ref: Any,
     xi_ref: Any,
     v_ff: Any,
     v0: Any,
-) -> tuple[Any, Any, Any, Any]:
-    """Steps 1, 3, 4 and 6: (xi_pred, e, frozen, v) from the estimate."""
-    e = e + g["control_time"] * (1 - frozen) * (p_ref - y)
+) -> tuple[Any, Any, Any]:
+    """Steps 3, 4 and 6: (xi_pred, frozen, v) from the estimate and the sums of errors."""
     # The first sum is the same for all machines under one reference: engines compute it once a sample.
     wanted = (g["K"] @ xi_ref + v_ff) + (g["Ki"] @ e - g["K"] @ xi_hat) + v0
     v = ca.fmax(ca.fmin(wanted, g["force_limit"]), -g["force_limit"])
-    return g["Ad"] @ xi_hat + g["Bd"] @ (v - v0), e, v != wanted, v
+    return g["Ad"] @ xi_hat + g["Bd"] @ (v - v0), v != wanted, v
 
 
 def freeze_moving(g: Mapping[str, Any], frozen: Any, dp_ref: Any) -> Any:
@@ -343,9 +347,10 @@ def _symbolic_law(
     """Symbols of the law's arguments and expressions of its results, each by name; gains may be symbols too."""
     sizes = {"xi_pred": n, "e": p, "frozen": p, "y": p, "p_ref": p, "xi_ref": n, "v_ff": m, "v0": m}
     args = {name: ca.SX.sym(name, size) for name, size in sizes.items()}
-    xi_pred, e, frozen, *given = args.values()
-    xi_hat = estimated(g, xi_pred, filtered(tracks, args["y"], args["p_ref"]))
-    xi_pred_next, e_next, frozen_next, v = commanded(g, xi_hat, e, frozen, *given)
+    xi_pred, e, frozen, y, p_ref, *given = args.values()
+    xi_hat = estimated(g, xi_pred, filtered(tracks, y, p_ref))
+    e_next = sum_errors(g, e, frozen, y, p_ref)
+    xi_pred_next, frozen_next, v = commanded(g, xi_hat, e_next, *given)
     return args, {
         "xi_pred_next": xi_pred_next,
         "e_next": e_next,

@@ -1,0 +1,101 @@
+"""Programs as C99: one operation a statement, so that no compiler may contract or reorder what the bits depend on."""
+
+from __future__ import annotations
+
+import re
+import textwrap
+
+import numpy as np
+
+from malta.firmware.elementary import Precision
+from malta.firmware.program import TRUTHS, Program
+
+_FORMS = {
+    "ADD": "{0} + {1}",
+    "SUB": "{0} - {1}",
+    "MUL": "{0} * {1}",
+    "DIV": "{0} / {1}",
+    "NEG": "-{0}",
+    "FABS": "({0} < {zero}) ? -{0} : {0}",
+    "SQRT": "{root}({0})",
+    "FMIN": "({0} < {1}) ? {0} : {1}",
+    "FMAX": "({0} > {1}) ? {0} : {1}",
+    "LT": "{0} < {1}",
+    "LE": "{0} <= {1}",
+    "EQ": "{0} == {1}",
+    "NE": "{0} != {1}",
+    "NOT": "!{0}",
+    "AND": "{0} && {1}",
+    "OR": "{0} || {1}",
+    "IF_ELSE_ZERO": "{0} ? {1} : {zero}",
+    "PICK": "{0} ? {1} : {2}",
+}
+_CONDITIONS = {"NOT": 1, "AND": 2, "OR": 2, "IF_ELSE_ZERO": 1, "PICK": 1}  # operands that are true or false
+
+
+def c_name(text: str) -> str:
+    """A text as part of a C identifier."""
+    name = re.sub(r"\W+", "_", text.lower(), flags=re.ASCII).strip("_")
+    return f"m_{name}" if not name or name[0].isdigit() else name
+
+
+def c_number(value: float, precision: Precision) -> str:
+    """A number as C reads it back to the bit."""
+    if precision == "float":
+        return _with_point(str(np.float32(value))) + "f"
+    return _with_point(repr(float(value)))
+
+
+def _with_point(text: str) -> str:
+    return text if any(mark in text for mark in ".e") else f"{text}.0"
+
+
+def signature(p: Program, prefix: str) -> str:
+    """The declaration of a program's function, without its end."""
+    takes = [f"const {prefix}_real {name}[{size}]" for name, size in p.arguments if size]
+    gives = [f"{prefix}_real {name}[{size}]" for name, size in p.results if size]
+    text = f"void {prefix}_{p.name}({', '.join([*takes, *gives])})"
+    return "\n".join(textwrap.wrap(text, 118, subsequent_indent="    ", break_long_words=False))
+
+
+def function_text(p: Program, prefix: str, precision: Precision, *, static: bool = False) -> str:
+    """The C function of a program. All arguments are read before a result is written: they may be the same arrays."""
+    kind = f"{prefix}_real"
+    zero = c_number(0.0, precision)
+    inputs = {k for k, o in enumerate(p.operations) if o.op == "INPUT"}
+    direct = {k: c_number(o.value, precision) for k, o in enumerate(p.operations) if o.op == "CONST"}
+    lines = []
+
+    def text(k: int, *, condition: bool = False) -> str:
+        is_truth = p.operations[k].op in TRUTHS
+        if k in direct:
+            return f"({direct[k]} != {zero})" if condition else _bracketed(direct[k])
+        if condition:
+            return f"t{k}" if is_truth else f"(t{k} != {zero})"
+        return f"({kind})t{k}" if is_truth else f"t{k}"
+
+    for k, operation in enumerate(p.operations):
+        if operation.op == "CONST":
+            continue
+        if k in inputs:
+            argument, entry = operation.place
+            value, of = f"{p.arguments[argument][0]}[{entry}]", kind
+        else:
+            conditions = _CONDITIONS.get(operation.op, 0)
+            operands = [text(a, condition=i < conditions) for i, a in enumerate(operation.operands)]
+            value = _FORMS[operation.op].format(*operands, zero=zero, root=f"{prefix}_root")
+            of = "int" if operation.op in TRUTHS else kind
+        lines.append(f"  const {of} t{k} = {value};")
+    for i, j, k in p.outputs:
+        lines.append(f"  {p.results[i][0]}[{j}] = {text(k)};")
+    written = {(i, j) for i, j, _ in p.outputs}
+    for i, (name, size) in enumerate(p.results):
+        lines += [f"  {name}[{j}] = {zero};" for j in range(size) if (i, j) not in written]
+    head = f"{'static ' if static else ''}{signature(p, prefix)} {{"
+    used = {p.operations[k].place[0] for k in inputs}
+    unused = [f"  (void){name};" for i, (name, size) in enumerate(p.arguments) if size and i not in used]
+    return "\n".join([head, *unused, *lines, "}", ""])
+
+
+def _bracketed(number: str) -> str:
+    return f"({number})" if number.startswith("-") else number

@@ -1,0 +1,222 @@
+"""The exported folder: C of the controller, its test, build files, an example and a report, from jinja2 templates."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import cache
+from importlib.metadata import version
+from typing import Any
+
+import jinja2
+import numpy as np
+
+from malta.firmware.ctext import c_name, c_number, function_text, signature
+from malta.firmware.parts import parts_of
+from malta.firmware.program import Program, program_of
+from malta.firmware.signals import (
+    Field,
+    Target,
+    input_fields,
+    output_fields,
+    reading_ranges,
+    reference_fields,
+    state_fields,
+)
+
+MOST_POINTS = 65_535  # of a table of v0(z)
+MOST_RATE = 1e6  # of a reference, per s and s^2: beyond, single precision has no room
+FUSED = ("sense", "decide", "state_at")  # functions that a step consists of; the others are its pieces
+RISES = 6.0  # times its rise that a stroke lasts: a logistic one is then within 2e-6 of its ends
+WORDS = {
+    "double": "Double precision: the numbers of the simulation.",
+    "float": "Single precision: sums keep what rounding takes from them.",
+}
+
+
+def programs_of(t: Target) -> dict[str, Program]:
+    """The programs of all functions of an export, by name."""
+    return {name: program_of(f) for name, f in parts_of(t).items()}
+
+
+def sources(t: Target, sha256: str, name: str = "") -> dict[str, str]:
+    """The C files of a controller by name: <name>.h, <name>.c, <name>_parts.c.
+
+    sha256 : of the gain file; name : the controller's own, as a C identifier, by default
+    """
+    name = name or c_name(t.controller.name)
+    programs = programs_of(t)
+    context = _context(t, programs, name, sha256)
+    return {
+        f"{name}.h": render("controller.h", context),
+        f"{name}.c": render("controller.c", context),
+        f"{name}_parts.c": render("parts.c", context),
+    }
+
+
+def render(template: str, context: Mapping[str, Any]) -> str:
+    """A template with a context; every undefined name is an error. Lines end without blanks."""
+    text = _environment().get_template(template).render(context)
+    return "\n".join(line.rstrip() for line in text.splitlines()) + "\n"
+
+
+@cache
+def _environment() -> jinja2.Environment:
+    return jinja2.Environment(
+        loader=jinja2.PackageLoader("malta.firmware"),
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        autoescape=False,
+    )
+
+
+def _context(t: Target, programs: Mapping[str, Program], name: str, sha256: str) -> dict[str, Any]:
+    """What the templates of a controller are filled with."""
+    c, plant = t.controller, t.believed
+
+    def number(value: float) -> str:
+        return c_number(value, t.precision)
+
+    def rows(values: Any, width: int) -> str:
+        flat = [number(v) for v in np.ravel(values)]
+        return ",\n".join("  " + ", ".join(flat[k : k + width]) for k in range(0, len(flat), width))
+
+    fused = {key: function_text(programs[key], name, t.precision, static=True) for key in FUSED}
+    others = {key: p for key, p in programs.items() if key not in FUSED}
+    root = any(o.op == "SQRT" for p in programs.values() for o in p.operations)
+    ff = c.feedforward
+    stroke = plant.has_stroke and plant.travel > 0
+    step_z = f"out->y_used[{plant.stroke_output}]" if plant.has_stroke else "s->z[0]"
+    start_z = f"s->reference.p[{plant.stroke_output}]" if plant.has_stroke else "s->z[0]"
+    return {
+        "name": name,
+        "NAME": name.upper(),
+        "title": comment(c.name),
+        "machine": comment(plant.name),
+        "version": version("malta"),
+        "sha256": sha256,
+        "precision": t.precision,
+        "precision_text": WORDS[t.precision],
+        "period": f"{c.sample_time * 1e6:g} us",
+        "sample_time": number(c.sample_time),
+        "records": _records(t, name),
+        "state": state_fields(t),
+        "reference": reference_fields(t),
+        "sums": _sums(t),
+        "declarations": [signature(p, name) for p in others.values()],
+        "functions": "\n".join(function_text(p, name, t.precision) for p in others.values()),
+        **fused,
+        "call_sense": call(programs["sense"], t, name),
+        "call_decide": call(programs["decide"], t, name),
+        "call_start": call(programs["state_at"], t, name),
+        "step_z": step_z,
+        "start_z": start_z,
+        "forces": len(c.forces),
+        "outputs": len(c.measurements),
+        "force_names": comment(" ".join(s.name for s in c.forces)),
+        "points": len(ff.z_grid),
+        "z_rows": rows(ff.z_grid, 6),
+        "v0_rows": rows(ff.v0, len(c.forces)),
+        "force_limits": ", ".join(number(v) for v in _finite(c.limits.force)),
+        "ranges": ", ".join(number(v) for v in reading_ranges(plant)),
+        "most_points": MOST_POINTS,
+        "most_rate": number(MOST_RATE),
+        "stroke": stroke,
+        "stroke_output": plant.stroke_output if stroke else 0,
+        "travel": number(plant.travel),
+        "longest_rise": number(1000.0),
+        "rises": number(RISES),
+        "link": number(plant.drive.link_voltage) if t.driven else "",
+        "last_output": _last_output(t),
+        "root": root,
+        "arm_fpu": f" || (defined(__ARM_FP) && ((__ARM_FP & {8 if t.precision == 'double' else 4}) != 0))",
+        "builtin_root": "__builtin_sqrt" if t.precision == "double" else "__builtin_sqrtf",
+        "digits": 52 if t.precision == "double" else 23,
+        **{key: number(v) for key, v in _NUMBERS.items()},
+    }
+
+
+_NUMBERS = {"zero": 0.0, "one": 1.0, "two": 2.0, "four": 4.0, "half": 0.5, "quarter": 0.25}
+
+
+def _finite(values: Any) -> list[float]:
+    """Limits, with the largest number of single precision in place of none."""
+    return [min(float(v), float(np.finfo(np.float32).max)) for v in values]
+
+
+def _records(t: Target, n: str) -> list[dict[str, Any]]:
+    """The structs of the header."""
+    beside = [
+        f"{n}_reference reference; /* of the next step */",
+        f"const {n}_real *z; /* v0(z): points of z, m */",
+        f"const {n}_real *v0; /* forces at each */",
+        "int32_t points;",
+    ]
+    commanded = "What is commanded at a sample, and what else a log or a supervisor wants."
+    remembered = "What the controller remembers from one sample to the next."
+    found: list[tuple[str, str, list[Field], list[str]]] = [
+        ("reference", "The reference of a sample.", reference_fields(t), []),
+        ("state", remembered, state_fields(t), beside),
+        ("inputs", "What is read at a sample.", input_fields(t), []),
+        ("outputs", commanded, output_fields(t), []),
+    ]
+    if t.believed.has_stroke:
+        reals = (("start", "m"), ("end", "m"), ("rise", "s, 10 to 90 %"))
+        whole = [f"{n}_real {key}; /* {unit} */" for key, unit in reals]
+        whole += [
+            "int32_t profile;",
+            "int32_t sample; /* that comes next */",
+            "int32_t samples; /* in all */",
+        ]
+        found.append(("stroke", "A stroke that is under way.", [], whole))
+    return [
+        {"name": key, "meaning": meaning, "more": more, "fields": [_shown(f) for f in fields if f.size]}
+        for key, meaning, fields, more in found
+    ]
+
+
+def _shown(field: Field) -> dict[str, Any]:
+    """A field with lines that name its signals, as long as lines may be."""
+    lines, line = [], ""
+    for text in (comment(f"{s.name} [{s.unit}]") for s in field.signals):
+        if line and len(line) + len(text) > 100:
+            lines.append(line + ",")
+            line = ""
+        line = f"{line}, {text}" if line else text
+    return {"name": field.name, "size": field.size, "meaning": field.meaning, "lines": [*lines, line]}
+
+
+def comment(text: str) -> str:
+    """A text that cannot end a comment in C, whoever gave the names in it."""
+    plain = "".join(letter if letter.isascii() and letter.isprintable() else "?" for letter in text)
+    return plain.replace("*/", "* /").replace("/*", "/ *").replace("\\", "/").replace("??", "? ?")
+
+
+def _sums(t: Target) -> list[dict[str, Any]]:
+    """The fields that `reset_integrators` sets to zero."""
+    c = t.controller
+    sizes = {f.name: f.size for f in state_fields(t)}
+    whole = ("e", "e_rest", "frozen", "xi_rest", "u_integral", "u_limited", "u_rest")
+    found = [{"name": key, "first": 0, "end": sizes[key]} for key in whole if sizes.get(key)]
+    if c.observed:
+        n = len(c.states)
+        found.append({"name": "xi_pred", "first": n - len(c.forces), "end": n})
+    return found
+
+
+def _last_output(t: Target) -> str:
+    if t.has_set_points:
+        return "command: set points of the machine's electronics"
+    return "command: duty cycles of the half-bridges" if t.driven else "current: of each coil"
+
+
+def call(p: Program, t: Target, name: str) -> str:
+    """The call of a fused function with members of the structs."""
+    places = {f.name: f"s->{f.name}" for f in state_fields(t)}
+    places |= {f"{f.name}_next": f"s->{f.name}" for f in state_fields(t)}
+    places |= {f.name: f"s->reference.{f.name}" for f in reference_fields(t)}
+    places |= {f.name: f"in->{f.name}" for f in input_fields(t)}
+    places |= {f.name: f"out->{f.name}" for f in output_fields(t)}
+    places["v0"] = "v0"
+    given = [places[key] for key, size in (*p.arguments, *p.results) if size]
+    return f"{name}_{p.name}({', '.join(given)})"

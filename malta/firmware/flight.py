@@ -1,0 +1,330 @@
+"""The exported C flies: an engine of simulations whose control law is the compiled controller.
+
+The machine, its sensors and the delay are those of every simulation, computed by CasADi's virtual machine; the law, the
+current loops and what they remember are the C's. It reads what a controller reads, and nothing else.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cache, lru_cache
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import casadi as ca
+import numpy as np
+
+from malta.errors import InputError
+from malta.firmware.elementary import Precision
+from malta.firmware.native import Native, call, compile_controller, new_state, view
+from malta.firmware.signals import Target, state_fields
+from malta.model.plant import Plant
+from malta.simulation.engines import Engine, evaluate, substeps_until
+from malta.simulation.layout import Layout, Setup, command_size, layout_of, numbers_of, signals_of
+from malta.simulation.period import Period, period_of
+from malta.simulation.prepared import Prepared
+from malta.synthesis.controller import Controller
+
+if TYPE_CHECKING:
+    from malta.model.plant import FloatArray
+    from malta.simulation.trajectory import Trajectory
+
+SERIES_COMPARED = ("p", "y", "xi_hat", "v", "current", "force", "i", "u", "i_phase", "duty")
+
+
+def engine_of_c(precision: Precision = "double") -> Callable[[Prepared, Plant, float], Engine]:
+    """What `malta.simulate` takes as its engine to fly the exported C in place of the law: see `malta.simulate`.
+
+    Raises InputError without a C compiler, and for what the export does not have: another estimator, C at the measured
+    position, axes that turn, forces known in advance, an open loop.
+
+        run = malta.simulate(plant, controller, malta.Scenario.stroke(), engine=malta.engine_of_c("float"))
+    """
+    sessions: dict[int, tuple[Any, Any]] = {}
+
+    def engine(ready: Prepared, now: Plant, substeps: float) -> Engine:
+        return _engine(ready, now, substeps, precision, sessions)
+
+    return engine
+
+
+def _engine(
+    ready: Prepared, now: Plant, substeps: float, precision: Precision, sessions: dict[int, tuple[Any, Any]]
+) -> Engine:
+    """The engine of a machine; one run has one state of the controller, also where the machine changes on the way."""
+    simulation, inputs, _ = ready
+    c, setup = simulation.controller, simulation.setup
+    _require_exported(simulation.scenario.name, setup)
+    native = compile_controller(_target(c, precision, setup.fidelity))
+    sizes = layout_of(simulation.plant, c, setup)
+    if id(inputs) not in sessions:
+        sessions.clear()
+        sessions[id(inputs)] = inputs, _first_state(native, sizes, ready)
+    state = sessions[id(inputs)][1]
+    errors = tuple(sorted((simulation.scenario.sensor_errors or {}).items()))
+    machine = _machine(now, c, setup, substeps, errors)
+
+    def run(
+        first: int, begin: FloatArray, given: FloatArray, noise: FloatArray, fast: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        ddp = inputs.motion.ddp[first : first + len(given)]
+        flight = _Flight(native, state, sizes, machine, setup)
+        return _fly(flight, first, begin, given, noise, fast, ddp, substeps)
+
+    return Engine(f"exported C, {precision}", run)
+
+
+@lru_cache(maxsize=16)
+def _target(c: Controller, precision: Precision, fidelity: Any) -> Target:
+    return Target(c, precision, fidelity)
+
+
+def _require_exported(scenario: str, s: Setup) -> None:
+    """InputError for a setup whose law is not the exported one."""
+    for name, found in (
+        ("estimator", s.outside),
+        ("scheduled", s.scheduled),
+        ("bearing_axes", s.turning),
+        ("anticipated", s.anticipated),
+        ("open_loop", s.open_loop),
+    ):
+        if found:
+            raise InputError(
+                f"scenario {scenario}", name, "a law that is not exported", "the gain file's own law"
+            )
+
+
+class _Machine(NamedTuple):
+    """The functions of the simulated machine."""
+
+    sense: ca.Function  # (state, given, noise) -> y and errors of currents
+    record: ca.Function  # (state, given, y, outputs of the controller) -> row
+    motion: Callable[[int], ca.Function]  # substeps -> (machine, held, given, fast noise) -> machine
+
+
+@lru_cache(maxsize=8)
+def _machine(
+    plant: Plant, c: Controller, setup: Setup, substeps: float, errors: tuple[tuple[str, float], ...]
+) -> _Machine:
+    period = period_of(plant, c, setup, numbers_of(plant, c, substeps, dict(errors)), constant=True)
+    return _Machine(
+        period.sense, _record(plant, c, setup, period), cache(lambda count: _motion(period, count))
+    )
+
+
+def _motion(p: Period, count: int) -> ca.Function:
+    """`count` substeps in one call."""
+    machine, held = ca.MX.sym("machine", p.substep.size1_in(0)), ca.MX.sym("held", p.substep.size1_in(1))
+    given = ca.MX.sym("given", p.substep.size1_in(2))
+    jitter = ca.MX.sym("jitter", p.substep.size1_in(3), count)
+    after = machine
+    if count <= 16:
+        for k in range(count):
+            after = p.substep(after, held, given, jitter[:, k], ca.DM(0, 1))
+    else:
+        state, noise = ca.MX.sym("state", machine.numel()), ca.MX.sym("noise", p.substep.size1_in(3))
+        fixed = ca.MX.sym("fixed", held.numel() + given.numel())
+        parts = ca.vertsplit(fixed, [0, held.numel(), fixed.numel()])
+        step = ca.Function("step", [state, noise, fixed], [p.substep(state, *parts, noise, ca.DM(0, 1))])
+        after = step.mapaccum("steps", count)(machine, jitter, ca.repmat(ca.vertcat(held, given), 1, count))[
+            :, -1
+        ]
+    return ca.Function("motion", [machine, held, given, ca.vec(jitter)], [ca.densify(after)])
+
+
+_REPLACED = ("xi_hat", "v", "saturated", "current", "met", "command")
+
+
+def _record(plant: Plant, c: Controller, setup: Setup, p: Period) -> ca.Function:
+    """(state, given, y, outputs) -> row: what the machine knows of a sample, and what the C commanded."""
+    sizes = layout_of(plant, c, setup)
+    state, given = ca.SX.sym("state", p.decide.size1_in(0)), ca.SX.sym("given", p.decide.size1_in(1))
+    y = ca.SX.sym("y", p.decide.size1_in(2))
+    count = command_size(plant, setup)
+    widths = {
+        "xi_hat": len(c.states),
+        "v": len(c.forces),
+        "saturated": len(c.forces),
+        "current": sizes.row["current"],
+    }
+    out = {name: ca.SX.sym(name, size) for name, size in (widths | {"met": 1, "command": count}).items()}
+    own = p.decide(state, given, y, ca.SX.zeros(len(c.forces)), ca.DM(0, 1))[2]
+    row, begin = {}, 0
+    for name, size in sizes.row.items():
+        row[name] = own[begin : begin + size, 0]
+        begin += size
+    row |= {name: out[name] for name in widths}
+    row["met"] = ca.vertcat(out["met"], row["met"][1:, 0])
+    if "u" in sizes.row:
+        signals = signals_of(sizes, ca.SX)
+        machine, inputs = signals.machine, signals.given
+        V = machine["link"] * (1 - inputs["sag"] if setup.faulty else 1)
+        drive = plant.drive
+        if setup.fidelity == "dq":
+            u = out["command"] * V
+        else:
+            u = drive.to_axes(machine["x"]) @ ((out["command"] - 0.5) * V)
+            row["duty"] = out["command"]
+        whole = [
+            ca.vertcat(*machine.values(), *signals.controller.values()),
+            ca.vertcat(*inputs.values()),
+            out["command"],
+        ]
+        row["u"] = ca.Function("u", whole, [u])(state, given, out["command"])
+    values = ca.vertcat(*(row[name] for name in sizes.row))
+    return ca.Function("record", [state, given, y, ca.vertcat(*out.values())], [ca.densify(ca.cse(values))])
+
+
+def _first_state(native: Native, sizes: Layout, ready: Prepared) -> Any:
+    """The controller's state at the start of a run: what the simulation's own law would remember."""
+    state = new_state(native)
+    _, inputs, start = ready
+    reference = (inputs.motion.p[0], inputs.motion.dp[0], inputs.motion.ddp[0])
+    for name, values in zip(("p", "dp", "ddp"), reference, strict=True):
+        view(state.reference, name)[:] = values
+    call(native, "start", state)
+    known = _entries(sizes.controller, sum(sizes.machine.values()))
+    for field in state_fields(native.target):
+        if field.name in known and field.size:
+            view(state, field.name)[:] = start[known[field.name]]
+    machine = _entries(sizes.machine, 0)
+    if "i_last" in {f.name for f in state_fields(native.target)}:
+        view(state, "i_last")[:] = start[machine["i_phase" if "i_phase" in machine else "i"]]
+    return state
+
+
+def _entries(sizes: dict[str, int], begin: int) -> dict[str, slice]:
+    """The places of signals in a vector."""
+    places = {}
+    for name, size in sizes.items():
+        places[name] = slice(begin, begin + size)
+        begin += size
+    return places
+
+
+class _Flight(NamedTuple):
+    """A controller on its way with a machine."""
+
+    native: Native
+    state: Any
+    sizes: Layout
+    machine: _Machine
+    setup: Setup
+
+
+def _fly(
+    f: _Flight,
+    first: int,
+    begin: FloatArray,
+    given: FloatArray,
+    noise: FloatArray,
+    fast: FloatArray,
+    ddp: FloatArray,
+    substeps: float,
+) -> tuple[FloatArray, FloatArray]:
+    """Samples of a run: the last state, and rows."""
+    inputs, outputs = f.native.Inputs(), f.native.Outputs()
+    step = getattr(f.native.lib, f"{f.native.name}_step")
+    records = tuple(ctypes.byref(r) for r in (f.state, inputs, outputs))
+    held_state = np.array(begin, dtype=float)
+    states = np.empty((len(given), len(held_state)))
+    reads = np.empty((len(given), f.machine.sense.size1_out(0)))
+    entries = {name: view(outputs, name) for name in _REPLACED if hasattr(outputs, name)}
+    if f.setup.fidelity == "force":
+        entries["command"] = entries["current"]
+    commands = np.empty((len(given), sum(entries[name].size for name in _REPLACED)))
+    places = _entries({**f.sizes.machine, **f.sizes.controller}, 0)
+    around = _entries(f.sizes.given, 0)
+    machine = slice(0, sum(f.sizes.machine.values()))
+    done = substeps_until(first, substeps)
+    begin_substep = done
+    _call_all_valid(inputs)
+    for k, row in enumerate(given):
+        states[k] = held_state
+        read, _ = (x.ravel() for x in evaluate(f.machine.sense, held_state, row, noise[k], np.empty(0)))
+        reads[k] = read
+        missed = f.setup.faulty and row[around["missed"]][0]
+        if not missed:
+            _put(f, inputs, held_state, row, read, ddp[k], places, around)
+            step(*records)
+            for name in ("xi_pred", "e", "frozen", "u_integral", "u_limited"):
+                if name in places:
+                    held_state[places[name]] = view(f.state, name)
+            if f.setup.faulty:
+                held_state[places["y_last"]] = read[: f.sizes.row["y"]]
+                held_state[places["command"]] = entries["command"]
+        command = held_state[places["command"]] if missed else np.array(entries["command"], dtype=float)
+        commands[k] = np.concatenate([entries[name] for name in _REPLACED])
+        commands[k, commands.shape[1] - len(command) :] = command
+        queue = np.concatenate([held_state[places["under_way"]], command])
+        held_state[places["under_way"]] = queue[len(command) :]
+        end = substeps_until(first + k + 1, substeps)
+        jitter = fast[done - begin_substep : end - begin_substep].ravel()
+        motion = f.machine.motion(end - done)
+        held_state[machine] = evaluate(motion, held_state[machine], queue[: len(command)], row, jitter)[
+            0
+        ].ravel()
+        done = end
+    rows = evaluate(f.machine.record.map(len(given)), states, given, reads, commands)[0]
+    return held_state, rows
+
+
+def _call_all_valid(inputs: Any) -> None:
+    """No sensor calls its reading invalid."""
+    for name in ("y_valid", "i_valid"):
+        if hasattr(inputs, name):
+            view(inputs, name)[:] = 1
+
+
+def _put(
+    f: _Flight,
+    inputs: Any,
+    state: FloatArray,
+    row: FloatArray,
+    read: FloatArray,
+    ddp: FloatArray,
+    places: dict[str, slice],
+    around: dict[str, slice],
+) -> None:
+    """Give a sample's reference and readings to the controller."""
+    reference = f.state.reference
+    view(reference, "p")[:] = row[around["p_ref"]]
+    view(reference, "dp")[:] = row[around["dp_ref"]]
+    view(reference, "ddp")[:] = ddp
+    outputs = f.sizes.row["y"]
+    view(inputs, "y")[:] = read[:outputs]
+    if f.native.target.driven:
+        currents = state[places["i_phase" if "i_phase" in places else "i"]]
+        view(inputs, "i")[:] = currents
+        if f.setup.current_sensors and f.setup.fidelity == "phase":
+            view(inputs, "i")[:] = currents + read[outputs:]
+        sag = row[around["sag"]][0] if f.setup.faulty else 0.0
+        view(inputs, "link")[:] = state[places["link"]] * (1 - sag)
+
+
+@dataclass(frozen=True)
+class Difference:
+    """How far a signal of two runs is apart at most, and the range of the signal."""
+
+    name: str
+    largest: float
+    range: float
+
+    @property
+    def share(self) -> float:
+        """The difference as a share of the range."""
+        return self.largest / self.range if self.range else self.largest
+
+
+def differences(
+    run: Trajectory, other: Trajectory, names: Sequence[str] = SERIES_COMPARED
+) -> list[Difference]:
+    """The largest differences of two runs' signals, over the samples that both have."""
+    samples = min(len(run.t), len(other.t))
+    found = []
+    for name in names:
+        one, two = getattr(run, name)[:samples], getattr(other, name)[:samples]
+        if one.size:
+            found.append(Difference(name, float(np.abs(one - two).max()), float(np.abs(one).max())))
+    return found

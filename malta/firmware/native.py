@@ -1,0 +1,108 @@
+"""The exported C, compiled on this computer and called from Python: `--controller c`, and tests."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Mapping
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from malta.errors import InputError
+from malta.firmware.ctext import c_name
+from malta.firmware.export import sources
+from malta.firmware.program import TYPES
+from malta.firmware.signals import (
+    Field,
+    Target,
+    input_fields,
+    output_fields,
+    reference_fields,
+    state_fields,
+)
+from malta.simulation.compiled import library
+
+if TYPE_CHECKING:
+    from malta.model.plant import FloatArray
+
+FLAGS = ("-std=c99", "-O2", "-ffp-contract=off", "-fno-math-errno", "-fPIC", "-shared")
+
+
+class Native(NamedTuple):
+    """A compiled controller; its records are ctypes structures with arrays of the names in signals.py."""
+
+    target: Target
+    lib: Any
+    name: str
+    State: Any
+    Reference: Any
+    Inputs: Any
+    Outputs: Any
+
+
+@lru_cache(maxsize=16)
+def compile_controller(t: Target) -> Native:
+    """The controller's C, compiled. Raises InputError without a C compiler."""
+    name = c_name(t.controller.name)
+    files = sources(t, "", name)
+    text = "".join(files[f"{name}{end}"] for end in (".h", ".c", "_parts.c"))
+    text = text.replace(f'#include "{name}.h"', "")
+    lib = library(text, 1, flags=FLAGS)
+    if lib is None:
+        raise InputError("export", "C compiler", "none that works", "cc, gcc or clang, or $CC")
+    real = ctypes.c_double if t.precision == "double" else ctypes.c_float
+
+    def record(title: str, fields: list[Field], more: tuple[tuple[str, Any], ...] = ()) -> Any:
+        arrays = [(f.name, real * f.size) for f in fields if f.size]
+        return type(title, (ctypes.Structure,), {"_fields_": [*arrays, *more]})
+
+    Reference = record("Reference", reference_fields(t))
+    table = (("z", ctypes.c_void_p), ("v0", ctypes.c_void_p), ("points", ctypes.c_int32))
+    return Native(
+        t,
+        lib,
+        name,
+        record("State", state_fields(t), (("reference", Reference), *table)),
+        Reference,
+        record("Inputs", input_fields(t)),
+        record("Outputs", output_fields(t)),
+    )
+
+
+def call(native: Native, function: str, *arguments: Any) -> int:
+    """Call a function of the controller with records and numbers."""
+    given = [ctypes.byref(a) if isinstance(a, ctypes.Structure) else a for a in arguments]
+    return int(getattr(native.lib, f"{native.name}_{function}")(*given))
+
+
+def call_piece(
+    native: Native, piece: str, given: Mapping[str, FloatArray], sizes: Mapping[str, int]
+) -> dict[str, Any]:
+    """Call a piece with vectors; the results by name. sizes : of the results"""
+    real = TYPES[native.target.precision]
+    results = {name: np.zeros(size, dtype=real) for name, size in sizes.items()}
+    vectors = [np.ascontiguousarray(value, dtype=real) for value in given.values()]
+    getattr(native.lib, f"{native.name}_{piece}")(
+        *(v.ctypes.data_as(ctypes.c_void_p) for v in (*vectors, *results.values()))
+    )
+    return results
+
+
+def new_state(native: Native) -> Any:
+    """A state at rest."""
+    state = native.State()
+    call(native, "init", state)
+    return state
+
+
+def write(record: Any, values: Mapping[str, Any]) -> None:
+    """Put vectors into the arrays of a record."""
+    for name, value in values.items():
+        array = getattr(record, name)
+        array[:] = np.asarray(value, dtype=float).ravel().tolist()
+
+
+def view(record: Any, name: str) -> Any:
+    """The array of a record as numpy sees it, in place."""
+    return np.ctypeslib.as_array(getattr(record, name))

@@ -1,0 +1,359 @@
+"""The parts of a control period as CasADi functions of named vectors, from the expressions that simulations run.
+
+    sense       (raw readings, validity) -> y: readings that cannot be true give way to what the filter expects
+    decide      (state, reference, y, v0, currents, link) -> (state, forces, currents, duty cycles)
+
+and each piece of `decide` alone: positions, filter, law, feedforward, currents, current control, transformations,
+references of strokes, calibration, the position of Hall sensors. v0(z) is looked up between the two, see controller.c.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any
+
+import casadi as ca
+import numpy as np
+
+from malta.firmware.elementary import as_written
+from malta.firmware.lowering import lower
+from malta.firmware.signals import (
+    Field,
+    Target,
+    input_fields,
+    output_fields,
+    reading_ranges,
+    reference_fields,
+    state_fields,
+)
+from malta.model.plant import Plant
+from malta.simulation.current_control import control_currents
+from malta.simulation.layout import Loop, Signals, electronics_of, numbers_of
+from malta.simulation.period import law_reference, state_reference
+from malta.simulation.references import QUINTIC_DURATION
+from malta.synthesis.controller import (
+    commanded,
+    estimated,
+    filtered,
+    freeze_moving,
+    look_ahead,
+    sum_errors,
+)
+
+if TYPE_CHECKING:
+    from malta.model.plant import FloatArray
+
+LINK_RANGE = (0.05, 4.0)  # readings of the link's voltage that are believed, in multiples of the nominal one
+
+
+def parts_of(t: Target) -> dict[str, ca.Function]:
+    """All functions of an export by name, lowered: `sense` and `decide`, then the pieces that are usable alone."""
+    functions = [sense_function(t), decide_function(t), state_function(t), *pieces(t)]
+    return {f.name(): lower(f, t.precision) for f in functions}
+
+
+def symbols(fields: Sequence[Field]) -> dict[str, Any]:
+    """Symbols of fields by name."""
+    return {field.name: ca.SX.sym(field.name, field.size) for field in fields}
+
+
+def named_function(name: str, arguments: dict[str, Any], results: dict[str, Any]) -> ca.Function:
+    """A function with named, dense arguments and results."""
+    given = {key: ca.densify(value) for key, value in results.items()}
+    return ca.Function(name, list(arguments.values()), list(given.values()), list(arguments), list(given))
+
+
+def sense_function(t: Target) -> ca.Function:
+    """(xi_pred, p, raw y, y_valid) -> (y_used, refused).
+
+    A reading is refused that its sensor calls invalid, that is no number, or beyond all that the machine can reach; the
+    filter then goes on by its model. Comparisons with a NaN are false, so no reading poisons the state.
+    """
+    c = t.controller
+    a = symbols(
+        [
+            *(f for f in state_fields(t) if f.name == "xi_pred"),
+            *(f for f in reference_fields(t) if f.name == "p"),
+            *(f for f in input_fields(t) if f.name in ("y", "y_valid")),
+        ]
+    )
+    expected = ca.sparsify(ca.DM(c.Cd)) @ a["xi_pred"]
+    if c.tracks == "errors":
+        expected = a["p"]
+    used, refused = gate(a["y"], a["y_valid"], reading_ranges(t.believed), expected)
+    return named_function("sense", a, {"y_used": used, "refused": refused})
+
+
+def gate(raw: Any, valid: Any, ranges: FloatArray, instead: Any) -> tuple[Any, Any]:
+    """Readings, others in place of refused ones; and 1 where one was refused."""
+    used, refused = [], []
+    for k, most in enumerate(ranges):
+        inside = ca.logic_and(raw[k] <= float(most), raw[k] >= -float(most))
+        accepted = ca.logic_and(valid[k] != 0, inside)
+        used.append(ca.if_else(accepted, raw[k], instead[k]))
+        refused.append(ca.logic_not(accepted))
+    return ca.vertcat(*used), ca.vertcat(*refused)
+
+
+def decide_function(t: Target) -> ca.Function:
+    """(state, reference, y, v0, currents, link) -> (state, outputs): the rest of a control period.
+
+    It consists of the functions of synthesis/controller.py and simulation/current_control.py, as a simulation does.
+    """
+    c, plant = t.controller, t.believed
+    g = {name: ca.SX(value) for name, value in numbers_of(plant, c, 1).items()}
+    state, reference = symbols(state_fields(t)), symbols(reference_fields(t))
+    y, v0 = ca.SX.sym("y_used", len(c.measurements)), ca.SX.sym("v0", len(c.forces))
+    read = symbols([f for f in input_fields(t) if f.name in ("i", "i_valid", "link")])
+    p, dp = reference["p"], reference["dp"]
+    after: dict[str, Any] = dict(state)
+    out: dict[str, Any] = {}
+    v_ff = feedforward(t, p, dp, reference["ddp"])
+    v_past, after["memory"] = recall(t, state.get("memory"), v_ff, p, dp)
+    xi_ref = law_reference(c, plant, g, {"p_ref": p, "dp_ref": dp, "v_past": v_past})
+    sums = _Sums(t, state)
+    xi_hat = estimated(g, state["xi_pred"], filtered(c.tracks, y, p), None, sums.add_to_states)
+    frozen = freeze_moving(g, state["frozen"], dp)
+    e = sum_errors(g, state["e"], frozen, y, p, sums.add_to_errors)
+    xi_pred, saturated, v = commanded(g, xi_hat, e, xi_ref, v_ff, v0)
+    xi_pred, place = look_ahead(g, xi_pred, y, dp)
+    wanted, current = currents(t, place, v)
+    out |= {"xi_hat": xi_hat, "v": v, "saturated": saturated, "current": current}
+    out["met"] = ca.mmax(ca.fabs(current - wanted)) > 0
+    after |= {"xi_pred": xi_pred, "e": e, "frozen": saturated}
+    if t.has_set_points:
+        electronics = electronics_of(plant, t.setup)
+        assert electronics is not None
+        out["command"] = electronics.held(current, place)
+    elif t.driven:
+        known = xi_hat if c.tracks == "states" else state_reference(plant)(y, dp)
+        out["command"], electric = drive_currents(t, g, state, read, current, known, sums)
+        after |= electric
+    after |= sums.rests
+    results = {f.name: after[f.name] for f in state_fields(t)}
+    results |= {f.name: out[f.name] for f in output_fields(t) if f.name in out}
+    arguments = {**state, **reference, "y_used": y, "v0": v0, **read}
+    results = {(f"{name}_next" if name in state else name): value for name, value in results.items()}
+    return named_function("decide", arguments, results)
+
+
+class _Sums:
+    """How the sums of a sample take what is added: plainly in double precision, compensated (Kahan) in single.
+
+    At e = 1e-4 a float moves in steps of 7e-12; Ts (p* - y) is smaller for errors below 73 nm at 20 kHz, and the sum
+    would stand still. What rounding took away is kept beside the sum and added at the next sample.
+    """
+
+    def __init__(self, t: Target, state: dict[str, Any]) -> None:
+        self.t, self.state = t, state
+        self.rests: dict[str, Any] = {}
+
+    def add_to_errors(self, total: Any, more: Any) -> Any:
+        return self._add(total, more, "e_rest", range(total.numel()))
+
+    def add_to_voltages(self, total: Any, more: Any) -> Any:
+        return self._add(total, more, "u_rest", range(total.numel()))
+
+    def add_to_states(self, total: Any, more: Any) -> Any:
+        return self._add(total, more, "xi_rest", self.t.summing_states)
+
+    def _add(self, total: Any, more: Any, rest: str, entries: Sequence[int]) -> Any:
+        total, more = ca.densify(ca.SX(total)), ca.densify(ca.SX(more))
+        plain = total + more
+        if not self.t.compensated or not entries:
+            return plain
+        kept = ca.SX.zeros(total.numel())
+        with as_written():
+            for k in entries:
+                wanted = more[k] + self.state[rest][k]
+                found = total[k] + wanted
+                kept[k] = wanted - (found - total[k])
+                plain[k] = found
+        self.rests[rest] = kept
+        return plain
+
+
+def feedforward(t: Target, p: Any, dp: Any, ddp: Any) -> Any:
+    """v_ff = inertia p*'' + speed p*' + position q*, the forces that the reference takes."""
+    ff = t.controller.feedforward
+    v = ca.DM(ff.inertia) * ddp + ca.sparsify(ca.DM(ff.speed)) @ dp
+    if ff.position.size:
+        states = state_reference(t.believed)(p, dp)
+        v += ca.sparsify(ca.DM(ff.position)) @ states[: ff.position.shape[1]]
+    return v
+
+
+def recall(t: Target, memory: Any, v_ff: Any, p: Any, dp: Any) -> tuple[Any, Any]:
+    """References of the forces under way, and the memory of the next sample: see inputs.sample_inputs.
+
+    The memory holds the forces behind the lag, the stored forces, and the feedforward of as many samples.
+    """
+    c, m = t.controller, len(t.controller.forces)
+    if c.tracks == "errors":
+        return ca.SX(0, 1), memory
+    zeros = ca.SX.zeros(m * c.observed)
+    if memory is None:
+        return zeros, None
+    lagging, d = c.lagging, c.delay
+    edges = (0, m * lagging, m * (lagging + d), memory.numel())
+    lag, stored, forward = (memory[a:b, 0] for a, b in pairwise(edges))  # columns, where they are empty too
+    after: list[Any] = []
+    if lagging:
+        decay = float(c.Ad[len(c.A), len(c.A)])
+        acting = forward[:m, 0] if d else v_ff
+        after.append((1 - decay) * acting + decay * lag)
+    if d:
+        n = len(c.A)
+        newest = n + m * (lagging + d - 1)
+        pull = ca.sparsify(ca.DM(c.Ad[newest : newest + m, :n]))
+        now = v_ff + pull @ state_reference(t.believed)(p, dp)
+        if c.commutation is not None:
+            now += ca.sparsify(ca.DM(c.commutation.lead * c.commutation.pull)) @ dp
+        after += [stored[m:, 0], now]
+        if lagging:
+            after += [forward[m:, 0], v_ff]
+    return ca.vertcat(lag, stored, zeros), ca.vertcat(*after)
+
+
+def currents(t: Target, place: Any, v: Any) -> tuple[Any, Any]:
+    """Coil currents that make the forces v where the machine is, as wanted and within their limits."""
+    wanted = t.believed.currents(place, v)
+    limit = ca.DM(t.controller.limits.current)
+    current = t.believed.limited(wanted)
+    bounded = [
+        ca.fmax(ca.fmin(current[k], float(limit[k])), -float(limit[k]))
+        if np.isfinite(float(limit[k]))
+        else current[k]
+        for k in range(limit.numel())
+    ]
+    return wanted, ca.vertcat(*bounded)
+
+
+def drive_currents(
+    t: Target,
+    g: dict[str, Any],
+    state: dict[str, Any],
+    read: dict[str, Any],
+    current: Any,
+    known: Any,
+    sums: _Sums,
+) -> tuple[Any, dict[str, Any]]:
+    """Duty cycles (or voltages of axes) for these currents, and the state of the current loops after the sample."""
+    c, plant, drive = t.controller, t.believed, t.believed.drive
+    most = 4 * max(plant.actuator.current_limit, float(np.max(c.limits.current)))
+    i, _ = gate(read["i"], read["i_valid"], np.full(read["i"].numel(), most), state["i_last"])
+    low, high = (share * drive.link_voltage for share in LINK_RANGE)
+    usable = ca.logic_and(read["link"] >= low, read["link"] <= high)
+    V = ca.if_else(usable, read["link"], state["link_last"])
+    machine = {"i_phase": i, "i": i, "link": V, "x": ca.SX.zeros(len(plant.states))}
+    loops = {name: state[name] for name in ("u_integral", "u_limited")}
+    command, after, _ = control_currents(
+        Loop(plant, c, t.setup, g), Signals(machine, loops, {}), current, known, None, sums.add_to_voltages
+    )
+    return command, after | {"i_last": i, "link_last": V}
+
+
+def state_function(t: Target) -> ca.Function:
+    """(p, dp, ddp, v0) -> state: the filter knows the machine to follow the reference, which has been so before."""
+    c, plant = t.controller, t.believed
+    reference = symbols(reference_fields(t))
+    v0 = ca.SX.sym("v0", len(c.forces))
+    state: dict[str, Any] = {f.name: ca.SX.zeros(f.size) for f in state_fields(t)}
+    p, dp = reference["p"], reference["dp"]
+    if c.tracks == "states":
+        v_ff = feedforward(t, p, dp, reference["ddp"])
+        if "memory" in state:
+            m, ahead = len(c.forces), c.lagging + c.delay
+            trial = ca.SX.zeros(state["memory"].numel())
+            _, after = recall(t, trial, v_ff, p, dp)
+            newest = after[m * (ahead - 1) : m * ahead, 0] if c.delay else v_ff
+            state["memory"] = ca.vertcat(
+                *([v_ff] if c.lagging else []), *[newest] * c.delay, *([v_ff] * c.delay if c.lagging else [])
+            )
+        v_past, _ = recall(t, state.get("memory"), v_ff, p, dp)
+        state["xi_pred"] = ca.vertcat(state_reference(plant)(p, dp), v_past)
+    if t.driven:
+        drive, x = plant.drive, ca.SX.zeros(len(plant.states))
+        q = state_reference(plant)(p, dp)
+        for k, index in enumerate(plant.controlled):
+            x[index] = q[k]
+        i = drive.command(plant.currents(p, v0))
+        state["u_integral"] = plant.actuator.R * i
+        state["i_last"] = drive.to_phases(x) @ i if t.fidelity == "phase" else i
+        state["link_last"] = ca.SX(drive.link_voltage)
+    return named_function("state_at", {**reference, "v0": v0}, {f"{k}_next": v for k, v in state.items()})
+
+
+def pieces(t: Target) -> list[ca.Function]:
+    """The pieces of a control period that are usable alone."""
+    c, plant = t.controller, t.believed
+    g = {name: ca.SX(value) for name, value in numbers_of(plant, c, 1).items()}
+    reference = symbols(reference_fields(t))
+    p, dp, ddp = reference.values()
+    y, v, v0 = (
+        ca.SX.sym(n, k) for n, k in (("y", len(c.measurements)), ("v", len(c.forces)), ("v0", len(c.forces)))
+    )
+    raw, gain, offset = (ca.SX.sym(name, len(c.measurements)) for name in ("raw", "gain", "offset"))
+    xi_pred, xi_hat = ca.SX.sym("xi_pred", len(c.states)), ca.SX.sym("xi_hat", len(c.states))
+    xi_ref, e = ca.SX.sym("xi_ref", len(c.states)), ca.SX.sym("e", len(c.measurements))
+    v_ff = ca.SX.sym("v_ff", len(c.forces))
+    taken = filtered(c.tracks, y, p)
+    following, saturated, force = commanded(g, xi_hat, e, xi_ref, v_ff, v0)
+    return [
+        named_function("calibrate", {"raw": raw, "gain": gain, "offset": offset}, {"y": gain * raw + offset}),
+        named_function("positions", {"y": y}, {"q": plant.position_of(y)}),
+        named_function("feedforward", reference, {"v_ff": feedforward(t, p, dp, ddp)}),
+        named_function(
+            "filter", {"xi_pred": xi_pred, "y": y, "p": p}, {"xi_hat": estimated(g, xi_pred, taken)}
+        ),
+        named_function(
+            "law",
+            {"xi_hat": xi_hat, "e": e, "xi_ref": xi_ref, "v_ff": v_ff, "v0": v0},
+            {"v": force, "saturated": saturated, "xi_pred_next": following},
+        ),
+        named_function("currents", {"y": y, "v": v}, {"current": currents(t, y, v)[1]}),
+        *strokes(),
+        *_transformations(plant),
+    ]
+
+
+def _transformations(plant: Plant) -> list[ca.Function]:
+    """Axes from phases and back, of a machine with windings, and the position of two Hall sensors half a pole apart."""
+    if plant.windings is None:
+        return []
+    drive, x = plant.windings, ca.SX.sym("x", len(plant.states))
+    i_phase, u = ca.SX.sym("i_phase", len(drive.phases)), ca.SX.sym("u", len(drive.axes))
+    sine, cosine, z, pole = (ca.SX.sym(name) for name in ("sine", "cosine", "z_last", "pole"))
+    angle = ca.atan2(sine, cosine)
+    turns = (z * math.pi / pole - angle) / (2 * math.pi)
+    return [
+        named_function("to_axes", {"x": x, "i_phase": i_phase}, {"i": drive.to_axes(x) @ i_phase}),
+        named_function("to_phases", {"x": x, "u": u}, {"u_phase": drive.to_phases(x) @ u}),
+        named_function("induced_voltage", {"x": x}, {"e": drive.emf(x)}),
+        named_function(
+            "hall_position",
+            {"sine": sine, "cosine": cosine, "z_last": z, "pole": pole},
+            {"z": (angle + 2 * math.pi * ca.floor(turns + 0.5)) * pole / math.pi},
+        ),
+    ]
+
+
+def strokes() -> list[ca.Function]:
+    """Shares of a stroke, with rate and acceleration, from the time since its middle: see simulation/references.py."""
+    time, rise = ca.SX.sym("t"), ca.SX.sym("rise")
+    arguments = {"t": time, "rise": rise}
+    k = 2 * math.log(9) / rise
+    s = 0.5 * (1 + ca.tanh(k * time / 2))
+    ds = k * s * (1 - s)
+    T = QUINTIC_DURATION * rise
+    u = ca.fmin(ca.fmax(time / T + 0.5, 0), 1)
+    names = ("share", "rate", "acceleration")
+    logistic = (s, ds, k * ds * (1 - 2 * s))
+    w = u * (1 - u)
+    quintic = (u * u * u * (10 + u * (6 * u - 15)), 30 * (w * w) / T, 60 * w * (1 - 2 * u) / (T * T))
+    return [
+        named_function("logistic", arguments, dict(zip(names, logistic, strict=True))),
+        named_function("quintic", arguments, dict(zip(names, quintic, strict=True))),
+    ]

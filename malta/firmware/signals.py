@@ -1,0 +1,224 @@
+"""Names, units and order of all that goes into the exported controller, stays in it, and comes out of it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+import casadi as ca
+import numpy as np
+
+from malta.errors import InputError
+from malta.firmware.elementary import Precision
+from malta.model.data import plant_of
+from malta.model.plant import Plant, Signal
+from malta.simulation.layout import Fidelity, Setup, electronics_of
+from malta.synthesis.controller import Controller
+
+if TYPE_CHECKING:
+    from malta.model.plant import FloatArray
+
+
+class Field(NamedTuple):
+    """A vector of named numbers."""
+
+    name: str
+    signals: tuple[Signal, ...]
+    meaning: str
+
+    @property
+    def size(self) -> int:
+        return len(self.signals)
+
+
+@dataclass(frozen=True, eq=False)
+class Target:
+    """What is exported: a controller, in a precision, down to forces, axes or half-bridges."""
+
+    controller: Controller
+    precision: Precision = "double"
+    fidelity: Fidelity = (
+        "phase"  # "force" ends with currents, "dq" with voltages of axes, "phase" with duty cycles
+    )
+
+    def __post_init__(self) -> None:
+        if self.precision not in ("double", "float"):
+            raise InputError("export", "precision", repr(self.precision), "double or float")
+        if self.believed.tabulated:
+            found = f"a {self.believed.name} whose currents come from a table"
+            raise InputError("export", self.controller.name, found, "a coil model without a table, cells = 0")
+        if self.fidelity != "force" and self.believed.windings is None and not self.has_set_points:
+            found = f"a {self.believed.name} without a model of its current loops"
+            raise InputError("export", self.controller.name, found, "an export down to currents")
+
+    @property
+    def believed(self) -> Plant:
+        """The machine as the gain file knows it."""
+        return plant_of(self.controller.parameters)
+
+    @property
+    def setup(self) -> Setup:
+        """The setup of simulations whose functions the firmware shares."""
+        return Setup(fidelity=self.fidelity, delay=0)
+
+    @property
+    def has_set_points(self) -> bool:
+        """Whether the machine's own electronics take set points in place of currents."""
+        return self.fidelity == "phase" and self.believed.electronics is not None
+
+    @property
+    def driven(self) -> bool:
+        """Whether current loops are part of the export."""
+        return self.fidelity != "force" and not self.has_set_points
+
+    @property
+    def summing_states(self) -> tuple[int, ...]:
+        """The states that stay as they are without a correction: observed disturbances."""
+        Ad, Bd = self.controller.Ad, self.controller.Bd
+        unit = np.eye(len(Ad))
+        return tuple(k for k in range(len(Ad)) if (Ad[k] == unit[k]).all() and not Bd[k].any())
+
+    @property
+    def compensated(self) -> bool:
+        """Whether sums keep what rounding took from them: in single precision they would stop moving."""
+        return self.precision == "float"
+
+
+def fidelity_of(plant: Plant) -> Fidelity:
+    """How far down a machine's controller can be exported."""
+    return "force" if plant.windings is None and plant.electronics is None else "phase"
+
+
+def state_fields(t: Target) -> list[Field]:
+    """What the controller remembers from one sample to the next."""
+    c, m = t.controller, t.controller.forces
+    errors = tuple(Signal(f"sum of {s.name}* - {s.name}", f"{s.unit} s") for s in c.measurements)
+    fields = [
+        Field("xi_pred", c.states, "what the filter expects of the states at the next sample"),
+        Field("e", errors, "sums of the errors p* - y"),
+        Field("frozen", named("waits ", c.measurements, "1"), "1 where the sum of errors waits"),
+    ]
+    if t.compensated:
+        fields.append(Field("e_rest", errors, "what rounding took from the sums of errors"))
+        if t.summing_states:
+            fields.append(Field("xi_rest", c.states, "the same, of states that sum up"))
+    if c.tracks == "states" and (c.lagging or c.delay):
+        ages = range(c.delay, 0, -1)
+        stored = [Signal(f"{s.name}*[k-{age}]", s.unit) for age in ages for s in m]
+        lag = [Signal(f"{s.name}*[i]", s.unit) for s in m] if c.lagging else []
+        forward = [Signal(f"{s.name}_ff[k-{age}]", s.unit) for age in ages for s in m] if c.lagging else []
+        fields.append(Field("memory", (*lag, *stored, *forward), "references of forces that are under way"))
+    if t.driven:
+        drive = t.believed.drive
+        volts = tuple(Signal(s.name.replace("i_", "u_"), "V") for s in drive.axes)
+        fields.append(Field("u_integral", volts, "integrals of the current loops"))
+        fields.append(
+            Field("u_limited", named("limited ", drive.axes, "1"), "1 where a half-bridge was at its limit")
+        )
+        if t.compensated:
+            fields.append(Field("u_rest", volts, "what rounding took from the integrals"))
+        fields.append(Field("i_last", current_readings(t), "the last valid readings of currents"))
+        fields.append(Field("link_last", (Signal("V_link", "V"),), "the last valid reading of the link"))
+    return fields
+
+
+def reference_fields(t: Target) -> list[Field]:
+    """The reference of a sample."""
+    outputs = t.controller.measurements
+    return [
+        Field("p", named("", outputs, "", "*"), "reference"),
+        Field("dp", tuple(Signal(f"{s.name}*'", f"{s.unit}/s") for s in outputs), "its rate"),
+        Field("ddp", tuple(Signal(f"{s.name}*''", f"{s.unit}/s^2") for s in outputs), "its acceleration"),
+    ]
+
+
+def input_fields(t: Target) -> list[Field]:
+    """What is read at a sample."""
+    outputs = t.controller.measurements
+    fields = [
+        Field("y", outputs, "measured outputs"),
+        Field("y_valid", named("valid ", outputs, "1"), "1 where a reading may be used, else 0"),
+    ]
+    if t.driven:
+        fields += [
+            Field("i", current_readings(t), "measured currents"),
+            Field(
+                "i_valid", named("valid ", current_readings(t), "1"), "1 where a reading may be used, else 0"
+            ),
+            Field("link", (Signal("V_link", "V"),), "measured voltage of the DC link"),
+        ]
+    return fields
+
+
+def output_fields(t: Target) -> list[Field]:
+    """What is commanded at a sample, and what else a supervisor or a log wants of it."""
+    c, plant = t.controller, t.believed
+    outputs = c.measurements
+    fields = [
+        Field("y_used", outputs, "readings, or what the filter expected in place of refused ones"),
+        Field("refused", named("refused ", outputs, "1"), "1 where a reading was refused"),
+        Field("xi_hat", c.states, "estimated states"),
+        Field("v", c.forces, "commanded forces, within their limits"),
+        Field("saturated", named("limited ", c.forces, "1"), "1 where a force is at its limit"),
+        Field("current", plant.actuator.coils, "commanded currents"),
+        Field("met", (Signal("current limit", "1"),), "1 where a current is at its limit"),
+    ]
+    if t.has_set_points:
+        electronics = electronics_of(plant, t.setup)
+        size = 0 if electronics is None else electronics.held_size
+        fields.append(
+            Field(
+                "command",
+                tuple(Signal(f"set point {k}", "SI") for k in range(size)),
+                "set points of the electronics",
+            )
+        )
+    elif t.driven:
+        phases = plant.drive.phases if t.fidelity == "phase" else plant.drive.axes
+        sign = "d_" if t.fidelity == "phase" else "m_"
+        meaning = (
+            "duty cycles of the half-bridges"
+            if sign == "d_"
+            else "voltages of the axes as shares of the link's"
+        )
+        fields.append(
+            Field("command", tuple(Signal(s.name.replace("i_", sign), "1") for s in phases), meaning)
+        )
+    return fields
+
+
+def current_readings(t: Target) -> tuple[Signal, ...]:
+    """The currents that the current loops read."""
+    return t.believed.drive.phases if t.fidelity == "phase" else t.believed.drive.axes
+
+
+def named(before: str, signals: tuple[Signal, ...], unit: str, after: str = "") -> tuple[Signal, ...]:
+    """Signals named after others; unit "": their own."""
+    return tuple(Signal(f"{before}{s.name}{after}", unit or s.unit) for s in signals)
+
+
+def reading_ranges(plant: Plant) -> FloatArray:
+    """The largest reading of each output that a machine can give, either way: twice where it touches, or its travel.
+
+    Of an output that meets nothing: 1 m, or 1 of its unit. Beyond, a reading is refused.
+    """
+    x = ca.SX.sym("x", len(plant.states))
+    contact = ca.Function("contact", [x], [ca.densify(ca.vertcat(plant.contact(x), 0))])
+    ranges = []
+    for k, _ in enumerate(plant.outputs):
+        sizes = 10.0 ** np.arange(-7, 0.01, 0.05)
+        reach = math.inf
+        for size in sizes:
+            p = np.zeros(len(plant.outputs))
+            p[k] = size
+            q = np.array(plant.position_of(ca.DM(p))).ravel()
+            state = np.zeros(len(plant.states))
+            state[list(plant.controlled)[: len(q)]] = q
+            if np.array(contact(state)).max() >= 1:
+                reach = size
+                break
+        if plant.has_stroke and k == plant.stroke_output and plant.travel:
+            reach = max(plant.travel, reach if math.isfinite(reach) else 0.0)
+        ranges.append(2 * reach if math.isfinite(reach) else 1.0)
+    return np.array(ranges)

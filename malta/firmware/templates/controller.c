@@ -1,0 +1,202 @@
+/* {{ title }}: see {{ name }}.h. Written by malta {{ version }}; one operation a statement. */
+#include "{{ name }}.h"
+
+#include <float.h>
+
+#if defined(__FAST_MATH__)
+#error "compile {{ name }}.c without fast mathematics"
+#endif
+#if defined(FLT_EVAL_METHOD) && FLT_EVAL_METHOD != 0
+#error "{{ name }}.c needs a processor that computes in the precision of its numbers"
+#endif
+#if defined(__clang__)
+#pragma STDC FP_CONTRACT OFF
+#endif
+
+static const {{ name }}_real own_z[{{ points }}] = {
+{{ z_rows }}
+};
+static const {{ name }}_real own_v0[{{ points * forces }}] = { /* N, {{ force_names }} */
+{{ v0_rows }}
+};
+static const {{ name }}_real force_limit[{{ forces }}] = { {{ force_limits }} };
+static const {{ name }}_real reach[{{ outputs }}] = { {{ ranges }} }; /* of references */
+
+{% if root %}
+{% include "root.c" %}
+
+{% endif %}
+{{ sense }}
+{{ decide }}
+{{ state_at }}
+/* v0(z), linear between the points of the table and constant beyond them. */
+static void look_up(const {{ name }}_state *s, {{ name }}_real z, {{ name }}_real v0[{{ forces }}]) {
+  int32_t low = 0;
+  int32_t high = s->points - 1;
+  const {{ name }}_real first = s->z[0];
+  const {{ name }}_real last = s->z[high];
+  const {{ name }}_real bounded = (z < last) ? z : last;
+  const {{ name }}_real at = (bounded > first) ? bounded : first;
+  while ((high - low) > 1) {
+    const int32_t middle = low + ((high - low) / 2);
+    if (at < s->z[middle]) {
+      high = middle;
+    } else {
+      low = middle;
+    }
+  }
+  {
+    const {{ name }}_real along = at - s->z[low];
+    const {{ name }}_real whole = s->z[high] - s->z[low];
+    const {{ name }}_real share = along / whole;
+    const {{ name }}_real rest = {{ one }} - share;
+    int32_t j;
+    for (j = 0; j < {{ forces }}; j++) {
+      const {{ name }}_real before = rest * s->v0[(low * {{ forces }}) + j];
+      const {{ name }}_real after = share * s->v0[(high * {{ forces }}) + j];
+      v0[j] = before + after;
+    }
+  }
+}
+
+void {{ name }}_init({{ name }}_state *s) {
+  int32_t k;
+{% for f in state %}
+  for (k = 0; k < {{ f.size }}; k++) {
+    s->{{ f.name }}[k] = {{ zero }};
+  }
+{% endfor %}
+{% for f in reference %}
+  for (k = 0; k < {{ f.size }}; k++) {
+    s->reference.{{ f.name }}[k] = {{ zero }};
+  }
+{% endfor %}
+{% if link %}
+  s->link_last[0] = {{ link }}; /* V, nominal */
+{% endif %}
+  s->points = {{ points }};
+  s->z = own_z;
+  s->v0 = own_v0;
+}
+
+void {{ name }}_start({{ name }}_state *s) {
+  {{ name }}_real v0[{{ forces }}];
+  look_up(s, {{ start_z }}, v0);
+  {{ call_start }};
+}
+
+void {{ name }}_step({{ name }}_state *s, const {{ name }}_inputs *in, {{ name }}_outputs *out) {
+  {{ name }}_real v0[{{ forces }}];
+  {{ call_sense }};
+  look_up(s, {{ step_z }}, v0);
+  {{ call_decide }};
+}
+
+int32_t {{ name }}_set_reference({{ name }}_state *s, const {{ name }}_reference *r) {
+  int32_t accepted = 1;
+  int32_t k;
+  for (k = 0; k < {{ outputs }}; k++) {
+    const int32_t near = ((r->p[k] <= reach[k]) && (r->p[k] >= -reach[k])) ? 1 : 0;
+    const int32_t slow = ((r->dp[k] <= {{ most_rate }}) && (r->dp[k] >= -{{ most_rate }})) ? 1 : 0;
+    const int32_t even = ((r->ddp[k] <= {{ most_rate }}) && (r->ddp[k] >= -{{ most_rate }})) ? 1 : 0;
+    if ((near + slow + even) != 3) { /* a NaN is in no interval */
+      accepted = 0;
+    }
+  }
+  if (accepted == 1) {
+    s->reference = *r;
+  }
+  return accepted;
+}
+
+int32_t {{ name }}_set_v0_table({{ name }}_state *s, int32_t points, const {{ name }}_real z[], const {{ name }}_real v0[]) {
+  int32_t accepted = ((points >= 2) && (points <= {{ most_points }})) ? 1 : 0;
+  int32_t k;
+  for (k = 0; (accepted == 1) && (k < points); k++) {
+    int32_t j;
+    if (!((z[k] >= -{{ most_rate }}) && (z[k] <= {{ most_rate }}))) {
+      accepted = 0;
+    }
+    if ((k > 0) && !(z[k] > z[k - 1])) {
+      accepted = 0;
+    }
+    for (j = 0; j < {{ forces }}; j++) {
+      const {{ name }}_real force = v0[(k * {{ forces }}) + j];
+      if (!((force <= force_limit[j]) && (force >= -force_limit[j]))) {
+        accepted = 0;
+      }
+    }
+  }
+  if (accepted == 1) {
+    s->points = points;
+    s->z = z;
+    s->v0 = v0;
+  }
+  return accepted;
+}
+
+void {{ name }}_reset_integrators({{ name }}_state *s) {
+  int32_t k;
+{% for f in sums %}
+  for (k = {{ f.first }}; k < {{ f.end }}; k++) {
+    s->{{ f.name }}[k] = {{ zero }};
+  }
+{% endfor %}
+}
+{% if stroke %}
+
+int32_t {{ name }}_start_stroke({{ name }}_stroke *k, int32_t profile, {{ name }}_real start, {{ name }}_real end,
+                       {{ name }}_real rise) {
+  const {{ name }}_real most = {{ travel }};
+  const {{ name }}_real limit = {{ longest_rise }};
+  int32_t accepted = ((profile == {{ NAME }}_LOGISTIC) || (profile == {{ NAME }}_QUINTIC)) ? 1 : 0;
+  if (!((start <= most) && (start >= -most) && (end <= most) && (end >= -most))) {
+    accepted = 0;
+  }
+  if (!((rise >= {{ NAME }}_SAMPLE_TIME) && (rise <= limit))) {
+    accepted = 0;
+  }
+  if (accepted == 1) {
+    const {{ name }}_real lasts = {{ rises }} * rise;
+    k->profile = profile;
+    k->start = start;
+    k->end = end;
+    k->rise = rise;
+    k->sample = 0;
+    k->samples = (int32_t)(lasts / {{ NAME }}_SAMPLE_TIME) + 1;
+  }
+  return accepted;
+}
+
+int32_t {{ name }}_follow_stroke({{ name }}_stroke *k, {{ name }}_reference *r) {
+  const {{ name }}_real count = ({{ name }}_real)((2 * k->sample) - k->samples);
+  const {{ name }}_real half = {{ half }} * {{ NAME }}_SAMPLE_TIME;
+  {{ name }}_real t[1];
+  {{ name }}_real share[1];
+  {{ name }}_real rate[1];
+  {{ name }}_real acceleration[1];
+  const {{ name }}_real way = k->end - k->start;
+  int32_t j;
+  t[0] = count * half;
+  if (k->profile == {{ NAME }}_QUINTIC) {
+    {{ name }}_quintic(t, &k->rise, share, rate, acceleration);
+  } else {
+    {{ name }}_logistic(t, &k->rise, share, rate, acceleration);
+  }
+  for (j = 0; j < {{ outputs }}; j++) {
+    r->p[j] = {{ zero }};
+    r->dp[j] = {{ zero }};
+    r->ddp[j] = {{ zero }};
+  }
+  {
+    const {{ name }}_real gone = way * share[0];
+    r->p[{{ stroke_output }}] = k->start + gone;
+    r->dp[{{ stroke_output }}] = way * rate[0];
+    r->ddp[{{ stroke_output }}] = way * acceleration[0];
+  }
+  if (k->sample < k->samples) {
+    k->sample++;
+  }
+  return (k->sample < k->samples) ? 1 : 0;
+}
+{% endif %}

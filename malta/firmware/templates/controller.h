@@ -1,0 +1,79 @@
+/* {{ title }}: the controller of a {{ machine }}, sampled every {{ period }}.
+
+   From the gain file with sha256 {{ sha256 }}, by malta {{ version }}.
+   {{ precision_text }}
+
+   C99 without heap, globals, recursion or library functions. A state belongs to its caller; several may run at once, and a
+   step neither blocks nor loops but over a table's rows. Compile without contraction and fast mathematics
+   (-ffp-contract=off, no -ffast-math): then every processor computes the same bits. Units are SI, an angle is in rad.
+
+   At every sample:  read the sensors,  {{ name }}_step(&state, &inputs, &outputs),  write outputs.{{ last_output }}.     */
+#ifndef {{ NAME }}_H
+#define {{ NAME }}_H
+
+#include <stdint.h>
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+typedef {{ precision }} {{ name }}_real;
+
+#define {{ NAME }}_SAMPLE_TIME {{ sample_time }} /* s */
+#define {{ NAME }}_GAINS_SHA256 "{{ sha256 }}"
+#define {{ NAME }}_MALTA_VERSION "{{ version }}"
+{% for record in records %}
+
+/* {{ record.meaning }} */
+typedef struct {
+{% for f in record.fields %}
+  {{ name }}_real {{ f.name }}[{{ f.size }}]; /* {{ f.meaning }} */
+{% for line in f.lines %}
+  /*   {{ line }} */
+{% endfor %}
+{% endfor %}
+{% for line in record.more %}
+  {{ line }}
+{% endfor %}
+} {{ name }}_{{ record.name }};
+{% endfor %}
+
+/* A state at rest at a reference of zero that knows nothing of the machine, with the v0(z) of the gain file. */
+void {{ name }}_init({{ name }}_state *s);
+
+/* The same state, for a machine that follows the reference of the state at this moment: bumpless. Keeps the table. */
+void {{ name }}_start({{ name }}_state *s);
+
+/* One sample. Any numbers may be in `in`, also NaN and infinity; what cannot be true is not used. */
+void {{ name }}_step({{ name }}_state *s, const {{ name }}_inputs *in, {{ name }}_outputs *out);
+
+/* The reference from the next step on; 1, or 0 and nothing changes where a number is not finite or out of reach. */
+int32_t {{ name }}_set_reference({{ name }}_state *s, const {{ name }}_reference *r);
+
+/* Another v0(z): forces v0[{{ forces }} k + j] at z[k], in memory of the caller. 1, or 0 and nothing changes where there are
+   fewer than 2 or more than {{ most_points }} points, where z does not grow, or where a force is beyond the limits. */
+int32_t {{ name }}_set_v0_table({{ name }}_state *s, int32_t points, const {{ name }}_real z[], const {{ name }}_real v0[]);
+
+/* Sums of errors, integrals of current loops and observed disturbances begin at zero again. */
+void {{ name }}_reset_integrators({{ name }}_state *s);
+{% if stroke %}
+
+/* A stroke from `start` to `end` (m) in `rise` (s, 10 to 90 %); 1, or 0 where it is out of reach or too fast to compute. */
+int32_t {{ name }}_start_stroke({{ name }}_stroke *k, int32_t profile, {{ name }}_real start, {{ name }}_real end,
+                       {{ name }}_real rise);
+
+/* The reference of a stroke's next sample; 1 while it moves, 0 when it has ended. */
+int32_t {{ name }}_follow_stroke({{ name }}_stroke *k, {{ name }}_reference *r);
+#define {{ NAME }}_LOGISTIC 0
+#define {{ NAME }}_QUINTIC 1
+{% endif %}
+
+/* The pieces of a step, usable alone. */
+{% for declaration in declarations %}
+{{ declaration }};
+{% endfor %}
+
+#ifdef __cplusplus
+}
+#endif
+#endif

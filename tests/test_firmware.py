@@ -1,0 +1,157 @@
+"""The exported controller: the same bits as its expressions, and the same flight as the simulation's law."""
+
+from __future__ import annotations
+
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from conftest import ROOT
+
+import malta
+from malta.firmware.elementary import Precision
+from malta.firmware.export import sources
+from malta.firmware.flight import differences, engine_of_c
+from malta.firmware.native import call, call_piece, compile_controller, new_state, view, write
+from malta.firmware.parts import parts_of
+from malta.firmware.program import TYPES, evaluate, program_of
+from malta.firmware.signals import Target, fidelity_of, reading_ranges, reference_fields, state_fields
+from malta.simulation.compiled import compiler
+from malta.synthesis.controller import Controller
+
+NAMES = (
+    "robust",
+    "table2",
+    "robust_observer",
+    "tubular_pid",
+    "halbach",
+    "halbach_late",
+    "planar",
+    "planar_pid",
+)
+PRECISIONS: tuple[Precision, ...] = ("double", "float")
+WARNINGS = (
+    *("-std=c99", "-O2", "-ffp-contract=off", "-fno-math-errno", "-Werror", "-Wall", "-Wextra", "-Wpedantic"),
+    *("-Wconversion", "-Wdouble-promotion", "-Wshadow", "-Wstrict-prototypes", "-Wmissing-prototypes"),
+    *("-Wfloat-conversion", "-Wcast-qual", "-Wundef", "-Wswitch-default"),
+)
+
+
+@pytest.fixture(autouse=True)
+def _with_compiler() -> None:
+    if compiler() is None:
+        pytest.skip("no C compiler")
+
+
+def controller(name: str) -> Controller:
+    return malta.gains.read(ROOT / "design" / "gains" / f"{name}.json")
+
+
+def target(name: str, precision: Precision) -> Target:
+    c = controller(name)
+    return Target(c, precision, fidelity_of(malta.plant_of(c.parameters)))
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize("name", NAMES)
+def test_every_piece_computes_the_bits_of_its_expressions(name: str, precision: Precision) -> None:
+    t = target(name, precision)
+    native, rng = compile_controller(t), np.random.default_rng(3)
+    pieces = {
+        key: program_of(f) for key, f in parts_of(t).items() if key not in ("sense", "decide", "state_at")
+    }
+    assert len(pieces) >= 8
+    for key, p in pieces.items():
+        for _ in range(4):
+            given = {of: rng.normal(size=size) * 1e-3 for of, size in p.arguments}
+            given |= {of: np.array([0.02]) for of in ("rise", "pole") if of in given}
+            expected = evaluate(p, given, precision)
+            found = call_piece(native, key, given, dict(p.results))
+            for of, values in expected.items():
+                assert np.array_equal(found[of], values), (key, of)
+
+
+def look_up(t: Target, z: float) -> Any:
+    """v0(z) in the arithmetic of a target."""
+    real, ff = TYPES[t.precision], t.controller.feedforward
+    grid, v0 = ff.z_grid.astype(real), ff.v0.astype(real)
+    at = np.clip(real(z), grid[0], grid[-1])
+    k = min(int(np.searchsorted(grid, at, side="right")) - 1, len(grid) - 2)
+    share = (at - grid[k]) / (grid[k + 1] - grid[k])
+    return (real(1) - share) * v0[k] + share * v0[k + 1]
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize("name", NAMES)
+def test_steps_compute_the_bits_of_their_expressions(name: str, precision: Precision) -> None:
+    """The whole state and all outputs, sample after sample, with readings that are none among them."""
+    t = target(name, precision)
+    native, rng, reach = compile_controller(t), np.random.default_rng(4), reading_ranges(t.believed)
+    sense, decide = (program_of(parts_of(t)[key]) for key in ("sense", "decide"))
+    state, given, out = new_state(native), native.Inputs(), native.Outputs()
+    reference = {f.name: np.zeros(f.size) for f in reference_fields(t)}
+    for k in range(12):
+        before = {f.name: view(state, f.name).copy() for f in state_fields(t) if f.size}
+        read: dict[str, Any] = {"y": rng.normal(size=len(reach)) * reach / 10, "y_valid": np.ones(len(reach))}
+        if k == 5:
+            read["y"][0] = np.nan
+        if t.driven:
+            read |= {"i": rng.normal(size=18), "i_valid": np.ones(18), "link": np.array([45.0 - k])}
+        write(given, read)
+        call(native, "step", state, given, out)
+        sensed = evaluate(sense, {**before, **reference, **read}, precision)
+        z = sensed["y_used"][t.believed.stroke_output] if t.believed.has_stroke else 0.0
+        values = {**before, **reference, **read, **sensed, "v0": look_up(t, z)}
+        for of, expected in (sensed | evaluate(decide, values, precision)).items():
+            found = view(state if of.endswith("_next") else out, of.removesuffix("_next"))
+            assert np.array_equal(found, expected), (k, of)
+        assert bool(sensed["refused"].any()) == (k == 5)
+
+
+@pytest.mark.parametrize("fidelity", ["force", "dq"])
+def test_it_flies_to_the_bit_where_nothing_is_contracted(fidelity: Any) -> None:
+    """A noisy stroke: CasADi's virtual machine and the C compute the same numbers, in double precision."""
+    c = controller("robust")
+    plant, scenario = malta.plant_of(c.parameters), malta.Scenario.stroke(10e-3, fidelity=fidelity, noise=1.0)
+    own = malta.simulate(plant, c, scenario, engine="virtual machine")
+    flown = malta.simulate(plant, c, scenario, engine=engine_of_c())
+    assert flown.verdict.completed
+    assert {d.name: d.largest for d in differences(own, flown)} == dict.fromkeys(
+        [d.name for d in differences(own, flown)], 0.0
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "distance"),
+    [("robust", 10e-3), ("tubular_pid", 10e-3), ("robust_observer", 10e-3), ("planar", 1e-3)],
+)
+def test_it_flies_as_the_simulation_does(name: str, distance: float) -> None:
+    """With phase currents and duty cycles where the machine has them: every signal within 1e-12 of its range."""
+    c = controller(name)
+    plant = malta.plant_of(c.parameters)
+    fidelity: Any = "force" if plant.windings is None else "phase"
+    scenario = malta.Scenario.stroke(distance, fidelity=fidelity, noise=1.0, duration=0.05)
+    own = malta.simulate(plant, c, scenario)
+    flown = malta.simulate(plant, c, scenario, engine=engine_of_c())
+    single = malta.simulate(plant, c, scenario, engine=engine_of_c("float"))
+    assert max(d.share for d in differences(own, flown)) < 1e-12
+    assert 1e-9 < max(d.share for d in differences(own, single)) < 3e-4
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize("name", ["robust", "halbach", pytest.param("planar_pid", marks=pytest.mark.slow)])
+def test_no_compiler_warns(name: str, precision: Precision, tmp_path: Path) -> None:
+    for file, text in sources(target(name, precision), "0" * 64).items():
+        (tmp_path / file).write_text(text, encoding="utf-8")
+    cc = compiler()
+    assert cc is not None
+    for path in sorted(tmp_path.glob("*.c")):
+        done = subprocess.run(
+            [*cc, *WARNINGS, "-c", str(path), "-o", str(path.with_suffix(".o"))],
+            check=False,
+            capture_output=True,
+            text=True,
+        )
+        assert done.returncode == 0, done.stderr[:2000]
