@@ -17,6 +17,7 @@ from malta.cli.campaign import campaign
 from malta.cli.check import check
 from malta.cli.claims import claims
 from malta.cli.design import design
+from malta.cli.export import export
 from malta.cli.new import new
 from malta.cli.output import print_error, print_note, silence
 from malta.cli.simulate import simulate
@@ -38,7 +39,17 @@ app = typer.Typer(
 
     Exit codes: 0 fine; 1 a check failed (unstable, touched down), old gain files stand; 2 bad input.""",
 )
-for command in (design, verify, check, simulate, campaign, tune, claims, new):  # the order of the help
+for command in (
+    design,
+    verify,
+    check,
+    simulate,
+    campaign,
+    tune,
+    export,
+    claims,
+    new,
+):  # the order of the help
     app.command()(command)
 
 

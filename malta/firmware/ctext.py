@@ -30,13 +30,14 @@ _FORMS = {
     "IF_ELSE_ZERO": "{0} ? {1} : {zero}",
     "PICK": "{0} ? {1} : {2}",
 }
+HEADERS = ("float", "math", "stdint", "stdio", "string")  # of the standard library, which NAME.h may not hide
 _CONDITIONS = {"NOT": 1, "AND": 2, "OR": 2, "IF_ELSE_ZERO": 1, "PICK": 1}  # operands that are true or false
 
 
 def c_name(text: str) -> str:
     """A text as part of a C identifier."""
     name = re.sub(r"\W+", "_", text.lower(), flags=re.ASCII).strip("_")
-    return f"m_{name}" if not name or name[0].isdigit() else name
+    return f"m_{name}" if not name or name[0].isdigit() or name in HEADERS else name
 
 
 def c_number(value: float, precision: Precision) -> str:

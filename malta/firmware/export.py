@@ -11,8 +11,7 @@ import jinja2
 import numpy as np
 
 from malta.firmware.ctext import c_name, c_number, function_text, signature
-from malta.firmware.parts import parts_of
-from malta.firmware.program import Program, program_of
+from malta.firmware.program import Program
 from malta.firmware.signals import (
     Field,
     Target,
@@ -22,6 +21,7 @@ from malta.firmware.signals import (
     reference_fields,
     state_fields,
 )
+from malta.firmware.step import programs_of
 
 MOST_POINTS = 65_535  # of a table of v0(z)
 MOST_RATE = 1e6  # of a reference, per s and s^2: beyond, single precision has no room
@@ -33,11 +33,6 @@ WORDS = {
 }
 
 
-def programs_of(t: Target) -> dict[str, Program]:
-    """The programs of all functions of an export, by name."""
-    return {name: program_of(f) for name, f in parts_of(t).items()}
-
-
 def sources(t: Target, sha256: str, name: str = "") -> dict[str, str]:
     """The C files of a controller by name: <name>.h, <name>.c, <name>_parts.c.
 
@@ -45,7 +40,7 @@ def sources(t: Target, sha256: str, name: str = "") -> dict[str, str]:
     """
     name = name or c_name(t.controller.name)
     programs = programs_of(t)
-    context = _context(t, programs, name, sha256)
+    context = context_of(t, programs, name, sha256)
     return {
         f"{name}.h": render("controller.h", context),
         f"{name}.c": render("controller.c", context),
@@ -70,7 +65,7 @@ def _environment() -> jinja2.Environment:
     )
 
 
-def _context(t: Target, programs: Mapping[str, Program], name: str, sha256: str) -> dict[str, Any]:
+def context_of(t: Target, programs: Mapping[str, Program], name: str, sha256: str) -> dict[str, Any]:
     """What the templates of a controller are filled with."""
     c, plant = t.controller, t.believed
 

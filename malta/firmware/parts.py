@@ -118,7 +118,7 @@ def decide_function(t: Target) -> ca.Function:
     frozen = freeze_moving(g, state["frozen"], dp)
     e = sum_errors(g, state["e"], frozen, y, p, sums.add_to_errors)
     xi_pred, saturated, v = commanded(g, xi_hat, e, xi_ref, v_ff, v0)
-    xi_pred, place = look_ahead(g, xi_pred, y, dp)
+    xi_pred, place = look_ahead(g, sums.predict(xi_pred, xi_hat), y, dp)
     wanted, current = currents(t, place, v)
     out |= {"xi_hat": xi_hat, "v": v, "saturated": saturated, "current": current}
     out["met"] = ca.mmax(ca.fabs(current - wanted)) > 0
@@ -157,7 +157,20 @@ class _Sums:
         return self._add(total, more, "u_rest", range(total.numel()))
 
     def add_to_states(self, total: Any, more: Any) -> Any:
+        if self.t.controller.tracks == "errors":  # its states are summed up in `predict`
+            return total + more
         return self._add(total, more, "xi_rest", self.t.summing_states)
+
+    def predict(self, xi_pred: Any, xi_hat: Any) -> Any:
+        """The states of the next sample: those of a law of errors as sums, xi_hat + (Ad - 1) xi_hat, as 1 - 1e-6 is no
+        number of single precision."""
+        c = self.t.controller
+        if c.tracks != "errors" or not self.t.compensated:
+            return xi_pred
+        slow = self.t.summing_states
+        change = ca.sparsify(ca.DM(c.Ad - np.eye(len(c.Ad)))) @ xi_hat
+        sums = self._add(xi_hat, change, "xi_rest", slow)
+        return ca.vertcat(*(sums[k] if k in slow else xi_pred[k] for k in range(xi_pred.numel())))
 
     def _add(self, total: Any, more: Any, rest: str, entries: Sequence[int]) -> Any:
         total, more = ca.densify(ca.SX(total)), ca.densify(ca.SX(more))

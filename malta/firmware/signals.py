@@ -20,6 +20,9 @@ if TYPE_CHECKING:
     from malta.model.plant import FloatArray
 
 
+SLOW = 0.1  # share that a state changes by in a sample without anything added, at most: it is then a sum
+
+
 class Field(NamedTuple):
     """A vector of named numbers."""
 
@@ -74,8 +77,10 @@ class Target:
 
     @property
     def summing_states(self) -> tuple[int, ...]:
-        """The states that stay as they are without a correction: observed disturbances."""
+        """The states that sum up what is added to them: observed disturbances, and slow states of a law of errors."""
         Ad, Bd = self.controller.Ad, self.controller.Bd
+        if self.controller.tracks == "errors":
+            return tuple(k for k in range(len(Ad)) if abs(Ad[k, k] - 1) < SLOW)
         unit = np.eye(len(Ad))
         return tuple(k for k in range(len(Ad)) if (Ad[k] == unit[k]).all() and not Bd[k].any())
 

@@ -103,8 +103,10 @@ int32_t {{ name }}_set_reference({{ name }}_state *s, const {{ name }}_reference
       accepted = 0;
     }
   }
-  if (accepted == 1) {
-    s->reference = *r;
+  for (k = 0; (accepted == 1) && (k < {{ outputs }}); k++) {
+    s->reference.p[k] = r->p[k];
+    s->reference.dp[k] = r->dp[k];
+    s->reference.ddp[k] = r->ddp[k];
   }
   return accepted;
 }

@@ -1,0 +1,109 @@
+"""The exported folder: the controller's C, its test with recorded vectors, build files, an example and a report."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from malta.firmware.ctext import c_name, c_number
+from malta.firmware.elementary import Precision
+from malta.firmware.export import context_of, render, sources
+from malta.firmware.report import report_text
+from malta.firmware.signals import (
+    Field,
+    Target,
+    current_readings,
+    input_fields,
+    output_fields,
+    reference_fields,
+    state_fields,
+)
+from malta.firmware.step import programs_of
+from malta.firmware.vectors import FNV_FACTOR, FNV_START, SAMPLES, Vector, record_vectors
+
+EXAMPLE_SAMPLES = 2000  # of the example's main program
+
+
+def folder_files(
+    t: Target, sha256: str, uncertainty: Mapping[str, float] | None = None, *, proof: bool = True
+) -> dict[str, str]:
+    """Every file of an export by its name.
+
+    sha256 : of the gain file
+    uncertainty : of the gain file's margin; proof : whether the report proves it again with rounded coefficients
+
+        files = folder_files(Target(controller, "float"), sha256)
+    """
+    name = c_name(t.controller.name)
+    files = sources(t, sha256, name)
+    c_files = [file for file in files if file.endswith(".c")]
+    context = context_of(t, programs_of(t), name, sha256) | {
+        "objects": " ".join(file.removesuffix(".c") + ".o" for file in c_files),
+        "c_files": " ".join(c_files),
+        "driven": t.driven,
+        "currents": len(current_readings(t)) if t.driven else 0,
+        "example_samples": EXAMPLE_SAMPLES,
+        "example_end": c_number(t.believed.travel / 10, t.precision),
+        "example_rise": c_number(0.02, t.precision),
+    }
+    files |= {
+        f"{name}_test.c": render("test.c", context | _test_context(t)),
+        f"{name}_example.c": render("example.c", context),
+        "Makefile": render("Makefile", context),
+        "CMakeLists.txt": render("CMakeLists.txt", context),
+    }
+    report = report_text(t, context, list(files), dict(uncertainty or {}), proof=proof)
+    return files | {"REPORT.md": report}
+
+
+def _test_context(t: Target) -> dict[str, Any]:
+    """What the template of the test is filled with."""
+    vectors = record_vectors(t)
+    return {
+        "samples": SAMPLES,
+        "readings": vectors[0].readings.shape[1],
+        "answers": vectors[0].expected.shape[1],
+        "last": "commands" if t.driven or t.has_set_points else "currents",
+        "last_field": "command" if t.driven or t.has_set_points else "current",
+        "fnv_start": FNV_START,
+        "fnv_factor": FNV_FACTOR,
+        "reference_all": reference_fields(t),
+        "input_all": input_fields(t),
+        "output_all": _filled(output_fields(t)),
+        "state_all": _filled(state_fields(t)),
+        "vectors": [_vector_text(v, t.precision) for v in vectors],
+    }
+
+
+def _filled(fields: list[Field]) -> list[Field]:
+    return [field for field in fields if field.size]
+
+
+def _vector_text(v: Vector, precision: Precision) -> dict[str, Any]:
+    """A vector's numbers as C."""
+
+    def rows(values: Any) -> str:
+        lines = ["{" + ", ".join(_number(x, precision) for x in row) + "}" for row in values]
+        return ",\n".join(lines)
+
+    sums = [f"0x{x:08x}u" for x in v.checksums]
+    return {
+        "name": v.name,
+        "warm": int(v.warm),
+        "readings": rows(v.readings),
+        "answers": rows(v.expected),
+        "checksums": ",\n".join(", ".join(sums[k : k + 10]) for k in range(0, len(sums), 10)),
+    }
+
+
+def _number(value: Any, precision: Precision) -> str:
+    """A number as C, also one that is not finite."""
+    kind = "double" if precision == "double" else "float"
+    if math.isnan(value):
+        return f"({kind})NAN"
+    if math.isinf(value):
+        return f"({kind})INFINITY" if value > 0 else f"-({kind})INFINITY"
+    return c_number(float(np.float32(value)) if precision == "float" else float(value), precision)

@@ -1,0 +1,132 @@
+/* {{ title }}: recorded vectors. Prints `pass` or the first sample that differs; the exit code is 0 or 1.
+   Link with {{ name }}.c and {{ name }}_parts.c. Written by malta {{ version }}. */
+#include "{{ name }}.h"
+
+#include <math.h> /* of NAN and INFINITY alone */
+#include <stdio.h>
+#include <string.h>
+
+#define SAMPLES {{ samples }}
+#define READINGS {{ readings }}
+#define ANSWERS {{ answers }}
+
+/* p, dp, ddp, then what is read, as in {{ name }}.h; the forces v, then {{ last }}; checksums of all outputs and the state. */
+typedef struct {
+  const char *name;
+  int32_t warm;
+  {{ name }}_real readings[SAMPLES][READINGS];
+  {{ name }}_real answers[SAMPLES][ANSWERS];
+  uint32_t checksums[SAMPLES];
+} vector;
+
+static uint32_t add_bits(uint32_t sum, {{ name }}_real value) {
+  const {{ name }}_real plain = (value == {{ zero }}) ? {{ zero }} : value; /* -0 is 0 */
+{% if precision == "double" %}
+  uint64_t bits;
+  (void)memcpy(&bits, &plain, sizeof bits);
+  sum = (sum ^ (uint32_t)(bits >> 32)) * {{ fnv_factor }}u;
+  return (sum ^ (uint32_t)(bits & 0xFFFFFFFFu)) * {{ fnv_factor }}u;
+{% else %}
+  uint32_t bits;
+  (void)memcpy(&bits, &plain, sizeof bits);
+  return (sum ^ bits) * {{ fnv_factor }}u;
+{% endif %}
+}
+
+static uint32_t add_all(uint32_t sum, const {{ name }}_real values[], int32_t count) {
+  int32_t k;
+  for (k = 0; k < count; k++) {
+    sum = add_bits(sum, values[k]);
+  }
+  return sum;
+}
+
+static void take({{ name }}_real to[], const {{ name }}_real **from, int32_t count) {
+  int32_t k;
+  for (k = 0; k < count; k++) {
+    to[k] = (*from)[k];
+  }
+  *from += count;
+}
+
+/* Compare one sample; 0 where all bits agree. */
+static int32_t compare(const vector *v, int32_t k, const {{ name }}_state *s, const {{ name }}_outputs *out) {
+  uint32_t sum = {{ fnv_start }}u;
+  int32_t j;
+{% for f in output_all %}
+  sum = add_all(sum, out->{{ f.name }}, {{ f.size }});
+{% endfor %}
+{% for f in state_all %}
+  sum = add_all(sum, s->{{ f.name }}, {{ f.size }});
+{% endfor %}
+  if (sum == v->checksums[k]) {
+    return 0;
+  }
+  (void)printf("%s: sample %ld differs\n", v->name, (long)k);
+  for (j = 0; j < ANSWERS; j++) {
+    const {{ name }}_real found = (j < {{ forces }}) ? out->v[j] : out->{{ last_field }}[j - {{ forces }}];
+    if (!(found == v->answers[k][j])) {
+      (void)printf("  %s[%ld] is %.17g, expected %.17g\n", (j < {{ forces }}) ? "v" : "{{ last_field }}",
+                   (long)((j < {{ forces }}) ? j : (j - {{ forces }})), (double)found, (double)v->answers[k][j]);
+    }
+  }
+  return 1;
+}
+
+static int32_t run(const vector *v, uint32_t *total) {
+  {{ name }}_state s;
+  {{ name }}_inputs in;
+  {{ name }}_outputs out;
+  int32_t k;
+  {{ name }}_init(&s);
+  for (k = 0; k < SAMPLES; k++) {
+    const {{ name }}_real *from = v->readings[k];
+    {{ name }}_reference r;
+{% for f in reference_all %}
+    take(r.{{ f.name }}, &from, {{ f.size }});
+{% endfor %}
+{% for f in input_all %}
+    take(in.{{ f.name }}, &from, {{ f.size }});
+{% endfor %}
+    if ({{ name }}_set_reference(&s, &r) == 0) {
+      (void)printf("%s: sample %ld: the reference is refused\n", v->name, (long)k);
+      return 1;
+    }
+    if ((k == 0) && (v->warm == 1)) {
+      {{ name }}_start(&s);
+    }
+    {{ name }}_step(&s, &in, &out);
+    if (compare(v, k, &s, &out) != 0) {
+      return 1;
+    }
+    *total = (*total ^ v->checksums[k]) * {{ fnv_factor }}u;
+  }
+  return 0;
+}
+
+static const vector vectors[] = {
+{% for v in vectors %}
+  { "{{ v.name }}", {{ v.warm }}, {
+{{ v.readings }}
+  }, {
+{{ v.answers }}
+  }, {
+{{ v.checksums }}
+  } },
+{% endfor %}
+};
+
+int main(void) {
+  const int32_t count = (int32_t)(sizeof vectors / sizeof vectors[0]);
+  uint32_t total = {{ fnv_start }}u;
+  int32_t failed = 0;
+  int32_t k;
+  for (k = 0; k < count; k++) {
+    failed += run(&vectors[k], &total);
+  }
+  if (failed == 0) {
+    (void)printf("pass: %ld vectors of %ld samples, checksum %08lx\n", (long)count, (long)SAMPLES,
+                 (unsigned long)total);
+  }
+  return (failed == 0) ? 0 : 1;
+}
