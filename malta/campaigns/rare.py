@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     from malta.simulation.digest import Batch
     from malta.simulation.engines import EngineChoice
     from malta.simulation.experiments import Experiment, Progress
+    from malta.simulation.simulate import EngineOf
 
 PARTS = 100  # of a run, whose noise changes independently
 SCHEMA, VERSION = "malta-rare-event", 1
@@ -187,7 +188,11 @@ def read_design_point(path: Path, plan: Plan) -> DesignPoint:
 
 
 def replay_design_point(
-    plan: Plan, point: DesignPoint, *, engine: EngineChoice = "auto", progress: Progress | None = None
+    plan: Plan,
+    point: DesignPoint,
+    *,
+    engine: EngineChoice | EngineOf = "auto",
+    progress: Progress | None = None,
 ) -> Experiment:
     """Simulate a design point again, with all its time series: the same to the bit by the compiled engine."""
     machines = machines_of(plan, np.array([[point.values[name] for name in varied_names(plan)]]))

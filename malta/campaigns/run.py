@@ -37,6 +37,7 @@ from malta.simulation.batch import record_run, replayed
 from malta.simulation.catalogue import single_run
 from malta.simulation.engines import EngineChoice
 from malta.simulation.experiments import Experiment, Progress
+from malta.simulation.simulate import EngineOf
 
 if TYPE_CHECKING:
     import numpy as np
@@ -237,7 +238,7 @@ def _report_runs(report: Progress, count: int, share: float) -> None:
 
 
 def replay(
-    plan: Plan, index: int, *, engine: EngineChoice = "auto", progress: Progress | None = None
+    plan: Plan, index: int, *, engine: EngineChoice | EngineOf = "auto", progress: Progress | None = None
 ) -> Experiment:
     """Simulate one run of a campaign again, with all its time series.
 
@@ -249,7 +250,7 @@ def replay(
     """
     if not 0 <= index < plan.samples:
         raise InputError("campaign", "run", str(index), f"0 to {plan.samples - 1}")
-    if engine not in get_args(EngineChoice):
+    if not callable(engine) and engine not in get_args(EngineChoice):
         raise InputError("campaign", "engine", repr(engine), "one of " + ", ".join(get_args(EngineChoice)))
     first = index // compiled.LANES * compiled.LANES
     machines = draw_machines(plan, first, min(compiled.LANES, plan.samples - first))
@@ -263,7 +264,7 @@ def replay_machine(
     noise: NDArray[np.int64] | None = None,
     *,
     first: int = 0,
-    engine: EngineChoice = "auto",
+    engine: EngineChoice | EngineOf = "auto",
     progress: Progress | None = None,
 ) -> Experiment:
     """Simulate a plan's run on machine `index` with all its time series.
@@ -276,7 +277,7 @@ def replay_machine(
     if noise is not None:
         scenario = replace(scenario, run=tuple(noise[index - first].tolist()))
     own = planned._replace(scenario=scenario)
-    if engine == "virtual machine":
+    if engine == "virtual machine" or callable(engine):
         return single_run(plan.scenario, plant, plan.controller, own, engine, progress)
     run = record_run(
         plan.plant,

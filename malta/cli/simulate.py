@@ -4,12 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, cast
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
 from malta.cli.assignments import add_own_options, read_sensor_errors, scenario_options
 from malta.cli.documents import experiment_document
+from malta.cli.exported import (
+    compare_flights,
+    comparison_document,
+    comparison_table,
+    require_controller,
+    titles,
+)
 from malta.cli.inputs import change_machine, print_scenarios, read_controller
 from malta.cli.options import (
     SCENARIOS,
@@ -39,7 +46,6 @@ from malta.cli.patience import limit_time
 from malta.errors import CheckError, InputError
 
 if TYPE_CHECKING:
-    from malta.simulation.engines import EngineChoice
     from malta.simulation.experiments import Experiment
     from malta.synthesis.controller import Controller
 
@@ -88,6 +94,12 @@ def simulate(
     substeps: Substeps = None,
     seed: Seed = None,
     engine: Annotated[str, typer.Option(help="auto, compiled or virtual-machine.")] = "auto",
+    law: Annotated[
+        str,
+        typer.Option(
+            "--controller", help="own; or c: the exported C flies, compared with the own law and in float."
+        ),
+    ] = "own",
     out: Annotated[
         Path | None,
         typer.Option(
@@ -121,7 +133,8 @@ def simulate(
     if scenario == "help":
         print_scenarios(plant)
         raise typer.Exit
-    chosen, choice = scenario or main_job(plant), engine.replace("-", " ")
+    require_controller(law, engine)
+    chosen, choice = scenario or main_job(plant), _engine_choice(law, engine)
     options = scenario_options(
         distance,
         rise,
@@ -142,31 +155,51 @@ def simulate(
         seed=seed,
     )
     options = add_own_options(options, option, chosen, plant)
+    times = (3.0 if substeps else 1.0) * (
+        10.0 if law == "c" else 1.0
+    )  # own law, double and float: see exported.py
     with progress_bar(scenario or "simulating", quiet=as_json) as bar:
         # With --substeps a second run, with twice as many, follows for the estimate of the error.
-        progress = limit_time(bar, chosen, agreed=yes, times=3.0 if substeps else 1.0)
-        if replay is None:
-            result = experiment(chosen, plant, controller, progress=progress, engine=choice, **options)
-            simulation = Simulation(chosen, result, f"{controller.name}_{chosen}")
-        else:
+        progress = limit_time(bar, chosen, agreed=yes, times=times)
+
+        def fly(engine: Any) -> Simulation:
+            if replay is None:
+                result = experiment(chosen, plant, controller, progress=progress, engine=engine, **options)
+                return Simulation(chosen, result, f"{controller.name}_{chosen}")
             others = [*options, *(["scenario"] if scenario else []), *(["set"] if change else [])]
-            simulation = _replay(replay, controller, others, choice, progress)
+            return _replay(replay, controller, others, engine, progress)
+
+        simulation = fly(choice)
+        compared = compare_flights(lambda e: fly(e).experiment, simulation.experiment) if law == "c" else {}
     published = published_figures(plant.name)
     files = [] if out is None else _save(simulation, out, published) + _save_gains(simulation, gains, out)
     if as_json:
         document = {"gains": str(gains), "scenario": simulation.scenario, "files": [str(f) for f in files]}
-        print_json(document | experiment_document(simulation.experiment))
+        more = {"exported": comparison_document(compared)} if compared else {}
+        print_json(document | experiment_document(simulation.experiment) | more)
     else:
         _print_tables(gains, simulation, change or (), published, estimate=substeps is not None)
+        for title, found in zip(titles(list(compared)), compared.values(), strict=True):
+            make_console().print(f"\n{title}")
+            make_console().print(comparison_table(found))
         print_written(make_console(), files)
     _conclude(gains, simulation, engine)
+
+
+def _engine_choice(law: str, engine: str) -> Any:
+    """What `malta.simulate` takes as its engine."""
+    if law == "own":
+        return engine.replace("-", " ")
+    from malta.firmware.flight import engine_of_c
+
+    return engine_of_c()
 
 
 def _replay(
     text: str,
     controller: Controller,
     others: Sequence[str],
-    engine: str,
+    engine: Any,
     progress: Callable[[float], None] | None,
 ) -> Simulation:
     """Simulate one run of a campaign, `FOLDER:RUN`, or the design point of a rare event, `FOLDER:rare_LIMIT`, again.
@@ -186,12 +219,11 @@ def _replay(
         names = ", ".join("--" + name.replace("_", "-") for name in others)
         raise InputError("--replay", "", f"{names} too", "none of them: the campaign says how it runs")
     plan = read_plan(folder, controller)
-    choice = cast("EngineChoice", engine)
     if event:
         point = read_design_point(Path(folder) / f"{run}.json", plan)
-        result, name = replay_design_point(plan, point, engine=choice, progress=progress), run
+        result, name = replay_design_point(plan, point, engine=engine, progress=progress), run
     else:
-        result, name = simulate_run(plan, int(run), engine=choice, progress=progress), f"run_{int(run)}"
+        result, name = simulate_run(plan, int(run), engine=engine, progress=progress), f"run_{int(run)}"
     return Simulation(plan.scenario, result, f"{controller.name}_{plan.scenario}_{name}")
 
 

@@ -36,6 +36,7 @@ from malta.simulation import generic
 from malta.simulation.engines import EngineChoice
 from malta.simulation.experiments import Case, Experiment, PlannedRun, Progress, fly, setting
 from malta.simulation.scenario import Scenario
+from malta.simulation.simulate import EngineOf
 from malta.simulation.trajectory import Trajectory
 from malta.synthesis.controller import Controller
 
@@ -91,7 +92,7 @@ def single_run(
     plant: Plant,
     controller: Controller,
     planned: PlannedRun,
-    engine: EngineChoice = "auto",
+    engine: EngineChoice | EngineOf = "auto",
     progress: Progress | None = None,
     run: Trajectory | None = None,
 ) -> Experiment:
