@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Literal, cast
+from typing import Annotated, Any, get_args
 
 import typer
 
@@ -11,9 +11,6 @@ from malta.cli.inputs import read_controller
 from malta.cli.options import AsJson, GainFile, MachineFile
 from malta.cli.output import make_console, print_json, print_note, print_written
 from malta.errors import InputError
-from malta.files import file_exists, replace_files
-
-Until = Literal["currents", "duty-cycles"]
 
 
 def export(
@@ -38,58 +35,22 @@ def export(
     \b
     Example:  malta export design/gains/robust.json --to c --precision float --out build/robust_c
     """
+    from malta.firmware.elementary import Precision
+    from malta.firmware.folder import Until, export_c
+
     if to != "c":
         raise InputError("--to", "", repr(to), "c")
-    files = _write_c(gains, precision, until, out, proof=proof, machine=machine, quiet=as_json)
+    if precision not in get_args(Precision):
+        raise InputError("--precision", "", repr(precision), "double or float")
+    if until not in (None, *get_args(Until)):
+        raise InputError("--until", "", repr(until), " or ".join(get_args(Until)))
+    controller = read_controller(gains, machine)
+    if proof and precision == "float" and not as_json:
+        print_note("proving the margin with the coefficients that float holds; --no-proof leaves it out")
+    folder = out or Path("build") / f"{controller.name}_c"
+    chosen: Any = {"precision": precision, "until": until}
+    files = export_c(gains, folder, proof=proof, **chosen)
     if as_json:
         print_json({"gains": str(gains), "to": to, "files": [str(file) for file in files]})
     else:
         print_written(make_console(), files)
-
-
-def _write_c(
-    gains: Path,
-    precision: str,
-    until: str | None,
-    out: Path | None,
-    *,
-    proof: bool,
-    machine: Path | None,
-    quiet: bool,
-) -> list[Path]:
-    """Write the folder of C files; the files. Raises InputError for a folder that is not empty, and bad options."""
-    from malta.firmware.folder import folder_files
-    from malta.firmware.signals import Target, fidelity_of
-    from malta.gains.file import content_of
-    from malta.model.data import plant_of
-
-    if precision not in ("double", "float"):
-        raise InputError("--precision", "", repr(precision), "double or float")
-    if until not in (None, "currents", "duty-cycles"):
-        raise InputError("--until", "", repr(until), "currents or duty-cycles")
-    controller = read_controller(gains, machine)
-    deepest = fidelity_of(plant_of(controller.parameters))
-    fidelity = {None: deepest, "currents": "force", "duty-cycles": "phase"}[until]
-    target = Target(controller, cast("Any", precision), cast("Any", fidelity))
-    folder = require_empty(out or Path("build") / f"{controller.name}_c")
-    content = content_of(gains)[0]
-    robust = content.verification.robust
-    if not quiet and proof and precision == "float" and robust is not None:
-        print_note("proving the margin with the coefficients that float holds; --no-proof leaves it out")
-    texts = folder_files(target, content.sha256, {} if robust is None else robust.uncertainty, proof=proof)
-    files = {folder / name: text.encode() for name, text in sorted(texts.items())}
-    replace_files(files)
-    return list(files)
-
-
-def require_empty(folder: Path) -> Path:
-    """The folder, which is new or empty. Raises InputError for one with files, whatever they are."""
-    if file_exists(folder):
-        if not folder.is_dir():
-            raise InputError(folder, "", "a file of that name", "a folder, new or empty")
-        try:
-            if any(folder.iterdir()):
-                raise InputError(folder, "", "a folder with files in it", "one that is new or empty")
-        except OSError as error:
-            raise InputError(folder, "", error.strerror or str(error), "a folder that can be read") from error
-    return folder

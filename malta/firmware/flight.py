@@ -252,8 +252,9 @@ def _fly(
                 if name in places:
                     held_state[places[name]] = view(f.state, name)
             if f.setup.faulty:
-                held_state[places["y_last"]] = read[: f.sizes.row["y"]]
                 held_state[places["command"]] = entries["command"]
+        if f.setup.faulty:
+            held_state[places["y_last"]] = read[: f.sizes.row["y"]]
         command = held_state[places["command"]] if missed else np.array(entries["command"], dtype=float)
         commands[k] = np.concatenate([entries[name] for name in _REPLACED])
         commands[k, commands.shape[1] - len(command) :] = command

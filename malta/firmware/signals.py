@@ -54,6 +54,9 @@ class Target:
         if self.fidelity != "force" and self.believed.windings is None and not self.has_set_points:
             found = f"a {self.believed.name} without a model of its current loops"
             raise InputError("export", self.controller.name, found, "an export down to currents")
+        if self.driven and self.controller.current_loop is None:
+            found = "a gain file with no current loops"
+            raise InputError("export", self.controller.name, found, "an export down to currents")
 
     @property
     def believed(self) -> Plant:
