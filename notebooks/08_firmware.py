@@ -33,7 +33,7 @@ STYLES = malta.report.STYLES
 
 # %% [markdown]
 # ## A folder, and its test
-# `malta export design/gains/robust.json --to c` writes the same. Without a C compiler the folder is written all the same.
+# `malta export design/gains/robust.json --to c` writes the same. The folder is written without a C compiler too.
 
 # %%
 folder = Path(tempfile.mkdtemp()) / "robust_c"
@@ -49,8 +49,8 @@ if can_build:
     assert said.stdout.startswith("pass: 4 vectors")
 
 # %% [markdown]
-# **Judgement.** The recorded vectors hold a stroke, saturation, readings that are none, and lift-off. The checksum is of
-# every bit of the outputs and the state after each sample; it is the same on x86, on a Cortex-A9 and on a Cortex-M4F.
+# **Judgement.** The recorded vectors hold a stroke, saturation, readings that are none, and lift-off. The checksum is
+# of every bit of the outputs and the state after each sample; it is the same on x86, a Cortex-A9 and a Cortex-M4F.
 
 # %% [markdown]
 # ## It flies
