@@ -110,15 +110,16 @@ SAMPLE(, inline, )
 
 #if LANES == 1
 /* Rows of `samples` control periods from the one of number `first` on; `state` is taken and left behind. Where a sample is
-   no whole number of substeps, it begins with the first substep after it.                                             */
-void run(long first, long samples, double substeps, const double *theta, long points, const double *table, double *state,
-         const double *given, const double *noise, const double *fast, double *rows) {
+   no whole number of substeps, it begins with the first substep after it. The first row that has 1 or more, or no number,
+   in one of the `ends` columns is the last. Returns the number of rows.                                                */
+long run(long first, long samples, double substeps, const double *theta, long points, const double *table, double *state,
+         const double *given, const double *noise, const double *fast, double *rows, long ends, const long *ending) {
   double c[CONSTANTS + 1], d[SHARED + 1], g[FORESEEN + 1], held[HELD], m[2][STATES], *now = m[0], *after = m[1], *before;
   Grid grid = {points, 0, table};
-  long done = (long)ceil((double)first * substeps - 1e-6);
+  long done = (long)ceil((double)first * substeps - 1e-6), left = samples;
   prepare(theta, c, d);
   memcpy(now, state, sizeof *m);
-  for (long k = first; k < first + samples; k++, given += GIVEN, noise += OUTPUTS, rows += ROW) {
+  for (long k = first; left > 0; k++, left--, given += GIVEN, noise += OUTPUTS, rows += ROW) {
     const long end = (long)ceil((double)(k + 1) * substeps - 1e-6), count = end - done;
     foresee(d, given, g);
     int near = control_near(c, d, g, now, &grid, given, noise, after + MACHINE, held, rows);
@@ -126,8 +127,11 @@ void run(long first, long samples, double substeps, const double *theta, long po
     if (!near || !motion_near(c, d, g, count, now, held, given, fast, after))
       motion(c, d, g, count, now, held, given, fast, after);
     before = now, now = after, after = before, done = end, fast += count * JITTER;
+    for (long i = 0; i < ends; i++)
+      if (!(rows[ending[i]] < 1)) samples -= left - 1, left = 1;
   }
   memcpy(state, now, sizeof *m);
+  return samples;
 }
 #else
 #if CRUISE

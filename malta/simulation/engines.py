@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cache, lru_cache, partial
 from typing import TYPE_CHECKING, Any, Literal
@@ -17,7 +17,7 @@ from malta.model.data import plant_of
 from malta.model.parameters import acting_names, shape_parameters, twins_of
 from malta.model.plant import Plant
 from malta.simulation.compiled import address_of, feedforward_table, library
-from malta.simulation.layout import Setup, electronics_of, flatten, numbers_of
+from malta.simulation.layout import Setup, electronics_of, ending_columns, flatten, numbers_of
 from malta.simulation.period import Period, chain, columns_of, period_of, without_zeros
 from malta.simulation.translate import source
 from malta.simulation.working import with_working_state
@@ -36,6 +36,7 @@ class Engine:
 
     first : index of the first sample
     given, noise, rows : samples x size; fast noise : substeps x size
+    The compiled engine's rows end with the first in which a contact ends the run.
     """
 
     kind: str  # "compiled" or "virtual machine"
@@ -64,7 +65,9 @@ def engine_of(
             lib, p = found
             ff = c.feedforward
             table = feedforward_table(ff.z_grid, ff.v0)
-            return compiled_engine(lib.run, p, flatten(values), substeps, table)
+            return compiled_engine(
+                lib.run, p, flatten(values), substeps, table, ending_columns(plant, c, setup)
+            )
         if choice == "compiled":
             if plant_of(c.parameters).tabulated:
                 raise InputError(
@@ -130,9 +133,15 @@ def substeps_until(sample: int, substeps: float) -> int:
     return math.ceil(sample * substeps - 1e-6)
 
 
-def compiled_engine(run: Any, p: Period, theta: FloatArray, substeps: float, table: FloatArray) -> Engine:
-    """The engine of a library with one lane; `run` is the library's function."""
+def compiled_engine(
+    run: Any, p: Period, theta: FloatArray, substeps: float, table: FloatArray, ending: Sequence[int] = ()
+) -> Engine:
+    """The engine of a library with one lane; `run` is the library's function.
+
+    ending : columns of a row that end a run, see ending_columns; rows after such a row are not computed
+    """
     width = p.decide.size1_out(2)
+    ends, columns = ctypes.c_long(len(ending)), (ctypes.c_long * len(ending))(*ending)
     theta, table = (np.ascontiguousarray(a, dtype=float) for a in (theta, table))
     numbers, points, rows_of_table = (  # these addresses keep their arrays alive
         theta.ctypes.data_as(ctypes.c_void_p),
@@ -146,7 +155,7 @@ def compiled_engine(run: Any, p: Period, theta: FloatArray, substeps: float, tab
         after = np.array(state, dtype=float)
         given, noise, fast = (np.ascontiguousarray(a) for a in (given, noise, fast))
         rows = np.empty((len(given), width))
-        run(
+        done = run(
             ctypes.c_long(first),
             ctypes.c_long(len(given)),
             ctypes.c_double(substeps),
@@ -158,8 +167,10 @@ def compiled_engine(run: Any, p: Period, theta: FloatArray, substeps: float, tab
             address_of(noise),
             address_of(fast),
             address_of(rows),
+            ends,
+            columns,
         )
-        return after, rows
+        return after, rows[:done]
 
     return Engine("compiled", call)
 

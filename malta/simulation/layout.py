@@ -11,6 +11,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import accumulate
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
 import casadi as ca
@@ -122,6 +123,20 @@ def layout_of(plant: Plant, c: Controller, s: Setup) -> Layout:
     if s.fidelity == "phase":
         row |= dict.fromkeys(("i_phase", "duty"), phases if driven else coils)
     return Layout({"x": len(plant.states)} | electric_state, controller, given, row)
+
+
+@lru_cache(maxsize=64)
+def columns_of_row(plant: Plant, c: Controller, s: Setup) -> dict[str, slice]:
+    """The columns of each signal in the row that a sample leaves."""
+    sizes = layout_of(plant, c, s).row
+    ends = accumulate(sizes.values())
+    return {name: slice(end - size, end) for (name, size), end in zip(sizes.items(), ends, strict=True)}
+
+
+def ending_columns(plant: Plant, c: Controller, s: Setup) -> tuple[int, ...]:
+    """The columns of a row whose contacts end a run; a contact that a touchdown bearing cushions ends none."""
+    first = columns_of_row(plant, c, s)["contact"].start
+    return tuple(first + i for i, cushioned in enumerate(plant.cushioned) if not (s.bearing and cushioned))
 
 
 def numbers_of(

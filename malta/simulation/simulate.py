@@ -8,22 +8,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, get_args
 
 import numpy as np
 
 from malta.errors import InputError
 from malta.model.data import plant_of
-from malta.model.parameters import shape_parameters, units_of
 from malta.model.plant import Plant
 from malta.simulation import references
 from malta.simulation.engines import Engine, EngineChoice, engine_of, substeps_until
 from malta.simulation.inputs import (
     Inputs,
-    electronics_noise,
     sample_inputs,
     samples_of_memory,
-    sensor_noise,
 )
 from malta.simulation.prepared import Prepared, prepare
 from malta.simulation.scenario import (
@@ -31,7 +28,6 @@ from malta.simulation.scenario import (
     Scenario,
     Simulation,
     steps_of,
-    substeps_of,
 )
 from malta.simulation.trajectory import Trajectory, label_rows
 from malta.simulation.verdict import Verdict, columns_of, judge
@@ -72,7 +68,7 @@ def simulate(
     if not callable(engine) and engine not in get_args(EngineChoice):
         raise InputError("simulate", "engine", repr(engine), "one of " + ", ".join(get_args(EngineChoice)))
     ready = prepare(plant, controller, scenario)
-    simulation, inputs, _ = ready
+    simulation, inputs = ready.simulation, ready.inputs
     parts: list[FloatArray] = []
     verdict: Verdict | None = None
     kind, done = "", 0
@@ -99,14 +95,9 @@ def _portions(
 
     Between portions the machine's parameters may change, and an outer loop may correct the reference.
     """
-    simulation, inputs, state = ready
-    plant, controller, scenario, setup = simulation
-    t, _, given = inputs
+    simulation, (t, _, given), state, stages, steps, noise, fast = ready
+    _, controller, scenario, setup = simulation
     samples = len(t)
-    stages = _stages(plant, scenario, controller.sample_time)
-    noise = sensor_noise(simulation, stages, t)
-    steps = substeps_of(plant, controller, setup, scenario)
-    fast = electronics_noise(simulation, substeps_until(samples, steps))
     observer = _observer(simulation) if setup.outside else None
     every = _samples_between_stops(scenario, controller.sample_time)
     longest = max(1, min(PORTION, int(WORK / steps)))
@@ -123,13 +114,14 @@ def _portions(
             state, rows = engine.run(done, state, given[part], noise[part], jitter)
         else:
             state, rows = observer(engine, now, state, given[part], noise[part])
-        rows, verdict = judge(simulation, rows, t[part])
+        ended = observer is None and engine.kind == "compiled"
+        rows, verdict = judge(simulation, rows, t[part], ended)
         done += len(rows)
         yield rows, verdict, engine.kind
         if scenario.correction is not None and done < samples and done % every == 0:
             p = columns_of(simulation, rows[-1], "p")
             offset = np.asarray(scenario.correction.update(float(t[done]), p), dtype=float)
-            _correct(simulation, inputs, slice(done, done + every), offset)
+            _correct(simulation, ready.inputs, slice(done, done + every), offset)
 
 
 def _correct(simulation: Simulation, inputs: Inputs, ahead: slice, offset: FloatArray) -> None:
@@ -171,30 +163,6 @@ def _observer(simulation: Simulation) -> Observer:
     from malta.simulation.start_up import observer  # filterpy takes a while to import
 
     return observer(simulation, steps_of(simulation.plant, simulation.controller, simulation.scenario))
-
-
-def _stages(plant: Plant, scenario: Scenario, Ts: float) -> list[tuple[int, Plant]]:
-    """(first sample, machine): the machine before and after every change of its parameters.
-
-    Raises InputError for unknown parameters, and for those that shape the machine's functions.
-    """
-    stages = [(0, plant)]
-    for at, values in sorted(scenario.changes, key=lambda change: change[0]):
-        known = units_of(plant.parameters)
-        for name in values:
-            if name not in known:
-                raise InputError(
-                    f"scenario {scenario.name}", f"changes.{name}", "an unknown parameter", " ".join(known)
-                )
-            if name in shape_parameters(plant.parameters):
-                found = "a parameter that shapes the machine's functions"
-                raise InputError(
-                    f"scenario {scenario.name}", f"changes.{name}", found, "one that enters them"
-                )
-        before = stages[-1][1]
-        par: Any = replace(before.parameters, **values)
-        stages.append((max(0, round(at / Ts)), before.variant(par)))
-    return stages
 
 
 def _samples_between_stops(scenario: Scenario, Ts: float) -> int:

@@ -6,7 +6,6 @@ import io
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from itertools import accumulate
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +16,7 @@ from malta.files import replace_files
 from malta.model.plant import Plant, Signal, readonly
 from malta.simulation.engines import evaluate
 from malta.simulation.inputs import Inputs
-from malta.simulation.layout import electronics_of, layout_of
+from malta.simulation.layout import columns_of_row, electronics_of
 from malta.simulation.scenario import Scenario, Simulation, setup_of
 from malta.simulation.verdict import Verdict, bearing_verdict, judge
 from malta.synthesis.controller import Controller
@@ -59,7 +58,9 @@ class Trajectory:
 
     def __post_init__(self) -> None:
         for name in ("t", "reference", *SERIES):
-            object.__setattr__(self, name, readonly(getattr(self, name)))
+            array = getattr(self, name)
+            if array is not (sealed := readonly(array)):
+                object.__setattr__(self, name, sealed)
 
     @property
     def limits(self) -> tuple[str, ...]:
@@ -118,11 +119,10 @@ def label_rows(
     (t, _, given), done = inputs, len(rows)
     for array in (rows, given, t):
         array.flags.writeable = False  # the trajectory's series are views of them
-    sizes = layout_of(plant, controller, setup).row
-    ends = accumulate(sizes.values())
-    columns = {name: rows[:, end - sizes[name] : end] for name, end in zip(sizes, ends, strict=True)}
+    columns = columns_of_row(plant, controller, setup)
     if setup.bearing and (verdict is None or verdict.name in plant.contacts):
-        verdict = bearing_verdict(plant, columns["contact"], t) or verdict
+        verdict = bearing_verdict(plant, rows[:, columns["contact"]], t) or verdict
+    none = slice(0, 0)  # of a signal that this fidelity does not have
     return Trajectory(
         plant,
         controller,
@@ -131,7 +131,7 @@ def label_rows(
         kind,
         t=t[:done],
         reference=given[:done, : len(plant.outputs)],
-        **{name: columns.get(name, np.empty((done, 0))) for name in SERIES},
+        **{name: rows[:, columns.get(name, none)] for name in SERIES},
     )
 
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from malta.model.plant import Plant
-from malta.simulation.layout import layout_of
+from malta.simulation.layout import columns_of_row
 from malta.simulation.scenario import Simulation
 
 if TYPE_CHECKING:
@@ -28,14 +29,21 @@ class Verdict(NamedTuple):
         return self.name == "completed"
 
 
-def judge(run: Simulation, rows: FloatArray, t: FloatArray) -> tuple[FloatArray, Verdict | None]:
+def judge(
+    run: Simulation, rows: FloatArray, t: FloatArray, ended: bool = False
+) -> tuple[FloatArray, Verdict | None]:
     """The rows up to the first contact or the first NaN, and the verdict; None where neither occurs.
 
     A machine with touchdown bearings goes on after it touches one of them; only other contacts end its run.
+
+    ended : rows end with the first in which a contact ends the run, as the compiled engine's do
     """
-    plant, contact = run.plant, columns_of(run, rows, "contact")
-    if np.isfinite(rows[-1]).all() and contact.max(initial=0.0) < 1:
-        return rows, None  # a state that is no number stays none
+    columns, last = columns_of_row(run.plant, run.controller, run.setup)["contact"], rows[-1].tolist()
+    if all(map(math.isfinite, last)):  # a state that is no number stays none
+        largest = max(last[columns], default=0.0) if ended else rows[:, columns].max(initial=0.0)
+        if largest < 1:
+            return rows, None
+    plant, contact = run.plant, rows[:, columns]
     lost = np.atleast_1d(~np.isfinite(rows).all(axis=1))
     touching = contact >= 1
     if run.setup.bearing:
@@ -66,6 +74,4 @@ def bearing_verdict(plant: Plant, contact: FloatArray, t: FloatArray) -> Verdict
 
 def columns_of(run: Simulation, rows: FloatArray, name: str) -> FloatArray:
     """The columns of one signal of `layout_of(...).row`; rows has any number of leading axes."""
-    sizes = layout_of(run.plant, run.controller, run.setup).row
-    first = sum(size for key, size in list(sizes.items())[: list(sizes).index(name)])
-    return rows[..., first : first + sizes[name]]
+    return rows[..., columns_of_row(run.plant, run.controller, run.setup)[name]]
