@@ -7,7 +7,7 @@ compiled, engines                           libraries of C, or CasADi's virtual 
 scenario, references, noise, inputs         the reference, and everything that disturbs the machine
 prepared, simulate, verdict                 one machine
 trajectory, start_up                        its time series, and its observer at the start
-batch, digest                               thousands of machines, with the figures of each run
+batch, workers, digest                      thousands of machines, with the figures of each run
 experiments, generic, responses             scenarios with figures of merit
 time_optimal, inverter                      the fastest stroke, and half-bridges on a DC link
 """

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import cache, lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -50,6 +49,7 @@ from malta.simulation.scenario import Scenario, Simulation, setup_of, simulation
 from malta.simulation.simulate import simulate
 from malta.simulation.trajectory import Trajectory, stroke_figures, trajectory_of
 from malta.simulation.translate import source
+from malta.simulation.workers import Work, run_groups
 from malta.synthesis.controller import Controller
 
 if TYPE_CHECKING:
@@ -106,13 +106,9 @@ def simulate_many(
     groups, runs = len(lanes.theta), variation.runs
     lanes = lanes._replace(digests=arrange_in_lanes(digest[None], groups))
     shared = shared._replace(foreseen=foresee_samples(compiled[0], lanes, shared))
-    work = _Work(lanes, shared, parts)
-    _run_groups(compiled[0], work, workers or os.cpu_count() or 1, progress)
+    run_groups(compiled[0], Work(lanes, shared, parts), workers or os.cpu_count() or 1, progress)
     ends = lanes.digests.swapaxes(1, 2).reshape(groups * LANES, -1)[:runs]
     return batch_of(ends, len(inputs.t), controller.sample_time, digest_sizes(plant))
-
-
-WORK = 2_000_000  # substeps of the groups in one call of the engine, at most: a fraction of a second
 
 
 class Variation(NamedTuple):
@@ -123,36 +119,6 @@ class Variation(NamedTuple):
     starts: Mapping[str, FloatArray]  # states by name, SI
     noise: NDArray[np.int64]  # runs x parts, index of the run whose noise a part has
     runs: int
-
-
-class _Work(NamedTuple):
-    """The runs of a batch, ready for the compiled engine; the lanes' keys are those of the parts."""
-
-    lanes: Lanes
-    shared: Shared
-    parts: Sequence[Part]
-
-
-def _run_groups(lib: Any, work: _Work, workers: int, progress: Callable[[float], None] | None) -> None:
-    """Simulate all groups of machines on several threads; the digests change in place."""
-    lanes, shared, parts = work
-    groups = len(lanes.theta)
-    most = max(1, WORK // (len(shared.given) * shared.substeps))
-    step = max(1, min(8, groups // (4 * workers), most))  # groups in one call: progress comes often
-    if len(parts) > 1:  # calls of short parts: the more groups in each, the less it counts
-        step = max(step, min(64, -(-groups // workers), most))
-
-    def run(k: int) -> None:
-        run_many(lib, slice(k, min(k + step, groups)), lanes, shared, parts)
-
-    with ThreadPoolExecutor(workers) as pool:
-        try:
-            for done, _ in enumerate(pool.map(run, range(0, groups, step))):
-                if progress is not None:
-                    progress(min(1.0, (done + 1) * step / groups))
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
 
 
 def _prepare(simulation: Simulation, variation: Variation) -> tuple[Inputs, Shared, Lanes, Sequence[Part]]:

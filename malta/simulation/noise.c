@@ -37,6 +37,7 @@ static UNCONTRACTED void draw(bits64 key, uint64_t count, const real *scale, rea
 #pragma clang fp contract(off)
 #endif
   count = count / 2 * OUTPUTS;
+#pragma GCC unroll 8
   for (int j = 0; j < 2 * OUTPUTS; j += 2) {
     bits32 x = (bits32)split_mix(key, count + j), w = (bits32)split_mix(key, count + j + 1);
     bits32 high = CHOSEN(x, w, 1, 3, 5, 7, 9, 11, 13, 15, 17, 19, 21, 23, 25, 27, 29, 31);
