@@ -16,9 +16,9 @@ from malta.machines.tubular import plant as tubular
 from malta.simulation import compiled, prepared
 from malta.simulation.batch import simulate_many
 from malta.simulation.digest import cruise_functions, digest_function
-from malta.simulation.engines import EngineChoice, compiled_period, shape_of
+from malta.simulation.engines import EngineChoice, compiled_period, engine_of, shape_of
 from malta.simulation.expressions import Identities, conserved, linear_parts
-from malta.simulation.layout import numbers_of, with_symbols
+from malta.simulation.layout import ending_columns, numbers_of, with_symbols
 from malta.simulation.once import Counts
 from malta.simulation.period import Period, columns_of
 from malta.simulation.scenario import Scenario, setup_of
@@ -317,3 +317,38 @@ def test_what_may_change_is_prepared_anew(designs: dict[str, Design]) -> None:
     ):
         options: Any = {"reference": own} | touched
         assert not prepared.is_repeatable(Scenario("hold", 0.005, **options))
+
+
+# Where a run ends
+
+
+@needs_compiler
+def test_the_compiled_engine_ends_with_the_contact(designs: dict[str, Design]) -> None:
+    """Its last row is the first of a contact, and the virtual machine's run ends there too."""
+    design = designs["table2"]
+    par = design.plant.parameters
+    assert isinstance(par, tubular.Parameters)
+    plant = design.plant.variant(replace(par, m=2 * par.m))
+    scenario = Scenario.stroke(10e-3, fidelity="force")
+    ready = prepared.prepare(plant, design.controller, scenario)
+    setup = ready.simulation.setup
+    engine = engine_of(plant, design.controller, setup, ready.substeps, choice="compiled")
+    _, rows = engine.run(0, ready.state, ready.inputs.given, ready.noise, ready.fast_noise)
+    contact = rows[:, ending_columns(plant, design.controller, setup)]
+    assert len(rows) < len(ready.inputs.t)
+    assert contact[-1].max() >= 1
+    assert contact[:-1].max() < 1
+    one, other = (malta.simulate(plant, design.controller, scenario, engine=choice) for choice in _ENGINES)
+    assert len(one.t) == len(other.t) == len(rows)
+    assert one.verdict == other.verdict
+
+
+def test_a_contact_that_a_bearing_cushions_ends_nothing(designs: dict[str, Design]) -> None:
+    design = designs["table2"]
+    setups = [
+        setup_of(design.plant, design.controller, Scenario.stroke(10e-3, fidelity="force", bearing=bearing))
+        for bearing in (False, True)
+    ]
+    apart, cushioned = (ending_columns(design.plant, design.controller, setup) for setup in setups)
+    assert len(apart) == len(design.plant.contacts)
+    assert cushioned == apart[2:]

@@ -27,7 +27,7 @@ from malta.simulation.compiled import (
     arrange_in_lanes,
     feedforward_table,
     foresee_samples,
-    repeat_in_lanes,
+    numbers_in_lanes,
     run_many,
 )
 from malta.simulation.digest import (
@@ -103,7 +103,7 @@ def simulate_many(
         return _simulate_one_by_one(alone, variation, progress)
     inputs, shared, lanes, parts = _prepare(simulation, variation)
     digest = first_digest(plant, inputs.motion.p)
-    groups, runs = len(lanes.theta), variation.runs
+    groups, runs = len(lanes.states), variation.runs
     lanes = lanes._replace(digests=arrange_in_lanes(digest[None], groups))
     shared = shared._replace(foreseen=foresee_samples(compiled[0], lanes, shared))
     run_groups(compiled[0], Work(lanes, shared, parts), workers or os.cpu_count() or 1, progress)
@@ -142,7 +142,7 @@ def _prepare(simulation: Simulation, variation: Variation) -> tuple[Inputs, Shar
         if end > start
     ]
     lanes = Lanes(
-        theta=repeat_in_lanes(same, own, groups),
+        theta=numbers_in_lanes(same, own, groups),
         states=arrange_in_lanes(states, groups),
         sigma=arrange_in_lanes(scenario.noise * noise, groups),
         keys=parts[0].keys,

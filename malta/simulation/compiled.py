@@ -175,13 +175,21 @@ def feedforward_table(z_grid: FloatArray, v0: FloatArray) -> FloatArray:
     return np.ascontiguousarray(np.hstack([z_grid[:, None], v0, np.vstack([slope, slope[-1:]])]))
 
 
+class Numbers(NamedTuple):
+    """Numbers of machines and controller: the same for all machines, but for some that are each machine's own."""
+
+    same: FloatArray
+    places: NDArray[np.int_]  # of those that are each machine's own
+    own: FloatArray  # groups x numbers x LANES
+
+
 class Lanes(NamedTuple):
     """Machines of a batch in groups of LANES: every array is groups x numbers x LANES, keys are groups x LANES.
 
     A run changes `states` and `digests` in place.
     """
 
-    theta: FloatArray  # numbers of machine and controller
+    theta: FloatArray | Numbers  # numbers of machine and controller; an array: all are each machine's own
     states: FloatArray
     sigma: FloatArray  # standard deviations of the sensors' noise
     keys: NDArray[np.uint64]  # of the noise
@@ -215,16 +223,32 @@ def repeat_in_lanes(same: FloatArray, own: Mapping[int, FloatArray], groups: int
 
     own : a number for each machine, by index
     """
-    lanes = np.empty((groups, len(same), LANES))
-    lanes[:] = same[:, None]
-    for k, column in own.items():
-        lanes[:, k] = np.pad(column, (0, groups * LANES - len(column)), mode="edge").reshape(groups, LANES)
+    lanes = np.broadcast_to(same[:, None], (groups, len(same), LANES)).copy()
+    lanes[:, list(own)] = numbers_in_lanes(same, own, groups).own
     return lanes
+
+
+def numbers_in_lanes(same: FloatArray, own: Mapping[int, FloatArray], groups: int) -> Numbers:
+    """The numbers of `repeat_in_lanes`; only those that are each machine's own take memory for every machine."""
+    lanes = np.empty((groups, len(own), LANES))
+    for k, column in enumerate(own.values()):
+        lanes[:, k] = np.pad(column, (0, groups * LANES - len(column)), mode="edge").reshape(groups, LANES)
+    return Numbers(same, np.array(list(own), dtype=np.int_), lanes)
+
+
+def _numbers_of(theta: FloatArray | Numbers, chosen: slice) -> tuple[Any, ...]:
+    """The numbers of some groups as the engine takes them; the addresses keep their arrays alive."""
+    if not isinstance(theta, Numbers):
+        theta = Numbers(np.zeros(theta.shape[1]), np.arange(theta.shape[1]), theta)
+    same, places, own = (
+        array.ctypes.data_as(ctypes.c_void_p) for array in (theta.same, theta.places, theta.own[chosen])
+    )
+    return same, ctypes.c_long(len(theta.places)), places, own
 
 
 def foresee_samples(lib: ctypes.CDLL, lanes: Lanes, shared: Shared) -> FloatArray:
     """What all machines of a batch share at every sample, samples x numbers: see once.py."""
-    call = partial(lib.foresee_all, ctypes.c_long(len(shared.given)), address_of(lanes.theta))
+    call = partial(lib.foresee_all, ctypes.c_long(len(shared.given)), *_numbers_of(lanes.theta, slice(0, 1)))
     numbers = np.empty((len(shared.given), call(address_of(shared.given), None)))
     call(address_of(shared.given), address_of(numbers))
     return numbers
@@ -244,10 +268,11 @@ def run_many(
 
     parts : of the time, one after the other; None: all samples with the keys of the lanes
     """
-    theta, states, sigma, digests = (
-        address_of(array[chosen]) for array in (lanes.theta, lanes.states, lanes.sigma, lanes.digests)
+    numbers = _numbers_of(lanes.theta, chosen)
+    states, sigma, digests = (
+        address_of(array[chosen]) for array in (lanes.states, lanes.sigma, lanes.digests)
     )
-    groups, rows = ctypes.c_long(len(lanes.theta[chosen])), ctypes.c_long(len(shared.table))
+    groups, rows = ctypes.c_long(len(lanes.states[chosen])), ctypes.c_long(len(shared.table))
     substeps, uniform = ctypes.c_long(shared.substeps), ctypes.c_long(shared.uniform)
     table = address_of(shared.table)
     ahead = foresee_samples(lib, lanes, shared) if shared.foreseen is None else shared.foreseen
@@ -257,7 +282,7 @@ def run_many(
             groups,
             ctypes.c_long(len(given)),
             substeps,
-            theta,
+            *numbers,
             rows,
             table,
             states,

@@ -206,21 +206,29 @@ static void run_group(long samples, long substeps, const real *c, const double *
   memcpy(digests, kept, sizeof(real) * DIGEST);
 }
 
+/* c and d of a group, from the numbers that all machines share and the `count` that are each machine's own, at `own`. */
+static void prepare_group(const double *same, long count, const long *places, const double *own, real *c, double *d) {
+  real t[THETA + 1];
+  for (int k = 0; k < THETA; k++) t[k] = K(same[k]);
+  for (long k = 0; k < count; k++) memcpy(t + places[k], own + k * LANES, sizeof *t);
+  prepare(t, c, d);
+}
+
 /* g of all samples, from the numbers of any group; without a place for it, how many numbers a sample has. */
-long foresee_all(long samples, const double *theta, const double *given, double *g) {
-  real c[CONSTANTS + 1], t[THETA + 1];
+long foresee_all(long samples, const double *same, long count, const long *places, const double *own,
+                 const double *given, double *g) {
+  real c[CONSTANTS + 1];
   double d[SHARED + 1];
   if (!g) return FORESEEN;
-  memcpy(t, theta, sizeof(real) * THETA);
-  prepare(t, c, d);
+  prepare_group(same, count, places, own, c, d);
   for (long k = 0; k < samples; k++) foresee(d, given + k * GIVEN, g + k * FORESEEN);
   return FORESEEN;
 }
 
 /* Groups of LANES machines, one after the other; states and digests are taken and left behind. g: of foresee_all. */
-void run_many(long groups, long samples, long substeps, const double *theta, long points, const double *table,
-              double *states, const double *given, const double *g, long uniform, const double *sigma,
-              const uint64_t *keys, double *digests) {
+void run_many(long groups, long samples, long substeps, const double *same, long count, const long *places,
+              const double *own, long points, const double *table, double *states, const double *given, const double *g,
+              long uniform, const double *sigma, const uint64_t *keys, double *digests) {
   const size_t size = (size_t)(points * PADDED + LANES) * sizeof(double);
   double *rows = aligned_alloc(64, size), first = table[0];
   if (!rows) abort();
@@ -234,9 +242,8 @@ void run_many(long groups, long samples, long substeps, const double *theta, lon
         rows[k * PADDED + part * COLUMNS + j] = table[k * WIDTH + 1 + part * FORCES + column[j]];
   }
   for (long i = 0; i < groups; i++) {
-    real c[CONSTANTS + 1], t[THETA + 1];
-    memcpy(t, theta + i * THETA * LANES, sizeof(real) * THETA);
-    prepare(t, c, d);
+    real c[CONSTANTS + 1];
+    prepare_group(same, count, places, own + i * count * LANES, c, d);
     run_group(samples, substeps, c, d, g, &grid, states + i * STATES * LANES, given, uniform,
               sigma + i * OUTPUTS * LANES, keys + i * LANES, digests + i * DIGEST * LANES);
   }

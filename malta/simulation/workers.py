@@ -24,7 +24,7 @@ class Work(NamedTuple):
 def run_groups(lib: Any, work: Work, workers: int, progress: Callable[[float], None] | None) -> None:
     """Simulate all groups of machines on several threads; the digests change in place."""
     lanes, shared, parts = work
-    groups, done = len(lanes.theta), list[int]()
+    groups, done = len(lanes.states), list[int]()
     most = max(1, WORK // (len(shared.given) * shared.substeps))
     if len(parts) == 1:
         calls = _calls(groups, workers, 1, min(16, most))
