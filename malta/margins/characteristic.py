@@ -155,12 +155,13 @@ class Characteristic:
         if self.minors is None:
             driven = driven_group(self.loop, self.group, self._entries(p), matrix)
             return [c * driven.det_E for c in coefficients(closed_loop(driven))]
-        known, place = self.minors.known, (ctx.prec, tuple(p))
+        terms = [(x.p, x.q) for x in p]  # of which a hash takes an eighth of that of the quotient's
+        known, place = self.minors.known, (ctx.prec, tuple(terms))
         pi, beta = known.get(place, (None, None))
         if beta is None:
             if len(known) > MOST:
                 known.clear()
-            entries, own = self._entries(p), (ctx.prec, *(p[i] for i in self._of_plant))
+            entries, own = self._entries(p), (ctx.prec, *(terms[i] for i in self._of_plant))
             pi = known.get(own)
             if pi is None:
                 known[own] = pi = self.minors.plant(entries, matrix)

@@ -30,6 +30,7 @@ from malta.margins.closed import (
 from malta.margins.expressions import NotAnalytic, Program, exact
 from malta.margins.groups import A, B, C, E, Group, UncertainLoop, rational, upper
 from malta.margins.majorant import all_bounds, coefficient_bounds
+from malta.margins.mirrors import Places, first_alike
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
@@ -41,13 +42,22 @@ Pair = tuple[tuple[int, ...], tuple[int, ...]]
 
 @dataclass(frozen=True, eq=False)
 class Minors:
-    """The minors of a group: its rows with inputs, its inputs and outputs, and the compensator between these."""
+    """The minors of a group: its rows with inputs, its inputs and outputs, and the compensator between these.
+
+    The system's minors are those of the group's first mirror image; R, S and T count in the group.
+    """
 
     loop: UncertainLoop
     group: Group
     rows: tuple[int, ...]  # states, by their number in the group
     inputs: tuple[int, ...]
     outputs: tuple[int, ...]
+
+    @cached_property
+    def system(self) -> Places:
+        """The group whose system stands for this one's (mirrors.py)."""
+        own = Places(self.group.states, self.rows, self.inputs, self.outputs)
+        return first_alike(self.loop.program, self.loop.symbolic, own)
 
     @property
     def order(self) -> int:
@@ -72,18 +82,18 @@ class Minors:
         f = fmpq_mat(table) if n else None
         d = fmpq_poly([1]) if f is None else fmpq_poly(f.charpoly())
         entries: dict[tuple[int, int], Any] = {}
-        for t in self.inputs:
-            for s in self.outputs:
+        for i, t in enumerate(self.inputs):
+            for j, s in enumerate(self.outputs):
                 entry = d * exact(float(law.D[t, s]))
                 if f is not None:
                     b = fmpq_mat(rational(law.B[own][:, [s]]))
                     c = fmpq_mat(rational(law.C[[t]][:, own]))
                     entry += fmpq_poly((f - b * c).charpoly()) - d
-                entries[t, s] = entry
+                entries[i, j] = entry
         found: dict[Pair, Any] = {((), ()): d}
         for k in range(1, self.order + 1):
-            for T in itertools.combinations(self.inputs, k):
-                for S in itertools.combinations(self.outputs, k):
+            for T in itertools.combinations(range(len(self.inputs)), k):
+                for S in itertools.combinations(range(len(self.outputs)), k):
                     det = _determinant([[entries[t, s] for s in S] for t in T])
                     found[T, S] = det if k == 1 else _quotient(det, d, k - 1)
         return found
@@ -117,8 +127,8 @@ class Minors:
         return {pair: p * factor for pair, p in found.items()}
 
     def _matrices(self, entries: list[list[tuple[int, int, Any]]], matrix: Any) -> tuple[Any, Any, Any]:
-        x = {state: k for k, state in enumerate(self.group.states)}
-        n, y = len(x), {output: k for k, output in enumerate(self.outputs)}
+        x = {state: k for k, state in enumerate(self.system.states)}
+        n, y = len(x), {output: k for k, output in enumerate(self.system.outputs)}
         a = dense(matrix, n, n, ((x[i], x[j], r) for i, j, r in entries[A] if i in x and j in x))
         c = dense(matrix, len(y), n, ((y[i], x[j], r) for i, j, r in entries[C] if i in y and j in x))
         factor: Any = 1
@@ -130,8 +140,8 @@ class Minors:
 
     def forces(self, entries: list[list[tuple[int, int, Any]]], matrix: Any) -> dict[Pair, Any]:
         """beta_RT at given p, without structural zeros."""
-        x = {state: k for k, state in enumerate(self.group.states)}
-        n, u = len(x), {t: k for k, t in enumerate(self.inputs)}
+        x = {state: k for k, state in enumerate(self.system.states)}
+        n, u = len(x), {t: k for k, t in enumerate(self.system.inputs)}
         own = {(x[i], u[j]): r for i, j, r in entries[B] if i in x and j in u}
         if self.loop.descriptor:
             e = dense(matrix, n, n, ((x[i], x[j], r) for i, j, r in entries[E] if i in x and j in x))
@@ -140,8 +150,8 @@ class Minors:
         found: dict[Pair, Any] = {}
         for k in range(1, self.order + 1):
             for R in itertools.combinations(range(len(self.rows)), k):
-                for T in itertools.combinations(self.inputs, k):
-                    part = [[own.get((self.rows[i], u[t])) for t in T] for i in R]
+                for T in itertools.combinations(range(len(u)), k):
+                    part = [[own.get((self.rows[i], t)) for t in T] for i in R]
                     det = _determinant(part)
                     if det is not None:
                         found[R, T] = det
@@ -154,11 +164,10 @@ class Minors:
         for (S, R), p in pi.items():
             if not R:
                 continue
-            names = tuple(self.outputs[s] for s in S)
             part = None
-            for T in itertools.combinations(self.inputs, len(R)):
+            for T in itertools.combinations(range(len(self.inputs)), len(R)):
                 if (R, T) in beta:
-                    term = kappa[T, names] * beta[R, T]
+                    term = kappa[T, S] * beta[R, T]
                     part = term if part is None else part + term
             if part is not None:
                 total = total + p * part
@@ -188,10 +197,10 @@ class Minors:
             ]
             pi |= zip(places, _bounds(a, [(into[:, list(R)], c[list(S)]) for S, R in places]), strict=True)
         beta = {
-            (R, T): float(np.prod(b[np.ix_(R, [self.inputs.index(t) for t in T])].sum(axis=1))) * (1 + 1e-9)
+            (R, T): float(np.prod(b[np.ix_(R, T)].sum(axis=1))) * (1 + 1e-9)
             for k in range(1, self.order + 1)
             for R in itertools.combinations(range(len(self.rows)), k)
-            for T in itertools.combinations(self.inputs, k)
+            for T in itertools.combinations(range(len(self.inputs)), k)
         }
         if not all(math.isfinite(size) for size in beta.values()):
             raise NotAnalytic("numbers that overflow")
@@ -201,11 +210,10 @@ class Minors:
         """Upper bounds of the coefficients of s or g."""
         result: list[Any] = []
         for (S, R), pi in sizes.pi.items():
-            names = tuple(self.outputs[s] for s in S)
             weight = [] if R else self._absolute_kappa[(), ()]
-            for T in itertools.combinations(self.inputs, len(R)) if R else ():
+            for T in itertools.combinations(range(len(self.inputs)), len(R)) if R else ():
                 if sizes.beta[R, T]:
-                    weight = _sum(weight, [arb(sizes.beta[R, T]) * x for x in self._absolute_kappa[T, names]])
+                    weight = _sum(weight, [arb(sizes.beta[R, T]) * x for x in self._absolute_kappa[T, S]])
             if weight:
                 result = _sum(result, _product(pi, weight))
         return result
@@ -217,11 +225,8 @@ class Minors:
     @property
     def known(self) -> dict[Any, Any]:
         """The remembered minors of the system at places and on discs, which do not depend on the compensator."""
-        g, law = self.group, self.loop.law
-        return _known(
-            self.loop.program, g.states, self.rows, self.inputs, self.outputs,
-            (law.sample_time, law.lag, self.loop.sampled),
-        )  # fmt: skip
+        law = self.loop.law
+        return _known(self.loop.program, self.system, (law.sample_time, law.lag, self.loop.sampled))
 
 
 @lru_cache(maxsize=64)  # laws change, the system stays

@@ -1,0 +1,89 @@
+"""Groups of states that are mirror images of each other share their system's minors; others do not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import malta
+from malta.margins import minors, mirrors, robust
+from malta.margins.groups import groups, loop_of
+from malta.margins.mirrors import Places, first_alike, is_mirror
+from malta.margins.uncertain import Compensator
+
+ONE, TWO = Places((0, 1), (1,), (0,), (0,)), Places((2, 3), (1,), (1,), (1,))
+
+
+def planes(
+    stiffness: float = 4.0, signs: tuple[float, float, float] = (-1.0, -1.0, 1.0)
+) -> malta.UncertainSystem:
+    """Two planes x, v and y, w; signs: of y' = w, w' = y, and the second reading, a force along -w."""
+    a, b, c = signs
+    return malta.uncertain(
+        lambda k: (
+            [[0, 1, 0, 0], [4 * k, 0, 0, 0], [0, 0, 0, a], [0, 0, b * stiffness * k, 0]],
+            [[0, 0], [1, 0], [0, 0], [0, -1]],
+            [[1, 0, 0, 0], [0, 0, c, 0]],
+        ),
+        {"k": 1.0},
+    )  # fmt: skip
+
+
+def law(gain: float = 1.0) -> Compensator:
+    """Proportional-derivative control of each plane behind a filter."""
+    A, B = -50 * np.eye(2), 50 * np.eye(2)
+    return Compensator(A, B, np.diag([1000.0, gain * 1000.0]), np.diag([-1030.0, gain * -1030.0]))
+
+
+def mirrored(system: malta.UncertainSystem) -> bool:
+    loop = loop_of(system, law())
+    assert loop.symbolic is not None
+    return is_mirror(loop.symbolic, ONE, TWO)
+
+
+def test_planes_that_differ_in_signs_alone_are_mirror_images() -> None:
+    assert mirrored(planes())
+    assert mirrored(planes(signs=(1.0, 1.0, -1.0)))
+
+
+@pytest.mark.parametrize(
+    "system",
+    [
+        planes(stiffness=np.nextafter(4.0, 5.0)),  # the last digit of a number
+        planes(signs=(-1.0, 1.0, 1.0)),  # a spring that pulls back in place of one that pushes away
+        planes(signs=(1.0, 1.0, 1.0)),  # the sign of the whole plane: the gain around its loop
+        planes(signs=(-2.0, -0.5, 1.0)),  # other units: equal but for a factor that is no sign
+    ],
+)
+def test_planes_that_differ_in_more_than_signs_are_none(system: malta.UncertainSystem) -> None:
+    assert not mirrored(system)
+
+
+def test_mirror_images_share_what_is_known_and_keep_their_own_compensators() -> None:
+    loop = loop_of(planes(), law(1.1))
+    found = [minors.minors(loop, group) for group in groups(loop)]
+    one, two = (m for m in found if m is not None)
+    assert {one.system, two.system} == {one.system}
+    assert one.known is two.known
+    assert one.kappa != two.kappa
+
+
+def test_the_margin_of_mirror_images_is_that_without_sharing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The second plane has the smaller gain, and loses stability first: the first plane's proof is not enough."""
+
+    def margin(gain: float) -> malta.Margin:
+        return malta.robust_margin(planes(), law(gain), {"k": 0.2})
+
+    shared = margin(0.5)
+    assert shared.lower is not None
+    assert shared.upper < 0.75 * margin(1.0).upper
+    monkeypatch.setattr(mirrors, "is_mirror", lambda *_: False)
+    for known in (robust.problem_of, minors._known, mirrors._firsts):
+        known.cache_clear()
+    alone = margin(0.5)
+    assert (shared.lower, shared.upper) == pytest.approx((alone.lower, alone.upper), rel=1e-12)
+
+
+def test_a_group_without_rational_entries_stands_for_itself() -> None:
+    loop = loop_of(planes(), law())
+    assert first_alike(loop.program, None, TWO) == TWO
