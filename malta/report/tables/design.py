@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, TypeGuard
 
 import numpy as np
 from rich.table import Table
-from scipy.optimize import linear_sum_assignment
+from scipy import sparse
 
 from malta.margins.verify import (
     BANDWIDTHS,
@@ -110,7 +110,8 @@ def _modes(model: LinearModel) -> tuple[list[str], FloatArray]:
     names = [s.name for s in model.plant.design_states[: len(model.stiffness)]]
     squares, shapes = np.linalg.eig(model.stiffness)
     participation = np.abs(shapes * np.linalg.inv(shapes).T)  # of position i in mode j, free of units
-    _, mode = linear_sum_assignment(-participation)
+    above_zero = sparse.csr_array(1 + participation)  # entries of zero would be no candidates
+    _, mode = sparse.csgraph.min_weight_full_bipartite_matching(above_zero, maximize=True)
     found = squares.real[mode]
     return names, np.where(np.abs(found) < 1e-12 * np.abs(found).max(initial=0.0), 0.0, found)
 

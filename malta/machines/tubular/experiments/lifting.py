@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 
 import casadi as ca
 import numpy as np
-from scipy.optimize import brentq
 
 from malta.machines.tubular.experiments.strokes import delayed_stroke
 from malta.model.plant import Plant
@@ -75,6 +74,8 @@ def rise_reference(plant: Plant, start: Mapping[str, float], duration: float = 3
 
 def rest_on_bearing(plant: Plant) -> dict[str, float]:
     """The state in which the mover lies on its touchdown bearings, without current."""
+    from scipy.optimize import brentq  # takes 0.06 s to import, for this experiment alone
+
     names = [s.name for s in plant.states]
     downward = int(np.argmax(np.abs(np.array(ca.evalf(plant.load(ca.SX(ca.DM(plant.at().x)))))[:3, 0])))
     free = plant.states[downward].name

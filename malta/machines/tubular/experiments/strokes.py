@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache, partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import casadi as ca
 import numpy as np
@@ -22,14 +22,11 @@ from malta.simulation.experiments import (
 )
 from malta.simulation.references import Profile, Reference
 from malta.simulation.scenario import Scenario
-from malta.simulation.time_optimal import (
-    FastestStroke,
-    SigmoidStroke,
-    fastest_stroke,
-    sigmoid_at_peak_current,
-)
 from malta.simulation.trajectory import Trajectory, stroke_figures
 from malta.synthesis.controller import Controller
+
+if TYPE_CHECKING:
+    from malta.simulation.time_optimal import FastestStroke, SigmoidStroke
 
 DISTANCE, RISE = 10e-3, 16.2e-3  # m, s from 10 to 90 %: the published stroke, Fig. 12
 
@@ -146,6 +143,11 @@ def _limit_strokes(
     plant: Plant, distance: float, current_share: float, voltage_share: float
 ) -> tuple[FastestStroke, SigmoidStroke]:
     """The fastest stroke within shares of current and voltage, and the sigmoid of the same peak current."""
+    from malta.simulation.time_optimal import (
+        fastest_stroke,  # with scipy's integrators, for these experiments alone
+        sigmoid_at_peak_current,
+    )
+
     shares: dict[str, Any] = {"voltage_share": voltage_share, "current_share": current_share}
     emf = induced_per_speed(plant)
     return (
