@@ -235,10 +235,18 @@ def test_no_box_is_proven_that_holds_an_unstable_loop() -> None:
     loop = chain(3, None)
     m = malta.robust_margin(*loop, ranges(loop[0]), time=2)
     s = asked(loop)
-    s.until = clock.monotonic() + 2
+    s.until = clock.monotonic() + 1
     assert m.lower is not None
     assert m.lower <= m.upper
     assert s.raise_bound(1.2 * m.upper) < m.upper
+
+
+def test_parts_of_a_box_without_a_pencil_are_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    """However narrow they are, nothing is computed on them: halving ends, and nothing is proven."""
+    s = asked(chain(2, None))
+    monkeypatch.setattr(Structured, "_branch", lambda *_: None)
+    assert s.raise_bound(1.0) == 0.0
+    assert 20 < s.count < 2000
 
 
 @pytest.mark.slow

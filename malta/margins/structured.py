@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from malta.model.plant import FloatArray
 
 NEAR = 0.98  # beta up to which splitting frequency is expected to do
-NARROWEST = 1e-9  # of an interval of frequency, relative
+NARROWEST = 1e-9  # of an interval of frequency, relative; of a part of a box, in sides of box(1)
 LOWEST = 1e-5  # end of the one from zero, relative to the octave that it was cut from
 REMEMBERED = 64  # pencils
 TERMS = 20_000  # of all entries, beyond which they are not expanded
@@ -215,7 +215,7 @@ class Structured:
                     return Attempt(1.0, cell, [])
                 step = step.after(cell, False)
                 todo += [replace(half, near=m) for half in reversed(across_frequency(cell))]
-            elif split:
+            elif split and self._width(cell.sides).max() > NARROWEST:
                 todo += self._across_box(cell, m)
             else:
                 return Attempt(beta, cell, [])
@@ -274,10 +274,13 @@ class Structured:
             return math.inf, None, False
         return beta, m, done
 
+    def _width(self, sides: FloatArray) -> FloatArray:
+        """The widths of a part of a box, in those of box(1)."""
+        return np.asarray((sides[:, 1] - sides[:, 0]) / np.maximum(self.box.up + self.box.down, 1e-300))
+
     def _across_box(self, cell: Cell, m: Multiplier | None) -> list[Cell]:
         sides = cell.sides
-        width = (sides[:, 1] - sides[:, 0]) / np.maximum(self.box.up + self.box.down, 1e-300)
-        axis = int(width.argmax())
+        axis = int(self._width(sides).argmax())
         own = self._branch(cell)
         if own is not None and m is not None:
             found = response(own, cell.low, cell.high)
