@@ -9,6 +9,7 @@ import re
 import shutil
 import subprocess
 import sys
+from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -18,9 +19,12 @@ import pytest
 from conftest import Run, numbers, one_sentence
 from typer.testing import CliRunner
 
+import malta
 from malta import gains
 from malta.cli import main as cli
 from malta.errors import InputError
+from malta.report.ledger import Ledger
+from malta.synthesis.spec import Spec
 
 pytestmark = pytest.mark.usefixtures("proven_once")
 
@@ -675,7 +679,18 @@ def test_ctrl_c_leaves_what_was_computed(run: Run, tmp_path: Path, monkeypatch: 
 
 
 def test_claims_prints_the_ledger(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As a table, as JSON and as Markdown; it is computed once, as nothing but its form differs."""
     monkeypatch.setattr("malta.machines.tubular.evidence.MACHINES", 64)
+    computed: list[Ledger] = []
+
+    def once(specs: Sequence[Spec], *of: Any) -> Ledger:
+        assert [spec.name for spec in specs] == ["table2"]
+        if not computed:
+            computed.append(compute(specs, *of))
+        return computed[0]
+
+    compute = malta.ledger
+    monkeypatch.setattr("malta.report.ledger.ledger", once)
     code, out, err = run("claims", "design/table2.toml")
     assert (code, err) == (0, "")
     assert max(map(len, out.splitlines())) <= WIDTH
