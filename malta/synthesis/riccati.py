@@ -114,6 +114,8 @@ def _by_parts(
 
 def _solve(A: FloatArray, B: FloatArray, Q: FloatArray, what: str, *, discrete: bool) -> _Found:
     """The first solution that is as good as rounding allows, or else the best; R is the identity."""
+    import control
+
     candidates: list[_Found] = []
     failures: list[Exception] = []
     balanced = _balance(A - discrete * np.eye(len(A)), B @ B.T, Q)
@@ -125,7 +127,7 @@ def _solve(A: FloatArray, B: FloatArray, Q: FloatArray, what: str, *, discrete: 
                 X = way(equation)
                 t = t if last else _unit_diagonal(t, X * equation.unit)
             found = _refine(_evaluate(equation, X))
-        except ValueError as error:
+        except (ValueError, control.ControlArgument) as error:
             failures.append(error)
             continue
         if way is not _doubled or _stands(found):
@@ -140,19 +142,23 @@ def _solve(A: FloatArray, B: FloatArray, Q: FloatArray, what: str, *, discrete: 
 
 
 def _hamiltonian(equation: _Equation) -> FloatArray:
-    """X by scipy's Hamiltonian, as control.care has it; time counts in the largest entry of A."""
+    """X by scipy's Hamiltonian; time counts in the largest entry of A."""
+    import control
+
     A, B, Q, R = equation[:4]
     rate = np.abs(A).max() or 1.0
-    return np.asarray(linalg.solve_continuous_are(A / rate, B / np.sqrt(rate), Q / rate, R))
+    return np.asarray(control.care(A / rate, B / np.sqrt(rate), Q / rate, R, method="scipy")[0])
 
 
 def _symplectic(equation: _Equation) -> FloatArray:
-    """X by scipy's pencil, as control.dare has it, from a basis of its stable subspace, [I; X] times some matrix.
+    """X by scipy's pencil, from a basis of its stable subspace, [I; X] times some matrix.
 
     X counts in units of Q. Where weights are weak or samples short Q is small beside X, and the I beside this X: the
     ratio is lost in digits. scipy balances the pencil once more and so returns to these units from any other.
     """
-    return np.asarray(linalg.solve_discrete_are(*equation[:4]))
+    import control
+
+    return np.asarray(control.dare(*equation[:4], method="scipy")[0])
 
 
 def _doubled(equation: _Equation) -> FloatArray:
