@@ -53,7 +53,7 @@ def _engine(
     ready: Prepared, now: Plant, substeps: float, precision: Precision, sessions: dict[int, tuple[Any, Any]]
 ) -> Engine:
     """The engine of a machine; one run has one state of the controller, also where the machine changes on the way."""
-    simulation, inputs, _ = ready
+    simulation, inputs = ready.simulation, ready.inputs
     c, setup = simulation.controller, simulation.setup
     _require_exported(simulation.scenario.name, setup)
     native = compile_controller(_target(c, precision, setup.fidelity))
@@ -179,7 +179,7 @@ def _record(plant: Plant, c: Controller, setup: Setup, p: Period) -> ca.Function
 def _first_state(native: Native, sizes: Layout, ready: Prepared) -> Any:
     """The controller's state at the start of a run: what the simulation's own law would remember."""
     state = new_state(native)
-    _, inputs, start = ready
+    inputs, start = ready.inputs, ready.state
     reference = (inputs.motion.p[0], inputs.motion.dp[0], inputs.motion.ddp[0])
     for name, values in zip(("p", "dp", "ddp"), reference, strict=True):
         view(state.reference, name)[:] = values
