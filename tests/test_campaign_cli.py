@@ -16,6 +16,7 @@ from conftest import Run
 from typer.testing import CliRunner
 
 from malta.cli import main as cli
+from malta.simulation import compiled
 
 pytestmark = pytest.mark.usefixtures("proven_once")
 
@@ -317,3 +318,26 @@ def test_help_shows_an_example_and_no_cluster_is_imported() -> None:
     assert "--replay" in CliRunner().invoke(cli.app, ["simulate", "--help"]).output
     code = "import sys, malta; malta.campaign, malta.Plan; sys.exit('distributed' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_the_exported_c_flies_in_a_campaign(run: Run, tmp_path: Path) -> None:
+    """The same machines and noise: the figures of the law's own campaign to 1e-9, and a replay of a run."""
+    if compiled.compiler() is None:
+        pytest.skip("no C compiler")
+    gains, found = "design/gains/table2.json", {}
+    common = ("--samples", "8", "--json")
+    for law in ("own", "c", "c-float"):
+        code, out, err = run("campaign", gains, *common, "--controller", law, "--out", tmp_path / law)
+        assert code == 0, err
+        found[law] = json.loads(out)
+    merits = {law: document["merits"] for law, document in found.items()}
+    for name, own in merits["own"].items():
+        assert merits["c"][name]["largest"] == pytest.approx(own["largest"], rel=1e-9, abs=1e-15), name
+    assert found["c"]["ends"] == found["own"]["ends"]
+    assert [found[law]["engines"] for law in ("c", "c-float")] == [["exported C, double"], ["exported C, float"]]
+    assert len({document["folder"] for document in found.values()}) == 3
+    code, out, err = run("simulate", gains, "--replay", f"{tmp_path / 'c'}:3")
+    assert code == 0, err
+    code, _, err = run("campaign", gains, "--controller", "rust")
+    assert code == 2
+    assert "campaign: controller: found 'rust', expected one of own, c, c-float" in err

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, NamedTuple
 
-from malta.campaigns.plan import Machines, Plan, draw_machines, planned_run
+from malta.campaigns.plan import PRECISIONS, Machines, Plan, draw_machines, planned_run
+from malta.firmware.flight import engine_of_c
 from malta.simulation.batch import is_compiled, simulate_many
 from malta.simulation.digest import Batch
 from malta.simulation.experiments import Progress
@@ -22,7 +23,7 @@ class Block(NamedTuple):
 
     values: FloatArray  # runs x names, SI: drawn parameters and errors of the sensors
     batch: Batch
-    engine: str  # that simulated them: "compiled" or "virtual machine"
+    engine: str  # that simulated them, see store.ENGINES
 
 
 def simulate_machines(
@@ -45,6 +46,7 @@ def simulate_machines(
         first=first,
         noise=noise,
         workers=workers,
+        engine=None if plan.law == "own" else engine_of_c(PRECISIONS[plan.law]),
         progress=progress,
     )
 
@@ -59,5 +61,12 @@ def fly(
     """
     machines = draw_machines(plan, first, count)
     batch = simulate_machines(plan, machines, first=first, workers=workers, progress=progress)
+    return Block(machines.values, batch, _engine_name(plan))
+
+
+def _engine_name(plan: Plan) -> str:
+    """What simulates a plan's runs."""
+    if plan.law != "own":
+        return f"exported C, {PRECISIONS[plan.law]}"
     compiled = is_compiled(plan.plant, plan.controller, planned_run(plan).scenario)
-    return Block(machines.values, batch, "compiled" if compiled else "virtual machine")
+    return "compiled" if compiled else "virtual machine"

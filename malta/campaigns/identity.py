@@ -98,12 +98,23 @@ def revision_of(plant: Plant, controller: Controller, scenario: Scenario) -> dic
 @cache
 def _engine_sha256() -> str:
     """sha256 of the names and texts of the modules of PACKAGES, and of the engine's C text."""
+    return _sha256(_package_parts(PACKAGES))
+
+
+@cache
+def firmware_sha256() -> str:
+    """The same of the modules that write the exported C, and of its templates."""
+    return _sha256(_package_parts(("firmware", "firmware/templates")))
+
+
+def _package_parts(packages: tuple[str, ...]) -> list[bytes]:
+    """The names and texts of the modules and C files of packages."""
     parts: list[bytes] = []
-    for package in PACKAGES:
+    for package in packages:
         for file in sorted(files("malta").joinpath(package).iterdir(), key=lambda file: file.name):
-            if file.name.endswith((".py", ".c")):
+            if file.name.endswith((".py", ".c", ".h")):
                 parts += [f"{package}/{file.name}".encode(), file.read_bytes()]
-    return _sha256(parts)
+    return parts
 
 
 def _module_parts(name: str) -> list[bytes]:

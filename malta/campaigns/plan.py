@@ -19,9 +19,10 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 import numpy as np
 
 from malta.campaigns.identity import fingerprint as fingerprint
-from malta.campaigns.identity import revision_of
+from malta.campaigns.identity import firmware_sha256, revision_of
 from malta.campaigns.sampling import latin_hypercube, sobol
 from malta.errors import InputError
+from malta.firmware.elementary import Precision
 from malta.gains.encodings import decode
 from malta.model.data import plant_of
 from malta.model.parameters import differences, shape_parameters, twins_of, units_of, values_of
@@ -36,6 +37,8 @@ if TYPE_CHECKING:
 SCHEMA, VERSION = "malta-campaign", 1
 Sampler = Literal["latin-hypercube", "sobol"]
 SAMPLERS: tuple[Sampler, ...] = get_args(Sampler)
+Law = Literal["own", "c", "c-float"]
+PRECISIONS: dict[Law, Precision] = {"c": "double", "c-float": "float"}
 DRAWING = (
     2  # how samplers make points of a seed, see sampling.py; a folder of another version has other machines
 )
@@ -62,6 +65,7 @@ class Plan:
     parameters: Any = None  # of the machine in the middle of the box; None: those of the gain file
     case: str | None = None  # label of one of the scenario's cases; None: the first
     options: Mapping[str, Any] = field(default_factory=dict)  # of the scenario, SI; noise: 1 by default
+    law: Law = "own"  # "c", "c-float": the exported C flies, one machine after the other
 
     def __post_init__(self) -> None:
         machine = self.controller.parameters if self.parameters is None else self.parameters
@@ -127,6 +131,8 @@ def _check_counts(plan: Plan) -> None:
             raise InputError("campaign", name, repr(value), f"a whole number of at least {least}")
     if plan.samples > MOST:
         raise InputError("campaign", "samples", str(plan.samples), f"at most {MOST}")
+    if plan.law not in get_args(Law):
+        raise InputError("campaign", "controller", repr(plan.law), "one of " + ", ".join(get_args(Law)))
     if plan.sampler not in SAMPLERS:
         raise InputError("campaign", "sampler", repr(plan.sampler), "one of " + ", ".join(SAMPLERS))
     for name in ("seed", "run", "engine"):
@@ -189,6 +195,8 @@ def _manifest(plan: Plan) -> dict[str, Any]:
         "sampler": plan.sampler,
         "sampler_version": DRAWING,
     }
+    if plan.law != "own":
+        tables |= {"controller": {"law": plan.law, "sha256": firmware_sha256()}}
     content: dict[str, Any] = _use_integers(json.loads(_compact_json(tables)))
     return content
 

@@ -20,7 +20,7 @@ from types import FrameType
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, get_args
 
 from malta.campaigns.block import Block, fly
-from malta.campaigns.plan import Machines, Plan, draw_machines, planned_run
+from malta.campaigns.plan import PRECISIONS, Machines, Plan, draw_machines, planned_run
 from malta.campaigns.result import Campaign, gather
 from malta.campaigns.store import (
     MANIFEST,
@@ -32,6 +32,7 @@ from malta.campaigns.store import (
 )
 from malta.errors import InputError
 from malta.files import file_exists, replace_files
+from malta.firmware.flight import engine_of_c
 from malta.simulation import compiled
 from malta.simulation.batch import record_run, replayed
 from malta.simulation.catalogue import single_run
@@ -188,7 +189,7 @@ def block_size(plan: Plan, session: Session) -> int:
         raise InputError("campaign", "workers", str(workers), "none with a cluster, which has its own")
     if workers is not None and workers < 1:
         raise InputError("campaign", "workers", str(workers), "at least 1")
-    size = block or (BLOCK if compiled.compiler() or cluster else SLOW_BLOCK)
+    size = block or (BLOCK if plan.law == "own" and (compiled.compiler() or cluster) else SLOW_BLOCK)
     if size < 1 or size % compiled.LANES:
         raise InputError("campaign", "block", f"{size} runs", f"a multiple of {compiled.LANES}")
     while not block and BLOCK <= size < LARGE_BLOCK and plan.samples > FILES * size:
@@ -277,6 +278,8 @@ def replay_machine(
     if noise is not None:
         scenario = replace(scenario, run=tuple(noise[index - first].tolist()))
     own = planned._replace(scenario=scenario)
+    if plan.law != "own" and engine == "auto":
+        engine = engine_of_c(PRECISIONS[plan.law])
     if engine == "virtual machine" or callable(engine):
         return single_run(plan.scenario, plant, plan.controller, own, engine, progress)
     run = record_run(

@@ -142,6 +142,7 @@ def read_plan(folder: str | Path, controller: Controller) -> Plan:
             replace(controller.parameters, **values, preset=machine["preset"]),
             scenario["case"],
             scenario["options"],
+            content.get("controller", {}).get("law", "own"),
         )
     except InputError as error:
         raise InputError(path, error.field, error.found, error.expected) from error
@@ -246,7 +247,7 @@ def read_block(path: Path, plan: Plan, first: int, count: int) -> Block | None:
     return Block(values, Batch(**columns), kind) if whole else None
 
 
-ENGINES = ("compiled", "virtual machine")
+ENGINES = ("compiled", "virtual machine", "exported C, double", "exported C, float")
 
 
 def _are_possible(columns: Mapping[str, Any], plan: Plan, count: int) -> bool:

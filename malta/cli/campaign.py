@@ -45,7 +45,7 @@ from malta.cli.studies import Setting, run_study, study_of
 from malta.errors import InputError
 
 if TYPE_CHECKING:
-    from malta.campaigns.plan import Sampler
+    from malta.campaigns.plan import Law, Sampler
     from malta.campaigns.summary import Summary
 
 
@@ -89,6 +89,12 @@ def campaign(
     delay: Delay = None,
     substeps: Substeps = None,
     seed: Annotated[int, typer.Option(help="Seed of machines and noise.")] = 0,
+    law: Annotated[
+        str,
+        typer.Option(
+            "--controller", help="own; or c, c-float: the exported C flies, one machine after another."
+        ),
+    ] = "own",
     workers: Annotated[int | None, typer.Option(help="Threads. [one for each core]")] = None,
     cluster: Annotated[
         str | None,
@@ -203,6 +209,7 @@ def campaign(
         parameters,
         case,
         options,
+        cast("Law", law),
     )
     bounds = Bounds(published, design_of(gains, controller, design))
     folder = out or Path("build") / "campaigns" / f"{controller.name}_{scenario}_{plan.identity[:8]}"

@@ -40,13 +40,13 @@ from malta.simulation.digest import (
     recorder_function,
     verdicts,
 )
-from malta.simulation.engines import BLOCK, compiled_period, evaluate, library_of, shape_of
+from malta.simulation.engines import BLOCK, EngineChoice, compiled_period, evaluate, library_of, shape_of
 from malta.simulation.inputs import Inputs, initial_values, inputs_of
 from malta.simulation.layout import electronics_of, flatten, layout_of, noise_scales, numbers_of, with_symbols
 from malta.simulation.noise import TOGETHER, advance_keys, keys, starts_of_parts
 from malta.simulation.period import initial_state, period_of
 from malta.simulation.scenario import Scenario, Simulation, setup_of, simulation_of, steps_of
-from malta.simulation.simulate import simulate
+from malta.simulation.simulate import EngineOf, simulate
 from malta.simulation.trajectory import Trajectory, stroke_figures, trajectory_of
 from malta.simulation.translate import source
 from malta.simulation.workers import Work, run_groups
@@ -69,6 +69,7 @@ def simulate_many(
     first: int = 0,
     noise: NDArray[np.int64] | None = None,
     workers: int | None = None,
+    engine: EngineOf | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Batch:
     """Run a scenario on many machines, or from many starts, and keep the figures of each run.
@@ -79,6 +80,7 @@ def simulate_many(
     first : index of the first run; noise depends on scenario.seed and on the index
     noise : runs x parts: each of these equal parts of a run has the noise of the run of this index; None: its own
     workers : threads; None: one for each core
+    engine : makes the engine of each run, one after the other, as `malta.engine_of_c`; None: all machines at once
     progress : called now and then with the share of the runs that is done
 
     Raises InputError for an unknown parameter, for columns of different length, and for a scenario with faults,
@@ -95,6 +97,8 @@ def simulate_many(
     variation = _variation(plant, changes, sensor_errors, starts, first, noise)
     for name in set(changes) & set(shape_parameters(plant.parameters)):
         raise InputError("campaign", name, "another one for each run", "one for all: it shapes the functions")
+    if engine is not None:
+        return _simulate_one_by_one(simulation, variation, progress, engine)
     alone, plant = simulation, with_varied(plant, changes)
     simulation = simulation_of(plant, controller, simulation.scenario)
     shape = shape_of(plant, controller, simulation.setup)
@@ -385,9 +389,12 @@ def _starts_and_noise(
 
 
 def _simulate_one_by_one(
-    simulation: Simulation, variation: Variation, progress: Callable[[float], None] | None
+    simulation: Simulation,
+    variation: Variation,
+    progress: Callable[[float], None] | None,
+    engine: EngineChoice | EngineOf = "virtual machine",
 ) -> Batch:
-    """A batch without a C compiler: every run by `simulate` on CasADi's virtual machine."""
+    """A batch without a C compiler, or with engines of one's own: every run by `simulate`."""
     plant, controller, scenario, _ = simulation
     changes, sensor_errors, starts, noise, runs = variation
     figures: dict[str, list[Any]] = {name: [] for name in Batch.__dataclass_fields__}
@@ -395,7 +402,7 @@ def _simulate_one_by_one(
         machine_k, scenario_k = replayed(plant, scenario, changes, k, sensor_errors=sensor_errors)
         own = dict(scenario_k.start) | {name: float(column[k]) for name, column in starts.items()}
         scenario_k = replace(scenario_k, start=own, run=tuple(noise[k].tolist()))
-        run = simulate(machine_k, controller, scenario_k, engine="virtual machine")
+        run = simulate(machine_k, controller, scenario_k, engine=engine)
         stroke = stroke_figures(run)
         error = run.p - run.reference
         row = {
