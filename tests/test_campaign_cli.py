@@ -320,11 +320,12 @@ def test_help_shows_an_example_and_no_cluster_is_imported() -> None:
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
+@pytest.mark.slow
 def test_the_exported_c_flies_in_a_campaign(run: Run, tmp_path: Path) -> None:
     """The same machines and noise: the figures of the law's own campaign to 1e-9, and a replay of a run."""
     if compiled.compiler() is None:
         pytest.skip("no C compiler")
-    gains, found = "design/gains/table2.json", {}
+    gains, found = "design/gains/robust.json", {}
     common = ("--samples", "8", "--json")
     for law in ("own", "c", "c-float"):
         code, out, err = run("campaign", gains, *common, "--controller", law, "--out", tmp_path / law)
