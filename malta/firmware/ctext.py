@@ -30,7 +30,7 @@ _FORMS = {
     "IF_ELSE_ZERO": "{0} ? {1} : {zero}",
     "PICK": "{0} ? {1} : {2}",
 }
-HEADERS = ("float", "math", "stdint", "stdio", "string")  # of the standard library, which NAME.h may not hide
+HEADERS = ("float", "math", "stdbool", "stdint", "stdio", "string")  # of C, which NAME.h may not hide
 _CONDITIONS = {"NOT": 1, "AND": 2, "OR": 2, "IF_ELSE_ZERO": 1, "PICK": 1}  # operands that are true or false
 
 
@@ -62,7 +62,7 @@ def signature(p: Program, prefix: str) -> str:
 def function_text(p: Program, prefix: str, precision: Precision, *, static: bool = False) -> str:
     """The C function of a program. All arguments are read before a result is written: they may be the same arrays."""
     kind = f"{prefix}_real"
-    zero = c_number(0.0, precision)
+    zero, one = c_number(0.0, precision), c_number(1.0, precision)
     inputs = {k for k, o in enumerate(p.operations) if o.op == "INPUT"}
     direct = {k: c_number(o.value, precision) for k, o in enumerate(p.operations) if o.op == "CONST"}
     lines = []
@@ -73,7 +73,7 @@ def function_text(p: Program, prefix: str, precision: Precision, *, static: bool
             return f"({direct[k]} != {zero})" if condition else _bracketed(direct[k])
         if condition:
             return f"t{k}" if is_truth else f"(t{k} != {zero})"
-        return f"({kind})t{k}" if is_truth else f"t{k}"
+        return f"(t{k} ? {one} : {zero})" if is_truth else f"t{k}"
 
     for k, operation in enumerate(p.operations):
         if operation.op == "CONST":
@@ -85,7 +85,7 @@ def function_text(p: Program, prefix: str, precision: Precision, *, static: bool
             conditions = _CONDITIONS.get(operation.op, 0)
             operands = [text(a, condition=i < conditions) for i, a in enumerate(operation.operands)]
             value = _FORMS[operation.op].format(*operands, zero=zero, root=f"{prefix}_root")
-            of = "int" if operation.op in TRUTHS else kind
+            of = "bool" if operation.op in TRUTHS else kind
         lines.append(f"  const {of} t{k} = {value};")
     for i, j, k in p.outputs:
         lines.append(f"  {p.results[i][0]}[{j}] = {text(k)};")

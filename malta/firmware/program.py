@@ -70,7 +70,7 @@ def program_of(f: ca.Function) -> Program:
         elif NAMES[op] in _RULES:
             operands = tuple(work[r] for r in reads)
             work[writes[0]] = place(
-                _picked(operations, NAMES[op], operands) or Operation(NAMES[op], operands)
+                _shorter(operations, NAMES[op], operands) or Operation(NAMES[op], operands)
             )
         else:
             raise CheckError(f"firmware has no {NAMES[op]}")
@@ -79,8 +79,14 @@ def program_of(f: ca.Function) -> Program:
     return _without_unused(Program(f.name(), arguments, results, tuple(operations), tuple(outputs)))
 
 
-def _picked(operations: list[Operation], name: str, operands: tuple[int, ...]) -> Operation | None:
-    """(c ? x : 0) + (not c ? y : 0), as CasADi writes if_else(c, x, y), as one operation; None for others."""
+def _shorter(operations: list[Operation], name: str, operands: tuple[int, ...]) -> Operation | None:
+    """A shorter operation with the same value; None where there is none.
+
+    The larger of two truths is their disjunction, the smaller one their conjunction. (c ? x : 0) + (not c ? y : 0), as
+    CasADi writes if_else(c, x, y), is one choice.
+    """
+    if name in ("FMIN", "FMAX") and all(operations[k].op in TRUTHS for k in operands):
+        return Operation("OR" if name == "FMAX" else "AND", operands)
     if name != "ADD":
         return None
     first, second = (operations[k] for k in operands)
@@ -113,7 +119,7 @@ _RULES: dict[str, Callable[..., Any]] = {
     "DIV": lambda a, b: a / b,
     "NEG": lambda a: -a,
     "FABS": abs,
-    "SQRT": np.sqrt,
+    "SQRT": lambda a: np.sqrt(a) if a > 0 else 0.0,
     "FMIN": lambda a, b: a if a < b else b,
     "FMAX": lambda a, b: a if a > b else b,
     "LT": lambda a, b: a < b,
@@ -145,7 +151,7 @@ def evaluate(p: Program, given: Mapping[str, Any], precision: Precision) -> dict
                 values.append(real(operation.value))
             else:
                 found = _RULES[operation.op](*(values[k] for k in operation.operands))
-                values.append(found if operation.op in TRUTHS else real(found))
+                values.append(bool(found) if operation.op in TRUTHS else real(found))
     results = {name: np.zeros(size, dtype=real) for name, size in p.results}
     names = [name for name, _ in p.results]
     for i, j, k in p.outputs:

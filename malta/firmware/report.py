@@ -8,6 +8,7 @@ from typing import Any
 
 from malta.firmware.cost import CLOCK, PROCESSORS, costs, operations
 from malta.firmware.export import comment, render
+from malta.firmware.misra import DEVIATIONS
 from malta.firmware.parts import LINK_RANGE
 from malta.firmware.rounding import SAMPLES, rounded_margin, rounding_noise, smallest_error
 from malta.firmware.signals import Target, reading_ranges
@@ -49,6 +50,7 @@ def report_text(
             "rounding_text": _rounding_text(t),
             "noise": _noise(t),
             "rounding_samples": SAMPLES,
+            "deviations": DEVIATIONS,
             "margin_text": _margin_text(t, uncertainty, proof=proof),
             "link_range": f"{LINK_RANGE[0]:g} to {LINK_RANGE[1]:g} times its nominal value",
             "ranges": [

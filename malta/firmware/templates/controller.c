@@ -2,6 +2,7 @@
 #include "{{ name }}.h"
 
 #include <float.h>
+#include <stdbool.h>
 
 #if defined(__FAST_MATH__)
 #error "compile {{ name }}.c without fast mathematics"
@@ -13,15 +14,8 @@
 #pragma STDC FP_CONTRACT OFF
 #endif
 
-static const {{ name }}_real own_z[{{ points }}] = {
-{{ z_rows }}
-};
-static const {{ name }}_real own_v0[{{ points * forces }}] = { /* N, {{ force_names }} */
-{{ v0_rows }}
-};
-static const {{ name }}_real force_limit[{{ forces }}] = { {{ force_limits }} };
-static const {{ name }}_real reach[{{ outputs }}] = { {{ ranges }} }; /* of references */
-
+{# The place of force j in row k of a table of v0(z). #}
+{% macro entry(k) %}{{ k if forces == 1 else "(%s * %d)"|format(k, forces) }} + j{% endmacro %}
 {% if root %}
 {% include "root.c" %}
 
@@ -52,14 +46,20 @@ static void look_up(const {{ name }}_state *s, {{ name }}_real z, {{ name }}_rea
     const {{ name }}_real rest = {{ one }} - share;
     int32_t j;
     for (j = 0; j < {{ forces }}; j++) {
-      const {{ name }}_real before = rest * s->v0[(low * {{ forces }}) + j];
-      const {{ name }}_real after = share * s->v0[(high * {{ forces }}) + j];
+      const {{ name }}_real before = rest * s->v0[{{ entry("low") }}];
+      const {{ name }}_real after = share * s->v0[{{ entry("high") }}];
       v0[j] = before + after;
     }
   }
 }
 
 void {{ name }}_init({{ name }}_state *s) {
+  static const {{ name }}_real own_z[{{ points }}] = {
+{{ z_rows }}
+  };
+  static const {{ name }}_real own_v0[{{ points * forces }}] = { /* N, {{ force_names }} */
+{{ v0_rows }}
+  };
   int32_t k;
 {% for f in state %}
   for (k = 0; k < {{ f.size }}; k++) {
@@ -93,48 +93,44 @@ void {{ name }}_step({{ name }}_state *s, const {{ name }}_inputs *in, {{ name }
 }
 
 int32_t {{ name }}_set_reference({{ name }}_state *s, const {{ name }}_reference *r) {
-  int32_t accepted = 1;
+  static const {{ name }}_real reach[{{ outputs }}] = { {{ ranges }} };
+  bool accepted = true;
   int32_t k;
   for (k = 0; k < {{ outputs }}; k++) {
-    const int32_t near = ((r->p[k] <= reach[k]) && (r->p[k] >= -reach[k])) ? 1 : 0;
-    const int32_t slow = ((r->dp[k] <= {{ most_rate }}) && (r->dp[k] >= -{{ most_rate }})) ? 1 : 0;
-    const int32_t even = ((r->ddp[k] <= {{ most_rate }}) && (r->ddp[k] >= -{{ most_rate }})) ? 1 : 0;
-    if ((near + slow + even) != 3) { /* a NaN is in no interval */
-      accepted = 0;
-    }
+    const bool near = (r->p[k] <= reach[k]) && (r->p[k] >= -reach[k]);
+    const bool slow = (r->dp[k] <= {{ most_rate }}) && (r->dp[k] >= -{{ most_rate }});
+    const bool even = (r->ddp[k] <= {{ most_rate }}) && (r->ddp[k] >= -{{ most_rate }});
+    accepted = accepted && near && slow && even; /* a NaN is in no interval */
   }
-  for (k = 0; (accepted == 1) && (k < {{ outputs }}); k++) {
+  for (k = 0; accepted && (k < {{ outputs }}); k++) {
     s->reference.p[k] = r->p[k];
     s->reference.dp[k] = r->dp[k];
     s->reference.ddp[k] = r->ddp[k];
   }
-  return accepted;
+  return accepted ? 1 : 0;
 }
 
 int32_t {{ name }}_set_v0_table({{ name }}_state *s, int32_t points, const {{ name }}_real z[], const {{ name }}_real v0[]) {
-  int32_t accepted = ((points >= 2) && (points <= {{ most_points }})) ? 1 : 0;
+  static const {{ name }}_real most[{{ forces }}] = { {{ force_limits }} }; /* N */
+  bool accepted = (points >= 2) && (points <= {{ most_points }});
   int32_t k;
-  for (k = 0; (accepted == 1) && (k < points); k++) {
+  for (k = 0; accepted && (k < points); k++) {
     int32_t j;
-    if (!((z[k] >= -{{ most_rate }}) && (z[k] <= {{ most_rate }}))) {
-      accepted = 0;
-    }
-    if ((k > 0) && !(z[k] > z[k - 1])) {
-      accepted = 0;
+    accepted = (z[k] >= -{{ most_rate }}) && (z[k] <= {{ most_rate }});
+    if (accepted && (k > 0)) {
+      accepted = z[k] > z[k - 1];
     }
     for (j = 0; j < {{ forces }}; j++) {
-      const {{ name }}_real force = v0[(k * {{ forces }}) + j];
-      if (!((force <= force_limit[j]) && (force >= -force_limit[j]))) {
-        accepted = 0;
-      }
+      const {{ name }}_real force = v0[{{ entry("k") }}];
+      accepted = accepted && (force <= most[j]) && (force >= -most[j]);
     }
   }
-  if (accepted == 1) {
+  if (accepted) {
     s->points = points;
     s->z = z;
     s->v0 = v0;
   }
-  return accepted;
+  return accepted ? 1 : 0;
 }
 
 void {{ name }}_reset_integrators({{ name }}_state *s) {
@@ -151,27 +147,26 @@ int32_t {{ name }}_start_stroke({{ name }}_stroke *k, int32_t profile, {{ name }
                        {{ name }}_real rise) {
   const {{ name }}_real most = {{ travel }};
   const {{ name }}_real limit = {{ longest_rise }};
-  int32_t accepted = ((profile == {{ NAME }}_LOGISTIC) || (profile == {{ NAME }}_QUINTIC)) ? 1 : 0;
-  if (!((start <= most) && (start >= -most) && (end <= most) && (end >= -most))) {
-    accepted = 0;
-  }
-  if (!((rise >= {{ NAME }}_SAMPLE_TIME) && (rise <= limit))) {
-    accepted = 0;
-  }
-  if (accepted == 1) {
+  const bool known = (profile == {{ NAME }}_LOGISTIC) || (profile == {{ NAME }}_QUINTIC);
+  const bool near = (start <= most) && (start >= -most) && (end <= most) && (end >= -most);
+  const bool slow = (rise >= {{ NAME }}_SAMPLE_TIME) && (rise <= limit);
+  const bool accepted = known && near && slow;
+  if (accepted) {
     const {{ name }}_real lasts = {{ rises }} * rise;
+    const {{ name }}_real periods = lasts / {{ NAME }}_SAMPLE_TIME;
     k->profile = profile;
     k->start = start;
     k->end = end;
     k->rise = rise;
     k->sample = 0;
-    k->samples = (int32_t)(lasts / {{ NAME }}_SAMPLE_TIME) + 1;
+    k->samples = (int32_t)periods + 1;
   }
-  return accepted;
+  return accepted ? 1 : 0;
 }
 
 int32_t {{ name }}_follow_stroke({{ name }}_stroke *k, {{ name }}_reference *r) {
-  const {{ name }}_real count = ({{ name }}_real)((2 * k->sample) - k->samples);
+  const int32_t halves = (2 * k->sample) - k->samples; /* since the middle */
+  const {{ name }}_real count = ({{ name }}_real)halves;
   const {{ name }}_real half = {{ half }} * {{ NAME }}_SAMPLE_TIME;
   {{ name }}_real t[1];
   {{ name }}_real share[1];

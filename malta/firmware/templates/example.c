@@ -2,10 +2,9 @@
    are here, they run on a PC. Written by malta {{ version }}. */
 #include "{{ name }}.h"
 
-static int32_t samples_left = {{ example_samples }};
-
 /* Wait for the timer of {{ period }}; 0 ends the program. */
 static int32_t wait_for_timer(void) {
+  static int32_t samples_left = {{ example_samples }};
   samples_left--;
   return (samples_left >= 0) ? 1 : 0;
 }

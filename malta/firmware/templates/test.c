@@ -6,6 +6,7 @@
 #include <stdio.h>
 #include <string.h>
 
+#define VECTORS {{ vectors|length }}
 #define SAMPLES {{ samples }}
 #define READINGS {{ readings }}
 #define ANSWERS {{ answers }}
@@ -23,9 +24,12 @@ static uint32_t add_bits(uint32_t sum, {{ name }}_real value) {
   const {{ name }}_real plain = (value == {{ zero }}) ? {{ zero }} : value; /* -0 is 0 */
 {% if precision == "double" %}
   uint64_t bits;
+  uint64_t upper;
+  uint32_t half;
   (void)memcpy(&bits, &plain, sizeof bits);
-  sum = (sum ^ (uint32_t)(bits >> 32)) * {{ fnv_factor }}u;
-  return (sum ^ (uint32_t)(bits & 0xFFFFFFFFu)) * {{ fnv_factor }}u;
+  upper = bits >> 32;
+  half = (sum ^ (uint32_t)upper) * {{ fnv_factor }}u;
+  return (half ^ (uint32_t)bits) * {{ fnv_factor }}u;
 {% else %}
   uint32_t bits;
   (void)memcpy(&bits, &plain, sizeof bits);
@@ -33,7 +37,8 @@ static uint32_t add_bits(uint32_t sum, {{ name }}_real value) {
 {% endif %}
 }
 
-static uint32_t add_all(uint32_t sum, const {{ name }}_real values[], int32_t count) {
+static uint32_t add_all(uint32_t begin, const {{ name }}_real values[], int32_t count) {
+  uint32_t sum = begin;
   int32_t k;
   for (k = 0; k < count; k++) {
     sum = add_bits(sum, values[k]);
@@ -41,17 +46,18 @@ static uint32_t add_all(uint32_t sum, const {{ name }}_real values[], int32_t co
   return sum;
 }
 
-static void take({{ name }}_real to[], const {{ name }}_real **from, int32_t count) {
+static void take({{ name }}_real to[], const {{ name }}_real from[], int32_t *next, int32_t count) {
   int32_t k;
   for (k = 0; k < count; k++) {
-    to[k] = (*from)[k];
+    to[k] = from[*next + k];
   }
-  *from += count;
+  *next = *next + count;
 }
 
 /* Compare one sample; 0 where all bits agree. */
 static int32_t compare(const vector *v, int32_t k, const {{ name }}_state *s, const {{ name }}_outputs *out) {
   uint32_t sum = {{ fnv_start }}u;
+  int32_t differs = 0;
   int32_t j;
 {% for f in output_all %}
   sum = add_all(sum, out->{{ f.name }}, {{ f.size }});
@@ -59,52 +65,54 @@ static int32_t compare(const vector *v, int32_t k, const {{ name }}_state *s, co
 {% for f in state_all %}
   sum = add_all(sum, s->{{ f.name }}, {{ f.size }});
 {% endfor %}
-  if (sum == v->checksums[k]) {
-    return 0;
+  if (sum != v->checksums[k]) {
+    differs = 1;
+    (void)printf("%s: sample %ld differs\n", v->name, (long)k);
   }
-  (void)printf("%s: sample %ld differs\n", v->name, (long)k);
-  for (j = 0; j < ANSWERS; j++) {
-    const {{ name }}_real found = (j < {{ forces }}) ? out->v[j] : out->{{ last_field }}[j - {{ forces }}];
+  for (j = 0; (differs == 1) && (j < ANSWERS); j++) {
+    const int32_t entry = (j < {{ forces }}) ? j : (j - {{ forces }});
+    const {{ name }}_real found = (j < {{ forces }}) ? out->v[j] : out->{{ last_field }}[entry];
     if (!(found == v->answers[k][j])) {
-      (void)printf("  %s[%ld] is %.17g, expected %.17g\n", (j < {{ forces }}) ? "v" : "{{ last_field }}",
-                   (long)((j < {{ forces }}) ? j : (j - {{ forces }})), (double)found, (double)v->answers[k][j]);
+      (void)printf("  %s[%ld] is %.17g, expected %.17g\n", (j < {{ forces }}) ? "v" : "{{ last_field }}", (long)entry,
+                   (double)found, (double)v->answers[k][j]);
     }
   }
-  return 1;
+  return differs;
 }
 
 static int32_t run(const vector *v, uint32_t *total) {
   {{ name }}_state s;
   {{ name }}_inputs in;
   {{ name }}_outputs out;
+  int32_t failed = 0;
   int32_t k;
   {{ name }}_init(&s);
-  for (k = 0; k < SAMPLES; k++) {
-    const {{ name }}_real *from = v->readings[k];
+  for (k = 0; (failed == 0) && (k < SAMPLES); k++) {
+    int32_t next = 0;
     {{ name }}_reference r;
 {% for f in reference_all %}
-    take(r.{{ f.name }}, &from, {{ f.size }});
+    take(r.{{ f.name }}, v->readings[k], &next, {{ f.size }});
 {% endfor %}
 {% for f in input_all %}
-    take(in.{{ f.name }}, &from, {{ f.size }});
+    take(in.{{ f.name }}, v->readings[k], &next, {{ f.size }});
 {% endfor %}
     if ({{ name }}_set_reference(&s, &r) == 0) {
       (void)printf("%s: sample %ld: the reference is refused\n", v->name, (long)k);
-      return 1;
+      failed = 1;
+    } else {
+      if ((k == 0) && (v->warm == 1)) {
+        {{ name }}_start(&s);
+      }
+      {{ name }}_step(&s, &in, &out);
+      failed = compare(v, k, &s, &out);
+      *total = (*total ^ v->checksums[k]) * {{ fnv_factor }}u;
     }
-    if ((k == 0) && (v->warm == 1)) {
-      {{ name }}_start(&s);
-    }
-    {{ name }}_step(&s, &in, &out);
-    if (compare(v, k, &s, &out) != 0) {
-      return 1;
-    }
-    *total = (*total ^ v->checksums[k]) * {{ fnv_factor }}u;
   }
-  return 0;
+  return failed;
 }
 
-static const vector vectors[] = {
+int main(void) {
+  static const vector vectors[VECTORS] = {
 {% for v in vectors %}
   { "{{ v.name }}", {{ v.warm }}, {
 {{ v.readings }}
@@ -114,18 +122,15 @@ static const vector vectors[] = {
 {{ v.checksums }}
   } },
 {% endfor %}
-};
-
-int main(void) {
-  const int32_t count = (int32_t)(sizeof vectors / sizeof vectors[0]);
+  };
   uint32_t total = {{ fnv_start }}u;
   int32_t failed = 0;
   int32_t k;
-  for (k = 0; k < count; k++) {
+  for (k = 0; k < VECTORS; k++) {
     failed += run(&vectors[k], &total);
   }
   if (failed == 0) {
-    (void)printf("pass: %ld vectors of %ld samples, checksum %08lx\n", (long)count, (long)SAMPLES,
+    (void)printf("pass: %ld vectors of %ld samples, checksum %08lx\n", (long)VECTORS, (long)SAMPLES,
                  (unsigned long)total);
   }
   return (failed == 0) ? 0 : 1;
