@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import ROOT
+from exported import PRECISIONS, controller, target
 
 import malta
 from malta.firmware.elementary import Precision
@@ -17,16 +17,14 @@ from malta.firmware.flight import differences, engine_of_c
 from malta.firmware.native import call, call_piece, compile_controller, new_state, view, write
 from malta.firmware.parts import parts_of
 from malta.firmware.program import evaluate, program_of
-from malta.firmware.signals import Target, fidelity_of, reading_ranges, reference_fields, state_fields
+from malta.firmware.signals import reading_ranges, reference_fields, state_fields
 from malta.firmware.step import step_of
 from malta.simulation.compiled import compiler
-from malta.synthesis.controller import Controller
 
 NAMES = [
     *("robust", "tubular_pid", "halbach", "halbach_late"),
     *(pytest.param(n, marks=pytest.mark.slow) for n in ("table2", "robust_observer", "planar", "planar_pid")),
 ]
-PRECISIONS: tuple[Precision, ...] = ("double", "float")
 WARNINGS = (
     *("-std=c99", "-O2", "-ffp-contract=off", "-fno-math-errno", "-Werror", "-Wall", "-Wextra", "-Wpedantic"),
     *("-Wconversion", "-Wdouble-promotion", "-Wshadow", "-Wstrict-prototypes", "-Wmissing-prototypes"),
@@ -38,15 +36,6 @@ WARNINGS = (
 def _with_compiler() -> None:
     if compiler() is None:
         pytest.skip("no C compiler")
-
-
-def controller(name: str) -> Controller:
-    return malta.gains.read(ROOT / "design" / "gains" / f"{name}.json")
-
-
-def target(name: str, precision: Precision) -> Target:
-    c = controller(name)
-    return Target(c, precision, fidelity_of(malta.plant_of(c.parameters)))
 
 
 @pytest.mark.parametrize("precision", PRECISIONS)

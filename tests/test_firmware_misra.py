@@ -1,0 +1,46 @@
+"""MISRA C:2012: cppcheck finds no rule in an exported folder but those that malta gives a reason for."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+from exported import PRECISIONS, require, run, texts, write_folder
+
+from malta.firmware.elementary import Precision
+from malta.firmware.misra import DEVIATIONS
+
+CHECKS = ("--addon=misra", "--enable=warning,style,performance,portability", "--std=c99", "--quiet")
+SECONDS = 200.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("precision", PRECISIONS)
+def test_deviations_are_those_with_a_reason(precision: Precision, tmp_path: Path) -> None:
+    """Each file alone, as two programs share a folder; a deviation that no longer exists leaves the list too."""
+    require("cppcheck")
+    folder = write_folder("halbach", precision, tmp_path)
+    found = set()
+    for path in sorted(folder.glob("*.c")):
+        command = [
+            "cppcheck",
+            *CHECKS,
+            "--template={file} {id}",
+            "--suppress=missingIncludeSystem",
+            path.name,
+        ]
+        done = run(command, folder, SECONDS)
+        if "misra" in done.stdout:  # of the addon that is not installed
+            pytest.skip(done.stdout.splitlines()[0])
+        for file, rule in re.findall(r"^(\S+) (\S+)$", done.stderr, re.MULTILINE):
+            of = {d.rule for d in DEVIATIONS if file.endswith(d.files)}
+            assert rule.removeprefix("misra-c2012-") in of, f"{file} deviates from {rule}"
+            found.add(rule.removeprefix("misra-c2012-"))
+    assert found == {d.rule for d in DEVIATIONS}
+
+
+def test_the_report_has_the_deviations() -> None:
+    report = texts("halbach", "double")["REPORT.md"]
+    for d in DEVIATIONS:
+        assert f"| {d.rule} | `*{d.files}` | {d.reason} |" in report
