@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -126,3 +127,17 @@ def unit_factor(unit: str, name: str) -> float:
         return float(factor / 1000.0 ** float(grams))
     except Exception as error:  # pint raises many kinds, tokenizer errors among them
         raise InputError("data", name, _quoted(unit), "a unit") from error
+
+
+@cache
+def base_exponents(unit: str) -> Mapping[str, int]:
+    """The exponents of kg, m, s, A and rad in a unit. Raises InputError for an unknown unit.
+
+    >>> base_exponents("N m")
+    {'kg': 1, 'm': 2, 's': -2}
+    """
+    symbols = {"gram": "kg", "meter": "m", "second": "s", "ampere": "A", "radian": "rad"}
+    unit_factor(unit, "unit")
+    _, root = _root_units("" if unit == "1" else unit)
+    powers = {symbols[name]: int(power) for name, power in root._units.items()}
+    return dict(sorted(powers.items()))

@@ -165,6 +165,20 @@ def _compile(cc: tuple[str, ...], text: str, lanes: int, path: Path, flags: tupl
     return False
 
 
+def shared_library(files: Mapping[str, bytes], flags: tuple[str, ...]) -> bytes | None:
+    """The shared library of C files by name, for all processors of this kind; None where no compiler can make it."""
+    cc = compiler()
+    if cc is None:
+        return None
+    with tempfile.TemporaryDirectory() as folder:
+        for name, content in files.items():
+            (Path(folder) / name).write_bytes(content)
+        texts = [str(Path(folder) / name) for name in sorted(files) if name.endswith(".c")]
+        made = Path(folder) / "library"
+        found = _answer([*cc, *flags, *texts, "-o", str(made), "-lm"])
+        return made.read_bytes() if found is not None and found[0] == 0 else None
+
+
 def address_of(array: Any) -> ctypes.c_void_p:
     return ctypes.c_void_p(array.ctypes.data)
 

@@ -1,0 +1,163 @@
+"""FMUs of the controller, its machine, or the loop of both: C for co-simulation by FMI 2.0 and 3.0, in one archive.
+
+The archive has the sources, this computer's binary where there is a C compiler, and a model description with units and
+start values. The same gain file gives the same bytes: dates are fixed, and the token that ties binary and description
+together is the SHA-256 of the sources and the description. Python is not needed where an FMU runs.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import platform
+import sys
+import zipfile
+from collections.abc import Mapping
+from importlib.metadata import version
+from importlib.resources import files as resources
+from pathlib import Path
+from typing import Any, NamedTuple
+from xml.sax.saxutils import quoteattr
+
+from malta.errors import InputError
+from malta.files import replace_files
+from malta.firmware.export import render
+from malta.firmware.native import FLAGS
+from malta.firmware.signals import Target
+from malta.firmware.unit import Part, Unit, unit_of, unit_sources
+from malta.simulation.compiled import shared_library
+from malta.units import base_exponents, unit_factor
+
+VERSIONS = (2, 3)
+HEADERS = {
+    2: ("fmi2FunctionTypes.h", "fmi2Functions.h", "fmi2TypesPlatform.h"),
+    3: ("fmi3FunctionTypes.h", "fmi3Functions.h", "fmi3PlatformTypes.h"),
+}
+WITHOUT_COMPILER = (
+    "without a binary, because no C compiler works here: the importing tool has to compile the sources"
+)
+DATE = (1980, 1, 1, 0, 0, 0)  # of all members
+STOP = 0.1  # s, of the default experiment
+NOWHERE = "0" * 64  # in place of the token while it is computed
+
+
+class Fmu(NamedTuple):
+    """An FMU as a file's content, and a sentence where it has no binary."""
+
+    content: bytes
+    note: str
+
+
+def write_fmu(path: Path, t: Target, sha256: str, *, part: Part = "controller", fmi: int = 2) -> str:
+    """Write an FMU. Returns a sentence where it has no binary, else "".
+
+    sha256 : of the gain file
+    part : "controller", "machine" or "loop"
+    fmi : version of the interface, 2 or 3
+
+    Raises InputError for another part or version, and for a machine that cannot be exported.
+
+        c = malta.gains.read("design/gains/robust.json")
+        write_fmu(Path("robust.fmu"), Target(c), "0" * 64, part="loop", fmi=3)
+    """
+    fmu = build_fmu(t, sha256, part=part, fmi=fmi)
+    replace_files({path: fmu.content})
+    return fmu.note
+
+
+def build_fmu(t: Target, sha256: str, *, part: Part = "controller", fmi: int = 2) -> Fmu:
+    """The content of an FMU: see `write_fmu`."""
+    if fmi not in VERSIONS:
+        raise InputError("export", "fmi", repr(fmi), "2 or 3")
+    unit = unit_of(t, part)
+    digest = hashlib.sha256()
+    for name, text in sorted(_texts(unit, sha256, fmi, NOWHERE).items()):
+        digest.update(f"{name}\n{text}\n".encode())
+    members = {name: text.encode() for name, text in _texts(unit, sha256, fmi, digest.hexdigest()).items()}
+    own = {
+        name.removeprefix("sources/"): data for name, data in members.items() if name.endswith((".c", ".h"))
+    }
+    binary = shared_library(own, (*FLAGS, "-fvisibility=hidden"))
+    if binary is not None:
+        members[f"binaries/{platform_of(fmi)}/{identifier_of(unit)}{_ending()}"] = binary
+    return Fmu(_archive(members), "" if binary is not None else WITHOUT_COMPILER)
+
+
+def identifier_of(u: Unit) -> str:
+    """The model identifier, which names the binary."""
+    return f"{u.name}_{u.part}"
+
+
+def platform_of(fmi: int) -> str:
+    """The folder of this computer's binaries in an FMU."""
+    system = "darwin" if sys.platform == "darwin" else "linux"
+    if fmi == 2:
+        return f"{system}64"
+    machine = platform.machine().lower()
+    return f"{ {'arm64': 'aarch64', 'amd64': 'x86_64'}.get(machine, machine) }-{system}"
+
+
+def _ending() -> str:
+    return ".dylib" if sys.platform == "darwin" else ".so"
+
+
+def _texts(u: Unit, sha256: str, fmi: int, token: str) -> dict[str, str]:
+    """All text files of an FMU by their place in it."""
+    context = _context(u, sha256, token)
+    own = unit_sources(u, sha256, token) | {f"fmi{fmi}.c": render(f"fmu_fmi{fmi}.c", context)}
+    context |= {"files": sorted(name for name in own if name.endswith(".c"))}
+    texts = {f"sources/{name}": text for name, text in own.items()}
+    for name in HEADERS[fmi]:
+        texts[f"sources/{name}"] = (
+            (resources("malta.firmware") / "templates" / "fmi" / name).read_bytes().decode()
+        )
+    if fmi == 3:
+        texts["sources/buildDescription.xml"] = render("fmu_build.xml", context)
+    texts["documentation/index.html"] = render("fmu_index.html", context)
+    return texts | {"modelDescription.xml": render(f"fmu_fmi{fmi}.xml", context)}
+
+
+def _context(u: Unit, sha256: str, token: str) -> dict[str, Any]:
+    t, c = u.target, u.target.controller
+    words = {
+        "controller": "The controller",
+        "machine": "The machine",
+        "loop": "The controller and the machine",
+    }
+    return {
+        "title": f"{c.name} {u.part}",
+        "description": f"{words[u.part]} of a {t.believed.name}, sampled every {c.sample_time * 1e6:g} us",
+        "version": version("malta"),
+        "sha256": sha256,
+        "token": token,
+        "part": u.part,
+        "identifier": identifier_of(u),
+        "sample_time": repr(c.sample_time),
+        "stop": repr(max(STOP, 10 * c.sample_time)),
+        "variables": u.variables,
+        "units": _units(u),
+    }
+
+
+def _units(u: Unit) -> list[dict[str, str]]:
+    """The units of all variables, with the exponents of their base units as attributes."""
+    found = []
+    for name in sorted({v.unit for v in u.variables if v.unit}):
+        factor = unit_factor(name, "unit")
+        numbers = dict(base_exponents(name)) | ({} if factor == 1 else {"factor": repr(factor)})
+        base = "".join(f" {key}={quoteattr(str(value))}" for key, value in sorted(numbers.items()))
+        found.append({"name": name, "base": base})
+    return found
+
+
+def _archive(members: Mapping[str, bytes]) -> bytes:
+    """A zip archive whose bytes depend on its members alone."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:
+        for name in sorted(members):
+            info = zipfile.ZipInfo(name, DATE)
+            info.compress_type = zipfile.ZIP_DEFLATED
+            info.create_system = 3
+            info.external_attr = (0o755 if name.startswith("binaries/") else 0o644) << 16
+            archive.writestr(info, members[name])
+    return buffer.getvalue()

@@ -1,0 +1,44 @@
+/* A {{ machine }} between two samples, which are {{ period }} apart: see {{ name }}.c. Units are SI. */
+#ifndef {{ NAME }}_H
+#define {{ NAME }}_H
+
+#include <stdint.h>
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+typedef double {{ name }}_real;
+
+typedef struct {
+  {{ name }}_real state[{{ state }}];
+{% if delay %}
+  {{ name }}_real under_way[{{ delay * held }}]; /* commands that do not act yet */
+{% endif %}
+  {{ name }}_real samples; /* since the start */
+  {{ name }}_real substeps;
+} {{ name }}_state;
+
+typedef struct {
+{% for f in reads %}
+  {{ name }}_real {{ f.name }}[{{ f.size }}]; /* {{ f.meaning }} */
+{% endfor %}
+} {{ name }}_readings;
+
+/* The machine at x[{{ states }}], with the currents that make v0 there. Also what integrals of current loops hold then. */
+void {{ name }}_start({{ name }}_state *s, const {{ name }}_real x[{{ states }}]{% if volts %}, {{ name }}_real u_integral[{{ volts }}]{% endif %});
+
+/* One sample{% if delay %}; the command acts {{ delay }} later where `late` is not 0, else at once{% endif %}. */
+void {{ name }}_step({{ name }}_state *s, const {{ name }}_real command[{{ held }}]{% if wrench %}, const {{ name }}_real w[{{ wrench }}]{% endif %}{% if delay %}, int32_t late{% endif %});
+
+/* What is known of the machine now. */
+void {{ name }}_look(const {{ name }}_state *s, {{ name }}_readings *r);
+{% for text in declarations %}
+
+{{ text }};
+{% endfor %}
+
+#ifdef __cplusplus
+}
+#endif
+#endif

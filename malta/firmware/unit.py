@@ -1,0 +1,237 @@
+"""A unit of co-simulation: the controller, its machine, or both, as variables and C that knows nothing of FMI.
+
+A step takes the inputs at its beginning and leaves the outputs at its end. A master that lets the controller step first
+hands its commands to the machine in the same sample, and the machine delays them (`late`). A master that lets both step
+at once adds a sample by itself: with a delay of one sample, `late` is 0 there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from importlib.metadata import version
+from typing import Any, Literal, NamedTuple, get_args
+
+import casadi as ca
+import numpy as np
+
+from malta.errors import InputError
+from malta.firmware.ctext import c_name, c_number
+from malta.firmware.export import comment, render, sources
+from malta.firmware.machine import (
+    Machine,
+    command_field,
+    machine_functions,
+    machine_sources,
+    reading_fields,
+    state_field,
+    wrench_fields,
+)
+from malta.firmware.signals import Field, Target, input_fields, output_fields, reference_fields
+from malta.model.plant import Signal
+from malta.simulation.period import initial_state
+
+Part = Literal["controller", "machine", "loop"]
+PARTS: tuple[Part, ...] = get_args(Part)
+LATE = Field("late", (Signal("", "1"),), "1: commands act a delay later, 0: at once")
+_WORDS = ("valid ", "refused ", "limited ")  # before the names of signals that belong to others
+
+
+class Variable(NamedTuple):
+    """A variable of a unit; its place among the others is its value reference."""
+
+    name: str
+    causality: str
+    variability: str
+    unit: str
+    start: float | None
+    description: str
+    reference: int
+
+    @property
+    def initial(self) -> str:
+        """How the variable begins; "" where its causality says it."""
+        return {"parameter": "exact", "output": "calculated", "local": "calculated"}.get(self.causality, "")
+
+    @property
+    def role(self) -> str:
+        """One letter for the C text: t time, i input, p parameter, o output or local."""
+        return {"independent": "t", "input": "i", "parameter": "p"}.get(self.causality, "o")
+
+
+class Group(NamedTuple):
+    """A field as variables."""
+
+    field: Field
+    causality: str
+    variability: str
+    start: Any = None  # numbers, or one for all
+
+
+class Unit(NamedTuple):
+    """A part of the loop as a unit; the names begin the names of its C files."""
+
+    target: Target
+    part: Part
+    variables: tuple[Variable, ...]
+    at: dict[str, int]  # value reference of each group's first variable
+    name: str
+
+    @property
+    def has_controller(self) -> bool:
+        return self.part != "machine"
+
+    @property
+    def has_machine(self) -> bool:
+        return self.part != "controller"
+
+
+def unit_of(t: Target, part: Part) -> Unit:
+    """A unit and its variables. Raises InputError for an unknown part."""
+    if part not in PARTS:
+        raise InputError("export", "part", repr(part), "one of " + ", ".join(PARTS))
+    variables = [Variable("time", "independent", "continuous", "s", None, "simulation time", 0)]
+    at = {}
+    for group in _groups(t, part):
+        at[group.field.name] = len(variables)
+        starts = (
+            [None] * group.field.size
+            if group.start is None
+            else np.broadcast_to(group.start, group.field.size)
+        )
+        for signal, label, start in zip(group.field.signals, _labels(group.field), starts, strict=True):
+            variables.append(
+                Variable(
+                    label,
+                    group.causality,
+                    group.variability,
+                    "" if signal.unit == "SI" else signal.unit,
+                    None if start is None else float(start),
+                    f"{group.field.meaning}{': ' if signal.name else ''}{signal.name}",
+                    len(variables),
+                )
+            )
+    return Unit(t, part, tuple(variables), at, c_name(t.controller.name))
+
+
+def _groups(t: Target, part: Part) -> Iterator[Group]:
+    """The fields of a part in the order of their value references: inputs, parameters, outputs, what is inside."""
+    m = Machine(t) if part != "controller" else None
+    if part != "machine":
+        for f in reference_fields(t):
+            yield Group(f._replace(name=f"{f.name}_ref"), "input", "continuous", 0.0)
+    if m is None:
+        for f in input_fields(t):
+            valid = f.name.endswith("_valid")
+            start = 1.0 if valid else t.believed.drive.link_voltage if f.name == "link" else 0.0
+            yield Group(f, "input", "discrete" if valid else "continuous", start)
+    elif part == "machine":
+        yield Group(command_field(t), "input", "discrete", _command_at_rest(m))
+    for f in wrench_fields(m) if m is not None else []:
+        yield Group(f, "input", "continuous", 0.0)
+    if m is not None and part == "machine":
+        yield Group(state_field(m, "x_start", "at the start"), "parameter", "fixed", _at_rest(m))
+        if m.setup.delay:
+            yield Group(LATE, "parameter", "fixed", 1.0)
+    elif m is not None:
+        meaning = "at the start, beyond what the reference gives"
+        yield Group(state_field(m, "offset", meaning), "parameter", "fixed", 0.0)
+    if part != "machine":
+        for f in output_fields(t):
+            yield Group(f, "output", "discrete")
+    for f in reading_fields(m) if m is not None else []:
+        yield Group(f, "local" if f.name == "x" else "output", "continuous")
+
+
+def _labels(field: Field) -> list[str]:
+    """The names of a field's variables, as `y.z`; by numbers where names of signals are not letters and digits."""
+    if field.size == 1 and not field.signals[0].name:
+        return [field.name]
+    labels = []
+    for s in field.signals:
+        text = s.name.rstrip("'").removesuffix("*")
+        for word in _WORDS:
+            text = text.removeprefix(word)
+        labels.append(c_name(text) if text.lower() == text else _with_capitals(text))
+    if len(set(labels)) < len(labels) or "m_" in labels:
+        return [f"{field.name}[{k}]" for k in range(1, field.size + 1)]
+    return [f"{field.name}.{label}" for label in labels]
+
+
+def _with_capitals(text: str) -> str:
+    """As c_name, with capital letters: forces F and torques T."""
+    plain = "".join(letter if letter.isascii() and letter.isalnum() else "_" for letter in text).strip("_")
+    return plain if plain and not plain[0].isdigit() else f"m_{plain}"
+
+
+def _at_rest(m: Machine) -> list[float]:
+    """The states that a reference of zero gives."""
+    place = machine_functions(m)["place"]
+    zeros = [ca.DM.zeros(place.size1_in(k)) for k in range(place.n_in())]
+    return [float(v) for v in np.array(place(*zeros)).ravel()]
+
+
+def _command_at_rest(m: Machine) -> list[float]:
+    """The commands that hold the machine there."""
+    plant, c = m.plant, m.target.controller
+    x = ca.DM(_at_rest(m))
+    z = float(x[plant.stroke_state]) if plant.has_stroke else 0.0
+    current = plant.currents(plant.h(x, 0), ca.DM(c.feedforward.at(z)))
+    whole = initial_state(plant, c, replace(m.setup, delay=1), x, ca.DM.zeros(len(c.states)), current)
+    held = command_field(m.target).size
+    return [float(v) for v in np.array(ca.evalf(whole[-held:])).ravel()]
+
+
+def unit_sources(u: Unit, sha256: str, token: str) -> dict[str, str]:
+    """The C files of a unit by name, without those of an interface. sha256 : of the gain file; token : of the unit"""
+    files: dict[str, str] = {}
+    if u.has_controller:
+        files |= sources(u.target, sha256, f"{u.name}_controller")
+    if u.has_machine:
+        more = ("place", "shift") if u.has_controller else ()
+        files |= machine_sources(Machine(u.target), f"{u.name}_machine", ("begin", "substep", "read", *more))
+    context = _context(u, token)
+    return files | {f"unit.{end}": render(f"fmu_unit.{end}", context) for end in ("h", "c")}
+
+
+def _context(u: Unit, token: str) -> dict[str, Any]:
+    t, c = u.target, u.target.controller
+    m = Machine(t) if u.has_machine else None
+    roles = "".join(v.role for v in u.variables)
+    starts = [c_number(v.start or 0.0, "double") for v in u.variables]
+    inputs = [f for f in input_fields(t) if f.size]
+
+    def places(fields: list[Field], suffix: str = "") -> list[dict[str, Any]]:
+        return [
+            {"field": f.name, "at": u.at.get(f.name + suffix, 0), "size": f.size, "name": f.name}
+            for f in fields
+            if f.size
+        ]
+
+    checked = [] if m is None else wrench_fields(m) + ([] if u.has_controller else [command_field(t)])
+    return {
+        "title": comment(c.name),
+        "version": version("malta"),
+        "name": f"{u.name}_controller",
+        "plant": f"{u.name}_machine",
+        "token": token,
+        "controller": u.has_controller,
+        "machine": u.has_machine,
+        "variables": u.variables,
+        "at": u.at,
+        "sample_time": c_number(c.sample_time, "double"),
+        "roles": [roles[k : k + 80] for k in range(0, len(roles), 80)],
+        "starts": ",\n".join("  " + ", ".join(starts[k : k + 8]) for k in range(0, len(starts), 8)),
+        "one": c_number(1.0, t.precision),
+        "reference": places(reference_fields(t), "_ref"),
+        "inputs": places(inputs),
+        "outputs": places(output_fields(t)),
+        "readings": [] if m is None else places(reading_fields(m)),
+        "checked": places(checked),
+        "states": len(t.believed.states),
+        "filtered": len(c.states),
+        "currents": sum(f.size for f in inputs if f.name == "i"),
+        "volts": 0 if m is None else m.sizes.controller.get("u_integral", 0),
+        "wrench": 0 if m is None else sum(f.size for f in wrench_fields(m)),
+        "delay": 0 if m is None else m.setup.delay,
+    } | ({} if m is None else {"at": u.at | {"command": u.at[command_field(t).name]}})
