@@ -33,12 +33,13 @@ HEADERS = {
     2: ("fmi2FunctionTypes.h", "fmi2Functions.h", "fmi2TypesPlatform.h"),
     3: ("fmi3FunctionTypes.h", "fmi3Functions.h", "fmi3PlatformTypes.h"),
 }
+ARCHITECTURES = {"arm64": "aarch64", "amd64": "x86_64"}  # as FMI calls them
 WITHOUT_COMPILER = (
     "without a binary, because no C compiler works here: the importing tool has to compile the sources"
 )
 DATE = (1980, 1, 1, 0, 0, 0)  # of all members
 STOP = 0.1  # s, of the default experiment
-NOWHERE = "0" * 64  # in place of the token while it is computed
+TOKEN = "@token@"  # in place of the token while it is computed
 
 
 class Fmu(NamedTuple):
@@ -70,10 +71,10 @@ def build_fmu(t: Target, sha256: str, *, part: Part = "controller", fmi: int = 2
     if fmi not in VERSIONS:
         raise InputError("export", "fmi", repr(fmi), "2 or 3")
     unit = unit_of(t, part)
-    digest = hashlib.sha256()
-    for name, text in sorted(_texts(unit, sha256, fmi, NOWHERE).items()):
-        digest.update(f"{name}\n{text}\n".encode())
-    members = {name: text.encode() for name, text in _texts(unit, sha256, fmi, digest.hexdigest()).items()}
+    texts = _texts(unit, sha256, fmi)
+    whole = "".join(f"{name}\n{text}\n" for name, text in sorted(texts.items()))
+    token = hashlib.sha256(whole.encode()).hexdigest()
+    members = {name: text.replace(TOKEN, token).encode() for name, text in texts.items()}
     own = {
         name.removeprefix("sources/"): data for name, data in members.items() if name.endswith((".c", ".h"))
     }
@@ -94,17 +95,17 @@ def platform_of(fmi: int) -> str:
     if fmi == 2:
         return f"{system}64"
     machine = platform.machine().lower()
-    return f"{ {'arm64': 'aarch64', 'amd64': 'x86_64'}.get(machine, machine) }-{system}"
+    return f"{ARCHITECTURES.get(machine, machine)}-{system}"
 
 
 def _ending() -> str:
     return ".dylib" if sys.platform == "darwin" else ".so"
 
 
-def _texts(u: Unit, sha256: str, fmi: int, token: str) -> dict[str, str]:
+def _texts(u: Unit, sha256: str, fmi: int) -> dict[str, str]:
     """All text files of an FMU by their place in it."""
-    context = _context(u, sha256, token)
-    own = unit_sources(u, sha256, token) | {f"fmi{fmi}.c": render(f"fmu_fmi{fmi}.c", context)}
+    context = _context(u, sha256)
+    own = unit_sources(u, sha256, TOKEN) | {f"fmi{fmi}.c": render(f"fmu_fmi{fmi}.c", context)}
     context |= {"files": sorted(name for name in own if name.endswith(".c"))}
     texts = {f"sources/{name}": text for name, text in own.items()}
     for name in HEADERS[fmi]:
@@ -117,7 +118,7 @@ def _texts(u: Unit, sha256: str, fmi: int, token: str) -> dict[str, str]:
     return texts | {"modelDescription.xml": render(f"fmu_fmi{fmi}.xml", context)}
 
 
-def _context(u: Unit, sha256: str, token: str) -> dict[str, Any]:
+def _context(u: Unit, sha256: str) -> dict[str, Any]:
     t, c = u.target, u.target.controller
     words = {
         "controller": "The controller",
@@ -129,7 +130,7 @@ def _context(u: Unit, sha256: str, token: str) -> dict[str, Any]:
         "description": f"{words[u.part]} of a {t.believed.name}, sampled every {c.sample_time * 1e6:g} us",
         "version": version("malta"),
         "sha256": sha256,
-        "token": token,
+        "token": TOKEN,
         "part": u.part,
         "identifier": identifier_of(u),
         "sample_time": repr(c.sample_time),

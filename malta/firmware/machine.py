@@ -20,7 +20,6 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from malta.errors import InputError
 from malta.firmware.ctext import c_number, function_text, signature
 from malta.firmware.export import comment, render
 from malta.firmware.lowering import lower
@@ -50,19 +49,9 @@ ROOT = {  # what root.c is filled with
 
 @dataclass(frozen=True, eq=False)
 class Machine:
-    """The machine that a gain file knows, under the commands of its exported controller.
-
-    Raises InputError for currents from a table, and for options that a simulation refuses too.
-    """
+    """The machine that a gain file knows, under the commands of its exported controller; a Target refuses tables."""
 
     target: Target
-
-    def __post_init__(self) -> None:
-        if self.plant.tabulated:
-            found = f"a {self.plant.name} whose currents come from a table"
-            raise InputError(
-                "export", self.target.controller.name, found, "a coil model without a table, cells = 0"
-            )
 
     @property
     def plant(self) -> Plant:

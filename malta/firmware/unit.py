@@ -76,14 +76,11 @@ class Unit(NamedTuple):
     variables: tuple[Variable, ...]
     at: dict[str, int]  # value reference of each group's first variable
     name: str
+    machine: Machine | None  # None for a controller alone
 
     @property
     def has_controller(self) -> bool:
         return self.part != "machine"
-
-    @property
-    def has_machine(self) -> bool:
-        return self.part != "controller"
 
 
 def unit_of(t: Target, part: Part) -> Unit:
@@ -91,8 +88,9 @@ def unit_of(t: Target, part: Part) -> Unit:
     if part not in PARTS:
         raise InputError("export", "part", repr(part), "one of " + ", ".join(PARTS))
     variables = [Variable("time", "independent", "continuous", "s", None, "simulation time", 0)]
-    at = {}
-    for group in _groups(t, part):
+    at: dict[str, int] = {}
+    m = None if part == "controller" else Machine(t)
+    for group in _groups(t, part, m):
         at[group.field.name] = len(variables)
         starts = (
             [None] * group.field.size
@@ -111,12 +109,11 @@ def unit_of(t: Target, part: Part) -> Unit:
                     len(variables),
                 )
             )
-    return Unit(t, part, tuple(variables), at, c_name(t.controller.name))
+    return Unit(t, part, tuple(variables), at, c_name(t.controller.name), m)
 
 
-def _groups(t: Target, part: Part) -> Iterator[Group]:
+def _groups(t: Target, part: Part, m: Machine | None) -> Iterator[Group]:
     """The fields of a part in the order of their value references: inputs, parameters, outputs, what is inside."""
-    m = Machine(t) if part != "controller" else None
     if part != "machine":
         for f in reference_fields(t):
             yield Group(f._replace(name=f"{f.name}_ref"), "input", "continuous", 0.0)
@@ -187,16 +184,15 @@ def unit_sources(u: Unit, sha256: str, token: str) -> dict[str, str]:
     files: dict[str, str] = {}
     if u.has_controller:
         files |= sources(u.target, sha256, f"{u.name}_controller")
-    if u.has_machine:
+    if u.machine is not None:
         more = ("place", "shift") if u.has_controller else ()
-        files |= machine_sources(Machine(u.target), f"{u.name}_machine", ("begin", "substep", "read", *more))
+        files |= machine_sources(u.machine, f"{u.name}_machine", ("begin", "substep", "read", *more))
     context = _context(u, token)
     return files | {f"unit.{end}": render(f"fmu_unit.{end}", context) for end in ("h", "c")}
 
 
 def _context(u: Unit, token: str) -> dict[str, Any]:
-    t, c = u.target, u.target.controller
-    m = Machine(t) if u.has_machine else None
+    t, c, m = u.target, u.target.controller, u.machine
     roles = "".join(v.role for v in u.variables)
     starts = [c_number(v.start or 0.0, "double") for v in u.variables]
     inputs = [f for f in input_fields(t) if f.size]
@@ -216,7 +212,7 @@ def _context(u: Unit, token: str) -> dict[str, Any]:
         "plant": f"{u.name}_machine",
         "token": token,
         "controller": u.has_controller,
-        "machine": u.has_machine,
+        "machine": m is not None,
         "variables": u.variables,
         "at": u.at,
         "sample_time": c_number(c.sample_time, "double"),

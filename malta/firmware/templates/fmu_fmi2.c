@@ -81,7 +81,7 @@ fmi2Status fmi2SetupExperiment(fmi2Component c, fmi2Boolean toleranceDefined, fm
   (void)stopTimeDefined;
   (void)stopTime;
   if (i->data.phase != UNIT_NEW) {
-    return refuse(c, "a setup after the initialization");
+    return refuse(c, "an initialization after the start");
   }
   i->data.value[0] = startTime;
   return fmi2OK;

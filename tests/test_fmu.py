@@ -1,0 +1,499 @@
+"""Exported FMUs, simulated by fmpy: the bits of the exported C, and the flight of malta.simulate."""
+
+from __future__ import annotations
+
+import io
+import shutil
+import subprocess
+import zipfile
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from conftest import ROOT
+
+import malta
+from malta.errors import InputError
+from malta.firmware import fmu as module
+from malta.firmware.elementary import Precision
+from malta.firmware.fmu import build_fmu, write_fmu
+from malta.firmware.machine import Machine, command_field
+from malta.firmware.native import FLAGS
+from malta.firmware.signals import Target, fidelity_of
+from malta.firmware.unit import PARTS, Part
+from malta.simulation import references
+from malta.simulation.compiled import compiler
+
+fmpy = pytest.importorskip("fmpy")
+if compiler() is None:
+    pytest.skip("no C compiler", allow_module_level=True)
+
+SHA256 = "5" * 64
+WARNINGS = ("-Werror", "-Wall", "-Wextra", "-Wpedantic", "-Wshadow", "-Wconversion", "-Wundef")
+BOTH = pytest.mark.parametrize("fmi", [2, 3])
+
+
+@lru_cache
+def target(name: str, precision: Precision = "double", fidelity: Any = None) -> Target:
+    c = malta.gains.read(ROOT / "design" / "gains" / f"{name}.json")
+    return Target(c, precision, fidelity or fidelity_of(malta.plant_of(c.parameters)))
+
+
+@lru_cache
+def content(t: Target, part: Part, fmi: int) -> bytes:
+    fmu = build_fmu(t, SHA256, part=part, fmi=fmi)
+    assert fmu.note == ""
+    return fmu.content
+
+
+class Unit:
+    """An instance of an FMU; its groups of variables are vectors."""
+
+    def __init__(self, folder: Path) -> None:
+        from fmpy.fmi2 import FMU2Slave
+        from fmpy.fmi3 import FMU3Slave
+
+        d = fmpy.read_model_description(folder, validate=False)
+        self.second = d.fmiVersion == "2.0"
+        kind = FMU2Slave if self.second else FMU3Slave
+        self.fmu = kind(
+            guid=d.guid,
+            unzipDirectory=str(folder),
+            modelIdentifier=d.coSimulation.modelIdentifier,
+            instanceName="unit",
+        )
+        self.fmu.instantiate()
+        self.step = float(d.defaultExperiment.stepSize)
+        self.samples = 0
+        self.groups: dict[str, list[int]] = {}
+        for v in d.modelVariables:
+            self.groups.setdefault(v.name.split(".")[0], []).append(v.valueReference)
+
+    def set(self, group: str, values: Any) -> None:
+        call = self.fmu.setReal if self.second else self.fmu.setFloat64
+        call(self.groups[group], np.ravel(values).tolist())
+
+    def get(self, group: str) -> Any:
+        call = self.fmu.getReal if self.second else self.fmu.getFloat64
+        return np.array(call(self.groups[group]))
+
+    def refer(self, motion: Any, k: int) -> None:
+        for name in ("p", "dp", "ddp"):
+            self.set(f"{name}_ref", getattr(motion, name)[k])
+
+    def begin(self) -> None:
+        if self.second:
+            self.fmu.setupExperiment(startTime=0.0)
+            self.fmu.enterInitializationMode()
+        else:
+            self.fmu.enterInitializationMode(startTime=0.0)
+
+    def start(self) -> None:
+        self.fmu.exitInitializationMode()
+
+    def advance(self, samples: float = 1) -> None:
+        self.fmu.doStep(self.samples * self.step, samples * self.step)
+        self.samples += int(samples)
+
+
+@pytest.fixture
+def instance(tmp_path: Path) -> Iterator[Callable[..., Unit]]:
+    """Makes instances of FMUs, and frees them."""
+    units: list[Unit] = []
+
+    def make(t: Target, part: Part, fmi: int, again: bool = False) -> Unit:
+        folder = tmp_path / f"{part}{fmi}"
+        if not again:
+            with zipfile.ZipFile(io.BytesIO(content(t, part, fmi))) as archive:
+                archive.extractall(folder)
+        units.append(Unit(folder))
+        return units[-1]
+
+    yield make
+    for unit in units:
+        unit.fmu.freeInstance()
+
+
+def scenario(t: Target, **options: Any) -> malta.Scenario:
+    """A stroke, without noise."""
+    plant = t.believed
+    if plant.name == "tubular":
+        return malta.Scenario.stroke(10e-3, fidelity=t.fidelity, duration=0.1, **options)
+    if plant.has_stroke:
+        rise = 40 * t.controller.sample_time
+        return malta.Scenario.stroke(1e-3, fidelity=t.fidelity, rise=rise, duration=3 * rise, **options)
+    return malta.Scenario("hold", 0.02, references.hold, fidelity=t.fidelity, **options)
+
+
+def silent(t: Target) -> malta.Plant:
+    """The machine without noise of its electronics."""
+    par: Any = t.believed.parameters
+    return t.believed.variant(replace(par, s_adc=0.0)) if t.has_set_points else t.believed
+
+
+def fly(unit: Unit, run: Any, motion: Any) -> float:
+    """The largest distance of a loop from a run, m."""
+    far = 0.0
+    for k in range(len(run.t)):
+        far = max(far, float(np.abs(unit.get("p") - run.p[k]).max()))
+        unit.refer(motion, k)
+        unit.advance()
+    return far
+
+
+FLIGHTS = [
+    ("halbach", None, 2),
+    ("robust", None, 3),
+    *(
+        pytest.param(*case, marks=pytest.mark.slow)
+        for case in (
+            ("robust", "dq", 2),
+            ("robust", "force", 3),
+            ("tubular_pid", None, 2),
+            ("halbach_late", None, 3),
+        )
+    ),
+    pytest.param("planar", None, 3, marks=pytest.mark.slow),
+]
+
+
+@pytest.mark.parametrize(("name", "fidelity", "fmi"), FLIGHTS)
+def test_loop_and_pair_fly_as_simulated(
+    name: str, fidelity: Any, fmi: int, instance: Callable[..., Unit]
+) -> None:
+    """One FMU of both; two that a master steps one after the other; and a controller with the exported C's bits."""
+    t = target(name, "double", fidelity)
+    s, plant = scenario(t), silent(t)
+    run = malta.simulate(plant, t.controller, s)
+    flown = malta.simulate(plant, t.controller, s, engine=malta.engine_of_c())
+    assert run.verdict.completed
+    motion = s.reference(plant)(run.t)
+    loop = instance(t, "loop", fmi)
+    loop.begin()
+    loop.refer(motion, 0)
+    loop.start()
+    assert fly(loop, run, motion) < 1e-12
+
+    one, other, alone = instance(t, "controller", fmi), instance(t, "machine", fmi), None
+    alone = instance(t, "controller", fmi, again=True)
+    for unit in (one, alone):
+        unit.begin()
+        unit.refer(motion, 0)
+        unit.start()
+    other.begin()
+    other.set("x_start", run.x[0])
+    other.start()
+    far, command = 0.0, command_field(t).name
+    for k in range(len(run.t)):
+        far = max(far, float(np.abs(other.get("p") - run.p[k]).max()))
+        for unit, values in ((one, other.get), (alone, lambda group, k=k: known(flown, t, group, k))):
+            unit.refer(motion, k)
+            for group in ("y", "i", "link") if t.driven else ("y",):
+                unit.set(group, values(group))
+            unit.advance()
+        other.set(command, one.get(command))
+        other.advance()
+        for group in ("v", "current", "xi_hat"):
+            assert np.array_equal(alone.get(group), getattr(flown, group)[k]), (group, k)
+        if t.fidelity == "phase" and t.driven:
+            assert np.array_equal(alone.get("command"), flown.duty[k])
+    assert far < 1e-12
+
+
+def known(run: Any, t: Target, group: str, k: int) -> Any:
+    """What a controller read at a sample of a run."""
+    return getattr(run, "i_phase" if group == "i" and t.fidelity == "phase" else group)[k]
+
+
+@pytest.mark.slow
+def test_single_precision_flies_as_the_exported_c(instance: Callable[..., Unit]) -> None:
+    t = target("robust", "float")
+    s = scenario(t)
+    flown = malta.simulate(t.believed, t.controller, s, engine=malta.engine_of_c("float"))
+    motion = s.reference(t.believed)(flown.t)
+    loop = instance(t, "loop", 2)
+    loop.begin()
+    loop.refer(motion, 0)
+    loop.start()
+    assert fly(loop, flown, motion) < 1e-9
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fidelity", ["phase", "dq"])
+def test_sensors_with_lag_dead_time_and_offsets_are_part_of_the_machine(
+    fidelity: Any, instance: Callable[..., Unit]
+) -> None:
+    c = target("robust").controller
+    par: Any = c.parameters
+    late = replace(c, parameters=replace(par, T_s=80e-6, tau_s=30e-6, d_i=0.01))
+    t = Target(late, "double", fidelity)
+    s = scenario(t)
+    run = malta.simulate(t.believed, late, s)
+    ideal = malta.simulate(target("robust").believed, c, s)
+    motion = s.reference(t.believed)(run.t)
+    loop = instance(t, "loop", 2)
+    loop.begin()
+    loop.refer(motion, 0)
+    loop.start()
+    assert fly(loop, run, motion) < 1e-12
+    assert np.abs(run.p - ideal.p[: len(run.p)]).max() > 1e-7
+
+
+def test_a_wrench_and_another_start_act_as_simulated(instance: Callable[..., Unit]) -> None:
+    t = target("robust")
+    push = np.array([0.0, 2.0, 0.0, 0.0, 0.01, 0.0])
+    s = malta.Scenario(
+        "push",
+        0.02,
+        references.hold,
+        start={"y": 20e-6},
+        fidelity="phase",
+        disturbance=lambda times: np.outer(times >= 0.005, push),
+    )
+    run = malta.simulate(t.believed, t.controller, s)
+    loop = instance(t, "loop", 3)
+    loop.begin()
+    loop.set("offset", [20e-6 if state.name == "y" else 0.0 for state in t.believed.states])
+    loop.start()
+    far = 0.0
+    for k, time in enumerate(run.t):
+        far = max(far, float(np.abs(loop.get("p") - run.p[k]).max()))
+        loop.set("w", push if time >= 0.005 else 0 * push)
+        loop.advance()
+    assert float(np.abs(run.p).max()) > 15e-6
+    assert far < 1e-12
+
+
+@BOTH
+def test_fmpy_simulates_a_stroke(fmi: int, tmp_path: Path) -> None:
+    """The whole way of an importing tool: a file, inputs as signals, a table of outputs."""
+    t = target("halbach")
+    s = scenario(t)
+    run = malta.simulate(silent(t), t.controller, s)
+    motion = s.reference(t.believed)(run.t)
+    columns = [("time", run.t), *((f"{n}_ref.x", getattr(motion, n)[:, 0]) for n in ("p", "dp", "ddp"))]
+    columns.append(("w.F_x", np.zeros(len(run.t))))
+    signals = np.array(
+        list(zip(*(c for _, c in columns), strict=True)), dtype=[(n, float) for n, _ in columns]
+    )
+    path = tmp_path / "loop.fmu"
+    path.write_bytes(content(t, "loop", fmi))
+    found = fmpy.simulate_fmu(
+        str(path),
+        stop_time=run.t[-1],
+        output_interval=t.controller.sample_time,
+        input=signals,
+        output=["p.x", "contact.left_the_travel", "y_used.x"],
+    )
+    assert len(found) == len(run.t)
+    assert np.abs(found["p.x"] - run.p[:, 0]).max() < 1e-12
+    assert 0 < found["contact.left_the_travel"].max() < 1
+
+
+@BOTH
+@pytest.mark.parametrize("part", PARTS)
+def test_validation_finds_nothing(
+    part: Part, fmi: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Every machine and fidelity; here without a binary, of which a sentence tells."""
+    from fmpy.validation import validate_fmu
+
+    monkeypatch.setattr(module, "shared_library", lambda *_: None)
+    for name, fidelity in (
+        ("halbach", None),
+        ("robust", "phase"),
+        ("robust", "dq"),
+        ("tubular_pid", "force"),
+    ):
+        path = tmp_path / f"{name}.fmu"
+        note = write_fmu(path, target(name, "float", fidelity), SHA256, part=part, fmi=fmi)
+        assert "without a binary, because no C compiler works here" in note
+        assert validate_fmu(str(path)) == []
+    d = fmpy.read_model_description(path)
+    units = {u.name: u.baseUnit for u in d.unitDefinitions}
+    assert (units["N"].kg, units["N"].m, units["N"].s) == (1, 1, -2)
+    causalities = {v.name: (v.causality, v.variability, v.unit) for v in d.modelVariables}
+    if part != "machine":
+        assert causalities["v.f_D"] == ("output", "discrete", "N")
+    if part != "controller":
+        assert causalities["p.z"] == ("output", "continuous", "m")
+        assert causalities["w.T_z"] == ("input", "continuous", "N m")
+
+
+def test_the_same_gain_file_gives_the_same_bytes() -> None:
+    t, other = target("halbach"), target("halbach_late")
+    again = build_fmu(Target(t.controller, "double", t.fidelity), SHA256, part="loop", fmi=2)
+    assert again.content == content(t, "loop", 2)
+    tokens = []
+    for data in (content(t, "loop", 2), content(t, "loop", 3), content(other, "loop", 3)):
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            assert {info.date_time for info in archive.infolist()} == {(1980, 1, 1, 0, 0, 0)}
+            assert archive.namelist() == sorted(archive.namelist())
+        tokens.append(fmpy.read_model_description(io.BytesIO(data)).guid)
+    assert len(set(tokens)) == 3
+    assert all(len(token) == 64 for token in tokens)
+
+
+@BOTH
+def test_states_are_taken_put_back_written_and_read(fmi: int, instance: Callable[..., Unit]) -> None:
+    t = target("halbach")
+    loop, twin = instance(t, "loop", fmi), instance(t, "loop", fmi, again=True)
+    calls = ["getFMUState", "setFMUState", "serializeFMUState", "deserializeFMUState", "freeFMUState"]
+    take, put, write, read, free = (
+        getattr(
+            loop.fmu,
+            c if fmi == 3 else c.replace("deserialize", "deSerialize").replace("State", "state"),
+            None,
+        )
+        or getattr(loop.fmu, c)
+        for c in calls
+    )
+    for unit in (loop, twin):
+        unit.begin()
+        unit.start()
+        unit.set("p_ref", [1e-4])
+        unit.advance()
+    loop.advance()
+    state = take()
+    data = write(state)
+    twin.advance(2)
+    loop.advance()
+    later = loop.get("x")
+    assert np.array_equal(later, twin.get("x"))
+    put(state)
+    assert not np.array_equal(loop.get("x"), later)
+    loop.samples -= 1
+    loop.advance()
+    assert np.array_equal(loop.get("x"), later)
+    free(state)
+    other = read(data)
+    put(other)
+    loop.samples -= 1
+    loop.advance()
+    assert np.array_equal(loop.get("x"), later)
+    free(other)
+    loop.fmu.reset()
+    loop.samples = 0
+    loop.begin()
+    loop.start()
+    assert loop.get("time")[0] == 0
+    assert not np.array_equal(loop.get("x"), later)
+    for _ in range(2):
+        loop.set("p_ref", [1e-4])
+        loop.advance()
+    loop.advance()
+    assert np.array_equal(loop.get("x"), later)
+    loop.fmu.terminate()
+
+
+@BOTH
+def test_what_cannot_be_is_refused_with_a_message(
+    fmi: int, instance: Callable[..., Unit], capfd: pytest.CaptureFixture[str]
+) -> None:
+    from fmpy.fmi1 import FMICallException
+
+    t = target("halbach")
+    machine = instance(t, "machine", fmi)
+    machine.groups["none"] = [10_000]
+
+    def give_infinity() -> None:
+        machine.set("command", [np.inf] * 4)
+        machine.advance()
+
+    def check(message: str, action: Callable[[], object]) -> None:
+        machine.samples = 0
+        with pytest.raises(FMICallException):
+            action()
+        assert message in capfd.readouterr().out
+
+    check("a step outside of the simulation", machine.advance)
+    check("a parameter that is no finite number", lambda: machine.set("x_start", [np.nan, 0]))
+    check("a value reference that no variable has", lambda: machine.set("none", [0.0]))
+    check("a value reference that no variable has", lambda: machine.get("none"))
+    check("only inputs and parameters can be set", lambda: machine.set("p", [0.0]))
+    machine.begin()
+    machine.start()
+    check("a parameter is fixed", lambda: machine.set("x_start", [0, 0]))
+    check("no multiple of the sample time", lambda: machine.advance(0.5))
+    check("no multiple of the sample time", lambda: machine.advance(-1))
+    check("an input command that is no finite number", give_infinity)
+    check("an initialization after the start", machine.begin)
+    kind = type(machine.fmu)
+    impostor = kind(
+        guid="another",
+        unzipDirectory=machine.fmu.unzipDirectory,
+        modelIdentifier=machine.fmu.modelIdentifier,
+        instanceName="impostor",
+    )
+    with pytest.raises(Exception, match="instantiate"):
+        impostor.instantiate()
+
+
+def test_no_reading_poisons_the_controller(instance: Callable[..., Unit]) -> None:
+    """NaN as a reading and as a reference: a step on it commands finite forces, and the next readings count again."""
+    t = target("halbach")
+    unit, other = instance(t, "controller", 2), instance(t, "controller", 2, again=True)
+    for u in (unit, other):
+        u.begin()
+        u.start()
+    unit.set("y", [np.nan])
+    unit.set("p_ref", [np.inf])
+    unit.advance()
+    assert unit.get("refused")[0] == 1
+    assert np.isfinite(unit.get("v")).all()
+    unit.set("y", [1e-4])
+    unit.advance()
+    assert unit.get("refused")[0] == 0
+    assert np.isfinite(unit.get("v")).all()
+    assert unit.get("v")[0] != 0
+    assert other.get("v")[0] == 0  # instances know nothing of each other
+
+
+@pytest.mark.slow
+@BOTH
+@pytest.mark.parametrize("part", PARTS)
+def test_no_compiler_warns_and_fmpy_builds_the_binary_anew(part: Part, fmi: int, tmp_path: Path) -> None:
+    from fmpy.build import build_platform_binary
+
+    with zipfile.ZipFile(io.BytesIO(content(target("robust"), part, fmi))) as archive:
+        archive.extractall(tmp_path)
+    cc = compiler()
+    assert cc is not None
+    for path in sorted((tmp_path / "sources").glob("*.c")):
+        command = [*cc, *FLAGS, *WARNINGS, "-c", str(path), "-o", str(tmp_path / "object")]
+        done = subprocess.run(command, check=False, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr[:2000]
+    (binary,) = (tmp_path / "binaries").glob("*/*")
+    binary.unlink()
+    if shutil.which("cmake") is None:
+        pytest.skip("no cmake")
+    (tmp_path / "build").mkdir()
+    build_platform_binary(tmp_path, build_dir=tmp_path / "build", all_warnings=True)
+    unit = Unit(tmp_path)
+    unit.begin()
+    unit.start()
+    unit.advance()
+    assert binary.exists()
+    unit.fmu.freeInstance()
+
+
+def test_bad_input_gets_a_sentence() -> None:
+    t = target("halbach")
+    with pytest.raises(InputError, match="fmi: found 1, expected 2 or 3"):
+        build_fmu(t, SHA256, fmi=1)
+    planar = target("planar").controller
+    par: Any = planar.parameters
+    with pytest.raises(InputError, match="whose currents come from a table"):
+        Target(replace(planar, parameters=replace(par, cells=8)), "double", "force")
+    part: Any = "rotor"
+    with pytest.raises(InputError, match="part: found 'rotor', expected one of controller, machine, loop"):
+        build_fmu(t, SHA256, part=part)
+
+
+def test_a_machine_takes_as_many_substeps_as_a_simulation() -> None:
+    assert Machine(target("robust")).substeps == 4
+    assert Machine(target("halbach")).substeps == pytest.approx(805.664, abs=1e-3)
