@@ -268,6 +268,35 @@ def test_a_wrench_and_another_start_act_as_simulated(instance: Callable[..., Uni
     assert far < 1e-12
 
 
+def test_a_master_that_steps_both_at_once_makes_the_delay_itself(instance: Callable[..., Unit]) -> None:
+    """With late = 0: commands act one sample after they are computed, as they do with late = 1 one after the other."""
+    t = target("robust")
+    push = np.array([0.0, 2.0, 0.0, 0.0, 0.01, 0.0])
+    s = malta.Scenario(
+        "push", 0.01, references.hold, fidelity="phase", disturbance=lambda k: np.outer(k >= 0.002, push)
+    )
+    run = malta.simulate(t.believed, t.controller, s)
+    controller, machine = instance(t, "controller", 3), instance(t, "machine", 3)
+    controller.begin()
+    controller.start()
+    machine.begin()
+    machine.set("late", [0.0])
+    machine.start()
+    far, command = 0.0, np.empty(0)
+    for k, time in enumerate(run.t):
+        far = max(far, float(np.abs(machine.get("p") - run.p[k]).max()))
+        for group in ("y", "i", "link"):
+            controller.set(group, machine.get(group))
+        if k:  # before, the machine holds the commands that it starts with
+            machine.set("command", command)
+        machine.set("w", push if time >= 0.002 else 0 * push)
+        controller.advance()
+        machine.advance()
+        command = controller.get("command")
+    assert float(np.abs(run.p).max()) > 5e-6
+    assert far < 1e-12
+
+
 @BOTH
 def test_fmpy_simulates_a_stroke(fmi: int, tmp_path: Path) -> None:
     """The whole way of an importing tool: a file, inputs as signals, a table of outputs."""
