@@ -21,7 +21,7 @@ from xml.sax.saxutils import quoteattr
 
 from malta.errors import InputError
 from malta.files import replace_files
-from malta.firmware.export import render
+from malta.firmware.export import comment, render
 from malta.firmware.native import FLAGS
 from malta.firmware.signals import Target
 from malta.firmware.unit import Part, Unit, unit_of, unit_sources
@@ -126,7 +126,7 @@ def _context(u: Unit, sha256: str) -> dict[str, Any]:
         "loop": "The controller and the machine",
     }
     return {
-        "title": f"{c.name} {u.part}",
+        "title": comment(f"{c.name} {u.part}"),
         "description": f"{words[u.part]} of a {t.believed.name}, sampled every {c.sample_time * 1e6:g} us",
         "version": version("malta"),
         "sha256": sha256,

@@ -15,7 +15,7 @@ from typing import Any, Literal, NamedTuple, get_args
 import casadi as ca
 import numpy as np
 
-from malta.errors import InputError
+from malta.errors import InputError, on_one_line
 from malta.firmware.ctext import c_name, c_number
 from malta.firmware.export import comment, render, sources
 from malta.firmware.machine import (
@@ -105,7 +105,7 @@ def unit_of(t: Target, part: Part) -> Unit:
                     group.variability,
                     "" if signal.unit == "SI" else signal.unit,
                     None if start is None else float(start),
-                    f"{group.field.meaning}{': ' if signal.name else ''}{signal.name}",
+                    on_one_line(f"{group.field.meaning}{': ' if signal.name else ''}{signal.name}"),
                     len(variables),
                 )
             )
