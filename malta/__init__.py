@@ -22,8 +22,9 @@ if TYPE_CHECKING:  # the contents page, as type checkers and readers see it
     from malta.campaigns.tolerance import tolerances as tolerances
     from malta.errors import CheckError as CheckError
     from malta.errors import InputError as InputError
+    from malta.firmware.exports import export_c as export_c
+    from malta.firmware.exports import export_fmu as export_fmu
     from malta.firmware.flight import engine_of_c as engine_of_c
-    from malta.firmware.folder import export_c as export_c
     from malta.margins.blocks import Dynamic as Dynamic
     from malta.margins.dynamic import dynamic_margin as dynamic_margin
     from malta.margins.gain import Gain as Gain
@@ -96,7 +97,7 @@ _NAMES = {  # the same, for the first use of each name
     "campaigns.tolerance": ("tolerances",),
     "margins.stages": ("Robustness", "robustness"),
     "firmware.flight": ("engine_of_c",),
-    "firmware.folder": ("export_c",),
+    "firmware.exports": ("export_c", "export_fmu"),
     "report.ledger": ("ledger",),
     "synthesis.controller": ("Controller",),
     "model.data": ("plant_of", "read"),

@@ -335,7 +335,10 @@ def test_the_exported_c_flies_in_a_campaign(run: Run, tmp_path: Path) -> None:
     for name, own in merits["own"].items():
         assert merits["c"][name]["largest"] == pytest.approx(own["largest"], rel=1e-9, abs=1e-15), name
     assert found["c"]["ends"] == found["own"]["ends"]
-    assert [found[law]["engines"] for law in ("c", "c-float")] == [["exported C, double"], ["exported C, float"]]
+    assert [found[law]["engines"] for law in ("c", "c-float")] == [
+        ["exported C, double"],
+        ["exported C, float"],
+    ]
     assert len({document["folder"] for document in found.values()}) == 3
     code, out, err = run("simulate", gains, "--replay", f"{tmp_path / 'c'}:3")
     assert code == 0, err

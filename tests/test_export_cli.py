@@ -6,6 +6,7 @@ import json
 import re
 import shutil
 import subprocess
+import zipfile
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -59,6 +60,22 @@ def test_export_writes_a_folder_whose_test_passes(run: Run, tmp_path: Path, prec
     assert "nan" not in report
 
 
+@pytest.mark.parametrize(("part", "fmi"), [("controller", "2"), ("loop", "3")])
+def test_export_writes_an_fmu(run: Run, tmp_path: Path, part: str, fmi: str) -> None:
+    if compiled.compiler() is None:
+        pytest.skip("no C compiler")
+    file = tmp_path / "mine.fmu"
+    code, out, err = run("export", GAINS, "--to", "fmu", "--part", part, "--fmi", fmi, "--out", file)
+    assert (code, out, err) == (0, f"wrote {file}\n", "")
+    with zipfile.ZipFile(file) as archive:
+        names = archive.namelist()
+        description = archive.read("modelDescription.xml").decode()
+    assert f'fmiVersion="{fmi}.0"' in description
+    assert any(name.startswith("binaries/") for name in names)
+    sources_of = {name for name in names if name.startswith("sources/")}
+    assert any(name.endswith("_controller.c") for name in sources_of), sorted(names)
+
+
 def test_json_lists_the_files(run: Run, tmp_path: Path) -> None:
     code, out, err = run("export", GAINS, "--out", tmp_path / "c", "--json")
     assert (code, err) == (0, "")
@@ -70,7 +87,10 @@ def test_json_lists_the_files(run: Run, tmp_path: Path) -> None:
     ("arguments", "sentence"),
     [
         (("--precision", "half"), "--precision: found 'half', expected double or float"),
-        (("--to", "rust"), "--to: found 'rust', expected c"),
+        (("--to", "rust"), "--to: found 'rust', expected c or fmu"),
+        (("--to", "fmu", "--part", "motor"), "--part: found 'motor', expected controller or machine or loop"),
+        (("--to", "fmu", "--fmi", "1"), "--fmi: found 1, expected 2 or 3"),
+        (("--to", "fmu", "--precision", "float"), "--precision: found float of an FMU, expected double"),
         (("--until", "volts"), "--until: found 'volts', expected currents or duty-cycles"),
         (("--out", "/dev/null"), "/dev/null: found a file of that name, expected a folder, new or empty"),
         (("--out", "/proc/no"), "expected a place to write the file to"),

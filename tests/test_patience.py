@@ -81,9 +81,10 @@ def test_the_commands_refuse_and_obey(
 ) -> None:
     monkeypatch.setattr(patience, "ENOUGH", 0.0)
     monkeypatch.setattr(patience, "LONGEST", 1e-9)
+    monkeypatch.setattr("malta.simulation.workers.LOOK", 1e-3)
     own = {
         "simulate": ("--substeps", "500", "--fidelity", "force", "--out", tmp_path),
-        "campaign": ("--samples", "512", "--fidelity", "force", "--spread", "1%", "--out", tmp_path),
+        "campaign": ("--samples", "1024", "--fidelity", "force", "--spread", "1%", "--out", tmp_path),
     }[command]
     said = run(command, GAINS, *own)
     assert said.code == 2

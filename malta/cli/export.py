@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, get_args
+from typing import Annotated, Any, cast, get_args
 
 import typer
 
@@ -15,7 +15,7 @@ from malta.errors import InputError
 
 def export(
     gains: GainFile,
-    to: Annotated[str, typer.Option("--to", metavar="FORM", help="c: a folder of C99.")] = "c",
+    to: Annotated[str, typer.Option("--to", metavar="FORM", help="c: a folder of C99; fmu: one file.")] = "c",
     precision: Annotated[str, typer.Option(help="float or double, of the C.")] = "double",
     until: Annotated[
         str | None,
@@ -23,33 +23,58 @@ def export(
             help="How far down the C goes: currents, or duty-cycles. [as far as the machine is modelled]"
         ),
     ] = None,
-    out: Annotated[Path | None, typer.Option(help="The folder, new or empty. [build/NAME_c]")] = None,
+    part: Annotated[
+        str, typer.Option(help="Of an FMU: controller, machine, or loop, which has both.")
+    ] = "controller",
+    fmi: Annotated[int, typer.Option(help="Version of an FMU's interface: 2 or 3.")] = 2,
+    out: Annotated[
+        Path | None,
+        typer.Option(help="The folder, new or empty, or the .fmu file. [build/NAME_c, build/NAME_PART.fmu]"),
+    ] = None,
     proof: Annotated[
         bool, typer.Option(help="Prove the margin again with the coefficients that float holds.")
     ] = True,
     machine: MachineFile = None,
     as_json: AsJson = False,
 ) -> None:
-    """Write the controller as C that computes the same bits on every processor, with its test and a report.
+    """Write the controller as C that computes the same bits on every processor, or as an FMU.
+
+    The folder of C has a test with recorded vectors and a report of cost, rounding and margin. An FMU is of the
+    controller, of its machine, or of the loop of both, for co-simulation.
 
     \b
     Example:  malta export design/gains/robust.json --to c --precision float --out build/robust_c
+              malta export design/gains/robust.json --to fmu --part loop --fmi 3
     """
     from malta.firmware.elementary import Precision
-    from malta.firmware.folder import Until, export_c
+    from malta.firmware.exports import Until, export_c, export_fmu
+    from malta.firmware.unit import Part
 
-    if to != "c":
-        raise InputError("--to", "", repr(to), "c")
-    if precision not in get_args(Precision):
-        raise InputError("--precision", "", repr(precision), "double or float")
-    if until not in (None, *get_args(Until)):
-        raise InputError("--until", "", repr(until), " or ".join(get_args(Until)))
+    for name, value, known in (
+        ("--to", to, ("c", "fmu")),
+        ("--precision", precision, get_args(Precision)),
+        ("--until", until, (None, *get_args(Until))),
+        ("--part", part, get_args(Part)),
+        ("--fmi", fmi, (2, 3)),
+    ):
+        if value not in known:
+            expected = " or ".join(str(one) for one in known if one is not None)
+            raise InputError(name, "", repr(value), expected)
     controller = read_controller(gains, machine)
-    if proof and precision == "float" and not as_json:
-        print_note("proving the margin with the coefficients that float holds; --no-proof leaves it out")
-    folder = out or Path("build") / f"{controller.name}_c"
-    chosen: Any = {"precision": precision, "until": until}
-    files = export_c(gains, folder, proof=proof, **chosen)
+    chosen: Any = {"until": until}
+    if to == "fmu":
+        if precision != "double":
+            raise InputError("--precision", "", f"{precision} of an FMU", "double")
+        file = out or Path("build") / f"{controller.name}_{part}.fmu"
+        note = export_fmu(gains, file, part=cast("Part", part), fmi=fmi, **chosen)
+        if note:
+            print_note(f"{file}: {note}")
+        files = [file]
+    else:
+        if proof and precision == "float" and not as_json:
+            print_note("proving the margin with the coefficients that float holds; --no-proof leaves it out")
+        folder = out or Path("build") / f"{controller.name}_c"
+        files = export_c(gains, folder, precision=cast("Precision", precision), proof=proof, **chosen)
     if as_json:
         print_json({"gains": str(gains), "to": to, "files": [str(file) for file in files]})
     else:

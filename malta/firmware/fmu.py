@@ -15,12 +15,10 @@ import zipfile
 from collections.abc import Mapping
 from importlib.metadata import version
 from importlib.resources import files as resources
-from pathlib import Path
 from typing import Any, NamedTuple
 from xml.sax.saxutils import quoteattr
 
 from malta.errors import InputError
-from malta.files import replace_files
 from malta.firmware.export import comment, render
 from malta.firmware.native import FLAGS
 from malta.firmware.signals import Target
@@ -49,8 +47,8 @@ class Fmu(NamedTuple):
     note: str
 
 
-def write_fmu(path: Path, t: Target, sha256: str, *, part: Part = "controller", fmi: int = 2) -> str:
-    """Write an FMU. Returns a sentence where it has no binary, else "".
+def build_fmu(t: Target, sha256: str, *, part: Part = "controller", fmi: int = 2) -> Fmu:
+    """An FMU.
 
     sha256 : of the gain file
     part : "controller", "machine" or "loop"
@@ -59,15 +57,8 @@ def write_fmu(path: Path, t: Target, sha256: str, *, part: Part = "controller", 
     Raises InputError for another part or version, and for a machine that cannot be exported.
 
         c = malta.gains.read("design/gains/robust.json")
-        write_fmu(Path("robust.fmu"), Target(c), "0" * 64, part="loop", fmi=3)
+        build_fmu(Target(c), "0" * 64, part="loop", fmi=3).content
     """
-    fmu = build_fmu(t, sha256, part=part, fmi=fmi)
-    replace_files({path: fmu.content})
-    return fmu.note
-
-
-def build_fmu(t: Target, sha256: str, *, part: Part = "controller", fmi: int = 2) -> Fmu:
-    """The content of an FMU: see `write_fmu`."""
     if fmi not in VERSIONS:
         raise InputError("export", "fmi", repr(fmi), "2 or 3")
     unit = unit_of(t, part)

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any
 
 import numpy as np
 
-from malta.errors import InputError
-from malta.files import file_exists, locate, replace_files
 from malta.firmware.ctext import c_name, c_number
 from malta.firmware.elementary import Precision
 from malta.firmware.export import context_of, render, sources
@@ -19,7 +16,6 @@ from malta.firmware.signals import (
     Field,
     Target,
     current_readings,
-    fidelity_of,
     input_fields,
     output_fields,
     reference_fields,
@@ -27,58 +23,8 @@ from malta.firmware.signals import (
 )
 from malta.firmware.step import programs_of
 from malta.firmware.vectors import FNV_FACTOR, FNV_START, SAMPLES, Vector, record_vectors
-from malta.gains.file import content_of, read
-from malta.model.data import plant_of
-from malta.simulation.layout import Fidelity
 
-Until = Literal["currents", "duty-cycles"]
 EXAMPLE_SAMPLES = 2000  # of the example's main program
-
-
-def export_c(
-    gains: str | Path,
-    out: str | Path,
-    *,
-    precision: Precision = "double",
-    until: Until | None = None,
-    proof: bool = True,
-) -> list[Path]:
-    """Write the controller of a gain file as a folder of C99 with its test and a report; the files.
-
-    out : the folder, new or empty
-    until : how far down the C goes; None: as far as the machine is modelled
-    proof : prove the margin again with the coefficients that single precision holds
-
-    Raises InputError for a folder that has files, an unknown precision, and duty cycles of a machine without windings.
-
-        malta.export_c("design/gains/robust.json", "build/robust_c", precision="float")
-    """
-    path = locate(gains)
-    controller, content = read(path), content_of(path)[0]
-    if until not in (None, *get_args(Until)):
-        raise InputError("export", "until", repr(until), "one of " + ", ".join(get_args(Until)))
-    deepest = fidelity_of(plant_of(controller.parameters))
-    depths: dict[str | None, Fidelity] = {None: deepest, "currents": "force", "duty-cycles": "phase"}
-    target = Target(controller, precision, depths[until])
-    folder = require_empty(Path(out))
-    robust = content.verification.robust
-    texts = folder_files(target, content.sha256, {} if robust is None else robust.uncertainty, proof=proof)
-    files = {folder / name: text.encode() for name, text in sorted(texts.items())}
-    replace_files(files)
-    return list(files)
-
-
-def require_empty(folder: Path) -> Path:
-    """The folder, which is new or empty. Raises InputError for one with files, whatever they are."""
-    if file_exists(folder):
-        if not folder.is_dir():
-            raise InputError(folder, "", "a file of that name", "a folder, new or empty")
-        try:
-            if any(folder.iterdir()):
-                raise InputError(folder, "", "a folder with files in it", "one that is new or empty")
-        except OSError as error:
-            raise InputError(folder, "", error.strerror or str(error), "a folder that can be read") from error
-    return folder
 
 
 def folder_files(

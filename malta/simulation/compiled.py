@@ -104,13 +104,14 @@ def _answer(command: list[str]) -> tuple[int, str] | None:
 
 
 def library(
-    text: str, lanes: int, folder: Path | None = None, flags: tuple[str, ...] = FLAGS
+    text: str, lanes: int, folder: Path | None = None, flags: tuple[str, ...] | None = None
 ) -> ctypes.CDLL | None:
     """The library of a C text, from the cache folder or compiled now; None where no compiler can make it."""
     cc = compiler()
     version = None if cc is None else _version(cc)
     if cc is None or version is None:
         return None
+    flags = FLAGS if flags is None else flags
     key = "\n".join([text, str(lanes), *flags, *NATIVE, *cc, version, _processor(), platform.platform()])
     name = f"{hashlib.sha256(key.encode()).hexdigest()}.so"
     for wanted in (folder or cache_folder(), _temporary_folder(), None):

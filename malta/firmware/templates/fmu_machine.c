@@ -1,6 +1,8 @@
 /* The machine between two samples: see {{ name }}.h. Written by malta {{ version }}; one operation a statement. */
 #include "{{ name }}.h"
 
+#include <stdbool.h>
+
 #if defined(__clang__)
 #pragma STDC FP_CONTRACT OFF
 #endif

@@ -1,0 +1,90 @@
+"""What `malta export` writes: a gain file's controller as a folder of C, or a part of its loop as an FMU."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal, get_args
+
+from malta.errors import InputError
+from malta.files import file_exists, locate, replace_files
+from malta.firmware.elementary import Precision
+from malta.firmware.fmu import build_fmu
+from malta.firmware.folder import folder_files
+from malta.firmware.signals import Target, fidelity_of
+from malta.firmware.unit import Part
+from malta.gains.file import content_of, read
+from malta.model.data import plant_of
+from malta.simulation.layout import Fidelity
+from malta.synthesis.controller import Controller
+
+Until = Literal["currents", "duty-cycles"]
+
+
+def export_c(
+    gains: str | Path,
+    out: str | Path,
+    *,
+    precision: Precision = "double",
+    until: Until | None = None,
+    proof: bool = True,
+) -> list[Path]:
+    """Write the controller of a gain file as a folder of C99 with its test and a report; the files.
+
+    out : the folder, new or empty
+    until : how far down the C goes; None: as far as the machine is modelled
+    proof : prove the margin again with the coefficients that single precision holds
+
+    Raises InputError for a folder that has files, an unknown precision, and duty cycles of a machine without windings.
+
+        malta.export_c("design/gains/robust.json", "build/robust_c", precision="float")
+    """
+    path = locate(gains)
+    target = _target(read(path), precision, until)
+    folder, content = require_empty(Path(out)), content_of(path)[0]
+    robust = content.verification.robust
+    texts = folder_files(target, content.sha256, {} if robust is None else robust.uncertainty, proof=proof)
+    files = {folder / name: text.encode() for name, text in sorted(texts.items())}
+    replace_files(files)
+    return list(files)
+
+
+def export_fmu(
+    gains: str | Path, out: str | Path, *, part: Part = "controller", fmi: int = 2, until: Until | None = None
+) -> str:
+    """Write a part of a gain file's loop as an FMU. Returns a sentence where it has no binary, else "".
+
+    out : the file
+    part : "controller", "machine" or "loop"
+    fmi : version of the interface, 2 or 3
+
+    Raises InputError for another part or version, and for duty cycles of a machine without windings.
+
+        malta.export_fmu("design/gains/robust.json", "build/robust_loop.fmu", part="loop", fmi=3)
+    """
+    path = locate(gains)
+    target = _target(read(path), "double", until)
+    fmu = build_fmu(target, content_of(path)[0].sha256, part=part, fmi=fmi)
+    replace_files({Path(out): fmu.content})
+    return fmu.note
+
+
+def _target(c: Controller, precision: Precision, until: Until | None) -> Target:
+    """What is exported. Raises InputError for what a machine does not have."""
+    if until not in (None, *get_args(Until)):
+        raise InputError("export", "until", repr(until), "one of " + ", ".join(get_args(Until)))
+    deepest = fidelity_of(plant_of(c.parameters))
+    depths: dict[str | None, Fidelity] = {None: deepest, "currents": "force", "duty-cycles": "phase"}
+    return Target(c, precision, depths[until])
+
+
+def require_empty(folder: Path) -> Path:
+    """The folder, which is new or empty. Raises InputError for one with files, whatever they are."""
+    if file_exists(folder):
+        if not folder.is_dir():
+            raise InputError(folder, "", "a file of that name", "a folder, new or empty")
+        try:
+            if any(folder.iterdir()):
+                raise InputError(folder, "", "a folder with files in it", "one that is new or empty")
+        except OSError as error:
+            raise InputError(folder, "", error.strerror or str(error), "a folder that can be read") from error
+    return folder
