@@ -7,6 +7,7 @@ at once adds a sample by itself: with a delay of one sample, `late` is 0 there.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from dataclasses import replace
 from importlib.metadata import version
@@ -141,7 +142,7 @@ def _groups(t: Target, part: Part, m: Machine | None) -> Iterator[Group]:
 
 
 def _labels(field: Field) -> list[str]:
-    """The names of a field's variables, as `y.z`; by numbers where names of signals are not letters and digits."""
+    """The names of a field's variables, as `y.z`; numbers as `y[1]` where names of signals do not serve."""
     if field.size == 1 and not field.signals[0].name:
         return [field.name]
     labels = []
@@ -149,16 +150,10 @@ def _labels(field: Field) -> list[str]:
         text = s.name.rstrip("'").removesuffix("*")
         for word in _WORDS:
             text = text.removeprefix(word)
-        labels.append(c_name(text) if text.lower() == text else _with_capitals(text))
-    if len(set(labels)) < len(labels) or "m_" in labels:
+        labels.append(re.sub(r"\W+", "_", text, flags=re.ASCII).strip("_"))
+    if len(set(labels)) < len(labels) or any(not label or label[0].isdigit() for label in labels):
         return [f"{field.name}[{k}]" for k in range(1, field.size + 1)]
     return [f"{field.name}.{label}" for label in labels]
-
-
-def _with_capitals(text: str) -> str:
-    """As c_name, with capital letters: forces F and torques T."""
-    plain = "".join(letter if letter.isascii() and letter.isalnum() else "_" for letter in text).strip("_")
-    return plain if plain and not plain[0].isdigit() else f"m_{plain}"
 
 
 def _at_rest(m: Machine) -> list[float]:
