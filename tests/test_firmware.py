@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +15,12 @@ import malta
 from malta.firmware.elementary import Precision
 from malta.firmware.export import sources
 from malta.firmware.flight import differences, engine_of_c
+from malta.firmware.fmu import build_fmu
+from malta.firmware.folder import folder_files
 from malta.firmware.native import call, call_piece, compile_controller, new_state, view, write
 from malta.firmware.parts import parts_of
 from malta.firmware.program import evaluate, program_of
-from malta.firmware.signals import reading_ranges, reference_fields, state_fields
+from malta.firmware.signals import Target, reading_ranges, reference_fields, state_fields
 from malta.firmware.step import step_of
 from malta.simulation.compiled import compiler
 
@@ -110,6 +113,32 @@ def test_it_flies_as_the_simulation_does(name: str, distance: float) -> None:
     single = malta.simulate(plant, c, scenario, engine=engine_of_c("float"))
     assert max(d.share for d in differences(own, flown)) < 1e-12
     assert 1e-9 < max(d.share for d in differences(own, single)) < 3e-4
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("precision", PRECISIONS)
+def test_a_table_of_currents_is_exported(precision: Precision, tmp_path: Path) -> None:
+    """The planar motor commutates by the paper's bilinear table; recorded vectors pass, and the C flies as the law."""
+    c = controller("planar")
+    c = replace(c, parameters=replace(c.parameters, cells=35.0))
+    t = Target(c, precision, "force")
+    assert [len(t.look_ups), *t.look_ups[0].nodes.shape] == [16, 36, 36, 6]
+    for file, text in folder_files(t, "0" * 64, proof=False).items():
+        (tmp_path / file).write_text(text, encoding="utf-8")
+    done = subprocess.run(
+        ["make", "-s", "-C", str(tmp_path), "test"], check=False, capture_output=True, text=True
+    )
+    assert done.stdout.startswith("pass: 4 vectors"), done.stderr
+    plant = malta.plant_of(c.parameters)
+    scenario = malta.Scenario("hold", 60 * c.sample_time, malta.references.hold, noise=1.0, fidelity="force")
+    own = malta.simulate(plant, c, scenario)
+    flown = malta.simulate(plant, c, scenario, engine=engine_of_c(precision))
+    assert max(d.share for d in differences(own, flown)) < (1e-12 if precision == "double" else 1e-4)
+    assert build_fmu(t, "0" * 64).content
+    with pytest.raises(
+        malta.InputError, match="whose currents come from a table, expected the controller alone"
+    ):
+        build_fmu(t, "0" * 64, part="loop")
 
 
 @pytest.mark.parametrize("precision", PRECISIONS)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import cache
 from importlib.metadata import version
 from typing import Any
@@ -78,7 +78,9 @@ def context_of(t: Target, programs: Mapping[str, Program], name: str, sha256: st
 
     fused = {key: function_text(programs[key], name, t.precision, static=True) for key in FUSED}
     others = {key: p for key, p in programs.items() if key not in FUSED}
-    root = any(o.op == "SQRT" for p in programs.values() for o in p.operations)
+    fused_root, parts_root = (
+        any(o.op == "SQRT" for key in keys for o in programs[key].operations) for keys in (FUSED, others)
+    )
     ff = c.feedforward
     stroke = plant.has_stroke and plant.travel > 0
     step_z = f"out->y_used[{plant.stroke_output}]" if plant.has_stroke else "s->z[0]"
@@ -116,6 +118,10 @@ def context_of(t: Target, programs: Mapping[str, Program], name: str, sha256: st
         "ranges": ", ".join(number(v) for v in reading_ranges(plant)),
         "most_points": MOST_POINTS,
         "most_rate": number(MOST_RATE),
+        "reads": len(t.look_ups),
+        **_table(t, rows),
+        "last_row": number(float(t.look_ups[0].nodes.shape[0] - 1) if t.look_ups else 0.0),
+        "last_column": number(float(t.look_ups[0].nodes.shape[1] - 1) if t.look_ups else 0.0),
         "stroke": stroke,
         "stroke_output": plant.stroke_output if stroke else 0,
         "travel": number(plant.travel),
@@ -123,12 +129,20 @@ def context_of(t: Target, programs: Mapping[str, Program], name: str, sha256: st
         "rises": number(RISES),
         "link": number(plant.drive.link_voltage) if t.driven else "",
         "last_output": _last_output(t),
-        "root": root,
+        "root": fused_root,
+        "parts_root": parts_root,
         "arm_fpu": f" || (defined(__ARM_FP) && ((__ARM_FP & {8 if t.precision == 'double' else 4}) != 0))",
         "builtin_root": "__builtin_sqrt" if t.precision == "double" else "__builtin_sqrtf",
         "digits": 52 if t.precision == "double" else 23,
         **{key: number(v) for key, v in _NUMBERS.items()},
     }
+
+
+def _table(t: Target, rows: Callable[[Any, int], str]) -> dict[str, Any]:
+    """The table of the currents, of a machine that has one."""
+    nodes = t.look_ups[0].nodes if t.look_ups else np.zeros((0, 0, 0))
+    sizes = dict(zip(("table_rows", "table_columns", "table_values"), nodes.shape, strict=True))
+    return {**sizes, "table_numbers": rows(nodes, 6) if nodes.size else ""}
 
 
 _NUMBERS = {"zero": 0.0, "one": 1.0, "two": 2.0, "four": 4.0, "half": 0.5, "quarter": 0.25}
@@ -212,6 +226,6 @@ def call(p: Program, t: Target, name: str) -> str:
     places |= {f.name: f"s->reference.{f.name}" for f in reference_fields(t)}
     places |= {f.name: f"in->{f.name}" for f in input_fields(t)}
     places |= {f.name: f"out->{f.name}" for f in output_fields(t)}
-    places["v0"] = "v0"
+    places |= {key: key for key in ("v0", "table_at", "table")}
     given = [places[key] for key, size in (*p.arguments, *p.results) if size]
     return f"{name}_{p.name}({', '.join(given)})"

@@ -139,8 +139,9 @@ _REPLACED = ("xi_hat", "v", "saturated", "current", "met", "command")
 def _record(plant: Plant, c: Controller, setup: Setup, p: Period) -> ca.Function:
     """(state, given, y, outputs) -> row: what the machine knows of a sample, and what the C commanded."""
     sizes = layout_of(plant, c, setup)
-    state, given = ca.SX.sym("state", p.decide.size1_in(0)), ca.SX.sym("given", p.decide.size1_in(1))
-    y = ca.SX.sym("y", p.decide.size1_in(2))
+    kind = ca.MX if plant.tabulated else ca.SX
+    state, given = kind.sym("state", p.decide.size1_in(0)), kind.sym("given", p.decide.size1_in(1))
+    y = kind.sym("y", p.decide.size1_in(2))
     count = command_size(plant, setup)
     widths = {
         "xi_hat": len(c.states),
@@ -148,8 +149,8 @@ def _record(plant: Plant, c: Controller, setup: Setup, p: Period) -> ca.Function
         "saturated": len(c.forces),
         "current": sizes.row["current"],
     }
-    out = {name: ca.SX.sym(name, size) for name, size in (widths | {"met": 1, "command": count}).items()}
-    own = p.decide(state, given, y, ca.SX.zeros(len(c.forces)), ca.DM(0, 1))[2]
+    out = {name: kind.sym(name, size) for name, size in (widths | {"met": 1, "command": count}).items()}
+    own = p.decide(state, given, y, ca.DM.zeros(len(c.forces)), ca.DM(0, 1))[2]
     row, begin = {}, 0
     for name, size in sizes.row.items():
         row[name] = own[begin : begin + size, 0]

@@ -28,6 +28,7 @@ from malta.firmware.signals import (
     reference_fields,
     state_fields,
 )
+from malta.model.lookup import recorded_look_ups
 from malta.model.plant import Plant
 from malta.simulation.current_control import control_currents
 from malta.simulation.layout import Loop, Signals, electronics_of, numbers_of
@@ -66,7 +67,7 @@ def named_function(name: str, arguments: dict[str, Any], results: dict[str, Any]
 
 
 def sense_function(t: Target) -> ca.Function:
-    """(xi_pred, p, raw y, y_valid) -> (y_used, refused).
+    """(xi_pred, p, raw y, y_valid) -> (y_used, refused), and where the currents will read a table.
 
     A reading is refused that its sensor calls invalid, that is no number, or beyond all that the machine can reach; the
     filter then goes on by its model. Comparisons with a NaN are false, so no reading poisons the state.
@@ -75,7 +76,7 @@ def sense_function(t: Target) -> ca.Function:
     a = symbols(
         [
             *(f for f in state_fields(t) if f.name == "xi_pred"),
-            *(f for f in reference_fields(t) if f.name == "p"),
+            *(f for f in reference_fields(t) if f.name == "p" or (f.name == "dp" and t.look_ups)),
             *(f for f in input_fields(t) if f.name in ("y", "y_valid")),
         ]
     )
@@ -83,7 +84,12 @@ def sense_function(t: Target) -> ca.Function:
     if c.tracks == "errors":
         expected = a["p"]
     used, refused = gate(a["y"], a["y_valid"], reading_ranges(t.believed), expected)
-    return named_function("sense", a, {"y_used": used, "refused": refused})
+    results = {"y_used": used, "refused": refused}
+    if t.look_ups:
+        g = {name: ca.SX(value) for name, value in numbers_of(t.believed, c, 1).items()}
+        _, place = look_ahead(g, a["xi_pred"], used, a["dp"])
+        results["table_at"] = places_in_table(t, place)
+    return named_function("sense", a, results)
 
 
 def gate(raw: Any, valid: Any, ranges: FloatArray, instead: Any) -> tuple[Any, Any]:
@@ -119,7 +125,8 @@ def decide_function(t: Target) -> ca.Function:
     e = sum_errors(g, state["e"], frozen, y, p, sums.add_to_errors)
     xi_pred, saturated, v = commanded(g, xi_hat, e, xi_ref, v_ff, v0)
     xi_pred, place = look_ahead(g, sums.predict(xi_pred, xi_hat), y, dp)
-    wanted, current = currents(t, place, v)
+    table = ca.SX.sym("table", table_size(t))
+    wanted, current = currents(t, place, v, table)
     out |= {"xi_hat": xi_hat, "v": v, "saturated": saturated, "current": current}
     out["met"] = ca.mmax(ca.fabs(current - wanted)) > 0
     after |= {"xi_pred": xi_pred, "e": e, "frozen": saturated}
@@ -134,7 +141,7 @@ def decide_function(t: Target) -> ca.Function:
     after |= sums.rests
     results = {f.name: after[f.name] for f in state_fields(t)}
     results |= {f.name: out[f.name] for f in output_fields(t) if f.name in out}
-    arguments = {**state, **reference, "y_used": y, "v0": v0, **read}
+    arguments = {**state, **reference, "y_used": y, "v0": v0, "table": table, **read}
     results = {(f"{name}_next" if name in state else name): value for name, value in results.items()}
     return named_function("decide", arguments, results)
 
@@ -230,9 +237,27 @@ def recall(t: Target, memory: Any, v_ff: Any, p: Any, dp: Any) -> tuple[Any, Any
     return ca.vertcat(lag, stored, zeros), ca.vertcat(*after)
 
 
-def currents(t: Target, place: Any, v: Any) -> tuple[Any, Any]:
-    """Coil currents that make the forces v where the machine is, as wanted and within their limits."""
-    wanted = t.believed.currents(place, v)
+def table_size(t: Target) -> int:
+    """How many values of a table the currents of a sample take."""
+    return sum(one.values.numel() for one in t.look_ups)
+
+
+def places_in_table(t: Target, place: Any) -> Any:
+    """(u, v) of each reading of the table, where the currents are commutated for `place`."""
+    with recorded_look_ups() as found:
+        t.believed.currents(place, ca.SX.sym("v", len(t.controller.forces)))
+    return ca.vertcat(*(x for one in found for x in (one.u, one.v)))
+
+
+def currents(t: Target, place: Any, v: Any, table: Any) -> tuple[Any, Any]:
+    """Coil currents that make the forces v where the machine is, as wanted and within their limits.
+
+    table : the values that are read at `places_in_table`; none for most machines
+    """
+    with recorded_look_ups() as found:
+        wanted = ca.SX(t.believed.currents(place, v))
+    if found:
+        wanted = ca.substitute(wanted, ca.vertcat(*(one.values for one in found)), table)
     limit = ca.DM(t.controller.limits.current)
     current = t.believed.limited(wanted)
     bounded = [
@@ -312,6 +337,7 @@ def pieces(t: Target) -> list[ca.Function]:
     xi_pred, xi_hat = ca.SX.sym("xi_pred", len(c.states)), ca.SX.sym("xi_hat", len(c.states))
     xi_ref, e = ca.SX.sym("xi_ref", len(c.states)), ca.SX.sym("e", len(c.measurements))
     v_ff = ca.SX.sym("v_ff", len(c.forces))
+    table = ca.SX.sym("table", table_size(t))
     taken = filtered(c.tracks, y, p)
     following, saturated, force = commanded(g, xi_hat, e, xi_ref, v_ff, v0)
     return [
@@ -326,7 +352,10 @@ def pieces(t: Target) -> list[ca.Function]:
             {"xi_hat": xi_hat, "e": e, "xi_ref": xi_ref, "v_ff": v_ff, "v0": v0},
             {"v": force, "saturated": saturated, "xi_pred_next": following},
         ),
-        named_function("currents", {"y": y, "v": v}, {"current": currents(t, y, v)[1]}),
+        *([named_function("places", {"y": y}, {"table_at": places_in_table(t, y)})] if t.look_ups else []),
+        named_function(
+            "currents", {"y": y, "v": v, "table": table}, {"current": currents(t, y, v, table)[1]}
+        ),
         *strokes(),
         *_transformations(plant),
     ]

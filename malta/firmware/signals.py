@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
 import casadi as ca
@@ -12,6 +13,7 @@ import numpy as np
 from malta.errors import InputError
 from malta.firmware.elementary import Precision
 from malta.model.data import plant_of
+from malta.model.lookup import LookUp, recorded_look_ups
 from malta.model.plant import Plant, Signal
 from malta.simulation.layout import Fidelity, Setup, electronics_of
 from malta.synthesis.controller import Controller
@@ -48,9 +50,6 @@ class Target:
     def __post_init__(self) -> None:
         if self.precision not in ("double", "float"):
             raise InputError("export", "precision", repr(self.precision), "double or float")
-        if self.believed.tabulated:
-            found = f"a {self.believed.name} whose currents come from a table"
-            raise InputError("export", self.controller.name, found, "a coil model without a table, cells = 0")
         if self.fidelity != "force" and self.believed.windings is None and not self.has_set_points:
             found = f"a {self.believed.name} without a model of its current loops"
             raise InputError("export", self.controller.name, found, "an export down to currents")
@@ -62,6 +61,24 @@ class Target:
     def believed(self) -> Plant:
         """The machine as the gain file knows it."""
         return plant_of(self.controller.parameters)
+
+    @cached_property
+    def look_ups(self) -> tuple[LookUp, ...]:
+        """Where the currents of a sample read a table; none for most machines.
+
+        Raises InputError for several tables.
+        """
+        if not self.believed.tabulated:
+            return ()
+        y, v = (
+            ca.SX.sym("y", len(self.controller.measurements)),
+            ca.SX.sym("v", len(self.controller.forces)),
+        )
+        with recorded_look_ups() as found:
+            self.believed.currents(y, v)
+        if any(one.nodes is not found[0].nodes for one in found):
+            raise InputError("export", self.controller.name, "currents from several tables", "one table")
+        return tuple(found)
 
     @property
     def setup(self) -> Setup:

@@ -11,6 +11,7 @@ import numpy as np
 from malta.firmware.parts import parts_of
 from malta.firmware.program import TYPES, Program, evaluate, program_of
 from malta.firmware.signals import Target, reference_fields, state_fields
+from malta.model.lookup import interpolate
 
 Vectors = dict[str, Any]
 Step = Callable[[Vectors, Mapping[str, Any], Mapping[str, Any]], tuple[Vectors, Vectors]]
@@ -30,6 +31,15 @@ def look_up(t: Target, z: Any) -> Any:
     k = min(int(np.searchsorted(grid, at, side="right")) - 1, len(grid) - 2)
     share = (at - grid[k]) / (grid[k + 1] - grid[k])
     return (real(1) - share) * v0[k] + share * v0[k + 1]
+
+
+def read_table(t: Target, places: Any) -> Any:
+    """The values of the table at (u, v), (u, v), ..., one reading after the other; none without a table."""
+    real = TYPES[t.precision]
+    if not t.look_ups:
+        return np.zeros(0, dtype=real)
+    nodes = t.look_ups[0].nodes.astype(real)
+    return np.concatenate([interpolate(nodes, u, v) for u, v in np.reshape(places, (-1, 2))])
 
 
 def first_state(t: Target) -> Vectors:
@@ -67,7 +77,8 @@ def step_of(t: Target) -> Step:
             if t.believed.has_stroke
             else t.controller.feedforward.z_grid[0]
         )
-        decided = evaluate(decide, {**known, **sensed, "v0": look_up(t, z)}, t.precision)
+        table = read_table(t, sensed.pop("table_at", None))
+        decided = evaluate(decide, {**known, **sensed, "v0": look_up(t, z), "table": table}, t.precision)
         after = {
             name.removesuffix("_next"): v for name, v in decided.items() if name.endswith("_next") and v.size
         }

@@ -88,6 +88,9 @@ def unit_of(t: Target, part: Part) -> Unit:
     """A unit and its variables. Raises InputError for an unknown part."""
     if part not in PARTS:
         raise InputError("export", "part", repr(part), "one of " + ", ".join(PARTS))
+    if part != "controller" and t.look_ups:
+        found = f"a {t.believed.name} whose currents come from a table"
+        raise InputError("export", part, found, "the controller alone, or a coil model without a table")
     variables = [Variable("time", "independent", "continuous", "s", None, "simulation time", 0)]
     at: dict[str, int] = {}
     m = None if part == "controller" else Machine(t)

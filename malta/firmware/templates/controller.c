@@ -10,9 +10,7 @@
 #if defined(FLT_EVAL_METHOD) && FLT_EVAL_METHOD != 0
 #error "{{ name }}.c needs a processor that computes in the precision of its numbers"
 #endif
-#if defined(__clang__)
-#pragma STDC FP_CONTRACT OFF
-#endif
+{% include "exact.c" %}
 
 {# The place of force j in row k of a table of v0(z). #}
 {% macro entry(k) %}{{ k if forces == 1 else "(%s * %d)"|format(k, forces) }} + j{% endmacro %}
@@ -87,8 +85,15 @@ void {{ name }}_start({{ name }}_state *s) {
 
 void {{ name }}_step({{ name }}_state *s, const {{ name }}_inputs *in, {{ name }}_outputs *out) {
   {{ name }}_real v0[{{ forces }}];
+{% if reads %}
+  {{ name }}_real table_at[{{ 2 * reads }}];
+  {{ name }}_real table[{{ reads * table_values }}];
+{% endif %}
   {{ call_sense }};
   look_up(s, {{ step_z }}, v0);
+{% if reads %}
+  {{ name }}_read_table(table_at, table);
+{% endif %}
   {{ call_decide }};
 }
 

@@ -73,6 +73,12 @@ int32_t {{ name }}_follow_stroke({{ name }}_stroke *k, {{ name }}_reference *r);
 {{ declaration }};
 {% endfor %}
 
+{% if reads %}
+
+/* The table of the currents, bilinear between its nodes: {{ table_values }} values at each (u, v) of `{{ name }}_places`. */
+void {{ name }}_read_table(const {{ name }}_real table_at[{{ 2 * reads }}], {{ name }}_real table[{{ reads * table_values }}]);
+{% endif %}
+
 #ifdef __cplusplus
 }
 #endif

@@ -3,9 +3,7 @@
 
 #include <stdbool.h>
 
-#if defined(__clang__)
-#pragma STDC FP_CONTRACT OFF
-#endif
+{% include "exact.c" %}
 
 static const {{ name }}_real own_z[{{ points }}] = {
 {{ z_rows }}

@@ -24,6 +24,7 @@ from malta.machines.planar.field import (
     Shape,
     unit_series,
 )
+from malta.model.lookup import look_up
 from malta.model.plant import (
     readonly,
 )
@@ -126,7 +127,7 @@ class Table:
     cells: FloatArray  # n^2 x 4 x 6, the corners of each cell
 
     def __call__(self, x: Any, y: Any, z: Any) -> Any:
-        """F_x F_y F_z T_x T_y T_z for 1 A, as `Series`; from CasADi only for MX symbols, as SX has no tables."""
+        """F_x F_y F_z T_x T_y T_z for 1 A, as `Series`; from CasADi for MX, and for SX where look-ups are recorded."""
         if not isinstance(x, np.ndarray):
             return self._traced(x, y, z)
         n = len(self.nodes) - 1
@@ -145,9 +146,6 @@ class Table:
 
     def _traced(self, x: Any, y: Any, z: Any) -> Any:
         n = len(self.nodes) - 1
-        grid = list(np.linspace(0, n, n + 1))
-        values = self.nodes.transpose(1, 0, 2).ravel()  # CasADi counts the first axis fastest
-        table = ca.interpolant("table", "linear", [grid, grid], values, {"lookup_mode": ["exact", "exact"]})
         places, signs = [], []
         for p in (x, y):
             u = p * (n / self.tau_n)
@@ -155,7 +153,7 @@ class Table:
             places.append(n - ca.fabs(u - n))
             signs.append(ca.if_else(u > n, -1, 1))
         sign = [(signs[0] if a else 1) * (signs[1] if b else 1) for a, b in zip(ODD_X, ODD_Y, strict=True)]
-        return table(ca.vertcat(*places)) * ca.vertcat(*sign) * ca.exp(-math.pi / self.tau_n * (z - self.z))
+        return look_up(self.nodes, *places) * ca.vertcat(*sign) * ca.exp(-math.pi / self.tau_n * (z - self.z))
 
 
 _SIGNS = np.array(

@@ -98,8 +98,15 @@ def current_law(par: Parameters, *, numbers: bool) -> Callable[[Any, Any], Any]:
     if not par.cells:
         return lambda y, W: _currents_function(shape_of(par), int(par.order))(y, W, factors_of(par))
     if numbers:
-        look_up = decoupling(par, controller_model(par))
-        return lambda y, W: look_up(_place(par, y), W)
+        model = controller_model(par)
+        looked_up = decoupling(par, model)
+
+        def by_table(y: Any, W: Any) -> Any:
+            if isinstance(W, ca.SX):  # of firmware, which records where the table is read
+                return currents(wrench_matrix(par, model, _place(par, y)), W)
+            return looked_up(_place(par, y), W)
+
+        return by_table
 
     def refuse(_y: Any, _W: Any) -> Any:
         raise CheckError("planar: a table holds numbers: where parameters are symbols, cells has to be 0")
