@@ -30,27 +30,49 @@ if TYPE_CHECKING:
     from malta.model.plant import FloatArray
     from malta.simulation.trajectory import Trajectory
 
+# (inputs, outputs, sample, steps missed before it) -> nothing: what runs at every sample; and what makes it for a state
+Step = Callable[[Any, Any, int, int], None]
+StepOf = Callable[[Native, Any], Step]
 SERIES_COMPARED = ("p", "y", "xi_hat", "v", "current", "force", "i", "u", "i_phase", "duty")
 
 
-def engine_of_c(precision: Precision = "double") -> Callable[[Prepared, Plant, float], Engine]:
+def _own_step(native: Native, state: Any) -> Step:
+    """The controller's own step."""
+    step = getattr(native.lib, f"{native.name}_step")
+
+    def run(inputs: Any, outputs: Any, _: int, __: int) -> None:
+        step(ctypes.byref(state), ctypes.byref(inputs), ctypes.byref(outputs))
+
+    return run
+
+
+def engine_of_c(
+    precision: Precision = "double", step_of: StepOf = _own_step
+) -> Callable[[Prepared, Plant, float], Engine]:
     """What `malta.simulate` takes as its engine to fly the exported C in place of the law: see `malta.simulate`.
+
+    step_of : makes what runs at every sample of a run, for the controller's state; by default the controller's own step
 
     Raises InputError without a C compiler, and for what the export does not have: another estimator, C at the measured
     position, axes that turn, forces known in advance, an open loop.
 
         run = malta.simulate(plant, controller, malta.Scenario.stroke(), engine=malta.engine_of_c("float"))
     """
-    sessions: dict[int, tuple[Any, Any]] = {}
+    sessions: dict[int, tuple[Any, Any, Step]] = {}
 
     def engine(ready: Prepared, now: Plant, substeps: float) -> Engine:
-        return _engine(ready, now, substeps, precision, sessions)
+        return _engine(ready, now, substeps, precision, sessions, step_of)
 
     return engine
 
 
 def _engine(
-    ready: Prepared, now: Plant, substeps: float, precision: Precision, sessions: dict[int, tuple[Any, Any]]
+    ready: Prepared,
+    now: Plant,
+    substeps: float,
+    precision: Precision,
+    sessions: dict[int, tuple[Any, Any, Step]],
+    step_of: StepOf,
 ) -> Engine:
     """The engine of a machine; one run has one state of the controller, also where the machine changes on the way."""
     simulation, inputs = ready.simulation, ready.inputs
@@ -60,8 +82,9 @@ def _engine(
     sizes = layout_of(simulation.plant, c, setup)
     if id(inputs) not in sessions:
         sessions.clear()
-        sessions[id(inputs)] = inputs, _first_state(native, sizes, ready)
-    state = sessions[id(inputs)][1]
+        first_state = _first_state(native, sizes, ready)
+        sessions[id(inputs)] = inputs, first_state, step_of(native, first_state)
+    _, state, step = sessions[id(inputs)]
     errors = tuple(sorted((simulation.scenario.sensor_errors or {}).items()))
     machine = _machine(now, c, setup, substeps, errors)
 
@@ -69,7 +92,7 @@ def _engine(
         first: int, begin: FloatArray, given: FloatArray, noise: FloatArray, fast: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         ddp = inputs.motion.ddp[first : first + len(given)]
-        flight = _Flight(native, state, sizes, machine, setup)
+        flight = _Flight(native, state, step, sizes, machine, setup)
         return _fly(flight, first, begin, given, noise, fast, ddp, substeps)
 
     return Engine(f"exported C, {precision}", run)
@@ -209,6 +232,7 @@ class _Flight(NamedTuple):
 
     native: Native
     state: Any
+    step: Step
     sizes: Layout
     machine: _Machine
     setup: Setup
@@ -226,8 +250,6 @@ def _fly(
 ) -> tuple[FloatArray, FloatArray]:
     """Samples of a run: the last state, and rows."""
     inputs, outputs = f.native.Inputs(), f.native.Outputs()
-    step = getattr(f.native.lib, f"{f.native.name}_step")
-    records = tuple(ctypes.byref(r) for r in (f.state, inputs, outputs))
     held_state = np.array(begin, dtype=float)
     states = np.empty((len(given), len(held_state)))
     reads = np.empty((len(given), f.machine.sense.size1_out(0)))
@@ -240,15 +262,18 @@ def _fly(
     machine = slice(0, sum(f.sizes.machine.values()))
     done = substeps_until(first, substeps)
     begin_substep = done
+    lost = 0
     _call_all_valid(inputs)
     for k, row in enumerate(given):
         states[k] = held_state
         read, _ = (x.ravel() for x in evaluate(f.machine.sense, held_state, row, noise[k], np.empty(0)))
         reads[k] = read
         missed = f.setup.faulty and row[around["missed"]][0]
+        lost += int(missed)
         if not missed:
             _put(f, inputs, held_state, row, read, ddp[k], places, around)
-            step(*records)
+            f.step(inputs, outputs, first + k, lost)
+            lost = 0
             for name in ("xi_pred", "e", "frozen", "u_integral", "u_limited"):
                 if name in places:
                     held_state[places[name]] = view(f.state, name)

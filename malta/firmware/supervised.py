@@ -1,0 +1,154 @@
+"""The exported controller with its supervisor, compiled on this computer: tests, and flights in the simulation."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from malta.errors import InputError
+from malta.firmware.elementary import Precision
+from malta.firmware.export import sources
+from malta.firmware.flight import Step, engine_of_c
+from malta.firmware.native import FLAGS, Native, compile_controller, view
+from malta.firmware.signals import Target
+from malta.firmware.supervisor import STATES, State
+from malta.firmware.supervisor_text import (
+    Member,
+    request_members,
+    supervisor_members,
+    supervisor_sources,
+    time_members,
+)
+from malta.simulation.compiled import compiler, library
+
+if TYPE_CHECKING:
+    from malta.model.plant import FloatArray, Plant
+    from malta.simulation.engines import Engine
+    from malta.simulation.prepared import Prepared
+
+NUMBERS: dict[State, int] = {state: k for k, state in enumerate(STATES)}
+
+
+class Supervised(NamedTuple):
+    """A compiled controller with its supervisor; records are ctypes structures."""
+
+    native: Native
+    Supervisor: Any
+    Request: Any
+
+
+@lru_cache(maxsize=16)
+def compile_supervised(t: Target) -> Supervised:
+    """The C of controller and supervisor, compiled. Raises InputError without a C compiler."""
+    own = compile_controller(t)
+    files = sources(t, "", own.name) | supervisor_sources(t, own.name)
+    order = (".h", "_supervisor.h", ".c", "_parts.c", "_supervisor.c")
+    text = "".join(files[f"{own.name}{end}"] for end in order)
+    for header in (f"{own.name}.h", f"{own.name}_supervisor.h"):
+        text = text.replace(f'#include "{header}"', "")
+    lib = library(text, 1, flags=FLAGS)
+    if lib is None:
+        raise InputError("export", "C compiler", "none that works", "cc, gcc or clang, or $CC")
+    real = ctypes.c_double if t.precision == "double" else ctypes.c_float
+    kinds: dict[str, Any] = {"int32_t": ctypes.c_int32, "real": real, "reference": own.Reference}
+
+    def record(title: str, members: Sequence[Member]) -> Any:
+        of = [(m.name, kinds[m.kind] * m.size if m.size else kinds[m.kind]) for m in members]
+        return type(title, (ctypes.Structure,), {"_fields_": of})
+
+    kinds["times"] = record("Times", time_members())
+    return Supervised(
+        own._replace(lib=lib),
+        record("Supervisor", supervisor_members(t)),
+        record("Request", request_members()),
+    )
+
+
+def require_compiler(what: str) -> None:
+    """Raise InputError where no C compiler is found, which `what` needs."""
+    if compiler() is None:
+        found = "none, and what flies is the exported C"
+        raise InputError("simulate", f"{what}: C compiler", found, "a C compiler: cc, gcc, clang or $CC")
+
+
+class Requests(NamedTuple):
+    """When a supervisor is asked for what, s; take_over: it flies from the start, and would rest there."""
+
+    start: float = 0.0
+    operate: float = 0.0
+    land: float = np.inf
+    take_over: tuple[float, ...] = ()
+
+
+@dataclass(eq=False)
+class Flown:
+    """What a supervisor did in a run, a row for each step that it made."""
+
+    t: list[float] = field(default_factory=list)  # s
+    state: list[int] = field(default_factory=list)  # index in STATES
+    monitor: list[int] = field(default_factory=list)  # index in MONITORS, or -1
+    reference: list[FloatArray] = field(default_factory=list)  # that the controller followed
+    v: list[FloatArray] = field(default_factory=list)  # commanded forces
+
+    def states(self, t: FloatArray) -> FloatArray:
+        """The state at each time; that of the last step where one was missed."""
+        return np.asarray(np.array(self.state)[self._last_steps(t)])
+
+    def references(self, t: FloatArray) -> FloatArray:
+        """The reference that the controller followed at each time."""
+        return np.asarray(np.array(self.reference)[self._last_steps(t)])
+
+    def _last_steps(self, t: FloatArray) -> Any:
+        return np.maximum(np.searchsorted(np.array(self.t), np.asarray(t) + 1e-9, side="right") - 1, 0)
+
+
+def supervised_engine(
+    flights: list[Flown], requests: Requests, precision: Precision = "double"
+) -> Callable[[Prepared, Plant, float], Engine]:
+    """What `malta.simulate` takes as its engine to fly controller and supervisor; each run adds a record to `flights`.
+
+    Raises InputError as `engine_of_c` does.
+
+        flights = []
+        run = malta.simulate(plant, controller, scenario, engine=supervised_engine(flights, Requests()))
+    """
+
+    def stepped(native: Native, state: Any) -> Step:
+        flown = Flown()
+        flights.append(flown)
+        s = compile_supervised(native.target)
+        supervisor, request = s.Supervisor(), s.Request()
+        step = getattr(s.native.lib, f"{native.name}_supervisor_step")
+        if requests.take_over:
+            rest = type(supervisor.rest)(*requests.take_over)
+            getattr(s.native.lib, f"{native.name}_supervisor_take_over")(ctypes.byref(supervisor), rest)
+        else:
+            getattr(s.native.lib, f"{native.name}_supervisor_init")(ctypes.byref(supervisor))
+        last = native.Reference()
+        ctypes.pointer(last)[0] = state.reference
+        Ts = native.target.controller.sample_time
+
+        def fly(inputs: Any, outputs: Any, sample: int, missed: int) -> None:
+            t = sample * Ts
+            request.reference = state.reference
+            state.reference = last
+            request.start = int(requests.start <= t < requests.start + Ts)
+            request.operate = int(t >= requests.operate)
+            request.land = int(t >= requests.land)
+            request.missed = missed
+            step(*(ctypes.byref(r) for r in (supervisor, state, inputs, request, outputs)))
+            ctypes.pointer(last)[0] = state.reference
+            flown.t.append(t)
+            flown.state.append(int(supervisor.state))
+            flown.monitor.append(int(supervisor.monitor))
+            flown.reference.append(view(state.reference, "p").copy())
+            flown.v.append(view(outputs, "v").copy())
+
+        return fly
+
+    return engine_of_c(precision, stepped)

@@ -1,0 +1,296 @@
+"""The supervisor: what it watches, with which limits, and how it reacts; all of it from the gain file and its machine.
+
+    off --start--> offsets --> sensors --> lift --> settle --operate--> operate <--> hold
+     ^                                       |         |                   |           |
+     +-------------------------------- landing <-------+------- land ------+-----------+
+    fault: from everywhere, until it is acknowledged
+
+supervisor_text.py writes these tables as C; templates/supervisor.c is the machine of states itself.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING, Literal, NamedTuple
+
+import casadi as ca
+import numpy as np
+
+from malta.firmware.signals import Target, reading_ranges
+from malta.model.plant import Plant
+from malta.synthesis.controller import Controller
+from malta.synthesis.riccati import eigenvalues
+
+if TYPE_CHECKING:
+    from malta.model.plant import FloatArray
+
+State = Literal["OFF", "OFFSETS", "SENSORS", "LIFT", "SETTLE", "OPERATE", "HOLD", "LANDING", "FAULT"]
+Reaction = Literal["NONE", "IGNORE", "HOLD", "LAND", "FAULT"]
+
+STATES: dict[State, str] = {
+    "OFF": "bridges at zero voltage",
+    "OFFSETS": "bridges at zero voltage; readings of the currents are averaged",
+    "SENSORS": "bridges at zero voltage; readings of positions are checked and averaged",
+    "LIFT": "from the place where the machine rests to zero; a stroke stays where it is",
+    "SETTLE": "at zero, until the errors are small",
+    "OPERATE": "the reference of the request",
+    "HOLD": "the reference stops; operation goes on when no monitor of it is over its threshold",
+    "LANDING": "to the place where the machine rested, with its stroke",
+    "FAULT": "bridges at zero voltage, until acknowledged",
+}
+REACTIONS: tuple[Reaction, ...] = ("NONE", "IGNORE", "HOLD", "LAND", "FAULT")
+FLYING: tuple[State, ...] = ("LIFT", "SETTLE", "OPERATE", "HOLD", "LANDING")
+READY: tuple[State, ...] = ("SETTLE", "OPERATE", "HOLD")
+AWAKE: tuple[State, ...] = ("OFFSETS", "SENSORS", *FLYING)
+TRANSITIONS: tuple[tuple[State, str, State], ...] = (
+    ("OFF", "START", "OFFSETS"),
+    ("OFFSETS", "DONE", "SENSORS"),
+    ("OFFSETS", "LAND", "OFF"),
+    ("SENSORS", "DONE", "LIFT"),
+    ("SENSORS", "LAND", "OFF"),
+    ("LIFT", "DONE", "SETTLE"),
+    ("SETTLE", "DONE", "OPERATE"),
+    ("OPERATE", "HOLD", "HOLD"),
+    ("HOLD", "DONE", "OPERATE"),
+    *((state, "LAND", "LANDING") for state in FLYING if state != "LANDING"),
+    ("LANDING", "DONE", "OFF"),
+    *((state, "FAULT", "FAULT") for state in AWAKE),
+    ("FAULT", "ACKNOWLEDGE", "OFF"),
+)
+
+MONITORS = (
+    *("TOUCH", "RANGE", "RATE", "INNOVATION", "STUCK", "STALE", "NAN", "UNBELIEVED", "BLIND"),
+    *("ASTRAY", "HELPLESS", "MISSED", "CURRENT", "OFFSET", "LINK", "SATURATION", "REFERENCE"),
+    *("UNSETTLED", "UNREADY"),
+)
+
+TOUCH = 0.7  # share of a clearance: two outputs at it are not beyond the clearance of a round bearing
+JUMP = 8.0  # standard deviations of readings that a jump, an innovation or a returning reading may have
+FALSE_ALARM = 1e-15  # probability at a sample that working sensors repeat a value as long as a stuck one
+DISTURBED = 0.05  # share of the largest acceleration by which a machine may leave what the filter expects
+STOPPING = 0.2  # share of the largest acceleration with which references stop
+BRIDGED = 10  # samples for which a sensor is ignored before the reference stops
+SETTLED = 12.0  # standard deviations of readings that errors may have
+SAGGING = 0.3  # share of the link's voltage that is missing
+OFFSET = 0.02  # largest offset of a current sensor as a share of the current limit
+OVER = 1.2  # a current is too large, as a multiple of what the limits of the axes can add up to
+
+
+class Times(NamedTuple):
+    """Durations in samples."""
+
+    offsets: int  # averaged readings of the currents
+    check: int  # samples in a row with readings of all positions that can be true
+    lift: int
+    settle: int  # samples in a row with small errors
+    fade: int  # from one reference to that of the request
+    landing: int
+    calm: int  # samples in a row without a cause to hold
+
+
+TIMES = Times(offsets=200, check=200, lift=1000, settle=200, fade=1000, landing=4000, calm=200)
+
+
+class Monitor(NamedTuple):
+    """A row of the table of monitors: it acts when its level is over a threshold for so many samples in a row."""
+
+    key: str
+    level: str  # in words
+    threshold: float
+    samples: int
+    reaction: Reaction
+    states: tuple[State, ...]  # in which it counts
+
+
+@dataclass(frozen=True, eq=False)
+class Bounds:
+    """Limits of the p outputs, of currents and of times, from the gain file and its machine; inf: none."""
+
+    touch: FloatArray  # p, of readings: near a touchdown or the end of the travel
+    range: FloatArray  # p, of readings: see signals.reading_ranges
+    jump: FloatArray  # p, of readings from sample to sample
+    sigma: FloatArray  # p, standard deviation of a reading, with its resolution
+    settled: FloatArray  # p, of errors
+    drift: FloatArray  # p, of what the filter expects without readings, per sample^2
+    stopping: FloatArray  # p, per s^2, of a reference that stops
+    stuck: tuple[int, ...]  # p, samples with one value from which on a sensor is stuck
+    stale: int  # the same, of all sensors at once
+    unbelieved: int  # samples that a sensor may be ignored
+    current: float  # A, of a reading
+    offset: float  # A, of a current sensor
+
+
+@lru_cache(maxsize=16)
+def bounds_of(t: Target) -> Bounds:
+    """The limits of a target's supervisor.
+
+    Speeds: from rest through twice the way to a touchdown with the largest acceleration, v = sqrt(4 a d). A reading
+    jumps by v Ts and JUMP standard deviations of a difference at most.
+
+        bounds_of(Target(malta.gains.read("design/gains/robust.json"))).jump
+    """
+    c, plant = t.controller, t.believed
+    sigma = reading_deviations(plant)
+    touch, acceleration = touch_bounds(plant), accelerations(c)
+    speed = np.sqrt(4 * acceleration * touch)
+    known = np.where(sigma > 0, sigma, np.inf)
+    quiet = np.where(np.isfinite(touch), 0.01 * touch, reading_ranges(plant) / 100)
+    stopping = np.where(np.isfinite(acceleration), STOPPING * acceleration, np.inf)
+    return Bounds(
+        touch=touch,
+        range=reading_ranges(plant),
+        jump=speed * c.sample_time + math.sqrt(2) * JUMP * sigma,
+        sigma=known,
+        settled=np.where(sigma > 0, SETTLED * sigma, quiet),
+        drift=np.where(np.isfinite(acceleration), DISTURBED / 2 * acceleration * c.sample_time**2, np.inf),
+        stopping=stopping,
+        stuck=tuple(_repetitions([p]) for p in repetition_probabilities(plant)),
+        stale=_repetitions(repetition_probabilities(plant)),
+        unbelieved=_samples_without_reading(c),
+        current=OVER * largest_reading(t),
+        offset=OFFSET * float(np.max(c.limits.current)) if t.driven else math.inf,
+    )
+
+
+def monitors_of(t: Target) -> tuple[Monitor, ...]:
+    """The table of monitors: those that make sense for a target's machine, in the order in which they are counted."""
+    b = bounds_of(t)
+    checked: tuple[State, ...] = ("SENSORS", *FLYING)
+    moving: tuple[State, ...] = ("OPERATE", "HOLD")
+    listed = [
+        Monitor("TOUCH", "reading over the bound of a touchdown", 1.0, 5, "LAND", READY),
+        Monitor("RANGE", "reading over what can be read", 1.0, 1, "IGNORE", checked),
+        Monitor("RATE", "jump of a reading over what the machine can do", 1.0, 1, "IGNORE", FLYING),
+        Monitor("INNOVATION", "|y - h(xi_pred)| over sigma", JUMP, 20, "HOLD", moving),
+        Monitor("INNOVATION", "|y - h(xi_pred)| over sigma", JUMP, 400, "LAND", moving),
+        Monitor("STUCK", "repetitions over what noise allows", 1.0, 1, "IGNORE", checked),
+        Monitor("STALE", "repetitions of all sensors at once", b.stale - 0.5, 1, "IGNORE", checked),
+        Monitor("NAN", "no number, or called invalid", 0.5, 1, "IGNORE", checked),
+        Monitor("UNBELIEVED", "a sensor is ignored", 0.5, BRIDGED, "HOLD", moving),
+        Monitor("UNBELIEVED", "a sensor is ignored", 0.5, b.unbelieved, "LAND", FLYING),
+        Monitor("BLIND", "all sensors are ignored", 0.5, b.unbelieved, "FAULT", FLYING),
+        Monitor("ASTRAY", "expected reading over what can be read", 1.0, 5, "FAULT", FLYING),
+        Monitor("HELPLESS", "a force at its limit, a sensor ignored", 0.5, 10, "FAULT", FLYING),
+        Monitor("MISSED", "missed steps before this one", 2.5, 1, "HOLD", moving),
+        Monitor("MISSED", "missed steps before this one", b.unbelieved + 0.5, 1, "LAND", FLYING),
+        Monitor("CURRENT", "largest reading of a current, A", b.current, 3, "FAULT", AWAKE),
+        Monitor("OFFSET", "largest offset of a current sensor, A", b.offset, 1, "FAULT", ("OFFSETS",)),
+        Monitor("LINK", "missing share of the link voltage", SAGGING, 3, "HOLD", moving),
+        Monitor("LINK", "missing share of the link voltage", SAGGING, 2000, "LAND", READY),
+        Monitor("SATURATION", "a force is at its limit", 0.5, 200, "HOLD", moving),
+        Monitor("SATURATION", "a force is at its limit", 0.5, 1000, "LAND", READY),
+        Monitor("REFERENCE", "a request that is no number or out of reach", 0.5, 1, "HOLD", moving),
+        Monitor("UNSETTLED", "samples without settling", 20.0 * TIMES.settle, 1, "LAND", ("SETTLE",)),
+        Monitor("UNREADY", "samples without good readings", 8.0 * TIMES.check, 1, "FAULT", ("SENSORS",)),
+    ]
+    absent = {
+        "TOUCH": not np.isfinite(b.touch).any(),
+        "RATE": not np.isfinite(b.jump).any(),
+        "INNOVATION": not np.isfinite(b.sigma).any(),
+        "STUCK": min(b.stuck) >= LONG,
+        "STALE": b.stale >= LONG,
+        "CURRENT": not t.driven,
+        "OFFSET": not t.driven,
+        "LINK": not t.driven,
+        "HELPLESS": not np.isfinite(t.controller.limits.force).any(),
+        "SATURATION": not np.isfinite(t.controller.limits.force).any(),
+    }
+    return tuple(row for row in listed if not absent.get(row.key, False))
+
+
+def reading_deviations(plant: Plant) -> FloatArray:
+    """Standard deviations of readings: noise, and steps of the resolution as even noise, q / sqrt(12)."""
+    return np.asarray(np.hypot(np.array(plant.noise), np.array(plant.resolution) / math.sqrt(12)))
+
+
+def repetition_probabilities(plant: Plant) -> list[float]:
+    """The largest probability of each output that a reading of a machine at rest is that of the sample before.
+
+    Normal noise s in steps q stays within the step about its mean with erf(q / (2 sqrt(2) s)); without steps, numbers
+    do not repeat. Of a sensor without noise: 1, it may repeat for ever.
+    """
+    found = []
+    for noise, step in zip(plant.noise, plant.resolution, strict=True):
+        inside = math.erf(step / (2 * math.sqrt(2) * noise)) if noise else 1.0
+        found.append(min(max(inside, 1e-12), 1.0))
+    return found
+
+
+LONG = 1_000_000_000  # samples: never
+
+
+def _repetitions(probabilities: list[float]) -> int:
+    """Repetitions that are less likely than FALSE_ALARM for sensors that repeat with these probabilities."""
+    together = sum(math.log(p) for p in probabilities)
+    return LONG if together > -1e-6 else max(2, math.ceil(math.log(FALSE_ALARM) / together))
+
+
+def touch_bounds(plant: Plant) -> FloatArray:
+    """The reading of each output, the others zero, at which TOUCH of a cushioned clearance is used up, or another one.
+
+    Infinite where nothing is met.
+    """
+    x = ca.SX.sym("x", len(plant.states))
+    cushioned = np.array(plant.cushioned, dtype=bool)
+    contact = ca.Function("contact", [x], [ca.densify(ca.vertcat(plant.contact(x), 0))])
+
+    def used(k: int, reading: float) -> float:
+        p = np.zeros(len(plant.outputs))
+        p[k] = reading
+        q = np.array(plant.position_of(ca.DM(p))).ravel()
+        state = np.zeros(len(plant.states))
+        state[list(plant.controlled)[: len(q)]] = q
+        shares = np.array(contact(state)).ravel()[: len(cushioned)]
+        return float((shares / np.where(cushioned, TOUCH, 1.0)).max(initial=0.0))
+
+    found = []
+    for k, most in enumerate(reading_ranges(plant)):
+        low, high = 0.0, float(most)
+        if max(used(k, high), used(k, -high)) < 1 or used(k, 0.0) >= 1:
+            found.append(math.inf)
+            continue
+        for _ in range(40):
+            middle = (low + high) / 2
+            if max(used(k, middle), used(k, -middle)) < 1:
+                low = middle
+            else:
+                high = middle
+        found.append(low)
+    return np.array(found)
+
+
+def accelerations(c: Controller) -> FloatArray:
+    """The largest accelerations of the outputs, p'' = C A B v within the limits of the forces; inf without limits.
+
+    Of a machine whose states are not positions and rates, p' = C B v is not zero: inf.
+    """
+    if np.abs(c.C @ c.B).max(initial=0.0) > 0:
+        return np.full(len(c.measurements), math.inf)
+    gain = np.abs(c.C @ c.A @ c.B)
+    limits = np.asarray(c.limits.force, dtype=float)
+    return np.array([np.sum(row[row > 0] * limits[row > 0]) or math.inf for row in gain])
+
+
+def _samples_without_reading(c: Controller) -> int:
+    """Samples in which an error of the filter's prediction doubles by the machine's fastest instability; 5 to 200."""
+    fastest = float(eigenvalues(np.asarray(c.A)).real.max(initial=0.0))
+    doubling = math.log(2) / (fastest * c.sample_time) if fastest > 0 else math.inf
+    return int(min(max(doubling, 5), 200))
+
+
+def largest_reading(t: Target) -> float:
+    """A: a bound of what a current sensor reads with all axes at their limits, at any place of the travel; else inf."""
+    if not t.driven:
+        return math.inf
+    plant, drive = t.believed, t.believed.drive
+    axes = np.abs(np.array(ca.DM(drive.command(ca.DM(t.controller.limits.current))))).ravel()
+    if t.fidelity == "dq":
+        return float(axes.max())
+    places = np.linspace(-plant.travel, plant.travel, 101) if plant.has_stroke else np.zeros(1)
+    largest = 0.0
+    for place in places:
+        x = plant.at(**({plant.stroke: place} if plant.has_stroke else {})).x
+        largest = max(largest, float((np.abs(np.array(ca.DM(drive.to_phases(ca.DM(x))))) @ axes).max()))
+    return largest

@@ -1,0 +1,283 @@
+"""The supervisor of supervisor.py as C: <name>_supervisor.h and .c, and the fields of its records."""
+
+from __future__ import annotations
+
+import math
+import textwrap
+from collections.abc import Iterable
+from importlib.metadata import version
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+import casadi as ca
+import numpy as np
+
+from malta.firmware.ctext import c_number, function_text
+from malta.firmware.export import MOST_RATE, comment, render
+from malta.firmware.lowering import lower
+from malta.firmware.program import Program, program_of
+from malta.firmware.sensor_loss import expected_readings, gains_without, prediction_correction
+from malta.firmware.signals import Target, output_fields
+from malta.firmware.supervisor import (
+    JUMP,
+    LONG,
+    MONITORS,
+    REACTIONS,
+    STATES,
+    TIMES,
+    TRANSITIONS,
+    Monitor,
+    bounds_of,
+    monitors_of,
+)
+from malta.simulation.layout import electronics_of
+
+if TYPE_CHECKING:
+    from malta.model.plant import FloatArray
+
+SHORTEST = 20.0  # samples in which a reference stops at least
+QUICK = 40.0  # samples in which an acceleration fades that the next state does not have
+MEMORY = 64.0  # samples over which the noise of readings is averaged
+PASSING = 0.2  # largest (1 - u)^3 (u + 3 u^2): how far a reference of rate 1 goes on in the time 1
+MOST_MISSED = 1_000_000  # steps that count as missed
+
+
+class Member(NamedTuple):
+    """A member of a record: a number, an array of them, or another record."""
+
+    kind: Literal["int32_t", "real", "times", "reference"]
+    name: str
+    size: int  # 0: no array
+    meaning: str
+
+
+def time_members() -> list[Member]:
+    """The durations of a supervisor."""
+    words = {
+        "offsets": "readings of currents that are averaged",
+        "check": "good readings of positions in a row",
+        "lift": "",
+        "settle": "in a row with small errors",
+        "fade": "from one reference to that of the request",
+        "landing": "",
+        "calm": "in a row without a cause to hold",
+    }
+    return [Member("int32_t", name, 0, words[name]) for name in TIMES._fields]
+
+
+def request_members() -> list[Member]:
+    """What a supervisor is asked for at a sample."""
+    return [
+        Member("int32_t", "start", 0, "1: leave OFF"),
+        Member("int32_t", "operate", 0, "1: leave SETTLE for OPERATE"),
+        Member("int32_t", "land", 0, "1: land"),
+        Member("int32_t", "acknowledge", 0, "1: leave FAULT"),
+        Member("int32_t", "missed", 0, "steps that were missed since the last one"),
+        Member("reference", "reference", 0, "in OPERATE"),
+    ]
+
+
+def supervisor_members(t: Target) -> list[Member]:
+    """What a supervisor remembers; state, monitor, reaction and acted are for its caller to read."""
+    p, rows = len(t.controller.measurements), len(monitors_of(t))
+    members = [
+        Member("times", "times", 0, ""),
+        Member("int32_t", "state", 0, ""),
+        Member("int32_t", "monitor", 0, "the last one that acted, or -1"),
+        Member("int32_t", "reaction", 0, "its reaction"),
+        Member("int32_t", "acted", rows, "how often each row of the table acted"),
+        Member("int32_t", "unbelieved", p, "samples for which a sensor has been ignored"),
+        Member("int32_t", "samples", 0, "since the state began"),
+        Member("int32_t", "steady", 0, "samples in a row of what the state waits for"),
+        Member("int32_t", "count", rows * p, "samples in a row over the threshold, of each row and output"),
+        Member("int32_t", "repeated", p, "samples for which a reading has been the same"),
+        Member("int32_t", "unchanged", 0, "the same of all readings"),
+        Member("real", "rest", p, "readings of the machine at rest"),
+        Member("real", "last", p, "last readings"),
+        Member("real", "noise", p, "mean of the last readings' jumps"),
+        Member("real", "limited", p, "1 where a force was at its limit"),
+        Member("real", "place", p, "where the references go"),
+        Member("real", "lasts", p, "s, how long they take"),
+        Member("real", "d0", p, "by how much they differed at first, with two derivatives"),
+        Member("real", "d1", p, ""),
+        Member("real", "d2", p, ""),
+    ]
+    if t.driven:
+        members.append(Member("real", "offset", _currents(t), "A, of the current sensors"))
+    return members
+
+
+def supervisor_sources(t: Target, name: str) -> dict[str, str]:
+    """The C files of a controller's supervisor by name: <name>_supervisor.h and <name>_supervisor.c.
+
+    name : the controller's, see export.sources
+
+        supervisor_sources(Target(malta.gains.read("design/gains/robust.json")), "robust")
+    """
+    context = _context(t, name)
+    return {f"{name}_supervisor.{end}": render(f"supervisor.{end}", context) for end in ("h", "c")}
+
+
+def monitor_lines(t: Target) -> list[str]:
+    """The table of monitors for readers: monitor, level and threshold, samples until it acts, reaction."""
+    lines = [f"{'monitor':<12}{'level':<46}{'over':>9}{'samples':>9}  reaction"]
+    lines += [
+        f"{row.key.lower():<12}{row.level:<46}{row.threshold:>9.4g}{row.samples:>9}  {row.reaction.lower()}"
+        for row in monitors_of(t)
+    ]
+    return lines
+
+
+def _currents(t: Target) -> int:
+    """The number of currents that are read."""
+    return len(t.believed.drive.phases if t.fidelity == "phase" else t.believed.drive.axes)
+
+
+def _context(t: Target, name: str) -> dict[str, Any]:
+    """What the templates of a supervisor are filled with."""
+    c, plant = t.controller, t.believed
+    times = TIMES if t.driven else TIMES._replace(offsets=0)
+    off = _off_command(t)
+    return {
+        "name": name,
+        "NAME": name.upper(),
+        "title": comment(c.name),
+        "version": version("malta"),
+        "states": list(STATES),
+        "monitors": MONITORS,
+        "reactions": REACTIONS,
+        "transitions": TRANSITIONS,
+        "rows": [_row(row, t) for row in monitors_of(t)],
+        "state_lines": [f"{key.lower():<10}{words}" for key, words in STATES.items()],
+        "monitor_lines": monitor_lines(t),
+        "records": _records(t, name),
+        "times": list(times._asdict().items()),
+        "outputs": len(c.measurements),
+        "estimated": len(c.states),
+        "output_fields": [f for f in output_fields(t) if f.size],
+        "currents": _currents(t) if t.driven else 0,
+        "link": _number(plant.drive.link_voltage, t) if t.driven else "",
+        "command": len(off),
+        "off": _vector(off, t),
+        "stroke_output": plant.stroke_output if plant.has_stroke else -1,
+        "except_stroke": f" && (k != {plant.stroke_output})" if plant.has_stroke else "",
+        "longest": LONG,
+        "most_missed": MOST_MISSED,
+        **_bounds(t),
+        **_filters(t, name),
+        **{key: c_number(value, t.precision) for key, value in _NUMBERS.items()},
+    }
+
+
+def _bounds(t: Target) -> dict[str, str]:
+    """The limits of the outputs."""
+    b = bounds_of(t)
+    names = ("touch", "range", "jump", "sigma", "settled", "drift", "stopping")
+    return {name: _vector(getattr(b, name), t) for name in names} | {"stuck": ", ".join(map(str, b.stuck))}
+
+
+def _filters(t: Target, name: str) -> dict[str, Any]:
+    """What the filter expects, and the filters that do without a sensor."""
+    c, gains = t.controller, gains_without(t)
+    p, places = len(c.measurements), gains.places
+    programs: dict[str, Program] = {}
+    if c.tracks == "states":
+        programs["expectation"] = program_of(lower(expected_readings(t), t.precision))
+    if gains.L:
+        programs["correction"] = program_of(lower(prediction_correction(t), t.precision))
+    missing, blocks = np.zeros((len(places), len(c.states), p)), []
+    for k in range(p):
+        of = [f"    {{\n{_matrix(L, t)}\n    }}" for L in gains.L.get(k, missing)]
+        blocks.append("  {\n" + ",\n".join(of) + "\n  }")
+    return {
+        "tracks_errors": c.tracks == "errors",
+        "fallback": bool(gains.L),
+        "places": len(places),
+        "first_place": _number(float(places[0]), t),
+        "apart": _number(float(np.ptp(places)) / max(len(places) - 1, 1), t),
+        "has_gain": ", ".join(str(int(k in gains.L)) for k in range(p)),
+        "gain_rows": ",\n".join(blocks),
+        "root": any(o.op == "SQRT" for program in programs.values() for o in program.operations),
+        **{key: function_text(program, name, t.precision, static=True) for key, program in programs.items()},
+    }
+
+
+def _number(value: float, t: Target) -> str:
+    """A limit in C; in place of none a number that nothing reaches, and whose square is a number in any precision."""
+    return c_number(min(value, 1e18), t.precision)
+
+
+def _vector(values: Iterable[float], t: Target) -> str:
+    """Limits or gains in C."""
+    return ", ".join(_number(float(v), t) for v in values)
+
+
+def _matrix(rows: FloatArray, t: Target) -> str:
+    """A matrix of gains in C."""
+    indent = " " * 8
+    lines = [
+        textwrap.fill(_vector(row, t), 110, initial_indent=indent, subsequent_indent=indent) for row in rows
+    ]
+    return ",\n".join(f"{indent[2:]}{{\n{line}\n{indent[2:]}}}" for line in lines)
+
+
+_NUMBERS = {
+    "zero": 0.0,
+    "one": 1.0,
+    "two": 2.0,
+    "three": 3.0,
+    "six": 6.0,
+    "twelve": 12.0,
+    "half": 0.5,
+    "three_halves": 1.5,
+    "most": 1e30,  # of a reading that is a number
+    "believed": JUMP,
+    "jump_deviations": math.sqrt(2) * JUMP,
+    "mean_jump": 2 / math.sqrt(math.pi),
+    "memory": 1 / MEMORY,
+    "shortest": SHORTEST,
+    "quick": QUICK,
+    "passing": PASSING,
+    "most_rate": MOST_RATE,
+}
+
+
+def _row(row: Monitor, t: Target) -> dict[str, Any]:
+    """A row of the table of monitors for the template."""
+    bits = sum(1 << k for k, state in enumerate(STATES) if state in row.states)
+    threshold = c_number(row.threshold, t.precision)
+    return row._asdict() | {"threshold": threshold, "states": bits}
+
+
+def _off_command(t: Target) -> list[float]:
+    """What is commanded for no voltage, or for no current of electronics that take set points."""
+    if t.has_set_points:
+        electronics = electronics_of(t.believed, t.setup)
+        if electronics is None:
+            return []
+        y = t.believed.h(ca.SX.zeros(len(t.believed.states)), 0)
+        held = electronics.held(ca.SX.zeros(len(t.believed.actuator.coils)), y)
+        return [float(v) for v in np.array(ca.evalf(ca.densify(held))).ravel()]
+    if not t.driven:
+        return []
+    return [0.5] * _currents(t) if t.fidelity == "phase" else [0.0] * _currents(t)
+
+
+def _records(t: Target, name: str) -> list[dict[str, Any]]:
+    """The structs of the header."""
+    listed = (
+        ("times", "Durations in samples.", time_members()),
+        ("request", "What is asked for at a sample.", request_members()),
+        ("supervisor", "What the supervisor remembers.", supervisor_members(t)),
+    )
+    return [
+        {"name": key, "meaning": meaning, "lines": [_line(member, name) for member in members]}
+        for key, meaning, members in listed
+    ]
+
+
+def _line(member: Member, name: str) -> str:
+    """A member of a struct, with its meaning."""
+    kind = member.kind if member.kind == "int32_t" else f"{name}_{member.kind}"
+    size = f"[{member.size}]" if member.size else ""
+    text = f"{kind} {member.name}{size};"
+    return f"{text} /* {member.meaning} */" if member.meaning else text

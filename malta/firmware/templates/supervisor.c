@@ -1,0 +1,759 @@
+/* {{ title }}: see {{ name }}_supervisor.h. Written by malta {{ version }}. */
+#include "{{ name }}_supervisor.h"
+
+#include <stdbool.h>
+
+#if defined(__clang__)
+#pragma STDC FP_CONTRACT OFF
+#endif
+
+#define OUTPUTS {{ outputs }}
+#define STATES {{ estimated }} /* of the filter */
+#define EVENT_NONE 0
+#define EVENT_START 1
+#define EVENT_DONE 2
+#define EVENT_HOLD 3
+#define EVENT_LAND 4
+#define EVENT_FAULT 5
+#define EVENT_ACKNOWLEDGE 6
+
+const {{ name }}_monitor {{ name }}_monitors[{{ NAME }}_MONITOR_ROWS] = {
+{% for row in rows %}
+  { {{ NAME }}_MONITOR_{{ row.key }}, {{ row.threshold }}, {{ row.samples }}, {{ NAME }}_REACTION_{{ row.reaction }}, {{ row.states }} },
+{% endfor %}
+};
+
+typedef struct {
+  int32_t from;
+  int32_t event;
+  int32_t to;
+} transition;
+
+static const transition transitions[{{ transitions | length }}] = {
+{% for row in transitions %}
+  { {{ NAME }}_{{ row[0] }}, EVENT_{{ row[1] }}, {{ NAME }}_{{ row[2] }} },
+{% endfor %}
+};
+
+static const {{ name }}_real near_touch[OUTPUTS] = { {{ touch }} };
+static const {{ name }}_real range[OUTPUTS] = { {{ range }} };
+static const {{ name }}_real jump[OUTPUTS] = { {{ jump }} };       /* from sample to sample */
+static const {{ name }}_real sigma[OUTPUTS] = { {{ sigma }} };     /* of a reading */
+static const {{ name }}_real settled[OUTPUTS] = { {{ settled }} }; /* errors of a machine that has settled */
+static const {{ name }}_real drift[OUTPUTS] = { {{ drift }} };     /* of what the filter expects alone, per sample^2 */
+static const {{ name }}_real stopping[OUTPUTS] = { {{ stopping }} }; /* of references, per s^2 */
+static const int32_t same_values[OUTPUTS] = { {{ stuck }} };       /* in a row, from which on a sensor is stuck */
+{% if fallback %}
+static const int32_t has_gain[OUTPUTS] = { {{ has_gain }} };
+static const {{ name }}_real gain_without[OUTPUTS][{{ places }}][STATES][OUTPUTS] = { /* of the filter, without one sensor each */
+{{ gain_rows }}
+};
+{% endif %}
+
+static {{ name }}_real size_of({{ name }}_real value) { return (value < {{ zero }}) ? -value : value; }
+
+static int32_t is_flying(int32_t state) {
+  return ((state >= {{ NAME }}_LIFT) && (state <= {{ NAME }}_LANDING)) ? 1 : 0;
+}
+
+/* Whether a number is one, and of this size at most. */
+static int32_t is_within({{ name }}_real value, {{ name }}_real most) {
+  return ((value <= most) && (value >= -most)) ? 1 : 0;
+}
+
+/* Steps that were missed before a sample. */
+static int32_t missed_of(const {{ name }}_request *request) {
+  const int32_t some = (request->missed > 0) ? request->missed : 0;
+  return (some < {{ most_missed }}) ? some : {{ most_missed }};
+}
+
+static void forget_sensors({{ name }}_supervisor *sup) {
+  int32_t k;
+  for (k = 0; k < OUTPUTS; k++) {
+    sup->unbelieved[k] = 0;
+    sup->repeated[k] = 0;
+    sup->limited[k] = {{ zero }};
+    sup->noise[k] = {{ zero }};
+  }
+  for (k = 0; k < ({{ NAME }}_MONITOR_ROWS * OUTPUTS); k++) {
+    sup->count[k] = 0;
+  }
+  sup->unchanged = 0;
+}
+
+void {{ name }}_supervisor_init({{ name }}_supervisor *sup) {
+  int32_t k;
+{% for key, value in times %}
+  sup->times.{{ key }} = {{ value }};
+{% endfor %}
+  sup->state = {{ NAME }}_OFF;
+  sup->monitor = -1;
+  sup->reaction = {{ NAME }}_REACTION_NONE;
+  sup->samples = 0;
+  sup->steady = 0;
+  for (k = 0; k < {{ NAME }}_MONITOR_ROWS; k++) {
+    sup->acted[k] = 0;
+  }
+  for (k = 0; k < OUTPUTS; k++) {
+    sup->rest[k] = {{ zero }};
+    sup->last[k] = {{ zero }};
+    sup->place[k] = {{ zero }};
+    sup->d0[k] = {{ zero }};
+    sup->d1[k] = {{ zero }};
+    sup->d2[k] = {{ zero }};
+    sup->lasts[k] = {{ NAME }}_SAMPLE_TIME;
+  }
+{% if currents %}
+  for (k = 0; k < {{ currents }}; k++) {
+    sup->offset[k] = {{ zero }};
+  }
+{% endif %}
+  forget_sensors(sup);
+}
+
+void {{ name }}_supervisor_take_over({{ name }}_supervisor *sup, const {{ name }}_real rest[OUTPUTS]) {
+  int32_t k;
+  {{ name }}_supervisor_init(sup);
+  sup->state = {{ NAME }}_OPERATE;
+  for (k = 0; k < OUTPUTS; k++) {
+    sup->rest[k] = rest[k];
+  }
+}
+
+{% if not tracks_errors %}
+{% if root %}
+{% include "root.c" %}
+
+{% endif %}
+{{ expectation }}
+{% endif %}
+{% if fallback %}
+{{ correction }}
+{% endif %}
+/* What the filter expects of the readings; of a machine that does not fly, the readings themselves. */
+static void expect(const {{ name }}_supervisor *sup, const {{ name }}_state *s, const {{ name }}_inputs *in,
+                   {{ name }}_real expected[OUTPUTS]) {
+  int32_t k;
+  if (is_flying(sup->state) == 1) {
+{% if tracks_errors %}
+    for (k = 0; k < OUTPUTS; k++) {
+      expected[k] = s->reference.p[k];
+    }
+{% else %}
+    {{ name }}_expected(s->xi_pred, expected);
+{% endif %}
+  } else {
+    for (k = 0; k < OUTPUTS; k++) {
+      expected[k] = in->y[k];
+    }
+  }
+}
+
+/* Levels of the monitors of each position sensor. */
+static void look_at_sensor({{ name }}_supervisor *sup, const {{ name }}_inputs *in, int32_t missed, int32_t k,
+                           {{ name }}_real expected, {{ name }}_real level[{{ monitors | length }}][OUTPUTS]) {
+  const {{ name }}_real y = in->y[k];
+  const int32_t is_number = is_within(y, {{ most }});
+  if ((is_number == 1) && (in->y_valid[k] != {{ zero }})) {
+    const {{ name }}_real moved = size_of(y - sup->last[k]);
+    const {{ name }}_real age = ({{ name }}_real)sup->unbelieved[k];
+    const {{ name }}_real away = size_of(y - expected);
+    const {{ name }}_real grown = (age * age) * drift[k];
+    const {{ name }}_real counted = (moved < range[k]) ? moved : range[k];
+    {{ name }}_real near_expected;
+    {{ name }}_real more;
+    sup->noise[k] = sup->noise[k] + ({{ memory }} * (counted - sup->noise[k]));
+    more = sup->noise[k] / ({{ mean_jump }} * sigma[k]); /* readings may be noisier than they are said to be */
+    more = (more > {{ one }}) ? more : {{ one }};
+    near_expected = ({{ believed }} * (sigma[k] * more)) + grown;
+    sup->repeated[k] = (y == sup->last[k]) ? (sup->repeated[k] + 1) : 0;
+    level[{{ NAME }}_MONITOR_RANGE][k] = size_of(y) / range[k];
+    level[{{ NAME }}_MONITOR_STUCK][k] = ({{ name }}_real)sup->repeated[k] / ({{ name }}_real)same_values[k];
+    if (sup->unbelieved[k] == 0) {
+      const {{ name }}_real times = ({{ name }}_real)(missed + 1);
+      level[{{ NAME }}_MONITOR_TOUCH][k] = size_of(y) / near_touch[k];
+      const {{ name }}_real wider = {{ jump_deviations }} * (sigma[k] * (more - {{ one }}));
+      level[{{ NAME }}_MONITOR_RATE][k] = moved / ((jump[k] + wider) * times);
+      level[{{ NAME }}_MONITOR_INNOVATION][k] = away / (sigma[k] * more);
+    } else if (away > near_expected) {
+      level[{{ NAME }}_MONITOR_UNBELIEVED][k] = {{ one }};
+    } else {
+      /* believed again, unless a monitor objects */
+    }
+    sup->last[k] = y;
+  } else {
+    level[{{ NAME }}_MONITOR_NAN][k] = {{ one }};
+    sup->repeated[k] = 0;
+  }
+}
+
+/* Levels of the monitors that look at all position sensors together. */
+static void look_at_sensors({{ name }}_supervisor *sup, {{ name }}_real level[{{ monitors | length }}][OUTPUTS]) {
+  int32_t repeated = 1;
+  int32_t believed = 0;
+  int32_t k;
+  for (k = 0; k < OUTPUTS; k++) {
+    if (sup->repeated[k] == 0) {
+      repeated = 0;
+    }
+    if (sup->unbelieved[k] == 0) {
+      believed++;
+    }
+  }
+  sup->unchanged = (repeated == 1) ? (sup->unchanged + 1) : 0;
+  for (k = 0; k < OUTPUTS; k++) {
+    level[{{ NAME }}_MONITOR_STALE][k] = ({{ name }}_real)sup->unchanged;
+  }
+  level[{{ NAME }}_MONITOR_BLIND][0] = (believed == 0) ? {{ one }} : {{ zero }};
+  for (k = 0; k < OUTPUTS; k++) {
+    /* a filter that lost its way would throw the machine against its bearings */
+    level[{{ NAME }}_MONITOR_HELPLESS][k] = (believed < OUTPUTS) ? sup->limited[k] : {{ zero }};
+  }
+}
+
+/* Whether a reference consists of numbers within reach. */
+static int32_t is_reference(const {{ name }}_reference *r) {
+  int32_t accepted = 1;
+  int32_t k;
+  for (k = 0; k < OUTPUTS; k++) {
+    if ((is_within(r->p[k], range[k]) + is_within(r->dp[k], {{ most_rate }}) + is_within(r->ddp[k], {{ most_rate }})) != 3) {
+      accepted = 0;
+    }
+  }
+  return accepted;
+}
+
+/* Levels of all monitors at a sample. */
+static void look({{ name }}_supervisor *sup, const {{ name }}_inputs *in, const {{ name }}_request *request,
+                 const {{ name }}_real expected[OUTPUTS], {{ name }}_real level[{{ monitors | length }}][OUTPUTS]) {
+  const int32_t missed = missed_of(request);
+  int32_t k;
+  int32_t m;
+  for (m = 0; m < {{ monitors | length }}; m++) {
+    for (k = 0; k < OUTPUTS; k++) {
+      level[m][k] = {{ zero }};
+    }
+  }
+  for (k = 0; k < OUTPUTS; k++) {
+    look_at_sensor(sup, in, missed, k, expected[k], level);
+    level[{{ NAME }}_MONITOR_SATURATION][k] = sup->limited[k];
+    if (is_flying(sup->state) == 1) {
+      level[{{ NAME }}_MONITOR_ASTRAY][k] = (is_within(expected[k], range[k]) == 1) ? {{ zero }} : {{ two }};
+    }
+  }
+  look_at_sensors(sup, level);
+  level[{{ NAME }}_MONITOR_MISSED][0] = ({{ name }}_real)missed;
+  level[{{ NAME }}_MONITOR_REFERENCE][0] = (is_reference(&request->reference) == 1) ? {{ zero }} : {{ one }};
+  level[{{ NAME }}_MONITOR_UNSETTLED][0] = ({{ name }}_real)sup->samples;
+  level[{{ NAME }}_MONITOR_UNREADY][0] = ({{ name }}_real)sup->samples;
+{% if currents %}
+  for (k = 0; k < {{ currents }}; k++) {
+    if ((in->i_valid[k] != {{ zero }}) && (size_of(in->i[k]) > level[{{ NAME }}_MONITOR_CURRENT][0])) {
+      level[{{ NAME }}_MONITOR_CURRENT][0] = size_of(in->i[k]);
+    }
+    if ((sup->samples >= sup->times.offsets) && (size_of(sup->offset[k]) > level[{{ NAME }}_MONITOR_OFFSET][0])) {
+      level[{{ NAME }}_MONITOR_OFFSET][0] = size_of(sup->offset[k]);
+    }
+  }
+  level[{{ NAME }}_MONITOR_LINK][0] = {{ one }};
+  if (is_within(in->link[0], {{ most }}) == 1) {
+    level[{{ NAME }}_MONITOR_LINK][0] = {{ one }} - (in->link[0] / {{ link }});
+  }
+{% endif %}
+}
+
+/* Count every row of the table; the strongest reaction of those that act. */
+static int32_t judge({{ name }}_supervisor *sup, {{ name }}_real level[{{ monitors | length }}][OUTPUTS]) {
+  int32_t strongest = {{ NAME }}_REACTION_NONE;
+  int32_t calm = 1;
+  int32_t refused[OUTPUTS];
+  int32_t r;
+  int32_t k;
+  for (k = 0; k < OUTPUTS; k++) {
+    /* an unbelieved sensor stays so while it is far from what is expected */
+    refused[k] = (level[{{ NAME }}_MONITOR_UNBELIEVED][k] > {{ half }}) ? 1 : 0;
+  }
+  for (r = 0; r < {{ NAME }}_MONITOR_ROWS; r++) {
+    const {{ name }}_monitor *row = &{{ name }}_monitors[r];
+    const int32_t counts = (row->states / (1 << sup->state)) % 2;
+    int32_t acts = 0;
+    for (k = 0; k < OUTPUTS; k++) {
+      int32_t *count = &sup->count[(r * OUTPUTS) + k];
+      {{ name }}_real now = level[row->monitor][k];
+      if (row->monitor == {{ NAME }}_MONITOR_UNBELIEVED) {
+        now = (sup->unbelieved[k] > 0) ? {{ one }} : {{ zero }};
+      }
+      if ((counts == 1) && (now > row->threshold)) {
+        *count = (*count < {{ longest }}) ? (*count + 1) : *count;
+        if (row->reaction == {{ NAME }}_REACTION_HOLD) {
+          calm = 0;
+        }
+        if (*count >= row->samples) {
+          acts = 1;
+          if (row->reaction == {{ NAME }}_REACTION_IGNORE) {
+            refused[k] = 1;
+          }
+          if (*count == row->samples) {
+            sup->monitor = row->monitor;
+            sup->reaction = row->reaction;
+            sup->acted[r] = (sup->acted[r] < {{ longest }}) ? (sup->acted[r] + 1) : sup->acted[r];
+          }
+        }
+      } else {
+        *count = 0;
+      }
+    }
+    if ((acts == 1) && (row->reaction > strongest)) {
+      strongest = row->reaction;
+    }
+  }
+  for (k = 0; k < OUTPUTS; k++) {
+    const int32_t longer = (sup->unbelieved[k] < {{ longest }}) ? (sup->unbelieved[k] + 1) : sup->unbelieved[k];
+    sup->unbelieved[k] = (refused[k] == 1) ? longer : 0;
+    if ((refused[k] == 1) && (sup->state == {{ NAME }}_SENSORS)) {
+      calm = 0;
+    }
+  }
+  if ((sup->state == {{ NAME }}_HOLD) || (sup->state == {{ NAME }}_SENSORS)) {
+    sup->steady = (calm == 1) ? (sup->steady + 1) : 0;
+  }
+  return strongest;
+}
+
+{% if currents %}
+/* Average the readings of the current sensors while there is no current. */
+static void average_currents({{ name }}_supervisor *sup, const {{ name }}_inputs *in) {
+  const {{ name }}_real number = ({{ name }}_real)(sup->samples + 1);
+  int32_t k;
+  for (k = 0; k < {{ currents }}; k++) {
+    if (is_within(in->i[k], {{ most }}) == 1) {
+      const {{ name }}_real more = (in->i[k] - sup->offset[k]) / number;
+      sup->offset[k] = sup->offset[k] + more;
+    } else {
+      sup->offset[k] = {{ most }}; /* a sensor without a number has no offset: refused */
+    }
+  }
+}
+
+{% endif %}
+/* Average the readings of a machine at rest: the place where it lands again. */
+static void average_rest({{ name }}_supervisor *sup) {
+  int32_t k;
+  for (k = 0; k < OUTPUTS; k++) {
+    const {{ name }}_real more = (sup->last[k] - sup->rest[k]) / ({{ name }}_real)((sup->steady > 0) ? sup->steady : 1);
+    sup->rest[k] = sup->rest[k] + more;
+  }
+}
+
+/* Samples in a row at which a machine that lands without one of its sensors is where it rested, by the others. */
+static void count_landed({{ name }}_supervisor *sup, const {{ name }}_inputs *in) {
+  int32_t ignored = 0;
+  int32_t k;
+  sup->steady = sup->steady + 1;
+  for (k = 0; k < OUTPUTS; k++) {
+    if (sup->unbelieved[k] > 0) {
+      ignored = 1;
+    } else if ((is_within(in->y[k] - sup->rest[k], settled[k]) == 0){{ except_stroke }}) {
+      sup->steady = 0;
+    } else {
+      /* there */
+    }
+  }
+  if (ignored == 0) {
+    sup->steady = 0;
+  }
+}
+
+/* Samples in a row with errors of a machine that has settled. */
+static void count_settled({{ name }}_supervisor *sup, const {{ name }}_state *s, const {{ name }}_inputs *in) {
+  int32_t k;
+  sup->steady = sup->steady + 1;
+  for (k = 0; k < OUTPUTS; k++) {
+    if ((sup->unbelieved[k] > 0) || (is_within(in->y[k] - s->reference.p[k], settled[k]) == 0)) {
+      sup->steady = 0;
+    }
+  }
+}
+
+/* What a state waits for. */
+static int32_t is_done(const {{ name }}_supervisor *sup, const {{ name }}_request *request) {
+  int32_t done;
+  switch (sup->state) {
+  case {{ NAME }}_OFFSETS:
+    done = (sup->samples > sup->times.offsets) ? 1 : 0; /* one more, in which the offsets are judged */
+    break;
+  case {{ NAME }}_SENSORS:
+    done = (sup->steady >= sup->times.check) ? 1 : 0;
+    break;
+  case {{ NAME }}_LIFT:
+    done = (sup->samples >= sup->times.lift) ? 1 : 0;
+    break;
+  case {{ NAME }}_SETTLE:
+    done = ((sup->steady >= sup->times.settle) && (request->operate != 0)) ? 1 : 0;
+    break;
+  case {{ NAME }}_HOLD:
+    done = (sup->steady >= sup->times.calm) ? 1 : 0;
+    break;
+  case {{ NAME }}_LANDING:
+    done = ((sup->samples >= (sup->times.landing + sup->times.settle)) || (sup->steady > 0)) ? 1 : 0;
+    break;
+  default:
+    done = 0;
+    break;
+  }
+  return done;
+}
+
+/* The event of a sample: the strongest. */
+static int32_t event_of(const {{ name }}_supervisor *sup, const {{ name }}_request *request, int32_t reaction) {
+  int32_t event = EVENT_NONE;
+  if (reaction == {{ NAME }}_REACTION_FAULT) {
+    event = EVENT_FAULT;
+  } else if ((reaction == {{ NAME }}_REACTION_LAND) || (request->land != 0)) {
+    event = EVENT_LAND;
+  } else if (reaction == {{ NAME }}_REACTION_HOLD) {
+    event = EVENT_HOLD;
+  } else if (is_done(sup, request) == 1) {
+    event = EVENT_DONE;
+  } else if ((request->start != 0) && (sup->state == {{ NAME }}_OFF)) {
+    event = EVENT_START;
+  } else if (request->acknowledge != 0) {
+    event = EVENT_ACKNOWLEDGE;
+  } else {
+    /* nothing */
+  }
+  if ((event == EVENT_LAND) && (sup->state == {{ NAME }}_LANDING) && (is_done(sup, request) == 1)) {
+    event = EVENT_DONE;
+  }
+  return event;
+}
+
+/* The place where a moving reference stops, within the room that is left, and the time that this takes. */
+static void stop_output({{ name }}_supervisor *sup, int32_t k, {{ name }}_real p, {{ name }}_real dp) {
+  const {{ name }}_real speed = size_of(dp);
+  const {{ name }}_real ahead = (dp > {{ zero }}) ? (near_touch[k] - p) : (near_touch[k] + p);
+  const {{ name }}_real shortest = {{ shortest }} * {{ NAME }}_SAMPLE_TIME;
+  {{ name }}_real lasts = ({{ three_halves }} * speed) / stopping[k];
+  if ((ahead > {{ zero }}) && ((speed * lasts) > ({{ three_halves }} * ahead))) {
+    lasts = ({{ three_halves }} * ahead) / speed; /* it needs three quarters of the way that is left */
+  }
+  if (lasts < shortest) {
+    lasts = shortest;
+  }
+  sup->lasts[k] = lasts;
+  sup->place[k] = p + ({{ half }} * (dp * lasts));
+}
+
+{% if stroke_output >= 0 %}
+/* Less time for a stroke that moves on its way back: it goes on by {{ passing }} of its speed times this time. */
+static void return_output({{ name }}_supervisor *sup, int32_t k, {{ name }}_real p, {{ name }}_real dp) {
+  const {{ name }}_real ahead = (dp > {{ zero }}) ? (near_touch[k] - p) : (near_touch[k] + p);
+  const {{ name }}_real most = {{ half }} * ahead;
+  const {{ name }}_real passed = {{ passing }} * (size_of(dp) * sup->lasts[k]);
+  if ((most > {{ zero }}) && (passed > most)) {
+    sup->lasts[k] = most / ({{ passing }} * size_of(dp));
+  }
+}
+
+{% endif %}
+/* The goal of an output's reference in a state: p, dp, ddp. */
+static void goal_of(const {{ name }}_supervisor *sup, const {{ name }}_request *request, int32_t k,
+                    {{ name }}_real goal[3]) {
+  goal[0] = sup->place[k];
+  goal[1] = {{ zero }};
+  goal[2] = {{ zero }};
+  if (sup->state == {{ NAME }}_OPERATE) {
+    goal[0] = request->reference.p[k];
+    goal[1] = request->reference.dp[k];
+    goal[2] = request->reference.ddp[k];
+  }
+}
+
+/* Where a state's references go, and the time that this takes; what they differ by at first fades. */
+static void begin({{ name }}_supervisor *sup, const {{ name }}_state *s, const {{ name }}_request *request) {
+  const int32_t missed = missed_of(request);
+  const {{ name }}_real h = ({{ name }}_real)(missed + 1) * {{ NAME }}_SAMPLE_TIME;
+  int32_t k;
+  for (k = 0; k < OUTPUTS; k++) {
+    const {{ name }}_real ddp = s->reference.ddp[k];
+    const {{ name }}_real dp = s->reference.dp[k] + (ddp * h);
+    const {{ name }}_real mean = s->reference.dp[k] + ({{ half }} * (ddp * h));
+    const {{ name }}_real p = s->reference.p[k] + (mean * h);
+    {{ name }}_real goal[3];
+    int32_t samples = sup->times.fade;
+    switch (sup->state) {
+    case {{ NAME }}_LIFT:
+      samples = sup->times.lift;
+      sup->place[k] = {{ zero }};
+      break;
+    case {{ NAME }}_LANDING:
+      samples = sup->times.landing;
+      sup->place[k] = sup->rest[k];
+      break;
+    default:
+      break;
+    }
+    sup->lasts[k] = ({{ name }}_real)samples * {{ NAME }}_SAMPLE_TIME;
+{% if stroke_output >= 0 %}
+    if ((k == {{ stroke_output }}) && (sup->state == {{ NAME }}_LIFT)) {
+      sup->place[k] = sup->rest[k]; /* the stroke begins in operation */
+    }
+    if ((k == {{ stroke_output }}) && (sup->state == {{ NAME }}_LANDING)) {
+      return_output(sup, k, p, dp);
+    }
+{% endif %}
+    if (sup->state == {{ NAME }}_HOLD) {
+      stop_output(sup, k, p, dp);
+    }
+    goal_of(sup, request, k, goal);
+    sup->d0[k] = p - goal[0];
+    sup->d1[k] = dp - goal[1];
+    sup->d2[k] = ddp - goal[2];
+  }
+}
+
+/* Follow the table of transitions. */
+static void change_state({{ name }}_supervisor *sup, {{ name }}_state *s, const {{ name }}_request *request,
+                         int32_t event) {
+  const int32_t from = sup->state;
+  int32_t to = from;
+  int32_t r;
+  int32_t k;
+  for (r = 0; r < {{ transitions | length }}; r++) {
+    if ((transitions[r].from == from) && (transitions[r].event == event)) {
+      to = transitions[r].to;
+    }
+  }
+  if (to == from) {
+    const int32_t passed = 1 + missed_of(request);
+    sup->samples = (sup->samples < {{ longest }}) ? (sup->samples + passed) : sup->samples;
+  } else {
+    sup->state = to;
+    sup->samples = 0;
+    sup->steady = 0;
+    if (to == {{ NAME }}_OFFSETS) {
+      forget_sensors(sup);
+      sup->monitor = -1;
+      sup->reaction = {{ NAME }}_REACTION_NONE;
+{% if currents %}
+      for (k = 0; k < {{ currents }}; k++) {
+        sup->offset[k] = {{ zero }};
+      }
+{% endif %}
+    }
+    if (to == {{ NAME }}_LIFT) {
+      for (k = 0; k < OUTPUTS; k++) {
+        s->reference.p[k] = sup->rest[k];
+        s->reference.dp[k] = {{ zero }};
+        s->reference.ddp[k] = {{ zero }};
+      }
+      {{ name }}_start(s);
+    }
+    if ((is_flying(to) == 1) && (to != {{ NAME }}_SETTLE)) {
+      begin(sup, s, request);
+    }
+  }
+}
+
+/* Add (1 - u)^3 (d0 (1 + 3 u + 6 u^2) + d1 T (u + 3 u^2)) with u = t / T: from d0, at the rate d1, to rest at zero. */
+static void fade({{ name }}_real t, {{ name }}_real d0, {{ name }}_real d1, {{ name }}_real T,
+                 {{ name }}_reference *next, int32_t k) {
+  if (t < T) {
+    const {{ name }}_real u = t / T;
+    const {{ name }}_real v = {{ one }} - u;
+    const {{ name }}_real b = d1 * T;
+    /* v^3 q with q = d0 + (3 d0 + b) u + (6 d0 + 3 b) u^2 */
+    const {{ name }}_real q1 = ({{ three }} * d0) + b;
+    const {{ name }}_real q2 = ({{ six }} * d0) + ({{ three }} * b);
+    const {{ name }}_real q = d0 + (u * (q1 + (u * q2)));
+    const {{ name }}_real dq = q1 + ({{ two }} * (u * q2));
+    const {{ name }}_real ddq = {{ two }} * q2;
+    const {{ name }}_real slope = (v * dq) - ({{ three }} * q);
+    const {{ name }}_real bend = ((v * v) * ddq) + (({{ six }} * q) - ({{ six }} * (v * dq)));
+    next->p[k] = next->p[k] + ((v * (v * v)) * q);
+    next->dp[k] = next->dp[k] + (((v * v) * slope) / T);
+    next->ddp[k] = next->ddp[k] + ((v * bend) / (T * T));
+  }
+}
+
+/* Add d2 (T^2 / 2) w^2 (1 - w)^3 with w = t / T: an acceleration that fades fast, before a reference brakes. */
+static void fade_acceleration({{ name }}_real t, {{ name }}_real d2, {{ name }}_reference *next, int32_t k) {
+  const {{ name }}_real T = {{ quick }} * {{ NAME }}_SAMPLE_TIME;
+  if (t < T) {
+    const {{ name }}_real w = t / T;
+    const {{ name }}_real v = {{ one }} - w;
+    const {{ name }}_real c = {{ half }} * d2;
+    const {{ name }}_real first = ({{ two }} * (w * v)) - ({{ three }} * (w * w));
+    const {{ name }}_real second = ({{ two }} * (v * v)) + (({{ six }} * (w * w)) - ({{ twelve }} * (w * v)));
+    next->p[k] = next->p[k] + ((c * (T * T)) * ((w * w) * (v * (v * v))));
+    next->dp[k] = next->dp[k] + ((c * T) * ((v * v) * first));
+    next->ddp[k] = next->ddp[k] + (c * (v * second));
+  }
+}
+
+/* The reference of a sample: the goal, and what is left of the difference at the beginning. */
+static void guide({{ name }}_supervisor *sup, {{ name }}_state *s, const {{ name }}_request *request) {
+  const {{ name }}_real t = ({{ name }}_real)sup->samples * {{ NAME }}_SAMPLE_TIME;
+  {{ name }}_reference next;
+  int32_t k;
+  for (k = 0; k < OUTPUTS; k++) {
+    const {{ name }}_real T = sup->lasts[k];
+    {{ name }}_real goal[3];
+    goal_of(sup, request, k, goal);
+    next.p[k] = goal[0];
+    next.dp[k] = goal[1];
+    next.ddp[k] = goal[2];
+    if (sup->state != {{ NAME }}_SETTLE) {
+      fade(t, sup->d0[k], sup->d1[k], T, &next, k);
+      fade_acceleration(t, sup->d2[k], &next, k);
+    }
+  }
+  (void){{ name }}_set_reference(s, &next);
+}
+
+{% if fallback %}
+/* The nearest place along the stroke for which there is a gain. */
+static int32_t place_of(const {{ name }}_real expected[OUTPUTS]) {
+{% if places > 1 %}
+  const {{ name }}_real along = ((expected[{{ stroke_output }}] - ({{ first_place }})) / {{ apart }}) + {{ half }};
+  const {{ name }}_real most = ({{ name }}_real){{ places - 1 }};
+  int32_t place = 0;
+  if (along > most) {
+    place = {{ places - 1 }};
+  } else if (along > {{ zero }}) {
+    place = (int32_t)along;
+  } else {
+    /* the first */
+  }
+  return place;
+{% else %}
+  (void)expected;
+  return 0;
+{% endif %}
+}
+
+{% endif %}
+/* The filter without the sensors that are not believed: one of them by a gain for the others, where there is one. */
+static int32_t leave_out(const {{ name }}_supervisor *sup, {{ name }}_state *s, const {{ name }}_real expected[OUTPUTS],
+                      {{ name }}_inputs *seen) {
+  int32_t without = -1;
+  int32_t number = 0;
+  int32_t estimated = 0;
+  int32_t k;
+  for (k = 0; k < OUTPUTS; k++) {
+    if (sup->unbelieved[k] > 0) {
+      seen->y_valid[k] = {{ zero }};
+      without = k;
+      number++;
+    }
+  }
+{% if fallback %}
+  if ((number == 1) && (has_gain[without] == 1)) {
+    const int32_t place = place_of(expected);
+    int32_t i;
+    for (i = 0; i < STATES; i++) {
+      {{ name }}_real sum = s->xi_pred[i];
+      for (k = 0; k < OUTPUTS; k++) {
+        if (k != without) {
+          const {{ name }}_real part = gain_without[without][place][i][k] * (seen->y[k] - expected[k]);
+          sum = sum + part;
+        }
+      }
+      s->xi_pred[i] = sum;
+    }
+    for (k = 0; k < OUTPUTS; k++) {
+      seen->y_valid[k] = {{ zero }}; /* the estimate is made */
+    }
+    estimated = 1;
+  }
+{% else %}
+  (void)s;
+  (void)expected;
+  (void)without;
+  (void)number;
+{% endif %}
+  return estimated;
+}
+
+/* What the machine's equations add to the linear prediction: two unstable modes seen by one sensor leave no room. */
+static void predict({{ name }}_state *s, const {{ name }}_outputs *out) {
+{% if fallback %}
+  {{ name }}_real more[STATES];
+  int32_t k;
+  {{ name }}_correction(out->xi_hat, more);
+  for (k = 0; k < STATES; k++) {
+    s->xi_pred[k] = s->xi_pred[k] + more[k];
+  }
+{% else %}
+  (void)s;
+  (void)out;
+{% endif %}
+}
+
+/* Outputs of bridges at zero voltage. */
+static void rest_bridges(const {{ name }}_inputs *in, {{ name }}_outputs *out) {
+{% if command %}
+  static const {{ name }}_real off[{{ command }}] = { {{ off }} };
+{% endif %}
+  int32_t k;
+{% for f in output_fields %}
+  for (k = 0; k < {{ f.size }}; k++) {
+    out->{{ f.name }}[k] = {{ "off[k]" if f.name == "command" else zero }};
+  }
+{% endfor %}
+  for (k = 0; k < OUTPUTS; k++) {
+    if (is_within(in->y[k], {{ most }}) == 1) {
+      out->y_used[k] = in->y[k];
+    }
+  }
+}
+
+void {{ name }}_supervisor_step({{ name }}_supervisor *sup, {{ name }}_state *s, const {{ name }}_inputs *in,
+                       const {{ name }}_request *request, {{ name }}_outputs *out) {
+  {{ name }}_inputs seen = *in;
+  {{ name }}_real expected[OUTPUTS];
+  {{ name }}_real level[{{ monitors | length }}][OUTPUTS];
+  int32_t reaction;
+  int32_t estimated;
+  int32_t k;
+{% if currents %}
+  if (sup->state == {{ NAME }}_OFFSETS) {
+    if (sup->samples < sup->times.offsets) {
+      average_currents(sup, in);
+    }
+  } else {
+    for (k = 0; k < {{ currents }}; k++) {
+      seen.i[k] = in->i[k] - sup->offset[k];
+    }
+  }
+{% endif %}
+  expect(sup, s, in, expected);
+  look(sup, &seen, request, expected, level);
+  reaction = judge(sup, level);
+  if ((sup->state == {{ NAME }}_SENSORS) && (sup->steady > 0)) {
+    average_rest(sup);
+  }
+  if (sup->state == {{ NAME }}_SETTLE) {
+    count_settled(sup, s, in);
+  }
+  if (sup->state == {{ NAME }}_LANDING) {
+    count_landed(sup, in);
+  }
+  change_state(sup, s, request, event_of(sup, request, reaction));
+  if (is_flying(sup->state) == 1) {
+    guide(sup, s, request);
+    estimated = leave_out(sup, s, expected, &seen);
+    {{ name }}_step(s, &seen, out);
+    if (estimated == 1) {
+      predict(s, out);
+    }
+    for (k = 0; k < OUTPUTS; k++) {
+      sup->limited[k] = out->saturated[k];
+    }
+  } else {
+    rest_bridges(in, out);
+    for (k = 0; k < OUTPUTS; k++) {
+      sup->limited[k] = {{ zero }};
+    }
+  }
+}
