@@ -962,6 +962,8 @@ def test_every_experiment_bears_its_name_and_tells_its_progress(designs: dict[st
             {"estimator": "steady-state"} if name == "lift-off" else {}
         )  # others take seconds
         options |= {"points": 5} if name == "capture" else {}
+        options |= {"only": "10"} if name == "supervised-faults" else {}
+        options |= {"duration": 0.05} if name == "commissioning" else {}
         found = experiment(name, design.plant, design.controller, progress=shares.append, **options)
         assert found.name == name
         assert found.question.endswith("?")
@@ -991,7 +993,7 @@ def test_failure_is_a_run_that_should_not_have_ended(flown: Flown) -> None:
     run = flown("calibrated", "stroke").run
     good, bad = _ended(run, "completed"), _ended(run, "touchdown at sensor plane 1", 0.0724)
     for name in EXPERIMENTS:
-        finding = name in ("payload", "disturbance", "faults", "carrier", "capture")
+        finding = name in ("payload", "disturbance", "faults", "carrier", "capture", "supervised-faults")
         assert Experiment(name, "?", (good, bad), ()).failed is not finding
         assert not Experiment(name, "?", (good, good), ()).failed
     assert Experiment("stroke", "?", (good,), ()).outcome == "completed at 0.1 s"

@@ -12,6 +12,7 @@ import numpy as np
 
 from malta.machines.tubular.capture_figure import capture_figure
 from malta.machines.tubular.carrier_figure import carrier_figure
+from malta.machines.tubular.commissioning_figure import commissioning_figure, supervised_faults_figure
 from malta.machines.tubular.experiments.rest import RESTING
 from malta.machines.tubular.recording_figure import recording_figure
 from malta.model.data import plant_of
@@ -415,4 +416,6 @@ FIGURES: dict[str, Callable[[Experiment, Published | None], Figure]] = {
     "record-v0": recording_figure,
     "carrier": carrier_figure,
     "capture": capture_figure,
+    "commissioning": commissioning_figure,
+    "supervised-faults": supervised_faults_figure,
 }

@@ -11,6 +11,8 @@ faults        of sensors, samples, a phase and the DC link: survival or touchdow
 drive-limits  the fastest stroke that the drive allows, against the sigmoid at the same peak current
 record-v0     v0(z) recorded by a slow stroke or from a log, beside the computed one
 carrier       the stator moves sideways, its acceleration fed forward or not, Sec. IV-A
+commissioning from the touchdown bearing to operation and back, by the supervisor of the exported C
+supervised-faults  the faults with that supervisor and without it: which touchdowns it prevents
 capture       displacements and tilts from which the mover returns, beside what the force limit allows
 """
 
@@ -23,6 +25,7 @@ from typing import Any
 from malta.errors import InputError
 from malta.machines.tubular.experiments.capture import capture
 from malta.machines.tubular.experiments.carrier import carrier, carrier_cases
+from malta.machines.tubular.experiments.commissioning import commissioning, supervised_faults
 from malta.machines.tubular.experiments.failures import faults
 from malta.machines.tubular.experiments.forces import disturbance, disturbance_cases
 from malta.machines.tubular.experiments.lifting import lift_cases, lift_off, payload
@@ -54,6 +57,8 @@ EXPERIMENTS: dict[str, Callable[..., Experiment]] = {
     "record-v0": record_v0,
     "carrier": carrier,
     "capture": capture,
+    "commissioning": commissioning,
+    "supervised-faults": supervised_faults,
 }
 # Experiments that campaigns can run: nothing but the machine differs between the runs of a case.
 CASES: dict[str, Callable[..., list[PlannedRun]]] = {
@@ -67,7 +72,7 @@ CASES: dict[str, Callable[..., list[PlannedRun]]] = {
 }
 SHORTEST, LONGEST = 0.5, 60.0  # s, of one way of the slow stroke
 MOST_POINTS = 201  # of a side of a map
-FINDINGS = ("payload", "disturbance", "faults", "carrier", "capture")
+FINDINGS = ("payload", "disturbance", "faults", "carrier", "capture", "supervised-faults")
 ALONE = ("stroke", "hold", "tilt")
 WORDS = {"stroke": "axial", "m": "radial", "thrust": "thrust", "N": "bearing force"}
 STROKE_UNIT = "mm"
@@ -88,7 +93,7 @@ OPTION_UNITS = {
 
 def check(name: str, option: str, value: Any) -> None:
     """Raise InputError for a number that is zero or not finite. Strokes and logs check their own options."""
-    if option in ("distance", "rise", "profile", "during", "log"):
+    if option in ("distance", "rise", "profile", "during", "only", "log"):
         return
     if option == "way" and not SHORTEST <= value <= LONGEST:
         raise InputError(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
@@ -25,6 +26,8 @@ from malta.simulation.scenario import Fault
 from malta.simulation.trajectory import Trajectory
 from malta.synthesis.controller import Controller
 
+AT = 0.05  # s, when faults strike
+
 
 def faults(
     plant: Plant,
@@ -36,9 +39,26 @@ def faults(
 ) -> Experiment:
     """Each fault strikes where the published stroke accelerates most, or during a hold. Touchdown bearings catch the
     mover; 0.25 s are left."""
+    wanted = planned_faults("faults", plant, controller, during, options)
+    cases, cut = fly(plant, controller, wanted, progress, options)
+    survived = float(sum(case.run.verdict.completed for case in cases))
+    merit = Merit(f"survived, of {len(cases)}", survived, "1")
+    return Experiment("faults", "What does it survive?", cases, (merit,), interrupted=cut)
+
+
+def planned_faults(
+    name: str,
+    plant: Plant,
+    controller: Controller,
+    during: str,
+    options: Mapping[str, Any],
+    duration: float = 0.3,
+) -> list[PlannedRun]:
+    """The runs of an experiment `name` on faults that strike at AT. Raises InputError for another word than stroke or
+    hold."""
     if during not in ("stroke", "hold"):
-        raise InputError("simulate", "faults: during", repr(during), "stroke or hold")
-    at, Ts = 0.05, controller.sample_time
+        raise InputError("simulate", f"{name}: during", repr(during), "stroke or hold")
+    at, Ts = AT, controller.sample_time
     eps = Ts / 4  # faults begin and end between samples
     # A logistic of slope k = 2 ln 9 / rise has its largest acceleration ln(2 + sqrt 3) / k before its middle.
     early = math.log(2 + math.sqrt(3)) * RISE / (2 * math.log(9))
@@ -64,15 +84,12 @@ def faults(
     }
     wanted = []
     for label, struck in listed.items():
-        own: dict[str, Any] = {"faults": struck, "bearing": True} | options
+        own: dict[str, Any] = {"faults": struck, "bearing": True} | dict(options)
         if any(fault.kind == "open phase" for fault in struck):
             own["fidelity"] = "phase"
-        scenario = scenario_of("faults", 0.3, reference, own)
+        scenario = scenario_of(name, duration, reference, own)
         wanted.append(PlannedRun(label, scenario, partial(_fault_merits, at=at)))
-    cases, cut = fly(plant, controller, wanted, progress, options)
-    survived = float(sum(case.run.verdict.completed for case in cases))
-    merit = Merit(f"survived, of {len(cases)}", survived, "1")
-    return Experiment("faults", "What does it survive?", cases, (merit,), interrupted=cut)
+    return wanted
 
 
 def _most_loaded(plant: Plant) -> int:

@@ -1,0 +1,148 @@
+"""Figures of commissioning by the supervisor, and of faults with and without it."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from malta.firmware.supervisor import STATES
+from malta.machines.tubular.experiments.commissioning import WITH
+from malta.report.figures.parts import (
+    CROSS,
+    NOTE,
+    STYLES,
+    Published,
+    add_shared_legend,
+    clearance,
+    draw_bound,
+    draw_line,
+    ended_early,
+    finish_axes,
+    merit_phrase,
+    micro,
+    new_page,
+    number,
+    runs_of,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from malta.model.plant import FloatArray
+    from malta.simulation.experiments import Experiment
+
+
+def commissioning_figure(e: Experiment, _: Published | None = None) -> Figure:
+    """Heights, stroke, deviation from the reference and forces, with the states of the supervisor."""
+    run, ms = e.run, e.run.t * 1e3
+    plant, state = run.plant, e.curves["state"]
+    flying = (state >= list(STATES).index("LIFT")) & (state <= list(STATES).index("LANDING"))
+    followed = np.where(flying[:, None], e.curves["followed"], np.nan)
+    shown = (e.merits[1], e.merits[3], e.merits[5])
+    found = ", ".join(f"{merit.label} {merit_phrase(merit)}" for merit in shown)
+    figure = new_page([run], "commissioning by the supervisor", found, hspace=0.16, top=0.83)
+    (height, error), (stroke, force) = figure.subplots(2, 2, sharex=True)
+    axis = plant.stroke_output
+    for k, style in zip((1, 3), STYLES, strict=False):
+        draw_line(height, ms, run.p[:, k] * 1e6, label=plant.outputs[k].name, **style)
+    draw_line(height, ms, followed[:, 1] * 1e6, label="reference that is followed", **STYLES[3])
+    draw_line(stroke, ms, run.p[:, axis] * 1e3, **STYLES[0])
+    draw_line(stroke, ms, followed[:, axis] * 1e3, **STYLES[3])
+    off = np.abs(run.p - followed)[:, [k for k in range(followed.shape[1]) if k != axis]].max(axis=1)
+    draw_line(error, ms, np.maximum(off * 1e6, 1e-2), **STYLES[0])
+    error.set_yscale("log")
+    for k, style in zip((1, 3, plant.thrust_input), STYLES, strict=False):
+        draw_line(force, ms, run.v[:, k], label=f"force {plant.inputs[k].name}", **style)
+    draw_bound(height, -clearance(plant) * 1e6, "touchdown bearing")
+    finish_axes(height, "", "height [µm]")
+    finish_axes(error, "", "off its reference, radially [µm]")
+    finish_axes(stroke, "time [ms]", f"{plant.stroke} [mm]")
+    finish_axes(force, "time [ms]", "commanded forces [N]")
+    for axes in (height, error, stroke, force):
+        _mark_states(axes, ms, state, named=axes in (height, error))
+    add_shared_legend(figure)
+    return figure
+
+
+def _mark_states(axes: Axes, ms: FloatArray, state: FloatArray, *, named: bool) -> None:
+    """Shade every other state, and write the names above the axes, upright where they are short."""
+    edges = [0, *(np.flatnonzero(np.diff(state)) + 1).tolist(), len(state)]
+    apart, free = 0.033 * ms[-1], -np.inf  # of upright names
+    for n, (begin, end) in enumerate(pairwise(edges)):
+        left, right = ms[begin], ms[end - 1]
+        if n % 2:
+            axes.axvspan(left, right, color="#e6e6e6", zorder=0)
+        if named:
+            upright = right - left < 0.13 * ms[-1]
+            place = max((left + right) / 2, free)
+            free = place + apart if upright else free
+            where: dict[str, Any] = {"xycoords": ("data", "axes fraction"), "ha": "center", "va": "bottom"}
+            name = list(STATES)[int(state[begin])].lower()
+            axes.annotate(name, (place, 1.01), rotation=90 * upright, **where, **NOTE | {"fontsize": 7})
+
+
+def supervised_faults_figure(e: Experiment, _: Published | None = None) -> Figure:
+    """The speed at which a bearing is met after each fault, with and without the supervisor; deviations over time."""
+    found = ", ".join(f"{merit.label}: {merit.value:.0f}" for merit in e.merits)
+    figure = new_page(runs_of(e), "faults with and without the supervisor", found, left=0.245, wspace=0.24)
+    bars, deviations = figure.subplots(1, 2, width_ratios=(1, 1.25))
+    _draw_speeds(bars, e)
+    _draw_deviations(deviations, e)
+    finish_axes(bars, "speed at the first contact [mm/s]", "", legend=2)
+    finish_axes(
+        deviations, "time after the fault [ms]", "largest radial deviation [µm]", legend=2, side="right"
+    )
+    return figure
+
+
+def _draw_speeds(axes: Axes, e: Experiment) -> None:
+    """Two bars for each fault: alone, and with the supervisor."""
+    labels = list(dict.fromkeys(case.label.removesuffix(WITH) for case in e.cases))
+    speeds = [case.merits[2].value * 1e3 for case in e.cases]
+    for case, speed in zip(e.cases, speeds, strict=True):
+        supervised = case.label.endswith(WITH)
+        place = labels.index(case.label.removesuffix(WITH)) + (0.2 if supervised else -0.2)
+        text = "no contact"
+        if speed >= 0:
+            axes.barh(place, speed, height=0.36, **LOOKS[supervised])
+            text = f"{number(speed, 2)} mm/s, " + ("touchdown" if ended_early(case.run) else "landed")
+        where: dict[str, Any] = {"xytext": (3, 0), "textcoords": "offset points", "va": "center"}
+        axes.annotate(
+            text, (max(speed, 0.0) if speed >= 0 else 0.0, place), **where, **NOTE | {"fontsize": 7}
+        )
+    for supervised, look in LOOKS.items():
+        axes.barh(0, 0, label="with supervisor" if supervised else "alone", **look)
+    axes.set_yticks(range(len(labels)), [micro(label) for label in labels], fontsize=9)
+    axes.set_ylim(len(labels) - 0.5, -0.5)
+    axes.set_xlim(0, 1.9 * max([speed for speed in speeds if speed >= 0], default=1.0))
+
+
+LOOKS: dict[bool, dict[str, Any]] = {
+    False: {"color": "#2b2b2b"},
+    True: {"color": "#ffffff", "edgecolor": "#2b2b2b", "hatch": "////"},
+}
+
+
+def _draw_deviations(axes: Axes, e: Experiment) -> None:
+    """The largest radial deviation over time of two faults that end in a touchdown without the supervisor."""
+    struck = e.run.scenario.faults[0].at
+    alone = [case for case in e.cases if not case.label.endswith(WITH)]
+    down = [case.label for case in alone if ended_early(case.run)][:2]
+    styles = iter(STYLES)
+    for case in (case for case in e.cases if case.label.removesuffix(WITH) in down):
+        run = case.run
+        radial = [k for k in range(run.p.shape[1]) if k != run.plant.stroke_output]
+        ms, off = (run.t - struck) * 1e3, np.abs(run.p[:, radial]).max(axis=1) * 1e6
+        label = micro(case.label.removesuffix(WITH)) + (", supervised" if case.label.endswith(WITH) else "")
+        draw_line(axes, ms, np.maximum(off, 0.1), label=label, **next(styles))
+        if case.merits[1].value >= 0:
+            k = min(int(np.searchsorted(ms, case.merits[1].value * 1e3)), len(ms) - 1)
+            axes.plot(ms[k], off[k], **CROSS | ({} if ended_early(run) else {"marker": "v"}))
+    if not down:
+        axes.annotate("no touchdown", (0.5, 0.5), xycoords="axes fraction", ha="center", **NOTE)
+    axes.set_yscale("log")
+    axes.set_ylim(bottom=0.1)
+    draw_bound(axes, clearance(e.run.plant) * 1e6, "touchdown bearing")

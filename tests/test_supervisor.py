@@ -1,0 +1,436 @@
+"""The supervisor in C: states in order, no jumps, what each monitor does, and flights with it and without it."""
+
+from __future__ import annotations
+
+import ctypes
+import math
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from conftest import ROOT
+from test_firmware import WARNINGS
+
+import malta
+from malta.errors import InputError
+from malta.firmware import supervised
+from malta.firmware.elementary import Precision
+from malta.firmware.export import sources
+from malta.firmware.native import new_state, view
+from malta.firmware.sensor_loss import expected_readings, gains_without, prediction_correction
+from malta.firmware.signals import Target, fidelity_of
+from malta.firmware.supervised import NUMBERS, compile_supervised
+from malta.firmware.supervisor import (
+    MONITORS,
+    STATES,
+    TIMES,
+    TRANSITIONS,
+    State,
+    bounds_of,
+    monitors_of,
+)
+from malta.firmware.supervisor_text import monitor_lines, supervisor_sources
+from malta.machines.tubular.experiments.commissioning import SOFT
+from malta.simulation.compiled import compiler
+
+
+@pytest.fixture(autouse=True)
+def _with_compiler() -> None:
+    if compiler() is None:
+        pytest.skip("no C compiler")
+
+
+def target(name: str, precision: Precision = "double") -> Target:
+    c = malta.gains.read(ROOT / "design" / "gains" / f"{name}.json")
+    return Target(c, precision, fidelity_of(malta.plant_of(c.parameters)))
+
+
+TARGETS = {name: target(name) for name in ("robust", "halbach", "tubular_pid")}
+REST = (0.0, -0.6e-3, 0.0, -0.6e-3, 1e-3)
+
+
+class Bench:
+    """A supervisor with a machine that is where its reference wants it, or rests; noise in its sensors."""
+
+    def __init__(self, name: str = "robust", seed: int = 1) -> None:
+        self.t = TARGETS[name]
+        self.s = compile_supervised(self.t)
+        self.state, self.supervisor, self.request = (
+            new_state(self.s.native),
+            self.s.Supervisor(),
+            self.s.Request(),
+        )
+        self.inputs, self.outputs = self.s.native.Inputs(), self.s.native.Outputs()
+        self.rng, self.plant = np.random.default_rng(seed), self.t.believed
+        self.rest = np.array(REST[: len(self.plant.outputs)])
+        self._call("supervisor_init", self.supervisor)
+        self.seen: list[str] = []
+
+    def _call(self, function: str, *records: Any) -> None:
+        getattr(self.s.native.lib, f"{self.s.native.name}_{function}")(*(ctypes.byref(r) for r in records))
+
+    def fly(self) -> Bench:
+        """Begin in operation, at zero."""
+        rest = type(self.supervisor.rest)(*self.rest)
+        take_over = getattr(self.s.native.lib, f"{self.s.native.name}_supervisor_take_over")
+        take_over(ctypes.byref(self.supervisor), rest)
+        self._call("start", self.state)
+        return self
+
+    def step(self, samples: int = 1, y: dict[int, float] | None = None, **given: Any) -> str:
+        """So many samples with these readings in place of true ones; the state."""
+        off = self.now in ("OFF", "OFFSETS", "SENSORS", "FAULT")
+        for _ in range(samples):
+            place = self.rest if off else view(self.state.reference, "p")
+            noise, steps = np.array(self.plant.noise), np.array(self.plant.resolution)
+            read = place + noise * self.rng.normal(size=len(noise))
+            read = np.where(steps > 0, np.round(read / np.where(steps > 0, steps, 1)) * steps, read)
+            for k, value in (y or {}).items():
+                read[k] = value
+            view(self.inputs, "y")[:], view(self.inputs, "y_valid")[:] = read, 1
+            if self.t.driven:
+                view(self.inputs, "i")[:], view(self.inputs, "i_valid")[:] = given.get("i", 0.0), 1
+                view(self.inputs, "link")[:] = given.get("link", 45.0)
+            for name in ("start", "operate", "land", "acknowledge", "missed"):
+                setattr(self.request, name, given.get(name, 0))
+            view(self.request.reference, "p")[0] = given.get("reference", 0.0)
+            self._call(
+                "supervisor_step", self.supervisor, self.state, self.inputs, self.request, self.outputs
+            )
+            off = self.now in ("OFF", "OFFSETS", "SENSORS", "FAULT")
+            if not self.seen or self.seen[-1] != self.now:
+                self.seen.append(self.now)
+        return self.now
+
+    @property
+    def now(self) -> State:
+        return list(STATES)[int(self.supervisor.state)]
+
+    @property
+    def monitor(self) -> str:
+        return MONITORS[self.supervisor.monitor] if self.supervisor.monitor >= 0 else ""
+
+
+@pytest.mark.parametrize("name", ["robust", "halbach", "tubular_pid"])
+def test_states_follow_each_other_without_jumps(name: str) -> None:
+    """From off to operation, through a landing to off: the reference is smooth and starts where the machine rests."""
+    bench, Ts = Bench(name), TARGETS[name].controller.sample_time
+    assert bench.step(20) == "OFF"
+    assert not view(bench.outputs, "v").any()
+    if bench.t.driven:
+        assert (view(bench.outputs, "command") == 0.5).all()
+    p, dp, v = [], [], []
+    for k in range(7000):
+        bench.step(start=int(k == 0), operate=1, land=int(k == 2000))
+        if bench.supervisor.state in (NUMBERS["LIFT"], NUMBERS["SETTLE"], *range(5, 8)):
+            p.append(view(bench.state.reference, "p").copy())
+            dp.append(view(bench.state.reference, "dp").copy())
+            v.append(view(bench.outputs, "v").copy())
+    whole = ["OFF", "OFFSETS", "SENSORS", "LIFT", "SETTLE", "OPERATE", "LANDING", "OFF"]
+    assert bench.seen == whole
+    assert np.abs(p[0] - bench.rest).max() < 4 * max(bench.plant.noise) / math.sqrt(TIMES.check) + 1e-9
+    assert np.abs(p[-1] - p[0]).max() < 1e-12
+    steps, rates = np.diff(p, axis=0), np.array(dp)
+    assert np.abs(steps - Ts * (rates[1:] + rates[:-1]) / 2).max() < 1e-9
+    fastest = 5.78 * np.abs(p[0]).max() / (TIMES.lift * Ts) ** 2  # of a quintic
+    assert np.abs(np.diff(rates, axis=0)).max() < 1.01 * Ts * fastest + 1e-12
+    usual = np.abs(np.diff(v, axis=0)).max(axis=0)
+    changes = [TIMES.lift - 1, TIMES.lift]
+    assert all((np.abs(v[k + 1] - v[k]) <= usual + 1e-9).all() for k in changes)
+
+
+def test_the_first_command_balances_the_machine_at_rest() -> None:
+    """Weight and attraction at the bearing, and nothing else: a small share of the force limit."""
+    bench = Bench()
+    while bench.step(start=1) != "LIFT":
+        pass
+    limit = bench.t.controller.limits.force
+    plant, par = bench.plant, bench.plant.parameters
+    pull = 2 * par.K_A * 0.6e-3 + plant.mass * par.g  # type: ignore[attr-defined]
+    v = view(bench.outputs, "v")
+    assert v[1] + v[3] == pytest.approx(pull, rel=0.15)
+    assert (np.abs(v) < 0.35 * limit).all()
+
+
+STUCK = TARGETS["robust"]
+LOST = bounds_of(STUCK).unbelieved
+
+
+def test_a_reading_that_cannot_be_true_is_left_out_and_believed_again() -> None:
+    for k, wrong in ((1, math.nan), (1, 1.0), (1, 50e-6), (4, math.inf)):
+        bench = Bench().fly()
+        bench.step(300)
+        bench.step(5, y={k: wrong})
+        assert bench.supervisor.unbelieved[k] == 5
+        assert bench.monitor in ("NAN", "RANGE", "RATE")
+        bench.step(3)
+        assert (bench.now, bench.supervisor.unbelieved[k]) == ("OPERATE", 0)
+        assert all(np.isfinite(view(bench.state, name)).all() for name in ("xi_pred", "e", "u_integral"))
+        assert np.isfinite(view(bench.outputs, "command")).all()
+
+
+def test_a_sensor_that_stays_away_stops_the_stroke_and_lands() -> None:
+    bench = Bench().fly()
+    bench.step(300)
+    assert bench.step(10, y={1: math.nan}) == "OPERATE"
+    assert bench.step(1, y={1: math.nan}) == "HOLD"
+    assert bench.step(LOST - 11, y={1: math.nan}) == "HOLD"
+    assert bench.step(1, y={1: math.nan}) == "LANDING"
+    assert (bench.monitor, bench.now) == ("UNBELIEVED", "LANDING")
+    bench.step(TIMES.landing + TIMES.settle, y={1: math.nan})
+    assert bench.now == "OFF"
+    assert np.isfinite(view(bench.state, "xi_pred")).all()
+
+
+def test_without_any_sensor_it_switches_off_until_acknowledged() -> None:
+    bench = Bench().fly()
+    bench.step(300)
+    nothing = dict.fromkeys(range(5), math.nan)
+    bench.step(LOST + 1, y=nothing)
+    assert (bench.now, bench.monitor) == ("FAULT", "BLIND")
+    assert (view(bench.outputs, "command") == 0.5).all()
+    assert bench.step(50, start=1) == "FAULT"
+    assert bench.step(acknowledge=1) == "OFF"
+    assert bench.step(start=1) == "OFFSETS"
+
+
+def test_stuck_sensors_are_told_from_quiet_ones() -> None:
+    """91 equal readings of a radial sensor, of all sensors two: an hour of noise at rest has no such row."""
+    b = bounds_of(STUCK)
+    assert b.stuck == (91, 91, 91, 91, 2)
+    assert b.stale == 2
+    bench = Bench().fly()
+    bench.step(300)
+    bench.step(b.stuck[1], y={1: 1e-6})
+    assert bench.supervisor.unbelieved[1] == 0
+    bench.step(3, y={1: 1e-6})
+    assert (bench.monitor, bool(bench.supervisor.unbelieved[1])) == ("STUCK", True)
+    bench = Bench().fly()
+    bench.step(300)
+    bench.step(4, y=dict.fromkeys(range(5), 1e-7))
+    assert list(bench.supervisor.unbelieved) == [2] * 5
+    assert bench.step(20) == "OPERATE"
+    assert list(bench.supervisor.unbelieved) == [0] * 5
+
+
+Acts = tuple[str, dict[str, Any], int, str, str]
+ACTS: tuple[Acts, ...] = (
+    ("three missed steps", {"missed": 3}, 1, "MISSED", "HOLD"),
+    ("as many as unstable ones take to double", {"missed": LOST + 1}, 1, "MISSED", "LANDING"),
+    ("a sagging link", {"link": 30.0}, 3, "LINK", "HOLD"),
+    ("a link without a reading", {"link": math.nan}, 3, "LINK", "HOLD"),
+    ("a link that stays down", {"link": 4.5}, 2000, "LINK", "LANDING"),
+    ("a current beyond its limits", {"i": 11.0}, 3, "CURRENT", "FAULT"),
+    ("a request that is no number", {"reference": math.nan}, 1, "REFERENCE", "HOLD"),
+    ("a request out of reach", {"reference": 1.0}, 1, "REFERENCE", "HOLD"),
+)
+
+
+@pytest.mark.parametrize(
+    ("given", "samples", "monitor", "state"), [a[1:] for a in ACTS], ids=[a[0] for a in ACTS]
+)
+def test_each_monitor_acts_after_its_samples(
+    given: dict[str, Any], samples: int, monitor: str, state: str
+) -> None:
+    bench = Bench().fly()
+    bench.step(300)
+    assert not any(bench.supervisor.acted)
+    if samples > 1:
+        bench.step(samples - 1, **given)
+        assert bench.now != state
+    bench.step(**given)
+    assert (bench.now, bench.monitor) == (state, monitor)
+    if state == "HOLD":
+        bench.step(TIMES.calm + 2)
+        assert bench.now == "OPERATE"
+
+
+def acted(bench: Bench, key: str) -> list[int]:
+    """How often the rows of a monitor acted."""
+    return [n for n, row in zip(bench.supervisor.acted, monitors_of(bench.t), strict=True) if row.key == key]
+
+
+def test_a_machine_that_does_not_answer_its_forces_is_held_and_landed() -> None:
+    """A sum of errors of 1 m s keeps a force at its limit, and the readings do not follow."""
+    bench = Bench().fly()
+    bench.step(300)
+    view(bench.state, "e")[1] = 1.0
+    bench.step(199)
+    assert bench.now == "OPERATE"
+    bench.step(3)
+    assert (bench.now, bench.monitor) == ("HOLD", "SATURATION")
+    bench.step(800)
+    assert (bench.now, bench.monitor) == ("LANDING", "SATURATION")
+
+
+def test_a_filter_that_expects_other_readings_stops_the_stroke() -> None:
+    bench = Bench().fly()
+    bench.step(300)
+    for samples, state in ((19, "OPERATE"), (1, "HOLD"), (379, "HOLD"), (1, "LANDING")):
+        for _ in range(samples):
+            view(bench.state, "xi_pred")[:] = np.eye(15)[1] * 20e-6
+            bench.step()
+        assert bench.now == state
+    assert acted(bench, "INNOVATION") == [2, 2]  # both sensors of y
+
+
+def test_a_filter_that_lost_its_way_switches_off() -> None:
+    bench = Bench().fly()
+    bench.step(300)
+    view(bench.state, "xi_pred")[1] = 2e-3
+    bench.step(6, y=dict.fromkeys(range(5), math.nan))
+    assert (bench.now, bench.monitor) == ("FAULT", "ASTRAY")
+    bench = Bench().fly()
+    bench.step(300)
+    view(bench.state, "e")[1] = 1.0
+    bench.step(12, y={1: math.nan})
+    assert (bench.now, bench.monitor) == ("FAULT", "HELPLESS")
+
+
+def test_near_its_bearing_it_lands() -> None:
+    bench, bound = Bench().fly(), bounds_of(STUCK).touch
+    assert bound[:4] == pytest.approx(0.7 * 0.6e-3, rel=1e-6)
+    assert bound[4] == pytest.approx(15e-3, rel=1e-6)
+    bench.step(300, reference=0.3e-3)
+    bench.step(1000, reference=0.3e-3)
+    assert bench.now == "OPERATE"
+    bench.step(1200, reference=0.45e-3)
+    assert (bench.monitor, bench.now) == ("TOUCH", "LANDING")
+
+
+def test_it_starts_neither_with_offsets_nor_with_dead_sensors() -> None:
+    bench = Bench()
+    bench.step(start=1)
+    bench.step(TIMES.offsets + 2, i=0.05)
+    assert bench.now == "SENSORS"
+    assert view(bench.supervisor, "offset") == pytest.approx(0.05)
+    bench = Bench()
+    bench.step(start=1)
+    bench.step(TIMES.offsets + 2, i=0.2)
+    assert (bench.now, bench.monitor) == ("FAULT", "OFFSET")
+    bench = Bench()
+    bench.step(start=1)
+    bench.step(TIMES.offsets + 5 + 8 * TIMES.check, y={2: math.nan})
+    assert (bench.now, bench.monitor) == ("FAULT", "UNREADY")
+
+
+def test_a_machine_that_does_not_settle_lands() -> None:
+    bench = Bench()
+    while bench.step(start=1, operate=1) != "SETTLE":
+        pass
+    for k in range(20 * TIMES.settle + 2):
+        bench.step(y={1: (20 + k % 2) * 1e-6}, operate=1)
+    assert bench.monitor == "UNSETTLED"
+    assert bench.now == "LANDING"
+
+
+def test_machines_have_the_monitors_that_make_sense() -> None:
+    robust, halbach = ({row.key for row in monitors_of(TARGETS[name])} for name in ("robust", "halbach"))
+    assert robust == set(MONITORS)
+    assert robust - halbach == {"CURRENT", "OFFSET", "LINK"}
+    assert len(monitor_lines(TARGETS["robust"])) == 1 + len(monitors_of(TARGETS["robust"]))
+    assert {state for state, _, _ in TRANSITIONS} == set(STATES)
+
+
+def test_bounds_follow_from_the_machine() -> None:
+    """A jump is the fastest fall through the clearance, v = sqrt(4 a d) with all bearing forces, and noise."""
+    t = TARGETS["robust"]
+    b, par, Ts = bounds_of(t), t.believed.parameters, t.controller.sample_time
+    m, inertia, l_B, l_S = (getattr(par, name) for name in ("m", "I_xx", "l_B", "l_S"))
+    force = 5.2 * 5.0
+    a = force * (abs(1 / m + l_B * l_S / inertia) + abs(1 / m - l_B * l_S / inertia))
+    sigma = math.hypot(0.5e-6, 1e-6 / math.sqrt(12))
+    assert b.sigma[:4] == pytest.approx(sigma)
+    assert b.jump[1] == pytest.approx(math.sqrt(4 * a * 0.42e-3) * Ts + 8 * math.sqrt(2) * sigma, rel=1e-4)
+    assert b.stopping[4] == pytest.approx(0.2 * 2 * force / m)
+    assert math.log(2) / (218.92 * Ts) == pytest.approx(LOST, abs=1)
+
+
+def test_one_sensor_less_leaves_a_stable_filter() -> None:
+    """At any place, with the machine's own derivatives there; without the stroke's sensor there is none."""
+    import casadi as ca
+
+    t = TARGETS["robust"]
+    gains, n = gains_without(t), len(t.controller.states)
+    assert sorted(gains.L) == [0, 1, 2, 3]
+    xi = ca.SX.sym("xi", n)
+    jacobians = [ca.jacobian(f(t)(xi), xi) for f in (prediction_correction, expected_readings)]
+    derivatives = ca.Function("derivatives", [xi], jacobians)
+    worst = 0.0
+    for z in np.linspace(-14e-3, 14e-3, 9):
+        at = np.zeros(n)
+        at[2] = z
+        more, C = (np.array(value) for value in derivatives(at))
+        near = int(np.abs(gains.places - z).argmin())
+        for k, L in gains.L.items():
+            assert not L[near][:, k].any()
+            whole = (np.eye(n) - L[near] @ C) @ (t.controller.Ad + more)
+            worst = max(worst, float(np.abs(np.linalg.eigvals(whole)).max()))
+    assert 0.99 < worst < 1
+    assert gains_without(TARGETS["tubular_pid"]).L == {}
+
+
+@pytest.mark.parametrize(("name", "precision"), [("robust", "float"), ("halbach", "double")])
+def test_no_compiler_warns(name: str, precision: Precision, tmp_path: Path) -> None:
+    t, cc = target(name, precision), compiler()
+    files = sources(t, "0" * 64, name) | supervisor_sources(t, name)
+    for file, text in files.items():
+        (tmp_path / file).write_text(text, encoding="utf-8")
+    assert cc is not None
+    command = [*cc, *WARNINGS, "-c", f"{name}_supervisor.c", "-o", "x.o"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False, timeout=100)
+    assert (done.returncode, done.stderr) == (0, "")
+    code = files[f"{name}_supervisor.c"]
+    assert not any(word in code for word in ("malloc", "math.h", "int8_t", "char "))
+    assert code.count("switch (") == code.count("default:")
+
+
+def test_it_says_so_where_there_is_no_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(supervised, "compiler", lambda: None)
+    c = TARGETS["robust"].controller
+    with pytest.raises(InputError, match="expected a C compiler: cc"):
+        malta.experiment("commissioning", malta.plant_of(c.parameters), c)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["robust", "robust_observer", "tubular_pid", "table2", "calibrated"])
+def test_commissioning_completes(name: str) -> None:
+    """Every design rises from its bearing, moves and lands; the command stays smooth, the landing slow."""
+    c = malta.gains.read(ROOT / "design" / "gains" / f"{name}.json")
+    e = malta.experiment("commissioning", malta.plant_of(c.parameters), c)
+    found = {merit.label: merit.value for merit in e.merits}
+    states = e.curves["state"][np.flatnonzero(np.diff(e.curves["state"], prepend=-1))]
+    assert [list(STATES)[int(k)] for k in states] == [
+        *("OFFSETS", "SENSORS", "LIFT", "SETTLE", "OPERATE", "LANDING", "OFF")
+    ]
+    assert e.run.verdict.completed
+    assert found["largest jump of a force between states in flight"] < 2.5
+    assert found["meets its bearing in the landing at"] < 0.02
+    if name == "robust":
+        assert found["off its reference, at zero and in operation"] < 3e-6
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("during", "alone"), [("stroke", 2), ("hold", 1)])
+def test_it_prevents_touchdowns(during: str, alone: int) -> None:
+    """A stuck sensor, and a link that sags by 90 % in a stroke: crashes at over 0.1 m/s become landings."""
+    c = TARGETS["robust"].controller
+    e = malta.experiment("supervised-faults", malta.plant_of(c.parameters), c, during=during)
+    without, with_, landed = (merit.value for merit in e.merits)
+    assert (without, with_, landed) == (alone, 0, 3)
+    speeds = {case.label: case.merits[2].value for case in e.cases}
+    assert speeds["y1 stuck"] > 0.1
+    assert speeds["y1 stuck +"] < SOFT
+    assert speeds["y1 biased by 50 um +"] < 0.005
+    assert not e.failed
+
+
+def test_faults_are_chosen_by_a_word_and_fly_with_their_own_engine() -> None:
+    c = TARGETS["robust"].controller
+    for engine in (malta.engine_of_c(), "virtual machine"):
+        with pytest.raises(InputError, match="expected auto"):
+            malta.experiment("commissioning", malta.plant_of(c.parameters), c, engine=engine)
+    with pytest.raises(InputError, match="only"):
+        malta.experiment("supervised-faults", malta.plant_of(c.parameters), c, only="lunch")
