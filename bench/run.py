@@ -25,6 +25,7 @@ from typing import Any, NamedTuple
 
 import control
 import numpy as np
+from firmware import firmware
 from margins import margin, published
 from peer_control import closed_loop, documented_run
 from peer_problem import Workload
@@ -392,6 +393,7 @@ WORKLOADS: dict[str, Callable[[int], list[Result]]] = {
     "studies": studies,
     "planar": decoupling,
     "halbach": halbach,
+    "firmware": firmware,
 }
 
 
@@ -406,7 +408,7 @@ def main() -> None:
     for name in arguments.only:
         found = WORKLOADS[name](arguments.runs)
         table = Table(
-            title=f"{name}: medians of {arguments.runs} runs in turn, seconds",
+            title=f"{name}: medians of {arguments.runs} runs in turn, seconds where nothing else is named",
             title_justify="left",
             box=box.SIMPLE_HEAD,
         )
