@@ -237,8 +237,11 @@ def instructions(p: Processor, w: Way, main: str) -> float:
 
 
 def can_count(p: Processor) -> bool:
-    """Whether compiler and QEMU are here."""
-    return all(shutil.which(tool) for tool in (f"{p.prefix}gcc", RUNNERS[p.name][0]))
+    """Whether compiler and QEMU are here, and QEMU can go instruction by instruction by this option."""
+    runner = RUNNERS[p.name][0]
+    if shutil.which(f"{p.prefix}gcc") is None or shutil.which(runner) is None:
+        return False
+    return "-singlestep" in subprocess.run([runner, "-help"], capture_output=True, text=True).stdout
 
 
 class Case(NamedTuple):

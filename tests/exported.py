@@ -47,11 +47,13 @@ PROCESSORS = {
 }
 
 
+@cache
 def controller(name: str) -> Controller:
     """The controller of a shipped gain file."""
     return malta.gains.read(ROOT / "design" / "gains" / f"{name}.json")
 
 
+@cache
 def target(name: str, precision: Precision) -> Target:
     """The export of a shipped gain file, as far down as its machine is modelled."""
     c = controller(name)

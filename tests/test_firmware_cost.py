@@ -27,7 +27,8 @@ from malta.firmware.vectors import record_vectors
 def test_no_other_way_has_fewer_instructions(p: Any, precision: Precision) -> None:
     """The law beside loops over matrices, both beside what CasADi generates: instructions that are executed."""
     require(f"{p.prefix}gcc", RUNNERS[p.name][0])
-    assert can_count(p)
+    if not can_count(p):
+        pytest.skip("another version of QEMU")
     for case in cases(target("robust", precision)):
         agree(case)
         counts = {way: instructions(p, case.ways[way], case.main(way)) for way in case.ways}

@@ -1,0 +1,195 @@
+"""Single precision over many samples, and numbers that are none: sums move on, and nothing poisons the state."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from exported import PRECISIONS, controller, target
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import malta
+from malta.firmware.elementary import Precision
+from malta.firmware.flight import engine_of_c
+from malta.firmware.native import Native, call, compile_controller, new_state, view, write
+from malta.firmware.program import TYPES
+from malta.firmware.signals import Target, input_fields, state_fields
+from malta.simulation import references
+from malta.simulation.compiled import compiler
+
+ERROR = 1e-8  # m, which does not move a float of 1e-4 in a sample of 50 us
+BAD = (math.nan, math.inf, -math.inf, 1e30, -1e30)
+BEGIN, LENGTH = 5, 20  # samples of a burst
+DAMAGES = st.lists(
+    st.tuples(st.integers(0, LENGTH - 1), st.integers(0, 99), st.sampled_from(BAD)), min_size=1, max_size=40
+)
+PRESENT = ("y", "i", "link")  # readings, each with or without a flag of its own
+
+
+@pytest.fixture(autouse=True)
+def _with_compiler() -> None:
+    if compiler() is None:
+        pytest.skip("no C compiler")
+
+
+class Run:
+    """A controller that takes sample after sample; it starts with a machine that follows a reference of zero."""
+
+    def __init__(self, t: Target) -> None:
+        self.native: Native = compile_controller(t)
+        self.state, self.inputs, self.outputs = (
+            new_state(self.native),
+            self.native.Inputs(),
+            self.native.Outputs(),
+        )
+        self.width = sum(f.size for f in state_fields(t))
+        call(self.native, "start", self.state)
+
+    def step(self, readings: dict[str, Any]) -> None:
+        write(self.inputs, readings)
+        call(self.native, "step", self.state, self.inputs, self.outputs)
+
+    def numbers(self) -> Any:
+        """All outputs but the flags of refused readings, then the state, in a row."""
+        real = TYPES[self.native.target.precision]
+        outputs, state = np.frombuffer(self.outputs, real).copy(), np.frombuffer(self.state, real, self.width)
+        entries = len(self.outputs.refused)
+        outputs[entries : 2 * entries] = 0  # after y_used
+        return np.concatenate([outputs, state])
+
+
+def at_rest(r: Run) -> dict[str, Any]:
+    """Readings of a machine where the reference is, without noise."""
+    t = r.native.target
+    readings: dict[str, Any] = {f.name: np.ones(f.size) for f in input_fields(t)}
+    readings["y"] = np.zeros(len(t.controller.measurements))
+    if t.driven:
+        readings |= {"i": view(r.state, "i_last").copy(), "link": view(r.state, "link_last").copy()}
+    return readings
+
+
+def damaged(readings: dict[str, Any], damages: list[tuple[int, int, float]], sample: int) -> dict[str, Any]:
+    """Readings of one sample of a burst with its damages."""
+    after = {name: np.array(value, dtype=float) for name, value in readings.items()}
+    names = [name for name in PRESENT if name in readings]
+    places = [(name, k) for name in names for k in range(len(readings[name]))]
+    for _, where, value in (d for d in damages if d[0] == sample):
+        name, k = places[where % len(places)]
+        after[name][k] = value
+    return after
+
+
+def moved(precision: Precision, samples: int) -> Any:
+    """How far the sums of errors move from 1e-4 m s, with an error of 10 nm in all readings and no sum that waits."""
+    r = Run(target("robust", precision))
+    readings = at_rest(r) | {"y": np.full(5, -ERROR)}
+    view(r.state, "e")[:] = 1e-4
+    begin = view(r.state, "e").astype(float)
+    for _ in range(samples):
+        view(r.state, "frozen")[:] = 0
+        r.step(readings)
+    return view(r.state, "e").astype(float) - begin
+
+
+def test_sums_of_single_precision_do_not_stand_still() -> None:
+    """Over 1 s they follow those of double precision within 1e-3; a plain sum would not move at all."""
+    Ts = controller("robust").sample_time
+    samples = round(1 / Ts)
+    double = moved("double", samples)
+    assert double == pytest.approx(np.full(5, ERROR), rel=1e-9)
+    assert moved("float", samples) == pytest.approx(double, rel=1e-3)
+    plain = np.float32(1e-4)
+    for _ in range(samples):
+        plain = plain + np.float32(Ts * ERROR)
+    assert plain == np.float32(1e-4)
+
+
+@pytest.mark.slow
+def test_ten_seconds_of_single_precision() -> None:
+    """A hold with noise: positions agree within 10 pm, 2e-6 of their range, and drift nowhere."""
+    c = controller("robust")
+    plant = malta.plant_of(c.parameters)
+    scenario = malta.Scenario("hold", 10.0, references.hold, noise=1.0, fidelity="phase")
+    double, single = (malta.simulate(plant, c, scenario, engine=engine_of_c(p)) for p in PRECISIONS)
+    assert double.verdict.completed
+    apart = np.abs(single.p - double.p)
+    assert 1e-14 < apart.max() < 1e-11
+    tenths = np.array([part.max() for part in np.array_split(apart, 10)])
+    assert tenths[-1] < 2 * tenths[0]
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize("name", ["halbach", "robust", "tubular_pid"])
+@settings(max_examples=40, deadline=None)
+@given(damages=DAMAGES)
+def test_refused_readings_leave_no_trace_at_rest(
+    name: str, precision: Precision, damages: list[tuple[int, int, float]]
+) -> None:
+    """Where the machine does what the filter expects, a burst changes no bit of outputs and state, then or later."""
+    t = target(name, precision)
+    calm, disturbed = Run(t), Run(t)
+    readings = at_rest(calm)
+    for k in range(BEGIN + LENGTH + 10):
+        calm.step(readings)
+        disturbed.step(damaged(readings, damages, k - BEGIN))
+        assert disturbed.numbers().tobytes() == calm.numbers().tobytes(), k
+        refused = any(d[0] == k - BEGIN and d[1] % count(readings) < len(readings["y"]) for d in damages)
+        assert bool(view(disturbed.outputs, "refused").any()) == refused
+
+
+def count(readings: dict[str, Any]) -> int:
+    return sum(len(readings[name]) for name in PRESENT if name in readings)
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize("name", ["halbach", "robust"])
+@settings(max_examples=40, deadline=None)
+@given(damages=DAMAGES)
+def test_after_a_burst_sums_lack_what_was_refused(
+    name: str, precision: Precision, damages: list[tuple[int, int, float]]
+) -> None:
+    """With noise: the state stays finite, and sums of errors lack the refused errors times Ts."""
+    t = target(name, precision)
+    calm, disturbed = Run(t), Run(t)
+    rows = noisy_rows(calm)
+    missed = np.zeros(len(t.controller.measurements))
+    for k in range(BEGIN + LENGTH + 60):
+        readings = rows[k % len(rows)]
+        calm.step(readings)
+        disturbed.step(damaged(readings, damages, k - BEGIN))
+        assert np.isfinite(disturbed.numbers()).all()
+        missed += view(calm.outputs, "y_used") - view(disturbed.outputs, "y_used")
+    one, other = (view(r.state, "e").astype(float) for r in (calm, disturbed))
+    rounding = {"double": 1e-12, "float": 1e-4}[precision] * np.abs(one).max()
+    assert np.abs(other - one - t.controller.sample_time * missed).max() <= rounding
+
+
+def noisy_rows(r: Run) -> list[dict[str, Any]]:
+    """Readings of a machine at rest with noise, for 60 samples."""
+    rng, rest = np.random.default_rng(7), at_rest(r)
+    sizes = {name: size for name, size in (("y", 1e-7), ("i", 1e-2)) if name in rest}
+    return [
+        rest | {k: rest[k] + size * rng.normal(size=len(rest[k])) for k, size in sizes.items()}
+        for _ in range(60)
+    ]
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize("bad", [*BAD, 2.0])
+def test_a_reference_out_of_reach_changes_nothing(bad: float, precision: Precision) -> None:
+    """NaN, infinity, or beyond the travel, in any entry: refused, and the state keeps every byte."""
+    r = Run(target("robust", precision))
+    before = bytes(r.state)
+    for name in ("p", "dp", "ddp") if abs(bad) != 2 else ("p",):
+        for k in range(5):
+            reference = r.native.Reference()
+            view(reference, name)[k] = bad
+            assert call(r.native, "set_reference", r.state, reference) == 0
+    assert bytes(r.state) == before
+    reference = r.native.Reference()
+    view(reference, "p")[4] = 1e-3
+    assert call(r.native, "set_reference", r.state, reference) == 1
+    assert view(r.state.reference, "p")[4] == TYPES[precision](1e-3)
