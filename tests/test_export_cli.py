@@ -46,7 +46,7 @@ def test_export_writes_a_folder_whose_test_passes(run: Run, tmp_path: Path, prec
     assert ("proving the margin" in err) == (precision == "float")
     names = {path.name for path in folder.iterdir()}
     assert {"halbach.h", "halbach.c", "halbach_parts.c", "halbach_test.c", "halbach_example.c"} < names
-    assert {"Makefile", "CMakeLists.txt", "REPORT.md"} < names
+    assert {"Makefile", "CMakeLists.txt", "REPORT.md", "halbach_supervisor.c", "halbach_supervisor.h"} < names
     assert out.count("wrote ") == len(names)
     assert re.fullmatch(r"pass: 4 vectors of 60 samples, checksum [0-9a-f]{8}\n", build_and_test(folder))
     done = subprocess.run([str(folder / "halbach_example")], check=False, timeout=60)
@@ -80,7 +80,7 @@ def test_json_lists_the_files(run: Run, tmp_path: Path) -> None:
     code, out, err = run("export", GAINS, "--out", tmp_path / "c", "--json")
     assert (code, err) == (0, "")
     found = json.loads(out)
-    assert (found["gains"], found["to"], len(found["files"])) == (GAINS, "c", 8)
+    assert (found["gains"], found["to"], len(found["files"])) == (GAINS, "c", 10)
 
 
 @pytest.mark.parametrize(

@@ -100,7 +100,13 @@ def test_it_flies_to_the_bit_where_nothing_is_contracted(fidelity: Any) -> None:
 
 @pytest.mark.parametrize(
     ("name", "distance"),
-    [("robust", 10e-3), ("tubular_pid", 10e-3), ("robust_observer", 10e-3), ("planar", 1e-3)],
+    [
+        *(("robust", 10e-3), ("tubular_pid", 10e-3)),
+        *(
+            pytest.param(*given, marks=pytest.mark.slow)
+            for given in (("robust_observer", 10e-3), ("planar", 1e-3))
+        ),
+    ],
 )
 def test_it_flies_as_the_simulation_does(name: str, distance: float) -> None:
     """With phase currents and duty cycles where the machine has them: every signal within 1e-12 of its range."""

@@ -521,8 +521,9 @@ def test_bad_input_gets_a_sentence() -> None:
         build_fmu(t, SHA256, fmi=1)
     planar = target("planar").controller
     par: Any = planar.parameters
-    with pytest.raises(InputError, match="whose currents come from a table"):
-        Target(replace(planar, parameters=replace(par, cells=8)), "double", "force")
+    with_table = Target(replace(planar, parameters=replace(par, cells=8)), "double", "force")
+    with pytest.raises(InputError, match="whose currents come from a table, expected the controller alone"):
+        build_fmu(with_table, SHA256, part="machine")
     part: Any = "rotor"
     with pytest.raises(InputError, match="part: found 'rotor', expected one of controller, machine, loop"):
         build_fmu(t, SHA256, part=part)

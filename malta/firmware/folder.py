@@ -22,6 +22,7 @@ from malta.firmware.signals import (
     state_fields,
 )
 from malta.firmware.step import programs_of
+from malta.firmware.supervisor_text import monitor_lines, supervisor_sources
 from malta.firmware.vectors import FNV_FACTOR, FNV_START, SAMPLES, Vector, record_vectors
 
 EXAMPLE_SAMPLES = 2000  # of the example's main program
@@ -38,7 +39,7 @@ def folder_files(
         files = folder_files(Target(controller, "float"), sha256)
     """
     name = c_name(t.controller.name)
-    files = sources(t, sha256, name)
+    files = sources(t, sha256, name) | supervisor_sources(t, name)
     c_files = [file for file in files if file.endswith(".c")]
     context = context_of(t, programs_of(t), name, sha256) | {
         "objects": " ".join(file.removesuffix(".c") + ".o" for file in c_files),
@@ -55,6 +56,7 @@ def folder_files(
         "Makefile": render("Makefile", context),
         "CMakeLists.txt": render("CMakeLists.txt", context),
     }
+    context["monitors"] = monitor_lines(t)
     report = report_text(t, context, list(files), dict(uncertainty or {}), proof=proof)
     return files | {"REPORT.md": report}
 

@@ -83,9 +83,9 @@ def call_piece(
     real = TYPES[native.target.precision]
     results = {name: np.zeros(size, dtype=real) for name, size in sizes.items()}
     vectors = [np.ascontiguousarray(value, dtype=real) for value in given.values()]
-    getattr(native.lib, f"{native.name}_{piece}")(
-        *(v.ctypes.data_as(ctypes.c_void_p) for v in (*vectors, *results.values()))
-    )
+    # The C has no arguments without entries.
+    places = [v.ctypes.data_as(ctypes.c_void_p) for v in (*vectors, *results.values()) if v.size]
+    getattr(native.lib, f"{native.name}_{piece}")(*places)
     return results
 
 
