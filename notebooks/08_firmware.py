@@ -125,3 +125,24 @@ if rows:
 # %% [markdown]
 # **Judgement.** The whole control period, from readings to duty cycles, takes less than a tenth of 50 µs on the paper's
 # processor. Light bars call arithmetic that the processor does not have: single precision is for the Cortex-M4F.
+
+# %% [markdown]
+# ## The supervisor
+# The folder has a machine of states around the controller: current offsets, sensors, lift-off, settling, operation, landing.
+# It flies here, from the bearing and back, with a stroke in between.
+
+# %%
+if can_build:
+    commissioning = malta.experiment("commissioning", plant, c)
+    for merit in commissioning.merits:
+        print(f"{merit.label}: {merit.value:.4g}")
+    malta.report.experiment(commissioning, "build/robust_commissioning.png")
+    shown, axis = plt.subplots(figsize=(9, 6), layout="constrained")
+    axis.imshow(plt.imread("build/robust_commissioning.png"))
+    axis.set_axis_off()
+    assert commissioning.run.verdict.completed
+    by_label = {merit.label: merit.value for merit in commissioning.merits}
+    assert by_label["in operation after"] < 0.1
+
+# %% [markdown]
+# `malta simulate design/gains/robust.json --scenario supervised-faults` flies each fault with it and without it.

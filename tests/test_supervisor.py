@@ -422,8 +422,8 @@ def test_it_prevents_touchdowns(during: str, alone: int) -> None:
     assert (without, with_, landed) == (alone, 0, 3)
     speeds = {case.label: case.merits[2].value for case in e.cases}
     assert speeds["y1 stuck"] > 0.1
-    assert speeds["y1 stuck +"] < SOFT
-    assert speeds["y1 biased by 50 um +"] < 0.005
+    assert speeds["y1 stuck (s)"] < SOFT
+    assert speeds["y1 biased by 50 um (s)"] < 0.005
     assert not e.failed
 
 

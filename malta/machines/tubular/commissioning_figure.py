@@ -62,7 +62,7 @@ def commissioning_figure(e: Experiment, _: Published | None = None) -> Figure:
     finish_axes(stroke, "time [ms]", f"{plant.stroke} [mm]")
     finish_axes(force, "time [ms]", "commanded forces [N]")
     for axes in (height, error, stroke, force):
-        _mark_states(axes, ms, state, named=axes in (height, error))
+        _mark_states(axes, ms, state, named=axes is height)
     add_shared_legend(figure)
     return figure
 

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 STROKE, LAND, END = 0.4, 0.5, 0.75  # s: middle of the stroke, request to land, end
 SOFT = 0.05  # m/s: a landing that meets its bearing faster is a touchdown; a fall by 33 um, pulled by the magnets
 LASTING = 0.4  # s, of a run with a fault: room for a landing
-WITH = " +"  # in the label of a run with the supervisor
+WITH = " (s)"  # in the label of a run with the supervisor
 
 
 def commissioning(
@@ -111,7 +111,7 @@ def supervised_faults(
             break
     return Experiment(
         "supervised-faults",
-        "Which touchdowns does the supervisor (+) prevent?",
+        "Which touchdowns does the supervisor (s) prevent?",
         tuple(cases),
         _counts(cases),
         curves,
