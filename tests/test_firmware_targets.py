@@ -7,11 +7,22 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from exported import EXACT, HERE, PRECISIONS, PROCESSORS, build, c_files, require, run, run_test, write_folder
+from exported import (
+    EXACT,
+    HERE,
+    PRECISIONS,
+    PROCESSORS,
+    build,
+    c_files,
+    require,
+    root_text,
+    run,
+    run_test,
+    write_folder,
+)
 
 from malta.firmware.cost import FLAGS
 from malta.firmware.elementary import Precision
-from malta.firmware.export import render
 
 NAMES = ["halbach", *(pytest.param(n, marks=pytest.mark.slow) for n in ("robust", "planar_pid"))]
 DIFFERS = r"stroke: sample (\d+) differs\n  \w+\[\d+\] is \S+, expected \S+\n"
@@ -116,19 +127,10 @@ def test_roots_bit_by_bit_are_those_of_the_processor(precision: Precision, tmp_p
     require("gcc")
     real = np.float64 if precision == "double" else np.float32
     limits = np.finfo(real)
-    context = {
-        "name": "own",
-        "NAME": "OWN",
-        "arm_fpu": "",
-        "digits": limits.nmant,
-        "builtin_root": "__builtin_sqrt",
-    }
-    numbers = {"zero": 0.0, "one": 1.0, "two": 2.0, "four": 4.0, "half": 0.5, "quarter": 0.25}
-    head = f"#include <stdbool.h>\n#include <stdint.h>\n#include <stdio.h>\ntypedef {precision} own_real;\n"
     loop = 'while (scanf("%la", &x) == 1) printf("%a\\n", (double)own_root((own_real)x));'
     main = f"int main(void) {{ double x; {loop} }}\n"
-    text = head + render("root.c", context | numbers).replace("__SSE2__", "NEVER") + main
-    (tmp_path / "root.c").write_text(text.replace("__aarch64__", "NEVER"), encoding="utf-8")
+    text = "#include <stdio.h>\n" + root_text(precision) + main
+    (tmp_path / "root.c").write_text(text, encoding="utf-8")
     rng = np.random.default_rng(5)
     given = (10.0 ** rng.uniform(np.log10(limits.tiny), np.log10(limits.max), 500)).astype(real)
     given = np.concatenate([given, [limits.smallest_subnormal, limits.tiny, limits.max, 1, 4, 2, np.inf]])
