@@ -135,7 +135,7 @@ if rows:
 if can_build:
     commissioning = malta.experiment("commissioning", plant, c)
     for merit in commissioning.merits:
-        print(f"{merit.label}: {merit.value:.4g}")
+        print(merit)
     malta.report.experiment(commissioning, "build/robust_commissioning.png")
     shown, axis = plt.subplots(figsize=(9, 6), layout="constrained")
     axis.imshow(plt.imread("build/robust_commissioning.png"))
