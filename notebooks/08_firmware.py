@@ -128,8 +128,8 @@ if rows:
 
 # %% [markdown]
 # ## The supervisor
-# The folder has a machine of states around the controller: current offsets, sensors, lift-off, settling, operation, landing.
-# It flies here, from the bearing and back, with a stroke in between.
+# The folder has a machine of states around the controller: current offsets, sensors, lift-off, settling, operation,
+# landing. It flies here, from the bearing and back, with a stroke in between.
 
 # %%
 if can_build:
