@@ -57,7 +57,7 @@ def test_export_writes_a_folder_whose_test_passes(run: Run, tmp_path: Path, prec
     assert f"typedef {precision} halbach_real;" in header
     report = (folder / "REPORT.md").read_text(encoding="utf-8")
     assert ("% is proven for the sampled loop" in report) == (precision == "float")
-    assert "nan" not in report
+    assert "| nan" not in report
 
 
 @pytest.mark.parametrize(("part", "fmi"), [("controller", "2"), ("loop", "3")])

@@ -13,7 +13,7 @@ from matplotlib import pyplot
 pytestmark = pytest.mark.usefixtures("proven_once")
 
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.py"))
-SLOW = {name: [pytest.mark.slow] for name in ("03_experiments", "05_halbach", "06_planar")} | {
+SLOW = {name: [pytest.mark.slow] for name in ("03_experiments", "05_halbach", "06_planar", "08_firmware")} | {
     "04_robustness": [pytest.mark.slow, pytest.mark.xdist_group("chain")]  # where its margins are proven once
 }
 

@@ -46,8 +46,34 @@ def export(
     Example:  malta export design/gains/robust.json --to c --precision float --out build/robust_c
               malta export design/gains/robust.json --to fmu --part loop --fmi 3
     """
+    from malta.firmware.exports import export_c, export_fmu
+
+    _require_known(to, precision, until, part, fmi)
+    controller = read_controller(gains, machine)
+    chosen: Any = {"until": until}
+    if to == "fmu":
+        if precision != "double":
+            raise InputError("--precision", "", f"{precision} of an FMU", "double")
+        file = out or Path("build") / f"{controller.name}_{part}.fmu"
+        note = export_fmu(gains, file, part=cast("Any", part), fmi=fmi, **chosen)
+        if note:
+            print_note(f"{file}: {note}")
+        files = [file]
+    else:
+        if proof and precision == "float" and not as_json:
+            print_note("proving the margin with the coefficients that float holds; --no-proof leaves it out")
+        folder = out or Path("build") / f"{controller.name}_c"
+        files = export_c(gains, folder, precision=cast("Any", precision), proof=proof, **chosen)
+    if as_json:
+        print_json({"gains": str(gains), "to": to, "files": [str(file) for file in files]})
+    else:
+        print_written(make_console(), files)
+
+
+def _require_known(to: str, precision: str, until: str | None, part: str, fmi: int) -> None:
+    """Raise InputError for an option with a value that there is not."""
     from malta.firmware.elementary import Precision
-    from malta.firmware.exports import Until, export_c, export_fmu
+    from malta.firmware.exports import Until
     from malta.firmware.unit import Part
 
     for name, value, known in (
@@ -60,22 +86,3 @@ def export(
         if value not in known:
             expected = " or ".join(str(one) for one in known if one is not None)
             raise InputError(name, "", repr(value), expected)
-    controller = read_controller(gains, machine)
-    chosen: Any = {"until": until}
-    if to == "fmu":
-        if precision != "double":
-            raise InputError("--precision", "", f"{precision} of an FMU", "double")
-        file = out or Path("build") / f"{controller.name}_{part}.fmu"
-        note = export_fmu(gains, file, part=cast("Part", part), fmi=fmi, **chosen)
-        if note:
-            print_note(f"{file}: {note}")
-        files = [file]
-    else:
-        if proof and precision == "float" and not as_json:
-            print_note("proving the margin with the coefficients that float holds; --no-proof leaves it out")
-        folder = out or Path("build") / f"{controller.name}_c"
-        files = export_c(gains, folder, precision=cast("Precision", precision), proof=proof, **chosen)
-    if as_json:
-        print_json({"gains": str(gains), "to": to, "files": [str(file) for file in files]})
-    else:
-        print_written(make_console(), files)

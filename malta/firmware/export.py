@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import cache
 from importlib.metadata import version
 from typing import Any
@@ -26,6 +26,7 @@ from malta.firmware.step import programs_of
 MOST_POINTS = 65_535  # of a table of v0(z)
 MOST_RATE = 1e6  # of a reference, per s and s^2: beyond, single precision has no room
 FUSED = ("sense", "decide", "state_at")  # functions that a step consists of; the others are its pieces
+LONGEST_RISE = 1000.0  # s, of a stroke
 RISES = 6.0  # times its rise that a stroke lasts: a logistic one is then within 2e-6 of its ends
 WORDS = {
     "double": "Double precision: the numbers of the simulation.",
@@ -69,23 +70,6 @@ def _environment() -> jinja2.Environment:
 def context_of(t: Target, programs: Mapping[str, Program], name: str, sha256: str) -> dict[str, Any]:
     """What the templates of a controller are filled with."""
     c, plant = t.controller, t.believed
-
-    def number(value: float) -> str:
-        return c_number(value, t.precision)
-
-    def rows(values: Any, width: int) -> str:
-        flat = [number(v) for v in np.ravel(values)]
-        return ",\n".join("  " + ", ".join(flat[k : k + width]) for k in range(0, len(flat), width))
-
-    fused = {key: function_text(programs[key], name, t.precision, static=True) for key in FUSED}
-    others = {key: p for key, p in programs.items() if key not in FUSED}
-    fused_root, parts_root = (
-        any(o.op == "SQRT" for key in keys for o in programs[key].operations) for keys in (FUSED, others)
-    )
-    ff = c.feedforward
-    stroke = plant.has_stroke and plant.travel > 0
-    step_z = f"out->y_used[{plant.stroke_output}]" if plant.has_stroke else "s->z[0]"
-    start_z = f"s->reference.p[{plant.stroke_output}]" if plant.has_stroke else "s->z[0]"
     return {
         "name": name,
         "NAME": name.upper(),
@@ -96,54 +80,84 @@ def context_of(t: Target, programs: Mapping[str, Program], name: str, sha256: st
         "precision": t.precision,
         "precision_text": WORDS[t.precision],
         "period": f"{c.sample_time * 1e6:g} us",
-        "sample_time": number(c.sample_time),
+        "sample_time": c_number(c.sample_time, t.precision),
         "records": _records(t, name),
         "state": state_fields(t),
         "reference": reference_fields(t),
         "sums": _sums(t),
-        "declarations": [signature(p, name) for p in others.values()],
-        "functions": "\n".join(function_text(p, name, t.precision) for p in others.values()),
-        **fused,
-        "call_sense": call(programs["sense"], t, name),
-        "call_decide": call(programs["decide"], t, name),
-        "call_start": call(programs["state_at"], t, name),
-        "step_z": step_z,
-        "start_z": start_z,
         "forces": len(c.forces),
         "outputs": len(c.measurements),
         "force_names": comment(" ".join(s.name for s in c.forces)),
-        "points": len(ff.z_grid),
-        "z_rows": rows(ff.z_grid, 6),
-        "v0_rows": rows(ff.v0, len(c.forces)),
-        "force_limits": ", ".join(number(v) for v in _finite(c.limits.force)),
-        "ranges": ", ".join(number(v) for v in reading_ranges(plant)),
-        "most_points": MOST_POINTS,
-        "most_rate": number(MOST_RATE),
-        "reads": len(t.look_ups),
-        **_table(t, rows),
-        "last_row": number(float(t.look_ups[0].nodes.shape[0] - 1) if t.look_ups else 0.0),
-        "last_column": number(float(t.look_ups[0].nodes.shape[1] - 1) if t.look_ups else 0.0),
-        "stroke": stroke,
-        "stroke_output": plant.stroke_output if stroke else 0,
-        "travel": number(plant.travel),
-        "longest_rise": number(1000.0),
-        "rises": number(RISES),
-        "link": number(plant.drive.link_voltage) if t.driven else "",
+        "link": c_number(plant.drive.link_voltage, t.precision) if t.driven else "",
         "last_output": _last_output(t),
-        "root": fused_root,
-        "parts_root": parts_root,
-        "arm_fpu": f" || (defined(__ARM_FP) && ((__ARM_FP & {8 if t.precision == 'double' else 4}) != 0))",
-        "builtin_root": "__builtin_sqrt" if t.precision == "double" else "__builtin_sqrtf",
-        "digits": 52 if t.precision == "double" else 23,
-        **{key: number(v) for key, v in _NUMBERS.items()},
+        **_function_context(t, programs, name),
+        **_limit_context(t),
+        **_table_context(t),
+        **{key: c_number(v, t.precision) for key, v in _NUMBERS.items()},
     }
 
 
-def _table(t: Target, rows: Callable[[Any, int], str]) -> dict[str, Any]:
-    """The table of the currents, of a machine that has one."""
-    nodes = t.look_ups[0].nodes if t.look_ups else np.zeros((0, 0, 0))
+def _function_context(t: Target, programs: Mapping[str, Program], name: str) -> dict[str, Any]:
+    """The functions, the calls of those that a step consists of, and the root that they need."""
+    others = {key: p for key, p in programs.items() if key not in FUSED}
+    fused_root, parts_root = (
+        any(o.op == "SQRT" for key in keys for o in programs[key].operations) for keys in (FUSED, others)
+    )
+    double = t.precision == "double"
+    return {
+        **{key: function_text(programs[key], name, t.precision, static=True) for key in FUSED},
+        "declarations": [signature(p, name) for p in others.values()],
+        "functions": "\n".join(function_text(p, name, t.precision) for p in others.values()),
+        "call_sense": call(programs["sense"], t, name),
+        "call_decide": call(programs["decide"], t, name),
+        "call_start": call(programs["state_at"], t, name),
+        "root": fused_root,
+        "parts_root": parts_root,
+        "arm_fpu": f" || (defined(__ARM_FP) && ((__ARM_FP & {8 if double else 4}) != 0))",
+        "builtin_root": "__builtin_sqrt" if double else "__builtin_sqrtf",
+        "digits": 52 if double else 23,
+    }
+
+
+def _limit_context(t: Target) -> dict[str, Any]:
+    """What references, tables and strokes may be."""
+    plant = t.believed
+    stroke = plant.has_stroke and plant.travel > 0
+    return {
+        "force_limits": ", ".join(c_number(v, t.precision) for v in _finite(t.controller.limits.force)),
+        "ranges": ", ".join(c_number(v, t.precision) for v in reading_ranges(plant)),
+        "most_points": MOST_POINTS,
+        "most_rate": c_number(MOST_RATE, t.precision),
+        "stroke": stroke,
+        "stroke_output": plant.stroke_output if stroke else 0,
+        "travel": c_number(plant.travel, t.precision),
+        "longest_rise": c_number(LONGEST_RISE, t.precision),
+        "rises": c_number(RISES, t.precision),
+        "step_z": f"out->y_used[{plant.stroke_output}]" if plant.has_stroke else "s->z[0]",
+        "start_z": f"s->reference.p[{plant.stroke_output}]" if plant.has_stroke else "s->z[0]",
+    }
+
+
+def _table_context(t: Target) -> dict[str, Any]:
+    """v0(z), and the table of the currents of a machine that has one."""
+
+    def rows(values: Any, width: int) -> str:
+        flat = [c_number(v, t.precision) for v in np.ravel(values)]
+        return ",\n".join("  " + ", ".join(flat[k : k + width]) for k in range(0, len(flat), width))
+
+    ff = t.controller.feedforward
+    nodes = t.look_ups[0].nodes if t.look_ups else np.zeros((1, 1, 0))
     sizes = dict(zip(("table_rows", "table_columns", "table_values"), nodes.shape, strict=True))
-    return {**sizes, "table_numbers": rows(nodes, 6) if nodes.size else ""}
+    return {
+        "points": len(ff.z_grid),
+        "z_rows": rows(ff.z_grid, 6),
+        "v0_rows": rows(ff.v0, ff.v0.shape[1]),
+        "reads": len(t.look_ups),
+        **sizes,
+        "table_numbers": rows(nodes, 6),
+        "last_row": c_number(nodes.shape[0] - 1, t.precision),
+        "last_column": c_number(nodes.shape[1] - 1, t.precision),
+    }
 
 
 _NUMBERS = {"zero": 0.0, "one": 1.0, "two": 2.0, "four": 4.0, "half": 0.5, "quarter": 0.25}
