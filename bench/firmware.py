@@ -25,7 +25,8 @@ from malta.firmware.ctext import c_name, c_number, function_text, signature
 from malta.firmware.elementary import Precision
 from malta.firmware.export import sources
 from malta.firmware.lowering import lower
-from malta.firmware.parts import decide_function, named_function, parts_of, sense_function
+from malta.firmware.parts import decide_function, named_function, sense_function
+from malta.firmware.pieces import parts_of
 from malta.firmware.program import evaluate, program_of
 from malta.firmware.signals import Target, input_fields, reference_fields, state_fields
 from malta.firmware.step import look_up, started_state, step_of

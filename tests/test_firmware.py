@@ -18,7 +18,7 @@ from malta.firmware.flight import differences, engine_of_c
 from malta.firmware.fmu import build_fmu
 from malta.firmware.folder import folder_files
 from malta.firmware.native import call, call_piece, compile_controller, new_state, view, write
-from malta.firmware.parts import parts_of
+from malta.firmware.pieces import parts_of
 from malta.firmware.program import evaluate, program_of
 from malta.firmware.signals import Target, reading_ranges, reference_fields, state_fields
 from malta.firmware.step import step_of

@@ -3,13 +3,11 @@
     sense       (raw readings, validity) -> y: readings that cannot be true give way to what the filter expects
     decide      (state, reference, y, v0, currents, link) -> (state, forces, currents, duty cycles)
 
-and each piece of `decide` alone: positions, filter, law, feedforward, currents, current control, transformations,
-references of strokes, calibration, the position of Hall sensors. v0(z) is looked up between the two, see controller.c.
+v0(z) is looked up between the two, see controller.c. pieces.py has each piece alone.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
@@ -18,7 +16,6 @@ import casadi as ca
 import numpy as np
 
 from malta.firmware.elementary import as_written
-from malta.firmware.lowering import lower
 from malta.firmware.signals import (
     Field,
     Target,
@@ -29,11 +26,9 @@ from malta.firmware.signals import (
     state_fields,
 )
 from malta.model.lookup import recorded_look_ups
-from malta.model.plant import Plant
 from malta.simulation.current_control import control_currents
 from malta.simulation.layout import Loop, Signals, electronics_of, numbers_of
 from malta.simulation.period import law_reference, state_reference
-from malta.simulation.references import QUINTIC_DURATION
 from malta.synthesis.controller import (
     commanded,
     estimated,
@@ -47,12 +42,6 @@ if TYPE_CHECKING:
     from malta.model.plant import FloatArray
 
 LINK_RANGE = (0.05, 4.0)  # readings of the link's voltage that are believed, in multiples of the nominal one
-
-
-def parts_of(t: Target) -> dict[str, ca.Function]:
-    """All functions of an export by name, lowered: `sense` and `decide`, then the pieces that are usable alone."""
-    functions = [sense_function(t), decide_function(t), state_function(t), *pieces(t)]
-    return {f.name(): lower(f, t.precision) for f in functions}
 
 
 def symbols(fields: Sequence[Field]) -> dict[str, Any]:
@@ -119,7 +108,7 @@ def decide_function(t: Target) -> ca.Function:
     v_ff = feedforward(t, p, dp, reference["ddp"])
     v_past, after["memory"] = recall(t, state.get("memory"), v_ff, p, dp)
     xi_ref = law_reference(c, plant, g, {"p_ref": p, "dp_ref": dp, "v_past": v_past})
-    sums = _Sums(t, state)
+    sums = Sums(t, state)
     xi_hat = estimated(g, state["xi_pred"], filtered(c.tracks, y, p), None, sums.add_to_states)
     frozen = freeze_moving(g, state["frozen"], dp)
     e = sum_errors(g, state["e"], frozen, y, p, sums.add_to_errors)
@@ -146,7 +135,7 @@ def decide_function(t: Target) -> ca.Function:
     return named_function("decide", arguments, results)
 
 
-class _Sums:
+class Sums:
     """How the sums of a sample take what is added: plainly in double precision, compensated (Kahan) in single.
 
     At e = 1e-4 a float moves in steps of 7e-12; Ts (p* - y) is smaller for errors below 73 nm at 20 kHz, and the sum
@@ -276,7 +265,7 @@ def drive_currents(
     read: dict[str, Any],
     current: Any,
     known: Any,
-    sums: _Sums,
+    sums: Sums,
 ) -> tuple[Any, dict[str, Any]]:
     """Duty cycles (or voltages of axes) for these currents, and the state of the current loops after the sample."""
     c, plant, drive = t.controller, t.believed, t.believed.drive
@@ -322,80 +311,3 @@ def state_function(t: Target) -> ca.Function:
         state["i_last"] = drive.to_phases(x) @ i if t.fidelity == "phase" else i
         state["link_last"] = ca.SX(drive.link_voltage)
     return named_function("state_at", {**reference, "v0": v0}, {f"{k}_next": v for k, v in state.items()})
-
-
-def pieces(t: Target) -> list[ca.Function]:
-    """The pieces of a control period that are usable alone."""
-    c, plant = t.controller, t.believed
-    g = {name: ca.SX(value) for name, value in numbers_of(plant, c, 1).items()}
-    reference = symbols(reference_fields(t))
-    p, dp, ddp = reference.values()
-    y, v, v0 = (
-        ca.SX.sym(n, k) for n, k in (("y", len(c.measurements)), ("v", len(c.forces)), ("v0", len(c.forces)))
-    )
-    raw, gain, offset = (ca.SX.sym(name, len(c.measurements)) for name in ("raw", "gain", "offset"))
-    xi_pred, xi_hat = ca.SX.sym("xi_pred", len(c.states)), ca.SX.sym("xi_hat", len(c.states))
-    xi_ref, e = ca.SX.sym("xi_ref", len(c.states)), ca.SX.sym("e", len(c.measurements))
-    v_ff = ca.SX.sym("v_ff", len(c.forces))
-    table = ca.SX.sym("table", table_size(t))
-    taken = filtered(c.tracks, y, p)
-    following, saturated, force = commanded(g, xi_hat, e, xi_ref, v_ff, v0)
-    return [
-        named_function("calibrate", {"raw": raw, "gain": gain, "offset": offset}, {"y": gain * raw + offset}),
-        named_function("positions", {"y": y}, {"q": plant.position_of(y)}),
-        named_function("feedforward", reference, {"v_ff": feedforward(t, p, dp, ddp)}),
-        named_function(
-            "filter", {"xi_pred": xi_pred, "y": y, "p": p}, {"xi_hat": estimated(g, xi_pred, taken)}
-        ),
-        named_function(
-            "law",
-            {"xi_hat": xi_hat, "e": e, "xi_ref": xi_ref, "v_ff": v_ff, "v0": v0},
-            {"v": force, "saturated": saturated, "xi_pred_next": following},
-        ),
-        *([named_function("places", {"y": y}, {"table_at": places_in_table(t, y)})] if t.look_ups else []),
-        named_function(
-            "currents", {"y": y, "v": v, "table": table}, {"current": currents(t, y, v, table)[1]}
-        ),
-        *strokes(),
-        *_transformations(plant),
-    ]
-
-
-def _transformations(plant: Plant) -> list[ca.Function]:
-    """Axes from phases and back, of a machine with windings, and the position of two Hall sensors half a pole apart."""
-    if plant.windings is None:
-        return []
-    drive, x = plant.windings, ca.SX.sym("x", len(plant.states))
-    i_phase, u = ca.SX.sym("i_phase", len(drive.phases)), ca.SX.sym("u", len(drive.axes))
-    sine, cosine, z, pole = (ca.SX.sym(name) for name in ("sine", "cosine", "z_last", "pole"))
-    angle = ca.atan2(sine, cosine)
-    turns = (z * math.pi / pole - angle) / (2 * math.pi)
-    return [
-        named_function("to_axes", {"x": x, "i_phase": i_phase}, {"i": drive.to_axes(x) @ i_phase}),
-        named_function("to_phases", {"x": x, "u": u}, {"u_phase": drive.to_phases(x) @ u}),
-        named_function("induced_voltage", {"x": x}, {"e": drive.emf(x)}),
-        named_function(
-            "hall_position",
-            {"sine": sine, "cosine": cosine, "z_last": z, "pole": pole},
-            {"z": (angle + 2 * math.pi * ca.floor(turns + 0.5)) * pole / math.pi},
-        ),
-    ]
-
-
-def strokes() -> list[ca.Function]:
-    """Shares of a stroke, with rate and acceleration, from the time since its middle: see simulation/references.py."""
-    time, rise = ca.SX.sym("t"), ca.SX.sym("rise")
-    arguments = {"t": time, "rise": rise}
-    k = 2 * math.log(9) / rise
-    s = 0.5 * (1 + ca.tanh(k * time / 2))
-    ds = k * s * (1 - s)
-    T = QUINTIC_DURATION * rise
-    u = ca.fmin(ca.fmax(time / T + 0.5, 0), 1)
-    names = ("share", "rate", "acceleration")
-    logistic = (s, ds, k * ds * (1 - 2 * s))
-    w = u * (1 - u)
-    quintic = (u * u * u * (10 + u * (6 * u - 15)), 30 * (w * w) / T, 60 * w * (1 - 2 * u) / (T * T))
-    return [
-        named_function("logistic", arguments, dict(zip(names, logistic, strict=True))),
-        named_function("quintic", arguments, dict(zip(names, quintic, strict=True))),
-    ]

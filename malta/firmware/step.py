@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from malta.firmware.parts import parts_of
+from malta.firmware.pieces import parts_of
 from malta.firmware.program import TYPES, Program, evaluate, program_of
 from malta.firmware.signals import Target, reference_fields, state_fields
 from malta.model.lookup import interpolate
