@@ -21,7 +21,7 @@ from malta.firmware.native import call, call_piece, compile_controller, new_stat
 from malta.firmware.pieces import parts_of
 from malta.firmware.program import evaluate, program_of
 from malta.firmware.signals import Target, reading_ranges, reference_fields, state_fields
-from malta.firmware.step import step_of
+from malta.firmware.step import look_up, programs_of, started_state, step_of, zero_reference
 from malta.simulation.compiled import compiler
 
 NAMES = [
@@ -83,6 +83,45 @@ def test_steps_compute_the_bits_of_their_expressions(name: str, precision: Preci
             for of, expected in values.items():
                 assert np.array_equal(view(record, of), expected), (k, of)
         assert bool(sensed["refused"].any()) == (k == 5)
+
+
+@pytest.mark.parametrize("name", ["table2", "tubular_pid"])
+def test_the_pieces_make_the_step(name: str) -> None:
+    """Called one after the other as a firmware may do, in double precision: the bits of a step."""
+    t = target(name, "double")
+    c, rng, step = t.controller, np.random.default_rng(5), step_of(t)
+    programs = programs_of(t)
+
+    def piece(of: str, **given: Any) -> dict[str, Any]:
+        return evaluate(programs[of], given, "double")
+
+    reference = zero_reference(t)
+    state = started_state(t, reference)
+    for k in range(4):
+        read: dict[str, Any] = {"y": 1e-5 * rng.normal(size=5), "y_valid": np.ones(5), "link": [44.0]}
+        read |= {"i": rng.normal(size=18), "i_valid": np.ones(18)}
+        p, dp, y = reference["p"], reference["dp"], read["y"]
+        xi_hat = piece("filter", xi_pred=state["xi_pred"], y=y, p=p)["xi_hat"]
+        e = piece("sum_errors", e=state["e"], frozen=state["frozen"], y=y, p=p, dp=dp)["e_next"]
+        v_ff = piece("feedforward", **reference)["v_ff"]
+        xi_ref = np.zeros(len(c.states))
+        xi_ref[: len(c.A)] = piece("reference_states", p=p, dp=dp)["states"]
+        v0 = look_up(t, y[t.believed.stroke_output])
+        law = piece("law", xi_hat=xi_hat, e=e, xi_ref=xi_ref, v_ff=v_ff, v0=v0)
+        current = piece("currents", y=y, v=law["v"], table=[])["current"]
+        loops = {name: state[name] for name in ("u_integral", "u_limited", "i_last", "link_last")}
+        drive = piece("current_control", current=current, states=xi_hat[: len(c.A)], **loops, **read)
+        state, out = step(state, reference, read)
+        for mine, theirs in (
+            (xi_hat, out["xi_hat"]),
+            (e, state["e"]),
+            (law["v"], out["v"]),
+            (law["xi_pred_next"], state["xi_pred"]),
+            (current, out["current"]),
+            (drive["command"], out["command"]),
+            (drive["u_integral_next"], state["u_integral"]),
+        ):
+            assert np.array_equal(mine, theirs), k
 
 
 @pytest.mark.parametrize("fidelity", ["force", "dq"])
