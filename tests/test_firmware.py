@@ -108,7 +108,7 @@ def test_the_pieces_make_the_step(name: str) -> None:
         xi_ref[: len(c.A)] = piece("reference_states", p=p, dp=dp)["states"]
         v0 = look_up(t, y[t.believed.stroke_output])
         law = piece("law", xi_hat=xi_hat, e=e, xi_ref=xi_ref, v_ff=v_ff, v0=v0)
-        current = piece("currents", y=y, v=law["v"], table=[])["current"]
+        current = piece("currents", y=y, v=law["v"])["current"]
         loops = {name: state[name] for name in ("u_integral", "u_limited", "i_last", "link_last")}
         drive = piece("current_control", current=current, states=xi_hat[: len(c.A)], **loops, **read)
         state, out = step(state, reference, read)

@@ -88,7 +88,7 @@ def generated(f: ca.Function, folder: Path) -> Any:
     real = ctypes.POINTER(ctypes.c_double)
 
     def compute(given: dict[str, Any]) -> dict[str, Any]:
-        vectors = [np.array(given.get(f.name_in(k), ()), dtype=float) for k in range(f.n_in())]
+        vectors = [np.array(given[f.name_in(k)], dtype=float) for k in range(f.n_in())]
         results = [np.zeros(f.size1_out(k)) for k in range(f.n_out())]
         a = (real * f.sz_arg())(*(v.ctypes.data_as(real) for v in vectors))
         r = (real * f.sz_res())(*(v.ctypes.data_as(real) for v in results))

@@ -130,7 +130,14 @@ def decide_function(t: Target) -> ca.Function:
     after |= sums.rests
     results = {f.name: after[f.name] for f in state_fields(t)}
     results |= {f.name: out[f.name] for f in output_fields(t) if f.name in out}
-    arguments = {**state, **reference, "y_used": y, "v0": v0, "table": table, **read}
+    arguments = {
+        **state,
+        **reference,
+        "y_used": y,
+        "v0": v0,
+        **({"table": table} if t.look_ups else {}),
+        **read,
+    }
     results = {(f"{name}_next" if name in state else name): value for name, value in results.items()}
     return named_function("decide", arguments, results)
 

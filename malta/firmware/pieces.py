@@ -98,9 +98,8 @@ def _current_pieces(t: Target) -> list[ca.Function]:
     c, plant = t.controller, t.believed
     y, v = ca.SX.sym("y", len(c.measurements)), ca.SX.sym("v", len(c.forces))
     table, current = ca.SX.sym("table", table_size(t)), ca.SX.sym("current", len(plant.actuator.coils))
-    found = [
-        named_function("currents", {"y": y, "v": v, "table": table}, {"current": currents(t, y, v, table)[1]})
-    ]
+    read = {"table": table} if t.look_ups else {}
+    found = [named_function("currents", {"y": y, "v": v, **read}, {"current": currents(t, y, v, table)[1]})]
     if t.look_ups:
         found.append(named_function("places", {"y": y}, {"table_at": places_in_table(t, y)}))
     electronics = electronics_of(plant, t.setup)
