@@ -89,10 +89,12 @@ def _process_noise(c: Controller) -> FloatArray:
 def _sees_instability(k: int, A: FloatArray, C: FloatArray) -> bool:
     """Whether the sensors without k see every mode of A that does not decay (Hautus)."""
     others = np.delete(C, k, axis=0)
-    scale = np.abs(A).max(axis=1, keepdims=True)
+    rows = np.abs(A).max(axis=1, keepdims=True)
+    scale = np.where(rows > 0, rows, 1.0)  # a delayed force remembers nothing
+    seen = others / (np.abs(others).max() or 1.0)
     for pole in eigenvalues(A):
         if abs(pole) >= 1 - 1e-9:
-            pencil = np.vstack([(A - pole * np.eye(len(A))) / scale, others / np.abs(others).max()])
+            pencil = np.vstack([(A - pole * np.eye(len(A))) / scale, seen])
             if np.linalg.matrix_rank(pencil, tol=1e-9) < len(A):
                 return False
     return True
