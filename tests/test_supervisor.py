@@ -23,6 +23,7 @@ from malta.firmware.sensor_loss import expected_readings, gains_without, predict
 from malta.firmware.signals import Target, fidelity_of
 from malta.firmware.supervised import NUMBERS, compile_supervised
 from malta.firmware.supervisor import (
+    LONG,
     MONITORS,
     STATES,
     TIMES,
@@ -324,6 +325,27 @@ def test_a_machine_that_does_not_settle_lands() -> None:
         bench.step(y={1: (20 + k % 2) * 1e-6}, operate=1)
     assert bench.monitor == "UNSETTLED"
     assert bench.now == "LANDING"
+
+
+def test_a_machine_that_has_settled_waits_for_its_request() -> None:
+    """Ten times as long as it may take to settle; what unsettles it then has all that time again."""
+    bench = Bench()
+    while bench.step(start=1) != "SETTLE":
+        pass
+    assert bench.step(200 * TIMES.settle) == "SETTLE"
+    unsettled = {1: 20e-6}
+    assert bench.step(10, y=unsettled) == "SETTLE"
+    assert bench.step(2 * TIMES.settle, operate=1) == "OPERATE"
+
+
+def test_counts_end_where_samples_stand_for_ever() -> None:
+    """A machine that is off for days with sensors that are: 2^31 samples of 50 us are 30 hours."""
+    bench = Bench()
+    bench.step(y=dict.fromkeys(range(5), 0.0))
+    bench.supervisor.unchanged, bench.supervisor.samples = LONG - 1, LONG - 1
+    bench.supervisor.repeated[:] = [LONG - 1] * 5
+    assert bench.step(3, y=dict.fromkeys(range(5), 0.0)) == "OFF"
+    assert [bench.supervisor.unchanged, bench.supervisor.samples, *bench.supervisor.repeated] == [LONG] * 7
 
 
 def test_machines_have_the_monitors_that_make_sense() -> None:

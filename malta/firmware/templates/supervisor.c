@@ -56,6 +56,9 @@ static int32_t is_flying(int32_t state) {
   return ((state >= {{ NAME }}_LIFT) && (state <= {{ NAME }}_LANDING)) ? 1 : 0;
 }
 
+/* A count and one, up to a number of samples that stands for ever: a machine may be off for days. */
+static int32_t one_more(int32_t count) { return (count < {{ longest }}) ? (count + 1) : count; }
+
 /* Whether a number is one, and of this size at most. */
 static int32_t is_within({{ name }}_real value, {{ name }}_real most) {
   return ((value <= most) && (value >= -most)) ? 1 : 0;
@@ -166,7 +169,7 @@ static void look_at_sensor({{ name }}_supervisor *sup, const {{ name }}_inputs *
     more = sup->noise[k] / ({{ mean_jump }} * sigma[k]); /* readings may be noisier than they are said to be */
     more = (more > {{ one }}) ? more : {{ one }};
     near_expected = ({{ believed }} * (sigma[k] * more)) + grown;
-    sup->repeated[k] = (y == sup->last[k]) ? (sup->repeated[k] + 1) : 0;
+    sup->repeated[k] = (y == sup->last[k]) ? one_more(sup->repeated[k]) : 0;
     level[{{ NAME }}_MONITOR_RANGE][k] = size_of(y) / range[k];
     level[{{ NAME }}_MONITOR_STUCK][k] = ({{ name }}_real)sup->repeated[k] / ({{ name }}_real)same_values[k];
     if (sup->unbelieved[k] == 0) {
@@ -200,7 +203,7 @@ static void look_at_sensors({{ name }}_supervisor *sup, {{ name }}_real level[{{
       believed++;
     }
   }
-  sup->unchanged = (repeated == 1) ? (sup->unchanged + 1) : 0;
+  sup->unchanged = (repeated == 1) ? one_more(sup->unchanged) : 0;
   for (k = 0; k < OUTPUTS; k++) {
     level[{{ NAME }}_MONITOR_STALE][k] = ({{ name }}_real)sup->unchanged;
   }
@@ -284,7 +287,7 @@ static int32_t judge({{ name }}_supervisor *sup, {{ name }}_real level[{{ monito
         now = (sup->unbelieved[k] > 0) ? {{ one }} : {{ zero }};
       }
       if ((counts == 1) && (now > row->threshold)) {
-        *count = (*count < {{ longest }}) ? (*count + 1) : *count;
+        *count = one_more(*count);
         if (row->reaction == {{ NAME }}_REACTION_HOLD) {
           calm = 0;
         }
@@ -296,7 +299,7 @@ static int32_t judge({{ name }}_supervisor *sup, {{ name }}_real level[{{ monito
           if (*count == row->samples) {
             sup->monitor = row->monitor;
             sup->reaction = row->reaction;
-            sup->acted[r] = (sup->acted[r] < {{ longest }}) ? (sup->acted[r] + 1) : sup->acted[r];
+            sup->acted[r] = one_more(sup->acted[r]);
           }
         }
       } else {
@@ -308,14 +311,13 @@ static int32_t judge({{ name }}_supervisor *sup, {{ name }}_real level[{{ monito
     }
   }
   for (k = 0; k < OUTPUTS; k++) {
-    const int32_t longer = (sup->unbelieved[k] < {{ longest }}) ? (sup->unbelieved[k] + 1) : sup->unbelieved[k];
-    sup->unbelieved[k] = (refused[k] == 1) ? longer : 0;
+    sup->unbelieved[k] = (refused[k] == 1) ? one_more(sup->unbelieved[k]) : 0;
     if ((refused[k] == 1) && (sup->state == {{ NAME }}_SENSORS)) {
       calm = 0;
     }
   }
   if ((sup->state == {{ NAME }}_HOLD) || (sup->state == {{ NAME }}_SENSORS)) {
-    sup->steady = (calm == 1) ? (sup->steady + 1) : 0;
+    sup->steady = (calm == 1) ? one_more(sup->steady) : 0;
   }
   return strongest;
 }
@@ -349,7 +351,7 @@ static void average_rest({{ name }}_supervisor *sup) {
 static void count_landed({{ name }}_supervisor *sup, const {{ name }}_inputs *in) {
   int32_t ignored = 0;
   int32_t k;
-  sup->steady = sup->steady + 1;
+  sup->steady = one_more(sup->steady);
   for (k = 0; k < OUTPUTS; k++) {
     if (sup->unbelieved[k] > 0) {
       ignored = 1;
@@ -367,11 +369,14 @@ static void count_landed({{ name }}_supervisor *sup, const {{ name }}_inputs *in
 /* Samples in a row with errors of a machine that has settled. */
 static void count_settled({{ name }}_supervisor *sup, const {{ name }}_state *s, const {{ name }}_inputs *in) {
   int32_t k;
-  sup->steady = sup->steady + 1;
+  sup->steady = one_more(sup->steady);
   for (k = 0; k < OUTPUTS; k++) {
     if ((sup->unbelieved[k] > 0) || (is_within(in->y[k] - s->reference.p[k], settled[k]) == 0)) {
       sup->steady = 0;
     }
+  }
+  if (sup->steady >= sup->times.settle) {
+    sup->samples = 0; /* it has settled, and waits for its request */
   }
 }
 
