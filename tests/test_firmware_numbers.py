@@ -177,6 +177,23 @@ def noisy_rows(r: Run) -> list[dict[str, Any]]:
     ]
 
 
+def test_a_filter_that_is_left_alone_finds_back() -> None:
+    """Forces at their limits, then a second without any reading: the unstable model would leave single precision."""
+    r = Run(target("robust", "float"))
+    readings = at_rest(r)
+    for k in range(3):
+        r.step(readings | {"y": 1e-3 * (-1.0) ** (k + np.arange(5))})
+    write(r.inputs, readings | {"y": np.full(5, math.nan)})
+    for _ in range(20_000):
+        call(r.native, "step", r.state, r.inputs, r.outputs)
+    assert np.isfinite(r.numbers()).all()
+    write(r.inputs, readings)
+    for _ in range(20_000):
+        call(r.native, "step", r.state, r.inputs, r.outputs)
+    assert np.abs(view(r.state, "xi_pred")[:5]).max() < 1e-6
+    assert not view(r.outputs, "saturated").any()
+
+
 @pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize("bad", [*BAD, 2.0])
 def test_a_reference_out_of_reach_changes_nothing(bad: float, precision: Precision) -> None:

@@ -41,6 +41,7 @@ from malta.synthesis.controller import (
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
 
+FAR = 1e3  # times the reach of a reading: what a filter may expect in its place, which supervisors call astray before
 LINK_RANGE = (0.05, 4.0)  # readings of the link's voltage that are believed, in multiples of the nominal one
 
 
@@ -59,7 +60,8 @@ def sense_function(t: Target) -> ca.Function:
     """(xi_pred, p, raw y, y_valid) -> (y_used, refused), and where the currents will read a table.
 
     A reading is refused that its sensor calls invalid, that is no number, or beyond all that the machine can reach; the
-    filter then goes on by its model. Comparisons with a NaN are false, so no reading poisons the state.
+    filter then goes on by its model. Comparisons with a NaN are false, so no reading poisons the state. What the filter
+    expects is bounded by FAR times that reach: an unstable model that goes on alone would leave all numbers behind.
     """
     c = t.controller
     a = symbols(
@@ -72,7 +74,10 @@ def sense_function(t: Target) -> ca.Function:
     expected = ca.sparsify(ca.DM(c.Cd)) @ a["xi_pred"]
     if c.tracks == "errors":
         expected = a["p"]
-    used, refused = gate(a["y"], a["y_valid"], reading_ranges(t.believed), expected)
+    reach = reading_ranges(t.believed)
+    most = ca.DM(FAR * reach)
+    bounded = ca.fmax(ca.fmin(expected, most), -most)
+    used, refused = gate(a["y"], a["y_valid"], reach, bounded)
     results = {"y_used": used, "refused": refused}
     if t.look_ups:
         g = {name: ca.SX(value) for name, value in numbers_of(t.believed, c, 1).items()}
