@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from hypothesis import strategies as st
 
 import malta
 from malta.firmware.elementary import Precision
+from malta.firmware.export import sources
 from malta.firmware.flight import engine_of_c
 from malta.firmware.native import Native, call, compile_controller, new_state, view, write
 from malta.firmware.program import TYPES
@@ -192,6 +194,17 @@ def test_a_filter_that_is_left_alone_finds_back() -> None:
         call(r.native, "step", r.state, r.inputs, r.outputs)
     assert np.abs(view(r.state, "xi_pred")[:5]).max() < 1e-6
     assert not view(r.outputs, "saturated").any()
+
+
+@pytest.mark.parametrize(("gain", "fits"), [(1e38, True), (1e39, False)])
+def test_single_precision_refuses_what_it_does_not_hold(gain: float, fits: bool) -> None:
+    c = controller("tubular_pid")
+    t = Target(replace(c, K=np.where(np.abs(c.K).max() == c.K, gain, c.K)), "float")
+    if fits:
+        assert "1e+38f" in sources(t, "")["tubular_pid.c"]
+    else:
+        with pytest.raises(malta.InputError, match=r"precision: found float for a number of 1e\+39"):
+            sources(t, "")
 
 
 @pytest.mark.parametrize("precision", PRECISIONS)

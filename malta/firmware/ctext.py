@@ -7,6 +7,7 @@ import textwrap
 
 import numpy as np
 
+from malta.errors import InputError
 from malta.firmware.elementary import Precision
 from malta.firmware.program import TRUTHS, Program
 
@@ -41,9 +42,13 @@ def c_name(text: str) -> str:
 
 
 def c_number(value: float, precision: Precision) -> str:
-    """A number as C reads it back to the bit."""
+    """A number as C reads it back to the bit. Raises InputError for one that the precision does not hold."""
     if precision == "float":
-        return _with_point(str(np.float32(value))) + "f"
+        with np.errstate(over="ignore"):
+            single = np.float32(value)
+        if not np.isfinite(single):
+            raise InputError("export", "precision", f"float for a number of {float(value):g}", "double")
+        return _with_point(str(single)) + "f"
     return _with_point(repr(float(value)))
 
 
