@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import replace
 from typing import Any
 
@@ -205,6 +206,16 @@ def test_single_precision_refuses_what_it_does_not_hold(gain: float, fits: bool)
     else:
         with pytest.raises(malta.InputError, match=r"precision: found float for a number of 1e\+39"):
             sources(t, "")
+
+
+def test_the_samples_of_a_stroke_are_counted_at_any_rate() -> None:
+    """At 1 MHz the longest rise is shorter than a thousand seconds: 2^31 half samples are all."""
+    c = controller("tubular_pid")
+    for period, longest in ((c.sample_time, 1000.0), (1e-6, 1e9 * 1e-6 / 6)):
+        text = sources(Target(replace(c, sample_time=period)), "")["tubular_pid.c"]
+        (limit,) = re.findall(r"_real limit = (\S+);", text)
+        assert float(limit) == pytest.approx(longest)
+        assert 2 * 6 * float(limit) / period < 2**31
 
 
 @pytest.mark.parametrize("precision", PRECISIONS)

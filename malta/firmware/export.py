@@ -28,6 +28,7 @@ MOST_RATE = 1e6  # of a reference, per s and s^2: beyond, single precision has n
 FUSED = ("sense", "decide", "state_at")  # functions that a step consists of; the others are its pieces
 LONGEST_RISE = 1000.0  # s, of a stroke
 RISES = 6.0  # times its rise that a stroke lasts: a logistic one is then within 2e-6 of its ends
+MOST_SAMPLES = 1e9  # of a stroke: twice their number is an int32_t
 WORDS = {
     "double": "Double precision: the numbers of the simulation.",
     "float": "Single precision: sums keep what rounding takes from them.",
@@ -123,6 +124,7 @@ def _limit_context(t: Target) -> dict[str, Any]:
     """What references, tables and strokes may be."""
     plant = t.believed
     stroke = plant.has_stroke and plant.travel > 0
+    longest = min(LONGEST_RISE, MOST_SAMPLES * t.controller.sample_time / RISES)
     return {
         "force_limits": ", ".join(c_number(v, t.precision) for v in _finite(t.controller.limits.force)),
         "ranges": ", ".join(c_number(v, t.precision) for v in reading_ranges(plant)),
@@ -131,7 +133,7 @@ def _limit_context(t: Target) -> dict[str, Any]:
         "stroke": stroke,
         "stroke_output": plant.stroke_output if stroke else 0,
         "travel": c_number(plant.travel, t.precision),
-        "longest_rise": c_number(LONGEST_RISE, t.precision),
+        "longest_rise": c_number(longest, t.precision),
         "rises": c_number(RISES, t.precision),
         "step_z": f"out->y_used[{plant.stroke_output}]" if plant.has_stroke else "s->z[0]",
         "start_z": f"s->reference.p[{plant.stroke_output}]" if plant.has_stroke else "s->z[0]",
