@@ -16,8 +16,10 @@ import pytest
 from conftest import ROOT, one_sentence
 
 import malta
+from malta.firmware.ctext import c_name
 from malta.firmware.export import comment, sources
 from malta.firmware.flight import differences, engine_of_c
+from malta.firmware.folder import folder_files
 from malta.firmware.signals import Target
 from malta.simulation import compiled
 
@@ -209,3 +211,22 @@ def test_a_machine_that_changes_keeps_its_controller() -> None:
     names = ("p", "y", "force", "i_phase", "duty")
     assert max(d.share for d in differences(own, flown, names)) < 1e-12
     assert np.abs(own.p - own.reference).max() > 1e-6
+
+
+def test_names_of_other_files_and_targets_are_left_to_them(tmp_path: Path) -> None:
+    """Headers of C's library beside an include folder, and a target that CMake has itself."""
+    assert [c_name(name) for name in ("limits", "Features", "time", "test")] == [
+        "m_limits",
+        "m_features",
+        "m_time",
+        "test",
+    ]
+    cmake = shutil.which("cmake")
+    if cmake is None or compiled.compiler() is None:
+        pytest.skip("no cmake, or no C compiler")
+    c = replace(malta.gains.read(GAINS), name="test")
+    for file, text in folder_files(Target(c, "double", "force"), "", proof=False).items():
+        (tmp_path / file).write_text(text, encoding="utf-8")
+    command = [cmake, "-B", str(tmp_path / "build"), "-S", str(tmp_path)]
+    done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr

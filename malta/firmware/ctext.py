@@ -31,7 +31,11 @@ _FORMS = {
     "IF_ELSE_ZERO": "{0} ? {1} : {zero}",
     "PICK": "{0} ? {1} : {2}",
 }
-HEADERS = ("float", "math", "stdbool", "stdint", "stdio", "string")  # of C, which NAME.h may not hide
+HEADERS = (  # of C's library, which NAME.h may not hide
+    *("assert", "complex", "ctype", "errno", "features", "fenv", "float", "inttypes", "iso646"),
+    *("limits", "locale", "math", "setjmp", "signal", "stdarg", "stdbool", "stddef", "stdint"),
+    *("stdio", "stdlib", "string", "tgmath", "time", "wchar", "wctype"),
+)
 _CONDITIONS = {"NOT": 1, "AND": 2, "OR": 2, "IF_ELSE_ZERO": 1, "PICK": 1}  # operands that are true or false
 
 
