@@ -197,6 +197,27 @@ def test_a_filter_that_is_left_alone_finds_back() -> None:
     assert not view(r.outputs, "saturated").any()
 
 
+def test_a_motor_turns_on_beyond_one_radian() -> None:
+    """Nothing bounds readings of a machine without contacts; under a load a blind controller would lose it."""
+    A = [[0, 1, 0], [0, -1, 2], [0, 0, -30]]
+    plant = malta.linear_machine(
+        A, [[0], [0], [30]], [[1, 0, 0]], limit=50.0, noise=1e-4, outputs=["phi [rad]"]
+    )
+    w = malta.weights([10, 1, 0], [1], [1], [1e-6], q_i=[10])
+    c = malta.lqg(malta.linearize(plant, plant.at()), w, 1e-3, name="motor")
+
+    def turned(_: Any) -> Any:
+        return lambda t: references.Motion(*(np.full((len(t), 1), value) for value in (3.0, 0.0, 0.0)))
+
+    def load(t: Any) -> Any:
+        return np.full((len(t), 1), -0.5)
+
+    run = malta.Scenario("turned", 0.5, turned, fidelity="force", noise=1.0, disturbance=load)
+    own, flown = malta.simulate(plant, c, run), malta.simulate(plant, c, run, engine=engine_of_c("double"))
+    assert own.p[0, 0] > 2
+    np.testing.assert_allclose(flown.p, own.p, rtol=1e-12)
+
+
 @pytest.mark.parametrize(("gain", "fits"), [(1e38, True), (1e39, False)])
 def test_single_precision_refuses_what_it_does_not_hold(gain: float, fits: bool) -> None:
     c = controller("tubular_pid")

@@ -23,6 +23,9 @@ if TYPE_CHECKING:
 
 
 SLOW = 0.1  # share that a state changes by in a sample without anything added, at most: it is then a sum
+UNBOUNDED = (
+    1e6  # of its unit, an output's range where nothing is known of it: beyond, single precision has no room
+)
 
 
 class Field(NamedTuple):
@@ -226,11 +229,12 @@ def named(before: str, signals: tuple[Signal, ...], unit: str, after: str = "") 
 def reading_ranges(plant: Plant) -> FloatArray:
     """The largest reading of each output that a machine can give, either way: twice where it touches, or its travel.
 
-    Of an output that meets nothing: 1 m, or 1 of its unit. Beyond, a reading is refused.
+    Of an output that meets nothing: 1 m, or 1 of its unit; UNBOUNDED for a machine that has no contacts at all, as a
+    motor that turns. Beyond, a reading is refused.
     """
     x = ca.SX.sym("x", len(plant.states))
     contact = ca.Function("contact", [x], [ca.densify(ca.vertcat(plant.contact(x), 0))])
-    ranges = []
+    ranges, nowhere = [], 1.0 if plant.contacts else UNBOUNDED
     for k, _ in enumerate(plant.outputs):
         sizes = 10.0 ** np.arange(-7, 0.01, 0.05)
         reach = math.inf
@@ -245,5 +249,5 @@ def reading_ranges(plant: Plant) -> FloatArray:
                 break
         if plant.has_stroke and k == plant.stroke_output and plant.travel:
             reach = max(plant.travel, reach if math.isfinite(reach) else 0.0)
-        ranges.append(2 * reach if math.isfinite(reach) else 1.0)
+        ranges.append(2 * reach if math.isfinite(reach) else nowhere)
     return np.array(ranges)

@@ -136,7 +136,7 @@ def bounds_of(t: Target) -> Bounds:
     touch, acceleration = touch_bounds(plant), accelerations(c)
     speed = np.sqrt(4 * acceleration * touch)
     known = np.where(sigma > 0, sigma, np.inf)
-    quiet = np.where(np.isfinite(touch), 0.01 * touch, reading_ranges(plant) / 100)
+    quiet = np.where(np.isfinite(touch), 0.01 * touch, np.minimum(reading_ranges(plant), 1.0) / 100)
     stopping = np.where(np.isfinite(acceleration), STOPPING * acceleration, np.inf)
     return Bounds(
         touch=touch,

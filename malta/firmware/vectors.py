@@ -49,7 +49,7 @@ class Vector(NamedTuple):
 def record_vectors(t: Target) -> list[Vector]:
     """The vectors of a target; the readings are those of simulations, the answers are computed by step.py."""
     rest, moving = _flight(t, stroke=False), _flight(t, stroke=True)
-    reach = reading_ranges(t.believed)
+    reach = np.minimum(reading_ranges(t.believed), 1.0)
     far = {name: value.copy() for name, value in rest.items()}
     far["y"][10:35] += 0.2 * reach * (-1.0) ** np.arange(len(reach))
     lifted = {name: value.copy() for name, value in rest.items()}
