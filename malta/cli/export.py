@@ -24,9 +24,10 @@ def export(
         ),
     ] = None,
     part: Annotated[
-        str, typer.Option(help="Of an FMU: controller, machine, or loop, which has both.")
-    ] = "controller",
-    fmi: Annotated[int, typer.Option(help="Version of an FMU's interface: 2 or 3.")] = 2,
+        str | None,
+        typer.Option(help="Of an FMU: controller, machine, or loop, which has both. [controller]"),
+    ] = None,
+    fmi: Annotated[int | None, typer.Option(help="Version of an FMU's interface: 2 or 3. [2]")] = None,
     out: Annotated[
         Path | None,
         typer.Option(help="The folder, new or empty, or the .fmu file. [build/NAME_c, build/NAME_PART.fmu]"),
@@ -52,10 +53,9 @@ def export(
     controller = read_controller(gains, machine)
     chosen: Any = {"until": until}
     if to == "fmu":
-        if precision != "double":
-            raise InputError("--precision", "", f"{precision} of an FMU", "double")
-        file = out or Path("build") / f"{controller.name}_{part}.fmu"
-        note = export_fmu(gains, file, part=cast("Any", part), fmi=fmi, **chosen)
+        own = part or "controller"
+        file = out or Path("build") / f"{controller.name}_{own}.fmu"
+        note = export_fmu(gains, file, part=cast("Any", own), fmi=fmi or 2, **chosen)
         if note:
             print_note(f"{file}: {note}")
         files = [file]
@@ -70,8 +70,8 @@ def export(
         print_written(make_console(), files)
 
 
-def _require_known(to: str, precision: str, until: str | None, part: str, fmi: int) -> None:
-    """Raise InputError for an option with a value that there is not."""
+def _require_known(to: str, precision: str, until: str | None, part: str | None, fmi: int | None) -> None:
+    """Raise InputError for an option with a value that there is not, or that the form does not have."""
     from malta.firmware.elementary import Precision
     from malta.firmware.exports import Until
     from malta.firmware.unit import Part
@@ -80,9 +80,14 @@ def _require_known(to: str, precision: str, until: str | None, part: str, fmi: i
         ("--to", to, ("c", "fmu")),
         ("--precision", precision, get_args(Precision)),
         ("--until", until, (None, *get_args(Until))),
-        ("--part", part, get_args(Part)),
-        ("--fmi", fmi, (2, 3)),
+        ("--part", part, (None, *get_args(Part))),
+        ("--fmi", fmi, (None, 2, 3)),
     ):
         if value not in known:
             expected = " or ".join(str(one) for one in known if one is not None)
             raise InputError(name, "", repr(value), expected)
+    if to == "fmu" and precision != "double":
+        raise InputError("--precision", "", f"{precision} of an FMU", "double")
+    for name, given in (("--part", part), ("--fmi", fmi)):
+        if to == "c" and given is not None:
+            raise InputError(name, "", f"{given} of a folder of C", "--to fmu")
