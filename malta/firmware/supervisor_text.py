@@ -16,7 +16,7 @@ from malta.firmware.export import MOST_RATE, comment, render
 from malta.firmware.lowering import lower
 from malta.firmware.program import Program, program_of
 from malta.firmware.sensor_loss import expected_readings, gains_without, prediction_correction
-from malta.firmware.signals import Target, output_fields
+from malta.firmware.signals import Target, input_fields, output_fields
 from malta.firmware.supervisor import (
     JUMP,
     LONG,
@@ -153,6 +153,7 @@ def _context(t: Target, name: str) -> dict[str, Any]:
         "times": list(times._asdict().items()),
         "outputs": len(c.measurements),
         "estimated": len(c.states),
+        "input_fields": input_fields(t),
         "output_fields": [f for f in output_fields(t) if f.size],
         "currents": _currents(t) if t.driven else 0,
         "link": _number(plant.drive.link_voltage, t) if t.driven else "",

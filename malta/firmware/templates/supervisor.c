@@ -713,14 +713,25 @@ static void rest_bridges(const {{ name }}_inputs *in, {{ name }}_outputs *out) {
   }
 }
 
+/* Entry by entry: a compiler may call memcpy for a record. */
+static void copy_inputs(const {{ name }}_inputs *in, {{ name }}_inputs *seen) {
+  int32_t k;
+{% for f in input_fields %}
+  for (k = 0; k < {{ f.size }}; k++) {
+    seen->{{ f.name }}[k] = in->{{ f.name }}[k];
+  }
+{% endfor %}
+}
+
 void {{ name }}_supervisor_step({{ name }}_supervisor *sup, {{ name }}_state *s, const {{ name }}_inputs *in,
                        const {{ name }}_request *request, {{ name }}_outputs *out) {
-  {{ name }}_inputs seen = *in;
+  {{ name }}_inputs seen;
   {{ name }}_real expected[OUTPUTS];
   {{ name }}_real level[{{ monitors | length }}][OUTPUTS];
   int32_t reaction;
   int32_t estimated;
   int32_t k;
+  copy_inputs(in, &seen);
 {% if currents %}
   if (sup->state == {{ NAME }}_OFFSETS) {
     if (sup->samples < sup->times.offsets) {
