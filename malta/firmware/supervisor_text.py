@@ -161,6 +161,7 @@ def _context(t: Target, name: str) -> dict[str, Any]:
         "off": _vector(off, t),
         "stroke_output": plant.stroke_output if plant.has_stroke else -1,
         "except_stroke": f" && (k != {plant.stroke_output})" if plant.has_stroke else "",
+        "only_stroke": plant.has_stroke and len(c.measurements) == 1,
         "longest": LONG,
         "most_missed": MOST_MISSED,
         **_bounds(t),

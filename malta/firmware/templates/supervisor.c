@@ -8,7 +8,9 @@
 #endif
 
 #define OUTPUTS {{ outputs }}
+{% if fallback %}
 #define STATES {{ estimated }} /* of the filter */
+{% endif %}
 #define EVENT_NONE 0
 #define EVENT_START 1
 #define EVENT_DONE 2
@@ -19,7 +21,7 @@
 
 const {{ name }}_monitor {{ name }}_monitors[{{ NAME }}_MONITOR_ROWS] = {
 {% for row in rows %}
-  { {{ NAME }}_MONITOR_{{ row.key }}, {{ row.threshold }}, {{ row.samples }}, {{ NAME }}_REACTION_{{ row.reaction }}, {{ row.states }} },
+  { {{ NAME }}_MONITOR_{{ row.key }}, {{ row.threshold }}, {{ row.samples }}, {{ NAME }}_REACTION_{{ row.reaction }}, {{ row.states }}u },
 {% endfor %}
 };
 
@@ -29,26 +31,8 @@ typedef struct {
   int32_t to;
 } transition;
 
-static const transition transitions[{{ transitions | length }}] = {
-{% for row in transitions %}
-  { {{ NAME }}_{{ row[0] }}, EVENT_{{ row[1] }}, {{ NAME }}_{{ row[2] }} },
-{% endfor %}
-};
-
 static const {{ name }}_real near_touch[OUTPUTS] = { {{ touch }} };
 static const {{ name }}_real range[OUTPUTS] = { {{ range }} };
-static const {{ name }}_real jump[OUTPUTS] = { {{ jump }} };       /* from sample to sample */
-static const {{ name }}_real sigma[OUTPUTS] = { {{ sigma }} };     /* of a reading */
-static const {{ name }}_real settled[OUTPUTS] = { {{ settled }} }; /* errors of a machine that has settled */
-static const {{ name }}_real drift[OUTPUTS] = { {{ drift }} };     /* of what the filter expects alone, per sample^2 */
-static const {{ name }}_real stopping[OUTPUTS] = { {{ stopping }} }; /* of references, per s^2 */
-static const int32_t same_values[OUTPUTS] = { {{ stuck }} };       /* in a row, from which on a sensor is stuck */
-{% if fallback %}
-static const int32_t has_gain[OUTPUTS] = { {{ has_gain }} };
-static const {{ name }}_real gain_without[OUTPUTS][{{ places }}][STATES][OUTPUTS] = { /* of the filter, without one sensor each */
-{{ gain_rows }}
-};
-{% endif %}
 
 static {{ name }}_real size_of({{ name }}_real value) { return (value < {{ zero }}) ? -value : value; }
 
@@ -78,7 +62,7 @@ static void forget_sensors({{ name }}_supervisor *sup) {
     sup->limited[k] = {{ zero }};
     sup->noise[k] = {{ zero }};
   }
-  for (k = 0; k < ({{ NAME }}_MONITOR_ROWS * OUTPUTS); k++) {
+  for (k = 0; k < {{ rows | length * outputs }}; k++) {
     sup->count[k] = 0;
   }
   sup->unchanged = 0;
@@ -136,9 +120,9 @@ void {{ name }}_supervisor_take_over({{ name }}_supervisor *sup, const {{ name }
 /* What the filter expects of the readings; of a machine that does not fly, the readings themselves. */
 static void expect(const {{ name }}_supervisor *sup, const {{ name }}_state *s, const {{ name }}_inputs *in,
                    {{ name }}_real expected[OUTPUTS]) {
-  int32_t k;
   if (is_flying(sup->state) == 1) {
 {% if tracks_errors %}
+    int32_t k;
     for (k = 0; k < OUTPUTS; k++) {
       expected[k] = s->reference.p[k];
     }
@@ -146,6 +130,7 @@ static void expect(const {{ name }}_supervisor *sup, const {{ name }}_state *s, 
     {{ name }}_expected(s->xi_pred, expected);
 {% endif %}
   } else {
+    int32_t k;
     for (k = 0; k < OUTPUTS; k++) {
       expected[k] = in->y[k];
     }
@@ -155,6 +140,10 @@ static void expect(const {{ name }}_supervisor *sup, const {{ name }}_state *s, 
 /* Levels of the monitors of each position sensor. */
 static void look_at_sensor({{ name }}_supervisor *sup, const {{ name }}_inputs *in, int32_t missed, int32_t k,
                            {{ name }}_real expected, {{ name }}_real level[{{ monitors | length }}][OUTPUTS]) {
+  static const {{ name }}_real jump[OUTPUTS] = { {{ jump }} }; /* from sample to sample */
+  static const {{ name }}_real sigma[OUTPUTS] = { {{ sigma }} }; /* of a reading */
+  static const {{ name }}_real drift[OUTPUTS] = { {{ drift }} }; /* of what the filter expects alone, per sample^2 */
+  static const int32_t same_values[OUTPUTS] = { {{ stuck }} }; /* in a row, from which on a sensor is stuck */
   const {{ name }}_real y = in->y[k];
   const int32_t is_number = is_within(y, {{ most }});
   if ((is_number == 1) && (in->y_valid[k] != {{ zero }})) {
@@ -173,10 +162,10 @@ static void look_at_sensor({{ name }}_supervisor *sup, const {{ name }}_inputs *
     level[{{ NAME }}_MONITOR_RANGE][k] = size_of(y) / range[k];
     level[{{ NAME }}_MONITOR_STUCK][k] = ({{ name }}_real)sup->repeated[k] / ({{ name }}_real)same_values[k];
     if (sup->unbelieved[k] == 0) {
-      const {{ name }}_real times = ({{ name }}_real)(missed + 1);
+      const int32_t steps = missed + 1;
       level[{{ NAME }}_MONITOR_TOUCH][k] = size_of(y) / near_touch[k];
       const {{ name }}_real wider = {{ jump_deviations }} * (sigma[k] * (more - {{ one }}));
-      level[{{ NAME }}_MONITOR_RATE][k] = moved / ((jump[k] + wider) * times);
+      level[{{ NAME }}_MONITOR_RATE][k] = moved / ((jump[k] + wider) * ({{ name }}_real)steps);
       level[{{ NAME }}_MONITOR_INNOVATION][k] = away / (sigma[k] * more);
     } else if (away > near_expected) {
       level[{{ NAME }}_MONITOR_UNBELIEVED][k] = {{ one }};
@@ -269,50 +258,51 @@ static void look({{ name }}_supervisor *sup, const {{ name }}_inputs *in, const 
 static int32_t judge({{ name }}_supervisor *sup, {{ name }}_real level[{{ monitors | length }}][OUTPUTS]) {
   int32_t strongest = {{ NAME }}_REACTION_NONE;
   int32_t calm = 1;
-  int32_t refused[OUTPUTS];
+  int32_t entry = 0; /* of a row and an output in the counts */
+  bool refused[OUTPUTS];
   int32_t r;
   int32_t k;
   for (k = 0; k < OUTPUTS; k++) {
     /* an unbelieved sensor stays so while it is far from what is expected */
-    refused[k] = (level[{{ NAME }}_MONITOR_UNBELIEVED][k] > {{ half }}) ? 1 : 0;
+    refused[k] = level[{{ NAME }}_MONITOR_UNBELIEVED][k] > {{ half }};
   }
   for (r = 0; r < {{ NAME }}_MONITOR_ROWS; r++) {
     const {{ name }}_monitor *row = &{{ name }}_monitors[r];
-    const int32_t counts = (row->states / (1 << sup->state)) % 2;
+    const bool counts = ((row->states >> (uint32_t)sup->state) & 1u) == 1u;
     int32_t acts = 0;
     for (k = 0; k < OUTPUTS; k++) {
-      int32_t *count = &sup->count[(r * OUTPUTS) + k];
+      int32_t count = 0;
       {{ name }}_real now = level[row->monitor][k];
       if (row->monitor == {{ NAME }}_MONITOR_UNBELIEVED) {
         now = (sup->unbelieved[k] > 0) ? {{ one }} : {{ zero }};
       }
-      if ((counts == 1) && (now > row->threshold)) {
-        *count = one_more(*count);
+      if (counts && (now > row->threshold)) {
+        count = one_more(sup->count[entry]);
         if (row->reaction == {{ NAME }}_REACTION_HOLD) {
           calm = 0;
         }
-        if (*count >= row->samples) {
+        if (count >= row->samples) {
           acts = 1;
           if (row->reaction == {{ NAME }}_REACTION_IGNORE) {
-            refused[k] = 1;
+            refused[k] = true;
           }
-          if (*count == row->samples) {
+          if (count == row->samples) {
             sup->monitor = row->monitor;
             sup->reaction = row->reaction;
             sup->acted[r] = one_more(sup->acted[r]);
           }
         }
-      } else {
-        *count = 0;
       }
+      sup->count[entry] = count;
+      entry++;
     }
     if ((acts == 1) && (row->reaction > strongest)) {
       strongest = row->reaction;
     }
   }
   for (k = 0; k < OUTPUTS; k++) {
-    sup->unbelieved[k] = (refused[k] == 1) ? one_more(sup->unbelieved[k]) : 0;
-    if ((refused[k] == 1) && (sup->state == {{ NAME }}_SENSORS)) {
+    sup->unbelieved[k] = refused[k] ? one_more(sup->unbelieved[k]) : 0;
+    if (refused[k] && (sup->state == {{ NAME }}_SENSORS)) {
       calm = 0;
     }
   }
@@ -325,11 +315,11 @@ static int32_t judge({{ name }}_supervisor *sup, {{ name }}_real level[{{ monito
 {% if currents %}
 /* Average the readings of the current sensors while there is no current. */
 static void average_currents({{ name }}_supervisor *sup, const {{ name }}_inputs *in) {
-  const {{ name }}_real number = ({{ name }}_real)(sup->samples + 1);
+  const int32_t number = sup->samples + 1;
   int32_t k;
   for (k = 0; k < {{ currents }}; k++) {
     if (is_within(in->i[k], {{ most }}) == 1) {
-      const {{ name }}_real more = (in->i[k] - sup->offset[k]) / number;
+      const {{ name }}_real more = (in->i[k] - sup->offset[k]) / ({{ name }}_real)number;
       sup->offset[k] = sup->offset[k] + more;
     } else {
       sup->offset[k] = {{ most }}; /* a sensor without a number has no offset: refused */
@@ -340,11 +330,18 @@ static void average_currents({{ name }}_supervisor *sup, const {{ name }}_inputs
 {% endif %}
 /* Average the readings of a machine at rest: the place where it lands again. */
 static void average_rest({{ name }}_supervisor *sup) {
+  const int32_t number = (sup->steady > 0) ? sup->steady : 1;
   int32_t k;
   for (k = 0; k < OUTPUTS; k++) {
-    const {{ name }}_real more = (sup->last[k] - sup->rest[k]) / ({{ name }}_real)((sup->steady > 0) ? sup->steady : 1);
+    const {{ name }}_real more = (sup->last[k] - sup->rest[k]) / ({{ name }}_real)number;
     sup->rest[k] = sup->rest[k] + more;
   }
+}
+
+/* Whether a reading is as near to a place as that of a machine that has settled. */
+static int32_t is_near({{ name }}_real y, {{ name }}_real place, int32_t k) {
+  static const {{ name }}_real settled[OUTPUTS] = { {{ settled }} };
+  return is_within(y - place, settled[k]);
 }
 
 /* Samples in a row at which a machine that lands without one of its sensors is where it rested, by the others. */
@@ -355,12 +352,19 @@ static void count_landed({{ name }}_supervisor *sup, const {{ name }}_inputs *in
   for (k = 0; k < OUTPUTS; k++) {
     if (sup->unbelieved[k] > 0) {
       ignored = 1;
-    } else if ((is_within(in->y[k] - sup->rest[k], settled[k]) == 0){{ except_stroke }}) {
+{% if only_stroke %}
+    }
+{% else %}
+    } else if ((is_near(in->y[k], sup->rest[k], k) == 0){{ except_stroke }}) {
       sup->steady = 0;
     } else {
       /* there */
     }
+{% endif %}
   }
+{% if only_stroke %}
+  (void)in; /* a stroke may rest anywhere */
+{% endif %}
   if (ignored == 0) {
     sup->steady = 0;
   }
@@ -371,7 +375,7 @@ static void count_settled({{ name }}_supervisor *sup, const {{ name }}_state *s,
   int32_t k;
   sup->steady = one_more(sup->steady);
   for (k = 0; k < OUTPUTS; k++) {
-    if ((sup->unbelieved[k] > 0) || (is_within(in->y[k] - s->reference.p[k], settled[k]) == 0)) {
+    if ((sup->unbelieved[k] > 0) || (is_near(in->y[k], s->reference.p[k], k) == 0)) {
       sup->steady = 0;
     }
   }
@@ -381,29 +385,29 @@ static void count_settled({{ name }}_supervisor *sup, const {{ name }}_state *s,
 }
 
 /* What a state waits for. */
-static int32_t is_done(const {{ name }}_supervisor *sup, const {{ name }}_request *request) {
-  int32_t done;
+static bool is_done(const {{ name }}_supervisor *sup, const {{ name }}_request *request) {
+  bool done;
   switch (sup->state) {
   case {{ NAME }}_OFFSETS:
-    done = (sup->samples > sup->times.offsets) ? 1 : 0; /* one more, in which the offsets are judged */
+    done = sup->samples > sup->times.offsets; /* one more, in which the offsets are judged */
     break;
   case {{ NAME }}_SENSORS:
-    done = (sup->steady >= sup->times.check) ? 1 : 0;
+    done = sup->steady >= sup->times.check;
     break;
   case {{ NAME }}_LIFT:
-    done = (sup->samples >= sup->times.lift) ? 1 : 0;
+    done = sup->samples >= sup->times.lift;
     break;
   case {{ NAME }}_SETTLE:
-    done = ((sup->steady >= sup->times.settle) && (request->operate != 0)) ? 1 : 0;
+    done = (sup->steady >= sup->times.settle) && (request->operate != 0);
     break;
   case {{ NAME }}_HOLD:
-    done = (sup->steady >= sup->times.calm) ? 1 : 0;
+    done = sup->steady >= sup->times.calm;
     break;
   case {{ NAME }}_LANDING:
-    done = ((sup->samples >= (sup->times.landing + sup->times.settle)) || (sup->steady > 0)) ? 1 : 0;
+    done = (sup->samples >= (sup->times.landing + sup->times.settle)) || (sup->steady > 0);
     break;
   default:
-    done = 0;
+    done = false;
     break;
   }
   return done;
@@ -418,7 +422,7 @@ static int32_t event_of(const {{ name }}_supervisor *sup, const {{ name }}_reque
     event = EVENT_LAND;
   } else if (reaction == {{ NAME }}_REACTION_HOLD) {
     event = EVENT_HOLD;
-  } else if (is_done(sup, request) == 1) {
+  } else if (is_done(sup, request)) {
     event = EVENT_DONE;
   } else if ((request->start != 0) && (sup->state == {{ NAME }}_OFF)) {
     event = EVENT_START;
@@ -427,7 +431,7 @@ static int32_t event_of(const {{ name }}_supervisor *sup, const {{ name }}_reque
   } else {
     /* nothing */
   }
-  if ((event == EVENT_LAND) && (sup->state == {{ NAME }}_LANDING) && (is_done(sup, request) == 1)) {
+  if ((event == EVENT_LAND) && (sup->state == {{ NAME }}_LANDING) && is_done(sup, request)) {
     event = EVENT_DONE;
   }
   return event;
@@ -435,6 +439,7 @@ static int32_t event_of(const {{ name }}_supervisor *sup, const {{ name }}_reque
 
 /* The place where a moving reference stops, within the room that is left, and the time that this takes. */
 static void stop_output({{ name }}_supervisor *sup, int32_t k, {{ name }}_real p, {{ name }}_real dp) {
+  static const {{ name }}_real stopping[OUTPUTS] = { {{ stopping }} }; /* of references, per s^2 */
   const {{ name }}_real speed = size_of(dp);
   const {{ name }}_real ahead = (dp > {{ zero }}) ? (near_touch[k] - p) : (near_touch[k] + p);
   const {{ name }}_real shortest = {{ shortest }} * {{ NAME }}_SAMPLE_TIME;
@@ -476,8 +481,8 @@ static void goal_of(const {{ name }}_supervisor *sup, const {{ name }}_request *
 
 /* Where a state's references go, and the time that this takes; what they differ by at first fades. */
 static void begin({{ name }}_supervisor *sup, const {{ name }}_state *s, const {{ name }}_request *request) {
-  const int32_t missed = missed_of(request);
-  const {{ name }}_real h = ({{ name }}_real)(missed + 1) * {{ NAME }}_SAMPLE_TIME;
+  const int32_t steps = missed_of(request) + 1;
+  const {{ name }}_real h = ({{ name }}_real)steps * {{ NAME }}_SAMPLE_TIME;
   int32_t k;
   for (k = 0; k < OUTPUTS; k++) {
     const {{ name }}_real ddp = s->reference.ddp[k];
@@ -520,10 +525,14 @@ static void begin({{ name }}_supervisor *sup, const {{ name }}_state *s, const {
 /* Follow the table of transitions. */
 static void change_state({{ name }}_supervisor *sup, {{ name }}_state *s, const {{ name }}_request *request,
                          int32_t event) {
+  static const transition transitions[{{ transitions | length }}] = {
+{% for row in transitions %}
+    { {{ NAME }}_{{ row[0] }}, EVENT_{{ row[1] }}, {{ NAME }}_{{ row[2] }} },
+{% endfor %}
+  };
   const int32_t from = sup->state;
   int32_t to = from;
   int32_t r;
-  int32_t k;
   for (r = 0; r < {{ transitions | length }}; r++) {
     if ((transitions[r].from == from) && (transitions[r].event == event)) {
       to = transitions[r].to;
@@ -537,6 +546,9 @@ static void change_state({{ name }}_supervisor *sup, {{ name }}_state *s, const 
     sup->samples = 0;
     sup->steady = 0;
     if (to == {{ NAME }}_OFFSETS) {
+{% if currents %}
+      int32_t k;
+{% endif %}
       forget_sensors(sup);
       sup->monitor = -1;
       sup->reaction = {{ NAME }}_REACTION_NONE;
@@ -547,6 +559,7 @@ static void change_state({{ name }}_supervisor *sup, {{ name }}_state *s, const 
 {% endif %}
     }
     if (to == {{ NAME }}_LIFT) {
+      int32_t k;
       for (k = 0; k < OUTPUTS; k++) {
         s->reference.p[k] = sup->rest[k];
         s->reference.dp[k] = {{ zero }};
@@ -641,6 +654,12 @@ static int32_t place_of(const {{ name }}_real expected[OUTPUTS]) {
 /* The filter without the sensors that are not believed: one of them by a gain for the others, where there is one. */
 static int32_t leave_out(const {{ name }}_supervisor *sup, {{ name }}_state *s, const {{ name }}_real expected[OUTPUTS],
                       {{ name }}_inputs *seen) {
+{% if fallback %}
+  static const int32_t has_gain[OUTPUTS] = { {{ has_gain }} };
+  static const {{ name }}_real gain_without[OUTPUTS][{{ places }}][STATES][OUTPUTS] = { /* of the filter, without one sensor each */
+{{ gain_rows }}
+  };
+{% endif %}
   int32_t without = -1;
   int32_t number = 0;
   int32_t estimated = 0;
@@ -729,7 +748,6 @@ void {{ name }}_supervisor_step({{ name }}_supervisor *sup, {{ name }}_state *s,
   {{ name }}_real expected[OUTPUTS];
   {{ name }}_real level[{{ monitors | length }}][OUTPUTS];
   int32_t reaction;
-  int32_t estimated;
   int32_t k;
   copy_inputs(in, &seen);
 {% if currents %}
@@ -757,6 +775,7 @@ void {{ name }}_supervisor_step({{ name }}_supervisor *sup, {{ name }}_state *s,
   }
   change_state(sup, s, request, event_of(sup, request, reaction));
   if (is_flying(sup->state) == 1) {
+    int32_t estimated;
     guide(sup, s, request);
     estimated = leave_out(sup, s, expected, &seen);
     {{ name }}_step(s, &seen, out);

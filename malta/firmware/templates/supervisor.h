@@ -51,7 +51,7 @@ typedef struct {
   {{ name }}_real threshold; /* of the monitor's level */
   int32_t samples;           /* in a row that the level is over it until the row acts */
   int32_t reaction;
-  int32_t states;            /* in which the row counts: a bit for each */
+  uint32_t states;           /* in which the row counts: a bit for each */
 } {{ name }}_monitor;
 
 extern const {{ name }}_monitor {{ name }}_monitors[{{ NAME }}_MONITOR_ROWS];
