@@ -41,7 +41,13 @@ static int32_t is_flying(int32_t state) {
 }
 
 /* A count and one, up to a number of samples that stands for ever: a machine may be off for days. */
-static int32_t one_more(int32_t count) { return (count < {{ longest }}) ? (count + 1) : count; }
+static int32_t one_more(int32_t count) {
+  int32_t more = count;
+  if (count < {{ longest }}) {
+    more++;
+  }
+  return more;
+}
 
 /* Whether a number is one, and of this size at most. */
 static int32_t is_within({{ name }}_real value, {{ name }}_real most) {
