@@ -388,6 +388,7 @@ def analysed_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "_analyse", once)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("analysed_once")
 def test_verify_prints_tables_within_a_hundred_columns(tmp_path: Path) -> None:
     out = CliRunner().invoke(app, ["verify", "design/gains/calibrated.json", "--out", str(tmp_path)])

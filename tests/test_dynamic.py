@@ -70,6 +70,7 @@ def test_a_weight_that_rises_with_frequency() -> None:
         assert (worst * t < 1) == (t == m.lower) or worst * t == pytest.approx(1, abs=2e-3)
 
 
+@pytest.mark.slow
 def test_dynamics_of_a_machine_over_its_travel() -> None:
     """MALTA's flagship with 20 % of dynamics at the axial sensor: nothing within the proven set closes |W T| t >= 1."""
     c = gains.read("design/gains/robust.json")

@@ -40,7 +40,7 @@ def build_and_test(folder: Path) -> str:
     return done.stdout
 
 
-@pytest.mark.parametrize("precision", ["double", "float"])
+@pytest.mark.parametrize("precision", ["double", pytest.param("float", marks=pytest.mark.slow)])
 def test_export_writes_a_folder_whose_test_passes(run: Run, tmp_path: Path, precision: str) -> None:
     folder = tmp_path / "c"
     code, out, err = run("export", GAINS, "--precision", precision, "--out", folder)
@@ -141,6 +141,7 @@ def test_names_in_a_gain_file_are_only_comments() -> None:
         assert '#error "out"' not in code
 
 
+@pytest.mark.slow
 def test_simulate_flies_the_c(run: Run) -> None:
     if compiled.compiler() is None:
         pytest.skip("no C compiler")

@@ -25,8 +25,11 @@ from malta.firmware.step import look_up, programs_of, started_state, step_of, ze
 from malta.simulation.compiled import compiler
 
 NAMES = [
-    *("robust", "tubular_pid", "halbach", "halbach_late"),
-    *(pytest.param(n, marks=pytest.mark.slow) for n in ("table2", "robust_observer", "planar", "planar_pid")),
+    *("robust", "halbach_late"),
+    *(
+        pytest.param(n, marks=pytest.mark.slow)
+        for n in ("tubular_pid", "halbach", "table2", "robust_observer", "planar", "planar_pid")
+    ),
 ]
 WARNINGS = (
     *("-std=c99", "-O2", "-ffp-contract=off", "-fno-math-errno", "-Werror", "-Wall", "-Wextra", "-Wpedantic"),

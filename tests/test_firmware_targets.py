@@ -24,6 +24,7 @@ from exported import (
 from malta.firmware.cost import FLAGS
 from malta.firmware.elementary import Precision
 
+SOME = ["float", *(pytest.param(p, marks=pytest.mark.slow) for p in PRECISIONS if p != "float")]
 NAMES = ["halbach", *(pytest.param(n, marks=pytest.mark.slow) for n in ("robust", "planar_pid"))]
 DIFFERS = r"stroke: sample (\d+) differs\n  \w+\[\d+\] is \S+, expected \S+\n"
 SANITIZERS = ("-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-fno-omit-frame-pointer")
@@ -35,7 +36,7 @@ def checksum(printed: str) -> str:
     return found[1]
 
 
-@pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize("precision", SOME)
 @pytest.mark.parametrize("name", NAMES)
 def test_every_processor_computes_the_same_bits(name: str, precision: Precision, tmp_path: Path) -> None:
     folder = write_folder(name, precision, tmp_path)
@@ -46,13 +47,13 @@ def test_every_processor_computes_the_same_bits(name: str, precision: Precision,
 
 
 @pytest.mark.parametrize("level", ["-O0", "-O1", "-Os", pytest.param("-O3", marks=pytest.mark.slow)])
-@pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize("precision", SOME)
 def test_optimization_changes_no_bit(level: str, precision: Precision, tmp_path: Path) -> None:
     folder = write_folder("halbach", precision, tmp_path)
     assert checksum(run_test(HERE, folder, level).stdout) == checksum(run_test(HERE, folder, "-O2").stdout)
 
 
-@pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize("precision", SOME)
 def test_contraction_is_noticed(precision: Precision, tmp_path: Path) -> None:
     """A multiplication and an addition in one instruction round once. The files forbid it, whatever the flags."""
     folder = write_folder("halbach", precision, tmp_path)
@@ -83,7 +84,7 @@ def test_a_changed_vector_is_named(tmp_path: Path) -> None:
     assert found[1] == "4"
 
 
-@pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize("precision", SOME)
 @pytest.mark.parametrize("name", NAMES)
 def test_no_library_is_called(name: str, precision: Precision, tmp_path: Path) -> None:
     """A float build has no arithmetic of double precision, and no build has a function of libm."""
@@ -99,7 +100,7 @@ def test_no_library_is_called(name: str, precision: Precision, tmp_path: Path) -
         assert not [s for s in undefined if not s.startswith(("__aeabi_", f"{name}_"))]
 
 
-@pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize("precision", SOME)
 @pytest.mark.parametrize("name", NAMES)
 def test_sanitizers_find_nothing(name: str, precision: Precision, tmp_path: Path) -> None:
     """Addresses and undefined behaviour, over the vectors and the example."""
@@ -112,7 +113,7 @@ def test_sanitizers_find_nothing(name: str, precision: Precision, tmp_path: Path
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize("precision", SOME)
 def test_the_analyzer_finds_nothing(precision: Precision, tmp_path: Path) -> None:
     require("gcc")
     folder = write_folder("halbach", precision, tmp_path)
@@ -121,7 +122,7 @@ def test_the_analyzer_finds_nothing(precision: Precision, tmp_path: Path) -> Non
         assert done.returncode == 0, done.stderr[:2000]
 
 
-@pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize("precision", SOME)
 def test_roots_bit_by_bit_are_those_of_the_processor(precision: Precision, tmp_path: Path) -> None:
     """Also of the smallest and the largest number, and 0 of what is not positive; infinity is its own root."""
     require("gcc")

@@ -34,7 +34,7 @@ if compiler() is None:
 
 SHA256 = "5" * 64
 WARNINGS = ("-Werror", "-Wall", "-Wextra", "-Wpedantic", "-Wshadow", "-Wconversion", "-Wundef")
-BOTH = pytest.mark.parametrize("fmi", [2, 3])
+BOTH = pytest.mark.parametrize("fmi", [2, pytest.param(3, marks=pytest.mark.slow)])
 
 
 @lru_cache
@@ -146,11 +146,11 @@ def fly(unit: Unit, run: Any, motion: Any) -> float:
 
 
 FLIGHTS = [
-    ("halbach", None, 2),
     ("halbach_late", None, 3),
     *(
         pytest.param(*case, marks=pytest.mark.slow)
         for case in (
+            ("halbach", None, 2),
             ("robust", None, 3),
             ("robust", "dq", 2),
             ("robust", "force", 3),
