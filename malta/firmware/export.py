@@ -153,7 +153,7 @@ def _table_context(t: Target) -> dict[str, Any]:
     return {
         "points": len(ff.z_grid),
         "z_rows": rows(ff.z_grid, 6),
-        "v0_rows": rows(ff.v0, ff.v0.shape[1]),
+        "v0_rows": rows(ff.v0, ff.v0.shape[1] if ff.v0.shape[1] > 2 else 6),
         "reads": len(t.look_ups),
         **sizes,
         "table_numbers": rows(nodes, 6),

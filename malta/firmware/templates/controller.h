@@ -4,7 +4,8 @@
    {{ precision_text }}
 
    C99 without heap, globals, recursion or library functions. A state belongs to its caller; several may run at once, and a
-   step neither blocks nor loops but over a table's rows. Compile without contraction and fast mathematics
+   step neither blocks nor loops but over a table's rows. Integers have 32 bits; truths inside are bool, which C99 has also
+   where no type has 8 bits. Compile without contraction and fast mathematics
    (-ffp-contract=off, no -ffast-math): then every processor computes the same bits. Units are SI, an angle is in rad.
 
    At every sample:  read the sensors,  {{ name }}_step(&state, &inputs, &outputs),  write outputs.{{ last_output }}.     */
