@@ -18,6 +18,9 @@ export MPLCONFIGDIR ?= $(CURDIR)/$(VENV)/matplotlib
 design: $(VENV)/runtime
 	$(BIN)/malta design
 
+# One thread of linear algebra for each worker, as the command line has it: more get into each other's way.
+test slow: export OPENBLAS_NUM_THREADS = 1
+
 test: $(VENV)/dev
 	$(BIN)/python -m pytest -n auto --dist loadfile -m "not slow"
 

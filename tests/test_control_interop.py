@@ -107,9 +107,17 @@ def test_control_dlqr_gives_the_sampled_gains(shipped: Design) -> None:
 
 
 def test_control_dlqe_loses_digits_of_the_filters_in_si_units(shipped: Design) -> None:
-    """Up to a ten-thousandth of them, where forces count in newtons and sensor noise in 1e-13 m2."""
+    """Up to a ten-thousandth of them, where forces count in newtons and sensor noise in 1e-13 m2.
+
+    Or all of them: at times, as rounding has it, the solver finds the problem too ill-conditioned.
+    """
     A, B, Q, R, *_, found = shipped.sampled[1]
-    L = control.dlqe(A.T, np.eye(len(A)), B.T, Q, R, method="scipy")[0]
+    try:
+        L = control.dlqe(A.T, np.eye(len(A)), B.T, Q, R, method="scipy")[0]
+    except ValueError as error:
+        if "ill-conditioned" not in str(error):
+            raise
+        return
     assert apart(L, found.K.T) < 1e-3
 
 
