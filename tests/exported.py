@@ -13,7 +13,7 @@ from conftest import ROOT
 
 import malta
 from malta.firmware.elementary import Precision
-from malta.firmware.export import render
+from malta.firmware.export import render, root_context
 from malta.firmware.folder import folder_files
 from malta.firmware.signals import Target, fidelity_of
 from malta.synthesis.controller import Controller
@@ -76,16 +76,8 @@ def write_folder(name: str, precision: Precision, folder: Path) -> Path:
 
 def root_text(precision: Precision) -> str:
     """C of the square root as own_root, bit by bit on every processor."""
-    digits, end = (52, "") if precision == "double" else (23, "f")
-    numbers = {"zero": 0.0, "one": 1.0, "two": 2.0, "four": 4.0, "half": 0.5, "quarter": 0.25}
-    context = {
-        "name": "own",
-        "NAME": "OWN",
-        "arm_fpu": "",
-        "digits": digits,
-        "builtin_root": "__builtin_sqrt",
-    }
-    text = render("root.c", context | {name: f"{value}{end}" for name, value in numbers.items()})
+    own = {"name": "own", "NAME": "OWN", "arm_fpu": ""}
+    text = render("root.c", root_context(precision) | own)
     for processor in ("__SSE2__", "__aarch64__", "__riscv_flen"):
         text = text.replace(f"defined({processor})", "0")
     return f"#include <stdbool.h>\n#include <stdint.h>\n\ntypedef {precision} own_real;\n\n{text}"

@@ -11,6 +11,7 @@ import jinja2
 import numpy as np
 
 from malta.firmware.ctext import c_name, c_number, function_text, signature
+from malta.firmware.elementary import Precision
 from malta.firmware.program import Program
 from malta.firmware.signals import (
     Field,
@@ -94,7 +95,7 @@ def context_of(t: Target, programs: Mapping[str, Program], name: str, sha256: st
         **_function_context(t, programs, name),
         **_limit_context(t),
         **_table_context(t),
-        **{key: c_number(v, t.precision) for key, v in _NUMBERS.items()},
+        **root_context(t.precision),
     }
 
 
@@ -104,7 +105,6 @@ def _function_context(t: Target, programs: Mapping[str, Program], name: str) -> 
     fused_root, parts_root = (
         any(o.op == "SQRT" for key in keys for o in programs[key].operations) for keys in (FUSED, others)
     )
-    double = t.precision == "double"
     return {
         **{key: function_text(programs[key], name, t.precision, static=True) for key in FUSED},
         "declarations": [signature(p, name) for p in others.values()],
@@ -114,9 +114,6 @@ def _function_context(t: Target, programs: Mapping[str, Program], name: str) -> 
         "call_start": call(programs["state_at"], t, name),
         "root": fused_root,
         "parts_root": parts_root,
-        "arm_fpu": f" || (defined(__ARM_FP) && ((__ARM_FP & {8 if double else 4}) != 0))",
-        "builtin_root": "__builtin_sqrt" if double else "__builtin_sqrtf",
-        "digits": 52 if double else 23,
     }
 
 
@@ -142,23 +139,35 @@ def _limit_context(t: Target) -> dict[str, Any]:
 
 def _table_context(t: Target) -> dict[str, Any]:
     """v0(z), and the table of the currents of a machine that has one."""
-
-    def rows(values: Any, width: int) -> str:
-        flat = [c_number(v, t.precision) for v in np.ravel(values)]
-        return ",\n".join("  " + ", ".join(flat[k : k + width]) for k in range(0, len(flat), width))
-
     ff = t.controller.feedforward
     nodes = t.look_ups[0].nodes if t.look_ups else np.zeros((1, 1, 0))
     sizes = dict(zip(("table_rows", "table_columns", "table_values"), nodes.shape, strict=True))
     return {
         "points": len(ff.z_grid),
-        "z_rows": rows(ff.z_grid, 6),
-        "v0_rows": rows(ff.v0, ff.v0.shape[1] if ff.v0.shape[1] > 2 else 6),
+        "z_rows": number_rows(ff.z_grid, 6, t.precision),
+        "v0_rows": number_rows(ff.v0, ff.v0.shape[1] if ff.v0.shape[1] > 2 else 6, t.precision),
         "reads": len(t.look_ups),
         **sizes,
-        "table_numbers": rows(nodes, 6),
+        "table_numbers": number_rows(nodes, 6, t.precision),
         "last_row": c_number(nodes.shape[0] - 1, t.precision),
         "last_column": c_number(nodes.shape[1] - 1, t.precision),
+    }
+
+
+def number_rows(values: Any, width: int, precision: Precision) -> str:
+    """Numbers in C, so many in a row."""
+    flat = [c_number(v, precision) for v in np.ravel(values)]
+    return ",\n".join("  " + ", ".join(flat[k : k + width]) for k in range(0, len(flat), width))
+
+
+def root_context(precision: Precision) -> dict[str, Any]:
+    """What root.c is filled with, beside the name."""
+    double = precision == "double"
+    return {
+        "arm_fpu": f" || (defined(__ARM_FP) && ((__ARM_FP & {8 if double else 4}) != 0))",
+        "builtin_root": "__builtin_sqrt" if double else "__builtin_sqrtf",
+        "digits": 52 if double else 23,
+        **{key: c_number(v, precision) for key, v in _NUMBERS.items()},
     }
 
 
@@ -244,5 +253,10 @@ def call(p: Program, t: Target, name: str) -> str:
     places |= {f.name: f"in->{f.name}" for f in input_fields(t)}
     places |= {f.name: f"out->{f.name}" for f in output_fields(t)}
     places |= {key: key for key in ("v0", "table_at", "table")}
-    given = [places[key] for key, size in (*p.arguments, *p.results) if size]
-    return f"{name}_{p.name}({', '.join(given)})"
+    return call_text(p, name, places)
+
+
+def call_text(p: Program, prefix: str, places: Mapping[str, str]) -> str:
+    """The call of a program's function in C. places : where each argument and result is"""
+    given = [places[name] for name, size in (*p.arguments, *p.results) if size]
+    return f"{prefix}_{p.name}({', '.join(given)})"

@@ -21,7 +21,16 @@ from malta.firmware.native import Native, call, compile_controller, new_state, v
 from malta.firmware.signals import Target, state_fields
 from malta.model.plant import Plant
 from malta.simulation.engines import Engine, evaluate, substeps_until
-from malta.simulation.layout import Layout, Setup, command_size, layout_of, numbers_of, signals_of
+from malta.simulation.layout import (
+    Layout,
+    Setup,
+    columns_of_row,
+    command_size,
+    layout_of,
+    numbers_of,
+    places_of,
+    signals_of,
+)
 from malta.simulation.period import Period, period_of
 from malta.simulation.prepared import Prepared
 from malta.synthesis.controller import Controller
@@ -174,10 +183,7 @@ def _record(plant: Plant, c: Controller, setup: Setup, p: Period) -> ca.Function
     }
     out = {name: kind.sym(name, size) for name, size in (widths | {"met": 1, "command": count}).items()}
     own = p.decide(state, given, y, ca.DM.zeros(len(c.forces)), ca.DM(0, 1))[2]
-    row, begin = {}, 0
-    for name, size in sizes.row.items():
-        row[name] = own[begin : begin + size, 0]
-        begin += size
+    row = {name: own[place, 0] for name, place in columns_of_row(plant, c, setup).items()}
     row |= {name: out[name] for name in widths}
     row["met"] = ca.vertcat(out["met"], row["met"][1:, 0])
     if "u" in sizes.row:
@@ -208,23 +214,14 @@ def _first_state(native: Native, sizes: Layout, ready: Prepared) -> Any:
     for name, values in zip(("p", "dp", "ddp"), reference, strict=True):
         view(state.reference, name)[:] = values
     call(native, "start", state)
-    known = _entries(sizes.controller, sum(sizes.machine.values()))
+    known = places_of(sizes.controller, sum(sizes.machine.values()))
     for field in state_fields(native.target):
         if field.name in known and field.size:
             view(state, field.name)[:] = start[known[field.name]]
-    machine = _entries(sizes.machine, 0)
+    machine = places_of(sizes.machine)
     if "i_last" in {f.name for f in state_fields(native.target)}:
         view(state, "i_last")[:] = start[machine["i_phase" if "i_phase" in machine else "i"]]
     return state
-
-
-def _entries(sizes: dict[str, int], begin: int) -> dict[str, slice]:
-    """The places of signals in a vector."""
-    places = {}
-    for name, size in sizes.items():
-        places[name] = slice(begin, begin + size)
-        begin += size
-    return places
 
 
 class _Flight(NamedTuple):
@@ -257,8 +254,8 @@ def _fly(
     if f.setup.fidelity == "force":
         entries["command"] = entries["current"]
     commands = np.empty((len(given), sum(entries[name].size for name in _REPLACED)))
-    places = _entries({**f.sizes.machine, **f.sizes.controller}, 0)
-    around = _entries(f.sizes.given, 0)
+    places = places_of({**f.sizes.machine, **f.sizes.controller})
+    around = places_of(f.sizes.given)
     machine = slice(0, sum(f.sizes.machine.values()))
     done = substeps_until(first, substeps)
     begin_substep = done

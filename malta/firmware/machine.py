@@ -21,30 +21,19 @@ import casadi as ca
 import numpy as np
 
 from malta.firmware.ctext import c_number, function_text, signature
-from malta.firmware.export import comment, render
+from malta.firmware.export import call_text, comment, number_rows, render, root_context
 from malta.firmware.lowering import lower
 from malta.firmware.parts import named_function, symbols
 from malta.firmware.program import Program, program_of
 from malta.firmware.signals import Field, Target, current_readings, output_fields
 from malta.model.plant import Plant, Signal
 from malta.simulation import references
-from malta.simulation.layout import Layout, Setup, layout_of, numbers_of, read_currents
+from malta.simulation.layout import Layout, Setup, layout_of, numbers_of, places_of, read_currents
 from malta.simulation.period import Period, initial_state, period_of, state_reference
 from malta.simulation.scenario import Scenario, setup_of, substeps_of
 
 TINY = 1e-6  # share of a substep that rounding may add, see engines.substeps_until
 OWN = ("begin", "substep", "read")  # functions that only the machine's text calls
-ROOT = {  # what root.c is filled with
-    "builtin_root": "__builtin_sqrt",
-    "arm_fpu": " || (defined(__ARM_FP) && ((__ARM_FP & 8) != 0))",
-    "digits": 52,
-    "zero": "0.0",
-    "quarter": "0.25",
-    "half": "0.5",
-    "one": "1.0",
-    "two": "2.0",
-    "four": "4.0",
-}
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,11 +195,7 @@ def _shift(m: Machine) -> ca.Function:
 
 def _split(vector: Any, sizes: Mapping[str, int]) -> dict[str, Any]:
     """The parts of a vector by name."""
-    parts, begin = {}, 0
-    for name, size in sizes.items():
-        parts[name] = vector[begin : begin + size, 0]
-        begin += size
-    return parts
+    return {name: vector[place, 0] for name, place in places_of(sizes).items()}
 
 
 def machine_sources(m: Machine, name: str, functions: tuple[str, ...]) -> dict[str, str]:
@@ -222,10 +207,6 @@ def machine_sources(m: Machine, name: str, functions: tuple[str, ...]) -> dict[s
 
 def _context(m: Machine, programs: Mapping[str, Program], name: str) -> dict[str, Any]:
     plant, c = m.plant, m.target.controller
-
-    def rows(values: Any, width: int) -> str:
-        flat = [c_number(v, "double") for v in np.ravel(values)]
-        return ",\n".join("  " + ", ".join(flat[k : k + width]) for k in range(0, len(flat), width))
 
     command = command_field(m.target)
     places = {
@@ -256,22 +237,16 @@ def _context(m: Machine, programs: Mapping[str, Program], name: str) -> dict[str
         "volts": m.sizes.controller.get("u_integral", 0),
         "at": f"x[{plant.stroke_state}]" if plant.has_stroke else c_number(ff.z_grid[0], "double"),
         "points": len(ff.z_grid),
-        "z_rows": rows(ff.z_grid, 6),
-        "v0_rows": rows(ff.v0, len(c.forces)),
+        "z_rows": number_rows(ff.z_grid, 6, "double"),
+        "v0_rows": number_rows(ff.v0, len(c.forces), "double"),
         "reads": [f for f in reading_fields(m) if f.size],
         "functions": "\n".join(
             function_text(p, name, "double", static=key in OWN) for key, p in programs.items()
         ),
         "declarations": [signature(p, name) for key, p in programs.items() if key not in OWN],
-        "call_begin": call_of(programs["begin"], name, places | {"x": "x"}),
-        "call_substep": call_of(programs["substep"], name, places),
-        "call_read": call_of(programs["read"], name, places),
+        "call_begin": call_text(programs["begin"], name, places | {"x": "x"}),
+        "call_substep": call_text(programs["substep"], name, places),
+        "call_read": call_text(programs["read"], name, places),
         "root": any(o.op == "SQRT" for p in programs.values() for o in p.operations),
-        **ROOT,
+        **root_context("double"),
     }
-
-
-def call_of(p: Program, prefix: str, places: Mapping[str, str]) -> str:
-    """The call of a program's function in C. places : where each argument and result is"""
-    given = [places[name] for name, size in (*p.arguments, *p.results) if size]
-    return f"{prefix}_{p.name}({', '.join(given)})"

@@ -28,7 +28,7 @@ from malta.firmware.signals import (
 from malta.model.lookup import recorded_look_ups
 from malta.simulation.current_control import control_currents
 from malta.simulation.layout import Loop, Signals, electronics_of, numbers_of
-from malta.simulation.period import law_reference, state_reference
+from malta.simulation.period import law_reference, limited_currents, state_reference
 from malta.synthesis.controller import (
     commanded,
     estimated,
@@ -56,6 +56,11 @@ def named_function(name: str, arguments: dict[str, Any], results: dict[str, Any]
     return ca.Function(name, list(arguments.values()), list(given.values()), list(arguments), list(given))
 
 
+def numbers(t: Target) -> dict[str, Any]:
+    """Every number of the law and of its machine, by name, as expressions take them."""
+    return {name: ca.SX(value) for name, value in numbers_of(t.believed, t.controller, 1).items()}
+
+
 def sense_function(t: Target) -> ca.Function:
     """(xi_pred, p, raw y, y_valid) -> (y_used, refused), and where the currents will read a table.
 
@@ -80,8 +85,7 @@ def sense_function(t: Target) -> ca.Function:
     used, refused = gate(a["y"], a["y_valid"], reach, bounded)
     results = {"y_used": used, "refused": refused}
     if t.look_ups:
-        g = {name: ca.SX(value) for name, value in numbers_of(t.believed, c, 1).items()}
-        _, place = look_ahead(g, a["xi_pred"], used, a["dp"])
+        _, place = look_ahead(numbers(t), a["xi_pred"], used, a["dp"])
         results["table_at"] = places_in_table(t, place)
     return named_function("sense", a, results)
 
@@ -103,7 +107,7 @@ def decide_function(t: Target) -> ca.Function:
     It consists of the functions of synthesis/controller.py and simulation/current_control.py, as a simulation does.
     """
     c, plant = t.controller, t.believed
-    g = {name: ca.SX(value) for name, value in numbers_of(plant, c, 1).items()}
+    g = numbers(t)
     state, reference = symbols(state_fields(t)), symbols(reference_fields(t))
     y, v0 = ca.SX.sym("y_used", len(c.measurements)), ca.SX.sym("v0", len(c.forces))
     read = symbols([f for f in input_fields(t) if f.name in ("i", "i_valid", "link")])
@@ -259,15 +263,7 @@ def currents(t: Target, place: Any, v: Any, table: Any) -> tuple[Any, Any]:
         wanted = ca.SX(t.believed.currents(place, v))
     if found:
         wanted = ca.substitute(wanted, ca.vertcat(*(one.values for one in found)), table)
-    limit = ca.DM(t.controller.limits.current)
-    current = t.believed.limited(wanted)
-    bounded = [
-        ca.fmax(ca.fmin(current[k], float(limit[k])), -float(limit[k]))
-        if np.isfinite(float(limit[k]))
-        else current[k]
-        for k in range(limit.numel())
-    ]
-    return wanted, ca.vertcat(*bounded)
+    return wanted, limited_currents(t.believed, wanted, ca.SX(ca.DM(t.controller.limits.current)))
 
 
 def drive_currents(

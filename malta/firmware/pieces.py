@@ -28,6 +28,7 @@ from malta.firmware.parts import (
     drive_currents,
     feedforward,
     named_function,
+    numbers,
     places_in_table,
     sense_function,
     state_function,
@@ -36,9 +37,9 @@ from malta.firmware.parts import (
 )
 from malta.firmware.signals import Field, Target, input_fields, reference_fields, state_fields
 from malta.model.plant import Plant
-from malta.simulation.layout import electronics_of, numbers_of
+from malta.simulation import references
+from malta.simulation.layout import electronics_of
 from malta.simulation.period import state_reference
-from malta.simulation.references import QUINTIC_DURATION
 from malta.synthesis.controller import commanded, estimated, filtered, freeze_moving, sum_errors
 
 
@@ -56,7 +57,7 @@ def pieces(t: Target) -> list[ca.Function]:
 def _law_pieces(t: Target) -> list[ca.Function]:
     """From readings to forces."""
     c, plant = t.controller, t.believed
-    g = {name: ca.SX(value) for name, value in numbers_of(plant, c, 1).items()}
+    g = numbers(t)
     n, m, outputs = len(c.states), len(c.forces), len(c.measurements)
     sizes = {
         "raw": outputs,
@@ -117,7 +118,7 @@ def _current_control(t: Target, current: Any) -> ca.Function:
     state = symbols(_chosen(state_fields(t), names))
     read = symbols(_chosen(input_fields(t), ("i", "i_valid", "link")))
     known = ca.SX.sym("states", len(t.controller.A))
-    g = {name: ca.SX(value) for name, value in numbers_of(t.believed, t.controller, 1).items()}
+    g = numbers(t)
     sums = Sums(t, state)
     command, after = drive_currents(t, g, state, read, current, known, sums)
     after = {f"{name}_next": value for name, value in (after | sums.rests).items()}
@@ -158,15 +159,9 @@ def strokes() -> list[ca.Function]:
     """Shares of a stroke, with rate and acceleration, from the time since its middle: see simulation/references.py."""
     time, rise = ca.SX.sym("t"), ca.SX.sym("rise")
     arguments = {"t": time, "rise": rise}
-    k = 2 * math.log(9) / rise
-    s = 0.5 * (1 + ca.tanh(k * time / 2))
-    ds = k * s * (1 - s)
-    T = QUINTIC_DURATION * rise
-    u = ca.fmin(ca.fmax(time / T + 0.5, 0), 1)
     names = ("share", "rate", "acceleration")
-    logistic = (s, ds, k * ds * (1 - 2 * s))
-    w = u * (1 - u)
-    quintic = (u * u * u * (10 + u * (6 * u - 15)), 30 * (w * w) / T, 60 * w * (1 - 2 * u) / (T * T))
+    logistic = references.logistic(time, rise, ca.tanh)
+    quintic = references.quintic(time, rise, lambda u, low, high: ca.fmin(ca.fmax(u, low), high))
     return [
         named_function("logistic", arguments, dict(zip(names, logistic, strict=True))),
         named_function("quintic", arguments, dict(zip(names, quintic, strict=True))),

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, NamedTuple
 
 import casadi as ca
@@ -14,8 +15,8 @@ from malta.errors import InputError
 from malta.firmware.elementary import Precision
 from malta.model.data import plant_of
 from malta.model.lookup import LookUp, recorded_look_ups
-from malta.model.plant import Plant, Signal
-from malta.simulation.layout import Fidelity, Setup, electronics_of
+from malta.model.plant import Plant, Signal, readonly
+from malta.simulation.layout import Fidelity, Setup, electronics_of, fidelities
 from malta.synthesis.controller import Controller
 
 if TYPE_CHECKING:
@@ -53,7 +54,7 @@ class Target:
     def __post_init__(self) -> None:
         if self.precision not in ("double", "float"):
             raise InputError("export", "precision", repr(self.precision), "double or float")
-        if self.fidelity != "force" and self.believed.windings is None and not self.has_set_points:
+        if self.fidelity not in fidelities(self.believed):
             found = f"a {self.believed.name} without a model of its current loops"
             raise InputError("export", self.controller.name, found, "an export down to currents")
         if self.driven and self.controller.current_loop is None:
@@ -115,7 +116,7 @@ class Target:
 
 def fidelity_of(plant: Plant) -> Fidelity:
     """How far down a machine's controller can be exported."""
-    return "force" if plant.windings is None and plant.electronics is None else "phase"
+    return fidelities(plant)[-1]
 
 
 def state_fields(t: Target) -> list[Field]:
@@ -226,28 +227,34 @@ def named(before: str, signals: tuple[Signal, ...], unit: str, after: str = "") 
     return tuple(Signal(f"{before}{s.name}{after}", unit or s.unit) for s in signals)
 
 
+def used_clearances(plant: Plant) -> Callable[[int, float], FloatArray]:
+    """(index of an output, its reading) -> used share of each clearance, while the other outputs read zero."""
+    x = ca.SX.sym("x", len(plant.states))
+    contact = ca.Function("contact", [x], [ca.densify(ca.vertcat(plant.contact(x), 0))])
+
+    def used(k: int, reading: float) -> FloatArray:
+        p = np.zeros(len(plant.outputs))
+        p[k] = reading
+        q = np.array(plant.position_of(ca.DM(p))).ravel()
+        state = np.zeros(len(plant.states))
+        state[list(plant.controlled)[: len(q)]] = q
+        return np.array(contact(state)).ravel()[: len(plant.contacts)]
+
+    return used
+
+
+@lru_cache(maxsize=16)
 def reading_ranges(plant: Plant) -> FloatArray:
     """The largest reading of each output that a machine can give, either way: twice where it touches, or its travel.
 
     Of an output that meets nothing: 1 m, or 1 of its unit; UNBOUNDED for a machine that has no contacts at all, as a
     motor that turns. Beyond, a reading is refused.
     """
-    x = ca.SX.sym("x", len(plant.states))
-    contact = ca.Function("contact", [x], [ca.densify(ca.vertcat(plant.contact(x), 0))])
+    used, sizes = used_clearances(plant), 10.0 ** np.arange(-7, 0.01, 0.05)
     ranges, nowhere = [], 1.0 if plant.contacts else UNBOUNDED
     for k, _ in enumerate(plant.outputs):
-        sizes = 10.0 ** np.arange(-7, 0.01, 0.05)
-        reach = math.inf
-        for size in sizes:
-            p = np.zeros(len(plant.outputs))
-            p[k] = size
-            q = np.array(plant.position_of(ca.DM(p))).ravel()
-            state = np.zeros(len(plant.states))
-            state[list(plant.controlled)[: len(q)]] = q
-            if np.array(contact(state)).max() >= 1:
-                reach = size
-                break
+        reach = next((size for size in sizes if used(k, size).max(initial=0.0) >= 1), math.inf)
         if plant.has_stroke and k == plant.stroke_output and plant.travel:
             reach = max(plant.travel, reach if math.isfinite(reach) else 0.0)
         ranges.append(2 * reach if math.isfinite(reach) else nowhere)
-    return np.array(ranges)
+    return readonly(ranges)

@@ -33,6 +33,12 @@ def look_up(t: Target, z: Any) -> Any:
     return (real(1) - share) * v0[k] + share * v0[k + 1]
 
 
+def _v0(t: Target, outputs: Any) -> Any:
+    """v0 where the outputs are; that of the first point for a machine without a stroke."""
+    grid = t.controller.feedforward.z_grid
+    return look_up(t, outputs[t.believed.stroke_output] if t.believed.has_stroke else grid[0])
+
+
 def read_table(t: Target, places: Any) -> Any:
     """The values of the table at (u, v), (u, v), ..., one reading after the other; none without a table."""
     real = TYPES[t.precision]
@@ -53,12 +59,7 @@ def first_state(t: Target) -> Vectors:
 
 def started_state(t: Target, reference: Mapping[str, Any]) -> Vectors:
     """The state that `start` leaves: of a machine that follows the reference."""
-    z = (
-        reference["p"][t.believed.stroke_output]
-        if t.believed.has_stroke
-        else t.controller.feedforward.z_grid[0]
-    )
-    found = evaluate(programs_of(t)["state_at"], {**reference, "v0": look_up(t, z)}, t.precision)
+    found = evaluate(programs_of(t)["state_at"], {**reference, "v0": _v0(t, reference["p"])}, t.precision)
     return {name.removesuffix("_next"): value for name, value in found.items() if value.size}
 
 
@@ -72,13 +73,10 @@ def step_of(t: Target) -> Step:
     ) -> tuple[Vectors, Vectors]:
         known = {**none, **state, **reference, **readings}
         sensed = evaluate(sense, known, t.precision)
-        z = (
-            sensed["y_used"][t.believed.stroke_output]
-            if t.believed.has_stroke
-            else t.controller.feedforward.z_grid[0]
-        )
         table = read_table(t, sensed.pop("table_at", None))
-        decided = evaluate(decide, {**known, **sensed, "v0": look_up(t, z), "table": table}, t.precision)
+        decided = evaluate(
+            decide, {**known, **sensed, "v0": _v0(t, sensed["y_used"]), "table": table}, t.precision
+        )
         after = {
             name.removesuffix("_next"): v for name, v in decided.items() if name.endswith("_next") and v.size
         }

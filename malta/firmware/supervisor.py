@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 import casadi as ca
 import numpy as np
 
-from malta.firmware.signals import Target, reading_ranges
+from malta.firmware.signals import Target, reading_ranges, used_clearances
 from malta.model.plant import Plant
 from malta.synthesis.controller import Controller
 from malta.synthesis.riccati import eigenvalues
@@ -232,18 +232,11 @@ def touch_bounds(plant: Plant) -> FloatArray:
 
     Infinite where nothing is met.
     """
-    x = ca.SX.sym("x", len(plant.states))
-    cushioned = np.array(plant.cushioned, dtype=bool)
-    contact = ca.Function("contact", [x], [ca.densify(ca.vertcat(plant.contact(x), 0))])
+    bounds = np.where(np.array(plant.cushioned, dtype=bool), TOUCH, 1.0)
+    shares = used_clearances(plant)
 
     def used(k: int, reading: float) -> float:
-        p = np.zeros(len(plant.outputs))
-        p[k] = reading
-        q = np.array(plant.position_of(ca.DM(p))).ravel()
-        state = np.zeros(len(plant.states))
-        state[list(plant.controlled)[: len(q)]] = q
-        shares = np.array(contact(state)).ravel()[: len(cushioned)]
-        return float((shares / np.where(cushioned, TOUCH, 1.0)).max(initial=0.0))
+        return float((shares(k, reading) / bounds).max(initial=0.0))
 
     found = []
     for k, most in enumerate(reading_ranges(plant)):

@@ -16,7 +16,7 @@ from malta.firmware.export import MOST_RATE, comment, render
 from malta.firmware.lowering import lower
 from malta.firmware.program import Program, program_of
 from malta.firmware.sensor_loss import expected_readings, gains_without, prediction_correction
-from malta.firmware.signals import Target, input_fields, output_fields
+from malta.firmware.signals import Target, current_readings, input_fields, output_fields
 from malta.firmware.supervisor import (
     JUMP,
     LONG,
@@ -102,7 +102,7 @@ def supervisor_members(t: Target) -> list[Member]:
         Member("real", "d2", p, ""),
     ]
     if t.driven:
-        members.append(Member("real", "offset", _currents(t), "A, of the current sensors"))
+        members.append(Member("real", "offset", len(current_readings(t)), "A, of the current sensors"))
     return members
 
 
@@ -125,11 +125,6 @@ def monitor_lines(t: Target) -> list[str]:
         for row in monitors_of(t)
     ]
     return lines
-
-
-def _currents(t: Target) -> int:
-    """The number of currents that are read."""
-    return len(t.believed.drive.phases if t.fidelity == "phase" else t.believed.drive.axes)
 
 
 def _context(t: Target, name: str) -> dict[str, Any]:
@@ -155,7 +150,7 @@ def _context(t: Target, name: str) -> dict[str, Any]:
         "estimated": len(c.states),
         "input_fields": input_fields(t),
         "output_fields": [f for f in output_fields(t) if f.size],
-        "currents": _currents(t) if t.driven else 0,
+        "currents": len(current_readings(t)) if t.driven else 0,
         "link": _number(plant.drive.link_voltage, t) if t.driven else "",
         "command": len(off),
         "off": _vector(off, t),
@@ -261,7 +256,7 @@ def _off_command(t: Target) -> list[float]:
         return [float(v) for v in np.array(ca.evalf(ca.densify(held))).ravel()]
     if not t.driven:
         return []
-    return [0.5] * _currents(t) if t.fidelity == "phase" else [0.0] * _currents(t)
+    return [0.5] * len(current_readings(t)) if t.fidelity == "phase" else [0.0] * len(current_readings(t))
 
 
 def _records(t: Target, name: str) -> list[dict[str, Any]]:

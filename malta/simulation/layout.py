@@ -11,7 +11,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import accumulate
+from itertools import accumulate, pairwise
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
 import casadi as ca
@@ -128,9 +128,13 @@ def layout_of(plant: Plant, c: Controller, s: Setup) -> Layout:
 @lru_cache(maxsize=64)
 def columns_of_row(plant: Plant, c: Controller, s: Setup) -> dict[str, slice]:
     """The columns of each signal in the row that a sample leaves."""
-    sizes = layout_of(plant, c, s).row
-    ends = accumulate(sizes.values())
-    return {name: slice(end - size, end) for (name, size), end in zip(sizes.items(), ends, strict=True)}
+    return places_of(layout_of(plant, c, s).row)
+
+
+def places_of(sizes: Mapping[str, int], begin: int = 0) -> dict[str, slice]:
+    """The places of signals of these sizes in a vector, from entry `begin` on."""
+    ends = accumulate(sizes.values(), initial=begin)
+    return {name: slice(*edges) for name, edges in zip(sizes, pairwise(ends), strict=True)}
 
 
 def ending_columns(plant: Plant, c: Controller, s: Setup) -> tuple[int, ...]:

@@ -246,8 +246,7 @@ def _control_law(
     # The controller commutates with the machine of its gain file. The simulated machine limits the currents, and the
     # gain file does: the smaller limit counts.
     wanted = believed.currents(place, v)
-    current, fast = plant.limited(wanted), electronics_of(plant, s)
-    current = ca.fmax(ca.fmin(current, g["current_limit"]), -g["current_limit"])
+    current, fast = limited_currents(plant, wanted, g["current_limit"]), electronics_of(plant, s)
     met = [ca.mmax(ca.fabs(current - wanted)) > 0]
     row: dict[str, Any] = {"xi_hat": xi_hat, "v": v, "saturated": frozen, "current": current}
     if fast is not None:
@@ -273,6 +272,11 @@ def _control_law(
     size = command.numel()
     after["under_way"] = queue[size:, 0]  # a column, also where no entry is left
     return after, queue[:size], row
+
+
+def limited_currents(plant: Plant, wanted: Any, limit: Any) -> Any:
+    """Coil currents within the machine's own limits and those of a gain file."""
+    return ca.fmax(ca.fmin(plant.limited(wanted), limit), -limit)
 
 
 def law_reference(c: Controller, believed: Plant, g: Mapping[str, Any], given: Mapping[str, Any]) -> Any:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -34,21 +34,28 @@ class Motion(NamedTuple):
 Reference = Callable[["FloatArray"], Motion]
 
 
-def logistic(t: FloatArray, rise: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """s = 1 / (1 + e^(-k t)), centred at t = 0, from 10 to 90 % in `rise` (s): k = 2 ln 9 / rise."""
+def logistic(
+    t: Any, rise: Any, tanh: Callable[[Any], Any] = np.tanh
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """s = 1 / (1 + e^(-k t)), centred at t = 0, from 10 to 90 % in `rise` (s): k = 2 ln 9 / rise.
+
+    tanh : of numpy, or CasADi's for expressions
+    """
     k = 2 * math.log(9) / rise
-    s = 0.5 * (1 + np.tanh(k * t / 2))  # 1 / (1 + e^(-k t)) without overflow
+    s = 0.5 * (1 + tanh(k * t / 2))  # 1 / (1 + e^(-k t)) without overflow
     ds = k * s * (1 - s)
     return s, ds, k * ds * (1 - 2 * s)
 
 
-def quintic(t: FloatArray, rise: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+def quintic(
+    t: Any, rise: Any, clip: Callable[[Any, Any, Any], Any] = np.clip
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """s = 10 u^3 - 15 u^4 + 6 u^5, u from 0 to 1, centred at t = 0, from 10 to 90 % in `rise` (s).
 
-    At rest outside; the whole move takes QUINTIC_DURATION times `rise`.
+    At rest outside; the whole move takes QUINTIC_DURATION times `rise`. clip : of numpy, or one for expressions
     """
     T = QUINTIC_DURATION * rise
-    u = np.clip(t / T + 0.5, 0, 1)
+    u = clip(t / T + 0.5, 0, 1)
     return (
         u**3 * (10 + u * (6 * u - 15)),
         30 * (u * (1 - u)) ** 2 / T,
@@ -58,7 +65,10 @@ def quintic(t: FloatArray, rise: float) -> tuple[FloatArray, FloatArray, FloatAr
 
 QUINTIC_DURATION = 1 / (1 - 2 * 0.24663645328846656)  # 10 u^3 - 15 u^4 + 6 u^5 = 0.1 at u = 0.2466
 
-PROFILES = {"logistic": logistic, "quintic": quintic}
+PROFILES: dict[str, Callable[[Any, Any], tuple[FloatArray, FloatArray, FloatArray]]] = {
+    "logistic": logistic,
+    "quintic": quintic,
+}
 
 
 def stroke(
