@@ -33,6 +33,7 @@ from malta.simulation.layout import (
 )
 from malta.simulation.period import Period, period_of
 from malta.simulation.prepared import Prepared
+from malta.simulation.simulate import sensor_errors_of
 from malta.synthesis.controller import Controller
 
 if TYPE_CHECKING:
@@ -94,8 +95,7 @@ def _engine(
         first_state = _first_state(native, sizes, ready)
         sessions[id(inputs)] = inputs, first_state, step_of(native, first_state)
     _, state, step = sessions[id(inputs)]
-    errors = tuple(sorted((simulation.scenario.sensor_errors or {}).items()))
-    machine = _machine(now, c, setup, substeps, errors)
+    machine = _machine(now, c, setup, substeps, sensor_errors_of(simulation.scenario))
 
     def run(
         first: int, begin: FloatArray, given: FloatArray, noise: FloatArray, fast: FloatArray

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -11,6 +12,7 @@ import numpy as np
 
 from malta.errors import InputError
 from malta.firmware.ctext import c_name
+from malta.firmware.elementary import Precision
 from malta.firmware.export import sources
 from malta.firmware.program import TYPES
 from malta.firmware.signals import (
@@ -26,6 +28,7 @@ from malta.simulation.compiled import library
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
 
+REALS: dict[Precision, Any] = {"double": ctypes.c_double, "float": ctypes.c_float}
 FLAGS = ("-std=c99", "-O2", "-ffp-contract=off", "-fno-math-errno", "-fPIC", "-shared")
 
 
@@ -46,12 +49,8 @@ def compile_controller(t: Target) -> Native:
     """The controller's C, compiled. Raises InputError without a C compiler."""
     name = c_name(t.controller.name)
     files = sources(t, "", name)
-    text = "".join(files[f"{name}{end}"] for end in (".h", ".c", "_parts.c"))
-    text = text.replace(f'#include "{name}.h"', "")
-    lib = library(text, 1, flags=FLAGS)
-    if lib is None:
-        raise InputError("export", "C compiler", "none that works", "cc, gcc or clang, or $CC")
-    real = ctypes.c_double if t.precision == "double" else ctypes.c_float
+    lib = compile_files([files[f"{name}{end}"] for end in (".h", ".c", "_parts.c")])
+    real = REALS[t.precision]
 
     def record(title: str, fields: list[Field], more: tuple[tuple[str, Any], ...] = ()) -> Any:
         arrays = [(f.name, real * f.size) for f in fields if f.size]
@@ -68,6 +67,14 @@ def compile_controller(t: Target) -> Native:
         record("Inputs", input_fields(t)),
         record("Outputs", output_fields(t)),
     )
+
+
+def compile_files(texts: Sequence[str]) -> Any:
+    """The library of C files in this order, headers first. Raises InputError without a C compiler."""
+    lib = library(re.sub(r'#include "\w+\.h"\n', "", "".join(texts)), 1, flags=FLAGS)
+    if lib is None:
+        raise InputError("export", "C compiler", "none that works", "cc, gcc or clang, or $CC")
+    return lib
 
 
 def call(native: Native, function: str, *arguments: Any) -> int:

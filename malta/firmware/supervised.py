@@ -14,7 +14,7 @@ from malta.errors import InputError
 from malta.firmware.elementary import Precision
 from malta.firmware.export import sources
 from malta.firmware.flight import Step, engine_of_c
-from malta.firmware.native import FLAGS, Native, compile_controller, view
+from malta.firmware.native import REALS, Native, compile_controller, compile_files, view
 from malta.firmware.signals import Target
 from malta.firmware.supervisor import STATES, State
 from malta.firmware.supervisor_text import (
@@ -24,7 +24,7 @@ from malta.firmware.supervisor_text import (
     supervisor_sources,
     time_members,
 )
-from malta.simulation.compiled import compiler, library
+from malta.simulation.compiled import compiler
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray, Plant
@@ -48,14 +48,12 @@ def compile_supervised(t: Target) -> Supervised:
     own = compile_controller(t)
     files = sources(t, "", own.name) | supervisor_sources(t, own.name)
     order = (".h", "_supervisor.h", ".c", "_parts.c", "_supervisor.c")
-    text = "".join(files[f"{own.name}{end}"] for end in order)
-    for header in (f"{own.name}.h", f"{own.name}_supervisor.h"):
-        text = text.replace(f'#include "{header}"', "")
-    lib = library(text, 1, flags=FLAGS)
-    if lib is None:
-        raise InputError("export", "C compiler", "none that works", "cc, gcc or clang, or $CC")
-    real = ctypes.c_double if t.precision == "double" else ctypes.c_float
-    kinds: dict[str, Any] = {"int32_t": ctypes.c_int32, "real": real, "reference": own.Reference}
+    lib = compile_files([files[f"{own.name}{end}"] for end in order])
+    kinds: dict[str, Any] = {
+        "int32_t": ctypes.c_int32,
+        "real": REALS[t.precision],
+        "reference": own.Reference,
+    }
 
     def record(title: str, members: Sequence[Member]) -> Any:
         of = [(m.name, kinds[m.kind] * m.size if m.size else kinds[m.kind]) for m in members]

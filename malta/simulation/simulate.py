@@ -107,7 +107,7 @@ def _portions(
         if callable(choice):
             engine = choice(ready, now, steps)
         else:
-            engine = engine_of(now, controller, setup, steps, _sensor_errors(scenario), choice)
+            engine = engine_of(now, controller, setup, steps, sensor_errors_of(scenario), choice)
         part = slice(done, stop)
         if observer is None:
             jitter = fast[substeps_until(done, steps) : substeps_until(stop, steps)]
@@ -153,7 +153,7 @@ def integration_error(run: Trajectory) -> float:
     return float(np.abs(run.p[:k] - other.p[:k]).max()) * (16 / 15 if finer else 1 / 15)
 
 
-def _sensor_errors(scenario: Scenario) -> tuple[tuple[str, float], ...]:
+def sensor_errors_of(scenario: Scenario) -> tuple[tuple[str, float], ...]:
     """Errors of the sensors by name, as a key of `engine_of`'s memory."""
     return tuple(sorted((scenario.sensor_errors or {}).items()))
 
