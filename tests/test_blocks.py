@@ -270,6 +270,7 @@ def test_the_nominal_loss_is_found_in_any_box() -> None:
         assert 0.99 * m.upper <= m.lower <= m.upper
 
 
+@pytest.mark.slow
 def test_a_block_that_nothing_passes_at_the_nominal() -> None:
     """T = 2 k / (s + 1 + 2 k): 0.5 t |T| = 1 at w = 0 and k = -t, where t^2 + 2 t = 1; nothing at the nominal k = 0."""
     s = malta.uncertain(lambda k: ([[-1.0]], [[k]], [[1.0]]), {"k": 0.0})

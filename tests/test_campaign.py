@@ -99,6 +99,7 @@ def test_the_name_is_the_function() -> None:
     assert malta.Plan is Plan
 
 
+@pytest.mark.slow
 @settings(max_examples=30, deadline=None)
 @given(
     shares=st.dictionaries(st.sampled_from(["m", "K_A", "K_B", "R", "l_S"]), st.floats(0, 0.99), min_size=1),

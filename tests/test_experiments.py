@@ -954,6 +954,7 @@ def test_what_an_experiment_does_not_take_is_refused(designs: dict[str, Design])
     assert _refused(design, "hold", foo=1).found == "an unknown option"
 
 
+@pytest.mark.slow
 def test_every_experiment_bears_its_name_and_tells_its_progress(designs: dict[str, Design]) -> None:
     design = designs["calibrated"]
     for name in EXPERIMENTS:

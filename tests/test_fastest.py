@@ -157,6 +157,7 @@ def test_bang_bang_is_the_limit_of_an_ideal_drive(smooth: Plant, par: tubular.Pa
     assert excess[2] < 1e-3
 
 
+@pytest.mark.slow
 def test_a_finer_mesh_takes_as_long(plant: Plant, par: tubular.Parameters, stroke: FastestStroke) -> None:
     for intervals in (100, 300):
         other = fastest_stroke(plant, DISTANCE, par.K_ind, intervals=intervals)
@@ -183,6 +184,7 @@ def test_more_of_a_limit_never_takes_longer(
     assert bang_bang(plant, distance) / 1.05 < T  # cogging may help
 
 
+@pytest.mark.slow
 def test_backwards_is_the_mirror_image(smooth: Plant, par: tubular.Parameters, stroke: FastestStroke) -> None:
     there, back = (fastest_stroke(smooth, d, par.K_ind, intervals=80) for d in (DISTANCE, -DISTANCE))
     assert back.duration == pytest.approx(there.duration, rel=1e-6)
@@ -206,6 +208,7 @@ def test_the_limits_hold_between_the_nodes_too(
     assert 0.9999 * par.I_max < np.abs(current).max() < 1.0001 * par.I_max
 
 
+@pytest.mark.slow
 def test_the_whole_machine_arrives(plant: Plant, par: tubular.Parameters, stroke: FastestStroke) -> None:
     end = flown(plant, par, stroke).y[:, -1]
     assert end[2] == pytest.approx(DISTANCE / 2, abs=1e-4 * DISTANCE)

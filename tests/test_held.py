@@ -512,6 +512,7 @@ def test_currents_carry_the_weight_that_there_is() -> None:
         assert np.abs(1 + c.sample_time * np.linalg.eigvals(ours)).max() == pytest.approx(radius, abs=1e-9)
 
 
+@pytest.mark.slow
 def test_twins_that_are_both_named_move_apart() -> None:
     plant, c = _plant("planar"), _controller("planar", 1)
     system, law = machine_system(plant, c, ["I_x", "I_y"], {"y": 0.0})

@@ -231,6 +231,7 @@ def test_a_proof_goes_on_where_time_ended_it() -> None:
     assert stable_within(loop, parts.box, 3.0)
 
 
+@pytest.mark.slow
 def test_no_box_is_proven_that_holds_an_unstable_loop() -> None:
     loop = chain(3, None)
     m = malta.robust_margin(*loop, ranges(loop[0]), time=2)

@@ -671,6 +671,7 @@ def test_a_symmetric_start_stays_symmetric(
     assert worst[3] > 0.1
 
 
+@pytest.mark.slow
 def test_what_a_model_error_moves(par: planar.Parameters, paper: dict[str, Any], exact: Series) -> None:
     """From (6, 4) mm: exact 0, table 0.006 and 0.024 urad, fitted fundamental 0.12 urad, (17)-(24) as printed 3.9 urad.
 
