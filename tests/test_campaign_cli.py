@@ -28,7 +28,7 @@ QUICK = ("--fidelity", "force", "--rise", "3")
 @pytest.fixture
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without figures, which take longer than so few runs."""
-    monkeypatch.setattr("malta.report.pages.campaign", lambda *_: [])
+    monkeypatch.setattr("malta.cli.campaign._draw", lambda *_: [])
 
 
 def _sentence(err: str) -> str:

@@ -256,7 +256,8 @@ def test_tables_of_a_machine_without_a_travel(
     ):
         assert words in text
     assert "travel" not in text
-    assert report.robustness(found, "rotor_pid", box, tmp_path / "margins.png").stat().st_size > 10_000
+    report.robustness(found, "rotor_pid", box, tmp_path / "margins.png")
+    assert (tmp_path / "margins.png").stat().st_size > 10_000
     point = replace(found, extent=NOWHERE, places=found.places[1:2])
     text = "\n".join(
         printed(table) for table in (report.chain_table(point), report.places_table(point, 1e-4))

@@ -173,7 +173,7 @@ def test_changed_outcomes_are_named_and_not_reported(
     run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """`completed` zeroed, with and without a verdict that no run has: the yield stays, without a traceback."""
-    monkeypatch.setattr("malta.report.pages.campaign", lambda *_: [])
+    monkeypatch.setattr("malta.cli.campaign._draw", lambda *_: [])
     command = ("campaign", GAINS, "--samples", "8", "--fidelity", "force", "--rise", "3", "--out", tmp_path)
     path, wanted = tmp_path / block_name(0), run(*command)
     zeroed = {"completed": np.zeros(8)}

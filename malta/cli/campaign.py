@@ -254,4 +254,5 @@ def _draw(found: Summary) -> list[Path]:
         return []
     from malta import report
 
-    return report.campaign(found, found.folder)
+    report.campaign(found, found.folder)
+    return [found.folder / name for name in report.CAMPAIGN_FILES]

@@ -235,7 +235,9 @@ def _save(simulation: Simulation, folder: Path, published: Mapping[str, Any] | N
     cases, stem = simulation.experiment.cases, simulation.stem
     stems = [stem] if len(cases) == 1 else [f"{stem}_{_slug(case.label)}" for case in cases]
     series = [save_series(case.run, folder / f"{name}.npz") for name, case in zip(stems, cases, strict=True)]
-    return [*series, report.experiment(simulation.experiment, folder / f"{stem}.png", published)]
+    picture = folder / f"{stem}.png"
+    report.experiment(simulation.experiment, picture, published)
+    return [*series, picture]
 
 
 def _save_gains(simulation: Simulation, gains: Path, folder: Path) -> list[Path]:

@@ -158,7 +158,8 @@ def _sobol(limit: Limit, _: float, setting: Setting, progress: Progress | None) 
     document = sensitivity_document(found)
     files = [_write(setting, f"sobol_{limit.slug}.json", document)]
     if found.of_yield or any(found.of_merits.values()):
-        files.append(report.sensitivity(found, setting.folder / f"sobol_{limit.slug}.png"))
+        files.append(setting.folder / f"sobol_{limit.slug}.png")
+        report.sensitivity(found, files[-1])
     notes = [text for text in (report.sensitivity_sentence(found),) if text]
     return Outcome(document, files, [report.sensitivity_tables(found)], notes)
 

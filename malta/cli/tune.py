@@ -115,7 +115,9 @@ def _write(spec: Spec, tuned: Tuned, target: Path) -> list[Path]:
         return list(files)
     files[target.with_name(f"{target.stem}_front.md")] = report.front_markdown(tuned).encode()
     replace_files(files)
-    return [*files, report.front(tuned, target.with_name(f"{target.stem}_front.png"))]
+    picture = target.with_name(f"{target.stem}_front.png")
+    report.front(tuned, picture)
+    return [*files, picture]
 
 
 def _document(spec: Spec, tuned: Tuned, files: Sequence[Path]) -> dict[str, Any]:

@@ -194,11 +194,11 @@ def _draw(loop: Loop, analysis: Analysis, folder: Path) -> list[Path]:
 
     name = loop.controller.name
     picture, position = folder / f"{name}_margins.png", f"position {loop.plant.stroke}"
-    files = [report.robustness(analysis.robustness, name, loop.box, picture, position, analysis.worst)]
+    report.robustness(analysis.robustness, name, loop.box, picture, position, analysis.worst)
+    files = [picture]
     if analysis.recovered:
-        files.append(
-            report.loads(loop.plant, loop.controller, folder / f"{name}_loads.png", analysis.recovered)
-        )
+        files.append(folder / f"{name}_loads.png")
+        report.loads(loop.plant, loop.controller, files[-1], analysis.recovered)
     return files
 
 

@@ -10,6 +10,9 @@ from malta.report.figures import worst_figure as worst_figure
 from malta.report.figures import yield_figure as yield_figure
 from malta.report.figures.margins import chain_figure as chain_figure
 from malta.report.figures.parts import STYLES as STYLES
+from malta.report.figures.parts import new_figure as new_figure
+from malta.report.pages import CAMPAIGN_FILES as CAMPAIGN_FILES
+from malta.report.pages import CampaignFigures as CampaignFigures
 from malta.report.pages import campaign as campaign
 from malta.report.pages import design_page as design_page
 from malta.report.pages import experiment as experiment

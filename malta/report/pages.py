@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from rich.console import Group
 from rich.text import Text
@@ -33,6 +33,8 @@ from malta.synthesis.lqg import continuous_poles
 from malta.synthesis.spec import Spec
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from malta.campaigns.result import Campaign
     from malta.campaigns.sensitivity import Sensitivity
     from malta.campaigns.summary import Summary
@@ -80,70 +82,100 @@ def _rate_text(Ts: float) -> str:
     return f"{1e-3 / Ts:g} kHz" if Ts <= 1e-3 else f"a sample every {Ts * 1e3:g} ms"
 
 
-def front(tuned: Tuned, path: str | Path) -> Path:
-    """Draw the Pareto front and save it. Returns the path."""
-    return save(front_figure(tuned), path)
+def front(tuned: Tuned, path: str | Path | None = None) -> Figure:
+    """Draw the Pareto front of a search, and save it where a path is given."""
+    return _saved(front_figure(tuned), path)
 
 
-def stroke(run: Trajectory, path: str | Path | None = None, published: Published | None = None) -> Path:
-    """Draw a run and save it, by default as build/NAME_SCENARIO.png. Returns the path."""
-    return save(
-        stroke_figure(run, published), _default_path(run, run.scenario.name) if path is None else path
-    )
+def stroke(run: Trajectory, path: str | Path | None = None, published: Published | None = None) -> Figure:
+    """Draw a run, and save it where a path is given.
+
+    published : figures of the machine's paper, drawn beside the run's
+
+    Example: `malta.report.stroke(run)` as the last line of a cell shows the picture.
+    """
+    return _saved(stroke_figure(run, published), path)
 
 
-def experiment(e: Experiment, path: str | Path | None = None, published: Published | None = None) -> Path:
-    """Draw an experiment and save it, by default as build/NAME_EXPERIMENT.png. Returns the path."""
-    return save(experiment_figure(e, published), _default_path(e.run, e.name) if path is None else path)
-
-
-def _default_path(run: Trajectory, name: str) -> Path:
-    return Path("build") / f"{run.controller.name}_{name}.png"
+def experiment(e: Experiment, path: str | Path | None = None, published: Published | None = None) -> Figure:
+    """Draw an experiment, and save it where a path is given; arguments as those of `stroke`."""
+    return _saved(experiment_figure(e, published), path)
 
 
 def robustness(
     found: Robustness,
     name: str,
     uncertainty: Mapping[str, float],
-    path: str | Path,
+    path: str | Path | None = None,
     position: str = "position",
     worst: Mapping[str, Gain] | None = None,
-) -> Path:
-    """Draw the margins of a design stage by stage and save the figure; arguments as those of `chain_figure`."""
-    return save(chain_figure(found, name, uncertainty, position, worst), Path(path))
+) -> Figure:
+    """Draw the margins of a design stage by stage, and save the figure where a path is given.
+
+    Other arguments as those of `chain_figure`.
+    """
+    return _saved(chain_figure(found, name, uncertainty, position, worst), path)
 
 
 def loads(
-    plant: Plant, controller: Controller, path: str | Path, found: Sequence[Recovery] | None = None
-) -> Path:
-    """Draw the answer to a constant load from outside and the compliance over frequency, and save the figure.
+    plant: Plant,
+    controller: Controller,
+    path: str | Path | None = None,
+    found: Sequence[Recovery] | None = None,
+) -> Figure:
+    """Draw the answer to a constant load from outside and the compliance over frequency; save it where a path is given.
 
     found : malta.recovery(plant, controller), where it is known already
 
     Example: `malta.report.loads(plant, controller, "build/robust_loads.png")`
     """
     found = recovery(plant, controller) if found is None else found
-    return save(recovery_figure(plant, controller, found), Path(path))
+    return _saved(recovery_figure(plant, controller, found), path)
 
 
-def sensitivity(found: Sensitivity, path: str | Path) -> Path:
-    """Draw the Sobol indices of a campaign's yield and merits, and save the figure."""
-    return save(sensitivity_figure(found), Path(path))
+def sensitivity(found: Sensitivity, path: str | Path | None = None) -> Figure:
+    """Draw the Sobol indices of a campaign's yield and merits, and save the figure where a path is given."""
+    return _saved(sensitivity_figure(found), path)
 
 
-def campaign(found: Campaign | Summary, folder: str | Path, published: Published | None = None) -> list[Path]:
-    """Draw the results of a campaign: distributions.png, yield.png and worst.png in a folder. Returns their paths.
+class CampaignFigures(NamedTuple):
+    """The figures of a campaign; a notebook shows all three as the value of a cell."""
+
+    distributions: Figure
+    endings: Figure  # how runs end over the parameters
+    worst: Figure
+
+    def _ipython_display_(self) -> None:
+        """Show every figure, as IPython asks for it."""
+        from IPython.display import display
+
+        for figure in self:
+            display(figure)  # type: ignore[no-untyped-call]
+
+
+CAMPAIGN_FILES = ("distributions.png", "yield.png", "worst.png")  # of CampaignFigures, in a campaign's folder
+
+
+def campaign(
+    found: Campaign | Summary, folder: str | Path | None = None, published: Published | None = None
+) -> CampaignFigures:
+    """Draw the results of a campaign, and save them as CAMPAIGN_FILES where a folder is given.
 
     published : figures of the machine's paper; a summary has its own
+
+    Example: `malta.report.campaign(found).worst` is the figure of the worst runs.
     """
     from malta.campaigns.summary import Bounds, as_summary
 
     summary = as_summary(found, Bounds(published))
-    return [
-        save(draw(summary), Path(folder) / name)
-        for name, draw in (
-            ("distributions.png", distributions_figure),
-            ("yield.png", yield_figure),
-            ("worst.png", worst_figure),
-        )
-    ]
+    figures = CampaignFigures(distributions_figure(summary), yield_figure(summary), worst_figure(summary))
+    for figure, name in zip(figures, CAMPAIGN_FILES, strict=True):
+        _saved(figure, None if folder is None else Path(folder) / name)
+    return figures
+
+
+def _saved(figure: Figure, path: str | Path | None) -> Figure:
+    """The figure itself, saved where a path is given."""
+    if path is not None:
+        save(figure, path)
+    return figure

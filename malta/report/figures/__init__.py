@@ -42,6 +42,7 @@ from malta.report.figures.parts import (
     finish_axes,
     front_lines,
     micro,
+    new_figure,
     new_page,
 )
 from malta.report.figures.parts import MORE as MORE
@@ -96,18 +97,16 @@ def save(figure: Figure, path: str | Path) -> Path:
 def encode_figure(figure: Figure, path: Path) -> bytes:
     """The content of a .png or .svg file of a figure. Raises InputError for another suffix of its path."""
     import matplotlib
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    from malta.report.figures.inline import png_of
 
     if path.suffix not in (".png", ".svg"):
         raise InputError(path, "", f"suffix {path.suffix!r}", "one of .png, .svg")
+    if path.suffix == ".png":
+        return png_of(figure)
     buffer = io.BytesIO()
     with matplotlib.rc_context({"svg.hashsalt": "malta", "svg.fonttype": "none"}):
-        if path.suffix == ".svg":
-            figure.savefig(buffer, format="svg", metadata={"Date": None})
-        else:
-            # Figure.savefig first draws once for the layout, which only tight bounding boxes need.
-            canvas: Any = FigureCanvasAgg(figure)
-            canvas.print_png(buffer, metadata={"Software": None}, pil_kwargs={"compress_level": 1})
+        figure.savefig(buffer, format="svg", metadata={"Date": None})
     return buffer.getvalue()
 
 
@@ -198,20 +197,16 @@ def _draw_currents(axes: Axes, x: str, run: Trajectory) -> None:
 
 def front_figure(tuned: Tuned) -> Figure:
     """The Pareto front of a search: force noise and motion against the proven margin, the chosen trial ringed."""
-    from matplotlib.figure import Figure
     from matplotlib.ticker import LogLocator
 
     asked, chosen, front = tuned.spec.specification, tuned.trial, tuned.front
-    figure = Figure(figsize=(9.0, 4.6), dpi=120)
-    figure.subplots_adjust(left=0.1, right=0.98, bottom=0.115, top=0.8, wspace=0.25)
     taken = next((one for one in front if one.values == chosen.values), chosen)
     others = [one for one in front if one is not taken] or [taken]
     kept = (
         "keeps all that is asked for" if tuned.reached else f"misses {tuned.binding.name.replace('_', ' ')}"
     )
     found = f"{tuned.trials} trials; taken: margin {100 * taken.figures['margin']:.0f} %, which {kept}"
-    figure.suptitle(f"{tuned.spec.name}: margin against noise", fontsize=11, y=0.985)
-    figure.text(0.5, 0.925, found, fontsize=9, color="#4a4a4a", ha="center", va="top")
+    figure = new_figure(f"{tuned.spec.name}: margin against noise", found, size=(9.0, 4.6), left=0.1)
     panels: Any = figure.subplots(1, 2)
     sides = (front_lines(tuned.spec.plant, taken.figures, trade) for trade in get_args(Trade))
     for axes, lines, y in zip(

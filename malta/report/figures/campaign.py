@@ -21,6 +21,7 @@ from malta.report.figures.parts import (
     finish_axes,
     legend_entries,
     micro,
+    new_figure,
     published_in_unit,
 )
 from malta.simulation.digest import LARGEST_FIGURE
@@ -237,24 +238,17 @@ def worst_figure(found: Campaign | Summary, published: Published | None = None) 
     return figure
 
 
-def _campaign_figure(found: Summary, what: str, **places: float) -> Figure:
+def _campaign_figure(found: Summary, what: str, **places: Any) -> Figure:
     """An empty figure whose title names the campaign, with its yield."""
-    from matplotlib.figure import Figure
-
     from malta.campaigns.plan import planned_run
 
     plan, share = found.plan, found.rate
-    figure = Figure(figsize=(9.0, 6.0), dpi=120)
-    usual = {"left": 0.085, "right": 0.98, "bottom": 0.085, "top": 0.86, "wspace": 0.25, "hspace": 0.3}
-    figure.subplots_adjust(**usual | places)
     wanted = planned_run(plan)
     flown = plan.scenario if wanted.label == plan.scenario else f"{plan.scenario} ({wanted.label})"
     title = f"{plan.controller.name}, {flown}, fidelity {wanted.scenario.fidelity}: {what}"
-    figure.suptitle(title, fontsize=11, y=0.985)
     text = f"{share.passed} of {share.runs} runs completed: {100 * share.share:.4g} % "
     text += f"(95 %: {100 * share.low:.4g} to {100 * share.high:.4g} %)"
-    figure.text(0.5, 0.945, text, fontsize=9, color="#4a4a4a", ha="center", va="top")
-    return figure
+    return new_figure(title, text, **places)
 
 
 def _run_label(plan: Plan, index: int, verdict: float) -> str:

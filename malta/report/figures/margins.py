@@ -15,6 +15,7 @@ from malta.report.figures.parts import (
     NOTE,
     STYLES,
     draw_grid,
+    new_figure,
 )
 
 if TYPE_CHECKING:
@@ -43,13 +44,15 @@ def chain_figure(
     position : the machine's word for its travel, as "position z"
     worst : the largest |S| of each sensor over the uncertainty and all that the margin covers
     """
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(9.0, 6.0), dpi=120)
-    figure.subplots_adjust(left=0.21, right=0.97, bottom=0.09, top=0.86, wspace=0.12, hspace=0.45)
     box = ", ".join(f"{key} ±{100 * share:g} %" for key, share in uncertainty.items())
-    figure.suptitle(f"{name}: where the margin goes", fontsize=11, y=0.985)
-    figure.text(0.5, 0.945, f"100 %: {box}, all at once", fontsize=9, color="#4a4a4a", ha="center", va="top")
+    figure = new_figure(
+        f"{name}: where the margin goes",
+        f"100 %: {box}, all at once",
+        left=0.21,
+        right=0.97,
+        wspace=0.12,
+        hspace=0.45,
+    )
     extent = found.extent
     grid = figure.add_gridspec(
         2 if extent.course else 1, 2, height_ratios=(1.6, 1) if extent.course else None

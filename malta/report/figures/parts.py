@@ -50,17 +50,33 @@ def runs_of(e: Experiment) -> list[Trajectory]:
     return [case.run for case in e.cases]
 
 
-def new_page(runs: Sequence[Trajectory], what: str, found: str, **places: float) -> Figure:
-    """An empty figure whose title names the design, the fidelity and the subject; `found` is its line of results."""
-    from matplotlib.figure import Figure
+def new_figure(
+    title: str = "", found: str = "", *, size: tuple[float, float] = (9.0, 6.0), **places: Any
+) -> Figure:
+    """An empty figure that shows itself in a notebook: as the value of a cell, or by `display(figure)`.
 
-    figure = Figure(figsize=(9.0, 6.0), dpi=120)
-    usual = {"left": 0.085, "right": 0.98, "bottom": 0.085, "top": 0.86, "wspace": 0.25, "hspace": 0.3}
-    figure.subplots_adjust(**usual | places)
-    fidelities = " and ".join(dict.fromkeys(run.scenario.fidelity for run in runs))
-    figure.suptitle(f"{runs[0].controller.name}, fidelity {fidelities}: {what}", fontsize=11, y=0.985)
-    figure.text(0.5, 0.945, found, fontsize=9, color="#4a4a4a", ha="center", va="top")
+    title, found : what the figure shows, and below it a line of results
+    size : width and height, inch
+    places : left, right, bottom, top, wspace, hspace of the panels, as Figure.subplots_adjust takes them
+
+    Example: `axes = new_figure("robust: Bode plot", size=(9.0, 4.6)).subplots(2, 1, sharex=True)`
+    """
+    from malta.report.figures.inline import InlineFigure
+
+    figure, height = InlineFigure(figsize=size, dpi=120), size[1]
+    usual = {"left": 0.085, "right": 0.98, "bottom": 0.51 / height, "top": 1 - 0.84 / height}
+    figure.subplots_adjust(**usual | {"wspace": 0.25, "hspace": 0.3} | places)
+    if title:
+        figure.suptitle(title, fontsize=11, y=1 - 0.09 / height)
+    if found:
+        figure.text(0.5, 1 - 0.33 / height, found, fontsize=9, color="#4a4a4a", ha="center", va="top")
     return figure
+
+
+def new_page(runs: Sequence[Trajectory], what: str, found: str, **places: Any) -> Figure:
+    """A new figure whose title names the design, the fidelity and the subject; `found` is its line of results."""
+    fidelities = " and ".join(dict.fromkeys(run.scenario.fidelity for run in runs))
+    return new_figure(f"{runs[0].controller.name}, fidelity {fidelities}: {what}", found, **places)
 
 
 def ending_text(run: Trajectory) -> str:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from malta.margins.recovery import PushedLoop, furthest, load_vector
-from malta.report.figures.parts import MORE, STYLES, finish_axes, micro
+from malta.report.figures.parts import MORE, STYLES, finish_axes, micro, new_figure
 from malta.units import unit_factor
 
 if TYPE_CHECKING:
@@ -33,19 +33,19 @@ def recovery_figure(plant: Plant, controller: Controller, found: Sequence[Recove
 
     A row for each pair of units, as um under N. Raises CheckError for an unstable loop.
     """
-    from matplotlib.figure import Figure
-
     picked = furthest(found)
     units = {s.name: s.unit for s in plant.disturbances}
     rows: dict[tuple[str, str], list[tuple[Recovery, Deviation]]] = {}
     for load, output in picked:
         rows.setdefault((output.unit, units[load.name]), []).append((load, output))
     height = 0.9 + 2.4 * len(rows)
-    figure = Figure(figsize=(9.0, height), dpi=120)
-    figure.subplots_adjust(
-        left=0.09, right=0.98, bottom=0.6 / height, top=0.97 - 0.62 / height, hspace=0.5, wspace=0.24
+    figure = new_figure(
+        f"{controller.name}: how a load from outside is carried",
+        size=(9.0, height),
+        bottom=0.6 / height,
+        top=0.97 - 0.62 / height,
+        hspace=0.5,
     )
-    figure.suptitle(f"{controller.name}: how a load from outside is carried", fontsize=11, y=0.99)
     panels = figure.subplots(len(rows), 2, squeeze=False)
     loop = PushedLoop.of(plant, controller)
     answer = loop.answer()

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from malta.report.figures.parts import add_shared_legend, finish_axes
+from malta.report.figures.parts import add_shared_legend, finish_axes, new_figure
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -26,24 +26,19 @@ BARS: dict[str, dict[str, Any]] = {
 
 def sensitivity_figure(found: Sensitivity) -> Figure:
     """First-order and total Sobol indices with their 95 % intervals: of the yield, then of figures of merit."""
-    from matplotlib.figure import Figure
-
     from malta.report.tables.campaign import run_text
 
     panels = {"yield": found.of_yield, **found.of_merits}
     shown = {label: indices for label, indices in panels.items() if indices}
-    figure = Figure(figsize=(9.0, 6.0), dpi=120)
-    places = {"left": 0.07, "right": 0.98, "top": 0.83, "wspace": 0.22}
+    places: dict[str, Any] = {"left": 0.07, "right": 0.98, "top": 0.83, "wspace": 0.22}
     places |= (
         {"bottom": 0.09, "hspace": 0.42} if len(found.factors) <= UPRIGHT else {"bottom": 0.15, "hspace": 0.7}
     )
-    figure.subplots_adjust(**places)
     title = f"{found.plan.controller.name}, {run_text(found.plan)}: what costs yield"
-    figure.suptitle(title, fontsize=11, y=0.985)
     share = found.within
     text = f"{found.limit.kept}: {100 * share.share:.4g} % "
     text += f"(95 %: {100 * share.low:.4g} to {100 * share.high:.4g} %), {found.runs} runs"
-    figure.text(0.5, 0.945, text, fontsize=9, color="#4a4a4a", ha="center", va="top")
+    figure = new_figure(title, text, **places)
     every = figure.subplots(*PANELS).ravel()
     for axes, (label, indices) in zip(every, shown.items(), strict=False):
         _draw_indices(axes, label, found.factors, indices)
