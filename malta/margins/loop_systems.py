@@ -37,6 +37,8 @@ class LoopSystems:
     S_forces: Any
     T_forces: Any
     tracking: Any  # references at rest, as "z_ref" -> outputs
+    plant: Plant
+    controller: Controller
 
 
 @on_one_thread
@@ -74,4 +76,6 @@ def loop_systems(plant: Plant, controller: Controller) -> LoopSystems:
         S_forces=named_system("S_forces", forces, forces, Ts, loop.closed, pushed, v, one_m),
         T_forces=named_system("T_forces", forces, forces, Ts, loop.closed, pushed, -v),
         tracking=named_system("tracking", references, outputs, Ts, loop.closed, sent, y),
+        plant=plant,
+        controller=controller,
     )

@@ -113,15 +113,20 @@ def named_system(
     """
     import control  # imports matplotlib and takes a second: only where it is used
 
-    n, size = len(A), len(A) + max(B.shape[1], len(C))
     D = np.zeros((len(C), B.shape[1])) + D
-    whole = np.zeros((size, size))
-    whole[: n + len(C), : n + B.shape[1]] = np.block([[A, B], [C, np.zeros_like(D)]])
-    _, (units, _) = matrix_balance(whole, permute=False, separate=True)
-    t = units[:n]
+    t = balanced_units(A, B, C)
     return control.ss(
         A * t / t[:, None], B / t[:, None], C * t, D, Ts, name=name, inputs=inputs, outputs=outputs
     )
+
+
+def balanced_units(A: FloatArray, B: FloatArray, C: FloatArray) -> FloatArray:
+    """Powers of two t for states x = t xi, in which A t / t', B / t' and C t have rows and columns of like size."""
+    n, size = len(A), len(A) + max(B.shape[1], len(C))
+    whole = np.zeros((size, size))
+    whole[: n + len(C), : n + B.shape[1]] = np.block([[A, B], [C, np.zeros((len(C), B.shape[1]))]])
+    _, (units, _) = matrix_balance(whole, permute=False, separate=True)
+    return np.asarray(units[:n])
 
 
 def reference_names(c: Controller) -> list[str]:
