@@ -3,6 +3,7 @@
 # make slow     the tests that take longer
 # make fuzz     damaged input of every kind, for FUZZ_SECONDS (600): see tests/fuzz
 # make mutants  faults in the code that refuses, proves, seals and limits: tests have to notice each; see tests/mutants
+# make docs     the pages of docs/ to docs/_build: warnings are errors; `make links` asks the addresses they point to
 # make check    what CI runs: lint, format, types, both kinds of tests
 PYTHON ?= python3
 VENV := .venv
@@ -13,7 +14,7 @@ export PIP_CONSTRAINT := $(CURDIR)/constraints.txt
 export OPENBLAS_NUM_THREADS ?= 1
 export MPLCONFIGDIR ?= $(CURDIR)/$(VENV)/matplotlib
 
-.PHONY: design test slow fuzz mutants check lint types notebooks bench figures clean
+.PHONY: design test slow fuzz mutants check lint types notebooks docs links bench figures clean
 
 design: $(VENV)/runtime
 	$(BIN)/malta design
@@ -33,7 +34,7 @@ fuzz: $(VENV)/dev
 mutants: $(VENV)/dev
 	PYTHONPATH=tests $(BIN)/python -m mutants
 
-check: lint types test slow
+check: lint types docs test slow
 
 lint: $(VENV)/dev
 	$(BIN)/ruff check .
@@ -52,6 +53,13 @@ notebooks: $(VENV)/dev
 	  $(BIN)/jupyter nbconvert --log-level=ERROR --to html $$name.ipynb || exit 1; \
 	done
 	@ls build/*.html
+
+docs: $(VENV)/docs
+	$(BIN)/python -m sphinx -W --keep-going -n -q docs docs/_build/html
+	@echo docs/_build/html/index.html
+
+links: $(VENV)/docs  # needs a network
+	$(BIN)/python -m sphinx -W --keep-going -q -b linkcheck docs docs/_build/links
 
 bench: $(VENV)/dev
 	$(BIN)/python bench/run.py
@@ -72,7 +80,11 @@ $(VENV)/runtime: $(BIN)/python pyproject.toml constraints.txt
 
 $(VENV)/dev: $(BIN)/python pyproject.toml constraints.txt
 	$(PIP) install --quiet --editable '.[dev]'
+	touch $@ $(VENV)/runtime $(VENV)/docs
+
+$(VENV)/docs: $(BIN)/python pyproject.toml constraints.txt
+	$(PIP) install --quiet --editable '.[docs]'
 	touch $@ $(VENV)/runtime
 
 clean:
-	rm -rf $(VENV) build *.egg-info
+	rm -rf $(VENV) build docs/_build *.egg-info

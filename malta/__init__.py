@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:  # the contents page, as type checkers and readers see it
     from malta import gains as gains
     from malta import report as report
+    from malta import schemas as schemas
     from malta.campaigns.limits import limit_of as limit_of
     from malta.campaigns.plan import Plan as Plan
     from malta.campaigns.rare import rare_event as rare_event
@@ -133,7 +134,7 @@ _NAMES = {  # the same, for the first use of each name
     "margins.uncertain": ("Compensator", "UncertainSystem"),
     "margins.verify": ("Margins", "verify"),
 }
-_MODULES = {"gains": "gains", "references": "simulation.references", "report": "report"}
+_MODULES = {"gains": "gains", "references": "simulation.references", "report": "report", "schemas": "schemas"}
 _MODULE_OF = {name: module for module, names in _NAMES.items() for name in names}
 
 __all__ = [*_MODULE_OF, *_MODULES]

@@ -27,6 +27,7 @@ ORDER = (
         "synthesis",
         "margins",
         "gains",
+        "schemas",
         "simulation",
         "firmware",
         "campaigns",

@@ -39,7 +39,7 @@ class Sourced(Quantity):
     source: StrictStr
 
 
-class _MachineFile(Record):
+class MachineFile(Record):
     machine: Annotated[StrictStr, Checked(pattern=r"^[^\x00-\x1f]+$")]
     default_preset: StrictStr = ""
     parameters: dict[str, Sourced]
@@ -64,7 +64,7 @@ def read(path: str | Path, preset: str | None = None) -> Any:
     Example: `malta.read("data/tubular.toml").m`
     """
     path = locate(path)
-    content = validate(_MachineFile, load_toml(path), path)
+    content = validate(MachineFile, load_toml(path), path)
     presets = content.presets or {ONLY_PRESET: {}}
     if content.presets and not content.default_preset:
         raise InputError(path, "default_preset", "nothing", "this key, one of " + ", ".join(presets))
