@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import gc
 import hashlib
+import io
 import math
 import pickle
+import re
 import sys
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import pytest
+from rich.console import Console
 
 import malta
 from malta.cli import main as cli
@@ -230,6 +234,26 @@ def designs(_answers: Answers) -> dict[str, Design]:
 def design(request: pytest.FixtureRequest, designs: dict[str, Design]) -> Design:
     """Each shipped design in turn."""
     return designs[request.param]
+
+
+QUANTITY = re.compile(r"[-+±]*\d[\w.+-]*(?: (?:%|[munk]?(?:m|s|N|A|V|J|Hz|rad|kg|g))(?![\w/]))?")
+
+
+def printed(renderable: object, width: int = 100) -> str:
+    """As a terminal of some columns shows it: no line is longer, and nothing is cut off."""
+    stream = io.StringIO()
+    Console(file=stream, width=width, markup=False, highlight=False, emoji=False).print(renderable)
+    text = stream.getvalue()
+    assert max(len(line.rstrip()) for line in text.splitlines()) <= width
+    assert "…" not in text
+    return text
+
+
+def assert_folds(renderable: object, *widths: int) -> None:
+    """Narrow terminals show every number, with its unit on the same line, as often as a wide one does."""
+    whole = Counter(QUANTITY.findall(printed(renderable, 1000)))
+    for width in widths:
+        assert not whole - Counter(QUANTITY.findall(printed(renderable, width)))
 
 
 def one_sentence(err: str) -> str:

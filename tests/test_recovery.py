@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import math
 from dataclasses import replace
@@ -10,8 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import pytest
-from conftest import ROOT
-from rich.console import Console
+from conftest import ROOT, assert_folds, printed
 
 import malta
 from malta.errors import CheckError, InputError
@@ -167,10 +165,8 @@ def test_every_machine_has_a_table_of_80_columns(file: str) -> None:
     assert all(0 < d.largest < 1e-2 for _, d in rows)
     # A load's own unit: a force moves a distance, a torque turns.
     assert all((d.unit == "rad") == r.name.startswith("T") for r, d in rows)
-    stream = io.StringIO()
-    Console(file=stream, width=80).print(recovery_table(found, plant))
-    lines = stream.getvalue().splitlines()
-    assert max(map(len, lines)) <= 80
+    lines = printed(recovery_table(found, plant), 80).splitlines()
+    assert_folds(recovery_table(found, plant), 80, 60, 40)
     assert sum(line.strip().startswith("1 N") for line in lines) == len(rows)
 
 

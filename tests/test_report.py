@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from conftest import assert_folds, printed
 from rich.console import Console
 
 import malta
@@ -70,16 +71,6 @@ def pictured(flown: Flown, published: dict[str, Any], tmp_path_factory: pytest.T
         return figure, drawn(figure, folder)
 
     return made
-
-
-def printed(renderable: object) -> str:
-    """As a terminal of 100 columns shows it; nothing is cut off."""
-    buffer = io.StringIO()
-    Console(file=buffer, width=100, markup=False, highlight=False, emoji=False).print(renderable)
-    text = buffer.getvalue()
-    assert max(len(line.rstrip()) for line in text.splitlines()) <= 100
-    assert "…" not in text
-    return text
 
 
 def drawn(figure: Figure, folder: Path) -> bytes:
@@ -413,6 +404,7 @@ def test_the_table_of_an_experiment_fits_and_names_its_merits(
             assert f"{case.run.verdict.time * 1e3:.1f}" in flat
     assert ("published" in text) == any(m.published for m in (*e.merits, *e.cases[0].merits))
     assert "published" not in printed(report.experiment_table(e))
+    assert_folds(report.experiment_table(e, published), 80, 60, 40)
 
 
 def test_tables_show_what_the_paper_prints(flown: Flown, published: dict[str, Any]) -> None:

@@ -39,16 +39,13 @@ def compare_flights(
     return found
 
 
-def comparison_table(found: dict[Precision, list[Difference]]) -> Any:
+def comparison_table(title: str, found: dict[Precision, list[Difference]]) -> Any:
     """A table of the largest difference of each signal, as a share of its range."""
-    from rich.table import Table
+    from malta.report.tables.parts import add_row, new_table
 
-    table = Table(box=None, padding=(0, 2, 0, 0))
-    table.add_column("signal")
-    for head in ("largest", "C, double", "C, float"):
-        table.add_column(head, justify="right")
+    table = new_table(title, "signal", "largest", "C, double", "C, float")
     for double, single in zip(found["double"], found["float"], strict=True):
-        table.add_row(double.name, f"{double.range:.3g}", f"{double.share:.1e}", f"{single.share:.1e}")
+        add_row(table, double.name, f"{double.range:.3g}", f"{double.share:.1e}", f"{single.share:.1e}")
     return table
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -19,7 +20,8 @@ from malta.files import json_text
 if TYPE_CHECKING:
     from rich.console import Console
 
-WIDTH = 100  # columns of tables on wide terminals, in files and in pipes
+WIDTH = 100  # columns of tables on wide terminals, and in files and pipes where COLUMNS says nothing else
+NARROWEST = 20  # columns; COLUMNS below is no width
 PATIENCE = 5.0  # s, from the first bounds of a margin to the first line about them
 INTERVAL = 2.0  # s, between the lines
 NO_COMPILER = "no C compiler: simulated on CasADi's virtual machine, some hundred times slower"
@@ -27,13 +29,26 @@ LINES = 10.0  # s, between lines of how far other work is
 
 
 def make_console() -> Console:
-    """A console on standard output that prints text as it stands, at most WIDTH columns wide."""
+    """A console on standard output that prints text as it stands.
+
+    A terminal has its own width, up to WIDTH; files and pipes have that of the variable COLUMNS, else WIDTH.
+    """
     from rich.console import Console
 
     console = Console(highlight=False, markup=False, emoji=False)
-    if not console.is_terminal or console.width > WIDTH:
-        console.width = WIDTH
+    if console.is_terminal:
+        console.width = min(console.width, WIDTH)
+    else:
+        columns = os.environ.get("COLUMNS", "")
+        console.width = max(int(columns), NARROWEST) if re.fullmatch(r"0*[1-9]\d{0,3}", columns) else WIDTH
     return console
+
+
+def print_text(console: Console, text: str) -> None:
+    """Print a paragraph that folds to the console's width and parts no number from its unit."""
+    from malta.report.tables.layout import Paragraph
+
+    console.print(Paragraph(text))
 
 
 def print_written(console: Console, files: Iterable[Path]) -> None:

@@ -41,7 +41,7 @@ from malta.cli.options import (
     Substeps,
     Yes,
 )
-from malta.cli.output import make_console, print_json, print_note, print_written, progress_bar
+from malta.cli.output import make_console, print_json, print_note, print_text, print_written, progress_bar
 from malta.cli.patience import limit_time
 from malta.errors import CheckError, InputError
 
@@ -180,8 +180,7 @@ def simulate(
     else:
         _print_tables(gains, simulation, change or (), published, estimate=substeps is not None)
         for title, found in zip(titles(list(compared)), compared.values(), strict=True):
-            make_console().print(f"\n{title}")
-            make_console().print(comparison_table(found))
+            make_console().print(comparison_table(title, found))
         print_written(make_console(), files)
     _conclude(gains, simulation, engine)
 
@@ -282,17 +281,14 @@ def _print_tables(
 
     result = simulation.experiment
     run, console = result.run, make_console()
-    console.print(
-        f"{gains}: {simulation.scenario}, fidelity {run.scenario.fidelity}",
-        *changes,
-        f"-> {result.outcome}",
-    )
+    what = " ".join([f"fidelity {run.scenario.fidelity}", *changes])
+    print_text(console, f"{gains}: {simulation.scenario}, {what} -> {result.outcome}")
     console.print(report.experiment_table(result, published))
     for line in report.limits_text(result):
-        console.print(line)
+        print_text(console, line)
     if estimate:
         units = "/".join(dict.fromkeys(signal.unit for signal in run.plant.outputs))
-        console.print(f"integration error, estimated: {integration_error(run):.1g} {units}")
+        print_text(console, f"integration error, estimated: {integration_error(run):.1g} {units}")
 
 
 def _conclude(gains: Path, simulation: Simulation, engine: str) -> None:

@@ -9,7 +9,7 @@ import typer
 
 from malta.cli.documents import campaign_document, status_document
 from malta.cli.inputs import design_of, read_controller
-from malta.cli.output import make_console, print_json, print_note, progress_bar
+from malta.cli.output import make_console, print_json, print_note, print_text, progress_bar
 from malta.cli.patience import duration_text
 from malta.errors import InputError
 
@@ -23,8 +23,8 @@ def print_tables(gains: Path, found: Summary, worst: int) -> None:
     from malta import report
 
     plan, console = found.plan, make_console()
-    console.print(f"{gains}: {report.run_text(plan)}, {found.runs} of {plan.samples} machines")
-    console.print(f"{report.box_text(plan)}; {plan.sampler}, seed {plan.seed}")
+    print_text(console, f"{gains}: {report.run_text(plan)}, {found.runs} of {plan.samples} machines")
+    print_text(console, f"{report.box_text(plan)}; {plan.sampler}, seed {plan.seed}")
     if not found.runs:
         return
     console.print(report.campaign_tables(found, worst=worst))
@@ -74,7 +74,7 @@ def show_status(ctx: typer.Context, folder: Path, gains: Path | None, options: S
         print_note(f"{file}: a damaged block, which the campaign will fly again")
     console = make_console()
     for line in _status_lines(found):
-        console.print(line, soft_wrap=True)
+        print_text(console, line)
     print_tables(gains, found.summary, options.worst)
 
 

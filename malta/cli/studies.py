@@ -14,6 +14,7 @@ from malta.cli.output import (
     make_console,
     print_json,
     print_note,
+    print_text,
     print_written,
     progress_bar,
 )
@@ -115,8 +116,8 @@ def run_study(study: Study, setting: Setting) -> None:
         print_json(head | {"files": names, "manifest": setting.plan.manifest} | outcome.document)
     else:
         console = make_console()
-        console.print(f"{setting.gains}: {report.run_text(setting.plan)}")
-        console.print(f"{report.box_text(setting.plan)}; seed {setting.plan.seed}")
+        print_text(console, f"{setting.gains}: {report.run_text(setting.plan)}")
+        print_text(console, f"{report.box_text(setting.plan)}; seed {setting.plan.seed}")
         for part in outcome.parts:
             console.print(part, soft_wrap=isinstance(part, str))
         print_written(console, outcome.files)

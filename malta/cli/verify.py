@@ -13,7 +13,7 @@ from malta.cli.assignments import read_shares
 from malta.cli.documents import margins_document, recovery_document, robustness_document
 from malta.cli.inputs import change_machine, read_controller
 from malta.cli.options import AsJson, Changes, GainFile, MachineFile
-from malta.cli.output import make_console, margin_progress, print_json, print_written
+from malta.cli.output import make_console, margin_progress, print_json, print_text, print_written
 from malta.errors import CheckError, InputError
 
 if TYPE_CHECKING:
@@ -232,17 +232,15 @@ def _print_tables(
     controller, margins, robust = loop.controller, analysis.margins, analysis.robustness
     box = "  ".join(f"{name} +-{100 * share:g} %" for name, share in loop.box.items())
     console = make_console()
-    console.print(
-        f"{loop.gains}: {controller.name}, {loop.plant.name}, preset {controller.parameters.preset}",
-        *changes,
-    )
+    preset = f"{controller.parameters.preset} {' '.join(changes)}".rstrip()
+    print_text(console, f"{loop.gains}: {controller.name}, {loop.plant.name}, preset {preset}")
     for table in (
         report.poles_table(loop.model, None if changes else published),
         report.loop_poles_table(margins),
         report.bandwidth_table(margins, published),
         report.sensitivity_table(margins),
         *([report.recovery_table(analysis.recovered, loop.plant)] if analysis.recovered else []),
-        f"Uncertainty: {box}\n",
+        report.Paragraph(f"Uncertainty: {box}\n"),
         report.chain_table(robust),
         report.disk_table(robust, controller.sample_time),
         report.gang_table(robust, loop.plant),

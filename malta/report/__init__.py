@@ -32,6 +32,7 @@ from malta.report.tables.design import sensitivity_table as sensitivity_table
 from malta.report.tables.experiments import experiment_table as experiment_table
 from malta.report.tables.experiments import limits_text as limits_text
 from malta.report.tables.experiments import scenarios_table as scenarios_table
+from malta.report.tables.layout import Paragraph as Paragraph
 from malta.report.tables.margins import chain_table as chain_table
 from malta.report.tables.margins import disk_table as disk_table
 from malta.report.tables.margins import gang_table as gang_table

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from rich.console import Group
-from rich.text import Text
 
 from malta.margins.recovery import recovery
 from malta.margins.verify import Margins
@@ -27,6 +26,7 @@ from malta.report.figures.recovery import recovery_figure
 from malta.report.figures.sensitivity import sensitivity_figure
 from malta.report.tables.design import bandwidth_table, loop_poles_table, poles_table, sensitivity_table
 from malta.report.tables.experiments import experiment_table
+from malta.report.tables.layout import Paragraph
 from malta.report.tables.margins import is_of_whole_travel
 from malta.simulation.trajectory import Trajectory
 from malta.synthesis.lqg import continuous_poles
@@ -57,8 +57,8 @@ def design_page(
         made = f"PID, {_rate_text(spec.sample_time)}"
     made += ", commutated for the predicted place" if spec.commutation == "predicted" else ""
     return Group(
-        Text(f"{spec.name}: {spec.summary}", style="bold"),
-        f"{model.plant.name}, preset {spec.parameters.preset}, {made}",
+        Paragraph(f"{spec.name}: {spec.summary}", style="bold"),
+        Paragraph(f"{model.plant.name}, preset {spec.parameters.preset}, {made}"),
         "",
         poles_table(model, published),
         loop_poles_table(margins, continuous_poles(model, spec.weights) if spec.pid is None else None),
@@ -69,13 +69,13 @@ def design_page(
     )
 
 
-def _margin_text(margins: Margins) -> Text:
+def _margin_text(margins: Margins) -> Paragraph:
     box_text = " ".join(f"{name} +-{100 * share:g} %" for name, share in margins.uncertainty.items())
     assert margins.robust is not None
     where = str(margins.extent).replace("the travel", "the whole travel")
     if not is_of_whole_travel(margins.robust):
         where = "in the middle and at the end of the travel"
-    return Text(f"{f'Parametric margin {where}'.rstrip()} ({box_text}): {margins.robust}\n")
+    return Paragraph(f"{f'Parametric margin {where}'.rstrip()} ({box_text}): {margins.robust}\n")
 
 
 def _rate_text(Ts: float) -> str:

@@ -93,7 +93,6 @@ def _findings_table(found: Summary) -> Table:
         "figure",
         *heads,
     )
-    table.columns[0].no_wrap = True
     for m in found.merits:
         if not m.sketch.count:
             continue

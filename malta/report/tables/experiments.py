@@ -69,8 +69,6 @@ def _cases_table(e: Experiment, published: Published | None) -> Table:
     ended = any(not case.run.verdict.completed for case in e.cases)
     heads = ["verdict", "at [ms]"] if ended else []
     table = new_table(e.question, "case", *heads, *map(merit_heading, fullest))
-    longest = max(len(case.label) for case in e.cases)
-    table.columns[0].no_wrap = longest <= WORDY
     if ended:
         table.columns[1].justify = "left"
     for case in e.cases:
@@ -86,7 +84,6 @@ def _cases_table(e: Experiment, published: Published | None) -> Table:
 
 
 COLUMNS = 6  # largest number of figures of merit beside each other
-WORDY = 44  # letters; a longer name of a case is broken into lines
 
 
 def _transposed(e: Experiment, fullest: Sequence[Merit]) -> Table:
@@ -104,7 +101,6 @@ def _transposed(e: Experiment, fullest: Sequence[Merit]) -> Table:
 def _list_of_merits(e: Experiment) -> Table:
     """The figures of merit of all cases below each other."""
     table = new_table(e.question, "case", "figure", "ours")
-    table.columns[0].no_wrap = table.columns[1].no_wrap = True
     table.columns[1].justify = "left"
     for case in e.cases:
         end = case.run.verdict

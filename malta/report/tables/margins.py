@@ -173,7 +173,6 @@ def tolerance_table(
             change = "nothing proven" if t is None else f"{100 * sign * t * uncertainty[name]:+.1f} %"
             cells.append(f"{change} and further" if t is not None and margin.exhausted else change)
         add_row(table, name, *cells, f"{100 * shares.get(name, 0):.0f} %")
-    table.columns[0].no_wrap = True
     if found.mass is not None:
         t = found.mass.lower
         more = " and more" if found.mass.exhausted else ""

@@ -1,14 +1,14 @@
-"""Rows, cells and headings that several tables share; all fit a terminal of 100 columns."""
+"""Rows, cells and headings that several tables share."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from rich import box
 from rich.table import Table
 from rich.text import Text
 
 from malta.report.figures.parts import Published, number, published_in_unit
+from malta.report.tables.layout import FoldingTable, new_sheet
 from malta.units import in_unit
 
 if TYPE_CHECKING:
@@ -35,13 +35,10 @@ def published_text(merit: Merit, published: Published) -> str:
     return f"<= {value}" if merit.relation == "at most" else value
 
 
-def new_table(title: str, *columns: str) -> Table:
+def new_table(title: str, *columns: str) -> FoldingTable:
     """An empty table: the first column and columns of poles are left-aligned, the others right-aligned."""
-    heading = Text(title)  # a Text, because [ms] is markup to rich
-    table = Table(title=heading, title_justify="left", title_style="", box=box.SIMPLE_HEAD, pad_edge=False)
-    for i, column in enumerate(columns):
-        table.add_column(Text(column), justify="left" if i == 0 or column == "poles" else "right")
-    return table
+    sides = ("left" if i == 0 or heading == "poles" else "right" for i, heading in enumerate(columns))
+    return new_sheet(title, list(zip(columns, sides, strict=True)))
 
 
 def add_row(table: Table, *cells: str) -> None:

@@ -31,8 +31,7 @@ def recovery_table(found: Sequence[Recovery], plant: Plant) -> Table:
     after = [f"left after {t:g} s" for t in (found[0].after if found else ())]
     heads = ("load", "output", "moves by", *after, f"{100 * SHARE:g} % after [s]", "peak over w", "at rad/s")
     table = new_table("A constant load from outside, and the output that it moves furthest", *heads)
-    for column in table.columns[:2]:  # words
-        column.justify, column.no_wrap = "left", True
+    table.columns[1].justify = "left"
     for recovered, d in furthest(found):
         load = ", ".join(f"{size:g} {units[name]} {name}" for name, size in recovered.load.items())
         fine = FINE.get(d.unit, d.unit)

@@ -9,19 +9,16 @@ from typing import TYPE_CHECKING
 from rich.console import Group
 from rich.table import Table
 
+from malta.report.tables.layout import Paragraph
 from malta.report.tables.parts import add_row, new_table
 from malta.units import in_unit
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from malta.campaigns.plan import Plan
     from malta.campaigns.rare import RareEvent
     from malta.campaigns.result import Rate
     from malta.campaigns.sensitivity import Index, Sensitivity
     from malta.campaigns.tolerance import Spread, Tolerances
-
-COLUMNS = 5  # of factors in one table
 
 
 def rare_event_tables(event: RareEvent) -> Group:
@@ -94,17 +91,12 @@ def _design_point_table(event: RareEvent) -> Table:
 
 def sensitivity_tables(found: Sensitivity) -> Group:
     """Total and first-order Sobol indices of the yield and of each figure of merit, by what varies."""
-    parts: list[Table | str] = [
-        f"yield: {share_text(found.within)} of the machines {found.limit.kept}; {found.runs} runs"
-    ]
+    said = f"yield: {share_text(found.within)} of the machines {found.limit.kept}; {found.runs} runs"
+    parts: list[Table | Paragraph] = [Paragraph(said)]
     if not (found.of_yield or any(found.of_merits.values())):
         return Group(*parts)
-    for k in range(0, len(found.factors), COLUMNS):
-        columns = range(k, min(k + COLUMNS, len(found.factors)))
-        parts.append(
-            _index_table("Total indices: a parameter, alone and with others", found, columns, total=True)
-        )
-        parts.append(_index_table("First-order indices: a parameter alone", found, columns, total=False))
+    parts.append(_index_table("Total indices: a parameter, alone and with others", found, total=True))
+    parts.append(_index_table("First-order indices: a parameter alone", found, total=False))
     return Group(*parts)
 
 
@@ -118,9 +110,8 @@ def sensitivity_sentence(found: Sensitivity) -> str:
     return ""
 
 
-def _index_table(title: str, found: Sensitivity, columns: Sequence[int], *, total: bool) -> Table:
-    table = new_table(f"{title}, with 95 % intervals", "figure", *(found.factors[k] for k in columns))
-    table.columns[0].no_wrap = True
+def _index_table(title: str, found: Sensitivity, *, total: bool) -> Table:
+    table = new_table(f"{title}, with 95 % intervals", "figure", *found.factors)
 
     def cell(index: Index) -> str:
         value, half = (index.total, index.total_half) if total else (index.first, index.first_half)
@@ -128,7 +119,7 @@ def _index_table(title: str, found: Sensitivity, columns: Sequence[int], *, tota
 
     for label, indices in {"yield": found.of_yield, **found.of_merits}.items():
         if indices:
-            add_row(table, label, *(cell(indices[k]) for k in columns))
+            add_row(table, label, *map(cell, indices))
     return table
 
 
