@@ -20,6 +20,7 @@ from malta.cli.design import design
 from malta.cli.export import export
 from malta.cli.new import new
 from malta.cli.output import print_error, print_note, silence
+from malta.cli.report import report
 from malta.cli.simulate import simulate
 from malta.cli.tune import tune
 from malta.cli.verify import verify
@@ -46,6 +47,7 @@ for command in (
     simulate,
     campaign,
     tune,
+    report,
     export,
     claims,
     new,

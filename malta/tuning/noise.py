@@ -32,9 +32,33 @@ def noise_variance(plant: Plant) -> FloatArray:
 
 def noise_of(loop: Loop, plant: Plant) -> Noise:
     """Compute the rms of the true outputs and of the commanded forces from the sensors' noise and steps."""
-    c, V = loop.control, noise_variance(plant)
+    return _noise_from(loop, noise_variance(plant), len(plant.inputs))
+
+
+def budget_of(loop: Loop, plant: Plant) -> Noise:
+    """Compute which sensors the noise at rest comes from: shares of each variance, p x p of motion, m x p of force.
+
+    A row without noise is zero.
+    """
+    V = noise_variance(plant)
+    parts = [_noise_from(loop, V * alone, len(plant.inputs)) for alone in np.eye(len(V))]
+    return Noise(_shares([part.motion for part in parts]), _shares([part.force for part in parts]))
+
+
+def _shares(sizes: list[FloatArray]) -> FloatArray:
+    """The share of each part in the sum of squares, a column for each part."""
+    squares = np.array(sizes).T ** 2
+    whole = squares.sum(axis=1, keepdims=True)
+    found: FloatArray = np.divide(squares, whole, out=np.zeros_like(squares), where=whole > 0)
+    return found
+
+
+def _noise_from(loop: Loop, V: FloatArray, m: int) -> Noise:
+    """The noise at rest from sensors of these variances; of m forces, behind which a loop may hand on readings."""
+    c = loop.control
     noise = np.vstack([loop.Bd @ c.D_y, c.B_y])
     X, n = covariance(loop.closed, noise * V @ noise.T), len(loop.Ad)
     command = np.hstack([c.D_y @ loop.Cd, c.C])
     out = np.diag(loop.outputs @ X[:n, :n] @ loop.outputs.T)
-    return Noise(np.sqrt(out), np.sqrt(np.diag(command @ X @ command.T + c.D_y * V @ c.D_y.T)))
+    force = np.diag(command @ X @ command.T + c.D_y * V @ c.D_y.T)[:m]
+    return Noise(np.sqrt(out), np.sqrt(force))

@@ -14,6 +14,7 @@ from malta.errors import InputError
 from malta.margins.loops import machine_loop
 from malta.margins.recovery import bounded_deviation, worst_along
 from malta.margins.verify import BANDWIDTHS, verify
+from malta.model.linearize import linearize
 from malta.simulation import references
 from malta.simulation.catalogue import experiment
 from malta.simulation.experiments import scenario_of
@@ -138,14 +139,20 @@ class SynthesizedDesign:
         return run
 
 
-def judge(spec: Spec) -> tuple[Outcome, ...]:
+def judge(spec: Spec, controller: Controller | None = None) -> tuple[Outcome, ...]:
     """Measure every requirement of a design: proven margin, verified loop, covariance, simulated experiments.
+
+    controller : of a gain file, in place of the one that the design file is synthesized to
 
     A PID's load errors come first, which no bound is asked of. What an unstable loop does not have fails.
 
     Raises InputError for a PID without [cost], and for a requirement that the machine does not have.
     """
-    design = SynthesizedDesign(spec, *model_and_controller(spec))
+    if controller is None:
+        model, controller = model_and_controller(spec)
+    else:
+        model = linearize(spec.plant, spec.plant.at(**spec.operating_point))
+    design = SynthesizedDesign(spec, model, controller)
     outcomes = _load_errors(design) if spec.pid else []
     known = requirements_for(spec.plant)
     for name, asked in spec.specification.items():

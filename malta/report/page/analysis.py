@@ -1,0 +1,187 @@
+"""All that the pages show of a loop, computed once: margins, loads, noise, the machine's main job, requirements."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, NamedTuple
+
+from malta.errors import CheckError, InputError
+from malta.margins.classical import Classical, classical_margins
+from malta.margins.loops import CurrentLoops, loaded_system, machine_loop
+from malta.margins.recovery import recovery
+from malta.margins.stages import robustness
+from malta.margins.travel import covers_travel, worst_sensitivities
+from malta.margins.verify import verify
+from malta.model.data import plant_of
+from malta.model.linearize import linearize
+from malta.model.plant import position_at
+from malta.simulation.catalogue import experiment, main_job
+from malta.simulation.experiments import progress_of_part
+from malta.simulation.payload import payload
+from malta.tuning.noise import noise_of
+from malta.tuning.outcomes import judge
+
+if TYPE_CHECKING:
+    from malta.campaigns.summary import Summary
+    from malta.margins.gain import Gain
+    from malta.margins.recovery import Recovery
+    from malta.margins.robust import Margin, Progress
+    from malta.margins.stages import Robustness
+    from malta.margins.verify import Margins
+    from malta.model.linearize import LinearModel
+    from malta.model.plant import Parameters, Plant
+    from malta.simulation.experiments import Experiment
+    from malta.simulation.payload import Payload
+    from malta.synthesis.controller import Controller
+    from malta.synthesis.requirements import Noise
+    from malta.synthesis.spec import Spec
+    from malta.tuning.outcomes import Outcome
+
+Share = Callable[[float], None]  # takes the share of the work that is done, 0 to 1
+
+
+class Subject(NamedTuple):
+    """A controller on a machine, with what a page needs to know beside them."""
+
+    controller: Controller
+    parameters: Parameters  # of the machine, which need not be those of the controller
+    box: Mapping[
+        str, float
+    ] = {}  # parameter -> share, either way, at margin 1; empty: no margin of parameters
+    spec: Spec | None = None  # the design file, whose [specification] is judged
+    source: str = ""  # the gain file, as the user named it
+    changes: Sequence[str] = ()  # of the machine, as "m=0.56"
+    provenance: Sequence[
+        tuple[str, str]
+    ] = ()  # of the gain file: its seal, and versions that it was written with
+    current_loops: CurrentLoops = "lag"
+
+    @property
+    def plant(self) -> Plant:
+        """The machine."""
+        return plant_of(self.parameters)
+
+    @property
+    def model(self) -> LinearModel:
+        """The machine's linear model at the controller's operating point."""
+        plant = self.plant
+        return linearize(plant, plant.point(self.controller.operating_point[0]))
+
+
+@dataclass(frozen=True, eq=False)
+class Analysis:
+    """The results for one subject. What an unstable loop or a machine does not have is None or empty."""
+
+    subject: Subject
+    plant: Plant
+    model: LinearModel
+    margins: Margins
+    robust: Robustness | None  # None without uncertain parameters
+    margin: (
+        Margin | None
+    )  # of all parameters at once, anywhere in the travel; None where it was not asked for
+    classical: Classical | None  # at the operating point
+    worst: Mapping[str, Gain]
+    recovered: Sequence[Recovery]
+    payload: Payload | None
+    noise: Noise | None
+    job: Experiment | None
+    outcomes: Sequence[Outcome]
+    campaigns: Sequence[Summary]
+    notes: Sequence[str]  # what could not be computed, and why
+
+
+def analyse(
+    subject: Subject,
+    *,
+    proof: bool = True,
+    stages: bool = True,
+    campaigns: Sequence[Summary] = (),
+    progress: Share | None = None,
+    bounds: Progress | None = None,
+) -> Analysis:
+    """Compute all that the pages show of a subject.
+
+    proof : whether margins of the parameters are proven
+    stages : whether every stage and each parameter alone has its margin, and |S| its worst case; otherwise the margin
+        of all parameters at once is the only one
+    progress : takes the share of the work that is done;  bounds : takes the bounds of the margin so far
+
+    Raises CheckError when numbers overflow or no input holds the machine.
+    """
+    plant, model, controller = subject.plant, subject.model, subject.controller
+    parts = 3
+    margins = verify(model, controller, subject.box if proof and not stages else None)
+    robust = _robust(subject, progress_of_part(progress, 0, parts), bounds, proof=proof and stages)
+    covered = stages and proof and bool(subject.box)
+    covered = covered and covers_travel(plant, controller, tuple(subject.box), subject.current_loops)
+    stable = margins.stable
+    notes: list[str] = []
+    job = _main_job(subject, notes, progress_of_part(progress, 1, parts))
+    found = Analysis(
+        subject,
+        plant,
+        model,
+        margins,
+        robust,
+        margin=margins.robust if robust is None or not stages else robust.travel if proof else None,
+        classical=_classical(subject) if stable else None,
+        worst=worst_sensitivities(plant, controller, subject.box, subject.current_loops) if covered else {},
+        recovered=recovery(plant, controller) if stable and plant.disturbances else (),
+        payload=payload(plant, controller) if stable and stages and proof else None,
+        noise=noise_of(machine_loop(model, controller), plant) if stable else None,
+        job=job,
+        outcomes=_outcomes(subject, notes),
+        campaigns=tuple(campaigns),
+        notes=tuple(notes),
+    )
+    if progress is not None:
+        progress(1.0)
+    return found
+
+
+def _robust(
+    subject: Subject, progress: Share | None, bounds: Progress | None, *, proof: bool
+) -> Robustness | None:
+    """Margins of the parameters and along the travel; None without uncertain parameters."""
+    if not subject.box:
+        return None
+    return robustness(
+        subject.plant, subject.controller, subject.box,
+        current_loops=subject.current_loops, progress=progress, bounds=bounds, proof=proof,
+    )  # fmt: skip
+
+
+def _classical(subject: Subject) -> Classical:
+    """Disk and delay margins and the gang of four at the operating point."""
+    plant, controller = subject.plant, subject.controller
+    at = position_at(plant, plant.point(controller.operating_point[0]).x)
+    system, law = loaded_system(plant, controller, at, subject.current_loops)
+    return classical_margins(system, law, [s.name for s in plant.outputs])
+
+
+def _main_job(subject: Subject, notes: list[str], progress: Share | None) -> Experiment | None:
+    """The machine's main job; None, with a note, where it cannot be simulated."""
+    plant = subject.plant
+    name = main_job(plant)
+    try:
+        found = experiment(name, plant, subject.controller, progress=progress)
+    except (InputError, CheckError) as error:
+        notes.append(f"{name} was not simulated: {error}")
+        return None
+    if found.interrupted or any(case.run.verdict.name == "interrupted" for case in found.cases):
+        raise KeyboardInterrupt
+    return found
+
+
+def _outcomes(subject: Subject, notes: list[str]) -> tuple[Outcome, ...]:
+    """What the design file asks for, measured with the gains of the gain file; none without a design file."""
+    if subject.spec is None:
+        return ()
+    spec = replace(subject.spec, parameters=subject.parameters)
+    try:
+        return judge(spec, subject.controller)
+    except (InputError, CheckError) as error:
+        notes.append(f"the requirements were not judged: {error}")
+        return ()

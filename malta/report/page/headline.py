@@ -1,0 +1,117 @@
+"""The key figures at the top of a report."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from malta.margins.verify import BANDWIDTHS, zone
+from malta.model.signals import FINE
+from malta.report.figures.parts import merit_phrase, micro, number
+from malta.units import in_unit
+
+if TYPE_CHECKING:
+    from malta.report.page.analysis import Analysis
+
+MERITS = 3  # of the main job, on the first screen
+
+
+class KeyFigure(NamedTuple):
+    """A figure that a reader looks for first."""
+
+    label: str
+    value: str
+    note: str = ""
+    state: str = ""  # "good", "near", "bad" or ""
+
+
+def key_figures(a: Analysis) -> list[KeyFigure]:
+    """List the figures that a reader looks for first: stability, margin, peak |S|, bandwidth, noise, main job."""
+    parts = (_stability, _margin, _peak, _bandwidth, _noise, _job, _requirements)
+    return [figure for part in parts for figure in part(a)]
+
+
+def _stability(a: Analysis) -> Iterator[KeyFigure]:
+    stable = a.margins.stable
+    largest = a.margins.stages[-1].spectral_radius
+    note = "with hold, delay and current loops" if stable else f"a pole at |λ| = {largest:.6f}"
+    yield KeyFigure("Loop", "stable" if stable else "UNSTABLE", note, "good" if stable else "bad")
+
+
+def _margin(a: Analysis) -> Iterator[KeyFigure]:
+    label = "Margin of the parameters"
+    if not a.subject.box:
+        yield KeyFigure(label, "not asked", "the gain file names no uncertain parameters")
+    elif a.margin is None:
+        yield KeyFigure(label, "not proven", "left out by --no-proof")
+    elif a.margin.lower is None:
+        yield KeyFigure(label, "nothing proven", a.margin.reason, "bad")
+    else:
+        box = ", ".join(f"{name} ±{100 * share:g} %" for name, share in a.subject.box.items())
+        state = "good" if a.margin.lower >= 1 else "bad"
+        where = f" {a.margins.extent}" if str(a.margins.extent) else ""
+        yield KeyFigure("Proven margin", f"{100 * a.margin.lower:.1f} %", f"of {box}{where}", state)
+
+
+def _peak(a: Analysis) -> Iterator[KeyFigure]:
+    if not a.margins.stable:
+        return
+    peaks = {name: peak for name, peak in a.margins.peak_sensitivity.items() if name != "sigma_max"}
+    name = max(peaks, key=lambda sensor: peaks[sensor])
+    found = zone(peaks[name])
+    state = {"A": "good", "B": "near"}.get(found, "bad")
+    note = f"zone {found} of ISO 14839-3, worst at {name}"
+    yield KeyFigure("Peak |S|", f"{peaks[name]:.2f}", note, state)
+
+
+def _bandwidth(a: Analysis) -> Iterator[KeyFigure]:
+    key = "sigma_max_T"
+    value = a.margins.bandwidth.get(key, math.nan)
+    if math.isfinite(value):
+        note = f"{number(value)} rad/s, {BANDWIDTHS[key]}"
+        yield KeyFigure("Bandwidth", f"{number(value / (2 * math.pi), 3)} Hz", note)
+
+
+def _noise(a: Analysis) -> Iterator[KeyFigure]:
+    if a.noise is None or not (np.any(a.noise.motion) or np.any(a.noise.force)):
+        return
+    for values, signals, label in (
+        (a.noise.motion, a.plant.outputs, "Motion at rest"),
+        (a.noise.force, a.plant.inputs, "Commands at rest"),
+    ):
+        largest: dict[str, tuple[float, str]] = {}  # by unit
+        for signal, value in zip(signals, values.tolist(), strict=True):
+            largest[signal.unit] = max(largest.get(signal.unit, (0.0, "")), (value, signal.name))
+        texts = []
+        for unit, (value, _) in largest.items():
+            fine = FINE.get(unit, unit)
+            shown = "" if fine == "1" else f" {micro(fine)}"
+            texts.append(f"{number(in_unit(value, fine), 3)}{shown}")
+        names = ", ".join(name for _, name in largest.values())
+        yield KeyFigure(label, " · ".join(texts), f"rms of the worst: {names}")
+
+
+def _job(a: Analysis) -> Iterator[KeyFigure]:
+    if a.job is None:
+        return
+    outcome, label = a.job.outcome, a.job.name.replace("-", " ").replace("_", " ").capitalize()
+    state = "bad" if a.job.failed else "good"
+    short = "completed" if not a.job.failed else outcome
+    fidelity = f"simulated, fidelity {a.job.run.scenario.fidelity}"
+    yield KeyFigure(label, short, outcome if short != outcome and a.job.failed else fidelity, state)
+    for merit in a.job.merits[:MERITS]:
+        if math.isfinite(merit.value):
+            yield KeyFigure(merit.label.capitalize(), merit_phrase(merit), label.lower())
+
+
+def _requirements(a: Analysis) -> Iterator[KeyFigure]:
+    asked = [one for one in a.outcomes if one.asked is not None]
+    if asked:
+        held = sum(one.holds for one in asked)
+        state = "good" if held == len(asked) else "bad"
+        yield KeyFigure(
+            "Requirements", f"{held} of {len(asked)} hold", "[specification] of the design file", state
+        )

@@ -1,0 +1,119 @@
+"""The report of a gain file: one page in HTML, and its figures as a PDF."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from malta.report.page.analysis import Analysis, Subject, analyse
+from malta.report.page.document import Front, Page, render
+from malta.report.page.headline import key_figures
+from malta.report.page.sections import report_sections
+
+if TYPE_CHECKING:
+    from malta.campaigns.summary import Summary
+    from malta.gains.schema import GainFile
+    from malta.model.plant import Parameters
+    from malta.synthesis.controller import Controller
+    from malta.synthesis.spec import Spec
+
+WORK = 0.9  # share of the work that is done when all is computed; the rest is drawing
+
+
+def gain_page(
+    gains: str | Path | Controller,
+    *,
+    parameters: Parameters | None = None,
+    uncertainty: Mapping[str, float] | None = None,
+    spec: Spec | None = None,
+    campaigns: Sequence[Summary] = (),
+    proof: bool = True,
+) -> Page:
+    """Report a gain file, or a controller, as one page in HTML that needs no network and no other file.
+
+    parameters : of the machine; None: those of the controller
+    uncertainty : parameter -> share, either way, at margin 1; None: those of the gain file, none of a controller
+    spec : the design file, whose [specification] is judged;  campaigns : summaries of campaigns of these gains
+    proof : whether margins are proven, which takes seconds
+
+    A notebook shows the page; `save` writes it. Raises InputError and CheckError as `malta.gains.read` and
+    `malta.verify`.
+
+        malta.report.gain_page("design/gains/robust.json").save("build/robust_report.html")
+    """
+    subject = subject_of(gains, parameters=parameters, uncertainty=uncertainty, spec=spec)
+    return page_of(analyse(subject, proof=proof, campaigns=campaigns))
+
+
+def subject_of(
+    gains: str | Path | Controller,
+    *,
+    parameters: Parameters | None = None,
+    uncertainty: Mapping[str, float] | None = None,
+    spec: Spec | None = None,
+    changes: Sequence[str] = (),
+) -> Subject:
+    """Read what a page is about. Raises InputError as `malta.gains.read`."""
+    from malta.files import locate
+    from malta.gains.file import content_of, read
+
+    if not isinstance(gains, str | Path):
+        box = dict(uncertainty or {})
+        return Subject(gains, parameters or gains.parameters, box, spec, "", changes)
+    path = locate(gains)
+    controller = read(path)
+    file, _ = content_of(path)
+    box = dict(uncertainty_of(file) if uncertainty is None else uncertainty)
+    return Subject(
+        controller, parameters or controller.parameters, box, spec, str(gains), changes, provenance_of(file)
+    )
+
+
+def uncertainty_of(file: GainFile) -> Mapping[str, float]:
+    """The uncertain parameters that a gain file names; none where it names none."""
+    robust = file.verification.robust
+    return {} if robust is None else robust.uncertainty
+
+
+def provenance_of(file: GainFile) -> tuple[tuple[str, str], ...]:
+    """The seal of a gain file, and the versions that it was written with."""
+    written: dict[str, Any] = file.provenance.model_dump()
+    versions = tuple((f"written with {name}", str(value)) for name, value in written.items())
+    return (("sha256 of the gain file's content", file.sha256), *versions)
+
+
+def page_of(found: Analysis, progress: Callable[[float], None] | None = None) -> Page:
+    """Write an analysis as a page."""
+    c = found.subject.controller
+    changes = f", changed: {', '.join(found.subject.changes)}" if found.subject.changes else ""
+    about = f"Machine {found.plant.name}, preset {found.subject.parameters.preset}{changes}"
+    front = Front("Design report", c.name, about, key_figures(found), _foot(found))
+    return render(front, report_sections(found), progress)
+
+
+def _foot(found: Analysis) -> str:
+    seal = dict(found.subject.provenance).get("sha256 of the gain file's content", "")
+    return f"malta report of {found.subject.controller.name}" + (
+        f", gain file sha256 {seal[:16]}" if seal else ""
+    )
+
+
+def report_work(
+    subject: Subject,
+    *,
+    proof: bool,
+    campaigns: Sequence[Summary],
+    progress: Callable[[float], None] | None,
+    bounds: Callable[[float, float], None] | None,
+) -> tuple[Analysis, Page]:
+    """Analyse a subject and write its page, behind one measure of progress."""
+
+    def computed(share: float) -> None:
+        if progress is not None:
+            progress(WORK * share)
+
+    found = analyse(subject, proof=proof, campaigns=campaigns, progress=computed, bounds=bounds)
+    return found, page_of(
+        found, None if progress is None else lambda share: progress(WORK + (1 - WORK) * share)
+    )

@@ -1,0 +1,272 @@
+"""Figures of merit of a loop: identifiers with units, words, and which way is better. One table of meanings.
+
+Headlines of reports, columns of comparisons and their JSON documents take their figures from here.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, Literal, NamedTuple
+
+import numpy as np
+
+from malta.margins.recovery import furthest
+from malta.margins.verify import BANDWIDTHS
+from malta.model.signals import FINE
+from malta.report.figures.parts import UNITS, micro, number
+from malta.units import base_exponents, in_unit, unit_factor
+
+if TYPE_CHECKING:
+    from malta.report.page.analysis import Analysis
+
+Better = Literal["high", "low", ""]  # "": neither
+Scope = Literal[
+    "loop", "box", "machine"
+]  # what two designs share for a comparison of the figure to make sense
+ROOTS = ("m s^0.5", "rad s^0.5")  # units of load errors, which are no products of whole powers
+SI_UNITS = ("m", "s", "rad", "N", "N m", "A", "V", "kg", "J", "1/s", "m/s", "rad/s", "m/N", "N/m", "m/s^2")
+
+
+class Meaning(NamedTuple):
+    """What a kind of figures is."""
+
+    group: str
+    better: Better
+    scope: Scope
+    unit: str = "1"  # for display
+    key_unit: str = ""  # the end of the identifier
+
+
+MEANINGS: dict[str, Meaning] = {
+    "stable": Meaning("stability and margins", "high", "loop"),
+    "margin_proven": Meaning("stability and margins", "high", "box", "percent"),
+    "margin_lost_at": Meaning("stability and margins", "high", "box", "percent"),
+    "disk": Meaning("stability and margins", "high", "loop"),
+    "delay_margin": Meaning("stability and margins", "high", "loop", "us", "s"),
+    "mass_margin": Meaning("stability and margins", "high", "machine", "kg", "kg"),
+    "payload": Meaning("stability and margins", "high", "machine", "kg", "kg"),
+    "peak_s": Meaning("sensitivity", "low", "loop"),
+    "peak_s_of": Meaning("sensitivity", "low", "machine"),
+    "peak_t": Meaning("sensitivity", "low", "loop"),
+    "bandwidth": Meaning("bandwidth and poles", "high", "loop", "rad/s", "rad_per_s"),
+    "natural": Meaning("bandwidth and poles", "", "loop", "rad/s", "rad_per_s"),
+    "slowest_pole": Meaning("bandwidth and poles", "high", "loop", "rad/s", "rad_per_s"),
+    "damping": Meaning("bandwidth and poles", "high", "loop"),
+    "motion": Meaning("noise at rest", "low", "machine"),
+    "command": Meaning("noise at rest", "low", "machine"),
+    "load_moves": Meaning("a constant load from outside", "low", "machine"),
+    "load_settles": Meaning("a constant load from outside", "low", "machine", "ms", "s"),
+    "compliance": Meaning("a constant load from outside", "low", "machine"),
+    "job_lower": Meaning("main job", "low", "machine"),
+    "job_higher": Meaning("main job", "high", "machine"),
+    "job": Meaning("main job", "", "machine"),
+    "requirements": Meaning("requirements", "high", "machine"),
+    "at_most": Meaning("requirements", "low", "machine"),
+    "at_least": Meaning("requirements", "high", "machine"),
+}
+# Words in the names of the experiments' figures of merit.
+HIGHER = re.compile(
+    r"payload|carried|efficiency|stiffness|inside the clearance|lowest|smallest stair|slow landings"
+)
+NEITHER = re.compile(
+    r"reference|over fastest|^moved$|its speed|thrust per|drive constant|fitted|largest stair"
+)
+
+
+class Score(NamedTuple):
+    """A figure of merit of a design."""
+
+    kind: str  # of MEANINGS
+    key: str  # identifier with its unit
+    label: str
+    value: float  # SI
+    unit: str  # for display
+    factor: float  # from SI to it
+
+    @property
+    def meaning(self) -> Meaning:
+        """What figures of this kind are."""
+        return MEANINGS[self.kind]
+
+    @property
+    def text(self) -> str:
+        """The value in its unit, with four digits."""
+        if self.kind == "stable":
+            return "yes" if self.value else "NO"
+        if math.isnan(self.value):
+            return "none"
+        if math.isinf(self.value):
+            return "any"
+        return number(self.factor * self.value) if self.value else "0"
+
+    @property
+    def heading(self) -> str:
+        """The label with the unit in brackets."""
+        shown = {"percent": "%", "1": ""}.get(self.unit, micro(self.unit))
+        return f"{self.label} [{shown}]" if shown else self.label
+
+
+def identifier(*parts: str) -> str:
+    """Words as one identifier of letters, digits and underscores.
+
+    >>> identifier("rise, 10-90 %", "s")
+    'rise_10_90_s'
+    """
+    return re.sub(r"\W+", "_", "_".join(part for part in parts if part), flags=re.ASCII).strip("_").lower()
+
+
+def unit_word(unit: str) -> str:
+    """An SI unit as the end of an identifier: "rad_per_s" of rad/s; "" for a plain number."""
+    return "" if unit in ("1", "percent") else identifier(unit.replace("/", " per ").replace("^", ""))
+
+
+def scores_of(found: Analysis) -> list[Score]:
+    """List the figures of merit of a loop, in the order of their groups."""
+    parts = (_margins, _sensitivities, _bandwidths, _noise, _loads, _job, _requirements)
+    return [score for part in parts for score in part(found)]
+
+
+def _score(kind: str, name: str, label: str, value: float, unit: str = "", key_unit: str = "") -> Score:
+    meaning = MEANINGS[kind]
+    key = identifier(name, key_unit or meaning.key_unit)
+    unit = unit or meaning.unit
+    factor, shown = UNITS[unit] if unit in ROOTS else (in_unit(1.0, unit), unit)
+    return Score(kind, key, label, float(value), shown, factor)
+
+
+def _margins(a: Analysis) -> Iterator[Score]:
+    yield _score("stable", "stable", "stable on the machine", float(a.margins.stable))
+    if a.margin is not None:
+        where = f", {a.margins.extent}" if str(a.margins.extent) else ""
+        yield _score(
+            "margin_proven", "margin_proven", f"margin of parameters, proven{where}", a.margin.lower or 0.0
+        )
+        yield _score("margin_lost_at", "margin_lost_at", "lost at", a.margin.upper)
+    classical = a.classical
+    if classical is None:
+        return
+    for disk in classical.disks:
+        yield _score("disk", f"disk_margin {disk.channels}", f"disk margin, {disk.channels}", disk.size)
+    smallest = min(classical.delay.values())
+    yield _score("delay_margin", "delay_margin", "delay margin, smallest", smallest)
+    if a.robust is not None and a.robust.mass is not None and a.margin is not None:
+        yield _score("mass_margin", "mass_margin", "mass margin, linear loop", a.robust.mass.lower or 0.0)
+    if a.payload is not None:
+        yield _score("payload", "payload_held", "payload held at rest", a.payload.held)
+        if not math.isnan(a.payload.carried):
+            yield _score("payload", "payload_carried", "payload in flight", a.payload.carried)
+
+
+def _sensitivities(a: Analysis) -> Iterator[Score]:
+    peaks = a.margins.peak_sensitivity
+    sensors = {name: peak for name, peak in peaks.items() if name != "sigma_max"}
+    worst = max(sensors.values()) if a.margins.stable else math.nan
+    yield _score("peak_s", "peak_sensitivity", "peak |S| of the worst sensor", worst)
+    yield _score("peak_s", "peak_sensitivity_sigma_max", "peak sigma_max(S)", peaks["sigma_max"])
+    for name, peak in sensors.items():
+        yield _score("peak_s_of", f"peak_sensitivity {name}", f"peak |S| at {name}", peak)
+    if a.classical is not None:
+        largest = max(gang[1] for gang in a.classical.gang.values())
+        yield _score("peak_t", "peak_complementary", "peak |T| of the worst sensor", largest)
+
+
+def _bandwidths(a: Analysis) -> Iterator[Score]:
+    for key, value in a.margins.bandwidth.items():
+        kind = "natural" if key.startswith("w_n") else "bandwidth"
+        yield _score(kind, f"bandwidth_{key}", BANDWIDTHS[key], value)
+    poles = a.margins.poles.closed_loop
+    if len(poles) and a.margins.stable:
+        yield _score("slowest_pole", "slowest_pole", "decay of the slowest pole", -poles.real.max())
+        damping = -poles.real / np.maximum(np.abs(poles), 1e-300)
+        yield _score("damping", "smallest_damping", "smallest damping ratio", damping.min())
+
+
+def _noise(a: Analysis) -> Iterator[Score]:
+    if a.noise is None:
+        return
+    for signal, value in zip(a.plant.outputs, a.noise.motion, strict=True):
+        fine, words = FINE.get(signal.unit, signal.unit), f"motion {signal.name}, rms"
+        yield _score("motion", f"motion {signal.name} rms", words, value, fine, unit_word(signal.unit))
+    for signal, value in zip(a.plant.inputs, a.noise.force, strict=True):
+        words = f"command {signal.name}, rms"
+        yield _score(
+            "command", f"command {signal.name} rms", words, value, signal.unit, unit_word(signal.unit)
+        )
+
+
+def _loads(a: Analysis) -> Iterator[Score]:
+    units = {s.name: s.unit for s in a.plant.disturbances}
+    for load, output in furthest(a.recovered):
+        fine, name, unit = FINE.get(output.unit, output.unit), f"load {load.name}", unit_word(output.unit)
+        size = f"1 {units[load.name]} {load.name}"
+        label = f"{size} moves {output.output} by"
+        yield _score("load_moves", f"{name} moves {output.output}", label, output.largest, fine, unit)
+        yield _score("load_settles", f"{name} settles", f"{size}: within 1 % after", output.settled)
+        label = f"{size}: largest over frequency"
+        yield _score("compliance", f"{name} compliance", label, output.compliance, fine, unit)
+
+
+def _job(a: Analysis) -> Iterator[Score]:
+    if a.job is None:
+        return
+    several = len(a.job.cases) > 1
+    rows = [("", merit) for merit in a.job.merits]
+    if several and [m.label for m in a.job.merits] == [m.label for m in a.job.cases[0].merits]:
+        rows = [(case.label, merit) for case in a.job.cases for merit in case.merits]
+    completed = all(case.run.verdict.completed for case in a.job.cases)
+    yield _score("job_higher", f"{a.job.name} completed", f"{a.job.name}: runs completed", float(completed))
+    for case, merit in rows:
+        kind = "job_lower"
+        if NEITHER.search(merit.label):
+            kind = "job"
+        elif HIGHER.search(merit.label):
+            kind = "job_higher"
+        label = f"{case}: {merit.label}" if case else merit.label
+        unit = unit_word(si_unit(merit.unit))
+        yield _score(kind, f"{a.job.name} {case} {merit.label}", label, merit.value, merit.unit, unit)
+
+
+def si_unit(unit: str) -> str:
+    """The SI unit of a unit for display: "s" of ms, "m" of um."""
+    if unit in ("1", "percent"):
+        return "1"
+    for known in SI_UNITS:
+        if base_exponents(known) == base_exponents(unit) and unit_factor(known, "unit") == 1.0:
+            return known
+    return unit
+
+
+def _requirements(a: Analysis) -> Iterator[Score]:
+    asked = [one for one in a.outcomes if one.asked is not None]
+    if asked:
+        kept = sum(one.holds for one in asked) / len(asked)
+        yield _score("requirements", "requirements_held", "requirements held", kept, "percent")
+    for one in a.outcomes:
+        more = f" {one.how}" if sum(other.name == one.name for other in a.outcomes) > 1 else ""
+        words = requirement_words(one.name) + (f", {one.how}" if more else "")
+        unit = FINE.get(one.unit, one.unit)
+        kind = "at_least" if one.at_least else "at_most"
+        yield _score(kind, f"requirement {one.name}{more}", words, one.found, unit, unit_word(one.unit))
+
+
+def requirement_words(name: str) -> str:
+    """A requirement in words, with the name of its signal or load as it is: "peak sensitivity", "recovery F_x left"."""
+    base, space, rest = name.partition(" ")
+    return base.replace("_", " ") + space + rest
+
+
+def best_of(scores: Sequence[Score | None]) -> tuple[bool, ...]:
+    """Which designs are better than some other: those that share the best value, none where all are as good.
+
+    Values that are written with the same digits are as good as each other.
+    """
+    known = [score for score in scores if score is not None and not math.isnan(score.value)]
+    if len(known) < 2 or not known[0].meaning.better:
+        return tuple(False for _ in scores)
+    pick = max if known[0].meaning.better == "high" else min
+    best = pick(known, key=lambda score: score.value).text
+    if all(score.text == best for score in known):
+        return tuple(False for _ in scores)
+    return tuple(score is not None and score.text == best for score in scores)

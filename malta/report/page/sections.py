@@ -1,0 +1,361 @@
+"""The sections of a report: what stands in each, as tables, figures and sentences."""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from importlib.metadata import version
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from malta.margins.loops import machine_loop
+from malta.model.published import published_figures
+from malta.model.signals import FINE
+from malta.report.figures.parts import UNITS, number
+from malta.report.page.design import design_entries, display_unit, kind_of
+from malta.report.page.scores import requirement_words
+from malta.report.page.sheets import Sheet, matrix_sheet, plain_sheet, sheets_of
+from malta.report.tables.campaign import box_text, campaign_tables, run_text
+from malta.report.tables.design import bandwidth_table, loop_poles_table, poles_table, sensitivity_table
+from malta.report.tables.experiments import experiment_table, limits_text
+from malta.report.tables.margins import (
+    chain_table,
+    disk_table,
+    gang_table,
+    places_table,
+    tolerance_table,
+    worst_case_table,
+)
+from malta.report.tables.recovery import recovery_table
+from malta.tuning.noise import budget_of
+from malta.units import in_unit
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from malta.report.page.analysis import Analysis
+    from malta.tuning.outcomes import Outcome
+
+NEAR = 0.95  # of a bound: a requirement holds, but hardly
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """A figure of a page: what draws it, and its caption."""
+
+    draw: Callable[[], Figure]
+    caption: str
+
+
+@dataclass(frozen=True)
+class Folded:
+    """Tables that a reader opens."""
+
+    summary: str
+    sheets: tuple[Sheet, ...]
+
+
+Item = Sheet | Picture | Folded | str  # a string is a paragraph
+
+
+@dataclass(frozen=True)
+class Section:
+    """A section of a page with its anchor."""
+
+    anchor: str
+    title: str
+    items: Sequence[Item] = field(default_factory=tuple)
+
+
+def report_sections(a: Analysis) -> list[Section]:
+    """List the sections of a report that have content."""
+    parts = (
+        ("design", "The design", _design),
+        ("requirements", "Requirements", _requirements),
+        ("poles", "Poles", _poles),
+        ("margins", "Margins, and where they go", _margins),
+        ("loop", "The loop over frequency", _loop),
+        ("loads", "Loads from outside", _loads),
+        ("job", _job_title(a), _job),
+        ("noise", "Noise at rest", _noise),
+        ("campaign", "Campaigns", _campaigns),
+        ("gains", "Gains", _gains),
+        ("provenance", "Provenance", _provenance),
+    )
+    sections = [Section(anchor, title, tuple(build(a))) for anchor, title, build in parts]
+    return [section for section in sections if section.items]
+
+
+def summary_sentences(a: Analysis) -> list[str]:
+    """Say in words what the design is."""
+    c, plant = a.subject.controller, a.plant
+    rate = f"{1e-3 / c.sample_time:g} kHz" if c.sample_time <= 1e-3 else f"every {c.sample_time * 1e3:g} ms"
+    law = kind_of(c)
+    article = "An" if law == "LQG" else "A"
+    text = f"{article} {law} controller of the machine {plant.name}, preset {a.subject.parameters.preset}: "
+    text += f"{_count(len(c.measurements), 'measurement')} and {_count(len(c.forces), 'command')} at {rate}, "
+    text += f"{_count(len(c.states), 'state')}."
+    sentences = [text]
+    parts = []
+    if c.integrating:
+        parts.append("sums the errors")
+    if c.observed:
+        parts.append("observes constant forces of disturbance")
+    if c.lagging:
+        parts.append("has the lag of the current loops in its model")
+    if c.delay:
+        parts.append(f"has a delay of {_count(c.delay, 'sample')} in its model")
+    if c.commutation is not None:
+        parts.append("commutates for the predicted place")
+    if parts:
+        sentences.append(f"It {_listed(parts)}.")
+    if plant.has_stroke:
+        sentences.append(f"The stroke moves {plant.stroke} by ±{in_unit(plant.travel, 'mm'):g} mm.")
+    if a.subject.spec is not None and a.subject.spec.summary:
+        sentences.insert(0, f"{a.subject.spec.summary.rstrip('.')}.")
+    if a.subject.changes:
+        sentences.append(
+            f"The machine is changed: {', '.join(a.subject.changes)}; the controller is not told."
+        )
+    if not a.margins.stable:
+        sentences.append("The loop is UNSTABLE on this machine: it has no sensitivities, margins or noise.")
+    return sentences
+
+
+def _count(number_of: int, what: str) -> str:
+    return f"{number_of} {what}{'' if number_of == 1 else 's'}"
+
+
+def _listed(parts: Sequence[str]) -> str:
+    return parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"
+
+
+def _design(a: Analysis) -> Iterator[Item]:
+    yield from summary_sentences(a)
+    groups: dict[str, list[list[str]]] = {}
+    for entry in design_entries(a.subject):
+        unit = display_unit(entry.unit, [entry.value])
+        groups.setdefault(entry.group, []).append([entry.name, entry.text(unit), "" if unit == "1" else unit])
+    heads = ("entry", "value", "unit")
+    sheets = [plain_sheet(group.capitalize(), heads, rows) for group, rows in groups.items()]
+    first = [sheet for sheet in sheets if sheet.title == "Law"]
+    yield from first
+    yield Folded("Machine, weights, noise and limits", tuple(sheet for sheet in sheets if sheet not in first))
+
+
+def _requirements(a: Analysis) -> Iterator[Item]:
+    if not a.outcomes:
+        return
+    if a.subject.spec is not None and a.subject.spec.sha256 != a.subject.controller.spec_sha256:
+        yield "The design file was changed after the gain file was written: these are its present requirements."
+    rows, marks = [], []
+    for one in a.outcomes:
+        state, word = _light(one)
+        scale, unit = UNITS.get(one.unit, (1.0, ""))
+        shown = f" {unit}" if unit else ""
+        asked = "as little as possible"
+        if one.asked is not None:
+            sign = ">=" if one.at_least else "<="
+            asked = f"{sign} {one.asked * scale:.4g}{shown}"
+        of = "" if one.asked is None else f"{100 * one.ratio:.1f} %"
+        rows.append(
+            [word, requirement_words(one.name), asked, f"{one.found * scale:.4g}{shown}", of, one.how]
+        )
+        marks.append((state, "", "", "", "", ""))
+    heads = ("", "requirement", "asked", "found", "of the limit", "from")
+    sheet = plain_sheet("[specification] of the design file, measured with these gains", heads, rows)
+    right = (False, False, True, True, True, False)
+    yield Sheet(sheet.title, sheet.heads, sheet.rows, right, tuple(marks))
+
+
+def _light(one: Outcome) -> tuple[str, str]:
+    """The traffic light of a requirement: its mark, and its word for readers without colours."""
+    if one.asked is None:
+        return "", "–"
+    if not one.holds:
+        return "bad", "✗ fails"
+    # A test that is passed or failed has its bound as its figure.
+    return ("near", "✓ barely") if NEAR < one.ratio < 1 else ("good", "✓ holds")
+
+
+def _poles(a: Analysis) -> Iterator[Item]:
+    published = None if a.subject.changes else published_figures(a.plant.name)
+    yield from sheets_of([poles_table(a.model, published), loop_poles_table(a.margins)])
+
+
+def _margins(a: Analysis) -> Iterator[Item]:
+    c, robust = a.subject.controller, a.robust
+    if robust is not None:
+        from malta.report.figures.margins import chain_figure
+
+        position = f"position {a.plant.stroke}"
+        yield Picture(
+            lambda: chain_figure(robust, c.name, a.subject.box, position, a.worst),
+            "Margins stage by stage, from full state feedback to the machine's own loop, and the peak sensitivity "
+            "of each stage with the zones of ISO 14839-3.",
+        )
+        yield from sheets_of([chain_table(robust), disk_table(robust, c.sample_time)])
+        if robust.tolerance:
+            yield from sheets_of([tolerance_table(robust, a.subject.box, a.payload)])
+        yield from sheets_of([places_table(robust, c.sample_time)])
+    elif a.classical is not None:
+        yield "The gain file names no uncertain parameters, so that no margin of parameters is shown."
+        yield _classical_sheet(a)
+    if a.worst:
+        yield from sheets_of([worst_case_table(a.worst)])
+
+
+def _classical_sheet(a: Analysis) -> Sheet:
+    """Disk and delay margins of a machine without uncertain parameters."""
+    assert a.classical is not None
+    Ts, rows = a.subject.controller.sample_time, []
+    for disk in a.classical.disks:
+        gain = f"{1 / disk.gain:.2f} .. {disk.gain:.2f}"
+        phase = f"+-{np.degrees(disk.phase):.1f}"
+        rows.append([disk.channels, f"{disk.size:.3f}", gain, phase, f"{disk.frequency:.4g}"])
+    for name, delay in a.classical.delay.items():
+        found = f"{delay * 1e6:.0f} us, {delay / Ts:.1f} samples" if np.isfinite(delay) else "any"
+        rows.append([f"delay at {name} alone", found, "", "", ""])
+    return plain_sheet(
+        "Disk and delay margins of the sampled loop",
+        ("factor in", "disk", "gain", "phase [deg]", "rad/s"),
+        rows,
+    )
+
+
+def _loop(a: Analysis) -> Iterator[Item]:
+    published = published_figures(a.plant.name)
+    tables: list[Any] = [sensitivity_table(a.margins), bandwidth_table(a.margins, published)]
+    yield from sheets_of(tables)
+    if a.robust is not None and a.robust.gang:
+        yield from sheets_of([gang_table(a.robust, a.plant)])
+    elif a.classical is not None:
+        rows = [[name, *(f"{value:.4g}" for value in gang)] for name, gang in a.classical.gang.items()]
+        heads = ("sensor", "|S|", "|T|", "from force |SP|, SI", "to force |FS|, SI")
+        yield plain_sheet("Gang of four, largest over frequency", heads, rows)
+
+
+def _loads(a: Analysis) -> Iterator[Item]:
+    if not a.recovered:
+        return
+    from malta.report.figures.recovery import recovery_figure
+
+    c = a.subject.controller
+    yield Picture(
+        lambda: recovery_figure(a.plant, c, a.recovered),
+        "Deviation after a unit step of each load from outside, and compliance over frequency, of the output that "
+        "the load moves furthest.",
+    )
+    yield from sheets_of([recovery_table(a.recovered, a.plant)])
+
+
+def _job_title(a: Analysis) -> str:
+    name = a.job.name if a.job is not None else "main job"
+    return f"{name.replace('_', ' ').replace('-', ' ').capitalize()}, simulated"
+
+
+def _job(a: Analysis) -> Iterator[Item]:
+    if a.job is None:
+        yield from (note for note in a.notes if "was not simulated" in note)
+        return
+    from malta.report.figures import experiment_figure
+
+    job, published = a.job, published_figures(a.plant.name)
+    yield f"{job.question} Fidelity {job.run.scenario.fidelity}: {job.outcome}."
+    yield Picture(
+        lambda: experiment_figure(job, published),
+        f"The machine's main job, {job.name}, on the nonlinear machine with sensors as built.",
+    )
+    yield from sheets_of(experiment_table(job, published))
+    yield from limits_text(job)
+
+
+def _noise(a: Analysis) -> Iterator[Item]:
+    if a.noise is None:
+        return
+    budget = budget_of(machine_loop(a.model, a.subject.controller), a.plant)
+    names = [s.name for s in a.plant.outputs]
+    for signals, totals, shares, title in (
+        (
+            a.plant.outputs,
+            a.noise.motion,
+            budget.motion,
+            "True motion at rest, rms, and the sensors that cause it",
+        ),
+        (
+            a.plant.inputs,
+            a.noise.force,
+            budget.force,
+            "Commands at rest, rms, and the sensors that cause them",
+        ),
+    ):
+        if not np.any(totals):
+            continue
+        rows = []
+        for k, signal in enumerate(signals):
+            fine = FINE.get(signal.unit, signal.unit)
+            parts = (f"{100 * share:.0f} %" if share >= 0.005 else "" for share in shares[k])
+            head = signal.name if fine == "1" else f"{signal.name} [{fine}]"
+            rows.append([head, number(in_unit(float(totals[k]), fine)), *parts])
+        heads = ("signal", "rms", *(f"from {name}" for name in names))
+        yield plain_sheet(f"{title}, as shares of the variance", heads, rows)
+    if not np.any(a.noise.motion):
+        yield "The machine's sensors have no noise and no steps: at rest nothing moves."
+
+
+def _campaigns(a: Analysis) -> Iterator[Item]:
+    from malta.report.figures.campaign import distributions_figure, worst_figure, yield_figure
+
+    for found in a.campaigns:
+        text = (
+            f"{run_text(found.plan)}: {found.runs} of {found.plan.samples} machines; {box_text(found.plan)}; "
+        )
+        yield text + f"{found.plan.sampler}, seed {found.plan.seed}."
+        if not found.runs:
+            continue
+        drawn: tuple[tuple[Callable[[Any], Figure], str], ...] = (
+            (yield_figure, "How the runs of the campaign end over the ranges of the parameters."),
+            (distributions_figure, "Distributions of the figures of merit over the completed runs."),
+            (worst_figure, "The worst runs of the campaign."),
+        )
+        for draw, caption in drawn:
+            yield Picture(lambda draw=draw, found=found: draw(found), caption)  # type: ignore[misc]
+        yield from sheets_of(campaign_tables(found))
+
+
+def _gains(a: Analysis) -> Iterator[Item]:
+    c = a.subject.controller
+    law = "v = K (ξ* − ξ̂) + Ki e, and ξ̂ = ξ + L (y − Cd ξ)"
+    yield f"{law}: rows and columns bear the names of their signals; all numbers are in SI units."
+    yield Folded(
+        f"K, {len(c.forces)} × {len(c.states)}: states to commands",
+        (matrix_sheet("K", c.K, c.forces, c.states),),
+    )
+    if c.integrating:
+        yield Folded(
+            f"Ki, {len(c.forces)} × {len(c.measurements)}: sums of errors to commands",
+            (matrix_sheet("Ki", c.Ki, c.forces, c.measurements),),
+        )
+    yield Folded(
+        f"L, {len(c.states)} × {len(c.measurements)}: innovations to states",
+        (matrix_sheet("L", c.L, c.states, c.measurements),),
+    )
+
+
+def _provenance(a: Analysis) -> Iterator[Item]:
+    c = a.subject.controller
+    rows = [
+        ["gain file", a.subject.source],
+        ["design", c.name],
+        ["sha256 of the design file's content", c.spec_sha256],
+        ["machine", a.plant.name],
+        ["preset of its data", a.subject.parameters.preset],
+        *([[key, value] for key, value in a.subject.provenance]),
+        ["this page: malta", version("malta")],
+        ["this page: Python", platform.python_version()],
+    ]
+    sheet = plain_sheet("Where the numbers come from", ("what", "which"), [row for row in rows if row[1]])
+    yield Sheet(sheet.title, sheet.heads, tuple((row[0], row[1]) for row in rows if row[1]), (False, False))
+    yield from (note for note in a.notes if "was not simulated" not in note)
