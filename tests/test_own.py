@@ -204,7 +204,7 @@ def test_only_what_the_paper_shows_has_its_bounds(toy: Plant, plant: Plant) -> N
 
 
 def test_the_gang_of_four_of_angles_says_its_units(toy: Plant) -> None:
-    from test_report import printed
+    from conftest import printed
 
     angles = replace(toy, outputs=(Signal("x1", "m"), Signal("a", "rad")))
     gang = {"x1": (1.0, 1.0, 2e-6, 3e6), "a": (1.0, 1.0, 4e-6, 5e6)}
@@ -217,7 +217,7 @@ def test_the_gang_of_four_of_angles_says_its_units(toy: Plant) -> None:
 
 
 def test_poles_of_damped_and_of_stable_machines(designs: dict[str, Design]) -> None:
-    from test_report import printed
+    from conftest import printed
 
     model = designs["calibrated"].model
     A = model.A.copy()

@@ -16,9 +16,8 @@ import casadi as ca
 import matplotlib
 import numpy as np
 import pytest
-from conftest import ROOT
+from conftest import ROOT, printed
 from matplotlib import pyplot
-from test_report import printed
 
 import malta
 from malta import report

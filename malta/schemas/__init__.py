@@ -1,4 +1,4 @@
-"""JSON schemas of the files that malta reads: made of the tables that the readers check with, and never written by hand.
+"""JSON schemas of the files that malta reads, made of the tables that the readers check with.
 
     malta.schemas.schema("gain")      a gain file (.json, and what .npz and .mat hold)
     malta.schemas.schema("design")    a design file (.toml)
