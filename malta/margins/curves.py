@@ -116,6 +116,16 @@ class LoopCurves:
         found[fine] = np.linalg.svd(G[fine], compute_uv=False)
         return found
 
+    def over(self, low: float, high: float) -> LoopCurves:
+        """The same curves from a lower and, of a continuous loop, to a higher frequency, rad/s."""
+        top = min(high, self.nyquist)
+        below = np.geomspace(low, self.w[0], BASE // 4)[:-1] if low < self.w[0] else np.zeros(0)
+        above = np.geomspace(self.w[-1], top, BASE // 4)[1:] if top > self.w[-1] else np.zeros(0)
+        more = np.concatenate([below, above])
+        if not len(more):
+            return self
+        return LoopCurves(self.loop, _merged(self.responses, respond(self.loop, more)))
+
     @cached_property
     def margins(self) -> tuple[ChannelMargins, ...]:
         """The margins of each channel at the sensors, the others closed."""

@@ -22,6 +22,16 @@ from malta.report.pages import loads as loads
 from malta.report.pages import robustness as robustness
 from malta.report.pages import sensitivity as sensitivity
 from malta.report.pages import stroke as stroke
+from malta.report.plots import bode as bode
+from malta.report.plots import gang_of_four as gang_of_four
+from malta.report.plots import load_response as load_response
+from malta.report.plots import nichols as nichols
+from malta.report.plots import nyquist as nyquist
+from malta.report.plots import pzmap as pzmap
+from malta.report.plots import root_locus as root_locus
+from malta.report.plots import sensitivity_curves as sensitivity_curves
+from malta.report.plots import sigma as sigma
+from malta.report.plots import step as step
 from malta.report.tables.campaign import box_text as box_text
 from malta.report.tables.campaign import campaign_tables as campaign_tables
 from malta.report.tables.campaign import run_text as run_text

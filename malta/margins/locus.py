@@ -1,0 +1,207 @@
+"""Root locus of any loop: the closed-loop poles over a parameter of the machine, or over a factor of the loop gain.
+
+Every sample is a set of eigenvalues. From sample to sample each pole goes to the one that the motion so far leads to,
+with the least sum of distances (assignment), and an interval in which a pole moves far is halved. The values at which
+the loop becomes stable or unstable are found by bisection.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy import optimize
+
+from malta.errors import CheckError, InputError
+from malta.margins.linear_loops import LinearLoop, Place, linear_loop
+from malta.model.data import plant_of
+from malta.model.parameters import units_of
+from malta.model.plant import Plant
+from malta.synthesis.riccati import eigenvalues
+from malta.threads import on_one_thread
+
+if TYPE_CHECKING:
+    from malta.model.plant import ComplexArray, FloatArray
+    from malta.synthesis.controller import Controller
+
+GAIN = "gain"  # the name of the factor of the loop gain
+SAMPLES = 41
+MOST = 121  # samples with those of halved intervals
+FAR = 0.08  # how far a pole may move from sample to sample, of twice its distance from zero
+NEAR = 1e-4  # of the range: intervals that are not halved
+EXACT = 1e-8  # of the range: the accuracy of the values at which stability changes
+
+
+@dataclass(frozen=True, eq=False)
+class RootLocus:
+    """Closed-loop poles over a parameter. Poles in rad/s; of sampled loops ln(z) / T, NaN for those of pure delay."""
+
+    name: str
+    parameter: str
+    unit: str
+    values: FloatArray  # k, ascending
+    poles: ComplexArray  # k x n, a column for each branch
+    nominal: float
+    nominal_poles: ComplexArray
+    changes: tuple[float, ...]  # values at which the loop becomes stable or unstable
+    sample_time: float | None  # s; None: continuous
+
+
+@on_one_thread
+def root_locus(
+    source: Any,
+    controller: Any = None,
+    *,
+    parameter: str = GAIN,
+    low: float | None = None,
+    high: float | None = None,
+    channel: str | None = None,
+    samples: int = SAMPLES,
+) -> RootLocus:
+    """The root locus of a loop.
+
+    source, controller : as `linear_loop` takes them; for a parameter of the machine, a plant and its controller
+    parameter : of the machine, by name; or "gain", a factor of the loop gain
+    low, high : of the parameter, SI; None: half and one and a half of its nominal value, of the gain 0.1 and 10
+    channel : the output or force whose gain is changed; None: all forces
+
+    Raises InputError for an unknown parameter, a range that is none, and a value that the machine cannot have.
+
+    >>> import control
+    >>> found = root_locus(control.tf([1], [1, 3, 2, 0]), low=1, high=10)
+    >>> [round(value, 3) for value in found.changes]
+    [6.0]
+    """
+    loop = linear_loop(source, controller)
+    matrix, nominal, unit = _family(source, controller, loop, parameter, channel)
+    usual = (0.1, 10.0) if parameter == GAIN else (0.5 * nominal, 1.5 * nominal)
+    low, high = (usual[0] if low is None else low), (usual[1] if high is None else high)
+    if not (math.isfinite(low) and math.isfinite(high) and low < high):
+        raise InputError(
+            "root locus", parameter, f"{low:g} to {high:g}", "a range from a lower to a higher value"
+        )
+    first = _values(low, high, nominal, samples, wide=parameter == GAIN)
+    values, found = _followed(matrix, first, loop.sample_time)
+    return RootLocus(
+        loop.name,
+        parameter,
+        unit,
+        values,
+        _in_rates(found, loop.sample_time),
+        nominal,
+        loop.closed_poles,
+        _changes(matrix, values, found, loop.sample_time),
+        loop.sample_time,
+    )
+
+
+Matrix = Callable[[float], "ComplexArray"]  # of a value: the eigenvalues of the closed loop, in differences
+
+
+def _family(
+    source: Any, controller: Any, loop: LinearLoop, parameter: str, channel: str | None
+) -> tuple[Matrix, float, str]:
+    """The eigenvalues by value, the nominal value and its unit."""
+    if parameter == GAIN:
+        outputs, inputs = ([s.name for s in signals] for signals in (loop.outputs, loop.inputs))
+        if channel is not None and channel not in (*outputs, *inputs):
+            raise InputError(
+                "root locus", "channel", repr(channel), "one of " + " ".join([*outputs, *inputs])
+            )
+        at: Place = "sensors" if channel in outputs else "forces"
+        chosen = np.array([channel in (None, name) for name in (outputs if at == "sensors" else inputs)])
+        return cache(lambda k: eigenvalues(loop.closed(np.where(chosen, k, 1.0), at).A)), 1.0, "1"
+    plant, law = source if isinstance(source, tuple) else (source, controller)
+    if not isinstance(plant, Plant):
+        raise InputError(
+            "root locus", parameter, "a loop without a machine", f"{GAIN!r}, or a plant and its controller"
+        )
+    units = units_of(plant.parameters)
+    if parameter not in units:
+        raise InputError("root locus", "parameter", repr(parameter), "one of " + " ".join([GAIN, *units]))
+    nominal = float(getattr(plant.parameters, parameter))
+    return cache(lambda value: _of_machine(plant, law, parameter, value)), nominal, units[parameter]
+
+
+def _of_machine(plant: Plant, controller: Controller, parameter: str, value: float) -> ComplexArray:
+    """The eigenvalues with another value of a parameter; the controller stays."""
+    try:
+        changed = plant_of(replace(plant.parameters, **{parameter: value}))
+        return eigenvalues(linear_loop(changed, controller).closed().A)
+    except InputError as error:
+        raise InputError("root locus", parameter, f"{value:g}", error.expected) from error
+    except CheckError as error:
+        raise InputError(
+            "root locus", parameter, f"{value:g} ({error})", "a machine that can be held"
+        ) from error
+
+
+def _values(low: float, high: float, nominal: float, samples: int, *, wide: bool) -> FloatArray:
+    """Values from low to high, of which one is the nominal one where it lies between."""
+    if wide and high > 0:
+        start = low if low > 0 else high * 1e-4
+        values = np.geomspace(start, high, samples)
+        values = np.append(low, values) if low < start else values
+    else:
+        values = np.linspace(low, high, samples)
+    return np.unique(np.append(values, nominal)) if low < nominal < high else values
+
+
+def _followed(matrix: Matrix, values: FloatArray, T: float | None) -> tuple[FloatArray, ComplexArray]:
+    """All samples with their eigenvalues in the order of the branches; intervals are halved where poles move far."""
+    known = values.tolist()
+    found = _in_order([matrix(value) for value in known])
+    while len(known) < MOST:
+        rates = _in_rates(found, T)
+        # Not of poles next to pure delay, nor where ln(z) jumps from one edge of its strip to the other.
+        seen = np.where(np.abs(rates) < (np.inf if T is None else 2 / T), rates, np.nan)
+        moved = np.abs(np.diff(seen, axis=0)) / np.maximum(np.abs(seen[1:]) + np.abs(seen[:-1]), 1e-300)
+        far = np.flatnonzero(np.nan_to_num(moved).max(axis=1, initial=0.0) > FAR)
+        wide = [k for k in far.tolist() if known[k + 1] - known[k] > NEAR * (known[-1] - known[0])]
+        if not wide:
+            break
+        for k in reversed(wide[: MOST - len(known)]):
+            known.insert(k + 1, (known[k] + known[k + 1]) / 2)
+        found = _in_order([matrix(value) for value in known])
+    return np.array(known), found
+
+
+def _in_order(sets: list[ComplexArray]) -> ComplexArray:
+    """Sets of eigenvalues as rows, each entry after the one in the row before from which it came."""
+    rows = [sets[0]]
+    for found in sets[1:]:
+        ahead = rows[-1] if len(rows) < 2 else 2 * rows[-1] - rows[-2]
+        cost = np.abs(ahead[:, None] - found) + np.abs(rows[-1][:, None] - found)
+        rows.append(found[optimize.linear_sum_assignment(cost)[1]])
+    return np.array(rows)
+
+
+def _in_rates(found: ComplexArray, T: float | None) -> ComplexArray:
+    """Eigenvalues in rad/s, NaN for those of pure delay."""
+    if T is None:
+        return found
+    gone = np.abs(1 + T * found) < 1e-6
+    return np.asarray(np.where(gone, complex(np.nan, np.nan), np.log1p(T * np.where(gone, 0, found)) / T))
+
+
+def _growth(found: ComplexArray, T: float | None) -> float:
+    """The growth of the worst eigenvalue, 1/s: positive where unstable."""
+    return float((found.real + 0.5 * (T or 0.0) * np.abs(found) ** 2).max(initial=-math.inf))
+
+
+def _changes(matrix: Matrix, values: FloatArray, found: ComplexArray, T: float | None) -> tuple[float, ...]:
+    """The values at which the worst pole crosses the boundary of stability."""
+    worst = [_growth(row, T) for row in found]
+    made = []
+    for k in range(len(values) - 1):
+        if worst[k] * worst[k + 1] < 0:
+            root: Any = optimize.brentq(
+                lambda value: _growth(matrix(value), T), values[k], values[k + 1],
+                xtol=EXACT * (values[-1] - values[0]),
+            )  # fmt: skip
+            made.append(float(root))
+    return tuple(made)

@@ -1,0 +1,294 @@
+"""Plots over frequency: Bode, singular values, sensitivities with their zones, gang of four."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from malta.margins.curves import LoopCurves
+from malta.margins.verify import ZONES, zone
+from malta.report.figures.parts import new_figure
+from malta.report.plots.parts import (
+    PLACES,
+    Sheet,
+    add_legend,
+    chosen_channels,
+    decibels,
+    draw_level,
+    finish_frequency,
+    having,
+    loops_of,
+    margins_text,
+    mark,
+    new_sheet,
+    note_style,
+    plain,
+    rate_text,
+    styles_of,
+    thin,
+    write_above,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from malta.margins.channels import ChannelMargins
+    from malta.margins.linear_loops import Place
+    from malta.model.plant import FloatArray
+
+RANGE = (-100.0, 120.0)  # dB, of a loop gain that is drawn
+Channel = str | Sequence[str] | None
+
+
+def bode(
+    source: Any, controller: Any = None, *, channel: Channel = None, at: Place = "sensors", axes: Any = None
+) -> Figure:
+    """Bode plot of the loop gain of each channel, the others closed, with its margins drawn in.
+
+    source, controller : a plant and its controller, any other loop of `malta.loop_curves`, or a table name -> loop
+    channel : the channel or channels, by name; None: all
+    at : where the loop is cut, "sensors" or "forces"
+    axes : magnitude and phase of every channel, as `figure.subplots(2, channels)` gives them; None: a new figure
+
+    Raises InputError for an unknown channel or another number of axes.
+
+    Example: `malta.report.bode(plant, controller, channel="z")`
+    """
+    loops = loops_of(source, controller)
+    chosen, styles = chosen_channels(loops, channel, at), styles_of(loops)
+    title = f"{title_of(loops)}: Bode plot {PLACES[at]}, one loop at a time, the others closed"
+    sheet = new_sheet(title, loops, len(chosen), axes, stacked=2, height=1.75)
+    for (name, _), (upper, lower) in zip(chosen, sheet.panels, strict=True):
+        lines, shown = [], []
+        for loop, curves, k, margins in having(loops, name, at):
+            gain, style = curves.responses.alone(at)[:, k], styles[loop]
+            phase = phase_of(curves.w, gain, margins)
+            upper.plot(curves.w, decibels(gain), **style)
+            lower.plot(curves.w, phase, **style)
+            _draw_margins(upper, lower, curves, phase, margins, style)
+            lines.append((margins_text(margins), style["color"]))
+            shown.append(curves)
+        _finish_bode(upper, lower, shown)
+        write_above(upper, name, lines)
+    return sheet.figure
+
+
+def title_of(loops: Mapping[str, LoopCurves]) -> str:
+    """The names of the loops in a title."""
+    names = list(loops)
+    text = names[0] if len(names) == 1 else f"{len(names)} loops"
+    return plain(text if len(text) <= 40 else f"{text[:37]}...")
+
+
+def phase_of(w: FloatArray, gain: Any, margins: ChannelMargins) -> FloatArray:
+    """The unwrapped phase in degrees, within a half turn of -180 degrees at the gain crossing of the phase margin."""
+    phase = np.degrees(np.unwrap(np.angle(gain)))
+    known = [c for c in margins.gain_crossings if c.frequency == margins.phase_frequency]
+    crossing = known[0].frequency if known else float(w[len(w) // 2])
+    at = float(np.interp(math.log(crossing), np.log(w), phase))
+    return np.asarray(phase - 360 * round((at + 180) / 360))
+
+
+def _draw_margins(
+    upper: Axes,
+    lower: Axes,
+    curves: LoopCurves,
+    phase: FloatArray,
+    margins: ChannelMargins,
+    style: Mapping[str, Any],
+) -> None:
+    """Segments from 0 dB and from -180 degrees (or its like a turn away) to the curves."""
+    w = curves.w
+    for factor, frequency in zip(margins.gain, margins.gain_frequency, strict=True):
+        if 0 < factor < math.inf:
+            at = max(frequency, float(w[0]))
+            level = -20 * math.log10(factor)
+            upper.plot([at, at], [0, level], **thin(style))
+            mark(upper, at, level, style)
+            mark(lower, at, float(np.interp(math.log(at), np.log(w), phase)), style, markerfacecolor="none")
+    if math.isfinite(margins.phase):
+        at = margins.phase_frequency
+        here = float(np.interp(math.log(at), np.log(w), phase))
+        lower.plot([at, at], [360 * round((here + 180) / 360) - 180, here], **thin(style))
+        mark(lower, at, here, style)
+        mark(upper, at, 0, style, markerfacecolor="none")
+
+
+def _finish_bode(upper: Axes, lower: Axes, shown: Sequence[LoopCurves]) -> None:
+    from matplotlib.ticker import MultipleLocator
+
+    draw_level(upper, 0)
+    low, high = upper.get_ylim()
+    upper.set_ylim(max(low, RANGE[0]), min(high, RANGE[1]))
+    lower.set_ylim(
+        *(np.array([math.floor(lower.get_ylim()[0] / 45), math.ceil(lower.get_ylim()[1] / 45)]) * 45)
+    )
+    low, high = lower.get_ylim()
+    for level in np.arange(math.ceil((low + 180) / 360), math.floor((high + 180) / 360) + 1) * 360 - 180:
+        draw_level(lower, float(level))
+    lower.yaxis.set_major_locator(
+        MultipleLocator(45 if high - low <= 270 else 90 if high - low <= 720 else 180)
+    )
+    finish_frequency(upper, shown, "magnitude [dB]", labelled=False)
+    finish_frequency(lower, shown, "phase [°]")
+
+
+def sigma(source: Any, controller: Any = None, *, at: Place = "sensors", axes: Any = None) -> Figure:
+    """Singular values of L, S and T with all channels: the largest and the smallest, and the band between them.
+
+    axes : three axes, for L, S and T; the other arguments as those of `bode`
+
+    Signals count in SI units, metres beside radians.
+
+    Example: `malta.report.sigma({"old": (plant, old), "new": (plant, new)})`
+    """
+    loops = loops_of(source, controller)
+    chosen_channels(loops, None, at)
+    styles = styles_of(loops)
+    title = f"{title_of(loops)}: singular values {PLACES[at]}, all channels, in SI units"
+    sheet = new_sheet(title, loops, 3, axes, height=3.1)
+    for k, ((panel,), letter) in enumerate(zip(sheet.panels, "LST", strict=True)):
+        lines = []
+        for name, curves in loops.items():
+            values = decibels(curves.singular_values(curves.responses.cut(at)[k]))
+            style = styles[name]
+            panel.plot(curves.w, values[:, 0], **style)
+            if values.shape[1] > 1:
+                panel.plot(curves.w, values[:, -1], **{**style, "linewidth": 0.8})
+                panel.fill_between(
+                    curves.w, values[:, -1], values[:, 0], color=style["color"], alpha=0.08, linewidth=0
+                )
+            lines.append((_largest_text(curves, values[:, 0], letter), style["color"]))
+        draw_level(panel, 0)
+        low, high = panel.get_ylim()
+        panel.set_ylim(max(low, RANGE[0]), min(high, RANGE[1]))
+        finish_frequency(panel, loops.values(), f"singular values of {letter} [dB]")
+        write_above(panel, letter, lines)
+    return sheet.figure
+
+
+def _largest_text(curves: LoopCurves, values: FloatArray, letter: str) -> str:
+    """The largest singular value of S or T; of L the last frequency with a value above 0 dB."""
+    if letter == "L":
+        above = np.flatnonzero(values > 0)
+        return f"last 0 dB at {rate_text(curves.w[above[-1]])}" if len(above) else "below 0 dB"
+    if not curves.stable:
+        return "unstable"
+    k = int(np.nanargmax(values))
+    return f"max {10 ** (values[k] / 20):.2f} ({values[k]:.1f} dB) at {rate_text(curves.w[k])}"
+
+
+def sensitivity_curves(
+    source: Any, controller: Any = None, *, channel: Channel = None, at: Place = "sensors", axes: Any = None
+) -> Figure:
+    """|S_ii| and |T_ii| of each channel, with the zones of ISO 14839-3 and the peaks marked; arguments as of `bode`.
+
+    Example: `malta.report.sensitivity_curves(plant, controller)`
+    """
+    loops = loops_of(source, controller)
+    chosen, styles = chosen_channels(loops, channel, at), styles_of(loops)
+    title = f"{title_of(loops)}: sensitivity |S| above, |T| below, {PLACES[at]}; zones of ISO 14839-3"
+    sheet = new_sheet(title, loops, len(chosen), axes, stacked=2, height=1.75)
+    for (name, _), (upper, lower) in zip(chosen, sheet.panels, strict=True):
+        lines, shown = [], []
+        for loop, curves, k, margins in having(loops, name, at):
+            style, (_, S, T) = styles[loop], curves.responses.cut(at)
+            upper.plot(curves.w, np.abs(S[:, k, k]), **style)
+            lower.plot(curves.w, np.abs(T[:, k, k]), **style)
+            text = "UNSTABLE"
+            if margins.stable:
+                top = int(np.argmax(np.abs(T[:, k, k])))
+                mark(upper, margins.peak_frequency, margins.peak_sensitivity, style)
+                mark(lower, curves.w[top], abs(T[top, k, k]), style)
+                peak = margins.peak_sensitivity
+                text = f"max|S| {peak:.2f} (zone {zone(peak)}) at {rate_text(margins.peak_frequency)}"
+                text += f", max|T| {abs(T[top, k, k]):.2f}"
+            lines.append((text, style["color"]))
+            shown.append(curves)
+        _draw_zones(upper)
+        for panel, letter in ((upper, "S"), (lower, "T")):
+            panel.set_yscale("log")
+            low, high = panel.get_ylim()
+            panel.set_ylim(max(low, 1e-3), max(min(high, 1e3), 8.0 if letter == "S" else 2.0))
+            finish_frequency(panel, shown, f"|{letter}|", labelled=panel is lower)
+            draw_level(panel, 1)
+        write_above(upper, name, lines)
+    return sheet.figure
+
+
+def _draw_zones(axes: Axes) -> None:
+    """The limits of the zones; the best and the worst zone are named beside the axes."""
+    for limit, _ in ZONES[:-1]:
+        axes.axhline(limit, color="#c1440e", linewidth=0.6, linestyle=(0, (1, 2)))
+    for (limit, _), name, side in ((ZONES[0], "A", "top"), (ZONES[-2], "D", "bottom")):
+        axes.annotate(
+            name, (1, limit), xycoords=("axes fraction", "data"), xytext=(3, 0), textcoords="offset points",
+            va=side, annotation_clip=False, **note_style(),
+        )  # fmt: skip
+
+
+def gang_of_four(source: Any, controller: Any = None, *, channel: Channel = None, axes: Any = None) -> Figure:
+    """S, T, S P and F S of each channel at the sensors: what noise, references and forces do to it.
+
+    channel : outputs, by name; None: all. Output i stands with force i, of the same axis
+    axes : four for each channel, row by row; the other arguments as those of `bode`
+
+    Example: `malta.report.gang_of_four(plant, controller, channel="z")`
+    """
+    loops = loops_of(source, controller)
+    chosen, styles = chosen_channels(loops, channel, "sensors"), styles_of(loops)
+    sheet = _gang_sheet(loops, len(chosen), axes)
+    for row, (name, unit) in enumerate(chosen):
+        panels = [panel for (panel,) in sheet.panels[4 * row : 4 * row + 4]]
+        shown, force = [], ""
+        for loop, curves, k, _ in having(loops, name, "sensors"):
+            r = curves.responses
+            if k >= len(curves.loop.inputs):
+                continue
+            of_force = curves.loop.inputs[k]
+            force = of_force.unit
+            for panel, G in zip(panels, (r.S, r.T, r.SP, r.FS), strict=True):
+                panel.plot(curves.w, np.abs(G[:, k, k]), **styles[loop])
+            shown.append(curves)
+        units = ("", "", f" [{_ratio(unit, force)}]", f" [{_ratio(force, unit)}]")
+        heads = (
+            f"{name}: |S|",
+            "|T|",
+            "|S P|, force to output" + units[2],
+            "|F S|, reading to force" + units[3],
+        )
+        for k, (panel, head) in enumerate(zip(panels, heads, strict=True)):
+            panel.set_yscale("log")
+            low, high = panel.get_ylim()
+            panel.set_ylim(max(low, high / 1e7), high * 1.3)
+            if k < 2:
+                draw_level(panel, 1)
+            finish_frequency(panel, shown, "", labelled=row == len(chosen) - 1)
+            panel.set_title(plain(head), fontsize=8.5, loc="left", pad=3)
+    return sheet.figure
+
+
+def _ratio(upper: str, lower: str) -> str:
+    """A unit over another."""
+    if upper == lower:
+        return "1"
+    return f"{upper}/({lower})" if " " in lower else f"{upper}/{lower}"
+
+
+def _gang_sheet(loops: Mapping[str, LoopCurves], count: int, axes: Any) -> Sheet:
+    """Four panels in a row for each channel."""
+    if axes is not None:
+        return new_sheet("", loops, 4 * count, axes)
+    height = 1.1 + 2.05 * count
+    title = f"{title_of(loops)}: gang of four at the sensors, each channel with the force of its axis"
+    figure = new_figure(
+        title, size=(13.0, height), left=0.045, right=0.99, bottom=0.5 / height, top=1 - 0.85 / height,
+        wspace=0.2, hspace=0.33,
+    )  # fmt: skip
+    add_legend(figure, loops, height)
+    grid = figure.subplots(count, 4, squeeze=False)
+    return Sheet(figure, [(panel,) for panel in grid.ravel()])

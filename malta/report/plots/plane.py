@@ -1,0 +1,257 @@
+"""Plots in the plane of poles: pole-zero map and root locus. Poles of sampled loops are ln(z) / T, in rad/s."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from malta.errors import InputError
+from malta.margins.curves import loop_curves
+from malta.margins.locus import GAIN, RootLocus
+from malta.margins.locus import root_locus as locus_of
+from malta.report.figures.parts import new_figure, number
+from malta.report.plots.frequency import title_of
+from malta.report.plots.parts import Sheet, add_legend, loops_of, plain, styles_of
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from malta.margins.curves import LoopCurves
+    from malta.model.plant import ComplexArray
+
+DAMPING = (0.2, 0.5, 0.8)  # rays of the grid
+NEAR = 2.5  # times the highest crossing of unit gain: the panel of the slow poles
+STRIP = 1.6  # times the Nyquist frequency: sampled poles beyond are next to pure delay
+GREY = "#dcdcdc"
+
+
+def pzmap(source: Any, controller: Any = None, *, axes: Any = None, reach: float | None = None) -> Figure:
+    """Poles of the closed loop and of the plant, and zeros of L, with rays of damping and circles of frequency.
+
+    Left: all of them; right: those slower than `reach`. Sampled loops: ln(z) / T, without the poles of pure delay; the
+    unit circle is the imaginary axis, and levels at pi / T are the Nyquist frequency.
+
+    reach : rad/s, of the right panel; None: NEAR times the highest crossing of unit gain
+    axes : one for all poles and one for the slow ones, or one alone for the slow ones
+    The other arguments are those of `bode`.
+
+    Example: `malta.report.pzmap({"old": (plant, old), "new": (plant, new)})`
+    """
+    loops = loops_of(source, controller)
+    sheet = _plane_sheet(f"{title_of(loops)}: poles and zeros", loops, axes)
+    styles = styles_of(loops)
+    everything = [_finite(p) for curves in loops.values() for p in (*curves.poles.values(), curves.zeros)]
+    times = [curves.loop.sample_time for curves in loops.values()]
+    whole = _whole(np.concatenate(everything), times)
+    slow = _reach(loops) if reach is None else reach
+    reaches = [whole, min(slow, whole)][-len(sheet.panels) :]
+    for (panel,), size in zip(sheet.panels, reaches, strict=True):
+        _draw_plane(panel, 1.08 * size, times)
+        for name, curves in loops.items():
+            _draw_poles(panel, curves, styles[name], 1.08 * size)
+    _explain(sheet, [("x", "closed loop"), ("+", "plant"), ("o", "zero of L")])
+    return sheet.figure
+
+
+def _finite(values: ComplexArray) -> ComplexArray:
+    return values[np.isfinite(values)]
+
+
+def _whole(poles: ComplexArray, times: Sequence[float | None]) -> float:
+    """The size of the largest pole, of sampled loops at most STRIP times the Nyquist frequency, rad/s."""
+    known = float(np.abs(poles).max(initial=0.0)) or 1.0
+    return min([known, *(STRIP * np.pi / T for T in times if T is not None)])
+
+
+def _reach(loops: Mapping[str, LoopCurves]) -> float:
+    """NEAR times the highest crossing of unit gain of the loops; infinite where none crosses."""
+    crossings = [c.frequency for curves in loops.values() for m in curves.margins for c in m.gain_crossings]
+    return NEAR * max(crossings) if crossings else math.inf
+
+
+def _plane_sheet(title: str, loops: Mapping[str, LoopCurves], axes: Any) -> Sheet:
+    """Two panels, or the axes of the caller."""
+    if axes is not None:
+        given = list(np.ravel(np.asarray(axes, dtype=object)))
+        if len(given) not in (1, 2):
+            raise InputError("plot", "axes", str(len(given)), "two, or one for the slow poles")
+        figure: Figure = given[0].figure
+        return Sheet(figure, [(panel,) for panel in given])
+    height = 5.4
+    figure = new_figure(
+        title,
+        size=(10.5, height),
+        left=0.075,
+        right=0.98,
+        bottom=0.52 / height,
+        top=1 - 0.92 / height,
+        wspace=0.2,
+    )
+    add_legend(figure, loops, height)
+    return Sheet(figure, [(panel,) for panel in figure.subplots(1, 2)])
+
+
+def _draw_plane(axes: Axes, reach: float, times: Sequence[float | None]) -> None:
+    """Axes of equal scale with a grid of damping and frequency, the unstable half grey, and the Nyquist frequency."""
+    right = 0.3 * reach
+    axes.set_xlim(-reach, right)
+    axes.set_ylim(-0.65 * reach, 0.65 * reach)
+    axes.set_box_aspect(1)
+    axes.axvspan(0, right, color="#f3f3f3", zorder=0)
+    axes.axvline(0, color="#000000", linewidth=0.9, zorder=1)
+    axes.axhline(0, color=GREY, linewidth=0.8, zorder=0.5)
+    small: dict[str, Any] = {"fontsize": 7, "color": "#8a8a8a"}
+    for damping in DAMPING:
+        slope = math.sqrt(1 - damping**2) / damping
+        end = min(reach, 0.65 * reach / slope)
+        for sign in (1, -1):
+            axes.plot([0, -end], [0, sign * slope * end], color=GREY, linewidth=0.8, zorder=0.5)
+        axes.annotate(f"ζ {damping:g}", (-0.8 * end, 0.8 * slope * end), ha="center", va="center",
+                      bbox={"facecolor": "#ffffff", "edgecolor": "none", "pad": 0.3}, **small)  # fmt: skip
+    turn = np.linspace(np.pi / 2, 3 * np.pi / 2, 121)
+    step = _round(reach / 3)
+    for radius in np.arange(step, reach * 1.19, step).tolist():
+        x, y = radius * np.cos(turn), radius * np.sin(turn)
+        inside = (x > -reach) & (np.abs(y) < 0.65 * reach)
+        axes.plot(
+            np.where(inside, x, np.nan), np.where(inside, y, np.nan), color=GREY, linewidth=0.8, zorder=0.5
+        )
+    for T in dict.fromkeys(times):
+        for level in () if T is None else (np.pi / T, -np.pi / T):
+            if abs(level) < 0.65 * reach:
+                axes.axhline(level, color="#9a9a9a", linestyle=(0, (8, 3)), linewidth=0.9)
+    axes.tick_params(labelsize=8)
+    for edge in ("top", "right"):
+        axes.spines[edge].set_visible(False)
+    axes.locator_params(nbins=5)
+    axes.set_xlabel("real part [rad/s]", fontsize=8.5)
+    axes.set_ylabel("imaginary part [rad/s]", fontsize=8.5)
+
+
+def _round(value: float) -> float:
+    """The next number below of 1, 2 or 5 times a power of ten."""
+    power = 10.0 ** math.floor(math.log10(value))
+    return power * max(m for m in (1, 2, 5) if m * power <= value)
+
+
+def _draw_poles(axes: Axes, curves: LoopCurves, style: Mapping[str, Any], reach: float) -> None:
+    """Poles and zeros of one loop that lie within the axes."""
+    colour = style["color"]
+    drawn: tuple[tuple[ComplexArray, dict[str, Any]], ...] = (
+        (
+            curves.poles["closed_loop"],
+            {"marker": "x", "markersize": 6.5, "markeredgewidth": 1.5, "zorder": 4},
+        ),
+        (curves.poles["plant"], {"marker": "+", "markersize": 8, "markeredgewidth": 0.9, "zorder": 3}),
+        (curves.zeros, {"marker": "o", "markersize": 5.5, "markerfacecolor": "none", "markeredgewidth": 0.9}),
+    )
+    for values, look in drawn:
+        shown = within(values, reach)
+        axes.plot(shown.real, shown.imag, linestyle="none", color=colour, **look)
+
+
+def within(values: ComplexArray, reach: float) -> ComplexArray:
+    """The poles that lie within the axes of a plane of this reach."""
+    fine = values[np.isfinite(values)]
+    return fine[(fine.real > -reach) & (fine.real < 0.3 * reach) & (np.abs(fine.imag) < 0.65 * reach)]
+
+
+def _explain(sheet: Sheet, marks: Sequence[tuple[str, str]]) -> None:
+    """A legend of the markers above the last panel."""
+    from matplotlib.lines import Line2D
+
+    handles = [
+        Line2D(
+            [],
+            [],
+            linestyle="none",
+            marker=m,
+            color="#000000",
+            markerfacecolor="none" if m == "o" else "#000000",
+        )
+        for m, _ in marks
+    ]
+    sheet.panels[-1][0].legend(
+        handles, [text for _, text in marks], ncols=len(marks), loc="lower right", bbox_to_anchor=(1, 1),
+        frameon=False, fontsize=8, handletextpad=0.1, columnspacing=1.2, borderaxespad=0.2,
+    )  # fmt: skip
+
+
+def root_locus(
+    source: Any,
+    controller: Any = None,
+    *,
+    parameter: str = GAIN,
+    low: float | None = None,
+    high: float | None = None,
+    channel: str | None = None,
+    axes: Any = None,
+    reach: float | None = None,
+) -> Figure:
+    """Closed-loop poles over a parameter of the machine or over the loop gain, every branch a line.
+
+    parameter, low, high, channel : as `malta.margins.locus.root_locus` takes them
+    axes, reach : as those of `pzmap`; the right panel shows the poles slower than `reach`
+
+    Small circles: the lowest value; triangles: the highest; crosses: the nominal machine. Text: the values at which the
+    loop becomes stable or unstable. One loop, or its RootLocus, at a time.
+
+    Example: `malta.report.root_locus(plant, controller, parameter="m")`
+    """
+    found = source
+    if not isinstance(source, RootLocus):
+        found = locus_of(source, controller, parameter=parameter, low=low, high=high, channel=channel)
+    unit = "" if found.unit == "1" else f" {found.unit}"
+    gain = f"the gain of {channel}" if channel else "the loop gain"
+    what = gain if found.parameter == GAIN else found.parameter
+    ends = f"{found.values[0]:.4g} … {found.values[-1]:.4g}{unit}"
+    title = plain(f"{found.name}: root locus over {what}, {ends}")
+    sheet = _plane_sheet(title, {}, axes)
+    figure = sheet.figure
+    if axes is None:
+        height = figure.get_figheight()
+        figure.text(0.075, 1 - 0.62 / height, plain(_changes_text(found, unit)), fontsize=9, color="#4a4a4a")
+    whole = _whole(_finite(found.poles.ravel()), [found.sample_time])
+    slow = reach
+    if slow is None:
+        slow = whole if isinstance(source, RootLocus) else _reach({"": loop_curves(source, controller)})
+    for (panel,), size in zip(sheet.panels, [whole, min(slow, whole)][-len(sheet.panels) :], strict=True):
+        _draw_plane(panel, 1.08 * size, [found.sample_time])
+        _draw_branches(panel, found, 1.08 * size)
+    _explain(sheet, [("o", "lowest value"), ("x", "nominal"), (">", "highest value")])
+    return figure
+
+
+def _changes_text(found: RootLocus, unit: str) -> str:
+    """What becomes of stability over the range."""
+    if found.changes:
+        values = ", ".join(f"{number(value)}{unit}" for value in found.changes)
+        return f"stability changes at {found.parameter} = {values}"
+    stable = bool((found.poles[0][np.isfinite(found.poles[0])].real < 0).all())
+    return f"{'stable' if stable else 'UNSTABLE'} over the whole range"
+
+
+def _draw_branches(axes: Axes, found: RootLocus, reach: float) -> None:
+    """Lines that are interrupted where ln(z) jumps from one edge of its strip to the other."""
+    strip = np.inf if found.sample_time is None else np.pi / found.sample_time
+    for branch in found.poles.T:
+        line = branch.copy()
+        jumps = np.flatnonzero(np.abs(np.diff(branch.imag)) > strip)
+        line = np.insert(line, jumps + 1, complex(np.nan, np.nan))
+        axes.plot(line.real, line.imag, color="#000000", linewidth=1.1, zorder=3)
+    colour = "#c1440e"
+    drawn: tuple[tuple[ComplexArray, dict[str, Any]], ...] = (
+        (
+            found.poles[0],
+            {"marker": "o", "markersize": 4.5, "markerfacecolor": "#ffffff", "color": "#000000"},
+        ),
+        (found.poles[-1], {"marker": ">", "markersize": 4.5, "color": "#000000"}),
+        (found.nominal_poles, {"marker": "x", "markersize": 6.5, "markeredgewidth": 1.6, "color": colour}),
+    )
+    for values, look in drawn:
+        shown = within(values, reach)
+        axes.plot(shown.real, shown.imag, linestyle="none", zorder=4, **look)

@@ -1,0 +1,242 @@
+"""Plots of the loop gain in the plane: Nyquist and Nichols, with the margins drawn in."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from malta.report.figures.parts import BOUND, draw_grid
+from malta.report.plots.frequency import Channel, phase_of, title_of
+from malta.report.plots.parts import (
+    PLACES,
+    chosen_channels,
+    decibels,
+    having,
+    loops_of,
+    margins_text,
+    mark,
+    new_sheet,
+    styles_of,
+    thin,
+    write_above,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from malta.margins.channels import ChannelMargins
+    from malta.margins.linear_loops import Place
+    from malta.model.plant import ComplexArray, FloatArray
+
+WIDEST = 4.0  # how far left of the origin a Nyquist plot reaches at most
+M_CIRCLES = (12.0, 6.0, 3.0, 1.0, 0.0, -3.0, -6.0, -12.0)  # dB of |T|
+HEIGHTS = (-45.0, 60.0)  # dB, of a Nichols plot
+
+
+def nyquist(
+    source: Any, controller: Any = None, *, channel: Channel = None, at: Place = "sensors", axes: Any = None
+) -> Figure:
+    """Nyquist plot of the loop gain of each channel, the others closed.
+
+    Thin: negative frequencies. Dotted about -1: the circle of radius 1 / max|S|, which the curve touches. Grey: the
+    circle of the symmetric disk margin, which the curve does not enter. Dots: where margins of gain and phase are read.
+    N: counterclockwise turns about -1; P: unstable poles with this channel open. The loop is stable where they agree.
+
+    axes : one for each channel; the other arguments as those of `bode`
+
+    Example: `malta.report.nyquist(plant, controller, channel="x1")`
+    """
+    loops = loops_of(source, controller)
+    chosen, styles = chosen_channels(loops, channel, at), styles_of(loops)
+    title = f"{title_of(loops)}: Nyquist plot {PLACES[at]}, one loop at a time; N turns about −1, P unstable poles"
+    sheet = new_sheet(title, loops, len(chosen), axes, height=3.3)
+    for (name, _), (panel,) in zip(chosen, sheet.panels, strict=True):
+        found = list(having(loops, name, at))
+        window = _window([margins for *_, margins in found])
+        _draw_circles(panel)
+        lines = []
+        for loop, curves, k, margins in found:
+            style = styles[loop]
+            gain = _inside(curves.responses.alone(at)[:, k], window)
+            panel.plot(gain.real, gain.imag, **style)
+            panel.plot(gain.real, -gain.imag, **{**style, "linewidth": 0.6})
+            _draw_direction(panel, gain, style)
+            _draw_margins(panel, margins, style, window)
+            lines.append((margins_text(margins, turns=True), style["color"]))
+        panel.set_xlim(window[0], window[1])
+        panel.set_ylim(-window[2], window[2])
+        panel.set_aspect("equal", adjustable="box")
+        draw_grid(panel)
+        panel.tick_params(labelsize=8)
+        panel.set_xlabel("real part of L", fontsize=8.5)
+        panel.set_ylabel("imaginary part of L", fontsize=8.5)
+        write_above(panel, name, lines)
+    return sheet.figure
+
+
+def _window(found: list[ChannelMargins]) -> tuple[float, float, float]:
+    """Left and right end and half the height: the unit circle, and the places of the gain margins within WIDEST."""
+    left = -1.9
+    for margins in found:
+        half = margins.disk.size / 2
+        if half < 1:
+            left = min(left, max(-1.05 * (1 + half) / (1 - half), -WIDEST))
+        places = [1 / k for k in margins.gain if 0 < k < math.inf]
+        left = min([left, *(-1.2 * place for place in places if place < WIDEST / 1.2)])
+    right = 1.3
+    return left, right, max(1.3, (right - left) / 2)
+
+
+def _inside(gain: ComplexArray, window: tuple[float, float, float]) -> ComplexArray:
+    """The curve without what lies far outside of the window; NaN interrupts the line."""
+    reach = 4 * max(abs(window[0]), window[2])
+    return np.asarray(np.where(np.abs(gain) < reach, gain, complex(np.nan, np.nan)))
+
+
+def _draw_circles(axes: Axes) -> None:
+    """The unit circle, the axes and the critical point."""
+    turn = np.exp(1j * np.linspace(0, 2 * np.pi, 200))
+    axes.plot(turn.real, turn.imag, **BOUND)
+    axes.axhline(0, color="#c8c8c8", linewidth=0.6)
+    axes.axvline(0, color="#c8c8c8", linewidth=0.6)
+    axes.plot(-1, 0, marker="+", markersize=10, markeredgewidth=1.8, color="#000000", zorder=5)
+
+
+def _draw_direction(axes: Axes, gain: ComplexArray, style: Mapping[str, Any]) -> None:
+    """An arrow of rising frequency where the curve is nearest to the unit circle, if it comes near."""
+    far = np.abs(np.log(np.maximum(np.abs(np.nan_to_num(gain, nan=1e9)), 1e-300)))
+    k = min(max(int(far.argmin()), 1), len(gain) - 2)
+    here, after = complex(gain[k]), complex(gain[k + 1])
+    if not far[k] < 1 or not np.isfinite([here, after]).all() or here == after:
+        return
+    ahead = here + 0.02 * (after - here) / abs(after - here)
+    axes.annotate(
+        "", (ahead.real, ahead.imag), xytext=(here.real, here.imag),
+        arrowprops={"arrowstyle": "-|>", "color": style["color"], "lw": 1.0, "mutation_scale": 11},
+    )  # fmt: skip
+
+
+def _draw_margins(
+    axes: Axes, found: ChannelMargins, style: Mapping[str, Any], window: tuple[float, float, float]
+) -> None:
+    """The circles of max|S| and of the disk margin, and the crossings at which margins are read."""
+    if not found.stable:
+        return
+    turn = np.exp(1j * np.linspace(0, 2 * np.pi, 200))
+    near = -1 + turn / found.peak_sensitivity
+    axes.plot(near.real, near.imag, **{**thin(style), "linestyle": (0, (1, 1.5))})
+    half = found.disk.size / 2
+    if half < 1:  # -1 / f for the factors f = (1 + d) / (1 - d) with |d| <= half
+        ends = -(1 + half) / (1 - half), -(1 - half) / (1 + half)
+        disk = sum(ends) / 2 + turn * (ends[1] - ends[0]) / 2
+        axes.fill(disk.real, disk.imag, color="#000000", alpha=0.07, linewidth=0)
+    for factor in found.gain:
+        if 0 < factor < math.inf and -1 / factor > window[0]:
+            mark(axes, -1 / factor, 0, style)
+    for crossing in found.gain_crossings:
+        if crossing.frequency == found.phase_frequency:
+            mark(axes, crossing.value.real, crossing.value.imag, style, markerfacecolor="#ffffff")
+            axes.plot([0, crossing.value.real], [0, crossing.value.imag], **thin(style) | {"linewidth": 0.6})
+
+
+def nichols(
+    source: Any, controller: Any = None, *, channel: Channel = None, at: Place = "sensors", axes: Any = None
+) -> Figure:
+    """Nichols chart of the loop gain of each channel, the others closed, on curves of equal |T|.
+
+    The arguments are those of `bode`. Crosses: the critical points, 0 dB at -180 degrees and a turn away. Segments from
+    there: the margins of gain, upright, and of phase, level.
+
+    Example: `malta.report.nichols(plant, controller, channel="z")`
+    """
+    loops = loops_of(source, controller)
+    chosen, styles = chosen_channels(loops, channel, at), styles_of(loops)
+    title = f"{title_of(loops)}: Nichols chart {PLACES[at]}, one loop at a time, the others closed"
+    sheet = new_sheet(title, loops, len(chosen), axes, height=3.3)
+    for (name, _), (panel,) in zip(chosen, sheet.panels, strict=True):
+        lines, phases = [], []
+        for loop, curves, k, margins in having(loops, name, at):
+            gain, style = curves.responses.alone(at)[:, k], styles[loop]
+            phase, size = phase_of(curves.w, gain, margins), decibels(gain)
+            shown = (size > HEIGHTS[0]) & (size < HEIGHTS[1])
+            panel.plot(np.where(shown, phase, np.nan), np.where(shown, size, np.nan), **style)
+            _draw_nichols_margins(panel, curves.w, phase, margins, style)
+            phases.append(phase[shown])
+            lines.append((margins_text(margins), style["color"]))
+        _finish_nichols(panel, np.concatenate(phases))
+        write_above(panel, name, lines)
+    return sheet.figure
+
+
+def _draw_nichols_margins(
+    axes: Axes, w: FloatArray, phase: FloatArray, found: ChannelMargins, style: Mapping[str, Any]
+) -> None:
+    def critical(frequency: float) -> tuple[float, float]:
+        """The phase at a frequency, and that of the critical point next to it."""
+        here = float(np.interp(math.log(max(frequency, w[0])), np.log(w), phase))
+        return here, 360 * round((here + 180) / 360) - 180.0
+
+    for factor, frequency in zip(found.gain, found.gain_frequency, strict=True):
+        if 0 < factor < math.inf:
+            _, at = critical(frequency)
+            level = float(np.clip(-20 * math.log10(factor), *HEIGHTS))
+            axes.plot([at, at], [0, level], **thin(style))
+            mark(axes, at, level, style)
+    if math.isfinite(found.phase):
+        here, at = critical(found.phase_frequency)
+        axes.plot([at, here], [0, 0], **thin(style))
+        mark(axes, here, 0, style, markerfacecolor="#ffffff")
+
+
+def _finish_nichols(axes: Axes, phases: FloatArray) -> None:
+    """Curves of equal |T|, critical points, and axes in quarter turns about them."""
+    from matplotlib.ticker import MultipleLocator
+
+    known = phases[np.isfinite(phases)]
+    low = 90 * math.floor(min(float(known.min(initial=-180.0)), -225) / 90)
+    high = 90 * math.ceil(max(float(known.max(initial=-180.0)), -135) / 90)
+    low, high = max(low, -720), min(high, 360)
+    axes.set_xlim(low, high)
+    axes.set_ylim(*HEIGHTS)
+    angle = np.linspace(1e-3, 2 * np.pi - 1e-3, 400)
+    for k in range(math.floor(low / 360), math.ceil(high / 360) + 1):
+        for level in M_CIRCLES:
+            T = 10 ** (level / 20) * np.exp(1j * angle)
+            L = T / (1 - T)
+            x = np.degrees(np.mod(np.angle(L), 2 * np.pi)) - 360 + 360 * k
+            x = np.where(np.abs(np.diff(x, append=x[-1])) > 180, np.nan, x)
+            if np.nanmax(x) > low and np.nanmin(x) < high:
+                axes.plot(x, decibels(L), color="#d6d6d6", linewidth=0.7, zorder=1)
+        if low <= 360 * k - 180 <= high:
+            axes.plot(
+                360 * k - 180, 0, marker="+", markersize=10, markeredgewidth=1.8, color="#000000", zorder=5
+            )
+    _name_circles(axes, low, high)
+    axes.xaxis.set_major_locator(MultipleLocator(90 if high - low <= 540 else 180))
+    axes.tick_params(labelsize=8)
+    for edge in ("top", "right"):
+        axes.spines[edge].set_visible(False)
+    axes.set_xlabel("phase of L [°]", fontsize=8.5)
+    axes.set_ylabel("magnitude of L [dB]", fontsize=8.5)
+
+
+def _name_circles(axes: Axes, low: float, high: float) -> None:
+    """What |T| is: beside the closed curves about the first critical point, and at the left end of the open ones."""
+    at = next(p for p in (-180.0, -540.0, 180.0) if low <= p <= high)
+    where: dict[str, Any] = {"textcoords": "offset points", "zorder": 2, "color": "#9a9a9a", "fontsize": 7}
+    for level in (6.0, 1.0):
+        size = 10 ** (level / 20)
+        reach, height = math.degrees(math.asin(1 / size)), 10 * math.log10(size**2 / (size**2 - 1))
+        if at - reach > low:
+            axes.annotate(
+                f"{level:g} dB", (at - reach, height), xytext=(-2, 0), ha="right", va="center", **where
+            )
+    for level in (-3.0, -6.0, -12.0):
+        size, turn = 10 ** (level / 20), math.cos(math.radians(low))
+        # |L| on |T| = M at phase low: x^2 (1 - M^2) - 2 M^2 cos(low) x - M^2 = 0
+        x = (size**2 * turn + size * math.sqrt(1 - size**2 * (1 - turn**2))) / (1 - size**2)
+        axes.annotate(f"{level:g} dB", (low, 20 * math.log10(x)), xytext=(2, 1), va="bottom", **where)

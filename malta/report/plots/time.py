@@ -1,0 +1,252 @@
+"""Plots over time: steps of the references, and loads from outside with the compliance over frequency."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from malta.errors import InputError
+from malta.margins.steps import StepFigures, loop_steps, step_figures
+from malta.model.signals import FINE
+from malta.report.figures.parts import draw_grid, micro, number
+from malta.report.plots.frequency import Channel, title_of
+from malta.report.plots.parts import (
+    chosen_channels,
+    draw_level,
+    finish_frequency,
+    having,
+    loops_of,
+    mark,
+    new_sheet,
+    plain,
+    rate_text,
+    seconds_text,
+    styles_of,
+    thin,
+    write_above,
+)
+from malta.units import unit_factor
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from malta.margins.curves import LoopCurves
+    from malta.synthesis.step_response import StepResponse
+
+SHOWN = 1.6  # times the longest settling time
+LONGEST = 60.0  # times the shortest rise or time to the peak
+POINTS = 1500  # of a line
+TIMES = (("s", 1.0), ("ms", 1e-3), ("µs", 1e-6))
+
+
+def step(source: Any, controller: Any = None, *, channel: Channel = None, axes: Any = None) -> Figure:
+    """Answer of each output to a unit step of its own reference, by the sampled linear loop: no limits, no feedforward.
+
+    Marked: 10 to 90 % (rise), the largest value (overshoot), and the time after which it stays within 2 % (settling).
+
+    axes : one for each channel; the other arguments as those of `bode`
+
+    Example: `malta.report.step({"old": (plant, old), "new": (plant, new)}, channel="z")`
+    """
+    loops = loops_of(source, controller)
+    chosen, styles = chosen_channels(loops, channel, "sensors"), styles_of(loops)
+    answers = {name: loop_steps(curves.loop).references for name, curves in loops.items()}
+    sheet = new_sheet(
+        f"{title_of(loops)}: step of each reference, linear loop", loops, len(chosen), axes, height=2.3
+    )
+    for (name, unit), (panel,) in zip(chosen, sheet.panels, strict=True):
+        rows = [(loop, answers[loop], k, k) for loop, _, k, _ in having(loops, name, "sensors")]
+        figures = [step_figures(answer, k, column) for _, answer, k, column in rows]
+        window = _window(rows, figures)
+        lines = []
+        for (loop, answer, k, column), found in zip(rows, figures, strict=True):
+            _draw_answer(panel, answer, k, column, window, styles[loop])
+            _mark_step(panel, answer, k, found, styles[loop])
+            lines.append((_step_text(found), styles[loop]["color"]))
+        draw_level(panel, 1)
+        _finish_time(panel, window, f"{name} over its reference [{_over(unit, unit)}]")
+        write_above(panel, name, lines)
+    return sheet.figure
+
+
+def _over(upper: str, lower: str) -> str:
+    if upper == lower:
+        return "1" if upper == "1" else f"{upper}/{lower}"
+    return micro(upper if lower == "1" else f"{upper}/({lower})" if " " in lower else f"{upper}/{lower}")
+
+
+def _step_text(found: StepFigures) -> str:
+    if math.isnan(found.final):
+        return "UNSTABLE"
+    if math.isnan(found.rise):
+        return f"returns to 0, settled {seconds_text(found.settling)}"
+    over = f"overshoot {number(100 * found.overshoot, 3)} %"
+    ends = "" if abs(found.final - 1) < 1e-3 else f", ends at {found.final:.3g}"
+    return f"rise {seconds_text(found.rise)}, {over}, settled {seconds_text(found.settling)}{ends}"
+
+
+def _window(rows: Sequence[tuple[str, StepResponse, int, int]], figures: Sequence[StepFigures]) -> float:
+    """The time to show, s: until the slowest loop has settled, as long as the fastest can still be seen.
+
+    Of unstable loops alone: all that is known.
+    """
+    settled = [f.settling for f in figures if math.isfinite(f.settling) and f.settling > 0]
+    if settled:
+        seen = min(max(f.peak_time, 0.0 if math.isnan(f.rise) else f.rise) for f in figures if f.settling > 0)
+        return min(SHOWN * max(settled), max(LONGEST * seen, SHOWN * min(settled)))
+    return max(float(answer.t[min(len(answer.t) - 1, POINTS)]) for _, answer, *_ in rows)
+
+
+def _draw_answer(
+    axes: Axes,
+    answer: StepResponse,
+    k: int,
+    column: int,
+    window: float,
+    style: Mapping[str, Any],
+    scale: float = 1.0,
+) -> None:
+    """One line, of points that are evenly spread over the window."""
+    last = min(int(np.searchsorted(answer.t, window)) + 1, len(answer.t))
+    picked = np.unique(np.searchsorted(answer.t[:last], np.linspace(0, answer.t[last - 1], POINTS)))
+    t, y = answer.t[picked], answer.y[picked, k, column]
+    if t[-1] < window and math.isfinite(answer.final[k, column]):  # nothing changes any more
+        t, y = np.append(t, window), np.append(y, answer.final[k, column])
+    axes.plot(t, scale * y, **style)
+
+
+def _mark_step(
+    axes: Axes, answer: StepResponse, k: int, found: StepFigures, style: Mapping[str, Any]
+) -> None:
+    """The rise as a bar below the line, the peak as a dot, the settling time as an upright line at the final value."""
+    if math.isnan(found.rise):
+        return
+    share = answer.y[:, k, k] / found.final
+    for level in (0.1, 0.9):
+        at = int(np.argmax(share >= level))
+        mark(axes, answer.t[at], answer.y[at, k, k], style, marker="|", markersize=8)
+    if found.overshoot > 1e-3:
+        mark(axes, found.peak_time, found.peak, style)
+    if math.isfinite(found.settling):
+        axes.plot(
+            2 * [found.settling], np.array([0.95, 1.05]) * found.final, **thin(style) | {"linewidth": 1.4}
+        )
+
+
+def _finish_time(axes: Axes, window: float, y: str) -> None:
+    """A linear axis of time in a unit that fits."""
+    from matplotlib.ticker import FuncFormatter, MaxNLocator
+
+    unit, size = next(((u, s) for u, s in TIMES if window >= 2 * s), TIMES[-1])
+    axes.set_xlim(0, window)
+    axes.xaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 2.5, 5, 10]))
+    scaled = [tick * size for tick in MaxNLocator(6, steps=[1, 2, 2.5, 5, 10]).tick_values(0, window / size)]
+    axes.set_xticks([tick for tick in scaled if tick <= window])
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value / size:g}"))
+    draw_grid(axes)
+    axes.tick_params(labelsize=8)
+    axes.set_xlabel(f"time [{unit}]", fontsize=8.5)
+    axes.set_ylabel(plain(y), fontsize=8.5)
+
+
+def load_response(
+    source: Any, controller: Any = None, *, channel: Channel = None, axes: Any = None
+) -> Figure:
+    """Deviation after a constant load of 1 N or 1 N m from outside, above; and compliance over frequency, below.
+
+    channel : outputs, by name; None: of each load the output that it moves furthest
+    axes : time and frequency of every load and output, as `figure.subplots(2, n)` gives them
+
+    The other arguments are those of `bode`. Raises InputError for loops on which no loads act from outside.
+
+    Example: `malta.report.load_response(plant, controller, channel="x1")`
+    """
+    loops = loops_of(source, controller)
+    answers = {name: loop_steps(curves.loop).loads for name, curves in loops.items()}
+    pairs = _pairs(loops, answers, channel)
+    styles = styles_of(loops)
+    title = f"{title_of(loops)}: a constant load of one unit from outside, above; compliance, below"
+    sheet = new_sheet(title, loops, len(pairs), axes, stacked=2, height=1.85, ticks=True)
+    for (load, output), (upper, lower) in zip(pairs, sheet.panels, strict=True):
+        rows, units, shown = [], ("1", "1"), []
+        for name, curves in loops.items():
+            found = _places(curves, load, output)
+            if found is None:
+                continue
+            k, column, units = found
+            rows.append((name, answers[name], k, column))
+            shown.append(curves)
+        figures = [step_figures(answer, k, column) for _, answer, k, column in rows]
+        window = _window(rows, figures)
+        fine = FINE.get(units[0], units[0])
+        scale = 1 / unit_factor(fine, fine) if fine != units[0] else 1.0
+        lines = []
+        for (name, answer, k, column), found_figures, curves in zip(rows, figures, shown, strict=True):
+            style = styles[name]
+            _draw_answer(upper, answer, k, column, window, style, scale)
+            size = np.abs(curves.responses.compliance[:, k, column]) * scale
+            lower.plot(curves.w, size, **style)
+            lines.append(
+                (_load_text(curves, size, found_figures, scale, _over(fine, units[1])), style["color"])
+            )
+            if curves.stable:
+                mark(upper, found_figures.peak_time, found_figures.peak * scale, style)
+                mark(lower, curves.w[int(size.argmax())], size.max(), style)
+        _finish_time(upper, window, f"{output} [{_over(fine, units[1])}]")
+        lower.set_yscale("log")
+        low, high = lower.get_ylim()
+        lower.set_ylim(max(low, high / 1e6), high * 1.5)
+        finish_frequency(lower, shown, f"|{output}/{load}| [{_over(fine, units[1])}]")
+        write_above(upper, f"{load} → {output}", lines)
+    return sheet.figure
+
+
+def _load_text(curves: LoopCurves, size: Any, found: StepFigures, scale: float, unit: str) -> str:
+    if not curves.stable:
+        return "UNSTABLE"
+    at = rate_text(float(curves.w[int(size.argmax())]))
+    ends = f", stays {number(scale * found.final, 3)}" if abs(found.final) > 1e-6 * abs(found.peak) else ""
+    return f"peak {number(scale * found.peak, 3)} {unit}{ends}; below {number(float(size.max()), 3)} at {at}"
+
+
+def _places(curves: LoopCurves, load: str, output: str) -> tuple[int, int, tuple[str, str]] | None:
+    """The indices of an output and a load, and their units; None where a loop has not both."""
+    outputs, loads = curves.loop.outputs, curves.loop.loads
+    k = next((i for i, s in enumerate(outputs) if s.name == output), None)
+    column = next((i for i, s in enumerate(loads) if s.name == load), None)
+    if k is None or column is None:
+        return None
+    return k, column, (outputs[k].unit, loads[column].unit)
+
+
+def _pairs(
+    loops: Mapping[str, LoopCurves], answers: Mapping[str, StepResponse], channel: Channel
+) -> list[tuple[str, str]]:
+    """Loads with the outputs to show: those named, or of each load the output that it moves furthest for its unit."""
+    loads = dict.fromkeys(s.name for curves in loops.values() for s in curves.loop.loads)
+    if not loads:
+        raise InputError(
+            "plot", "load", "no loads from outside", "a machine with disturbances, or plant and controller"
+        )
+    if channel is not None:
+        outputs = [name for name, _ in chosen_channels(loops, channel, "sensors")]
+        return [(load, output) for load in loads for output in outputs]
+    return [(load, output) for load in loads if (output := _furthest(loops, answers, load)) is not None]
+
+
+def _furthest(loops: Mapping[str, LoopCurves], answers: Mapping[str, StepResponse], load: str) -> str | None:
+    """The output that a load moves furthest in the first loop that has the load, for its unit; None: it moves none."""
+    for name, curves in loops.items():
+        known = [s.name for s in curves.loop.loads]
+        if load not in known:
+            continue
+        largest = np.abs(np.nan_to_num(answers[name].y)).max(axis=0)
+        units = [s.unit for s in curves.loop.outputs]
+        whole = {unit: max(largest[k].max() for k, u in enumerate(units) if u == unit) for unit in units}
+        moved = [largest[k, known.index(load)] / max(whole[u], 1e-300) for k, u in enumerate(units)]
+        return curves.loop.outputs[int(np.argmax(moved))].name if max(moved) > 1e-9 else None
+    return None
