@@ -16,6 +16,7 @@ import typer
 from malta.cli.campaign import campaign
 from malta.cli.check import check
 from malta.cli.claims import claims
+from malta.cli.compare import compare
 from malta.cli.design import design
 from malta.cli.export import export
 from malta.cli.new import new
@@ -48,6 +49,7 @@ for command in (
     campaign,
     tune,
     report,
+    compare,
     export,
     claims,
     new,

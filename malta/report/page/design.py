@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -28,13 +29,31 @@ FINER: dict[str, tuple[tuple[str, float], ...]] = {
 }
 
 
+GROUPS = (
+    *(
+        "machine",
+        "parameters",
+        "uncertainty",
+        "law",
+        "PID gains",
+        "weights",
+        "bases",
+        "cost",
+        "noise",
+        "gains",
+    ),
+    "limits",
+)
+
+
 class Entry(NamedTuple):
     """A number or a word of a design, as it stands in its files."""
 
-    group: str  # "machine", "parameters", "law", "weights", "noise", "gains", "limits"
+    group: str  # of GROUPS
     name: str
     value: float | str  # SI
     unit: str = ""
+    signal: str = ""  # in the name, of an entry that each signal has
 
     @property
     def key(self) -> str:
@@ -70,7 +89,8 @@ def kind_of(controller: Controller) -> str:
 
 def design_entries(subject: Subject) -> list[Entry]:
     """List what a design is: the machine, the law, its weights and its noise, the size of its gains."""
-    return [entry for part in (_machine, _law, _weights, _noise, _gains, _limits) for entry in part(subject)]
+    parts = (_machine, _law, _weights, _noise, _gains, _limits)
+    return sorted((entry for part in parts for entry in part(subject)), key=lambda e: GROUPS.index(e.group))
 
 
 def _machine(subject: Subject) -> Iterator[Entry]:
@@ -96,7 +116,8 @@ def _law(subject: Subject) -> Iterator[Entry]:
         yield Entry("law", "discretization", "PID" if subject.spec.pid else subject.spec.discretization)
     for signal, pause in zip(c.measurements, c.pause, strict=False):
         if pause:
-            yield Entry("law", f"integral of {signal.name} waits above", float(pause), f"{signal.unit}/s")
+            name, unit = f"integral of {signal.name} waits above", f"{signal.unit}/s"
+            yield Entry("law", name, float(pause), unit, signal.name)
     if c.current_loop is not None:
         yield Entry("law", "current loop Kp", c.current_loop.Kp, "V/A")
         yield Entry("law", "current loop Ki", c.current_loop.Ki, "V / (A s)")
@@ -107,7 +128,8 @@ def _weights(subject: Subject) -> Iterator[Entry]:
     law = None if subject.spec is None else subject.spec.law
     if isinstance(law, Pid):
         for table, signals in pid_signals(plant, law.axes).items():
-            yield from _row("PID gains", f"{table} ", signals, getattr(law, table))
+            plain = [Signal(s.name, re.sub(r"\((\w+)\)", r"\1", s.unit).replace(" / ", "/")) for s in signals]
+            yield from _row("PID gains", f"{table} ", plain, getattr(law, table))
     elif isinstance(law, Weights):
         integrals = integral_signals(plant, law.coordinates)
         for table, states, weight, base in (
@@ -151,10 +173,10 @@ def _limits(subject: Subject) -> Iterator[Entry]:
     c = subject.controller
     for signal, limit in zip(c.forces, c.limits.force, strict=True):
         if np.isfinite(limit):
-            yield Entry("limits", signal.name, float(limit), signal.unit)
+            yield Entry("limits", signal.name, float(limit), signal.unit, signal.name)
 
 
 def _row(group: str, prefix: str, signals: Sequence[Signal], values: FloatArray) -> Iterator[Entry]:
     """An entry for each signal that has a value; none of an empty vector."""
     for signal, value in zip(signals, values, strict=False):
-        yield Entry(group, f"{prefix}{signal.name}", float(value), signal.unit)
+        yield Entry(group, f"{prefix}{signal.name}", float(value), signal.unit, signal.name)

@@ -9,15 +9,14 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import jinja2
-from markupsafe import Markup
-
 from malta.errors import InputError
 from malta.files import replace_files
 from malta.report.page.inline import colours_of, inline_svg, printable
 from malta.report.page.sections import Folded, Item, Picture, Section
 
 if TYPE_CHECKING:
+    import jinja2
+
     from malta.report.page.headline import KeyFigure
     from malta.report.page.sheets import Sheet
 
@@ -79,6 +78,8 @@ def render(
 
     progress : takes the share of the figures that are drawn
     """
+    from markupsafe import Markup  # here, as jinja2: only pages need them
+
     pictures = [item for section in sections for item in section.items if isinstance(item, Picture)]
     drawn: dict[int, str] = {}
     for number, picture in enumerate(pictures):
@@ -104,6 +105,8 @@ def render(
 
 def _part(item: Item, drawn: dict[int, str]) -> dict[str, Any]:
     """An item of a section, as the template takes it."""
+    from markupsafe import Markup
+
     if isinstance(item, str):
         return {"kind": "text", "text": item}
     if isinstance(item, Picture):
@@ -124,6 +127,8 @@ def _inks(texts: Any) -> str:
 
 @cache
 def _environment() -> jinja2.Environment:
+    import jinja2
+
     return jinja2.Environment(
         loader=jinja2.PackageLoader("malta.report", "page"),
         undefined=jinja2.StrictUndefined,

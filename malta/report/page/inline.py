@@ -64,7 +64,7 @@ def plain_texts(figure: Figure) -> None:
     for text in figure.findobj(Text):
         if text.get_text() and "\\mathdefault" not in text.get_text():
             text.set_parse_math(False)
-            text.set_text(printable(text.get_text()))
+            text.set_text(printable(text.get_text().replace(r"\$", "$")))
 
 
 def _references(node: ElementTree.Element) -> list[str]:

@@ -6,15 +6,12 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from malta.report.page.analysis import Analysis, Subject, analyse
-from malta.report.page.document import Front, Page, render
-from malta.report.page.headline import key_figures
-from malta.report.page.sections import report_sections
-
 if TYPE_CHECKING:
     from malta.campaigns.summary import Summary
     from malta.gains.schema import GainFile
     from malta.model.plant import Parameters
+    from malta.report.page.analysis import Analysis, Subject
+    from malta.report.page.document import Page
     from malta.synthesis.controller import Controller
     from malta.synthesis.spec import Spec
 
@@ -42,6 +39,8 @@ def gain_page(
 
         malta.report.gain_page("design/gains/robust.json").save("build/robust_report.html")
     """
+    from malta.report.page.analysis import analyse
+
     subject = subject_of(gains, parameters=parameters, uncertainty=uncertainty, spec=spec)
     return page_of(analyse(subject, proof=proof, campaigns=campaigns))
 
@@ -57,6 +56,7 @@ def subject_of(
     """Read what a page is about. Raises InputError as `malta.gains.read`."""
     from malta.files import locate
     from malta.gains.file import content_of, read
+    from malta.report.page.analysis import Subject
 
     if not isinstance(gains, str | Path):
         box = dict(uncertainty or {})
@@ -85,6 +85,10 @@ def provenance_of(file: GainFile) -> tuple[tuple[str, str], ...]:
 
 def page_of(found: Analysis, progress: Callable[[float], None] | None = None) -> Page:
     """Write an analysis as a page."""
+    from malta.report.page.document import Front, render
+    from malta.report.page.headline import key_figures
+    from malta.report.page.sections import report_sections
+
     c = found.subject.controller
     changes = f", changed: {', '.join(found.subject.changes)}" if found.subject.changes else ""
     about = f"Machine {found.plant.name}, preset {found.subject.parameters.preset}{changes}"
@@ -108,6 +112,7 @@ def report_work(
     bounds: Callable[[float, float], None] | None,
 ) -> tuple[Analysis, Page]:
     """Analyse a subject and write its page, behind one measure of progress."""
+    from malta.report.page.analysis import analyse
 
     def computed(share: float) -> None:
         if progress is not None:

@@ -57,7 +57,7 @@ MEANINGS: dict[str, Meaning] = {
     "motion": Meaning("noise at rest", "low", "machine"),
     "command": Meaning("noise at rest", "low", "machine"),
     "load_moves": Meaning("a constant load from outside", "low", "machine"),
-    "load_settles": Meaning("a constant load from outside", "low", "machine", "ms", "s"),
+    "load_settles": Meaning("a constant load from outside", "low", "machine", "s", "s"),
     "compliance": Meaning("a constant load from outside", "low", "machine"),
     "job_lower": Meaning("main job", "low", "machine"),
     "job_higher": Meaning("main job", "high", "machine"),
@@ -84,6 +84,7 @@ class Score(NamedTuple):
     value: float  # SI
     unit: str  # for display
     factor: float  # from SI to it
+    signal: str = ""  # in the label, of a figure that each signal has
 
     @property
     def meaning(self) -> Meaning:
@@ -128,12 +129,14 @@ def scores_of(found: Analysis) -> list[Score]:
     return [score for part in parts for score in part(found)]
 
 
-def _score(kind: str, name: str, label: str, value: float, unit: str = "", key_unit: str = "") -> Score:
+def _score(
+    kind: str, name: str, label: str, value: float, unit: str = "", key_unit: str = "", signal: str = ""
+) -> Score:
     meaning = MEANINGS[kind]
     key = identifier(name, key_unit or meaning.key_unit)
     unit = unit or meaning.unit
     factor, shown = UNITS[unit] if unit in ROOTS else (in_unit(1.0, unit), unit)
-    return Score(kind, key, label, float(value), shown, factor)
+    return Score(kind, key, label, float(value), shown, factor, signal)
 
 
 def _margins(a: Analysis) -> Iterator[Score]:
@@ -148,7 +151,9 @@ def _margins(a: Analysis) -> Iterator[Score]:
     if classical is None:
         return
     for disk in classical.disks:
-        yield _score("disk", f"disk_margin {disk.channels}", f"disk margin, {disk.channels}", disk.size)
+        signal = disk.channels.removesuffix(" alone") if disk.channels.endswith(" alone") else ""
+        words = f"disk margin, {disk.channels}"
+        yield _score("disk", f"disk_margin {disk.channels}", words, disk.size, signal=signal)
     smallest = min(classical.delay.values())
     yield _score("delay_margin", "delay_margin", "delay margin, smallest", smallest)
     if a.robust is not None and a.robust.mass is not None and a.margin is not None:
@@ -166,7 +171,7 @@ def _sensitivities(a: Analysis) -> Iterator[Score]:
     yield _score("peak_s", "peak_sensitivity", "peak |S| of the worst sensor", worst)
     yield _score("peak_s", "peak_sensitivity_sigma_max", "peak sigma_max(S)", peaks["sigma_max"])
     for name, peak in sensors.items():
-        yield _score("peak_s_of", f"peak_sensitivity {name}", f"peak |S| at {name}", peak)
+        yield _score("peak_s_of", f"peak_sensitivity {name}", f"peak |S| at {name}", peak, signal=name)
     if a.classical is not None:
         largest = max(gang[1] for gang in a.classical.gang.values())
         yield _score("peak_t", "peak_complementary", "peak |T| of the worst sensor", largest)
@@ -188,7 +193,8 @@ def _noise(a: Analysis) -> Iterator[Score]:
         return
     for signal, value in zip(a.plant.outputs, a.noise.motion, strict=True):
         fine, words = FINE.get(signal.unit, signal.unit), f"motion {signal.name}, rms"
-        yield _score("motion", f"motion {signal.name} rms", words, value, fine, unit_word(signal.unit))
+        key, unit = f"motion {signal.name} rms", unit_word(signal.unit)
+        yield _score("motion", key, words, value, fine, unit, signal.name)
     for signal, value in zip(a.plant.inputs, a.noise.force, strict=True):
         words = f"command {signal.name}, rms"
         yield _score(
@@ -201,11 +207,19 @@ def _loads(a: Analysis) -> Iterator[Score]:
     for load, output in furthest(a.recovered):
         fine, name, unit = FINE.get(output.unit, output.unit), f"load {load.name}", unit_word(output.unit)
         size = f"1 {units[load.name]} {load.name}"
-        label = f"{size} moves {output.output} by"
-        yield _score("load_moves", f"{name} moves {output.output}", label, output.largest, fine, unit)
-        yield _score("load_settles", f"{name} settles", f"{size}: within 1 % after", output.settled)
-        label = f"{size}: largest over frequency"
-        yield _score("compliance", f"{name} compliance", label, output.compliance, fine, unit)
+        settled = f"{size}: within 1 % after"
+        peak = f"{size}: largest over frequency"
+        yield _score(
+            "load_moves",
+            f"{name} largest",
+            f"{size}: largest deviation",
+            output.largest,
+            fine,
+            unit,
+            load.name,
+        )
+        yield _score("load_settles", f"{name} settles", settled, output.settled, signal=load.name)
+        yield _score("compliance", f"{name} compliance", peak, output.compliance, fine, unit, load.name)
 
 
 def _job(a: Analysis) -> Iterator[Score]:
@@ -215,8 +229,10 @@ def _job(a: Analysis) -> Iterator[Score]:
     rows = [("", merit) for merit in a.job.merits]
     if several and [m.label for m in a.job.merits] == [m.label for m in a.job.cases[0].merits]:
         rows = [(case.label, merit) for case in a.job.cases for merit in case.merits]
-    completed = all(case.run.verdict.completed for case in a.job.cases)
-    yield _score("job_higher", f"{a.job.name} completed", f"{a.job.name}: runs completed", float(completed))
+    completed = float(np.mean([case.run.verdict.completed for case in a.job.cases]))
+    yield _score(
+        "job_higher", f"{a.job.name} completed", f"{a.job.name}: runs completed", completed, "percent"
+    )
     for case, merit in rows:
         kind = "job_lower"
         if NEITHER.search(merit.label):

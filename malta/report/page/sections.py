@@ -191,11 +191,12 @@ def _margins(a: Analysis) -> Iterator[Item]:
         from malta.report.figures.margins import chain_figure
 
         position = f"position {a.plant.stroke}"
-        yield Picture(
-            lambda: chain_figure(robust, c.name, a.subject.box, position, a.worst),
-            "Margins stage by stage, from full state feedback to the machine's own loop, and the peak sensitivity "
-            "of each stage with the zones of ISO 14839-3.",
-        )
+        if a.margin is not None:
+            yield Picture(
+                lambda: chain_figure(robust, c.name, a.subject.box, position, a.worst),
+                "Margins stage by stage, from full state feedback to the machine's own loop, and the peak sensitivity "
+                "of each stage with the zones of ISO 14839-3.",
+            )
         yield from sheets_of([chain_table(robust), disk_table(robust, c.sample_time)])
         if robust.tolerance:
             yield from sheets_of([tolerance_table(robust, a.subject.box, a.payload)])

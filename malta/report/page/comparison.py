@@ -1,0 +1,277 @@
+"""Several designs beside each other: what differs, and every figure of merit with the better one marked."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import PurePath
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from malta.errors import InputError
+from malta.report.page.design import GROUPS, Entry, design_entries, display_unit
+from malta.report.page.scores import Score, best_of, scores_of
+from malta.simulation.experiments import progress_of_part
+
+if TYPE_CHECKING:
+    from malta.report.page.analysis import Analysis, Subject
+
+LEAST, MOST = 2, 8  # designs
+GAP = "\0"  # in the place of a signal's name
+
+
+class Difference(NamedTuple):
+    """An entry that is not the same in all designs; None where a design does not have it."""
+
+    group: str
+    key: str
+    name: str
+    unit: str  # for display
+    entries: tuple[Entry | None, ...]
+
+    @property
+    def texts(self) -> tuple[str, ...]:
+        """The value of each design; a dash where there is none."""
+        return tuple("-" if entry is None else entry.text(self.unit) for entry in self.entries)
+
+    @property
+    def heading(self) -> str:
+        """The name with its unit in brackets."""
+        return self.name if self.unit in ("", "1") else f"{self.name} [{self.unit}]"
+
+
+class Row(NamedTuple):
+    """A figure of merit of all designs; None where a design does not have it."""
+
+    group: str
+    key: str
+    heading: str
+    scores: tuple[Score | None, ...]
+    best: tuple[bool, ...]  # better than some other design
+
+    @property
+    def texts(self) -> tuple[str, ...]:
+        """The value of each design; a dash where there is none."""
+        return tuple("-" if score is None else score.text for score in self.scores)
+
+
+class Line(NamedTuple):
+    """A line of a table of designs."""
+
+    group: str
+    heading: str
+    texts: tuple[str, ...]
+    best: tuple[bool, ...]
+
+
+def _joined(lines: Iterable[tuple[Line, str]]) -> list[Line]:
+    """Lines, each with its signal: those that differ in the signal alone become one, with all signals in it.
+
+    Example: "motion x1, rms" and "motion y1, rms" of the same values become "motion x1 y1, rms".
+    """
+    found: list[Line] = []
+    kept: dict[tuple[Any, ...], tuple[int, list[str]]] = {}  # form of a line -> its place, its signals
+    for line, signal in lines:
+        form = line._replace(heading=_without(line.heading, signal))
+        if not signal or form not in kept:
+            kept[form] = len(found), [signal]
+            found.append(line)
+            continue
+        place, signals = kept[form]
+        signals.append(signal)
+        found[place] = line._replace(heading=form.heading.replace(GAP, " ".join(signals)))
+    return found
+
+
+def _without(heading: str, signal: str) -> str:
+    """A heading with a gap in the place of its signal."""
+    return (
+        re.sub(rf"(?<!\w){re.escape(signal)}(?!\w)", lambda _: GAP, heading, count=1) if signal else heading
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Designs beside each other."""
+
+    names: tuple[str, ...]  # each once
+    designs: tuple[Analysis, ...]
+
+    def __repr__(self) -> str:
+        return f"Comparison({', '.join(self.names)})"
+
+    @cached_property
+    def differences(self) -> tuple[Difference, ...]:
+        """The entries that are not the same in all designs, in the order of the first design that has them."""
+        found = [{entry.key: entry for entry in design_entries(a.subject)} for a in self.designs]
+        rows: list[Difference] = []
+        for key in dict.fromkeys(key for entries in found for key in entries):
+            entries = tuple(of.get(key) for of in found)
+            first = next(entry for entry in entries if entry is not None)
+            if not all(first.equals(entry) for entry in entries):
+                unit = display_unit(first.unit, [entry.value for entry in entries if entry is not None])
+                rows.append(Difference(first.group, key, first.name, unit, entries))
+        return tuple(sorted(rows, key=lambda row: GROUPS.index(row.group)))
+
+    @cached_property
+    def rows(self) -> tuple[Row, ...]:
+        """The figures of merit that make sense beside each other."""
+        found = [{score.key: score for score in scores_of(a)} for a in self.designs]
+        rows = []
+        for key in dict.fromkeys(key for scores in found for key in scores):
+            scores = tuple(of.get(key) for of in found)
+            first = next(score for score in scores if score is not None)
+            known = [score for score in scores if score is not None]
+            if any(score.unit != first.unit for score in known) or not self._is_shown(first):
+                continue
+            best = best_of(scores) if self._is_judged(first) else tuple(False for _ in scores)
+            rows.append(Row(first.meaning.group, key, first.heading, scores, best))
+        order = list(dict.fromkeys(row.group for row in rows))
+        return tuple(sorted(rows, key=lambda row: order.index(row.group)))
+
+    @cached_property
+    def one_machine(self) -> bool:
+        """Whether all designs are of the same machine, whatever its parameters."""
+        return len({(a.plant.name, *(s.name for s in a.plant.outputs)) for a in self.designs}) == 1
+
+    @cached_property
+    def one_box(self) -> bool:
+        """Whether the margins of all designs count in the same uncertainty."""
+        return self.one_machine and len({tuple(sorted(a.subject.box.items())) for a in self.designs}) == 1
+
+    @property
+    def difference_lines(self) -> list[Line]:
+        """The differences as lines of a table: signals with the same values share one."""
+        return _joined(
+            (
+                Line(row.group, row.heading, row.texts, (False,) * len(row.texts)),
+                next(entry.signal for entry in row.entries if entry is not None),
+            )
+            for row in self.differences
+        )
+
+    @property
+    def figure_lines(self) -> list[Line]:
+        """The figures of merit as lines of a table: signals with the same values share one."""
+        return _joined(
+            (
+                Line(row.group, row.heading, row.texts, row.best),
+                next(score.signal for score in row.scores if score is not None),
+            )
+            for row in self.rows
+        )
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """What is not compared, and why; what could not be computed."""
+        found = []
+        if not self.one_machine:
+            machines = ", ".join(dict.fromkeys(a.plant.name for a in self.designs))
+            found.append(
+                f"The machines differ ({machines}): sensors, noise, loads, main job and requirements are not compared."
+            )
+        elif not self.one_box:
+            found.append(
+                "The margins of parameters count in different uncertainties; none is marked as better. "
+                "--uncertain sets one for all."
+            )
+        for name, a in zip(self.names, self.designs, strict=True):
+            found += [f"{name}: {note}" for note in a.notes]
+            if not a.margins.stable:
+                found.append(f"{name}: the loop is UNSTABLE on its machine.")
+        return tuple(found)
+
+    def _is_shown(self, score: Score) -> bool:
+        """Whether a figure means the same in all designs, or at least something beside the others."""
+        return self.one_machine or score.meaning.scope != "machine"
+
+    def _is_judged(self, score: Score) -> bool:
+        """Whether one of the designs can be better by this figure."""
+        return score.meaning.scope != "box" or self.one_box
+
+
+def compare(
+    subjects: Sequence[Subject],
+    *,
+    proof: bool = True,
+    progress: Callable[[float], None] | None = None,
+    bounds: Callable[[float, float], None] | None = None,
+) -> Comparison:
+    """Analyse designs and put them beside each other.
+
+    proof : whether the margin of the parameters is proven for each
+    progress, bounds : as `analyse` takes them
+
+    Raises InputError for fewer than LEAST or more than MOST designs, CheckError as `analyse`.
+    """
+    from malta.report.page.analysis import analyse
+
+    require_count(len(subjects))
+    designs = [
+        analyse(
+            subject,
+            proof=proof,
+            stages=False,
+            progress=progress_of_part(progress, n, len(subjects)),
+            bounds=bounds,
+        )
+        for n, subject in enumerate(subjects)
+    ]
+    return Comparison(names_of(subjects), tuple(designs))
+
+
+def require_count(count: int) -> None:
+    """Raise InputError for fewer than LEAST or more than MOST designs."""
+    if not LEAST <= count <= MOST:
+        raise InputError("compare", "", f"{count} gain files", f"{LEAST} to {MOST}")
+
+
+def names_of(subjects: Sequence[Subject]) -> tuple[str, ...]:
+    """A name for each design, no name twice: where designs share a name, with what tells their files apart.
+
+    Two files of one name differ by the folders that they are in; the same file twice is numbered.
+    """
+    names = [subject.controller.name for subject in subjects]
+    for depth in range(1, 1 + max(len(PurePath(subject.source).parts) for subject in subjects)):
+        if len(set(names)) == len(names):
+            break
+        names = [
+            _deeper(subject, depth) if names.count(name) > 1 else name
+            for subject, name in zip(subjects, names, strict=True)
+        ]
+    return tuple(
+        f"{name} ({names[: k + 1].count(name)})" if names.count(name) > 1 else name
+        for k, name in enumerate(names)
+    )
+
+
+def _deeper(subject: Subject, depth: int) -> str:
+    """The last parts of the name of a subject's file; the design's name without a file."""
+    parts = PurePath(subject.source).parts
+    return "/".join(parts[-depth:]) if parts else subject.controller.name
+
+
+def comparison_document(found: Comparison) -> dict[str, Any]:
+    """A comparison as one JSON document: identifiers with units, values in SI."""
+    return {
+        "designs": [
+            {"name": name, "gains": a.subject.source, "machine": a.plant.name, "stable": a.margins.stable}
+            for name, a in zip(found.names, found.designs, strict=True)
+        ],
+        "differences": {
+            row.key: [None if entry is None else entry.value for entry in row.entries]
+            for row in found.differences
+        },
+        "figures": [
+            {
+                "key": row.key,
+                "group": row.group,
+                "better": next(s for s in row.scores if s is not None).meaning.better or None,
+                "values": [None if score is None else score.value for score in row.scores],
+                "best": [name for name, best in zip(found.names, row.best, strict=True) if best],
+            }
+            for row in found.rows
+        ],
+        "remarks": list(found.remarks),
+    }
