@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
 from malta.errors import CheckError, InputError
 from malta.margins.classical import Classical, classical_margins
+from malta.margins.curves import loop_curves
 from malta.margins.loops import CurrentLoops, loaded_system, machine_loop
 from malta.margins.recovery import recovery
 from malta.margins.stages import robustness
@@ -24,6 +26,7 @@ from malta.tuning.outcomes import judge
 
 if TYPE_CHECKING:
     from malta.campaigns.summary import Summary
+    from malta.margins.curves import LoopCurves
     from malta.margins.gain import Gain
     from malta.margins.recovery import Recovery
     from malta.margins.robust import Margin, Progress
@@ -90,6 +93,11 @@ class Analysis:
     outcomes: Sequence[Outcome]
     campaigns: Sequence[Summary]
     notes: Sequence[str]  # what could not be computed, and why
+
+    @cached_property
+    def curves(self) -> LoopCurves:
+        """The curves of the machine's loop."""
+        return loop_curves(self.plant, self.subject.controller, name=self.subject.controller.name)
 
 
 def analyse(

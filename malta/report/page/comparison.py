@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from malta.report.page.analysis import Analysis, Subject
 
 LEAST, MOST = 2, 8  # designs
+NOTHING = "-"  # the text of a design that has no such entry or figure
 GAP = "\0"  # in the place of a signal's name
 
 
@@ -33,7 +34,7 @@ class Difference(NamedTuple):
     @property
     def texts(self) -> tuple[str, ...]:
         """The value of each design; a dash where there is none."""
-        return tuple("-" if entry is None else entry.text(self.unit) for entry in self.entries)
+        return tuple(NOTHING if entry is None else entry.text(self.unit) for entry in self.entries)
 
     @property
     def heading(self) -> str:
@@ -53,7 +54,7 @@ class Row(NamedTuple):
     @property
     def texts(self) -> tuple[str, ...]:
         """The value of each design; a dash where there is none."""
-        return tuple("-" if score is None else score.text for score in self.scores)
+        return tuple(NOTHING if score is None else score.text for score in self.scores)
 
 
 class Line(NamedTuple):

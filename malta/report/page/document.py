@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from malta.errors import InputError
 from malta.files import replace_files
-from malta.report.page.inline import colours_of, inline_svg, printable
+from malta.report.page.inline import colours_of, inline_svg, printable, style_rules
 from malta.report.page.sections import Folded, Item, Picture, Section
 
 if TYPE_CHECKING:
@@ -82,10 +82,12 @@ def render(
 
     pictures = [item for section in sections for item in section.items if isinstance(item, Picture)]
     drawn: dict[int, str] = {}
-    for number, picture in enumerate(pictures):
-        drawn[id(picture)] = inline_svg(picture.draw(), f"f{number + 1}", picture.caption)
+    styles: dict[str, str] = {}
+    for number, picture in enumerate(pictures, 1):
+        drawn[id(picture)] = inline_svg(picture.draw(), f"f{number}", picture.caption, styles)
         if progress is not None:
-            progress((number + 1) / len(pictures))
+            progress(number / len(pictures))
+    rules = style_rules(styles)
     parts = [
         {
             "anchor": section.anchor,
@@ -98,7 +100,7 @@ def render(
     title = f"{front.heading}: {front.kind.lower()}"
     text = _environment().get_template("page.html.jinja").render(
         title=title, kind=front.kind, heading=front.heading, about=front.about, figures=front.figures,
-        foot=front.foot, sections=parts, style=Markup(_style()), inks=Markup(_inks(drawn.values())),
+        foot=front.foot, sections=parts, style=Markup(_style()), inks=Markup(f"{_inks([rules])}\n{rules}"),
     )  # fmt: skip
     return Page(title, text, tuple((picture.caption, picture) for picture in pictures))
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from xml.etree import ElementTree
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Mapping
 
     from matplotlib.figure import Figure
 
@@ -18,6 +18,7 @@ NAMESPACE = re.compile(r"^\{[^}]*\}")
 COLOUR = re.compile(r"#[0-9a-f]{6}\b")
 REFERENCE = re.compile(r"url\(#([^)]+)\)")
 NUMBER = re.compile(r"-?\d+\.\d{3,}")
+FONT = re.compile(r"font-family: [^;]*;? ?")
 UNPRINTABLE = re.compile(r"[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 
@@ -26,23 +27,26 @@ def printable(text: str) -> str:
     return UNPRINTABLE.sub("\ufffd", text)
 
 
-def inline_svg(figure: Figure, prefix: str, label: str) -> str:
+def inline_svg(figure: Figure, prefix: str, label: str, styles: dict[str, str]) -> str:
     """Draw a figure as an <svg> element for a page.
 
     prefix : of the identifiers in it, which no other figure of the page may have
     label : what the figure shows, for readers who do not see it
+    styles : style -> class, of all figures of the page so far; those of this figure are added
     """
     root = ElementTree.fromstring(_svg_bytes(figure))
-    used = {found for node in root.iter() for found in _references(node)}
+    named = dict.fromkeys(found for node in root.iter() for found in _references(node))
+    names = {name: f"{prefix}-{number}" for number, name in enumerate(named)}
     for node in root.iter():
-        _simplify(node, prefix, used)
+        _simplify(node, names, styles)
     for parent in list(root.iter()):
         for child in list(parent):
             if child.tag in ("metadata", "style"):
                 parent.remove(child)
     box = root.get("viewBox", "")
+    least = f"min-width:{float(box.split()[2]):.0f}px"  # of a narrow screen, which scrolls
     root.attrib.clear()
-    root.attrib.update({"viewBox": box, "role": "img", "aria-label": label})
+    root.attrib.update({"viewBox": box, "role": "img", "aria-label": printable(label), "style": least})
     return ElementTree.tostring(root, encoding="unicode")
 
 
@@ -74,25 +78,36 @@ def _references(node: ElementTree.Element) -> list[str]:
     return [name for names in (*found, links) for name in names]
 
 
-def _simplify(node: ElementTree.Element, prefix: str, used: set[str]) -> None:
-    """Drop namespaces, unused identifiers and digits that no screen shows; name colours by variables."""
+def _simplify(node: ElementTree.Element, names: Mapping[str, str], styles: dict[str, str]) -> None:
+    """Drop namespaces, unused identifiers and digits that no screen shows; name colours and styles.
+
+    names : identifiers in the page of those that are used
+    """
     node.tag = NAMESPACE.sub("", str(node.tag))
     attributes = {}
     for key, value in node.attrib.items():
         name = NAMESPACE.sub("", key)
+        if (name == "id" and value not in names) or (name == "transform" and value.startswith("rotate(-0 ")):
+            continue
         if name == "id":
-            if value not in used:
-                continue
-            value = f"{prefix}-{value}"
-        elif name == "href" and value.startswith("#"):
-            value = f"#{prefix}-{value[1:]}"
+            value = names[value]
+        elif name == "href" and value[1:] in names:
+            value = f"#{names[value[1:]]}"
         elif name == "style":
-            value = COLOUR.sub(lambda found: f"var(--ink-{found[0][1:]})", value)
-        elif name in ("d", "points"):
+            value = COLOUR.sub(lambda found: f"var(--ink-{found[0][1:]})", FONT.sub("", value))
+        elif name in ("d", "points", "x", "y", "transform"):
             value = NUMBER.sub(lambda found: f"{float(found[0]):.2f}", " ".join(value.split()))
-        attributes[name] = REFERENCE.sub(rf"url(#{prefix}-\1)", value)
+        value = REFERENCE.sub(lambda found: f"url(#{names[found[1]]})", value)
+        if name == "style":
+            name, value = "class", styles.setdefault(value, f"k{len(styles)}")
+        attributes[name] = value
     node.attrib.clear()
     node.attrib.update(attributes)
+
+
+def style_rules(styles: Mapping[str, str]) -> str:
+    """The rules of the classes that stand in place of styles, as `inline_svg` collects them."""
+    return "\n".join(f".{name}{{{style}}}" for style, name in styles.items())
 
 
 def colours_of(texts: Iterable[str]) -> dict[str, tuple[str, str]]:

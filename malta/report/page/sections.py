@@ -5,6 +5,7 @@ from __future__ import annotations
 import platform
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +15,7 @@ from malta.margins.loops import machine_loop
 from malta.model.published import published_figures
 from malta.model.signals import FINE
 from malta.report.figures.parts import UNITS, number
+from malta.report.page.channels import distinct_channels
 from malta.report.page.design import design_entries, display_unit, kind_of
 from malta.report.page.scores import requirement_words
 from malta.report.page.sheets import Sheet, matrix_sheet, plain_sheet, sheets_of
@@ -181,6 +183,13 @@ def _light(one: Outcome) -> tuple[str, str]:
 
 
 def _poles(a: Analysis) -> Iterator[Item]:
+    from malta.report import plots
+
+    loops = {a.subject.controller.name: a.curves}
+    yield Picture(
+        lambda: plots.pzmap(loops),
+        "Poles of the closed loop, of the machine and of the law; of sampled systems ln(λ) / Ts.",
+    )
     published = None if a.subject.changes else published_figures(a.plant.name)
     yield from sheets_of([poles_table(a.model, published), loop_poles_table(a.margins)])
 
@@ -227,6 +236,29 @@ def _classical_sheet(a: Analysis) -> Sheet:
 
 
 def _loop(a: Analysis) -> Iterator[Item]:
+    from malta.report import plots
+
+    loops = {a.subject.controller.name: a.curves}
+    panels = distinct_channels(loops)
+    sensitivity = (
+        plots.sensitivity_curves,
+        "Sensitivity S and complementary sensitivity T at each sensor, with the zones of ISO 14839-3.",
+    )
+    drawn = [
+        (
+            plots.nyquist,
+            "Nyquist plots of the loop at each sensor, the others closed, with the circle of max|S|.",
+        ),
+        (
+            plots.bode,
+            "Bode plots of the loop at each sensor, the others closed, with gain and phase margins.",
+        ),
+        (plots.gang_of_four, "Gang of four: what noise, references and forces do at each sensor."),
+    ]
+    for draw, caption in [sensitivity, *drawn] if a.margins.stable else drawn[:2]:
+        yield Picture(partial(draw, loops, channel=panels.channels), f"{caption}{panels.note}")
+    if a.margins.stable:
+        yield Picture(partial(plots.sigma, loops), "Singular values of L, S and T with all sensors at once.")
     published = published_figures(a.plant.name)
     tables: list[Any] = [sensitivity_table(a.margins), bandwidth_table(a.margins, published)]
     yield from sheets_of(tables)
@@ -322,7 +354,7 @@ def _campaigns(a: Analysis) -> Iterator[Item]:
             (worst_figure, "The worst runs of the campaign."),
         )
         for draw, caption in drawn:
-            yield Picture(lambda draw=draw, found=found: draw(found), caption)  # type: ignore[misc]
+            yield Picture(partial(draw, found), caption)
         yield from sheets_of(campaign_tables(found))
 
 

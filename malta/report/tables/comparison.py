@@ -9,6 +9,7 @@ from rich.console import Group
 from rich.text import Text
 
 from malta.report.figures.parts import micro
+from malta.report.page.comparison import NOTHING
 from malta.report.tables.parts import new_table
 
 if TYPE_CHECKING:
@@ -40,9 +41,9 @@ def comparison_tables(found: Comparison, width: int = 80) -> Group:
 def _blocks(names: Sequence[str], lines: Sequence[Line], width: int) -> Iterator[list[int]]:
     """Columns of designs that fit beside each other; none without lines."""
     block: list[int] = []
-    room = width - LABELS - EDGE
+    room, sign = width - LABELS - EDGE, _sign_width(lines)
     for k, name in enumerate(names if lines else ()):
-        needed = max(min(len(name), NAME), *(len(line.texts[k]) + len(BEST) + 1 for line in lines)) + 2
+        needed = max(min(len(name), NAME), *(len(line.texts[k]) + sign for line in lines)) + EDGE
         if block and needed > room:
             yield block
             block, room = [], width - LABELS - EDGE
@@ -52,19 +53,25 @@ def _blocks(names: Sequence[str], lines: Sequence[Line], width: int) -> Iterator
         yield block
 
 
+def _sign_width(lines: Sequence[Line]) -> int:
+    """The letters behind a value that mark it as better."""
+    return len(BEST) + 1 if any(any(line.best) for line in lines) else 0
+
+
 def _table(title: str, names: Sequence[str], lines: Sequence[Line], columns: Sequence[int]) -> Table:
-    """A table of some of the designs, with a line for each group."""
+    """A table of some of the designs, with a line for each group, of the lines that one of them has a value in."""
     table = new_table(title, "", *(names[k] for k in columns))
-    table.columns[0].max_width = LABELS
-    group = ""
+    group, blank = "", " " * _sign_width(lines)
     for line in lines:
+        if all(line.texts[k] == NOTHING for k in columns):
+            continue
         if line.group != group:
             if group:
                 table.add_section()
             group = line.group
             table.add_row(Text(group, style="italic"))
         cells = [
-            Text(f"{line.texts[k]} {BEST}", style="bold") if line.best[k] else Text(f"{line.texts[k]}  ")
+            Text(f"{line.texts[k]} {BEST}", style="bold") if line.best[k] else Text(line.texts[k] + blank)
             for k in columns
         ]
         table.add_row(Text(micro(line.heading)), *cells)

@@ -10,6 +10,7 @@ import re
 import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import islice
 from typing import TYPE_CHECKING
 
 from rich import box
@@ -18,6 +19,7 @@ from rich.text import Text
 
 if TYPE_CHECKING:
     from rich.console import Console, ConsoleOptions, RenderResult
+    from rich.style import Style
     from rich.table import Column
 
 EDGES = 2  # columns of a terminal, left and right of a table
@@ -162,8 +164,15 @@ class FoldingTable(Table):
             texts = [cells[i][row] for i in block]
             if len(block) == len(self.columns) or any(texts[1:]):
                 folded = ("\n".join(fold(text, width)) for text, width in zip(texts, widths, strict=True))
-                drawn.add_row(*map(Text, folded), end_section=style.end_section)
+                marks = (_style_of(self.columns[i], row) for i in block)
+                drawn.add_row(*map(Text, folded, marks), end_section=style.end_section)
         return drawn
+
+
+def _style_of(column: Column, row: int) -> str | Style:
+    """The style of a cell, as bold; none of a plain string."""
+    cell = next(islice(column.cells, row, None))
+    return cell.style if isinstance(cell, Text) else ""
 
 
 def _as_lists(headings: Sequence[str], cells: Sequence[Sequence[str]], width: int) -> list[str]:
