@@ -161,7 +161,7 @@ def _of_panel(name: str, axes: Axes) -> Iterator[str]:
         what = f"the {side.axis_name} axis of {name}"  # type: ignore[attr-defined]
         if _is_of_names(side) or (not numbers and not _wants_numbers(side)):
             continue
-        if "[" not in label and not _shared_label(axes, side):
+        if "[" not in label + axes.get_title() and not _shared_label(axes, side):
             yield f"{what} has no unit: {label!r}"
         if len(numbers) < 2:
             yield f"{what} has {len(numbers) or 'no'} number at its ticks"
@@ -261,8 +261,8 @@ def _unnamed_looks(name: str, axes: Axes, figure: Figure) -> Iterator[str]:
         for line in axes.lines
         if line.get_visible()
         and line.get_linestyle() != "None"
-        and not _is_straight(line)
         and _has_data(line)
+        and not _is_straight(line)
     }
     missing = drawn - named
     if len(drawn) > 1 and len(missing) > len([text for text in axes.texts if text.get_visible()]):
@@ -275,4 +275,4 @@ def _colour_and_dash(line: Line2D) -> tuple[str, str]:
 
 def _is_straight(line: Line2D) -> bool:
     xy = np.asarray(line.get_xydata(), dtype=float)
-    return len(xy) <= 3 and bool(np.ptp(xy, axis=0).min() == 0 or not math.isfinite(np.ptp(xy)))
+    return 0 < len(xy) <= 3 and bool(np.ptp(xy, axis=0).min() == 0 or not math.isfinite(np.ptp(xy)))

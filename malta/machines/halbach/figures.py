@@ -20,13 +20,13 @@ from malta.machines.halbach.experiments.lift import (
 from malta.machines.halbach.experiments.motions import BEFORE, PAUSE, responses
 from malta.report.figures.parts import (
     MORE,
-    NOTE,
     STYLES,
     Published,
     add_shared_legend,
     draw_bound,
-    draw_grid,
+    draw_dots,
     draw_line,
+    draw_noisy,
     ending_text,
     finish_axes,
     merit_phrase,
@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    from malta.model.plant import FloatArray
     from malta.simulation.experiments import Case, Experiment
     from malta.simulation.trajectory import Trajectory
 
@@ -54,7 +55,7 @@ def step_figure(e: Experiment, _: Published | None = None) -> Figure:
     """All steps on top of each other with their mean, the position at rest, and the vertical force. Fig. 9."""
     run = e.run
     merits = "; ".join(f"{m.label} {merit_phrase(m)}" for m in e.cases[0].merits[:4])
-    figure = new_page([run], f"steps{ending_text(run)}", f"{e.cases[0].label}: {micro(merits)}")
+    figure = new_page([run], f"steps{ending_text(run)}", f"{e.cases[0].label}: {micro(merits)}", hspace=0.4)
     grid = figure.add_gridspec(2, 2)
     if len(e.cases) > 1:
         panels = [figure.add_subplot(grid[0, k]) for k in range(2)]
@@ -65,9 +66,9 @@ def step_figure(e: Experiment, _: Published | None = None) -> Figure:
     rest, lift = figure.add_subplot(grid[1, 0]), figure.add_subplot(grid[1, 1])
     last = slice(_first_sample_at_rest(run), None)
     draw_line(rest, run.t[last], 1e6 * (run.p - run.reference)[last, 0], **STYLES[0] | {"linewidth": 0.9})
-    draw_line(lift, run.t, lift_force(run), **STYLES[0] | {"linewidth": 0.9})
+    draw_noisy(lift, run.t, lift_force(run), PAUSE)
     finish_axes(rest, "time [s]", "off reference, at rest [µm]")
-    finish_axes(lift, "time [s]", "vertical force [N]")
+    finish_axes(lift, "time [s]", "vertical force [N]", legend=2)
     add_shared_legend(figure)
     return figure
 
@@ -124,11 +125,11 @@ def _published_text(e: Experiment, published: Published) -> str:
 
 
 def ramp_figure(e: Experiment, _: Published | None = None) -> Figure:
-    """Position and error over time, error and vertical force along the travel, for each speed. Fig. 8."""
-    figure = new_page(runs_of(e), f"ramps{ending_text(e.run)}", merits_phrase(e.cases, 0))
+    """Position and error over time; error and vertical force along the travel, by stretches, for each speed. Fig. 8."""
+    figure = new_page(runs_of(e), f"ramps{ending_text(e.run)}", merits_phrase(e.cases, 0), hspace=0.42)
     (position, begin), (along, lift) = figure.subplots(2, 2)
-    for case, style in zip(e.cases, cycle((*STYLES, *MORE))):
-        run = case.run
+    for n, (case, style) in enumerate(zip(e.cases, cycle((*STYLES, *MORE)), strict=False)):
+        run, aside = case.run, (n - (len(e.cases) - 1) / 2) / (len(e.cases) + 1)
         error, place = 1e6 * (run.p - run.reference)[:, 0], 1e3 * run.reference[:, 0]
         moving = np.diff(run.reference[:, 0], append=run.reference[-1, 0]) != 0
         first = run.t - (run.t[moving][0] if moving.any() else 0.0)
@@ -136,22 +137,41 @@ def ramp_figure(e: Experiment, _: Published | None = None) -> Figure:
         started = (first > -0.5) & (first < 3)
         begin.plot(first[started], error[started], **style)
         steady = moving & (first > 2)
-        along.plot(place[steady], error[steady], **style | {"linewidth": 0.8})
-        lift.plot(place[moving], lift_force(run)[moving], **style | {"linewidth": 0.8})
+        mark = {"marker": MARKERS[n % len(MARKERS)], "color": style["color"], "label": case.label}
+        _draw_stretches(along, place[steady], error[steady], aside, mark)
+        _draw_stretches(lift, place[moving], lift_force(run)[moving], aside, mark)
     finish_axes(position, "time [s]", "position [mm]")
     finish_axes(begin, "time after the begin [s]", "off reference [µm]")
-    finish_axes(along, "position [mm]", "off reference, after 2 s [µm]")
-    finish_axes(lift, "position [mm]", "vertical force [N]")
+    stretches, columns = f"position, mean and deviation in each {STRETCH:g} mm [mm]", len(e.cases)
+    finish_axes(along, stretches, "off reference, after 2 s [µm]", legend=columns)
+    finish_axes(lift, stretches, "vertical force [N]", legend=columns)
+    for axes in (along, lift):
+        axes.margins(x=0.03)
     add_shared_legend(figure)
     return figure
+
+
+STRETCH = 5.0  # mm of the travel, over which noisy signals are averaged
+MARKERS = "osD^"
+
+
+def _draw_stretches(
+    axes: Axes, place: FloatArray, values: FloatArray, aside: float, mark: dict[str, Any]
+) -> None:
+    """Mean and standard deviation of a signal in each stretch of the travel, drawn a share of it beside its middle."""
+    stretch = np.floor(place / STRETCH)
+    parts = {(k + 0.5 + 0.8 * aside) * STRETCH: values[stretch == k] for k in np.unique(stretch)}
+    means, deviations = ([float(f(part)) for part in parts.values()] for f in (np.mean, np.std))
+    axes.errorbar(list(parts), means, deviations, markersize=4.5, linestyle="none", elinewidth=0.9, **mark)
 
 
 def force_figure(e: Experiment, published: Published | None = None) -> Figure:
     """Vertical force and position over time for each law, and the steady changes with faults. Fig. 10."""
     sound = [case for case in e.cases if case.label in LAWS]
-    figure = new_page(runs_of(e), "vertical force of a move", merits_phrase(sound, 0), left=0.085, wspace=0.3)
+    figure = new_page(runs_of(e), "vertical force of a move", merits_phrase(sound, 0), top=0.84, wspace=0.34)
     grid = figure.add_gridspec(2, 2, width_ratios=(1.15, 1))
-    lift, position = figure.add_subplot(grid[0, 0]), figure.add_subplot(grid[1, 0])
+    lift = figure.add_subplot(grid[0, 0])
+    position = figure.add_subplot(grid[1, 0], sharex=lift)
     for case, style in zip(sound, STYLES, strict=False):
         run = case.run
         start = run.scenario.duration * CALM / (CALM + AFTER)
@@ -159,10 +179,10 @@ def force_figure(e: Experiment, published: Published | None = None) -> Figure:
         draw_line(lift, run.t[shown] - start, lift_force(run)[shown], label=case.label, **style)
         draw_line(position, run.t[shown] - start, 1e3 * run.p[shown, 0], **style)
     draw_bound(lift, commanded_lift(e.run), "wanted", where="below right")
-    finish_axes(lift, "", "vertical force [N]")
+    finish_axes(lift, "", "vertical force [N]", legend=len(sound))
+    lift.tick_params(labelbottom=False)
     finish_axes(position, "time after the begin [s]", "position [mm]")
     _draw_faults(figure.add_subplot(grid[:, 1]), e, published)
-    add_shared_legend(figure)
     return figure
 
 
@@ -176,20 +196,19 @@ def _draw_faults(axes: Axes, e: Experiment, published: Published | None) -> None
             if label in found:
                 heights.append(-row - 0.2 * (k - 1))
                 changes.append(100 * found[label])
-        mark = {"marker": "osD"[k], "markersize": 6, "linestyle": "none", "color": style["color"]}
-        axes.plot(changes, heights, **mark)
+        mark = {"marker": MARKERS[k], "markersize": 6, "linestyle": "none", "color": style["color"]}
+        axes.plot(changes, heights, label=law, **mark)
         if published is not None:
             value = published_in_unit(published, f"figure_10.{PRINTED[law]}", "percent")
             axes.axvline(value, color=style["color"], linewidth=0.9, linestyle=style["linestyle"])
     if published is not None:
-        where: dict[str, Any] = {"xycoords": "axes fraction", "ha": "center", "va": "bottom"}
-        axes.annotate("lines: as\nthe paper\nmeasured", (0.27, 0.01), **where, **NOTE)
+        axes.plot([], [], color="#5a5a5a", linewidth=0.9, label="lines: published")
     axes.set_yticks(
         [-row for row in range(len(FAULTS))], [_on_two_lines(fault) for fault in FAULTS], fontsize=8
     )
     axes.set_ylim(-len(FAULTS) + 0.35, 0.5)
-    axes.set_xlabel("steady change of the vertical force [%]")
-    draw_grid(axes)
+    finish_axes(axes, "steady change of the vertical force [%]", "", legend=2)
+    axes.margins(x=0.06)
 
 
 def _on_two_lines(text: str) -> str:
@@ -200,25 +219,14 @@ def _on_two_lines(text: str) -> str:
 
 def budget_figure(e: Experiment, _: Published | None = None) -> Figure:
     """The error at rest by source, and current noise along half a pitch. Sec. 5.1."""
-    figure = new_page(
-        runs_of(e), "error of the position at rest, by source", merits_phrase(e.cases, 0), wspace=0.3
-    )
-    bars, along = figure.subplots(1, 2, width_ratios=(1.2, 1))
     values = [in_unit(case.merits[0].value, "um") for case in e.cases]
-    floor = 1e-3  # um, end of the logarithmic axis: the resolution of the laser is 1 nm
-    for k, value in enumerate(values):
-        bars.bar(
-            k, max(value, floor) - floor, bottom=floor, color="#d4d4d4", edgecolor="#000000", linewidth=0.9
-        )
-        text = number(value, 2) if value >= floor else "0"
-        bars.annotate(
-            text, (k, max(value, floor)), xytext=(0, 2), textcoords="offset points", ha="center", **NOTE
-        )
-    bars.set_yscale("log")
-    bars.set_ylim(floor, 3 * max(*values, floor))
-    bars.set_xticks(range(len(e.cases)), [_on_two_lines(case.label) for case in e.cases], fontsize=8)
-    bars.set_ylabel("position, rms [µm]")
-    draw_grid(bars)
+    found = f"position, rms, of all sources together: {merit_phrase(e.cases[-1].merits[0])}"
+    figure = new_page(runs_of(e), "error of the position at rest, by source", found, left=0.15, wspace=0.26)
+    sources, along = figure.subplots(1, 2, width_ratios=(1.2, 1))
+    floor = 1e-3  # um: the resolution of the laser is 1 nm
+    values = [value if value >= floor else 0.0 for value in values]
+    draw_dots(sources, [case.label for case in e.cases], values, [f"{number(v, 2)} µm" for v in values])
+    finish_axes(sources, "position, rms [µm]", "")
     along.plot(1e3 * e.curves["place"], 1e6 * e.curves["rms"], marker="o", markersize=5, **STYLES[0])
     along.set_ylim(0, None)
     finish_axes(along, "place [mm], half a pitch", "current noise alone: position, rms [µm]")

@@ -4,19 +4,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from malta.report.figures.parts import (
+    BOUND,
     STYLES,
     Published,
     add_shared_legend,
     draw_bound,
-    draw_grid,
+    draw_dots,
     draw_line,
     draw_published,
     finish_axes,
+    label_upright,
     mark_end,
     merit_phrase,
     new_page,
@@ -92,8 +94,10 @@ def errors_figure(e: Experiment, published: Published | None = None) -> Figure:
         right=0.985,
     )
     (*maps, steps), (forces, missed, torque) = figure.subplots(2, 3)
-    for axes, name in zip(maps, models, strict=False):
-        _draw_map(axes, mm, np.abs(c[name][..., 2]) * 1e3, f"{name}: error of F_z [mN]")
+    errors = {name: np.abs(c[name][..., 2]) * 1e3 for name in models}
+    darkest = max(float(values.max()) for values in errors.values())
+    for axes, (name, values) in zip(maps, errors.items(), strict=False):
+        _draw_map(axes, mm, values, darkest, f"{name}: error of F_z")
     for axes in maps[len(models) :]:
         axes.set_visible(False)
     for k, (force, style) in enumerate(zip(("F_x", "F_z"), STYLES, strict=False)):
@@ -104,9 +108,9 @@ def errors_figure(e: Experiment, published: Published | None = None) -> Figure:
     names = [s.name for s in e.run.plant.inputs]
     for k, style in zip((0, 1, 2), STYLES, strict=False):
         draw_line(forces, mm, c["exact"][:, row, k], label=names[k], **style)
-    for axes, k, scale in ((missed, 0, 1e3), (torque, 3, 1e3)):
-        for name, style in zip(models, (STYLES[0], STYLES[2]), strict=False):
-            draw_line(axes, mm, c[name][:, row, k] * scale, label=name, **style)
+    for axes, k in ((missed, 0), (torque, 3)):
+        for name in models:
+            _draw_error(axes, mm, c[name][:, row, k] * 1e3, name)
     finish_axes(steps, "step of the table [mm]", "largest error [N]", legend=2)
     steps.xaxis.set_major_locator(FixedLocator([0.3, 0.5, 1, 2, 3]))
     steps.xaxis.set_major_formatter("{x:g}")
@@ -114,14 +118,31 @@ def errors_figure(e: Experiment, published: Published | None = None) -> Figure:
     where = f"x [mm], y = {number(c['x'][row] * 1e3, 3)} mm"
     finish_axes(forces, where, "exact force [N]", legend=3)
     finish_axes(missed, where, "error of F_x [mN]", legend=2)
-    finish_axes(torque, where, "error of T_x [mN m]", legend=2)
+    finish_axes(torque, where, "error of T_x [mN m]", legend=2, side="right")
     return figure
 
 
-def _draw_map(axes: Axes, mm: FloatArray, values: FloatArray, text: str) -> None:
-    """A map over x and y in grey levels, with its scale."""
-    drawn = axes.pcolormesh(mm, mm, values.T, cmap="Greys", shading="gouraud", rasterized=True)
+def _draw_error(axes: Axes, mm: FloatArray, values: FloatArray, name: str) -> None:
+    """An error along x: a line, or a band from least to largest where it turns too often for a line to be followed."""
+    turns = int(np.count_nonzero(np.diff(np.sign(np.diff(values)))))
+    if turns < MANY_TURNS:
+        draw_line(axes, mm, values, label=name, **STYLES[0])
+        return
+    window = 2 * math.ceil(2 * len(values) / turns) + 1
+    around = np.lib.stride_tricks.sliding_window_view(np.pad(values, window // 2, mode="edge"), window)
+    band: dict[str, Any] = {"color": "#9ecae1", "linewidth": 0, "label": f"{name}, extremes"}
+    axes.fill_between(mm, around.min(axis=1), around.max(axis=1), **band)
+
+
+MANY_TURNS = 40  # of a line over a panel
+
+
+def _draw_map(axes: Axes, mm: FloatArray, values: FloatArray, darkest: float, text: str) -> None:
+    """A map over x and y in grey levels from 0 to `darkest`, with its scale."""
+    shown: dict[str, Any] = {"cmap": "Greys", "shading": "gouraud", "rasterized": True}
+    drawn = axes.pcolormesh(mm, mm, values.T, vmin=0, vmax=darkest, **shown)
     bar = axes.figure.colorbar(drawn, ax=axes, fraction=0.05, pad=0.03)
+    bar.ax.set_title("[mN]", fontsize=8)
     bar.outline.set_visible(False)
     bar.ax.tick_params(labelsize=8)
     axes.set_title(text, fontsize=9, loc="left")
@@ -134,12 +155,14 @@ def delay_figure(e: Experiment, _: Published | None = None) -> Figure:
     """The largest of the three angles over time, by speed of the controller."""
     speeds = list(dict.fromkeys(case.label.split(", ")[1] for case in e.cases))
     left = (
-        f"{case.label} {merit_phrase(case.merits[1])}" for case in e.cases if case.label.endswith(speeds[-1])
+        f"{merit_phrase(case.merits[1])} {case.label.split(',')[0]} the delay"
+        for case in e.cases
+        if case.label.endswith(speeds[-1])
     )
     figure = new_page(
         runs_of(e),
         "filters with and without the delay in their model",
-        "angles left at rest: " + ", ".join(left),
+        f"angles left at rest, {speeds[-1]} as fast as designed: " + ", ".join(left),
         top=0.82,
         wspace=0.12,
     )
@@ -164,30 +187,24 @@ LEAST = 1e-4  # urad, smallest value on the logarithmic axis
 
 
 def timing_figure(e: Experiment, published: Published | None = None) -> Figure:
-    """Computing times of one commutation as bars, beside the control period."""
+    """Computing times of one commutation, beside the control period."""
     timed = [merit for merit in e.merits if merit.unit == "us" and math.isfinite(merit.value)]
-    bars = {merit.label: merit.value * 1e6 for merit in timed}
+    times = {merit.label: merit.value * 1e6 for merit in timed}
     if published is not None:
-        bars["the paper's whole loop"] = published_in_unit(published, "real_time.mean", "us")
+        times["the paper's whole loop"] = published_in_unit(published, "real_time.mean", "us")
     figure = new_page(
         runs_of(e),
         "K(p) and its pseudo-inverse",
         "on this computer; the paper's on an NI PXI-1042Q",
-        left=0.2,
+        left=0.28,
     )
     axes = figure.subplots()
-    places = range(len(bars))
-    axes.barh(places, list(bars.values()), height=0.5, color="#8a8a8a")
-    for place, value in zip(places, bars.values(), strict=True):
-        axes.annotate(f" {number(value, 3)}", (value, place), va="center", fontsize=9)
-    axes.set_yticks(places, list(bars))
-    axes.invert_yaxis()
-    axes.set_xscale("log")
+    draw_dots(axes, list(times), list(times.values()), [f"{number(value, 3)} µs" for value in times.values()])
     period = e.run.controller.sample_time * 1e6
-    axes.axvline(period, color="#9a9a9a", linestyle=(0, (8, 3)), linewidth=0.9)
-    axes.set_xlim(0.1, 4 * period)
-    axes.set_xlabel(f"time of one call [µs]; dashed: control period, {period:g} µs")
-    draw_grid(axes)
+    axes.axvline(period, **BOUND)
+    label_upright(axes, 1.05 * period, 0.4, f"control period, {period:g} µs", ha="left")
+    axes.set_xlim(0.5 * min(times.values()), 4 * period)
+    finish_axes(axes, "time of one call [µs]", "")
     return figure
 
 

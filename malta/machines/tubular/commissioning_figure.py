@@ -17,6 +17,7 @@ from malta.report.figures.parts import (
     add_shared_legend,
     clearance,
     draw_bound,
+    draw_group,
     draw_line,
     ended_early,
     finish_axes,
@@ -43,7 +44,7 @@ def commissioning_figure(e: Experiment, _: Published | None = None) -> Figure:
     followed = np.where(flying[:, None], e.curves["followed"], np.nan)
     shown = (e.merits[1], e.merits[3], e.merits[5])
     found = ", ".join(f"{merit.label} {merit_phrase(merit)}" for merit in shown)
-    figure = new_page([run], "commissioning by the supervisor", found, hspace=0.16, top=0.83)
+    figure = new_page([run], "commissioning by the supervisor", found, hspace=0.3, top=0.83)
     (height, error), (stroke, force) = figure.subplots(2, 2, sharex=True)
     axis = plant.stroke_output
     for k, style in zip((1, 3), STYLES, strict=False):
@@ -54,13 +55,13 @@ def commissioning_figure(e: Experiment, _: Published | None = None) -> Figure:
     off = np.abs(run.p - followed)[:, [k for k in range(followed.shape[1]) if k != axis]].max(axis=1)
     draw_line(error, ms, np.maximum(off * 1e6, 1e-2), **STYLES[0])
     error.set_yscale("log")
-    for k, style in zip((1, 3, plant.thrust_input), STYLES, strict=False):
-        draw_line(force, ms, run.v[:, k], label=f"force {plant.inputs[k].name}", **style)
-    draw_bound(height, -clearance(plant) * 1e6, "touchdown bearing")
+    first = sorted(range(len(plant.inputs)), key=lambda k: k != plant.thrust_input)
+    draw_group(force, ms, {plant.inputs[k].name: run.v[:, k] for k in first})
+    draw_bound(height, -clearance(plant) * 1e6, "touchdown bearing", where="below left")
     finish_axes(height, "", "height [µm]")
     finish_axes(error, "", "off its reference, radially [µm]")
     finish_axes(stroke, "time [ms]", f"{plant.stroke} [mm]")
-    finish_axes(force, "time [ms]", "commanded forces [N]")
+    finish_axes(force, "time [ms]", "commanded forces [N]", legend=len(first))
     for axes in (height, error, stroke, force):
         _mark_states(axes, ms, state, named=axes is height)
     add_shared_legend(figure)
@@ -86,8 +87,9 @@ def _mark_states(axes: Axes, ms: FloatArray, state: FloatArray, *, named: bool) 
 
 def supervised_faults_figure(e: Experiment, _: Published | None = None) -> Figure:
     """The speed at which a bearing is met after each fault, with and without the supervisor; deviations over time."""
-    found = ", ".join(f"{merit.label}: {merit.value:.0f}" for merit in e.merits)
-    figure = new_page(runs_of(e), "faults with and without the supervisor", found, left=0.245, wspace=0.24)
+    found = "; ".join(f"{merit.label}: {merit.value:.0f}" for merit in e.merits)
+    places = {"left": 0.245, "wspace": 0.24, "top": 0.83}
+    figure = new_page(runs_of(e), "faults with and without the supervisor", found, **places)
     bars, deviations = figure.subplots(1, 2, width_ratios=(1, 1.25))
     _draw_speeds(bars, e)
     _draw_deviations(deviations, e)
@@ -140,7 +142,8 @@ def _draw_deviations(axes: Axes, e: Experiment) -> None:
         draw_line(axes, ms, np.maximum(off, 0.1), label=label, **next(styles))
         if case.merits[1].value >= 0:
             k = min(int(np.searchsorted(ms, case.merits[1].value * 1e3)), len(ms) - 1)
-            axes.plot(ms[k], off[k], **CROSS | ({} if ended_early(run) else {"marker": "v"}))
+            down_there = {"label": "touchdown"} if ended_early(run) else {"marker": "v", "label": "landed"}
+            axes.plot(ms[k], off[k], **CROSS | down_there)
     if not down:
         axes.annotate("no touchdown", (0.5, 0.5), xycoords="axes fraction", ha="center", **NOTE)
     axes.set_yscale("log")

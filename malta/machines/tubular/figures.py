@@ -27,6 +27,8 @@ from malta.report.figures.parts import (
     add_shared_legend,
     clearance,
     draw_bound,
+    draw_dots,
+    draw_group,
     draw_histograms,
     draw_line,
     draw_published,
@@ -76,10 +78,12 @@ def stroke_figure(run: Trajectory, published: Published | None = None) -> Figure
     draw_line(position, ms, run.reference[:, axis] * 1e3, label="reference z*", **STYLES[2])
     draw_line(position, ms, run.p[:, axis] * 1e3, label="position z", **STYLES[0])
     draw_line(error, ms, (run.reference[:, axis] - run.p[:, axis]) * 1e3, **STYLES[0])
-    for i, style in zip((k for k in range(len(names)) if k != axis), (1, 0, 3, 2), strict=False):
-        draw_line(radial, ms, (run.p[:, i] - run.reference[:, i]) * 1e6, label=names[i], **STYLES[style])
-    for name, style, i in _widest_currents(run):
-        draw_line(current, ms, run.current[:, i], label=name, **STYLES[style])
+    off = (run.p - run.reference) * 1e6
+    draw_group(radial, ms, {name: off[:, i] for i, name in enumerate(names) if i != axis})
+    forces = [s.name for s in plant.inputs]
+    forces[plant.thrust_input] += " (thrust)"
+    order = sorted(range(len(forces)), key=lambda i: i != plant.thrust_input)
+    draw_group(current, ms, {forces[i]: run.current[:, i] for i in order})
     draw_published(error, published, "figure_12.axial_error", "mm", both=True)
     draw_published(radial, published, "figure_13.radial_deviation", "um", both=True)
     reached = np.array([first, last, run.p[:, axis].min(), run.p[:, axis].max()]) * 1e3
@@ -88,20 +92,11 @@ def stroke_figure(run: Trajectory, published: Published | None = None) -> Figure
     finish_axes(position, "", "axial position z [mm]", legend=2)
     finish_axes(radial, "", "radial deviation [µm]", legend=4)
     finish_axes(error, "time [ms]", "axial error z* - z [mm]")
-    finish_axes(current, "time [ms]", "current per module [A]", legend=3)
+    finish_axes(current, "time [ms]", "current per module [A]", legend=5, side="right")
     constant = plant_of(run.controller.parameters).actuator.force_constant[plant.thrust_input]
     thrust = current.secondary_yaxis("right", functions=(lambda i: i * constant, lambda f: f / constant))
     thrust.set_ylabel("thrust [N]")
     return figure
-
-
-def _widest_currents(run: Trajectory) -> list[tuple[str, int, int]]:
-    """The thrust current and the two bearing currents that carry the weight: label, style, index."""
-    inputs = [s.name for s in run.plant.inputs]
-    thrust = run.plant.thrust_input
-    widest = np.argsort(-np.abs(run.v).max(axis=0), kind="stable")
-    others = sorted(int(i) for i in widest[widest != thrust][:2])
-    return [(inputs[i], style, i) for style, i in enumerate([thrust, *others])]
 
 
 def hold_figure(e: Experiment, published: Published | None = None) -> Figure:
@@ -115,7 +110,7 @@ def hold_figure(e: Experiment, published: Published | None = None) -> Figure:
     figure = new_page(
         [run],
         f"{len(y)} samples at rest{ending_text(run)}",
-        "mean and standard deviation of what is measured above the bars; "
+        "means and standard deviations above the bars; "
         f"true motion {number(rms[radial].max(), 2)} µm rms radially, {number(rms[axis], 2)} µm axially",
         wspace=0.33,
     )
@@ -123,15 +118,17 @@ def hold_figure(e: Experiment, published: Published | None = None) -> Figure:
     panels = [figure.add_subplot(grid[k % 2, k // 2] if k != axis else grid[:, 2]) for k in range(len(names))]
     labels = (
         f"measured, in bins of {bins[0]:.2g} µm ({names[axis]}: {bins[axis]:.2g} µm)",
-        "true, in bins of a tenth",
+        "true, in the same bins",
     )
-    spreads = [[("ours", float(y[:, k].mean()), float(y[:, k].std()))] for k in range(len(names))]
+    spreads = [[("measured", float(y[:, k].mean()), float(y[:, k].std()))] for k in range(len(names))]
     if published is not None:
         for name, found in zip(names, spreads, strict=True):
             mean, std = (
                 published_in_unit(published, f"table_III.{what}.{name}", "um") for what in ("mean", "std")
             )
             found.append(("Table III", mean, std))
+    for k, found in enumerate(spreads):
+        found.append(("true", float(p[:, k].mean()), float(p[:, k].std())))
     for k, axes in enumerate(panels):
         reach = 1.4 * max(float(widest[k] if k == axis else widest[radial].max()), bins[k])
         told = [2.4 * (abs(mean) + std) for _, mean, std in spreads[k][1:]]
@@ -185,22 +182,30 @@ def tilt_figure(e: Experiment, published: Published | None = None) -> Figure:
 
 
 def lift_off_figure(e: Experiment, _: Published | None = None) -> Figure:
-    """From the touchdown bearing to the centre, and the bearing currents, for each start-up estimator."""
+    """From the touchdown bearing to the centre, and the bearing currents, for each start-up estimator.
+
+    Both ends rise nearly alike: the left panels have the end in sensor plane 1, the right ones what differs.
+    """
     plant, runs = e.run.plant, runs_of(e)
     figure = new_page(runs, "lift-off from the touchdown bearing", merits_phrase(e.cases, 1), hspace=0.2)
-    panels = figure.subplots(2, 2, sharex=True, sharey="row")
-    for k, (height, current) in zip((1, 3), panels.T, strict=True):
-        for case, style in zip(e.cases, STYLES, strict=False):
-            ms, y = case.run.t * 1e3, case.run.p[:, k] * 1e6
-            draw_line(height, ms, y, label=case.label, **style)
-            mark_end(height, case.run, ms, y)
-            draw_line(current, ms, case.run.force[:, k] / plant.actuator.force_constant[k], **style)
-        draw_bound(height, -clearance(plant) * 1e6, "touchdown bearing")
-        draw_bound(current, e.merits[0].value, "lifts it by statics")
-        finish_axes(height, "", f"{plant.outputs[k].name} [µm]")
-        finish_axes(current, "time [ms]", f"current of {plant.inputs[k].name} [A]")
+    (height, tilt), (current, uneven) = figure.subplots(2, 2, sharex=True)
+    for case, style in zip(e.cases, STYLES, strict=False):
+        ms, y = case.run.t * 1e3, case.run.p * 1e6
+        i = case.run.force / np.array(plant.actuator.force_constant)
+        for axes, differs, values in ((height, tilt, y), (current, uneven, i)):
+            draw_line(axes, ms, values[:, 1], label=case.label, **style)
+            draw_line(differs, ms, values[:, 3] - values[:, 1], **style)
+        mark_end(height, case.run, ms, y[:, 1])
+    draw_bound(height, -clearance(plant) * 1e6, "touchdown bearing")
+    draw_bound(current, e.merits[0].value, "lifts it by statics")
+    one, two = (plant.outputs[k].name for k in (1, 3))
+    finish_axes(height, "", f"{one} [µm]")
+    finish_axes(tilt, "", f"{two} less {one} [µm]")
+    one, two = (plant.inputs[k].name for k in (1, 3))
+    finish_axes(current, "time [ms]", f"current of {one} [A]")
+    finish_axes(uneven, "time [ms]", f"current of {two} less that of {one} [A]")
     moving = max(float(run.t[np.flatnonzero(np.abs(run.p[:, 1]) > 20e-6)].max(initial=0.0)) for run in runs)
-    panels[0, 0].set_xlim(0, 1e3 * min(1.6 * moving, max(float(run.t[-1]) for run in runs)) or None)
+    height.set_xlim(0, 1e3 * min(1.6 * moving, max(float(run.t[-1]) for run in runs)) or None)
     add_shared_legend(figure)
     return figure
 
@@ -318,20 +323,20 @@ def faults_figure(e: Experiment, _: Published | None = None) -> Figure:
     survived = f"{e.merits[0].value:.0f} of {len(e.cases)} survived"
     during = "stroke" if e.run.scenario.reference is not hold else "hold"
     figure = new_page(runs_of(e), f"faults during a {during}", survived, left=0.245, wspace=0.24)
-    bars, traces = figure.subplots(1, 2, width_ratios=(1, 1.25))
-    for place, case in enumerate(e.cases):
-        down, deviation = ended_early(case.run), case.merits[0].value * 1e6
-        bars.barh(place, deviation, height=0.62, color="#2b2b2b" if down else "#c9c9c9")
-        text = _touchdown_text(case.merits[1]) if down else f"{number(deviation, 2)} µm"
-        inside = deviation > edge / 10
-        style = NOTE | {"color": "#ffffff" if down else NOTE["color"], "ha": "right" if inside else "left"}
-        bars.annotate(text, (deviation * (0.88 if inside else 1.1), place), va="center", **style)
-    bars.set_yticks(range(len(e.cases)), [micro(case.label) for case in e.cases], fontsize=9)
-    bars.invert_yaxis()
-    bars.set_xscale("log")
-    bars.set_xlim(0.1, 2 * edge)
-    bars.axvline(edge, **BOUND)
-    label_upright(bars, 1.1 * edge, 0.02, "touchdown bearing", ha="left")
+    dots, traces = figure.subplots(1, 2, width_ratios=(1, 1.25))
+    down, deviations = (
+        [ended_early(run) for run in runs_of(e)],
+        [case.merits[0].value * 1e6 for case in e.cases],
+    )
+    texts = [
+        _touchdown_text(case.merits[1]) if touched else f"{number(deviation, 2)} µm"
+        for case, touched, deviation in zip(e.cases, down, deviations, strict=True)
+    ]
+    marks = [CROSS if touched else DOT for touched in down]
+    draw_dots(dots, [micro(case.label) for case in e.cases], deviations, texts, marks)
+    dots.set_xlim(min(0.1, 0.5 * min(deviations)), 2 * edge)
+    dots.axvline(edge, **BOUND)
+    label_upright(dots, 1.1 * edge, 0.02, "touchdown bearing", ha="left")
     struck = e.run.scenario.faults[0].at
     traces.set_xlim(-20, (e.run.scenario.duration - struck) * 1e3)
     worst = sorted(e.cases, key=lambda case: -case.merits[0].value)[: len(STYLES)]
@@ -344,7 +349,7 @@ def faults_figure(e: Experiment, _: Published | None = None) -> Figure:
     traces.set_yscale("log")
     traces.set_ylim(bottom=0.1)
     draw_bound(traces, edge, "touchdown bearing")
-    finish_axes(bars, "largest radial deviation [µm]", "")
+    finish_axes(dots, "largest radial deviation [µm]", "")
     finish_axes(
         traces, "time after the fault [ms]", "radial deviation of the worst [µm]", legend=2, side="right"
     )

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    from malta.model.plant import FloatArray
     from malta.simulation.experiments import Experiment
 
 
@@ -34,7 +35,7 @@ def recording_figure(e: Experiment, _: Published | None = None) -> Figure:
     if e.merits:
         thrust = next(merit for merit in e.merits if merit.label.endswith(e.run.plant.thrust))
         found = f"{thrust.label}: {merit_phrase(thrust)}; {e.merits[-1].label}: {merit_phrase(e.merits[-1])}"
-    figure = new_page(runs_of(e), "v0(z) recorded by a slow stroke", found, hspace=0.3)
+    figure = new_page(runs_of(e), "v0(z) recorded by a slow stroke", found, hspace=0.34, top=0.83)
     (table, difference), (own, recorded) = figure.subplots(2, 2)
     _draw_tables(table, difference, e)
     top = 0.0
@@ -67,11 +68,16 @@ def _draw_tables(table: Axes, difference: Axes, e: Experiment) -> None:
     if "v0 " in e.curves:
         off = (e.curves["v0 "] - np.array([ff.at(float(at)) for at in z])) * 1e3
         bearings = np.delete(off, axis, axis=1)
-        draw_line(difference, z * 1e3, off[:, axis], label=plant.thrust, **MORE[0])
-        for extreme, label in ((bearings.max(axis=1), "bearing forces"), (bearings.min(axis=1), "")):
-            draw_line(difference, z * 1e3, extreme, label=label, **MORE[1])
+        draw_line(difference, z * 1e3, off[:, axis], label=plant.thrust, **STYLES[0] | {"linewidth": 0.9})
+        count = f"{bearings.shape[1]} bearing forces, least to largest"
+        difference.fill_between(z * 1e3, *_extremes(bearings), color="#e0a08c", linewidth=0, label=count)
     finish_axes(table, f"{plant.stroke} [mm]", f"v0 of {plant.thrust} [N]")
-    finish_axes(difference, f"{plant.stroke} [mm]", "recorded less own v0 [mN]")
+    finish_axes(difference, f"{plant.stroke} [mm]", "recorded less own v0 [mN]", legend=2)
+
+
+def _extremes(values: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The least and the largest of each row."""
+    return values.min(axis=1), values.max(axis=1)
 
 
 def _machine(label: str) -> str:

@@ -37,6 +37,7 @@ from malta.report.figures.parts import (
     DOT,
     Published,
     draw_bound,
+    draw_group,
     draw_line,
     ending_text,
     finish_axes,
@@ -130,7 +131,8 @@ def run_figure(e: Experiment, _: Published | None = None) -> Figure:
     text = "furthest off its reference: " + ", ".join(told)
     rows = 2 if len(panels) > 3 else len(panels)
     columns = math.ceil(len(panels) / rows)
-    places = {"hspace": 0.24, "wspace": 0.25 if columns < 3 else 0.42}
+    rows_of_legends = max(-(-len(group) // 4) for group in (run.plant.inputs, run.plant.outputs))
+    places = {"hspace": 0.24 + 0.06 * (min(rows_of_legends, 2) - 1), "wspace": 0.25 if columns < 3 else 0.42}
     figure = new_page([run], f"{micro(what)}{ending_text(run)}", text, **places)
     grid = figure.subplots(rows, columns, sharex=True, squeeze=False).ravel()
     last = len(panels) - columns
@@ -157,42 +159,38 @@ def _stroke_unit(run: Trajectory) -> str:
 def _draw_errors(axes: Axes, x: str, run: Trajectory, group: Group, unit: str) -> None:
     """Errors of the outputs of a group."""
     error = in_unit(1.0, unit) * (run.p - run.reference)
-    styles = cycle((1, 0, 3, 2)) if len(group.columns) > 1 else (0,)
-    for k, style in zip(group.columns, styles, strict=False):
-        draw_line(axes, run.t * 1e3, error[:, k], label=run.plant.outputs[k].name, **STYLES[style])
-    several = len(group.columns) if len(group.columns) > 1 else 0
+    several = len(group.columns) > 1
+    columns = draw_group(axes, run.t * 1e3, {run.plant.outputs[k].name: error[:, k] for k in group.columns})
     name = group.name if several else run.plant.outputs[group.columns[0]].name
-    finish_axes(axes, x, f"{name}, off reference [{micro(unit)}]", legend=several)
+    finish_axes(axes, x, f"{name}, off reference [{micro(unit)}]", legend=columns if several else 0)
 
 
 def _draw_forces(axes: Axes, x: str, run: Trajectory, unit: str) -> None:
-    """The leading input and the two others of this unit that are largest."""
-    plant = run.plant
-    widest = np.argsort(-np.abs(run.v).max(axis=0), kind="stable").tolist()
-    others = [k for k in widest if plant.inputs[k].unit == unit and k != plant.leading_input]
-    first = [plant.leading_input] if plant.inputs[plant.leading_input].unit == unit else []
-    shown = [*first, *sorted(others[: 3 - len(first)])]
-    for k, style in zip(shown, STYLES, strict=False):
-        draw_line(axes, run.t * 1e3, run.v[:, k], label=plant.inputs[k].name, **style)
-    finish_axes(axes, x, f"commanded {KINDS.get(unit, 'input')} [{unit}]", legend=3)
+    """Every input of this unit, the leading one first."""
+    inputs = run.plant.inputs
+    shown = [k for k in range(len(inputs)) if inputs[k].unit == unit]
+    shown.sort(key=lambda k: k != run.plant.leading_input)
+    columns = draw_group(axes, run.t * 1e3, {inputs[k].name: run.v[:, k] for k in shown})
+    finish_axes(axes, x, f"commanded {KINDS.get(unit, 'input')} [{unit}]", legend=columns)
 
 
 def _draw_clearances(axes: Axes, x: str, run: Trajectory) -> None:
     """Shares of the clearances that are used up, on a logarithmic axis."""
-    for name, used, style in zip(run.plant.contacts, run.contact.T, cycle(STYLES)):
-        way = np.maximum(used * 100, 1e-3)
-        draw_line(axes, run.t * 1e3, way, label=name.removeprefix("touchdown at sensor "), **style)
+    names = [name.removeprefix("touchdown at sensor ") for name in run.plant.contacts]
+    ways = dict(zip(names, np.maximum(run.contact.T * 100, 1e-3), strict=True))
+    columns = draw_group(axes, run.t * 1e3, ways)
     axes.set_yscale("log")
     axes.set_ylim(bottom=0.01)
     draw_bound(axes, 100, "touched")
-    finish_axes(axes, x, "clearance used up [%]", legend=3, side="right")
+    finish_axes(axes, x, "clearance used up [%]", legend=columns, side="right")
 
 
 def _draw_currents(axes: Axes, x: str, run: Trajectory) -> None:
     """The largest and the smallest of all currents, for a machine without contacts."""
-    for values, style in zip((run.current.max(axis=1), run.current.min(axis=1)), STYLES, strict=False):
-        draw_line(axes, run.t * 1e3, values, **style)
-    finish_axes(axes, x, "currents, from least to largest [A]")
+    for side, style in zip(("largest", "least"), STYLES, strict=False):
+        values = run.current.max(axis=1) if side == "largest" else run.current.min(axis=1)
+        draw_line(axes, run.t * 1e3, values, label=f"{side} of {run.current.shape[1]}", **style)
+    finish_axes(axes, x, "currents, from least to largest [A]", legend=2)
 
 
 def front_figure(tuned: Tuned) -> Figure:

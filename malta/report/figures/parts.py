@@ -97,6 +97,73 @@ def draw_line(axes: Axes, t: FloatArray, values: FloatArray, **style: Any) -> No
     axes.plot(t, values, **style)
 
 
+def draw_group(
+    axes: Axes, t: FloatArray, series: Mapping[str, FloatArray], styles: Sequence[dict[str, Any]] = ()
+) -> int:
+    """Draw every signal of a group; returns the number of columns that its legend has room for.
+
+    Signals with the same values share a line, and more lines than there are styles share a band: from the least to the
+    largest of them, with the three that reach furthest as lines.
+
+    series : name -> values over t
+    styles : of the lines; the usual ones where none are given
+    """
+    lines: dict[str, FloatArray] = {}
+    for name, values in series.items():
+        twin = next((known for known, drawn in lines.items() if np.array_equal(drawn, values)), None)
+        if twin is None:
+            lines[name] = values
+        else:
+            lines[f"{twin}, {name}"] = lines.pop(twin)
+    styles = styles or (*STYLES, *MORE)
+    if len(lines) > len(styles):
+        every = np.array(list(series.values()))
+        label = f"all {len(every)}, least to largest"
+        axes.fill_between(t, every.min(axis=0), every.max(axis=0), color="#d4d4d4", linewidth=0, label=label)
+        furthest = sorted(lines, key=lambda name: -float(np.abs(lines[name]).max()))[:3]
+        lines = {name: lines[name] for name in lines if name in furthest}
+    for (name, values), style in zip(lines.items(), styles, strict=False):
+        draw_line(axes, t, values, label=name, **style)
+    return len(lines) if len(lines) < 5 else 4
+
+
+def draw_dots(
+    axes: Axes,
+    names: Sequence[str],
+    values: Sequence[float],
+    texts: Sequence[str],
+    marks: Sequence[dict[str, Any]] = (),
+) -> None:
+    """Draw a row for each name, from top to bottom: a dot at its value on a logarithmic axis, and a text beside it.
+
+    Dots, as bars on a logarithmic axis would begin at an arbitrary place. A value of 0 or less has its text alone.
+
+    marks : of the rows; dots where none are given
+    """
+    shown = [value for value in values if value > 0]
+    axes.set_xscale("log")
+    axes.set_xlim(min(shown, default=1.0) / 3, 3 * max(shown, default=1.0))
+    low, high = axes.get_xlim()
+    rows = zip(values, texts, marks or [DOT] * len(values), strict=True)
+    for row, (value, text, mark) in enumerate(rows):
+        if value > 0:
+            axes.plot(value, row, **mark)
+        beyond = value > math.sqrt(low * high)
+        where: dict[str, Any] = {"xytext": (-8 if beyond else 8, 0), "textcoords": "offset points"}
+        where |= {"ha": "right" if beyond else "left", "va": "center"}
+        axes.annotate(text, (value if value > 0 else low, row), **where, **NOTE)
+    axes.set_yticks(range(len(names)), names, fontsize=9)
+    axes.set_ylim(len(names) - 0.4, -0.6)
+
+
+def draw_noisy(axes: Axes, t: FloatArray, values: FloatArray, size: int, **style: Any) -> None:
+    """Draw samples in grey, and as a line their means over stretches of `size` samples."""
+    count = len(t) // size * size
+    draw_line(axes, t, values, color="#c4c4c4", linewidth=0.7, label="samples")
+    means = (s[:count].reshape(-1, size).mean(axis=1) for s in (t, values))
+    axes.plot(*means, label=f"means of {size}", **STYLES[0] | style)
+
+
 def mark_end(axes: Axes, run: Trajectory, t: FloatArray, values: FloatArray, *, named: bool = True) -> None:
     """Draw a cross where a run ended early; `named`: with an entry in the legend."""
     if ended_early(run):
@@ -163,6 +230,8 @@ def draw_bound(
         axes.set_ylim(top=max(2.5 * abs(value), 1.5 * reach))
     elif value > 0:
         axes.set_ylim(top=room)
+    elif height == "below":
+        axes.set_ylim(bottom=-room)
 
 
 def label_upright(axes: Axes, x: float, height: float, text: str, *, ha: str) -> None:
@@ -202,12 +271,13 @@ def finish_axes(axes: Axes, x: str, y: str, *, legend: int = 0, side: str = "lef
     if legend:
         where: dict[str, Any] = {"loc": f"lower {side}", "bbox_to_anchor": ({"left": 0, "right": 1}[side], 1)}
         handles, labels = legend_entries([axes])
-        axes.legend(handles, labels, ncols=legend, borderaxespad=0.2, **where, **LEGEND)
+        close = {"handlelength": 1.8, "columnspacing": 0.9} if len(labels) > 4 else {}
+        axes.legend(handles, labels, ncols=legend, borderaxespad=0.2, **where, **LEGEND | close)
 
 
 def add_shared_legend(figure: Figure) -> None:
-    """Add one legend for all panels below the title."""
-    handles, labels = legend_entries(figure.axes)
+    """Add one legend below the title for all panels that have none of their own."""
+    handles, labels = legend_entries([axes for axes in figure.axes if axes.get_legend() is None])
     where: dict[str, Any] = {"loc": "upper center", "bbox_to_anchor": (0.5, 0.925)}
     figure.legend(handles, labels, ncols=len(labels), **where, **LEGEND)
 
@@ -225,14 +295,14 @@ def legend_entries(panels: Sequence[Axes]) -> tuple[list[Any], list[str]]:
 def draw_histograms(
     axes: Axes, series: Sequence[FloatArray], labels: Sequence[str], bins: float, reach: float
 ) -> None:
-    """Draw shares of samples in bins of this width, and those of the second series in bins of a tenth of it."""
+    """Draw shares of samples in bins of this width: of the first series as filled bars, of the others as outlines."""
     styles: tuple[dict[str, Any], ...] = (
         {"fill": True, "facecolor": "#d4d4d4", "edgecolor": "#8a8a8a", "linewidth": 0.8},
         {"edgecolor": "#000000", "linewidth": 1.2},
     )
-    for values, label, width, style in zip(series, labels, (bins, bins / 10), styles, strict=True):
-        count = math.ceil(reach / width)
-        edges = (np.arange(-count, count + 2) - 0.5) * width
+    count = math.ceil(reach / bins)
+    edges = (np.arange(-count, count + 2) - 0.5) * bins
+    for values, label, style in zip(series, labels, styles, strict=True):
         axes.stairs(100 * np.histogram(values, edges)[0] / len(values), edges, label=label, **style)
     axes.set_xlim(-reach, reach)
 
@@ -240,13 +310,14 @@ def draw_histograms(
 def draw_spreads(axes: Axes, spreads: Sequence[tuple[str, float, float]], top: float) -> None:
     """Draw means and standard deviations above histograms: label, mean and deviation of each."""
     for n, (label, mean, std) in enumerate(spreads):
-        height = top * (1.26 - 0.13 * n)
+        height = top * (1 + 0.13 * (len(spreads) - n))
         style = {"color": STYLES[n]["color"], "marker": "|", "markersize": 7}
         axes.plot([mean - std, mean, mean + std], 3 * [height], **style)
         where: dict[str, Any] = {"xycoords": ("axes fraction", "data"), "va": "center"}
         axes.annotate(label, (0.03, height), **where, **NOTE)
         axes.annotate(f"{number(std, 3)} µm", (0.99, height), ha="right", **where, **NOTE)
-    axes.set_ylim(0, 1.36 * top)
+    axes.set_ylim(0, top * (1.1 + 0.13 * len(spreads)))
+    axes.set_yticks([tick for tick in axes.get_yticks() if tick <= top])
 
 
 def clearance(plant: Plant) -> float:
