@@ -67,8 +67,8 @@ def test_half_a_campaign_that_runs_and_one_that_does_not(run: Run, tmp_path: Pat
     document = json.loads(run("campaign", GAINS, "--status", tmp_path, "--json")[1])
     assert document["blocks"] | {"bytes": 0} == {"done": 3, "all": 5, "runs": 8, "bytes": 0}
     assert document["running"]
-    assert document["pace"] == pytest.approx(4, abs=0.1)
-    assert document["left"] == pytest.approx(8, abs=0.2)
+    assert document["pace_s"] == pytest.approx(4, abs=0.1)
+    assert document["left_s"] == pytest.approx(8, abs=0.2)
     assert (document["runs"], document["yield"]["passed"], document["damaged"]) == (24, 24, [])
     assert document["yield"]["low"] == pytest.approx(0.025 ** (1 / 24))
     assert document["manifest"]["spread"] == {"m": 0.2, "K_A": 0.2, "K_B": 0.2, "K_D": 0.2}

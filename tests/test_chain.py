@@ -418,7 +418,7 @@ def test_verify_as_json_holds_finite_numbers(run: Run) -> None:
     assert len(found) > 60
     assert all(map(math.isfinite, found))
     assert (result["design"], result["stable"]) == ("calibrated", True)
-    assert max(result["poles"]["open_loop"])[0] == pytest.approx(218.92, abs=0.005)
+    assert max(result["poles_rad_per_s"]["open_loop"])[0] == pytest.approx(218.92, abs=0.005)
 
 
 @pytest.mark.slow

@@ -214,13 +214,13 @@ def test_design_as_json_holds_finite_numbers(run: Run, tmp_path: Path) -> None:
         "design", "design/calibrated.toml", "--json", "--out", tmp_path / "g", "--figures", tmp_path / "f"
     )
     assert (code, err) == (0, "")
-    (result,) = json.loads(out)
+    (result,) = json.loads(out)["designs"]
     found = numbers(result)
     assert len(found) > 60
     assert all(map(math.isfinite, found))
     assert result["design"] == "calibrated"
     assert result["stable"] is True
-    assert result["verdict"] == {"name": "completed", "time": 0.1}
+    assert result["verdict"] == {"name": "completed", "time_s": 0.1}
     assert [Path(file).is_file() for file in result["files"]] == [True] * 4
 
 
@@ -355,7 +355,7 @@ def test_two_designs_of_one_name_do_not_overwrite_each_other(run: Run, tmp_path:
     code, out, err = run("design", first, second, "--json", "--figures", tmp_path / "figures")
     assert code == 2
     assert one_sentence(err) == f"{second}: name: found 'table2', expected another name than that of {first}"
-    assert [result["design"] for result in json.loads(out)] == ["table2"]
+    assert [result["design"] for result in json.loads(out)["designs"]] == ["table2"]
     assert gains.read(tmp_path / "design" / "gains" / "table2.json").sample_time == 50e-6
 
 
@@ -365,7 +365,7 @@ def test_bad_design_file_does_not_stop_the_others(run: Run, tmp_path: Path) -> N
     code, out, err = run("design", bad, "design/table2.toml", *options)
     assert code == 2
     assert one_sentence(err) == f"{bad}: sample_time.unit: found 'um', expected a unit of s"
-    assert [result["design"] for result in json.loads(out)] == ["table2"]
+    assert [result["design"] for result in json.loads(out)["designs"]] == ["table2"]
     assert sorted(path.name for path in (tmp_path / "gains").iterdir()) == list(NAMES)
 
 
@@ -405,8 +405,8 @@ def test_verify_of_an_unstable_machine_fails_after_printing(run: Run) -> None:
     assert "Peak sensitivity" in out
     code, out, err = run("verify", CALIBRATED, "--set", "K_A=50000", "--json")
     result = json.loads(out)
-    assert (code, result["stable"], result["bandwidth"]["sigma_max_T"]) == (1, False, None)
-    assert all(math.isfinite(number) for number in numbers(result["poles"]))
+    assert (code, result["stable"], result["bandwidth_rad_per_s"]["sigma_max_T"]) == (1, False, None)
+    assert all(math.isfinite(number) for number in numbers(result["poles_rad_per_s"]))
 
 
 def test_verify_counts_the_force_constants_of_the_machine(run: Run) -> None:
@@ -507,7 +507,7 @@ def test_simulate_as_json_holds_finite_numbers(run: Run) -> None:
     assert len(found) > 30  # merits of experiment and case, the stroke, and when it ended
     assert (result["engine"], result["fidelity"]) == ("compiled", "dq")
     assert all(map(math.isfinite, found))
-    assert result["verdict"] == {"name": "completed", "time": 0.1}
+    assert result["verdict"] == {"name": "completed", "time_s": 0.1}
     assert result["files"] == []
 
 
@@ -522,7 +522,7 @@ def test_touchdown_as_json_is_said_in_the_verdict(run: Run) -> None:
     code, out, err = run("simulate", TABLE2, "--set", "m=0.56", "--json")
     result = json.loads(out)
     assert (code, result["verdict"]["name"]) == (1, "touchdown at sensor plane 1")
-    assert result["stroke"]["rise"] is None
+    assert result["stroke"]["rise_s"] is None
     assert one_sentence(err)
 
 
@@ -564,11 +564,11 @@ def test_options_of_the_stroke_are_taken(run: Run) -> None:
 
     plain = stroke()
     assert stroke("--rise", "16.2", "--distance", "10", "--profile", "logistic") == plain
-    assert stroke("--rise", "32.4")["rise"] == pytest.approx(2 * plain["rise"], rel=0.1)
-    assert stroke("--distance", "5")["force"] == pytest.approx(plain["force"] / 2, rel=0.1)
-    assert stroke("--profile", "quintic")["force"] != plain["force"]
+    assert stroke("--rise", "32.4")["rise_s"] == pytest.approx(2 * plain["rise_s"], rel=0.1)
+    assert stroke("--distance", "5")["force_N"] == pytest.approx(plain["force_N"] / 2, rel=0.1)
+    assert stroke("--profile", "quintic")["force_N"] != plain["force_N"]
     assert stroke("--delay", "1") == plain  # the machine's own
-    assert stroke("--delay", "6")["axial_error"] > 1.01 * plain["axial_error"]
+    assert stroke("--delay", "6")["error_along"] > 1.01 * plain["error_along"]
 
 
 def test_the_scenarios_of_the_machine_are_listed(run: Run) -> None:
@@ -625,7 +625,7 @@ def test_sensor_errors_are_taken(run: Run) -> None:
     def held(*options: str) -> float:
         code, out, _ = run("simulate", CALIBRATED, "--scenario", "hold", "--json", *options)
         assert code == 0
-        value: float = json.loads(out)["merits"]["true x1, rms"]
+        value: float = json.loads(out)["merits"]["true_x1_rms_m"]
         return value
 
     assert held("--sensor", "offset_x1=20um", "--sensor", "gain_y1=2%") > 15e-6 > 1e-6 > held()
@@ -700,7 +700,7 @@ def test_claims_prints_the_ledger(run: Run, monkeypatch: pytest.MonkeyPatch) -> 
     assert "not reproduced" in out
     code, out, err = run("claims", "design/table2.toml", "--json")
     assert (code, err) == (0, "")
-    (ledger,) = json.loads(out)
+    (ledger,) = json.loads(out)["ledgers"]
     assert (ledger["machine"], ledger["designs"]) == ("tubular", ["table2"])
     ours = {claim["subject"]: claim["ours"] for claim in ledger["claims"]}
     assert ours["poles of x, y [rad/s]"] == ["±218.92"]

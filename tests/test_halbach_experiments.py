@@ -529,7 +529,7 @@ def test_simulate_with_options_of_the_electronics(run: Run) -> None:
         "--json",
     )
     assert said.code == 0
-    assert json.loads(said.out)["cases"][0]["merits"]["at rest, rms"] < 0.5e-6
+    assert json.loads(said.out)["cases"][0]["merits"]["at_rest_rms_m"] < 0.5e-6
     said = run("simulate", GAINS, "--option", "pwm=coarse")
     assert (said.code, said.out) == (2, "")
     assert "pwm: found 'coarse', expected one of exact, plain, fine" in said.err

@@ -422,7 +422,7 @@ def test_simulate_json(run: Run) -> None:
     found = json.loads(out)
     assert code == 0
     assert len(found["cases"]) == 6
-    assert found["merits"]["table moves theta by"] > 0.1e-6
+    assert found["merits"]["table_moves_theta_by_rad"] > 0.1e-6
 
 
 def test_a_campaign(lqg: Design, tmp_path: Path) -> None:

@@ -201,7 +201,7 @@ def test_verify_prints_loads_and_writes_them_as_json(run: Run) -> None:
     (one,) = document["recovery"]
     assert one["load"] == {"F_x": 1.0}
     assert one["outputs"]["x"]["largest"] == pytest.approx(1443e-6, rel=1e-3)
-    assert [left["after"] for left in one["outputs"]["x"]["left"]] == [0.1, 0.3]
+    assert [left["after_s"] for left in one["outputs"]["x"]["left"]] == [0.1, 0.3]
 
 
 @pytest.mark.parametrize("file", ["robust", "halbach", "planar"])

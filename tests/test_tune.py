@@ -517,7 +517,7 @@ def test_the_command_finds_writes_and_goes_on(run: Any, tmp_path: Path) -> None:
     assert (out / "robust.toml").read_bytes() == written
     found = json.loads(text)
     assert [r["name"] for r in found["requirements"]] == ["margin", "peak_sensitivity"]
-    assert found["values"].keys() == {v.name for v in malta.read_design(path).search}
+    assert found["search"]["values"].keys() == {v.name for v in malta.read_design(path).search}
     code, _, err = run(path, "--out", path.parent)
     assert code == 2
     assert path.read_text(encoding="utf-8").startswith("# The flagship")

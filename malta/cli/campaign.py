@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated, cast
 import typer
 
 from malta.cli.assignments import add_own_options, read_sensor_errors, read_shares, scenario_options
-from malta.cli.documents import campaign_document
 from malta.cli.inputs import change_machine, design_of, print_scenarios, read_controller
 from malta.cli.options import (
     SCENARIOS,
@@ -34,7 +33,7 @@ from malta.cli.options import (
 from malta.cli.output import (
     NO_COMPILER,
     make_console,
-    print_json,
+    print_document,
     print_note,
     print_written,
     progress_bar,
@@ -231,9 +230,10 @@ def _report(gains: Path, found: Summary, worst: int, *, as_json: bool) -> None:
         print_note(f"{file}: a damaged block, flown again")
     files = _draw(found)
     if as_json:
-        names = [str(file) for file in files]
-        document = {"gains": str(gains), "folder": str(found.folder), "files": names}
-        print_json(document | campaign_document(found, worst))
+        from malta.cli.documents.campaigns import CampaignOutput, runs_fields
+
+        names, fields = [str(file) for file in files], runs_fields(found, worst)
+        print_document(CampaignOutput(gains=str(gains), folder=str(found.folder), files=names, **fields))
     else:
         print_tables(gains, found, worst)
         print_written(make_console(), files)

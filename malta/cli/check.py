@@ -9,7 +9,7 @@ import typer
 
 from malta.cli.inputs import read_controller
 from malta.cli.options import AsJson, MachineFile
-from malta.cli.output import make_console, print_json, print_note
+from malta.cli.output import make_console, print_document, print_note
 
 if TYPE_CHECKING:
     from malta.margins.loops import CurrentLoops
@@ -37,8 +37,12 @@ def check(
     if gains is not None and not failures and not _matches_gains(file, read_controller(gains, machine)):
         failures.append(f"the loops are not those of {gains}")
     if as_json:
-        claim = {"file": str(file), "holds": not failures, "lower": verdict.claim}
-        print_json(claim | {"groups": list(verdict.groups), "failures": failures})
+        from malta.cli.documents.others import CheckOutput
+
+        groups, claim = list(verdict.groups), verdict.claim
+        print_document(
+            CheckOutput(file=str(file), holds=not failures, lower=claim, groups=groups, failures=failures)
+        )
     else:
         console = make_console()
         for line in verdict.groups:

@@ -10,7 +10,7 @@ import typer
 
 from malta.cli.inputs import design_files
 from malta.cli.options import AsJson
-from malta.cli.output import make_console, print_json, print_written, progress_bar
+from malta.cli.output import make_console, print_document, print_written, progress_bar
 from malta.errors import InputError
 
 if TYPE_CHECKING:
@@ -55,9 +55,9 @@ def claims(
     with progress_bar("claims", quiet=as_json) as progress:
         ledgers = _compute_ledgers(specs, progress)
     if as_json:
-        from dataclasses import asdict
+        from malta.cli.documents.others import claims_output
 
-        print_json([asdict(one) | {"claims": [claim._asdict() for claim in one.claims]} for one in ledgers])
+        print_document(claims_output(ledgers))
     elif markdown:
         print("\n".join(f"### {one.title}\n\n{one.markdown()}" for one in ledgers), end="")
     else:

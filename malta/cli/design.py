@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from malta.cli.documents import experiment_document, margins_document
 from malta.cli.inputs import design_files, gains_folder
 from malta.cli.options import AsJson
-from malta.cli.output import make_console, print_error, print_json, print_written, track_files
+from malta.cli.output import make_console, print_document, print_error, print_written, track_files
 from malta.errors import CheckError, InputError
 from malta.files import replace_files
 
 if TYPE_CHECKING:
+    from malta.cli.documents.simulations import DesignPart
     from malta.margins.verify import Margins
     from malta.simulation.experiments import Experiment
     from malta.synthesis.controller import Controller
@@ -38,29 +38,32 @@ def design(
     \b
     Example:  malta design design/table2.toml
     """
-    documents: list[dict[str, Any]] = []
+    designed: list[DesignPart] = []
     sources: dict[Path, Path] = {}  # output file -> the design file of this run that it comes from
     code = 0
     for file in track_files(design_files("design", files), "designing", quiet=as_json):
         try:
             folder = out or gains_folder(file)
-            documents.append(_run_design(file, folder, figures, sources, quiet=as_json))
+            designed.append(_run_design(file, folder, figures, sources, quiet=as_json))
         except (InputError, CheckError) as error:
             code = max(code, print_error(error, file))
     if as_json:
-        print_json(documents)
+        from malta.cli.documents.simulations import DesignOutput
+
+        print_document(DesignOutput(designs=designed))
     raise typer.Exit(code)
 
 
 def _run_design(
     file: Path, out: Path, figures: Path, sources: dict[Path, Path], *, quiet: bool
-) -> dict[str, Any]:
+) -> DesignPart:
     """Design, verify and simulate the controller of one design file and write its gain files; the JSON document.
 
     Raises InputError for a design of a name that `sources` has, CheckError where a check fails; nothing is written
     over a gain file then.
     """
     from malta import gains, report
+    from malta.cli.documents.simulations import design_part
     from malta.margins.verify import require_stable
     from malta.margins.verify import verify as compute_margins
     from malta.model.linearize import linearize
@@ -97,8 +100,7 @@ def _run_design(
             console.print(f"{paths[0]}: holds these numbers already; left as it is", soft_wrap=True)
         print_written(console, (picture,) if unchanged else (*paths, picture))
         console.print()
-    written = {"design": spec.name, "files": [str(path) for path in (*paths, picture)]}
-    return written | margins_document(margins) | experiment_document(result)
+    return design_part(spec.name, (*paths, picture), {}, margins, result)
 
 
 def _simulate_gain_file(

@@ -9,7 +9,7 @@ import typer
 
 from malta.cli.inputs import read_controller
 from malta.cli.options import AsJson, GainFile, MachineFile
-from malta.cli.output import make_console, print_json, print_note, print_written
+from malta.cli.output import make_console, print_document, print_note, print_written
 from malta.errors import InputError
 
 
@@ -65,7 +65,10 @@ def export(
         folder = out or Path("build") / f"{controller.name}_c"
         files = export_c(gains, folder, precision=cast("Any", precision), proof=proof, **chosen)
     if as_json:
-        print_json({"gains": str(gains), "to": to, "files": [str(file) for file in files]})
+        from malta.cli.documents.others import ExportOutput
+
+        names = [str(file) for file in files]
+        print_document(ExportOutput(gains=str(gains), to=cast("Any", to), files=names))
     else:
         print_written(make_console(), files)
 

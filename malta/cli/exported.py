@@ -49,19 +49,6 @@ def comparison_table(title: str, found: dict[Precision, list[Difference]]) -> An
     return table
 
 
-def comparison_document(found: dict[str, dict[Precision, list[Difference]]]) -> list[dict[str, Any]]:
-    """The same for --json."""
-    return [
-        {
-            "case": label,
-            "precision": precision,
-            "signals": {d.name: {"largest": d.largest, "range": d.range} for d in rows},
-        }
-        for label, by_precision in found.items()
-        for precision, rows in by_precision.items()
-    ]
-
-
 def titles(labels: Sequence[str]) -> list[str]:
     """A title for the table of each case."""
     text = "The exported C against the simulation's law: largest difference / range"

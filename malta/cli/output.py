@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import TYPE_CHECKING, TextIO
 
 import typer
 
@@ -19,6 +19,8 @@ from malta.files import json_text
 
 if TYPE_CHECKING:
     from rich.console import Console
+
+    from malta.cli.documents.parts import Part
 
 WIDTH = 100  # columns of tables on wide terminals, and in files and pipes where COLUMNS says nothing else
 NARROWEST = 20  # columns; COLUMNS below is no width
@@ -57,9 +59,11 @@ def print_written(console: Console, files: Iterable[Path]) -> None:
         console.print(f"wrote {file}", soft_wrap=True)
 
 
-def print_json(content: Any) -> None:
-    """Print one JSON document; numbers that are not finite become null."""
-    print(json_text(content))
+def print_document(document: Part) -> None:
+    """Print one JSON document, its schema and version first; numbers that are not finite become null."""
+    content = document.model_dump(by_alias=True)
+    head = {key: content.pop(key) for key in ("schema", "version")}
+    print(json_text(head | content))
 
 
 def print_note(text: str) -> None:

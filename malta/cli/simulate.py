@@ -9,10 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 import typer
 
 from malta.cli.assignments import add_own_options, read_sensor_errors, scenario_options
-from malta.cli.documents import experiment_document
 from malta.cli.exported import (
     compare_flights,
-    comparison_document,
     comparison_table,
     require_controller,
     titles,
@@ -41,7 +39,7 @@ from malta.cli.options import (
     Substeps,
     Yes,
 )
-from malta.cli.output import make_console, print_json, print_note, print_text, print_written, progress_bar
+from malta.cli.output import make_console, print_document, print_note, print_text, print_written, progress_bar
 from malta.cli.patience import limit_time
 from malta.errors import CheckError, InputError
 
@@ -174,9 +172,18 @@ def simulate(
     published = published_figures(plant.name)
     files = [] if out is None else _save(simulation, out, published) + _save_gains(simulation, gains, out)
     if as_json:
-        document = {"gains": str(gains), "scenario": simulation.scenario, "files": [str(f) for f in files]}
-        more = {"exported": comparison_document(compared)} if compared else {}
-        print_json(document | experiment_document(simulation.experiment) | more)
+        from malta.cli.documents.simulations import SimulateOutput, experiment_fields, flights
+
+        names, fields = [str(file) for file in files], experiment_fields(simulation.experiment)
+        print_document(
+            SimulateOutput(
+                gains=str(gains),
+                scenario=simulation.scenario,
+                files=names,
+                exported=flights(compared),
+                **fields,
+            )
+        )
     else:
         _print_tables(gains, simulation, change or (), published, estimate=substeps is not None)
         for title, found in zip(titles(list(compared)), compared.values(), strict=True):

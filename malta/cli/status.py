@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import typer
 
-from malta.cli.documents import campaign_document, status_document
 from malta.cli.inputs import design_of, read_controller
-from malta.cli.output import make_console, print_json, print_note, print_text, progress_bar
+from malta.cli.output import make_console, print_document, print_note, print_text, progress_bar
 from malta.cli.patience import duration_text
 from malta.errors import InputError
 
@@ -67,8 +66,10 @@ def show_status(ctx: typer.Context, folder: Path, gains: Path | None, options: S
     with progress_bar("status", quiet=options.as_json) as progress:
         found = status_of(folder, controller, bounds, progress)
     if options.as_json:
-        document = {"gains": str(gains), "folder": str(folder)} | status_document(found)
-        print_json(document | campaign_document(found.summary, options.worst))
+        from malta.cli.documents.campaigns import StatusOutput, runs_fields, status_fields
+
+        fields = runs_fields(found.summary, options.worst) | status_fields(found)
+        print_document(StatusOutput(gains=str(gains), folder=str(folder), **fields))
         return
     for file in found.summary.damaged:
         print_note(f"{file}: a damaged block, which the campaign will fly again")

@@ -12,7 +12,7 @@ from malta.cli.assignments import NUMBER, read_assignments
 from malta.cli.output import (
     NO_COMPILER,
     make_console,
-    print_json,
+    print_document,
     print_note,
     print_text,
     print_written,
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from malta.campaigns.limits import Limit
     from malta.campaigns.plan import Plan
     from malta.campaigns.summary import Bounds
+    from malta.cli.documents.parts import Part
     from malta.simulation.experiments import Progress
 
 
@@ -82,7 +83,7 @@ def study_of(
 class Outcome(NamedTuple):
     """What a study leaves behind."""
 
-    document: dict[str, Any]
+    document: Part
     files: list[Path]
     parts: list[Any]  # tables and lines for the console
     notes: list[str]
@@ -111,9 +112,7 @@ def run_study(study: Study, setting: Setting) -> None:
             print_note("interrupted before anything was known")
             raise typer.Exit(130) from None
     if setting.as_json:
-        head = {"gains": str(setting.gains), "folder": str(setting.folder)}
-        names = [str(file) for file in outcome.files]
-        print_json(head | {"files": names, "manifest": setting.plan.manifest} | outcome.document)
+        print_document(outcome.document)
     else:
         console = make_console()
         print_text(console, f"{setting.gains}: {report.run_text(setting.plan)}")
@@ -133,7 +132,8 @@ def run_study(study: Study, setting: Setting) -> None:
 def _rare(limit: Limit, _: float, setting: Setting, progress: Progress | None) -> Outcome:
     """The probability of exceeding a limit."""
     from malta import report
-    from malta.campaigns.rare import event_document, event_name, rare_event, write_event
+    from malta.campaigns.rare import event_name, rare_event, write_event
+    from malta.cli.documents.campaigns import RareOutput, rare_fields
 
     event = rare_event(setting.plan, limit, workers=setting.workers, progress=progress)
     files = [write_event(event, setting.folder)]
@@ -147,34 +147,44 @@ def _rare(limit: Limit, _: float, setting: Setting, progress: Progress | None) -
             f"the failures descend from {event.found.ancestors} of the first runs: the coefficient of variation is "
             "itself uncertain, more --samples make it certain"
         )
-    return Outcome(event_document(event), files, parts, notes, event.found.interrupted)
+    document = RareOutput(**_head(setting, files), **rare_fields(event))
+    return Outcome(document, files, parts, notes, event.found.interrupted)
 
 
 def _sobol(limit: Limit, _: float, setting: Setting, progress: Progress | None) -> Outcome:
     """Which parameter costs yield."""
     from malta import report
     from malta.campaigns.sensitivity import sensitivity, sensitivity_document
+    from malta.cli.documents.campaigns import SobolOutput, sobol_fields
 
     found = sensitivity(setting.plan, limit, workers=setting.workers, progress=progress)
-    document = sensitivity_document(found)
-    files = [_write(setting, f"sobol_{limit.slug}.json", document)]
+    files = [_write(setting, f"sobol_{limit.slug}.json", sensitivity_document(found))]
     if found.of_yield or any(found.of_merits.values()):
         files.append(setting.folder / f"sobol_{limit.slug}.png")
         report.sensitivity(found, files[-1])
     notes = [text for text in (report.sensitivity_sentence(found),) if text]
-    return Outcome(document, files, [report.sensitivity_tables(found)], notes)
+    output = SobolOutput(**_head(setting, files), **sobol_fields(found))
+    return Outcome(output, files, [report.sensitivity_tables(found)], notes)
 
 
 def _tolerance(limit: Limit, wanted: float, setting: Setting, progress: Progress | None) -> Outcome:
     """The largest spreads that keep a yield."""
     from malta import report
     from malta.campaigns.tolerance import tolerance_document, tolerances
+    from malta.cli.documents.campaigns import ToleranceOutput, tolerance_fields
 
     found = tolerances(setting.plan, limit, wanted, workers=setting.workers, progress=progress)
-    document = tolerance_document(found)
-    files = [_write(setting, f"tolerance_{limit.slug}.json", document)]
+    files = [_write(setting, f"tolerance_{limit.slug}.json", tolerance_document(found))]
     notes = [text for text in (report.tolerance_sentence(found),) if text]
-    return Outcome(document, files, [report.spreads_table(found)], notes)
+    output = ToleranceOutput(**_head(setting, files), **tolerance_fields(found))
+    return Outcome(output, files, [report.spreads_table(found)], notes)
+
+
+def _head(setting: Setting, files: list[Path]) -> dict[str, Any]:
+    """What the documents of all studies begin with."""
+    names = [str(file) for file in files]
+    gains, folder = str(setting.gains), str(setting.folder)
+    return {"gains": gains, "folder": folder, "files": names, "manifest": setting.plan.manifest}
 
 
 STUDIES = {"--rare": _rare, "--sobol": _sobol, "--tolerance": _tolerance}

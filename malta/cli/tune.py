@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from malta.cli.documents import requirement_document
 from malta.cli.options import AsJson
-from malta.cli.output import make_console, print_json, print_note, print_written, progress_bar
+from malta.cli.output import make_console, print_document, print_note, print_written, progress_bar
 from malta.errors import CheckError, InputError
 
 if TYPE_CHECKING:
@@ -72,7 +71,9 @@ def tune(
     tuned = _search(spec, journal, effort, restart=restart, quiet=as_json)
     files = _write(spec, tuned, target)
     if as_json:
-        print_json(_document(spec, tuned, files))
+        from malta.cli.documents.others import tune_output
+
+        print_document(tune_output(spec, tuned, files))
     else:
         _print_tables(tuned, files)
     _require_all(tuned.requirements, target)
@@ -85,7 +86,10 @@ def _judge(spec: Spec, file: Path, *, as_json: bool) -> None:
 
     requirements = judge(spec)
     if as_json:
-        print_json({"design": spec.name, "requirements": [requirement_document(r) for r in requirements]})
+        from malta.cli.documents.others import TuneOutput, requirement_part
+
+        parts = [requirement_part(one) for one in requirements]
+        print_document(TuneOutput(design=spec.name, requirements=parts))
     else:
         make_console().print(report.requirements_table(requirements))
     _require_all(requirements, file)
@@ -118,19 +122,6 @@ def _write(spec: Spec, tuned: Tuned, target: Path) -> list[Path]:
     picture = target.with_name(f"{target.stem}_front.png")
     report.front(tuned, picture)
     return [*files, picture]
-
-
-def _document(spec: Spec, tuned: Tuned, files: Sequence[Path]) -> dict[str, Any]:
-    """The JSON document of a search."""
-    return {
-        "design": spec.name,
-        "files": [str(path) for path in files],
-        "trials": tuned.trials,
-        "values": dict(zip((v.name for v in spec.search), tuned.trial.values, strict=True)),
-        "delay": tuned.trial.delay,
-        "requirements": [requirement_document(r) for r in tuned.requirements],
-        "front": [dict(point.figures) for point in tuned.front],
-    }
 
 
 def _print_tables(tuned: Tuned, files: Sequence[Path]) -> None:

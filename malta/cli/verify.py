@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, cast
 import typer
 
 from malta.cli.assignments import read_shares
-from malta.cli.documents import margins_document, recovery_document, robustness_document
 from malta.cli.inputs import change_machine, read_controller
 from malta.cli.options import AsJson, Changes, GainFile, MachineFile
-from malta.cli.output import make_console, margin_progress, print_json, print_text, print_written
+from malta.cli.output import make_console, margin_progress, print_document, print_text, print_written
 from malta.errors import CheckError, InputError
 
 if TYPE_CHECKING:
+    from malta.cli.documents.loops import VerifyOutput
     from malta.margins.gain import Gain
     from malta.margins.loops import CurrentLoops
     from malta.margins.recovery import Recovery
@@ -124,7 +124,7 @@ def verify(
     if out is not None:
         files += _draw(loop, analysis, out)
     if as_json:
-        print_json(_document(loop, analysis, files))
+        print_document(_document(loop, analysis, files))
     else:
         _print_tables(loop, analysis, published, change or (), files)
     require_stable(analysis.margins, str(gains))
@@ -202,20 +202,19 @@ def _draw(loop: Loop, analysis: Analysis, folder: Path) -> list[Path]:
     return files
 
 
-def _document(loop: Loop, analysis: Analysis, files: Sequence[Path]) -> dict[str, Any]:
+def _document(loop: Loop, analysis: Analysis, files: Sequence[Path]) -> VerifyOutput:
     """The JSON document of a verification."""
-    design = {
-        "gains": str(loop.gains),
-        "design": loop.controller.name,
-        "files": [str(file) for file in files],
-    }
-    robust = robustness_document(analysis.robustness, loop.box, analysis.worst)
-    recovered = [recovery_document(one) for one in analysis.recovered]
-    carried = None if analysis.payload is None else analysis.payload._asdict()
-    return (
-        design
-        | margins_document(analysis.margins)
-        | {"recovery": recovered, "robust": robust, "payload": carried}
+    from malta.cli.documents.loops import VerifyOutput, loop_fields, payload_part, recovery_part, robust_part
+
+    units = {signal.name: signal.unit for signal in loop.plant.outputs}
+    return VerifyOutput(
+        gains=str(loop.gains),
+        design=loop.controller.name,
+        files=[str(file) for file in files],
+        recovery=[recovery_part(one) for one in analysis.recovered],
+        robust=robust_part(analysis.robustness, loop.box, analysis.worst, units),
+        payload=payload_part(analysis.payload),
+        **loop_fields(analysis.margins),
     )
 
 

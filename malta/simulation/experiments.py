@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from malta.errors import InputError
+from malta.identifiers import identifier
 from malta.model.machines import attribute_of
 from malta.model.plant import Plant
 from malta.simulation.inputs import LONGEST
@@ -43,6 +44,12 @@ class Merit(NamedTuple):
     unit: str
     published: str = ""  # key of data/published/
     relation: str = "about"  # of ours to the published: "about" or "at most"
+    key: str = ""  # its name in documents, without a unit; "": the words of the label
+
+    @property
+    def identifier(self) -> str:
+        """The key of the figure in JSON documents, with its SI unit: `rise_s`."""
+        return identifier(self.key or self.label, self.unit)
 
     def __str__(self) -> str:
         unit = "%" if self.unit == "percent" else self.unit

@@ -197,7 +197,7 @@ def _step_merits(run: Trajectory, output: int, size: float) -> tuple[Merit, ...]
     unit = run.plant.outputs[output].unit
     merits = [
         Merit("overshoot", max(0.0, float(share.max()) - 1), "percent"),
-        Merit("within 2 % after", settled, "ms"),
+        Merit("within 2 % after", settled, "ms", key="settled"),
         Merit("left at the end", abs(float(share[-1]) - 1) * abs(size), FINE.get(unit, unit)),
     ]
     units = {s.unit for k, s in enumerate(run.plant.outputs) if k != output}

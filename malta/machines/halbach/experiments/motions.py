@@ -120,7 +120,7 @@ def _step_merits(run: Trajectory, distance: float, count: int) -> tuple[Merit, .
         tail = np.array([math.nan])
     return (
         Merit("mean overshoot", max(float(mean.max()) - 1, 0.0), "percent"),
-        Merit("mean within 5 % after", settled, "ms"),
+        Merit("mean within 5 % after", settled, "ms", key="mean_settled"),
         Merit("at rest, rms", float(tail.std()), "um"),
         Merit("at rest, mean error", abs(float(tail.mean())), "um"),
         Merit("vertical force off by", lift_deviation(run), "percent"),

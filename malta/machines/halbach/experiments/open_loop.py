@@ -134,7 +134,9 @@ def identify(
     off = linear - case.run.p[:, 0]
     merits = (
         Merit("linear servo off by, rms", rms(off), "mm"),
-        Merit("the same in the first 2 s", rms(off[case.run.t < 2]), "mm"),
+        Merit(
+            "the same in the first 2 s", rms(off[case.run.t < 2]), "mm", key="linear_servo_off_by_rms_early"
+        ),
         Merit("secant stiffness", motor.stiffness(par, F_z, distance), "N/m", "servo.K"),
         Merit("tangent stiffness", motor.stiffness(par, F_z), "N/m"),
     )

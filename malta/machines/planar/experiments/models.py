@@ -78,7 +78,9 @@ def errors(
             for s, a in zip(plant.inputs, amplitude, strict=True)
         ),
         Merit("fitted C of the analytical model", coils.compensation(par, truth), "1"),
-        Merit("error of the table, each halving of its step", _error_ratio(curves), "1"),
+        Merit(
+            "error of the table, each halving of its step", _error_ratio(curves), "1", key="table_error_ratio"
+        ),
     )
     return Experiment("errors", "What do the coil models miss?", cases, found_merits, curves, interrupted=cut)
 

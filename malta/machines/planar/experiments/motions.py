@@ -177,9 +177,11 @@ def step_merits(run: Trajectory) -> tuple[Merit, ...]:
     late = run.t >= LIFT_AT + 0.02 - Ts / 2
     beyond = (run.p[:, 1] - target[1]) * np.sign(target[1] - run.reference[0, 1])
     return (
-        Merit("y within 10 um after its step", _arrival(run, target[1]), "ms"),
+        Merit("y within 10 um after its step", _arrival(run, target[1]), "ms", key="y_settled"),
         Merit("y, overshoot", max(float(beyond.max()), 0.0), "um"),
-        Merit("z, from 20 ms after its step", _largest(np.abs(run.p[late, 2] - target[2])), "um"),
+        Merit(
+            "z, from 20 ms after its step", _largest(np.abs(run.p[late, 2] - target[2])), "um", key="z_late"
+        ),
         *(
             Merit(f"{signal.name}, deviation", float(error[:, k].max()), "um" if k < 3 else "urad")
             for k, signal in enumerate(run.plant.outputs)

@@ -71,7 +71,12 @@ def timing(
             for name, seconds in compiled.items()
         ),
         Merit("whole step by the table, compiled", whole, "us"),
-        Merit("of the control period, table compiled", compiled["table"] / Ts, "percent"),
+        Merit(
+            "of the control period, table compiled",
+            compiled["table"] / Ts,
+            "percent",
+            key="table_of_control_period",
+        ),
     )
     return Experiment("timing", "Is it quick enough?", cases, merits, interrupted=cut)
 

@@ -227,7 +227,7 @@ def _run_merits(run: Trajectory) -> tuple[Merit, ...]:
     current = np.abs(run.force[:, bearings] / np.array(run.plant.actuator.force_constant)[bearings]).max()
     return (
         Merit("furthest off centre", float(off.max()), "mm"),
-        Merit(f"within {BACK * 1e6:.0f} um after", back, "ms"),
+        Merit(f"within {BACK * 1e6:.0f} um after", back, "ms", key="settled"),
         Merit("largest bearing current", float(current), "A"),
     )
 

@@ -201,7 +201,7 @@ def _fault_merits(run: Trajectory) -> tuple[Merit, ...]:
     return (
         Merit("largest deviation", float(np.abs(run.p[run.t >= AT][:, others]).max(initial=0.0)), "um"),
         Merit("contact after", at - AT, "ms"),
-        Merit("its speed", speed, "mm/s"),
+        Merit("its speed", speed, "mm/s", key="contact_speed"),
     )
 
 
@@ -212,7 +212,9 @@ def _counts(cases: list[Case]) -> tuple[Merit, ...]:
     down, still = (float(sum(not c.run.verdict.completed for c in part)) for part in (alone, supervised))
     landed = sum(case.run.verdict.completed and case.merits[2].value >= 0 for case in supervised)
     return (
-        Merit(f"touchdowns alone, of {len(alone)}", down, "1"),
-        Merit(f"touchdowns with supervisor, of {len(supervised)}", still, "1"),
+        Merit(f"touchdowns alone, of {len(alone)}", down, "1", key="touchdowns_alone"),
+        Merit(
+            f"touchdowns with supervisor, of {len(supervised)}", still, "1", key="touchdowns_with_supervisor"
+        ),
         Merit("slow landings with supervisor", float(landed), "1"),
     )

@@ -42,7 +42,7 @@ def faults(
     wanted = planned_faults("faults", plant, controller, during, options)
     cases, cut = fly(plant, controller, wanted, progress, options)
     survived = float(sum(case.run.verdict.completed for case in cases))
-    merit = Merit(f"survived, of {len(cases)}", survived, "1")
+    merit = Merit(f"survived, of {len(cases)}", survived, "1", key="survived")
     return Experiment("faults", "What does it survive?", cases, (merit,), interrupted=cut)
 
 

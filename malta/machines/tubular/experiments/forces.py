@@ -40,8 +40,8 @@ def disturbance(
     curve = compliance(plant, controller, w)
     worst = int(curve.argmax())
     found = (
-        Merit("largest compliance, x1 to F_x", float(curve[worst]), "um/N"),
-        Merit("at", float(w[worst] / (2 * math.pi)), "Hz"),
+        Merit("largest compliance, x1 to F_x", float(curve[worst]), "um/N", key="largest_compliance"),
+        Merit("at", float(w[worst] / (2 * math.pi)), "Hz", key="compliance_frequency"),
         Merit("smallest dynamic stiffness", float(1 / curve[worst]), "N/um"),
     )
     curves = {

@@ -112,7 +112,7 @@ def _lift_merits(run: Trajectory) -> tuple[Merit, ...]:
     settled = float(run.t[late[-1]]) if len(late) and late[-1] + 1 < len(run.t) else math.nan
     return (
         Merit("off the bearing after", lifted, "ms"),
-        Merit("within 20 um after", settled, "ms"),
+        Merit("within 20 um after", settled, "ms", key="settled"),
         Merit("beyond the centre", max(float(run.p[:, [1, 3]].max()), 0.0), "um"),
         Merit("off its path", float(np.abs(run.p - run.reference)[:, :4].max()), "um"),
         Merit("largest bearing current", _bearing_current(run), "A"),

@@ -156,13 +156,28 @@ def _differences(recorded: Recorded, controller: Controller, plant: Plant) -> tu
     """The largest differences between the recorded v0(z) and the controller's own, and of the two ways."""
     off = np.abs(recorded.v0 - _own(controller, recorded.z_grid))
     merits = [
-        Merit(f"largest |recorded - own v0|, {signal.name}", float(off[:, k].max()), "N")
+        Merit(
+            f"largest |recorded - own v0|, {signal.name}",
+            float(off[:, k].max()),
+            "N",
+            key=f"recorded_minus_own_v0_{signal.name}",
+        )
         for k, signal in enumerate(plant.inputs)
     ]
     at = float(recorded.z_grid[int(off[:, plant.thrust_input].argmax())])
-    merits.append(Merit(f"that of {plant.thrust} at {plant.stroke}", at, "mm"))
+    merits.append(
+        Merit(
+            f"that of {plant.thrust} at {plant.stroke}",
+            at,
+            "mm",
+            key=f"recorded_minus_own_v0_{plant.thrust}_at",
+        )
+    )
     apart = float(np.abs(recorded.apart).max())
-    return (*merits, Merit("largest |there - back| / 2 of any force", apart, "N"))
+    return (
+        *merits,
+        Merit("largest |there - back| / 2 of any force", apart, "N", key="half_there_minus_back"),
+    )
 
 
 def _own(controller: Controller, z: FloatArray) -> FloatArray:

@@ -146,7 +146,7 @@ def thermal(
     found = (
         Merit("drift of the support", drift, "um", "thermal.drift"),
         Merit("lag if the mover goes where it is sent", lag, "um"),
-        Merit("the same at the true speed", lag / faster, "um"),
+        Merit("the same at the true speed", lag / faster, "um", key="lag_at_true_speed"),
     )
     curves = {"drift": moved(cases[0].run.t)}
     return Experiment("thermal", "Does it hold its place in space?", cases, found, curves, interrupted=cut)

@@ -73,7 +73,13 @@ def stroke_merits(run: Trajectory, *, published: bool = True) -> tuple[Merit, ..
     merits += [
         Merit("largest thrust", f.force, "N"),
         Merit("largest commanded current", f.current, "A"),
-        Merit("drive constant per module, f / i", drive_constant(run), "N/A", "figure_12.drive_constant"),
+        Merit(
+            "drive constant per module, f / i",
+            drive_constant(run),
+            "N/A",
+            "figure_12.drive_constant",
+            key="drive_constant",
+        ),
         Merit("heat in the windings", float(run.copper_loss.sum()) * run.controller.sample_time, "J"),
     ]
     if run.u.size:
@@ -188,7 +194,9 @@ def _limit_merits(run: Trajectory, found: FastestStroke | SigmoidStroke) -> tupl
     """Rise and travel time of the reference, and the figures of the stroke."""
     return (
         Merit("reference: rise, 10-90 %", found.rise, "ms"),
-        Merit("reference: 0.1 to 99.9 % of travel", found.travel_time(1e-3), "ms"),
+        Merit(
+            "reference: 0.1 to 99.9 % of travel", found.travel_time(1e-3), "ms", key="reference_travel_time"
+        ),
         *stroke_merits(run, published=False),
     )
 

@@ -1,0 +1,320 @@
+"""The documents of `malta campaign`: runs, status, and the studies on the same box."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Literal
+
+from pydantic import Field
+
+from malta.cli.documents.parts import Files, Number, Part, ShareOfRuns, keyed, share_of, words_of
+from malta.identifiers import distinct, identifier
+
+if TYPE_CHECKING:
+    from malta.campaigns.rare import RareEvent
+    from malta.campaigns.sensitivity import Index, Sensitivity
+    from malta.campaigns.status import Status
+    from malta.campaigns.summary import Merit, Runs, Summary
+    from malta.campaigns.tolerance import Tolerances
+
+Manifest = dict[str, Any]
+
+
+class HeadPart(Part):
+    """What every document of a campaign begins with."""
+
+    gains: str
+    folder: str
+    manifest: Manifest = Field(description="all that the runs depend on, as in campaign.json")
+
+
+class PercentilesPart(Part):
+    """How exact the percentiles are."""
+
+    exact: bool
+    relative_error: float
+
+
+class DistributionPart(Part):
+    """A figure of merit over the completed runs, SI."""
+
+    p5: Number
+    p50: Number
+    p95: Number
+    p99: Number
+    largest: Number
+    smallest: Number
+    mean: Number
+    standard_deviation: Number
+    published: Number
+
+
+class RunPart(Part):
+    """One run."""
+
+    run: int
+    end: str
+    time_s: Number
+    values: dict[str, float] = Field(description="of what varies, SI")
+    deviation: dict[str, Number] = Field(description="largest, by output; a key ends in the SI unit")
+    contact: dict[str, Number] = Field(description="how near each contact was; 1: touched")
+    replay: str = Field(description="for `malta simulate GAINS --replay`")
+
+
+class RunsPart(HeadPart):
+    """The yield of a campaign, the distribution of each figure of merit, and its worst runs."""
+
+    samples: int = Field(description="runs that the campaign is to have")
+    runs: int = Field(
+        description="runs that the figures are of; fewer than `samples`: a part of the campaign"
+    )
+    interrupted: bool
+    engines: list[str]
+    share: ShareOfRuns = Field(alias="yield", description="runs that were completed")
+    within_published: int | None
+    within_specification: int | None
+    ends: dict[str, int] = Field(description="runs by the way they ended")
+    percentiles: PercentilesPart
+    merits: dict[str, DistributionPart]
+    worst: list[RunPart]
+
+
+class CampaignOutput(RunsPart):
+    """What `malta campaign --json` prints."""
+
+    kind: Literal["malta-campaign-output"] = Field(default="malta-campaign-output", alias="schema")
+    version: Literal[1] = 1
+    files: Files
+
+
+class BlocksPart(Part):
+    """Blocks in the folder of a campaign."""
+
+    done: int
+    all: int
+    runs: int = Field(description="in a block")
+    bytes: int
+
+
+class StatusOutput(RunsPart):
+    """What `malta campaign --status FOLDER --json` prints."""
+
+    kind: Literal["malta-status-output"] = Field(default="malta-status-output", alias="schema")
+    version: Literal[1] = 1
+    blocks: BlocksPart
+    damaged: list[str]
+    running: bool
+    pace_s: Number = Field(description="from one block to the next")
+    age_s: Number = Field(description="of the last block")
+    left_s: Number
+
+
+class LevelPart(Part):
+    """A level of a subset simulation."""
+
+    threshold: Number = Field(description="severity; 1 is the limit")
+    share: Number
+    cov: Number
+    acceptance: Number
+
+
+class DesignPointPart(Part):
+    """The failed run whose machine is nearest the middle of the box."""
+
+    values: dict[str, float] = Field(description="of what varies, SI")
+    distance: float = Field(description="from the middle, in standard deviations")
+    noise: list[int]
+    end: str
+    time_s: float
+
+
+class RareOutput(HeadPart):
+    """What `malta campaign --rare LIMIT --json` prints."""
+
+    kind: Literal["malta-rare-output"] = Field(default="malta-rare-output", alias="schema")
+    version: Literal[1] = 1
+    files: Files
+    limit: str
+    text: str
+    probability: Number = Field(description="null where no run failed: then it is below `bound`")
+    bound: Number
+    cov: Number = Field(description="coefficient of variation of the probability")
+    low: Number
+    high: Number
+    simulated: int
+    plain_sampling: Number = Field(description="runs that plain sampling needs for the same coefficient")
+    ancestors: int
+    worst_severity: Number
+    interrupted: bool
+    levels: list[LevelPart]
+    design_point: DesignPointPart | None
+
+
+class IndexPart(Part):
+    """Sobol indices of a factor, with half the width of their 95 % intervals."""
+
+    first: Number
+    first_half: Number
+    total: Number
+    total_half: Number
+
+
+Indices = dict[str, IndexPart] | None
+
+
+class SobolOutput(HeadPart):
+    """What `malta campaign --sobol --json` prints."""
+
+    kind: Literal["malta-sobol-output"] = Field(default="malta-sobol-output", alias="schema")
+    version: Literal[1] = 1
+    files: Files
+    limit: str
+    factors: list[str]
+    runs: int
+    within: ShareOfRuns
+    of_yield: Indices = Field(alias="yield", description="null: every run is within the limit, or none")
+    merits: dict[str, Indices]
+
+
+class SpreadPart(Part):
+    """The largest spread of a parameter that keeps the yield."""
+
+    factor: float = Field(description="in multiples of today's")
+    spread: Number = Field(description="a share, or SI; null for all together")
+    within: ShareOfRuns | None
+    at_least: bool = Field(description="true: no wider spread was tried")
+    monotone: bool
+
+
+class ToleranceOutput(HeadPart):
+    """What `malta campaign --tolerance YIELD --json` prints."""
+
+    kind: Literal["malta-tolerance-output"] = Field(default="malta-tolerance-output", alias="schema")
+    version: Literal[1] = 1
+    files: Files
+    limit: str
+    wanted: float
+    today: ShareOfRuns
+    spreads: dict[str, SpreadPart]
+
+
+def runs_fields(found: Summary, worst: int) -> dict[str, Any]:
+    """The fields of a RunsPart but `gains` and `folder`."""
+    from malta.campaigns.sketch import ACCURACY
+    from malta.campaigns.summary import worst_runs
+
+    completed, within, specified = found.yields
+    runs = worst_runs(found, worst)
+    names = distinct(identifier(merit.label, merit.unit) for merit in found.merits)
+    error = 0.0 if found.exact else ACCURACY
+    return {
+        "manifest": found.plan.manifest,
+        "samples": found.plan.samples,
+        "runs": found.runs,
+        "interrupted": found.interrupted,
+        "engines": list(found.engines),
+        "share": share_of(completed),
+        "within_published": None if within is None else within.passed,
+        "within_specification": None if specified is None else specified.passed,
+        "ends": keyed(found.ends),
+        "percentiles": PercentilesPart(exact=found.exact, relative_error=error),
+        "merits": {name: _distribution(m) for name, m in zip(names, found.merits, strict=True)},
+        "worst": [_run_part(found, runs, row) for row in range(len(runs.index))],
+    }
+
+
+def status_fields(found: Status) -> dict[str, Any]:
+    """How far a campaign is."""
+    return {
+        "blocks": BlocksPart(done=found.blocks, all=found.of, runs=found.size, bytes=found.stored),
+        "damaged": [str(file) for file in found.summary.damaged],
+        "running": found.running,
+        "pace_s": found.pace,
+        "age_s": found.age,
+        "left_s": found.left,
+    }
+
+
+def rare_fields(event: RareEvent) -> dict[str, Any]:
+    """The probability of a rare event."""
+    from malta.campaigns.rare import event_document
+
+    document = event_document(event)
+    point = event.design_point
+    if point is not None:
+        document["design_point"] = DesignPointPart(
+            values=dict(point.values),
+            distance=point.distance,
+            noise=list(point.noise),
+            end=point.end,
+            time_s=point.time,
+        )
+    return {name: value for name, value in document.items() if name not in ("schema", "version")}
+
+
+def sobol_fields(found: Sensitivity) -> dict[str, Any]:
+    """Sobol indices of the yield and of each figure of merit, which have no unit."""
+
+    def part(indices: tuple[Index, ...]) -> Indices:
+        rows = zip(found.factors, indices, strict=True) if indices else ()
+        return {name: IndexPart(**index._asdict()) for name, index in rows} or None
+
+    names = distinct(identifier(label, "1") for label in found.of_merits)
+    return {
+        "limit": found.limit.name,
+        "factors": list(found.factors),
+        "runs": found.runs,
+        "within": share_of(found.within),
+        "of_yield": part(found.of_yield),
+        "merits": {name: part(one) for name, one in zip(names, found.of_merits.values(), strict=True)},
+    }
+
+
+def tolerance_fields(found: Tolerances) -> dict[str, Any]:
+    """The largest spreads that keep a yield."""
+    from malta.campaigns.tolerance import spread_of
+
+    return {
+        "limit": found.limit.name,
+        "wanted": found.wanted,
+        "today": share_of(found.today),
+        "spreads": {
+            words_of(spread.name): SpreadPart(
+                factor=spread.factor,
+                spread=spread_of(found, spread),
+                within=None if spread.within is None else share_of(spread.within),
+                at_least=spread.factor == spread.widest,
+                monotone=spread.monotone,
+            )
+            for spread in found.spreads
+        },
+    }
+
+
+def _distribution(merit: Merit) -> DistributionPart:
+    marks = merit.percentiles((5, 50, 95, 99, 100)).tolist()
+    return DistributionPart(
+        **dict(zip(("p5", "p50", "p95", "p99", "largest"), marks, strict=True)),
+        smallest=merit.sketch.smallest,
+        mean=merit.mean,
+        standard_deviation=merit.standard_deviation,
+        published=merit.published,
+    )
+
+
+def _run_part(found: Summary, runs: Runs, row: int) -> RunPart:
+    """One run of a campaign, by its row among some runs."""
+    from malta.campaigns.plan import varied_names
+    from malta.simulation.digest import verdicts
+
+    plant, batch = found.plan.plant, runs.batch
+    outputs = [identifier(signal.name, signal.unit) for signal in plant.outputs]
+    contacts = distinct(map(words_of, plant.contacts))
+    return RunPart(
+        run=int(runs.index[row]),
+        end=verdicts(plant)[int(batch.verdict[row])],
+        time_s=float(batch.duration[row]),
+        values=dict(zip(varied_names(found.plan), runs.values[row].tolist(), strict=True)),
+        deviation=dict(zip(outputs, batch.deviation[row].tolist(), strict=True)),
+        contact=dict(zip(contacts, batch.contact[row].tolist(), strict=True)),
+        replay=f"{found.folder}:{runs.index[row]}",
+    )

@@ -1,0 +1,152 @@
+"""The documents of `malta check`, `malta tune`, `malta claims` and `malta export`."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Literal
+
+from pydantic import Field
+
+from malta.cli.documents.parts import Files, Number, Part
+from malta.identifiers import identifier
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    from malta.report.ledger import Ledger
+    from malta.synthesis.spec import Spec
+    from malta.tuning.outcomes import Outcome
+    from malta.tuning.tune import Tuned
+
+
+class CheckOutput(Part):
+    """What `malta check --json` prints."""
+
+    kind: Literal["malta-check-output"] = Field(default="malta-check-output", alias="schema")
+    version: Literal[1] = 1
+    file: str
+    holds: bool
+    lower: Number = Field(description="what the certificate claims, in multiples of the uncertainty")
+    groups: list[str]
+    failures: list[str]
+
+
+class RequirementPart(Part):
+    """A requirement on a design, and what the design reaches; SI."""
+
+    name: str
+    asked: Number = Field(description="null: as little as the others leave")
+    found: Number
+    unit: str
+    how: str = Field(description="where the figure comes from")
+    ratio: Number = Field(description="how near its limit: at most 1 where it holds; null: infinite")
+    holds: bool
+
+
+class SearchPart(Part):
+    """How a design was found."""
+
+    trials: int
+    values: dict[str, float] = Field(description="the numbers that were searched, by their names in the file")
+    delay_samples: int
+    front: list[dict[str, Number]] = Field(description="figures of the trials of the Pareto front")
+
+
+class TuneOutput(Part):
+    """What `malta tune --json` prints."""
+
+    kind: Literal["malta-tune-output"] = Field(default="malta-tune-output", alias="schema")
+    version: Literal[1] = 1
+    design: str
+    files: Files = Field(default=[])
+    requirements: list[RequirementPart]
+    search: SearchPart | None = Field(default=None, description="null with --check, which searches nothing")
+
+
+class ClaimPart(Part):
+    """A published number, ours for each design, and the verdict; as text, with the printed digits."""
+
+    subject: str
+    published: str
+    ours: list[str]
+    verdict: str
+
+
+class LedgerPart(Part):
+    """All published numbers on a machine."""
+
+    machine: str
+    source: str
+    designs: list[str]
+    claims: list[ClaimPart]
+
+
+class ClaimsOutput(Part):
+    """What `malta claims --json` prints."""
+
+    kind: Literal["malta-claims-output"] = Field(default="malta-claims-output", alias="schema")
+    version: Literal[1] = 1
+    ledgers: list[LedgerPart]
+
+
+class ExportOutput(Part):
+    """What `malta export --json` prints."""
+
+    kind: Literal["malta-export-output"] = Field(default="malta-export-output", alias="schema")
+    version: Literal[1] = 1
+    gains: str
+    to: Literal["c", "fmu"]
+    files: Files
+
+
+def requirement_part(outcome: Outcome) -> RequirementPart:
+    """A requirement and what is reached of it."""
+    return RequirementPart(
+        name=outcome.name,
+        asked=outcome.asked,
+        found=outcome.found,
+        unit=outcome.unit,
+        how=outcome.how,
+        ratio=outcome.ratio,
+        holds=outcome.holds,
+    )
+
+
+def tune_output(spec: Spec, tuned: Tuned, files: Sequence[Path]) -> TuneOutput:
+    """The document of a search."""
+    from malta.synthesis.requirements import requirements_for
+
+    units = {name: one.unit for name, one in requirements_for(spec.plant).items()}
+    search = SearchPart(
+        trials=tuned.trials,
+        values=dict(zip((v.name for v in spec.search), tuned.trial.values, strict=True)),
+        delay_samples=tuned.trial.delay,
+        front=[
+            {identifier(name, units.get(name, "1")): value for name, value in point.figures.items()}
+            for point in tuned.front
+        ],
+    )
+    return TuneOutput(
+        design=spec.name,
+        files=[str(path) for path in files],
+        requirements=[requirement_part(r) for r in tuned.requirements],
+        search=search,
+    )
+
+
+def claims_output(ledgers: Sequence[Ledger]) -> ClaimsOutput:
+    """The document of ledgers."""
+    return ClaimsOutput(
+        ledgers=[
+            LedgerPart(
+                machine=one.machine,
+                source=one.source,
+                designs=list(one.designs),
+                claims=[
+                    ClaimPart(subject=c.subject, published=c.published, ours=list(c.ours), verdict=c.verdict)
+                    for c in one.claims
+                ],
+            )
+            for one in ledgers
+        ]
+    )

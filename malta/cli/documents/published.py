@@ -1,0 +1,42 @@
+"""The JSON schemas of the documents, made of their models."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from malta.cli.documents.campaigns import (
+    CampaignOutput,
+    RareOutput,
+    SobolOutput,
+    StatusOutput,
+    ToleranceOutput,
+)
+from malta.cli.documents.loops import VerifyOutput
+from malta.cli.documents.others import CheckOutput, ClaimsOutput, ExportOutput, TuneOutput
+from malta.cli.documents.parts import Part
+from malta.cli.documents.simulations import DesignOutput, SimulateOutput
+
+DRAFT = "https://json-schema.org/draft/2020-12/schema"
+MODELS: dict[str, type[Part]] = {
+    "design-output": DesignOutput,
+    "verify-output": VerifyOutput,
+    "check-output": CheckOutput,
+    "simulate-output": SimulateOutput,
+    "campaign-output": CampaignOutput,
+    "status-output": StatusOutput,
+    "rare-output": RareOutput,
+    "sobol-output": SobolOutput,
+    "tolerance-output": ToleranceOutput,
+    "tune-output": TuneOutput,
+    "export-output": ExportOutput,
+    "claims-output": ClaimsOutput,
+}
+
+
+def output_schema(name: str) -> dict[str, Any]:
+    """The JSON schema (draft 2020-12) of a document; `name` is a key of MODELS.
+
+    >>> output_schema("export-output")["properties"]["to"]["enum"]
+    ['c', 'fmu']
+    """
+    return {"$schema": DRAFT} | MODELS[name].model_json_schema(mode="serialization")
