@@ -15,6 +15,24 @@ from malta.files import read_file
 _Model = TypeVar("_Model", bound=BaseModel)
 DEEPEST = 30  # tables and lists in others; files of malta have 6 at most
 Finite = Annotated[float, Checked(strict=True, allow_inf_nan=False)]
+Positive = Annotated[Finite, Checked(gt=0)]
+
+
+def entry(
+    meaning: str, unit: str = "", *, shape: str = "", default: Any = ..., alias: str | None = None
+) -> Any:
+    """Declare an entry of a table: a field of its Record, with what schemas and pages say of it.
+
+    meaning : what the entry holds, in words
+    unit : SI unit of the number or of each number of the list; "" where the text or the machine says it
+    shape : number of entries of a list, or rows x columns of a matrix, as "m x n"
+    default : of an entry that may be left out; without one the entry has to stand in the file
+    alias : key in the file, where it is no name of Python
+
+    Example: `Kp: Positive = entry("proportional gain", "V/A")`
+    """
+    extra: dict[str, Any] = {key: value for key, value in (("unit", unit), ("shape", shape)) if value}
+    return Checked(default, description=meaning, alias=alias, json_schema_extra=extra)
 
 
 class Record(BaseModel):
@@ -26,8 +44,8 @@ class Record(BaseModel):
 class Quantity(Record):
     """A number with its unit: `{ value = 0.36, unit = "kg" }`."""
 
-    value: Finite
-    unit: StrictStr
+    value: Finite = entry("number, in the unit beside it")
+    unit: StrictStr = entry('unit of the right dimension, as "um" or "N s/m"')
 
 
 def load_toml(path: str | Path) -> dict[str, Any]:

@@ -1,23 +1,7 @@
 """The gain file: everything that a digital implementation needs, as .json, .npz or .mat.
 
-    schema "malta-gains", version 1; 2 with what is below
-    design           name, spec_sha256
-    plant            name, preset, parameters {name: {value, unit}}, without those that have their defaults
-    operating_point  x [n0], u [m]
-    sample_time      s
-    signals          states [n], forces [m], measurements [p]: {name, unit} each, SI
-    model            A n0 x n0, B n0 x m, C p x n0 (continuous, n0 mechanical states); Ad n x n, Bd n x m, Cd p x n
-    gains            K m x n, Ki m x p, L n x p (filter form)
-    cost             state n0, input m, integral p: diagonals of Q, R, Q_i that the regulator minimizes, SI
-    noise            process [N^2] m, sensor [m^2] p: variances that the filter was designed for; drift [N^2] m or null
-    feedforward      inertia [kg or kg m^2] m, speed m x p [N s/m], rate n0/2 x p, z_grid [g] [m], v0 g x m [N]
-    current_loop     Kp [V/A], Ki [V/(A s)], sample_time [s]
-    limits           current [A], voltage [V]: of each of c coils; force [N or N m]: m, which bounds v0 too
-    verification     poles {open_loop, regulator, filter, closed_loop} as rows [re, im] in rad/s, bandwidth [rad/s],
-                     peak_sensitivity, robust {uncertainty, lower, upper, witness [SI]} or null: the margin over
-                     the travel in multiples of the uncertainty; lower null: not proven, upper null: no witness
-    provenance       versions of malta, python, numpy, scipy, control, casadi
-    sha256           of the rest as compact JSON with sorted keys
+Its tables and entries, with meaning, unit and shape of each, stand in schema.py, and malta.schemas makes a JSON schema
+of them. Version 1; 2 with what is below.
 
 n = n0 + m d where the design models a delay of d samples: the mechanical states first, then stored forces; m more where
 the filter observes forces of disturbance. The control law is stated in synthesis/controller.py. A PID controller has
@@ -27,19 +11,12 @@ limits.voltage is null where voltages have no limit. A simulation keeps the smal
 of forces and currents always, of voltages where it has windings (fidelities dq and phase; the smallest of the file's).
 A machine with electronics of its own keeps its own voltages.
 
-A file of version 2 has one more table, and may have others:
+A file of version 2 has one more table, law, and may have others: plant.linear of a machine from plain matrices, and
+commutation. What law.tracks, law.coordinates and commutation mean for the control law stands in synthesis/controller.py
+and synthesis/kalman.py.
 
-    law              tracks "states" or "errors": the signals that the control law takes, see synthesis/controller.py;
-                     coordinates "signals", or "positions" where cost.integral [n0/2] is of the errors of q and
-                     noise.process [n0/2, m^2/s^4] of its accelerations, see synthesis/kalman.py;
-                     pause [p, m/s]: sums of errors wait while the reference is faster; 0: never
-    plant.linear     of a machine from plain matrices, whose name is "linear" and whose preset its own name:
-                     states, inputs, outputs: signals; matrices A, B, C; terms {parameter: A, B, C}; limit [m],
-                     noise [p], dead_time [s], as model/linear.py takes them
-    commutation      lead [s], pull m x p [N/m]: currents are commutated for y + lead p*', see synthesis/controller.py
-
-There plant.parameters and its terms are null without parameters, feedforward.rate without rates among the states, and
-limits.current and limits.force without limits. The states of a law of errors are its own, then its last errors. An
+There plant.parameters and its terms may be null, feedforward.rate without rates among the states, and limits.current
+and limits.force without limits. The states of a law of errors are its own, then its last errors. An
 LQG's may hold forces behind the lag of the current loops, as fx_B1[i], between the mechanical states and stored forces.
 Its noise may have correlation [n0/2] of readings with accelerations, and any feedforward position m x n0/2 [N/m].
 Files without these tables keep version 1.

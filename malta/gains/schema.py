@@ -1,14 +1,19 @@
-"""The tables of a gain file, as pydantic checks them. What they mean stands in file.py."""
+"""The tables of a gain file, as pydantic checks them, with the meaning, the unit and the shape of each entry.
+
+Sizes: n0 mechanical states, n states with stored forces and disturbances, m forces, p measurements, c coils, g
+positions.
+Checks that need the machine or the shapes of other entries stand in contents.py.
+"""
 
 from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field, StrictInt, StrictStr
+from pydantic import BeforeValidator, StrictInt, StrictStr
 
 from malta.synthesis.controller import Tracks
 from malta.synthesis.spec import Coordinates
-from malta.tables import Finite, Quantity, Record
+from malta.tables import Finite, Positive, Quantity, Record, entry
 
 Vector = list[Finite]
 Matrix = list[list[Finite]]
@@ -23,163 +28,229 @@ def _rows(value: Any) -> Any:
     return value
 
 
-class _Signal(Record):
-    name: StrictStr
-    unit: StrictStr
+class Signal(Record):
+    """A signal of the machine or of the controller."""
+
+    name: StrictStr = entry("name of the signal")
+    unit: StrictStr = entry("its SI unit")
 
 
-_Signals = Annotated[list[_Signal], BeforeValidator(_rows)]
+class Columns(Record):
+    """Signals as .npz and .mat hold them: two lists of equal length."""
+
+    name: list[StrictStr] = entry("names of the signals")
+    unit: list[StrictStr] = entry("their SI units")
 
 
-class _Design(Record):
-    name: StrictStr
-    spec_sha256: StrictStr
+Signals = Annotated[list[Signal], BeforeValidator(_rows, json_schema_input_type=list[Signal] | Columns)]
 
 
-class _Matrices(Record):
-    A: Matrix
-    B: Matrix
-    C: Matrix
+class Design(Record):
+    """The design file that the gains come from."""
+
+    name: StrictStr = entry("name of the design, a plain file name")
+    spec_sha256: StrictStr = entry("sha256 of all that shapes the design in its file")
+
+
+class Matrices(Record):
+    """A linear model, or what one parameter adds to it."""
+
+    A: Matrix = entry("state matrix", shape="n0 x n0")
+    B: Matrix = entry("input matrix", shape="n0 x m")
+    C: Matrix = entry("output matrix", shape="p x n0")
 
 
 class LinearTable(Record):
-    states: _Signals
-    inputs: _Signals
-    outputs: _Signals
-    matrices: _Matrices
-    terms: dict[StrictStr, _Matrices] | None
-    limit: Vector | None
-    noise: Vector
-    dead_time: Finite
+    """A machine from plain matrices, as `malta.linear_machine` takes them."""
+
+    states: Signals = entry("states", shape="n0")
+    inputs: Signals = entry("inputs", shape="m")
+    outputs: Signals = entry("outputs", shape="p")
+    matrices: Matrices = entry("matrices of the nominal machine")
+    terms: dict[StrictStr, Matrices] | None = entry("matrices by parameter; null without parameters")
+    limit: Vector | None = entry("limits of the outputs", "m", shape="p")
+    noise: Vector = entry("noise of one sample of each output, rms, SI", shape="p")
+    dead_time: Finite = entry("from a command to its force", "s")
 
 
 class PlantTable(Record):
-    name: StrictStr
-    preset: StrictStr
-    parameters: dict[StrictStr, Quantity] | None
-    linear: LinearTable | None = None
+    """The machine that the gains are for."""
+
+    name: StrictStr = entry('name of the machine; "linear" of a machine from plain matrices')
+    preset: StrictStr = entry("preset of the data file; name of a machine from plain matrices")
+    parameters: dict[StrictStr, Quantity] | None = entry(
+        "parameters by name, SI, without those that have their defaults; null without parameters"
+    )
+    linear: LinearTable | None = entry("the matrices of a machine from plain matrices", default=None)
 
 
-class _Law(Record):
-    tracks: Tracks
-    coordinates: Coordinates = "signals"
-    pause: Vector | None = None
+class Law(Record):
+    """What the control law takes; version 2."""
+
+    tracks: Tracks = entry("signals that the control law takes: estimated states, or errors of outputs")
+    coordinates: Coordinates = entry(
+        "of cost.integral and noise.process: signals, or positions q and their accelerations",
+        default="signals",
+    )
+    pause: Vector | None = entry(
+        "rates of the references above which sums of errors wait; 0: never", "m/s", shape="p", default=None
+    )
 
 
-class _OperatingPoint(Record):
-    x: Vector
-    u: Vector
+class OperatingPoint(Record):
+    """Where the machine was linearized."""
+
+    x: Vector = entry("mechanical states, SI", shape="n0")
+    u: Vector = entry("forces", "N, N m", shape="m")
 
 
-class _SignalTable(Record):
-    states: _Signals
-    forces: _Signals
-    measurements: _Signals
+class SignalTable(Record):
+    """Names and units, in the order of the matrices."""
+
+    states: Signals = entry(
+        "mechanical states, forces behind the lag, stored forces, disturbances; of a law of errors its own",
+        shape="n",
+    )
+    forces: Signals = entry("commanded forces and torques", shape="m")
+    measurements: Signals = entry("measured positions", shape="p")
 
 
-class _Model(Record):
-    A: Matrix
-    B: Matrix
-    C: Matrix
-    Ad: Matrix
-    Bd: Matrix
-    Cd: Matrix
+class Model(Record):
+    """The design model."""
+
+    A: Matrix = entry("continuous, mechanical states", shape="n0 x n0")
+    B: Matrix = entry("continuous", shape="n0 x m")
+    C: Matrix = entry("continuous", shape="p x n0")
+    Ad: Matrix = entry("sampled, with stored forces and disturbances", shape="n x n")
+    Bd: Matrix = entry("sampled", shape="n x m")
+    Cd: Matrix = entry("sampled", shape="p x n")
 
 
-class _Gains(Record):
-    K: Matrix
-    Ki: Matrix
-    L: Matrix
+class Gains(Record):
+    """The gains of the control law."""
+
+    K: Matrix = entry("of the states", shape="m x n")
+    Ki: Matrix = entry("of the sums of errors", shape="m x p")
+    L: Matrix = entry("of the filter, filter form", shape="n x p")
 
 
-class _Cost(Record):
-    state: Vector
-    input: Vector
-    integral: Vector
+class Cost(Record):
+    """Diagonals of Q, R and Q_i, which the regulator minimizes, SI."""
+
+    state: Vector = entry("of the mechanical states, at least 0", shape="n0")
+    input: Vector = entry("of the forces, above 0", shape="m")
+    integral: Vector = entry("of the integrals of errors, at least 0", shape="p, or n0/2 in positions")
 
 
-class _Noise(Record):
-    process: Vector
-    sensor: Vector
-    drift: Vector | None
-    correlation: Vector | None = None
+class Noise(Record):
+    """Variances that the filter was designed for, of one sample."""
+
+    process: Vector = entry(
+        "of the forces; in positions of their accelerations, m^2/s^4", "N^2", shape="m, or n0/2 in positions"
+    )
+    sensor: Vector = entry("of the readings", "m^2", shape="p")
+    drift: Vector | None = entry("of the steps of observed disturbances; null: none", "N^2", shape="m")
+    correlation: Vector | None = entry(
+        "of the noise of each position with the acceleration before, between -1 and 1",
+        "1",
+        shape="n0/2",
+        default=None,
+    )
 
 
-class _Feedforward(Record):
-    inertia: Vector
-    speed: Matrix
-    rate: Matrix | None
-    z_grid: Vector
-    v0: Matrix
-    position: Matrix | None = None
+class Feedforward(Record):
+    """What is added to the forces for a reference."""
+
+    inertia: Vector = entry("mass or moment of inertia of each force", "kg, kg m^2", shape="m")
+    speed: Matrix = entry("forces by rate of each measurement", "N s/m", shape="m x p")
+    rate: Matrix | None = entry("rates of the states by rate of each measurement", shape="n0/2 x p")
+    z_grid: Vector = entry("rising positions of the stroke", "m", shape="g")
+    v0: Matrix = entry("forces that hold the machine at these positions", "N, N m", shape="g x m")
+    position: Matrix | None = entry(
+        "forces by position of the reference", "N/m", shape="m x n0/2", default=None
+    )
 
 
-class _CurrentLoop(Record):
-    Kp: Annotated[Finite, Field(gt=0)]
-    Ki: Annotated[Finite, Field(gt=0)]
-    sample_time: Annotated[Finite, Field(gt=0)]
+class CurrentLoop(Record):
+    """PI controllers of the currents."""
+
+    Kp: Positive = entry("proportional gain", "V/A")
+    Ki: Positive = entry("integral gain", "V/(A s)")
+    sample_time: Positive = entry("sample time of the loop", "s")
 
 
-class _Commutation(Record):
-    lead: Annotated[Finite, Field(gt=0)]
-    pull: Matrix
+class Commutation(Record):
+    """Currents that are commutated for where the machine will be; version 2."""
+
+    lead: Positive = entry("time ahead: currents are for y + lead p*'", "s")
+    pull: Matrix = entry("change of the forces with the position at constant currents", "N/m", shape="m x p")
 
 
-class _Limits(Record):
-    current: Vector | None
-    voltage: Vector | None
-    force: Vector | None
+class Limits(Record):
+    """Largest values, either way."""
+
+    current: Vector | None = entry("of each coil; null: no limit", "A", shape="c")
+    voltage: Vector | None = entry("of each coil; null: no limit", "V", shape="c")
+    force: Vector | None = entry("of each force, which bounds v0 too; null: no limit", "N, N m", shape="m")
 
 
-class _Poles(Record):
-    open_loop: Matrix
-    regulator: Matrix | None
-    filter: Matrix | None
-    closed_loop: Matrix
+class Poles(Record):
+    """Poles as rows [real part, imaginary part]."""
+
+    open_loop: Matrix = entry("of the machine", "rad/s")
+    regulator: Matrix | None = entry("of the regulator; null of a PID", "rad/s")
+    filter: Matrix | None = entry("of the filter; null of a PID", "rad/s")
+    closed_loop: Matrix = entry("of the loop", "rad/s")
 
 
-class _Robust(Record):
-    uncertainty: dict[StrictStr, Finite]
-    lower: Finite | None
-    upper: Finite | None
-    witness: dict[StrictStr, Finite] | None
+class Robust(Record):
+    """The margin over the travel, in multiples of the uncertainty."""
+
+    uncertainty: dict[StrictStr, Finite] = entry("half width of the box by parameter, relative", "1")
+    lower: Finite | None = entry("proven margin; null: nothing proven", "1")
+    upper: Finite | None = entry("margin at which the witness is unstable; null: no witness", "1")
+    witness: dict[StrictStr, Finite] | None = entry("parameters that destabilize, SI; null: none found")
 
 
-class _Verification(Record):
-    poles: _Poles
-    bandwidth: dict[StrictStr, Finite]
-    peak_sensitivity: dict[StrictStr, Finite]
-    robust: _Robust | None
+class Verification(Record):
+    """What `malta verify` found when the file was written."""
+
+    poles: Poles = entry("poles")
+    bandwidth: dict[StrictStr, Finite] = entry("bandwidth by its definition", "rad/s")
+    peak_sensitivity: dict[StrictStr, Finite] = entry("largest |S| by measurement", "1")
+    robust: Robust | None = entry("robust margin; null: none was asked for")
 
 
-class _Provenance(Record):
-    malta: StrictStr
-    python: StrictStr
-    numpy: StrictStr
-    scipy: StrictStr
-    control: StrictStr
-    casadi: StrictStr
+class Provenance(Record):
+    """Versions of what computed the gains."""
+
+    malta: StrictStr = entry("version of malta")
+    python: StrictStr = entry("version of Python")
+    numpy: StrictStr = entry("version of NumPy")
+    scipy: StrictStr = entry("version of SciPy")
+    control: StrictStr = entry("version of python-control")
+    casadi: StrictStr = entry("version of CasADi")
 
 
 class GainFile(Record):
     """The document that a gain file holds."""
 
-    schema_: Annotated[Literal["malta-gains"], Field(alias="schema")]
-    version: StrictInt
-    design: _Design
-    plant: PlantTable
-    operating_point: _OperatingPoint
-    sample_time: Annotated[Finite, Field(gt=0)]
-    law: _Law | None = None
-    signals: _SignalTable
-    model: _Model
-    gains: _Gains
-    cost: _Cost | None
-    noise: _Noise | None
-    feedforward: _Feedforward
-    current_loop: _CurrentLoop | None
-    commutation: _Commutation | None = None
-    limits: _Limits
-    verification: _Verification
-    provenance: _Provenance
-    sha256: StrictStr
+    schema_: Literal["malta-gains"] = entry("kind of the file", alias="schema")
+    version: StrictInt = entry("1; 2 of a file with a table law")
+    design: Design = entry("the design file that the gains come from")
+    plant: PlantTable = entry("the machine that the gains are for")
+    operating_point: OperatingPoint = entry("where the machine was linearized")
+    sample_time: Positive = entry("control period", "s")
+    law: Law | None = entry("what the control law takes; version 2", default=None)
+    signals: SignalTable = entry("names and units, in the order of the matrices")
+    model: Model = entry("the design model")
+    gains: Gains = entry("the gains of the control law")
+    cost: Cost | None = entry("weights of the regulator; null of a PID")
+    noise: Noise | None = entry("variances of the filter; null of a PID")
+    feedforward: Feedforward = entry("what is added to the forces for a reference")
+    current_loop: CurrentLoop | None = entry("PI controllers of the currents; null: currents follow at once")
+    commutation: Commutation | None = entry("commutation ahead; version 2", default=None)
+    limits: Limits = entry("largest values, either way")
+    verification: Verification = entry("poles, bandwidth, peaks and margin")
+    provenance: Provenance = entry("versions of what computed the gains")
+    sha256: StrictStr = entry("sha256 of the rest as compact JSON with sorted keys")

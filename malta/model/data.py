@@ -25,7 +25,7 @@ from malta.files import locate
 from malta.model.checks import check_plant
 from malta.model.machines import file_of, machine, machine_names, name_of
 from malta.model.parameters import check_range
-from malta.tables import Quantity, Record, load_toml, validate
+from malta.tables import Quantity, Record, entry, load_toml, validate
 from malta.units import to_si
 
 if TYPE_CHECKING:
@@ -35,15 +35,23 @@ if TYPE_CHECKING:
 class Sourced(Quantity):
     """A quantity with its source and how far to trust it."""
 
-    tag: Literal["printed", "computed", "assumed"]
-    source: StrictStr
+    tag: Literal["printed", "computed", "assumed"] = entry(
+        "how far to trust it: in the source, from what the source prints, or ours"
+    )
+    source: StrictStr = entry("where the number comes from")
 
 
 class MachineFile(Record):
-    machine: Annotated[StrictStr, Checked(pattern=r"^[^\x00-\x1f]+$")]
-    default_preset: StrictStr = ""
-    parameters: dict[str, Sourced]
-    presets: dict[str, dict[str, Sourced]] = Checked(default_factory=dict)
+    """A data file: the parameters of a machine, each with its unit and its source."""
+
+    machine: Annotated[StrictStr, Checked(pattern=r"^[^\x00-\x1f]+$")] = entry(
+        "name of an installed machine, or the file of its module, as rotor.py"
+    )
+    default_preset: StrictStr = entry("preset that is read where none is named", default="")
+    parameters: dict[str, Sourced] = entry("parameters by name")
+    presets: dict[str, dict[str, Sourced]] = entry(
+        "by name: parameters that replace those of parameters", default={}
+    )
 
 
 def read(path: str | Path, preset: str | None = None) -> Any:
@@ -76,11 +84,11 @@ def read(path: str | Path, preset: str | None = None) -> Any:
     tables = {"parameters": content.parameters} | {f"presets.{k}": v for k, v in presets.items()}
     values: dict[str, float] = {}
     for table, entries in tables.items():  # every preset is checked, the chosen one is used
-        for key, entry in entries.items():
+        for key, given in entries.items():
             if key not in known:
                 raise InputError(path, f"{table}.{key}", "an unknown parameter", ", ".join(known))
             unit = known[key].metadata["unit"]
-            value = to_si(entry.value, entry.unit, unit, path, f"{table}.{key}")
+            value = to_si(given.value, given.unit, unit, path, f"{table}.{key}")
             check_range(known[key], value, path, f"{table}.{key}")
             if table in ("parameters", f"presets.{name}"):
                 values[key] = value

@@ -1,55 +1,47 @@
 """JSON schemas of the files that malta reads, made of the tables that the readers check with.
 
-    malta.schemas.schema("gain")      a gain file (.json, and what .npz and .mat hold)
-    malta.schemas.schema("design")    a design file (.toml)
-    malta.schemas.schema("data")      a machine's data file (.toml)
+    malta.schemas.schema("gain")            a gain file: .json, and what .npz and .mat hold
+    malta.schemas.schema("design")          a design file, as TOML holds it
+    malta.schemas.schema("data")            a machine's data file
+    malta.schemas.schema("design", plant)   with the names of this machine's signals, parameters and requirements
 
-An editor that knows the schema of a file completes its keys and underlines what the reader would refuse. A schema sees
-one file: what depends on the machine (names of signals and parameters, dimensions, whether a loop is stable) the
-reader checks alone.
+An editor that has the schema of a file completes its keys and marks what the reader would refuse. A schema sees one
+file: what depends on other files or on arithmetic (dimensions of units, shapes of matrices, stability) the reader
+checks alone.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING
 
 from malta.errors import InputError
-from malta.gains.schema import GainFile
-from malta.model.data import MachineFile
-from malta.synthesis.design_tables import DesignFile
+from malta.schemas.files import data_schema, design_schema, gain_schema
+from malta.schemas.parts import Schema as Schema
 
-DRAFT = "https://json-schema.org/draft/2020-12/schema"
-Schema = dict[str, Any]
-
-
-def gain_schema() -> Schema:
-    """The schema of a gain file."""
-    return {"$schema": DRAFT} | GainFile.model_json_schema()
-
-
-def design_schema() -> Schema:
-    """The schema of a design file."""
-    return {"$schema": DRAFT} | DesignFile.model_json_schema()
-
-
-def data_schema() -> Schema:
-    """The schema of a machine's data file."""
-    return {"$schema": DRAFT} | MachineFile.model_json_schema()
-
+if TYPE_CHECKING:
+    from malta.model.plant import Plant
 
 SCHEMAS: dict[str, Callable[[], Schema]] = {"gain": gain_schema, "design": design_schema, "data": data_schema}
+OF_MACHINES: dict[str, Callable[[Plant], Schema]] = {"design": design_schema, "data": data_schema}
 
 
-def schema(name: str) -> Schema:
-    """Return the JSON schema (draft 2020-12) of a kind of file: "gain", "design" or "data".
+def schema(name: str, plant: Plant | None = None) -> Schema:
+    """Return the JSON schema (draft 2020-12) of a kind of file.
 
-    Raises InputError for an unknown name.
+    name : "gain", "design" or "data"
+    plant : the machine whose names a design file or a data file may have; None: any names
+
+    Raises InputError for an unknown name, and for a machine where the schema is the same for all machines.
 
     >>> import malta
     >>> malta.schemas.schema("data")["required"]
     ['machine', 'parameters']
+    >>> plant = malta.plant_of(malta.read("data/halbach.toml"))
+    >>> sorted(malta.schemas.schema("design", plant)["$defs"]["WeightsTable"]["properties"]["input"]["properties"])
+    ['F_x']
     """
-    if name not in SCHEMAS:
-        raise InputError("schema", "", repr(name), "one of " + ", ".join(SCHEMAS))
-    return SCHEMAS[name]()
+    known = SCHEMAS if plant is None else OF_MACHINES
+    if name not in known:
+        raise InputError("schema", "name", repr(name), "one of " + ", ".join(known))
+    return SCHEMAS[name]() if plant is None else OF_MACHINES[name](plant)

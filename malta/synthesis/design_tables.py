@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, StrictBool, StrictInt, StrictStr, create_model
 
 from malta.synthesis.recovery import RecoveryTable
 from malta.synthesis.requirements import Requirement
 from malta.synthesis.spec import Coordinates, Discretization, PidAxes, Place
-from malta.tables import Finite, Quantity, Record, validate
+from malta.tables import Finite, Positive, Quantity, Record, entry, validate
 
 
 def _table_or_SI(value: Any) -> Any:
@@ -20,94 +20,122 @@ def _table_or_SI(value: Any) -> Any:
     return None if value == "SI" else value
 
 
-_Bases = Annotated[dict[StrictStr, Quantity] | None, BeforeValidator(_table_or_SI)]
+Bases = Annotated[
+    dict[StrictStr, Quantity] | None,
+    BeforeValidator(_table_or_SI, json_schema_input_type=dict[StrictStr, Quantity] | Literal["SI"]),
+]
 
 
 class WeightsTable(Record):
     """[weights]: dimensionless, by the names of states, inputs and outputs."""
 
-    state: dict[StrictStr, Finite]
-    input: dict[StrictStr, Finite]
-    integral: dict[StrictStr, Finite]
+    state: dict[StrictStr, Finite] = entry("by state, at least 0", "1")
+    input: dict[StrictStr, Finite] = entry("by input, above 0", "1")
+    integral: dict[StrictStr, Finite] = entry("by output, or by position, at least 0", "1")
 
 
 class BasesTable(Record):
     """[bases]: what a weight of 1 is worth, or "SI" for one SI unit each."""
 
-    state: _Bases
-    input: _Bases
-    integral: _Bases
+    state: Bases = entry("by state")
+    input: Bases = entry("by input")
+    integral: Bases = entry("by output, or by position, times s")
 
 
 class NoiseTable(Record):
     """[noise]: of one sample, as standard deviations or variances; correlations of positions with accelerations."""
 
-    process: dict[StrictStr, Quantity]
-    correlation: dict[StrictStr, Annotated[Finite, Field(gt=-1, lt=1)]] | None = None
-    sensor: dict[StrictStr, Quantity]
-    drift: dict[StrictStr, Quantity] | None = None
+    process: dict[StrictStr, Quantity] = entry("by input, a force; or by position, an acceleration")
+    correlation: dict[StrictStr, Annotated[Finite, Field(gt=-1, lt=1)]] | None = entry(
+        "by position, of its noise with the acceleration before", "1", default=None
+    )
+    sensor: dict[StrictStr, Quantity] = entry("by output")
+    drift: dict[StrictStr, Quantity] | None = entry(
+        "by input or by position: how far a constant disturbance goes in a sample; the filter observes it",
+        default=None,
+    )
 
 
 class PidTable(Record):
     """[pid]: gains by axis, and the time constant of the measured rates: one of all, or one of each axis."""
 
-    axes: PidAxes | None = None
-    Kp: dict[StrictStr, Quantity]
-    Ki: dict[StrictStr, Quantity]
-    Kd: dict[StrictStr, Quantity]
-    filter: Quantity | None = None
-    filters: dict[StrictStr, Quantity] | None = None
+    axes: PidAxes | None = entry("what an axis is; without it, an output with its input", default=None)
+    Kp: dict[StrictStr, Quantity] = entry("proportional gains, by input")
+    Ki: dict[StrictStr, Quantity] = entry("integral gains, by input")
+    Kd: dict[StrictStr, Quantity] = entry("derivative gains, by input")
+    filter: Quantity | None = entry("time constant of all measured rates; this or filters", default=None)
+    filters: dict[StrictStr, Quantity] | None = entry("time constants by input; this or filter", default=None)
 
 
 class CostTable(Record):
     """[cost]: the loads that a PID is judged by."""
 
-    load: dict[StrictStr, Quantity]
-    force_noise: dict[StrictStr, Quantity] | None = None
-    sensor_noise: dict[StrictStr, Quantity] | None = None
+    load: dict[StrictStr, Quantity] = entry("constant force on each input, one at a time")
+    force_noise: dict[StrictStr, Quantity] | None = entry("rms by input; without it, none", default=None)
+    sensor_noise: dict[StrictStr, Quantity] | None = entry(
+        "rms by output; without it, that of the machine", default=None
+    )
 
 
 class Range(Record):
     """An entry of [search.numbers]: one number, and the entries of the file that share it."""
 
-    vary: Annotated[list[StrictStr], Field(min_length=1)]
-    low: Annotated[Finite, Field(gt=0)]
-    high: Annotated[Finite, Field(gt=0)]
-    unit: StrictStr = "1"
+    vary: Annotated[list[StrictStr], Field(min_length=1)] = entry('entries of the file, as "bases.state.x"')
+    low: Positive = entry("smallest value, in the unit beside it")
+    high: Positive = entry("largest value")
+    unit: StrictStr = entry("unit of low and high", default="1")
+
+
+Delay = Annotated[StrictInt, Field(ge=0, le=10)]
 
 
 class SearchTable(Record):
     """[search]: what `malta tune` may vary."""
 
-    delay: list[Annotated[StrictInt, Field(ge=0, le=10)]] = Field(default_factory=list)
-    numbers: dict[StrictStr, Range]
+    delay: list[Delay] = entry("delays to choose from; without it, that of the design", "samples", default=[])
+    numbers: dict[StrictStr, Range] = entry("numbers by a name of your choice")
 
 
 class DesignFile(Record):
     """A design file; [specification] is checked once the machine is known, see `specification_table`."""
 
-    name: Annotated[StrictStr, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")]
-    summary: StrictStr
-    machine: StrictStr
-    preset: StrictStr
-    sample_time: Quantity
-    discretization: Discretization = "sampled-data"
-    delay: Annotated[StrictInt, Field(ge=0, le=10)] = 0
-    current_loop_delay: StrictBool
-    current_lag: StrictBool = False
-    coordinates: Coordinates = "signals"
-    position_feedforward: StrictBool = False
-    pause: dict[StrictStr, Quantity] | None = None
-    commutation: Place = "measured"
-    operating_point: dict[StrictStr, Quantity]
-    weights: WeightsTable | None = None
-    bases: BasesTable | None = None
-    noise: NoiseTable | None = None
-    pid: PidTable | None = None
-    uncertainty: dict[StrictStr, Annotated[Finite, Field(gt=0, lt=1)]]
-    cost: CostTable | None = None
-    specification: dict[StrictStr, Any] | None = None
-    search: SearchTable | None = None
+    name: Annotated[StrictStr, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")] = entry(
+        "name of the design and of its gain files"
+    )
+    summary: StrictStr = entry("one sentence on the design")
+    machine: StrictStr = entry("path of the machine's data file, from this file")
+    preset: StrictStr = entry('preset of the data file; "data" where it has none')
+    sample_time: Quantity = entry("control period, a time")
+    discretization: Discretization = entry("of the design model; of an LQG", default="sampled-data")
+    delay: Delay = entry("between measurement and force in the design model; of an LQG", "samples", default=0)
+    current_loop_delay: StrictBool = entry("whether current loops are designed with the machine's dead time")
+    current_lag: StrictBool = entry(
+        "whether the lag of the current loops is in the design model", default=False
+    )
+    coordinates: Coordinates = entry(
+        "of integrals and process noise: outputs and inputs, or positions and accelerations",
+        default="signals",
+    )
+    position_feedforward: StrictBool = entry(
+        "whether the forces that hold the machine at its reference are fed forward", default=False
+    )
+    pause: dict[StrictStr, Quantity] | None = entry(
+        "by output: rate of the reference above which the sum of its errors waits", default=None
+    )
+    commutation: Place = entry("position for which currents are commutated", default="measured")
+    operating_point: dict[StrictStr, Quantity] = entry("of the stroke; an empty table without one")
+    weights: WeightsTable | None = entry("weights of an LQG", default=None)
+    bases: BasesTable | None = entry("what a weight of 1 is worth", default=None)
+    noise: NoiseTable | None = entry("noise of one sample that the filter expects", default=None)
+    pid: PidTable | None = entry("gains of a PID, in place of weights, bases and noise", default=None)
+    uncertainty: dict[StrictStr, Annotated[Finite, Field(gt=0, lt=1)]] = entry(
+        "by parameter: half width of the box of the margin, relative", "1"
+    )
+    cost: CostTable | None = entry("loads that a PID is judged by", default=None)
+    specification: dict[StrictStr, Any] | None = entry(
+        "requirements by name, which `malta tune` is to reach and `malta tune --check` measures", default=None
+    )
+    search: SearchTable | None = entry("what `malta tune` may vary", default=None)
 
 
 def specification_table(requirements: Iterable[Requirement], given: Mapping[str, Any], path: Path) -> Record:
@@ -115,12 +143,22 @@ def specification_table(requirements: Iterable[Requirement], given: Mapping[str,
 
     Raises InputError for an unknown key, another kind of value, or a number out of range.
     """
-    keys: dict[str, Any] = {r.name: (_kind(r) | None, None) for r in requirements}
-    table = create_model("Specification", __base__=Record, **keys)
-    whole = create_model("DesignFile", __base__=Record, specification=(table, ...))
+    whole = create_model(
+        "DesignFile", __base__=Record, specification=(specification_record(requirements), ...)
+    )
     checked: Any = validate(whole, {"specification": given}, path)
     found: Record = checked.specification
     return found
+
+
+def specification_record(requirements: Iterable[Requirement]) -> type[Record]:
+    """Make the table [specification] of some requirements: one optional key for each."""
+    keys: dict[str, Any] = {r.name: (_kind(r) | None, None) for r in requirements}
+    return create_model("Specification", __base__=Record, **keys)
+
+
+# What may stand behind the key of a requirement whose machine is not known.
+AnyBound = StrictBool | Positive | Quantity | dict[StrictStr, Quantity] | dict[StrictStr, RecoveryTable]
 
 
 def _kind(requirement: Requirement) -> Any:

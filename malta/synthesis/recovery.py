@@ -27,7 +27,7 @@ from pydantic import Field, StrictStr
 
 from malta.errors import InputError
 from malta.synthesis.quantities import positive
-from malta.tables import Quantity, Record
+from malta.tables import Quantity, Record, entry
 from malta.units import to_si
 
 if TYPE_CHECKING:
@@ -37,23 +37,28 @@ if TYPE_CHECKING:
 class LeftTable(Quantity):
     """An entry of `left`: a bound, and from when on it holds."""
 
-    after: Quantity
+    after: Quantity = entry("time after which the bound holds")
 
 
 class BoundsTable(Record):
     """[specification.recovery.NAME.anywhere]: bounds of the deviation."""
 
-    largest: Quantity | None = None
-    left: list[LeftTable] = Field(default_factory=list)
+    largest: Quantity | None = entry("largest deviation", default=None)
+    left: list[LeftTable] = entry("deviations that are left after some time", default=[])
 
 
 class RecoveryTable(BoundsTable):
     """[specification.recovery.NAME]: a load, and what it may do."""
 
-    load: Annotated[dict[StrictStr, Quantity], Field(min_length=1)] | None = None
-    load_slope: dict[StrictStr, Quantity] = Field(default_factory=dict)
-    outputs: Annotated[list[StrictStr], Field(min_length=1)] | None = None
-    anywhere: BoundsTable | None = None
+    load: Annotated[dict[StrictStr, Quantity], Field(min_length=1)] | None = entry(
+        "forces and torques by disturbance; without it, 1 of the disturbance that the table is named after",
+        default=None,
+    )
+    load_slope: dict[StrictStr, Quantity] = entry("change of the load along the stroke", default={})
+    outputs: Annotated[list[StrictStr], Field(min_length=1)] | None = entry(
+        "outputs that are bounded; without it, all of the unit", default=None
+    )
+    anywhere: BoundsTable | None = entry("bounds anywhere in the travel", default=None)
 
 
 @dataclass(frozen=True)

@@ -39,7 +39,7 @@ def gain_document(name: str) -> dict[str, Any]:
     return malta.gains.document(controller, malta.verify(model, controller))
 
 
-def _signed(document: Any) -> Any:
+def signed(document: Any) -> Any:
     """A document with the sha256 of what its reader makes of it."""
     if not isinstance(document, dict):
         return document
@@ -85,7 +85,7 @@ def read_gain_file(case: Case, folder: Path, suffix: str) -> Ended | None:
     document = edited(gain_document(case.base), case.edits)
     path = folder / f"mine{suffix}"
     try:
-        path.write_bytes(_FORMS[suffix](_signed(document) if case.sealed else document, case))
+        path.write_bytes(_FORMS[suffix](signed(document) if case.sealed else document, case))
     except Exception:  # numpy and scipy do not write every document
         return None
     ended = observe(lambda: malta.gains.read(path), folder, [str(path)])
@@ -106,7 +106,7 @@ def read_shares_of(case: Case, folder: Path) -> Ended | None:
     """Read the spread of a campaign from a gain file."""
     path = folder / "mine.json"
     document = edited(gain_document(case.base), case.edits)
-    path.write_bytes(_gain_json(_signed(document), case))
+    path.write_bytes(_gain_json(signed(document), case))
     read = observe(lambda: malta.gains.read(path), folder, [str(path)])
     return observe(lambda: box_of(path), folder, [str(path)]) if read.code == 0 else read
 
@@ -115,5 +115,5 @@ def show_scenarios(case: Case, folder: Path) -> Ended | None:
     """`malta simulate FILE --scenario help`, which reads a gain file as every command does."""
     path = folder / "mine.json"
     document = edited(gain_document(case.base), case.edits)
-    path.write_bytes(_gain_json(_signed(document), case))
+    path.write_bytes(_gain_json(signed(document), case))
     return observe(line("simulate", str(path), "--scenario", "help"), folder, [str(path)])

@@ -1,0 +1,125 @@
+"""The schemas of gain files, design files and data files, from the tables that their readers check with."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from pydantic import StrictStr, create_model
+
+from malta.gains.schema import GainFile
+from malta.model.data import MachineFile
+from malta.model.parameters import units_of
+from malta.schemas.parts import Schema, changed, named, schema_of, without_null
+from malta.synthesis.design_file import LQG, ONLY_LQG
+from malta.synthesis.design_tables import AnyBound, DesignFile, specification_record
+from malta.synthesis.requirements import requirements_for
+
+if TYPE_CHECKING:
+    from malta.model.plant import Plant
+
+PUBLISHED: Schema = {
+    "type": "object",
+    "description": "what the machine's paper prints under a name of its published figures",
+    "properties": {"published": {"description": 'dotted name, as "table_II.state"'}},
+    "required": ["published"],
+    "additionalProperties": False,
+}
+
+
+def gain_schema() -> Schema:
+    """Make the schema of a gain file; that of its tables in .npz and .mat is the same."""
+    versions = {
+        "if": {"required": ["law"]},
+        "then": {"properties": {"version": {"const": 2}}},
+        "else": {
+            "properties": {
+                "version": {"const": 1},
+                "commutation": {"type": "null"},
+                "plant": {"properties": {"linear": {"type": "null"}}},
+            }
+        },
+    }
+    return schema_of(GainFile, "malta gain file") | versions
+
+
+def design_schema(plant: Plant | None = None) -> Schema:
+    """Make the schema of a design file.
+
+    plant : the machine whose signals, parameters and requirements the file names; None: any names
+    """
+    bounds: Any = dict[StrictStr, AnyBound]
+    if plant is not None:
+        bounds = specification_record(requirements_for(plant).values())
+    known = DesignFile.model_fields["specification"]
+    model = create_model("DesignFile", __base__=DesignFile, specification=(bounds | None, known))
+    schema = changed(schema_of(model, "malta design file"), without_null)
+    if plant is not None:
+        _name_signals(schema, plant)
+    schema = changed(schema, _or_published)
+    schema["$defs"]["Published"] = PUBLISHED
+    schema["properties"]["machine"]["anyOf"].pop()  # the path is read before anything is looked up
+    laws = {
+        "if": {"required": ["pid"]},
+        "then": {"properties": dict.fromkeys(ONLY_LQG, False)},
+        "else": {"required": list(LQG)},
+    }
+    return schema | laws
+
+
+def data_schema(plant: Plant | None = None) -> Schema:
+    """Make the schema of a data file.
+
+    plant : the machine whose parameters the file names; None: any names
+    """
+    schema = changed(schema_of(MachineFile, "malta data file"), without_null)
+    if plant is not None:
+        units = units_of(plant.parameters)
+        entries = {name: {"$ref": "#/$defs/Sourced", "unit": unit} for name, unit in units.items()}
+        table = {"type": "object", "properties": entries, "additionalProperties": False}
+        schema["properties"]["parameters"] |= table
+        schema["properties"]["presets"]["additionalProperties"] = table
+    return schema
+
+
+def _name_signals(schema: Schema, plant: Plant) -> None:
+    """Put the names of a machine in the place of free keys; tables of signals that every law has are complete."""
+    states, inputs, outputs = (
+        [s.name for s in signals] for signals in (plant.design_states, plant.inputs, plant.outputs)
+    )
+    positions = states[: plant.coordinates]
+    integrals, axes = [*outputs, *positions], [*inputs, *positions]
+    complete = {"state": states, "input": inputs, "sensor": outputs}
+    some = {
+        "WeightsTable": {"integral": integrals},
+        "BasesTable": {"integral": integrals},
+        "NoiseTable": dict.fromkeys(("process", "drift"), axes) | {"correlation": positions},
+        "PidTable": dict.fromkeys(("Kp", "Ki", "Kd", "filters"), axes),
+        "CostTable": {"load": inputs, "force_noise": inputs, "sensor_noise": outputs},
+    }
+    for table, partial in some.items():
+        properties = schema["$defs"][table]["properties"]
+        for key, allowed in (complete | partial).items():
+            if key in properties:
+                properties[key] = named(properties[key], allowed, all_of=key in complete)
+    whole = schema["properties"]
+    whole["operating_point"] = named(whole["operating_point"], [plant.stroke] if plant.has_stroke else [])
+    whole["pause"] = named(whole["pause"], outputs)
+    whole["uncertainty"] = named(whole["uncertainty"], units_of(plant.parameters))
+
+
+def _or_published(node: Schema) -> Schema:
+    """Allow a reference to a published figure for each entry of a table; those of lists are not looked up."""
+    node = dict(node)
+    if "properties" in node:
+        node["properties"] = {name: _alternative(inner) for name, inner in node["properties"].items()}
+    if isinstance(node.get("additionalProperties"), dict):
+        node["additionalProperties"] = _alternative(node["additionalProperties"])
+    return node
+
+
+def _alternative(node: Schema) -> Schema:
+    """A schema, or a reference to a published figure in its place; what is said of it stands beside both."""
+    said = {key: node[key] for key in ("description", "unit", "default") if key in node}
+    bare = {key: value for key, value in node.items() if key not in said}
+    kinds = bare["anyOf"] if list(bare) == ["anyOf"] else [bare]
+    return said | {"anyOf": [*kinds, {"$ref": "#/$defs/Published"}]}
