@@ -29,9 +29,20 @@ def shorten(text: str, most: int = LONGEST, *, head: float = 0.75) -> str:
 class InputError(ValueError):
     """Input that cannot be used: one sentence with file, field, what was found and what was expected.
 
-    The sentence has at most LONGEST characters: what is longer is cut in its middle.
+    The sentence has at most 300 characters: what is longer is cut in its middle. The command line prints it without a
+    traceback and exits with code 2.
 
-    The command line prints it without a traceback and exits with code 2.
+    where : the file, or the function
+    field : the entry or the argument
+    found : what stands there
+    expected : what should
+
+    >>> import malta
+    >>> try:
+    ...     malta.read("data/tubular.toml", preset="table9")
+    ... except malta.InputError as error:
+    ...     print(error.field, error.found, sep=": ")
+    presets: no preset 'table9'
     """
 
     def __init__(self, where: str | Path, field: str, found: str, expected: str) -> None:
@@ -48,5 +59,13 @@ class InputError(ValueError):
 class CheckError(ArithmeticError):
     """A result that failed its own check (residual, stability, symmetry); nothing is written then.
 
-    The command line prints it and exits with code 1.
+    The command line prints its sentence and exits with code 1.
+
+    >>> import malta
+    >>> cart = malta.linear_machine([[0, 1], [0, 0]], [[0], [0]], [[1, 0]])  # no force on it
+    >>> try:
+    ...     malta.lqr(malta.linearize(cart, cart.at()), malta.weights([1, 1], [1], [1], [1]))
+    ... except malta.CheckError as error:
+    ...     print(str(error).partition(" (")[0])
+    LQR: no stabilizing solution
     """

@@ -110,9 +110,17 @@ def to_si(value: float, unit: str, si_unit: str, where: str | Path, name: str) -
 
 
 def in_unit(value: float, unit: str) -> float:
-    """Convert an SI value to `unit`. Raises InputError for an unknown unit.
+    """Convert an SI value to a unit of choice.
 
-    >>> round(in_unit(16.2e-3, "ms"), 9)
+    value : in SI
+    unit : products of names with powers, as "um", "kg m^2", "N s/m" or "m / (s * A)"
+
+    Returns the value in this unit.
+
+    Raises InputError for an unknown unit.
+
+    >>> import malta
+    >>> round(malta.in_unit(16.2e-3, "ms"), 9)
     16.2
     """
     return value / unit_factor(unit, "unit")

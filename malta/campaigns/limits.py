@@ -52,13 +52,26 @@ class Limit:
 
 
 def limit_of(plan: Plan, name: str, bound: float | None = None, bounds: Bounds = UNBOUNDED) -> Limit:
-    """The limit of a name: one of EVENTS, or a figure of merit with its bound in SI.
+    """Make the limit that a run of a plan must not exceed, from its name.
+
+    A run of severity 1 or more exceeds the limit, and so does every run that was not completed.
+
+    plan : the campaign's plan
+    name : "touchdown", "published" or "specification", or a figure of merit of the scenario, as "deviation-y"
+    bound : of a figure of merit, above 0, in SI; None for the three events
+    bounds : published figures and the design whose [specification] counts, for these two events
+
+    Returns a Limit: its name, what exceeds it in words, and the severity of each run of a batch.
 
     Raises InputError for an unknown name, a bound that is missing, needless or not above 0, and for a limit that this
     machine or this scenario does not have.
 
-        touchdown = malta.limit_of(plan, "touchdown")
-        far = malta.limit_of(plan, "deviation-y1", 20e-6)
+    >>> import malta
+    >>> spec = malta.read_design("examples/ball/design/ball.toml")
+    >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
+    >>> plan = malta.Plan(controller, "disturbance", spread={"m": 0.2}, options={"duration": 0.1})
+    >>> malta.limit_of(plan, "deviation-y", 50e-6).text
+    'deviation y above 50 um or an earlier end'
     """
     key = slug(name)
     if key in EVENTS:

@@ -46,26 +46,45 @@ DRAWING = (
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """The plan of a campaign: controller, scenario, and the box from which the machines are drawn.
+    """The plan of a campaign: a controller, a scenario, and the box from which the machines are drawn.
 
-    Values are uniform in the box. Twins, parameters that a machine declares equal (I_xx and I_yy), stay equal. The
-    spread of a difference or an offset (`differences`, as dK_A) is in its own unit, SI.
+    Values are uniform in the box. Twins, parameters that a machine declares equal (I_xx and I_yy), stay equal. Plans
+    with equal manifests have equal runs, on any number of workers.
+
+    controller : the controller of all runs
+    scenario : an experiment that the machine has for campaigns, as "stroke", "hold" or "disturbance"
+    spread : half width of the box by parameter, as a share of the value in the middle (0.1: +-10 %); of a
+        difference or an offset, as dK_A, in its own SI unit
+    sensor_spread : half width by error of a sensor, SI
+    samples : number of runs
+    seed : of the machines and of the noise
+    sampler : "latin-hypercube" or "sobol" (scrambled)
+    parameters : of the machine in the middle of the box; None: those that the controller was designed for
+    case : label of one of the scenario's cases; None: the first
+    options : of the scenario, SI, as {"duration": 0.1}; noise is 1 (sensors as built) unless it is given
+    law : "own", or "c" and "c-float": the exported C flies, in double or single precision
 
     Raises InputError for an unknown scenario, case, option, parameter or error of a sensor, for a spread outside 0 to
     1, and for a scenario that changes the machine on the way.
+
+    >>> import malta
+    >>> controller = malta.gains.read("design/gains/calibrated.json")
+    >>> plan = malta.Plan(controller, spread={"m": 0.1, "K_A": 0.05}, samples=200, seed=1)
+    >>> plan.scenario, dict(plan.options), plan.plant.name
+    ('stroke', {'noise': 1.0}, 'tubular')
     """
 
     controller: Controller
-    scenario: str = "stroke"  # an experiment of the machine's CASES, see simulation/catalogue.py
-    spread: Mapping[str, float] = field(default_factory=dict)  # parameter -> share or SI, to either side
-    sensor_spread: Mapping[str, float] = field(default_factory=dict)  # error -> SI, to either side
+    scenario: str = "stroke"
+    spread: Mapping[str, float] = field(default_factory=dict)
+    sensor_spread: Mapping[str, float] = field(default_factory=dict)
     samples: int = 10_000
-    seed: int = 0  # of the machines and of the noise
+    seed: int = 0
     sampler: Sampler = "latin-hypercube"
-    parameters: Any = None  # of the machine in the middle of the box; None: those of the gain file
-    case: str | None = None  # label of one of the scenario's cases; None: the first
-    options: Mapping[str, Any] = field(default_factory=dict)  # of the scenario, SI; noise: 1 by default
-    law: Law = "own"  # "c", "c-float": the exported C flies, one machine after the other
+    parameters: Any = None
+    case: str | None = None
+    options: Mapping[str, Any] = field(default_factory=dict)
+    law: Law = "own"
 
     def __post_init__(self) -> None:
         machine = self.controller.parameters if self.parameters is None else self.parameters

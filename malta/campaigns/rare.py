@@ -79,12 +79,28 @@ def rare_event(
 ) -> RareEvent:
     """Estimate the probability that a run of a plan exceeds a limit, by subset simulation.
 
-    plan.samples is the number of runs in each level, plan.seed decides machines and noise, plan.sampler does not count.
+    Each level runs plan.samples machines, of which those beyond the level's threshold begin the chains of the next.
+    plan.seed decides machines and noise; plan.sampler does not count. Source: S. K. Au and J. L. Beck, Probabilistic
+    Engineering Mechanics 16 (2001) 263-277.
 
-    Raises InputError where nothing is random, and as `subset_simulation` does.
+    plan : the plan of the runs
+    limit : from `malta.limit_of`
+    workers : threads; None: one for each core
+    progress : called with the share of the work that is done, 0 to 1
 
-        plan = malta.Plan(malta.gains.read("design/gains/table2.json"), spread={"m": 0.05}, samples=2000)
-        print(malta.rare_event(plan, malta.limit_of(plan, "touchdown")).found.probability)
+    Returns a RareEvent: `found.probability` with its interval, and the failed run nearest the middle of the box.
+
+    Raises InputError where nothing is random, and for numbers of samples that no level can be made of.
+
+    >>> import malta
+    >>> spec = malta.read_design("examples/ball/design/ball.toml")
+    >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
+    >>> plan = malta.Plan(controller, "disturbance", {"m": 0.2}, samples=100, options={"duration": 0.02})
+    >>> event = malta.rare_event(plan, malta.limit_of(plan, "deviation-y", 40e-6), workers=1)
+    >>> 1e-4 < event.found.probability < 1
+    True
+    >>> f"{len(event.found.levels)} level(s), {event.found.simulated} runs"
+    '1 level(s), 100 runs'
     """
     noisy = planned_run(plan).scenario.noise > 0
     dimensions = len(varying_columns(plan))

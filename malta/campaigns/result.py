@@ -27,16 +27,34 @@ CONFIDENCE = 0.95  # of the interval about a share
 
 @dataclass(frozen=True, eq=False)
 class Campaign:
-    """The result of a campaign: a row for each run that was simulated. SI."""
+    """The result of a campaign: a row of figures for each run that was simulated. SI.
+
+    plan : the plan of the campaign
+    index : number of each run in the plan
+    names : of the values that vary: parameters, then errors of the sensors
+    values : the values that vary, runs x names, SI
+    batch : figures of the runs, see `malta.Batch`
+    engines : which simulated them: "compiled" or "virtual machine"
+    interrupted : whether Ctrl-C ended the campaign; it has the runs of the blocks before
+    damaged : files of blocks that could not be read; their runs were simulated again
+    folder : where the blocks are stored; None: nowhere
+
+    >>> import malta
+    >>> controller = malta.gains.read("design/gains/calibrated.json")
+    >>> plan = malta.Plan(controller, "hold", {"m": 0.1}, samples=5, options={"duration": 0.01})
+    >>> found = malta.campaign(plan, workers=1)
+    >>> found.names, found.values.shape, found.ends
+    (('m',), (5, 1), {'completed': 5})
+    """
 
     plan: Plan
-    index: NDArray[np.int64]  # of each run
-    names: tuple[str, ...]  # of the values that vary: parameters, then errors of the sensors
-    values: FloatArray  # runs x names, SI
+    index: NDArray[np.int64]
+    names: tuple[str, ...]
+    values: FloatArray
     batch: Batch
-    engines: tuple[str, ...]  # that simulated them: "compiled" or "virtual machine"
-    interrupted: bool = False  # Ctrl-C ended the campaign: it has the runs of the blocks before
-    damaged: tuple[Path, ...] = ()  # files of blocks that could not be read; their runs were simulated again
+    engines: tuple[str, ...]
+    interrupted: bool = False
+    damaged: tuple[Path, ...] = ()
     folder: Path | None = None
 
     @property

@@ -58,14 +58,33 @@ class Sensitivity:
 def sensitivity(
     plan: Plan, limit: Limit, *, workers: int | None = None, progress: Progress | None = None
 ) -> Sensitivity:
-    """The Sobol indices over a plan's box, from Saltelli's design: at most plan.samples runs, n (factors + 2).
+    """Attribute the variance of a campaign's yield and figures to the parameters: Sobol indices by Saltelli's design.
 
-    n is a power of two; plan.seed decides machines and noise, plan.sampler does not count.
+        first-order index   Var(E[Y | x_i]) / Var(Y)
+        total index         E[Var(Y | x_not i)] / Var(Y)
+
+    The design takes n (factors + 2) runs, n the largest power of two with which they are at most plan.samples.
+    plan.seed decides machines and noise; plan.sampler does not count. SALib, an extra, draws and evaluates. Source:
+    A. Saltelli et al., Computer Physics Communications 181 (2010) 259-270.
+
+    plan : the plan of the runs
+    limit : from `malta.limit_of`; a run within it counts for the yield
+    workers : threads; None: one for each core
+    progress : called with the share of the runs that is done, 0 to 1
+
+    Returns a Sensitivity: indices with 95 % intervals by factor, of the yield and of each figure of merit.
 
     Raises InputError where SALib is not installed, for a box in which nothing varies, and for too few samples.
 
-        plan = malta.Plan(malta.gains.read("design/gains/robust.json"), spread={"m": 0.2, "K_A": 0.2}, samples=4096)
-        print(malta.sensitivity(plan, malta.limit_of(plan, "touchdown")).of_merits["deviation y1"])
+    >>> import malta
+    >>> spec = malta.read_design("examples/ball/design/ball.toml")
+    >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
+    >>> box, options = {"m": 0.2, "C": 0.2}, {"duration": 0.02, "noise": 0.0}
+    >>> plan = malta.Plan(controller, "disturbance", box, samples=64, options=options)
+    >>> found = malta.sensitivity(plan, malta.limit_of(plan, "touchdown"), workers=1)
+    >>> mass, constant = found.of_merits["deviation y"]
+    >>> found.factors, constant.total > mass.total  # the magnets matter more than the mass
+    (('m', 'C'), True)
     """
     sampling, analysis = _salib()
     names = [varied_names(plan)[k] for k in varying_columns(plan)]

@@ -91,22 +91,42 @@ class Merit:
 
 @dataclass(frozen=True, eq=False)
 class Summary:
-    """What a campaign found, without its runs."""
+    """What a campaign found, without its runs: counts, yields, percentiles and the worst runs. SI.
+
+    plan : the plan of the campaign
+    bounds : published figures and the design whose bounds are counted
+    runs : number of runs
+    verdicts : number of runs with each verdict
+    within : runs that were completed within every published bound; None where the paper has none
+    specified : runs that were completed within [specification]; None where it has no bounds for them
+    engines : which simulated them: "compiled" or "virtual machine"
+    listed : distributions of the figures of merit; those of a stroke also where there is none
+    bands : numbers of runs, names x ways to end x bins over the box
+    kept : the runs among which the worst are, ascending
+    interrupted : whether Ctrl-C ended the campaign; the summary is of the blocks before
+    damaged : files of blocks that could not be read; their runs were simulated again
+    folder : where the blocks are stored; None: nowhere
+
+    >>> import malta
+    >>> controller = malta.gains.read("design/gains/calibrated.json")
+    >>> plan = malta.Plan(controller, "hold", {"m": 0.1}, samples=5, options={"duration": 0.01})
+    >>> found = malta.summarize(plan, workers=1)
+    >>> found.runs, found.ends, [merit.label for merit in found.merits][:2]
+    (5, {'completed': 5}, ['deviation of z', 'deviation x1'])
+    """
 
     plan: Plan
     bounds: Bounds
     runs: int
-    verdicts: IntArray  # number of runs with each verdict
-    within: int | None  # runs that were completed within every published bound; None where the paper has none
-    specified: (
-        int | None
-    )  # runs that were completed within [specification]; None where it has no bounds for them
-    engines: tuple[str, ...]  # that simulated them: "compiled" or "virtual machine"
-    listed: tuple[Merit, ...]  # those of a stroke also where there is none
-    bands: IntArray  # names x ways to end x bins over the box; the ways are those of `ways_to_end`
-    kept: Runs  # among which the worst runs are, ascending
-    interrupted: bool = False  # Ctrl-C ended the campaign: the summary is of the blocks before
-    damaged: tuple[Path, ...] = ()  # files of blocks that could not be read; their runs were simulated again
+    verdicts: IntArray
+    within: int | None
+    specified: int | None
+    engines: tuple[str, ...]
+    listed: tuple[Merit, ...]
+    bands: IntArray
+    kept: Runs
+    interrupted: bool = False
+    damaged: tuple[Path, ...] = ()
     folder: Path | None = None
 
     @property

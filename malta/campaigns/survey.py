@@ -45,12 +45,26 @@ def summarize(
 ) -> Summary:
     """Simulate all runs of a plan, or those that its folder does not have yet, and return what they have in common.
 
-    As `malta.campaign`, whose arguments these are, but in memory that does not grow with the runs.
+    As `malta.campaign`, but in memory that does not grow with the runs: a million of them fit.
 
+    plan : the plan of the campaign
+    folder : stores every block as soon as it is done, and the manifest; None: nothing is written
     bounds : figures of a paper and the design whose bounds the summary counts
+    workers : threads on this machine; None: one for each core
+    cluster : address of a Dask scheduler, as tcp://host:8786, whose workers simulate the blocks
+    block : runs in a block, a multiple of 8; a folder that has a campaign keeps its own number
+    progress : called now and then with the share of the runs that is done, 0 to 1
 
-        plan = malta.Plan(malta.gains.read("design/gains/calibrated.json"), spread={"m": 0.1}, samples=1_000_000)
-        print(malta.summarize(plan, "build/campaigns/masses").rate)
+    Returns a Summary. After Ctrl-C it is of the blocks that are done, and says `interrupted`.
+
+    Raises InputError as `malta.campaign`, for any number of runs.
+
+    >>> import malta
+    >>> controller = malta.gains.read("design/gains/calibrated.json")
+    >>> plan = malta.Plan(controller, "hold", {"m": 0.1}, samples=16, options={"duration": 0.01})
+    >>> rate = malta.summarize(plan, workers=1).rate
+    >>> f"{rate.passed} of {rate.runs}, so that with 95 % confidence the rate is above {rate.low:.2f}"
+    '16 of 16, so that with 95 % confidence the rate is above 0.79'
     """
     session = Session(workers, cluster, block, progress)
     with campaign_folder(plan, folder, session) as (place, size):

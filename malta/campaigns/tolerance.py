@@ -68,16 +68,28 @@ class Tolerances:
 def tolerances(
     plan: Plan, limit: Limit, wanted: float, *, workers: int | None = None, progress: Progress | None = None
 ) -> Tolerances:
-    """The largest spread of each parameter of a plan, and the largest common factor, that keep a yield.
+    """Find the largest spread of each parameter of a plan, and the largest common factor, that keep a yield.
 
+    All spreads share their points of the unit box and their noise (common random numbers). A spread with which a
+    machine cannot exist counts as one that loses the yield.
+
+    plan : the plan, whose spreads are today's
+    limit : from `malta.limit_of`
     wanted : share of the plan's machines within the limit, above 0 and up to 1
+    workers : threads; None: one for each core
+    progress : called with the share of the work that is done, 0 to 1
 
-    A spread with which a machine cannot exist counts as one that loses the yield.
+    Returns a Tolerances: the yield of today, and a factor on each spread with the yield that it keeps.
 
     Raises InputError for a yield out of range, and for a box in which nothing varies.
 
-        plan = malta.Plan(malta.gains.read("design/gains/table2.json"), spread={"m": 0.05, "K_A": 0.05}, samples=1000)
-        print(malta.tolerances(plan, malta.limit_of(plan, "touchdown"), 0.99).spreads)
+    >>> import malta
+    >>> spec = malta.read_design("examples/ball/design/ball.toml")
+    >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
+    >>> plan = malta.Plan(controller, "disturbance", {"m": 0.1}, samples=20, options={"duration": 0.02})
+    >>> found = malta.tolerances(plan, malta.limit_of(plan, "deviation-y", 50e-6), 0.95, workers=1)
+    >>> found.today.share, found.spreads[0].name, found.spreads[0].factor > 1
+    (1.0, 'm', True)
     """
     if not 0 < wanted <= 1:
         raise InputError("campaign", "tolerance", f"{wanted:g}", "a yield above 0 and up to 1")

@@ -28,15 +28,22 @@ def export_c(
     until: Until | None = None,
     proof: bool = True,
 ) -> list[Path]:
-    """Write the controller of a gain file as a folder of C99 with its test and a report; the files.
+    """Write the controller of a gain file as a folder of C99 with its test and a report.
 
+    gains : the gain file
     out : the folder, new or empty
-    until : how far down the C goes; None: as far as the machine is modelled
+    precision : of all numbers, "double" or "float"
+    until : how far down the C goes: "currents" or "duty-cycles"; None: as far as the machine is modelled
     proof : prove the margin again with the coefficients that single precision holds
+
+    Returns the files.
 
     Raises InputError for a folder that has files, an unknown precision, and duty cycles of a machine without windings.
 
-        malta.export_c("design/gains/robust.json", "build/robust_c", precision="float")
+    >>> import malta
+    >>> files = malta.export_c("design/gains/tubular_pid.json", "build/pid_c", until="currents")
+    >>> [file.name for file in files if file.suffix == ".h"]
+    ['tubular_pid.h', 'tubular_pid_supervisor.h']
     """
     path = locate(gains)
     target = _target(read(path), precision, until)
@@ -51,15 +58,23 @@ def export_c(
 def export_fmu(
     gains: str | Path, out: str | Path, *, part: Part = "controller", fmi: int = 2, until: Until | None = None
 ) -> str:
-    """Write a part of a gain file's loop as an FMU. Returns a sentence where it has no binary, else "".
+    """Write a part of a gain file's loop as an FMU, for co-simulation.
 
+    gains : the gain file
     out : the file
     part : "controller", "machine" or "loop"
     fmi : version of the interface, 2 or 3
+    until : how far down the controller goes: "currents" or "duty-cycles"; None: as far as the machine is modelled
+
+    Returns "", or a sentence that says why the FMU has sources but no binary.
 
     Raises InputError for another part or version, and for duty cycles of a machine without windings.
 
-        malta.export_fmu("design/gains/robust.json", "build/robust_loop.fmu", part="loop", fmi=3)
+    >>> import malta
+    >>> from zipfile import ZipFile
+    >>> _ = malta.export_fmu("design/gains/calibrated.json", "build/calibrated.fmu", fmi=3)
+    >>> "modelDescription.xml" in ZipFile("build/calibrated.fmu").namelist()
+    True
     """
     path = locate(gains)
     target = _target(read(path), "double", until)

@@ -28,12 +28,27 @@ APART = {"provenance", "sha256", "verification"}  # tables that are not compared
 
 
 def agrees(controller: Controller, margins: Margins, *paths: str | Path) -> bool:
-    """Whether all of these gain files exist, are sound, and hold this controller to 1e-9 of each array's largest entry.
+    """Compare gain files with a controller and its margins: files whose numbers agree need not be written again.
 
-    Poles and bandwidths have to agree to 1e-6. The bounds of the margin must not contradict those in the file, nor be
-    narrower by more than 1 %: a slower computer proves less in the same time.
+    Each array has to agree to 1e-9 of its largest entry, poles and bandwidths to 1e-6. The bounds of the margin must
+    not contradict those in the file, nor be narrower by more than 1 %: a slower computer proves less in the same time.
 
-    Raises CheckError when the loop is not stable, as `document` does.
+    controller : the controller
+    margins : its margins, from `malta.verify`
+    paths : the gain files
+
+    Returns True where all files exist, are sound, and hold this controller.
+
+    Raises CheckError when the loop is not stable, as `malta.gains.document` does.
+
+    >>> import malta
+    >>> spec = malta.read_design("examples/ball/design/ball.toml")
+    >>> model = malta.linearize(spec.plant, spec.plant.at())
+    >>> controller = malta.synthesize(spec, model)
+    >>> margins = malta.verify(model, controller, spec.uncertainty)
+    >>> malta.gains.write(controller, margins, "build/ball.json")
+    >>> malta.gains.agrees(controller, margins, "build/ball.json")
+    True
     """
     wanted = document(controller, margins)
     with suppress(InputError):

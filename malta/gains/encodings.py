@@ -193,6 +193,12 @@ _FORMS: dict[str, _Form] = {
     ".mat": (_to_mat, _from_mat),
 }
 SUFFIXES = tuple(_FORMS)
+"""The suffixes of gain files, one for each encoding.
+
+>>> import malta
+>>> malta.gains.SUFFIXES
+('.json', '.npz', '.mat')
+"""
 
 
 def _form(path: Path) -> _Form:

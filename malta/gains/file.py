@@ -61,9 +61,22 @@ SCHEMA = "malta-gains"
 
 
 def document(controller: Controller, margins: Margins) -> dict[str, Any]:
-    """The content of the gain file of a controller, as plain tables, lists and numbers.
+    """Make the content of a controller's gain file, as plain tables, lists and numbers.
+
+    controller : the controller
+    margins : its margins, from `malta.verify`
+
+    Returns the tables of the file without encoding, see the format of gain files.
 
     Raises CheckError when the loop is not stable, InputError for a name that no file could have.
+
+    >>> import malta
+    >>> spec = malta.read_design("examples/ball/design/ball.toml")
+    >>> model = malta.linearize(spec.plant, spec.plant.at())
+    >>> controller = malta.synthesize(spec, model)
+    >>> content = malta.gains.document(controller, malta.verify(model, controller))
+    >>> content["schema"], content["sample_time"], content["signals"]["forces"]
+    ('malta-gains', 0.0002, [{'name': 'f', 'unit': 'N'}])
     """
     require_stable(margins, controller.name)
     c = controller
@@ -138,27 +151,65 @@ def _robust(margins: Margins) -> dict[str, Any] | None:
 
 
 def write(controller: Controller, margins: Margins, *paths: str | Path) -> None:
-    """Write a controller to gain files; the suffix (.json, .npz, .mat) gives the encoding.
+    """Write a controller to gain files.
 
     All files are completed beside their targets before any is renamed into place, so a failure leaves the old ones.
 
-    Raises InputError for an unknown suffix or a folder that cannot be written to.
+    controller : the controller
+    margins : its margins, from `malta.verify`
+    paths : of the files; the suffix (.json, .npz, .mat) gives the encoding
+
+    Raises InputError for an unknown suffix or a folder that cannot be written to, and CheckError when the loop is not
+    stable.
+
+    >>> import malta
+    >>> cart = malta.linear_machine([[0, 1], [400, 0]], [[0], [2]], [[1, 0]], name="cart")
+    >>> model = malta.linearize(cart, cart.at())
+    >>> controller = malta.lqg(model, malta.weights([1e6, 0], [1], [1e-2], [1e-12]), Ts=1e-3)
+    >>> malta.gains.write(controller, malta.verify(model, controller), "build/cart.json", "build/cart.mat")
+    >>> malta.gains.read("build/cart.mat").K.shape
+    (1, 2)
     """
     replace_files(file_contents(controller, margins, *paths))
 
 
 def file_contents(controller: Controller, margins: Margins, *paths: str | Path) -> dict[Path, bytes]:
-    """The contents of the gain files that `write` writes, by their paths. Raises InputError for an unknown suffix."""
+    """Make the contents of the gain files that `malta.gains.write` writes.
+
+    controller : the controller
+    margins : its margins, from `malta.verify`
+    paths : of the files; the suffix (.json, .npz, .mat) gives the encoding
+
+    Returns bytes by path.
+
+    Raises InputError for an unknown suffix, and CheckError when the loop is not stable.
+
+    >>> import malta
+    >>> spec = malta.read_design("examples/ball/design/ball.toml")
+    >>> model = malta.linearize(spec.plant, spec.plant.at())
+    >>> controller = malta.synthesize(spec, model)
+    >>> files = malta.gains.file_contents(controller, malta.verify(model, controller), "ball.json", "ball.mat")
+    >>> [path.name for path in files]
+    ['ball.json', 'ball.mat']
+    """
     content = document(controller, margins)
     return {Path(path): encode(content, Path(path)) for path in paths}
 
 
 def read(path: str | Path) -> Controller:
-    """Read a gain file (.json, .npz or .mat) and check it.
+    """Read a gain file and check it.
+
+    path : .json, .npz or .mat
+
+    Returns the Controller in it.
 
     Raises InputError, naming file and field: not such a file, another schema or version, a missing or extra entry, a
     wrong shape, NaN or infinity, a non-positive sample time, content that does not match its sha256, gains that do not
     stabilize the file's own model.
+
+    >>> import malta
+    >>> malta.gains.read("design/gains/planar.json")
+    Controller('planar', preset 'pitch_16_3', 24 states, 6 forces, 5 kHz, delay 1)
     """
     path = locate(path)
     file, _ = content_of(path)

@@ -36,16 +36,24 @@ MOST = 4  # blocks: 2^4 polynomials
 
 @dataclass(frozen=True, eq=False)
 class Dynamic:
-    """Unmodelled dynamics: Delta stable, of largest singular value |Delta(jw)| <= |W(jw)| in the modelled set.
+    """Unmodelled dynamics: Delta stable, of largest singular value `|Delta(jw)| <= |W(jw)|` in the modelled set.
 
     In a sampled loop Delta acts on samples, of readings or of held commands: a discrete-time system with
-    |Delta(e^jwT)| <= |W(jw)| up to the Nyquist frequency. Aliases of a continuous Delta between hold and sampler are
+    `|Delta(e^jwT)| <= |W(jw)|` up to the Nyquist frequency. Aliases of a continuous Delta between hold and sampler are
     not covered; they are small when Delta is small above that frequency.
 
-    weight: W, a number or a control.TransferFunction in s (additive: units of the sensor over those of the force)
-    kind: multiplicative (a gain 1 + Delta), feedback (1 / (1 - Delta)) or additive (P + Delta)
-    at: sensors or forces, of multiplicative and feedback
-    channel: counted from 0; several of them, as a tuple, share one full block; additive: (sensors, forces)
+    weight : W, a number or a control.TransferFunction in s; of kind "additive" in units of the sensor over those of the
+        force
+    kind : "multiplicative" (a gain 1 + Delta), "feedback" (1 / (1 - Delta)) or "additive" (P + Delta)
+    at : "sensors" or "forces", where a multiplicative or feedback block acts
+    channel : counted from 0; several of them, as a tuple, share one full block; of an additive block (sensors, forces)
+
+    >>> import control, malta
+    >>> flexible = malta.Dynamic(control.tf([1 / 500, 0.1], [1 / 5000, 1]))  # 10 %, from 50 rad/s on more
+    >>> motor = malta.uncertain(lambda k: ([[-1.0]], [[k]], [[1.0]]), {"k": 1.0})
+    >>> found = malta.dynamic_margin(motor, [[-2.0]], {"k": 0.2}, flexible)
+    >>> f"{found.lower:.2f}"
+    '6.51'
     """
 
     weight: Any

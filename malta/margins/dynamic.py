@@ -73,19 +73,21 @@ def dynamic_margin(
     tolerance: float = TOLERANCE,
     time: float | None = None,
 ) -> Margin:
-    """The margin of real parameters and blocks of unmodelled dynamics together, as robstab with ureal and ultidyn.
+    """Prove how far real parameters and blocks of unmodelled dynamics may deviate together before the loop is unstable.
 
-    Parameters
-    ----------
-    compensator, ranges, over : as in robust_margin; ranges may be empty
-    dynamic : a block, or up to four that act in this order, at most one of them full; their weights grow with t as the
-        ranges do
+    The weights of the blocks grow with t as the ranges of the parameters do. This is robstab with ureal and ultidyn.
+
+    system : the uncertain system, from `malta.uncertain`
+    compensator : u = F y (positive feedback): a Compensator, a control.StateSpace, or a gain matrix
+    ranges : of the parameters, as in `malta.robust_margin`; may be empty
+    dynamic : a block, or up to four that act in this order, at most one of them full
+    over : intervals that do not grow with t, in SI
     tolerance : relative distance between the proven bound and the loss that was found
     time : s, longest search, which then returns the bounds found so far; None: 120
 
-    `witness` holds the parameters; the blocks' sizes there are t |W| at `frequency`.
+    Returns a Margin. `witness` holds the parameters; the blocks' sizes there are `t |W|` at `frequency`.
 
-    Raises InputError as robust_margin does, for channels that the loop does not have and for invalid weights.
+    Raises InputError as `malta.robust_margin` does, for channels that the loop does not have and for invalid weights.
 
     >>> import malta
     >>> motor = malta.uncertain(lambda k: ([[-1.0]], [[k]], [[1.0]]), {"k": 1.0})

@@ -53,15 +53,27 @@ NOTHING = (1e-12, 1e-9, 1e-6, 1e-3, 1.0)
 
 @dataclass(frozen=True, eq=False)
 class Gain:
-    """The largest gain over a box.
+    """The largest gain of a closed loop over a box of parameters and all frequencies.
 
-    lower : reached by `witness`; upper : proven, None when nothing is proven, and `reason` says why
+    lower : the gain that `witness` reaches
+    upper : proven bound; None when nothing is proven, and `reason` says why
+    frequency : rad/s, of the gain at the witness
+    witness : parameters of the gain `lower`, SI
+    cells : number of cells that were searched
+    seconds : s, time of the search
+    reason : why nothing, or less than asked for, is proven
+
+    >>> import malta
+    >>> motor = malta.uncertain(lambda k: ([[-1.0]], [[k]], [[1.0]]), {"k": 1.0})
+    >>> found = malta.worst_case_gain(motor, [[-2.0]], {"k": 0.5}, of="compliance", channel=(0, 0))
+    >>> f"{found.lower:.3f} at k = {found.witness['k']}"  # k / (s + 1 + 2 k), k from 0.5 to 1.5
+    '0.375 at k = 1.5'
     """
 
     lower: float
     upper: float | None
-    frequency: float  # rad/s
-    witness: Mapping[str, float]  # SI
+    frequency: float
+    witness: Mapping[str, float]
     cells: int
     seconds: float
     reason: str = ""
@@ -85,22 +97,28 @@ def worst_case_gain(
     tolerance: float = TOLERANCE,
     time: float | None = None,
 ) -> Gain:
-    """The largest gain of a closed loop over all parameters of a box and all frequencies, as wcgain gives it.
+    """Prove the largest gain of a closed loop over all parameters of a box and all frequencies, as wcgain gives it.
 
-    Parameters
-    ----------
-    compensator, ranges, over : as in robust_margin; the box is the modelled one, t = 1
-    of : sensitivity S = 1 / (1 - L) or complementary sensitivity T = L / (1 - L), L around the loop from the channel
-        back to it, the other channels closed; compliance (1 - P F)^-1 P from a force on the plant to a sensor; effort
-        F (1 - P F)^-1 from a sensor's noise to a command. Forces of a sampled loop are held for a sample.
-    at : sensors or forces, of S and T
+    With L around the loop from the channel back to it, the other channels closed, and u = F y:
+
+        sensitivity    S = 1 / (1 - L)       compliance  (1 - P F)^-1 P, from a force on the plant to a sensor
+        complementary  T = L / (1 - L)       effort      F (1 - P F)^-1, from a sensor's noise to a command
+
+    system : the uncertain system, from `malta.uncertain`
+    compensator : u = F y (positive feedback): a Compensator, a control.StateSpace, or a gain matrix
+    ranges : of the parameters, as in `malta.robust_margin`; the box is the modelled one, t = 1
+    over : intervals beside the box, in SI
+    of : "sensitivity", "complementary", "compliance" or "effort"; forces of a sampled loop are held for a sample
+    at : "sensors" or "forces", of S and T
     channel : counted from 0; several of them as a tuple, all as None: the largest singular value; of compliance
         (sensors, forces), of effort (forces, sensors)
     dynamics : blocks of unmodelled dynamics, of their full size, beside the parameters
     tolerance : relative distance between the proven bound and the gain that was found
     time : s, longest search, which then returns the bounds found so far; None: 120
 
-    Raises InputError as robust_margin does, and for channels that the loop does not have.
+    Returns a Gain: a number for S and T, output units over input units for compliance and effort.
+
+    Raises InputError as `malta.robust_margin` does, and for channels that the loop does not have.
 
     >>> import malta
     >>> motor = malta.uncertain(lambda k: ([[-1.0]], [[k]], [[1.0]]), {"k": 1.0})

@@ -26,30 +26,64 @@ from malta.threads import on_one_thread
 
 @dataclass(frozen=True, eq=False)
 class LoopSystems:
-    """Discrete control.StateSpace with the names of the machine's signals."""
+    """The systems of a machine's sampled loop, discrete control.StateSpace with the names of the machine's signals.
 
-    P: Any  # forces -> outputs
-    F: Any  # measurements -> forces
-    L: Any  # at the sensors
+    Negative feedback stands in F. Gains are in SI.
+
+    P : from forces to outputs: hold, delay, current loops and the loads against v0(z)
+    F : from measurements to forces, the control law
+    L : loop gain at the sensors, -P F
+    S : sensitivity at the sensors, (I + L)^-1
+    T : complementary sensitivity at the sensors, I - S
+    L_forces : loop gain at the forces, -F P
+    S_forces : sensitivity at the forces
+    T_forces : complementary sensitivity at the forces
+    tracking : from references at rest, as "z_ref", to outputs
+    plant : the machine
+    controller : its controller
+
+    >>> import malta
+    >>> controller = malta.gains.read("design/gains/calibrated.json")
+    >>> loop = malta.loop_systems(malta.plant_of(controller.parameters), controller)
+    >>> loop.F.input_labels, loop.F.output_labels[:2], loop.S.dt
+    (['x1', 'y1', 'x2', 'y2', 'z'], ['fx_B1', 'fy_B1'], 5e-05)
+    """
+
+    P: Any
+    F: Any
+    L: Any
     S: Any
     T: Any
     L_forces: Any
     S_forces: Any
     T_forces: Any
-    tracking: Any  # references at rest, as "z_ref" -> outputs
+    tracking: Any
     plant: Plant
     controller: Controller
 
 
 @on_one_thread
 def loop_systems(plant: Plant, controller: Controller) -> LoopSystems:
-    """The loop of a controller on a machine, at the controller's operating point.
+    """Make python-control systems of a controller's loop on a machine, at the controller's operating point.
 
     Currents that are held between samples hang on the last reading, too: at the sensors this is part of F, and broken
     with it; P, F and what is taken at the forces have it in the machine.
 
-    Example: `control.bode_plot(malta.loop_systems(plant, controller).S)`
-    Raises CheckError where no input holds the machine there.
+    plant : the machine
+    controller : its controller
+
+    Returns a LoopSystems, for control.bode_plot and its like.
+
+    Raises CheckError where no input holds the machine at the operating point.
+
+    >>> import malta
+    >>> import numpy as np
+    >>> spec = malta.read_design("examples/ball/design/ball.toml")
+    >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
+    >>> loop = malta.loop_systems(spec.plant, controller)
+    >>> w = np.logspace(0, 4, 200)  # rad/s
+    >>> f"largest |S| {loop.S.frequency_response(w).magnitude.max():.2f}"
+    'largest |S| 1.57'
     """
     loop = machine_loop(linearize(plant, plant.point(controller.operating_point[0])), controller)
     law, m = loop.control, len(controller.forces)

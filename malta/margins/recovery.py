@@ -57,11 +57,25 @@ class Deviation:
 
 @dataclass(frozen=True, eq=False)
 class Recovery:
-    """The answer of a machine's loop to a constant load from outside."""
+    """The answer of a machine's loop to a constant load from outside.
+
+    name : of the load
+    load : N or N m, by disturbance
+    after : s, times after which what is left is looked at
+    outputs : of each output, in SI: `largest` deviation, what is `left` after these times, the time after which it is
+        `settled` (s), the `final` value, and the largest `compliance` over frequency with its `frequency` (rad/s)
+
+    >>> import malta
+    >>> controller = malta.gains.read("design/gains/calibrated.json")
+    >>> found = malta.recovery(malta.plant_of(controller.parameters), controller, {"payload": {"F_z": -2.0}})
+    >>> z = found[0].outputs[-1]
+    >>> f"{found[0].name} moves {z.output} by {z.largest * 1e6:.0f} um"
+    'payload moves z by 707 um'
+    """
 
     name: str
-    load: Mapping[str, float]  # N or N m, by disturbance
-    after: tuple[float, ...]  # s
+    load: Mapping[str, float]
+    after: tuple[float, ...]
     outputs: tuple[Deviation, ...]
 
 
@@ -76,9 +90,13 @@ def recovery(
 ) -> tuple[Recovery, ...]:
     """Answer constant loads from outside with the machine's linear loop.
 
+    plant : the machine
+    controller : its controller
     loads : sizes in N or N m by disturbance, for each name; None: 1 N or 1 N m of each of the plant's disturbances
     position : of the stroke, m; None: the controller's operating point
     after : s, times after which what is left is looked at
+
+    Returns a Recovery for each load.
 
     Raises InputError for a machine without disturbances or a load of an unknown one, and CheckError for an unstable
     loop.
@@ -86,9 +104,9 @@ def recovery(
     >>> import malta
     >>> controller = malta.gains.read("design/gains/calibrated.json")
     >>> found = malta.recovery(malta.plant_of(controller.parameters), controller)
-    >>> load, output = furthest(found)[0]
-    >>> f"{load.name} moves {output.output} by {output.largest * 1e6:.1f} um"
-    'F_x moves x2 by 52.9 um'
+    >>> x1 = found[0].outputs[0]
+    >>> f"1 N of {found[0].name} moves {x1.output} by {x1.largest * 1e6:.1f} um"
+    '1 N of F_x moves x1 by 48.2 um'
     """
     known = [s.name for s in plant.disturbances]
     if not known:

@@ -71,18 +71,31 @@ class Certificate:
 
 @dataclass(frozen=True, eq=False)
 class Margin:
-    """A robust stability margin in multiples of the modelled box.
+    """A robust stability margin in multiples of the modelled box of parameters.
 
-    lower : proven; None when nothing is proven, and `reason` says why
+    lower : proven: no parameters within `lower` times the box make the loop unstable; None when nothing is proven, and
+        `reason` says why
     upper : reached by `witness`; infinite when no admissible parameters make the loop unstable
+    frequency : rad/s, of the loss of stability at the witness; None without one
+    witness : parameters with which the loop is at its limit of stability, SI; None without one
+    moved : the witness minus the nominal values, SI
+    sensitivity : share of each parameter in the margin; the shares add up to 1
+    certificate : cells and directions of the proof, which `malta.margins.check` checks again
+    seconds : s, time of the search
+    reason : why nothing, or less than asked for, is proven
+
+    >>> import malta
+    >>> found = malta.margin_of_polynomial(lambda k: [1, 3, 3, 1 + k], {"k": 0.5}, {"k": 1})
+    >>> f"{found.lower:.2f} <= t* <= {found.upper:.2f} at k = {found.witness['k']:.2f}"
+    '4.00 <= t* <= 4.00 at k = -1.00'
     """
 
     lower: float | None
     upper: float
-    frequency: float | None  # rad/s, of the loss of stability at the witness
-    witness: Mapping[str, float] | None  # SI
-    moved: Mapping[str, float]  # SI, the witness minus the nominal values
-    sensitivity: Mapping[str, float]  # share of each parameter in the margin; they add up to 1
+    frequency: float | None
+    witness: Mapping[str, float] | None
+    moved: Mapping[str, float]
+    sensitivity: Mapping[str, float]
     certificate: tuple[Certificate, ...] = field(repr=False)
     seconds: float
     reason: str = ""
@@ -115,18 +128,21 @@ def robust_margin(
     most_cells: int = MOST_CELLS,
     progress: Progress | None = None,
 ) -> Margin:
-    """How far the parameters may deviate together, in multiples of their modelled range, before the loop is unstable.
+    """Prove how far the parameters may deviate together, in multiples of their ranges, before the loop is unstable.
 
-    Parameters
-    ----------
+    With t the range (low, high) of a parameter grows to nominal - t (nominal - low) .. nominal + t (high - nominal).
+    The proof encloses the characteristic polynomial on cells of frequency and parameters, and excludes zero on each.
+
+    system : the uncertain system, from `malta.uncertain`
     compensator : u = F y (positive feedback): a Compensator, a control.StateSpace, or a gain matrix
-    ranges : by name; 0.2 is +-20 % of the nominal value, (low, high) an interval in SI. With t the lower side is
-        nominal - t (nominal - low), the upper one nominal + t (high - nominal): linear on each side.
+    ranges : by name; 0.2 is +-20 % of the nominal value, (low, high) an interval in SI
     over : intervals that do not grow with t, in SI: the bound holds anywhere in them (`z` over the travel)
     tolerance : relative distance between the proven bound and the witness; None: 9e-4, and less where that is cheap
     time : s, longest search, which then returns the bounds found so far; None: 120
     most_cells : number of cells after which the proof is given up
     progress : called with the lower and upper bound so far
+
+    Returns a Margin: proven lower bound, and a witness at the upper one.
 
     Raises InputError for names that the system does not have, ranges that are not valid, and shapes that do not fit.
 
@@ -134,9 +150,9 @@ def robust_margin(
     >>> def cart(m, k):
     ...     return [[0, 1], [-k / m, -0.2 / m]], [[0], [1 / m]], [[1, 0]]
     >>> spring = malta.uncertain(cart, {"m": 1, "k": 4})
-    >>> found = malta.robust_margin(spring, [[-1.0]], {"m": 0.2, "k": 0.1})
-    >>> found.lower <= found.upper
-    True
+    >>> found = malta.robust_margin(spring, [[2.0]], {"m": 0.2, "k": 0.1})  # F = +2 N/m: pushes away from rest
+    >>> f"{found.lower:.2f} {found.upper:.2f} {found.witness['k']:.2f}"  # stable while k > 2
+    '5.00 5.00 2.00'
     """
     effort = Effort(tolerance, time, most_cells, progress)
     law = law_of(system, compensator)
@@ -238,18 +254,21 @@ def margin_of_polynomial(
     time: float | None = None,
     progress: Progress | None = None,
 ) -> Margin:
-    """The margin of a characteristic polynomial whose coefficients depend on parameters.
+    """Prove the margin of a characteristic polynomial whose coefficients depend on parameters.
 
-    Parameters
-    ----------
     coefficients : a function of the parameters by name (or of one array p), or a casadi.Function: the coefficients,
         highest power first
     box : intervals (low, high) by name, or shares of the nominal value
     nominal : values by name; the middle of the interval for a parameter without one
+    over : intervals that do not grow with t, in SI
     discrete : whether stable roots lie in the unit disc, in place of the left half plane
-    over, tolerance, time, progress : as in robust_margin
+    tolerance : relative distance between the proven bound and the witness; None: 9e-4, and less where that is cheap
+    time : s, longest search, which then returns the bounds found so far; None: 120
+    progress : called with the lower and upper bound so far
 
-    Raises InputError as robust_margin does.
+    Returns a Margin.
+
+    Raises InputError as `malta.robust_margin` does.
 
     >>> import malta
     >>> malta.margin_of_polynomial(lambda k: [1, 3, 3, 1 + k], {"k": (1, 2)}, {"k": 1}).upper.__round__(6)

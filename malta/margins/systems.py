@@ -37,15 +37,27 @@ LETTERS = "ABCDE"
 
 
 def uncertain(source: Any, names: Any, **options: Any) -> UncertainSystem:
-    """A linear system in parameters by name: of a plant (`of_plant`), or of functions and matrices (`from_source`).
+    """Make a linear system that depends on parameters by name.
 
-    options : the keyword arguments of these functions
+        E(p) x' = A(p) x + B(p) u,  y = C(p) x + D(p) u
 
-    Raises InputError for unknown options, and as these functions do.
+    source : a Plant, which is linearized with these parameters; a function of the parameters by name (or of one array
+        p), of numpy and CasADi operations, that returns A, B, C, or with D, or with D and E; a casadi.Function of p; or
+        matrices A0, B0, C0[, D0[, E0]]
+    names : of a Plant the names of its parameters; else their nominal values by name, SI
+    options : of a Plant `x`, the states to linearize at; of the others `terms`, the factors of each parameter beside
+        matrices, as {"k": (A1, B1, C1)}; `limits` (above, below) of parameters; `sample_time` (s) of matrices that give
+        x+ in place of x'
+
+    Returns an UncertainSystem.
+
+    Raises InputError for unknown options, and for names, shapes and values that do not fit.
 
     >>> import malta
-    >>> motor = malta.uncertain(lambda J, b: ([[0, 1], [0, -b / J]], [[0], [1 / J]], [[1, 0]]), {"J": 2e-3, "b": 0.1})
-    >>> motor.names
+    >>> def motor(J, b):
+    ...     return [[0, 1], [0, -b / J]], [[0], [1 / J]], [[1, 0]]
+    >>> system = malta.uncertain(motor, {"J": 2e-3, "b": 0.1})
+    >>> system.names
     ('J', 'b')
     """
     from malta.margins.plants import of_plant

@@ -35,11 +35,21 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class UncertainSystem:
-    """E(p) x' = A(p) x + B(p) u, y = C(p) x + D(p) u with parameters p by name.
+    """A linear system in parameters by name: E(p) x' = A(p) x + B(p) u, y = C(p) x + D(p) u.
 
-    matrices : p -> A, B, C, or with D, or with D and E; their structure is read from the expressions
+    names : of the parameters, in the order of p
+    nominal : their values, SI
+    matrices : a casadi.Function p -> A, B, C, or with D, or with D and E; their structure is read from the expressions
     limits : of each parameter, (above, below), exclusive; none: infinite
     sample_time : s, of a discrete system, with x+ in place of x'; None: continuous
+
+    >>> import malta
+    >>> def motor(J, b):
+    ...     return [[0, 1], [0, -b / J]], [[0], [1 / J]], [[1, 0]]
+    >>> system = malta.uncertain(motor, {"J": 2e-3, "b": 0.1})
+    >>> A, B, C = system.at([[1e-3, 0.1], [2e-3, 0.1]])  # at two rows of parameters
+    >>> A[:, 1, 1].tolist()
+    [-100.0, -50.0]
     """
 
     names: tuple[str, ...]
@@ -61,20 +71,37 @@ class UncertainSystem:
 
 @dataclass(frozen=True, eq=False)
 class Compensator:
-    """u = F y: x+ = A x + B y (x' when sample_time is None), u = C x + D y; the last states are plain integrals.
+    """A linear law u = F y: x+ = A x + B y, u = C x + D y, with positive feedback; x' for x+ in continuous time.
 
     Between u and the plant stand a delay of whole samples, a zero-order hold when sampled, and a first-order lag
-    w_c / (s + w_c) when `lag` is given.
+    w_c / (s + w_c) when `lag` is given. The last states are plain integrals.
+
+    A : n x n
+    B : n x p, measurements
+    C : m x n, forces
+    D : m x p
+    integrals : number of the last states that are plain integrals
+    sample_time : s; None: continuous
+    delay : samples between u and the plant
+    lag : w_c, rad/s; None: no lag
+
+    >>> import malta
+    >>> import numpy as np
+    >>> one = np.eye(1)  # PI: u = -2 y - 50 sum of Ts y, at 1 kHz, with a sample of delay
+    >>> law = malta.Compensator(one, 1e-3 * one, -50 * one, -2 * one, integrals=1, sample_time=1e-3, delay=1)
+    >>> motor = malta.uncertain(lambda k: ([[-1.0]], [[k]], [[1.0]]), {"k": 1.0})
+    >>> f"{malta.robust_margin(motor, law, {'k': 0.2}).lower:.2f}"
+    '5.00'
     """
 
     A: FloatArray
     B: FloatArray
     C: FloatArray
     D: FloatArray
-    integrals: int = 0  # how many of the last states: x+ = x + B y, x' = B y
-    sample_time: float | None = None  # s; None: continuous
-    delay: int = 0  # samples
-    lag: float | None = None  # rad/s
+    integrals: int = 0
+    sample_time: float | None = None
+    delay: int = 0
+    lag: float | None = None
 
 
 def held_gain(plant: Plant, position: float) -> FloatArray:

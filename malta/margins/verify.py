@@ -62,14 +62,32 @@ class Stage:
 
 @dataclass(frozen=True, eq=False)
 class Margins:
-    """The result of `verify`. The last stage is the machine's loop, whose bandwidths these are."""
+    """What `malta.verify` finds: poles, peak sensitivities, bandwidths and the robust margin of a loop.
+
+    The last stage is the machine's loop: hold, delay and current loops. ISO 14839-3 sorts its peak sensitivities into
+    zones: A below 3 (9.5 dB), B below 4, C below 5, D above.
+
+    poles : open loop, regulator, filter and closed loop, rad/s; of sampled systems ln(lambda) / Ts
+    stages : peak sensitivities and spectral radius of the loop as designed, with current loops, and of the machine
+    bandwidth : rad/s, by definition
+    uncertainty : relative half range of each parameter
+    robust : the margin in multiples of these ranges, anywhere in `extent`; None without ranges
+    extent : the intervals that the margin covers beside the ranges
+
+    >>> import malta
+    >>> spec = malta.read_design("examples/ball/design/ball.toml")
+    >>> model = malta.linearize(spec.plant, spec.plant.at())
+    >>> margins = malta.verify(model, malta.synthesize(spec, model), {"m": 0.2})
+    >>> margins.stable, f"{margins.peak_sensitivity['y']:.2f}", f"{margins.robust.lower:.2f}"
+    (True, '1.57', '3.91')
+    """
 
     poles: Poles
     stages: tuple[Stage, ...]
-    bandwidth: Mapping[str, float]  # rad/s, by definition
-    uncertainty: Mapping[str, float]  # relative half range of each parameter
-    robust: Margin | None  # in multiples of these ranges, anywhere in `extent`; None without ranges
-    extent: Extent = NOWHERE  # the intervals that the margin covers beside the ranges
+    bandwidth: Mapping[str, float]
+    uncertainty: Mapping[str, float]
+    robust: Margin | None
+    extent: Extent = NOWHERE
 
     @property
     def stable(self) -> bool:
@@ -152,18 +170,34 @@ def unstable_gain(c: Controller) -> tuple[str, float] | None:
 def verify(
     model: LinearModel, controller: Controller, uncertainty: Mapping[str, float] | None = None
 ) -> Margins:
-    """Poles, peak sensitivities and bandwidths of a controller on a machine's linear model.
+    """Verify a controller on a machine's linear model: poles, peak sensitivities, bandwidths, and the robust margin.
 
-    Stages: the sampled loop as designed; with the current loops; the machine (`machine_loop`).
+    Stages: the sampled loop as designed; with the current loops; the machine. The robust margin covers the travel and
+    the intervals of `plant.over`. The peak sensitivities of an unstable loop are NaN; instability raises nothing.
 
+    model : the machine's linear model, from `malta.linearize`
+    controller : its controller
     uncertainty : relative half range of each parameter, the unit of the robust margin, as {"m": 0.2}; None: no margin
 
-    The robust margin covers the travel and the intervals of `plant.over`. The peak sensitivities of an unstable loop
-    are NaN; instability raises nothing.
+    Returns a Margins, which prints as a short table.
 
     Raises CheckError when numbers overflow or no input holds the machine.
 
-    Example: `print(malta.verify(model, controller, {"m": 0.2}))`
+    >>> import malta
+    >>> spec = malta.read_design("examples/ball/design/ball.toml")
+    >>> model = malta.linearize(spec.plant, spec.plant.at())
+    >>> print(malta.verify(model, malta.synthesize(spec, model), spec.uncertainty))
+    stable with hold, delay and current loops
+    peak |S|, sampled: y 1.71 A  all 1.71 (4.7 dB)
+    peak |S|, + current loops: y 1.71 A  all 1.71 (4.7 dB)
+    peak |S|, machine: y 1.57 A  all 1.57 (3.9 dB)
+    bandwidth, last -3 dB of sigma_max(T): 652.0 rad/s (103.76 Hz)
+    bandwidth, first -3 dB of sigma_min(T): 652.0 rad/s (103.76 Hz)
+    bandwidth, last 0 dB of sigma_max(L): 290.8 rad/s (46.29 Hz)
+    bandwidth, regulator's fastest natural frequency: 247.4 rad/s (39.37 Hz)
+    bandwidth, regulator's slowest natural frequency: 247.4 rad/s (39.37 Hz)
+    uncertainty: m +-20 %  C +-20 %
+    robust: proven 320... %, lost at 320.61 % at 1047 rad/s
     """
     try:
         with np.errstate(over="ignore", invalid="ignore"):

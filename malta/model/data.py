@@ -60,16 +60,19 @@ def read(path: str | Path, preset: str | None = None) -> Any:
     The key `machine` names the module: "tubular" is a machine of an installed package, "rotor.py" is a file beside
     the data file, which is imported.
 
-    Parameters
-    ----------
     path : the data file, as data/tubular.toml
     preset : a table of `presets`, whose entries replace those of `parameters`; the file's default_preset if None. A
         file without presets has the single preset "data": all of its parameters.
 
+    Returns the record, whose fields are numbers in SI.
+
     Raises InputError, which names file and field, for a missing, unknown or doubled key, an unknown preset, a wrong
     unit, NaN, a value out of range, and a machine that is unknown or cannot be imported.
 
-    Example: `malta.read("data/tubular.toml").m`
+    >>> import malta
+    >>> parameters = malta.read("data/tubular.toml")
+    >>> parameters.m, parameters.preset  # kg
+    (0.36, 'table1')
     """
     path = locate(path)
     content = validate(MachineFile, load_toml(path), path)
@@ -135,9 +138,18 @@ def parameters_record(module: ModuleType, where: str | Path) -> type[Parameters]
 
 
 def plant_of(parameters: Parameters) -> Plant:
-    """Build the plant with these parameters by the function `plant` of the module that defines their class.
+    """Build the plant with these parameters, by the function `plant` of the module that defines their class.
+
+    parameters : a machine's Parameters record, SI
+
+    Returns a Plant; equal records of parameters have the same one.
 
     Raises InputError when the module has no such function, and when the fields of its plant do not fit each other.
+
+    >>> import malta
+    >>> plant = malta.plant_of(malta.read("data/tubular.toml"))
+    >>> plant.name, len(plant.states), [s.name for s in plant.outputs]
+    ('tubular', 12, ['x1', 'y1', 'x2', 'y2', 'z'])
     """
     return _plant_of(parameters)
 

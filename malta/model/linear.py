@@ -15,7 +15,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, make_dataclass
 from functools import cache
 from numbers import Real
-from typing import TYPE_CHECKING, Any, TypedDict, cast
+from typing import TYPE_CHECKING, Any, TypedDict, Unpack, cast
 
 import casadi as ca
 import numpy as np
@@ -27,8 +27,6 @@ from malta.model.parameters import check_parameters, si
 from malta.model.plant import Actuator, Parameters, Plant, Signal
 
 if TYPE_CHECKING:
-    from typing import Unpack
-
     from malta.model.plant import FloatArray
 
 Rows = tuple[tuple[float, ...], ...]
@@ -51,16 +49,7 @@ class LinearSystem:
 
 
 class Details(TypedDict, total=False):
-    """The optional arguments of `linear_machine`.
-
-    name : the machine's own name
-    states, inputs, outputs : names, "z [m]" with a unit, or Signals; those of a StateSpace, else x1 x2 ..., u1, y1
-    nominal : values of the parameters, as {"k": 1.5}
-    terms : the factors of each parameter, as {"k": (A1, B1, C1)}; None, or left out at the end: zeros
-    limit : of the inputs, one number for all or one for each; default: infinite
-    noise : of the sensors, rms of a sample, one number for all or one for each; default: 0
-    dead_time : s, from measurement to force; default: 0
-    """
+    """The optional arguments of `linear_machine`, which says what they are."""
 
     name: str
     states: Sequence[str | Signal]
@@ -74,19 +63,33 @@ class Details(TypedDict, total=False):
 
 
 def linear_machine(A: Any, B: Any = None, C: Any = None, **details: Unpack[Details]) -> Plant:
-    """A machine x' = A x + B (u + d), y = C x from matrices, or from a continuous control.StateSpace in place of A.
-
-    A : n x n, B : n x m, C : m x n, as many outputs as inputs for a design; details : see `Details`
+    """Make a machine x' = A x + B (u + d), y = C x from matrices or from a system of python-control.
 
     States of positions and then their rates, A = [[0, I], ...], make a machine of second order. An LQG and a margin
     work for other states as well. Their reference is the rest at which the outputs have the wanted values:
     [A B; C 0] (x*, u*) = (0, p*), in the least-squares sense. u* is not fed forward: a machine that needs some stops
     short of the reference without integrals or observed disturbances.
 
+    A : n x n; or a continuous control.StateSpace in place of A, B and C
+    B : n x m
+    C : m x n, as many outputs as inputs for a design
+    details : by keyword, all optional:
+    name : the machine's own name
+    states, inputs, outputs : names, "z [m]" with a unit, or Signals; those of a StateSpace, else x1 x2 ..., u1, y1
+    nominal : values of the parameters, as {"k": 1.5}
+    terms : the factors of each parameter, as {"k": (A1, B1, C1)}; None, or left out at the end: zeros
+    limit : of the inputs, one number for all or one for each; default: infinite
+    noise : of the sensors, rms of a sample, one number for all or one for each; default: 0
+    dead_time : s, from measurement to force; default: 0
+
+    Returns a Plant.
+
     Raises InputError for shapes and values that do not fit, a discrete system, and a system with D.
 
     >>> import malta
-    >>> cart = malta.linear_machine([[0, 1], [0, -0.1]], [[0], [2]], [[1, 0]], name="cart", states=["z [m]", "v [m/s]"])
+    >>> cart = malta.linear_machine(
+    ...     [[0, 1], [0, -0.1]], [[0], [2]], [[1, 0]], name="cart", states=["z [m]", "v [m/s]"]
+    ... )
     >>> malta.linearize(cart, cart.at()).A.tolist()
     [[0.0, 1.0], [0.0, -0.1]]
     """

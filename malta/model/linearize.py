@@ -25,7 +25,23 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class LinearModel:
-    """xi' = A xi + B v + E (y_k - C xi), p = C xi about `operating_point`: A n x n, B n x m, C p x n, E n x p."""
+    """The linear model of a machine about an operating point: xi' = A xi + B v + E (y_k - C xi), p = C xi.
+
+    y_k is the last reading: currents that are held between samples pull back to the place that they were made for.
+
+    plant : the machine
+    operating_point : the point
+    A : n x n
+    B : n x m, forces
+    C : p x n
+    E : n x p; zeros where nothing is held
+
+    >>> import malta
+    >>> plant = malta.plant_of(malta.read("data/tubular.toml"))
+    >>> model = malta.linearize(plant, plant.at(z=0.0))
+    >>> model.A.shape, model.B.shape, f"{model.stiffness[0, 0] ** 0.5:.0f} rad/s"  # M^-1 S: unstable poles
+    ((10, 10), (10, 5), '219 rad/s')
+    """
 
     plant: Plant
     operating_point: OperatingPoint
@@ -82,13 +98,20 @@ def linearize(plant: Plant, point: OperatingPoint, believed: Plant | None = None
     model has the slopes of the loads and of the inputs that balance them (for the tubular machine m g / Ixx from z to
     alpha'', the slope of the cogging in z'', and off the centre z f_D / Ixx in alpha'' and beta'').
 
-    point : the operating point, from `plant.at`, `plant.point` or `trim`
+    plant : the machine
+    point : the operating point, from `plant.at`, `plant.point` or `malta.trim`
     believed : the machine with the controller's parameters; None: the plant itself. The inputs are the forces that the
         controller commands with these parameters.
 
+    Returns a LinearModel, exact derivatives by CasADi.
+
     Raises InputError when the point has the wrong size, CheckError when the Jacobian is not finite.
 
-    Example: `malta.linearize(plant, plant.at(z=5e-3)).A`
+    >>> import malta
+    >>> spec = malta.read_design("examples/ball/design/ball.toml")
+    >>> model = malta.linearize(spec.plant, spec.plant.at())
+    >>> sorted(model.sys.poles().real.round(1).tolist())  # rad/s
+    [-120.0, 120.0]
     """
     n, m = len(plant.states), len(plant.inputs)
     if point.x.shape != (n,) or point.u.shape != (m,):

@@ -49,12 +49,20 @@ _files: dict[str, _File] = {}  # machines that the user named by their files, by
 
 
 def machine(name: str | Path | ModuleType) -> ModuleType:
-    """The module of a machine, by its name or by its file; a module is returned unchanged.
+    """Find the module of a machine, by its name or by its file.
 
     After `malta.machine("rotor.py")` the name `rotor` finds this machine, as `malta.gains.read` does. A file is loaded
     again after its text has changed; the last file of a name counts, and records of an earlier one keep their plant.
 
+    name : of an installed machine, as "tubular"; a file; or a module, which is returned unchanged
+
+    Returns the module, with its Parameters and its function plant.
+
     Raises InputError for an unknown name, a file that cannot be imported, or a module without Parameters and plant.
+
+    >>> import malta
+    >>> malta.machine("examples/ball/ball.py").__doc__.splitlines()[0]
+    'A steel sphere between two electromagnets: one axis, open-loop unstable.'
     """
     if isinstance(name, ModuleType):
         return _require_plant(name, str(getattr(name, "__file__", name.__name__)))

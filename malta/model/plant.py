@@ -40,7 +40,15 @@ class Parameters(Protocol):
 
 
 class Signal(NamedTuple):
-    """A named scalar with its SI unit."""
+    """A named scalar with its SI unit.
+
+    name : as it stands in files and figures
+    unit : SI, "1" for a pure number
+
+    >>> import malta
+    >>> malta.Signal("z", "m")
+    Signal(name='z', unit='m')
+    """
 
     name: str
     unit: str
@@ -53,21 +61,37 @@ class Actuator:
     The current loop is a PI controller on 1 / (L s + R), designed for `crossover` and `phase_margin`. Without a
     crossover currents follow their commands at once, and of the fields after `current_limit` only `dead_time` counts.
 
-    Example: `Actuator(coils=(Signal("i", "A"),), force_constant=(38.0,), current_limit=3.0)`
+    coils : their currents, A
+    force_constant : N/A, of each input; empty when inputs share coils
+    current_limit : A, of each coil
+    force_limit : of each input, N or N m; (): by the current limit
+    voltage_limit : V; inf: none
+    R : ohm
+    L : H
+    crossover : rad/s, of the current loops; inf: currents follow their commands at once
+    phase_margin : rad, of the current loops
+    sample_time : s, of the current loops
+    loop_delay : s, dead time of the current loops
+    dead_time : s, from measurement to force
+
+    >>> import malta
+    >>> coil = malta.Actuator((malta.Signal("i", "A"),), force_constant=(38.0,), current_limit=3.0, dead_time=100e-6)
+    >>> coil.force_limit, coil.delay(Ts=50e-6)  # N; samples
+    ((114.0,), 2)
     """
 
-    coils: tuple[Signal, ...]  # their currents, A
-    force_constant: tuple[float, ...]  # N/A, of each input; empty when inputs share coils
-    current_limit: float  # A, of each coil
-    force_limit: tuple[float, ...] = ()  # of each input, N or N m; (): by the current limit
-    voltage_limit: float = math.inf  # V; inf: none
-    R: float = 0.0  # ohm
-    L: float = 0.0  # H
-    crossover: float = math.inf  # rad/s; inf: currents follow their commands at once
-    phase_margin: float = math.pi / 2  # rad
-    sample_time: float = 0.0  # s, of the current loops
-    loop_delay: float = 0.0  # s, their dead time
-    dead_time: float = 0.0  # s, from measurement to force
+    coils: tuple[Signal, ...]
+    force_constant: tuple[float, ...]
+    current_limit: float
+    force_limit: tuple[float, ...] = ()
+    voltage_limit: float = math.inf
+    R: float = 0.0
+    L: float = 0.0
+    crossover: float = math.inf
+    phase_margin: float = math.pi / 2
+    sample_time: float = 0.0
+    loop_delay: float = 0.0
+    dead_time: float = 0.0
 
     def __post_init__(self) -> None:
         if not self.force_limit:
@@ -84,20 +108,58 @@ class Actuator:
 
 @dataclass(frozen=True, eq=False)
 class Plant:
-    """A machine: equations of motion that CasADi can trace, and the names and units of its signals.
+    """A machine: equations of motion that CasADi can trace, and the names and units of its signals. SI.
+
+        x' = f(x, u, w + load(x)),    y = h(x, u)
 
     `states` are positions, then their rates in the same order (`second_order`); a machine with other states has no
-    natural frequencies, no PID and no feedforward of speeds. `uncontrolled` are states that no input reaches, as the
-    rotation of a round mover: they are simulated, but not part of the design model.
+    natural frequencies, no PID and no feedforward of speeds. The inputs are forces. `currents(y, v)` returns the coil
+    currents for the forces v at the measured position y. They are held for one sample, while the forces of these
+    currents, `forces(x, i)`, change with the state.
 
-    The inputs are forces. `currents(y, v)` returns the coil currents for the forces v at the measured position y. They
-    are held for one sample, while the forces of these currents, `forces(x, i)`, change with the state.
+    Only the fields without a default are required. `malta.plant_of` checks that the fields fit each other.
 
-    Only the fields without a default are required. A machine without a `stroke` has no travel, thrust and mass. A
-    machine that runs at any value of a parameter, as a rotor at any speed, gives the interval in `over`: margins are
-    proven for the whole interval, as they are for the travel.
+    name : of the machine
+    parameters : its Parameters record
+    states : n
+    inputs : m, forces and torques
+    outputs : p
+    f : (x, u, w) -> x'
+    h : (x, u) -> y
+    actuator : coils, limits and current loops
+    variant : the same machine with other parameters: its own function `plant`
+    disturbances : w, forces and torques from outside
+    uncontrolled : states that no input reaches, as the rotation of a round mover: simulated, but not designed for
+    load : x -> w of gravity and cogging; default: zero
+    position_of : y -> controlled positions at rest (of other states than (q, q'): all states), inverse of h; default: y
+    preload : x -> inputs at the operating point of the design model; default: zero
+    currents : (y, inputs) -> coil currents, A; default: by the force constants
+    forces : (x, coil currents) -> inputs; default: by the force constants
+    limited : coil currents -> coil currents within their limits
+    tabulated : whether `currents` uses a look-up table, so that only CasADi MX works
+    windings : model of the windings; None: none
+    electronics : options of the machine -> electronics; None: those of the drive
+    contacts : surfaces that the mover may touch
+    contact : x -> used share of each clearance; 1 at contact
+    cushioned : of each contact: whether a touchdown bearing carries it
+    bearing : x -> w of the touchdown bearings; zero without contact
+    sense : (x, sensor errors) -> y without noise; default: h
+    sensor_errors : systematic errors of the sensors
+    sensors : lag of the sensors; None: they read at once
+    noise : of each sensor, rms of a sample, in the unit of the output; default: zero
+    uniform : whether the noise is uniform; else normal
+    resolution : of each sensor, in the unit of the output; 0: not quantized
+    inertia : of each input: factor of p*'' of the same output in the feedforward
+    mass : kg, moved by the `thrust` input
+    thrust : the input that drives the stroke
+    stroke : the output that the stroke moves; "": the machine has no stroke, travel, thrust and mass
+    travel : of the stroke, either way, m
+    over : intervals of parameters that proofs cover, SI, as any speed of a rotor: {"Omega": (0, 2094)}
 
-    `data.plant_of` checks that the fields fit each other. Examples: malta/machines/, the module of `malta new`.
+    >>> import malta
+    >>> plant = malta.plant_of(malta.read("data/tubular.toml"))
+    >>> plant.second_order, plant.stroke, plant.travel, plant.uncontrolled
+    (True, 'z', 0.015, ('gamma', 'gamma_dot'))
     """
 
     name: str
@@ -105,42 +167,37 @@ class Plant:
     states: tuple[Signal, ...]
     inputs: tuple[Signal, ...]
     outputs: tuple[Signal, ...]
-    f: CasadiFn  # (x, u, w) -> x'
-    h: CasadiFn  # (x, u) -> y
+    f: CasadiFn
+    h: CasadiFn
     actuator: Actuator
-    variant: Callable[[Any], Plant]  # the same machine with other parameters: its own function `plant`
-    disturbances: tuple[Signal, ...] = ()  # w: forces and torques from outside
+    variant: Callable[[Any], Plant]
+    disturbances: tuple[Signal, ...] = ()
     uncontrolled: tuple[str, ...] = ()
-    load: CasadiFn = DEFAULT  # x -> w of gravity and cogging; default: zero
-    # y -> controlled positions at rest (of other states than (q, q'): all states), the inverse of h; default: y
+    load: CasadiFn = DEFAULT
     position_of: CasadiFn = DEFAULT
-    preload: CasadiFn = DEFAULT  # x -> inputs at the operating point of the design model; default: zero
-    currents: CasadiFn = DEFAULT  # (y, inputs) -> coil currents, A; default: by the force constants
-    forces: CasadiFn = DEFAULT  # (x, coil currents) -> inputs; default: by the force constants
-    limited: CasadiFn = DEFAULT  # coil currents -> coil currents within their limits
-    tabulated: bool = False  # whether `currents` uses a look-up table, so that only CasADi MX works
-    windings: Drive | None = None  # None: no model of the windings
-    electronics: Callable[[Any], Electronics] | None = (
-        None  # options of the machine -> electronics; None: those of the drive
-    )
-    contacts: tuple[str, ...] = ()  # surfaces that the mover may touch
-    contact: CasadiFn = DEFAULT  # x -> used share of each clearance; 1 at contact
-    cushioned: tuple[bool, ...] = ()  # of each contact: whether a touchdown bearing carries it
-    bearing: CasadiFn = DEFAULT  # x -> w of the touchdown bearings; zero without contact
-    sense: CasadiFn = DEFAULT  # (x, sensor errors) -> y without noise; default: h
+    preload: CasadiFn = DEFAULT
+    currents: CasadiFn = DEFAULT
+    forces: CasadiFn = DEFAULT
+    limited: CasadiFn = DEFAULT
+    tabulated: bool = False
+    windings: Drive | None = None
+    electronics: Callable[[Any], Electronics] | None = None
+    contacts: tuple[str, ...] = ()
+    contact: CasadiFn = DEFAULT
+    cushioned: tuple[bool, ...] = ()
+    bearing: CasadiFn = DEFAULT
+    sense: CasadiFn = DEFAULT
     sensor_errors: tuple[Signal, ...] = ()
-    sensors: LateSensors | None = None  # None: they read at once
-    noise: tuple[float, ...] = ()  # of each sensor, rms of a sample, in the unit of the output; default: zero
-    uniform: bool = False  # whether the noise is uniform; else normal
-    resolution: tuple[float, ...] = ()  # of each sensor, in the unit of the output; 0: not quantized
-    inertia: tuple[float, ...] = ()  # of each input: factor of p*'' of the same output in the feedforward
-    mass: float = 0.0  # kg, moved by the `thrust` input
-    thrust: str = ""  # the input that drives the stroke
-    stroke: str = ""  # the output that the stroke moves; "": the machine has no stroke
-    travel: float = 0.0  # of the stroke, either way, m
-    over: Mapping[str, tuple[float, float]] = field(
-        default_factory=dict
-    )  # intervals of parameters that proofs cover, SI
+    sensors: LateSensors | None = None
+    noise: tuple[float, ...] = ()
+    uniform: bool = False
+    resolution: tuple[float, ...] = ()
+    inertia: tuple[float, ...] = ()
+    mass: float = 0.0
+    thrust: str = ""
+    stroke: str = ""
+    travel: float = 0.0
+    over: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for name, value in defaults(self).items():
@@ -290,7 +347,18 @@ def position_at(plant: Plant, x: ArrayLike) -> dict[str, float]:
 
 @dataclass(frozen=True, eq=False)
 class OperatingPoint:
-    """A state and inputs to linearize at; `loaded`: whether the loads act and u balances them (trim)."""
+    """A state and inputs to linearize at.
+
+    x : all states, SI
+    u : inputs, N
+    loaded : whether the loads act and u balances them, as after `malta.trim`
+
+    >>> import malta
+    >>> plant = malta.plant_of(malta.read("data/tubular.toml"))
+    >>> point = plant.at(z=5e-3)
+    >>> point.loaded, float(point.x[2]), malta.trim(plant, z=5e-3).loaded
+    (False, 0.005, True)
+    """
 
     x: FloatArray
     u: FloatArray
@@ -328,14 +396,22 @@ def symbolic(parameters: Any, symbols: Mapping[str, Any]) -> Any:
 
 
 def trim(plant: Plant, /, **positions: float) -> OperatingPoint:
-    """The inputs that hold the machine at rest at these states (SI) against its loads.
+    """Find the inputs that hold the machine at rest at these states against its loads.
 
     Solves 0 = f(x, u, load(x)) for u, in the least-squares sense, by Newton's method. Accelerations of uncontrolled
     states are left: a mover whose centre of gravity is off its axis rolls.
 
+    plant : the machine
+    positions : states by name, SI; the others are zero
+
+    Returns an OperatingPoint.
+
     Raises InputError for unknown states, CheckError when no input holds the machine there.
 
-    Example: `malta.trim(plant, z=5e-3).u`
+    >>> import malta
+    >>> ball = malta.read_design("examples/ball/design/ball.toml").plant
+    >>> malta.trim(ball, q=0.5e-3).u.round(3).tolist()  # N: the weight of 100 g
+    [0.981]
     """
     x = plant.at(**positions).x
     return OperatingPoint(x, _hold(plant, x[None, :])[0], loaded=True)

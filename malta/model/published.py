@@ -16,7 +16,16 @@ from malta.units import unit_factor
 def published(machine_file: str | Path) -> dict[str, Any]:
     """Read the figures that a machine's paper prints: published/NAME.toml or published.toml beside its data file.
 
-    Raises InputError when neither file exists; `published_beside` returns None instead.
+    machine_file : the machine's data file, as data/tubular.toml
+
+    Returns the tables of the file; a quantity is {"value": ..., "unit": ...}, in the paper's own unit.
+
+    Raises InputError when neither file exists.
+
+    >>> import malta
+    >>> printed = malta.published("data/tubular.toml")
+    >>> printed["table_I"]["poles"]["x"], printed["table_I"]["unit"]
+    (218.92, 'rad/s')
     """
     return load_toml(_published_file(Path(machine_file)))
 

@@ -135,11 +135,24 @@ class Row(NamedTuple):
 
 
 def ledger(specs: Sequence[Spec], published: Mapping[str, Any], progress: Progress | None = None) -> Ledger:
-    """Compute every claim of the paper on a machine for these designs of it.
+    """Compute every claim of the paper on a machine for some designs of it.
 
-    progress : called with the share that is done
+    A verdict follows from the numbers: "reproduced", "within x %", "not reproduced" with the reason, and others.
+
+    specs : designs of one machine, from `malta.read_design`
+    published : what the paper prints, from `malta.published`
+    progress : called with the share of the work that is done, 0 to 1
+
+    Returns a Ledger: for each claim the paper's figure, that of each design, and the verdict.
 
     Raises InputError for designs of another machine, of one without claims, or when the published figures lack one.
+
+    >>> import malta
+    >>> spec = malta.read_design("design/table2.toml")
+    >>> found = malta.ledger([spec], malta.published("data/tubular.toml"))
+    >>> poles = next(claim for claim in found.claims if "pole" in claim.subject)
+    >>> found.designs, poles.published, poles.verdict
+    (('table2',), '±218.92', 'by construction; K_A solved from it; Table IV as printed gives 215.12')
     """
     if not specs:
         raise InputError("claims", "designs", "none", "at least one design")

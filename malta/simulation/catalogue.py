@@ -69,9 +69,22 @@ def experiment(
 ) -> Experiment:
     """Run an experiment by name.
 
+    name : one of the machine's experiments, as "stroke", "hold" or "disturbance"
+    plant : the machine
+    controller : its controller
+    progress : called with the share of the work that is done, 0 to 1
+    options : of the experiment, SI, as distance=20e-3, and fields of `malta.Scenario`, as seed=1
+
+    Returns an Experiment: runs, and their figures of merit.
+
     Raises InputError for an unknown experiment, and for options that it does not have.
 
-        print(malta.experiment("hold", plant, controller, seed=1))
+    >>> import malta
+    >>> spec = malta.read_design("examples/ball/design/ball.toml")
+    >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
+    >>> print(malta.experiment("disturbance", spec.plant, controller, size=0.1, noise=0.0, quantize=False))
+    disturbance: completed at 0.4 s
+      w; y moves by 34.3 um; y, left at the end 0.0531 um
     """
     _check(name, plant, options)
     return experiments_of(plant)[name](plant, controller, progress=progress, **options)

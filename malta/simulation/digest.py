@@ -23,19 +23,40 @@ LARGEST_FIGURE = 1e30  # of a run that was completed, SI
 
 @dataclass(frozen=True, eq=False)
 class Batch:
-    """Figures of each run of a batch, a row for each. SI."""
+    """Figures of each run of a batch, a row for each. SI.
 
-    duration: FloatArray  # s, until the end or the first contact
-    completed: FloatArray  # 1 or 0
-    deviation: FloatArray  # runs x outputs, largest |p - p*|
-    rms: FloatArray  # runs x outputs, root mean square of p - p*
-    force: FloatArray  # runs x inputs, N, largest |v|
-    contact: FloatArray  # runs x contacts, largest share of each clearance; 1: touch
-    rise: FloatArray  # s, 10-90 % of the stroke; NaN when it was not reached
-    overshoot: FloatArray  # beyond the end, as a share of the stroke; NaN when the run ended early
-    saturated: FloatArray  # runs x inputs, share of the samples whose command was limited
-    verdict: FloatArray  # index into `verdicts` of the plant
-    last: FloatArray  # runs x outputs, p - p* at the last sample, or before the first contact
+    duration : s, until the end or the first contact
+    completed : 1 or 0
+    deviation : runs x outputs, largest `|p - p*|`
+    rms : runs x outputs, root mean square of p - p*
+    force : runs x inputs, N, largest `|v|`
+    contact : runs x contacts, largest share of each clearance; 1: touch
+    rise : s, 10-90 % of the stroke; NaN when it was not reached
+    overshoot : beyond the end, as a share of the stroke; NaN when the run ended early
+    saturated : runs x inputs, share of the samples whose command was limited
+    verdict : index into the plant's verdicts; 0: completed
+    last : runs x outputs, p - p* at the last sample, or before the first contact
+
+    >>> import malta
+    >>> controller = malta.gains.read("design/gains/calibrated.json")
+    >>> plant = malta.plant_of(controller.parameters)
+    >>> hold = malta.Scenario("hold", 5e-3, malta.references.hold, start={"x": 20e-6})
+    >>> batch = malta.simulate_many(plant, controller, hold, {"m": [0.3, 0.4]}, workers=1)
+    >>> batch.completed.tolist(), batch.deviation.shape, (1e6 * batch.deviation[:, 0]).round(1).tolist()
+    ([1.0, 1.0], (2, 5), [20.0, 20.0])
+    """
+
+    duration: FloatArray
+    completed: FloatArray
+    deviation: FloatArray
+    rms: FloatArray
+    force: FloatArray
+    contact: FloatArray
+    rise: FloatArray
+    overshoot: FloatArray
+    saturated: FloatArray
+    verdict: FloatArray
+    last: FloatArray
 
     def __post_init__(self) -> None:
         for name in self.__dataclass_fields__:

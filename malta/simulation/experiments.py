@@ -74,15 +74,33 @@ class PlannedRun(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Experiment:
-    """The result of an experiment."""
+    """The result of an experiment.
+
+    name : of the experiment
+    question : which it answers
+    cases : runs, each with its label, its Trajectory and its figures of merit
+    merits : figures of merit of the experiment as a whole, in SI, with a unit for display
+    curves : arrays that are drawn beside the runs
+    interrupted : whether Ctrl-C ended the experiment; it has the cases up to then
+    controller : a controller that the experiment has found, for a gain file; None: none
+
+    >>> import malta
+    >>> spec = malta.read_design("examples/ball/design/ball.toml")
+    >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
+    >>> found = malta.experiment("disturbance", spec.plant, controller, size=0.1, noise=0.0, quantize=False)
+    >>> found.failed, found.cases[0].label, found.run.p.shape
+    (False, 'w', (2000, 1))
+    >>> str(found.cases[0].merits[0])
+    'y moves by 34.3 um'
+    """
 
     name: str
     question: str
     cases: tuple[Case, ...]
     merits: tuple[Merit, ...]
-    curves: Mapping[str, FloatArray] = field(default_factory=dict)  # drawn beside the runs
-    interrupted: bool = False  # Ctrl-C ended the experiment: it has the cases up to then
-    controller: Controller | None = None  # that the experiment has found, for a gain file
+    curves: Mapping[str, FloatArray] = field(default_factory=dict)
+    interrupted: bool = False
+    controller: Controller | None = None
 
     def __str__(self) -> str:
         cases = ("; ".join([case.label, *map(str, case.merits)]) for case in self.cases)

@@ -44,51 +44,95 @@ class Correction(NamedTuple):
 
 
 class Fault(NamedTuple):
-    """A fault that begins at `at` (s) and ends at `until` (s)."""
+    """A fault of the machine or its electronics during a run.
+
+    kind : "lost sample", "stuck sensor", "biased sensor", "noisy sensor", "open phase", "link sag" or "missed step"
+    at : s, its begin
+    until : s, its end
+    what : name of the output whose sensor fails, or of the phase
+    size : bias (the output's unit), factor of the noise, or missing share of the link voltage
+
+    >>> import malta
+    >>> controller = malta.gains.read("design/gains/calibrated.json")
+    >>> stuck = malta.Fault("stuck sensor", at=1e-3, until=2e-3, what="x1")
+    >>> hold = malta.Scenario("hold", 5e-3, malta.references.hold, noise=1.0, faults=(stuck,))
+    >>> malta.simulate(malta.plant_of(controller.parameters), controller, hold).verdict.name
+    'completed'
+    """
 
     kind: FaultKind
-    at: float  # s
-    until: float = math.inf  # s
-    what: str = ""  # name of the output whose sensor fails, or of the phase
-    size: float = 0.0  # bias (the output's unit), factor of the noise, or missing share of the link voltage
+    at: float
+    until: float = math.inf
+    what: str = ""
+    size: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
 class Scenario:
     """A reference for a machine, with start, disturbances, noise, faults and the fidelity of the simulation.
 
+    name : of the scenario, for figures and errors
+    duration : s
+    reference : plant -> reference, as `malta.references.hold`
+    start : states (SI) that do not start on the reference
+    cold : starts without current, with the observer at zero
+    disturbance : t (s, shape (k,)) -> wrench, k x disturbances, N and N m; None: none
+    anticipated : likewise: what the controller knows of the disturbance in advance
+    noise : standard deviation of the sensors in multiples of the plant's
+    quantize : sensors with the plant's resolution
+    sensor_errors : errors by name, SI; those that are left out are 0; None: y = p exactly
+    seed : of the noise
+    run : index in a campaign: the noise depends on seed and run only. Several: equal parts of the time have theirs.
+    delay : samples between measurement and force; None: the machine's own
+    substeps : Runge-Kutta steps in a sample; None: as many as the machine needs
+    fidelity : how forces arise: "force" (at once), "dq" (current loops in axes) or "phase" (duty cycles of the phases)
+    real_pwm : duty cycles with a resolution, dead time (fidelity phase)
+    bearing_axes : of the current controllers: "fixed", or "turning" with the mover
+    bearing : touchdown bearings push back; without them a touchdown ends the run
+    estimator : "steady-state", "kalman" or "extended"
+    feedforward : "own" (the controller's), "axial" or "attraction"
+    scheduled : the steady-state filter uses C at the measured z
+    faults : of the machine and its electronics
+    correction : an outer loop that moves the reference; None: none
+    open_loop : no feedback: feedforward alone, commutated for the reference
+    electronics : options of the machine's own electronics (fidelity phase)
+    changes : times (s), and parameters of the machine (SI) from then on
+
     Raises InputError for values out of range or unknown words.
 
-        malta.Scenario("hold", 0.1, malta.references.hold, noise=1.0, fidelity="force")
+    >>> import malta
+    >>> drop = malta.Scenario("drop", 20e-3, malta.references.hold, start={"x": 50e-6}, fidelity="force")
+    >>> controller = malta.gains.read("design/gains/calibrated.json")
+    >>> run = malta.simulate(malta.plant_of(controller.parameters), controller, drop)
+    >>> f"x1 from {1e6 * run.p[0, 0]:.0f} um to {1e6 * run.p[-1, 0]:.1f} um"
+    'x1 from 50 um to -0.9 um'
     """
 
     name: str
-    duration: float  # s
+    duration: float
     reference: Callable[[Plant], Reference]
-    start: Mapping[str, float] = field(default_factory=dict)  # states (SI) that do not start on the reference
-    cold: bool = False  # starts without current, with the observer at zero
-    disturbance: Callable[[FloatArray], FloatArray] | None = None  # t (k,) -> wrench, k x 6, N and N m
-    anticipated: Callable[[FloatArray], FloatArray] | None = None  # likewise: what the controller knows of it
-    noise: float = 0.0  # standard deviation of the sensors in multiples of the plant's
-    quantize: bool = False  # sensors with the plant's resolution
-    sensor_errors: Mapping[str, float] | None = None  # names: plant.sensor_errors; None: y = p exactly
+    start: Mapping[str, float] = field(default_factory=dict)
+    cold: bool = False
+    disturbance: Callable[[FloatArray], FloatArray] | None = None
+    anticipated: Callable[[FloatArray], FloatArray] | None = None
+    noise: float = 0.0
+    quantize: bool = False
+    sensor_errors: Mapping[str, float] | None = None
     seed: int = 0
-    # Index in a campaign: the noise depends on seed and run only. Several: equal parts of the time have their noise.
     run: int | tuple[int, ...] = 0
-    delay: int | None = None  # samples between measurement and force; None: the machine's own
-    substeps: int | None = None  # Runge–Kutta steps in a sample; None: see steps_of
-    fidelity: Fidelity = "dq"  # how forces arise, see period.py
-    real_pwm: bool = False  # duty cycles with a resolution, dead time (fidelity phase)
-    bearing_axes: BearingAxes = "fixed"  # of the current controllers; "turning": eq. (18) as printed
-    bearing: bool = False  # touchdown bearings push back; without them a touchdown ends the run
+    delay: int | None = None
+    substeps: int | None = None
+    fidelity: Fidelity = "dq"
+    real_pwm: bool = False
+    bearing_axes: BearingAxes = "fixed"
+    bearing: bool = False
     estimator: Estimator = "steady-state"
-    feedforward: FeedforwardChoice = "own"  # see the function `feedforward` of inputs.py
-    scheduled: bool = False  # the steady-state filter uses C at the measured z
+    feedforward: FeedforwardChoice = "own"
+    scheduled: bool = False
     faults: tuple[Fault, ...] = ()
     correction: Correction | None = None
-    open_loop: bool = False  # no feedback: feedforward alone, commutated for the reference
-    electronics: Any = None  # options of the machine's own electronics (fidelity phase)
-    # Times (s), and parameters of the machine (SI) from then on.
+    open_loop: bool = False
+    electronics: Any = None
     changes: tuple[tuple[float, Mapping[str, float]], ...] = ()
 
     def __post_init__(self) -> None:

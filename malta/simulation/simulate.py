@@ -50,17 +50,26 @@ def simulate(
     engine: EngineChoice | EngineOf = "auto",
     progress: Callable[[float], None] | None = None,
 ) -> Trajectory:
-    """Simulate a scenario. Touchdown and divergence end it early; the verdict names them, and nothing is raised.
+    """Simulate a scenario: the sampled controller on the nonlinear machine, Runge-Kutta steps between samples.
 
+    Touchdown and divergence end the run early; the verdict names them, and nothing is raised. After Ctrl-C the
+    trajectory has the samples that were computed, and the verdict "interrupted".
+
+    plant : the machine
+    controller : its controller, which may have been designed for other parameters
+    scenario : reference, start, disturbances, noise, faults and fidelity
     engine : "auto" compiles where there is a C compiler; a function makes the engine of a run, as `malta.engine_of_c`
-    progress : called now and then with the share of the samples that is done
+    progress : called now and then with the share of the samples that is done, 0 to 1
 
-    Ctrl-C ends the simulation; the trajectory then has the samples that were computed, and the verdict "interrupted".
+    Returns a Trajectory: time series in SI, a row for each sample.
 
     Raises InputError when plant and controller do not belong together or the scenario does not fit the plant.
 
-        controller = malta.gains.read("design/gains/calibrated.json")
-        run = malta.simulate(malta.plant_of(controller.parameters), controller, malta.Scenario.stroke(10e-3))
+    >>> import malta
+    >>> controller = malta.gains.read("design/gains/calibrated.json")
+    >>> run = malta.simulate(malta.plant_of(controller.parameters), controller, malta.Scenario.stroke(10e-3))
+    >>> run.verdict.completed, f"z = {1e3 * run.p[-1, -1]:.3f} mm"
+    (True, 'z = 4.993 mm')
     """
     believed = plant_of(controller.parameters)
     if (plant.inputs, plant.outputs) != (believed.inputs, believed.outputs):

@@ -120,16 +120,31 @@ def fastest_stroke(
     current_share: float = 1.0,
     intervals: int = 150,
 ) -> FastestStroke:
-    """The stroke by `distance` (m, either sign), symmetric about the middle, that takes the least time.
+    """Find the stroke that takes the least time within the drive's limits of current and voltage, and of its slew.
 
-    Parameters
-    ----------
+        minimize T    subject to    z'' = a(z, z', k i),   L i' = u - R i - K_ind z',
+                                    |i| <= i_max,   |u| <= u_max,   |u'| <= 2 u_max / Ts
+
+    IPOPT solves the collocated problem on meshes that are refined until T converges; the optimum is then integrated
+    between the nodes and compared.
+
+    plant : the machine, with a stroke and current loops
+    distance : m, either sign, symmetric about the middle
     emf_constant : K_ind, induced voltage of one module's axis over speed, V s/m
-    voltage_share, current_share : of the actuator's limits, above 0, at most 1
+    voltage_share : of the actuator's limit, above 0, at most 1
+    current_share : of the actuator's limit, above 0, at most 1
     intervals : of the mesh
+
+    Returns a FastestStroke: t (s), z (m), v (m/s), a (m/s2), i (A), u (V) at the nodes, with `rise` and `duration` (s).
 
     Raises InputError for arguments that do not fit the plant; CheckError when IPOPT finds no optimum, when the last
     mesh still changes T by 0.05 %, or when the equations, integrated between the nodes, miss the next or the limits.
+
+    >>> import malta
+    >>> parameters = malta.read("data/tubular.toml")
+    >>> fastest = malta.fastest_stroke(malta.plant_of(parameters), 10e-3, parameters.K_ind)
+    >>> f"{fastest.duration * 1e3:.1f} ms, 10 to 90 % in {fastest.rise * 1e3:.1f} ms"
+    '17.4 ms, 10 to 90 % in 9.3 ms'
     """
     i_max, u_max = _limits(plant, distance, emf_constant, voltage_share, current_share)
     if not (isinstance(intervals, int) and 20 <= intervals <= 2000):

@@ -27,34 +27,65 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """Labelled time series, one row a sample, up to the verdict. SI.
+    """Labelled time series of a run, one row a sample, up to the verdict. SI.
 
     i, u and link are empty in fidelity `force`, i_phase and duty in all fidelities but `phase`. The phases of a machine
     with electronics of its own are its coils.
+
+    plant : the machine
+    controller : its controller
+    scenario : the scenario
+    verdict : its name, as "completed", and its time (s)
+    engine : which simulated it: "compiled" or "virtual machine"
+    t : k, s
+    reference : k x p
+    p : k x p, true outputs
+    y : k x p, measured
+    x : k x states, true
+    xi_hat : k x n, estimated
+    v : k x m, commanded forces, N
+    force : k x m, acting forces, N
+    saturated : k x m, 1 where the command was limited
+    contact : k x contacts, share of each clearance that the mover takes; 1: touch
+    current : k x coils, commanded, A
+    met : k x limits, 1 where a limit was reached: the coil currents', then those of the electronics
+    i : k x axes, A
+    u : k x axes, V
+    link : k x 1, V
+    i_phase : k x phases, A
+    duty : k x phases, 0 to 1
+
+    >>> import malta
+    >>> controller = malta.gains.read("design/gains/calibrated.json")
+    >>> run = malta.simulate(malta.plant_of(controller.parameters), controller, malta.Scenario.stroke(10e-3))
+    >>> run.verdict.name, run.p.shape, run.limits
+    ('completed', (2000, 5), ())
+    >>> f"{run.copper_loss.max():.0f} W"
+    '134 W'
     """
 
     plant: Plant
     controller: Controller
     scenario: Scenario
     verdict: Verdict
-    engine: str  # that simulated it: "compiled" or "virtual machine"
-    t: FloatArray  # k
-    reference: FloatArray  # k x p
-    p: FloatArray  # k x p, true outputs
-    y: FloatArray  # k x p, measured
-    x: FloatArray  # k x states, true
-    xi_hat: FloatArray  # k x n, estimated
-    v: FloatArray  # k x m, commanded forces, N
-    force: FloatArray  # k x m, acting forces, N
-    saturated: FloatArray  # k x m, 1 where the command was limited
-    contact: FloatArray  # k x contacts, share of each clearance that the mover takes; 1: touch
-    current: FloatArray  # k x coils, commanded, A
-    met: FloatArray  # k x limits, 1 where a limit was reached: the coil currents', then those of the electronics
-    i: FloatArray  # k x axes, A
-    u: FloatArray  # k x axes, V
-    link: FloatArray  # k x 1, V
-    i_phase: FloatArray  # k x phases, A
-    duty: FloatArray  # k x phases, 0 to 1
+    engine: str
+    t: FloatArray
+    reference: FloatArray
+    p: FloatArray
+    y: FloatArray
+    x: FloatArray
+    xi_hat: FloatArray
+    v: FloatArray
+    force: FloatArray
+    saturated: FloatArray
+    contact: FloatArray
+    current: FloatArray
+    met: FloatArray
+    i: FloatArray
+    u: FloatArray
+    link: FloatArray
+    i_phase: FloatArray
+    duty: FloatArray
 
     def __post_init__(self) -> None:
         for name in ("t", "reference", *SERIES):
@@ -148,9 +179,19 @@ class StrokeFigures:
 
 
 def stroke_figures(run: Trajectory) -> StrokeFigures:
-    """Rise, overshoot, tracking error and deviations of a stroke; of a machine without a stroke, of its leading output.
+    """Compute rise, overshoot, tracking error and deviations of a stroke.
 
-    malta.stroke_figures(run).rise
+    run : a run; of a machine without a stroke its leading output is taken
+
+    Returns a StrokeFigures, in SI: rise (s, 10 to 90 %), overshoot (share of the stroke), axial_error (m), radial
+    deviations (m) by output, largest commanded force (N) and current (A). NaN where a run ended early.
+
+    >>> import malta
+    >>> controller = malta.gains.read("design/gains/calibrated.json")
+    >>> run = malta.simulate(malta.plant_of(controller.parameters), controller, malta.Scenario.stroke(10e-3))
+    >>> figures = malta.stroke_figures(run)
+    >>> f"{1e3 * figures.rise:.1f} ms, overshoot {figures.overshoot:.2%}"
+    '15.8 ms, overshoot 0.00%'
     """
     names = [s.name for s in run.plant.outputs]
     axis = run.plant.leading_output

@@ -20,16 +20,32 @@ def calibrate(
     axial_ratio: float = 1.0,
     integral_time: float = 1.0,
 ) -> Weights:
-    """Bases on which the LQR (without integrals) has the stiffness K1 = stiffness_ratio k in every unstable mode.
+    """Find bases of the weights on which the LQR is a given number of times as stiff as the magnets pull.
 
     Where the modes decouple, q'' = k q + u with input weight 1/g gives K1 = k + sqrt(k^2 + q g / base^2), so the
-    base follows. The natural frequency is then w_n = sqrt((stiffness_ratio - 1) k). Modes without stiffness get
-    axial_ratio times the w_n of the first mode. A rate's base is w_n times its position's, an error integral's is
-    `integral_time` (s) times that of the first position (radial) or of its own (modes without stiffness).
+    base follows from K1 = stiffness_ratio k. The natural frequency is then w_n = sqrt((stiffness_ratio - 1) k). A
+    rate's base is w_n times its position's. k, K1 and g are per unit of mass or inertia (1/s2). Integral action makes
+    the exported controller a little stiffer.
 
-    k, K1 and g are per unit of mass or inertia (1/s2). Integral action makes the exported controller a little stiffer.
-    Raises InputError when stiffness_ratio <= 2 (2 is reached at zero weight), axial_ratio or integral_time <= 0, the
-    first mode has no stiffness, or the modes couple.
+    model : the linear model, with decoupled modes
+    weights : dimensionless weights, whose bases are replaced
+    stiffness_ratio : K1 / k of every unstable mode, more than 2 (which is reached at zero weight)
+    axial_ratio : w_n of modes without stiffness over the w_n of the first mode
+    integral_time : s; an error integral's base is this times that of the first position (radial) or of its own (modes
+        without stiffness)
+
+    Returns the weights with the new bases.
+
+    Raises InputError when stiffness_ratio <= 2, axial_ratio or integral_time <= 0, the first mode has no stiffness, or
+    the modes couple.
+
+    >>> import malta
+    >>> spec = malta.read_design("design/calibrated.toml")
+    >>> model = malta.linearize(spec.plant, spec.plant.at())
+    >>> K = malta.lqr(model, malta.calibrate(model, spec.weights, stiffness_ratio=4))
+    >>> stiffness = (model.force_map @ K)[0, 0] / model.stiffness[0, 0]
+    >>> f"K1 / k = {stiffness:.3f}"
+    'K1 / k = 4.000'
     """
     k, G = model.stiffness, model.force_map
     n = len(k)

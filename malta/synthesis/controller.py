@@ -160,36 +160,70 @@ class Cost:
 class Controller:
     """Gains, models and limits of one controller; n states, m forces, p = m measurements.
 
-    Force i and measurement i are of the same axis: when force i saturates, error integral i waits.
+        xi_hat = xi_pred + L (y - Cd xi_pred),    e += Ts (p* - y)
+        v = saturate(K (xi* - xi_hat) + Ki e + v_ff + v0(z)),    xi_pred = Ad xi_hat + Bd (v - v0(z))
+
+    Force i and measurement i are of the same axis: when force i saturates, error integral i waits. Behind the n0 states
+    of the machine stand forces behind the lag of the current loops, stored forces, and observed disturbances, where the
+    design models them.
+
+    name : of the design
+    spec_sha256 : digest of all in the design file that shapes the design
+    parameters : of the machine that it was designed for
+    operating_point : x (n0 states) and u
+    sample_time : Ts, s
+    states : n
+    forces : m
+    measurements : p
+    A, B, C : continuous model of the machine alone, n0 x n0, n0 x m, p x n0
+    Ad, Bd, Cd : sampled design model, n x n, n x m, p x n
+    K : m x n
+    Ki : m x p
+    L : n x p, filter form
+    cost : diagonals that the regulator minimizes; None for a PID or a law of errors
+    noise : variances that the filter was designed for; None for a PID or a law of errors
+    feedforward : v_ff = inertia p*'' + speed p*' + position q*, and v0(z) in N, linear between the points of z_grid (m)
+    current_loop : PI gains Kp (V/A) and Ki (V/(A s)); None: currents follow their commands at once
+    limits : current (A) and voltage (V) of each coil, force (N or N m) of each input
+    pause : p, m/s: sums of errors wait while `|p*'|` is above it, 0: never; none: nothing waits. A stroke that the
+        machine follows late or early by its own mass and force constants would charge the sums, which would push it
+        past its end.
+    tracks : what the filter takes: "states" (y) or "errors" (y - p*)
+    commutation : place for which currents are commutated; None: the reading y
+
+    >>> import malta
+    >>> controller = malta.gains.read("design/gains/calibrated.json")
+    >>> controller
+    Controller('calibrated', preset 'table1', 10 states, 5 forces, 20 kHz, delay 0)
+    >>> controller.K.shape, controller.integrating, [s.unit for s in controller.measurements]
+    ((5, 10), True, ['m', 'm', 'm', 'm', 'm'])
     """
 
     name: str
     spec_sha256: str
-    parameters: Parameters  # of the machine that it was designed for
-    operating_point: tuple[FloatArray, FloatArray]  # x (the mechanical states), u
-    sample_time: float  # s
-    states: tuple[Signal, ...]  # n
-    forces: tuple[Signal, ...]  # m
-    measurements: tuple[Signal, ...]  # p
-    A: FloatArray  # continuous, mechanical states only
+    parameters: Parameters
+    operating_point: tuple[FloatArray, FloatArray]
+    sample_time: float
+    states: tuple[Signal, ...]
+    forces: tuple[Signal, ...]
+    measurements: tuple[Signal, ...]
+    A: FloatArray
     B: FloatArray
     C: FloatArray
-    Ad: FloatArray  # n x n
-    Bd: FloatArray  # n x m
-    Cd: FloatArray  # p x n
-    K: FloatArray  # m x n
-    Ki: FloatArray  # m x p
-    L: FloatArray  # n x p, filter form
-    cost: Cost | None  # None, as the noise: a PID, or a law of errors
+    Ad: FloatArray
+    Bd: FloatArray
+    Cd: FloatArray
+    K: FloatArray
+    Ki: FloatArray
+    L: FloatArray
+    cost: Cost | None
     noise: Noise | None
     feedforward: Feedforward
-    current_loop: CurrentLoop | None  # None: currents follow their commands at once
+    current_loop: CurrentLoop | None
     limits: Limits
-    # p, m/s: sums of errors wait while |p*'| is above it, 0: never; none: nothing waits. A stroke that the machine
-    # follows late or early by its own mass and force constants would charge them, and they would push it past its end.
     pause: FloatArray = field(default_factory=lambda: np.zeros(0), metadata={"later": True})
-    tracks: Tracks = field(default="states", metadata={"later": True})  # what the filter takes: y, or y - p*
-    commutation: Commutation | None = field(default=None, metadata={"later": True})  # None: for the place y
+    tracks: Tracks = field(default="states", metadata={"later": True})
+    commutation: Commutation | None = field(default=None, metadata={"later": True})
 
     def __post_init__(self) -> None:
         for f in fields(self):

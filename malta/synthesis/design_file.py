@@ -53,9 +53,18 @@ if TYPE_CHECKING:
 
 
 def read_design(path: str | Path) -> Spec:
-    """Read a design file as design/table2.toml, and the data of the machine that it names.
+    """Read a design file, and the data of the machine that it names.
+
+    path : the design file, as design/table2.toml
+
+    Returns a Spec, in SI.
 
     Raises InputError, naming file and field, for anything missing, unknown, of a wrong unit or out of range.
+
+    >>> import malta
+    >>> spec = malta.read_design("design/calibrated.toml")
+    >>> spec.name, spec.sample_time, spec.plant.name
+    ('calibrated', 5e-05, 'tubular')
     """
     path = locate(path)
     raw = load_toml(path)

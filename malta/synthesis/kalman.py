@@ -30,10 +30,23 @@ if TYPE_CHECKING:
 
 @on_one_thread
 def kalman(model: Linear, weights: Weights) -> FloatArray:
-    """Continuous steady-state Kalman gain L, n x p: xi_hat' = A xi_hat + B v + L (y - C xi_hat).
+    """Design the continuous steady-state Kalman filter: xi_hat' = A xi_hat + B v + L (y - C xi_hat).
 
-    Only the ratio of process to sensor noise matters, so variances of a sample serve as intensities. The same as
-    control.lqe(A, B, C, W, V)[0], which loses digits in SI units: see riccati.py.
+    L = P C' V^-1 with 0 = A P + P A' + W - P C' V^-1 C P. Only the ratio of process to sensor noise matters, so
+    variances of a sample serve as intensities. The same as control.lqe(A, B, C, W, V)[0], which loses digits in SI.
+
+    model : the linear model
+    weights : whose variances are used
+
+    Returns L, n x p.
+
+    Raises InputError for weights of another size, CheckError when the Riccati equation has no sound solution.
+
+    >>> import malta
+    >>> cart = malta.linear_machine([[0, 1], [0, 0]], [[0], [1]], [[1, 0]])
+    >>> model = malta.linearize(cart, cart.at())
+    >>> malta.kalman(model, malta.weights(q=[1, 1], r=[1], w=[1e-2], v=[1e-6])).round(6).tolist()
+    [[14.142136], [100.0]]
     """
     G = noise_input(model.B, weights.coordinates)
     W, V = G * weights.process_variance @ G.T, np.diag(weights.sensor_variance)

@@ -67,9 +67,22 @@ if TYPE_CHECKING:
 
 @on_one_thread
 def lqr(model: Linear, weights: Weights) -> FloatArray:
-    """Continuous LQR gain K, m x n: v = -K xi minimizes the integral of xi'Q xi + v'R v.
+    """Design a continuous LQR: v = -K xi minimizes the integral of xi' Q xi + v' R v.
 
-    The same as control.lqr(A, B, Q, R)[0].
+    K = R^-1 B' P with 0 = A' P + P A + Q - P B R^-1 B' P. The same as control.lqr(A, B, Q, R)[0].
+
+    model : the linear model
+    weights : Q and R
+
+    Returns K, m x n.
+
+    Raises InputError for weights of another size, CheckError when the Riccati equation has no sound solution.
+
+    >>> import malta
+    >>> cart = malta.linear_machine([[0, 1], [0, 0]], [[0], [1]], [[1, 0]])
+    >>> K = malta.lqr(malta.linearize(cart, cart.at()), malta.weights(q=[16, 0], r=[1], w=[1], v=[1]))
+    >>> K.round(6).tolist()  # w_n = 2 rad/s: K1 = w_n^2, K2 = sqrt(2) w_n
+    [[4.0, 2.828427]]
     """
     _check_sizes(model, weights)
     return care(model.A, model.B, weights.Q, weights.R, "LQR").K
@@ -77,11 +90,25 @@ def lqr(model: Linear, weights: Weights) -> FloatArray:
 
 @on_one_thread
 def lqi(model: Linear, weights: Weights) -> tuple[FloatArray, FloatArray]:
-    """Continuous LQR with the integrals of the measured errors: K (m x n) and Ki (m x p).
+    """Design a continuous LQR with the integrals of the measured errors.
 
-    v = K (xi* - xi) + Ki e, e' = p* - p. The Riccati gain on e acts as -K_e e, so Ki = -K_e; 0 where nothing weighs e.
-    The same as control.lqr(A, B, diag(Q, Q_i), R, integral_action=C)[0] = [K, Ki].
-    Raises InputError and CheckError as riccati.care.
+        minimize integral of xi' Q xi + e' Q_i e + v' R v,    v = K (xi* - xi) + Ki e,   e' = p* - p
+
+    The Riccati gain on e acts as -K_e e, so Ki = -K_e; 0 where nothing weighs e. The same as control.lqr(A, B,
+    diag(Q, Q_i), R, integral_action=C)[0] = [K, Ki].
+
+    model : the linear model
+    weights : Q, R and Q_i
+
+    Returns K (m x n) and Ki (m x p).
+
+    Raises InputError for weights of another size, CheckError when the Riccati equation has no sound solution.
+
+    >>> import malta
+    >>> cart = malta.linear_machine([[0, 1], [0, 0]], [[0], [1]], [[1, 0]])
+    >>> K, Ki = malta.lqi(malta.linearize(cart, cart.at()), malta.weights([1, 0], [1], [1], [1], q_i=[4]))
+    >>> K.round(3).tolist(), Ki.round(3).tolist()
+    ([[3.375, 2.598]], [[2.0]])
     """
     _check_sizes(model, weights)
     n, p = len(model.A), len(model.C)
@@ -166,17 +193,30 @@ def lqg(
     current_lag: bool = False,
     position_feedforward: bool = False,
 ) -> Controller:
-    """Design the controller: LQR with integrals, steady-state Kalman filter, feedforward, current loop.
+    """Design an LQG controller: LQR with integrals, steady-state Kalman filter, feedforward, current loop, all sampled.
 
-    Parameters
-    ----------
+    model : the machine's linear model
+    weights : of the cost, and the noise of one sample
     Ts : sample time, s
+    discretization : "sampled-data" (cost and noise integrated over the sample, Van Loan), "zoh" (taken once a sample)
+        or "backward-euler" (continuous gains)
     delay : samples between measurement and force in the design model (not with backward-euler)
+    name : of the design
     current_loop_delay : design the current loop with the machine's dead time
     current_lag : forces are states of the design model, first-order lags at the current loops' crossover behind v
     position_feedforward : feed forward the forces that hold the machine at its reference, so that a tilt meets no error
 
+    Returns a Controller.
+
     Raises InputError for arguments that do not fit, CheckError when an equation has no sound solution.
+
+    >>> import malta
+    >>> cart = malta.linear_machine([[0, 1], [400, 0]], [[0], [2]], [[1, 0]], name="cart", states=["z [m]", "v [m/s]"])
+    >>> model = malta.linearize(cart, cart.at())
+    >>> weights = malta.weights(q=[1e6, 0], r=[1], w=[1e-2], v=[1e-12], q_i=[1e7])
+    >>> controller = malta.lqg(model, weights, Ts=1e-3)
+    >>> malta.verify(model, controller).stable, [f"{k:.3g}" for k in controller.K[0]]
+    (True, ['1.29e+03', '35.8'])
     """
     if not (math.isfinite(Ts) and Ts > 0):
         raise InputError("lqg", "Ts", f"{Ts} s", "a sample time above 0 s")
@@ -254,10 +294,19 @@ def _require_lag(model: LinearModel, lag: float | None, discretization: Discreti
 def weights(
     q: ArrayLike, r: ArrayLike, w: ArrayLike, v: ArrayLike, *, q_i: ArrayLike | None = None
 ) -> Weights:
-    """Weights in SI units, without bases: of the cost, and variances of a sample of forces (w) and sensors (v).
+    """Make weights of a cost and variances of noise in SI units, without bases.
 
-    A vector or a diagonal matrix each; q_i: of the integrals of the errors, none if None.
-    Raises InputError for a matrix that is not diagonal, and as Weights.
+    A vector or a diagonal matrix each.
+
+    q : n, of the states
+    r : m, of the inputs
+    w : m, variance of the forces held over a sample, N2
+    v : p, variance of a sample of the sensors
+    q_i : p, of the integrals of the errors; None: none
+
+    Returns a Weights.
+
+    Raises InputError for a matrix that is not diagonal, and for values below 0.
 
     >>> import malta
     >>> malta.weights([1e8, 1e4], [1], [1e-2], [1e-12]).Q.tolist()
@@ -299,7 +348,21 @@ def _without_bases(
 
 @on_one_thread
 def synthesize(spec: Spec, model: LinearModel) -> Controller:
-    """The controller that a design file asks for. Errors name the file."""
+    """Design the controller that a design file asks for.
+
+    spec : from `malta.read_design`
+    model : the machine's linear model at the design's operating point
+
+    Returns a Controller.
+
+    Raises InputError and CheckError, which name the file.
+
+    >>> import malta
+    >>> spec = malta.read_design("examples/ball/design/ball.toml")
+    >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
+    >>> controller.name, controller.K.shape  # position, rate, and a stored force
+    ('ball', (1, 3))
+    """
     named: dict[str, Any] = {
         "name": spec.name,
         "current_loop_delay": spec.current_loop_delay,

@@ -36,28 +36,47 @@ Place = Literal["measured", "predicted"]
 
 @dataclass(frozen=True, eq=False)
 class Weights:
-    """Dimensionless weights with their bases, and the noise of one sample.
+    """Dimensionless weights of a cost with their bases, and the noise of one sample; n states, m inputs, p outputs.
 
-    Q = diag(q / q_base^2) and so on; n states, m inputs, p outputs, in the order of the plant's signals. Where
-    `coordinates` are positions, q_i is of the integrals of the first n / 2 states, q, and process_variance and
-    drift_variance are of their accelerations.
+        Q = diag(q / q_base^2),    R = diag(r / r_base^2),    Q_i = diag(q_i / q_i_base^2)
+
+    All are in the order of the plant's signals. Where `coordinates` are positions, q_i is of the integrals of the first
+    n / 2 states, q, and process_variance and drift_variance are of their accelerations.
+
+    q : n, states
+    q_base : n, SI unit of each state
+    r : m, inputs
+    r_base : m, N
+    q_i : p, integrals of p* - p
+    q_i_base : p, m s
+    process_variance : m, N2, of the forces held over a sample
+    sensor_variance : p, m2, of each sample
+    drift_variance : m, N2: how far a constant force of disturbance goes in a sample; none: the filter observes none
+    coordinates : "signals" or "positions"
+    correlation : n / 2, of the noise of each position with the acceleration that led to it; none: no correlation
+
+    Raises InputError for values that are not finite and above 0 (q and q_i may be 0), and for other numbers of bases
+    than of weights.
+
+    >>> import malta
+    >>> import numpy as np
+    >>> one = np.ones(1)
+    >>> weights = malta.Weights(np.ones(2), np.array([1e-4, 0.1]), one, one, one, 1e-3 * one, one, 1e-12 * one)
+    >>> weights.Q.round(3).tolist(), weights.R.tolist()  # Bryson's rule: 0.1 mm, 0.1 m/s and 1 N weigh the same
+    ([[100000000.0, 0.0], [0.0, 100.0]], [[1.0]])
     """
 
-    q: FloatArray  # n, states
-    q_base: FloatArray  # n, SI unit of each state
-    r: FloatArray  # m, inputs
-    r_base: FloatArray  # m, N
-    q_i: FloatArray  # p, integrals of p* - p
-    q_i_base: FloatArray  # p, m s
-    process_variance: FloatArray  # m, N2, of the forces held over a sample
-    sensor_variance: FloatArray  # p, m2, of each sample
-    drift_variance: FloatArray = dataclass_field(
-        default_factory=lambda: np.zeros(0)
-    )  # m, N2: how far a constant force of disturbance goes in a sample; none: the filter observes none
+    q: FloatArray
+    q_base: FloatArray
+    r: FloatArray
+    r_base: FloatArray
+    q_i: FloatArray
+    q_i_base: FloatArray
+    process_variance: FloatArray
+    sensor_variance: FloatArray
+    drift_variance: FloatArray = dataclass_field(default_factory=lambda: np.zeros(0))
     coordinates: Coordinates = "signals"
-    correlation: FloatArray = dataclass_field(
-        default_factory=lambda: np.zeros(0)
-    )  # n / 2, of the noise of each position with the acceleration that led to it; none: no correlation
+    correlation: FloatArray = dataclass_field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self) -> None:
         self._check_correlation()
@@ -177,34 +196,61 @@ class Variable(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Spec:
-    """A design file, read and checked."""
+    """A design file, read and checked. SI.
+
+    name : of the design
+    summary : one line of text
+    path : the design file
+    machine_file : the machine's data file
+    sha256 : of everything in the file that shapes the design, published references resolved
+    parameters : of the machine
+    operating_point : states by name
+    sample_time : s
+    discretization : "sampled-data", "zoh" or "backward-euler"
+    delay : samples between measurement and force in the design model
+    current_loop_delay : whether the current loops are designed with the machine's dead time
+    law : the weights of an LQG, or the gains of a PID
+    uncertainty : relative, either way, by parameter
+    current_lag : whether the lag of the current loops is in the design model
+    pause : p, m/s: of the reference, above which sums of errors wait; 0: never
+    position_feedforward : whether the forces that hold the machine at its reference are fed forward
+    commutation : the place for which currents are commutated: "measured" or "predicted"
+    loads : what a PID is judged by; None: nothing
+    specification : SI, by requirement: "margin"; by requirement and signal: "noise_motion x"
+    recovery : what the entries "recovery NAME" of the specification bound, by NAME
+    search : numbers that a search may choose
+    delays : that a search may choose from
+
+    >>> import malta
+    >>> spec = malta.read_design("examples/ball/design/ball.toml")
+    >>> spec.weights.q_base.tolist(), spec.uncertainty  # m and m/s; shares
+    ([0.0001, 0.01], {'m': 0.2, 'C': 0.2})
+    >>> spec.plant is malta.plant_of(spec.parameters)
+    True
+    """
 
     name: str
     summary: str
     path: Path
     machine_file: Path
-    sha256: str  # of everything in the file that shapes the design, published references resolved
+    sha256: str
     parameters: Parameters
     operating_point: Mapping[str, float]
-    sample_time: float  # s
+    sample_time: float
     discretization: Discretization
-    delay: int  # samples between measurement and force in the design model
-    current_loop_delay: bool  # whether the current loops are designed with the machine's dead time
-    law: Weights | Pid  # of an LQG, or the gains of a PID
-    uncertainty: Mapping[str, float]  # relative, either way, by parameter
-    current_lag: bool = False  # whether the lag of the current loops is in the design model
-    pause: tuple[float, ...] = ()  # p, m/s: of the reference, above which sums of errors wait; 0: never
-    position_feedforward: bool = False  # whether the forces that hold it at its reference are fed forward
-    commutation: Place = "measured"  # for which currents are commutated
-    loads: Loads | None = None  # what a PID is judged by
-    specification: Mapping[str, float] = dataclass_field(
-        default_factory=dict
-    )  # SI, by requirement: "margin"; by requirement and signal: "noise_motion x"
-    recovery: Mapping[str, RecoveryBound] = dataclass_field(
-        default_factory=dict
-    )  # what the entries "recovery NAME" of the specification bound, by NAME
+    delay: int
+    current_loop_delay: bool
+    law: Weights | Pid
+    uncertainty: Mapping[str, float]
+    current_lag: bool = False
+    pause: tuple[float, ...] = ()
+    position_feedforward: bool = False
+    commutation: Place = "measured"
+    loads: Loads | None = None
+    specification: Mapping[str, float] = dataclass_field(default_factory=dict)
+    recovery: Mapping[str, RecoveryBound] = dataclass_field(default_factory=dict)
     search: tuple[Variable, ...] = ()
-    delays: tuple[int, ...] = ()  # that the search may choose from
+    delays: tuple[int, ...] = ()
 
     @property
     def plant(self) -> Plant:

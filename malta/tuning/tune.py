@@ -54,12 +54,25 @@ def tune(
     restart: bool = False,
     progress: Progress | None = None,
 ) -> Tuned:
-    """Search the numbers of [search] for the figures of [specification].
+    """Search the numbers of [search] in a design file for the figures of [specification].
 
-    journal : file of the trials; what is in it is not computed again
+    spec : the design, from `malta.read_design`
+    journal : file of the trials; what is in it is not computed again; None: none is written
+    effort : generations of the search, trials that polish its best, and trials for the Pareto front
+    restart : forget what is in the journal
+    progress : called with the share of the work that is done, 0 to 1
+
+    Returns a Tuned: the `spec` with the numbers that were found, its `requirements`, and the Pareto `front`.
 
     Raises InputError when the design file asks for nothing or lets nothing vary, for a machine whose sensors read late,
     and when the journal is another search's.
+
+    >>> import malta
+    >>> from malta.tuning.search import Effort
+    >>> spec = malta.read_design("examples/ball/design/ball.toml")
+    >>> tuned = malta.tune(spec, effort=Effort(generations=4, polish=10, front=0))
+    >>> tuned.reached, [requirement.name for requirement in tuned.requirements]
+    (True, ['margin', 'peak_sensitivity', 'motion y', 'motion y', 'force_noise f', 'force_noise f'])
     """
     if not spec.specification:
         raise InputError(spec.path, "specification", "nothing", "a table of what the design shall reach")
