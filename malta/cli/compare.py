@@ -9,7 +9,7 @@ import typer
 
 from malta.cli.inputs import read_controller
 from malta.cli.options import AsJson, Changes, MachineFile
-from malta.cli.output import make_console, margin_progress, print_json, print_written
+from malta.cli.output import make_console, margin_progress, print_document, print_written
 from malta.cli.report import read_subject
 from malta.files import locate, replace_files
 
@@ -46,7 +46,7 @@ def compare(
     """
     from malta.margins.verify import require_stable
     from malta.report.page.comparison import compare as compare_subjects
-    from malta.report.page.comparison import comparison_document, require_count
+    from malta.report.page.comparison import require_count
     from malta.report.page.document import SUFFIXES, require_suffix
     from malta.report.tables.comparison import comparison_tables
 
@@ -63,7 +63,9 @@ def compare(
             replace_files({page_file: comparison_page(found).content})
             written.append(page_file)
     if as_json:
-        print_json(comparison_document(found) | {"files": [str(file) for file in written]})
+        from malta.cli.documents.pages import compare_output
+
+        print_document(compare_output(found, written))
     else:
         console = make_console()
         console.print(comparison_tables(found, console.width))

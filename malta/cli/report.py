@@ -11,7 +11,7 @@ import typer
 from malta.cli.assignments import read_assignments
 from malta.cli.inputs import change_machine, design_of, read_controller
 from malta.cli.options import AsJson, Changes, GainFile, MachineFile
-from malta.cli.output import make_console, margin_progress, print_json, print_note, print_written
+from malta.cli.output import make_console, margin_progress, print_document, print_note, print_written
 from malta.errors import InputError
 from malta.files import replace_files
 
@@ -86,17 +86,9 @@ def report(
             contents[page_file.with_suffix(".pdf")] = pdf_of(page)
     replace_files(contents)
     if as_json:
-        from malta.report.page.scores import scores_of
+        from malta.cli.documents.pages import report_output
 
-        figures = {score.key: score.value for score in scores_of(analysis)}
-        print_json(
-            {
-                "gains": str(gains),
-                "design": controller.name,
-                "files": list(map(str, contents)),
-                "figures": figures,
-            }
-        )
+        print_document(report_output(gains, analysis, contents))
     else:
         print_written(make_console(), contents)
     for note in analysis.notes:

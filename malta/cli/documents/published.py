@@ -13,6 +13,7 @@ from malta.cli.documents.campaigns import (
 )
 from malta.cli.documents.loops import VerifyOutput
 from malta.cli.documents.others import CheckOutput, ClaimsOutput, ExportOutput, TuneOutput
+from malta.cli.documents.pages import CompareOutput, ReportOutput
 from malta.cli.documents.parts import Part
 from malta.cli.documents.simulations import DesignOutput, SimulateOutput
 
@@ -28,6 +29,8 @@ MODELS: dict[str, type[Part]] = {
     "sobol-output": SobolOutput,
     "tolerance-output": ToleranceOutput,
     "tune-output": TuneOutput,
+    "report-output": ReportOutput,
+    "compare-output": CompareOutput,
     "export-output": ExportOutput,
     "claims-output": ClaimsOutput,
 }

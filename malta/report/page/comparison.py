@@ -251,28 +251,3 @@ def _deeper(subject: Subject, depth: int) -> str:
     """The last parts of the name of a subject's file; the design's name without a file."""
     parts = PurePath(subject.source).parts
     return "/".join(parts[-depth:]) if parts else subject.controller.name
-
-
-def comparison_document(found: Comparison) -> dict[str, Any]:
-    """A comparison as one JSON document: identifiers with units, values in SI."""
-    return {
-        "designs": [
-            {"name": name, "gains": a.subject.source, "machine": a.plant.name, "stable": a.margins.stable}
-            for name, a in zip(found.names, found.designs, strict=True)
-        ],
-        "differences": {
-            row.key: [None if entry is None else entry.value for entry in row.entries]
-            for row in found.differences
-        },
-        "figures": [
-            {
-                "key": row.key,
-                "group": row.group,
-                "better": next(s for s in row.scores if s is not None).meaning.better or None,
-                "values": [None if score is None else score.value for score in row.scores],
-                "best": [name for name, best in zip(found.names, row.best, strict=True) if best],
-            }
-            for row in found.rows
-        ],
-        "remarks": list(found.remarks),
-    }
