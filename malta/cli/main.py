@@ -21,6 +21,7 @@ from malta.cli.design import design
 from malta.cli.export import export
 from malta.cli.new import new
 from malta.cli.output import print_error, print_note, silence
+from malta.cli.plot import plot
 from malta.cli.report import report
 from malta.cli.simulate import simulate
 from malta.cli.tune import tune
@@ -48,6 +49,7 @@ for command in (
     simulate,
     campaign,
     tune,
+    plot,
     report,
     compare,
     export,

@@ -60,13 +60,16 @@ def root_locus(
     low: float | None = None,
     high: float | None = None,
     channel: str | None = None,
-    samples: int = SAMPLES,
+    name: str = "",
+    progress: Callable[[float], None] | None = None,
 ) -> RootLocus:
     """The root locus of a loop.
 
     source, controller : as `linear_loop` takes them; for a parameter of the machine, a plant and its controller
     parameter : of the machine, by name; or "gain", a factor of the loop gain
     low, high : of the parameter, SI; None: half and one and a half of its nominal value, of the gain 0.1 and 10
+    name : of the loop; "": that of the controller
+    progress : takes the share that is done, 0 to 1
     channel : the output or force whose gain is changed; None: all forces
 
     Raises InputError for an unknown parameter, a range that is none, and a value that the machine cannot have.
@@ -76,7 +79,7 @@ def root_locus(
     >>> [round(value, 3) for value in found.changes]
     [6.0]
     """
-    loop = linear_loop(source, controller)
+    loop = linear_loop(source, controller, name=name)
     matrix, nominal, unit = _family(source, controller, loop, parameter, channel)
     usual = (0.1, 10.0) if parameter == GAIN else (0.5 * nominal, 1.5 * nominal)
     low, high = (usual[0] if low is None else low), (usual[1] if high is None else high)
@@ -84,8 +87,8 @@ def root_locus(
         raise InputError(
             "root locus", parameter, f"{low:g} to {high:g}", "a range from a lower to a higher value"
         )
-    first = _values(low, high, nominal, samples, wide=parameter == GAIN)
-    values, found = _followed(matrix, first, loop.sample_time)
+    first = _values(low, high, nominal, wide=parameter == GAIN)
+    values, found = _followed(_counted(matrix, progress), first, loop.sample_time)
     return RootLocus(
         loop.name,
         parameter,
@@ -100,6 +103,21 @@ def root_locus(
 
 
 Matrix = Callable[[float], "ComplexArray"]  # of a value: the eigenvalues of the closed loop, in differences
+
+
+def _counted(matrix: Matrix, progress: Callable[[float], None] | None) -> Matrix:
+    """The same function, which says after each new value how many of at most MOST there were."""
+    if progress is None:
+        return matrix
+    seen: set[float] = set()
+
+    def counted(value: float) -> ComplexArray:
+        found = matrix(value)
+        seen.add(value)
+        progress(min(len(seen) / MOST, 1.0))
+        return found
+
+    return counted
 
 
 def _family(
@@ -140,14 +158,14 @@ def _of_machine(plant: Plant, controller: Controller, parameter: str, value: flo
         ) from error
 
 
-def _values(low: float, high: float, nominal: float, samples: int, *, wide: bool) -> FloatArray:
+def _values(low: float, high: float, nominal: float, *, wide: bool) -> FloatArray:
     """Values from low to high, of which one is the nominal one where it lies between."""
     if wide and high > 0:
         start = low if low > 0 else high * 1e-4
-        values = np.geomspace(start, high, samples)
+        values = np.geomspace(start, high, SAMPLES)
         values = np.append(low, values) if low < start else values
     else:
-        values = np.linspace(low, high, samples)
+        values = np.linspace(low, high, SAMPLES)
     return np.unique(np.append(values, nominal)) if low < nominal < high else values
 
 

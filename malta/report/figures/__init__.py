@@ -89,25 +89,26 @@ def stroke_figure(run: Trajectory, published: Published | None = None) -> Figure
 
 
 def save(figure: Figure, path: str | Path) -> Path:
-    """Write a figure as .png or .svg, whole or not at all; the same figure gives the same bytes."""
+    """Write a figure as .png, .svg or .pdf, whole or not at all; the same figure gives the same bytes."""
     path = Path(path)
     replace_files({path: encode_figure(figure, path)})
     return path
 
 
 def encode_figure(figure: Figure, path: Path) -> bytes:
-    """The content of a .png or .svg file of a figure. Raises InputError for another suffix of its path."""
+    """The content of a .png, .svg or .pdf file of a figure. Raises InputError for another suffix of its path."""
     import matplotlib
 
     from malta.report.figures.inline import png_of
 
-    if path.suffix not in (".png", ".svg"):
-        raise InputError(path, "", f"suffix {path.suffix!r}", "one of .png, .svg")
+    if path.suffix not in (".png", ".svg", ".pdf"):
+        raise InputError(path, "", f"suffix {path.suffix!r}", "one of .png, .svg, .pdf")
     if path.suffix == ".png":
         return png_of(figure)
     buffer = io.BytesIO()
-    with matplotlib.rc_context({"svg.hashsalt": "malta", "svg.fonttype": "none"}):
-        figure.savefig(buffer, format="svg", metadata={"Date": None})
+    date = {"Date": None} if path.suffix == ".svg" else {"CreationDate": None}
+    with matplotlib.rc_context({"svg.hashsalt": "malta", "svg.fonttype": "none", "pdf.fonttype": 42}):
+        figure.savefig(buffer, format=path.suffix[1:], metadata=date)
     return buffer.getvalue()
 
 

@@ -198,7 +198,7 @@ def root_locus(
     axes, reach : as those of `pzmap`; the right panel shows the poles slower than `reach`
 
     Small circles: the lowest value; triangles: the highest; crosses: the nominal machine. Text: the values at which the
-    loop becomes stable or unstable. One loop, or its RootLocus, at a time.
+    loop becomes stable or unstable. One loop at a time; or a RootLocus, and the curves of its loop for `controller`.
 
     Example: `malta.report.root_locus(plant, controller, parameter="m")`
     """
@@ -218,7 +218,8 @@ def root_locus(
     whole = _whole(_finite(found.poles.ravel()), [found.sample_time])
     slow = reach
     if slow is None:
-        slow = whole if isinstance(source, RootLocus) else _reach({"": loop_curves(source, controller)})
+        loop = controller if isinstance(source, RootLocus) else loop_curves(source, controller)
+        slow = whole if loop is None else _reach({"": loop})
     for (panel,), size in zip(sheet.panels, [whole, min(slow, whole)][-len(sheet.panels) :], strict=True):
         _draw_plane(panel, 1.08 * size, [found.sample_time])
         _draw_branches(panel, found, 1.08 * size)

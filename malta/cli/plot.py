@@ -1,0 +1,287 @@
+"""`malta plot`: the plots of a control engineer of one or several gain files."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, cast
+
+import typer
+
+from malta.cli.assignments import NUMBER, read_assignments
+from malta.cli.inputs import change_machine, read_controller
+from malta.cli.options import AsJson, Changes, GainFile, MachineFile
+from malta.cli.output import make_console, print_json, print_note, print_written, progress_bar
+from malta.errors import InputError
+from malta.files import locate
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from malta.margins.curves import LoopCurves
+    from malta.margins.linear_loops import Place
+    from malta.margins.locus import RootLocus
+    from malta.model.plant import Plant
+    from malta.synthesis.controller import Controller
+
+KINDS = ("bode", "nyquist", "nichols", "pzmap", "sigma", "sensitivity", "gang", "step", "load", "rootlocus")
+LOCUS = "rootlocus"
+GAIN = "gain"
+SUFFIXES = (".png", ".svg", ".pdf")
+Machines = Mapping[str, tuple["Plant", "Controller"]]  # by the names of their loops
+
+
+class Picture(NamedTuple):
+    """A figure with the name that its file gets: NAME_KIND."""
+
+    name: str
+    figure: Figure
+
+
+def plot(
+    gains: GainFile,
+    kinds: Annotated[
+        list[str], typer.Argument(metavar="KIND...", help=f"One or more of: {', '.join(KINDS)}.")
+    ],
+    others: Annotated[
+        list[Path] | None,
+        typer.Option("--with", metavar="GAINS", help="Another gain file, laid over the first. Repeatable."),
+    ] = None,
+    channel: Annotated[
+        list[str] | None, typer.Option(metavar="NAME", help="A channel to draw. Repeatable. [all]")
+    ] = None,
+    at: Annotated[str, typer.Option(help="Where the loop is cut: sensors or forces.")] = "sensors",
+    parameter: Annotated[
+        str | None,
+        typer.Option(metavar="NAME", help="Root locus: a parameter of the machine, or gain. [gain]"),
+    ] = None,
+    span: Annotated[
+        str | None,
+        typer.Option(
+            "--range",
+            metavar="LOW..HIGH",
+            help="Root locus: multiples of the nominal value, or values with units. [0.5..1.5, gain 0.1..10]",
+        ),
+    ] = None,
+    change: Changes = None,
+    machine: MachineFile = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE|FOLDER", help="A .png, .svg or .pdf file, or a folder. [build/NAME_KIND.png]"
+        ),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Draw the loop of a gain file: one channel at a time with the others closed, margins where they are read.
+
+    bode, nyquist, nichols: loop gain with margins. sigma: singular values of L, S, T. sensitivity: |S|, |T| with the
+    zones of ISO 14839-3. gang: gang of four. pzmap: poles and zeros. step: references. load: 1 N or 1 N m from
+    outside, and compliance. rootlocus: poles over the loop gain or a parameter.
+
+    The loop is the machine's: sampled, with hold, delay and current loops. The machine is the one in the file, with
+    the changes given by --set.
+
+    \b
+    Examples:  malta plot design/gains/robust.json bode nyquist --with design/gains/table2.json
+               malta plot design/gains/robust.json rootlocus --parameter m --range 0.2..2
+    """
+    _require_kinds(kinds, at, out, parameter, span)
+    machines = _read_machines([gains, *(locate(path) for path in others or ())], machine, change)
+    from malta.margins.curves import loop_curves
+    from malta.report.plots.parts import chosen_channels
+
+    place = cast("Place", at)
+    loops = {name: loop_curves(*pair, name=name) for name, pair in machines.items()}
+    channels = _channels(loops, kinds, channel, place)
+    loci = _loci(machines, parameter or GAIN, span, channels, quiet=as_json) if LOCUS in kinds else ()
+    names = [*dict.fromkeys(kinds)]
+    pictures = _draw(loops, names, channels, place, loci)
+    files = _save(pictures, out)
+    if as_json:
+        from malta.cli.plot_documents import locus_document, loop_document
+
+        shown = channels or [name for name, _ in chosen_channels(loops, None, place)]
+        shown = [
+            *shown,
+            *(s.name for curves in loops.values() for s in curves.loop.outputs if channels is None),
+        ]
+        documents = [loop_document(curves, names, shown, place) for curves in loops.values()]
+        roots = {LOCUS: [locus_document(found) for found in loci]} if loci else {}
+        print_json({"files": [str(file) for file in files], "at": at, "loops": documents} | roots)
+    else:
+        print_written(make_console(), files)
+    for name, curves in loops.items():
+        if not curves.stable:
+            print_note(f"{name}: the loop is unstable")
+
+
+def _require_kinds(
+    kinds: Sequence[str], at: str, out: Path | None, parameter: str | None, span: str | None
+) -> None:
+    """Raise InputError for an unknown kind or place, options without a root locus, and a file for several pictures."""
+    for kind in kinds:
+        if kind not in KINDS:
+            raise InputError("plot", "KIND", repr(kind), "one of " + " ".join(KINDS))
+    if at not in ("sensors", "forces"):
+        raise InputError("--at", "", repr(at), "sensors or forces")
+    for option, given in (("--parameter", parameter), ("--range", span)):
+        if given is not None and LOCUS not in kinds:
+            raise InputError(option, "", f"no {LOCUS} among the kinds", f"{LOCUS}, which it is for")
+    if out is not None and out.suffix and out.suffix not in SUFFIXES and not out.is_dir():
+        raise InputError("--out", "", str(out), "a folder, or a file " + ", ".join(SUFFIXES))
+    if out is not None and out.suffix in SUFFIXES and len({*kinds}) > 1:
+        raise InputError("--out", "", f"one file for {len({*kinds})} pictures", "a folder")
+
+
+def _read_machines(files: Sequence[Path], machine: Path | None, change: list[str] | None) -> Machines:
+    """Machines and controllers by the names of the designs; designs of one name get those of their files."""
+    from malta.model.data import plant_of
+
+    controllers = [read_controller(file, machine) for file in files]
+    names = [c.name for c in controllers]
+    if len({*names}) < len(names):
+        names = [str(file) for file in files]
+    if len({*names}) < len(names):
+        raise InputError("--with", "", "the same gain file twice", "other gain files")
+    plants = [plant_of(change_machine(c.parameters, change)) for c in controllers]
+    return dict(zip(names, zip(plants, controllers, strict=True), strict=True))
+
+
+def _channels(
+    loops: Mapping[str, LoopCurves], kinds: Sequence[str], named: list[str] | None, at: Place
+) -> list[str] | None:
+    """The channels that were named; None: all. Raises InputError for a name that no plot of these kinds has."""
+    if not named:
+        return None
+    signals = {
+        s.name
+        for curves in loops.values()
+        for s in (*curves.channels(at), *(curves.loop.outputs if {"gang", "step", "load"} & {*kinds} else ()))
+    }
+    for name in named:
+        if name not in signals:
+            known = dict.fromkeys(s.name for curves in loops.values() for s in curves.channels(at))
+            raise InputError("--channel", "", repr(name), "one of " + " ".join(known))
+    return named
+
+
+def _loci(
+    machines: Machines, parameter: str, span: str | None, channels: list[str] | None, *, quiet: bool
+) -> Sequence[RootLocus]:
+    """The root locus of each loop, behind a progress bar."""
+    from malta.margins.locus import root_locus
+
+    if channels is not None and len(channels) > 1 and parameter == GAIN:
+        raise InputError(
+            "--channel", "", f"{len(channels)} channels", f"one for a {LOCUS} over the gain, or none"
+        )
+    only = channels[0] if channels and parameter == GAIN else None
+    found = []
+    for name, (plant, controller) in machines.items():
+        low, high = _read_span(plant, parameter, span)
+        with progress_bar(f"root locus of {name}", quiet=quiet) as progress:
+            found.append(
+                root_locus(
+                    plant,
+                    controller,
+                    parameter=parameter,
+                    low=low,
+                    high=high,
+                    channel=only,
+                    name=name,
+                    progress=progress,
+                )
+            )
+    return found
+
+
+def _read_span(plant: Plant, parameter: str, span: str | None) -> tuple[float | None, float | None]:
+    """Both ends of a range in SI: multiples of the nominal value where neither has a unit. Raises InputError."""
+    from malta.model.parameters import units_of
+
+    units = units_of(plant.parameters) | {GAIN: "1"}
+    if parameter not in units:
+        raise InputError(
+            "--parameter", "", repr(parameter), "one of " + " ".join([GAIN, *units_of(plant.parameters)])
+        )
+    if span is None:
+        return None, None
+    ends = span.split("..")
+    numbers = [re.fullmatch(NUMBER, end.strip()) for end in ends]
+    if len(ends) != 2 or None in numbers:
+        raise InputError("--range", "", repr(span), "LOW..HIGH, as 0.5..1.5 or 0.2kg..0.5kg")
+    plain = all(number is not None and not number[2] for number in numbers)
+    nominal = 1.0 if parameter == GAIN else float(getattr(plant.parameters, parameter))
+    if plain and nominal == 0:
+        unit = units[parameter]
+        raise InputError(
+            "--range", "", f"multiples of {parameter}, which is 0", f"values with a unit, as 1{unit}"
+        )
+    if plain:
+        low, high = sorted(float(cast("re.Match[str]", number)[1]) * nominal for number in numbers)
+    else:
+        low, high = (
+            read_assignments("--range", [f"{parameter}={end.strip()}"], units)[parameter] for end in ends
+        )
+    if not low < high:
+        raise InputError("--range", "", repr(span), "a lower value, then a higher one")
+    return low, high
+
+
+def _draw(
+    loops: Mapping[str, LoopCurves],
+    kinds: Sequence[str],
+    channels: list[str] | None,
+    at: Place,
+    loci: Sequence[RootLocus],
+) -> list[Picture]:
+    """The pictures of all kinds; a root locus is drawn of each loop."""
+    from malta.report import plots
+
+    outputs = None
+    if channels is not None:
+        known = {s.name for curves in loops.values() for s in curves.loop.outputs}
+        outputs = [name for name in channels if name in known] or None
+    draw: Mapping[str, Callable[[], Any]] = {
+        "bode": lambda: plots.bode(loops, channel=channels, at=at),
+        "nyquist": lambda: plots.nyquist(loops, channel=channels, at=at),
+        "nichols": lambda: plots.nichols(loops, channel=channels, at=at),
+        "pzmap": lambda: plots.pzmap(loops),
+        "sigma": lambda: plots.sigma(loops, at=at),
+        "sensitivity": lambda: plots.sensitivity_curves(loops, channel=channels, at=at),
+        "gang": lambda: plots.gang_of_four(loops, channel=outputs),
+        "step": lambda: plots.step(loops, channel=outputs),
+        "load": lambda: plots.load_response(loops, channel=outputs),
+    }
+    first = next(iter(loops))
+    pictures = []
+    for kind in kinds:
+        if kind == LOCUS:
+            pictures += [
+                Picture(f"{found.name}_{LOCUS}", plots.root_locus(found, loops[found.name])) for found in loci
+            ]
+        else:
+            pictures.append(Picture(f"{first}_{kind}", draw[kind]()))
+    return pictures
+
+
+def _save(pictures: Sequence[Picture], out: Path | None) -> list[Path]:
+    """Write the pictures to the file that was named, or to a folder as NAME_KIND.png, all or none."""
+    from malta.files import replace_files
+    from malta.report import encode_figure
+
+    one = out is not None and out.suffix in SUFFIXES and not out.is_dir()
+    if one and len(pictures) > 1:
+        raise InputError("--out", "", f"one file for {len(pictures)} pictures", "a folder")
+    folder = Path("build") if out is None else out
+    paths = [cast("Path", out)] if one else [folder / f"{_file_name(p.name)}.png" for p in pictures]
+    contents = {path: encode_figure(p.figure, path) for path, p in zip(paths, pictures, strict=True)}
+    replace_files(contents)
+    return list(contents)
+
+
+def _file_name(name: str) -> str:
+    """The name of a loop as that of a file: a path of a gain file becomes one word."""
+    return re.sub(r"[^\w .,()\[\]$+-]", "_", name)[:120]
