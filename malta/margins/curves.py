@@ -37,8 +37,9 @@ if TYPE_CHECKING:
 BASE = 160  # frequencies of the logarithmic grid
 DECADES = 8.0  # at most
 BEYOND = 30.0  # times the slowest and the fastest pole
-TURN = 0.25  # |ln| of the ratio of neighbours, above which an interval is halved
-ROUNDS = 2  # of halving
+TURN = 0.15  # |ln| of the ratio of neighbours, above which an interval is halved
+NARROW = 5e-4  # of the frequency: intervals that are not halved, so that none falls on a pole on the axis
+ROUNDS = 3  # of halving
 MOST = 90  # frequencies that a round may add
 AROUND = np.array([-4.0, -2.0, -1.0, -0.5, 0.5, 1.0, 2.0, 4.0])  # half-widths of a resonance
 LIGHT = 0.5  # damping below which a pole makes a resonance
@@ -230,6 +231,7 @@ def _refined(loop: LinearLoop) -> LoopCurves:
                 np.mod(values[1:].imag - values[:-1].imag + np.pi, 2 * np.pi) - np.pi
             )
         coarse = np.nan_to_num(step, nan=0.0, posinf=0.0).max(axis=1)
+        coarse[np.diff(found.w) < NARROW * found.w[:-1]] = 0.0
         widest = np.argsort(-coarse)[:MOST]
         k = np.sort(widest[coarse[widest] > TURN])
         if not len(k):

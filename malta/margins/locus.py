@@ -31,7 +31,10 @@ if TYPE_CHECKING:
 GAIN = "gain"  # the name of the factor of the loop gain
 SAMPLES = 41
 MOST = 121  # samples with those of halved intervals
-FAR = 0.08  # how far a pole may move from sample to sample, of twice its distance from zero
+MOST_OF_GAIN = 401  # the same, where a sample costs no new model of the machine
+FAR = 0.12  # how far a pole may move from sample to sample, of its distance from zero
+SLOW = 1e-4  # of the fastest rate: poles that may move as far as one of this rate
+DELAY = 0.02  # |z| of poles that count as pure delay
 NEAR = 1e-4  # of the range: intervals that are not halved
 EXACT = 1e-8  # of the range: the accuracy of the values at which stability changes
 
@@ -87,8 +90,9 @@ def root_locus(
         raise InputError(
             "root locus", parameter, f"{low:g} to {high:g}", "a range from a lower to a higher value"
         )
+    most = MOST_OF_GAIN if parameter == GAIN else MOST
     first = _values(low, high, nominal, wide=parameter == GAIN)
-    values, found = _followed(_counted(matrix, progress), first, loop.sample_time)
+    values, found = _followed(_counted(matrix, most, progress), first, most, loop.sample_time)
     return RootLocus(
         loop.name,
         parameter,
@@ -105,8 +109,8 @@ def root_locus(
 Matrix = Callable[[float], "ComplexArray"]  # of a value: the eigenvalues of the closed loop, in differences
 
 
-def _counted(matrix: Matrix, progress: Callable[[float], None] | None) -> Matrix:
-    """The same function, which says after each new value how many of at most MOST there were."""
+def _counted(matrix: Matrix, most: int, progress: Callable[[float], None] | None) -> Matrix:
+    """The same function, which says after each new value how many of at most `most` there were."""
     if progress is None:
         return matrix
     seen: set[float] = set()
@@ -114,7 +118,7 @@ def _counted(matrix: Matrix, progress: Callable[[float], None] | None) -> Matrix
     def counted(value: float) -> ComplexArray:
         found = matrix(value)
         seen.add(value)
-        progress(min(len(seen) / MOST, 1.0))
+        progress(min(len(seen) / most, 1.0))
         return found
 
     return counted
@@ -169,23 +173,37 @@ def _values(low: float, high: float, nominal: float, *, wide: bool) -> FloatArra
     return np.unique(np.append(values, nominal)) if low < nominal < high else values
 
 
-def _followed(matrix: Matrix, values: FloatArray, T: float | None) -> tuple[FloatArray, ComplexArray]:
+def _followed(
+    matrix: Matrix, values: FloatArray, most: int, T: float | None
+) -> tuple[FloatArray, ComplexArray]:
     """All samples with their eigenvalues in the order of the branches; intervals are halved where poles move far."""
     known = values.tolist()
     found = _in_order([matrix(value) for value in known])
-    while len(known) < MOST:
-        rates = _in_rates(found, T)
-        # Not of poles next to pure delay, nor where ln(z) jumps from one edge of its strip to the other.
-        seen = np.where(np.abs(rates) < (np.inf if T is None else 2 / T), rates, np.nan)
-        moved = np.abs(np.diff(seen, axis=0)) / np.maximum(np.abs(seen[1:]) + np.abs(seen[:-1]), 1e-300)
-        far = np.flatnonzero(np.nan_to_num(moved).max(axis=1, initial=0.0) > FAR)
-        wide = [k for k in far.tolist() if known[k + 1] - known[k] > NEAR * (known[-1] - known[0])]
-        if not wide:
+    while len(known) < most:
+        moved = np.abs(np.diff(found, axis=0)) / _sizes(found, T)
+        worst = moved.max(axis=1, initial=0.0)
+        worst[np.diff(known) < NEAR * (known[-1] - known[0])] = 0.0
+        far = np.argsort(-worst)[: most - len(known)]
+        far = np.sort(far[worst[far] > FAR])
+        if not len(far):
             break
-        for k in reversed(wide[: MOST - len(known)]):
+        for k in reversed(far.tolist()):
             known.insert(k + 1, (known[k] + known[k + 1]) / 2)
         found = _in_order([matrix(value) for value in known])
     return np.array(known), found
+
+
+def _sizes(found: ComplexArray, T: float | None) -> FloatArray:
+    """The distance from zero frequency of the poles before each motion; in the plane of z also that from z = 0.
+
+    Poles next to pure delay have no size: they may move at will.
+    """
+    size = np.maximum(np.abs(found[:-1]), np.abs(found[1:]))
+    size = np.maximum(size, SLOW * size.max(initial=1e-300))
+    if T is None:
+        return np.asarray(size)
+    z = np.maximum(np.abs(1 + T * found[:-1]), np.abs(1 + T * found[1:]))
+    return np.asarray(np.where(z < DELAY, np.inf, np.minimum(size, z / T)))
 
 
 def _in_order(sets: list[ComplexArray]) -> ComplexArray:

@@ -20,6 +20,7 @@ from malta.report.plots.parts import (
     draw_level,
     finish_frequency,
     having,
+    head_of,
     loops_of,
     margins_text,
     mark,
@@ -40,7 +41,10 @@ if TYPE_CHECKING:
     from malta.margins.linear_loops import Place
     from malta.model.plant import FloatArray
 
+ALONE = "one loop at a time, the others closed"
 RANGE = (-100.0, 120.0)  # dB, of a loop gain that is drawn
+HALF = 170.0  # degrees, between neighbours: a pole on the axis
+ZERO = 0.1  # of the value beside it: a loop gain that counts as zero at the end of the grid
 Channel = str | Sequence[str] | None
 
 
@@ -60,7 +64,7 @@ def bode(
     """
     loops = loops_of(source, controller)
     chosen, styles = chosen_channels(loops, channel, at), styles_of(loops)
-    title = f"{title_of(loops)}: Bode plot {PLACES[at]}, one loop at a time, the others closed"
+    title = f"{title_of(loops)}: Bode plot {PLACES[at]}", ALONE
     sheet = new_sheet(title, loops, len(chosen), axes, stacked=2, height=1.75)
     for (name, _), (upper, lower) in zip(chosen, sheet.panels, strict=True):
         lines, shown = [], []
@@ -85,11 +89,19 @@ def title_of(loops: Mapping[str, LoopCurves]) -> str:
 
 
 def phase_of(w: FloatArray, gain: Any, margins: ChannelMargins) -> FloatArray:
-    """The unwrapped phase in degrees, within a half turn of -180 degrees at the gain crossing of the phase margin."""
-    phase = np.degrees(np.unwrap(np.angle(gain)))
+    """The unwrapped phase in degrees, within a half turn of -180 degrees at the gain crossing of the phase margin.
+
+    It falls by half a turn at a pole on the axis.
+    """
+    steps = np.mod(np.degrees(np.diff(np.angle(gain))) + 180, 360) - 180
+    phase = math.degrees(np.angle(gain[0])) + np.append(
+        0, np.cumsum(np.where(steps > HALF, steps - 360, steps))
+    )
     known = [c for c in margins.gain_crossings if c.frequency == margins.phase_frequency]
     crossing = known[0].frequency if known else float(w[len(w) // 2])
     at = float(np.interp(math.log(crossing), np.log(w), phase))
+    if abs(gain[-1]) < ZERO * abs(gain[-2]):  # a zero at the Nyquist frequency, where any phase is as good
+        phase[-1] = phase[-2]
     return np.asarray(phase - 360 * round((at + 180) / 360))
 
 
@@ -149,7 +161,7 @@ def sigma(source: Any, controller: Any = None, *, at: Place = "sensors", axes: A
     loops = loops_of(source, controller)
     chosen_channels(loops, None, at)
     styles = styles_of(loops)
-    title = f"{title_of(loops)}: singular values {PLACES[at]}, all channels, in SI units"
+    title = f"{title_of(loops)}: singular values {PLACES[at]}", "all channels together, in SI units"
     sheet = new_sheet(title, loops, 3, axes, height=3.1)
     for k, ((panel,), letter) in enumerate(zip(sheet.panels, "LST", strict=True)):
         lines = []
@@ -179,7 +191,8 @@ def _largest_text(curves: LoopCurves, values: FloatArray, letter: str) -> str:
     if not curves.stable:
         return "unstable"
     k = int(np.nanargmax(values))
-    return f"max {10 ** (values[k] / 20):.2f} ({values[k]:.1f} dB) at {rate_text(curves.w[k])}"
+    text = f"max {10 ** (values[k] / 20):.2f} ({values[k] + 0.0:.1f} dB) at {rate_text(curves.w[k])}"
+    return text.replace("-0.0", "0.0").replace("-", "−")
 
 
 def sensitivity_curves(
@@ -191,7 +204,10 @@ def sensitivity_curves(
     """
     loops = loops_of(source, controller)
     chosen, styles = chosen_channels(loops, channel, at), styles_of(loops)
-    title = f"{title_of(loops)}: sensitivity |S| above, |T| below, {PLACES[at]}; zones of ISO 14839-3"
+    title = (
+        f"{title_of(loops)}: sensitivities {PLACES[at]}",
+        "|S| above, with zones A to D of ISO 14839-3; |T| below",
+    )
     sheet = new_sheet(title, loops, len(chosen), axes, stacked=2, height=1.75)
     for (name, _), (upper, lower) in zip(chosen, sheet.panels, strict=True):
         lines, shown = [], []
@@ -213,8 +229,8 @@ def sensitivity_curves(
         for panel, letter in ((upper, "S"), (lower, "T")):
             panel.set_yscale("log")
             low, high = panel.get_ylim()
-            panel.set_ylim(max(low, 1e-3), max(min(high, 1e3), 8.0 if letter == "S" else 2.0))
-            finish_frequency(panel, shown, f"|{letter}|", labelled=panel is lower)
+            panel.set_ylim(min(max(low, 1e-3), 0.1), max(min(high, 1e3), 8.0 if letter == "S" else 2.0))
+            finish_frequency(panel, shown, f"|{letter}| [-]", labelled=panel is lower)
             draw_level(panel, 1)
         write_above(upper, name, lines)
     return sheet.figure
@@ -264,7 +280,7 @@ def gang_of_four(source: Any, controller: Any = None, *, channel: Channel = None
         for k, (panel, head) in enumerate(zip(panels, heads, strict=True)):
             panel.set_yscale("log")
             low, high = panel.get_ylim()
-            panel.set_ylim(max(low, high / 1e7), high * 1.3)
+            panel.set_ylim(min(max(low, high / 1e7), high / 30), high * 1.3)
             if k < 2:
                 draw_level(panel, 1)
             finish_frequency(panel, shown, "", labelled=row == len(chosen) - 1)
@@ -275,18 +291,19 @@ def gang_of_four(source: Any, controller: Any = None, *, channel: Channel = None
 def _ratio(upper: str, lower: str) -> str:
     """A unit over another."""
     if upper == lower:
-        return "1"
+        return "-"
     return f"{upper}/({lower})" if " " in lower else f"{upper}/{lower}"
 
 
 def _gang_sheet(loops: Mapping[str, LoopCurves], count: int, axes: Any) -> Sheet:
     """Four panels in a row for each channel."""
     if axes is not None:
-        return new_sheet("", loops, 4 * count, axes)
-    height = 1.1 + 2.05 * count
-    title = f"{title_of(loops)}: gang of four at the sensors, each channel with the force of its axis"
+        return new_sheet(("", ""), loops, 4 * count, axes)
+    head = head_of(loops) + 0.2
+    height = head + 0.35 + 2.05 * count
     figure = new_figure(
-        title, size=(13.0, height), left=0.045, right=0.99, bottom=0.5 / height, top=1 - 0.85 / height,
+        f"{title_of(loops)}: gang of four at the sensors", "each channel with the force of its axis",
+        size=(13.0, height), left=0.045, right=0.99, bottom=0.5 / height, top=1 - head / height,
         wspace=0.2, hspace=0.33,
     )  # fmt: skip
     add_legend(figure, loops, height)

@@ -84,7 +84,7 @@ def having(
 
 
 def new_sheet(
-    title: str,
+    title: tuple[str, str],
     loops: Mapping[str, LoopCurves],
     count: int,
     axes: Any,
@@ -96,6 +96,7 @@ def new_sheet(
 ) -> Sheet:
     """A sheet of `count` channels, or the axes of the caller as one.
 
+    title : and the line below it
     stacked : panels of one channel, above each other
     height : inch, of a panel
     lines : of text above each channel; None: its name, and one for each loop
@@ -115,11 +116,11 @@ def new_sheet(
     columns = min(count, 3) if count != 4 else 2
     blocks = math.ceil(count / columns)
     lines = 1 + min(len(loops), MOST_LINES) if lines is None else lines
-    head, foot, above = 0.62, 0.5, LINE * lines + 0.08
+    head, foot, above = head_of(loops), 0.5, LINE * lines + 0.08
     gap = foot + 0.1 if ticks else 0.12
     each = above + height * stacked + gap * (stacked - 1) + foot
     width, whole = {1: 7.5, 2: 9.5}.get(columns, 12.0), head + each * blocks
-    figure = new_figure(title, size=(width, whole))
+    figure = new_figure(*title, size=(width, whole))
     add_legend(figure, loops, whole)
     left, right = 0.72 / width, 1 - 0.4 / width
     panels = []
@@ -140,6 +141,11 @@ def new_sheet(
     return Sheet(figure, panels)
 
 
+def head_of(loops: Mapping[str, LoopCurves]) -> float:
+    """The height of the title, the line below it and the legend, inch."""
+    return 0.52 if len(loops) < 2 else 0.75 + 0.18 * ((len(loops) - 1) // 4)
+
+
 def add_legend(figure: Figure, loops: Mapping[str, LoopCurves], height: float) -> None:
     """A legend of the loops below the title, where there are several."""
     if len(loops) < 2:
@@ -153,7 +159,7 @@ def add_legend(figure: Figure, loops: Mapping[str, LoopCurves], height: float) -
         [plain(name) for name in names],
         ncols=min(len(loops), 4),
         loc="upper center",
-        bbox_to_anchor=(0.5, 1 - 0.3 / height),
+        bbox_to_anchor=(0.5, 1 - 0.45 / height),
         frameon=False,
         fontsize=8.5,
         handlelength=3.0,
@@ -208,11 +214,15 @@ def rate_text(w: float) -> str:
 
 def finish_frequency(axes: Axes, loops: Iterable[LoopCurves], y: str, *, labelled: bool = True) -> None:
     """A logarithmic axis of frequency that ends where the curves do, with a grid; `labelled`: with its label."""
+    from matplotlib.ticker import NullFormatter
+
     shown = list(loops)
     axes.set_xscale("log")
     axes.set_xlim(min(_lowest(curves) for curves in shown), max(float(curves.w[-1]) for curves in shown))
     draw_grid(axes)
     axes.tick_params(labelsize=8)
+    axes.xaxis.set_minor_formatter(NullFormatter())
+    axes.yaxis.set_minor_formatter(NullFormatter())
     axes.set_ylabel(plain(y), fontsize=8.5)
     if labelled:
         axes.set_xlabel("frequency [rad/s]", fontsize=8.5)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from malta.margins.locus import GAIN, RootLocus
 from malta.margins.locus import root_locus as locus_of
 from malta.report.figures.parts import new_figure, number
 from malta.report.plots.frequency import title_of
-from malta.report.plots.parts import Sheet, add_legend, loops_of, plain, styles_of
+from malta.report.plots.parts import Sheet, add_legend, head_of, loops_of, plain, styles_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -42,17 +42,18 @@ def pzmap(source: Any, controller: Any = None, *, axes: Any = None, reach: float
     Example: `malta.report.pzmap({"old": (plant, old), "new": (plant, new)})`
     """
     loops = loops_of(source, controller)
-    sheet = _plane_sheet(f"{title_of(loops)}: poles and zeros", loops, axes)
     styles = styles_of(loops)
-    everything = [_finite(p) for curves in loops.values() for p in (*curves.poles.values(), curves.zeros)]
+    everything = np.concatenate(
+        [_finite(p) for curves in loops.values() for p in (*curves.poles.values(), curves.zeros)]
+    )
     times = [curves.loop.sample_time for curves in loops.values()]
-    whole = _whole(np.concatenate(everything), times)
-    slow = _reach(loops) if reach is None else reach
-    reaches = [whole, min(slow, whole)][-len(sheet.panels) :]
+    reaches = _reaches(everything, times, _reach(loops) if reach is None else reach)
+    sheet, reaches = _plane_sheet((f"{title_of(loops)}: poles and zeros", ""), loops, axes, reaches)
     for (panel,), size in zip(sheet.panels, reaches, strict=True):
-        _draw_plane(panel, 1.08 * size, times)
+        window = Window.about(everything, size)
+        _draw_plane(panel, window, times)
         for name, curves in loops.items():
-            _draw_poles(panel, curves, styles[name], 1.08 * size)
+            _draw_poles(panel, curves, styles[name], window)
     _explain(sheet, [("x", "closed loop"), ("+", "plant"), ("o", "zero of L")])
     return sheet.figure
 
@@ -73,33 +74,58 @@ def _reach(loops: Mapping[str, LoopCurves]) -> float:
     return NEAR * max(crossings) if crossings else math.inf
 
 
-def _plane_sheet(title: str, loops: Mapping[str, LoopCurves], axes: Any) -> Sheet:
-    """Two panels, or the axes of the caller."""
+def _reaches(poles: ComplexArray, times: Sequence[float | None], slow: float) -> list[float]:
+    """The sizes of the panels of all poles and of the slow ones, rad/s; one where they are nearly the same."""
+    whole = _whole(poles, times)
+    return [whole, slow] if slow < 0.8 * whole else [whole]
+
+
+class Window(NamedTuple):
+    """The part of the plane that a panel shows, rad/s."""
+
+    left: float
+    right: float
+    height: float  # either way
+
+    @classmethod
+    def about(cls, poles: ComplexArray, reach: float) -> Window:
+        """The left half plane to a reach, and as much of the right one as holds the unstable poles."""
+        near = poles[np.abs(poles) <= 1.001 * reach]
+        right = max(0.3 * reach, 1.15 * float(near.real.max(initial=0.0)))
+        return cls(-1.08 * reach, right, (1.08 * reach + right) / 2)
+
+    def inside(self, values: ComplexArray) -> ComplexArray:
+        """The poles that lie in the window."""
+        fine = _finite(values)
+        kept = (fine.real > self.left) & (fine.real < self.right) & (np.abs(fine.imag) < self.height)
+        return fine[kept]
+
+
+def _plane_sheet(
+    title: tuple[str, str], loops: Mapping[str, LoopCurves], axes: Any, reaches: list[float]
+) -> tuple[Sheet, list[float]]:
+    """A panel for each reach, or the axes of the caller for the last of them."""
     if axes is not None:
         given = list(np.ravel(np.asarray(axes, dtype=object)))
         if len(given) not in (1, 2):
             raise InputError("plot", "axes", str(len(given)), "two, or one for the slow poles")
         figure: Figure = given[0].figure
-        return Sheet(figure, [(panel,) for panel in given])
-    height = 5.4
+        return Sheet(figure, [(panel,) for panel in given]), [*reaches, reaches[-1]][-len(given) :]
+    width, height = 5.6 * len(reaches), 5.0 + head_of(loops)
     figure = new_figure(
-        title,
-        size=(10.5, height),
-        left=0.075,
-        right=0.98,
-        bottom=0.52 / height,
-        top=1 - 0.92 / height,
-        wspace=0.2,
-    )
+        *title, size=(width, height), left=0.8 / width, right=1 - 0.2 / width,
+        bottom=0.52 / height, top=1 - (head_of(loops) + 0.25) / height, wspace=0.2,
+    )  # fmt: skip
     add_legend(figure, loops, height)
-    return Sheet(figure, [(panel,) for panel in figure.subplots(1, 2)])
+    return Sheet(figure, [(panel,) for panel in np.ravel(figure.subplots(1, len(reaches)))]), reaches
 
 
-def _draw_plane(axes: Axes, reach: float, times: Sequence[float | None]) -> None:
+def _draw_plane(axes: Axes, window: Window, times: Sequence[float | None]) -> None:
     """Axes of equal scale with a grid of damping and frequency, the unstable half grey, and the Nyquist frequency."""
-    right = 0.3 * reach
-    axes.set_xlim(-reach, right)
-    axes.set_ylim(-0.65 * reach, 0.65 * reach)
+    left, right, height = window
+    reach = -left
+    axes.set_xlim(left, right)
+    axes.set_ylim(-height, height)
     axes.set_box_aspect(1)
     axes.axvspan(0, right, color="#f3f3f3", zorder=0)
     axes.axvline(0, color="#000000", linewidth=0.9, zorder=1)
@@ -107,22 +133,22 @@ def _draw_plane(axes: Axes, reach: float, times: Sequence[float | None]) -> None
     small: dict[str, Any] = {"fontsize": 7, "color": "#8a8a8a"}
     for damping in DAMPING:
         slope = math.sqrt(1 - damping**2) / damping
-        end = min(reach, 0.65 * reach / slope)
+        end = min(reach, height / slope)
         for sign in (1, -1):
             axes.plot([0, -end], [0, sign * slope * end], color=GREY, linewidth=0.8, zorder=0.5)
         axes.annotate(f"ζ {damping:g}", (-0.8 * end, 0.8 * slope * end), ha="center", va="center",
                       bbox={"facecolor": "#ffffff", "edgecolor": "none", "pad": 0.3}, **small)  # fmt: skip
     turn = np.linspace(np.pi / 2, 3 * np.pi / 2, 121)
     step = _round(reach / 3)
-    for radius in np.arange(step, reach * 1.19, step).tolist():
+    for radius in np.arange(step, math.hypot(reach, height), step).tolist():
         x, y = radius * np.cos(turn), radius * np.sin(turn)
-        inside = (x > -reach) & (np.abs(y) < 0.65 * reach)
+        inside = (x > -reach) & (np.abs(y) < height)
         axes.plot(
             np.where(inside, x, np.nan), np.where(inside, y, np.nan), color=GREY, linewidth=0.8, zorder=0.5
         )
     for T in dict.fromkeys(times):
         for level in () if T is None else (np.pi / T, -np.pi / T):
-            if abs(level) < 0.65 * reach:
+            if abs(level) < height:
                 axes.axhline(level, color="#9a9a9a", linestyle=(0, (8, 3)), linewidth=0.9)
     axes.tick_params(labelsize=8)
     for edge in ("top", "right"):
@@ -138,7 +164,7 @@ def _round(value: float) -> float:
     return power * max(m for m in (1, 2, 5) if m * power <= value)
 
 
-def _draw_poles(axes: Axes, curves: LoopCurves, style: Mapping[str, Any], reach: float) -> None:
+def _draw_poles(axes: Axes, curves: LoopCurves, style: Mapping[str, Any], window: Window) -> None:
     """Poles and zeros of one loop that lie within the axes."""
     colour = style["color"]
     drawn: tuple[tuple[ComplexArray, dict[str, Any]], ...] = (
@@ -150,14 +176,8 @@ def _draw_poles(axes: Axes, curves: LoopCurves, style: Mapping[str, Any], reach:
         (curves.zeros, {"marker": "o", "markersize": 5.5, "markerfacecolor": "none", "markeredgewidth": 0.9}),
     )
     for values, look in drawn:
-        shown = within(values, reach)
+        shown = window.inside(values)
         axes.plot(shown.real, shown.imag, linestyle="none", color=colour, **look)
-
-
-def within(values: ComplexArray, reach: float) -> ComplexArray:
-    """The poles that lie within the axes of a plane of this reach."""
-    fine = values[np.isfinite(values)]
-    return fine[(fine.real > -reach) & (fine.real < 0.3 * reach) & (np.abs(fine.imag) < 0.65 * reach)]
 
 
 def _explain(sheet: Sheet, marks: Sequence[tuple[str, str]]) -> None:
@@ -209,22 +229,19 @@ def root_locus(
     gain = f"the gain of {channel}" if channel else "the loop gain"
     what = gain if found.parameter == GAIN else found.parameter
     ends = f"{found.values[0]:.4g} … {found.values[-1]:.4g}{unit}"
-    title = plain(f"{found.name}: root locus over {what}, {ends}")
-    sheet = _plane_sheet(title, {}, axes)
-    figure = sheet.figure
-    if axes is None:
-        height = figure.get_figheight()
-        figure.text(0.075, 1 - 0.62 / height, plain(_changes_text(found, unit)), fontsize=9, color="#4a4a4a")
-    whole = _whole(_finite(found.poles.ravel()), [found.sample_time])
+    title = plain(f"{found.name}: root locus over {what}, {ends}"), plain(_changes_text(found, unit))
     slow = reach
     if slow is None:
         loop = controller if isinstance(source, RootLocus) else loop_curves(source, controller)
-        slow = whole if loop is None else _reach({"": loop})
-    for (panel,), size in zip(sheet.panels, [whole, min(slow, whole)][-len(sheet.panels) :], strict=True):
-        _draw_plane(panel, 1.08 * size, [found.sample_time])
-        _draw_branches(panel, found, 1.08 * size)
+        slow = math.inf if loop is None else _reach({"": loop})
+    drawn, times = _finite(found.poles.ravel()), [found.sample_time]
+    sheet, reaches = _plane_sheet(title, {}, axes, _reaches(drawn, times, slow))
+    for (panel,), size in zip(sheet.panels, reaches, strict=True):
+        window = Window.about(drawn, size)
+        _draw_plane(panel, window, times)
+        _draw_branches(panel, found, window)
     _explain(sheet, [("o", "lowest value"), ("x", "nominal"), (">", "highest value")])
-    return figure
+    return sheet.figure
 
 
 def _changes_text(found: RootLocus, unit: str) -> str:
@@ -236,7 +253,7 @@ def _changes_text(found: RootLocus, unit: str) -> str:
     return f"{'stable' if stable else 'UNSTABLE'} over the whole range"
 
 
-def _draw_branches(axes: Axes, found: RootLocus, reach: float) -> None:
+def _draw_branches(axes: Axes, found: RootLocus, window: Window) -> None:
     """Lines that are interrupted where ln(z) jumps from one edge of its strip to the other."""
     strip = np.inf if found.sample_time is None else np.pi / found.sample_time
     for branch in found.poles.T:
@@ -254,5 +271,5 @@ def _draw_branches(axes: Axes, found: RootLocus, reach: float) -> None:
         (found.nominal_poles, {"marker": "x", "markersize": 6.5, "markeredgewidth": 1.6, "color": colour}),
     )
     for values, look in drawn:
-        shown = within(values, reach)
+        shown = window.inside(values)
         axes.plot(shown.real, shown.imag, linestyle="none", zorder=4, **look)

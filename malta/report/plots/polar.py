@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from malta.report.figures.parts import BOUND, draw_grid
-from malta.report.plots.frequency import Channel, phase_of, title_of
+from malta.report.plots.frequency import ALONE, Channel, phase_of, title_of
 from malta.report.plots.parts import (
     PLACES,
     chosen_channels,
@@ -52,7 +52,7 @@ def nyquist(
     """
     loops = loops_of(source, controller)
     chosen, styles = chosen_channels(loops, channel, at), styles_of(loops)
-    title = f"{title_of(loops)}: Nyquist plot {PLACES[at]}, one loop at a time; N turns about −1, P unstable poles"
+    title = f"{title_of(loops)}: Nyquist plot {PLACES[at]}", f"{ALONE}; N turns about −1, P unstable poles"
     sheet = new_sheet(title, loops, len(chosen), axes, height=3.3)
     for (name, _), (panel,) in zip(chosen, sheet.panels, strict=True):
         found = list(having(loops, name, at))
@@ -72,8 +72,8 @@ def nyquist(
         panel.set_aspect("equal", adjustable="box")
         draw_grid(panel)
         panel.tick_params(labelsize=8)
-        panel.set_xlabel("real part of L", fontsize=8.5)
-        panel.set_ylabel("imaginary part of L", fontsize=8.5)
+        panel.set_xlabel("real part of L [-]", fontsize=8.5)
+        panel.set_ylabel("imaginary part of L [-]", fontsize=8.5)
         write_above(panel, name, lines)
     return sheet.figure
 
@@ -155,7 +155,7 @@ def nichols(
     """
     loops = loops_of(source, controller)
     chosen, styles = chosen_channels(loops, channel, at), styles_of(loops)
-    title = f"{title_of(loops)}: Nichols chart {PLACES[at]}, one loop at a time, the others closed"
+    title = f"{title_of(loops)}: Nichols chart {PLACES[at]}", f"{ALONE}; light: |T|"
     sheet = new_sheet(title, loops, len(chosen), axes, height=3.3)
     for (name, _), (panel,) in zip(chosen, sheet.panels, strict=True):
         lines, phases = [], []

@@ -39,6 +39,7 @@ if TYPE_CHECKING:
 
 SHOWN = 1.6  # times the longest settling time
 LONGEST = 60.0  # times the shortest rise or time to the peak
+FEW = 60  # samples in a window: each gets a dot
 POINTS = 1500  # of a line
 TIMES = (("s", 1.0), ("ms", 1e-3), ("µs", 1e-6))
 
@@ -55,19 +56,22 @@ def step(source: Any, controller: Any = None, *, channel: Channel = None, axes: 
     loops = loops_of(source, controller)
     chosen, styles = chosen_channels(loops, channel, "sensors"), styles_of(loops)
     answers = {name: loop_steps(curves.loop).references for name, curves in loops.items()}
-    sheet = new_sheet(
-        f"{title_of(loops)}: step of each reference, linear loop", loops, len(chosen), axes, height=2.3
+    title = (
+        f"{title_of(loops)}: step of each reference",
+        "linear loop, without limits and feedforward of rates",
     )
+    sheet = new_sheet(title, loops, len(chosen), axes, height=2.3)
     for (name, unit), (panel,) in zip(chosen, sheet.panels, strict=True):
         rows = [(loop, answers[loop], k, k) for loop, _, k, _ in having(loops, name, "sensors")]
         figures = [step_figures(answer, k, column) for _, answer, k, column in rows]
         window = _window(rows, figures)
         lines = []
         for (loop, answer, k, column), found in zip(rows, figures, strict=True):
-            _draw_answer(panel, answer, k, column, window, styles[loop])
+            _draw_answer(panel, answer, k, column, window, _dotted(styles[loop], loops[loop], window))
             _mark_step(panel, answer, k, found, styles[loop])
             lines.append((_step_text(found), styles[loop]["color"]))
         draw_level(panel, 1)
+        _hold_range(panel, rows, window)
         _finish_time(panel, window, f"{name} over its reference [{_over(unit, unit)}]")
         write_above(panel, name, lines)
     return sheet.figure
@@ -75,7 +79,7 @@ def step(source: Any, controller: Any = None, *, channel: Channel = None, axes: 
 
 def _over(upper: str, lower: str) -> str:
     if upper == lower:
-        return "1" if upper == "1" else f"{upper}/{lower}"
+        return "-" if upper == "1" else f"{upper}/{lower}"
     return micro(upper if lower == "1" else f"{upper}/({lower})" if " " in lower else f"{upper}/{lower}")
 
 
@@ -119,6 +123,12 @@ def _draw_answer(
     axes.plot(t, scale * y, **style)
 
 
+def _dotted(style: Mapping[str, Any], curves: LoopCurves, window: float) -> Mapping[str, Any]:
+    """The style of a line, with a dot at each sample where a window has few."""
+    T = curves.loop.sample_time
+    return style if T is None or window / T > FEW else {**style, "marker": ".", "markersize": 4}
+
+
 def _mark_step(
     axes: Axes, answer: StepResponse, k: int, found: StepFigures, style: Mapping[str, Any]
 ) -> None:
@@ -135,6 +145,21 @@ def _mark_step(
         axes.plot(
             2 * [found.settling], np.array([0.95, 1.05]) * found.final, **thin(style) | {"linewidth": 1.4}
         )
+
+
+def _hold_range(
+    axes: Axes, rows: Sequence[tuple[str, StepResponse, int, int]], window: float, scale: float = 1.0
+) -> None:
+    """Keep the stable answers visible beside unstable ones, which leave the axes."""
+    values = [
+        scale * answer.y[answer.t <= window, k, column]
+        for _, answer, k, column in rows
+        if math.isfinite(answer.final[k, column])
+    ]
+    if 0 < len(values) < len(rows):
+        known = np.concatenate(values)
+        reach = float(known.max() - min(known.min(), 0.0)) or 1.0
+        axes.set_ylim(float(min(known.min(), 0.0)) - 0.6 * reach, float(known.max()) + 0.6 * reach)
 
 
 def _finish_time(axes: Axes, window: float, y: str) -> None:
@@ -169,7 +194,10 @@ def load_response(
     answers = {name: loop_steps(curves.loop).loads for name, curves in loops.items()}
     pairs = _pairs(loops, answers, channel)
     styles = styles_of(loops)
-    title = f"{title_of(loops)}: a constant load of one unit from outside, above; compliance, below"
+    title = (
+        f"{title_of(loops)}: loads from outside",
+        "above: constant, one unit; below: compliance over frequency",
+    )
     sheet = new_sheet(title, loops, len(pairs), axes, stacked=2, height=1.85, ticks=True)
     for (load, output), (upper, lower) in zip(pairs, sheet.panels, strict=True):
         rows, units, shown = [], ("1", "1"), []
@@ -187,7 +215,7 @@ def load_response(
         lines = []
         for (name, answer, k, column), found_figures, curves in zip(rows, figures, shown, strict=True):
             style = styles[name]
-            _draw_answer(upper, answer, k, column, window, style, scale)
+            _draw_answer(upper, answer, k, column, window, _dotted(style, curves, window), scale)
             size = np.abs(curves.responses.compliance[:, k, column]) * scale
             lower.plot(curves.w, size, **style)
             lines.append(
@@ -196,6 +224,7 @@ def load_response(
             if curves.stable:
                 mark(upper, found_figures.peak_time, found_figures.peak * scale, style)
                 mark(lower, curves.w[int(size.argmax())], size.max(), style)
+        _hold_range(upper, rows, window, scale)
         _finish_time(upper, window, f"{output} [{_over(fine, units[1])}]")
         lower.set_yscale("log")
         low, high = lower.get_ylim()
@@ -210,7 +239,7 @@ def _load_text(curves: LoopCurves, size: Any, found: StepFigures, scale: float, 
         return "UNSTABLE"
     at = rate_text(float(curves.w[int(size.argmax())]))
     ends = f", stays {number(scale * found.final, 3)}" if abs(found.final) > 1e-6 * abs(found.peak) else ""
-    return f"peak {number(scale * found.peak, 3)} {unit}{ends}; below {number(float(size.max()), 3)} at {at}"
+    return f"peak {number(scale * found.peak, 3)} {unit}{ends}; max {number(float(size.max()), 3)} at {at}"
 
 
 def _places(curves: LoopCurves, load: str, output: str) -> tuple[int, int, tuple[str, str]] | None:
@@ -234,8 +263,21 @@ def _pairs(
         )
     if channel is not None:
         outputs = [name for name, _ in chosen_channels(loops, channel, "sensors")]
-        return [(load, output) for load in loads for output in outputs]
+        found = [
+            (load, output) for load in loads for output in outputs if _moved(loops, answers, load, output)
+        ]
+        if not found:
+            raise InputError("plot", "channel", " ".join(outputs), "an output that a load from outside moves")
+        return found
     return [(load, output) for load in loads if (output := _furthest(loops, answers, load)) is not None]
+
+
+def _moved(
+    loops: Mapping[str, LoopCurves], answers: Mapping[str, StepResponse], load: str, output: str
+) -> bool:
+    """Whether a load moves an output of any loop."""
+    found = [(name, _places(curves, load, output)) for name, curves in loops.items()]
+    return any(np.abs(answers[name].y[:, at[0], at[1]]).max() > 0 for name, at in found if at is not None)
 
 
 def _furthest(loops: Mapping[str, LoopCurves], answers: Mapping[str, StepResponse], load: str) -> str | None:
