@@ -7,7 +7,8 @@ axes without units      a numeric axis needs a label with its unit in brackets, 
 bare axes               fewer than two numbers at the ticks, as on a logarithmic axis of less than a decade
 lines drawn twice       two lines of one axes with the same data
 looks that are alike    two entries of one legend that differ by colour alone, or not at all
-lines without a name    two or more looks of lines in one axes, some neither in a legend nor beside a note
+lines without a name    two or more looks of lines in one axes, some neither in a legend, nor beside a
+                            note, nor with their name at a tick
 """
 
 from __future__ import annotations
@@ -263,6 +264,12 @@ def _unnamed_looks(name: str, axes: Axes, figure: Figure) -> Iterator[str]:
         and line.get_linestyle() != "None"
         and _has_data(line)
         and not _is_straight(line)
+    }
+    written = set(texts_of(figure))
+    named |= {
+        _colour_and_dash(h)
+        for h in figure.findobj(Line2D)
+        if isinstance(h, Line2D) and h.get_label() in written
     }
     missing = drawn - named
     if len(drawn) > 1 and len(missing) > len([text for text in axes.texts if text.get_visible()]):

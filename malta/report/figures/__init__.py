@@ -30,7 +30,6 @@ from malta.model.signals import (
     outputs_of,
 )
 from malta.report.figures.campaign import distributions_figure as distributions_figure
-from malta.report.figures.campaign import worst_figure as worst_figure
 from malta.report.figures.campaign import yield_figure as yield_figure
 from malta.report.figures.parts import (
     BOUND,
@@ -50,6 +49,7 @@ from malta.report.figures.parts import MORE as MORE
 from malta.report.figures.parts import POINTS as POINTS
 from malta.report.figures.parts import STYLES as STYLES
 from malta.report.figures.parts import number as number
+from malta.report.figures.runs import worst_figure as worst_figure
 from malta.simulation.catalogue import experiments_of
 from malta.simulation.experiments import Case, Experiment
 from malta.simulation.trajectory import Trajectory

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +12,8 @@ import numpy as np
 from malta.margins.verify import ZONES
 from malta.report.figures.parts import (
     BOUND,
+    DOT,
+    LEGEND,
     NOTE,
     STYLES,
     draw_grid,
@@ -19,13 +21,19 @@ from malta.report.figures.parts import (
 )
 
 if TYPE_CHECKING:
+    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
     from malta.margins.gain import Gain
+    from malta.margins.robust import Margin
     from malta.margins.stages import Robustness
 
 
+LOOKS: tuple[dict[str, Any], dict[str, Any]] = ({"color": "#c9c9c9"}, {"color": "#5a5a5a"})  # stages, machine
+WITNESS: dict[str, Any] = {"color": "#c1440e", "linewidth": 1.6}
+NO_WITNESS: dict[str, Any] = {"marker": ">", "markersize": 7, "linestyle": "none", "color": "#000000"}
+PAPER: dict[str, Any] = {"bbox": {"facecolor": "#ffffff", "edgecolor": "none", "pad": 0.5}}
 CROWDED = 12.0  # peak |S| up to which the names of the zones have room
 
 
@@ -50,7 +58,8 @@ def chain_figure(
         f"100 %: {box}, all at once",
         left=0.21,
         right=0.97,
-        wspace=0.12,
+        top=0.83,
+        wspace=0.17,
         hspace=0.45,
     )
     extent = found.extent
@@ -69,46 +78,63 @@ def chain_figure(
 
 def _draw_stages(left: Axes, right: Axes, found: Robustness) -> None:
     """Bars of all stages: the proven margin with its witness, and the peak sensitivity with the zones of its limits."""
+    from matplotlib.patches import Patch
+
     rows = [(link.name, link.margin, link.peak) for link in found.chain]
     extent = found.extent
     if extent.course:
         everything = "all of the travel" if extent.stroke else f"every {extent.course}"
         rows.append((everything, found.travel, float(np.max([place.peak for place in found.places]))))
     most = max([_percent(m.lower) for _, m, _ in rows if m.lower is not None] + [100.0])
+    beside: dict[str, Any] = {"xytext": (6, 0), "textcoords": "offset points", "va": "center"}
     for k, (_, margin, peak) in enumerate(rows):
-        proven = _percent(margin.lower)
-        left.barh(k, proven, height=0.6, color="#c9c9c9" if k < len(found.chain) - 1 else "#5a5a5a")
-        if not margin.exhausted:
-            left.plot([_percent(margin.upper)] * 2, [k - 0.38, k + 0.38], color="#c1440e", linewidth=1.6)
-        left.text(
-            proven + 0.02 * most,
-            k,
-            "none" if margin.lower is None else f"{proven:.1f} %",
-            va="center",
-            **NOTE,
-        )
-        if not math.isnan(peak):
-            right.barh(k, peak, height=0.6, color="#c9c9c9" if k < len(found.chain) - 1 else "#5a5a5a")
+        look, end = LOOKS[k >= len(found.chain) - 1], _draw_margin(left, k, margin)
+        text = "none" if margin.lower is None else f"{_percent(margin.lower):.1f} %"
+        text = f"{text} or more" if margin.exhausted and margin.lower is not None else text
+        left.annotate(text, (end, k), **beside, **NOTE)
         stable = not math.isnan(peak)
-        right.text(
-            peak + 0.08 if stable else 0.08, k, f"{peak:.2f}" if stable else "unstable", va="center", **NOTE
+        if stable:
+            right.barh(k, peak, height=0.6, **look)
+        right.annotate(
+            f"{peak:.2f}" if stable else "unstable", (peak if stable else 0.0, k), **beside, **NOTE | PAPER
         )
-    left.set_xlim(0, 1.2 * most)
+        left.patches[k].set(**look)
+    ends = [_percent(m.upper) for _, m, _ in rows if not m.exhausted]
+    left.set_xlim(0, 1.35 * max([most, *(end for end in ends if end < 2 * most)]))
     left.set_yticks(range(len(rows)), [row[0] for row in rows])
-    left.plot([], [], color="#c1440e", linewidth=1.6, label="witness: unstable there")
-    left.bar(0, 0, color="#5a5a5a", label="proven, the machine's loop")
+    if ends:
+        left.plot([], [], **WITNESS, label="unstable there")
+    if any(m.exhausted and m.lower is not None for _, m, _ in rows):
+        left.plot([], [], **NO_WITNESS, label="no instability found")
     _legend(left)
-    left.set_xlabel("margin without loads [% of the box]")
+    named = ("of a stage", "of the machine, under its loads")
+    _legend(right, 1.07, [Patch(label=label, **look) for look, label in zip(LOOKS, named, strict=True)])
+    left.set_xlabel("proven margin without loads [% of the box]")
     right.set_yticks(range(len(rows)), [""] * len(rows))
+    right.tick_params(axis="y", length=0)
     right.set_xlim(0, max(5.6, 1.15 * max(link.peak for link in found.chain if not math.isnan(link.peak))))
     for (limit, zone), (_, worse) in pairwise(ZONES):
         right.axvline(limit, **BOUND)
         if right.get_xlim()[1] < CROWDED:
-            right.text(limit, -0.75, f"{zone} | {worse}", ha="center", va="bottom", **NOTE)
-    right.set_xlabel("peak |S|, dark: under its loads; zones of ISO 14839-3", fontsize=9)
+            where: dict[str, Any] = {"xycoords": ("data", "axes fraction"), "ha": "center", "va": "bottom"}
+            right.annotate(f"{zone} | {worse}", (limit, 1.005), **where, **NOTE)
+    right.set_xlabel("peak |S| [-], zones of ISO 14839-3")
     for axes in (left, right):
         draw_grid(axes)
         axes.set_ylim(len(rows) - 0.4, -0.8)
+
+
+def _draw_margin(axes: Axes, row: int, margin: Margin) -> float:
+    """A bar of the proven margin, and at the end of it what ends it: a witness, or the search. Returns the end."""
+    proven = _percent(margin.lower)
+    axes.barh(row, proven, height=0.6)
+    if margin.exhausted:
+        if margin.lower is not None:
+            axes.plot(proven, row, **NO_WITNESS)
+        return proven
+    witness = _percent(margin.upper)
+    axes.plot([witness] * 2, [row - 0.38, row + 0.38], **WITNESS)
+    return witness if witness < 1.3 * proven else proven
 
 
 def _draw_along_course(left: Axes, right: Axes, found: Robustness, bound: float) -> None:
@@ -121,9 +147,7 @@ def _draw_along_course(left: Axes, right: Axes, found: Robustness, bound: float)
         array = np.array(values)
         return np.concatenate([array[:0:-1], array]) if even else array
 
-    left.plot(
-        both, mirrored([_percent(p.margin.lower) for p in places]), marker="o", markersize=3.5, **STYLES[0]
-    )
+    left.plot(both, mirrored([_percent(p.margin.lower) for p in places]), **DOT | {"markersize": 4})
     if found.travel.lower is not None:
         left.axhline(100 * found.travel.lower, **STYLES[1])
         left.annotate(
@@ -132,7 +156,7 @@ def _draw_along_course(left: Axes, right: Axes, found: Robustness, bound: float)
         )  # fmt: skip
     left.set_ylim(0, 1.25 * max([_percent(p.margin.lower) for p in places] + [1.0]))
     left.set_ylabel("margin [%]")
-    right.plot(both, mirrored([p.peak for p in places]), marker="o", markersize=3.5, **STYLES[0])
+    right.plot(both, mirrored([p.peak for p in places]), **DOT | {"markersize": 4})
     right.set_xlim(left.get_xlim())
     for place, peak in zip(both, mirrored([p.peak for p in places]), strict=True):
         if math.isnan(peak):
@@ -150,9 +174,9 @@ def _draw_along_course(left: Axes, right: Axes, found: Robustness, bound: float)
             xytext=(0, 3), textcoords="offset points", va="bottom", **NOTE,
         )  # fmt: skip
     right.axhline(limit, **BOUND)
-    where: dict[str, Any] = {"xycoords": ("axes fraction", "data"), "ha": "right", "va": "top"}
-    right.annotate(f"zone {zone}", (0.985, limit), **where, **NOTE)
-    right.set_ylabel("peak |S|")
+    where: dict[str, Any] = {"xycoords": ("axes fraction", "data"), "ha": "right", "va": "bottom"}
+    right.annotate(f"end of zone {zone}", (0.985, limit), **where, **NOTE)
+    right.set_ylabel("peak |S| [-]")
     for axes in (left, right):
         draw_grid(axes)
 
@@ -168,8 +192,7 @@ def _percent(t: float | None) -> float:
     return 0.0 if t is None else 100 * t
 
 
-def _legend(axes: Axes) -> None:
-    """A legend of two columns above the axes."""
-    axes.legend(
-        loc="lower left", bbox_to_anchor=(0, 1), ncols=2, borderaxespad=0.2, frameon=False, fontsize=8
-    )
+def _legend(axes: Axes, bottom: float = 1.0, handles: Sequence[Artist] | None = None) -> None:
+    """A legend of two columns above the axes, of what is drawn or of these handles."""
+    where: dict[str, Any] = {"loc": "lower left", "bbox_to_anchor": (0, bottom), "borderaxespad": 0.2}
+    axes.legend(handles=handles, ncols=2, **where, **LEGEND)

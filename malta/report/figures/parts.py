@@ -18,6 +18,7 @@ from malta.units import in_unit
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.axis import Axis
     from matplotlib.figure import Figure
 
     from malta.model.plant import FloatArray
@@ -102,15 +103,18 @@ def draw_group(
 ) -> int:
     """Draw every signal of a group; returns the number of columns that its legend has room for.
 
-    Signals with the same values share a line, and more lines than there are styles share a band: from the least to the
-    largest of them, with the three that reach furthest as lines.
+    Signals with the same values, but for rounding, share a line. More lines than there are styles share a band from the
+    least to the largest of them, and the three that reach furthest are lines as well.
 
     series : name -> values over t
     styles : of the lines; the usual ones where none are given
     """
     lines: dict[str, FloatArray] = {}
     for name, values in series.items():
-        twin = next((known for known, drawn in lines.items() if np.array_equal(drawn, values)), None)
+        room = 1e-9 * float(np.abs(values).max(initial=0.0))
+        twin = next(
+            (known for known, drawn in lines.items() if np.abs(drawn - values).max(initial=0.0) <= room), None
+        )
         if twin is None:
             lines[name] = values
         else:
@@ -268,11 +272,30 @@ def finish_axes(axes: Axes, x: str, y: str, *, legend: int = 0, side: str = "lef
     axes.set_ylabel(y)
     draw_grid(axes)
     axes.margins(x=0)
+    for scale in (axes.xaxis, axes.yaxis):
+        if scale.get_scale() == "log":
+            number_logarithm(scale)
     if legend:
         where: dict[str, Any] = {"loc": f"lower {side}", "bbox_to_anchor": ({"left": 0, "right": 1}[side], 1)}
         handles, labels = legend_entries([axes])
         close = {"handlelength": 1.8, "columnspacing": 0.9} if len(labels) > 4 else {}
         axes.legend(handles, labels, ncols=legend, borderaxespad=0.2, **where, **LEGEND | close)
+
+
+def number_logarithm(side: Axis) -> None:
+    """Set numbers at the ticks of a logarithmic axis: enough for a part of a decade, not too many for several."""
+    from matplotlib.ticker import LogLocator, MaxNLocator
+
+    low, high = sorted(side.get_view_interval())
+    decades = math.log10(high / low)
+    side.set_minor_formatter("")
+    if decades > 2.2:
+        return  # powers of ten
+    if decades < 0.7:
+        side.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
+    else:
+        side.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if decades < 1.7 else (1.0, 3.0)))
+    side.set_major_formatter("{x:g}")
 
 
 def add_shared_legend(figure: Figure) -> None:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from malta.margins.recovery import PushedLoop, furthest, load_vector
-from malta.report.figures.parts import MORE, STYLES, finish_axes, micro, new_figure
+from malta.report.figures.parts import MORE, STYLES, draw_group, finish_axes, micro, new_figure
 from malta.units import unit_factor
 
 if TYPE_CHECKING:
@@ -24,6 +24,14 @@ if TYPE_CHECKING:
 FINE = {"m": "um", "rad": "urad"}  # units that outputs are drawn in
 SHOWN = 1.5  # times the longest time to 1 %
 POINTS = 400  # of frequency
+LOOKS = (
+    STYLES[0],
+    MORE[1],
+    STYLES[2],
+    MORE[0],
+    *STYLES[1::2],
+    *MORE[2:],
+)  # a line that covers another has gaps
 
 
 def recovery_figure(plant: Plant, controller: Controller, found: Sequence[Recovery]) -> Figure:
@@ -68,15 +76,12 @@ def _draw_steps(
     settled = max(output.settled for _, output in lines)
     end = min(SHOWN * settled, float(answer.t[-1])) if np.isfinite(settled) else float(answer.t[-1])
     shown = answer.t <= end
-    for (load, output), style in zip(lines, _styles(len(lines)), strict=True):
+    series = {}
+    for load, output in lines:
         y = answer.of(load_vector(plant, load.name, load.load)).y[shown, names.index(output.output), 0]
-        axes.plot(
-            1e3 * answer.t[shown],
-            y * np.sign(y[np.abs(y).argmax()]) / unit_factor(unit, unit),
-            label=f"{load.name}: {output.output}",
-            **style,
-        )
-    finish_axes(axes, "time [ms]", f"deviation under 1 {of} [{micro(unit)}]", legend=len(lines))
+        series[f"{load.name}: {output.output}"] = y * np.sign(y[np.abs(y).argmax()]) / unit_factor(unit, unit)
+    columns = draw_group(axes, 1e3 * answer.t[shown], series, LOOKS)
+    finish_axes(axes, "time [ms]", f"deviation under 1 {of} [{micro(unit)}]", legend=columns)
 
 
 def _draw_compliance(
@@ -90,17 +95,16 @@ def _draw_compliance(
     """Amplitude of the same outputs over frequency, under a load of amplitude 1 N or 1 N m."""
     names = [s.name for s in plant.outputs]
     w: FloatArray = np.geomspace(1.0, 0.3 * np.pi / loop.loop.sample_time, POINTS)
-    for (load, output), style in zip(lines, _styles(len(lines)), strict=True):
+    series = {}
+    for load, output in lines:
         amplitude = np.abs(loop.compliance(w, load_vector(plant, load.name, load.load)))
-        axes.loglog(
-            w / (2 * np.pi), amplitude[:, names.index(output.output)] / unit_factor(unit, unit), **style
+        series[f"{load.name}: {output.output}"] = amplitude[:, names.index(output.output)] / unit_factor(
+            unit, unit
         )
-    finish_axes(axes, "frequency [Hz]", f"compliance [{micro(unit)} / {of}]")
-
-
-def _styles(count: int) -> list[dict[str, Any]]:
-    """Styles of lines that may cover each other, as those of mirror images: the first are wider."""
-    chosen = [dict(style) for style in (*STYLES, *MORE)[:count]]
-    for k, style in enumerate(chosen):
-        style["linewidth"] += 1.3 * (count - 1 - k)
-    return chosen
+    axes.set(xscale="log", yscale="log")
+    draw_group(axes, w / (2 * np.pi), series, LOOKS)
+    finish_axes(
+        axes,
+        "frequency [Hz]",
+        f"compliance [{micro(unit)}/({of})]" if " " in of else f"compliance [{micro(unit)}/{of}]",
+    )

@@ -339,7 +339,7 @@ def _noise(a: Analysis) -> Iterator[Item]:
 
 
 def _campaigns(a: Analysis) -> Iterator[Item]:
-    from malta.report.figures.campaign import distributions_figure, worst_figure, yield_figure
+    from malta.report.figures import distributions_figure, worst_figure, yield_figure
 
     for found in a.campaigns:
         text = (

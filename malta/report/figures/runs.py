@@ -1,0 +1,244 @@
+"""Figures of a campaign's single runs: how near they come to a limit over the parameters, and the worst of them."""
+
+from __future__ import annotations
+
+import math
+import textwrap
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from malta.model.signals import lateral_outputs
+from malta.report.figures.parts import (
+    BOUND,
+    CROSS,
+    DOT,
+    LEGEND,
+    MORE,
+    NOTE,
+    STYLES,
+    Published,
+    clearance,
+    finish_axes,
+    legend_entries,
+    micro,
+    new_figure,
+    number,
+    published_in_unit,
+)
+from malta.simulation.digest import LARGEST_FIGURE
+from malta.units import in_unit
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from malta.campaigns.plan import Plan
+    from malta.campaigns.result import Campaign
+    from malta.campaigns.summary import Runs, Summary
+    from malta.model.plant import FloatArray
+
+SHOWN = 9  # parameters with a panel each, at most
+LEAST = 1e-3  # of a deviation on a logarithmic axis, in its fine unit
+
+
+def campaign_page(found: Summary, what: str, **places: Any) -> Figure:
+    """An empty figure whose title names the campaign, with its yield."""
+    from malta.campaigns.plan import planned_run
+
+    plan, share = found.plan, found.rate
+    wanted = planned_run(plan)
+    flown = plan.scenario if wanted.label == plan.scenario else f"{plan.scenario} ({wanted.label})"
+    title = f"{plan.controller.name}, {flown}, fidelity {wanted.scenario.fidelity}: {what}"
+    done = "all" if share.passed == share.runs else f"{share.passed} of"
+    text = f"{done} {share.runs} runs completed: {100 * share.share:.4g} % "
+    text += f"(95 %: {100 * share.low:.4g} to {100 * share.high:.4g} %)"
+    return new_figure(title, text, **places)
+
+
+def panels_over_parameters(
+    summary: Summary, what: str, **places: Any
+) -> tuple[Figure, list[tuple[str, Axes]]]:
+    """A page with a panel for each value that was varied, at most SHOWN, side by side with one y axis."""
+    from malta.campaigns.plan import half_width, varied_names
+
+    names = [
+        name for name in varied_names(summary.plan) if half_width(summary.plan, name) and summary.runs > 1
+    ]
+    shown = names[:SHOWN]
+    columns = min(3, max(1, len(shown))) if len(shown) != 4 else 2
+    rows = max(1, -(-len(shown) // columns))
+    more = f", {len(shown)} of {len(names)} shown" if len(shown) < len(names) else ""
+    figure = campaign_page(summary, what + more, **{"hspace": 0.5, "top": 0.8} | places)
+    panels = figure.subplots(rows, columns, squeeze=False, sharey=True).ravel()
+    for axes in panels[len(shown) :]:
+        axes.set_visible(False)
+    if not shown:
+        figure.text(
+            0.5, 0.5, "one run" if summary.runs == 1 else "no parameter was varied", ha="center", **NOTE
+        )
+    return figure, list(zip(shown, panels, strict=False))
+
+
+def nearest_figure(summary: Summary) -> Figure:
+    """How near the runs of a campaign came to a limit, over each parameter: for a campaign whose runs all end alike.
+
+    The limit is the contact to which the nearest run is closest beyond the usual; without contacts the deviation stands
+    in its place. Of more runs than a summary keeps, these are the nearest.
+    """
+    from malta.campaigns.plan import varied_names
+    from malta.campaigns.statistics import unit_of
+    from malta.campaigns.summary import bin_edges
+
+    runs = summary.kept
+    values, label = _nearness(summary, runs)
+    what, _, unit = label.removesuffix("]").rpartition(" [")
+    nearest = f"run {runs.index[int(values.argmax())]}, {what} {number(float(values.max()), 3)} {unit}"
+    every = varied_names(summary.plan)
+    page, panels = panels_over_parameters(summary, "how near runs come to a limit", top=0.79, left=0.12)
+    page.texts[-1].set_text(f"{page.texts[-1].get_text()}; nearest: {nearest}")
+    for name, axes in panels:
+        unit = unit_of(summary.plan, name)
+        scale = in_unit(1.0, unit)
+        at, edges = runs.values[:, every.index(name)] * scale, bin_edges(summary.plan, name) * scale
+        axes.plot(at, values, label="each run", **DOT | {"markersize": 2.5, "color": "#9a9a9a"})
+        place = np.clip(np.searchsorted(edges, at, side="right") - 1, 0, len(edges) - 2)
+        highest = [
+            values[place == k].max() if (place == k).any() else math.nan for k in range(len(edges) - 1)
+        ]
+        axes.stairs(
+            highest, edges, baseline=None, label="nearest in each stretch", color="#000000", linewidth=1.4
+        )
+        shown = "%" if unit == "percent" else micro(unit)
+        finish_axes(axes, f"{name} [{shown}]", textwrap.fill(label, 30) if is_first(axes) else "")
+        axes.set_xlim(edges[0], edges[-1])
+    for _, axes in panels[:1]:
+        most = float(values.max())
+        apart = most - float(values.min())
+        axes.set_ylim(most - 1.3 * apart if apart < 0.3 * most else 0, most + 0.15 * min(most, 2 * apart))
+    kept = "" if len(runs.index) == summary.runs else f", the {len(runs.index)} nearest"
+    where: dict[str, Any] = {"loc": "upper center", "bbox_to_anchor": (0.5, 0.91)}
+    handles, labels = legend_entries([axes for _, axes in panels])
+    if handles:
+        page.legend(
+            handles, [text + kept * (text == "each run") for text in labels], ncols=2, **where, **LEGEND
+        )
+    return page
+
+
+def is_first(axes: Axes) -> bool:
+    """Whether axes are in the first column, which has the label."""
+    place = axes.get_subplotspec()
+    return place is None or place.is_first_col()
+
+
+def _nearness(summary: Summary, runs: Runs) -> tuple[FloatArray, str]:
+    """How near each run came to a limit, and what that is, for an axis."""
+    plant = summary.plan.plant
+    contact = np.clip(np.nan_to_num(runs.batch.contact, nan=0.0), 0.0, LARGEST_FIGURE)
+    if contact.shape[1]:
+        beyond = contact.max(axis=0) - np.median(contact, axis=0)
+        k = int(beyond.argmax())
+        name = plant.contacts[k].removeprefix("touchdown at ")
+        return 100 * contact[:, k], f"clearance used up, {name} [%]"
+    group = lateral_outputs(plant)[0]
+    worst = runs.batch.deviation[:, group.columns].max(axis=1) * in_unit(1.0, group.fine)
+    return np.asarray(worst), f"largest {group.name} deviation [{micro(group.fine)}]"
+
+
+def worst_figure(found: Campaign | Summary, published: Published | None = None) -> Figure:
+    """The worst runs: the places of their machines in the box, and their largest errors."""
+    from malta.campaigns.plan import half_width, middle_of, varied_names
+    from malta.campaigns.statistics import spread_text
+    from malta.campaigns.summary import Bounds, as_summary, worst_runs
+
+    summary = as_summary(found, Bounds(published))
+    plan, names = summary.plan, varied_names(summary.plan)
+    runs = worst_runs(summary, len(STYLES) + len(MORE))
+    figure = campaign_page(summary, "the worst runs and their machines", wspace=0.42, top=0.84, bottom=0.13)
+    box, far = figure.subplots(1, 2, width_ratios=(1.7, 1))
+    labels = [_run_label(plan, index, end) for index, end in zip(runs.index, runs.batch.verdict, strict=True)]
+    at = np.arange(len(names))
+    middle = np.array([middle_of(plan, name) for name in names])
+    half = np.array([half_width(plan, name) for name in names])
+    for row, style in zip(range(len(runs.index)), (*STYLES, *MORE), strict=False):
+        where = 100 * (runs.values[row] - middle) / np.where(half == 0, 1, half)
+        box.plot(at, where, marker="o", markersize=4, **style)
+        # the look of its line, left of the name of the run
+        named: dict[str, Any] = style | {"label": labels[row], "clip_on": False}
+        far.plot([-0.12, -0.02], [row, row], transform=far.get_yaxis_transform(), **named)
+    box.set_xticks(at, [f"{name}\n{spread_text(plan, name)}" for name in names], fontsize=9)
+    box.set_yticks([-100, -50, 0, 50, 100])
+    finish_axes(box, "", "place in the box [% of half its width]")
+    box.set_xlim(-0.3, len(at) - 0.7)
+    box.set_ylim(-108, 108)
+    _draw_errors(far, summary, runs)
+    far.set_yticks(range(len(labels)), labels, fontsize=8)
+    far.tick_params(axis="y", length=0, pad=28)
+    far.set_ylim(len(labels) - 0.5, -0.5)
+    return figure
+
+
+def _draw_errors(axes: Axes, summary: Summary, runs: Runs) -> None:
+    """The largest deviation of each run with its value, beside its bounds; where the reference jumps, its nearness."""
+    from malta.campaigns.statistics import bounds_of
+
+    plan, plant, published = summary.plan, summary.plan.plant, summary.bounds.published
+    across, completed = lateral_outputs(plant)[0], runs.batch.completed == 1
+    fine = in_unit(1.0, across.fine)
+    known = np.nan_to_num(runs.batch.deviation[:, across.columns], nan=np.inf)  # of runs that diverged
+    values = np.clip(np.minimum(known, LARGEST_FIGURE) * fine, LEAST, None).max(axis=1)
+    label, unit = f"largest {across.name} deviation [{micro(across.fine)}]", micro(across.fine)
+    bounds = {"clearance": clearance(plant) * fine} if across.unit == "m" else {}
+    key = bounds_of(plan).get(across.unit)
+    if published is not None and key is not None:
+        bounds["published bound"] = published_in_unit(published, key, across.fine)
+    alike = len(values) > 1 and bool(completed.all()) and np.ptp(values) < 0.01 * values.max()
+    if plant.contacts and alike:
+        values, label = _nearness(summary, runs)
+        unit, bounds = "%", {"touched": 100.0}
+    most = float(values.max(initial=0.0))
+    bounds = {text: v for text, v in bounds.items() if math.isfinite(v) and v < 30 * most}
+    _set_reach(axes, values, list(bounds.values()))
+    for row, value in enumerate(values):
+        axes.plot(value, row, **(DOT if completed[row] else CROSS))
+        place = axes.transAxes.inverted().transform(axes.transData.transform((value, row)))[0]
+        beside: dict[str, Any] = {"xytext": (8 if place < 0.5 else -8, 0), "textcoords": "offset points"}
+        text = f"{number(float(value), 3)} {unit}" if value < LARGEST_FIGURE * fine else "diverged"
+        axes.annotate(
+            text, (value, row), ha="left" if place < 0.5 else "right", va="center", **beside, **NOTE
+        )
+    for text, value in bounds.items():
+        axes.axvline(value, **BOUND)
+        above: dict[str, Any] = {"xycoords": ("data", "axes fraction"), "ha": "center", "va": "bottom"}
+        axes.annotate(text, (value, 1.01), **above, **NOTE)
+    finish_axes(axes, label, "")
+
+
+def _set_reach(axes: Axes, values: FloatArray, bounds: Sequence[float]) -> None:
+    """Set the x axis: logarithmic where values and bounds reach far, without zero where the values are nearly alike."""
+    from matplotlib.ticker import MaxNLocator
+
+    if not len(values):
+        return
+    least, most = float(values.min()), max([float(values.max()), *bounds, 1e-12])
+    apart = most - least
+    if least > 0 and most > 10 * min([least, *bounds]):
+        axes.set_xscale("log")
+        axes.set_xlim(min([least, *bounds]) / 3, 2 * most)
+    elif 0 < apart < 0.3 * most:
+        axes.set_xlim(least - 0.6 * apart, most + 0.6 * apart)
+        axes.xaxis.set_major_locator(MaxNLocator(3, prune="upper"))
+    else:
+        axes.set_xlim(0, 1.5 * most)
+
+
+def _run_label(plan: Plan, index: int, verdict: float) -> str:
+    """The number of a run, and how it ended."""
+    from malta.simulation.digest import verdicts
+
+    name = verdicts(plan.plant)[int(verdict)]
+    text = f"run {index}"
+    return text if name == "completed" else f"{text}\n{name.replace(' at ', chr(10) + 'at ')}"
