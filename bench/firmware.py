@@ -330,7 +330,7 @@ def rows_of(case: Case, runs: int) -> list[Result]:
             continue
         counts = {way: instructions(p, case.ways[way], case.main(way)) for way in case.ways}
         what = f"{title}: {p.name} instructions"
-        rows += [Result(what, counts["malta"], way, counts[way], "at least 1") for way in peers]
+        rows += [Result(what, counts["malta"], way, counts[way], "at least 1", unit="") for way in peers]
     with tempfile.TemporaryDirectory() as scratch:
         calls: dict[str, Callable[[], object]] = {}
         for k, (way, w) in enumerate(case.ways.items()):
@@ -354,5 +354,5 @@ def firmware(runs: int) -> list[Result]:
         count = whole_step(t)
         if count is not None:
             what, clocks = f"whole step, {precision}: {A9.name} instructions", controller.sample_time * CLOCK
-            rows.append(Result(what, count, "50 us at 667 MHz, one a clock", clocks, "at least 10"))
+            rows.append(Result(what, count, "50 us at 667 MHz, one a clock", clocks, "at least 10", unit=""))
     return rows

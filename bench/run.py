@@ -1,6 +1,6 @@
 """Benchmarks: malta beside what a user would pick instead, as ratios of medians from one run.
 
-make bench            python bench/run.py [--runs N] [--only stroke many ...]
+make bench            python bench/run.py [--runs N] [--only stroke many ...] [--page docs/benchmarks.md]
 
 The peers that are not python-control are written by hand (peers/ and peer_*.py). Some have malta's equations as they
 stand; those called reformulated are what an expert makes of them for this machine alone: modes apart, small angles
@@ -27,6 +27,7 @@ import control
 import numpy as np
 from firmware import firmware
 from margins import margin, published
+from page import update_page
 from peer_control import closed_loop, documented_run
 from peer_problem import Workload
 from rich import box
@@ -404,6 +405,7 @@ def main() -> None:
     parser.add_argument(
         "--only", choices=WORKLOADS, nargs="+", default=[*WORKLOADS], help="some of the workloads"
     )
+    parser.add_argument("--page", type=Path, help="a page whose sections of these workloads are replaced")
     arguments = parser.parse_args()
     for name in arguments.only:
         found = WORKLOADS[name](arguments.runs)
@@ -420,6 +422,11 @@ def main() -> None:
                 theirs = ratio = "–"
             table.add_row(row.workload, f"{row.ours:.4g}", row.peer, theirs, ratio, row.wanted)
         Console(width=100).print(table)
+        if arguments.page is not None:
+            description = (WORKLOADS[name].__doc__ or "").strip().partition("\n\n")[0]
+            update_page(
+                arguments.page, {name: (" ".join(description.split()), found)}, WORKLOADS, arguments.runs
+            )
 
 
 if __name__ == "__main__":

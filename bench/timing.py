@@ -19,10 +19,11 @@ class Result(NamedTuple):
     """A line of the table."""
 
     workload: str
-    ours: float  # s
+    ours: float  # in `unit`
     peer: str
-    theirs: float  # s; NaN where it does not apply
+    theirs: float  # in `unit`; NaN where it does not apply
     wanted: str
+    unit: str = "s"  # "": a count, of what the workload says
 
 
 def medians(*calls: Callable[[], object], runs: int, what: str) -> list[float]:
