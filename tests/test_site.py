@@ -1,0 +1,113 @@
+"""Pages of docs/: public names have a place, pages too, commands exist; the site is built without a warning."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from conftest import ROOT
+from docstrings import restructured
+from public import all_names, docstring_of, names_of
+from typer.main import get_command
+
+from malta.cli.main import app
+
+DOCS = ROOT / "docs"
+PAGES = sorted(page for page in DOCS.rglob("*.md") if "_build" not in page.parts)
+COMMAND = re.compile(r"(?:^|&& )(?:\$ )?malta ((?:[^#\n&|>;]|\\\n)+)", re.MULTILINE)
+FENCED = re.compile(r"^```(\w*|\{code-block\} \w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+SHELL = ("console", "sh", "bash", "")
+
+
+def test_every_public_name_stands_on_a_page() -> None:
+    listed = [
+        name
+        for page in (DOCS / "reference").glob("*.md")
+        for part in re.findall(r"^```\{public-names\} (\S+)$", page.read_text(encoding="utf-8"), re.MULTILINE)
+        for name in names_of(part)
+    ]
+    assert sorted(listed) == sorted(all_names())
+    assert len(listed) > 120
+
+
+def test_every_page_is_in_a_table_of_contents() -> None:
+    reached = {DOCS / "index.md"}
+    for page in PAGES:
+        for block in re.findall(
+            r"^```\{toctree\}\n(.*?)^```$", page.read_text(encoding="utf-8"), re.M | re.S
+        ):
+            lines = [line for line in block.splitlines() if line and not line.startswith(":")]
+            found = [match for line in lines for match in page.parent.glob(f"{line}.md")]
+            assert len(found) >= len(lines), page
+            reached |= {*found} - {page}
+    assert {*PAGES} - reached == set()
+
+
+def _commands(page: Path) -> list[str]:
+    text = page.read_text(encoding="utf-8")
+    blocks = [block for kind, block in FENCED.findall(text) if kind in SHELL]
+    return [line for block in blocks for line in COMMAND.findall(block)]
+
+
+@pytest.mark.parametrize("page", [ROOT / "README.md", *PAGES], ids=lambda page: str(page.relative_to(ROOT)))
+def test_commands_on_a_page_exist_with_their_options(page: Path) -> None:
+    """Arguments are parsed as the program does; files are not looked for."""
+    program: Any = get_command(app)
+    for line in _commands(page):
+        name, *arguments = shlex.split(line.replace("\\\n", " "))
+        if name.startswith("-"):
+            name, arguments = "", [name, *arguments]
+        assert not name or name in program.commands, line
+        command = program.commands[name] if name else program
+        parser = command.make_parser(command.context_class(command, info_name=name))
+        parser.parse_args(list(arguments))
+
+
+def test_commands_are_found_in_pages() -> None:
+    assert COMMAND.findall("$ cd x && malta design a.toml  # one\n") == ["design a.toml  "]
+    assert len(_commands(ROOT / "README.md")) > 1
+
+
+def test_docstrings_become_pages() -> None:
+    text = """Close the loop of `plant`.
+
+    x' = A x
+
+a, b : sizes of |S|
+    in each axis
+`malta.verify` and `nothing` follow *here*.
+
+>>> 1 + 1
+2
+"""
+    found = "\n".join(restructured(text.splitlines(), ["malta.verify"]))
+    assert "::\n\n    x' = A x\n" in found
+    assert ":param a,b: sizes of \\|S\\|\n    in each axis\n" in found
+    assert ":py:obj:`malta.verify <malta.verify>`" in found
+    assert "``nothing``\\  follow \\*here\\*." in found
+    assert ">>> 1 + 1\n2\n" in found
+    assert all(docstring_of(name) is not None for name in all_names())
+
+
+@pytest.mark.slow
+def test_the_site_is_built_without_a_warning(tmp_path: Path) -> None:
+    """Every link within it leads to its place; it holds every name, the schemas, and nothing from a network."""
+    command = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-n", "-q", "-d", tmp_path / "trees"]
+    built = subprocess.run(
+        [*map(str, command), str(DOCS), str(tmp_path / "site")],
+        cwd=ROOT, env=os.environ | {"PYTHONPATH": str(ROOT)}, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert (built.returncode, built.stderr) == (0, "")
+    pages = {page: page.read_text(encoding="utf-8") for page in (tmp_path / "site").rglob("*.html")}
+    known = {found for text in pages.values() for found in re.findall(r'id="(malta\.[\w.]+)"', text)}
+    assert set(all_names()) <= known
+    for page, text in pages.items():
+        assert re.findall(r'(?:src|<link[^>]* href)="https?:', text) == [], page
+    assert json.loads((tmp_path / "site" / "schemas" / "gain.json").read_text())["title"] == "malta gain file"
