@@ -18,7 +18,8 @@ extensions = [
     "sphinx_copybutton",
     "sphinx_design",
     "sphinx.ext.autodoc",
-    "mathml",  # these are of _extensions
+    "links",  # these are of _extensions
+    "mathml",
     "reference",
 ]
 source_suffix = {".md": "markdown"}

@@ -24,13 +24,18 @@ def names_of(page: str) -> list[str]:
     """List the public names on a page of the reference.
 
     page : a package, as "margins", for the names of malta itself that come from it; a public module, as
-        "malta.report", for the names within it
+        "malta.gains", for the names within it, or "malta.report:tables" for those from this part of it
     """
     if not page.startswith("malta."):
         own = [name for name in malta.__all__ if name not in MODULES]
         return [f"malta.{name}" for name in sorted(own, key=str.lower) if _package_of(name) == page]
-    module = getattr(malta, page.removeprefix("malta."))
-    return [f"{page}.{name}" for name in sorted(_public_names(module), key=str.lower)]
+    whole, _, part = page.partition(":")
+    module = getattr(malta, whole.removeprefix("malta."))
+    sources = dict(_passed_on(module))
+    names = sorted(_public_names(module), key=str.lower)
+    return [
+        f"{whole}.{name}" for name in names if not part or f"{sources[name]}.".startswith(f"{whole}.{part}.")
+    ]
 
 
 def all_names() -> list[str]:

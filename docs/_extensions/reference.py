@@ -50,7 +50,8 @@ def _described(name: str) -> list[str]:
     """The directive that documents a public name."""
     value = value_of(name)
     if inspect.isclass(value):
-        return [f".. autoclass:: {name}", "   :members:"]
+        fields = ", ".join(getattr(value, "_fields", ()))  # of a named tuple, which its text explains
+        return [f".. autoclass:: {name}", "   :members:", f"   :exclude-members: {fields}"]
     if inspect.isroutine(value):
         return [f".. autofunction:: {name}"]
     text = restructured(docstring_of(name).splitlines(), all_names())
