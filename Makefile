@@ -4,7 +4,7 @@
 # make fuzz     damaged input of every kind, for FUZZ_SECONDS (600): see tests/fuzz
 # make mutants  faults in the code that refuses, proves, seals and limits: tests have to notice each; see tests/mutants
 # make docs     the pages of docs/ to docs/_build: warnings are errors; `make links` asks the addresses they point to
-# make check    what CI runs: lint, format, types, both kinds of tests
+# make check    what CI runs: lint, format, types, pages, both kinds of tests
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
@@ -61,8 +61,8 @@ docs: $(VENV)/docs
 links: $(VENV)/docs  # needs a network
 	$(BIN)/python -m sphinx -W --keep-going -q -b linkcheck docs docs/_build/links
 
-bench: $(VENV)/dev
-	$(BIN)/python bench/run.py
+bench: $(VENV)/dev  # with PAGE=docs/benchmarks.md it writes that page
+	$(BIN)/python bench/run.py $(if $(PAGE),--page $(PAGE))
 
 figures: $(VENV)/runtime  # the picture of the README
 	$(BIN)/python -c "import malta; c = malta.gains.read('design/gains/calibrated.json'); \

@@ -10,7 +10,7 @@ import re
 from collections.abc import Iterable, Iterator
 from itertools import groupby
 
-ENTRY = re.compile(r"(?P<names>[A-Za-z_]\w*(?:, [A-Za-z_]\w*)*) : (?P<text>.+)")
+ENTRY = re.compile(r"(?P<names>\*{0,2}[A-Za-z_]\w*(?:, [A-Za-z_]\w*)*) : (?P<text>.+)")
 CODE = re.compile(r"(?<![`\w])`([^`\n]+)`(?!`)")
 
 
@@ -71,7 +71,7 @@ def _field(line: str, known: frozenset[str]) -> str:
     entry = ENTRY.match(line)
     if entry is None:
         return _marked(line, known)
-    names = entry["names"].replace(" ", "")  # what follows a space would be a type
+    names = _escaped(entry["names"].replace(" ", ""))  # what follows a space would be a type
     return f":param {names}: {_marked(entry['text'], known)}"
 
 

@@ -1,4 +1,4 @@
-"""Links between the pages as they were written: each file and each anchor is there, and nothing comes from a network."""
+"""Links between pages as they were written: each file and each anchor is there, and nothing comes from a network."""
 
 from __future__ import annotations
 

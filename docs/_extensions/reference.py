@@ -2,13 +2,15 @@
 
 ```{public-names} margins        names of malta that come from this package, or those of a module as malta.report
 ```{commands}                    every command of the program with its help
-```{entries} gain                the tables of a file, from its schema
+```{entries} gain                the tables of a file or of a command's output, from its schema
 """
 
 from __future__ import annotations
 
 import inspect
 import os
+from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from docstrings import restructured
@@ -16,8 +18,13 @@ from docutils import nodes
 from public import all_names, docstring_of, names_of, summary_of, value_of
 from sphinx import addnodes
 from sphinx.util.docutils import SphinxDirective
+from typer.main import get_command
+from typer.testing import CliRunner
 
 import malta
+from malta.cli.documents.published import MODELS, output_schema
+from malta.cli.main import app as program
+from malta.files import json_text
 
 if TYPE_CHECKING:
     from sphinx.application import Sphinx
@@ -63,22 +70,16 @@ class Commands(SphinxDirective):
 
     def run(self) -> list[nodes.Node]:
         """Ask every command for its help, as a terminal of 80 columns shows it."""
-        from typer.main import get_command
-
-        from malta.cli.main import app
-
-        commands: dict[str, Any] = get_command(app).commands  # type: ignore[attr-defined]
+        commands: dict[str, Any] = get_command(program).commands  # type: ignore[attr-defined]
         found: list[nodes.Node] = [self._help("malta", "malta", [])]
         found += [self._help(f"malta {name}", f"command-{name}", [name]) for name in commands]
         return found
 
     def _help(self, title: str, anchor: str, arguments: list[str]) -> nodes.section:
-        from typer.testing import CliRunner
-
-        from malta.cli.main import app
-
         terminal = {"COLUMNS": WIDTH, "TERMINAL_WIDTH": WIDTH, "NO_COLOR": "1", "TERM": "dumb"}
-        shown = CliRunner().invoke(app, [*arguments, "--help"], prog_name="malta", env=os.environ | terminal)
+        shown = CliRunner().invoke(
+            program, [*arguments, "--help"], prog_name="malta", env=os.environ | terminal
+        )
         section = nodes.section("", nodes.title("", title), names=[anchor])
         section += nodes.literal_block(shown.output, shown.output.strip("\n"), language="text")
         self.state.document.note_explicit_target(section)
@@ -93,7 +94,7 @@ class Entries(SphinxDirective):
     def run(self) -> list[nodes.Node]:
         """Write the table of the file itself, and a section for each of its tables, in the order of their use."""
         kind = self.arguments[0]
-        tables = tables_of(malta.schemas.schema(kind))
+        tables = tables_of(schemas()[kind]())
         places = {name: place for name, place, _ in tables}
         found: list[nodes.Node] = [self._download(kind)]
         for name, place, table in tables:
@@ -120,7 +121,7 @@ def _rows(table: dict[str, Any], file: str, places: dict[str, str]) -> list[str]
     for key, entry in table["properties"].items():
         kind = [_kind(entry, file, places), entry.get("unit", "").removeprefix("1")]
         kind += [] if key in table.get("required", []) else ["optional"]
-        cells = [f"`{key}`", ", ".join(filter(None, kind)), entry["description"]]
+        cells = [f"`{key}`", ", ".join(filter(None, kind)), entry.get("description", "")]
         rows.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
     return rows
 
@@ -154,6 +155,11 @@ def tables_of(whole: dict[str, Any]) -> list[tuple[str, str, dict[str, Any]]]:
 
 
 UNLISTED = ("Published", "Columns")  # explained in words
+
+
+def schemas() -> dict[str, Callable[[], dict[str, Any]]]:
+    """Functions that make the schemas of files and of the documents that commands print, by name."""
+    return malta.schemas.SCHEMAS | {name: partial(output_schema, name) for name in MODELS}
 
 
 def _kind(entry: dict[str, Any], file: str, places: dict[str, str]) -> str:
@@ -217,15 +223,13 @@ def _is_of_signature(node: Any) -> bool:
 
 
 def publish_schemas(app: Sphinx, error: Exception | None) -> None:
-    """Write the schemas of files beside the pages, for editors."""
-    from malta.files import json_text
-
+    """Write the schemas of files and outputs beside the pages, for editors and programs."""
     if error is not None or app.builder.format != "html":
         return
     folder = app.outdir / "schemas"
     folder.mkdir(exist_ok=True)
-    for name in malta.schemas.SCHEMAS:
-        (folder / f"{name}.json").write_text(json_text(malta.schemas.schema(name)) + "\n", encoding="utf-8")
+    for name, make in schemas().items():
+        (folder / f"{name}.json").write_text(json_text(make()) + "\n", encoding="utf-8")
 
 
 def setup(app: Sphinx) -> dict[str, Any]:
