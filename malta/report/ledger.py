@@ -148,11 +148,11 @@ def ledger(specs: Sequence[Spec], published: Mapping[str, Any], progress: Progre
     Raises InputError for designs of another machine, of one without claims, or when the published figures lack one.
 
     >>> import malta
-    >>> spec = malta.read_design("design/table2.toml")
-    >>> found = malta.ledger([spec], malta.published("data/tubular.toml"))
-    >>> poles = next(claim for claim in found.claims if "pole" in claim.subject)
-    >>> found.designs, poles.published, poles.verdict
-    (('table2',), '±218.92', 'by construction; K_A solved from it; Table IV as printed gives 215.12')
+    >>> spec = malta.read_design("design/halbach_pid.toml")
+    >>> found = malta.ledger([spec], malta.published("data/halbach.toml"))
+    >>> pitch = found.claims[0]
+    >>> found.designs, pitch.subject, pitch.published, pitch.ours
+    (('halbach_pid',), 'pitch, 2π/k [mm]', '29.778', ('29.778',))
     """
     if not specs:
         raise InputError("claims", "designs", "none", "at least one design")

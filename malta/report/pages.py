@@ -50,7 +50,27 @@ if TYPE_CHECKING:
 def design_page(
     spec: Spec, model: LinearModel, margins: Margins, flown: Experiment, published: Published | None
 ) -> Group:
-    """A page about a design: its loop, its margins, and the experiment that is the machine's main job."""
+    """Make the page of a design for a terminal: its loop, its margins, and the machine's main experiment.
+
+    spec : the design, from `malta.read_design`
+    model : the machine's linear model
+    margins : from `malta.verify`
+    flown : the experiment that is the machine's main job, from `malta.experiment`
+    published : figures of the machine's paper, from `malta.published`; None: none
+
+    Returns a rich Group, which `rich.print` prints.
+
+    >>> import malta, rich
+    >>> spec = malta.read_design("examples/ball/design/ball.toml")
+    >>> model = malta.linearize(spec.plant, spec.plant.at())
+    >>> controller = malta.synthesize(spec, model)
+    >>> push = malta.experiment("disturbance", spec.plant, controller, size=0.1, noise=0.0, quantize=False)
+    >>> page = malta.report.design_page(spec, model, malta.verify(model, controller), push, None)
+    >>> for line in page.renderables[:2]:
+    ...     rich.print(line)
+    ball: LQG with integral action
+    ball, preset data, sampled-data, 5 kHz, delay 1 in the design model
+    """
     made = f"{spec.discretization}, {_rate_text(spec.sample_time)}, delay {spec.delay} in the design model"
     made += ", with the lag of the current loops" if spec.current_lag else ""
     if spec.pid is not None:
@@ -83,22 +103,70 @@ def _rate_text(Ts: float) -> str:
 
 
 def front(tuned: Tuned, path: str | Path | None = None) -> Figure:
-    """Draw the Pareto front of a search, and save it where a path is given."""
+    """Draw the Pareto front of a search, and save the figure where a path is given.
+
+    tuned : from `malta.tune`
+    path : .png or .svg file; None: nothing is written
+
+    Returns a matplotlib Figure, which a notebook shows as the value of a cell.
+
+    Raises InputError for another suffix.
+
+    >>> import malta
+    >>> from malta.tuning.search import Trial
+    >>> from malta.tuning.tune import Tuned
+    >>> spec = malta.read_design("examples/ball/design/ball.toml")
+    >>> quiet = Trial((223.0, 50.0, 0.051), 1, {"margin": 3.28, "force_noise f": 0.0122, "motion y": 0.523e-6})
+    >>> safe = Trial((190.0, 40.0, 0.11), 1, {"margin": 3.63, "force_noise f": 0.0414, "motion y": 0.501e-6})
+    >>> tuned = Tuned(spec, safe, requirements=(), front=(quiet, safe), trials=120)  # as malta.tune finds it
+    >>> figure = malta.report.front(tuned, "build/front.svg")
+    >>> figure.axes[0].get_xlabel()
+    'robust margin over the travel, proven [% of the box]'
+    """
     return _saved(front_figure(tuned), path)
 
 
 def stroke(run: Trajectory, path: str | Path | None = None, published: Published | None = None) -> Figure:
-    """Draw a run, and save it where a path is given.
+    """Draw a run, and save the figure where a path is given.
 
-    published : figures of the machine's paper, drawn beside the run's
+    run : from `malta.simulate`
+    path : .png or .svg file; None: nothing is written
+    published : figures of the machine's paper, from `malta.published`; None: none
 
-    Example: `malta.report.stroke(run)` as the last line of a cell shows the picture.
+    Returns a matplotlib Figure, which a notebook shows as the value of a cell.
+
+    Raises InputError for another suffix.
+
+    >>> import malta
+    >>> spec = malta.read_design("examples/ball/design/ball.toml")
+    >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
+    >>> hold = malta.Scenario("hold", 20e-3, malta.references.hold, start={"q": 50e-6}, fidelity="force")
+    >>> figure = malta.report.stroke(malta.simulate(spec.plant, controller, hold))
+    >>> [axes.get_ylabel() for axes in figure.axes]
+    ['commanded force [N]', 'y, off reference [µm]', 'clearance used up [%]']
     """
     return _saved(stroke_figure(run, published), path)
 
 
 def experiment(e: Experiment, path: str | Path | None = None, published: Published | None = None) -> Figure:
-    """Draw an experiment, and save it where a path is given; arguments as those of `stroke`."""
+    """Draw an experiment, and save the figure where a path is given.
+
+    e : from `malta.experiment`
+    path : .png or .svg file; None: nothing is written
+    published : figures of the machine's paper, from `malta.published`; None: none
+
+    Returns a matplotlib Figure, which a notebook shows as the value of a cell.
+
+    Raises InputError for an experiment that the machine does not have, and for another suffix.
+
+    >>> import malta
+    >>> spec = malta.read_design("examples/ball/design/ball.toml")
+    >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
+    >>> push = malta.experiment("disturbance", spec.plant, controller, size=0.1, noise=0.0, quantize=False)
+    >>> figure = malta.report.experiment(push)
+    >>> [axes.get_ylabel() for axes in figure.axes]
+    ['commanded force [N]', 'y, off reference [µm]', 'clearance used up [%]']
+    """
     return _saved(experiment_figure(e, published), path)
 
 
@@ -112,7 +180,24 @@ def robustness(
 ) -> Figure:
     """Draw the margins of a design stage by stage, and save the figure where a path is given.
 
-    Other arguments as those of `chain_figure`.
+    found : from `malta.robustness`
+    name : of the design
+    uncertainty : half-widths of the box, as shares
+    path : .png or .svg file; None: nothing is written
+    position : the machine's word for its travel, as "position z"
+    worst : the largest `|S|` of each sensor over the uncertainty, from `malta.worst_case_gain`; None: none
+
+    Returns a matplotlib Figure, which a notebook shows as the value of a cell.
+
+    Raises InputError for another suffix.
+
+    >>> import malta
+    >>> spec = malta.read_design("examples/ball/design/ball.toml")
+    >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
+    >>> box = {"m": 0.2}
+    >>> figure = malta.report.robustness(malta.robustness(spec.plant, controller, box), "ball", box)
+    >>> figure.axes[0].get_xlabel()
+    'margin without loads [% of the box]'
     """
     return _saved(chain_figure(found, name, uncertainty, position, worst), path)
 
@@ -123,26 +208,69 @@ def loads(
     path: str | Path | None = None,
     found: Sequence[Recovery] | None = None,
 ) -> Figure:
-    """Draw the answer to a constant load from outside and the compliance over frequency; save it where a path is given.
+    """Draw the answer to constant loads from outside and the compliance over frequency.
 
-    found : malta.recovery(plant, controller), where it is known already
+    plant : the machine
+    controller : its controller
+    path : .png or .svg file; None: nothing is written
+    found : from `malta.recovery`, where it is known already; None: it is computed
 
-    Example: `malta.report.loads(plant, controller, "build/robust_loads.png")`
+    Returns a matplotlib Figure, which a notebook shows as the value of a cell.
+
+    Raises InputError for a machine without disturbances and for another suffix.
+
+    >>> import malta
+    >>> spec = malta.read_design("examples/ball/design/ball.toml")
+    >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
+    >>> figure = malta.report.loads(spec.plant, controller)
+    >>> [axes.get_ylabel() for axes in figure.axes]
+    ['deviation under 1 N [µm]', 'compliance [µm / N]']
     """
     found = recovery(plant, controller) if found is None else found
     return _saved(recovery_figure(plant, controller, found), path)
 
 
 def sensitivity(found: Sensitivity, path: str | Path | None = None) -> Figure:
-    """Draw the Sobol indices of a campaign's yield and merits, and save the figure where a path is given."""
+    """Draw the Sobol indices of a campaign's yield and merits, and save the figure where a path is given.
+
+    found : from `malta.sensitivity`
+    path : .png or .svg file; None: nothing is written
+
+    Returns a matplotlib Figure, which a notebook shows as the value of a cell.
+
+    Raises InputError for another suffix.
+
+    >>> import malta
+    >>> spec = malta.read_design("examples/ball/design/ball.toml")
+    >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
+    >>> options = {"duration": 0.02, "noise": 0.0}
+    >>> plan = malta.Plan(controller, "disturbance", {"m": 0.2, "C": 0.2}, samples=64, options=options)
+    >>> found = malta.sensitivity(plan, malta.limit_of(plan, "touchdown"), workers=1)
+    >>> figure = malta.report.sensitivity(found)
+    >>> figure.axes[0].get_ylabel()
+    'share of the variance'
+    """
     return _saved(sensitivity_figure(found), path)
 
 
 class CampaignFigures(NamedTuple):
-    """The figures of a campaign; a notebook shows all three as the value of a cell."""
+    """The figures of a campaign; a notebook shows all three as the value of a cell.
+
+    distributions : of the figures of merit
+    endings : how runs end over the parameters
+    worst : the worst runs
+
+    >>> import malta
+    >>> spec = malta.read_design("examples/ball/design/ball.toml")
+    >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
+    >>> plan = malta.Plan(controller, "disturbance", {"m": 0.1}, samples=8, options={"duration": 0.02})
+    >>> figures = malta.report.campaign(malta.campaign(plan, workers=1))
+    >>> figures._fields
+    ('distributions', 'endings', 'worst')
+    """
 
     distributions: Figure
-    endings: Figure  # how runs end over the parameters
+    endings: Figure
     worst: Figure
 
     def _ipython_display_(self) -> None:
@@ -154,6 +282,12 @@ class CampaignFigures(NamedTuple):
 
 
 CAMPAIGN_FILES = ("distributions.png", "yield.png", "worst.png")  # of CampaignFigures, in a campaign's folder
+"""The files of `CampaignFigures` in a campaign's folder, in their order.
+
+>>> import malta
+>>> malta.report.CAMPAIGN_FILES
+('distributions.png', 'yield.png', 'worst.png')
+"""
 
 
 def campaign(
@@ -161,9 +295,19 @@ def campaign(
 ) -> CampaignFigures:
     """Draw the results of a campaign, and save them as CAMPAIGN_FILES where a folder is given.
 
-    published : figures of the machine's paper; a summary has its own
+    found : the campaign, or its summary
+    folder : of the files; None: nothing is written
+    published : figures of the machine's paper, from `malta.published`; None: none; a summary has its own
 
-    Example: `malta.report.campaign(found).worst` is the figure of the worst runs.
+    Returns CampaignFigures.
+
+    >>> import malta
+    >>> spec = malta.read_design("examples/ball/design/ball.toml")
+    >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
+    >>> plan = malta.Plan(controller, "disturbance", {"m": 0.1}, samples=8, options={"duration": 0.02})
+    >>> figures = malta.report.campaign(malta.campaign(plan, workers=1), "build")
+    >>> figures.worst is figures[-1], malta.report.CAMPAIGN_FILES[-1]
+    (True, 'worst.png')
     """
     from malta.campaigns.summary import Bounds, as_summary
 

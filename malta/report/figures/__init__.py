@@ -64,9 +64,22 @@ if TYPE_CHECKING:
 
 
 def experiment_figure(e: Experiment, published: Published | None = None) -> Figure:
-    """The figure of an experiment, beside published figures.
+    """Draw an experiment: the machine's own figure of it, or that of its first run.
+
+    e : the experiment
+    published : figures of the machine's paper, from `malta.published`; None: none
+
+    Returns a matplotlib Figure, which a notebook shows as the value of a cell.
 
     Raises InputError for an experiment that the machine does not have.
+
+    >>> import malta
+    >>> spec = malta.read_design("examples/ball/design/ball.toml")
+    >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
+    >>> push = malta.experiment("disturbance", spec.plant, controller, size=0.1, noise=0.0, quantize=False)
+    >>> figure = malta.report.experiment_figure(push)
+    >>> [axes.get_ylabel() for axes in figure.axes]
+    ['commanded force [N]', 'y, off reference [µm]', 'clearance used up [%]']
     """
     plant = e.run.plant
     drawn: dict[str, Callable[[Experiment, Published | None], Figure]] = {
@@ -80,7 +93,20 @@ def experiment_figure(e: Experiment, published: Published | None = None) -> Figu
 
 
 def stroke_figure(run: Trajectory, published: Published | None = None) -> Figure:
-    """The machine's figure of a stroke; of a machine without one, that of a run."""
+    """Draw a run: the machine's own figure of a stroke; of a machine without one, errors, forces and clearances.
+
+    run : from `malta.simulate`
+    published : figures of the machine's paper, from `malta.published`; None: none
+
+    Returns a matplotlib Figure, which a notebook shows as the value of a cell.
+
+    >>> import malta
+    >>> controller = malta.gains.read("design/gains/calibrated.json")
+    >>> run = malta.simulate(malta.plant_of(controller.parameters), controller, malta.Scenario.stroke(10e-3))
+    >>> figure = malta.report.stroke_figure(run, malta.published("data/tubular.toml"))
+    >>> len(figure.axes) > 2
+    True
+    """
     draw = attribute_of(run.plant, "figures", "stroke_figure")
     if draw is None:
         return run_figure(Experiment("run", run.scenario.name, (Case(run.scenario.name, run, ()),), ()))
@@ -89,14 +115,39 @@ def stroke_figure(run: Trajectory, published: Published | None = None) -> Figure
 
 
 def save(figure: Figure, path: str | Path) -> Path:
-    """Write a figure as .png, .svg or .pdf, whole or not at all; the same figure gives the same bytes."""
+    """Write a figure as .png, .svg or .pdf, whole or not at all; the same figure gives the same bytes.
+
+    figure : a matplotlib Figure
+    path : of the file; its suffix gives the form
+
+    Returns the path.
+
+    Raises InputError for another suffix, or a folder that cannot be written to.
+
+    >>> import malta
+    >>> malta.report.save(malta.report.new_figure("empty"), "build/empty.svg").name
+    'empty.svg'
+    """
     path = Path(path)
     replace_files({path: encode_figure(figure, path)})
     return path
 
 
 def encode_figure(figure: Figure, path: Path) -> bytes:
-    """The content of a .png, .svg or .pdf file of a figure. Raises InputError for another suffix of its path."""
+    r"""Make the content of a .png, .svg or .pdf file of a figure; the same figure gives the same bytes.
+
+    figure : a matplotlib Figure
+    path : of the file; its suffix gives the form
+
+    Returns the bytes.
+
+    Raises InputError for another suffix.
+
+    >>> import malta
+    >>> from pathlib import Path
+    >>> malta.report.encode_figure(malta.report.new_figure("empty"), Path("empty.png"))[:4]
+    b'\x89PNG'
+    """
     import matplotlib
 
     from malta.report.figures.inline import png_of
@@ -195,7 +246,23 @@ def _draw_currents(axes: Axes, x: str, run: Trajectory) -> None:
 
 
 def front_figure(tuned: Tuned) -> Figure:
-    """The Pareto front of a search: force noise and motion against the proven margin, the chosen trial ringed."""
+    """Draw the Pareto front of a search: force noise and motion over the proven margin, the chosen trial ringed.
+
+    tuned : from `malta.tune`
+
+    Returns a matplotlib Figure, which a notebook shows as the value of a cell.
+
+    >>> import malta
+    >>> from malta.tuning.search import Trial
+    >>> from malta.tuning.tune import Tuned
+    >>> spec = malta.read_design("examples/ball/design/ball.toml")
+    >>> quiet = Trial((223.0, 50.0, 0.051), 1, {"margin": 3.28, "force_noise f": 0.0122, "motion y": 0.523e-6})
+    >>> safe = Trial((190.0, 40.0, 0.11), 1, {"margin": 3.63, "force_noise f": 0.0414, "motion y": 0.501e-6})
+    >>> tuned = Tuned(spec, safe, requirements=(), front=(quiet, safe), trials=120)  # as malta.tune finds it
+    >>> figure = malta.report.front_figure(tuned)
+    >>> [axes.get_ylabel() for axes in figure.axes]
+    ['noise of the force [N rms]', 'true motion [µm rms]']
+    """
     from matplotlib.ticker import LogLocator
 
     asked, chosen, front = tuned.spec.specification, tuned.trial, tuned.front

@@ -53,9 +53,22 @@ LEFT = 1e-3  # where the lines of the worst runs begin, in the fine unit of thei
 
 
 def distributions_figure(found: Campaign | Summary, published: Published | None = None) -> Figure:
-    """Distributions of the figures of merit over the completed runs, with the published bounds.
+    """Draw the distributions of a campaign's figures of merit over the completed runs, with the published bounds.
 
     A figure that is the same in every run, or that the reference makes by a jump, is told in a sentence.
+
+    found : the campaign, or its summary
+    published : figures of the machine's paper, from `malta.published`; None: none; a summary has its own
+
+    Returns a matplotlib Figure, which a notebook shows as the value of a cell.
+
+    >>> import malta
+    >>> spec = malta.read_design("examples/ball/design/ball.toml")
+    >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
+    >>> plan = malta.Plan(controller, "disturbance", {"m": 0.1}, samples=8, options={"duration": 0.02})
+    >>> figure = malta.report.distributions_figure(malta.campaign(plan, workers=1))
+    >>> [axes.get_xlabel() for axes in figure.axes][:2]
+    ['deviation [µm]', 'largest f [N]']
     """
     from malta.campaigns.summary import Bounds, as_summary
 
@@ -160,9 +173,22 @@ def _draw_distribution(axes: Axes, kind: str, listed: Sequence[Merit]) -> None:
 
 
 def yield_figure(found: Campaign | Summary, published: Published | None = None) -> Figure:
-    """Shares of the ways in which runs end, over each parameter that was varied.
+    """Draw the shares of the ways in which the runs of a campaign end, over each parameter that was varied.
 
     Where all are completed alike there is nothing to tell apart, and `nearest_figure` stands in its place.
+
+    found : the campaign, or its summary
+    published : figures of the machine's paper, from `malta.published`; None: none; a summary has its own
+
+    Returns a matplotlib Figure, which a notebook shows as the value of a cell.
+
+    >>> import malta
+    >>> spec = malta.read_design("examples/ball/design/ball.toml")
+    >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
+    >>> plan = malta.Plan(controller, "disturbance", {"m": 0.1}, samples=8, options={"duration": 0.02})
+    >>> figure = malta.report.yield_figure(malta.campaign(plan, workers=1))
+    >>> [axes.get_xlabel() for axes in figure.axes]
+    ['m [kg]']
     """
     from malta.campaigns.plan import varied_names
     from malta.campaigns.summary import Bounds, as_summary

@@ -44,13 +44,26 @@ def chain_figure(
     position: str = "position",
     worst: Mapping[str, Gain] | None = None,
 ) -> Figure:
-    """Margins and peak sensitivities of all stages as bars, and below them both along the travel.
+    """Draw margins and peak sensitivities of all stages as bars, and below them both along the travel.
 
     A machine without a travel has the first parameter that its proofs cover in its place, or nothing below.
 
-    found : the analysis; name : of the design; uncertainty : half-widths of the box, as shares
+    found : from `malta.robustness`
+    name : of the design
+    uncertainty : half-widths of the box, as shares
     position : the machine's word for its travel, as "position z"
-    worst : the largest |S| of each sensor over the uncertainty and all that the margin covers
+    worst : the largest `|S|` of each sensor over the uncertainty and all that the margin covers, from
+        `malta.worst_case_gain`; None: none
+
+    Returns a matplotlib Figure, which a notebook shows as the value of a cell.
+
+    >>> import malta
+    >>> spec = malta.read_design("examples/ball/design/ball.toml")
+    >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
+    >>> box = {"m": 0.2}
+    >>> figure = malta.report.chain_figure(malta.robustness(spec.plant, controller, box), "ball", box)
+    >>> [axes.get_xlabel() for axes in figure.axes]
+    ['margin without loads [% of the box]', 'peak |S|, dark: under its loads; zones of ISO 14839-3']
     """
     box = ", ".join(f"{key} ±{100 * share:g} %" for key, share in uncertainty.items())
     figure = new_figure(

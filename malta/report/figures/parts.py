@@ -32,6 +32,12 @@ STYLES: Sequence[dict[str, Any]] = (  # distinct without colour: by darkness and
     {"color": "#1f77b4", "linestyle": (0, (5, 2)), "linewidth": 1.4},
     {"color": "#8a8a8a", "linestyle": (0, (1.5, 1.5)), "linewidth": 1.6},
 )
+"""Styles of lines that are distinct without colour, by darkness and dashes: keywords of Axes.plot.
+
+>>> import malta
+>>> [style["color"] for style in malta.report.STYLES]
+['#000000', '#c1440e', '#1f77b4', '#8a8a8a']
+"""
 MORE: Sequence[dict[str, Any]] = (  # used after STYLES
     {"color": "#000000", "linestyle": (0, (7, 2, 1.5, 2)), "linewidth": 1.4},
     {"color": "#c1440e", "linestyle": (0, (1.5, 1.5)), "linewidth": 1.6},
@@ -54,13 +60,20 @@ def runs_of(e: Experiment) -> list[Trajectory]:
 def new_figure(
     title: str = "", found: str = "", *, size: tuple[float, float] = (9.0, 6.0), **places: Any
 ) -> Figure:
-    """An empty figure that shows itself in a notebook: as the value of a cell, or by `display(figure)`.
+    """Make an empty figure that shows itself in a notebook: as the value of a cell, or by `display(figure)`.
 
-    title, found : what the figure shows, and below it a line of results
+    title : what the figure shows
+    found : a line of results below the title
     size : width and height, inch
     places : left, right, bottom, top, wspace, hspace of the panels, as Figure.subplots_adjust takes them
 
-    Example: `axes = new_figure("robust: Bode plot", size=(9.0, 4.6)).subplots(2, 1, sharex=True)`
+    Returns a matplotlib Figure.
+
+    >>> import malta
+    >>> figure = malta.report.new_figure("robust: Bode plot", size=(9.0, 4.6))
+    >>> upper, lower = figure.subplots(2, 1, sharex=True)
+    >>> figure.get_size_inches().tolist()
+    [9.0, 4.6]
     """
     from malta.report.figures.inline import InlineFigure
 

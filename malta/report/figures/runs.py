@@ -149,7 +149,21 @@ def _nearness(summary: Summary, runs: Runs) -> tuple[FloatArray, str]:
 
 
 def worst_figure(found: Campaign | Summary, published: Published | None = None) -> Figure:
-    """The worst runs: the places of their machines in the box, and their largest errors."""
+    """Draw the worst runs of a campaign: the places of their machines in the box, and their largest errors.
+
+    found : the campaign, or its summary
+    published : figures of the machine's paper, from `malta.published`; None: none; a summary has its own
+
+    Returns a matplotlib Figure, which a notebook shows as the value of a cell.
+
+    >>> import malta
+    >>> spec = malta.read_design("examples/ball/design/ball.toml")
+    >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
+    >>> plan = malta.Plan(controller, "disturbance", {"m": 0.1}, samples=8, options={"duration": 0.02})
+    >>> figure = malta.report.worst_figure(malta.campaign(plan, workers=1))
+    >>> len(figure.axes)
+    2
+    """
     from malta.campaigns.plan import half_width, middle_of, varied_names
     from malta.campaigns.statistics import spread_text
     from malta.campaigns.summary import Bounds, as_summary, worst_runs

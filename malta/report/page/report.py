@@ -29,15 +29,23 @@ def gain_page(
 ) -> Page:
     """Report a gain file, or a controller, as one page in HTML that needs no network and no other file.
 
+    gains : the gain file, or a controller
     parameters : of the machine; None: those of the controller
     uncertainty : parameter -> share, either way, at margin 1; None: those of the gain file, none of a controller
-    spec : the design file, whose [specification] is judged;  campaigns : summaries of campaigns of these gains
+    spec : the design, whose [specification] is judged; None: none
+    campaigns : summaries of campaigns of these gains
     proof : whether margins are proven, which takes seconds
 
-    A notebook shows the page; `save` writes it. Raises InputError and CheckError as `malta.gains.read` and
-    `malta.verify`.
+    Returns a Page: a notebook shows it, and its `save` writes it.
 
-        malta.report.gain_page("design/gains/robust.json").save("build/robust_report.html")
+    Raises InputError and CheckError as `malta.gains.read` and `malta.verify`.
+
+    >>> import malta
+    >>> spec = malta.read_design("examples/ball/design/ball.toml")
+    >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
+    >>> page = malta.report.gain_page(controller, spec=spec, proof=False)
+    >>> page.save("build/ball.html").name, "<svg" in page.html
+    ('ball.html', True)
     """
     from malta.report.page.analysis import analyse
 

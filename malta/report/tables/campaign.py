@@ -24,7 +24,17 @@ if TYPE_CHECKING:
 
 
 def run_text(plan: Plan) -> str:
-    """What each machine of a plan does: its scenario, with the case, and the fidelity."""
+    """Say what each machine of a plan does: its scenario, with the case, and the fidelity.
+
+    plan : of a campaign
+
+    Returns a line of text.
+
+    >>> import malta
+    >>> controller = malta.gains.read("design/gains/calibrated.json")
+    >>> malta.report.run_text(malta.Plan(controller, "stroke", spread={"m": 0.1}))
+    'stroke, fidelity dq'
+    """
     from malta.campaigns.plan import planned_run
 
     wanted = planned_run(plan)
@@ -33,7 +43,17 @@ def run_text(plan: Plan) -> str:
 
 
 def box_text(plan: Plan) -> str:
-    """The parameters that a plan varies, with their half-widths."""
+    """Name the parameters that a plan varies, with their half-widths.
+
+    plan : of a campaign
+
+    Returns a line of text.
+
+    >>> import malta
+    >>> controller = malta.gains.read("design/gains/calibrated.json")
+    >>> malta.report.box_text(malta.Plan(controller, spread={"m": 0.1, "K_A": 0.05}))
+    'm ±10 %, K_A ±5 %'
+    """
     from malta.campaigns.statistics import spread_text
 
     spreads: dict[str, list[str]] = {}
@@ -48,10 +68,26 @@ def campaign_tables(
     worst: int = 5,
     spec: Spec | None = None,
 ) -> Group:
-    """How the runs of a campaign end, their figures of merit beside the published bounds, and the worst runs.
+    """Tabulate how the runs of a campaign end, their figures of merit beside the published bounds, and the worst runs.
 
-    published, spec : figures of the machine's paper, and the design whose [specification] bounds the runs as well;
-        a summary has its own
+    found : the campaign, or its summary
+    published : figures of the machine's paper, from `malta.published`; None: none; a summary has its own
+    worst : number of the worst runs that are listed
+    spec : the design whose [specification] bounds the runs as well; a summary has its own
+
+    Returns a rich Group of tables, which `rich.print` prints.
+
+    >>> import malta, rich
+    >>> spec = malta.read_design("examples/ball/design/ball.toml")
+    >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
+    >>> plan = malta.Plan(controller, "disturbance", {"m": 0.1}, samples=8, options={"duration": 0.02})
+    >>> rich.print(malta.report.campaign_tables(malta.campaign(plan, workers=1)).renderables[0])
+    How the runs end
+    <BLANKLINE>
+     end         runs   share [%]   95 % interval [%]
+     ────────────────────────────────────────────────
+     completed      8       100.0      63.06 to 100.0
+    <BLANKLINE>
     """
     from malta.campaigns.summary import Bounds, as_summary
 

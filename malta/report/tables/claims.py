@@ -13,7 +13,23 @@ if TYPE_CHECKING:
 
 
 def claims_table(ledger: Ledger) -> Table:
-    """A row for each published number: the paper's value, that of each design, and the verdict."""
+    """Tabulate published numbers: the paper's value, that of each design, and the verdict.
+
+    ledger : from `malta.ledger`
+
+    Returns a rich Table, which `rich.print` prints.
+
+    >>> import malta, rich
+    >>> from malta.report.ledger import Claim, Ledger
+    >>> claim = Claim("pole of x [rad/s]", "±218.92", ("±218.92",), "reproduced")
+    >>> rich.print(malta.report.claims_table(Ledger("tubular", "the paper", ("table2",), (claim,))))
+    Published numbers and ours: tubular, the paper
+    <BLANKLINE>
+     claim               published    table2   verdict
+     ────────────────────────────────────────────────────
+     pole of x [rad/s]     ±218.92   ±218.92   reproduced
+    <BLANKLINE>
+    """
     table = new_table(
         f"Published numbers and ours: {ledger.title}", "claim", "published", *ledger.designs, "verdict"
     )

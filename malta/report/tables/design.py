@@ -26,9 +26,26 @@ if TYPE_CHECKING:
 
 
 def poles_table(model: LinearModel, published: Published | None) -> Table:
-    """Open-loop poles by mode; beside them the paper's Table I, which holds at the middle of the travel.
+    """Tabulate open-loop poles by mode; beside them the paper's Table I, which holds at the middle of the travel.
 
     A damped plant has no pairs of opposite poles: all its poles are listed.
+
+    model : the machine's linear model
+    published : figures of the machine's paper, from `malta.published`; None: none
+
+    Returns a rich Table, which `rich.print` prints.
+
+    >>> import malta, rich
+    >>> plant = malta.plant_of(malta.read("data/tubular.toml"))
+    >>> model = malta.linearize(plant, plant.at())
+    >>> rich.print(malta.report.poles_table(model, malta.published("data/tubular.toml")))
+    Open-loop poles [rad/s]
+    <BLANKLINE>
+     mode               x        y      z    alpha     beta
+     ──────────────────────────────────────────────────────
+     ours, +-      218.92   218.92   0.00   157.53   157.53
+     Table I, +-   218.92   218.92   0.00   157.53   157.53
+    <BLANKLINE>
     """
     n = len(model.A) // 2
     if np.any(model.A[n:, n:]):
@@ -53,9 +70,26 @@ def publishes(published: Published | None, table: str, key: str) -> TypeGuard[Pu
 
 
 def loop_poles_table(margins: Margins, continuous: Mapping[str, ComplexArray] | None = None) -> Table:
-    """Poles of the continuous design, if given, and of the sampled loop as ln(lambda) / Ts, rad/s.
+    """Tabulate poles of the continuous design, if given, and of the sampled loop as ln(lambda) / Ts, rad/s.
 
-    continuous : poles by the name of their row
+    margins : from `malta.verify`
+    continuous : poles by the name of their row, rad/s; None: none
+
+    Returns a rich Table, which `rich.print` prints.
+
+    >>> import malta, rich
+    >>> spec = malta.read_design("examples/ball/design/ball.toml")
+    >>> model = malta.linearize(spec.plant, spec.plant.at())
+    >>> controller = malta.synthesize(spec, model)
+    >>> rich.print(malta.report.loop_poles_table(malta.verify(model, controller)))
+    Poles [rad/s]; of sampled systems ln(lambda) / Ts
+    <BLANKLINE>
+     of                           poles
+     ───────────────────────────────────────────────────────────────────
+     sampled regulator            -518.6  -98.37  -19.61
+     sampled Kalman filter        -507.3+-492.9j
+     closed loop of the machine   -567.1+-588.7j  -391.9  -95.23  -20.05
+    <BLANKLINE>
     """
     table = new_table("Poles [rad/s]; of sampled systems ln(lambda) / Ts", "of", "poles")
     for what, poles in (continuous or {}).items():
@@ -71,7 +105,29 @@ def loop_poles_table(margins: Margins, continuous: Mapping[str, ComplexArray] | 
 
 
 def bandwidth_table(margins: Margins, published: Published | None) -> Table:
-    """The bandwidth by each definition; a paper may print one figure without saying which it is."""
+    """Tabulate the bandwidth by each definition; a paper may print one figure without saying which it is.
+
+    margins : from `malta.verify`
+    published : figures of the machine's paper, from `malta.published`; None: none
+
+    Returns a rich Table, which `rich.print` prints.
+
+    >>> import malta, rich
+    >>> spec = malta.read_design("examples/ball/design/ball.toml")
+    >>> model = malta.linearize(spec.plant, spec.plant.at())
+    >>> controller = malta.synthesize(spec, model)
+    >>> rich.print(malta.report.bandwidth_table(malta.verify(model, controller), None))
+    Bandwidth by definition
+    <BLANKLINE>
+     definition                              rad/s       Hz
+     ──────────────────────────────────────────────────────
+     last -3 dB of sigma_max(T)              652.0   103.76
+     first -3 dB of sigma_min(T)             652.0   103.76
+     last 0 dB of sigma_max(L)               290.8    46.29
+     regulator's fastest natural frequency   247.4    39.37
+     regulator's slowest natural frequency   247.4    39.37
+    <BLANKLINE>
+    """
     table = new_table("Bandwidth by definition", "definition", "rad/s", "Hz")
     for key, meaning in BANDWIDTHS.items():
         if key not in margins.bandwidth:  # a machine or a law without natural frequencies
@@ -87,7 +143,26 @@ def bandwidth_table(margins: Margins, published: Published | None) -> Table:
 
 
 def sensitivity_table(margins: Margins) -> Table:
-    """Peak sensitivity at each sensor with its ISO 14839-3 zone, for each stage of the analysis."""
+    """Tabulate peak sensitivities at each sensor with their ISO 14839-3 zones, for each stage of the analysis.
+
+    margins : from `malta.verify`
+
+    Returns a rich Table, which `rich.print` prints.
+
+    >>> import malta, rich
+    >>> spec = malta.read_design("examples/ball/design/ball.toml")
+    >>> model = malta.linearize(spec.plant, spec.plant.at())
+    >>> controller = malta.synthesize(spec, model)
+    >>> rich.print(malta.report.sensitivity_table(malta.verify(model, controller)))
+    Peak sensitivity (ISO 14839-3 zone: A < 3, B < 4, C < 5)
+    <BLANKLINE>
+     loop                   y   sigma_max   at rad/s
+     ───────────────────────────────────────────────
+     sampled           1.71 A        1.71        542
+     + current loops   1.71 A        1.71        542
+     machine           1.57 A        1.57        584
+    <BLANKLINE>
+    """
     sensors = [k for k in margins.peak_sensitivity if k != "sigma_max"]
     limits = ", ".join(f"{name} < {limit:g}" for limit, name in ZONES if math.isfinite(limit))
     table = new_table(

@@ -20,7 +20,19 @@ if TYPE_CHECKING:
 
 
 def limits_text(e: Experiment) -> list[str]:
-    """Sentences on the limits that runs reached: one for each set of limits, with the cases that reached it."""
+    """Name the limits that runs reached: a sentence for each set of limits, with the cases that reached it.
+
+    e : from `malta.experiment`
+
+    Returns the sentences; none where no run reached a limit.
+
+    >>> import malta
+    >>> spec = malta.read_design("examples/ball/design/ball.toml")
+    >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
+    >>> push = malta.experiment("disturbance", spec.plant, controller, size=8.0)
+    >>> malta.report.limits_text(push)
+    ['met the force limit: w']
+    """
     met: dict[tuple[str, ...], list[str]] = {}
     for case in e.cases:
         met.setdefault(case.run.limits, []).append(case.label)
@@ -28,9 +40,27 @@ def limits_text(e: Experiment) -> list[str]:
 
 
 def experiment_table(e: Experiment, published: Published | None = None) -> Group:
-    """The cases of an experiment, and its figures of merit beside the published ones.
+    """Tabulate the cases of an experiment, and its figures of merit beside the published ones.
 
     Where the experiment has no figures of merit of its own, each case has a row.
+
+    e : from `malta.experiment`
+    published : figures of the machine's paper, from `malta.published`; None: none
+
+    Returns a rich Group of tables, which `rich.print` prints.
+
+    >>> import malta, rich
+    >>> spec = malta.read_design("examples/ball/design/ball.toml")
+    >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
+    >>> push = malta.experiment("disturbance", spec.plant, controller, size=0.1, noise=0.0, quantize=False)
+    >>> rich.print(malta.report.experiment_table(push))
+    How far does a load move it, and does it come back?
+    <BLANKLINE>
+     figure                       ours
+     ─────────────────────────────────
+     y moves by [um]             34.29
+     y, left at the end [um]   0.05314
+    <BLANKLINE>
     """
     if len(e.cases) > 1 and e.merits is e.cases[0].merits:
         return Group(_cases_table(e, published))
@@ -111,9 +141,26 @@ def _list_of_merits(e: Experiment) -> Table:
 
 
 def scenarios_table(plant: Plant, flown: Collection[str] | None = None) -> Table:
-    """The experiments of a machine, each with a description and the options that only it has.
+    """Tabulate the experiments of a machine, each with a description and the options that only it has.
 
-    flown : names of the experiments to list; all if None
+    plant : the machine
+    flown : names of the experiments to list; None: all
+
+    Returns a rich Table, which `rich.print` prints.
+
+    >>> import malta, rich
+    >>> ball = malta.read_design("examples/ball/design/ball.toml").plant
+    >>> rich.print(malta.report.scenarios_table(ball, ["disturbance"]))
+    Scenarios of the machine 'ball'
+    <BLANKLINE>
+                                                                          options
+                                                                          of its
+     scenario     what is run                                             own
+     ─────────────────────────────────────────────────────────────────────────────
+     disturbance  A constant force or torque of `size` (N or N m) on one  on=all
+                  input of disturbance, or on each in turn.               size=1.0
+                                                                          time=0.0
+    <BLANKLINE>
     """
     table = new_table(
         f"Scenarios of the machine {plant.name!r}", "scenario", "what is run", "options of its own"

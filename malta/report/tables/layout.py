@@ -197,7 +197,15 @@ def new_sheet(title: str, columns: Sequence[tuple[str, str]]) -> FoldingTable:
 
 @dataclass(frozen=True)
 class Paragraph:
-    """A text of one paragraph that folds as the cells of tables do."""
+    """A text of one paragraph that folds at spaces, as the cells of tables do: no number parts from its unit.
+
+    text : the text
+    style : as rich has it, "bold"; "": plain
+
+    >>> import malta, rich
+    >>> rich.print(malta.report.Paragraph("F_x moves x2 by 52.9 um", style="bold"))
+    F_x moves x2 by 52.9 um
+    """
 
     text: str
     style: str = ""

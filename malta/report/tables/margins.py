@@ -27,9 +27,31 @@ if TYPE_CHECKING:
 
 
 def chain_table(found: Robustness) -> Table:
-    """Parametric margin and peak sensitivity of each stage, from the ideal loop to the machine's.
+    """Tabulate the parametric margin and the peak sensitivity of each stage, from the ideal loop to the machine's.
 
-    Margins are without the loads; |S| of the last stage is that of the machine under its loads.
+    Margins are without the loads; `|S|` of the last stage is that of the machine under its loads.
+
+    found : from `malta.robustness`
+
+    Returns a rich Table, which `rich.print` prints.
+
+    >>> import malta, rich
+    >>> spec = malta.read_design("examples/ball/design/ball.toml")
+    >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
+    >>> found = malta.robustness(spec.plant, controller, {"m": 0.2})
+    >>> rich.print(malta.report.chain_table(found))
+    Where the margin goes: multiples of the uncertainty that no parameter set may
+    exceed
+    <BLANKLINE>
+                                              first to
+     stage       proven     lost at   rad/s       give   peak |S|                of
+     ──────────────────────────────────────────────────────────────────────────────
+     LQR       499.95 %   not found                          1.00            forces
+     LQI       499.95 %   not found                          1.00            forces
+     LQG       390.34 %    390.34 %    1006         m-     1.60 A           sensors
+     LQGI      386.27 %    386.27 %    1010         m-     1.64 A           sensors
+     sampled   390.69 %    390.69 %    1047         m-     1.57 A   sensors, loaded
+    <BLANKLINE>
     """
     table = new_table(
         "Where the margin goes: multiples of the uncertainty that no parameter set may exceed",
@@ -89,9 +111,28 @@ def _limiting_parameters(margin: Margin) -> str:
 
 
 def disk_table(found: Robustness, Ts: float) -> Table:
-    """Disk margins of the machine's loop, and the delay margin of each sensor's loop.
+    """Tabulate disk margins of the machine's loop, and the delay margin of each sensor's loop.
 
+    found : from `malta.robustness`
     Ts : sample time, s
+
+    Returns a rich Table, which `rich.print` prints.
+
+    >>> import malta, rich
+    >>> spec = malta.read_design("examples/ball/design/ball.toml")
+    >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
+    >>> found = malta.robustness(spec.plant, controller, {"m": 0.2})
+    >>> rich.print(malta.report.disk_table(found, controller.sample_time))
+    Margins of the sampled loop without parameters
+    <BLANKLINE>
+     factor in               disk           gain   phase [deg]   rad/s
+     ─────────────────────────────────────────────────────────────────
+     forces                 0.810   0.42 .. 2.36        +-44.1   66.57
+     sensors                0.810   0.42 .. 2.36        +-44.1   66.57
+     forces and sensors     0.400   0.67 .. 1.50        +-22.6   314.4
+     y alone                0.810   0.42 .. 2.36        +-44.1   66.57
+     delay at y alone     2719 us   13.6 samples
+    <BLANKLINE>
     """
     table = new_table(
         f"Margins of the sampled loop without parameters{_places_text(found)}",
@@ -130,7 +171,25 @@ def _delay_cells(delay: float, Ts: float) -> tuple[str, str]:
 
 
 def gang_table(found: Robustness, plant: Plant) -> Table:
-    """Gang of four: the largest gains of S, T, PS and FS at each sensor."""
+    """Tabulate the gang of four: the largest gains of S, T, PS and FS at each sensor.
+
+    found : from `malta.robustness`
+    plant : the machine
+
+    Returns a rich Table, which `rich.print` prints.
+
+    >>> import malta, rich
+    >>> spec = malta.read_design("examples/ball/design/ball.toml")
+    >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
+    >>> found = malta.robustness(spec.plant, controller, {"m": 0.2})
+    >>> rich.print(malta.report.gang_table(found, spec.plant))
+    Gang of four, largest over frequency
+    <BLANKLINE>
+     sensor    |S|    |T|   from force |SP| [um/N]   to force |FS| [N/um]
+     ────────────────────────────────────────────────────────────────────
+     y        1.57   1.72                    430.5                  0.034
+    <BLANKLINE>
+    """
     units = {signal.name: signal.unit for signal in plant.outputs}
     one = next(iter(set(units.values()))) if len(set(units.values())) == 1 else ""
     heads = (f" [{per(one)}]" if one else "" for per in (compliance_unit, stiffness_unit))
@@ -155,9 +214,28 @@ def _course_text(extent: Extent) -> str:
 def tolerance_table(
     found: Robustness, uncertainty: Mapping[str, float], payload: Payload | None = None
 ) -> Table:
-    """The proven range of each parameter alone, and its share in the margin of all together.
+    """Tabulate the proven range of each parameter alone, and its share in the margin of all together.
 
     The mass margin is that of the linear loop; the payload below it is bounded by limits of forces and by flight.
+
+    found : from `malta.robustness`
+    uncertainty : half-widths of the box, as shares
+    payload : masses that the machine carries, kg; None: no rows of it
+
+    Returns a rich Table, which `rich.print` prints.
+
+    >>> import malta, rich
+    >>> spec = malta.read_design("examples/ball/design/ball.toml")
+    >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
+    >>> found = malta.robustness(spec.plant, controller, {"m": 0.2})
+    >>> rich.print(malta.report.tolerance_table(found, {"m": 0.2}))
+    One at a time, proven
+    <BLANKLINE>
+     parameter                  down to       up to   share in the margin
+     ────────────────────────────────────────────────────────────────────
+     m                          -78.1 %   +1663.9 %                 100 %
+     mass margin, linear loop               1.66 kg
+    <BLANKLINE>
     """
     anywhere = ["anywhere in the travel"] if found.extent.stroke else []
     anywhere += [f"for {found.extent.values}"] if found.extent.over else []
@@ -188,7 +266,24 @@ def tolerance_table(
 
 
 def worst_case_table(gains: Mapping[str, Gain]) -> Table:
-    """The largest |S| of each sensor over all that the margin covers: found, and proven upper bound."""
+    """Tabulate the largest `|S|` of each sensor over all that the margin covers: found, and proven upper bound.
+
+    gains : by sensor, from `malta.worst_case_gain`
+
+    Returns a rich Table, which `rich.print` prints.
+
+    >>> import malta, rich
+    >>> spring = malta.uncertain(lambda k: ([[0, 1], [-k, -1]], [[0], [1]], [[1, 0]]), {"k": 4.0})
+    >>> gain = malta.worst_case_gain(spring, [[-5.0]], {"k": 0.2})
+    >>> rich.print(malta.report.worst_case_table({"y": gain}))
+    Worst-case peak |S| over the uncertainty and all that the margin covers, without
+    loads
+    <BLANKLINE>
+     sensor   found   at rad/s   proven below   zone
+     ───────────────────────────────────────────────
+     y        2.105      3.026          2.112      A
+    <BLANKLINE>
+    """
     title = "Worst-case peak |S| over the uncertainty and all that the margin covers, without loads"
     table = new_table(title, "sensor", "found", "at rad/s", "proven below", "zone")
     for name, gain in gains.items():
@@ -198,9 +293,27 @@ def worst_case_table(gains: Mapping[str, Gain]) -> Table:
 
 
 def places_table(found: Robustness, Ts: float) -> Table:
-    """Margins of the machine's loop along the travel, where each holds at a position and at its negative.
+    """Tabulate margins of the machine's loop along the travel, where each holds at a position and at its negative.
 
     A machine without a travel has the first parameter that its proofs cover in its place.
+
+    found : from `malta.robustness`
+    Ts : sample time, s
+
+    Returns a rich Table, which `rich.print` prints.
+
+    >>> import malta, rich
+    >>> spec = malta.read_design("examples/ball/design/ball.toml")
+    >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
+    >>> found = malta.robustness(spec.plant, controller, {"m": 0.2})
+    >>> rich.print(malta.report.places_table(found, controller.sample_time))
+    The machine's loop: margins without the loads, the rest under them
+    <BLANKLINE>
+                                              peak  disk,
+     at            proven   lost at  rad/s     |S|    all                  delay
+     ───────────────────────────────────────────────────────────────────────────
+     its values  390.69 %  390.69 %   1047  1.57 A  0.400  2719 us, 13.6 samples
+    <BLANKLINE>
     """
     extent = found.extent
     if not extent.stroke:

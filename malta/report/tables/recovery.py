@@ -25,7 +25,23 @@ def recovery_table(found: Sequence[Recovery], plant: Plant) -> Table:
 
     The peak over frequency is the amplitude of the output under a load of this amplitude.
 
-    Example: `recovery_table(malta.recovery(plant, controller), plant)`
+    found : from `malta.recovery`
+    plant : the machine
+
+    Returns a rich Table, which `rich.print` prints.
+
+    >>> import malta, rich
+    >>> spec = malta.read_design("examples/ball/design/ball.toml")
+    >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
+    >>> rich.print(malta.report.recovery_table(malta.recovery(spec.plant, controller), spec.plant))
+    A constant load from outside, and the output that it moves furthest
+    <BLANKLINE>
+                               left    left     1 %
+                      moves   after   after   after     peak
+     load    output      by   0.1 s   0.3 s     [s]   over w   at rad/s
+     ──────────────────────────────────────────────────────────────────
+     1 N w   y [um]   343.4   94.98   1.722   0.266    430.5       42.8
+    <BLANKLINE>
     """
     units = {s.name: s.unit for s in plant.disturbances}
     after = [f"left after {t:g} s" for t in (found[0].after if found else ())]

@@ -22,7 +22,20 @@ if TYPE_CHECKING:
 
 
 def rare_event_tables(event: RareEvent) -> Group:
-    """The probability of a rare event with its interval, the levels on the way to it, and its design point."""
+    """Tabulate the probability of a rare event with its interval, the levels on the way to it, and its design point.
+
+    event : from `malta.rare_event`
+
+    Returns a rich Group of tables, which `rich.print` prints.
+
+    >>> import malta
+    >>> spec = malta.read_design("examples/ball/design/ball.toml")
+    >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
+    >>> plan = malta.Plan(controller, "disturbance", {"m": 0.2}, samples=100, options={"duration": 0.02})
+    >>> event = malta.rare_event(plan, malta.limit_of(plan, "deviation-y", 40e-6), workers=1)
+    >>> [str(table.title) for table in malta.report.rare_event_tables(event).renderables][:2]
+    ['Rare event: deviation y above 40 um or an earlier end', 'Levels: 1 is the limit']
+    """
     parts: list[Table | str] = [_probability_table(event), _levels_table(event)]
     if event.design_point is not None:
         parts.append(_design_point_table(event))
@@ -30,7 +43,20 @@ def rare_event_tables(event: RareEvent) -> Group:
 
 
 def rare_event_sentence(event: RareEvent) -> str:
-    """What is known of a rare event where no run failed; empty where runs did."""
+    """Say what is known of a rare event where no run failed.
+
+    event : from `malta.rare_event`
+
+    Returns a sentence; "" where runs failed.
+
+    >>> import malta
+    >>> spec = malta.read_design("examples/ball/design/ball.toml")
+    >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
+    >>> plan = malta.Plan(controller, "disturbance", {"m": 0.1}, samples=100, options={"duration": 0.02})
+    >>> event = malta.rare_event(plan, malta.limit_of(plan, "deviation-y", 40e-6), workers=1)
+    >>> malta.report.rare_event_sentence(event).partition(", as")[0]
+    'no run failed: deviation y above 40 um or an earlier end has a probability below 2.4e-08'
+    """
     found = event.found
     if found.reached:
         return ""
@@ -90,7 +116,21 @@ def _design_point_table(event: RareEvent) -> Table:
 
 
 def sensitivity_tables(found: Sensitivity) -> Group:
-    """Total and first-order Sobol indices of the yield and of each figure of merit, by what varies."""
+    """Tabulate total and first-order Sobol indices of the yield and of each figure of merit, by what varies.
+
+    found : from `malta.sensitivity`
+
+    Returns a rich Group of tables, which `rich.print` prints.
+
+    >>> import malta, rich
+    >>> spec = malta.read_design("examples/ball/design/ball.toml")
+    >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
+    >>> options = {"duration": 0.02, "noise": 0.0}
+    >>> plan = malta.Plan(controller, "disturbance", {"m": 0.2, "C": 0.2}, samples=64, options=options)
+    >>> found = malta.sensitivity(plan, malta.limit_of(plan, "touchdown"), workers=1)
+    >>> rich.print(malta.report.sensitivity_tables(found).renderables[0])
+    yield: 100 % (89.11 to 100 %) of the machines without touchdown; 64 runs
+    """
     said = f"yield: {share_text(found.within)} of the machines {found.limit.kept}; {found.runs} runs"
     parts: list[Table | Paragraph] = [Paragraph(said)]
     if not (found.of_yield or any(found.of_merits.values())):
@@ -101,7 +141,21 @@ def sensitivity_tables(found: Sensitivity) -> Group:
 
 
 def sensitivity_sentence(found: Sensitivity) -> str:
-    """Why figures have no indices; empty where all have."""
+    """Say why figures have no indices.
+
+    found : from `malta.sensitivity`
+
+    Returns a sentence; "" where all figures have indices.
+
+    >>> import malta
+    >>> spec = malta.read_design("examples/ball/design/ball.toml")
+    >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
+    >>> options = {"duration": 0.02, "noise": 0.0}
+    >>> plan = malta.Plan(controller, "disturbance", {"m": 0.2, "C": 0.2}, samples=64, options=options)
+    >>> found = malta.sensitivity(plan, malta.limit_of(plan, "touchdown"), workers=1)
+    >>> malta.report.sensitivity_sentence(found)
+    'every run is without touchdown: the yield has no indices'
+    """
     if not found.of_yield:
         every = "every" if found.within.share == 1 else "no"
         return f"{every} run is {found.limit.kept}: the yield has no indices"
@@ -124,7 +178,21 @@ def _index_table(title: str, found: Sensitivity, *, total: bool) -> Table:
 
 
 def spreads_table(found: Tolerances) -> Table:
-    """The largest spread of each parameter that keeps the wanted yield, beside today's."""
+    """Tabulate the largest spread of each parameter that keeps the wanted yield, beside today's.
+
+    found : from `malta.tolerances`
+
+    Returns a rich Table, which `rich.print` prints.
+
+    >>> import malta
+    >>> spec = malta.read_design("examples/ball/design/ball.toml")
+    >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
+    >>> plan = malta.Plan(controller, "disturbance", {"m": 0.1}, samples=20, options={"duration": 0.02})
+    >>> found = malta.tolerances(plan, malta.limit_of(plan, "deviation-y", 50e-6), 0.95, workers=1)
+    >>> table = malta.report.spreads_table(found)
+    >>> [str(column.header) for column in table.columns][:4], table.row_count
+    (['parameter', 'today', 'largest', 'times'], 1)
+    """
     from malta.campaigns.statistics import spread_text
 
     wanted = f"{100 * found.wanted:.6g} %"
@@ -145,7 +213,20 @@ def spreads_table(found: Tolerances) -> Table:
 
 
 def tolerance_sentence(found: Tolerances) -> str:
-    """Which parameters keep the yield again with a wider spread; empty where none does."""
+    """Name the parameters that keep the yield again with a wider spread.
+
+    found : from `malta.tolerances`
+
+    Returns a sentence; "" where none does.
+
+    >>> import malta
+    >>> spec = malta.read_design("examples/ball/design/ball.toml")
+    >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
+    >>> plan = malta.Plan(controller, "disturbance", {"m": 0.1}, samples=20, options={"duration": 0.02})
+    >>> found = malta.tolerances(plan, malta.limit_of(plan, "deviation-y", 50e-6), 0.95, workers=1)
+    >>> malta.report.tolerance_sentence(found)
+    ''
+    """
     names = " ".join(spread.name for spread in found.spreads if not spread.monotone)
     return f"a wider spread keeps the yield again: {names}" if names else ""
 

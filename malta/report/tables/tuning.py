@@ -17,7 +17,23 @@ if TYPE_CHECKING:
 
 
 def requirements_table(requirements: Sequence[Outcome]) -> Table:
-    """Each requirement of a design: the limit, the value found, and their ratio."""
+    """Tabulate the requirements of a design: the limit, the value found, and their ratio.
+
+    requirements : of a Tuned, from `malta.tune`
+
+    Returns a rich Table, which `rich.print` prints.
+
+    >>> import malta, rich
+    >>> from malta.tuning.outcomes import Outcome
+    >>> margin = Outcome("margin", asked=3.0, found=3.6, unit="1", how="proven over the travel", at_least=True)
+    >>> rich.print(malta.report.requirements_table([margin]))
+    Requirements
+    <BLANKLINE>
+     requirement   asked   found   of the limit                             from
+     ───────────────────────────────────────────────────────────────────────────
+     margin         >= 3     3.6         83.3 %   holds   proven over the travel
+    <BLANKLINE>
+    """
     table = new_table("Requirements", "requirement", "asked", "found", "of the limit", "", "from")
     for r in requirements:
         scale, unit = UNITS.get(r.unit, (1.0, ""))
@@ -53,7 +69,23 @@ def _front_columns(tuned: Tuned) -> dict[str, tuple[str, float, str]]:
 
 
 def front_rows(tuned: Tuned) -> tuple[list[str], list[list[str]]]:
-    """The Pareto front as headings and cells: a row for each trial, the chosen one with a star."""
+    """List the Pareto front as headings and cells: a row for each trial, the chosen one with a star.
+
+    tuned : from `malta.tune`
+
+    Returns headings and rows.
+
+    >>> import malta
+    >>> from malta.tuning.search import Trial
+    >>> from malta.tuning.tune import Tuned
+    >>> spec = malta.read_design("examples/ball/design/ball.toml")
+    >>> quiet = Trial((223.0, 50.0, 0.051), 1, {"margin": 3.28, "force_noise f": 0.0122, "motion y": 0.523e-6})
+    >>> safe = Trial((190.0, 40.0, 0.11), 1, {"margin": 3.63, "force_noise f": 0.0414, "motion y": 0.501e-6})
+    >>> tuned = Tuned(spec, safe, requirements=(), front=(quiet, safe), trials=120)  # as malta.tune finds it
+    >>> heads, rows = malta.report.front_rows(tuned)
+    >>> rows[1]
+    ['363', '0.0414', '0.501', '*']
+    """
     columns = _front_columns(tuned)
     shown = [name for name in columns if any(name in one.figures for one in tuned.front)]
     heads = [f"{columns[k][0]} [{columns[k][2]}]".removesuffix(" []") for k in shown]
@@ -66,7 +98,28 @@ def front_rows(tuned: Tuned) -> tuple[list[str], list[list[str]]]:
 
 
 def front_table(tuned: Tuned) -> Table:
-    """The Pareto front of margin, force noise and motion, in the order of margins."""
+    """Tabulate the Pareto front of margin, force noise and motion, in the order of margins.
+
+    tuned : from `malta.tune`
+
+    Returns a rich Table, which `rich.print` prints.
+
+    >>> import malta, rich
+    >>> from malta.tuning.search import Trial
+    >>> from malta.tuning.tune import Tuned
+    >>> spec = malta.read_design("examples/ball/design/ball.toml")
+    >>> quiet = Trial((223.0, 50.0, 0.051), 1, {"margin": 3.28, "force_noise f": 0.0122, "motion y": 0.523e-6})
+    >>> safe = Trial((190.0, 40.0, 0.11), 1, {"margin": 3.63, "force_noise f": 0.0414, "motion y": 0.501e-6})
+    >>> tuned = Tuned(spec, safe, requirements=(), front=(quiet, safe), trials=120)  # as malta.tune finds it
+    >>> rich.print(malta.report.front_table(tuned))
+    What the margin costs (* chosen)
+    <BLANKLINE>
+     margin, proven [%]   f [N rms]   y motion [um rms]
+     ──────────────────────────────────────────────────────
+     328                     0.0122               0.523
+     363                     0.0414               0.501   *
+    <BLANKLINE>
+    """
     heads, rows = front_rows(tuned)
     table = new_table("What the margin costs (* chosen)", *heads)
     for row in rows:
@@ -75,7 +128,26 @@ def front_table(tuned: Tuned) -> Table:
 
 
 def front_markdown(tuned: Tuned) -> str:
-    """The Pareto front as a Markdown table."""
+    """Write the Pareto front as a Markdown table.
+
+    tuned : from `malta.tune`
+
+    Returns the text.
+
+    >>> import malta
+    >>> from malta.tuning.search import Trial
+    >>> from malta.tuning.tune import Tuned
+    >>> spec = malta.read_design("examples/ball/design/ball.toml")
+    >>> quiet = Trial((223.0, 50.0, 0.051), 1, {"margin": 3.28, "force_noise f": 0.0122, "motion y": 0.523e-6})
+    >>> safe = Trial((190.0, 40.0, 0.11), 1, {"margin": 3.63, "force_noise f": 0.0414, "motion y": 0.501e-6})
+    >>> tuned = Tuned(spec, safe, requirements=(), front=(quiet, safe), trials=120)  # as malta.tune finds it
+    >>> print(malta.report.front_markdown(tuned))
+    | margin, proven [%] | f [N rms] | y motion [um rms] |  |
+    | ---: | ---: | ---: | ---: |
+    | 328 | 0.0122 | 0.523 |  |
+    | 363 | 0.0414 | 0.501 | * |
+    <BLANKLINE>
+    """
     heads, rows = front_rows(tuned)
     lines = ["| " + " | ".join(row) + " |" for row in (heads, ["---:"] * len(heads), *rows)]
     return "\n".join([*lines, ""])
