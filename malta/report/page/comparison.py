@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 LEAST, MOST = 2, 8  # designs
 NOTHING = "-"  # the text of a design that has no such entry or figure
+ANY_MACHINE = ("machine", "law", "gains")  # groups of entries that machines have in common
 GAP = "\0"  # in the place of a signal's name
 
 
@@ -110,6 +111,8 @@ class Comparison:
         for key in dict.fromkeys(key for entries in found for key in entries):
             entries = tuple(of.get(key) for of in found)
             first = next(entry for entry in entries if entry is not None)
+            if not self.one_machine and first.group not in ANY_MACHINE:
+                continue
             if not all(first.equals(entry) for entry in entries):
                 unit = display_unit(first.unit, [entry.value for entry in entries if entry is not None])
                 rows.append(Difference(first.group, key, first.name, unit, entries))
@@ -170,7 +173,8 @@ class Comparison:
         if not self.one_machine:
             machines = ", ".join(dict.fromkeys(a.plant.name for a in self.designs))
             found.append(
-                f"The machines differ ({machines}): sensors, noise, loads, main job and requirements are not compared."
+                f"The machines differ ({machines}): parameters, weights, single sensors, noise, loads, main job and "
+                "requirements are not compared."
             )
         elif not self.one_box:
             found.append(

@@ -147,8 +147,15 @@ def _weights(subject: Subject) -> Iterator[Entry]:
             ("input", plant.inputs, c.cost.input),
             ("integral", integrals, c.cost.integral),
         ):
-            squares = [Signal(s.name, f"1/({s.unit})^2") for s in states]
+            squares = [Signal(s.name, _over_square(s.unit)) for s in states]
             yield from _row("cost", f"{table} ", squares, cost)
+
+
+def _over_square(unit: str) -> str:
+    """The unit of a weight on a square: "1/m^2" of m, "1/(m/s)^2" of m/s."""
+    if unit == "1":
+        return unit
+    return f"1/{unit}^2" if unit.isalpha() else f"1/({unit})^2"
 
 
 def _noise(subject: Subject) -> Iterator[Entry]:

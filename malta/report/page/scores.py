@@ -25,6 +25,7 @@ Better = Literal["high", "low", ""]  # "": neither
 Scope = Literal[
     "loop", "box", "machine"
 ]  # what two designs share for a comparison of the figure to make sense
+PLAIN = (1e-2, 1e6)  # sizes of numbers that are written without a power of ten
 ROOTS = ("m s^0.5", "rad s^0.5")  # units of load errors, which are no products of whole powers
 SI_UNITS = ("m", "s", "rad", "N", "N m", "A", "V", "kg", "J", "1/s", "m/s", "rad/s", "m/N", "N/m", "m/s^2")
 
@@ -44,6 +45,7 @@ MEANINGS: dict[str, Meaning] = {
     "margin_proven": Meaning("stability and margins", "high", "box", "percent"),
     "margin_lost_at": Meaning("stability and margins", "high", "box", "percent"),
     "disk": Meaning("stability and margins", "high", "loop"),
+    "disk_of": Meaning("stability and margins", "high", "machine"),
     "delay_margin": Meaning("stability and margins", "high", "loop", "us", "s"),
     "mass_margin": Meaning("stability and margins", "high", "machine", "kg", "kg"),
     "payload": Meaning("stability and margins", "high", "machine", "kg", "kg"),
@@ -100,13 +102,23 @@ class Score(NamedTuple):
             return "none"
         if math.isinf(self.value):
             return "any"
-        return number(self.factor * self.value) if self.value else "0"
+        return four_digits(self.factor * self.value)
 
     @property
     def heading(self) -> str:
         """The label with the unit in brackets."""
         shown = {"percent": "%", "1": ""}.get(self.unit, micro(self.unit))
         return f"{self.label} [{shown}]" if shown else self.label
+
+
+def four_digits(value: float) -> str:
+    """A number with four digits; far from one with its power of ten.
+
+    >>> four_digits(0.5), four_digits(4.7e-7)
+    ('0.5000', '4.7e-07')
+    """
+    rounded = float(f"{value:.4g}")
+    return number(rounded) if PLAIN[0] <= abs(value) < PLAIN[1] or not value else f"{rounded:g}"
 
 
 def identifier(*parts: str) -> str:
@@ -153,7 +165,8 @@ def _margins(a: Analysis) -> Iterator[Score]:
     for disk in classical.disks:
         signal = disk.channels.removesuffix(" alone") if disk.channels.endswith(" alone") else ""
         words = f"disk margin, {disk.channels}"
-        yield _score("disk", f"disk_margin {disk.channels}", words, disk.size, signal=signal)
+        kind = "disk_of" if signal else "disk"
+        yield _score(kind, f"disk_margin {disk.channels}", words, disk.size, signal=signal)
     smallest = min(classical.delay.values())
     yield _score("delay_margin", "delay_margin", "delay margin, smallest", smallest)
     if a.robust is not None and a.robust.mass is not None and a.margin is not None:
@@ -206,7 +219,7 @@ def _loads(a: Analysis) -> Iterator[Score]:
     units = {s.name: s.unit for s in a.plant.disturbances}
     for load, output in furthest(a.recovered):
         fine, name, unit = FINE.get(output.unit, output.unit), f"load {load.name}", unit_word(output.unit)
-        size = f"1 {units[load.name]} {load.name}"
+        size = f"1 {units[load.name]} {load.name}".replace("1 1 ", "1 ")
         settled = f"{size}: within 1 % after"
         peak = f"{size}: largest over frequency"
         yield _score(

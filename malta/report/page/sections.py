@@ -14,10 +14,10 @@ import numpy as np
 from malta.margins.loops import machine_loop
 from malta.model.published import published_figures
 from malta.model.signals import FINE
-from malta.report.figures.parts import UNITS, number
+from malta.report.figures.parts import UNITS
 from malta.report.page.channels import distinct_channels
 from malta.report.page.design import design_entries, display_unit, kind_of
-from malta.report.page.scores import requirement_words
+from malta.report.page.scores import four_digits, requirement_words
 from malta.report.page.sheets import Sheet, matrix_sheet, plain_sheet, sheets_of
 from malta.report.tables.campaign import box_text, campaign_tables, run_text
 from malta.report.tables.design import bandwidth_table, loop_poles_table, poles_table, sensitivity_table
@@ -331,7 +331,7 @@ def _noise(a: Analysis) -> Iterator[Item]:
             fine = FINE.get(signal.unit, signal.unit)
             parts = (f"{100 * share:.0f} %" if share >= 0.005 else "" for share in shares[k])
             head = signal.name if fine == "1" else f"{signal.name} [{fine}]"
-            rows.append([head, number(in_unit(float(totals[k]), fine)), *parts])
+            rows.append([head, four_digits(in_unit(float(totals[k]), fine)), *parts])
         heads = ("signal", "rms", *(f"from {name}" for name in names))
         yield plain_sheet(f"{title}, as shares of the variance", heads, rows)
     if not np.any(a.noise.motion):

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
     from malta.report.page.comparison import Comparison, Line
 
+JOINT = "\N{NO-BREAK SPACE}"
 BEST = "*"  # behind the better value, beside bold letters
 LABELS = 34  # letters of the first column; longer labels are broken into lines
 NAME = 18  # letters of a design's name in a heading; longer names are broken
@@ -61,7 +62,7 @@ def _sign_width(lines: Sequence[Line]) -> int:
 def _table(title: str, names: Sequence[str], lines: Sequence[Line], columns: Sequence[int]) -> Table:
     """A table of some of the designs, with a line for each group, of the lines that one of them has a value in."""
     table = new_table(title, "", *(names[k] for k in columns))
-    group, blank = "", " " * _sign_width(lines)
+    group, blank = "", JOINT * _sign_width(lines)
     for line in lines:
         if all(line.texts[k] == NOTHING for k in columns):
             continue
@@ -71,7 +72,9 @@ def _table(title: str, names: Sequence[str], lines: Sequence[Line], columns: Seq
             group = line.group
             table.add_row(Text(group, style="italic"))
         cells = [
-            Text(f"{line.texts[k]} {BEST}", style="bold") if line.best[k] else Text(line.texts[k] + blank)
+            Text(f"{line.texts[k]}{JOINT}{BEST}", style="bold")
+            if line.best[k]
+            else Text(line.texts[k] + blank)
             for k in columns
         ]
         table.add_row(Text(micro(line.heading)), *cells)
