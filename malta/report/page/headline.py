@@ -45,6 +45,8 @@ def _margin(a: Analysis) -> Iterator[KeyFigure]:
     label = "Margin of the parameters"
     if not a.subject.box:
         yield KeyFigure(label, "not asked", "the gain file names no uncertain parameters")
+    elif not a.margins.stable:
+        yield KeyFigure(label, "none", "the loop is unstable already", "bad")
     elif a.margin is None:
         yield KeyFigure(label, "not proven", "left out by --no-proof")
     elif a.margin.lower is None:
@@ -53,7 +55,8 @@ def _margin(a: Analysis) -> Iterator[KeyFigure]:
         box = ", ".join(f"{name} ±{100 * share:g} %" for name, share in a.subject.box.items())
         state = "good" if a.margin.lower >= 1 else "bad"
         where = f" {a.margins.extent}" if str(a.margins.extent) else ""
-        yield KeyFigure("Proven margin", f"{100 * a.margin.lower:.1f} %", f"of {box}{where}", state)
+        more = "at least " if a.margin.exhausted else ""
+        yield KeyFigure("Proven margin", f"{more}{100 * a.margin.lower:.1f} %", f"of {box}{where}", state)
 
 
 def _peak(a: Analysis) -> Iterator[KeyFigure]:
@@ -103,7 +106,7 @@ def _job(a: Analysis) -> Iterator[KeyFigure]:
     fidelity = f"simulated, fidelity {a.job.run.scenario.fidelity}"
     yield KeyFigure(label, short, outcome if short != outcome and a.job.failed else fidelity, state)
     for merit in a.job.merits[:MERITS]:
-        if math.isfinite(merit.value):
+        if math.isfinite(merit.value) and not a.job.failed:
             yield KeyFigure(merit.label.capitalize(), merit_phrase(merit), label.lower())
 
 

@@ -28,16 +28,17 @@ def overlaid(found: Comparison) -> Iterator[Item]:
     loops = {name: a.curves for name, a in named.items()}
     stable = {name: loops[name] for name, a in named.items() if a.margins.stable}
     panels = distinct_channels(loops)
-    if stable:
+    if stable and found.one_machine:
         shown = distinct_channels(stable)
         yield Picture(
             partial(plots.sensitivity_curves, stable, channel=shown.channels),
             f"Sensitivity S and complementary sensitivity T, with the zones of ISO 14839-3.{shown.note}",
         )
-    yield Picture(
-        partial(plots.nyquist, loops, channel=panels.channels),
-        f"Nyquist plots of the loop at each sensor, the others closed.{panels.note}",
-    )
+    if found.one_machine:
+        yield Picture(
+            partial(plots.nyquist, loops, channel=panels.channels),
+            f"Nyquist plots of the loop at each sensor, the others closed.{panels.note}",
+        )
     if stable:
         yield Picture(partial(plots.sigma, stable), "Singular values of L, S and T with all sensors at once.")
     if stable and found.one_machine and found.designs[0].plant.disturbances:

@@ -132,7 +132,11 @@ def identifier(*parts: str) -> str:
 
 def unit_word(unit: str) -> str:
     """An SI unit as the end of an identifier: "rad_per_s" of rad/s; "" for a plain number."""
-    return "" if unit in ("1", "percent") else identifier(unit.replace("/", " per ").replace("^", ""))
+    return (
+        ""
+        if unit in ("1", "percent")
+        else identifier(re.sub("^1/", "per ", unit).replace("/", " per ").replace("^", ""))
+    )
 
 
 def scores_of(found: Analysis) -> list[Score]:

@@ -188,9 +188,11 @@ def _poles(a: Analysis) -> Iterator[Item]:
     loops = {a.subject.controller.name: a.curves}
     yield Picture(
         lambda: plots.pzmap(loops),
-        "Poles of the closed loop, of the machine and of the law; of sampled systems ln(λ) / Ts.",
+        "Poles of the closed loop and of the machine, and zeros of the loop gain; of sampled systems ln(z) / Ts. "
+        "The right side is the neighbourhood of the origin.",
     )
-    published = None if a.subject.changes else published_figures(a.plant.name)
+    changed = a.subject.parameters != a.subject.controller.parameters
+    published = None if changed else published_figures(a.plant.name)
     yield from sheets_of([poles_table(a.model, published), loop_poles_table(a.margins)])
 
 

@@ -1,0 +1,187 @@
+"""Gain files beside each other: what differs, which is better, and what cannot be compared."""
+
+from __future__ import annotations
+
+import io
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from browsing import browser as browser
+from browsing import open_page
+from conftest import ROOT, Run
+from page_checks import read_page
+from rich.console import Console
+from test_report_page import HOSTILE, STRANGE, cart_controller
+
+from malta.margins.verify import verify
+from malta.report.page.analysis import Subject
+from malta.report.page.compared import comparison_page
+from malta.report.page.comparison import Comparison, Row, compare, comparison_document, names_of
+from malta.report.page.scores import MEANINGS, Score, best_of, four_digits, identifier
+from malta.report.tables.comparison import comparison_tables
+
+if TYPE_CHECKING:
+    from malta.synthesis.controller import Controller
+
+GAINS = ROOT / "design" / "gains"
+
+
+def subject_of(controller: Controller, source: str = "", **box: float) -> Subject:
+    return Subject(controller, controller.parameters, box or {"k": 0.2}, None, source)
+
+
+@pytest.fixture(scope="module")
+def carts() -> Comparison:
+    soft, stiff = cart_controller("soft"), cart_controller("stiff", 2e-5)
+    return compare([subject_of(soft), subject_of(stiff)])
+
+
+def row_of(found: Comparison, key: str) -> Row:
+    (row,) = [one for one in found.rows if one.key == key]
+    return row
+
+
+def text_of(found: Comparison, width: int) -> str:
+    console = Console(file=io.StringIO(), width=width, highlight=False, markup=False)
+    console.print(comparison_tables(found, width))
+    file = console.file
+    assert isinstance(file, io.StringIO)
+    return file.getvalue()
+
+
+def test_figures_are_those_of_verify_and_the_better_is_marked(carts: Comparison) -> None:
+    for name, a in zip(carts.names, carts.designs, strict=True):
+        margins = verify(a.model, a.subject.controller)
+        k = carts.names.index(name)
+        for key, of in (("bandwidth_sigma_max_t_rad_per_s", margins.bandwidth["sigma_max_T"]),
+                        ("peak_sensitivity", margins.peak_sensitivity[STRANGE])):  # fmt: skip
+            score = row_of(carts, key).scores[k]
+            assert score is not None
+            assert score.value == of
+    soft, stiff = (score.value for score in row_of(carts, "bandwidth_sigma_max_t_rad_per_s").scores if score)
+    assert stiff > 1.5 * soft
+    assert row_of(carts, "bandwidth_sigma_max_t_rad_per_s").best == (False, True)
+    noise = next(row for row in carts.rows if row.scores[0] and row.scores[0].kind == "command")
+    assert noise.best == (True, False)
+    assert row_of(carts, "stable").best == (False, False)  # a tie
+
+
+def test_only_what_differs_is_listed(carts: Comparison) -> None:
+    keys = {row.key for row in carts.differences}
+    assert {"cost_state_z_per_m2", "gains_norm_of_k"} <= keys
+    assert not any(key.startswith(("machine", "parameters", "law_sample_time", "noise")) for key in keys)
+    same = cart_controller("soft")
+    assert compare([subject_of(same), subject_of(same)], proof=False).differences == ()
+
+
+def test_the_table_fits_its_width_and_marks_without_colour(carts: Comparison) -> None:
+    for width in (80, 60):
+        text = text_of(carts, width)
+        assert max(map(len, text.splitlines())) <= width
+        lines = [line for line in text.splitlines() if line.lstrip().startswith("last 0 dB")]
+        assert [line.rstrip()[-1] for line in lines if line.rstrip().endswith("*")] == ["*"]
+    assert "What differs in the designs" in text
+    document = comparison_document(carts)
+    json.dumps(document, allow_nan=True)
+    assert [one["name"] for one in document["designs"]] == ["soft", "stiff"]
+    bandwidth = next(one for one in document["figures"] if one["key"] == "bandwidth_crossover_max_rad_per_s")
+    assert bandwidth["best"] == ["stiff"]
+    assert bandwidth["better"] == "high"
+
+
+def test_different_uncertainties_mark_no_margin(carts: Comparison) -> None:
+    wide = replace(carts.designs[1], subject=carts.designs[1].subject._replace(box={"k": 0.1}))
+    found = Comparison(carts.names, (carts.designs[0], wide))
+    assert row_of(found, "margin_proven").best == (False, False)
+    assert any("different uncertainties" in remark for remark in found.remarks)
+
+
+def test_names_stay_distinguishable() -> None:
+    controller = cart_controller("one")
+    found = names_of(
+        [subject_of(controller, source) for source in ("a/one.json", "b/one.json", "b/one.json", "")]
+    )
+    assert len(set(found)) == 4
+    assert found[0] == "a/one.json"
+    assert found[1:3] == ("b/one.json (1)", "b/one.json (2)")
+
+
+def score(value: float, kind: str = "peak_s") -> Score:
+    return Score(kind, "key", "label", value, "1", 1.0)
+
+
+def test_the_best_is_better_in_digits_that_are_shown() -> None:
+    low, nan = [score(1.5), score(2.0), score(1.5)], score(float("nan"))
+    assert best_of(low) == (True, False, True)
+    assert best_of([score(1.5), score(1.5000001)]) == (False, False)
+    assert best_of([nan, score(1.5)]) == (False, False)
+    assert best_of([nan, score(1.5), score(2.5), None]) == (False, True, False, False)
+    assert best_of([score(1.0, "disk"), score(2.0, "disk")]) == (False, True)
+    assert best_of([score(1.0, "natural"), score(2.0, "natural")]) == (False, False)
+    assert best_of([score(float("inf"), "delay_margin"), score(2.0, "delay_margin")]) == (True, False)
+    assert {one.better for one in MEANINGS.values()} == {"high", "low", ""}
+    assert (four_digits(0.0), four_digits(1.99996), four_digits(-4.7e-7)) == ("0", "2.000", "-4.7e-07")
+    assert identifier("rise, 10-90 %", "s") == "rise_10_90_s"
+
+
+def test_two_to_eight_designs_are_compared(run: Run) -> None:
+    one = GAINS / "robust.json"
+    for files in ([one], [one] * 9):
+        said = run("compare", *files)
+        assert said.code == 2
+        assert f"{len(files)} gain files, expected 2 to 8" in said.err
+
+
+@pytest.mark.slow
+def test_the_page_of_a_comparison(carts: Comparison, tmp_path: Path, browser: Any) -> None:
+    page = comparison_page(carts)
+    reader = read_page(page.html)
+    text = "".join(reader.text)
+    assert HOSTILE.replace("\x0b", "\ufffd") in text
+    assert "★ " in text
+    assert comparison_page(carts).content == page.content
+    out = page.save(tmp_path / "page.html")
+    for width in (1280, 390):
+        open_page(browser, out, width=width)
+        assert browser.execute_script("return document.documentElement.scrollWidth") <= width
+    assert [entry for entry in browser.get_log("browser") if entry["level"] == "SEVERE"] == []
+
+
+@pytest.mark.slow
+def test_shipped_designs_beside_each_other(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    files = [GAINS / f"{name}.json" for name in ("table2", "calibrated", "robust", "tubular_pid")]
+    said = run("compare", *files, "--no-proof")
+    assert said.code == 0
+    assert max(map(len, said.out.splitlines())) <= 80
+    found = json.loads(run("compare", *files, "--json", "--out", tmp_path / "page.html").out)
+    read_page((tmp_path / "page.html").read_text(encoding="utf-8"))
+    figures = {one["key"]: one for one in found["figures"]}
+    for k, file in enumerate(files):
+        stored = json.loads(file.read_text(encoding="utf-8"))["verification"]
+        assert figures["margin_proven"]["values"][k] == pytest.approx(stored["robust"]["lower"], rel=2e-3)
+        peak = stored["peak_sensitivity"]["sigma_max"]
+        assert figures["peak_sensitivity_sigma_max"]["values"][k] == pytest.approx(peak, rel=1e-4)
+    assert figures["margin_proven"]["best"] == ["robust"]
+    assert {"law_kind", "gains_norm_of_k"} <= set(found["differences"])
+
+
+@pytest.mark.slow
+def test_different_machines_are_compared_in_what_they_share(run: Run) -> None:
+    said = run("compare", GAINS / "robust.json", GAINS / "halbach.json", "--no-proof", "--json")
+    found = json.loads(said.out)
+    keys = {one["key"] for one in found["figures"]}
+    assert {"stable", "disk_margin_forces", "peak_sensitivity"} <= keys
+    assert not any(key.startswith(("motion", "load", "stroke", "requirement")) for key in keys)
+    assert any("machines differ (tubular, halbach)" in remark for remark in found["remarks"])
+
+
+@pytest.mark.slow
+def test_an_unstable_design_is_compared_and_ends_with_exit_code_1(run: Run) -> None:
+    said = run("compare", GAINS / "robust.json", GAINS / "table2.json", "--set", "m=15", "--no-proof")
+    assert said.code == 1
+    assert "UNSTABLE" in said.out
+    assert "unstable" in said.err

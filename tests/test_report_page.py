@@ -1,0 +1,203 @@
+"""The report of a gain file: its numbers are those of verify, and the page needs nothing else."""
+
+from __future__ import annotations
+
+import io
+import json
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from browsing import browser as browser
+from browsing import open_page, printed
+from conftest import ROOT, Run
+from page_checks import cells_of, read_page
+
+import malta
+from malta.margins.verify import verify
+from malta.report.page.analysis import Subject, analyse
+from malta.report.page.document import Page
+from malta.report.page.headline import key_figures
+from malta.report.page.inline import dark_colour, printable
+from malta.report.page.pdf import pdf_of
+from malta.report.page.report import page_of
+from malta.report.page.scores import scores_of
+
+if TYPE_CHECKING:
+    from malta.report.page.analysis import Analysis
+    from malta.synthesis.controller import Controller
+
+HOSTILE = '<script>alert("x")</script>$a_b$\\frac{\x0b'
+# of a letter in a figure and of the page, as "rgb(0, 0, 0)"
+COLOURS = """return [getComputedStyle(document.querySelector("svg text")).fill,
+  getComputedStyle(document.body).backgroundColor]"""
+STRANGE = "é</svg>\"'&lt; ]]>"
+
+
+def cart_controller(name: str = "cart design", base: float = 1e-4) -> Controller:
+    """An LQG of a cart on a weak negative spring whose signals have names that no page may take for tags."""
+    cart = malta.linear_machine(
+        [[0, 1], [100, -0.1]], [[0], [2]], [[1, 0]],
+        name="cart", states=["z [m]", "v [m/s]"], inputs=[f"{HOSTILE} [N]"], outputs=[f"{STRANGE} [m]"],
+        noise=1e-6, nominal={"k": 1.0}, terms={"k": ([[0, 0], [50, 0]],)},
+    )  # fmt: skip
+    one = np.ones(1)
+    weights = malta.Weights(
+        np.ones(2), np.array([base, 0.1]), one, one, one, np.array([base]), 1e-2 * one, 1e-12 * one
+    )
+    return malta.lqg(malta.linearize(cart, cart.at()), weights, 1e-3, name=name)
+
+
+@pytest.fixture(scope="module")
+def cart() -> Analysis:
+    controller = cart_controller()
+    return analyse(Subject(controller, controller.parameters, {"k": 0.2}), stages=False)
+
+
+@pytest.fixture(scope="module")
+def page(cart: Analysis) -> Page:
+    return page_of(cart)
+
+
+def test_a_page_is_whole_in_itself_and_names_stay_text(page: Page) -> None:
+    reader = read_page(page.html)
+    text = "".join(reader.text)
+    assert '<script>alert("x")</script>$a_b$\\frac{\ufffd' in text
+    assert STRANGE in text
+    assert reader.count["svg"] >= 7
+    assert len(page.content) < 500_000
+
+
+def test_the_key_figures_are_those_of_verify(cart: Analysis, page: Page) -> None:
+    controller = cart.subject.controller
+    margins = verify(cart.model, controller, {"k": 0.2})
+    shown = {figure.label: figure.value for figure in key_figures(cart)}
+    peak = max(value for name, value in margins.peak_sensitivity.items() if name != "sigma_max")
+    assert margins.robust is not None
+    assert margins.robust.lower is not None
+    assert shown["Loop"] == "stable"
+    assert shown["Peak |S|"] == f"{peak:.2f}"
+    assert shown["Proven margin"] == f"at least {100 * margins.robust.lower:.1f} %"
+    assert shown["Bandwidth"] == f"{margins.bandwidth['sigma_max_T'] / (2 * np.pi):.1f} Hz"
+    for value in shown.values():
+        assert f'<dd class="value">{value}</dd>' in page.html
+    found = {score.key: score.value for score in scores_of(cart)}
+    assert found["peak_sensitivity"] == peak
+    assert found["bandwidth_sigma_max_t_rad_per_s"] == margins.bandwidth["sigma_max_T"]
+    assert found["stable"] == 1.0
+
+
+def test_the_gains_stand_in_the_page_to_six_digits(cart: Analysis, page: Page) -> None:
+    K = cart.subject.controller.K
+    (row,) = cells_of(page.html, "K<")[1:]
+    assert [float(cell.replace("−", "-")) for cell in row[1:]] == pytest.approx(K[0], rel=1e-5)
+
+
+@pytest.mark.slow
+def test_the_same_controller_gives_the_same_bytes(cart: Analysis, page: Page) -> None:
+    assert page_of(cart).content == page.content
+    assert pdf_of(page) == pdf_of(page)
+
+
+def test_a_notebook_shows_the_page_in_a_frame(page: Page) -> None:
+    shown = page._repr_html_()
+    assert shown.startswith('<iframe srcdoc="&lt;!DOCTYPE html&gt;')
+    assert shown.count("<") == 2  # the frame alone: what is in it is quoted
+
+
+def test_a_page_has_the_suffix_of_a_page(page: Page, tmp_path: Path) -> None:
+    assert page.save(tmp_path / "new" / "cart.html").read_bytes() == page.content
+    with pytest.raises(malta.InputError, match=r"suffix '\.pdf'"):
+        page.save(tmp_path / "cart.pdf")
+
+
+def test_colours_turn_and_unprintable_characters_are_marked() -> None:
+    assert dark_colour("000000") == "#ededed"
+    assert dark_colour("ffffff") == "#1a1a1a"
+    red = dark_colour("c1440e")  # stays red, and becomes lighter
+    assert int(red[1:3], 16) > int(red[3:5], 16) > int(red[5:7], 16)
+    assert printable("a\x00b\ud800c\n") == "a\ufffdb\ufffdc\n"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["robust", "halbach", "planar", "tubular_pid"])
+def test_the_report_of_a_shipped_design(name: str, tmp_path: Path, browser: Any, run: Run) -> None:
+    pypdf = pytest.importorskip("pypdf")
+    gains, out = ROOT / "design" / "gains" / f"{name}.json", tmp_path / "page.html"
+    assert run("report", gains, "--out", out, "--pdf").code == 0
+    verified = json.loads(run("verify", gains, "--json").out)
+    html = out.read_text(encoding="utf-8")
+    read_page(html)
+    lower = verified["robust"]["travel"]["lower"]
+    assert f'<dd class="value">{100 * lower:.1f} %</dd>' in html
+    chain = {row[0]: row[1] for row in cells_of(html, "Where the margin goes")[1:]}
+    for link in verified["robust"]["chain"]:
+        assert chain[link["stage"]] == f"{100 * link['lower']:.2f} %"
+    delays = {row[0]: row[1] for row in cells_of(html, "Margins of the sampled loop")[1:]}
+    for sensor, delay in verified["robust"]["delay"].items():
+        assert delays[f"delay at {sensor} alone"] == f"{1e6 * delay:.0f} µs"
+    assert len(html) < 2_000_000
+    for width in (1280, 390):
+        for scheme in ("light", "dark"):
+            open_page(browser, out, width=width, scheme=scheme)
+            assert browser.execute_script("return document.documentElement.scrollWidth") <= width
+            ink, paper = (
+                sum(map(int, re.findall(r"\d+", colour))) for colour in browser.execute_script(COLOURS)
+            )
+            assert (ink - paper if scheme == "dark" else paper - ink) > 500
+    assert [entry for entry in browser.get_log("browser") if entry["level"] == "SEVERE"] == []
+    sheet = pypdf.PdfReader(io.BytesIO(printed(browser)))
+    text = " ".join(" ".join(one.extract_text().split()) for one in sheet.pages)
+    assert f"{100 * lower:.1f} %" in text
+    assert "innovations to states" in text
+    assert "states to commands" in text
+    figures = pypdf.PdfReader(out.with_suffix(".pdf"))
+    assert len(figures.pages) == html.count("<figure>")
+    assert "/CreationDate" not in (figures.metadata or {})
+    for number, one in enumerate(figures.pages, 1):
+        assert f"Figure {number}." in one.extract_text()
+        fonts = one["/Resources"]["/Font"].get_object()
+        assert {font.get_object()["/Subtype"] for font in fonts.values()} == {"/Type0"}  # type 42, embedded
+
+
+@pytest.mark.slow
+def test_an_unstable_loop_has_a_page_that_says_so(tmp_path: Path, run: Run) -> None:
+    out = tmp_path / "page.html"
+    gains = ROOT / "design" / "gains" / "robust.json"
+    said = run("report", gains, "--set", "m=15", "--out", out)
+    assert said.code == 1
+    assert "unstable" in said.err
+    html = out.read_text(encoding="utf-8")
+    read_page(html)
+    assert '<dd class="value">UNSTABLE</dd>' in html
+    assert "changed: m=15" in html
+    assert "Gang of four" not in html
+
+
+@pytest.mark.slow
+def test_a_campaign_and_the_requirements_stand_in_the_page(tmp_path: Path, run: Run) -> None:
+    gains, folder, out = ROOT / "design" / "gains" / "robust.json", tmp_path / "c", tmp_path / "page.html"
+    report = "report", gains, "--no-proof", "--campaign", folder, "--out", out
+    assert run("campaign", gains, "--samples", "64", "--out", folder).code == 0
+    assert run(*report).code == 0
+    html = out.read_text(encoding="utf-8")
+    read_page(html)
+    ends = {row[0]: row[1] for row in cells_of(html, "How the runs end")[1:]}
+    assert ends["completed"] == "64"
+    lights = cells_of(html, "[specification] of the design file")[1:]
+    asked = {row[1]: row[0] for row in lights}
+    assert asked["peak sensitivity"].startswith("✓")
+    assert len(lights) > 30
+    before = out.read_bytes()
+    assert run(*report).code == 0
+    assert out.read_bytes() == before
+
+
+def test_the_command_refuses_what_is_no_page(tmp_path: Path, run: Run) -> None:
+    gains = ROOT / "design" / "gains" / "robust.json"
+    said = run("report", gains, "--out", tmp_path / "page.txt")
+    assert said.code == 2
+    assert "suffix '.txt'" in said.err
+    assert list(tmp_path.iterdir()) == []
