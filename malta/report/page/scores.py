@@ -127,7 +127,7 @@ def identifier(*parts: str) -> str:
     >>> identifier("rise, 10-90 %", "s")
     'rise_10_90_s'
     """
-    return re.sub(r"\W+", "_", "_".join(part for part in parts if part), flags=re.ASCII).strip("_").lower()
+    return re.sub(r"[\W_]+", "_", " ".join(parts), flags=re.ASCII).strip("_").lower()
 
 
 def unit_word(unit: str) -> str:
