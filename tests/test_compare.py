@@ -16,10 +16,11 @@ from page_checks import read_page
 from rich.console import Console
 from test_report_page import HOSTILE, STRANGE, cart_controller
 
+from malta.cli.documents.pages import compare_output
 from malta.margins.verify import verify
 from malta.report.page.analysis import Subject
 from malta.report.page.compared import comparison_page
-from malta.report.page.comparison import Comparison, Row, compare, comparison_document, names_of
+from malta.report.page.comparison import Comparison, Row, compare, names_of
 from malta.report.page.scores import MEANINGS, Score, best_of, four_digits, identifier
 from malta.report.tables.comparison import comparison_tables
 
@@ -84,7 +85,7 @@ def test_the_table_fits_its_width_and_marks_without_colour(carts: Comparison) ->
         lines = [line for line in text.splitlines() if line.lstrip().startswith("last 0 dB")]
         assert [line.rstrip()[-1] for line in lines if line.rstrip().endswith("*")] == ["*"]
     assert "What differs in the designs" in text
-    document = comparison_document(carts)
+    document = compare_output(carts, ()).model_dump()
     json.dumps(document, allow_nan=True)
     assert [one["name"] for one in document["designs"]] == ["soft", "stiff"]
     bandwidth = next(one for one in document["figures"] if one["key"] == "bandwidth_crossover_max_rad_per_s")

@@ -12,7 +12,7 @@ import typer
 from malta.cli.assignments import NUMBER, read_assignments
 from malta.cli.inputs import change_machine, read_controller
 from malta.cli.options import AsJson, Changes, GainFile, MachineFile
-from malta.cli.output import make_console, print_json, print_note, print_written, progress_bar
+from malta.cli.output import make_console, print_document, print_note, print_written, progress_bar
 from malta.errors import InputError
 from malta.files import locate
 
@@ -100,16 +100,15 @@ def plot(
     pictures = _draw(loops, names, channels, place, loci)
     files = _save(pictures, out)
     if as_json:
-        from malta.cli.plot_documents import locus_document, loop_document
+        from malta.cli.documents.plots import loop_part, plot_output
 
         shown = channels or [name for name, _ in chosen_channels(loops, None, place)]
         shown = [
             *shown,
             *(s.name for curves in loops.values() for s in curves.loop.outputs if channels is None),
         ]
-        documents = [loop_document(curves, names, shown, place) for curves in loops.values()]
-        roots = {LOCUS: [locus_document(found) for found in loci]} if loci else {}
-        print_json({"files": [str(file) for file in files], "at": at, "loops": documents} | roots)
+        parts = [loop_part(curves, names, shown, place) for curves in loops.values()]
+        print_document(plot_output(parts, loci, place, files))
     else:
         print_written(make_console(), files)
     for name, curves in loops.items():

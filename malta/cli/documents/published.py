@@ -15,6 +15,7 @@ from malta.cli.documents.loops import VerifyOutput
 from malta.cli.documents.others import CheckOutput, ClaimsOutput, ExportOutput, TuneOutput
 from malta.cli.documents.pages import CompareOutput, ReportOutput
 from malta.cli.documents.parts import Part
+from malta.cli.documents.plots import PlotOutput
 from malta.cli.documents.simulations import DesignOutput, SimulateOutput
 
 DRAFT = "https://json-schema.org/draft/2020-12/schema"
@@ -29,6 +30,7 @@ MODELS: dict[str, type[Part]] = {
     "sobol-output": SobolOutput,
     "tolerance-output": ToleranceOutput,
     "tune-output": TuneOutput,
+    "plot-output": PlotOutput,
     "report-output": ReportOutput,
     "compare-output": CompareOutput,
     "export-output": ExportOutput,
