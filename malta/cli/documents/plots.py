@@ -25,7 +25,7 @@ POINTS = 500  # of a line over time
 
 
 Lines = dict[str, dict[str, list[Number]]]  # curves by channel and quantity
-Pairs = Annotated[list[list[float]], Field(description="rows of real and imaginary part")]
+Pairs = Annotated[list[list[Number]], Field(description="rows of real and imaginary part")]
 
 
 class ChannelPart(Part):
