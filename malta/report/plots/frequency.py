@@ -270,21 +270,16 @@ def gang_of_four(source: Any, controller: Any = None, *, channel: Channel = None
             for panel, G in zip(panels, (r.S, r.T, r.SP, r.FS), strict=True):
                 panel.plot(curves.w, np.abs(G[:, k, k]), **styles[loop])
             shown.append(curves)
-        units = ("", "", f" [{_ratio(unit, force)}]", f" [{_ratio(force, unit)}]")
-        heads = (
-            f"{name}: |S|",
-            "|T|",
-            "|S P|, force to output" + units[2],
-            "|F S|, reading to force" + units[3],
-        )
-        for k, (panel, head) in enumerate(zip(panels, heads, strict=True)):
+        panels[0].set_title(plain(name), fontsize=8.5, loc="left", pad=3, fontweight="bold")
+        units = ("-", "-", _ratio(unit, force), _ratio(force, unit))
+        for k, (panel, letters, of) in enumerate(zip(panels, ("S", "T", "S P", "F S"), units, strict=True)):
             panel.set_yscale("log")
             low, high = panel.get_ylim()
-            panel.set_ylim(min(max(low, high / 1e7), high / 30), high * 1.3)
+            panel.set_ylim(min(max(low, high / 1e7), high / 100), high * 1.3)
             if k < 2:
                 draw_level(panel, 1)
-            finish_frequency(panel, shown, "", labelled=row == len(chosen) - 1)
-            panel.set_title(plain(head), fontsize=8.5, loc="left", pad=3)
+            finish_frequency(panel, shown, f"|{letters}| [{of}]", labelled=row == len(chosen) - 1)
+            panel.tick_params(labelbottom=row == len(chosen) - 1)
     return sheet.figure
 
 
@@ -301,10 +296,11 @@ def _gang_sheet(loops: Mapping[str, LoopCurves], count: int, axes: Any) -> Sheet
         return new_sheet(("", ""), loops, 4 * count, axes)
     head = head_of(loops) + 0.2
     height = head + 0.35 + 2.05 * count
+    told = "each channel with the force of its axis; S P: force to output, F S: reading to force"
     figure = new_figure(
-        f"{title_of(loops)}: gang of four at the sensors", "each channel with the force of its axis",
-        size=(13.0, height), left=0.045, right=0.99, bottom=0.5 / height, top=1 - head / height,
-        wspace=0.2, hspace=0.33,
+        f"{title_of(loops)}: gang of four at the sensors", told,
+        size=(13.0, height), left=0.055, right=0.99, bottom=0.5 / height, top=1 - head / height,
+        wspace=0.3, hspace=0.2,
     )  # fmt: skip
     add_legend(figure, loops, height)
     grid = figure.subplots(count, 4, squeeze=False)

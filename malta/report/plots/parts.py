@@ -25,7 +25,8 @@ LINE = 0.155  # inch, of text above a panel
 DECADES = 3.0  # shown below the first crossing of unit gain
 MOST_LINES = 3  # loops whose margins are written above a panel
 PLACES: Mapping[str, str] = {"sensors": "at the sensors", "forces": "at the forces"}
-SMALL: dict[str, Any] = {"fontsize": 7.5, "va": "bottom"}
+CLEAR: dict[str, Any] = {"facecolor": "#ffffff", "edgecolor": "none", "pad": 0.2}
+SMALL: dict[str, Any] = {"fontsize": 7.5, "va": "bottom", "bbox": CLEAR}
 
 
 class Sheet(NamedTuple):

@@ -52,8 +52,8 @@ def pzmap(source: Any, controller: Any = None, *, axes: Any = None, reach: float
     for (panel,), size in zip(sheet.panels, reaches, strict=True):
         window = Window.about(everything, size)
         _draw_plane(panel, window, times)
-        for name, curves in loops.items():
-            _draw_poles(panel, curves, styles[name], window)
+        for k, (name, curves) in enumerate(loops.items()):
+            _draw_poles(panel, curves, styles[name], window, list(loops.values())[:k])
     _explain(sheet, [("x", "closed loop"), ("+", "plant"), ("o", "zero of L")])
     return sheet.figure
 
@@ -164,8 +164,14 @@ def _round(value: float) -> float:
     return power * max(m for m in (1, 2, 5) if m * power <= value)
 
 
-def _draw_poles(axes: Axes, curves: LoopCurves, style: Mapping[str, Any], window: Window) -> None:
-    """Poles and zeros of one loop that lie within the axes."""
+def _draw_poles(
+    axes: Axes,
+    curves: LoopCurves,
+    style: Mapping[str, Any],
+    window: Window,
+    drawn_before: Sequence[LoopCurves],
+) -> None:
+    """Poles and zeros of one loop that lie within the axes; a plant that stands there already is not drawn again."""
     colour = style["color"]
     drawn: tuple[tuple[ComplexArray, dict[str, Any]], ...] = (
         (
@@ -177,7 +183,11 @@ def _draw_poles(axes: Axes, curves: LoopCurves, style: Mapping[str, Any], window
     )
     for values, look in drawn:
         shown = window.inside(values)
-        axes.plot(shown.real, shown.imag, linestyle="none", color=colour, **look)
+        known = look["marker"] == "+" and any(
+            np.array_equal(values, before.poles["plant"]) for before in drawn_before
+        )
+        if len(shown) and not known:
+            axes.plot(shown.real, shown.imag, linestyle="none", color=colour, **look)
 
 
 def _explain(sheet: Sheet, marks: Sequence[tuple[str, str]]) -> None:
@@ -256,7 +266,7 @@ def _changes_text(found: RootLocus, unit: str) -> str:
 def _draw_branches(axes: Axes, found: RootLocus, window: Window) -> None:
     """Lines that are interrupted where ln(z) jumps from one edge of its strip to the other."""
     strip = np.inf if found.sample_time is None else np.pi / found.sample_time
-    for branch in found.poles.T:
+    for branch in found.poles.T[np.isfinite(found.poles).any(axis=0)]:
         line = branch.copy()
         jumps = np.flatnonzero(np.abs(np.diff(branch.imag)) > strip)
         line = np.insert(line, jumps + 1, complex(np.nan, np.nan))

@@ -11,6 +11,7 @@ import numpy as np
 from malta.report.figures.parts import BOUND, draw_grid
 from malta.report.plots.frequency import ALONE, Channel, phase_of, title_of
 from malta.report.plots.parts import (
+    CLEAR,
     PLACES,
     chosen_channels,
     decibels,
@@ -227,7 +228,13 @@ def _finish_nichols(axes: Axes, phases: FloatArray) -> None:
 def _name_circles(axes: Axes, low: float, high: float) -> None:
     """What |T| is: beside the closed curves about the first critical point, and at the left end of the open ones."""
     at = next(p for p in (-180.0, -540.0, 180.0) if low <= p <= high)
-    where: dict[str, Any] = {"textcoords": "offset points", "zorder": 2, "color": "#9a9a9a", "fontsize": 7}
+    where: dict[str, Any] = {
+        "textcoords": "offset points",
+        "zorder": 1.5,
+        "color": "#8a8a8a",
+        "fontsize": 7,
+        "bbox": CLEAR,
+    }
     for level in (6.0, 1.0):
         size = 10 ** (level / 20)
         reach, height = math.degrees(math.asin(1 / size)), 10 * math.log10(size**2 / (size**2 - 1))
