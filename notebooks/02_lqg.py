@@ -13,6 +13,7 @@ from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
+from IPython.display import display
 
 import malta
 from malta.margins.loops import machine_loop
@@ -132,7 +133,7 @@ for name, controller in controllers.items():
     assert figures.overshoot < 0.015
     assert figures.axial_error < 0.6e-3
     assert max(figures.radial.values()) < 20e-6
-    malta.report.stroke(run, f"build/02_lqg_{name}.png", published)
+    display(malta.report.stroke(run, f"build/02_lqg_{name}.png", published))
 
 # %% [markdown]
 # ## Judgement

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
+from IPython.display import display
 
 import malta
 
@@ -39,7 +40,7 @@ plants = {name: malta.plant_of(c.parameters) for name, c in controllers.items()}
 strokes = {}
 for key, controller in controllers.items():
     e = strokes[key] = malta.experiment("stroke", plants[key], controller)
-    malta.report.experiment(e, f"build/03_{key}_stroke.png", published)
+    display(malta.report.experiment(e, f"build/03_{key}_stroke.png", published))
     print(f"{key}, {e}")
 lagged = malta.experiment("stroke", plants["calibrated"], controllers["calibrated"], fidelity="force")
 figures = malta.stroke_figures(lagged.run)
@@ -67,7 +68,7 @@ for e in strokes.values():
 rests = {}
 for key, controller in controllers.items():
     e = rests[key] = malta.experiment("hold", plants[key], controller)
-    malta.report.experiment(e, f"build/03_{key}_hold.png", published)
+    display(malta.report.experiment(e, f"build/03_{key}_hold.png", published))
     print(f"{key}, {e}")
 for e in rests.values():
     measured = e.run.y[-2000:, :4].std(axis=0) * 1e6
@@ -95,7 +96,7 @@ for key, e in rests.items():
 drifts = {}
 for key, controller in controllers.items():
     e = drifts[key] = malta.experiment("thermal", plants[key], controller)
-    malta.report.experiment(e, f"build/03_{key}_thermal.png", published)
+    display(malta.report.experiment(e, f"build/03_{key}_thermal.png", published))
     print(f"{key}, {e}")
 for e in drifts.values():
     left, raw = (case.merits[0].value for case in e.cases)
@@ -116,7 +117,7 @@ for key, e in drifts.items():
 tilts = {}
 for key, controller in controllers.items():
     e = tilts[key] = malta.experiment("tilt", plants[key], controller)
-    malta.report.experiment(e, f"build/03_{key}_tilt.png", published)
+    display(malta.report.experiment(e, f"build/03_{key}_tilt.png", published))
     print(f"{key}, {e}")
 for key, e in tilts.items():
     as_printed, held = (case.merits[0].value * 1e6 for case in e.cases)
@@ -150,7 +151,7 @@ for name in ("lift-off", "payload", "faults"):
     others[name] = {}
     for key, controller in controllers.items():
         e = others[name][key] = malta.experiment(name, plants[key], controller)
-        malta.report.experiment(e, f"build/03_{key}_{name}.png", published)
+        display(malta.report.experiment(e, f"build/03_{key}_{name}.png", published))
         print(f"{key}, {e}")
 
 # %% [markdown]
@@ -190,12 +191,12 @@ for key in controllers:
 stiff = {}
 for key, controller in controllers.items():
     e = stiff[key] = malta.experiment("disturbance", plants[key], controller)
-    malta.report.experiment(e, f"build/03_{key}_disturbance.png", published)
+    display(malta.report.experiment(e, f"build/03_{key}_disturbance.png", published))
     print(f"{key}, {e}")
 limits = {}
 for key, controller in controllers.items():
     e = limits[key] = malta.experiment("drive-limits", plants[key], controller)
-    malta.report.experiment(e, f"build/03_{key}_drive-limits.png", published)
+    display(malta.report.experiment(e, f"build/03_{key}_drive-limits.png", published))
     print(f"{key}, {e}")
 fastest, sigmoid = (case.merits[0].value for case in limits["calibrated"].cases)
 print(f"rise {fastest * 1e3:.1f} ms against {sigmoid * 1e3:.1f} ms of the sigmoid at the same peak current")

@@ -15,6 +15,7 @@ from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
+from IPython.display import display
 
 import malta
 
@@ -39,7 +40,7 @@ plant = malta.plant_of(controllers["robust"].parameters)
 # %%
 found = {name: malta.robustness(plant, controller, BOX) for name, controller in controllers.items()}
 for name, result in found.items():
-    malta.report.robustness(result, name, BOX, f"build/04_{name}_margins.png", "position z")
+    display(malta.report.robustness(result, name, BOX, f"build/04_{name}_margins.png", "position z"))
     print(name)
     for link in result.chain:
         print(f"  {link.name:16} {link.margin};  peak |S| {link.peak:.2f} at the {link.broken_at}")
@@ -132,7 +133,7 @@ for name, completed in yields.items():
 plan = malta.Plan(controllers["calibrated"], "stroke", BOX, samples=1024, options={"fidelity": "force"})
 folder = f"build/04_campaign_{plan.identity[:8]}"
 campaign = malta.campaign(plan, folder)
-malta.report.campaign(campaign, folder, malta.published("data/tubular.toml"))
+display(malta.report.campaign(campaign, folder, malta.published("data/tubular.toml")))
 assert campaign.completed.all()
 
 # %% [markdown]

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
+from IPython.display import display
 
 import malta
 from malta.machines.halbach import electronics, motor
@@ -103,7 +104,7 @@ for name, controller in controllers.items():
 # %%
 for name, controller in controllers.items():
     e = malta.experiment("step", plant, controller)
-    malta.report.experiment(e, f"build/05_{name}_step.png", published)
+    display(malta.report.experiment(e, f"build/05_{name}_step.png", published))
     print(f"{name}, {e}")
     jumps, quintics = ({merit.label: merit.value for merit in case.merits} for case in e.cases)
     assert quintics["mean overshoot"] < 0.1
@@ -122,7 +123,7 @@ for name, controller in controllers.items():
 
 # %%
 force = malta.experiment("force", plant, controllers["halbach"])
-malta.report.experiment(force, "build/05_halbach_force.png", published)
+display(malta.report.experiment(force, "build/05_halbach_force.png", published))
 steady = {case.label: case.merits[0].value for case in force.cases}
 for label, value in steady.items():
     print(f"{label}: {100 * value:.2f} %")
@@ -140,7 +141,7 @@ assert abs(force.cases[0].merits[1].value + 0.503) < 1e-3
 
 # %%
 budget = malta.experiment("budget", plant, controllers["halbach"])
-malta.report.experiment(budget, "build/05_halbach_budget.png", published)
+display(malta.report.experiment(budget, "build/05_halbach_budget.png", published))
 rms = {case.label: 1e6 * case.merits[0].value for case in budget.cases}
 for label, value in rms.items():
     print(f"{label}: {value:.3f} µm rms")

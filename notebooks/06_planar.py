@@ -15,6 +15,7 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
+from IPython.display import display
 
 import malta
 from malta.machines.planar import coils, commutation
@@ -141,7 +142,7 @@ for name, controller in controllers.items():
 
 # %%
 e = malta.experiment("step", plant, controllers["planar"], engine="virtual machine")
-malta.report.experiment(e, "build/06_planar_step.png", published)
+display(malta.report.experiment(e, "build/06_planar_step.png", published))
 print(e)
 moved = {merit.label: merit.value for merit in e.merits}
 assert moved["table moves phi by"] < 0.02e-6
@@ -159,7 +160,7 @@ for case in e.cases:
 
 # %%
 late = malta.experiment("delay", plant, controllers["planar"], speeds=(1.0, 2.0), engine="virtual machine")
-malta.report.experiment(late, "build/06_planar_delay.png", published)
+display(malta.report.experiment(late, "build/06_planar_delay.png", published))
 left_at_rest = {case.label: case.merits[1].value for case in late.cases}
 print(late)
 assert left_at_rest["with, 2 x"] < 1e-9 < 30e-6 < left_at_rest["without, 2 x"]

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
+from IPython.display import display
 
 import malta
 from malta.firmware.cost import CLOCK, costs, operations
@@ -136,10 +137,7 @@ if can_build:
     commissioning = malta.experiment("commissioning", plant, c)
     for merit in commissioning.merits:
         print(merit)
-    malta.report.experiment(commissioning, "build/robust_commissioning.png")
-    shown, axis = plt.subplots(figsize=(9, 6), layout="constrained")
-    axis.imshow(plt.imread("build/robust_commissioning.png"))
-    axis.set_axis_off()
+    display(malta.report.experiment(commissioning, "build/robust_commissioning.png"))
     assert commissioning.run.verdict.completed
     by_label = {merit.label: merit.value for merit in commissioning.merits}
     assert by_label["in operation after"] < 0.1

@@ -278,7 +278,7 @@ class CampaignFigures(NamedTuple):
         from IPython.display import display
 
         for figure in self:
-            display(figure)  # type: ignore[no-untyped-call]
+            display(figure)
 
 
 CAMPAIGN_FILES = ("distributions.png", "yield.png", "worst.png")  # of CampaignFigures, in a campaign's folder
