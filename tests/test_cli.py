@@ -178,7 +178,7 @@ def test_design_prints_table_I_beside_ours(designed: tuple[Path, str]) -> None:
 
 def test_design_prints_bandwidths_sensitivities_and_stroke(designed: tuple[Path, str]) -> None:
     _, printed = designed
-    stroke = "\nDoes it follow the stroke? "
+    stroke = "\nDoes it follow the stroke?\n"
     for title in ("Bandwidth by definition", "Peak sensitivity (ISO 14839-3", stroke, "overshoot [%]"):
         assert printed.count(title) == 2, title
     assert "calibrated: Table II's weights on bases" in printed

@@ -91,7 +91,9 @@ def test_the_page_of_a_design_fits_and_names_its_figures(
     design: Design, flown: Flown, published: dict[str, Any]
 ) -> None:
     stroke = flown(design.spec.name, "stroke")
-    text = printed(report.design_page(design.spec, design.model, design.margins, stroke, published))
+    page = report.design_page(design.spec, design.model, design.margins, stroke, published)
+    text = printed(page)
+    assert_folds(page, 80, 60, 40)
     for wanted in (
         "218.92",
         "157.53",

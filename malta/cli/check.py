@@ -9,7 +9,7 @@ import typer
 
 from malta.cli.inputs import read_controller
 from malta.cli.options import AsJson, MachineFile
-from malta.cli.output import make_console, print_document, print_note
+from malta.cli.output import make_console, print_document, print_line, print_note
 
 if TYPE_CHECKING:
     from malta.margins.loops import CurrentLoops
@@ -46,11 +46,11 @@ def check(
     else:
         console = make_console()
         for line in verdict.groups:
-            console.print(line, soft_wrap=True)
+            print_line(console, line)
         holds = "does not hold" if failures else "holds"
         share, loops = f"{100 * verdict.claim:.3f} %", _count_loops(file)
         where = "" if loops == 1 else f" at each of {loops} places, not between them"
-        console.print(f"{file}: stable in {share} of the uncertainty{where}: {holds}", soft_wrap=True)
+        print_line(console, f"{file}: stable in {share} of the uncertainty{where}: {holds}")
         for line in failures:
             print_note(f"{file}: {line}")
     raise typer.Exit(1 if failures else 0)

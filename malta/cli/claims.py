@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from malta.cli.completion import design_files as complete_designs
 from malta.cli.inputs import design_files
 from malta.cli.options import AsJson
 from malta.cli.output import make_console, print_document, print_written, progress_bar
@@ -21,7 +22,9 @@ if TYPE_CHECKING:
 def claims(
     designs: Annotated[
         list[Path] | None,
-        typer.Argument(help="Design files; all of design/ if none is named."),
+        typer.Argument(
+            help="Design files; all of design/ if none is named.", autocompletion=complete_designs
+        ),
     ] = None,
     markdown: Annotated[
         bool, typer.Option("--markdown", help="Print the table as the README holds it.")

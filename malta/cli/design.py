@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from malta.cli.completion import design_files as complete_designs
 from malta.cli.inputs import design_files, gains_folder
 from malta.cli.options import AsJson
 from malta.cli.output import make_console, print_document, print_error, print_written, track_files
@@ -23,7 +24,10 @@ if TYPE_CHECKING:
 
 def design(
     files: Annotated[
-        list[Path] | None, typer.Argument(help="Design files; all of design/ if none is named.")
+        list[Path] | None,
+        typer.Argument(
+            help="Design files; all of design/ if none is named.", autocompletion=complete_designs
+        ),
     ] = None,
     out: Annotated[
         Path | None, typer.Option(help="Folder of the gain files. [gains/ beside the design file]")

@@ -9,9 +9,12 @@ import gc
 import io
 import os
 import sys
+from collections.abc import Callable
+from itertools import chain
 from typing import Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
 from malta.cli.campaign import campaign
 from malta.cli.check import check
@@ -23,6 +26,7 @@ from malta.cli.new import new
 from malta.cli.output import print_error, print_note, silence
 from malta.cli.plot import plot
 from malta.cli.report import report
+from malta.cli.schema import schema
 from malta.cli.simulate import simulate
 from malta.cli.tune import tune
 from malta.cli.verify import verify
@@ -32,30 +36,40 @@ UsageError: Any = (
     typer.BadParameter.__base__
 )  # of click, or of the copy of click that newer versions of typer have
 
+
+class Grouped(TyperGroup):
+    """The group of all commands: its help lists them under the headings of GROUPS, with their whole first lines."""
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """Write the sections of the commands."""
+        for heading, commands in GROUPS.items():
+            known = [(c.__name__, _first_line(c)) for c in commands if self.get_command(ctx, c.__name__)]
+            with formatter.section(heading):
+                formatter.write_dl(known)
+
+
+def _first_line(command: Callable[..., None]) -> str:
+    """The first paragraph of a command's help, as its entry in the list of commands."""
+    return " ".join((command.__doc__ or "").split("\n\n")[0].split()).rstrip(".")
+
+
+GROUPS: dict[str, tuple[Callable[..., None], ...]] = {  # the order of the help
+    "Commands": (design, verify, check, simulate, campaign, tune),
+    "Pages and pictures": (plot, report, compare, claims),
+    "For other programs": (export, schema),
+    "A machine of your own": (new,),
+}
 app = typer.Typer(
+    cls=Grouped,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
-    add_completion=False,
     rich_markup_mode=None,
     help="""Controllers for self-bearing and magnetically levitated actuators: from a machine's data to verified
     gain files, and a nonlinear simulation that consumes them.
 
-    Exit codes: 0 fine; 1 a check failed (unstable, touched down), old gain files stand; 2 bad input.""",
+    Exit codes: 0 fine; 1 a check failed (unstable, touched down), old gain files stand; 2 bad input; 130 Ctrl-C.""",
 )
-for command in (
-    design,
-    verify,
-    check,
-    simulate,
-    campaign,
-    tune,
-    plot,
-    report,
-    compare,
-    export,
-    claims,
-    new,
-):  # the order of the help
+for command in chain.from_iterable(GROUPS.values()):
     app.command()(command)
 
 

@@ -7,13 +7,17 @@ from typing import Annotated
 
 import typer
 
+from malta.cli.completion import gain_files, parameters
 from malta.files import locate
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON document instead of tables.")]
 Changes = Annotated[
     list[str] | None,
     typer.Option(
-        "--set", metavar="NAME=VALUE", help="Change a parameter of the machine: m=0.56 (SI) or l_B=45mm."
+        "--set",
+        metavar="NAME=VALUE",
+        help="Change a parameter of the machine: m=0.56 (SI) or l_B=45mm.",
+        autocompletion=parameters,
     ),
 ]
 SCENARIOS = "one of the machine's own, which `--scenario help` lists. [its first]"
@@ -67,7 +71,10 @@ Substeps = Annotated[
 Yes = Annotated[bool, typer.Option("--yes", help="Start work of more than ten minutes too.")]
 Seed = Annotated[int | None, typer.Option(help="Seed of the noise. [0]")]
 GainFile = Annotated[
-    Path, typer.Argument(metavar="GAINS", help="A gain file: .json, .npz or .mat.", callback=locate)
+    Path,
+    typer.Argument(
+        metavar="GAINS", help="A gain file: .json, .npz or .mat.", callback=locate, autocompletion=gain_files
+    ),
 ]
 GainFileOrNone = Annotated[
     Path | None,
@@ -75,6 +82,7 @@ GainFileOrNone = Annotated[
         metavar="[GAINS]",
         help="A gain file: .json, .npz or .mat. With --status: [the campaign's own]",
         callback=lambda path: None if path is None else locate(path),
+        autocompletion=gain_files,
         show_default=False,
     ),
 ]

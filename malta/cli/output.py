@@ -53,6 +53,14 @@ def print_text(console: Console, text: str) -> None:
     console.print(Paragraph(text))
 
 
+def print_line(console: Console, text: str) -> None:
+    """Print a line that has names of files: whole in files and pipes, folded on a terminal."""
+    if console.is_terminal:
+        print_text(console, text)
+    else:
+        console.print(text, soft_wrap=True)
+
+
 def print_written(console: Console, files: Iterable[Path]) -> None:
     """Print one line for each file that a command wrote."""
     for file in files:

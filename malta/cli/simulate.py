@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 import typer
 
 from malta.cli.assignments import add_own_options, read_sensor_errors, scenario_options
+from malta.cli.completion import scenarios
 from malta.cli.exported import (
     compare_flights,
     comparison_table,
@@ -61,7 +62,9 @@ class Simulation(NamedTuple):
 
 def simulate(
     gains: GainFile,
-    scenario: Annotated[str | None, typer.Option(help=f"What to simulate: {SCENARIOS}")] = None,
+    scenario: Annotated[
+        str | None, typer.Option(help=f"What to simulate: {SCENARIOS}", autocompletion=scenarios)
+    ] = None,
     change: Changes = None,
     distance: Distance = None,
     rise: Rise = None,

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import typer
 
 from malta.cli.inputs import design_of, read_controller
-from malta.cli.output import make_console, print_document, print_note, print_text, progress_bar
+from malta.cli.output import make_console, print_document, print_line, print_note, print_text, progress_bar
 from malta.cli.patience import duration_text
 from malta.errors import InputError
 
@@ -75,7 +75,7 @@ def show_status(ctx: typer.Context, folder: Path, gains: Path | None, options: S
         print_note(f"{file}: a damaged block, which the campaign will fly again")
     console = make_console()
     for line in _status_lines(found):
-        print_text(console, line)
+        print_line(console, line)
     print_tables(gains, found.summary, options.worst)
 
 

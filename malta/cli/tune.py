@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from malta.cli.completion import design_files
 from malta.cli.options import AsJson
 from malta.cli.output import make_console, print_document, print_note, print_written, progress_bar
 from malta.errors import CheckError, InputError
@@ -21,7 +22,12 @@ if TYPE_CHECKING:
 
 def tune(
     file: Annotated[
-        Path, typer.Argument(metavar="SPEC", help="A design file with [specification] and [search].")
+        Path,
+        typer.Argument(
+            metavar="SPEC",
+            help="A design file with [specification] and [search].",
+            autocompletion=design_files,
+        ),
     ],
     out: Annotated[
         Path, typer.Option(help="Folder of the design file that is found, the trials, the front.")

@@ -253,7 +253,7 @@ def _poles(curves: LoopCurves, channels: Names, at: Place) -> dict[str, Any]:
     return {key: pairs(values) for key, values in (sets | {"zeros_rad_per_s": curves.zeros}).items()}
 
 
-def pairs(values: Any) -> list[list[float]]:
+def pairs(values: Any) -> list[list[float | None]]:
     """Complex numbers as rows of real and imaginary parts."""
     return [[float(value.real), float(value.imag)] for value in values]
 

@@ -17,8 +17,10 @@ from malta.cli.documents.pages import CompareOutput, ReportOutput
 from malta.cli.documents.parts import Part
 from malta.cli.documents.plots import PlotOutput
 from malta.cli.documents.simulations import DesignOutput, SimulateOutput
+from malta.errors import InputError
+from malta.schemas import SCHEMAS, schema
+from malta.schemas.parts import DRAFT
 
-DRAFT = "https://json-schema.org/draft/2020-12/schema"
 MODELS: dict[str, type[Part]] = {
     "design-output": DesignOutput,
     "verify-output": VerifyOutput,
@@ -36,6 +38,7 @@ MODELS: dict[str, type[Part]] = {
     "export-output": ExportOutput,
     "claims-output": ClaimsOutput,
 }
+NAMES = (*SCHEMAS, *MODELS)  # of all schemas
 
 
 def output_schema(name: str) -> dict[str, Any]:
@@ -45,3 +48,14 @@ def output_schema(name: str) -> dict[str, Any]:
     ['c', 'fmu']
     """
     return {"$schema": DRAFT} | MODELS[name].model_json_schema(mode="serialization")
+
+
+def schema_of(name: str) -> dict[str, Any]:
+    """The JSON schema of a kind of file or of a document. Raises InputError for an unknown name.
+
+    >>> schema_of("data")["required"]
+    ['machine', 'parameters']
+    """
+    if name not in NAMES:
+        raise InputError("schema", "", repr(name), "one of " + ", ".join(NAMES))
+    return schema(name) if name in SCHEMAS else output_schema(name)

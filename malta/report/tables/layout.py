@@ -96,10 +96,12 @@ def widths_of(heading: str, cells: Sequence[str]) -> Widths:
 def allot(columns: Sequence[Widths], room: int, *, cells: bool) -> list[int] | None:
     """Share `room` among columns, the widest folds first. None where they do not fit.
 
-    Headings fold before cells, where `cells` lets them fold, and the first column, which names the rows, folds last.
+    Headings and sentences fold before short cells, where `cells` lets these fold, and the first column, which names
+    the rows, folds last.
     """
     found = [one.whole for one in columns]
-    bodies, least = [one.body for one in columns], [one.least for one in columns]
+    bodies = [columns[0].body, *(_short(one) for one in columns[1:])]
+    least = [one.least for one in columns]
     for floors in (bodies, [bodies[0], *least[1:]], least)[: 3 if cells else 1]:
         while sum(found) > room:
             loose = [i for i, floor in enumerate(floors) if found[i] > floor]
@@ -109,13 +111,18 @@ def allot(columns: Sequence[Widths], room: int, *, cells: bool) -> list[int] | N
     return found if sum(found) <= room else None
 
 
+def _short(column: Widths) -> int:
+    """The width to which a column folds before others fold: that of its cells, or of lines of sentences."""
+    return column.body if column.body <= WORDY else max(column.least, WORDY)
+
+
 def split(columns: Sequence[Widths], width: int) -> list[list[int]] | None:
     """The columns of the tables that a wide table is drawn as: each has the first one, and as many others as fit.
 
     None where the first column and some other do not fit beside each other.
     """
     gap = GAPS[-1]
-    wanted = [max(one.least, min(one.body, WORDY)) for one in columns]
+    wanted = [_short(one) for one in columns]
     room, blocks = width - EDGES, [[0]]
     for i in range(1, len(columns)):
         if columns[0].least + gap + columns[i].least > room:
