@@ -19,6 +19,7 @@ ORDER = (
     *(
         "errors",
         "units",
+        "identifiers",
         "files",
         "archives",
         "tables",
