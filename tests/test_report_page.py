@@ -85,7 +85,7 @@ def test_the_key_figures_are_those_of_verify(cart: Analysis, page: Page) -> None
         assert f'<dd class="value">{value}</dd>' in page.html
     found = {score.key: score.value for score in scores_of(cart)}
     assert found["peak_sensitivity"] == peak
-    assert found["bandwidth_sigma_max_t_rad_per_s"] == margins.bandwidth["sigma_max_T"]
+    assert found["bandwidth_sigma_max_T_rad_per_s"] == margins.bandwidth["sigma_max_T"]
     assert found["stable"] == 1.0
 
 

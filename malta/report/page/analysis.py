@@ -61,6 +61,12 @@ class Subject(NamedTuple):
     current_loops: CurrentLoops = "lag"
 
     @property
+    def written_from(self) -> Spec | None:
+        """The design file that the gains were synthesized from; None where it is not known, or was changed since."""
+        same = self.spec is not None and self.spec.sha256 == self.controller.spec_sha256
+        return self.spec if same else None
+
+    @property
     def plant(self) -> Plant:
         """The machine."""
         return plant_of(self.parameters)

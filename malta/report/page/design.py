@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from malta.identifiers import identifier
 from malta.model.linear import is_linear
 from malta.model.parameters import units_of
 from malta.model.plant import Signal
-from malta.report.page.scores import identifier, unit_word
 from malta.synthesis.spec import Pid, Weights, integral_signals, pid_signals, process_signals
 from malta.units import in_unit
 
@@ -58,7 +58,7 @@ class Entry(NamedTuple):
     @property
     def key(self) -> str:
         """The entry as an identifier with its unit."""
-        return identifier(self.group, self.name, unit_word(self.unit) if self.unit else "")
+        return identifier(f"{self.group} {self.name}", self.unit)
 
     def text(self, unit: str) -> str:
         """The value in a unit of display, with six digits."""
@@ -112,8 +112,9 @@ def _law(subject: Subject) -> Iterator[Entry]:
     yield Entry("law", "integrals of errors", "yes" if c.integrating else "no")
     yield Entry("law", "observed forces of disturbance", "yes" if c.observed else "no")
     yield Entry("law", "commutation", "measured place" if c.commutation is None else "predicted place")
-    if subject.spec is not None:
-        yield Entry("law", "discretization", "PID" if subject.spec.pid else subject.spec.discretization)
+    spec = subject.written_from
+    if spec is not None and spec.pid is None:
+        yield Entry("law", "discretization", spec.discretization)
     for signal, pause in zip(c.measurements, c.pause, strict=False):
         if pause:
             name, unit = f"integral of {signal.name} waits above", f"{signal.unit}/s"
@@ -125,7 +126,7 @@ def _law(subject: Subject) -> Iterator[Entry]:
 
 def _weights(subject: Subject) -> Iterator[Entry]:
     c, plant = subject.controller, subject.plant
-    law = None if subject.spec is None else subject.spec.law
+    law = None if subject.written_from is None else subject.written_from.law
     if isinstance(law, Pid):
         for table, signals in pid_signals(plant, law.axes).items():
             plain = [Signal(s.name, re.sub(r"\((\w+)\)", r"\1", s.unit).replace(" / ", "/")) for s in signals]

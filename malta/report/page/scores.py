@@ -12,11 +12,12 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 
+from malta.identifiers import distinct, identifier
 from malta.margins.recovery import furthest
 from malta.margins.verify import BANDWIDTHS
 from malta.model.signals import FINE
 from malta.report.figures.parts import UNITS, micro, number
-from malta.units import base_exponents, in_unit, unit_factor
+from malta.units import in_unit
 
 if TYPE_CHECKING:
     from malta.report.page.analysis import Analysis
@@ -27,7 +28,6 @@ Scope = Literal[
 ]  # what two designs share for a comparison of the figure to make sense
 PLAIN = (1e-2, 1e6)  # sizes of numbers that are written without a power of ten
 ROOTS = ("m s^0.5", "rad s^0.5")  # units of load errors, which are no products of whole powers
-SI_UNITS = ("m", "s", "rad", "N", "N m", "A", "V", "kg", "J", "1/s", "m/s", "rad/s", "m/N", "N/m", "m/s^2")
 
 
 class Meaning(NamedTuple):
@@ -37,7 +37,6 @@ class Meaning(NamedTuple):
     better: Better
     scope: Scope
     unit: str = "1"  # for display
-    key_unit: str = ""  # the end of the identifier
 
 
 MEANINGS: dict[str, Meaning] = {
@@ -46,20 +45,20 @@ MEANINGS: dict[str, Meaning] = {
     "margin_lost_at": Meaning("stability and margins", "high", "box", "percent"),
     "disk": Meaning("stability and margins", "high", "loop"),
     "disk_of": Meaning("stability and margins", "high", "machine"),
-    "delay_margin": Meaning("stability and margins", "high", "loop", "us", "s"),
-    "mass_margin": Meaning("stability and margins", "high", "machine", "kg", "kg"),
-    "payload": Meaning("stability and margins", "high", "machine", "kg", "kg"),
+    "delay_margin": Meaning("stability and margins", "high", "loop", "us"),
+    "mass_margin": Meaning("stability and margins", "high", "machine", "kg"),
+    "payload": Meaning("stability and margins", "high", "machine", "kg"),
     "peak_s": Meaning("sensitivity", "low", "loop"),
     "peak_s_of": Meaning("sensitivity", "low", "machine"),
     "peak_t": Meaning("sensitivity", "low", "loop"),
-    "bandwidth": Meaning("bandwidth and poles", "high", "loop", "rad/s", "rad_per_s"),
-    "natural": Meaning("bandwidth and poles", "", "loop", "rad/s", "rad_per_s"),
-    "slowest_pole": Meaning("bandwidth and poles", "high", "loop", "rad/s", "rad_per_s"),
+    "bandwidth": Meaning("bandwidth and poles", "high", "loop", "rad/s"),
+    "natural": Meaning("bandwidth and poles", "", "loop", "rad/s"),
+    "slowest_pole": Meaning("bandwidth and poles", "high", "loop", "rad/s"),
     "damping": Meaning("bandwidth and poles", "high", "loop"),
     "motion": Meaning("noise at rest", "low", "machine"),
     "command": Meaning("noise at rest", "low", "machine"),
     "load_moves": Meaning("a constant load from outside", "low", "machine"),
-    "load_settles": Meaning("a constant load from outside", "low", "machine", "s", "s"),
+    "load_settles": Meaning("a constant load from outside", "low", "machine", "s"),
     "compliance": Meaning("a constant load from outside", "low", "machine"),
     "job_lower": Meaning("main job", "low", "machine"),
     "job_higher": Meaning("main job", "high", "machine"),
@@ -121,38 +120,18 @@ def four_digits(value: float) -> str:
     return number(rounded) if PLAIN[0] <= abs(value) < PLAIN[1] or not value else f"{rounded:g}"
 
 
-def identifier(*parts: str) -> str:
-    """Words as one identifier of letters, digits and underscores.
-
-    >>> identifier("rise, 10-90 %", "s")
-    'rise_10_90_s'
-    """
-    return re.sub(r"[\W_]+", "_", " ".join(parts), flags=re.ASCII).strip("_").lower()
-
-
-def unit_word(unit: str) -> str:
-    """An SI unit as the end of an identifier: "rad_per_s" of rad/s; "" for a plain number."""
-    return (
-        ""
-        if unit in ("1", "percent")
-        else identifier(re.sub("^1/", "per ", unit).replace("/", " per ").replace("^", ""))
-    )
-
-
 def scores_of(found: Analysis) -> list[Score]:
     """List the figures of merit of a loop, in the order of their groups."""
     parts = (_margins, _sensitivities, _bandwidths, _noise, _loads, _job, _requirements)
-    return [score for part in parts for score in part(found)]
+    scores = [score for part in parts for score in part(found)]
+    return [s._replace(key=key) for s, key in zip(scores, distinct(s.key for s in scores), strict=True)]
 
 
-def _score(
-    kind: str, name: str, label: str, value: float, unit: str = "", key_unit: str = "", signal: str = ""
-) -> Score:
-    meaning = MEANINGS[kind]
-    key = identifier(name, key_unit or meaning.key_unit)
-    unit = unit or meaning.unit
+def _score(kind: str, name: str, label: str, value: float, unit: str = "", signal: str = "") -> Score:
+    """The figure of a kind: `name` is its key without a unit; `unit` for display, if not that of its kind."""
+    unit = unit or MEANINGS[kind].unit
     factor, shown = UNITS[unit] if unit in ROOTS else (in_unit(1.0, unit), unit)
-    return Score(kind, key, label, float(value), shown, factor, signal)
+    return Score(kind, identifier(name, unit), label, float(value), shown, factor, signal)
 
 
 def _margins(a: Analysis) -> Iterator[Score]:
@@ -210,33 +189,23 @@ def _noise(a: Analysis) -> Iterator[Score]:
         return
     for signal, value in zip(a.plant.outputs, a.noise.motion, strict=True):
         fine, words = FINE.get(signal.unit, signal.unit), f"motion {signal.name}, rms"
-        key, unit = f"motion {signal.name} rms", unit_word(signal.unit)
-        yield _score("motion", key, words, value, fine, unit, signal.name)
+        yield _score("motion", f"motion {signal.name} rms", words, value, fine, signal.name)
     for signal, value in zip(a.plant.inputs, a.noise.force, strict=True):
         words = f"command {signal.name}, rms"
-        yield _score(
-            "command", f"command {signal.name} rms", words, value, signal.unit, unit_word(signal.unit)
-        )
+        yield _score("command", f"command {signal.name} rms", words, value, signal.unit, signal.name)
 
 
 def _loads(a: Analysis) -> Iterator[Score]:
     units = {s.name: s.unit for s in a.plant.disturbances}
     for load, output in furthest(a.recovered):
-        fine, name, unit = FINE.get(output.unit, output.unit), f"load {load.name}", unit_word(output.unit)
+        fine, name = FINE.get(output.unit, output.unit), f"load {load.name}"
         size = f"1 {units[load.name]} {load.name}".replace("1 1 ", "1 ")
         settled = f"{size}: within 1 % after"
         peak = f"{size}: largest over frequency"
-        yield _score(
-            "load_moves",
-            f"{name} largest",
-            f"{size}: largest deviation",
-            output.largest,
-            fine,
-            unit,
-            load.name,
-        )
+        moved = f"{size}: largest deviation"
+        yield _score("load_moves", f"{name} largest", moved, output.largest, fine, load.name)
         yield _score("load_settles", f"{name} settles", settled, output.settled, signal=load.name)
-        yield _score("compliance", f"{name} compliance", peak, output.compliance, fine, unit, load.name)
+        yield _score("compliance", f"{name} compliance", peak, output.compliance, fine, load.name)
 
 
 def _job(a: Analysis) -> Iterator[Score]:
@@ -257,18 +226,8 @@ def _job(a: Analysis) -> Iterator[Score]:
         elif HIGHER.search(merit.label):
             kind = "job_higher"
         label = f"{case}: {merit.label}" if case else merit.label
-        unit = unit_word(si_unit(merit.unit))
-        yield _score(kind, f"{a.job.name} {case} {merit.label}", label, merit.value, merit.unit, unit)
-
-
-def si_unit(unit: str) -> str:
-    """The SI unit of a unit for display: "s" of ms, "m" of um."""
-    if unit in ("1", "percent"):
-        return "1"
-    for known in SI_UNITS:
-        if base_exponents(known) == base_exponents(unit) and unit_factor(known, "unit") == 1.0:
-            return known
-    return unit
+        name = f"{a.job.name} {case} {merit.key or merit.label}"
+        yield _score(kind, name, label, merit.value, merit.unit)
 
 
 def _requirements(a: Analysis) -> Iterator[Score]:
@@ -281,7 +240,7 @@ def _requirements(a: Analysis) -> Iterator[Score]:
         words = requirement_words(one.name) + (f", {one.how}" if more else "")
         unit = FINE.get(one.unit, one.unit)
         kind = "at_least" if one.at_least else "at_most"
-        yield _score(kind, f"requirement {one.name}{more}", words, one.found, unit, unit_word(one.unit))
+        yield _score(kind, f"requirement {one.name}{more}", words, one.found, unit)
 
 
 def requirement_words(name: str) -> str:

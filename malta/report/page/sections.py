@@ -115,8 +115,9 @@ def summary_sentences(a: Analysis) -> list[str]:
         sentences.append(f"It {_listed(parts)}.")
     if plant.has_stroke:
         sentences.append(f"The stroke moves {plant.stroke} by ±{in_unit(plant.travel, 'mm'):g} mm.")
-    if a.subject.spec is not None and a.subject.spec.summary:
-        sentences.insert(0, f"{a.subject.spec.summary.rstrip('.')}.")
+    spec = a.subject.written_from
+    if spec is not None and spec.summary:
+        sentences.insert(0, f"{spec.summary.rstrip('.')}.")
     if a.subject.changes:
         sentences.append(
             f"The machine is changed: {', '.join(a.subject.changes)}; the controller is not told."
@@ -150,7 +151,7 @@ def _design(a: Analysis) -> Iterator[Item]:
 def _requirements(a: Analysis) -> Iterator[Item]:
     if not a.outcomes:
         return
-    if a.subject.spec is not None and a.subject.spec.sha256 != a.subject.controller.spec_sha256:
+    if a.subject.written_from is None:
         yield "The design file was changed after the gain file was written: these are its present requirements."
     rows, marks = [], []
     for one in a.outcomes:
