@@ -18,6 +18,7 @@ import malta
 ORDER = (
     *(
         "errors",
+        "identifiers",
         "units",
         "identifiers",
         "files",

@@ -136,7 +136,7 @@ def test_the_report_of_a_shipped_design(name: str, tmp_path: Path, browser: Any,
     for link in verified["robust"]["chain"]:
         assert chain[link["stage"]] == f"{100 * link['lower']:.2f} %"
     delays = {row[0]: row[1] for row in cells_of(html, "Margins of the sampled loop")[1:]}
-    for sensor, delay in verified["robust"]["delay"].items():
+    for sensor, delay in verified["robust"]["delay_s"].items():
         assert delays[f"delay at {sensor} alone"] == f"{1e6 * delay:.0f} µs"
     assert len(html) < 2_000_000
     for width in (1280, 390):
