@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from malta.margins.loops import machine_loop
+from malta.margins.robust import NOT_PROVEN
 from malta.model.published import published_figures
 from malta.model.signals import FINE
 from malta.report.figures.parts import UNITS
@@ -203,7 +204,7 @@ def _margins(a: Analysis) -> Iterator[Item]:
         from malta.report.figures.margins import chain_figure
 
         position = f"position {a.plant.stroke}"
-        if a.margin is not None:
+        if robust.travel is not NOT_PROVEN:
             yield Picture(
                 lambda: chain_figure(robust, c.name, a.subject.box, position, a.worst),
                 "Margins stage by stage, from full state feedback to the machine's own loop, and the peak sensitivity "
