@@ -31,7 +31,7 @@ from malta.margins.uncertain import (
 )
 from malta.model.data import plant_of
 from malta.model.linearize import LinearModel, linearize
-from malta.model.plant import position_at, position_in, trim
+from malta.model.plant import position_in, trim
 from malta.model.sensors import whole_samples, with_lags
 from malta.synthesis.controller import Controller, LinearLaw, linear_law, with_readings, with_slope
 from malta.synthesis.riccati import add_lags, delay_inputs, sample
@@ -135,7 +135,7 @@ def machine_loop(model: LinearModel, controller: Controller) -> Loop:
     its sensors that is not whole samples.
     """
     plant = model.plant
-    loaded = linearize(plant, trim(plant, **position_at(plant, model.operating_point.x)))
+    loaded = loaded_model(plant, position_in(plant, model.operating_point.x))
     delay = plant.actuator.delay(controller.sample_time) + whole_samples(plant, controller.sample_time)
     return loop(loaded, controller, delay=delay, current_loops=True, feedforward=True, sensors=True)
 
@@ -184,13 +184,32 @@ def machine_system(
 ) -> tuple[UncertainSystem, Compensator]:
     """The machine at the states `at` in parameters by name, and its control law: the arguments of robust_margin."""
     believed = plant_of(controller.parameters)
-    if not is_commutated(believed):
-        system = of_plant(plant, names, at=at, believed=believed, late=True)
-        return system, machine_law(plant, controller, current_loops)
-    H = held_gain(believed, position_in(believed, believed.at(**at).x))
-    system = of_plant(plant, names, at=at, believed=believed, held=H, late=True)
-    handed = system.matrices.size2_out(1) > len(H)
+    system, H = _commanded_system(plant, believed, tuple(names), tuple(at.items()))
+    handed = H is not None and system.matrices.size2_out(1) > len(H)
     return system, machine_law(plant, controller, current_loops, use=ReadingUse(H, handed))
+
+
+@lru_cache(maxsize=16)  # every controller of a machine has it; plants compare by identity
+def _commanded_system(
+    plant: Plant, believed: Plant, names: tuple[str, ...], at: tuple[tuple[str, float], ...]
+) -> tuple[UncertainSystem, FloatArray | None]:
+    """The machine at the states `at` in parameters by name, and the gain of currents that are held; None: none are."""
+    states = dict(at)
+    H = (
+        held_gain(believed, position_in(believed, believed.at(**states).x))
+        if is_commutated(believed)
+        else None
+    )
+    return of_plant(plant, names, at=states, believed=believed, held=H, late=True), H
+
+
+@lru_cache(maxsize=16)  # every loop of a machine needs it; plants compare by identity
+def loaded_model(plant: Plant, position: float) -> LinearModel:
+    """The machine at rest under its loads at a position of the stroke, m; 0 for a machine without a stroke.
+
+    Raises CheckError when no input holds the machine there.
+    """
+    return linearize(plant, trim(plant, **({plant.stroke: position} if plant.has_stroke else {})))
 
 
 def loaded_system(
@@ -202,7 +221,7 @@ def loaded_system(
 
     Raises CheckError when no input holds the machine there.
     """
-    model = commanded_model(linearize(plant, trim(plant, **at)), controller)
+    model = commanded_model(loaded_model(plant, at.get(plant.stroke, 0.0)), controller)
     A, B, C, use = model.A, model.B, model.C, ReadingUse(slope=feedforward_slope(model, controller))
     if model.E.any():
         A, H = held(model)

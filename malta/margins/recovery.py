@@ -16,16 +16,17 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import casadi as ca
 import numpy as np
 
 from malta.errors import CheckError, InputError
-from malta.margins.loops import Loop, machine_loop
+from malta.margins.loops import Loop, loaded_model, machine_loop
 from malta.margins.responses import find_peaks
-from malta.model.linearize import LinearModel, linearize
-from malta.model.plant import position_at, position_in, trim
+from malta.model.linearize import LinearModel
+from malta.model.plant import position_in, readonly
 from malta.model.sensors import with_lags
 from malta.synthesis.riccati import sample
 from malta.synthesis.step_response import StepResponse, step_response
@@ -146,6 +147,7 @@ def load_vector(plant: Plant, name: str, load: Mapping[str, float]) -> FloatArra
     return np.array([load.get(disturbance, 0.0) for disturbance in known])
 
 
+@lru_cache(maxsize=16)  # every controller of a machine has it; models compare by identity
 def disturbance_map(model: LinearModel) -> FloatArray:
     """B_w of xi' = A xi + B v + B_w w: n states of the design model x disturbances."""
     plant, point = model.plant, model.operating_point
@@ -154,7 +156,7 @@ def disturbance_map(model: LinearModel) -> FloatArray:
     acting = w + plant.load(x) if point.loaded else w
     rate = plant.f(x, kind(ca.DM(point.u)), acting)
     found = ca.Function("B_w", [x, w], [ca.densify(ca.jacobian(rate, w))])(point.x, 0)
-    return np.array(found)[list(plant.controlled)]
+    return readonly(np.array(found)[list(plant.controlled)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,12 +169,11 @@ class PushedLoop:
     @classmethod
     def of(cls, plant: Plant, controller: Controller, position: float | None = None) -> PushedLoop:
         """Build the loop at a position of the stroke; None: at the controller's operating point."""
-        point = plant.point(controller.operating_point[0])
-        if position is not None:
-            point = plant.at(**{plant.states[plant.stroke_state].name: position})
-        loop = machine_loop(linearize(plant, point), controller)
+        if position is None:
+            position = position_in(plant, plant.point(controller.operating_point[0]).x)
         # Between samples the machine is itself, whoever commutates: A - E C of either model.
-        loaded = linearize(plant, trim(plant, **position_at(plant, point.x)))
+        loaded = loaded_model(plant, position)
+        loop = machine_loop(loaded, controller)
         return cls(loop, sampled_push(loaded, controller.sample_time, len(loop.Ad)))
 
     def answer(self) -> StepResponse:

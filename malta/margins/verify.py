@@ -214,16 +214,16 @@ def _verify(model: LinearModel, controller: Controller, uncertainty: Mapping[str
         "machine": machine,
     }
     names = [s.name for s in controller.measurements]
-    stages = tuple(_stage(name, stage, names) for name, stage in loops.items())
+    stages = tuple(stage_of(name, stage, names) for name, stage in loops.items())
     empty = np.zeros(0, dtype=complex)
     regulator, observer = (empty, empty) if controller.cost is None else controller_poles(controller)
     poles = Poles(
         open_loop=_sorted(eigenvalues(model.A)),
-        regulator=_continuous(regulator, controller.sample_time),
-        filter=_continuous(observer, controller.sample_time),
-        closed_loop=_continuous(eigenvalues(machine.closed), controller.sample_time),
+        regulator=continuous_poles(regulator, controller.sample_time),
+        filter=continuous_poles(observer, controller.sample_time),
+        closed_loop=continuous_poles(eigenvalues(machine.closed), controller.sample_time),
     )
-    bandwidths = _bandwidths(model, controller, machine, stable=stages[-1].stable)
+    bandwidths = bandwidths_of(model, controller, machine, stable=stages[-1].stable)
     robust = travel_margin(model.plant, controller, uncertainty) if uncertainty else None
     return Margins(poles, stages, bandwidths, uncertainty, robust, extent_of(model.plant, uncertainty))
 
@@ -241,7 +241,8 @@ def _grid(Ts: float) -> FloatArray:
     return np.geomspace(1e-2, np.pi / Ts, 240)
 
 
-def _stage(name: str, stage: Loop, sensors: list[str]) -> Stage:
+def stage_of(name: str, stage: Loop, sensors: list[str]) -> Stage:
+    """The peak sensitivities and the spectral radius of a loop; the peaks of an unstable one are NaN."""
     radius = float(np.abs(eigenvalues(stage.closed)).max())
     if radius >= 1:
         return Stage(name, dict.fromkeys([*sensors, "sigma_max"], np.nan), np.nan, radius)
@@ -254,9 +255,10 @@ def _stage(name: str, stage: Loop, sensors: list[str]) -> Stage:
     return Stage(name, dict(zip([*sensors, "sigma_max"], peaks.tolist(), strict=True)), float(at[-1]), radius)
 
 
-def _bandwidths(
+def bandwidths_of(
     model: LinearModel, controller: Controller, machine: Loop, *, stable: bool
 ) -> dict[str, float]:
+    """The bandwidths of the machine's loop by the definitions of BANDWIDTHS, rad/s; NaN where it is unstable."""
     natural = _natural_frequencies(commanded_model(model, controller), controller)
     if not stable:
         return {key: np.nan for key in BANDWIDTHS if not key.startswith("w_n")} | natural
@@ -290,7 +292,8 @@ def _singular_values(G: ComplexArray) -> FloatArray:
     return np.asarray(np.linalg.svd(G, compute_uv=False))
 
 
-def _continuous(sampled: ComplexArray, Ts: float) -> ComplexArray:
+def continuous_poles(sampled: ComplexArray, Ts: float) -> ComplexArray:
+    """Poles in rad/s of a sampled system, ln(lambda) / Ts, in order; poles of pure delay are left out."""
     return _sorted(np.asarray(np.log(sampled[np.abs(sampled) > 1e-6].astype(complex)) / Ts))
 
 

@@ -58,22 +58,10 @@ def sample_inputs(run: Simulation, motion: references.Motion, t: FloatArray) -> 
     """
     plant, c, scenario, setup = run
     v_ff = feedforward(c, motion, scenario.feedforward)
-    stored = v_ff
-    if c.delay:
-        n, m = len(c.A), len(c.forces)
-        newest = n + m * (c.lagging + c.delay - 1)
-        states = evaluate(state_reference(plant_of(c.parameters)).map(len(t)), motion.p, motion.dp)[0]
-        stored = v_ff + states @ c.Ad[newest : newest + m, :n].T
-        if c.commutation is not None:
-            stored += motion.dp @ (c.commutation.lead * c.commutation.pull).T
-    past = [np.vstack([np.repeat(stored[:1], age, axis=0), stored[:-age]]) for age in range(c.delay, 0, -1)]
-    if c.lagging:
-        past.insert(0, lagging_references(c, v_ff))
-    if c.observed:
-        past.append(np.zeros_like(v_ff))
     parts = {"p_ref": motion.p, "dp_ref": motion.dp, "v_ff": v_ff}
-    if past:
-        parts["v_past"] = np.hstack(past)
+    past = past_forces(c, motion, v_ff)
+    if past.shape[1]:
+        parts["v_past"] = past
     sizes = layout_of(plant, c, setup).given
     if scenario.disturbance is not None:
         parts["w"] = _wrench(plant, scenario, "disturbance", t)
@@ -84,6 +72,24 @@ def sample_inputs(run: Simulation, motion: references.Motion, t: FloatArray) -> 
         parts |= _fault_flags(plant, scenario, sizes, t)
     parts |= {name: np.zeros((len(t), size)) for name, size in sizes.items() if name not in parts}
     return np.hstack([parts[name] for name in sizes])
+
+
+def past_forces(c: Controller, motion: references.Motion, v_ff: FloatArray) -> FloatArray:
+    """References of the states that hold forces, k x such states: lagging forces, stored forces, disturbances."""
+    stored = v_ff
+    if c.delay:
+        n, m = len(c.A), len(c.forces)
+        newest = n + m * (c.lagging + c.delay - 1)
+        states = evaluate(state_reference(plant_of(c.parameters)).map(len(v_ff)), motion.p, motion.dp)[0]
+        stored = v_ff + states @ c.Ad[newest : newest + m, :n].T
+        if c.commutation is not None:
+            stored += motion.dp @ (c.commutation.lead * c.commutation.pull).T
+    past = [np.vstack([np.repeat(stored[:1], age, axis=0), stored[:-age]]) for age in range(c.delay, 0, -1)]
+    if c.lagging:
+        past.insert(0, lagging_references(c, v_ff))
+    if c.observed:
+        past.append(np.zeros_like(v_ff))
+    return np.hstack(past) if past else np.zeros((len(v_ff), 0))
 
 
 def lagging_references(c: Controller, v_ff: FloatArray) -> FloatArray:

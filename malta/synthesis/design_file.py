@@ -49,7 +49,7 @@ from malta.tables import Quantity, load_toml, validate
 from malta.units import to_si
 
 if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
+    from malta.model.plant import FloatArray, Parameters
 
 
 def read_design(path: str | Path) -> Spec:
@@ -67,16 +67,41 @@ def read_design(path: str | Path) -> Spec:
     ('calibrated', 5e-05, 'tubular')
     """
     path = locate(path)
-    raw = load_toml(path)
+    return spec_of(load_toml(path), path)
+
+
+def machine_file_of(raw: Mapping[str, Any], path: Path) -> Path:
+    """The data file that the content of a design file names. Raises InputError where it names none."""
     machine = raw.get("machine")
     if not isinstance(machine, str):
         found = "nothing" if machine is None else repr(machine)
         raise InputError(path, "machine", found, "the path of the machine's data file")
-    machine_file = Path(os.path.normpath(path.parent / machine))
+    return Path(os.path.normpath(path.parent / machine))
+
+
+def resolved(raw: Mapping[str, Any], path: Path) -> dict[str, Any]:
+    """The content of a design file with the published numbers in the place of every `{ published = "..." }`.
+
+    Raises InputError for a reference to what is not published.
+    """
+    machine_file = machine_file_of(raw, path)
     printed = cache(partial(published, machine_file))  # read once, and only where something refers to it
-    content = validate(DesignFile, _resolve(raw, printed, machine_file, path), path)
+    found: dict[str, Any] = _resolve(raw, printed, machine_file, path)
+    return found
+
+
+def spec_of(raw: Mapping[str, Any], path: Path, parameters: Parameters | None = None) -> Spec:
+    """Check the content of a design file, as TOML gives it.
+
+    path : the file, which errors name and relative paths start at
+    parameters : of the machine, in place of those in its data file; None: the data file's
+
+    Raises InputError as `read_design`.
+    """
+    machine_file = machine_file_of(raw, path)
+    content = validate(DesignFile, resolved(raw, path), path)
     _require_law(content, raw, path)
-    par = read(machine_file, content.preset)
+    par = read(machine_file, content.preset) if parameters is None else parameters
     try:
         plant = plant_of(par)
     except CheckError as error:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -141,6 +142,7 @@ def commutate_ahead(controller: Controller, model: LinearModel) -> Controller:
     )
 
 
+@lru_cache(maxsize=8)  # every controller of a machine has it; plants compare by identity
 def static_feedforward(plant: Plant) -> Feedforward:
     """Inertias, and v0(z): the forces that hold the machine along its travel against gravity and cogging.
 

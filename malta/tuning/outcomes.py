@@ -154,17 +154,25 @@ def judge(spec: Spec, controller: Controller | None = None) -> tuple[Outcome, ..
         model = linearize(spec.plant, spec.plant.at(**spec.operating_point))
     design = SynthesizedDesign(spec, model, controller)
     outcomes = _load_errors(design) if spec.pid else []
-    known = requirements_for(spec.plant)
-    for name, asked in spec.specification.items():
-        if base_of(name) not in known:
-            raise InputError(spec.path, f"specification.{name}", "an unknown requirement", " ".join(known))
-        requirement, signal = known[base_of(name)], name.partition(" ")[2]
-        unit = requirement.unit_of(spec, signal)
-        outcomes += [
-            Outcome(name, asked, figure.value, unit, figure.source, requirement.at_least)
-            for figure in _measure(requirement, design, asked, signal)
-        ]
+    for name in spec.specification:
+        outcomes += outcomes_of(design, name)
     return tuple(outcomes)
+
+
+def outcomes_of(design: SynthesizedDesign, name: str) -> list[Outcome]:
+    """Measure one entry of the specification: a figure for each way to measure the requirement.
+
+    Raises InputError for a requirement that the machine does not have.
+    """
+    spec, known = design.spec, requirements_for(design.plant)
+    if base_of(name) not in known:
+        raise InputError(spec.path, f"specification.{name}", "an unknown requirement", " ".join(known))
+    requirement, signal, asked = known[base_of(name)], name.partition(" ")[2], spec.specification[name]
+    unit = requirement.unit_of(spec, signal)
+    return [
+        Outcome(name, asked, figure.value, unit, figure.source, requirement.at_least)
+        for figure in _measure(requirement, design, asked, signal)
+    ]
 
 
 def _measure(requirement: Requirement, design: SynthesizedDesign, asked: float, signal: str) -> list[Figure]:
