@@ -1,0 +1,88 @@
+"""A reference followed by the linear loop of a machine: what a simulation shows, in milliseconds and without limits.
+
+    X+ = M X + G r,   p = C X,   v = K X + D r        X = (machine, law), r = (p*, xi*, v_ff, v0)
+
+The loop is that of margins.loops.machine_loop: hold, delay, current loops, late sensors, loads against v0(z) at the
+trim. Forces that saturate, sums of errors that wait, and what changes along the way are left to `simulate`.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import casadi as ca
+import numpy as np
+
+from malta.errors import InputError
+from malta.model.data import plant_of
+from malta.simulation.engines import evaluate
+from malta.simulation.inputs import feedforward, past_forces
+from malta.simulation.period import state_reference
+
+if TYPE_CHECKING:
+    from malta.margins.loops import Loop
+    from malta.model.plant import FloatArray
+    from malta.simulation.references import Motion
+    from malta.simulation.scenario import Scenario
+    from malta.synthesis.controller import Controller
+
+LONGEST = 20_000  # samples
+
+
+class LinearRun(NamedTuple):
+    """A reference and its answer, one row a sample, SI."""
+
+    t: FloatArray  # s, k
+    reference: FloatArray  # k x p
+    p: FloatArray  # k x p, true outputs
+    v: FloatArray  # k x m, commanded forces beside those that hold the machine at its operating point
+
+
+def linear_run(loop: Loop, controller: Controller, scenario: Scenario) -> LinearRun:
+    """Follow the reference of a scenario with the linear loop, which starts at rest on the reference.
+
+    loop : `machine_loop` of the machine and the controller
+
+    Raises InputError for more than LONGEST samples.
+    """
+    c, law, plant = controller, loop.control, plant_of(controller.parameters)
+    samples = max(1, round(scenario.duration / c.sample_time))
+    if samples > LONGEST:
+        raise InputError(f"scenario {scenario.name}", "duration", f"{samples} samples", f"at most {LONGEST}")
+    t = np.arange(samples) * c.sample_time
+    motion = scenario.reference(plant)(t)
+    here = np.array(ca.DM(plant.h(ca.DM(plant.point(c.operating_point[0]).x), 0))).ravel()
+    r = _references(c, motion, here)
+    closed, driven = loop.closed, r @ np.vstack([loop.Bd @ law.D_r, law.B_r]).T
+    n, m = len(loop.Ad), len(c.forces)
+    X = np.empty((samples, len(closed)))
+    with np.errstate(all="ignore"):  # an unstable loop runs away
+        state = _at_rest(closed, driven[0])
+        for k in range(samples):
+            X[k] = state
+            state = closed @ state + driven[k]
+        p = here + X[:, :n] @ loop.outputs.T
+        v = X @ np.hstack([law.D_y @ loop.Cd, law.C])[:m].T + r @ law.D_r[:m].T
+    return LinearRun(t, motion.p, p, v)
+
+
+def _at_rest(closed: FloatArray, driven: FloatArray) -> FloatArray:
+    """The states of which X = M X + G r, for a reference that stands still."""
+    left = np.eye(len(closed)) - closed
+    try:
+        return np.linalg.solve(left, driven)
+    except np.linalg.LinAlgError:  # an integral that nothing reads
+        return np.asarray(np.linalg.lstsq(left, driven, rcond=None)[0])
+
+
+def _references(c: Controller, motion: Motion, here: FloatArray) -> FloatArray:
+    """r = (p*, xi*, v_ff, v0) at every sample, as deviations from the operating point; v0 follows the readings."""
+    v_ff = feedforward(c, motion)
+    zeros, p = np.zeros_like(v_ff), motion.p - here
+    if c.tracks == "errors":
+        return np.hstack([p, np.zeros((len(p), len(c.states))), v_ff, zeros])
+    rest, rates = state_reference(plant_of(c.parameters)), len(c.feedforward.rate)
+    states = evaluate(rest.map(len(p)), motion.p, motion.dp)[0] - np.array(rest(here, 0)).ravel()
+    if rates:
+        states[:, len(c.A) - rates :] += motion.dp @ c.feedforward.rate.T
+    return np.hstack([p, states, past_forces(c, motion, v_ff), v_ff, zeros])
