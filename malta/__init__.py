@@ -12,6 +12,7 @@ if TYPE_CHECKING:  # the contents page, as type checkers and readers see it
     from malta import gains as gains
     from malta import report as report
     from malta import schemas as schemas
+    from malta.app.notebook import app_widget as app_widget
     from malta.campaigns.limits import limit_of as limit_of
     from malta.campaigns.plan import Plan as Plan
     from malta.campaigns.rare import rare_event as rare_event
@@ -87,6 +88,7 @@ if TYPE_CHECKING:  # the contents page, as type checkers and readers see it
     from malta.units import in_unit as in_unit
 
 _NAMES = {  # the same, for the first use of each name
+    "app.notebook": ("app_widget",),
     "campaigns.limits": ("limit_of",),
     "campaigns.plan": ("Plan",),
     "campaigns.rare": ("rare_event",),

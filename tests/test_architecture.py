@@ -20,7 +20,6 @@ ORDER = (
         "errors",
         "identifiers",
         "units",
-        "identifiers",
         "files",
         "archives",
         "tables",
@@ -34,7 +33,7 @@ ORDER = (
         "firmware",
         "campaigns",
     ),
-    *("tuning", "report", "machines", "cli"),
+    *("tuning", "report", "app", "machines", "cli"),
 )
 MACHINES = {"tubular", "halbach", "planar"}
 SOURCES = sorted((ROOT / "malta").rglob("*.py"))

@@ -16,6 +16,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
+from malta.cli.app import app as live_page
 from malta.cli.campaign import campaign
 from malta.cli.check import check
 from malta.cli.claims import claims
@@ -55,7 +56,7 @@ def _first_line(command: Callable[..., None]) -> str:
 
 GROUPS: dict[str, tuple[Callable[..., None], ...]] = {  # the order of the help
     "Commands": (design, verify, check, simulate, campaign, tune),
-    "Pages and pictures": (plot, report, compare, claims),
+    "Pages and pictures": (plot, report, compare, live_page, claims),
     "For other programs": (export, schema),
     "A machine of your own": (new,),
 }

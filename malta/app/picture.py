@@ -1,0 +1,271 @@
+"""What the page draws of a design at each move: poles, S and T, Nyquist, a run, a load, figures; numbers only, in SI.
+
+The loop is the machine's own, margins.loops.machine_loop, and the figures are those of malta.verify and malta.recovery.
+Nothing here is proven: the eigenvalue margin is an upper bound, and the proof follows in proof.py.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from malta.app.files import Edited
+from malta.app.runs import planned_run
+from malta.errors import CheckError, InputError
+from malta.margins.curves import LoopCurves, loop_curves
+from malta.margins.loops import Loop, machine_loop
+from malta.margins.rays import RayBound, ray_bound
+from malta.margins.recovery import PushedLoop
+from malta.margins.travel import travel_loops
+from malta.margins.verify import (
+    BANDWIDTHS,
+    Stage,
+    bandwidths_of,
+    continuous_poles,
+    controller_poles,
+    stage_of,
+    zone,
+)
+from malta.model.data import plant_of
+from malta.model.linearize import LinearModel, linearize
+from malta.simulation.linear_run import linear_run
+from malta.synthesis.lqg import synthesize
+from malta.synthesis.riccati import eigenvalues
+from malta.tuning.noise import noise_of
+
+if TYPE_CHECKING:
+    from malta.model.plant import ComplexArray, FloatArray, Plant
+    from malta.synthesis.controller import Controller
+    from malta.synthesis.spec import Spec
+
+POINTS = 400  # of a curve over time, at most
+LOAD_POINTS = 240
+
+
+@dataclass(frozen=True)
+class View:
+    """What the page looks at: a run of runs.py, and a disturbance of the machine; "": the first of each."""
+
+    run: str = ""
+    load: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """A design that has been synthesized, and the machine that it runs on."""
+
+    spec: Spec
+    plant: Plant
+    model: LinearModel  # of the machine that it runs on
+    controller: Controller
+
+    @cached_property
+    def loop(self) -> Loop:
+        """The machine's own loop. Raises CheckError where no input holds the machine."""
+        return machine_loop(self.model, self.controller)
+
+    @cached_property
+    def stage(self) -> Stage:
+        """Its peak sensitivities, as `malta.verify` has them."""
+        return stage_of("machine", self.loop, [s.name for s in self.controller.measurements])
+
+    @cached_property
+    def curves(self) -> LoopCurves:
+        """Its frequency responses and the margins of its channels."""
+        return loop_curves(self.plant, self.controller)
+
+    @cached_property
+    def poles(self) -> ComplexArray:
+        """Poles of the closed loop, rad/s, as `malta.verify` has them."""
+        return continuous_poles(eigenvalues(self.loop.closed), self.controller.sample_time)
+
+
+def solve(edited: Edited) -> Problem:
+    """Synthesize the controller of an edited design. Raises InputError and CheckError as `synthesize`."""
+    spec = edited.spec
+    position = spec.operating_point.get(spec.plant.stroke, 0.0)
+    controller = synthesize(spec, _design_model(spec.plant, position))
+    plant = _machine(edited)
+    return Problem(spec, plant, _design_model(plant, position), controller)
+
+
+def _machine(edited: Edited) -> Plant:
+    try:
+        return plant_of(edited.truth)
+    except CheckError as error:
+        raise InputError(edited.spec.machine_file.name, "parameters", str(error), "a machine") from error
+
+
+@lru_cache(maxsize=8)  # every controller of a machine needs it; plants compare by identity
+def _design_model(plant: Plant, position: float) -> LinearModel:
+    return linearize(plant, plant.at(**({plant.stroke: position} if plant.has_stroke else {})))
+
+
+def picture(problem: Problem, view: View, first: int | None = None, *, margin: bool = True) -> dict[str, Any]:
+    """Compute the document that the page draws.
+
+    first : the ray of the last eigenvalue margin, see margins.rays
+    margin : whether the eigenvalue margin is asked for
+
+    Raises CheckError where no input holds the machine.
+    """
+    stage = problem.stage
+    with np.errstate(all="ignore"):  # an unstable loop runs away
+        return {
+            "stable": stage.stable,
+            "radius": stage.spectral_radius,
+            "poles": _poles(problem),
+            "frequency": _frequency(problem.curves),
+            "run": run_document(problem, view),
+            "load": _load(problem, view),
+            "margin": _margin(problem, first) if margin else None,
+            "figures": _figures(problem),
+        }
+
+
+def _poles(problem: Problem) -> dict[str, list[list[float]]]:
+    """The poles of the continuous machine, of regulator, filter and closed loop, rad/s, as rows [re, im]."""
+    c, Ts = problem.controller, problem.controller.sample_time
+    sets = {"machine": eigenvalues(problem.model.A), "closed loop": problem.poles}
+    if c.cost is not None:
+        regulator, observer = controller_poles(c)
+        sets |= {"regulator": continuous_poles(regulator, Ts), "filter": continuous_poles(observer, Ts)}
+    return {name: [[float(s.real), float(s.imag)] for s in found] for name, found in sets.items()}
+
+
+def _frequency(curves: LoopCurves) -> dict[str, Any]:
+    """|S_ii|, |T_ii| and the loop of each sensor with the others closed, up to half of sampling."""
+    w, responses, rows = curves.w, curves.responses, slice(None)
+    if not curves.stable:
+        rows = slice(0, 0)
+    alone = responses.alone("sensors")
+    S, T = (np.abs(np.einsum("kii->ki", G)).T[rows] for G in (responses.S, responses.T))
+    return {
+        "w": rounded(w),
+        "sensors": [s.name for s in curves.loop.outputs],
+        "S": [rounded(row) for row in S],
+        "T": [rounded(row) for row in T],
+        "L": [[rounded(row.real), rounded(row.imag)] for row in alone.T],
+    }
+
+
+def run_document(problem: Problem, view: View) -> dict[str, Any] | None:
+    """The chosen run on the linear loop; None where the machine has no such run, or it is too long."""
+    try:
+        name, planned = planned_run(problem.plant, problem.controller, view.run)
+        found = linear_run(problem.loop, problem.controller, planned.scenario)
+    except InputError:
+        return None
+    return curves(name, found.t, found.reference, found.p, found.v)
+
+
+def curves(name: str, t: FloatArray, reference: FloatArray, p: FloatArray, v: FloatArray) -> dict[str, Any]:
+    """A run as the page draws it: every so many samples of it, by output and by input."""
+    step = -(-len(t) // POINTS)
+    rows = [rounded(np.asarray(series)[::step].T) for series in (reference, p, v)]
+    return {"name": name, "t": rounded(t[::step]), "reference": rows[0], "p": rows[1], "v": rows[2]}
+
+
+def _load(problem: Problem, view: View) -> dict[str, Any] | None:
+    """The outputs under a unit of one disturbance, until little of it is left; None without disturbances."""
+    names = [s.name for s in problem.plant.disturbances]
+    if not names or not problem.stage.stable:
+        return None
+    k = names.index(view.load) if view.load in names else 0
+    answer = PushedLoop.of(problem.plant, problem.controller).answer()
+    one = answer.of(np.eye(len(names))[k])
+    settled = one.within(0.02)
+    ends = settled[np.isfinite(settled)]
+    end = max(1.3 * float(ends.max(initial=0.0)), 20 * problem.controller.sample_time)
+    t = np.linspace(0.0, min(end, float(answer.t[-1])), LOAD_POINTS)
+    y = np.array([np.interp(t, answer.t, row) for row in one.y[..., 0].T])
+    return {"name": names[k], "t": rounded(t), "y": rounded(y), "largest": rounded(one.largest[:, 0])}
+
+
+def _margin(problem: Problem, first: int | None) -> dict[str, Any] | None:
+    """The eigenvalue margin, an upper bound; None without an uncertainty, or where the model is none of parameters."""
+    box = problem.spec.uncertainty
+    if not box:
+        return None
+    try:
+        loops, over = travel_loops(problem.plant, problem.controller, tuple(box))
+        bound = ray_bound(loops, box, over, first)
+    except (InputError, CheckError) as error:
+        return {"upper": None, "reason": str(error)}
+    return margin_document(bound)
+
+
+def margin_document(bound: RayBound) -> dict[str, Any]:
+    """An eigenvalue margin for the page; no upper bound is null."""
+    upper = bound.upper if math.isfinite(bound.upper) else None
+    return {"upper": upper, "at": dict(bound.at), "frequency": bound.frequency, "ray": bound.ray}
+
+
+class Merit(NamedTuple):
+    """A figure of the comparison: which side is better is +1 (larger), -1 (smaller) or 0."""
+
+    label: str
+    value: float
+    unit: str
+    better: int
+    note: str = ""
+
+
+def _figures(problem: Problem) -> list[dict[str, Any]]:
+    """The figures that pinned designs are compared by."""
+    poles = problem.poles
+    damping = float((-poles.real / np.maximum(np.abs(poles), 1e-300)).min(initial=1.0))
+    merits = [
+        Merit("least damping", damping, "1", 1),
+        Merit("slowest pole", float(-poles.real.max(initial=-math.inf)), "rad/s", 1),
+    ]
+    if problem.stage.stable:
+        merits = [*_stable_merits(problem), *merits]
+    return [m._asdict() | {"value": m.value if math.isfinite(m.value) else None} for m in merits]
+
+
+def _stable_merits(problem: Problem) -> list[Merit]:
+    """Of the machine's loop: sensitivity, bandwidths, margins of the channels, noise."""
+    stage, loop = problem.stage, problem.loop
+    sensors = {k: v for k, v in stage.peak_sensitivity.items() if k != "sigma_max"}
+    worst = max(sensors, key=lambda name: sensors[name])
+    bandwidths = bandwidths_of(problem.model, problem.controller, loop, stable=True)
+    delay = min(problem.curves.margins, key=lambda m: m.delay)
+    phase = min(problem.curves.margins, key=lambda m: m.phase)
+    noise = noise_of(loop, problem.plant)
+    alone = "smallest of the sensors, the others closed"
+    return [
+        Merit("peak |S|", sensors[worst], "1", -1, f"at {worst}, zone {zone(sensors[worst])}"),
+        *(
+            Merit(f"bandwidth, {short}", bandwidths[key], "rad/s", 1, BANDWIDTHS[key])
+            for key, short in (("sigma_max_T", "T"), ("crossover_max", "L"))
+        ),
+        Merit("phase margin", math.degrees(phase.phase), "deg", 1, f"{phase.channel}, {alone}"),
+        Merit("delay margin", delay.delay, "s", 1, f"{delay.channel}, {alone}"),
+        *_worst_by_unit("motion at rest", noise.motion, problem.plant.outputs),
+        *_worst_by_unit("noise of commands", noise.force[: len(problem.plant.inputs)], problem.plant.inputs),
+    ]
+
+
+def _worst_by_unit(label: str, values: FloatArray, signals: Sequence[Any]) -> list[Merit]:
+    """The largest of the values of each unit."""
+    worst: dict[str, tuple[float, str]] = {}
+    for value, s in zip(values.tolist(), signals, strict=True):
+        worst[s.unit] = max(worst.get(s.unit, (0.0, s.name)), (value, s.name))
+    return [
+        Merit(label if len(worst) == 1 else f"{label} [{unit}]", value, unit, -1, f"rms, {name}")
+        for unit, (value, name) in worst.items()
+    ]
+
+
+def rounded(values: Any) -> list[Any]:
+    """Numbers with six digits, as lists; what is not finite becomes None."""
+    return [
+        rounded(value) if np.ndim(value) else float(f"{value:.6g}") if math.isfinite(value) else None
+        for value in (values.tolist() if isinstance(values, np.ndarray) else values)
+    ]

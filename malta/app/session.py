@@ -1,0 +1,276 @@
+"""One design under edit, behind the page of `malta app` and the widget in a notebook.
+
+Both send documents {"ask": ..., ...} and get documents back; `Session.answer` is the one door. The newest move wins: an
+evaluation that a newer one overtook is dropped, and so is what follows it in worker processes.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from malta.app.files import DesignFiles, Edit, open_design
+from malta.app.follow import Worker
+from malta.app.picture import Problem, View, picture, solve
+from malta.app.runs import run_names
+from malta.app.saving import TakenError, default_file, inside, save_design, save_gains
+from malta.errors import CheckError, InputError, shorten
+from malta.synthesis.requirements import requirements_for
+from malta.tuning.search import base_of
+
+if TYPE_CHECKING:
+    from malta.synthesis.spec import Spec
+
+QUIET = 0.25  # s, after the last move until its proof begins
+SLOW = 0.06  # s: an eigenvalue margin that takes longer for a new machine follows in the background
+LONGEST_WAIT = 20.0  # s, of a question for news
+KEPT = 1000  # news of one version
+
+Document = dict[str, Any]
+
+
+class Session:
+    """The state of a page: the files, the newest edit, and what follows it.
+
+    design : the design file
+    root : the folder that files may be saved in
+    machine : the module that the user named for the machine, or None
+    hear : called with each piece of news, from another thread; None: `news` is asked for them
+    """
+
+    def __init__(
+        self,
+        design: Path,
+        root: Path,
+        machine: Path | None = None,
+        hear: Callable[[Document], None] | None = None,
+    ) -> None:
+        self.root, self.machine = root.resolve(), machine
+        self.files: DesignFiles = open_design(design)
+        self.edit = Edit()
+        self._hear = hear
+        self._busy = threading.Lock()  # one evaluation at a time
+        self._state = threading.Condition()
+        self._newest, self._version, self._base = 0, 0, 0
+        self._news: list[Document] = []
+        self._count = 0
+        self._ray: int | None = None
+        self._slow_margin, self._machines = False, set[Any]()
+        self._timer: threading.Timer | None = None
+        self._serial, self._due = 0, set[str]()  # tasks that the workers are asked for when the page rests
+        self._workers = {task: Worker(self._tell) for task in ("check", "prove")}
+
+    # --- the door ---
+
+    def answer(self, body: object) -> Document:
+        """Answer a document of the page; what is wrong with it becomes {"error": sentence}."""
+        doors: dict[str, Callable[[Mapping[str, Any]], Document]] = {
+            "open": self.open,
+            "evaluate": self.evaluate,
+            "news": self.news,
+            "save": self.save,
+            "gains": self.gains,
+        }
+        try:
+            if not isinstance(body, dict) or body.get("ask") not in doors:
+                raise InputError("malta app", "ask", "another document", "one of " + ", ".join(doors))
+            return doors[body["ask"]](body)
+        except (InputError, CheckError) as error:
+            return {"error": shorten(str(error))}
+        except ArithmeticError as error:
+            return {"error": shorten(f"numbers beyond what can be computed ({error})")}
+        except MemoryError:
+            return {"error": "more was asked for than this computer has memory for"}
+
+    # --- what the page asks ---
+
+    def open(self, _body: Mapping[str, Any]) -> Document:
+        """Describe the design: fields, runs, disturbances, requirements, units."""
+        files, spec = self.files, self.files.spec
+        problem = solve(files.apply(Edit()))
+        return {
+            "name": spec.name,
+            "summary": spec.summary,
+            "machine": spec.plant.name,
+            "preset": spec.parameters.preset,
+            "law": "PID" if spec.pid else "LQG",
+            "file": default_file(self.root, files.path),
+            "fields": [asdict(field) for field in files.fields.values()],
+            "runs": run_names(problem.plant, problem.controller),
+            "loads": [s._asdict() for s in spec.plant.disturbances],
+            "inputs": [s._asdict() for s in spec.plant.inputs],
+            "outputs": [s._asdict() for s in spec.plant.outputs],
+            "parameters": dict(spec.uncertainty),
+            "requirements": requirement_list(spec),
+            "edit": {"values": dict(self.edit.values), "redesign": self.edit.redesign},
+        }
+
+    def evaluate(self, body: Mapping[str, Any]) -> Document:
+        """The picture of an edit; {"stale": true} where a newer one was asked for meanwhile."""
+        number = body.get("number")
+        if not isinstance(number, int) or isinstance(number, bool):
+            raise InputError("malta app", "number", repr(number), "a whole number")
+        with self._state:
+            self._newest = max(self._newest, number)
+        with self._busy:
+            if number < self._newest:
+                return {"number": number, "stale": True}
+            began, cpu = time.perf_counter(), time.thread_time()
+            edit = self.files.edit(body.get("values", {}), redesign=body.get("redesign", True))
+            view = View(str(body.get("run", "")), str(body.get("load", "")))
+            same = edit == self.edit and self._version > 0
+            self.edit = edit
+            version = self._version if same else self._supersede()
+            try:
+                document, problem = self._picture(edit, view)
+            except (InputError, CheckError, ArithmeticError) as error:
+                return {"number": number, "version": version, "error": shorten(str(error))}
+            margin = document["margin"] is None and bool(problem.spec.uncertainty)
+            self._follow_later(edit, view, {"check"} if same else {"check", "prove"}, margin=margin)
+            spent = {"wall": time.perf_counter() - began, "cpu": time.thread_time() - cpu}
+            return {"number": number, "version": version, **document, "seconds": spent}
+
+    def news(self, body: Mapping[str, Any]) -> Document:
+        """News that are newer than body["after"], as soon as there are some; none after LONGEST_WAIT."""
+        after = body.get("after", 0)
+        if not isinstance(after, int):
+            raise InputError("malta app", "after", repr(after), "a whole number")
+        with self._state:
+            self._state.wait_for(lambda: self._count > after, LONGEST_WAIT)
+            first = self._count - len(self._news)
+            return {"after": self._count, "news": self._news[max(after - first, 0) :]}
+
+    def save(self, body: Mapping[str, Any]) -> Document:
+        """Save the design; {"exists": files} where these exist and body["replace"] is not true."""
+        with self._busy:
+            edit = self.files.edit(body.get("values", {}), redesign=body.get("redesign", True))
+            target = inside(self.root, str(body.get("file", "")))
+            try:
+                self.files, written = save_design(
+                    self.files, edit, target, self.root, replace=body.get("replace") is True
+                )
+            except TakenError as taken:
+                return {"exists": taken.files}
+            self._base += 1
+            self.edit = Edit() if edit.redesign else Edit(_machine_values(edit), redesign=False)
+            return {"written": written, "open": self.open({})}
+
+    def gains(self, _body: Mapping[str, Any]) -> Document:
+        """Write the gain files of the saved design, as `malta design` does. Refused while something is unsaved."""
+        if self.unsaved():
+            raise InputError(
+                "gain files", "design", "changes that are not saved", "a design file that is saved"
+            )
+        target = inside(self.root, default_file(self.root, self.files.path))
+        if not target.is_file():
+            raise InputError(
+                "gain files", "design", "a design file outside of this folder", "one that is saved here"
+            )
+        return {"written": save_gains(target, self.root, self.machine)}
+
+    def unsaved(self) -> list[str]:
+        """The entries that differ from the file; parameters that the machine alone has are no part of the design."""
+        edit = self.edit
+        return list(edit.values) if edit.redesign else list(edit.design)
+
+    def close(self) -> None:
+        """End the worker processes."""
+        if self._timer is not None:
+            self._timer.cancel()
+        for worker in self._workers.values():
+            worker.close()
+
+    # --- what follows ---
+
+    def _picture(self, edit: Edit, view: View) -> tuple[Document, Problem]:
+        """The picture of an edit; the eigenvalue margin is left to the background where tracing a machine is slow."""
+        problem = solve(self.files.apply(edit))
+        new = problem.plant.parameters not in self._machines
+        wanted = not (new and self._slow_margin)
+        began = time.perf_counter()
+        document = picture(problem, view, self._ray, margin=wanted)
+        if new and wanted:
+            self._machines.add(problem.plant.parameters)
+            self._slow_margin = self._slow_margin or (
+                len(self._machines) > 1 and time.perf_counter() - began > 4 * SLOW
+            )
+        if document["margin"] is not None:
+            self._ray = document["margin"].get("ray", self._ray)
+        return document, problem
+
+    def _supersede(self) -> int:
+        """A new version: what followed the last one counts no longer."""
+        with self._state:
+            if self._timer is not None:
+                self._timer.cancel()
+            self._due.clear()
+            self._news = []
+            self._version += 1
+            return self._version
+
+    def _follow_later(self, edit: Edit, view: View, tasks: set[str], *, margin: bool) -> None:
+        """Ask the workers for these tasks, and for those that are due, once the page rests."""
+        self._serial += 1
+        message = {
+            "version": self._version,
+            "serial": self._serial,
+            "base": self._base,
+            "path": str(self.files.path.resolve()),
+            "machine": None if self.machine is None else str(self.machine.resolve()),
+            "values": dict(edit.values),
+            "redesign": edit.redesign,
+            "run": view.run,
+            "margin": margin,
+        }
+
+        def ask() -> None:
+            with self._state:
+                due = [task for task in self._workers if task in self._due]
+                self._due.clear()
+            for task in due:
+                self._workers[task].ask(message | {"task": task})
+
+        with self._state:
+            if self._timer is not None:
+                self._timer.cancel()
+            self._due |= tasks
+            self._timer = threading.Timer(QUIET, ask)
+            self._timer.daemon = True
+            self._timer.start()
+
+    def _tell(self, reply: Document) -> None:
+        """Take a document of a worker, unless it is of an older version."""
+        with self._state:
+            if reply["version"] != self._version:
+                return
+            self._count += 1
+            self._news = [*self._news, reply][-KEPT:]
+            self._state.notify_all()
+        if self._hear is not None:
+            self._hear(reply)
+
+
+def requirement_list(spec: Spec) -> list[Document]:
+    """What the design is asked for: name, bound, unit, side."""
+    known, rows = requirements_for(spec.plant), []
+    for name, asked in spec.specification.items():
+        requirement, signal = known[base_of(name)], name.partition(" ")[2]
+        rows.append(
+            {
+                "name": name,
+                "asked": asked if math.isfinite(asked) else None,
+                "unit": requirement.unit_of(spec, signal),
+                "at_least": requirement.at_least,
+                "switch": requirement.form == "switch",
+            }
+        )
+    return rows
+
+
+def _machine_values(edit: Edit) -> Document:
+    return {key: value for key, value in edit.values.items() if key not in edit.design}

@@ -1,0 +1,395 @@
+// The page of `malta app`: a design under edit, seen at every move. mount(root, transport) fills a node;
+// transport: {ask(document) -> promise of a document, listen(heard)}.
+
+import { createChart } from "./chart.js";
+import { createPanel, element } from "./controls.js";
+import { color, loadView, nyquistView, poleView, runView, sensitivityView, timeGroups } from "./figures.js";
+import { digits, floored, percent } from "./numbers.js";
+import { countLights, differenceTable, figureTable, requirementRows } from "./tables.js";
+
+const MOST_PINS = 4;
+const MOST_UNDO = 200;
+const NEAR = 1.6, WIDE = 10; // of the Nyquist chart
+const SHORTCUTS = [["Ctrl Z", "undo"], ["Ctrl Y, Ctrl Shift Z", "redo"], ["P", "pin this design"], ["R", "reset to the file"], ["Ctrl S", "save the design file"],
+  ["/", "find a number"], ["?", "this list"], ["← →", "move a slider or the readout of a chart"], ["Page ↑ ↓", "move a slider by a tenth"], ["↑ ↓", "a number field by 1 %, with Shift 10 %"], ["Esc", "take a number back, hide a readout"]];
+
+export async function mount(root, transport) {
+  root.classList.add("malta-app");
+  let description;
+  try {
+    description = await transport.ask({ ask: "open" });
+    if (description.error) throw new Error(description.error);
+  } catch (problem) {
+    root.replaceChildren(element("p", { class: "fatal", role: "alert" }, `The design cannot be shown: ${problem.message}`));
+    return;
+  }
+  const state = {
+    description, values: {}, redesign: true, undo: [], redo: [], pins: [], pinned: 0,
+    picture: null, simulated: null, requirements: {}, proof: null, version: 0, number: 0, failed: "",
+    run: description.runs[0], load: description.loads[0]?.name ?? "", runGroup: "", loadGroup: "",
+    sens: "S", reach: NEAR, allPoles: false, table: "requirements", hidden: new Set(), hiddenPoles: new Set(), ties: false,
+  };
+  const fresh = () => Object.fromEntries(state.description.fields.map((field) => [field.key, field.value]));
+  state.values = { ...fresh(), ...description.edit.values };
+  state.redesign = description.edit.redesign;
+
+  // --- parts of the page ---
+  const button = (text, title, press, attributes = {}) => element("button", { type: "button", title, onclick: press, ...attributes }, text);
+  const badge = element("div", { class: "badge", role: "status", "aria-live": "polite" });
+  const lights = element("button", { type: "button", class: "lights", title: "requirements", onclick: () => { state.table = "requirements"; drawTables(); } });
+  const speed = element("span", { class: "speed" });
+  const title = element("h1", {}), subtitle = element("span", { class: "soft" });
+  const undo = button("↶ Undo", "Ctrl Z", () => step("undo", "redo")), redo = button("↷ Redo", "Ctrl Y", () => step("redo", "undo"));
+  const reset = button("Reset", "to the numbers of the file (R)", () => commit({ values: fresh(), redesign: true }));
+  const pin = button("Pin", "keep this design beside (P)", pinDesign);
+  const save = button("Save…", "design file (Ctrl S)", () => openSave(), { class: "main" });
+  const gains = button("Gain files", "malta design: verify, simulate, write", writeGains);
+  const theme = button("◐", "light or dark", turnTheme, { "aria-label": "light or dark" });
+  const help = button("?", "shortcuts", () => shortcuts.showModal(), { "aria-label": "shortcuts" });
+  const message = element("div", { class: "message", role: "alert" });
+  const pins = element("div", { class: "pins" });
+  const header = element("header", {}, element("div", { class: "name" }, title, subtitle), badge, lights, pins, element("div", { class: "buttons" }, undo, redo, reset, pin, save, gains, theme, help));
+
+  const ties = element("input", { type: "checkbox", onchange: () => { state.ties = ties.checked; } });
+  const redesign = element("input", { type: "checkbox", onchange: () => commit({ values: state.values, redesign: redesign.checked }) });
+  let panel;
+  const controls = element("section", { class: "controls", "aria-label": "numbers of the design" });
+
+  const charts = {};
+  const cards = element("section", { class: "cards", "aria-label": "charts" });
+  function card(key, heading, ...tools) {
+    const chart = (charts[key] = createChart(heading));
+    const note = element("p", { class: "note" }), legend = element("div", { class: "legend" });
+    chart.note = note;
+    chart.legend = legend;
+    cards.append(element("article", { class: `card ${key}` }, element("div", { class: "bar" }, element("h2", {}, heading), ...tools), chart.node, legend, note));
+  }
+  const tabs = (choices, get, set) => {
+    const group = element("div", { class: "tabs", role: "group" }, ...choices.map(([value, text]) => button(text, text, () => { set(value); draw(); }, { "data-value": value })));
+    group.mark = () => { for (const one of group.children) one.setAttribute("aria-pressed", String(one.dataset.value === String(get()))); };
+    return group;
+  };
+  const pick = (label, get, set) => {
+    const list = element("select", { "aria-label": label, onchange: () => { set(list.value); } });
+    list.fill = (options) => { list.replaceChildren(...options.map(([value, text]) => element("option", { value }, text))); list.value = get(); list.hidden = options.length < 2; };
+    return list;
+  };
+  const sensTabs = tabs([["S", "S"], ["T", "T"]], () => state.sens, (value) => { state.sens = value; });
+  const reachTabs = tabs([[NEAR, "near −1"], [WIDE, "wide"]], () => state.reach, (value) => { state.reach = Number(value); });
+  const poleTabs = tabs([["slow", "slow"], ["all", "all"]], () => (state.allPoles ? "all" : "slow"), (value) => { state.allPoles = value === "all"; });
+  const runList = pick("run", () => state.run, (value) => { state.run = value; state.simulated = null; ask(); });
+  const runGroups = pick("signals of the run", () => state.runGroup, (value) => { state.runGroup = value; draw(); });
+  const loadList = pick("load", () => state.load, (value) => { state.load = value; ask(); });
+  const loadGroups = pick("outputs under the load", () => state.loadGroup, (value) => { state.loadGroup = value; draw(); });
+  card("sensitivity", "Sensitivity", sensTabs);
+  card("nyquist", "Nyquist", reachTabs);
+  card("poles", "Poles", poleTabs);
+  card("run", "Run", runList, runGroups);
+  card("load", "Load", loadList, loadGroups);
+  const tableTabs = tabs([["requirements", "Requirements"], ["figures", "Figures"], ["changes", "Changes"]], () => state.table, (value) => { state.table = value; });
+  const tables = element("div", { class: "tables", tabindex: "0", role: "region", "aria-label": "tables" });
+  cards.append(element("article", { class: "card table" }, element("div", { class: "bar" }, tableTabs), tables));
+
+  const shortcuts = element("dialog", { class: "help" }, element("h2", {}, "Keys"), element("table", {}, ...SHORTCUTS.map(([keys, what]) => element("tr", {}, element("th", { scope: "row" }, keys), element("td", {}, what)))), element("form", { method: "dialog" }, element("button", { class: "main" }, "Close")));
+  const file = element("input", { type: "text", id: "malta-file", autocomplete: "off", spellcheck: "false" });
+  const saveNote = element("p", { class: "soft", role: "status" }), saveButton = element("button", { class: "main", type: "submit" }, "Save");
+  const saveForm = element("form", { onsubmit: (event) => { event.preventDefault(); saveDesign(); } },
+    element("label", {}, "Design file, in the folder that malta app was started in", file), saveNote,
+    element("div", { class: "buttons" }, button("Cancel", "Esc", () => saving.close()), saveButton));
+  const saving = element("dialog", { class: "save" }, element("h2", {}, "Save the design"), saveForm);
+  root.replaceChildren(header, message, element("main", {}, controls, cards), shortcuts, saving);
+  root.tabIndex = -1;
+
+  // --- moves ---
+  const snapshot = () => ({ values: { ...state.values }, redesign: state.redesign });
+  let before = null; // where a drag began
+  let tied = [];
+
+  function change(field, value, done) {
+    if (!before) {
+      before = snapshot();
+      tied = field.linked.length ? [...field.linked] : [field.key];
+      if (state.ties) {
+        for (const other of state.description.fields) {
+          if (other.group === field.group && other.unit === field.unit && before.values[other.key] === before.values[field.key] && !tied.includes(other.key)) tied.push(other.key);
+        }
+      }
+    }
+    for (const key of tied) state.values[key] = value;
+    if (done) {
+      if (tied.some((key) => before.values[key] !== state.values[key])) remember(before);
+      before = null;
+    }
+    refresh();
+  }
+
+  function remember(past) {
+    state.undo = [...state.undo, past].slice(-MOST_UNDO);
+    state.redo = [];
+  }
+
+  function commit(next) {
+    remember(snapshot());
+    Object.assign(state, { values: { ...next.values }, redesign: next.redesign });
+    refresh();
+  }
+
+  function step(from, to) {
+    const next = state[from].pop();
+    if (!next) return;
+    state[to].push(snapshot());
+    Object.assign(state, { values: { ...next.values }, redesign: next.redesign });
+    before = null;
+    refresh();
+  }
+
+  const changes = () => Object.fromEntries(state.description.fields.filter((field) => state.values[field.key] !== field.value).map((field) => [field.key, state.values[field.key]]));
+
+  function refresh() {
+    // Nothing that was proven or measured of the last design is shown beside the numbers of the next.
+    if (!state.moving) last = { version: state.version, proof: state.proof, requirements: state.requirements, simulated: state.simulated };
+    Object.assign(state, { moving: true, proof: null, requirements: {}, simulated: null });
+    panel.show(state.values);
+    redesign.checked = state.redesign;
+    drawHeader();
+    ask();
+  }
+
+  // --- asking: one question at a time, and the newest move wins ---
+  let busy = false, again = false;
+  let last = {}; // what followed the design before a move, which may come back to it
+
+  async function ask() {
+    if (busy) { again = true; return; }
+    busy = true;
+    const began = performance.now(), number = ++state.number;
+    let answer;
+    try {
+      answer = await transport.ask({ ask: "evaluate", number, values: changes(), redesign: state.redesign, run: state.run, load: state.load });
+    } catch {
+      answer = { error: "malta app has ended: start it again to go on" };
+    }
+    if (!answer.stale) take(answer, performance.now() - began);
+    busy = false;
+    if (again) { again = false; ask(); return; }
+    state.moving = false;
+    drawHeader();
+    for (const item of early.splice(0)) hear(item);
+  }
+
+  function take(answer, milliseconds) {
+    state.failed = answer.error ?? "";
+    if (answer.version !== undefined && answer.version !== state.version) {
+      Object.assign(state, { version: answer.version, requirements: {}, proof: null, simulated: null });
+    } else if (state.moving && answer.version === last.version) Object.assign(state, last);
+    if (!answer.error) {
+      state.picture = answer;
+      speed.textContent = `${Math.round(milliseconds)} ms`;
+      speed.title = `last move: seen after ${Math.round(milliseconds)} ms, of which ${Math.round(1e3 * answer.seconds.wall)} ms to compute`;
+      root.dataset.milliseconds = milliseconds.toFixed(1);
+    }
+    root.dataset.version = String(state.version);
+    root.classList.toggle("failed", Boolean(answer.error));
+    if (state.failed || message.classList.contains("error")) say(state.failed, "error");
+    draw();
+  }
+
+  const early = []; // news of a version that has not been seen yet
+
+  function hear(item) {
+    if (item.version > state.version || state.moving) { early.push(item); return; }
+    if (item.version < state.version || !state.picture) return;
+    if (item.kind === "requirement") state.requirements[item.name] = item;
+    if (item.kind === "proof") state.proof = item;
+    if (item.kind === "run") state.simulated = item;
+    if (item.kind === "margin") state.picture.margin = item;
+    if (item.kind === "failed") say(item.error, "error");
+    if (item.kind === "run") draw();
+    else { drawHeader(); drawTables(); }
+  }
+
+  function say(text, kind = "note") {
+    message.textContent = text;
+    message.className = `message ${text ? kind : ""}`;
+  }
+
+  // --- drawing ---
+  function legendOf(chart, names, hidden, marks = {}) {
+    chart.legend.replaceChildren(...names.map((name, k) => {
+      const swatch = element("i", {}, marks[name] ?? "");
+      swatch.style.setProperty("--swatch", color(marks[name] ? { machine: 7, "closed loop": 0, regulator: 2, filter: 4 }[name] : k));
+      return element("button", { type: "button", class: marks[name] ? "mark" : "", "aria-pressed": String(!hidden.has(name)), title: `show or hide ${name}`, onclick: () => { if (!hidden.delete(name)) hidden.add(name); draw(); } }, swatch, name);
+    }));
+  }
+
+  function show(chart, view, empty) {
+    chart.node.classList.toggle("empty", !view || Boolean(view.empty));
+    chart.note.textContent = view?.empty || view?.note || (view ? "" : empty);
+    if (view) chart.draw(view);
+  }
+
+  function draw() {
+    drawHeader();
+    const { picture } = state;
+    if (!picture) return;
+    for (const group of [sensTabs, reachTabs, poleTabs]) group.mark();
+    const names = picture.frequency.sensors;
+    show(charts.sensitivity, sensitivityView(picture, state.pins, state.sens, state.hidden));
+    show(charts.nyquist, nyquistView(picture, state.pins, state.reach, state.hidden));
+    show(charts.poles, poleView(picture, state.pins, state.allPoles, state.hiddenPoles));
+    legendOf(charts.sensitivity, names, state.hidden);
+    legendOf(charts.nyquist, names, state.hidden);
+    legendOf(charts.poles, Object.keys(picture.poles).filter((name) => picture.poles[name].length), state.hiddenPoles, { machine: "○", "closed loop": "×", regulator: "+", filter: "□" });
+    drawTimes();
+    drawTables();
+  }
+
+  function drawTimes() {
+    const groups = timeGroups(state.description, true), short = timeGroups(state.description, false);
+    const group = groups.find((one) => one.id === state.runGroup) ?? groups[0];
+    const under = short.find((one) => one.id === state.loadGroup) ?? short[0];
+    show(charts.run, runView(state, group, state.hidden), "Too many samples for the linear loop, or no such run.");
+    show(charts.load, loadView(state, under, state.hidden), state.description.loads.length ? "An unstable loop carries no load." : "No force acts on this machine from outside.");
+    const signals = group.of === "v" ? state.description.inputs : state.description.outputs;
+    const named = (of, indices) => indices.map((k) => of[k].name);
+    legendOf(charts.run, named(signals, group.indices), state.hidden);
+    legendOf(charts.load, named(state.description.outputs, under.indices), state.hidden);
+    for (const [chart, indices] of [[charts.run, group.indices], [charts.load, under.indices]]) {
+      [...chart.legend.children].forEach((one, k) => one.querySelector("i").style.setProperty("--swatch", color(indices[k])));
+    }
+    const { simulated } = state;
+    charts.run.note.textContent = !simulated ? "linear loop; the simulation follows" : simulated.error ? `no simulation: ${simulated.error}`
+      : `– – linear loop   —— simulation (${simulated.engine})${simulated.completed ? "" : `: ${simulated.verdict} at ${digits(simulated.end, 3)} s`}`;
+    if (state.picture.load) charts.load.note.textContent = `1 ${state.description.loads.find((load) => load.name === state.picture.load.name).unit} of ${state.picture.load.name}, constant from t = 0, linear loop`;
+  }
+
+  function drawTables() {
+    if (!state.picture) return;
+    tableTabs.mark();
+    const { table } = state;
+    if (table === "requirements") {
+      tables.replaceChildren(state.description.requirements.length ? element("table", { class: "requirements" }, element("tbody", {}, ...requirementRows(state.description, state)))
+        : element("p", { class: "soft" }, "The design file asks for nothing: it has no [specification]."), figureTable(state));
+    } else tables.replaceChildren(table === "figures" ? figureTable(state) : differenceTable(state.description, state));
+    const counts = countLights(state.description, state);
+    lights.hidden = !state.description.requirements.length;
+    lights.replaceChildren(...[["true", "✓"], ["false", "✗"], ["null", "…"]].filter(([key]) => counts[key]).map(([key, sign]) => element("span", { class: `light ${key === "null" ? "open" : key}` }, `${sign} ${counts[key]}`)));
+    lights.setAttribute("aria-label", `requirements: ${counts.true} met, ${counts.false} not met, ${counts.null} not known yet`);
+  }
+
+  function badgeText() {
+    const { picture, proof } = state;
+    if (state.failed) return ["broken", "✗ no design", state.failed];
+    if (!picture) return ["open", "…", ""];
+    if (!picture.stable && !state.moving) return ["broken", "✗ unstable", `spectral radius ${digits(picture.radius, 6)}`];
+    const upper = picture.margin?.upper;
+    const found = picture.margin === null ? "" : upper === null || upper === undefined ? "no loss found by eigenvalues" : `≤ ${percent(upper)} by eigenvalues`;
+    if (!Object.keys(state.description.parameters).length) return ["open", "✓ stable", "no uncertainty in the file, so no margin"];
+    if (state.moving) return ["open", `… ${found}`, "of the last design"];
+    if (!proof) return ["open", `✓ stable  ${found}`, "not proven yet: the proof follows"];
+    const lost = proof.upper === null || proof.upper === undefined ? "" : `lost at ${percent(proof.upper)}${proof.frequency === null ? "" : `, ${digits(proof.frequency, 4)} rad/s`}`;
+    if (proof.lower === null || proof.lower === undefined) return ["unknown", "nothing proven", [proof.reason, found].filter(Boolean).join("; ")];
+    return ["proven", `✓ proven ${percent(floored(proof.lower))}`, [lost, proof.reason].filter(Boolean).join("; ")];
+  }
+
+  function drawHeader() {
+    const { description: d } = state, count = Object.keys(changes()).length;
+    title.textContent = `${d.name}${count ? " ·" : ""}`;
+    title.title = d.summary;
+    subtitle.textContent = `${d.law} for ${d.machine} (${d.preset})${count ? `, ${count} changed` : ""}${state.redesign ? "" : ", machine differs"}`;
+    const [kind, text, more] = badgeText();
+    badge.className = `badge ${kind}`;
+    badge.replaceChildren(element("b", {}, text), element("small", { title: more }, more), speed);
+    undo.disabled = !state.undo.length;
+    redo.disabled = !state.redo.length;
+    pin.disabled = !state.picture || Boolean(state.failed);
+    pins.replaceChildren(...state.pins.map((one) => element("span", { class: "pin" }, button(one.name, "go back to this design", () => commit(one)), button("×", `forget ${one.name}`, () => { state.pins = state.pins.filter((other) => other !== one); draw(); }, { "aria-label": `forget ${one.name}` }))));
+  }
+
+  // --- pins, saving ---
+  function pinDesign() {
+    if (!state.picture || state.failed) return;
+    const name = String.fromCharCode(65 + (state.pinned++ % 26));
+    state.pins = [...state.pins, { name, ...snapshot(), picture: state.picture, proof: state.proof }].slice(-MOST_PINS);
+    state.table = state.table === "requirements" ? "figures" : state.table;
+    draw();
+  }
+
+  let replace = false;
+
+  function openSave() {
+    replace = false;
+    file.value = state.description.file;
+    saveNote.textContent = "";
+    saveButton.textContent = "Save";
+    saving.showModal();
+    file.select();
+  }
+  file.addEventListener("input", () => { replace = false; saveButton.textContent = "Save"; saveNote.textContent = ""; });
+
+  async function saveDesign() {
+    const answer = await transport.ask({ ask: "save", file: file.value, values: changes(), redesign: state.redesign, replace }).catch(() => ({ error: "malta app has ended" }));
+    if (answer.exists) {
+      replace = true;
+      saveNote.textContent = `${answer.exists.join(", ")} exists.`;
+      saveButton.textContent = "Replace";
+      return;
+    }
+    if (answer.error) { saveNote.textContent = answer.error; return; }
+    saving.close();
+    describe(answer.open);
+    say(`wrote ${answer.written.join(", ")}`);
+    draw();
+  }
+
+  async function writeGains() {
+    gains.disabled = true;
+    say("malta design runs: verify, simulate, write…");
+    const answer = await transport.ask({ ask: "gains" }).catch(() => ({ error: "malta app has ended" }));
+    gains.disabled = false;
+    say(answer.error ?? `wrote ${answer.written.join(", ")}`, answer.error ? "error" : "note");
+  }
+
+  function turnTheme() {
+    const dark = root.dataset.theme ? root.dataset.theme === "dark" : matchMedia("(prefers-color-scheme: dark)").matches;
+    root.dataset.theme = dark ? "light" : "dark";
+  }
+
+  // --- keys ---
+  root.addEventListener("keydown", onKey);
+  function onKey(event) {
+    if (saving.open || shortcuts.open) return;
+    const key = event.key.toLowerCase(), control = event.ctrlKey || event.metaKey;
+    const typing = event.target.matches?.("input[type=text], input[type=search], select");
+    const typed = event.target.matches?.("input[type=text]") && event.target.value !== event.target.dataset.shown;
+    const run = (action) => { event.preventDefault(); action(); };
+    if (control && key === "s") run(openSave);
+    else if (control && !typed && (key === "y" || (key === "z" && event.shiftKey))) run(() => step("redo", "undo"));
+    else if (control && !typed && key === "z") run(() => step("undo", "redo"));
+    else if (control || event.altKey || typing) return;
+    else if (key === "p") run(pinDesign);
+    else if (key === "r") run(() => reset.click());
+    else if (key === "/") run(() => panel.seek.focus());
+    else if (key === "?") run(() => shortcuts.showModal());
+  }
+
+  function describe(next) {
+    state.description = next;
+    const tail = next.fields.some((field) => field.group === "Machine") ? [element("label", { class: "switch", title: "off: the controller believes in the machine of the file, and runs on this one" }, redesign, "design for the machine's numbers")] : [];
+    const opened = new Set([...controls.querySelectorAll("details[open]")].map((box) => box.dataset.group));
+    panel = createPanel(next, change, (text) => say(text, "error"));
+    if (opened.size) for (const box of panel.nodes) box.open = opened.has(box.dataset.group);
+    controls.replaceChildren(panel.seek, element("div", { class: "switches" }, element("label", { class: "switch" }, ties, "equal values move together"), ...tail), ...panel.nodes);
+    runList.fill(next.runs.map((run) => [run, run]));
+    loadList.fill(next.loads.map((load) => [load.name, `1 ${load.unit} of ${load.name}`]));
+    runGroups.fill(timeGroups(next, true).map((group) => [group.id, group.text]));
+    loadGroups.fill(timeGroups(next, false).map((group) => [group.id, group.text]));
+    for (const [list, first] of [[runGroups, timeGroups(next, true)[0]], [loadGroups, timeGroups(next, false)[0]]]) if (!list.value) list.value = first.id;
+    panel.show(state.values);
+    redesign.checked = state.redesign;
+  }
+
+  describe(description);
+  transport.listen(hear);
+  await ask();
+}

@@ -1,0 +1,235 @@
+// A chart in SVG: axes with ticks, lines, points, shapes; a readout that follows the pointer or the arrow keys.
+
+import { linearTicks, logTicks, tickLabel } from "./numbers.js";
+
+const NAMESPACE = "http://www.w3.org/2000/svg";
+const MARGIN = { left: 50, right: 12, top: 8, bottom: 34 };
+let charts = 0;
+
+export function svg(name, attributes = {}, text = "") {
+  const node = document.createElementNS(NAMESPACE, name);
+  for (const [key, value] of Object.entries(attributes)) node.setAttribute(key, value);
+  if (text) node.textContent = text;
+  return node;
+}
+
+// Positions on an axis: value -> pixels.
+function axisScale(axis, from, to) {
+  const [low, high] = axis.log ? [Math.log(axis.min), Math.log(axis.max)] : [axis.min, axis.max];
+  const slope = (to - from) / (high - low);
+  return (value) => from + ((axis.log ? Math.log(Math.max(value, 1e-300)) : value) - low) * slope;
+}
+
+// The same step along both axes: the range of one is widened about its middle.
+function equalAxes(x, y, width, height) {
+  const perPixel = Math.max((x.max - x.min) / width, (y.max - y.min) / height);
+  const widen = (axis, size) => {
+    const middle = (axis.min + axis.max) / 2, half = (perPixel * size) / 2;
+    return { ...axis, min: middle - half, max: middle + half };
+  };
+  return [widen(x, width), widen(y, height)];
+}
+
+function pathOf(xs, ys, toX, toY) {
+  let text = "", pen = false;
+  for (let k = 0; k < xs.length; k++) {
+    if (xs[k] === null || ys[k] === null) { pen = false; continue; }
+    const px = toX(xs[k]), py = toY(ys[k]);
+    if (!Number.isFinite(px) || !Number.isFinite(py) || Math.abs(py) > 1e5 || Math.abs(px) > 1e5) { pen = false; continue; }
+    text += `${pen ? "L" : "M"}${px.toFixed(1)} ${py.toFixed(1)}`;
+    pen = true;
+  }
+  return text;
+}
+
+const MARKS = {
+  x: (s) => `M${-s} ${-s}L${s} ${s}M${-s} ${s}L${s} ${-s}`,
+  "+": (s) => `M${-s} 0L${s} 0M0 ${-s}L0 ${s}`,
+  o: (s) => `M${-s} 0A${s} ${s} 0 1 0 ${s} 0A${s} ${s} 0 1 0 ${-s} 0`,
+  s: (s) => `M${-s} ${-s}L${s} ${-s}L${s} ${s}L${-s} ${s}L${-s} ${-s}`,
+};
+
+// A chart that fills its node. draw(view) draws
+//   x, y: {label, min, max, log}; equal: one scale for both
+//   lines: {name, xs, ys, color, dash, width, faint}; points: {name, xs, ys, mark, color, faint}
+//   shapes: {kind: "circle" | "band" | "line" | "ray" | "text", ...}
+//   read(line, k): rows of the readout; nearest: "x" along the axis, "xy" the nearest point
+export function createChart(label) {
+  const node = document.createElement("div");
+  node.className = "chart";
+  node.tabIndex = 0;
+  node.setAttribute("role", "img");
+  const picture = svg("svg", { "aria-hidden": "true" });
+  const readout = document.createElement("div");
+  readout.className = "readout";
+  readout.hidden = true;
+  readout.setAttribute("role", "status");
+  node.append(picture, readout);
+  const clip = `malta-clip-${++charts}`;
+  let view = null, shown = null, at = null;
+
+  function layout() {
+    const width = node.clientWidth, height = node.clientHeight;
+    const right = width - MARGIN.right, bottom = height - MARGIN.bottom;
+    let { x, y } = view;
+    if (view.equal) [x, y] = equalAxes(x, y, right - MARGIN.left, bottom - MARGIN.top);
+    return {
+      width, height, right, bottom, x, y,
+      toX: axisScale(x, MARGIN.left, right),
+      toY: axisScale(y, bottom, MARGIN.top),
+    };
+  }
+
+  function drawAxes(group, s) {
+    const { x, y, toX, toY, right, bottom } = s;
+    const ticksOf = (axis, most) => (axis.log ? logTicks(axis.min, axis.max) : { major: linearTicks(axis.min, axis.max, most), minor: [] });
+    const across = ticksOf(x, Math.max(3, (right - MARGIN.left) / 60)), up = ticksOf(y, Math.max(3, (bottom - MARGIN.top) / 36));
+    let fine = "", grid = "";
+    for (const t of across.minor) fine += `M${toX(t).toFixed(1)} ${MARGIN.top}V${bottom}`;
+    for (const t of up.minor) fine += `M${MARGIN.left} ${toY(t).toFixed(1)}H${right}`;
+    for (const t of across.major) grid += `M${toX(t).toFixed(1)} ${MARGIN.top}V${bottom}`;
+    for (const t of up.major) grid += `M${MARGIN.left} ${toY(t).toFixed(1)}H${right}`;
+    group.append(svg("path", { class: "grid fine", d: fine }), svg("path", { class: "grid", d: grid }));
+    for (const t of across.major) group.append(svg("text", { class: "tick", x: toX(t), y: bottom + 14, "text-anchor": "middle" }, tickLabel(t, x.log)));
+    for (const t of up.major) group.append(svg("text", { class: "tick", x: MARGIN.left - 5, y: toY(t) + 3.5, "text-anchor": "end" }, tickLabel(t, y.log)));
+    group.append(svg("rect", { class: "frame", x: MARGIN.left, y: MARGIN.top, width: Math.max(0, right - MARGIN.left), height: Math.max(0, bottom - MARGIN.top) }));
+    group.append(svg("text", { class: "axis", x: (MARGIN.left + right) / 2, y: bottom + 29, "text-anchor": "middle" }, x.label));
+    group.append(svg("text", { class: "axis", transform: `translate(11 ${(MARGIN.top + bottom) / 2}) rotate(-90)`, "text-anchor": "middle" }, y.label));
+  }
+
+  function drawShape(group, shape, s) {
+    const { toX, toY, right, bottom, x, y } = s;
+    if (shape.kind === "circle") {
+      const rx = Math.abs(toX(shape.x + shape.r) - toX(shape.x)), ry = Math.abs(toY(shape.y + shape.r) - toY(shape.y));
+      group.append(svg("ellipse", { class: shape.class, cx: toX(shape.x), cy: toY(shape.y), rx, ry }));
+    } else if (shape.kind === "band") {
+      const top = toY(Math.min(shape.to, y.max)), low = toY(Math.max(shape.from, y.min));
+      if (low > top) group.append(svg("rect", { class: shape.class, x: MARGIN.left, y: top, width: right - MARGIN.left, height: low - top }));
+      if (low - top > 10 && shape.text) group.append(svg("text", { class: "zone", x: MARGIN.left + 4, y: top + 10 }, shape.text));
+    } else if (shape.kind === "line") {
+      const d = shape.x !== undefined ? `M${toX(shape.x)} ${MARGIN.top}V${bottom}` : `M${MARGIN.left} ${toY(shape.y)}H${right}`;
+      group.append(svg("path", { class: shape.class ?? "zero", d }));
+    } else if (shape.kind === "ray") {
+      const far = 2 * Math.max(Math.abs(x.min), Math.abs(x.max), Math.abs(y.min), Math.abs(y.max));
+      group.append(svg("path", { class: shape.class, d: `M${toX(0)} ${toY(0)}L${toX(shape.dx * far)} ${toY(shape.dy * far)}` }));
+    } else if (shape.kind === "text") {
+      group.append(svg("text", { class: shape.class ?? "zone", x: toX(shape.x) + (shape.shift ?? 0), y: toY(shape.y) + (shape.drop ?? 0), "text-anchor": shape.anchor ?? "middle" }, shape.text));
+    }
+  }
+
+  function draw(next) {
+    if (next) view = next;
+    if (!view || node.clientWidth < 20 || node.clientHeight < 20) return;
+    const s = (shown = layout());
+    picture.setAttribute("width", s.width);
+    picture.setAttribute("height", s.height);
+    picture.setAttribute("viewBox", `0 0 ${s.width} ${s.height}`);
+    const definitions = svg("defs"), cut = svg("clipPath", { id: clip });
+    cut.append(svg("rect", { x: MARGIN.left, y: MARGIN.top, width: Math.max(0, s.right - MARGIN.left), height: Math.max(0, s.bottom - MARGIN.top) }));
+    definitions.append(cut);
+    const axes = svg("g"), inside = svg("g", { "clip-path": `url(#${clip})` });
+    for (const shape of (view.shapes ?? []).filter((one) => one.kind === "band")) drawShape(inside, shape, s);
+    const front = svg("g", { "clip-path": `url(#${clip})` });
+    drawAxes(axes, s);
+    for (const shape of (view.shapes ?? []).filter((one) => one.kind !== "band")) drawShape(front, shape, s);
+    for (const line of view.lines ?? []) {
+      const mark = { class: `line${line.faint ? " faint" : ""}`, d: pathOf(line.xs, line.ys, s.toX, s.toY), stroke: line.color };
+      if (line.dash) mark["stroke-dasharray"] = line.dash;
+      if (line.width) mark["stroke-width"] = line.width;
+      front.append(svg("path", mark));
+    }
+    for (const set of view.points ?? []) {
+      let d = "";
+      set.xs.forEach((px, k) => {
+        const left = s.toX(px), top = s.toY(set.ys[k]);
+        if (left > -50 && left < s.width + 50 && top > -50 && top < s.height + 50) d += MARKS[set.mark](set.size ?? 4).replace(/([ML])(-?[\d.]+) (-?[\d.]+)/g, (_, c, a, b) => `${c}${(left + +a).toFixed(1)} ${(top + +b).toFixed(1)}`).replace(/A([\d.]+) ([\d.]+) 0 1 0 (-?[\d.]+) 0/g, (_, a, b, c) => `A${a} ${b} 0 1 0 ${(left + +c).toFixed(1)} ${top.toFixed(1)}`);
+      });
+      front.append(svg("path", { class: `mark${set.faint ? " faint" : ""}`, d, stroke: set.color }));
+    }
+    const cursor = svg("g", { class: "cursor" });
+    picture.replaceChildren(definitions, inside, axes, front, cursor);
+    node.setAttribute("aria-label", `${label}. ${view.summary ?? ""}`);
+    if (at) point(at);
+  }
+
+  // Lines and points that can be read, in the order of the readout.
+  const readable = () => [...(view?.lines ?? []), ...(view?.points ?? [])].filter((one) => !one.silent);
+
+  function nearest(left, top) {
+    let best = null;
+    for (const set of readable()) {
+      for (let k = 0; k < set.xs.length; k++) {
+        if (set.xs[k] === null || set.ys[k] === null) continue;
+        const dx = shown.toX(set.xs[k]) - left, dy = shown.toY(set.ys[k]) - top;
+        const distance = view.nearest === "xy" ? dx * dx + dy * dy : Math.abs(dx) + 1e-3 * Math.abs(dy);
+        if (best === null || distance < best.distance) best = { distance, set, k };
+      }
+    }
+    return best;
+  }
+
+  function point(place) {
+    at = place;
+    const cursor = picture.querySelector(".cursor");
+    if (!cursor || !shown) return;
+    cursor.replaceChildren();
+    const found = place && nearest(place.left, place.top);
+    if (!found) { readout.hidden = true; return; }
+    const { set, k } = found, left = shown.toX(set.xs[k]), top = shown.toY(set.ys[k]);
+    if (view.nearest !== "xy") cursor.append(svg("path", { class: "hair", d: `M${left} ${MARGIN.top}V${shown.bottom}` }));
+    cursor.append(svg("circle", { class: "dot", cx: left, cy: top, r: 4, stroke: set.color }));
+    const rows = view.read(set, k);
+    readout.replaceChildren(...rows.map((row) => {
+      const line = document.createElement("div");
+      if (row.color) {
+        const swatch = document.createElement("i");
+        swatch.style.background = row.color;
+        line.append(swatch);
+      }
+      line.append(row.text);
+      if (row.strong) line.className = "strong";
+      return line;
+    }));
+    readout.hidden = false;
+    const beside = left + 12 + readout.offsetWidth > shown.width ? left - 12 - readout.offsetWidth : left + 12;
+    readout.style.left = `${Math.max(2, beside)}px`;
+    readout.style.top = `${Math.max(2, Math.min(place.top - 10, shown.height - readout.offsetHeight - 4))}px`;
+  }
+
+  node.addEventListener("pointermove", (event) => {
+    const box = node.getBoundingClientRect();
+    if (view) point({ left: event.clientX - box.left, top: event.clientY - box.top });
+  });
+  node.addEventListener("pointerleave", () => point(null));
+  node.addEventListener("blur", () => point(null));
+  node.addEventListener("keydown", (event) => {
+    const step = { ArrowLeft: -1, ArrowRight: 1 }[event.key];
+    if (event.key === "Escape") point(null);
+    if (!step || !view || !shown) return;
+    event.preventDefault();
+    const found = nearest(at?.left ?? (MARGIN.left + shown.right) / 2, at?.top ?? (MARGIN.top + shown.bottom) / 2);
+    if (!found) return;
+    const k = Math.max(0, Math.min(found.set.xs.length - 1, found.k + step * (event.shiftKey ? 10 : 1)));
+    point({ left: shown.toX(found.set.xs[k]), top: shown.toY(found.set.ys[k]) });
+  });
+  new ResizeObserver(() => draw()).observe(node);
+  return { node, draw };
+}
+
+// The range of values with some room; `zero`: whether 0 has to be in it.
+export function rangeOf(series, { zero = false, log = false, room = 0.06 } = {}) {
+  let low = Infinity, high = -Infinity;
+  for (const values of series) {
+    for (const value of values) {
+      if (value === null || !Number.isFinite(value) || (log && value <= 0)) continue;
+      if (value < low) low = value;
+      if (value > high) high = value;
+    }
+  }
+  if (low > high) return log ? [0.1, 10] : [-1, 1];
+  if (zero) [low, high] = [Math.min(low, 0), Math.max(high, 0)];
+  if (log) return [10 ** (Math.log10(low) - 0.1), 10 ** (Math.log10(high) + 0.1)];
+  const gap = (high - low || Math.abs(high) || 1) * room;
+  return [low - gap, high + gap];
+}
+

@@ -1,0 +1,182 @@
+// What the charts show: documents of the session as views of chart.js.
+
+import { rangeOf } from "./chart.js";
+import { decibels, digits, quantity, scaleFor } from "./numbers.js";
+
+const DASHES = ["", "7 3", "2 3", "8 3 2 3", "", "7 3", "2 3", "8 3 2 3"];
+export const color = (k) => `var(--c${k % 8})`;
+const hertz = (w) => `${digits(w, 4)} rad/s (${quantity(w / (2 * Math.PI), "Hz")})`;
+
+function signalLines(names, rows, xs, hidden, { ghost = false, dashed = null } = {}) {
+  return names.map((name, k) => ({
+    name, xs, ys: rows[k] ?? [], k,
+    color: color(k),
+    dash: dashed ?? DASHES[k % DASHES.length],
+    faint: ghost, silent: ghost,
+  })).filter((line) => !hidden.has(line.name) && line.ys.length);
+}
+
+// |S| or |T| of each sensor, with the zones of ISO 14839-3 behind S.
+export function sensitivityView(picture, pins, which, hidden) {
+  const { w, sensors } = picture.frequency;
+  const rows = picture.frequency[which];
+  const lines = [
+    ...pins.flatMap((pin) => signalLines(sensors, pin.picture.frequency[which], pin.picture.frequency.w, hidden, { ghost: true })),
+    ...signalLines(sensors, rows, w, hidden),
+  ];
+  const [, top] = rangeOf(rows, { log: true });
+  const zones = [[0, 3, "A"], [3, 4, "B"], [4, 5, "C"], [5, 1e9, "D"]];
+  const shapes = which === "S" ? zones.map(([from, to, name]) => ({ kind: "band", from: Math.max(from, 1e-9), to, text: name === "A" ? "zone A below 3" : name, class: `zone-${name}` })) : [];
+  return {
+    x: { label: "frequency [rad/s]", min: w[0], max: w[w.length - 1], log: true },
+    y: { label: which === "S" ? "|S|, each sensor" : "|T|, each sensor", min: 0.01, max: Math.max(8, top), log: true },
+    lines, shapes: [...shapes, { kind: "line", y: 1 }], nearest: "x",
+    summary: rows.length ? sensors.map((name, k) => `${name}: largest ${digits(Math.max(...rows[k]), 3)}`).join(", ") : "unstable: no sensitivity",
+    empty: rows.length ? "" : "An unstable loop has no sensitivity.",
+    read: (line, k) => [
+      { text: hertz(line.xs[k]), strong: true },
+      ...lines.filter((one) => !one.silent).map((one) => ({ color: one.color, text: `${one.name}: ${digits(one.ys[k], 3)} (${decibels(one.ys[k])})` })),
+    ],
+  };
+}
+
+// The loop of each sensor with the others closed, about -1; the disk inside of which |S| is above 3.
+export function nyquistView(picture, pins, reach, hidden) {
+  const { w, sensors, L } = picture.frequency;
+  const curves = (frequency, ghost) => frequency.sensors.map((name, k) => ({
+    name, w: frequency.w, xs: frequency.L[k][0], ys: frequency.L[k][1], color: color(k),
+    dash: DASHES[k % DASHES.length], faint: ghost, silent: ghost,
+  })).filter((line) => !hidden.has(line.name));
+  return {
+    equal: true, nearest: "xy",
+    x: { label: "Re, loop of one sensor, others closed", min: -1 - reach, max: -1 + reach },
+    y: { label: "Im", min: -reach, max: reach },
+    shapes: [
+      { kind: "circle", x: 0, y: 0, r: 1, class: "unit" },
+      { kind: "circle", x: -1, y: 0, r: 1 / 3, class: "forbidden" },
+      { kind: "line", x: 0 }, { kind: "line", y: 0 },
+      { kind: "text", x: -1, y: 0, text: "+", drop: 3.5 },
+      { kind: "text", x: -1, y: 1 / 3, text: "|S| > 3", drop: -4 },
+    ],
+    lines: [...pins.flatMap((pin) => curves(pin.picture.frequency, true)), ...curves(picture.frequency, false)],
+    summary: `${sensors.length} curves from ${digits(w[0], 3)} to ${digits(w[w.length - 1], 3)} rad/s`,
+    read: (line, k) => [
+      { text: line.name, strong: true, color: line.color },
+      { text: hertz(line.w[k]) },
+      { text: `${digits(line.xs[k], 3)} ${line.ys[k] < 0 ? "−" : "+"} ${digits(Math.abs(line.ys[k]), 3)} j` },
+      { text: `distance to −1: ${digits(Math.hypot(line.xs[k] + 1, line.ys[k]), 3)}` },
+    ],
+  };
+}
+
+const POLES = { machine: ["o", 7], "closed loop": ["x", 0], regulator: ["+", 2], filter: ["s", 4] };
+
+// Poles in the s plane, ln z / Ts of sampled ones; rays of damping 0.1, 0.3 and 0.7.
+export function poleView(picture, pins, all, hidden) {
+  const sizes = picture.poles["closed loop"].map(([re, im]) => Math.hypot(re, im)).sort((a, b) => a - b);
+  const wanted = 1.25 * (all ? sizes[sizes.length - 1] : sizes[Math.floor(0.6 * (sizes.length - 1))] ?? 1);
+  const power = 10 ** Math.floor(Math.log10(wanted));
+  const reach = [1, 1.5, 2, 3, 5, 7, 10].find((s) => s * power >= wanted) * power;
+  const sets = (poles, ghost) => Object.entries(POLES).filter(([name]) => poles[name]?.length && !hidden.has(name)).map(([name, [mark, k]]) => ({
+    name, mark, color: color(k), xs: poles[name].map((p) => p[0]), ys: poles[name].map((p) => p[1]), faint: ghost, silent: ghost,
+    size: name === "closed loop" ? 4.5 : 3.5,
+  }));
+  const rays = [0.1, 0.3, 0.7].flatMap((zeta) => [1, -1].map((side) => ({ kind: "ray", dx: -zeta, dy: side * Math.sqrt(1 - zeta * zeta), class: "ray" })));
+  const labels = [[0.1, 0.9], [0.3, 0.7], [0.7, 0.55]].map(([zeta, share]) => {
+    const far = share * reach;
+    return { kind: "text", x: -zeta * far, y: Math.sqrt(1 - zeta * zeta) * far, text: `ζ ${zeta}`, shift: -3, anchor: "end" };
+  });
+  const hiddenPoles = sizes.filter((size) => size > reach).length;
+  return {
+    equal: true, nearest: "xy",
+    x: { label: "Re s [rad/s]", min: -reach, max: 0.35 * reach },
+    y: { label: "Im s [rad/s]", min: -reach, max: reach },
+    shapes: [{ kind: "line", x: 0, class: "limit" }, { kind: "line", y: 0 }, ...rays, ...labels],
+    points: [...pins.flatMap((pin) => sets(pin.picture.poles, true)), ...sets(picture.poles, false)],
+    note: hiddenPoles ? `${hiddenPoles} faster poles outside` : "",
+    summary: `${sizes.length} poles of the closed loop, spectral radius ${digits(picture.radius, 6)}`,
+    read: (set, k) => {
+      const size = Math.hypot(set.xs[k], set.ys[k]);
+      return [
+        { text: set.name, strong: true, color: set.color },
+        { text: `${digits(set.xs[k], 4)} ${set.ys[k] < 0 ? "−" : "+"} ${digits(Math.abs(set.ys[k]), 4)} j rad/s` },
+        { text: `|s| ${hertz(size)}` },
+        { text: `damping ${digits(-set.xs[k] / size, 3)}` },
+      ];
+    },
+  };
+}
+
+// Groups of signals of one unit: [{id, text, unit, of, indices}], for the choice above a chart over time.
+export function timeGroups(description, withErrors) {
+  const groups = [];
+  const add = (signals, what, key) => {
+    for (const unit of [...new Set(signals.map((s) => s.unit))]) {
+      const indices = signals.flatMap((s, k) => (s.unit === unit ? [k] : []));
+      groups.push({ id: `${key} ${unit}`, text: `${what} [${unit}]`, unit, of: key, indices });
+    }
+  };
+  add(description.outputs, "outputs", "p");
+  if (withErrors) {
+    add(description.outputs, "errors", "error");
+    add(description.inputs, "commands", "v");
+  }
+  return groups;
+}
+
+const seriesOf = (run, group, k) => (group.of === "error" ? run.p[k].map((value, i) => (value === null ? null : value - run.reference[k][i])) : run[group.of][k]);
+
+// A run: the linear loop dashed, the simulation solid, the reference dotted.
+export function runView(state, group, hidden) {
+  const { picture, simulated, pins, description } = state;
+  const run = picture.run, sources = [];
+  if (!run) return null;
+  for (const pin of pins) if (pin.picture.run?.name === run.name) sources.push({ run: pin.picture.run, ghost: true });
+  sources.push({ run, dash: simulated ? "5 3" : "", linear: true });
+  if (simulated?.name === run.name && simulated.t) sources.push({ run: simulated, dash: "", solid: true });
+  const signals = group.of === "v" ? description.inputs : description.outputs;
+  const lines = [];
+  for (const source of sources) {
+    for (const k of group.indices) {
+      if (hidden.has(signals[k].name)) continue;
+      lines.push({
+        name: signals[k].name, xs: source.run.t, ys: seriesOf(source.run, group, k), color: color(k), dash: source.dash,
+        faint: source.ghost, silent: source.ghost || (source.linear && sources.some((s) => s.solid)), width: source.linear && source.dash ? 1.2 : 1.6,
+      });
+    }
+  }
+  if (group.of === "p") {
+    for (const k of group.indices) {
+      if (Math.max(...run.reference[k].map(Math.abs)) > 0) lines.unshift({ name: `${signals[k].name} reference`, xs: run.t, ys: run.reference[k], color: "var(--soft)", dash: "2 2", silent: true, width: 2.4 });
+    }
+  }
+  return timeView(lines, group.unit, run.t, `${run.name}: ${group.text}`);
+}
+
+// The outputs under a unit of one disturbance.
+export function loadView(state, group, hidden) {
+  const { picture, pins, description } = state, load = picture.load;
+  if (!load) return null;
+  const rows = (source, ghost) => group.indices.filter((k) => !hidden.has(description.outputs[k].name)).map((k) => ({
+    name: description.outputs[k].name, xs: source.t, ys: source.y[k], color: color(k), faint: ghost, silent: ghost,
+  }));
+  const lines = [...pins.filter((pin) => pin.picture.load?.name === load.name).flatMap((pin) => rows(pin.picture.load, true)), ...rows(load, false)];
+  return timeView(lines, group.unit, load.t, `load ${load.name}`);
+}
+
+function timeView(lines, unit, times, title) {
+  const [low, high] = rangeOf(lines.map((line) => line.ys), { zero: true });
+  const size = Math.max(Math.abs(low), Math.abs(high)), value = scaleFor(size, unit), time = scaleFor(times[times.length - 1], "s");
+  const scaled = lines.map((line) => ({ ...line, xs: line.xs.map((t) => t / time.factor), ys: line.ys.map((y) => (y === null ? null : y / value.factor)) }));
+  return {
+    nearest: "x",
+    x: { label: `time [${time.unit}]`, min: 0, max: times[times.length - 1] / time.factor },
+    y: { label: `[${value.unit || "1"}]`, min: low / value.factor, max: high / value.factor },
+    lines: scaled, shapes: [{ kind: "line", y: 0 }],
+    summary: `${title}, largest ${quantity(size, unit)}`,
+    read: (line, k) => [
+      { text: `${digits(line.xs[k], 4)} ${time.unit}`, strong: true },
+      ...scaled.filter((one) => !one.silent && one.xs === line.xs || (!one.silent && one.xs.length === line.xs.length)).map((one) => ({ color: one.color, text: `${one.name}: ${digits(one.ys[k], 4)} ${value.unit}` })),
+    ],
+  };
+}

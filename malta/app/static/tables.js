@@ -1,0 +1,79 @@
+// The tables beside the charts: requirements as lights, figures of pinned designs, and what differs.
+
+import { element } from "./controls.js";
+import { digits, floored, percent, printedUnit, quantity } from "./numbers.js";
+
+const SIGNS = { true: ["✓", "met"], false: ["✗", "not met"], null: ["…", "not known yet"] };
+
+// Whether a margin is reached: by the proof, or refuted by eigenvalues before it.
+function marginLight(asked, state) {
+  const { proof, picture } = state, upper = proof?.upper ?? picture.margin?.upper;
+  if (!picture.stable) return { holds: false, found: 0, how: "unstable loop" };
+  if (proof?.lower !== undefined && proof?.lower !== null && proof.lower >= asked) return { holds: true, found: floored(proof.lower), how: "proven over the travel" };
+  if (upper !== undefined && upper !== null && upper < asked) return { holds: false, found: upper, how: "lost there, by eigenvalues" };
+  if (proof && proof.lower !== undefined) return { holds: null, found: proof.lower, how: proof.reason || "not proven as far as that" };
+  return { holds: null, found: upper ?? null, how: "eigenvalues; the proof follows" };
+}
+
+// "peak_sensitivity" as words; what follows the first space are names of signals and loads.
+const wordsOf = (name) => [name.split(" ")[0].replaceAll("_", " "), ...name.split(" ").slice(1)].join(" ");
+
+const boundText = (asked, value) => (asked.switch ? (value ? "yes" : "no") : asked.name === "margin" ? percent(value) : quantity(value, asked.unit, 3));
+
+export function requirementRows(description, state) {
+  return description.requirements.map((asked) => {
+    const found = asked.name === "margin" ? marginLight(asked.asked, state) : state.requirements[asked.name] ?? { holds: null, found: null, how: "" };
+    const [sign, words] = SIGNS[found.holds ?? null];
+    const value = found.found === null || found.found === undefined ? (found.holds === false ? "none" : "") : boundText(asked, found.found);
+    const bound = asked.switch ? "" : `${asked.at_least ? "≥" : "≤"} ${boundText(asked, asked.asked)}`;
+    return element("tr", { class: `light ${found.holds ?? "open"}`, title: found.how ?? "" },
+      element("td", { class: "sign", role: "img", "aria-label": words }, sign),
+      element("td", {}, wordsOf(asked.name)), element("td", { class: "number" }, value), element("td", { class: "number soft" }, bound));
+  });
+}
+
+export function countLights(description, state) {
+  const counts = { true: 0, false: 0, null: 0 };
+  for (const row of requirementRows(description, state)) counts[row.classList.contains("true") ? "true" : row.classList.contains("false") ? "false" : "null"] += 1;
+  return counts;
+}
+
+const near = (a, b) => Math.abs(a - b) <= 1e-4 * Math.max(Math.abs(a), Math.abs(b));
+
+function figureRows(figures, proof, margin) {
+  const upper = proof?.upper ?? margin?.upper;
+  const rows = figures.map((one) => ({ ...one, text: quantity(one.value, one.unit, 4) }));
+  if (upper !== undefined && upper !== null) rows.unshift({ label: "margin, eigenvalues", value: upper, better: 1, text: `≤ ${percent(upper)}`, note: "upper bound" });
+  if (proof?.lower !== undefined && proof?.lower !== null) rows.unshift({ label: "margin, proven", value: proof.lower, better: 1, text: percent(floored(proof.lower)), note: proof.reason });
+  return rows;
+}
+
+// Figures of the design and of the pinned ones, the better of two marked.
+export function figureTable(state) {
+  const columns = [{ name: "now", rows: figureRows(state.picture.figures, state.proof, state.picture.margin) }];
+  for (const pin of state.pins) columns.push({ name: pin.name, rows: figureRows(pin.picture.figures, pin.proof, pin.picture.margin) });
+  const labels = [...new Set(columns.flatMap((column) => column.rows.map((row) => row.label)))];
+  const head = element("tr", {}, element("th", {}, ""), ...columns.map((column) => element("th", { scope: "col", class: "number" }, column.name)));
+  const body = labels.map((label) => {
+    const cells = columns.map((column) => column.rows.find((row) => row.label === label));
+    const values = cells.filter(Boolean).map((cell) => cell.value).filter((value) => value !== null);
+    const side = cells.find(Boolean).better, best = side > 0 ? Math.max(...values) : Math.min(...values);
+    return element("tr", {}, element("th", { scope: "row" }, label), ...cells.map((cell) => {
+      const wins = cell && side && values.length > 1 && near(cell.value, best) && !values.every((value) => near(value, best));
+      return element("td", { class: `number${wins ? " better" : ""}`, title: cell?.note ?? "" }, cell ? (wins ? "★ " : "") + cell.text : "–");
+    }));
+  });
+  return element("table", { class: "figures" }, element("thead", {}, head), element("tbody", {}, ...body));
+}
+
+// Entries that differ from the file, or between the design and a pinned one.
+export function differenceTable(description, state) {
+  const columns = [{ name: "file", values: Object.fromEntries(description.fields.map((field) => [field.key, field.value])) }, ...state.pins, { name: "now", values: state.values }];
+  const rows = description.fields.filter((field) => columns.some((column) => column.values[field.key] !== columns[0].values[field.key]));
+  if (!rows.length) return element("p", { class: "soft" }, "Nothing differs from the file.");
+  const text = (value) => (typeof value === "number" ? digits(value, 5) : String(value));
+  return element("table", { class: "figures" },
+    element("thead", {}, element("tr", {}, element("th", {}, ""), ...columns.map((column) => element("th", { scope: "col", class: "number" }, column.name)))),
+    element("tbody", {}, ...rows.map((field) => element("tr", {}, element("th", { scope: "row" }, `${field.key}${field.unit ? ` [${printedUnit(field.unit)}]` : ""}`),
+      ...columns.map((column) => element("td", { class: `number${column.values[field.key] !== field.value ? " better" : ""}` }, text(column.values[field.key])))))));
+}

@@ -1,0 +1,438 @@
+"""The live page: the session's numbers, what the server refuses, what saving writes, and the page in a browser."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import shutil
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import malta
+from malta.app.files import Edit, open_design
+from malta.app.picture import View, picture, solve
+from malta.app.saving import TakenError, inside, save_design
+from malta.app.server import LARGEST, PAGES, Server
+from malta.app.session import Session
+from malta.errors import InputError
+from malta.files import shipped_path
+from malta.margins.rays import ray_bound
+from malta.margins.travel import travel_loops, travel_margin
+from malta.tuning.search import model_and_controller
+
+HALBACH = shipped_path("design", "halbach_pid.toml")
+ROBUST = shipped_path("design", "robust.toml")
+BALL = shipped_path("examples", "ball", "design", "ball.toml")
+ROTOR = shipped_path("examples", "rotor", "design", "rotor.toml")
+
+
+def copied(folder: Path, name: str = "halbach_pid") -> Path:
+    """A design with its machine's data in a folder of its own."""
+    machine = {"halbach_pid": "halbach", "robust": "tubular"}[name]
+    for part in ("design", "data/published"):
+        (folder / part).mkdir(parents=True)
+    for file in (f"design/{name}.toml", f"data/{machine}.toml", f"data/published/{machine}.toml"):
+        shutil.copy(shipped_path(*file.split("/")), folder / file)
+    return folder / "design" / f"{name}.toml"
+
+
+class Client:
+    """A session that asks no workers."""
+
+    def __init__(self, design: Path, root: Path) -> None:
+        self.session = Session(design, root)
+        for worker in self.session._workers.values():
+            worker.close()
+
+    def ask(self, ask: str, **body: Any) -> dict[str, Any]:
+        return self.session.answer({"ask": ask, **body})
+
+
+# --- numbers ---
+
+
+@pytest.mark.parametrize("design", [HALBACH, BALL, pytest.param(ROBUST, marks=pytest.mark.slow)])
+def test_picture_has_the_figures_of_verify_and_recovery(design: Path) -> None:
+    spec = malta.read_design(design)
+    problem = solve(open_design(design).apply(Edit()))
+    found = picture(problem, View())
+    margins = malta.verify(problem.model, problem.controller)
+    figures = {m["label"]: m["value"] for m in found["figures"]}
+    peaks = [v for k, v in margins.peak_sensitivity.items() if k != "sigma_max"]
+    assert figures["peak |S|"] == max(peaks)
+    assert figures["bandwidth, T"] == margins.bandwidth["sigma_max_T"]
+    assert found["stable"]
+    closed = np.array(found["poles"]["closed loop"])
+    assert np.allclose(closed[:, 0] + 1j * closed[:, 1], margins.poles.closed_loop, rtol=1e-12)
+    drawn = [max(row) for row in found["frequency"]["S"]]
+    assert drawn == pytest.approx(peaks, rel=2e-3)
+    if found["load"]:
+        of_load = malta.recovery(problem.plant, problem.controller)[0]
+        assert found["load"]["largest"] == pytest.approx([d.largest for d in of_load.outputs], rel=1e-5)
+    assert np.array_equal(problem.controller.K, malta.synthesize(spec, problem.model).K)
+
+
+def test_linear_run_is_what_the_simulation_does() -> None:
+    from malta.app.runs import planned_run
+
+    problem = solve(open_design(ROTOR).apply(Edit()))
+    name, planned = planned_run(problem.plant, problem.controller, "step s_Ax")
+    linear = picture(problem, View(run=name), margin=False)["run"]
+    run = malta.simulate(problem.plant, problem.controller, planned.scenario)
+    step = len(run.t) // len(linear["t"])
+    # a step of 19 um, of which the linear loop leaves out the saturation and the curve of the magnets
+    assert np.abs(np.array(linear["p"]).T - run.p[::step]).max() < 0.1e-6
+
+
+@pytest.mark.parametrize("design", [BALL, HALBACH, pytest.param(ROBUST, marks=pytest.mark.slow)])
+def test_eigenvalue_margin_lies_just_above_the_proven_one(design: Path) -> None:
+    spec = malta.read_design(design)
+    _, controller = model_and_controller(spec)
+    loops, over = travel_loops(spec.plant, controller, tuple(spec.uncertainty))
+    bound = ray_bound(loops, spec.uncertainty, over)
+    proven = travel_margin(spec.plant, controller, spec.uncertainty)
+    assert proven.lower is not None
+    assert proven.lower <= bound.upper <= 1.001 * proven.lower + 1e-3
+    again = ray_bound(loops, spec.uncertainty, over, bound.ray)
+    assert again.upper == pytest.approx(bound.upper, rel=2e-3)
+
+
+def test_a_machine_that_differs_keeps_its_controller(tmp_path: Path) -> None:
+    files = open_design(copied(tmp_path))
+    own = solve(files.apply(Edit()))
+    heavier = {"machine.m": 4.5}
+    other = solve(files.apply(files.edit(heavier, redesign=False)))
+    redesigned = solve(files.apply(files.edit(heavier)))
+    assert np.array_equal(own.controller.K, other.controller.K)
+    assert other.plant.parameters.m == redesigned.plant.parameters.m == 4.5  # type: ignore[attr-defined]
+    assert other.controller.parameters.m == 3.75  # type: ignore[attr-defined]
+    assert redesigned.controller.parameters.m == 4.5  # type: ignore[attr-defined]
+
+
+def test_fields_keep_units_and_ranges_of_the_file() -> None:
+    fields = open_design(HALBACH).fields
+    kp = fields["pid.Kp.F_x"]
+    assert (kp.value, kp.unit, kp.tuning, kp.low, kp.high) == (647.02, "N/m", "stiffness", 30.0, 3000.0)
+    assert fields["sample_time"].unit == "ms"
+    assert fields["machine.m"].note.startswith("printed")
+    printed = open_design(shipped_path("design", "table2.toml")).fields
+    assert printed["bases.state.x"].value == 1.0  # "SI" in the file
+    assert printed["weights.integral.x1"].value == 80  # of data/published
+
+
+# --- what is wrong is one sentence ---
+
+
+@pytest.mark.parametrize(
+    ("values", "says"),
+    [
+        ({"machine.m": -1.0}, "finite number above 0"),
+        ({"machine.m": float("nan")}, "a finite number"),
+        ({"pid.Kp.F_x": "x"}, "a finite number"),
+        ({"pid.Kp.F_x": 10**400}, "a finite number"),
+        ({"sample_time": 0.0}, "more than 0 s"),
+        ({"machine": "../other.toml"}, "a field of the page"),
+        ({"name": "x"}, "a field of the page"),
+        ({"commutation": "elsewhere"}, "'measured' or 'predicted'"),
+        ([], "values by key"),
+    ],
+)
+def test_bad_values_are_one_sentence(tmp_path: Path, values: Any, says: str) -> None:
+    client = Client(copied(tmp_path), tmp_path)
+    answer = client.ask("evaluate", number=1, values=values)
+    assert says in answer["error"]
+    assert len(answer["error"]) <= 300
+    assert "poles" not in answer
+    assert client.ask("evaluate", number=2, values={})["stable"]
+
+
+def test_an_unstable_design_has_poles_and_no_sensitivity(tmp_path: Path) -> None:
+    client = Client(copied(tmp_path), tmp_path)
+    found = client.ask("evaluate", number=1, values={"pid.Kd.F_x": 300.0})
+    assert not found["stable"]
+    assert found["frequency"]["S"] == []
+    assert found["load"] is None
+    assert found["margin"]["upper"] == 0.0
+    json.dumps(found, allow_nan=False)
+
+
+def test_the_newest_move_wins(tmp_path: Path) -> None:
+    client = Client(copied(tmp_path), tmp_path)
+    assert client.ask("evaluate", number=5, values={})["stable"]
+    assert client.ask("evaluate", number=4, values={"pid.Kp.F_x": 700.0}) == {"number": 4, "stale": True}
+    assert client.session.unsaved() == []
+
+
+def test_unknown_questions_are_refused(tmp_path: Path) -> None:
+    client = Client(copied(tmp_path), tmp_path)
+    bodies: list[Any] = [None, [], {}, {"ask": "close"}, {"ask": "evaluate"}, {"ask": "news", "after": "x"}]
+    for body in bodies:
+        assert "expected" in client.session.answer(body)["error"]
+
+
+# --- saving ---
+
+
+def test_a_saved_design_makes_the_gains_of_the_page(tmp_path: Path) -> None:
+    design = copied(tmp_path)
+    files, before = open_design(design), design.read_text()
+    edit = files.edit({"pid.Kp.F_x": 1000 / 3, "sample_time": 55.0, "uncertainty.m": 0.15})
+    page = solve(files.apply(edit)).controller
+    target = tmp_path / "design" / "mine.toml"
+    saved, written = save_design(files, edit, target, tmp_path, replace=False)
+    assert written == ["design/mine.toml"]
+    spec = malta.read_design(target)
+    _, controller = model_and_controller(spec)
+    for name in ("K", "Ki", "L", "Ad"):
+        assert np.array_equal(getattr(page, name), getattr(controller, name))
+    assert spec.sha256 == saved.spec.sha256
+    text = target.read_text()
+    changed = {(a, b) for a, b in zip(before.splitlines(), text.splitlines(), strict=True) if a != b}
+    assert len(changed) == 3  # the name, the gain, the uncertainty; comments and order stay
+    assert all("#" not in a or a.partition("#")[2] == b.partition("#")[2] for a, b in changed)
+    with pytest.raises(TakenError, match=r"design/mine\.toml"):
+        save_design(saved, Edit(), target, tmp_path, replace=False)
+
+
+def test_a_machine_of_the_page_is_saved_beside_its_design(tmp_path: Path) -> None:
+    files = open_design(copied(tmp_path))
+    edit = files.edit({"machine.m": 4.0, "pid.Kp.F_x": 700.0})
+    target = tmp_path / "design" / "heavy.toml"
+    _, written = save_design(files, edit, target, tmp_path, replace=False)
+    assert written == ["design/heavy.toml", "design/heavy_machine.toml"]
+    _, controller = model_and_controller(malta.read_design(target))
+    assert np.array_equal(controller.K, solve(files.apply(edit)).controller.K)
+    assert controller.parameters.m == 4.0  # type: ignore[attr-defined]
+
+
+def test_published_numbers_and_si_bases_are_written_out_where_they_change(tmp_path: Path) -> None:
+    folder = tmp_path / "design"
+    folder.mkdir()
+    files = open_design(shipped_path("design", "table2.toml"))
+    edit = files.edit({"bases.state.x": 2.0, "weights.integral.x1": 81.0})
+    save_design(files, edit, folder / "other.toml", tmp_path, replace=False)
+    text = (folder / "other.toml").read_text()
+    assert 'input = "SI"' in text
+    assert 'published = "table_II.state"' in text
+    saved, page = malta.read_design(folder / "other.toml"), files.apply(edit).spec
+    assert np.array_equal(saved.weights.Q, page.weights.Q)
+    assert np.array_equal(saved.weights.Q_i, page.weights.Q_i)
+
+
+@pytest.mark.parametrize(
+    "file", ["../x.toml", "/tmp/x.toml", "a/../../x.toml", "x.txt", "x y.toml", "", "link/x.toml"]
+)
+def test_nothing_is_saved_outside_of_the_folder(tmp_path: Path, file: str) -> None:
+    root, other = tmp_path / "root", tmp_path / "other"
+    design = copied(root)
+    other.mkdir()
+    (root / "link").symlink_to(other)
+    client = Client(design, root)
+    answer = client.ask("save", file=file, values={}, replace=True)
+    assert "expected" in answer["error"]
+    assert list(other.iterdir()) == []
+    assert list(tmp_path.glob("*.toml")) == []
+
+
+def test_a_link_in_place_of_a_design_is_not_followed(tmp_path: Path) -> None:
+    (tmp_path / "real.toml").write_text("x")
+    (tmp_path / "link.toml").symlink_to(tmp_path / "real.toml")
+    with pytest.raises(InputError, match="no link"):
+        inside(tmp_path, "link.toml")
+    assert inside(tmp_path, "design/new.toml") == tmp_path / "design" / "new.toml"
+
+
+def test_saving_asks_before_it_replaces(tmp_path: Path) -> None:
+    client = Client(copied(tmp_path), tmp_path)
+    values = {"pid.Kp.F_x": 650.0}
+    asked = client.ask("save", file="design/halbach_pid.toml", values=values)
+    assert asked == {"exists": ["design/halbach_pid.toml"]}
+    saved = client.ask("save", file="design/halbach_pid.toml", values=values, replace=True)
+    assert saved["written"] == ["design/halbach_pid.toml"]
+    assert client.session.unsaved() == []
+    fields = {f["key"]: f["value"] for f in saved["open"]["fields"]}
+    assert fields["pid.Kp.F_x"] == 650.0
+
+
+def test_gain_files_are_those_of_a_saved_design(tmp_path: Path) -> None:
+    client = Client(copied(tmp_path), tmp_path)
+    client.ask("evaluate", number=1, values={"pid.Kp.F_x": 700.0})
+    assert "changes that are not saved" in client.ask("gains")["error"]
+
+
+@pytest.mark.slow
+def test_gain_files_go_through_the_checks_of_malta_design(tmp_path: Path) -> None:
+    client = Client(copied(tmp_path), tmp_path)
+    written = client.ask("gains")["written"]
+    assert written == [f"design/gains/halbach_pid{suffix}" for suffix in (".json", ".npz", ".mat")]
+    controller = malta.gains.read(tmp_path / written[0])
+    assert np.array_equal(controller.K, solve(client.session.files.apply(Edit())).controller.K)
+    unstable = {"pid.Kd.F_x": 300.0}
+    client.ask("save", file="design/wild.toml", values=unstable)
+    assert "unstable" in client.ask("gains")["error"]
+    assert not (tmp_path / "design/gains/wild.json").exists()
+
+
+# --- the server ---
+
+
+@pytest.fixture
+def server(tmp_path: Path) -> Iterator[Server]:
+    session = Client(copied(tmp_path), tmp_path).session
+    with Server(session) as running:
+        thread = threading.Thread(target=running.serve_forever, kwargs={"poll_interval": 0.02})
+        thread.start()
+        yield running
+        running.shutdown()
+        thread.join()
+
+
+def send(
+    server: Server, method: str, path: str, body: bytes | None = None, **headers: str
+) -> tuple[int, str, dict[str, str]]:
+    """A request as this page sends it, but for some headers; "" leaves one out."""
+    own = {
+        "Host": f"127.0.0.1:{server.server_port}",
+        "Origin": server.origin,
+        "X-Malta-Token": server.token,
+        "Content-Type": "application/json",
+    } | {name.replace("_", "-"): value for name, value in headers.items()}
+    connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=10)
+    connection.putrequest(method, path, skip_host=True)
+    for name, value in own.items():
+        if value:
+            connection.putheader(name, value)
+    if body is not None and "Content-Length" not in own:
+        connection.putheader("Content-Length", str(len(body)))
+    connection.endheaders(body)
+    answer = connection.getresponse()
+    found = answer.status, answer.read().decode(), dict(answer.getheaders())
+    connection.close()
+    return found
+
+
+def test_the_page_is_served_to_whoever_has_its_address(server: Server) -> None:
+    status, text, headers = send(server, "GET", f"/?token={server.token}", Origin="")
+    assert status == 200
+    assert "app.js" not in text
+    assert "page.js" in text
+    assert "script-src 'self'" in headers["Content-Security-Policy"]
+    assert "unsafe" not in headers["Content-Security-Policy"]
+    for path, (_, kind) in PAGES.items():
+        status, text, headers = send(server, "GET", f"{path}?token={server.token}")
+        assert status == 200
+        assert headers["Content-Type"].startswith(kind)
+        assert "http" not in text.replace(
+            "http://www.w3.org/2000/svg", ""
+        )  # nothing is loaded from elsewhere
+    status, text, _ = send(server, "POST", "/ask", json.dumps({"ask": "open"}).encode())
+    assert status == 200
+    assert json.loads(text)["name"] == "halbach_pid"
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "headers", "status"),
+    [
+        ("GET", "/", {}, 403),
+        ("GET", "/?token=wrong", {}, 403),
+        ("GET", "/?token=%C3%A9", {}, 403),
+        ("GET", "/../files.py", {}, 404),
+        ("GET", "/static/app.js", {}, 404),
+        ("GET", "/%2e%2e/session.py", {}, 404),
+        ("GET", "/app.js", {"Host": "evil.example"}, 421),
+        ("GET", "/app.js", {"Host": ""}, 421),
+        ("GET", "/app.js", {"Origin": "http://evil.example"}, 403),
+        ("GET", "/app.js", {"Sec_Fetch_Site": "cross-site"}, 403),
+        ("POST", "/ask", {"X_Malta_Token": ""}, 403),
+        ("POST", "/ask", {"X_Malta_Token": "wrong"}, 403),
+        ("POST", "/ask", {"Host": "evil.example"}, 421),
+        ("POST", "/ask", {"Origin": "null"}, 403),
+        ("POST", "/ask", {"Origin": "http://127.0.0.1:1"}, 403),
+        ("POST", "/ask", {"Content_Type": "text/plain"}, 415),
+        ("POST", "/ask", {"Content_Length": str(LARGEST + 1)}, 413),
+        ("POST", "/ask", {"Content_Length": "-1"}, 411),
+        ("POST", "/save", {}, 404),
+        ("PUT", "/ask", {}, 405),
+        ("DELETE", "/ask", {}, 405),
+        ("OPTIONS", "/ask", {}, 405),
+    ],
+)
+def test_the_server_refuses(
+    server: Server, method: str, path: str, headers: dict[str, str], status: int
+) -> None:
+    found, text, answered = send(server, method, path, b"{}" if method == "POST" else None, **headers)
+    assert found == status, text
+    assert server.token not in text
+    assert "Access-Control-Allow-Origin" not in answered
+
+
+def test_a_body_that_is_no_json_is_refused(server: Server) -> None:
+    assert send(server, "POST", "/ask", b"{" * 10)[0] == 400
+    assert send(server, "POST", "/ask", b"[" * 100_000)[0] == 400
+    assert send(server, "POST", "/ask", b'"ask"')[0] == 200
+
+
+def test_a_port_that_is_taken_is_one_sentence(server: Server) -> None:
+    with pytest.raises(InputError, match="--port"):
+        Server(server.session, server.server_port)
+
+
+# --- processes, and the page in a browser ---
+
+
+@pytest.mark.slow
+def test_workers_follow_the_newest_design_and_prove_it(tmp_path: Path) -> None:
+    session = Session(copied(tmp_path), tmp_path)
+    try:
+        for number, gain in enumerate((700.0, 710.0, 720.0)):
+            version = session.answer({"ask": "evaluate", "number": number, "values": {"pid.Kp.F_x": gain}})[
+                "version"
+            ]
+        found: dict[str, dict[str, Any]] = {}
+        after, until = 0, time.monotonic() + 60
+        while time.monotonic() < until and not {"proof", "run", "requirement"} <= set(found):
+            answer = session.answer({"ask": "news", "after": after})
+            after = answer["after"]
+            for item in answer["news"]:
+                assert item["version"] == version
+                found[item["kind"]] = item
+    finally:
+        session.close()
+    assert found["run"]["completed"]
+    assert found["requirement"]["holds"] in (True, False)
+    _, controller = model_and_controller(session.files.apply(session.edit).spec)
+    spec = session.files.spec
+    assert found["proof"]["lower"] == travel_margin(spec.plant, controller, spec.uncertainty).lower
+
+
+@pytest.mark.slow
+def test_the_command_prints_an_address_and_says_what_is_unsaved(tmp_path: Path) -> None:
+    design = copied(tmp_path)
+    command = [sys.executable, "-m", "malta", "app", str(design), "--no-browser"]
+    with subprocess.Popen(
+        command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        url = process.stdout.readline()
+        assert url.startswith("http://127.0.0.1:")
+        assert "token=" in url
+        host, token = url.split("/")[2], url.strip().rpartition("=")[2]
+        connection = http.client.HTTPConnection(host, timeout=30)
+        body = json.dumps({"ask": "evaluate", "number": 1, "values": {"pid.Kp.F_x": 700.0}})
+        headers = {"X-Malta-Token": token, "Content-Type": "application/json"}
+        connection.request("POST", "/ask", body, headers)
+        assert json.loads(connection.getresponse().read())["stable"]
+        connection.close()
+        process.send_signal(2)
+        said = process.stderr.read()
+    assert said == "malta: ended; not saved to halbach_pid.toml: pid.Kp.F_x\n"
+    assert process.returncode == 0

@@ -1,0 +1,344 @@
+"""The live page in headless Chromium, and as a widget; skipped where there is no browser."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import threading
+import time
+from collections.abc import Callable, Iterator
+from functools import partial
+from http.server import BaseHTTPRequestHandler, HTTPServer
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from test_app import copied
+
+import malta
+from malta.app.notebook import script
+from malta.app.server import Server
+from malta.app.session import Session
+from malta.files import shipped_path
+
+pytestmark = pytest.mark.slow
+FLAGS = (
+    *(
+        "--headless=new",
+        "--no-sandbox",
+        "--disable-gpu",
+        "--disable-quic",
+        "--no-first-run",
+        "--disable-sync",
+    ),
+    *("--disable-background-networking", "--disable-component-update", "--window-size=1280,800"),
+)
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+    """Headless Chromium with its log."""
+    webdriver = pytest.importorskip("selenium.webdriver")
+    from selenium.webdriver.chrome.options import Options
+    from selenium.webdriver.chrome.service import Service
+
+    chromium = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+    driver = shutil.which("chromedriver")
+    if chromium is None or driver is None:
+        pytest.skip("no chromium with its chromedriver")
+    options = Options()
+    options.binary_location = chromium
+    for flag in (*FLAGS, f"--user-data-dir={tmp_path_factory.mktemp('chromium')}"):
+        options.add_argument(flag)
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
+    opened = webdriver.Chrome(options=options, service=Service(driver))
+    try:
+        yield opened
+    finally:
+        opened.quit()
+
+
+@pytest.fixture
+def page(browser: Any, tmp_path: Path) -> Iterator[Any]:
+    """The page of a design, once its margin is proven."""
+    session = Session(copied(tmp_path), tmp_path)
+    with Server(session) as server:
+        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02})
+        thread.start()
+        try:
+            browser.get(server.url)
+            wait(lambda: "proven" in badge(browser))
+            yield browser
+            severe = [line for line in browser.get_log("browser") if line["level"] in ("SEVERE", "WARNING")]
+            assert severe == []
+        finally:
+            browser.get("about:blank")
+            server.shutdown()
+            thread.join()
+            session.close()
+
+
+def wait(is_so: Callable[[], Any], seconds: float = 60.0) -> Any:
+    """Wait until a condition holds, and return what it gave."""
+    until = time.monotonic() + seconds
+    while time.monotonic() < until:
+        found = is_so()
+        if found:
+            return found
+        time.sleep(0.05)
+    raise AssertionError(f"not so after {seconds:g} s")
+
+
+def find(browser: Any, selector: str) -> Any:
+    return browser.find_element("css selector", selector)
+
+
+def badge(browser: Any) -> str:
+    """The text of the badge; "" before there is one."""
+    return text(browser, ".badge b")
+
+
+def text(browser: Any, selector: str) -> str:
+    """The text of the first such element, at once: elements may be drawn anew meanwhile."""
+    return str(
+        browser.execute_script("return document.querySelector(arguments[0])?.textContent ?? ''", selector)
+    )
+
+
+def press(browser: Any, *keys: str) -> None:
+    from selenium.webdriver import ActionChains
+
+    ActionChains(browser).send_keys(*keys).perform()
+
+
+def row(browser: Any, label: str) -> tuple[Any, Any]:
+    """Slider and number field of a row in an open group."""
+    return tuple(
+        find(browser, f"details[open] [aria-label^='{label}']{kind}")
+        for kind in ("[type=range]", "[type=text]")
+    )
+
+
+def test_a_slider_moves_the_design_and_its_proof_follows(page: Any) -> None:
+    from selenium.webdriver.common.keys import Keys
+
+    first = badge(page)
+    assert first == "✓ proven 288.7 %"
+    slider, number = row(page, "stiffness")
+    assert number.get_attribute("value") == "647.02"
+    page.execute_script("arguments[0].focus()", slider)
+    press(page, *[Keys.ARROW_RIGHT] * 8)
+    assert float(number.get_attribute("value")) > 647.02
+    assert "proven" not in badge(page)  # from the very move on
+    wait(lambda: "not proven yet" in text(page, ".badge"))
+    wait(lambda: "proven" in badge(page) and badge(page) != first)
+    spec = malta.read_design(shipped_path("design", "halbach_pid.toml"))
+    assert float(badge(page).split()[-2]) < 288.7  # stiffer is less robust
+    assert spec.pid is not None
+    page.find_elements("css selector", ".tables, .card.table .tabs button")[2].click()
+    assert "pid.Kp.F_x" in text(page, ".tables")
+    press(page, Keys.CONTROL, "z")
+
+
+def test_undo_redo_and_reset_by_keys(page: Any) -> None:
+    from selenium.webdriver.common.keys import Keys
+
+    slider, number = row(page, "damping")
+    page.execute_script("arguments[0].focus()", slider)
+    press(page, Keys.ARROW_RIGHT)
+    wait(lambda: number.get_attribute("value") != "44.551")
+    moved = number.get_attribute("value")
+    press_with_control(page, "z")
+    wait(lambda: number.get_attribute("value") == "44.551")
+    press_with_control(page, "y")
+    wait(lambda: number.get_attribute("value") == moved)
+    page.execute_script("document.activeElement.blur()")
+    press(page, "r")
+    wait(lambda: number.get_attribute("value") == "44.551")
+    wait(lambda: "proven 288.7" in badge(page))  # also where a move comes back to where it began
+    press(page, "r")
+    time.sleep(0.5)
+    wait(lambda: "proven 288.7" in badge(page))
+
+
+def press_with_control(browser: Any, key: str) -> None:
+    from selenium.webdriver import ActionChains
+    from selenium.webdriver.common.keys import Keys
+
+    ActionChains(browser).key_down(Keys.CONTROL).send_keys(key).key_up(Keys.CONTROL).perform()
+
+
+def test_bad_numbers_are_one_sentence_and_the_last_picture_is_greyed(page: Any) -> None:
+    from selenium.webdriver.common.keys import Keys
+
+    _, number = row(page, "stiffness")
+    number.click()
+    number.send_keys(Keys.CONTROL, "a")
+    number.send_keys("stiff", Keys.ENTER)
+    wait(lambda: "expected a finite number in N/m" in text(page, ".message"))
+    number.send_keys(Keys.ESCAPE)
+    seek = find(page, ".seek")
+    seek.send_keys("machine.m")
+    mass = wait(lambda: find(page, "details[open] [aria-label^='m in kg']"))
+    mass.click()
+    mass.send_keys(Keys.CONTROL, "a")
+    mass.send_keys("-1", Keys.ENTER)
+    wait(lambda: "expected a finite number above 0 in kg" in text(page, ".message"))
+    assert "failed" in find(page, "#page").get_attribute("class")
+    assert badge(page) == "✗ no design"
+    press_with_control(page, "z")
+    wait(lambda: "failed" not in find(page, "#page").get_attribute("class"))
+    assert text(page, ".message") == ""
+
+
+def test_pins_are_compared_and_a_design_is_saved(page: Any, tmp_path: Path) -> None:
+    from selenium.webdriver.common.keys import Keys
+
+    page.execute_script("document.activeElement.blur()")
+    press(page, "p")
+    wait(lambda: len(page.find_elements("css selector", ".pin")) == 1)
+    slider, number = row(page, "integral")
+    page.execute_script("arguments[0].focus()", slider)
+    press(page, Keys.PAGE_UP)
+    wait(lambda: number.get_attribute("value") != "6846.1")
+    wait(lambda: "★" in text(page, ".tables"))
+    assert page.find_elements("css selector", ".line.faint")
+    gain = float(number.get_attribute("value"))
+    press_with_control(page, "s")
+    name = wait(lambda: find(page, "dialog.save input"))
+    name.send_keys(Keys.CONTROL, "a")
+    name.send_keys("design/mine.toml", Keys.ENTER)
+    wait(lambda: "wrote design/mine.toml" in text(page, ".message"))
+    spec = malta.read_design(tmp_path / "design" / "mine.toml")
+    assert spec.pid is not None
+    assert float(spec.pid.Ki[0]) == pytest.approx(gain, rel=1e-5)
+    assert text(page, "h1") == "mine"
+    press_with_control(page, "s")
+    name = wait(lambda: find(page, "dialog.save[open] input"))
+    name.send_keys(Keys.ENTER)
+    wait(lambda: "exists" in text(page, "dialog.save"))
+    press(page, Keys.ESCAPE)
+
+
+@pytest.mark.parametrize(("width", "height"), [(1280, 800), (390, 844)])
+def test_the_page_fits_its_window(page: Any, width: int, height: int) -> None:
+    size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
+    page.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+    try:
+        time.sleep(0.3)
+        wide, high = page.execute_script(
+            "const r = document.documentElement; return [r.scrollWidth, r.scrollHeight]"
+        )
+        assert wide <= width
+        assert high <= height
+        boxes = page.execute_script(
+            "return [...document.querySelectorAll('.chart')].map(c => [c.clientWidth, c.clientHeight])"
+        )
+        assert all(w > 200 and h > 130 for w, h in boxes)
+        if width == 1280:  # no chart is scrolled away
+            bottom = page.execute_script(
+                "return Math.max(...[...document.querySelectorAll('.card')].map(c => c.getBoundingClientRect().bottom))"
+            )
+            assert bottom <= height
+    finally:
+        page.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+
+
+def test_everything_has_a_name_for_screen_readers(page: Any) -> None:
+    nameless = page.execute_script(
+        """return [...document.querySelectorAll('input, button, select')].filter(e =>
+        !e.closest('[hidden]') && !e.textContent.trim() && !e.getAttribute('aria-label') && !e.labels?.length
+        ).map(e => e.outerHTML)"""
+    )
+    assert nameless == []
+
+
+# --- the widget ---
+
+HARNESS = b"""<!doctype html><meta charset="utf-8"><link rel="icon" href="data:,">
+<div id="here"></div><script type="module">
+import widget from "/bundle.js";
+let heard = () => {};
+const model = { get: () => 700, on: (_, f) => { heard = f; }, send: (message) => fetch("/message", {method: "POST",
+  body: JSON.stringify(message)}).then((r) => r.json()).then((m) => heard(m)) };
+widget.render({ model, el: document.getElementById("here") });
+</script>"""
+
+
+class _Harness(BaseHTTPRequestHandler):
+    """A notebook's side of the widget: its bundle, and messages to the session."""
+
+    def __init__(self, session: Session, *args: Any) -> None:
+        self.session = session
+        super().__init__(*args)
+
+    def do_GET(self) -> None:
+        bundle = self.path == "/bundle.js"
+        self._send("text/javascript" if bundle else "text/html", script().encode() if bundle else HARNESS)
+
+    def do_POST(self) -> None:
+        message = json.loads(self.rfile.read(int(self.headers["Content-Length"])))
+        answer = {"id": message["id"], "body": self.session.answer(message["body"])}
+        self._send("application/json", json.dumps(answer).encode())
+
+    def _send(self, kind: str, content: bytes) -> None:
+        self.send_response(200)
+        self.send_header("Content-Type", kind)
+        self.send_header("Content-Length", str(len(content)))
+        self.end_headers()
+        self.wfile.write(content)
+
+    def log_message(self, format: str, *args: Any) -> None:
+        """Say nothing."""
+
+
+def test_the_bundle_of_the_widget_draws_the_page(browser: Any, tmp_path: Path) -> None:
+    session = Session(copied(tmp_path), tmp_path)
+    with HTTPServer(("127.0.0.1", 0), partial(_Harness, session)) as server:
+        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02})
+        thread.start()
+        try:
+            browser.get(f"http://127.0.0.1:{server.server_port}/")
+            wait(lambda: "stable" in badge(browser))
+            assert len(browser.find_elements("css selector", ".chart svg .line")) > 3
+            assert [line for line in browser.get_log("browser") if line["level"] == "SEVERE"] == []
+        finally:
+            browser.get("about:blank")
+            server.shutdown()
+            thread.join()
+            session.close()
+
+
+def test_a_widget_answers_messages_and_is_told_the_proof(tmp_path: Path) -> None:
+    pytest.importorskip("anywidget")
+    design = copied(tmp_path)
+    widget = malta.app_widget(malta.read_design(design), folder=tmp_path)
+    sent: list[dict[str, Any]] = []
+    widget.send = sent.append
+    try:
+        widget._handle_custom_msg(
+            {"id": 1, "body": {"ask": "evaluate", "number": 1, "values": {"pid.Kp.F_x": 700.0}}}, []
+        )
+        assert sent[0]["id"] == 1
+        assert sent[0]["body"]["stable"]
+        proof = wait(
+            lambda: next((m["news"] for m in sent if m.get("news", {}).get("kind") == "proof"), None)
+        )
+    finally:
+        widget.close()
+    assert 2.0 < proof["lower"] <= proof["upper"]
+    assert dict(widget.session.edit.values) == {"pid.Kp.F_x": 700.0}
+    assert np.isfinite(proof["seconds"])
+
+
+def test_a_notebook_shows_the_widget(tmp_path: Path) -> None:
+    nbformat, nbclient = pytest.importorskip("nbformat"), pytest.importorskip("nbclient")
+    design = copied(tmp_path)
+    cell = nbformat.v4.new_code_cell(
+        f"import malta\nw = malta.app_widget({str(design)!r}, folder={str(tmp_path)!r})\nw"
+    )
+    ended = nbformat.v4.new_code_cell("w.close()")
+    notebook = nbformat.v4.new_notebook(cells=[cell, ended])
+    nbclient.NotebookClient(notebook, timeout=120).execute()
+    assert "application/vnd.jupyter.widget-view+json" in notebook.cells[0].outputs[0]["data"]
