@@ -8,9 +8,9 @@ machine moves by f(x, u, w + load(x)), and the controller is designed for f(x, u
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
-from functools import cached_property, partial
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Protocol
 
 import casadi as ca
@@ -440,7 +440,13 @@ def holding_forces(plant: Plant) -> FloatArray:
     i = plant.currents(plant.h(x, kind.zeros(len(plant.inputs))), v)
     rate = ca.densify(plant.f(x, plant.forces(x, i), plant.load(x)))
     residual = ca.Function("residual", [v], [rate, ca.jacobian(rate, v)])
-    return _inputs_at_rest(plant, residual, "it at rest", steps=30)
+
+    def rates(forces: FloatArray) -> tuple[FloatArray, FloatArray]:
+        r, J = (np.array(value) for value in residual(forces[0]))
+        return r.T, J[None]
+
+    (forces,) = _inputs_at_rest(plant, rates, ["it at rest"], steps=30)
+    return np.asarray(forces)
 
 
 def _hold(plant: Plant, states: FloatArray, *, loads_alone: bool = False) -> FloatArray:
@@ -451,30 +457,41 @@ def _hold(plant: Plant, states: FloatArray, *, loads_alone: bool = False) -> Flo
     if plant.second_order:
         for index in set(range(len(plant.states) // 2, len(plant.states))) - set(plant.controlled):
             rate[index] = 0  # an acceleration that no input holds
-    residual = ca.Function("residual", [x, u], [rate, ca.jacobian(rate, u)])
-    return np.array(
-        [
-            # f is affine in the inputs of most machines: the second step only polishes
-            _inputs_at_rest(plant, partial(residual, state), f"the state {state.tolist()}", steps=2)
-            for state in states
-        ]
-    )
+    size, count = len(plant.inputs), len(states)
+    residual = ca.Function("residual", [x, u], [rate, ca.jacobian(rate, u)]).map(count)
+
+    def rates(forces: FloatArray) -> tuple[FloatArray, FloatArray]:
+        r, J = (np.array(value) for value in residual(states.T, forces.T))
+        return r.T, J.reshape(-1, count, size).swapaxes(0, 1)
+
+    held = [f"the state {state.tolist()}" for state in states]
+    # f is affine in the inputs of most machines: the second step only polishes
+    return _inputs_at_rest(plant, rates, held, steps=2)
 
 
-def _inputs_at_rest(plant: Plant, residual: CasadiFn, held: str, *, steps: int) -> FloatArray:
-    """The inputs where the rates vanish, by at most so many steps of Newton's method.
+def _inputs_at_rest(
+    plant: Plant,
+    rates: Callable[[FloatArray], tuple[FloatArray, FloatArray]],
+    held: Sequence[str],
+    *,
+    steps: int,
+) -> FloatArray:
+    """The inputs where the rates vanish, by at most so many steps of Newton's method; one row for each state.
 
-    residual : inputs -> rates and their derivatives by the inputs
+    rates : rows of inputs -> rows of rates, and their derivatives by the inputs
 
     Raises CheckError, which names what is `held`, when some rate is left.
     """
-    u = np.zeros(len(plant.inputs))
+    u = np.zeros((len(held), len(plant.inputs)))
+    moving = np.ones(len(held), dtype=bool)
     for _ in range(steps):
-        r, J = (np.array(value) for value in residual(u))
-        if not r.any() or not np.isfinite(r).all():
-            break
-        u -= np.linalg.lstsq(J, r, rcond=None)[0].ravel()
-    left = float(np.abs(np.array(residual(u)[0])).max())
-    if not left <= 1e-9:  # m/s, rad/s, m/s2 or rad/s2
-        raise CheckError(f"{plant.name}: no input holds {held}: it changes at up to {left:.3g} (SI) a second")
+        r, J = rates(u)
+        moving &= r.any(axis=1) & np.isfinite(r).all(axis=1)
+        for k in np.flatnonzero(moving):
+            u[k] -= np.linalg.lstsq(J[k], r[k], rcond=None)[0]
+    left = np.abs(rates(u)[0]).max(axis=1)
+    for what, most in zip(held, left.tolist(), strict=True):
+        if not most <= 1e-9:  # m/s, rad/s, m/s2 or rad/s2
+            found = f"it changes at up to {most:.3g} (SI) a second"
+            raise CheckError(f"{plant.name}: no input holds {what}: {found}")
     return u

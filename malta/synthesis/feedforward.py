@@ -152,7 +152,9 @@ def static_feedforward(plant: Plant) -> Feedforward:
     if plant.has_stroke:
         half = max(V0_STEPS, round(plant.travel / V0_STEP))
         z_grid = np.linspace(-plant.travel, plant.travel, 2 * half + 1)
-        v0 = load_balance(plant, np.array([plant.at(**{plant.stroke: z}).x for z in z_grid]))
+        along = np.tile(plant.state({}), (len(z_grid), 1))
+        along[:, plant.stroke_state] = z_grid
+        v0 = load_balance(plant, along)
     else:
         z_grid = np.array([0.0, 1.0])
         v0 = np.tile(holding_forces(plant), (2, 1))
