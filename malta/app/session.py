@@ -14,12 +14,13 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from malta.app.faults import describe_error
 from malta.app.files import DesignFiles, Edit, open_design
 from malta.app.follow import Worker
 from malta.app.picture import Problem, View, picture, solve
 from malta.app.runs import run_names
 from malta.app.saving import TakenError, default_file, inside, save_design, save_gains
-from malta.errors import CheckError, InputError, shorten
+from malta.errors import InputError, shorten
 from malta.synthesis.requirements import requirements_for
 from malta.tuning.search import base_of
 
@@ -80,12 +81,8 @@ class Session:
             if not isinstance(body, dict) or body.get("ask") not in doors:
                 raise InputError("malta app", "ask", "another document", "one of " + ", ".join(doors))
             return doors[body["ask"]](body)
-        except (InputError, CheckError) as error:
-            return {"error": shorten(str(error))}
-        except ArithmeticError as error:
-            return {"error": shorten(f"numbers beyond what can be computed ({error})")}
-        except MemoryError:
-            return {"error": "more was asked for than this computer has memory for"}
+        except Exception as error:
+            return {"error": shorten(describe_error(error))}
 
     # --- what the page asks ---
 
@@ -128,8 +125,8 @@ class Session:
             version = self._version if same else self._supersede()
             try:
                 document, problem = self._picture(edit, view)
-            except (InputError, CheckError, ArithmeticError) as error:
-                return {"number": number, "version": version, "error": shorten(str(error))}
+            except Exception as error:
+                return {"number": number, "version": version, "error": shorten(describe_error(error))}
             margin = document["margin"] is None and bool(problem.spec.uncertainty)
             self._follow_later(edit, view, {"check"} if same else {"check", "prove"}, margin=margin)
             spent = {"wall": time.perf_counter() - began, "cpu": time.thread_time() - cpu}

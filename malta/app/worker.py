@@ -17,10 +17,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from malta.app.faults import describe_error
 from malta.app.files import DesignFiles, Edited, open_design
 from malta.app.picture import Problem, View, curves, margin_document, solve
 from malta.app.runs import planned_run
-from malta.errors import CheckError, InputError
+from malta.errors import CheckError, InputError, shorten
 from malta.margins.rays import ray_bound
 from malta.margins.travel import travel_loops, travel_margin
 from malta.simulation.simulate import simulate
@@ -115,8 +116,18 @@ def work(message: Message, opened: DesignFiles, newer: Newer) -> Iterator[dict[s
         problem = solve(edited)
         yield from replies(problem, edited, message, newer)
         yield {"kind": "done"}
-    except (InputError, CheckError, ArithmeticError) as error:
-        yield {"kind": "failed", "error": str(error)}
+    except SupersededError:
+        raise
+    except Exception as error:
+        yield failure(message, error)
+
+
+def failure(message: Message, error: Exception) -> dict[str, Any]:
+    """What ended the work, in a sentence: nothing is proven then."""
+    sentence = shorten(describe_error(error))
+    if message["task"] == "prove":
+        return {"kind": "proof", "lower": None, "upper": None, "frequency": None, "reason": sentence}
+    return {"kind": "failed", "error": sentence}
 
 
 class _Inbox:
@@ -159,8 +170,8 @@ def main() -> None:
                 say(message, reply)
         except SupersededError:
             continue
-        except (InputError, CheckError) as error:
-            say(message, {"kind": "failed", "error": str(error)})
+        except Exception as error:
+            say(message, failure(message, error))
 
 
 def open_message(message: Message) -> DesignFiles:
