@@ -86,6 +86,12 @@ DAMAGED: dict[str, tuple[str, str, Change]] = {
     "a long delay": ("design", "robust", lambda c: c.update(delay=11)),
     "uncertainty of 100 %": ("design", "halbach_pid", lambda c: c["uncertainty"].update(m=1.0)),
     "correlation of 1": ("design", "robust", lambda c: c["noise"]["correlation"].update(x=1)),
+    "a published text": ("design", "table2", lambda c: c.update(summary={"published": "table_I.unit"})),
+    "a published table of tables": (
+        "design",
+        "table2",
+        lambda c: c.update(weights={"published": "table_II"}),
+    ),
     "a text for a switch": ("design", "robust", lambda c: c.update(current_lag="yes")),
     "a range from 0": ("design", "robust", lambda c: c["search"]["numbers"]["tilt"].update(low=0)),
     "a name with a slash": ("design", "robust", lambda c: c.update(name="a/b")),
@@ -196,7 +202,7 @@ def test_schemas_of_a_machine_know_its_names() -> None:
     content["specification"]["payloads"] = content["specification"].pop("payload")
     assert len(faults("design", content)) == 0
     places = {fault.split(":")[0] for fault in faults("design", content, spec.plant)}
-    assert places == {"$.weights", "$.uncertainty", "$.specification"}
+    assert places == {"$.weights.state", "$.uncertainty", "$.specification"}
     data = load_toml(ROOT / "data" / "tubular.toml")
     data["parameters"]["mass"] = data["parameters"].pop("m")
     assert faults("data", data) == []

@@ -57,7 +57,6 @@ def design_schema(plant: Plant | None = None) -> Schema:
         _name_signals(schema, plant)
     schema = changed(schema, _or_published)
     schema["$defs"]["Published"] = PUBLISHED
-    schema["properties"]["machine"]["anyOf"].pop()  # the path is read before anything is looked up
     laws = {
         "if": {"required": ["pid"]},
         "then": {"properties": dict.fromkeys(ONLY_LQG, False)},
@@ -108,13 +107,36 @@ def _name_signals(schema: Schema, plant: Plant) -> None:
 
 
 def _or_published(node: Schema) -> Schema:
-    """Allow a reference to a published figure for each entry of a table; those of lists are not looked up."""
+    """Allow a reference to a published figure in the place of a number, a quantity, or a table of them.
+
+    Entries of lists are not looked up.
+    """
     node = dict(node)
     if "properties" in node:
-        node["properties"] = {name: _alternative(inner) for name, inner in node["properties"].items()}
-    if isinstance(node.get("additionalProperties"), dict):
+        node["properties"] = {
+            name: _alternative(inner) if _is_numeric(inner) else inner
+            for name, inner in node["properties"].items()
+        }
+    if isinstance(node.get("additionalProperties"), dict) and _is_numeric(node["additionalProperties"]):
         node["additionalProperties"] = _alternative(node["additionalProperties"])
     return node
+
+
+NUMERIC = (
+    "Quantity",
+    "BoundsTable",
+    "RecoveryTable",
+    "Specification",
+)  # tables of quantities, and quantities
+
+
+def _is_numeric(node: Schema) -> bool:
+    """Whether a number, a quantity or a table of them may stand where this schema is."""
+    inside = [*node.get("anyOf", ()), *node.get("properties", {}).values()]
+    if isinstance(node.get("additionalProperties"), dict):
+        inside.append(node["additionalProperties"])
+    name = str(node.get("$ref", "")).rpartition("/")[2]
+    return node.get("type") in ("number", "integer") or name in NUMERIC or any(map(_is_numeric, inside))
 
 
 def _alternative(node: Schema) -> Schema:

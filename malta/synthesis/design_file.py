@@ -408,11 +408,24 @@ def _resolve(
                     source = machine_file.parent / "published" / machine_file.name
                     raise InputError(where, field, repr(node["published"]), f"a table of {source}")
                 found = found[key]
+            if not _is_numeric(found):
+                expected = "the name of a number, a quantity or a table of them"
+                raise InputError(where, field, repr(node["published"]), expected)
             return found
         return {
             k: _resolve(v, printed, machine_file, where, f"{field}.{k}".lstrip(".")) for k, v in node.items()
         }
     return node
+
+
+def _is_numeric(found: Any) -> bool:
+    """Whether a published entry is a number, a quantity, or a table of them."""
+
+    def is_number(value: Any) -> bool:
+        number = isinstance(value, int | float) and not isinstance(value, bool)
+        return number or (isinstance(value, dict) and "value" in value)
+
+    return is_number(found) or (isinstance(found, dict) and all(map(is_number, found.values())))
 
 
 def _operating_point(entries: Mapping[str, Quantity], plant: Plant, where: Path) -> dict[str, float]:
