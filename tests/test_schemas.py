@@ -175,7 +175,7 @@ def check_edits(name: str, stem: str, count: int, folder: Path) -> int:
     ("name", "stem"), [("design", "halbach_pid"), ("data", "halbach"), ("gain", "halbach")]
 )
 def test_what_the_schema_refuses_the_reader_refuses(name: str, stem: str, tmp_path: Path) -> None:
-    assert check_edits(name, stem, 20, tmp_path) > 3
+    assert check_edits(name, stem, 12, tmp_path) > 1
 
 
 @pytest.mark.slow
