@@ -2,13 +2,15 @@
 
 ```{public-names} margins        names of malta that come from this package, or those of a module as malta.report
 ```{commands}                    every command of the program with its help
-```{entries} gain                the tables of a file or of a command's output, from its schema
+```{entries} gain                the tables of a file, from its schema
+```{outputs}                     those of every document that a command prints with --json
 """
 
 from __future__ import annotations
 
 import inspect
 import os
+import re
 from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -93,8 +95,11 @@ class Entries(SphinxDirective):
 
     def run(self) -> list[nodes.Node]:
         """Write the table of the file itself, and a section for each of its tables, in the order of their use."""
-        kind = self.arguments[0]
-        tables = tables_of(schemas()[kind]())
+        return self.entries(self.arguments[0])
+
+    def entries(self, kind: str) -> list[nodes.Node]:
+        """Write the tables of one schema."""
+        tables = tables_of(SCHEMAS[kind]())
         places = {name: place for name, place, _ in tables}
         found: list[nodes.Node] = [self._download(kind)]
         for name, place, table in tables:
@@ -113,6 +118,24 @@ class Entries(SphinxDirective):
         file = "../" * self.env.docname.count("/") + f"schemas/{kind}.json"
         link = nodes.reference("", f"schemas/{kind}.json", refuri=file, internal=False)
         return nodes.paragraph("", "", nodes.Text("As a JSON schema: "), link, nodes.Text("."))
+
+
+class Outputs(Entries):
+    """The documents that commands print, each in a section."""
+
+    required_arguments = 0
+
+    def run(self) -> list[nodes.Node]:
+        """Write a section for each document, under the command that its description names."""
+        found: list[nodes.Node] = []
+        for name in MODELS:
+            command = re.search(r"`([^`]+)`", str(output_schema(name).get("description")))
+            words = name if command is None else command[1]
+            title = nodes.title("", "", nodes.literal("", words))
+            section = nodes.section("", title, *self.entries(name), names=[name])
+            self.state.document.note_explicit_target(section)
+            found.append(section)
+        return found
 
 
 def _rows(table: dict[str, Any], file: str, places: dict[str, str]) -> list[str]:
@@ -157,9 +180,9 @@ def tables_of(whole: dict[str, Any]) -> list[tuple[str, str, dict[str, Any]]]:
 UNLISTED = ("Published", "Columns")  # explained in words
 
 
-def schemas() -> dict[str, Callable[[], dict[str, Any]]]:
-    """Functions that make the schemas of files and of the documents that commands print, by name."""
-    return malta.schemas.SCHEMAS | {name: partial(output_schema, name) for name in MODELS}
+SCHEMAS: dict[str, Callable[[], dict[str, Any]]] = malta.schemas.SCHEMAS | {
+    name: partial(output_schema, name) for name in MODELS
+}
 
 
 def _kind(entry: dict[str, Any], file: str, places: dict[str, str]) -> str:
@@ -228,7 +251,7 @@ def publish_schemas(app: Sphinx, error: Exception | None) -> None:
         return
     folder = app.outdir / "schemas"
     folder.mkdir(exist_ok=True)
-    for name, make in schemas().items():
+    for name, make in SCHEMAS.items():
         (folder / f"{name}.json").write_text(json_text(make()) + "\n", encoding="utf-8")
 
 
@@ -237,6 +260,7 @@ def setup(app: Sphinx) -> dict[str, Any]:
     app.add_directive("public-names", PublicNames)
     app.add_directive("commands", Commands)
     app.add_directive("entries", Entries)
+    app.add_directive("outputs", Outputs)
     app.connect("autodoc-process-docstring", convert)
     app.connect("missing-reference", resolve)
     app.connect("build-finished", publish_schemas)

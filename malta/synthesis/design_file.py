@@ -11,7 +11,7 @@ import hashlib
 import json
 import math
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
@@ -31,6 +31,7 @@ from malta.synthesis.design_tables import (
     SearchTable,
     specification_table,
 )
+from malta.synthesis.published_entries import with_published
 from malta.synthesis.quantities import bases, numbers, ordered, positive, variances
 from malta.synthesis.recovery import RecoveryBound, recovery_bounds
 from malta.synthesis.requirements import Requirement, requirements_for
@@ -86,7 +87,7 @@ def resolved(raw: Mapping[str, Any], path: Path) -> dict[str, Any]:
     """
     machine_file = machine_file_of(raw, path)
     printed = cache(partial(published, machine_file))  # read once, and only where something refers to it
-    found: dict[str, Any] = _resolve(raw, printed, machine_file, path)
+    found: dict[str, Any] = with_published(raw, printed, machine_file, path)
     return found
 
 
@@ -394,38 +395,6 @@ def _stands(entry: str, raw: Mapping[str, Any]) -> bool:
     for key in entry.split("."):
         node = node.get(key) if isinstance(node, Mapping) else None
     return node is not None and (not isinstance(node, Mapping) or "value" in node)
-
-
-def _resolve(
-    node: Any, printed: Callable[[], dict[str, Any]], machine_file: Path, where: Path, field: str = ""
-) -> Any:
-    """Put the published numbers in the place of every `{ published = "..." }`."""
-    if isinstance(node, dict):
-        if set(node) == {"published"}:
-            found: Any = printed()
-            for key in str(node["published"]).split("."):
-                if not isinstance(found, dict) or key not in found:
-                    source = machine_file.parent / "published" / machine_file.name
-                    raise InputError(where, field, repr(node["published"]), f"a table of {source}")
-                found = found[key]
-            if not _is_numeric(found):
-                expected = "the name of a number, a quantity or a table of them"
-                raise InputError(where, field, repr(node["published"]), expected)
-            return found
-        return {
-            k: _resolve(v, printed, machine_file, where, f"{field}.{k}".lstrip(".")) for k, v in node.items()
-        }
-    return node
-
-
-def _is_numeric(found: Any) -> bool:
-    """Whether a published entry is a number, a quantity, or a table of them."""
-
-    def is_number(value: Any) -> bool:
-        number = isinstance(value, int | float) and not isinstance(value, bool)
-        return number or (isinstance(value, dict) and "value" in value)
-
-    return is_number(found) or (isinstance(found, dict) and all(map(is_number, found.values())))
 
 
 def _operating_point(entries: Mapping[str, Quantity], plant: Plant, where: Path) -> dict[str, float]:
