@@ -11,8 +11,6 @@ from __future__ import annotations
 import inspect
 import os
 import re
-from collections.abc import Callable
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from docstrings import restructured
@@ -23,8 +21,7 @@ from sphinx.util.docutils import SphinxDirective
 from typer.main import get_command
 from typer.testing import CliRunner
 
-import malta
-from malta.cli.documents.published import MODELS, output_schema
+from malta.cli.documents.published import ALL_SCHEMAS, MODELS
 from malta.cli.main import app as program
 from malta.files import json_text
 
@@ -99,7 +96,7 @@ class Entries(SphinxDirective):
 
     def entries(self, kind: str) -> list[nodes.Node]:
         """Write the tables of one schema."""
-        tables = tables_of(SCHEMAS[kind]())
+        tables = tables_of(ALL_SCHEMAS[kind]())
         places = {name: place for name, place, _ in tables}
         found: list[nodes.Node] = [self._download(kind)]
         for name, place, table in tables:
@@ -129,7 +126,7 @@ class Outputs(Entries):
         """Write a section for each document, under the command that its description names."""
         found: list[nodes.Node] = []
         for name in MODELS:
-            command = re.search(r"`([^`]+)`", str(output_schema(name).get("description")))
+            command = re.search(r"`([^`]+)`", str(ALL_SCHEMAS[name]().get("description")))
             words = name if command is None else command[1]
             title = nodes.title("", "", nodes.literal("", words))
             section = nodes.section("", title, *self.entries(name), names=[name])
@@ -178,11 +175,6 @@ def tables_of(whole: dict[str, Any]) -> list[tuple[str, str, dict[str, Any]]]:
 
 
 UNLISTED = ("Published", "Columns")  # explained in words
-
-
-SCHEMAS: dict[str, Callable[[], dict[str, Any]]] = malta.schemas.SCHEMAS | {
-    name: partial(output_schema, name) for name in MODELS
-}
 
 
 def _kind(entry: dict[str, Any], file: str, places: dict[str, str]) -> str:
@@ -251,7 +243,7 @@ def publish_schemas(app: Sphinx, error: Exception | None) -> None:
         return
     folder = app.outdir / "schemas"
     folder.mkdir(exist_ok=True)
-    for name, make in SCHEMAS.items():
+    for name, make in ALL_SCHEMAS.items():
         (folder / f"{name}.json").write_text(json_text(make()) + "\n", encoding="utf-8")
 
 

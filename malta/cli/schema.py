@@ -18,7 +18,7 @@ def schema(
     Example:  malta schema verify-output
               malta schema design > design.schema.json
     """
-    from malta.cli.documents.published import NAMES, schema_of
+    from malta.cli.documents.published import ALL_SCHEMAS, schema_of
     from malta.files import json_text
 
-    print("\n".join(NAMES) if name is None else json_text(schema_of(name)))
+    print("\n".join(ALL_SCHEMAS) if name is None else json_text(schema_of(name)))

@@ -1,7 +1,9 @@
-"""The JSON schemas of the documents, made of their models."""
+"""The JSON schemas of the documents, made of their models, and of the files that malta reads."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from malta.cli.documents.campaigns import (
@@ -18,7 +20,7 @@ from malta.cli.documents.parts import Part
 from malta.cli.documents.plots import PlotOutput
 from malta.cli.documents.simulations import DesignOutput, SimulateOutput
 from malta.errors import InputError
-from malta.schemas import SCHEMAS, schema
+from malta.schemas import SCHEMAS
 from malta.schemas.parts import DRAFT
 
 MODELS: dict[str, type[Part]] = {
@@ -38,7 +40,6 @@ MODELS: dict[str, type[Part]] = {
     "export-output": ExportOutput,
     "claims-output": ClaimsOutput,
 }
-NAMES = (*SCHEMAS, *MODELS)  # of all schemas
 
 
 def output_schema(name: str) -> dict[str, Any]:
@@ -50,12 +51,17 @@ def output_schema(name: str) -> dict[str, Any]:
     return {"$schema": DRAFT} | MODELS[name].model_json_schema(mode="serialization")
 
 
+ALL_SCHEMAS: dict[str, Callable[[], dict[str, Any]]] = SCHEMAS | {
+    name: partial(output_schema, name) for name in MODELS
+}  # of files and of documents, by name
+
+
 def schema_of(name: str) -> dict[str, Any]:
     """The JSON schema of a kind of file or of a document. Raises InputError for an unknown name.
 
     >>> schema_of("data")["required"]
     ['machine', 'parameters']
     """
-    if name not in NAMES:
-        raise InputError("schema", "", repr(name), "one of " + ", ".join(NAMES))
-    return schema(name) if name in SCHEMAS else output_schema(name)
+    if name not in ALL_SCHEMAS:
+        raise InputError("schema", "", repr(name), "one of " + ", ".join(ALL_SCHEMAS))
+    return ALL_SCHEMAS[name]()
