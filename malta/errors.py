@@ -62,9 +62,10 @@ class CheckError(ArithmeticError):
     The command line prints its sentence and exits with code 1.
 
     >>> import malta
-    >>> cart = malta.linear_machine([[0, 1], [0, 0]], [[0], [0]], [[1, 0]])  # no force on it
+    >>> cart = malta.linear_machine([[0, 1], [0, 0]], [[0], [0]], [[1, 0]])  # B = 0
+    >>> model = malta.linearize(cart, cart.at())
     >>> try:
-    ...     malta.lqr(malta.linearize(cart, cart.at()), malta.weights([1, 1], [1], [1], [1]))
+    ...     malta.lqr(model, malta.weights([1, 1], [1], [1], [1]))
     ... except malta.CheckError as error:
     ...     print(str(error).partition(" (")[0])
     LQR: no stabilizing solution

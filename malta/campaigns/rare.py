@@ -95,8 +95,11 @@ def rare_event(
     >>> import malta
     >>> spec = malta.read_design("examples/ball/design/ball.toml")
     >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
-    >>> plan = malta.Plan(controller, "disturbance", {"m": 0.2}, samples=100, options={"duration": 0.02})
-    >>> event = malta.rare_event(plan, malta.limit_of(plan, "deviation-y", 40e-6), workers=1)
+    >>> short = {"duration": 0.02}  # s
+    >>> box = {"m": 0.2}
+    >>> plan = malta.Plan(controller, "disturbance", box, samples=100, options=short)
+    >>> limit = malta.limit_of(plan, "deviation-y", 40e-6)
+    >>> event = malta.rare_event(plan, limit, workers=1)
     >>> 1e-4 < event.found.probability < 1
     True
     >>> f"{len(event.found.levels)} level(s), {event.found.simulated} runs"

@@ -41,7 +41,8 @@ class Campaign:
 
     >>> import malta
     >>> controller = malta.gains.read("design/gains/calibrated.json")
-    >>> plan = malta.Plan(controller, "hold", {"m": 0.1}, samples=5, options={"duration": 0.01})
+    >>> short = {"duration": 0.01}  # s
+    >>> plan = malta.Plan(controller, "hold", {"m": 0.1}, samples=5, options=short)
     >>> found = malta.campaign(plan, workers=1)
     >>> found.names, found.values.shape, found.ends
     (('m',), (5, 1), {'completed': 5})

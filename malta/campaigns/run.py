@@ -102,7 +102,8 @@ def campaign(
 
     >>> import malta
     >>> controller = malta.gains.read("design/gains/calibrated.json")
-    >>> plan = malta.Plan(controller, "hold", {"m": 0.1}, samples=5, options={"duration": 0.01})
+    >>> short = {"duration": 0.01}  # s
+    >>> plan = malta.Plan(controller, "hold", {"m": 0.1}, samples=5, options=short)
     >>> found = malta.campaign(plan, workers=1)
     >>> found.rate.passed, found.rate.runs
     (5, 5)

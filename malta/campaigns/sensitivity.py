@@ -83,7 +83,7 @@ def sensitivity(
     >>> plan = malta.Plan(controller, "disturbance", box, samples=64, options=options)
     >>> found = malta.sensitivity(plan, malta.limit_of(plan, "touchdown"), workers=1)
     >>> mass, constant = found.of_merits["deviation y"]
-    >>> found.factors, constant.total > mass.total  # the magnets matter more than the mass
+    >>> found.factors, constant.total > mass.total  # magnets matter more
     (('m', 'C'), True)
     """
     sampling, analysis = _salib()

@@ -61,10 +61,11 @@ def summarize(
 
     >>> import malta
     >>> controller = malta.gains.read("design/gains/calibrated.json")
-    >>> plan = malta.Plan(controller, "hold", {"m": 0.1}, samples=16, options={"duration": 0.01})
+    >>> short = {"duration": 0.01}  # s
+    >>> plan = malta.Plan(controller, "hold", {"m": 0.1}, samples=16, options=short)
     >>> rate = malta.summarize(plan, workers=1).rate
-    >>> f"{rate.passed} of {rate.runs}, so that with 95 % confidence the rate is above {rate.low:.2f}"
-    '16 of 16, so that with 95 % confidence the rate is above 0.79'
+    >>> f"{rate.passed} of {rate.runs}; with 95 % confidence above {rate.low:.2f}"
+    '16 of 16; with 95 % confidence above 0.79'
     """
     session = Session(workers, cluster, block, progress)
     with campaign_folder(plan, folder, session) as (place, size):

@@ -86,8 +86,11 @@ def tolerances(
     >>> import malta
     >>> spec = malta.read_design("examples/ball/design/ball.toml")
     >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
-    >>> plan = malta.Plan(controller, "disturbance", {"m": 0.1}, samples=20, options={"duration": 0.02})
-    >>> found = malta.tolerances(plan, malta.limit_of(plan, "deviation-y", 50e-6), 0.95, workers=1)
+    >>> short = {"duration": 0.02}  # s
+    >>> box = {"m": 0.1}
+    >>> plan = malta.Plan(controller, "disturbance", box, samples=20, options=short)
+    >>> limit = malta.limit_of(plan, "deviation-y", 50e-6)
+    >>> found = malta.tolerances(plan, limit, 0.95, workers=1)
     >>> found.today.share, found.spreads[0].name, found.spreads[0].factor > 1
     (1.0, 'm', True)
     """

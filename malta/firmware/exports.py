@@ -41,7 +41,8 @@ def export_c(
     Raises InputError for a folder that has files, an unknown precision, and duty cycles of a machine without windings.
 
     >>> import malta
-    >>> files = malta.export_c("design/gains/tubular_pid.json", "build/pid_c", until="currents")
+    >>> gains = "design/gains/tubular_pid.json"
+    >>> files = malta.export_c(gains, "build/pid_c", until="currents")
     >>> [file.name for file in files if file.suffix == ".h"]
     ['tubular_pid.h', 'tubular_pid_supervisor.h']
     """
@@ -72,7 +73,8 @@ def export_fmu(
 
     >>> import malta
     >>> from zipfile import ZipFile
-    >>> _ = malta.export_fmu("design/gains/calibrated.json", "build/calibrated.fmu", fmi=3)
+    >>> gains = "design/gains/calibrated.json"
+    >>> note = malta.export_fmu(gains, "build/calibrated.fmu", fmi=3)
     >>> "modelDescription.xml" in ZipFile("build/calibrated.fmu").namelist()
     True
     """

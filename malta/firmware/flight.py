@@ -75,8 +75,10 @@ def engine_of_c(
     >>> import malta
     >>> controller = malta.gains.read("design/gains/calibrated.json")
     >>> plant = malta.plant_of(controller.parameters)
-    >>> hold = malta.Scenario("hold", 2e-3, malta.references.hold, start={"x": 20e-6}, fidelity="force")
-    >>> flown = malta.simulate(plant, controller, hold, engine=malta.engine_of_c("double"))
+    >>> off = {"x": 20e-6}  # m
+    >>> hold = malta.Scenario("hold", 2e-3, malta.references.hold, off, fidelity="force")
+    >>> exported = malta.engine_of_c("double")
+    >>> flown = malta.simulate(plant, controller, hold, engine=exported)
     >>> run = malta.simulate(plant, controller, hold)
     >>> flown.engine, bool(abs(flown.v - run.v).max() < 1e-9)  # N
     ('exported C, double', True)

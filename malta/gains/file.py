@@ -163,10 +163,13 @@ def write(controller: Controller, margins: Margins, *paths: str | Path) -> None:
     stable.
 
     >>> import malta
-    >>> cart = malta.linear_machine([[0, 1], [400, 0]], [[0], [2]], [[1, 0]], name="cart")
+    >>> A, B, C = [[0, 1], [400, 0]], [[0], [2]], [[1, 0]]
+    >>> cart = malta.linear_machine(A, B, C, name="cart")
     >>> model = malta.linearize(cart, cart.at())
-    >>> controller = malta.lqg(model, malta.weights([1e6, 0], [1], [1e-2], [1e-12]), Ts=1e-3)
-    >>> malta.gains.write(controller, malta.verify(model, controller), "build/cart.json", "build/cart.mat")
+    >>> weights = malta.weights([1e6, 0], [1], [1e-2], [1e-12])
+    >>> controller = malta.lqg(model, weights, Ts=1e-3)
+    >>> margins = malta.verify(model, controller)
+    >>> malta.gains.write(controller, margins, "build/cart.json", "build/cart.mat")
     >>> malta.gains.read("build/cart.mat").K.shape
     (1, 2)
     """
@@ -188,7 +191,8 @@ def file_contents(controller: Controller, margins: Margins, *paths: str | Path) 
     >>> spec = malta.read_design("examples/ball/design/ball.toml")
     >>> model = malta.linearize(spec.plant, spec.plant.at())
     >>> controller = malta.synthesize(spec, model)
-    >>> files = malta.gains.file_contents(controller, malta.verify(model, controller), "ball.json", "ball.mat")
+    >>> margins = malta.verify(model, controller)
+    >>> files = malta.gains.file_contents(controller, margins, "ball.json", "ball.mat")
     >>> [path.name for path in files]
     ['ball.json', 'ball.mat']
     """

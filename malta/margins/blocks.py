@@ -49,9 +49,9 @@ class Dynamic:
     channel : counted from 0; several of them, as a tuple, share one full block; of an additive block (sensors, forces)
 
     >>> import control, malta
-    >>> flexible = malta.Dynamic(control.tf([1 / 500, 0.1], [1 / 5000, 1]))  # 10 %, from 50 rad/s on more
+    >>> W = control.tf([1 / 500, 0.1], [1 / 5000, 1])  # 10 %, from 50 rad/s on more
     >>> motor = malta.uncertain(lambda k: ([[-1.0]], [[k]], [[1.0]]), {"k": 1.0})
-    >>> found = malta.dynamic_margin(motor, [[-2.0]], {"k": 0.2}, flexible)
+    >>> found = malta.dynamic_margin(motor, [[-2.0]], {"k": 0.2}, malta.Dynamic(W))
     >>> f"{found.lower:.2f}"
     '6.51'
     """

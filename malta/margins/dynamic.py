@@ -91,8 +91,8 @@ def dynamic_margin(
 
     >>> import malta
     >>> motor = malta.uncertain(lambda k: ([[-1.0]], [[k]], [[1.0]]), {"k": 1.0})
-    >>> found = malta.dynamic_margin(motor, [[-2.0]], {}, malta.Dynamic(0.5))  # |T| = 2 / 3 at w = 0
-    >>> round(found.upper, 3)
+    >>> found = malta.dynamic_margin(motor, [[-2.0]], {}, malta.Dynamic(0.5))
+    >>> round(found.upper, 3)  # |T| = 2 / 3 at w = 0
     3.0
     """
     begun = clock.monotonic()

@@ -65,8 +65,9 @@ class Gain:
 
     >>> import malta
     >>> motor = malta.uncertain(lambda k: ([[-1.0]], [[k]], [[1.0]]), {"k": 1.0})
-    >>> found = malta.worst_case_gain(motor, [[-2.0]], {"k": 0.5}, of="compliance", channel=(0, 0))
-    >>> f"{found.lower:.3f} at k = {found.witness['k']}"  # k / (s + 1 + 2 k), k from 0.5 to 1.5
+    >>> box = {"k": 0.5}  # k from 0.5 to 1.5
+    >>> found = malta.worst_case_gain(motor, [[-2]], box, of="compliance", channel=(0, 0))
+    >>> f"{found.lower:.3f} at k = {found.witness['k']}"  # k / (s + 1 + 2 k)
     '0.375 at k = 1.5'
     """
 

@@ -68,7 +68,8 @@ class Recovery:
 
     >>> import malta
     >>> controller = malta.gains.read("design/gains/calibrated.json")
-    >>> found = malta.recovery(malta.plant_of(controller.parameters), controller, {"payload": {"F_z": -2.0}})
+    >>> plant = malta.plant_of(controller.parameters)
+    >>> found = malta.recovery(plant, controller, {"payload": {"F_z": -2.0}})
     >>> z = found[0].outputs[-1]
     >>> f"{found[0].name} moves {z.output} by {z.largest * 1e6:.0f} um"
     'payload moves z by 707 um'

@@ -85,9 +85,11 @@ class Margin:
     reason : why nothing, or less than asked for, is proven
 
     >>> import malta
-    >>> found = malta.margin_of_polynomial(lambda k: [1, 3, 3, 1 + k], {"k": 0.5}, {"k": 1})
-    >>> f"{found.lower:.2f} <= t* <= {found.upper:.2f} at k = {found.witness['k']:.2f}"
-    '4.00 <= t* <= 4.00 at k = -1.00'
+    >>> def cubic(k):  # stable from -1 to 8
+    ...     return [1, 3, 3, 1 + k]
+    >>> found = malta.margin_of_polynomial(cubic, {"k": 0.5}, {"k": 1})
+    >>> f"proven {found.lower:.2f}, lost at k = {found.witness['k']:.2f}"
+    'proven 4.00, lost at k = -1.00'
     """
 
     lower: float | None
@@ -150,8 +152,9 @@ def robust_margin(
     >>> def cart(m, k):
     ...     return [[0, 1], [-k / m, -0.2 / m]], [[0], [1 / m]], [[1, 0]]
     >>> spring = malta.uncertain(cart, {"m": 1, "k": 4})
-    >>> found = malta.robust_margin(spring, [[2.0]], {"m": 0.2, "k": 0.1})  # F = +2 N/m: pushes away from rest
-    >>> f"{found.lower:.2f} {found.upper:.2f} {found.witness['k']:.2f}"  # stable while k > 2
+    >>> push = [[2.0]]  # F = +2 N/m, away from rest: stable while k > 2
+    >>> found = malta.robust_margin(spring, push, {"m": 0.2, "k": 0.1})
+    >>> f"{found.lower:.2f} {found.upper:.2f} {found.witness['k']:.2f}"
     '5.00 5.00 2.00'
     """
     effort = Effort(tolerance, time, most_cells, progress)
@@ -271,8 +274,11 @@ def margin_of_polynomial(
     Raises InputError as `malta.robust_margin` does.
 
     >>> import malta
-    >>> malta.margin_of_polynomial(lambda k: [1, 3, 3, 1 + k], {"k": (1, 2)}, {"k": 1}).upper.__round__(6)
-    7.0
+    >>> def cubic(k):  # stable while k < 8
+    ...     return [1, 3, 3, 1 + k]
+    >>> found = malta.margin_of_polynomial(cubic, {"k": (1, 2)}, {"k": 1})
+    >>> f"{found.lower:.2f}, {found.upper:.2f}"
+    '7.00, 7.00'
     """
     caller = "margin_of_polynomial"
     effort = Effort(tolerance, time, MOST_CELLS, progress, caller)

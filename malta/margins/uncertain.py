@@ -59,7 +59,10 @@ class UncertainSystem:
     sample_time: float | None = None
 
     def at(self, p: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """A, B and C at k rows of parameters: arrays of k matrices each."""
+        """A, B and C at k rows of parameters: arrays of k matrices each.
+
+        p : k x parameters, in the order of `names`
+        """
         rows = np.atleast_2d(p)
         found = self.matrices.map(len(rows))(rows.T)
         shapes = [self.matrices.size_out(i) for i in range(3)]
@@ -87,8 +90,8 @@ class Compensator:
 
     >>> import malta
     >>> import numpy as np
-    >>> one = np.eye(1)  # PI: u = -2 y - 50 sum of Ts y, at 1 kHz, with a sample of delay
-    >>> law = malta.Compensator(one, 1e-3 * one, -50 * one, -2 * one, integrals=1, sample_time=1e-3, delay=1)
+    >>> one, Ts = np.eye(1), 1e-3  # PI: u = -2 y - 50 sum of Ts y
+    >>> law = malta.Compensator(one, Ts * one, -50 * one, -2 * one, 1, Ts, delay=1)
     >>> motor = malta.uncertain(lambda k: ([[-1.0]], [[k]], [[1.0]]), {"k": 1.0})
     >>> f"{malta.robust_margin(motor, law, {'k': 0.2}).lower:.2f}"
     '5.00'

@@ -87,9 +87,8 @@ def linear_machine(A: Any, B: Any = None, C: Any = None, **details: Unpack[Detai
     Raises InputError for shapes and values that do not fit, a discrete system, and a system with D.
 
     >>> import malta
-    >>> cart = malta.linear_machine(
-    ...     [[0, 1], [0, -0.1]], [[0], [2]], [[1, 0]], name="cart", states=["z [m]", "v [m/s]"]
-    ... )
+    >>> A, B, C = [[0, 1], [0, -0.1]], [[0], [2]], [[1, 0]]
+    >>> cart = malta.linear_machine(A, B, C, name="cart", states=["z [m]", "v [m/s]"])
     >>> malta.linearize(cart, cart.at()).A.tolist()
     [[0.0, 1.0], [0.0, -0.1]]
     """

@@ -75,7 +75,8 @@ class Actuator:
     dead_time : s, from measurement to force
 
     >>> import malta
-    >>> coil = malta.Actuator((malta.Signal("i", "A"),), force_constant=(38.0,), current_limit=3.0, dead_time=100e-6)
+    >>> current = malta.Signal("i", "A")
+    >>> coil = malta.Actuator((current,), (38.0,), current_limit=3.0, dead_time=100e-6)
     >>> coil.force_limit, coil.delay(Ts=50e-6)  # N; samples
     ((114.0,), 2)
     """
@@ -100,6 +101,8 @@ class Actuator:
 
     def delay(self, Ts: float) -> int:
         """Whole samples of delay from measurement to force: the dead time minus the half sample of the hold.
+
+        Ts : sample time, s
 
         Raises InputError for more than MOST_DELAY.
         """
@@ -236,7 +239,10 @@ class Plant:
         return len(self.controlled) // 2 if self.second_order else 0
 
     def require_second_order(self, what: str) -> None:
-        """Raise InputError unless the states are (q, q'), which `what` requires."""
+        """Raise InputError unless the states are (q, q').
+
+        what : the part that requires it, which the error names
+        """
         if not self.second_order:
             found = "states that are not positions and then their rates"
             raise InputError(self.name, what, found, "x = (q, q')")
@@ -281,6 +287,11 @@ class Plant:
         """The machine as a continuous control.NonlinearIOSystem with named signals, evaluated by CasADi.
 
         x' = f(x, u, w + load(x)), y = h(x, u); the inputs of the machine come first, then the disturbances w.
+
+        >>> import malta
+        >>> ball = malta.read_design("examples/ball/design/ball.toml").plant
+        >>> ball.nlsys().input_labels
+        ['f', 'w']
         """
         import control  # imports matplotlib and takes a second: only where it is used
 
@@ -298,16 +309,31 @@ class Plant:
         )
 
     def at(self, /, **positions: float) -> OperatingPoint:
-        """The operating point at these states (SI), the others zero, with the preload of the design model.
+        """The operating point at these states, the others zero, with the preload of the design model.
 
-        The loads do not act, because v0(z) cancels them at every position. Raises InputError for unknown states.
+        The loads do not act, because v0(z) cancels them at every position.
 
-        Example: `plant.at(z=5e-3)`
+        positions : states by name, SI
+
+        Raises InputError for unknown states.
+
+        >>> import malta
+        >>> plant = malta.plant_of(malta.read("data/tubular.toml"))
+        >>> plant.at(z=5e-3).x.tolist()[:3]
+        [0.0, 0.0, 0.005]
         """
         return self._operating_point(self.state(positions))
 
     def point(self, design: ArrayLike) -> OperatingPoint:
-        """The operating point at these states of the design model (SI), the uncontrolled states zero."""
+        """The operating point at these states of the design model, the uncontrolled states zero.
+
+        design : the states of the design model, SI
+
+        >>> import malta
+        >>> plant = malta.plant_of(malta.read("data/tubular.toml"))
+        >>> len(plant.design_states), len(plant.point([0.0] * 10).x)
+        (10, 12)
+        """
         x = np.zeros(len(self.states))
         x[list(self.controlled)] = design
         return self._operating_point(x)
@@ -317,9 +343,15 @@ class Plant:
         return OperatingPoint(x, u, loaded=False)
 
     def state(self, values: Mapping[str, float]) -> FloatArray:
-        """The state vector with these entries (SI), the others zero.
+        """The state vector with these entries, the others zero.
+
+        values : states by name, SI
 
         Raises InputError for unknown names and values that are not finite.
+
+        >>> import malta
+        >>> malta.read_design("examples/ball/design/ball.toml").plant.state({"q": 1e-3}).tolist()
+        [0.001, 0.0]
         """
         names = [s.name for s in self.states]
         x = np.zeros(len(names))

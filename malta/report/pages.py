@@ -64,8 +64,10 @@ def design_page(
     >>> spec = malta.read_design("examples/ball/design/ball.toml")
     >>> model = malta.linearize(spec.plant, spec.plant.at())
     >>> controller = malta.synthesize(spec, model)
-    >>> push = malta.experiment("disturbance", spec.plant, controller, size=0.1, noise=0.0, quantize=False)
-    >>> page = malta.report.design_page(spec, model, malta.verify(model, controller), push, None)
+    >>> exact = {"noise": 0.0, "quantize": False}  # sensors
+    >>> push = malta.experiment("disturbance", spec.plant, controller, size=0.1, **exact)
+    >>> margins = malta.verify(model, controller)
+    >>> page = malta.report.design_page(spec, model, margins, push, None)
     >>> for line in page.renderables[:2]:
     ...     rich.print(line)
     ball: LQG with integral action
@@ -106,7 +108,7 @@ def front(tuned: Tuned, path: str | Path | None = None) -> Figure:
     """Draw the Pareto front of a search, and save the figure where a path is given.
 
     tuned : from `malta.tune`
-    path : .png or .svg file; None: nothing is written
+    path : .png, .svg or .pdf file; None: nothing is written
 
     Returns a matplotlib Figure, which a notebook shows as the value of a cell.
 
@@ -116,9 +118,10 @@ def front(tuned: Tuned, path: str | Path | None = None) -> Figure:
     >>> from malta.tuning.search import Trial
     >>> from malta.tuning.tune import Tuned
     >>> spec = malta.read_design("examples/ball/design/ball.toml")
-    >>> quiet = Trial((223.0, 50.0, 0.051), 1, {"margin": 3.28, "force_noise f": 0.0122, "motion y": 0.523e-6})
-    >>> safe = Trial((190.0, 40.0, 0.11), 1, {"margin": 3.63, "force_noise f": 0.0414, "motion y": 0.501e-6})
-    >>> tuned = Tuned(spec, safe, requirements=(), front=(quiet, safe), trials=120)  # as malta.tune finds it
+    >>> noisy = {"margin": 3.63, "force_noise f": 0.0414, "motion y": 0.501e-6}
+    >>> quiet = {"margin": 3.28, "force_noise f": 0.0122, "motion y": 0.523e-6}
+    >>> front = Trial((223.0, 50, 0.051), 1, quiet), Trial((190.0, 40, 0.11), 1, noisy)
+    >>> tuned = Tuned(spec, front[1], (), front, trials=120)  # as malta.tune finds it
     >>> figure = malta.report.front(tuned, "build/front.svg")
     >>> figure.axes[0].get_xlabel()
     'robust margin over the travel, proven [% of the box]'
@@ -130,7 +133,7 @@ def stroke(run: Trajectory, path: str | Path | None = None, published: Published
     """Draw a run, and save the figure where a path is given.
 
     run : from `malta.simulate`
-    path : .png or .svg file; None: nothing is written
+    path : .png, .svg or .pdf file; None: nothing is written
     published : figures of the machine's paper, from `malta.published`; None: none
 
     Returns a matplotlib Figure, which a notebook shows as the value of a cell.
@@ -140,7 +143,8 @@ def stroke(run: Trajectory, path: str | Path | None = None, published: Published
     >>> import malta
     >>> spec = malta.read_design("examples/ball/design/ball.toml")
     >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
-    >>> hold = malta.Scenario("hold", 20e-3, malta.references.hold, start={"q": 50e-6}, fidelity="force")
+    >>> low = {"q": -50e-6}  # m
+    >>> hold = malta.Scenario("hold", 20e-3, malta.references.hold, low, fidelity="force")
     >>> figure = malta.report.stroke(malta.simulate(spec.plant, controller, hold))
     >>> [axes.get_ylabel() for axes in figure.axes]
     ['commanded force [N]', 'y, off reference [µm]', 'clearance used up [%]']
@@ -152,7 +156,7 @@ def experiment(e: Experiment, path: str | Path | None = None, published: Publish
     """Draw an experiment, and save the figure where a path is given.
 
     e : from `malta.experiment`
-    path : .png or .svg file; None: nothing is written
+    path : .png, .svg or .pdf file; None: nothing is written
     published : figures of the machine's paper, from `malta.published`; None: none
 
     Returns a matplotlib Figure, which a notebook shows as the value of a cell.
@@ -162,7 +166,8 @@ def experiment(e: Experiment, path: str | Path | None = None, published: Publish
     >>> import malta
     >>> spec = malta.read_design("examples/ball/design/ball.toml")
     >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
-    >>> push = malta.experiment("disturbance", spec.plant, controller, size=0.1, noise=0.0, quantize=False)
+    >>> exact = {"noise": 0.0, "quantize": False}  # sensors
+    >>> push = malta.experiment("disturbance", spec.plant, controller, size=0.1, **exact)
     >>> figure = malta.report.experiment(push)
     >>> [axes.get_ylabel() for axes in figure.axes]
     ['commanded force [N]', 'y, off reference [µm]', 'clearance used up [%]']
@@ -183,7 +188,7 @@ def robustness(
     found : from `malta.robustness`
     name : of the design
     uncertainty : half-widths of the box, as shares
-    path : .png or .svg file; None: nothing is written
+    path : .png, .svg or .pdf file; None: nothing is written
     position : the machine's word for its travel, as "position z"
     worst : the largest `|S|` of each sensor over the uncertainty, from `malta.worst_case_gain`; None: none
 
@@ -195,9 +200,10 @@ def robustness(
     >>> spec = malta.read_design("examples/ball/design/ball.toml")
     >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
     >>> box = {"m": 0.2}
-    >>> figure = malta.report.robustness(malta.robustness(spec.plant, controller, box), "ball", box)
+    >>> found = malta.robustness(spec.plant, controller, box)
+    >>> figure = malta.report.robustness(found, "ball", box)
     >>> figure.axes[0].get_xlabel()
-    'margin without loads [% of the box]'
+    'proven margin without loads [% of the box]'
     """
     return _saved(chain_figure(found, name, uncertainty, position, worst), path)
 
@@ -212,7 +218,7 @@ def loads(
 
     plant : the machine
     controller : its controller
-    path : .png or .svg file; None: nothing is written
+    path : .png, .svg or .pdf file; None: nothing is written
     found : from `malta.recovery`, where it is known already; None: it is computed
 
     Returns a matplotlib Figure, which a notebook shows as the value of a cell.
@@ -224,7 +230,7 @@ def loads(
     >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
     >>> figure = malta.report.loads(spec.plant, controller)
     >>> [axes.get_ylabel() for axes in figure.axes]
-    ['deviation under 1 N [µm]', 'compliance [µm / N]']
+    ['deviation under 1 N [µm]', 'compliance [µm/N]']
     """
     found = recovery(plant, controller) if found is None else found
     return _saved(recovery_figure(plant, controller, found), path)
@@ -234,7 +240,7 @@ def sensitivity(found: Sensitivity, path: str | Path | None = None) -> Figure:
     """Draw the Sobol indices of a campaign's yield and merits, and save the figure where a path is given.
 
     found : from `malta.sensitivity`
-    path : .png or .svg file; None: nothing is written
+    path : .png, .svg or .pdf file; None: nothing is written
 
     Returns a matplotlib Figure, which a notebook shows as the value of a cell.
 
@@ -244,7 +250,8 @@ def sensitivity(found: Sensitivity, path: str | Path | None = None) -> Figure:
     >>> spec = malta.read_design("examples/ball/design/ball.toml")
     >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
     >>> options = {"duration": 0.02, "noise": 0.0}
-    >>> plan = malta.Plan(controller, "disturbance", {"m": 0.2, "C": 0.2}, samples=64, options=options)
+    >>> box = {"m": 0.2, "C": 0.2}
+    >>> plan = malta.Plan(controller, "disturbance", box, samples=64, options=options)
     >>> found = malta.sensitivity(plan, malta.limit_of(plan, "touchdown"), workers=1)
     >>> figure = malta.report.sensitivity(found)
     >>> figure.axes[0].get_ylabel()
@@ -263,7 +270,8 @@ class CampaignFigures(NamedTuple):
     >>> import malta
     >>> spec = malta.read_design("examples/ball/design/ball.toml")
     >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
-    >>> plan = malta.Plan(controller, "disturbance", {"m": 0.1}, samples=8, options={"duration": 0.02})
+    >>> short = {"duration": 0.02}  # s
+    >>> plan = malta.Plan(controller, "disturbance", {"m": 0.1}, samples=8, options=short)
     >>> figures = malta.report.campaign(malta.campaign(plan, workers=1))
     >>> figures._fields
     ('distributions', 'endings', 'worst')
@@ -304,7 +312,8 @@ def campaign(
     >>> import malta
     >>> spec = malta.read_design("examples/ball/design/ball.toml")
     >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
-    >>> plan = malta.Plan(controller, "disturbance", {"m": 0.1}, samples=8, options={"duration": 0.02})
+    >>> short = {"duration": 0.02}  # s
+    >>> plan = malta.Plan(controller, "disturbance", {"m": 0.1}, samples=8, options=short)
     >>> figures = malta.report.campaign(malta.campaign(plan, workers=1), "build")
     >>> figures.worst is figures[-1], malta.report.CAMPAIGN_FILES[-1]
     (True, 'worst.png')

@@ -35,7 +35,8 @@ def schema(name: str, plant: Plant | None = None) -> Schema:
     >>> malta.schemas.schema("data")["required"]
     ['machine', 'parameters']
     >>> plant = malta.plant_of(malta.read("data/halbach.toml"))
-    >>> malta.schemas.schema("data", plant)["properties"]["parameters"]["properties"]["m"]["unit"]
+    >>> parameters = malta.schemas.schema("data", plant)["properties"]["parameters"]
+    >>> parameters["properties"]["m"]["unit"]
     'kg'
     """
     known = SCHEMAS if plant is None else OF_MACHINES

@@ -96,7 +96,8 @@ def simulate_many(
     >>> controller = malta.gains.read("design/gains/calibrated.json")
     >>> plant = malta.plant_of(controller.parameters)
     >>> masses = {"m": np.linspace(0.3, 0.4, 3)}
-    >>> batch = malta.simulate_many(plant, controller, malta.Scenario.stroke(10e-3), masses, workers=1)
+    >>> stroke = malta.Scenario.stroke(10e-3)
+    >>> batch = malta.simulate_many(plant, controller, stroke, masses, workers=1)
     >>> [f"{1e3 * rise:.1f} ms" for rise in batch.rise]
     ['14.5 ms', '15.6 ms', '16.5 ms']
     """

@@ -82,7 +82,8 @@ def experiment(
     >>> import malta
     >>> spec = malta.read_design("examples/ball/design/ball.toml")
     >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
-    >>> print(malta.experiment("disturbance", spec.plant, controller, size=0.1, noise=0.0, quantize=False))
+    >>> exact = {"noise": 0.0, "quantize": False}  # sensors
+    >>> print(malta.experiment("disturbance", spec.plant, controller, size=0.1, **exact))
     disturbance: completed at 0.4 s
       w; y moves by 34.3 um; y, left at the end 0.0531 um
     """

@@ -41,9 +41,10 @@ class Batch:
     >>> controller = malta.gains.read("design/gains/calibrated.json")
     >>> plant = malta.plant_of(controller.parameters)
     >>> hold = malta.Scenario("hold", 5e-3, malta.references.hold, start={"x": 20e-6})
-    >>> batch = malta.simulate_many(plant, controller, hold, {"m": [0.3, 0.4]}, workers=1)
-    >>> batch.completed.tolist(), batch.deviation.shape, (1e6 * batch.deviation[:, 0]).round(1).tolist()
-    ([1.0, 1.0], (2, 5), [20.0, 20.0])
+    >>> masses = {"m": [0.3, 0.4]}
+    >>> batch = malta.simulate_many(plant, controller, hold, masses, workers=1)
+    >>> batch.completed.tolist(), batch.deviation.shape, batch.force.shape
+    ([1.0, 1.0], (2, 5), (2, 5))
     """
 
     duration: FloatArray

@@ -87,7 +87,8 @@ class Experiment:
     >>> import malta
     >>> spec = malta.read_design("examples/ball/design/ball.toml")
     >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
-    >>> found = malta.experiment("disturbance", spec.plant, controller, size=0.1, noise=0.0, quantize=False)
+    >>> exact = {"noise": 0.0, "quantize": False}  # sensors
+    >>> found = malta.experiment("disturbance", spec.plant, controller, size=0.1, **exact)
     >>> found.failed, found.cases[0].label, found.run.p.shape
     (False, 'w', (2000, 1))
     >>> str(found.cases[0].merits[0])

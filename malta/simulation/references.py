@@ -61,8 +61,10 @@ Reference = Callable[["FloatArray"], Motion]
 
 >>> import malta
 >>> import numpy as np
->>> ramp = lambda t: malta.references.Motion(np.outer(t, [1e-3]), 1e-3 + 0 * t[:, None], 0 * t[:, None])
->>> scenario = malta.Scenario("ramp", 0.1, lambda plant: ramp)  # 1 mm/s
+>>> def ramp(t):  # 1 mm/s
+...     zeros = np.zeros((len(t), 1))
+...     return malta.references.Motion(1e-3 * t[:, None], zeros + 1e-3, zeros)
+>>> scenario = malta.Scenario("ramp", 0.1, lambda plant: ramp)
 >>> scenario.reference(None)(np.array([0.0, 0.1])).p.tolist()
 [[0.0], [0.0001]]
 """
@@ -81,7 +83,8 @@ def logistic(
 
     >>> import malta
     >>> import numpy as np
-    >>> s, ds, dds = malta.references.logistic(np.array([-10e-3, 0.0, 10e-3]), rise=20e-3)
+    >>> t = np.array([-10e-3, 0.0, 10e-3])
+    >>> s, ds, dds = malta.references.logistic(t, rise=20e-3)
     >>> s.round(3).tolist(), f"{ds[1]:.1f}"
     ([0.1, 0.5, 0.9], '54.9')
     """
@@ -104,7 +107,8 @@ def quintic(
 
     >>> import malta
     >>> import numpy as np
-    >>> s, ds, dds = malta.references.quintic(np.array([-10e-3, 0.0, 10e-3, 1.0]), rise=20e-3)
+    >>> t = np.array([-10e-3, 0.0, 10e-3, 1.0])
+    >>> s, ds, dds = malta.references.quintic(t, rise=20e-3)
     >>> s.round(3).tolist(), f"{ds[1]:.1f}"
     ([0.1, 0.5, 0.9, 1.0], '47.5')
     """
@@ -156,7 +160,7 @@ def stroke(
     >>> import malta
     >>> import numpy as np
     >>> plant = malta.plant_of(malta.read("data/tubular.toml"))
-    >>> move = malta.references.stroke(plant, -5e-3, 5e-3, rise=20e-3, centre=50e-3, profile="quintic")
+    >>> move = malta.references.stroke(plant, -5e-3, 5e-3, 20e-3, 50e-3, "quintic")
     >>> (1e3 * move(np.array([0.0, 0.05, 0.06, 0.1])).p[:, -1]).round(3).tolist()  # mm
     [-5.0, 0.0, 4.0, 5.0]
     """
@@ -209,7 +213,8 @@ def hold(plant: Plant, **outputs: float) -> Reference:
     >>> import malta
     >>> from functools import partial
     >>> controller = malta.gains.read("design/gains/calibrated.json")
-    >>> aside = malta.Scenario("aside", 20e-3, partial(malta.references.hold, x1=1e-6, x2=1e-6))
+    >>> reference = partial(malta.references.hold, x1=1e-6, x2=1e-6)
+    >>> aside = malta.Scenario("aside", 20e-3, reference)
     >>> run = malta.simulate(malta.plant_of(controller.parameters), controller, aside)
     >>> f"{1e6 * run.reference[0, 0]:.0f} um"
     '1 um'

@@ -55,8 +55,9 @@ class Fault(NamedTuple):
     >>> import malta
     >>> controller = malta.gains.read("design/gains/calibrated.json")
     >>> stuck = malta.Fault("stuck sensor", at=1e-3, until=2e-3, what="x1")
-    >>> hold = malta.Scenario("hold", 5e-3, malta.references.hold, noise=1.0, faults=(stuck,))
-    >>> malta.simulate(malta.plant_of(controller.parameters), controller, hold).verdict.name
+    >>> hold = malta.Scenario("hold", 5e-3, malta.references.hold, faults=(stuck,))
+    >>> plant = malta.plant_of(controller.parameters)
+    >>> malta.simulate(plant, controller, hold).verdict.name
     'completed'
     """
 
@@ -101,9 +102,10 @@ class Scenario:
     Raises InputError for values out of range or unknown words.
 
     >>> import malta
-    >>> drop = malta.Scenario("drop", 20e-3, malta.references.hold, start={"x": 50e-6}, fidelity="force")
+    >>> off = {"x": 50e-6}  # m
+    >>> hold = malta.Scenario("hold", 0.02, malta.references.hold, off, fidelity="force")
     >>> controller = malta.gains.read("design/gains/calibrated.json")
-    >>> run = malta.simulate(malta.plant_of(controller.parameters), controller, drop)
+    >>> run = malta.simulate(malta.plant_of(controller.parameters), controller, hold)
     >>> f"x1 from {1e6 * run.p[0, 0]:.0f} um to {1e6 * run.p[-1, 0]:.1f} um"
     'x1 from 50 um to -0.9 um'
     """
@@ -188,13 +190,19 @@ class Scenario:
         duration: float | None = None,
         **options: Any,
     ) -> Scenario:
-        """A stroke by `distance` (m), symmetric about the middle, in `rise` (s, 10-90 %).
+        """A stroke, symmetric about the middle.
 
-        rise : None: the machine's own, RISE of its experiments
+        distance : m, either sign
+        rise : s, 10-90 %; None: the machine's own, RISE of its experiments
+        profile : "logistic" or "quintic"
         duration : s; None: six times the rise, at least 0.1 s, so that the move fits
         options : fields of the scenario, as noise=1.0
 
         Raises InputError for a distance of 0 m, or a rise that no stroke may have.
+
+        >>> import malta
+        >>> malta.Scenario.stroke(20e-3, rise=30e-3, noise=1.0).duration
+        0.18
         """
         if rise is not None:
             references.check_rise(rise)

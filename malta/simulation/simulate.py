@@ -67,7 +67,8 @@ def simulate(
 
     >>> import malta
     >>> controller = malta.gains.read("design/gains/calibrated.json")
-    >>> run = malta.simulate(malta.plant_of(controller.parameters), controller, malta.Scenario.stroke(10e-3))
+    >>> plant = malta.plant_of(controller.parameters)
+    >>> run = malta.simulate(plant, controller, malta.Scenario.stroke(10e-3))
     >>> run.verdict.completed, f"z = {1e3 * run.p[-1, -1]:.3f} mm"
     (True, 'z = 4.993 mm')
     """

@@ -57,7 +57,8 @@ class Trajectory:
 
     >>> import malta
     >>> controller = malta.gains.read("design/gains/calibrated.json")
-    >>> run = malta.simulate(malta.plant_of(controller.parameters), controller, malta.Scenario.stroke(10e-3))
+    >>> plant = malta.plant_of(controller.parameters)
+    >>> run = malta.simulate(plant, controller, malta.Scenario.stroke(10e-3))
     >>> run.verdict.name, run.p.shape, run.limits
     ('completed', (2000, 5), ())
     >>> f"{run.copper_loss.max():.0f} W"
@@ -188,7 +189,8 @@ def stroke_figures(run: Trajectory) -> StrokeFigures:
 
     >>> import malta
     >>> controller = malta.gains.read("design/gains/calibrated.json")
-    >>> run = malta.simulate(malta.plant_of(controller.parameters), controller, malta.Scenario.stroke(10e-3))
+    >>> plant = malta.plant_of(controller.parameters)
+    >>> run = malta.simulate(plant, controller, malta.Scenario.stroke(10e-3))
     >>> figures = malta.stroke_figures(run)
     >>> f"{1e3 * figures.rise:.1f} ms, overshoot {figures.overshoot:.2%}"
     '15.8 ms, overshoot 0.00%'

@@ -195,8 +195,8 @@ class Controller:
     >>> controller = malta.gains.read("design/gains/calibrated.json")
     >>> controller
     Controller('calibrated', preset 'table1', 10 states, 5 forces, 20 kHz, delay 0)
-    >>> controller.K.shape, controller.integrating, [s.unit for s in controller.measurements]
-    ((5, 10), True, ['m', 'm', 'm', 'm', 'm'])
+    >>> controller.K.shape, controller.integrating, controller.measurements[0]
+    ((5, 10), True, Signal(name='x1', unit='m'))
     """
 
     name: str

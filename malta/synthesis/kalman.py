@@ -45,7 +45,8 @@ def kalman(model: Linear, weights: Weights) -> FloatArray:
     >>> import malta
     >>> cart = malta.linear_machine([[0, 1], [0, 0]], [[0], [1]], [[1, 0]])
     >>> model = malta.linearize(cart, cart.at())
-    >>> malta.kalman(model, malta.weights(q=[1, 1], r=[1], w=[1e-2], v=[1e-6])).round(6).tolist()
+    >>> weights = malta.weights(q=[1, 1], r=[1], w=[1e-2], v=[1e-6])
+    >>> malta.kalman(model, weights).round(6).tolist()
     [[14.142136], [100.0]]
     """
     G = noise_input(model.B, weights.coordinates)

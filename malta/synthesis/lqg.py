@@ -80,7 +80,8 @@ def lqr(model: Linear, weights: Weights) -> FloatArray:
 
     >>> import malta
     >>> cart = malta.linear_machine([[0, 1], [0, 0]], [[0], [1]], [[1, 0]])
-    >>> K = malta.lqr(malta.linearize(cart, cart.at()), malta.weights(q=[16, 0], r=[1], w=[1], v=[1]))
+    >>> weights = malta.weights(q=[16, 0], r=[1], w=[1], v=[1])
+    >>> K = malta.lqr(malta.linearize(cart, cart.at()), weights)
     >>> K.round(6).tolist()  # w_n = 2 rad/s: K1 = w_n^2, K2 = sqrt(2) w_n
     [[4.0, 2.828427]]
     """
@@ -106,7 +107,8 @@ def lqi(model: Linear, weights: Weights) -> tuple[FloatArray, FloatArray]:
 
     >>> import malta
     >>> cart = malta.linear_machine([[0, 1], [0, 0]], [[0], [1]], [[1, 0]])
-    >>> K, Ki = malta.lqi(malta.linearize(cart, cart.at()), malta.weights([1, 0], [1], [1], [1], q_i=[4]))
+    >>> weights = malta.weights([1, 0], [1], [1], [1], q_i=[4])
+    >>> K, Ki = malta.lqi(malta.linearize(cart, cart.at()), weights)
     >>> K.round(3).tolist(), Ki.round(3).tolist()
     ([[3.375, 2.598]], [[2.0]])
     """
@@ -211,7 +213,8 @@ def lqg(
     Raises InputError for arguments that do not fit, CheckError when an equation has no sound solution.
 
     >>> import malta
-    >>> cart = malta.linear_machine([[0, 1], [400, 0]], [[0], [2]], [[1, 0]], name="cart", states=["z [m]", "v [m/s]"])
+    >>> A, B, C = [[0, 1], [400, 0]], [[0], [2]], [[1, 0]]
+    >>> cart = malta.linear_machine(A, B, C, name="cart", states=["z [m]", "v [m/s]"])
     >>> model = malta.linearize(cart, cart.at())
     >>> weights = malta.weights(q=[1e6, 0], r=[1], w=[1e-2], v=[1e-12], q_i=[1e7])
     >>> controller = malta.lqg(model, weights, Ts=1e-3)

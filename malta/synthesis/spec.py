@@ -61,8 +61,9 @@ class Weights:
     >>> import malta
     >>> import numpy as np
     >>> one = np.ones(1)
-    >>> weights = malta.Weights(np.ones(2), np.array([1e-4, 0.1]), one, one, one, 1e-3 * one, one, 1e-12 * one)
-    >>> weights.Q.round(3).tolist(), weights.R.tolist()  # Bryson's rule: 0.1 mm, 0.1 m/s and 1 N weigh the same
+    >>> base = np.array([1e-4, 0.1])  # 0.1 mm and 0.1 m/s weigh as much as 1 N
+    >>> weights = malta.Weights(np.ones(2), base, one, one, one, one, one, 1e-12 * one)
+    >>> weights.Q.round(3).tolist(), weights.R.tolist()  # Bryson's rule
     ([[100000000.0, 0.0], [0.0, 100.0]], [[1.0]])
     """
 
@@ -280,11 +281,27 @@ class Spec:
         return self.law.axes if isinstance(self.law, Pid) else "decentralized"
 
     def place_of(self, entry: str, field: str = "search") -> Entry:
-        """Find where an entry of the file stands in the law. Raises InputError for an entry that no design file has."""
+        """Find where an entry of the file stands in the law.
+
+        entry : as "bases.state.x"
+        field : the field of the file that an error names
+
+        Raises InputError for an entry that no design file has.
+        """
         return place_of(entry, self.plant, self.path, field, self.law)
 
     def vary(self, values: Sequence[float]) -> Spec:
-        """Return the design with other numbers: one value for each variable of the search, in its own unit."""
+        """Return the design with other numbers.
+
+        values : one for each variable of the search, in its own unit
+
+        >>> import malta
+        >>> spec = malta.read_design("examples/ball/design/ball.toml")
+        >>> [variable.name for variable in spec.search]
+        ['position', 'integral', 'force']
+        >>> float(spec.vary([50.0, 5.0, 0.1]).weights.q_base[0])  # 50 um
+        5e-05
+        """
         numbers = [name for name in self.law.__dataclass_fields__ if name not in ("axes", "coordinates")]
         fields: dict[str, Any] = {name: np.array(getattr(self.law, name)) for name in numbers}
         for variable, value in zip(self.search, values, strict=True):
@@ -295,7 +312,10 @@ class Spec:
         return replace(self, law=replace(self.law, **fields))
 
     def value_of(self, variable: Variable) -> float:
-        """Return the number that the file holds for a variable of the search, in the variable's unit."""
+        """Return the number that the file holds for a variable of the search, in the variable's unit.
+
+        variable : one of `search`
+        """
         field, index, unit, squared = self.place_of(variable.entries[0])
         si = float(np.asarray(getattr(self.law, field))[index])
         si = math.sqrt(si) if squared else si

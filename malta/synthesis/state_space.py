@@ -51,9 +51,11 @@ def controller_of(
 
     >>> import control, malta
     >>> cart = malta.linear_machine([[0, 1], [0, 0]], [[0], [1]], [[1, 0]])
-    >>> lead = control.c2d(control.ss(control.tf([200, 1000], [1 / 50, 1])), 1e-3, "tustin")
+    >>> lead = control.ss(control.tf([200, 1000], [1 / 50, 1]))
+    >>> lead = control.c2d(lead, 1e-3, "tustin")
     >>> controller = malta.controller_of(lead, cart, name="lead")
-    >>> controller.sample_time, malta.verify(malta.linearize(cart, cart.at()), controller).stable
+    >>> model = malta.linearize(cart, cart.at())
+    >>> controller.sample_time, malta.verify(model, controller).stable
     (0.001, True)
     """
     A, B, C, D, Ts = _discrete(sys)

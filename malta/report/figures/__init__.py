@@ -76,7 +76,8 @@ def experiment_figure(e: Experiment, published: Published | None = None) -> Figu
     >>> import malta
     >>> spec = malta.read_design("examples/ball/design/ball.toml")
     >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
-    >>> push = malta.experiment("disturbance", spec.plant, controller, size=0.1, noise=0.0, quantize=False)
+    >>> exact = {"noise": 0.0, "quantize": False}  # sensors
+    >>> push = malta.experiment("disturbance", spec.plant, controller, size=0.1, **exact)
     >>> figure = malta.report.experiment_figure(push)
     >>> [axes.get_ylabel() for axes in figure.axes]
     ['commanded force [N]', 'y, off reference [µm]', 'clearance used up [%]']
@@ -102,7 +103,8 @@ def stroke_figure(run: Trajectory, published: Published | None = None) -> Figure
 
     >>> import malta
     >>> controller = malta.gains.read("design/gains/calibrated.json")
-    >>> run = malta.simulate(malta.plant_of(controller.parameters), controller, malta.Scenario.stroke(10e-3))
+    >>> plant = malta.plant_of(controller.parameters)
+    >>> run = malta.simulate(plant, controller, malta.Scenario.stroke(10e-3))
     >>> figure = malta.report.stroke_figure(run, malta.published("data/tubular.toml"))
     >>> len(figure.axes) > 2
     True
@@ -145,7 +147,8 @@ def encode_figure(figure: Figure, path: Path) -> bytes:
 
     >>> import malta
     >>> from pathlib import Path
-    >>> malta.report.encode_figure(malta.report.new_figure("empty"), Path("empty.png"))[:4]
+    >>> figure = malta.report.new_figure("empty")
+    >>> malta.report.encode_figure(figure, Path("empty.png"))[:4]
     b'\x89PNG'
     """
     import matplotlib
@@ -256,9 +259,10 @@ def front_figure(tuned: Tuned) -> Figure:
     >>> from malta.tuning.search import Trial
     >>> from malta.tuning.tune import Tuned
     >>> spec = malta.read_design("examples/ball/design/ball.toml")
-    >>> quiet = Trial((223.0, 50.0, 0.051), 1, {"margin": 3.28, "force_noise f": 0.0122, "motion y": 0.523e-6})
-    >>> safe = Trial((190.0, 40.0, 0.11), 1, {"margin": 3.63, "force_noise f": 0.0414, "motion y": 0.501e-6})
-    >>> tuned = Tuned(spec, safe, requirements=(), front=(quiet, safe), trials=120)  # as malta.tune finds it
+    >>> noisy = {"margin": 3.63, "force_noise f": 0.0414, "motion y": 0.501e-6}
+    >>> quiet = {"margin": 3.28, "force_noise f": 0.0122, "motion y": 0.523e-6}
+    >>> front = Trial((223.0, 50, 0.051), 1, quiet), Trial((190.0, 40, 0.11), 1, noisy)
+    >>> tuned = Tuned(spec, front[1], (), front, trials=120)  # as malta.tune finds it
     >>> figure = malta.report.front_figure(tuned)
     >>> [axes.get_ylabel() for axes in figure.axes]
     ['noise of the force [N rms]', 'true motion [µm rms]']

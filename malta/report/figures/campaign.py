@@ -65,10 +65,11 @@ def distributions_figure(found: Campaign | Summary, published: Published | None 
     >>> import malta
     >>> spec = malta.read_design("examples/ball/design/ball.toml")
     >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
-    >>> plan = malta.Plan(controller, "disturbance", {"m": 0.1}, samples=8, options={"duration": 0.02})
+    >>> short = {"duration": 0.02}  # s
+    >>> plan = malta.Plan(controller, "disturbance", {"m": 0.1}, samples=8, options=short)
     >>> figure = malta.report.distributions_figure(malta.campaign(plan, workers=1))
     >>> [axes.get_xlabel() for axes in figure.axes][:2]
-    ['deviation [µm]', 'largest f [N]']
+    ['deviation y [µm]', 'largest f [N]']
     """
     from malta.campaigns.summary import Bounds, as_summary
 
@@ -185,7 +186,8 @@ def yield_figure(found: Campaign | Summary, published: Published | None = None) 
     >>> import malta
     >>> spec = malta.read_design("examples/ball/design/ball.toml")
     >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
-    >>> plan = malta.Plan(controller, "disturbance", {"m": 0.1}, samples=8, options={"duration": 0.02})
+    >>> short = {"duration": 0.02}  # s
+    >>> plan = malta.Plan(controller, "disturbance", {"m": 0.1}, samples=8, options=short)
     >>> figure = malta.report.yield_figure(malta.campaign(plan, workers=1))
     >>> [axes.get_xlabel() for axes in figure.axes]
     ['m [kg]']

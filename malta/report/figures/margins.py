@@ -61,9 +61,10 @@ def chain_figure(
     >>> spec = malta.read_design("examples/ball/design/ball.toml")
     >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
     >>> box = {"m": 0.2}
-    >>> figure = malta.report.chain_figure(malta.robustness(spec.plant, controller, box), "ball", box)
+    >>> found = malta.robustness(spec.plant, controller, box)
+    >>> figure = malta.report.chain_figure(found, "ball", box)
     >>> [axes.get_xlabel() for axes in figure.axes]
-    ['margin without loads [% of the box]', 'peak |S|, dark: under its loads; zones of ISO 14839-3']
+    ['proven margin without loads [% of the box]', 'peak |S| [-], zones of ISO 14839-3']
     """
     box = ", ".join(f"{key} ±{100 * share:g} %" for key, share in uncertainty.items())
     figure = new_figure(

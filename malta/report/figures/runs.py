@@ -159,7 +159,8 @@ def worst_figure(found: Campaign | Summary, published: Published | None = None) 
     >>> import malta
     >>> spec = malta.read_design("examples/ball/design/ball.toml")
     >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
-    >>> plan = malta.Plan(controller, "disturbance", {"m": 0.1}, samples=8, options={"duration": 0.02})
+    >>> short = {"duration": 0.02}  # s
+    >>> plan = malta.Plan(controller, "disturbance", {"m": 0.1}, samples=8, options=short)
     >>> figure = malta.report.worst_figure(malta.campaign(plan, workers=1))
     >>> len(figure.axes)
     2

@@ -51,16 +51,25 @@ Channel = str | Sequence[str] | None
 def bode(
     source: Any, controller: Any = None, *, channel: Channel = None, at: Place = "sensors", axes: Any = None
 ) -> Figure:
-    """Bode plot of the loop gain of each channel, the others closed, with its margins drawn in.
+    """Draw the Bode plot of the loop gain of each channel, the others closed, with its margins drawn in.
 
-    source, controller : a plant and its controller, any other loop of `malta.loop_curves`, or a table name -> loop
+    source : a plant; LoopSystems; a system of python-control, the loop gain L of negative feedback or the plant P of
+        L = P C; or a table name -> loop, where a pair is a tuple
+    controller : of the plant, or the system C; None: the source has it
     channel : the channel or channels, by name; None: all
     at : where the loop is cut, "sensors" or "forces"
     axes : magnitude and phase of every channel, as `figure.subplots(2, channels)` gives them; None: a new figure
 
-    Raises InputError for an unknown channel or another number of axes.
+    Returns a matplotlib Figure, which a notebook shows as the value of a cell.
 
-    Example: `malta.report.bode(plant, controller, channel="z")`
+    Raises InputError for what is no loop, for an unknown channel and another number of axes.
+
+    >>> import malta
+    >>> spec = malta.read_design("examples/ball/design/ball.toml")
+    >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
+    >>> figure = malta.report.bode(spec.plant, controller)
+    >>> figure.axes[0].texts[-1].get_text()
+    'GM −7.8 … +12.8 dB, PM 45.3°, delay 2.72 ms'
     """
     loops = loops_of(source, controller)
     chosen, styles = chosen_channels(loops, channel, at), styles_of(loops)
@@ -150,13 +159,25 @@ def _finish_bode(upper: Axes, lower: Axes, shown: Sequence[LoopCurves]) -> None:
 
 
 def sigma(source: Any, controller: Any = None, *, at: Place = "sensors", axes: Any = None) -> Figure:
-    """Singular values of L, S and T with all channels: the largest and the smallest, and the band between them.
-
-    axes : three axes, for L, S and T; the other arguments as those of `bode`
+    """Draw the singular values of L, S and T with all channels: the largest, the smallest, and the band between.
 
     Signals count in SI units, metres beside radians.
 
-    Example: `malta.report.sigma({"old": (plant, old), "new": (plant, new)})`
+    source : a plant; LoopSystems; a system of python-control, the loop gain L of negative feedback or the plant P of
+        L = P C; or a table name -> loop, where a pair is a tuple
+    controller : of the plant, or the system C; None: the source has it
+    at : where the loop is cut, "sensors" or "forces"
+    axes : three axes, for L, S and T; None: a new figure
+
+    Returns a matplotlib Figure, which a notebook shows as the value of a cell.
+
+    Raises InputError for what is no loop, for an unknown channel and another number of axes.
+
+    >>> import control, malta
+    >>> old, new = (control.tf([gain], [1, 3, 2, 0]) for gain in (1, 2))
+    >>> figure = malta.report.sigma({"old": old, "new": new})
+    >>> [axes.get_ylabel() for axes in figure.axes]
+    ['singular values of L [dB]', 'singular values of S [dB]', 'singular values of T [dB]']
     """
     loops = loops_of(source, controller)
     chosen_channels(loops, None, at)
@@ -198,9 +219,25 @@ def _largest_text(curves: LoopCurves, values: FloatArray, letter: str) -> str:
 def sensitivity_curves(
     source: Any, controller: Any = None, *, channel: Channel = None, at: Place = "sensors", axes: Any = None
 ) -> Figure:
-    """|S_ii| and |T_ii| of each channel, with the zones of ISO 14839-3 and the peaks marked; arguments as of `bode`.
+    """Draw `|S_ii|` and `|T_ii|` of each channel, with the zones of ISO 14839-3 and the peaks marked.
 
-    Example: `malta.report.sensitivity_curves(plant, controller)`
+    source : a plant; LoopSystems; a system of python-control, the loop gain L of negative feedback or the plant P of
+        L = P C; or a table name -> loop, where a pair is a tuple
+    controller : of the plant, or the system C; None: the source has it
+    channel : the channel or channels, by name; None: all
+    at : where the loop is cut, "sensors" or "forces"
+    axes : `|S|` and `|T|` of every channel, as `figure.subplots(2, channels)` gives them; None: a new figure
+
+    Returns a matplotlib Figure, which a notebook shows as the value of a cell.
+
+    Raises InputError for what is no loop, for an unknown channel and another number of axes.
+
+    >>> import malta
+    >>> spec = malta.read_design("examples/ball/design/ball.toml")
+    >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
+    >>> figure = malta.report.sensitivity_curves(spec.plant, controller)
+    >>> [axes.get_ylabel() for axes in figure.axes]
+    ['|S| [-]', '|T| [-]']
     """
     loops = loops_of(source, controller)
     chosen, styles = chosen_channels(loops, channel, at), styles_of(loops)
@@ -248,12 +285,24 @@ def _draw_zones(axes: Axes) -> None:
 
 
 def gang_of_four(source: Any, controller: Any = None, *, channel: Channel = None, axes: Any = None) -> Figure:
-    """S, T, S P and F S of each channel at the sensors: what noise, references and forces do to it.
+    """Draw S, T, S P and F S of each channel at the sensors: what noise, references and forces do to it.
 
+    source : a plant; LoopSystems; a system of python-control, the loop gain L of negative feedback or the plant P of
+        L = P C; or a table name -> loop, where a pair is a tuple
+    controller : of the plant, or the system C; None: the source has it
     channel : outputs, by name; None: all. Output i stands with force i, of the same axis
-    axes : four for each channel, row by row; the other arguments as those of `bode`
+    axes : four for each channel, row by row; None: a new figure
 
-    Example: `malta.report.gang_of_four(plant, controller, channel="z")`
+    Returns a matplotlib Figure, which a notebook shows as the value of a cell.
+
+    Raises InputError for what is no loop, for an unknown channel and another number of axes.
+
+    >>> import malta
+    >>> spec = malta.read_design("examples/ball/design/ball.toml")
+    >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
+    >>> figure = malta.report.gang_of_four(spec.plant, controller, channel="y")
+    >>> len(figure.axes)
+    4
     """
     loops = loops_of(source, controller)
     chosen, styles = chosen_channels(loops, channel, "sensors"), styles_of(loops)

@@ -30,16 +30,25 @@ GREY = "#dcdcdc"
 
 
 def pzmap(source: Any, controller: Any = None, *, axes: Any = None, reach: float | None = None) -> Figure:
-    """Poles of the closed loop and of the plant, and zeros of L, with rays of damping and circles of frequency.
+    """Draw poles of the closed loop and of the plant, and zeros of L, with rays of damping and circles of frequency.
 
     Left: all of them; right: those slower than `reach`. Sampled loops: ln(z) / T, without the poles of pure delay; the
     unit circle is the imaginary axis, and levels at pi / T are the Nyquist frequency.
 
-    reach : rad/s, of the right panel; None: NEAR times the highest crossing of unit gain
-    axes : one for all poles and one for the slow ones, or one alone for the slow ones
-    The other arguments are those of `bode`.
+    source : a plant; LoopSystems; a system of python-control, the loop gain L of negative feedback or the plant P of
+        L = P C; or a table name -> loop, where a pair is a tuple
+    controller : of the plant, or the system C; None: the source has it
+    axes : one for all poles and one for the slow ones, or one alone for the slow ones; None: a new figure
+    reach : rad/s, of the right panel; None: a multiple of the highest crossing of unit gain
 
-    Example: `malta.report.pzmap({"old": (plant, old), "new": (plant, new)})`
+    Returns a matplotlib Figure, which a notebook shows as the value of a cell.
+
+    Raises InputError for what is no loop and for another number of axes.
+
+    >>> import control, malta
+    >>> figure = malta.report.pzmap(control.tf([1], [1, 3, 2, 0]))
+    >>> figure.axes[0].get_xlabel()
+    'real part [rad/s]'
     """
     loops = loops_of(source, controller)
     styles = styles_of(loops)
@@ -222,15 +231,29 @@ def root_locus(
     axes: Any = None,
     reach: float | None = None,
 ) -> Figure:
-    """Closed-loop poles over a parameter of the machine or over the loop gain, every branch a line.
-
-    parameter, low, high, channel : as `malta.margins.locus.root_locus` takes them
-    axes, reach : as those of `pzmap`; the right panel shows the poles slower than `reach`
+    """Draw closed-loop poles over a parameter of the machine or over the loop gain, every branch a line.
 
     Small circles: the lowest value; triangles: the highest; crosses: the nominal machine. Text: the values at which the
-    loop becomes stable or unstable. One loop at a time; or a RootLocus, and the curves of its loop for `controller`.
+    loop becomes stable or unstable.
 
-    Example: `malta.report.root_locus(plant, controller, parameter="m")`
+    source : one loop: a plant; LoopSystems; a system of python-control, L or P; or a RootLocus
+    controller : of the plant, the system C, or the curves of the RootLocus's loop; None: the source has it
+    parameter : of the machine, by name; or "gain", a factor of the loop gain
+    low : lowest value of the parameter, SI; None: half of its nominal value, of the gain 0.1
+    high : highest value of the parameter, SI; None: one and a half of its nominal value, of the gain 10
+    channel : the output or force whose gain is changed; None: all forces
+    axes : one for all poles and one for the slow ones, or one alone for the slow ones; None: a new figure
+    reach : rad/s, of the right panel; None: a multiple of the highest crossing of unit gain
+
+    Returns a matplotlib Figure, which a notebook shows as the value of a cell.
+
+    Raises InputError for an unknown parameter, a range that is none, and a value that the machine cannot have.
+
+    >>> import control, malta
+    >>> servo = control.tf([1], [1, 3, 2, 0], name="servo")
+    >>> figure = malta.report.root_locus(servo, low=1, high=10)
+    >>> figure.get_suptitle()
+    'servo: root locus over the loop gain, 1 … 10'
     """
     found = source
     if not isinstance(source, RootLocus):

@@ -41,15 +41,27 @@ HEIGHTS = (-45.0, 60.0)  # dB, of a Nichols plot
 def nyquist(
     source: Any, controller: Any = None, *, channel: Channel = None, at: Place = "sensors", axes: Any = None
 ) -> Figure:
-    """Nyquist plot of the loop gain of each channel, the others closed.
+    """Draw the Nyquist plot of the loop gain of each channel, the others closed.
 
-    Thin: negative frequencies. Dotted about -1: the circle of radius 1 / max|S|, which the curve touches. Grey: the
+    Thin: negative frequencies. Dotted about -1: the circle of radius `1 / max|S|`, which the curve touches. Grey: the
     circle of the symmetric disk margin, which the curve does not enter. Dots: where margins of gain and phase are read.
     N: counterclockwise turns about -1; P: unstable poles with this channel open. The loop is stable where they agree.
 
-    axes : one for each channel; the other arguments as those of `bode`
+    source : a plant; LoopSystems; a system of python-control, the loop gain L of negative feedback or the plant P of
+        L = P C; or a table name -> loop, where a pair is a tuple
+    controller : of the plant, or the system C; None: the source has it
+    channel : the channel or channels, by name; None: all
+    at : where the loop is cut, "sensors" or "forces"
+    axes : one for each channel; None: a new figure
 
-    Example: `malta.report.nyquist(plant, controller, channel="x1")`
+    Returns a matplotlib Figure, which a notebook shows as the value of a cell.
+
+    Raises InputError for what is no loop, for an unknown channel and another number of axes.
+
+    >>> import control, malta
+    >>> figure = malta.report.nyquist(control.tf([3], [1, -1]))  # stable: N = P = 1
+    >>> figure.axes[0].texts[-1].get_text()
+    'GM −9.5 … ∞, PM 70.5°, N 1, P 1'
     """
     loops = loops_of(source, controller)
     chosen, styles = chosen_channels(loops, channel, at), styles_of(loops)
@@ -147,12 +159,26 @@ def _draw_margins(
 def nichols(
     source: Any, controller: Any = None, *, channel: Channel = None, at: Place = "sensors", axes: Any = None
 ) -> Figure:
-    """Nichols chart of the loop gain of each channel, the others closed, on curves of equal |T|.
+    """Draw the Nichols chart of the loop gain of each channel, the others closed, on curves of equal `|T|`.
 
-    The arguments are those of `bode`. Crosses: the critical points, 0 dB at -180 degrees and a turn away. Segments from
-    there: the margins of gain, upright, and of phase, level.
+    Crosses: the critical points, 0 dB at -180 degrees and a turn away. Segments from there: the margins of gain,
+    upright, and of phase, level.
 
-    Example: `malta.report.nichols(plant, controller, channel="z")`
+    source : a plant; LoopSystems; a system of python-control, the loop gain L of negative feedback or the plant P of
+        L = P C; or a table name -> loop, where a pair is a tuple
+    controller : of the plant, or the system C; None: the source has it
+    channel : the channel or channels, by name; None: all
+    at : where the loop is cut, "sensors" or "forces"
+    axes : one for each channel; None: a new figure
+
+    Returns a matplotlib Figure, which a notebook shows as the value of a cell.
+
+    Raises InputError for what is no loop, for an unknown channel and another number of axes.
+
+    >>> import control, malta
+    >>> figure = malta.report.nichols(control.tf([1], [1, 3, 2, 0]))
+    >>> figure.axes[0].get_xlabel(), figure.axes[0].get_ylabel()
+    ('phase of L [°]', 'magnitude of L [dB]')
     """
     loops = loops_of(source, controller)
     chosen, styles = chosen_channels(loops, channel, at), styles_of(loops)

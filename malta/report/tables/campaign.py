@@ -80,8 +80,10 @@ def campaign_tables(
     >>> import malta, rich
     >>> spec = malta.read_design("examples/ball/design/ball.toml")
     >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
-    >>> plan = malta.Plan(controller, "disturbance", {"m": 0.1}, samples=8, options={"duration": 0.02})
-    >>> rich.print(malta.report.campaign_tables(malta.campaign(plan, workers=1)).renderables[0])
+    >>> short = {"duration": 0.02}  # s
+    >>> plan = malta.Plan(controller, "disturbance", {"m": 0.1}, samples=8, options=short)
+    >>> tables = malta.report.campaign_tables(malta.campaign(plan, workers=1))
+    >>> rich.print(tables.renderables[0])
     How the runs end
     <BLANKLINE>
      end         runs   share [%]   95 % interval [%]

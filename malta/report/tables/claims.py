@@ -22,7 +22,8 @@ def claims_table(ledger: Ledger) -> Table:
     >>> import malta, rich
     >>> from malta.report.ledger import Claim, Ledger
     >>> claim = Claim("pole of x [rad/s]", "±218.92", ("±218.92",), "reproduced")
-    >>> rich.print(malta.report.claims_table(Ledger("tubular", "the paper", ("table2",), (claim,))))
+    >>> ledger = Ledger("tubular", "the paper", ("table2",), (claim,))
+    >>> rich.print(malta.report.claims_table(ledger))
     Published numbers and ours: tubular, the paper
     <BLANKLINE>
      claim               published    table2   verdict

@@ -38,7 +38,8 @@ def poles_table(model: LinearModel, published: Published | None) -> Table:
     >>> import malta, rich
     >>> plant = malta.plant_of(malta.read("data/tubular.toml"))
     >>> model = malta.linearize(plant, plant.at())
-    >>> rich.print(malta.report.poles_table(model, malta.published("data/tubular.toml")))
+    >>> printed = malta.published("data/tubular.toml")
+    >>> rich.print(malta.report.poles_table(model, printed))
     Open-loop poles [rad/s]
     <BLANKLINE>
      mode               x        y      z    alpha     beta

@@ -52,7 +52,8 @@ def experiment_table(e: Experiment, published: Published | None = None) -> Group
     >>> import malta, rich
     >>> spec = malta.read_design("examples/ball/design/ball.toml")
     >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
-    >>> push = malta.experiment("disturbance", spec.plant, controller, size=0.1, noise=0.0, quantize=False)
+    >>> exact = {"noise": 0.0, "quantize": False}  # sensors
+    >>> push = malta.experiment("disturbance", spec.plant, controller, size=0.1, **exact)
     >>> rich.print(malta.report.experiment_table(push))
     How far does a load move it, and does it come back?
     <BLANKLINE>

@@ -273,8 +273,10 @@ def worst_case_table(gains: Mapping[str, Gain]) -> Table:
     Returns a rich Table, which `rich.print` prints.
 
     >>> import malta, rich
-    >>> spring = malta.uncertain(lambda k: ([[0, 1], [-k, -1]], [[0], [1]], [[1, 0]]), {"k": 4.0})
-    >>> gain = malta.worst_case_gain(spring, [[-5.0]], {"k": 0.2})
+    >>> def spring(k):
+    ...     return [[0, 1], [-k, -1]], [[0], [1]], [[1, 0]]
+    >>> system = malta.uncertain(spring, {"k": 4.0})
+    >>> gain = malta.worst_case_gain(system, [[-5.0]], {"k": 0.2})
     >>> rich.print(malta.report.worst_case_table({"y": gain}))
     Worst-case peak |S| over the uncertainty and all that the margin covers, without
     loads

@@ -33,7 +33,8 @@ def recovery_table(found: Sequence[Recovery], plant: Plant) -> Table:
     >>> import malta, rich
     >>> spec = malta.read_design("examples/ball/design/ball.toml")
     >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
-    >>> rich.print(malta.report.recovery_table(malta.recovery(spec.plant, controller), spec.plant))
+    >>> found = malta.recovery(spec.plant, controller)
+    >>> rich.print(malta.report.recovery_table(found, spec.plant))
     A constant load from outside, and the output that it moves furthest
     <BLANKLINE>
                                left    left     1 %

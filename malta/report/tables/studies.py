@@ -31,9 +31,13 @@ def rare_event_tables(event: RareEvent) -> Group:
     >>> import malta
     >>> spec = malta.read_design("examples/ball/design/ball.toml")
     >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
-    >>> plan = malta.Plan(controller, "disturbance", {"m": 0.2}, samples=100, options={"duration": 0.02})
-    >>> event = malta.rare_event(plan, malta.limit_of(plan, "deviation-y", 40e-6), workers=1)
-    >>> [str(table.title) for table in malta.report.rare_event_tables(event).renderables][:2]
+    >>> short = {"duration": 0.02}  # s
+    >>> box = {"m": 0.2}
+    >>> plan = malta.Plan(controller, "disturbance", box, samples=100, options=short)
+    >>> limit = malta.limit_of(plan, "deviation-y", 40e-6)
+    >>> event = malta.rare_event(plan, limit, workers=1)
+    >>> tables = malta.report.rare_event_tables(event).renderables
+    >>> [str(table.title) for table in tables][:2]
     ['Rare event: deviation y above 40 um or an earlier end', 'Levels: 1 is the limit']
     """
     parts: list[Table | str] = [_probability_table(event), _levels_table(event)]
@@ -52,8 +56,11 @@ def rare_event_sentence(event: RareEvent) -> str:
     >>> import malta
     >>> spec = malta.read_design("examples/ball/design/ball.toml")
     >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
-    >>> plan = malta.Plan(controller, "disturbance", {"m": 0.1}, samples=100, options={"duration": 0.02})
-    >>> event = malta.rare_event(plan, malta.limit_of(plan, "deviation-y", 40e-6), workers=1)
+    >>> short = {"duration": 0.02}  # s
+    >>> box = {"m": 0.1}
+    >>> plan = malta.Plan(controller, "disturbance", box, samples=100, options=short)
+    >>> limit = malta.limit_of(plan, "deviation-y", 40e-6)
+    >>> event = malta.rare_event(plan, limit, workers=1)
     >>> malta.report.rare_event_sentence(event).partition(", as")[0]
     'no run failed: deviation y above 40 um or an earlier end has a probability below 2.4e-08'
     """
@@ -126,7 +133,8 @@ def sensitivity_tables(found: Sensitivity) -> Group:
     >>> spec = malta.read_design("examples/ball/design/ball.toml")
     >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
     >>> options = {"duration": 0.02, "noise": 0.0}
-    >>> plan = malta.Plan(controller, "disturbance", {"m": 0.2, "C": 0.2}, samples=64, options=options)
+    >>> box = {"m": 0.2, "C": 0.2}
+    >>> plan = malta.Plan(controller, "disturbance", box, samples=64, options=options)
     >>> found = malta.sensitivity(plan, malta.limit_of(plan, "touchdown"), workers=1)
     >>> rich.print(malta.report.sensitivity_tables(found).renderables[0])
     yield: 100 % (89.11 to 100 %) of the machines without touchdown; 64 runs
@@ -151,7 +159,8 @@ def sensitivity_sentence(found: Sensitivity) -> str:
     >>> spec = malta.read_design("examples/ball/design/ball.toml")
     >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
     >>> options = {"duration": 0.02, "noise": 0.0}
-    >>> plan = malta.Plan(controller, "disturbance", {"m": 0.2, "C": 0.2}, samples=64, options=options)
+    >>> box = {"m": 0.2, "C": 0.2}
+    >>> plan = malta.Plan(controller, "disturbance", box, samples=64, options=options)
     >>> found = malta.sensitivity(plan, malta.limit_of(plan, "touchdown"), workers=1)
     >>> malta.report.sensitivity_sentence(found)
     'every run is without touchdown: the yield has no indices'
@@ -187,8 +196,11 @@ def spreads_table(found: Tolerances) -> Table:
     >>> import malta
     >>> spec = malta.read_design("examples/ball/design/ball.toml")
     >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
-    >>> plan = malta.Plan(controller, "disturbance", {"m": 0.1}, samples=20, options={"duration": 0.02})
-    >>> found = malta.tolerances(plan, malta.limit_of(plan, "deviation-y", 50e-6), 0.95, workers=1)
+    >>> short = {"duration": 0.02}  # s
+    >>> box = {"m": 0.1}
+    >>> plan = malta.Plan(controller, "disturbance", box, samples=20, options=short)
+    >>> limit = malta.limit_of(plan, "deviation-y", 50e-6)
+    >>> found = malta.tolerances(plan, limit, 0.95, workers=1)
     >>> table = malta.report.spreads_table(found)
     >>> [str(column.header) for column in table.columns][:4], table.row_count
     (['parameter', 'today', 'largest', 'times'], 1)
@@ -222,8 +234,11 @@ def tolerance_sentence(found: Tolerances) -> str:
     >>> import malta
     >>> spec = malta.read_design("examples/ball/design/ball.toml")
     >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
-    >>> plan = malta.Plan(controller, "disturbance", {"m": 0.1}, samples=20, options={"duration": 0.02})
-    >>> found = malta.tolerances(plan, malta.limit_of(plan, "deviation-y", 50e-6), 0.95, workers=1)
+    >>> short = {"duration": 0.02}  # s
+    >>> box = {"m": 0.1}
+    >>> plan = malta.Plan(controller, "disturbance", box, samples=20, options=short)
+    >>> limit = malta.limit_of(plan, "deviation-y", 50e-6)
+    >>> found = malta.tolerances(plan, limit, 0.95, workers=1)
     >>> malta.report.tolerance_sentence(found)
     ''
     """

@@ -25,7 +25,7 @@ def requirements_table(requirements: Sequence[Outcome]) -> Table:
 
     >>> import malta, rich
     >>> from malta.tuning.outcomes import Outcome
-    >>> margin = Outcome("margin", asked=3.0, found=3.6, unit="1", how="proven over the travel", at_least=True)
+    >>> margin = Outcome("margin", 3.0, 3.6, "1", "proven over the travel", at_least=True)
     >>> rich.print(malta.report.requirements_table([margin]))
     Requirements
     <BLANKLINE>
@@ -79,9 +79,10 @@ def front_rows(tuned: Tuned) -> tuple[list[str], list[list[str]]]:
     >>> from malta.tuning.search import Trial
     >>> from malta.tuning.tune import Tuned
     >>> spec = malta.read_design("examples/ball/design/ball.toml")
-    >>> quiet = Trial((223.0, 50.0, 0.051), 1, {"margin": 3.28, "force_noise f": 0.0122, "motion y": 0.523e-6})
-    >>> safe = Trial((190.0, 40.0, 0.11), 1, {"margin": 3.63, "force_noise f": 0.0414, "motion y": 0.501e-6})
-    >>> tuned = Tuned(spec, safe, requirements=(), front=(quiet, safe), trials=120)  # as malta.tune finds it
+    >>> noisy = {"margin": 3.63, "force_noise f": 0.0414, "motion y": 0.501e-6}
+    >>> quiet = {"margin": 3.28, "force_noise f": 0.0122, "motion y": 0.523e-6}
+    >>> front = Trial((223.0, 50, 0.051), 1, quiet), Trial((190.0, 40, 0.11), 1, noisy)
+    >>> tuned = Tuned(spec, front[1], (), front, trials=120)  # as malta.tune finds it
     >>> heads, rows = malta.report.front_rows(tuned)
     >>> rows[1]
     ['363', '0.0414', '0.501', '*']
@@ -108,9 +109,10 @@ def front_table(tuned: Tuned) -> Table:
     >>> from malta.tuning.search import Trial
     >>> from malta.tuning.tune import Tuned
     >>> spec = malta.read_design("examples/ball/design/ball.toml")
-    >>> quiet = Trial((223.0, 50.0, 0.051), 1, {"margin": 3.28, "force_noise f": 0.0122, "motion y": 0.523e-6})
-    >>> safe = Trial((190.0, 40.0, 0.11), 1, {"margin": 3.63, "force_noise f": 0.0414, "motion y": 0.501e-6})
-    >>> tuned = Tuned(spec, safe, requirements=(), front=(quiet, safe), trials=120)  # as malta.tune finds it
+    >>> noisy = {"margin": 3.63, "force_noise f": 0.0414, "motion y": 0.501e-6}
+    >>> quiet = {"margin": 3.28, "force_noise f": 0.0122, "motion y": 0.523e-6}
+    >>> front = Trial((223.0, 50, 0.051), 1, quiet), Trial((190.0, 40, 0.11), 1, noisy)
+    >>> tuned = Tuned(spec, front[1], (), front, trials=120)  # as malta.tune finds it
     >>> rich.print(malta.report.front_table(tuned))
     What the margin costs (* chosen)
     <BLANKLINE>
@@ -138,9 +140,10 @@ def front_markdown(tuned: Tuned) -> str:
     >>> from malta.tuning.search import Trial
     >>> from malta.tuning.tune import Tuned
     >>> spec = malta.read_design("examples/ball/design/ball.toml")
-    >>> quiet = Trial((223.0, 50.0, 0.051), 1, {"margin": 3.28, "force_noise f": 0.0122, "motion y": 0.523e-6})
-    >>> safe = Trial((190.0, 40.0, 0.11), 1, {"margin": 3.63, "force_noise f": 0.0414, "motion y": 0.501e-6})
-    >>> tuned = Tuned(spec, safe, requirements=(), front=(quiet, safe), trials=120)  # as malta.tune finds it
+    >>> noisy = {"margin": 3.63, "force_noise f": 0.0414, "motion y": 0.501e-6}
+    >>> quiet = {"margin": 3.28, "force_noise f": 0.0122, "motion y": 0.523e-6}
+    >>> front = Trial((223.0, 50, 0.051), 1, quiet), Trial((190.0, 40, 0.11), 1, noisy)
+    >>> tuned = Tuned(spec, front[1], (), front, trials=120)  # as malta.tune finds it
     >>> print(malta.report.front_markdown(tuned))
     | margin, proven [%] | f [N rms] | y motion [um rms] |  |
     | ---: | ---: | ---: | ---: |
