@@ -97,7 +97,7 @@ a, b : sizes of |S|
 2
 """
     found = "\n".join(restructured(text.splitlines(), ["malta.verify"]))
-    assert "::\n\n    x' = A x\n" in found
+    assert ".. code-block:: none\n\n    x' = A x\n" in found
     assert ":param a,b: sizes of \\|S\\|\n    in each axis\n" in found
     assert ":py:obj:`malta.verify <malta.verify>`" in found
     assert "``nothing``\\  follow \\*here\\*." in found

@@ -54,7 +54,7 @@ def _converted(block: list[str], known: frozenset[str]) -> list[str]:
     if kind == "example":
         return block
     if kind == "equation":
-        return ["::", "", *block]
+        return [".. code-block:: none", "", *block]
     if kind == "entries":
         return [_field(line, known) for line in block]
     if len(block) == 2 and set(block[1]) == {"-"}:  # the underlined word above entries
