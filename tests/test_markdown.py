@@ -75,10 +75,17 @@ def test_a_file_without_tables_is_refused(text: str, found: str) -> None:
         find_tables(text, "a.md")
 
 
-def test_the_readme_has_its_three_tables() -> None:
-    places = find_tables((ROOT / "README.md").read_text(encoding="utf-8"), "README.md")
-    assert [place.machine for place in places] == ["tubular", "halbach", "planar"]
+@pytest.mark.parametrize("machine", ["tubular", "halbach", "planar"])
+def test_each_machine_has_a_page_of_its_tables(machine: str) -> None:
+    file = ROOT / "docs" / "claims" / f"{machine}.md"
+    places = find_tables(file.read_text(encoding="utf-8"), file.name)
+    assert {place.machine for place in places} == {machine}
     assert all(place.designs for place in places)
+
+
+def test_a_title_is_of_the_second_or_third_order() -> None:
+    higher = TEXT.replace("### halbach", "## halbach")
+    assert [place.machine for place in find_tables(higher, "a.md")] == ["tubular", "halbach"]
 
 
 def test_the_command_writes_the_file(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

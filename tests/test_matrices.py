@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from malta.model.linearize import LinearModel
     from malta.synthesis.controller import Controller
 
+PAGE = Path("docs/howto/margin.md")
 SUFFIXES = (".json", ".npz", ".mat")
 A = [[0, 1, 0], [0, -1, 2], [0, 0, -30]]  # a motor: angle, speed, current
 B = [[0], [0], [30]]
@@ -78,11 +79,11 @@ def test_design_margin_and_gain_file_in_five_lines(tmp_path: Path) -> None:
     assert malta.gains.read(tmp_path / "plain.json").parameters == plant.parameters
 
 
-def test_the_lines_of_the_readme_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_lines_of_the_page_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (block,) = (
-        b for b in re.findall(r"```pycon\n(.*?)```", Path("README.md").read_text(), re.S) if "by_k" in b
+        b for b in re.findall(r"```pycon\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.S) if "by_k" in b
     )
-    example = doctest.DocTestParser().get_doctest(block, {"malta": malta}, "README.md", None, 0)
+    example = doctest.DocTestParser().get_doctest(block, {"malta": malta}, PAGE.name, None, 0)
     monkeypatch.chdir(tmp_path)
     assert doctest.DocTestRunner().run(example) == (0, 6)
     assert malta.gains.read(tmp_path / "plain.json").integrating is False

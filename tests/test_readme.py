@@ -1,4 +1,4 @@
-"""The README's example runs, and its tables of claims show what the code computes."""
+"""The README's example runs, and the tables of claims, on its pages, show what the code computes."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from scipy.stats import binomtest
 import malta
 from malta.campaigns.yields import main_yields
 from malta.machines.tubular.claims import SOURCE
+from malta.report.markdown import find_tables
 
 pytestmark = pytest.mark.usefixtures("proven_once")
 
@@ -20,6 +21,8 @@ DESIGNS = {
     "halbach": ("halbach_late", "halbach", "halbach_pid"),
     "planar": ("planar", "planar_pid"),
 }
+OBSERVED = ("robust_observer",)  # a table of its own on the page of its machine
+PAGES = {name: (ROOT / "docs" / "claims" / f"{name}.md").read_text(encoding="utf-8") for name in DESIGNS}
 DRAWN = "machines ±20 %"  # rows that are shares of machines drawn at random
 FEW = 1000  # machines in the fast test
 TIMED = "K(p) and pseudo-inverse"  # rows that are measured on the computer that computes them
@@ -41,9 +44,27 @@ def _cells(table: str) -> dict[str, list[str]]:
     return {row[0]: row[1:] for row in rows}
 
 
-def _shown(title: str) -> dict[str, list[str]]:
-    start = README.index("| claim |", README.index(f"### {title}\n"))
-    return _cells(README[start : README.index("\n\n", start)])
+def _shown(title: str, designs: tuple[str, ...]) -> dict[str, list[str]]:
+    """The table of these designs on the page of a machine, under the title of its ledger."""
+    page = PAGES[title.split(",")[0]]
+    header = "| claim | published | " + " | ".join(f"`{name}`" for name in designs) + " | verdict |"
+    start = page.index(header, page.index(f"## {title}\n"))
+    return _cells((page + "\n")[start : (page + "\n").index("\n\n", start)])
+
+
+def test_the_headlines_are_rows_of_the_pages() -> None:
+    start = README.index("| claim | design |")
+    lines = README[start : README.index("\n\n", start)].splitlines()[2:]
+    assert len(lines) > 5
+    for line in lines:
+        claim, design, published, ours, verdict = (cell.strip() for cell in line.strip("|").split("|"))
+        (machine,) = [name for name, designs in DESIGNS.items() if design.strip("`") in designs]
+        first = find_tables(PAGES[machine], machine)[0]
+        row = _cells(PAGES[machine][first.start : first.end])[claim]
+        column = DESIGNS[machine].index(design.strip("`"))
+        said = dict(part.split(": ", 1) for part in row[-1].split("; ") if part.startswith(DESIGNS[machine]))
+        assert (published, ours) == (row[0], row[1 + column])
+        assert said.get(design.strip("`"), row[-1]).startswith(verdict)
 
 
 def _is_noisy(machine: str, subject: str) -> bool:
@@ -53,19 +74,27 @@ def _is_noisy(machine: str, subject: str) -> bool:
 
 
 @pytest.mark.parametrize(
-    "machine",
+    ("machine", "designs"),
     [
-        "tubular",
-        pytest.param("halbach", marks=pytest.mark.slow),
-        pytest.param("planar", marks=[pytest.mark.slow, pytest.mark.xdist_group("planar")]),
+        pytest.param("tubular", DESIGNS["tubular"], id="tubular"),
+        pytest.param("tubular", OBSERVED, marks=pytest.mark.slow, id="observed"),
+        pytest.param("halbach", DESIGNS["halbach"], marks=pytest.mark.slow, id="halbach"),
+        pytest.param(
+            "planar",
+            DESIGNS["planar"],
+            marks=[pytest.mark.slow, pytest.mark.xdist_group("planar")],
+            id="planar",
+        ),
     ],
 )
-def test_the_table_of_claims_is_computed(machine: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Yields, of 10 000 machines in the README, are computed of FEW: they lie within the interval of these."""
+def test_the_table_of_claims_is_computed(
+    machine: str, designs: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Yields, of 10 000 machines on the pages, are computed of FEW: they lie within the interval of these."""
     monkeypatch.setattr("malta.machines.tubular.evidence.MACHINES", FEW)
-    specs = [malta.read_design(f"design/{name}.toml") for name in DESIGNS[machine]]
+    specs = [malta.read_design(f"design/{name}.toml") for name in designs]
     ledger = malta.ledger(specs, malta.published(f"data/{machine}.toml"))
-    found, shown = _cells(ledger.markdown()), _shown(ledger.title)
+    found, shown = _cells(ledger.markdown()), _shown(ledger.title, designs)
     assert list(shown) == list(found)
     assert len(found) > 35
     for subject, cells in found.items():
@@ -99,7 +128,7 @@ def _is_of_sample(shown: float | None, found: float | None) -> bool:
 @pytest.mark.slow
 def test_yields_are_those_of_ten_thousand_machines() -> None:
     """All of them; the last digits of the arithmetic decide for machines at a bound."""
-    shown = _shown(f"tubular, {SOURCE}")
+    shown = _shown(f"tubular, {SOURCE}", DESIGNS["tubular"])
     published = malta.published("data/tubular.toml")
     for k, name in enumerate(DESIGNS["tubular"]):
         controller = malta.gains.read(f"design/gains/{name}.json")

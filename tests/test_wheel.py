@@ -14,6 +14,7 @@ import pytest
 from conftest import ROOT
 
 README = (ROOT / "README.md").read_text(encoding="utf-8")
+COMMANDS = (ROOT / "docs" / "howto" / "commands.md").read_text(encoding="utf-8")
 SOURCES = (
     "malta",
     "data",
@@ -25,7 +26,7 @@ SOURCES = (
     "MANIFEST.in",
     "README.md",
 )
-SHORTER = {  # commands of the README that take minutes, as the same commands with less to do
+SHORTER = {  # commands of the page that take minutes, as the same commands with less to do
     "malta tune design/robust.toml": "malta tune design/robust.toml --check",
     "malta tune design/halbach_pid.toml": "malta tune design/halbach_pid.toml --generations 0 --front 0",
     "malta campaign design/gains/calibrated.json --spread 20%": "malta campaign design/gains/calibrated.json "
@@ -85,14 +86,14 @@ def run(program: Path, folder: Path, *command: str) -> subprocess.CompletedProce
     )
 
 
-def test_the_readmes_lines_and_commands(program: Path, tmp_path: Path) -> None:
+def test_the_readmes_lines_and_all_commands(program: Path, tmp_path: Path) -> None:
     """Five lines of Python, then every command, from a folder that has nothing."""
     code = re.search(r"```python\n(.*?)```", README, re.S)
     assert code is not None
     done = run(program, tmp_path, "python", "-c", code[1])
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout.startswith("stable with hold, delay and current loops")
-    every = re.findall(r"^(malta .*?)(?: +#.*)?$", README, re.M)
+    every = re.findall(r"^(malta .*?)(?: +#.*)?$", COMMANDS, re.M)
     lines = [
         line for line in every if "rotor" not in line
     ]  # commands on a machine of one's own have a test of theirs

@@ -27,7 +27,7 @@ def claims(
         ),
     ] = None,
     markdown: Annotated[
-        bool, typer.Option("--markdown", help="Print the table as the README holds it.")
+        bool, typer.Option("--markdown", help="Print the tables as the pages of claims hold them.")
     ] = False,
     update: Annotated[
         Path | None,
@@ -44,7 +44,7 @@ def claims(
 
     \b
     Example:  malta claims design/table2.toml
-              malta claims --update README.md
+              malta claims --update docs/claims/tubular.md
     """
     from malta.synthesis.design_file import read_design
 

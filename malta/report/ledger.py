@@ -70,7 +70,7 @@ class Ledger:
         return f"{self.machine}, {self.source}"
 
     def markdown(self) -> str:
-        """The table as the README shows it."""
+        """The table as the pages of claims show it."""
         header = ["claim", "published", *(f"`{name}`" for name in self.designs), "verdict"]
         rows = [[c.subject, c.published, *c.ours, c.verdict] for c in self.claims]
         lines = ["| " + " | ".join(row) + " |" for row in (header, *rows)]

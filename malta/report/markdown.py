@@ -1,6 +1,6 @@
 """The ledger in a Markdown file: its tables are computed anew where they stand, and nothing else changes.
 
-    ### tubular, S. Miric et al., ...          the machine and its paper: the title of a ledger
+    ### tubular, S. Miric et al., ...          the machine and its paper: the title of a ledger (or with ##)
 
     | claim | published | `table2` | ... | verdict |       the designs are those that the header names
 
@@ -17,7 +17,7 @@ from malta.errors import InputError
 from malta.report.ledger import Ledger
 
 HEADER = re.compile(r"^\| claim \| published \|(?P<designs>.*)\| verdict \|\n", re.MULTILINE)
-TITLE = re.compile(r"^### (?P<machine>\w+), .*\n", re.MULTILINE)
+TITLE = re.compile(r"^###? (?P<machine>\w+), .*\n", re.MULTILINE)
 COUNT = re.compile(r"(?<=<summary>)\d+(?= figures)")
 
 

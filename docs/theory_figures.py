@@ -1,0 +1,362 @@
+"""The figures of the theory pages, computed by malta: python docs/theory_figures.py [FOLDER], `make figures`.
+
+The same malta draws the same bytes: ids of the SVGs are hashed with a fixed salt, and no date is written.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from itertools import product
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import control
+import matplotlib as mpl
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle, Rectangle
+from scipy.special import comb
+
+import malta
+from malta.margins import certificate, taylor
+from malta.margins.robust import law_of
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from malta.model.plant import ComplexArray, FloatArray
+
+FOLDER = Path(__file__).parent / "theory" / "figures"
+STYLES = malta.report.STYLES
+GREY: dict[str, Any] = {"color": "#8a8a8a", "fontsize": 8}
+# The Handbook's problem 7.3.3 (Floudas et al., 1999): q = middle + t width.
+MIDDLE, WIDTH = np.array([2.25, 1.5, 1.5]), np.array([0.25, 0.5, 1.5])
+
+
+def new_figure(panels: int = 1, width: float = 7.2, height: float = 3.6) -> tuple[Figure, list[Axes]]:
+    """An empty figure and its panels, side by side."""
+    figure = Figure(figsize=(width, height), layout="constrained")
+    return figure, list(np.atleast_1d(figure.subplots(1, panels)))
+
+
+def finish(axes: Axes, x: str, y: str, title: str = "") -> None:
+    """Label a panel."""
+    axes.set(xlabel=x, ylabel=y)
+    axes.set_title(title, fontsize=10)
+    axes.spines[["top", "right"]].set_visible(False)
+    if axes.get_legend_handles_labels()[0]:
+        axes.legend(frameon=False, fontsize=8)
+
+
+def handbook(q1: Any, q2: Any, q3: Any) -> list[Any]:
+    """Coefficients of the polynomial, highest power first."""
+    return [
+        16,
+        16 * q1 - 24,
+        78 - 9.625 * q1 - 16 * q2,
+        19 * q1 + 8 * q2 + q3 - 44,
+        12 - 4 * q1 - q2 + q3,
+    ]
+
+
+def handbook_values(w: FloatArray, u: FloatArray, t: float) -> ComplexArray:
+    """a(jw; q) at frequencies w and places u, 3 x n, of the box t."""
+    rows = [
+        np.broadcast_to(row, u.shape[1:]) for row in handbook(*(MIDDLE[:, None] + t * WIDTH[:, None] * u))
+    ]
+    return np.asarray(sum(row * (1j * w[:, None]) ** (4 - k) for k, row in enumerate(rows)))
+
+
+def handbook_margin() -> malta.Margin:
+    """The margin of the polynomial, proven."""
+    box = {f"q{k + 1}": (MIDDLE[k] - WIDTH[k], MIDDLE[k] + WIDTH[k]) for k in range(3)}
+    return malta.margin_of_polynomial(handbook, box, dict(zip(box, MIDDLE.tolist(), strict=True)))
+
+
+def value_sets() -> Figure:
+    """Images of growing boxes at the frequency where stability is lost: zero lies outside up to the margin."""
+    found = handbook_margin()
+    assert found.frequency is not None
+    figure, (axes,) = new_figure(width=5.4)
+    corners = np.array(list(product((-1, 1), repeat=3))).T
+    inside = np.random.default_rng(0).uniform(-1, 1, (3, 120))
+    for t, style in zip((0.4, 0.6, found.upper), STYLES, strict=False):
+        points = handbook_values(np.array([found.frequency]), corners, t)[0]
+        edge = points[hull(points)]
+        axes.plot(edge.real, edge.imag, label=f"t = {t:.3g}", **style)
+        some = handbook_values(np.array([found.frequency]), inside, t)[0]
+        axes.plot(some.real, some.imag, ".", markersize=1.5, color=style["color"])
+    axes.plot(0, 0, "k+", markersize=10, markeredgewidth=1.6)
+    axes.annotate("0", (0, 0), (6, 4), textcoords="offset points")
+    finish(
+        axes, "Re a(jw; p)", "Im a(jw; p)", f"one frequency, {found.frequency:.3g} rad/s, and growing boxes"
+    )
+    return figure
+
+
+def hull(points: ComplexArray) -> list[int]:
+    """Indices around the convex hull of points in the plane, closed."""
+    from scipy.spatial import ConvexHull
+
+    vertices = ConvexHull(np.column_stack([points.real, points.imag])).vertices
+    return [int(k) for k in (*vertices, vertices[0])]
+
+
+def bernstein(low: float, high: float, t: float) -> ComplexArray:
+    """Bernstein coefficients of a(jw; q) over w in [low, high] and the corners of the box t: 5 x 8."""
+    corners = np.array(list(product((-1, 1), repeat=3))).T
+    x = np.linspace(0, 1, 5)
+    values = handbook_values(low + (high - low) * x, corners, t)
+    basis = np.array([[comb(4, k) * s**k * (1 - s) ** (4 - k) for k in range(5)] for s in x])
+    return np.asarray(np.linalg.solve(basis, values))
+
+
+def cell() -> Figure:
+    """One cell: an interval of frequency times the box; its coefficients lie in an open half plane."""
+    low, high, t = 0.95, 1.15, 0.6
+    coefficients = bernstein(low, high, t).ravel()
+    u = np.random.default_rng(1).uniform(-1, 1, (3, 30))
+    values = handbook_values(np.linspace(low, high, 20), u, t).ravel()
+    edge = coefficients[hull(coefficients)]
+    directions = np.exp(1j * np.linspace(0, 2 * np.pi, 7200, endpoint=False))
+    spare = (np.conj(directions)[:, None] * edge[None]).real.min(axis=1)
+    c = directions[spare.argmax()]
+    figure, (axes,) = new_figure(width=5.4)
+    axes.plot(values.real, values.imag, ".", markersize=1.2, color="#8a8a8a", label="values in the cell")
+    axes.plot(
+        coefficients.real,
+        coefficients.imag,
+        "o",
+        markersize=4,
+        color="#c1440e",
+        label="Bernstein coefficients",
+    )
+    axes.plot(edge.real, edge.imag, **(STYLES[0] | {"label": "their hull", "linewidth": 1.0}))
+    reach = 1.1 * np.abs(edge).max()
+    line = c * 1j * np.array([-reach, reach])
+    axes.plot(line.real, line.imag, **(STYLES[2] | {"label": "Re(conj(c) a) = 0"}))
+    axes.annotate("", (0.3 * reach * c.real, 0.3 * reach * c.imag), (0, 0), arrowprops={"arrowstyle": "->"})
+    axes.annotate("c", (0.3 * reach * c.real, 0.3 * reach * c.imag), (5, 0), textcoords="offset points")
+    axes.plot(0, 0, "k+", markersize=10, markeredgewidth=1.6)
+    view = np.concatenate([edge, [0]])
+    room = 0.15 * np.ptp(view.real)
+    axes.set_xlim(view.real.min() - room, view.real.max() + room)
+    axes.set_ylim(view.imag.min() - room, view.imag.max() + room)
+    finish(axes, "Re a(jw; p)", "Im a(jw; p)", f"one cell: w = {low} .. {high} rad/s, {t} boxes")
+    return figure
+
+
+def gain_loop() -> tuple[malta.UncertainSystem, Any]:
+    """A levitated mass with an uncertain force constant b, closed by a lead at 1 kHz."""
+    mass = malta.uncertain(lambda b: ([[0, 1], [100.0, 0]], [[0], [b]], [[1, 0]]), {"b": 1.0})
+    lead = control.c2d(-control.tf([8.0, 400.0], [0.004, 1]), 1e-3, "tustin")
+    return mass, lead
+
+
+def cells() -> Figure:
+    """All cells of a proof: they tile every frequency and the whole interval of the parameter."""
+    mass, lead = gain_loop()
+    ranges = {"b": (0.2, 2.0)}
+    margin = malta.robust_margin(mass, lead, ranges)
+    proof = certificate.certificate_of([(mass, law_of(mass, lead))], ranges, None, margin)
+    figure, (axes,) = new_figure()
+    (loop,) = proof["loops"]
+    (group,) = loop["groups"]
+    count = 0
+    for part in group["parts"]:
+        (ends,) = [[float.fromhex(x) for x in side] for side in part["box"]]
+        for branch, low, high, ((first, last),), *_ in part["cells"]:
+            x = (low, high) if branch == 0 else (2 - high, 2 - low)
+            place = [ends[0] + share * (ends[1] - ends[0]) for share in (first, last)]
+            below, above = sorted(1 / v for v in place) if group["inverted"][0] else place
+            axes.add_patch(
+                Rectangle(
+                    (x[0], below), x[1] - x[0], above - below, facecolor="#dfe8f1" if branch == 0 else "#f3e3da",
+                    edgecolor="#404040", linewidth=0.5,
+                )
+            )  # fmt: skip
+            count += 1
+    assert margin.lower is not None
+    assert margin.witness is not None
+    axes.axhline(margin.witness["b"], **(STYLES[1] | {"label": f"lost: b = {margin.witness['b']:.4g}"}))
+    axes.axhline(1.0, **(STYLES[3] | {"label": "nominal"}))
+    top = 1 + 1.06 * margin.upper
+    axes.set(xlim=(0, 2), ylim=(1 - 0.85 * margin.upper, top))
+    axes.set_xticks([0, 0.5, 1, 1.5, 2], ["0", "", "w1", "", "Nyquist"])
+    finish(
+        axes, "frequency: w / w1, then 2 - w1 / w", "b [1]", f"{count} cells prove {100 * margin.lower:.2f} %"
+    )
+    axes.legend(frameon=True, fontsize=8, loc="lower right", framealpha=1)
+    return figure
+
+
+def taylor_model() -> Figure:
+    """Taylor models of a function on one interval and on three, and the function that they enclose."""
+    half = 1.4
+    figure, (axes,) = new_figure(width=5.4)
+    u = np.linspace(-1, 1, 100)
+    for pieces, color in ((1, "#e7edf3"), (3, "#9fb3c8")):
+        z = taylor.variable(-half, half, pieces)
+        f = taylor.divide(taylor.cosine(z), taylor.add(taylor.constant(2.0, pieces), taylor.sine(z)))
+        polynomial = np.sum([np.outer(f.c[k], u**k) for k in range(len(f.c))], axis=0)
+        label = f"{pieces} interval{'s' * (pieces > 1)}: +-{f.radius.max():.1g}"
+        for k in range(pieces):
+            y = z.c[0, k] + z.c[1, k] * u
+            axes.fill_between(
+                y,
+                polynomial[k] - f.radius[k],
+                polynomial[k] + f.radius[k],
+                color=color,
+                label=label if k == 0 else None,
+            )
+    y = half * u
+    axes.plot(y, np.cos(y) / (2 + np.sin(y)), **(STYLES[0] | {"label": "cos z / (2 + sin z)"}))
+    finish(axes, "z [rad]", "f", "polynomials of degree 6 with their remainders")
+    return figure
+
+
+def continuation() -> Figure:
+    """Roots of the sampled loop on the way from the nominal machine to the witness."""
+    spec = malta.read_design("design/calibrated.toml")
+    model = malta.linearize(spec.plant, spec.plant.at(z=0.0))
+    law = malta.synthesize(spec, model)
+    found = malta.verify(model, law, spec.uncertainty).robust
+    assert found is not None
+    assert found.witness is not None
+    par = spec.parameters
+    z = found.witness.get("z", 0.0)
+    way = np.linspace(0, 1.15, 47)
+    steps = {name: found.witness[name] - getattr(par, name) for name in spec.uncertainty}
+    roots = [
+        roots_at(par, law, {name: getattr(par, name) + s * d for name, d in steps.items()}, z) for s in way
+    ]
+    figure, (left, right) = new_figure(2)
+    for s, row in zip(way, roots, strict=True):
+        left.plot(row.real, row.imag, ".", markersize=2.5, color=mpl.colormaps["viridis"](0.9 * s / way[-1]))
+    left.axvline(0, color="0.5", linewidth=0.8)
+    left.set(xlim=(-600, 60), ylim=(-450, 450))
+    finish(left, "Re ln(z) / Ts [rad/s]", "Im ln(z) / Ts [rad/s]", "roots, dark to light on the way")
+    share = 100 * found.upper * way
+    right.plot(share, [row.real.max() for row in roots], **STYLES[0])
+    right.axhline(0, color="0.5", linewidth=0.8)
+    right.axvline(100 * found.upper, **(STYLES[1] | {"label": f"lost at {100 * found.upper:.2f} %"}))
+    finish(
+        right, "of the way to the witness, in % of the box", "largest real part [rad/s]", "where it is lost"
+    )
+    return figure
+
+
+def roots_at(par: Any, law: malta.Controller, values: dict[str, float], z: float) -> ComplexArray:
+    """Poles of the sampled loop on another machine, as ln(z) / Ts."""
+    from dataclasses import replace
+
+    plant = malta.plant_of(replace(par, **values))
+    poles = malta.verify(malta.linearize(plant, plant.at(z=z)), law).poles.closed_loop
+    return np.asarray(poles)
+
+
+def discs() -> Figure:
+    """Unmodelled dynamics: a disc about every point of the Nyquist curve, which grows until it meets -1."""
+    plant = control.tf([18], [1, 1.8, 10])
+    pid = 2.3 + control.tf([3], [1, 0]) + control.tf([0.38, 0], [0.001, 1])
+    w = np.geomspace(1, 40, 600)
+    L = (plant * pid)(1j * w)
+    margin = malta.dynamic_margin(
+        malta.uncertain(lambda k: ([[0, 1], [-k, -1.8]], [[0], [18]], [[1, 0]]), {"k": 10.0}),
+        -pid, {}, malta.Dynamic(0.5),
+    )  # fmt: skip
+    figure, panels = new_figure(2, height=3.8)
+    for axes, t in zip(panels, (1.0, margin.upper), strict=True):
+        for k in range(0, len(w), 12):
+            disc = Circle(
+                (L[k].real, L[k].imag), 0.5 * t * abs(L[k]), facecolor="#dfe8f1", edgecolor="#b8c4d0", lw=0.4
+            )
+            axes.add_patch(disc)
+        axes.plot(L.real, L.imag, **STYLES[0])
+        axes.plot(-1, 0, "k+", markersize=10, markeredgewidth=1.6)
+        axes.set(xlim=(-4, 2), ylim=(-3.6, 2.4), aspect="equal")
+        finish(axes, "Re L", "Im L", f"discs of 50 %, times {t:.3f}")
+    return figure
+
+
+def stages() -> Figure:
+    """Where the margin goes: from full state feedback to the machine, of two designs."""
+    figure, (axes,) = new_figure(height=3.2)
+    for n, name in enumerate(("calibrated", "robust")):
+        law = malta.gains.read(f"design/gains/{name}.json")
+        chain = malta.robustness(
+            malta.plant_of(law.parameters), law, dict.fromkeys(("m", "K_A", "K_D", "K_B"), 0.2)
+        ).chain
+        proven = [
+            0.0 if link.margin is None or link.margin.lower is None else 100 * link.margin.lower
+            for link in chain
+        ]
+        places = np.arange(len(chain)) + 0.38 * (n - 0.5)
+        axes.bar(places, proven, 0.36, color=("#c9d3de", "#404a55")[n], label=name)
+        for x, value in zip(places, proven, strict=True):
+            axes.annotate(
+                f"{value:.0f}", (x, value), (0, 2), textcoords="offset points", ha="center", fontsize=7
+            )
+    axes.set_xticks(
+        range(len(chain)), [link.name.replace("all of the travel", "travel") for link in chain], fontsize=8
+    )
+    finish(axes, "", "proven [% of the box]")
+    return figure
+
+
+def frames() -> Figure:
+    """The mover from the side: bearing planes, sensor planes, and a tilt."""
+    par = malta.read("data/tubular.toml")
+    figure, (axes,) = new_figure(height=2.7)
+    tilt, shift = 0.06, 5.0  # much more than an air gap allows
+    l_B, l_S = 1e3 * par.l_B, 1e3 * par.l_S
+    line = np.array([-1.2 * l_S, 1.2 * l_S])
+    axes.plot(line, shift + tilt * line, color="#000000", linewidth=5, alpha=0.25, solid_capstyle="butt")
+    axes.plot(line, 0 * line, **(STYLES[3] | {"label": "axis of the stator, z"}))
+    axes.plot(line, shift + tilt * line, **(STYLES[0] | {"label": "axis of the mover"}))
+    for n, (z, what) in enumerate(((-l_S, "x1"), (-l_B, "fx_B1"), (l_B, "fx_B2"), (l_S, "x2"))):
+        sensor = what[0] == "x"
+        axes.plot([z, z], [0, shift + tilt * z], **(STYLES[1 + sensor] | {"linestyle": "-"}))
+        up = shift + tilt * z
+        axes.annotate(what, (z, max(up, 0)), (0, 7), textcoords="offset points", ha="center")
+        axes.annotate(("sensor", "bearing", "bearing", "sensor")[n], (z, 0), (0, -14), textcoords="offset points",
+                      ha="center", **GREY)  # fmt: skip
+    axes.plot(0, shift, "ko", markersize=4)
+    axes.annotate("centre of gravity (x, z)", (0, shift), (6, -14), textcoords="offset points", fontsize=8)
+    axes.annotate(
+        "tilt beta", (0.7 * l_S, shift + tilt * 0.7 * l_S), (-8, 16), textcoords="offset points", fontsize=8
+    )
+    axes.set(ylim=(-6, 17), yticks=[])
+    finish(axes, "z [mm]", "x, not to scale")
+    axes.legend(frameon=False, fontsize=8, loc="upper left")
+    return figure
+
+
+FIGURES: dict[str, Callable[[], Figure]] = {
+    "value_sets": value_sets,
+    "cell": cell,
+    "cells": cells,
+    "taylor": taylor_model,
+    "continuation": continuation,
+    "discs": discs,
+    "stages": stages,
+    "frames": frames,
+}
+
+
+def draw(folder: Path) -> list[Path]:
+    """Draw all figures into a folder."""
+    mpl.rcParams.update(
+        {"svg.hashsalt": "malta", "svg.fonttype": "none", "font.size": 9, "path.simplify": True}
+    )
+    folder.mkdir(parents=True, exist_ok=True)
+    files = []
+    for name, make in FIGURES.items():
+        files.append(folder / f"{name}.svg")
+        make().savefig(files[-1], metadata={"Date": None}, facecolor="white")
+    return files
+
+
+if __name__ == "__main__":
+    print(*draw(Path(sys.argv[1]) if sys.argv[1:] else FOLDER), sep="\n")
