@@ -23,7 +23,18 @@ from mutants import ROOT, Mutant, mutants
 SECONDS = float(
     os.environ.get("MUTANT_SECONDS") or 300
 )  # of the tests of a mutant: those that do not end notice it
-PARTS = ("malta", "tests", "bench", "data", "design", "examples", "notebooks", "docs", "pyproject.toml", "README.md")
+PARTS = (
+    "malta",
+    "tests",
+    "bench",
+    "data",
+    "design",
+    "examples",
+    "notebooks",
+    "docs",
+    "pyproject.toml",
+    "README.md",
+)
 
 
 def main() -> int:
