@@ -154,13 +154,11 @@ def scenarios_table(plant: Plant, flown: Collection[str] | None = None) -> Table
     >>> rich.print(malta.report.scenarios_table(ball, ["disturbance"]))
     Scenarios of the machine 'ball'
     <BLANKLINE>
-                                                                          options
-                                                                          of its
-     scenario     what is run                                             own
+     scenario      what is run                                  options of its own
      ─────────────────────────────────────────────────────────────────────────────
-     disturbance  A constant force or torque of `size` (N or N m) on one  on=all
-                  input of disturbance, or on each in turn.               size=1.0
-                                                                          time=0.0
+     disturbance   A constant force or torque of `size` (N or   on=all
+                   N m) on one input of disturbance, or on      size=1.0
+                   each in turn.                                time=0.0
     <BLANKLINE>
     """
     table = new_table(
