@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import tomllib
 from collections.abc import Callable
 from pathlib import Path
@@ -18,6 +19,7 @@ from jsonschema import Draft202012Validator
 import malta
 from fuzz.edits import EDITS, edited
 from fuzz.gain_files import gain_document, signed
+from malta.cli.schema import schema as schema_command
 from malta.gains.encodings import decode
 from malta.schemas import SCHEMAS, schema
 from malta.tables import load_toml
@@ -207,6 +209,19 @@ def test_schemas_of_a_machine_know_its_names() -> None:
     data["parameters"]["mass"] = data["parameters"].pop("m")
     assert faults("data", data) == []
     assert len(faults("data", data, spec.plant)) == 1
+
+
+@pytest.mark.parametrize("name", ["design", "data"])
+def test_the_example_of_a_page_fits(name: str) -> None:
+    page = (ROOT / "docs" / "formats" / f"{name}.md").read_text(encoding="utf-8")
+    (example,) = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
+    assert faults(name, tomllib.loads(example)) == []
+
+
+def test_the_command_knows_machines(capsys: pytest.CaptureFixture[str]) -> None:
+    schema_command("design", Path("data/halbach.toml"))
+    plant = malta.plant_of(malta.read("data/halbach.toml"))
+    assert json.loads(capsys.readouterr().out) == schema("design", plant)
 
 
 def test_unknown_schemas_are_refused() -> None:

@@ -3,6 +3,7 @@
 ```{public-names} margins        names of malta that come from this package, or those of a module as malta.report
 ```{commands}                    every command of the program with its help
 ```{entries} gain                the tables of a file, from its schema
+```{requirements}                what a design can be asked for, of any machine or of that of a data file
 ```{outputs}                     those of every document that a command prints with --json
 """
 
@@ -21,9 +22,13 @@ from sphinx.util.docutils import SphinxDirective
 from typer.main import get_command
 from typer.testing import CliRunner
 
+import malta
 from malta.cli.documents.published import ALL_SCHEMAS, MODELS
 from malta.cli.main import app as program
 from malta.files import json_text
+from malta.schemas.parts import changed, without_null
+from malta.synthesis.design_tables import specification_record
+from malta.synthesis.requirements import GENERIC, requirements_for
 
 if TYPE_CHECKING:
     from sphinx.application import Sphinx
@@ -135,13 +140,35 @@ class Outputs(Entries):
         return found
 
 
+class Requirements(SphinxDirective):
+    """What a design of a machine can be asked for: the keys of [specification].
+
+    The argument is a data file, of which the machine's own requirements are listed; without it, those of any machine.
+    """
+
+    optional_arguments = 1
+
+    def run(self) -> list[nodes.Node]:
+        """Write a table of them, as of other entries."""
+        wanted = {requirement.name: requirement for requirement in GENERIC}
+        if self.arguments:
+            known = requirements_for(malta.plant_of(malta.read(self.arguments[0])))
+            wanted = {name: one for name, one in known.items() if wanted.get(name) is not one}
+        table = changed(specification_record(wanted.values()).model_json_schema(), without_null)
+        table["required"] = [*table["properties"]]  # each of them may be left out, which is not said of each
+        places = {name: place for name, place, _ in tables_of(ALL_SCHEMAS["design"]())}
+        found: list[nodes.Node] = self.parse_text_to_nodes("\n".join(_rows(table, "design", places)))
+        return found
+
+
 def _rows(table: dict[str, Any], file: str, places: dict[str, str]) -> list[str]:
     """The entries of a table as rows in Markdown."""
     rows = ["| entry | kind | meaning |", "|---|---|---|"]
     for key, entry in table["properties"].items():
         kind = [_kind(entry, file, places), entry.get("unit", "").removeprefix("1")]
         kind += [] if key in table.get("required", []) else ["optional"]
-        cells = [f"`{key}`", ", ".join(filter(None, kind)), entry.get("description", "")]
+        meaning = re.sub(r"(?<![`\w])--[a-z]+", r"`\g<0>`", entry.get("description", ""))
+        cells = [f"`{key}`", ", ".join(filter(None, kind)), meaning]
         rows.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
     return rows
 
@@ -181,7 +208,8 @@ def _kind(entry: dict[str, Any], file: str, places: dict[str, str]) -> str:
     """What stands behind a key, in words; tables are links to their entries."""
     if "anyOf" in entry:
         kinds = dict.fromkeys(_kind(inner, file, places) for inner in entry["anyOf"])
-        return " or ".join(kind for kind in kinds if kind)
+        named = [kind for kind in kinds if kind]
+        return (" or " if len(named) < 3 else ", ").join(named)
     if "$ref" in entry:
         name = entry["$ref"].rpartition("/")[2]
         return "" if name in UNLISTED else f"[{places[name]}](#{file}-{name.lower()})"
@@ -253,6 +281,7 @@ def setup(app: Sphinx) -> dict[str, Any]:
     app.add_directive("commands", Commands)
     app.add_directive("entries", Entries)
     app.add_directive("outputs", Outputs)
+    app.add_directive("requirements", Requirements)
     app.connect("autodoc-process-docstring", convert)
     app.connect("missing-reference", resolve)
     app.connect("build-finished", publish_schemas)

@@ -153,7 +153,10 @@ def specification_table(requirements: Iterable[Requirement], given: Mapping[str,
 
 def specification_record(requirements: Iterable[Requirement]) -> type[Record]:
     """Make the table [specification] of some requirements: one optional key for each."""
-    keys: dict[str, Any] = {r.name: (_kind(r) | None, None) for r in requirements}
+    keys: dict[str, Any] = {
+        r.name: (_kind(r) | None, entry(r.meaning, r.unit.removeprefix("1"), default=None))
+        for r in requirements
+    }
     return create_model("Specification", __base__=Record, **keys)
 
 

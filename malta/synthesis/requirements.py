@@ -161,6 +161,7 @@ class Requirement:
     needs_stability : an unstable loop has no such figure, and fails
     trade : what the Pareto front shows it as, against the margin: noise of the force, or motion
     heading : its words in the Pareto front, without "motion"; none: not shown, or by the signal's name
+    meaning : what is bounded, in words, for schemas and pages
     """
 
     name: str
@@ -174,6 +175,7 @@ class Requirement:
     needs_stability: bool = True
     trade: Trade | None = None
     heading: str = ""
+    meaning: str = ""
 
     def signals(self, plant: Plant) -> tuple[Signal, ...]:
         """Return the signals that can be bounded one by one; none for one bound of the whole machine."""
@@ -215,8 +217,16 @@ def motion_of(name: str, outputs: Indices, heading: str) -> Requirement:
     def estimate(loop: TrialLoop, _signal: str) -> float | None:
         return _largest(loop.noise.motion, loop.outputs, outputs(loop.plant))
 
+    meaning = f"{heading} motion at rest, rms, from the sensors' noise and steps"
     return Requirement(
-        name, measure, "m", laws=("LQG", "PID"), estimate=estimate, trade="motion", heading=heading
+        name,
+        measure,
+        "m",
+        laws=("LQG", "PID"),
+        estimate=estimate,
+        trade="motion",
+        heading=heading,
+        meaning=meaning,
     )
 
 
@@ -229,8 +239,16 @@ def force_noise_of(name: str, inputs: Indices, heading: str) -> Requirement:
     def estimate(loop: TrialLoop, _signal: str) -> float | None:
         return _largest(loop.noise.force, loop.inputs, inputs(loop.plant))
 
+    meaning = f"noise of the commanded {heading} at rest, rms"
     return Requirement(
-        name, measure, "N", laws=("LQG", "PID"), estimate=estimate, trade="force", heading=heading
+        name,
+        measure,
+        "N",
+        laws=("LQG", "PID"),
+        estimate=estimate,
+        trade="force",
+        heading=heading,
+        meaning=meaning,
     )
 
 
@@ -317,17 +335,22 @@ def _index(signals: Sequence[Signal], name: str) -> list[int]:
 
 GENERIC = (
     Requirement(
-        "noise_motion", _noise_motion, laws=("PID",), form="outputs"
-    ),  # rms, from the noise of [cost]
-    Requirement(  # multiples of the box of `uncertainty`, anywhere in the travel
+        "noise_motion",
+        _noise_motion,
+        laws=("PID",),
+        form="outputs",
+        meaning="motion of outputs, rms, from the noise of [cost]",
+    ),
+    Requirement(
         "margin",
         _margin,
         at_least=True,
         laws=("LQG", "PID"),
         estimate=lambda loop, _: loop.margin,
         needs_stability=False,
+        meaning="proven margin in multiples of the box of uncertainty, anywhere in the travel, at least",
     ),
-    Requirement(  # of every sensor, on the machine
+    Requirement(
         "peak_sensitivity",
         _peak_sensitivity,
         laws=("LQG", "PID"),
@@ -335,8 +358,9 @@ GENERIC = (
         estimate=lambda loop, _: loop.peak_sensitivity,
         needs_stability=False,
         heading="peak S",
+        meaning="largest |S| of every sensor, on the machine",
     ),
-    Requirement(  # by every definition of verify
+    Requirement(
         "bandwidth",
         _bandwidth,
         "rad/s",
@@ -345,12 +369,24 @@ GENERIC = (
         estimate=lambda loop, _: loop.bandwidth,
         needs_stability=False,
         heading="bandwidth",
-    ),
-    Requirement(  # of a constant load from outside: see recovery.py
-        "recovery", _recovery, laws=("LQG", "PID"), form="loads", estimate=_recovery_estimate
+        meaning="bandwidth by every definition of `malta verify`, at least",
     ),
     Requirement(
-        "motion", _motion, laws=("LQG", "PID"), form="outputs", estimate=_motion_estimate, trade="motion"
+        "recovery",
+        _recovery,
+        laws=("LQG", "PID"),
+        form="loads",
+        estimate=_recovery_estimate,
+        meaning="what a constant load from outside does, by the name of a load",
+    ),
+    Requirement(
+        "motion",
+        _motion,
+        laws=("LQG", "PID"),
+        form="outputs",
+        estimate=_motion_estimate,
+        trade="motion",
+        meaning="motion of outputs at rest, rms, from the sensors' noise and steps",
     ),
     Requirement(
         "force_noise",
@@ -359,5 +395,6 @@ GENERIC = (
         form="inputs",
         estimate=_force_estimate,
         trade="force",
+        meaning="noise of commanded inputs at rest, rms",
     ),
 )

@@ -124,9 +124,42 @@ REQUIREMENTS = (
     motion_of("axial_motion", _axial, "axial"),
     force_noise_of("force_noise", _bearings, "bearing force"),
     force_noise_of("thrust_noise", _thrust, "thrust"),
-    Requirement("tracking_error", _of_strokes(0), "m", laws=ANY),
-    Requirement("radial_deviation", _of_strokes(1), "m", laws=ANY),
-    Requirement("tilt_deviation", _tilt, "m", laws=ANY, estimate=_tilt_estimate),
-    Requirement("payload", _payload, "kg", at_least=True, laws=ANY),  # picked up and carried through a stroke
-    Requirement("lift_off", _lift_off, at_least=True, laws=ANY, form="switch"),  # from rest on the bearing
+    Requirement(
+        "tracking_error",
+        _of_strokes(0),
+        "m",
+        laws=ANY,
+        meaning="axial error in the stroke with 5 % error of K_D, either way",
+    ),
+    Requirement(
+        "radial_deviation",
+        _of_strokes(1),
+        "m",
+        laws=ANY,
+        meaning="radial deviation in the same strokes",
+    ),
+    Requirement(
+        "tilt_deviation",
+        _tilt,
+        "m",
+        laws=ANY,
+        estimate=_tilt_estimate,
+        meaning="deviation of sensor plane 2 in the tilt",
+    ),
+    Requirement(
+        "payload",
+        _payload,
+        "kg",
+        at_least=True,
+        laws=ANY,
+        meaning="mass that is picked up and carried through a stroke, at least",
+    ),
+    Requirement(
+        "lift_off",
+        _lift_off,
+        at_least=True,
+        laws=ANY,
+        form="switch",
+        meaning="whether it lifts off from rest on the bearing",
+    ),
 )
