@@ -65,7 +65,7 @@ bench: $(VENV)/dev  # with PAGE=docs/benchmarks.md it writes that page
 	$(BIN)/python bench/run.py $(if $(PAGE),--page $(PAGE))
 
 figures: $(VENV)/runtime  # the pictures of the README and of the theory pages
-	$(BIN)/python docs/theory_figures.py
+	$(BIN)/python docs/page_figures.py
 	$(BIN)/python -c "import malta; c = malta.gains.read('design/gains/calibrated.json'); \
 	  run = malta.simulate(malta.plant_of(c.parameters), c, malta.Scenario.stroke()); \
 	  malta.report.stroke(run, 'design/figures/stroke.svg', malta.published('data/tubular.toml'))"

@@ -35,7 +35,7 @@ def test_the_examples_of_a_page_show_what_comes_out(page: Path, monkeypatch: pyt
 @pytest.mark.slow
 def test_figures_of_the_theory_are_those_that_are_drawn(tmp_path: Path) -> None:
     """The words and numbers in them; lines differ in their last digits between processors."""
-    from theory_figures import FOLDER, draw
+    from page_figures import FOLDER, draw
 
     drawn = {file.name: file for file in draw(tmp_path)}
     shown = {file.name: file for file in FOLDER.glob("*.svg")}

@@ -1,4 +1,4 @@
-"""The figures of the theory pages, computed by malta: python docs/theory_figures.py [FOLDER], `make figures`.
+"""The figures of the tutorial and the theory pages, computed by malta: python docs/page_figures.py [FOLDER], `make figures`.
 
 The same malta draws the same bytes: ids of the SVGs are hashed with a fixed salt, and no date is written.
 """
@@ -333,6 +333,15 @@ def frames() -> Figure:
     return figure
 
 
+def bode() -> Figure:
+    """The Bode plot of the machine that the tutorial begins with."""
+    from malta.files import shipped_path
+
+    spec = malta.read_design(shipped_path("examples", "ball", "design", "ball.toml"))
+    model = malta.linearize(spec.plant, spec.plant.at())
+    return malta.report.bode(spec.plant, malta.synthesize(spec, model))
+
+
 FIGURES: dict[str, Callable[[], Figure]] = {
     "value_sets": value_sets,
     "cell": cell,
@@ -342,6 +351,7 @@ FIGURES: dict[str, Callable[[], Figure]] = {
     "discs": discs,
     "stages": stages,
     "frames": frames,
+    "bode": bode,
 }
 
 
