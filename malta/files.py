@@ -6,10 +6,12 @@ import math
 import os
 import re
 import secrets
+import signal
 import socket
 import stat
-from collections.abc import Callable, Mapping
-from contextlib import suppress
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -80,22 +82,61 @@ def replace_files(contents: Mapping[Path, bytes]) -> None:
             except (OSError, ValueError) as error:
                 raise _refused(path, error) from error
         before = {path: path.read_bytes() if path.exists() else None for _, path in staged}
-        replaced: list[Path] = []
-        for temporary, path in staged:
-            try:
-                temporary.replace(path)
-            except OSError as error:
-                for other in replaced:
-                    old = before[other]
-                    other.unlink() if old is None else other.write_bytes(old)
-                raise _refused(path, error) from error
-            replaced.append(path)
-        for folder in {path.parent for path in replaced}:
+        with _uninterrupted():
+            _rename(staged, before)
+        for folder in {path.parent for _, path in staged}:
             _sync_folder(folder)
     finally:
         for temporary, _ in staged:
             with suppress(OSError):
                 temporary.unlink(missing_ok=True)
+
+
+def _rename(staged: list[tuple[Path, Path]], before: Mapping[Path, bytes | None]) -> None:
+    """Rename files into place, all or none. Raises InputError; the old files stand then."""
+    replaced: list[Path] = []
+    for temporary, path in staged:
+        try:
+            temporary.replace(path)
+        except OSError as error:
+            for other in replaced:
+                old = before[other]
+                other.unlink() if old is None else other.write_bytes(old)
+            raise _refused(path, error) from error
+        replaced.append(path)
+    for noted in _notes:
+        noted.extend(replaced)
+
+
+_notes: list[list[Path]] = []  # of `noting_files`
+
+
+@contextmanager
+def noting_files() -> Iterator[list[Path]]:
+    """Note the files that are written; yields the list that grows."""
+    written: list[Path] = []
+    _notes.append(written)
+    try:
+        yield written
+    finally:
+        _notes.pop()
+
+
+@contextmanager
+def _uninterrupted() -> Iterator[None]:
+    """Put Ctrl-C off to the end of a block, where it would raise KeyboardInterrupt."""
+    usual = threading.current_thread() is threading.main_thread()
+    if not usual or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+        yield
+        return
+    pressed: list[int] = []
+    signal.signal(signal.SIGINT, lambda number, _: pressed.append(number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+    if pressed:
+        raise KeyboardInterrupt
 
 
 def json_text(content: Any) -> str:

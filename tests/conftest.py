@@ -103,6 +103,12 @@ def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> 
 
 
 @pytest.fixture(autouse=True)
+def _silent(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Commands say nothing of how far they are, however slow the machine; tests of that set their own patience."""
+    monkeypatch.setattr("malta.cli.output.PATIENCE", math.inf)
+
+
+@pytest.fixture(autouse=True)
 def _in_the_root(monkeypatch: pytest.MonkeyPatch) -> None:
     """Tests name files as a user in the project's root does: data/tubular.toml."""
     monkeypatch.chdir(ROOT)

@@ -483,9 +483,8 @@ def test_a_variable_without_effect_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.fixture
-def run(run: Run, monkeypatch: pytest.MonkeyPatch) -> Run:
-    """Run `malta tune ARGUMENTS`, without a word on how far it is, however slow the machine."""
-    monkeypatch.setattr("malta.cli.output.PATIENCE", math.inf)
+def run(run: Run) -> Run:
+    """Run `malta tune ARGUMENTS`."""
     return partial(run, "tune")
 
 

@@ -219,7 +219,7 @@ def campaign(
         run_study(study, Setting(gains, plan, bounds, folder, workers, as_json, yes))
         return
     session = Session(workers, cluster)
-    with campaign_folder(plan, folder, session, gains), progress_bar(scenario, quiet=as_json) as bar:
+    with campaign_folder(plan, folder, session, gains), progress_bar(scenario) as bar:
         progress = limit_time(bar, f"{scenario}, {samples} runs", agreed=yes)
         result = summarize(plan, folder, bounds, workers=workers, cluster=cluster, progress=progress)
     _report(gains, result, worst, as_json=as_json)

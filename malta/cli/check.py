@@ -9,7 +9,7 @@ import typer
 
 from malta.cli.inputs import read_controller
 from malta.cli.options import AsJson, MachineFile
-from malta.cli.output import make_console, print_document, print_line, print_note
+from malta.cli.output import make_console, print_document, print_line, print_note, working
 
 if TYPE_CHECKING:
     from malta.margins.loops import CurrentLoops
@@ -32,10 +32,11 @@ def check(
     """
     from malta.margins.check import check as check_certificate
 
-    verdict = check_certificate(file, gains)
-    failures = list(verdict.failures)
-    if gains is not None and not failures and not _matches_gains(file, read_controller(gains, machine)):
-        failures.append(f"the loops are not those of {gains}")
+    with working(f"checking {file}"):
+        verdict = check_certificate(file, gains)
+        failures = list(verdict.failures)
+        if gains is not None and not failures and not _matches_gains(file, read_controller(gains, machine)):
+            failures.append(f"the loops are not those of {gains}")
     if as_json:
         from malta.cli.documents.others import CheckOutput
 

@@ -49,13 +49,13 @@ def claims(
     from malta.synthesis.design_file import read_design
 
     if update is not None:
-        _update(update, designs or [], quiet=as_json)
+        _update(update, designs or [])
         return
 
     specs = [read_design(file) for file in design_files("claims", designs, reverse=True, or_shipped=True)]
     if not designs:
         specs.sort(key=lambda spec: bool(spec.search))  # the paper's own designs first
-    with progress_bar("claims", quiet=as_json) as progress:
+    with progress_bar("claims") as progress:
         ledgers = _compute_ledgers(specs, progress)
     if as_json:
         from malta.cli.documents.others import claims_output
@@ -88,7 +88,7 @@ def _compute_each(groups: Sequence[Sequence[Spec]], progress: Callable[[float], 
     ]
 
 
-def _update(file: Path, designs: Sequence[Path], *, quiet: bool) -> None:
+def _update(file: Path, designs: Sequence[Path]) -> None:
     """Compute the tables of a Markdown file anew.
 
     Raises InputError for designs beside the file, a table of a design that is not there, and a file without tables.
@@ -107,7 +107,7 @@ def _update(file: Path, designs: Sequence[Path], *, quiet: bool) -> None:
             if name not in known:
                 raise InputError(file, place.machine, name, "one of " + " ".join(sorted(known)))
         specs.append([read_design(known[name]) for name in place.designs])
-    with progress_bar("claims", quiet=quiet) as progress:
+    with progress_bar("claims") as progress:
         ledgers = _compute_each(specs, progress)
     replace_files({file: replace_tables(text, ledgers, str(file)).encode()})
     print_written(make_console(), [file])

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
 from malta.cli.completion import design_files as complete_designs
 from malta.cli.inputs import design_files, gains_folder
 from malta.cli.options import AsJson
-from malta.cli.output import make_console, print_document, print_error, print_written, track_files
+from malta.cli.output import make_console, print_document, print_error, print_written, working
 from malta.errors import CheckError, InputError
 from malta.files import replace_files
 
@@ -45,12 +46,19 @@ def design(
     designed: list[DesignPart] = []
     sources: dict[Path, Path] = {}  # output file -> the design file of this run that it comes from
     code = 0
-    for file in track_files(design_files("design", files), "designing", quiet=as_json):
+    chosen = design_files("design", files)
+    for n, file in enumerate(chosen):
         try:
-            folder = out or gains_folder(file)
-            designed.append(_run_design(file, folder, figures, sources, quiet=as_json))
+            with working(
+                f"designing {file}" + (f" ({n + 1} of {len(chosen)})" if len(chosen) > 1 else "")
+            ) as work:
+                made = _run_design(file, out or gains_folder(file), figures, sources, work.note)
         except (InputError, CheckError) as error:
             code = max(code, print_error(error, file))
+            continue
+        designed.append(made.document)
+        if not as_json:
+            _print_design(made)
     if as_json:
         from malta.cli.documents.simulations import DesignOutput
 
@@ -58,10 +66,20 @@ def design(
     raise typer.Exit(code)
 
 
+class Made(NamedTuple):
+    """A design whose gain files stand."""
+
+    page: Any
+    document: DesignPart
+    paths: Sequence[Path]  # gain files
+    picture: Path
+    unchanged: bool  # the gain files held these numbers already
+
+
 def _run_design(
-    file: Path, out: Path, figures: Path, sources: dict[Path, Path], *, quiet: bool
-) -> DesignPart:
-    """Design, verify and simulate the controller of one design file and write its gain files; the JSON document.
+    file: Path, out: Path, figures: Path, sources: dict[Path, Path], note: Callable[[str], None]
+) -> Made:
+    """Design, verify and simulate the controller of one design file and write its gain files.
 
     Raises InputError for a design of a name that `sources` has, CheckError where a check fails; nothing is written
     over a gain file then.
@@ -85,9 +103,12 @@ def _run_design(
             raise InputError(file, "name", repr(spec.name), f"another name than that of {sources[target]}")
     model = linearize(plant, plant.at(**spec.operating_point))
     controller = synthesize(spec, model)
+    note("margins")
     margins = compute_margins(model, controller, spec.uncertainty)
     require_stable(margins, str(file))
+    note(job)
     result = _simulate_gain_file(file, spec, controller, margins, job)
+    note("figure")
     published = published_beside(spec.machine_file)
     page = report.design_page(spec, model, margins, result, published)
     contents = {picture: report.encode_figure(report.experiment_figure(result, published), picture)}
@@ -97,14 +118,18 @@ def _run_design(
     replace_files(
         contents
     )  # last, and all at once: whatever fails leaves the old gain files and their figure
-    if not quiet:
-        console = make_console()
-        console.print(page)
-        if unchanged:
-            console.print(f"{paths[0]}: holds these numbers already; left as it is", soft_wrap=True)
-        print_written(console, (picture,) if unchanged else (*paths, picture))
-        console.print()
-    return design_part(spec.name, (*paths, picture), {}, margins, result)
+    document = design_part(spec.name, (*paths, picture), {}, margins, result)
+    return Made(page, document, paths, picture, unchanged)
+
+
+def _print_design(made: Made) -> None:
+    """Print the page of a design, and the files."""
+    console = make_console()
+    console.print(made.page)
+    if made.unchanged:
+        console.print(f"{made.paths[0]}: holds these numbers already; left as it is", soft_wrap=True)
+    print_written(console, (made.picture,) if made.unchanged else (*made.paths, made.picture))
+    console.print()
 
 
 def _simulate_gain_file(
@@ -112,7 +137,7 @@ def _simulate_gain_file(
 ) -> Experiment:
     """Simulate the main job with a gain file that is written for it alone, before a good one is replaced.
 
-    Raises CheckError, naming the design file, when a run ends early.
+    Raises CheckError, naming the design file, when a run ends early; KeyboardInterrupt when Ctrl-C cut it short.
     """
     import tempfile
 
@@ -127,6 +152,8 @@ def _simulate_gain_file(
         except InputError as error:  # of numbers in the design: the user knows of no other file
             raise InputError(file, error.field, error.found, error.expected) from error
         result = experiment(job, spec.plant, written)
+    if result.interrupted or result.run.verdict.name == "interrupted":
+        raise KeyboardInterrupt
     for case in result.cases:
         end = case.run.verdict
         if not end.completed:

@@ -9,7 +9,7 @@ import typer
 
 from malta.cli.inputs import read_controller
 from malta.cli.options import AsJson, GainFile, MachineFile
-from malta.cli.output import make_console, print_document, print_note, print_written
+from malta.cli.output import make_console, print_document, print_note, print_written, working
 from malta.errors import InputError
 
 
@@ -55,7 +55,8 @@ def export(
     if to == "fmu":
         own = part or "controller"
         file = out or Path("build") / f"{controller.name}_{own}.fmu"
-        note = export_fmu(gains, file, part=cast("Any", own), fmi=fmi or 2, **chosen)
+        with working("exporting"):
+            note = export_fmu(gains, file, part=cast("Any", own), fmi=fmi or 2, **chosen)
         if note:
             print_note(f"{file}: {note}")
         files = [file]
@@ -63,7 +64,8 @@ def export(
         if proof and precision == "float" and not as_json:
             print_note("proving the margin with the coefficients that float holds; --no-proof leaves it out")
         folder = out or Path("build") / f"{controller.name}_c"
-        files = export_c(gains, folder, precision=cast("Any", precision), proof=proof, **chosen)
+        with working("exporting"):
+            files = export_c(gains, folder, precision=cast("Any", precision), proof=proof, **chosen)
     if as_json:
         from malta.cli.documents.others import ExportOutput
 

@@ -9,8 +9,9 @@ import gc
 import io
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from itertools import chain
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -24,7 +25,7 @@ from malta.cli.compare import compare
 from malta.cli.design import design
 from malta.cli.export import export
 from malta.cli.new import new
-from malta.cli.output import print_error, print_note, silence
+from malta.cli.output import interruption, print_error, print_note, silence
 from malta.cli.plot import plot
 from malta.cli.report import report
 from malta.cli.schema import schema
@@ -32,6 +33,7 @@ from malta.cli.simulate import simulate
 from malta.cli.tune import tune
 from malta.cli.verify import verify
 from malta.errors import CheckError, InputError, shorten
+from malta.files import noting_files
 
 UsageError: Any = (
     typer.BadParameter.__base__
@@ -41,12 +43,29 @@ UsageError: Any = (
 class Grouped(TyperGroup):
     """The group of all commands: its help lists them under the headings of GROUPS, with their whole first lines."""
 
+    def invoke(self, ctx: Any) -> Any:
+        """Run a command; Ctrl-C says which files it has written."""
+        with noting_files() as written:
+            try:
+                return super().invoke(ctx)
+            except KeyboardInterrupt:
+                raise interruption(_files_text(written)) from None
+
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """Write the sections of the commands."""
         for heading, commands in GROUPS.items():
             known = [(c.__name__, _first_line(c)) for c in commands if self.get_command(ctx, c.__name__)]
             with formatter.section(heading):
                 formatter.write_dl(known)
+
+
+def _files_text(written: Sequence[Path]) -> str:
+    """Which files stand, for the sentence after Ctrl-C; those of a scratch folder are gone."""
+    stand = [str(path) for path in dict.fromkeys(written) if path.exists()]
+    if not stand:
+        return "nothing was written"
+    more = f" and {len(stand) - 3} more" if len(stand) > 3 else ""
+    return f"complete: {' '.join(stand[:3])}{more}; all other files stand as they were"
 
 
 def _first_line(command: Callable[..., None]) -> str:
@@ -108,7 +127,8 @@ def main() -> None:
                 sys.stdout.flush()  # now: at the end of the process nobody could say what went wrong
     except UsageError as error:
         sys.exit(_print_usage(error))
-    except typer.Abort:
+    except (typer.Abort, KeyboardInterrupt):  # before or after the command itself
+        print_note("interrupted")
         sys.exit(130)
     except OSError as error:  # of standard output: files that are read or written have errors of their own
         sys.exit(_end_output(error))

@@ -10,10 +10,12 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, TextIO
+from threading import Event, Thread
+from typing import TYPE_CHECKING, Any, TextIO
 
 import typer
 
+from malta.cli.patience import duration_text
 from malta.errors import CheckError, InputError, shorten
 from malta.files import json_text
 
@@ -24,10 +26,10 @@ if TYPE_CHECKING:
 
 WIDTH = 100  # columns of tables on wide terminals, and in files and pipes where COLUMNS says nothing else
 NARROWEST = 20  # columns; COLUMNS below is no width
-PATIENCE = 5.0  # s, from the first bounds of a margin to the first line about them
-INTERVAL = 2.0  # s, between the lines
+PATIENCE = 2.0  # s, from the begin of work to the first line about it
+INTERVAL = 2.0  # s, between the first lines
 NO_COMPILER = "no C compiler: simulated on CasADi's virtual machine, some hundred times slower"
-LINES = 10.0  # s, between lines of how far other work is
+LINES = 10.0  # s, between later lines
 
 
 def make_console() -> Console:
@@ -97,83 +99,119 @@ def print_error(error: InputError | CheckError, file: Path | None = None) -> int
     return 1 if failed else 2
 
 
-def track_files(files: list[Path], what: str, *, quiet: bool) -> Iterable[Path]:
-    """Iterate over files behind a progress bar, on a terminal's standard error when there are several files."""
-    if quiet or len(files) < 2 or not sys.stderr.isatty():
-        return files
-    from rich.console import Console
-    from rich.progress import track
+class Work:
+    """Work that takes a while, and what is known of how far it is.
 
-    return track(files, what, console=Console(stderr=True), transient=True)
-
-
-@contextmanager
-def progress_bar(what: str, *, quiet: bool) -> Iterator[Callable[[float], None] | None]:
-    """Show how far the work is on standard error: a bar with the time left on a terminal, elsewhere lines.
-
-    Yields the function that takes the share done, 0 to 1, or None where nothing is shown. A line comes every LINES,
-    once the work has taken PATIENCE.
+    Whoever works reports; a thread speaks where no report comes. Lines on standard error begin after PATIENCE and
+    become rarer, up to one in LINES.
     """
-    if quiet:
-        yield None
-        return
-    if not sys.stderr.isatty():
-        yield _progress_lines(what)
-        return
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task(what, total=1.0)
-        yield lambda share: bar.update(task, completed=share)
+    def __init__(self, what: str) -> None:
+        self.what, self.share, self.found = what, 0.0, ""
+        self.started = time.monotonic()
+        self.due = self.started + PATIENCE
+        self.ended = Event()
 
+    def report(self, share: float) -> None:
+        """Note the share that is done, 0 to 1."""
+        self.share = share
+        self.speak()
 
-def _progress_lines(what: str) -> Callable[[float], None]:
-    """The function that takes the share done and prints a line of it now and then."""
-    started = time.monotonic()
-    due = started + PATIENCE
+    def bound(self, lower: float, upper: float) -> None:
+        """Note the bounds of a margin."""
+        self.note(_bounds_text(lower, upper))
 
-    def show(share: float) -> None:
-        nonlocal due
+    def note(self, found: str) -> None:
+        """Note in words how far the work is."""
+        self.found = found
+        self.speak()
+
+    def speak(self) -> None:
+        """Print a line if one is due."""
         now = time.monotonic()
-        if now < due or not 0 < share < 1:
+        if now < self.due:
             return
-        due = now + LINES
-        spent = now - started
-        print_note(f"{what}: {100 * share:.0f} %, {spent:.0f} s, about {spent * (1 / share - 1):.0f} s left")
+        spent = now - self.started
+        self.due = now + min(LINES, max(INTERVAL, spent / 4))
+        shown = [self.found, f"{100 * self.share:.0f} %" if self.share > 0 else "", duration_text(spent)]
+        if self.share > 0:
+            shown.append(f"about {duration_text(spent * (1 / min(self.share, 1) - 1))} left")
+        print_note(f"{self.what}: {', '.join(filter(None, shown))}")
 
-    return show
+    def keep_speaking(self) -> None:
+        """Print lines, as they become due, until the work has ended."""
+        while not self.ended.wait(min(max(self.due - time.monotonic(), 0.05), LINES)):
+            self.speak()
 
 
 @contextmanager
-def margin_progress(
-    what: str, *, quiet: bool
-) -> Iterator[tuple[Callable[[float], None] | None, Callable[[float, float], None]]]:
-    """Show a progress bar and the bounds of a margin while its proof is searched.
+def working(what: str) -> Iterator[Work]:
+    """Say how far work is on standard error: a bar on a terminal, elsewhere lines.
 
-    Yields the functions that take the share done and the bounds so far. Without a terminal the bounds are printed as
-    a line every INTERVAL, once the proof has taken PATIENCE. Ctrl-C prints the last bounds and ends with exit code 130.
+    Example: `with working("claims") as work: work.report(0.5)`
     """
-    last: tuple[float, float] | None = None  # the bounds so far
-    due: float | None = None  # when the next line is printed; None before the first bounds
-    terminal = sys.stderr.isatty()
+    work = Work(what)
+    if sys.stderr.isatty():
+        with _drawn(work):
+            yield work
+        return
+    speaker = Thread(target=work.keep_speaking, daemon=True)
+    speaker.start()
+    try:
+        yield work
+    finally:
+        work.ended.set()
+        speaker.join()
 
-    def show(lower: float, upper: float) -> None:
-        nonlocal last, due
-        last = lower, upper
-        due = time.monotonic() + PATIENCE if due is None else due
-        if quiet or terminal or time.monotonic() < due:
-            return
-        due = time.monotonic() + INTERVAL
-        print_note(f"{what}: {_bounds_text(lower, upper)}")
 
-    with progress_bar(what, quiet=quiet or not terminal) as progress:
+@contextmanager
+def _drawn(work: Work) -> Iterator[None]:
+    """Draw a bar for work on a terminal: it pulses until the first report, then has the time left."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+
+    class Bar(Progress):
+        """A bar that looks at the work whenever it is drawn."""
+
+        def get_renderables(self) -> Iterable[Any]:
+            for task in self.tasks:
+                task.description = f"{work.what} {work.found}".rstrip()
+                task.total, task.completed = (1.0, work.share) if work.share > 0 else (None, 0)
+            return super().get_renderables()
+
+    work.due = math.inf  # no lines
+    with Bar(*columns, console=Console(stderr=True), transient=True) as bar:
+        bar.add_task(work.what, total=None)
+        yield
+
+
+@contextmanager
+def progress_bar(what: str) -> Iterator[Callable[[float], None]]:
+    """Say how far work is; yields the function that takes the share done, 0 to 1."""
+    with working(what) as work:
+        yield work.report
+
+
+@contextmanager
+def margin_progress(what: str) -> Iterator[tuple[Callable[[float], None], Callable[[float, float], None]]]:
+    """Say how far the proof of a margin is, and the bounds so far.
+
+    Yields the functions that take the share done and the bounds. Ctrl-C prints the last bounds and ends with exit
+    code 130.
+    """
+    with working(what) as work:
         try:
-            yield progress, show
+            yield work.report, work.bound
         except KeyboardInterrupt:
-            print_note("interrupted; " + (_bounds_text(*last) if last else "nothing proven"))
-            raise typer.Exit(130) from None
+            raise interruption(work.found or "nothing proven") from None
+
+
+def interruption(stands: str) -> typer.Exit:
+    """What Ctrl-C ends a command with: one sentence of what stands, and exit code 130."""
+    print_note(f"interrupted; {stands}")
+    return typer.Exit(130)
 
 
 def _bounds_text(lower: float, upper: float) -> str:

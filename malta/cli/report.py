@@ -77,7 +77,7 @@ def report(
     page_file = require_suffix(out or Path("build") / f"{controller.name}_report.html", *SUFFIXES)
     subject = read_subject(gains, controller, change, uncertain, design)
     found_campaigns = _campaigns_of(campaign, controller, subject.spec)
-    with margin_progress("report", quiet=as_json) as (progress, bounds):
+    with margin_progress("report") as (progress, bounds):
         analysis, page = report_work(
             subject, proof=not no_proof, campaigns=found_campaigns, progress=progress, bounds=bounds
         )

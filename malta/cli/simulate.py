@@ -159,7 +159,7 @@ def simulate(
     times = (3.0 if substeps else 1.0) * (
         10.0 if law == "c" else 1.0
     )  # own law, double and float: see exported.py
-    with progress_bar(scenario or "simulating", quiet=as_json) as bar:
+    with progress_bar(chosen) as bar:
         # With --substeps a second run, with twice as many, follows for the estimate of the error.
         progress = limit_time(bar, chosen, agreed=yes, times=times)
 

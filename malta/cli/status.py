@@ -63,7 +63,7 @@ def show_status(ctx: typer.Context, folder: Path, gains: Path | None, options: S
     controller = read_controller(gains, options.machine)
     published = published_figures(plant_of(controller.parameters).name)
     bounds = Bounds(published, design_of(gains, controller, options.design))
-    with progress_bar("status", quiet=options.as_json) as progress:
+    with progress_bar("status") as progress:
         found = status_of(folder, controller, bounds, progress)
     if options.as_json:
         from malta.cli.documents.campaigns import StatusOutput, runs_fields, status_fields

@@ -11,6 +11,7 @@ import typer
 from malta.cli.assignments import NUMBER, read_assignments
 from malta.cli.output import (
     NO_COMPILER,
+    interruption,
     make_console,
     print_document,
     print_note,
@@ -104,13 +105,12 @@ def run_study(study: Study, setting: Setting) -> None:
     limit = read_limit(option, study.limit, setting.plan, setting.bounds)
     what, session = f"{setting.plan.scenario} {study.option}", Session(setting.workers)
     folder = campaign_folder(setting.plan, setting.folder, session, setting.gains)
-    with folder, progress_bar(what, quiet=setting.as_json) as bar:
+    with folder, progress_bar(what) as bar:
         progress = limit_time(bar, what, agreed=setting.yes)
         try:
             outcome = STUDIES[study.option](limit, study.wanted, setting, progress)
         except KeyboardInterrupt:
-            print_note("interrupted before anything was known")
-            raise typer.Exit(130) from None
+            raise interruption(f"nothing is known of {what}; {setting.folder} stands as it was") from None
     if setting.as_json:
         print_document(outcome.document)
     else:

@@ -10,7 +10,7 @@ import typer
 
 from malta.cli.completion import design_files
 from malta.cli.options import AsJson
-from malta.cli.output import make_console, print_document, print_note, print_written, progress_bar
+from malta.cli.output import interruption, make_console, print_document, print_written, progress_bar, working
 from malta.errors import CheckError, InputError
 
 if TYPE_CHECKING:
@@ -74,7 +74,7 @@ def tune(
     if file_exists(target) and not overwrite:
         raise InputError(target, "", "a design file", "another --out, or --overwrite")
     effort = Effort(generations=generations, front=front)
-    tuned = _search(spec, journal, effort, restart=restart, quiet=as_json)
+    tuned = _search(spec, journal, effort, restart=restart)
     files = _write(spec, tuned, target)
     if as_json:
         from malta.cli.documents.others import tune_output
@@ -90,7 +90,8 @@ def _judge(spec: Spec, file: Path, *, as_json: bool) -> None:
     from malta import report
     from malta.tuning.outcomes import judge
 
-    requirements = judge(spec)
+    with working(f"judging {spec.name}"):
+        requirements = judge(spec)
     if as_json:
         from malta.cli.documents.others import TuneOutput, requirement_part
 
@@ -101,16 +102,15 @@ def _judge(spec: Spec, file: Path, *, as_json: bool) -> None:
     _require_all(requirements, file)
 
 
-def _search(spec: Spec, journal: Path, effort: Effort, *, restart: bool, quiet: bool) -> Tuned:
+def _search(spec: Spec, journal: Path, effort: Effort, *, restart: bool) -> Tuned:
     """Search the numbers behind a progress bar; Ctrl-C names the journal of the trials and ends with code 130."""
     from malta.tuning.tune import tune as search
 
-    with progress_bar(f"tuning {spec.name}", quiet=quiet) as progress:
+    with progress_bar(f"tuning {spec.name}") as progress:
         try:
             return search(spec, journal, effort=effort, restart=restart, progress=progress)
         except KeyboardInterrupt:
-            print_note(f"interrupted; the same command goes on from {journal}")
-            raise typer.Exit(130) from None
+            raise interruption(f"the same command goes on from {journal}") from None
 
 
 def _write(spec: Spec, tuned: Tuned, target: Path) -> list[Path]:

@@ -29,6 +29,9 @@ if TYPE_CHECKING:
     from malta.synthesis.controller import Controller
 
 
+MOST = 0.5  # of the time of a verification, which the margins take
+
+
 class Loop(NamedTuple):
     """A gain file on its machine, and the uncertainty that the margins count in."""
 
@@ -113,7 +116,7 @@ def verify(
     box = read_shares(gains, uncertain, plant.parameters, published, option="--uncertain")
     _require_options(box, time, certificate, proof=not no_proof)
     loop = Loop(gains, controller, plant, model, box, cast("CurrentLoops", current_loops))
-    analysis = _analyse(loop, time, proof=not no_proof, worst_case=worst_case, quiet=as_json)
+    analysis = _analyse(loop, time, proof=not no_proof, worst_case=worst_case)
     files: list[Path] = []
     refusal: InputError | CheckError | None = None
     if certificate is not None:
@@ -145,9 +148,7 @@ def _require_options(
         raise InputError("--certificate", "", "--no-proof", "one of them")
 
 
-def _analyse(
-    loop: Loop, time: float | None, *, proof: bool, worst_case: bool | None, quiet: bool
-) -> Analysis:
+def _analyse(loop: Loop, time: float | None, *, proof: bool, worst_case: bool | None) -> Analysis:
     """Compute the margins of a loop behind a progress bar.
 
     time : s, longest search of a margin over the travel
@@ -163,17 +164,21 @@ def _analyse(
 
     plant, controller, box, current_loops = loop.plant, loop.controller, loop.box, loop.current_loops
     try:
-        margins = compute_margins(loop.model, controller)
-        with margin_progress("margins", quiet=quiet) as (progress, bounds):
+        with margin_progress("margins") as (progress, bounds):
+            margins = compute_margins(loop.model, controller)
             robust = robustness(
                 plant, controller, box,
-                current_loops=current_loops, progress=progress, bounds=bounds, time=time, proof=proof,
+                current_loops=current_loops, progress=lambda share: progress(MOST * share), bounds=bounds,
+                time=time, proof=proof,
             )  # fmt: skip
-        if worst_case is None:
-            worst_case = proof and covers_travel(plant, controller, tuple(box), current_loops)
-        worst = worst_sensitivities(plant, controller, box, current_loops, time=time) if worst_case else {}
-        recovered = recovery(plant, controller) if margins.stable and plant.disturbances else ()
-        carried = payload(plant, controller) if margins.stable and proof else None
+            if worst_case is None:
+                worst_case = proof and covers_travel(plant, controller, tuple(box), current_loops)
+            worst = (
+                worst_sensitivities(plant, controller, box, current_loops, time=time) if worst_case else {}
+            )
+            progress(0.5 * (1 + MOST))
+            recovered = recovery(plant, controller) if margins.stable and plant.disturbances else ()
+            carried = payload(plant, controller) if margins.stable and proof else None
     except CheckError as error:
         raise CheckError(f"{loop.gains}: {error}") from error
     return Analysis(margins, robust, worst, recovered, carried)
