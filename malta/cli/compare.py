@@ -54,7 +54,7 @@ def compare(
     page_file = None if out is None else require_suffix(out, *SUFFIXES)
     files = [locate(file) for file in gains]
     subjects = [read_subject(file, read_controller(file, machine), change, uncertain, None) for file in files]
-    with margin_progress("compare", quiet=as_json) as (progress, bounds):
+    with margin_progress("compare") as (progress, bounds):
         found = compare_subjects(subjects, proof=not no_proof, progress=progress, bounds=bounds)
         written = []
         if page_file is not None:

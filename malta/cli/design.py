@@ -152,7 +152,7 @@ def _simulate_gain_file(
         except InputError as error:  # of numbers in the design: the user knows of no other file
             raise InputError(file, error.field, error.found, error.expected) from error
         result = experiment(job, spec.plant, written)
-    if result.interrupted or result.run.verdict.name == "interrupted":
+    if result.cut:
         raise KeyboardInterrupt
     for case in result.cases:
         end = case.run.verdict

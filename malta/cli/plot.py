@@ -95,7 +95,7 @@ def plot(
     place = cast("Place", at)
     loops = {name: loop_curves(*pair, name=name) for name, pair in machines.items()}
     channels = _channels(loops, kinds, channel, place)
-    loci = _loci(machines, parameter or GAIN, span, channels, quiet=as_json) if LOCUS in kinds else ()
+    loci = _loci(machines, parameter or GAIN, span, channels) if LOCUS in kinds else ()
     names = [*dict.fromkeys(kinds)]
     pictures = _draw(loops, names, channels, place, loci)
     files = _save(pictures, out)
@@ -180,7 +180,7 @@ def _loci(
     found = []
     for name, (plant, controller) in machines.items():
         low, high = _read_span(plant, parameter, span)
-        with progress_bar(f"root locus of {name}", quiet=quiet) as progress:
+        with progress_bar(f"root locus of {name}") as progress:
             found.append(
                 root_locus(
                     plant,

@@ -103,6 +103,11 @@ class Margin:
     reason: str = ""
 
     @property
+    def time_up(self) -> bool:
+        """Whether the search ended as its time was up, before anything was proven: more time may prove more."""
+        return self.lower is None and self.reason.rpartition("; ")[2].startswith(TIME_UP)
+
+    @property
     def exhausted(self) -> bool:
         """Whether no loss of stability was found within the limits of the parameters (a mass above zero)."""
         return math.isinf(self.upper)
@@ -115,6 +120,7 @@ class Margin:
         return f"{low}, lost at {100 * self.upper:.2f} %{where}"
 
 
+TIME_UP = "time w"  # begins reasons of a search that was or would be too long
 NOT_PROVEN = Margin(None, math.inf, None, None, {}, {}, (), 0.0, "not asked")
 
 

@@ -120,6 +120,11 @@ class Experiment:
         return self.name not in findings and not ends <= {"completed", "interrupted"}
 
     @property
+    def cut(self) -> bool:
+        """Whether Ctrl-C ended the experiment or its last run: no figure is final."""
+        return self.interrupted or any(case.run.verdict.name == "interrupted" for case in self.cases)
+
+    @property
     def outcome(self) -> str:
         """How the runs ended, in words."""
         ends = [case for case in self.cases if not case.run.verdict.completed]

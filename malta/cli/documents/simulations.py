@@ -104,7 +104,7 @@ def experiment_fields(experiment: Experiment) -> dict[str, Any]:
     return {
         "engine": run.engine,
         "fidelity": run.scenario.fidelity,
-        "interrupted": experiment.interrupted or run.verdict.name == "interrupted",
+        "interrupted": experiment.cut,
         "verdict": end_of(run.verdict),
         "merits": merits_of(experiment.merits),
         "cases": [

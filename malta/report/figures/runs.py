@@ -55,6 +55,8 @@ def campaign_page(found: Summary, what: str, **places: Any) -> Figure:
     done = "all" if share.passed == share.runs else f"{share.passed} of"
     text = f"{done} {share.runs} runs completed: {100 * share.share:.4g} % "
     text += f"(95 %: {100 * share.low:.4g} to {100 * share.high:.4g} %)"
+    if found.runs < plan.samples:
+        text += f"; not final: {plan.samples} runs are planned"
     return new_figure(title, text, **places)
 
 

@@ -13,6 +13,7 @@ from malta.model.signals import (
     lateral_outputs,
 )
 from malta.report.figures.parts import Published, number
+from malta.report.tables.layout import Paragraph
 from malta.report.tables.parts import add_row, new_table
 from malta.units import in_unit
 
@@ -94,12 +95,21 @@ def campaign_tables(
     from malta.campaigns.summary import Bounds, as_summary
 
     summary = as_summary(found, Bounds(published, spec))
-    tables: list[Table | str] = [_ends_table(summary)]
+    tables: list[Table | Paragraph] = [*_missing_text(summary), _ends_table(summary)]
     if summary.rate.passed:
         tables.append(_findings_table(summary))
     if worst and summary.runs:
         tables.append(_worst_table(summary, worst))
     return Group(*tables)
+
+
+def _missing_text(found: Summary) -> list[Paragraph]:
+    """A sentence on the runs that are not there yet; none of a whole campaign."""
+    if found.runs >= found.plan.samples:
+        return []
+    done = f"{found.runs} of {found.plan.samples} runs"
+    ended = ", interrupted" if found.interrupted else " so far"
+    return [Paragraph(f"{done}{ended}: the figures below are of these, none is final.\n")]
 
 
 def _ends_table(found: Summary) -> Table:

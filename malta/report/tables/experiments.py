@@ -10,6 +10,7 @@ from rich.console import Group
 from rich.table import Table
 
 from malta.report.figures.parts import Published
+from malta.report.tables.layout import Paragraph
 from malta.report.tables.parts import add_row, merit_heading, merit_text, new_table, published_text
 from malta.simulation.catalogue import experiments_of, options_of
 from malta.simulation.experiments import setting
@@ -39,6 +40,9 @@ def limits_text(e: Experiment) -> list[str]:
     return [f"met the {' and the '.join(names)}: {', '.join(cases)}" for names, cases in met.items() if names]
 
 
+CUT = "Interrupted: the figures below are of what was simulated until then; none is final.\n"
+
+
 def experiment_table(e: Experiment, published: Published | None = None) -> Group:
     """Tabulate the cases of an experiment, and its figures of merit beside the published ones.
 
@@ -63,13 +67,14 @@ def experiment_table(e: Experiment, published: Published | None = None) -> Group
      y, left at the end [um]   0.05314
     <BLANKLINE>
     """
+    tables: list[Table | Paragraph] = [Paragraph(CUT)] if e.cut else []
     if len(e.cases) > 1 and e.merits is e.cases[0].merits:
-        return Group(_cases_table(e, published))
-    tables = []
+        return Group(*tables, _cases_table(e, published))
+    first = len(tables)
     if [merit.label for merit in e.merits] != [merit.label for merit in e.cases[0].merits]:
         tables.append(_cases_table(e, published))
     if e.merits:
-        tables.append(_merits_table("" if tables else e.question, e.merits, published))
+        tables.append(_merits_table("" if tables[first:] else e.question, e.merits, published))
     return Group(*tables)
 
 

@@ -94,6 +94,8 @@ def _margin_cells(margin: Margin) -> tuple[str, str, str]:
     if margin is NOT_PROVEN:
         return "not asked", "", ""
     low = "nothing" if margin.lower is None else f"{100 * margin.lower:.2f} %"
+    if margin.time_up:
+        low += " so far"
     high = "not found" if margin.exhausted else f"{100 * margin.upper:.2f} %"
     return low, high, "" if margin.frequency is None else f"{margin.frequency:.4g}"
 
