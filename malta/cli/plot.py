@@ -167,7 +167,7 @@ def _channels(
 
 
 def _loci(
-    machines: Machines, parameter: str, span: str | None, channels: list[str] | None, *, quiet: bool
+    machines: Machines, parameter: str, span: str | None, channels: list[str] | None
 ) -> Sequence[RootLocus]:
     """The root locus of each loop, behind a progress bar."""
     from malta.margins.locus import root_locus
