@@ -162,7 +162,8 @@ def _of_panel(name: str, axes: Axes) -> Iterator[str]:
         what = f"the {side.axis_name} axis of {name}"  # type: ignore[attr-defined]
         if _is_of_names(side) or (not numbers and not _wants_numbers(side)):
             continue
-        if "[" not in label + axes.get_title() and not _shared_label(axes, side):
+        title = "" if second else axes.get_title()
+        if "[" not in label + title and not _shared_label(axes, side):
             yield f"{what} has no unit: {label!r}"
         if len(numbers) < 2:
             yield f"{what} has {len(numbers) or 'no'} number at its ticks"

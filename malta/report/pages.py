@@ -124,7 +124,7 @@ def front(tuned: Tuned, path: str | Path | None = None) -> Figure:
     >>> tuned = Tuned(spec, front[1], (), front, trials=120)  # as malta.tune finds it
     >>> figure = malta.report.front(tuned, "build/front.svg")
     >>> figure.axes[0].get_xlabel()
-    'robust margin over the travel, proven [% of the box]'
+    'proven margin [% of the box]'
     """
     return _saved(front_figure(tuned), path)
 

@@ -88,7 +88,7 @@ def _mark_states(axes: Axes, ms: FloatArray, state: FloatArray, *, named: bool) 
 def supervised_faults_figure(e: Experiment, _: Published | None = None) -> Figure:
     """The speed at which a bearing is met after each fault, with and without the supervisor; deviations over time."""
     found = "; ".join(f"{merit.label}: {merit.value:.0f}" for merit in e.merits)
-    places = {"left": 0.245, "wspace": 0.24, "top": 0.83}
+    places = {"left": 0.245, "wspace": 0.24, "top": 0.8}
     figure = new_page(runs_of(e), "faults with and without the supervisor", found, **places)
     bars, deviations = figure.subplots(1, 2, width_ratios=(1, 1.25))
     _draw_speeds(bars, e)

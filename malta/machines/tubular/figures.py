@@ -22,6 +22,7 @@ from malta.report.figures.parts import (
     DOT,
     MORE,
     NOTE,
+    PAPER,
     STYLES,
     Published,
     add_shared_legend,
@@ -165,7 +166,7 @@ def tilt_figure(e: Experiment, published: Published | None = None) -> Figure:
             np.linspace(0, 2 * math.pi, 181),
         )
         blow_up.plot(bound * np.cos(angle), bound * np.sin(angle), **BOUND)
-        blow_up.annotate("published bound", (0, -1.08 * bound), ha="center", va="top", **NOTE)
+        blow_up.annotate("published bound", (0, -1.08 * bound), ha="center", va="top", **NOTE | PAPER)
     for axes in (tracking, deviation):
         axes.set_yscale("log")
         axes.set_ylim(bottom=0.1)

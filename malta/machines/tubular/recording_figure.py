@@ -35,7 +35,7 @@ def recording_figure(e: Experiment, _: Published | None = None) -> Figure:
     if e.merits:
         thrust = next(merit for merit in e.merits if merit.label.endswith(e.run.plant.thrust))
         found = f"{thrust.label}: {merit_phrase(thrust)}; {e.merits[-1].label}: {merit_phrase(e.merits[-1])}"
-    figure = new_page(runs_of(e), "v0(z) recorded by a slow stroke", found, hspace=0.34, top=0.83)
+    figure = new_page(runs_of(e), "v0(z) recorded by a slow stroke", found, hspace=0.34, top=0.83, left=0.1)
     (table, difference), (own, recorded) = figure.subplots(2, 2)
     _draw_tables(table, difference, e)
     top = 0.0

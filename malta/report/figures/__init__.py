@@ -13,11 +13,10 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
-from itertools import cycle
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -31,36 +30,30 @@ from malta.model.signals import (
 )
 from malta.report.figures.campaign import distributions_figure as distributions_figure
 from malta.report.figures.campaign import yield_figure as yield_figure
+from malta.report.figures.front import front_figure as front_figure
+from malta.report.figures.parts import MORE as MORE
+from malta.report.figures.parts import POINTS as POINTS
+from malta.report.figures.parts import STYLES as STYLES
 from malta.report.figures.parts import (
-    BOUND,
-    DOT,
     Published,
     draw_bound,
     draw_group,
     draw_line,
     ending_text,
     finish_axes,
-    front_lines,
     micro,
-    new_figure,
     new_page,
 )
-from malta.report.figures.parts import MORE as MORE
-from malta.report.figures.parts import POINTS as POINTS
-from malta.report.figures.parts import STYLES as STYLES
 from malta.report.figures.parts import number as number
 from malta.report.figures.runs import worst_figure as worst_figure
 from malta.simulation.catalogue import experiments_of
 from malta.simulation.experiments import Case, Experiment
 from malta.simulation.trajectory import Trajectory
-from malta.synthesis.requirements import Trade
 from malta.units import in_unit
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-    from malta.tuning.tune import Tuned
 
 
 def experiment_figure(e: Experiment, published: Published | None = None) -> Figure:
@@ -246,68 +239,3 @@ def _draw_currents(axes: Axes, x: str, run: Trajectory) -> None:
         values = run.current.max(axis=1) if side == "largest" else run.current.min(axis=1)
         draw_line(axes, run.t * 1e3, values, label=f"{side} of {run.current.shape[1]}", **style)
     finish_axes(axes, x, "currents, from least to largest [A]", legend=2)
-
-
-def front_figure(tuned: Tuned) -> Figure:
-    """Draw the Pareto front of a search: force noise and motion over the proven margin, the chosen trial ringed.
-
-    tuned : from `malta.tune`
-
-    Returns a matplotlib Figure, which a notebook shows as the value of a cell.
-
-    >>> import malta
-    >>> from malta.tuning.search import Trial
-    >>> from malta.tuning.tune import Tuned
-    >>> spec = malta.read_design("examples/ball/design/ball.toml")
-    >>> noisy = {"margin": 3.63, "force_noise f": 0.0414, "motion y": 0.501e-6}
-    >>> quiet = {"margin": 3.28, "force_noise f": 0.0122, "motion y": 0.523e-6}
-    >>> front = Trial((223.0, 50, 0.051), 1, quiet), Trial((190.0, 40, 0.11), 1, noisy)
-    >>> tuned = Tuned(spec, front[1], (), front, trials=120)  # as malta.tune finds it
-    >>> figure = malta.report.front_figure(tuned)
-    >>> [axes.get_ylabel() for axes in figure.axes]
-    ['noise of the force [N rms]', 'true motion [µm rms]']
-    """
-    from matplotlib.ticker import LogLocator
-
-    asked, chosen, front = tuned.spec.specification, tuned.trial, tuned.front
-    taken = next((one for one in front if one.values == chosen.values), chosen)
-    others = [one for one in front if one is not taken] or [taken]
-    kept = (
-        "keeps all that is asked for" if tuned.reached else f"misses {tuned.binding.name.replace('_', ' ')}"
-    )
-    found = f"{tuned.trials} trials; taken: margin {100 * taken.figures['margin']:.0f} %, which {kept}"
-    figure = new_figure(f"{tuned.spec.name}: margin against noise", found, size=(9.0, 4.6), left=0.1)
-    panels: Any = figure.subplots(1, 2)
-    sides = (front_lines(tuned.spec.plant, taken.figures, trade) for trade in get_args(Trade))
-    for axes, lines, y in zip(
-        panels, sides, ("noise of the force [N rms]", "true motion [µm rms]"), strict=True
-    ):
-        axes.set_yscale("log")
-        axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-        axes.yaxis.set_major_formatter("{x:g}")
-        axes.yaxis.set_minor_formatter("")
-        for (name, label, scale, _), style in zip(lines, cycle((0, 2, 1)), strict=False):
-            if not all(name in one.figures for one in front):
-                continue
-            every = sorted((one.figures["margin"], one.figures[name]) for one in others)
-            best = _pareto_front(every)
-            drawn = STYLES[style] if len(best) > 2 else STYLES[style] | {"linestyle": "none"}
-            margins, sizes = np.array(best if len(best) > 2 else every).T
-            axes.plot(100 * margins, scale * sizes, marker="o", markersize=4, label=label, **drawn)
-            where = 100 * taken.figures["margin"], scale * taken.figures[name]
-            ring = {"markersize": 9, "markerfacecolor": "none", "markeredgecolor": STYLES[style]["color"]}
-            axes.plot(*where, **DOT | ring)
-        if "margin" in asked:
-            axes.axvline(100 * asked["margin"], **BOUND)
-        finish_axes(axes, "robust margin over the travel, proven [% of the box]", y, legend=2)
-        axes.margins(x=0.04)
-    return figure
-
-
-def _pareto_front(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
-    """The points (margin, size) that no other beats in both, by margin."""
-    found: list[tuple[float, float]] = []
-    for margin, size in sorted(points, key=lambda point: (-point[0], point[1])):
-        if not found or size < found[-1][1]:
-            found.append((margin, size))
-    return found[::-1]

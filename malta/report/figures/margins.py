@@ -15,6 +15,7 @@ from malta.report.figures.parts import (
     DOT,
     LEGEND,
     NOTE,
+    PAPER,
     STYLES,
     draw_grid,
     new_figure,
@@ -33,7 +34,6 @@ if TYPE_CHECKING:
 LOOKS: tuple[dict[str, Any], dict[str, Any]] = ({"color": "#c9c9c9"}, {"color": "#5a5a5a"})  # stages, machine
 WITNESS: dict[str, Any] = {"color": "#c1440e", "linewidth": 1.6}
 NO_WITNESS: dict[str, Any] = {"marker": ">", "markersize": 7, "linestyle": "none", "color": "#000000"}
-PAPER: dict[str, Any] = {"bbox": {"facecolor": "#ffffff", "edgecolor": "none", "pad": 0.5}}
 CROWDED = 12.0  # peak |S| up to which the names of the zones have room
 
 

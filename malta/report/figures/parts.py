@@ -46,6 +46,9 @@ MORE: Sequence[dict[str, Any]] = (  # used after STYLES
 )
 BOUND: dict[str, Any] = {"color": "#9a9a9a", "linestyle": (0, (8, 3)), "linewidth": 0.9}
 NOTE: dict[str, Any] = {"fontsize": 8, "color": "#5a5a5a"}
+PAPER: dict[str, Any] = {
+    "bbox": {"facecolor": "#ffffff", "edgecolor": "none", "alpha": 0.75, "pad": 0.4}
+}  # of a text
 DOT: dict[str, Any] = {"marker": "o", "markersize": 6, "linestyle": "none", "color": "#000000"}
 CROSS: dict[str, Any] = DOT | {"marker": "X", "markersize": 9, "markeredgecolor": "#ffffff", "clip_on": False}
 LEGEND: dict[str, Any] = {"frameon": False, "fontsize": 8, "handlelength": 2.4, "columnspacing": 1.5}
@@ -238,7 +241,7 @@ def draw_bound(
         textcoords="offset points",
         ha=side,
         va="bottom" if height == "above" else "top",
-        **NOTE,
+        **NOTE | PAPER,
     )
     room = max(1.25 * abs(value), 1.1 * reach)
     if both:
