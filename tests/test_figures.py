@@ -2,18 +2,33 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from dataclasses import replace
+from functools import cache
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from figure_checks import defects
+from conftest import ROOT
+from figure_checks import defects, texts_of
 
+import malta
+from malta import report
+from malta.cli.assignments import read_shares
+from malta.model.signals import outputs_of
 from malta.report import new_figure
+from malta.simulation.catalogue import experiments_of
+from malta.simulation.experiments import Case, Experiment
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from matplotlib.axes import Axes
+
+    from malta.campaigns.result import Campaign
+
+GAINS = sorted((ROOT / "design" / "gains").glob("*.json"))
+SHORT: dict[str, dict[str, Any]] = {"capture": {"points": 9}, "supervised-faults": {"only": "stuck"}}
+PREDICTS_NOTHING = ("delay",)  # experiments that no PID has
 
 X = np.linspace(0, 1, 50)
 
@@ -40,6 +55,7 @@ def _alike(axes: Axes) -> None:
 @pytest.mark.parametrize(
     ("spoil", "said"),
     [
+        (lambda axes: axes, []),
         (lambda axes: axes.lines[0].remove(), ["panel 0 is empty"]),
         (lambda axes: axes.set_ylabel("height"), ["the y axis of panel 0 has no unit: 'height'"]),
         (_bare, ["the y axis of panel 0 has no number at its ticks"]),
@@ -54,6 +70,127 @@ def _alike(axes: Axes) -> None:
 def test_the_checks_find_what_is_wrong(spoil: Callable[[Axes], object], said: list[str]) -> None:
     figure = new_figure("title", "found", size=(4.5, 3.0), left=0.2, bottom=0.2)
     _plain(figure.subplots())
-    assert defects(figure) == []
     spoil(figure.axes[0])
     assert defects(figure) == said
+
+
+# --- experiments ---
+
+
+@cache
+def machine(name: str) -> tuple[malta.Plant, malta.Controller, Any]:
+    """The plant and the controller of a shipped gain file, and what its paper prints."""
+    c = malta.gains.read(ROOT / "design" / "gains" / f"{name}.json")
+    plant = malta.plant_of(c.parameters)
+    kind = next((kind for kind in ("halbach", "planar") if name.startswith(kind)), "tubular")
+    return plant, c, malta.published(ROOT / "data" / f"{kind}.toml")
+
+
+def drawn_experiments() -> list[Any]:
+    """Every shipped design with every experiment that its controller can have; those of one machine's LQG are fast."""
+    found = []
+    for path in GAINS:
+        for name in experiments_of(machine(path.stem)[0]):
+            if not (name in PREDICTS_NOTHING and path.stem.endswith("_pid")):
+                found.append(pytest.param(path.stem, name, marks=pytest.mark.slow))
+    return found
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("design", "name"), drawn_experiments())
+def test_nothing_is_wrong_with_the_figure_of_an_experiment(design: str, name: str) -> None:
+    plant, c, paper = machine(design)
+    e = malta.experiment(name, plant, c, **SHORT.get(name, {}))
+    for published in (paper, None):
+        assert defects(report.experiment_figure(e, published)) == []
+
+
+@cache
+def run_of(name: str) -> Experiment:
+    """The first run of a machine's first experiment, as an experiment without a figure of its own."""
+    plant, c, _ = machine(name)
+    run = malta.experiment(next(iter(experiments_of(plant))), plant, c).run
+    return Experiment("run", "A run", (Case("a", run, ()),), ())
+
+
+@pytest.mark.parametrize("name", ["calibrated", "halbach", pytest.param("planar", marks=pytest.mark.slow)])
+def test_a_run_is_drawn_with_every_input_and_output(name: str) -> None:
+    figure = report.experiment_figure(run_of(name))
+    assert defects(figure) == []
+    written = " ".join(texts_of(figure))
+    plant = run_of(name).run.plant
+    assert [s.name for s in (*plant.inputs, *plant.outputs) if s.name not in written] == []
+    assert len(outputs_of(plant)) <= len([axes for axes in figure.axes if axes.get_visible()])
+
+
+def test_many_inputs_are_drawn_as_a_band() -> None:
+    """Of twenty inputs no line is dropped: the band reaches from the least to the largest of all."""
+    run = run_of("calibrated").run
+    count = 20
+    pushed = np.sin(np.outer(run.t, np.arange(1, count + 1))) * np.linspace(1, 3, count)
+    inputs = tuple(run.plant.inputs[0]._replace(name=f"coil {k}") for k in range(count - 1))
+    plant = replace(run.plant, inputs=(*inputs, run.plant.inputs[-1]))
+    e = Experiment("run", "A run", (Case("a", replace(run, plant=plant, v=pushed), ()),), ())
+    force = next(axes for axes in report.experiment_figure(e).axes if "force" in axes.get_ylabel())
+    (band,) = force.collections
+    assert str(band.get_label()) == f"all {count}, least to largest"
+    heights = np.asarray(band.get_paths()[0].vertices)[:, 1]
+    assert (heights.min(), heights.max()) == (pushed.min(), pushed.max())
+    assert len(force.lines) == 3
+
+
+# --- campaigns, margins, loads ---
+
+
+def campaign_of(name: str, scenario: str, samples: int, share: float = 1.0, **options: Any) -> Campaign:
+    """A campaign over the box of a shipped gain file."""
+    plant, c, _ = machine(name)
+    box = read_shares(ROOT / "design" / "gains" / f"{name}.json", [], plant.parameters, None)
+    spread = {key: share * value for key, value in box.items()}
+    return malta.campaign(malta.Plan(c, scenario, spread, samples=samples, **options))
+
+
+def test_a_campaign_without_failures_shows_how_near_they_are() -> None:
+    """A jump of the reference is no merit, what is the same in every run no distribution, 100 % no picture."""
+    drawn = report.campaign(campaign_of("halbach", "step", 16), published=machine("halbach")[2])
+    written = texts_of(drawn.distributions)
+    assert any("deviation of x: the jump of the reference itself, 100 µm" in text for text in written)
+    assert any("limited commands: 0 % in every run" in text for text in written)
+    assert len(drawn.distributions.axes) == 2
+    title, *_ = (text for text in texts_of(drawn.endings) if text.startswith("all 16 runs completed"))
+    assert "nearest: run" in title
+    assert all(patch.get_label() != "completed" for axes in drawn.endings.axes for patch in axes.patches)
+    far = drawn.worst.axes[1]
+    dots = [float(np.asarray(line.get_xdata())[0]) for line in far.lines if line.get_marker() == "o"]
+    low, high = far.get_xlim()
+    assert np.ptp(dots) > 0.2 * (high - low)  # eight marks that can be told apart
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "scenario", "samples", "share"),
+    [
+        ("calibrated", "stroke", 200, 1.0),
+        ("table2", "stroke", 200, 1.0),
+        ("calibrated", "hold", 60, 3.0),
+        ("planar", "step", 40, 1.0),
+        ("halbach_pid", "step", 40, 1.0),
+        ("calibrated", "hold", 1, 1.0),
+    ],
+)
+def test_nothing_is_wrong_with_the_figures_of_a_campaign(
+    name: str, scenario: str, samples: int, share: float
+) -> None:
+    for figure in report.campaign(campaign_of(name, scenario, samples, share), published=machine(name)[2]):
+        assert defects(figure) == []
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("proven_once")
+@pytest.mark.parametrize("name", [path.stem for path in GAINS if path.stem != "halbach_late"])
+def test_nothing_is_wrong_with_the_figures_of_margins_and_loads(name: str) -> None:
+    plant, c, _ = machine(name)
+    box = read_shares(ROOT / "design" / "gains" / f"{name}.json", [], plant.parameters, None)
+    found = malta.robustness(plant, c, box)
+    assert defects(report.robustness(found, name, box, position=f"position {plant.stroke}")) == []
+    assert defects(report.loads(plant, c)) == []

@@ -11,7 +11,7 @@ from malta.report.figures.parts import (
     STYLES,
     Published,
     add_shared_legend,
-    draw_line,
+    draw_largest,
     finish_axes,
     mark_end,
     merit_phrase,
@@ -42,7 +42,7 @@ def carrier_figure(e: Experiment, _: Published | None = None) -> Figure:
         radial = [k for k in range(run.p.shape[1]) if k != run.plant.stroke_output]
         off = np.maximum(np.abs((run.p - run.reference)[:, radial]).max(axis=1) * 1e6, 0.1)
         axes = still if place == "rest" else stroke
-        draw_line(axes, ms, off, label=label, **style)
+        draw_largest(axes, ms, off, label=label, **style)
         mark_end(axes, run, ms, off)
         if place == "rest":
             count = len(ms) // SMOOTHED * SMOOTHED

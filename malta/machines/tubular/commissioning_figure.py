@@ -18,6 +18,7 @@ from malta.report.figures.parts import (
     clearance,
     draw_bound,
     draw_group,
+    draw_largest,
     draw_line,
     ended_early,
     finish_axes,
@@ -139,7 +140,7 @@ def _draw_deviations(axes: Axes, e: Experiment) -> None:
         radial = [k for k in range(run.p.shape[1]) if k != run.plant.stroke_output]
         ms, off = (run.t - struck) * 1e3, np.abs(run.p[:, radial]).max(axis=1) * 1e6
         label = micro(case.label.removesuffix(WITH)) + (", supervised" if case.label.endswith(WITH) else "")
-        draw_line(axes, ms, np.maximum(off, 0.1), label=label, **next(styles))
+        draw_largest(axes, ms, np.maximum(off, 0.1), label=label, **next(styles))
         if case.merits[1].value >= 0:
             k = min(int(np.searchsorted(ms, case.merits[1].value * 1e3)), len(ms) - 1)
             down_there = {"label": "touchdown"} if ended_early(run) else {"marker": "v", "label": "landed"}

@@ -31,6 +31,7 @@ from malta.report.figures.parts import (
     draw_dots,
     draw_group,
     draw_histograms,
+    draw_largest,
     draw_line,
     draw_published,
     draw_spreads,
@@ -153,7 +154,7 @@ def tilt_figure(e: Experiment, published: Published | None = None) -> Figure:
         blow_up.plot(error[late, 2], error[late, 3], **style)
         for axes, k in ((tracking, 0), (deviation, 2)):
             distance = np.hypot(error[:, k], error[:, k + 1])
-            draw_line(axes, run.t, distance, **style)
+            draw_largest(axes, run.t, distance, **style)
             mark_end(axes, run, run.t, distance)
     asked = e.run.reference * 1e6
     circle.plot(
@@ -345,7 +346,7 @@ def faults_figure(e: Experiment, _: Published | None = None) -> Figure:
         run, last = case.run, end_of(case.run) + 1
         ms = (run.t[:last] - struck) * 1e3
         deviation = np.maximum(np.abs(run.p[:last, :4]).max(axis=1) * 1e6, 1e-3)
-        draw_line(traces, ms, deviation, label=micro(case.label), **style)
+        draw_largest(traces, ms, deviation, label=micro(case.label), **style)
         mark_end(traces, run, ms, deviation, named=False)
     traces.set_yscale("log")
     traces.set_ylim(bottom=0.1)

@@ -180,7 +180,11 @@ def run_figure(e: Experiment, _: Published | None = None) -> Figure:
     rows = 2 if len(panels) > 3 else len(panels)
     columns = math.ceil(len(panels) / rows)
     rows_of_legends = max(-(-len(group) // 4) for group in (run.plant.inputs, run.plant.outputs))
-    places = {"hspace": 0.24 + 0.06 * (min(rows_of_legends, 2) - 1), "wspace": 0.25 if columns < 3 else 0.42}
+    places = {
+        "left": 0.1,
+        "hspace": 0.24 + 0.06 * (min(rows_of_legends, 2) - 1),
+        "wspace": 0.25 if columns < 3 else 0.42,
+    }
     figure = new_page([run], f"{micro(what)}{ending_text(run)}", text, **places)
     grid = figure.subplots(rows, columns, sharex=True, squeeze=False).ravel()
     last = len(panels) - columns

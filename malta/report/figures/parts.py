@@ -147,6 +147,16 @@ def draw_group(
     return len(lines) if len(lines) < 5 else 4
 
 
+def draw_largest(axes: Axes, t: FloatArray, values: FloatArray, **style: Any) -> None:
+    """Draw the largest value of each stretch: of a noisy size on a logarithmic axis the small values say nothing."""
+    size = math.ceil(len(t) / STRETCHES)
+    first = np.arange(0, len(t), size)
+    axes.plot(t[first], np.maximum.reduceat(values, first), **style)
+
+
+STRETCHES = 400  # of `draw_largest`
+
+
 def draw_dots(
     axes: Axes,
     names: Sequence[str],
