@@ -1,4 +1,4 @@
-"""Figures of the tutorial and the theory pages, computed by malta: python docs/page_figures.py [FOLDER], `make figures`.
+"""Figures of the tutorial and the theory pages, computed by malta: python docs/page_figures.py [FOLDER].
 
 The same malta draws the same bytes: ids of the SVGs are hashed with a fixed salt, and no date is written.
 """

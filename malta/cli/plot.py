@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, cast
 
@@ -90,25 +91,18 @@ def plot(
     _require_kinds(kinds, at, out, parameter, span)
     machines = _read_machines([gains, *(locate(path) for path in others or ())], machine, change)
     from malta.margins.curves import loop_curves
-    from malta.report.plots.parts import chosen_channels
 
     place = cast("Place", at)
     loops = {name: loop_curves(*pair, name=name) for name, pair in machines.items()}
     channels = _channels(loops, kinds, channel, place)
-    loci = _loci(machines, parameter or GAIN, span, channels) if LOCUS in kinds else ()
+    loci = _loci(machines, parameter or GAIN, span, channels, place) if LOCUS in kinds else ()
     names = [*dict.fromkeys(kinds)]
     pictures = _draw(loops, names, channels, place, loci)
     files = _save(pictures, out)
     if as_json:
-        from malta.cli.documents.plots import loop_part, plot_output
+        from malta.cli.documents.plots import plot_output
 
-        shown = channels or [name for name, _ in chosen_channels(loops, None, place)]
-        shown = [
-            *shown,
-            *(s.name for curves in loops.values() for s in curves.loop.outputs if channels is None),
-        ]
-        parts = [loop_part(curves, names, shown, place) for curves in loops.values()]
-        print_document(plot_output(parts, loci, place, files))
+        print_document(plot_output(loops.values(), names, channels, place, loci, files))
     else:
         print_written(make_console(), files)
     for name, curves in loops.items():
@@ -167,7 +161,11 @@ def _channels(
 
 
 def _loci(
-    machines: Machines, parameter: str, span: str | None, channels: list[str] | None
+    machines: Machines,
+    parameter: str,
+    span: str | None,
+    channels: list[str] | None,
+    at: Place,
 ) -> Sequence[RootLocus]:
     """The root locus of each loop, behind a progress bar."""
     from malta.margins.locus import root_locus
@@ -179,24 +177,16 @@ def _loci(
     only = channels[0] if channels and parameter == GAIN else None
     found = []
     for name, (plant, controller) in machines.items():
-        low, high = _read_span(plant, parameter, span)
+        ends = _read_span(plant, parameter, span)
         with progress_bar(f"root locus of {name}") as progress:
-            found.append(
-                root_locus(
-                    plant,
-                    controller,
-                    parameter=parameter,
-                    low=low,
-                    high=high,
-                    channel=only,
-                    name=name,
-                    progress=progress,
-                )
+            one = root_locus(
+                plant, controller, parameter=parameter, span=ends, channel=only, at=at, progress=progress
             )
+        found.append(replace(one, name=name))
     return found
 
 
-def _read_span(plant: Plant, parameter: str, span: str | None) -> tuple[float | None, float | None]:
+def _read_span(plant: Plant, parameter: str, span: str | None) -> tuple[float, float] | None:
     """Both ends of a range in SI: multiples of the nominal value where neither has a unit. Raises InputError."""
     from malta.model.parameters import units_of
 
@@ -206,7 +196,7 @@ def _read_span(plant: Plant, parameter: str, span: str | None) -> tuple[float | 
             "--parameter", "", repr(parameter), "one of " + " ".join([GAIN, *units_of(plant.parameters)])
         )
     if span is None:
-        return None, None
+        return None
     ends = span.split("..")
     numbers = [re.fullmatch(NUMBER, end.strip()) for end in ends]
     if len(ends) != 2 or None in numbers:

@@ -45,6 +45,7 @@ class RootLocus:
 
     name: str
     parameter: str
+    channel: str | None  # whose gain it is; None: all
     unit: str
     values: FloatArray  # k, ascending
     poles: ComplexArray  # k x n, a column for each branch
@@ -60,32 +61,31 @@ def root_locus(
     controller: Any = None,
     *,
     parameter: str = GAIN,
-    low: float | None = None,
-    high: float | None = None,
+    span: tuple[float, float] | None = None,
     channel: str | None = None,
-    name: str = "",
+    at: Place = "sensors",
     progress: Callable[[float], None] | None = None,
 ) -> RootLocus:
     """The root locus of a loop.
 
     source, controller : as `linear_loop` takes them; for a parameter of the machine, a plant and its controller
     parameter : of the machine, by name; or "gain", a factor of the loop gain
-    low, high : of the parameter, SI; None: half and one and a half of its nominal value, of the gain 0.1 and 10
-    name : of the loop; "": that of the controller
+    span : lowest and highest value, SI; None: half and one and a half of the nominal value, of the gain 0.1 and 10
     progress : takes the share that is done, 0 to 1
-    channel : the output or force whose gain is changed; None: all forces
+    channel : the channel whose gain is changed, the others as they are; None: all
+    at : where the gain is changed, "sensors" or "forces"
 
     Raises InputError for an unknown parameter, a range that is none, and a value that the machine cannot have.
 
     >>> import control
-    >>> found = root_locus(control.tf([1], [1, 3, 2, 0]), low=1, high=10)
+    >>> found = root_locus(control.tf([1], [1, 3, 2, 0]), span=(1, 10))
     >>> [round(value, 3) for value in found.changes]
     [6.0]
     """
-    loop = linear_loop(source, controller, name=name)
-    matrix, nominal, unit = _family(source, controller, loop, parameter, channel)
+    loop = linear_loop(source, controller)
+    matrix, nominal, unit = _family(source, controller, loop, parameter, (channel, at))
     usual = (0.1, 10.0) if parameter == GAIN else (0.5 * nominal, 1.5 * nominal)
-    low, high = (usual[0] if low is None else low), (usual[1] if high is None else high)
+    low, high = span or usual
     if not (math.isfinite(low) and math.isfinite(high) and low < high):
         raise InputError(
             "root locus", parameter, f"{low:g} to {high:g}", "a range from a lower to a higher value"
@@ -96,6 +96,7 @@ def root_locus(
     return RootLocus(
         loop.name,
         parameter,
+        channel if parameter == GAIN else None,
         unit,
         values,
         _in_rates(found, loop.sample_time),
@@ -125,17 +126,15 @@ def _counted(matrix: Matrix, most: int, progress: Callable[[float], None] | None
 
 
 def _family(
-    source: Any, controller: Any, loop: LinearLoop, parameter: str, channel: str | None
+    source: Any, controller: Any, loop: LinearLoop, parameter: str, where: tuple[str | None, Place]
 ) -> tuple[Matrix, float, str]:
     """The eigenvalues by value, the nominal value and its unit."""
     if parameter == GAIN:
-        outputs, inputs = ([s.name for s in signals] for signals in (loop.outputs, loop.inputs))
-        if channel is not None and channel not in (*outputs, *inputs):
-            raise InputError(
-                "root locus", "channel", repr(channel), "one of " + " ".join([*outputs, *inputs])
-            )
-        at: Place = "sensors" if channel in outputs else "forces"
-        chosen = np.array([channel in (None, name) for name in (outputs if at == "sensors" else inputs)])
+        channel, at = where
+        names = [s.name for s in (loop.outputs if at == "sensors" else loop.inputs)]
+        if channel is not None and channel not in names:
+            raise InputError("root locus", "channel", repr(channel), "one of " + " ".join(names))
+        chosen = np.array([channel in (None, name) for name in names])
         return cache(lambda k: eigenvalues(loop.closed(np.where(chosen, k, 1.0), at).A)), 1.0, "1"
     plant, law = source if isinstance(source, tuple) else (source, controller)
     if not isinstance(plant, Plant):

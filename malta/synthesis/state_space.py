@@ -101,7 +101,8 @@ def law_system(c: Controller) -> Any:
     """The control law without saturation as a discrete control.StateSpace with names.
 
     Inputs: the measurements by their names, then what they should be, as "z_ref", at rest (p*' = 0). Outputs: the
-    forces, without v0 and v_ff. Negative feedback is inside: v = F y + R p*, and the loop gain at the sensors is -P F.
+    forces, without v0, and of v_ff with what holds the machine there. Negative feedback is inside: v = F y + R p*, and
+    the loop gain at the sensors is -P F.
     States: those of the controller, then its sums of errors, in units as named_system has them.
     """
     law, R = linear_law(c), set_point(c)
@@ -146,7 +147,11 @@ def reference_names(c: Controller) -> list[str]:
 
 
 def set_point(c: Controller) -> FloatArray:
-    """r = (p*, xi*, v_ff, v0) of the law by p* at rest, near the operating point."""
+    """r = (p*, xi*, v_ff, v0) of the law by p* at rest, near the operating point.
+
+    At rest the forces behind the lag of the design model are v_ff, and the stored forces are v_ff and what currents
+    commutated for the reference make beside it, as in the references of a simulation.
+    """
     n, m, p = len(c.states), len(c.forces), len(c.measurements)
     R = np.zeros((p + n + 2 * m, p))
     R[:p] = np.eye(p)
@@ -157,4 +162,13 @@ def set_point(c: Controller) -> FloatArray:
         here = np.array(ca.DM(plant.h(ca.DM(plant.point(c.operating_point[0]).x), 0))).ravel()
         X = np.array(ca.Function("X", [y], [q])(here))
         R[p : p + len(X)] = X
+        v_ff, mechanical = R[p + n : p + n + m], len(c.A)
+        if c.feedforward.position.size:
+            v_ff[:] = c.feedforward.position @ X
+        known = c.lagging + c.delay
+        past = R[p + mechanical : p + mechanical + m * known].reshape(known, m, p)
+        past[:] = v_ff
+        if c.delay:
+            newest = mechanical + m * (known - 1)
+            past[c.lagging :] += c.Ad[newest : newest + m, : len(X)] @ X
     return R

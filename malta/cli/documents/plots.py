@@ -1,9 +1,9 @@
-"""The document of `malta plot`: the numbers that each kind of plot draws."""
+"""The document of `malta plot`: the margins of each loop, and the numbers that each kind of plot draws."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
@@ -20,110 +20,128 @@ if TYPE_CHECKING:
     from malta.margins.locus import RootLocus
     from malta.synthesis.step_response import StepResponse
 
-Names = Sequence[str]
+Line = Annotated[list[Number], Field(description="one number for each frequency, time or value")]
+Poles = Annotated[list[list[float]], Field(description="rows of real and imaginary part")]
 POINTS = 500  # of a line over time
 
 
-Lines = dict[str, dict[str, list[Number]]]  # curves by channel and quantity
-Pairs = Annotated[list[list[Number]], Field(description="rows of real and imaginary part")]
-
-
-class ChannelPart(Part):
-    """The margins of one channel; what nothing bounds is null, as is what an unstable loop has not."""
+class MarginsPart(Part):
+    """The margins of one channel with the others closed; null where nothing bounds them, or the loop is unstable."""
 
     channel: str
     stable: bool
-    gain_margin_lower: Number
-    gain_margin_lower_frequency_rad_per_s: Number
-    gain_margin_upper: Number
-    gain_margin_upper_frequency_rad_per_s: Number
-    phase_margin_rad: Number
-    phase_margin_frequency_rad_per_s: Number
-    delay_margin_s: Number
-    delay_margin_frequency_rad_per_s: Number
-    disk_margin: Number
-    disk_margin_frequency_rad_per_s: Number
-    modulus_margin: Number
+    gain_lower: Number = Field(description="the loop is stable for factors of the gain between both")
+    gain_lower_at_rad_per_s: Number
+    gain_upper: Number
+    gain_upper_at_rad_per_s: Number
+    phase_rad: Number
+    phase_at_rad_per_s: Number
+    delay_s: Number
+    delay_at_rad_per_s: Number
+    disk: Number = Field(description="symmetric disk margin")
+    disk_at_rad_per_s: Number
+    modulus: Number = Field(description="1 / peak_sensitivity")
     peak_sensitivity: Number
-    peak_sensitivity_frequency_rad_per_s: Number
-    encirclements: int | None
-    unstable_poles: int | None
+    peak_sensitivity_at_rad_per_s: Number
+    encirclements: int = Field(description="of -1, counterclockwise")
+    unstable_poles: int = Field(description="with this channel open")
+
+
+class GainPart(Part):
+    """The loop gain of a channel with the others closed."""
+
+    magnitude: Line
+    phase_rad: Line
+
+
+class PlanePart(Part):
+    """The same in the complex plane."""
+
+    real: Line
+    imaginary: Line
+
+
+class SensitivityPart(Part):
+    """|S_ii| and |T_ii| of a channel."""
+
+    S: Line
+    T: Line
+
+
+class GangPart(Part):
+    """Magnitudes of the gang of four of an output and the force of its axis."""
+
+    output_unit: str
+    force: str
+    force_unit: str
+    S: Line
+    T: Line
+    SP: Line = Field(description="output_unit over force_unit")
+    FS: Line = Field(description="force_unit over output_unit")
+
+
+class PolesPart(Part):
+    """Poles and zeros; of sampled loops ln(z) / T."""
+
+    closed_loop_rad_per_s: Poles
+    plant_rad_per_s: Poles
+    law_rad_per_s: Poles
+    zeros_rad_per_s: Poles
 
 
 class AnswerPart(Part):
-    """An answer over time, in the output's unit for a unit step, and the figures that are read off."""
+    """The answer of an output to a unit step, and what is read off."""
 
     rise_s: Number
     overshoot_share: Number
-    settling_s: Number
+    settling_s: Number = Field(description="to 2 %")
     peak: Number
-    peak_time_s: Number
+    peak_at_s: Number
     final: Number
     time_s: list[float]
-    value: list[Number]
+    value: list[float]
 
 
 class LoadPart(AnswerPart):
-    """What a unit load from outside does to one output, over time and over frequency."""
+    """The answer of an output to a constant load, and the compliance over frequency."""
 
     load: str
     load_unit: str
     output: str
     output_unit: str
-    compliance: list[Number]
-
-
-class GangPart(Part):
-    """The gang of four of one output and the force of its axis, over frequency."""
-
-    output_unit: str
-    force: str
-    force_unit: str
-    S: list[Number]
-    T: list[Number]
-    SP: list[Number]
-    FS: list[Number]
-
-
-class PolesPart(Part):
-    """Poles and zeros; of sampled loops ln(z) / Ts."""
-
-    plant_poles_rad_per_s: Pairs
-    law_poles_rad_per_s: Pairs
-    closed_loop_poles_rad_per_s: Pairs
-    zeros_rad_per_s: Pairs
+    compliance: Line
 
 
 class LoopPart(Part):
-    """One loop: its margins, and the curves of each kind of plot that was asked for."""
+    """One loop; a kind that was not asked for is null."""
 
     name: str
     stable: bool
-    sample_time_s: Number = Field(description="null for a continuous loop")
-    margins: list[ChannelPart]
-    frequency_rad_per_s: list[float] | None = None
-    bode: Lines | None = Field(default=None, description="magnitude and phase_rad by channel")
-    nyquist: Lines | None = Field(default=None, description="real and imaginary part by channel")
-    nichols: Lines | None = Field(default=None, description="magnitude and phase_rad by channel")
-    sigma: dict[str, list[list[Number]]] | None = Field(default=None, description="of L, S, T; largest first")
-    sensitivity: Lines | None = Field(default=None, description="|S| and |T| by channel")
+    sample_time_s: Number = Field(description="null: continuous")
+    margins: list[MarginsPart]
+    frequency_rad_per_s: list[float]
+    bode: dict[str, GainPart] | None = Field(default=None, description="by channel; of nichols too")
+    nyquist: dict[str, PlanePart] | None = None
+    sigma: dict[str, list[Line]] | None = Field(default=None, description="of L, S and T, the largest first")
+    sensitivity: dict[str, SensitivityPart] | None = None
     gang: dict[str, GangPart] | None = None
     pzmap: PolesPart | None = None
-    step: dict[str, AnswerPart] | None = Field(default=None, description="of each reference's own output")
+    step: dict[str, AnswerPart] | None = None
     load: list[LoadPart] | None = None
 
 
 class LocusPart(Part):
-    """The poles of the closed loop over a parameter of the machine, or over the gain of the loop."""
+    """A root locus: closed-loop poles over a parameter, a list for each branch."""
 
     name: str
     parameter: str
+    channel: str | None = Field(description="whose gain it is; null: all")
     unit: str
     nominal: float
-    stability_changes: list[float]
+    stability_changes: list[float] = Field(description="values at which the loop becomes stable or unstable")
     values: list[float]
-    branches_rad_per_s: list[Pairs]
-    nominal_poles_rad_per_s: Pairs
+    branches_rad_per_s: list[list[list[Number]]]
+    nominal_rad_per_s: Poles
 
 
 class PlotOutput(Part):
@@ -131,131 +149,143 @@ class PlotOutput(Part):
 
     kind: Literal["malta-plot-output"] = Field(default="malta-plot-output", alias="schema")
     version: Literal[1] = 1
-    at: Literal["sensors", "forces"] = Field(description="where the loops are cut")
+    at: Literal["sensors", "forces"]
     loops: list[LoopPart]
-    rootlocus: list[LocusPart] = Field(default=[])
+    root_loci: list[LocusPart]
     files: Files
 
 
 def plot_output(
-    loops: Iterable[LoopPart], loci: Iterable[RootLocus], at: Place, files: Iterable[Path]
+    loops: Iterable[LoopCurves],
+    kinds: Sequence[str],
+    channels: Sequence[str] | None,
+    at: Place,
+    loci: Iterable[RootLocus],
+    files: Iterable[Path],
 ) -> PlotOutput:
-    """The document of a command."""
+    """The document of plots of these kinds; channels : by name; None: all."""
     return PlotOutput(
-        at=at, loops=list(loops), rootlocus=list(map(_locus, loci)), files=list(map(str, files))
+        at=at,
+        loops=[_loop_part(curves, kinds, channels, at) for curves in loops],
+        root_loci=[_locus_part(found) for found in loci],
+        files=list(map(str, files)),
     )
 
 
-def loop_part(curves: LoopCurves, kinds: Sequence[str], channels: Names, at: Place) -> LoopPart:
-    """One loop: its margins, and what each kind draws of these channels."""
-    of_kind: Mapping[str, Callable[[LoopCurves, Names, Place], Any]] = {
-        "bode": _bode,
-        "nyquist": _nyquist,
-        "nichols": _bode,
-        "sigma": _sigma,
-        "sensitivity": _sensitivity,
-        "gang": _gang,
-        "pzmap": _poles,
-        "step": _steps,
-        "load": _loads,
-    }
-    drawn = [kind for kind in kinds if kind in of_kind]
+def _loop_part(
+    curves: LoopCurves, kinds: Sequence[str], channels: Sequence[str] | None, at: Place
+) -> LoopPart:
+    r, S, T = curves.responses, *curves.responses.cut(at)[1:]
+    gain, here = r.alone(at), _indices(curves, channels, at)
+    outputs = _indices(curves, channels, "sensors")
+    of_kind: dict[str, Any] = {}
+    if {"bode", "nichols"} & {*kinds}:
+        of_kind["bode"] = {name: _gain_part(gain[:, k]) for name, k in here.items()}
+    if "nyquist" in kinds:
+        of_kind["nyquist"] = {
+            name: PlanePart(real=gain[:, k].real.tolist(), imaginary=gain[:, k].imag.tolist())
+            for name, k in here.items()
+        }
+    if "sigma" in kinds:
+        of_kind["sigma"] = {
+            letter: curves.singular_values(G).T.tolist() for letter, G in zip("LST", r.cut(at), strict=True)
+        }
+    if "sensitivity" in kinds:
+        of_kind["sensitivity"] = {
+            name: SensitivityPart(S=_sizes(S[:, k, k]), T=_sizes(T[:, k, k])) for name, k in here.items()
+        }
+    if "gang" in kinds:
+        of_kind["gang"] = {
+            name: _gang_part(curves, k) for name, k in outputs.items() if k < len(curves.loop.inputs)
+        }
+    if "pzmap" in kinds:
+        of_kind["pzmap"] = _poles_part(curves)
+    if {"step", "load"} & {*kinds}:
+        of_kind |= _answers(curves, kinds, outputs)
     return LoopPart(
         name=curves.name,
         stable=curves.stable,
         sample_time_s=curves.loop.sample_time,
-        margins=[_channel(m) for m in curves.margins_at(at) if m.channel in channels],
-        frequency_rad_per_s=curves.w.tolist() if {*drawn} - {"pzmap", "step"} else None,
-        **{kind: of_kind[kind](curves, channels, at) for kind in drawn},
+        margins=[_margins_part(m) for m in curves.margins_at(at) if m.channel in here],
+        frequency_rad_per_s=curves.w.tolist(),
+        **of_kind,
     )
 
 
-def _channel(found: ChannelMargins) -> ChannelPart:
-    lower, upper = found.gain
-    below, above = found.gain_frequency
-    return ChannelPart(
+def _indices(curves: LoopCurves, channels: Sequence[str] | None, at: Place) -> dict[str, int]:
+    """Channels by name: those named, or all where none of the names is one of this place."""
+    known = {s.name: k for k, s in enumerate(curves.channels(at))}
+    return {name: k for name, k in known.items() if channels is None or name in channels} or known
+
+
+def _margins_part(found: ChannelMargins) -> MarginsPart:
+    return MarginsPart(
         channel=found.channel,
         stable=found.stable,
-        gain_margin_lower=lower,
-        gain_margin_lower_frequency_rad_per_s=below,
-        gain_margin_upper=upper,
-        gain_margin_upper_frequency_rad_per_s=above,
-        phase_margin_rad=found.phase,
-        phase_margin_frequency_rad_per_s=found.phase_frequency,
-        delay_margin_s=found.delay,
-        delay_margin_frequency_rad_per_s=found.delay_frequency,
-        disk_margin=found.disk.size,
-        disk_margin_frequency_rad_per_s=found.disk.frequency,
-        modulus_margin=found.modulus,
+        gain_lower=found.gain[0],
+        gain_lower_at_rad_per_s=found.gain_frequency[0],
+        gain_upper=found.gain[1],
+        gain_upper_at_rad_per_s=found.gain_frequency[1],
+        phase_rad=found.phase,
+        phase_at_rad_per_s=found.phase_frequency,
+        delay_s=found.delay,
+        delay_at_rad_per_s=found.delay_frequency,
+        disk=found.disk.size,
+        disk_at_rad_per_s=found.disk.frequency,
+        modulus=found.modulus,
         peak_sensitivity=found.peak_sensitivity,
-        peak_sensitivity_frequency_rad_per_s=found.peak_frequency,
+        peak_sensitivity_at_rad_per_s=found.peak_frequency,
         encirclements=found.encirclements,
         unstable_poles=found.unstable_poles,
     )
 
 
-def _indices(curves: LoopCurves, channels: Names, at: Place) -> dict[str, int]:
-    return {s.name: k for k, s in enumerate(curves.channels(at)) if s.name in channels}
-
-
-def _bode(curves: LoopCurves, channels: Names, at: Place) -> dict[str, Any]:
-    gain = curves.responses.alone(at)
-    return {
-        name: {
-            "magnitude": np.abs(gain[:, k]).tolist(),
-            "phase_rad": np.unwrap(np.angle(gain[:, k])).tolist(),
-        }
-        for name, k in _indices(curves, channels, at).items()
-    }
-
-
-def _nyquist(curves: LoopCurves, channels: Names, at: Place) -> dict[str, Any]:
-    gain = curves.responses.alone(at)
-    return {
-        name: {"real": gain[:, k].real.tolist(), "imaginary": gain[:, k].imag.tolist()}
-        for name, k in _indices(curves, channels, at).items()
-    }
-
-
-def _sigma(curves: LoopCurves, channels: Names, at: Place) -> dict[str, Any]:
-    del channels  # all of them together
-    return {
-        letter: curves.singular_values(G).T.tolist()
-        for letter, G in zip("LST", curves.responses.cut(at), strict=True)
-    }
-
-
-def _sensitivity(curves: LoopCurves, channels: Names, at: Place) -> dict[str, Any]:
-    _, S, T = curves.responses.cut(at)
-    return {
-        name: {"S": np.abs(S[:, k, k]).tolist(), "T": np.abs(T[:, k, k]).tolist()}
-        for name, k in _indices(curves, channels, at).items()
-    }
-
-
-def _gang(curves: LoopCurves, channels: Names, at: Place) -> dict[str, Any]:
-    del at  # of each output and the force of its axis
-    r, found = curves.responses, {}
-    for name, k in _indices(curves, channels, "sensors").items():
-        if k < len(curves.loop.inputs):
-            parts = {"S": r.S, "T": r.T, "SP": r.SP, "FS": r.FS}
-            found[name] = {
-                "output_unit": curves.loop.outputs[k].unit,
-                "force": curves.loop.inputs[k].name,
-                "force_unit": curves.loop.inputs[k].unit,
-            } | {key: np.abs(G[:, k, k]).tolist() for key, G in parts.items()}
+def _sizes(values: Any) -> list[float | None]:
+    found: list[float | None] = np.abs(values).tolist()
     return found
 
 
-def _poles(curves: LoopCurves, channels: Names, at: Place) -> dict[str, Any]:
-    del channels, at  # of the whole loop
-    sets = {f"{name}_poles_rad_per_s": values for name, values in curves.poles.items()}
-    return {key: pairs(values) for key, values in (sets | {"zeros_rad_per_s": curves.zeros}).items()}
+def _gain_part(gain: Any) -> GainPart:
+    return GainPart(magnitude=_sizes(gain), phase_rad=np.unwrap(np.angle(gain)).tolist())
 
 
-def pairs(values: Any) -> list[list[float | None]]:
-    """Complex numbers as rows of real and imaginary parts."""
+def _gang_part(curves: LoopCurves, k: int) -> GangPart:
+    r, output, force = curves.responses, curves.loop.outputs[k], curves.loop.inputs[k]
+    sizes = {key: _sizes(getattr(r, key)[:, k, k]) for key in ("S", "T", "SP", "FS")}
+    return GangPart(output_unit=output.unit, force=force.name, force_unit=force.unit, **sizes)
+
+
+def _pairs(values: Any) -> list[list[float]]:
     return [[float(value.real), float(value.imag)] for value in values]
+
+
+def _poles_part(curves: LoopCurves) -> PolesPart:
+    sets = {f"{name}_rad_per_s": _pairs(values) for name, values in curves.poles.items()}
+    return PolesPart(**sets, zeros_rad_per_s=_pairs(curves.zeros))
+
+
+def _answers(curves: LoopCurves, kinds: Sequence[str], outputs: dict[str, int]) -> dict[str, Any]:
+    """The answers to steps and loads."""
+    from malta.margins.steps import loop_steps
+
+    found = loop_steps(curves.loop)
+    made: dict[str, Any] = {}
+    if "step" in kinds:
+        made["step"] = {name: AnswerPart(**_line(found.references, k, k)) for name, k in outputs.items()}
+    if "load" in kinds:
+        made["load"] = [
+            LoadPart(
+                load=load.name,
+                load_unit=load.unit,
+                output=name,
+                output_unit=curves.loop.outputs[k].unit,
+                compliance=_sizes(curves.responses.compliance[:, k, column]),
+                **_line(found.loads, k, column),
+            )
+            for column, load in enumerate(curves.loop.loads)
+            for name, k in outputs.items()
+        ]
+    return made
 
 
 def _line(answer: StepResponse, output: int, column: int) -> dict[str, Any]:
@@ -271,48 +301,22 @@ def _line(answer: StepResponse, output: int, column: int) -> dict[str, Any]:
         "overshoot_share": found.overshoot,
         "settling_s": found.settling,
         "peak": found.peak,
-        "peak_time_s": found.peak_time,
+        "peak_at_s": found.peak_time,
         "final": found.final,
         "time_s": answer.t[k].tolist(),
         "value": answer.y[k, output, column].tolist(),
     }
 
 
-def _steps(curves: LoopCurves, channels: Names, at: Place) -> dict[str, Any]:
-    from malta.margins.steps import loop_steps
-
-    del at  # of the outputs after their references
-    answer = loop_steps(curves.loop).references
-    return {name: _line(answer, k, k) for name, k in _indices(curves, channels, "sensors").items()}
-
-
-def _loads(curves: LoopCurves, channels: Names, at: Place) -> list[dict[str, Any]]:
-    from malta.margins.steps import loop_steps
-
-    del at  # of the outputs after loads from outside
-    answer, compliance = loop_steps(curves.loop).loads, curves.responses.compliance
-    return [
-        {
-            "load": load.name,
-            "load_unit": load.unit,
-            "output": name,
-            "output_unit": curves.loop.outputs[k].unit,
-        }
-        | {"compliance": np.abs(compliance[:, k, column]).tolist()}
-        | _line(answer, k, column)
-        for column, load in enumerate(curves.loop.loads)
-        for name, k in _indices(curves, channels, "sensors").items()
-    ]
-
-
-def _locus(found: RootLocus) -> LocusPart:
+def _locus_part(found: RootLocus) -> LocusPart:
     return LocusPart(
         name=found.name,
         parameter=found.parameter,
+        channel=found.channel,
         unit=found.unit,
         nominal=found.nominal,
         stability_changes=list(found.changes),
         values=found.values.tolist(),
-        branches_rad_per_s=[pairs(branch) for branch in found.poles.T],
-        nominal_poles_rad_per_s=pairs(found.nominal_poles),
+        branches_rad_per_s=[[[*pair] for pair in _pairs(branch)] for branch in found.poles.T],
+        nominal_rad_per_s=_pairs(found.nominal_poles),
     )

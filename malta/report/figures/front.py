@@ -24,6 +24,9 @@ MARKS = ((0, "o"), (2, "s"), (1, "D"))  # style of a line and marker
 def front_figure(tuned: Tuned) -> Figure:
     """Draw the Pareto front of a search: force noise and motion over the proven margin, the chosen trial ringed.
 
+    A dot has the least force noise, or the least motion, that goes with its margin. The chosen trial has to keep the
+    bounds of both and of the experiments at once, so it may lie off either front.
+
     tuned : from `malta.tune`
 
     Returns a matplotlib Figure, which a notebook shows as the value of a cell.
@@ -32,10 +35,9 @@ def front_figure(tuned: Tuned) -> Figure:
     >>> from malta.tuning.search import Trial
     >>> from malta.tuning.tune import Tuned
     >>> spec = malta.read_design("examples/ball/design/ball.toml")
-    >>> noisy = {"margin": 3.63, "force_noise f": 0.0414, "motion y": 0.501e-6}
-    >>> quiet = {"margin": 3.28, "force_noise f": 0.0122, "motion y": 0.523e-6}
-    >>> front = Trial((223.0, 50, 0.051), 1, quiet), Trial((190.0, 40, 0.11), 1, noisy)
-    >>> tuned = Tuned(spec, front[1], (), front, trials=120)  # as malta.tune finds it
+    >>> quiet = Trial((223.0, 50.0, 0.051), 1, {"margin": 3.28, "force_noise f": 0.0122, "motion y": 0.523e-6})
+    >>> safe = Trial((190.0, 40.0, 0.11), 1, {"margin": 3.63, "force_noise f": 0.0414, "motion y": 0.501e-6})
+    >>> tuned = Tuned(spec, safe, requirements=(), front=(quiet, safe), trials=120)  # as malta.tune finds it
     >>> figure = malta.report.front_figure(tuned)
     >>> [axes.get_ylabel() for axes in figure.axes]
     ['noise of the force [N rms]', 'true motion [µm rms]']

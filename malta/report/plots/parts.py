@@ -92,7 +92,6 @@ def new_sheet(
     *,
     stacked: int = 1,
     height: float = 2.6,
-    lines: int | None = None,
     ticks: bool = False,
 ) -> Sheet:
     """A sheet of `count` channels, or the axes of the caller as one.
@@ -100,7 +99,6 @@ def new_sheet(
     title : and the line below it
     stacked : panels of one channel, above each other
     height : inch, of a panel
-    lines : of text above each channel; None: its name, and one for each loop
     ticks : whether stacked panels have an axis each; else they share that of frequency
 
     Raises InputError for another number of axes.
@@ -116,7 +114,7 @@ def new_sheet(
         return Sheet(figure, [tuple(column) for column in rows.T])
     columns = min(count, 3) if count != 4 else 2
     blocks = math.ceil(count / columns)
-    lines = 1 + min(len(loops), MOST_LINES) if lines is None else lines
+    lines = 1 + min(len(loops), MOST_LINES)
     head, foot, above = head_of(loops), 0.5, LINE * lines + 0.08
     gap = foot + 0.1 if ticks else 0.12
     each = above + height * stacked + gap * (stacked - 1) + foot
@@ -147,13 +145,22 @@ def head_of(loops: Mapping[str, LoopCurves]) -> float:
     return 0.52 if len(loops) < 2 else 0.75 + 0.18 * ((len(loops) - 1) // 4)
 
 
-def add_legend(figure: Figure, loops: Mapping[str, LoopCurves], height: float) -> None:
-    """A legend of the loops below the title, where there are several."""
+def add_legend(
+    figure: Figure, loops: Mapping[str, LoopCurves], height: float, markers: Sequence[str] = ()
+) -> None:
+    """A legend of the loops below the title, where there are several: of their lines, or of their markers."""
     if len(loops) < 2:
         return
     from matplotlib.lines import Line2D
 
-    handles = [Line2D([], [], **style) for style in styles_of(loops).values()]
+    styles = list(styles_of(loops).values())
+    handles = [Line2D([], [], **style) for style in styles]
+    if markers:
+        hollow: dict[str, Any] = {"linestyle": "none", "markerfacecolor": "none", "markersize": 6.5}
+        handles = [
+            Line2D([], [], color=style["color"], marker=markers[k % len(markers)], **hollow)
+            for k, style in enumerate(styles)
+        ]
     names = [name if len(name) <= 40 else f"{name[:37]}..." for name in loops]
     figure.legend(
         handles,

@@ -21,9 +21,11 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from malta.margins.curves import LoopCurves
+    from malta.margins.linear_loops import Place
     from malta.model.plant import ComplexArray
 
 DAMPING = (0.2, 0.5, 0.8)  # rays of the grid
+MARKERS = ("x", "s", "D", "^", "v", "p", "h", "*")  # of the closed loops
 NEAR = 2.5  # times the highest crossing of unit gain: the panel of the slow poles
 STRIP = 1.6  # times the Nyquist frequency: sampled poles beyond are next to pure delay
 GREY = "#dcdcdc"
@@ -39,7 +41,6 @@ def pzmap(source: Any, controller: Any = None, *, axes: Any = None, reach: float
         L = P C; or a table name -> loop, where a pair is a tuple
     controller : of the plant, or the system C; None: the source has it
     axes : one for all poles and one for the slow ones, or one alone for the slow ones; None: a new figure
-    reach : rad/s, of the right panel; None: a multiple of the highest crossing of unit gain
 
     Returns a matplotlib Figure, which a notebook shows as the value of a cell.
 
@@ -52,18 +53,20 @@ def pzmap(source: Any, controller: Any = None, *, axes: Any = None, reach: float
     """
     loops = loops_of(source, controller)
     styles = styles_of(loops)
-    everything = np.concatenate(
-        [_finite(p) for curves in loops.values() for p in (*curves.poles.values(), curves.zeros)]
-    )
+    drawn = [_finite(curves.poles[of]) for curves in loops.values() for of in ("closed_loop", "plant")]
+    everything = np.concatenate(drawn)
     times = [curves.loop.sample_time for curves in loops.values()]
     reaches = _reaches(everything, times, _reach(loops) if reach is None else reach)
-    sheet, reaches = _plane_sheet((f"{title_of(loops)}: poles and zeros", ""), loops, axes, reaches)
+    told = "" if len(loops) == 1 else "marks of the legend: closed loop"
+    sheet, reaches = _plane_sheet((f"{title_of(loops)}: poles and zeros", told), loops, axes, reaches)
     for (panel,), size in zip(sheet.panels, reaches, strict=True):
         window = Window.about(everything, size)
         _draw_plane(panel, window, times)
         for k, (name, curves) in enumerate(loops.items()):
-            _draw_poles(panel, curves, styles[name], window, list(loops.values())[:k])
-    _explain(sheet, [("x", "closed loop"), ("+", "plant"), ("o", "zero of L")])
+            look = {"color": styles[name]["color"], "marker": MARKERS[k % len(MARKERS)]}
+            _draw_poles(panel, curves, look, window, list(loops.values())[:k])
+    own = [("x", "closed loop")] if len(loops) == 1 else []
+    _explain(sheet, [*own, ("+", "plant"), ("o", "zero of L")])
     return sheet.figure
 
 
@@ -125,7 +128,7 @@ def _plane_sheet(
         *title, size=(width, height), left=0.8 / width, right=1 - 0.2 / width,
         bottom=0.52 / height, top=1 - (head_of(loops) + 0.25) / height, wspace=0.2,
     )  # fmt: skip
-    add_legend(figure, loops, height)
+    add_legend(figure, loops, height, MARKERS)
     return Sheet(figure, [(panel,) for panel in np.ravel(figure.subplots(1, len(reaches)))]), reaches
 
 
@@ -176,27 +179,22 @@ def _round(value: float) -> float:
 def _draw_poles(
     axes: Axes,
     curves: LoopCurves,
-    style: Mapping[str, Any],
+    look: Mapping[str, Any],
     window: Window,
     drawn_before: Sequence[LoopCurves],
 ) -> None:
     """Poles and zeros of one loop that lie within the axes; a plant that stands there already is not drawn again."""
-    colour = style["color"]
-    drawn: tuple[tuple[ComplexArray, dict[str, Any]], ...] = (
-        (
-            curves.poles["closed_loop"],
-            {"marker": "x", "markersize": 6.5, "markeredgewidth": 1.5, "zorder": 4},
-        ),
-        (curves.poles["plant"], {"marker": "+", "markersize": 8, "markeredgewidth": 0.9, "zorder": 3}),
-        (curves.zeros, {"marker": "o", "markersize": 5.5, "markerfacecolor": "none", "markeredgewidth": 0.9}),
-    )
-    for values, look in drawn:
+    hollow = {"linestyle": "none", "markerfacecolor": "none", "markeredgewidth": 0.9, "color": look["color"]}
+    closed, plant, zeros = curves.poles["closed_loop"], curves.poles["plant"], curves.zeros
+    again = any(np.array_equal(plant, before.poles["plant"]) for before in drawn_before)
+    for values, own in (
+        (closed, {"marker": look["marker"], "markersize": 6.5, "markeredgewidth": 1.4, "zorder": 4}),
+        (plant[:0] if again else plant, {"marker": "+", "markersize": 8}),
+        (zeros, {"marker": "o", "markersize": 5.5}),
+    ):
         shown = window.inside(values)
-        known = look["marker"] == "+" and any(
-            np.array_equal(values, before.poles["plant"]) for before in drawn_before
-        )
-        if len(shown) and not known:
-            axes.plot(shown.real, shown.imag, linestyle="none", color=colour, **look)
+        if len(shown):
+            axes.plot(shown.real, shown.imag, **{**hollow, **own})
 
 
 def _explain(sheet: Sheet, marks: Sequence[tuple[str, str]]) -> None:
@@ -225,11 +223,10 @@ def root_locus(
     controller: Any = None,
     *,
     parameter: str = GAIN,
-    low: float | None = None,
-    high: float | None = None,
+    span: tuple[float, float] | None = None,
     channel: str | None = None,
+    at: Place = "sensors",
     axes: Any = None,
-    reach: float | None = None,
 ) -> Figure:
     """Draw closed-loop poles over a parameter of the machine or over the loop gain, every branch a line.
 
@@ -239,9 +236,10 @@ def root_locus(
     source : one loop: a plant; LoopSystems; a system of python-control, L or P; or a RootLocus
     controller : of the plant, the system C, or the curves of the RootLocus's loop; None: the source has it
     parameter : of the machine, by name; or "gain", a factor of the loop gain
-    low : lowest value of the parameter, SI; None: half of its nominal value, of the gain 0.1
-    high : highest value of the parameter, SI; None: one and a half of its nominal value, of the gain 10
-    channel : the output or force whose gain is changed; None: all forces
+    span : lowest and highest value of the parameter, SI; None: half and one and a half of its nominal value, of the
+        gain 0.1 and 10
+    channel : whose gain is changed; None: all
+    at : where the gain is changed, "sensors" or "forces"
     axes : one for all poles and one for the slow ones, or one alone for the slow ones; None: a new figure
     reach : rad/s, of the right panel; None: a multiple of the highest crossing of unit gain
 
@@ -251,22 +249,20 @@ def root_locus(
 
     >>> import control, malta
     >>> servo = control.tf([1], [1, 3, 2, 0], name="servo")
-    >>> figure = malta.report.root_locus(servo, low=1, high=10)
+    >>> figure = malta.report.root_locus(servo, span=(1, 10))
     >>> figure.get_suptitle()
     'servo: root locus over the loop gain, 1 … 10'
     """
     found = source
     if not isinstance(source, RootLocus):
-        found = locus_of(source, controller, parameter=parameter, low=low, high=high, channel=channel)
+        found = locus_of(source, controller, parameter=parameter, span=span, channel=channel, at=at)
     unit = "" if found.unit == "1" else f" {found.unit}"
-    gain = f"the gain of {channel}" if channel else "the loop gain"
+    gain = f"the gain of {found.channel}" if found.channel else "the loop gain"
     what = gain if found.parameter == GAIN else found.parameter
     ends = f"{found.values[0]:.4g} … {found.values[-1]:.4g}{unit}"
     title = plain(f"{found.name}: root locus over {what}, {ends}"), plain(_changes_text(found, unit))
-    slow = reach
-    if slow is None:
-        loop = controller if isinstance(source, RootLocus) else loop_curves(source, controller)
-        slow = math.inf if loop is None else _reach({"": loop})
+    loop = controller if isinstance(source, RootLocus) else loop_curves(source, controller)
+    slow = math.inf if loop is None else _reach({"": loop})
     drawn, times = _finite(found.poles.ravel()), [found.sample_time]
     sheet, reaches = _plane_sheet(title, {}, axes, _reaches(drawn, times, slow))
     for (panel,), size in zip(sheet.panels, reaches, strict=True):

@@ -1,0 +1,235 @@
+"""Plots of loops: what they draw, where margins are marked, and that nothing of them overlaps; `malta plot`."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import control
+import jsonschema
+import numpy as np
+import pytest
+from conftest import ROOT, Run, one_sentence
+from figure_checks import defects, texts_of
+from matplotlib.figure import Figure
+
+import malta
+from malta import report
+from malta.cli.documents.published import output_schema
+from malta.margins.curves import LoopCurves, loop_curves
+from malta.margins.locus import root_locus
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+s = control.tf("s")
+GAINS = ROOT / "design" / "gains"
+PLOTS = (
+    report.bode,
+    report.nyquist,
+    report.nichols,
+    report.sigma,
+    report.sensitivity_curves,
+    report.gang_of_four,
+    report.step,
+    report.pzmap,
+)
+
+
+def shipped(name: str) -> LoopCurves:
+    controller = malta.gains.read(GAINS / f"{name}.json")
+    return loop_curves(malta.plant_of(controller.parameters), controller)
+
+
+@pytest.fixture(scope="module")
+def robust() -> LoopCurves:
+    return shipped("robust")
+
+
+@pytest.fixture(scope="module")
+def unstable() -> dict[str, Any]:
+    """An unstable open loop, closed with enough gain and with too little."""
+    return {"enough": loop_curves(3 / (s - 1)), "too little": loop_curves(0.5 / (s - 1))}
+
+
+def lines(axes: Axes) -> list[np.ndarray[Any, Any]]:
+    """The data of all lines, k x 2 each."""
+    return [np.asarray(line.get_xydata(), dtype=float) for line in axes.lines]
+
+
+def near(axes: Axes, x: float, y: float, rel: float = 1e-3) -> bool:
+    """Whether a marker or the end of a segment stands at a place."""
+    short = [xy for xy in lines(axes) if len(xy) < 3]
+    return any(np.allclose(point, (x, y), rtol=rel, atol=rel) for xy in short for point in xy)
+
+
+@pytest.mark.parametrize("draw", PLOTS, ids=lambda draw: draw.__name__)
+def test_plots_of_stable_and_unstable_loops_have_no_defects(draw: Any, unstable: dict[str, Any]) -> None:
+    figure = draw(unstable)
+    assert isinstance(figure, Figure)
+    assert defects(figure) == []
+    assert all(np.isfinite(xy).all(axis=1).any() for axes in figure.axes for xy in lines(axes))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("draw", [*PLOTS, report.load_response], ids=lambda draw: draw.__name__)
+@pytest.mark.parametrize(
+    "names",
+    [("robust", "table2", "calibrated"), ("halbach",), ("planar", "planar_pid"), ("tubular_pid",)],
+    ids=lambda names: names[0],
+)
+def test_plots_of_every_machine_have_no_defects(draw: Any, names: tuple[str, ...]) -> None:
+    assert defects(draw({name: shipped(name) for name in names})) == []
+
+
+def test_loads_are_drawn_without_defects(robust: LoopCurves) -> None:
+    figure = report.load_response(robust)
+    assert defects(figure) == []
+    assert len(figure.axes) == 2 * 5  # T_z turns the mover about its axis, which no output reads
+
+
+def test_names_are_drawn_as_they_are() -> None:
+    """No formula of $, no markup; names of any length leave room."""
+    names = ["$a_1$ <b>", "ε" * 70, "c", "d", "e"]
+    figure = report.bode({name: control.tf([k], [1, 1, 0]) for k, name in enumerate(names, 2)})
+    assert defects(figure) == []
+    assert any(r"\$a_1\$ <b>" in text for text in texts_of(figure))
+
+
+def test_margins_are_marked_on_the_bode_plot() -> None:
+    L = 1 / (s * (s + 1) * (s + 2))
+    upper, lower = report.bode(L).axes
+    gain, phase, at_gain, at_phase = control.margin(L)
+    assert near(upper, at_gain, -20 * math.log10(gain))
+    assert near(upper, at_phase, 0)
+    assert near(lower, at_phase, phase - 180)
+    curve = lines(upper)[0]
+    assert np.interp(1.0, *curve.T) == pytest.approx(20 * math.log10(abs(L(1j))), abs=0.01)
+    phases = lines(lower)[0]
+    assert np.interp(1.0, *phases.T) == pytest.approx(math.degrees(np.angle(L(1j))), abs=0.1)
+
+
+def test_both_sides_of_the_gain_margin_are_marked(unstable: dict[str, Any]) -> None:
+    (axes,) = report.nyquist(unstable["enough"]).axes
+    assert near(axes, -3, 0)
+    text = " ".join(texts_of(axes.figure))  # type: ignore[arg-type]
+    assert "N 1, P 1" in text
+    assert "GM −9.5 … ∞" in text
+    assert "UNSTABLE; N 0, P 1" in " ".join(texts_of(report.nyquist(unstable["too little"])))
+
+
+def test_the_circle_of_the_peak_touches_the_nyquist_curve() -> None:
+    L = 1 / (s * (s + 1) * (s + 2))
+    found = loop_curves(L)
+    radius = 1 / found.margins[0].peak_sensitivity
+    drawn = [xy[:, 0] + 1j * xy[:, 1] for xy in lines(report.nyquist(found).axes[0])]
+    circle = next(line for line in drawn if np.allclose(np.abs(line + 1), radius))
+    value = found.responses.L[:, 0, 0]
+    assert np.abs(circle - value[:, None]).min() < 0.02
+    assert np.abs(value + 1).min() >= radius - 1e-6
+
+
+def test_a_channel_and_axes_may_be_chosen(robust: LoopCurves) -> None:
+    figure = Figure()
+    axes = figure.subplots(2, 2)
+    assert report.bode(robust, channel=["x1", "z"], axes=axes) is figure
+    assert all(panel.lines for panel in axes.ravel())
+    assert len(report.nyquist(robust, channel="z").axes) == 1
+    assert len(report.bode(robust, at="forces").axes) == 10
+    with pytest.raises(malta.InputError, match="axes: found 1, expected 2"):
+        report.bode(robust, channel="z", axes=axes[0, 0])
+    with pytest.raises(malta.InputError, match="'q', expected one of x1 y1 x2 y2 z"):
+        report.step(robust, channel="q")
+    with pytest.raises(malta.InputError, match="'here', expected sensors or forces"):
+        report.bode(robust, at="here")  # type: ignore[arg-type]
+    with pytest.raises(malta.InputError, match="loops: found none"):
+        report.bode({})
+    with pytest.raises(malta.InputError, match="no loads from outside"):
+        report.load_response(control.tf([1], [1, 1]))
+
+
+def test_a_root_locus_shows_its_ends_and_the_boundary() -> None:
+    found = root_locus(1 / (s * (s + 1) * (s + 2)), span=(0.5, 10))
+    figure = report.root_locus(found)
+    assert defects(figure) == []
+    assert "stability changes at gain = 6.000" in " ".join(texts_of(figure))
+    drawn = np.vstack([xy for axes in figure.axes for xy in lines(axes)])
+    for pole in (*found.poles[0], *found.poles[-1], *found.nominal_poles):
+        assert np.hypot(*(drawn - [pole.real, pole.imag]).T)[np.isfinite(drawn).all(axis=1)].min() < 1e-9
+
+
+def test_plots_show_themselves_in_notebooks(unstable: dict[str, Any]) -> None:
+    picture = report.sigma(unstable)._repr_png_()  # type: ignore[attr-defined]
+    assert picture.startswith(b"\x89PNG")
+
+
+# --- malta plot ---
+
+
+def test_the_command_writes_pictures_and_numbers(tmp_path: Path, run: Run) -> None:
+    gains = str(GAINS / "halbach.json")
+    said = run(
+        "plot", gains, "bode", "pzmap", "rootlocus", "step", "--json", "--out", str(tmp_path),
+        "--with", str(GAINS / "halbach_late.json"),
+    )  # fmt: skip
+    document = json.loads(said.out)
+    assert said.code == 0
+    jsonschema.validate(document, output_schema("plot-output"))
+    names = [Path(file).name for file in document["files"]]
+    assert names == ["halbach_bode.png", "halbach_pzmap.png", "halbach_rootlocus.png", "halbach_late_rootlocus.png",
+                     "halbach_step.png"]  # fmt: skip
+    assert all(Path(file).read_bytes().startswith(b"\x89PNG") for file in document["files"])
+    first, second = document["loops"]
+    margins = shipped("halbach").margins[0]
+    assert first["margins"][0]["phase_rad"] == pytest.approx(margins.phase)
+    assert len(first["bode"]["x"]["magnitude"]) == len(first["frequency_rad_per_s"])
+    assert second["step"]["x"]["final"] == pytest.approx(1, abs=1e-6)
+    assert document["root_loci"][0]["stability_changes"] == pytest.approx([margins.gain[1]], rel=1e-4)
+
+
+@pytest.mark.parametrize("suffix", [".svg", ".pdf"])
+def test_a_picture_may_be_a_drawing(tmp_path: Path, run: Run, suffix: str) -> None:
+    contents = []
+    for name in "ab":
+        path = tmp_path / f"{name}{suffix}"
+        assert run("plot", str(GAINS / "halbach.json"), "nyquist", "--out", str(path)).code == 0
+        contents.append(path.read_bytes())
+    assert contents[0] == contents[1]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["blode"], "'blode', expected one of bode nyquist"),
+        (["bode", "--at", "here"], "--at: found 'here', expected sensors or forces"),
+        (["bode", "--channel", "q"], "--channel: found 'q', expected one of x"),
+        (["bode", "--out", "a.gif"], "--out: found a.gif, expected a folder, or a file .png"),
+        (["bode", "step", "--out", "a.png"], "--out: found one file for 2 pictures, expected a folder"),
+        (["bode", "--range", "1..2"], "--range: found no rootlocus"),
+        (["rootlocus", "--range", "1-2"], "--range: found '1-2', expected LOW..HIGH"),
+        (["rootlocus", "--range", "2..1..3"], "expected LOW..HIGH"),
+        (["rootlocus", "--parameter", "q"], "--parameter: found 'q', expected one of gain A k m"),
+        (
+            ["rootlocus", "--parameter", "m", "--range", "0..2"],
+            "m: found 0, expected a finite number above 0",
+        ),
+        (["rootlocus", "--parameter", "m", "--range", "1kg..2V"], "expected a unit of kg"),
+        (["bode", "--with", str(GAINS / "halbach.json")], "the same gain file twice"),
+    ],
+    ids=lambda value: " ".join(value)[-40:] if isinstance(value, list) else "",
+)
+def test_bad_input_is_one_sentence(arguments: list[str], message: str, run: Run) -> None:
+    said = run("plot", str(GAINS / "halbach.json"), *arguments)
+    assert said.code == 2
+    assert message in one_sentence(said.err)
+    assert not said.out
+
+
+def test_an_unstable_loop_is_drawn_and_named(tmp_path: Path, run: Run) -> None:
+    said = run(
+        "plot", str(GAINS / "robust.json"), "step", "--channel", "z", "--set", "m=9", "--out", str(tmp_path / "a.png")
+    )  # fmt: skip
+    assert said.code == 0
+    assert "robust: the loop is unstable" in said.err
