@@ -84,6 +84,7 @@ def test_plots_of_every_machine_have_no_defects(draw: Any, names: tuple[str, ...
     assert defects(draw({name: shipped(name) for name in names})) == []
 
 
+@pytest.mark.slow
 def test_loads_are_drawn_without_defects(robust: LoopCurves) -> None:
     figure = report.load_response(robust)
     assert defects(figure) == []
@@ -160,6 +161,7 @@ def test_a_root_locus_shows_its_ends_and_the_boundary() -> None:
         assert np.hypot(*(drawn - [pole.real, pole.imag]).T)[np.isfinite(drawn).all(axis=1)].min() < 1e-9
 
 
+@pytest.mark.slow
 def test_plots_show_themselves_in_notebooks(unstable: dict[str, Any]) -> None:
     picture = report.sigma(unstable)._repr_png_()  # type: ignore[attr-defined]
     assert picture.startswith(b"\x89PNG")
@@ -189,6 +191,7 @@ def test_the_command_writes_pictures_and_numbers(tmp_path: Path, run: Run) -> No
     assert document["root_loci"][0]["stability_changes"] == pytest.approx([margins.gain[1]], rel=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", [".svg", ".pdf"])
 def test_a_picture_may_be_a_drawing(tmp_path: Path, run: Run, suffix: str) -> None:
     contents = []
