@@ -11,6 +11,8 @@ from malta.report.figures import yield_figure as yield_figure
 from malta.report.figures.margins import chain_figure as chain_figure
 from malta.report.figures.parts import STYLES as STYLES
 from malta.report.figures.parts import new_figure as new_figure
+from malta.report.page.report import compare_gains as compare_gains
+from malta.report.page.report import comparison_page as comparison_page
 from malta.report.page.report import gain_page as gain_page
 from malta.report.pages import CAMPAIGN_FILES as CAMPAIGN_FILES
 from malta.report.pages import CampaignFigures as CampaignFigures

@@ -13,6 +13,7 @@ from malta.errors import InputError
 from malta.files import replace_files
 from malta.report.page.inline import colours_of, inline_svg, printable, style_rules
 from malta.report.page.sections import Folded, Item, Picture, Section
+from malta.report.page.sheets import polish
 
 if TYPE_CHECKING:
     import jinja2
@@ -114,7 +115,7 @@ def _part(item: Item, drawn: dict[int, str]) -> dict[str, Any]:
     if isinstance(item, Picture):
         return {"kind": "picture", "caption": item.caption, "svg": Markup(drawn[id(item)])}
     if isinstance(item, Folded):
-        return {"kind": "folded", "summary": item.summary, "sheets": item.sheets}
+        return {"kind": "folded", "summary": item.summary, "sheets": item.sheets, "narrow": item.narrow}
     sheet: Sheet = item
     return {"kind": "table", "sheet": sheet}
 
@@ -131,7 +132,7 @@ def _inks(texts: Any) -> str:
 def _environment() -> jinja2.Environment:
     import jinja2
 
-    return jinja2.Environment(
+    environment = jinja2.Environment(
         loader=jinja2.PackageLoader("malta.report", "page"),
         undefined=jinja2.StrictUndefined,
         autoescape=True,
@@ -139,6 +140,8 @@ def _environment() -> jinja2.Environment:
         lstrip_blocks=True,
         finalize=lambda value: printable(value) if type(value) is str else value,
     )
+    environment.filters["polish"] = polish
+    return environment
 
 
 @cache

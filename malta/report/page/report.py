@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from malta.gains.schema import GainFile
     from malta.model.plant import Parameters
     from malta.report.page.analysis import Analysis, Subject
+    from malta.report.page.comparison import Comparison
     from malta.report.page.document import Page
     from malta.synthesis.controller import Controller
     from malta.synthesis.spec import Spec
@@ -51,6 +52,32 @@ def gain_page(
 
     subject = subject_of(gains, parameters=parameters, uncertainty=uncertainty, spec=spec)
     return page_of(analyse(subject, proof=proof, campaigns=campaigns))
+
+
+def compare_gains(
+    *gains: str | Path | Controller, uncertainty: Mapping[str, float] | None = None, proof: bool = True
+) -> Comparison:
+    """Compare 2 to 8 gain files, or controllers: what differs, and figures of merit with the better one marked.
+
+    uncertainty : parameter -> share, either way, at margin 1, of all designs; None: of each gain file its own
+    proof : whether the margin of the parameters is proven for each, which takes seconds
+
+    Raises InputError for another number of them, and as `malta.gains.read`.
+
+        found = malta.report.compare_gains("design/gains/table2.json", "design/gains/robust.json")
+        malta.report.comparison_page(found).save("build/comparison.html")
+    """
+    from malta.report.page.comparison import compare, require_count
+
+    require_count(len(gains))
+    return compare([subject_of(one, uncertainty=uncertainty) for one in gains], proof=proof)
+
+
+def comparison_page(found: Comparison) -> Page:
+    """Write a comparison as one page in HTML that needs no network and no other file."""
+    from malta.report.page.compared import comparison_page as write
+
+    return write(found)
 
 
 def subject_of(

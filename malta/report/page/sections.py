@@ -19,7 +19,7 @@ from malta.report.figures.parts import UNITS
 from malta.report.page.channels import distinct_channels
 from malta.report.page.design import design_entries, display_unit, kind_of
 from malta.report.page.scores import four_digits, requirement_words
-from malta.report.page.sheets import Sheet, matrix_sheet, plain_sheet, sheets_of
+from malta.report.page.sheets import Sheet, matrix_sheets, plain_sheet, sheets_of
 from malta.report.tables.campaign import box_text, campaign_tables, run_text
 from malta.report.tables.design import bandwidth_table, loop_poles_table, poles_table, sensitivity_table
 from malta.report.tables.experiments import experiment_table, limits_text
@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from malta.report.page.analysis import Analysis
     from malta.tuning.outcomes import Outcome
 
+NARROW = 3  # columns of a table
 NEAR = 0.95  # of a bound: a requirement holds, but hardly
 
 
@@ -58,6 +59,11 @@ class Folded:
 
     summary: str
     sheets: tuple[Sheet, ...]
+
+    @property
+    def narrow(self) -> bool:
+        """Whether the tables have room beside each other."""
+        return all(len(sheet.heads) <= NARROW for sheet in self.sheets)
 
 
 Item = Sheet | Picture | Folded | str  # a string is a paragraph
@@ -303,7 +309,7 @@ def _job(a: Analysis) -> Iterator[Item]:
     yield f"{job.question} Fidelity {job.run.scenario.fidelity}: {job.outcome}."
     yield Picture(
         lambda: experiment_figure(job, published),
-        f"The machine's main job, {job.name}, on the nonlinear machine with sensors as built.",
+        f"The machine's main job, {job.name}, on the nonlinear machine.",
     )
     yield from sheets_of(experiment_table(job, published))
     yield from limits_text(job)
@@ -366,19 +372,14 @@ def _gains(a: Analysis) -> Iterator[Item]:
     c = a.subject.controller
     law = "v = K (ξ* − ξ̂) + Ki e, and ξ̂ = ξ + L (y − Cd ξ)"
     yield f"{law}: rows and columns bear the names of their signals; all numbers are in SI units."
-    yield Folded(
-        f"K, {len(c.forces)} × {len(c.states)}: states to commands",
-        (matrix_sheet("K", c.K, c.forces, c.states),),
-    )
-    if c.integrating:
-        yield Folded(
-            f"Ki, {len(c.forces)} × {len(c.measurements)}: sums of errors to commands",
-            (matrix_sheet("Ki", c.Ki, c.forces, c.measurements),),
-        )
-    yield Folded(
-        f"L, {len(c.states)} × {len(c.measurements)}: innovations to states",
-        (matrix_sheet("L", c.L, c.states, c.measurements),),
-    )
+    for name, M, rows, columns, what in (
+        ("K", c.K, c.forces, c.states, "states to commands"),
+        ("Ki", c.Ki, c.forces, c.measurements, "sums of errors to commands"),
+        ("L", c.L, c.states, c.measurements, "innovations to states"),
+    ):
+        if name != "Ki" or c.integrating:
+            sheets = matrix_sheets(name, M, rows, columns)
+            yield Folded(f"{name}, {len(rows)} × {len(columns)}: {what}", tuple(sheets))
 
 
 def _provenance(a: Analysis) -> Iterator[Item]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +15,9 @@ from malta.report.figures.parts import micro
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray, Signal
+
+
+WIDE = 8  # columns of a matrix beside each other
 
 
 @dataclass(frozen=True)
@@ -78,11 +81,17 @@ def plain_sheet(title: str, heads: Sequence[str], rows: Iterable[Sequence[str]])
     )
 
 
-def matrix_sheet(title: str, M: FloatArray, rows: Sequence[Signal], columns: Sequence[Signal]) -> Sheet:
-    """A matrix with the names and units of its rows and columns."""
-    heads = ["", *(_name(s) for s in columns)]
-    cells = ([_name(s), *(_entry(value) for value in row)] for s, row in zip(rows, M.tolist(), strict=True))
-    return plain_sheet(title, heads, cells)
+def matrix_sheets(
+    title: str, M: FloatArray, rows: Sequence[Signal], columns: Sequence[Signal]
+) -> Iterator[Sheet]:
+    """A matrix with the names and units of its rows and columns, in parts that a sheet of paper has room for."""
+    for first in range(0, len(columns), WIDE):
+        part = columns[first : first + WIDE]
+        heads = ["", *(_name(s) for s in part)]
+        values = M[:, first : first + WIDE].tolist()
+        cells = ([_name(s), *(_entry(value) for value in row)] for s, row in zip(rows, values, strict=True))
+        more = "" if len(part) == len(columns) else f", columns {first + 1} to {first + len(part)}"
+        yield plain_sheet(f"{title}{more}", heads, cells)
 
 
 def _name(signal: Signal) -> str:
