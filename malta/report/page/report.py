@@ -59,13 +59,20 @@ def compare_gains(
 ) -> Comparison:
     """Compare 2 to 8 gain files, or controllers: what differs, and figures of merit with the better one marked.
 
+    gains : gain files, or controllers
     uncertainty : parameter -> share, either way, at margin 1, of all designs; None: of each gain file its own
     proof : whether the margin of the parameters is proven for each, which takes seconds
 
+    Returns a Comparison with `names`, `differences` and `rows`, the figures of merit.
+
     Raises InputError for another number of them, and as `malta.gains.read`.
 
-        found = malta.report.compare_gains("design/gains/table2.json", "design/gains/robust.json")
-        malta.report.comparison_page(found).save("build/comparison.html")
+    >>> import malta
+    >>> specs = [malta.read_design(f"examples/ball/design/{name}.toml") for name in ("ball", "ball_pid")]
+    >>> designs = [malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at())) for spec in specs]
+    >>> found = malta.report.compare_gains(*designs, proof=False)
+    >>> [one.texts for one in found.differences if one.name == "kind"]
+    [('LQG', 'PID')]
     """
     from malta.report.page.comparison import compare, require_count
 
@@ -74,7 +81,15 @@ def compare_gains(
 
 
 def comparison_page(found: Comparison) -> Page:
-    """Write a comparison as one page in HTML that needs no network and no other file."""
+    """Write a comparison as one page in HTML that needs no network and no other file.
+
+    found : the comparison, as `compare_gains` returns it
+
+    Returns a Page: a notebook shows it, and its `save` writes it.
+
+        found = malta.report.compare_gains("design/gains/table2.json", "design/gains/robust.json")
+        malta.report.comparison_page(found).save("build/comparison.html")
+    """
     from malta.report.page.compared import comparison_page as write
 
     return write(found)
