@@ -9,8 +9,8 @@ import typer
 
 from malta.cli.inputs import read_controller
 from malta.cli.options import AsJson, Changes, MachineFile
-from malta.cli.output import make_console, margin_progress, print_document, print_written
-from malta.cli.report import read_subject
+from malta.cli.output import make_console, print_document, print_written
+from malta.cli.report import read_subject, unwritten_progress
 from malta.files import locate, replace_files
 
 
@@ -54,8 +54,8 @@ def compare(
     page_file = None if out is None else require_suffix(out, *SUFFIXES)
     files = [locate(file) for file in gains]
     subjects = [read_subject(file, read_controller(file, machine), change, uncertain, None) for file in files]
-    with margin_progress("compare") as (progress, bounds):
-        found = compare_subjects(subjects, proof=not no_proof, progress=progress, bounds=bounds)
+    with unwritten_progress("compare") as progress:
+        found = compare_subjects(subjects, proof=not no_proof, progress=progress)
         written = []
         if page_file is not None:
             from malta.report.page.compared import comparison_page

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -11,7 +12,14 @@ import typer
 from malta.cli.assignments import read_assignments
 from malta.cli.inputs import change_machine, design_of, read_controller
 from malta.cli.options import AsJson, Changes, GainFile, MachineFile
-from malta.cli.output import make_console, margin_progress, print_document, print_note, print_written
+from malta.cli.output import (
+    interruption,
+    make_console,
+    print_document,
+    print_note,
+    print_written,
+    progress_bar,
+)
 from malta.errors import InputError
 from malta.files import replace_files
 
@@ -77,9 +85,9 @@ def report(
     page_file = require_suffix(out or Path("build") / f"{controller.name}_report.html", *SUFFIXES)
     subject = read_subject(gains, controller, change, uncertain, design)
     found_campaigns = _campaigns_of(campaign, controller, subject.spec)
-    with margin_progress("report") as (progress, bounds):
+    with unwritten_progress("report") as progress:
         analysis, page = report_work(
-            subject, proof=not no_proof, campaigns=found_campaigns, progress=progress, bounds=bounds
+            subject, proof=not no_proof, campaigns=found_campaigns, progress=progress
         )
         contents = {page_file: page.content}
         if pdf:
@@ -94,6 +102,16 @@ def report(
     for note in analysis.notes:
         print_note(note)
     require_stable(analysis.margins, str(gains))
+
+
+@contextmanager
+def unwritten_progress(what: str) -> Iterator[Callable[[float], None]]:
+    """Say how far work is that writes nothing before its end; Ctrl-C ends it with exit code 130."""
+    with progress_bar(what) as progress:
+        try:
+            yield progress
+        except KeyboardInterrupt:
+            raise interruption("nothing is written") from None
 
 
 def read_subject(

@@ -19,7 +19,6 @@ from malta.model.data import plant_of
 from malta.model.linearize import linearize
 from malta.model.plant import position_at
 from malta.simulation.catalogue import experiment, main_job
-from malta.simulation.experiments import progress_of_part
 from malta.simulation.payload import payload
 from malta.tuning.noise import noise_of
 from malta.tuning.outcomes import judge
@@ -29,7 +28,7 @@ if TYPE_CHECKING:
     from malta.margins.curves import LoopCurves
     from malta.margins.gain import Gain
     from malta.margins.recovery import Recovery
-    from malta.margins.robust import Margin, Progress
+    from malta.margins.robust import Margin
     from malta.margins.stages import Robustness
     from malta.margins.verify import Margins
     from malta.model.linearize import LinearModel
@@ -113,57 +112,71 @@ def analyse(
     stages: bool = True,
     campaigns: Sequence[Summary] = (),
     progress: Share | None = None,
-    bounds: Progress | None = None,
 ) -> Analysis:
     """Compute all that the pages show of a subject.
 
     proof : whether margins of the parameters are proven
     stages : whether every stage and each parameter alone has its margin, and |S| its worst case; otherwise the margin
         of all parameters at once is the only one
-    progress : takes the share of the work that is done;  bounds : takes the bounds of the margin so far
+    progress : takes the share of the work that is done
 
     Raises CheckError when numbers overflow or no input holds the machine.
     """
     plant, model, controller = subject.plant, subject.model, subject.controller
-    parts = 3
+    steps = _Steps(progress)
     margins = verify(model, controller, subject.box if proof and not stages else None)
-    robust = _robust(subject, progress_of_part(progress, 0, parts), bounds, proof=proof and stages)
+    robust = _robust(subject, steps.part(0.0, 0.5), proof=proof and stages)
+    steps.reach(0.5)
     covered = stages and proof and bool(subject.box)
     covered = covered and covers_travel(plant, controller, tuple(subject.box), subject.current_loops)
-    stable = margins.stable
+    worst = worst_sensitivities(plant, controller, subject.box, subject.current_loops) if covered else {}
+    carried = payload(plant, controller) if margins.stable and stages and proof else None
+    steps.reach(0.7)
     notes: list[str] = []
-    job = _main_job(subject, notes, progress_of_part(progress, 1, parts))
-    found = Analysis(
+    job = _main_job(subject, notes, steps.part(0.7, 0.8))
+    outcomes = _outcomes(subject, notes)
+    steps.reach(1.0)
+    return Analysis(
         subject,
         plant,
         model,
         margins,
         robust,
         margin=margins.robust if robust is None or not stages else robust.travel if proof else None,
-        classical=_classical(subject) if stable else None,
-        worst=worst_sensitivities(plant, controller, subject.box, subject.current_loops) if covered else {},
-        recovered=recovery(plant, controller) if stable and plant.disturbances else (),
-        payload=payload(plant, controller) if stable and stages and proof else None,
-        noise=noise_of(machine_loop(model, controller), plant) if stable else None,
+        classical=_classical(subject) if margins.stable else None,
+        worst=worst,
+        recovered=recovery(plant, controller) if margins.stable and plant.disturbances else (),
+        payload=carried,
+        noise=noise_of(machine_loop(model, controller), plant) if margins.stable else None,
         job=job,
-        outcomes=_outcomes(subject, notes),
+        outcomes=outcomes,
         campaigns=tuple(campaigns),
         notes=tuple(notes),
     )
-    if progress is not None:
-        progress(1.0)
-    return found
 
 
-def _robust(
-    subject: Subject, progress: Share | None, bounds: Progress | None, *, proof: bool
-) -> Robustness | None:
+class _Steps(NamedTuple):
+    """The work of an analysis, in parts that each take about their share of the time."""
+
+    progress: Share | None
+
+    def reach(self, share: float) -> None:
+        """Say that a share of the work is done."""
+        if self.progress is not None:
+            self.progress(share)
+
+    def part(self, low: float, high: float) -> Share:
+        """The function that takes the share done of a part of the work."""
+        return lambda share: self.reach(low + (high - low) * share)
+
+
+def _robust(subject: Subject, progress: Share, *, proof: bool) -> Robustness | None:
     """Margins of the parameters and along the travel; None without uncertain parameters."""
     if not subject.box:
         return None
     return robustness(
         subject.plant, subject.controller, subject.box,
-        current_loops=subject.current_loops, progress=progress, bounds=bounds, proof=proof,
+        current_loops=subject.current_loops, progress=progress, proof=proof,
     )  # fmt: skip
 
 
@@ -175,7 +188,7 @@ def _classical(subject: Subject) -> Classical:
     return classical_margins(system, law, [s.name for s in plant.outputs])
 
 
-def _main_job(subject: Subject, notes: list[str], progress: Share | None) -> Experiment | None:
+def _main_job(subject: Subject, notes: list[str], progress: Share) -> Experiment | None:
     """The machine's main job; None, with a note, where it cannot be simulated."""
     plant = subject.plant
     name = main_job(plant)

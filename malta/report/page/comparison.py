@@ -201,12 +201,11 @@ def compare(
     *,
     proof: bool = True,
     progress: Callable[[float], None] | None = None,
-    bounds: Callable[[float, float], None] | None = None,
 ) -> Comparison:
     """Analyse designs and put them beside each other.
 
     proof : whether the margin of the parameters is proven for each
-    progress, bounds : as `analyse` takes them
+    progress : takes the share of the work that is done
 
     Raises InputError for fewer than LEAST or more than MOST designs, CheckError as `analyse`.
     """
@@ -219,7 +218,6 @@ def compare(
             proof=proof,
             stages=False,
             progress=progress_of_part(progress, n, len(subjects)),
-            bounds=bounds,
         )
         for n, subject in enumerate(subjects)
     ]

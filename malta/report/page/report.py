@@ -159,7 +159,6 @@ def report_work(
     proof: bool,
     campaigns: Sequence[Summary],
     progress: Callable[[float], None] | None,
-    bounds: Callable[[float, float], None] | None,
 ) -> tuple[Analysis, Page]:
     """Analyse a subject and write its page, behind one measure of progress."""
     from malta.report.page.analysis import analyse
@@ -168,7 +167,7 @@ def report_work(
         if progress is not None:
             progress(WORK * share)
 
-    found = analyse(subject, proof=proof, campaigns=campaigns, progress=computed, bounds=bounds)
+    found = analyse(subject, proof=proof, campaigns=campaigns, progress=computed)
     return found, page_of(
         found, None if progress is None else lambda share: progress(WORK + (1 - WORK) * share)
     )
