@@ -26,6 +26,7 @@ from typing import Any, NamedTuple
 import control
 import numpy as np
 from firmware import firmware
+from live import live_page
 from margins import margin, published
 from page import update_page
 from peer_control import closed_loop, documented_run
@@ -395,6 +396,7 @@ WORKLOADS: dict[str, Callable[[int], list[Result]]] = {
     "planar": decoupling,
     "halbach": halbach,
     "firmware": firmware,
+    "live": live_page,
 }
 
 

@@ -45,6 +45,7 @@ if TYPE_CHECKING:
 
 POINTS = 400  # of a curve over time, at most
 LOAD_POINTS = 240
+DIGITS = 6  # of what is drawn
 
 
 @dataclass(frozen=True)
@@ -148,9 +149,9 @@ def _frequency(curves: LoopCurves) -> dict[str, Any]:
     return {
         "w": rounded(w),
         "sensors": [s.name for s in curves.loop.outputs],
-        "S": [rounded(row) for row in S],
-        "T": [rounded(row) for row in T],
-        "L": [[rounded(row.real), rounded(row.imag)] for row in alone.T],
+        "S": rounded(S),
+        "T": rounded(T),
+        "L": rounded(np.stack([alone.T.real, alone.T.imag], axis=1)),
     }
 
 
@@ -264,8 +265,15 @@ def _worst_by_unit(label: str, values: FloatArray, signals: Sequence[Any]) -> li
 
 
 def rounded(values: Any) -> list[Any]:
-    """Numbers with six digits, as lists; what is not finite becomes None."""
-    return [
-        rounded(value) if np.ndim(value) else float(f"{value:.6g}") if math.isfinite(value) else None
-        for value in (values.tolist() if isinstance(values, np.ndarray) else values)
-    ]
+    """Numbers with DIGITS digits, as lists; what is not finite becomes None."""
+    x = np.asarray(values, dtype=float)
+    finite = np.isfinite(x)
+    with np.errstate(all="ignore"):
+        size = np.where(finite & (x != 0), np.floor(np.log10(np.abs(x))), 0.0)
+        scale = 10.0 ** np.clip(DIGITS - 1 - size, -300, 300)
+        short = np.where(finite, np.round(x * scale) / scale, x)
+    if not finite.all():
+        boxed = short.astype(object)
+        boxed[~finite] = None
+        return list(boxed.tolist())
+    return list(short.tolist())

@@ -1,0 +1,90 @@
+"""Moves of the live page: what a slider waits for, from the question by HTTP to the last byte of its answer."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import os
+import tempfile
+import threading
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from timing import Result
+
+from malta.app.server import Server
+from malta.app.session import Session
+from malta.files import shipped_path
+
+ASKED = 0.15  # s, of a move
+MOVES = 25  # of a run; the first of each is left out, which traces the machine
+CASES = {  # design file -> keys that are moved, a number of the law and one of the machine
+    "design/robust.toml": ("bases.state.x", "machine.m"),
+    "design/tubular_pid.toml": ("pid.Kd.fx_B1", "machine.m"),
+    "design/halbach_pid.toml": ("pid.Kp.F_x", "machine.m"),
+    "design/planar.toml": ("bases.integral.x", "machine.m"),
+    "examples/rotor/design/rotor.toml": ("bases.state.x", "machine.m"),
+}
+
+
+class Moves(NamedTuple):
+    """Seconds of each move: on the clock, and of this process's cores."""
+
+    wall: list[float]
+    cpu: list[float]
+
+
+def live_page(runs: int) -> list[Result]:
+    """Moves of one number at a time: the median and the 95th percentile beside what the page asks for."""
+    rows = []
+    for file, keys in CASES.items():
+        for key in keys:
+            seconds = moves(shipped_path(*file.split("/")), key, runs * MOVES)
+            for name, share in (("median", 50), ("95 %", 95)):
+                label = f"{Path(file).stem}, {key}, {name}"
+                rows.append(
+                    Result(label, float(np.percentile(seconds.wall, share)), "asked for", ASKED, "at least 1")
+                )
+    return rows
+
+
+def moves(design: Path, key: str, count: int) -> Moves:
+    """Move one number of a design by small steps, and wait for each picture."""
+    with tempfile.TemporaryDirectory() as scratch:
+        session = Session(design, Path(scratch))
+        with Server(session) as server:
+            thread = threading.Thread(target=server.serve_forever, daemon=True)
+            thread.start()
+            connection = http.client.HTTPConnection("127.0.0.1", server.server_port)
+            headers = {"X-Malta-Token": server.token, "Content-Type": "application/json"}
+            value, found = session.files.fields[key].value, Moves([], [])
+            assert isinstance(value, float | int)
+            for number in range(count + 3):
+                values = {key: value * (1 + 0.02 * np.sin(number + 1))}
+                body = json.dumps({"ask": "evaluate", "number": number, "values": values})
+                began, cpu = time.perf_counter(), time.process_time()
+                connection.request("POST", "/ask", body, headers)
+                answer = connection.getresponse().read()
+                spent = time.perf_counter() - began, time.process_time() - cpu
+                assert b'"poles"' in answer, answer[:300]
+                if number > 2:
+                    found.wall.append(spent[0])
+                    found.cpu.append(spent[1])
+            connection.close()
+            server.shutdown()
+            thread.join()
+        session.close()
+    return found
+
+
+if __name__ == "__main__":
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    for file, keys in CASES.items():
+        for key in keys:
+            found = moves(shipped_path(*file.split("/")), key, 2 * MOVES)
+            wall, cpu = (np.percentile(np.array(s) * 1e3, [50, 95]) for s in found)
+            print(
+                f"{file} {key}: wall {wall[0]:.0f} / {wall[1]:.0f} ms, cpu {cpu[0]:.0f} / {cpu[1]:.0f} ms (50 / 95 %)"
+            )
