@@ -7,7 +7,7 @@ Nothing here is proven: the eigenvalue margin is an upper bound, and the proof f
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -122,10 +122,10 @@ def picture(problem: Problem, view: View, first: int | None = None, *, margin: b
             "radius": stage.spectral_radius,
             "poles": _poles(problem),
             "frequency": _frequency(problem.curves),
-            "run": run_document(problem, view),
-            "load": _load(problem, view),
+            "run": (run := run_document(problem, view)),
+            "load": (load := _load(problem, view)),
             "margin": _margin(problem, first) if margin else None,
-            "figures": _figures(problem),
+            "figures": _figures(problem, run, load),
         }
 
 
@@ -217,7 +217,9 @@ class Merit(NamedTuple):
     note: str = ""
 
 
-def _figures(problem: Problem) -> list[dict[str, Any]]:
+def _figures(
+    problem: Problem, run: Mapping[str, Any] | None, load: Mapping[str, Any] | None
+) -> list[dict[str, Any]]:
     """The figures that pinned designs are compared by."""
     poles = problem.poles
     damping = float((-poles.real / np.maximum(np.abs(poles), 1e-300)).min(initial=1.0))
@@ -226,7 +228,7 @@ def _figures(problem: Problem) -> list[dict[str, Any]]:
         Merit("slowest pole", float(-poles.real.max(initial=-math.inf)), "rad/s", 1),
     ]
     if problem.stage.stable:
-        merits = [*_stable_merits(problem), *merits]
+        merits = [*_stable_merits(problem), *_time_merits(problem, run, load), *merits]
     return [m._asdict() | {"value": m.value if math.isfinite(m.value) else None} for m in merits]
 
 
@@ -248,9 +250,22 @@ def _stable_merits(problem: Problem) -> list[Merit]:
         ),
         Merit("phase margin", math.degrees(phase.phase), "deg", 1, f"{phase.channel}, {alone}"),
         Merit("delay margin", delay.delay, "s", 1, f"{delay.channel}, {alone}"),
-        *_worst_by_unit("motion at rest", noise.motion, problem.plant.outputs),
-        *_worst_by_unit("noise of commands", noise.force[: len(problem.plant.inputs)], problem.plant.inputs),
+        *_worst_by_unit("motion at rest, rms", noise.motion, problem.plant.outputs),
+        *_worst_by_unit("command noise, rms", noise.force[: len(problem.plant.inputs)], problem.plant.inputs),
     ]
+
+
+def _time_merits(
+    problem: Problem, run: Mapping[str, Any] | None, load: Mapping[str, Any] | None
+) -> list[Merit]:
+    """The largest errors of the run, and what the load moves, on the linear loop."""
+    outputs, merits = problem.plant.outputs, []
+    if run is not None:
+        error = np.abs(np.array(run["p"]) - np.array(run["reference"])).max(axis=1)
+        merits += _worst_by_unit(f"error, {run['name']}", error, outputs)
+    if load is not None:
+        merits += _worst_by_unit(f"moved by {load['name']}", np.array(load["largest"]), outputs)
+    return merits
 
 
 def _worst_by_unit(label: str, values: FloatArray, signals: Sequence[Any]) -> list[Merit]:
@@ -259,8 +274,9 @@ def _worst_by_unit(label: str, values: FloatArray, signals: Sequence[Any]) -> li
     for value, s in zip(values.tolist(), signals, strict=True):
         worst[s.unit] = max(worst.get(s.unit, (0.0, s.name)), (value, s.name))
     return [
-        Merit(label if len(worst) == 1 else f"{label} [{unit}]", value, unit, -1, f"rms, {name}")
+        Merit(label if len(worst) == 1 else f"{label} [{unit}]", value, unit, -1, f"largest at {name}")
         for unit, (value, name) in worst.items()
+        if value > 0
     ]
 
 

@@ -21,7 +21,7 @@ FIRST = "design"  # the folder whose first design opens where none is named
 def app(
     file: Annotated[
         Path | None,
-        typer.Argument(metavar="[DESIGN]", help="A design file. [the first of design/]", show_default=False),
+        typer.Argument(metavar="DESIGN", help="A design file. [the first of design/]", show_default=False),
     ] = None,
     no_browser: Annotated[
         bool, typer.Option("--no-browser", help="Only print the address of the page.")

@@ -93,9 +93,10 @@ export async function mount(root, transport) {
   const shortcuts = element("dialog", { class: "help" }, element("h2", {}, "Keys"), element("table", {}, ...SHORTCUTS.map(([keys, what]) => element("tr", {}, element("th", { scope: "row" }, keys), element("td", {}, what)))), element("form", { method: "dialog" }, element("button", { class: "main" }, "Close")));
   const file = element("input", { type: "text", id: "malta-file", autocomplete: "off", spellcheck: "false" });
   const saveNote = element("p", { class: "soft", role: "status" }), saveButton = element("button", { class: "main", type: "submit" }, "Save");
+  const cancel = button("Cancel", "Esc", () => saving.close());
   const saveForm = element("form", { onsubmit: (event) => { event.preventDefault(); saveDesign(); } },
     element("label", {}, "Design file, in the folder that malta app was started in", file), saveNote,
-    element("div", { class: "buttons" }, button("Cancel", "Esc", () => saving.close()), saveButton));
+    element("div", { class: "buttons" }, cancel, saveButton));
   const saving = element("dialog", { class: "save" }, element("h2", {}, "Save the design"), saveForm);
   root.replaceChildren(header, message, element("main", {}, controls, cards), shortcuts, saving);
   root.tabIndex = -1;
@@ -223,8 +224,11 @@ export async function mount(root, transport) {
   }
 
   function show(chart, view, empty) {
-    chart.node.classList.toggle("empty", !view || Boolean(view.empty));
-    chart.note.textContent = view?.empty || view?.note || (view ? "" : empty);
+    const missing = view ? view.empty : empty;
+    chart.node.classList.toggle("empty", Boolean(missing));
+    chart.node.dataset.missing = missing ?? "";
+    chart.legend.hidden = !view;
+    chart.note.textContent = view?.note ?? "";
     if (view) chart.draw(view);
   }
 
@@ -259,7 +263,8 @@ export async function mount(root, transport) {
     }
     const { simulated } = state;
     charts.run.note.textContent = !simulated ? "linear loop; the simulation follows" : simulated.error ? `no simulation: ${simulated.error}`
-      : `– – linear loop   —— simulation (${simulated.engine})${simulated.completed ? "" : `: ${simulated.verdict} at ${digits(simulated.end, 3)} s`}`;
+      : `– – linear   —— simulated${simulated.engine === "compiled" ? "" : ` (${simulated.engine})`}${simulated.completed ? "" : `: ${simulated.verdict} at ${digits(simulated.end, 3)} s`}`;
+    charts.run.note.title = charts.run.note.textContent;
     if (state.picture.load) charts.load.note.textContent = `1 ${state.description.loads.find((load) => load.name === state.picture.load.name).unit} of ${state.picture.load.name}, constant from t = 0, linear loop`;
   }
 
@@ -333,6 +338,7 @@ export async function mount(root, transport) {
       replace = true;
       saveNote.textContent = `${answer.exists.join(", ")} exists.`;
       saveButton.textContent = "Replace";
+      cancel.focus(); // a second Enter replaces nothing
       return;
     }
     if (answer.error) { saveNote.textContent = answer.error; return; }

@@ -105,7 +105,6 @@ export function createChart(label) {
     } else if (shape.kind === "band") {
       const top = toY(Math.min(shape.to, y.max)), low = toY(Math.max(shape.from, y.min));
       if (low > top) group.append(svg("rect", { class: shape.class, x: MARGIN.left, y: top, width: right - MARGIN.left, height: low - top }));
-      if (low - top > 10 && shape.text) group.append(svg("text", { class: "zone", x: MARGIN.left + 4, y: top + 10 }, shape.text));
     } else if (shape.kind === "line") {
       const d = shape.x !== undefined ? `M${toX(shape.x)} ${MARGIN.top}V${bottom}` : `M${MARGIN.left} ${toY(shape.y)}H${right}`;
       group.append(svg("path", { class: shape.class ?? "zero", d }));
@@ -131,7 +130,10 @@ export function createChart(label) {
     for (const shape of (view.shapes ?? []).filter((one) => one.kind === "band")) drawShape(inside, shape, s);
     const front = svg("g", { "clip-path": `url(#${clip})` });
     drawAxes(axes, s);
-    for (const shape of (view.shapes ?? []).filter((one) => one.kind !== "band")) drawShape(front, shape, s);
+    for (const shape of view.shapes ?? []) {
+      if (shape.kind !== "band") drawShape(front, shape, s);
+      else if (s.toY(shape.from) - s.toY(Math.min(shape.to, s.y.max)) > 11) front.append(svg("text", { class: "zone", x: MARGIN.left + 4, y: s.toY(Math.min(shape.to, s.y.max)) + 10 }, shape.text));
+    }
     for (const line of view.lines ?? []) {
       const mark = { class: `line${line.faint ? " faint" : ""}`, d: pathOf(line.xs, line.ys, s.toX, s.toY), stroke: line.color };
       if (line.dash) mark["stroke-dasharray"] = line.dash;

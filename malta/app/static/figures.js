@@ -1,7 +1,7 @@
 // What the charts show: documents of the session as views of chart.js.
 
 import { rangeOf } from "./chart.js";
-import { decibels, digits, quantity, scaleFor } from "./numbers.js";
+import { decibels, digits, printedUnit, quantity, scaleFor } from "./numbers.js";
 
 const DASHES = ["", "7 3", "2 3", "8 3 2 3", "", "7 3", "2 3", "8 3 2 3"];
 export const color = (k) => `var(--c${k % 8})`;
@@ -93,7 +93,7 @@ export function poleView(picture, pins, all, hidden) {
     y: { label: "Im s [rad/s]", min: -reach, max: reach },
     shapes: [{ kind: "line", x: 0, class: "limit" }, { kind: "line", y: 0 }, ...rays, ...labels],
     points: [...pins.flatMap((pin) => sets(pin.picture.poles, true)), ...sets(picture.poles, false)],
-    note: hiddenPoles ? `${hiddenPoles} faster poles outside` : "",
+    note: hiddenPoles ? `${hiddenPoles} faster ${hiddenPoles > 1 ? "poles" : "pole"} outside` : "",
     summary: `${sizes.length} poles of the closed loop, spectral radius ${digits(picture.radius, 6)}`,
     read: (set, k) => {
       const size = Math.hypot(set.xs[k], set.ys[k]);
@@ -113,7 +113,7 @@ export function timeGroups(description, withErrors) {
   const add = (signals, what, key) => {
     for (const unit of [...new Set(signals.map((s) => s.unit))]) {
       const indices = signals.flatMap((s, k) => (s.unit === unit ? [k] : []));
-      groups.push({ id: `${key} ${unit}`, text: `${what} [${unit}]`, unit, of: key, indices });
+      groups.push({ id: `${key} ${unit}`, text: `${what} [${printedUnit(unit)}]`, words: what, unit, of: key, indices });
     }
   };
   add(description.outputs, "outputs", "p");
@@ -150,7 +150,7 @@ export function runView(state, group, hidden) {
       if (Math.max(...run.reference[k].map(Math.abs)) > 0) lines.unshift({ name: `${signals[k].name} reference`, xs: run.t, ys: run.reference[k], color: "var(--soft)", dash: "2 2", silent: true, width: 2.4 });
     }
   }
-  return timeView(lines, group.unit, run.t, `${run.name}: ${group.text}`);
+  return timeView(lines, group, run.t, run.name);
 }
 
 // The outputs under a unit of one disturbance.
@@ -161,19 +161,19 @@ export function loadView(state, group, hidden) {
     name: description.outputs[k].name, xs: source.t, ys: source.y[k], color: color(k), faint: ghost, silent: ghost,
   }));
   const lines = [...pins.filter((pin) => pin.picture.load?.name === load.name).flatMap((pin) => rows(pin.picture.load, true)), ...rows(load, false)];
-  return timeView(lines, group.unit, load.t, `load ${load.name}`);
+  return timeView(lines, group, load.t, `load ${load.name}`);
 }
 
-function timeView(lines, unit, times, title) {
+function timeView(lines, { unit, words }, times, title) {
   const [low, high] = rangeOf(lines.map((line) => line.ys), { zero: true });
   const size = Math.max(Math.abs(low), Math.abs(high)), value = scaleFor(size, unit), time = scaleFor(times[times.length - 1], "s");
   const scaled = lines.map((line) => ({ ...line, xs: line.xs.map((t) => t / time.factor), ys: line.ys.map((y) => (y === null ? null : y / value.factor)) }));
   return {
     nearest: "x",
     x: { label: `time [${time.unit}]`, min: 0, max: times[times.length - 1] / time.factor },
-    y: { label: `[${value.unit || "1"}]`, min: low / value.factor, max: high / value.factor },
+    y: { label: `${words} [${value.unit || "1"}]`, min: low / value.factor, max: high / value.factor },
     lines: scaled, shapes: [{ kind: "line", y: 0 }],
-    summary: `${title}, largest ${quantity(size, unit)}`,
+    summary: `${title}: ${words}, largest ${quantity(size, unit)}`,
     read: (line, k) => [
       { text: `${digits(line.xs[k], 4)} ${time.unit}`, strong: true },
       ...scaled.filter((one) => !one.silent && one.xs === line.xs || (!one.silent && one.xs.length === line.xs.length)).map((one) => ({ color: one.color, text: `${one.name}: ${digits(one.ys[k], 4)} ${value.unit}` })),

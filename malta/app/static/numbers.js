@@ -25,7 +25,7 @@ export function digits(value, count = 4) {
   if (value === null || value === undefined || Number.isNaN(value)) return "–";
   if (!Number.isFinite(value)) return value > 0 ? "∞" : "−∞";
   const size = Math.abs(value);
-  const text = size !== 0 && (size >= 1e6 || size < 1e-4) ? value.toExponential(count - 1) : String(Number(value.toPrecision(count)));
+  const text = size !== 0 && (size >= 1e6 || size < 1e-4) ? value.toExponential(count - 1).replace(/\.?0+e/, "e") : String(Number(value.toPrecision(count)));
   return text.replace("e+", "e").replace("-", "−");
 }
 
