@@ -131,7 +131,7 @@ def test_two_to_eight_designs_are_compared(run: Run) -> None:
     for files in ([one], [one] * 9):
         said = run("compare", *files)
         assert said.code == 2
-        assert f"{len(files)} gain files, expected 2 to 8" in said.err
+        assert f"gain files: found {len(files)}, expected 2 to 8" in said.err
 
 
 @pytest.mark.slow

@@ -227,7 +227,7 @@ def compare(
 def require_count(count: int) -> None:
     """Raise InputError for fewer than LEAST or more than MOST designs."""
     if not LEAST <= count <= MOST:
-        raise InputError("compare", "", f"{count} gain files", f"{LEAST} to {MOST}")
+        raise InputError("compare", "gain files", str(count), f"{LEAST} to {MOST}")
 
 
 def names_of(subjects: Sequence[Subject]) -> tuple[str, ...]:

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from malta.synthesis.controller import Controller
     from malta.synthesis.spec import Spec
 
-WORK = 0.9  # share of the work that is done when all is computed; the rest is drawing
+WORK = 0.75  # share of the work that is done when all is computed; the rest is drawing
 
 
 def gain_page(
