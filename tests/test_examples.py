@@ -6,21 +6,18 @@ or passes on (`from a import b as b`).
 
 from __future__ import annotations
 
-import ast
 import doctest
-import importlib
 import inspect
 import io
 import re
 from collections.abc import Iterator
 from dataclasses import fields, is_dataclass
-from functools import cache, cached_property
-from itertools import pairwise
+from functools import cached_property
 from pathlib import Path
-from types import ModuleType
 from typing import Any, get_type_hints
 
 import pytest
+from public import all_names, docstring_of, public_names, value_of
 
 import malta
 
@@ -73,73 +70,12 @@ ENTRY = re.compile(r"^(\*{0,2}\w+(?:, \w+)*) : ", re.MULTILINE)  # "name : meani
 
 def test_every_public_name_is_listed() -> None:
     """The lists are not empty, and the package's own agrees with its contents page."""
-    assert set(_public_names(malta)) == set(malta.__all__)
+    assert set(public_names(malta)) == set(malta.__all__)
     assert {"malta.gains.read", "malta.references.stroke", "malta.report.stroke"} < set(DOCUMENTED)
     assert len(DOCUMENTED) > 120
 
 
-@cache
-def _tree(module: ModuleType) -> ast.Module:
-    assert module.__file__ is not None
-    return ast.parse(Path(module.__file__).read_text(encoding="utf-8"))
-
-
-def _public_names(module: ModuleType) -> list[str]:
-    """The names that a module offers, without its own modules."""
-    names = []
-    for source in ast.walk(_tree(module)):
-        if isinstance(source, ast.ImportFrom):
-            names += [alias.name for alias in source.names if alias.asname == alias.name]
-    for node in _tree(module).body:
-        names += _defined(node)
-    return [name for name in dict.fromkeys(names) if not name.startswith("_")]
-
-
-def _defined(node: ast.stmt) -> list[str]:
-    """The names that a statement of a module defines."""
-    if isinstance(node, ast.FunctionDef | ast.ClassDef):
-        return [node.name]
-    targets = node.targets if isinstance(node, ast.Assign) else []
-    targets = [node.target] if isinstance(node, ast.AnnAssign) else targets
-    return [target.id for target in targets if isinstance(target, ast.Name)]
-
-
-def _docstring(module: ModuleType, name: str) -> str:
-    """The text of a public name: of a constant the string below its assignment."""
-    value = getattr(module, name)
-    if inspect.isroutine(value) or inspect.isclass(value):
-        return inspect.cleandoc(value.__doc__ or "")
-    body = _tree(module).body
-    for node, after in pairwise(body):
-        if name in _defined(node) and isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant):
-            return inspect.cleandoc(str(after.value.value))
-    for source in ast.walk(_tree(module)):
-        if isinstance(source, ast.ImportFrom) and name in [alias.name for alias in source.names]:
-            return _docstring(importlib.import_module(str(source.module)), name)
-    return ""
-
-
-def _documented() -> dict[str, str]:
-    """The docstrings of all public names, by their names."""
-    found: dict[str, str] = {}
-    for name in malta.__all__:
-        value = getattr(malta, name)
-        if isinstance(value, ModuleType):
-            own = {part for part in _public_names(value) if not isinstance(getattr(value, part), ModuleType)}
-            found |= {f"malta.{name}.{part}": _docstring(value, part) for part in sorted(own)}
-        else:
-            found[f"malta.{name}"] = _docstring(malta, name)
-    return found
-
-
-DOCUMENTED = _documented()
-
-
-def _value(name: str) -> Any:
-    value: Any = malta
-    for part in name.split(".")[1:]:
-        value = getattr(value, part)
-    return value
+DOCUMENTED = {name: docstring_of(name) for name in all_names()}
 
 
 def _parameters(value: Any) -> tuple[set[str], set[str]]:
@@ -169,7 +105,7 @@ def _explained(text: str) -> set[str]:
 
 def _methods(name: str) -> dict[str, Any]:
     """The methods and properties of a public class, by their names; none of anything else."""
-    value = _value(name)
+    value = value_of(name)
     members = vars(value) if inspect.isclass(value) else {}
     return {
         f"{name}.{key}": getattr(member, "func", getattr(member, "__func__", member))
@@ -185,7 +121,7 @@ def test_names_explain_their_parameters_and_no_others() -> None:
     wrong = {}
     methods = {name: inspect.getdoc(method) or "" for name, method in METHODS.items()}
     for name, text in {**DOCUMENTED, **methods}.items():
-        needed, allowed = _parameters(METHODS[name] if name in METHODS else _value(name))
+        needed, allowed = _parameters(METHODS[name] if name in METHODS else value_of(name))
         explained = _explained(text)
         wrong[name] = sorted(needed - explained) + [f"{one}?" for one in sorted(explained - needed - allowed)]
     assert {name: found for name, found in wrong.items() if found} == {}

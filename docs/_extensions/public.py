@@ -1,7 +1,7 @@
 """The public names of malta, and the pages of the reference that they stand on.
 
-Public are the names of `malta.__all__`, and those of each module among them: what a package's `__init__` passes on
-(`from a import b as b`), or what a plain module defines.
+Public are the names of `malta.__all__`, and those of each module among them: what it defines or passes on (`from a
+import b as b`).
 """
 
 from __future__ import annotations
@@ -32,10 +32,12 @@ def names_of(page: str) -> list[str]:
     whole, _, part = page.partition(":")
     module = getattr(malta, whole.removeprefix("malta."))
     sources = dict(_passed_on(module))
-    names = sorted(_public_names(module), key=str.lower)
-    return [
-        f"{whole}.{name}" for name in names if not part or f"{sources[name]}.".startswith(f"{whole}.{part}.")
-    ]
+    found = []
+    for name in sorted(public_names(module), key=str.lower):
+        here = not part or f"{sources.get(name)}.".startswith(f"{whole}.{part}.")
+        if here and not isinstance(getattr(module, name), ModuleType):
+            found.append(f"{whole}.{name}")
+    return found
 
 
 def all_names() -> list[str]:
@@ -56,7 +58,7 @@ def docstring_of(name: str) -> str:
     """Return the text of a public name: of a constant the string below its assignment."""
     value = value_of(name)
     if inspect.isroutine(value) or inspect.isclass(value):
-        return inspect.getdoc(value) or ""
+        return inspect.cleandoc(value.__doc__ or "")
     return _text_below(value_of(name.rpartition(".")[0]), name.rpartition(".")[2])
 
 
@@ -75,13 +77,11 @@ def _tree(module: ModuleType) -> ast.Module:
     return ast.parse(Path(module.__file__).read_text(encoding="utf-8"))
 
 
-def _public_names(module: ModuleType) -> list[str]:
-    """The names that a module offers, without its own modules."""
+def public_names(module: ModuleType) -> list[str]:
+    """List the names that a module offers: what it passes on, and what it defines."""
     names = [alias for alias, _ in _passed_on(module)]
-    if not hasattr(module, "__path__"):
-        names += [name for node in _tree(module).body for name in _defined(node)]
-    values = {name: getattr(module, name) for name in names if not name.startswith("_")}
-    return [name for name, value in values.items() if not isinstance(value, ModuleType)]
+    names += [name for node in _tree(module).body for name in _defined(node)]
+    return [name for name in dict.fromkeys(names) if not name.startswith("_")]
 
 
 def _passed_on(module: ModuleType) -> list[tuple[str, str]]:
