@@ -33,6 +33,9 @@ HOSTILE = '<script>alert("x")</script>$a_b$\\frac{\x0b'
 # of a letter in a figure and of the page, as "rgb(0, 0, 0)"
 COLOURS = """return [getComputedStyle(document.querySelector("svg text")).fill,
   getComputedStyle(document.body).backgroundColor]"""
+# Labels of figures that a screen of this width does not show whole.
+CUT = """return [...document.querySelectorAll("figure .scroll")].filter(box => box.scrollWidth > box.clientWidth)
+  .map(box => box.getAttribute("aria-label"))"""
 STRANGE = "é</svg>\"'&lt; ]]>"
 
 
@@ -154,6 +157,8 @@ def test_the_report_of_a_shipped_design_on_screens_and_paper(
         for scheme in ("light", "dark"):
             open_page(browser, out, width=width, scheme=scheme)
             assert browser.execute_script("return document.documentElement.scrollWidth") <= width
+            if width == 1280:
+                assert browser.execute_script(CUT) == []
             ink, paper = (
                 sum(map(int, re.findall(r"\d+", colour))) for colour in browser.execute_script(COLOURS)
             )
