@@ -13,6 +13,7 @@ import numpy as np
 
 from malta.margins.loops import machine_loop
 from malta.margins.robust import NOT_PROVEN
+from malta.model.plant import Signal
 from malta.model.published import published_figures
 from malta.model.signals import FINE
 from malta.report.figures.parts import UNITS
@@ -372,9 +373,10 @@ def _gains(a: Analysis) -> Iterator[Item]:
     c = a.subject.controller
     law = "v = K (ξ* − ξ̂) + Ki e, and ξ̂ = ξ + L (y − Cd ξ)"
     yield f"{law}: rows and columns bear the names of their signals; all numbers are in SI units."
+    sums = tuple(Signal(s.name, f"{s.unit} s") for s in c.measurements)
     for name, M, rows, columns, what in (
         ("K", c.K, c.forces, c.states, "states to commands"),
-        ("Ki", c.Ki, c.forces, c.measurements, "sums of errors to commands"),
+        ("Ki", c.Ki, c.forces, sums, "sums of errors to commands"),
         ("L", c.L, c.states, c.measurements, "innovations to states"),
     ):
         if name != "Ki" or c.integrating:
