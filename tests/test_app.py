@@ -262,6 +262,18 @@ def test_saving_asks_before_it_replaces(tmp_path: Path) -> None:
     assert fields["pid.Kp.F_x"] == 650.0
 
 
+def test_gain_files_follow_no_link(tmp_path: Path) -> None:
+    root, other = tmp_path / "root", tmp_path / "other"
+    client = Client(copied(root), root)
+    other.mkdir()
+    (root / "build").symlink_to(other)
+    assert "no link" in client.ask("gains")["error"]
+    (root / "build").unlink()
+    (root / "design" / "gains").symlink_to(other)
+    assert "no link" in client.ask("gains")["error"]
+    assert list(other.iterdir()) == []
+
+
 def test_gain_files_are_those_of_a_saved_design(tmp_path: Path) -> None:
     client = Client(copied(tmp_path), tmp_path)
     client.ask("evaluate", number=1, values={"pid.Kp.F_x": 700.0})
@@ -273,6 +285,7 @@ def test_gain_files_go_through_the_checks_of_malta_design(tmp_path: Path) -> Non
     client = Client(copied(tmp_path), tmp_path)
     written = client.ask("gains")["written"]
     assert written == [f"design/gains/halbach_pid{suffix}" for suffix in (".json", ".npz", ".mat")]
+    assert client.ask("gains") == {"exists": written}
     controller = malta.gains.read(tmp_path / written[0])
     assert np.array_equal(controller.K, solve(client.session.files.apply(Edit())).controller.K)
     unstable = {"pid.Kd.F_x": 300.0}

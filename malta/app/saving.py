@@ -20,6 +20,7 @@ from malta.app.fields import MACHINE
 from malta.app.files import DesignFiles, Edit, edited_content, open_design, set_entry
 from malta.errors import CheckError, InputError
 from malta.files import file_exists, replace_files
+from malta.gains import SUFFIXES
 
 if TYPE_CHECKING:
     from malta.synthesis.spec import Spec
@@ -164,44 +165,31 @@ def _plain(law: Any, name: str) -> Any:
     return value.tolist() if hasattr(value, "tolist") else value
 
 
-def save_gains(design: Path, root: Path, machine: Path | None) -> list[str]:
+def save_gains(design: Path, root: Path, machine: Path | None, *, replace: bool) -> list[str]:
     """Run `malta design` on a saved design file: the same checks, the same gain files.
 
-    Raises CheckError with the sentence of `malta design` when it refuses.
+    replace : whether gain files of its name may be replaced
+
+    Returns the files by their names in `root`. Raises TakenError, and CheckError with the sentence of `malta design`
+    when it refuses.
     """
     gains = inside(root, (design.parent / "gains").relative_to(root).as_posix())
-    command = [
-        sys.executable,
-        "-m",
-        "malta",
-        "design",
-        str(design),
-        "--out",
-        str(gains),
-        "--figures",
-        str(root / "build"),
-    ]
-    environment = os.environ | ({"MALTA_MACHINE": str(machine)} if machine else {})
+    written = [gains / f"{design.stem}{suffix}" for suffix in SUFFIXES]
+    taken = [path.relative_to(root).as_posix() for path in written if file_exists(path)]
+    if taken and not replace:
+        raise TakenError(taken)
+    options = ["--out", str(gains), "--figures", str(inside(root, "build")), "--json"]
+    command = [sys.executable, "-m", "malta", "design", str(design), *options]
+    environment = os.environ | ({"MALTA_MACHINE": str(machine.resolve())} if machine else {})
     try:
         done = subprocess.run(
-            [*command, "--json"],
-            cwd=root,
-            env=environment,
-            capture_output=True,
-            text=True,
-            timeout=LONGEST,
-            check=False,
+            command, cwd=root, env=environment, capture_output=True, text=True, timeout=LONGEST, check=False
         )
     except subprocess.TimeoutExpired as error:
         raise CheckError(
-            f"malta design took more than {LONGEST} s and was ended; old gain files stand"
+            f"malta design took more than {LONGEST:g} s and was ended; old gain files stand"
         ) from error
     if done.returncode:
-        said = done.stderr.strip().splitlines()
-        raise CheckError(
-            (said[-1] if said else f"malta design ended with code {done.returncode}").removeprefix("malta: ")
-        )
-    return [
-        (gains / f"{design.stem}{suffix}").relative_to(root).as_posix()
-        for suffix in (".json", ".npz", ".mat")
-    ]
+        said = done.stderr.strip().splitlines() or [f"malta design ended with code {done.returncode}"]
+        raise CheckError(said[-1].removeprefix("malta: "))
+    return [path.relative_to(root).as_posix() for path in written]

@@ -157,8 +157,11 @@ class Session:
             self.edit = Edit() if edit.redesign else Edit(_machine_values(edit), redesign=False)
             return {"written": written, "open": self.open({})}
 
-    def gains(self, _body: Mapping[str, Any]) -> Document:
-        """Write the gain files of the saved design, as `malta design` does. Refused while something is unsaved."""
+    def gains(self, body: Mapping[str, Any]) -> Document:
+        """Write the gain files of the saved design, as `malta design` does; {"exists": files} as `save`.
+
+        Refused while something is unsaved.
+        """
         if self.unsaved():
             raise InputError(
                 "gain files", "design", "changes that are not saved", "a design file that is saved"
@@ -168,7 +171,12 @@ class Session:
             raise InputError(
                 "gain files", "design", "a design file outside of this folder", "one that is saved here"
             )
-        return {"written": save_gains(target, self.root, self.machine)}
+        try:
+            return {
+                "written": save_gains(target, self.root, self.machine, replace=body.get("replace") is True)
+            }
+        except TakenError as taken:
+            return {"exists": taken.files}
 
     def unsaved(self) -> list[str]:
         """The entries that differ from the file; parameters that the machine alone has are no part of the design."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -50,7 +52,7 @@ def app(
     session = Session(design, Path.cwd(), machine_file)
     with Server(session, port) as server:
         print(server.url, flush=True)
-        if not no_browser and not webbrowser.open(server.url):
+        if not no_browser and not (_has_screen() and webbrowser.open(server.url)):
             print_note("no browser found: open the address above in one")
         try:
             server.serve_forever(poll_interval=0.2)
@@ -58,6 +60,13 @@ def app(
             print_note(_farewell(session))
         finally:
             session.close()
+
+
+def _has_screen() -> bool:
+    """Whether a browser would open beside the terminal, and not in it."""
+    return not sys.platform.startswith("linux") or bool(
+        os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    )
 
 
 def _design_file(named: Path | None) -> Path:

@@ -9,6 +9,7 @@ import { countLights, differenceTable, figureTable, requirementRows } from "./ta
 
 const MOST_PINS = 4;
 const MOST_UNDO = 200;
+const GONE = "malta app has ended: start it again to go on";
 const NEAR = 1.6, WIDE = 10; // of the Nyquist chart
 const SHORTCUTS = [["Ctrl Z", "undo"], ["Ctrl Y, Ctrl Shift Z", "redo"], ["P", "pin this design"], ["R", "reset to the file"], ["Ctrl S", "save the design file"],
   ["/", "find a number"], ["?", "this list"], ["← →", "move a slider or the readout of a chart"], ["Page ↑ ↓", "move a slider by a tenth"], ["↑ ↓", "a number field by 1 %, with Shift 10 %"], ["Esc", "take a number back, hide a readout"]];
@@ -37,7 +38,7 @@ export async function mount(root, transport) {
   const button = (text, title, press, attributes = {}) => element("button", { type: "button", title, onclick: press, ...attributes }, text);
   const badge = element("div", { class: "badge", role: "status", "aria-live": "polite" });
   const lights = element("button", { type: "button", class: "lights", title: "requirements", onclick: () => { state.table = "requirements"; drawTables(); } });
-  const speed = element("span", { class: "speed" });
+  const speed = element("span", { class: "speed", "aria-hidden": "true" });
   const title = element("h1", {}), subtitle = element("span", { class: "soft" });
   const undo = button("↶ Undo", "Ctrl Z", () => step("undo", "redo")), redo = button("↷ Redo", "Ctrl Y", () => step("redo", "undo"));
   const reset = button("Reset", "to the numbers of the file (R)", () => commit({ values: fresh(), redesign: true }));
@@ -163,12 +164,13 @@ export async function mount(root, transport) {
   async function ask() {
     if (busy) { again = true; return; }
     busy = true;
-    const began = performance.now(), number = ++state.number;
+    const began = performance.now(), number = (state.number = Math.max(state.number + 1, Date.now())); // newer than those of a page before
+   
     let answer;
     try {
       answer = await transport.ask({ ask: "evaluate", number, values: changes(), redesign: state.redesign, run: state.run, load: state.load });
     } catch {
-      answer = { error: "malta app has ended: start it again to go on" };
+      answer = { error: GONE };
     }
     if (!answer.stale) take(answer, performance.now() - began);
     busy = false;
@@ -198,6 +200,7 @@ export async function mount(root, transport) {
   const early = []; // news of a version that has not been seen yet
 
   function hear(item) {
+    if (item.kind === "gone") { say(GONE, "error"); return; }
     if (item.version > state.version || state.moving) { early.push(item); return; }
     if (item.version < state.version || !state.picture) return;
     if (item.kind === "requirement") state.requirements[item.name] = item;
@@ -333,7 +336,7 @@ export async function mount(root, transport) {
   file.addEventListener("input", () => { replace = false; saveButton.textContent = "Save"; saveNote.textContent = ""; });
 
   async function saveDesign() {
-    const answer = await transport.ask({ ask: "save", file: file.value, values: changes(), redesign: state.redesign, replace }).catch(() => ({ error: "malta app has ended" }));
+    const answer = await transport.ask({ ask: "save", file: file.value, values: changes(), redesign: state.redesign, replace }).catch(() => ({ error: GONE }));
     if (answer.exists) {
       replace = true;
       saveNote.textContent = `${answer.exists.join(", ")} exists.`;
@@ -348,12 +351,16 @@ export async function mount(root, transport) {
     draw();
   }
 
+  let replaceGains = "";
+
   async function writeGains() {
     gains.disabled = true;
     say("malta design runs: verify, simulate, write…");
-    const answer = await transport.ask({ ask: "gains" }).catch(() => ({ error: "malta app has ended" }));
+    const answer = await transport.ask({ ask: "gains", replace: replaceGains === state.description.file }).catch(() => ({ error: GONE }));
     gains.disabled = false;
-    say(answer.error ?? `wrote ${answer.written.join(", ")}`, answer.error ? "error" : "note");
+    replaceGains = answer.exists ? state.description.file : "";
+    if (answer.exists) say(`${answer.exists.join(", ")} exist: press Gain files again to replace them`);
+    else say(answer.error ?? `wrote ${answer.written.join(", ")}`, answer.error ? "error" : "note");
   }
 
   function turnTheme() {

@@ -19,9 +19,10 @@ async function listen(hear) {
       found.news.forEach(hear);
     } catch {
       failures += 1;
-      await new Promise((resume) => setTimeout(resume, 500 * failures));
+      await new Promise((resume) => setTimeout(resume, 300 * failures));
     }
   }
+  hear({ kind: "gone" });
 }
 
 const root = document.getElementById("page");
