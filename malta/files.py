@@ -6,16 +6,15 @@ import math
 import os
 import re
 import secrets
-import signal
 import socket
 import stat
-import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, TypeVar
 
 from malta.errors import InputError
+from malta.interrupts import put_off_interrupts
 
 PACKAGE = Path(__file__).resolve().parent
 FOLDERS = ("data", "design", "notebooks", "examples")  # that come with malta
@@ -82,7 +81,7 @@ def replace_files(contents: Mapping[Path, bytes]) -> None:
             except (OSError, ValueError) as error:
                 raise _refused(path, error) from error
         before = {path: path.read_bytes() if path.exists() else None for _, path in staged}
-        with _uninterrupted():
+        with put_off_interrupts():
             _rename(staged, before)
         for folder in {path.parent for _, path in staged}:
             _sync_folder(folder)
@@ -120,23 +119,6 @@ def noting_files() -> Iterator[list[Path]]:
         yield written
     finally:
         _notes.pop()
-
-
-@contextmanager
-def _uninterrupted() -> Iterator[None]:
-    """Put Ctrl-C off to the end of a block, where it would raise KeyboardInterrupt."""
-    usual = threading.current_thread() is threading.main_thread()
-    if not usual or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
-        yield
-        return
-    pressed: list[int] = []
-    signal.signal(signal.SIGINT, lambda number, _: pressed.append(number))
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-    if pressed:
-        raise KeyboardInterrupt
 
 
 def json_text(content: Any) -> str:

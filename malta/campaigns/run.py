@@ -9,15 +9,12 @@ and a campaign that is complete is read from its folder.
 
 from __future__ import annotations
 
-import signal
-import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from types import FrameType
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, get_args
+from typing import TYPE_CHECKING, NamedTuple, Protocol, get_args
 
 from malta.campaigns.block import Block, fly
 from malta.campaigns.plan import PRECISIONS, Machines, Plan, draw_machines, planned_run
@@ -33,6 +30,7 @@ from malta.campaigns.store import (
 from malta.errors import InputError
 from malta.files import file_exists, replace_files
 from malta.firmware.flight import engine_of_c
+from malta.interrupts import watch_interrupts
 from malta.simulation import compiled
 from malta.simulation.batch import record_run, replayed
 from malta.simulation.catalogue import single_run
@@ -159,7 +157,7 @@ def run_blocks(plan: Plan, place: Path | None, size: int, session: Session, done
             session.progress((runs + more) / plan.samples)
 
     try:
-        with _watch_interrupts() as pressed:
+        with watch_interrupts() as pressed:
             left = dict(parts)
             if place is not None:
                 for first, path, found in read_blocks(place, plan, parts):
@@ -203,26 +201,6 @@ def block_size(plan: Plan, session: Session) -> int:
     while not block and BLOCK <= size < LARGE_BLOCK and plan.samples > FILES * size:
         size *= 2
     return size
-
-
-@contextmanager
-def _watch_interrupts() -> Iterator[list[int]]:
-    """A list that is no longer empty after Ctrl-C: libraries under the campaign may drop the KeyboardInterrupt."""
-    before, pressed = signal.getsignal(signal.SIGINT), list[int]()
-    if threading.current_thread() is not threading.main_thread() or not callable(before):
-        yield pressed
-        return
-    handle: Callable[[int, FrameType | None], Any] = before
-
-    def note(number: int, frame: FrameType | None) -> None:
-        pressed.append(number)
-        handle(number, frame)
-
-    signal.signal(signal.SIGINT, note)
-    try:
-        yield pressed
-    finally:
-        signal.signal(signal.SIGINT, before)
 
 
 def _fly_blocks(

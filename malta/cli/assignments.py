@@ -40,6 +40,31 @@ def read_assignments(option: str, texts: list[str] | None, units: Mapping[str, s
     return values
 
 
+def read_entries(option: str, texts: list[str]) -> dict[str, Any]:
+    """Read `NAME=VALUE` as entries of a design file: a number, one with its unit, true or false, or a word.
+
+    Raises InputError for another form.
+
+    >>> read_entries("--set", ["bases.state.x=50um", "delay=1", "uncertainty.m=30%"])
+    {'bases.state.x': {'value': 50.0, 'unit': 'um'}, 'delay': 1, 'uncertainty.m': 0.3}
+    """
+    entries: dict[str, Any] = {}
+    for text in texts:
+        name, value = _split(text)
+        if not all(part.isidentifier() for part in name.split(".")) or not value:
+            raise InputError(option, "", repr(text), f"NAME=VALUE, as {EXAMPLES[option]}")
+        number = re.fullmatch(NUMBER, value)
+        if number is None:
+            entries[name] = {"true": True, "false": False}.get(value, value)
+        elif number[2] in ("%", "percent"):
+            entries[name] = float(number[1]) / 100
+        elif number[2]:
+            entries[name] = {"value": float(number[1]), "unit": number[2]}
+        else:
+            entries[name] = int(number[1]) if re.fullmatch(r"[-+]?\d+", number[1]) else float(number[1])
+    return entries
+
+
 def read_sensor_errors(texts: list[str] | None, plant: Plant) -> dict[str, float]:
     """Read `--sensor NAME=VALUE`, errors of a machine's sensors, in SI; raises as `read_assignments` does."""
     return read_assignments("--sensor", texts, {error.name: error.unit for error in plant.sensor_errors})

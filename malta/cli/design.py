@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 import typer
 
 from malta.cli.completion import design_files as complete_designs
-from malta.cli.inputs import design_files, gains_folder
-from malta.cli.options import AsJson
+from malta.cli.inputs import design_files, gains_folder, read_changed_design
+from malta.cli.options import AsJson, DesignChanges
 from malta.cli.output import make_console, print_document, print_error, print_written, working
 from malta.errors import CheckError, InputError
 from malta.files import replace_files
@@ -30,6 +30,7 @@ def design(
             help="Design files; all of design/ if none is named.", autocompletion=complete_designs
         ),
     ] = None,
+    change: DesignChanges = None,
     out: Annotated[
         Path | None, typer.Option(help="Folder of the gain files. [gains/ beside the design file]")
     ] = None,
@@ -40,8 +41,11 @@ def design(
 
     Gain files are replaced only by a design that is stable on the machine and completes its main job, as the stroke.
 
+    With --set the gain files have the name of the design and its changes, so that those of the unchanged design stand.
+
     \b
     Example:  malta design design/table2.toml
+              malta design design/calibrated.toml --set m=0.4 --set weights.state.z=2
     """
     designed: list[DesignPart] = []
     sources: dict[Path, Path] = {}  # output file -> the design file of this run that it comes from
@@ -52,7 +56,7 @@ def design(
             with working(
                 f"designing {file}" + (f" ({n + 1} of {len(chosen)})" if len(chosen) > 1 else "")
             ) as work:
-                made = _run_design(file, out or gains_folder(file), figures, sources, work.note)
+                made = _run_design(file, change, out or gains_folder(file), figures, sources, work.note)
         except (InputError, CheckError) as error:
             code = max(code, print_error(error, file))
             continue
@@ -77,7 +81,12 @@ class Made(NamedTuple):
 
 
 def _run_design(
-    file: Path, out: Path, figures: Path, sources: dict[Path, Path], note: Callable[[str], None]
+    file: Path,
+    changes: list[str] | None,
+    out: Path,
+    figures: Path,
+    sources: dict[Path, Path],
+    note: Callable[[str], None],
 ) -> Made:
     """Design, verify and simulate the controller of one design file and write its gain files.
 
@@ -91,10 +100,9 @@ def _run_design(
     from malta.model.linearize import linearize
     from malta.model.published import published_beside
     from malta.simulation.catalogue import main_job
-    from malta.synthesis.design_file import read_design
     from malta.synthesis.lqg import synthesize
 
-    spec = read_design(file)
+    spec = read_changed_design(file, changes)
     plant, job = spec.plant, main_job(spec.plant)
     paths = [out / f"{spec.name}{suffix}" for suffix in gains.SUFFIXES]
     picture = figures / f"{spec.name}_{job}.png"
@@ -118,7 +126,7 @@ def _run_design(
     replace_files(
         contents
     )  # last, and all at once: whatever fails leaves the old gain files and their figure
-    document = design_part(spec.name, (*paths, picture), {}, margins, result)
+    document = design_part(spec.name, (*paths, picture), changes or (), margins, result)
     return Made(page, document, paths, picture, unchanged)
 
 

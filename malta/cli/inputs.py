@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from malta.cli.assignments import read_assignments
+from malta.cli.assignments import read_assignments, read_entries
 from malta.cli.output import make_console
 from malta.errors import CheckError, InputError
 from malta.files import locate, shipped_path
@@ -14,6 +16,9 @@ if TYPE_CHECKING:
     from malta.model.plant import Parameters, Plant
     from malta.synthesis.controller import Controller
     from malta.synthesis.spec import Spec
+
+
+LONGEST_NAME = 48  # letters of the changes in the name of a design; more are shortened to a number
 
 
 def design_files(
@@ -73,6 +78,40 @@ def design_of(gains: Path, controller: Controller, named: Path | None) -> Spec |
     if named is None:
         return None
     raise InputError(named, "machine", spec.plant.name, "that of the gain file")
+
+
+def read_changed_design(file: Path, changes: list[str] | None) -> Spec:
+    """Read a design file with `--set NAME=VALUE`: parameters of the machine, and entries of the file.
+
+    The design has a name of its own then, with its changes: `calibrated_m_0_56`.
+
+    Raises InputError for a change of the design's name or machine, and as `read_design` does.
+    """
+    from dataclasses import replace
+
+    from malta.model.parameters import units_of
+    from malta.synthesis.design_file import read_design
+    from malta.synthesis.design_tables import DesignFile
+
+    spec = read_design(file)
+    if not changes:
+        return spec
+    units = units_of(spec.parameters)
+    of_machine = [text for text in changes if text.partition("=")[0].strip() in units]
+    others = read_entries("--set", [text for text in changes if text not in of_machine])
+    for name in others:
+        if name in ("name", "machine"):
+            raise InputError("--set", name, "a change of it", "another design file")
+        if name.partition(".")[0] not in DesignFile.model_fields:
+            expected = f"one of {' '.join(units)}, or an entry of the design file"
+            raise InputError("--set", name, "an unknown parameter", expected)
+    values = read_assignments("--set", of_machine, units)
+    change_machine(spec.parameters, of_machine)  # which says what is wrong with a value
+    words = re.sub(r"[^A-Za-z0-9-]+", "_", " ".join(changes)).strip("_")
+    if len(words) > LONGEST_NAME:
+        words = hashlib.sha256(words.encode()).hexdigest()[:8]
+    changed = read_design(file, values, others)
+    return replace(changed, name=f"{spec.name}_{words}", summary=f"{spec.summary}; with {', '.join(changes)}")
 
 
 def change_machine(parameters: Parameters, changes: list[str] | None) -> Parameters:

@@ -20,6 +20,15 @@ Changes = Annotated[
         autocompletion=parameters,
     ),
 ]
+DesignChanges = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set",
+        metavar="NAME=VALUE",
+        help="Change a parameter of the machine, as m=0.56 (SI) or l_B=45mm, or an entry of the design file, as "
+        "weights.state.x=4, bases.state.x=50um or delay=1. The design is named after its changes.",
+    ),
+]
 SCENARIOS = "one of the machine's own, which `--scenario help` lists. [its first]"
 # Options of a run, in `simulate` and in `campaign`.
 Distance = Annotated[float | None, typer.Option(help="Length of a stroke [mm]. [the scenario's]")]

@@ -18,6 +18,7 @@ import typer
 from malta.cli.patience import duration_text
 from malta.errors import CheckError, InputError, shorten
 from malta.files import json_text
+from malta.interrupts import watch_interrupts
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -29,6 +30,7 @@ NARROWEST = 20  # columns; COLUMNS below is no width
 PATIENCE = 2.0  # s, from the begin of work to the first line about it
 INTERVAL = 2.0  # s, between the first lines
 NO_COMPILER = "no C compiler: simulated on CasADi's virtual machine, some hundred times slower"
+DROPPED = 2.0  # s after Ctrl-C; work that still reports has not heard of it
 LINES = 10.0  # s, between later lines
 
 
@@ -109,12 +111,15 @@ class Work:
     def __init__(self, what: str) -> None:
         self.what, self.share, self.found = what, 0.0, ""
         self.started = time.monotonic()
+        self.pressed: list[float] = []  # when Ctrl-C was
         self.due = self.started + PATIENCE
         self.ended = Event()
 
     def report(self, share: float) -> None:
-        """Note the share that is done, 0 to 1."""
+        """Note the share that is done, 0 to 1. Raises KeyboardInterrupt where a library has dropped one."""
         self.share = share
+        if self.pressed and time.monotonic() > self.pressed[0] + DROPPED:
+            raise KeyboardInterrupt
         self.speak()
 
     def bound(self, lower: float, upper: float) -> None:
@@ -151,14 +156,17 @@ def working(what: str) -> Iterator[Work]:
     Example: `with working("claims") as work: work.report(0.5)`
     """
     work = Work(what)
-    if sys.stderr.isatty():
-        with _drawn(work):
-            yield work
-        return
+    with watch_interrupts() as work.pressed, _drawn(work) if sys.stderr.isatty() else _spoken(work):
+        yield work
+
+
+@contextmanager
+def _spoken(work: Work) -> Iterator[None]:
+    """Print lines of work, also while it does not report."""
     speaker = Thread(target=work.keep_speaking, daemon=True)
     speaker.start()
     try:
-        yield work
+        yield
     finally:
         work.ended.set()
         speaker.join()

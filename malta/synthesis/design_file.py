@@ -12,6 +12,7 @@ import json
 import math
 import os
 from collections.abc import Mapping
+from copy import deepcopy
 from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
@@ -53,22 +54,36 @@ if TYPE_CHECKING:
     from malta.model.plant import FloatArray, Parameters
 
 
-def read_design(path: str | Path) -> Spec:
+def read_design(
+    path: str | Path,
+    parameters: Mapping[str, float] | None = None,
+    entries: Mapping[str, Any] | None = None,
+) -> Spec:
     """Read a design file, and the data of the machine that it names.
 
     path : the design file, as design/table2.toml
+    parameters : values of the machine's parameters that differ from its data file, SI
+    entries : entries of the design file that differ from it, by dotted name, as {"bases.state.x": {"value": 50,
+        "unit": "um"}}
 
     Returns a Spec, in SI.
+
+    parameters : values of the machine's parameters that differ from its data file, SI
+    entries : entries of the design file that differ from it, by dotted name, as {"bases.state.x": {"value": 50,
+        "unit": "um"}}
 
     Raises InputError, naming file and field, for anything missing, unknown, of a wrong unit or out of range.
 
     >>> import malta
-    >>> spec = malta.read_design("design/calibrated.toml")
-    >>> spec.name, spec.sample_time, spec.plant.name
-    ('calibrated', 5e-05, 'tubular')
+    >>> spec = malta.read_design("design/calibrated.toml", {"m": 0.4})
+    >>> spec.name, spec.sample_time, spec.plant.name, spec.parameters.m
+    ('calibrated', 5e-05, 'tubular', 0.4)
     """
     path = locate(path)
-    return spec_of(load_toml(path), path)
+    raw = load_toml(path)
+    if entries:  # also those within a table that is published
+        raw = _with_entries(resolved(raw, path), entries, path)
+    return spec_of(raw, path, parameters or None)
 
 
 def machine_file_of(raw: Mapping[str, Any], path: Path) -> Path:
@@ -91,18 +106,24 @@ def resolved(raw: Mapping[str, Any], path: Path) -> dict[str, Any]:
     return found
 
 
-def spec_of(raw: Mapping[str, Any], path: Path, parameters: Parameters | None = None) -> Spec:
+def spec_of(
+    raw: Mapping[str, Any], path: Path, parameters: Parameters | Mapping[str, float] | None = None
+) -> Spec:
     """Check the content of a design file, as TOML gives it.
 
     path : the file, which errors name and relative paths start at
-    parameters : of the machine, in place of those in its data file; None: the data file's
+    parameters : of the machine, in place of those in its data file, or values that differ from it; None: the file's
 
     Raises InputError as `read_design`.
     """
     machine_file = machine_file_of(raw, path)
     content = validate(DesignFile, resolved(raw, path), path)
     _require_law(content, raw, path)
-    par = read(machine_file, content.preset) if parameters is None else parameters
+    if isinstance(parameters, Mapping):
+        par = read(machine_file, content.preset)
+        par = replace(par, **parameters, preset=f"{par.preset}, changed")
+    else:
+        par = read(machine_file, content.preset) if parameters is None else parameters
     try:
         plant = plant_of(par)
     except CheckError as error:
@@ -395,6 +416,22 @@ def _stands(entry: str, raw: Mapping[str, Any]) -> bool:
     for key in entry.split("."):
         node = node.get(key) if isinstance(node, Mapping) else None
     return node is not None and (not isinstance(node, Mapping) or "value" in node)
+
+
+def _with_entries(content: dict[str, Any], entries: Mapping[str, Any], where: Path) -> dict[str, Any]:
+    """Put entries in the place of those with their dotted names. InputError where such a place is no table."""
+    changed = deepcopy(content)
+    for name, value in entries.items():
+        *tables, key = name.split(".")
+        node: Any = changed
+        for depth, table in enumerate(tables):
+            node = node.setdefault(table, {})
+            if not isinstance(node, dict):
+                raise InputError(
+                    where, ".".join(tables[: depth + 1]), repr(node), "a table, to change an entry of"
+                )
+        node[key] = value
+    return changed
 
 
 def _operating_point(entries: Mapping[str, Quantity], plant: Plant, where: Path) -> dict[str, float]:

@@ -87,7 +87,7 @@ class DesignPart(LoopPart, ExperimentPart):
 
     design: str
     files: Files = Field(description="gain files, and the figure")
-    changed: dict[str, float] = Field(default={}, description="values of --set, SI")
+    changes: list[str] = Field(default=[], description="of --set")
 
 
 class DesignOutput(Part):
@@ -149,13 +149,13 @@ def flights(found: Mapping[str, Mapping[Precision, Sequence[Difference]]]) -> li
 
 
 def design_part(
-    name: str, files: Sequence[Path], changed: Mapping[str, float], margins: Margins, flown: Experiment
+    name: str, files: Sequence[Path], changes: Sequence[str], margins: Margins, flown: Experiment
 ) -> DesignPart:
     """A design with its loop and its main job."""
     return DesignPart(
         design=name,
         files=[str(file) for file in files],
-        changed=dict(changed),
+        changes=list(changes),
         **loop_fields(margins),
         **experiment_fields(flown),
     )

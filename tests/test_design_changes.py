@@ -1,0 +1,71 @@
+"""`malta design --set`: parameters of the machine and entries of the design file, without an edit."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import Run, one_sentence
+
+from malta.cli.inputs import read_changed_design
+
+FILE = Path("design/calibrated.toml")
+
+
+def test_changes_reach_the_machine_and_the_design() -> None:
+    plain = read_changed_design(FILE, None)
+    heavy = read_changed_design(FILE, ["m=400g"])
+    assert (heavy.parameters.m, heavy.name) == (0.4, "calibrated_m_400g")  # type: ignore[attr-defined]
+    assert heavy.parameters.preset == "table1, changed"
+    assert heavy.sha256 == plain.sha256  # of the design file alone
+    other = read_changed_design(FILE, ["weights.state.z=2", "bases.state.x = 60 um", "uncertainty.m=30%"])
+    names = [s.name for s in plain.plant.design_states]
+    x, z = names.index("x"), names.index("z")
+    assert (other.weights.q[z], other.weights.q_base[x]) == (2, pytest.approx(60e-6))
+    assert np.delete(other.weights.q, z).tolist() == np.delete(plain.weights.q, z).tolist()
+    assert other.uncertainty == {**plain.uncertainty, "m": 0.3}
+    assert other.sha256 != plain.sha256
+    assert other.summary.endswith("; with weights.state.z=2, bases.state.x = 60 um, uncertainty.m=30%")
+    later = read_changed_design(FILE, ["discretization=zoh", "delay=1", "current_loop_delay=false"])
+    assert (later.discretization, later.delay, later.current_loop_delay) == ("zoh", 1, False)
+    many = read_changed_design(FILE, [f"weights.state.{name}=1" for name in names])
+    assert len(many.name) < 60
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        ("l_B=3kg", "--set: l_B.unit: found 'kg', expected a unit of m"),
+        ("m=-1", "--set: m: found -1.0 kg, expected a finite number above 0 in kg"),
+        ("nix=3", "--set: nix: found an unknown parameter, expected one of m "),
+        ("m", "--set: found 'm', expected NAME=VALUE, as m=0.56 or l_B=45mm"),
+        ("name=x", "--set: name: found a change of it, expected another design file"),
+        ("weights.state.q=3", "design/calibrated.toml: weights.state: found 11 entries "),
+        ("bases.state.x=60", "design/calibrated.toml: bases.state.x: found 60, expected a table"),
+        ("bases.input.x=3N", "design/calibrated.toml: bases.input: found 'SI', expected a table, to change "),
+    ],
+)
+def test_changes_that_are_none(run: Run, tmp_path: Path, change: str, sentence: str) -> None:
+    code, out, err = run("design", FILE, "--set", change, "--out", tmp_path)
+    assert (code, out) == (2, "")
+    assert one_sentence(err).startswith(sentence)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.slow
+def test_the_gain_files_of_the_unchanged_design_stand(run: Run, tmp_path: Path) -> None:
+    folders = ("--out", tmp_path, "--figures", tmp_path)
+    assert run("design", "design/table2.toml", *folders).code == 0
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    code, out, err = run("design", "design/table2.toml", "--set", "m=0.4", *folders, "--json")
+    assert (code, err) == (0, "")
+    (made,) = json.loads(out)["designs"]
+    assert (made["design"], made["changes"]) == ("table2_m_0_4", ["m=0.4"])
+    assert {path: path.read_bytes() for path in before} == before
+    content = json.loads((tmp_path / "table2_m_0_4.json").read_text(encoding="utf-8"))
+    assert content["design"]["name"] == "table2_m_0_4"
+    assert content["plant"]["preset"] == "table1, changed"
+    assert content["plant"]["parameters"]["m"] == {"value": 0.4, "unit": "kg"}
+    assert run("verify", tmp_path / "table2_m_0_4.json", "--no-proof").code == 0

@@ -1,0 +1,139 @@
+"""Ctrl-C on real processes, and lines that say how far work is."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from conftest import ROOT, Run
+
+from malta.cli import output
+from malta.files import noting_files, replace_files
+
+TABLE2, ROBUST = "design/gains/table2.json", "design/gains/robust.json"
+LINES = re.compile(r"malta: .*\b(s|min|h)( left)?$")  # of how far the work is
+
+
+def interrupted(wait: float, *arguments: str | Path) -> tuple[int, list[str]]:
+    """Run `malta ARGUMENTS`, press Ctrl-C after some seconds: exit code, and sentences but those of progress."""
+    command = [sys.executable, "-m", "malta", *map(str, arguments)]
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment, cwd=ROOT
+    )
+    time.sleep(wait)
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+    return process.returncode, [line for line in err.splitlines() if not LINES.match(line)]
+
+
+NOTHING = "interrupted; nothing was written"
+COMMANDS: tuple[tuple[tuple[str, ...], str], ...] = (
+    (("verify", ROBUST, "--json"), r"interrupted; (proven [\d.]+ %, lost at .*|nothing proven)"),
+    (("claims", "--json"), NOTHING),
+    (("design", "--out", "OUT", "--figures", "OUT"), r"interrupted; complete: .*; all other files stand .*"),
+    (
+        ("campaign", TABLE2, "--samples", "100000", "--yes", "--out", "OUT"),
+        r"interrupted after \d+ of 100000 runs, which .* keeps; the same command goes on",
+    ),
+    (
+        ("tune", "design/robust.toml", "--out", "OUT"),
+        r"interrupted; the same command goes on from .*robust_trials.jsonl",
+    ),
+    (("simulate", TABLE2, "--scenario", "capture", "--option", "points=41", "--yes"), "interrupted: .*"),
+)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("arguments", "sentence"), COMMANDS)
+@pytest.mark.parametrize("wait", [0.15, 0.7, 1.7, 4.0])
+def test_ctrl_c_says_what_stands(
+    arguments: tuple[str, ...], sentence: str, wait: float, tmp_path: Path
+) -> None:
+    code, said = interrupted(wait, *(str(tmp_path) if a == "OUT" else a for a in arguments))
+    assert code == 130
+    assert len(said) <= 1  # none where Python itself had not begun
+    known = f"malta: ({sentence}|{NOTHING}|interrupted)"
+    assert all(re.fullmatch(known, line) for line in said)
+    assert not [path for path in tmp_path.rglob(".*") if path.is_file()]  # half-written
+
+
+@pytest.mark.slow
+def test_a_piped_proof_says_how_far_it_is_and_prints_one_document() -> None:
+    command = [sys.executable, "-m", "malta", "verify", ROBUST, "--json"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, cwd=ROOT)
+    lines = done.stderr.splitlines()
+    assert len(lines) >= 2
+    assert all(LINES.match(line) for line in lines)
+    assert any("proven 350." in line for line in lines)
+    assert done.stdout.startswith("{")
+
+
+def test_work_speaks_when_it_reports_and_when_it_does_not(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(output, "PATIENCE", 0.0)
+    monkeypatch.setattr(output, "INTERVAL", 0.05)
+    with output.working("sorting") as work:
+        time.sleep(0.15)
+        silent = len(capsys.readouterr().err.splitlines())
+        work.report(0.25)
+        work.bound(0.5, float("inf"))
+        time.sleep(0.1)
+    assert silent >= 1
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert re.fullmatch(
+        r"malta: sorting: proven 50\.00 %, lost at not found, 25 %, [\d.e-]+ s, about [\d.e-]+ s left", last
+    )
+    with output.working("nothing"):
+        pass
+    monkeypatch.setattr(output, "PATIENCE", 10.0)
+    with output.working("quick work") as work:
+        work.report(0.5)
+    assert "quick" not in capsys.readouterr().err
+
+
+def test_an_interruption_waits_until_all_files_are_in_place(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ctrl-C between two files of one design."""
+    targets = {tmp_path / name: name.encode() for name in ("a.json", "b.json", "c.json")}
+    renamed, replace = [], Path.replace
+
+    def slowly(self: Path, target: Path) -> Path:
+        renamed.append(target)
+        if len(renamed) == 2:
+            os.kill(os.getpid(), signal.SIGINT)
+        return replace(self, target)
+
+    monkeypatch.setattr(Path, "replace", slowly)
+    with noting_files() as written, pytest.raises(KeyboardInterrupt):
+        replace_files(targets)
+    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == targets
+    assert written == list(targets)
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_ctrl_c_names_the_files_that_are_complete(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def written_then_cut(*_: object) -> None:
+        replace_files({tmp_path / "done.json": b"{}"})
+        raise KeyboardInterrupt
+
+    def cut(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("malta.margins.check.check", cut)
+    said = run("check", "nothing.json")
+    assert said == (130, "", "malta: interrupted; nothing was written\n")
+    monkeypatch.setattr("malta.margins.check.check", written_then_cut)
+    said = run("check", "nothing.json")
+    stands = f"complete: {tmp_path / 'done.json'}; all other files stand as they were"
+    assert said.err == f"malta: interrupted; {stands}\n"
