@@ -21,6 +21,7 @@ from malta.report.figures.parts import (
     micro,
     number,
     number_logarithm,
+    rows_and_columns,
 )
 from malta.report.figures.runs import campaign_page, is_first, nearest_figure, panels_over_parameters
 from malta.units import in_unit
@@ -79,8 +80,7 @@ def distributions_figure(found: Campaign | Summary, published: Published | None 
     for listed in summary.merits:
         if listed.label not in told and listed.sketch.count:
             panels.setdefault((listed.kind, listed.unit), []).append(listed)
-    columns = {1: 1, 2: 2, 4: 2}.get(len(panels), 3)
-    rows = max(1, -(-len(panels) // columns))
+    rows, columns = rows_and_columns(len(panels))
     height = 1.2 + 2.4 * rows
     places = {"size": (9.0, height), "top": 1 - 1.05 / height, "hspace": 0.7, "wspace": 0.28}
     figure = campaign_page(summary, "figures of merit of the completed runs", **places)

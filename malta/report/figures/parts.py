@@ -90,6 +90,12 @@ def new_figure(
     return figure
 
 
+def rows_and_columns(count: int) -> tuple[int, int]:
+    """Rows and columns of so many panels, at most three beside each other and few places left empty."""
+    columns = {0: 1, 1: 1, 2: 2, 4: 2}.get(count, 3)
+    return max(1, -(-count // columns)), columns
+
+
 def new_page(runs: Sequence[Trajectory], what: str, found: str, **places: Any) -> Figure:
     """A new figure whose title names the design, the fidelity and the subject; `found` is its line of results."""
     fidelities = " and ".join(dict.fromkeys(run.scenario.fidelity for run in runs))
@@ -327,7 +333,10 @@ def number_logarithm(side: Axis) -> None:
 def add_shared_legend(figure: Figure) -> None:
     """Add one legend below the title for all panels that have none of their own."""
     handles, labels = legend_entries([axes for axes in figure.axes if axes.get_legend() is None])
-    where: dict[str, Any] = {"loc": "upper center", "bbox_to_anchor": (0.5, 0.925)}
+    where: dict[str, Any] = {
+        "loc": "upper center",
+        "bbox_to_anchor": (0.5, 1 - 0.45 / figure.get_figheight()),
+    }
     figure.legend(handles, labels, ncols=len(labels), **where, **LEGEND)
 
 

@@ -25,6 +25,7 @@ from malta.report.figures.parts import (
     new_figure,
     number,
     published_in_unit,
+    rows_and_columns,
 )
 from malta.simulation.digest import LARGEST_FIGURE
 from malta.units import in_unit
@@ -70,8 +71,7 @@ def panels_over_parameters(
         name for name in varied_names(summary.plan) if half_width(summary.plan, name) and summary.runs > 1
     ]
     shown = names[:SHOWN]
-    columns = min(3, max(1, len(shown))) if len(shown) != 4 else 2
-    rows = max(1, -(-len(shown) // columns))
+    rows, columns = rows_and_columns(len(shown))
     more = f", {len(shown)} of {len(names)} shown" if len(shown) < len(names) else ""
     figure = campaign_page(summary, what + more, **{"hspace": 0.5, "top": 0.8} | places)
     panels = figure.subplots(rows, columns, squeeze=False, sharey=True).ravel()
