@@ -153,6 +153,7 @@ def test_the_report_of_a_shipped_design_on_screens_and_paper(
     html = out.read_text(encoding="utf-8")
     read_page(html)
     assert len(html) < 2_000_000
+    assert ("y1, x2 and y2 have the curves of x1." in html) == (name != "planar")
     for width in (1280, 390):
         for scheme in ("light", "dark"):
             open_page(browser, out, width=width, scheme=scheme)

@@ -84,11 +84,9 @@ def report(
     controller = read_controller(gains, machine)
     page_file = require_suffix(out or Path("build") / f"{controller.name}_report.html", *SUFFIXES)
     subject = read_subject(gains, controller, change, uncertain, design)
-    found_campaigns = _campaigns_of(campaign, controller, subject.spec)
     with unwritten_progress("report") as progress:
-        analysis, page = report_work(
-            subject, proof=not no_proof, campaigns=found_campaigns, progress=progress
-        )
+        flown = _campaigns_of(campaign, controller, subject.spec)
+        analysis, page = report_work(subject, proof=not no_proof, campaigns=flown, progress=progress)
         contents = {page_file: page.content}
         if pdf:
             contents[page_file.with_suffix(".pdf")] = pdf_of(page)
