@@ -1,9 +1,9 @@
-"""The key figures at the top of a report."""
+"""The top of a report: its key figures, and what the design is in words."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -11,6 +11,7 @@ import numpy as np
 from malta.margins.verify import BANDWIDTHS, zone
 from malta.model.signals import FINE
 from malta.report.figures.parts import merit_phrase, micro, number
+from malta.report.page.design import kind_of
 from malta.units import in_unit
 
 if TYPE_CHECKING:
@@ -118,3 +119,48 @@ def _requirements(a: Analysis) -> Iterator[KeyFigure]:
         yield KeyFigure(
             "Requirements", f"{held} of {len(asked)} hold", "[specification] of the design file", state
         )
+
+
+def summary_sentences(a: Analysis) -> list[str]:
+    """Say in words what the design is."""
+    c, plant = a.subject.controller, a.plant
+    rate = f"{1e-3 / c.sample_time:g} kHz" if c.sample_time <= 1e-3 else f"every {c.sample_time * 1e3:g} ms"
+    law = kind_of(c)
+    article = "An" if law == "LQG" else "A"
+    text = f"{article} {law} controller of the machine {plant.name}, preset {a.subject.parameters.preset}: "
+    text += f"{_count(len(c.measurements), 'measurement')} and {_count(len(c.forces), 'command')} at {rate}, "
+    text += f"{_count(len(c.states), 'state')}."
+    sentences = [text]
+    parts = []
+    if c.integrating:
+        parts.append("sums the errors")
+    if c.observed:
+        parts.append("observes constant forces of disturbance")
+    if c.lagging:
+        parts.append("has the lag of the current loops in its model")
+    if c.delay:
+        parts.append(f"has a delay of {_count(c.delay, 'sample')} in its model")
+    if c.commutation is not None:
+        parts.append("commutates for the predicted place")
+    if parts:
+        sentences.append(f"It {_listed(parts)}.")
+    if plant.has_stroke:
+        sentences.append(f"The stroke moves {plant.stroke} by ±{in_unit(plant.travel, 'mm'):g} mm.")
+    spec = a.subject.written_from
+    if spec is not None and spec.summary:
+        sentences.insert(0, f"{spec.summary.rstrip('.')}.")
+    if a.subject.changes:
+        sentences.append(
+            f"The machine is changed: {', '.join(a.subject.changes)}; the controller is not told."
+        )
+    if not a.margins.stable:
+        sentences.append("The loop is UNSTABLE on this machine: it has no sensitivities, margins or noise.")
+    return sentences
+
+
+def _count(number_of: int, what: str) -> str:
+    return f"{number_of} {what}{'' if number_of == 1 else 's'}"
+
+
+def _listed(parts: Sequence[str]) -> str:
+    return parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"
