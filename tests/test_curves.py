@@ -18,6 +18,7 @@ from malta.margins.linear_loops import linear_loop
 from malta.margins.locus import root_locus
 from malta.margins.recovery import PushedLoop
 from malta.margins.steps import loop_steps, step_figures
+from malta.simulation.references import Motion
 
 if TYPE_CHECKING:
     from malta.model.plant import Plant
@@ -274,6 +275,29 @@ def test_a_law_that_stores_forces_ends_at_its_reference() -> None:
     """Without sums of errors, by an observed force alone; the stored force is that of the place to be held."""
     answer = loop_steps(linear_loop(*shipped("halbach_late"))).references
     assert answer.final[0, 0] == pytest.approx(1, abs=1e-9)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "output", "size"), [("halbach_late", 0, 1e-5), ("halbach_pid", 0, 1e-5), ("robust", 0, 1e-7)]
+)
+def test_steps_are_those_of_the_simulated_machine(name: str, output: int, size: float) -> None:
+    """A small step, from the fourth sample on: held currents, stored forces, forces that hold against attraction."""
+    plant, controller = shipped(name)
+    T, first = controller.sample_time, 4
+
+    def jump(_: Plant) -> Any:
+        def at(t: Any) -> Motion:
+            p = np.zeros((len(t), len(plant.outputs)))
+            p[:, output] = np.where(np.asarray(t) > (first - 0.5) * T, size, 0.0)
+            return Motion(p, 0 * p, 0 * p)
+
+        return at
+
+    run = malta.simulate(plant, controller, malta.Scenario("step", 120 * T, jump, fidelity="force"))
+    wanted = (run.p[first:, output] - run.p[0, output]) / size
+    answer = loop_steps(linear_loop(plant, controller)).references.y[: len(wanted), output, output]
+    assert np.abs(answer - wanted).max() < 3e-3
 
 
 def test_an_unstable_loop_is_followed_while_it_grows() -> None:

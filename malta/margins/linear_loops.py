@@ -23,7 +23,7 @@ from malta.errors import CheckError, InputError
 from malta.margins.loop_systems import LoopSystems
 from malta.margins.recovery import PushedLoop
 from malta.model.plant import Plant, Signal
-from malta.synthesis.controller import Controller
+from malta.synthesis.controller import Controller, LinearLaw
 from malta.synthesis.riccati import eigenvalues
 from malta.synthesis.state_space import balanced_units, set_point
 
@@ -199,19 +199,44 @@ def linear_loop(
 def _of_machine(plant: Plant, controller: Controller, name: str, position: float | None) -> LinearLoop:
     pushed = PushedLoop.of(plant, controller, position)
     loop, law, T = pushed.loop, pushed.loop.control, pushed.loop.sample_time
-    R = set_point(controller)
+    driven, command = _commanded(controller, law)
     outputs = loop.Cd if loop.true is None else np.vstack([loop.Cd, loop.true])
     into = np.hstack([loop.Bd, pushed.pushed]) / T
     return LinearLoop(
         name,
         System((loop.Ad - np.eye(len(loop.Ad))) / T, into, outputs, np.zeros((len(outputs), into.shape[1]))),
-        System((law.A - np.eye(len(law.A))) / T, law.B_y / T, law.C, law.D_y),
-        (law.B_r @ R / T, law.D_r @ R),
+        driven,
+        command,
         T,
         plant.outputs,
         plant.inputs,
         plant.disturbances,
     )
+
+
+def _commanded(c: Controller, law: LinearLaw) -> tuple[System, tuple[FloatArray, FloatArray]]:
+    """The law from readings, and what a unit reference adds to its states and to its outputs.
+
+    The reference of a stored force is as old as the force: the law gets the references of the last samples as states
+    where that matters. No reading reaches them, so that the loop stays the same.
+    """
+    T, R, p, m = c.sample_time, set_point(c), len(c.measurements), len(c.forces)
+    A, B_y, C = (law.A - np.eye(len(law.A))) / T, law.B_y / T, law.C
+    first = p + len(c.A) + m * c.lagging  # of the stored forces in r, the oldest first
+    stored = R[first : first + m * c.delay].copy()
+    if not stored.any():
+        return System(A, B_y, C, law.D_y), (law.B_r @ R / T, law.D_r @ R)
+    R[first : first + m * c.delay] = 0
+    rows = np.arange(m * c.delay).reshape(c.delay, m)[::-1]  # of the newest, one sample old, first
+    of_stored = slice(first, first + m * c.delay)
+    B_old = np.hstack([law.B_r[:, of_stored][:, r] @ stored[r] for r in rows]) / T
+    D_old = np.hstack([law.D_r[:, of_stored][:, r] @ stored[r] for r in rows])
+    size = p * c.delay
+    shift = (np.eye(size, k=-p) - np.eye(size)) / T
+    whole = np.block([[A, B_old], [np.zeros((size, len(A))), shift]])
+    newest = np.vstack([np.eye(p), np.zeros((size - p, p))]) / T
+    driven = System(whole, np.vstack([B_y, np.zeros((size, p))]), np.hstack([C, D_old]), law.D_y)
+    return driven, (np.vstack([law.B_r @ R / T, newest]), law.D_r @ R)
 
 
 def _is_system(source: Any) -> bool:
