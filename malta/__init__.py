@@ -28,6 +28,8 @@ if TYPE_CHECKING:  # the contents page, as type checkers and readers see it
     from malta.firmware.exports import export_fmu as export_fmu
     from malta.firmware.flight import engine_of_c as engine_of_c
     from malta.margins.blocks import Dynamic as Dynamic
+    from malta.margins.curves import LoopCurves as LoopCurves
+    from malta.margins.curves import loop_curves as loop_curves
     from malta.margins.dynamic import dynamic_margin as dynamic_margin
     from malta.margins.gain import Gain as Gain
     from malta.margins.gain import worst_case_gain as worst_case_gain
@@ -118,6 +120,7 @@ _NAMES = {  # the same, for the first use of each name
     "model.parameters": ("check_parameters", "si"),
     "model.plant": ("Actuator", "OperatingPoint", "Plant", "Signal", "trim"),
     "margins.blocks": ("Dynamic",),
+    "margins.curves": ("LoopCurves", "loop_curves"),
     "margins.dynamic": ("dynamic_margin",),
     "margins.gain": ("Gain", "worst_case_gain"),
     "margins.loop_systems": ("LoopSystems", "loop_systems"),

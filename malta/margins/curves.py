@@ -73,7 +73,18 @@ class Responses(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class LoopCurves:
-    """The curves of one loop. Frequencies and poles are in rad/s, everything else in SI."""
+    """The curves of one loop: responses, poles, zeros and margins. Frequencies and poles are in rad/s.
+
+    loop : matrices and signals of the loop
+    responses : L, S, T at the sensors and at the forces, gang of four and compliance at the frequencies `w`
+
+    >>> import control, malta
+    >>> curves = malta.loop_curves(control.tf([4], [1, 1, 0], name="servo"))
+    >>> curves.stable, curves.channels()[0].name
+    (True, 'y[0]')
+    >>> f"{curves.singular_values(curves.responses.S).max():.2f}"
+    '2.28'
+    """
 
     loop: LinearLoop
     responses: Responses
@@ -100,25 +111,39 @@ class LoopCurves:
         return self.loop.stable
 
     def channels(self, at: Place = "sensors") -> tuple[Signal, ...]:
-        """The signals at which the loop is cut."""
+        """The signals at which the loop is cut.
+
+        at : "sensors" or "forces"
+        """
         return self.loop.outputs if at == "sensors" else self.loop.inputs
 
     def channel_index(self, name: str, at: Place = "sensors") -> int:
-        """The index of a channel by its name. Raises InputError for an unknown one."""
+        """The index of a channel by its name. Raises InputError for an unknown one.
+
+        name : of the output or force
+        at : where it is, "sensors" or "forces"
+        """
         known = [s.name for s in self.channels(at)]
         if name not in known:
             raise InputError(self.name, "channel", repr(name), "one of " + " ".join(known))
         return known.index(name)
 
     def singular_values(self, G: ComplexArray) -> FloatArray:
-        """Singular values of a response, the largest first: k x n; NaN where it is infinite."""
+        """Singular values of a response, the largest first: k x n; NaN where it is infinite.
+
+        G : k x outputs x inputs, as `responses.S`
+        """
         fine = np.isfinite(G).all(axis=(1, 2))
         found = np.full((len(G), min(G.shape[1:])), np.nan)
         found[fine] = np.linalg.svd(G[fine], compute_uv=False)
         return found
 
     def over(self, low: float, high: float) -> LoopCurves:
-        """The same curves from a lower and, of a continuous loop, to a higher frequency, rad/s."""
+        """The same curves from a lower and, of a continuous loop, to a higher frequency.
+
+        low : lowest frequency, rad/s
+        high : highest frequency, rad/s
+        """
         top = min(high, self.nyquist)
         below = np.geomspace(low, self.w[0], BASE // 4)[:-1] if low < self.w[0] else np.zeros(0)
         above = np.geomspace(self.w[-1], top, BASE // 4)[1:] if top > self.w[-1] else np.zeros(0)
@@ -138,7 +163,10 @@ class LoopCurves:
         return _margins(self, "forces")
 
     def margins_at(self, at: Place) -> tuple[ChannelMargins, ...]:
-        """The margins at the sensors or at the forces."""
+        """The margins at the sensors or at the forces.
+
+        at : "sensors" or "forces"
+        """
         return self.margins if at == "sensors" else self.margins_at_forces
 
     @cached_property
@@ -167,16 +195,21 @@ def loop_curves(
     position: float | None = None,
     w: Sequence[float] | FloatArray | None = None,
 ) -> LoopCurves:
-    """The curves of a loop.
+    """Compute the curves of a loop: frequency responses on a grid that fits them, poles, zeros, margins.
 
-    source, controller, name, position : as `linear_loop` takes them: a plant and its controller, LoopSystems, systems
-        of python-control; curves are returned as they are
-    w : frequencies, rad/s; None: a grid that fits the loop
+    source : a plant; LoopSystems; a system of python-control, P or the loop gain L; or curves, which are returned
+    controller : of the plant, or the system C of the errors (L = P C, negative feedback); None: the source has it
+    name : of the loop; "": that of the controller or of the system
+    position : of the stroke, m, of a plant; None: the controller's operating point
+    w : frequencies, rad/s; None: a grid that fits the loop, to the Nyquist frequency
+
+    Margins are those of one channel at a time, the others closed. An open loop that is unstable has a lower bound of
+    its gain as well.
 
     Raises InputError for what is no loop, and CheckError where no input holds the machine.
 
-    >>> import control
-    >>> unstable = loop_curves(control.tf([3], [1, -1])).margins[0]
+    >>> import control, malta
+    >>> unstable = malta.loop_curves(control.tf([3], [1, -1])).margins[0]
     >>> [round(bound, 3) for bound in unstable.gain], unstable.encirclements
     ([0.333, inf], 1)
     """

@@ -41,6 +41,7 @@ def pzmap(source: Any, controller: Any = None, *, axes: Any = None, reach: float
         L = P C; or a table name -> loop, where a pair is a tuple
     controller : of the plant, or the system C; None: the source has it
     axes : one for all poles and one for the slow ones, or one alone for the slow ones; None: a new figure
+    reach : rad/s, of the right panel; None: a multiple of the highest crossing of unit gain
 
     Returns a matplotlib Figure, which a notebook shows as the value of a cell.
 
@@ -241,7 +242,6 @@ def root_locus(
     channel : whose gain is changed; None: all
     at : where the gain is changed, "sensors" or "forces"
     axes : one for all poles and one for the slow ones, or one alone for the slow ones; None: a new figure
-    reach : rad/s, of the right panel; None: a multiple of the highest crossing of unit gain
 
     Returns a matplotlib Figure, which a notebook shows as the value of a cell.
 
