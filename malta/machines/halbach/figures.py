@@ -18,15 +18,14 @@ from malta.machines.halbach.experiments.lift import (
     lift_force,
 )
 from malta.machines.halbach.experiments.motions import BEFORE, PAUSE, responses
+from malta.report.figures.marks import draw_dots, draw_noisy
 from malta.report.figures.parts import (
     MORE,
     STYLES,
     Published,
     add_shared_legend,
     draw_bound,
-    draw_dots,
     draw_line,
-    draw_noisy,
     ending_text,
     finish_axes,
     merit_phrase,

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from malta.report.figures.marks import draw_dots
 from malta.report.figures.parts import (
     BOUND,
     STYLES,
     Published,
     add_shared_legend,
     draw_bound,
-    draw_dots,
     draw_line,
     draw_published,
     finish_axes,

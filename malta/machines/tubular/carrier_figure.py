@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from malta.machines.tubular.experiments.carrier import KNOWN
+from malta.report.figures.marks import draw_largest
 from malta.report.figures.parts import (
     STYLES,
     Published,
     add_shared_legend,
-    draw_largest,
     finish_axes,
     mark_end,
     merit_phrase,

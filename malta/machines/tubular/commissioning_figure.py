@@ -9,6 +9,7 @@ import numpy as np
 
 from malta.firmware.supervisor import STATES
 from malta.machines.tubular.experiments.commissioning import WITH
+from malta.report.figures.marks import draw_group, draw_largest
 from malta.report.figures.parts import (
     CROSS,
     NOTE,
@@ -17,8 +18,6 @@ from malta.report.figures.parts import (
     add_shared_legend,
     clearance,
     draw_bound,
-    draw_group,
-    draw_largest,
     draw_line,
     ended_early,
     finish_axes,

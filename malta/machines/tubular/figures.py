@@ -16,6 +16,7 @@ from malta.machines.tubular.commissioning_figure import commissioning_figure, su
 from malta.machines.tubular.experiments.rest import RESTING
 from malta.machines.tubular.recording_figure import recording_figure
 from malta.model.data import plant_of
+from malta.report.figures.marks import draw_dots, draw_group, draw_histograms, draw_largest, draw_spreads
 from malta.report.figures.parts import (
     BOUND,
     CROSS,
@@ -28,13 +29,8 @@ from malta.report.figures.parts import (
     add_shared_legend,
     clearance,
     draw_bound,
-    draw_dots,
-    draw_group,
-    draw_histograms,
-    draw_largest,
     draw_line,
     draw_published,
-    draw_spreads,
     end_of,
     ended_early,
     ending_text,
@@ -72,6 +68,7 @@ def stroke_figure(run: Trajectory, published: Published | None = None) -> Figure
         [run],
         f"stroke of {(last - first) * 1e3:.3g} mm{ending_text(run)}",
         (tracked if run.verdict.completed else "") + errors,
+        left=0.1,
         right=0.925,
         hspace=0.24,
     )

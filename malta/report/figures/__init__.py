@@ -31,13 +31,13 @@ from malta.model.signals import (
 from malta.report.figures.campaign import distributions_figure as distributions_figure
 from malta.report.figures.campaign import yield_figure as yield_figure
 from malta.report.figures.front import front_figure as front_figure
+from malta.report.figures.marks import draw_group
 from malta.report.figures.parts import MORE as MORE
 from malta.report.figures.parts import POINTS as POINTS
 from malta.report.figures.parts import STYLES as STYLES
 from malta.report.figures.parts import (
     Published,
     draw_bound,
-    draw_group,
     draw_line,
     ending_text,
     finish_axes,

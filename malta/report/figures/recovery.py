@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from malta.margins.recovery import PushedLoop, furthest, load_vector
-from malta.report.figures.parts import MORE, STYLES, draw_group, finish_axes, micro, new_figure
+from malta.report.figures.marks import draw_group
+from malta.report.figures.parts import MORE, STYLES, finish_axes, micro, new_figure
 from malta.units import unit_factor
 
 if TYPE_CHECKING:
@@ -50,6 +51,7 @@ def recovery_figure(plant: Plant, controller: Controller, found: Sequence[Recove
     figure = new_figure(
         f"{controller.name}: how a load from outside is carried",
         size=(9.0, height),
+        left=0.1,
         bottom=0.6 / height,
         top=0.97 - 0.62 / height,
         hspace=0.5,
