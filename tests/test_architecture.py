@@ -20,6 +20,7 @@ ORDER = (
         "errors",
         "identifiers",
         "units",
+        "interrupts",
         "files",
         "archives",
         "tables",

@@ -11,6 +11,7 @@ wherever a curve turns, and has every peak and crossing that margins are read at
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -242,11 +243,15 @@ def respond(loop: LinearLoop, w: FloatArray) -> Responses:
 
 
 def _inverse(M: ComplexArray) -> ComplexArray:
-    """The inverses of k matrices; NaN for all where one is singular, as on a pole of an unstable loop."""
+    """The inverses of k matrices; NaN for a singular one, as on a pole of an unstable loop."""
     try:
         return np.asarray(np.linalg.inv(M))
     except np.linalg.LinAlgError:
-        return np.asarray(np.linalg.pinv(np.nan_to_num(M)))
+        found = np.full_like(M, np.nan)
+        for k, one in enumerate(M):
+            with suppress(np.linalg.LinAlgError):
+                found[k] = np.linalg.inv(one)
+        return found
 
 
 def _diagonal(G: ComplexArray) -> ComplexArray:
