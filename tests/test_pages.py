@@ -21,6 +21,7 @@ def _name(page: Path) -> str:
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::FutureWarning")  # of python-control's own libraries
 @pytest.mark.parametrize("page", [p for p in PAGES if BEGIN.search(p.read_text(encoding="utf-8"))], ids=_name)
 def test_the_examples_of_a_page_show_what_comes_out(page: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MPLBACKEND", "agg")
