@@ -32,6 +32,7 @@ HALBACH = shipped_path("design", "halbach_pid.toml")
 ROBUST = shipped_path("design", "robust.toml")
 BALL = shipped_path("examples", "ball", "design", "ball.toml")
 ROTOR = shipped_path("examples", "rotor", "design", "rotor.toml")
+SLOW = [pytest.param(design, marks=pytest.mark.slow) for design in (HALBACH, ROBUST)]
 
 
 def copied(folder: Path, name: str = "halbach_pid") -> Path:
@@ -59,7 +60,7 @@ class Client:
 # --- numbers ---
 
 
-@pytest.mark.parametrize("design", [HALBACH, BALL, pytest.param(ROBUST, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("design", [BALL, *SLOW])
 def test_picture_has_the_figures_of_verify_and_recovery(design: Path) -> None:
     spec = malta.read_design(design)
     problem = solve(open_design(design).apply(Edit()))
@@ -92,7 +93,7 @@ def test_linear_run_is_what_the_simulation_does() -> None:
     assert np.abs(np.array(linear["p"]).T - run.p[::step]).max() < 0.1e-6
 
 
-@pytest.mark.parametrize("design", [BALL, HALBACH, pytest.param(ROBUST, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("design", [BALL, *SLOW])
 def test_eigenvalue_margin_lies_just_above_the_proven_one(design: Path) -> None:
     spec = malta.read_design(design)
     _, controller = model_and_controller(spec)
@@ -169,6 +170,25 @@ def test_the_newest_move_wins(tmp_path: Path) -> None:
     assert client.ask("evaluate", number=5, values={})["stable"]
     assert client.ask("evaluate", number=4, values={"pid.Kp.F_x": 700.0}) == {"number": 4, "stale": True}
     assert client.session.unsaved() == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("design", [HALBACH, ROBUST, BALL, ROTOR], ids=lambda path: path.stem)
+def test_every_field_moves_the_design_or_says_why_not(design: Path, tmp_path: Path) -> None:
+    client, number = Client(design, tmp_path), 0
+    for key, field in client.session.files.fields.items():
+        if isinstance(field.value, str):
+            values: list[Any] = list(field.choices)
+        elif isinstance(field.value, bool):
+            values = [not field.value]
+        else:
+            values = [3] if field.kind == "integer" else [1.1 * field.value or 1e-6]
+        for value in values:
+            for redesign in (True, False) if key.startswith("machine.") else (True,):
+                number += 1
+                found = client.ask("evaluate", number=number, values={key: value}, redesign=redesign)
+                assert "poles" in found or "defect" not in found["error"], (key, value, redesign, found)
+                json.dumps(found, allow_nan=False)
 
 
 def test_unknown_questions_are_refused(tmp_path: Path) -> None:

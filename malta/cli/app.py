@@ -72,6 +72,10 @@ def _has_screen() -> bool:
 def _design_file(named: Path | None) -> Path:
     """The design file that was named, or the first of design/. Raises InputError where there is none."""
     if named is not None:
+        if named.suffix in (".json", ".npz", ".mat"):
+            raise InputError(
+                named, "", "a gain file", "the design file that it was made of, as design/NAME.toml"
+            )
         return locate(named)
     found = sorted(Path(FIRST).glob("*.toml"))
     if not found:
