@@ -112,9 +112,9 @@ def test_claims(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize(
     ("name", "arguments"),
     [
-        ("rare-output", ["--rare", "touchdown", "--spread", "60%", "--samples", "50"]),
-        ("rare-output", ["--rare", "touchdown", "--spread", "1%", "--samples", "50"]),
-        ("sobol-output", ["--sobol", "--spread", "60%", "--samples", "64"]),
+        ("rare-output", ["--rare", "touchdown", "--spread", "60%", "--samples", "100"]),
+        ("rare-output", ["--rare", "touchdown", "--spread", "1%", "--samples", "100"]),
+        ("sobol-output", ["--sobol", "--spread", "60%", "--samples", "128"]),
         ("tolerance-output", ["--tolerance", "90%", "--spread", "20%", "--samples", "64"]),
     ],
 )
