@@ -20,6 +20,7 @@ import pytest
 from public import all_names, docstring_of, public_names, value_of
 
 import malta
+from malta.model import machines
 
 ROOT = Path(__file__).parents[1]
 FOLDERS = ("data", "design", "examples")  # that examples read
@@ -37,6 +38,7 @@ SLOW = {
     "malta.report.campaign",
     "malta.report.chain_figure",
     "malta.report.chain_table",
+    "malta.report.comparison_page",
     "malta.report.disk_table",
     "malta.report.distributions_figure",
     "malta.report.front",
@@ -66,6 +68,12 @@ WIDEST = 86  # letters of an example's line, prompt and all, that a page shows w
 FLAGS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE  # tables end their lines with spaces
 DESCRIPTORS = (property, cached_property, classmethod)
 ENTRY = re.compile(r"^(\*{0,2}\w+(?:, \w+)*) : ", re.MULTILINE)  # "name : meaning", or "one, two : meaning"
+
+
+@pytest.fixture(autouse=True)
+def own_machines(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Forget the machines that an example names: other tests have some of the same name."""
+    monkeypatch.setattr(machines, "_files", dict(machines._files))
 
 
 def test_every_public_name_is_listed() -> None:

@@ -35,9 +35,10 @@ def front_figure(tuned: Tuned) -> Figure:
     >>> from malta.tuning.search import Trial
     >>> from malta.tuning.tune import Tuned
     >>> spec = malta.read_design("examples/ball/design/ball.toml")
-    >>> quiet = Trial((223.0, 50.0, 0.051), 1, {"margin": 3.28, "force_noise f": 0.0122, "motion y": 0.523e-6})
-    >>> safe = Trial((190.0, 40.0, 0.11), 1, {"margin": 3.63, "force_noise f": 0.0414, "motion y": 0.501e-6})
-    >>> tuned = Tuned(spec, safe, requirements=(), front=(quiet, safe), trials=120)  # as malta.tune finds it
+    >>> noisy = {"margin": 3.63, "force_noise f": 0.0414, "motion y": 0.501e-6}
+    >>> quiet = {"margin": 3.28, "force_noise f": 0.0122, "motion y": 0.523e-6}
+    >>> front = Trial((223.0, 50, 0.051), 1, quiet), Trial((190.0, 40, 0.11), 1, noisy)
+    >>> tuned = Tuned(spec, front[1], (), front, trials=120)  # as malta.tune finds it
     >>> figure = malta.report.front_figure(tuned)
     >>> [axes.get_ylabel() for axes in figure.axes]
     ['noise of the force [N rms]', 'true motion [µm rms]']

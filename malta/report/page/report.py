@@ -68,8 +68,10 @@ def compare_gains(
     Raises InputError for another number of them, and as `malta.gains.read`.
 
     >>> import malta
-    >>> specs = [malta.read_design(f"examples/ball/design/{name}.toml") for name in ("ball", "ball_pid")]
-    >>> designs = [malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at())) for spec in specs]
+    >>> files = [f"examples/ball/design/{name}.toml" for name in ("ball", "ball_pid")]
+    >>> specs = [malta.read_design(file) for file in files]
+    >>> models = [malta.linearize(spec.plant, spec.plant.at()) for spec in specs]
+    >>> designs = [malta.synthesize(*pair) for pair in zip(specs, models)]
     >>> found = malta.report.compare_gains(*designs, proof=False)
     >>> [one.texts for one in found.differences if one.name == "kind"]
     [('LQG', 'PID')]
@@ -83,12 +85,19 @@ def compare_gains(
 def comparison_page(found: Comparison) -> Page:
     """Write a comparison as one page in HTML that needs no network and no other file.
 
-    found : the comparison, as `compare_gains` returns it
+    found : from `malta.report.compare_gains`
 
-    Returns a Page: a notebook shows it, and its `save` writes it.
+    Returns a Page: a notebook shows it, and its `save` writes it to a file.
 
-        found = malta.report.compare_gains("design/gains/table2.json", "design/gains/robust.json")
-        malta.report.comparison_page(found).save("build/comparison.html")
+    >>> import malta
+    >>> A, B, C = [[0, 1], [100, 0]], [[0], [1]], [[1, 0]]
+    >>> plant = malta.linear_machine(A, B, C, name="compared")
+    >>> model = malta.linearize(plant, plant.at())
+    >>> chosen = [malta.weights(q=[q, 1], r=[1], w=[1], v=[1e-8]) for q in (1e2, 1e4)]
+    >>> designs = [malta.lqg(model, one, Ts=1e-3) for one in chosen]
+    >>> found = malta.report.compare_gains(*designs, proof=False)
+    >>> b"What differs in the designs" in malta.report.comparison_page(found).content
+    True
     """
     from malta.report.page.compared import comparison_page as write
 
