@@ -36,6 +36,14 @@ def watch_interrupts() -> Iterator[list[float]]:
         signal.signal(signal.SIGINT, handle)
 
 
+def press_again() -> None:
+    """Press Ctrl-C for the main thread, also where it waits."""
+    if hasattr(signal, "pthread_kill"):
+        signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
+    else:
+        signal.raise_signal(signal.SIGINT)
+
+
 @contextmanager
 def put_off_interrupts() -> Iterator[None]:
     """Put Ctrl-C off to the end of a block."""

@@ -99,6 +99,19 @@ def test_work_speaks_when_it_reports_and_when_it_does_not(
     assert "quick" not in capsys.readouterr().err
 
 
+def test_ctrl_c_that_a_library_drops_is_pressed_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    def wait(seconds: float, *, insists: bool) -> None:
+        with output.working("sorting", insists=insists) as work:
+            work.pressed.append(0.0)  # long ago
+            time.sleep(seconds)
+
+    monkeypatch.setattr(output, "DROPPED", 0.05)
+    with pytest.raises(KeyboardInterrupt):
+        wait(5, insists=True)
+    wait(0.4, insists=False)
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
 def test_an_interruption_waits_until_all_files_are_in_place(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

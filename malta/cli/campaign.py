@@ -158,9 +158,9 @@ def campaign(
     Memory does not grow with the machines: beyond 100 000 of them percentiles are counted, to 0.006 % of their values.
 
     \b
-    Example:  malta campaign design/gains/calibrated.json --samples 10000 --spread 20%
+    Example:  malta campaign design/gains/calibrated.json --spread 20%
               malta campaign --status build/campaigns/calibrated_stroke_1a2b3c4d
-              malta campaign design/gains/table2.json --spread 6% --rare touchdown --samples 2000
+              malta campaign design/gains/table2.json --rare touchdown
     """
     if status is not None:
         show_status(ctx, status, gains, StatusOptions(design, machine, worst, as_json))
@@ -219,7 +219,7 @@ def campaign(
         run_study(study, Setting(gains, plan, bounds, folder, workers, as_json, yes))
         return
     session = Session(workers, cluster)
-    with campaign_folder(plan, folder, session, gains), progress_bar(scenario) as bar:
+    with campaign_folder(plan, folder, session, gains), progress_bar(scenario, insists=False) as bar:
         progress = limit_time(bar, f"{scenario}, {samples} runs", agreed=yes)
         result = summarize(plan, folder, bounds, workers=workers, cluster=cluster, progress=progress)
     _report(gains, result, worst, as_json=as_json)

@@ -28,7 +28,7 @@ def check(
     """Check the proof of a margin, in arithmetic with rigorous bounds and without the code that found it.
 
     \b
-    Example:  malta check build/table2_margin.json --gains design/gains/table2.json
+    Example:  malta check build/table2.json --gains design/gains/table2.json
     """
     from malta.margins.check import check as check_certificate
 

@@ -42,7 +42,7 @@ def compare(
     Machines that differ are compared in what their loops have in common. An unstable loop gives exit code 1.
 
     \b
-    Example:  malta compare design/gains/table2.json design/gains/robust.json --out build/comparison.html
+    Example:  malta compare design/gains/table2.json design/gains/robust.json
     """
     from malta.margins.verify import require_stable
     from malta.report.page.comparison import compare as compare_subjects

@@ -45,7 +45,7 @@ def design(
 
     \b
     Example:  malta design design/table2.toml
-              malta design design/calibrated.toml --set m=0.4 --set weights.state.z=2
+              malta design design/table2.toml --set m=0.4 --set weights.state.z=2
     """
     designed: list[DesignPart] = []
     sources: dict[Path, Path] = {}  # output file -> the design file of this run that it comes from

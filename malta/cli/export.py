@@ -44,7 +44,7 @@ def export(
     controller, of its machine, or of the loop of both, for co-simulation.
 
     \b
-    Example:  malta export design/gains/robust.json --to c --precision float --out build/robust_c
+    Example:  malta export design/gains/robust.json --precision float
               malta export design/gains/robust.json --to fmu --part loop --fmi 3
     """
     from malta.firmware.exports import export_c, export_fmu

@@ -8,7 +8,7 @@ import re
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from threading import Event, Thread
 from typing import TYPE_CHECKING, Any, TextIO
@@ -18,7 +18,7 @@ import typer
 from malta.cli.patience import duration_text
 from malta.errors import CheckError, InputError, shorten
 from malta.files import json_text
-from malta.interrupts import watch_interrupts
+from malta.interrupts import press_again, watch_interrupts
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -30,7 +30,7 @@ NARROWEST = 20  # columns; COLUMNS below is no width
 PATIENCE = 2.0  # s, from the begin of work to the first line about it
 INTERVAL = 2.0  # s, between the first lines
 NO_COMPILER = "no C compiler: simulated on CasADi's virtual machine, some hundred times slower"
-DROPPED = 2.0  # s after Ctrl-C; work that still reports has not heard of it
+DROPPED = 2.0  # s after Ctrl-C; work that goes on has not heard of it
 LINES = 10.0  # s, between later lines
 
 
@@ -105,21 +105,22 @@ class Work:
     """Work that takes a while, and what is known of how far it is.
 
     Whoever works reports; a thread speaks where no report comes. Lines on standard error begin after PATIENCE and
-    become rarer, up to one in LINES.
+    become rarer, up to one in LINES. Libraries may drop the KeyboardInterrupt of Ctrl-C: where the work goes on
+    DROPPED seconds after it, the thread presses again.
+
+    insists : whether it does; not for work that ends by itself after Ctrl-C, with what it has
     """
 
-    def __init__(self, what: str) -> None:
-        self.what, self.share, self.found = what, 0.0, ""
+    def __init__(self, what: str, *, insists: bool = True) -> None:
+        self.what, self.share, self.found, self.insists = what, 0.0, "", insists
         self.started = time.monotonic()
         self.pressed: list[float] = []  # when Ctrl-C was
         self.due = self.started + PATIENCE
         self.ended = Event()
 
     def report(self, share: float) -> None:
-        """Note the share that is done, 0 to 1. Raises KeyboardInterrupt where a library has dropped one."""
+        """Note the share that is done, 0 to 1."""
         self.share = share
-        if self.pressed and time.monotonic() > self.pressed[0] + DROPPED:
-            raise KeyboardInterrupt
         self.speak()
 
     def bound(self, lower: float, upper: float) -> None:
@@ -143,33 +144,29 @@ class Work:
             shown.append(f"about {duration_text(spent * (1 / min(self.share, 1) - 1))} left")
         print_note(f"{self.what}: {', '.join(filter(None, shown))}")
 
-    def keep_speaking(self) -> None:
-        """Print lines, as they become due, until the work has ended."""
-        while not self.ended.wait(min(max(self.due - time.monotonic(), 0.05), LINES)):
+    def attend(self) -> None:
+        """Print lines as they become due, and press Ctrl-C again where it was dropped, until the work has ended."""
+        while not self.ended.wait(min(max(self.due - time.monotonic(), 0.05), 0.25)):
             self.speak()
+            if self.insists and self.pressed and time.monotonic() > self.pressed[-1] + DROPPED:
+                press_again()
 
 
 @contextmanager
-def working(what: str) -> Iterator[Work]:
-    """Say how far work is on standard error: a bar on a terminal, elsewhere lines.
+def working(what: str, *, insists: bool = True) -> Iterator[Work]:
+    """Say how far work is on standard error: a bar on a terminal, elsewhere lines. `insists` as of Work.
 
     Example: `with working("claims") as work: work.report(0.5)`
     """
-    work = Work(what)
-    with watch_interrupts() as work.pressed, _drawn(work) if sys.stderr.isatty() else _spoken(work):
-        yield work
-
-
-@contextmanager
-def _spoken(work: Work) -> Iterator[None]:
-    """Print lines of work, also while it does not report."""
-    speaker = Thread(target=work.keep_speaking, daemon=True)
-    speaker.start()
-    try:
-        yield
-    finally:
-        work.ended.set()
-        speaker.join()
+    work = Work(what, insists=insists)
+    thread = Thread(target=work.attend, daemon=True)
+    with watch_interrupts() as work.pressed, _drawn(work) if sys.stderr.isatty() else nullcontext():
+        thread.start()
+        try:
+            yield work
+        finally:
+            work.ended.set()
+            thread.join()
 
 
 @contextmanager
@@ -196,9 +193,9 @@ def _drawn(work: Work) -> Iterator[None]:
 
 
 @contextmanager
-def progress_bar(what: str) -> Iterator[Callable[[float], None]]:
-    """Say how far work is; yields the function that takes the share done, 0 to 1."""
-    with working(what) as work:
+def progress_bar(what: str, *, insists: bool = True) -> Iterator[Callable[[float], None]]:
+    """Say how far work is; yields the function that takes the share done, 0 to 1. `insists` as of Work."""
+    with working(what, insists=insists) as work:
         yield work.report
 
 

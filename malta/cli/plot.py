@@ -85,8 +85,8 @@ def plot(
     the changes given by --set.
 
     \b
-    Examples:  malta plot design/gains/robust.json bode nyquist --with design/gains/table2.json
-               malta plot design/gains/robust.json rootlocus --parameter m --range 0.2..2
+    Examples:  malta plot design/gains/robust.json bode nyquist
+               malta plot design/gains/robust.json rootlocus --parameter m
     """
     _require_kinds(kinds, at, out, parameter, span)
     machines = _read_machines([gains, *(locate(path) for path in others or ())], machine, change)

@@ -123,7 +123,7 @@ def simulate(
     The machine is the one in the file, with the changes given by --set; the controller does not learn of them.
 
     \b
-    Example:  malta simulate design/gains/calibrated.json --scenario stroke --set m=0.56 --noise 1 --out build
+    Example:  malta simulate design/gains/calibrated.json --set m=0.56 --out build
     """
     from malta.model.data import plant_of
     from malta.model.published import published_figures
@@ -159,7 +159,7 @@ def simulate(
     times = (3.0 if substeps else 1.0) * (
         10.0 if law == "c" else 1.0
     )  # own law, double and float: see exported.py
-    with progress_bar(chosen) as bar:
+    with progress_bar(chosen, insists=False) as bar:
         # With --substeps a second run, with twice as many, follows for the estimate of the error.
         progress = limit_time(bar, chosen, agreed=yes, times=times)
 

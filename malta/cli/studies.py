@@ -105,7 +105,7 @@ def run_study(study: Study, setting: Setting) -> None:
     limit = read_limit(option, study.limit, setting.plan, setting.bounds)
     what, session = f"{setting.plan.scenario} {study.option}", Session(setting.workers)
     folder = campaign_folder(setting.plan, setting.folder, session, setting.gains)
-    with folder, progress_bar(what) as bar:
+    with folder, progress_bar(what, insists=False) as bar:
         progress = limit_time(bar, what, agreed=setting.yes)
         try:
             outcome = STUDIES[study.option](limit, study.wanted, setting, progress)
