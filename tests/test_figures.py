@@ -99,10 +99,9 @@ def drawn_experiments() -> list[Any]:
 @pytest.mark.slow
 @pytest.mark.parametrize(("design", "name"), drawn_experiments())
 def test_nothing_is_wrong_with_the_figure_of_an_experiment(design: str, name: str) -> None:
-    plant, c, paper = machine(design)
+    plant, c, published = machine(design)
     e = malta.experiment(name, plant, c, **SHORT.get(name, {}))
-    for published in (paper, None):
-        assert defects(report.experiment_figure(e, published)) == []
+    assert defects(report.experiment_figure(e, published)) == []
 
 
 @cache
@@ -194,3 +193,16 @@ def test_nothing_is_wrong_with_the_figures_of_margins_and_loads(name: str) -> No
     found = malta.robustness(plant, c, box)
     assert defects(report.robustness(found, name, box, position=f"position {plant.stroke}")) == []
     assert defects(report.loads(plant, c)) == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "name", ["ball/design/ball", "ball/design/ball_pid", "rotor/design/rotor", "rotor/design/rotor_pid"]
+)
+def test_nothing_is_wrong_with_the_figures_of_machines_of_ones_own(name: str) -> None:
+    """Without figures of their own: with and without a stroke, one input or several, one output or four."""
+    spec = malta.read_design(ROOT / "examples" / f"{name}.toml")
+    c = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at(**spec.operating_point)))
+    for experiment in experiments_of(spec.plant):
+        assert defects(report.experiment_figure(malta.experiment(experiment, spec.plant, c))) == []
+    assert defects(report.loads(spec.plant, c)) == []

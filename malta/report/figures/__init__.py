@@ -177,7 +177,7 @@ def run_figure(e: Experiment, _: Published | None = None) -> Figure:
     told = (f"{name} {number(in_unit(size, unit), 3)} {micro(unit)}" for name, size, unit in furthest)
     what = e.question if len(e.cases) == 1 else f"{e.question} {e.cases[0].label}, one of {len(e.cases)}"
     text = "furthest off its reference: " + ", ".join(told)
-    rows = 2 if len(panels) > 3 else len(panels)
+    rows = min(2, len(panels))
     columns = math.ceil(len(panels) / rows)
     rows_of_legends = max(-(-len(group) // 4) for group in (run.plant.inputs, run.plant.outputs))
     places = {
