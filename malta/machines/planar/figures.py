@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from malta.report.figures.marks import draw_dots
+from malta.report.figures.marks import draw_dots, draw_group
 from malta.report.figures.parts import (
     BOUND,
     STYLES,
@@ -54,8 +54,8 @@ def step_figure(e: Experiment, published: Published | None = None) -> Figure:
     for k, style in ((1, STYLES[0]), (2, STYLES[3])):
         moved = (run.p[:, k] - run.reference[0, k]) * 1e3
         draw_line(motion, run.t * 1e3, moved, label=run.plant.outputs[k].name, **style)
-        name = f"F_{run.plant.outputs[k].name}"
-        draw_line(forces, run.t * 1e3, run.v[:, inputs.index(name)], label=name, **style)
+    pushes = {name: run.v[:, k] for k, name in enumerate(inputs) if run.plant.inputs[k].unit == "N"}
+    draw_group(forces, run.t * 1e3, pushes)
     for axes, k, scale in (
         (across, 0, 1e9),
         (below[0][0], 3, 1e6),
@@ -71,7 +71,7 @@ def step_figure(e: Experiment, published: Published | None = None) -> Figure:
         finish_axes(axes, "time [ms]" if k else "", f"{run.plant.outputs[k].name}, off reference [{unit}]")
     draw_published(forces, published, "steps.force_limit", "N", "published limit", both=True)
     finish_axes(motion, "", "moved [mm]", legend=2)
-    finish_axes(forces, "", "commanded force [N]", legend=2)
+    finish_axes(forces, "", "commanded force [N]", legend=3)
     finish_axes(across, "", "x, off reference [nm]", legend=3)
     return figure
 
