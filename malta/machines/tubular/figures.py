@@ -335,7 +335,7 @@ def faults_figure(e: Experiment, _: Published | None = None) -> Figure:
     draw_dots(dots, [micro(case.label) for case in e.cases], deviations, texts, marks)
     dots.set_xlim(min(0.1, 0.5 * min(deviations)), 2 * edge)
     dots.axvline(edge, **BOUND)
-    label_upright(dots, 1.1 * edge, 0.02, "touchdown bearing", ha="left")
+    label_upright(dots, 1.1 * edge, 0.62, "touchdown bearing", ha="left")
     struck = e.run.scenario.faults[0].at
     traces.set_xlim(-20, (e.run.scenario.duration - struck) * 1e3)
     worst = sorted(e.cases, key=lambda case: -case.merits[0].value)[: len(STYLES)]

@@ -38,7 +38,7 @@ def draw_group(
         if twin is None:
             lines[name] = values
         else:
-            lines[f"{twin}, {name}"] = lines.pop(twin)
+            lines = {f"{twin}, {name}" if known == twin else known: drawn for known, drawn in lines.items()}
     styles = styles or (*STYLES, *MORE)
     if len(lines) > len(styles):
         every = np.array(list(series.values()))
