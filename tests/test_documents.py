@@ -60,7 +60,8 @@ def test_the_command_prints_them(run: Run) -> None:
     assert said.err.startswith("malta: schema: found 'chekc-output', expected one of gain, design, data, ")
 
 
-@pytest.mark.parametrize("gains", ["halbach", pytest.param("planar_pid", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("gains", ["halbach", "planar_pid"])
 def test_verify(run: Run, gains: str) -> None:
     found = document(run("verify", f"design/gains/{gains}.json", "--no-proof", "--json"), "verify-output")
     assert found["peak_sensitivity"].keys() == {"sampled", "current_loops", "machine"}
