@@ -147,7 +147,7 @@ def stroke(run: Trajectory, path: str | Path | None = None, published: Published
     >>> hold = malta.Scenario("hold", 20e-3, malta.references.hold, low, fidelity="force")
     >>> figure = malta.report.stroke(malta.simulate(spec.plant, controller, hold))
     >>> [axes.get_ylabel() for axes in figure.axes]
-    ['commanded force [N]', 'y, off reference [µm]', 'clearance used up [%]']
+    ['commanded force [N]', 'y, off reference [µm]', 'clearance used up [%]', '']
     """
     return _saved(stroke_figure(run, published), path)
 
@@ -170,7 +170,7 @@ def experiment(e: Experiment, path: str | Path | None = None, published: Publish
     >>> push = malta.experiment("disturbance", spec.plant, controller, size=0.1, **exact)
     >>> figure = malta.report.experiment(push)
     >>> [axes.get_ylabel() for axes in figure.axes]
-    ['commanded force [N]', 'y, off reference [µm]', 'clearance used up [%]']
+    ['commanded force [N]', 'y, off reference [µm]', 'clearance used up [%]', '']
     """
     return _saved(experiment_figure(e, published), path)
 
@@ -255,7 +255,7 @@ def sensitivity(found: Sensitivity, path: str | Path | None = None) -> Figure:
     >>> found = malta.sensitivity(plan, malta.limit_of(plan, "touchdown"), workers=1)
     >>> figure = malta.report.sensitivity(found)
     >>> figure.axes[0].get_ylabel()
-    'share of the variance'
+    'share of the variance [-]'
     """
     return _saved(sensitivity_figure(found), path)
 

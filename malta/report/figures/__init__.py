@@ -73,7 +73,7 @@ def experiment_figure(e: Experiment, published: Published | None = None) -> Figu
     >>> push = malta.experiment("disturbance", spec.plant, controller, size=0.1, **exact)
     >>> figure = malta.report.experiment_figure(push)
     >>> [axes.get_ylabel() for axes in figure.axes]
-    ['commanded force [N]', 'y, off reference [µm]', 'clearance used up [%]']
+    ['commanded force [N]', 'y, off reference [µm]', 'clearance used up [%]', '']
     """
     plant = e.run.plant
     drawn: dict[str, Callable[[Experiment, Published | None], Figure]] = {

@@ -120,7 +120,8 @@ def _draw_stages(left: Axes, right: Axes, found: Robustness) -> None:
         left.plot([], [], **WITNESS, label="unstable there")
     if any(m.exhausted and m.lower is not None for _, m, _ in rows):
         left.plot([], [], **NO_WITNESS, label="no instability found")
-    _legend(left)
+    if left.get_legend_handles_labels()[0]:
+        _legend(left)
     named = ("of a stage", "of the machine, under its loads")
     _legend(right, 1.07, [Patch(label=label, **look) for look, label in zip(LOOKS, named, strict=True)])
     left.set_xlabel("proven margin without loads [% of the box]")
