@@ -532,6 +532,7 @@ def test_ctrl_c_prints_what_stands(run: Run, monkeypatch: pytest.MonkeyPatch) ->
 
 def test_a_long_proof_says_where_it_is(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("malta.cli.output.PATIENCE", 0.0)
+    monkeypatch.setattr("malta.cli.output.INTERVAL", 0.0)
     _, _, err = run("verify", str(HALBACH), "--uncertain", "b=20%")
     assert re.search(r"^malta: margins: proven \d+\.\d\d %, lost at ", err, re.MULTILINE)
 

@@ -407,6 +407,7 @@ def test_verify_prints_tables_within_a_hundred_columns(tmp_path: Path) -> None:
     assert (tmp_path / "calibrated_margins.png").stat().st_size > 20_000
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("analysed_once")
 def test_verify_as_json_holds_finite_numbers(run: Run) -> None:
     code, out, err = run("verify", "design/gains/calibrated.json", "--json")

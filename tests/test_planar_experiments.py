@@ -425,6 +425,7 @@ def test_simulate_json(run: Run) -> None:
     assert found["merits"]["table_moves_theta_by_rad"] > 0.1e-6
 
 
+@pytest.mark.slow
 def test_a_campaign(lqg: Design, tmp_path: Path) -> None:
     """Machines whose coils, magnets and masses differ: all arrive; the unknown pitch tilts by some urad."""
     spread = {"m": 0.05, "B_r": 0.05, "I_x": 0.1, "coil_pitch": 0.002}
