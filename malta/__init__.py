@@ -49,6 +49,7 @@ if TYPE_CHECKING:  # the contents page, as type checkers and readers see it
     from malta.margins.verify import verify as verify
     from malta.model.data import plant_of as plant_of
     from malta.model.data import read as read
+    from malta.model.equilibrium import trim as trim
     from malta.model.linear import linear_machine as linear_machine
     from malta.model.linearize import LinearModel as LinearModel
     from malta.model.linearize import linearize as linearize
@@ -59,7 +60,6 @@ if TYPE_CHECKING:  # the contents page, as type checkers and readers see it
     from malta.model.plant import OperatingPoint as OperatingPoint
     from malta.model.plant import Plant as Plant
     from malta.model.plant import Signal as Signal
-    from malta.model.plant import trim as trim
     from malta.model.published import published as published
     from malta.report.ledger import ledger as ledger
     from malta.simulation import references as references
@@ -118,7 +118,8 @@ _NAMES = {  # the same, for the first use of each name
     "simulation.digest": ("Batch",),
     "model.machines": ("machine",),
     "model.parameters": ("check_parameters", "si"),
-    "model.plant": ("Actuator", "OperatingPoint", "Plant", "Signal", "trim"),
+    "model.equilibrium": ("trim",),
+    "model.plant": ("Actuator", "OperatingPoint", "Plant", "Signal"),
     "margins.blocks": ("Dynamic",),
     "margins.curves": ("LoopCurves", "loop_curves"),
     "margins.dynamic": ("dynamic_margin",),

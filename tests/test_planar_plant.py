@@ -17,8 +17,9 @@ import malta
 from malta.machines.planar import coils, commutation
 from malta.machines.planar import plant as planar
 from malta.model.data import plant_of
+from malta.model.equilibrium import trim
 from malta.model.parameters import shape_parameters, units_of
-from malta.model.plant import Plant, symbolic, trim
+from malta.model.plant import Plant, symbolic
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray

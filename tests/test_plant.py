@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 
 import malta
 from malta.machines.tubular import plant as tubular
-from malta.model.plant import OperatingPoint, load_balance
+from malta.model.equilibrium import load_balance
+from malta.model.plant import OperatingPoint
 
 if TYPE_CHECKING:
     from malta.model.plant import Plant

@@ -18,8 +18,9 @@ import numpy as np
 
 from malta.errors import InputError
 from malta.margins.loops import machine_loop
+from malta.model.equilibrium import trim
 from malta.model.linearize import linearize
-from malta.model.plant import Plant, trim
+from malta.model.plant import Plant
 from malta.simulation import generic, references
 from malta.simulation.experiments import (
     QUIET,

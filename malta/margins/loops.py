@@ -30,8 +30,9 @@ from malta.margins.uncertain import (
     sampled_law,
 )
 from malta.model.data import plant_of
+from malta.model.equilibrium import trim
 from malta.model.linearize import LinearModel, linearize
-from malta.model.plant import position_in, trim
+from malta.model.plant import position_in
 from malta.model.sensors import whole_samples, with_lags
 from malta.synthesis.controller import Controller, LinearLaw, linear_law, with_readings, with_slope
 from malta.synthesis.riccati import add_lags, delay_inputs, sample

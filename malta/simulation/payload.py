@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from scipy.optimize import brentq
 
+from malta.model.equilibrium import trim
 from malta.model.parameters import units_of
-from malta.model.plant import trim
 from malta.simulation.catalogue import experiment
 from malta.simulation.experiments import setting
 

@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from malta.errors import CheckError, InputError
+from malta.model.equilibrium import holding_forces, load_balance
 from malta.model.linearize import LinearModel
-from malta.model.plant import Actuator, Plant, holding_forces, load_balance
+from malta.model.plant import Actuator, Plant
 from malta.synthesis.controller import (
     Commutation,
     Controller,

@@ -24,8 +24,9 @@ from malta.errors import CheckError, InputError
 from malta.margins.plants import of_plant
 from malta.margins.recovery import disturbance_map, push_through
 from malta.margins.responses import crossing
+from malta.model.equilibrium import trim
 from malta.model.linearize import linearize
-from malta.model.plant import position_in, trim
+from malta.model.plant import position_in
 from malta.synthesis.controller import linear_law_of
 from malta.synthesis.feedforward import holding_gain, static_feedforward
 from malta.synthesis.lqg import gains

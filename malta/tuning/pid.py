@@ -28,8 +28,9 @@ from scipy import optimize, sparse
 from malta.errors import InputError
 from malta.margins.loops import Loop, machine_loop
 from malta.margins.responses import crossing
+from malta.model.equilibrium import trim
 from malta.model.linearize import linearize
-from malta.model.plant import position_at, position_in, trim
+from malta.model.plant import position_at, position_in
 from malta.synthesis.controller import linear_law_of, with_readings
 from malta.synthesis.pid import Axes, axes_of, law_of_outputs, pid_gains
 from malta.synthesis.requirements import ratio_of

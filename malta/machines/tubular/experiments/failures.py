@@ -12,7 +12,8 @@ import numpy as np
 
 from malta.errors import InputError
 from malta.machines.tubular.experiments.strokes import RISE, delayed_stroke
-from malta.model.plant import Plant, trim
+from malta.model.equilibrium import trim
+from malta.model.plant import Plant
 from malta.simulation import references
 from malta.simulation.experiments import (
     Experiment,
