@@ -142,7 +142,7 @@ def test_the_stroke_figure_reads_currents_as_thrust(design: Design, tmp_path: Pa
     drawn(figure, tmp_path)
     current = figure.axes[3]
     (thrust,) = current.child_axes
-    assert thrust.get_ylabel() == "thrust [N]"
+    assert thrust.get_ylabel() == "thrust f_D [N]"
     assert np.allclose(thrust.get_ylim(), 10.4 * np.array(current.get_ylim()))
 
 

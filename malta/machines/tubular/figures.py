@@ -80,7 +80,6 @@ def stroke_figure(run: Trajectory, published: Published | None = None) -> Figure
     off = (run.p - run.reference) * 1e6
     draw_group(radial, ms, {name: off[:, i] for i, name in enumerate(names) if i != axis})
     forces = [s.name for s in plant.inputs]
-    forces[plant.thrust_input] += " (thrust)"
     order = sorted(range(len(forces)), key=lambda i: i != plant.thrust_input)
     draw_group(current, ms, {forces[i]: run.current[:, i] for i in order})
     draw_published(error, published, "figure_12.axial_error", "mm", both=True)
@@ -91,10 +90,10 @@ def stroke_figure(run: Trajectory, published: Published | None = None) -> Figure
     finish_axes(position, "", "axial position z [mm]", legend=2)
     finish_axes(radial, "", "radial deviation [µm]", legend=4)
     finish_axes(error, "time [ms]", "axial error z* - z [mm]")
-    finish_axes(current, "time [ms]", "current per module [A]", legend=5, side="right")
+    finish_axes(current, "time [ms]", "current, by force [A]", legend=5, side="right")
     constant = plant_of(run.controller.parameters).actuator.force_constant[plant.thrust_input]
     thrust = current.secondary_yaxis("right", functions=(lambda i: i * constant, lambda f: f / constant))
-    thrust.set_ylabel("thrust [N]")
+    thrust.set_ylabel(f"thrust {forces[plant.thrust_input]} [N]")
     return figure
 
 
