@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import http.client
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -17,11 +18,12 @@ import numpy as np
 import pytest
 
 import malta
-from malta.app.files import Edit, open_design
+from malta.app.files import Edit, fingerprint, open_design
 from malta.app.picture import View, picture, solve
 from malta.app.saving import TakenError, inside, save_design
 from malta.app.server import LARGEST, PAGES, Server
 from malta.app.session import Session
+from malta.app.worker import work
 from malta.errors import InputError
 from malta.files import shipped_path
 from malta.margins.rays import ray_bound
@@ -419,6 +421,49 @@ def test_a_port_that_is_taken_is_one_sentence(server: Server) -> None:
 
 
 # --- processes, and the page in a browser ---
+
+
+def test_the_version_of_one_page_is_no_proof_of_the_design_of_another(tmp_path: Path) -> None:
+    client = Client(copied(tmp_path), tmp_path)
+    mine, other = {"pid.Kp.F_x": 700.0}, {"pid.Kp.F_x": 900.0}
+    versions = [
+        client.ask("evaluate", number=k, values=values)["version"] for k, values in enumerate((mine, other))
+    ]
+    assert client.ask("save", file="design/mine.toml", values=mine)["written"] == ["design/mine.toml"]
+    versions += [client.ask("evaluate", number=3, values=mine)["version"]]
+    assert client.ask("save", file="design/mine.toml", values=mine, replace=True)["written"]
+    assert client.ask("evaluate", number=4, values=mine)["version"] == versions[-1]  # saved: the same design
+    versions += [client.ask("evaluate", number=5, values={"pid.Kp.F_x": 1e301})["version"]]
+    versions += [client.ask("evaluate", number=6, values=mine)["version"]]
+    assert versions == sorted(set(versions))
+
+
+@pytest.mark.parametrize(("task", "kind"), [("prove", "proof"), ("check", "failed")])
+def test_nothing_follows_of_files_that_changed_since_the_page_read_them(
+    tmp_path: Path, task: str, kind: str
+) -> None:
+    design = copied(tmp_path)
+    edited = open_design(design).apply(Edit())
+    design.write_text(design.read_text(encoding="utf-8").replace("647.02", "647.03"), encoding="utf-8")
+    message = {"task": task, "values": {}, "redesign": True, "design": fingerprint(*edited)}
+    (reply,) = work(message, open_design(design), lambda: False)
+    assert reply["kind"] == kind
+    assert reply.get("lower") is None
+    assert "changed since the page read them" in reply.get("reason", reply.get("error", ""))
+
+
+def test_entries_that_move_together_keep_units_of_their_own(tmp_path: Path) -> None:
+    design = copied(tmp_path, "robust")
+    text = design.read_text(encoding="utf-8")
+    design.write_text(
+        re.sub(r'(?m)^y  .*8.9384, unit = "um"', 'y = { value = 0.0089384, unit = "mm"', text),
+        encoding="utf-8",
+    )
+    fields = open_design(design).fields
+    x, y = fields["bases.state.x"], fields["bases.state.y"]
+    assert y.unit == "mm"
+    assert x.linked == y.linked == (x.key, y.key)
+    assert y.factor / x.factor == pytest.approx(1e-3, rel=1e-12)  # 9 um in x are 0.009 mm in y
 
 
 @pytest.mark.slow

@@ -55,6 +55,7 @@ class Field:
     low, high : of the slider; a field accepts any number that the files accept
     zero : whether 0 is allowed beside a logarithmic slider
     tuning : the name of the [search] number that moves this entry together with `linked`; "": none
+    factor : from the unit of that number to the entry's own
     """
 
     key: str
@@ -69,6 +70,7 @@ class Field:
     choices: tuple[str, ...] = ()
     tuning: str = ""
     linked: tuple[str, ...] = ()
+    factor: float = 1.0
     note: str = ""
 
 
@@ -92,19 +94,18 @@ def _law_fields(files: DesignFiles) -> Iterator[Field]:
                 value, unit = (entry["value"], entry["unit"]) if isinstance(entry, Mapping) else (entry, "")
                 variable = variables.get(key)
                 low, high, kind = _range(value, zero=path.startswith("weights"), share="correlation" in path)
+                scale = 1.0
                 if variable is not None:
                     si = files.spec.place_of(key)[2]
-                    scale = (
-                        1.0
-                        if not unit
-                        else to_si(1.0, variable.unit, si, "", key) / to_si(1.0, unit, si, "", key)
-                    )
+                    if unit:
+                        scale = to_si(1.0, variable.unit, si, "", key) / to_si(1.0, unit, si, "", key)
                     low, high = min(value, variable.low * scale), max(value, variable.high * scale)
                 yield Field(
                     key, TITLES.get(path, path), name, value, unit, kind, low, high,
                     zero=path.startswith("weights"),
                     tuning="" if variable is None else variable.name,
                     linked=() if variable is None else variable.entries,
+                    factor=scale,
                 )  # fmt: skip
 
 

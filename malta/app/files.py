@@ -7,8 +7,9 @@ synthesis.design_file. What the page shows is thus what `malta design` makes of 
 from __future__ import annotations
 
 import copy
+import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -142,6 +143,19 @@ def open_design(path: Path, spec: Spec | None = None) -> DesignFiles:
     raw = load_toml(path)
     spec = spec_of(raw, path) if spec is None else spec
     return DesignFiles(path, raw, load_toml(spec.machine_file), spec)
+
+
+def fingerprint(spec: Spec, truth: Parameters) -> str:
+    """Everything that a design and its machine are, but for their places: a proof of another text is of another design.
+
+    spec, truth : as in `Edited`
+    """
+    numbers = asdict(spec) | {"path": "", "machine_file": ""}
+    return json.dumps([numbers, asdict(truth), type(truth).__module__], default=_plain, sort_keys=True)
+
+
+def _plain(value: Any) -> Any:
+    return value.tolist() if hasattr(value, "tolist") else str(value)
 
 
 def edited_content(files: DesignFiles, edit: Edit) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from malta.app.faults import describe_error
-from malta.app.files import DesignFiles, Edit, open_design
+from malta.app.files import DesignFiles, Edit, fingerprint, open_design
 from malta.app.follow import Worker
 from malta.app.picture import Problem, View, picture, solve
 from malta.app.runs import run_names
@@ -54,6 +54,7 @@ class Session:
         self.root, self.machine = root.resolve(), machine
         self.files: DesignFiles = open_design(design)
         self.edit = Edit()
+        self._followed: Edit | None = None  # what the version is of
         self._hear = hear
         self._busy = threading.Lock()  # one evaluation at a time
         self._state = threading.Condition()
@@ -118,17 +119,24 @@ class Session:
             if number < self._newest:
                 return {"number": number, "stale": True}
             began, cpu = time.perf_counter(), time.thread_time()
-            edit = self.files.edit(body.get("values", {}), redesign=body.get("redesign", True))
+            try:
+                edit = self.files.edit(body.get("values", {}), redesign=body.get("redesign", True))
+            except InputError as error:
+                self._followed = None
+                return {"number": number, "version": self._supersede(), "error": shorten(str(error))}
             view = View(str(body.get("run", "")), str(body.get("load", "")))
-            same = edit == self.edit and self._version > 0
-            self.edit = edit
+            same = edit == self._followed
+            self.edit = self._followed = edit
             version = self._version if same else self._supersede()
             try:
                 document, problem = self._picture(edit, view)
             except Exception as error:
                 return {"number": number, "version": version, "error": shorten(describe_error(error))}
             margin = document["margin"] is None and bool(problem.spec.uncertainty)
-            self._follow_later(edit, view, {"check"} if same else {"check", "prove"}, margin=margin)
+            tasks = {"check"} if same else {"check", "prove"}
+            self._follow_later(
+                edit, view, tasks, fingerprint(problem.spec, problem.plant.parameters), margin=margin
+            )
             spent = {"wall": time.perf_counter() - began, "cpu": time.thread_time() - cpu}
             return {"number": number, "version": version, **document, "seconds": spent}
 
@@ -154,7 +162,9 @@ class Session:
             except TakenError as taken:
                 return {"exists": taken.files}
             self._base += 1
+            followed = edit == self._followed  # or another page asked for another design meanwhile
             self.edit = Edit() if edit.redesign else Edit(_machine_values(edit), redesign=False)
+            self._followed = self.edit if followed else None
             return {"written": written, "open": self.open({})}
 
     def gains(self, body: Mapping[str, Any]) -> Document:
@@ -218,7 +228,7 @@ class Session:
             self._version += 1
             return self._version
 
-    def _follow_later(self, edit: Edit, view: View, tasks: set[str], *, margin: bool) -> None:
+    def _follow_later(self, edit: Edit, view: View, tasks: set[str], design: str, *, margin: bool) -> None:
         """Ask the workers for these tasks, and for those that are due, once the page rests."""
         self._serial += 1
         message = {
@@ -229,6 +239,7 @@ class Session:
             "machine": None if self.machine is None else str(self.machine.resolve()),
             "values": dict(edit.values),
             "redesign": edit.redesign,
+            "design": design,
             "run": view.run,
             "margin": margin,
         }

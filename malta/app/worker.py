@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from malta.app.faults import describe_error
-from malta.app.files import DesignFiles, Edited, open_design
+from malta.app.files import DesignFiles, Edited, fingerprint, open_design
 from malta.app.picture import Problem, View, curves, margin_document, solve
 from malta.app.runs import planned_run
 from malta.errors import CheckError, InputError, shorten
@@ -113,6 +113,10 @@ def work(message: Message, opened: DesignFiles, newer: Newer) -> Iterator[dict[s
     """Solve the design of a message and follow it; an error is the last document."""
     try:
         edited = opened.apply(opened.edit(message["values"], redesign=message["redesign"]))
+        if fingerprint(*edited) != message["design"]:
+            raise CheckError(
+                "the files of this design have changed since the page read them: start malta app again"
+            )
         problem = solve(edited)
         yield from replies(problem, edited, message, newer)
         yield {"kind": "done"}

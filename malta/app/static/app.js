@@ -117,12 +117,18 @@ export async function mount(root, transport) {
         }
       }
     }
-    for (const key of tied) state.values[key] = value;
+    for (const key of tied) state.values[key] = inUnitOf(key, value, field);
     if (done) {
       if (tied.some((key) => before.values[key] !== state.values[key])) remember(before);
       before = null;
     }
     refresh();
+  }
+
+  // Entries that move together may have units of their own.
+  function inUnitOf(key, value, field) {
+    const factor = state.description.fields.find((other) => other.key === key).factor / field.factor;
+    return factor === 1 ? value : Number((value * factor).toPrecision(12));
   }
 
   function remember(past) {
@@ -168,11 +174,12 @@ export async function mount(root, transport) {
    
     let answer;
     try {
-      answer = await transport.ask({ ask: "evaluate", number, values: changes(), redesign: state.redesign, run: state.run, load: state.load });
+      answer = await transport.ask({ ask: "evaluate", number, values: state.values, redesign: state.redesign, run: state.run, load: state.load });
     } catch {
       answer = { error: GONE };
     }
-    if (!answer.stale) take(answer, performance.now() - began);
+    if (answer.stale) again = true; // another page asked meanwhile: what stands here is of an older design
+    else take(answer, performance.now() - began);
     busy = false;
     if (again) { again = false; ask(); return; }
     state.moving = false;
@@ -291,7 +298,7 @@ export async function mount(root, transport) {
     if (!picture) return ["open", "…", ""];
     if (!picture.stable && !state.moving) return ["broken", "✗ unstable", `spectral radius ${digits(picture.radius, 6)}`];
     const upper = picture.margin?.upper;
-    const found = picture.margin === null ? "" : upper === null || upper === undefined ? "no loss found by eigenvalues" : `≤ ${percent(upper)} by eigenvalues`;
+    const found = picture.margin === null ? "" : picture.margin.reason ? `no eigenvalue margin: ${picture.margin.reason}` : upper === null || upper === undefined ? "no loss found by eigenvalues" : `≤ ${percent(upper)} by eigenvalues`;
     if (!Object.keys(state.description.parameters).length) return ["open", "✓ stable", "no uncertainty in the file, so no margin"];
     if (state.moving) return ["open", `… ${found}`, "of the last design"];
     if (!proof) return ["open", `✓ stable  ${found}`, "not proven yet: the proof follows"];
@@ -336,7 +343,7 @@ export async function mount(root, transport) {
   file.addEventListener("input", () => { replace = false; saveButton.textContent = "Save"; saveNote.textContent = ""; });
 
   async function saveDesign() {
-    const answer = await transport.ask({ ask: "save", file: file.value, values: changes(), redesign: state.redesign, replace }).catch(() => ({ error: GONE }));
+    const answer = await transport.ask({ ask: "save", file: file.value, values: state.values, redesign: state.redesign, replace }).catch(() => ({ error: GONE }));
     if (answer.exists) {
       replace = true;
       saveNote.textContent = `${answer.exists.join(", ")} exists.`;
