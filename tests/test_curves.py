@@ -65,6 +65,21 @@ def test_an_unstable_plant_has_a_margin_on_both_sides() -> None:
     assert (found.encirclements, found.unstable_poles) == (1, 1)
 
 
+def test_a_weak_integrator_crosses_far_below_the_poles() -> None:
+    """k / (s (s + 1)) has |L| = 1 at k and 90 degrees there, however small k is."""
+    found = loop_curves(1e-9 / (s * (s + 1))).margins[0]
+    assert found.phase_frequency == pytest.approx(1e-9, rel=1e-6)
+    assert found.phase == pytest.approx(math.pi / 2, rel=1e-6)
+    assert found.delay == pytest.approx(math.pi / 2 * 1e9, rel=1e-6)
+
+
+def test_a_pole_on_the_axis_is_no_crossing() -> None:
+    """Im L changes its sign through infinity at s = j; the poles of s^2 + 1 + k (s + 0.5) / 5 decay for every k > 0."""
+    found = loop_curves(0.2 * (s + 0.5) / (s**2 + 1)).margins[0]
+    assert found.gain == (0.0, math.inf)
+    assert not found.phase_crossings
+
+
 def test_the_gain_margin_of_a_sampled_loop_may_lie_at_the_nyquist_frequency() -> None:
     found = loop_curves(control.tf([0.8], [1, -1], 0.01)).margins[0]  # |1 - 0.8 k| < 1
     assert found.gain[1] == pytest.approx(2.5, rel=1e-9)

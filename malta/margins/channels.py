@@ -86,7 +86,7 @@ def find_crossings(see: See, seen: Seen) -> tuple[list[list[Crossing]], list[lis
         k, i, phase = np.array(rows).T
         w, values = _false_position(see, seen, k, i, phase == 1)
         for at, value, channel, of_phase in zip(w.tolist(), values.tolist(), i, phase, strict=True):
-            if not of_phase or value.real < 0:
+            if not math.isnan(at) and (not of_phase or value.real < 0):
                 found[of_phase][0][channel].append(Crossing(at, value))
     return found[0][0], found[1][0]
 
@@ -94,7 +94,10 @@ def find_crossings(see: See, seen: Seen) -> tuple[list[list[Crossing]], list[lis
 def _false_position(
     see: See, seen: Seen, k: FloatArray, i: FloatArray, phase: FloatArray
 ) -> tuple[FloatArray, ComplexArray]:
-    """Roots of log|l_i|, or of Im l_i where `phase`, in the intervals k of the grid (Illinois); and l there."""
+    """Roots of log|l_i|, or of Im l_i where `phase`, in the intervals k of the grid (Illinois); and l there.
+
+    NaN where the sign changes at a pole on the axis: there the measure grows instead of vanishing.
+    """
 
     def measure(values: ComplexArray) -> FloatArray:
         return np.where(phase, values.imag, np.log(np.abs(values)))
@@ -102,6 +105,7 @@ def _false_position(
     rows = np.arange(len(k))
     a, b = np.log(seen.w[k]), np.log(seen.w[k + 1])
     f, g = measure(seen.loop[k, i]), measure(seen.loop[k + 1, i])
+    largest = np.maximum(np.abs(f), np.abs(g))
     kept = np.zeros(len(k))  # the end that stayed: -1 a, 1 b
     for _ in range(STEPS):
         x = np.where(f == g, (a + b) / 2, b - g * (b - a) / np.where(f == g, 1, g - f))
@@ -111,7 +115,7 @@ def _false_position(
         g = np.where(left & (kept == 1), g / 2, np.where(left, g, h))
         f = np.where(~left & (kept == -1), f / 2, np.where(left, h, f))
         a, b, kept = np.where(left, x, a), np.where(left, b, x), np.where(left, 1.0, -1.0)
-    return np.exp(x), values
+    return np.where(np.abs(h) > largest, np.nan, np.exp(x)), values
 
 
 def find_tops(see: See, seen: Seen, measure: Callable[[Seen], FloatArray]) -> tuple[FloatArray, FloatArray]:

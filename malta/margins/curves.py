@@ -45,6 +45,8 @@ MOST = 90  # frequencies that a round may add
 AROUND = np.array([-4.0, -2.0, -1.0, -0.5, 0.5, 1.0, 2.0, 4.0])  # half-widths of a resonance
 LIGHT = 0.5  # damping below which a pole makes a resonance
 STILL = 1e-7  # of the fastest rate: poles that count as zero
+BELOW = 1e-12  # of the lowest frequency: as far as gain crossings are looked for
+FAR_BELOW = 13  # frequencies from there to the lowest
 HUGE = 1e9  # times the fastest rate: zeros that count as infinite
 
 
@@ -260,7 +262,7 @@ def _diagonal(G: ComplexArray) -> ComplexArray:
 
 def _refined(loop: LinearLoop) -> LoopCurves:
     """The curves on a grid that is finer where they turn."""
-    found = respond(loop, _grid(loop))
+    found = _to_crossings(loop, respond(loop, _grid(loop)))
     for _ in range(ROUNDS):
         parts = [found.alone("sensors"), found.alone("forces"), _diagonal(found.S)]
         with np.errstate(all="ignore"):
@@ -276,6 +278,17 @@ def _refined(loop: LinearLoop) -> LoopCurves:
             break
         found = _merged(found, respond(loop, np.sqrt(found.w[k] * found.w[k + 1])))
     return LoopCurves(loop, found)
+
+
+def _to_crossings(loop: LinearLoop, found: Responses) -> Responses:
+    """The same with frequencies to a gain crossing far below, as of a weak integrator beside fast poles."""
+    w = found.w[0] * np.geomspace(BELOW, 1.0, FAR_BELOW)
+    far = respond(loop, w)
+    above = np.abs(np.concatenate([far.alone("sensors"), far.alone("forces")], axis=1)) > 1
+    crossed = np.flatnonzero((above[1:] != above[:-1]).any(axis=1))
+    if not len(crossed):
+        return found
+    return _merged(found, respond(loop, np.geomspace(w[crossed[0]], w[-1], BASE)[:-1]))
 
 
 def _merged(one: Responses, other: Responses) -> Responses:
