@@ -171,7 +171,7 @@ def test_the_newest_move_wins(tmp_path: Path) -> None:
     client = Client(copied(tmp_path), tmp_path)
     assert client.ask("evaluate", number=5, values={})["stable"]
     assert client.ask("evaluate", number=4, values={"pid.Kp.F_x": 700.0}) == {"number": 4, "stale": True}
-    assert client.session.unsaved() == []
+    assert client.session.unsaved_changes() == []
 
 
 @pytest.mark.slow
@@ -279,7 +279,7 @@ def test_saving_asks_before_it_replaces(tmp_path: Path) -> None:
     assert asked == {"exists": ["design/halbach_pid.toml"]}
     saved = client.ask("save", file="design/halbach_pid.toml", values=values, replace=True)
     assert saved["written"] == ["design/halbach_pid.toml"]
-    assert client.session.unsaved() == []
+    assert client.session.unsaved_changes() == []
     fields = {f["key"]: f["value"] for f in saved["open"]["fields"]}
     assert fields["pid.Kp.F_x"] == 650.0
 

@@ -138,13 +138,13 @@ def test_gain_margins_bound_the_stable_factors(seed: int) -> None:
                 for shift, stable in ((1e-4 * side, True), (-1e-4 * side, False)):
                     factors = np.ones(2)
                     factors[i] = factor * (1 + shift)
-                    poles = curves.loop.poles_of(curves.loop.closed(factors, "sensors").A)
+                    poles = curves.loop.poles_of(curves.loop.closed_loop(factors, "sensors").A)
                     assert (poles.real.max() < 0) == stable
         low, high = max(margins.gain[0], 0.02), min(margins.gain[1], 50)
         for factor in np.geomspace(low * 1.001, high * 0.999, 9):
             factors = np.ones(2)
             factors[i] = factor
-            assert curves.loop.poles_of(curves.loop.closed(factors, "sensors").A).real.max() < 0
+            assert curves.loop.poles_of(curves.loop.closed_loop(factors, "sensors").A).real.max() < 0
 
 
 def test_the_delay_margin_ends_stability() -> None:

@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 from conftest import ROOT
-from docstrings import restructured
+from docstrings import to_rest
 from links import broken_links
 from public import all_names, docstring_of, names_of
 from typer.main import get_command
@@ -101,7 +101,7 @@ a, b : sizes of |S|
 >>> 1 + 1
 2
 """
-    found = "\n".join(restructured(text.splitlines(), ["malta.verify"]))
+    found = "\n".join(to_rest(text.splitlines(), ["malta.verify"]))
     assert ".. code-block:: none\n\n    x' = A x\n" in found
     assert ":param a,b: sizes of \\|S\\|\n    in each axis\n" in found
     assert ":py:obj:`malta.verify <malta.verify>`" in found

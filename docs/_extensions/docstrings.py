@@ -14,12 +14,12 @@ ENTRY = re.compile(r"(?P<names>\*{0,2}[A-Za-z_]\w*(?:, [A-Za-z_]\w*)*) : (?P<tex
 CODE = re.compile(r"(?<![`\w])`([^`\n]+)`(?!`)")
 
 
-def restructured(lines: Iterable[str], public: Iterable[str]) -> list[str]:
+def to_rest(lines: Iterable[str], public: Iterable[str]) -> list[str]:
     """Convert the lines of a docstring; links are made to names that are public."""
     known = frozenset(public)
     found: list[str] = []
     for block in _blocks(lines):
-        found += [*_converted(block, known), ""]
+        found += [*_convert(block, known), ""]
     return found
 
 
@@ -49,7 +49,7 @@ def _kind(line: str, before: str | None) -> str:
     return "equation" if line.startswith("    ") else "text"
 
 
-def _converted(block: list[str], known: frozenset[str]) -> list[str]:
+def _convert(block: list[str], known: frozenset[str]) -> list[str]:
     kind = _kind(block[0], None)
     if kind == "example":
         return block
@@ -59,10 +59,10 @@ def _converted(block: list[str], known: frozenset[str]) -> list[str]:
         return [_field(line, known) for line in block]
     if len(block) == 2 and set(block[1]) == {"-"}:  # the underlined word above entries
         return []
-    return [text for line in _joined(block) for text in [_marked(line, known)]]
+    return [text for line in _join_lines(block) for text in [_mark_names(line, known)]]
 
 
-def _joined(block: list[str]) -> list[str]:
+def _join_lines(block: list[str]) -> list[str]:
     """Lines of a paragraph, so that code in backticks does not end with its line."""
     return [" ".join(line.strip() for line in block)]
 
@@ -70,18 +70,18 @@ def _joined(block: list[str]) -> list[str]:
 def _field(line: str, known: frozenset[str]) -> str:
     entry = ENTRY.match(line)
     if entry is None:
-        return _marked(line, known)
-    names = _escaped(entry["names"].replace(" ", ""))  # what follows a space would be a type
-    return f":param {names}: {_marked(entry['text'], known)}"
+        return _mark_names(line, known)
+    names = _escape(entry["names"].replace(" ", ""))  # what follows a space would be a type
+    return f":param {names}: {_mark_names(entry['text'], known)}"
 
 
-def _marked(text: str, known: frozenset[str]) -> str:
+def _mark_names(text: str, known: frozenset[str]) -> str:
     """Text with its code marked and its other characters taken as they are."""
     parts = CODE.split(text)
-    return "".join(_link(part, known) if k % 2 else _escaped(part) for k, part in enumerate(parts))
+    return "".join(_link(part, known) if k % 2 else _escape(part) for k, part in enumerate(parts))
 
 
-def _escaped(text: str) -> str:
+def _escape(text: str) -> str:
     return re.sub(r"([\\*|_`])", r"\\\1", text)
 
 

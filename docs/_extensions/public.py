@@ -80,7 +80,7 @@ def _tree(module: ModuleType) -> ast.Module:
 def public_names(module: ModuleType) -> list[str]:
     """List the names that a module offers: what it passes on, and what it defines."""
     names = [alias for alias, _ in _passed_on(module)]
-    names += [name for node in _tree(module).body for name in _defined(node)]
+    names += [name for node in _tree(module).body for name in _defined_names(node)]
     return [name for name in dict.fromkeys(names) if not name.startswith("_")]
 
 
@@ -90,7 +90,7 @@ def _passed_on(module: ModuleType) -> list[tuple[str, str]]:
     return [(a.name, str(node.module)) for node in imports for a in node.names if a.asname == a.name]
 
 
-def _defined(node: ast.stmt) -> list[str]:
+def _defined_names(node: ast.stmt) -> list[str]:
     """The names that a statement of a module defines."""
     if isinstance(node, ast.FunctionDef | ast.ClassDef):
         return [node.name]
@@ -102,7 +102,11 @@ def _defined(node: ast.stmt) -> list[str]:
 def _text_below(module: ModuleType, name: str) -> str:
     """The string below the assignment of a constant, in this module or in the one that it comes from."""
     for node, after in pairwise(_tree(module).body):
-        if name in _defined(node) and isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant):
+        if (
+            name in _defined_names(node)
+            and isinstance(after, ast.Expr)
+            and isinstance(after.value, ast.Constant)
+        ):
             return inspect.cleandoc(str(after.value.value))
     sources = dict(_passed_on(module))
     return _text_below(importlib.import_module(sources[name]), name) if name in sources else ""

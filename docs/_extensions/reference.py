@@ -14,7 +14,7 @@ import os
 import re
 from typing import TYPE_CHECKING, Any
 
-from docstrings import restructured
+from docstrings import to_rest
 from docutils import nodes
 from public import all_names, docstring_of, names_of, summary_of, value_of
 from sphinx import addnodes
@@ -26,7 +26,7 @@ import malta
 from malta.cli.documents.published import ALL_SCHEMAS, MODELS
 from malta.cli.main import app as program
 from malta.files import json_text
-from malta.schemas.parts import changed, without_null
+from malta.schemas.parts import change_nodes, without_null
 from malta.synthesis.design_tables import specification_record
 from malta.synthesis.requirements import GENERIC, requirements_for
 
@@ -48,16 +48,16 @@ class PublicNames(SphinxDirective):
         names = names_of(self.arguments[0])
         for name in names:
             link = f":py:obj:`{name.removeprefix('malta.')} <{name}>`"
-            first = " ".join(restructured([summary_of(name)], all_names()))
+            first = " ".join(to_rest([summary_of(name)], all_names()))
             lines += [f"   * - {link}", f"     - {first}"]
         for name in names:
-            lines += ["", *_described(name)]
+            lines += ["", *_describe(name)]
         lines += ["```"]
         found: list[nodes.Node] = self.parse_text_to_nodes("\n".join(lines))
         return found
 
 
-def _described(name: str) -> list[str]:
+def _describe(name: str) -> list[str]:
     """The directive that documents a public name."""
     value = value_of(name)
     if inspect.isclass(value):
@@ -65,7 +65,7 @@ def _described(name: str) -> list[str]:
         return [f".. autoclass:: {name}", "   :members:", f"   :exclude-members: {fields}"]
     if inspect.isroutine(value):
         return [f".. autofunction:: {name}"]
-    text = restructured(docstring_of(name).splitlines(), all_names())
+    text = to_rest(docstring_of(name).splitlines(), all_names())
     return [f".. py:data:: {name}", "", *(f"   {line}" for line in text)]
 
 
@@ -154,7 +154,7 @@ class Requirements(SphinxDirective):
         if self.arguments:
             known = requirements_for(malta.plant_of(malta.read(self.arguments[0])))
             wanted = {name: one for name, one in known.items() if wanted.get(name) is not one}
-        table = changed(specification_record(wanted.values()).model_json_schema(), without_null)
+        table = change_nodes(specification_record(wanted.values()).model_json_schema(), without_null)
         table["required"] = [*table["properties"]]  # each of them may be left out, which is not said of each
         places = {name: place for name, place, _ in tables_of(ALL_SCHEMAS["design"]())}
         found: list[nodes.Node] = self.parse_text_to_nodes("\n".join(_rows(table, "design", places)))
@@ -239,7 +239,7 @@ def _range(entry: dict[str, Any]) -> str:
 
 def convert(_app: Sphinx, _what: str, _name: str, _value: object, _options: object, lines: list[str]) -> None:
     """Make reStructuredText of a docstring, in place, as autodoc asks for it."""
-    lines[:] = restructured(lines, all_names())
+    lines[:] = to_rest(lines, all_names())
 
 
 def resolve(_app: Sphinx, _env: BuildEnvironment, node: Any, text: Any) -> Any:

@@ -89,7 +89,7 @@ def _law_fields(files: DesignFiles) -> Iterator[Field]:
     variables = {entry: v for v in files.spec.search for entry in v.entries}
     for table in ("weights", "bases", "noise", "pid"):
         for path, entries in _tables(files.content.get(table, {}), table):
-            for name, entry in (files.expanded(path) if entries is None else entries).items():
+            for name, entry in (files.expand(path) if entries is None else entries).items():
                 key = f"{path}.{name}"
                 value, unit = (entry["value"], entry["unit"]) if isinstance(entry, Mapping) else (entry, "")
                 variable = variables.get(key)

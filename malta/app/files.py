@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from malta.app.fields import MACHINE, Field, check_value, fields_of
 from malta.errors import InputError
 from malta.model.parameters import check_range
-from malta.synthesis.design_file import resolved, spec_of
+from malta.synthesis.design_file import resolve_published, spec_of
 from malta.synthesis.spec import integral_signals
 from malta.tables import load_toml
 from malta.units import to_si
@@ -70,14 +70,14 @@ class DesignFiles:
     @cached_property
     def content(self) -> dict[str, Any]:
         """The design file with its published numbers."""
-        return resolved(self.raw, self.path)
+        return resolve_published(self.raw, self.path)
 
     @cached_property
     def fields(self) -> dict[str, Field]:
         """What can be edited, by key."""
         return {f.key: f for f in fields_of(self)}
 
-    def expanded(self, table: str) -> dict[str, Any]:
+    def expand(self, table: str) -> dict[str, Any]:
         """A table that stands as "SI" or as a published one, with an entry for every signal."""
         node: Any = self.content
         for name in table.split("."):
@@ -175,7 +175,7 @@ def set_entry(content: Any, key: str, value: Value, files: DesignFiles) -> None:
     node: Any = content
     for k, table in enumerate(tables):
         if not isinstance(node[table], Mapping) or "published" in node[table]:
-            node[table] = files.expanded(".".join(tables[: k + 1]))
+            node[table] = files.expand(".".join(tables[: k + 1]))
         node = node[table]
     if isinstance(node.get(name), Mapping):
         node[name]["value"] = value

@@ -147,11 +147,11 @@ def _frequency(curves: LoopCurves) -> dict[str, Any]:
     alone = responses.alone("sensors")
     S, T = (np.abs(np.einsum("kii->ki", G)).T[rows] for G in (responses.S, responses.T))
     return {
-        "w": rounded(w),
+        "w": round_values(w),
         "sensors": [s.name for s in curves.loop.outputs],
-        "S": rounded(S),
-        "T": rounded(T),
-        "L": rounded(np.stack([alone.T.real, alone.T.imag], axis=1)),
+        "S": round_values(S),
+        "T": round_values(T),
+        "L": round_values(np.stack([alone.T.real, alone.T.imag], axis=1)),
     }
 
 
@@ -168,8 +168,8 @@ def run_document(problem: Problem, view: View) -> dict[str, Any] | None:
 def curves(name: str, t: FloatArray, reference: FloatArray, p: FloatArray, v: FloatArray) -> dict[str, Any]:
     """A run as the page draws it: every so many samples of it, by output and by input."""
     step = -(-len(t) // POINTS)
-    rows = [rounded(np.asarray(series)[::step].T) for series in (reference, p, v)]
-    return {"name": name, "t": rounded(t[::step]), "reference": rows[0], "p": rows[1], "v": rows[2]}
+    rows = [round_values(np.asarray(series)[::step].T) for series in (reference, p, v)]
+    return {"name": name, "t": round_values(t[::step]), "reference": rows[0], "p": rows[1], "v": rows[2]}
 
 
 def _load(problem: Problem, view: View) -> dict[str, Any] | None:
@@ -185,7 +185,12 @@ def _load(problem: Problem, view: View) -> dict[str, Any] | None:
     end = max(1.3 * float(ends.max(initial=0.0)), 20 * problem.controller.sample_time)
     t = np.linspace(0.0, min(end, float(answer.t[-1])), LOAD_POINTS)
     y = np.array([np.interp(t, answer.t, row) for row in one.y[..., 0].T])
-    return {"name": names[k], "t": rounded(t), "y": rounded(y), "largest": rounded(one.largest[:, 0])}
+    return {
+        "name": names[k],
+        "t": round_values(t),
+        "y": round_values(y),
+        "largest": round_values(one.largest[:, 0]),
+    }
 
 
 def _margin(problem: Problem, first: int | None) -> dict[str, Any] | None:
@@ -280,7 +285,7 @@ def _worst_by_unit(label: str, values: FloatArray, signals: Sequence[Any]) -> li
     ]
 
 
-def rounded(values: Any) -> list[Any]:
+def round_values(values: Any) -> list[Any]:
     """Numbers with DIGITS digits, as lists; what is not finite becomes None."""
     x = np.asarray(values, dtype=float)
     finite = np.isfinite(x)

@@ -172,7 +172,7 @@ class Session:
 
         Refused while something is unsaved.
         """
-        if self.unsaved():
+        if self.unsaved_changes():
             raise InputError(
                 "gain files", "design", "changes that are not saved", "a design file that is saved"
             )
@@ -188,7 +188,7 @@ class Session:
         except TakenError as taken:
             return {"exists": taken.files}
 
-    def unsaved(self) -> list[str]:
+    def unsaved_changes(self) -> list[str]:
         """The entries that differ from the file; parameters that the machine alone has are no part of the design."""
         edit = self.edit
         return list(edit.values) if edit.redesign else list(edit.design)

@@ -45,11 +45,11 @@ def replies(problem: Problem, truth: Edited, message: Message, newer: Newer) -> 
     if message["margin"] and problem.spec.uncertainty:
         loops, over = travel_loops(problem.plant, problem.controller, tuple(problem.spec.uncertainty))
         yield {"kind": "margin"} | margin_document(ray_bound(loops, problem.spec.uncertainty, over))
-    yield _simulated(problem, View(run=message["run"]))
+    yield _simulate(problem, View(run=message["run"]))
     yield from _requirements(problem, truth)
 
 
-def _simulated(problem: Problem, view: View) -> dict[str, Any]:
+def _simulate(problem: Problem, view: View) -> dict[str, Any]:
     """The chosen run by the nonlinear simulation."""
     try:
         name, planned = planned_run(problem.plant, problem.controller, view.run)

@@ -85,7 +85,7 @@ def _design_file(named: Path | None) -> Path:
 
 def _farewell(session: Session) -> str:
     """What Ctrl-C left unsaved, in one sentence."""
-    unsaved = session.unsaved()
+    unsaved = session.unsaved_changes()
     name = session.files.path.name
     if not unsaved:
         return f"ended; {name} holds all that was changed"

@@ -160,7 +160,7 @@ def working(what: str, *, insists: bool = True) -> Iterator[Work]:
     """
     work = Work(what, insists=insists)
     thread = Thread(target=work.attend, daemon=True)
-    with watch_interrupts() as work.pressed, _drawn(work) if sys.stderr.isatty() else nullcontext():
+    with watch_interrupts() as work.pressed, _draw_bar(work) if sys.stderr.isatty() else nullcontext():
         thread.start()
         try:
             yield work
@@ -170,7 +170,7 @@ def working(what: str, *, insists: bool = True) -> Iterator[Work]:
 
 
 @contextmanager
-def _drawn(work: Work) -> Iterator[None]:
+def _draw_bar(work: Work) -> Iterator[None]:
     """Draw a bar for work on a terminal: it pulses until the first report, then has the time left."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn

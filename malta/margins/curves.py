@@ -153,7 +153,7 @@ class LoopCurves:
         more = np.concatenate([below, above])
         if not len(more):
             return self
-        return LoopCurves(self.loop, _merged(self.responses, respond(self.loop, more)))
+        return LoopCurves(self.loop, _merge(self.responses, respond(self.loop, more)))
 
     @cached_property
     def margins(self) -> tuple[ChannelMargins, ...]:
@@ -221,7 +221,7 @@ def loop_curves(
     loop = linear_loop(source, controller, name=name, position=position)
     if w is not None:
         return LoopCurves(loop, respond(loop, np.asarray(w, dtype=float)))
-    return _refined(loop)
+    return _refine(loop)
 
 
 @on_one_thread
@@ -260,7 +260,7 @@ def _diagonal(G: ComplexArray) -> ComplexArray:
     return np.asarray(np.einsum("kii->ki", G))
 
 
-def _refined(loop: LinearLoop) -> LoopCurves:
+def _refine(loop: LinearLoop) -> LoopCurves:
     """The curves on a grid that is finer where they turn."""
     found = _to_crossings(loop, respond(loop, _grid(loop)))
     for _ in range(ROUNDS):
@@ -276,7 +276,7 @@ def _refined(loop: LinearLoop) -> LoopCurves:
         k = np.sort(widest[coarse[widest] > TURN])
         if not len(k):
             break
-        found = _merged(found, respond(loop, np.sqrt(found.w[k] * found.w[k + 1])))
+        found = _merge(found, respond(loop, np.sqrt(found.w[k] * found.w[k + 1])))
     return LoopCurves(loop, found)
 
 
@@ -288,10 +288,10 @@ def _to_crossings(loop: LinearLoop, found: Responses) -> Responses:
     crossed = np.flatnonzero((above[1:] != above[:-1]).any(axis=1))
     if not len(crossed):
         return found
-    return _merged(found, respond(loop, np.geomspace(w[crossed[0]], w[-1], BASE)[:-1]))
+    return _merge(found, respond(loop, np.geomspace(w[crossed[0]], w[-1], BASE)[:-1]))
 
 
-def _merged(one: Responses, other: Responses) -> Responses:
+def _merge(one: Responses, other: Responses) -> Responses:
     """Both responses in the order of frequency."""
     order = np.argsort(np.concatenate([one.w, other.w]), kind="stable")
     return Responses(*(np.concatenate(pair)[order] for pair in zip(one, other, strict=True)))

@@ -82,7 +82,7 @@ class LinearLoop:
         T, s = self.sample_time, 1j * np.asarray(w, dtype=float)
         return np.asarray(s if T is None else np.expm1(s * T) / T)
 
-    def closed(self, factors: FloatArray | None = None, at: Place = "forces") -> System:
+    def closed_loop(self, factors: FloatArray | None = None, at: Place = "forces") -> System:
         """The closed loop from references and loads to the true outputs.
 
         factors : of the loop gain, one for each channel at the sensors or at the forces; 0 opens a channel
@@ -134,7 +134,7 @@ class LinearLoop:
         eigenvalue, and a millionth of its frequency. Integrators, which scatter about zero when several are in
         series, and undamped oscillators count as stable.
         """
-        system, T = self.closed(factors, at), self.sample_time
+        system, T = self.closed_loop(factors, at), self.sample_time
         A = system.A
         found = eigenvalues(A) if len(A) else np.zeros(0, dtype=complex)
         if not (self._growth(found) > 0).any():
@@ -156,7 +156,7 @@ class LinearLoop:
     @cached_property
     def closed_poles(self) -> ComplexArray:
         """The poles of the closed loop, rad/s."""
-        return self.poles_of(self.closed().A)
+        return self.poles_of(self.closed_loop().A)
 
     @cached_property
     def stable(self) -> bool:
@@ -199,7 +199,7 @@ def linear_loop(
 def _of_machine(plant: Plant, controller: Controller, name: str, position: float | None) -> LinearLoop:
     pushed = PushedLoop.of(plant, controller, position)
     loop, law, T = pushed.loop, pushed.loop.control, pushed.loop.sample_time
-    driven, command = _commanded(controller, law)
+    driven, command = _commanded_system(controller, law)
     outputs = loop.Cd if loop.true is None else np.vstack([loop.Cd, loop.true])
     into = np.hstack([loop.Bd, pushed.pushed]) / T
     return LinearLoop(
@@ -214,7 +214,7 @@ def _of_machine(plant: Plant, controller: Controller, name: str, position: float
     )
 
 
-def _commanded(c: Controller, law: LinearLaw) -> tuple[System, tuple[FloatArray, FloatArray]]:
+def _commanded_system(c: Controller, law: LinearLaw) -> tuple[System, tuple[FloatArray, FloatArray]]:
     """The law from readings, and what a unit reference adds to its states and to its outputs.
 
     The reference of a stored force is as old as the force: the law gets the references of the last samples as states

@@ -92,7 +92,7 @@ def root_locus(
         )
     most = MOST_OF_GAIN if parameter == GAIN else MOST
     first = _values(low, high, nominal, wide=parameter == GAIN)
-    values, found = _followed(_counted(matrix, most, progress), first, most, loop.sample_time)
+    values, found = _follow_branches(_count_calls(matrix, most, progress), first, most, loop.sample_time)
     return RootLocus(
         loop.name,
         parameter,
@@ -110,19 +110,19 @@ def root_locus(
 Matrix = Callable[[float], "ComplexArray"]  # of a value: the eigenvalues of the closed loop, in differences
 
 
-def _counted(matrix: Matrix, most: int, progress: Callable[[float], None] | None) -> Matrix:
+def _count_calls(matrix: Matrix, most: int, progress: Callable[[float], None] | None) -> Matrix:
     """The same function, which says after each new value how many of at most `most` there were."""
     if progress is None:
         return matrix
     seen: set[float] = set()
 
-    def counted(value: float) -> ComplexArray:
+    def call(value: float) -> ComplexArray:
         found = matrix(value)
         seen.add(value)
         progress(min(len(seen) / most, 1.0))
         return found
 
-    return counted
+    return call
 
 
 def _family(
@@ -135,7 +135,7 @@ def _family(
         if channel is not None and channel not in names:
             raise InputError("root locus", "channel", repr(channel), "one of " + " ".join(names))
         chosen = np.array([channel in (None, name) for name in names])
-        return cache(lambda k: eigenvalues(loop.closed(np.where(chosen, k, 1.0), at).A)), 1.0, "1"
+        return cache(lambda k: eigenvalues(loop.closed_loop(np.where(chosen, k, 1.0), at).A)), 1.0, "1"
     plant, law = source if isinstance(source, tuple) else (source, controller)
     if not isinstance(plant, Plant):
         raise InputError(
@@ -152,7 +152,7 @@ def _of_machine(plant: Plant, controller: Controller, parameter: str, value: flo
     """The eigenvalues with another value of a parameter; the controller stays."""
     try:
         changed = plant_of(replace(plant.parameters, **{parameter: value}))
-        return eigenvalues(linear_loop(changed, controller).closed().A)
+        return eigenvalues(linear_loop(changed, controller).closed_loop().A)
     except InputError as error:
         raise InputError("root locus", parameter, f"{value:g}", error.expected) from error
     except CheckError as error:
@@ -172,7 +172,7 @@ def _values(low: float, high: float, nominal: float, *, wide: bool) -> FloatArra
     return np.unique(np.append(values, nominal)) if low < nominal < high else values
 
 
-def _followed(
+def _follow_branches(
     matrix: Matrix, values: FloatArray, most: int, T: float | None
 ) -> tuple[FloatArray, ComplexArray]:
     """All samples with their eigenvalues in the order of the branches; intervals are halved where poles move far."""

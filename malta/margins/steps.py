@@ -50,13 +50,13 @@ def loop_steps(loop: LinearLoop) -> LoopSteps:
     >>> round(step_figures(answer, 0, 0).overshoot, 3)
     0.444
     """
-    system, T = loop.closed(), loop.sample_time
-    M, g, dt = _sampled(loop, system, T)
+    system, T = loop.closed_loop(), loop.sample_time
+    M, g, dt = _sample_system(loop, system, T)
     if loop.stable:
         found = step_response(M, g, system.C, dt)
         found = StepResponse(found.t, found.y + system.D, found.final + system.D)
     else:
-        found = _followed(loop, M, g, system, dt)
+        found = _respond_for_a_while(loop, M, g, system, dt)
     p = len(loop.outputs)
     return LoopSteps(
         StepResponse(found.t, found.y[..., :p], found.final[:, :p]),
@@ -64,7 +64,7 @@ def loop_steps(loop: LinearLoop) -> LoopSteps:
     )
 
 
-def _sampled(loop: LinearLoop, system: System, T: float | None) -> tuple[FloatArray, FloatArray, float]:
+def _sample_system(loop: LinearLoop, system: System, T: float | None) -> tuple[FloatArray, FloatArray, float]:
     """The closed loop from sample to sample: M, g and the time between samples."""
     if T is not None:
         return np.eye(len(system.A)) + T * system.A, T * system.B, T
@@ -72,7 +72,9 @@ def _sampled(loop: LinearLoop, system: System, T: float | None) -> tuple[FloatAr
     return *sample(system.A, system.B, FAST / fastest), FAST / fastest
 
 
-def _followed(loop: LinearLoop, M: FloatArray, g: FloatArray, system: System, dt: float) -> StepResponse:
+def _respond_for_a_while(
+    loop: LinearLoop, M: FloatArray, g: FloatArray, system: System, dt: float
+) -> StepResponse:
     """The answer of an unstable loop over a finite time."""
     growth = max(float(loop.closed_poles.real.max()), 1e-3 * float(np.abs(loop.closed_poles).max()))
     stride = max(1, round(math.log(GROWN) / growth / dt / SAMPLES))
@@ -99,7 +101,7 @@ def step_figures(answer: StepResponse, output: int, column: int) -> StepFigures:
     returns = abs(final) < 1e-6 * max(largest, 1e-300)
     band = SETTLED * (largest if returns else abs(final))
     outside = np.flatnonzero(np.abs(y - final) > band)
-    settling = 0.0 if not len(outside) else _settled(t, np.abs(y - final), band, int(outside[-1]))
+    settling = 0.0 if not len(outside) else _settling_time(t, np.abs(y - final), band, int(outside[-1]))
     if returns:
         return StepFigures(nan, nan, settling, peak, float(t[k]), final)
     share = y / final
@@ -118,7 +120,7 @@ def _first(t: FloatArray, share: FloatArray, level: float) -> float:
     return float(t[k - 1] + (t[k] - t[k - 1]) * (level - share[k - 1]) / (share[k] - share[k - 1]))
 
 
-def _settled(t: FloatArray, away: FloatArray, band: float, last: int) -> float:
+def _settling_time(t: FloatArray, away: FloatArray, band: float, last: int) -> float:
     """When a deviation enters its band for good, between samples; infinite where it ends outside."""
     if last + 1 >= len(t):
         return math.inf

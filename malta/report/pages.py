@@ -126,7 +126,7 @@ def front(tuned: Tuned, path: str | Path | None = None) -> Figure:
     >>> figure.axes[0].get_xlabel()
     'proven margin [% of the box]'
     """
-    return _saved(front_figure(tuned), path)
+    return _save_figure(front_figure(tuned), path)
 
 
 def stroke(run: Trajectory, path: str | Path | None = None, published: Published | None = None) -> Figure:
@@ -149,7 +149,7 @@ def stroke(run: Trajectory, path: str | Path | None = None, published: Published
     >>> [axes.get_ylabel() for axes in figure.axes]
     ['commanded force [N]', 'y, off reference [µm]', 'clearance used up [%]', '']
     """
-    return _saved(stroke_figure(run, published), path)
+    return _save_figure(stroke_figure(run, published), path)
 
 
 def experiment(e: Experiment, path: str | Path | None = None, published: Published | None = None) -> Figure:
@@ -172,7 +172,7 @@ def experiment(e: Experiment, path: str | Path | None = None, published: Publish
     >>> [axes.get_ylabel() for axes in figure.axes]
     ['commanded force [N]', 'y, off reference [µm]', 'clearance used up [%]', '']
     """
-    return _saved(experiment_figure(e, published), path)
+    return _save_figure(experiment_figure(e, published), path)
 
 
 def robustness(
@@ -205,7 +205,7 @@ def robustness(
     >>> figure.axes[0].get_xlabel()
     'proven margin without loads [% of the box]'
     """
-    return _saved(chain_figure(found, name, uncertainty, position, worst), path)
+    return _save_figure(chain_figure(found, name, uncertainty, position, worst), path)
 
 
 def loads(
@@ -233,7 +233,7 @@ def loads(
     ['deviation under 1 N [µm]', 'compliance [µm/N]']
     """
     found = recovery(plant, controller) if found is None else found
-    return _saved(recovery_figure(plant, controller, found), path)
+    return _save_figure(recovery_figure(plant, controller, found), path)
 
 
 def sensitivity(found: Sensitivity, path: str | Path | None = None) -> Figure:
@@ -257,7 +257,7 @@ def sensitivity(found: Sensitivity, path: str | Path | None = None) -> Figure:
     >>> figure.axes[0].get_ylabel()
     'share of the variance [-]'
     """
-    return _saved(sensitivity_figure(found), path)
+    return _save_figure(sensitivity_figure(found), path)
 
 
 class CampaignFigures(NamedTuple):
@@ -323,11 +323,11 @@ def campaign(
     summary = as_summary(found, Bounds(published))
     figures = CampaignFigures(distributions_figure(summary), yield_figure(summary), worst_figure(summary))
     for figure, name in zip(figures, CAMPAIGN_FILES, strict=True):
-        _saved(figure, None if folder is None else Path(folder) / name)
+        _save_figure(figure, None if folder is None else Path(folder) / name)
     return figures
 
 
-def _saved(figure: Figure, path: str | Path | None) -> Figure:
+def _save_figure(figure: Figure, path: str | Path | None) -> Figure:
     """The figure itself, saved where a path is given."""
     if path is not None:
         save(figure, path)

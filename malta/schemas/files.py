@@ -9,7 +9,7 @@ from pydantic import StrictStr, create_model
 from malta.gains.schema import GainFile
 from malta.model.data import MachineFile
 from malta.model.parameters import units_of
-from malta.schemas.parts import Schema, changed, named, schema_of, without_null
+from malta.schemas.parts import Schema, change_nodes, require_names, schema_of, without_null
 from malta.synthesis.design_file import LQG, ONLY_LQG
 from malta.synthesis.design_tables import AnyBound, DesignFile, specification_record
 from malta.synthesis.requirements import requirements_for
@@ -52,10 +52,10 @@ def design_schema(plant: Plant | None = None) -> Schema:
         bounds = specification_record(requirements_for(plant).values())
     known = DesignFile.model_fields["specification"]
     model = create_model("DesignFile", __base__=DesignFile, specification=(bounds | None, known))
-    schema = changed(schema_of(model, "malta design file"), without_null)
+    schema = change_nodes(schema_of(model, "malta design file"), without_null)
     if plant is not None:
         _name_signals(schema, plant)
-    schema = changed(schema, _or_published)
+    schema = change_nodes(schema, _or_published)
     schema["$defs"]["Published"] = PUBLISHED
     laws = {
         "if": {"required": ["pid"]},
@@ -70,7 +70,7 @@ def data_schema(plant: Plant | None = None) -> Schema:
 
     plant : the machine whose parameters the file names; None: any names
     """
-    schema = changed(schema_of(MachineFile, "malta data file"), without_null)
+    schema = change_nodes(schema_of(MachineFile, "malta data file"), without_null)
     if plant is not None:
         units = units_of(plant.parameters)
         entries = {name: {"$ref": "#/$defs/Sourced", "unit": unit} for name, unit in units.items()}
@@ -99,11 +99,13 @@ def _name_signals(schema: Schema, plant: Plant) -> None:
         properties = schema["$defs"][table]["properties"]
         for key, allowed in (complete | partial).items():
             if key in properties:
-                properties[key] = named(properties[key], allowed, all_of=key in complete)
+                properties[key] = require_names(properties[key], allowed, all_of=key in complete)
     whole = schema["properties"]
-    whole["operating_point"] = named(whole["operating_point"], [plant.stroke] if plant.has_stroke else [])
-    whole["pause"] = named(whole["pause"], outputs)
-    whole["uncertainty"] = named(whole["uncertainty"], units_of(plant.parameters))
+    whole["operating_point"] = require_names(
+        whole["operating_point"], [plant.stroke] if plant.has_stroke else []
+    )
+    whole["pause"] = require_names(whole["pause"], outputs)
+    whole["uncertainty"] = require_names(whole["uncertainty"], units_of(plant.parameters))
 
 
 def _or_published(node: Schema) -> Schema:

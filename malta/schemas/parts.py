@@ -13,20 +13,22 @@ Schema = dict[str, Any]
 
 def schema_of(model: type[BaseModel], title: str) -> Schema:
     """Make the schema of a table; its title replaces those that pydantic derives from names of Python."""
-    return {"$schema": DRAFT, "title": title} | changed(model.model_json_schema(by_alias=True), _untitled)
+    return {"$schema": DRAFT, "title": title} | change_nodes(
+        model.model_json_schema(by_alias=True), _drop_title
+    )
 
 
-def changed(node: Schema, change: Callable[[Schema], Schema]) -> Schema:
+def change_nodes(node: Schema, change: Callable[[Schema], Schema]) -> Schema:
     """Apply a change to a schema and all schemas in it, the innermost first."""
     node = dict(node)
     for key in ("$defs", "properties"):
         if key in node:
-            node[key] = {name: changed(inner, change) for name, inner in node[key].items()}
+            node[key] = {name: change_nodes(inner, change) for name, inner in node[key].items()}
     for key in ("additionalProperties", "items"):
         if isinstance(node.get(key), dict):
-            node[key] = changed(node[key], change)
+            node[key] = change_nodes(node[key], change)
     if "anyOf" in node:
-        node["anyOf"] = [changed(inner, change) for inner in node["anyOf"]]
+        node["anyOf"] = [change_nodes(inner, change) for inner in node["anyOf"]]
     return change(node)
 
 
@@ -42,13 +44,13 @@ def without_null(node: Schema) -> Schema:
     return rest[0] | node
 
 
-def named(node: Schema, names: Iterable[str], *, all_of: bool = False) -> Schema:
+def require_names(node: Schema, names: Iterable[str], *, all_of: bool = False) -> Schema:
     """Restrict the keys of a table with free keys to some names.
 
     all_of : each of the names has to stand in the table
     """
     if "anyOf" in node:
-        return node | {"anyOf": [named(inner, names, all_of=all_of) for inner in node["anyOf"]]}
+        return node | {"anyOf": [require_names(inner, names, all_of=all_of) for inner in node["anyOf"]]}
     if not isinstance(node.get("additionalProperties"), dict):
         return node
     properties = dict.fromkeys(names, node["additionalProperties"])
@@ -56,6 +58,6 @@ def named(node: Schema, names: Iterable[str], *, all_of: bool = False) -> Schema
     return node | {"properties": properties, "additionalProperties": False} | needed
 
 
-def _untitled(node: Schema) -> Schema:
+def _drop_title(node: Schema) -> Schema:
     """A schema without the title that repeats its name."""
     return {key: value for key, value in node.items() if key != "title"}

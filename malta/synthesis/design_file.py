@@ -82,7 +82,7 @@ def read_design(
     path = locate(path)
     raw = load_toml(path)
     if entries:  # also those within a table that is published
-        raw = _with_entries(resolved(raw, path), entries, path)
+        raw = _with_entries(resolve_published(raw, path), entries, path)
     return spec_of(raw, path, parameters or None)
 
 
@@ -95,7 +95,7 @@ def machine_file_of(raw: Mapping[str, Any], path: Path) -> Path:
     return Path(os.path.normpath(path.parent / machine))
 
 
-def resolved(raw: Mapping[str, Any], path: Path) -> dict[str, Any]:
+def resolve_published(raw: Mapping[str, Any], path: Path) -> dict[str, Any]:
     """The content of a design file with the published numbers in the place of every `{ published = "..." }`.
 
     Raises InputError for a reference to what is not published.
@@ -117,7 +117,7 @@ def spec_of(
     Raises InputError as `read_design`.
     """
     machine_file = machine_file_of(raw, path)
-    content = validate(DesignFile, resolved(raw, path), path)
+    content = validate(DesignFile, resolve_published(raw, path), path)
     _require_law(content, raw, path)
     if isinstance(parameters, Mapping):
         par = read(machine_file, content.preset)

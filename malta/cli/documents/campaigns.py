@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import Field
 
-from malta.cli.documents.parts import Files, Number, Part, ShareOfRuns, keyed, share_of, words_of
+from malta.cli.documents.parts import Files, Number, Part, ShareOfRuns, share_of, with_keys, words_of
 from malta.identifiers import distinct, identifier
 
 if TYPE_CHECKING:
@@ -215,7 +215,7 @@ def runs_fields(found: Summary, worst: int) -> dict[str, Any]:
         "share": share_of(completed),
         "within_published": None if within is None else within.passed,
         "within_specification": None if specified is None else specified.passed,
-        "ends": keyed(found.ends),
+        "ends": with_keys(found.ends),
         "percentiles": PercentilesPart(exact=found.exact, relative_error=error),
         "merits": {name: _distribution(m) for name, m in zip(names, found.merits, strict=True)},
         "worst": [_run_part(found, runs, row) for row in range(len(runs.index))],

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import Field
 
-from malta.cli.documents.parts import Files, Number, Part, Shares, keyed
+from malta.cli.documents.parts import Files, Number, Part, Shares, with_keys
 
 if TYPE_CHECKING:
     from malta.margins.gain import Gain
@@ -185,7 +185,7 @@ def loop_fields(margins: Margins) -> dict[str, Any]:
         "stable": margins.stable,
         "poles_rad_per_s": margins.poles.pairs(),
         "bandwidth_rad_per_s": dict(margins.bandwidth),
-        "peak_sensitivity": keyed(peaks),
+        "peak_sensitivity": with_keys(peaks),
     }
 
 

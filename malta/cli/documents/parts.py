@@ -83,6 +83,6 @@ def words_of(label: str) -> str:
     return "_".join(re.findall(r"\w+", label))
 
 
-def keyed(table: Mapping[str, Any]) -> dict[str, Any]:
+def with_keys(table: Mapping[str, Any]) -> dict[str, Any]:
     """A table whose keys are labels, with keys that are identifiers."""
     return dict(zip(distinct(map(words_of, table)), table.values(), strict=True))

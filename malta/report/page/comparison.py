@@ -67,7 +67,7 @@ class Line(NamedTuple):
     best: tuple[bool, ...]
 
 
-def _joined(lines: Iterable[tuple[Line, str]]) -> list[Line]:
+def _join_signals(lines: Iterable[tuple[Line, str]]) -> list[Line]:
     """Lines, each with its signal: those that differ in the signal alone become one, with all signals in it.
 
     Example: "motion x1, rms" and "motion y1, rms" of the same values become "motion x1 y1, rms".
@@ -147,7 +147,7 @@ class Comparison:
     @property
     def difference_lines(self) -> list[Line]:
         """The differences as lines of a table: signals with the same values share one."""
-        return _joined(
+        return _join_signals(
             (
                 Line(row.group, row.heading, row.texts, (False,) * len(row.texts)),
                 next(entry.signal for entry in row.entries if entry is not None),
@@ -158,7 +158,7 @@ class Comparison:
     @property
     def figure_lines(self) -> list[Line]:
         """The figures of merit as lines of a table: signals with the same values share one."""
-        return _joined(
+        return _join_signals(
             (
                 Line(row.group, row.heading, row.texts, row.best),
                 next(score.signal for score in row.scores if score is not None),

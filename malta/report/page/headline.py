@@ -143,7 +143,7 @@ def summary_sentences(a: Analysis) -> list[str]:
     if c.commutation is not None:
         parts.append("commutates for the predicted place")
     if parts:
-        sentences.append(f"It {_listed(parts)}.")
+        sentences.append(f"It {_list_in_words(parts)}.")
     if plant.has_stroke:
         sentences.append(f"The stroke moves {plant.stroke} by ±{in_unit(plant.travel, 'mm'):g} mm.")
     spec = a.subject.written_from
@@ -162,5 +162,5 @@ def _count(number_of: int, what: str) -> str:
     return f"{number_of} {what}{'' if number_of == 1 else 's'}"
 
 
-def _listed(parts: Sequence[str]) -> str:
+def _list_in_words(parts: Sequence[str]) -> str:
     return parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"

@@ -172,11 +172,11 @@ def report_work(
     """Analyse a subject and write its page, behind one measure of progress."""
     from malta.report.page.analysis import analyse
 
-    def computed(share: float) -> None:
+    def report_work_share(share: float) -> None:
         if progress is not None:
             progress(WORK * share)
 
-    found = analyse(subject, proof=proof, campaigns=campaigns, progress=computed)
+    found = analyse(subject, proof=proof, campaigns=campaigns, progress=report_work_share)
     return found, page_of(
         found, None if progress is None else lambda share: progress(WORK + (1 - WORK) * share)
     )

@@ -78,7 +78,7 @@ def step(source: Any, controller: Any = None, *, channel: Channel = None, axes: 
         window = _window(rows, figures)
         lines = []
         for (loop, answer, k, column), found in zip(rows, figures, strict=True):
-            _draw_answer(panel, answer, k, column, window, _dotted(styles[loop], loops[loop], window))
+            _draw_answer(panel, answer, k, column, window, _with_dots(styles[loop], loops[loop], window))
             _mark_step(panel, answer, k, found, styles[loop])
             lines.append((_step_text(found), styles[loop]["color"]))
         draw_level(panel, 1)
@@ -134,7 +134,7 @@ def _draw_answer(
     axes.plot(t, scale * y, **style)
 
 
-def _dotted(style: Mapping[str, Any], curves: LoopCurves, window: float) -> Mapping[str, Any]:
+def _with_dots(style: Mapping[str, Any], curves: LoopCurves, window: float) -> Mapping[str, Any]:
     """The style of a line, with a dot at each sample where a window has few."""
     T = curves.loop.sample_time
     return style if T is None or window / T > FEW else {**style, "marker": ".", "markersize": 4}
@@ -236,7 +236,7 @@ def load_response(
         lines = []
         for (name, answer, k, column), found_figures, curves in zip(rows, figures, shown, strict=True):
             style = styles[name]
-            _draw_answer(upper, answer, k, column, window, _dotted(style, curves, window), scale)
+            _draw_answer(upper, answer, k, column, window, _with_dots(style, curves, window), scale)
             size = np.abs(curves.responses.compliance[:, k, column]) * scale
             lower.plot(curves.w, size, **style)
             lines.append(
@@ -285,7 +285,7 @@ def _pairs(
     if channel is not None:
         outputs = [name for name, _ in chosen_channels(loops, channel, "sensors")]
         found = [
-            (load, output) for load in loads for output in outputs if _moved(loops, answers, load, output)
+            (load, output) for load in loads for output in outputs if _moves(loops, answers, load, output)
         ]
         if not found:
             raise InputError("plot", "channel", " ".join(outputs), "an output that a load from outside moves")
@@ -293,7 +293,7 @@ def _pairs(
     return [(load, output) for load in loads if (output := _furthest(loops, answers, load)) is not None]
 
 
-def _moved(
+def _moves(
     loops: Mapping[str, LoopCurves], answers: Mapping[str, StepResponse], load: str, output: str
 ) -> bool:
     """Whether a load moves an output of any loop."""

@@ -148,7 +148,7 @@ class FoldingTable(Table):
         for gap, folded in ((GAPS[0], False), (GAPS[1], False), (GAPS[1], True)):
             found = allot(measured, width - EDGES - gap * (len(measured) - 1), cells=folded)
             if found is not None:
-                yield self._drawn(list(range(len(measured))), found, cells, gap)
+                yield self._block_table(list(range(len(measured))), found, cells, gap)
                 return
         blocks = split(measured, width)
         if blocks is None:
@@ -158,9 +158,11 @@ class FoldingTable(Table):
             room = width - EDGES - GAPS[-1] * (len(block) - 1)
             found = allot([measured[i] for i in block], room, cells=True)
             assert found is not None  # `split` has made blocks that fit
-            yield self._drawn(block, found, cells, GAPS[-1])
+            yield self._block_table(block, found, cells, GAPS[-1])
 
-    def _drawn(self, block: Sequence[int], widths: Sequence[int], cells: list[list[str]], gap: int) -> Table:
+    def _block_table(
+        self, block: Sequence[int], widths: Sequence[int], cells: list[list[str]], gap: int
+    ) -> Table:
         """The table of some columns in these widths; rows without a cell in them are left out."""
         drawn = Table(box=self.box, pad_edge=False, padding=(0, 1, 0, gap - 2), show_header=self.show_header)
         for i, width in zip(block, widths, strict=True):
