@@ -6,6 +6,7 @@ import http.client
 import json
 import re
 import shutil
+import socket
 import subprocess
 import sys
 import threading
@@ -413,6 +414,19 @@ def test_a_body_that_is_no_json_is_refused(server: Server) -> None:
     assert send(server, "POST", "/ask", b"{" * 10)[0] == 400
     assert send(server, "POST", "/ask", b"[" * 100_000)[0] == 400
     assert send(server, "POST", "/ask", b'"ask"')[0] == 200
+
+
+def test_many_connections_at_once_wait_their_turn(server: Server) -> None:
+    address = ("127.0.0.1", server.server_port)
+    waiting = [socket.create_connection(address, timeout=10) for _ in range(40)]
+    try:
+        for connection in waiting:
+            connection.sendall(f"GET /app.css HTTP/1.1\r\nHost: {address[0]}:{address[1]}\r\n\r\n".encode())
+        assert [connection.recv(15) for connection in waiting] == [b"HTTP/1.1 200 OK"] * 40
+    finally:
+        for connection in waiting:
+            connection.close()
+    assert server.request_queue_size > 40
 
 
 def test_a_port_that_is_taken_is_one_sentence(server: Server) -> None:

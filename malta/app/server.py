@@ -45,6 +45,7 @@ class Server(ThreadingHTTPServer):
     """A server of one session. port: 0 for a free one. Raises InputError for a port that is taken."""
 
     daemon_threads = True
+    request_queue_size = 128  # of connections that wait; the five of the library refuse a busy page
 
     def __init__(self, session: Session, port: int = 0) -> None:
         self.session, self.token = session, secrets.token_urlsafe(24)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import sys
 from pathlib import Path
@@ -50,6 +51,10 @@ def app(
 
         machine(machine_file)
     session = Session(design, Path.cwd(), machine_file)
+    gc.freeze()
+    gc.set_threshold(
+        20_000, 5, 5
+    )  # a page runs for hours: expressions of past machines go, the libraries stay
     with Server(session, port) as server:
         print(server.url, flush=True)
         if not no_browser and not (_has_screen() and webbrowser.open(server.url)):
