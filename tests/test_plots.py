@@ -20,6 +20,7 @@ from malta import report
 from malta.cli.documents.published import output_schema
 from malta.margins.curves import LoopCurves, loop_curves
 from malta.margins.locus import root_locus
+from malta.report.plots.plane import Window
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -236,3 +237,11 @@ def test_an_unstable_loop_is_drawn_and_named(tmp_path: Path, run: Run) -> None:
     )  # fmt: skip
     assert said.code == 0
     assert "robust: the loop is unstable" in said.err
+
+
+@pytest.mark.parametrize("unstable", [0.0, 20.0])
+def test_a_pole_map_holds_poles_of_little_damping(unstable: float) -> None:
+    poles = np.array([-17.4 + 139.3j, -17.4 - 139.3j, -5.0, unstable])
+    window = Window.about(poles, float(np.abs(poles).max()))
+    assert len(window.inside(poles)) == len(poles)
+    assert window.right - window.left == pytest.approx(2 * window.height)  # equal scales in a square
