@@ -124,11 +124,14 @@ def _requirements(a: Analysis) -> Iterator[KeyFigure]:
 def summary_sentences(a: Analysis) -> list[str]:
     """Say in words what the design is."""
     c, plant = a.subject.controller, a.plant
-    rate = f"{1e-3 / c.sample_time:g} kHz" if c.sample_time <= 1e-3 else f"every {c.sample_time * 1e3:g} ms"
+    rate = (
+        f"at {1e-3 / c.sample_time:g} kHz" if c.sample_time <= 1e-3 else f"every {c.sample_time * 1e3:g} ms"
+    )
     law = kind_of(c)
     article = "An" if law == "LQG" else "A"
-    text = f"{article} {law} controller of the machine {plant.name}, preset {a.subject.parameters.preset}: "
-    text += f"{_count(len(c.measurements), 'measurement')} and {_count(len(c.forces), 'command')} at {rate}, "
+    what = f"{law} controller" if law.isupper() else law
+    text = f"{article} {what} of the machine {plant.name}, preset {a.subject.parameters.preset}: "
+    text += f"{_count(len(c.measurements), 'measurement')} and {_count(len(c.forces), 'command')} {rate}, "
     text += f"{_count(len(c.states), 'state')}."
     sentences = [text]
     parts = []
