@@ -102,7 +102,7 @@ class Window(NamedTuple):
 
     @classmethod
     def about(cls, poles: ComplexArray, reach: float) -> Window:
-        """The left half plane to a reach, as much of the right one as holds the unstable poles, and the highest pole."""
+        """The left half plane to a reach, the right one as far as unstable poles, and the highest pole."""
         near = poles[np.abs(poles) <= 1.001 * reach]
         right = max(0.3 * reach, 1.15 * float(near.real.max(initial=0.0)))
         height = max((1.08 * reach + right) / 2, 1.08 * float(np.abs(near.imag).max(initial=0.0)))
