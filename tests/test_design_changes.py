@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from conftest import Run, one_sentence
 
-from malta.cli.inputs import read_changed_design
+from malta.cli.inputs import _name_of, read_changed_design
 
 FILE = Path("design/calibrated.toml")
 
@@ -69,3 +69,20 @@ def test_the_gain_files_of_the_unchanged_design_stand(run: Run, tmp_path: Path) 
     assert content["plant"]["preset"] == "table1, changed"
     assert content["plant"]["parameters"]["m"] == {"value": 0.4, "unit": "kg"}
     assert run("verify", tmp_path / "table2_m_0_4.json", "--no-proof").code == 0
+
+
+@pytest.mark.parametrize(
+    ("one", "other"), [("m=.4", "m=4"), ("uncertainty.m=30%", "uncertainty.m=30"), ("x=5µm", "x=5m")]
+)
+def test_designs_of_other_changes_have_other_names(one: str, other: str) -> None:
+    """Else the gain files of one would take the place of those of the other."""
+    assert _name_of([one]) != _name_of([other])
+    assert _name_of(["m=.4"]) == _name_of(["m=0.4"])
+
+
+@pytest.mark.parametrize("name", ["m", "weights.state.z"])
+def test_a_change_is_given_once(run: Run, tmp_path: Path, name: str) -> None:
+    code, _, err = run("design", FILE, "--set", f"{name}=0.3", "--set", f"{name}=0.4", "--out", tmp_path)
+    assert code == 2
+    assert one_sentence(err) == f"--set: {name}: found '0.4' for the second time, expected it once"
+    assert not list(tmp_path.iterdir())

@@ -22,7 +22,7 @@ def read_assignments(option: str, texts: list[str] | None, units: Mapping[str, s
 
     units : SI unit of each name that may be assigned; "1" for a number without unit, or in %
 
-    Raises InputError for another form, an unknown name or a unit that does not fit.
+    Raises InputError for another form, an unknown name, a name given twice or a unit that does not fit.
 
     >>> read_assignments("--set", ["l_B=45mm"], {"l_B": "m"})
     {'l_B': 0.045}
@@ -36,6 +36,7 @@ def read_assignments(option: str, texts: list[str] | None, units: Mapping[str, s
         if name not in units:
             kind = "sensor error" if option == "--sensor" else "parameter"
             raise InputError(option, name, f"an unknown {kind}", "one of " + " ".join(units))
+        _require_once(option, name, value, values)
         values[name] = _in_si(number, units[name], option, name)
     return values
 
@@ -43,7 +44,7 @@ def read_assignments(option: str, texts: list[str] | None, units: Mapping[str, s
 def read_entries(option: str, texts: list[str]) -> dict[str, Any]:
     """Read `NAME=VALUE` as entries of a design file: a number, one with its unit, true or false, or a word.
 
-    Raises InputError for another form.
+    Raises InputError for another form, and for a name given twice.
 
     >>> read_entries("--set", ["bases.state.x=50um", "delay=1", "uncertainty.m=30%"])
     {'bases.state.x': {'value': 50.0, 'unit': 'um'}, 'delay': 1, 'uncertainty.m': 0.3}
@@ -53,6 +54,7 @@ def read_entries(option: str, texts: list[str]) -> dict[str, Any]:
         name, value = _split(text)
         if not all(part.isidentifier() for part in name.split(".")) or not value:
             raise InputError(option, "", repr(text), f"NAME=VALUE, as {EXAMPLES[option]}")
+        _require_once(option, name, value, entries)
         number = re.fullmatch(NUMBER, value)
         if number is None:
             entries[name] = {"true": True, "false": False}.get(value, value)
@@ -125,8 +127,7 @@ def add_own_options(
         if not (name and value):
             raise InputError("--option", "", repr(text), "NAME=VALUE")
         default = option_of(scenario, plant, name)
-        if name in merged:
-            raise InputError("--option", name, f"{value!r} for the second time", "it once")
+        _require_once("--option", name, value, merged)
         merged[name] = _read_like(default, value, units.get(name, "1"), name)
     return merged
 
@@ -147,6 +148,12 @@ def _read_like(default: Any, text: str, si_unit: str, name: str) -> Any:
     if several:
         return tuple(values)
     return int(values[0]) if isinstance(default, int) and values[0].is_integer() else values[0]
+
+
+def _require_once(option: str, name: str, value: str, known: Mapping[str, Any]) -> None:
+    """Raise InputError for a name that has a value already."""
+    if name in known:
+        raise InputError(option, name, f"{value!r} for the second time", "it once")
 
 
 def _split(text: str) -> tuple[str, str]:

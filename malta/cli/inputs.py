@@ -107,11 +107,18 @@ def read_changed_design(file: Path, changes: list[str] | None) -> Spec:
             raise InputError("--set", name, "an unknown parameter", expected)
     values = read_assignments("--set", of_machine, units)
     change_machine(spec.parameters, of_machine)  # which says what is wrong with a value
-    words = re.sub(r"[^A-Za-z0-9-]+", "_", " ".join(changes)).strip("_")
-    if len(words) > LONGEST_NAME:
-        words = hashlib.sha256(words.encode()).hexdigest()[:8]
     changed = read_design(file, values, others)
-    return replace(changed, name=f"{spec.name}_{words}", summary=f"{spec.summary}; with {', '.join(changes)}")
+    return replace(
+        changed, name=f"{spec.name}_{_name_of(changes)}", summary=f"{spec.summary}; with {', '.join(changes)}"
+    )
+
+
+def _name_of(changes: list[str]) -> str:
+    """The changes as a part of a file's name: `m=.4` is m_0_4, `m=4` is m_4 and `m=4%` m_4percent."""
+    words = re.sub(r"(?<!\d)\.(?=\d)", "0.", " ".join(changes)).replace("%", "percent")
+    words = re.sub(r"[\u00b5\u03bc]", "u", words)  # micro
+    words = re.sub(r"[^A-Za-z0-9-]+", "_", words).strip("_")
+    return words if len(words) <= LONGEST_NAME else hashlib.sha256(words.encode()).hexdigest()[:8]
 
 
 def change_machine(parameters: Parameters, changes: list[str] | None) -> Parameters:
