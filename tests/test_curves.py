@@ -73,6 +73,36 @@ def test_a_weak_integrator_crosses_far_below_the_poles() -> None:
     assert found.delay == pytest.approx(math.pi / 2 * 1e9, rel=1e-6)
 
 
+@pytest.mark.parametrize("rate", [1e-9, 1e9])
+def test_slow_and_fast_transfer_functions_keep_their_states(rate: float) -> None:
+    """2 / (p (p + 1)) at p = s / rate: control.ss alone leaves no state of the slow one."""
+    found = loop_curves(control.tf([2 * rate**2], [1, rate, 0])).margins[0]
+    assert found.phase_frequency == pytest.approx(1.2496 * rate, rel=1e-3)
+    assert math.degrees(found.phase) == pytest.approx(38.668, rel=1e-3)
+    x = 1 + math.sqrt(2)  # |S|^2 = (x^2 + x) / (x^2 - 3 x + 4), x = (w / rate)^2, is largest there
+    assert found.peak_sensitivity**2 == pytest.approx((x**2 + x) / (x**2 - 3 * x + 4), rel=1e-4)
+
+
+@pytest.mark.parametrize("gain", [0.0, 2.0])
+@pytest.mark.parametrize("dt", [0, 0.1])
+def test_a_gain_without_states_is_a_loop(gain: float, dt: float) -> None:
+    """Its answer to a step is there at once; no warning of log 0 either."""
+    loop = linear_loop(control.ss([], [], [], [[gain]], dt))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        margins, answer = loop_curves(loop).margins[0], loop_steps(loop).references
+    assert margins.gain == (0.0, math.inf)
+    assert margins.peak_sensitivity == pytest.approx(1 / (1 + gain))
+    assert np.allclose(answer.y[:, 0, 0], gain / (1 + gain))
+    figures = step_figures(answer, 0, 0)
+    assert figures.settling == 0
+
+
+def test_a_pole_that_no_number_tells_from_the_frequency_is_no_error() -> None:
+    found = linear_loop(control.ss([[0, 1], [0, 0]], [[0], [1]], [[1, 0]], [[0]])).plant.response(np.zeros(2))
+    assert np.isnan(found).all()
+
+
 def test_a_pole_on_the_axis_is_no_crossing() -> None:
     """Im L changes its sign through infinity at s = j; the poles of s^2 + 1 + k (s + 0.5) / 5 decay for every k > 0."""
     found = loop_curves(0.2 * (s + 0.5) / (s**2 + 1)).margins[0]

@@ -74,12 +74,14 @@ See = Callable[["FloatArray"], Seen]
 
 def find_crossings(see: See, seen: Seen) -> tuple[list[list[Crossing]], list[list[Crossing]]]:
     """Gain and phase crossings of each channel between the frequencies of `seen`, by false position."""
-    size, turn = np.log(np.abs(seen.loop)), seen.loop.imag
+    turn = seen.loop.imag
+    with np.errstate(divide="ignore"):
+        size = np.log(np.abs(seen.loop))
     behind = (seen.loop.real[1:] < 0) | (seen.loop.real[:-1] < 0)
     found: list[tuple[list[list[Crossing]], Any, bool]] = []
     channels = seen.loop.shape[1]
     for values, also, phase in ((size, True, False), (turn, behind, True)):
-        ends = values[:-1] * values[1:] < 0
+        ends = np.sign(values[:-1]) * np.sign(values[1:]) < 0
         found.append(([[] for _ in range(channels)], np.argwhere(ends & also), phase))
     rows = [(k, i, phase) for _, where, phase in found for k, i in where.tolist()]
     if rows:
@@ -100,7 +102,8 @@ def _false_position(
     """
 
     def measure(values: ComplexArray) -> FloatArray:
-        return np.where(phase, values.imag, np.log(np.abs(values)))
+        with np.errstate(divide="ignore"):
+            return np.where(phase, values.imag, np.log(np.abs(values)))
 
     rows = np.arange(len(k))
     a, b = np.log(seen.w[k]), np.log(seen.w[k + 1])

@@ -45,8 +45,8 @@ MOST = 90  # frequencies that a round may add
 AROUND = np.array([-4.0, -2.0, -1.0, -0.5, 0.5, 1.0, 2.0, 4.0])  # half-widths of a resonance
 LIGHT = 0.5  # damping below which a pole makes a resonance
 STILL = 1e-7  # of the fastest rate: poles that count as zero
-BELOW = 1e-12  # of the lowest frequency: as far as gain crossings are looked for
-FAR_BELOW = 13  # frequencies from there to the lowest
+BELOW = 1e-9  # of the lowest frequency: as far as gain crossings are looked for
+FAR_BELOW = 10  # frequencies from there to the lowest
 HUGE = 1e9  # times the fastest rate: zeros that count as infinite
 
 
@@ -71,7 +71,8 @@ class Responses(NamedTuple):
     def alone(self, at: Place) -> ComplexArray:
         """The loop gain of each channel with the others closed, T_ii / S_ii: k x channels."""
         _, S, T = self.cut(at)
-        return _diagonal(T) / _diagonal(S)
+        with np.errstate(all="ignore"):
+            return _diagonal(T) / _diagonal(S)
 
 
 @dataclass(frozen=True, eq=False)
@@ -284,8 +285,9 @@ def _to_crossings(loop: LinearLoop, found: Responses) -> Responses:
     """The same with frequencies to a gain crossing far below, as of a weak integrator beside fast poles."""
     w = found.w[0] * np.geomspace(BELOW, 1.0, FAR_BELOW)
     far = respond(loop, w)
-    above = np.abs(np.concatenate([far.alone("sensors"), far.alone("forces")], axis=1)) > 1
-    crossed = np.flatnonzero((above[1:] != above[:-1]).any(axis=1))
+    with np.errstate(divide="ignore"):
+        size = np.log(np.abs(np.concatenate([far.alone("sensors"), far.alone("forces")], axis=1)))
+    crossed = np.flatnonzero((np.sign(size[1:]) * np.sign(size[:-1]) < 0).any(axis=1))  # not of NaN
     if not len(crossed):
         return found
     return _merge(found, respond(loop, np.geomspace(w[crossed[0]], w[-1], BASE)[:-1]))

@@ -12,6 +12,7 @@ lost their digits.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
@@ -34,6 +35,7 @@ CALLER = "loop"
 Place = Literal["sensors", "forces"]
 GONE = 1e-6  # |z| of the poles of pure delay
 STILL = 1e-6  # of a pole's frequency: growth that counts as none
+SAME = 1e-3  # of a response: the error of states that still are those of a transfer function
 ROUNDING = 1e-14  # of a matrix whose eigenvalues are taken
 
 
@@ -46,7 +48,10 @@ class System(NamedTuple):
     D: FloatArray
 
     def response(self, s: ComplexArray) -> ComplexArray:
-        """C (s - A)^-1 B + D at k complex frequencies s, in differences (z - 1) / T: k x outputs x inputs."""
+        """C (s - A)^-1 B + D at k complex frequencies s, in differences (z - 1) / T: k x outputs x inputs.
+
+        NaN at a frequency that no double number tells from a pole.
+        """
         if not len(self.A):
             return np.broadcast_to(self.D.astype(complex), (len(s), *self.D.shape))
         t = balanced_units(self.A, self.B, self.C)
@@ -55,7 +60,11 @@ class System(NamedTuple):
         try:
             found = np.linalg.solve(matrices, B.astype(complex))
         except np.linalg.LinAlgError:  # a frequency on a pole: beside it
-            found = np.linalg.solve(matrices + 1e-9 * s[:, None, None] * np.eye(len(A)), B.astype(complex))
+            beside = matrices + 1e-9 * s[:, None, None] * np.eye(len(A))
+            found = np.full((len(s), *B.shape), np.nan, dtype=complex)
+            for k, one in enumerate(beside):
+                with suppress(np.linalg.LinAlgError):
+                    found[k] = np.linalg.solve(one, B)
         return np.asarray(C @ found + self.D)
 
 
@@ -279,7 +288,36 @@ def _matrices(system: Any, T: float | None) -> System:
     except Exception as error:  # many kinds: an improper function, a frequency response without states
         wanted = "a system with states, or a proper transfer function"
         raise InputError(CALLER, system.name, f"a {type(system).__name__}", wanted) from error
+    if isinstance(system, control.TransferFunction) and _lost(system, found):
+        if system.ninputs * system.noutputs > 1:
+            wanted = "a system with states: the digits of its coefficients do not suffice for one"
+            raise InputError(CALLER, system.name, "a TransferFunction", wanted)
+        found = control.ss(*_companion(system.num[0][0], system.den[0][0]), system.dt)
     A, B, C, D = (np.array(M, dtype=float) for M in (found.A, found.B, found.C, found.D))
     if not all(np.isfinite(M).all() for M in (A, B, C, D)):
         raise InputError(CALLER, system.name, "NaN or infinity", "finite numbers")
     return System(A, B, C, D) if T is None else System((A - np.eye(len(A))) / T, B / T, C, D)
+
+
+def _lost(system: Any, found: Any) -> bool:
+    """Whether the states of a transfer function have lost its response, as those of very slow poles or small gains."""
+    poles = np.concatenate([np.roots(den) for row in system.den for den in row]).astype(complex)
+    sampled = system.isdtime(strict=True)
+    sizes = np.abs(np.log(poles[poles != 0]) if sampled else poles)
+    w = np.outer(np.append(sizes[sizes > 0], 1.0), [1e-2, 0.3, 1.7, 1e2]).ravel()
+    points = np.exp(1j * w[w < np.pi]) if sampled else 1j * w
+    wanted, made = (np.atleast_1d(np.asarray(one(points))) for one in (system, found))
+    return not bool((np.abs(made - wanted) <= SAME * np.abs(wanted)).all())
+
+
+def _companion(num: FloatArray, den: FloatArray) -> System:
+    """States of a proper transfer function, in units of time and of the output in which its coefficients are near 1."""
+    n = len(den) - 1
+    a = np.asarray(den[1:] / den[0], dtype=float)
+    b = np.append(np.zeros(n + 1 - len(num)), num) / den[0]
+    orders = np.arange(1, n + 1)
+    rate = float((np.abs(a) ** (1 / orders)).max(initial=0.0)) or 1.0
+    A = np.eye(n, k=-1) * rate
+    A[:1] = -a / rate ** (orders - 1.0)
+    c = (b[1:] - b[0] * a) / rate ** (orders - 1.0)
+    return System(A, np.eye(n, 1), c[None, :], np.array([[b[0]]]))

@@ -75,7 +75,7 @@ def step_response(M: FloatArray, g: FloatArray, C: FloatArray, Ts: float) -> Ste
     [[2.0]]
     """
     n, w = g.shape
-    radius = float(np.abs(np.linalg.eigvals(M)).max())
+    radius = float(np.abs(np.linalg.eigvals(M)).max(initial=0.0))
     if not radius < 1:
         raise CheckError(f"an unstable loop, |lambda| = {radius:.6f}, has no answer to a constant load")
     step = np.block([[M, g], [np.zeros((w, n)), np.eye(w)]])
