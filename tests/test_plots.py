@@ -245,3 +245,10 @@ def test_a_pole_map_holds_poles_of_little_damping(unstable: float) -> None:
     window = Window.about(poles, float(np.abs(poles).max()))
     assert len(window.inside(poles)) == len(poles)
     assert window.right - window.left == pytest.approx(2 * window.height)  # equal scales in a square
+
+
+def test_a_constant_gain_is_a_straight_line() -> None:
+    """|S| of -2 / (s + 1) is 1 at every frequency: the axis shows decibels, not the digits of rounding."""
+    figure = malta.report.sigma(control.tf([-2], [1, 1]))
+    low, high = figure.axes[1].get_ylim()
+    assert low < -2 < 2 < high

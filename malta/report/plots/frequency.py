@@ -43,6 +43,7 @@ if TYPE_CHECKING:
 
 ALONE = "one loop at a time, the others closed"
 RANGE = (-100.0, 120.0)  # dB, of a loop gain that is drawn
+LEAST = 6.0  # dB that an axis shows
 HALF = 170.0  # degrees, between neighbours: a pole on the axis
 ZERO = 0.1  # of the value beside it: a loop gain that counts as zero at the end of the grid
 Channel = str | Sequence[str] | None
@@ -139,12 +140,18 @@ def _draw_margins(
         mark(upper, at, 0, style, markerfacecolor="none")
 
 
+def _limit_decibels(axes: Axes) -> None:
+    """Limits within RANGE, and so wide that a constant value shows no rounding."""
+    low, high = axes.get_ylim()
+    more = max(LEAST - (high - low), 0.0) / 2
+    axes.set_ylim(max(low - more, RANGE[0]), min(high + more, RANGE[1]))
+
+
 def _finish_bode(upper: Axes, lower: Axes, shown: Sequence[LoopCurves]) -> None:
     from matplotlib.ticker import MultipleLocator
 
     draw_level(upper, 0)
-    low, high = upper.get_ylim()
-    upper.set_ylim(max(low, RANGE[0]), min(high, RANGE[1]))
+    _limit_decibels(upper)
     lower.set_ylim(
         *(np.array([math.floor(lower.get_ylim()[0] / 45), math.ceil(lower.get_ylim()[1] / 45)]) * 45)
     )
@@ -197,8 +204,7 @@ def sigma(source: Any, controller: Any = None, *, at: Place = "sensors", axes: A
                 )
             lines.append((_largest_text(curves, values[:, 0], letter), style["color"]))
         draw_level(panel, 0)
-        low, high = panel.get_ylim()
-        panel.set_ylim(max(low, RANGE[0]), min(high, RANGE[1]))
+        _limit_decibels(panel)
         finish_frequency(panel, loops.values(), f"singular values of {letter} [dB]")
         write_above(panel, letter, lines)
     return sheet.figure
