@@ -99,7 +99,9 @@ def test_a_gain_without_states_is_a_loop(gain: float, dt: float) -> None:
 
 
 def test_a_pole_that_no_number_tells_from_the_frequency_is_no_error() -> None:
-    found = linear_loop(control.ss([[0, 1], [0, 0]], [[0], [1]], [[1, 0]], [[0]])).plant.response(np.zeros(2))
+    found = linear_loop(control.ss([[0, 1], [0, 0]], [[0], [1]], [[1, 0]], [[0]])).plant.response(
+        np.zeros(2, dtype=complex)
+    )
     assert np.isnan(found).all()
 
 
