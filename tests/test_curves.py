@@ -397,3 +397,9 @@ def test_the_locus_of_a_parameter_has_the_nominal_machine(machine: Machine) -> N
 def test_loci_of_nothing_are_refused(machine: Machine, options: dict[str, Any], message: str) -> None:
     with pytest.raises(malta.InputError, match=message):
         root_locus(*machine, **options)
+
+
+def test_a_pole_that_stays_on_the_boundary_changes_no_stability() -> None:
+    """z^2 + (0.02 k - 2 cos 0.3) z + 1 has both roots at |z| = 1 for every k from 0.1 to 10."""
+    L = control.tf([0.02, 0], [1, -2 * math.cos(0.3), 1], 0.01)
+    assert root_locus(L).changes == ()

@@ -36,6 +36,7 @@ FAR = 0.12  # how far a pole may move from sample to sample, of its distance fro
 SLOW = 1e-4  # of the fastest rate: poles that may move as far as one of this rate
 DELAY = 0.02  # |z| of poles that count as pure delay
 NEAR = 1e-4  # of the range: intervals that are not halved
+ROUNDING = 1e-13  # of the fastest rate: growth that counts as none
 EXACT = 1e-8  # of the range: the accuracy of the values at which stability changes
 
 
@@ -229,11 +230,12 @@ def _growth(found: ComplexArray, T: float | None) -> float:
 
 
 def _changes(matrix: Matrix, values: FloatArray, found: ComplexArray, T: float | None) -> tuple[float, ...]:
-    """The values at which the worst pole crosses the boundary of stability."""
+    """The values at which the worst pole crosses the boundary of stability; rounding on it is no crossing."""
+    least = ROUNDING * (float(np.abs(found).max(initial=0.0)) + (0.0 if T is None else 1 / T))
     worst = [_growth(row, T) for row in found]
     made = []
     for k in range(len(values) - 1):
-        if worst[k] * worst[k + 1] < 0:
+        if worst[k] * worst[k + 1] < 0 and max(abs(worst[k]), abs(worst[k + 1])) > least:
             root: Any = optimize.brentq(
                 lambda value: _growth(matrix(value), T), values[k], values[k + 1],
                 xtol=EXACT * (values[-1] - values[0]),
