@@ -245,6 +245,14 @@ def design(request: pytest.FixtureRequest, designs: dict[str, Design]) -> Design
 QUANTITY = re.compile(r"[-+±]*\d[\w.+-]*(?: (?:%|[munk]?(?:m|s|N|A|V|J|Hz|rad|kg|g))(?![\w/]))?")
 
 
+def without_progress(text: str) -> str:
+    """What a command says on standard error, but for lines of how far it is: a loaded computer gets some."""
+    lines = text.splitlines(keepends=True)
+    return "".join(
+        line for line in lines if not re.fullmatch(r"malta: .+: (.+, )?[\d.]+ (s|min)(,.+ left)?\n", line)
+    )
+
+
 def printed(renderable: object, width: int = 100) -> str:
     """As a terminal of some columns shows it: no line is longer, and nothing is cut off."""
     stream = io.StringIO()

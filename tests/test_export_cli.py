@@ -148,7 +148,7 @@ def test_simulate_flies_the_c(run: Run) -> None:
     gains, given = "design/gains/robust.json", ("--noise", "1", "--controller", "c")
     code, out, err = run("simulate", gains, *given)
     assert code == 0, err
-    rows = dict(re.findall(r"^(\w+) +\S+ +(\S+) +\S+ *$", out, flags=re.MULTILINE))
+    rows = dict(re.findall(r"^ ?(\w+) +\S+ +(\S+) +\S+ *$", out, flags=re.MULTILINE))
     assert {"p", "y", "xi_hat", "v", "current", "i", "u"} <= set(rows)
     assert max(float(rows[name]) for name in ("p", "y", "xi_hat", "v", "current", "i", "u")) < 1e-12
     code, out, err = run("simulate", gains, *given, "--json")
