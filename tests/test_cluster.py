@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import pytest
+from conftest import without_progress
 
 import malta
 from malta.campaigns import dask as cluster

@@ -20,6 +20,7 @@ from malta import report
 from malta.cli.documents.published import output_schema
 from malta.margins.curves import LoopCurves, loop_curves
 from malta.margins.locus import root_locus
+from malta.model.signals import axis_units
 from malta.report.plots.plane import Window
 
 if TYPE_CHECKING:
@@ -252,3 +253,16 @@ def test_a_constant_gain_is_a_straight_line() -> None:
     figure = malta.report.sigma(control.tf([-2], [1, 1]))
     low, high = figure.axes[1].get_ylim()
     assert low < -2 < 2 < high
+
+
+@pytest.mark.parametrize(
+    ("output", "force", "found"),
+    [
+        ("m", "N", ("um/N", "N/um", True)),
+        ("1", "1", ("1", "1", False)),
+        ("1", "V", ("1/V", "V", False)),
+        ("m", "V", ("m/V", "V/m", False)),
+    ],
+)
+def test_axes_of_any_unit_have_a_compliance(output: str, force: str, found: tuple[str, str, bool]) -> None:
+    assert axis_units(output, force) == found

@@ -35,14 +35,28 @@ def inputs_of(plant: Plant) -> tuple[Group, ...]:
     return _groups(plant, plant.inputs, plant.thrust_input if plant.has_stroke else None, "thrust")
 
 
-def compliance_unit(unit: str) -> str:
-    """The unit of an output over the force or torque that moves it."""
-    return {"m": "um/N", "rad": "urad/(N m)"}[unit]
+class AxisUnits(NamedTuple):
+    """Units of an output over the input of its axis, and of the input over the output."""
+
+    compliance: str
+    stiffness: str
+    micro: bool  # whether the output is meant in millionths
 
 
-def stiffness_unit(unit: str) -> str:
-    """The unit of a force or torque over the output that it moves."""
-    return {"m": "N/um", "rad": "N m/urad"}[unit]
+def axis_units(output: str, force: str) -> AxisUnits:
+    """The units of an axis; motions by forces and torques in millionths, all others in the units of the signals."""
+    known = {"m": ("um/N", "N/um"), "rad": ("urad/(N m)", "N m/urad")}
+    if output in known and force in KINDS:
+        return AxisUnits(*known[output], micro=True)
+    return AxisUnits(_per(output, force), _per(force, output), micro=False)
+
+
+def _per(unit: str, other: str) -> str:
+    """One unit over another."""
+    if other == "1":
+        return unit
+    whole = any(sign in other for sign in " /")
+    return "1" if unit == other else f"{unit}/({other})" if whole else f"{unit}/{other}"
 
 
 def lateral_outputs(plant: Plant) -> tuple[Group, ...]:

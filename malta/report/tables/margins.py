@@ -11,10 +11,7 @@ from rich.table import Table
 from malta.margins.robust import NOT_PROVEN
 from malta.margins.travel import NOT_BETWEEN
 from malta.margins.verify import zone
-from malta.model.signals import (
-    compliance_unit,
-    stiffness_unit,
-)
+from malta.model.signals import axis_units
 from malta.report.tables.parts import add_row, new_table
 
 if TYPE_CHECKING:
@@ -192,18 +189,19 @@ def gang_table(found: Robustness, plant: Plant) -> Table:
      y        1.57   1.72                    430.5                  0.034
     <BLANKLINE>
     """
-    units = {signal.name: signal.unit for signal in plant.outputs}
-    one = next(iter(set(units.values()))) if len(set(units.values())) == 1 else ""
-    heads = (f" [{per(one)}]" if one else "" for per in (compliance_unit, stiffness_unit))
+    pairs = zip(plant.outputs, plant.inputs, strict=False)
+    units = {output.name: axis_units(output.unit, force.unit) for output, force in pairs}
+    one = next(iter(units.values())) if len(set(units.values())) == 1 else None
+    heads = (f" [{unit}]" for unit in one[:2]) if one else ("", "")
     extent = found.extent
     title = f"Gang of four, largest over frequency{f' and {_course_text(extent)}' if extent.course else ''}"
     forces = (f"{what}{unit}" for what, unit in zip(("from force |SP|", "to force |FS|"), heads, strict=True))
     table = new_table(title, "sensor", "|S|", "|T|", *forces)
     for name, (S, T, PS, FS) in found.gang.items():
         unit = units[name]
-        cells = f"{PS * 1e6:.1f}", f"{FS * 1e-6:.3f}"
+        cells = (f"{PS * 1e6:.1f}", f"{FS * 1e-6:.3f}") if unit.micro else (f"{PS:.4g}", f"{FS:.4g}")
         if not one:
-            cells = f"{cells[0]} {compliance_unit(unit)}", f"{cells[1]} {stiffness_unit(unit)}"
+            cells = f"{cells[0]} {unit.compliance}", f"{cells[1]} {unit.stiffness}"
         add_row(table, name, f"{S:.2f}", f"{T:.2f}", *cells)
     return table
 
