@@ -5,10 +5,13 @@ from __future__ import annotations
 import os
 import re
 import shutil
+import signal
 import subprocess
 import sys
 import venv
 from pathlib import Path
+from typing import Any
+from urllib.request import urlopen
 
 import pytest
 from conftest import ROOT, without_progress
@@ -72,18 +75,33 @@ def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return bin_
 
 
+def own_environment() -> dict[str, str]:
+    found = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
+    return found | {"MPLBACKEND": "agg", "OPENBLAS_NUM_THREADS": "1"}
+
+
 def run(program: Path, folder: Path, *command: str) -> subprocess.CompletedProcess[str]:
-    environment = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
-    environment |= {"MPLBACKEND": "agg", "OPENBLAS_NUM_THREADS": "1"}
     return subprocess.run(
         [str(program / command[0]), *command[1:]],
         cwd=folder,
-        env=environment,
+        env=own_environment(),
         capture_output=True,
         text=True,
         check=False,
         timeout=600,
     )
+
+
+def assert_serves(program: Path, folder: Path, *command: str) -> None:
+    """The command prints its address and serves the page until Ctrl-C."""
+    whole = [str(program / command[0]), *command[1:], "--no-browser"]
+    pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    with subprocess.Popen(whole, cwd=folder, env=own_environment(), **pipes) as server:
+        assert server.stdout is not None
+        with urlopen(server.stdout.readline().strip(), timeout=60) as page:
+            assert page.status == 200
+        server.send_signal(signal.SIGINT)
+        assert server.wait(timeout=60) == 0
 
 
 def test_the_readmes_lines_and_all_commands(program: Path, tmp_path: Path) -> None:
@@ -99,6 +117,9 @@ def test_the_readmes_lines_and_all_commands(program: Path, tmp_path: Path) -> No
     ]  # commands on a machine of one's own have a test of theirs
     assert len(lines) >= 12
     for line in lines:
+        if line.startswith("malta app"):
+            assert_serves(program, tmp_path, *line.split())
+            continue
         done = run(program, tmp_path, *SHORTER.get(line, line).split())
         missed = line == "malta tune design/robust.toml" and "not reached: radial_motion is 1." in done.stderr
         apart = "--sobol" in line and "pip install 'malta[sensitivity]'" in done.stderr  # an extra

@@ -19,7 +19,7 @@ export function element(name, attributes = {}, ...children) {
   return node;
 }
 
-const toNumber = (text) => (text.trim() === "" ? NaN : Number(text.trim().replace("−", "-").replace(",", ".")));
+const toNumber = (text) => (text.trim() === "" ? NaN : Number(text.trim().replace("−", "-"))); // a comma is refused: 1,000 may be one or a thousand
 
 // Slider position, 0 to STEPS, of a value, and back. With `zero` the left end of a logarithmic slider is 0.
 function positionOf(field, value) {
