@@ -6,6 +6,7 @@ import gc
 import hashlib
 import io
 import math
+import os
 import pickle
 import re
 import sys
@@ -38,6 +39,7 @@ if TYPE_CHECKING:
 # As in the program: numeric libraries make many lasting objects, and going through them again and again costs time.
 gc.set_threshold(200_000, 50, 50)
 
+os.environ.pop("COLUMNS", None)  # which workers of pytest may have: tables have the width of a file
 ROOT = Path(__file__).parents[1]
 DESIGNS = ("table2", "calibrated")
 

@@ -256,7 +256,7 @@ def ball() -> Plant:
     """A levitated ball, 0.1 kg on a negative stiffness of 2 kN/m."""
     return malta.linear_machine(
         [[0, 1], [0, 0]], [[0], [10]], [[1, 0]],
-        name="ball", states=["x [m]", "x_dot [m/s]"], inputs=["f [N]"], outputs=["x [m]"],
+        name="levitated_ball", states=["x [m]", "x_dot [m/s]"], inputs=["f [N]"], outputs=["x [m]"],
         nominal={"k": 2e4}, terms={"k": [[[0, 0], [1, 0]]]}, noise=1e-7, limit=40.0, dead_time=1e-4,
     )  # fmt: skip
 

@@ -265,7 +265,10 @@ def test_the_grid_ends_at_the_nyquist_frequency_and_has_the_peaks(curves: LoopCu
 
 def test_zeros_are_those_of_python_control() -> None:
     L = CONTINUOUS["double integrator and lead"] * (s**2 + 0.3 * s + 9) / (s + 4) ** 2
-    assert np.sort_complex(loop_curves(L).zeros) == pytest.approx(np.sort_complex(L.zeros()), rel=1e-6)
+    found, expected = (
+        sorted(zeros, key=lambda zero: zero.imag) for zeros in (loop_curves(L).zeros, L.zeros())
+    )
+    assert found == pytest.approx(expected, rel=1e-6)
 
 
 def test_a_pair_of_systems_is_a_plant_and_its_controller() -> None:

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -18,6 +19,14 @@ from malta.files import noting_files, replace_files
 
 TABLE2, ROBUST = "design/gains/table2.json", "design/gains/robust.json"
 LINES = re.compile(r"malta: .*\b(s|min|h)( left)?$")  # of how far the work is
+
+
+@pytest.fixture(autouse=True)
+def own_handler() -> Iterator[None]:
+    """Ctrl-C raises KeyboardInterrupt, also where the tests run in the background of a shell, which ignores it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
 
 
 def interrupted(wait: float, *arguments: str | Path) -> tuple[int, list[str]]:
