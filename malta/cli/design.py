@@ -60,8 +60,9 @@ def design(
         except (InputError, CheckError) as error:
             code = max(code, print_error(error, file))
             continue
-        designed.append(made.document)
-        if not as_json:
+        if as_json:
+            designed.append(_document(made, change or ()))
+        else:
             _print_design(made)
     if as_json:
         from malta.cli.documents.simulations import DesignOutput
@@ -73,8 +74,10 @@ def design(
 class Made(NamedTuple):
     """A design whose gain files stand."""
 
+    name: str
     page: Any
-    document: DesignPart
+    margins: Margins
+    result: Experiment
     paths: Sequence[Path]  # gain files
     picture: Path
     unchanged: bool  # the gain files held these numbers already
@@ -94,7 +97,6 @@ def _run_design(
     over a gain file then.
     """
     from malta import gains, report
-    from malta.cli.documents.simulations import design_part
     from malta.margins.verify import require_stable
     from malta.margins.verify import verify as compute_margins
     from malta.model.linearize import linearize
@@ -126,8 +128,14 @@ def _run_design(
     replace_files(
         contents
     )  # last, and all at once: whatever fails leaves the old gain files and their figure
-    document = design_part(spec.name, (*paths, picture), changes or (), margins, result)
-    return Made(page, document, paths, picture, unchanged)
+    return Made(spec.name, page, margins, result, paths, picture, unchanged)
+
+
+def _document(made: Made, changes: Sequence[str]) -> DesignPart:
+    """The design in the JSON document."""
+    from malta.cli.documents.simulations import design_part
+
+    return design_part(made.name, (*made.paths, made.picture), changes, made.margins, made.result)
 
 
 def _print_design(made: Made) -> None:

@@ -1,5 +1,10 @@
 """Tables and figures of everything that malta computes."""
 
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
 from malta.report.figures import distributions_figure as distributions_figure
 from malta.report.figures import encode_figure as encode_figure
 from malta.report.figures import experiment_figure as experiment_figure
@@ -24,16 +29,6 @@ from malta.report.pages import loads as loads
 from malta.report.pages import robustness as robustness
 from malta.report.pages import sensitivity as sensitivity
 from malta.report.pages import stroke as stroke
-from malta.report.plots import bode as bode
-from malta.report.plots import gang_of_four as gang_of_four
-from malta.report.plots import load_response as load_response
-from malta.report.plots import nichols as nichols
-from malta.report.plots import nyquist as nyquist
-from malta.report.plots import pzmap as pzmap
-from malta.report.plots import root_locus as root_locus
-from malta.report.plots import sensitivity_curves as sensitivity_curves
-from malta.report.plots import sigma as sigma
-from malta.report.plots import step as step
 from malta.report.tables.campaign import box_text as box_text
 from malta.report.tables.campaign import campaign_tables as campaign_tables
 from malta.report.tables.campaign import run_text as run_text
@@ -63,3 +58,30 @@ from malta.report.tables.tuning import front_markdown as front_markdown
 from malta.report.tables.tuning import front_rows as front_rows
 from malta.report.tables.tuning import front_table as front_table
 from malta.report.tables.tuning import requirements_table as requirements_table
+
+if TYPE_CHECKING:  # loaded when the first one is drawn: commands that draw none start sooner
+    from malta.report.plots import bode as bode
+    from malta.report.plots import gang_of_four as gang_of_four
+    from malta.report.plots import load_response as load_response
+    from malta.report.plots import nichols as nichols
+    from malta.report.plots import nyquist as nyquist
+    from malta.report.plots import pzmap as pzmap
+    from malta.report.plots import root_locus as root_locus
+    from malta.report.plots import sensitivity_curves as sensitivity_curves
+    from malta.report.plots import sigma as sigma
+    from malta.report.plots import step as step
+
+_PLOTS = {
+    *("bode", "gang_of_four", "load_response", "nichols", "nyquist"),
+    *("pzmap", "root_locus", "sensitivity_curves", "sigma", "step"),
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _PLOTS:
+        raise AttributeError(f"module 'malta.report' has no attribute {name!r}")
+    return getattr(import_module("malta.report.plots"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_PLOTS})
