@@ -16,6 +16,7 @@ from conftest import ROOT, Run
 from page_checks import cells_of, read_page
 
 import malta
+from malta.cli.report import read_subject
 from malta.margins.verify import verify
 from malta.report.page.analysis import Subject, analyse
 from malta.report.page.document import Page
@@ -219,3 +220,18 @@ def test_the_command_refuses_what_is_no_page(tmp_path: Path, run: Run) -> None:
     assert said.code == 2
     assert "suffix '.txt'" in said.err
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("texts", "box"),
+    [
+        (None, {"m": 0.2, "K_A": 0.2, "K_B": 0.2, "K_D": 0.2}),
+        (["10%"], {"m": 0.1, "K_A": 0.1, "K_B": 0.1, "K_D": 0.1}),
+        (["m=10%"], {"m": 0.1}),
+    ],
+)
+def test_an_uncertainty_is_read_as_verify_reads_it(texts: list[str] | None, box: dict[str, float]) -> None:
+    path = ROOT / "design" / "gains" / "table2.json"
+    assert dict(read_subject(path, malta.gains.read(path), None, texts, None).box) == box
+    with pytest.raises(malta.InputError, match="a share above 0 %"):
+        read_subject(path, malta.gains.read(path), None, ["m=0%"], None)

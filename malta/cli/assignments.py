@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -101,6 +102,17 @@ def read_shares(
     own = differences(parameters) if option == "--spread" else {}
     units = dict.fromkeys(units_of(parameters), "1") | own
     return shares | read_assignments(option, named, units)
+
+
+def read_uncertainty(
+    gains: Path, texts: list[str] | None, parameters: Parameters, published: Mapping[str, Any] | None
+) -> dict[str, float]:
+    """Read `--uncertain`, the box of a margin: shares above 0. Raises InputError as `read_shares`."""
+    box = read_shares(gains, texts, parameters, published, option="--uncertain")
+    for name, share in box.items():
+        if not 0 < share < math.inf:
+            raise InputError("--uncertain", name, f"{100 * share:g} %", "a share above 0 %")
+    return box
 
 
 def scenario_options(distance: float | None, rise: float | None, **others: Any) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from malta.cli.inputs import read_controller
-from malta.cli.options import AsJson, Changes, MachineFile
+from malta.cli.options import AsJson, Changes, MachineFile, Uncertain
 from malta.cli.output import make_console, print_document, print_written
 from malta.cli.report import read_subject, unwritten_progress
 from malta.files import locate, replace_files
@@ -22,14 +22,7 @@ def compare(
         Path | None,
         typer.Option(metavar="FILE", help="Write a page (.html) with the curves over each other."),
     ] = None,
-    uncertain: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--uncertain",
-            metavar="NAME=SHARE",
-            help="How far parameters vary at margin 1, either way, in all designs: m=10%, ... [each gain file's]",
-        ),
-    ] = None,
+    uncertain: Uncertain = None,
     change: Changes = None,
     no_proof: Annotated[
         bool, typer.Option("--no-proof", help="Leave out the margins of the parameters, which take longest.")

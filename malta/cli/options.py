@@ -29,6 +29,15 @@ DesignChanges = Annotated[
         "weights.state.x=4, bases.state.x=50um or delay=1. The design is named after its changes.",
     ),
 ]
+Uncertain = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--uncertain",
+        metavar="SHARE|NAME=SHARE",
+        help="How far parameters vary at margin 1, either way: 20% (those of the gain file), m=10%, ... "
+        "[the gain file's]",
+    ),
+]
 SCENARIOS = "one of the machine's own, which `--scenario help` lists. [its first]"
 # Options of a run, in `simulate` and in `campaign`.
 Distance = Annotated[float | None, typer.Option(help="Length of a stroke [mm]. [the scenario's]")]

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from malta.cli.assignments import read_assignments
+from malta.cli.assignments import read_uncertainty
 from malta.cli.inputs import change_machine, design_of, read_controller
-from malta.cli.options import AsJson, Changes, GainFile, MachineFile
+from malta.cli.options import AsJson, Changes, GainFile, MachineFile, Uncertain
 from malta.cli.output import (
     interruption,
     make_console,
@@ -53,14 +53,7 @@ def report(
             help="Design file whose [specification] is judged. [NAME.toml beside the gain file's folder]",
         ),
     ] = None,
-    uncertain: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--uncertain",
-            metavar="NAME=SHARE",
-            help="How far parameters vary at margin 1, either way: m=10%, ... [the gain file's]",
-        ),
-    ] = None,
+    uncertain: Uncertain = None,
     change: Changes = None,
     no_proof: Annotated[
         bool, typer.Option("--no-proof", help="A first look: no proof of the margins of the parameters.")
@@ -123,7 +116,7 @@ def read_subject(
 
     Raises InputError for a change, a share or a design file that does not fit.
     """
-    from malta.model.parameters import units_of
+    from malta.model.published import published_figures
     from malta.report.page.report import subject_of
 
     parameters = change_machine(controller.parameters, change)
@@ -131,11 +124,8 @@ def read_subject(
     subject = subject_of(gains, parameters=parameters, spec=spec, changes=change or ())
     if not uncertain:
         return subject
-    shares = read_assignments("--uncertain", uncertain, dict.fromkeys(units_of(parameters), "1"))
-    for name, share in shares.items():
-        if not 0 < share < float("inf"):
-            raise InputError("--uncertain", name, f"{100 * share:g} %", "a share above 0 %")
-    return subject._replace(box=dict(subject.box) | shares)
+    box = read_uncertainty(gains, uncertain, parameters, published_figures(subject.plant.name))
+    return subject._replace(box=box)
 
 
 def _campaigns_of(folders: Sequence[Path] | None, controller: Controller, spec: Spec | None) -> list[Summary]:

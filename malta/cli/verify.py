@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, cast
 
 import typer
 
-from malta.cli.assignments import read_shares
+from malta.cli.assignments import read_uncertainty
 from malta.cli.inputs import change_machine, read_controller
-from malta.cli.options import AsJson, Changes, GainFile, MachineFile
+from malta.cli.options import AsJson, Changes, GainFile, MachineFile, Uncertain
 from malta.cli.output import make_console, margin_progress, print_document, print_text, print_written
 from malta.errors import CheckError, InputError
 
@@ -58,15 +58,7 @@ class Analysis(NamedTuple):
 def verify(
     gains: GainFile,
     change: Changes = None,
-    uncertain: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--uncertain",
-            metavar="SHARE|NAME=SHARE",
-            help="How far parameters vary at margin 1, either way: 20% (those of the gain file), m=10%, ... "
-            "[the gain file's]",
-        ),
-    ] = None,
+    uncertain: Uncertain = None,
     current_loops: Annotated[
         str, typer.Option(help="Of the machine's loop: lag (first order), or pi (sampled PI loops).")
     ] = "lag",
@@ -113,8 +105,8 @@ def verify(
     plant = plant_of(change_machine(controller.parameters, change))
     model = linearize(plant, plant.point(controller.operating_point[0]))
     published = published_figures(plant.name)
-    box = read_shares(gains, uncertain, plant.parameters, published, option="--uncertain")
-    _require_options(box, time, certificate, proof=not no_proof)
+    box = read_uncertainty(gains, uncertain, plant.parameters, published)
+    _require_options(time, certificate, proof=not no_proof)
     loop = Loop(gains, controller, plant, model, box, cast("CurrentLoops", current_loops))
     analysis = _analyse(loop, time, proof=not no_proof, worst_case=worst_case)
     files: list[Path] = []
@@ -135,13 +127,8 @@ def verify(
         raise refusal
 
 
-def _require_options(
-    box: Mapping[str, float], time: float | None, certificate: Path | None, *, proof: bool
-) -> None:
-    """Raise InputError for a share or a time that is not positive, or a certificate without a proof."""
-    for name, share in box.items():
-        if not 0 < share < math.inf:
-            raise InputError("--uncertain", name, f"{100 * share:g} %", "a share above 0 %")
+def _require_options(time: float | None, certificate: Path | None, *, proof: bool) -> None:
+    """Raise InputError for a time that is not positive, or a certificate without a proof."""
     if time is not None and not 0 < time < math.inf:
         raise InputError("--time", "", f"{time:g}", "seconds above 0")
     if certificate is not None and not proof:
