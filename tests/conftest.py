@@ -247,12 +247,12 @@ def design(request: pytest.FixtureRequest, designs: dict[str, Design]) -> Design
 QUANTITY = re.compile(r"[-+±]*\d[\w.+-]*(?: (?:%|[munk]?(?:m|s|N|A|V|J|Hz|rad|kg|g))(?![\w/]))?")
 
 
+PROGRESS = re.compile(r"malta: .+: (.+, )?[\d.]+ (s|min|h|days)(,.+ left)?")  # a line of how far a command is
+
+
 def without_progress(text: str) -> str:
     """What a command says on standard error, but for lines of how far it is: a loaded computer gets some."""
-    lines = text.splitlines(keepends=True)
-    return "".join(
-        line for line in lines if not re.fullmatch(r"malta: .+: (.+, )?[\d.]+ (s|min)(,.+ left)?\n", line)
-    )
+    return "".join(f"{line}\n" for line in text.splitlines() if not PROGRESS.fullmatch(line))
 
 
 def printed(renderable: object, width: int = 100) -> str:

@@ -12,13 +12,12 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from conftest import ROOT, Run
+from conftest import PROGRESS, ROOT, Run
 
 from malta.cli import output
 from malta.files import noting_files, replace_files
 
 TABLE2, ROBUST = "design/gains/table2.json", "design/gains/robust.json"
-LINES = re.compile(r"malta: .*\b(s|min|h)( left)?$")  # of how far the work is
 
 
 @pytest.fixture(autouse=True)
@@ -49,7 +48,7 @@ def interrupted(wait: float, *arguments: str | Path) -> tuple[int, list[str]]:
     except subprocess.TimeoutExpired:
         process.send_signal(signal.SIGINT)
         _, err = process.communicate(timeout=60)
-    return process.returncode, [line for line in err.splitlines() if not LINES.match(line)]
+    return process.returncode, [line for line in err.splitlines() if not PROGRESS.fullmatch(line)]
 
 
 NOTHING = "interrupted; nothing was written"
@@ -89,7 +88,7 @@ def test_a_piped_proof_says_how_far_it_is_and_prints_one_document() -> None:
     done = subprocess.run(command, capture_output=True, text=True, check=True, cwd=ROOT)
     lines = done.stderr.splitlines()
     assert len(lines) >= 2
-    assert all(LINES.match(line) for line in lines)
+    assert all(PROGRESS.fullmatch(line) for line in lines)
     assert any("proven 350." in line for line in lines)
     assert done.stdout.startswith("{")
 
