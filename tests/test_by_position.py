@@ -257,7 +257,7 @@ def test_the_loop_whose_sums_wait_stands_the_box_too(flagship: Flagship, z: floa
         }
         plant = malta.plant_of(replace(spec.parameters, **values))
         closed = malta.margins.loops.loop(
-            malta.linearize(plant, plant.at(z=z)), waiting, delay=1, current_loops=True
+            malta.linearize(plant, plant.at(z=z)), waiting, delay=1, current_loops="lag"
         ).closed
         # e of z is not fed back, and stays as it is: one eigenvalue of 1.
         radii = np.sort(np.abs(np.linalg.eigvals(closed)))

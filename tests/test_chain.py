@@ -25,13 +25,13 @@ from malta.margins.classical import (
     classical_margins,
     delay_margins,
     disk_margin,
-    is_stable,
+    nominal_loop,
 )
 from malta.margins.gain import Gain
-from malta.margins.loops import loaded_system, machine_law
+from malta.margins.loops import loaded_loop, machine_law, machine_system
 from malta.margins.responses import responses
 from malta.margins.robust import robust_margin
-from malta.margins.stages import SAMPLED, Robustness, compensators, robustness
+from malta.margins.stages import MACHINE, SAMPLED, Robustness, compensators, robustness
 from malta.margins.systems import uncertain
 from malta.margins.uncertain import Compensator, UncertainSystem, closed_loop, instability
 from malta.model.data import plant_of
@@ -46,7 +46,7 @@ pytestmark = pytest.mark.usefixtures("proven_once")
 
 
 BOX = dict.fromkeys(("m", "K_A", "K_D", "K_B"), 0.2)
-STAGES = ["LQR", "LQI", "LQG", "LQGI", "+ current loops", "sampled"]
+STAGES = ["LQR", "LQI", "LQG", "LQGI", "+ current loops", "sampled", "machine"]
 DESIGNS = ("table2", "calibrated")
 
 
@@ -70,15 +70,15 @@ SENSORS = ["x1", "y1", "x2", "y2", "z"]
 def _sampled(name: str, z: float = 0.0) -> tuple[UncertainSystem, Compensator]:
     c = gains.read(f"design/gains/{name}.json")
     plant = plant_of(c.parameters)
-    return uncertain(plant, list(BOX), at={"z": z}), machine_law(plant, c)
+    return uncertain(plant, list(BOX), at={"z": z}), machine_law(plant, c, "lag")
 
 
 @pytest.mark.parametrize("name", CHAINED)
 def test_margins_go_where_the_chain_says(name: str) -> None:
     found = chain_of(name)
     assert [link.name for link in found.chain] == STAGES
-    assert STAGES[-1] == SAMPLED
-    assert [link.broken_at for link in found.chain] == ["forces"] * 2 + ["sensors"] * 4
+    assert STAGES[-2:] == [SAMPLED, MACHINE]
+    assert [link.broken_at for link in found.chain] == ["forces"] * 2 + ["sensors"] * 5
     by_name = {link.name: link for link in found.chain}
     for state_feedback in ("LQR", "LQI"):  # Kalman's inequality; R is diagonal
         assert by_name[state_feedback].peak <= 1 + 1e-6
@@ -100,7 +100,7 @@ def test_places_stand_for_both_sides_of_the_travel(name: str) -> None:
     places = chain_of(name).places
     assert [place.position for place in places] == pytest.approx([0, 5e-3, 10e-3, 15e-3])
     for z in (15e-3, -15e-3):
-        there = robust_margin(uncertain(plant, list(BOX), at={"z": z}), machine_law(plant, c), BOX)
+        there = robust_margin(*machine_system(plant, c, list(BOX), {"z": z}), BOX)
         assert there.upper >= places[-1].margin.upper * (1 - 1e-9)
     assert places[-1].margin.upper >= (chain_of(name).travel.lower or 0)
 
@@ -113,7 +113,7 @@ def test_gang_of_four_by_its_definition(name: str) -> None:
     S = np.linalg.inv(np.eye(5) - P @ F)
     T = -P @ F @ S
     assert np.abs(S + T - np.eye(5)).max() < 1e-7
-    for i, figures in enumerate(classical_margins(system, law, SENSORS).gang.values()):
+    for i, figures in enumerate(classical_margins(nominal_loop(system, law), SENSORS).gang.values()):
         expected = (
             np.abs(S[:, i, i]).max(),
             np.abs(T[:, i, i]).max(),
@@ -127,7 +127,7 @@ def test_gang_of_four_by_its_definition(name: str) -> None:
 def test_disks_are_stood_and_the_one_channel_disk_is_exact(name: str) -> None:
     """Real factors within the disk, in all channels at once, leave it stable; one channel's is reached by a factor."""
     system, law = _sampled(name)
-    disks = {d.channels: d for d in classical_margins(system, law, SENSORS).disks}
+    disks = {d.channels: d for d in classical_margins(nominal_loop(system, law), SENSORS).disks}
     assert list(disks)[:3] == ["forces", "sensors", "forces and sensors"]
     assert disks["forces and sensors"].size <= min(disks["forces"].size, disks["sensors"].size)
     rng = np.random.default_rng(0)
@@ -171,7 +171,9 @@ def test_a_single_loop_has_the_disk_of_its_peak() -> None:
     S = np.linalg.inv(np.eye(5) - P @ F)
     for i in range(5):
         expected = 1 / np.abs(S[:, i, i] - 0.5).max()
-        assert disk_margin(system, law, "sensors", only=i).size == pytest.approx(expected, rel=1e-4)
+        assert disk_margin(nominal_loop(system, law), "sensors", only=i).size == pytest.approx(
+            expected, rel=1e-4
+        )
 
 
 def test_a_balanced_matrix_bounds_mu() -> None:
@@ -193,7 +195,7 @@ def test_delay_margins_in_whole_samples(name: str) -> None:
     """One sensor late by whole samples: stable up to the margin, unstable beyond."""
     system, law = _sampled(name)
     T, n = 50e-6, len(law.A)
-    for i, (_, margin) in enumerate(classical_margins(system, law, SENSORS).delay.items()):
+    for i, (_, margin) in enumerate(classical_margins(nominal_loop(system, law), SENSORS).delay.items()):
         if margin > 200 * T:  # as many states more
             continue
         stable = {}
@@ -300,7 +302,7 @@ def test_force_constants_that_the_controller_does_not_know() -> None:
 def test_an_unstable_machine_is_reported() -> None:
     c = gains.read("design/gains/calibrated.json")
     found = robustness(plant_of(replace(c.parameters, K_A=3e4)), c, BOX)
-    assert [link.margin.upper > 0 for link in found.chain] == [True, True, False, False, False, False]
+    assert [link.margin.upper > 0 for link in found.chain] == [True, True, False, False, False, False, False]
     assert math.isnan(found.chain[-1].peak)
     assert not found.disks
     assert not found.gang
@@ -489,15 +491,15 @@ def test_bad_input_gets_one_sentence(
 def test_margins_without_parameters_are_the_smallest_along_the_travel(name: str) -> None:
     c = gains.read(f"design/gains/{name}.json")
     loops = [
-        loaded_system(plant_of(c.parameters), c, {"z": z})
+        loaded_loop(plant_of(c.parameters), c, {"z": z})
         for z in (-15e-3, -10e-3, -5e-3, 0.0, 5e-3, 10e-3, 15e-3)
     ]
     found = chain_of(name)
     if name == "table2":  # unstable at 10 and 15 mm under its cogging
-        assert [is_stable(*loop) for loop in loops[3:]] == [True, True, False, False]
+        assert [loop.stable for loop in loops[3:]] == [True, True, False, False]
         assert (found.disks, found.gang) == ((), {})
         return
-    places = [classical_margins(*loop, sensors=SENSORS) for loop in loops]
+    places = [classical_margins(loop, SENSORS) for loop in loops]
     assert found.delay == pytest.approx({key: min(p.delay[key] for p in places) for key in SENSORS})
     for k, disk in enumerate(found.disks):
         assert disk.size == pytest.approx(min(p.disks[k].size for p in places))

@@ -124,7 +124,7 @@ def test_every_corner_at_350_percent_is_stable(
         }
         plant = malta.plant_of(replace(par, **values))
         model = malta.linearize(plant, plant.at(z=z))
-        closed = loop(model, controller, delay=1, current_loops=True).closed
+        closed = loop(model, controller, delay=1, current_loops="lag").closed
         return float(np.abs(eigenvalues(closed)).max())
 
     corners = np.array(np.meshgrid(*[(-1, 1)] * 4)).reshape(4, -1).T

@@ -7,18 +7,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from scipy import linalg
 
 import malta
-from malta import gains
 from malta.errors import InputError
 from malta.margins.loops import loop, machine_law
 from malta.margins.responses import responses
 from malta.margins.robust import robust_margin
 from malta.margins.systems import uncertain
-from malta.margins.uncertain import closed_loop, critical_frequency, instability, sampled_law
-from malta.model.data import plant_of
-from malta.synthesis.controller import linear_law
+from malta.margins.uncertain import closed_loop, critical_frequency, instability
 
 if TYPE_CHECKING:
     from conftest import Design
@@ -68,9 +64,9 @@ def test_a_machine_that_the_controller_does_not_know(designs: dict[str, Design])
     """K_B = 4 N/A where the controller believes in 5.2: the same loop as verify's."""
     design = designs["calibrated"]
     weak = malta.plant_of(replace(design.spec.parameters, K_B=4.0))
-    law = machine_law(weak, design.controller)
+    law = machine_law(weak, design.controller, "lag")
     system = uncertain(weak, ["m"], believed=design.plant)
-    expected = loop(malta.linearize(weak, weak.at()), design.controller, delay=1, current_loops=True)
+    expected = loop(malta.linearize(weak, weak.at()), design.controller, delay=1, current_loops="lag")
     w = np.geomspace(1, 6e4, 30)
     P, _, _, F = responses(system, law, system.nominal, w)
     assert np.linalg.inv(np.eye(5) - P @ F) == pytest.approx(expected.sensitivity(w), rel=1e-6, abs=1e-8)
@@ -83,10 +79,10 @@ def test_an_unknown_parameter_is_named(plant: Plant) -> None:
 
 def test_the_closed_loop_is_verifys(design: Design) -> None:
     """Poles, sensitivity and spectral radius of the sampled machine, by the other route."""
-    law = machine_law(design.plant, design.controller)
+    law = machine_law(design.plant, design.controller, "lag")
     system = uncertain(design.plant, ["m", "K_A"], at={"z": 4e-3})
     model = malta.linearize(design.plant, design.plant.at(z=4e-3))
-    expected = loop(model, design.controller, delay=1, current_loops=True)
+    expected = loop(model, design.controller, delay=1, current_loops="lag")
     (ours,) = closed_loop(system, law, system.nominal)
     z = np.sort_complex(1 + 50e-6 * np.linalg.eigvals(ours))
     radius = float(np.abs(np.linalg.eigvals(expected.closed)).max())
@@ -102,52 +98,11 @@ def test_the_closed_loop_is_verifys(design: Design) -> None:
 
 def test_the_worst_pole_has_a_frequency(designs: dict[str, Design]) -> None:
     design = designs["calibrated"]
-    law, system = machine_law(design.plant, design.controller), uncertain(design.plant, ["m", "K_A", "K_B"])
+    law, system = (
+        machine_law(design.plant, design.controller, "lag"),
+        uncertain(design.plant, ["m", "K_A", "K_B"]),
+    )
     m = robust_margin(system, law, {"m": 0.2, "K_A": 0.2, "K_B": 0.2})
     assert m.witness is not None
     p = np.array([m.witness[name] for name in system.names])
     assert critical_frequency(system, law, p) == pytest.approx(m.frequency, rel=1e-3)
-
-
-@pytest.mark.parametrize("name", ["calibrated", "table2", "robust"])
-@pytest.mark.parametrize("delay", [0, 1, 3])
-def test_current_loops_in_the_law_are_those_of_the_machine(name: str, delay: int) -> None:
-    """Stepped through time: mover and windings sampled exactly, voltages late by `delay`, PI control on each axis."""
-    c = gains.read(f"design/gains/{name}.json")
-    plant = plant_of(c.parameters)
-    T, a = c.sample_time, plant.actuator
-    current, law = c.current_loop, linear_law(c)
-    assert current is not None
-    system = uncertain(plant, ["m"], at={"z": 3e-3})
-    A, B, C = (M[0] for M in system.at(system.nominal))
-    # forces follow voltages / R with the windings' time constant
-    n, m = B.shape
-    whole = np.zeros((n + 2 * m, n + 2 * m))
-    whole[:n, :n], whole[:n, n : n + m] = A, B
-    whole[n : n + m, n : n + m], whole[n : n + m, n + m :] = -a.R / a.L * np.eye(m), np.eye(m) / a.L
-    E = linalg.expm(whole * T)
-    rng = np.random.default_rng(0)
-    x, s = np.r_[1e-6 * rng.normal(size=n), np.zeros(m)], np.zeros(len(law.A))
-    sums, late = np.zeros(m), [np.zeros(m)] * delay
-    y_of = np.hstack([C, np.zeros((len(C), m))])
-    seen = []
-    for _ in range(300):
-        seen.append(y_of @ x)
-        wanted = law.C @ s + law.D_y @ seen[-1]
-        s = law.A @ s + law.B_y @ seen[-1]
-        error = wanted - x[n:]
-        sums = sums + current.Ki * T * error
-        late.append(current.Kp * error + sums)
-        x = E[: n + m, : n + m] @ x + E[: n + m, n + m :] @ late.pop(0)
-    compensator = sampled_law(c, delay, a.R / a.L, current, a.R)
-    (ours,) = closed_loop(system, compensator, system.nominal)
-    step = np.eye(len(ours)) + T * ours
-    rng = np.random.default_rng(0)
-    state = np.zeros(len(step))
-    state[:n] = 1e-6 * rng.normal(size=n)
-    found = []
-    for _ in range(300):
-        found.append(C @ state[:n])
-        state = step @ state
-    assert np.array(found) == pytest.approx(np.array(seen), rel=1e-6, abs=1e-9 * np.abs(seen).max())
-    assert np.ptp(np.array(seen), axis=0).max() > 1e-7

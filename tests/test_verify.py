@@ -58,7 +58,7 @@ def test_the_sampled_machine_is_python_controls(design: Design) -> None:
         -w_c * np.eye(5), w_c * np.eye(5), np.eye(5), 0 * np.eye(5)
     )
     sampled = control.c2d(machine, 50e-6, "zoh")
-    stage = loop(design.model, design.controller, delay=2, current_loops=True)
+    stage = loop(design.model, design.controller, delay=2, current_loops="lag")
     law = stage.control
     controller = control.ss(law.A, law.B_y, law.C, law.D_y, 50e-6)
     for w in (10.0, 300.0, 4000.0):

@@ -12,7 +12,7 @@ from malta.cli.options import AsJson, MachineFile
 from malta.cli.output import make_console, print_document, print_line, print_note, working
 
 if TYPE_CHECKING:
-    from malta.margins.loops import CurrentLoops
+    from malta.margins.windings import CurrentLoops
     from malta.synthesis.controller import Controller
 
 

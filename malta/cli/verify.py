@@ -18,11 +18,11 @@ from malta.errors import CheckError, InputError
 if TYPE_CHECKING:
     from malta.cli.documents.loops import VerifyOutput
     from malta.margins.gain import Gain
-    from malta.margins.loops import CurrentLoops
     from malta.margins.recovery import Recovery
     from malta.margins.robust import Margin
     from malta.margins.stages import Robustness
     from malta.margins.verify import Margins
+    from malta.margins.windings import CurrentLoops
     from malta.model.linearize import LinearModel
     from malta.model.plant import Plant
     from malta.simulation.payload import Payload
@@ -60,8 +60,8 @@ def verify(
     change: Changes = None,
     uncertain: Uncertain = None,
     current_loops: Annotated[
-        str, typer.Option(help="Of the machine's loop: lag (first order), or pi (sampled PI loops).")
-    ] = "lag",
+        str, typer.Option(help="Of the last stage: pi (controllers on the windings), or lag (first order).")
+    ] = "pi",
     time: Annotated[
         float | None,
         typer.Option(metavar="SECONDS", help="Longest search of a margin over the travel. [120]"),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
@@ -13,6 +13,35 @@ from malta.margins.uncertain import Compensator, UncertainSystem, instability
 
 if TYPE_CHECKING:
     from malta.model.plant import ComplexArray, FloatArray
+
+
+class Nominal(NamedTuple):
+    """A nominal loop y = P u, u = F y by its responses, positive feedback.
+
+    response : frequencies w (rad/s) -> P, k x p x m, and F, k x m x p
+    stable : whether the loop is stable
+    sample_time : s; None: continuous
+    """
+
+    response: Callable[[FloatArray], tuple[ComplexArray, ComplexArray]]
+    stable: bool
+    sample_time: float | None
+
+    @property
+    def frequencies(self) -> FloatArray:
+        """A grid up to the Nyquist frequency, rad/s."""
+        return np.geomspace(1e-2, 1e5 if self.sample_time is None else np.pi / self.sample_time, 400)
+
+
+def nominal_loop(system: UncertainSystem, law: Compensator) -> Nominal:
+    """A loop at its nominal parameters."""
+
+    def response(w: FloatArray) -> tuple[ComplexArray, ComplexArray]:
+        r = responses(system, law, system.nominal, w)
+        return r.G_y, r.F
+
+    stable = bool(instability(system, law, system.nominal)[0] < 0)
+    return Nominal(response, stable, law.sample_time)
 
 
 @dataclass(frozen=True)
@@ -42,13 +71,13 @@ class Classical(NamedTuple):
     gang: dict[str, tuple[float, ...]]  # by sensor: largest |S|, |T|, |S P| (m/N), |F S| (N/m)
 
 
-def classical_margins(system: UncertainSystem, law: Compensator, sensors: Sequence[str]) -> Classical:
+def classical_margins(loop: Nominal, sensors: Sequence[str]) -> Classical:
     """The disk margins, delay margins and the gang of four of a stable loop; `sensors` names the rows of y."""
-    w = _frequencies(law)
-    P, F = _responses(system, law, w)
-    disks = [disk_margin(system, law, kind) for kind in ("forces", "sensors", "forces and sensors")]
+    w = loop.frequencies
+    P, F = loop.response(w)
+    disks = [disk_margin(loop, kind) for kind in ("forces", "sensors", "forces and sensors")]
     for k, name in enumerate(sensors):
-        disks.append(replace(disk_margin(system, law, "sensors", only=k), channels=f"{name} alone"))
+        disks.append(replace(disk_margin(loop, "sensors", only=k), channels=f"{name} alone"))
     delays = delay_margins(P @ F, w).tolist()
     return Classical(
         tuple(disks),
@@ -75,8 +104,7 @@ def worst_of(margins: Sequence[Classical | None]) -> Classical | None:
 
 
 def disk_margin(
-    system: UncertainSystem,
-    law: Compensator,
+    loop: Nominal,
     kind: Literal["forces", "sensors", "forces and sensors"],
     only: int | None = None,
 ) -> Disk:
@@ -88,10 +116,9 @@ def disk_margin(
     M = (1 - Q)^-1 - 1/2 (Seiler, Packard, Gahinet 2020). For several channels mu is bounded above by a balanced
     D M D^-1, so the margin is a lower bound; for one channel it is exact.
     """
-    w = _frequencies(law)
 
     def sizes(w: FloatArray) -> FloatArray:
-        P, F = _responses(system, law, w)
+        P, F = loop.response(w)
         if kind == "forces":
             Q = F @ P
         elif kind == "sensors":
@@ -104,7 +131,7 @@ def disk_margin(
         mu = _balanced_norm(M) if only is None else np.abs(M[:, only, only])
         return np.asarray(mu[:, None])
 
-    (mu,), (at,) = find_peaks(sizes, w)
+    (mu,), (at,) = find_peaks(sizes, loop.frequencies)
     channels = kind if only is None else f"{kind[:-1]} {only + 1}"
     return Disk(channels, float(1 / mu), float(at))
 
@@ -143,35 +170,18 @@ def delay_margins(L: ComplexArray, w: FloatArray) -> FloatArray:
     return found
 
 
-def _frequencies(law: Compensator) -> FloatArray:
-    """A grid up to the Nyquist frequency, rad/s."""
-    top = 1e5 if law.sample_time is None else np.pi / law.sample_time
-    return np.geomspace(1e-2, top, 400)
-
-
-def _responses(system: UncertainSystem, law: Compensator, w: FloatArray) -> tuple[ComplexArray, ComplexArray]:
-    """P, from commands to sensors, and F at nominal parameters."""
-    r = responses(system, law, system.nominal, w)
-    return r.G_y, r.F
-
-
-def is_stable(system: UncertainSystem, law: Compensator) -> bool:
-    """Whether the loop is stable at nominal parameters."""
-    return bool(instability(system, law, system.nominal)[0] < 0)
-
-
-def peak_sensitivity(system: UncertainSystem, law: Compensator, at: Literal["forces", "sensors"]) -> float:
+def peak_sensitivity(loop: Nominal, at: Literal["forces", "sensors"]) -> float:
     """The largest |S_ii| over all frequencies and channels at nominal parameters; NaN for an unstable loop."""
-    if not is_stable(system, law):
+    if not loop.stable:
         return float("nan")
 
     def sizes(w: FloatArray) -> FloatArray:
-        P, F = _responses(system, law, w)
+        P, F = loop.response(w)
         Q = F @ P if at == "forces" else P @ F
         S = np.linalg.inv(np.eye(Q.shape[-1]) - Q)
         return np.asarray(np.abs(np.einsum("kii->ki", S)))
 
-    return float(find_peaks(sizes, _frequencies(law))[0].max())
+    return float(find_peaks(sizes, loop.frequencies)[0].max())
 
 
 def gang_of_four(P: ComplexArray, F: ComplexArray) -> list[tuple[float, ...]]:

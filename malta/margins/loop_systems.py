@@ -85,7 +85,8 @@ def loop_systems(plant: Plant, controller: Controller) -> LoopSystems:
     >>> f"largest |S| {loop.S.frequency_response(w).magnitude.max():.2f}"
     'largest |S| 1.57'
     """
-    loop = machine_loop(linearize(plant, plant.point(controller.operating_point[0])), controller)
+    model = linearize(plant, plant.point(controller.operating_point[0]))
+    loop = machine_loop(model, controller, forces_alone=True)
     law, m = loop.control, len(controller.forces)
     n, k, p = len(loop.Ad), len(law.A), len(loop.Cd)
     Cd, B1 = loop.Cd, loop.Bd[:, :m]

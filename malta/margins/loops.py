@@ -14,20 +14,27 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING, Literal, get_args
+from typing import TYPE_CHECKING
 
 import casadi as ca
 import numpy as np
 
-from malta.errors import InputError
+from malta.margins.classical import Nominal
+from malta.margins.laws import ReadingUse, sampled_law
 from malta.margins.plants import of_plant
-from malta.margins.uncertain import (
-    Compensator,
-    ReadingUse,
-    UncertainSystem,
-    held_gain,
-    is_commutated,
-    sampled_law,
+from malta.margins.uncertain import Compensator, UncertainSystem, held_gain, is_commutated
+from malta.margins.windings import (
+    CurrentLoops,
+    axis_map,
+    chosen_loops,
+    current_control,
+    force_modes,
+    forecast_as_forces,
+    forecast_rows,
+    link_at_rest,
+    windings_of,
+    with_forecast,
+    with_windings,
 )
 from malta.model.data import plant_of
 from malta.model.equilibrium import trim
@@ -35,15 +42,14 @@ from malta.model.linearize import LinearModel, linearize
 from malta.model.plant import position_in
 from malta.model.sensors import whole_samples, with_lags
 from malta.synthesis.controller import Controller, LinearLaw, linear_law, with_readings, with_slope
-from malta.synthesis.riccati import add_lags, delay_inputs, sample
-from malta.synthesis.sampled import held
+from malta.synthesis.riccati import add_lags, delay_inputs, eigenvalues, sample
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from malta.model.plant import ComplexArray, FloatArray, Plant
+    from malta.model.plant import ComplexArray, FloatArray, OperatingPoint, Plant
 
-CurrentLoops = Literal["lag", "pi"]
+LAST: CurrentLoops = "pi"  # the last stage: the loop that simulations fly by default
 ROUNDING = 1e-9  # of the largest entry
 
 
@@ -92,16 +98,18 @@ def loop(
     controller: Controller,
     *,
     delay: int = 0,
-    current_loops: bool = False,
+    current_loops: CurrentLoops | None = None,
     feedforward: bool = False,
     sensors: bool = False,
+    forces_alone: bool = False,
 ) -> Loop:
     """The sampled loop of a machine and a controller.
 
     delay : samples between measurement and force
-    current_loops : whether forces follow their commands with a first-order lag at the loops' crossover
+    current_loops : "lag" or "pi" (windings.py); None: forces follow their commands at once
     feedforward : whether the slope of v0(z) acts, for models at their trim, where the slope of the loads acts
     sensors : whether the machine's sensors read late; their readings are states after the machine's
+    forces_alone : whether voltages that the law forecasts are part of its forces, not outputs beside them
 
     The controller commutates with its own parameters, and the currents produce forces with the machine's parameters.
     """
@@ -109,19 +117,74 @@ def loop(
     A, B, C = model.A, model.B, model.C
     if model.E.any():
         A, B = A - model.E @ C, np.hstack([B, model.E])
-    lag, true = model.plant.actuator.crossover, None
-    if sensors and model.plant.sensors is not None:
-        true = C
-        A, B, C = (np.array(ca.DM(M)) for M in with_lags(model.plant.sensors, A, B, C))
-    if current_loops and math.isfinite(lag):
-        A, B = add_lags(A, B, lag)
-    Ad, Bd = delay_inputs(*sample(A, B, controller.sample_time), delay)
-    Cd, true = _pad(C, len(Ad)), None if true is None else _pad(true, len(Ad))
+    plant, true, late = model.plant, None, 0
+    if sensors and plant.sensors is not None:
+        true, late = C, whole_samples(plant, controller.sample_time)
+        A, B, C = (np.array(ca.DM(M)) for M in with_lags(plant.sensors, A, B, C))
     if feedforward:
         law = with_slope(law, feedforward_slope(model, controller))
+    if current_loops == "pi":
+        Ad, Bd, law = _driven(model, controller, (A, B, C), delay, law, forces_alone=forces_alone)
+    else:
+        if current_loops == "lag" and math.isfinite(plant.actuator.crossover):
+            A, B = add_lags(A, B, plant.actuator.crossover)
+        Ad, Bd = delay_inputs(*sample(A, B, controller.sample_time), delay)
+    Cd, true = _pad(C, len(Ad)), None if true is None else _pad(true, len(Ad))
+    if late:
+        Ad, Bd, Cd = _stored_readings(Ad, Bd, Cd, late)
+        true = None if true is None else _pad(true, len(Ad))
     if model.E.any():
         law = with_readings(law)
     return Loop(Ad, Bd, Cd, law, controller.sample_time, true)
+
+
+def _driven(
+    model: LinearModel,
+    controller: Controller,
+    abc: tuple[FloatArray, FloatArray, FloatArray],
+    delay: int,
+    law: LinearLaw,
+    *,
+    forces_alone: bool,
+) -> tuple[FloatArray, FloatArray, LinearLaw]:
+    """The machine behind its current controllers, from the law's outputs to its states, and the law.
+
+    Under load the link's voltage is a state. The voltages that the law forecasts, M^+ emf(x_hat), are outputs of the
+    law beside its forces, or with `forces_alone` part of these.
+    """
+    plant, point, m = model.plant, model.operating_point, len(controller.forces)
+    believed = plant_of(controller.parameters)
+    windings = windings_of(plant, believed, point, np.eye(m))
+    control = current_control(controller, windings, point)
+    A, B, C = (np.array(ca.DM(M)) for M in with_windings(plant, windings, point.x, *abc))
+    phi = C[-m:]
+    to_w: FloatArray = np.zeros((m, len(A)))  # of states in w, beside the controllers
+    link = link_at_rest(plant, windings, point, axis_map(believed, point)) if point.loaded else None
+    if link is not None:
+        A = np.block([[A, B @ link.share[:, None]], [link.by_phi @ phi, np.array([[link.rate]])]])
+        B, phi = np.vstack([B, link.by_w[None]]), _pad(phi, len(A))
+        to_w = np.hstack([to_w, -link.share[:, None]])
+    Ad, Bd = delay_inputs(*sample(A, B, controller.sample_time), delay)
+    phi, to_w, one = _pad(phi, len(Ad)), _pad(to_w, len(Ad)), np.eye(m)
+    slope, R = control.loop.Ki * controller.sample_time, windings.R
+    gain = control.loop.Kp + slope
+    closed = np.block([[Ad + Bd @ (to_w - gain / R * phi), Bd / R], [-slope * phi, one]])
+    driven = np.vstack([gain / R * Bd, slope * one])
+    if forces_alone:
+        return closed, driven, forecast_as_forces(law, control, controller.sample_time)
+    forecast = np.vstack([Bd / R, np.zeros((m, m))])[:, forecast_rows(control)]
+    return closed, np.hstack([driven, forecast]), with_forecast(law, control)
+
+
+def _stored_readings(
+    A: FloatArray, B: FloatArray, C: FloatArray, late: int
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """The sampled machine whose outputs are read `late` samples old: stored readings follow its states."""
+    n, p = len(A), len(C)
+    whole = np.zeros((n + p * late,) * 2)
+    whole[:n, :n], whole[n : n + p, :n] = A, C
+    whole[n:, n:] = np.eye(p * late, k=-p)
+    return whole, np.vstack([B, np.zeros((p * late, B.shape[1]))]), np.eye(len(whole))[-p:]
 
 
 def _pad(C: FloatArray, n: int) -> FloatArray:
@@ -129,16 +192,29 @@ def _pad(C: FloatArray, n: int) -> FloatArray:
     return np.hstack([C, np.zeros((len(C), n - C.shape[1]))])
 
 
-def machine_loop(model: LinearModel, controller: Controller) -> Loop:
+def machine_loop(
+    model: LinearModel,
+    controller: Controller,
+    current_loops: CurrentLoops = LAST,
+    *,
+    forces_alone: bool = False,
+) -> Loop:
     """The loop as the machine runs it: hold, delay, current loops, late sensors, loads against v0(z) at the trim.
+
+    current_loops : "pi", the controllers of the gain file on the windings, where a machine has some; or "lag"
+    forces_alone : see `loop`
 
     Raises CheckError when no input holds the machine at the model's operating point, and InputError for a dead time of
     its sensors that is not whole samples.
     """
     plant = model.plant
     loaded = loaded_model(plant, position_in(plant, model.operating_point.x))
-    delay = plant.actuator.delay(controller.sample_time) + whole_samples(plant, controller.sample_time)
-    return loop(loaded, controller, delay=delay, current_loops=True, feedforward=True, sensors=True)
+    chosen = chosen_loops(plant, controller, current_loops)
+    delay = plant.actuator.delay(controller.sample_time)
+    return loop(
+        loaded, controller,
+        delay=delay, current_loops=chosen, feedforward=True, sensors=True, forces_alone=forces_alone,
+    )  # fmt: skip
 
 
 @lru_cache(maxsize=8)  # every stage needs it; records compare by identity, so no entry is stale
@@ -153,27 +229,29 @@ def commanded_model(model: LinearModel, controller: Controller) -> LinearModel:
 def machine_law(
     plant: Plant,
     controller: Controller,
-    current_loops: CurrentLoops = "lag",
+    current_loops: CurrentLoops = LAST,
     *,
     use: ReadingUse | None = None,
+    point: OperatingPoint | None = None,
 ) -> Compensator:
     """The control law with the machine's hold, delay and current loops.
 
-    current_loops : "lag", first-order lags at the crossover, or "pi", the PI controllers on the windings
+    current_loops : "pi", the controllers of the gain file on the windings, where a machine has some; "lag", first-order
+        lags at the crossover
     use : of the reading besides the law
+    point : where the windings are at rest; None: at the centre
 
-    Raises InputError for other current loops, for PI loops that run faster than the control law, and for a dead time
-    of the sensors that is not whole samples.
+    Raises InputError for other current loops, and for a dead time of the sensors that is not whole samples.
     """
-    if current_loops not in get_args(CurrentLoops):
-        raise InputError("verify", "current_loops", repr(current_loops), "lag or pi")
-    a = plant.actuator
-    delay = a.delay(controller.sample_time) + whole_samples(plant, controller.sample_time)
-    if current_loops == "lag" or controller.current_loop is None:
-        return sampled_law(controller, delay, a.crossover, use=use)
-    if plant.windings is None:
-        raise InputError("verify", "current_loops", "pi", f"lag: those of a {plant.name} run much faster")
-    return sampled_law(controller, delay, a.R / a.L, controller.current_loop, a.R, use=use)
+    a, late = plant.actuator, whole_samples(plant, controller.sample_time)
+    delay = a.delay(controller.sample_time)
+    if chosen_loops(plant, controller, current_loops) == "lag":
+        return sampled_law(controller, delay + late, a.crossover, use=use)
+    believed = plant_of(controller.parameters)
+    point = plant.at() if point is None else point
+    windings = windings_of(plant, believed, point, force_modes(believed))
+    control = current_control(controller, windings, point)
+    return sampled_law(controller, delay, a.crossover, control, late=late, use=use)
 
 
 def machine_system(
@@ -181,27 +259,34 @@ def machine_system(
     controller: Controller,
     names: Sequence[str],
     at: Mapping[str, float],
-    current_loops: CurrentLoops = "lag",
+    current_loops: CurrentLoops = LAST,
 ) -> tuple[UncertainSystem, Compensator]:
     """The machine at the states `at` in parameters by name, and its control law: the arguments of robust_margin."""
     believed = plant_of(controller.parameters)
-    system, H = _commanded_system(plant, believed, tuple(names), tuple(at.items()))
+    driven = chosen_loops(plant, controller, current_loops) == "pi"
+    system, H = _commanded_system(plant, believed, tuple(names), tuple(at.items()), driven)
     handed = H is not None and system.matrices.size2_out(1) > len(H)
-    return system, machine_law(plant, controller, current_loops, use=ReadingUse(H, handed))
+    use = ReadingUse(H, handed)
+    return system, machine_law(plant, controller, current_loops, use=use, point=plant.at(**at))
 
 
 @lru_cache(maxsize=16)  # every controller of a machine has it; plants compare by identity
 def _commanded_system(
-    plant: Plant, believed: Plant, names: tuple[str, ...], at: tuple[tuple[str, float], ...]
+    plant: Plant, believed: Plant, names: tuple[str, ...], at: tuple[tuple[str, float], ...], driven: bool
 ) -> tuple[UncertainSystem, FloatArray | None]:
-    """The machine at the states `at` in parameters by name, and the gain of currents that are held; None: none are."""
+    """The machine at the states `at` in parameters by name, and the gain of currents that are held; None: none are.
+
+    driven : whether the windings are states
+    """
     states = dict(at)
     H = (
         held_gain(believed, position_in(believed, believed.at(**states).x))
         if is_commutated(believed)
         else None
     )
-    return of_plant(plant, names, at=states, believed=believed, held=H, late=True), H
+    windings = windings_of(plant, believed, plant.at(**states), force_modes(believed)) if driven else None
+    system = of_plant(plant, names, at=states, believed=believed, held=H, late=True, windings=windings)
+    return system, H
 
 
 @lru_cache(maxsize=16)  # every loop of a machine needs it; plants compare by identity
@@ -213,27 +298,47 @@ def loaded_model(plant: Plant, position: float) -> LinearModel:
     return linearize(plant, trim(plant, **({plant.stroke: position} if plant.has_stroke else {})))
 
 
-def loaded_system(
-    plant: Plant, controller: Controller, at: Mapping[str, float], current_loops: CurrentLoops = "lag"
-) -> tuple[UncertainSystem, Compensator]:
-    """The machine under its loads against v0(z), and its law: `machine_loop` in the form of `machine_system`.
+def loaded_loop(
+    plant: Plant, controller: Controller, at: Mapping[str, float], current_loops: CurrentLoops = LAST
+) -> Nominal:
+    """The responses of `machine_loop` at the states `at` (SI), from forces to sensors and back.
 
-    at : the states of the position, SI. The system has no uncertain parameters.
+    Currents that are held hang on the reading: as far as forces make the same, H y is part of the law's forces.
 
     Raises CheckError when no input holds the machine there.
     """
-    model = commanded_model(loaded_model(plant, at.get(plant.stroke, 0.0)), controller)
-    A, B, C, use = model.A, model.B, model.C, ReadingUse(slope=feedforward_slope(model, controller))
-    if model.E.any():
-        A, H = held(model)
-        left = model.E - B @ H
-        handed = bool(np.abs(left).max() > ROUNDING * np.abs(model.E).max())
-        B, use = np.hstack([B, left]) if handed else B, use._replace(held=H, handed=handed)
-    if plant.sensors is not None:
-        A, B, C = (np.array(ca.DM(M)) for M in with_lags(plant.sensors, A, B, C))
-    none = ca.SX.sym("p", 0)
-    matrices = ca.Function("matrices", [none], [ca.SX(ca.DM(M)) for M in (A, B, C)])
-    return UncertainSystem((), np.zeros(0), matrices), machine_law(plant, controller, current_loops, use=use)
+    model = loaded_model(plant, at.get(plant.stroke, 0.0))
+    loop = machine_loop(model, controller, current_loops, forces_alone=True)
+    m, B, law = len(controller.forces), loop.Bd, loop.control
+    into, rest = B[:, :m], B[:, m:]
+    H = np.linalg.lstsq(into, rest, rcond=None)[0]
+    left = rest - into @ H
+    law = law._replace(
+        C=law.C + _on_top(H @ law.C[m:], law.C), D_y=law.D_y + _on_top(H @ law.D_y[m:], law.D_y)
+    )
+    if np.abs(left).max(initial=0.0) <= ROUNDING * np.abs(rest).max(initial=0.0):
+        B, law = into, law._replace(C=law.C[:m], D_y=law.D_y[:m])
+    else:
+        B = np.hstack([into, left])
+    T = loop.sample_time
+
+    def response(w: FloatArray) -> tuple[ComplexArray, ComplexArray]:
+        # In differences: slow poles lie close to 1, where z - A has lost their digits.
+        s = (np.expm1(1j * np.asarray(w) * T) / T)[:, None, None]
+        return _response(s, loop.Ad, B, loop.Cd, T), _response(s, law.A, law.B_y, law.C, T) + law.D_y
+
+    return Nominal(response, bool(np.abs(eigenvalues(loop.closed)).max() < 1), T)
+
+
+def _response(s: ComplexArray, A: FloatArray, B: FloatArray, C: FloatArray, T: float) -> ComplexArray:
+    """C (s - (A - 1) / T)^-1 B / T at s = (z - 1) / T."""
+    eye = np.eye(len(A))
+    return np.asarray(C @ np.linalg.solve(s * eye - (A - eye) / T, (B / T).astype(complex)))
+
+
+def _on_top(rows: FloatArray, of: FloatArray) -> FloatArray:
+    """These rows over zeros, in the shape of another matrix."""
+    return np.vstack([rows, np.zeros((len(of) - len(rows), of.shape[1]))])
 
 
 def feedforward_slope(model: LinearModel, controller: Controller) -> FloatArray:

@@ -21,7 +21,8 @@ from malta.margins.uncertain import (
     model_of,
     upper_limit,
 )
-from malta.model.parameters import shape_parameters, units_of
+from malta.margins.windings import Windings, with_windings
+from malta.model.parameters import shape_parameters, twins_of, units_of
 from malta.model.plant import Plant, position_in, readonly, symbolic
 from malta.model.sensors import LateSensors, with_lags
 
@@ -40,6 +41,7 @@ def of_plant(
     believed: Plant | None = None,
     held: FloatArray | None = None,
     late: bool = False,
+    windings: Windings | None = None,
 ) -> UncertainSystem:
     """The design model of a plant at a position along its stroke, in parameters by name, at its preload.
 
@@ -50,6 +52,7 @@ def of_plant(
     held : the gain H of currents that are held between samples (`held_gain`): the inputs are v + H y, and the reading y
         is a further input when the parameters change its gain
     late : whether the outputs are read behind the lags of the plant's sensors, as further states
+    windings : these are states, too: inputs are their voltages, and their currents are further outputs (windings.py)
 
     The inputs are commanded forces: the controller commutates with its own parameters, and the currents produce forces
     with the plant's parameters.
@@ -85,6 +88,11 @@ def of_plant(
             B = ca.horzcat(B, left)
     if late:
         A, B, C = with_lags(_sensors_in(plant, p, names), A, B, C)
+    if windings is not None:
+        point = ca.SX(x0)
+        if plant.has_stroke:
+            point[plant.stroke_state] = z
+        A, B, C = with_windings(_in_symbols(plant, p, names), windings, point, A, B, C)
     if states:
         C = ca.vertcat(C, ca.DM.eye(len(plant.controlled)))
     bounds = {f.name: (lower_limit(f.metadata), upper_limit(f.metadata)) for f in fields(par)}
@@ -98,16 +106,24 @@ def _sensors_in(plant: Plant, p: Any, names: Sequence[str]) -> LateSensors | Non
 
     Raises InputError for an uncertain lag whose nominal value is none.
     """
-    symbols = {name: p[k] for k, name in enumerate(names) if name != plant.stroke}
-    if plant.sensors is None and all(getattr(plant.parameters, name) for name in symbols):
+    uncertain = [name for name in names if name != plant.stroke]
+    if plant.sensors is None and all(getattr(plant.parameters, name) for name in uncertain):
         return None  # no uncertain parameter is a lag of 0 s
-    sensors: LateSensors | None = plant.variant(symbolic(plant.parameters, symbols)).sensors
+    sensors = _in_symbols(plant, p, names).sensors
     nominal = [] if plant.sensors is None else plant.sensors.lagging
     if sensors is not None and sensors.lagging != nominal:
         raise InputError(
             "uncertain", "sensors", "an uncertain lag of 0 s", "one above 0 s, set in the machine"
         )
     return sensors
+
+
+def _in_symbols(plant: Plant, p: Any, names: Sequence[str]) -> Plant:
+    """The plant with symbols p for these parameters; twins share a symbol."""
+    symbols = {name: p[k] for k, name in enumerate(names) if name != plant.stroke}
+    twins = {name: symbols[twin] for name, twin in twins_of(plant.parameters).items() if twin in symbols}
+    machine: Plant = plant.variant(symbolic(plant.parameters, twins | symbols))
+    return machine
 
 
 def _check_names(plant: Plant, names: Any) -> None:

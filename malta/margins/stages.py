@@ -1,8 +1,11 @@
 """The margin at each stage of a design, from full state feedback to the machine's own loop.
 
-    LQR -> LQI -> LQG -> LQGI -> with current loops -> sampled: the gain file's own gains, with hold and delay
+    LQR -> LQI -> LQG -> LQGI -> with current loops -> sampled -> machine
 
-A PID has the last stage alone. A design without weights on integrals has no LQI and no LQGI.
+From `sampled` on the gains are the gain file's own, with hold and delay. Current loops are first-order lags, as
+papers have them, up to `sampled`. The machine has the PI controllers of the gain file on its windings (windings.py), as
+simulations fly it by default; a machine without windings ends at `sampled`.
+A PID has the stages from `sampled` on. A design without weights on integrals has no LQI and no LQGI.
 
 The first five stages are continuous; they are synthesized from the cost and the noise in the gain file. Each stage
 has its parametric margin (robust.py) and its peak sensitivity: at the forces for state feedback, where an LQR
@@ -23,9 +26,17 @@ from typing import Literal
 import numpy as np
 
 from malta.errors import InputError
-from malta.margins.classical import Classical, Disk, classical_margins, is_stable, peak_sensitivity, worst_of
+from malta.margins.classical import (
+    Classical,
+    Disk,
+    Nominal,
+    classical_margins,
+    nominal_loop,
+    peak_sensitivity,
+    worst_of,
+)
 from malta.margins.extent import NOWHERE, Extent, extent_of, own_position
-from malta.margins.loops import CurrentLoops, machine_law
+from malta.margins.loops import LAST, machine_law
 from malta.margins.plants import of_plant
 from malta.margins.robust import NOT_PROVEN, Margin, Progress, Ranges, robust_margin
 from malta.margins.travel import (
@@ -38,7 +49,8 @@ from malta.margins.travel import (
     places_along,
     travel_margin,
 )
-from malta.margins.uncertain import Compensator, UncertainSystem
+from malta.margins.uncertain import Compensator
+from malta.margins.windings import CurrentLoops, chosen_loops
 from malta.model.data import plant_of
 from malta.model.linearize import linearize
 from malta.model.parameters import units_of
@@ -47,7 +59,8 @@ from malta.synthesis.controller import Controller
 from malta.synthesis.lqg import kalman, lqi, lqr, weights_of
 from malta.threads import on_one_thread
 
-SAMPLED = "sampled"  # the last link: the machine's own loop
+SAMPLED = "sampled"  # with first-order lags
+MACHINE = "machine"  # with PI controllers on the windings: the last stage of a machine that has some
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,7 +125,7 @@ class Robustness:
 
 
 def compensators(
-    plant: Plant, controller: Controller, current_loops: CurrentLoops = "lag"
+    plant: Plant, controller: Controller, current_loops: CurrentLoops = LAST
 ) -> dict[str, tuple[Compensator, bool]]:
     """The control laws of the stages by name, each with whether it feeds back the states.
 
@@ -120,7 +133,9 @@ def compensators(
 
     State feedback reads [y, x]; the other laws read y.
     """
-    own = {SAMPLED: (machine_law(plant, controller, current_loops), False)}
+    own = {SAMPLED: (machine_law(plant, controller, "lag"), False)}
+    if chosen_loops(plant, controller, current_loops) == "pi":
+        own[MACHINE] = machine_law(plant, controller), False
     if controller.cost is None:
         return own
     believed, weights = plant_of(controller.parameters), weights_of(controller)
@@ -196,7 +211,7 @@ class _Question:
     def _moves(self) -> bool:
         return depends_on_course(self.plant, self.controller, self.names, self.current_loops)
 
-    def loaded_loop_at(self, position: float) -> tuple[UncertainSystem, Compensator]:
+    def loaded_loop_at(self, position: float) -> Nominal:
         return loaded_loop_at(self.plant, self.controller, self.names, position, self.current_loops)
 
     def margin_at(self, position: float) -> Margin:
@@ -226,7 +241,7 @@ def robustness(
     controller: Controller,
     uncertainty: Mapping[str, float],
     *,
-    current_loops: CurrentLoops = "lag",
+    current_loops: CurrentLoops = LAST,
     progress: Callable[[float], None] | None = None,
     bounds: Progress | None = None,
     time: float | None = None,
@@ -239,7 +254,8 @@ def robustness(
     plant : the machine
     controller : its controller
     uncertainty : relative half range of each parameter, as {"m": 0.2} for +-20 %; margins are multiples of it
-    current_loops : "lag", first-order lags at the crossover, or "pi", the sampled controllers of the gain file
+    current_loops : "pi", the controllers of the gain file on the windings, where a machine has some; "lag" ends at the
+        stage `sampled`, with first-order lags at the crossover
     progress : called with the share of the work that is done, 0 to 1
     bounds : called with the lower and upper bound of the margin over the travel so far
     time : s, longest search of the margin over the travel; None: 120
@@ -260,7 +276,7 @@ def robustness(
     """
     if not uncertainty:
         raise InputError("robustness", "uncertainty", "no parameters", 'some, as {"m": 0.2}')
-    steps, total = itertools.count(1), 8 + 2 * len(uncertainty) + len(PLACES)
+    steps, total = itertools.count(1), 9 + 2 * len(uncertainty) + len(PLACES)
 
     def report() -> None:
         if progress is not None:
@@ -290,16 +306,21 @@ def _links(q: _Question) -> tuple[Link, ...]:
     at = position_at(q.plant, q.plant.point(q.controller.operating_point[0]).x)
     believed = plant_of(q.controller.parameters)
     links = []
-    for name, (law, states) in compensators(q.plant, q.controller, q.current_loops).items():
-        if name == SAMPLED:
+    stages = compensators(q.plant, q.controller, q.current_loops)
+    last = [*stages][-1]
+    for name, (law, states) in stages.items():
+        own = name in (SAMPLED, MACHINE)
+        if own:
+            stage = q if name == last else replace(q, current_loops="lag")
             position = own_position(q.plant, q.extent, at)
-            system, law = q.loaded_loop_at(position)
-            margin = q.margin_at(position) if q.proof else NOT_PROVEN
+            loop = stage.loaded_loop_at(position)
+            margin = stage.margin_at(position) if q.proof else NOT_PROVEN
         else:
             system = of_plant(q.plant, list(q.uncertainty), states=states, at=at, believed=believed)
             margin = robust_margin(system, law, q.uncertainty, time=q.time) if q.proof else NOT_PROVEN
+            loop = nominal_loop(system, law)
         where: Literal["forces", "sensors"] = "forces" if states else "sensors"
-        links.append(Link(name, margin, peak_sensitivity(system, law, where), where, loaded=name == SAMPLED))
+        links.append(Link(name, margin, peak_sensitivity(loop, where), where, loaded=own))
         q.report()
     return tuple(links)
 
@@ -327,8 +348,8 @@ def _places(q: _Question) -> tuple[tuple[Place, ...], Classical | None]:
         proven_at = positions if q.whole else positions[:1]  # else a place takes as long as the whole travel
         margin = _smallest([q.margin_at(z) for z in proven_at]) if q.proof else NOT_PROVEN
         loops = [q.loaded_loop_at(z) for z in positions]
-        peak = float(np.max([peak_sensitivity(*loop, "sensors") for loop in loops]))
-        sides = [classical_margins(*loop, sensors) if is_stable(*loop) else None for loop in loops]
+        peak = float(np.max([peak_sensitivity(loop, "sensors") for loop in loops]))
+        sides = [classical_margins(loop, sensors) if loop.stable else None for loop in loops]
         classical += sides
         worst = worst_of(sides)
         disk, delay = (worst.disks[2].size, min(worst.delay.values())) if worst else (np.nan, np.nan)

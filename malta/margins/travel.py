@@ -12,10 +12,11 @@ from functools import lru_cache
 from typing import TYPE_CHECKING
 
 from malta.margins.box import Box, box_of
+from malta.margins.classical import Nominal
 from malta.margins.expressions import NotAnalytic
 from malta.margins.extent import extent_of, machine_at, positions_of
 from malta.margins.held_currents import held_machine
-from malta.margins.loops import CurrentLoops, loaded_system, machine_law, machine_system
+from malta.margins.loops import LAST, loaded_loop, machine_law, machine_system
 from malta.margins.plants import LONGEST
 from malta.margins.problem import OfSeveral
 from malta.margins.robust import (
@@ -32,6 +33,7 @@ from malta.margins.robust import (
 )
 from malta.margins.uncertain import Compensator, UncertainSystem, is_commutated, model_of
 from malta.margins.weak_coupling import HeldLoop
+from malta.margins.windings import CurrentLoops
 from malta.model.data import plant_of
 from malta.threads import on_one_thread
 
@@ -54,7 +56,7 @@ def travel_margin(
     plant: Plant,
     controller: Controller,
     ranges: Ranges,
-    current_loops: CurrentLoops = "lag",
+    current_loops: CurrentLoops = LAST,
     names: Sequence[str] = (),
     *,
     time: float | None = None,
@@ -91,7 +93,7 @@ def travel_margin(
 
 
 def travel_loops(
-    plant: Plant, controller: Controller, names: tuple[str, ...], current_loops: CurrentLoops = "lag"
+    plant: Plant, controller: Controller, names: tuple[str, ...], current_loops: CurrentLoops = LAST
 ) -> tuple[list[tuple[UncertainSystem, Compensator]], dict[str, tuple[float, float]]]:
     """The loops whose common margin travel_margin proves, and the intervals that do not grow with the margin."""
     along, extent = _along(plant, controller, names, current_loops), extent_of(plant, names)
@@ -161,7 +163,7 @@ def place_margin(
     controller: Controller,
     ranges: Ranges,
     position: float,
-    current_loops: CurrentLoops = "lag",
+    current_loops: CurrentLoops = LAST,
     names: Sequence[str] = (),
 ) -> Margin:
     """The margin of the machine's loop at a position along its course (`Extent.course`), SI.
@@ -187,7 +189,7 @@ def worst_sensitivities(
     plant: Plant,
     controller: Controller,
     ranges: Ranges,
-    current_loops: CurrentLoops = "lag",
+    current_loops: CurrentLoops = LAST,
     *,
     time: float | None = None,
 ) -> dict[str, Gain]:
@@ -210,7 +212,7 @@ def worst_sensitivities(
 
 
 def places_along(
-    plant: Plant, controller: Controller, names: tuple[str, ...], current_loops: CurrentLoops = "lag"
+    plant: Plant, controller: Controller, names: tuple[str, ...], current_loops: CurrentLoops = LAST
 ) -> tuple[tuple[float, ...], ...]:
     """The places along the course that a report shows: for each its position, or +position and -position (SI)."""
     shares = PLACES if covers_travel(plant, controller, names, current_loops) else ENDS
@@ -218,14 +220,14 @@ def places_along(
 
 
 def covers_travel(
-    plant: Plant, controller: Controller, names: tuple[str, ...], current_loops: CurrentLoops = "lag"
+    plant: Plant, controller: Controller, names: tuple[str, ...], current_loops: CurrentLoops = LAST
 ) -> bool:
     """Whether one proof covers the whole travel."""
     return len(_along(plant, controller, names, current_loops)) == 1
 
 
 def depends_on_course(
-    plant: Plant, controller: Controller, names: tuple[str, ...], current_loops: CurrentLoops = "lag"
+    plant: Plant, controller: Controller, names: tuple[str, ...], current_loops: CurrentLoops = LAST
 ) -> bool:
     """Whether the machine's loop depends on the position along its course."""
     along, course = _along(plant, controller, names, current_loops), extent_of(plant, names).course
@@ -244,7 +246,7 @@ def loop_at(
     controller: Controller,
     names: tuple[str, ...],
     position: float,
-    current_loops: CurrentLoops = "lag",
+    current_loops: CurrentLoops = LAST,
 ) -> tuple[UncertainSystem, Compensator]:
     """The machine's loop at a position along its course (SI); equal arguments return the same records."""
     there, at = machine_at(plant, extent_of(plant, names).course, position)
@@ -256,11 +258,11 @@ def loaded_loop_at(
     controller: Controller,
     names: tuple[str, ...],
     position: float,
-    current_loops: CurrentLoops = "lag",
-) -> tuple[UncertainSystem, Compensator]:
-    """The machine's loop under its loads at a position along its course (SI), without uncertain parameters.
+    current_loops: CurrentLoops = LAST,
+) -> Nominal:
+    """The machine's loop under its loads at a position along its course (SI), at nominal parameters.
 
     names : the uncertain parameters, which are no course
     """
     there, at = machine_at(plant, extent_of(plant, names).course, position)
-    return loaded_system(there, controller, at, current_loops)
+    return loaded_loop(there, controller, at, current_loops)

@@ -8,25 +8,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import casadi as ca
 import numpy as np
 
-from malta.errors import CheckError
-from malta.model.data import plant_of
 from malta.model.linearize import jacobians
 from malta.model.plant import Plant, symbolic
-from malta.synthesis.controller import (
-    Controller,
-    CurrentLoop,
-    LinearLaw,
-    linear_law,
-    with_readings,
-    with_slope,
-)
 from malta.synthesis.riccati import add_lags, delay_inputs, sample
 
 if TYPE_CHECKING:
@@ -160,120 +150,6 @@ def upper_limit(declared: Mapping[str, Any]) -> float:
     """The exclusive upper limit of a declared parameter."""
     below = declared.get("below")
     return math.inf if below is None else float(below)
-
-
-class ReadingUse(NamedTuple):
-    """What a reading y does besides entering the control law."""
-
-    held: FloatArray | None = None  # the gain H of held currents: v + H y acts
-    handed: bool = False  # whether y is a further input of the system
-    slope: FloatArray | None = None  # dv0/dy, m x p: v0 follows the reading; None: it stands still
-
-
-def sampled_law(
-    controller: Controller,
-    delay: int,
-    lag: float,
-    loop: CurrentLoop | None = None,
-    R: float = 1.0,
-    *,
-    use: ReadingUse | None = None,
-) -> Compensator:
-    """The control law of a gain file as the machine runs it: hold, `delay` samples, current loops.
-
-    lag : rad/s, crossover of the current loops, as first-order lags; with `loop`, the R / L of the windings
-    loop : PI controllers of the currents, for windings of resistance R (ohm), sampled with the control law
-    """
-    law, T = linear_law(controller), controller.sample_time
-    held, handed, slope = use or ReadingUse()
-    if slope is not None:
-        law = with_slope(law, slope)
-    n, m = len(controller.states), len(controller.forces)
-    half = plant_of(controller.parameters).coordinates
-    p = len(controller.measurements) if controller.integrating else 0
-    # Sums of errors and stored forces in the coordinates of the modes, where these decouple.
-    to_modes = np.eye(len(law.A))
-    if controller.tracks == "states" and len(controller.measurements) == m == half:
-        if p:
-            to_modes[n:, n:] = np.linalg.inv(controller.C[:, :half])
-        for k in range(2 * half, n, m):
-            to_modes[k : k + m, k : k + m] = controller.B[half:]
-    back = np.linalg.inv(to_modes)
-    law = law._replace(A=to_modes @ law.A @ back, B_y=to_modes @ law.B_y, C=law.C @ back)
-    if controller.observed:
-        law, p = _integrals_last(law, m), m
-    if held is not None:
-        law = law._replace(D_y=law.D_y + held)
-    if handed:
-        law = with_readings(law)
-    c = Compensator(
-        law.A, law.B_y, law.C, law.D_y,
-        integrals=p, sample_time=T, delay=delay, lag=lag if math.isfinite(lag) else None,
-    )  # fmt: skip
-    return c if loop is None else _with_current_control(c, loop, R, controller.B[half:])
-
-
-def _integrals_last(law: LinearLaw, count: int) -> LinearLaw:
-    """Transform a law that cancels observed disturbances d: its last states d + X xi become plain sums of the readings.
-
-    With A = [[M, N], [G, 1]], X solves X (M - 1) = -G. Then X N = 0, because the law leaves no constant disturbance.
-    """
-    A, k = law.A, len(law.A) - count
-    try:
-        X = -np.linalg.solve((A[:k, :k] - np.eye(k)).T, A[k:, :k].T).T
-    except np.linalg.LinAlgError as error:
-        raise CheckError("the law sums errors beside the disturbances that it observes") from error
-    left, size = np.abs(X @ A[:k, k:]).max(), (np.abs(X) @ np.abs(A[:k, k:])).max()
-    if not left <= 1e-8 * size:
-        raise CheckError(
-            f"the law does not take off constant disturbances: {left / size:.1e} of them is left"
-        )
-
-    def summed(M: FloatArray) -> FloatArray:
-        return np.vstack([M[:k], M[k:] + X @ M[:k]])
-
-    T = np.eye(len(A))
-    T[k:, :k] = -X
-    A = summed(A) @ T
-    A[k:] = np.eye(len(A))[k:]
-    return law._replace(A=A, B_y=summed(law.B_y), B_r=summed(law.B_r), C=law.C @ T)
-
-
-def _with_current_control(c: Compensator, loop: CurrentLoop, R: float, B2: FloatArray) -> Compensator:
-    """The law in series with PI controllers of the currents; their voltages over R are the inputs of the lag R / L.
-
-    Each axis: e = v - i, I+ = I + Ki T e, u = Kp e + I+, i+ = a i + (1 - a) u[k - d] / R with a = e^(-T R / L).
-    """
-    assert c.sample_time is not None
-    assert c.lag is not None
-    T, d, m = c.sample_time, c.delay, len(c.C)
-    a = math.exp(-T * c.lag)
-    slope, gain = loop.Ki * T, loop.Kp + loop.Ki * T
-    A, B = np.zeros((2 + d, 2 + d)), np.zeros((2 + d, 1))  # I, i, voltages under way (the oldest first)
-    A[0, :2], B[0] = (1, -slope), slope
-    A[1, 1] = a
-    C, D = np.zeros((1, 2 + d)), gain
-    C[0, :2] = 1, -gain
-    if d:
-        A[1, 2] = (1 - a) / R
-        A[2:-1, 3:] = np.eye(d - 1)
-        A[-1], B[-1] = C, D
-    else:
-        A[1] += (1 - a) / R * C[0]
-        B[1] = (1 - a) / R * D
-    k = len(c.A) - c.integrals
-    modes = B2 if B2.shape == (m, m) else np.eye(m)
-    A5, B5, C5 = np.kron(A, np.eye(m)), np.kron(B, modes), np.kron(C, np.linalg.inv(modes)) / R
-    own = [*range(k), *range(k + len(A5), k + len(A5) + c.integrals)]
-    axes = [*range(k, k + len(A5))]
-    full = np.zeros((len(c.A) + len(A5),) * 2)
-    full[np.ix_(own, own)] = c.A
-    full[np.ix_(axes, axes)] = A5
-    full[np.ix_(axes, own)] = B5 @ c.C
-    driven, out = np.zeros((len(full), c.B.shape[1])), np.zeros((m, len(full)))
-    driven[own], driven[axes] = c.B, B5 @ c.D
-    out[:, own], out[:, axes] = c.C * D / R, C5
-    return replace(c, A=full, B=driven, C=out, D=c.D * D / R)
 
 
 def difference_form(c: Compensator) -> tuple[FloatArray, FloatArray]:

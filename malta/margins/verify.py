@@ -210,7 +210,7 @@ def _verify(model: LinearModel, controller: Controller, uncertainty: Mapping[str
     machine = machine_loop(model, controller)
     loops = {
         "sampled": loop(model, controller, delay=controller.delay),
-        "+ current loops": loop(model, controller, delay=controller.delay, current_loops=True),
+        "+ current loops": loop(model, controller, delay=controller.delay, current_loops="lag"),
         "machine": machine,
     }
     names = [s.name for s in controller.measurements]

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from malta.errors import CheckError, InputError
 from malta.margins.classical import Classical, classical_margins
 from malta.margins.curves import loop_curves
-from malta.margins.loops import CurrentLoops, loaded_system, machine_loop
+from malta.margins.loops import LAST, loaded_loop, machine_loop
 from malta.margins.recovery import recovery
 from malta.margins.stages import robustness
 from malta.margins.travel import covers_travel, worst_sensitivities
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from malta.margins.robust import Margin
     from malta.margins.stages import Robustness
     from malta.margins.verify import Margins
+    from malta.margins.windings import CurrentLoops
     from malta.model.linearize import LinearModel
     from malta.model.plant import Parameters, Plant
     from malta.simulation.experiments import Experiment
@@ -57,7 +58,7 @@ class Subject(NamedTuple):
     provenance: Sequence[
         tuple[str, str]
     ] = ()  # of the gain file: its seal, and versions that it was written with
-    current_loops: CurrentLoops = "lag"
+    current_loops: CurrentLoops = LAST
 
     @property
     def written_from(self) -> Spec | None:
@@ -184,8 +185,8 @@ def _classical(subject: Subject) -> Classical:
     """Disk and delay margins and the gang of four at the operating point."""
     plant, controller = subject.plant, subject.controller
     at = position_at(plant, plant.point(controller.operating_point[0]).x)
-    system, law = loaded_system(plant, controller, at, subject.current_loops)
-    return classical_margins(system, law, [s.name for s in plant.outputs])
+    loop = loaded_loop(plant, controller, at, subject.current_loops)
+    return classical_margins(loop, [s.name for s in plant.outputs])
 
 
 def _main_job(subject: Subject, notes: list[str], progress: Share) -> Experiment | None:

@@ -1,0 +1,105 @@
+"""One machine: the loop that is designed, proven and judged is the derivative of the loop that is simulated.
+
+d(state after a control period) / d(state)    at rest, default fidelity, by CasADi: tests/flight.py
+machine_loop                                  windings, PI controllers, delay, hold, loads, sensors: exactly sampled
+machine_system                                the same with parameters by name: what margins are proven of
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from flight import derivative_at_rest, poles, without_loads
+
+import malta
+from malta import gains
+from malta.margins.loops import loaded_model, machine_loop, machine_system
+from malta.margins.uncertain import closed_loop
+from malta.model.parameters import twins_of
+
+if TYPE_CHECKING:
+    from malta.model.plant import ComplexArray, Plant
+    from malta.synthesis.controller import Controller
+
+TUBULAR = ("table2", "calibrated", "robust", "robust_observer", "tubular_pid")
+OTHERS = ("halbach", "halbach_late", "halbach_pid", "planar", "planar_pid")
+BOXES = {
+    "tubular": ("m", "K_A", "K_B", "K_D"),
+    "halbach": ("m", "A", "b"),
+    "planar": ("m", "I_x", "I_z", "B_r"),
+}
+SAME = 1e-6  # of a pole, or of 1 rad/s
+
+
+def shipped(name: str) -> tuple[Plant, Controller]:
+    c = gains.read(f"design/gains/{name}.json")
+    return malta.plant_of(c.parameters), c
+
+
+def along(plant: Plant, share: float) -> dict[str, float]:
+    return {plant.stroke: share * plant.travel} if plant.has_stroke else {}
+
+
+def distance(ours: ComplexArray, flown: ComplexArray) -> float:
+    """The largest distance of one of our poles from the nearest pole that flies, as a share of it or of 1 rad/s."""
+    return max(float(np.abs(flown - s).min() / max(1.0, abs(s))) for s in ours)
+
+
+def check_machine_loop(plant: Plant, c: Controller, share: float) -> None:
+    at = along(plant, share)
+    ours = machine_loop(loaded_model(plant, at.get(plant.stroke, 0.0)), c)
+    flown = derivative_at_rest(plant, c, plant.at(**at).x)
+    assert distance(poles(ours.closed, c.sample_time), poles(flown, c.sample_time)) < SAME
+
+
+def check_proven_loop(plant: Plant, c: Controller, names: tuple[str, ...], values: Any, share: float) -> None:
+    """The loop of a proof at these parameters, which has no loads, and the flight of that machine without loads."""
+    at = along(plant, share)
+    system, law = machine_system(plant, c, names, at)
+    (ours,) = closed_loop(system, law, np.array(values))
+    own = dict(zip(names, values, strict=True))
+    own |= {name: own[twin] for name, twin in twins_of(plant.parameters).items() if twin in own}
+    there = malta.plant_of(replace(plant.parameters, **own))
+    light, unloaded = without_loads(there, c)
+    flown = derivative_at_rest(light, unloaded, light.at(**at).x)
+    T = c.sample_time
+    assert distance(poles(np.eye(len(ours)) + T * ours, T), poles(flown, T)) < SAME
+
+
+@pytest.mark.parametrize("name", TUBULAR)
+def test_the_loop_under_load_is_the_derivative_of_the_flight(name: str) -> None:
+    plant, c = shipped(name)
+    for share in (0.0, 0.37):
+        check_machine_loop(plant, c, share)
+
+
+@pytest.mark.parametrize("name", [n for n in OTHERS if "planar" not in n])
+def test_the_loop_of_lagging_currents_is_the_derivative_of_the_flight(name: str) -> None:
+    check_machine_loop(*shipped(name), 0.37)
+
+
+@pytest.mark.parametrize("name", TUBULAR)
+def test_the_proven_loop_is_the_derivative_of_the_flight(name: str) -> None:
+    plant, c = shipped(name)
+    names = BOXES[plant.name]
+    nominal = np.array([getattr(plant.parameters, n) for n in names])
+    check_proven_loop(plant, c, names, nominal, 0.0)
+    check_proven_loop(plant, c, names, nominal * [0.85, 1.15, 0.9, 1.1], 0.61)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", TUBULAR + OTHERS)
+def test_the_derivative_of_the_flight_anywhere_in_box_and_travel(name: str) -> None:
+    plant, c = shipped(name)
+    names, rng = BOXES[plant.name], np.random.default_rng(7)
+    nominal = np.array([getattr(plant.parameters, n) for n in names])
+    count = 4 if plant.name == "planar" else 20
+    for share in (-0.93, -0.41, 0.0, 0.37, 0.88):
+        check_machine_loop(plant, c, share)
+    for k, spread in enumerate(rng.uniform(-1, 1, (count, len(names)))):
+        check_proven_loop(
+            plant, c, names, nominal * (1 + 0.2 * spread), (-0.93, -0.41, 0.0, 0.37, 0.88)[k % 5]
+        )
