@@ -18,9 +18,8 @@ from malta.app.files import Edited
 from malta.app.runs import planned_run
 from malta.errors import CheckError, InputError
 from malta.margins.curves import LoopCurves, loop_curves
-from malta.margins.loops import Loop, machine_loop
+from malta.margins.loops import Loop, machine_loop, machine_loop_at
 from malta.margins.rays import RayBound, ray_bound
-from malta.margins.recovery import PushedLoop
 from malta.margins.travel import travel_loops
 from malta.margins.verify import (
     BANDWIDTHS,
@@ -178,7 +177,7 @@ def _load(problem: Problem, view: View) -> dict[str, Any] | None:
     if not names or not problem.stage.stable:
         return None
     k = names.index(view.load) if view.load in names else 0
-    answer = PushedLoop.of(problem.plant, problem.controller).answer()
+    answer = machine_loop_at(problem.plant, problem.controller).answer()
     one = answer.of(np.eye(len(names))[k])
     settled = one.within(0.02)
     ends = settled[np.isfinite(settled)]

@@ -22,7 +22,7 @@ from scipy import linalg
 
 from malta.errors import CheckError, InputError
 from malta.margins.loop_systems import LoopSystems
-from malta.margins.recovery import PushedLoop
+from malta.margins.loops import machine_loop_at
 from malta.model.plant import Plant, Signal
 from malta.synthesis.controller import Controller, LinearLaw
 from malta.synthesis.riccati import eigenvalues
@@ -206,11 +206,12 @@ def linear_loop(
 
 
 def _of_machine(plant: Plant, controller: Controller, name: str, position: float | None) -> LinearLoop:
-    pushed = PushedLoop.of(plant, controller, position)
-    loop, law, T = pushed.loop, pushed.loop.control, pushed.loop.sample_time
+    loop = machine_loop_at(plant, controller, position)
+    law, T = loop.control, loop.sample_time
+    assert loop.pushed is not None
     driven, command = _commanded_system(controller, law)
     outputs = loop.Cd if loop.true is None else np.vstack([loop.Cd, loop.true])
-    into = np.hstack([loop.Bd, pushed.pushed]) / T
+    into = np.hstack([loop.Bd, loop.pushed]) / T
     return LinearLoop(
         name,
         System((loop.Ad - np.eye(len(loop.Ad))) / T, into, outputs, np.zeros((len(outputs), into.shape[1]))),

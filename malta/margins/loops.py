@@ -12,7 +12,7 @@ reading is a further input of P, and F passes it on.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
@@ -30,19 +30,20 @@ from malta.margins.windings import (
     current_control,
     force_modes,
     forecast_as_forces,
-    forecast_rows,
     link_at_rest,
+    sample_driven,
     windings_of,
-    with_forecast,
+    with_estimated_emf,
     with_windings,
 )
 from malta.model.data import plant_of
 from malta.model.equilibrium import trim
 from malta.model.linearize import LinearModel, linearize
-from malta.model.plant import position_in
+from malta.model.plant import position_in, readonly
 from malta.model.sensors import whole_samples, with_lags
 from malta.synthesis.controller import Controller, LinearLaw, linear_law, with_readings, with_slope
 from malta.synthesis.riccati import add_lags, delay_inputs, eigenvalues, sample
+from malta.synthesis.step_response import StepResponse, step_response
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -63,6 +64,8 @@ class Loop:
     control: LinearLaw
     sample_time: float  # s
     true: FloatArray | None = None  # outputs of the states, where sensors read them late; None: Cd
+    continuous: FloatArray | None = None  # of the first states, between samples
+    pushed: FloatArray | None = None  # what unit disturbances leave in the states in one sample, n x w
 
     @property
     def outputs(self) -> FloatArray:
@@ -91,6 +94,28 @@ class Loop:
     def sensitivity(self, w: FloatArray) -> ComplexArray:
         """The sensitivity S = (I + L)^-1 at the sensors, k x p x p; it also takes noise to the outputs."""
         return np.asarray(np.linalg.inv(np.eye(len(self.Cd)) + self.loop_gain(w)))
+
+    def answer(self) -> StepResponse:
+        """The true outputs after a unit step of every disturbance. Raises CheckError for an unstable loop."""
+        assert self.pushed is not None
+        k = len(self.control.A)
+        g = np.vstack([self.pushed, np.zeros((k, self.pushed.shape[1]))])
+        C = np.hstack([self.outputs, np.zeros((len(self.Cd), k))])
+        return step_response(self.closed, g, C, self.sample_time)
+
+    def compliance(self, w: FloatArray, load: FloatArray) -> ComplexArray:
+        """True outputs per load at frequencies w, rad/s, of a load that is constant throughout each sample: k x p."""
+        assert self.pushed is not None
+        z = np.exp(1j * np.asarray(w) * self.sample_time)[:, None, None]
+        law, into = self.control, np.hstack([self.Bd, self.pushed @ load[:, None]])
+        P = np.linalg.solve(z * np.eye(len(self.Ad)) - self.Ad, into)
+        P, true = self.Cd @ P, self.outputs @ P
+        F = law.C @ np.linalg.solve(z * np.eye(len(law.A)) - law.A, law.B_y) + law.D_y
+        m = self.Bd.shape[1]
+        read = np.linalg.solve(np.eye(len(self.Cd)) - P[..., :m] @ F, P[..., m:])
+        if self.true is None:
+            return np.asarray(read[..., 0])
+        return np.asarray((true[..., m:] + true[..., :m] @ F @ read)[..., 0])
 
 
 def loop(
@@ -124,8 +149,10 @@ def loop(
     if feedforward:
         law = with_slope(law, feedforward_slope(model, controller))
     if current_loops == "pi":
-        Ad, Bd, law = _driven(model, controller, (A, B, C), delay, law, forces_alone=forces_alone)
+        A, Ad, Bd, law = _driven(model, controller, (A, B, C), delay, law, forces_alone=forces_alone)
+        continuous = A
     else:
+        continuous = A
         if current_loops == "lag" and math.isfinite(plant.actuator.crossover):
             A, B = add_lags(A, B, plant.actuator.crossover)
         Ad, Bd = delay_inputs(*sample(A, B, controller.sample_time), delay)
@@ -135,7 +162,7 @@ def loop(
         true = None if true is None else _pad(true, len(Ad))
     if model.E.any():
         law = with_readings(law)
-    return Loop(Ad, Bd, Cd, law, controller.sample_time, true)
+    return Loop(Ad, Bd, Cd, law, controller.sample_time, true, continuous)
 
 
 def _driven(
@@ -146,34 +173,26 @@ def _driven(
     law: LinearLaw,
     *,
     forces_alone: bool,
-) -> tuple[FloatArray, FloatArray, LinearLaw]:
-    """The machine behind its current controllers, from the law's outputs to its states, and the law.
+) -> tuple[FloatArray, FloatArray, FloatArray, LinearLaw]:
+    """The machine with its windings between samples; behind its current controllers, from the law's outputs; the law.
 
     Under load the link's voltage is a state. The voltages that the law forecasts, M^+ emf(x_hat), are outputs of the
     law beside its forces, or with `forces_alone` part of these.
     """
-    plant, point, m = model.plant, model.operating_point, len(controller.forces)
+    plant, point, m, Ts = model.plant, model.operating_point, len(controller.forces), controller.sample_time
     believed = plant_of(controller.parameters)
     windings = windings_of(plant, believed, point, np.eye(m))
     control = current_control(controller, windings, point)
     A, B, C = (np.array(ca.DM(M)) for M in with_windings(plant, windings, point.x, *abc))
-    phi = C[-m:]
-    to_w: FloatArray = np.zeros((m, len(A)))  # of states in w, beside the controllers
+    phi, share = C[-m:], None
     link = link_at_rest(plant, windings, point, axis_map(believed, point)) if point.loaded else None
     if link is not None:
         A = np.block([[A, B @ link.share[:, None]], [link.by_phi @ phi, np.array([[link.rate]])]])
-        B, phi = np.vstack([B, link.by_w[None]]), _pad(phi, len(A))
-        to_w = np.hstack([to_w, -link.share[:, None]])
-    Ad, Bd = delay_inputs(*sample(A, B, controller.sample_time), delay)
-    phi, to_w, one = _pad(phi, len(Ad)), _pad(to_w, len(Ad)), np.eye(m)
-    slope, R = control.loop.Ki * controller.sample_time, windings.R
-    gain = control.loop.Kp + slope
-    closed = np.block([[Ad + Bd @ (to_w - gain / R * phi), Bd / R], [-slope * phi, one]])
-    driven = np.vstack([gain / R * Bd, slope * one])
-    if forces_alone:
-        return closed, driven, forecast_as_forces(law, control, controller.sample_time)
-    forecast = np.vstack([Bd / R, np.zeros((m, m))])[:, forecast_rows(control)]
-    return closed, np.hstack([driven, forecast]), with_forecast(law, control)
+        B, phi, share = np.vstack([B, link.by_w[None]]), _pad(phi, len(A)), link.share
+    Ad, Bd = sample_driven((A, B, phi), control.loop, windings.R, Ts, delay, share)
+    if forces_alone or not len(control.emf[0]):
+        return A, Ad, Bd[:, :m], forecast_as_forces(law, control, Ts)
+    return A, Ad, Bd, with_estimated_emf(law, control)
 
 
 def _stored_readings(
@@ -215,6 +234,40 @@ def machine_loop(
         loaded, controller,
         delay=delay, current_loops=chosen, feedforward=True, sensors=True, forces_alone=forces_alone,
     )  # fmt: skip
+
+
+def machine_loop_at(plant: Plant, controller: Controller, position: float | None = None) -> Loop:
+    """The machine's loop at a position of the stroke, with what disturbances do to it.
+
+    position : m; None: the controller's operating point
+
+    Raises CheckError when no input holds the machine there.
+    """
+    if position is None:
+        position = position_in(plant, plant.point(controller.operating_point[0]).x)
+    model = loaded_model(plant, position)
+    found = machine_loop(model, controller)
+    assert found.continuous is not None
+    pushed = push_through(found.continuous, disturbance_map(model), controller.sample_time, len(found.Ad))
+    return replace(found, pushed=pushed)
+
+
+@lru_cache(maxsize=16)  # every controller of a machine has it; models compare by identity
+def disturbance_map(model: LinearModel) -> FloatArray:
+    """B_w of xi' = A xi + B v + B_w w: n states of the design model x disturbances."""
+    plant, point = model.plant, model.operating_point
+    kind = ca.MX if plant.tabulated else ca.SX
+    x, w = kind.sym("x", len(plant.states)), kind.sym("w", len(plant.disturbances))
+    acting = w + plant.load(x) if point.loaded else w
+    rate = plant.f(x, kind(ca.DM(point.u)), acting)
+    found = ca.Function("B_w", [x, w], [ca.densify(ca.jacobian(rate, w))])(point.x, 0)
+    return readonly(np.array(found)[list(plant.controlled)])
+
+
+def push_through(A: FloatArray, B_w: FloatArray, Ts: float, size: int) -> FloatArray:
+    """What x' = A x + B_w w leaves in `size` states in one sample; states behind those of B_w or A take nothing of w."""
+    _, pushed = sample(A, np.vstack([B_w, np.zeros((len(A) - len(B_w), B_w.shape[1]))]), Ts)
+    return np.vstack([pushed, np.zeros((size - len(pushed), B_w.shape[1]))])
 
 
 @lru_cache(maxsize=8)  # every stage needs it; records compare by identity, so no entry is stale

@@ -16,24 +16,19 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import TYPE_CHECKING
 
-import casadi as ca
 import numpy as np
 
 from malta.errors import CheckError, InputError
-from malta.margins.loops import Loop, loaded_model, machine_loop
+from malta.margins.loops import Loop, machine_loop_at
 from malta.margins.responses import find_peaks
-from malta.model.linearize import LinearModel
-from malta.model.plant import position_in, readonly
-from malta.model.sensors import with_lags
-from malta.synthesis.riccati import sample
-from malta.synthesis.step_response import StepResponse, step_response
+from malta.model.plant import position_in
+from malta.synthesis.step_response import StepResponse
 from malta.threads import on_one_thread
 
 if TYPE_CHECKING:
-    from malta.model.plant import ComplexArray, FloatArray, Plant
+    from malta.model.plant import FloatArray, Plant
     from malta.synthesis.controller import Controller
     from malta.synthesis.recovery import RecoveryBound
 
@@ -115,10 +110,10 @@ def recovery(
         raise InputError(plant.name, "disturbances", "none", "a machine on which forces act from outside")
     loads = {name: {name: 1.0} for name in known} if loads is None else loads
     sizes = [load_vector(plant, name, load) for name, load in loads.items()]
-    pushed = PushedLoop.of(plant, controller, position)
-    unit_loads = pushed.answer()
+    loop = machine_loop_at(plant, controller, position)
+    unit_loads = loop.answer()
     return tuple(
-        Recovery(name, dict(load), after, _deviations(plant, pushed, unit_loads, size, after))
+        Recovery(name, dict(load), after, _deviations(plant, loop, unit_loads, size, after))
         for (name, load), size in zip(loads.items(), sizes, strict=True)
     )
 
@@ -148,76 +143,6 @@ def load_vector(plant: Plant, name: str, load: Mapping[str, float]) -> FloatArra
     return np.array([load.get(disturbance, 0.0) for disturbance in known])
 
 
-@lru_cache(maxsize=16)  # every controller of a machine has it; models compare by identity
-def disturbance_map(model: LinearModel) -> FloatArray:
-    """B_w of xi' = A xi + B v + B_w w: n states of the design model x disturbances."""
-    plant, point = model.plant, model.operating_point
-    kind = ca.MX if plant.tabulated else ca.SX
-    x, w = kind.sym("x", len(plant.states)), kind.sym("w", len(plant.disturbances))
-    acting = w + plant.load(x) if point.loaded else w
-    rate = plant.f(x, kind(ca.DM(point.u)), acting)
-    found = ca.Function("B_w", [x, w], [ca.densify(ca.jacobian(rate, w))])(point.x, 0)
-    return readonly(np.array(found)[list(plant.controlled)])
-
-
-@dataclass(frozen=True, eq=False)
-class PushedLoop:
-    """A machine's loop with what its disturbances leave in the machine's states in one sample, n x w."""
-
-    loop: Loop
-    pushed: FloatArray
-
-    @classmethod
-    def of(cls, plant: Plant, controller: Controller, position: float | None = None) -> PushedLoop:
-        """Build the loop at a position of the stroke; None: at the controller's operating point."""
-        if position is None:
-            position = position_in(plant, plant.point(controller.operating_point[0]).x)
-        # Between samples the machine is itself, whoever commutates: A - E C of either model.
-        loaded = loaded_model(plant, position)
-        loop = machine_loop(loaded, controller)
-        return cls(loop, sampled_push(loaded, controller.sample_time, len(loop.Ad)))
-
-    def answer(self) -> StepResponse:
-        """Answer a unit step of every disturbance. Raises CheckError for an unstable loop."""
-        law, k = self.loop.control, len(self.loop.control.A)
-        g = np.vstack([self.pushed, np.zeros((k, self.pushed.shape[1]))])
-        C = np.hstack([self.loop.outputs, np.zeros((len(self.loop.Cd), len(law.A)))])
-        return step_response(self.loop.closed, g, C, self.loop.sample_time)
-
-    def compliance(self, w: FloatArray, load: FloatArray) -> ComplexArray:
-        """Outputs per load at frequencies w, rad/s, of a load that is constant throughout each sample: k x p."""
-        z = np.exp(1j * np.asarray(w) * self.loop.sample_time)[:, None, None]
-        loop, law = self.loop, self.loop.control
-        P = np.linalg.solve(
-            z * np.eye(len(loop.Ad)) - loop.Ad, np.hstack([loop.Bd, self.pushed @ load[:, None]])
-        )
-        P, true = loop.Cd @ P, loop.outputs @ P
-        F = law.C @ np.linalg.solve(z * np.eye(len(law.A)) - law.A, law.B_y) + law.D_y
-        m = loop.Bd.shape[1]
-        read = np.linalg.solve(np.eye(len(loop.Cd)) - P[..., :m] @ F, P[..., m:])
-        if loop.true is None:
-            return np.asarray(read[..., 0])
-        return np.asarray((true[..., m:] + true[..., :m] @ F @ read)[..., 0])
-
-
-def sampled_push(model: LinearModel, Ts: float, size: int) -> FloatArray:
-    """What unit disturbances leave in a machine's sampled states, of which there are `size`, in one sample.
-
-    model : at its trim; between samples its currents are held
-    """
-    A = model.A - model.E @ model.C if model.E.any() else model.A
-    A, B_w, _ = (
-        np.array(ca.DM(M)) for M in with_lags(model.plant.sensors, A, disturbance_map(model), model.C)
-    )
-    return push_through(A, B_w, Ts, size)
-
-
-def push_through(A: FloatArray, B_w: FloatArray, Ts: float, size: int) -> FloatArray:
-    """Sample x' = A x + B_w w. Lagging and stored forces follow x, `size` states in all, and take nothing from w."""
-    _, pushed = sample(A, B_w, Ts)
-    return np.vstack([pushed, np.zeros((size - len(pushed), B_w.shape[1]))])
-
-
 @on_one_thread
 def bounded_deviation(
     plant: Plant, controller: Controller, bound: RecoveryBound, position: float | None = None
@@ -226,7 +151,7 @@ def bounded_deviation(
     chosen = [k for k, s in enumerate(plant.outputs) if s.name in bound.outputs]
     at = position_in(plant, plant.point(controller.operating_point[0]).x) if position is None else position
     try:
-        answer = PushedLoop.of(plant, controller, position).answer().of(bound.load_at(at))
+        answer = machine_loop_at(plant, controller, position).answer().of(bound.load_at(at))
     except CheckError:
         return math.inf
     reached = answer.largest if bound.after is None else answer.left(bound.after)
@@ -240,12 +165,12 @@ def worst_along(plant: Plant, controller: Controller, bound: RecoveryBound) -> t
 
 
 def _deviations(
-    plant: Plant, pushed: PushedLoop, unit_loads: StepResponse, load: FloatArray, after: tuple[float, ...]
+    plant: Plant, loop: Loop, unit_loads: StepResponse, load: FloatArray, after: tuple[float, ...]
 ) -> tuple[Deviation, ...]:
     """What a load does to each output."""
-    answer, Ts = unit_loads.of(load), pushed.loop.sample_time
+    answer, Ts = unit_loads.of(load), loop.sample_time
     w = np.geomspace(1e-2, np.pi / Ts, 240)
-    peaks, at = find_peaks(lambda some: np.abs(pushed.compliance(some, load)), w)
+    peaks, at = find_peaks(lambda some: np.abs(loop.compliance(some, load)), w)
     reached, settled, left = answer.largest, answer.within(SHARE), [answer.left(t) for t in after]
     rounding = 1e-12 * float(reached.max())
     return tuple(

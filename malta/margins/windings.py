@@ -26,7 +26,7 @@ from malta.errors import CheckError, InputError
 from malta.margins.uncertain import Compensator, is_commutated
 from malta.model.data import plant_of
 from malta.model.linearize import linearize
-from malta.synthesis.riccati import delay_inputs
+from malta.synthesis.riccati import delay_inputs, sample
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray, OperatingPoint, Plant
@@ -174,27 +174,16 @@ def with_estimated_emf(law: LinearLaw, k: CurrentControl) -> LinearLaw:
     )
 
 
-def forecast_rows(k: CurrentControl) -> list[int]:
-    """The forces in whose axes the law forecasts a voltage."""
-    C, D = k.emf
-    return np.flatnonzero(np.abs(np.hstack([C, D])).max(axis=1)).tolist() if len(C) else []
-
-
-def with_forecast(law: LinearLaw, k: CurrentControl) -> LinearLaw:
-    """The law with the voltages that it forecasts, M^+ emf(x_hat) of `forecast_rows`, as further outputs."""
-    both, m = with_estimated_emf(law, k), len(law.C)
-    rows = [*range(m), *(m + row for row in forecast_rows(k))]
-    return both._replace(C=both.C[rows], D_y=both.D_y[rows], D_r=both.D_r[rows])
-
-
 def forecast_as_forces(law: LinearLaw, k: CurrentControl, Ts: float) -> LinearLaw:
-    """The law whose forces contain those that make the current controllers answer with the forecast voltages.
+    """The law whose forces contain those that make the current controllers answer with the voltages that it forecasts.
 
     The controllers make u of forces by Kp + Ki Ts z / (z - 1) = (gain z - Kp) / (z - 1), so that a voltage e takes
     forces of (z - 1) / (gain z - Kp) e. The zero of the controllers becomes a pole of the law, which it cancels.
     """
-    both, m, rows, gain = with_forecast(law, k), len(law.C), forecast_rows(k), k.loop.Kp + k.loop.Ki * Ts
-    C_e, D_e, a, into = both.C[m:] / gain, both.D_y[m:] / gain, k.loop.Kp / gain, np.eye(m)[:, rows]
+    both, m, gain = with_estimated_emf(law, k), len(law.C), k.loop.Kp + k.loop.Ki * Ts
+    C_e, D_e, a = both.C[m:] / gain, both.D_y[m:] / gain, k.loop.Kp / gain
+    rows = np.flatnonzero(np.hstack([C_e, D_e]).any(axis=1))
+    C_e, D_e, into = C_e[rows], D_e[rows], np.eye(m)[:, rows]
     n, r = len(law.A), law.B_r.shape[1]
     return law._replace(
         A=np.block([[law.A, np.zeros((n, len(rows)))], [(a - 1) * C_e, a * np.eye(len(rows))]]),
@@ -203,6 +192,36 @@ def forecast_as_forces(law: LinearLaw, k: CurrentControl, Ts: float) -> LinearLa
         C=np.hstack([law.C + into @ C_e, into]),
         D_y=law.D_y + into @ D_e,
     )
+
+
+def sample_driven(
+    machine: tuple[FloatArray, FloatArray, FloatArray],
+    loop: CurrentLoop,
+    R: float,
+    Ts: float,
+    delay: int,
+    share: FloatArray | None = None,
+) -> tuple[FloatArray, FloatArray]:
+    """The machine behind its current controllers, sampled: from forces v, and then from voltages M^+ emf(x_hat).
+
+    machine : A, B of w, and the matrix of phi of the continuous machine with its windings
+    R : ohm, R_0
+    share : of w in the last state, the link's voltage, which a duty cycle counts in; None: that is no state
+
+    States are those of the machine, of w under way, and the integrals I.
+    """
+    A, B, phi = machine
+    m = B.shape[1]
+    Ad, Bd = delay_inputs(*sample(A, B, Ts), delay)
+    read = np.zeros((m, len(Ad)))
+    read[:, : len(A)] = -(loop.Kp + loop.Ki * Ts) / R * phi
+    if share is not None:
+        read[:, len(A) - 1] -= share
+    sums = np.zeros((m, len(Ad)))
+    sums[:, : len(A)] = -loop.Ki * Ts * phi
+    one, gain = np.eye(m), loop.Kp + loop.Ki * Ts
+    closed = np.block([[Ad + Bd @ read, Bd / R], [sums, one]])
+    return closed, np.block([[gain / R * Bd, Bd / R], [loop.Ki * Ts * one, np.zeros((m, m))]])
 
 
 def with_current_control(c: Compensator, k: CurrentControl, late: int = 0) -> Compensator:

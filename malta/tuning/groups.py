@@ -21,8 +21,8 @@ import numpy as np
 from scipy import sparse
 
 from malta.errors import CheckError, InputError
+from malta.margins.loops import disturbance_map, push_through
 from malta.margins.plants import of_plant
-from malta.margins.recovery import disturbance_map, push_through
 from malta.margins.responses import crossing
 from malta.model.equilibrium import trim
 from malta.model.linearize import linearize

@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from malta.margins.recovery import PushedLoop, furthest, load_vector
+from malta.margins.loops import Loop, machine_loop_at
+from malta.margins.recovery import furthest, load_vector
 from malta.report.figures.marks import draw_group
 from malta.report.figures.parts import MORE, STYLES, finish_axes, micro, new_figure
 from malta.units import unit_factor
@@ -57,7 +58,7 @@ def recovery_figure(plant: Plant, controller: Controller, found: Sequence[Recove
         hspace=0.5,
     )
     panels = figure.subplots(len(rows), 2, squeeze=False)
-    loop = PushedLoop.of(plant, controller)
+    loop = machine_loop_at(plant, controller)
     answer = loop.answer()
     for (left, right), ((unit, of), lines) in zip(panels, rows.items(), strict=True):
         _draw_steps(left, plant, answer, lines, FINE.get(unit, unit), of)
@@ -89,14 +90,14 @@ def _draw_steps(
 def _draw_compliance(
     axes: Axes,
     plant: Plant,
-    loop: PushedLoop,
+    loop: Loop,
     lines: Sequence[tuple[Recovery, Deviation]],
     unit: str,
     of: str,
 ) -> None:
     """Amplitude of the same outputs over frequency, under a load of amplitude 1 N or 1 N m."""
     names = [s.name for s in plant.outputs]
-    w: FloatArray = np.geomspace(1.0, 0.3 * np.pi / loop.loop.sample_time, POINTS)
+    w: FloatArray = np.geomspace(1.0, 0.3 * np.pi / loop.sample_time, POINTS)
     series = {}
     for load, output in lines:
         amplitude = np.abs(loop.compliance(w, load_vector(plant, load.name, load.load)))
