@@ -21,6 +21,7 @@ from malta.margins.systems import uncertain
 from malta.margins.travel import travel_margin
 from malta.margins.uncertain import UncertainSystem, closed_loop
 from malta.margins.verify import controller_poles, unstable_gain, verify
+from malta.margins.windings import left_out
 from malta.model.data import plant_of
 from malta.model.linearize import LinearModel
 from malta.model.plant import Plant
@@ -463,8 +464,10 @@ def test_fidelities_that_a_machine_has_not_are_one_sentence(fidelity: Any) -> No
 def test_machines_without_windings_say_so() -> None:
     with pytest.raises(malta.InputError, match="windings are modelled"):
         _ = _plant("planar").drive
-    with pytest.raises(malta.InputError, match="those of a halbach run much faster"):
-        travel_margin(_plant("halbach"), _controller("halbach", 0), {"m": 0.2}, "pi")
+    assert "the electronics' own current controllers" in left_out(
+        _plant("halbach"), _controller("halbach", 0)
+    )
+    assert left_out(_plant("planar"), _controller("planar", 1)) == ""
 
 
 def test_disturbances_by_hand() -> None:

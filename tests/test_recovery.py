@@ -146,7 +146,7 @@ def test_the_nonlinear_machine_answers_alike(calibrated: Machine, name: str) -> 
         return responses.step_wrench(t, column, size, at, len(plant.disturbances))
 
     scenario = malta.Scenario(
-        "push", 0.12, malta.references.hold, fidelity="force", noise=0.0, quantize=False, disturbance=push
+        "push", 0.12, malta.references.hold, noise=0.0, quantize=False, disturbance=push
     )
     run = malta.simulate(plant, c, scenario)
     answer = machine_loop_at(plant, c).answer().of(load_vector(plant, name, {name: size}))
@@ -179,7 +179,7 @@ def test_the_flagship_carries_a_load_in_a_tenth_of_a_second(name: str) -> None:
     assert found["F_z"].largest < 140e-6
     assert found["F_x"].left[0] < 0.5e-6
     assert found["F_x"].left[1] < 0.02e-6
-    assert found["F_z"].left[0] < 6e-6
+    assert found["F_z"].left[0] < 6.5e-6
     assert max(d.settled for d in found.values()) < 0.2
     assert "T_z" not in found  # no input of the machine's turns it about its axis, nor does a sensor see it
 

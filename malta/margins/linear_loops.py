@@ -24,7 +24,7 @@ from malta.errors import CheckError, InputError
 from malta.margins.loop_systems import LoopSystems
 from malta.margins.loops import machine_loop_at
 from malta.model.plant import Plant, Signal
-from malta.synthesis.controller import Controller, LinearLaw
+from malta.synthesis.controller import Controller, LinearLaw, linear_law
 from malta.synthesis.riccati import eigenvalues
 from malta.synthesis.state_space import balanced_units, set_point
 
@@ -85,6 +85,7 @@ class LinearLoop:
     outputs: tuple[Signal, ...]
     inputs: tuple[Signal, ...]
     loads: tuple[Signal, ...]
+    cancelled: tuple[float, ...] = ()  # rad/s, poles of the law that its zeros cancel: of forecast voltages
 
     def frequencies(self, w: FloatArray) -> ComplexArray:
         """The complex frequencies of the systems at w, rad/s: jw, or (z - 1) / T."""
@@ -164,8 +165,11 @@ class LinearLoop:
 
     @cached_property
     def closed_poles(self) -> ComplexArray:
-        """The poles of the closed loop, rad/s."""
-        return self.poles_of(self.closed_loop().A)
+        """The poles of the closed loop, rad/s, without those that the law cancels in itself."""
+        found = self.poles_of(self.closed_loop().A)
+        for pole in self.cancelled:
+            found = np.delete(found, np.abs(found - pole).argmin())
+        return found
 
     @cached_property
     def stable(self) -> bool:
@@ -206,7 +210,7 @@ def linear_loop(
 
 
 def _of_machine(plant: Plant, controller: Controller, name: str, position: float | None) -> LinearLoop:
-    loop = machine_loop_at(plant, controller, position)
+    loop = machine_loop_at(plant, controller, position, forces_alone=True)
     law, T = loop.control, loop.sample_time
     assert loop.pushed is not None
     driven, command = _commanded_system(controller, law)
@@ -221,6 +225,7 @@ def _of_machine(plant: Plant, controller: Controller, name: str, position: float
         plant.outputs,
         plant.inputs,
         plant.disturbances,
+        cancelled=tuple((np.log(np.diag(law.A)[len(linear_law(controller).A) :]) / T).tolist()),
     )
 
 

@@ -236,17 +236,20 @@ def machine_loop(
     )  # fmt: skip
 
 
-def machine_loop_at(plant: Plant, controller: Controller, position: float | None = None) -> Loop:
+def machine_loop_at(
+    plant: Plant, controller: Controller, position: float | None = None, *, forces_alone: bool = False
+) -> Loop:
     """The machine's loop at a position of the stroke, with what disturbances do to it.
 
     position : m; None: the controller's operating point
+    forces_alone : see `loop`
 
     Raises CheckError when no input holds the machine there.
     """
     if position is None:
         position = position_in(plant, plant.point(controller.operating_point[0]).x)
     model = loaded_model(plant, position)
-    found = machine_loop(model, controller)
+    found = machine_loop(model, controller, forces_alone=forces_alone)
     assert found.continuous is not None
     pushed = push_through(found.continuous, disturbance_map(model), controller.sample_time, len(found.Ad))
     return replace(found, pushed=pushed)
@@ -265,7 +268,7 @@ def disturbance_map(model: LinearModel) -> FloatArray:
 
 
 def push_through(A: FloatArray, B_w: FloatArray, Ts: float, size: int) -> FloatArray:
-    """What x' = A x + B_w w leaves in `size` states in one sample; states behind those of B_w or A take nothing of w."""
+    """What x' = A x + B_w w leaves in `size` states in one sample; states behind those of B_w take nothing from w."""
     _, pushed = sample(A, np.vstack([B_w, np.zeros((len(A) - len(B_w), B_w.shape[1]))]), Ts)
     return np.vstack([pushed, np.zeros((size - len(pushed), B_w.shape[1]))])
 
