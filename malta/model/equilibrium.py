@@ -1,117 +1,229 @@
-"""The inputs that hold a machine at rest: against its loads, and against what its magnets pull with."""
+"""The commands that hold a machine at rest: against its loads, and against what its magnets pull with.
+
+A controller commands v, its coils carry currents(h(x), v), and these make the inputs u = forces(x, i) of the machine:
+
+    v -> i = currents(h(x), v) -> u = forces(x, i) -> x' = f(x, u, w + load(x))
+
+`currents` need not be the inverse of `forces`, and the controller may have it from other parameters than the machine's.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any
 
 import casadi as ca
 import numpy as np
 
 from malta.errors import CheckError
+from malta.model.newton import solve
 from malta.model.plant import OperatingPoint, Plant
 
 if TYPE_CHECKING:
+    from malta.model.newton import Equations
     from malta.model.plant import FloatArray
+
+STILL = 1e-9  # m/s, rad/s, m/s2 or rad/s2: a machine that changes by less is at rest
+SHARE = 1e-10  # of the rates that the inputs make: rounding
+LIMIT_ROUNDING = 1e-9  # of a limit
+STARTS = (1.0, 0.3, 0.1, 0.01)  # of the limits of the commands, from where a balance is searched at last
 
 
 def trim(plant: Plant, /, **positions: float) -> OperatingPoint:
-    """Find the inputs that hold the machine at rest at these states against its loads.
+    """Find the command that holds the machine at rest at these states against its loads.
 
-    Solves 0 = f(x, u, load(x)) for u, in the least-squares sense, by Newton's method. Accelerations of uncontrolled
-    states are left: a mover whose centre of gravity is off its axis rolls.
+    Solves 0 = f(x, u, load(x)), u = forces(x, currents(h(x), v)), for v by a damped Newton method. Where several
+    commands hold the machine, this is the one nearest to the inputs. Accelerations of uncontrolled states are left: a
+    mover whose centre of gravity is off its axis rolls.
 
     plant : the machine
     positions : states by name, SI; the others are zero
 
-    Returns an OperatingPoint.
+    Returns an OperatingPoint with the inputs u that act and the command v that makes them.
 
-    Raises InputError for unknown states, CheckError when no input holds the machine there.
+    Raises InputError for unknown states, CheckError when no input or no command holds the machine there, or none
+    within its limits of forces and currents.
 
     >>> import malta
     >>> ball = malta.read_design("examples/ball/design/ball.toml").plant
-    >>> malta.trim(ball, q=0.5e-3).u.round(3).tolist()  # N: the weight of 100 g
-    [0.981]
+    >>> held = malta.trim(ball, q=1e-3)
+    >>> held.u.round(3).tolist(), held.v.round(3).tolist()  # N: the weight of 100 g, and the command that makes it
+    ([0.981], [-0.523])
     """
-    x = plant.at(**positions).x
-    return OperatingPoint(x, _hold(plant, x[None, :])[0], loaded=True)
+    point = balance(plant, plant.state(positions))
+    excess = exceeded_limit(plant, point)
+    if excess:
+        raise CheckError(f"{plant.name}: nothing holds {_named(plant, point.x)} within its limits: {excess}")
+    return point
+
+
+def balance(plant: Plant, x: FloatArray) -> OperatingPoint:
+    """The operating point at rest under the loads, within the limits or beyond them: see `trim`."""
+    u = _hold(plant, x[None, :])[0]
+    return commanded(plant, OperatingPoint(x, u, loaded=True))
+
+
+def commanded(plant: Plant, point: OperatingPoint, believed: Plant | None = None) -> OperatingPoint:
+    """The operating point with the command v at which its inputs act, and the inputs that v makes.
+
+    Solves f(x, forces(x, currents(h(x), v)), w) = f(x, u, w) for v, with the currents of `believed`, but for the
+    accelerations of uncontrolled states.
+
+    plant : the machine
+    believed : the machine with the controller's parameters; None: the plant itself
+
+    Raises CheckError when no command has the effect of the inputs.
+    """
+    before = [] if point.v is None else [point.v[None, :]]
+    (v,), (u,) = _commands(plant, believed, point.x[None, :], point.u[None, :], before, loaded=point.loaded)
+    return OperatingPoint(point.x, u, point.loaded, v)
+
+
+def exceeded_limit(plant: Plant, point: OperatingPoint) -> str:
+    """The limit of forces or currents that a point with a command exceeds, in words; "": none."""
+    assert point.v is not None
+    for s, v, most in zip(plant.inputs, point.v.tolist(), plant.actuator.force_limit, strict=False):
+        if abs(v) > most * (1 + LIMIT_ROUNDING):
+            return f"the command {s.name} = {v:.4g} {s.unit} is beyond its limit of {most:.4g} {s.unit}"
+    _, currents = _chain(plant, None)
+    wanted = np.array(currents(point.x, point.v)).ravel()
+    carried = np.array(ca.evalf(ca.vertcat(plant.limited(ca.DM(wanted))))).ravel()
+    carried = np.clip(carried, -plant.actuator.current_limit, plant.actuator.current_limit)
+    missed = np.abs(carried - wanted)
+    k = int(missed.argmax())
+    if missed[k] <= LIMIT_ROUNDING * np.abs(wanted).max():
+        return ""
+    coil = plant.actuator.coils[k]
+    return f"the current {coil.name} = {wanted[k]:.4g} {coil.unit} is limited to {carried[k]:.4g} {coil.unit}"
 
 
 def load_balance(plant: Plant, states: FloatArray) -> FloatArray:
-    """The inputs that cancel the loads alone at rest: f(x, u, load(x)) = f(x, 0, 0); one row for each row of states.
+    """The commands that cancel the loads alone at rest: f(x, u, load(x)) = f(x, 0, 0); one row for each row of states.
 
     The controller balances the other forces, as the pull of a magnetic bearing off its centre.
 
-    Raises CheckError when no input cancels the loads.
+    Raises CheckError when no command cancels the loads.
     """
-    return _hold(plant, states, loads_alone=True)
+    u = _hold(plant, states, loads_alone=True)
+    return _commands(plant, None, states, u, [], loaded=True)[0]
 
 
 def holding_forces(plant: Plant) -> FloatArray:
     """The forces v to command at the states' zero, so that their currents hold the machine there at rest.
 
-    Solves 0 = f(0, forces(0, currents(h(0), v)), load(0)) by Newton's method, in the least-squares sense. A plant that
-    is written about a point off its centre is thus held there, whatever its magnets pull with.
+    A plant that is written about a point off its centre is thus held there, whatever its magnets pull with.
 
     Raises CheckError when no forces hold it.
     """
-    kind = ca.MX if plant.tabulated else ca.SX
-    x, v = kind(ca.DM.zeros(len(plant.states))), kind.sym("v", len(plant.inputs))
-    i = plant.currents(plant.h(x, kind.zeros(len(plant.inputs))), v)
-    rate = ca.densify(plant.f(x, plant.forces(x, i), plant.load(x)))
-    residual = ca.Function("residual", [v], [rate, ca.jacobian(rate, v)])
+    v = balance(plant, np.zeros(len(plant.states))).v
+    assert v is not None
+    return v
 
-    def rates(forces: FloatArray) -> tuple[FloatArray, FloatArray]:
-        r, J = (np.array(value) for value in residual(forces[0]))
-        return r.T, J[None]
 
-    (forces,) = _inputs_at_rest(plant, rates, ["it at rest"], steps=30)
-    return np.asarray(forces)
+def _named(plant: Plant, x: FloatArray) -> str:
+    """A state in words: "q = 0.001 m"."""
+    entries = [f"{s.name} = {v:.4g} {s.unit}" for s, v in zip(plant.states, x.tolist(), strict=True) if v]
+    return f"the state {', '.join(entries)}" if entries else "it at rest at its states' zero"
+
+
+@lru_cache(maxsize=32)  # plants compare by identity
+def _chain(plant: Plant, believed: Plant | None) -> tuple[ca.Function, ca.Function]:
+    """(x, v) -> inputs that the currents of v make; (x, v) -> these currents, A."""
+    kind = ca.MX if (believed or plant).tabulated else ca.SX
+    x, v = kind.sym("x", len(plant.states)), kind.sym("v", len(plant.inputs))
+    i = (believed or plant).currents(plant.h(x, kind.zeros(len(plant.inputs))), v)
+    made = ca.Function("inputs", [x, v], [ca.densify(plant.forces(x, i))])
+    return made, ca.Function("currents", [x, v], [ca.densify(i)])
+
+
+def _rates_of(plant: Plant, x: Any, u: Any, w: Any) -> Any:
+    """f(x, u, w) with zeros for accelerations that no input holds."""
+    rate = ca.densify(plant.f(x, u, w))
+    if plant.second_order:
+        for index in set(range(len(plant.states) // 2, len(plant.states))) - set(plant.controlled):
+            rate[index] = 0
+    return rate
 
 
 def _hold(plant: Plant, states: FloatArray, *, loads_alone: bool = False) -> FloatArray:
-    x, u = ca.SX.sym("x", len(plant.states)), ca.SX.sym("u", len(plant.inputs))
-    rate = plant.f(x, u, plant.load(x))
+    """The inputs that hold the machine at rest, or that cancel its loads alone; one row for each row of states."""
+    m, w = len(plant.inputs), len(plant.disturbances)
+    x, u = ca.SX.sym("x", len(plant.states)), ca.SX.sym("u", m)
+    rate = _rates_of(plant, x, u, plant.load(x))
     if loads_alone:
-        rate -= plant.f(x, ca.SX.zeros(len(plant.inputs)), ca.SX.zeros(len(plant.disturbances)))
-    if plant.second_order:
-        for index in set(range(len(plant.states) // 2, len(plant.states))) - set(plant.controlled):
-            rate[index] = 0  # an acceleration that no input holds
-    size, count = len(plant.inputs), len(states)
-    residual = ca.Function("residual", [x, u], [rate, ca.jacobian(rate, u)]).map(count)
+        rate -= _rates_of(plant, x, ca.SX.zeros(m), ca.SX.zeros(w))
+    found = solve(_equations(x, u, rate, states), [np.zeros((len(states), m))], _scales(plant), STILL, SHARE)
+    _require_solved(plant, found.left, "input", states)
+    return found.values
 
-    def rates(forces: FloatArray) -> tuple[FloatArray, FloatArray]:
-        r, J = (np.array(value) for value in residual(states.T, forces.T))
+
+def _commands(
+    plant: Plant,
+    believed: Plant | None,
+    states: FloatArray,
+    inputs: FloatArray,
+    before: Sequence[FloatArray],
+    *,
+    loaded: bool,
+) -> tuple[FloatArray, FloatArray]:
+    """The commands that have the effect of these inputs, and the inputs that they make; a row for each state.
+
+    before : commands to start from, beside the inputs and shares of the limits
+    """
+    made, _ = _chain(plant, believed)
+    kind = ca.MX if (believed or plant).tabulated else ca.SX
+    x, v = kind.sym("x", len(plant.states)), kind.sym("v", len(plant.inputs))
+    w = plant.load(x) if loaded else kind.zeros(len(plant.disturbances))
+    u = kind.sym("u", len(plant.inputs))
+    left = _rates_of(plant, x, made(x, v), w) - _rates_of(plant, x, u, w)
+    equations = _equations(ca.vertcat(x, u), v, left, np.hstack([states, inputs]))
+    scales = _scales(plant)
+    rough = np.where(inputs < 0, -1.0, 1.0) * scales
+    starts = [
+        *before,
+        inputs,
+        np.zeros_like(inputs),
+        *(s * share * rough for share in STARTS for s in (1.0, -1.0)),
+    ]
+    found = solve(equations, starts, scales, STILL, SHARE)
+    _require_solved(plant, found.left, "command", states, inputs if not loaded else None)
+    acting = np.array(made.map(len(states))(states.T, found.values.T)).T
+    near = np.abs(acting - inputs) <= 1e-12 * np.maximum(np.abs(inputs), scales)
+    return found.values, np.where(near, inputs, acting)
+
+
+def _equations(given: Any, unknown: Any, left: Any, rows: FloatArray) -> Equations:
+    """The residual and its Jacobian by the unknown, row by row of what is given."""
+    count, size = len(rows), unknown.numel()
+    both = ca.Function("residual", [given, unknown], [left, ca.jacobian(left, unknown)])
+
+    def evaluate(values: FloatArray) -> tuple[FloatArray, FloatArray]:
+        r, J = (np.array(value) for value in both.map(count)(rows.T, values.T))
         return r.T, J.reshape(-1, count, size).swapaxes(0, 1)
 
-    held = [f"the state {state.tolist()}" for state in states]
-    # f is affine in the inputs of most machines: the second step only polishes
-    return _inputs_at_rest(plant, rates, held, steps=2)
+    return evaluate
 
 
-def _inputs_at_rest(
-    plant: Plant,
-    rates: Callable[[FloatArray], tuple[FloatArray, FloatArray]],
-    held: Sequence[str],
-    *,
-    steps: int,
-) -> FloatArray:
-    """The inputs where the rates vanish, by at most so many steps of Newton's method; one row for each state.
+def _scales(plant: Plant) -> FloatArray:
+    """The limits of the inputs; ones where some have none."""
+    limits = np.array(plant.actuator.force_limit, dtype=float)
+    whole = len(limits) == len(plant.inputs) and np.isfinite(limits).all() and (limits > 0).all()
+    return limits if whole else np.ones(len(plant.inputs))
 
-    rates : rows of inputs -> rows of rates, and their derivatives by the inputs
 
-    Raises CheckError, which names what is `held`, when some rate is left.
-    """
-    u = np.zeros((len(held), len(plant.inputs)))
-    moving = np.ones(len(held), dtype=bool)
-    for _ in range(steps):
-        r, J = rates(u)
-        moving &= r.any(axis=1) & np.isfinite(r).all(axis=1)
-        for k in np.flatnonzero(moving):
-            u[k] -= np.linalg.lstsq(J[k], r[k], rcond=None)[0]
-    left = np.abs(rates(u)[0]).max(axis=1)
-    for what, most in zip(held, left.tolist(), strict=True):
-        if not most <= 1e-9:  # m/s, rad/s, m/s2 or rad/s2
-            found = f"it changes at up to {most:.3g} (SI) a second"
-            raise CheckError(f"{plant.name}: no input holds {what}: {found}")
-    return u
+def _require_solved(
+    plant: Plant, left: FloatArray, what: str, states: FloatArray, preload: FloatArray | None = None
+) -> None:
+    """Raise CheckError for the first state with a rate that is left."""
+    for row, (x, rate) in enumerate(zip(states, left, strict=True)):
+        if (rate == 0).all():
+            continue
+        k = int(np.nanargmax(np.abs(rate))) if np.isfinite(rate).any() else 0
+        found = f"{plant.states[k].name} changes at {rate[k]:.3g} {plant.states[k].unit}/s"
+        if preload is None:
+            raise CheckError(f"{plant.name}: no {what} holds {_named(plant, x)}: {found}")
+        missed = (
+            f"no command makes its `preload` {preload[row].tolist()} at {_named(plant, x)}: {found} otherwise"
+        )
+        raise CheckError(f"{plant.name}: {missed}")

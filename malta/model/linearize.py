@@ -17,6 +17,7 @@ import casadi as ca
 import numpy as np
 
 from malta.errors import CheckError, InputError
+from malta.model.equilibrium import commanded
 from malta.model.plant import OperatingPoint, Plant, readonly
 
 if TYPE_CHECKING:
@@ -94,7 +95,10 @@ class LinearModel:
 
 
 def linearize(plant: Plant, point: OperatingPoint, believed: Plant | None = None) -> LinearModel:
-    """Linearize x' = f(x, u, w), y = h(x, u) at an operating point.
+    """Linearize x' = f(x, u, w), y = h(x, u), u = forces(x, currents(y, v)) at an operating point.
+
+    The inputs of the model are commands: A, B and E are slopes of the whole chain from a command to the rates, at the
+    command v at which the inputs of the point act, whatever the controller believes.
 
     At `plant.at(z=...)` the loads are left out, because v0(z) cancels them. At `trim(plant, z=...)` they act, and the
     model has the slopes of the loads and of the inputs that balance them (for the tubular machine m g / Ixx from z to
@@ -105,9 +109,10 @@ def linearize(plant: Plant, point: OperatingPoint, believed: Plant | None = None
     believed : the machine with the controller's parameters; None: the plant itself. The inputs are the forces that the
         controller commands with these parameters.
 
-    Returns a LinearModel, exact derivatives by CasADi.
+    Returns a LinearModel, exact derivatives by CasADi; its operating point has the command v.
 
-    Raises InputError when the point has the wrong size, CheckError when the Jacobian is not finite.
+    Raises InputError when the point has the wrong size, CheckError when no command makes its inputs or the Jacobian is
+    not finite: without a `preload`, currents sqrt(v) have no slope at v = 0.
 
     >>> import malta
     >>> spec = malta.read_design("examples/ball/design/ball.toml")
@@ -120,19 +125,33 @@ def linearize(plant: Plant, point: OperatingPoint, believed: Plant | None = None
         raise InputError(
             plant.name, "operating point", f"x {point.x.shape}, u {point.u.shape}", f"x ({n},), u ({m},)"
         )
+    if not np.isfinite(point.x).all() or not np.isfinite(point.u).all():
+        raise CheckError(f"{plant.name}: the operating point is not finite: x = {point.x}, u = {point.u}")
+    point = commanded(plant, point, believed)
     kind = ca.MX if (believed or plant).tabulated else ca.SX
     x, u, v = kind.sym("x", n), kind.sym("u", m), kind.sym("v", m)
     w = plant.load(x) if point.loaded else kind.zeros(len(plant.disturbances))
     derivatives = ca.Function("derivatives", [x, u, v], list(jacobians(plant, believed, x, u, v, w)))
-    A, B, C, E, made, G = (np.array(value) for value in derivatives(point.x, point.u, point.u))
-    if believed is not None:  # the commands at which these inputs act
-        wanted = point.u + np.linalg.lstsq(G, point.u - made.ravel(), rcond=None)[0]
-        A, B, C, E, *_ = (np.array(value) for value in derivatives(point.x, point.u, wanted))
+    A, B, C, E, _, ratio = (np.array(value) for value in derivatives(point.x, point.u, point.v))
     keep = list(plant.controlled)
     A, B, C, E = A[np.ix_(keep, keep)], B[keep], C[:, keep], E[keep]
+    if not np.isfinite(ratio).all():
+        raise CheckError(_without_slope(plant, point))
     if not all(np.isfinite(M).all() for M in (A, B, C, E)):
         raise CheckError(f"{plant.name}: the linear model is not finite at x = {point.x.tolist()}")
     return LinearModel(plant, point, A, B, C, E)
+
+
+def _without_slope(plant: Plant, point: OperatingPoint) -> str:
+    """Why the currents have no slope, in a sentence."""
+    assert point.v is not None
+    at = ", ".join(
+        f"{s.name} = {v:.4g} {s.unit}" for s, v in zip(plant.inputs, point.v.tolist(), strict=True)
+    )
+    found = f"{plant.name}: `currents` has no finite slope at the command {at}"
+    if point.loaded:
+        return f"{found}, which holds the machine"
+    return f"{found}: the plant needs a `preload`, x -> inputs that act at its operating point"
 
 
 def jacobians(
@@ -140,10 +159,10 @@ def jacobians(
 ) -> tuple[Any, Any, Any, Any, Any, Any]:
     """A, B, C and E for all states, the forces on the machine, and their ratio to the commands: expressions of x, u, v.
 
-    The inputs u act; the controller commands the forces v. With equal parameters of machine and controller the two
-    are equal, and B is the Jacobian of f. With other parameters the currents produce other forces, and B contains
-    their ratio. A contains the stiffness that commutation does not cancel: of coordinates that it ignores, as the tilt
-    of a planar motor, or of parameters that differ.
+    The inputs u act; the controller commands the forces v, and their currents make the inputs. B contains the slope of
+    what they make: 1 where `currents` is the inverse of `forces` and the controller has the machine's parameters. A
+    contains the stiffness that commutation does not cancel: of coordinates that it ignores, as the tilt of a planar
+    motor, or of parameters that differ.
     """
     C = ca.jacobian(plant.h(x, u), x)
     kind = type(x)
@@ -159,4 +178,4 @@ def jacobians(
     G, ratio = ca.jacobian(rate, u), at(from_i @ ca.jacobian(wanted, v))
     turned = at(from_i @ ca.jacobian(wanted, y))  # slope of the forces in the reading
     A = ca.jacobian(rate, x) + G @ (at(ca.jacobian(made, x)) + turned @ C)
-    return A, G if believed is None else G @ ratio, C, G @ turned, at(made), ratio
+    return A, G @ ratio, C, G @ turned, at(made), ratio

@@ -382,8 +382,10 @@ class OperatingPoint:
     """A state and inputs to linearize at.
 
     x : all states, SI
-    u : inputs, N
+    u : inputs that act on the machine, N
     loaded : whether the loads act and u balances them, as after `malta.trim`
+    v : inputs to command, so that the currents of the controller make u; None: `malta.linearize` finds them. They are
+        u where `currents` is the inverse of `forces`.
 
     >>> import malta
     >>> plant = malta.plant_of(malta.read("data/tubular.toml"))
@@ -395,10 +397,13 @@ class OperatingPoint:
     x: FloatArray
     u: FloatArray
     loaded: bool
+    v: FloatArray | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "x", readonly(self.x))
         object.__setattr__(self, "u", readonly(self.u))
+        if self.v is not None:
+            object.__setattr__(self, "v", readonly(self.v))
 
 
 def readonly(array: ArrayLike) -> FloatArray:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from scipy.optimize import brentq
 
-from malta.model.equilibrium import trim
+from malta.model.equilibrium import balance
 from malta.model.parameters import units_of
 from malta.simulation.catalogue import experiment
 from malta.simulation.experiments import setting
@@ -61,7 +61,8 @@ def held_payload(plant: Plant) -> float:
 
     def share_used(extra: float) -> float:
         heavier = plant.variant(replace(par, m=par.m + extra))
-        return max(float(np.abs(trim(heavier, **at).u / limits).max()) for at in places)
+        held = [balance(heavier, plant.state(at)).v for at in places]
+        return float(np.abs(np.array(held) / limits).max())
 
     if share_used(0.0) >= 1:
         return 0.0

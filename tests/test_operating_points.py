@@ -1,0 +1,246 @@
+"""Operating points of machines whose `currents` is not the inverse of `forces`: commands, slopes, limits, refusals."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import casadi as ca
+import numpy as np
+import pytest
+
+import malta
+from malta.model.equilibrium import commanded
+from malta.model.plant import OperatingPoint
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from malta.model.plant import FloatArray, Plant
+
+
+@dataclass(frozen=True)
+class Bench:
+    """A mass before a magnet, with knobs for how wrong its currents are."""
+
+    m: float = malta.si("kg", above=0)
+    C: float = malta.si("N m^2/A^2", above=0)
+    g0: float = malta.si("m", above=0)
+    bias: float = malta.si("A", at_least=0)
+    k: float = malta.si("N/m")  # spring, negative: a permanent magnet
+    preload: float = malta.si("N")
+    I_max: float = malta.si("A", above=0)
+    kind: str = "knows"
+    preset: str = "custom"
+
+
+def bench(par: Any) -> Plant:
+    """One magnet that pulls: u = C (bias + i)^2 / (g0 - x)^2; `currents` knows the gap, the middle, or a slope."""
+    slope = 2 * par.C * max(par.bias, 1.0) / par.g0**2 if isinstance(par.bias, float) else 1.0
+
+    def currents(y: Any, v: Any) -> Any:
+        if par.kind == "knows":
+            return ca.sqrt(v / par.C) * (par.g0 - y) - par.bias
+        if par.kind == "middle":
+            return ca.sqrt(v / par.C) * par.g0 - par.bias
+        return v / slope
+
+    return malta.Plant(
+        name=f"bench that {par.kind}",
+        parameters=par,
+        variant=bench,
+        states=(malta.Signal("x", "m"), malta.Signal("x_dot", "m/s")),
+        inputs=(malta.Signal("f", "N"),),
+        outputs=(malta.Signal("y", "m"),),
+        disturbances=(malta.Signal("w", "N"),),
+        f=lambda x, u, w: ca.vertcat(x[1], (u + w - par.k * x[0]) / par.m),
+        h=lambda x, _: x[0],
+        load=lambda _: -9.81 * par.m,
+        preload=lambda _: ca.DM([par.preload]),
+        currents=currents,
+        forces=lambda x, i: par.C * (par.bias + i) ** 2 / (par.g0 - x[0]) ** 2,
+        actuator=malta.Actuator((malta.Signal("i", "A"),), (), current_limit=par.I_max, force_limit=(40.0,)),
+    )
+
+
+BENCH = Bench(m=0.5, C=3e-5, g0=4e-3, bias=1.5, k=-200.0, preload=4.905, I_max=6.0)
+
+
+def two_coils(par: Any) -> Plant:
+    """Three coils for a force and a torque, whose shares of the force depend on the position, with a wrong inverse."""
+    share = [[1.0, 1.0, 1.0], [1.0, 0.0, -0.6]]
+
+    def forces(x: Any, i: Any) -> Any:
+        return (ca.DM(share) + 40 * x[0] * ca.DM([[0, 1, 0], [2, 0, 1]])) @ (par.C * 1e5 * (i + 0.3 * i**2))
+
+    right = np.linalg.pinv(np.array(share))
+    return malta.Plant(
+        name="three coils",
+        parameters=par,
+        variant=two_coils,
+        states=tuple(
+            malta.Signal(n, u) for n, u in (("z", "m"), ("a", "rad"), ("z_dot", "m/s"), ("a_dot", "rad/s"))
+        ),
+        inputs=(malta.Signal("f", "N"), malta.Signal("t", "N m")),
+        outputs=(malta.Signal("p", "m"), malta.Signal("b", "rad")),
+        disturbances=(malta.Signal("w", "N"),),
+        f=lambda x, u, w: ca.vertcat(x[2:], (u[0] + w) / par.m - par.k * x[0], (u[1] + 0.02 * x[1]) / 1e-3),
+        h=lambda x, _: x[:2],
+        load=lambda _: -9.81 * par.m,
+        preload=lambda _: ca.DM([par.preload, 0.1]),
+        currents=lambda y, v: ca.DM(right) @ v / (par.C * 1e5) * (1 + 10 * y[0]),
+        forces=forces,
+        actuator=malta.Actuator(
+            tuple(malta.Signal(f"i{k}", "A") for k in range(3)),
+            (),
+            current_limit=60.0,
+            force_limit=(40.0, 20.0),
+        ),
+    )
+
+
+MACHINES: dict[str, tuple[Callable[[Any], Plant], Bench, dict[str, float]]] = {
+    "inverse": (bench, BENCH, {"x": 1e-3}),
+    "middle": (bench, replace(BENCH, kind="middle"), {"x": 1e-3}),
+    "slope": (bench, replace(BENCH, kind="slope", bias=2.5), {"x": -0.7e-3}),
+    "three coils": (two_coils, BENCH, {"z": 0.8e-3, "a": 0.01}),
+}
+DIFFERENT = {"C": 1.2, "g0": 0.85, "m": 1.2}  # what a controller may believe instead, relative
+
+
+def rate(
+    plant: Plant, believed: Plant, x: FloatArray, y: FloatArray, v: FloatArray, *, loaded: bool
+) -> FloatArray:
+    """x' of the whole chain from a command v at a reading y."""
+    u = plant.forces(ca.DM(x), believed.currents(ca.DM(y), ca.DM(v)))
+    w = plant.load(ca.DM(x)) if loaded else ca.DM.zeros(len(plant.disturbances))
+    return np.array(ca.DM(ca.vertcat(plant.f(ca.DM(x), u, w)))).ravel()
+
+
+def slopes(function: Callable[[FloatArray], FloatArray], at: FloatArray, step: float) -> FloatArray:
+    """The derivative by differences of fourth order, one column for each entry."""
+    columns = []
+    for e in np.eye(len(at)) * step:
+        columns.append(
+            (8 * (function(at + e) - function(at - e)) - function(at + 2 * e) + function(at - 2 * e)) / 12
+        )
+    return np.array(columns).T / step
+
+
+@pytest.mark.parametrize("loaded", [False, True])
+@pytest.mark.parametrize("differ", [False, True])
+@pytest.mark.parametrize("name", MACHINES)
+def test_the_linear_model_is_the_derivative_of_the_chain(name: str, differ: bool, loaded: bool) -> None:
+    """A, B and E by differences of f(x, forces(x, currents(y, v)), w) where its command v converged."""
+    make, par, at = MACHINES[name]
+    plant = make(par)
+    other = replace(par, **{key: getattr(par, key) * by for key, by in DIFFERENT.items()})
+    believed = make(other) if differ else plant
+    point = malta.trim(plant, **at) if loaded else plant.at(**at)
+    model = malta.linearize(plant, point, believed if differ else None)
+    x, v = model.operating_point.x, model.operating_point.v
+    assert v is not None
+    y = np.array(plant.h(ca.DM(x), 0)).ravel()
+    wanted = np.array(ca.DM(plant.f(ca.DM(x), ca.DM(point.u), plant.load(ca.DM(x)) if loaded else 0))).ravel()
+    np.testing.assert_allclose(rate(plant, believed, x, y, v, loaded=loaded), wanted, rtol=1e-10, atol=1e-9)
+
+    def read(z: FloatArray) -> FloatArray:
+        return np.array(plant.h(ca.DM(z), 0)).ravel()
+
+    A = slopes(lambda z: rate(plant, believed, z, read(z), v, loaded=loaded), x, 1e-6)
+    B = slopes(lambda c: rate(plant, believed, x, y, c, loaded=loaded), v, 1e-3)
+    E = slopes(lambda r: rate(plant, believed, x, r, v, loaded=loaded), y, 1e-6)
+    for ours, theirs in ((model.A, A), (model.B, B), (model.E, E)):
+        np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-8 * np.abs(A).max())
+
+
+@pytest.mark.parametrize("name", MACHINES)
+def test_trim_is_at_rest_with_the_forces_that_its_command_makes(name: str) -> None:
+    """f(x, forces(x, currents(h(x), v)), load) is rounding, and the point's inputs are those of its command."""
+    make, par, at = MACHINES[name]
+    plant = make(par)
+    point = malta.trim(plant, **at)
+    assert point.v is not None
+    y = np.array(plant.h(ca.DM(point.x), 0)).ravel()
+    assert abs(rate(plant, plant, point.x, y, point.v, loaded=True)).max() < 1e-9
+    made = np.array(plant.forces(ca.DM(point.x), plant.currents(ca.DM(y), ca.DM(point.v)))).ravel()
+    np.testing.assert_allclose(point.u, made, rtol=1e-12, atol=1e-12)
+    exact = name == "inverse"
+    assert np.allclose(point.u, point.v, rtol=1e-9) == exact
+
+
+@pytest.mark.parametrize(
+    ("q", "stiffness", "per_force"),
+    [(0.0, 14667.3, 10.0), (1e-3, 16888.7, 10.9697), (2e-3, 21121.6, 13.1385)],
+)
+def test_the_ball_off_its_middle(q: float, stiffness: float, per_force: float) -> None:
+    """Where k_i i makes another force than is commanded: slopes at the current that carries the weight."""
+    ball = malta.read_design("examples/ball/design/ball.toml").plant
+    model = malta.linearize(ball, malta.trim(ball, q=q))
+    assert model.A[1, 0] == pytest.approx(stiffness, abs=0.06)
+    assert model.B[1, 0] == pytest.approx(per_force, abs=1e-4)
+    assert model.operating_point.u[0] == pytest.approx(0.981, rel=1e-12)
+
+
+def test_a_controller_with_other_parameters_commands_another_force() -> None:
+    """Its current for v is that of its own constants: v = v* C'/C (g0'/g0)^2 makes the machine's weight."""
+    plant = bench(BENCH)
+    believed = bench(replace(BENCH, C=1.2 * BENCH.C, bias=1.5))
+    held = malta.trim(plant)
+    model = malta.linearize(plant, held, believed)
+    assert model.operating_point.v == pytest.approx(held.u * 1.2, rel=1e-10)
+    assert model.operating_point.u == pytest.approx(held.u, rel=1e-10)
+
+
+def test_no_command_is_said_where_the_forces_exist() -> None:
+    """An input would hold the mass, but the currents of no command make one that pushes."""
+    pushed = bench(replace(BENCH, k=20e3))  # at x = -1 mm the spring pushes with 20 N, the weight with 4.9
+    with pytest.raises(malta.CheckError, match=r"no command holds the state x = -0.001 m: x_dot changes at"):
+        malta.trim(pushed, x=-1e-3)
+    with pytest.raises(malta.CheckError, match="no input holds the state x_dot"):
+        malta.trim(pushed, x_dot=0.1)
+
+
+def test_limits_that_bind_are_named() -> None:
+    """Of a force, of a current, and a machine's own `limited`."""
+    with pytest.raises(malta.CheckError, match=r"current i = .* A is limited to 0.1 A"):
+        malta.trim(bench(replace(BENCH, I_max=0.1)), x=-2e-3)
+    heavy = replace(BENCH, m=5.0, I_max=1e3)
+    with pytest.raises(malta.CheckError, match=r"command f = 49.05 N is beyond its limit of 40 N"):
+        malta.trim(bench(heavy))
+    one_way = replace(bench(BENCH), limited=lambda i: ca.fmax(i, 0))
+    with pytest.raises(malta.CheckError, match=r"the current i = -.* A is limited to 0 A"):
+        malta.trim(replace(one_way, load=lambda _: -0.5))
+
+
+def test_a_missing_preload_is_named() -> None:
+    """Currents sqrt(v) have no slope at v = 0."""
+    for kind in ("knows", "middle"):
+        plant = bench(replace(BENCH, preload=0.0, kind=kind))
+        with pytest.raises(
+            malta.CheckError, match=r"no finite slope at the command f = 0 N: .* needs a `preload`"
+        ):
+            malta.linearize(plant, plant.at())
+    pushing = bench(replace(BENCH, preload=-1.0))
+    with pytest.raises(malta.CheckError, match=r"no command makes its `preload` \[-1.0\]"):
+        malta.linearize(pushing, pushing.at())
+
+
+def test_a_command_is_found_from_another_start() -> None:
+    """Where the currents of the wanted force are not defined, shares of the limits are tried."""
+    plant = bench(BENCH)
+    shifted = replace(plant, currents=lambda y, v: plant.currents(y, v - 10))
+    point = malta.trim(shifted, x=1e-3)
+    assert point.v == pytest.approx(malta.trim(plant, x=1e-3).u + 10, rel=1e-9)
+
+
+def test_the_command_of_a_point_is_kept() -> None:
+    """Two commands hold a mass whose force is even in them: a model begins at the point's own."""
+    plant = bench(replace(BENCH, kind="slope", bias=0.0, I_max=40.0))
+    here = malta.trim(plant)
+    assert here.v is not None
+    mirror = OperatingPoint(here.x, here.u, loaded=True, v=-here.v)
+    assert malta.linearize(plant, mirror).B[1, 0] == pytest.approx(
+        -malta.linearize(plant, here).B[1, 0], rel=1e-9
+    )
+    assert commanded(plant, mirror).v == pytest.approx(-here.v, rel=1e-9)
