@@ -47,6 +47,7 @@ SLOW = {
     "malta.report.gang_table",
     "malta.report.load_response",
     "malta.report.loads",
+    "malta.report.open_bounds",
     "malta.report.places_table",
     "malta.report.rare_event_sentence",
     "malta.report.robustness",

@@ -114,6 +114,28 @@ def test_what_cannot_be_enclosed_is_not_proven() -> None:
     assert m.lower is None
     assert m.upper == pytest.approx(2, rel=1e-6)
     assert "if_else" in m.reason
+    assert str(m).startswith(f"nothing proven ({m.reason}), lost at 200.00 %")
+
+
+def test_the_end_of_a_search_is_named() -> None:
+    """A spring that is stable for every stiffness above zero: the margin ends where the stiffness may."""
+
+    def spring(k: Any, d: Any) -> Any:
+        return [[0, 1], [-k, -d]], [[0], [1]], [[1, 0]]
+
+    limits = {"k": (0, math.inf), "d": (0, 7)}
+    system = malta.uncertain(spring, {"k": 4.0, "d": 1.0}, limits=limits)
+    words = {
+        "up to t = 8, where k reaches its limit 0": {"k": (3.5, 4.5), "d": (0.9, 1.1)},
+        "up to t = 6, where d reaches its limit 7": {"k": (3.5, 4.5), "d": (1.0, 2.0)},
+        "up to t = 100": {"k": (4.0, 4.5)},
+    }
+    for searched, box in words.items():
+        m = malta.robust_margin(system, [[0.0]], box)
+        assert m.exhausted
+        assert m.lower is not None
+        assert m.lower == pytest.approx(float(searched.split()[4].strip(",")), rel=2e-4)
+        assert str(m) == f"proven {100 * m.lower:.2f} %; no unstable machine found {searched}"
 
 
 def test_algebraic_equations_are_solved_for_their_states() -> None:

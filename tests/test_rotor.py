@@ -23,6 +23,8 @@ import malta
 from malta import report
 from malta.campaigns.statistics import figures_of
 from malta.margins.extent import NOWHERE, Extent, extent_of, positions_of
+from malta.margins.gain import Gain
+from malta.margins.robust import Margin
 from malta.margins.stages import robustness
 from malta.margins.travel import travel_loops, travel_margin
 from malta.margins.uncertain import instability
@@ -255,6 +257,21 @@ def test_tables_of_a_machine_without_a_travel(
     ):
         assert words in text
     assert "travel" not in text
+    assert not report.open_bounds(found, {})  # nothing was asked
+    lost = Margin(None, 2.0, None, None, {}, {}, (), 0.0, "time was up")
+    ends = Margin(4.0, math.inf, None, None, {}, {}, (), 0.0)
+    unproven = replace(
+        found,
+        chain=(replace(found.chain[0], margin=lost), replace(found.chain[0], name="end", margin=ends)),
+        places=tuple(replace(place, margin=lost) for place in found.places),
+        tolerance={"k_i": (lost, ends)},
+    )
+    assert report.open_bounds(unproven, {"x": Gain(1.0, None, 2.0, {}, 3, 4.0, "why")}) == [
+        f"{found.chain[0].name}, at 0, at 1047, at 2094: nothing proven (time was up), lost at 200.00 %",
+        "end: proven 400.00 %; no unstable machine found",
+        "k_i down: nothing proven (time was up)",
+        "|S| of x: 1 at 2 rad/s, nothing proven (why)",
+    ]
     report.robustness(found, "rotor_pid", box, tmp_path / "margins.png")
     assert (tmp_path / "margins.png").stat().st_size > 10_000
     point = replace(found, extent=NOWHERE, places=found.places[1:2])

@@ -221,6 +221,7 @@ def _print_tables(
     from malta import report
 
     controller, margins, robust = loop.controller, analysis.margins, analysis.robustness
+    open_bounds = report.open_bounds(robust, analysis.worst)
     box = "  ".join(f"{name} +-{100 * share:g} %" for name, share in loop.box.items())
     console = make_console()
     preset = f"{controller.parameters.preset} {' '.join(changes)}".rstrip()
@@ -233,6 +234,7 @@ def _print_tables(
         *([report.recovery_table(analysis.recovered, loop.plant)] if analysis.recovered else []),
         report.Paragraph(f"Uncertainty: {box}\n"),
         report.chain_table(robust),
+        *([report.Paragraph("\n".join(open_bounds) + "\n")] if open_bounds else []),
         report.disk_table(robust, controller.sample_time),
         report.gang_table(robust, loop.plant),
         report.tolerance_table(robust, loop.box, analysis.payload),

@@ -103,11 +103,15 @@ def _margin_text(t: Target, uncertainty: dict[str, float], *, proof: bool) -> st
     margin = rounded_margin(t.controller, uncertainty)
     assert margin is not None
     box = ", ".join(f"{name} +-{100 * share:g} %" for name, share in uncertainty.items())
-    proven = "nothing is proven" if margin.lower is None else f"{100 * margin.lower:.2f} % is proven"
+    proven = (
+        f"nothing is proven ({margin.reason})"
+        if margin.lower is None
+        else f"{100 * margin.lower:.2f} % is proven"
+    )
     lost = (
         f"lost at {100 * margin.upper:.2f} %"
         if math.isfinite(margin.upper)
-        else "lost nowhere that was searched"
+        else f"not lost {margin.searched}"
     )
     return (
         f"With the coefficients that single precision holds, of {box} {proven} for the sampled loop over the whole "

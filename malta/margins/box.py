@@ -48,11 +48,20 @@ class Box:
     frame: Mapping[int, tuple[float, float]] = field(
         default_factory=dict
     )  # by index: an interval around `over`, shared by several boxes
+    ends: tuple[str, float] | None = None  # the parameter that reaches its limit at `most`, and the limit
 
     @property
     def limit(self) -> float:
         """The largest t that a search tries: close to the limit of a parameter, FAR at most."""
         return min(self.most * (1 - EDGE), FAR)
+
+    @property
+    def searched(self) -> str:
+        """How far a search goes, in words."""
+        if self.ends is None or self.most * (1 - EDGE) > FAR:
+            return f"up to t = {FAR:g}"
+        name, limit = self.ends
+        return f"up to t = {self.most:.4g}, where {name} reaches its limit {limit:g}"
 
     def margin(self, p: FloatArray) -> FloatArray:
         """The smallest t with p in box(t): ... -> ..."""
@@ -102,7 +111,7 @@ def box_of(
     by_name(caller, "over", over, '{"k": (1, 2)}')
     k = len(names)
     down, up, fixed = np.zeros(k), np.zeros(k), np.zeros((k, 2))
-    most = math.inf
+    most, ends = math.inf, None
     for name, value in (*ranges.items(), *over.items()):
         if name not in names:
             raise InputError(caller, name, "an unknown parameter", "one of " + " ".join(names))
@@ -118,11 +127,12 @@ def box_of(
             fixed[i] = pair[0] - nominal, pair[1] - nominal
             continue
         down[i], up[i] = nominal - pair[0], pair[1] - nominal
-        for room, rate in ((nominal - low, down[i]), (high - nominal, up[i])):
-            most = min(most, room / rate) if rate > 0 else most
+        for limit, rate in ((low, down[i]), (high, up[i])):
+            if rate > 0 and abs(limit - nominal) / rate < most:
+                most, ends = abs(limit - nominal) / rate, (name, limit)
     if not ranges and not empty:
         raise InputError(caller, "ranges", "no parameters", "at least one uncertain parameter")
-    return Box(names, at, down, up, fixed, most)
+    return Box(names, at, down, up, fixed, most, ends=ends)
 
 
 def _sides(caller: str, name: str, value: Any, nominal: float) -> tuple[float, float]:

@@ -112,7 +112,7 @@ def dynamic_margin(
         lower, reason = _prove(asked, min(t, asked.box.limit), tolerance, until)
     spent, names = clock.monotonic() - begun, box.names
     if lost is None:
-        return Margin(lower, math.inf, None, None, {}, {}, (), spent, reason)
+        return Margin(lower, math.inf, None, None, {}, {}, (), spent, reason, box.searched)
     witness = dict(zip(names, lost.p.tolist(), strict=True))
     moved = dict(zip(names, (lost.p - box.nominal).tolist(), strict=True))
     return Margin(lower, t, lost.frequency, witness, moved, {}, (), spent, reason)

@@ -33,7 +33,7 @@ from malta.margins.dynamic import (
 from malta.margins.enclosure import Unproven
 from malta.margins.peaks import Peak, climb, patterns
 from malta.margins.polydisc import is_zero_free
-from malta.margins.robust import deadline
+from malta.margins.robust import deadline, unproven
 from malta.margins.transfer import performance
 from malta.margins.uncertain import Compensator, UncertainSystem
 from malta.margins.weight import weight_of
@@ -80,7 +80,7 @@ class Gain:
     reason: str = ""
 
     def __str__(self) -> str:
-        high = "nothing proven" if self.upper is None else f"proven below {self.upper:.4g}"
+        high = unproven(self.reason) if self.upper is None else f"proven below {self.upper:.4g}"
         return f"{self.lower:.4g} at {self.frequency:.4g} rad/s, {high}"
 
 

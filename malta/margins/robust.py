@@ -83,6 +83,7 @@ class Margin:
     certificate : cells and directions of the proof, which `malta.margins.check` checks again
     seconds : s, time of the search
     reason : why nothing, or less than asked for, is proven
+    searched : how far no unstable parameters were found, where `upper` is infinite
 
     >>> import malta
     >>> def cubic(k):  # stable from -1 to 8
@@ -101,6 +102,7 @@ class Margin:
     certificate: tuple[Certificate, ...] = field(repr=False)
     seconds: float
     reason: str = ""
+    searched: str = ""
 
     @property
     def time_up(self) -> bool:
@@ -113,11 +115,16 @@ class Margin:
         return math.isinf(self.upper)
 
     def __str__(self) -> str:
-        low = "nothing proven" if self.lower is None else f"proven {100 * self.lower:.2f} %"
+        low = f"proven {100 * self.lower:.2f} %" if self.lower is not None else unproven(self.reason)
         if self.exhausted:
-            return f"{low}: stable as far as was looked, or as the parameters exist"
+            return f"{low}; no unstable machine found {self.searched}".rstrip()
         where = "" if self.frequency is None else f" at {self.frequency:.4g} rad/s"
         return f"{low}, lost at {100 * self.upper:.2f} %{where}"
+
+
+def unproven(reason: str) -> str:
+    """The words for a bound that is not proven."""
+    return f"nothing proven ({reason})" if reason else "nothing proven"
 
 
 TIME_UP = "time w"  # begins reasons of a search that was or would be too long

@@ -328,12 +328,15 @@ class Job:
         if lower >= upper * (1 - self.asked):
             self.reasons.clear()
         names, nominal = self.box.names, self.box.nominal
+        if not (lower > 0 or self.reasons):
+            self.reasons.append("not settled")
         named = None if witness is None else dict(zip(names, witness.tolist(), strict=True))
         moved = {} if witness is None else dict(zip(names, (witness - nominal).tolist(), strict=True))
         return Margin(
             lower if lower > 0 else None, upper, frequency, named, moved,
             {} if self.zero is None or witness is None else contributions(*self.zero, names),
             tuple(proofs), clock.monotonic() - begun, "; ".join(dict.fromkeys(self.reasons)),
+            self.box.searched if math.isinf(upper) else "",
         )  # fmt: skip
 
     def _multiplier_proof(self, s: Structured) -> Certificate:

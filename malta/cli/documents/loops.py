@@ -50,6 +50,7 @@ class MarginPart(Part):
     sensitivity: dict[str, float] = Field(description="share of each parameter in the margin")
     cells: int = Field(description="of the proof")
     reason: str = Field(description="why nothing, or less than found, is proven")
+    searched: str = Field(description="how far no unstable loop was found, where upper is null")
     time_up: bool = Field(description="the search ended as its time was up: more time may prove more")
 
 
@@ -283,6 +284,7 @@ def _margin_fields(margin: Margin) -> dict[str, Any]:
         "sensitivity": dict(margin.sensitivity),
         "cells": sum(proof.cells for proof in margin.certificate),
         "reason": margin.reason,
+        "searched": margin.searched,
         "time_up": margin.time_up,
     }
 

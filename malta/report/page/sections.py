@@ -29,6 +29,7 @@ from malta.report.tables.margins import (
     chain_table,
     disk_table,
     gang_table,
+    open_bounds,
     places_table,
     tolerance_table,
     worst_case_table,
@@ -173,7 +174,9 @@ def _margins(a: Analysis) -> Iterator[Item]:
                 "Margins stage by stage, from full state feedback to the machine's own loop, and the peak sensitivity "
                 "of each stage with the zones of ISO 14839-3.",
             )
-        yield from sheets_of([chain_table(robust), disk_table(robust, c.sample_time)])
+        yield from sheets_of([chain_table(robust)])
+        yield from open_bounds(robust, a.worst)
+        yield from sheets_of([disk_table(robust, c.sample_time)])
         if robust.tolerance:
             yield from sheets_of([tolerance_table(robust, a.subject.box, a.payload)])
         yield from sheets_of([places_table(robust, c.sample_time)])

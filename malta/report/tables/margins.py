@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from rich.table import Table
 
-from malta.margins.robust import NOT_PROVEN
+from malta.margins.robust import NOT_PROVEN, unproven
 from malta.margins.travel import NOT_BETWEEN
 from malta.margins.verify import zone
 from malta.model.signals import axis_units
@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from malta.margins.stages import Robustness
     from malta.model.plant import Plant
     from malta.simulation.payload import Payload
+
+WAYS = ("down", "up")
 
 
 def chain_table(found: Robustness) -> Table:
@@ -76,6 +78,38 @@ def chain_table(found: Robustness) -> Table:
             "",
         )
     return table
+
+
+def open_bounds(found: Robustness, worst: Mapping[str, Gain]) -> list[str]:
+    """Say why a bound is not proven, and where a search ended that found no unstable machine: a line for each.
+
+    found : from `malta.robustness`
+    worst : by sensor, from `malta.worst_case_gain`; may be empty
+
+    >>> import malta
+    >>> spec = malta.read_design("examples/ball/design/ball.toml")
+    >>> controller = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
+    >>> found = malta.robustness(spec.plant, controller, {"m": 0.2})
+    >>> malta.report.open_bounds(found, {})[0].rpartition("; ")[2]
+    'no unstable machine found up to t = 5, where m reaches its limit 0'
+    """
+    margins = [(link.name, link.margin) for link in found.chain]
+    margins += [(_coverage_text(found), found.travel)] if found.extent.intervals else []
+    unit = " mm" if found.extent.stroke else ""
+    margins += [(f"at {_position_text(found.extent, p.position)}{unit}", p.margin) for p in found.places]
+    alone = [
+        (f"{name} {way}", m)
+        for name, both in found.tolerance.items()
+        for way, m in zip(WAYS, both, strict=True)
+    ]
+    alone += [] if found.mass is None else [("mass margin", found.mass)]
+    said = [(name, str(m)) for name, m in margins if m is not NOT_PROVEN and (m.lower is None or m.exhausted)]
+    said += [(name, unproven(m.reason)) for name, m in alone if m.lower is None]
+    said += [(f"|S| of {name}", str(gain)) for name, gain in worst.items() if gain.upper is None]
+    together: dict[str, list[str]] = {}  # margins of loops that do not depend on the place are the same
+    for name, text in said:
+        together.setdefault(text, []).append(name)
+    return [f"{', '.join(names)}: {text}" for text, names in together.items()]
 
 
 def _coverage_text(found: Robustness) -> str:
@@ -339,7 +373,7 @@ def places_table(found: Robustness, Ts: float) -> Table:
         peak = "unstable" if math.isnan(place.peak) else f"{place.peak:.2f} {zone(place.peak)}"
         add_row(
             table,
-            f"{place.position * 1e3:.1f}" if extent.stroke else _position_text(extent, place.position),
+            _position_text(extent, place.position),
             *_margin_cells(place.margin),
             peak,
             "none" if math.isnan(place.disk) else f"{place.disk:.3f}",
@@ -349,7 +383,9 @@ def places_table(found: Robustness, Ts: float) -> Table:
 
 
 def _position_text(extent: Extent, position: float) -> str:
-    """A place along a parameter."""
+    """A place along the travel, mm, or along a parameter."""
+    if extent.stroke:
+        return f"{position * 1e3:.1f}"
     return f"{position:.4g}" if extent.course else "its values"
 
 
