@@ -17,6 +17,7 @@ from malta.margins.expressions import (
     Program,
     exact,
 )
+from malta.margins.time_limit import check_time
 
 LARGEST = 4000  # terms of an expression at most
 
@@ -34,6 +35,7 @@ class Ratio:
         self.num, self.den = num, den
         if len(num) > LARGEST:
             raise TooLarge
+        check_time()
 
     def __add__(self, other: Ratio) -> Ratio:
         if self.den is None and other.den is None:
@@ -108,6 +110,7 @@ class Symbolic:
 
 def value(polynomial: Any, p: Sequence[Any]) -> Any:
     """The value of a polynomial at complex balls."""
+    check_time()
     total = acb(0)
     for monomial, c in polynomial.to_dict().items():
         term = acb(c)

@@ -15,6 +15,7 @@ import numpy as np
 
 from malta.margins.exclusion import Cell, Growth
 from malta.margins.family import Family
+from malta.margins.time_limit import is_late
 from malta.margins.witness import Zero, coefficients_at, rows_and_slopes
 
 if TYPE_CHECKING:
@@ -43,6 +44,8 @@ def nearest(f: Family, g: Growth, branch: int, x: float, u: FloatArray, below: f
     trust, widest, best = 0.5, 1.0, None
     for k in range(MOST if here is not None else 0):
         assert here is not None
+        if is_late():
+            break
         found = _smallest_step(f, g, here, trust)
         if found is None:  # nothing within the trust region solves the equation
             if trust >= widest:

@@ -46,6 +46,7 @@ from malta.margins.robust import (
     law_of,
     problem_of,
 )
+from malta.margins.time_limit import TimeUp, time_limit
 from malta.margins.transfer import mu_bound, transfer
 from malta.margins.uncertain import Compensator, UncertainSystem
 from malta.margins.weight import Expanded, Weight
@@ -172,7 +173,11 @@ class Blocks:
         Raises Unproven when they cannot be enclosed.
         """
         most = [share * b.weight.most for share, b in zip(shares, self.blocks, strict=True)]
-        return parts_of(self.with_blocks, self.blocks, self.box, reach, most, until)
+        try:
+            with time_limit(until):
+                return parts_of(self.with_blocks, self.blocks, self.box, reach, most, until)
+        except TimeUp as error:
+            raise Unproven("time was up before the coefficients were found") from error
 
     def starts(self, t: float, chosen: FloatArray) -> list[FloatArray]:
         """The parameters in box(t) at relative places `chosen` (rows, -1 to 1)."""
@@ -234,7 +239,8 @@ def _loss(asked: Blocks, until: float) -> Peak | None:
     if (box.down + box.up).any():
         high = min(_size(asked, nearest()), asked.box.limit)
         if (asked.problem.instability(np.array(asked.starts(high, every))) >= 0).any():
-            t, w, p = first_loss(asked.problem, box, high)  # by the parameters alone
+            with time_limit(until):
+                t, w, p = first_loss(asked.problem, box, high)  # by the parameters alone
             if p is not None and w is not None:
                 seen.append(Peak(1 / t, w, p))
                 high = t

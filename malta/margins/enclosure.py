@@ -20,6 +20,7 @@ from flint import acb, arb, ctx, fmpq
 from malta.margins.characteristic import pair
 from malta.margins.expressions import NotAnalytic, exact
 from malta.margins.family import Family, family, nodes
+from malta.margins.time_limit import check_time
 
 if TYPE_CHECKING:
     from malta.margins.problem import Polynomial
@@ -195,6 +196,7 @@ def _discs(
     found: list[Disc] = []
     refused = NotAnalytic("no disc about its range")
     for radius in reversed(RADII):  # the largest that there is leaves out the least, mostly
+        check_time()
         balls = []
         for k, (a, b) in enumerate(zip(low, high, strict=True)):
             middle, half = arb((a + b) / 2), arb((b - a) / 2)

@@ -15,6 +15,7 @@ from malta.margins.expressions import NotAnalytic, exact
 from malta.margins.family import Family, narrow
 from malta.margins.parts import Part, cut, merge_twins
 from malta.margins.problem import Polynomial, Problem, hurwitz
+from malta.margins.time_limit import TimeUp, time_limit
 from malta.margins.weak_coupling import HeldLoop
 
 if TYPE_CHECKING:
@@ -35,14 +36,17 @@ def parts_over(problem: Problem, box: Box, reach: float, last: float) -> list[Pa
     Raises Unproven when a matrix has no value on the box, or when time is up.
     """
     sides = box.frame_sides(reach)
-    if isinstance(problem, HeldLoop):
-        return problem.enclose(box, reach)
     parts: list[Part] = []
     try:
-        for polynomial, moves in problem.parts([arb(a).union(arb(b)) for a, b in sides.tolist()]):
-            parts += _parts_of(polynomial, box, sides, moves, last)
+        with time_limit(last):
+            if isinstance(problem, HeldLoop):
+                return problem.enclose(box, reach)
+            for polynomial, moves in problem.parts([arb(a).union(arb(b)) for a, b in sides.tolist()]):
+                parts += _parts_of(polynomial, box, sides, moves, last)
     except NotAnalytic as error:
         raise Unproven(f"the matrices have no value on the box: {error}") from error
+    except TimeUp as error:
+        raise Unproven("time was up before the coefficients were found") from error
     return merge_twins(parts)
 
 

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from malta.margins import taylor
 from malta.margins.expressions import NotAnalytic, Program
 from malta.margins.taylor import Taylor
+from malta.margins.time_limit import check_time
 
 Monomial = tuple[int, ...]
 
@@ -45,9 +46,13 @@ class Evaluation:
         return Laurent({exponents: taylor.constant(1.0, self.count)})
 
     def run(self, program: Program, inputs: Sequence[Value]) -> list[list[tuple[int, int, Value]]]:
-        """The entries (row, column, value) of each matrix. Raises NotAnalytic for expressions without this form."""
+        """The entries (row, column, value) of each matrix.
+
+        Raises NotAnalytic for expressions without this form, TimeUp within a time_limit.
+        """
         cells: list[Value] = []
         for name, target, operands, x in program.steps:
+            check_time()
             if name == "input":
                 cells.append(inputs[target])
             elif name == "const":

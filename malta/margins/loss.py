@@ -11,6 +11,7 @@ import numpy as np
 
 from malta.errors import CheckError
 from malta.margins.expressions import NotAnalytic
+from malta.margins.time_limit import is_late
 
 if TYPE_CHECKING:
     from malta.margins.box import Box
@@ -29,7 +30,8 @@ CORNERS = 64  # of a box that are looked at before its families are made
 def corner_loss(problem: Problem, box: Box, reach: float) -> float | None:
     """The first t up to `reach` at which a corner of the box is unstable, by the poles.
 
-    The estimate comes from above; infinite without a loss. None where the box has more than CORNERS.
+    The estimate comes from above; infinite without a loss. None where the box has more than CORNERS, and where the time
+    is up.
     """
     sides = [
         [rate for rate in (-down, up) if rate] or [0.0]
@@ -41,39 +43,56 @@ def corner_loss(problem: Problem, box: Box, reach: float) -> float | None:
     rays = [(place, corner) for place in box.nominal_places()[:3] for corner in corners]
     low, high = 0.0, reach
     for steps in (np.geomspace(1e-2, 1, 10), *[np.linspace(0, 1, 6)[1:]] * 3):
-        grid = low + (high - low) * steps
-        rows = [place + t * corner for t in grid for place, corner in rays]
-        bad = (_instability(problem, np.array(rows), -math.inf) >= 0).reshape(len(grid), -1)
-        if not bad.any():
+        for t in (low + (high - low) * steps).tolist():
+            if is_late():
+                return None
+            rows = np.array([place + t * corner for place, corner in rays])
+            bad = _instability(problem, rows, -math.inf) >= 0
+            if bad.any():
+                break
+            low = t
+        else:
             return math.inf
-        k = int(bad.any(axis=1).argmax())
-        low, high = (float(grid[k - 1]) if k else low), float(grid[k])
-        rays = [ray for ray, lost in zip(rays, bad[k], strict=True) if lost]
+        high = t
+        rays = [ray for ray, lost in zip(rays, bad, strict=True) if lost]
     return high
 
 
 def first_loss(problem: Problem, box: Box, reach: float) -> Loss:
-    """The first loss of stability along the diagonals of the box, by the poles: t, w (rad/s) and p; else infinity."""
+    """The first loss of stability along the diagonals of the box, by the poles: t, w (rad/s) and p; else infinity.
+
+    The nearest that is found by the time that is up.
+    """
     free = [i for i in range(len(box.names)) if box.down[i] + box.up[i] > 0]
     signs = np.array(list(itertools.islice(itertools.product((-1, 1), repeat=len(free)), 256)))
     best: Loss = (math.inf, None, None)
     for place in box.nominal_places()[:27]:
+        best = _nearer(problem, place, _uphill(problem, box, place), reach, best)
+        best = _improve_corner(problem, box, place, best)
         for sign in signs:
+            if is_late():
+                return best
             d = np.zeros(len(box.names))
             d[free] = np.where(sign > 0, box.up[free], -box.down[free])
-            t = _along(problem, place, d, min(reach, best[0]))
-            if t < best[0]:
-                p = place + t * d
-                best = (t, _critical(problem, p, place), p)
+            best = _nearer(problem, place, d, reach, best)
         best = _improve_corner(problem, box, place, best)
     return best
+
+
+def _nearer(problem: Problem, place: FloatArray, d: FloatArray, reach: float, best: Loss) -> Loss:
+    """The first loss along a direction if it is nearer than the best one, else that one."""
+    t = _along(problem, place, d, min(reach, best[0]))
+    if not t < best[0]:
+        return best
+    p = place + t * d
+    return t, _critical(problem, p, place), p
 
 
 def _improve_corner(problem: Problem, box: Box, place: FloatArray, best: Loss) -> Loss:
     """Move a loss to the corner that the slopes of the worst root point to, as long as t decreases."""
     for _ in range(ROUNDS):
         t, _, p = best
-        if p is None or not np.isfinite(t):
+        if p is None or not np.isfinite(t) or is_late():
             break
         d = _uphill(problem, box, p)
         nearer = _along(problem, place, d, t)
@@ -134,6 +153,8 @@ def _along(problem: Problem, p: FloatArray, d: FloatArray, reach: float) -> floa
     k = int(bad.argmax())
     low, high = (grid[k - 1] if k else 0.0), grid[k]
     for _ in range(40):
+        if is_late():
+            break
         middle = (low + high) / 2
         low, high = (low, middle) if unstable([middle])[0] else (middle, high)
     return float(high)

@@ -18,6 +18,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from scipy import linalg
 
+from malta.margins.time_limit import check_time
+
 if TYPE_CHECKING:
     from malta.model.plant import ComplexArray, FloatArray
 
@@ -27,6 +29,7 @@ SHARE = 0.3  # of the way from the level reached to the one that stands
 FLAT = 0.01  # relative progress below which the level is the best there is
 STEP = 1e-6  # of N, for the slopes of a centre
 SLACK = 1e-6  # what keeps G within thousands of D where nothing else does
+SECONDS = 3e-11  # that a Newton step takes, about, times the cube of its coordinates
 
 
 @dataclass(frozen=True)
@@ -112,6 +115,8 @@ def multiplier(
 
     along : slopes of N along frequency, for the slopes of D and G
     hasty : whether to stop at `first` when its beta is not below `wanted`
+
+    Raises TimeUp within a time_limit.
     """
     scale = units(N, blocks)
     turn = scale[:, None] / scale
@@ -221,6 +226,7 @@ class _Centres:
     def centre(self, x: FloatArray, b: float) -> FloatArray:
         """Newton steps towards the centre for b."""
         for _ in range(INNER):
+            check_time(SECONDS * len(x) ** 3)
             try:
                 inverses = self._inverses(x, b)
                 g = self._gradient(x, b, *inverses)

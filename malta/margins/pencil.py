@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from malta.margins.algebra import TooLarge
 from malta.margins.degrees import clear_denominators
 from malta.margins.expansion import (
     EPS,
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
     from malta.margins.expansion import Table
     from malta.model.plant import FloatArray
 
+TERMS = 20_000  # of all entries, beyond which they are not expanded
 LIFTED = 8  # states up to which the square of a hold has rows of its own
 LESS = 0.05  # largest ratio of bounds with and without these rows for which they are used
 
@@ -62,7 +64,10 @@ class Pencil:
 
 
 class Rows:
-    """The rows of one group of a loop as polynomials in p, from which pencils over boxes are made."""
+    """The rows of one group of a loop as polynomials in p, from which pencils over boxes are made.
+
+    Raises TooLarge for more than TERMS.
+    """
 
     def __init__(self, loop: UncertainLoop, group: Group) -> None:
         s, law = loop.symbolic, loop.law
@@ -70,6 +75,8 @@ class Rows:
         self.loop, self.group, self.count = loop, group, loop.program.inputs
         n, p = len(group.states), self.count
         found, one = clear_denominators(loop, group, s), s.context.constant(1)
+        if sum(len(polynomial) for row in found for polynomial in row.values()) > TERMS:
+            raise TooLarge
         state = {j: k for k, j in enumerate(group.states)}
         self.inputs = sorted({at[1] for row in found for at in row if at is not None and at[0] == "u"})
         u = {j: k for k, j in enumerate(self.inputs)}

@@ -240,13 +240,18 @@ class OfCoefficients:
             found = np.maximum(found, self._common.degrees()[: len(self.names)])
         return tuple(int(d) for d in found)
 
-    def at(self, v: Sequence[Any]) -> list[Any]:
+    def values(self, v: Sequence[Any]) -> list[Any]:
+        """The coefficients as they are given."""
         rational = self.program.rational
         (entries,) = self.program.run(v if rational else [arb(x) for x in v], EXACT if rational else POINTS)
         a: list[Any] = [fmpq(0) if rational else arb(0)] * self.count
-        scale = self._common(*v) if self.exact and self._common is not None else 1
         for i, _, x in entries:
-            a[i] = x * scale
+            a[i] = x
+        return a
+
+    def at(self, v: Sequence[Any]) -> list[Any]:
+        scale = self._common(*v) if self.exact and self._common is not None else 1
+        a = [x * scale for x in self.values(v)]
         return map_bilinear(_about_one(a)) if self.discrete else a
 
     def majorant(self, v: Sequence[Any]) -> list[tuple[float, int]]:
@@ -299,9 +304,7 @@ class OfPolynomial:
         return np.roots(scaled[::-1]) * 2.0**step
 
     def _values(self, v: list[Any]) -> list[Any]:
-        f = self.polynomial
-        plain = OfCoefficients(f.program, f.names, False)
-        return plain.at(v)
+        return self.polynomial.values(v)
 
     def instability(self, rows: FloatArray) -> FloatArray:
         found = []

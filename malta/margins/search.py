@@ -21,8 +21,9 @@ from malta.margins.families import is_nominal_stable, parts_over
 from malta.margins.loss import corner_loss, first_loss
 from malta.margins.parts import Part
 from malta.margins.problem import Problem
-from malta.margins.robust import Certificate, Margin, Progress
+from malta.margins.robust import TIME_UP, Certificate, Margin, Progress
 from malta.margins.structured import Structured, rows_of
+from malta.margins.time_limit import TimeUp, time_limit
 from malta.margins.weak_coupling import HeldLoop
 from malta.margins.witness import Zero, starts
 
@@ -42,6 +43,9 @@ LEVELS = 5  # of these boxes, each half of the next
 # of the time for families, by the number of parameters, the last for MANY
 SHARES = (0.6, 0.6, 0.6, 0.6, 0.4, 0.3)
 MANY = 5  # parameters from which on multipliers come before many cells
+LOOK = 0.2  # share of the time for a first look at the poles of corners
+LOOK_AGAIN = 0.3  # share of what is left for another, or GRACE and LATE of the time beyond its end
+GRACE, LATE = 0.4, 0.1  # s, share
 LAST = 20.0  # s that they may take at the end where cells have proven something
 TURN, TURN_AFTER = 0.5, 4.0  # their share of the time in that turn, and how many times what was spent before
 
@@ -100,7 +104,8 @@ class Job:
         while True:
             spent = clock.monotonic() - begun
             now = clock.monotonic()
-            last = now + 0.3 * (self.end - now)
+            hurried = why.startswith(TIME_UP)  # a smaller box takes as long
+            last = now + (1.0 if hurried else 0.3) * (self.end - now)
             if done or FIRST < reach >= self.limit:
                 last = min(last, now + max(BRIEF, 2 * spent))
             try:
@@ -144,7 +149,9 @@ class Job:
         """
         one = np.count_nonzero(self.box.down) + np.count_nonzero(self.box.up) == 1
         most = self.limit if one else min(self.limit, FIRST)
-        t = corner_loss(self.problem, self.box, most)
+        now = clock.monotonic()
+        with time_limit(now + LOOK * (self.end - now)):
+            t = corner_loss(self.problem, self.box, most)
         return most if t is None else min(most, 1.02 * t)
 
     def _descend(self, part: Part) -> None:
@@ -191,7 +198,9 @@ class Job:
     @cached_property
     def structured(self) -> Structured | None:
         """The proof by multipliers; None for a loop without a pencil of rational functions."""
-        rows = None if self.box.frame else rows_of(self.problem)
+        rows = None
+        with suppress(TimeUp), time_limit(self.until):
+            rows = None if self.box.frame else rows_of(self.problem)
         return None if rows is None else Structured(rows, self.box, self.until, self.most_cells, self._report)
 
     def _multiply(self, target: float, share: float, most: float = math.inf) -> None:
@@ -199,7 +208,8 @@ class Job:
         now = clock.monotonic()
         if self.structured is not None and now < self.until:
             self.structured.until = now + min(share * (self.until - now), most)
-            self.structured.raise_bound(target)
+            with suppress(TimeUp), time_limit(self.structured.until):
+                self.structured.raise_bound(target)
 
     def _report(self, t: float) -> None:
         self.stands = max(self.stands, t)
@@ -286,12 +296,24 @@ class Job:
     def margin(self, begun: float) -> Margin:
         if self.structured is not None:  # families may take all the time there is, and not come to be
             self.until = begun + SHARES[min(self._count, MANY)] * (self.end - begun)
-        parts, reach = self.search()
+        with time_limit(self.until):
+            parts, reach = self.search()
         self.until = self.end
         if not parts:
             return self._by_poles(begun)
-        lower, searches = self.prove(parts, reach)
+        with time_limit(self.end):
+            lower, looked, searches = self._prove_all(parts, reach)
+        upper, frequency, witness = self._loss(looked)
+        if max(lower, self._multiplier_bound()) < min(self.limit, upper * (1 - 2 * self.asked)):
+            most = max(LAST, 0.5 * (clock.monotonic() - self.begun)) if lower > 0 else math.inf
+            self._multiply(min(self.limit, upper * (1 - self.tolerance)), 1.0, most)
+        proofs = [self._certificate(part, s) for part, s in searches]
+        return self._margin(lower, (upper, frequency, witness), proofs, begun)
+
+    def _prove_all(self, parts: list[Part], reach: float) -> tuple[float, float, Searches]:
+        """The proven bound, the box that was looked at, and the searches of the proof."""
         looked = reach
+        lower, searches = self.prove(parts, reach)
         # where the enclosure over the whole box is too wide, those over smaller ones may do
         for _ in range(3):
             reach /= 2
@@ -303,12 +325,7 @@ class Job:
                 continue
             if inner[0] > lower:
                 lower, searches = inner
-        upper, frequency, witness = self._loss(looked)
-        if max(lower, self._multiplier_bound()) < min(self.limit, upper * (1 - 2 * self.asked)):
-            most = max(LAST, 0.5 * (clock.monotonic() - self.begun)) if lower > 0 else math.inf
-            self._multiply(min(self.limit, upper * (1 - self.tolerance)), 1.0, most)
-        proofs = [self._certificate(part, s) for part, s in searches]
-        return self._margin(lower, (upper, frequency, witness), proofs, begun)
+        return lower, looked, searches
 
     def _margin(
         self,
@@ -361,13 +378,18 @@ class Job:
             if loss is not None:
                 return loss
             self.reasons.append("the poles of the loop do not confirm the witness")
-        return (
-            first_loss(self.problem, self.box, self.limit) if reach < self.limit else (math.inf, None, None)
-        )
+        return self._first_loss() if reach < self.limit else (math.inf, None, None)
+
+    def _first_loss(self) -> Loss:
+        """The first loss along the box's diagonals that is found in LOOK_AGAIN of the time left, or a little more."""
+        now = clock.monotonic()
+        longest = max(LOOK_AGAIN * (self.end - now), GRACE + LATE * (self.end - self.begun))
+        with time_limit(now + longest):
+            return first_loss(self.problem, self.box, self.limit)
 
     def _by_poles(self, begun: float) -> Margin:
         """The margin without families: the first loss along the box's diagonals, and a proof by multipliers."""
-        loss = first_loss(self.problem, self.box, self.limit)
+        loss = self._first_loss()
         self.upper = loss[0]
         self._multiply(min(self.limit, self.upper * (1 - self.tolerance)), 1.0)
         return self._margin(0.0, loss, [], begun)

@@ -18,11 +18,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from scipy import linalg
 
+from malta.margins.algebra import TooLarge
 from malta.margins.groups import groups
 from malta.margins.multipliers import Blocks, Multiplier, multiplier
-from malta.margins.pencil import Rows
+from malta.margins.pencil import TERMS, Rows
 from malta.margins.problem import OfLoop, OfSeveral, Problem
 from malta.margins.response import Branch, excludes_zero, response
+from malta.margins.time_limit import check_time
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -35,7 +37,6 @@ NEAR = 0.98  # beta up to which splitting frequency is expected to do
 NARROWEST = 1e-9  # of an interval of frequency, relative; of a part of a box, in sides of box(1)
 LOWEST = 1e-5  # end of the one from zero, relative to the octave that it was cut from
 REMEMBERED = 64  # pencils
-TERMS = 20_000  # of all entries, beyond which they are not expanded
 LARGEST = 40  # rows of a group's pencil, beyond which families of its smaller groups are cheaper
 ROUGH = 0.1  # how close the first beta is to the smallest, relative
 SMALLEST = 1e-6  # of the target: boxes below that are not tried
@@ -114,7 +115,10 @@ class Structured:
         return clock.monotonic() > min(until, self.until) or self.count >= self.most
 
     def raise_bound(self, target: float) -> float:
-        """Prove box(target), or smaller boxes when that takes too long; a further call continues the work."""
+        """Prove box(target), or smaller boxes when that takes too long; a further call continues the work.
+
+        Raises TimeUp within a time_limit.
+        """
         if not self.lower:
             self._order = self._prove_whole(target)
         t, begun = self._next(target), self._open
@@ -174,6 +178,7 @@ class Structured:
         found, near = [], None
         for cell in self.cover(t):
             for part in [cell] if cell.low == 0 else across_frequency(cell):
+                check_time()
                 own = self._branch(part)
                 if own is None:
                     return math.inf, []
@@ -354,6 +359,9 @@ def rows_of(problem: Problem) -> list[Rows] | None:
     loop = problem.loop
     if loop.symbolic is None or not loop.program.rational or (loop.descriptor and loop.sampled):
         return None
-    found = [Rows(loop, group) for group in groups(loop)]
+    try:
+        found = [Rows(loop, group) for group in groups(loop)]
+    except TooLarge:
+        return None
     small = sum(rows.cost for rows in found) <= TERMS and max(rows.size for rows in found) <= LARGEST
     return found if small else None

@@ -7,6 +7,8 @@ axis is proven alone and the coupling of the axes is bounded (weak_coupling.py),
 
 from __future__ import annotations
 
+import math
+import time as clock
 from dataclasses import replace
 from functools import lru_cache
 from typing import TYPE_CHECKING
@@ -26,11 +28,13 @@ from malta.margins.robust import (
     Progress,
     Ranges,
     common_margin,
+    deadline,
     margin_at,
     margin_of,
     problem_of,
     robust_margin,
 )
+from malta.margins.time_limit import TimeUp, time_limit
 from malta.margins.uncertain import Compensator, UncertainSystem, is_commutated, model_of
 from malta.margins.weak_coupling import HeldLoop
 from malta.margins.windings import CurrentLoops
@@ -49,6 +53,8 @@ LONG = 5000  # operations of matrices that are not enclosed over an interval of 
 PLACES = (0.0, 1 / 3, 2 / 3, 1.0)  # shares of the travel, either way
 EACH = 6.0  # s, of the margin at a position for itself
 ENDS = (0.0, 1.0)  # of those, where no interval is enclosed
+AXES = 0.6  # of the time, for the proof of each axis alone
+BRIEFEST = 1e-3  # s, of a search that begins when the time is up
 
 
 @on_one_thread
@@ -78,14 +84,23 @@ def travel_margin(
 
     Example: `travel_margin(plant, controller, {"m": 0.2}).lower`
     """
-    names = tuple(names or ranges)
-    along, over = travel_loops(plant, controller, names, current_loops)
-    alone = plant.has_stroke and not over  # places of the travel, and no other interval
-    if alone and (problem := _anywhere(plant, controller, names, current_loops)) is not None:
-        found = margin_of(problem, _box(along[0][0], ranges), Effort(time=time, progress=progress))
+    names, begun, problem = tuple(names or ranges), clock.monotonic(), None
+    end = deadline(begun, time)
+    try:
+        with time_limit(end):
+            along, over = travel_loops(plant, controller, names, current_loops)
+            if plant.has_stroke and not over:  # places of the travel, and no other interval
+                problem = _anywhere(plant, controller, names, current_loops)
+    except TimeUp:
+        spent, why = clock.monotonic() - begun, "time was up before the model was written out"
+        return Margin(None, math.inf, None, None, {}, {}, (), spent, why)
+    if problem is not None:
+        effort = Effort(time=max(AXES * (end - clock.monotonic()), BRIEFEST), progress=progress)
+        found = margin_of(problem, _box(along[0][0], ranges), effort)
         if found.lower is not None:
             return found
-    found = common_margin(along, ranges, over, time=time, progress=progress)
+    left = max(end - clock.monotonic(), BRIEFEST)
+    found = common_margin(along, ranges, over, time=left, progress=progress)
     if len(along) == 1:
         return found
     here = f"at {len(along)} places of the travel, {NOT_BETWEEN}"

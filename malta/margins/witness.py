@@ -11,6 +11,7 @@ import numpy as np
 from malta.margins.exclusion import Growth
 from malta.margins.family import Family, basis
 from malta.margins.frequency import cover
+from malta.margins.time_limit import is_late
 
 if TYPE_CHECKING:
     from malta.model.plant import ComplexArray, FloatArray
@@ -114,6 +115,8 @@ def starts(f: Family, g: Growth, most: int = 6) -> list[tuple[float, int, float,
     places = [np.array(place) for place in itertools.islice(itertools.product(*fixed), 27)]
     x = np.geomspace(inner[0, 1], inner[-1, 2], STEPS * len(inner)) if len(inner) else np.ones(1)
     for u in places:
+        if is_late():
+            break
         t = linear_distance(f, g, u, 0, x)
         low = np.flatnonzero((t <= np.r_[np.inf, t[:-1]]) & (t <= np.r_[t[1:], np.inf]) & np.isfinite(t))
         for k in low[np.argsort(t[low])][:most]:
@@ -139,6 +142,8 @@ def _corners(f: Family, g: Growth, most: int) -> list[tuple[float, int, float, F
     centre, grows = g.shares(g.nominal), g.grows
     found = []
     for row in signs:
+        if is_late():
+            break
         end = centre.copy()
         end[free] = row
         start = np.where(grows, centre, end)
