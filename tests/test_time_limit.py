@@ -14,8 +14,8 @@ import pytest
 from conftest import ROOT
 
 import malta
+from malta.margins.algebra import symbolic
 from malta.margins.expressions import program
-from malta.margins.groups import symbolic
 from malta.margins.time_limit import TimeUp, check_time, is_late, time_limit
 from malta.margins.travel import travel_margin
 
