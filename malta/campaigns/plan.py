@@ -23,6 +23,7 @@ from malta.campaigns.identity import firmware_sha256, revision_of
 from malta.campaigns.sampling import latin_hypercube, sobol
 from malta.errors import InputError
 from malta.firmware.elementary import Precision
+from malta.gains.contents import uncertainty_of
 from malta.gains.encodings import decode
 from malta.model.data import plant_of
 from malta.model.parameters import differences, shape_parameters, twins_of, units_of, values_of
@@ -133,13 +134,12 @@ def box_of(
 
     Raises InputError where neither names any.
     """
-    robust = decode(Path(gains)).get("verification", {}).get("robust") or {}
-    own = robust.get("uncertainty") or (published or {}).get("position_controller", {}).get("uncertainty")
+    own = uncertainty_of(decode(Path(gains)), published)
     if not own:
         raise InputError(
             gains, "verification.robust", "no uncertain parameters", f"them, or {option} NAME=10%"
         )
-    return {name: float(value) for name, value in own.items()}
+    return own
 
 
 def _check_counts(plan: Plan) -> None:

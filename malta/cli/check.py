@@ -7,25 +7,31 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from malta.cli.assignments import read_uncertainty
 from malta.cli.inputs import read_controller
-from malta.cli.options import AsJson, MachineFile
-from malta.cli.output import make_console, print_document, print_line, print_note, working
+from malta.cli.options import AsJson, MachineFile, Uncertain
+from malta.cli.output import make_console, print_document, print_line, print_note, print_text, working
+from malta.errors import InputError, shorten
 
 if TYPE_CHECKING:
-    from malta.margins.windings import CurrentLoops
-    from malta.synthesis.controller import Controller
+    from malta.cli.documents.others import CheckOutput
+    from malta.margins.check import Verdict
 
 
 def check(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="A certificate that verify wrote.")],
     gains: Annotated[
         Path | None,
-        typer.Option(metavar="GAINS", help="The gain file that it has to be of, to the last digit."),
+        typer.Option(metavar="GAINS", help="The gain file that it has to be of: loops, box and travel."),
     ] = None,
+    uncertain: Uncertain = None,
     machine: MachineFile = None,
     as_json: AsJson = False,
 ) -> None:
     """Check the proof of a margin, in arithmetic with rigorous bounds and without the code that found it.
+
+    With --gains, loops, uncertainty and travel are made anew from the gain file; a certificate that claims less, or
+    something else, does not hold. Without it they are the certificate's own.
 
     \b
     Example:  malta check build/table2.json --gains design/gains/table2.json
@@ -33,46 +39,61 @@ def check(
     from malta.margins.check import check as check_certificate
 
     with working(f"checking {file}"):
-        verdict = check_certificate(file, gains)
-        failures = list(verdict.failures)
-        if gains is not None and not failures and not _matches_gains(file, read_controller(gains, machine)):
-            failures.append(f"the loops are not those of {gains}")
+        box = None if gains is None else _box_of(gains, uncertain, machine)
+        if gains is None and uncertain:
+            raise InputError("--uncertain", "", "no gain file", "--gains GAINS, whose uncertainty it is")
+        verdict = check_certificate(file, gains, uncertain=box)
     if as_json:
-        from malta.cli.documents.others import CheckOutput
-
-        groups, claim = list(verdict.groups), verdict.claim
-        print_document(
-            CheckOutput(file=str(file), holds=not failures, lower=claim, groups=groups, failures=failures)
-        )
+        print_document(_document(file, verdict))
     else:
-        console = make_console()
-        for line in verdict.groups:
-            print_line(console, line)
-        holds = "does not hold" if failures else "holds"
-        share, loops = f"{100 * verdict.claim:.3f} %", _count_loops(file)
-        where = "" if loops == 1 else f" at each of {loops} places, not between them"
-        print_line(console, f"{file}: stable in {share} of the uncertainty{where}: {holds}")
-        for line in failures:
-            print_note(f"{file}: {line}")
-    raise typer.Exit(1 if failures else 0)
+        _print(file, gains, verdict)
+    raise typer.Exit(0 if verdict.ok else 1)
 
 
-def _count_loops(certificate: Path) -> int:
-    """The loops that a certificate is about: one, or the same machine at several places of its travel."""
-    from malta.margins import checked_file
-
-    return len(checked_file.content_of(certificate)["loops"])
-
-
-def _matches_gains(certificate: Path, controller: Controller) -> bool:
-    """Whether a certificate's loops are those of a gain file, with either kind of current loops."""
-    from malta.margins import checked_file
-    from malta.margins.certificate import matches
-    from malta.margins.travel import travel_loops
+def _box_of(gains: Path, uncertain: list[str] | None, machine: Path | None) -> dict[str, float] | None:
+    """The uncertainty that was asked for; None: that of the gain file. It makes the machine's module known."""
     from malta.model.data import plant_of
+    from malta.model.published import published_figures
 
+    controller = read_controller(gains, machine)
+    if not uncertain:
+        return None
     plant = plant_of(controller.parameters)
-    parameters = (entry["name"] for entry in checked_file.content_of(certificate)["parameters"])
-    names = tuple(name for name in parameters if name != plant.stroke)
-    kinds: tuple[CurrentLoops, ...] = ("lag", "pi") if controller.current_loop is not None else ("lag",)
-    return any(matches(certificate, travel_loops(plant, controller, names, kind)[0]) for kind in kinds)
+    return read_uncertainty(gains, uncertain, plant.parameters, published_figures(plant.name))
+
+
+def _print(file: Path, gains: Path | None, verdict: Verdict) -> None:
+    """Print what is claimed, of what and where, and whether it holds."""
+    from malta.report.tables.certificate import claim_share, claim_table, claim_text
+
+    console, stated = make_console(), verdict.stated
+    print_text(console, f"{claim_text(stated)}\n")
+    console.print(claim_table(stated))
+    for line in verdict.groups:
+        print_line(console, line)
+    places = stated.places
+    where = "" if places is None else f" at each of {len(places.at)} places, not between them"
+    holds = "holds" if verdict.ok else "does not hold"
+    share = f"{claim_share(stated)} of the uncertainty"
+    if gains is None:
+        share += " that it states itself, with the box above"
+    print_line(console, f"{file}: stable in {share}{where}: {holds}")
+    if verdict.ok and gains is None:
+        print_line(console, f"{file}: the box is the certificate's own, compared with no gain file (--gains)")
+    for line in verdict.failures:
+        print_note(shorten(f"{file}: {line}"))
+
+
+def _document(file: Path, verdict: Verdict) -> CheckOutput:
+    """The JSON document of a check."""
+    from malta.cli.documents.others import CheckOutput, certified_part
+
+    return CheckOutput(
+        file=str(file),
+        holds=verdict.ok,
+        lower=verdict.claim,
+        compared=verdict.compared,
+        claim=certified_part(verdict.stated),
+        groups=list(verdict.groups),
+        failures=list(verdict.failures),
+    )

@@ -173,11 +173,13 @@ def _analyse(loop: Loop, time: float | None, *, proof: bool, worst_case: bool | 
 
 def _write_certificate(path: Path, loop: Loop, margin: Margin) -> Path:
     """Write the certificate of the margin over the travel."""
+    from malta.gains.certified import origin_of
     from malta.margins import certificate
     from malta.margins.travel import travel_loops
 
     places, over = travel_loops(loop.plant, loop.controller, tuple(loop.box), loop.current_loops)
-    return certificate.write(path, places, loop.box, over, margin, loop.gains)
+    origin = origin_of(loop.gains, loop.plant, loop.controller, loop.current_loops, len(places))
+    return certificate.write(path, places, loop.box, over, margin, origin)
 
 
 def _draw(loop: Loop, analysis: Analysis, folder: Path) -> list[Path]:

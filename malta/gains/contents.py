@@ -303,3 +303,10 @@ def _array(value: list[Any], shape: tuple[int, ...], path: str | Path, field: st
 def _names(signals: tuple[Signal, ...]) -> str:
     """Signals with their units, as a message lists them."""
     return " ".join(f"{s.name} [{s.unit}]" for s in signals) or "nothing"
+
+
+def uncertainty_of(content: Mapping[str, Any], published: Mapping[str, Any] | None) -> dict[str, float]:
+    """The uncertain parameters of a gain file with their shares, else those that the machine's paper names; or none."""
+    robust = content.get("verification", {}).get("robust") or {}
+    own = robust.get("uncertainty") or (published or {}).get("position_controller", {}).get("uncertainty")
+    return {name: float(value) for name, value in (own or {}).items()}

@@ -6,11 +6,10 @@ claim is a little below the lower bound of the margin: the largest of a few shar
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,9 +20,11 @@ from flint import arb, ctx
 from malta.errors import CheckError, InputError
 from malta.files import replace_files
 from malta.margins import checked_file
+from malta.margins.arguments import is_number
 from malta.margins.box import Box, box_of
 from malta.margins.certificate_groups import divides, groups_of, units_of
 from malta.margins.check import BITS, MOST_NODES, balls, bernstein, interpolated, within
+from malta.margins.checked_file import double
 from malta.margins.checked_loop import Polynomial, Refused, expressions, height, split
 from malta.margins.exclusion import Growth, advance, start
 from malta.margins.expressions import FIELD, exact
@@ -53,19 +54,32 @@ RADII = (1.5, 2.0, 3.0, 4.0, 6.0, 8.0, *(2.0**k for k in (4, 5, 6, 8, 10, 14, 20
 Places = Sequence[tuple["UncertainSystem", "Compensator"]]
 
 
+@dataclass(frozen=True)
+class Origin:
+    """The machine and the law that loops are of, as the claim names them."""
+
+    named: checked_file.Origin
+    units: Mapping[str, str]  # SI, of the parameters and of the travel
+    places: checked_file.Places | None  # of the loops, where they are several
+
+
 def write(
     path: str | Path,
     places: Places,
     ranges: Ranges,
     over: Mapping[str, tuple[float, float]] | None,
     margin: Margin,
-    gains: str | Path | None = None,
+    origin: Origin | None = None,
 ) -> Path:
-    """Write the certificate of a margin; places: its loops, one, or one for each place at which it holds.
+    """Write the certificate of a margin.
+
+    places : its loops, one, or one for each place at which it holds
+    ranges, over : the box and the intervals that do not grow, as for `robust_margin`
+    origin : the machine and the law, from `malta.gains.certified.origin_of`; None: matrices of no machine
 
     Raises InputError for loops that certificates do not cover, CheckError when nothing is proven.
     """
-    content = certificate_of(places, ranges, over, margin, gains)
+    content = certificate_of(places, ranges, over, margin, origin)
     replace_files({Path(path): (json.dumps(content, separators=(",", ":")) + "\n").encode()})
     return Path(path)
 
@@ -75,36 +89,85 @@ def certificate_of(
     ranges: Ranges,
     over: Mapping[str, tuple[float, float]] | None,
     margin: Margin,
-    gains: str | Path | None = None,
+    origin: Origin | None = None,
 ) -> dict[str, Any]:
     """The certificate of a margin as a JSON document."""
     if margin.lower is None:
         raise CheckError(f"no certificate: nothing is proven ({margin.reason})")
     system = places[0][0]
-    box = box_of(system.names, system.nominal, system.limits, ranges, over or {})
+    box = _around(box_of(system.names, system.nominal, system.limits, ranges, over or {}), ranges, over or {})
     lower, proven = _prove(places, box, margin.lower)
+    T = proven[0]["sample_time"]
     content: dict[str, Any] = {
         "format": checked_file.FORMAT,
         "version": checked_file.VERSION,
         "malta": version("malta"),
-        "gains": {"name": None, "sha256": None},
-        "lower": lower.hex(),
-        "parameters": [
-            {
-                "name": name,
-                "nominal": box.nominal[i].hex(),
-                "down": box.down[i].hex(),
-                "up": box.up[i].hex(),
-                "over": [x.hex() for x in box.over[i].tolist()],
-            }
-            for i, name in enumerate(box.names)
-        ],
+        "claim": {
+            "lower": lower,
+            **_origin(origin),
+            "sample_time": None if T is None else float.fromhex(T),
+            "parameters": _parameters(box, lower, origin.units if origin else {}),
+        },
         "loops": proven,
     }
-    if gains is not None:
-        found = hashlib.sha256(Path(gains).read_bytes()).hexdigest()
-        content["gains"] = {"name": Path(gains).name, "sha256": found}
     return content | {"sha256": checked_file.digest(content)}
+
+
+def _around(box: Box, ranges: Ranges, over: Mapping[str, tuple[float, float]]) -> Box:
+    """A box of doubles that holds the exact one."""
+    down, up, fixed = box.down.copy(), box.up.copy(), box.over.copy()
+    for name, value in (*ranges.items(), *over.items()):
+        i = box.names.index(name)
+        nominal = exact(box.nominal[i])
+        low, high = (end - nominal for end in sides_of(box.nominal[i], value))
+        if name in over:
+            fixed[i] = _below(low), -_below(-high)
+        else:
+            down[i], up[i] = -_below(low), -_below(-high)
+    return replace(box, down=down, up=up, over=fixed)
+
+
+def sides_of(nominal: float, value: float | Sequence[float]) -> tuple[Any, Any]:
+    """The exact ends of a range about a nominal value: a share of that, or an interval (low, high), SI."""
+    middle = exact(nominal)
+    if not is_number(value):
+        low, high = value  # type: ignore[misc]
+        return exact(low), exact(high)
+    width = abs(middle) * exact(value)
+    return middle - width, middle + width
+
+
+def _origin(origin: Origin | None) -> dict[str, Any]:
+    """What a claim says of machine, law, stage and places."""
+    if origin is None:
+        return dict.fromkeys(("machine", "law", "current_loops", "places"))
+    named, places = origin.named, origin.places
+    return {
+        "machine": {"name": named.machine, "preset": named.preset},
+        "law": {"name": named.law, "sha256": named.sha256},
+        "current_loops": named.current_loops,
+        "places": None
+        if places is None
+        else {"name": places.name, "unit": places.unit, "at": [double(x) for x in places.at]},
+    }
+
+
+def _parameters(box: Box, lower: float, units: Mapping[str, str]) -> list[dict[str, Any]]:
+    """The box of a claim: of each parameter what it is at first, how it grows, and where it is at `lower`."""
+    rows, t = [], exact(lower)
+    for name, *numbers, over in zip(
+        box.names, *(x.tolist() for x in (box.nominal, box.down, box.up, box.over)), strict=True
+    ):
+        nominal, down, up = numbers
+        sides = (
+            exact(nominal) - t * exact(down) + exact(over[0]),
+            exact(nominal) + t * exact(up) + exact(over[1]),
+        )
+        rows.append({
+            "name": name, "unit": units.get(name), "nominal": nominal, "down": down, "up": up, "over": over,
+            "interval": list(checked_file.inside(*sides)),
+        })  # fmt: skip
+    return rows
 
 
 def _prove(places: Places, box: Box, margin: float) -> tuple[float, list[dict[str, Any]]]:
@@ -117,17 +180,15 @@ def _prove(places: Places, box: Box, margin: float) -> tuple[float, list[dict[st
     raise last
 
 
-def matches(path: str | Path, places: Places) -> bool:
-    """Whether a certificate has these loops and nominal values, to the last digit."""
-    content = checked_file.content_of(Path(path))
-    found = content["loops"]
-    own = [_description(loop_of(s, _law(s, law))) for s, law in places]
-    nominal = [float(x).hex() for x in places[0][0].nominal]
-    return (
-        len(found) == len(own)
-        and [p["nominal"] for p in content["parameters"]] == nominal
-        and all({key: one.get(key) for key in two} == two for one, two in zip(found, own, strict=True))
-    )
+def loops_of(places: Places) -> tuple[checked_file.Loop, ...]:
+    """Loops as a certificate has them, without their groups. Raises InputError for those that it cannot have."""
+    found = []
+    for system, law in places:
+        described = _description(loop_of(system, _law(system, law)))
+        states = len(described["compensator"]["A"]) + described["shape"][0]
+        field = checked_file.Field(Path("certificate"), "", described | {"groups": [], "units": [0] * states})
+        found.append(checked_file.loop(field, len(system.names)))
+    return tuple(found)
 
 
 def _law(system: UncertainSystem, law: Any) -> Compensator:
@@ -227,7 +288,7 @@ def _parts(f: Polynomial, box: Box, lower: float) -> list[dict[str, Any]]:
 
 def _below(x: Any) -> float:
     """A double at or below an exact number."""
-    found = _float(x)
+    found = double(x)
     return found if exact(found) <= x else math.nextafter(found, -math.inf)
 
 
@@ -253,7 +314,7 @@ def _enclosed(f: Polynomial, v: list[tuple[Any, Any]], box: Box, lower: float) -
     axes = [replace(axis, kept=k) for axis, k in zip(axes, kept, strict=True)]
     family = _family(*bernstein(values, left, axes), f.moved(balls(v)))
     return {
-        "axes": [[axis.degree, _float(axis.rho).hex(), axis.kept] for axis in axes],
+        "axes": [[axis.degree, double(axis.rho).hex(), axis.kept] for axis in axes],
         "scale": family.scale,
         "cells": _cells(family, v, f.group.inverted, box, lower),
     }
@@ -279,15 +340,11 @@ def _axis(f: Polynomial, v: list[tuple[Any, Any]], i: int, size: list[float]) ->
     return checked_file.Axis(best[1], exact(best[2]), best[1])
 
 
-def _float(x: Any) -> float:
-    return int(x.p) / int(x.q)
-
-
 def _cells(
     family: Family, v: list[tuple[Any, Any]], inverted: Sequence[bool], box: Box, lower: float
 ) -> list[list[Any]]:
     """Cells from which zero is excluded. Raises CheckError."""
-    low, high = (np.array([_float(x) for x in ends]) for ends in zip(*v, strict=True))
+    low, high = (np.array([double(x) for x in ends]) for ends in zip(*v, strict=True))
     growth = Growth(low, high, tuple(inverted), box.nominal, box.down, box.up)
     search = start(family, growth, 2 * lower + 1)
     while not search.finished:

@@ -1,5 +1,7 @@
 """A margin certificate checked: in balls with outward rounding, from the certificate's matrices alone.
 
+Whose matrices and whose box these are, a gain file says, from which the rest of malta rebuilds them (gains/certified).
+
 This file shares no code with the search that found the margin, and trusts no floating-point number. A stable loop
 becomes unstable over a connected box only where its characteristic polynomial a(s; p) has a zero s = jw, w = infinity
 among them. So for every loop and every group of states (`checked_loop`)
@@ -16,14 +18,15 @@ from __future__ import annotations
 import itertools
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from flint import acb, arb, arb_mat, arb_poly, ctx, fmpq, fmpq_mat, fmpq_poly, fmpz_poly
 
-from malta.margins.checked_file import Axis, Document, Part, read
+from malta.errors import InputError
+from malta.margins.checked_file import Axis, Claim, Document, Part, double, inside, read
 from malta.margins.checked_loop import Polynomial, Refused, split
 
 BITS = 256  # of the coefficients; cells need fewer
@@ -35,48 +38,94 @@ Box = Sequence[tuple[Any, Any]]
 
 @dataclass(frozen=True)
 class Verdict:
-    """What a certificate claims, and whether it holds."""
+    """What a certificate claims, and whether it holds.
+
+    ok : whether it does
+    claim : multiple of the uncertainty in which every loop is stable
+    groups : one line for each group of states
+    failures : one sentence for each that does not hold
+    stated : the claim with its box, in exact numbers; of the certificate's own making unless `compared`
+    compared : whether a gain file has this machine, law, stage, box and travel
+    """
 
     ok: bool
-    claim: float  # every p in box(claim) is stable
-    groups: tuple[str, ...]  # one line for each
+    claim: float
+    groups: tuple[str, ...]
     failures: tuple[str, ...]
+    stated: Claim
+    compared: bool
 
 
-def check(path: str | Path, gains: str | Path | None = None, seconds: float = 600.0) -> Verdict:
-    """Whether a certificate holds; with `gains`, whether it is of that gain file.
+def check(
+    path: str | Path,
+    gains: str | Path | None = None,
+    seconds: float = 600.0,
+    uncertain: Mapping[str, float | tuple[float, float]] | None = None,
+) -> Verdict:
+    """Whether a certificate holds; with `gains`, whether what it claims is of that gain file and its box.
 
-    Raises InputError for files that are no certificates.
+    path : of the certificate
+    gains : a gain file, from which loops, box and travel are rebuilt; None: those in the certificate are believed
+    seconds : s, the longest check of the proof
+    uncertain : share or interval (SI) of each parameter that the claim counts in; None: those in the gain file, else
+        those of the machine's paper
+
+    Raises InputError for files that are no certificates or no gain files, and for `uncertain` without `gains`.
     """
-    document, changed = read(Path(path), None if gains is None else Path(gains))
-    claim = float(int(document.lower.p) / int(document.lower.q))
-    if changed:
-        return Verdict(False, claim, (), (changed,))
-    lines, failures, until, before = [], [], time.monotonic() + seconds, ctx.prec
+    document = read(Path(path))
+    stated, refused = document.claim, _contradiction(document)
+    if gains is None and uncertain is not None:
+        raise InputError("check", "uncertain", "no gain file", "the gain file whose uncertainty it is")
+    if not refused and gains is not None:
+        # the one place where the checker asks the rest of malta
+        from malta.gains.certified import disagreement
+
+        refused = disagreement(document, gains, uncertain)
+    lines, failures = ([], [refused]) if refused else _proofs(document, time.monotonic() + seconds)
+    claim, compared = double(stated.lower), gains is not None and not refused
+    return Verdict(not failures, claim, tuple(lines), tuple(failures), stated, compared)
+
+
+def _contradiction(document: Document) -> str:
+    """Where a certificate contradicts itself; empty if it does not."""
+    claim = document.claim
+    if not document.sealed:
+        return "the file was changed after it was written (sha256)"
+    for p in claim.parameters:
+        low, high = inside(*p.sides(claim.lower))
+        if p.interval != (fmpq(*low.as_integer_ratio()), fmpq(*high.as_integer_ratio())):
+            return f"{p.name}: the interval is not the one that is claimed, {low:.7g} .. {high:.7g}"
+    if any(loop.sample_time != claim.sample_time for loop in document.loops):
+        return "the sample time is not that of the loops"
+    return ""
+
+
+def _proofs(document: Document, until: float) -> tuple[list[str], list[str]]:
+    """What was shown of each group, and what was not."""
+    lines: list[str] = []
+    failures, before = [], ctx.prec
     try:
         for k, loop in enumerate(document.loops):
             name = where = f"loop {k + 1}" if len(document.loops) > 1 else "loop"
             try:
                 for n, polynomial in enumerate(split(loop, until)):
                     where = f"{name}, group {n + 1}"
-                    lines.append(f"{where}: {proven(document, polynomial, until)}")
+                    lines.append(f"{where}: {proven(document.claim, polynomial, until)}")
             except (Refused, ArithmeticError) as error:
                 failures.append(f"{where}: {error}")
     finally:
         ctx.prec = before
-    return Verdict(not failures, claim, tuple(lines), tuple(failures))
+    return lines, failures
 
 
-def proven(document: Document, f: Polynomial, until: float) -> str:
+def proven(claim: Claim, f: Polynomial, until: float) -> str:
     """One line of what was shown. Raises Refused."""
-    group, parameters, unit = f.group, document.parameters, (fmpq(0), fmpq(1))
+    group, parameters, unit = f.group, claim.parameters, (fmpq(0), fmpq(1))
     ctx.prec = 2 * BITS
     nominal = [1 / p.nominal if inv else p.nominal for p, inv in zip(parameters, group.inverted, strict=True)]
     if not stable(f.at([arb(x) for x in nominal])):
         raise Refused("the nominal loop is not shown to be stable")
-    t = document.lower
-    wanted = [(p.nominal - t * p.down + p.over[0], p.nominal + t * p.up + p.over[1]) for p in parameters]
-    if not tiled([part.box for part in group.parts], wanted, until):
+    if not tiled([part.box for part in group.parts], [p.sides(claim.lower) for p in parameters], until):
         raise Refused("the parts of the box leave a gap")
     for k, part in enumerate(group.parts):
         ends = [max((c.high for c in part.cells if c.branch == branch), default=fmpq(0)) for branch in (0, 1)]

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,9 +17,10 @@ from flint import fmpq
 
 from malta.errors import InputError
 
-FORMAT, VERSION = "malta margin certificate", 1
+FORMAT, VERSION = "malta margin certificate", 2
 LARGEST = 4_000_000  # bytes of a certificate
-LARGEST_GAINS = 100_000_000  # bytes of its gain file
+STAGES = ("lag", "pi")  # of current loops: first-order lags, or the sampled PI controllers of the gain file
+LONG = 100  # characters of a name
 ARITY = {
     "assign": 1, "neg": 1, "sq": 1, "twice": 1, "inv": 1, "constpow": 1,
     "add": 2, "sub": 2, "mul": 2, "div": 2, "input": 0, "const": 0,
@@ -27,13 +29,50 @@ ARITY = {
 
 @dataclass(frozen=True)
 class Parameter:
-    """p in [nominal - t down, nominal + t up], or in nominal + over whatever t is."""
+    """p in [nominal - t down + over[0], nominal + t up + over[1]], SI; `over` does not grow with the margin t."""
 
     name: str
+    unit: str | None  # None: matrices of no machine
     nominal: Any
     down: Any
     up: Any
     over: tuple[Any, Any]
+    interval: tuple[Any, Any]  # at the claim, as the file has it
+
+    def sides(self, t: Any) -> tuple[Any, Any]:
+        """The ends of the interval at t."""
+        return self.nominal - t * self.down + self.over[0], self.nominal + t * self.up + self.over[1]
+
+
+@dataclass(frozen=True)
+class Origin:
+    """The machine and the law that the loops are said to be of."""
+
+    machine: str
+    preset: str
+    law: str  # name of the design
+    sha256: str  # of the gain file, without what was verified and where it was made
+    current_loops: str  # one of STAGES
+
+
+@dataclass(frozen=True)
+class Places:
+    """Where each loop stands along the travel, which is no parameter then."""
+
+    name: str
+    unit: str
+    at: tuple[Any, ...]
+
+
+@dataclass(frozen=True)
+class Claim:
+    """Every loop is stable for all p in the sides at `lower`."""
+
+    lower: Any
+    origin: Origin | None  # None: of matrices alone
+    sample_time: Any  # s; None: continuous
+    places: Places | None  # None: all loops are of the whole travel, or of no travel
+    parameters: tuple[Parameter, ...]
 
 
 @dataclass(frozen=True)
@@ -109,11 +148,11 @@ class Loop:
 
 @dataclass(frozen=True)
 class Document:
-    """What is claimed: box(lower) is stable, of each loop."""
+    """What is claimed, and of which loops; sha256: what the file says and what it is."""
 
-    parameters: tuple[Parameter, ...]
-    lower: Any
+    claim: Claim
     loops: tuple[Loop, ...]
+    sealed: bool
 
 
 @dataclass(frozen=True)
@@ -144,6 +183,13 @@ class Field:
         if type(self.value) is not int or not low <= self.value <= high:
             raise self.wrong(f"a whole number from {low} to {high}")
         return self.value
+
+    def text(self, longest: int = LONG) -> str:
+        """A name that a terminal can print."""
+        found = self.value
+        if not (isinstance(found, str) and 0 < len(found) <= longest and found.isprintable()):
+            raise self.wrong(f"printable text of 1 to {longest} characters")
+        return found
 
     def truth(self) -> bool:
         if type(self.value) is not bool:
@@ -177,11 +223,54 @@ class Field:
         return tuple(x.whole(0, count - 1) for x in self.items(0, max(count, 1)))
 
 
-def parameter(f: Field) -> Parameter:
-    name, over = f["name"].value, f["over"].pair()
-    if not isinstance(name, str) or len(name) > 100 or not over[0] <= 0 <= over[1]:
-        raise f.wrong("a parameter's name, and a range about its nominal value")
-    return Parameter(name, f["nominal"].number(), f["down"].number(0), f["up"].number(0), over)
+def parameter(f: Field, known: bool) -> Parameter:
+    """A parameter of the box; `known`: of a machine, which gives it a unit."""
+    over = f["over"].pair()
+    if not over[0] <= 0 <= over[1]:
+        raise f["over"].wrong("an interval about zero")
+    if not known and f["unit"].value is not None:
+        raise f["unit"].wrong("null without a machine")
+    unit = f["unit"].text() if known else None
+    grows = (f["down"].number(0), f["up"].number(0))
+    return Parameter(f["name"].text(), unit, f["nominal"].number(), *grows, over, f["interval"].pair())
+
+
+def claim(f: Field, loops: int) -> Claim:
+    """What the certificate claims of so many loops."""
+    machine, law, stage = f["machine"], f["law"], f["current_loops"]
+    origin = None
+    if not machine.value is law.value is stage.value is None:
+        if stage.value not in STAGES:
+            raise stage.wrong(" or ".join(STAGES))
+        seal = law["sha256"].text(64)
+        if len(seal) != 64 or set(seal) - set("0123456789abcdef"):
+            raise law["sha256"].wrong("64 hexadecimal digits")
+        name, preset = machine["name"].text(), machine["preset"].text(200)
+        origin = Origin(name, preset, law["name"].text(), seal, stage.value)
+    T, where, places = f["sample_time"], f["places"], None
+    if where.value is not None:
+        at = tuple(x.number() for x in where["at"].items(loops))
+        places = Places(where["name"].text(), where["unit"].text(), at)
+    parameters = tuple(parameter(x, origin is not None) for x in f["parameters"].items(1, 20))
+    if len({p.name for p in parameters}) < len(parameters):
+        raise f["parameters"].wrong("each parameter once")
+    time = None if T.value is None else T.number(1e-90)
+    return Claim(f["lower"].number(1e-9, 10_000), origin, time, places, parameters)
+
+
+def double(x: Any) -> float:
+    """The double nearest to a rational."""
+    return int(x.p) / int(x.q)
+
+
+def inside(low: Any, high: Any) -> tuple[float, float]:
+    """The doubles next to the ends of an interval of rationals, within it; it holds a double."""
+    first, last = double(low), double(high)
+    if fmpq(*first.as_integer_ratio()) < low:
+        first = math.nextafter(first, math.inf)
+    if fmpq(*last.as_integer_ratio()) > high:
+        last = math.nextafter(last, -math.inf)
+    return first, last
 
 
 def step(f: Field, k: int, inputs: int) -> tuple[str, int, tuple[int, ...], Any]:
@@ -257,25 +346,19 @@ def digest(content: dict[str, object]) -> str:
     return hashlib.sha256(json.dumps(rest, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
 
 
-def _bytes(path: Path, kind: str, largest: int) -> bytes:
-    """The content of a file. Raises InputError for one that is missing or too large, and for pipes and devices."""
+def content_of(path: Path) -> dict[str, Any]:
+    """The JSON of a certificate. Raises InputError for what is none, and for pipes and devices."""
     try:
         if not (path.is_file() or path.is_dir()) and path.exists():
-            raise InputError(path, "", "a pipe or a device", f"a {kind}")
+            raise InputError(path, "", "a pipe or a device", "a certificate")
         size = path.stat().st_size
-        if size > largest:
-            raise InputError(path, "", f"{size} bytes", f"a {kind} of at most {largest}")
-        return path.read_bytes()
-    except OSError as error:
-        raise InputError(path, "", error.strerror or "an unreadable file", f"a {kind}") from error
-
-
-def content_of(path: Path) -> dict[str, Any]:
-    """The JSON of a certificate. Raises InputError for what is none."""
-    try:
-        content = json.loads(_bytes(path, "certificate", LARGEST).decode())
+        if size > LARGEST:
+            raise InputError(path, "", f"{size} bytes", f"a certificate of at most {LARGEST}")
+        content = json.loads(path.read_bytes().decode())
     except InputError:
         raise
+    except OSError as error:
+        raise InputError(path, "", error.strerror or "an unreadable file", "a certificate") from error
     except (ValueError, RecursionError) as error:
         raise InputError(path, "", f"no JSON ({str(error)[:80]})", "a certificate") from error
     f = Field(path, "", content)
@@ -285,22 +368,11 @@ def content_of(path: Path) -> dict[str, Any]:
     return content
 
 
-def read(path: Path, gains: Path | None) -> tuple[Document, str]:
-    """A certificate, and why it is refused before its proof is looked at: empty if it is not.
-
-    Raises InputError for files that cannot be read, and fields that are missing or wrong.
-    """
+def read(path: Path) -> Document:
+    """A certificate. Raises InputError for files that cannot be read, and fields that are missing or wrong."""
     content = content_of(path)
     f = Field(path, "", content)
-    of, refused = f["gains"]["sha256"].value, ""
-    if f["sha256"].value != digest(content):
-        refused = "the file was changed after it was written (sha256)"
-    elif gains is not None:
-        found = hashlib.sha256(_bytes(gains, "gain file", LARGEST_GAINS)).hexdigest()
-        if found != of:
-            refused = f"the certificate is of another gain file than {gains} (sha256)"
-    parameters = tuple(parameter(x) for x in f["parameters"].items(1, 20))
-    lower = f["lower"].number(1e-9, 10_000)
-    return Document(
-        parameters, lower, tuple(loop(x, len(parameters)) for x in f["loops"].items(1, 20))
-    ), refused
+    several = f["loops"].items(1, 20)
+    made = claim(f["claim"], len(several))
+    loops = tuple(loop(x, len(made.parameters)) for x in several)
+    return Document(made, loops, f["sha256"].value == digest(content))

@@ -13,10 +13,36 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
+    from malta.margins.checked_file import Claim
     from malta.report.ledger import Ledger
     from malta.synthesis.spec import Spec
     from malta.tuning.outcomes import Outcome
     from malta.tuning.tune import Tuned
+
+
+class ClaimedParameter(Part):
+    """A parameter of a certificate's box; SI."""
+
+    name: str
+    unit: str | None
+    nominal: float
+    low: float = Field(description="of the interval at `lower`")
+    high: float
+
+
+class CertifiedPart(Part):
+    """What a certificate says that it is of; null where it is of matrices alone."""
+
+    machine: str | None
+    preset: str | None
+    law: str | None
+    law_sha256: str | None
+    current_loops: str | None = Field(description="the stage: lag, or pi")
+    sample_time_s: Number
+    places: list[float] | None = Field(
+        description="along the travel, one for each loop; null: all of the travel"
+    )
+    parameters: list[ClaimedParameter]
 
 
 class CheckOutput(Part):
@@ -27,8 +53,40 @@ class CheckOutput(Part):
     file: str
     holds: bool
     lower: Number = Field(description="what the certificate claims, in multiples of the uncertainty")
+    compared: bool = Field(
+        description="a gain file has this machine, law, uncertainty and travel; false: they are the certificate's own"
+    )
+    claim: CertifiedPart
     groups: list[str]
     failures: list[str]
+
+
+def certified_part(claim: Claim) -> CertifiedPart:
+    """What a certificate says that it is of."""
+    from malta.margins.checked_file import double
+
+    o, places, T = claim.origin, claim.places, claim.sample_time
+    names = None if o is None else (o.machine, o.preset, o.law, o.sha256, o.current_loops)
+    machine, preset, law, sha256, stage = names or (None,) * 5
+    return CertifiedPart(
+        machine=machine,
+        preset=preset,
+        law=law,
+        law_sha256=sha256,
+        current_loops=stage,
+        sample_time_s=None if T is None else double(T),
+        places=None if places is None else [double(x) for x in places.at],
+        parameters=[
+            ClaimedParameter(
+                name=p.name,
+                unit=p.unit,
+                nominal=double(p.nominal),
+                low=double(p.interval[0]),
+                high=double(p.interval[1]),
+            )
+            for p in claim.parameters
+        ],
+    )
 
 
 class RequirementPart(Part):

@@ -1,0 +1,190 @@
+"""What a certificate claims beside what a gain file says: machine, law, stage, box, travel and loops.
+
+The checker of the proof (margins/check.py) imports nothing that found it. Whose loop it is has to come from the gain
+file, through the machine's model, which is what is proven: this module rebuilds that, with the code of `malta verify`.
+Boxes are compared as exact numbers, loops to the last digit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+
+from malta.errors import CheckError, InputError
+from malta.files import locate
+from malta.gains.agreement import APART
+from malta.gains.contents import uncertainty_of
+from malta.gains.encodings import content_sha256
+from malta.gains.file import content_of, read
+from malta.margins.box import box_of
+from malta.margins.certificate import Origin, loops_of, sides_of
+from malta.margins.checked_file import Claim, Document, Loop, Parameter, Places, double
+from malta.margins.checked_file import Origin as Named
+from malta.margins.expressions import NotAnalytic, exact
+from malta.margins.extent import extent_of
+from malta.margins.travel import ENDS, travel_loops
+from malta.model.data import plant_of
+from malta.model.parameters import units_of
+from malta.model.published import published_figures
+
+if TYPE_CHECKING:
+    from malta.margins.loops import CurrentLoops
+    from malta.margins.robust import Ranges
+    from malta.model.plant import Plant
+    from malta.synthesis.controller import Controller
+
+
+def origin_of(
+    gains: str | Path, plant: Plant, controller: Controller, current_loops: CurrentLoops, loops: int
+) -> Origin:
+    """The machine and the law that a certificate names.
+
+    gains : the file of the controller
+    plant : the machine, which may differ from the one in the file
+    current_loops : the stage; "lag" where the file has no PI current loops
+    loops : how many; several are those of places along the travel
+
+    Raises InputError for a file that is none.
+    """
+    content = content_of(locate(Path(gains)))[1]
+    law = {key: value for key, value in content.items() if key not in APART}
+    stage = current_loops if controller.current_loop is not None else "lag"
+    preset = plant.parameters.preset
+    named = Named(plant.name, preset, controller.name, content_sha256(law), stage)
+    units = units_of(plant.parameters) | ({plant.stroke: "m"} if plant.has_stroke else {})
+    at = tuple(exact(share * plant.travel) for share in ENDS)
+    return Origin(named, units, Places(plant.stroke, "m", at) if loops > 1 else None)
+
+
+def disagreement(
+    document: Document, gains: str | Path, uncertain: Mapping[str, float | tuple[float, float]] | None = None
+) -> str:
+    """Where a certificate claims less than the uncertainty and the travel of a gain file, or something else.
+
+    uncertain : share or interval (SI) of each parameter; None: those in the gain file, else in the machine's paper
+
+    Returns one sentence, empty where the claim covers those of the gain file.
+
+    Raises InputError for a file that is none, for one without uncertain parameters, and for unknown ones.
+    """
+    claim, path = document.claim, locate(Path(gains))
+    controller, content = read(path), content_of(path)[1]
+    plant = plant_of(controller.parameters)
+    ranges = uncertain
+    if ranges is None:
+        ranges = uncertainty_of(content, published_figures(plant.name))
+        if not ranges:
+            raise InputError(path, "verification.robust", "no uncertain parameters", "them, or `uncertain`")
+    if claim.origin is None:
+        return f"it is of matrices alone and names no machine, expected that of {gains}"
+    stage = cast("CurrentLoops", claim.origin.current_loops)
+    own = origin_of(path, plant, controller, stage, len(document.loops))
+    return (
+        _of_another(claim, own, controller, str(gains))
+        or _of_other_values(claim, plant, own.units, str(gains))
+        or _less(claim, plant, ranges, own, str(gains))
+        or _of_other_loops(document, plant, controller, stage, str(gains))
+    )
+
+
+def _of_another(claim: Claim, own: Origin, controller: Controller, gains: str) -> str:
+    """Whether machine, law, stage, sample time or places are those of the gain file."""
+    assert claim.origin is not None
+    found, wanted = claim.origin, own.named
+    for what, one, two in (
+        ("machine", found.machine, wanted.machine),
+        ("preset of the machine", found.preset, wanted.preset),
+        ("law", found.law, wanted.law),
+        ("sha256 of the law", found.sha256, wanted.sha256),
+        ("stage of current loops", found.current_loops, wanted.current_loops),
+        ("sample time", claim.sample_time, exact(controller.sample_time)),
+        ("place of each loop", _places_text(claim.places), _places_text(own.places)),
+    ):
+        if one != two:
+            a, b = (x if isinstance(x, str) else f"{double(x):.12g} s" for x in (one, two))
+            return f"the {what} is {a}, that of {gains} is {b}"
+    return ""
+
+
+def _places_text(places: Places | None) -> str:
+    if places is None:
+        return "none"
+    return f"{places.name} = {', '.join(repr(double(x)) for x in places.at)} {places.unit}"
+
+
+def _of_other_values(claim: Claim, plant: Plant, units: Mapping[str, str], gains: str) -> str:
+    """Whether each parameter is one of the machine, in its unit and about its value."""
+    for p in claim.parameters:
+        if p.name not in units or (p.name == plant.stroke and claim.places is not None):
+            return f"{p.name} is no parameter of the loop of {gains}"
+        if p.unit != units[p.name]:
+            return f"the unit of {p.name} is {p.unit}, that of {gains} is {units[p.name]}"
+        nominal = _nominal(plant, p.name)
+        if p.nominal != exact(nominal):
+            return f"the nominal {p.name} is {double(p.nominal)!r} {p.unit}, that of {gains} is {nominal!r}"
+    return ""
+
+
+def _less(claim: Claim, plant: Plant, ranges: Ranges, own: Origin, gains: str) -> str:
+    """Whether the box at `lower` covers the uncertainty that many times, and the travel."""
+    names = tuple(name for name in units_of(plant.parameters))
+    extent = extent_of(plant, ranges)
+    nominal = np.array([_nominal(plant, name) for name in names])
+    box_of(names, nominal, (), ranges, extent.over, caller="check")  # which says what is wrong with a range
+    given: dict[str, Parameter] = {p.name: p for p in claim.parameters}
+    intervals = dict(extent.over) if own.places else extent.intervals
+    for name, value in (*ranges.items(), *intervals.items()):
+        low, high = sides_of(_nominal(plant, name), value)
+        at = f"at {100 * double(claim.lower):.7g} % of the uncertainty"
+        if name not in intervals:
+            middle = exact(_nominal(plant, name))
+            low, high = middle - claim.lower * (middle - low), middle + claim.lower * (high - middle)
+        if name not in given:
+            return (
+                f"{name} is not among its parameters, and {gains} has it from {_ends(low, high, own, name)}"
+            )
+        first, last = given[name].sides(claim.lower)
+        if not (first <= low and high <= last):
+            what = "travel" if name == plant.stroke else "box"
+            found, wanted = _ends(first, last, own, name), _ends(low, high, own, name)
+            return f"its {what} is too small: {name} from {found} {at}, that of {gains} from {wanted}"
+    return ""
+
+
+def _ends(low: Any, high: Any, own: Origin, name: str) -> str:
+    return f"{double(low):.7g} to {double(high):.7g} {own.units[name]}".removesuffix(" 1")
+
+
+def _of_other_loops(
+    document: Document, plant: Plant, controller: Controller, stage: CurrentLoops, gains: str
+) -> str:
+    """Whether the loops are those that the gain file's law closes on its machine, to the last digit."""
+    claim = document.claim
+    still = {p.name for p in claim.parameters if not (p.down or p.up)}
+    along = {plant.stroke, *(name for name in plant.over if name in still)}
+    names = tuple(p.name for p in claim.parameters if p.name not in along)
+    try:
+        places, _ = travel_loops(plant, controller, names, stage)
+        if tuple(p.name for p in claim.parameters) != places[0][0].names:
+            return f"its parameters are not {' '.join(places[0][0].names)}, as in the loop of {gains}"
+        wanted = loops_of(places)
+    except (InputError, CheckError, NotAnalytic) as error:
+        return f"no such loop can be made of {gains} ({error})"
+    found = tuple(_bare(loop) for loop in document.loops)
+    if len(found) != len(wanted):
+        return f"its loops are {len(found)}, those of {gains} are {len(wanted)}"
+    return "" if found == tuple(_bare(loop) for loop in wanted) else f"the loops are not those of {gains}"
+
+
+def _bare(loop: Loop) -> Loop:
+    """A loop without what is chosen for its proof."""
+    return replace(loop, units=(), groups=())
+
+
+def _nominal(plant: Plant, name: str) -> float:
+    """The value of a parameter of the machine, SI; 0 for the position along the travel."""
+    return 0.0 if name == plant.stroke else float(getattr(plant.parameters, name))
