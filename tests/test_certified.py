@@ -21,8 +21,8 @@ from malta.errors import InputError
 from malta.gains.certified import origin_of
 from malta.margins import certificate, checked_file
 from malta.margins.check import Verdict, check
-from malta.margins.loops import CurrentLoops
 from malta.margins.travel import travel_loops
+from malta.margins.windings import CurrentLoops
 from malta.report.tables.certificate import claim_share
 
 ROOT = Path(__file__).parents[1]

@@ -26,14 +26,16 @@ from malta.margins.checked_file import Claim, Document, Loop, Parameter, Places,
 from malta.margins.checked_file import Origin as Named
 from malta.margins.expressions import NotAnalytic, exact
 from malta.margins.extent import extent_of
+from malta.margins.loops import LAST
 from malta.margins.travel import ENDS, travel_loops
+from malta.margins.windings import chosen_loops
 from malta.model.data import plant_of
 from malta.model.parameters import units_of
 from malta.model.published import published_figures
 
 if TYPE_CHECKING:
-    from malta.margins.loops import CurrentLoops
     from malta.margins.robust import Ranges
+    from malta.margins.windings import CurrentLoops
     from malta.model.plant import Plant
     from malta.synthesis.controller import Controller
 
@@ -45,14 +47,14 @@ def origin_of(
 
     gains : the file of the controller
     plant : the machine, which may differ from the one in the file
-    current_loops : the stage; "lag" where the file has no PI current loops
+    current_loops : the stage, see `chosen_loops`
     loops : how many; several are those of places along the travel
 
     Raises InputError for a file that is none.
     """
     content = content_of(locate(Path(gains)))[1]
     law = {key: value for key, value in content.items() if key not in APART}
-    stage = current_loops if controller.current_loop is not None else "lag"
+    stage = chosen_loops(plant, controller, current_loops)
     preset = plant.parameters.preset
     named = Named(plant.name, preset, controller.name, content_sha256(law), stage)
     units = units_of(plant.parameters) | ({plant.stroke: "m"} if plant.has_stroke else {})
@@ -82,7 +84,7 @@ def disagreement(
     if claim.origin is None:
         return f"it is of matrices alone and names no machine, expected that of {gains}"
     stage = cast("CurrentLoops", claim.origin.current_loops)
-    own = origin_of(path, plant, controller, stage, len(document.loops))
+    own = origin_of(path, plant, controller, LAST, len(document.loops))
     return (
         _of_another(claim, own, controller, str(gains))
         or _of_other_values(claim, plant, own.units, str(gains))

@@ -114,7 +114,12 @@ def axis_map(plant: Plant, point: OperatingPoint) -> FloatArray:
     """M: the slope of the commanded axis currents by the commanded forces, axes x forces."""
     v = ca.SX.sym("v", len(plant.inputs))
     axes = plant.drive.command(plant.currents(plant.h(ca.SX(point.x), 0), v))
-    return np.array(ca.Function("M", [v], [ca.densify(ca.jacobian(axes, v))])(point.u))
+    return np.array(ca.Function("M", [v], [ca.densify(ca.jacobian(axes, v))])(_command(point)))
+
+
+def _command(point: OperatingPoint) -> FloatArray:
+    """The forces that are commanded at an operating point."""
+    return point.u if point.v is None else point.v
 
 
 def emf_slope(plant: Plant, x: FloatArray) -> FloatArray:
@@ -279,7 +284,7 @@ def link_at_rest(plant: Plant, k: Windings, point: OperatingPoint, M: FloatArray
     """The link of a machine that holds its loads; None where no current flows, and the link has no part in the loop."""
     drive, R = plant.drive, plant.actuator.R
     y = plant.h(ca.DM(point.x), 0)
-    i = np.array(ca.DM(drive.command(plant.currents(y, ca.DM(point.u))))).ravel()
+    i = np.array(ca.DM(drive.command(plant.currents(y, ca.DM(_command(point)))))).ravel()
     u, weight = R * i, np.array(drive.weight)
     power, Rs, V0 = float(weight @ (u * i)), drive.supply_resistance, drive.link_voltage
     if power == 0:
