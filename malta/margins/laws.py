@@ -45,7 +45,7 @@ def sampled_law(
     if slope is not None:
         law = with_slope(law, slope)
     if control is not None:
-        law = with_estimated_emf(law, control)
+        law = with_estimated_emf(law, control.emf)
     n, m = len(controller.states), len(controller.forces)
     half = plant_of(controller.parameters).coordinates
     p = len(controller.measurements) if controller.integrating else 0

@@ -192,7 +192,7 @@ def _driven(
     Ad, Bd = sample_driven((A, B, phi), control.loop, windings.R, Ts, delay, share)
     if forces_alone or not len(control.emf[0]):
         return A, Ad, Bd[:, :m], forecast_as_forces(law, control, Ts)
-    return A, Ad, Bd, with_estimated_emf(law, control)
+    return A, Ad, Bd, with_estimated_emf(law, control.emf)
 
 
 def _stored_readings(

@@ -128,17 +128,20 @@ def emf_slope(plant: Plant, x: FloatArray) -> FloatArray:
     return np.array(ca.Function("E", [z], [ca.densify(ca.jacobian(plant.drive.emf(z), z))])(x))
 
 
+def estimated_rows(slope: FloatArray, L: FloatArray, Cd: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """slope x_hat of xi_pred and of y, x_hat = xi_pred + L (y - Cd xi_pred): slope is of the first states."""
+    n = slope.shape[1]
+    return slope @ (np.eye(len(L))[:n] - L[:n] @ Cd), slope @ L[:n]
+
+
 def _estimated(
     c: Controller, believed: Plant, slope: FloatArray, x: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """slope x_hat of the law's states (xi_pred, e) and of y: x_hat = xi_pred + L (y - Cd xi_pred)."""
+    """slope x_hat of the law's states and of y."""
     if not slope.any():
         return np.zeros((0, 0)), np.zeros((0, 0))
     if c.tracks == "states":
-        n = len(c.A)
-        own = slope @ (np.eye(len(c.Ad))[:n] - c.L[:n] @ c.Cd)
-        sums = np.zeros((len(slope), len(c.measurements) * c.integrating))
-        return np.hstack([own, sums]), slope @ c.L[:n]
+        return estimated_rows(slope, c.L, c.Cd)
     y = ca.SX.sym("y", len(c.measurements))
     here = np.array(ca.DM(believed.h(ca.DM(x), 0))).ravel()
     q = believed.position_of(y)
@@ -167,9 +170,9 @@ def with_windings(plant: Plant, k: Windings, x: Any, A: Any, B: Any, C: Any) -> 
     )
 
 
-def with_estimated_emf(law: LinearLaw, k: CurrentControl) -> LinearLaw:
-    """The law with M^+ emf(x_hat) as further outputs."""
-    C, D = k.emf
+def with_estimated_emf(law: LinearLaw, emf: tuple[FloatArray, FloatArray]) -> LinearLaw:
+    """The law with M^+ emf(x_hat) as further outputs: rows of its first states and of y."""
+    C, D = emf
     C = np.hstack([C, np.zeros((len(C), len(law.A) - C.shape[1]))]) if len(C) else np.zeros((0, len(law.A)))
     D = D if len(D) else np.zeros((0, law.D_y.shape[1]))
     return law._replace(
@@ -185,7 +188,7 @@ def forecast_as_forces(law: LinearLaw, k: CurrentControl, Ts: float) -> LinearLa
     The controllers make u of forces by Kp + Ki Ts z / (z - 1) = (gain z - Kp) / (z - 1), so that a voltage e takes
     forces of (z - 1) / (gain z - Kp) e. The zero of the controllers becomes a pole of the law, which it cancels.
     """
-    both, m, gain = with_estimated_emf(law, k), len(law.C), k.loop.Kp + k.loop.Ki * Ts
+    both, m, gain = with_estimated_emf(law, k.emf), len(law.C), k.loop.Kp + k.loop.Ki * Ts
     C_e, D_e, a = both.C[m:] / gain, both.D_y[m:] / gain, k.loop.Kp / gain
     rows = np.flatnonzero(np.hstack([C_e, D_e]).any(axis=1))
     C_e, D_e, into = C_e[rows], D_e[rows], np.eye(m)[:, rows]

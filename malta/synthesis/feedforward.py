@@ -41,10 +41,6 @@ def machine_part(
     position_feedforward : feed forward the forces that hold the machine at its reference
     """
     plant, actuator = model.plant, model.plant.actuator
-    loop = None
-    if math.isfinite(actuator.crossover):
-        dead_time = actuator.loop_delay if current_loop_delay else 0.0
-        loop = CurrentLoop(*pi_current_loop(actuator, dead_time), actuator.sample_time)
     coils = len(actuator.coils)
     forward = feedforward(model, Ts, delay)
     if position_feedforward:
@@ -61,13 +57,24 @@ def machine_part(
         "B": model.B,
         "C": model.C,
         "feedforward": forward,
-        "current_loop": loop,
+        "current_loop": current_loop_of(actuator, current_loop_delay=current_loop_delay),
         "limits": Limits(
             current=np.full(coils, actuator.current_limit),
             voltage=np.full(coils, actuator.voltage_limit),
             force=np.array(actuator.force_limit),
         ),
     }
+
+
+def current_loop_of(actuator: Actuator, *, current_loop_delay: bool) -> CurrentLoop | None:
+    """The current controllers of a machine; None where currents follow their commands at once.
+
+    current_loop_delay : whether they are designed with the machine's dead time
+    """
+    if not math.isfinite(actuator.crossover):
+        return None
+    dead_time = actuator.loop_delay if current_loop_delay else 0.0
+    return CurrentLoop(*pi_current_loop(actuator, dead_time), actuator.sample_time)
 
 
 def pi_current_loop(actuator: Actuator, delay: float = 0.0) -> tuple[float, float]:

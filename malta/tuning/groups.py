@@ -17,6 +17,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import casadi as ca
 import numpy as np
 from scipy import sparse
 
@@ -24,11 +25,20 @@ from malta.errors import CheckError, InputError
 from malta.margins.loops import disturbance_map, push_through
 from malta.margins.plants import of_plant
 from malta.margins.responses import crossing
+from malta.margins.windings import (
+    Windings,
+    emf_slope,
+    estimated_rows,
+    sample_driven,
+    windings_of,
+    with_estimated_emf,
+    with_windings,
+)
 from malta.model.equilibrium import trim
 from malta.model.linearize import linearize
 from malta.model.plant import position_in
 from malta.synthesis.controller import linear_law_of
-from malta.synthesis.feedforward import holding_gain, static_feedforward
+from malta.synthesis.feedforward import current_loop_of, holding_gain, static_feedforward
 from malta.synthesis.lqg import gains
 from malta.synthesis.requirements import Noise, TrialLoop, requirements_for
 from malta.synthesis.riccati import add_lags, delay_inputs, sample
@@ -41,7 +51,7 @@ from malta.tuning.noise import covariance, noise_variance
 if TYPE_CHECKING:
     from malta.model.linearize import LinearModel
     from malta.model.plant import ComplexArray, FloatArray, Plant
-    from malta.synthesis.controller import LinearLaw
+    from malta.synthesis.controller import CurrentLoop, LinearLaw
     from malta.synthesis.requirements import Requirement
     from malta.synthesis.sampled import Gains
     from malta.synthesis.step_response import StepResponse
@@ -58,6 +68,14 @@ class Part(NamedTuple):
     def E(self) -> FloatArray:
         """Nothing is held between samples here: `groups_of` refuses other machines."""
         return np.zeros((len(self.A), len(self.C)))
+
+
+class Driven(NamedTuple):
+    """The windings of a machine and the current controllers that drive them."""
+
+    windings: Windings
+    loop: CurrentLoop
+    induced: FloatArray  # M^+ emf(x): inputs x states
 
 
 class Place(NamedTuple):
@@ -79,6 +97,9 @@ class Group:
     model: Part
     nominal: SampledMachine  # with its loads, at their trim
     slope: FloatArray  # of v0(z), which acts against them: inputs x outputs
+    forecast: (
+        FloatArray  # of induced voltages, which current controllers take off: inputs x states; or nothing
+    )
     corners: SampledMachine | None  # levels x corners
     w: FloatArray  # rad/s
     response: ComplexArray  # of the nominal machine at w
@@ -95,7 +116,8 @@ class Group:
     def picture(self) -> tuple[Any, ...]:
         """Equal for mirror images: nothing here depends on the signs of coordinates."""
         parts = (np.abs(M).round(12) for M in self.model)
-        return (*(M.tobytes() for M in parts), self.variance.tobytes(), self.role)
+        forecast = np.abs(self.forecast).round(12).tobytes()
+        return (*(M.tobytes() for M in parts), self.variance.tobytes(), forecast, self.role)
 
     def part(self, w: Weights) -> Weights:
         """Pick the weights of the group's states, inputs and outputs."""
@@ -132,13 +154,17 @@ def groups_of(spec: Spec) -> list[Group]:
     slope = _slope(plant, position)
     names = tuple(spec.uncertainty)
     proven = "margin" in spec.specification
-    systems = [of_plant(plant, names, at=place) for place in positions] if proven else []
+    driven = _driven(spec)
+    windings = None if driven is None else driven.windings
+    systems = [of_plant(plant, names, at=place, windings=windings) for place in positions] if proven else []
     trims = _loaded_places(spec)
+    held = _with_windings(spec, driven, Part(loaded.A, model.B, model.C))
     found = []
     for i, j, o in _components(spec, positions):
         part = Part(model.A[np.ix_(i, i)], model.B[np.ix_(i, j)], model.C[np.ix_(o, i)])
-        nominal = _sample(spec, Part(loaded.A[np.ix_(i, i)], part.B, part.C))
-        places = tuple(_place(spec, *at, i, j, o) for at in trims)
+        forecast = np.zeros((0, 0)) if driven is None else driven.induced[np.ix_(j, i)]
+        nominal = _sample(spec, driven, _cut(spec, driven, held, (i, j, o)), forecast)
+        places = tuple(_place(spec, driven, *at, (i, j, o), forecast) for at in trims)
         w = _frequencies(spec.sample_time)
         lag = np.exp(1j * w * spec.sample_time)[:, None, None] * np.eye(len(nominal.Ad)) - nominal.Ad
         found.append(
@@ -149,7 +175,8 @@ def groups_of(spec: Spec) -> list[Group]:
                 part,
                 nominal,
                 slope[np.ix_(j, o)],
-                _corners(spec, systems, i, j, o) if systems else None,
+                forecast if forecast.any() else np.zeros((0, 0)),
+                _corners(spec, driven, systems, (i, j, o), forecast) if systems else None,
                 w,
                 np.asarray(nominal.Cd @ np.linalg.solve(lag, nominal.Bd)),
                 noise_variance(plant)[o],
@@ -223,10 +250,46 @@ def _loaded_places(spec: Spec) -> list[tuple[LinearModel, FloatArray]]:
     return [(linearize(plant, trim(plant, **at)), _slope(plant, at.get(plant.stroke, 0.0))) for at in along]
 
 
-def _place(spec: Spec, model: LinearModel, slope: FloatArray, i: Any, j: Any, o: Any) -> Place:
+def _driven(spec: Spec) -> Driven | None:
+    """The windings of a machine that current controllers drive, as in its own loop; None for lagging currents."""
+    plant = spec.plant
+    loop = current_loop_of(plant.actuator, current_loop_delay=spec.current_loop_delay)
+    if plant.windings is None or loop is None:
+        return None
+    point = plant.at(**spec.operating_point)
+    windings = windings_of(plant, plant, point, np.eye(len(plant.inputs)))
+    return Driven(windings, loop, windings.axes @ emf_slope(plant, point.x)[:, list(plant.controlled)])
+
+
+def _with_windings(spec: Spec, driven: Driven | None, whole: Part) -> Part:
+    """The machine with its windings between samples; unchanged for lagging currents."""
+    if driven is None:
+        return whole
+    x = spec.plant.at(**spec.operating_point).x
+    return Part(*(np.array(ca.DM(M)) for M in with_windings(spec.plant, driven.windings, x, *whole)))
+
+
+def _cut(spec: Spec, driven: Driven | None, whole: Part, group: tuple[Any, Any, Any]) -> Part:
+    """A group's part of the machine; of each of its inputs the current in the winding is a state and an output."""
+    i, j, o = group
+    if driven is not None:
+        i, o = np.append(i, len(spec.plant.design_states) + j), np.append(o, len(spec.plant.outputs) + j)
+    return Part(whole.A[np.ix_(i, i)], whole.B[np.ix_(i, j)], whole.C[np.ix_(o, i)])
+
+
+def _place(
+    spec: Spec,
+    driven: Driven | None,
+    model: LinearModel,
+    slope: FloatArray,
+    group: tuple[Any, Any, Any],
+    forecast: FloatArray,
+) -> Place:
     """The group's part of a place."""
-    part = Part(model.A[np.ix_(i, i)], model.B[np.ix_(i, j)], model.C[np.ix_(o, i)])
-    machine = _sample(spec, part)
+    i, j, o = group
+    whole = _with_windings(spec, driven, Part(model.A, model.B, model.C))
+    part = _cut(spec, driven, whole, group)
+    machine = _sample(spec, driven, part, forecast)
     pushed = push_through(part.A, disturbance_map(model)[i], spec.sample_time, len(machine.Ad))
     return Place(position_in(model.plant, model.operating_point.x), machine, slope[np.ix_(j, o)], pushed)
 
@@ -258,16 +321,24 @@ def _estimates(spec: Spec) -> tuple[tuple[str, str, Requirement], ...]:
     return tuple(found)
 
 
-def _sample(spec: Spec, part: Part) -> SampledMachine:
-    actuator = spec.plant.actuator
-    A, B = part.A, part.B
-    if math.isfinite(actuator.crossover):
-        A, B = add_lags(A, B, actuator.crossover)
-    Ad, Bd = delay_inputs(*sample(A, B, spec.sample_time), actuator.delay(spec.sample_time))
-    return SampledMachine(Ad, Bd, np.hstack([part.C, np.zeros((len(part.C), len(Ad) - part.C.shape[1]))]))
+def _sample(spec: Spec, driven: Driven | None, part: Part, forecast: FloatArray) -> SampledMachine:
+    """A part behind its current loops: from forces, and where there is a forecast from voltages beside them."""
+    A, B, C = part
+    actuator, m, Ts = spec.plant.actuator, B.shape[1], spec.sample_time
+    delay = actuator.delay(Ts)
+    if driven is not None:
+        Ad, Bd = sample_driven((A, B, C[-m:]), driven.loop, driven.windings.R, Ts, delay)
+        C, Bd = C[:-m], Bd if forecast.any() else Bd[:, :m]
+    else:
+        if math.isfinite(actuator.crossover):
+            A, B = add_lags(A, B, actuator.crossover)
+        Ad, Bd = delay_inputs(*sample(A, B, Ts), delay)
+    return SampledMachine(Ad, Bd, np.hstack([C, np.zeros((len(C), len(Ad) - C.shape[1]))]))
 
 
-def _corners(spec: Spec, systems: list[Any], i: Any, j: Any, o: Any) -> SampledMachine:
+def _corners(
+    spec: Spec, driven: Driven | None, systems: list[Any], group: tuple[Any, Any, Any], forecast: FloatArray
+) -> SampledMachine:
     """The machine at every corner of growing boxes, those that differ in this group."""
     signs = np.array(list(itertools.product((-1, 1), repeat=len(spec.uncertainty))))
     share = np.array(list(spec.uncertainty.values()))
@@ -276,11 +347,11 @@ def _corners(spec: Spec, systems: list[Any], i: Any, j: Any, o: Any) -> SampledM
     for system in systems:
         for corner in signs:
             rows = np.array([system.nominal * (1 + t * share * corner) for t in levels])
-            A, B, C = system.at(rows)
-            parts = [A[:, i][:, :, i], B[:, i][:, :, j], C[:, o][:, :, i]]
-            key = b"".join(np.abs(M).round(9).tobytes() for M in parts)
+            wholes = [Part(*matrices) for matrices in zip(*system.at(rows), strict=True)]
+            parts = [_cut(spec, driven, whole, group) for whole in wholes]
+            key = b"".join(np.abs(M).round(9).tobytes() for part in parts for M in part)
             if key not in made:
-                made[key] = [_sample(spec, Part(*part)) for part in zip(*parts, strict=True)]
+                made[key] = [_sample(spec, driven, part, forecast) for part in parts]
     stacked = (
         np.array([[getattr(m, name) for m in one] for one in made.values()]) for name in ("Ad", "Bd", "Cd")
     )
@@ -306,7 +377,7 @@ def figures_of_gains(spec: Spec, group: Group, g: Gains) -> dict[str, float]:
     """Compute the linear figures of a group under gains, by requirement; none where its loop is unstable."""
     Ts = spec.sample_time
     law = linear_law_of(g, Ts)
-    steady = law._replace(D_y=law.D_y + group.slope)
+    steady = _with_forecast(group, g, law._replace(D_y=law.D_y + group.slope))
     closed = group.nominal.close(steady)
     if not (np.isfinite(closed).all() and np.abs(np.linalg.eigvals(closed)).max() < 1):
         return {}
@@ -317,10 +388,10 @@ def figures_of_gains(spec: Spec, group: Group, g: Gains) -> dict[str, float]:
     resting = known if spec.current_lag else 0
     peak, bandwidth = _response(group, g, steady, Ts, known=resting, alone=alone)
     try:
-        answers = tuple((place.position, _answer(place, law, Ts)) for place in group.places)
+        answers = tuple((place.position, _answer(group, place, g, law, Ts)) for place in group.places)
     except CheckError:
         return {}
-    margins = None if group.corners is None else corner_margins(group.corners, law)
+    margins = None if group.corners is None else corner_margins(group.corners, _with_forecast(group, g, law))
     loop = TrialLoop(
         plant=spec.plant,
         sample_time=Ts,
@@ -328,7 +399,7 @@ def figures_of_gains(spec: Spec, group: Group, g: Gains) -> dict[str, float]:
         inputs=group.inputs,
         model=group.model,
         gains=g,
-        Bd=group.nominal.Bd,
+        Bd=group.nominal.Bd[:, : len(group.inputs)],
         Cd=group.nominal.Cd,
         closed=closed,
         noise=_noise(group, steady, closed),
@@ -351,9 +422,14 @@ def figures_of_gains(spec: Spec, group: Group, g: Gains) -> dict[str, float]:
     return figures
 
 
-def _answer(place: Place, law: LinearLaw, Ts: float) -> StepResponse:
+def _with_forecast(group: Group, g: Gains, law: LinearLaw) -> LinearLaw:
+    """The law with the induced voltages that it forecasts as further outputs, where there are any."""
+    return with_estimated_emf(law, estimated_rows(group.forecast, g.L, g.Cd)) if group.forecast.size else law
+
+
+def _answer(group: Group, place: Place, g: Gains, law: LinearLaw, Ts: float) -> StepResponse:
     """Outputs of a group under a unit step of each load from outside. Raises CheckError for an unstable loop."""
-    closed = place.machine.close(law._replace(D_y=law.D_y + place.slope))
+    closed = place.machine.close(_with_forecast(group, g, law._replace(D_y=law.D_y + place.slope)))
     k = len(law.A)
     pushed = np.vstack([place.pushed, np.zeros((k, place.pushed.shape[1]))])
     C = np.hstack([place.machine.Cd, np.zeros((len(place.machine.Cd), k))])
@@ -390,5 +466,5 @@ def _noise(group: Group, law: LinearLaw, closed: FloatArray) -> Noise:
     k = len(group.nominal.Ad)
     out = group.nominal.Cd @ X[:k, :k] @ group.nominal.Cd.T
     command = np.hstack([law.D_y @ group.nominal.Cd, law.C])
-    force = np.diag(command @ X @ command.T + law.D_y * group.variance @ law.D_y.T)
+    force = np.diag(command @ X @ command.T + law.D_y * group.variance @ law.D_y.T)[: len(group.inputs)]
     return Noise(np.sqrt(np.diag(out)), np.sqrt(force))

@@ -28,6 +28,8 @@ from scipy import optimize, sparse
 from malta.errors import InputError
 from malta.margins.loops import Loop, machine_loop
 from malta.margins.responses import crossing
+from malta.margins.windings import emf_slope, estimated_rows, windings_of, with_estimated_emf
+from malta.model.data import plant_of
 from malta.model.equilibrium import trim
 from malta.model.linearize import linearize
 from malta.model.plant import position_at, position_in
@@ -73,11 +75,14 @@ class Part:
 
     outputs: tuple[int, ...]  # k of them
     Ad: FloatArray  # n x n
-    Bd: FloatArray  # n x k forces, then the k readings that currents are commutated for, where they are held
+    # n x k forces, then the k readings that currents are commutated for, where they are held, or k voltages that the
+    # law forecasts
+    Bd: FloatArray
     Cd: FloatArray
     slope: FloatArray  # of v0(z), k x k
     push: FloatArray  # n x k, what constant forces leave in the states after a sample
     shaken: FloatArray  # n x n, covariance that the noise of forces leaves there
+    forecast: FloatArray  # k x 2 k, of voltages by positions and rates of the outputs; empty: none
 
 
 def whole_machine(model: LinearModel, controller: Controller, loads: Loads) -> Part:
@@ -85,7 +90,9 @@ def whole_machine(model: LinearModel, controller: Controller, loads: Loads) -> P
     machine, plant, Ts = machine_loop(model, controller), model.plant, controller.sample_time
     x = model.operating_point.x
     loaded = linearize(plant, trim(plant, **position_at(plant, x)))
-    A, B, n = loaded.A - loaded.E @ loaded.C, loaded.B, len(loaded.A)
+    assert machine.continuous is not None
+    A, n = machine.continuous, len(machine.continuous)
+    B = np.vstack([loaded.B, np.zeros((n - len(loaded.B), loaded.B.shape[1]))])
     push, shaken = np.zeros((len(machine.Ad), B.shape[1])), np.zeros_like(machine.Ad)
     push[:n] = sample(A, B, Ts)[1]
     shaken[:n, :n] = sample_noise(A, B * (np.square(loads.force_noise) * Ts) @ B.T, Ts)
@@ -93,8 +100,21 @@ def whole_machine(model: LinearModel, controller: Controller, loads: Loads) -> P
     if plant.has_stroke:
         slope[:, plant.stroke_output] = controller.feedforward.slope(position_in(plant, x))
     return Part(
-        tuple(range(len(machine.Cd))), machine.Ad, machine.Bd, machine.Cd, slope, push, shaken
+        tuple(range(len(machine.Cd))), machine.Ad, machine.Bd, machine.Cd, slope, push, shaken,
+        _forecast(model, controller, machine),
     )  # fmt: skip
+
+
+def _forecast(model: LinearModel, controller: Controller, machine: Loop) -> FloatArray:
+    """Voltages that the law forecasts, of positions and rates of the outputs, m x 2 m; empty where there are none."""
+    m, half = len(controller.forces), model.plant.coordinates
+    if model.E.any() or machine.Bd.shape[1] == m:
+        return np.zeros((0, 0))
+    believed, x = plant_of(controller.parameters), model.operating_point
+    axes = windings_of(model.plant, believed, x, np.eye(m)).axes
+    back = np.linalg.inv(model.C[:, :half])
+    slope = axes @ emf_slope(believed, x.x)[:, list(believed.controlled)]
+    return np.hstack([slope[:, :half] @ back, slope[:, half:] @ back])
 
 
 def parts_of(whole: Part) -> list[Part]:
@@ -108,6 +128,8 @@ def parts_of(whole: Part) -> list[Part]:
     for first in range(n, n + whole.Bd.shape[1], m):  # forces, then readings: each of its output
         touch[:n, n:] |= counts[:n, first : first + m]
     touch[n:, n:] = whole.slope != 0
+    for first in range(0, whole.forecast.shape[1], m):
+        touch[n:, n:] |= whole.forecast[:, first : first + m] != 0
     count, label = sparse.csgraph.connected_components(touch, directed=False)
     parts = []
     for k in range(count):
@@ -122,6 +144,7 @@ def parts_of(whole: Part) -> list[Part]:
                 whole.slope[np.ix_(o, o)],
                 whole.push[np.ix_(i, o)],
                 whole.shaken[np.ix_(i, i)],
+                whole.forecast[np.ix_(o, np.append(o, m + o))] if whole.forecast.size else whole.forecast,
             )
         )
     return parts
@@ -135,9 +158,14 @@ def close_loop(part: Part, terms: Pid, Ts: float, axes: Axes | None = None) -> L
     k = len(part.outputs)
     one = np.eye(len(terms.Kp))
     few, own = law_of_outputs(terms, axes or Axes(one, one, one), part.outputs)
-    law = linear_law_of(pid_gains(np.eye(k), few, Ts, own), Ts)
+    g = pid_gains(np.eye(k), few, Ts, own)
+    law = linear_law_of(g, Ts)
     linear = law._replace(D_y=law.D_y + part.slope)
-    return Loop(part.Ad, part.Bd, part.Cd, linear if part.Bd.shape[1] == k else with_readings(linear), Ts)
+    if part.forecast.size:
+        linear = with_estimated_emf(linear, estimated_rows(part.forecast, g.L, g.Cd))
+    elif part.Bd.shape[1] > k:
+        linear = with_readings(linear)
+    return Loop(part.Ad, part.Bd, part.Cd, linear, Ts)
 
 
 def loop_figures(spec: Spec, part: Part, loop: Loop) -> dict[str, float]:
