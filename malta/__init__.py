@@ -50,6 +50,7 @@ if TYPE_CHECKING:  # the contents page, as type checkers and readers see it
     from malta.model.data import plant_of as plant_of
     from malta.model.data import read as read
     from malta.model.equilibrium import trim as trim
+    from malta.model.inverse import InverseCheck as InverseCheck
     from malta.model.linear import linear_machine as linear_machine
     from malta.model.linearize import LinearModel as LinearModel
     from malta.model.linearize import linearize as linearize
@@ -119,6 +120,7 @@ _NAMES = {  # the same, for the first use of each name
     "model.machines": ("machine",),
     "model.parameters": ("check_parameters", "si"),
     "model.equilibrium": ("trim",),
+    "model.inverse": ("InverseCheck",),
     "model.plant": ("Actuator", "OperatingPoint", "Plant", "Signal"),
     "margins.blocks": ("Dynamic",),
     "margins.curves": ("LoopCurves", "loop_curves"),

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import malta
+from malta.margins.plants import of_plant
 from malta.model.equilibrium import commanded
 from malta.model.plant import OperatingPoint
 
@@ -244,3 +245,95 @@ def test_the_command_of_a_point_is_kept() -> None:
         -malta.linearize(plant, here).B[1, 0], rel=1e-9
     )
     assert commanded(plant, mirror).v == pytest.approx(-here.v, rel=1e-9)
+
+
+PROVEN = {  # a machine, what its controller believes otherwise, and whether its command is a formula of the parameters
+    "inverse": (True, True),
+    "middle": (True, True),
+    "slope": (True, True),
+    "three coils": (False, False),
+}
+
+
+@pytest.mark.parametrize("differ", [False, True])
+@pytest.mark.parametrize("name", MACHINES)
+def test_a_model_in_parameters_is_the_linear_model_at_each(name: str, differ: bool) -> None:
+    """The command follows the parameters, on which the preload, the currents and the forces depend."""
+    make, par, at = MACHINES[name]
+    names = ("m", "C", "g0") if make is bench else ("m", "C")
+    plant = make(par)
+    believed = make(replace(par, C=1.2 * par.C, g0=0.85 * par.g0)) if differ else plant
+    system = of_plant(plant, names, at=at, believed=believed)
+    assert (system.approximate == "") == PROVEN[name][differ]
+    rng = np.random.default_rng(3)
+    for _ in range(5):
+        values = {key: getattr(par, key) * rng.uniform(0.8, 1.2) for key in names}
+        other = make(replace(par, **values))
+        model = malta.linearize(other, other.at(**at), believed)
+        A, B, C = system.at(np.array([list(values.values())]))
+        np.testing.assert_allclose(A[0], model.A, rtol=0, atol=1e-9 * np.abs(model.A).max())
+        np.testing.assert_allclose(B[0], model.B, rtol=0, atol=1e-9 * np.abs(model.B).max())
+        np.testing.assert_array_equal(C[0], model.C)
+
+
+@pytest.mark.parametrize("q", [0.0, 1e-3])
+def test_the_ball_in_parameters_off_its_middle(q: float) -> None:
+    """Its command solves a quadratic equation, and the right one of two roots."""
+    ball = malta.read_design("examples/ball/design/ball.toml").plant
+    names = ("m", "C", "s", "I_0")
+    system = of_plant(ball, names, at={"q": q}, believed=ball)
+    assert system.approximate == ""
+    par: Any = ball.parameters
+    values = {"m": 0.08, "C": 2.3e-5, "s": 5.6e-3, "I_0": 1.3}
+    other = ball.variant(replace(par, **values))
+    model = malta.linearize(other, other.at(q=q), ball)
+    A, B, _ = system.at(np.array([list(values.values())]))
+    np.testing.assert_allclose(A[0], model.A, rtol=1e-12)
+    np.testing.assert_allclose(B[0], model.B, rtol=1e-12)
+
+
+def test_nothing_is_proven_at_a_command_that_is_no_formula() -> None:
+    """The witness is searched with the converged command; the bound is refused, with its reason, by every prover."""
+    make, par, at = MACHINES["three coils"]
+    plant = make(par)
+    system = of_plant(plant, ("m", "C"), at=at, believed=plant)
+    A, B, C = (M[0] for M in system.at(system.nominal))
+    inverse, w, fast = np.linalg.inv(B[2:]), 60.0, 2e3  # PD with a fast filter
+    K, D, one = inverse @ (A[2:, :2] + w**2 * np.eye(2)), 1.4 * w * inverse, np.eye(2)
+    law = malta.Compensator(-fast * one, fast * one, fast * D, -K - fast * D)
+    for refused in (system, replace(system, approximate="")):  # and by the operation that no enclosure knows
+        found = malta.robust_margin(refused, law, {"m": 0.2, "C": 0.2}, time=1.0)
+        assert found.lower is None
+        assert found.upper == pytest.approx(4.66, abs=0.3)
+    assert "no formula" in malta.robust_margin(system, law, {"m": 0.2, "C": 0.2}).reason
+    assert C.shape == (2, 4)
+
+
+def test_the_check_says_where_currents_are_no_inverse() -> None:
+    """Along each clearance, for commands within the limits: of the ball at the end of its way, of others nowhere."""
+    ball = malta.read_design("examples/ball/design/ball.toml").plant
+    found = ball.check()
+    assert not found.exact
+    (worst,) = found.mismatches
+    par: Any = ball.parameters
+    i = worst.command * par.s**2 / (4 * par.C * par.I_0)
+    made = par.C * (
+        ((par.I_0 + i) / (par.s - worst.place)) ** 2 - ((par.I_0 - i) / (par.s + worst.place)) ** 2
+    )
+    assert abs(worst.place) == pytest.approx(par.q_max, rel=1e-5)
+    assert worst.made == pytest.approx(made, rel=1e-12)
+    assert worst.share == pytest.approx(abs(made - worst.command) / ball.actuator.force_limit[0], rel=1e-12)
+    assert len(str(found).splitlines()) == 2
+    linear = replace(ball, forces=lambda _, i: 4 * par.C * par.I_0 / par.s**2 * i)
+    assert linear.check().exact
+    assert str(linear.check()) == "ball: `currents` is the inverse of `forces` along q"
+
+
+def test_the_check_names_commands_without_currents() -> None:
+    """A magnet that only pulls; and a machine without clearances is looked at where it stands."""
+    found = bench(BENCH).check()
+    assert found.exact
+    assert found.undefined == "no currents for f = -15.09 N"
+    wrong = str(two_coils(BENCH).check())
+    assert "is not the inverse" in wrong
+    assert len(wrong.splitlines()) <= 10

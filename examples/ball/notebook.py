@@ -13,6 +13,7 @@ spec = malta.read_design(HERE / "design" / "ball.toml")
 ball = spec.plant
 model = malta.linearize(ball, ball.at())
 print("open-loop poles, rad/s:", model.sys.poles().real)
+print(ball.check())
 
 # %% [markdown]
 # The controller, and the margin of its sampled loop: how far m and C may go at once, in multiples of the box in the

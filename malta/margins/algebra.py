@@ -103,6 +103,7 @@ class Symbolic:
     inputs: int
     atoms: tuple[int, ...]  # steps of the program that are further variables
     program: Program
+    arguments: tuple[Ratio, ...] = ()  # of each atom, the first
 
     def constant(self, x: float) -> Ratio:
         return Ratio(self.context.constant(exact(x)))
@@ -153,4 +154,5 @@ def symbolic(program: Program) -> Symbolic:
     entries = tuple(
         {(i, j): cells[k] for i, j, k in matrix if not cells[k].is_zero()} for matrix in program.entries
     )
-    return Symbolic(entries, context, program.inputs, atoms, program)
+    arguments = tuple(cells[program.steps[k][2][0]] for k in atoms)
+    return Symbolic(entries, context, program.inputs, atoms, program, arguments)

@@ -172,7 +172,7 @@ def probe(
     names = (*system.names, *(f"Delta {i + 1}" for i in range(count)))
     limits = (*system.limits, *[(-np.inf, np.inf)] * count) if system.limits else ()
     nominal = np.concatenate([system.nominal, np.zeros(count)])
-    return UncertainSystem(names, nominal, f, limits, system.sample_time), law
+    return UncertainSystem(names, nominal, f, limits, system.sample_time, system.approximate), law
 
 
 @dataclass(frozen=True, eq=False)

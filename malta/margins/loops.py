@@ -335,11 +335,7 @@ def _commanded_system(
     driven : whether the windings are states
     """
     states = dict(at)
-    H = (
-        held_gain(believed, position_in(believed, believed.at(**states).x))
-        if is_commutated(believed)
-        else None
-    )
+    H = held_gain(believed, states) if is_commutated(believed) else None
     windings = windings_of(plant, believed, plant.at(**states), force_modes(believed)) if driven else None
     system = of_plant(plant, names, at=states, believed=believed, held=H, late=True, windings=windings)
     return system, H

@@ -14,6 +14,7 @@ from malta.errors import InputError
 from malta.margins import compact
 from malta.margins.algebra import Ratio, TooLarge
 from malta.margins.arguments import describe
+from malta.margins.commands import command_of, is_affine
 from malta.margins.uncertain import (
     UncertainSystem,
     is_commutated,
@@ -22,6 +23,7 @@ from malta.margins.uncertain import (
     upper_limit,
 )
 from malta.margins.windings import Windings, with_windings
+from malta.model.equilibrium import commanded
 from malta.model.parameters import shape_parameters, twins_of, units_of
 from malta.model.plant import Plant, position_in, readonly, symbolic
 from malta.model.sensors import LateSensors, with_lags
@@ -43,10 +45,10 @@ def of_plant(
     late: bool = False,
     windings: Windings | None = None,
 ) -> UncertainSystem:
-    """The design model of a plant at a position along its stroke, in parameters by name, at its preload.
+    """The design model of a plant at a position, in parameters by name, where its preload acts at every value of them.
 
     names : parameters; the stroke itself may be one of them, with the position as its nominal value
-    at : the position, SI
+    at : the states that are not zero, SI
     states : whether y contains the states after the outputs
     believed : the machine with the controller's parameters; None: the plant itself
     held : the gain H of currents that are held between samples (`held_gain`): the inputs are v + H y, and the reading y
@@ -55,7 +57,8 @@ def of_plant(
     windings : these are states, too: inputs are their voltages, and their currents are further outputs (windings.py)
 
     The inputs are commanded forces: the controller commutates with its own parameters, and the currents produce forces
-    with the plant's parameters.
+    with the plant's parameters. The command at which the preload acts is a function of the parameters (commands.py);
+    where it is none that a proof could use, the system says so (`approximate`).
 
     Raises InputError for unknown names and for parameters that set the size of the model.
     """
@@ -66,7 +69,8 @@ def of_plant(
         raise InputError("uncertain", "believed", found, "one whose currents are a formula")
     x0 = plant.at(**(at or {})).x
     position = position_in(plant, x0)
-    of = model_of(plant, believed or plant, tuple(name for name in names if name != plant.stroke))
+    own_states = tuple((name, x) for name, x in (at or {}).items() if name != plant.stroke)
+    of = model_of(plant, believed or plant, tuple(name for name in names if name != plant.stroke), own_states)
     p = ca.SX.sym("p", len(names))
     own = [k for k, name in enumerate(names) if name != plant.stroke]
     z = p[names.index(plant.stroke)] if plant.stroke in names else position
@@ -74,14 +78,15 @@ def of_plant(
     short = (
         _expanded_matrices(of, p, z, np.array(nominal, dtype=float), held) if is_commutated(plant) else None
     )
+    why = ""
     if short is not None:
         A, B, C = short
     else:
         acting = of(p[own], z, ca.DM.zeros(len(plant.inputs)))[-1]
-        v = acting
-        if is_commutated(plant):  # the forces to be commanded so that the preload acts
-            made, ratio = of(p[own], z, acting)[4:6]
-            v = acting + ca.solve(ratio, acting - made)
+        q = ca.SX.sym("v", len(plant.inputs))
+        chain = ca.Function("chain", [p, q], [of(p[own], z, q)[4]])
+        wanted = commanded(plant, plant.at(**(at or {})), believed).v
+        v, why = command_of(chain, p, acting, np.array(nominal, dtype=float), np.asarray(wanted))
         A, B, C, E = of(p[own], z, v)[:4]
         if held is not None:
             A, left = A - E @ C, E - B @ ca.DM(held)
@@ -98,7 +103,7 @@ def of_plant(
     bounds = {f.name: (lower_limit(f.metadata), upper_limit(f.metadata)) for f in fields(par)}
     limits = tuple(bounds.get(name, (-math.inf, math.inf)) for name in names)
     matrices = ca.Function("matrices", [p], [A, B, C])
-    return UncertainSystem(tuple(names), readonly(nominal), matrices, limits=limits)
+    return UncertainSystem(tuple(names), readonly(nominal), matrices, limits=limits, approximate=why)
 
 
 def _sensors_in(plant: Plant, p: Any, names: Sequence[str]) -> LateSensors | None:
@@ -147,8 +152,9 @@ def _expanded_matrices(
     fixed = isinstance(z, float)
     place = z if fixed else ca.substitute([z], [p], [q[:k]])[0]
     own = [i for i in range(k) if fixed or not ca.is_equal(p[i], z)]
-    model = ca.Function("model", [q], list(of(q[own], place, q[k:])))
-    if model.n_instructions() > LONGEST:
+    outputs = of(q[own], place, q[k:])
+    model = ca.Function("model", [q], list(outputs))
+    if model.n_instructions() > LONGEST or not is_affine(outputs[4], q[k:]):
         return None
     scales = np.concatenate([nominal, np.array(model(np.r_[nominal, np.zeros(m)])[-1]).ravel()])
     try:

@@ -176,6 +176,13 @@ class OfSeveral:
         return self.problems[0].physical(x)
 
 
+def approximation(problem: Problem) -> str:
+    """Why a problem's matrices are no exact functions of p, so that nothing is proven of them; "" where they are."""
+    if isinstance(problem, OfSeveral):
+        return next(filter(None, map(approximation, problem.problems)), "")
+    return problem.loop.system.approximate if isinstance(problem, OfLoop) else ""
+
+
 def physical(x: float, T: float | None) -> float:
     """v = j x -> rad/s."""
     return x if T is None else 2 * math.atan(x) / T

@@ -33,12 +33,14 @@ from malta.margins.arguments import (
 from malta.margins.box import Box, box_of
 from malta.margins.expressions import program
 from malta.margins.groups import loop_of
+from malta.margins.loss import first_loss
 from malta.margins.problem import (
     OfCoefficients,
     OfLoop,
     OfPolynomial,
     OfSeveral,
     Problem,
+    approximation,
 )
 from malta.margins.systems import compensator_of, polynomial_system
 from malta.margins.uncertain import Compensator, UncertainSystem
@@ -363,6 +365,10 @@ def margin_of(problem: Problem, box: Box, effort: Effort) -> Margin:
             where = dict(zip(box.names, places[k + int(unstable.argmax())].tolist(), strict=True))
             spent = clock.monotonic() - begun
             return Margin(0.0, 0.0, None, where, {}, {}, (), spent, "the nominal loop is unstable")
+    if why := approximation(problem):
+        upper, frequency, witness = first_loss(problem, box, box.limit)
+        found = None if witness is None else dict(zip(box.names, witness.tolist(), strict=True))
+        return Margin(None, upper, frequency, found, {}, {}, (), clock.monotonic() - begun, why)
     job = Job(
         problem,
         box,

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import casadi as ca
 import numpy as np
 
-from malta.model.linearize import jacobians
+from malta.model.linearize import jacobians, linearize
 from malta.model.plant import Plant, symbolic
 from malta.synthesis.riccati import add_lags, delay_inputs, sample
 
@@ -32,6 +32,7 @@ class UncertainSystem:
     matrices : a casadi.Function p -> A, B, C, or with D, or with D and E; their structure is read from the expressions
     limits : of each parameter, (above, below), exclusive; none: infinite
     sample_time : s, of a discrete system, with x+ in place of x'; None: continuous
+    approximate : why the matrices are no exact functions, so that nothing is proven of them; "": they are
 
     >>> import malta
     >>> def motor(J, b):
@@ -47,6 +48,7 @@ class UncertainSystem:
     matrices: ca.Function
     limits: tuple[tuple[float, float], ...] = ()
     sample_time: float | None = None
+    approximate: str = ""
 
     def at(self, p: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """A, B and C at k rows of parameters: arrays of k matrices each.
@@ -97,17 +99,19 @@ class Compensator:
     lag: float | None = None
 
 
-def held_gain(plant: Plant, position: float) -> FloatArray:
-    """The gain H of held currents at a position along the stroke, from E = B H: v + H y acts (forces x sensors)."""
-    of, none = model_of(plant, plant, ()), ca.DM(0, 1)
-    acting = of(none, position, 0)[-1]
-    _, B, _, E = (np.array(M) for M in of(none, position, acting)[:4])
-    return np.asarray(np.linalg.lstsq(B, E, rcond=None)[0])
+def held_gain(plant: Plant, states: Mapping[str, float]) -> FloatArray:
+    """The gain H of held currents at these states, from E = B H: v + H y acts (forces x sensors)."""
+    model = linearize(plant, plant.at(**states))
+    return np.asarray(np.linalg.lstsq(model.B, model.E, rcond=None)[0])
 
 
 @lru_cache(maxsize=16)  # plants compare by identity, and are built once for their parameters
-def model_of(plant: Plant, believed: Plant, names: tuple[str, ...]) -> ca.Function:
-    """The design model as a CasADi function of parameters, position along the stroke and wanted inputs v.
+def model_of(
+    plant: Plant, believed: Plant, names: tuple[str, ...], at: tuple[tuple[str, float], ...] = ()
+) -> ca.Function:
+    """The design model as a CasADi function of parameters, position along the stroke and commands v.
+
+    at : the other states that are not zero
 
     Its outputs are those of `jacobians` on the controlled states (A, B, C, E, forces, their ratio) and the preload.
     """
@@ -119,7 +123,7 @@ def model_of(plant: Plant, believed: Plant, names: tuple[str, ...]) -> ca.Functi
     own = {name: own[twin] for name, twin in twins_of(par).items() if twin in own} | own
     machine: Plant = plant.variant(symbolic(par, own))
     x, u = ca.SX.sym("x", len(plant.states)), ca.SX.sym("u", len(plant.inputs))
-    point = ca.SX(plant.at().x)
+    point = ca.SX(plant.state(dict(at)))
     if plant.has_stroke:
         point[plant.stroke_state] = z
     preload = ca.SX(machine.preload(point))

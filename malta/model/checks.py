@@ -26,7 +26,7 @@ def defaults(plant: Plant) -> dict[str, Any]:
     return {
         "load": partial(_zeros, w),
         "position_of": _identity,
-        "preload": lambda _: ca.DM.zeros(m),
+        "preload": lambda x: plant.forces(x, plant.currents(plant.h(x, ca.DM.zeros(m)), ca.DM.zeros(m))),
         "currents": lambda _, v: v / ca.vertcat(*constants),
         "forces": lambda _, i: ca.vertcat(*constants) * i,
         "limited": lambda i: ca.fmax(ca.fmin(i, limit), -limit),

@@ -86,7 +86,7 @@ def exceeded_limit(plant: Plant, point: OperatingPoint) -> str:
     for s, v, most in zip(plant.inputs, point.v.tolist(), plant.actuator.force_limit, strict=False):
         if abs(v) > most * (1 + LIMIT_ROUNDING):
             return f"the command {s.name} = {v:.4g} {s.unit} is beyond its limit of {most:.4g} {s.unit}"
-    _, currents = _chain(plant, None)
+    _, currents = chain(plant, None)
     wanted = np.array(currents(point.x, point.v)).ravel()
     carried = np.array(ca.evalf(ca.vertcat(plant.limited(ca.DM(wanted))))).ravel()
     carried = np.clip(carried, -plant.actuator.current_limit, plant.actuator.current_limit)
@@ -128,7 +128,7 @@ def _named(plant: Plant, x: FloatArray) -> str:
 
 
 @lru_cache(maxsize=32)  # plants compare by identity
-def _chain(plant: Plant, believed: Plant | None) -> tuple[ca.Function, ca.Function]:
+def chain(plant: Plant, believed: Plant | None) -> tuple[ca.Function, ca.Function]:
     """(x, v) -> inputs that the currents of v make; (x, v) -> these currents, A."""
     kind = ca.MX if (believed or plant).tabulated else ca.SX
     x, v = kind.sym("x", len(plant.states)), kind.sym("v", len(plant.inputs))
@@ -171,7 +171,7 @@ def _commands(
 
     before : commands to start from, beside the inputs and shares of the limits
     """
-    made, _ = _chain(plant, believed)
+    made, _ = chain(plant, believed)
     kind = ca.MX if (believed or plant).tabulated else ca.SX
     x, v = kind.sym("x", len(plant.states)), kind.sym("v", len(plant.inputs))
     w = plant.load(x) if loaded else kind.zeros(len(plant.disturbances))
@@ -182,6 +182,7 @@ def _commands(
     rough = np.where(inputs < 0, -1.0, 1.0) * scales
     starts = [
         *before,
+        inputs if loaded else _nearer(made, states, inputs),
         inputs,
         np.zeros_like(inputs),
         *(s * share * rough for share in STARTS for s in (1.0, -1.0)),
@@ -191,6 +192,16 @@ def _commands(
     acting = np.array(made.map(len(states))(states.T, found.values.T)).T
     near = np.abs(acting - inputs) <= 1e-12 * np.maximum(np.abs(inputs), scales)
     return found.values, np.where(near, inputs, acting)
+
+
+def _nearer(made: ca.Function, states: FloatArray, inputs: FloatArray) -> FloatArray:
+    """The inputs as a command, or zero where that makes inputs which are nearer to these."""
+    off = [
+        np.abs(np.array(made.map(len(states))(states.T, command.T)).T - inputs).sum(axis=1)
+        for command in (np.zeros_like(inputs), inputs)
+    ]
+    nearer = np.isfinite(off[0]) & ~(off[1] <= off[0])
+    return np.where(nearer[:, None], 0.0, inputs)
 
 
 def _equations(given: Any, unknown: Any, left: Any, rows: FloatArray) -> Equations:

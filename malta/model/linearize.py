@@ -126,7 +126,7 @@ def linearize(plant: Plant, point: OperatingPoint, believed: Plant | None = None
             plant.name, "operating point", f"x {point.x.shape}, u {point.u.shape}", f"x ({n},), u ({m},)"
         )
     if not np.isfinite(point.x).all() or not np.isfinite(point.u).all():
-        raise CheckError(f"{plant.name}: the operating point is not finite: x = {point.x}, u = {point.u}")
+        raise CheckError(f"{plant.name}: a state or a `preload` is not finite: x = {point.x}, u = {point.u}")
     point = commanded(plant, point, believed)
     kind = ca.MX if (believed or plant).tabulated else ca.SX
     x, u, v = kind.sym("x", n), kind.sym("u", m), kind.sym("v", m)
