@@ -19,7 +19,7 @@ from tampering import claiming, written
 import malta
 from malta.errors import InputError
 from malta.gains.certified import origin_of
-from malta.margins import certificate, checked_file
+from malta.margins import certificate, checked_file, travel
 from malta.margins.check import Verdict, check
 from malta.margins.travel import travel_loops
 from malta.margins.windings import CurrentLoops
@@ -110,6 +110,16 @@ def another_time(content: Content) -> None:
     every("sample_time", (0.05).hex())(content)
 
 
+def no_time(content: Content) -> None:
+    content["claim"]["sample_time"] = None
+    every("sample_time", None)(content)
+
+
+def two_loops(content: Content) -> None:
+    content["loops"] *= 2
+    content["claim"]["places"] = {"name": "x", "unit": "m", "at": [0.0, 0.05]}
+
+
 def last_digit(content: Content) -> None:
     gains = content["loops"][0]["compensator"]["B"][0]
     gains[0] = math.nextafter(float.fromhex(gains[0]), math.inf).hex()
@@ -154,11 +164,12 @@ TAMPERED: dict[str, tuple[Change, str]] = {
     "stage": (claim("current_loops", value="pi"), "stage of current loops|no such loop can be made of"),
     "time": (claim("sample_time", value=0.05), "the sample time is not that of the loops"),
     "all times": (another_time, r"the sample time is 0\.05 s, that of .* is 0\.055 s"),
+    "no time": (no_time, r"the sample time is none, that of .* is 0\.055 s"),
     "places": (claim("places", value={"name": "x", "unit": "m", "at": [0.0]}), "the place of each loop is x = 0.0 m"),
     "gains": (last_digit, "the loops are not those of"),
     "constant": (another_constant, "the loops are not those of"),
     "delay": (every("delay", 1), "the loops are not those of"),
-    "two loops": (lambda c: c["loops"].append(c["loops"][0]), "the place of each loop is none"),
+    "two loops": (two_loops, "x is no parameter of the loop of"),
     "no machine": (no_machine, "is of matrices alone and names no machine"),
     "order": (lambda c: c["claim"]["parameters"].reverse(), "its parameters are not R b A m x, as in the loop of"),
 }  # fmt: skip
@@ -260,6 +271,84 @@ def test_no_random_change_makes_a_claim_stronger(document: Content, tmp_path: Pa
             messages += found.failures
     assert refused == len(messages) >= 30
     assert not any("\n" in message for message in messages)
+
+
+def exactly(x: float) -> Any:
+    return fmpq(*x.as_integer_ratio())
+
+
+def test_stated_intervals_lie_in_those_that_are_proven() -> None:
+    rng = np.random.default_rng(5)
+    for _ in range(200):
+        nominal, width, t = (exactly(float(x)) for x in rng.uniform(0.1, 3, 3))
+        low, high = nominal - t * width, nominal + t * width
+        first, last = checked_file.inside(low, high)
+        assert low <= exactly(first) <= nominal <= exactly(last) <= high
+        assert exactly(math.nextafter(first, -math.inf)) < low
+        assert exactly(math.nextafter(last, math.inf)) > high
+
+
+def test_boxes_hold_their_shares_exactly() -> None:
+    """Widths in doubles would miss shares and ends by half a digit."""
+    rng, missed = np.random.default_rng(6), 0
+    for _ in range(20):
+        m, share, k, end = rng.uniform(0.1, 3, 4).tolist()
+
+        def matrices(m: Any, k: Any) -> Any:
+            return [[0, 1], [-9 - k, -4 - m]], [[0], [1]], [[1, 0]]
+
+        system = malta.uncertain(matrices, {"m": m, "k": k})
+        law = malta.Compensator(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), np.zeros((1, 1)))
+        margin = malta.Margin(0.1, math.inf, None, None, {}, {}, (), 0.0)
+        content = certificate.certificate_of([(system, law)], {"m": share}, {"k": (k - end, k + 1)}, margin)
+        one, two = content["claim"]["parameters"]
+        assert exactly(one["down"]) == exactly(one["up"]) >= exactly(m) * exactly(share)
+        missed += one["down"] != m * share
+        assert exactly(k) + exactly(two["over"][0]) <= exactly(k - end)
+        assert exactly(k) + exactly(two["over"][1]) >= exactly(k + 1)
+    assert missed
+
+
+# places
+
+
+@pytest.fixture
+def two_places(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Every model along a travel is too long for one proof, so that two places stand for it."""
+    travel._along.cache_clear()
+    monkeypatch.setattr(travel, "LONG", 0)
+    yield
+    travel._along.cache_clear()
+
+
+@pytest.mark.usefixtures("two_places")
+def test_places_are_those_of_the_machine(tmp_path: Path, run: Run) -> None:
+    path = certified(HALBACH, BOX, 2.0, tmp_path / "c.json")
+    assert check(path, HALBACH).ok
+    document = json.loads(path.read_text())
+    assert document["claim"]["places"] == {"name": "x", "unit": "m", "at": [0.0, 0.05]}
+    out = run("check", str(path), "--gains", str(HALBACH)).out
+    assert "at x = 0, 0.05 m, not between them" in out
+    assert out.splitlines()[-1].endswith("of the uncertainty at each of 2 places, not between them: holds")
+    content = copy.deepcopy(document)
+    content["claim"]["places"]["at"] = [0.0, 0.06]
+    (line,) = check(written(content, tmp_path), HALBACH).failures
+    assert line.startswith("the place of each loop is x = 0.0, 0.06 m, that of ")
+    content = copy.deepcopy(document)
+    del content["loops"][1]
+    content["claim"]["places"] = None
+    (line,) = check(written(content, tmp_path), HALBACH).failures
+    assert line.startswith("x is not among its parameters")
+    content = copy.deepcopy(document)
+    content["loops"][1:] = content["loops"][1:] * 2
+    with pytest.raises(InputError):
+        check(written(content, tmp_path), HALBACH)
+    content["claim"]["places"] = None
+    with pytest.raises(InputError, match="expected the places of 3 loops"):
+        check(written(content, tmp_path))
+    content["claim"]["places"] = {"name": "x", "unit": "m", "at": [0.0, 0.05, 0.05]}
+    (line,) = check(written(content, tmp_path), HALBACH).failures
+    assert line.startswith("the place of each loop is")
 
 
 # what is more than the claim
@@ -396,11 +485,11 @@ def test_check_prints_the_box_and_whose_it_is(run: Run, document: Content, tmp_p
     code, out, err = run("check", str(path))
     assert (code, err) == (0, "")
     assert out.startswith("Claim: halbach, preset identified; law halbach, sha256 ")
-    assert "current loops as first-order lags" in out
+    assert "current loops, if any, as first-order lags" in " ".join(out.split())
     assert re.search(r"^ m +3\.75 +2\.251501 +5\.248499 +kg *$", out, re.M)
     assert re.search(r"^ x +0 +-0\.05 +0\.05 +m *$", out, re.M)
-    assert "stable in 399.600 % of the uncertainty that it states itself, with the box above: holds" in out
-    assert "the box is the certificate's own, compared with no gain file" in out
+    own = "in the certificate's own box above, compared with no gain file"
+    assert out.splitlines()[-1] == f"{path}: stable in 399.600 % of the uncertainty, {own}: holds"
     code, out, err = run("check", str(path), "--gains", str(HALBACH))
     assert (code, err) == (0, "")
     assert out.splitlines()[-1] == f"{path}: stable in 399.600 % of the uncertainty: holds"

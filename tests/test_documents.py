@@ -133,7 +133,8 @@ def test_the_others(run: Run, tmp_path: Path) -> None:
     certificate = tmp_path / "c.json"
     said = run("verify", TABLE2, "--uncertain", "m=10%", "--certificate", certificate, "--json")
     assert document(said, "verify-output")["robust"]["travel"]["lower"] > 1
-    assert document(run("check", certificate, "--gains", TABLE2, "--json"), "check-output")["holds"]
+    same = ("--gains", TABLE2, "--uncertain", "m=10%")
+    assert document(run("check", certificate, *same, "--json"), "check-output")["compared"]
     document(run("export", TABLE2, "--out", tmp_path / "c", "--json"), "export-output")
     document(run("report", TABLE2, "--no-proof", "--out", tmp_path / "r.html", "--json"), "report-output")
     assert document(run("tune", "design/robust.toml", "--check", "--json"), "tune-output")["search"] is None

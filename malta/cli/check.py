@@ -76,10 +76,8 @@ def _print(file: Path, gains: Path | None, verdict: Verdict) -> None:
     holds = "holds" if verdict.ok else "does not hold"
     share = f"{claim_share(stated)} of the uncertainty"
     if gains is None:
-        share += " that it states itself, with the box above"
+        share += ", in the certificate's own box above, compared with no gain file"
     print_line(console, f"{file}: stable in {share}{where}: {holds}")
-    if verdict.ok and gains is None:
-        print_line(console, f"{file}: the box is the certificate's own, compared with no gain file (--gains)")
     for line in verdict.failures:
         print_note(shorten(f"{file}: {line}"))
 

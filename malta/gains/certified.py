@@ -103,13 +103,16 @@ def _of_another(claim: Claim, own: Origin, controller: Controller, gains: str) -
         ("law", found.law, wanted.law),
         ("sha256 of the law", found.sha256, wanted.sha256),
         ("stage of current loops", found.current_loops, wanted.current_loops),
-        ("sample time", claim.sample_time, exact(controller.sample_time)),
+        ("sample time", _time_text(claim.sample_time), _time_text(exact(controller.sample_time))),
         ("place of each loop", _places_text(claim.places), _places_text(own.places)),
     ):
         if one != two:
-            a, b = (x if isinstance(x, str) else f"{double(x):.12g} s" for x in (one, two))
-            return f"the {what} is {a}, that of {gains} is {b}"
+            return f"the {what} is {one}, that of {gains} is {two}"
     return ""
+
+
+def _time_text(T: Any) -> str:
+    return "none" if T is None else f"{double(T)!r} s"
 
 
 def _places_text(places: Places | None) -> str:
@@ -177,8 +180,6 @@ def _of_other_loops(
     except (InputError, CheckError, NotAnalytic) as error:
         return f"no such loop can be made of {gains} ({error})"
     found = tuple(_bare(loop) for loop in document.loops)
-    if len(found) != len(wanted):
-        return f"its loops are {len(found)}, those of {gains} are {len(wanted)}"
     return "" if found == tuple(_bare(loop) for loop in wanted) else f"the loops are not those of {gains}"
 
 

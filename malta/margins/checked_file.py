@@ -251,6 +251,8 @@ def claim(f: Field, loops: int) -> Claim:
     if where.value is not None:
         at = tuple(x.number() for x in where["at"].items(loops))
         places = Places(where["name"].text(), where["unit"].text(), at)
+    elif origin is not None and loops > 1:
+        raise where.wrong(f"the places of {loops} loops along the travel")
     parameters = tuple(parameter(x, origin is not None) for x in f["parameters"].items(1, 20))
     if len({p.name for p in parameters}) < len(parameters):
         raise f["parameters"].wrong("each parameter once")

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from malta.margins.checked_file import Claim
 
 DIGITS = 7  # of the ends of an interval
-LOOPS = {"lag": "current loops as first-order lags", "pi": "the PI current loops of the gain file"}
+LOOPS = {"lag": "current loops, if any, as first-order lags", "pi": "the PI current loops of the gain file"}
 
 
 def claim_text(claim: Claim) -> str:
