@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from malta.errors import CheckError, InputError
+from malta.errors import CheckError, InputError, shorten
 from malta.files import locate
 from malta.gains.agreement import APART
 from malta.gains.contents import uncertainty_of
@@ -22,7 +22,7 @@ from malta.gains.encodings import content_sha256
 from malta.gains.file import content_of, read
 from malta.margins.box import box_of
 from malta.margins.certificate import Origin, loops_of, sides_of
-from malta.margins.checked_file import Claim, Document, Loop, Parameter, Places, double
+from malta.margins.checked_file import LONG, Claim, Document, Loop, Parameter, Places, double
 from malta.margins.checked_file import Origin as Named
 from malta.margins.expressions import NotAnalytic, exact
 from malta.margins.extent import extent_of
@@ -55,8 +55,10 @@ def origin_of(
     content = content_of(locate(Path(gains)))[1]
     law = {key: value for key, value in content.items() if key not in APART}
     stage = chosen_loops(plant, controller, current_loops)
-    preset = plant.parameters.preset
-    named = Named(plant.name, preset, controller.name, content_sha256(law), stage)
+    machine, preset, design = (
+        shorten(text, LONG) for text in (plant.name, plant.parameters.preset, controller.name)
+    )
+    named = Named(machine, preset, design, content_sha256(law), stage)
     units = units_of(plant.parameters) | ({plant.stroke: "m"} if plant.has_stroke else {})
     at = tuple(exact(share * plant.travel) for share in ENDS)
     return Origin(named, units, Places(plant.stroke, "m", at) if loops > 1 else None)

@@ -187,8 +187,8 @@ class Field:
     def text(self, longest: int = LONG) -> str:
         """A name that a terminal can print."""
         found = self.value
-        if not (isinstance(found, str) and 0 < len(found) <= longest and found.isprintable()):
-            raise self.wrong(f"printable text of 1 to {longest} characters")
+        if not (isinstance(found, str) and len(found) <= longest and found.isprintable()):
+            raise self.wrong(f"printable text of at most {longest} characters")
         return found
 
     def truth(self) -> bool:
@@ -245,8 +245,9 @@ def claim(f: Field, loops: int) -> Claim:
         seal = law["sha256"].text(64)
         if len(seal) != 64 or set(seal) - set("0123456789abcdef"):
             raise law["sha256"].wrong("64 hexadecimal digits")
-        name, preset = machine["name"].text(), machine["preset"].text(200)
-        origin = Origin(name, preset, law["name"].text(), seal, stage.value)
+        origin = Origin(
+            machine["name"].text(), machine["preset"].text(), law["name"].text(), seal, stage.value
+        )
     T, where, places = f["sample_time"], f["places"], None
     if where.value is not None:
         at = tuple(x.number() for x in where["at"].items(loops))
