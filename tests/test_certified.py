@@ -486,7 +486,7 @@ def test_check_prints_the_box_and_whose_it_is(run: Run, document: Content, tmp_p
     assert (code, err) == (0, "")
     assert out.startswith("Claim: halbach, preset identified; law halbach, sha256 ")
     assert "current loops, if any, as first-order lags" in " ".join(out.split())
-    assert re.search(r"^ m +3\.75 +2\.251501 +5\.248499 +kg *$", out, re.M)
+    assert re.search(r"^ m +3\.75 +2\.2515 +5\.2485 +kg *$", out, re.M)
     assert re.search(r"^ x +0 +-0\.05 +0\.05 +m *$", out, re.M)
     own = "in the certificate's own box above, compared with no gain file"
     assert out.splitlines()[-1] == f"{path}: stable in 399.600 % of the uncertainty, {own}: holds"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from decimal import ROUND_CEILING, ROUND_FLOOR, Context, Decimal
+from decimal import ROUND_CEILING, ROUND_FLOOR, Context
 from typing import TYPE_CHECKING, Any
 
 from rich.table import Table
@@ -33,7 +33,9 @@ def claim_text(claim: Claim) -> str:
 
 def claim_share(claim: Claim) -> str:
     """The multiple of the uncertainty that is claimed, in percent, cut."""
-    return f"{Decimal(double(claim.lower) * 100).quantize(Decimal('0.001'), ROUND_FLOOR)} %"
+    lower = double(claim.lower)
+    near = round(100_000 * lower)
+    return f"{(near if near / 100_000 <= lower else near - 1) / 1000:.3f} %"
 
 
 def claim_table(claim: Claim) -> Table:
@@ -49,4 +51,8 @@ def claim_table(claim: Claim) -> Table:
 
 
 def _cut(x: Any, towards: str) -> float:
-    return float(Context(prec=DIGITS, rounding=towards).create_decimal(double(x)))
+    """An end with some digits: the nearest number, unless that is beyond the end."""
+    end = double(x)
+    near = float(f"{end:.{DIGITS}g}")
+    within = near >= end if towards == ROUND_CEILING else near <= end
+    return near if within else float(Context(prec=DIGITS, rounding=towards).create_decimal(end))
