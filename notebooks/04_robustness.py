@@ -52,20 +52,21 @@ assert abs(lqr["table2"] - 5 / 3) < 1e-3 * 5 / 3
 assert abs(lqr["calibrated"] - 3) < 0.03
 assert machine["table2"].upper < 0.34
 assert machine["robust"].lower is not None
-assert machine["robust"].lower >= 3.5
+assert machine["robust"].lower >= 2.89
 
 # %% [markdown]
 # **Judgement.** The claimed 300 % is that of full state feedback with a gain four times as stiff as the attraction
 # pulls (`calibrated`). The observer takes half of it, and with the printed noise (`table2`) it takes all but a third of
-# the box. Current loops, hold and delay cost little after that. `robust` is designed for the loop as it is: a fast
-# observer for the bearings, a slow one for the noisy axial sensor, and keeps more than the claim with output feedback.
+# the box. Current loops, hold and delay cost little after that. `robust` has a fast observer for the bearings and a slow
+# one for the noisy axial sensor. It was tuned for first-order lags in place of the current controllers, with which it
+# keeps more than the claim (`sampled`); with the PI controllers that run (`machine`) it keeps a little less than that.
 # The margins are without the loads; |S| of the last stage is with them, and shows that the axial loop of `table2` is
 # softer than the cogging that v0(z) cancels.
 
 # %% [markdown]
 # ## A witness flies
 # What the eigenvalues say, the nonlinear machine should show: just inside the boundary a small step dies out, just
-# beyond it grows. Simulated with the forces as first-order lags, as the proof has them, without loads.
+# beyond it grows. Simulated with the current controllers of the gain file, as the proof has them, without loads.
 
 # %%
 nominal: Any = plant.parameters
@@ -74,17 +75,21 @@ for name in ("calibrated", "robust"):
     c = controllers[name]
     alone = replace(c, feedforward=replace(c.feedforward, v0=0 * c.feedforward.v0))
     left = []
-    for share in (0.9, 1.1):
+    for share in (0.97, 1.03):
         far = {k: getattr(nominal, k) + share * moved[k] for k in BOX}
         true = malta.plant_of(replace(nominal, **far, F_c=0.0, g=0.0))
         scenario = malta.Scenario(
-            "witness", 0.6, malta.references.hold, {"x": 1e-7, "z": 1e-7}, fidelity="force"
+            "witness", 3.0, malta.references.hold, {"x": 1e-7, "z": 1e-7}
         )
         run = malta.simulate(true, alone, scenario)
-        left.append(float(np.abs(run.p[-2000:]).max()))
+        half = len(run.p) // 2
+        if run.verdict.completed:  # the largest deviation of the last quarter, over that of the quarter before
+            left.append(float(np.abs(run.p[-half // 2 :]).max() / np.abs(run.p[half : -half // 2]).max()))
+        else:
+            left.append(np.inf)
     inside, outside = left
-    print(f"{name}: {inside * 1e6:.2g} um are left inside the boundary, {outside * 1e6:.2g} um beyond")
-    assert inside < 2e-8 < 1e-6 < outside
+    print(f"{name}: in 0.75 s a deviation becomes {inside:.2g} of itself inside the boundary, {outside:.2g} beyond")
+    assert inside < 0.9 < 1.1 < outside
 
 # %% [markdown]
 # ## Machines by the hundred
@@ -103,7 +108,7 @@ for name, controller in controllers.items():
             k: getattr(plant.parameters, k) * (1 + size * share * rng.uniform(-1, 1, RUNS))
             for k, share in BOX.items()
         }
-        scenario = malta.Scenario.stroke(fidelity="force", noise=1.0)
+        scenario = malta.Scenario.stroke(noise=1.0)
         shares.append(float(malta.simulate_many(plant, controller, scenario, changes).completed.mean()))
     yields[name] = np.array(shares)
 
