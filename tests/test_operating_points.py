@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -10,9 +11,11 @@ import numpy as np
 import pytest
 
 import malta
+from malta.margins.loops import loaded_model, machine_loop, machine_system
 from malta.margins.plants import of_plant
 from malta.model.equilibrium import commanded
 from malta.model.plant import OperatingPoint
+from malta.simulation.linear_run import linear_run
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -337,3 +340,58 @@ def test_the_check_names_commands_without_currents() -> None:
     wrong = str(two_coils(BENCH).check())
     assert "is not the inverse" in wrong
     assert len(wrong.splitlines()) <= 10
+
+
+@pytest.fixture(scope="module")
+def off_centre(tmp_path_factory: pytest.TempPathFactory) -> malta.Spec:
+    """The ball's design 1 mm above its middle."""
+    folder = tmp_path_factory.mktemp("off") / "ball"
+    shutil.copytree("examples/ball", folder, ignore=shutil.ignore_patterns("build", "gains", "__pycache__"))
+    file = folder / "design" / "ball.toml"
+    text = file.read_text(encoding="utf-8")
+    place = 'operating_point = { q = { value = 1, unit = "mm" } }'
+    file.write_text(text.replace("operating_point = {}", place), encoding="utf-8")
+    return malta.read_design(file)
+
+
+def test_a_design_off_the_stroke_stands_where_it_is_designed(off_centre: malta.Spec) -> None:
+    """Its feedforward holds the ball there, runs are about it, and the linear run is the simulation's."""
+    ball = off_centre.plant
+    model = malta.linearize(ball, ball.at(**off_centre.operating_point))
+    controller = malta.synthesize(off_centre, model)
+    assert controller.operating_point[0].tolist() == [1e-3, 0.0]
+    hold = controller.feedforward.v0[0] + controller.feedforward.position @ [1e-3]
+    assert hold == pytest.approx(malta.trim(ball, q=1e-3).v, rel=1e-12)
+    still = malta.experiment("hold", ball, controller, noise=0.0)
+    assert np.abs(still.run.p - 1e-3).max() < 1e-12
+    step = malta.experiment("step", ball, controller, size=20e-6)
+    assert step.run.p[-1, 0] == pytest.approx(1.02e-3, abs=1e-7)
+    loop = machine_loop(model, controller)
+    linear = linear_run(loop, controller, step.run.scenario)
+    np.testing.assert_allclose(linear.p[:, 0], step.run.p[:, 0], rtol=0, atol=0.5e-6)
+
+
+def test_a_design_off_the_stroke_is_proven_at_the_slopes_there(off_centre: malta.Spec) -> None:
+    """The machine's loop has the slopes at the current that carries the weight; the witness is near the margin."""
+    ball = off_centre.plant
+    model = malta.linearize(ball, ball.at(**off_centre.operating_point))
+    controller = malta.synthesize(off_centre, model)
+    loaded = loaded_model(ball, 0.0, (("q", 1e-3),))
+    assert loaded.A[1, 0] == pytest.approx(16888.7, abs=0.1)
+    system, _ = machine_system(ball, controller, ("m", "C"), off_centre.operating_point)
+    A, B, _ = (M[0] for M in system.at(system.nominal))
+    np.testing.assert_allclose(A, model.A, rtol=1e-12)
+    np.testing.assert_allclose(B, model.B, rtol=1e-12)
+    robust = malta.verify(model, controller, off_centre.uncertainty).robust
+    assert robust is not None
+    assert robust.lower is not None
+    assert robust.lower == pytest.approx(robust.upper, rel=2e-3)
+
+
+def test_a_moving_operating_point_is_refused_in_one_sentence(off_centre: malta.Spec) -> None:
+    """A speed is a state, but nothing rests there."""
+    ball = off_centre.plant
+    with pytest.raises(
+        malta.CheckError, match=r"no input holds the state q_dot = 0.1 m/s: q changes at 0.1 m/s"
+    ):
+        malta.synthesize(off_centre, malta.linearize(ball, ball.at(q_dot=0.1)))

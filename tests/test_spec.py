@@ -291,9 +291,9 @@ FAULTS = {  # old text, new text; field, found, expected
     "sample time in m": (TS_UNIT, TS_UNIT.replace("us", "m"), "sample_time.unit", "'m'", "unit of s"),
     "sample time in Hz": (TS_UNIT, TS_UNIT.replace("us", "kHz"), "sample_time.unit", "'kHz'", "unit of s"),
     "sample time without unit": (TS_UNIT, "sample_time = 50e-6", "sample_time", "5e-05", ""),
-    "a state off the stroke": (
-        OPERATING_POINT, 'alpha = { value = 0, unit = "rad" }', "operating_point.alpha", "another state",
-        "z, the stroke, alone",
+    "an unknown state": (
+        OPERATING_POINT, 'gamma = { value = 0, unit = "rad" }', "operating_point.gamma", "an unknown state",
+        "one of x y z alpha beta",
     ),
     "unit of the operating point": (
         OPERATING_POINT, OPERATING_POINT.replace("mm", "rad"), "operating_point.z.unit", "'rad'",

@@ -24,6 +24,7 @@ from malta.firmware.signals import (
 )
 from malta.firmware.step import first_state, started_state, step_of, zero_reference
 from malta.simulation import references
+from malta.simulation.inputs import motion_of
 from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate
 
@@ -72,7 +73,7 @@ def _flight(t: Target, *, stroke: bool) -> dict[str, FloatArray]:
     else:
         scenario = Scenario("hold", lasts, references.hold, **options)
     run = simulate(plant, c, scenario)
-    motion = scenario.reference(plant)(run.t)
+    motion = motion_of(scenario, plant, c, run.t)
     found = {"p": motion.p, "dp": motion.dp, "ddp": motion.ddp} | _readings(t, run)
     if len(run.t) < SAMPLES:  # it touched down: go on with the last reading
         found = {k: np.vstack([v, np.repeat(v[-1:], SAMPLES - len(v), axis=0)]) for k, v in found.items()}

@@ -39,7 +39,7 @@ from malta.margins.windings import (
 from malta.model.data import plant_of
 from malta.model.equilibrium import trim
 from malta.model.linearize import LinearModel, linearize
-from malta.model.plant import position_in, readonly
+from malta.model.plant import off_stroke, position_in, readonly
 from malta.model.sensors import whole_samples, with_lags
 from malta.synthesis.controller import Controller, LinearLaw, linear_law, with_readings, with_slope
 from malta.synthesis.riccati import add_lags, delay_inputs, eigenvalues, sample
@@ -227,7 +227,8 @@ def machine_loop(
     its sensors that is not whole samples.
     """
     plant = model.plant
-    loaded = loaded_model(plant, position_in(plant, model.operating_point.x))
+    x = model.operating_point.x
+    loaded = loaded_model(plant, position_in(plant, x), tuple(off_stroke(plant, x).items()))
     chosen = chosen_loops(plant, controller, current_loops)
     delay = plant.actuator.delay(controller.sample_time)
     return loop(
@@ -246,9 +247,9 @@ def machine_loop_at(
 
     Raises CheckError when no input holds the machine there.
     """
-    if position is None:
-        position = position_in(plant, plant.point(controller.operating_point[0]).x)
-    model = loaded_model(plant, position)
+    x = plant.point(controller.operating_point[0]).x
+    others = tuple(off_stroke(plant, x).items())
+    model = loaded_model(plant, position_in(plant, x) if position is None else position, others)
     found = machine_loop(model, controller, forces_alone=forces_alone)
     assert found.continuous is not None
     pushed = push_through(found.continuous, disturbance_map(model), controller.sample_time, len(found.Ad))
@@ -342,12 +343,15 @@ def _commanded_system(
 
 
 @lru_cache(maxsize=16)  # every loop of a machine needs it; plants compare by identity
-def loaded_model(plant: Plant, position: float) -> LinearModel:
+def loaded_model(plant: Plant, position: float, others: tuple[tuple[str, float], ...] = ()) -> LinearModel:
     """The machine at rest under its loads at a position of the stroke, m; 0 for a machine without a stroke.
+
+    others : further states that are not zero
 
     Raises CheckError when no input holds the machine there.
     """
-    return linearize(plant, trim(plant, **({plant.stroke: position} if plant.has_stroke else {})))
+    along = {plant.stroke: position} if plant.has_stroke else {}
+    return linearize(plant, trim(plant, **along, **dict(others)))
 
 
 def loaded_loop(
@@ -359,7 +363,8 @@ def loaded_loop(
 
     Raises CheckError when no input holds the machine there.
     """
-    model = loaded_model(plant, at.get(plant.stroke, 0.0))
+    others = tuple((name, x) for name, x in at.items() if name != plant.stroke)
+    model = loaded_model(plant, at.get(plant.stroke, 0.0), others)
     loop = machine_loop(model, controller, current_loops, forces_alone=True)
     m, B, law = len(controller.forces), loop.Bd, loop.control
     into, rest = B[:, :m], B[:, m:]

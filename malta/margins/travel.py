@@ -39,6 +39,7 @@ from malta.margins.uncertain import Compensator, UncertainSystem, is_commutated,
 from malta.margins.weak_coupling import HeldLoop
 from malta.margins.windings import CurrentLoops
 from malta.model.data import plant_of
+from malta.model.plant import off_stroke
 from malta.threads import on_one_thread
 
 if TYPE_CHECKING:
@@ -123,6 +124,7 @@ def _along(
     extent = extent_of(plant, names)
     if not (plant.has_stroke and _is_long(plant, controller, names)):
         at = {plant.stroke: 0.0} if plant.has_stroke else {}
+        at |= off_stroke(plant, plant.point(controller.operating_point[0]).x)
         whole = machine_system(plant, controller, [*names, *extent.intervals], at, current_loops)
         if not plant.has_stroke or whole[0].matrices.n_instructions() < LONG:
             return [whole]
@@ -150,6 +152,8 @@ def _anywhere(
     if not _is_long(plant, controller, names) or law.delay != 1 or law.lag is not None:
         return None
     if plant.sensors is not None:  # the axes have no states for readings
+        return None
+    if off_stroke(plant, plant.point(controller.operating_point[0]).x):
         return None
     along = _along(plant, controller, names, current_loops)
     try:
@@ -265,6 +269,7 @@ def loop_at(
 ) -> tuple[UncertainSystem, Compensator]:
     """The machine's loop at a position along its course (SI); equal arguments return the same records."""
     there, at = machine_at(plant, extent_of(plant, names).course, position)
+    at |= off_stroke(plant, plant.point(controller.operating_point[0]).x)
     return machine_system(there, controller, names, at, current_loops)
 
 
@@ -280,4 +285,5 @@ def loaded_loop_at(
     names : the uncertain parameters, which are no course
     """
     there, at = machine_at(plant, extent_of(plant, names).course, position)
+    at |= off_stroke(plant, plant.point(controller.operating_point[0]).x)
     return loaded_loop(there, controller, at, current_loops)

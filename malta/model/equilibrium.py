@@ -109,16 +109,12 @@ def load_balance(plant: Plant, states: FloatArray) -> FloatArray:
     return _commands(plant, None, states, u, [], loaded=True)[0]
 
 
-def holding_forces(plant: Plant) -> FloatArray:
-    """The forces v to command at the states' zero, so that their currents hold the machine there at rest.
+def holding_commands(plant: Plant, states: FloatArray) -> FloatArray:
+    """The commands whose currents hold the machine at rest at these states, whatever its magnets pull with there.
 
-    A plant that is written about a point off its centre is thus held there, whatever its magnets pull with.
-
-    Raises CheckError when no forces hold it.
+    Raises CheckError when no commands hold it.
     """
-    v = balance(plant, np.zeros(len(plant.states))).v
-    assert v is not None
-    return v
+    return _commands(plant, None, states, _hold(plant, states), [], loaded=True)[0]
 
 
 def _named(plant: Plant, x: FloatArray) -> str:

@@ -393,8 +393,14 @@ def position_in(plant: Plant, x: ArrayLike) -> float:
 
 
 def position_at(plant: Plant, x: ArrayLike) -> dict[str, float]:
-    """The position along the stroke by name, an argument of `plant.at`; empty for a machine without a stroke."""
-    return {plant.stroke: position_in(plant, x)} if plant.has_stroke else {}
+    """The position along the stroke by name, an argument of `plant.at`, and the other states that are not zero."""
+    return ({plant.stroke: position_in(plant, x)} if plant.has_stroke else {}) | off_stroke(plant, x)
+
+
+def off_stroke(plant: Plant, x: ArrayLike) -> dict[str, float]:
+    """The states by name that are not zero, without the stroke."""
+    pairs = zip(plant.states, np.asarray(x).tolist(), strict=True)
+    return {s.name: value for s, value in pairs if value and s.name != plant.stroke}
 
 
 @dataclass(frozen=True, eq=False)

@@ -101,9 +101,7 @@ def _name_signals(schema: Schema, plant: Plant) -> None:
             if key in properties:
                 properties[key] = require_names(properties[key], allowed, all_of=key in complete)
     whole = schema["properties"]
-    whole["operating_point"] = require_names(
-        whole["operating_point"], [plant.stroke] if plant.has_stroke else []
-    )
+    whole["operating_point"] = require_names(whole["operating_point"], states)
     whole["pause"] = require_names(whole["pause"], outputs)
     whole["uncertainty"] = require_names(whole["uncertainty"], units_of(plant.parameters))
 

@@ -189,7 +189,7 @@ def _rest_merits(run: Trajectory) -> tuple[Merit, ...]:
 
 def _step_merits(run: Trajectory, output: int, size: float) -> tuple[Merit, ...]:
     first = int(BEFORE * len(run.t))
-    share = run.p[first:, output] / size
+    share = (run.p[first:, output] - run.reference[0, output]) / size
     t = run.t[first:] - run.t[first]
     outside = np.flatnonzero(np.abs(share - 1) > 0.02)
     settled = float(t[outside[-1]]) if len(outside) and outside[-1] + 1 < len(t) else float("nan")

@@ -13,7 +13,7 @@ from scipy.special import erf
 
 from malta.errors import InputError
 from malta.model.data import plant_of
-from malta.model.plant import Plant, position_in
+from malta.model.plant import Plant, off_stroke, position_in
 from malta.simulation import references
 from malta.simulation.anticipation import countering_forces
 from malta.simulation.engines import evaluate
@@ -45,8 +45,19 @@ def inputs_of(run: Simulation) -> Inputs:
     if samples > LONGEST:
         raise InputError(f"scenario {scenario.name}", "duration", f"{samples} samples", f"at most {LONGEST}")
     t = np.arange(samples) * Ts
-    motion = scenario.reference(run.plant)(t)
+    motion = motion_of(scenario, run.plant, run.controller, t)
     return Inputs(t, motion, sample_inputs(run, motion, t))
+
+
+def motion_of(scenario: Scenario, plant: Plant, c: Controller, t: FloatArray) -> references.Motion:
+    """The reference of a scenario, about the outputs of the controller's operating point without its stroke."""
+    motion = scenario.reference(plant)(t)
+    believed = plant_of(c.parameters)
+    beside = off_stroke(believed, believed.point(c.operating_point[0]).x)
+    if not beside:
+        return motion
+    here, zero = (np.array(ca.DM(believed.h(ca.DM(believed.state(at)), 0))).ravel() for at in (beside, {}))
+    return motion._replace(p=motion.p + (here - zero))
 
 
 def sample_inputs(run: Simulation, motion: references.Motion, t: FloatArray) -> FloatArray:
@@ -233,7 +244,9 @@ def initial_values(run: Simulation, first: FloatArray) -> tuple[FloatArray, ...]
     if not scenario.cold:
         if c.tracks == "states":
             xi_pred[: len(design)] = x[list(plant.controlled)]
-        held = c.feedforward.at(position_in(plant, x))
+        held, hold = c.feedforward.at(position_in(plant, x)), c.feedforward.position
+        if hold.size:
+            held = held + hold @ moving[: hold.shape[1]]
         n, m, known = len(design), len(held), c.lagging + c.delay
         if known:  # the forces of the samples before, with currents commutated for this position
             newest = n + m * (known - 1)

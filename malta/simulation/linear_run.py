@@ -16,7 +16,7 @@ import numpy as np
 from malta.errors import InputError
 from malta.model.data import plant_of
 from malta.simulation.engines import evaluate
-from malta.simulation.inputs import feedforward, past_forces
+from malta.simulation.inputs import feedforward, motion_of, past_forces
 from malta.simulation.period import state_reference
 
 if TYPE_CHECKING:
@@ -50,7 +50,7 @@ def linear_run(loop: Loop, controller: Controller, scenario: Scenario) -> Linear
     if samples > LONGEST:
         raise InputError(f"scenario {scenario.name}", "duration", f"{samples} samples", f"at most {LONGEST}")
     t = np.arange(samples) * c.sample_time
-    motion = scenario.reference(plant)(t)
+    motion = motion_of(scenario, plant, c, t)
     here = np.array(ca.DM(plant.h(ca.DM(plant.point(c.operating_point[0]).x), 0))).ravel()
     r = _references(c, motion, here)
     closed, driven = loop.closed, r @ np.vstack([loop.Bd @ law.D_r, law.B_r]).T
@@ -77,7 +77,9 @@ def _at_rest(closed: FloatArray, driven: FloatArray) -> FloatArray:
 
 def _references(c: Controller, motion: Motion, here: FloatArray) -> FloatArray:
     """r = (p*, xi*, v_ff, v0) at every sample, as deviations from the operating point; v0 follows the readings."""
-    v_ff = feedforward(c, motion)
+    v_ff, hold = feedforward(c, motion), c.feedforward.position
+    if hold.size:  # at the operating point it is no deviation
+        v_ff = v_ff - c.operating_point[0][: hold.shape[1]] @ hold.T
     zeros, p = np.zeros_like(v_ff), motion.p - here
     if c.tracks == "errors":
         return np.hstack([p, np.zeros((len(p), len(c.states))), v_ff, zeros])

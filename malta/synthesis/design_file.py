@@ -435,16 +435,13 @@ def _with_entries(content: dict[str, Any], entries: Mapping[str, Any], where: Pa
 
 
 def _operating_point(entries: Mapping[str, Quantity], plant: Plant, where: Path) -> dict[str, float]:
-    """Along the stroke only: elsewhere v0(z) knows no equilibrium, and a plant is written about its point."""
-    units = {s.name: s.unit for s in plant.design_states if s.name == plant.stroke}
+    """States of the design model by name; the others are zero."""
+    units = {s.name: s.unit for s in plant.design_states}
     values = {}
     for name, q in entries.items():
         if name not in units:
-            alone = (
-                f"{plant.stroke}, the stroke, alone" if plant.has_stroke else "none, as there is no stroke"
-            )
-            expected = f"{alone}; a plant is written about another point, as its states' zero"
-            raise InputError(where, f"operating_point.{name}", "another state", expected)
+            expected = "one of " + " ".join(units)
+            raise InputError(where, f"operating_point.{name}", "an unknown state", expected)
         values[name] = to_si(q.value, q.unit, units[name], where, f"operating_point.{name}")
         if not math.isfinite(values[name]):
             raise InputError(where, f"operating_point.{name}", str(values[name]), "a finite number")

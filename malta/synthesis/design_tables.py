@@ -123,7 +123,7 @@ class DesignFile(Record):
         "by output: rate of the reference above which the sum of its errors waits", default=None
     )
     commutation: Place = entry("position for which currents are commutated", default="measured")
-    operating_point: dict[StrictStr, Quantity] = entry("of the stroke; an empty table without one")
+    operating_point: dict[StrictStr, Quantity] = entry("states by name; the others are zero")
     weights: WeightsTable | None = entry("weights of an LQG", default=None)
     bases: BasesTable | None = entry("what a weight of 1 is worth", default=None)
     noise: NoiseTable | None = entry("noise of one sample that the filter expects", default=None)

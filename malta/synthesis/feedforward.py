@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from malta.errors import CheckError, InputError
-from malta.model.equilibrium import holding_forces, load_balance
+from malta.model.equilibrium import holding_commands, load_balance
 from malta.model.linearize import LinearModel
-from malta.model.plant import Actuator, Plant
+from malta.model.plant import Actuator, Plant, off_stroke
 from malta.synthesis.controller import (
     Commutation,
     Controller,
@@ -108,7 +108,7 @@ def feedforward(model: LinearModel, Ts: float, delay: int = 0, lead: float = 0.0
     commutated for a place `lead` (s) ahead:
         Ad (0, w) + Bd (f - H (Ts delay - lead) p*') = (Ts P^-1 p*', w)
     """
-    static, half = static_feedforward(model.plant), len(model.A) // 2
+    static, half = _about(model, static_feedforward(model.plant)), len(model.A) // 2
     if not model.E.any():
         return static
     model.plant.require_second_order("held currents")
@@ -150,6 +150,30 @@ def commutate_ahead(controller: Controller, model: LinearModel) -> Controller:
     )
 
 
+def _about(model: LinearModel, static: Feedforward) -> Feedforward:
+    """The feedforward at a model's operating point, which may lie off the stroke.
+
+    The law's states count from the states' zero, and its model holds them at q0 by -G^-1 k q0. These forces follow the
+    reference, and v0(z) is what else holds the machine there.
+    """
+    plant, point = model.plant, model.operating_point
+    beside = off_stroke(plant, point.x)
+    if not beside:
+        return static
+    states = np.tile(plant.state(beside), (len(static.z_grid), 1))
+    if plant.has_stroke:
+        states[:, plant.stroke_state] = static.z_grid
+    apart = plant.state(beside)[list(plant.controlled)]
+    own: FloatArray
+    if plant.second_order:
+        position = holding_gain(model.A, model.B)
+        own = position @ apart[: position.shape[1]]
+    else:
+        position = static.position
+        own = -np.linalg.lstsq(model.B, model.A @ apart, rcond=None)[0]
+    return replace(static, v0=holding_commands(plant, states) - own, position=position)
+
+
 @lru_cache(maxsize=8)  # every controller of a machine has it; plants compare by identity
 def static_feedforward(plant: Plant) -> Feedforward:
     """Inertias, and v0(z): the forces that hold the machine along its travel against gravity and cogging.
@@ -165,5 +189,5 @@ def static_feedforward(plant: Plant) -> Feedforward:
         v0 = load_balance(plant, along)
     else:
         z_grid = np.array([0.0, 1.0])
-        v0 = np.tile(holding_forces(plant), (2, 1))
+        v0 = np.tile(holding_commands(plant, np.zeros((1, len(plant.states)))), (2, 1))
     return Feedforward(np.array(plant.inertia), np.zeros((m, p)), np.zeros((rates, p)), z_grid, v0)
