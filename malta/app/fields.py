@@ -171,7 +171,9 @@ def _place_fields(files: DesignFiles) -> Iterator[Field]:
     """The operating point and the box of the uncertainty."""
     plant, content = files.spec.plant, files.content
     for name, q in content["operating_point"].items():
-        reach = plant.travel / to_si(1.0, q["unit"], "m", "", name)
+        reach = 2 * abs(q["value"]) or 1.0
+        if name == plant.stroke:
+            reach = plant.travel / to_si(1.0, q["unit"], "m", "", name)
         yield Field(
             f"operating_point.{name}", "Operating point", name, q["value"], q["unit"], "linear", -reach, reach
         )

@@ -88,10 +88,10 @@ class Problem:
 def solve(edited: Edited) -> Problem:
     """Synthesize the controller of an edited design. Raises InputError and CheckError as `synthesize`."""
     spec = edited.spec
-    position = spec.operating_point.get(spec.plant.stroke, 0.0)
-    controller = synthesize(spec, _design_model(spec.plant, position))
+    at = tuple(spec.operating_point.items())
+    controller = synthesize(spec, _design_model(spec.plant, at))
     plant = _machine(edited)
-    return Problem(spec, plant, _design_model(plant, position), controller)
+    return Problem(spec, plant, _design_model(plant, at), controller)
 
 
 def _machine(edited: Edited) -> Plant:
@@ -102,8 +102,8 @@ def _machine(edited: Edited) -> Plant:
 
 
 @lru_cache(maxsize=8)  # every controller of a machine needs it; plants compare by identity
-def _design_model(plant: Plant, position: float) -> LinearModel:
-    return linearize(plant, plant.at(**({plant.stroke: position} if plant.has_stroke else {})))
+def _design_model(plant: Plant, at: tuple[tuple[str, float], ...]) -> LinearModel:
+    return linearize(plant, plant.at(**dict(at)))
 
 
 def picture(problem: Problem, view: View, first: int | None = None, *, margin: bool = True) -> dict[str, Any]:

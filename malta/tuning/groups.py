@@ -150,7 +150,8 @@ def groups_of(spec: Spec) -> list[Group]:
     loaded = linearize(plant, trim(plant, **spec.operating_point))
     position = spec.operating_point.get(plant.stroke, 0.0)
     along = sorted({position, -plant.travel, plant.travel}) if plant.has_stroke else []
-    positions: list[dict[str, float]] = [{plant.stroke: z} for z in along] or [{}]
+    beside = {name: x for name, x in spec.operating_point.items() if name != plant.stroke}
+    positions = [{plant.stroke: z} | beside for z in along] or [beside]
     slope = _slope(plant, position)
     names = tuple(spec.uncertainty)
     proven = "margin" in spec.specification
@@ -158,7 +159,7 @@ def groups_of(spec: Spec) -> list[Group]:
     windings = None if driven is None else driven.windings
     systems = [of_plant(plant, names, at=place, windings=windings) for place in positions] if proven else []
     trims = _loaded_places(spec)
-    held = _with_windings(spec, driven, Part(loaded.A, model.B, model.C))
+    held = _with_windings(spec, driven, Part(loaded.A, loaded.B, model.C))
     found = []
     for i, j, o in _components(spec, positions):
         part = Part(model.A[np.ix_(i, i)], model.B[np.ix_(i, j)], model.C[np.ix_(o, i)])
