@@ -16,6 +16,7 @@ from malta.margins.plants import of_plant
 from malta.model.equilibrium import commanded
 from malta.model.plant import OperatingPoint
 from malta.simulation.linear_run import linear_run
+from malta.simulation.payload import held_payload
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -395,3 +396,14 @@ def test_a_moving_operating_point_is_refused_in_one_sentence(off_centre: malta.S
         malta.CheckError, match=r"no input holds the state q_dot = 0.1 m/s: q changes at 0.1 m/s"
     ):
         malta.synthesize(off_centre, malta.linearize(ball, ball.at(q_dot=0.1)))
+
+
+def test_a_payload_ends_where_no_command_carries_it() -> None:
+    """Currents that are clipped at 2.5 A make C (bias + 2.5 A)^2 / g0^2 = 30 N at most."""
+
+    def clipped(par: Any) -> Plant:
+        plant = bench(par)
+        return replace(plant, variant=clipped, currents=lambda y, v: ca.fmin(plant.currents(y, v), 2.5))
+
+    most = BENCH.C * 4.0**2 / BENCH.g0**2
+    assert held_payload(clipped(BENCH)) == pytest.approx(most / 9.81 - BENCH.m, rel=1e-6)

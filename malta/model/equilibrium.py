@@ -48,7 +48,7 @@ def trim(plant: Plant, /, **positions: float) -> OperatingPoint:
     >>> import malta
     >>> ball = malta.read_design("examples/ball/design/ball.toml").plant
     >>> held = malta.trim(ball, q=1e-3)
-    >>> held.u.round(3).tolist(), held.v.round(3).tolist()  # N: its weight, and what is commanded for it
+    >>> held.u.round(3).tolist(), held.v.round(3).tolist()  # N: acting, commanded
     ([0.981], [-0.523])
     """
     point = balance(plant, plant.state(positions))

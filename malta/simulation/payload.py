@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from scipy.optimize import brentq
 
+from malta.errors import CheckError
 from malta.model.equilibrium import balance
 from malta.model.parameters import units_of
 from malta.simulation.catalogue import experiment
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 EXPERIMENT = "payload"
 PLACES = (-1.0, 0.0, 1.0)  # of the travel
 HEAVIEST = 1e6  # kg; what holds that is not limited by its forces
+UNREACHED = 2.0  # share of a limit, beyond it, where no command makes the forces
 STEP = 0.02  # of a mass: how finely the flight is bisected
 
 
@@ -61,7 +63,10 @@ def held_payload(plant: Plant) -> float:
 
     def share_used(extra: float) -> float:
         heavier = plant.variant(replace(par, m=par.m + extra))
-        held = [balance(heavier, plant.state(at)).v for at in places]
+        try:
+            held = [balance(heavier, plant.state(at)).v for at in places]
+        except CheckError:  # no command makes these forces
+            return UNREACHED
         return float(np.abs(np.array(held) / limits).max())
 
     if share_used(0.0) >= 1:
