@@ -44,7 +44,8 @@ def test_every_machine_can_bound_its_outputs_and_inputs_one_by_one(tmp_path: Pat
     assert rows["force_noise F_x", "covariance"].found == pytest.approx(noise.force[0], rel=1e-12)
     assert rows["motion x", "covariance"].holds
     assert not rows["force_noise F_x", "covariance"].holds
-    assert rows["force_noise F_x", "simulated hold"].unit == "N"
+    assert rows["force_noise F_x", "covariance"].unit == "N"
+    assert len(rows) == len(spec.specification)
 
 
 def test_a_machines_own_replace_generic_ones_of_their_name(tmp_path: Path) -> None:

@@ -74,10 +74,12 @@ def _requirements(problem: Problem, edited: Edited) -> Iterator[dict[str, Any]]:
 
 
 def outcome_document(outcomes: list[Outcome]) -> dict[str, Any]:
-    """The figure of a requirement that is nearest to its bound, or furthest beyond it."""
-    worst = max(outcomes, key=lambda o: o.ratio)
+    """The figure of a requirement that is nearest to its bound, or furthest beyond it; "holds" is null if undecided."""
+    worst = max(outcomes, key=lambda o: (o.verdict == "fails", o.verdict == "undecided", o.ratio))
     found = worst.found if math.isfinite(worst.found) else None
-    return {"holds": worst.holds, "found": found, "how": worst.how}
+    holds = None if worst.verdict == "undecided" else worst.holds
+    how = f"{worst.how}, undecided" if holds is None else worst.how
+    return {"holds": holds, "found": found, "how": how}
 
 
 def _proof(problem: Problem, newer: Newer) -> Iterator[dict[str, Any]]:

@@ -19,6 +19,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol
 
 import numpy as np
+from scipy import special
 
 from malta.model.machines import attribute_of
 from malta.model.plant import Plant, Signal
@@ -34,7 +35,10 @@ if TYPE_CHECKING:
 Law = Literal["LQG", "PID"]
 Trade = Literal["force", "motion"]
 Form = Literal["number", "switch", "outputs", "inputs", "loads"]
+Verdict = Literal["holds", "fails", "undecided"]
 Indices = Callable[[Plant], Sequence[int]]  # of some of a plant's outputs, or inputs
+SEEDS = (4, 8, 16, 32)  # numbers of seeds after which a simulated figure is compared with its bound
+CONFIDENCE = 0.95  # of the intervals at all of SEEDS together
 
 
 class Figure(NamedTuple):
@@ -42,6 +46,7 @@ class Figure(NamedTuple):
 
     value: float
     source: str
+    interval: tuple[float, float] | None = None  # CONFIDENCE of the value, where it is a mean over seeds
 
 
 class Noise(NamedTuple):
@@ -76,11 +81,7 @@ class Design(Protocol):
 
     @property
     def noise(self) -> Noise:
-        """By the covariance of the machine's linear loop."""
-
-    @property
-    def hold(self) -> Noise:
-        """On the simulated machine at rest."""
+        """By the covariance of the machine's linear loop, each reading's step q as noise of variance q^2 / 12."""
 
     @property
     def load_figures(self) -> Mapping[str, float]:
@@ -151,7 +152,8 @@ class Requirement:
     """A key of [specification].
 
     name : as it stands in the file
-    measure : (design, bound, signal) -> figures, each of which is judged; signal is "" unless `form` is of signals
+    measure : (design, bound, signal) -> figures, each of which is judged; signal is "" unless `form` is of signals.
+        One quantity has one figure: of a linear loop by its covariance, of noisy flights by `mean_over_seeds`
     unit : SI; of a requirement by signal each signal's own
     at_least : bounds from below; otherwise from above
     laws : the kinds of controllers that can be asked for it
@@ -203,6 +205,52 @@ def ratio_of(asked: float, found: float, *, at_least: bool) -> float:
     if at_least:
         return asked / found if found > 0 else math.inf
     return found / asked
+
+
+def judge_figure(figure: Figure, asked: float | None, *, at_least: bool) -> Verdict:
+    """Compare a figure with its bound: "undecided" where its interval holds values on both sides of the bound.
+
+    asked : the bound; None: as little as the others leave, which holds
+
+    >>> judge_figure(Figure(1.0, "mean", (0.9, 1.1)), 1.05, at_least=False)
+    'undecided'
+    """
+    bound = math.inf if asked is None else asked
+    ends = figure.interval or (figure.value, figure.value)
+    within = [ratio_of(bound, end, at_least=at_least) <= 1 for end in ends]
+    return "holds" if all(within) else "undecided" if any(within) else "fails"
+
+
+def mean_over_seeds(
+    draw: Callable[[int], float], asked: float, source: str, *, at_least: bool = False
+) -> Figure:
+    """Average a simulated figure over seeds of the noise until its interval decides against the bound.
+
+    After each number n of SEEDS the interval is mean -+ t s / sqrt(n), with Student's t (two sides) for a confidence of
+    1 - (1 - CONFIDENCE) / len(SEEDS), so that all of them hold the expected value with CONFIDENCE (Bonferroni).
+    Figures are taken as normal. No clock ends it: the number of seeds, and so the verdict, hangs on no computer's speed.
+
+    draw : seed -> the figure of one run; infinite for a run that failed
+    asked : the bound
+
+    Returns a Figure with its interval, after the last of SEEDS whether or not that decides; of a failed run an
+    infinite one.
+
+    >>> mean_over_seeds(lambda seed: 2.0 + 0.1 * (seed % 2), 3.0, "a run").source
+    'a run, 4 seeds'
+    """
+    found: list[float] = []
+    for n in SEEDS:
+        found += [draw(seed) for seed in range(len(found), n)]
+        if not all(map(math.isfinite, found)):
+            return Figure(math.inf, f"{source}, a run of {n} failed")
+        mean, spread = float(np.mean(found)), float(np.std(found, ddof=1))
+        t = float(special.stdtrit(n - 1, 1 - (1 - CONFIDENCE) / (2 * len(SEEDS))))
+        half = t * spread / math.sqrt(n)
+        figure = Figure(mean, f"{source}, {n} seeds", (mean - half, mean + half))
+        if judge_figure(figure, asked, at_least=at_least) != "undecided":
+            break
+    return figure
 
 
 # --- requirements that machines make of their outputs, inputs and experiments ---
@@ -262,11 +310,8 @@ def worst_merit(experiment: Any, merit: int = 0) -> float:
 
 
 def _worst(design: Design, kind: Trade, indices: Sequence[int]) -> list[Figure]:
-    """The largest of these, by the covariance and on the simulated machine."""
-    return [
-        Figure(float(getattr(noise, kind)[list(indices)].max()), source)
-        for noise, source in ((design.noise, "covariance"), (design.hold, "simulated hold"))
-    ]
+    """The largest of these, by the covariance."""
+    return [Figure(float(getattr(design.noise, kind)[list(indices)].max()), "covariance")]
 
 
 def _largest(values: FloatArray, places: Sequence[int], indices: Sequence[int]) -> float | None:

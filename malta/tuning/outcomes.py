@@ -8,20 +8,14 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-import numpy as np
-
 from malta.errors import InputError
 from malta.margins.loops import machine_loop
 from malta.margins.recovery import bounded_deviation, worst_along
 from malta.margins.verify import BANDWIDTHS, verify
 from malta.model.linearize import linearize
-from malta.simulation import references
 from malta.simulation.catalogue import experiment
-from malta.simulation.experiments import scenario_of
-from malta.simulation.layout import fidelities
-from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate
-from malta.synthesis.requirements import Figure, Noise, Requirement, ratio_of, requirements_for
+from malta.synthesis.requirements import Figure, Noise, Requirement, judge_figure, ratio_of, requirements_for
 from malta.tuning.noise import noise_of
 from malta.tuning.pid import loads_of, loop_figures, whole_machine
 from malta.tuning.search import base_of, model_and_controller
@@ -29,14 +23,14 @@ from malta.tuning.search import base_of, model_and_controller
 if TYPE_CHECKING:
     from malta.margins.verify import Margins
     from malta.model.linearize import LinearModel
-    from malta.model.plant import FloatArray, Parameters, Plant
+    from malta.model.plant import Parameters, Plant
     from malta.simulation.experiments import Experiment
+    from malta.simulation.scenario import Scenario
     from malta.simulation.trajectory import Trajectory
     from malta.synthesis.controller import Controller
     from malta.synthesis.recovery import RecoveryBound
+    from malta.synthesis.requirements import Verdict
     from malta.synthesis.spec import Spec
-
-HOLD, SAMPLES = 2.0, 2000  # s, and samples at the least, of the simulated rest; its second half counts
 
 
 class Outcome(NamedTuple):
@@ -48,6 +42,7 @@ class Outcome(NamedTuple):
     unit: str
     how: str  # where the figure comes from
     at_least: bool = False  # asked for from below
+    interval: tuple[float, float] | None = None  # 95 % confidence of a simulated figure
 
     @property
     def ratio(self) -> float:
@@ -56,16 +51,25 @@ class Outcome(NamedTuple):
         return ratio_of(asked, self.found, at_least=self.at_least)
 
     @property
+    def verdict(self) -> Verdict:
+        """Whether the bound holds; "undecided" where the interval of a simulated figure has the bound within."""
+        return judge_figure(Figure(self.found, self.how, self.interval), self.asked, at_least=self.at_least)
+
+    @property
     def holds(self) -> bool:
-        """Whether the figure is within its bound."""
-        return self.ratio <= 1
+        """Whether the figure is within its bound; not where that is undecided."""
+        return self.verdict == "holds"
 
     def __str__(self) -> str:
         unit = "" if self.unit == "1" else f" {self.unit}"
         if self.asked is None:
             return f"{self.name} is {self.found:.4g}{unit}, asked for little"
         bound = "at least" if self.at_least else "at most"
-        return f"{self.name} is {self.found:.4g}{unit}, asked for {bound} {self.asked:.4g}{unit}"
+        text = f"{self.name} is {self.found:.4g}{unit}, asked for {bound} {self.asked:.4g}{unit}"
+        if self.verdict != "undecided" or self.interval is None:
+            return text
+        low, high = self.interval
+        return f"{text}, undecided between {low:.4g} and {high:.4g}{unit}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,18 +102,6 @@ class SynthesizedDesign:
     def noise(self) -> Noise:
         """Motion and commanded forces at rest, rms, by the covariance of the machine's linear loop."""
         return noise_of(machine_loop(self.model, self.controller), self.plant)
-
-    @cached_property
-    def hold(self) -> Noise:
-        """The same on the simulated machine."""
-        duration = max(HOLD, SAMPLES * self.controller.sample_time)
-        able = fidelities(self.plant)
-        fidelity = Scenario.fidelity if Scenario.fidelity in able else able[0]
-        scenario = scenario_of("hold", duration, references.hold, {"fidelity": fidelity})
-        run = self.simulate(self.spec.parameters, scenario)
-        rest = slice(-len(run.t) // 2, None)
-        moved, pushed = run.p[rest], run.v[rest] - run.v[rest].mean(axis=0)
-        return Noise(_rms(moved - moved.mean(axis=0)), _rms(pushed))
 
     @cached_property
     def load_figures(self) -> Mapping[str, float]:
@@ -170,7 +162,7 @@ def outcomes_of(design: SynthesizedDesign, name: str) -> list[Outcome]:
     requirement, signal, asked = known[base_of(name)], name.partition(" ")[2], spec.specification[name]
     unit = requirement.unit_of(spec, signal)
     return [
-        Outcome(name, asked, figure.value, unit, figure.source, requirement.at_least)
+        Outcome(name, asked, figure.value, unit, figure.source, requirement.at_least, figure.interval)
         for figure in _measure(requirement, design, asked, signal)
     ]
 
@@ -190,7 +182,3 @@ def _load_errors(design: SynthesizedDesign) -> list[Outcome]:
         found = design.load_figures.get(name, math.inf)
         outcomes.append(Outcome(name, None, found, f"{output.unit} s^0.5", how))
     return outcomes
-
-
-def _rms(values: FloatArray) -> FloatArray:
-    return np.asarray(np.sqrt(np.mean(np.square(values), axis=0)))

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from malta.model.linearize import linearize
 from malta.synthesis.pid import axes_of, law_of_outputs, pid_gains
-from malta.synthesis.requirements import requirements_for
 from malta.tuning.groups import figures_of_gains, groups_of
 from malta.tuning.search import base_of
 
@@ -21,7 +20,6 @@ if TYPE_CHECKING:
     from malta.tuning.groups import Group
 
 EXACT = {"load_error", "noise_motion", "peak_sensitivity", "bandwidth"}  # tuning.pid computes these
-SCATTER = 0.03  # of a noise's rms over one simulated rest, by which it is judged beside the covariance
 BETWEEN = 1e-3  # of a margin: the corners of the box are interpolated between samples of the machine
 OF = " of "  # between the name of an estimate and the outputs that it is of
 
@@ -80,11 +78,8 @@ def _figures(spec: Spec, group: Group, terms: Pid, axes: Axes) -> dict[str, floa
     P = group.model.C[:, : len(group.states) // 2]
     few, own = law_of_outputs(terms, axes, group.outputs)
     gains = pid_gains(P, few, spec.sample_time, own._replace(of_positions=own.of_outputs @ P))
-    known = requirements_for(spec.plant)
     figures = {}
     for name, value in figures_of_gains(spec, group, gains).items():
         if base_of(name) not in EXACT:
-            noisy = known[base_of(name)].trade is not None
-            clear = 1 + SCATTER if noisy else 1 - BETWEEN if base_of(name) == "margin" else 1.0
-            figures[name] = clear * value
+            figures[name] = (1 - BETWEEN if base_of(name) == "margin" else 1.0) * value
     return figures

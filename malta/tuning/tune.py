@@ -72,7 +72,7 @@ def tune(
     >>> spec = malta.read_design("examples/ball/design/ball.toml")
     >>> tuned = malta.tune(spec, effort=Effort(generations=4, polish=10, front=0))
     >>> tuned.reached, [requirement.name for requirement in tuned.requirements]
-    (True, ['margin', 'peak_sensitivity', 'motion y', 'motion y', 'force_noise f', 'force_noise f'])
+    (True, ['margin', 'peak_sensitivity', 'motion y', 'force_noise f'])
     """
     if not spec.specification:
         raise InputError(spec.path, "specification", "nothing", "a table of what the design shall reach")

@@ -98,7 +98,11 @@ class RequirementPart(Part):
     unit: str
     how: str = Field(description="where the figure comes from")
     ratio: Number = Field(description="how near its limit: at most 1 where it holds; null: infinite")
-    holds: bool
+    holds: bool = Field(description="false where the verdict is undecided, too")
+    verdict: Literal["holds", "fails", "undecided"]
+    interval: tuple[float, float] | None = Field(
+        description="95 % confidence of a mean over seeds; null: a figure without chance"
+    )
 
 
 class SearchPart(Part):
@@ -167,6 +171,8 @@ def requirement_part(outcome: Outcome) -> RequirementPart:
         how=outcome.how,
         ratio=outcome.ratio,
         holds=outcome.holds,
+        verdict=outcome.verdict,
+        interval=outcome.interval,
     )
 
 

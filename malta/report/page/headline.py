@@ -115,10 +115,10 @@ def _requirements(a: Analysis) -> Iterator[KeyFigure]:
     asked = [one for one in a.outcomes if one.asked is not None]
     if asked:
         held = sum(one.holds for one in asked)
+        open_ = sum(one.verdict == "undecided" for one in asked)
         state = "good" if held == len(asked) else "bad"
-        yield KeyFigure(
-            "Requirements", f"{held} of {len(asked)} hold", "[specification] of the design file", state
-        )
+        words = f"{held} of {len(asked)} hold" + (f", {open_} undecided" if open_ else "")
+        yield KeyFigure("Requirements", words, "[specification] of the design file", state)
 
 
 def summary_sentences(a: Analysis) -> list[str]:

@@ -35,6 +35,7 @@ from malta.report.tables.margins import (
     worst_case_table,
 )
 from malta.report.tables.recovery import recovery_table
+from malta.report.tables.tuning import found_text
 from malta.tuning.noise import budget_of
 from malta.units import in_unit
 
@@ -128,9 +129,7 @@ def _requirements(a: Analysis) -> Iterator[Item]:
             sign = ">=" if one.at_least else "<="
             asked = f"{sign} {one.asked * scale:.4g}{shown}"
         of = "" if one.asked is None else f"{100 * one.ratio:.1f} %"
-        rows.append(
-            [word, requirement_words(one.name), asked, f"{one.found * scale:.4g}{shown}", of, one.how]
-        )
+        rows.append([word, requirement_words(one.name), asked, found_text(one), of, one.how])
         marks.append((state, "", "", "", "", ""))
     heads = ("", "requirement", "asked", "found", "of the limit", "from")
     sheet = plain_sheet("[specification] of the design file, measured with these gains", heads, rows)
@@ -142,6 +141,8 @@ def _light(one: Outcome) -> tuple[str, str]:
     """The traffic light of a requirement: its mark, and its word for readers without colours."""
     if one.asked is None:
         return "", "–"
+    if one.verdict == "undecided":
+        return "near", "? undecided"
     if not one.holds:
         return "bad", "✗ fails"
     # A test that is passed or failed has its bound as its figure.

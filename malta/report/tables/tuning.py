@@ -37,7 +37,7 @@ def requirements_table(requirements: Sequence[Outcome]) -> Table:
     table = new_table("Requirements", "requirement", "asked", "found", "of the limit", "", "from")
     for r in requirements:
         scale, unit = UNITS.get(r.unit, (1.0, ""))
-        found = f"{r.found * scale:.4g} {unit}".rstrip()
+        found = found_text(r)
         if r.asked is None:
             add_row(table, r.name.replace("_", " "), "least", found, "", "", r.how)
             continue
@@ -48,10 +48,20 @@ def requirements_table(requirements: Sequence[Outcome]) -> Table:
             f"{bound} {r.asked * scale:.4g} {unit}".rstrip(),
             found,
             f"{100 * r.ratio:.1f} %",
-            "holds" if r.holds else "FAILS",
+            "FAILS" if r.verdict == "fails" else r.verdict,
             r.how,
         )
     return table
+
+
+def found_text(outcome: Outcome) -> str:
+    """Write what was found in the unit that is shown; of a mean over seeds with half the width of its interval."""
+    scale, unit = UNITS.get(outcome.unit, (1.0, ""))
+    text = f"{outcome.found * scale:.4g}"
+    if outcome.interval is not None:
+        low, high = outcome.interval
+        text += f" ± {(high - low) / 2 * scale:.2g}"
+    return f"{text} {unit}".rstrip()
 
 
 def _front_columns(tuned: Tuned) -> dict[str, tuple[str, float, str]]:

@@ -1,0 +1,128 @@
+"""One verdict: a requirement has one figure, and every tool prints that figure and that verdict."""
+
+from __future__ import annotations
+
+import json
+import math
+from functools import partial
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from conftest import ROOT
+
+import malta
+from malta.app.worker import outcome_document
+from malta.gains.file import read
+from malta.report.page.headline import _requirements as headline
+from malta.report.tables.tuning import found_text, requirements_table
+from malta.synthesis.requirements import SEEDS, Figure, Verdict, judge_figure, mean_over_seeds
+from malta.tuning.outcomes import Outcome, SynthesizedDesign, judge, outcomes_of
+from malta.tuning.search import model_and_controller
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+OPEN = Outcome("error", 1.0, 0.99, "1", "flights", interval=(0.95, 1.03))
+
+
+def noisy_verdict(mean: float, rng: np.random.Generator, *, at_least: bool = False) -> Verdict:
+    """The verdict of a figure with a scatter of 1 against a bound of 100."""
+    figure = mean_over_seeds(lambda _: mean + rng.standard_normal(), 100.0, "draws", at_least=at_least)
+    return judge_figure(figure, 100.0, at_least=at_least)
+
+
+@pytest.mark.parametrize("at_least", [False, True])
+def test_an_interval_decides_wrongly_in_five_of_a_hundred_at_most(at_least: bool) -> None:
+    """At the bound itself either decision is an error; two scatters off it hardly one decision is."""
+    rng, runs = np.random.default_rng(7), 1500
+    at_bound = [noisy_verdict(100.0, rng, at_least=at_least) for _ in range(runs)]
+    wrong = 1 - at_bound.count("undecided") / runs
+    assert 0.02 < wrong < 0.05 + 2 * math.sqrt(0.05 * 0.95 / runs)
+    above = [noisy_verdict(102.0, rng, at_least=at_least) for _ in range(runs)]
+    right: Verdict = "holds" if at_least else "fails"
+    assert above.count(right) > 0.99 * runs
+
+
+def test_seeds_are_drawn_until_the_interval_decides_and_no_longer() -> None:
+    drawn: list[int] = []
+
+    def draw(seed: int) -> float:
+        drawn.append(seed)
+        return 1.1 if seed % 2 else 0.9
+
+    clear = mean_over_seeds(draw, 2.0, "runs")
+    assert drawn == list(range(SEEDS[0]))
+    assert clear.value == pytest.approx(1.0)
+    drawn.clear()
+    close = mean_over_seeds(draw, 1.001, "runs")
+    assert drawn == list(range(SEEDS[-1]))
+    assert judge_figure(close, 1.001, at_least=False) == "undecided"
+    exact = mean_over_seeds(lambda _: 1.0, 1.0, "runs")
+    assert judge_figure(exact, 1.0, at_least=False) == "holds"
+    lost = mean_over_seeds(lambda seed: math.inf if seed == 2 else 1.0, 2.0, "runs")
+    assert judge_figure(lost, 2.0, at_least=False) == "fails"
+
+
+def test_undecided_is_no_pass_anywhere() -> None:
+    assert (OPEN.verdict, OPEN.holds) == ("undecided", False)
+    assert "undecided between 0.95 and 1.03" in str(OPEN)
+    assert found_text(OPEN) == "0.99 ± 0.04"
+    assert "undecided" in str(list(requirements_table([OPEN]).columns[4].cells))
+    assert outcome_document([OPEN])["holds"] is None
+    held = Outcome("error", 1.0, 0.5, "1", "flights")
+    worse = Outcome("error", 1.0, 1.5, "1", "flights")
+    assert outcome_document([held, OPEN])["holds"] is None
+    assert outcome_document([OPEN, worse])["holds"] is False
+    assert judge_figure(Figure(math.nan, "nothing"), 1.0, at_least=False) == "fails"
+
+
+def test_the_headline_of_a_report_counts_undecided_requirements() -> None:
+    class Page:
+        outcomes = (OPEN, Outcome("margin", 3.0, 3.5, "1", "proof", at_least=True))
+
+    (key,) = headline(Page())  # type: ignore[arg-type]
+    assert "1 of 2 hold, 1 undecided" in str(key)
+    assert "good" not in str(key)
+
+
+def test_undecided_ends_tune_with_exit_code_1(monkeypatch: pytest.MonkeyPatch) -> None:
+    from typer.testing import CliRunner
+
+    from malta.cli.main import app
+
+    monkeypatch.setattr("malta.tuning.outcomes.judge", lambda *_: (OPEN,))
+    ended = CliRunner().invoke(app, ["tune", "--check", str(ROOT / "design" / "halbach_pid.toml"), "--json"])
+    (row,) = json.loads(ended.stdout)["requirements"]
+    assert (row["holds"], row["verdict"], row["interval"]) == (False, "undecided", [0.95, 1.03])
+    assert ended.exit_code != 0
+
+
+def five_verdicts(design: Path, gains: Path) -> None:
+    """The rows of tune, of a gain file (report, compare) and of the app: the same figures and verdicts."""
+    spec = malta.read_design(design)
+    model, controller = model_and_controller(spec)
+    stored = read(gains)
+    tuned = judge(spec)
+    reported = judge(spec, stored)
+    app = SynthesizedDesign(spec, model, controller)
+    shown = {name: outcomes_of(app, name) for name in spec.specification}
+    quiet = [one for one in tuned if one.asked is not None]
+    assert [(r.name, r.verdict) for r in tuned] == [(r.name, r.verdict) for r in reported]
+    assert [r.name for r in quiet] == list(spec.specification)  # one figure for each requirement
+    for mine, other in zip(tuned, reported, strict=True):
+        assert mine.found == pytest.approx(other.found, rel=1e-3), mine.name
+    for row in quiet:
+        (one,) = shown[row.name]
+        assert (one.found, one.verdict) == (row.found, row.verdict)
+
+
+SMALL = ("halbach_pid", "planar_pid")
+LARGE = ("robust", "robust_observer", "tubular_pid")
+
+
+@pytest.mark.parametrize(
+    "name", [*SMALL[:1], *map(partial(pytest.param, marks=pytest.mark.slow), (*SMALL[1:], *LARGE))]
+)
+def test_all_tools_give_one_figure_and_one_verdict(name: str) -> None:
+    five_verdicts(ROOT / "design" / f"{name}.toml", ROOT / "design" / "gains" / f"{name}.json")
