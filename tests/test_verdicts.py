@@ -111,7 +111,12 @@ def five_verdicts(design: Path, gains: Path) -> None:
     assert [(r.name, r.verdict) for r in tuned] == [(r.name, r.verdict) for r in reported]
     assert [r.name for r in quiet] == list(spec.specification)  # one figure for each requirement
     for mine, other in zip(tuned, reported, strict=True):
-        assert mine.found == pytest.approx(other.found, rel=1e-3), mine.name
+        if mine.interval is None or other.interval is None:
+            assert mine.found == pytest.approx(other.found, rel=1e-6), mine.name
+        else:  # quantizers make another flight of the last digits of a gain: the same figure within its interval
+            assert max(mine.interval[0], other.interval[0]) <= min(mine.interval[1], other.interval[1]), (
+                mine.name
+            )
     for row in quiet:
         (one,) = shown[row.name]
         assert (one.found, one.verdict) == (row.found, row.verdict)

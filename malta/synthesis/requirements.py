@@ -228,7 +228,7 @@ def mean_over_seeds(
 
     After each number n of SEEDS the interval is mean -+ t s / sqrt(n), with Student's t (two sides) for a confidence of
     1 - (1 - CONFIDENCE) / len(SEEDS), so that all of them hold the expected value with CONFIDENCE (Bonferroni).
-    Figures are taken as normal. No clock ends it: the number of seeds, and so the verdict, hangs on no computer's speed.
+    Figures are taken as normal. No clock ends it, so that no verdict depends on the speed of a computer.
 
     draw : seed -> the figure of one run; infinite for a run that failed
     asked : the bound
