@@ -98,7 +98,7 @@ def test_undecided_ends_tune_with_exit_code_1(monkeypatch: pytest.MonkeyPatch) -
     assert ended.exit_code != 0
 
 
-def five_verdicts(design: Path, gains: Path) -> None:
+def compare_verdicts(design: Path, gains: Path) -> None:
     """The rows of tune, of a gain file (report, compare) and of the app: the same figures and verdicts."""
     spec = malta.read_design(design)
     model, controller = model_and_controller(spec)
@@ -130,4 +130,4 @@ LARGE = ("robust", "robust_observer", "tubular_pid")
     "name", [*SMALL[:1], *map(partial(pytest.param, marks=pytest.mark.slow), (*SMALL[1:], *LARGE))]
 )
 def test_all_tools_give_one_figure_and_one_verdict(name: str) -> None:
-    five_verdicts(ROOT / "design" / f"{name}.toml", ROOT / "design" / "gains" / f"{name}.json")
+    compare_verdicts(ROOT / "design" / f"{name}.toml", ROOT / "design" / "gains" / f"{name}.json")
