@@ -16,6 +16,7 @@ from malta.simulation.scenario import setup_of, steps_of
 
 if TYPE_CHECKING:
     from malta.model.plant import ComplexArray, FloatArray, Plant
+    from malta.simulation.layout import Fidelity
     from malta.synthesis.controller import Controller
 
 LOADS = {"g": 0.0, "F_c": 0.0}  # of the parameters, those without which nothing pulls
@@ -31,15 +32,18 @@ def without_loads(plant: Plant, c: Controller) -> tuple[Plant, Controller]:
     return malta.plant_of(lighter), replace(c, feedforward=table)
 
 
+def default_of(plant: Plant) -> Fidelity:
+    """The fidelity in which simulations run unless another is asked for."""
+    return "dq" if "dq" in fidelities(plant) else "force"
+
+
 def derivative_at_rest(plant: Plant, c: Controller, position: FloatArray, least: int = 40) -> FloatArray:
     """The state matrix of a control period at rest: default fidelity, noise and quantizers off.
 
     position : the states of the machine there
     least : Runge-Kutta steps in a sample, so that their error is far below 1e-6 of every pole
     """
-    rest = malta.Scenario(
-        "rest", 0.1, malta.references.hold, fidelity="dq" if "dq" in fidelities(plant) else "force"
-    )
+    rest = malta.Scenario("rest", 0.1, malta.references.hold, fidelity=default_of(plant))
     s = setup_of(plant, c, rest)
     count = max(least, 16 * steps_of(plant, c, rest) if plant.electronics else 0)
     p = period_of(plant, c, s, numbers_of(plant, c, count), constant=True)
