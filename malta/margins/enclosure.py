@@ -75,7 +75,7 @@ def over_box(f: Polynomial, sides: FloatArray, moves: Sequence[Any] = (), until:
     """
     if f.foreign:
         raise Unproven(f"the model has {f.foreign[0]}, which has no enclosure")
-    low, high = _ends(f, sides)
+    low, high = ends_of(f, sides)
     with precision(BITS):
         known = f.degrees
         plan = _plan(f, low, high, known)
@@ -111,7 +111,7 @@ def _add_bounds(
     return total
 
 
-def _ends(f: Polynomial, sides: FloatArray) -> tuple[list[Any], list[Any]]:
+def ends_of(f: Polynomial, sides: FloatArray) -> tuple[list[Any], list[Any]]:
     """The ends of the box in v, exactly."""
     low, high = [], []
     for (a, b), inverted in zip(sides.tolist(), f.inverted, strict=True):
@@ -165,7 +165,7 @@ def _plan(f: Polynomial, low: list[Any], high: list[Any], known: tuple[int | Non
         middle = [(a + b) / 2 for a, b in zip(low, high, strict=True)]
         (nominal,) = _values(f, [tuple(middle)])
         size = [pair(c if hasattr(c, "abs_upper") else arb(c)) for c in nominal]
-        discs = {i: _discs(f, i, low, high, size) for i in free}
+        discs = {i: discs_of(f, i, low, high, size) for i in free}
     plan: list[Side] = []
     for tail in TAILS:
         plan = [
@@ -186,7 +186,7 @@ class Disc(NamedTuple):
     most: list[tuple[float, int]]
 
 
-def _discs(
+def discs_of(
     f: Polynomial, i: int, low: list[Any], high: list[Any], size: list[tuple[float, int]]
 ) -> list[Disc]:
     """Bounds on discs along one parameter on which the matrices are analytic, the largest disc first.

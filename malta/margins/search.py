@@ -22,6 +22,7 @@ from malta.margins.loss import corner_loss, first_loss
 from malta.margins.parts import Part
 from malta.margins.problem import Problem
 from malta.margins.robust import TIME_UP, Certificate, Margin, Progress
+from malta.margins.signs import Signs, raise_bound, signs_over
 from malta.margins.structured import Structured, rows_of
 from malta.margins.time_limit import TimeUp, time_limit
 from malta.margins.weak_coupling import HeldLoop
@@ -40,6 +41,7 @@ HARD = 4000  # cells after which smaller boxes are proven first
 FEW = 100  # cells of many parameters, of which each is dear, before multipliers take their turn
 NEAR = 1.005  # box of couplings, in multiples of where axes by themselves are lost
 LEVELS = 5  # of these boxes, each half of the next
+SMALLER = 4  # boxes, each half of the last one, that Hurwitz's determinant is tried on
 # of the time for families, by the number of parameters, the last for MANY
 SHARES = (0.6, 0.6, 0.6, 0.6, 0.4, 0.3)
 MANY = 5  # parameters from which on multipliers come before many cells
@@ -47,6 +49,9 @@ LOOK = 0.2  # share of the time for a first look at the poles of corners
 LOOK_AGAIN = 0.3  # share of what is left for another, or GRACE and LATE of the time beyond its end
 GRACE, LATE = 0.4, 0.1  # s, share
 LAST = 20.0  # s that they may take at the end where cells have proven something
+SIGNS = (
+    0.5  # share of the time that is left for Hurwitz's determinant where cells of frequency do not settle it
+)
 TURN, TURN_AFTER = 0.5, 4.0  # their share of the time in that turn, and how many times what was spent before
 
 BOUNDED = "what the position does is bounded, not followed"
@@ -76,6 +81,7 @@ class Job:
         self.upper = math.inf
         self.zero: tuple[Zero, Part] | None = None
         self.reasons: list[str] = []
+        self.signs: Signs | None = None
 
     @property
     def _count(self) -> int:
@@ -175,9 +181,13 @@ class Job:
         searches = self._start(parts, self.target(reach), min(reach, self.upper))
         final = self._advance(searches, reach, min(self.most_cells, FEW if self._count >= MANY else HARD))
         best, kept = 0.0, searches
+        if self._is_open(searches):
+            self._compare_signs()
+            if self._is_settled():
+                return final, searches
         if self._is_open(searches) and self._count >= MANY:
             self._multiply(self.target(reach), TURN, TURN_AFTER * (clock.monotonic() - self.begun))
-            if self._multiplier_bound() > final:
+            if self._bound_beside() > final:
                 self._multiply(self.target(reach), 0.9)
             if self._is_settled():
                 return final, searches
@@ -211,6 +221,25 @@ class Job:
             with suppress(TimeUp), time_limit(self.structured.until):
                 self.structured.raise_bound(target)
 
+    def _compare_signs(self) -> None:
+        """Raise the proven bound by Hurwitz's determinant, which needs no cells of frequency for light damping."""
+        if self.signs is not None or self.box.frame or isinstance(self.problem, HeldLoop):
+            return
+        now = clock.monotonic()
+        until = now + SIGNS * (self.until - now) if math.isfinite(self.until) else now + LAST
+        t = min(self.limit, 1.05 * self.upper)
+        for _ in range(SMALLER):
+            with suppress(Unproven):
+                self.signs = signs_over(self.problem, self.box, t, until)
+                break
+            t /= 2
+        if self.signs is not None:
+            if not self.fixed:
+                raise_bound(self.signs, FINEST, until, CHEAP)
+            raise_bound(self.signs, self.asked, until, self.most_cells)
+            self.upper = min(self.upper, self.signs.upper)
+            self._report(self.signs.lower)
+
     def _report(self, t: float) -> None:
         self.stands = max(self.stands, t)
         if self.progress is not None:
@@ -219,8 +248,12 @@ class Job:
     def _multiplier_bound(self) -> float:
         return 0.0 if self.structured is None else self.structured.lower
 
+    def _bound_beside(self) -> float:
+        """The bound that is proven without cells of frequency: by multipliers, or by Hurwitz's determinant."""
+        return max(self._multiplier_bound(), 0.0 if self.signs is None else self.signs.lower)
+
     def _is_settled(self) -> bool:
-        return self._multiplier_bound() >= self.upper * (1 - self.asked)
+        return self._bound_beside() >= min(self.upper * (1 - self.asked), self.limit * (1 - self.asked))
 
     def _start(self, parts: list[Part], target: float, until: float) -> Searches:
         begun = [
@@ -304,7 +337,7 @@ class Job:
         with time_limit(self.end):
             lower, looked, searches = self._prove_all(parts, reach)
         upper, frequency, witness = self._loss(looked)
-        if max(lower, self._multiplier_bound()) < min(self.limit, upper * (1 - 2 * self.asked)):
+        if max(lower, self._bound_beside()) < min(self.limit, upper) * (1 - 2 * self.asked):
             most = max(LAST, 0.5 * (clock.monotonic() - self.begun)) if lower > 0 else math.inf
             self._multiply(min(self.limit, upper * (1 - self.tolerance)), 1.0, most)
         proofs = [self._certificate(part, s) for part, s in searches]
@@ -317,7 +350,7 @@ class Job:
         # where the enclosure over the whole box is too wide, those over smaller ones may do
         for _ in range(3):
             reach /= 2
-            if lower > reach or self.late() or self._multiplier_bound() > reach:
+            if lower > reach or self.late() or self._bound_beside() > reach:
                 break
             try:
                 inner = self.prove(parts_over(self.problem, self.box, reach, self.until), reach)
@@ -336,7 +369,12 @@ class Job:
     ) -> Margin:
         upper, frequency, witness = loss
         if self.structured is not None and self._multiplier_bound() > lower:
-            lower, proofs = self._multiplier_bound(), [self._multiplier_proof(self.structured)]
+            lower, proofs = (
+                self._multiplier_bound(),
+                [self._whole_proof(self.structured.count, self.structured.lower)],
+            )
+        if self.signs is not None and self.signs.lower > lower:
+            lower, proofs = self.signs.lower, [self._whole_proof(self.signs.count, self.signs.lower)]
         if lower > 0 and not is_nominal_stable(self.problem, self.box):
             lower = 0.0
             self.reasons.append("the nominal loop is not proven stable")
@@ -356,11 +394,11 @@ class Job:
             self.box.searched if math.isinf(upper) else "",
         )  # fmt: skip
 
-    def _multiplier_proof(self, s: Structured) -> Certificate:
+    def _whole_proof(self, count: int, lower: float) -> Certificate:
         axes, top = len(self.box.names), self.problem.physical(math.inf)
         return Certificate(
-            s.count, (0.0, top), np.zeros((0, 3)), np.zeros((0, axes, 2)), np.zeros(0),
-            self.box.sides(s.lower), (False,) * axes, 0,
+            count, (0.0, top), np.zeros((0, 3)), np.zeros((0, axes, 2)), np.zeros(0),
+            self.box.sides(lower), (False,) * axes, 0,
         )  # fmt: skip
 
     def _certificate(self, part: Part, s: Search) -> Certificate:
@@ -373,11 +411,16 @@ class Job:
 
     def _loss(self, reach: float) -> Loss:
         """The witness, confirmed by the poles; else the first loss beyond `reach`, the box that was searched."""
+        touched = self._loss_by_signs()
         if self.zero is not None:
             loss = confirm(self.problem, self.box, *self.zero)
-            if loss is not None:
+            if loss is not None and (touched is None or loss[0] <= touched[0]):
                 return loss
-            self.reasons.append("the poles of the loop do not confirm the witness")
+            if touched is None:
+                self.reasons.append("the poles of the loop do not confirm the witness")
+        if touched is not None:
+            self.zero = None
+            return touched
         return self._first_loss() if reach < self.limit else (math.inf, None, None)
 
     def _first_loss(self) -> Loss:
@@ -387,11 +430,22 @@ class Job:
         with time_limit(now + longest):
             return first_loss(self.problem, self.box, self.limit)
 
+    def _loss_by_signs(self) -> Loss | None:
+        """The witness of Hurwitz's determinant, which may touch the boundary and not cross it."""
+        if self.signs is None or self.signs.witness is None:
+            return None
+        p = self.signs.witness
+        return self.signs.upper, self.problem.critical_frequency(p), p
+
     def _by_poles(self, begun: float) -> Margin:
         """The margin without families: the first loss along the box's diagonals, and a proof by multipliers."""
         loss = self._first_loss()
         self.upper = loss[0]
-        self._multiply(min(self.limit, self.upper * (1 - self.tolerance)), 1.0)
+        self._compare_signs()
+        if not self._is_settled():
+            self._multiply(min(self.limit, self.upper * (1 - self.tolerance)), 1.0)
+        touched = self._loss_by_signs()
+        loss = touched if touched is not None and touched[0] < loss[0] else loss
         return self._margin(0.0, loss, [], begun)
 
 
