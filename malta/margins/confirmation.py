@@ -19,26 +19,31 @@ if TYPE_CHECKING:
     from malta.model.plant import FloatArray
 
 BISECTIONS = 16  # of the way to a witness
+COARSE = 1e-5  # how far beyond a zero, relative, the poles may become unstable without a bisection
 
 
 def confirm(problem: Problem, box: Box, zero: Zero, part: Part) -> Loss | None:
     """The t, frequency and p just beyond a zero at which the poles are unstable; None where they stay stable."""
     p = part.growth.parameters(zero.u)
     w = problem.physical(zero.frequency(part.family))
-    for share in 1 + 10.0 ** np.arange(-9, -1.5, 0.5):
+    stable = 1.0
+    for share in 1 + 10.0 ** np.arange(-9, -0.9, 0.5):
         there = box.stretch(p, share)
         if _is_unstable(problem, there):
             if isinstance(problem, HeldLoop):  # the zero is that of uncoupled axes
                 p = corner_of(problem, box, there)
-                there = box.stretch(p, _first_unstable(problem, box, p))
+                there = box.stretch(p, _first_unstable(problem, box, p, 0.95, 1.0))
                 return float(box.margin(there)), w, there
+            if share > 1 + COARSE:  # a double zero, which is found to the root of rounding
+                share = _first_unstable(problem, box, p, stable, float(share))
+                there = box.stretch(p, share)
             return float(zero.t * share), w, there
+        stable = float(share)
     return None
 
 
-def _first_unstable(problem: Problem, box: Box, p: FloatArray) -> float:
-    """The share of the way to p, which is unstable, from which on the loop is unstable: bisected from 0.95."""
-    low, high = 0.95, 1.0
+def _first_unstable(problem: Problem, box: Box, p: FloatArray, low: float, high: float) -> float:
+    """The share of the way to p, between low and high, from which on the loop is unstable: bisected."""
     for _ in range(BISECTIONS):
         middle = (low + high) / 2
         low, high = (low, middle) if _is_unstable(problem, box.stretch(p, middle)) else (middle, high)
