@@ -37,7 +37,9 @@ class NotAnalytic(Exception):
 
 @lru_cache(maxsize=4096)  # constants and gains are needed at every place
 def exact(x: float) -> Any:
-    """The rational number that a float is."""
+    """The rational number that a float is; rational constants, as another basis has, are what they are."""
+    if isinstance(x, fmpq):
+        return x
     if not abs(x) < float("inf"):
         raise NotAnalytic("a constant that is not finite")
     return fmpq(*float(x).as_integer_ratio())

@@ -3,9 +3,9 @@
     a(s; p) = sum of a_k(p) s^k:    a_0 = 0 (a root at zero),  a_n = 0 (at infinity),  H(p) = 0 (a pair +-jw)
 
 H is Hurwitz's determinant of order n - 1: a_n^(n-1) times the product of all sums of two roots (Orlando). A loop
-that is stable at the nominal values stays stable on a box on which none of the three is zero. They are polynomials of p, or
-close to one: their Bernstein coefficients over parts of the box decide, in exact numbers or balls. The damping of a
-mode, however light, is a factor of H and no width that cells of frequency must resolve.
+that is stable at the nominal values stays stable on a box on which none of the three is zero. They are polynomials of
+p, or close to one: their Bernstein coefficients over parts of the box decide, in exact numbers or balls. The damping of
+a mode, however light, is a factor of H and no width that cells of frequency must resolve.
 """
 
 from __future__ import annotations

@@ -30,6 +30,7 @@ from malta.margins.arguments import (
     number,
     positive,
 )
+from malta.margins.basis import in_plain_basis
 from malta.margins.box import Box, box_of
 from malta.margins.expressions import program
 from malta.margins.groups import loop_of
@@ -258,7 +259,7 @@ def law_of(system: UncertainSystem, compensator: Any, caller: str = "robust_marg
 @lru_cache(maxsize=32)  # several margins need the same loops; records compare by identity
 def problem_of(system: UncertainSystem, law: Compensator) -> OfLoop:
     """The closed loop as a problem, which remembers its polynomials."""
-    return OfLoop(loop_of(system, law), system.names)
+    return OfLoop(in_plain_basis(loop_of(system, law)), system.names)
 
 
 @on_one_thread
