@@ -48,7 +48,7 @@ class Box:
     frame: Mapping[int, tuple[float, float]] = field(
         default_factory=dict
     )  # by index: an interval around `over`, shared by several boxes
-    ends: tuple[str, float] | None = None  # the parameter that reaches its limit at `most`, and the limit
+    ends: str = ""  # what happens at `most`
 
     @property
     def limit(self) -> float:
@@ -58,10 +58,9 @@ class Box:
     @property
     def searched(self) -> str:
         """How far a search goes, in words."""
-        if self.ends is None or self.most * (1 - EDGE) > FAR:
+        if self.most * (1 - EDGE) > FAR:
             return f"up to t = {FAR:g}"
-        name, limit = self.ends
-        return f"up to t = {self.most:.4g}, where {name} reaches its limit {limit:g}"
+        return f"up to t = {self.most:.4g}, where {self.ends}"
 
     def margin(self, p: FloatArray) -> FloatArray:
         """The smallest t with p in box(t): ... -> ..."""
@@ -111,7 +110,7 @@ def box_of(
     by_name(caller, "over", over, '{"k": (1, 2)}')
     k = len(names)
     down, up, fixed = np.zeros(k), np.zeros(k), np.zeros((k, 2))
-    most, ends = math.inf, None
+    most, ends = math.inf, ""
     for name, value in (*ranges.items(), *over.items()):
         if name not in names:
             raise InputError(caller, name, "an unknown parameter", "one of " + " ".join(names))
@@ -129,7 +128,7 @@ def box_of(
         down[i], up[i] = nominal - pair[0], pair[1] - nominal
         for limit, rate in ((low, down[i]), (high, up[i])):
             if rate > 0 and abs(limit - nominal) / rate < most:
-                most, ends = abs(limit - nominal) / rate, (name, limit)
+                most, ends = abs(limit - nominal) / rate, f"{name} reaches its limit {limit:g}"
     if not ranges and not empty:
         raise InputError(caller, "ranges", "no parameters", "at least one uncertain parameter")
     return Box(names, at, down, up, fixed, most, ends=ends)

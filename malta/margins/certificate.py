@@ -94,6 +94,9 @@ def certificate_of(
     """The certificate of a margin as a JSON document."""
     if margin.lower is None:
         raise CheckError(f"no certificate: nothing is proven ({margin.reason})")
+    if any(system.positive is not None for system, _ in places):
+        found = "a model that holds on one branch of its currents alone"
+        raise InputError("certificate", "places", found, "a model without branches and roots")
     system = places[0][0]
     box = _around(box_of(system.names, system.nominal, system.limits, ranges, over or {}), ranges, over or {})
     lower, proven = _prove(places, box, margin.lower)

@@ -2,7 +2,8 @@
 
 The matrices of a planar motor at a place are sums over many coils: ten thousand operations that equal polynomials of a
 few terms. They are expanded exactly, then rounded to doubles once. Entries that symmetry makes zero differ from zero by
-that rounding alone: terms below 1e-11 of the largest in their row and column are left out of the model.
+that rounding alone: terms below 1e-11 of the largest in their row and column are left out of the model. Branches and
+squares of roots are resolved before (branches.py).
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import casadi as ca
 import numpy as np
 
 from malta.margins.algebra import Ratio, Symbolic, symbolic
+from malta.margins.branches import resolve_branches
 from malta.margins.expressions import exact, program
 
 if TYPE_CHECKING:
@@ -25,20 +27,52 @@ ROUNDING = 1e-11  # relative size below which a term is rounding of the model's 
 Table = dict[tuple[int, int], Ratio]
 
 
-def expand_matrices(function: ca.Function, nominal: FloatArray) -> tuple[Symbolic, list[Table]]:
+def expand_matrices(function: ca.Function, nominal: FloatArray) -> tuple[Symbolic, list[Table], list[Ratio]]:
     """The matrices of a function of one vector as exact rational functions, without terms that are rounding.
 
-    nominal : values at which the sizes of terms are compared
+    nominal : values at which the sizes of terms are compared, and branches chosen
+
+    Returns them with their conditions, which are above zero where the matrices are those of the function.
 
     Raises TooLarge or NotAnalytic when the function has no short expansion.
     """
-    s = symbolic(program(function))
+    resolved, conditions = resolve_branches(program(function), nominal.tolist())
+    s = symbolic(resolved)
+    *matrices, positive = s.entries
     scales = np.concatenate([nominal, np.ones(len(s.atoms))])
-    circles = _circles(s)
-    return s, [
-        drop_rounding(s, {at: _replace_cosines(s, r, circles) for at, r in t.items()}, scales)
-        for t in s.entries
-    ]
+    circles, zero = _circles(s), Ratio(s.context.constant(0))
+    above = [positive.get((k, 0), zero) for k in range(resolved.shapes[-1][0])]
+    roots = dict(zip(_roots(s), above[conditions:], strict=True))
+
+    def turned(r: Ratio) -> Ratio:
+        return _replace_squares(s, _replace_cosines(s, r, circles), roots)
+
+    tables = [drop_rounding(s, {at: turned(r) for at, r in t.items()}, scales) for t in matrices]
+    return s, tables, [turned(r) for r in above]
+
+
+def _roots(s: Symbolic) -> list[int]:
+    """The variables that are square roots."""
+    return [s.inputs + k for k, step in enumerate(s.atoms) if s.program.steps[step][0] == "sqrt"]
+
+
+def _replace_squares(s: Symbolic, r: Ratio, roots: Mapping[int, Ratio]) -> Ratio:
+    """Replace squares of roots by their arguments, of the last root first, as its argument may have others."""
+    for i, argument in reversed(list(roots.items())):
+
+        def turn(polynomial: Any, i: int = i, argument: Ratio = argument) -> Ratio:
+            powers: dict[int, dict[Any, Any]] = {}
+            for monomial, c in polynomial.to_dict().items():
+                square, odd = divmod(int(monomial[i]), 2)
+                powers.setdefault(square, {})[*monomial[:i], odd, *monomial[i + 1 :]] = c
+            total = Ratio(s.context.constant(0))
+            for square, terms in powers.items():
+                total = total + Ratio(s.context.from_dict(terms)) * argument**square
+            return total
+
+        if any(p is not None and p.degrees()[i] > 1 for p in (r.num, r.den)):
+            r = turn(r.num) if r.den is None else turn(r.num) / turn(r.den)
+    return r
 
 
 def _circles(s: Symbolic) -> list[tuple[int, int]]:

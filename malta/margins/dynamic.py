@@ -27,6 +27,7 @@ from malta.margins.blocks import (
     probe,
 )
 from malta.margins.box import Box, box_of
+from malta.margins.branches import within_branches
 from malta.margins.enclosure import Unproven
 from malta.margins.families import is_nominal_stable
 from malta.margins.groups import loop_of
@@ -203,6 +204,9 @@ def question_of(
     law = law_of(system, compensator, caller)
     none = {} if over is None else over
     box = box_of(system.names, system.nominal, system.limits, ranges, none, empty=True, caller=caller)
+    box = within_branches(box, system.positive)
+    if not box.most > 0:
+        raise InputError(caller, "over", f"intervals within which {box.ends}", "narrower ones")
     return law, box
 
 

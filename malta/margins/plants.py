@@ -14,7 +14,9 @@ from malta.errors import InputError
 from malta.margins import compact
 from malta.margins.algebra import Ratio, TooLarge
 from malta.margins.arguments import describe
+from malta.margins.branches import without_branches
 from malta.margins.commands import command_of, is_affine
+from malta.margins.expressions import NotAnalytic, program
 from malta.margins.uncertain import (
     UncertainSystem,
     is_commutated,
@@ -75,12 +77,12 @@ def of_plant(
     own = [k for k, name in enumerate(names) if name != plant.stroke]
     z = p[names.index(plant.stroke)] if plant.stroke in names else position
     nominal = [position if name == plant.stroke else getattr(par, name) for name in names]
-    short = (
-        _expanded_matrices(of, p, z, np.array(nominal, dtype=float), held) if is_commutated(plant) else None
-    )
-    why = ""
+    short, positive, why = None, None, ""
+    if is_commutated(plant) or not program(of).rational:
+        short = _expanded_matrices(of, p, z, np.array(nominal, dtype=float), held)
     if short is not None:
-        A, B, C = short
+        A, B, C, above = short
+        positive = ca.Function("positive", [p], [above]) if above.numel() else None
     else:
         acting = of(p[own], z, ca.DM.zeros(len(plant.inputs)))[-1]
         q = ca.SX.sym("v", len(plant.inputs))
@@ -103,7 +105,11 @@ def of_plant(
     bounds = {f.name: (lower_limit(f.metadata), upper_limit(f.metadata)) for f in fields(par)}
     limits = tuple(bounds.get(name, (-math.inf, math.inf)) for name in names)
     matrices = ca.Function("matrices", [p], [A, B, C])
-    return UncertainSystem(tuple(names), readonly(nominal), matrices, limits=limits, approximate=why)
+    if short is None:
+        matrices, positive = without_branches(matrices, nominal)
+    return UncertainSystem(
+        tuple(names), readonly(nominal), matrices, limits=limits, approximate=why, positive=positive
+    )
 
 
 def _sensors_in(plant: Plant, p: Any, names: Sequence[str]) -> LateSensors | None:
@@ -145,8 +151,11 @@ def _check_names(plant: Plant, names: Any) -> None:
 
 def _expanded_matrices(
     of: ca.Function, p: Any, z: Any, nominal: FloatArray, held: FloatArray | None
-) -> tuple[Any, Any, Any] | None:
-    """A, B and C of held currents as short rational functions of p; None when they are not such functions."""
+) -> tuple[Any, Any, Any, Any] | None:
+    """A, B and C of held currents as short rational functions of p, and what is above zero where these hold.
+
+    None when they are not such functions.
+    """
     k, m = p.numel(), of.numel_in(2)
     q = ca.SX.sym("q", k + m)
     fixed = isinstance(z, float)
@@ -158,8 +167,8 @@ def _expanded_matrices(
         return None
     scales = np.concatenate([nominal, np.array(model(np.r_[nominal, np.zeros(m)])[-1]).ravel()])
     try:
-        s, tables = compact.expand_matrices(model, scales)
-    except TooLarge:
+        s, tables, above = compact.expand_matrices(model, scales)
+    except (TooLarge, NotAnalytic):
         return None
     A, B, C, E, made, ratio, preload = tables
     zero = Ratio(s.context.constant(0))
@@ -178,9 +187,11 @@ def _expanded_matrices(
         A = compact.drop_rounding(s, compact.difference(A, carried), scales, A, carried)
         gains = {(i, j): s.constant(float(x)) for (i, j), x in np.ndenumerate(held) if x}
         rest = compact.drop_rounding(s, compact.difference(E, compact.product(B, gains)), scales, E)
-    if not compact.is_free_of_functions(s, (A, B, C, rest)):
+    held_above = {(i, 0): compact.substitute(s, r, wanted) for i, r in enumerate(above)}
+    if not compact.is_free_of_functions(s, (A, B, C, rest, held_above)):
         return None
     b = compact.matrix_of(B, (n, m), p)
     if rest:
         b = ca.horzcat(b, compact.matrix_of(rest, (n, outputs), p))
-    return compact.matrix_of(A, (n, n), p), b, compact.matrix_of(C, (outputs, n), p)
+    a, c = compact.matrix_of(A, (n, n), p), compact.matrix_of(C, (outputs, n), p)
+    return a, b, c, ca.vertcat(*(compact.expression(r, p) for r in held_above.values()))

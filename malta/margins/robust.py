@@ -32,6 +32,7 @@ from malta.margins.arguments import (
 )
 from malta.margins.basis import in_plain_basis
 from malta.margins.box import Box, box_of
+from malta.margins.branches import within_branches
 from malta.margins.expressions import program
 from malta.margins.groups import loop_of
 from malta.margins.loss import first_loss
@@ -177,7 +178,7 @@ def robust_margin(
     effort = Effort(tolerance, time, most_cells, progress)
     law = law_of(system, compensator)
     box = box_of(system.names, system.nominal, system.limits, ranges, {} if over is None else over)
-    return margin_of(problem_of(system, law), box, effort)
+    return margin_of(problem_of(system, law), within_branches(box, system.positive), effort)
 
 
 @on_one_thread
@@ -209,6 +210,8 @@ def common_margin(
             )
     outside = {} if over is None else over
     box = box_of(first.names, first.nominal, first.limits, ranges, outside, caller="common_margin")
+    for system, _ in loops:
+        box = within_branches(box, system.positive)
     return margin_of(OfSeveral(tuple(problem_of(*loop) for loop in loops)), box, effort)
 
 
@@ -241,7 +244,8 @@ def margin_at(
     for name, value in at.items():
         nominal[system.names.index(name)] = value
     frame = {system.names.index(name): interval for name, interval in within.items()}
-    box = replace(box_of(system.names, nominal, system.limits, ranges, {}), frame=frame)
+    box = within_branches(box_of(system.names, nominal, system.limits, ranges, {}), system.positive)
+    box = replace(box, frame=frame)
     return margin_of(problem_of(system, compensator), box, Effort(tolerance, time))
 
 
@@ -357,6 +361,8 @@ def margin_of(problem: Problem, box: Box, effort: Effort) -> Margin:
 
     begun = clock.monotonic()
     until = deadline(begun, effort.time)
+    if not box.most > 0:
+        return Margin(None, math.inf, None, None, {}, {}, (), 0.0, box.ends, box.searched)
     places = box.nominal_places()
     for k in range(0, len(places), PLACES):
         if clock.monotonic() > until:

@@ -229,14 +229,15 @@ class Job:
         until = now + SIGNS * (self.until - now) if math.isfinite(self.until) else now + LAST
         t = min(self.limit, 1.05 * self.upper)
         for _ in range(SMALLER):
-            with suppress(Unproven):
+            with suppress(Unproven, TimeUp), time_limit(until):
                 self.signs = signs_over(self.problem, self.box, t, until)
                 break
             t /= 2
         if self.signs is not None:
-            if not self.fixed:
-                raise_bound(self.signs, FINEST, until, CHEAP)
-            raise_bound(self.signs, self.asked, until, self.most_cells)
+            with suppress(TimeUp), time_limit(until):
+                if not self.fixed:
+                    raise_bound(self.signs, FINEST, until, CHEAP)
+                raise_bound(self.signs, self.asked, until, self.most_cells)
             self.upper = min(self.upper, self.signs.upper)
             self._report(self.signs.lower)
 

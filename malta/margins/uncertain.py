@@ -33,6 +33,7 @@ class UncertainSystem:
     limits : of each parameter, (above, below), exclusive; none: infinite
     sample_time : s, of a discrete system, with x+ in place of x'; None: continuous
     approximate : why the matrices are no exact functions, so that nothing is proven of them; "": they are
+    positive : a casadi.Function p -> values that are above zero wherever `matrices` hold; None: they hold everywhere
 
     >>> import malta
     >>> def motor(J, b):
@@ -49,6 +50,7 @@ class UncertainSystem:
     limits: tuple[tuple[float, float], ...] = ()
     sample_time: float | None = None
     approximate: str = ""
+    positive: ca.Function | None = None
 
     def at(self, p: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """A, B and C at k rows of parameters: arrays of k matrices each.
