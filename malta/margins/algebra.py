@@ -20,6 +20,7 @@ from malta.margins.expressions import (
 from malta.margins.time_limit import check_time
 
 LARGEST = 4000  # terms of an expression at most
+LONGEST = 2_000_000  # products of terms that are added at once: more take seconds
 
 
 class TooLarge(Exception):
@@ -54,6 +55,8 @@ class Ratio:
         return self + (-other)
 
     def __mul__(self, other: Ratio) -> Ratio:
+        if len(self.num) * len(other.num) > LONGEST:
+            raise TooLarge
         if self.den is None and other.den is None:
             return Ratio(self.num * other.num)
         den = self.den if other.den is None else other.den if self.den is None else self.den * other.den

@@ -15,12 +15,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from malta.margins.time_limit import check_time
+
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
 
 EPS = 2.0**-52
 WIDE = 8  # nodes of the following axes from which on values are multiplied in place
 FEW = 6  # degree up to which a restriction is one product of matrices
+COLUMNS = 4096  # of a product of exact matrices at once
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,9 +217,12 @@ def _transform(table: Any, shape: tuple[int, ...], axis: int, M: Any) -> Any:
     array = np.moveaxis(table.reshape(*shape, count), axis, 0)
     rest = array.shape[1:]
     flat = array.reshape(n, -1)
-    product = kind(M) * kind(n, flat.shape[1], flat.ravel().tolist())
-    made = np.empty(flat.size, dtype=object)
-    made[:] = product.entries()
+    own, made = kind(M), np.empty(flat.shape, dtype=object)
+    for k in range(0, flat.shape[1], COLUMNS):
+        check_time()
+        some = flat[:, k : k + COLUMNS]
+        product = own * kind(n, some.shape[1], some.ravel().tolist())
+        made[:, k : k + COLUMNS] = np.array(product.entries(), dtype=object).reshape(some.shape)
     return np.moveaxis(made.reshape(n, *rest), 0, axis).reshape(-1, count)
 
 

@@ -15,7 +15,7 @@ from malta.margins import compact
 from malta.margins.algebra import Ratio, TooLarge
 from malta.margins.arguments import describe
 from malta.margins.branches import without_branches
-from malta.margins.commands import command_of, is_affine
+from malta.margins.commands import command_of
 from malta.margins.expressions import NotAnalytic, program
 from malta.margins.uncertain import (
     UncertainSystem,
@@ -163,7 +163,7 @@ def _expanded_matrices(
     own = [i for i in range(k) if fixed or not ca.is_equal(p[i], z)]
     outputs = of(q[own], place, q[k:])
     model = ca.Function("model", [q], list(outputs))
-    if model.n_instructions() > LONGEST or not is_affine(outputs[4], q[k:]):
+    if model.n_instructions() > LONGEST:
         return None
     scales = np.concatenate([nominal, np.array(model(np.r_[nominal, np.zeros(m)])[-1]).ravel()])
     try:
@@ -174,7 +174,10 @@ def _expanded_matrices(
     zero = Ratio(s.context.constant(0))
     acting = {k + i: preload.get((i, 0), zero) for i in range(m)}
     left = {i: acting[k + i] - compact.substitute(s, made.get((i, 0), zero), acting) for i in range(m)}
-    ratio = {at: compact.substitute(s, r, acting) for at, r in ratio.items()}
+    slope = {at: compact.substitute(s, r, acting) for at, r in ratio.items()}
+    if not all((slope[at] - r).is_zero() for at, r in ratio.items()):
+        return None  # one step finds the command of a chain that is affine in it, and of no other
+    ratio = slope
     moved = compact.solution(
         s, ratio, left, m
     )  # what has to be wanted beyond the preload so that the preload acts

@@ -21,6 +21,7 @@ from malta.margins.characteristic import (
     pair,
 )
 from malta.margins.closed import closed_loop, driven_group
+from malta.margins.companion import companion
 from malta.margins.expressions import (
     BALLS,
     EXACT,
@@ -236,16 +237,29 @@ class OfCoefficients:
             used = self.program.depends[0]
             return tuple(None if i in used else 0 for i in range(len(self.names)))
         found = np.zeros(len(self.names), dtype=int)
-        for r in s.entries[0].values():
-            num = (
-                r.num
-                if self._common is None
-                else r.num * (self._common if r.den is None else self._common / r.den)
-            )
+        for num in self._scaled.values():
             found = np.maximum(found, num.degrees()[: len(self.names)])
         if self._common is not None:
             found = np.maximum(found, self._common.degrees()[: len(self.names)])
         return tuple(int(d) for d in found)
+
+    @cached_property
+    def _scaled(self) -> dict[int, Any]:
+        """The coefficients as polynomials of p, multiplied by the common denominator."""
+        assert self._symbolic is not None
+        common = self._common
+        return {
+            i: r.num if common is None else r.num * (common if r.den is None else common / r.den)
+            for (i, _), r in self._symbolic.entries[0].items()
+        }
+
+    @cached_property
+    def companion(self) -> UncertainLoop | None:
+        """A loop with this polynomial, linear in p; None where there is no short one."""
+        if not self.exact:
+            return None
+        a = [self._scaled[i].to_dict() if i in self._scaled else {} for i in range(self.count)]
+        return companion(self.names, a, 1.0 if self.discrete else None)
 
     def values(self, v: Sequence[Any]) -> list[Any]:
         """The coefficients as they are given."""

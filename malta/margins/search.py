@@ -20,7 +20,7 @@ from malta.margins.exclusion import Search, advance, start
 from malta.margins.families import is_nominal_stable, parts_over
 from malta.margins.loss import corner_loss, first_loss
 from malta.margins.parts import Part
-from malta.margins.problem import Problem
+from malta.margins.problem import OfPolynomial, Problem
 from malta.margins.robust import TIME_UP, Certificate, Margin, Progress
 from malta.margins.signs import Signs, raise_bound, signs_over
 from malta.margins.structured import Structured, rows_of
@@ -45,6 +45,7 @@ SMALLER = 4  # boxes, each half of the last one, that Hurwitz's determinant is t
 # of the time for families, by the number of parameters, the last for MANY
 SHARES = (0.6, 0.6, 0.6, 0.6, 0.4, 0.3)
 MANY = 5  # parameters from which on multipliers come before many cells
+MANY_OF_POLYNOMIALS = 11  # whose cells are cheap
 LOOK = 0.2  # share of the time for a first look at the poles of corners
 LOOK_AGAIN = 0.3  # share of what is left for another, or GRACE and LATE of the time beyond its end
 GRACE, LATE = 0.4, 0.1  # s, share
@@ -87,6 +88,11 @@ class Job:
     def _count(self) -> int:
         """The number of parameters whose ranges grow."""
         return int((self.box.down + self.box.up > 0).sum())
+
+    @property
+    def _is_many(self) -> bool:
+        """Whether the parameters are so many that multipliers come before many cells."""
+        return self._count >= (MANY_OF_POLYNOMIALS if isinstance(self.problem, OfPolynomial) else MANY)
 
     def late(self) -> bool:
         return clock.monotonic() > self.until
@@ -179,13 +185,13 @@ class Job:
         Where the whole box takes long, smaller ones are proven first: each is a bound that stands.
         """
         searches = self._start(parts, self.target(reach), min(reach, self.upper))
-        final = self._advance(searches, reach, min(self.most_cells, FEW if self._count >= MANY else HARD))
+        final = self._advance(searches, reach, min(self.most_cells, FEW if self._is_many else HARD))
         best, kept = 0.0, searches
         if self._is_open(searches):
             self._compare_signs()
             if self._is_settled():
                 return final, searches
-        if self._is_open(searches) and self._count >= MANY:
+        if self._is_open(searches) and self._is_many:
             self._multiply(self.target(reach), TURN, TURN_AFTER * (clock.monotonic() - self.begun))
             if self._bound_beside() > final:
                 self._multiply(self.target(reach), 0.9)

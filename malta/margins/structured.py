@@ -22,7 +22,7 @@ from malta.margins.algebra import TooLarge
 from malta.margins.groups import groups
 from malta.margins.multipliers import Blocks, Multiplier, multiplier
 from malta.margins.pencil import TERMS, Rows
-from malta.margins.problem import OfLoop, OfSeveral, Problem
+from malta.margins.problem import OfLoop, OfPolynomial, OfSeveral, Problem
 from malta.margins.response import Branch, excludes_zero, response
 from malta.margins.time_limit import check_time
 
@@ -354,10 +354,15 @@ def rows_of(problem: Problem) -> list[Rows] | None:
     if isinstance(problem, OfSeveral):
         parts = [rows_of(part) for part in problem.problems]
         return None if any(part is None for part in parts) else [r for part in parts for r in part or []]
-    if not isinstance(problem, OfLoop):
+    if not isinstance(problem, OfLoop | OfPolynomial):
         return None
-    loop = problem.loop
-    if loop.symbolic is None or not loop.program.rational or (loop.descriptor and loop.sampled):
+    loop = problem.loop if isinstance(problem, OfLoop) else problem.polynomial.companion
+    if (
+        loop is None
+        or loop.symbolic is None
+        or not loop.program.rational
+        or (loop.descriptor and loop.sampled)
+    ):
         return None
     try:
         found = [Rows(loop, group) for group in groups(loop)]
