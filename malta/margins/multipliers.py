@@ -11,6 +11,7 @@ which beta^2 D - N* D N - j (G N - N* G) > 0 has a solution is computed by Newto
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -185,11 +186,15 @@ class _Centres:
         b = level + 0.5 * abs(level) + 1e-6
         for _ in range(0 if hasty and level >= wanted else STEPS):
             if level < wanted:
-                x = self.centre(x, 1.0)  # with room to all sides, for intervals of frequency
-                level = min(level, self.level(x))
+                moved = self.centre(x, 1.0)  # with room to all sides, for intervals of frequency
+                with suppress(np.linalg.LinAlgError):
+                    x, level = moved, min(level, self.level(moved))
                 break
-            x = self.centre(x, b)
-            level = self.level(x)
+            moved = self.centre(x, b)
+            try:
+                x, level = moved, self.level(moved)
+            except np.linalg.LinAlgError:  # to rounding at the edge of D > 0
+                break
             if b - level < flat * abs(level) + 1e-9:
                 break
             b = level + SHARE * (b - level)

@@ -20,7 +20,7 @@ from malta.margins.exclusion import Search, advance, start
 from malta.margins.families import is_nominal_stable, parts_over
 from malta.margins.loss import corner_loss, first_loss
 from malta.margins.parts import Part
-from malta.margins.problem import OfPolynomial, Problem
+from malta.margins.problem import OfLoop, OfPolynomial, Problem
 from malta.margins.robust import TIME_UP, Certificate, Margin, Progress
 from malta.margins.signs import Signs, raise_bound, signs_over
 from malta.margins.structured import Structured, rows_of
@@ -44,6 +44,7 @@ LEVELS = 5  # of these boxes, each half of the next
 SMALLER = 4  # boxes, each half of the last one, that Hurwitz's determinant is tried on
 # of the time for families, by the number of parameters, the last for MANY
 SHARES = (0.6, 0.6, 0.6, 0.6, 0.4, 0.3)
+OF_HOLDS = 0.12  # of many parameters under a hold, where each family takes long
 MANY = 5  # parameters from which on multipliers come before many cells
 MANY_OF_POLYNOMIALS = 11  # whose cells are cheap
 LOOK = 0.2  # share of the time for a first look at the poles of corners
@@ -335,7 +336,10 @@ class Job:
 
     def margin(self, begun: float) -> Margin:
         if self.structured is not None:  # families may take all the time there is, and not come to be
-            self.until = begun + SHARES[min(self._count, MANY)] * (self.end - begun)
+            share = SHARES[min(self._count, MANY)]
+            if self._is_many and isinstance(self.problem, OfLoop) and self.problem.loop.sampled:
+                share = OF_HOLDS
+            self.until = begun + share * (self.end - begun)
         with time_limit(self.until):
             parts, reach = self.search()
         self.until = self.end

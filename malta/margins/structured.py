@@ -41,7 +41,7 @@ LARGEST = 40  # rows of a group's pencil, beyond which families of its smaller g
 ROUGH = 0.1  # how close the first beta is to the smallest, relative
 SMALLEST = 1e-6  # of the target: boxes below that are not tried
 FIRST_STEP, LAST_STEP = 1.2, 1.003  # from one box to the next
-NOT_FAR = 5.0  # times what stands: boxes up to that are tried at once
+NOT_FAR = 1.3  # times what stands: boxes up to that are tried at once
 WIDER = 1.3  # the next interval of frequency than the last one
 HASTY = 0.4  # share of the last interval's width from which on a failure means that it was too wide
 PATIENCE = 0.8  # share of the time that is left for one box
@@ -170,7 +170,7 @@ class Structured:
                 self._raise_to(t)
                 break
             cells = [found.cell, *cells]
-            t *= min(0.9, max(0.9 / found.beta, 0.3))
+            t *= min(0.9, max(0.9 / found.beta, 0.6))
         return cells
 
     def _survey(self, t: float) -> tuple[float, list[Cell]]:
