@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from flint import arb, fmpq, fmpq_mat
@@ -26,15 +27,20 @@ APART = 1e-6  # singular value of independent vectors of size one, at least
 FEWER = 0.8  # share of the terms from which on another basis is worth it
 
 
+_KNOWN: WeakKeyDictionary[Program, Program | None] = WeakKeyDictionary()
+
+
 def in_plain_basis(loop: UncertainLoop) -> UncertainLoop:
     """The loop in the basis in which its matrices have clearly fewer terms; the loop itself when none is found."""
     s = loop.symbolic
     if s is None or s.atoms or loop.direct or not 1 < loop.states <= LARGEST:
         return loop
-    try:
-        found = _transformed(loop, s)
-    except (ZeroDivisionError, NotAnalytic, np.linalg.LinAlgError):
-        return loop
+    if loop.program not in _KNOWN:  # laws change, the system stays
+        try:
+            _KNOWN[loop.program] = _transformed(loop, s)
+        except (ZeroDivisionError, NotAnalytic, np.linalg.LinAlgError):
+            _KNOWN[loop.program] = None
+    found = _KNOWN[loop.program]
     return loop if found is None else UncertainLoop(loop.system, loop.law, found)
 
 

@@ -172,7 +172,7 @@ class Characteristic:
         return found + [zero] * (self.minors.degree + 1 - len(found))
 
     def _entries(self, p: list[Any]) -> list[list[tuple[int, int, Any]]]:
-        if not self.loop.program.rational:
+        if not (self.exact or (self.loop.program.rational and self.loop.program.short)):
             return self.loop.program.run([arb(x) for x in p], POINTS)
         entries = self.loop.program.run(p, EXACT)
         return entries if self.exact else [[(i, j, arb(x)) for i, j, x in matrix] for matrix in entries]

@@ -63,6 +63,11 @@ class Program:
         )
 
     @cached_property
+    def short(self) -> bool:
+        """Whether all constants are floats: other rationals, of another basis, are long."""
+        return all(isinstance(value, float) for _, _, _, value in self.steps)
+
+    @cached_property
     def foreign(self) -> tuple[str, ...]:
         """Operations that have no complex extension: if_else, abs, floor, ..."""
         return tuple(sorted({name for name, *_ in self.steps if name not in KNOWN}))
@@ -178,8 +183,7 @@ EXACT = Arithmetic(exact, {})
 
 
 def _real(x: float) -> Any:
-    exact(x)
-    return arb(x)
+    return arb(exact(x))
 
 
 def _ball(x: float) -> Any:
