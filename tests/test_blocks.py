@@ -190,7 +190,7 @@ def test_compliance_of_the_flagship_in_its_travel() -> None:
 
     c = gains.read("design/gains/robust.json")
     plant = plant_of(c.parameters)
-    ((s, law),), over = travel_loops(plant, c, ("m", "K_A"))
+    ((s, law),), over = travel_loops(plant, c, ("m", "K_A"), "lag")  # whose inputs are forces
     m = malta.worst_case_gain(s, law, {"m": 0.2, "K_A": 0.2}, over, of="compliance", channel=(4, 4))
     assert m.upper is not None
     assert m.lower <= m.upper <= 1.02 * m.lower

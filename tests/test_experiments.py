@@ -571,21 +571,12 @@ def test_the_lag_grows_with_the_speed(flown: Flown) -> None:
 
 
 def test_simulated_sines_are_on_the_compliance_curve(design: Design, flown: Flown) -> None:
-    """With forces as the linear loop has them, to 0.1 %."""
-    found = flown(design.spec.name, "disturbance", **LINEAR)
+    """With windings, link and current controllers, which the linear loop has as well, to 0.1 %."""
+    found = flown(design.spec.name, "disturbance")
     tones = found.curves["tones"]
     assert tones.tolist() == list(forces.TONES)
     curve = compliance(design.plant, design.controller, 2 * math.pi * tones)
     assert found.curves["simulated"] == pytest.approx(curve, rel=1e-3)
-
-
-def test_windings_leave_the_curve_by_a_fifth(design: Design, flown: Flown) -> None:
-    """The curve's current loops are lags at the crossover; PI loops with 60 degrees are faster below it."""
-    found = flown(design.spec.name, "disturbance")
-    curve = compliance(design.plant, design.controller, 2 * math.pi * found.curves["tones"])
-    off = np.abs(found.curves["simulated"] / curve - 1)
-    assert 0.1 < off.max() < 0.25
-    assert off[-1] < 0.01  # the mass alone
 
 
 def test_compliance_ends_as_a_free_mass(design: Design) -> None:
@@ -676,7 +667,7 @@ def _shaken(t: FloatArray, size: float, mass: float) -> FloatArray:
 
 def test_vibration_is_linear_in_the_housings_acceleration(design: Design, flown: Flown) -> None:
     """m a on the mover; ten times the acceleration, ten times the motion; and m a times the compliance."""
-    (case,) = [c for c in flown(design.spec.name, "disturbance", **LINEAR).cases if "shaken" in c.label]
+    (case,) = [c for c in flown(design.spec.name, "disturbance").cases if "shaken" in c.label]
     found = _merit(case.merits, "amplitude of y1")
     w = np.array([2 * math.pi * 50])
     curve = compliance(design.plant, design.controller, w, output=1, wrench="F_y")
@@ -684,7 +675,7 @@ def test_vibration_is_linear_in_the_housings_acceleration(design: Design, flown:
     sizes = []
     for size in (1.0, 10.0):
         push = partial(_shaken, size=size, mass=design.plant.mass)
-        scenario = Scenario("shaken", 0.3, references.hold, disturbance=push, **LINEAR)
+        scenario = Scenario("shaken", 0.3, references.hold, disturbance=push, **QUIET)
         run = simulate(design.plant, design.controller, scenario)
         sizes.append(float(np.abs(run.p[run.t > 0.2, 1]).max()))
     assert sizes[1] / sizes[0] == pytest.approx(10, rel=2e-3)

@@ -154,11 +154,11 @@ def test_an_interruption_waits_until_all_files_are_in_place(
 def test_ctrl_c_names_the_files_that_are_complete(
     run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def written_then_cut(*_: object) -> None:
+    def written_then_cut(*_: object, **__: object) -> None:
         replace_files({tmp_path / "done.json": b"{}"})
         raise KeyboardInterrupt
 
-    def cut(*_: object) -> None:
+    def cut(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr("malta.margins.check.check", cut)

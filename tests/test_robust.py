@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from malta import gains
 from malta.errors import InputError
-from malta.margins.loops import machine_law
+from malta.margins.loops import machine_law, machine_system
 from malta.margins.responses import responses
 from malta.margins.robust import robust_margin
 from malta.margins.stages import compensators
@@ -225,7 +225,7 @@ def _machine(
     name: str, current_loops: Any = "lag", z: float = 0.0, names: Sequence[str] = tuple(BOX)
 ) -> tuple[UncertainSystem, Compensator]:
     c, plant = shipped(name)
-    return uncertain(plant, names, at={"z": z}), machine_law(plant, c, current_loops)
+    return machine_system(plant, c, names, {"z": z}, current_loops)
 
 
 @pytest.mark.parametrize("current_loops", ["lag", "pi"])
@@ -250,14 +250,14 @@ def test_the_whole_travel_in_one_proof(name: str) -> None:
     begun = time.process_time()
     m = travel_margin(plant, c, BOX)
     assert time.process_time() - begun < 5
-    s, law = _machine(name, names=(*BOX, "z"))
+    s, law = _machine(name, "pi", names=(*BOX, "z"))
     assert m.lower is not None
     assert m.upper / m.lower <= 1.001
     assert at_witness(s, law, m) > 0
     over = {"z": (-15e-3, 15e-3)}
     assert (instability(s, law, samples(s, m, BOX, over, 1000)) < 0).all()
     for z in (0.0, 7e-3, -15e-3):
-        here = robust_margin(uncertain(plant, list(BOX), at={"z": z}), law, BOX)
+        here = robust_margin(*_machine(name, "pi", z), BOX)
         assert here.upper >= m.lower
         assert here.lower is not None
         assert m.upper >= m.lower
@@ -271,7 +271,7 @@ def test_the_whole_travel_in_one_proof(name: str) -> None:
 def test_a_hundred_thousand_machines_of_the_proven_box_are_stable(name: str) -> None:
     c, plant = shipped(name)
     m = travel_margin(plant, c, BOX)
-    s, law = _machine(name, names=(*BOX, "z"))
+    s, law = _machine(name, "pi", names=(*BOX, "z"))
     p = samples(s, m, BOX, {"z": (-15e-3, 15e-3)}, 100_000)
     assert max(float(instability(s, law, part).max()) for part in np.array_split(p, 100)) < 0
 

@@ -67,7 +67,7 @@ class Recovery:
     >>> found = malta.recovery(plant, controller, {"payload": {"F_z": -2.0}})
     >>> z = found[0].outputs[-1]
     >>> f"{found[0].name} moves {z.output} by {z.largest * 1e6:.0f} um"
-    'payload moves z by 707 um'
+    'payload moves z by 699 um'
     """
 
     name: str
