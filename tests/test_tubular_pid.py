@@ -250,17 +250,18 @@ def test_the_shipped_gains_are_those_that_the_search_ends_with(spec: Spec) -> No
 
 
 def test_axes_at_the_centre_of_gravity_win_little(spec: Spec, design: SynthesizedDesign) -> None:
-    """Both tuned within the same bounds: a load at a bearing moves the centred one 1 % less, its error is 15 % less."""
+    """Both tuned within the same bounds: a load at a bearing moves the centred one 2 % less, its error is 15 % less."""
     other = centred(spec)
     for one in (design, other):
         assert one.margins.robust is not None
-        assert one.margins.robust.lower == pytest.approx(3.0, abs=0.005)
+        # Both were tuned to 3 and a peak of 2 with first-order lags in place of the PI current loops.
+        assert 2.45 < one.margins.robust.lower < 2.55
         assert one.noise.force[:4].max() < 0.5
-        assert max(one.margins.peak_sensitivity[s.name] for s in one.plant.outputs) < 2.0001
+        assert max(one.margins.peak_sensitivity[s.name] for s in one.plant.outputs) < 2.2
     largest, error = spec.recovery["bearing_x largest"], "load_error x1"
-    assert design.deviation(largest).value == pytest.approx(14.56e-6, rel=2e-3)
-    assert other.deviation(largest).value == pytest.approx(14.44e-6, rel=2e-3)
-    assert other.load_figures[error] / design.load_figures[error] == pytest.approx(0.853, abs=0.005)
+    assert design.deviation(largest).value == pytest.approx(13.206e-6, rel=2e-3)
+    assert other.deviation(largest).value == pytest.approx(12.938e-6, rel=2e-3)
+    assert other.load_figures[error] / design.load_figures[error] == pytest.approx(0.843, abs=0.005)
 
 
 # --- the design file ---
@@ -334,15 +335,15 @@ def test_a_pid_has_no_verdict_on_figures_of_an_lqg(found: Evidence, published: d
 
 
 def test_what_the_paper_calls_unsuitable_holds_what_it_claims(found: Evidence) -> None:
-    """300 % of the box, which the paper has of full state feedback, with the sampled loop and single axes."""
-    assert claims.machine_share(found) == pytest.approx(3.0036, abs=1e-3)
-    assert claims.peak_sensitivity(found) == pytest.approx(2, abs=1e-3)
+    """254 % of the box, of 300 which the paper has of full state feedback, with the sampled loop and single axes."""
+    assert claims.machine_share(found) == pytest.approx(2.5453, abs=1e-3)
+    assert claims.peak_sensitivity(found) == pytest.approx(1.831, abs=1e-3)
     plant = found.model.plant
     end = malta.verify(malta.linearize(plant, plant.at(z=plant.travel)), found.controller)
-    assert max(end.peak_sensitivity[s.name] for s in plant.outputs) == pytest.approx(2.20, abs=0.01)
+    assert max(end.peak_sensitivity[s.name] for s in plant.outputs) == pytest.approx(2.209, abs=0.002)
     assert axis_coupling(found) == pytest.approx(0.139, abs=0.001)
-    assert noise_forces(found) == pytest.approx((0.4854, 0.7767), rel=1e-3)
-    assert load_deviation("centre of gravity", None, found) == pytest.approx(7.516e-6, rel=1e-3)
-    assert load_deviation("bearing", None, found) == pytest.approx(14.56e-6, rel=1e-3)
+    assert noise_forces(found) == pytest.approx((0.4861, 0.7768), rel=1e-3)
+    assert load_deviation("centre of gravity", None, found) == pytest.approx(6.827e-6, rel=1e-3)
+    assert load_deviation("bearing", None, found) == pytest.approx(13.206e-6, rel=1e-3)
     assert load_deviation("bearing", 0.1, found) < 1e-9
-    assert axial_deviation(found).largest == pytest.approx(107.2e-6, rel=1e-3)
+    assert axial_deviation(found).largest == pytest.approx(104.2e-6, rel=1e-3)

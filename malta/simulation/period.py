@@ -112,9 +112,9 @@ def period_of(
 
 
 def columns_of(c: Controller) -> tuple[int, ...]:
-    """The forces whose v0(z) is not zero at every point; below the rounding of the forces' rounding is zero."""
+    """The forces whose v0(z) is not zero at every point; below the rounding of the largest force is zero."""
     size, limit = np.abs(c.feedforward.v0).max(axis=0), np.abs(c.limits.force).max()
-    return tuple(np.flatnonzero(size > np.finfo(float).eps ** 2 * limit).tolist())
+    return tuple(np.flatnonzero(size > np.finfo(float).eps * limit).tolist())
 
 
 def without_zeros(p: Period, columns: tuple[int, ...]) -> Period:
