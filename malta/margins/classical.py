@@ -15,6 +15,9 @@ if TYPE_CHECKING:
     from malta.model.plant import ComplexArray, FloatArray
 
 
+Response = Callable[["FloatArray"], tuple["ComplexArray", "ComplexArray"]]
+
+
 class Nominal(NamedTuple):
     """A nominal loop y = P u, u = F y by its responses, positive feedback.
 
@@ -23,7 +26,7 @@ class Nominal(NamedTuple):
     sample_time : s; None: continuous
     """
 
-    response: Callable[[FloatArray], tuple[ComplexArray, ComplexArray]]
+    response: Response
     stable: bool
     sample_time: float | None
 
@@ -33,9 +36,23 @@ class Nominal(NamedTuple):
         return np.geomspace(1e-2, 1e5 if self.sample_time is None else np.pi / self.sample_time, 400)
 
 
+def remembered(response: Response) -> Response:
+    """The same responses, each grid of frequencies computed once: every margin begins with the same."""
+    known: dict[bytes, tuple[ComplexArray, ComplexArray]] = {}
+
+    def lookup(w: FloatArray) -> tuple[ComplexArray, ComplexArray]:
+        key = w.tobytes()
+        if key not in known:
+            known[key] = response(w)
+        return known[key]
+
+    return lookup
+
+
 def nominal_loop(system: UncertainSystem, law: Compensator) -> Nominal:
     """A loop at its nominal parameters."""
 
+    @remembered
     def response(w: FloatArray) -> tuple[ComplexArray, ComplexArray]:
         r = responses(system, law, system.nominal, w)
         return r.G_y, r.F

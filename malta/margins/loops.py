@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 import casadi as ca
 import numpy as np
 
-from malta.margins.classical import Nominal
+from malta.margins.classical import Nominal, remembered
 from malta.margins.laws import ReadingUse, sampled_law
 from malta.margins.plants import of_plant
 from malta.margins.uncertain import Compensator, UncertainSystem, held_gain, is_commutated
@@ -379,6 +379,7 @@ def loaded_loop(
         B = np.hstack([into, left])
     T = loop.sample_time
 
+    @remembered
     def response(w: FloatArray) -> tuple[ComplexArray, ComplexArray]:
         # In differences: slow poles lie close to 1, where z - A has lost their digits.
         s = (np.expm1(1j * np.asarray(w) * T) / T)[:, None, None]

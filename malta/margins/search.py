@@ -445,8 +445,10 @@ class Job:
         """The witness of Hurwitz's determinant, which may touch the boundary and not cross it."""
         if self.signs is None or self.signs.witness is None:
             return None
-        p = self.signs.witness
-        return self.signs.upper, self.problem.critical_frequency(p), p
+        p, frequency = self.signs.witness, None
+        with suppress(np.linalg.LinAlgError):  # matrices that overflow have no poles to take a frequency from
+            frequency = self.problem.critical_frequency(p)
+        return self.signs.upper, frequency, p
 
     def _by_poles(self, begun: float) -> Margin:
         """The margin without families: the first loss along the box's diagonals, and a proof by multipliers."""
