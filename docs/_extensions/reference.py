@@ -217,12 +217,11 @@ def _kind(entry: dict[str, Any], file: str, places: dict[str, str]) -> str:
         return " or ".join(f"`{value}`" for value in entry.get("enum", [entry.get("const")]))
     kind = str(entry.get("type", "any"))
     if kind == "array":
-        rows = entry["items"].get("type") == "array"
-        inner = (
-            ""
-            if rows or entry["items"].get("type") == "number"
-            else f" of {_kind(entry['items'], file, places)}"
-        )
+        items = (
+            entry["items"] if "items" in entry else entry["prefixItems"][0]
+        )  # of a tuple, whose entries are alike
+        rows = items.get("type") == "array"
+        inner = "" if rows or items.get("type") == "number" else f" of {_kind(items, file, places)}"
         size = f", {entry['shape']}" if "shape" in entry else ""
         return f"{'matrix' if rows else 'list'}{inner}{size}"
     if kind == "object":
