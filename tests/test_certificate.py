@@ -26,6 +26,7 @@ from malta.gains.certified import origin_of
 from malta.margins import certificate
 from malta.margins.check import check, tiled
 from malta.margins.checked_loop import determinant_bounds
+from malta.margins.loops import LAST
 from malta.margins.travel import travel_loops, travel_margin
 from malta.margins.uncertain import Compensator
 
@@ -50,7 +51,7 @@ def shipped(name: str, folder: Path) -> tuple[Path, dict[str, Any]]:
     ranges = dict.fromkeys(("m", "A", "b") if plant.name == "halbach" else ("m", "K_A", "K_D", "K_B"), 0.2)
     margin = travel_margin(plant, controller, ranges)
     places, over = travel_loops(plant, controller, tuple(ranges))
-    origin = origin_of(gains, plant, controller, "lag", len(places))
+    origin = origin_of(gains, plant, controller, LAST, len(places))
     path = certificate.write(folder / "certificate.json", places, ranges, over, margin, origin)
     assert path.stat().st_size < 1_000_000
     content = json.loads(path.read_text())

@@ -10,6 +10,7 @@ import control
 import numpy as np
 import pytest
 from conftest import ROOT
+from flight import default_of
 
 import malta
 from malta.margins.classical import delay_margins
@@ -344,7 +345,7 @@ def test_steps_are_those_of_the_simulated_machine(name: str, output: int, size: 
 
         return at
 
-    run = malta.simulate(plant, controller, malta.Scenario("step", 120 * T, jump, fidelity="force"))
+    run = malta.simulate(plant, controller, malta.Scenario("step", 120 * T, jump, fidelity=default_of(plant)))
     wanted = (run.p[first:, output] - run.p[0, output]) / size
     answer = loop_steps(linear_loop(plant, controller)).references.y[: len(wanted), output, output]
     assert np.abs(answer - wanted).max() < 3e-3

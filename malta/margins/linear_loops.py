@@ -163,6 +163,13 @@ class LinearLoop:
         T = self.sample_time or 0.0
         return np.asarray(poles.real + 0.5 * T * np.abs(poles) ** 2)
 
+    def closed_eigenvalues(self) -> ComplexArray:
+        """The eigenvalues of the closed loop, without those that the law cancels in itself."""
+        found, T = eigenvalues(self.closed_loop().A), self.sample_time
+        for pole in self.cancelled:
+            found = np.delete(found, np.abs(found - (pole if T is None else np.expm1(pole * T) / T)).argmin())
+        return found
+
     @cached_property
     def closed_poles(self) -> ComplexArray:
         """The poles of the closed loop, rad/s, without those that the law cancels in itself."""

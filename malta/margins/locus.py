@@ -153,7 +153,7 @@ def _of_machine(plant: Plant, controller: Controller, parameter: str, value: flo
     """The eigenvalues with another value of a parameter; the controller stays."""
     try:
         changed = plant_of(replace(plant.parameters, **{parameter: value}))
-        return eigenvalues(linear_loop(changed, controller).closed_loop().A)
+        return linear_loop(changed, controller).closed_eigenvalues()
     except InputError as error:
         raise InputError("root locus", parameter, f"{value:g}", error.expected) from error
     except CheckError as error:
