@@ -17,10 +17,10 @@ from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
-from flint import acb, arb, arb_mat, ctx, fmpq, fmpq_mat
+from flint import acb, acb_mat, arb, arb_mat, ctx, fmpq, fmpq_mat
 
 from malta.margins.algebra import Symbolic, value
-from malta.margins.closed import closed_loop, coefficients, driven_group, majorant_matrix
+from malta.margins.closed import closed_loop, coefficients, dense, driven_group, majorant_matrix
 from malta.margins.degrees import (
     clear_denominators,
     degree,
@@ -35,7 +35,7 @@ from malta.margins.expressions import (
     NotAnalytic,
     finite,
 )
-from malta.margins.groups import A, B, C, D, E, Group, UncertainLoop, divide_by_descriptor
+from malta.margins.groups import A, B, C, D, E, Group, UncertainLoop, divide_by_descriptor, rational
 from malta.margins.majorant import coefficient_bounds
 from malta.margins.minors import Minors, minors
 
@@ -260,7 +260,8 @@ class Characteristic:
         lags = len(acting) if law.lag is not None else 0
         if self.discrete:  # |z - a| <= 2 of a lag, |z| = 1 of stored inputs
             degree += lags + law.delay * (self.minors.order if self.minors is not None else len(acting))
-            total = [c * 2**lags for c in total] + [arb(0)] * (degree + 1 - len(total))
+            scale = self._row_factors(sides)
+            total = [c * 2**lags * scale for c in total] + [arb(0)] * (degree + 1 - len(total))
             return [pair(c) for c in map_bounds(total)]
         for _ in range(lags):
             rate = arb(law.lag)
@@ -268,17 +269,53 @@ class Characteristic:
                 (total[j - 1] if j else 0) + (total[j] * rate if j < len(total) else 0)
                 for j in range(len(total) + 1)
             ]
-        scale = arb(1)
-        if self.exact and self.loop.symbolic is not None:
-            p = [acb(low).union(acb(high)) for low, high in sides]
-            for den in _denominators(self.loop, self.group):
-                scale *= abs(value(den, p))
-            if self.loop.descriptor:
-                for (i, j), r in self.loop.symbolic.entries[E].items():
-                    if i == j and i in self.group.states:
-                        scale *= abs(value(r.num, p) / (1 if r.den is None else value(r.den, p)))
+        scale = self._row_factors(sides)
         total += [arb(0)] * (degree + lags + 1 - len(total))
         return [pair(c * scale) for c in total]
+
+    def _row_factors(self, sides: Sequence[tuple[Any, Any]]) -> Any:
+        """A bound of what multiplies the exact coefficients beside the divided matrices: denominators, and det E."""
+        scale = arb(1)
+        if not (self.exact and self.loop.symbolic is not None):
+            return scale
+        p = [acb(low).union(acb(high)) for low, high in sides]
+        for den in _denominators(self.loop, self.group):
+            scale *= abs(value(den, p))
+        if self.loop.descriptor:
+            entries = [
+                (i, j, value(r.num, p) / (1 if r.den is None else value(r.den, p)))
+                for (i, j), r in self.loop.symbolic.entries[E].items()
+            ]
+            scale *= self._descriptor_size(entries)
+        return scale
+
+    def _descriptor_size(self, entries: Sequence[tuple[int, int, Any]]) -> Any:
+        """A bound of |det E| of the group, and for an E that is not diagonal of the product of its diagonal too."""
+        x = {state: k for k, state in enumerate(self.group.states)}
+        own = [(x[i], x[j], z) for i, j, z in entries if i in x and j in x]
+        size = abs(dense(acb_mat, len(x), len(x), own).det())
+        if all(i == j for i, j, _ in own):
+            return size
+        product = arb(1)
+        for i, j, z in own:
+            product *= abs(z) if i == j else 1
+        return size.max(product)
+
+    def _factors(self, v: Sequence[Any], entries: list[list[tuple[int, int, Any]]]) -> Any:
+        """A bound of the factors that `at` gives the coefficients beside the charpoly: det E, det(I - D_c D), and the
+        denominators of exact rows."""
+        size = arb(1)
+        if self.loop.descriptor:
+            size *= self._descriptor_size(entries[E])
+        if self.loop.direct:
+            m, p = self.loop.program.shapes[B][1], self.loop.program.shapes[C][0]
+            w = acb_mat(rational(self.loop.law.D)) * dense(acb_mat, p, m, entries[D])
+            size *= abs((dense(acb_mat, m, m, ((i, i, 1) for i in range(m))) - w).det()).max(arb(1))
+        if self.exact and self.loop.symbolic is not None:
+            p_of_v = [1 / x if inverted else x for x, inverted in zip(v, self.inverted, strict=True)]
+            for den in _denominators(self.loop, self.group):
+                size *= abs(value(den, p_of_v)).max(arb(1))
+        return size
 
     @property
     def _acting(self) -> tuple[int, ...]:
@@ -300,6 +337,9 @@ class Characteristic:
             if where not in known:
                 known[where] = self.minors.sizes(self._balls(v))
             product = self.minors.majorant(known[where])
+        if self.loop.descriptor or self.loop.direct or self.exact:
+            size = self._factors(v, self._balls(v))
+            product = [c * size for c in product]
         return [pair(c) for c in (map_bounds(product) if self.discrete else product)]
 
 
