@@ -45,3 +45,25 @@ def test_masses_may_stand_in_E(mass: float) -> None:
     assert there.lower is not None
     assert there.lower <= divided.upper * (1 + 1e-9)
     assert there.lower == pytest.approx(divided.lower, rel=1e-3)
+
+
+@pytest.mark.parametrize("unit", [1e-6, 1.0, 1e6])
+def test_an_uncertain_mass_in_E(unit: float) -> None:
+    """The mass is a parameter of E, whose determinant every bound carries, in any unit."""
+
+    def matrices(m: Any, k: Any) -> Any:
+        import casadi as ca
+
+        A = ca.blockcat([[0, 1], [-k, -0.1 * unit]])
+        return A, ca.DM([[0], [unit]]), ca.DM([[1, 0]]), ca.DM(1, 1), ca.diag(ca.vertcat(1, m))
+
+    law = malta.Compensator(
+        np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), np.array([[0.2]]), sample_time=0.5
+    )
+    system = malta.uncertain(matrices, {"m": unit, "k": unit})
+    found = malta.robust_margin(system, law, {"m": 0.2, "k": 0.2}, time=10.0)
+    assert found.lower is not None
+    assert found.witness is not None
+    assert found.lower <= found.upper <= found.lower * 1.01
+    # k = 0.2 is where the spring no longer holds against the push
+    assert found.upper == pytest.approx(4.0, rel=1e-3)

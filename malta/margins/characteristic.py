@@ -301,10 +301,14 @@ class Characteristic:
             product *= abs(z) if i == j else 1
         return size.max(product)
 
-    def _factors(self, v: Sequence[Any], entries: list[list[tuple[int, int, Any]]]) -> Any:
+    def _factors(self, v: Sequence[Any]) -> Any:
         """A bound of the factors that `at` gives the coefficients beside the charpoly: det E, det(I - D_c D), and the
         denominators of exact rows."""
-        size = arb(1)
+        size, p_of_v = (
+            arb(1),
+            [1 / x if inverted else x for x, inverted in zip(v, self.inverted, strict=True)],
+        )
+        entries = self.loop.program.run(p_of_v, BALLS) if self.loop.descriptor or self.loop.direct else []
         if self.loop.descriptor:
             size *= self._descriptor_size(entries[E])
         if self.loop.direct:
@@ -312,7 +316,6 @@ class Characteristic:
             w = acb_mat(rational(self.loop.law.D)) * dense(acb_mat, p, m, entries[D])
             size *= abs((dense(acb_mat, m, m, ((i, i, 1) for i in range(m))) - w).det()).max(arb(1))
         if self.exact and self.loop.symbolic is not None:
-            p_of_v = [1 / x if inverted else x for x, inverted in zip(v, self.inverted, strict=True)]
             for den in _denominators(self.loop, self.group):
                 size *= abs(value(den, p_of_v)).max(arb(1))
         return size
@@ -337,9 +340,8 @@ class Characteristic:
             if where not in known:
                 known[where] = self.minors.sizes(self._balls(v))
             product = self.minors.majorant(known[where])
-        if self.loop.descriptor or self.loop.direct or self.exact:
-            size = self._factors(v, self._balls(v))
-            product = [c * size for c in product]
+        size = self._factors(v)
+        product = [c * size for c in product]
         return [pair(c) for c in (map_bounds(product) if self.discrete else product)]
 
 
