@@ -36,6 +36,7 @@ def chain(mass: float, *, explicit: bool) -> tuple[Any, Any]:
     return malta.uncertain(matrices, {"k": 1.0}), law
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mass", [1e-5, 1.0, 1e5, 1e9])
 def test_masses_may_stand_in_E(mass: float) -> None:
     """The coefficients of det(s E - A) carry det E, and so do their bounds."""
