@@ -56,12 +56,12 @@ assert machine["robust"].lower >= 2.89
 
 # %% [markdown]
 # **Judgement.** The claimed 300 % is that of full state feedback with a gain four times as stiff as the attraction
-# pulls (`calibrated`). The observer takes half of it, and with the printed noise (`table2`) it takes all but a third of
-# the box. Current loops, hold and delay cost little after that. `robust` has a fast observer for the bearings and a slow
-# one for the noisy axial sensor. It was tuned for first-order lags in place of the current controllers, with which it
-# keeps more than the claim (`sampled`); with the PI controllers that run (`machine`) it keeps a little less than that.
-# The margins are without the loads; |S| of the last stage is with them, and shows that the axial loop of `table2` is
-# softer than the cogging that v0(z) cancels.
+# pulls (`calibrated`). The observer takes half of it, and with the printed noise (`table2`) it takes all but a third
+# of the box. Current loops, hold and delay cost little after that. `robust` has a fast observer for the bearings and
+# a slow one for the noisy axial sensor. It was tuned for first-order lags in place of the current controllers, with
+# which it keeps more than the claim (`sampled`); with the PI controllers that run (`machine`) it keeps a little less
+# than that. The margins are without the loads; |S| of the last stage is with them, and shows that the axial loop of
+# `table2` is softer than the cogging that v0(z) cancels.
 
 # %% [markdown]
 # ## A witness flies
