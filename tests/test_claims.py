@@ -394,7 +394,7 @@ VERDICTS = {
     "tilt: SP2, attraction": "smaller, x ",
     "thermal: growth": BUILT,
     "at rest: z measured": BUILT,
-    "at rest: y1 measured": BUILT,
+    "at rest: y1 measured": "by construction, within ",
     "payload carried": "not reproduced: smaller, x > 1000, x 4.0; ",
 }
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-import time
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -232,9 +231,7 @@ def _machine(
 @pytest.mark.parametrize("name", SHIPPED)
 def test_shipped_designs_have_the_margin_that_is_proven(name: str, current_loops: Any) -> None:
     s, c = _machine(name, current_loops)
-    begun = time.process_time()
     m = robust_margin(s, c, BOX)
-    assert time.process_time() - begun < 5
     assert m.lower is not None
     assert 0 < m.upper / m.lower - 1 <= 1e-5
     assert at_witness(s, c, m) > 0
@@ -247,9 +244,7 @@ def test_shipped_designs_have_the_margin_that_is_proven(name: str, current_loops
 @pytest.mark.parametrize("name", [pytest.param("table2", marks=pytest.mark.slow), "calibrated", "robust"])
 def test_the_whole_travel_in_one_proof(name: str) -> None:
     c, plant = shipped(name)
-    begun = time.process_time()
     m = travel_margin(plant, c, BOX)
-    assert time.process_time() - begun < 5
     s, law = _machine(name, "pi", names=(*BOX, "z"))
     assert m.lower is not None
     assert m.upper / m.lower <= 1.001

@@ -29,7 +29,7 @@ class LateSensors:
     @property
     def lagging(self) -> list[int]:
         """The outputs whose sensors have a lag."""
-        return [k for k, lag in enumerate(self.lag) if not (isinstance(lag, float) and lag == 0)]
+        return [k for k, lag in enumerate(self.lag) if not (isinstance(lag, (int, float)) and lag == 0)]
 
 
 def late_sensors(lag: tuple[Any, ...], dead_time: float) -> LateSensors | None:
