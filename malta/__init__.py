@@ -33,6 +33,8 @@ if TYPE_CHECKING:  # the contents page, as type checkers and readers see it
     from malta.margins.dynamic import dynamic_margin as dynamic_margin
     from malta.margins.gain import Gain as Gain
     from malta.margins.gain import worst_case_gain as worst_case_gain
+    from malta.margins.loop import Loop as Loop
+    from malta.margins.loop import loop as loop
     from malta.margins.loop_systems import LoopSystems as LoopSystems
     from malta.margins.loop_systems import loop_systems as loop_systems
     from malta.margins.recovery import Recovery as Recovery
@@ -126,6 +128,7 @@ _NAMES = {  # the same, for the first use of each name
     "margins.curves": ("LoopCurves", "loop_curves"),
     "margins.dynamic": ("dynamic_margin",),
     "margins.gain": ("Gain", "worst_case_gain"),
+    "margins.loop": ("Loop", "loop"),
     "margins.loop_systems": ("LoopSystems", "loop_systems"),
     "margins.recovery": ("Recovery", "recovery"),
     "margins.robust": ("Margin", "margin_of_polynomial", "robust_margin"),

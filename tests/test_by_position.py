@@ -256,7 +256,7 @@ def test_the_loop_whose_sums_wait_stands_the_box_too(flagship: Flagship, z: floa
             for n, s in zip(("m", "K_A", "K_D", "K_B"), signs, strict=True)
         }
         plant = malta.plant_of(replace(spec.parameters, **values))
-        closed = malta.margins.loops.loop(
+        closed = malta.margins.loops.sampled_loop(
             malta.linearize(plant, plant.at(z=z)), waiting, delay=1, current_loops="lag"
         ).closed
         # e of z is not fed back, and stays as it is: one eigenvalue of 1.

@@ -15,7 +15,7 @@ from scipy import linalg
 
 import malta
 from malta.errors import InputError
-from malta.margins.loops import loop, machine_loop
+from malta.margins.loops import machine_loop, sampled_loop
 from malta.margins.verify import controller_poles
 from malta.simulation.inputs import lagging_references
 from malta.synthesis.controller import Controller
@@ -78,7 +78,9 @@ def test_the_filter_knows_the_forces_from_the_commands(made: Made) -> None:
 def test_the_machines_loop_is_the_design_model_closed(made: Made) -> None:
     """On the design's own machine, without its loads, regulator and filter separate: the model is exact."""
     model = malta.linearize(made.spec.plant, made.spec.plant.at())
-    closed = np.sort(np.abs(eigenvalues(loop(model, made.controller, delay=1, current_loops="lag").closed)))
+    closed = np.sort(
+        np.abs(eigenvalues(sampled_loop(model, made.controller, delay=1, current_loops="lag").closed))
+    )
     regulator, observer = controller_poles(made.controller)
     apart = np.sort(np.abs(np.concatenate([regulator, observer])))
     np.testing.assert_allclose(closed[-30:], apart[-30:], atol=1e-6)

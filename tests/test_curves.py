@@ -17,7 +17,6 @@ from malta.margins.classical import delay_margins
 from malta.margins.curves import LoopCurves, loop_curves, respond
 from malta.margins.linear_loops import linear_loop
 from malta.margins.locus import root_locus
-from malta.margins.loops import machine_loop_at
 from malta.margins.steps import loop_steps, step_figures
 from malta.simulation.references import Motion
 
@@ -232,7 +231,7 @@ def test_responses_are_those_of_the_systems(name: str) -> None:
         P, F = systems.P(point), systems.F(point)
         assert same(found.SP[k], np.linalg.solve(np.eye(len(P)) - P @ F, P), 1e-6)
         assert same(found.FS[k], F @ found.S[k], 1e-6)
-    pushed, load = machine_loop_at(plant, controller), np.eye(len(plant.disturbances))[2]
+    pushed, load = malta.loop(plant, controller).sampled, np.eye(len(plant.disturbances))[2]
     assert same(found.compliance[:, :, 2], pushed.compliance(w, load))
     assert np.array_equal(respond(linear_loop(systems), w).L, found.L)
 

@@ -18,7 +18,7 @@ from scipy.linalg import expm
 import malta
 from malta import references
 from malta.machines.tubular.experiments import EXPERIMENTS, forces, lifting, rest, strokes
-from malta.margins.loops import loop, machine_loop
+from malta.margins.loops import machine_loop, sampled_loop
 from malta.model.data import plant_of
 from malta.model.published import published_value
 from malta.simulation.catalogue import experiment
@@ -286,7 +286,7 @@ def test_without_noise_nothing_moves(design: Design, flown: Flown) -> None:
 def _circling(design: Design, *, attraction: bool, radius: float = 200e-6, frequency: float = 2.0) -> Any:
     """Largest errors in sensor planes 1 and 2, m, on the linear loop in its steady state."""
     model, c = design.model, design.controller
-    stage = loop(model, c, delay=1, current_loops="lag")
+    stage = sampled_loop(model, c, delay=1, current_loops="lag")
     w = 2 * math.pi * frequency
     p = radius * np.array([1, -1j, 0, 0, 0])  # cos, sin
     symbol = ca.SX.sym("p", 5)
@@ -440,7 +440,7 @@ def _pushed(
     x, u, w = ca.SX.sym("x", 12), ca.SX.sym("u", 5), ca.SX.sym("w", 6)
     slope = ca.Function("B", [x, u, w], [ca.jacobian(plant.f(x, u, w), w)])
     B_w = np.array(slope(plant.at(z=at).x, 0, 0))[list(plant.controlled), _column(plant, wrench)] * size
-    stage = loop(model, c, delay=1, current_loops="lag")
+    stage = sampled_loop(model, c, delay=1, current_loops="lag")
     A = np.zeros((16, 16))
     A[:10, :10], A[:10, 10:15], A[:10, 15] = model.A, model.B, B_w
     A[10:15, 10:15] = -plant.actuator.crossover * np.eye(5)
@@ -753,7 +753,7 @@ def test_before_it_strikes_a_fault_is_not_there(design: Design, flown: Flown) ->
 def test_a_biased_sensor_moves_the_mover_as_the_linear_loop_does(design: Design, flown: Flown) -> None:
     """50 um too much in y1. Where the integrals are quick, y1 goes where the sensor shows zero, and y2 stays; without
     them, table2 makes eight times the bias of it."""
-    stage = loop(design.model, design.controller, delay=1, current_loops="lag")
+    stage = sampled_loop(design.model, design.controller, delay=1, current_loops="lag")
     step = np.vstack([stage.Bd @ stage.control.D_y, stage.control.B_y])[:, 1] * 50e-6
     state, trace = np.zeros(len(step)), np.empty((5000, 5))
     for k in range(5000):

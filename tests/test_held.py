@@ -15,7 +15,7 @@ from scipy import linalg
 import malta
 from malta import gains
 from malta.margins.laws import sampled_law
-from malta.margins.loops import loop, machine_loop, machine_system
+from malta.margins.loops import machine_loop, machine_system, sampled_loop
 from malta.margins.responses import responses
 from malta.margins.systems import uncertain
 from malta.margins.travel import travel_margin
@@ -111,7 +111,7 @@ def test_simulation_and_linear_loop_agree(delay: int) -> None:
         _controller("halbach", delay, **late),
         _model("halbach", **late),
     )
-    exact = loop(model, c, delay=delay, current_loops="lag")
+    exact = sampled_loop(model, c, delay=delay, current_loops="lag")
     run = simulate(
         plant, c, Scenario("let go", 1.0, _still, start={"x": 1e-9}, fidelity="force", substeps=64)
     )
@@ -346,7 +346,7 @@ def test_margins_count_what_holding_costs() -> None:
     assert system.matrices.size2_out(1) == 1  # the reading acts as the force H y
     (ours,) = closed_loop(system, law, system.nominal)
     poles = 1 + c.sample_time * np.linalg.eigvals(ours)
-    expected = np.linalg.eigvals(loop(_model("halbach"), c, current_loops="lag").closed)
+    expected = np.linalg.eigvals(sampled_loop(_model("halbach"), c, current_loops="lag").closed)
     for pole in expected[np.abs(expected) > 0.01]:  # those of the fast lag are beyond rounding
         assert np.abs(poles - pole).min() < 1e-6
     margin = travel_margin(plant, c, {"m": 0.2, "A": 0.2})

@@ -11,7 +11,7 @@ import pytest
 from filterpy.kalman import KalmanFilter
 
 import malta
-from malta.margins.loops import loop
+from malta.margins.loops import sampled_loop
 from malta.margins.verify import controller_poles
 from malta.synthesis.controller import law, linear_law
 from malta.synthesis.riccati import eigenvalues, sample, sample_noise
@@ -42,7 +42,7 @@ def test_separation_principle(designs: dict[str, Design], way: Discretization, d
     design = designs["calibrated"]
     controller = malta.lqg(design.model, design.spec.weights, 50e-6, way, delay)
     regulator, observer = controller_poles(controller)
-    closed = eigenvalues(loop(design.model, controller, delay=delay).closed)
+    closed = eigenvalues(sampled_loop(design.model, controller, delay=delay).closed)
     expected = np.concatenate([regulator, observer])
     # The filter's copy of the stored forces and the machine's own make multiple eigenvalues at zero: compare the rest.
     moving, wanted = closed[np.abs(closed) > 0.3], expected[np.abs(expected) > 0.3]
@@ -67,7 +67,7 @@ def test_backward_euler_separates_on_its_own_model(designs: dict[str, Design]) -
 
 
 def test_sensitivity_and_complementary_sensitivity_add_up_to_one(design: Design) -> None:
-    stage = loop(design.model, design.controller, delay=1, current_loops="lag")
+    stage = sampled_loop(design.model, design.controller, delay=1, current_loops="lag")
     w = np.geomspace(1, 6e4, 50)
     S, L = stage.sensitivity(w), stage.loop_gain(w)
     T = L @ np.linalg.inv(np.eye(5) + L)
@@ -76,7 +76,7 @@ def test_sensitivity_and_complementary_sensitivity_add_up_to_one(design: Design)
 
 def test_sensitivity_is_what_noise_becomes_in_the_measurement(design: Design) -> None:
     """S computed from transfer functions equals the frequency response of the closed state space."""
-    stage = loop(design.model, design.controller, delay=1, current_loops="lag")
+    stage = sampled_loop(design.model, design.controller, delay=1, current_loops="lag")
     c = stage.control
     A = stage.closed
     B = np.vstack([stage.Bd @ c.D_y, c.B_y])
@@ -175,7 +175,7 @@ def test_integrals_remove_the_error_of_a_wrong_machine(
     controller = malta.lqg(design.model, design.spec.weights, 50e-6, way, delay)
     other = malta.plant_of(replace(design.spec.parameters, m=0.4, K_A=9000.0, l_B=0.046))
     model = malta.linearize(other, other.at(z=3e-3))
-    wrong = loop(model, controller, delay=max(delay, 1), current_loops="lag")
+    wrong = sampled_loop(model, controller, delay=max(delay, 1), current_loops="lag")
     assert np.abs(eigenvalues(wrong.closed)).max() < 1
     assert np.abs(wrong.sensitivity(np.array([1e-6]))).max() < 1e-5
 

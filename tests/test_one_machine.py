@@ -163,6 +163,54 @@ def test_the_proven_loop_of_any_magnet_is_the_derivative_of_its_flight(name: str
         assert distance(poles(np.eye(len(ours)) + T * ours, T), poles(flown, T)) < SAME
 
 
+def test_one_loop_answers_all_questions() -> None:
+    """Machine x law x operating point x parameters: the same matrix, poles, margins and curves by every way."""
+    plant, c = shipped("calibrated")
+    heavy = varied(plant, ("m",), [0.6])
+    one = malta.loop(plant, c, parameters={"m": 0.6}, z=5e-3)
+    np.testing.assert_array_equal(one.matrix, malta.loop(heavy, c, z=5e-3).matrix)
+    assert malta.loop(plant, c, z=5e-3) is malta.loop(plant, c, z=5e-3)
+    assert one.stable
+    assert one.left_out == ""
+    curves = malta.loop_curves(one)
+    assert distance(one.poles, curves.poles["closed_loop"]) < 1e-9
+    w = np.array([10.0, 300.0, 3000.0])
+    responses = malta.loop_curves(one, w=w).responses
+    np.testing.assert_allclose(one.loop_gain(w), responses.L, rtol=0, atol=1e-7 * np.abs(responses.L).max())
+    np.testing.assert_allclose(one.sensitivity(w), responses.S, rtol=0, atol=1e-7)
+    np.testing.assert_allclose(one.sampled.sensitivity(w), responses.S, rtol=0, atol=1e-7)
+    box = {"K_A": 0.2, "K_B": 0.2}
+    ours, there = one.margin(box), place_margin(heavy, c, box, 5e-3)
+    assert ours.upper == pytest.approx(there.upper, rel=1e-9)
+    assert ours.lower == pytest.approx(there.lower, rel=2e-3)
+    assert malta.recovery(heavy, c, position=5e-3)[0].outputs[0].largest == one.sampled.answer().largest[0, 0]
+
+
+def test_what_a_loop_leaves_out_is_said() -> None:
+    assert "PI" in malta.loop(*shipped("robust"), current_loops="lag").left_out
+    assert "electronics" in malta.loop(*shipped("halbach")).left_out
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"parameters": {"q": 1.0}}, "loop: q: found an unknown parameter"),
+        ({"parameters": {"m": -1.0}}, "m: found -1.0 kg"),
+        ({"w": 1.0}, "w: found an unknown state"),
+        ({"z": math.nan}, "z: found nan"),
+        ({"current_loops": "p"}, "current_loops: found 'p', expected lag or pi"),
+    ],
+)
+def test_a_loop_that_is_none_is_refused(options: Any, message: str) -> None:
+    with pytest.raises(malta.InputError, match=message):
+        malta.loop(*shipped("robust"), **options)
+
+
+def test_a_loop_of_another_machine_is_refused() -> None:
+    with pytest.raises(malta.InputError, match="found one of x, expected one of the tubular"):
+        malta.loop(shipped("robust")[0], shipped("halbach")[1])
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", TUBULAR + OTHERS)
 def test_witnesses_fly(name: str) -> None:

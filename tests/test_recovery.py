@@ -13,7 +13,7 @@ from conftest import ROOT, assert_folds, printed
 
 import malta
 from malta.errors import CheckError, InputError
-from malta.margins.loops import disturbance_map, machine_loop_at
+from malta.margins.loops import disturbance_map
 from malta.margins.recovery import furthest, load_vector, recovery
 from malta.model.linearize import linearize
 from malta.report.figures.recovery import recovery_figure
@@ -87,7 +87,7 @@ def test_settling_is_the_last_time_outside_and_never_where_a_deviation_stays() -
 
 def test_an_integrating_loop_comes_back_and_its_sum_is_the_compliance_at_rest(design: Machine) -> None:
     """|y(jw) / w_load(jw)| / w goes to the integral of the step's answer."""
-    pushed = machine_loop_at(design.plant, design.controller)
+    pushed = malta.loop(design.plant, design.controller).sampled
     answer = pushed.answer()
     for k, name in enumerate(("F_x", "F_y", "F_z")):
         load = load_vector(design.plant, name, {name: 1.0})
@@ -102,7 +102,7 @@ def test_an_integrating_loop_comes_back_and_its_sum_is_the_compliance_at_rest(de
 
 def test_compliance_is_that_of_the_experiments_where_holding_a_load_does_not_matter(design: Machine) -> None:
     w = np.array([5.0, 50.0, 500.0])
-    pushed = machine_loop_at(design.plant, design.controller)
+    pushed = malta.loop(design.plant, design.controller).sampled
     ours = np.abs(pushed.compliance(w, load_vector(design.plant, "x", {"F_x": 1.0}))[:, 0])
     theirs = responses.compliance(design.plant, design.controller, w, 0, "F_x")
     np.testing.assert_allclose(ours, theirs, rtol=1e-2)
@@ -114,7 +114,7 @@ def test_a_pid_without_an_integral_gives_way_by_its_compliance_at_rest() -> None
     (found,) = recovery(plant, springy)
     (d,) = found.outputs
     assert math.isinf(d.settled)
-    G = machine_loop_at(plant, springy).compliance(np.array([1e-6]), np.array([1.0]))
+    G = malta.loop(plant, springy).sampled.compliance(np.array([1e-6]), np.array([1.0]))
     assert d.final == pytest.approx(float(G[0, 0].real), rel=1e-6)
     assert d.left[-1] >= abs(d.final) > 1e-6
 
@@ -125,7 +125,7 @@ def test_a_load_at_a_point_is_the_sum_of_its_disturbances(calibrated: Machine) -
     arm = par.l_B
     loads = {"bearing 1": {"F_x": 2.0, "T_y": -2.0 * arm}}
     (found,) = recovery(plant, c, loads, after=(0.05,))
-    pushed = machine_loop_at(plant, c).answer()
+    pushed = malta.loop(plant, c).sampled.answer()
     sum_of = 2 * pushed.y[:, :, 0] - 2 * arm * pushed.y[:, :, 4]
     assert found.outputs[0].largest == pytest.approx(np.abs(sum_of[:, 0]).max(), rel=1e-12)
     assert found.load == loads["bearing 1"]
@@ -149,7 +149,7 @@ def test_the_nonlinear_machine_answers_alike(calibrated: Machine, name: str) -> 
         "push", 0.12, malta.references.hold, noise=0.0, quantize=False, disturbance=push
     )
     run = malta.simulate(plant, c, scenario)
-    answer = machine_loop_at(plant, c).answer().of(load_vector(plant, name, {name: size}))
+    answer = malta.loop(plant, c).sampled.answer().of(load_vector(plant, name, {name: size}))
     first = round(at / c.sample_time)
     moved = run.p[first:] - run.p[first]
     y = answer.y[: len(moved), :, 0]

@@ -14,7 +14,7 @@ from scipy.integrate import solve_ivp
 
 import malta
 from malta import references
-from malta.margins.loops import loop
+from malta.margins.loops import sampled_loop
 from malta.simulation.inputs import feedforward
 from malta.simulation.period import state_reference
 from malta.simulation.scenario import Scenario
@@ -48,7 +48,7 @@ def _linear_response(design: Design, moved: dict[str, float], samples: int, dela
     slope; the law by its derivatives."""
     c, plant = design.controller, design.plant
     model = malta.linearize(plant, malta.trim(plant, z=0.0))
-    stage = loop(model, c, delay=delay, current_loops="lag")
+    stage = sampled_loop(model, c, delay=delay, current_loops="lag")
     grid, table = c.feedforward.z_grid, c.feedforward.v0
     middle = len(grid) // 2
     slope = np.zeros((5, 5))
@@ -194,7 +194,7 @@ def test_noise_is_the_machines_and_repeats_with_its_seed(designs: dict[str, Desi
 def test_the_noise_of_a_hold_is_what_the_linear_loop_predicts(designs: dict[str, Design]) -> None:
     """True motion under sensor noise against the covariance of the closed loop (a Lyapunov equation)."""
     design = designs["calibrated"]
-    stage = loop(design.model, design.controller, delay=1, current_loops="lag")
+    stage = sampled_loop(design.model, design.controller, delay=1, current_loops="lag")
     A = stage.closed
     B = np.vstack([stage.Bd @ stage.control.D_y, stage.control.B_y])
     C = np.hstack([stage.Cd, np.zeros((5, len(stage.control.A)))])

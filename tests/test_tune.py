@@ -18,7 +18,7 @@ from conftest import ROOT, Run, refusal
 import malta
 from malta import gains, report
 from malta.machines.tubular.requirements import DRIVE
-from malta.margins.loops import loop, machine_loop
+from malta.margins.loops import machine_loop, sampled_loop
 from malta.margins.verify import BANDWIDTHS
 from malta.simulation.catalogue import experiment
 from malta.synthesis.controller import linear_law, linear_law_of
@@ -124,7 +124,7 @@ def test_every_corner_at_350_percent_is_stable(
         }
         plant = malta.plant_of(replace(par, **values))
         model = malta.linearize(plant, plant.at(z=z))
-        closed = loop(model, controller, delay=1, current_loops="lag").closed
+        closed = sampled_loop(model, controller, delay=1, current_loops="lag").closed
         return float(np.abs(eigenvalues(closed)).max())
 
     corners = np.array(np.meshgrid(*[(-1, 1)] * 4)).reshape(4, -1).T

@@ -10,7 +10,7 @@ import pytest
 
 import malta
 from malta.errors import InputError
-from malta.margins.loops import loop, machine_law
+from malta.margins.loops import machine_law, sampled_loop
 from malta.margins.responses import responses
 from malta.margins.robust import robust_margin
 from malta.margins.systems import uncertain
@@ -66,7 +66,7 @@ def test_a_machine_that_the_controller_does_not_know(designs: dict[str, Design])
     weak = malta.plant_of(replace(design.spec.parameters, K_B=4.0))
     law = machine_law(weak, design.controller, "lag")
     system = uncertain(weak, ["m"], believed=design.plant)
-    expected = loop(malta.linearize(weak, weak.at()), design.controller, delay=1, current_loops="lag")
+    expected = sampled_loop(malta.linearize(weak, weak.at()), design.controller, delay=1, current_loops="lag")
     w = np.geomspace(1, 6e4, 30)
     P, _, _, F = responses(system, law, system.nominal, w)
     assert np.linalg.inv(np.eye(5) - P @ F) == pytest.approx(expected.sensitivity(w), rel=1e-6, abs=1e-8)
@@ -82,7 +82,7 @@ def test_the_closed_loop_is_verifys(design: Design) -> None:
     law = machine_law(design.plant, design.controller, "lag")
     system = uncertain(design.plant, ["m", "K_A"], at={"z": 4e-3})
     model = malta.linearize(design.plant, design.plant.at(z=4e-3))
-    expected = loop(model, design.controller, delay=1, current_loops="lag")
+    expected = sampled_loop(model, design.controller, delay=1, current_loops="lag")
     (ours,) = closed_loop(system, law, system.nominal)
     z = np.sort_complex(1 + 50e-6 * np.linalg.eigvals(ours))
     radius = float(np.abs(np.linalg.eigvals(expected.closed)).max())

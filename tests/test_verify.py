@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import malta
-from malta.margins.loops import loop, machine_loop
+from malta.margins.loops import machine_loop, sampled_loop
 from malta.margins.verify import BANDWIDTHS, require_stable, zone
 from malta.synthesis.riccati import eigenvalues
 
@@ -58,7 +58,7 @@ def test_the_sampled_machine_is_python_controls(design: Design) -> None:
         -w_c * np.eye(5), w_c * np.eye(5), np.eye(5), 0 * np.eye(5)
     )
     sampled = control.c2d(machine, 50e-6, "zoh")
-    stage = loop(design.model, design.controller, delay=2, current_loops="lag")
+    stage = sampled_loop(design.model, design.controller, delay=2, current_loops="lag")
     law = stage.control
     controller = control.ss(law.A, law.B_y, law.C, law.D_y, 50e-6)
     for w in (10.0, 300.0, 4000.0):
@@ -66,7 +66,7 @@ def test_the_sampled_machine_is_python_controls(design: Design) -> None:
         expected = -sampled(z) @ controller(z) / z**2
         assert stage.loop_gain(np.array([w]))[0] == pytest.approx(expected, rel=1e-6, abs=1e-7)
     for delay in (0, 1):
-        plain = loop(design.model, design.controller, delay=delay)
+        plain = sampled_loop(design.model, design.controller, delay=delay)
         # S = (I + L)^-1 has the closed-loop poles as its own: the determinant vanishes there
         pole = max(eigenvalues(plain.closed), key=lambda p: abs(p.imag))
         P = plain.Cd @ np.linalg.solve(pole * np.eye(len(plain.Ad)) - plain.Ad, plain.Bd)
@@ -114,7 +114,7 @@ def test_table2_tolerates_a_third_of_the_published_uncertainty_with_its_observer
         worst = replace(par, K_A=8626.7 * (1 + 0.2 * share), K_B=5.2 * (1 - 0.2 * share))
         plant = malta.plant_of(worst)
         model = malta.linearize(plant, plant.at())
-        return bool(np.abs(eigenvalues(loop(model, design.controller).closed)).max() < 1)
+        return bool(np.abs(eigenvalues(sampled_loop(model, design.controller).closed)).max() < 1)
 
     assert stable(0.32)
     assert not stable(0.35)

@@ -1,6 +1,6 @@
 """What the page draws of a design at each move: poles, S and T, Nyquist, a run, a load, figures; numbers only, in SI.
 
-The loop is the machine's own, margins.loops.machine_loop, and the figures are those of malta.verify and malta.recovery.
+The loop is the machine's own, `malta.loop`, and the figures are those of malta.verify and malta.recovery.
 Nothing here is proven: the eigenvalue margin is an upper bound, and the proof follows in proof.py.
 """
 
@@ -18,7 +18,7 @@ from malta.app.files import Edited
 from malta.app.runs import planned_run
 from malta.errors import CheckError, InputError
 from malta.margins.curves import LoopCurves, loop_curves
-from malta.margins.loops import Loop, machine_loop, machine_loop_at
+from malta.margins.loop import Loop, loop_of_model
 from malta.margins.rays import RayBound, ray_bound
 from malta.margins.travel import travel_loops
 from malta.margins.verify import (
@@ -67,22 +67,22 @@ class Problem:
     @cached_property
     def loop(self) -> Loop:
         """The machine's own loop. Raises CheckError where no input holds the machine."""
-        return machine_loop(self.model, self.controller)
+        return loop_of_model(self.model, self.controller)
 
     @cached_property
     def stage(self) -> Stage:
         """Its peak sensitivities, as `malta.verify` has them."""
-        return stage_of("machine", self.loop, [s.name for s in self.controller.measurements])
+        return stage_of("machine", self.loop.sampled, [s.name for s in self.controller.measurements])
 
     @cached_property
     def curves(self) -> LoopCurves:
         """Its frequency responses and the margins of its channels."""
-        return loop_curves(self.plant, self.controller)
+        return loop_curves(self.loop)
 
     @cached_property
     def poles(self) -> ComplexArray:
         """Poles of the closed loop, rad/s, as `malta.verify` has them."""
-        return continuous_poles(eigenvalues(self.loop.closed), self.controller.sample_time)
+        return continuous_poles(eigenvalues(self.loop.matrix), self.controller.sample_time)
 
 
 def solve(edited: Edited) -> Problem:
@@ -158,7 +158,7 @@ def run_document(problem: Problem, view: View) -> dict[str, Any] | None:
     """The chosen run on the linear loop; None where the machine has no such run, or it is too long."""
     try:
         name, planned = planned_run(problem.plant, problem.controller, view.run)
-        found = linear_run(problem.loop, problem.controller, planned.scenario)
+        found = linear_run(problem.loop.sampled, problem.controller, planned.scenario)
     except InputError:
         return None
     return curves(name, found.t, found.reference, found.p, found.v)
@@ -177,7 +177,7 @@ def _load(problem: Problem, view: View) -> dict[str, Any] | None:
     if not names or not problem.stage.stable:
         return None
     k = names.index(view.load) if view.load in names else 0
-    answer = machine_loop_at(problem.plant, problem.controller).answer()
+    answer = problem.loop.sampled.answer()
     one = answer.of(np.eye(len(names))[k])
     settled = one.within(0.02)
     ends = settled[np.isfinite(settled)]
@@ -238,7 +238,7 @@ def _figures(
 
 def _stable_merits(problem: Problem) -> list[Merit]:
     """Of the machine's loop: sensitivity, bandwidths, margins of the channels, noise."""
-    stage, loop = problem.stage, problem.loop
+    stage, loop = problem.stage, problem.loop.sampled
     sensors = {k: v for k, v in stage.peak_sensitivity.items() if k != "sigma_max"}
     worst = max(sensors, key=lambda name: sensors[name])
     bandwidths = bandwidths_of(problem.model, problem.controller, loop, stable=True)

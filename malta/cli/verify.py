@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 MOST = 0.5  # of the time of a verification, which the margins take
 
 
-class Loop(NamedTuple):
+class Subject(NamedTuple):
     """A gain file on its machine, and the uncertainty that the margins count in."""
 
     gains: Path
@@ -91,7 +91,7 @@ def verify(
     forces hold and the mover carries in flight.
 
     The machine is the one in the file, with the changes given by --set, as far as they shape the linear loop (on MALTA
-    m, K_A, K_B, dK_A, l_B, F_c, T_d, tau_s; windings and DC link do not).
+    also windings and DC link; the current controllers are those of the gain file). What it leaves out is said.
 
     \b
     Example:  malta verify design/gains/calibrated.json --set m=0.56
@@ -107,21 +107,21 @@ def verify(
     published = published_figures(plant.name)
     box = read_uncertainty(gains, uncertain, plant.parameters, published)
     _require_options(time, certificate, proof=not no_proof)
-    loop = Loop(gains, controller, plant, model, box, cast("CurrentLoops", current_loops))
-    analysis = _analyse(loop, time, proof=not no_proof, worst_case=worst_case)
+    subject = Subject(gains, controller, plant, model, box, cast("CurrentLoops", current_loops))
+    analysis = _analyse(subject, time, proof=not no_proof, worst_case=worst_case)
     files: list[Path] = []
     refusal: InputError | CheckError | None = None
     if certificate is not None:
         try:
-            files.append(_write_certificate(certificate, loop, analysis.robustness.travel))
+            files.append(_write_certificate(certificate, subject, analysis.robustness.travel))
         except (InputError, CheckError) as error:
             refusal = error  # the tables come first
     if out is not None:
-        files += _draw(loop, analysis, out)
+        files += _draw(subject, analysis, out)
     if as_json:
-        print_document(_document(loop, analysis, files))
+        print_document(_document(subject, analysis, files))
     else:
-        _print_tables(loop, analysis, published, change or (), files)
+        _print_tables(subject, analysis, published, change or (), files)
     require_stable(analysis.margins, str(gains))
     if refusal is not None:
         raise refusal
@@ -135,7 +135,7 @@ def _require_options(time: float | None, certificate: Path | None, *, proof: boo
         raise InputError("--certificate", "", "--no-proof", "one of them")
 
 
-def _analyse(loop: Loop, time: float | None, *, proof: bool, worst_case: bool | None) -> Analysis:
+def _analyse(subject: Subject, time: float | None, *, proof: bool, worst_case: bool | None) -> Analysis:
     """Compute the margins of a loop behind a progress bar.
 
     time : s, longest search of a margin over the travel
@@ -149,10 +149,15 @@ def _analyse(loop: Loop, time: float | None, *, proof: bool, worst_case: bool | 
     from malta.margins.verify import verify as compute_margins
     from malta.simulation.payload import payload
 
-    plant, controller, box, current_loops = loop.plant, loop.controller, loop.box, loop.current_loops
+    plant, controller, box, current_loops = (
+        subject.plant,
+        subject.controller,
+        subject.box,
+        subject.current_loops,
+    )
     try:
         with margin_progress("margins") as (progress, bounds):
-            margins = compute_margins(loop.model, controller)
+            margins = compute_margins(subject.model, controller)
             robust = robustness(
                 plant, controller, box,
                 current_loops=current_loops, progress=lambda share: progress(MOST * share), bounds=bounds,
@@ -167,53 +172,55 @@ def _analyse(loop: Loop, time: float | None, *, proof: bool, worst_case: bool | 
             recovered = recovery(plant, controller) if margins.stable and plant.disturbances else ()
             carried = payload(plant, controller) if margins.stable and proof else None
     except CheckError as error:
-        raise CheckError(f"{loop.gains}: {error}") from error
+        raise CheckError(f"{subject.gains}: {error}") from error
     return Analysis(margins, robust, worst, recovered, carried)
 
 
-def _write_certificate(path: Path, loop: Loop, margin: Margin) -> Path:
+def _write_certificate(path: Path, subject: Subject, margin: Margin) -> Path:
     """Write the certificate of the margin over the travel."""
     from malta.gains.certified import origin_of
     from malta.margins import certificate
     from malta.margins.travel import travel_loops
 
-    places, over = travel_loops(loop.plant, loop.controller, tuple(loop.box), loop.current_loops)
-    origin = origin_of(loop.gains, loop.plant, loop.controller, loop.current_loops, len(places))
-    return certificate.write(path, places, loop.box, over, margin, origin)
+    places, over = travel_loops(subject.plant, subject.controller, tuple(subject.box), subject.current_loops)
+    origin = origin_of(subject.gains, subject.plant, subject.controller, subject.current_loops, len(places))
+    return certificate.write(path, places, subject.box, over, margin, origin)
 
 
-def _draw(loop: Loop, analysis: Analysis, folder: Path) -> list[Path]:
+def _draw(subject: Subject, analysis: Analysis, folder: Path) -> list[Path]:
     """Draw the margins stage by stage and over the travel, and how loads are carried where there are any."""
     from malta import report
 
-    name = loop.controller.name
-    picture, position = folder / f"{name}_margins.png", f"position {loop.plant.stroke}"
-    report.robustness(analysis.robustness, name, loop.box, picture, position, analysis.worst)
+    name = subject.controller.name
+    picture, position = folder / f"{name}_margins.png", f"position {subject.plant.stroke}"
+    report.robustness(analysis.robustness, name, subject.box, picture, position, analysis.worst)
     files = [picture]
     if analysis.recovered:
         files.append(folder / f"{name}_loads.png")
-        report.loads(loop.plant, loop.controller, files[-1], analysis.recovered)
+        report.loads(subject.plant, subject.controller, files[-1], analysis.recovered)
     return files
 
 
-def _document(loop: Loop, analysis: Analysis, files: Sequence[Path]) -> VerifyOutput:
+def _document(subject: Subject, analysis: Analysis, files: Sequence[Path]) -> VerifyOutput:
     """The JSON document of a verification."""
     from malta.cli.documents.loops import VerifyOutput, loop_fields, payload_part, recovery_part, robust_part
+    from malta.margins.windings import left_out
 
-    units = {signal.name: signal.unit for signal in loop.plant.outputs}
+    units = {signal.name: signal.unit for signal in subject.plant.outputs}
     return VerifyOutput(
-        gains=str(loop.gains),
-        design=loop.controller.name,
+        gains=str(subject.gains),
+        design=subject.controller.name,
         files=[str(file) for file in files],
         recovery=[recovery_part(one) for one in analysis.recovered],
-        robust=robust_part(analysis.robustness, loop.box, analysis.worst, units),
+        robust=robust_part(analysis.robustness, subject.box, analysis.worst, units),
         payload=payload_part(analysis.payload),
+        left_out=left_out(subject.plant, subject.controller, subject.current_loops),
         **loop_fields(analysis.margins),
     )
 
 
 def _print_tables(
-    loop: Loop,
+    subject: Subject,
     analysis: Analysis,
     published: Mapping[str, Any] | None,
     changes: Sequence[str],
@@ -221,25 +228,28 @@ def _print_tables(
 ) -> None:
     """Print the tables of a verification; poles of a changed machine stand beside no published ones."""
     from malta import report
+    from malta.margins.windings import left_out
 
-    controller, margins, robust = loop.controller, analysis.margins, analysis.robustness
+    controller, margins, robust = subject.controller, analysis.margins, analysis.robustness
+    missing = left_out(subject.plant, controller, subject.current_loops)
     open_bounds = report.open_bounds(robust, analysis.worst)
-    box = "  ".join(f"{name} +-{100 * share:g} %" for name, share in loop.box.items())
+    box = "  ".join(f"{name} +-{100 * share:g} %" for name, share in subject.box.items())
     console = make_console()
     preset = f"{controller.parameters.preset} {' '.join(changes)}".rstrip()
-    print_text(console, f"{loop.gains}: {controller.name}, {loop.plant.name}, preset {preset}")
+    print_text(console, f"{subject.gains}: {controller.name}, {subject.plant.name}, preset {preset}")
     for table in (
-        report.poles_table(loop.model, None if changes else published),
+        report.poles_table(subject.model, None if changes else published),
         report.loop_poles_table(margins),
         report.bandwidth_table(margins, published),
         report.sensitivity_table(margins),
-        *([report.recovery_table(analysis.recovered, loop.plant)] if analysis.recovered else []),
+        *([report.recovery_table(analysis.recovered, subject.plant)] if analysis.recovered else []),
         report.Paragraph(f"Uncertainty: {box}\n"),
         report.chain_table(robust),
+        *([report.Paragraph(f"Not in the last stage: {missing}\n")] if missing else []),
         *([report.Paragraph("\n".join(open_bounds) + "\n")] if open_bounds else []),
         report.disk_table(robust, controller.sample_time),
-        report.gang_table(robust, loop.plant),
-        report.tolerance_table(robust, loop.box, analysis.payload),
+        report.gang_table(robust, subject.plant),
+        report.tolerance_table(robust, subject.box, analysis.payload),
         report.places_table(robust, controller.sample_time),
         *([report.worst_case_table(analysis.worst)] if analysis.worst else []),
     ):

@@ -201,7 +201,8 @@ def loop_curves(
 ) -> LoopCurves:
     """Compute the curves of a loop: frequency responses on a grid that fits them, poles, zeros, margins.
 
-    source : a plant; LoopSystems; a system of python-control, P or the loop gain L; or curves, which are returned
+    source : a malta.Loop; a plant; LoopSystems; a system of python-control, P or the loop gain L; or curves, which
+        are returned
     controller : of the plant, or the system C of the errors (L = P C, negative feedback); None: the source has it
     name : of the loop; "": that of the controller or of the system
     position : of the stroke, m, of a plant; None: the controller's operating point

@@ -21,8 +21,8 @@ import numpy as np
 from scipy import linalg
 
 from malta.errors import CheckError, InputError
+from malta.margins.loop import Loop, loop_along
 from malta.margins.loop_systems import LoopSystems
-from malta.margins.loops import machine_loop_at
 from malta.model.plant import Plant, Signal
 from malta.synthesis.controller import Controller, LinearLaw, linear_law
 from malta.synthesis.riccati import eigenvalues
@@ -189,8 +189,8 @@ def linear_loop(
 ) -> LinearLoop:
     """The matrices of a loop.
 
-    source, controller : a plant and its Controller; LoopSystems; two systems of python-control, plant and controller of
-        the errors (L = P C, negative feedback); or one, the loop gain L. A pair may be one tuple
+    source, controller : a plant and its Controller; a Loop; LoopSystems; two systems of python-control, plant and
+        controller of the errors (L = P C, negative feedback); or one, the loop gain L. A pair may be one tuple
     name : of the loop; "": that of the controller or of the system
     position : of the stroke, m, of a plant; None: the controller's operating point
 
@@ -205,19 +205,21 @@ def linear_loop(
     if isinstance(source, LinearLoop):
         return source
     if isinstance(source, Plant) and isinstance(controller, Controller):
-        return _of_machine(source, controller, name or controller.name, position)
+        source, controller = loop_along(source, controller, position), None
+    if isinstance(source, Loop) and controller is None:
+        return _of_machine(source, name or source.controller.name)
     if isinstance(source, LoopSystems) and controller is None:
         return linear_loop(source.plant, source.controller, name=name)
     if _is_system(source) and (controller is None or _is_system(controller)):
         return _of_systems(source, controller, name)
     found = " and ".join(type(one).__name__ for one in (source, controller) if one is not None)
     raise InputError(
-        CALLER, "", f"a {found}", "a plant and its controller, or control systems: L, or P and C"
+        CALLER, "", f"a {found}", "a loop, a plant and its controller, or control systems: L, or P and C"
     )
 
 
-def _of_machine(plant: Plant, controller: Controller, name: str, position: float | None) -> LinearLoop:
-    loop = machine_loop_at(plant, controller, position, forces_alone=True)
+def _of_machine(whole: Loop, name: str) -> LinearLoop:
+    loop, plant, controller = whole.sampled_forces, whole.plant, whole.controller
     law, T = loop.control, loop.sample_time
     assert loop.pushed is not None
     driven, command = _commanded_system(controller, law)

@@ -6,7 +6,7 @@
     +-----------------------------+
 
 P is the machine as it runs, sampled: hold, delay, current loops, the loads against v0(z). F is the law, with negative
-feedback inside. They are those of loops.machine_loop.
+feedback inside. They are those of `malta.loop`.
 """
 
 from __future__ import annotations
@@ -16,8 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from malta.margins.loops import machine_loop
-from malta.model.linearize import linearize
+from malta.margins.loop import loop_along
 from malta.model.plant import Plant
 from malta.synthesis.controller import Controller
 from malta.synthesis.state_space import named_system, reference_names, set_point
@@ -85,8 +84,7 @@ def loop_systems(plant: Plant, controller: Controller) -> LoopSystems:
     >>> f"largest |S| {loop.S.frequency_response(w).magnitude.max():.2f}"
     'largest |S| 1.57'
     """
-    model = linearize(plant, plant.point(controller.operating_point[0]))
-    loop = machine_loop(model, controller, forces_alone=True)
+    loop = loop_along(plant, controller).sampled_forces
     law, m = loop.control, len(controller.forces)
     n, k, p = len(loop.Ad), len(law.A), len(loop.Cd)
     Cd, B1 = loop.Cd, loop.Bd[:, :m]

@@ -12,7 +12,7 @@ reading is a further input of P, and F passes it on.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
@@ -55,7 +55,7 @@ ROUNDING = 1e-9  # of the largest entry
 
 
 @dataclass(frozen=True, eq=False)
-class Loop:
+class SampledLoop:
     """Sampled machine x+ = Ad x + Bd v, y = Cd x, closed by the linear control law v = F y."""
 
     Ad: FloatArray
@@ -118,7 +118,7 @@ class Loop:
         return np.asarray((true[..., m:] + true[..., :m] @ F @ read)[..., 0])
 
 
-def loop(
+def sampled_loop(
     model: LinearModel,
     controller: Controller,
     *,
@@ -127,7 +127,7 @@ def loop(
     feedforward: bool = False,
     sensors: bool = False,
     forces_alone: bool = False,
-) -> Loop:
+) -> SampledLoop:
     """The sampled loop of a machine and a controller.
 
     delay : samples between measurement and force
@@ -162,7 +162,7 @@ def loop(
         true = None if true is None else _pad(true, len(Ad))
     if model.E.any():
         law = with_readings(law)
-    return Loop(Ad, Bd, Cd, law, controller.sample_time, true, continuous)
+    return SampledLoop(Ad, Bd, Cd, law, controller.sample_time, true, continuous)
 
 
 def _driven(
@@ -217,11 +217,11 @@ def machine_loop(
     current_loops: CurrentLoops = LAST,
     *,
     forces_alone: bool = False,
-) -> Loop:
+) -> SampledLoop:
     """The loop as the machine runs it: hold, delay, current loops, late sensors, loads against v0(z) at the trim.
 
     current_loops : "pi", the controllers of the gain file on the windings, where a machine has some; or "lag"
-    forces_alone : see `loop`
+    forces_alone : see `sampled_loop`
 
     Raises CheckError when no input holds the machine at the model's operating point, and InputError for a dead time of
     its sensors that is not whole samples.
@@ -231,29 +231,10 @@ def machine_loop(
     loaded = loaded_model(plant, position_in(plant, x), tuple(off_stroke(plant, x).items()))
     chosen = chosen_loops(plant, controller, current_loops)
     delay = plant.actuator.delay(controller.sample_time)
-    return loop(
+    return sampled_loop(
         loaded, controller,
         delay=delay, current_loops=chosen, feedforward=True, sensors=True, forces_alone=forces_alone,
     )  # fmt: skip
-
-
-def machine_loop_at(
-    plant: Plant, controller: Controller, position: float | None = None, *, forces_alone: bool = False
-) -> Loop:
-    """The machine's loop at a position of the stroke, with what disturbances do to it.
-
-    position : m; None: the controller's operating point
-    forces_alone : see `loop`
-
-    Raises CheckError when no input holds the machine there.
-    """
-    x = plant.point(controller.operating_point[0]).x
-    others = tuple(off_stroke(plant, x).items())
-    model = loaded_model(plant, position_in(plant, x) if position is None else position, others)
-    found = machine_loop(model, controller, forces_alone=forces_alone)
-    assert found.continuous is not None
-    pushed = push_through(found.continuous, disturbance_map(model), controller.sample_time, len(found.Ad))
-    return replace(found, pushed=pushed)
 
 
 @lru_cache(maxsize=16)  # every controller of a machine has it; models compare by identity

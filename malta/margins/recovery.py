@@ -3,7 +3,7 @@
          w (constant, from t = 0)
          |
          v         y
-    [ machine ] ------> [ law ] --+        the loop of verify.machine_loop: hold, delay, current loops, loads
+    [ machine ] ------> [ law ] --+        the loop of loop.py: hold, delay, current loops, loads
          ^                        |        against v0(z) at the trim
          +------------------------+
 
@@ -21,7 +21,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from malta.errors import CheckError, InputError
-from malta.margins.loops import Loop, machine_loop_at
+from malta.margins.loop import loop_along
+from malta.margins.loops import SampledLoop
 from malta.margins.responses import find_peaks
 from malta.model.plant import position_in
 from malta.synthesis.step_response import StepResponse
@@ -110,7 +111,7 @@ def recovery(
         raise InputError(plant.name, "disturbances", "none", "a machine on which forces act from outside")
     loads = {name: {name: 1.0} for name in known} if loads is None else loads
     sizes = [load_vector(plant, name, load) for name, load in loads.items()]
-    loop = machine_loop_at(plant, controller, position)
+    loop = loop_along(plant, controller, position).sampled
     unit_loads = loop.answer()
     return tuple(
         Recovery(name, dict(load), after, _deviations(plant, loop, unit_loads, size, after))
@@ -151,7 +152,7 @@ def bounded_deviation(
     chosen = [k for k, s in enumerate(plant.outputs) if s.name in bound.outputs]
     at = position_in(plant, plant.point(controller.operating_point[0]).x) if position is None else position
     try:
-        answer = machine_loop_at(plant, controller, position).answer().of(bound.load_at(at))
+        answer = loop_along(plant, controller, position).sampled.answer().of(bound.load_at(at))
     except CheckError:
         return math.inf
     reached = answer.largest if bound.after is None else answer.left(bound.after)
@@ -165,7 +166,7 @@ def worst_along(plant: Plant, controller: Controller, bound: RecoveryBound) -> t
 
 
 def _deviations(
-    plant: Plant, loop: Loop, unit_loads: StepResponse, load: FloatArray, after: tuple[float, ...]
+    plant: Plant, loop: SampledLoop, unit_loads: StepResponse, load: FloatArray, after: tuple[float, ...]
 ) -> tuple[Deviation, ...]:
     """What a load does to each output."""
     answer, Ts = unit_loads.of(load), loop.sample_time

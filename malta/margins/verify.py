@@ -12,7 +12,8 @@ import numpy as np
 
 from malta.errors import CheckError
 from malta.margins.extent import NOWHERE, Extent, extent_of
-from malta.margins.loops import Loop, commanded_model, loop, machine_loop
+from malta.margins.loop import loop_of_model
+from malta.margins.loops import SampledLoop, commanded_model, sampled_loop
 from malta.margins.responses import crossing, find_peaks
 from malta.margins.robust import Margin
 from malta.margins.travel import NOT_BETWEEN, travel_margin
@@ -156,7 +157,7 @@ def unstable_gain(c: Controller) -> tuple[str, float] | None:
     if c.cost is None:
         plant = plant_of(c.parameters)
         model = linearize(plant, plant.point(c.operating_point[0]))
-        found = {"K": eigenvalues(machine_loop(model, c).closed)}
+        found = {"K": eigenvalues(loop_of_model(model, c).matrix)}
     else:
         found = dict(zip("KL", controller_poles(c), strict=True))
     for name, poles in found.items():
@@ -207,10 +208,10 @@ def verify(
 
 
 def _verify(model: LinearModel, controller: Controller, uncertainty: Mapping[str, float]) -> Margins:
-    machine = machine_loop(model, controller)
+    machine = loop_of_model(model, controller).sampled
     loops = {
-        "sampled": loop(model, controller, delay=controller.delay),
-        "+ current loops": loop(model, controller, delay=controller.delay, current_loops="lag"),
+        "sampled": sampled_loop(model, controller, delay=controller.delay),
+        "+ current loops": sampled_loop(model, controller, delay=controller.delay, current_loops="lag"),
         "machine": machine,
     }
     names = [s.name for s in controller.measurements]
@@ -241,7 +242,7 @@ def _grid(Ts: float) -> FloatArray:
     return np.geomspace(1e-2, np.pi / Ts, 240)
 
 
-def stage_of(name: str, stage: Loop, sensors: list[str]) -> Stage:
+def stage_of(name: str, stage: SampledLoop, sensors: list[str]) -> Stage:
     """The peak sensitivities and the spectral radius of a loop; the peaks of an unstable one are NaN."""
     radius = float(np.abs(eigenvalues(stage.closed)).max())
     if radius >= 1:
@@ -256,7 +257,7 @@ def stage_of(name: str, stage: Loop, sensors: list[str]) -> Stage:
 
 
 def bandwidths_of(
-    model: LinearModel, controller: Controller, machine: Loop, *, stable: bool
+    model: LinearModel, controller: Controller, machine: SampledLoop, *, stable: bool
 ) -> dict[str, float]:
     """The bandwidths of the machine's loop by the definitions of BANDWIDTHS, rad/s; NaN where it is unstable."""
     natural = _natural_frequencies(commanded_model(model, controller), controller)

@@ -70,8 +70,10 @@ def _driven(plant: Plant, controller: Controller) -> bool:
     return plant.windings is not None and controller.current_loop is not None
 
 
-def left_out(plant: Plant, controller: Controller) -> str:
+def left_out(plant: Plant, controller: Controller, current_loops: CurrentLoops = "pi") -> str:
     """What the machine's loop leaves out of the current loops; "": nothing that simulations fly by default."""
+    if current_loops == "lag" and _driven(plant, controller):
+        return "the PI current controllers, for which first-order lags at their crossover stand"
     if plant.electronics is not None and plant.windings is None:
         return "the electronics' own current controllers, for which first-order lags at their crossover stand"
     if _driven(plant, controller) and is_commutated(plant_of(controller.parameters)):

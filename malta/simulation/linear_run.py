@@ -2,7 +2,7 @@
 
     X+ = M X + G r,   p = C X,   v = K X + D r        X = (machine, law), r = (p*, xi*, v_ff, v0)
 
-The loop is that of margins.loops.machine_loop: hold, delay, current loops, late sensors, loads against v0(z) at the
+The loop is `malta.loop`: hold, delay, current loops, late sensors, loads against v0(z) at the
 trim. Forces that saturate, sums of errors that wait, and what changes along the way are left to `simulate`.
 """
 
@@ -20,7 +20,7 @@ from malta.simulation.inputs import feedforward, motion_of, past_forces
 from malta.simulation.period import state_reference
 
 if TYPE_CHECKING:
-    from malta.margins.loops import Loop
+    from malta.margins.loops import SampledLoop
     from malta.model.plant import FloatArray
     from malta.simulation.references import Motion
     from malta.simulation.scenario import Scenario
@@ -38,10 +38,10 @@ class LinearRun(NamedTuple):
     v: FloatArray  # k x m, commanded forces beside those that hold the machine at its operating point
 
 
-def linear_run(loop: Loop, controller: Controller, scenario: Scenario) -> LinearRun:
+def linear_run(loop: SampledLoop, controller: Controller, scenario: Scenario) -> LinearRun:
     """Follow the reference of a scenario with the linear loop, which starts at rest on the reference.
 
-    loop : `machine_loop` of the machine and the controller
+    loop : `malta.loop(machine, controller).sampled`
 
     Raises InputError for more than LONGEST samples.
     """

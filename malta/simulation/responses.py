@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import casadi as ca
 import numpy as np
 
-from malta.margins.loops import machine_loop
+from malta.margins.loop import loop_along
 from malta.model.linearize import linearize
 from malta.model.plant import Plant
 from malta.simulation.trajectory import Trajectory
@@ -27,7 +27,7 @@ def compliance(
     """
     point = plant.point(controller.operating_point[0])
     model = linearize(plant, point)
-    loop = machine_loop(model, controller)
+    loop = loop_along(plant, controller)
     x, w_ext = ca.SX.sym("x", len(plant.states)), ca.SX.sym("w", len(plant.disturbances))
     rate = plant.f(x, ca.SX(point.u), w_ext)
     column = [s.name for s in plant.disturbances].index(wrench)

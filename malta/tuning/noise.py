@@ -9,7 +9,7 @@ import numpy as np
 from malta.synthesis.requirements import Noise
 
 if TYPE_CHECKING:
-    from malta.margins.loops import Loop
+    from malta.margins.loops import SampledLoop
     from malta.model.plant import FloatArray, Plant
 
 
@@ -30,12 +30,12 @@ def noise_variance(plant: Plant) -> FloatArray:
     return variance
 
 
-def noise_of(loop: Loop, plant: Plant) -> Noise:
+def noise_of(loop: SampledLoop, plant: Plant) -> Noise:
     """Compute the rms of the true outputs and of the commanded forces from the sensors' noise and steps."""
     return _noise_from(loop, noise_variance(plant), len(plant.inputs))
 
 
-def budget_of(loop: Loop, plant: Plant) -> Noise:
+def budget_of(loop: SampledLoop, plant: Plant) -> Noise:
     """Compute which sensors the noise at rest comes from: shares of each variance, p x p of motion, m x p of force.
 
     A row without noise is zero.
@@ -53,7 +53,7 @@ def _shares(sizes: list[FloatArray]) -> FloatArray:
     return found
 
 
-def _noise_from(loop: Loop, V: FloatArray, m: int) -> Noise:
+def _noise_from(loop: SampledLoop, V: FloatArray, m: int) -> Noise:
     """The noise at rest from sensors of these variances; of m forces, behind which a loop may hand on readings."""
     c = loop.control
     noise = np.vstack([loop.Bd @ c.D_y, c.B_y])

@@ -9,7 +9,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from malta.errors import InputError
-from malta.margins.loops import machine_loop
+from malta.margins.loop import Loop, loop_of_model
 from malta.margins.recovery import bounded_deviation, worst_along
 from malta.margins.verify import BANDWIDTHS, verify
 from malta.model.linearize import linearize
@@ -85,6 +85,11 @@ class SynthesizedDesign:
         """The machine that the controller is designed for."""
         return self.spec.plant
 
+    @property
+    def loop(self) -> Loop:
+        """The machine's loop at the design's operating point."""
+        return loop_of_model(self.model, self.controller)
+
     @cached_property
     def margins(self) -> Margins:
         """The verified loop, with the proven robust margin where one is asked for."""
@@ -101,13 +106,13 @@ class SynthesizedDesign:
     @cached_property
     def noise(self) -> Noise:
         """Motion and commanded forces at rest, rms, by the covariance of the machine's linear loop."""
-        return noise_of(machine_loop(self.model, self.controller), self.plant)
+        return noise_of(self.loop.sampled, self.plant)
 
     @cached_property
     def load_figures(self) -> Mapping[str, float]:
         """Of a PID under the loads of [cost], by name and output; none where its loop is unstable."""
         whole = whole_machine(self.model, self.controller, loads_of(self.spec))
-        return loop_figures(self.spec, whole, machine_loop(self.model, self.controller))
+        return loop_figures(self.spec, whole, self.loop.sampled)
 
     def deviation(self, bound: RecoveryBound) -> Figure:
         """Under a constant load from outside, at the operating point or at the worst of some places of the travel."""

@@ -26,7 +26,8 @@ import numpy as np
 from scipy import optimize, sparse
 
 from malta.errors import InputError
-from malta.margins.loops import Loop, machine_loop
+from malta.margins.loop import loop_of_model
+from malta.margins.loops import SampledLoop
 from malta.margins.responses import crossing
 from malta.margins.windings import emf_slope, estimated_rows, windings_of, with_estimated_emf
 from malta.model.data import plant_of
@@ -87,7 +88,7 @@ class Part:
 
 def whole_machine(model: LinearModel, controller: Controller, loads: Loads) -> Part:
     """Describe all of a machine as one part, with what the loads leave in its states."""
-    machine, plant, Ts = machine_loop(model, controller), model.plant, controller.sample_time
+    machine, plant, Ts = loop_of_model(model, controller).sampled, model.plant, controller.sample_time
     x = model.operating_point.x
     loaded = linearize(plant, trim(plant, **position_at(plant, x)))
     assert machine.continuous is not None
@@ -105,7 +106,7 @@ def whole_machine(model: LinearModel, controller: Controller, loads: Loads) -> P
     )  # fmt: skip
 
 
-def _forecast(model: LinearModel, controller: Controller, machine: Loop) -> FloatArray:
+def _forecast(model: LinearModel, controller: Controller, machine: SampledLoop) -> FloatArray:
     """Voltages that the law forecasts, of positions and rates of the outputs, m x 2 m; empty where there are none."""
     m, half = len(controller.forces), model.plant.coordinates
     if model.E.any() or machine.Bd.shape[1] == m:
@@ -150,8 +151,8 @@ def parts_of(whole: Part) -> list[Part]:
     return parts
 
 
-def close_loop(part: Part, terms: Pid, Ts: float, axes: Axes | None = None) -> Loop:
-    """Close a part's loop with gains, as `machine_loop` closes the whole machine's.
+def close_loop(part: Part, terms: Pid, Ts: float, axes: Axes | None = None) -> SampledLoop:
+    """Close a part's loop with gains, as `malta.loop` closes the whole machine's.
 
     axes : of the whole machine; None: each output with the input of its index
     """
@@ -165,10 +166,10 @@ def close_loop(part: Part, terms: Pid, Ts: float, axes: Axes | None = None) -> L
         linear = with_estimated_emf(linear, estimated_rows(part.forecast, g.L, g.Cd))
     elif part.Bd.shape[1] > k:
         linear = with_readings(linear)
-    return Loop(part.Ad, part.Bd, part.Cd, linear, Ts)
+    return SampledLoop(part.Ad, part.Bd, part.Cd, linear, Ts)
 
 
-def loop_figures(spec: Spec, part: Part, loop: Loop) -> dict[str, float]:
+def loop_figures(spec: Spec, part: Part, loop: SampledLoop) -> dict[str, float]:
     """Compute the figures of a part's loop, by name and output; none where the loop is unstable."""
     closed, c, n, Ts = loop.closed, loop.control, len(part.Ad), loop.sample_time
     if not np.isfinite(closed).all():

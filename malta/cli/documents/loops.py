@@ -177,6 +177,7 @@ class VerifyOutput(LoopPart):
     recovery: list[RecoveryPart]
     robust: RobustPart
     payload: PayloadPart | None
+    left_out: str = ""  # of the machine, by the loop of the last stage; "": nothing
 
 
 def loop_fields(margins: Margins) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from scipy.optimize import brentq
 
 from malta.campaigns.yields import Yields, main_yields
 from malta.machines.tubular.experiments.strokes import delayed_stroke
-from malta.margins.loops import machine_loop
+from malta.margins.loop import loop_of_model
 from malta.margins.plants import of_plant
 from malta.margins.recovery import PLACES, Deviation, recovery
 from malta.margins.robust import robust_margin
@@ -211,7 +211,7 @@ def true_radial(e: Evidence) -> float:
 def noise_forces(e: Evidence) -> tuple[float, float]:
     """Rms of the worst commanded bearing force and of the thrust at rest, N: covariance of the linear loop."""
     plant = e.model.plant
-    force = noise_of(machine_loop(e.model, e.controller), plant).force
+    force = noise_of(loop_of_model(e.model, e.controller).sampled, plant).force
     return float(np.delete(force, plant.thrust_input).max()), float(force[plant.thrust_input])
 
 

@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from malta.margins.loops import Loop, machine_loop_at
+from malta.margins.loop import loop_along
+from malta.margins.loops import SampledLoop
 from malta.margins.recovery import furthest, load_vector
 from malta.report.figures.marks import draw_group
 from malta.report.figures.parts import MORE, STYLES, finish_axes, micro, new_figure
@@ -58,7 +59,7 @@ def recovery_figure(plant: Plant, controller: Controller, found: Sequence[Recove
         hspace=0.5,
     )
     panels = figure.subplots(len(rows), 2, squeeze=False)
-    loop = machine_loop_at(plant, controller)
+    loop = loop_along(plant, controller).sampled
     answer = loop.answer()
     for (left, right), ((unit, of), lines) in zip(panels, rows.items(), strict=True):
         _draw_steps(left, plant, answer, lines, FINE.get(unit, unit), of)
@@ -90,7 +91,7 @@ def _draw_steps(
 def _draw_compliance(
     axes: Axes,
     plant: Plant,
-    loop: Loop,
+    loop: SampledLoop,
     lines: Sequence[tuple[Recovery, Deviation]],
     unit: str,
     of: str,

@@ -8,16 +8,16 @@ from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
 from malta.errors import CheckError, InputError
-from malta.margins.classical import Classical, classical_margins
+from malta.margins.classical import Classical
 from malta.margins.curves import loop_curves
-from malta.margins.loops import LAST, loaded_loop, machine_loop
+from malta.margins.loop import Loop, loop_along
+from malta.margins.loops import LAST
 from malta.margins.recovery import recovery
 from malta.margins.stages import robustness
 from malta.margins.travel import covers_travel, worst_sensitivities
 from malta.margins.verify import verify
 from malta.model.data import plant_of
 from malta.model.linearize import linearize
-from malta.model.plant import position_at
 from malta.simulation.catalogue import experiment, main_job
 from malta.simulation.payload import payload
 from malta.tuning.noise import noise_of
@@ -77,6 +77,11 @@ class Subject(NamedTuple):
         plant = self.plant
         return linearize(plant, plant.point(self.controller.operating_point[0]))
 
+    @property
+    def loop(self) -> Loop:
+        """The machine's loop at the controller's operating point."""
+        return loop_along(self.plant, self.controller, current_loops=self.current_loops)
+
 
 @dataclass(frozen=True, eq=False)
 class Analysis:
@@ -103,7 +108,7 @@ class Analysis:
     @cached_property
     def curves(self) -> LoopCurves:
         """The curves of the machine's loop."""
-        return loop_curves(self.plant, self.subject.controller, name=self.subject.controller.name)
+        return loop_curves(self.subject.loop)
 
 
 def analyse(
@@ -144,11 +149,11 @@ def analyse(
         margins,
         robust,
         margin=margins.robust if robust is None or not stages else robust.travel if proof else None,
-        classical=_classical(subject) if margins.stable else None,
+        classical=subject.loop.classical if margins.stable else None,
         worst=worst,
         recovered=recovery(plant, controller) if margins.stable and plant.disturbances else (),
         payload=carried,
-        noise=noise_of(machine_loop(model, controller), plant) if margins.stable else None,
+        noise=noise_of(subject.loop.sampled, plant) if margins.stable else None,
         job=job,
         outcomes=outcomes,
         campaigns=tuple(campaigns),
@@ -179,14 +184,6 @@ def _robust(subject: Subject, progress: Share, *, proof: bool) -> Robustness | N
         subject.plant, subject.controller, subject.box,
         current_loops=subject.current_loops, progress=progress, proof=proof,
     )  # fmt: skip
-
-
-def _classical(subject: Subject) -> Classical:
-    """Disk and delay margins and the gang of four at the operating point."""
-    plant, controller = subject.plant, subject.controller
-    at = position_at(plant, plant.point(controller.operating_point[0]).x)
-    loop = loaded_loop(plant, controller, at, subject.current_loops)
-    return classical_margins(loop, [s.name for s in plant.outputs])
 
 
 def _main_job(subject: Subject, notes: list[str], progress: Share) -> Experiment | None:

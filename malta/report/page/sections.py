@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from malta.margins.loops import machine_loop
 from malta.margins.robust import NOT_PROVEN
 from malta.model.plant import Signal
 from malta.model.published import published_figures
@@ -176,6 +175,8 @@ def _margins(a: Analysis) -> Iterator[Item]:
                 "of each stage with the zones of ISO 14839-3.",
             )
         yield from sheets_of([chain_table(robust)])
+        if missing := a.subject.loop.left_out:
+            yield f"Not in the last stage: {missing}."
         yield from open_bounds(robust, a.worst)
         yield from sheets_of([disk_table(robust, c.sample_time)])
         if robust.tolerance:
@@ -279,7 +280,7 @@ def _job(a: Analysis) -> Iterator[Item]:
 def _noise(a: Analysis) -> Iterator[Item]:
     if a.noise is None:
         return
-    budget = budget_of(machine_loop(a.model, a.subject.controller), a.plant)
+    budget = budget_of(a.subject.loop.sampled, a.plant)
     names = [s.name for s in a.plant.outputs]
     for signals, totals, shares, title in (
         (
