@@ -29,6 +29,7 @@ from malta.errors import InputError
 from malta.files import shipped_path
 from malta.margins.rays import ray_bound
 from malta.margins.travel import travel_loops, travel_margin
+from malta.tuning.outcomes import judge
 from malta.tuning.search import model_and_controller
 
 HALBACH = shipped_path("design", "halbach_pid.toml")
@@ -503,6 +504,8 @@ def test_workers_follow_the_newest_design_and_prove_it(tmp_path: Path) -> None:
     _, controller = model_and_controller(session.files.apply(session.edit).spec)
     spec = session.files.spec
     assert found["proof"]["lower"] == travel_margin(spec.plant, controller, spec.uncertainty).lower
+    judged = [one.holds for one in judge(spec, controller) if one.name == "margin"]
+    assert found["proof"]["holds"] == (judged[0] if judged else None)
 
 
 @pytest.mark.slow

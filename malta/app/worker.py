@@ -25,6 +25,7 @@ from malta.errors import CheckError, InputError, shorten
 from malta.margins.rays import ray_bound
 from malta.margins.travel import travel_loops, travel_margin
 from malta.simulation.simulate import simulate
+from malta.synthesis.requirements import judge_figure, proven_margin
 from malta.tuning.outcomes import Outcome, SynthesizedDesign, outcomes_of
 
 LONGEST = 120.0  # s, of a proof
@@ -90,9 +91,13 @@ def _proof(problem: Problem, newer: Newer) -> Iterator[dict[str, Any]]:
         return
     margin = travel_margin(problem.plant, problem.controller, box, time=LONGEST, progress=_end_if(newer))
     upper = margin.upper if math.isfinite(margin.upper) else None
+    asked = problem.spec.specification.get("margin")
     yield {
         "kind": "proof",
         "lower": margin.lower,
+        "holds": None
+        if asked is None
+        else judge_figure(proven_margin(margin), asked, at_least=True) == "holds",
         "upper": upper,
         "frequency": margin.frequency,
         "at": dict(margin.witness or {}),

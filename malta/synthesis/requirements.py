@@ -326,9 +326,13 @@ def _noise_motion(design: Design, _asked: float, signal: str) -> list[Figure]:
     return [Figure(design.load_figures.get(f"noise_motion {signal}", math.inf), "covariance")]
 
 
+def proven_margin(margin: Any) -> Figure:
+    """The figure of margins.robust.Margin by which a requirement is judged: what is proven, 0 where nothing is."""
+    return Figure((margin and margin.lower) or 0.0, "proven over the travel")
+
+
 def _margin(design: Design, _asked: float, _signal: str) -> list[Figure]:
-    robust = design.margins.robust
-    return [Figure((robust and robust.lower) or 0.0, "proven over the travel")]
+    return [proven_margin(design.margins.robust)]
 
 
 def _peak_sensitivity(design: Design, _asked: float, _signal: str) -> list[Figure]:

@@ -5,13 +5,12 @@ import { digits, floored, percent, printedUnit, quantity } from "./numbers.js";
 
 const SIGNS = { true: ["✓", "met"], false: ["✗", "not met"], null: ["…", "not known yet"] };
 
-// Whether a margin is reached: by the proof, or refuted by eigenvalues before it.
+// Whether a margin is reached: by the verdict on the proof, or refuted by eigenvalues before it.
 function marginLight(asked, state) {
   const { proof, picture } = state, upper = proof?.upper ?? picture.margin?.upper;
   if (!picture.stable) return { holds: false, found: 0, how: "unstable loop" };
-  if (proof?.lower !== undefined && proof?.lower !== null && proof.lower >= asked) return { holds: true, found: floored(proof.lower), how: "proven over the travel" };
+  if (proof?.holds !== undefined && proof?.holds !== null) return { holds: proof.holds, found: floored(proof.lower ?? 0), how: proof.reason || "proven over the travel" };
   if (upper !== undefined && upper !== null && upper < asked) return { holds: false, found: upper, how: "lost there, by eigenvalues" };
-  if (proof && proof.lower !== undefined) return { holds: null, found: proof.lower, how: proof.reason || "not proven as far as that" };
   return { holds: null, found: upper ?? null, how: "eigenvalues; the proof follows" };
 }
 

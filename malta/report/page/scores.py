@@ -64,6 +64,7 @@ MEANINGS: dict[str, Meaning] = {
     "job_higher": Meaning("main job", "high", "machine"),
     "job": Meaning("main job", "", "machine"),
     "requirements": Meaning("requirements", "high", "machine"),
+    "undecided": Meaning("requirements", "", "machine"),
     "at_most": Meaning("requirements", "low", "machine"),
     "at_least": Meaning("requirements", "high", "machine"),
 }
@@ -235,6 +236,11 @@ def _requirements(a: Analysis) -> Iterator[Score]:
     if asked:
         kept = sum(one.holds for one in asked) / len(asked)
         yield _score("requirements", "requirements_held", "requirements held", kept, "percent")
+        undecided = sum(one.verdict == "undecided" for one in asked) / len(asked)
+        if undecided:
+            yield _score(
+                "undecided", "requirements_undecided", "requirements undecided", undecided, "percent"
+            )
     for one in a.outcomes:
         more = f" {one.how}" if sum(other.name == one.name for other in a.outcomes) > 1 else ""
         words = requirement_words(one.name) + (f", {one.how}" if more else "")
