@@ -16,7 +16,6 @@ import numpy as np
 from IPython.display import display
 
 import malta
-from malta.margins.loops import machine_loop
 
 # The project's root, wherever Jupyter was started.
 os.chdir(next(p for p in (Path.cwd(), *Path.cwd().parents) if (p / "design").is_dir()))
@@ -102,8 +101,8 @@ assert margins["calibrated"].peak_sensitivity["sigma_max"] < 3
 figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.6), layout="constrained")
 w = np.geomspace(1, 6e4, 400)
 for name, style in (("table2", {"color": "0.55", "linestyle": "--"}), ("calibrated", {"color": "black"})):
-    machine = machine_loop(model, controllers[name])
-    S = machine.sensitivity(w)
+    loop = malta.loop(plant, controllers[name])
+    S = loop.sensitivity(w)
     left.loglog(w, np.linalg.svd(S, compute_uv=False)[:, 0], label=name, **style)
     right.loglog(w, np.linalg.svd(np.eye(5) - S, compute_uv=False)[:, 0], label=name, **style)
 left.axhline(3, color="0.7", linewidth=0.8)

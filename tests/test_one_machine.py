@@ -183,7 +183,13 @@ def test_one_loop_answers_all_questions() -> None:
     ours, there = one.margin(box), place_margin(heavy, c, box, 5e-3)
     assert ours.upper == pytest.approx(there.upper, rel=1e-9)
     assert ours.lower == pytest.approx(there.lower, rel=2e-3)
-    assert malta.recovery(heavy, c, position=5e-3)[0].outputs[0].largest == one.sampled.answer().largest[0, 0]
+    moved = one.sampled.answer().largest[0, 0]
+    for found in (malta.recovery(one), malta.recovery(heavy, c, position=5e-3)):
+        assert found[0].outputs[0].largest == moved
+    systems = malta.loop_systems(one)
+    assert distance(one.poles, np.log(systems.S.poles()) * 20e3) < 1e-6
+    with pytest.raises(malta.InputError, match="found one beside a Loop"):
+        malta.recovery(one, c)
 
 
 def test_what_a_loop_leaves_out_is_said() -> None:

@@ -17,7 +17,7 @@ import casadi as ca
 import numpy as np
 
 from malta.errors import InputError
-from malta.margins.loops import machine_loop
+from malta.margins.loop import loop
 from malta.model.equilibrium import trim
 from malta.model.linearize import linearize
 from malta.model.plant import Plant
@@ -115,7 +115,7 @@ def unbalance_response(plant: Plant, controller: Controller, speeds: FloatArray)
         half = speed * controller.sample_time / 2
         held = np.sin(half) / half * np.exp(-1j * half)
         inner = np.linalg.solve(1j * speed * np.eye(8) - loaded.A, np.array(column(0, 0)) @ wrench * held)
-        S = machine_loop(model, controller).sensitivity(np.array([speed]))[0]
+        S = loop(machine, controller).sensitivity(np.array([speed]))[0]
         found.append(S @ model.C @ inner)
     return np.array(found)
 

@@ -14,7 +14,6 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import malta
-from malta.margins.loops import machine_loop
 from malta.margins.verify import ZONES
 from malta.model.machines import attribute_of, machine
 
@@ -58,7 +57,7 @@ figure, panels = plt.subplots(1, 2, figsize=(8, 3.6), sharey=True, layout="const
 margins = {}
 for axes, (label, controller) in zip(panels, controllers.items(), strict=True):
     margins[label] = malta.verify(model, controller, specs[label].uncertainty)
-    S = np.abs(np.einsum("kii->ki", machine_loop(model, controller).sensitivity(w)))
+    S = np.abs(np.einsum("kii->ki", malta.loop(plant, controller).sensitivity(w)))
     assert np.allclose(S[:, 0], S[:, 1], rtol=1e-3)  # the same along x and y
     for k, name in ((0, "s_Ax, s_Ay"), (2, "s_Bx, s_By")):
         axes.semilogx(w, S[:, k], label=name, **STYLES[k])

@@ -206,7 +206,7 @@ def linear_loop(
         return source
     if isinstance(source, Plant) and isinstance(controller, Controller):
         source, controller = loop_along(source, controller, position), None
-    if isinstance(source, Loop) and controller is None:
+    if isinstance(source, Loop) and controller is None and position is None:
         return _of_machine(source, name or source.controller.name)
     if isinstance(source, LoopSystems) and controller is None:
         return linear_loop(source.plant, source.controller, name=name)

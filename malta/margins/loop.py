@@ -223,6 +223,16 @@ def loop_along(
     return _remembered(plant, controller, tuple(at.items()), current_loops)
 
 
+def loop_from(source: Plant | Loop, controller: Controller | None, position: float | None = None) -> Loop:
+    """The loop that a function was given: as it is, or of a plant and its controller. Raises InputError."""
+    if isinstance(source, Loop) and controller is None and position is None:
+        return source
+    if isinstance(source, Loop) or controller is None:
+        found = "none" if controller is None else "one beside a Loop"
+        raise InputError("loop", "controller", found, "a Loop, or a plant and its controller")
+    return loop_along(source, controller, position)
+
+
 @lru_cache(maxsize=32)  # what is asked of a loop is computed once; plants and controllers compare by identity
 def _remembered(
     plant: Plant, controller: Controller, at: tuple[tuple[str, float], ...], current_loops: CurrentLoops

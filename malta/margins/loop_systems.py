@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from malta.margins.loop import loop_along
+from malta.margins.loop import Loop, loop_from
 from malta.model.plant import Plant
 from malta.synthesis.controller import Controller
 from malta.synthesis.state_space import named_system, reference_names, set_point
@@ -62,14 +62,14 @@ class LoopSystems:
 
 
 @on_one_thread
-def loop_systems(plant: Plant, controller: Controller) -> LoopSystems:
-    """Make python-control systems of a controller's loop on a machine, at the controller's operating point.
+def loop_systems(plant: Plant | Loop, controller: Controller | None = None) -> LoopSystems:
+    """Make python-control systems of a machine's loop; of a plant and a controller at the controller's operating point.
 
     Currents that are held between samples hang on the last reading, too: at the sensors this is part of F, and broken
     with it; P, F and what is taken at the forces have it in the machine.
 
-    plant : the machine
-    controller : its controller
+    plant : the machine, or its Loop at any operating point
+    controller : of the plant; None: the Loop has it
 
     Returns a LoopSystems, for control.bode_plot and its like.
 
@@ -84,7 +84,8 @@ def loop_systems(plant: Plant, controller: Controller) -> LoopSystems:
     >>> f"largest |S| {loop.S.frequency_response(w).magnitude.max():.2f}"
     'largest |S| 1.57'
     """
-    loop = loop_along(plant, controller).sampled_forces
+    whole = loop_from(plant, controller)
+    plant, controller, loop = whole.plant, whole.controller, whole.sampled_forces
     law, m = loop.control, len(controller.forces)
     n, k, p = len(loop.Ad), len(law.A), len(loop.Cd)
     Cd, B1 = loop.Cd, loop.Bd[:, :m]

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from malta.errors import CheckError, InputError
-from malta.margins.loop import loop_along
+from malta.margins.loop import Loop, loop_along, loop_from
 from malta.margins.loops import SampledLoop
 from malta.margins.responses import find_peaks
 from malta.model.plant import position_in
@@ -79,8 +79,8 @@ class Recovery:
 
 @on_one_thread
 def recovery(
-    plant: Plant,
-    controller: Controller,
+    plant: Plant | Loop,
+    controller: Controller | None = None,
     loads: Mapping[str, Mapping[str, float]] | None = None,
     *,
     position: float | None = None,
@@ -88,10 +88,10 @@ def recovery(
 ) -> tuple[Recovery, ...]:
     """Answer constant loads from outside with the machine's linear loop.
 
-    plant : the machine
-    controller : its controller
+    plant : the machine, or its Loop
+    controller : of the plant; None: the Loop has it
     loads : sizes in N or N m by disturbance, for each name; None: 1 N or 1 N m of each of the plant's disturbances
-    position : of the stroke, m; None: the controller's operating point
+    position : of the stroke, m, of a plant; None: the controller's operating point
     after : s, times after which what is left is looked at
 
     Returns a Recovery for each load.
@@ -106,12 +106,14 @@ def recovery(
     >>> f"1 N of {found[0].name} moves {x1.output} by {x1.largest * 1e6:.1f} um"
     '1 N of F_x moves x1 by 48.2 um'
     """
+    whole = loop_from(plant, controller, position)
+    plant = whole.plant
     known = [s.name for s in plant.disturbances]
     if not known:
         raise InputError(plant.name, "disturbances", "none", "a machine on which forces act from outside")
     loads = {name: {name: 1.0} for name in known} if loads is None else loads
     sizes = [load_vector(plant, name, load) for name, load in loads.items()]
-    loop = loop_along(plant, controller, position).sampled
+    loop = whole.sampled
     unit_loads = loop.answer()
     return tuple(
         Recovery(name, dict(load), after, _deviations(plant, loop, unit_loads, size, after))
