@@ -5,9 +5,11 @@ from __future__ import annotations
 import ctypes
 import math
 import subprocess
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import casadi as ca
 import numpy as np
 import pytest
 from conftest import ROOT
@@ -18,11 +20,12 @@ from malta.errors import InputError
 from malta.firmware import supervised
 from malta.firmware.elementary import Precision
 from malta.firmware.export import sources
-from malta.firmware.native import new_state, view
+from malta.firmware.native import call, new_state, view
 from malta.firmware.sensor_loss import expected_readings, gains_without, prediction_correction
 from malta.firmware.signals import Target, fidelity_of
 from malta.firmware.supervised import NUMBERS, compile_supervised
 from malta.firmware.supervisor import (
+    FLYING,
     LONG,
     MONITORS,
     STATES,
@@ -31,8 +34,10 @@ from malta.firmware.supervisor import (
     State,
     bounds_of,
     monitors_of,
+    reference_limits,
 )
-from malta.firmware.supervisor_text import monitor_lines, supervisor_sources
+from malta.firmware.supervisor_text import monitor_lines, supervisor_members, supervisor_sources
+from malta.firmware.watch import UNWATCHED, watch_lines, watch_table
 from malta.machines.tubular.experiments.commissioning import SOFT
 from malta.simulation.compiled import compiler
 
@@ -68,6 +73,8 @@ class Bench:
         self.rest = np.array(REST[: len(self.plant.outputs)])
         self._call("supervisor_init", self.supervisor)
         self.seen: list[str] = []
+        self.forced: dict[str, Any] = {}
+        self.step()  # requests count when they come
 
     def _call(self, function: str, *records: Any) -> None:
         getattr(self.s.native.lib, f"{self.s.native.name}_{function}")(*(ctypes.byref(r) for r in records))
@@ -92,9 +99,13 @@ class Bench:
                 read[k] = value
             view(self.inputs, "y")[:], view(self.inputs, "y_valid")[:] = read, 1
             if self.t.driven:
-                view(self.inputs, "i")[:], view(self.inputs, "i_valid")[:] = given.get("i", 0.0), 1
+                view(self.inputs, "i")[:] = given.get("i", self.currents(place))
+                view(self.inputs, "i_valid")[:] = given.get("i_valid", 1)
                 view(self.inputs, "link")[:] = given.get("link", 45.0)
-            for name in ("start", "operate", "land", "acknowledge", "missed"):
+            for field, value in self.forced.items():
+                if value is not None:
+                    view(self.inputs, field)[0] = value
+            for name in ("start", "operate", "land", "acknowledge", "missed", "stop", "sto"):
                 setattr(self.request, name, given.get(name, 0))
             view(self.request.reference, "p")[0] = given.get("reference", 0.0)
             self._call(
@@ -104,6 +115,31 @@ class Bench:
             if not self.seen or self.seen[-1] != self.now:
                 self.seen.append(self.now)
         return self.now
+
+    def ask(self, entry: str, k: int, value: float, **given: Any) -> None:
+        """One sample with an entry of the requested reference."""
+        r = self.request.reference
+        for name in ("p", "dp", "ddp"):
+            view(r, name)[:] = 0.0
+        view(r, "dp")[k] = given.pop("dp", 0.0)
+        view(r, entry)[k] = value
+        self.step(reference=float(view(r, "p")[0]), **given)
+
+    def currents(self, place: Any) -> Any:
+        """The currents of the sensors, which are those that were commanded a sample ago."""
+        if (view(self.outputs, "current") == 0).all():
+            return 0.0
+        return np.array(self.phases(place, view(self.outputs, "current"))).ravel()
+
+    @cached_property
+    def phases(self) -> ca.Function:
+        """(readings of the positions, commanded currents of the coils) -> currents of the sensors."""
+        drive, x = self.plant.drive, ca.SX.zeros(len(self.plant.states))
+        y, current = ca.SX.sym("y", len(self.plant.outputs)), ca.SX.sym("i", len(self.plant.actuator.coils))
+        q = self.plant.position_of(y)
+        for k in range(q.numel()):
+            x[self.plant.controlled[k]] = q[k]
+        return ca.Function("phases", [y, current], [drive.to_phases(x) @ drive.command(current)])
 
     @property
     def now(self) -> State:
@@ -224,6 +260,12 @@ ACTS: tuple[Acts, ...] = (
     ("a link without a reading", {"link": math.nan}, 3, "LINK", "HOLD"),
     ("a link that stays down", {"link": 4.5}, 2000, "LINK", "LANDING"),
     ("a current beyond its limits", {"i": 11.0}, 3, "CURRENT", "FAULT"),
+    ("a link with too much voltage", {"link": 55.0}, 3, "OVERVOLTAGE", "FAULT"),
+    ("currents without a reading", {"i": math.nan}, 5, "CURRENT_LOST", "FAULT"),
+    ("currents that are called invalid", {"i_valid": 0.0}, 5, "CURRENT_LOST", "FAULT"),
+    ("currents whose validity is no number", {"i_valid": math.nan}, 5, "CURRENT_LOST", "FAULT"),
+    ("an emergency stop", {"stop": 1}, 1, "STOP", "FAULT"),
+    ("safe torque off", {"sto": 1}, 1, "STO", "FAULT"),
     ("a request that is no number", {"reference": math.nan}, 1, "REFERENCE", "HOLD"),
     ("a request out of reach", {"reference": 1.0}, 1, "REFERENCE", "HOLD"),
 )
@@ -294,11 +336,12 @@ def test_near_its_bearing_it_lands() -> None:
     bench, bound = Bench().fly(), bounds_of(STUCK).touch
     assert bound[:4] == pytest.approx(0.7 * 0.6e-3, rel=1e-6)
     assert bound[4] == pytest.approx(15e-3, rel=1e-6)
-    bench.step(300, reference=0.3e-3)
-    bench.step(1000, reference=0.3e-3)
+    bench.step(1300, reference=0.3e-3)
     assert bench.now == "OPERATE"
-    bench.step(1200, reference=0.45e-3)
-    assert (bench.monitor, bench.now) == ("TOUCH", "LANDING")
+    for y in np.arange(0.3e-3, 0.45e-3, 0.2e-6):  # so slowly that the filter follows
+        bench.step(y={0: y}, reference=0.3e-3)
+    assert list(STATES)[bench.supervisor.state] == "LANDING"
+    assert sum(acted(bench, "TOUCH")) == 1
 
 
 def test_it_starts_neither_with_offsets_nor_with_dead_sensors() -> None:
@@ -351,7 +394,8 @@ def test_counts_end_where_samples_stand_for_ever() -> None:
 def test_machines_have_the_monitors_that_make_sense() -> None:
     robust, halbach = ({row.key for row in monitors_of(TARGETS[name])} for name in ("robust", "halbach"))
     assert robust == set(MONITORS)
-    assert robust - halbach == {"CURRENT", "OFFSET", "LINK"}
+    currents = {"CURRENT", "CURRENT_LOST", "CURRENT_SUM", "CURRENT_ERROR", "OFFSET"}
+    assert robust - halbach == currents | {"LINK", "OVERVOLTAGE"}
     assert len(monitor_lines(TARGETS["robust"])) == 1 + len(monitors_of(TARGETS["robust"]))
     assert {state for state, _, _ in TRANSITIONS} == set(STATES)
 
@@ -372,8 +416,6 @@ def test_bounds_follow_from_the_machine() -> None:
 
 def test_one_sensor_less_leaves_a_stable_filter() -> None:
     """At any place, with the machine's own derivatives there; without the stroke's sensor there is none."""
-    import casadi as ca
-
     t = TARGETS["robust"]
     gains, n = gains_without(t), len(t.controller.states)
     assert sorted(gains.L) == [0, 1, 2, 3]
@@ -419,6 +461,194 @@ def test_no_compiler_warns(name: str, precision: Precision, tmp_path: Path) -> N
     code = files[f"{name}_supervisor.c"]
     assert not any(word in code for word in ("malloc", "math.h", "int8_t", "char "))
     assert code.count("switch (") == code.count("default:")
+
+
+EDGE = tuple(
+    (name, entry, k)
+    for name in ("robust", "halbach")
+    for entry in ("p", "dp", "ddp")
+    for k in range(len(TARGETS[name].controller.measurements))
+)
+
+
+@pytest.mark.parametrize(("name", "entry", "k"), EDGE)
+def test_references_end_at_their_limits(name: str, entry: str, k: int) -> None:
+    """A request at a limit is accepted, by controller and supervisor; one ulp beyond it is refused."""
+    t = TARGETS[name]
+    bound = dict(zip(("p", "dp", "ddp"), reference_limits(t), strict=True))[entry][k]
+    for sign in (1, -1):
+        for value, accepted in ((sign * bound, 1), (sign * np.nextafter(bound, np.inf), 0)):
+            native, state = compile_supervised(t).native, new_state(compile_supervised(t).native)
+            before, r = bytes(state), native.Reference()
+            view(r, entry)[k] = value
+            assert call(native, "set_reference", state, r) == accepted
+            assert (bytes(state) == before) == (not accepted)
+        bench = Bench(name).fly()
+        bench.step(300)
+        ahead = {"p": "asked", "dp": "asked_rate"}
+        if entry in ahead:  # as if it had come there
+            view(bench.supervisor, ahead[entry])[k] = sign * bound
+        bench.ask(entry, k, sign * bound)
+        assert bench.now == "OPERATE"
+        bench.ask(entry, k, sign * np.nextafter(bound, np.inf))
+        assert (bench.monitor, bench.now) == ("REFERENCE", "HOLD")
+
+
+def test_limits_of_references_are_those_of_the_machine() -> None:
+    """A tenth less than the way to a touchdown and than the travel; all that the forces can do."""
+    limits = reference_limits(TARGETS["robust"])
+    assert limits.position == pytest.approx([0.9 * 0.7 * 0.6e-3] * 4 + [0.9 * 15e-3], rel=1e-6)
+    m = TARGETS["robust"].believed.mass
+    assert limits.acceleration[4] == pytest.approx(2 * 5.2 * 5.0 / m)
+    assert limits.speed[4] == pytest.approx(math.sqrt(4 * limits.acceleration[4] * 13.5e-3))
+
+
+def test_a_step_of_the_reference_is_refused_and_then_faded_to_within_the_limits() -> None:
+    """10 mm in one sample: the reference stops, and goes there when the request stays, no faster than the forces do."""
+    bench = Bench().fly()
+    bench.step(300)
+    bench.ask("p", 4, 10e-3)
+    assert (bench.monitor, bench.now) == ("REFERENCE", "HOLD")
+    assert abs(view(bench.state.reference, "p")[4]) < 1e-9
+    limits, found = reference_limits(TARGETS["robust"]), []
+    for _ in range(6000):
+        bench.ask("p", 4, 10e-3)
+        found.append([view(bench.state.reference, name)[4] for name in ("p", "dp", "ddp")])
+    p, dp, ddp = np.abs(np.array(found)).max(axis=0)
+    assert bench.now == "OPERATE"
+    assert p == pytest.approx(10e-3, rel=1e-6)
+    assert dp <= 0.76 * limits.speed[4]
+    assert ddp <= 0.76 * limits.acceleration[4]
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, 31.6e-3])
+def test_operation_does_not_begin_with_a_bad_request(bad: float) -> None:
+    """In the sample of settle -> operate and at any other: it waits, and nothing that the supervisor knows changes."""
+    bench = Bench()
+    while bench.step(start=1) != "SETTLE":
+        pass
+    bench.step(2 * TIMES.settle)
+    before = view(bench.state.reference, "p").copy()
+    for _ in range(5):
+        bench.ask("p", 4, bad, operate=1)
+        assert bench.now == "SETTLE"
+        assert all(np.isfinite(view(bench.supervisor, name)).all() for name in REALS_OF_SUPERVISOR)
+    bench.ask("p", 4, 0.0, operate=1)
+    assert bench.now == "OPERATE"
+    assert np.abs(view(bench.state.reference, "p") - before).max() < 1e-9
+
+
+REALS_OF_SUPERVISOR = [m.name for m in supervisor_members(STUCK) if m.kind == "real" and m.size]
+
+
+def test_no_number_of_the_supervisor_is_ever_anything_else() -> None:
+    """Any numbers in readings, validity, currents, link and requests, in all states."""
+    rng = np.random.default_rng(3)
+    wild = np.array([math.nan, math.inf, -math.inf, 0.0, 1.0, -1.0, 1e30, 1e-30, 1e300, 5e-3])
+    bench, seen = Bench(), set()
+    for k in range(4000):
+        often = rng.random() < 0.98
+        for field in ("y", "i", "link"):
+            pick = rng.choice(wild)
+            bench.forced[field] = None if often else pick
+        reference = 0.0 if often else float(rng.choice(wild))
+        flags: dict[str, Any] = {
+            name: int(rng.random() < 0.3) for name in ("start", "operate", "acknowledge")
+        }
+        flags |= {name: int(rng.random() < 0.002) for name in ("land", "stop", "sto")}
+        bench.step(reference=reference, missed=int(rng.random() < 0.01) * 2, **flags)
+        seen.add(bench.now)
+        values = [bench.supervisor.late, *(v for n in REALS_OF_SUPERVISOR for v in view(bench.supervisor, n))]
+        assert np.isfinite(values).all(), k
+        assert np.isfinite(view(bench.outputs, "command")).all()
+        assert (np.abs(view(bench.outputs, "v")) <= bench.t.controller.limits.force * (1 + 1e-12)).all()
+        assert bench.supervisor.enable == int(bench.now in FLYING)
+    assert {"OFF", "OFFSETS", "SENSORS", "FAULT"} <= seen
+
+
+def test_a_frozen_current_is_found_when_its_command_moves() -> None:
+    """All nine of a module, whose currents still add up to zero: the command leaves them."""
+    bench = Bench().fly()
+    bench.step(300)
+    frozen = view(bench.inputs, "i").copy()
+    for k in range(3000):
+        z = 5e-3 * (1 - math.cos(k / 300))
+        view(bench.request.reference, "p")[4] = z
+        now = bench.currents(view(bench.state.reference, "p"))
+        i = np.concatenate([frozen[:9], np.atleast_1d(now)[9:] if np.size(now) > 1 else np.zeros(9)])
+        bench.ask("p", 4, z, i=i, dp=5e-3 * math.sin(k / 300) / 300 / bench.t.controller.sample_time)
+        if bench.now == "FAULT":
+            break
+    assert (bench.monitor, bench.now, bench.supervisor.enable) == ("CURRENT_ERROR", "FAULT", 0)
+
+
+def test_one_wrong_current_shows_in_the_sum_of_its_star() -> None:
+    bench = Bench().fly()
+    bench.step(300)
+    i = np.atleast_1d(bench.currents(view(bench.state.reference, "p"))) + np.zeros(18)
+    i[4] += 0.25
+    bench.step(4, i=i)
+    assert bench.now == "OPERATE"
+    bench.step(1, i=i)
+    assert (bench.monitor, bench.now) == ("CURRENT_SUM", "FAULT")
+
+
+def test_nothing_starts_without_a_link_or_with_too_much() -> None:
+    for link, monitor in ((0.0, "LINK"), (30.0, "LINK"), (math.nan, "LINK"), (60.0, "OVERVOLTAGE")):
+        bench = Bench()
+        bench.step(start=1, link=link)
+        bench.step(3, link=link)
+        assert (bench.monitor, bench.now) == (monitor, "FAULT")
+    bench = Bench()
+    while bench.step(start=1) != "LIFT":
+        pass
+    bench.step(3, link=20.0)
+    assert (bench.monitor, bench.now) == ("LINK", "LANDING")
+
+
+def test_start_and_acknowledge_count_when_they_come() -> None:
+    """Held together from the beginning they start nothing, and restart nothing after a fault."""
+    bench = Bench()
+    bench._call("supervisor_init", bench.supervisor)
+    assert bench.step(300, start=1, acknowledge=1) == "OFF"
+    bench.step()
+    assert bench.step(start=1, acknowledge=1) == "OFFSETS"
+    bench = Bench().fly()
+    bench.step(300)
+    assert bench.supervisor.enable == 1
+    assert bench.step(stop=1, start=1, acknowledge=1) == "FAULT"
+    assert bench.supervisor.enable == 0
+    assert bench.step(500, start=1, acknowledge=1) == "FAULT"
+    bench.step()
+    assert bench.step(stop=1, acknowledge=1) == "FAULT"  # still pressed
+    bench.step()
+    assert bench.step(acknowledge=1) == "OFF"
+    assert bench.step(start=1, sto=1) == "OFF"
+
+
+def test_overruns_are_counted_inside() -> None:
+    """Every third sample late by one: no row of single misses acts, the share does."""
+    bench = Bench().fly()
+    bench.step(300)
+    for k in range(200):
+        bench.step(missed=int(k % 3 == 0))
+        if bench.now == "HOLD":
+            break
+    assert (bench.monitor, bench.now) == ("OVERRUN", "HOLD")
+    assert bench.supervisor.overruns == k // 3 + 1
+
+
+@pytest.mark.parametrize("name", ["robust", "halbach", "tubular_pid"])
+def test_every_cell_of_the_table_of_monitors_has_a_reaction_or_a_reason(name: str) -> None:
+    table = watch_table(TARGETS[name])
+    assert set(table) == {row.key for row in monitors_of(TARGETS[name])}
+    for key, cells in table.items():
+        assert all(cells.values()), key
+        for state in STATES:
+            watched = any(row.key == key and state in row.states for row in monitors_of(TARGETS[name]))
+            assert cells[state].startswith("(") == (not watched)
+    reasons = {reason for keys, _, reason in UNWATCHED for key in keys if key in table}
+    assert len(watch_lines(TARGETS[name])) == 3 + len(table) + len(reasons)
 
 
 def test_it_says_so_where_there_is_no_compiler(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -18,14 +18,13 @@ from malta.firmware.signals import (
     Target,
     input_fields,
     output_fields,
-    reading_ranges,
     reference_fields,
     state_fields,
 )
 from malta.firmware.step import programs_of
+from malta.firmware.supervisor import MOST_RATE, reference_limits
 
 MOST_POINTS = 65_535  # of a table of v0(z)
-MOST_RATE = 1e6  # of a reference, per s and s^2: beyond, single precision has no room
 FUSED = ("sense", "decide", "state_at")  # functions that a step consists of; the others are its pieces
 LONGEST_RISE = 1000.0  # s, of a stroke
 RISES = 6.0  # times its rise that a stroke lasts: a logistic one is then within 2e-6 of its ends
@@ -123,18 +122,30 @@ def _limit_context(t: Target) -> dict[str, Any]:
     stroke = plant.has_stroke and plant.travel > 0
     longest = min(LONGEST_RISE, MOST_SAMPLES * t.controller.sample_time / RISES)
     return {
+        "limit_lines": _limit_lines(t),
         "force_limits": ", ".join(c_number(v, t.precision) for v in _finite(t.controller.limits.force)),
-        "ranges": ", ".join(c_number(v, t.precision) for v in reading_ranges(plant)),
+        "limits": {
+            key: ", ".join(c_number(v, t.precision) for v in values)
+            for key, values in reference_limits(t)._asdict().items()
+        },
         "most_points": MOST_POINTS,
         "most_rate": c_number(MOST_RATE, t.precision),
         "stroke": stroke,
         "stroke_output": plant.stroke_output if stroke else 0,
-        "travel": c_number(plant.travel, t.precision),
         "longest_rise": c_number(longest, t.precision),
         "rises": c_number(RISES, t.precision),
         "step_z": f"out->y_used[{plant.stroke_output}]" if plant.has_stroke else "s->z[0]",
         "start_z": f"s->reference.p[{plant.stroke_output}]" if plant.has_stroke else "s->z[0]",
     }
+
+
+def _limit_lines(t: Target) -> list[str]:
+    """The limits of references for readers: output, position, speed, acceleration."""
+    limits = reference_limits(t)
+    return [
+        comment(f"{s.name:<10}{p:.6g} {s.unit}, {v:.6g} {s.unit}/s, {a:.6g} {s.unit}/s^2")
+        for s, p, v, a in zip(t.controller.measurements, *limits, strict=True)
+    ]
 
 
 def _table_context(t: Target) -> dict[str, Any]:

@@ -95,7 +95,7 @@ def gate(raw: Any, valid: Any, ranges: FloatArray, instead: Any) -> tuple[Any, A
     used, refused = [], []
     for k, most in enumerate(ranges):
         inside = ca.logic_and(raw[k] <= float(most), raw[k] >= -float(most))
-        accepted = ca.logic_and(valid[k] != 0, inside)
+        accepted = ca.logic_and(valid[k] > 0.5, inside)  # a NaN is no yes
         used.append(ca.if_else(accepted, raw[k], instead[k]))
         refused.append(ca.logic_not(accepted))
     return ca.vertcat(*used), ca.vertcat(*refused)

@@ -12,6 +12,8 @@ from malta.firmware.misra import DEVIATIONS
 from malta.firmware.parts import LINK_RANGE
 from malta.firmware.rounding import SAMPLES, rounded_margin, rounding_noise, smallest_error
 from malta.firmware.signals import Target, reading_ranges
+from malta.firmware.supervisor import reference_limits
+from malta.firmware.watch import watch_lines
 
 FILES = {
     ".h": "names, units and order of all signals; what may be called",
@@ -56,6 +58,11 @@ def report_text(
             "ranges": [
                 {"name": comment(s.name), "unit": s.unit, "most": most}
                 for s, most in zip(t.controller.measurements, reading_ranges(t.believed), strict=True)
+            ],
+            "watched": watch_lines(t),
+            "references": [
+                {"name": comment(s.name), "unit": s.unit, "position": p, "speed": v, "acceleration": a}
+                for s, p, v, a in zip(t.controller.measurements, *reference_limits(t), strict=True)
             ],
         },
     )

@@ -135,7 +135,8 @@ def supervised_engine(
             t = sample * Ts
             request.reference = state.reference
             state.reference = last
-            request.start = int(requests.start <= t < requests.start + Ts)
+            begin = max(requests.start, Ts)  # after a sample without the request: it counts when it comes
+            request.start = int(begin <= t < begin + Ts)
             request.operate = int(t >= requests.operate)
             request.land = int(t >= requests.land)
             request.missed = missed

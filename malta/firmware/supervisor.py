@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 import casadi as ca
 import numpy as np
 
-from malta.firmware.signals import Target, reading_ranges, used_clearances
+from malta.firmware.signals import Target, current_readings, reading_ranges, used_clearances
 from malta.model.plant import Plant
 from malta.synthesis.controller import Controller
 from malta.synthesis.riccati import eigenvalues
@@ -63,9 +63,11 @@ TRANSITIONS: tuple[tuple[State, str, State], ...] = (
 MONITORS = (
     *("TOUCH", "RANGE", "RATE", "INNOVATION", "STUCK", "STALE", "NAN", "UNBELIEVED", "BLIND"),
     *("ASTRAY", "HELPLESS", "MISSED", "CURRENT", "OFFSET", "LINK", "SATURATION", "REFERENCE"),
-    *("UNSETTLED", "UNREADY"),
+    *("UNSETTLED", "UNREADY", "CURRENT_LOST", "CURRENT_SUM", "CURRENT_ERROR", "OVERVOLTAGE", "OVERRUN"),
+    *("STOP", "STO"),
 )
 
+MOST_RATE = 1e6  # of a reference, per s and s^2: beyond, single precision has no room
 TOUCH = 0.7  # share of a clearance: two outputs at it are not beyond the clearance of a round bearing
 JUMP = 8.0  # standard deviations of readings that a jump, an innovation or a returning reading may have
 FALSE_ALARM = 1e-15  # probability at a sample that working sensors repeat a value as long as a stuck one
@@ -75,6 +77,13 @@ BRIDGED = 10  # samples for which a sensor is ignored before the reference stops
 SETTLED = 12.0  # standard deviations of readings that errors may have
 SAGGING = 0.3  # share of the link's voltage that is missing
 OFFSET = 0.02  # largest offset of a current sensor as a share of the current limit
+OVERVOLTAGE = 0.2  # share of the link's voltage that is too much
+LOST_CURRENT = 5  # samples without a reading of a current: a loop that acts on an old one drives it away
+UNEVEN = 0.04  # share of the current limit that the currents of a star may add up to, offsets of its sensors included
+ASTRAY_CURRENT = 0.1  # share of the current limit by which a current may miss its command; see CURRENT_ERROR
+MISSING = 10  # samples in a row for it: in lift-off and strokes of MALTA it is 0.04 at most
+LATE = (0.2, 0.5)  # share of samples with a missed step before them, averaged over MEMORY samples: hold, land
+KEPT = 0.1  # share of a way to a touchdown or of a travel that references leave free
 OVER = 1.2  # a current is too large, as a multiple of what the limits of the axes can add up to
 
 
@@ -119,6 +128,8 @@ class Bounds:
     stale: int  # the same, of all sensors at once
     unbelieved: int  # samples that a sensor may be ignored
     current: float  # A, of a reading
+    deviation: float  # A, of a current from its command
+    uneven: float  # A, of the currents of a star
     offset: float  # A, of a current sensor
 
 
@@ -151,6 +162,8 @@ def bounds_of(t: Target) -> Bounds:
         unbelieved=_samples_without_reading(c),
         current=OVER * largest_reading(t),
         offset=OFFSET * float(np.max(c.limits.current)) if t.driven else math.inf,
+        deviation=ASTRAY_CURRENT * float(np.max(c.limits.current)) if t.driven else math.inf,
+        uneven=UNEVEN * float(np.max(c.limits.current)) if t.driven else math.inf,
     )
 
 
@@ -175,8 +188,18 @@ def monitors_of(t: Target) -> tuple[Monitor, ...]:
         Monitor("HELPLESS", "a force at its limit, a sensor ignored", 0.5, 10, "FAULT", FLYING),
         Monitor("MISSED", "missed steps before this one", 2.5, 1, "HOLD", moving),
         Monitor("MISSED", "missed steps before this one", b.unbelieved + 0.5, 1, "LAND", FLYING),
+        Monitor("OVERRUN", "share of samples after a missed step", LATE[0], 1, "HOLD", moving),
+        Monitor("OVERRUN", "share of samples after a missed step", LATE[1], 1, "LAND", FLYING),
+        Monitor("STOP", "the request to stop", 0.5, 1, "FAULT", AWAKE),
+        Monitor("STO", "safe torque off is active", 0.5, 1, "FAULT", AWAKE),
         Monitor("CURRENT", "largest reading of a current, A", b.current, 3, "FAULT", AWAKE),
         Monitor("OFFSET", "largest offset of a current sensor, A", b.offset, 1, "FAULT", ("OFFSETS",)),
+        Monitor("CURRENT_LOST", "a current without a reading", 0.5, LOST_CURRENT, "FAULT", AWAKE),
+        Monitor("CURRENT_SUM", "currents of a star together, A", b.uneven, LOST_CURRENT, "FAULT", checked),
+        Monitor("CURRENT_ERROR", "a current off its command, A", b.deviation, MISSING, "FAULT", checked),
+        Monitor("OVERVOLTAGE", "surplus share of the link voltage", OVERVOLTAGE, 3, "FAULT", AWAKE),
+        Monitor("LINK", "missing share of the link voltage", SAGGING, 3, "FAULT", ("OFFSETS", "SENSORS")),
+        Monitor("LINK", "missing share of the link voltage", SAGGING, 3, "LAND", ("LIFT",)),
         Monitor("LINK", "missing share of the link voltage", SAGGING, 3, "HOLD", moving),
         Monitor("LINK", "missing share of the link voltage", SAGGING, 2000, "LAND", READY),
         Monitor("SATURATION", "a force is at its limit", 0.5, 200, "HOLD", moving),
@@ -193,6 +216,10 @@ def monitors_of(t: Target) -> tuple[Monitor, ...]:
         "STALE": b.stale >= LONG,
         "CURRENT": not t.driven,
         "OFFSET": not t.driven,
+        "CURRENT_LOST": not t.driven,
+        "CURRENT_SUM": not t.driven or not stars_of(t),
+        "CURRENT_ERROR": not t.driven,
+        "OVERVOLTAGE": not t.driven,
         "LINK": not t.driven,
         "HELPLESS": not np.isfinite(t.controller.limits.force).any(),
         "SATURATION": not np.isfinite(t.controller.limits.force).any(),
@@ -264,6 +291,50 @@ def accelerations(c: Controller) -> FloatArray:
     gain = np.abs(c.C @ c.A @ c.B)
     limits = np.asarray(c.limits.force, dtype=float)
     return np.array([np.sum(row[row > 0] * limits[row > 0]) or math.inf for row in gain])
+
+
+def stars_of(t: Target) -> tuple[tuple[int, ...], ...]:
+    """The current readings that add up to zero, by index: those of one star point each; none of axes."""
+    return tuple(t.believed.drive.stars) if t.driven and t.fidelity == "phase" else ()
+
+
+def current_deviations(t: Target) -> ca.Function:
+    """(i, expected readings, commanded currents of the coils) -> how far the currents of the axes are off, A.
+
+    Readings of phases are turned to axes where the filter expects the machine.
+    """
+    plant, drive = t.believed, t.believed.drive
+    i, current = ca.SX.sym("i", len(current_readings(t))), ca.SX.sym("current", len(plant.actuator.coils))
+    y = ca.SX.sym("expected", len(plant.outputs))
+    x = ca.SX.zeros(len(plant.states))
+    q = plant.position_of(y)
+    for k in range(q.numel()):
+        x[plant.controlled[k]] = q[k]
+    axes = drive.to_axes(x) @ i if t.fidelity == "phase" else i
+    off = ca.densify(drive.command(current) - axes)
+    return ca.Function("deviation", [i, y, current], [off], ["i", "expected", "current"], ["off"])
+
+
+class ReferenceLimits(NamedTuple):
+    """What references may be at most, either way, of the p outputs."""
+
+    position: FloatArray  # in the unit of the output
+    speed: FloatArray  # per s
+    acceleration: FloatArray  # per s^2
+
+
+@lru_cache(maxsize=16)
+def reference_limits(t: Target) -> ReferenceLimits:
+    """The limits of references: of the design file, or by default those of the machine.
+
+    Positions: KEPT less than the way to a touchdown or the travel; what meets nothing has the range of its readings.
+    Accelerations: all that the forces can do. Speeds: from rest through twice the way with that, v = sqrt(4 a d).
+    """
+    touch, most = touch_bounds(t.believed), accelerations(t.controller)
+    position = np.where(np.isfinite(touch), (1 - KEPT) * touch, reading_ranges(t.believed))
+    acceleration = np.minimum(most, MOST_RATE)
+    speed = np.minimum(np.sqrt(4 * acceleration * position), MOST_RATE)
+    return ReferenceLimits(position, speed, acceleration)
 
 
 def _samples_without_reading(c: Controller) -> int:

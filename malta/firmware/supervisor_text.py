@@ -12,7 +12,7 @@ import casadi as ca
 import numpy as np
 
 from malta.firmware.ctext import c_number, function_text
-from malta.firmware.export import MOST_RATE, comment, render
+from malta.firmware.export import comment, render
 from malta.firmware.lowering import lower
 from malta.firmware.program import Program, program_of
 from malta.firmware.sensor_loss import expected_readings, gains_without, prediction_correction
@@ -21,13 +21,18 @@ from malta.firmware.supervisor import (
     JUMP,
     LONG,
     MONITORS,
+    MOST_RATE,
     REACTIONS,
+    SAGGING,
     STATES,
     TIMES,
     TRANSITIONS,
     Monitor,
     bounds_of,
+    current_deviations,
     monitors_of,
+    reference_limits,
+    stars_of,
 )
 from malta.simulation.layout import electronics_of
 
@@ -67,10 +72,12 @@ def time_members() -> list[Member]:
 def request_members() -> list[Member]:
     """What a supervisor is asked for at a sample."""
     return [
-        Member("int32_t", "start", 0, "1: leave OFF"),
+        Member("int32_t", "start", 0, "becomes 1: leave OFF"),
         Member("int32_t", "operate", 0, "1: leave SETTLE for OPERATE"),
         Member("int32_t", "land", 0, "1: land"),
-        Member("int32_t", "acknowledge", 0, "1: leave FAULT"),
+        Member("int32_t", "acknowledge", 0, "becomes 1: leave FAULT"),
+        Member("int32_t", "stop", 0, "1: emergency stop, gates off at once; to land first, ask for land"),
+        Member("int32_t", "sto", 0, "1: safe torque off is active in the drive"),
         Member("int32_t", "missed", 0, "steps that were missed since the last one"),
         Member("reference", "reference", 0, "in OPERATE"),
     ]
@@ -82,10 +89,17 @@ def supervisor_members(t: Target) -> list[Member]:
     members = [
         Member("times", "times", 0, ""),
         Member("int32_t", "state", 0, ""),
+        Member(
+            "int32_t", "enable", 0, "1: gates of the bridges on; 0: all switches open, where the drive can"
+        ),
         Member("int32_t", "monitor", 0, "the last one that acted, or -1"),
         Member("int32_t", "reaction", 0, "its reaction"),
         Member("int32_t", "acted", rows, "how often each row of the table acted"),
         Member("int32_t", "unbelieved", p, "samples for which a sensor has been ignored"),
+        Member("int32_t", "started", 0, "the request to start of the sample before"),
+        Member("int32_t", "acknowledged", 0, "the same of the one to acknowledge"),
+        Member("int32_t", "overruns", 0, "samples with missed steps before them, since the beginning"),
+        Member("real", "late", 0, "their share, averaged"),
         Member("int32_t", "samples", 0, "since the state began"),
         Member("int32_t", "steady", 0, "samples in a row of what the state waits for"),
         Member("int32_t", "count", rows * p, "samples in a row over the threshold, of each row and output"),
@@ -95,6 +109,8 @@ def supervisor_members(t: Target) -> list[Member]:
         Member("real", "last", p, "last readings"),
         Member("real", "noise", p, "mean of the last readings' jumps"),
         Member("real", "limited", p, "1 where a force was at its limit"),
+        Member("real", "asked", p, "last reference that was requested within its limits"),
+        Member("real", "asked_rate", p, "its rate"),
         Member("real", "place", p, "where the references go"),
         Member("real", "lasts", p, "s, how long they take"),
         Member("real", "d0", p, "by how much they differed at first, with two derivatives"),
@@ -103,6 +119,7 @@ def supervisor_members(t: Target) -> list[Member]:
     ]
     if t.driven:
         members.append(Member("real", "offset", len(current_readings(t)), "A, of the current sensors"))
+        members.append(Member("real", "current", len(t.believed.actuator.coils), "A, commanded"))
     return members
 
 
@@ -119,9 +136,9 @@ def supervisor_sources(t: Target, name: str) -> dict[str, str]:
 
 def monitor_lines(t: Target) -> list[str]:
     """The table of monitors for readers: monitor, level and threshold, samples until it acts, reaction."""
-    lines = [f"{'monitor':<12}{'level':<46}{'over':>9}{'samples':>9}  reaction"]
+    lines = [f"{'monitor':<15}{'level':<46}{'over':>9}{'samples':>9}  reaction"]
     lines += [
-        f"{row.key.lower():<12}{row.level:<46}{row.threshold:>9.4g}{row.samples:>9}  {row.reaction.lower()}"
+        f"{row.key.lower():<15}{row.level:<46}{row.threshold:>9.4g}{row.samples:>9}  {row.reaction.lower()}"
         for row in monitors_of(t)
     ]
     return lines
@@ -152,6 +169,10 @@ def _context(t: Target, name: str) -> dict[str, Any]:
         "output_fields": [f for f in output_fields(t) if f.size],
         "currents": len(current_readings(t)) if t.driven else 0,
         "link": _number(plant.drive.link_voltage, t) if t.driven else "",
+        "coils": len(plant.actuator.coils),
+        "axes": len(plant.drive.axes) if t.driven else 0,
+        "stars": stars_of(t),
+        "limits": {key: _vector(values, t) for key, values in reference_limits(t)._asdict().items()},
         "command": len(off),
         "off": _vector(off, t),
         "stroke_output": plant.stroke_output if plant.has_stroke else -1,
@@ -177,6 +198,8 @@ def _filters(t: Target, name: str) -> dict[str, Any]:
     c, gains = t.controller, gains_without(t)
     p, places = len(c.measurements), gains.places
     programs: dict[str, Program] = {}
+    if t.driven:
+        programs["deviation"] = program_of(lower(current_deviations(t), t.precision))
     if c.tracks == "states":
         programs["expectation"] = program_of(lower(expected_readings(t), t.precision))
     if gains.L:
@@ -235,6 +258,10 @@ _NUMBERS = {
     "quick": QUICK,
     "passing": PASSING,
     "most_rate": MOST_RATE,
+    "sagging": SAGGING,
+    "rounding": 1e-5,  # of a limit, by which references of two samples may differ beyond it
+    "fade_speed": 15 / 8 / 0.75,
+    "fade_acceleration": 10 / math.sqrt(3) / 0.75,
 }
 
 

@@ -98,13 +98,15 @@ void {{ name }}_step({{ name }}_state *s, const {{ name }}_inputs *in, {{ name }
 }
 
 int32_t {{ name }}_set_reference({{ name }}_state *s, const {{ name }}_reference *r) {
-  static const {{ name }}_real reach[{{ outputs }}] = { {{ ranges }} };
+  static const {{ name }}_real most[{{ outputs }}] = { {{ limits.position }} };
+  static const {{ name }}_real fastest[{{ outputs }}] = { {{ limits.speed }} };
+  static const {{ name }}_real steepest[{{ outputs }}] = { {{ limits.acceleration }} };
   bool accepted = true;
   int32_t k;
   for (k = 0; k < {{ outputs }}; k++) {
-    const bool near = (r->p[k] <= reach[k]) && (r->p[k] >= -reach[k]);
-    const bool slow = (r->dp[k] <= {{ most_rate }}) && (r->dp[k] >= -{{ most_rate }});
-    const bool even = (r->ddp[k] <= {{ most_rate }}) && (r->ddp[k] >= -{{ most_rate }});
+    const bool near = (r->p[k] <= most[k]) && (r->p[k] >= -most[k]);
+    const bool slow = (r->dp[k] <= fastest[k]) && (r->dp[k] >= -fastest[k]);
+    const bool even = (r->ddp[k] <= steepest[k]) && (r->ddp[k] >= -steepest[k]);
     accepted = accepted && near && slow && even; /* a NaN is in no interval */
   }
   for (k = 0; accepted && (k < {{ outputs }}); k++) {
@@ -150,7 +152,8 @@ void {{ name }}_reset_integrators({{ name }}_state *s) {
 
 int32_t {{ name }}_start_stroke({{ name }}_stroke *k, int32_t profile, {{ name }}_real start, {{ name }}_real end,
                        {{ name }}_real rise) {
-  const {{ name }}_real most = {{ travel }};
+  static const {{ name }}_real reach[{{ outputs }}] = { {{ limits.position }} };
+  const {{ name }}_real most = reach[{{ stroke_output }}];
   const {{ name }}_real limit = {{ longest_rise }};
   const bool known = (profile == {{ NAME }}_LOGISTIC) || (profile == {{ NAME }}_QUINTIC);
   const bool near = (start <= most) && (start >= -most) && (end <= most) && (end >= -most);

@@ -48,7 +48,10 @@ void {{ name }}_start({{ name }}_state *s);
 /* One sample. Any numbers may be in `in`, also NaN and infinity; what cannot be true is not used. */
 void {{ name }}_step({{ name }}_state *s, const {{ name }}_inputs *in, {{ name }}_outputs *out);
 
-/* The reference from the next step on; 1, or 0 and nothing changes where a number is not finite or out of reach. */
+/* The reference from the next step on; 1, or 0 and nothing changes where a number is not finite or beyond its limit:
+{% for line in limit_lines %}
+   {{ line }}
+{% endfor %} */
 int32_t {{ name }}_set_reference({{ name }}_state *s, const {{ name }}_reference *r);
 
 /* Another v0(z): forces v0[{{ forces }} k + j] at z[k], in memory of the caller. 1, or 0 and nothing changes where there are

@@ -33,6 +33,8 @@ typedef struct {
 
 static const {{ name }}_real near_touch[OUTPUTS] = { {{ touch }} };
 static const {{ name }}_real range[OUTPUTS] = { {{ range }} };
+static const {{ name }}_real fastest[OUTPUTS] = { {{ limits.speed }} };      /* of references */
+static const {{ name }}_real steepest[OUTPUTS] = { {{ limits.acceleration }} };
 
 static {{ name }}_real size_of({{ name }}_real value) { return (value < {{ zero }}) ? -value : value; }
 
@@ -82,6 +84,11 @@ void {{ name }}_supervisor_init({{ name }}_supervisor *sup) {
   sup->state = {{ NAME }}_OFF;
   sup->monitor = -1;
   sup->reaction = {{ NAME }}_REACTION_NONE;
+  sup->enable = 0;
+  sup->started = 1; /* a request that is held while power comes on starts nothing */
+  sup->acknowledged = 1;
+  sup->overruns = 0;
+  sup->late = {{ zero }};
   sup->samples = 0;
   sup->steady = 0;
   for (k = 0; k < {{ NAME }}_MONITOR_ROWS; k++) {
@@ -91,6 +98,8 @@ void {{ name }}_supervisor_init({{ name }}_supervisor *sup) {
     sup->rest[k] = {{ zero }};
     sup->last[k] = {{ zero }};
     sup->place[k] = {{ zero }};
+    sup->asked[k] = {{ zero }};
+    sup->asked_rate[k] = {{ zero }};
     sup->d0[k] = {{ zero }};
     sup->d1[k] = {{ zero }};
     sup->d2[k] = {{ zero }};
@@ -100,6 +109,9 @@ void {{ name }}_supervisor_init({{ name }}_supervisor *sup) {
   for (k = 0; k < {{ currents }}; k++) {
     sup->offset[k] = {{ zero }};
   }
+  for (k = 0; k < {{ coils }}; k++) {
+    sup->current[k] = {{ zero }};
+  }
 {% endif %}
   forget_sensors(sup);
 }
@@ -108,6 +120,7 @@ void {{ name }}_supervisor_take_over({{ name }}_supervisor *sup, const {{ name }
   int32_t k;
   {{ name }}_supervisor_init(sup);
   sup->state = {{ NAME }}_OPERATE;
+  sup->enable = 1;
   for (k = 0; k < OUTPUTS; k++) {
     sup->rest[k] = rest[k];
   }
@@ -122,6 +135,9 @@ void {{ name }}_supervisor_take_over({{ name }}_supervisor *sup, const {{ name }
 {% endif %}
 {% if fallback %}
 {{ correction }}
+{% endif %}
+{% if currents %}
+{{ deviation }}
 {% endif %}
 /* What the filter expects of the readings; of a machine that does not fly, the readings themselves. */
 static void expect(const {{ name }}_supervisor *sup, const {{ name }}_state *s, const {{ name }}_inputs *in,
@@ -152,7 +168,7 @@ static void look_at_sensor({{ name }}_supervisor *sup, const {{ name }}_inputs *
   static const int32_t same_values[OUTPUTS] = { {{ stuck }} }; /* in a row, from which on a sensor is stuck */
   const {{ name }}_real y = in->y[k];
   const int32_t is_number = is_within(y, {{ most }});
-  if ((is_number == 1) && (in->y_valid[k] != {{ zero }})) {
+  if ((is_number == 1) && (in->y_valid[k] > {{ half }})) { /* a NaN is no yes */
     const {{ name }}_real moved = size_of(y - sup->last[k]);
     const {{ name }}_real age = ({{ name }}_real)sup->unbelieved[k];
     const {{ name }}_real away = size_of(y - expected);
@@ -209,17 +225,93 @@ static void look_at_sensors({{ name }}_supervisor *sup, {{ name }}_real level[{{
   }
 }
 
-/* Whether a reference consists of numbers within reach. */
-static int32_t is_reference(const {{ name }}_reference *r) {
+/* Whether a requested reference is within its limits, and near enough to that of the sample before. */
+static int32_t is_reference(const {{ name }}_supervisor *sup, const {{ name }}_request *request) {
+  static const {{ name }}_real most[OUTPUTS] = { {{ limits.position }} };
+  const {{ name }}_reference *r = &request->reference;
+  const {{ name }}_real h = ({{ name }}_real)(missed_of(request) + 1) * {{ NAME }}_SAMPLE_TIME;
   int32_t accepted = 1;
   int32_t k;
   for (k = 0; k < OUTPUTS; k++) {
-    if ((is_within(r->p[k], range[k]) + is_within(r->dp[k], {{ most_rate }}) + is_within(r->ddp[k], {{ most_rate }})) != 3) {
+    const int32_t here = is_within(r->p[k], most[k]);
+    const int32_t slow = is_within(r->dp[k], fastest[k]);
+    const int32_t even = is_within(r->ddp[k], steepest[k]);
+    if ((here + slow + even) != 3) {
       accepted = 0;
+    } else if (sup->state == {{ NAME }}_OPERATE) {
+      const {{ name }}_real far = ({{ rounding }} * most[k]) + (fastest[k] * h);
+      const {{ name }}_real faster = ({{ rounding }} * fastest[k]) + (steepest[k] * h);
+      if ((is_within(r->p[k] - sup->asked[k], far) + is_within(r->dp[k] - sup->asked_rate[k], faster)) != 2) {
+        accepted = 0;
+      }
+    } else {
+      /* what it begins with is faded to */
     }
   }
   return accepted;
 }
+
+/* The last reference that was requested within the limits. */
+static void remember({{ name }}_supervisor *sup, const {{ name }}_reference *r) {
+  int32_t k;
+  for (k = 0; k < OUTPUTS; k++) {
+    if ((is_within(r->p[k], range[k]) == 1) && (is_within(r->dp[k], {{ most_rate }}) == 1)) {
+      sup->asked[k] = r->p[k];
+      sup->asked_rate[k] = r->dp[k];
+    }
+  }
+}
+{% if currents %}
+
+/* Levels of the monitors of currents and of the link; no reading of a current is used that is no number. */
+static void look_at_currents(const {{ name }}_supervisor *sup, const {{ name }}_inputs *in,
+                             const {{ name }}_real expected[OUTPUTS],
+                             {{ name }}_real level[{{ monitors | length }}][OUTPUTS]) {
+{% if stars %}
+  static const int32_t stars[{{ stars | length }}][{{ stars[0] | length }}] = { {% for star in stars %}{ {{ star | join(", ") }} }{{ ", " if not loop.last }}{% endfor %} };
+{% endif %}
+  {{ name }}_real off[{{ axes }}];
+  int32_t k;
+  for (k = 0; k < {{ currents }}; k++) {
+    if ((is_within(in->i[k], {{ most }}) == 0) || !(in->i_valid[k] > {{ half }})) {
+      level[{{ NAME }}_MONITOR_CURRENT_LOST][0] = {{ one }};
+    } else if (size_of(in->i[k]) > level[{{ NAME }}_MONITOR_CURRENT][0]) {
+      level[{{ NAME }}_MONITOR_CURRENT][0] = size_of(in->i[k]);
+    } else {
+      /* smaller than another */
+    }
+    if ((sup->samples >= sup->times.offsets) && (size_of(sup->offset[k]) > level[{{ NAME }}_MONITOR_OFFSET][0])) {
+      level[{{ NAME }}_MONITOR_OFFSET][0] = size_of(sup->offset[k]);
+    }
+  }
+  level[{{ NAME }}_MONITOR_LINK][0] = {{ one }};
+  if (is_within(in->link[0], {{ most }}) == 1) {
+    level[{{ NAME }}_MONITOR_LINK][0] = {{ one }} - (in->link[0] / {{ link }});
+    level[{{ NAME }}_MONITOR_OVERVOLTAGE][0] = (in->link[0] / {{ link }}) - {{ one }};
+  }
+  if (level[{{ NAME }}_MONITOR_CURRENT_LOST][0] < {{ half }}) {
+{% if stars %}
+    for (k = 0; k < {{ stars | length }}; k++) {
+      {{ name }}_real sum = {{ zero }};
+      int32_t j;
+      for (j = 0; j < {{ stars[0] | length }}; j++) {
+        sum = sum + in->i[stars[k][j]];
+      }
+      if (size_of(sum) > level[{{ NAME }}_MONITOR_CURRENT_SUM][0]) {
+        level[{{ NAME }}_MONITOR_CURRENT_SUM][0] = size_of(sum);
+      }
+    }
+{% endif %}
+    {{ name }}_deviation(in->i, expected, sup->current, off);
+    for (k = 0; k < {{ axes }}; k++) {
+      /* a link without voltage is told by its own monitor */
+      if ((level[{{ NAME }}_MONITOR_LINK][0] <= {{ sagging }}) && (size_of(off[k]) > level[{{ NAME }}_MONITOR_CURRENT_ERROR][0])) {
+        level[{{ NAME }}_MONITOR_CURRENT_ERROR][0] = size_of(off[k]);
+      }
+    }
+  }
+}
+{% endif %}
 
 /* Levels of all monitors at a sample. */
 static void look({{ name }}_supervisor *sup, const {{ name }}_inputs *in, const {{ name }}_request *request,
@@ -241,22 +333,16 @@ static void look({{ name }}_supervisor *sup, const {{ name }}_inputs *in, const 
   }
   look_at_sensors(sup, level);
   level[{{ NAME }}_MONITOR_MISSED][0] = ({{ name }}_real)missed;
-  level[{{ NAME }}_MONITOR_REFERENCE][0] = (is_reference(&request->reference) == 1) ? {{ zero }} : {{ one }};
+  sup->overruns = (missed > 0) ? one_more(sup->overruns) : sup->overruns;
+  sup->late = sup->late + ({{ memory }} * (((missed > 0) ? {{ one }} : {{ zero }}) - sup->late));
+  level[{{ NAME }}_MONITOR_OVERRUN][0] = sup->late;
+  level[{{ NAME }}_MONITOR_STOP][0] = (request->stop != 0) ? {{ one }} : {{ zero }};
+  level[{{ NAME }}_MONITOR_STO][0] = (request->sto != 0) ? {{ one }} : {{ zero }};
+  level[{{ NAME }}_MONITOR_REFERENCE][0] = (is_reference(sup, request) == 1) ? {{ zero }} : {{ one }};
   level[{{ NAME }}_MONITOR_UNSETTLED][0] = ({{ name }}_real)sup->samples;
   level[{{ NAME }}_MONITOR_UNREADY][0] = ({{ name }}_real)sup->samples;
 {% if currents %}
-  for (k = 0; k < {{ currents }}; k++) {
-    if ((in->i_valid[k] != {{ zero }}) && (size_of(in->i[k]) > level[{{ NAME }}_MONITOR_CURRENT][0])) {
-      level[{{ NAME }}_MONITOR_CURRENT][0] = size_of(in->i[k]);
-    }
-    if ((sup->samples >= sup->times.offsets) && (size_of(sup->offset[k]) > level[{{ NAME }}_MONITOR_OFFSET][0])) {
-      level[{{ NAME }}_MONITOR_OFFSET][0] = size_of(sup->offset[k]);
-    }
-  }
-  level[{{ NAME }}_MONITOR_LINK][0] = {{ one }};
-  if (is_within(in->link[0], {{ most }}) == 1) {
-    level[{{ NAME }}_MONITOR_LINK][0] = {{ one }} - (in->link[0] / {{ link }});
-  }
+  look_at_currents(sup, in, expected, level);
 {% endif %}
 }
 
@@ -404,7 +490,7 @@ static bool is_done(const {{ name }}_supervisor *sup, const {{ name }}_request *
     done = sup->samples >= sup->times.lift;
     break;
   case {{ NAME }}_SETTLE:
-    done = (sup->steady >= sup->times.settle) && (request->operate != 0);
+    done = (sup->steady >= sup->times.settle) && (request->operate != 0) && (is_reference(sup, request) == 1);
     break;
   case {{ NAME }}_HOLD:
     done = sup->steady >= sup->times.calm;
@@ -419,7 +505,10 @@ static bool is_done(const {{ name }}_supervisor *sup, const {{ name }}_request *
   return done;
 }
 
-/* The event of a sample: the strongest. */
+/* Whether nothing forbids torque. */
+static bool is_free(const {{ name }}_request *request) { return (request->stop == 0) && (request->sto == 0); }
+
+/* The event of a sample: the strongest. Start and acknowledge count when they come, not while they stay. */
 static int32_t event_of(const {{ name }}_supervisor *sup, const {{ name }}_request *request, int32_t reaction) {
   int32_t event = EVENT_NONE;
   if (reaction == {{ NAME }}_REACTION_FAULT) {
@@ -430,9 +519,9 @@ static int32_t event_of(const {{ name }}_supervisor *sup, const {{ name }}_reque
     event = EVENT_HOLD;
   } else if (is_done(sup, request)) {
     event = EVENT_DONE;
-  } else if ((request->start != 0) && (sup->state == {{ NAME }}_OFF)) {
+  } else if ((request->start != 0) && (sup->started == 0) && (sup->state == {{ NAME }}_OFF) && is_free(request)) {
     event = EVENT_START;
-  } else if (request->acknowledge != 0) {
+  } else if ((request->acknowledge != 0) && (sup->acknowledged == 0) && is_free(request)) {
     event = EVENT_ACKNOWLEDGE;
   } else {
     /* nothing */
@@ -485,6 +574,20 @@ static void goal_of(const {{ name }}_supervisor *sup, const {{ name }}_request *
   }
 }
 
+/* More time for a reference that is far away: within three quarters of its limits, v = 15/8 d / T, a = 5.8 d / T^2. */
+static void fade_slowly({{ name }}_supervisor *sup, const {{ name }}_request *request, int32_t k, {{ name }}_real p) {
+  const {{ name }}_real way = size_of(request->reference.p[k] - p);
+  const {{ name }}_real by_speed = ({{ fade_speed }} * way) / fastest[k];
+  int32_t doublings = 0;
+  if (by_speed > sup->lasts[k]) {
+    sup->lasts[k] = by_speed;
+  }
+  while ((({{ fade_acceleration }} * way) > (steepest[k] * (sup->lasts[k] * sup->lasts[k]))) && (doublings < 8)) {
+    sup->lasts[k] = {{ two }} * sup->lasts[k];
+    doublings++;
+  }
+}
+
 /* Where a state's references go, and the time that this takes; what they differ by at first fades. */
 static void begin({{ name }}_supervisor *sup, const {{ name }}_state *s, const {{ name }}_request *request) {
   const int32_t steps = missed_of(request) + 1;
@@ -510,6 +613,9 @@ static void begin({{ name }}_supervisor *sup, const {{ name }}_state *s, const {
       break;
     }
     sup->lasts[k] = ({{ name }}_real)samples * {{ NAME }}_SAMPLE_TIME;
+    if (sup->state == {{ NAME }}_OPERATE) {
+      fade_slowly(sup, request, k, p);
+    }
 {% if stroke_output >= 0 %}
     if ((k == {{ stroke_output }}) && (sup->state == {{ NAME }}_LIFT)) {
       sup->place[k] = sup->rest[k]; /* the stroke begins in operation */
@@ -632,7 +738,14 @@ static void guide({{ name }}_supervisor *sup, {{ name }}_state *s, const {{ name
       fade_acceleration(t, sup->d2[k], &next, k);
     }
   }
-  (void){{ name }}_set_reference(s, &next);
+  for (k = 0; k < OUTPUTS; k++) {
+    /* a fade may pass a limit of requests, but no reading's range; its numbers are finite as those that it joins are */
+    if ((is_within(next.p[k], range[k]) + is_within(next.dp[k], {{ most_rate }}) + is_within(next.ddp[k], {{ most_rate }})) == 3) {
+      s->reference.p[k] = next.p[k];
+      s->reference.dp[k] = next.dp[k];
+      s->reference.ddp[k] = next.ddp[k];
+    }
+  }
 }
 
 {% if fallback %}
@@ -780,6 +893,10 @@ void {{ name }}_supervisor_step({{ name }}_supervisor *sup, {{ name }}_state *s,
     count_landed(sup, in);
   }
   change_state(sup, s, request, event_of(sup, request, reaction));
+  remember(sup, &request->reference);
+  sup->started = request->start;
+  sup->acknowledged = request->acknowledge;
+  sup->enable = is_flying(sup->state);
   if (is_flying(sup->state) == 1) {
     int32_t estimated;
     guide(sup, s, request);
@@ -791,8 +908,18 @@ void {{ name }}_supervisor_step({{ name }}_supervisor *sup, {{ name }}_state *s,
     for (k = 0; k < OUTPUTS; k++) {
       sup->limited[k] = out->saturated[k];
     }
+{% if currents %}
+    for (k = 0; k < {{ coils }}; k++) {
+      sup->current[k] = out->current[k];
+    }
+{% endif %}
   } else {
     rest_bridges(in, out);
+{% if currents %}
+    for (k = 0; k < {{ coils }}; k++) {
+      sup->current[k] = {{ zero }};
+    }
+{% endif %}
     for (k = 0; k < OUTPUTS; k++) {
       sup->limited[k] = {{ zero }};
     }
