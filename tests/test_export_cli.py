@@ -232,3 +232,14 @@ def test_names_of_other_files_and_targets_are_left_to_them(tmp_path: Path) -> No
     command = [cmake, "-B", str(tmp_path / "build"), "-S", str(tmp_path)]
     done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [file.stem for file in sorted((ROOT / "design" / "gains").glob("*.json"))])
+def test_every_shipped_design_exports_in_single_precision(name: str, tmp_path: Path) -> None:
+    """With the margin of its rounded coefficients proven, or why not."""
+    out = tmp_path / "c"
+    malta.export_c(ROOT / "design" / "gains" / f"{name}.json", out, precision="float")
+    report = (out / "REPORT.md").read_text(encoding="utf-8")
+    assert "With the coefficients that single precision holds" in report
+    assert "% is proven" in report

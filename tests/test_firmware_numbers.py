@@ -242,7 +242,7 @@ def test_the_samples_of_a_stroke_are_counted_at_any_rate() -> None:
 @pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize("bad", [*BAD, 2.0])
 def test_a_reference_out_of_reach_changes_nothing(bad: float, precision: Precision) -> None:
-    """NaN, infinity, or beyond the travel, in any entry: refused, and the state keeps every byte."""
+    """NaN, infinity, or far beyond the travel, in any entry: refused, and the state keeps every byte."""
     r = Run(target("robust", precision))
     before = bytes(r.state)
     for name in ("p", "dp", "ddp") if abs(bad) != 2 else ("p",):
