@@ -20,6 +20,7 @@ from malta.firmware.signals import Target, current_readings, input_fields, outpu
 from malta.firmware.supervisor import (
     JUMP,
     LONG,
+    MEAN,
     MONITORS,
     MOST_RATE,
     REACTIONS,
@@ -109,6 +110,7 @@ def supervisor_members(t: Target) -> list[Member]:
         Member("real", "last", p, "last readings"),
         Member("real", "noise", p, "mean of the last readings' jumps"),
         Member("real", "limited", p, "1 where a force was at its limit"),
+        Member("int32_t", "followed", 0, "1 from the first request that was within its limits"),
         Member("real", "asked", p, "last reference that was requested within its limits"),
         Member("real", "asked_rate", p, "its rate"),
         Member("real", "place", p, "where the references go"),
@@ -120,6 +122,13 @@ def supervisor_members(t: Target) -> list[Member]:
     if t.driven:
         members.append(Member("real", "offset", len(current_readings(t)), "A, of the current sensors"))
         members.append(Member("real", "current", len(t.believed.actuator.coils), "A, commanded"))
+        members.append(Member("int32_t", "commanded", 0, "1 where the last command was another one"))
+        members.append(Member("real", "i_before", len(current_readings(t)), "A, last readings"))
+        members.append(
+            Member("real", "off_mean", len(t.believed.drive.axes), "A, of axes off their commands")
+        )
+        if stars_of(t):
+            members.append(Member("int32_t", "still", len(stars_of(t)), "samples without change of a star"))
     return members
 
 
@@ -172,6 +181,7 @@ def _context(t: Target, name: str) -> dict[str, Any]:
         "coils": len(plant.actuator.coils),
         "axes": len(plant.drive.axes) if t.driven else 0,
         "stars": stars_of(t),
+        "moves": _number(1e-4 * float(np.max(c.limits.current)), t),
         "limits": {key: _vector(values, t) for key, values in reference_limits(t)._asdict().items()},
         "command": len(off),
         "off": _vector(off, t),
@@ -254,6 +264,7 @@ _NUMBERS = {
     "jump_deviations": math.sqrt(2) * JUMP,
     "mean_jump": 2 / math.sqrt(math.pi),
     "memory": 1 / MEMORY,
+    "mean_share": 1 / MEAN,
     "shortest": SHORTEST,
     "quick": QUICK,
     "passing": PASSING,

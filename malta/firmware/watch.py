@@ -26,6 +26,7 @@ UNWATCHED: tuple[tuple[tuple[str, ...], tuple[State, ...], str], ...] = (
     (("MISSED", "OVERRUN"), GROUND, "nothing moves"),
     (("OFFSET",), OTHERS["OFFSETS"], "offsets are known, and subtracted"),
     (("CURRENT_SUM", "CURRENT_ERROR"), ("OFFSETS",), "offsets are not known; OFFSET and CURRENT watch"),
+    (("CURRENT_FROZEN",), GROUND, "nothing is commanded"),
     (("REFERENCE",), (*GROUND, "LIFT", "LANDING"), "requests are not followed"),
     (("REFERENCE",), ("SETTLE",), "it waits until the request is within its limits"),
     (("UNSETTLED",), OTHERS["SETTLE"], "nothing is waited for"),

@@ -88,6 +88,7 @@ void {{ name }}_supervisor_init({{ name }}_supervisor *sup) {
   sup->started = 1; /* a request that is held while power comes on starts nothing */
   sup->acknowledged = 1;
   sup->overruns = 0;
+  sup->followed = 0;
   sup->late = {{ zero }};
   sup->samples = 0;
   sup->steady = 0;
@@ -112,6 +113,16 @@ void {{ name }}_supervisor_init({{ name }}_supervisor *sup) {
   for (k = 0; k < {{ coils }}; k++) {
     sup->current[k] = {{ zero }};
   }
+  for (k = 0; k < {{ currents }}; k++) {
+    sup->i_before[k] = {{ zero }};
+  }
+  for (k = 0; k < {{ axes }}; k++) {
+    sup->off_mean[k] = {{ zero }};
+  }
+{% for _ in stars %}
+  sup->still[{{ loop.index0 }}] = 0;
+{% endfor %}
+  sup->commanded = 0;
 {% endif %}
   forget_sensors(sup);
 }
@@ -238,7 +249,7 @@ static int32_t is_reference(const {{ name }}_supervisor *sup, const {{ name }}_r
     const int32_t even = is_within(r->ddp[k], steepest[k]);
     if ((here + slow + even) != 3) {
       accepted = 0;
-    } else if (sup->state == {{ NAME }}_OPERATE) {
+    } else if ((sup->state == {{ NAME }}_OPERATE) && (sup->followed == 1)) {
       const {{ name }}_real far = ({{ rounding }} * most[k]) + (fastest[k] * h);
       const {{ name }}_real faster = ({{ rounding }} * fastest[k]) + (steepest[k] * h);
       if ((is_within(r->p[k] - sup->asked[k], far) + is_within(r->dp[k] - sup->asked_rate[k], faster)) != 2) {
@@ -258,13 +269,14 @@ static void remember({{ name }}_supervisor *sup, const {{ name }}_reference *r) 
     if ((is_within(r->p[k], range[k]) == 1) && (is_within(r->dp[k], {{ most_rate }}) == 1)) {
       sup->asked[k] = r->p[k];
       sup->asked_rate[k] = r->dp[k];
+      sup->followed = 1;
     }
   }
 }
 {% if currents %}
 
 /* Levels of the monitors of currents and of the link; no reading of a current is used that is no number. */
-static void look_at_currents(const {{ name }}_supervisor *sup, const {{ name }}_inputs *in,
+static void look_at_currents({{ name }}_supervisor *sup, const {{ name }}_inputs *in,
                              const {{ name }}_real expected[OUTPUTS],
                              {{ name }}_real level[{{ monitors | length }}][OUTPUTS]) {
 {% if stars %}
@@ -293,21 +305,32 @@ static void look_at_currents(const {{ name }}_supervisor *sup, const {{ name }}_
 {% if stars %}
     for (k = 0; k < {{ stars | length }}; k++) {
       {{ name }}_real sum = {{ zero }};
+      int32_t same = 1;
       int32_t j;
       for (j = 0; j < {{ stars[0] | length }}; j++) {
         sum = sum + in->i[stars[k][j]];
+        same = (in->i[stars[k][j]] == sup->i_before[stars[k][j]]) ? same : 0;
       }
       if (size_of(sum) > level[{{ NAME }}_MONITOR_CURRENT_SUM][0]) {
         level[{{ NAME }}_MONITOR_CURRENT_SUM][0] = size_of(sum);
+      }
+      sup->still[k] = ((same == 1) && (sup->commanded == 1)) ? one_more(sup->still[k]) : 0;
+      if (({{ name }}_real)sup->still[k] > level[{{ NAME }}_MONITOR_CURRENT_FROZEN][0]) {
+        level[{{ NAME }}_MONITOR_CURRENT_FROZEN][0] = ({{ name }}_real)sup->still[k];
       }
     }
 {% endif %}
     {{ name }}_deviation(in->i, expected, sup->current, off);
     for (k = 0; k < {{ axes }}; k++) {
       /* a link without voltage is told by its own monitor */
-      if ((level[{{ NAME }}_MONITOR_LINK][0] <= {{ sagging }}) && (size_of(off[k]) > level[{{ NAME }}_MONITOR_CURRENT_ERROR][0])) {
-        level[{{ NAME }}_MONITOR_CURRENT_ERROR][0] = size_of(off[k]);
+      const {{ name }}_real now = (level[{{ NAME }}_MONITOR_LINK][0] <= {{ sagging }}) ? off[k] : {{ zero }};
+      sup->off_mean[k] = sup->off_mean[k] + ({{ mean_share }} * (now - sup->off_mean[k]));
+      if (size_of(sup->off_mean[k]) > level[{{ NAME }}_MONITOR_CURRENT_ERROR][0]) {
+        level[{{ NAME }}_MONITOR_CURRENT_ERROR][0] = size_of(sup->off_mean[k]);
       }
+    }
+    for (k = 0; k < {{ currents }}; k++) {
+      sup->i_before[k] = in->i[k];
     }
   }
 }
@@ -909,7 +932,9 @@ void {{ name }}_supervisor_step({{ name }}_supervisor *sup, {{ name }}_state *s,
       sup->limited[k] = out->saturated[k];
     }
 {% if currents %}
+    sup->commanded = 0;
     for (k = 0; k < {{ coils }}; k++) {
+      sup->commanded = (size_of(out->current[k] - sup->current[k]) > {{ moves }}) ? 1 : sup->commanded;
       sup->current[k] = out->current[k];
     }
 {% endif %}
