@@ -19,6 +19,7 @@ from tampering import claiming
 
 import malta
 from malta.margins import certificate, check, checked_file, checked_loop, degrees, enclosure, exclusion
+from malta.margins.box import below
 from malta.margins.groups import loop_of
 from malta.margins.problem import OfLoop
 from malta.margins.robust import Margin
@@ -335,7 +336,7 @@ def test_doubles_below_exact_numbers() -> None:
     rng = np.random.default_rng(3)
     for p, q in rng.integers(1, 10**12, (500, 2)).tolist():
         for x in (fmpq(p, q), fmpq(-p, q)):
-            low = certificate._below(x)
+            low = below(x)
             assert fmpq(*low.as_integer_ratio()) <= x
             assert low == pytest.approx(p / q if x > 0 else -p / q, rel=1e-15)
 

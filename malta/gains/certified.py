@@ -20,8 +20,8 @@ from malta.gains.agreement import APART
 from malta.gains.contents import uncertainty_of
 from malta.gains.encodings import content_sha256
 from malta.gains.file import content_of, read
-from malta.margins.box import box_of
-from malta.margins.certificate import Origin, loops_of, sides_of
+from malta.margins.box import box_of, sides_of
+from malta.margins.certificate import Origin, loops_of
 from malta.margins.checked_file import LONG, Claim, Document, Loop, Parameter, Places, double
 from malta.margins.checked_file import Origin as Named
 from malta.margins.expressions import NotAnalytic, exact

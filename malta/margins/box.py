@@ -1,4 +1,8 @@
-"""Boxes of parameters: ranges that grow with the margin t, and intervals that do not."""
+"""Boxes of parameters: ranges that grow with the margin t, and intervals that do not.
+
+What is claimed of a box is about the numbers that were asked for, so that its ends are rounded outwards, from exact
+rationals. Rounding outwards crosses neither zero nor a limit, which are doubles themselves.
+"""
 
 from __future__ import annotations
 
@@ -18,6 +22,7 @@ from malta.margins.arguments import (
     is_number,
     is_pair,
 )
+from malta.margins.expressions import exact
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
@@ -41,9 +46,9 @@ class Box:
 
     names: tuple[str, ...]
     nominal: FloatArray
-    down: FloatArray
+    down: FloatArray  # at least what was asked for, by less than a digit
     up: FloatArray
-    over: FloatArray  # P x 2, intervals that do not grow, relative to nominal
+    over: FloatArray  # P x 2, ends of the intervals that do not grow; nominal values of the other parameters
     most: float  # t at which a parameter reaches its limit
     frame: Mapping[int, tuple[float, float]] = field(
         default_factory=dict
@@ -67,8 +72,17 @@ class Box:
         return smallest_t(p, self.nominal, self.down, self.up)
 
     def sides(self, t: float) -> FloatArray:
-        """The ends (low, high) of every parameter in box(t): P x 2."""
-        return np.column_stack([self.nominal - t * self.down, self.nominal + t * self.up]) + self.over
+        """The ends (low, high) of every parameter in box(t), rounded outwards: P x 2, for proofs."""
+        rows, t = zip(self.nominal.tolist(), self.down.tolist(), self.up.tolist(), strict=True), exact(t)
+        grown = [
+            (below(exact(c) - t * exact(down)), -below(-exact(c) - t * exact(up))) for c, down, up in rows
+        ]
+        return np.where((self.down + self.up > 0)[:, None], np.array(grown).reshape(-1, 2), self.over)
+
+    def near_sides(self, t: float) -> FloatArray:
+        """The sides of box(t) to a digit, for the search of a witness: plain numbers stay plain."""
+        grown = np.column_stack([self.nominal - t * self.down, self.nominal + t * self.up])
+        return np.where((self.down + self.up > 0)[:, None], grown, self.over)
 
     def frame_sides(self, t: float) -> FloatArray:
         """The sides of box(t) with those of the frame in place of the own ones: equal for several boxes."""
@@ -79,10 +93,13 @@ class Box:
 
     def nominal_places(self) -> FloatArray:
         """The nominal values at the ends and the middle of the intervals that do not grow; rows, nominal first."""
-        sides = (np.unique([0.0, low, (low + high) / 2, high]) for low, high in self.over)
+        sides = (
+            np.unique([c, low, (low + high) / 2, high])
+            for c, (low, high) in zip(self.nominal, self.over, strict=True)
+        )
         places = np.array(list(itertools.islice(itertools.product(*sides), 4096)))
-        order = np.argsort(np.abs(places).sum(axis=1), kind="stable")
-        return np.asarray(self.nominal + places[order])
+        order = np.argsort(np.abs(places - self.nominal).sum(axis=1), kind="stable")
+        return np.asarray(places[order])
 
     def stretch(self, p: FloatArray, share: float) -> FloatArray:
         """The parameters p with `share` times their deviation on the axes that grow."""
@@ -109,7 +126,7 @@ def box_of(
     by_name(caller, "ranges", ranges, '{"k": 0.2} or {"k": (1, 2)}')
     by_name(caller, "over", over, '{"k": (1, 2)}')
     k = len(names)
-    down, up, fixed = np.zeros(k), np.zeros(k), np.zeros((k, 2))
+    down, up, fixed = np.zeros(k), np.zeros(k), np.column_stack([at, at])
     most, ends = math.inf, ""
     for name, value in (*ranges.items(), *over.items()):
         if name not in names:
@@ -118,14 +135,14 @@ def box_of(
             raise InputError(caller, name, "in ranges and in over", "in one of them")
         i = names.index(name)
         nominal = float(at[i])
-        pair = _sides(caller, name, value, nominal)
+        pair = _checked_sides(caller, name, value, nominal)
         low, high = limits[i] if limits else (-math.inf, math.inf)
         if not low < nominal < high or (name in over and not low < pair[0] < pair[1] < high):
             raise InputError(caller, name, f"{pair}", f"values within its limits ({low:g}, {high:g})")
         if name in over:
-            fixed[i] = pair[0] - nominal, pair[1] - nominal
+            fixed[i] = pair
             continue
-        down[i], up[i] = nominal - pair[0], pair[1] - nominal
+        down[i], up[i] = (-below(-away) for away in rates_of(nominal, value))
         for limit, rate in ((low, down[i]), (high, up[i])):
             if rate > 0 and abs(limit - nominal) / rate < most:
                 most, ends = abs(limit - nominal) / rate, f"{name} reaches its limit {limit:g}"
@@ -134,7 +151,29 @@ def box_of(
     return Box(names, at, down, up, fixed, most, ends=ends)
 
 
-def _sides(caller: str, name: str, value: Any, nominal: float) -> tuple[float, float]:
+def sides_of(nominal: float, value: float | Sequence[float]) -> tuple[Any, Any]:
+    """The exact ends of a range about a nominal value: a share of that, or an interval (low, high), SI."""
+    middle = exact(nominal)
+    if not is_number(value):
+        low, high = value  # type: ignore[misc]
+        return exact(low), exact(high)
+    width = abs(middle) * exact(value)
+    return middle - width, middle + width
+
+
+def rates_of(nominal: float, value: float | Sequence[float]) -> tuple[Any, Any]:
+    """How far a range reaches below and above the nominal value, exactly."""
+    low, high = sides_of(nominal, value)
+    return exact(nominal) - low, high - exact(nominal)
+
+
+def below(x: Any) -> float:
+    """The largest double at or below an exact number."""
+    found = int(x.p) / int(x.q)
+    return found if exact(found) <= x else math.nextafter(found, -math.inf)
+
+
+def _checked_sides(caller: str, name: str, value: Any, nominal: float) -> tuple[float, float]:
     """(low, high) of a range about the nominal value: a share of that, or an interval. Raises InputError."""
     low = high = math.nan
     if is_pair(value) and all(is_number(v) for v in value):

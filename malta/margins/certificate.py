@@ -20,8 +20,7 @@ from flint import arb, ctx
 from malta.errors import CheckError, InputError
 from malta.files import replace_files
 from malta.margins import checked_file
-from malta.margins.arguments import is_number
-from malta.margins.box import Box, box_of
+from malta.margins.box import Box, below, box_of
 from malta.margins.certificate_groups import divides, groups_of, units_of
 from malta.margins.check import BITS, MOST_NODES, balls, bernstein, interpolated, within
 from malta.margins.checked_file import double
@@ -98,7 +97,7 @@ def certificate_of(
         found = "a model that holds on one branch of its currents alone"
         raise InputError("certificate", "places", found, "a model without branches and roots")
     system = places[0][0]
-    box = _around(box_of(system.names, system.nominal, system.limits, ranges, over or {}), ranges, over or {})
+    box = box_of(system.names, system.nominal, system.limits, ranges, over or {})
     lower, proven = _prove(places, box, margin.lower)
     T = proven[0]["sample_time"]
     content: dict[str, Any] = {
@@ -114,30 +113,6 @@ def certificate_of(
         "loops": proven,
     }
     return content | {"sha256": checked_file.digest(content)}
-
-
-def _around(box: Box, ranges: Ranges, over: Mapping[str, tuple[float, float]]) -> Box:
-    """A box of doubles that holds the exact one."""
-    down, up, fixed = box.down.copy(), box.up.copy(), box.over.copy()
-    for name, value in (*ranges.items(), *over.items()):
-        i = box.names.index(name)
-        nominal = exact(box.nominal[i])
-        low, high = (end - nominal for end in sides_of(box.nominal[i], value))
-        if name in over:
-            fixed[i] = _below(low), -_below(-high)
-        else:
-            down[i], up[i] = -_below(low), -_below(-high)
-    return replace(box, down=down, up=up, over=fixed)
-
-
-def sides_of(nominal: float, value: float | Sequence[float]) -> tuple[Any, Any]:
-    """The exact ends of a range about a nominal value: a share of that, or an interval (low, high), SI."""
-    middle = exact(nominal)
-    if not is_number(value):
-        low, high = value  # type: ignore[misc]
-        return exact(low), exact(high)
-    width = abs(middle) * exact(value)
-    return middle - width, middle + width
 
 
 def _origin(origin: Origin | None) -> dict[str, Any]:
@@ -157,20 +132,36 @@ def _origin(origin: Origin | None) -> dict[str, Any]:
 
 def _parameters(box: Box, lower: float, units: Mapping[str, str]) -> list[dict[str, Any]]:
     """The box of a claim: of each parameter what it is at first, how it grows, and where it is at `lower`."""
-    rows, t = [], exact(lower)
-    for name, *numbers, over in zip(
-        box.names, *(x.tolist() for x in (box.nominal, box.down, box.up, box.over)), strict=True
-    ):
-        nominal, down, up = numbers
-        sides = (
-            exact(nominal) - t * exact(down) + exact(over[0]),
-            exact(nominal) + t * exact(up) + exact(over[1]),
-        )
-        rows.append({
+    ends = _ends(box, lower)
+    return [
+        {
             "name": name, "unit": units.get(name), "nominal": nominal, "down": down, "up": up, "over": over,
             "interval": list(checked_file.inside(*sides)),
-        })  # fmt: skip
-    return rows
+        }
+        for name, nominal, down, up, over, sides in zip(
+            box.names, *(x.tolist() for x in (box.nominal, box.down, box.up)), _over(box), ends, strict=True
+        )
+    ]  # fmt: skip
+
+
+def _over(box: Box) -> list[list[float]]:
+    """The intervals that do not grow, less the nominal values, rounded outwards."""
+    return [
+        [below(exact(low) - exact(c)) + 0.0, -below(exact(c) - exact(high)) + 0.0]
+        for c, (low, high) in zip(box.nominal.tolist(), box.over.tolist(), strict=True)
+    ]
+
+
+def _ends(box: Box, lower: float) -> list[tuple[Any, Any]]:
+    """The ends of each parameter's interval at `lower`, from the numbers that the claim has: exact."""
+    rows, t = (
+        zip(*(x.tolist() for x in (box.nominal, box.down, box.up)), _over(box), strict=True),
+        exact(lower),
+    )
+    return [
+        (exact(c) - t * exact(down) + exact(over[0]), exact(c) + t * exact(up) + exact(over[1]))
+        for c, down, up, over in rows
+    ]
 
 
 def _prove(places: Places, box: Box, margin: float) -> tuple[float, list[dict[str, Any]]]:
@@ -253,13 +244,7 @@ def _loop(system: UncertainSystem, law: Any, box: Box, lower: float) -> dict[str
 
 def _parts(f: Polynomial, box: Box, lower: float) -> list[dict[str, Any]]:
     """The parts of the box with their cells, cut where it is too wide. Raises InputError, CheckError, Refused."""
-    t = exact(lower)
-    todo = [
-        np.array([
-            (_below(exact(c) - t * exact(d) + exact(o[0])), -_below(-(exact(c) + t * exact(u) + exact(o[1]))))
-            for c, d, u, o in zip(*(x.tolist() for x in (box.nominal, box.down, box.up, box.over)), strict=True)
-        ])
-    ]  # fmt: skip
+    todo = [np.array([(below(low), -below(-high)) for low, high in _ends(box, lower)])]
     moving = len(f.used & set(np.flatnonzero(todo[0][:, 0] < todo[0][:, 1]).tolist()))
     if 2**moving > MOST_NODES:
         most = math.floor(math.log2(MOST_NODES))
@@ -287,12 +272,6 @@ def _parts(f: Polynomial, box: Box, lower: float) -> list[dict[str, Any]]:
             continue
         made.append({"box": [[a.hex(), b.hex()] for a, b in sides.tolist()]} | proof)
     return made
-
-
-def _below(x: Any) -> float:
-    """A double at or below an exact number."""
-    found = double(x)
-    return found if exact(found) <= x else math.nextafter(found, -math.inf)
 
 
 def _widest(f: Polynomial, sides: FloatArray) -> int:

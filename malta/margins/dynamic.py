@@ -182,7 +182,7 @@ class Blocks:
 
     def starts(self, t: float, chosen: FloatArray) -> list[FloatArray]:
         """The parameters in box(t) at relative places `chosen` (rows, -1 to 1)."""
-        sides = self.box.sides(t)
+        sides = self.box.near_sides(t)
         return [sides.mean(axis=1) + x * (sides[:, 1] - sides[:, 0]) / 2 for x in chosen]
 
 
@@ -232,7 +232,7 @@ def _loss(asked: Blocks, until: float) -> Peak | None:
 
     def peak(t: float, chosen: FloatArray) -> Peak:
         starts = [box.nominal, *asked.starts(t, chosen)]
-        found = climb(value, asked.problem, box.sides(t), starts, until)
+        found = climb(value, asked.problem, box.near_sides(t), starts, until)
         seen.append(found)
         return found
 
@@ -290,7 +290,7 @@ def _narrow(peak: Callable[[float, FloatArray], Peak], high: float, chosen: Floa
 
 def _pattern(box: Box, t: float, p: FloatArray) -> FloatArray:
     """The relative place of p in box(t), -1 to 1, and the middle: two rows."""
-    sides = box.sides(t)
+    sides = box.near_sides(t)
     half = (sides[:, 1] - sides[:, 0]) / 2
     x = np.where(half > 0, (p - sides.mean(axis=1)) / np.where(half > 0, half, 1), 0)
     return np.array([np.clip(x, -1, 1), 0 * x])

@@ -10,12 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from malta.margins.box import Box, smallest_t
-from malta.margins.family import Family, restrict
+from malta.margins.family import EPS, Family, restrict
 from malta.margins.frequency import Expansion, cover, expand
 
 if TYPE_CHECKING:
@@ -34,6 +35,9 @@ class Growth:
     """The map between u in [0, 1]^P and the boxes that grow with t: nominal - t down <= p <= nominal + t up.
 
     p = v or 1 / v (inverted), v = low + (high - low) u. Axes with neither down nor up do not grow.
+
+    Rounding moves p by EPS (|p| + high - low) and t down by EPS (|p| + |nominal|) or less. A box may be as narrow as a
+    few digits of its parameters, so that sides and t are bounded with these budgets.
     """
 
     low: FloatArray
@@ -65,12 +69,21 @@ class Growth:
         width = np.where(self.high > self.low, self.high - self.low, 1)
         return np.asarray(np.clip(np.where(self.high > self.low, (v - self.low) / width, 0.5), 0, 1))
 
+    @cached_property
+    def _rounding(self) -> FloatArray:
+        """A bound of the error of p at u, and of 1 / p where inverted."""
+        largest = np.maximum(np.abs(self.low), np.abs(self.high))
+        return np.asarray(EPS * (largest + (self.high - self.low)))
+
     def inside(self, t: float) -> FloatArray:
-        """The sides of box(t) in u, clipped to [0, 1]: P x 2."""
+        """The sides of box(t) in u, not too small for any rounding, clipped to [0, 1]: P x 2."""
         with np.errstate(all="ignore"):
             ends = np.array([self.nominal - t * self.down, self.nominal + t * self.up])
-            sides = np.sort([self.shares(p) for p in ends], axis=0).T + np.array([-1e-9, 1e-9])
-        divides = self.inverted & (ends[0] * ends[1] <= 0)
+            wide = ends + 2 * EPS * (np.abs(self.nominal) + np.abs(ends)) * np.array([[-1], [1]])
+            divides = self.inverted & (wide[0] * wide[1] <= 0)
+            width = np.where(self.high > self.low, self.high - self.low, 1)
+            slack = 1e-9 + 2 * self._rounding / width
+            sides = np.sort([self.shares(p) for p in wide], axis=0).T + slack[:, None] * np.array([-1, 1])
         known = self.grows & ~divides & np.isfinite(sides).all(axis=1) & np.isfinite(t)
         return np.asarray(np.clip(np.where(known[:, None], sides, [0.0, 1.0]), 0, 1))
 
@@ -79,9 +92,15 @@ class Growth:
         return smallest_t(p, self.nominal, self.down, self.up)
 
     def smallest(self, boxes: FloatArray) -> FloatArray:
-        """The smallest t of any point of each box (cells x P x 2)."""
+        """The smallest t of any point of each box (cells x P x 2), not too large for any rounding."""
         a, b = self.parameters(boxes[..., 0]), self.parameters(boxes[..., 1])
-        return self.margin(np.clip(self.nominal, np.minimum(a, b), np.maximum(a, b)))
+        low, high = np.minimum(a, b), np.maximum(a, b)
+        largest = np.maximum(np.abs(low), np.abs(high))
+        share = largest * self._rounding  # of 1 / v: |1 / (v - r) - 1 / v| <= 2 r / v^2 for r <= |v| / 2
+        moved = np.where(self.inverted, np.where(share < 0.5, 2 * share * largest, np.inf), self._rounding)
+        moved = moved + EPS * largest
+        low, high = low - moved, high + moved
+        return self.margin(np.clip(self.nominal, low, high)) * (1 - 2 * EPS)
 
 
 def growth_over(sides: FloatArray, inverted: tuple[bool, ...], box: Box) -> Growth:

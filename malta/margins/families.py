@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 from weakref import WeakKeyDictionary
 
-import numpy as np
 from flint import arb
 
 from malta.margins.characteristic import pair
@@ -58,15 +57,24 @@ def _parts_of(f: Polynomial, box: Box, sides: FloatArray, moves: tuple[Any, ...]
 def _part(f: Polynomial, box: Box, sides: FloatArray, moves: tuple[Any, ...], last: float) -> list[Part]:
     """The part of the box that lies in the frame's part `sides`, if any."""
     family = _family(f, sides, moves, last)
-    whole = growth_over(sides, f.inverted, box)
     own = sides.copy()
     for i in box.frame:
-        own[i] = box.nominal[i] + box.over[i]
+        own[i] = box.over[i]
         if not sides[i, 0] <= own[i, 0] <= own[i, 1] <= sides[i, 1]:
             return []
-        ends = [float(whole.shares(np.where(np.arange(len(own)) == i, p, box.nominal))[i]) for p in own[i]]
-        family = narrow(family, i, min(ends), max(ends))
+        family = narrow(family, i, *_shares(sides[i], own[i], f.inverted[i]))
     return [Part(f, own, family, growth_over(own, f.inverted, box))]
+
+
+def _shares(side: FloatArray, own: FloatArray, inverted: bool) -> tuple[float, float]:
+    """The ends of a part of a side as shares of it, of 1 / p where inverted, to the last digit."""
+    low, high, *ends = (exact(x) for x in (*side.tolist(), *own.tolist()))
+    if inverted:
+        low, high, *ends = (1 / x for x in (high, low, *ends))
+    if not low < high:
+        return 0.5, 0.5
+    first, last = sorted((x - low) / (high - low) for x in ends)
+    return int(first.p) / int(first.q), int(last.p) / int(last.q)
 
 
 def _family(f: Polynomial, sides: FloatArray, moves: tuple[Any, ...], last: float) -> Family:

@@ -179,7 +179,7 @@ def _largest(asked: Blocks, until: float) -> Peak:
     if worst.max() >= 0:
         p = starts[int(worst.argmax())]
         return Peak(math.inf, asked.problem.critical_frequency(p), p)
-    return climb(value, asked.problem, asked.box.sides(1.0), starts, until)
+    return climb(value, asked.problem, asked.box.near_sides(1.0), starts, until)
 
 
 def _prove(asked: Blocks, lower: float, tolerance: float, until: float) -> tuple[float | None, int, str]:
