@@ -14,9 +14,12 @@ from hypothesis import strategies as st
 import malta
 from malta import gains
 from malta.errors import InputError
+from malta.margins.blocks import Block
 from malta.margins.family import align, combine, family
 from malta.margins.responses import responses
+from malta.margins.transfer import transfer
 from malta.margins.travel import travel_loops
+from malta.margins.weight import weight_of
 from malta.model.data import plant_of
 
 
@@ -65,7 +68,7 @@ def test_no_machine_of_the_box_exceeds_what_is_proven(at: Any) -> None:
     c = gains.read("design/gains/robust.json")
     plant = plant_of(c.parameters)
     box = {"m": 0.2, "K_A": 0.2, "K_D": 0.2, "K_B": 0.2}
-    ((s, law),), over = travel_loops(plant, c, tuple(box), "lag" if at == "forces" else "pi")
+    ((s, law),), over = travel_loops(plant, c, tuple(box), "pi")
     m = malta.worst_case_gain(s, law, box, over, at=at, channel=4)
     assert m.upper is not None
     assert m.lower <= m.upper <= 1.04 * m.lower
@@ -79,6 +82,23 @@ def test_no_machine_of_the_box_exceeds_what_is_proven(at: Any) -> None:
         S = np.linalg.inv(np.eye(Q.shape[-1]) - Q)
         worst = max(worst, float(np.abs(S[:, 4, 4]).max()))
     assert 0.8 * m.lower < worst <= m.upper
+
+
+def test_integrators_on_both_sides_of_a_gain_take_no_digits() -> None:
+    """S and F S of the flagship at its forces fall as s^3 and s^2, though plant and law reach 1e40 on the way."""
+    c = gains.read("design/gains/robust.json")
+    plant = plant_of(c.parameters)
+    ((s, law),), _ = travel_loops(plant, c, ("m", "K_A"), "pi")
+    blocks = [
+        Block("feedback", "forces", tuple(range(5)), tuple(range(5)), weight_of(1.0, "test")),
+        Block("effort", "sensors", (0,), tuple(range(5)), weight_of(1.0, "test")),
+    ]
+    w, p = np.geomspace(1e-17, 10, 50), s.nominal * np.array([0.8, 1.2, 0])
+    M = transfer(responses(s, law, p, w), blocks)
+    S, effort = np.linalg.norm(M[:, :5, :5], axis=(1, 2)), np.linalg.norm(M[:, 5:, 5], axis=1)
+    assert S.max() < 1e-3
+    assert S[w < 1e-4].max() < 1e-6
+    assert effort[:-10] == pytest.approx(effort[-10], rel=1e-2)
 
 
 @settings(max_examples=15, deadline=None)

@@ -4,7 +4,7 @@ With F the compensator, G_y and G_d the plant from commands (lag, hold and delay
 commands behind lag, hold and delay, and S = (1 - G_y F)^-1, outputs and commands follow from what is added to sensors
 (w_y), to commands (w_u) and to forces on the plant (w_d):
 
-    y = S (G_y F w_y + G_y w_u + G_d w_d),        u = F (y + w_y)
+    y = S (G_y F w_y + G_y w_u + G_d w_d),        u = (1 - F G_y)^-1 F (w_y + G_y w_u + G_d w_d)
 
 It is computed from frequency responses, a route of its own beside the polynomials that the proofs use.
 """
@@ -32,9 +32,10 @@ ZOOMS = 7
 def transfer(r: Responses, blocks: Sequence[Block]) -> ComplexArray:
     """M from the outputs of the blocks, in their order, to their inputs: frequencies x columns x rows."""
     q, m = r.G_y.shape[1:]
-    S = np.linalg.inv(np.eye(q) - r.G_y @ r.F)
-    y = S @ np.concatenate([r.G_y @ r.F, r.G_y, r.G_d], axis=2)
-    u = r.F @ (y + np.eye(q, q + 2 * m))
+    # solved for on either side: about integrators G and F are huge, and an inverse times them has lost all digits
+    y = np.linalg.solve(np.eye(q) - r.G_y @ r.F, np.concatenate([r.G_y @ r.F, r.G_y, r.G_d], axis=2))
+    into_law = np.concatenate([np.broadcast_to(np.eye(q), (len(y), q, q)), r.G_y, r.G_d], axis=2)
+    u = np.linalg.solve(np.eye(m) - r.F @ r.G_y, r.F @ into_law)
     total = sum(len(b.rows) for b in blocks)
     into = np.zeros((q + 2 * m, total))
     passed = {0: np.zeros((q, total)), q: np.zeros((m, total))}  # additions to a signal by earlier blocks
