@@ -68,3 +68,49 @@ def test_an_uncertain_mass_in_E(unit: float) -> None:
     assert found.lower <= found.upper <= found.lower * 1.01
     # k = 0.2 is where the spring no longer holds against the push
     assert found.upper == pytest.approx(4.0, rel=1e-3)
+
+
+def weakly_coupled(E: Any, sample_time: float | None) -> tuple[Any, Any]:
+    """Two loops whose slow pole, 5e-13 / s, leaves them to a coupling of 1e-13 k: lost at k = 10, and rows times E."""
+
+    def matrices(k: Any) -> Any:
+        import casadi as ca
+
+        A = np.kron(np.eye(2), [[-1, 1 - 1e-12], [1, -1]])
+        B = ca.SX(4, 2)
+        B[0, 0], B[2, 1] = k, k
+        C = ca.DM([[1, 0, 0, 0], [0, 0, 1, 0]])
+        return ca.DM(E @ A), ca.mtimes(ca.DM(E), B), C, ca.DM(2, 2), ca.DM(E)
+
+    law = malta.Compensator(
+        np.zeros((0, 0)), np.zeros((0, 2)), np.zeros((2, 0)), np.array([[0, 1e-13], [1e-13, 0]]),
+        sample_time=sample_time,
+    )  # fmt: skip
+    return malta.uncertain(matrices, {"k": 1.0}), law
+
+
+@pytest.mark.parametrize("sample_time", [None, 1.0])
+@pytest.mark.parametrize(
+    "E", [np.eye(4) * 1e9, np.kron(np.eye(2), [[1, 1e3], [0, 1]])], ids=["mass", "mixed"]
+)
+def test_neglected_couplings_carry_the_descriptor(E: Any, sample_time: float | None) -> None:
+    """The coefficients of a sampled loop carry det E as those of a continuous one do, and E may mix the rows."""
+    found = malta.robust_margin(*weakly_coupled(E, sample_time), {"k": (0.5, 1.5)}, time=0.7)
+    assert found.lower is None or found.lower < 18.5
+
+
+def test_neglected_couplings_carry_denominators() -> None:
+    """Lost at 1e-13 k = 1e-12 h, k = 5: rows with denominators are multiplied by them, bounds of couplings too."""
+
+    def matrices(k: Any, p: Any) -> Any:
+        import casadi as ca
+
+        h, A = 500 / p, ca.SX(4, 4)
+        for i in (0, 2):
+            A[i, i], A[i, i + 1], A[i + 1, i], A[i + 1, i + 1] = 1 - h, h * (1 - 1e-12), h, 1 - h
+            A[i, 2 - i] = 1e-13 * k
+        return A, ca.DM.zeros(4, 1), ca.DM.zeros(1, 4)
+
+    system = malta.uncertain(matrices, {"k": 1.0, "p": 1000.0}, sample_time=1.0)
+    found = malta.robust_margin(system, [[0.0]], {"k": (0.0, 2.0)}, time=0.7)
+    assert found.lower is None or found.lower < 4.01

@@ -274,32 +274,20 @@ class Characteristic:
         return [pair(c * scale) for c in total]
 
     def _row_factors(self, sides: Sequence[tuple[Any, Any]]) -> Any:
-        """A bound of what multiplies the exact coefficients beside the divided matrices: denominators, and det E."""
-        scale = arb(1)
-        if not (self.exact and self.loop.symbolic is not None):
-            return scale
-        p = [acb(low).union(acb(high)) for low, high in sides]
-        for den in _denominators(self.loop, self.group):
-            scale *= abs(value(den, p))
+        """A bound of what multiplies the coefficients beside those of the divided matrices: denominators, and det E."""
+        scale, p = arb(1), [acb(low).union(acb(high)) for low, high in sides]
+        if self.exact:
+            for den in _denominators(self.loop, self.group):
+                scale *= abs(value(den, p))
         if self.loop.descriptor:
-            entries = [
-                (i, j, value(r.num, p) / (1 if r.den is None else value(r.den, p)))
-                for (i, j), r in self.loop.symbolic.entries[E].items()
-            ]
-            scale *= self._descriptor_size(entries)
+            scale *= self._descriptor_size(self.loop.program.run(p, BALLS)[E])
         return scale
 
     def _descriptor_size(self, entries: Sequence[tuple[int, int, Any]]) -> Any:
-        """A bound of |det E| of the group, and for an E that is not diagonal of the product of its diagonal too."""
+        """A bound of |det E| of the group."""
         x = {state: k for k, state in enumerate(self.group.states)}
         own = [(x[i], x[j], z) for i, j, z in entries if i in x and j in x]
-        size = abs(dense(acb_mat, len(x), len(x), own).det())
-        if all(i == j for i, j, _ in own):
-            return size
-        product = arb(1)
-        for i, j, z in own:
-            product *= abs(z) if i == j else 1
-        return size.max(product)
+        return abs(dense(acb_mat, len(x), len(x), own).det())
 
     def _factors(self, v: Sequence[Any]) -> Any:
         """A bound of the factors that `at` gives the coefficients beside the charpoly: det E, det(I - D_c D), and the

@@ -23,6 +23,7 @@ from malta.margins.groups import (
     A,
     B,
     C,
+    E,
     Group,
     UncertainLoop,
     divide_by_descriptor,
@@ -114,7 +115,7 @@ class Part:
 def parts(loop: UncertainLoop, couplings: Couplings | None, p: Sequence[Any]) -> list[Part]:
     """The groups of a loop over real balls p, split further at couplings of the size of rounding."""
     exact = groups(loop)
-    if couplings is None or loop.direct or not any(len(g.states) > 1 for g in exact):
+    if couplings is None or loop.direct or _is_coupled(loop) or not any(len(g.states) > 1 for g in exact):
         return [Part(g, ()) for g in exact]
     try:
         size = couplings.bounds(p)
@@ -129,6 +130,11 @@ def parts(loop: UncertainLoop, couplings: Couplings | None, p: Sequence[Any]) ->
     return found
 
 
+def _is_coupled(loop: UncertainLoop) -> bool:
+    """Whether E has entries beside its diagonal, by which the rows of the couplings are not divided."""
+    return loop.descriptor and any(i != j for i, j, _ in loop.program.entries[E])
+
+
 def _split(loop: UncertainLoop, g: Group, members: list[int], size: FloatArray) -> list[Part]:
     _, (units, _) = linalg.matrix_balance(size, permute=False, separate=True)
     size = size * units / units[:, None]
@@ -139,10 +145,9 @@ def _split(loop: UncertainLoop, g: Group, members: list[int], size: FloatArray) 
         s = loop.symbolic
         assert s is not None
         place = {state: k for k, state in enumerate(members)}
-        for which in (A, *([4] if loop.descriptor else [])):
-            for i, j in s.entries[which]:
-                if i in place and j in place:
-                    touch[place[i], place[j]] = True
+        for i, j in s.entries[A]:
+            if i in place and j in place:
+                touch[place[i], place[j]] = True
     # a coupling above rounding in one direction joins two groups
     _, label = sparse.csgraph.connected_components(touch, directed=False)
     if label.max() == 0:
