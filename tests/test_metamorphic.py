@@ -114,3 +114,40 @@ def test_neglected_couplings_carry_denominators() -> None:
     system = malta.uncertain(matrices, {"k": 1.0, "p": 1000.0}, sample_time=1.0)
     found = malta.robust_margin(system, [[0.0]], {"k": (0.0, 2.0)}, time=0.7)
     assert found.lower is None or found.lower < 4.01
+
+
+def test_a_nominal_loop_is_stable_with_all_its_couplings() -> None:
+    """Poles of 6e-17 and -1.4e-16 where a coupling of 1.5e-16 meets a damping of 1.1e-16: splits are of rounding alone.
+
+    Floating point sees no unstable pole, and over a box up to k = 1e6 the coupling is not neglected.
+    """
+    damping = 2.0**-53
+
+    def matrices(k: Any) -> Any:
+        import casadi as ca
+
+        B = ca.SX(4, 2)
+        B[0, 0], B[2, 1] = k, k
+        return np.kron(np.eye(2), [[-1, 1 - damping], [1, -1]]), B, np.eye(4)[[0, 2]]
+
+    gain = 1.5 * damping * np.array([[0, 1.0], [1, 0]])
+    found = malta.robust_margin(malta.uncertain(matrices, {"k": 1.0}), gain, {"k": (0.9, 1e6)}, time=1.0)
+    assert not found.lower
+
+
+@pytest.mark.parametrize("unit", [1e-9, 1e9])
+def test_units_of_a_sampled_system(unit: float) -> None:
+    """Bounds of e^(A T) are found in balanced units."""
+
+    def proven(unit: float) -> float | None:
+        def matrices(k: Any) -> Any:
+            return [[-0.1, unit], [-k / unit, -0.2]], [[0], [1 / unit]], [[1, 0]]
+
+        system = malta.uncertain(matrices, {"k": 1.0})
+        law = malta.Compensator(
+            np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), np.array([[0.3]]), sample_time=0.5
+        )
+        return malta.robust_margin(system, law, {"k": 0.2}, time=10.0).lower
+
+    assert proven(1.0) is not None
+    assert proven(unit) == pytest.approx(proven(1.0), rel=1e-6)

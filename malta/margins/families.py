@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 from weakref import WeakKeyDictionary
 
@@ -13,7 +14,7 @@ from malta.margins.exclusion import growth_over
 from malta.margins.expressions import NotAnalytic, exact
 from malta.margins.family import Family, narrow
 from malta.margins.parts import Part, cut, merge_twins
-from malta.margins.problem import Polynomial, Problem, hurwitz
+from malta.margins.problem import OfLoop, OfSeveral, Polynomial, Problem, hurwitz
 from malta.margins.time_limit import TimeUp, time_limit
 from malta.margins.weak_coupling import HeldLoop
 
@@ -90,8 +91,11 @@ def _family(f: Polynomial, sides: FloatArray, moves: tuple[Any, ...], last: floa
 
 
 def is_nominal_stable(problem: Problem, box: Box) -> bool:
-    """Whether the nominal loop is proven stable, by Routh's scheme in exact numbers or balls."""
-    for f, _ in problem.parts([arb(x) for x in box.nominal.tolist()]):
+    """Whether the nominal loop is proven stable, by Routh's scheme in exact numbers or balls.
+
+    No coupling is neglected: over a box that is proven, other couplings may be than at the nominal values.
+    """
+    for f, _ in _undivided(problem).parts([arb(x) for x in box.nominal.tolist()]):
         bits, stable = 160, None
         while stable is None and bits <= MOST_BITS:
             with precision(bits):
@@ -102,3 +106,10 @@ def is_nominal_stable(problem: Problem, box: Box) -> bool:
         if not stable:
             return False
     return True
+
+
+def _undivided(problem: Problem) -> Problem:
+    """The problem with all couplings of its loops."""
+    if isinstance(problem, OfSeveral):
+        return OfSeveral(tuple(_undivided(one) for one in problem.problems))
+    return replace(problem, neglect=False) if isinstance(problem, OfLoop) else problem

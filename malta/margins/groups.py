@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import casadi as ca
 import numpy as np
 from flint import arb, arb_mat
-from scipy import sparse
+from scipy import linalg, sparse
 
 from malta.errors import InputError
 from malta.margins.algebra import (
@@ -217,11 +217,14 @@ def hold_bounds(size: FloatArray, diagonal: FloatArray, T: float) -> tuple[Float
         raise NotAnalytic("numbers that overflow")
     m = size.copy()
     np.fill_diagonal(m, diagonal)
+    _, (units, _) = linalg.matrix_balance(m, permute=False, separate=True)  # powers of two
+    turn = units / units[:, None]
+    m = m * turn
     if not float(m.max(initial=0.0)) * T < 1e4:
         raise NotAnalytic("numbers that overflow")
     whole = np.block([[m, np.eye(n)], [np.zeros((n, 2 * n))]])
     both = (arb_mat(whole.tolist()) * arb(T)).exp()
-    V = np.array([[float(both[i, n + j].upper()) for j in range(n)] for i in range(n)]).reshape(n, n)
+    V = np.array([[float(both[i, n + j].upper()) for j in range(n)] for i in range(n)]).reshape(n, n) / turn
     if not np.isfinite(V).all():
         raise NotAnalytic("numbers that overflow")
     V = np.maximum(V, 0) * (1 + 1e-9)

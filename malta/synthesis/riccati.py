@@ -34,6 +34,7 @@ EPS = float(np.finfo(float).eps)
 STEPS = 8  # of Newton's at most; each squares the error
 ROUNDING = 1e-16  # couplings below this, relative to what else acts on and from both ends, are none
 DOUBLINGS = 64  # at most: sums of 2^64 samples
+LARGEST = 1e8  # entry of a matrix whose exponential is taken
 
 
 class Solution(NamedTuple):
@@ -413,7 +414,12 @@ def sample_noise(A: FloatArray, W: FloatArray, Ts: float) -> FloatArray:
 
 def _exponential(M: FloatArray) -> FloatArray:
     with np.errstate(all="ignore"):
-        E = linalg.expm(M) if np.abs(M).max() < 1e8 else np.array([np.inf])  # e^710 is past the largest float
+        turn = np.ones(M.shape)
+        if not np.abs(M).max() < LARGEST and np.isfinite(M).all():  # large by the units of states, perhaps
+            _, (units, _) = linalg.matrix_balance(M, permute=False, separate=True)
+            turn = units / units[:, None]
+        # e^710 is past the largest float
+        E = linalg.expm(M * turn) / turn if np.abs(M * turn).max() < LARGEST else np.array([np.inf])
     if not np.isfinite(E).all():
         raise CheckError(
             "the sampled model's numbers overflow: no sample time of this length for so fast a machine"
