@@ -8,6 +8,7 @@ import json
 import math
 import time
 from dataclasses import replace
+from fractions import Fraction
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from tampering import claiming
 import malta
 from malta.margins import certificate, check, checked_file, checked_loop, degrees, enclosure, exclusion
 from malta.margins.box import below
+from malta.margins.family import nodes, restrict, restriction_rounding
 from malta.margins.groups import loop_of
 from malta.margins.problem import OfLoop
 from malta.margins.robust import Margin
@@ -440,3 +442,33 @@ def test_frequencies_that_no_cell_covers_are_missed(tmp_path: Path) -> None:
     path = tmp_path / "c.json"
     path.write_text(json.dumps(content))
     assert check.check(path).failures == ("loop, group 1: frequencies between the two branches are missing",)
+
+
+@pytest.mark.parametrize("degree", range(1, 17))
+def test_interpolation_is_no_further_off_than_its_constant(degree: int) -> None:
+    """1 + Lambda at the nodes that are taken, the largest sum of Lagrange's polynomials' moduli."""
+    u, x = np.array(nodes(degree, chebyshev=True)), np.linspace(0, 1, 4001)
+    total = np.zeros(len(x))
+    for k in range(degree + 1):
+        others = np.delete(u, k)
+        total += np.abs(np.prod((x[:, None] - others) / (u[k] - others), axis=1))
+    assert enclosure.LEBESGUE - 0.9 < 1 + max(total.max(), 2.2) <= enclosure.LEBESGUE
+
+
+@pytest.mark.parametrize("shape", [(2,), (2, 2, 2), (3,), (5, 4), (8,), (17,), (17, 3)])
+def test_the_rounding_of_restrictions_is_bounded(shape: tuple[int, ...]) -> None:
+    rng = np.random.default_rng(len(shape))
+    values, ends = rng.uniform(-1, 1, math.prod(shape)), np.sort(rng.uniform(0, 1, (len(shape), 2)), axis=1)
+    found = restrict(values[None], shape, ends[None])[0]
+    exact, before = [Fraction(x) for x in values.tolist()], 1
+    for n, (low, high) in zip(shape, ends.tolist(), strict=True):
+        a, b, after = Fraction(low), Fraction(high), math.prod(shape) // before // n
+        made = []
+        for outer, i, inner in itertools.product(range(before), range(n), range(after)):
+            c = [exact[(outer * n + k) * after + inner] for k in range(n)]
+            for at in [a] * (n - 1 - i) + [b] * i:  # de Casteljau's scheme: the blossom at a, ..., b, ...
+                c = [(1 - at) * x + at * y for x, y in itertools.pairwise(c)]
+            made.append(c[0])
+        exact, before = made, before * n
+    apart = max(abs(Fraction(x) - y) for x, y in zip(found.tolist(), exact, strict=True))
+    assert apart <= restriction_rounding(shape) * np.abs(values).max()

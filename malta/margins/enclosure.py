@@ -32,6 +32,7 @@ PLENTY = 1500  # places beyond which more may be left out
 TAILS = (1e-9, 1e-7, 3e-6)  # what interpolation may leave out, relative to each coefficient
 WORST = 1e-5  # beyond which the box is cut
 HIGHEST = 16  # degree of an interpolation along one parameter
+LEBESGUE = 4.0  # 1 + Lambda up to that degree: Lambda <= 1 + 2 / pi log(d + 1), below 2.81
 RADII = tuple(2.0**k for k in (0.5, 1, 1.5, 2, 3, 4, 5, 6, 8, 10, 12, 14, 17, 20))
 BITS = 160
 MOST_BITS = 640  # beyond which a coefficient is taken as the ball that it is
@@ -235,7 +236,7 @@ def _interpolation_side(name: str, axis: int, discs: list[Disc], tail: float) ->
         enough = left <= math.log2(tail)
         rank = (not enough, degree if enough else 0, left)
         if best is None or rank < best_rank:
-            scale = 3.5 * radius**-degree / (radius - 1)
+            scale = LEBESGUE * radius**-degree / (radius - 1)
             best = Side(degree, True, tuple((m * scale, e) for m, e in most))
             best_rank = rank
     assert best is not None

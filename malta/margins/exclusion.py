@@ -260,7 +260,12 @@ def _expanded(s: Search, cells: FloatArray, boxes: FloatArray) -> CellBounds:
 
 
 def half_plane(terms: list[ComplexArray], radius: FloatArray) -> ComplexArray:
-    """c of unit size with Re(conj(c) f) > 0 on the cell; zero when none was found."""
+    """c of unit size with Re(conj(c) f) > 0 on the cell; zero when none was found.
+
+    Rounding: a disc that takes nearly half the plane lets all centres be nearly parallel, so that |b_1| < |b_0| and a
+    centre's size is below 2 |b_0|; then 1e-14 |b_0| is more than the rounding of size and radius, the half angle is not
+    too small for it although arcsin is steep at one, and other angles are off by a few units of 1e-16, far below GUARD.
+    """
     b0, b1 = terms[:2]
     beside = (
         radius[:, None] + sum(np.abs(b) for b in terms[2:]) + 1e-14 * np.abs(b0).max(axis=1, keepdims=True)

@@ -204,6 +204,7 @@ def _round_to_doubles(shape: Sequence[int], table: Any, tails: Any) -> Family:
         radius = radius + [
             math.ldexp(m, max(min(e - x, 1000), -1020)) for (m, e), x in zip(tails, exponents, strict=True)
         ]
+        radius = radius * (1 + 1e-12)  # tails are sums and products of a few bounds, rounded to nearest
     moved = tuple(e + scale * k for k, e in enumerate(exponents))
     return _reduce(Family(tuple(shape), values, np.asarray(radius), moved, scale))
 
@@ -265,7 +266,8 @@ def _lower_degree(array: FloatArray, d: int) -> tuple[FloatArray, FloatArray]:
     lower = np.linalg.pinv(raise_)
     new = array @ lower.T
     left = np.abs(array - new @ raise_.T).reshape(len(array), -1).max(axis=1)
-    return new, left + 8 * d * EPS * np.abs(array).reshape(len(array), -1).max(axis=1)
+    size = np.abs(array).reshape(len(array), -1).max(axis=1) + np.abs(new).reshape(len(array), -1).max(axis=1)
+    return new, left + 8 * d * EPS * size  # two products a node, whose rounding hides the rest of `left`
 
 
 @lru_cache(maxsize=64)
@@ -309,6 +311,16 @@ def _blossoms(degree: int) -> tuple[Any, ...]:
     for n, (row, a, b) in enumerate(terms):
         weights[n, row * (degree + 1) + a + b] = math.comb(degree - row, a) * math.comb(row, b)
     return j, degree - i - j, k, i - k, weights
+
+
+def restriction_rounding(shape: Sequence[int]) -> float:
+    """A bound of the rounding of `restrict`, relative to the largest value.
+
+    Along a parameter of degree d an entry of the matrix takes 4 powers (a digit each, and d halves of one from 1 - x),
+    3 products and a sum of d + 1 terms, all above zero; the product with the values, convex combinations, takes d + 1
+    more. Degree 1 takes no powers: half a digit of 1 - x, two products and a sum.
+    """
+    return EPS * sum(2 if n == 2 else 3 * n + 6 for n in shape if n > 1)
 
 
 def restrict(values: Any, shape: tuple[int, ...], boxes: FloatArray) -> Any:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from malta.margins.family import EPS, Family
+from malta.margins.family import EPS, Family, restriction_rounding
 
 if TYPE_CHECKING:
     from malta.model.plant import ComplexArray, FloatArray
@@ -60,7 +60,7 @@ def expand(f: Family, cells: FloatArray, like: Family | None = None) -> Expansio
     m_end, e_end = np.frexp(end)
     tops = power * e_end[:, None] + np.array(f.exponents)
     shift = _shifts(like or f, power, m_end, e_end)
-    scaled = np.clip(tops - shift[:, None], -1000, 1000)
+    scaled = np.maximum(tops - shift[:, None], -1000)  # terms that overflow exclude nothing
     # terms C(k, m) x0^(k - m) h^m = end^k C(k, m) (x0 / end)^(k - m) (h / end)^m
     whole = np.ldexp(m_end[:, None] ** power, scaled)
     share, step = (x0 / end)[:, None], (h / end)[:, None]
@@ -71,7 +71,9 @@ def expand(f: Family, cells: FloatArray, like: Family | None = None) -> Expansio
         weight = np.where(power >= m, weight, 0)
         terms.append(_product(weight, turn, f.values))
     rest = whole * _binomial(power, ORDER) * step**ORDER
-    rounding = whole * (4 * n + 32) * EPS
+    # a term takes powers of end, share and step, 3 products and a binomial: 2 n + 8 digits; the sum of n + 1 terms as
+    # many, its restriction to parts of the box more; terms of one k add up to |a_k| end^k over all m at most
+    rounding = whole * ((4 * n + 32) * EPS + restriction_rounding(f.shape))
     lasting = rounding @ size + whole @ f.radius * (1 + 1e-9)
     radius = rest @ size * (1 + 1e-9) + lasting
     return Expansion(tuple(terms), radius + 1e-290, lasting)
