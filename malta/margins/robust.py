@@ -49,6 +49,7 @@ from malta.margins.uncertain import Compensator, UncertainSystem
 from malta.threads import on_one_thread
 
 if TYPE_CHECKING:
+    from malta.margins.structured import Proof
     from malta.model.plant import FloatArray
 
 TOLERANCE = 9e-4  # relative distance between the proven bound and the witness
@@ -72,6 +73,7 @@ class Certificate:
     sides: FloatArray  # the part of the box: parameters x 2
     inverted: tuple[bool, ...]  # parameters whose shares are of 1 / p
     scale: int
+    multipliers: Proof | None = None  # what a proof by multipliers is, without cells of the kind above
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +87,8 @@ class Margin:
     witness : parameters with which the loop is at its limit of stability, SI; None without one
     moved : the witness minus the nominal values, SI
     sensitivity : share of each parameter in the margin; the shares add up to 1
-    certificate : cells and directions of the proof, which `malta.margins.check` checks again
+    certificate : cells and directions of the proof, which `malta.margins.check` checks again; or multipliers, of which
+        `malta.margins.checked_multipliers` does
     seconds : s, time of the search
     reason : why nothing, or less than asked for, is proven
     searched : how far no unstable parameters were found, where `upper` is infinite

@@ -23,7 +23,7 @@ from malta.margins.parts import Part
 from malta.margins.problem import OfLoop, OfPolynomial, Problem
 from malta.margins.robust import TIME_UP, Certificate, Margin, Progress
 from malta.margins.signs import Signs, raise_bound, signs_over
-from malta.margins.structured import Structured, rows_of
+from malta.margins.structured import Proof, Structured, rows_of
 from malta.margins.time_limit import TimeUp, time_limit
 from malta.margins.weak_coupling import HeldLoop
 from malta.margins.witness import Zero, starts
@@ -382,7 +382,7 @@ class Job:
         if self.structured is not None and self._multiplier_bound() > lower:
             lower, proofs = (
                 self._multiplier_bound(),
-                [self._whole_proof(self.structured.count, self.structured.lower)],
+                [self._whole_proof(self.structured.count, self.structured.lower, self.structured.proof())],
             )
         if self.signs is not None and self.signs.lower > lower:
             lower, proofs = self.signs.lower, [self._whole_proof(self.signs.count, self.signs.lower)]
@@ -405,11 +405,11 @@ class Job:
             self.box.searched if math.isinf(upper) else "",
         )  # fmt: skip
 
-    def _whole_proof(self, count: int, lower: float) -> Certificate:
+    def _whole_proof(self, count: int, lower: float, multipliers: Proof | None = None) -> Certificate:
         axes, top = len(self.box.names), self.problem.physical(math.inf)
         return Certificate(
             count, (0.0, top), np.zeros((0, 3)), np.zeros((0, axes, 2)), np.zeros(0),
-            self.box.sides(lower), (False,) * axes, 0,
+            self.box.sides(lower), (False,) * axes, 0, multipliers,
         )  # fmt: skip
 
     def _certificate(self, part: Part, s: Search) -> Certificate:

@@ -60,6 +60,29 @@ class Cell:
     near: Multiplier | None = None
 
 
+class Shown(NamedTuple):
+    """A cell of a proof and the multiplier that excludes it; None where it lies in the layer before, or is empty."""
+
+    cell: Cell
+    multiplier: Multiplier | None
+
+
+class Layer(NamedTuple):
+    """The cells that tile all frequencies x box(t)."""
+
+    t: float
+    cells: tuple[Shown, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Proof:
+    """A proof by multipliers, which `checked_multipliers.refusal` checks again: boxes, the smallest first."""
+
+    rows: tuple[Rows, ...]
+    box: Box
+    layers: tuple[Layer, ...]
+
+
 class Attempt(NamedTuple):
     """The result for cells: beta of one that was not excluded, if any, and the cells left when time was up."""
 
@@ -106,6 +129,10 @@ class Structured:
     report: Callable[[float], None] | None = None  # of each t that is proven
     lower: float = 0.0
     count: int = 0
+    layers: list[Layer] = field(default_factory=list, repr=False)
+    _shown: dict[float, list[Shown]] = field(
+        default_factory=dict, repr=False
+    )  # by the t of boxes that were begun
     _order: list[Cell] = field(default_factory=list, repr=False)  # those that resist first
     # t of the largest box that was begun, and its cells that are left
     _open: tuple[float, list[Cell]] | None = None
@@ -126,9 +153,9 @@ class Structured:
             if begun is not None and self.lower < begun[0] <= target:
                 t, cells = begun
             else:
-                cells = self._cells_on(self._order or self.cover(t), t)
+                cells = self._begin(self._order or self.cover(t), t)
             begun, now = None, clock.monotonic()
-            found = self._prove(cells, now + PATIENCE * (self.until - now), split=True)
+            found = self._prove(cells, now + PATIENCE * (self.until - now), self._shown[t], split=True)
             if found.cell is None:
                 self._raise_to(t)
                 t = self._next(target)
@@ -147,11 +174,20 @@ class Structured:
         return target if target <= NOT_FAR * self.lower else FIRST_STEP * self.lower
 
     def _raise_to(self, t: float) -> None:
-        self.lower = max(self.lower, t)
+        if t > self.lower:
+            self.lower = t
+            self.layers.append(Layer(t, tuple(self._shown.pop(t))))
         if self.report is not None:
             self.report(self.lower)
 
-    def _cells_on(self, cells: list[Cell], t: float) -> list[Cell]:
+    def proof(self) -> Proof:
+        """What shows that box(lower) is stable when the nominal loop is."""
+        return Proof(tuple(self.rows), self.box, tuple(self.layers))
+
+    def _begin(self, cells: list[Cell], t: float) -> list[Cell]:
+        """The cells on box(t), of which none is shown yet."""
+        kept = self._open[0] if self._open is not None else t
+        self._shown = {u: shown for u, shown in self._shown.items() if u == kept} | {t: []}
         sides = self.box.sides(t)
         return [replace(cell, sides=sides) for cell in cells]
 
@@ -165,11 +201,11 @@ class Structured:
         now = clock.monotonic()
         last = now + 0.7 * (self.until - now)
         while cells and not self.late(last) and t > SMALLEST * target:
-            found = self._prove(self._cells_on(cells, t), last, split=False)
+            found = self._prove(self._begin(cells, t), last, self._shown[t], split=False)
             if found.cell is None:
                 self._raise_to(t)
                 break
-            cells = [found.cell, *cells]
+            cells = _first(cells, found.cell)
             t *= min(0.9, max(0.9 / found.beta, 0.6))
         return cells
 
@@ -198,8 +234,8 @@ class Structured:
             c for _, c in found
         ]
 
-    def _prove(self, cells: list[Cell], last: float, *, split: bool) -> Attempt:
-        """Exclude all cells in order of frequency, by intervals as wide as the last excluded ones."""
+    def _prove(self, cells: list[Cell], last: float, shown: list[Shown], *, split: bool) -> Attempt:
+        """Exclude all cells in order of frequency, by intervals as wide as the last excluded ones, into `shown`."""
         todo, step = list(reversed(cells)), Step()
         inner = self.box.sides(self.lower) if self.lower else None
         while todo:
@@ -207,11 +243,13 @@ class Structured:
             if self.late(last):
                 return Attempt(math.inf, cell, [cell, *reversed(todo)])
             if inner is not None and split and _within(cell.sides, inner):
+                shown.append(Shown(replace(cell, near=None), None))
                 continue
             cell, rest = step.cut(cell)
             todo += rest
             beta, m, done = self._level(cell, hasty=step.hasty(cell))
             if done:
+                shown.append(Shown(replace(cell, near=None), m))
                 step = step.after(cell, True)
                 if todo and (todo[-1].near is None or _is_next(cell, todo[-1])):
                     todo[-1] = replace(todo[-1], near=m)
@@ -297,6 +335,15 @@ class Structured:
             half[axis, 1 - side] = sides[axis].mean()
             made.append(replace(cell, sides=half, near=m))
         return made
+
+
+def _first(cells: list[Cell], hard: Cell) -> list[Cell]:
+    """The cells with the one that a part of resisted in front, each once."""
+
+    def holds(c: Cell) -> bool:
+        return (c.rows, c.branch) == (hard.rows, hard.branch) and c.low <= hard.low and hard.high <= c.high
+
+    return sorted(cells, key=lambda c: not holds(c))
 
 
 def _within(sides: FloatArray, outer: FloatArray) -> bool:
