@@ -160,7 +160,7 @@ def check(seed: int, names: Any, seconds: float) -> None:
 
 
 @pytest.mark.parametrize("name", CHANGES)
-@pytest.mark.parametrize("seed", [8, 10, 12])
+@pytest.mark.parametrize("seed", [8, pytest.param(10, marks=pytest.mark.slow), 12])
 def test_margins_of_random_loops(seed: int, name: str) -> None:
     check(seed, [name], 1.0)
 
