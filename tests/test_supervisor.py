@@ -503,6 +503,65 @@ def test_limits_of_references_are_those_of_the_machine() -> None:
     assert limits.speed[4] == pytest.approx(math.sqrt(4 * limits.acceleration[4] * 13.5e-3))
 
 
+DECLARED = """[references]
+position = { z = { value = 12, unit = "mm" } }
+speed = { z = { value = 1.5, unit = "m / s" } }
+acceleration = { z = { value = 100, unit = "m / s^2" }, x1 = { value = 20, unit = "m / s^2" } }
+
+"""
+
+
+def declared(folder: Path, text: str = DECLARED) -> malta.Spec:
+    """The design of the flagship with limits of references."""
+    own = (ROOT / "design" / "calibrated.toml").read_text(encoding="utf-8")
+    own = own.replace("../data/", f"{ROOT}/data/")
+    first = own.index("[")
+    path = folder / "calibrated.toml"
+    path.write_text(own[:first] + text + own[first:], encoding="utf-8")
+    return malta.read_design(path)
+
+
+def test_limits_of_references_are_declared_in_the_design_file(tmp_path: Path) -> None:
+    """They go with the gains in every form, and change no gain."""
+    spec = declared(tmp_path)
+    model = malta.linearize(spec.plant, spec.plant.at())
+    c = malta.synthesize(spec, model)
+    own = malta.gains.read(ROOT / "design" / "gains" / "calibrated.json")
+    np.testing.assert_allclose(c.K, own.K, rtol=1e-9)
+    for end in ("json", "npz", "mat"):
+        malta.gains.write(c, malta.verify(model, c), tmp_path / f"gains.{end}")
+        back = malta.gains.read(tmp_path / f"gains.{end}")
+        limits, usual = reference_limits(Target(back)), reference_limits(Target(own))
+        assert [row[4] for row in limits] == [12e-3, 1.5, 100.0]
+        assert limits.acceleration[0] == 20.0
+        np.testing.assert_array_equal(limits.position[:4], usual.position[:4])
+    assert "0.012 m, 1.5 m/s, 100 m/s^2" in sources(Target(c), "", "own")["own.h"]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (
+            DECLARED.replace("z = { value = 12", "w = { value = 12"),
+            "references.position.w: found an unknown output",
+        ),
+        (DECLARED.replace("1.5, unit", "-1.5, unit"), r"references.speed.z: found -1.5"),
+        (DECLARED.replace('"m / s"', '"m"'), "references.speed.z"),
+        (DECLARED.replace("speed", "velocity", 1), "references.velocity"),
+    ],
+)
+def test_limits_of_references_that_are_none_are_refused(text: str, message: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=message):
+        declared(tmp_path, text)
+
+
+def test_limits_of_references_beyond_the_machine_are_refused(tmp_path: Path) -> None:
+    spec = declared(tmp_path, DECLARED.replace("value = 12", "value = 16"))
+    c = malta.synthesize(spec, malta.linearize(spec.plant, spec.plant.at()))
+    with pytest.raises(InputError, match=r"references.position.z: found 0.016 m, expected at most 0.015"):
+        reference_limits(Target(c))
+
+
 def test_a_step_of_the_reference_is_refused_and_then_faded_to_within_the_limits() -> None:
     """10 mm in one sample: the reference stops, and goes there when the request stays, no faster than the forces do."""
     bench = Bench().fly()

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 import casadi as ca
 import numpy as np
 
+from malta.errors import InputError
 from malta.firmware.signals import Target, current_readings, reading_ranges, used_clearances
 from malta.model.plant import Plant
 from malta.synthesis.controller import Controller
@@ -348,12 +349,27 @@ def reference_limits(t: Target) -> ReferenceLimits:
 
     Positions: KEPT less than the way to a touchdown or the travel; what meets nothing has the range of its readings.
     Accelerations: all that the forces can do. Speeds: from rest through twice the way with that, v = sqrt(4 a d).
+
+    Raises InputError for a position beyond the way to a touchdown, the travel, or what can be read.
     """
     touch, most = touch_bounds(t.believed), accelerations(t.controller)
     position = np.where(np.isfinite(touch), (1 - KEPT) * touch, reading_ranges(t.believed))
     acceleration = np.minimum(most, MOST_RATE)
     speed = np.minimum(np.sqrt(4 * acceleration * position), MOST_RATE)
-    return ReferenceLimits(position, speed, acceleration)
+    limits = ReferenceLimits(position, speed, acceleration)
+    if not t.controller.references.size:
+        return limits
+    reach = np.minimum(touch, reading_ranges(t.believed))
+    for s, asked, end in zip(t.controller.measurements, t.controller.references[0], reach, strict=True):
+        if asked > end:
+            raise InputError(
+                t.controller.name,
+                f"references.position.{s.name}",
+                f"{asked:.6g} {s.unit}",
+                f"at most {end:.6g}",
+            )
+    asked_for = zip(t.controller.references, limits, strict=True)
+    return ReferenceLimits(*(np.where(given > 0, given, own) for given, own in asked_for))
 
 
 def _samples_without_reading(c: Controller) -> int:

@@ -113,6 +113,7 @@ def controller_of(file: GainFile, path: str | Path) -> Controller:
         limits=Limits(**(unlimited | arrays["limits"])),
         tracks="errors" if errors else "states",
         pause=_pause(file, layout.plant, path),
+        references=_references(file, layout.plant, path),
         commutation=None
         if file.commutation is None
         else Commutation(file.commutation.lead, **arrays["commutation"]),
@@ -127,6 +128,17 @@ def _pause(file: GainFile, plant: Plant, path: str | Path) -> FloatArray:
     found = _array(given, (len(plant.outputs),), path, "law.pause")
     if (found < 0).any():
         raise InputError(path, "law.pause", str(found.tolist()), "rates of at least 0")
+    return found
+
+
+def _references(file: GainFile, plant: Plant, path: str | Path) -> FloatArray:
+    """Limits of references, 3 x p; none where the file has none."""
+    given = None if file.law is None else file.law.references
+    if given is None:
+        return np.zeros((0, 0))
+    found = _array(given, (3, len(plant.outputs)), path, "law.references")
+    if (found < 0).any():
+        raise InputError(path, "law.references", str(found.tolist()), "limits of at least 0")
     return found
 
 

@@ -31,6 +31,7 @@ MATRICES = (
     "feedforward.rate",
     "feedforward.position",
     "commutation.pull",
+    "law.references",
     "verification.poles.",
     "plant.linear.matrices.",
     "plant.linear.terms.",

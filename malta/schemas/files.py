@@ -103,6 +103,9 @@ def _name_signals(schema: Schema, plant: Plant) -> None:
     whole = schema["properties"]
     whole["operating_point"] = require_names(whole["operating_point"], states)
     whole["pause"] = require_names(whole["pause"], outputs)
+    limits = schema["$defs"]["ReferencesTable"]["properties"]
+    for key in limits:
+        limits[key] = require_names(limits[key], outputs)
     whole["uncertainty"] = require_names(whole["uncertainty"], units_of(plant.parameters))
 
 

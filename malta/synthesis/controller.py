@@ -188,6 +188,8 @@ class Controller:
     pause : p, m/s: sums of errors wait while `|p*'|` is above it, 0: never; none: nothing waits. A stroke that the
         machine follows late or early by its own mass and force constants would charge the sums, which would push it
         past its end.
+    references : 3 x p, SI: limits of positions, speeds and accelerations of references, which exported controllers
+        obey; 0: those of the machine; none: all of them
     tracks : what the filter takes: "states" (y) or "errors" (y - p*)
     commutation : place for which currents are commutated; None: the reading y
 
@@ -222,6 +224,7 @@ class Controller:
     current_loop: CurrentLoop | None
     limits: Limits
     pause: FloatArray = field(default_factory=lambda: np.zeros(0), metadata={"later": True})
+    references: FloatArray = field(default_factory=lambda: np.zeros((0, 0)), metadata={"later": True})
     tracks: Tracks = field(default="states", metadata={"later": True})
     commutation: Commutation | None = field(default=None, metadata={"later": True})
 

@@ -29,6 +29,7 @@ from malta.model.published import published
 from malta.synthesis.design_tables import (
     DesignFile,
     PidTable,
+    ReferencesTable,
     SearchTable,
     specification_table,
 )
@@ -145,7 +146,8 @@ def spec_of(
         current_loop_delay=content.current_loop_delay,
         current_lag=content.current_lag,
         position_feedforward=content.position_feedforward,
-        pause=_pause(content.pause, plant, path),
+        pause=_rates(content.pause, plant, path, "pause"),
+        references=_references(content.references, plant, path),
         commutation=content.commutation,
         law=_law(content, plant, path),
         uncertainty=dict(content.uncertainty),
@@ -163,6 +165,7 @@ LATER = (
     "coordinates",
     "position_feedforward",
     "commutation",
+    "references",
 )  # keys that change no design without them
 
 
@@ -174,18 +177,32 @@ def _fingerprint(content: DesignFile) -> str:
     return hashlib.sha256(shaping.encode()).hexdigest()
 
 
-def _pause(given: Mapping[str, Quantity] | None, plant: Plant, path: Path) -> tuple[float, ...]:
-    """Rates of the references above which sums of errors wait, of each output; 0 where none is given."""
+def _rates(
+    given: Mapping[str, Quantity] | None, plant: Plant, path: Path, key: str, per: str = " / s"
+) -> tuple[float, ...]:
+    """Positive numbers of the outputs, as rates above which sums of errors wait; 0 where one is not given."""
     if given is None:
         return ()
-    units = {s.name: f"{s.unit} / s" for s in plant.outputs}
+    units = {s.name: f"{s.unit}{per}" for s in plant.outputs}
     rates = dict.fromkeys(units, 0.0)
     for name, q in given.items():
         if name not in units:
-            raise InputError(path, f"pause.{name}", "an unknown output", "one of " + " ".join(units))
-        si = to_si(q.value, q.unit, units[name], path, f"pause.{name}")
-        rates[name] = positive(si, path, f"pause.{name}", units[name])
+            raise InputError(path, f"{key}.{name}", "an unknown output", "one of " + " ".join(units))
+        si = to_si(q.value, q.unit, units[name], path, f"{key}.{name}")
+        rates[name] = positive(si, path, f"{key}.{name}", units[name])
     return tuple(rates.values())
+
+
+def _references(given: ReferencesTable | None, plant: Plant, path: Path) -> tuple[tuple[float, ...], ...]:
+    """Limits of positions, speeds and accelerations of references, of each output; 0 where one is not given."""
+    if given is None:
+        return ()
+    limits = (
+        ("position", given.position, ""),
+        ("speed", given.speed, " / s"),
+        ("acceleration", given.acceleration, " / s^2"),
+    )
+    return tuple(_rates(of or {}, plant, path, f"references.{key}", per) for key, of, per in limits)
 
 
 def _sample_time(content: DesignFile, path: Path) -> float:

@@ -77,6 +77,14 @@ class CostTable(Record):
     )
 
 
+class ReferencesTable(Record):
+    """[references]: limits of what may be asked of the machine, by output; by default those of the machine."""
+
+    position: dict[StrictStr, Quantity] | None = entry("largest reference, either way", default=None)
+    speed: dict[StrictStr, Quantity] | None = entry("its largest rate", default=None)
+    acceleration: dict[StrictStr, Quantity] | None = entry("its largest acceleration", default=None)
+
+
 class Range(Record):
     """An entry of [search.numbers]: one number, and the entries of the file that share it."""
 
@@ -121,6 +129,9 @@ class DesignFile(Record):
     )
     pause: dict[StrictStr, Quantity] | None = entry(
         "by output: rate of the reference above which the sum of its errors waits", default=None
+    )
+    references: ReferencesTable | None = entry(
+        "limits of what may be asked of the machine, which exported controllers obey", default=None
     )
     commutation: Place = entry("position for which currents are commutated", default="measured")
     operating_point: dict[StrictStr, Quantity] = entry("states by name; the others are zero")

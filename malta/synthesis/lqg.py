@@ -390,7 +390,8 @@ def synthesize(spec: Spec, model: LinearModel) -> Controller:
         raise InputError(
             spec.path, "pause", "a law without sums of errors", "one with integrals, or no pause"
         )
-    return replace(controller, spec_sha256=spec.sha256, pause=np.array(spec.pause))
+    references = np.array(spec.references) if spec.references else controller.references
+    return replace(controller, spec_sha256=spec.sha256, pause=np.array(spec.pause), references=references)
 
 
 def _backward_euler(
