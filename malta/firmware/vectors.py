@@ -23,6 +23,7 @@ from malta.firmware.signals import (
     state_fields,
 )
 from malta.firmware.step import first_state, started_state, step_of, zero_reference
+from malta.firmware.supervisor import reference_limits
 from malta.simulation import references
 from malta.simulation.inputs import motion_of
 from malta.simulation.scenario import Scenario
@@ -33,7 +34,7 @@ if TYPE_CHECKING:
     from malta.simulation.trajectory import Trajectory
 
 SAMPLES = 60  # of each vector
-STROKE = 0.02  # of the travel
+STROKE = 0.02  # of the travel, at most
 FNV_START, FNV_FACTOR = 2166136261, 16777619  # of the checksum: FNV-1a of 32 bits, over words
 
 
@@ -69,7 +70,7 @@ def _flight(t: Target, *, stroke: bool) -> dict[str, FloatArray]:
     lasts = SAMPLES * c.sample_time
     options: Any = {"noise": 1.0, "fidelity": "force" if not t.driven else t.fidelity}
     if stroke and plant.has_stroke and plant.travel:
-        scenario = Scenario.stroke(STROKE * plant.travel, rise=lasts / 6, duration=lasts, **options)
+        scenario = Scenario.stroke(_distance(t, lasts / 6), rise=lasts / 6, duration=lasts, **options)
     else:
         scenario = Scenario("hold", lasts, references.hold, **options)
     run = simulate(plant, c, scenario)
@@ -78,6 +79,13 @@ def _flight(t: Target, *, stroke: bool) -> dict[str, FloatArray]:
     if len(run.t) < SAMPLES:  # it touched down: go on with the last reading
         found = {k: np.vstack([v, np.repeat(v[-1:], SAMPLES - len(v), axis=0)]) for k, v in found.items()}
     return found
+
+
+def _distance(t: Target, rise: float) -> float:
+    """The way of a stroke, m, with half of the largest acceleration of references: a = D k^2 / (6 sqrt(3))."""
+    k = 2 * math.log(9) / rise
+    most = float(reference_limits(t).acceleration[t.believed.stroke_output])
+    return float(min(STROKE * t.believed.travel, 0.5 * most * 6 * math.sqrt(3) / k**2))
 
 
 def _readings(t: Target, run: Trajectory) -> dict[str, FloatArray]:
