@@ -8,7 +8,7 @@ import pytest
 import malta
 from malta.margins import minors, mirrors, robust
 from malta.margins.groups import groups, loop_of
-from malta.margins.mirrors import Places, first_alike, is_mirror
+from malta.margins.mirrors import Image, Places, first_alike, image_of
 from malta.margins.uncertain import Compensator
 
 ONE, TWO = Places((0, 1), (1,), (0,), (0,)), Places((2, 3), (1,), (1,), (1,))
@@ -35,15 +35,27 @@ def law(gain: float = 1.0) -> Compensator:
     return Compensator(A, B, np.diag([1000.0, gain * 1000.0]), np.diag([-1030.0, gain * -1030.0]))
 
 
-def mirrored(system: malta.UncertainSystem) -> bool:
+def image(system: malta.UncertainSystem) -> Image | None:
     loop = loop_of(system, law())
     assert loop.symbolic is not None
-    return is_mirror(loop.symbolic, ONE, TWO)
+    return image_of(loop.symbolic, ONE, TWO)
 
 
-def test_planes_that_differ_in_signs_alone_are_mirror_images() -> None:
-    assert mirrored(planes())
-    assert mirrored(planes(signs=(1.0, 1.0, -1.0)))
+@pytest.mark.parametrize(
+    ("signs", "gain"),
+    [
+        ((-1.0, -1.0, 1.0), 1),
+        ((1.0, 1.0, -1.0), 1),
+        ((1.0, 1.0, 1.0), -1),  # the gain from force to reading has the other sign
+    ],
+)
+def test_planes_that_differ_in_signs_alone_are_mirror_images(
+    signs: tuple[float, float, float], gain: int
+) -> None:
+    found = image(planes(signs=signs))
+    assert found is not None
+    assert found.of == ONE
+    assert found.inputs[0] * found.outputs[0] == gain
 
 
 @pytest.mark.parametrize(
@@ -51,12 +63,11 @@ def test_planes_that_differ_in_signs_alone_are_mirror_images() -> None:
     [
         planes(stiffness=np.nextafter(4.0, 5.0)),  # the last digit of a number
         planes(signs=(-1.0, 1.0, 1.0)),  # a spring that pulls back in place of one that pushes away
-        planes(signs=(1.0, 1.0, 1.0)),  # the sign of the whole plane: the gain around its loop
         planes(signs=(-2.0, -0.5, 1.0)),  # other units: equal but for a factor that is no sign
     ],
 )
 def test_planes_that_differ_in_more_than_signs_are_none(system: malta.UncertainSystem) -> None:
-    assert not mirrored(system)
+    assert image(system) is None
 
 
 def test_mirror_images_share_what_is_known_and_keep_their_own_compensators() -> None:
@@ -68,16 +79,19 @@ def test_mirror_images_share_what_is_known_and_keep_their_own_compensators() -> 
     assert one.kappa != two.kappa
 
 
-def test_the_margin_of_mirror_images_is_that_without_sharing(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_the_margin_of_mirror_images_is_that_without_sharing(
+    monkeypatch: pytest.MonkeyPatch, sign: float
+) -> None:
     """The second plane has the smaller gain, and loses stability first: the first plane's proof is not enough."""
 
     def margin(gain: float) -> malta.Margin:
-        return malta.robust_margin(planes(), law(gain), {"k": 0.2})
+        return malta.robust_margin(planes(signs=(-1.0, -1.0, sign)), law(sign * gain), {"k": 0.2})
 
     shared = margin(0.5)
     assert shared.lower is not None
     assert shared.upper < 0.75 * margin(1.0).upper
-    monkeypatch.setattr(mirrors, "is_mirror", lambda *_: False)
+    monkeypatch.setattr(mirrors, "image_of", lambda *_: None)
     for known in (robust.problem_of, minors._known, mirrors._firsts):
         known.cache_clear()
     alone = margin(0.5)
@@ -86,4 +100,4 @@ def test_the_margin_of_mirror_images_is_that_without_sharing(monkeypatch: pytest
 
 def test_a_group_without_rational_entries_stands_for_itself() -> None:
     loop = loop_of(planes(), law())
-    assert first_alike(loop.program, None, TWO) == TWO
+    assert first_alike(loop.program, None, TWO) == Image(TWO, (1,), (1,))

@@ -87,26 +87,27 @@ def _identity(matrix: Any, n: int) -> Any:
 
 
 def rows_of(matrix: Any, m: Any, picked: Sequence[int]) -> Any:
-    return matrix(len(picked), m.ncols(), [m[i, j] for i in picked for j in range(m.ncols())])
+    n, values = m.ncols(), m.entries()
+    return matrix(len(picked), n, [x for i in picked for x in values[i * n : (i + 1) * n]])
 
 
 def columns(matrix: Any, m: Any, picked: Sequence[int]) -> Any:
-    return matrix(m.nrows(), len(picked), [m[i, j] for i in range(m.nrows()) for j in picked])
+    n, values = m.ncols(), m.entries()
+    return matrix(m.nrows(), len(picked), [values[i + j] for i in range(0, m.nrows() * n, n) for j in picked])
 
 
 def join_columns(matrix: Any, *parts: Any) -> Any:
-    n = parts[0].nrows()
-    values = [part[i, j] for i in range(n) for part in parts for j in range(part.ncols())]
-    return matrix(n, sum(part.ncols() for part in parts), values)
+    rows, wide = parts[0].nrows(), [(part.ncols(), part.entries()) for part in parts]
+    values = [x for i in range(rows) for n, own in wide for x in own[i * n : (i + 1) * n]]
+    return matrix(rows, sum(n for n, _ in wide), values)
 
 
 def _stack(matrix: Any, blocks: list[list[Any]]) -> Any:
     rows = [join_columns(matrix, *row) for row in blocks if row[0].nrows()]
     if not rows:
         return matrix(0, 0, [])
-    columns = rows[0].ncols()
-    values = [row[i, j] for row in rows for i in range(row.nrows()) for j in range(columns)]
-    return matrix(sum(row.nrows() for row in rows), columns, values)
+    values = [x for row in rows for x in row.entries()]
+    return matrix(sum(row.nrows() for row in rows), rows[0].ncols(), values)
 
 
 def zeros(matrix: Any, n: int, m: int) -> Any:
@@ -132,9 +133,13 @@ def add_lag(matrix: Any, a: Any, b: Any, c: Any, d: Any, rate: Any) -> tuple[Any
 def hold(matrix: Any, a: Any, b: Any, T: Any) -> tuple[Any, Any]:
     """The system under a zero-order hold, exactly: e^(A T) - I and the integral of e^(A t) B."""
     n, m = a.nrows(), b.ncols()
-    both = (_stack(matrix, [[a, b], [zeros(matrix, m, n), zeros(matrix, m, m)]]) * T).exp()
-    phi = matrix(n, n, [both[i, j] - (1 if i == j else 0) for i in range(n) for j in range(n)])
-    gamma = matrix(n, m, [both[i, n + j] for i in range(n) for j in range(m)])
+    held = matrix(n + m, n + m, join_columns(matrix, a, b).entries() + [0] * (m * (n + m)))
+    both = (held * T).exp().entries()
+    rows = [both[i * (n + m) : (i + 1) * (n + m)] for i in range(n)]
+    phi = matrix(n, n, [x for row in rows for x in row[:n]])
+    gamma = matrix(n, m, [x for row in rows for x in row[n:]])
+    for i in range(n):
+        phi[i, i] -= 1
     if not all(x.is_finite() for x in phi.entries()):
         raise NotAnalytic("numbers that overflow: a system too fast for its sample time")
     return phi, gamma

@@ -19,18 +19,16 @@ from flint import acb_mat, arb, arb_mat, arb_poly, fmpq_mat, fmpq_poly
 
 from malta.margins.closed import (
     add_lag,
-    columns,
     dense,
     driven_bounds,
     hold,
     join_columns,
-    rows_of,
     solve,
 )
 from malta.margins.expressions import NotAnalytic, Program, exact
 from malta.margins.groups import A, B, C, E, Group, UncertainLoop, rational, upper
 from malta.margins.majorant import all_bounds, coefficient_bounds
-from malta.margins.mirrors import Places, first_alike
+from malta.margins.mirrors import Image, Places, first_alike
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
@@ -54,10 +52,15 @@ class Minors:
     outputs: tuple[int, ...]
 
     @cached_property
-    def system(self) -> Places:
-        """The group whose system stands for this one's (mirrors.py)."""
+    def image(self) -> Image:
+        """This group as an image of the one whose system stands for its own (mirrors.py)."""
         own = Places(self.group.states, self.rows, self.inputs, self.outputs)
         return first_alike(self.loop.program, self.loop.symbolic, own)
+
+    @property
+    def system(self) -> Places:
+        """The group whose system stands for this one's."""
+        return self.image.of
 
     @property
     def order(self) -> int:
@@ -106,8 +109,12 @@ class Minors:
 
     @cached_property
     def balls(self) -> tuple[dict[Pair, Any], dict[Pair, Any]]:
-        """kappa times the delay's power, signed, as exact polynomials and as balls."""
-        signed = {pair: p * self.late[len(pair[0])] * (-1) ** len(pair[0]) for pair, p in self.kappa.items()}
+        """kappa times the delay's power and the signs of an image, signed, as exact polynomials and as balls."""
+        u, y = self.image.inputs, self.image.outputs
+        signed = {}
+        for (T, S), p in self.kappa.items():
+            sign = math.prod(-u[t] * y[s] for t, s in zip(T, S, strict=True))
+            signed[T, S] = p * self.late[len(T)] * sign
         return signed, {pair: arb_poly(p) for pair, p in signed.items()}
 
     def plant(self, entries: list[list[tuple[int, int, Any]]], matrix: Any) -> dict[Pair, Any]:
@@ -123,7 +130,7 @@ class Minors:
             a, b, c, _ = add_lag(matrix, a, b, c, None, exact(law.lag))
         elif law.sample_time is not None:
             a = a - dense(matrix, a.nrows(), a.nrows(), ((i, i, 1) for i in range(a.nrows())))
-        found = _minors(a, b, c, len(self.rows), len(self.outputs), self.order)
+        found = _minors(a, b, c, self.order)
         return {pair: p * factor for pair, p in found.items()}
 
     def _matrices(self, entries: list[list[tuple[int, int, Any]]], matrix: Any) -> tuple[Any, Any, Any]:
@@ -282,22 +289,30 @@ def _quotient(p: Any, d: Any, k: int) -> Any:
     return p
 
 
-def _minors(a: Any, b: Any, c: Any, r: int, p: int, order: int) -> dict[Pair, Any]:
-    """d det X[S, R]: det(g - A + B_R C_S) is d times the sum of all principal minors of I + X[S, R]."""
-    own = a.charpoly()
+def _minors(a: Any, b: Any, c: Any, order: int) -> dict[Pair, Any]:
+    """d det X[S, R], X = C (g - A)^-1 B and d = det(g - A).
+
+    d X = C adj(g - A) B, whose powers of g follow from Horner's scheme (Leverrier, Faddeev); larger minors by their
+    first row, divided by d. Unlike differences of characteristic polynomials neither loses digits to cancellation.
+    """
+    own, p, r = a.charpoly(), c.nrows(), b.ncols()
     kind = arb_poly if isinstance(a, arb_mat) else fmpq_poly
-    d = kind(own)
+    d, power = kind(own), b
+    powers = [(c * b).entries()]
+    for k in range(a.nrows() - 1, 0, -1):
+        power = a * power + b * own[k]
+        powers.append((c * power).entries())
+    powers.reverse()
     found: dict[Pair, Any] = {((), ()): d}
-    matrix = type(a)
-    for k in range(1, order + 1):
+    for i, j in itertools.product(range(p), range(r)):
+        found[(i,), (j,)] = kind([row[i * r + j] for row in powers])
+    for k in range(2, order + 1):
         for S in itertools.combinations(range(p), k):
             for R in itertools.combinations(range(r), k):
-                closed = a - columns(matrix, b, R) * rows_of(matrix, c, S)
-                rest = kind(closed.charpoly()) - d
-                for size in range(1, k):
-                    for at in itertools.combinations(range(k), size):
-                        rest -= found[tuple(S[i] for i in at), tuple(R[i] for i in at)]
-                found[S, R] = rest
+                terms = (
+                    found[S[:1], (j,)] * found[S[1:], R[:n] + R[n + 1 :]] * (-1) ** n for n, j in enumerate(R)
+                )
+                found[S, R] = divmod(sum(terms, 0 * d), d)[0]
     return found
 
 
