@@ -17,8 +17,8 @@ from flint import acb, arb
 
 from malta.margins.blocks import Block
 from malta.margins.box import Box
-from malta.margins.enclosure import over_box
 from malta.margins.exclusion import Growth, growth_over
+from malta.margins.families import family_over
 from malta.margins.family import Family, align, combine
 from malta.margins.parts import PATCHES, cut
 
@@ -46,45 +46,50 @@ class Part:
 
 
 def parts_of(
-    problem: OfLoop, blocks: Sequence[Block], box: Box, reach: float, most: Sequence[float], until: float
+    problem: OfLoop,
+    blocks: Sequence[tuple[Block, list[int]]],
+    box: Box,
+    reach: float,
+    most: Sequence[float],
+    until: float,
 ) -> list[Part]:
-    """The groups' polynomials over parts of box(reach); the problem's last parameters are the blocks' entries.
+    """The groups' polynomials over parts of box(reach).
 
+    blocks : each with the numbers of its entries among the problem's parameters; other entries are zero
     most : the largest size of each block, if it is known; couplings of the size of rounding are then taken as zero and
         bounded
 
     Raises Unproven when a polynomial cannot be enclosed.
     """
-    sides, pins, first = box.sides(reach), [], len(box.names)
-    for b in blocks:
-        pins.append([first + k for k in range(len(b.entries))])
-        first += len(b.entries)
+    sides = box.sides(reach)
     known = all(
-        math.isfinite(r) and (b.kind != "feedback" or r < 1) for b, r in zip(blocks, most, strict=True)
+        math.isfinite(r) and (b.kind != "feedback" or r < 1) for (b, _), r in zip(blocks, most, strict=True)
     )
     p: list[Any] = [arb(low).union(arb(high)) for low, high in sides.tolist()]
+    p += [arb(0)] * (len(problem.names) - len(p))
     grown = 1.0
-    for b, r in zip(blocks, most, strict=True):
+    for (b, pins), r in zip(blocks, most, strict=True):
         if b.kind == "feedback" and known:  # the gain is 1 / (1 - delta), and f times 1 - delta
             r, grown = r / (1 - r), grown * (1 + r)
         disc = arb(0, max(b.unit, r) * (1 + 1e-9)) if known else arb(0, b.unit)
-        p += [acb(disc, disc)] * len(b.entries)
+        for i in pins:
+            p[i] = acb(disc, disc)
     groups = (problem if known else replace(problem, neglect=False)).parts(p)
     found: list[Part] = []
-    owners = _owners([f for f, _ in groups], blocks, pins)
+    owners = _owners([f for f, _ in groups], blocks)
     for (f, moves), acting in zip(groups, owners, strict=True):
         scaled = tuple(arb(grown) * c for c in moves)
-        own = [(k, blocks[k], pins[k]) for k in acting]
+        own = [(k, *blocks[k]) for k in acting]
         made = partial(_part, f, moves=scaled, acting=own, box=box, until=until)
         found += cut(sides, box.nominal, until, made, PATCHES - len(found))
     return found
 
 
-def _owners(groups: Sequence[Polynomial], blocks: Sequence[Block], pins: list[list[int]]) -> list[list[int]]:
+def _owners(groups: Sequence[Polynomial], blocks: Sequence[tuple[Block, list[int]]]) -> list[list[int]]:
     """The blocks on which each group's polynomial may depend; a feedback around no group belongs to the first."""
     found: list[list[int]] = [[] for _ in groups]
-    for k, b in enumerate(blocks):
-        touched = [n for n, f in enumerate(groups) if any(f.degrees[i] != 0 for i in pins[k])]
+    for k, (b, pins) in enumerate(blocks):
+        touched = [n for n, f in enumerate(groups) if any(f.degrees[i] != 0 for i in pins)]
         if not touched and b.kind == "feedback":
             touched = [0]
         for n in touched:
@@ -111,7 +116,7 @@ def _part(
             for _, b, pins in acting:
                 for i in pins:
                     fixed[i - len(sides)] = -b.unit if i in at else 0.0
-            made = over_box(f, np.vstack([sides, fixed]), () if at else moves, until)
+            made = family_over(f, np.vstack([sides, fixed]), () if at else moves, until)
             known[at] = replace(made, shape=made.shape[: len(sides)])  # entries are pinned
         return known[at]
 

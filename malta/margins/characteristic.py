@@ -33,13 +33,14 @@ from malta.margins.expressions import (
     EXACT,
     POINTS,
     NotAnalytic,
+    Program,
     finite,
 )
 from malta.margins.groups import A, B, C, D, E, Group, UncertainLoop, divide_by_descriptor, rational
 from malta.margins.majorant import coefficient_bounds
-from malta.margins.minors import Minors, minors
+from malta.margins.minors import Minors, Resolvent, minors
 
-MOST = 50_000  # places that are remembered
+MOST = 20_000  # places that are remembered
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,17 +160,26 @@ class Characteristic:
         known, place = self.minors.known, (ctx.prec, tuple(terms))
         pi, beta = known.get(place, (None, None))
         if beta is None:
-            if len(known) > MOST:
-                known.clear()
-            entries, own = self._entries(p), (ctx.prec, *(terms[i] for i in self._of_plant))
+            for one in (known, self.minors.resolvents):
+                if len(one) > MOST:
+                    one.clear()
+            entries, own = self._entries(p), (ctx.prec, *(terms[i] for i in self._on(A, C, E)))
             pi = known.get(own)
             if pi is None:
-                known[own] = pi = self.minors.plant(entries, matrix)
+                known[own] = pi = self.minors.plant(self._resolvent(entries, terms, matrix), entries, matrix)
             beta = self.minors.forces(entries, matrix)
             known[place] = pi, beta
         found = self.minors.combine(pi, beta, matrix)
         zero = 0 * found[0]
         return found + [zero] * (self.minors.degree + 1 - len(found))
+
+    def _resolvent(self, entries: Any, terms: list[Any], matrix: Any) -> Resolvent:
+        """The resolvent at given p, remembered."""
+        assert self.minors is not None
+        known, place = self.minors.resolvents, (ctx.prec, *(terms[i] for i in self._on(A, E)))
+        if place not in known:
+            known[place] = self.minors.resolvent(entries, matrix)
+        return known[place]  # type: ignore[no-any-return]
 
     def _entries(self, p: list[Any]) -> list[list[tuple[int, int, Any]]]:
         if not (self.exact or (self.loop.program.rational and self.loop.program.short)):
@@ -177,11 +187,9 @@ class Characteristic:
         entries = self.loop.program.run(p, EXACT)
         return entries if self.exact else [[(i, j, arb(x)) for i, j, x in matrix] for matrix in entries]
 
-    @cached_property
-    def _of_plant(self) -> tuple[int, ...]:
-        """The parameters on which A, C and E depend."""
-        on = self.loop.program.depends
-        return tuple(sorted(frozenset().union(*(on[k] for k in (A, C, E) if k < len(on)))))
+    def _on(self, *matrices: int) -> tuple[int, ...]:
+        """The parameters on which these matrices depend."""
+        return _parameters_of(self.loop.program, *matrices)
 
     def _map_to_v(self, a: list[Any]) -> list[Any]:
         return map_bilinear(a) if self.discrete else a
@@ -357,6 +365,11 @@ def pair(c: Any) -> tuple[float, int]:
         return 0.0, 0
     shift = max(m.bit_length() - 50, 0)
     return float((m >> shift) + 1), e + shift
+
+
+@lru_cache(maxsize=256)
+def _parameters_of(program: Program, *matrices: int) -> tuple[int, ...]:
+    return tuple(sorted(frozenset().union(*(on for k, on in enumerate(program.depends) if k in matrices))))
 
 
 @lru_cache(maxsize=64)

@@ -11,7 +11,8 @@ import math
 import time as clock
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import lru_cache, partial
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,11 +21,13 @@ from malta.errors import InputError
 from malta.margins.arguments import positive
 from malta.margins.block_parts import Part, parts_of
 from malta.margins.blocks import (
+    At,
     Block,
     Dynamic,
     blocks_of,
     check_blocks,
     probe,
+    shape_of,
 )
 from malta.margins.box import Box, box_of
 from malta.margins.branches import within_branches
@@ -50,7 +53,7 @@ from malta.margins.robust import (
 from malta.margins.time_limit import TimeUp, time_limit
 from malta.margins.transfer import mu_bound, transfer
 from malta.margins.uncertain import Compensator, UncertainSystem
-from malta.margins.weight import Expanded, Weight
+from malta.margins.weight import Expanded, Weight, weight_of
 from malta.threads import on_one_thread
 
 if TYPE_CHECKING:
@@ -129,7 +132,8 @@ class Blocks:
     box: Box
     blocks: tuple[Block, ...]
     problem: OfLoop  # without the blocks
-    with_blocks: OfLoop
+    with_blocks: OfLoop  # whose last parameters are entries of these blocks, perhaps among those of others
+    entries: tuple[list[int], ...]  # of each block: their numbers
 
     @classmethod
     def of(
@@ -142,8 +146,21 @@ class Blocks:
         check_blocks(blocks, where)
         problem = problem_of(system, law)
         scaled = tuple(_scale_probe(system, law, box.nominal, b, problem) for b in blocks)
+        first, one = len(system.names), scaled[0]
+        if len(scaled) == 1 and one.kind in ("multiplicative", "feedback") and not one.full:
+            return cls(
+                system,
+                law,
+                box,
+                scaled,
+                problem,
+                _in_each_channel(system, law, one.at),
+                ([first + one.rows[0]],),
+            )
+        ends = np.cumsum([first, *(len(b.entries) for b in scaled)]).tolist()
+        entries = tuple(list(range(*pair)) for pair in pairwise(ends))
         more, wider = probe(system, law, scaled)
-        return cls(system, law, box, scaled, problem, OfLoop(loop_of(more, wider), more.names))
+        return cls(system, law, box, scaled, problem, OfLoop(loop_of(more, wider), more.names), entries)
 
     def unstable(self) -> bool:
         """Whether the nominal loop is unstable anywhere in the intervals that do not grow."""
@@ -176,7 +193,8 @@ class Blocks:
         most = [share * b.weight.most for share, b in zip(shares, self.blocks, strict=True)]
         try:
             with time_limit(until):
-                return parts_of(self.with_blocks, self.blocks, self.box, reach, most, until)
+                blocks = list(zip(self.blocks, self.entries, strict=True))
+                return parts_of(self.with_blocks, blocks, self.box, reach, most, until)
         except TimeUp as error:
             raise Unproven("time was up before the coefficients were found") from error
 
@@ -184,6 +202,15 @@ class Blocks:
         """The parameters in box(t) at relative places `chosen` (rows, -1 to 1)."""
         sides = self.box.near_sides(t)
         return [sides.mean(axis=1) + x * (sides[:, 1] - sides[:, 0]) / 2 for x in chosen]
+
+
+@lru_cache(maxsize=8)  # gains of several channels need the same families; records compare by identity
+def _in_each_channel(system: UncertainSystem, law: Compensator, at: At) -> OfLoop:
+    """The loop with a block 1 + Delta in each channel at the sensors or at the forces."""
+    count = dict(zip(("sensors", "forces"), shape_of(system), strict=True))[at]
+    one = weight_of(1.0, "probe")
+    more, wider = probe(system, law, [Block("feedback", at, (i,), (i,), one) for i in range(count)])
+    return OfLoop(loop_of(more, wider), more.names)
 
 
 def _scale_probe(

@@ -34,7 +34,7 @@ WORST = 1e-5  # beyond which the box is cut
 HIGHEST = 16  # degree of an interpolation along one parameter
 LEBESGUE = 4.0  # 1 + Lambda up to that degree: Lambda <= 1 + 2 / pi log(d + 1), below 2.81
 RADII = tuple(2.0**k for k in (0.5, 1, 1.5, 2, 3, 4, 5, 6, 8, 10, 12, 14, 17, 20))
-BITS = 160
+BITS = 128  # of ball arithmetic, in which numbers of up to 128 bits take the least time
 MOST_BITS = 640  # beyond which a coefficient is taken as the ball that it is
 HOPE = 0.4  # of what the first place took, at least, the others take
 

@@ -57,7 +57,7 @@ def _parts_of(f: Polynomial, box: Box, sides: FloatArray, moves: tuple[Any, ...]
 
 def _part(f: Polynomial, box: Box, sides: FloatArray, moves: tuple[Any, ...], last: float) -> list[Part]:
     """The part of the box that lies in the frame's part `sides`, if any."""
-    family = _family(f, sides, moves, last)
+    family = family_over(f, sides, moves, last)
     own = sides.copy()
     for i in box.frame:
         own[i] = box.over[i]
@@ -78,7 +78,7 @@ def _shares(side: FloatArray, own: FloatArray, inverted: bool) -> tuple[float, f
     return int(first.p) / int(first.q), int(last.p) / int(last.q)
 
 
-def _family(f: Polynomial, sides: FloatArray, moves: tuple[Any, ...], last: float) -> Family:
+def family_over(f: Polynomial, sides: FloatArray, moves: tuple[Any, ...], last: float) -> Family:
     """The family of a polynomial over `sides`, remembered: several margins need it over the same box."""
     known = FAMILIES.setdefault(f, {})
     key = (sides.tobytes(), tuple(pair(m) for m in moves))

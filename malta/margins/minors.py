@@ -24,6 +24,7 @@ from malta.margins.closed import (
     hold,
     join_columns,
     solve,
+    zeros,
 )
 from malta.margins.expressions import NotAnalytic, Program, exact
 from malta.margins.groups import A, B, C, E, Group, UncertainLoop, rational, upper
@@ -42,7 +43,7 @@ Pair = tuple[tuple[int, ...], tuple[int, ...]]
 class Minors:
     """The minors of a group: its rows with inputs, its inputs and outputs, and the compensator between these.
 
-    The system's minors are those of the group's first mirror image; R, S and T count in the group.
+    R, S and T count in the group. Its resolvent is that of its first mirror image.
     """
 
     loop: UncertainLoop
@@ -53,14 +54,9 @@ class Minors:
 
     @cached_property
     def image(self) -> Image:
-        """This group as an image of the one whose system stands for its own (mirrors.py)."""
-        own = Places(self.group.states, self.rows, self.inputs, self.outputs)
+        """This group as an image of the one whose resolvent stands for its own (mirrors.py)."""
+        own = Places(self.group.states, self.rows)
         return first_alike(self.loop.program, self.loop.symbolic, own)
-
-    @property
-    def system(self) -> Places:
-        """The group whose system stands for this one's."""
-        return self.image.of
 
     @property
     def order(self) -> int:
@@ -109,51 +105,52 @@ class Minors:
 
     @cached_property
     def balls(self) -> tuple[dict[Pair, Any], dict[Pair, Any]]:
-        """kappa times the delay's power and the signs of an image, signed, as exact polynomials and as balls."""
-        u, y = self.image.inputs, self.image.outputs
-        signed = {}
-        for (T, S), p in self.kappa.items():
-            sign = math.prod(-u[t] * y[s] for t, s in zip(T, S, strict=True))
-            signed[T, S] = p * self.late[len(T)] * sign
+        """kappa times the delay's power, signed, as exact polynomials and as balls."""
+        signed = {pair: p * self.late[len(pair[0])] * (-1) ** len(pair[0]) for pair, p in self.kappa.items()}
         return signed, {pair: arb_poly(p) for pair, p in signed.items()}
 
-    def plant(self, entries: list[list[tuple[int, int, Any]]], matrix: Any) -> dict[Pair, Any]:
-        """pi_SR at given p, rows by their number in the group."""
-        a, c, factor = self._matrices(entries, matrix)
-        law, r = self.loop.law, len(self.rows)
-        b = dense(matrix, a.nrows(), r, ((i, k, 1) for k, i in enumerate(self.rows)))
-        if self.loop.sampled:
-            if law.lag is not None:
-                a, b, c, _ = add_lag(matrix, a, b, c, None, arb(law.lag))
-            a, b = hold(matrix, a, b, arb(law.sample_time))
-        elif law.lag is not None:
-            a, b, c, _ = add_lag(matrix, a, b, c, None, exact(law.lag))
-        elif law.sample_time is not None:
-            a = a - dense(matrix, a.nrows(), a.nrows(), ((i, i, 1) for i in range(a.nrows())))
-        found = _minors(a, b, c, self.order)
-        return {pair: p * factor for pair, p in found.items()}
-
-    def _matrices(self, entries: list[list[tuple[int, int, Any]]], matrix: Any) -> tuple[Any, Any, Any]:
-        x = {state: k for k, state in enumerate(self.system.states)}
-        n, y = len(x), {output: k for k, output in enumerate(self.system.outputs)}
-        a = dense(matrix, n, n, ((x[i], x[j], r) for i, j, r in entries[A] if i in x and j in x))
-        c = dense(matrix, len(y), n, ((y[i], x[j], r) for i, j, r in entries[C] if i in y and j in x))
+    def resolvent(self, entries: list[list[tuple[int, int, Any]]], matrix: Any) -> Resolvent:
+        """That of the first group of which this one is an image, at given p."""
+        a, law = self._square(entries[A], matrix, self.image.of.states), self.loop.law
+        b = dense(matrix, a.nrows(), len(self.rows), ((i, k, 1) for k, i in enumerate(self.rows)))
         factor: Any = 1
         if self.loop.descriptor:
-            e = dense(matrix, n, n, ((x[i], x[j], r) for i, j, r in entries[E] if i in x and j in x))
-            factor = e.det()
-            a = solve(e, a)
-        return a, c, factor
+            e = self._square(entries[E], matrix, self.image.of.states)
+            factor, a = e.det(), solve(e, a)
+        rate = None if law.lag is None else arb(law.lag) if self.loop.sampled else exact(law.lag)
+        if rate is not None:
+            a, b, _, _ = add_lag(matrix, a, b, zeros(matrix, 0, a.nrows()), None, rate)
+        if self.loop.sampled:
+            a, b = hold(matrix, a, b, arb(law.sample_time))
+        elif law.sample_time is not None:
+            a = a - dense(matrix, a.nrows(), a.nrows(), ((i, i, 1) for i in range(a.nrows())))
+        return _resolvent(a, b, factor)
+
+    def plant(
+        self, resolvent: Resolvent, entries: list[list[tuple[int, int, Any]]], matrix: Any
+    ) -> dict[Pair, Any]:
+        """pi_SR at given p, rows by their number in the group; signs of images are those of C and of `forces`."""
+        x = {state: k for k, state in enumerate(self.group.states)}
+        y, signs = {output: k for k, output in enumerate(self.outputs)}, self.image.signs
+        own = [(y[i], x[j], r * signs[x[j]]) for i, j, r in entries[C] if i in y and j in x]
+        found = _minors(resolvent, dense(matrix, len(y), resolvent.powers.nrows(), own), self.order)
+        return {pair: p * resolvent.det_E for pair, p in found.items()}
+
+    def _square(self, entries: list[tuple[int, int, Any]], matrix: Any, states: tuple[int, ...]) -> Any:
+        """The entries of A or E between states."""
+        x = {state: k for k, state in enumerate(states)}
+        return dense(matrix, len(x), len(x), ((x[i], x[j], r) for i, j, r in entries if i in x and j in x))
 
     def forces(self, entries: list[list[tuple[int, int, Any]]], matrix: Any) -> dict[Pair, Any]:
         """beta_RT at given p, without structural zeros."""
-        x = {state: k for k, state in enumerate(self.system.states)}
-        n, u = len(x), {t: k for k, t in enumerate(self.system.inputs)}
+        x, signs = {state: k for k, state in enumerate(self.group.states)}, self.image.signs
+        n, u = len(x), {t: k for k, t in enumerate(self.inputs)}
         own = {(x[i], u[j]): r for i, j, r in entries[B] if i in x and j in u}
         if self.loop.descriptor:
-            e = dense(matrix, n, n, ((x[i], x[j], r) for i, j, r in entries[E] if i in x and j in x))
+            e = self._square(entries[E], matrix, self.group.states)
             b = solve(e, dense(matrix, n, len(u), ((*at, r) for at, r in own.items())))
             own = {(i, j): b[i, j] for i in range(n) for j in range(len(u))}
+        own = {(i, j): r * signs[i] for (i, j), r in own.items()}
         found: dict[Pair, Any] = {}
         for k in range(1, self.order + 1):
             for R in itertools.combinations(range(len(self.rows)), k):
@@ -232,14 +229,31 @@ class Minors:
     @property
     def known(self) -> dict[Any, Any]:
         """The remembered minors of the system at places and on discs, which do not depend on the compensator."""
+        return _known(self.loop.program, self._kind, self.group.states, self.rows, self.inputs, self.outputs)
+
+    @property
+    def resolvents(self) -> dict[Any, Any]:
+        """The remembered resolvents at places, those of images too."""
+        return _known(self.loop.program, self._kind, self.image.of)
+
+    @property
+    def _kind(self) -> tuple[Any, ...]:
         law = self.loop.law
-        return _known(self.loop.program, self.system, (law.sample_time, law.lag, self.loop.sampled))
+        return law.sample_time, law.lag, self.loop.sampled
 
 
 @lru_cache(maxsize=64)  # laws change, the system stays
 def _known(program: Program, *of: Any) -> dict[Any, Any]:
     del program, of
     return {}
+
+
+class Resolvent(NamedTuple):
+    """(g - A)^-1 B as adj(g - A) B / d, d = det(g - A): the matrices of its powers of g side by side, lowest first."""
+
+    d: Any
+    powers: Any
+    det_E: Any
 
 
 class Sizes(NamedTuple):
@@ -267,6 +281,14 @@ def minors(loop: UncertainLoop, g: Group) -> Minors | None:
     return found if found.count <= MOST else None
 
 
+def _determinant_by_row(row: list[Any], rest: list[Any]) -> Any:
+    """The determinant from a first row and the minors of the others."""
+    total = row[0] * rest[0]
+    for n in range(1, len(row)):
+        total = total - row[n] * rest[n] if n % 2 else total + row[n] * rest[n]
+    return total
+
+
 def _determinant(m: list[list[Any]]) -> Any:
     """The determinant by its first row; None stands for zero."""
     if len(m) == 1:
@@ -289,30 +311,31 @@ def _quotient(p: Any, d: Any, k: int) -> Any:
     return p
 
 
-def _minors(a: Any, b: Any, c: Any, order: int) -> dict[Pair, Any]:
-    """d det X[S, R], X = C (g - A)^-1 B and d = det(g - A).
-
-    d X = C adj(g - A) B, whose powers of g follow from Horner's scheme (Leverrier, Faddeev); larger minors by their
-    first row, divided by d. Unlike differences of characteristic polynomials neither loses digits to cancellation.
-    """
-    own, p, r = a.charpoly(), c.nrows(), b.ncols()
-    kind = arb_poly if isinstance(a, arb_mat) else fmpq_poly
-    d, power = kind(own), b
-    powers = [(c * b).entries()]
+def _resolvent(a: Any, b: Any, det_E: Any) -> Resolvent:
+    """The resolvent by Horner's scheme (Leverrier, Faddeev), which loses few digits to cancellation."""
+    own = a.charpoly()
+    powers = [b]
     for k in range(a.nrows() - 1, 0, -1):
-        power = a * power + b * own[k]
-        powers.append((c * power).entries())
-    powers.reverse()
+        powers.append(a * powers[-1] + b * own[k])
+    kind = arb_poly if isinstance(a, arb_mat) else fmpq_poly
+    return Resolvent(kind(own), join_columns(type(a), *powers[::-1]), det_E)
+
+
+def _minors(resolvent: Resolvent, c: Any, order: int) -> dict[Pair, Any]:
+    """d det X[S, R], X = C (g - A)^-1 B: d X has entries of C adj(g - A) B, and larger minors are their determinants
+    by the first row, each divided by d."""
+    d, p, wide = resolvent.d, c.nrows(), resolvent.powers.ncols()
+    values, r = (c * resolvent.powers).entries(), wide // resolvent.powers.nrows()
     found: dict[Pair, Any] = {((), ()): d}
     for i, j in itertools.product(range(p), range(r)):
-        found[(i,), (j,)] = kind([row[i * r + j] for row in powers])
+        found[(i,), (j,)] = type(d)(values[i * wide + j : (i + 1) * wide : r])
     for k in range(2, order + 1):
         for S in itertools.combinations(range(p), k):
             for R in itertools.combinations(range(r), k):
-                terms = (
-                    found[S[:1], (j,)] * found[S[1:], R[:n] + R[n + 1 :]] * (-1) ** n for n, j in enumerate(R)
+                minor = _determinant_by_row(
+                    [found[S[:1], (j,)] for j in R], [found[S[1:], R[:n] + R[n + 1 :]] for n in range(k)]
                 )
-                found[S, R] = divmod(sum(terms, 0 * d), d)[0]
+                found[S, R] = minor // d
     return found
 
 

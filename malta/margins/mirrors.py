@@ -1,10 +1,9 @@
-"""Groups of states whose systems are equal but for signs, as those of the two planes of a round body.
+"""Groups of states whose own dynamics are equal but for signs, as those of the two planes of a round body.
 
-    A' = S A S,  B' = S B U,  C' = Y C S,  E' = S E S        S, U, Y = diag(+-1)
+    A' = S A S,  E' = S E S        S = diag(+-1)
 
-X = C (s E - A)^-1 is then Y X S, and each product det X[S, R] det B[R, T] of minors.py is that of the first group times
-the signs in Y of its outputs and those in U of its inputs. The signs are read from the exact entries: numbers that
-differ in their last digit make no mirror image.
+(s E - A)^-1 of minors.py is then S (s E' - A')^-1 S. The signs are read from the exact entries: numbers that differ in
+their last digit make no mirror image.
 """
 
 from __future__ import annotations
@@ -17,33 +16,26 @@ from scipy import sparse
 
 from malta.margins.algebra import Ratio, Symbolic
 from malta.margins.expressions import Program
-from malta.margins.groups import A, B, C, E
+from malta.margins.groups import A, E
 
 
 class Places(NamedTuple):
-    """A group's states, inputs and outputs by their numbers in the loop, and its rows with inputs by their own."""
+    """A group's states by their numbers in the loop, and its rows with inputs by their own."""
 
     states: tuple[int, ...]
     rows: tuple[int, ...]
-    inputs: tuple[int, ...]
-    outputs: tuple[int, ...]
 
     def entries(self, s: Symbolic, which: int) -> dict[tuple[int, int], Ratio]:
-        """The entries of A, B, C or E in the group, by row and column in the group."""
-        rows = self.outputs if which == C else self.states
-        columns = self.inputs if which == B else self.states
-        i_of, j_of = ({place: k for k, place in enumerate(own)} for own in (rows, columns))
-        return {
-            (i_of[i], j_of[j]): r for (i, j), r in s.entries[which].items() if i in i_of and j in j_of
-        }  # fmt: skip
+        """The entries of A or E in the group, by row and column in the group."""
+        at = {state: k for k, state in enumerate(self.states)}
+        return {(at[i], at[j]): r for (i, j), r in s.entries[which].items() if i in at and j in at}
 
 
 class Image(NamedTuple):
-    """A group as the mirror image of the group `of`, and the signs of its inputs and outputs beside that one's."""
+    """A group as the mirror image of the group `of`, and the signs of its states."""
 
     of: Places
-    inputs: tuple[int, ...]
-    outputs: tuple[int, ...]
+    signs: tuple[int, ...]
 
 
 def first_alike(program: Program, s: Symbolic | None, places: Places) -> Image:
@@ -52,8 +44,7 @@ def first_alike(program: Program, s: Symbolic | None, places: Places) -> Image:
     if places not in firsts:
         others = [one for one, image in firsts.items() if image.of == one] if s is not None else []
         found = (image for one in others if s is not None and (image := image_of(s, one, places)) is not None)
-        alone = Image(places, (1,) * len(places.inputs), (1,) * len(places.outputs))
-        firsts[places] = next(found, alone)
+        firsts[places] = next(found, Image(places, (1,) * len(places.states)))
     return firsts[places]
 
 
@@ -65,18 +56,16 @@ def _firsts(program: Program) -> dict[Places, Image]:
 
 def image_of(s: Symbolic, one: Places, two: Places) -> Image | None:
     """The second group as an image of the first; None where they differ, as exact expressions, in more than signs."""
-    if one.rows != two.rows or [len(part) for part in one] != [len(part) for part in two]:
+    if one.rows != two.rows or len(one.states) != len(two.states):
         return None
-    n, m, related = len(one.states), len(one.inputs), list[tuple[int, int, int]]()
-    for which in (k for k in (A, B, C, E) if k < len(s.entries)):
+    related = list[tuple[int, int, int]]()
+    for which in (k for k in (A, E) if k < len(s.entries)):
         own, other = one.entries(s, which), two.entries(s, which)
         if own.keys() != other.keys():
             return None
-        for (i, j), r in own.items():
-            sign = _sign(r, other[i, j])
-            related.append((n + m + i if which == C else i, n + j if which == B else j, sign))
-    signs = _signs(related, n + m + len(one.outputs))
-    return None if signs is None else Image(one, signs[n : n + m], signs[n + m :])
+        related += [(i, j, _sign(r, other[i, j])) for (i, j), r in own.items()]
+    signs = _signs(related, len(one.states))
+    return None if signs is None else Image(one, signs)
 
 
 def _sign(one: Ratio, two: Ratio) -> int:
