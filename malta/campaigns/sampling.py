@@ -21,7 +21,6 @@ from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.stats import qmc
 
 from malta.simulation.noise import GAMMA, keys, mix
 
@@ -97,6 +96,8 @@ def _directions(seed: int, bits: int, dimensions: int) -> tuple[NDArray[np.uint6
 
     The Gray code of 2**(k + 1) - 1 is 2**k: that point differs from point 0 by direction k alone.
     """
+    from scipy.stats import qmc  # half a second to import
+
     sequence = qmc.Sobol(dimensions, rng=seed, bits=DIGITS)
     start, at, directions = _whole(sequence.random(1)), 1, []
     for bit in range(bits):

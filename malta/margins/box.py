@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -50,9 +50,6 @@ class Box:
     up: FloatArray
     over: FloatArray  # P x 2, ends of the intervals that do not grow; nominal values of the other parameters
     most: float  # t at which a parameter reaches its limit
-    frame: Mapping[int, tuple[float, float]] = field(
-        default_factory=dict
-    )  # by index: an interval around `over`, shared by several boxes
     ends: str = ""  # what happens at `most`
 
     @property
@@ -83,13 +80,6 @@ class Box:
         """The sides of box(t) to a digit, for the search of a witness: plain numbers stay plain."""
         grown = np.column_stack([self.nominal - t * self.down, self.nominal + t * self.up])
         return np.where((self.down + self.up > 0)[:, None], grown, self.over)
-
-    def frame_sides(self, t: float) -> FloatArray:
-        """The sides of box(t) with those of the frame in place of the own ones: equal for several boxes."""
-        sides = self.sides(t)
-        for i, interval in self.frame.items():
-            sides[i] = interval
-        return sides
 
     def nominal_places(self) -> FloatArray:
         """The nominal values at the ends and the middle of the intervals that do not grow; rows, nominal first."""

@@ -43,7 +43,7 @@ from malta.margins.peaks import (
 )
 from malta.margins.polydisc import Size, is_zero_free
 from malta.margins.problem import OfLoop
-from malta.margins.responses import responses
+from malta.margins.responses import Responses, responses
 from malta.margins.robust import (
     Margin,
     deadline,
@@ -168,7 +168,11 @@ class Blocks:
 
     def transfer(self, p: FloatArray, w: FloatArray) -> ComplexArray:
         """M at parameters p and frequencies w (rad/s), its rows times the blocks' weights: k x columns x rows."""
-        M = transfer(responses(self.system, self.law, p, w), self.blocks)
+        if len(w) > 1:
+            found = _responses_on_grid(self.system, self.law, p.tobytes(), w.tobytes())
+        else:
+            found = responses(self.system, self.law, p, w)
+        M = transfer(found, self.blocks)
         scale = np.array([b.weight.at(w) for b in self.blocks for _ in b.columns])
         return np.asarray(M * scale.T[:, :, None])
 
@@ -202,6 +206,11 @@ class Blocks:
         """The parameters in box(t) at relative places `chosen` (rows, -1 to 1)."""
         sides = self.box.near_sides(t)
         return [sides.mean(axis=1) + x * (sides[:, 1] - sides[:, 0]) / 2 for x in chosen]
+
+
+@lru_cache(maxsize=64)  # searches of several gains begin at the same places; records compare by identity
+def _responses_on_grid(system: UncertainSystem, law: Compensator, p: bytes, w: bytes) -> Responses:
+    return responses(system, law, np.frombuffer(p), np.frombuffer(w))
 
 
 @lru_cache(maxsize=8)  # gains of several channels need the same families; records compare by identity

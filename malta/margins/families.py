@@ -12,7 +12,7 @@ from malta.margins.characteristic import pair
 from malta.margins.enclosure import Unproven, over_box, precision
 from malta.margins.exclusion import growth_over
 from malta.margins.expressions import NotAnalytic, exact
-from malta.margins.family import Family, narrow
+from malta.margins.family import Family
 from malta.margins.parts import Part, cut, merge_twins
 from malta.margins.problem import OfLoop, OfSeveral, Polynomial, Problem, hurwitz
 from malta.margins.time_limit import TimeUp, time_limit
@@ -35,7 +35,7 @@ def parts_over(problem: Problem, box: Box, reach: float, last: float) -> list[Pa
 
     Raises Unproven when a matrix has no value on the box, or when time is up.
     """
-    sides = box.frame_sides(reach)
+    sides = box.sides(reach)
     parts: list[Part] = []
     try:
         with time_limit(last):
@@ -52,30 +52,11 @@ def parts_over(problem: Problem, box: Box, reach: float, last: float) -> list[Pa
 
 def _parts_of(f: Polynomial, box: Box, sides: FloatArray, moves: tuple[Any, ...], last: float) -> list[Part]:
     """The parts of one polynomial."""
-    return cut(sides, box.nominal, last, lambda own: _part(f, box, own, moves, last))
 
+    def part_over(own: FloatArray) -> list[Part]:
+        return [Part(f, own, family_over(f, own, moves, last), growth_over(own, f.inverted, box))]
 
-def _part(f: Polynomial, box: Box, sides: FloatArray, moves: tuple[Any, ...], last: float) -> list[Part]:
-    """The part of the box that lies in the frame's part `sides`, if any."""
-    family = family_over(f, sides, moves, last)
-    own = sides.copy()
-    for i in box.frame:
-        own[i] = box.over[i]
-        if not sides[i, 0] <= own[i, 0] <= own[i, 1] <= sides[i, 1]:
-            return []
-        family = narrow(family, i, *_shares(sides[i], own[i], f.inverted[i]))
-    return [Part(f, own, family, growth_over(own, f.inverted, box))]
-
-
-def _shares(side: FloatArray, own: FloatArray, inverted: bool) -> tuple[float, float]:
-    """The ends of a part of a side as shares of it, of 1 / p where inverted, to the last digit."""
-    low, high, *ends = (exact(x) for x in (*side.tolist(), *own.tolist()))
-    if inverted:
-        low, high, *ends = (1 / x for x in (high, low, *ends))
-    if not low < high:
-        return 0.5, 0.5
-    first, last = sorted((x - low) / (high - low) for x in ends)
-    return int(first.p) / int(first.q), int(last.p) / int(last.q)
+    return cut(sides, box.nominal, last, part_over)
 
 
 def family_over(f: Polynomial, sides: FloatArray, moves: tuple[Any, ...], last: float) -> Family:

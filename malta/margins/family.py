@@ -128,21 +128,6 @@ def family(
     return _round_to_doubles(shape, table, tails)
 
 
-def narrow(f: Family, axis: int, low: float, high: float) -> Family:
-    """The family over the part [low, high] of one side; over a single value when these are equal."""
-    n = f.shape[axis]
-    boxes = np.tile([0.0, 1.0], (1, len(f.shape), 1))
-    boxes[0, axis] = low, high
-    values = restrict(f.values, f.shape, boxes) if n > 1 else f.values
-    shape = list(f.shape)
-    if low == high and n > 1:
-        values = np.take(values.reshape(len(values), *shape), 0, axis=axis + 1).reshape(len(values), -1)
-        shape[axis] = 1
-    # convex combinations of n values each, and low and high to the last digit
-    slack = 8 * n * n * EPS * np.abs(f.values).max(axis=1)
-    return Family(tuple(shape), values, f.radius + slack, f.exponents, f.scale)
-
-
 def align(f: Family, g: Family) -> tuple[Family, Family]:
     """Both families with the same degrees and with f's scale of s."""
     shape = tuple(max(n, m) for n, m in zip(f.shape, g.shape, strict=True))

@@ -9,10 +9,13 @@ import itertools
 import math
 import time as clock
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from scipy import optimize
+
+from malta.model.plant import readonly
 
 if TYPE_CHECKING:
     from malta.margins.problem import OfLoop
@@ -45,8 +48,13 @@ def patterns(count: int) -> FloatArray:
 
 def frequencies(problem: OfLoop, p: FloatArray) -> FloatArray:
     """Frequencies that show a loop's peaks: between its slowest and its fastest pole and about each of them, rad/s."""
+    return _frequencies(problem, p.tobytes())
+
+
+@lru_cache(maxsize=64)  # searches of several gains begin at the same places; problems compare by identity
+def _frequencies(problem: OfLoop, place: bytes) -> FloatArray:
     with np.errstate(all="ignore"):
-        s: ComplexArray = problem.poles(p)
+        s: ComplexArray = problem.poles(np.frombuffer(place))
     known = np.concatenate([np.abs(s), np.abs(s.imag)])
     known = known[np.isfinite(known) & (known > 0)]
     top = _top(problem)
@@ -55,7 +63,7 @@ def frequencies(problem: OfLoop, p: FloatArray) -> FloatArray:
     wide = np.geomspace(known.min() * ENDS[0], min(known.max() * ENDS[1], top), GRID)
     far = np.array([known.min(), known.max()]) * FAR_ENDS
     w = np.unique(np.concatenate([wide, far, (known[:, None] * AROUND).ravel()]))
-    return np.asarray(np.append(w[w < top], top) if math.isfinite(top) else w)
+    return readonly(np.append(w[w < top], top) if math.isfinite(top) else w)
 
 
 def _top(problem: OfLoop) -> float:

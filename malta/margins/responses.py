@@ -35,16 +35,17 @@ def responses(system: UncertainSystem, law: Compensator, p: FloatArray, w: Float
     if len(more) > 1:
         both = np.linalg.solve(more[1], np.hstack([A, B]))
         A, B = both[:, :n], both[:, n:]
-    eye, none = np.eye(m), np.zeros((m, m))
-    if law.lag is not None:
-        A = np.block([[A, B], [np.zeros((m, n)), -law.lag * eye]])
-        B = np.block([[np.zeros((n, m)), B], [law.lag * eye, none]])
-        C = np.block([[C, D], [np.zeros((m, n)), eye]])
-        D = np.block([[np.zeros_like(D), D], [none, none]])
+    k, q = n if law.lag is None else n + m, len(C)
+    into, out, through = np.zeros((k, 2 * m)), np.zeros((q + m, k)), np.zeros((q + m, 2 * m))
+    into[:n, m:], out[:q, :n], through[:q, m:] = B, C, D  # of forces on the plant, and then of commands
+    if law.lag is None:
+        into[:n, :m], through[:q, :m], through[q:, :m] = B, D, np.eye(m)
     else:
-        B = np.hstack([B, B])
-        C = np.vstack([C, np.zeros((m, n))])
-        D = np.block([[D, D], [eye, none]])
+        whole = np.zeros((k, k))
+        whole[:n, :n], whole[:n, n:], whole[n:, n:] = A, B, -law.lag * np.eye(m)
+        into[n:, :m], out[:q, n:], out[q:, n:] = law.lag * np.eye(m), D, np.eye(m)
+        A = whole
+    B, C, D = into, out, through
     T = law.sample_time
     s: ComplexArray = 1j * np.asarray(w, dtype=float)
     turned = np.ones_like(s)
@@ -59,7 +60,6 @@ def responses(system: UncertainSystem, law: Compensator, p: FloatArray, w: Float
     at = s[:, None, None]
     G = (C @ np.linalg.solve(at * np.eye(len(A)) - A, B) + D) * turned[:, None, None]
     F = law.C @ np.linalg.solve(at * np.eye(len(F_A)) - F_A, F_B) + law.D
-    q = len(C) - m
     return Responses(G[:, :q, :m], G[:, :q, m:], G[:, q:, :m], np.asarray(F, dtype=complex))
 
 

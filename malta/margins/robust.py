@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 import time as clock
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
@@ -233,22 +233,15 @@ def margin_at(
     compensator: Compensator,
     ranges: Ranges,
     at: Mapping[str, float],
-    within: Mapping[str, tuple[float, float]],
     *,
     tolerance: float | None = None,
     time: float | None = None,
 ) -> Margin:
-    """The margin with some parameters fixed at the values `at` in place of the nominal ones.
-
-    within : an interval around each of these values, SI; the coefficients are enclosed once over the intervals, which
-        several margins share
-    """
+    """The margin with some parameters fixed at the values `at` in place of the nominal ones."""
     nominal = system.nominal.copy()
     for name, value in at.items():
         nominal[system.names.index(name)] = value
-    frame = {system.names.index(name): interval for name, interval in within.items()}
     box = within_branches(box_of(system.names, nominal, system.limits, ranges, {}), system.positive)
-    box = replace(box, frame=frame)
     return margin_of(problem_of(system, compensator), box, Effort(tolerance, time))
 
 

@@ -217,7 +217,7 @@ class Job:
         """The proof by multipliers; None for a loop without a pencil of rational functions."""
         rows = None
         with suppress(TimeUp), time_limit(self.until):
-            rows = None if self.box.frame else rows_of(self.problem)
+            rows = rows_of(self.problem)
         return None if rows is None else Structured(rows, self.box, self.until, self.most_cells, self._report)
 
     def _multiply(self, target: float, share: float, most: float = math.inf) -> None:
@@ -230,7 +230,7 @@ class Job:
 
     def _compare_signs(self) -> None:
         """Raise the proven bound by Hurwitz's determinant, which needs no cells of frequency for light damping."""
-        if self.signs is not None or self.box.frame or isinstance(self.problem, HeldLoop):
+        if self.signs is not None or isinstance(self.problem, HeldLoop):
             return
         now = clock.monotonic()
         until = now + SIGNS * (self.until - now) if math.isfinite(self.until) else now + LAST

@@ -194,7 +194,7 @@ def place_margin(
         return robust_margin(*loop_at(plant, controller, names, position, current_loops), ranges)
     along, over = travel_loops(plant, controller, names, current_loops)
     if plant.stroke in over:
-        return margin_at(*along[0], ranges, {plant.stroke: position}, over, tolerance=TOLERANCE)
+        return margin_at(*along[0], ranges, {plant.stroke: position}, tolerance=TOLERANCE)
     loop = loop_at(plant, controller, names, position, current_loops)
     if (problem := _anywhere(plant, controller, names, current_loops, position)) is not None:
         found = margin_of(problem, _box(loop[0], ranges), Effort(time=EACH))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from functools import lru_cache
+from itertools import accumulate
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import casadi as ca
@@ -105,12 +106,13 @@ def past_forces(c: Controller, motion: references.Motion, v_ff: FloatArray) -> F
 
 def lagging_references(c: Controller, v_ff: FloatArray) -> FloatArray:
     """The forces behind the lag of the design model while v_ff is commanded, k x m; at rest before the first sample."""
-    from scipy.signal import lfilter  # a third of a second to import, for the few designs that need it
-
     decay = _decay(c)
-    acting = np.vstack([np.repeat(v_ff[:1], c.delay, axis=0), v_ff])[: len(v_ff)]
-    lagging: FloatArray = lfilter([0.0, 1 - decay], [1.0, -decay], acting, axis=0, zi=v_ff[:1])[0]
-    return lagging
+    acting = np.vstack([np.repeat(v_ff[:1], c.delay, axis=0), v_ff])[: len(v_ff) - 1]
+    columns = (
+        accumulate(forces.tolist(), lambda lagging, v: (1 - decay) * v + decay * lagging, initial=first)
+        for forces, first in zip(acting.T, v_ff[0].tolist(), strict=True)
+    )
+    return np.column_stack([list(column) for column in columns])
 
 
 def _decay(c: Controller) -> float:

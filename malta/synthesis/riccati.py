@@ -115,8 +115,6 @@ def _by_parts(
 
 def _solve(A: FloatArray, B: FloatArray, Q: FloatArray, what: str, *, discrete: bool) -> _Found:
     """The first solution that is as good as rounding allows, or else the best; R is the identity."""
-    import control
-
     candidates: list[_Found] = []
     failures: list[Exception] = []
     balanced = _balance(A - discrete * np.eye(len(A)), B @ B.T, Q)
@@ -128,7 +126,7 @@ def _solve(A: FloatArray, B: FloatArray, Q: FloatArray, what: str, *, discrete: 
                 X = way(equation)
                 t = t if last else _unit_diagonal(t, X * equation.unit)
             found = _refine(_evaluate(equation, X))
-        except (ValueError, control.ControlArgument) as error:
+        except ValueError as error:
             failures.append(error)
             continue
         if way is not _doubled or _stands(found):
@@ -144,11 +142,9 @@ def _solve(A: FloatArray, B: FloatArray, Q: FloatArray, what: str, *, discrete: 
 
 def _hamiltonian(equation: _Equation) -> FloatArray:
     """X by scipy's Hamiltonian; time counts in the largest entry of A."""
-    import control
-
     A, B, Q, R = equation[:4]
     rate = np.abs(A).max() or 1.0
-    return np.asarray(control.care(A / rate, B / np.sqrt(rate), Q / rate, R, method="scipy")[0])
+    return np.asarray(linalg.solve_continuous_are(A / rate, B / np.sqrt(rate), Q / rate, R))
 
 
 def _symplectic(equation: _Equation) -> FloatArray:
@@ -157,9 +153,7 @@ def _symplectic(equation: _Equation) -> FloatArray:
     X counts in units of Q. Where weights are weak or samples short Q is small beside X, and the I beside this X: the
     ratio is lost in digits. scipy balances the pencil once more and so returns to these units from any other.
     """
-    import control
-
-    return np.asarray(control.dare(*equation[:4], method="scipy")[0])
+    return np.asarray(linalg.solve_discrete_are(*equation[:4]))
 
 
 def _doubled(equation: _Equation) -> FloatArray:
@@ -358,7 +352,9 @@ def eigenvalues(M: FloatArray) -> ComplexArray:
 def sample(A: FloatArray, B: FloatArray, Ts: float) -> tuple[FloatArray, FloatArray]:
     """Zero-order hold: Ad = e^(A Ts), Bd = integral of e^(A s) B over one sample."""
     n, m = B.shape
-    E = _exponential(np.block([[A, B], [np.zeros((m, n + m))]]) * Ts)
+    held = np.zeros((n + m, n + m))
+    held[:n, :n], held[:n, n:] = A, B
+    E = _exponential(held * Ts)
     return E[:n, :n], E[:n, n:]
 
 
