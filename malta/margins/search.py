@@ -55,6 +55,7 @@ SIGNS = (
     0.5  # share of the time that is left for Hurwitz's determinant where cells of frequency do not settle it
 )
 TURN, TURN_AFTER = 0.5, 4.0  # their share of the time in that turn, and how many times what was spent before
+ALONE = 0.8  # their share where there are no families
 
 BOUNDED = "what the position does is bounded, not followed"
 
@@ -189,14 +190,13 @@ class Job:
         final = self._advance(searches, reach, min(self.most_cells, FEW if self._is_many else HARD))
         best, kept = 0.0, searches
         if self._is_open(searches):
-            self._compare_signs()
-            if self._is_settled():
-                return final, searches
-        if self._is_open(searches) and self._is_many:
-            self._multiply(self.target(reach), TURN, TURN_AFTER * (clock.monotonic() - self.begun))
-            if self._bound_beside() > final:
+            if self._is_many:
+                self._multiply(self.target(reach), TURN, TURN_AFTER * (clock.monotonic() - self.begun))
+            if not self._is_covered(reach):
+                self._compare_signs(final)
+            if self._is_many and not self._is_covered(reach) and self._bound_beside() > final:
                 self._multiply(self.target(reach), 0.9)
-            if self._is_settled():
+            if self._is_covered(reach):
                 return final, searches
         if self._is_open(searches) and not self.late() and not _is_blocked(searches):
             top = self.target(reach)
@@ -228,12 +228,17 @@ class Job:
             with suppress(TimeUp), time_limit(self.structured.until):
                 self.structured.raise_bound(target)
 
-    def _compare_signs(self) -> None:
-        """Raise the proven bound by Hurwitz's determinant, which needs no cells of frequency for light damping."""
+    def _compare_signs(self, proven: float = 0.0) -> None:
+        """Raise the proven bound by Hurwitz's determinant, which needs no cells of frequency for light damping.
+
+        Where the cells have proven as much as was asked for, it may take as long as they did.
+        """
         if self.signs is not None or isinstance(self.problem, HeldLoop):
             return
         now = clock.monotonic()
         until = now + SIGNS * (self.until - now) if math.isfinite(self.until) else now + LAST
+        if proven >= min(self.upper, self.limit) * (1 - self.asked):
+            until = min(until, now + (now - self.begun))
         t = min(self.limit, 1.05 * self.upper)
         for _ in range(SMALLER):
             with suppress(Unproven, TimeUp), time_limit(until):
@@ -262,6 +267,10 @@ class Job:
 
     def _is_settled(self) -> bool:
         return self._bound_beside() >= min(self.upper * (1 - self.asked), self.limit * (1 - self.asked))
+
+    def _is_covered(self, reach: float) -> bool:
+        """Whether as much is proven beside the cells as those of box(reach) can prove."""
+        return self._is_settled() or self._bound_beside() >= self.target(reach)
 
     def _start(self, parts: list[Part], target: float, until: float) -> Searches:
         begun = [
@@ -454,9 +463,13 @@ class Job:
         """The margin without families: the first loss along the box's diagonals, and a proof by multipliers."""
         loss = self._first_loss()
         self.upper = loss[0]
-        self._compare_signs()
+        target = min(self.limit, self.upper * (1 - self.tolerance))
+        if self._is_many:
+            self._multiply(target, ALONE)
         if not self._is_settled():
-            self._multiply(min(self.limit, self.upper * (1 - self.tolerance)), 1.0)
+            self._compare_signs()
+        if not self._is_settled():
+            self._multiply(target, 1.0)
         touched = self._loss_by_signs()
         loss = touched if touched is not None and touched[0] < loss[0] else loss
         return self._margin(0.0, loss, [], begun)
