@@ -11,7 +11,7 @@ At given p the coefficients are exact rationals, or balls as narrow as wanted.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any
@@ -158,38 +158,44 @@ class Characteristic:
             return [c * driven.det_E for c in coefficients(closed_loop(driven))]
         terms = [(x.p, x.q) for x in p]  # of which a hash takes an eighth of that of the quotient's
         known, place = self.minors.known, (ctx.prec, tuple(terms))
-        pi, beta = known.get(place, (None, None))
-        if beta is None:
+        if place not in known:
             for one in (known, self.minors.resolvents):
                 if len(one) > MOST:
                     one.clear()
-            entries, own = self._entries(p), (ctx.prec, *(terms[i] for i in self._on(A, C, E)))
-            pi = known.get(own)
-            if pi is None:
-                known[own] = pi = self.minors.plant(self._resolvent(entries, terms, matrix), entries, matrix)
-            beta = self.minors.forces(entries, matrix)
-            known[place] = pi, beta
+            known[place] = self._minors_at(p, terms, matrix)
+        pi, beta = known[place]
         found = self.minors.combine(pi, beta, matrix)
         zero = 0 * found[0]
         return found + [zero] * (self.minors.degree + 1 - len(found))
 
-    def _resolvent(self, entries: Any, terms: list[Any], matrix: Any) -> Resolvent:
-        """The resolvent at given p, remembered."""
-        assert self.minors is not None
-        known, place = self.minors.resolvents, (ctx.prec, *(terms[i] for i in self._on(A, E)))
-        if place not in known:
-            known[place] = self.minors.resolvent(entries, matrix)
-        return known[place]  # type: ignore[no-any-return]
+    def _minors_at(self, p: list[Any], terms: list[Any], matrix: Any) -> tuple[Any, Any]:
+        """pi and beta at given p, each remembered for the parameters that it depends on."""
+        minors = self.minors
+        assert minors is not None
 
-    def _entries(self, p: list[Any]) -> list[list[tuple[int, int, Any]]]:
+        def remembered(known: dict[Any, Any], on: tuple[int, ...], made: Callable[[], Any]) -> Any:
+            at = (ctx.prec, on, *(terms[i] for i in _parameters_of(self.loop.program, *on)))
+            if at not in known:
+                known[at] = made()
+            return known[at]
+
+        def resolvent() -> Resolvent:
+            return minors.resolvent(self._entries(p, (A, E)), matrix)
+
+        def plant() -> Any:
+            made = remembered(minors.resolvents, (A, E), resolvent)
+            return minors.plant(made, self._entries(p, (C,)), matrix)
+
+        pi = remembered(minors.known, (A, C, E), plant)
+        return pi, remembered(minors.known, (B, E), lambda: minors.forces(self._entries(p, (B, E)), matrix))
+
+    def _entries(self, p: list[Any], matrices: tuple[int, ...] = (A, B, C, D, E)) -> list[Any]:
+        """The entries of these matrices at given p; none of the others."""
+        program = self.loop.program.only(matrices)
         if not (self.exact or (self.loop.program.rational and self.loop.program.short)):
-            return self.loop.program.run([arb(x) for x in p], POINTS)
-        entries = self.loop.program.run(p, EXACT)
+            return program.run([arb(x) for x in p], POINTS)
+        entries = program.run(p, EXACT)
         return entries if self.exact else [[(i, j, arb(x)) for i, j, x in matrix] for matrix in entries]
-
-    def _on(self, *matrices: int) -> tuple[int, ...]:
-        """The parameters on which these matrices depend."""
-        return _parameters_of(self.loop.program, *matrices)
 
     def _map_to_v(self, a: list[Any]) -> list[Any]:
         return map_bilinear(a) if self.discrete else a

@@ -83,6 +83,10 @@ class Program:
                 on.append(frozenset().union(*(on[k] for k in operands)))
         return tuple(frozenset().union(*(on[k] for _, _, k in entries)) for entries in self.entries)
 
+    def only(self, matrices: tuple[int, ...]) -> Program:
+        """The program of these matrices alone; the others have no entries."""
+        return _only(self, matrices)
+
     def run(self, p: Sequence[Any], field: Arithmetic) -> list[list[tuple[int, int, Any]]]:
         """The entries (row, column, value) of each matrix at p, without structural zeros."""
         cells = self.cells(p, field)
@@ -105,6 +109,24 @@ class Program:
             else:
                 cells.append(field.apply(name, [cells[k] for k in operands], value))
         return cells
+
+
+@lru_cache(maxsize=64)
+def _only(program: Program, matrices: tuple[int, ...]) -> Program:
+    needed = {k for n in matrices if n < len(program.entries) for _, _, k in program.entries[n]}
+    for k in range(len(program.steps) - 1, -1, -1):
+        if k in needed:
+            needed.update(program.steps[k][2])
+    new = {k: i for i, k in enumerate(sorted(needed))}
+    steps = tuple(
+        (name, target, tuple(new[i] for i in operands), value)
+        for name, target, operands, value in (program.steps[k] for k in new)
+    )
+    entries = tuple(
+        tuple((i, j, new[k]) for i, j, k in own) if n in matrices else ()
+        for n, own in enumerate(program.entries)
+    )
+    return Program(steps, entries, program.shapes, program.inputs)
 
 
 class Arithmetic:
