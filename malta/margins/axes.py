@@ -1,16 +1,16 @@
 """A few axes as double integrators under their share of a compensator: determinants and adjugates over a box.
 
-A group's sampled loop has q+ = q + T q' + T^2 / 2 a, q'+ = q' + T a, a+ = b v: its matrix M0 = z - A0 is affine in each
-of the b_i, which are monomials of p. Its determinant and its adjugate are therefore sums over subsets of the b_i. The
-terms are computed once; a box of p changes their weights alone. Polynomials in g = z - 1 are mapped to v as in
-characteristic.py.
+A group's sampled loop has q+ = q + T q' + T^2 / 2 (a + k q), q'+ = q' + T (a + k q), a+ = b v. The b_i and the k_i are
+monomials of p, each the factor of a matrix of rank one in M0 = z - A0: its determinant and its adjugate are affine in
+each, so sums over subsets of them. The terms are computed once; a box of p changes their weights alone. Polynomials in
+g = z - 1 are mapped to v as in characteristic.py.
 """
 
 from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -23,33 +23,32 @@ from malta.margins.enclosure import precision
 from malta.margins.expressions import exact
 from malta.margins.family import EPS, binary
 from malta.margins.groups import rational
-from malta.margins.held_currents import HeldMachine
+from malta.margins.held_currents import HeldMachine, Lead
 
 if TYPE_CHECKING:
     from malta.margins.uncertain import Compensator
     from malta.model.plant import FloatArray
 
 BITS = 320
+STIFF = 2  # axes of a group whose own stiffness is kept
 
 
 @dataclass(frozen=True, eq=False)
 class Axes:
     """A group of axes with its states of the compensator; polynomials of g = z - 1 are mapped to v.
 
-    subsets : of the b_i; a term has the b_i of its subset at one and the others at zero
+    factors : the b_i, then the k_i other than zero
+    subsets : of the factors; a term has those of its subset at their coefficients and the others at zero
     """
 
     axes: tuple[int, ...]
     own: tuple[int, ...]
-    machine: HeldMachine
+    names: tuple[str, ...]
+    factors: tuple[Lead, ...]
     determinants: tuple[list[Any], ...]  # exact
     adjugates: FloatArray  # subsets x K x states x states, over 2^heights
     slack: FloatArray  # bounds of their errors
     heights: tuple[int, ...]
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        return self.machine.names
 
     @property
     def inverted(self) -> tuple[bool, ...]:
@@ -59,10 +58,10 @@ class Axes:
     def powers(self) -> list[tuple[int, ...]]:
         """The monomial of p that multiplies the term of each subset, with denominators cleared."""
         found = []
-        for chosen in itertools.product((0, 1), repeat=len(self.axes)):
+        for chosen in itertools.product((0, 1), repeat=len(self.factors)):
             total = [0] * len(self.names)
-            for i, inside in zip(self.axes, chosen, strict=True):
-                for k, e in enumerate(self.machine.lead[i].monomial):
+            for factor, inside in zip(self.factors, chosen, strict=True):
+                for k, e in enumerate(factor.monomial):
                     total[k] += max(e, 0) if inside else max(-e, 0)
             found.append(tuple(total))
         return found
@@ -70,6 +69,10 @@ class Axes:
     @cached_property
     def degrees(self) -> tuple[int, ...]:
         return tuple(max(row[k] for row in self.powers) for k in range(len(self.names)))
+
+    def values_at(self, p: FloatArray) -> tuple[float, ...]:
+        """The values of the factors at p, rounded."""
+        return tuple(float(x.coefficient * np.prod(p ** np.array(x.monomial))) for x in self.factors)
 
     def at(self, v: Sequence[Any]) -> list[Any]:
         """Coefficients of the determinant at exact p."""
@@ -101,13 +104,23 @@ def members_of(g: Axes, n: int) -> list[int]:
     return [*(k * n + i for k in range(3) for i in g.axes), *(3 * n + k for k in g.own)]
 
 
-def state_matrix(law: Compensator, axes: Sequence[int], own: Sequence[int], b: Sequence[Any]) -> FloatArray:
-    """The state matrix A0 of a group at values of b."""
+def stiff_axes(machine: HeldMachine, axes: Sequence[int]) -> tuple[int, ...]:
+    """The axes of a group whose k_i is other than zero and is kept: subsets of large groups would be many."""
+    return tuple(i for i in axes if machine.stiff[i].coefficient) if len(axes) <= STIFF else ()
+
+
+def state_matrix(
+    law: Compensator, axes: Sequence[int], own: Sequence[int], b: Sequence[Any], k: Sequence[Any] = ()
+) -> FloatArray:
+    """The state matrix A0 of a group at values of b and of k, which is zero if not given."""
     r, T = len(axes), float(law.sample_time or 0)
     A = np.zeros((3 * r + len(own),) * 2)
     eye = np.eye(r)
     A[:r, :r], A[:r, r : 2 * r], A[:r, 2 * r : 3 * r] = eye, T * eye, T**2 / 2 * eye
     A[r : 2 * r, r : 2 * r], A[r : 2 * r, 2 * r : 3 * r] = eye, T * eye
+    if len(k):
+        A[:r, :r] += T**2 / 2 * np.diag(k)
+        A[r : 2 * r, :r] += T * np.diag(k)
     A[2 * r : 3 * r, :r] = np.array(b)[:, None] * law.D[np.ix_(axes, axes)]
     A[2 * r : 3 * r, 3 * r :] = np.array(b)[:, None] * law.C[np.ix_(axes, own)]
     A[3 * r :, :r] = law.B[np.ix_(own, axes)]
@@ -116,13 +129,15 @@ def state_matrix(law: Compensator, axes: Sequence[int], own: Sequence[int], b: S
 
 
 def axes_of(machine: HeldMachine, law: Compensator, axes: tuple[int, ...], own: tuple[int, ...]) -> Axes:
-    """Determinants and adjugates of a group, for every subset of its b."""
-    vertices = []
-    chosen = list(itertools.product((0, 1), repeat=len(axes)))
+    """Determinants and adjugates of a group, for every subset of its b and k."""
+    vertices, stiff = [], stiff_axes(machine, axes)
+    factors = tuple(machine.lead[i] for i in axes) + tuple(machine.stiff[i] for i in stiff)
+    chosen = list(itertools.product((0, 1), repeat=len(factors)))
     with precision(BITS):
         for on in chosen:
-            c = [machine.lead[i].coefficient if x else 0.0 for i, x in zip(axes, on, strict=True)]
-            vertices.append(_adjugate(_exact(law, axes, own, c)))
+            c = [factor.coefficient if x else 0.0 for factor, x in zip(factors, on, strict=True)]
+            k = dict(zip(stiff, c[len(axes) :], strict=True))
+            vertices.append(_adjugate(_exact(law, axes, own, c, k)))
         count = len(vertices[0][0])
         determinants: list[list[Any]] = []
         adjugates: list[list[Any]] = []
@@ -136,10 +151,12 @@ def axes_of(machine: HeldMachine, law: Compensator, axes: tuple[int, ...], own: 
                 N = [x + sign * y for x, y in zip(N, R, strict=True)]
             determinants.append(f)
             adjugates.append(N)
-        return _stored(machine, axes, own, determinants, adjugates)
+        return Axes(axes, own, machine.names, factors, *_stored(determinants, adjugates))
 
 
-def _exact(law: Compensator, axes: Sequence[int], own: Sequence[int], c: Sequence[float]) -> Any:
+def _exact(
+    law: Compensator, axes: Sequence[int], own: Sequence[int], c: Sequence[float], stiff: Mapping[int, float]
+) -> Any:
     """A0 - 1 of a group in exact numbers, rounded to balls."""
     r, T = len(axes), exact(float(law.sample_time or 0))
     n = 3 * r + len(own)
@@ -148,13 +165,15 @@ def _exact(law: Compensator, axes: Sequence[int], own: Sequence[int], c: Sequenc
     B, A = rational(law.B[np.ix_(own, axes)]), rational(law.A[np.ix_(own, own)])
     for i in range(r):
         table[i][r + i], table[i][2 * r + i], table[r + i][2 * r + i] = T, T * T / 2, T
+        k = exact(stiff.get(axes[i], 0.0))
+        table[i][i], table[r + i][i] = T * T / 2 * k, T * k
         b = exact(c[i])
         table[2 * r + i][:r] = [b * x for x in D[i]]
         table[2 * r + i][3 * r :] = [b * x for x in C[i]]
         table[2 * r + i][2 * r + i] = fmpq(-1)
-    for k in range(len(own)):
-        table[3 * r + k][:r] = B[k]
-        table[3 * r + k][3 * r :] = [x - (k == i) for i, x in enumerate(A[k])]
+    for j in range(len(own)):
+        table[3 * r + j][:r] = B[j]
+        table[3 * r + j][3 * r :] = [x - (j == i) for i, x in enumerate(A[j])]
     return arb_mat(fmpq_mat(table))
 
 
@@ -172,19 +191,15 @@ def _adjugate(H: Any) -> tuple[list[Any], list[Any]]:
 
 
 def _stored(
-    machine: HeldMachine,
-    axes: tuple[int, ...],
-    own: tuple[int, ...],
-    determinants: list[list[Any]],
-    adjugates: list[list[Any]],
-) -> Axes:
-    """The terms mapped from g to v."""
+    determinants: list[list[Any]], adjugates: list[list[Any]]
+) -> tuple[tuple[list[Any], ...], FloatArray, FloatArray, tuple[int, ...]]:
+    """The terms mapped from g to v: determinants, adjugates, bounds of their errors, heights."""
     turned = [map_bilinear(f) for f in determinants]
     heights = []
     for k in range(len(turned[0])):
         sizes = [binary(f[k]) for f in turned]
         heights.append(max((math.frexp(m)[1] + e for m, _, e in sizes if m), default=0))
-    n = 3 * len(axes) + len(own)
+    n = adjugates[0][0].nrows()
     found, slack = np.zeros((2, len(turned), len(heights), n, n))
     for s, N in enumerate(adjugates):
         flat = arb_mat([m.entries() for m in N] + [[arb(0)] * (n * n)])
@@ -192,7 +207,7 @@ def _stored(
         for k, height in enumerate(heights):
             values, radii = _doubles([[rows[k, i] for i in range(n * n)]], [height] * (n * n))
             found[s, k], slack[s, k] = values.reshape(n, n), radii.reshape(n, n)
-    return Axes(axes, own, machine, tuple(turned), found, slack, tuple(heights))
+    return tuple(turned), found, slack, tuple(heights)
 
 
 def _doubles(a: Sequence[list[Any]], heights: Sequence[int]) -> tuple[FloatArray, FloatArray]:

@@ -46,11 +46,22 @@ class Lead(NamedTuple):
 Table = Mapping[tuple[int, int], Ranged]
 
 
+class Bounds(NamedTuple):
+    """Entrywise bounds of matrices over a box."""
+
+    Z: FloatArray
+    beside: FloatArray  # of Z without the k_i
+    E: FloatArray
+    shares: FloatArray  # of B b^-1 - 1
+    b: FloatArray
+
+
 @dataclass(frozen=True, eq=False)
 class HeldMachine:
     """A machine anywhere in an interval of positions, in n axes.
 
     lead : b_i of each axis
+    stiff : the stiffness k_i of each axis for itself, as far as it is one monomial of sure sign for every y; else zero
     Z, E, shares : Z and E as above, B b^-1 - 1
     ratios, rest : of the forces at rest, v = v0 + (1 + K)^-1 x, K in `ratios` and x in `rest`, relative to the half
         width that was assumed of v
@@ -59,6 +70,7 @@ class HeldMachine:
     names: tuple[str, ...]
     nominal: FloatArray
     lead: tuple[Lead, ...]
+    stiff: tuple[Lead, ...]
     Z: Table
     E: Table
     shares: Table
@@ -67,8 +79,8 @@ class HeldMachine:
     travel: tuple[float, float]
     models: tuple[Mapping[tuple[int, int], Laurent], ...]  # Z, E, shares, ratios and rest as functions of y
 
-    def bounds(self, p: Sequence[Any]) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Entrywise bounds of Z, of E, of B b^-1 - 1 and of b over real balls p.
+    def bounds(self, p: Sequence[Any]) -> Bounds:
+        """Entrywise bounds over real balls p.
 
         Raises NotAnalytic when a bound is infinite, or when the forces at rest leave their assumed range.
         """
@@ -91,12 +103,14 @@ class HeldMachine:
             return found
 
         b = np.array([float((arb(c) * monomial(m)).abs_upper()) * (1 + 1e-9) for c, m in self.lead])
-        Z, E, shares, ratios, rest = (size(t) for t in (self.Z, self.E, self.shares, self.ratios, self.rest))
-        if not all(np.isfinite(M).all() for M in (Z, E, shares, ratios, rest, b)):
+        left = _without(self.Z, self.stiff)
+        tables = (self.Z, left, self.E, self.shares, self.ratios, self.rest)
+        Z, beside, E, shares, ratios, rest = (size(t) for t in tables)
+        if not all(np.isfinite(M).all() for M in (Z, beside, E, shares, ratios, rest, b)):
             raise NotAnalytic("a parameter that divides reaches zero")
         if self.rest and not (dominating_solution(ratios, rest[:, :1]) <= 1).all():
             raise NotAnalytic("forces at rest that are not what they were taken for")
-        return Z, E, shares, b
+        return Bounds(Z, beside, E, shares, b)
 
     def at(self, y: float) -> HeldMachine:
         """The machine at one position of the interval, enclosed as on the piece that holds it."""
@@ -104,7 +118,15 @@ class HeldMachine:
         k = min(max(math.floor((y - low) / (high - low) * INTERVALS), 0), INTERVALS - 1)
         pieces = range(max(k - 1, 0), k + 2)  # k may be off by one from rounding
         Z, E, shares, ratios, rest = _tables(self.models, pieces)
-        return replace(self, Z=Z, E=E, shares=shares, ratios=ratios, rest=rest)
+        return replace(
+            self,
+            stiff=_stiffness(Z, self.nominal, len(self.lead)),
+            Z=Z,
+            E=E,
+            shares=shares,
+            ratios=ratios,
+            rest=rest,
+        )
 
 
 def dominating_solution(M: FloatArray, right: FloatArray) -> FloatArray:
@@ -161,7 +183,8 @@ def held_machine(
         {at: run.laurent(x) for at, x in table.items()}
         for table in (lower(A, n), lower(E, n), shares, ratios, rest)
     )
-    return HeldMachine(names, nominal, lead, *_tables(models), travel, models)
+    tables = _tables(models)
+    return HeldMachine(names, nominal, lead, _stiffness(tables[0], nominal, n), *tables, travel, models)
 
 
 def _require_linear(outputs: Sequence[Any], v: Any, at_zero: Any) -> None:
@@ -223,6 +246,31 @@ def _relative_shares(
         over = _divide(run, x, leads[j])
         found[i, j] = run.sum(over, -1.0) if i == j else over
     return tuple(leads), found
+
+
+def _stiffness(Z: Table, nominal: FloatArray, n: int) -> tuple[Lead, ...]:
+    """The largest monomial of each diagonal entry, where its sign is sure; its coefficient is amid the interval."""
+    found = []
+    for i in range(n):
+        terms = Z[i, i].terms if (i, i) in Z else ()
+        surest = max(
+            terms,
+            key=lambda t: abs(t[1] + t[2]) * float(np.prod(np.abs(nominal) ** np.array(t[0]))),
+            default=((0,) * len(nominal), 0.0, 0.0),
+        )
+        m, low, high = surest
+        found.append(Lead((low + high) / 2 if low * high > 0 else 0.0, m))
+    return tuple(found)
+
+
+def _without(Z: Table, stiff: tuple[Lead, ...]) -> Table:
+    """Z without k_i on its diagonal."""
+    found = dict(Z)
+    for i, (c, m) in enumerate(stiff):
+        if c:
+            terms = tuple((n, *((a - c, b - c) if n == m else (a, b))) for n, a, b in Z[i, i].terms)
+            found[i, i] = Ranged(terms)
+    return found
 
 
 def _divide(run: Evaluation, x: Value, lead: Lead) -> Value:
