@@ -18,6 +18,7 @@ from malta.margins.multipliers import Blocks, Multiplier, multiplier
 from malta.margins.problem import OfLoop
 from malta.margins.response import Branch, excludes_zero, response
 from malta.margins.robust import law_of, problem_of
+from malta.margins.series import LEVELS, _gains
 from malta.margins.structured import Structured, rows_of
 from malta.margins.uncertain import Compensator, UncertainSystem, instability
 from malta.synthesis.riccati import care, dare
@@ -76,7 +77,7 @@ def stable_within(loop: Loop, box: Box, t: float, count: int = 2000) -> bool:
     return bool((instability(*loop, sides[:, 0] + u * (sides[:, 1] - sides[:, 0])) < 0).all())
 
 
-@pytest.mark.parametrize("T", [None, 0.1, 1.5])
+@pytest.mark.parametrize("T", [None, 0.1, 1.5, 2.1])
 def test_pencils_hold_the_loop_all_over_their_box(T: float | None) -> None:
     system, law = chain(2, T)
     s = asked((system, Compensator(law.A, law.B, law.C, law.D, sample_time=T, delay=2 if T else 0)))
@@ -93,7 +94,7 @@ def test_pencils_hold_the_loop_all_over_their_box(T: float | None) -> None:
             assert (np.abs(moved - narrow.middle) <= wide.rest + narrow.rest).all()
 
 
-@pytest.mark.parametrize("T", [None, 0.1, 1.5])
+@pytest.mark.parametrize("T", [None, 0.1, 1.5, 2.1])
 def test_pencils_are_singular_at_the_poles(T: float | None) -> None:
     system, law = chain(2, T)
     s = asked((system, law))
@@ -115,6 +116,30 @@ def _matrix(system: UncertainSystem, law: Compensator, p: Any) -> Any:
         held = linalg.expm(law.sample_time * np.block([[A, B], [np.zeros((1, n + 1))]]))
         A, B = held[:n, :n], held[:n, n:]
     return np.block([[A + B @ law.D @ C, B @ law.C], [law.B @ C, law.A]])
+
+
+def test_fractions_come_close_to_a_hold() -> None:
+    """Y / 2 coth(Y / 2) - 1 is the fraction of a level and a remainder, whose terms are no larger than the whole's."""
+    whole, y = np.array(_gains(0)), 1.7
+    for level in range(LEVELS + 1):
+        z, held = y / 2, 0.0
+        for k in range(level, 0, -1):
+            held = z * z / (2 * k + 1 + held)
+        left = np.array(_gains(level))
+        beyond = float(left @ y ** (2.0 * np.arange(1, len(left) + 1)))
+        assert held + beyond == pytest.approx(z / math.tanh(z) - 1, rel=1e-14)
+        assert (left[:level] == 0).all()
+        assert (left[level:] * whole[level:] > 0).all()
+        assert (np.abs(left) <= np.abs(whole)).all()
+
+
+def test_slower_samples_have_more_levels() -> None:
+    found = []
+    for T in (0.1, 0.5, 1.5, 1.8):
+        (rows,) = asked(chain(2, T)).rows
+        found.append(rows._level(np.ones(4)))
+    assert found == sorted(found)
+    assert (found[0], found[-1]) == (1, LEVELS)
 
 
 @pytest.mark.parametrize("T", [None, 0.1])
@@ -160,7 +185,16 @@ def test_multipliers_of_another_structure_are_not_taken() -> None:
     assert taken
 
 
-@pytest.mark.parametrize(("n", "T", "t"), [(3, None, 2.0), (3, 0.1, 1.5), (7, None, 0.5)])
+@pytest.mark.parametrize(
+    ("n", "T", "t"),
+    [
+        (3, None, 2.0),
+        (3, 0.1, 1.5),
+        (3, 1.5, 0.4),
+        (7, None, 0.5),
+        pytest.param(3, 0.5, 1.6, marks=pytest.mark.slow),
+    ],
+)
 def test_chains_are_stable_where_it_is_proven(n: int, T: float | None, t: float) -> None:
     """Six and fourteen parameters."""
     loop = chain(n, T)

@@ -25,15 +25,16 @@ from malta.margins.expansion import (
     table,
 )
 from malta.margins.groups import C, Group, UncertainLoop
-from malta.margins.series import hold_series, square_hold_series
+from malta.margins.series import LEVELS, hold_series, square_hold_series
 
 if TYPE_CHECKING:
     from malta.margins.expansion import Table
     from malta.model.plant import FloatArray
 
 TERMS = 20_000  # of all entries, beyond which they are not expanded
-LIFTED = 8  # states up to which the square of a hold has rows of its own
-LESS = 0.05  # largest ratio of bounds with and without these rows for which they are used
+LIFTED = 8  # states up to which the fraction of a hold has rows of its own
+WIDEST = 40  # rows of a pencil with these, beyond the first level
+LESS = 0.2  # largest ratio of bounds with and without these rows for which they are used
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,8 +110,14 @@ class Rows:
     def size(self) -> int:
         """The number of rows of the pencil."""
         law, m = self.loop.law, len(self.inputs)
-        driven = len(self.group.states) + (m if law.lag is not None else 0)
-        return driven * (2 if self.liftable else 1) + len(self.group.own) + m * law.delay + len(self.reads)
+        lifted = self.loop.sampled and len(self.group.states) <= LIFTED
+        return self.driven * (2 if lifted else 1) + len(self.group.own) + m * law.delay + len(self.reads)
+
+    @property
+    def driven(self) -> int:
+        """The number of states of the machine with its lags."""
+        law, n = self.loop.law, len(self.group.states)
+        return n + (len(self.inputs) if law.lag is not None else 0)
 
     @property
     def cost(self) -> int:
@@ -131,22 +138,27 @@ class Rows:
         plant = self._plant(dens, c, r)
         return None if plant is None else self._join(plant, below, c, r)
 
-    def _lifts(self, c: FloatArray) -> bool:
-        """Whether the square of a hold, Y^2 / 12 of c(Y), gets linear rows of its own, w = Y x.
+    def _level(self, c: FloatArray) -> int:
+        """The level up to which the fraction of c(Y) has rows of its own; with x_0 = x and z = Y / 2
 
-        It does when slopes of c(Y) alone have a much larger error over a tenth of the range of the parameters.
+            (2 k + 1) x_k + z x_k+1 = z x_k-1,    c(Y) x = z x_1 + what is beyond
+
+        It has those when slopes of c(Y) alone have a much larger error over a tenth of the range of the parameters.
         """
         T, r = self.loop.law.sample_time, 0.1 * np.abs(c)
-        if T is None or not self.liftable:
-            return False
+        if T is None or not self.loop.sampled or len(self.group.states) > LIFTED:
+            return 0
         A, dens = self.A.over(c, r), self.dens.over(c, r)
-        whole, beyond = square_hold_series(A, dens, T), square_hold_series(A, dens, T, beyond=True)
-        return whole is not None and beyond is not None and beyond.rest.sum() < LESS * whole.rest.sum()
-
-    @property
-    def liftable(self) -> bool:
-        """Whether the states are few enough for twice as many rows."""
-        return self.loop.sampled and len(self.group.states) <= LIFTED
+        whole = square_hold_series(A, dens, T)
+        if whole is None:
+            return 0
+        for level in range(1, LEVELS + 1):
+            if level > 1 and self.size + (level - 1) * self.driven > WIDEST:
+                break
+            beyond = square_hold_series(A, dens, T, level=level)
+            if beyond is not None and beyond.rest.sum() < LESS * whole.rest.sum():
+                return level
+        return 0
 
     def _plant(self, dens: Expansion, c: FloatArray, r: FloatArray) -> tuple[Expansion, ...] | None:
         """P_0 and P_1 of the rows of x and of the lags: the columns of these states, then of their inputs."""
@@ -164,11 +176,10 @@ class Rows:
             return A.times(-1), E, B.times(-1), B.times(0)
         if not loop.sampled:
             return E + A.times(-1), E + A, B.times(-1), B
-        lifted = self._lifts(c)
-        curved = square_hold_series(A, dens, T, beyond=lifted)
+        level = self._level(c)
+        curved = square_hold_series(A, dens, T, level=level)
         if curved is not None:
-            lift = (A.times(T / 6), dens) if lifted else ()
-            return A.times(-T), curved, B.times(-T), B.times(T), *lift
+            return A.times(-T), curved, B.times(-T), B.times(T), *[dens] * level
         found = hold_series(A, B, dens, T)
         if found is None:
             return None
@@ -181,11 +192,13 @@ class Rows:
         )
 
     def _join(self, plant: tuple[Expansion, ...], below: Expansion, c: FloatArray, r: FloatArray) -> Pencil:
-        """The whole pencil; its columns are x with lags, the compensator's states, stored inputs, y and perhaps Y x."""
+        """The whole pencil; its columns are x with lags, the compensator's states, stored inputs, y, and x_k of c."""
         law, own, late = self.loop.law, list(self.group.own), self.loop.law.delay
         n, k, m, y = len(plant[0].middle), len(own), len(self.inputs), len(self.reads)
-        edges = np.cumsum([0, n, k, m * late, y, n if len(plant) > 4 else 0]).tolist()
-        N, (x, w, _, z, square) = edges[-1], (slice(a, b) for a, b in pairwise(edges))
+        dens = plant[4:]
+        edges = np.cumsum([0, n, k, m * late, y, *[n] * len(dens)]).tolist()
+        places = [slice(a, b) for a, b in pairwise(edges)]
+        N, (x, w, _, z), levels = edges[-1], places[:4], places[4:]
         eye = np.eye(N)
         wanted = np.zeros((m, N))
         wanted[:, w], wanted[:, z] = law.C[np.ix_(self.inputs, own)], law.D[np.ix_(self.inputs, self.reads)]
@@ -211,10 +224,13 @@ class Rows:
         P0.add(z, slice(0, len(self.group.states)), self.C.over(c, r).times(-1))
         P0.add(z, slice(0, N), self.D.over(c, r).columns(wanted).times(-1))
         P0.add(z, z, below)
-        if len(plant) > 4:  # w = Y x: dens w - T A x, and v dens Y^2 / 6 x = v T A / 6 w
-            P1.add(x, square, plant[4])
-            P0.add(square, x, plant[0])
-            P0.add(square, square, plant[5])
+        if levels:  # v 2 dens c(Y) x is about v T A x_1
+            P1.add(x, levels[0], plant[0].times(-1))
+        for i, (divisor, last, here) in enumerate(zip(dens, [x, *levels], levels, strict=False), 1):
+            P0.add(here, last, plant[0].times(1 / 2))
+            P0.add(here, here, divisor.times(2 * i + 1))
+            if i < len(levels):
+                P0.add(here, levels[i], plant[0].times(-1 / 2))
         curved = self.loop.sampled and len(plant) == 4
         return Pencil(P0.total, P1.total, np.arange(N) < n + k + m * late, curved)
 
