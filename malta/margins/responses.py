@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import lru_cache
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -29,7 +30,20 @@ def responses(system: UncertainSystem, law: Compensator, p: FloatArray, w: Float
     G(s) = C (s E - A)^-1 B + D behind a lag w_c / (s + w_c); of a sampled loop the exact discrete system under a
     zero-order hold at z = e^(j w T), times z^-delay. Differences (z - 1) / T keep the digits of slow modes.
     """
-    A, B, C, *more = (np.array(M) for M in system.matrices(p))
+    A, B, C, D = _plant(system, law, np.asarray(p, dtype=float).tobytes())
+    s, turned, F = _law(law, np.asarray(w, dtype=float).tobytes())
+    m, q = len(law.D), len(C) - len(law.D)
+    G = (C @ np.linalg.solve(s[:, None, None] * np.eye(len(A)) - A, B) + D) * turned[:, None, None]
+    return Responses(G[:, :q, :m], G[:, :q, m:], G[:, q:, :m], F)
+
+
+Sides = tuple["FloatArray", "FloatArray", "FloatArray", "FloatArray"]
+
+
+@lru_cache(maxsize=4)  # an ascent moves p or w and returns; records compare by identity
+def _plant(system: UncertainSystem, law: Compensator, p: bytes) -> Sides:
+    """A, B, C and D from commands and from forces on the plant to sensors and forces; in differences when sampled."""
+    A, B, C, *more = (np.array(M) for M in system.matrices(np.frombuffer(p)))
     n, m = B.shape
     D = more[0] if more else np.zeros((len(C), m))
     if len(more) > 1:
@@ -37,7 +51,7 @@ def responses(system: UncertainSystem, law: Compensator, p: FloatArray, w: Float
         A, B = both[:, :n], both[:, n:]
     k, q = n if law.lag is None else n + m, len(C)
     into, out, through = np.zeros((k, 2 * m)), np.zeros((q + m, k)), np.zeros((q + m, 2 * m))
-    into[:n, m:], out[:q, :n], through[:q, m:] = B, C, D  # of forces on the plant, and then of commands
+    into[:n, m:], out[:q, :n], through[:q, m:] = B, C, D
     if law.lag is None:
         into[:n, :m], through[:q, :m], through[q:, :m] = B, D, np.eye(m)
     else:
@@ -45,22 +59,26 @@ def responses(system: UncertainSystem, law: Compensator, p: FloatArray, w: Float
         whole[:n, :n], whole[:n, n:], whole[n:, n:] = A, B, -law.lag * np.eye(m)
         into[n:, :m], out[:q, n:], out[q:, n:] = law.lag * np.eye(m), D, np.eye(m)
         A = whole
-    B, C, D = into, out, through
     T = law.sample_time
-    s: ComplexArray = 1j * np.asarray(w, dtype=float)
+    if T is None:
+        return A, into, out, through
+    if system.sample_time is not None:
+        return (A - np.eye(len(A))) / T, into / T, out, through
+    _, Phi = sample(A, np.eye(len(A)), T)  # (e^AT - 1) / T = A Phi / T
+    return A @ Phi / T, Phi @ into / T, out, through
+
+
+@lru_cache(maxsize=4)
+def _law(law: Compensator, w: bytes) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
+    """s, or (z - 1) / T when sampled; z^-delay; and F: at frequencies w."""
+    T = law.sample_time
+    s: ComplexArray = 1j * np.frombuffer(w)
     turned = np.ones_like(s)
     if T is not None:
         turned, s = np.exp(-s * T * law.delay), np.expm1(s * T) / T
-        if system.sample_time is None:
-            _, Phi = sample(A, np.eye(len(A)), T)  # (e^AT - 1) / T = A Phi / T
-            A, B = A @ Phi / T, Phi @ B / T
-        else:
-            A, B = (A - np.eye(len(A))) / T, B / T
     F_A, F_B = difference_form(law)
-    at = s[:, None, None]
-    G = (C @ np.linalg.solve(at * np.eye(len(A)) - A, B) + D) * turned[:, None, None]
-    F = law.C @ np.linalg.solve(at * np.eye(len(F_A)) - F_A, F_B) + law.D
-    return Responses(G[:, :q, :m], G[:, :q, m:], G[:, q:, :m], np.asarray(F, dtype=complex))
+    F = law.C @ np.linalg.solve(s[:, None, None] * np.eye(len(F_A)) - F_A, F_B) + law.D
+    return s, turned, np.asarray(F, dtype=complex)
 
 
 def find_peaks(sizes: Callable[[FloatArray], FloatArray], w: FloatArray) -> tuple[FloatArray, FloatArray]:

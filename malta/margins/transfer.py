@@ -34,8 +34,7 @@ def transfer(r: Responses, blocks: Sequence[Block]) -> ComplexArray:
     q, m = r.G_y.shape[1:]
     # solved for on either side: about integrators G and F are huge, and an inverse times them has lost all digits
     y = np.linalg.solve(np.eye(q) - r.G_y @ r.F, np.concatenate([r.G_y @ r.F, r.G_y, r.G_d], axis=2))
-    into_law = np.concatenate([np.broadcast_to(np.eye(q), (len(y), q, q)), r.G_y, r.G_d], axis=2)
-    u = np.linalg.solve(np.eye(m) - r.F @ r.G_y, r.F @ into_law)
+    u = _inputs(r) if any(_acts_at_inputs(b) for b in blocks) else y
     total = sum(len(b.rows) for b in blocks)
     into = np.zeros((q + 2 * m, total))
     passed = {0: np.zeros((q, total)), q: np.zeros((m, total))}  # additions to a signal by earlier blocks
@@ -47,7 +46,9 @@ def transfer(r: Responses, blocks: Sequence[Block]) -> ComplexArray:
         into[[first + i for i in rows], own] = np.eye(len(rows))
         if b.kind == "feedback":  # it reads its own addition
             passed[first][rows, own] += np.eye(len(rows))
-        signal = {"additive": r.H @ u, "effort": u, "compliance": y}.get(b.kind, u if first else y)
+        signal = u if _acts_at_inputs(b) else y
+        if b.kind == "additive":
+            signal = r.H @ signal
         beside = passed[first][columns].copy() if b.kind in _LOOPS else 0.0
         found.append((signal[:, columns], beside))
         if b.kind in ("multiplicative", "additive"):
@@ -56,6 +57,18 @@ def transfer(r: Responses, blocks: Sequence[Block]) -> ComplexArray:
 
 
 _LOOPS = ("multiplicative", "feedback")
+
+
+def _acts_at_inputs(b: Block) -> bool:
+    """Whether a block reads u, and not y."""
+    return b.kind in ("additive", "effort") or (b.kind in _LOOPS and b.at == "forces")
+
+
+def _inputs(r: Responses) -> ComplexArray:
+    """u from additions to y, to u and from the disturbances: (1 - F G)^-1 F (1, G_y, G_d)."""
+    q, m = r.G_y.shape[1:]
+    law_reads = np.concatenate([np.broadcast_to(np.eye(q), (len(r.F), q, q)), r.G_y, r.G_d], axis=2)
+    return np.asarray(np.linalg.solve(np.eye(m) - r.F @ r.G_y, r.F @ law_reads))
 
 
 def mu_bound(M: ComplexArray, blocks: Sequence[Block]) -> tuple[FloatArray, ComplexArray]:

@@ -196,7 +196,11 @@ def closed_loop(system: UncertainSystem, c: Compensator, p: FloatArray) -> Float
     matrices = []
     for plant in zip(*system.at(p), strict=True):
         s = _sides(c, *plant)
-        matrices.append(np.block([[s.A + s.B @ c.D @ s.C, s.B @ c.C], [s.F_B @ s.C, s.F_A]]))
+        n, whole = len(s.A), np.empty((len(s.A) + len(s.F_A),) * 2)
+        whole[:n, :n], whole[:n, n:], whole[n:, :n], whole[n:, n:] = (
+            s.A + s.B @ c.D @ s.C, s.B @ c.C, s.F_B @ s.C, s.F_A,
+        )  # fmt: skip
+        matrices.append(whole)
     return np.array(matrices)
 
 
