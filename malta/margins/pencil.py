@@ -9,6 +9,7 @@ multiplied by their denominators, so that masses, springs and dampers enter line
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
@@ -34,7 +35,11 @@ if TYPE_CHECKING:
 TERMS = 20_000  # of all entries, beyond which they are not expanded
 LIFTED = 8  # states up to which the fraction of a hold has rows of its own
 WIDEST = 40  # rows of a pencil with these, beyond the first level
-LESS = 0.2  # largest ratio of bounds with and without these rows for which they are used
+LESS = (
+    0.2,
+    0.05,
+)  # largest ratio of bounds with and without these rows: where they cost little, and one level else
+MORE = 2  # times the coordinates of multipliers without these rows, that cost little
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,7 +148,8 @@ class Rows:
 
             (2 k + 1) x_k + z x_k+1 = z x_k-1,    c(Y) x = z x_1 + what is beyond
 
-        It has those when slopes of c(Y) alone have a much larger error over a tenth of the range of the parameters.
+        It has those when slopes of c(Y) alone have a much larger error over a tenth of the range of the parameters, and
+        when the channels of the parameters, of which each level has its own, stay few.
         """
         T, r = self.loop.law.sample_time, 0.1 * np.abs(c)
         if T is None or not self.loop.sampled or len(self.group.states) > LIFTED:
@@ -152,11 +158,17 @@ class Rows:
         whole = square_hold_series(A, dens, T)
         if whole is None:
             return 0
+        with_rows, without = (
+            sum(_rank(a, b) ** 2 for a, b in zip(A.slopes, other.slopes, strict=True))
+            for other in (dens, whole)
+        )
         for level in range(1, LEVELS + 1):
             if level > 1 and self.size + (level - 1) * self.driven > WIDEST:
                 break
             beyond = square_hold_series(A, dens, T, level=level)
-            if beyond is not None and beyond.rest.sum() < LESS * whole.rest.sum():
+            share = math.inf if beyond is None else beyond.rest.sum() / whole.rest.sum()
+            cheap = (level + 1) ** 2 * with_rows <= MORE * without
+            if (cheap and share < LESS[0]) or (level == 1 and share < LESS[1]):
                 return level
         return 0
 
@@ -233,6 +245,11 @@ class Rows:
                 P0.add(here, levels[i], plant[0].times(-1 / 2))
         curved = self.loop.sampled and len(plant) == 4
         return Pencil(P0.total, P1.total, np.arange(N) < n + k + m * late, curved)
+
+
+def _rank(a: FloatArray, b: FloatArray) -> int:
+    """The rank of [a b] or of a over b, the lower one."""
+    return int(min(np.linalg.matrix_rank(np.hstack([a, b])), np.linalg.matrix_rank(np.vstack([a, b]))))
 
 
 class _Sum:

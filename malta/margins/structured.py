@@ -39,7 +39,6 @@ LOWEST = 1e-5  # end of the one from zero, relative to the octave that it was cu
 REMEMBERED = 64  # pencils
 LARGEST = 40  # rows of a group's pencil, beyond which families of its smaller groups are cheaper
 ROUGH = 0.1  # how close the first beta is to the smallest, relative
-EASY = 0.5  # first beta below which a smaller one tells nothing
 SMALLEST = 1e-6  # of the target: boxes below that are not tried
 FIRST_STEP, LAST_STEP = 1.2, 1.003  # from one box to the next
 NOT_FAR = 1.3  # times what stands: boxes up to that are tried at once
@@ -226,7 +225,7 @@ class Structured:
                         # slopes alone: higher terms are slow, and matter in large boxes only
                         blocks = Blocks(own.channels[0].blocks.real)
                         N = r.terms[0][: blocks.size, : blocks.size]
-                        near, beta = multiplier(N, blocks, near, EASY, ROUGH)
+                        near, beta = multiplier(N, blocks, near, 0.0, ROUGH)
                     except (np.linalg.LinAlgError, ValueError):
                         near = None
                 found.append((beta, replace(part, near=near)))
