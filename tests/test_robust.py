@@ -431,6 +431,7 @@ def test_asymmetric_ranges_and_intervals_that_stay() -> None:
     assert unstable.witness is not None
     assert unstable.witness["k"] == -2.5
     assert unstable.reason == "the nominal loop is unstable"
+    assert str(unstable) == "nothing proven (the nominal loop is unstable), lost at 0.00 %"
     m = robust_margin(s, c, {"m": 0.2}, {"k": (-1.0, 30.0)})
     assert m.upper == pytest.approx(5, rel=1e-5)  # m = 0
 

@@ -123,7 +123,7 @@ class Margin:
         return math.isinf(self.upper)
 
     def __str__(self) -> str:
-        low = f"proven {100 * self.lower:.2f} %" if self.lower is not None else unproven(self.reason)
+        low = f"proven {100 * self.lower:.2f} %" if self.lower else unproven(self.reason)
         if self.exhausted:
             return f"{low}; no unstable machine found {self.searched}".rstrip()
         where = "" if self.frequency is None else f" at {self.frequency:.4g} rad/s"
