@@ -24,6 +24,9 @@ if TYPE_CHECKING:
     from malta.model.plant import FloatArray
 
 
+ROUNDING = 1e-14  # of a slope, beside the others of its row and column
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class LinearModel:
     """The linear model of a machine about an operating point: xi' = A xi + B v + E (y_k - C xi), p = C xi.
@@ -134,12 +137,19 @@ def linearize(plant: Plant, point: OperatingPoint, believed: Plant | None = None
     derivatives = ca.Function("derivatives", [x, u, v], list(jacobians(plant, believed, x, u, v, w)))
     A, B, C, E, _, ratio = (np.array(value) for value in derivatives(point.x, point.u, point.v))
     keep = list(plant.controlled)
-    A, B, C, E = A[np.ix_(keep, keep)], B[keep], C[:, keep], E[keep]
+    A, B, C, E = A[np.ix_(keep, keep)], _without_rounding(B[keep]), C[:, keep], E[keep]
     if not np.isfinite(ratio).all():
         raise CheckError(_without_slope(plant, point))
     if not all(np.isfinite(M).all() for M in (A, B, C, E)):
         raise CheckError(f"{plant.name}: the linear model is not finite at x = {point.x.tolist()}")
     return LinearModel(plant, point, A, B, C, E)
+
+
+def _without_rounding(B: FloatArray) -> FloatArray:
+    """B with zeros where forces(currents(v)) left what rounding makes, beside the largest of the row and the column."""
+    size = np.abs(B)
+    scale = np.sqrt(size.max(axis=1, keepdims=True, initial=0) * size.max(axis=0, keepdims=True, initial=0))
+    return np.where(size > ROUNDING * scale, B, 0.0)
 
 
 def _without_slope(plant: Plant, point: OperatingPoint) -> str:
