@@ -12,7 +12,7 @@ import numpy as np
 
 from malta.firmware.ctext import c_name, c_number, function_text, signature
 from malta.firmware.elementary import Precision
-from malta.firmware.program import Program
+from malta.firmware.program import TYPES, Program
 from malta.firmware.signals import (
     Field,
     Target,
@@ -29,6 +29,7 @@ FUSED = ("sense", "decide", "state_at")  # functions that a step consists of; th
 LONGEST_RISE = 1000.0  # s, of a stroke
 RISES = 6.0  # times its rise that a stroke lasts: a logistic one is then within 2e-6 of its ends
 MOST_SAMPLES = 1e9  # of a stroke: twice their number is an int32_t
+DIVISOR, DIVIDENDS = 7.0, (9.0, 13.0, 18.0)  # of quotients that a reciprocal rounds otherwise
 WORDS = {
     "double": "Double precision: the numbers of the simulation.",
     "float": "Single precision: sums keep what rounding takes from them.",
@@ -95,6 +96,7 @@ def context_of(t: Target, programs: Mapping[str, Program], name: str, sha256: st
         **_limit_context(t),
         **_table_context(t),
         **root_context(t.precision),
+        "arithmetic": arithmetic_context(t.precision),
     }
 
 
@@ -179,6 +181,30 @@ def root_context(precision: Precision) -> dict[str, Any]:
         "builtin_root": "__builtin_sqrt" if double else "__builtin_sqrtf",
         "digits": 52 if double else 23,
         **{key: c_number(v, precision) for key, v in _NUMBERS.items()},
+    }
+
+
+def arithmetic_context(precision: Precision) -> dict[str, Any]:
+    """What arithmetic.c is filled with: numbers for operations whose results are known to the last bit.
+
+    2^p + 1 is 2^p, and (1 + 2^-h)^2 is 1 + 2^(1-h) with 2 h > p; the quotients differ from products
+    with the rounded reciprocal in both precisions.
+    """
+    real = TYPES[precision]
+    limits = np.finfo(real)
+    p = int(limits.nmant) + 1
+    odd = 2.0 ** -(p // 2 + 1)
+    quotients = [float(real(value) / real(DIVISOR)) for value in DIVIDENDS]
+    given = (0, 1, 2.0**p, 1 + odd, 1 + 2 * odd, DIVISOR, limits.tiny, limits.max, limits.eps / 4, *DIVIDENDS)
+    divided = [value for value in quotients for _ in range(2)]
+    expected = (0, 0, *divided, 1, 1 + limits.eps, limits.tiny, 1, 0)
+    return {
+        "given": [c_number(float(value), precision) for value in given],
+        "expected": [c_number(float(value), precision) for value in expected],
+        "dividends": len(DIVIDENDS),
+        "rest": 2 + len(divided),
+        "divisor": c_number(DIVISOR, precision),
+        **{key: c_number(_NUMBERS[key], precision) for key in ("zero", "half", "two")},
     }
 
 

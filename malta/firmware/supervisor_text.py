@@ -12,7 +12,7 @@ import casadi as ca
 import numpy as np
 
 from malta.firmware.ctext import c_number, function_text
-from malta.firmware.export import comment, render
+from malta.firmware.export import arithmetic_context, comment, render
 from malta.firmware.lowering import lower
 from malta.firmware.program import Program, program_of
 from malta.firmware.sensor_loss import expected_readings, gains_without, prediction_correction
@@ -97,6 +97,9 @@ def supervisor_members(t: Target) -> list[Member]:
         Member("int32_t", "reaction", 0, "its reaction"),
         Member("int32_t", "acted", rows, "how often each row of the table acted"),
         Member("int32_t", "unbelieved", p, "samples for which a sensor has been ignored"),
+        Member(
+            "int32_t", "fit", 0, "1: the compiled arithmetic is that of the text; 0: the machine stays off"
+        ),
         Member("int32_t", "started", 0, "the request to start of the sample before"),
         Member("int32_t", "acknowledged", 0, "the same of the one to acknowledge"),
         Member("int32_t", "overruns", 0, "samples with missed steps before them, since the beginning"),
@@ -189,6 +192,7 @@ def _context(t: Target, name: str) -> dict[str, Any]:
         "except_stroke": f" && (k != {plant.stroke_output})" if plant.has_stroke else "",
         "only_stroke": plant.has_stroke and len(c.measurements) == 1,
         "longest": LONG,
+        "arithmetic": arithmetic_context(t.precision),
         "most_missed": MOST_MISSED,
         **_bounds(t),
         **_filters(t, name),

@@ -1,16 +1,10 @@
 /* {{ title }}: see {{ name }}.h. Written by malta {{ version }}; one operation a statement. */
 #include "{{ name }}.h"
 
-#include <float.h>
 #include <stdbool.h>
-
-#if defined(__FAST_MATH__)
-#error "compile {{ name }}.c without fast mathematics"
-#endif
-#if defined(FLT_EVAL_METHOD) && FLT_EVAL_METHOD != 0
-#error "{{ name }}.c needs a processor that computes in the precision of its numbers"
-#endif
 {% include "exact.c" %}
+
+{% include "arithmetic.c" %}
 
 {# The place of force j in row k of a table of v0(z). #}
 {% macro entry(k) %}{{ k if forces == 1 else "(%s * %d)"|format(k, forces) }} + j{% endmacro %}
@@ -49,6 +43,10 @@ static void look_up(const {{ name }}_state *s, {{ name }}_real z, {{ name }}_rea
       v0[j] = before + after;
     }
   }
+}
+
+int32_t {{ name }}_self_test(void) {
+  return ({{ name }}_is_exact() == 1) ? {{ name }}_parts_self_test() : 0;
 }
 
 void {{ name }}_init({{ name }}_state *s) {

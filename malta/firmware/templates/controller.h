@@ -6,7 +6,9 @@
    C99 without heap, globals, recursion or library functions. A state belongs to its caller; several may run at once, and a
    step neither blocks nor loops but over a table's rows. Integers have 32 bits; truths inside are bool, which C99 has also
    where no type has 8 bits. Compile without contraction and fast mathematics
-   (-ffp-contract=off, no -ffast-math): then every processor computes the same bits. Units are SI, an angle is in rad.
+   (-ffp-contract=off, no -ffast-math): then every processor computes the same bits. What macros show of another
+   arithmetic is refused when it is compiled, what they do not show {{ name }}_self_test() finds. Units are SI, an angle is
+   in rad.
 
    At every sample:  read the sensors,  {{ name }}_step(&state, &inputs, &outputs),  write outputs.{{ last_output }}.     */
 #ifndef {{ NAME }}_H
@@ -38,6 +40,12 @@ typedef struct {
 {% endfor %}
 } {{ name }}_{{ record.name }};
 {% endfor %}
+
+/* 1 where the compiled arithmetic is that of the text, which no macro shows; 0: compile it again, without
+   -funsafe-math-optimizations and what it consists of, to the nearest, with small numbers. To be called once, at the
+   start: the supervisor does so. The second is of {{ name }}_parts.c, and part of the first. */
+int32_t {{ name }}_self_test(void);
+int32_t {{ name }}_parts_self_test(void);
 
 /* A state at rest at a reference of zero that knows nothing of the machine, with the v0(z) of the gain file. */
 void {{ name }}_init({{ name }}_state *s);

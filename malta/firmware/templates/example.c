@@ -1,6 +1,7 @@
 /* {{ title }}: a main program with a loop on a timer. Put your hardware's functions in place of the first five; as they
    are here, they run on a PC. Written by malta {{ version }}. */
 #include "{{ name }}.h"
+{% include "exact.c" %}
 
 /* Wait for the timer of {{ period }}; 0 ends the program. */
 static int32_t wait_for_timer(void) {

@@ -2,7 +2,6 @@
 #include "{{ name }}.h"
 
 #include <stdbool.h>
-
 {% include "exact.c" %}
 
 static const {{ name }}_real own_z[{{ points }}] = {

@@ -2,6 +2,7 @@
 #include "unit.h"
 
 #include <string.h>
+{% include "exact.c" %}
 
 /* Each variable: t time, i input, p parameter, o output or local. */
 static const char roles[] = {% for line in roles %}
@@ -127,6 +128,11 @@ int unit_begin(unit_data *u, double time, const char **message) {
   if (is_finite(time) == 0) {
     return refuse(message, "a start time that is no number");
   }
+{% if controller %}
+  if ({{ name }}_self_test() == 0) {
+    return refuse(message, "compiled with another arithmetic than that of its text");
+  }
+{% endif %}
   u->value[0] = time;
   u->phase = UNIT_INITIAL;
   u->changed = 1;

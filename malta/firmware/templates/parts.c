@@ -2,11 +2,14 @@
 #include "{{ name }}.h"
 
 #include <stdbool.h>
-
 {% include "exact.c" %}
+
+{% include "arithmetic.c" %}
 {% if parts_root %}
 {% include "root.c" %}
 {% endif %}
+
+int32_t {{ name }}_parts_self_test(void) { return {{ name }}_is_exact(); }
 
 {{ functions }}
 {% if reads %}

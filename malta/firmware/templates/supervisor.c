@@ -2,10 +2,9 @@
 #include "{{ name }}_supervisor.h"
 
 #include <stdbool.h>
+{% include "exact.c" %}
 
-#if defined(__clang__)
-#pragma STDC FP_CONTRACT OFF
-#endif
+{% include "arithmetic.c" %}
 
 #define OUTPUTS {{ outputs }}
 {% if fallback %}
@@ -85,6 +84,7 @@ void {{ name }}_supervisor_init({{ name }}_supervisor *sup) {
   sup->monitor = -1;
   sup->reaction = {{ NAME }}_REACTION_NONE;
   sup->enable = 0;
+  sup->fit = ({{ name }}_is_exact() == 1) ? {{ name }}_self_test() : 0;
   sup->started = 1; /* a request that is held while power comes on starts nothing */
   sup->acknowledged = 1;
   sup->overruns = 0;
@@ -130,8 +130,10 @@ void {{ name }}_supervisor_init({{ name }}_supervisor *sup) {
 void {{ name }}_supervisor_take_over({{ name }}_supervisor *sup, const {{ name }}_real rest[OUTPUTS]) {
   int32_t k;
   {{ name }}_supervisor_init(sup);
-  sup->state = {{ NAME }}_OPERATE;
-  sup->enable = 1;
+  if (sup->fit == 1) {
+    sup->state = {{ NAME }}_OPERATE;
+    sup->enable = 1;
+  }
   for (k = 0; k < OUTPUTS; k++) {
     sup->rest[k] = rest[k];
   }
@@ -528,6 +530,12 @@ static bool is_done(const {{ name }}_supervisor *sup, const {{ name }}_request *
   return done;
 }
 
+/* Whether a machine that is off may start: when it is asked to, not while it is, with the arithmetic of this text. */
+static bool is_startable(const {{ name }}_supervisor *sup, const {{ name }}_request *request) {
+  const bool asked = (request->start != 0) && (sup->started == 0);
+  return asked && (sup->state == {{ NAME }}_OFF) && (sup->fit == 1);
+}
+
 /* Whether nothing forbids torque. */
 static bool is_free(const {{ name }}_request *request) { return (request->stop == 0) && (request->sto == 0); }
 
@@ -542,7 +550,7 @@ static int32_t event_of(const {{ name }}_supervisor *sup, const {{ name }}_reque
     event = EVENT_HOLD;
   } else if (is_done(sup, request)) {
     event = EVENT_DONE;
-  } else if ((request->start != 0) && (sup->started == 0) && (sup->state == {{ NAME }}_OFF) && is_free(request)) {
+  } else if (is_startable(sup, request) && is_free(request)) {
     event = EVENT_START;
   } else if ((request->acknowledge != 0) && (sup->acknowledged == 0) && is_free(request)) {
     event = EVENT_ACKNOWLEDGE;

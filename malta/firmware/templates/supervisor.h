@@ -17,6 +17,9 @@
    believed again when it is near what the filter expects. hold: the reference stops. land: down to the place where the
    machine rested. fault: bridges at zero voltage until acknowledged.
 
+   {{ name }}_supervisor_init tries the arithmetic of the compiled text, {{ name }}_self_test(). Where that is
+   not what is written (`fit` is 0), the machine stays off.
+
    At every sample, in place of {{ name }}_step:
      {{ name }}_supervisor_step(&supervisor, &state, &inputs, &request, &outputs).                                      */
 #ifndef {{ NAME }}_SUPERVISOR_H
@@ -68,7 +71,8 @@ typedef struct {
 /* A supervisor of a machine that is off, with the times of its design; they may be changed before the start. */
 void {{ name }}_supervisor_init({{ name }}_supervisor *sup);
 
-/* For a machine that flies already, at the reference of its controller: operation. rest: where it would rest. */
+/* For a machine that flies already, at the reference of its controller: operation. rest: where it would rest.
+   Without a fit arithmetic it is off. */
 void {{ name }}_supervisor_take_over({{ name }}_supervisor *sup, const {{ name }}_real rest[{{ outputs }}]);
 
 /* One sample. Any numbers may be in `in` and in the request's reference, also NaN and infinity. */

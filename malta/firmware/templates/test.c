@@ -5,6 +5,7 @@
 #include <math.h> /* of NAN and INFINITY alone */
 #include <stdio.h>
 #include <string.h>
+{% include "exact.c" %}
 
 #define VECTORS {{ vectors|length }}
 #define SAMPLES {{ samples }}
