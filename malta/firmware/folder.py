@@ -10,7 +10,7 @@ import numpy as np
 
 from malta.firmware.ctext import c_name, c_number
 from malta.firmware.elementary import Precision
-from malta.firmware.export import context_of, render, sources
+from malta.firmware.export import RISES, context_of, render, sources
 from malta.firmware.report import report_text
 from malta.firmware.signals import (
     Field,
@@ -21,11 +21,12 @@ from malta.firmware.signals import (
     reference_fields,
     state_fields,
 )
+from malta.firmware.stand_in import example_stroke, stand_in_context
 from malta.firmware.step import programs_of
 from malta.firmware.supervisor_text import monitor_lines, supervisor_sources
 from malta.firmware.vectors import FNV_FACTOR, FNV_START, SAMPLES, Vector, record_vectors
 
-EXAMPLE_SAMPLES = 2000  # of the example's main program
+EXAMPLE_SAMPLES = 10_000  # of the example's main program, beside its stroke
 
 
 def folder_files(
@@ -46,9 +47,8 @@ def folder_files(
         "c_files": " ".join(c_files),
         "driven": t.driven,
         "currents": len(current_readings(t)) if t.driven else 0,
-        "example_samples": EXAMPLE_SAMPLES,
-        "example_end": c_number(t.believed.travel / 10, t.precision),
-        "example_rise": c_number(0.02, t.precision),
+        **stand_in_context(t, name),
+        **_example_context(t),
     }
     files |= {
         f"{name}_test.c": render("test.c", context | _test_context(t)),
@@ -59,6 +59,18 @@ def folder_files(
     context["monitors"] = monitor_lines(t)
     report = report_text(t, context, list(files), dict(uncertainty or {}), proof=proof)
     return files | {"REPORT.md": report}
+
+
+def _example_context(t: Target) -> dict[str, Any]:
+    """How long the example runs, and its stroke."""
+    if not (t.believed.has_stroke and t.believed.travel > 0):
+        return {"example_samples": EXAMPLE_SAMPLES}
+    end, rise = example_stroke(t)
+    return {
+        "example_samples": EXAMPLE_SAMPLES + math.ceil(RISES * rise / t.controller.sample_time),
+        "example_end": c_number(end, t.precision),
+        "example_rise": c_number(rise, t.precision),
+    }
 
 
 def _test_context(t: Target) -> dict[str, Any]:

@@ -38,7 +38,7 @@ static int32_t {{ name }}_is_exact(void) {
   found[{{ arithmetic.rest + 1 }}] = unit + thrice;
   found[{{ arithmetic.rest + 2 }}] = smaller * {{ arithmetic.two }};
   found[{{ arithmetic.rest + 3 }}] = (inverse > {{ arithmetic.zero }}) ? unit : zero;
-  found[{{ arithmetic.rest + 4 }}] = ((none < unit) || (none >= unit)) ? unit : zero;
+  found[{{ arithmetic.rest + 4 }}] = (none <= greatest) ? unit : zero;
   for (k = 0; k < {{ arithmetic.expected | length }}; k++) {
     const {{ name }}_real now = found[k];
     if (!(now == expected[k])) {

@@ -1,35 +1,35 @@
-/* {{ title }}: a main program with a loop on a timer. Put your hardware's functions in place of the first five; as they
-   are here, they run on a PC. Written by malta {{ version }}. */
+/* {{ title }}: a main program with a loop on a timer, controller and supervisor. Put your hardware's functions in place of
+   the first six; as they are here, they run on a PC. Written by malta {{ version }}. */
 #include "{{ name }}.h"
+#include "{{ name }}_supervisor.h"
+
+#include <stdbool.h>
 {% include "exact.c" %}
 
-/* Wait for the timer of {{ period }}; 0 ends the program. */
-static int32_t wait_for_timer(void) {
+{% include "stand_in.c" %}
+
+/* Wait for the timer of {{ period }}; 0 ends the program. missed: periods of the timer that went by since the last one. */
+static int32_t wait_for_timer(int32_t *missed) {
   static int32_t samples_left = {{ example_samples }};
   samples_left--;
+  *missed = 0;
   return (samples_left >= 0) ? 1 : 0;
 }
 
-/* Raw readings of the position sensors, and 1 where a sensor calls its reading valid. */
-static void read_positions({{ name }}_real raw[{{ outputs }}], {{ name }}_real valid[{{ outputs }}]) {
+/* Raw readings of the position sensors, and 1 where a sensor calls its reading valid{{ "; phase currents, A, and the link, V" if driven }}. */
+static void read_sensors(stand_in *m, const {{ name }}_supervisor *sup, const {{ name }}_state *s,
+                         const {{ name }}_outputs *last, {{ name }}_real raw[{{ outputs }}], {{ name }}_inputs *in) {
   int32_t k;
-  for (k = 0; k < {{ outputs }}; k++) {
-    raw[k] = {{ zero }};
-    valid[k] = {{ one }};
-  }
-}
 {% if driven %}
-
-/* Phase currents, A, and the voltage of the DC link, V. */
-static void read_currents({{ name }}_inputs *in) {
-  int32_t k;
-  for (k = 0; k < {{ currents }}; k++) {
-    in->i[k] = {{ zero }};
-    in->i_valid[k] = {{ one }};
-  }
-  in->link[0] = {{ link }};
-}
+  read_stand_in(m, sup->enable, s, last, in);
+{% else %}
+  (void)last;
+  read_stand_in(m, sup->enable, s, in);
 {% endif %}
+  for (k = 0; k < {{ outputs }}; k++) {
+    raw[k] = in->y[k];
+  }
+}
 
 /* What the sensors' data sheets and calibration say: y = gain raw + offset, m. */
 static void read_calibration({{ name }}_real gain[{{ outputs }}], {{ name }}_real offset[{{ outputs }}]) {
@@ -40,37 +40,69 @@ static void read_calibration({{ name }}_real gain[{{ outputs }}], {{ name }}_rea
   }
 }
 
-/* {{ last_output }}. */
-static void write_outputs(const {{ name }}_outputs *out) { (void)out; }
+/* Buttons. Start and acknowledge count when they are pressed, not while they are: this one is pressed at the tenth sample. */
+static void read_buttons({{ name }}_request *request) {
+  static int32_t sample = 0;
+  sample = (sample < 20) ? (sample + 1) : sample;
+  request->start = ((sample >= 10) && (sample < 20)) ? 1 : 0;
+  request->acknowledge = 0; /* 1: go on after a fault */
+  request->stop = 0;        /* 1: emergency stop */
+}
+
+/* 1 while the drive's safe torque off is active. */
+static int32_t read_sto(void) { return 0; }
+
+/* {{ last_output }}; enable: gates of the bridges on, or all switches open. */
+static void write_outputs(const {{ name }}_outputs *out, int32_t enable) {
+  (void)out;
+  (void)enable;
+}
+
+/* What a machine in operation shall do next: 1 while it moves. */
+{% if stroke %}
+static int32_t follow({{ name }}_stroke *stroke, {{ name }}_request *request) {
+  return {{ name }}_follow_stroke(stroke, &request->reference);
+}
+{% else %}
+static int32_t follow(int32_t *samples_left) {
+  *samples_left = *samples_left - 1;
+  return (*samples_left > 0) ? 1 : 0;
+}
+{% endif %}
 
 int main(void) {
-  {{ name }}_state state;
-  {{ name }}_inputs in;
-  {{ name }}_outputs out;
+  static {{ name }}_supervisor supervisor;
+  static {{ name }}_state state;
+  static {{ name }}_request request; /* zeros: nothing is asked for */
+  static {{ name }}_inputs in;
+  static {{ name }}_outputs out;
+  static stand_in machine;
   {{ name }}_real raw[{{ outputs }}];
   {{ name }}_real gain[{{ outputs }}];
   {{ name }}_real offset[{{ outputs }}];
 {% if stroke %}
   {{ name }}_stroke stroke;
-  {{ name }}_reference reference;
+  int32_t ready = {{ name }}_start_stroke(&stroke, {{ NAME }}_QUINTIC, {{ zero }}, {{ example_end }}, {{ example_rise }});
+{% else %}
+  int32_t hover = 100; /* samples */
+  int32_t ready = 1;
 {% endif %}
   {{ name }}_init(&state);
+  {{ name }}_supervisor_init(&supervisor);
   read_calibration(gain, offset);
-{% if stroke %}
-  (void){{ name }}_start_stroke(&stroke, {{ NAME }}_QUINTIC, {{ zero }}, {{ example_end }}, {{ example_rise }});
-{% endif %}
-  while (wait_for_timer() == 1) {
-    read_positions(raw, in.y_valid);
+  ready = ((ready == 1) && ({{ name }}_self_test() == 1)) ? 1 : 0; /* else: a stroke out of reach, or a compiler's arithmetic */
+  while ((ready == 1) && (wait_for_timer(&request.missed) == 1)) {
+    read_buttons(&request);
+    request.sto = read_sto();
+    request.operate = 1; /* as soon as it has settled */
+    if ((supervisor.state == {{ NAME }}_OPERATE) && (request.land == 0)) {
+      request.land = (follow({{ "&stroke, &request" if stroke else "&hover" }}) == 1) ? 0 : 1;
+    }
+    read_sensors(&machine, &supervisor, &state, &out, raw, &in);
     {{ name }}_calibrate(raw, gain, offset, in.y);
-{% if driven %}
-    read_currents(&in);
-{% endif %}
-{% if stroke %}
-    (void){{ name }}_follow_stroke(&stroke, &reference);
-    (void){{ name }}_set_reference(&state, &reference);
-{% endif %}
-    {{ name }}_step(&state, &in, &out);
-    write_outputs(&out);
+    {{ name }}_supervisor_step(&supervisor, &state, &in, &request, &out);
+    write_outputs(&out, supervisor.enable);
   }
-  return 0;
+  /* 0 where it moved and landed, and no monitor acted */
+  return ((request.land == 1) && (supervisor.state == {{ NAME }}_OFF) && (supervisor.monitor == -1)) ? 0 : 1;
 }

@@ -242,7 +242,8 @@ static void look_at_sensors({{ name }}_supervisor *sup, {{ name }}_real level[{{
 static int32_t is_reference(const {{ name }}_supervisor *sup, const {{ name }}_request *request) {
   static const {{ name }}_real most[OUTPUTS] = { {{ limits.position }} };
   const {{ name }}_reference *r = &request->reference;
-  const {{ name }}_real h = ({{ name }}_real)(missed_of(request) + 1) * {{ NAME }}_SAMPLE_TIME;
+  const int32_t steps = missed_of(request) + 1;
+  const {{ name }}_real h = ({{ name }}_real)steps * {{ NAME }}_SAMPLE_TIME;
   int32_t accepted = 1;
   int32_t k;
   for (k = 0; k < OUTPUTS; k++) {
