@@ -43,8 +43,13 @@ static void read_calibration({{ name }}_real gain[{{ outputs }}], {{ name }}_rea
 /* Buttons. Start and acknowledge count when they are pressed, not while they are: this one is pressed at the tenth sample. */
 static void read_buttons({{ name }}_request *request) {
   static int32_t sample = 0;
-  sample = (sample < 20) ? (sample + 1) : sample;
-  request->start = ((sample >= 10) && (sample < 20)) ? 1 : 0;
+  if (sample < 20) {
+    sample++;
+  }
+  request->start = 0;
+  if ((sample >= 10) && (sample < 20)) {
+    request->start = 1;
+  }
   request->acknowledge = 0; /* 1: go on after a fault */
   request->stop = 0;        /* 1: emergency stop */
 }
@@ -90,13 +95,15 @@ int main(void) {
   {{ name }}_init(&state);
   {{ name }}_supervisor_init(&supervisor);
   read_calibration(gain, offset);
-  ready = ((ready == 1) && ({{ name }}_self_test() == 1)) ? 1 : 0; /* else: a stroke out of reach, or a compiler's arithmetic */
+  if ({{ name }}_self_test() == 0) {
+    ready = 0; /* a compiler's own arithmetic */
+  }
   while ((ready == 1) && (wait_for_timer(&request.missed) == 1)) {
     read_buttons(&request);
     request.sto = read_sto();
     request.operate = 1; /* as soon as it has settled */
     if ((supervisor.state == {{ NAME }}_OPERATE) && (request.land == 0)) {
-      request.land = (follow({{ "&stroke, &request" if stroke else "&hover" }}) == 1) ? 0 : 1;
+      request.land = 1 - follow({{ "&stroke, &request" if stroke else "&hover" }});
     }
     read_sensors(&machine, &supervisor, &state, &out, raw, &in);
     {{ name }}_calibrate(raw, gain, offset, in.y);

@@ -32,7 +32,7 @@ static void read_stand_in(stand_in *m, int32_t flies, const {{ name }}_state *s,
     in->y[k] = place[k] + m->drawn[k];
     in->y_valid[k] = {{ one }};
   }
-  m->back = (m->back == 1) ? 0 : 1;
+  m->back = 1 - m->back;
 {% if driven %}
   {{ name }}_phases(place, last->current, in->i);
   for (k = 0; k < {{ currents }}; k++) {
