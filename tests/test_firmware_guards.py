@@ -7,7 +7,7 @@ from functools import cache
 from pathlib import Path
 
 import pytest
-from exported import PRECISIONS, require, run, target, texts
+from exported import HERE, PRECISIONS, require, run, run_test, target, texts, write_folder
 
 from malta.firmware.elementary import Precision
 from malta.firmware.unit import unit_of, unit_sources
@@ -112,6 +112,13 @@ def test_a_machine_stays_off_where_the_arithmetic_is_another(
     """Refused by the compiler where a macro tells, else by the supervisor."""
     require("gcc")
     assert found in started(tmp_path, precision, "gcc", *flags.split())
+
+
+def test_the_test_says_why(tmp_path: Path) -> None:
+    """Where vectors differ, or would, for the options of the compiler."""
+    done = run_test(HERE, write_folder("halbach", "double", tmp_path), "-O2", "-funsafe-math-optimizations")
+    assert done.returncode == 1
+    assert "halbach_parts.c is not that of their text: look at the compiler's options\n" in done.stdout
 
 
 @pytest.mark.parametrize("flags", ["-O2", "-O3 -ffp-contract=fast -mfma", "-O2 -funsafe-math-optimizations"])

@@ -130,6 +130,10 @@ int main(void) {
   for (k = 0; k < VECTORS; k++) {
     failed += run(&vectors[k], &total);
   }
+  if ({{ name }}_self_test() == 0) {
+    failed++;
+    (void)printf("the arithmetic of {{ name }}.c or {{ name }}_parts.c is not that of their text: look at the compiler's options\n");
+  }
   if (failed == 0) {
     (void)printf("pass: %ld vectors of %ld samples, checksum %08lx\n", (long)VECTORS, (long)SAMPLES,
                  (unsigned long)total);
