@@ -470,8 +470,9 @@ def test_the_stage_of_a_claim_is_the_one_that_is_rebuilt(tmp_path: Path) -> None
     content = json.loads(path.read_text())
     content["claim"]["current_loops"] = "lag"
     assert check(written(content, tmp_path), gains, uncertain=box).failures == (
-        f"the loops are not those of {gains}",
+        f"the stage of current loops is lag, that of {gains} is pi",
     )
+    content["claim"]["current_loops"] = "pi"
     of("z", "over", lambda _: [-0.0149, 0.015])(content)
     (line,) = check(written(content, tmp_path), gains, uncertain=box).failures
     assert line.startswith("its travel is too small: z from -0.0149 to 0.015 m")

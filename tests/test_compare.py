@@ -182,7 +182,7 @@ def test_different_machines_are_compared_in_what_they_share(run: Run) -> None:
 
 @pytest.mark.slow
 def test_an_unstable_design_is_compared_and_ends_with_exit_code_1(run: Run) -> None:
-    said = run("compare", GAINS / "robust.json", GAINS / "table2.json", "--set", "m=15", "--no-proof")
+    said = run("compare", GAINS / "robust.json", GAINS / "table2.json", "--set", "K_B=15", "--no-proof")
     assert said.code == 1
     assert "UNSTABLE" in said.out
     assert "unstable" in said.err

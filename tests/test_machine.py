@@ -645,7 +645,7 @@ def test_bearings_push_inwards_and_never_pull(
         push = max(par.k_t * delta + par.d_t * approach, 0.0) if delta > 0 else 0.0
         speed = math.hypot(*dp[2 * k : 2 * k + 2])  # known to the tilt's second order
         terms = par.k_t * max(delta, 0.0) + par.d_t * speed  # which may nearly cancel
-        _close(F, -push * r / max(math.hypot(*r), 1e-12), rtol=1e-3, atol=1e-6 + 1e-4 * terms * (delta > 0))
+        _close(F, -push * r / max(math.hypot(*r), 1e-12), rtol=3e-3, atol=1e-6 + 3e-4 * terms * (delta > 0))
         assert F @ r <= 1e-9
 
 

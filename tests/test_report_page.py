@@ -185,13 +185,13 @@ def test_the_report_of_a_shipped_design_on_screens_and_paper(
 def test_an_unstable_loop_has_a_page_that_says_so(tmp_path: Path, run: Run) -> None:
     out = tmp_path / "page.html"
     gains = ROOT / "design" / "gains" / "robust.json"
-    said = run("report", gains, "--set", "m=15", "--out", out)
+    said = run("report", gains, "--set", "K_B=15", "--out", out)
     assert said.code == 1
     assert "unstable" in said.err
     html = out.read_text(encoding="utf-8")
     read_page(html)
     assert '<dd class="value">UNSTABLE</dd>' in html
-    assert "changed: m=15" in html
+    assert "changed: K_B=15" in html
     assert "Gang of four" not in html
 
 

@@ -175,14 +175,14 @@ def _deviations(
     w = np.geomspace(1e-2, np.pi / Ts, 240)
     peaks, at = find_peaks(lambda some: np.abs(loop.compliance(some, load)), w)
     reached, settled, left = answer.largest, answer.within(SHARE), [answer.left(t) for t in after]
-    rounding = 1e-12 * float(reached.max())
+    moves = reached[:, 0] > 1e-12 * float(reached.max())  # what rounding moves stands still
     return tuple(
         Deviation(
             output=s.name,
             unit=s.unit,
-            largest=float(reached[k, 0]) if reached[k, 0] > rounding else 0.0,
-            left=tuple(float(rest[k, 0]) for rest in left),
-            settled=float(settled[k, 0]),
+            largest=float(reached[k, 0]) if moves[k] else 0.0,
+            left=tuple(float(rest[k, 0]) if moves[k] else 0.0 for rest in left),
+            settled=float(settled[k, 0]) if moves[k] else 0.0,
             final=float(answer.final[k, 0]),
             compliance=float(peaks[k]),
             frequency=float(at[k]),

@@ -148,8 +148,8 @@ def linearize(plant: Plant, point: OperatingPoint, believed: Plant | None = None
 def _without_rounding(B: FloatArray) -> FloatArray:
     """B with zeros where forces(currents(v)) left what rounding makes, beside the largest of the row and the column."""
     size = np.abs(B)
-    scale = np.sqrt(size.max(axis=1, keepdims=True, initial=0) * size.max(axis=0, keepdims=True, initial=0))
-    return np.where(size > ROUNDING * scale, B, 0.0)
+    rows, columns = (np.sqrt(size.max(axis=k, keepdims=True, initial=0)) for k in (1, 0))
+    return np.where(size > ROUNDING * rows * columns, B, 0.0)
 
 
 def _without_slope(plant: Plant, point: OperatingPoint) -> str:
