@@ -143,7 +143,7 @@ def _norm(M: FloatArray) -> tuple[float, FloatArray]:
     shift = float(M.max(initial=0.0)) * np.eye(len(M))
     for _ in range(POWERS):
         d = np.maximum((M + shift) @ d, 1e-3)
-        d = d / d.max()
+        d = d / d.max(initial=1e-3)
     return float((M @ d / d).max(initial=0.0)) * (1 + 1e-12), d
 
 
