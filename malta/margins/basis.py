@@ -32,8 +32,10 @@ _KNOWN: WeakKeyDictionary[Program, Program | None] = WeakKeyDictionary()
 
 def in_plain_basis(loop: UncertainLoop) -> UncertainLoop:
     """The loop in the basis in which its matrices have clearly fewer terms; the loop itself when none is found."""
+    if loop.direct or not 1 < loop.states <= LARGEST:
+        return loop
     s = loop.symbolic
-    if s is None or s.atoms or loop.direct or not 1 < loop.states <= LARGEST:
+    if s is None or s.atoms:
         return loop
     if loop.program not in _KNOWN:  # laws change, the system stays
         try:
