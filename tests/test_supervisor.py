@@ -23,6 +23,7 @@ from malta.firmware.export import sources
 from malta.firmware.native import call, new_state, view
 from malta.firmware.sensor_loss import expected_readings, gains_without, prediction_correction
 from malta.firmware.signals import Target, fidelity_of
+from malta.firmware.stand_in import phase_currents
 from malta.firmware.supervised import NUMBERS, compile_supervised
 from malta.firmware.supervisor import (
     FLYING,
@@ -134,12 +135,7 @@ class Bench:
     @cached_property
     def phases(self) -> ca.Function:
         """(readings of the positions, commanded currents of the coils) -> currents of the sensors."""
-        drive, x = self.plant.drive, ca.SX.zeros(len(self.plant.states))
-        y, current = ca.SX.sym("y", len(self.plant.outputs)), ca.SX.sym("i", len(self.plant.actuator.coils))
-        q = self.plant.position_of(y)
-        for k in range(q.numel()):
-            x[self.plant.controlled[k]] = q[k]
-        return ca.Function("phases", [y, current], [drive.to_phases(x) @ drive.command(current)])
+        return phase_currents(self.t)
 
     @property
     def now(self) -> State:

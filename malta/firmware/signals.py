@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -225,6 +225,15 @@ def current_readings(t: Target) -> tuple[Signal, ...]:
 def named(before: str, signals: tuple[Signal, ...], unit: str, after: str = "") -> tuple[Signal, ...]:
     """Signals named after others; unit "": their own."""
     return tuple(Signal(f"{before}{s.name}{after}", unit or s.unit) for s in signals)
+
+
+def place_of_readings(plant: Plant, y: Any) -> Any:
+    """The states of a machine at rest that is read as y, as an expression."""
+    q = plant.position_of(y)
+    x = ca.SX.zeros(len(plant.states))
+    for k in range(q.numel()):
+        x[plant.controlled[k]] = q[k]
+    return x
 
 
 def used_clearances(plant: Plant) -> Callable[[int, float], FloatArray]:

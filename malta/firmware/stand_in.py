@@ -10,6 +10,7 @@ import numpy as np
 from malta.firmware.ctext import c_number, function_text
 from malta.firmware.lowering import lower
 from malta.firmware.program import program_of
+from malta.firmware.signals import place_of_readings
 from malta.firmware.supervisor import JUMP, bounds_of, reading_deviations, reference_limits
 
 if TYPE_CHECKING:
@@ -41,12 +42,8 @@ def phase_currents(t: Target) -> ca.Function:
     """(readings of the positions, commanded currents of the coils) -> i, what the current sensors read then."""
     plant, drive = t.believed, t.believed.drive
     y, current = ca.SX.sym("y", len(plant.outputs)), ca.SX.sym("current", len(plant.actuator.coils))
-    x = ca.SX.zeros(len(plant.states))
-    q = plant.position_of(y)
-    for k in range(q.numel()):
-        x[plant.controlled[k]] = q[k]
     axes = drive.command(current)
-    i = ca.densify(drive.to_phases(x) @ axes if t.fidelity == "phase" else axes)
+    i = ca.densify(drive.to_phases(place_of_readings(plant, y)) @ axes if t.fidelity == "phase" else axes)
     return ca.Function("phases", [y, current], [i], ["y", "current"], ["i"])
 
 

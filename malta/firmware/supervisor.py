@@ -19,7 +19,13 @@ import casadi as ca
 import numpy as np
 
 from malta.errors import InputError
-from malta.firmware.signals import Target, current_readings, reading_ranges, used_clearances
+from malta.firmware.signals import (
+    Target,
+    current_readings,
+    place_of_readings,
+    reading_ranges,
+    used_clearances,
+)
 from malta.model.plant import Plant
 from malta.synthesis.controller import Controller
 from malta.synthesis.riccati import eigenvalues
@@ -227,7 +233,13 @@ def monitors_of(t: Target) -> tuple[Monitor, ...]:
         Monitor("UNSETTLED", "samples without settling", 20.0 * TIMES.settle, 1, "LAND", ("SETTLE",)),
         Monitor("UNREADY", "samples without good readings", 8.0 * TIMES.check, 1, "FAULT", ("SENSORS",)),
     ]
-    absent = {
+    return tuple(row for row in listed if not _absent_monitors(t).get(row.key, False))
+
+
+def _absent_monitors(t: Target) -> dict[str, bool]:
+    """Whether a monitor makes no sense for a target's machine; those that are not named always do."""
+    b = bounds_of(t)
+    return {
         "TOUCH": not np.isfinite(b.touch).any(),
         "RATE": not np.isfinite(b.jump).any(),
         "INNOVATION": not np.isfinite(b.sigma).any(),
@@ -244,7 +256,6 @@ def monitors_of(t: Target) -> tuple[Monitor, ...]:
         "HELPLESS": not np.isfinite(t.controller.limits.force).any(),
         "SATURATION": not np.isfinite(t.controller.limits.force).any(),
     }
-    return tuple(row for row in listed if not absent.get(row.key, False))
 
 
 def reading_deviations(plant: Plant) -> FloatArray:
@@ -326,11 +337,7 @@ def current_deviations(t: Target) -> ca.Function:
     plant, drive = t.believed, t.believed.drive
     i, current = ca.SX.sym("i", len(current_readings(t))), ca.SX.sym("current", len(plant.actuator.coils))
     y = ca.SX.sym("expected", len(plant.outputs))
-    x = ca.SX.zeros(len(plant.states))
-    q = plant.position_of(y)
-    for k in range(q.numel()):
-        x[plant.controlled[k]] = q[k]
-    axes = drive.to_axes(x) @ i if t.fidelity == "phase" else i
+    axes = drive.to_axes(place_of_readings(plant, y)) @ i if t.fidelity == "phase" else i
     off = ca.densify(drive.command(current) - axes)
     return ca.Function("deviation", [i, y, current], [off], ["i", "expected", "current"], ["off"])
 

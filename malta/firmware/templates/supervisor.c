@@ -265,7 +265,7 @@ static int32_t is_reference(const {{ name }}_supervisor *sup, const {{ name }}_r
   return accepted;
 }
 
-/* The last reference that was requested within the limits. */
+/* The last reference that was requested in numbers of possible size: what the next one steps from. */
 static void remember({{ name }}_supervisor *sup, const {{ name }}_reference *r) {
   int32_t k;
   for (k = 0; k < OUTPUTS; k++) {
