@@ -19,13 +19,13 @@ from malta.app.runs import planned_run
 from malta.errors import CheckError, InputError
 from malta.margins.curves import LoopCurves, loop_curves
 from malta.margins.loop import Loop, loop_of_model
+from malta.margins.loops import continuous_poles
 from malta.margins.rays import RayBound, ray_bound
 from malta.margins.travel import travel_loops
 from malta.margins.verify import (
     BANDWIDTHS,
     Stage,
     bandwidths_of,
-    continuous_poles,
     controller_poles,
     stage_of,
     zone,
@@ -82,7 +82,7 @@ class Problem:
     @cached_property
     def poles(self) -> ComplexArray:
         """Poles of the closed loop, rad/s, as `malta.verify` has them."""
-        return continuous_poles(eigenvalues(self.loop.matrix), self.controller.sample_time)
+        return self.loop.poles
 
 
 def solve(edited: Edited) -> Problem:

@@ -14,6 +14,7 @@ from malta.margins.classical import Classical, Nominal, classical_margins
 from malta.margins.loops import (
     LAST,
     SampledLoop,
+    continuous_poles,
     disturbance_map,
     loaded_loop,
     loaded_model,
@@ -33,8 +34,6 @@ if TYPE_CHECKING:
     from malta.model.linearize import LinearModel
     from malta.model.plant import ComplexArray, FloatArray, Plant
     from malta.synthesis.controller import Controller
-
-DELAYED = 1e-6  # |z| below which a pole is one of pure delay
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,13 +103,16 @@ class Loop:
     @cached_property
     def poles(self) -> ComplexArray:
         """Of the closed loop, ln(z) / Ts in rad/s, without those of pure delay."""
-        z = eigenvalues(self.matrix).astype(complex)
-        return np.asarray(np.log(z[np.abs(z) > DELAYED]) / self.sample_time)
+        return continuous_poles(self._eigenvalues, self.sample_time)
+
+    @cached_property
+    def _eigenvalues(self) -> ComplexArray:
+        return eigenvalues(self.matrix)
 
     @cached_property
     def stable(self) -> bool:
         """Whether all poles decay."""
-        return bool(np.abs(eigenvalues(self.matrix)).max() < 1)
+        return bool(np.abs(self._eigenvalues).max() < 1)
 
     @property
     def left_out(self) -> str:

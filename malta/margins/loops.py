@@ -52,6 +52,7 @@ if TYPE_CHECKING:
 
 LAST: CurrentLoops = "pi"  # the last stage: the loop that simulations fly by default
 ROUNDING = 1e-9  # of the largest entry
+DELAYED = 1e-6  # |z| below which a pole is one of pure delay
 
 
 @dataclass(frozen=True, eq=False)
@@ -388,3 +389,17 @@ def feedforward_slope(model: LinearModel, controller: Controller) -> FloatArray:
         position = float(model.operating_point.x[plant.stroke_state])
         slope[:, plant.stroke_output] = controller.feedforward.slope(position)
     return slope
+
+
+def continuous_poles(sampled: ComplexArray, Ts: float) -> ComplexArray:
+    """Poles in rad/s of a sampled system, ln(lambda) / Ts, in order; poles of pure delay are left out."""
+    return sorted_poles(np.asarray(np.log(sampled[np.abs(sampled) > DELAYED].astype(complex)) / Ts))
+
+
+def sorted_poles(poles: ComplexArray) -> ComplexArray:
+    """The same poles in order of their real parts, then of their imaginary ones; read-only."""
+    poles = np.asarray(poles, dtype=complex)
+    order = np.lexsort((poles.imag.round(6), poles.real.round(6)))
+    frozen: ComplexArray = poles[order]
+    frozen.flags.writeable = False
+    return frozen

@@ -13,7 +13,7 @@ import numpy as np
 from malta.errors import CheckError
 from malta.margins.extent import NOWHERE, Extent, extent_of
 from malta.margins.loop import loop_of_model
-from malta.margins.loops import SampledLoop, commanded_model, sampled_loop
+from malta.margins.loops import SampledLoop, commanded_model, continuous_poles, sampled_loop, sorted_poles
 from malta.margins.responses import crossing, find_peaks
 from malta.margins.robust import Margin
 from malta.margins.travel import NOT_BETWEEN, travel_margin
@@ -208,7 +208,8 @@ def verify(
 
 
 def _verify(model: LinearModel, controller: Controller, uncertainty: Mapping[str, float]) -> Margins:
-    machine = loop_of_model(model, controller).sampled
+    whole = loop_of_model(model, controller)
+    machine = whole.sampled
     loops = {
         "sampled": sampled_loop(model, controller, delay=controller.delay),
         "+ current loops": sampled_loop(model, controller, delay=controller.delay, current_loops="lag"),
@@ -219,10 +220,10 @@ def _verify(model: LinearModel, controller: Controller, uncertainty: Mapping[str
     empty = np.zeros(0, dtype=complex)
     regulator, observer = (empty, empty) if controller.cost is None else controller_poles(controller)
     poles = Poles(
-        open_loop=_sorted(eigenvalues(model.A)),
+        open_loop=sorted_poles(eigenvalues(model.A)),
         regulator=continuous_poles(regulator, controller.sample_time),
         filter=continuous_poles(observer, controller.sample_time),
-        closed_loop=continuous_poles(eigenvalues(machine.closed), controller.sample_time),
+        closed_loop=whole.poles,
     )
     bandwidths = bandwidths_of(model, controller, machine, stable=stages[-1].stable)
     robust = travel_margin(model.plant, controller, uncertainty) if uncertainty else None
@@ -291,16 +292,3 @@ def _natural_frequencies(model: LinearModel, controller: Controller) -> dict[str
 
 def _singular_values(G: ComplexArray) -> FloatArray:
     return np.asarray(np.linalg.svd(G, compute_uv=False))
-
-
-def continuous_poles(sampled: ComplexArray, Ts: float) -> ComplexArray:
-    """Poles in rad/s of a sampled system, ln(lambda) / Ts, in order; poles of pure delay are left out."""
-    return _sorted(np.asarray(np.log(sampled[np.abs(sampled) > 1e-6].astype(complex)) / Ts))
-
-
-def _sorted(poles: ComplexArray) -> ComplexArray:
-    poles = np.asarray(poles, dtype=complex)
-    order = np.lexsort((poles.imag.round(6), poles.real.round(6)))
-    frozen: ComplexArray = poles[order]
-    frozen.flags.writeable = False
-    return frozen
