@@ -120,12 +120,17 @@ def _law(subject: Subject) -> Iterator[Entry]:
             name, unit = f"integral of {signal.name} waits above", f"{signal.unit}/s"
             yield Entry("law", name, float(pause), unit, signal.name)
     for words, per, row in zip(
-        ("reference", "its speed", "its acceleration"), ("", "/s", "/s^2"), c.references, strict=False
+        ("reference", "speed", "acceleration"), ("", "/s", "/s^2"), c.references, strict=False
     ):
         for signal, limit in zip(c.measurements, row, strict=True):
             if limit:
-                name = f"largest {words} of {signal.name}".replace("its ", "")
-                yield Entry("law", name, float(limit), f"{signal.unit}{per}", signal.name)
+                yield Entry(
+                    "law",
+                    f"largest {words} of {signal.name}",
+                    float(limit),
+                    f"{signal.unit}{per}",
+                    signal.name,
+                )
     if c.current_loop is not None:
         yield Entry("law", "current loop Kp", c.current_loop.Kp, "V/A")
         yield Entry("law", "current loop Ki", c.current_loop.Ki, "V / (A s)")
