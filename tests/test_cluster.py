@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import pytest
-from conftest import without_progress
+from conftest import one_sentence, without_progress
 
 import malta
 from malta.campaigns import dask as cluster
@@ -125,10 +125,9 @@ def test_a_worker_is_killed_and_then_the_scheduler(loopback: Loopback, tmp_path:
     loopback.scheduler.kill()
     out, err = cut.communicate(timeout=120)
     assert (cut.returncode, out) == (2, "")
-    assert "Traceback" not in err
-    assert err.count("\n") == 1
-    assert "the connection lost" in err
-    assert "it goes on with what is left" in err
+    sentence = one_sentence(without_progress(err))
+    assert "the connection lost" in sentence
+    assert "it goes on with what is left" in sentence
     kept = _blocks(tmp_path / "cut")
     assert 0 < len(kept) < 12
     rest = _malta(tmp_path / "cut", 12288)

@@ -16,9 +16,11 @@ from malta import gains
 from malta.errors import InputError
 from malta.margins.blocks import Block
 from malta.margins.family import align, combine, family
+from malta.margins.peaks import frequencies, patterns
 from malta.margins.responses import responses
+from malta.margins.robust import problem_of
 from malta.margins.transfer import transfer
-from malta.margins.travel import travel_loops
+from malta.margins.travel import travel_loops, worst_sensitivities
 from malta.margins.weight import weight_of
 from malta.model.data import plant_of
 
@@ -99,6 +101,28 @@ def test_integrators_on_both_sides_of_a_gain_take_no_digits() -> None:
     assert S.max() < 1e-3
     assert S[w < 1e-4].max() < 1e-6
     assert effort[:-10] == pytest.approx(effort[-10], rel=1e-2)
+
+
+def test_no_frequency_is_the_rounding_of_a_real_pole() -> None:
+    """The flagship at all corners of its box: nothing below the slowest pole's own far end, where 1 / 0 is rounding."""
+    c = gains.read("design/gains/robust.json")
+    ((s, law),), _ = travel_loops(plant_of(c.parameters), c, ("m", "K_A", "K_D", "K_B"), "pi")
+    problem = problem_of(s, law)
+    for x in patterns(4):
+        p = s.nominal * (1 + 0.2 * np.append(x, 0))
+        slowest = np.abs(problem.poles(p)).min()
+        assert 1e-9 * slowest < frequencies(problem, p).min() < slowest
+
+
+@pytest.mark.slow
+def test_radial_sensors_of_the_flagship_have_one_worst_sensitivity() -> None:
+    """Four sensors of a round body about the same axis: their worst |S| is one figure, up to the gains' rounding."""
+    c = gains.read("design/gains/robust.json")
+    box = {"m": 0.2, "K_A": 0.2, "K_D": 0.2, "K_B": 0.2}
+    found = worst_sensitivities(plant_of(c.parameters), c, box)
+    for name in ("y1", "x2", "y2"):
+        assert found[name].lower == pytest.approx(found["x1"].lower, rel=1e-6)
+        assert found[name].upper == pytest.approx(found["x1"].upper, rel=1e-3)
 
 
 @settings(max_examples=15, deadline=None)

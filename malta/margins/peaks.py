@@ -27,6 +27,7 @@ AROUND = np.array([0.5, 0.8, 0.9, 0.95, 0.98, 1.0, 1.02, 1.05, 1.1, 1.25, 2.0])
 ENDS = (0.01, 100.0)  # beyond the slowest and the fastest pole
 FAR_ENDS = (1e-5, 1e4)  # that stand for zero and for infinity
 GRID = 80
+REAL = 1e-3  # share of |s| below which an imaginary part shows no peak: of a real pole it is rounding
 
 Value = Callable[["FloatArray", "FloatArray"], "FloatArray"]  # of p and of rows of w
 
@@ -55,7 +56,7 @@ def frequencies(problem: OfLoop, p: FloatArray) -> FloatArray:
 def _frequencies(problem: OfLoop, place: bytes) -> FloatArray:
     with np.errstate(all="ignore"):
         s: ComplexArray = problem.poles(np.frombuffer(place))
-    known = np.concatenate([np.abs(s), np.abs(s.imag)])
+    known = np.concatenate([np.abs(s), np.abs(s.imag[np.abs(s.imag) > REAL * np.abs(s)])])
     known = known[np.isfinite(known) & (known > 0)]
     top = _top(problem)
     if not len(known):
