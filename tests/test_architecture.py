@@ -25,6 +25,7 @@ ORDER = (
         "archives",
         "tables",
         "threads",
+        "display",
         "model",
         "synthesis",
         "margins",

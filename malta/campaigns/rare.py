@@ -31,6 +31,7 @@ from malta.campaigns.plan import (
 )
 from malta.campaigns.run import replay_machine
 from malta.campaigns.subset import Runs, Subset, subset_simulation
+from malta.display import Description, display
 from malta.errors import InputError
 from malta.files import json_text, read_file, replace_files
 from malta.simulation.digest import verdicts
@@ -59,6 +60,7 @@ class DesignPoint(NamedTuple):
     time: float  # s, of the end
 
 
+@display
 @dataclass(frozen=True, eq=False)
 class RareEvent:
     """The probability that a run exceeds a limit. `found` says how it was estimated."""
@@ -72,6 +74,18 @@ class RareEvent:
     def uncertain(self) -> bool:
         """Whether the failures descend from so few first runs that their coefficient of variation is a guess."""
         return self.found.reached and len(self.found.levels) > 1 and self.found.ancestors < FEW
+
+    @property
+    def description(self) -> Description:
+        """The probability with its interval, and the machine that fails most easily."""
+        low, high = self.found.interval()
+        known = f"{self.found.probability:.3g}, 95 % interval {low:.2g} .. {high:.2g}"
+        rows = [("probability", known if self.found.reached else f"below {high:.2g}, no run failed")]
+        rows.append(("simulated", f"{self.found.simulated} runs, {len(self.found.levels)} levels"))
+        if self.design_point is not None:
+            values = ", ".join(f"{name} = {value:.4g}" for name, value in self.design_point.values.items())
+            rows.append(("fails first", f"{values}: {self.design_point.end}"))
+        return Description(f"RareEvent of {self.plan.controller.name!r}: {self.limit.text}", tuple(rows))
 
 
 def rare_event(

@@ -14,6 +14,7 @@ from scipy.stats import binomtest
 from malta.campaigns.block import Block
 from malta.campaigns.plan import Plan, varied_names
 from malta.campaigns.store import figure_shapes
+from malta.display import Description, display
 from malta.model.plant import readonly
 from malta.simulation.digest import Batch, verdicts
 
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 CONFIDENCE = 0.95  # of the interval about a share
 
 
+@display
 @dataclass(frozen=True, eq=False)
 class Campaign:
     """The result of a campaign: a row of figures for each run that was simulated. SI.
@@ -74,6 +76,19 @@ class Campaign:
         """Share of the runs that were completed."""
         return rate(int(self.completed.sum()), len(self.index))
 
+    @property
+    def description(self) -> Description:
+        """Its plan, its ends and its yield."""
+        ends = ", ".join(f"{name} {count}" for name, count in self.ends.items())
+        rows = (
+            ("varied", " ".join(self.names) or "nothing"),
+            ("ends", ends or "none"),
+            ("completed", str(self.rate)),
+            ("engines", " ".join(self.engines)),
+        )
+        title = f"Campaign of {self.plan.controller.name!r} in {self.plan.scenario!r}"
+        return Description(f"{title}: {len(self.index)} of {self.plan.samples} machines", rows)
+
 
 def gather(plan: Plan, done: Mapping[int, Block]) -> Campaign:
     """The campaign of the blocks that are done, by their first runs, in order of the runs."""
@@ -114,6 +129,10 @@ class Rate(NamedTuple):
     share: float  # passed / runs; NaN without runs
     low: float
     high: float
+
+    def __str__(self) -> str:
+        share, low, high = (f"{100 * x:.4g}" for x in (self.share, self.low, self.high))
+        return f"{self.passed} of {self.runs}: {share} %, {100 * CONFIDENCE:g} % interval {low} .. {high} %"
 
 
 def rate(count: int, runs: int) -> Rate:

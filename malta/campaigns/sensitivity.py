@@ -20,6 +20,7 @@ from malta.campaigns.block import simulate_machines
 from malta.campaigns.limits import Limit, findings_of
 from malta.campaigns.plan import Plan, machines_in_box, planned_run, varied_names, varying_columns
 from malta.campaigns.result import Rate, rate
+from malta.display import Description, display
 from malta.errors import InputError
 
 if TYPE_CHECKING:
@@ -40,6 +41,7 @@ class Index(NamedTuple):
     total_half: float
 
 
+@display
 @dataclass(frozen=True, eq=False)
 class Sensitivity:
     """Sobol indices of a campaign's figures of merit and of its yield."""
@@ -53,6 +55,18 @@ class Sensitivity:
     of_merits: Mapping[
         str, tuple[Index, ...]
     ]  # by label; empty where a run has no value, or all have the same
+
+    @property
+    def description(self) -> Description:
+        """The indices of the yield."""
+        rows = [("within", str(self.within)), ("simulated", f"{self.runs} runs")]
+        for factor, index in zip(self.factors, self.of_yield, strict=False):
+            first, total = (
+                f"{index.first:.3g} +- {index.first_half:.2g}",
+                f"{index.total:.3g} +- {index.total_half:.2g}",
+            )
+            rows.append((factor, f"first-order {first}, total {total}"))
+        return Description(f"Sensitivity of {self.plan.controller.name!r} {self.limit.kept}", tuple(rows))
 
 
 def sensitivity(

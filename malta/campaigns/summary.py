@@ -22,7 +22,9 @@ from malta.campaigns.result import Campaign, Rate, rate
 from malta.campaigns.sketch import Sketch, merge, quantiles, sketch_of
 from malta.campaigns.statistics import CLEARANCE, RISE, Finding, every_figure, runs_within_bounds
 from malta.campaigns.yields import Yields, runs_within_specification
+from malta.display import Description, display
 from malta.simulation.digest import LARGEST_FIGURE, Batch, verdicts
+from malta.units import in_unit
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -89,6 +91,7 @@ class Merit:
         return quantiles(self.sketch, [mark / 100 for mark in marks])
 
 
+@display
 @dataclass(frozen=True, eq=False)
 class Summary:
     """What a campaign found, without its runs: counts, yields, percentiles and the worst runs. SI.
@@ -159,6 +162,19 @@ class Summary:
             None if count is None else rate(count, self.runs) for count in (self.within, self.specified)
         )
         return Yields(self.rate, published, specified)
+
+    @property
+    def description(self) -> Description:
+        """Its plan, its ends, its yields and its figures of merit."""
+        ends = ", ".join(f"{name} {count}" for name, count in self.ends.items())
+        rows = [("ends", ends or "none"), ("completed", str(self.rate))]
+        for merit in self.merits:
+            low, middle, high = (in_unit(float(x), merit.unit) for x in merit.percentiles((5, 50, 95)))
+            rows.append(
+                (merit.label, f"{middle:.3g} {merit.unit}, 90 % of the runs in {low:.3g} .. {high:.3g}")
+            )
+        title = f"Summary of {self.plan.controller.name!r} in {self.plan.scenario!r}"
+        return Description(f"{title}: {self.runs} of {self.plan.samples} machines", tuple(rows))
 
 
 def summary_of(found: Campaign, bounds: Bounds = UNBOUNDED) -> Summary:

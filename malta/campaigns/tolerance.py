@@ -24,6 +24,7 @@ from malta.campaigns.plan import (
     varying_columns,
 )
 from malta.campaigns.result import Rate, rate
+from malta.display import Description, display
 from malta.errors import InputError
 from malta.model.parameters import differences
 from malta.simulation.experiments import progress_of_part
@@ -54,6 +55,7 @@ class Spread(NamedTuple):
 ALL = "all together"
 
 
+@display
 @dataclass(frozen=True, eq=False)
 class Tolerances:
     """The largest spreads that keep a yield."""
@@ -63,6 +65,14 @@ class Tolerances:
     wanted: float  # yield to keep
     today: Rate  # the yield of the plan's own spreads
     spreads: tuple[Spread, ...]  # by parameter, then of all together
+
+    @property
+    def description(self) -> Description:
+        """The factors on the spreads of today."""
+        rows = [("today", str(self.today))]
+        rows += [(s.name, f"{s.factor:.3g} times, {s.within or 'lost without any'}") for s in self.spreads]
+        title = f"Tolerances of {self.plan.controller.name!r} for {100 * self.wanted:g} % {self.limit.kept}"
+        return Description(title, tuple(rows))
 
 
 def tolerances(

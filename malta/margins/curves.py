@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from scipy import linalg
 
+from malta.display import Curves, Description, display
 from malta.errors import CheckError, InputError
 from malta.margins.channels import (
     ChannelMargins,
@@ -75,6 +76,7 @@ class Responses(NamedTuple):
             return _diagonal(T) / _diagonal(S)
 
 
+@display
 @dataclass(frozen=True, eq=False)
 class LoopCurves:
     """The curves of one loop: responses, poles, zeros and margins. Frequencies and poles are in rad/s.
@@ -189,6 +191,22 @@ class LoopCurves:
         B, C, D = P.B[:, :u], P.C[:p], P.D[:p, :u]
         A = np.block([[P.A, B @ F.C], [np.zeros((k, n)), F.A]])
         return _zeros(loop, System(A, np.vstack([B @ F.D, F.B]), np.hstack([C, D @ F.C]), D @ F.D))
+
+    @property
+    def description(self) -> Description:
+        """Stability, poles and the peaks of S and T."""
+        peaks = {key: self.singular_values(getattr(self.responses, key))[:, 0] for key in ("S", "T")}
+        rows = (
+            ("closed loop", "stable" if self.stable else "UNSTABLE"),
+            ("frequencies", f"{len(self.w)}, {self.w.min():.3g} .. {self.w.max():.3g} rad/s"),
+            *(
+                (f"largest |{key}|", f"{y.max():.3g} at {self.w[y.argmax()]:.3g} rad/s")
+                for key, y in peaks.items()
+            ),
+            ("channels", " ".join(channel.name for channel in self.channels())),
+        )
+        curves = Curves(self.w, "frequency [rad/s]", peaks, "largest singular value [1]", logarithmic=True)
+        return Description(f"Curves of {self.name!r}", rows, curves)
 
 
 def loop_curves(

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from malta.display import Description, display, quantity
 from malta.errors import InputError
 from malta.margins.blocks import (
     At,
@@ -51,6 +52,7 @@ LEAST = 1e-12  # a gain below this counts as zero, and one of the bounds NOTHING
 NOTHING = (1e-12, 1e-9, 1e-6, 1e-3, 1.0)
 
 
+@display
 @dataclass(frozen=True, eq=False)
 class Gain:
     """The largest gain of a closed loop over a box of parameters and all frequencies.
@@ -82,6 +84,14 @@ class Gain:
     def __str__(self) -> str:
         high = unproven(self.reason) if self.upper is None else f"proven below {self.upper:.4g}"
         return f"{self.lower:.4g} at {self.frequency:.4g} rad/s, {high}"
+
+    @property
+    def description(self) -> Description:
+        """The reached and the proven bound, and the witness."""
+        reached = ", ".join(f"{name} = {value:.4g}" for name, value in self.witness.items())
+        return Description(
+            f"Gain: {self}", (("reached at", reached), ("searched in", quantity(self.seconds, "s")))
+        )
 
 
 @on_one_thread

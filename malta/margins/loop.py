@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from malta.display import Description, display, quantity
 from malta.errors import InputError
 from malta.margins.classical import Classical, Nominal, classical_margins
 from malta.margins.loops import (
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
     from malta.synthesis.controller import Controller
 
 
+@display
 @dataclass(frozen=True, eq=False)
 class Loop:
     """A machine and its controller at an operating point: the derivative of the control period that simulations fly.
@@ -165,6 +167,20 @@ class Loop:
         Raises InputError for unknown parameters.
         """
         return robust_margin(*self.uncertain(tuple(ranges)), ranges, time=time, progress=progress)
+
+    @property
+    def description(self) -> Description:
+        """Where it stands, its size and its poles."""
+        place = ", ".join(f"{name} = {value:g}" for name, value in self.at.items() if value) or "the centre"
+        rate = np.abs(self.poles)
+        rows = (
+            ("machine", f"{self.plant.name!r}, preset {self.plant.parameters.preset!r}, at {place}"),
+            ("law", f"{self.controller.name!r}, every {quantity(self.sample_time, 's')}"),
+            ("closed loop", f"{len(self.matrix)} states, {'stable' if self.stable else 'UNSTABLE'}"),
+            ("poles", f"{rate.min():.4g} .. {rate.max():.4g} rad/s"),
+            ("left out", self.left_out or "nothing"),
+        )
+        return Description(f"Loop of {self.controller.name!r} at {place}", rows)
 
 
 def loop(

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from malta.display import Description, display, quantity
 from malta.margins.loop import Loop, loop_from
 from malta.model.plant import Plant
 from malta.synthesis.controller import Controller
@@ -23,6 +24,7 @@ from malta.synthesis.state_space import named_system, reference_names, set_point
 from malta.threads import on_one_thread
 
 
+@display
 @dataclass(frozen=True, eq=False)
 class LoopSystems:
     """The systems of a machine's sampled loop, discrete control.StateSpace with the names of the machine's signals.
@@ -59,6 +61,18 @@ class LoopSystems:
     tracking: Any
     plant: Plant
     controller: Controller
+
+    @property
+    def description(self) -> Description:
+        """The size of each system."""
+        systems = ((name, getattr(self, name)) for name in self.__dataclass_fields__)
+        rows = tuple(
+            (name, f"{s.ninputs} inputs, {s.noutputs} outputs, {s.nstates} states")
+            for name, s in systems
+            if name not in ("plant", "controller")
+        )
+        title = f"LoopSystems of {self.controller.name!r} on {self.plant.name!r}"
+        return Description(f"{title}, every {quantity(self.controller.sample_time, 's')}", rows)
 
 
 @on_one_thread

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from malta.display import Description, display, quantity
 from malta.errors import CheckError, InputError
 from malta.margins.loop import Loop, loop_along, loop_from
 from malta.margins.loops import SampledLoop
@@ -52,6 +53,7 @@ class Deviation:
     frequency: float  # rad/s, of it
 
 
+@display
 @dataclass(frozen=True, eq=False)
 class Recovery:
     """The answer of a machine's loop to a constant load from outside.
@@ -75,6 +77,20 @@ class Recovery:
     load: Mapping[str, float]
     after: tuple[float, ...]
     outputs: tuple[Deviation, ...]
+
+    @property
+    def description(self) -> Description:
+        """What the load does to each output."""
+        rows = tuple(
+            (
+                o.output,
+                f"moves {quantity(o.largest, o.unit)}, {quantity(o.final, o.unit)} stay, "
+                f"settled after {quantity(o.settled, 's')}",
+            )
+            for o in self.outputs
+        )
+        load = ", ".join(f"{name} {value:g}" for name, value in self.load.items())
+        return Description(f"Recovery from {self.name}: {load}", rows)
 
 
 @on_one_thread

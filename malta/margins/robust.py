@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from malta.display import Description, display, quantity
 from malta.errors import InputError
 from malta.margins.arguments import (
     by_name,
@@ -76,6 +77,7 @@ class Certificate:
     multipliers: Proof | None = None  # what a proof by multipliers is, without cells of the kind above
 
 
+@display
 @dataclass(frozen=True, eq=False)
 class Margin:
     """A robust stability margin in multiples of the modelled box of parameters.
@@ -128,6 +130,20 @@ class Margin:
             return f"{low}; no unstable machine found {self.searched}".rstrip()
         where = "" if self.frequency is None else f" at {self.frequency:.4g} rad/s"
         return f"{low}, lost at {100 * self.upper:.2f} %{where}"
+
+    @property
+    def description(self) -> Description:
+        """The proven and the reached bound, and the witness."""
+        rows = [("searched in", quantity(self.seconds, "s"))]
+        if self.witness is not None:
+            rows.insert(
+                0, ("lost at", ", ".join(f"{name} = {value:.4g}" for name, value in self.witness.items()))
+            )
+        if self.sensitivity:
+            rows.insert(
+                1, ("shares", ", ".join(f"{name} {100 * x:.0f} %" for name, x in self.sensitivity.items()))
+            )
+        return Description(f"Margin: {self}", tuple(rows))
 
 
 def unproven(reason: str) -> str:

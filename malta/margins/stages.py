@@ -25,6 +25,7 @@ from typing import Literal
 
 import numpy as np
 
+from malta.display import Description, display
 from malta.errors import InputError
 from malta.margins.classical import (
     Classical,
@@ -88,6 +89,12 @@ class Place:
     delay: float  # s, smallest delay margin; NaN where unstable, as peak and disk
 
 
+def _bound(margin: Margin) -> str:
+    """The proven multiple of a range."""
+    return "nothing" if margin.lower is None else f"{margin.lower:.4g}"
+
+
+@display
 @dataclass(frozen=True, eq=False)
 class Robustness:
     """What `malta.robustness` finds: margins of a loop stage by stage, along the travel, and of each parameter.
@@ -122,6 +129,20 @@ class Robustness:
     mass: Margin | None
     places: tuple[Place, ...]
     extent: Extent = NOWHERE
+
+    @property
+    def description(self) -> Description:
+        """The margin of each stage of the chain, then what bounds the last."""
+        rows = [
+            (link.name, f"{_bound(link.margin)} proven, largest |S| {link.peak:.3g}") for link in self.chain
+        ]
+        alone = ", ".join(
+            f"{name} -{_bound(down)} +{_bound(up)}" for name, (down, up) in self.tolerance.items()
+        )
+        disks = ", ".join(f"{disk.channels} {disk.size:.3g}" for disk in self.disks)
+        rows += [("one at a time", alone), ("disk margins", disks)]
+        where = f"{self.extent}, ".lstrip(", ")
+        return Description(f"Robustness: {where}{self.travel}", tuple(rows))
 
 
 def compensators(

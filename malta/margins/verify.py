@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from malta.display import Description, display
 from malta.errors import CheckError
 from malta.margins.extent import NOWHERE, Extent, extent_of
 from malta.margins.loop import loop_of_model
@@ -61,6 +62,7 @@ class Stage:
         return self.spectral_radius < 1
 
 
+@display
 @dataclass(frozen=True, eq=False)
 class Margins:
     """What `malta.verify` finds: poles, peak sensitivities, bandwidths and the robust margin of a loop.
@@ -118,6 +120,13 @@ class Margins:
             where = str(self.extent) if everywhere else "in the middle and at the end of the travel"
             lines += [f"uncertainty: {box}", f"{f'robust {where}'.rstrip()}: {self.robust}"]
         return "\n".join(lines)
+
+    @property
+    def description(self) -> Description:
+        """The sentences of `str`."""
+        first, *rest = str(self).splitlines()
+        parts = (line.partition(": ") for line in rest)
+        return Description(f"Margins: {first}", tuple((label, text) for label, _, text in parts))
 
 
 BANDWIDTHS = {

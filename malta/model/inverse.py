@@ -56,6 +56,9 @@ class InverseCheck:
         """Whether every command was made within rounding."""
         return all(m.share <= EXACT for m in self.mismatches)
 
+    def __repr__(self) -> str:
+        return str(self)
+
     def __str__(self) -> str:
         word = "is" if self.exact else "is not"
         along = ", ".join(m.state.name for m in self.mismatches)

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Protocol
 import casadi as ca
 import numpy as np
 
+from malta.display import Description, display, quantity
 from malta.errors import InputError
 from malta.model.checks import DEFAULT, defaults
 from malta.model.drive import CasadiFn, Drive, Electronics
@@ -111,6 +112,7 @@ class Actuator:
         return require_short("machine", "dead time", max(0, round(self.dead_time / Ts - 0.5)))
 
 
+@display
 @dataclass(frozen=True, eq=False)
 class Plant:
     """A machine: equations of motion that CasADi can trace, and the names and units of its signals. SI.
@@ -385,6 +387,21 @@ class Plant:
             if not np.isfinite(x[names.index(name)]):
                 raise InputError(self.name, name, repr(value), "a finite number")
         return x
+
+    @property
+    def description(self) -> Description:
+        """Its signals, travel and limits."""
+        names = {"states": self.states, "inputs": self.inputs, "outputs": self.outputs}
+        rows = [(kind, " ".join(signal.name for signal in signals)) for kind, signals in names.items()]
+        rows.append(("disturbances", " ".join(signal.name for signal in self.disturbances)))
+        if self.has_stroke:
+            rows.append(("stroke", f"{self.stroke}, {quantity(self.travel, 'm')} either way"))
+        rows.append(("contacts", " ".join(self.contacts) or "none"))
+        limits = (
+            quantity(limit, s.unit) for limit, s in zip(self.actuator.force_limit, self.inputs, strict=False)
+        )
+        rows += [("limits", ", ".join(limits)), ("current limit", quantity(self.actuator.current_limit, "A"))]
+        return Description(f"Plant {self.name!r}, preset {self.parameters.preset!r}", tuple(rows))
 
 
 def position_in(plant: Plant, x: ArrayLike) -> float:

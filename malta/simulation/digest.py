@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import casadi as ca
 import numpy as np
 
+from malta.display import Description, display
 from malta.model.plant import Plant, readonly
 from malta.simulation.layout import flatten, layout_of, numbers_of
 from malta.simulation.noise import TOGETHER
@@ -21,6 +22,7 @@ LEVELS = (0.1, 0.9)  # shares of a stroke between which its rise is measured
 LARGEST_FIGURE = 1e30  # of a run that was completed, SI
 
 
+@display
 @dataclass(frozen=True, eq=False)
 class Batch:
     """Figures of each run of a batch, a row for each. SI.
@@ -62,6 +64,16 @@ class Batch:
     def __post_init__(self) -> None:
         for name in self.__dataclass_fields__:
             object.__setattr__(self, name, readonly(getattr(self, name)))
+
+    @property
+    def description(self) -> Description:
+        """The ends of its runs, and their largest figures."""
+        ranges = {name: np.asarray(getattr(self, name)) for name in ("deviation", "rms", "force", "contact")}
+        rows = [("completed", f"{int(self.completed.sum())} of {len(self.completed)} runs")]
+        for name, values in ranges.items():
+            if values.size:
+                rows.append((f"largest {name}", " ".join(f"{x:.3g}" for x in values.max(axis=0))))
+        return Description(f"Batch of {len(self.completed)} runs, SI", tuple(rows))
 
 
 def verdicts(plant: Plant) -> tuple[str, ...]:

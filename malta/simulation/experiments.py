@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from malta.display import Description, display
 from malta.errors import InputError
 from malta.identifiers import identifier
 from malta.model.machines import attribute_of
@@ -72,6 +73,7 @@ class PlannedRun(NamedTuple):
     merits: Callable[[Trajectory], tuple[Merit, ...]]
 
 
+@display
 @dataclass(frozen=True, eq=False)
 class Experiment:
     """The result of an experiment.
@@ -136,6 +138,14 @@ class Experiment:
         if len(self.cases) == 1:
             return verdicts[0]
         return f"{len(ends)} of {len(self.cases)} runs not completed ({ends[0].label}: {verdicts[0]})"
+
+    @property
+    def description(self) -> Description:
+        """How it ended, and the figures of merit of the whole and of each run."""
+        own = self.merits if len(self.cases) > 1 else ()
+        rows = [("in all", "; ".join(map(str, own)))] if own else []
+        rows += [(case.label, "; ".join(map(str, case.merits))) for case in self.cases]
+        return Description(f"Experiment {self.name!r}: {self.outcome}", tuple(rows))
 
 
 def scenario_of(

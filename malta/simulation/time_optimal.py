@@ -31,6 +31,7 @@ from scipy.integrate import solve_ivp
 from scipy.interpolate import BPoly, PPoly
 from scipy.optimize import brentq
 
+from malta.display import Curves, Description, display, quantity
 from malta.errors import CheckError, InputError
 from malta.model.plant import Plant, readonly
 from malta.simulation import references
@@ -46,6 +47,7 @@ TOLERANCE = 1e-3  # of a state's range and of the current limit, between the nod
 IPOPT = {"print_level": 0, "sb": "yes", "max_iter": 500, "mu_strategy": "adaptive"}
 
 
+@display
 @dataclass(frozen=True, eq=False)
 class FastestStroke:
     """A stroke at the nodes of its mesh, at rest at the first and at the last node; u is linear between nodes."""
@@ -95,6 +97,26 @@ class FastestStroke:
         """The time (s) at which the mover reaches a share of the travel."""
         level = self.z[0] + share * (self.z[-1] - self.z[0])
         return float(self.path.solve(level, extrapolate=False)[0])
+
+    @property
+    def description(self) -> Description:
+        """Its duration and its largest speed, acceleration, current and voltage."""
+        units = {"v": "m/s", "a": "m/s2", "i": "A", "u": "V"}
+        rows = [
+            ("rise, 10-90 %", quantity(self.rise, "s")),
+            ("travel", quantity(self.z[-1] - self.z[0], "m")),
+        ]
+        rows += [
+            (f"largest {name}", quantity(float(np.abs(getattr(self, name)).max()), unit))
+            for name, unit in units.items()
+        ]
+        curves = Curves(
+            self.t,
+            "time [s]",
+            {"z": self.z / self.z[-1], "i": self.i / np.abs(self.i).max()},
+            "share of the largest [1]",
+        )
+        return Description(f"FastestStroke of {quantity(self.duration, 's')}", tuple(rows), curves)
 
 
 @dataclass(frozen=True)

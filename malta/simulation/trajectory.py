@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import casadi as ca
 import numpy as np
 
+from malta.display import Curves, Description, display, quantity
 from malta.files import replace_files
 from malta.model.plant import Plant, Signal, readonly
 from malta.simulation.engines import evaluate
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     from malta.model.plant import FloatArray
 
 
+@display
 @dataclass(frozen=True, eq=False)
 class Trajectory:
     """Labelled time series of a run, one row a sample, up to the verdict. SI.
@@ -129,6 +131,28 @@ class Trajectory:
         symbol = ca.SX.sym("i", len(constants))
         axes = ca.Function("axes", [symbol], [ca.densify(drive.command(symbol))])
         return evaluate(axes.map(len(self.force)), self.force / constants)[0]
+
+    @property
+    def description(self) -> Description:
+        """How it ended, the largest deviations, forces and shares of clearances."""
+        plant, Ts = self.plant, self.controller.sample_time
+        off = self.p - self.reference
+        rows = [("ended", f"{self.verdict.name} at {quantity(self.verdict.time, 's')}, {self.engine}")]
+        for k, signal in enumerate(plant.outputs):
+            sizes = (
+                np.abs(off[:, k]).max(initial=0.0),
+                math.sqrt((off[:, k] ** 2).mean()) if len(off) else 0.0,
+            )
+            largest, rms = (quantity(float(size), signal.unit) for size in sizes)
+            rows.append((f"p - p* of {signal.name}", f"{largest} at most, {rms} rms"))
+        closest = float(self.contact.max(initial=0.0))
+        rows += [("nearest contact", f"{100 * closest:.3g} % of a clearance")] if plant.contacts else []
+        rows.append(("limits reached", ", ".join(self.limits) or "none"))
+        size = np.abs(off).max(axis=0, initial=0.0)
+        shown = {s.name: off[:, k] / (size[k] or 1.0) for k, s in enumerate(plant.outputs)}
+        curves = Curves(self.t, "time [s]", shown, "(p - p*) / its largest [1]")
+        title = f"Trajectory of {self.controller.name!r} in {self.scenario.name!r}: {len(self.t)} samples"
+        return Description(f"{title} of {quantity(Ts, 's')}", tuple(rows), curves)
 
 
 SERIES = (

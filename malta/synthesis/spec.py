@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
+from malta.display import Description, display, quantity
 from malta.errors import InputError
 from malta.model.data import plant_of
 from malta.model.plant import Plant, Signal, readonly
@@ -195,6 +196,7 @@ class Variable(NamedTuple):
     unit: str  # of low and high, as the file will hold it
 
 
+@display
 @dataclass(frozen=True, eq=False)
 class Spec:
     """A design file, read and checked. SI.
@@ -322,6 +324,18 @@ class Spec:
         si = float(np.asarray(getattr(self.law, field))[index])
         si = math.sqrt(si) if squared else si
         return si if unit == "1" else si / to_si(1.0, variable.unit, unit, self.path, variable.name)
+
+    @property
+    def description(self) -> Description:
+        """Its machine, its law and what is asked of it."""
+        rows = [("machine", f"{self.plant.name}, preset {self.parameters.preset!r}")]
+        kind = "PID" if self.pid else f"LQG, {self.discretization}"
+        rows.append(("law", f"{kind}, every {quantity(self.sample_time, 's')}, delay {self.delay}"))
+        box = ", ".join(f"{name} +-{100 * share:g} %" for name, share in self.uncertainty.items())
+        rows.append(("uncertainty", box or "none"))
+        asked = ", ".join(f"{name} {value:g}" for name, value in self.specification.items())
+        rows += [("specification", asked or "none"), ("sha256", self.sha256[:12])]
+        return Description(f"Spec {self.name!r} of {self.path.name}", tuple(rows))
 
 
 def pid_signals(plant: Plant, axes: PidAxes = "decentralized") -> dict[str, list[Signal]]:

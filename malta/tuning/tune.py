@@ -11,6 +11,7 @@ import json
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING
 
+from malta.display import Description, display
 from malta.errors import InputError
 from malta.model.parameters import describe
 from malta.tuning import corners, lqg, pid
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     from malta.tuning.search import Progress, Trial
 
 
+@display
 @dataclass(frozen=True, eq=False)
 class Tuned:
     """What a search found."""
@@ -44,6 +46,13 @@ class Tuned:
     def binding(self) -> Outcome:
         """What is nearest to its limit, or furthest beyond it."""
         return max(self.requirements, key=lambda r: r.ratio)
+
+    @property
+    def description(self) -> Description:
+        """What was asked for, and what was found."""
+        rows = tuple((outcome.verdict, str(outcome)) for outcome in self.requirements)
+        word = "reached" if self.reached else "not reached"
+        return Description(f"Tuned {self.spec.name!r} in {self.trials} trials: {word}", rows)
 
 
 def tune(

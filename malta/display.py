@@ -1,0 +1,121 @@
+"""How a result shows itself: a title and some rows, as ten lines of text or as a table with a curve in a notebook."""
+
+from __future__ import annotations
+
+import html
+import io
+import math
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, TypeVar
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    FloatArray = NDArray[np.floating[Any]]
+
+LINES = 10  # of text, the title's included
+COLUMNS = 80
+PREFIXES = {-4: "p", -3: "n", -2: "u", -1: "m", 0: "", 1: "k", 2: "M", 3: "G"}
+PREFIXED = ("m", "rad", "s", "N", "A", "V", "W", "Hz", "N m")
+
+
+class Curves(NamedTuple):
+    """A small figure: curves over one axis, both with their units."""
+
+    x: FloatArray
+    x_label: str
+    y: Mapping[str, FloatArray]  # by name, as long as x
+    y_label: str
+    logarithmic: bool = False  # both axes
+
+
+class Description(NamedTuple):
+    """What a result says of itself: a sentence, figures with their units, and perhaps curves.
+
+    >>> print(Description("A ball, at rest", (("mass", "20 g"), ("gap", "8 mm"))))
+    A ball, at rest
+      mass  20 g
+      gap   8 mm
+    """
+
+    title: str
+    rows: tuple[tuple[str, str], ...] = ()
+    curves: Curves | None = None
+
+    def __str__(self) -> str:
+        shown = self.rows if len(self.rows) < LINES else self.rows[: LINES - 2]
+        width = max((len(label) for label, _ in shown), default=0)
+        lines = [self.title, *(f"  {label:{width}}  {value}".rstrip() for label, value in shown)]
+        if len(shown) < len(self.rows):
+            lines.append(f"  and {len(self.rows) - len(shown)} more")
+        return "\n".join(line if len(line) <= COLUMNS else f"{line[: COLUMNS - 3]}..." for line in lines)
+
+    @property
+    def html(self) -> str:
+        """A table of all rows, and the curves as SVG."""
+        rows = "".join(
+            f"<tr><th style='text-align:left'>{html.escape(label)}</th>"
+            f"<td style='text-align:left'>{html.escape(value)}</td></tr>"
+            for label, value in self.rows
+        )
+        picture = "" if self.curves is None else svg(self.curves)
+        return f"<div><p><b>{html.escape(self.title)}</b></p><table>{rows}</table>{picture}</div>"
+
+
+class Described(Protocol):
+    """A record that can say what it is."""
+
+    @property
+    def description(self) -> Description: ...
+
+
+T = TypeVar("T", bound=Described)
+
+
+def display(record: type[T]) -> type[T]:
+    """Let a record print as its description: `repr` in a terminal, a table in a notebook. A decorator of classes."""
+
+    def text(self: T) -> str:
+        return str(self.description)
+
+    def table(self: T) -> str:
+        return self.description.html
+
+    record.__repr__ = text  # type: ignore[assignment,method-assign]
+    record._repr_html_ = table  # type: ignore[attr-defined]
+    return record
+
+
+def quantity(value: float, unit: str) -> str:
+    """A value in SI with three digits and a prefix of its unit.
+
+    >>> quantity(13.4e-6, "m"), quantity(0.36, "kg"), quantity(2, "1")
+    ('13.4 um', '0.36 kg', '2')
+    """
+    prefix = ""
+    if unit in PREFIXED and math.isfinite(value) and value:
+        power = math.floor((math.log10(abs(value)) + 1e-9) / 3)
+        if power in PREFIXES and (unit != "rad" or power < 0):
+            value, prefix = value / 1000.0**power, PREFIXES[power]
+    return f"{value:.3g}" + ("" if unit == "1" else f" {prefix}{unit}")
+
+
+def svg(curves: Curves) -> str:
+    """The curves as an SVG element: lines that differ in grey and dashes, axes with units."""
+    from matplotlib.figure import Figure  # here: few results are shown in a notebook
+
+    figure = Figure(figsize=(5.5, 2.4), layout="constrained")
+    axes: Any = figure.add_subplot()
+    dashes = ("-", "--", "-.", ":")
+    for k, (name, y) in enumerate(curves.y.items()):
+        grey = str(0.6 * (k % 3) / 2)
+        axes.plot(curves.x, y, dashes[k % len(dashes)], color=grey, linewidth=1, label=name)
+    if curves.logarithmic:
+        axes.set(xscale="log", yscale="log")
+    axes.set(xlabel=curves.x_label, ylabel=curves.y_label)
+    axes.grid(visible=True, color="0.9")
+    axes.legend(fontsize=8, loc="center left", bbox_to_anchor=(1, 0.5))
+    file = io.StringIO()
+    figure.savefig(file, format="svg")
+    return file.getvalue().partition("\n<svg")[2].join(("<svg", ""))
