@@ -7,6 +7,7 @@ import io
 import re
 import tokenize
 from collections.abc import Iterator
+from functools import cache
 from graphlib import TopologicalSorter
 from pathlib import Path
 
@@ -49,9 +50,15 @@ def module_of(path: Path) -> str:
 MODULES = {module_of(path) for path in SOURCES}
 
 
+@cache
+def tree_of(path: Path) -> ast.Module:
+    """A module's syntax."""
+    return ast.parse(path.read_text(encoding="utf-8"))
+
+
 def imports(path: Path, *, at_load: bool = False) -> Iterator[str]:
     """The modules of malta that a module imports; at_load: those that it imports when it is imported itself."""
-    for node in statements(ast.parse(path.read_text(encoding="utf-8")), at_load=at_load):
+    for node in statements(tree_of(path), at_load=at_load):
         if isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] == "malta":
             for alias in node.names:
                 whole = f"{node.module}.{alias.name}"
@@ -115,7 +122,7 @@ def test_machines_know_nothing_of_each_other() -> None:
 def words_of_code(path: Path) -> Iterator[str]:
     """Names and texts of a module, without comments and docstrings."""
     text = path.read_text(encoding="utf-8")
-    tree = ast.parse(text)
+    tree = tree_of(path)
     documented = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
     docstrings = {
         node.body[0].lineno

@@ -203,6 +203,7 @@ def test_compliance_of_the_flagship_in_its_travel() -> None:
     assert 0.9 * m.lower < worst <= m.upper
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [2, pytest.param(3, marks=pytest.mark.slow)])
 def test_several_blocks_beside_parameters(count: int) -> None:
     """No random machine and no Delta within the proven set comes to det(1 - M Delta) = 0; the witness does."""

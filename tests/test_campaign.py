@@ -121,6 +121,7 @@ def test_machines_lie_in_the_box(
     assert np.array_equal(draw_machines(again).values, found.values)
 
 
+@pytest.mark.slow
 def test_a_latin_hypercube_has_one_machine_in_each_row_and_column(controller: Controller) -> None:
     plan = _plan(controller, 100)
     found = draw_machines(plan)
@@ -756,6 +757,7 @@ def test_figures_have_units_and_published_bounds(shaky: Controller, published: d
     assert any(text.startswith(f"run {found.index[worst_of(found, 1)[0]]}\n") for text in texts)
 
 
+@pytest.mark.slow
 def test_figures_and_tables_of_little_are_drawn(
     shaky: Controller, published: dict[str, Any], tmp_path: Path
 ) -> None:
@@ -773,6 +775,7 @@ def test_figures_and_tables_of_little_are_drawn(
         assert_folds(tables, 80, 60, 40)
 
 
+@pytest.mark.slow
 def test_the_same_campaign_gives_the_same_pictures(controller: Controller, tmp_path: Path) -> None:
     found = campaign(_plan(controller, 16))
     for name in ("a", "b"):

@@ -62,6 +62,7 @@ def test_a_campaign_is_shown_kept_and_read_again(run: Run, tmp_path: Path) -> No
     assert {path: path.stat().st_mtime_ns for path in tmp_path.glob("*.npz")} == before
 
 
+@pytest.mark.slow
 def test_json_holds_what_the_table_shows(run: Run, tmp_path: Path) -> None:
     code, out, _ = run(
         "campaign", SHAKY, "--samples", "64", "--spread", "60%", "--worst", "3", "--out", tmp_path, "--json"
@@ -311,6 +312,7 @@ def test_without_a_compiler_it_says_so(run: Run, tmp_path: Path, monkeypatch: py
     assert "no C compiler" in _sentence(err)
 
 
+@pytest.mark.slow
 def test_help_shows_an_example_and_no_cluster_is_imported() -> None:
     result = CliRunner().invoke(cli.app, ["campaign", "--help"])
     assert result.exit_code == 0

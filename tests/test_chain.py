@@ -73,6 +73,7 @@ def _sampled(name: str, z: float = 0.0) -> tuple[UncertainSystem, Compensator]:
     return uncertain(plant, list(BOX), at={"z": z}), machine_law(plant, c, "lag")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CHAINED)
 def test_margins_go_where_the_chain_says(name: str) -> None:
     found = chain_of(name)
@@ -270,6 +271,7 @@ def test_the_last_stage_is_the_machine_of_verify(name: str) -> None:
     assert found.places[0].peak == pytest.approx(largest, rel=1e-6)  # the middle
 
 
+@pytest.mark.slow
 def test_cogging_that_is_stiffer_than_the_axial_loop_shows() -> None:
     """table2: |S| of z is 1.3 without its loads and 36 with them; the places where v0(z) misfits are unstable."""
     c = gains.read("design/gains/table2.json")
@@ -284,6 +286,7 @@ def test_cogging_that_is_stiffer_than_the_axial_loop_shows() -> None:
     assert robustness(quiet, smooth, BOX, proof=False).chain[-1].peak == pytest.approx(6.93, abs=0.02)
 
 
+@pytest.mark.slow
 def test_force_constants_that_the_controller_does_not_know() -> None:
     """--set K_B: the last stage peaks as verify's machine, which has the slope of its loads too."""
     c = gains.read("design/gains/calibrated.json")

@@ -281,6 +281,7 @@ def test_the_verdict_of_several_designs() -> None:
     assert bound(0.5, 2.0) == "a: smaller, x 2.0; b: not reproduced: larger, x 2.0"
 
 
+@pytest.mark.slow
 def test_a_claim_shows_its_figures(found: Found, published: dict[str, Any]) -> None:
     values = iter([16.2e-3, math.nan, 17e-3, 17e-3])
 

@@ -121,6 +121,7 @@ except SystemExit as ended:
     assert "Usage: " in done.stdout
 
 
+@pytest.mark.slow
 def test_a_simulation_imports_what_it_needs_alone() -> None:
     """Modules that take long to import stay out of the commands that do without them."""
     program = """
@@ -196,6 +197,7 @@ def test_design_names_each_file_on_a_line_of_its_own(designed: tuple[Path, str])
     assert sorted(wrote) == sorted(str(path) for path in folder.rglob("*") if path.is_file())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("summary", ["word " * 60, "w" * 250])
 def test_long_texts_are_wrapped_and_paths_are_not(run: Run, tmp_path: Path, summary: str) -> None:
     file = project(tmp_path, (SUMMARY, f"{SUMMARY}{summary}"))
@@ -224,6 +226,7 @@ def test_design_as_json_holds_finite_numbers(run: Run, tmp_path: Path) -> None:
     assert [Path(file).is_file() for file in result["files"]] == [True] * 4
 
 
+@pytest.mark.slow
 def test_design_without_names_takes_the_folder(
     run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -337,6 +340,7 @@ def test_numbers_that_no_gain_file_may_have_are_those_of_the_design(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_gains_are_replaced_by_a_design_that_ends_well_and_by_no_other(run: Run, tmp_path: Path) -> None:
     """The regulator without integrals, of which the page prints the poles, has no solution here."""
     names = ("x", "y", "z", "alpha", "beta")
@@ -359,6 +363,7 @@ def test_two_designs_of_one_name_do_not_overwrite_each_other(run: Run, tmp_path:
     assert gains.read(tmp_path / "design" / "gains" / "table2.json").sample_time == 50e-6
 
 
+@pytest.mark.slow
 def test_bad_design_file_does_not_stop_the_others(run: Run, tmp_path: Path) -> None:
     bad = project(tmp_path, (TS, 'sample_time = { value = 50, unit = "um" }'))
     options = ("--json", "--out", tmp_path / "gains", "--figures", tmp_path / "figures")
@@ -389,6 +394,7 @@ def test_verify_prints_poles_bandwidths_and_sensitivities(run: Run) -> None:
     assert max(map(len, out.splitlines())) <= WIDTH
 
 
+@pytest.mark.slow
 def test_all_forms_of_a_gain_file_verify_alike(run: Run) -> None:
     results = []
     for suffix in ("json", "npz", "mat"):
@@ -409,6 +415,7 @@ def test_verify_of_an_unstable_machine_fails_after_printing(run: Run) -> None:
     assert all(math.isfinite(number) for number in numbers(result["poles_rad_per_s"]))
 
 
+@pytest.mark.slow
 def test_verify_counts_the_force_constants_of_the_machine(run: Run) -> None:
     code, out, err = run("verify", TABLE2, "--set", "K_B=2.6", "--uncertain", "K_B=20%")
     assert code == 1
@@ -468,6 +475,7 @@ def test_what_the_paper_does_not_print_is_not_shown(
     assert "published, without a definition" not in out
 
 
+@pytest.mark.slow
 def test_verify_of_a_changed_machine_says_so(run: Run) -> None:
     code, out, _ = run("verify", CALIBRATED, "--set", "m=0.56", "--set", "l_B=45mm", "--no-proof")
     assert code == 0
@@ -582,6 +590,7 @@ def test_the_scenarios_of_the_machine_are_listed(run: Run) -> None:
     assert "radius=0.0002 m" in out
 
 
+@pytest.mark.slow
 def test_options_of_a_scenario_come_with_their_units(run: Run) -> None:
     def lifted(masses: str) -> dict[str, Any]:
         code, out, err = run("simulate", CALIBRATED, "--json", "--scenario", "payload", "--option", masses)
@@ -678,6 +687,7 @@ def test_ctrl_c_leaves_what_was_computed(run: Run, tmp_path: Path, monkeypatch: 
     assert "measured x1, std" in out
 
 
+@pytest.mark.slow
 def test_claims_prints_the_ledger(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     """As a table, as JSON and as Markdown; it is computed once, as nothing but its form differs."""
     monkeypatch.setattr("malta.machines.tubular.evidence.MACHINES", 64)
@@ -848,6 +858,7 @@ def test_wrong_usage_names_the_option(run: Run, arguments: str, named: str) -> N
 # --- as a program ---
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "code", "lines"),
     [

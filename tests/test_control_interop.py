@@ -327,6 +327,7 @@ def test_an_h_infinity_controller_in_a_campaign(h_infinity: Controller) -> None:
     assert 1e-8 < found.batch.rms.min() < found.batch.rms.max() < 1e-6
 
 
+@pytest.mark.slow
 def test_a_law_of_errors_is_the_law_of_states_at_rest(
     plant: Plant, model: LinearModel, table2: Controller
 ) -> None:

@@ -143,6 +143,7 @@ def test_the_references_of_lagging_forces_are_what_the_model_makes_of_the_comman
     np.testing.assert_allclose(lagging_references(c, v), found, atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("estimator", ["steady-state", "kalman", "extended"])
 def test_a_stroke_goes_as_with_the_flagship(made: Made, estimator: str) -> None:
     """The references of all states follow the stroke: what is left is cogging and gravity's coupling."""

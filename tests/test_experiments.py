@@ -373,6 +373,7 @@ def test_the_current_that_lifts_is_what_statics_need(plant: Plant, par: Any) -> 
     assert lifting.break_away_current(free, down) == pytest.approx(par.m * par.g / (2 * par.K_B))
 
 
+@pytest.mark.slow
 def test_every_estimator_lifts_the_mover(design: Design, flown: Flown) -> None:
     found = flown(design.spec.name, "lift-off")
     assert tuple(case.label for case in found.cases) == ESTIMATORS

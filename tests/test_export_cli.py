@@ -78,6 +78,7 @@ def test_export_writes_an_fmu(run: Run, tmp_path: Path, part: str, fmi: str) -> 
     assert any(name.endswith("_controller.c") for name in sources_of), sorted(names)
 
 
+@pytest.mark.slow
 def test_json_lists_the_files(run: Run, tmp_path: Path) -> None:
     code, out, err = run("export", GAINS, "--out", tmp_path / "c", "--json")
     assert (code, err) == (0, "")
@@ -175,6 +176,7 @@ def test_what_cannot_fly_is_a_sentence(run: Run, arguments: tuple[str, ...], sen
     assert sentence in one_sentence(err)
 
 
+@pytest.mark.slow
 def test_without_a_compiler_the_c_does_not_fly(
     run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -186,6 +188,7 @@ def test_without_a_compiler_the_c_does_not_fly(
     assert run("export", GAINS, "--out", tmp_path / "c")[0] == 0  # the folder needs none
 
 
+@pytest.mark.slow
 def test_a_machine_that_changes_keeps_its_controller() -> None:
     """Mass and reference change on the way, samples are lost: still the simulation's law to 1e-12."""
     if compiled.compiler() is None:
@@ -215,6 +218,7 @@ def test_a_machine_that_changes_keeps_its_controller() -> None:
     assert np.abs(own.p - own.reference).max() > 1e-6
 
 
+@pytest.mark.slow
 def test_names_of_other_files_and_targets_are_left_to_them(tmp_path: Path) -> None:
     """Headers of C's library beside an include folder, and a target that CMake has itself."""
     assert [c_name(name) for name in ("limits", "Features", "time", "test")] == [

@@ -118,6 +118,7 @@ def test_malta_against_the_sigmoid_of_the_same_current(
     assert sigmoid.voltage == pytest.approx(12.81, rel=1e-3)  # of 22.5 V: the winding does not limit it
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("distance", [DISTANCE, 25e-3])
 def test_shooting_on_switching_times_takes_as_long(par: tubular.Parameters, distance: float) -> None:
     ideal = shooting(par, distance)
@@ -140,6 +141,7 @@ def test_without_resistance_the_closed_form(smooth: Plant, period: float) -> Non
     assert np.abs(stroke.v).max() == pytest.approx(a * t_a, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_bang_bang_is_the_limit_of_an_ideal_drive(smooth: Plant, par: tubular.Parameters) -> None:
     limit = bang_bang(smooth)
     excess = []
@@ -197,6 +199,7 @@ def test_backwards_is_the_mirror_image(smooth: Plant, par: tubular.Parameters, s
     assert abs(there.duration / stroke.duration - 1) > 1e-2
 
 
+@pytest.mark.slow
 def test_the_limits_hold_between_the_nodes_too(
     plant: Plant, par: tubular.Parameters, stroke: FastestStroke
 ) -> None:

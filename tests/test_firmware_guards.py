@@ -65,6 +65,7 @@ def write_files(files: dict[str, str], folder: Path) -> list[Path]:
     return sorted(path for path in paths if path.suffix == ".c")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cc", COMPILERS)
 @pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize("name", ["halbach", pytest.param("robust", marks=pytest.mark.slow)])

@@ -36,6 +36,7 @@ def checksum(printed: str) -> str:
     return found[1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("precision", SOME)
 @pytest.mark.parametrize("name", NAMES)
 def test_every_processor_computes_the_same_bits(name: str, precision: Precision, tmp_path: Path) -> None:
@@ -100,6 +101,7 @@ def test_no_library_is_called(name: str, precision: Precision, tmp_path: Path) -
         assert not [s for s in undefined if not s.startswith(("__aeabi_", f"{name}_"))]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("precision", SOME)
 @pytest.mark.parametrize("name", NAMES)
 def test_sanitizers_find_nothing(name: str, precision: Precision, tmp_path: Path) -> None:

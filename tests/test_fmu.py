@@ -243,6 +243,7 @@ def test_sensors_with_lag_dead_time_and_offsets_are_part_of_the_machine(
     assert np.abs(run.p - ideal.p[: len(run.p)]).max() > 1e-7
 
 
+@pytest.mark.slow
 def test_a_wrench_and_another_start_act_as_simulated(instance: Callable[..., Unit]) -> None:
     t = target("robust")
     push = np.array([0.0, 2.0, 0.0, 0.0, 0.01, 0.0])
@@ -268,6 +269,7 @@ def test_a_wrench_and_another_start_act_as_simulated(instance: Callable[..., Uni
     assert far < 1e-12
 
 
+@pytest.mark.slow
 def test_a_master_that_steps_both_at_once_makes_the_delay_itself(instance: Callable[..., Unit]) -> None:
     """With late = 0: commands act one sample after they are computed, as they do with late = 1 one after the other."""
     t = target("robust")
@@ -358,6 +360,7 @@ def test_validation_finds_nothing(
         assert causalities["w.T_z"] == ("input", "continuous", "N m")
 
 
+@pytest.mark.slow
 def test_the_same_gain_file_gives_the_same_bytes() -> None:
     t, other = target("halbach"), target("halbach_late")
     again = build_fmu(Target(t.controller, "double", t.fidelity), SHA256, part="loop", fmi=2)

@@ -797,6 +797,7 @@ def damaged(content: bytes, changes: Damage) -> bytes:
     return bytes(data)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", SUFFIXES)
 @settings(max_examples=500, deadline=None, derandomize=True)
 @given(changes=damage)

@@ -87,6 +87,7 @@ def found(e: Experiment, case: int | str, label: str) -> float:
 # Designs
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", DESIGNS)
 def test_gain_files_are_of_their_design_files(evidence: Mapping[str, Evidence], name: str) -> None:
     made, read = evidence[name].controller, controller_of(name)
@@ -357,6 +358,7 @@ def test_100_times_faster_than_the_motor() -> None:
 # The ledger
 
 
+@pytest.mark.slow
 def test_every_row_of_the_ledger_has_its_verdict(
     evidence: Mapping[str, Evidence], printed: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -498,6 +500,7 @@ def test_bad_options_are_refused_in_one_sentence(name: str, options: dict[str, A
 GAINS = "design/gains/halbach.json"
 
 
+@pytest.mark.slow
 def test_design_makes_the_shipped_gain_files(run: Run, tmp_path: Path) -> None:
     designs = [f"design/{name}.toml" for name in DESIGNS]
     said = run("design", *designs, "--out", tmp_path, "--figures", tmp_path)
@@ -541,6 +544,7 @@ def test_verify(run: Run) -> None:
     assert "Peak sensitivity" in said.out
 
 
+@pytest.mark.slow
 def test_claims(run: Run) -> None:
     said = run("claims", "design/halbach.toml", "--markdown")
     assert said.code == 0

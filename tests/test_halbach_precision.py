@@ -78,6 +78,7 @@ def test_the_working_point_of_the_paper_is_far_from_the_ends(par: Parameters) ->
         )
 
 
+@pytest.mark.slow
 def test_the_ends_cost_eight_times_in_place_and_a_hundred_times_in_force(par: Parameters) -> None:
     """At 14.45 N. A phase near its limit makes the vertical force, so the place is hardly off: 90 nm, not 2.5 um."""
     places = np.linspace(0, math.pi / 3 / par.k, 1001)

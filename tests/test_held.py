@@ -362,6 +362,7 @@ def test_margins_count_what_holding_costs() -> None:
         assert (radius < 1) == stable
 
 
+@pytest.mark.slow
 def test_coil_positions_make_waves_and_get_an_answer_in_time() -> None:
     plant, c = _plant("planar"), _controller("planar", 1)
     system, law = machine_system(plant, c, ["coil_pitch"], {"y": 0.0})
@@ -371,6 +372,7 @@ def test_coil_positions_make_waves_and_get_an_answer_in_time() -> None:
     assert found.lower is not None or found.reason
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "box",
     [

@@ -146,6 +146,7 @@ def test_lags_multiply_the_transfer_function(n: int, p: int, seed: int) -> None:
     np.testing.assert_allclose(found, short / (np.array(lag)[:, None] * s + 1), rtol=1e-6, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_stability_is_lost_at_the_lag_that_the_linear_loop_says(controller: Any) -> None:
     """The spectral radius crosses 1 at some lag; the simulated machine rings below it and touches down beyond it."""
     critical = brentq(lambda tau: radius(late(controller, tau_s=tau), controller) - 1, 1e-5, 5e-3, rtol=1e-4)
@@ -179,6 +180,7 @@ def test_the_proven_loop_is_the_loop_that_is_verified(controller: Any) -> None:
     assert system.matrices.size1_out(0) == 10 + 4 + 5
 
 
+@pytest.mark.slow
 def test_a_lag_costs_margin_and_the_proof_has_it(controller: Any) -> None:
     box = {"K_A": 0.2, "K_B": 0.2}
     prompt, slow = (travel_margin(late(controller, tau_s=tau), controller, box) for tau in (0.0, 3e-4))
@@ -232,6 +234,7 @@ def test_a_search_refuses_sensors_that_read_late() -> None:
 # --- command line ---
 
 
+@pytest.mark.slow
 def test_verify_takes_the_lag_and_refuses_parts_of_a_sample(run: Run) -> None:
     said = run("verify", GAINS, "--set", "tau_s=0.2ms", "--no-proof", "--json")
     assert said.code == 0, said.err

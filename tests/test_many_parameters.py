@@ -185,6 +185,7 @@ def test_multipliers_of_another_structure_are_not_taken() -> None:
     assert taken
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("n", "T", "t"),
     [
@@ -203,6 +204,7 @@ def test_chains_are_stable_where_it_is_proven(n: int, T: float | None, t: float)
     assert stable_within(loop, s.box, t)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("n", "T", "t", "lost"),
     [
@@ -253,6 +255,7 @@ def test_multipliers_that_move_with_frequency_exclude_zero_all_along_it() -> Non
     assert widths[0] >= 2 * widths[1]
 
 
+@pytest.mark.slow
 def test_a_proof_goes_on_where_time_ended_it() -> None:
     loop = chain(2, None)
     whole, parts = asked(loop), asked(loop)

@@ -59,6 +59,7 @@ def test_restrictions_along_all_axes_are_those_along_each() -> None:
     assert np.abs(whole - each).max() < 1e-13
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sample_time", [None, 1e-2])
 def test_another_law_of_the_same_plant_has_the_margin_that_it_has_alone(sample_time: float | None) -> None:
     """What is kept of a plant at places and on discs is no part of the compensator, its lag or its delay."""

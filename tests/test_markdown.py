@@ -88,6 +88,7 @@ def test_a_title_is_of_the_second_or_third_order() -> None:
     assert [place.machine for place in find_tables(higher, "a.md")] == ["tubular", "halbach"]
 
 
+@pytest.mark.slow
 def test_the_command_writes_the_file(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("malta.machines.tubular.evidence.MACHINES", 64)
     file = tmp_path / "claims.md"

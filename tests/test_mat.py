@@ -111,6 +111,7 @@ TABLES = st.recursive(
 )
 
 
+@pytest.mark.slow
 @settings(max_examples=40, deadline=None)
 @given(content=st.dictionaries(NAMES, TABLES, min_size=1, max_size=4), compressed=st.booleans())
 def test_whatever_scipy_writes_is_read_as_scipy_reads_it(
@@ -375,6 +376,7 @@ def _is_read(path: Path) -> bool:
         return not (error.found.startswith("a damaged or foreign file (") and str(error).isprintable())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", EDITS)
 @pytest.mark.parametrize("compressed", [False, True])
 def test_an_edited_file_is_read_or_refused(
@@ -398,6 +400,7 @@ def test_an_edited_file_is_read_or_refused(
     assert peak < 10 * len(SMALL.read_bytes())
 
 
+@pytest.mark.slow
 def test_edited_files_that_are_read_are_read_as_scipy_reads_them(tmp_path: Path) -> None:
     """In a process of its own, which scipy may crash: it does on files that are refused here."""
     data, accepted = SMALL.read_bytes(), 0

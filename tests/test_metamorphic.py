@@ -48,6 +48,7 @@ def test_masses_may_stand_in_E(mass: float) -> None:
     assert there.lower == pytest.approx(divided.lower, rel=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("unit", [1e-6, 1.0, 1e6])
 def test_an_uncertain_mass_in_E(unit: float) -> None:
     """The mass is a parameter of E, whose determinant every bound carries, in any unit."""

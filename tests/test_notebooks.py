@@ -64,6 +64,7 @@ def test_there_are_notebooks() -> None:
     assert [n.name for n in NOTEBOOKS][:3] == ["00_your_machine.py", "01_model.py", "02_lqg.py"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "notebook",
     [pytest.param(n, marks=SLOW.get(n.stem, []), id=n.stem) for n in NOTEBOOKS],

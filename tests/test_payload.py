@@ -16,6 +16,7 @@ from malta.model.data import plant_of
 from malta.simulation.payload import STEP, flown_payload, held_payload, payload
 
 
+@pytest.mark.slow
 def test_statics_by_hand() -> None:
     """At the end of the travel the nearer of the two bearings carries (l_B + z) / (2 l_B) of the weight."""
     c = gains.read("design/gains/calibrated.json")

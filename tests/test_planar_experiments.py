@@ -408,6 +408,7 @@ def test_design(run: Run, tmp_path: Path) -> None:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scenario", ["step", "errors", "timing"])
 def test_simulate(run: Run, tmp_path: Path, scenario: str) -> None:
     arguments = ("--scenario", scenario, "--engine", "virtual-machine", "--out", tmp_path)
@@ -417,6 +418,7 @@ def test_simulate(run: Run, tmp_path: Path, scenario: str) -> None:
     assert max(len(line) for line in out.splitlines() if not line.startswith("wrote")) <= 100
 
 
+@pytest.mark.slow
 def test_simulate_json(run: Run) -> None:
     code, out, _ = run("simulate", GAINS, "--engine", "virtual-machine", "--option", "cells=10", "--json")
     found = json.loads(out)

@@ -264,6 +264,7 @@ def test_a_touchdown_of_one_in_a_million() -> None:
     assert abs(found.probability / plain - 1) < 3 * np.hypot(found.cov, touched**-0.5)
 
 
+@pytest.mark.slow
 def test_the_command(run: Run, tmp_path: Path) -> None:
     quick = ("--spread", "9%", "--fidelity", "force", "--samples", "200")
     common = ("campaign", SHAKY, *quick, "--out", tmp_path)

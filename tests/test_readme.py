@@ -73,6 +73,7 @@ def _is_noisy(machine: str, subject: str) -> bool:
     return machine == "halbach" or subject.startswith(noisy)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("machine", "designs"),
     [

@@ -195,6 +195,7 @@ def _axial_error(e: Experiment, label: str) -> float:
     return next(merit.value for merit in case.merits if merit.label == "axial error")
 
 
+@pytest.mark.slow
 def test_the_recorded_v0_takes_an_error_of_the_cogging_off(recorded: Experiment) -> None:
     """The stroke is as good as with the right v0, whichever way the cogging is displaced."""
     right = _axial_error(recorded, OWN)

@@ -195,6 +195,7 @@ def test_a_stroke_is_drawn_whole_and_saved_only_where_a_path_is_given(
 # --- experiments ---
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", EXPERIMENTS)
 def test_every_experiment_has_a_figure_that_says_what_drew_it(
     name: str, flown: Flown, pictured: Pictured, published: dict[str, Any], tmp_path: Path
@@ -345,6 +346,7 @@ def test_lines_are_told_apart_without_colour() -> None:
     assert len(seen) == len(figures.STYLES) + len(figures.MORE)
 
 
+@pytest.mark.slow
 def test_one_case_is_an_experiment_too(flown: Flown, published: dict[str, Any], tmp_path: Path) -> None:
     """As after Ctrl-C, or where an option leaves one choice."""
     for name in EXPERIMENTS:

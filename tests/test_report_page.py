@@ -65,6 +65,7 @@ def page(cart: Analysis) -> Page:
     return page_of(cart)
 
 
+@pytest.mark.slow
 def test_a_page_is_whole_in_itself_and_names_stay_text(page: Page) -> None:
     reader = read_page(page.html)
     text = "".join(reader.text)

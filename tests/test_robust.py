@@ -241,6 +241,7 @@ def test_shipped_designs_have_the_margin_that_is_proven(name: str, current_loops
     assert critical_frequency(s, c, p) == pytest.approx(m.frequency, rel=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [pytest.param("table2", marks=pytest.mark.slow), "calibrated", "robust"])
 def test_the_whole_travel_in_one_proof(name: str) -> None:
     c, plant = shipped(name)
@@ -473,6 +474,7 @@ def test_parameters_of_the_geometry_and_twins() -> None:
     assert (instability(s, law, samples(s, m, ranges, {}, 1000)) < 0).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["table2", pytest.param("calibrated", marks=pytest.mark.slow)])
 def test_shares_are_what_the_margin_loses_with_a_range(name: str) -> None:
     """-d ln margin / d ln range by differences; together one, as a scaled box has a margin scaled back."""
@@ -520,6 +522,7 @@ def test_bad_ranges_get_one_sentence(ranges: Any, over: Any, part: str) -> None:
     assert str(caught.value).isprintable()
 
 
+@pytest.mark.slow
 def test_a_proof_that_is_given_up_says_where() -> None:
     s, c = _machine("calibrated")
     m = robust_margin(s, c, BOX, most_cells=3)

@@ -140,6 +140,7 @@ def test_the_commands(run: Run, tmp_path: Path) -> None:
     assert set(document["yield"]) == {"m", "K_A", "K_B", "K_D", "noise"}
 
 
+@pytest.mark.slow
 def test_a_tolerance_by_command(run: Run, tmp_path: Path) -> None:
     common = ("campaign", SHAKY, *QUICK, "--samples", "64", "--out", tmp_path, "--tolerance", "90%")
     code, out, err = run(*common)

@@ -96,6 +96,7 @@ def _blocks(flown: Campaign, size: int) -> list[Block]:
     ]
 
 
+@pytest.mark.slow
 def test_a_summary_of_blocks_is_that_of_the_arrays(flown: Campaign, bounds: Bounds, tmp_path: Path) -> None:
     """Read from the folder and simulated anew; tables too, and pictures to the byte."""
     wanted = summary_of(flown, bounds)

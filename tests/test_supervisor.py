@@ -366,6 +366,7 @@ def test_a_machine_that_does_not_settle_lands() -> None:
     assert bench.now == "LANDING"
 
 
+@pytest.mark.slow
 def test_a_machine_that_has_settled_waits_for_its_request() -> None:
     """Ten times as long as it may take to settle; what unsettles it then has all that time again."""
     bench = Bench()

@@ -200,6 +200,7 @@ def test_parts_of_either_kind_have_the_figures_of_the_whole_machine(spec: Spec) 
             assert quick[key] == pytest.approx(value, rel=1e-6), key
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("axes", ["decentralized", pytest.param("centre-of-gravity", marks=pytest.mark.slow)])
 def test_estimates_are_what_is_measured(spec: Spec, axes: str) -> None:
     """Margin, noise, recovery: the groups of the search beside the proof, the covariance and the machine's own loop."""
@@ -244,6 +245,7 @@ def test_the_shipped_gains_are_those_that_the_search_ends_with(spec: Spec) -> No
     assert rows["lift_off"].how == "steady-state estimator"
 
 
+@pytest.mark.slow
 def test_axes_at_the_centre_of_gravity_win_little(spec: Spec, design: SynthesizedDesign) -> None:
     """Both tuned within the same bounds: a load at a bearing moves the centred one 2 % less, its error is 15 % less."""
     other = centred(spec)
@@ -316,6 +318,7 @@ def test_a_number_of_the_search_is_written_to_its_own_axis(spec: Spec) -> None:
 # --- claims ---
 
 
+@pytest.mark.slow
 def test_a_pid_has_no_verdict_on_figures_of_an_lqg(found: Evidence, published: dict[str, Any]) -> None:
     lines = {row.subject: claims._claim(row, [found], published) for row in tubular.rows()}
     only = {subject for subject, line in lines.items() if line.verdict == "of an LQG only"}

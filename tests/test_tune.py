@@ -82,6 +82,7 @@ def small(spec: Spec) -> Spec:
 # --- the flagship ---
 
 
+@pytest.mark.slow
 def test_the_flagship_misses_three_requirements_with_pi_loops(
     spec: Spec, requirements: dict[tuple[str, str], Outcome]
 ) -> None:
@@ -323,6 +324,7 @@ def test_the_journal_of_another_search_is_refused(small: Spec, tmp_path: Path) -
     assert problem_sha256(small) != problem_sha256(replace(small, specification={"margin": 3.0}))
 
 
+@pytest.mark.slow
 def test_what_is_found_has_the_figures_that_were_found(small: Spec, tmp_path: Path) -> None:
     """Through the written file: the same bits of weights, comments kept, the machine found from another folder."""
     clusters = _clusters(small)
@@ -381,6 +383,7 @@ def test_a_poor_start_finds_its_way(spec: Spec) -> None:
     assert max(linear.values()) < 1.06, max(linear, key=linear.__getitem__)
 
 
+@pytest.mark.slow
 def test_an_impossible_wish_names_what_binds(small: Spec) -> None:
     asked = {"margin": 4.4, "peak_sensitivity": 1.2, "bandwidth": 400.0}
     found = tuned(replace(small, specification=asked), effort=Effort(generations=0, polish=1, front=0))
@@ -522,6 +525,7 @@ def test_the_command_finds_writes_and_goes_on(run: Any, tmp_path: Path) -> None:
     assert path.read_text(encoding="utf-8").startswith("# The flagship")
 
 
+@pytest.mark.slow
 def test_the_command_says_what_is_not_reached(run: Any, tmp_path: Path) -> None:
     path, out = bare(tmp_path, "margin = 4.4", "peak_sensitivity = 1.2"), tmp_path / "out"
     code, _, err = run(path, "--check")
@@ -542,6 +546,7 @@ def test_the_command_without_wishes_is_bad_input(run: Any, tmp_path: Path) -> No
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_ctrl_c_leaves_the_trials(run: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     module = sys.modules["malta.tuning.tune"]
 

@@ -255,6 +255,7 @@ def test_an_unstable_loop_has_no_figures(motor: Spec) -> None:
 # --- the search ---
 
 
+@pytest.mark.slow
 def test_no_grid_beats_what_is_found(motor: Spec, found: Tuned) -> None:
     """All of the cube, and a finer grid about the place."""
     search = search_of(motor)

@@ -159,6 +159,7 @@ def sampled_deviation(
     return found - lead @ np.hstack([np.diag(k), none, none]), complex(np.linalg.det(eye + late))
 
 
+@pytest.mark.slow
 def test_the_loop_is_what_is_bounded() -> None:
     """det(z - loop at a position) = det(M0 - e) det(1 + Gamma E / z) z^n; e within its bounds, entry by entry."""
     plant, controller, problem = machine()
@@ -211,6 +212,7 @@ def test_adjugates_and_determinants_of_axes() -> None:
             assert (np.abs(inverse - wanted) <= 1e-6 * np.sqrt(scale) + 1e-6 * np.abs(wanted)).all()
 
 
+@pytest.mark.slow
 def test_the_planar_motor_is_proven_between_places() -> None:
     """One proof for the whole travel, within a percent of what is lost; random machines in the box are stable."""
     plant, controller, problem = machine()
@@ -234,6 +236,7 @@ def test_the_planar_motor_is_proven_between_places() -> None:
         )
 
 
+@pytest.mark.slow
 def test_couplings_are_bounded_where_a_cell_is() -> None:
     """A law whose weakest corner has the least coupling: nearly all of what is true is proven, and no more."""
     controller = gains.read("design/gains/planar_pid.json")

@@ -96,6 +96,7 @@ def test_fewer_machines_of_table2_than_of_calibrated_fly_as_published(published:
     assert first.completed.share < 0.8 < second.completed.share == 1
 
 
+@pytest.mark.slow
 def test_a_campaign_shows_all_yields(run: Run, tmp_path: Path) -> None:
     common = ("campaign", LOADS, "--samples", "64", "--spread", "20%", "--out", tmp_path)
     code, out, err = run(*common)

@@ -106,6 +106,7 @@ def test_a_gain_file_may_list_a_default(tmp_path: Path) -> None:
 # --- physics ---
 
 
+@pytest.mark.slow
 @settings(deadline=None, max_examples=25)
 @given(seed=seeds)
 def test_motion_is_lagranges_of_the_energy(seed: int) -> None:
@@ -151,6 +152,7 @@ def test_forces_feed_in_their_power_where_they_act(seed: int) -> None:
     assert parts.sum() == pytest.approx(fed, abs=1e-11 * abs(parts).sum())
 
 
+@pytest.mark.slow
 @settings(deadline=None, max_examples=25)
 @given(seed=seeds)
 def test_swapped_modules_are_the_mirror_image(seed: int) -> None:
@@ -360,6 +362,7 @@ def test_set_on_the_command_line(run: Run) -> None:
         assert found in one_sentence(said.err)
 
 
+@pytest.mark.slow
 def test_spread_on_the_command_line(run: Run, tmp_path: Path) -> None:
     said = run(
         "campaign", GAINS, "--samples", "8", "--spread", "dK_A=3%", "--spread", "e_x=10um", "--fidelity", "force",
