@@ -12,9 +12,9 @@ from published_cases import CASES, Loop, Polynomial
 from timing import Result, medians, optional
 
 import malta
-from malta.margins.loops import machine_law
-from malta.margins.robust import problem_of
+from malta.loops.sampled_loops import machine_law
 from malta.margins.travel import travel_margin
+from malta.proof.robust import problem_of
 
 ROOT = Path(__file__).parents[1]
 SAMPLES, BATCH = 10_000, 100

@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from malta.margins.responses import responses
-from malta.margins.uncertain import Compensator, UncertainSystem, instability
+from malta.proof.responses import responses
+from malta.proof.uncertain import Compensator, UncertainSystem, instability
 
 if TYPE_CHECKING:
     from malta.model.plant import ComplexArray, FloatArray

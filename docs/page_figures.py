@@ -19,8 +19,9 @@ from matplotlib.patches import Circle, Rectangle
 from scipy.special import comb
 
 import malta
-from malta.margins import certificate, taylor
-from malta.margins.robust import law_of
+from malta.proof.certificate import certificate
+from malta.proof.robust import law_of
+from malta.proof.weak_coupling import taylor
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -27,26 +27,16 @@ if TYPE_CHECKING:  # the contents page, as type checkers and readers see it
     from malta.firmware.exports import export_c as export_c
     from malta.firmware.exports import export_fmu as export_fmu
     from malta.firmware.flight import engine_of_c as engine_of_c
-    from malta.margins.blocks import Dynamic as Dynamic
-    from malta.margins.curves import LoopCurves as LoopCurves
-    from malta.margins.curves import loop_curves as loop_curves
-    from malta.margins.dynamic import dynamic_margin as dynamic_margin
-    from malta.margins.gain import Gain as Gain
-    from malta.margins.gain import worst_case_gain as worst_case_gain
-    from malta.margins.loop import Loop as Loop
-    from malta.margins.loop import loop as loop
-    from malta.margins.loop_systems import LoopSystems as LoopSystems
-    from malta.margins.loop_systems import loop_systems as loop_systems
-    from malta.margins.recovery import Recovery as Recovery
-    from malta.margins.recovery import recovery as recovery
-    from malta.margins.robust import Margin as Margin
-    from malta.margins.robust import margin_of_polynomial as margin_of_polynomial
-    from malta.margins.robust import robust_margin as robust_margin
+    from malta.loops.curves import LoopCurves as LoopCurves
+    from malta.loops.curves import loop_curves as loop_curves
+    from malta.loops.loop import Loop as Loop
+    from malta.loops.loop import loop as loop
+    from malta.loops.loop_systems import LoopSystems as LoopSystems
+    from malta.loops.loop_systems import loop_systems as loop_systems
+    from malta.loops.recovery import Recovery as Recovery
+    from malta.loops.recovery import recovery as recovery
     from malta.margins.stages import Robustness as Robustness
     from malta.margins.stages import robustness as robustness
-    from malta.margins.systems import uncertain as uncertain
-    from malta.margins.uncertain import Compensator as Compensator
-    from malta.margins.uncertain import UncertainSystem as UncertainSystem
     from malta.margins.verify import Margins as Margins
     from malta.margins.verify import verify as verify
     from malta.model.data import plant_of as plant_of
@@ -64,6 +54,16 @@ if TYPE_CHECKING:  # the contents page, as type checkers and readers see it
     from malta.model.plant import Plant as Plant
     from malta.model.plant import Signal as Signal
     from malta.model.published import published as published
+    from malta.proof.blocks.blocks import Dynamic as Dynamic
+    from malta.proof.blocks.dynamic import dynamic_margin as dynamic_margin
+    from malta.proof.blocks.gain import Gain as Gain
+    from malta.proof.blocks.gain import worst_case_gain as worst_case_gain
+    from malta.proof.robust import Margin as Margin
+    from malta.proof.robust import margin_of_polynomial as margin_of_polynomial
+    from malta.proof.robust import robust_margin as robust_margin
+    from malta.proof.systems import uncertain as uncertain
+    from malta.proof.uncertain import Compensator as Compensator
+    from malta.proof.uncertain import UncertainSystem as UncertainSystem
     from malta.report.ledger import ledger as ledger
     from malta.simulation import references as references
     from malta.simulation.batch import replayed as replayed
@@ -124,15 +124,15 @@ _NAMES = {  # the same, for the first use of each name
     "model.equilibrium": ("trim",),
     "model.inverse": ("InverseCheck",),
     "model.plant": ("Actuator", "OperatingPoint", "Plant", "Signal"),
-    "margins.blocks": ("Dynamic",),
-    "margins.curves": ("LoopCurves", "loop_curves"),
-    "margins.dynamic": ("dynamic_margin",),
-    "margins.gain": ("Gain", "worst_case_gain"),
-    "margins.loop": ("Loop", "loop"),
-    "margins.loop_systems": ("LoopSystems", "loop_systems"),
-    "margins.recovery": ("Recovery", "recovery"),
-    "margins.robust": ("Margin", "margin_of_polynomial", "robust_margin"),
-    "margins.systems": ("uncertain",),
+    "proof.blocks.blocks": ("Dynamic",),
+    "loops.curves": ("LoopCurves", "loop_curves"),
+    "proof.blocks.dynamic": ("dynamic_margin",),
+    "proof.blocks.gain": ("Gain", "worst_case_gain"),
+    "loops.loop": ("Loop", "loop"),
+    "loops.loop_systems": ("LoopSystems", "loop_systems"),
+    "loops.recovery": ("Recovery", "recovery"),
+    "proof.robust": ("Margin", "margin_of_polynomial", "robust_margin"),
+    "proof.systems": ("uncertain",),
     "simulation.scenario": ("Fault", "Scenario"),
     "simulation.simulate": ("simulate",),
     "simulation.trajectory": ("Trajectory", "stroke_figures"),
@@ -142,7 +142,7 @@ _NAMES = {  # the same, for the first use of each name
     "synthesis.lqg": ("kalman", "lqg", "lqi", "lqr", "synthesize", "weights"),
     "synthesis.state_space": ("controller_of",),
     "tuning.tune": ("tune",),
-    "margins.uncertain": ("Compensator", "UncertainSystem"),
+    "proof.uncertain": ("Compensator", "UncertainSystem"),
     "margins.verify": ("Margins", "verify"),
 }
 _MODULES = {"gains": "gains", "references": "simulation.references", "report": "report", "schemas": "schemas"}

@@ -23,16 +23,17 @@ import malta
 from malta.cli import main as cli
 from malta.files import replace_files
 from malta.machines.tubular import plant as tubular
-from malta.margins import gain, robust
-from malta.margins.problem import OfLoop, OfSeveral, Problem
-from malta.margins.uncertain import Compensator, UncertainSystem
 from malta.model.published import published as read_published
+from malta.proof import robust
+from malta.proof.blocks import gain
+from malta.proof.problem import OfLoop, OfSeveral, Problem
+from malta.proof.uncertain import Compensator, UncertainSystem
 
 if TYPE_CHECKING:
-    from malta.margins.box import Box
     from malta.margins.verify import Margins
     from malta.model.linearize import LinearModel
     from malta.model.plant import Plant
+    from malta.proof.box import Box
     from malta.synthesis.controller import Controller
     from malta.synthesis.spec import Spec
 

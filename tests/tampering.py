@@ -8,7 +8,7 @@ from typing import Any
 
 from flint import fmpq
 
-from malta.margins import checked_file
+from malta.proof.certificate import checked_file
 
 
 def written(content: dict[str, Any], folder: Path, *, signed: bool = True) -> Path:

@@ -27,8 +27,8 @@ from malta.app.session import Session
 from malta.app.worker import work
 from malta.errors import InputError
 from malta.files import shipped_path
-from malta.margins.rays import ray_bound
 from malta.margins.travel import travel_loops, travel_margin
+from malta.proof.rays import ray_bound
 from malta.tuning.outcomes import judge
 from malta.tuning.search import model_and_controller
 

@@ -15,10 +15,10 @@ from hypothesis import strategies as st
 import malta
 from malta import Dynamic
 from malta.errors import InputError
-from malta.margins.blocks import Block, probe
-from malta.margins.responses import responses
-from malta.margins.transfer import mu_bound, performance, transfer
-from malta.margins.weight import weight_of
+from malta.proof.blocks.blocks import Block, probe
+from malta.proof.blocks.transfer import mu_bound, performance, transfer
+from malta.proof.blocks.weight import weight_of
+from malta.proof.responses import responses
 
 ONE = weight_of(1.0, "")
 
@@ -216,8 +216,8 @@ def test_several_blocks_beside_parameters(count: int) -> None:
     assert m.witness is not None
     assert m.frequency is not None
     assert 0.998 * m.upper <= m.lower <= m.upper
-    from malta.margins.blocks import blocks_of
-    from malta.margins.robust import law_of as converted
+    from malta.proof.blocks.blocks import blocks_of
+    from malta.proof.robust import law_of as converted
 
     law, blocks = converted(s, F), blocks_of(s, every[:count], "")
 

@@ -19,16 +19,18 @@ from flint import Ordering, arb, fmpq, fmpq_mpoly_ctx
 from tampering import claiming
 
 import malta
-from malta.margins import certificate, check, checked_file, checked_loop, degrees, enclosure, exclusion
-from malta.margins.box import below
-from malta.margins.family import nodes, restrict, restriction_rounding
-from malta.margins.groups import loop_of
-from malta.margins.problem import OfLoop
-from malta.margins.robust import Margin
-from malta.margins.rounding import parts
 from malta.margins.stages import _smallest
-from malta.margins.uncertain import Compensator, closed_loop
 from malta.margins.verify import Stage
+from malta.proof.box import below
+from malta.proof.certificate import certificate, check, checked_file, checked_loop
+from malta.proof.exclusion import exclusion
+from malta.proof.groups import loop_of
+from malta.proof.polynomial import degrees, enclosure
+from malta.proof.polynomial.family import nodes, restrict, restriction_rounding
+from malta.proof.polynomial.rounding import parts
+from malta.proof.problem import OfLoop
+from malta.proof.robust import Margin
+from malta.proof.uncertain import Compensator, closed_loop
 
 RANGES = {"m": 0.3, "k": 0.3}
 
@@ -426,7 +428,7 @@ def test_nothing_is_proven_unless_the_nominal_loop_is(monkeypatch: pytest.Monkey
     """Poles in floating point say that it is stable; without the proof of that, cells prove nothing."""
     law = replace(_sampled(), sample_time=None)
     assert malta.robust_margin(_spring(), law, RANGES).lower is not None
-    monkeypatch.setattr("malta.margins.search.is_nominal_stable", lambda *_: False)
+    monkeypatch.setattr("malta.proof.search.is_nominal_stable", lambda *_: False)
     found = malta.robust_margin(_spring(), law, RANGES)
     assert found.lower is None
     assert "the nominal loop is not proven stable" in found.reason

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import malta
-from malta.margins.box import Box, box_of
-from malta.margins.exclusion import growth_over
+from malta.proof.box import Box, box_of
+from malta.proof.exclusion.exclusion import growth_over
 
 
 def one(nominal: float, value: float | tuple[float, float], *, fixed: bool = False) -> Box:

@@ -15,8 +15,8 @@ from flint import arb
 import malta
 from malta import Actuator, Plant, Signal, si
 from malta.errors import InputError
-from malta.margins.box import FAR, box_of
-from malta.margins.branches import (
+from malta.proof.box import FAR, box_of
+from malta.proof.branches import (
     ENDS,
     INTERVALS,
     Interval,
@@ -24,9 +24,9 @@ from malta.margins.branches import (
     within_branches,
     without_branches,
 )
-from malta.margins.certificate import certificate_of
-from malta.margins.expressions import POINTS, NotAnalytic, program
-from malta.margins.plants import of_plant
+from malta.proof.certificate.certificate import certificate_of
+from malta.proof.expressions import POINTS, NotAnalytic, program
+from malta.proof.machine.parametric_plants import of_plant
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from scipy import linalg
 import malta
 from malta import gains
 from malta.errors import InputError
+from malta.loops.sampled_loops import sampled_loop
 from malta.synthesis.kalman import kalman, positions_from, sampled_filter
 from malta.synthesis.lqg import integral_weight, lqg, lqi, weights_of
 from malta.synthesis.riccati import sample, sample_noise
@@ -256,7 +257,7 @@ def test_the_loop_whose_sums_wait_stands_the_box_too(flagship: Flagship, z: floa
             for n, s in zip(("m", "K_A", "K_D", "K_B"), signs, strict=True)
         }
         plant = malta.plant_of(replace(spec.parameters, **values))
-        closed = malta.margins.loops.sampled_loop(
+        closed = sampled_loop(
             malta.linearize(plant, plant.at(z=z)), waiting, delay=1, current_loops="lag"
         ).closed
         # e of z is not fed back, and stays as it is: one eigenvalue of 1.

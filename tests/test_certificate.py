@@ -23,12 +23,12 @@ from tampering import claiming, written
 import malta
 from malta.errors import CheckError, InputError
 from malta.gains.certified import origin_of
-from malta.margins import certificate
-from malta.margins.check import check, tiled
-from malta.margins.checked_loop import determinant_bounds
-from malta.margins.loops import LAST
+from malta.loops.sampled_loops import LAST
 from malta.margins.travel import travel_loops, travel_margin
-from malta.margins.uncertain import Compensator
+from malta.proof.certificate import certificate
+from malta.proof.certificate.check import check, tiled
+from malta.proof.certificate.checked_loop import determinant_bounds
+from malta.proof.uncertain import Compensator
 
 pytestmark = pytest.mark.usefixtures("proven_once")
 
@@ -433,13 +433,17 @@ def test_fields_that_are_wrong(
 
 def test_the_checker_shares_no_code_with_the_search() -> None:
     """Of malta, its three files import each other and the errors; one line asks for the loop of a gain file."""
-    margins = ROOT / "malta" / "margins"
+    folder = ROOT / "malta" / "proof" / "certificate"
     beside = []
     for name in ("check", "checked_loop", "checked_file"):
-        for node in ast.walk(ast.parse((margins / f"{name}.py").read_text())):
+        for node in ast.walk(ast.parse((folder / f"{name}.py").read_text())):
             modules = [str(node.module)] if isinstance(node, ast.ImportFrom) else []
             modules += [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
-            own = ("malta.errors", "malta.margins.checked_loop", "malta.margins.checked_file")
+            own = (
+                "malta.errors",
+                "malta.proof.certificate.checked_loop",
+                "malta.proof.certificate.checked_file",
+            )
             beside += [module for module in modules if module.startswith("malta") and module not in own]
     assert beside == ["malta.gains.certified"]
 
@@ -449,13 +453,14 @@ def test_a_proof_is_checked_without_the_rest_of_malta(tmp_path: Path) -> None:
     margin = malta.robust_margin(system, gain(1.0), box)
     path = certificate.write(tmp_path / "c.json", [(system, gain(1.0))], box, None, margin)
     program = (
-        "import sys; from malta.margins.check import check\n"
+        "import sys; from malta.proof.certificate.check import check\n"
         f"assert check({str(path)!r}).ok\n"
-        "print(*sorted(name for name in sys.modules if name.startswith('malta.margins.')))"
+        "print(*sorted(name for name in sys.modules if name.startswith(('malta.proof.', 'malta.loops'))))"
     )
     ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    own = "malta.margins.check malta.margins.checked_file malta.margins.checked_loop"
-    assert ended.stdout.strip() == own
+    own = "malta.proof.certificate"
+    loaded = [own, *(f"{own}.{name}" for name in ("check", "checked_file", "checked_loop"))]
+    assert ended.stdout.split() == loaded
 
 
 def test_a_check_ends_in_time(document: dict[str, Any], tmp_path: Path) -> None:

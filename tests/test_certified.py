@@ -19,10 +19,11 @@ from tampering import claiming, written
 import malta
 from malta.errors import InputError
 from malta.gains.certified import origin_of
-from malta.margins import certificate, checked_file, travel
-from malta.margins.check import Verdict, check
+from malta.margins import travel
 from malta.margins.travel import travel_loops
-from malta.margins.windings import CurrentLoops
+from malta.proof.certificate import certificate, checked_file
+from malta.proof.certificate.check import Verdict, check
+from malta.proof.machine.windings import CurrentLoops
 from malta.report.tables.certificate import claim_share
 
 ROOT = Path(__file__).parents[1]

@@ -20,21 +20,21 @@ import malta
 from malta import gains
 from malta.cli.main import app, main
 from malta.errors import InputError
-from malta.margins.classical import (
+from malta.loops.classical import (
     _balanced_norm,
     classical_margins,
     delay_margins,
     disk_margin,
     nominal_loop,
 )
-from malta.margins.gain import Gain
-from malta.margins.loops import loaded_loop, machine_law, machine_system
-from malta.margins.responses import responses
-from malta.margins.robust import robust_margin
+from malta.loops.sampled_loops import loaded_loop, machine_law, machine_system
 from malta.margins.stages import MACHINE, SAMPLED, Robustness, compensators, robustness
-from malta.margins.systems import uncertain
-from malta.margins.uncertain import Compensator, UncertainSystem, closed_loop, instability
 from malta.model.data import plant_of
+from malta.proof.blocks.gain import Gain
+from malta.proof.responses import responses
+from malta.proof.robust import robust_margin
+from malta.proof.systems import uncertain
+from malta.proof.uncertain import Compensator, UncertainSystem, closed_loop, instability
 from malta.report.figures.margins import chain_figure
 
 if TYPE_CHECKING:

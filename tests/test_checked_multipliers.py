@@ -13,8 +13,8 @@ import pytest
 from test_many_parameters import asked, chain, ranges
 
 import malta
-from malta.margins.checked_multipliers import refusal
-from malta.margins.structured import Proof, Shown
+from malta.proof.certificate.checked_multipliers import refusal
+from malta.proof.multipliers.structured import Proof, Shown
 
 
 @cache

@@ -18,10 +18,10 @@ from scipy.linalg import expm
 
 import malta
 from malta import references
+from malta.loops.sampled_loops import machine_loop
 from malta.machines.tubular import claims as tubular
 from malta.machines.tubular import evidence as tubular_evidence
 from malta.machines.tubular.evidence import EXPERIMENT_NAMES, Evidence, is_solved_for_ratio
-from malta.margins.loops import machine_loop
 from malta.model.data import plant_of
 from malta.model.published import published_value
 from malta.report import ledger as claims

@@ -10,9 +10,9 @@ import pytest
 from flint import fmpq
 
 import malta
-from malta.margins.companion import MOST, companion
-from malta.margins.groups import groups
-from malta.margins.pencil import Rows
+from malta.proof.companion import MOST, companion
+from malta.proof.groups import groups
+from malta.proof.multipliers.pencil import Rows
 
 NAMES = tuple(f"q{i}" for i in range(14))
 

@@ -19,13 +19,13 @@ from scipy import linalg
 import malta
 from malta.campaigns.plan import fingerprint
 from malta.gains import encodings
-from malta.margins.loops import machine_loop
+from malta.loops.sampled_loops import machine_loop
 from malta.simulation.generic import jump
 from malta.synthesis import kalman as kalman_filter
 from malta.synthesis import lqg, riccati
 
 if TYPE_CHECKING:
-    from malta.margins.loop_systems import LoopSystems
+    from malta.loops.loop_systems import LoopSystems
     from malta.model.linearize import LinearModel
     from malta.model.plant import FloatArray, Plant
     from malta.synthesis.controller import Controller

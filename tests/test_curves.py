@@ -13,11 +13,11 @@ from conftest import ROOT
 from flight import default_of
 
 import malta
-from malta.margins.classical import delay_margins
-from malta.margins.curves import LoopCurves, loop_curves, respond
-from malta.margins.linear_loops import linear_loop
-from malta.margins.locus import root_locus
-from malta.margins.steps import loop_steps, step_figures
+from malta.loops.classical import delay_margins
+from malta.loops.curves import LoopCurves, loop_curves, respond
+from malta.loops.linear_loops import linear_loop
+from malta.loops.locus import root_locus
+from malta.loops.steps import loop_steps, step_figures
 from malta.simulation.references import Motion
 
 if TYPE_CHECKING:

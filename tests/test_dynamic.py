@@ -12,9 +12,9 @@ from published_cases import ROBSTAB, Loop, pid
 import malta
 from malta import Dynamic, dynamic_margin, gains
 from malta.errors import InputError
-from malta.margins.responses import responses
 from malta.margins.travel import travel_loops
 from malta.model.data import plant_of
+from malta.proof.responses import responses
 
 
 def robstab() -> malta.UncertainSystem:

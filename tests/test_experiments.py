@@ -17,8 +17,8 @@ from scipy.linalg import expm
 
 import malta
 from malta import references
+from malta.loops.sampled_loops import machine_loop, sampled_loop
 from malta.machines.tubular.experiments import EXPERIMENTS, forces, lifting, rest, strokes
-from malta.margins.loops import machine_loop, sampled_loop
 from malta.model.data import plant_of
 from malta.model.published import published_value
 from malta.simulation.catalogue import experiment

@@ -14,7 +14,7 @@ from conftest import refusal
 import malta
 from malta.campaigns.store import read_manifest
 from malta.files import read_file, replace_files, temporary_name
-from malta.margins import checked_file
+from malta.proof.certificate import checked_file
 from malta.simulation.force_log import read_log
 from malta.tables import load_toml
 

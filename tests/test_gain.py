@@ -14,15 +14,15 @@ from hypothesis import strategies as st
 import malta
 from malta import gains
 from malta.errors import InputError
-from malta.margins.blocks import Block
-from malta.margins.family import align, combine, family
-from malta.margins.peaks import frequencies, patterns
-from malta.margins.responses import responses
-from malta.margins.robust import problem_of
-from malta.margins.transfer import transfer
 from malta.margins.travel import travel_loops, worst_sensitivities
-from malta.margins.weight import weight_of
 from malta.model.data import plant_of
+from malta.proof.blocks.blocks import Block
+from malta.proof.blocks.peaks import frequencies, patterns
+from malta.proof.blocks.transfer import transfer
+from malta.proof.blocks.weight import weight_of
+from malta.proof.polynomial.family import align, combine, family
+from malta.proof.responses import responses
+from malta.proof.robust import problem_of
 
 
 def first_order(k: float = 1.0) -> malta.UncertainSystem:

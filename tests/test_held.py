@@ -14,17 +14,17 @@ from scipy import linalg
 
 import malta
 from malta import gains
-from malta.margins.laws import sampled_law
-from malta.margins.loops import machine_loop, machine_system, sampled_loop
-from malta.margins.responses import responses
-from malta.margins.systems import uncertain
+from malta.loops.machine_laws import sampled_law
+from malta.loops.sampled_loops import machine_loop, machine_system, sampled_loop
 from malta.margins.travel import travel_margin
-from malta.margins.uncertain import UncertainSystem, closed_loop
 from malta.margins.verify import controller_poles, unstable_gain, verify
-from malta.margins.windings import left_out
 from malta.model.data import plant_of
 from malta.model.linearize import LinearModel
 from malta.model.plant import Plant
+from malta.proof.machine.windings import left_out
+from malta.proof.responses import responses
+from malta.proof.systems import uncertain
+from malta.proof.uncertain import UncertainSystem, closed_loop
 from malta.simulation.references import Motion
 from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate

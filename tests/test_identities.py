@@ -11,7 +11,7 @@ import pytest
 from filterpy.kalman import KalmanFilter
 
 import malta
-from malta.margins.loops import sampled_loop
+from malta.loops.sampled_loops import sampled_loop
 from malta.margins.verify import controller_poles
 from malta.synthesis.controller import law, linear_law
 from malta.synthesis.riccati import eigenvalues, sample, sample_noise

@@ -16,13 +16,13 @@ from scipy.interpolate import CubicSpline
 from scipy.optimize import brentq
 
 import malta
-from malta.margins.loops import machine_loop, machine_system
-from malta.margins.recovery import recovery
+from malta.loops.recovery import recovery
+from malta.loops.sampled_loops import machine_loop, machine_system
 from malta.margins.travel import travel_margin
-from malta.margins.uncertain import instability
 from malta.model.data import plant_of
 from malta.model.linearize import linearize
 from malta.model.sensors import LateSensors, split_dead_time, with_lags
+from malta.proof.uncertain import instability
 from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate
 

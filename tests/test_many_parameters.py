@@ -13,14 +13,14 @@ import pytest
 from scipy import linalg
 
 import malta
-from malta.margins.box import Box, box_of
-from malta.margins.multipliers import Blocks, Multiplier, multiplier
-from malta.margins.problem import OfLoop
-from malta.margins.response import Branch, excludes_zero, response
-from malta.margins.robust import law_of, problem_of
-from malta.margins.series import LEVELS, _gains
-from malta.margins.structured import Structured, rows_of
-from malta.margins.uncertain import Compensator, UncertainSystem, instability
+from malta.proof.box import Box, box_of
+from malta.proof.multipliers.hold_series import LEVELS, _gains
+from malta.proof.multipliers.multipliers import Blocks, Multiplier, multiplier
+from malta.proof.multipliers.pencil_response import Branch, excludes_zero, response
+from malta.proof.multipliers.structured import Structured, rows_of
+from malta.proof.problem import OfLoop
+from malta.proof.robust import law_of, problem_of
+from malta.proof.uncertain import Compensator, UncertainSystem, instability
 from malta.synthesis.riccati import care, dare
 
 Loop = tuple[UncertainSystem, Compensator]

@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 
 import malta
 from malta.errors import InputError
-from malta.margins.problem import hurwitz
-from malta.margins.uncertain import Compensator, UncertainSystem
+from malta.proof.problem import hurwitz
+from malta.proof.uncertain import Compensator, UncertainSystem
 
 
 def chain(tau: float, unit: float = 1.0) -> UncertainSystem:

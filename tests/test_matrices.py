@@ -18,6 +18,7 @@ from conftest import refusal
 
 import malta
 from malta.gains import encodings
+from malta.loops.sampled_loops import machine_system
 from malta.model.plant import Plant, Signal
 from malta.simulation.generic import jump
 
@@ -62,9 +63,7 @@ def test_design_margin_and_gain_file_in_five_lines(tmp_path: Path) -> None:
     )
     model = malta.linearize(plant, plant.at())
     controller = malta.lqg(model, malta.weights([1e4, 1], [1], [1], [1e-8]), Ts=1e-3)
-    margin = malta.robust_margin(
-        *malta.margins.loops.machine_system(plant, controller, ["k"], {}), {"k": (-50, 50)}
-    )
+    margin = malta.robust_margin(*machine_system(plant, controller, ["k"], {}), {"k": (-50, 50)})
     malta.gains.write(controller, malta.verify(model, controller), tmp_path / "plain.json")
 
     assert margin.lower is not None

@@ -13,7 +13,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import malta
-from malta.margins.robust import problem_of
+from malta.proof.robust import problem_of
 
 Matrix = np.ndarray[Any, Any]
 CLOCKS = (None, 0.3, "discrete")  # continuous; held and sampled; a system in discrete time

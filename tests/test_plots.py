@@ -18,8 +18,8 @@ from matplotlib.figure import Figure
 import malta
 from malta import report
 from malta.cli.documents.published import output_schema
-from malta.margins.curves import LoopCurves, loop_curves
-from malta.margins.locus import root_locus
+from malta.loops.curves import LoopCurves, loop_curves
+from malta.loops.locus import root_locus
 from malta.model.signals import axis_units
 from malta.report.plots.plane import Window
 

@@ -13,8 +13,8 @@ from conftest import ROOT, assert_folds, printed
 
 import malta
 from malta.errors import CheckError, InputError
-from malta.margins.loops import disturbance_map
-from malta.margins.recovery import furthest, load_vector, recovery
+from malta.loops.recovery import furthest, load_vector, recovery
+from malta.loops.sampled_loops import disturbance_map
 from malta.model.linearize import linearize
 from malta.report.figures.recovery import recovery_figure
 from malta.report.tables.recovery import recovery_table

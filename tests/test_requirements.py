@@ -12,8 +12,8 @@ import pytest
 from conftest import ROOT, refusal
 
 import malta
+from malta.loops.sampled_loops import machine_loop
 from malta.machines.tubular.requirements import REQUIREMENTS
-from malta.margins.loops import machine_loop
 from malta.synthesis.requirements import GENERIC, requirements_for
 from malta.synthesis.spec import Loads, Pid, Spec
 from malta.tuning.groups import figures_of, groups_of

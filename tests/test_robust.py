@@ -16,20 +16,20 @@ from hypothesis import strategies as st
 
 from malta import gains
 from malta.errors import InputError
-from malta.margins.loops import machine_law, machine_system
-from malta.margins.responses import responses
-from malta.margins.robust import robust_margin
+from malta.loops.sampled_loops import machine_law, machine_system
 from malta.margins.stages import compensators
-from malta.margins.systems import uncertain
 from malta.margins.travel import travel_margin
-from malta.margins.uncertain import Compensator, UncertainSystem, critical_frequency, instability
 from malta.model.data import plant_of
+from malta.proof.responses import responses
+from malta.proof.robust import robust_margin
+from malta.proof.systems import uncertain
+from malta.proof.uncertain import Compensator, UncertainSystem, critical_frequency, instability
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from malta.margins.robust import Certificate, Margin
     from malta.model.plant import FloatArray, Plant
+    from malta.proof.robust import Certificate, Margin
     from malta.synthesis.controller import Controller
 
 SHIPPED = ("table2", "calibrated", "robust")

@@ -23,16 +23,16 @@ import malta
 from malta import report
 from malta.campaigns.statistics import figures_of
 from malta.margins.extent import NOWHERE, Extent, extent_of, positions_of
-from malta.margins.gain import Gain
-from malta.margins.robust import Margin
 from malta.margins.stages import robustness
 from malta.margins.travel import travel_loops, travel_margin
-from malta.margins.uncertain import instability
 from malta.margins.verify import Margins, zone
 from malta.model import machines
 from malta.model.checks import check_plant
 from malta.model.machines import machine
 from malta.model.plant import Plant
+from malta.proof.blocks.gain import Gain
+from malta.proof.robust import Margin
+from malta.proof.uncertain import instability
 from malta.simulation.catalogue import cases_of
 
 if TYPE_CHECKING:

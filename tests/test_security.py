@@ -10,8 +10,8 @@ from malta import archives, files, tables, units
 from malta.campaigns import plan
 from malta.cli import patience
 from malta.gains import mat
-from malta.margins import check, checked_file
 from malta.model import sensors
+from malta.proof.certificate import check, checked_file
 from malta.simulation import compiled, force_log, inputs, scenario
 
 TEXT = (Path(__file__).parents[1] / "SECURITY.md").read_text(encoding="utf-8")

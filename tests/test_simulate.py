@@ -14,7 +14,7 @@ from scipy.integrate import solve_ivp
 
 import malta
 from malta import references
-from malta.margins.loops import sampled_loop
+from malta.loops.sampled_loops import sampled_loop
 from malta.simulation.inputs import feedforward
 from malta.simulation.period import state_reference
 from malta.simulation.scenario import Scenario

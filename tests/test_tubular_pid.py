@@ -11,10 +11,10 @@ import pytest
 from conftest import ROOT, Run, one_sentence, refusal
 
 import malta
+from malta.loops.sampled_loops import machine_loop
 from malta.machines.tubular import claims as tubular
 from malta.machines.tubular.evidence import axial_deviation, axis_coupling, load_deviation, noise_forces
 from malta.machines.tubular.evidence import evidence as evidence_of
-from malta.margins.loops import machine_loop
 from malta.report import ledger as claims
 from malta.report.ledger import Row
 from malta.simulation.catalogue import experiment

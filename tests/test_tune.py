@@ -17,8 +17,8 @@ from conftest import ROOT, Run, refusal
 
 import malta
 from malta import gains, report
+from malta.loops.sampled_loops import machine_loop, sampled_loop
 from malta.machines.tubular.requirements import DRIVE
-from malta.margins.loops import machine_loop, sampled_loop
 from malta.margins.verify import BANDWIDTHS
 from malta.simulation.catalogue import experiment
 from malta.synthesis.controller import linear_law, linear_law_of

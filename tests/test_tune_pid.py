@@ -16,9 +16,9 @@ from conftest import ROOT, Run, refusal
 from scipy import linalg
 
 import malta
+from malta.loops.sampled_loops import machine_loop
 from malta.machines.halbach import electronics
 from malta.machines.halbach import plant as halbach
-from malta.margins.loops import machine_loop
 from malta.synthesis.riccati import sample, sample_noise
 from malta.synthesis.spec import Pid
 from malta.tuning import outcomes

@@ -10,11 +10,11 @@ import pytest
 
 import malta
 from malta.errors import InputError
-from malta.margins.loops import machine_law, sampled_loop
-from malta.margins.responses import responses
-from malta.margins.robust import robust_margin
-from malta.margins.systems import uncertain
-from malta.margins.uncertain import closed_loop, critical_frequency, instability
+from malta.loops.sampled_loops import machine_law, sampled_loop
+from malta.proof.responses import responses
+from malta.proof.robust import robust_margin
+from malta.proof.systems import uncertain
+from malta.proof.uncertain import closed_loop, critical_frequency, instability
 
 if TYPE_CHECKING:
     from conftest import Design

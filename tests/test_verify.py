@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import malta
-from malta.margins.loops import machine_loop, sampled_loop
+from malta.loops.sampled_loops import machine_loop, sampled_loop
 from malta.margins.verify import BANDWIDTHS, require_stable, zone
 from malta.synthesis.riccati import eigenvalues
 

@@ -16,16 +16,16 @@ from flint import arb
 from scipy import linalg
 
 from malta import gains
-from malta.margins import taylor
-from malta.margins.axes import members_of, state_matrix
-from malta.margins.box import box_of
-from malta.margins.expressions import NotAnalytic, program
-from malta.margins.held_currents import HeldMachine, dominating_solution, held_machine
-from malta.margins.laurent import Evaluation, Laurent
 from malta.margins.travel import NOT_BETWEEN, _anywhere, loop_at, travel_margin
-from malta.margins.uncertain import closed_loop, instability, model_of
-from malta.margins.weak_coupling import HeldLoop, coupling_bounds
 from malta.model.data import plant_of
+from malta.proof.box import box_of
+from malta.proof.expressions import NotAnalytic, program
+from malta.proof.uncertain import closed_loop, instability, model_of
+from malta.proof.weak_coupling import taylor
+from malta.proof.weak_coupling.axes import members_of, state_matrix
+from malta.proof.weak_coupling.held_currents import HeldMachine, dominating_solution, held_machine
+from malta.proof.weak_coupling.laurent import Evaluation, Laurent
+from malta.proof.weak_coupling.weak_coupling import HeldLoop, coupling_bounds
 
 NAMES = ("m", "I_x", "I_z", "B_r", "r_z")
 BOX = {"m": 0.05, "I_x": 0.1, "I_z": 0.1, "B_r": 0.05, "r_z": 0.2}
@@ -250,7 +250,7 @@ def test_couplings_are_bounded_where_a_cell_is() -> None:
 @pytest.mark.slow
 def test_a_stronger_coupling_proves_less() -> None:
     """The bound follows what couples the axes: ten times the stiffness of held currents costs some of it."""
-    from malta.margins.robust import Effort, margin_of
+    from malta.proof.robust import Effort, margin_of
 
     _, _, problem = machine()
     h = problem.machine

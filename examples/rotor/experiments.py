@@ -17,7 +17,7 @@ import casadi as ca
 import numpy as np
 
 from malta.errors import InputError
-from malta.margins.loop import loop
+from malta.loops.loop import loop
 from malta.model.equilibrium import trim
 from malta.model.linearize import linearize
 from malta.model.plant import Plant

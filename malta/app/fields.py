@@ -12,7 +12,7 @@ from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any, Literal, TypeGuard, get_args
 
 from malta.errors import InputError
-from malta.margins.uncertain import is_commutated
+from malta.proof.uncertain import is_commutated
 from malta.synthesis.design_tables import DesignFile
 from malta.synthesis.spec import Discretization, Place
 from malta.units import to_si

@@ -17,10 +17,9 @@ import numpy as np
 from malta.app.files import Edited
 from malta.app.runs import planned_run
 from malta.errors import CheckError, InputError
-from malta.margins.curves import LoopCurves, loop_curves
-from malta.margins.loop import Loop, loop_of_model
-from malta.margins.loops import continuous_poles
-from malta.margins.rays import RayBound, ray_bound
+from malta.loops.curves import LoopCurves, loop_curves
+from malta.loops.loop import Loop, loop_of_model
+from malta.loops.sampled_loops import continuous_poles
 from malta.margins.travel import travel_loops
 from malta.margins.verify import (
     BANDWIDTHS,
@@ -32,6 +31,7 @@ from malta.margins.verify import (
 )
 from malta.model.data import plant_of
 from malta.model.linearize import LinearModel, linearize
+from malta.proof.rays import RayBound, ray_bound
 from malta.simulation.linear_run import linear_run
 from malta.synthesis.lqg import synthesize
 from malta.synthesis.riccati import eigenvalues

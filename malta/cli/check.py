@@ -15,7 +15,7 @@ from malta.errors import InputError, shorten
 
 if TYPE_CHECKING:
     from malta.cli.documents.others import CheckOutput
-    from malta.margins.check import Verdict
+    from malta.proof.certificate.check import Verdict
 
 
 def check(
@@ -36,7 +36,7 @@ def check(
     \b
     Example:  malta check build/table2.json --gains design/gains/table2.json
     """
-    from malta.margins.check import check as check_certificate
+    from malta.proof.certificate.check import check as check_certificate
 
     with working(f"checking {file}"):
         box = None if gains is None else _box_of(gains, uncertain, machine)

@@ -20,9 +20,9 @@ from malta.files import locate
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from malta.margins.curves import LoopCurves
-    from malta.margins.linear_loops import Place
-    from malta.margins.locus import RootLocus
+    from malta.loops.curves import LoopCurves
+    from malta.loops.linear_loops import Place
+    from malta.loops.locus import RootLocus
     from malta.model.plant import Plant
     from malta.synthesis.controller import Controller
 
@@ -90,7 +90,7 @@ def plot(
     """
     _require_kinds(kinds, at, out, parameter, span)
     machines = _read_machines([gains, *(locate(path) for path in others or ())], machine, change)
-    from malta.margins.curves import loop_curves
+    from malta.loops.curves import loop_curves
 
     place = cast("Place", at)
     loops = {name: loop_curves(*pair, name=name) for name, pair in machines.items()}
@@ -168,7 +168,7 @@ def _loci(
     at: Place,
 ) -> Sequence[RootLocus]:
     """The root locus of each loop, behind a progress bar."""
-    from malta.margins.locus import root_locus
+    from malta.loops.locus import root_locus
 
     if channels is not None and len(channels) > 1 and parameter == GAIN:
         raise InputError(

@@ -17,14 +17,14 @@ from malta.errors import CheckError, InputError
 
 if TYPE_CHECKING:
     from malta.cli.documents.loops import VerifyOutput
-    from malta.margins.gain import Gain
-    from malta.margins.recovery import Recovery
-    from malta.margins.robust import Margin
+    from malta.loops.recovery import Recovery
     from malta.margins.stages import Robustness
     from malta.margins.verify import Margins
-    from malta.margins.windings import CurrentLoops
     from malta.model.linearize import LinearModel
     from malta.model.plant import Plant
+    from malta.proof.blocks.gain import Gain
+    from malta.proof.machine.windings import CurrentLoops
+    from malta.proof.robust import Margin
     from malta.simulation.payload import Payload
     from malta.synthesis.controller import Controller
 
@@ -143,7 +143,7 @@ def _analyse(subject: Subject, time: float | None, *, proof: bool, worst_case: b
 
     Raises CheckError, naming the gain file, when a result fails its own check.
     """
-    from malta.margins.recovery import recovery
+    from malta.loops.recovery import recovery
     from malta.margins.stages import robustness
     from malta.margins.travel import covers_travel, worst_sensitivities
     from malta.margins.verify import verify as compute_margins
@@ -179,8 +179,8 @@ def _analyse(subject: Subject, time: float | None, *, proof: bool, worst_case: b
 def _write_certificate(path: Path, subject: Subject, margin: Margin) -> Path:
     """Write the certificate of the margin over the travel."""
     from malta.gains.certified import origin_of
-    from malta.margins import certificate
     from malta.margins.travel import travel_loops
+    from malta.proof.certificate import certificate
 
     places, over = travel_loops(subject.plant, subject.controller, tuple(subject.box), subject.current_loops)
     origin = origin_of(subject.gains, subject.plant, subject.controller, subject.current_loops, len(places))
@@ -204,7 +204,7 @@ def _draw(subject: Subject, analysis: Analysis, folder: Path) -> list[Path]:
 def _document(subject: Subject, analysis: Analysis, files: Sequence[Path]) -> VerifyOutput:
     """The JSON document of a verification."""
     from malta.cli.documents.loops import VerifyOutput, loop_fields, payload_part, recovery_part, robust_part
-    from malta.margins.windings import left_out
+    from malta.proof.machine.windings import left_out
 
     units = {signal.name: signal.unit for signal in subject.plant.outputs}
     return VerifyOutput(
@@ -228,7 +228,7 @@ def _print_tables(
 ) -> None:
     """Print the tables of a verification; poles of a changed machine stand beside no published ones."""
     from malta import report
-    from malta.margins.windings import left_out
+    from malta.proof.machine.windings import left_out
 
     controller, margins, robust = subject.controller, analysis.margins, analysis.robustness
     missing = left_out(subject.plant, controller, subject.current_loops)

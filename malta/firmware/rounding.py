@@ -16,8 +16,8 @@ from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate
 
 if TYPE_CHECKING:
-    from malta.margins.robust import Margin
     from malta.model.plant import FloatArray
+    from malta.proof.robust import Margin
     from malta.synthesis.controller import Controller
 
 ROUNDED = ("Ad", "Bd", "Cd", "K", "Ki", "L")

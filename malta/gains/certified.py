@@ -20,23 +20,23 @@ from malta.gains.agreement import APART
 from malta.gains.contents import uncertainty_of
 from malta.gains.encodings import content_sha256
 from malta.gains.file import content_of, read
-from malta.margins.box import box_of, sides_of
-from malta.margins.certificate import Origin, loops_of
-from malta.margins.checked_file import LONG, Claim, Document, Loop, Parameter, Places, double
-from malta.margins.checked_file import Origin as Named
-from malta.margins.expressions import NotAnalytic, exact
+from malta.loops.sampled_loops import LAST
 from malta.margins.extent import extent_of
-from malta.margins.loops import LAST
 from malta.margins.travel import ENDS, travel_loops
-from malta.margins.windings import chosen_loops
 from malta.model.data import plant_of
 from malta.model.parameters import units_of
 from malta.model.published import published_figures
+from malta.proof.box import box_of, sides_of
+from malta.proof.certificate.certificate import Origin, loops_of
+from malta.proof.certificate.checked_file import LONG, Claim, Document, Loop, Parameter, Places, double
+from malta.proof.certificate.checked_file import Origin as Named
+from malta.proof.expressions import NotAnalytic, exact
+from malta.proof.machine.windings import chosen_loops
 
 if TYPE_CHECKING:
-    from malta.margins.robust import Ranges
-    from malta.margins.windings import CurrentLoops
     from malta.model.plant import Plant
+    from malta.proof.machine.windings import CurrentLoops
+    from malta.proof.robust import Ranges
     from malta.synthesis.controller import Controller
 
 

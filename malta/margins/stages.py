@@ -27,7 +27,7 @@ import numpy as np
 
 from malta.display import Description, display
 from malta.errors import InputError
-from malta.margins.classical import (
+from malta.loops.classical import (
     Classical,
     Disk,
     Nominal,
@@ -36,10 +36,8 @@ from malta.margins.classical import (
     peak_sensitivity,
     worst_of,
 )
+from malta.loops.sampled_loops import LAST, machine_law
 from malta.margins.extent import NOWHERE, Extent, extent_of, own_position
-from malta.margins.loops import LAST, machine_law
-from malta.margins.plants import of_plant
-from malta.margins.robust import NOT_PROVEN, Margin, Progress, Ranges, robust_margin
 from malta.margins.travel import (
     EACH,
     PLACES,
@@ -50,12 +48,14 @@ from malta.margins.travel import (
     places_along,
     travel_margin,
 )
-from malta.margins.uncertain import Compensator
-from malta.margins.windings import CurrentLoops, chosen_loops
 from malta.model.data import plant_of
 from malta.model.linearize import linearize
 from malta.model.parameters import units_of
 from malta.model.plant import Plant, position_at
+from malta.proof.machine.parametric_plants import of_plant
+from malta.proof.machine.windings import CurrentLoops, chosen_loops
+from malta.proof.robust import NOT_PROVEN, Margin, Progress, Ranges, robust_margin
+from malta.proof.uncertain import Compensator
 from malta.synthesis.controller import Controller
 from malta.synthesis.lqg import kalman, lqi, lqr, weights_of
 from malta.threads import on_one_thread

@@ -13,15 +13,17 @@ from dataclasses import replace
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
-from malta.margins.box import Box, box_of
-from malta.margins.classical import Nominal
-from malta.margins.expressions import NotAnalytic
+from malta.loops.classical import Nominal
+from malta.loops.sampled_loops import LAST, loaded_loop, machine_law, machine_system
 from malta.margins.extent import extent_of, machine_at, positions_of
-from malta.margins.held_currents import held_machine
-from malta.margins.loops import LAST, loaded_loop, machine_law, machine_system
-from malta.margins.plants import LONGEST
-from malta.margins.problem import OfSeveral
-from malta.margins.robust import (
+from malta.model.data import plant_of
+from malta.model.plant import off_stroke
+from malta.proof.box import Box, box_of
+from malta.proof.expressions import NotAnalytic
+from malta.proof.machine.parametric_plants import LONGEST
+from malta.proof.machine.windings import CurrentLoops
+from malta.proof.problem import OfSeveral
+from malta.proof.robust import (
     TOLERANCE,
     Effort,
     Margin,
@@ -34,19 +36,17 @@ from malta.margins.robust import (
     problem_of,
     robust_margin,
 )
-from malta.margins.time_limit import TimeUp, time_limit
-from malta.margins.uncertain import Compensator, UncertainSystem, is_commutated, model_of
-from malta.margins.weak_coupling import HeldLoop
-from malta.margins.windings import CurrentLoops
-from malta.model.data import plant_of
-from malta.model.plant import off_stroke
+from malta.proof.time_limit import TimeUp, time_limit
+from malta.proof.uncertain import Compensator, UncertainSystem, is_commutated, model_of
+from malta.proof.weak_coupling.held_currents import held_machine
+from malta.proof.weak_coupling.weak_coupling import HeldLoop
 from malta.threads import on_one_thread
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from malta.margins.gain import Gain
     from malta.model.plant import Plant
+    from malta.proof.blocks.gain import Gain
     from malta.synthesis.controller import Controller
 
 NOT_BETWEEN = "not between them"  # what a margin of several places says
@@ -216,7 +216,7 @@ def worst_sensitivities(
 
     The arguments are those of travel_margin. Without a proof along the travel, it covers the middle and the end alone.
     """
-    from malta.margins.gain import (
+    from malta.proof.blocks.gain import (
         worst_case_gain,  # with all that dynamics take, which a design does not ask for
     )
 

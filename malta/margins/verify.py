@@ -12,14 +12,20 @@ import numpy as np
 
 from malta.display import Description, display
 from malta.errors import CheckError
+from malta.loops.loop import loop_of_model
+from malta.loops.sampled_loops import (
+    SampledLoop,
+    commanded_model,
+    continuous_poles,
+    sampled_loop,
+    sorted_poles,
+)
 from malta.margins.extent import NOWHERE, Extent, extent_of
-from malta.margins.loop import loop_of_model
-from malta.margins.loops import SampledLoop, commanded_model, continuous_poles, sampled_loop, sorted_poles
-from malta.margins.responses import crossing, find_peaks
-from malta.margins.robust import Margin
 from malta.margins.travel import NOT_BETWEEN, travel_margin
 from malta.model.data import plant_of
 from malta.model.linearize import LinearModel, linearize
+from malta.proof.responses import crossing, find_peaks
+from malta.proof.robust import Margin
 from malta.synthesis.controller import Controller
 from malta.synthesis.riccati import add_integrals, eigenvalues
 from malta.synthesis.sampled import gain_at_rest

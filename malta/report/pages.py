@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from rich.console import Group
 
-from malta.margins.recovery import recovery
+from malta.loops.recovery import recovery
 from malta.margins.verify import Margins
 from malta.model.linearize import LinearModel
 from malta.report.figures import (
@@ -38,10 +38,10 @@ if TYPE_CHECKING:
     from malta.campaigns.result import Campaign
     from malta.campaigns.sensitivity import Sensitivity
     from malta.campaigns.summary import Summary
-    from malta.margins.gain import Gain
-    from malta.margins.recovery import Recovery
+    from malta.loops.recovery import Recovery
     from malta.margins.stages import Robustness
     from malta.model.plant import Plant
+    from malta.proof.blocks.gain import Gain
     from malta.simulation.experiments import Experiment
     from malta.synthesis.controller import Controller
     from malta.tuning.tune import Tuned

@@ -20,7 +20,7 @@ from malta.simulation.inputs import feedforward, motion_of, past_forces
 from malta.simulation.period import state_reference
 
 if TYPE_CHECKING:
-    from malta.margins.loops import SampledLoop
+    from malta.loops.sampled_loops import SampledLoop
     from malta.model.plant import FloatArray
     from malta.simulation.references import Motion
     from malta.simulation.scenario import Scenario

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import casadi as ca
 import numpy as np
 
-from malta.margins.loop import loop_along
+from malta.loops.loop import loop_along
 from malta.model.linearize import linearize
 from malta.model.plant import Plant
 from malta.simulation.trajectory import Trajectory

@@ -18,9 +18,9 @@ import casadi as ca
 import numpy as np
 
 from malta.errors import InputError
-from malta.margins.uncertain import is_commutated
 from malta.model.data import plant_of
 from malta.model.plant import Plant
+from malta.proof.uncertain import is_commutated
 from malta.simulation.engines import Engine
 from malta.simulation.layout import layout_of, numbers_of
 from malta.simulation.period import period_of

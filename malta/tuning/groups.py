@@ -22,10 +22,12 @@ import numpy as np
 from scipy import sparse
 
 from malta.errors import CheckError, InputError
-from malta.margins.loops import disturbance_map, push_through
-from malta.margins.plants import of_plant
-from malta.margins.responses import crossing
-from malta.margins.windings import (
+from malta.loops.sampled_loops import disturbance_map, push_through
+from malta.model.equilibrium import trim
+from malta.model.linearize import linearize
+from malta.model.plant import position_in
+from malta.proof.machine.parametric_plants import of_plant
+from malta.proof.machine.windings import (
     Windings,
     emf_slope,
     estimated_rows,
@@ -34,9 +36,7 @@ from malta.margins.windings import (
     with_estimated_emf,
     with_windings,
 )
-from malta.model.equilibrium import trim
-from malta.model.linearize import linearize
-from malta.model.plant import position_in
+from malta.proof.responses import crossing
 from malta.synthesis.controller import linear_law_of
 from malta.synthesis.feedforward import current_loop_of, holding_gain, static_feedforward
 from malta.synthesis.lqg import gains

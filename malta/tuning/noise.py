@@ -9,7 +9,7 @@ import numpy as np
 from malta.synthesis.requirements import Noise
 
 if TYPE_CHECKING:
-    from malta.margins.loops import SampledLoop
+    from malta.loops.sampled_loops import SampledLoop
     from malta.model.plant import FloatArray, Plant
 
 

@@ -9,8 +9,8 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from malta.errors import InputError
-from malta.margins.loop import Loop, loop_of_model
-from malta.margins.recovery import bounded_deviation, worst_along
+from malta.loops.loop import Loop, loop_of_model
+from malta.loops.recovery import bounded_deviation, worst_along
 from malta.margins.verify import BANDWIDTHS, verify
 from malta.model.linearize import linearize
 from malta.simulation.catalogue import experiment

@@ -26,14 +26,14 @@ import numpy as np
 from scipy import optimize, sparse
 
 from malta.errors import InputError
-from malta.margins.loop import loop_of_model
-from malta.margins.loops import SampledLoop
-from malta.margins.responses import crossing
-from malta.margins.windings import emf_slope, estimated_rows, windings_of, with_estimated_emf
+from malta.loops.loop import loop_of_model
+from malta.loops.sampled_loops import SampledLoop
 from malta.model.data import plant_of
 from malta.model.equilibrium import trim
 from malta.model.linearize import linearize
 from malta.model.plant import position_at, position_in
+from malta.proof.machine.windings import emf_slope, estimated_rows, windings_of, with_estimated_emf
+from malta.proof.responses import crossing
 from malta.synthesis.controller import linear_law_of, with_readings
 from malta.synthesis.pid import Axes, axes_of, law_of_outputs, pid_gains
 from malta.synthesis.requirements import ratio_of

@@ -18,9 +18,9 @@ from fuzz.oracle import Defect, Ended, observe
 from malta.campaigns.plan import Plan
 from malta.campaigns.run import campaign
 from malta.campaigns.store import MANIFEST, block_name, read_plan, seal
-from malta.margins import certificate, checked_file
-from malta.margins.check import check
-from malta.margins.uncertain import Compensator
+from malta.proof.certificate import certificate, checked_file
+from malta.proof.certificate.check import check
+from malta.proof.uncertain import Compensator
 from malta.report import campaign_tables
 from malta.simulation.force_log import columns_of_log, read_log
 from malta.simulation.recording import record

@@ -10,11 +10,11 @@ from pydantic import Field
 from malta.cli.documents.parts import Files, Number, Part, Shares, with_keys
 
 if TYPE_CHECKING:
-    from malta.margins.gain import Gain
-    from malta.margins.recovery import Deviation, Recovery
-    from malta.margins.robust import Margin
+    from malta.loops.recovery import Deviation, Recovery
     from malta.margins.stages import Robustness
     from malta.margins.verify import Margins
+    from malta.proof.blocks.gain import Gain
+    from malta.proof.robust import Margin
     from malta.simulation.payload import Payload
 
 Poles = list[tuple[float, float]]

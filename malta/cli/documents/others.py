@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-    from malta.margins.checked_file import Claim
+    from malta.proof.certificate.checked_file import Claim
     from malta.report.ledger import Ledger
     from malta.synthesis.spec import Spec
     from malta.tuning.outcomes import Outcome
@@ -63,7 +63,7 @@ class CheckOutput(Part):
 
 def certified_part(claim: Claim) -> CertifiedPart:
     """What a certificate says that it is of."""
-    from malta.margins.checked_file import double
+    from malta.proof.certificate.checked_file import double
 
     o, places, T = claim.origin, claim.places, claim.sample_time
     names = None if o is None else (o.machine, o.preset, o.law, o.sha256, o.current_loops)

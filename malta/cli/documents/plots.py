@@ -14,10 +14,10 @@ from malta.cli.documents.parts import Files, Number, Part
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from malta.margins.channels import ChannelMargins
-    from malta.margins.curves import LoopCurves
-    from malta.margins.linear_loops import Place
-    from malta.margins.locus import RootLocus
+    from malta.loops.channels import ChannelMargins
+    from malta.loops.curves import LoopCurves
+    from malta.loops.linear_loops import Place
+    from malta.loops.locus import RootLocus
     from malta.synthesis.step_response import StepResponse
 
 Line = Annotated[list[Number], Field(description="one number for each frequency, time or value")]
@@ -266,7 +266,7 @@ def _poles_part(curves: LoopCurves) -> PolesPart:
 
 def _answers(curves: LoopCurves, kinds: Sequence[str], outputs: dict[str, int]) -> dict[str, Any]:
     """The answers to steps and loads."""
-    from malta.margins.steps import loop_steps
+    from malta.loops.steps import loop_steps
 
     found = loop_steps(curves.loop)
     made: dict[str, Any] = {}
@@ -290,7 +290,7 @@ def _answers(curves: LoopCurves, kinds: Sequence[str], outputs: dict[str, int]) 
 
 def _line(answer: StepResponse, output: int, column: int) -> dict[str, Any]:
     """A step response at POINTS times at most until it has settled, and the figures that are read off."""
-    from malta.margins.steps import step_figures
+    from malta.loops.steps import step_figures
 
     found = step_figures(answer, output, column)
     end = 1.6 * found.settling if 0 < found.settling < math.inf else float(answer.t[-1])

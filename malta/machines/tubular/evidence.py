@@ -12,15 +12,15 @@ import numpy as np
 from scipy.optimize import brentq
 
 from malta.campaigns.yields import Yields, main_yields
+from malta.loops.loop import loop_of_model
+from malta.loops.recovery import PLACES, Deviation, recovery
 from malta.machines.tubular.experiments.strokes import delayed_stroke
-from malta.margins.loop import loop_of_model
-from malta.margins.plants import of_plant
-from malta.margins.recovery import PLACES, Deviation, recovery
-from malta.margins.robust import robust_margin
 from malta.margins.stages import compensators
 from malta.margins.verify import Margins
 from malta.model.linearize import LinearModel, linearize
 from malta.model.published import published_value
+from malta.proof.machine.parametric_plants import of_plant
+from malta.proof.robust import robust_margin
 from malta.report.ledger import (
     merit,
     proven_share,

@@ -26,9 +26,9 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from malta.margins.gain import Gain
-    from malta.margins.robust import Margin
     from malta.margins.stages import Robustness
+    from malta.proof.blocks.gain import Gain
+    from malta.proof.robust import Margin
 
 
 LOOKS: tuple[dict[str, Any], dict[str, Any]] = ({"color": "#c9c9c9"}, {"color": "#5a5a5a"})  # stages, machine

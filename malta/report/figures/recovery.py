@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from malta.margins.loop import loop_along
-from malta.margins.loops import SampledLoop
-from malta.margins.recovery import furthest, load_vector
+from malta.loops.loop import loop_along
+from malta.loops.recovery import furthest, load_vector
+from malta.loops.sampled_loops import SampledLoop
 from malta.report.figures.marks import draw_group
 from malta.report.figures.parts import MORE, STYLES, finish_axes, micro, new_figure
 from malta.units import unit_factor
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from malta.margins.recovery import Deviation, Recovery
+    from malta.loops.recovery import Deviation, Recovery
     from malta.model.plant import FloatArray, Plant
     from malta.synthesis.controller import Controller
     from malta.synthesis.step_response import StepResponse

@@ -8,11 +8,11 @@ from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
 from malta.errors import CheckError, InputError
-from malta.margins.classical import Classical
-from malta.margins.curves import loop_curves
-from malta.margins.loop import Loop, loop_along
-from malta.margins.loops import LAST
-from malta.margins.recovery import recovery
+from malta.loops.classical import Classical
+from malta.loops.curves import loop_curves
+from malta.loops.loop import Loop, loop_along
+from malta.loops.recovery import recovery
+from malta.loops.sampled_loops import LAST
 from malta.margins.stages import robustness
 from malta.margins.travel import covers_travel, worst_sensitivities
 from malta.margins.verify import verify
@@ -25,15 +25,15 @@ from malta.tuning.outcomes import judge
 
 if TYPE_CHECKING:
     from malta.campaigns.summary import Summary
-    from malta.margins.curves import LoopCurves
-    from malta.margins.gain import Gain
-    from malta.margins.recovery import Recovery
-    from malta.margins.robust import Margin
+    from malta.loops.curves import LoopCurves
+    from malta.loops.recovery import Recovery
     from malta.margins.stages import Robustness
     from malta.margins.verify import Margins
-    from malta.margins.windings import CurrentLoops
     from malta.model.linearize import LinearModel
     from malta.model.plant import Parameters, Plant
+    from malta.proof.blocks.gain import Gain
+    from malta.proof.machine.windings import CurrentLoops
+    from malta.proof.robust import Margin
     from malta.simulation.experiments import Experiment
     from malta.simulation.payload import Payload
     from malta.synthesis.controller import Controller

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 if TYPE_CHECKING:
-    from malta.margins.curves import LoopCurves
+    from malta.loops.curves import LoopCurves
 
 ALIKE = 1e-3  # relative difference of curves that a plot does not show
 

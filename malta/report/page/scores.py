@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 import numpy as np
 
 from malta.identifiers import distinct, identifier
-from malta.margins.recovery import furthest
+from malta.loops.recovery import furthest
 from malta.margins.verify import BANDWIDTHS
 from malta.model.signals import FINE
 from malta.report.figures.parts import UNITS, micro, number

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from malta.margins.robust import NOT_PROVEN
 from malta.model.plant import Signal
 from malta.model.published import published_figures
 from malta.model.signals import FINE
+from malta.proof.robust import NOT_PROVEN
 from malta.report.figures.parts import UNITS
 from malta.report.page.channels import distinct_channels
 from malta.report.page.design import design_entries, display_unit

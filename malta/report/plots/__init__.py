@@ -1,4 +1,4 @@
-"""Plots that a control engineer expects of any loop; numbers are those of malta/margins/curves.py."""
+"""Plots that a control engineer expects of any loop; numbers are those of malta/loops/curves.py."""
 
 from malta.report.plots.frequency import bode as bode
 from malta.report.plots.frequency import gang_of_four as gang_of_four

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from malta.margins.curves import LoopCurves
+from malta.loops.curves import LoopCurves
 from malta.margins.verify import ZONES, zone
 from malta.report.figures.parts import new_figure
 from malta.report.plots.parts import (
@@ -37,8 +37,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from malta.margins.channels import ChannelMargins
-    from malta.margins.linear_loops import Place
+    from malta.loops.channels import ChannelMargins
+    from malta.loops.linear_loops import Place
     from malta.model.plant import FloatArray
 
 ALONE = "one loop at a time, the others closed"

@@ -10,15 +10,15 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from malta.errors import InputError
-from malta.margins.curves import LoopCurves, loop_curves
+from malta.loops.curves import LoopCurves, loop_curves
 from malta.report.figures.parts import BOUND, MORE, NOTE, STYLES, draw_grid, new_figure, number
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from malta.margins.channels import ChannelMargins
-    from malta.margins.linear_loops import Place
+    from malta.loops.channels import ChannelMargins
+    from malta.loops.linear_loops import Place
     from malta.model.plant import ComplexArray, FloatArray
 
 LINE = 0.155  # inch, of text above a panel

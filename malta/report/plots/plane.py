@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from malta.errors import InputError
-from malta.margins.curves import loop_curves
-from malta.margins.locus import GAIN, RootLocus
-from malta.margins.locus import root_locus as locus_of
+from malta.loops.curves import loop_curves
+from malta.loops.locus import GAIN, RootLocus
+from malta.loops.locus import root_locus as locus_of
 from malta.report.figures.parts import new_figure, number
 from malta.report.plots.frequency import title_of
 from malta.report.plots.parts import Sheet, add_legend, head_of, loops_of, plain, styles_of
@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from malta.margins.curves import LoopCurves
-    from malta.margins.linear_loops import Place
+    from malta.loops.curves import LoopCurves
+    from malta.loops.linear_loops import Place
     from malta.model.plant import ComplexArray
 
 DAMPING = (0.2, 0.5, 0.8)  # rays of the grid

@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from malta.margins.channels import ChannelMargins
-    from malta.margins.linear_loops import Place
+    from malta.loops.channels import ChannelMargins
+    from malta.loops.linear_loops import Place
     from malta.model.plant import ComplexArray, FloatArray
 
 WIDEST = 4.0  # how far left of the origin a Nyquist plot reaches at most

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from malta.errors import InputError
-from malta.margins.steps import StepFigures, loop_steps, step_figures
+from malta.loops.steps import StepFigures, loop_steps, step_figures
 from malta.model.signals import FINE
 from malta.report.figures.parts import draw_grid, micro, number
 from malta.report.plots.frequency import Channel, title_of
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from malta.margins.curves import LoopCurves
+    from malta.loops.curves import LoopCurves
     from malta.synthesis.step_response import StepResponse
 
 SHOWN = 1.6  # times the longest settling time

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 from rich.table import Table
 
-from malta.margins.checked_file import double
+from malta.proof.certificate.checked_file import double
 from malta.report.tables.parts import add_row, new_table
 
 if TYPE_CHECKING:
-    from malta.margins.checked_file import Claim
+    from malta.proof.certificate.checked_file import Claim
 
 DIGITS = 7  # of the ends of an interval
 LOOPS = {"lag": "current loops, if any, as first-order lags", "pi": "the PI current loops of the gain file"}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-from malta.margins.recovery import SHARE, furthest
+from malta.loops.recovery import SHARE, furthest
 from malta.model.signals import FINE
 from malta.report.figures.parts import number
 from malta.report.tables.parts import add_row, new_table
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from rich.table import Table
 
-    from malta.margins.recovery import Recovery
+    from malta.loops.recovery import Recovery
     from malta.model.plant import Plant
 
 

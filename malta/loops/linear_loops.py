@@ -1,0 +1,338 @@
+"""Any linear loop as matrices: a machine and its controller, two systems of python-control, or a loop gain alone.
+
+       r                    w
+       |                    |
+    [ law F ] --+-- v --> [ plant P ] --+--> y           v = F y + R r,   y = P v + P_w w
+       ^                                |
+       +--------------------------------+                negative feedback is inside F: L = -P F
+
+Sampled systems are in differences, (x+ - x) / T = A x + B u: slow poles lie close to 1, where the A of x+ = A x has
+lost their digits.
+"""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+import numpy as np
+from scipy import linalg
+
+from malta.errors import CheckError, InputError
+from malta.loops.loop import Loop, loop_along
+from malta.loops.loop_systems import LoopSystems
+from malta.model.plant import Plant, Signal
+from malta.synthesis.controller import Controller, LinearLaw, linear_law
+from malta.synthesis.riccati import eigenvalues
+from malta.synthesis.state_space import balanced_units, set_point
+
+if TYPE_CHECKING:
+    from malta.model.plant import ComplexArray, FloatArray
+
+CALLER = "loop"
+Place = Literal["sensors", "forces"]
+GONE = 1e-6  # |z| of the poles of pure delay
+STILL = 1e-6  # of a pole's frequency: growth that counts as none
+SAME = 1e-3  # of a response: the error of states that still are those of a transfer function
+ROUNDING = 1e-14  # of a matrix whose eigenvalues are taken
+
+
+class System(NamedTuple):
+    """x' = A x + B u, y = C x + D u; of a sampled system (x+ - x) / T = A x + B u."""
+
+    A: FloatArray
+    B: FloatArray
+    C: FloatArray
+    D: FloatArray
+
+    def response(self, s: ComplexArray) -> ComplexArray:
+        """C (s - A)^-1 B + D at k complex frequencies s, in differences (z - 1) / T: k x outputs x inputs.
+
+        NaN at a frequency that no double number tells from a pole.
+        """
+        if not len(self.A):
+            return np.broadcast_to(self.D.astype(complex), (len(s), *self.D.shape))
+        t = balanced_units(self.A, self.B, self.C)
+        A, B, C = self.A * t / t[:, None], self.B / t[:, None], self.C * t
+        matrices = s[:, None, None] * np.eye(len(A)) - A
+        try:
+            found = np.linalg.solve(matrices, B.astype(complex))
+        except np.linalg.LinAlgError:  # a frequency on a pole: beside it
+            beside = matrices + 1e-9 * s[:, None, None] * np.eye(len(A))
+            found = np.full((len(s), *B.shape), np.nan, dtype=complex)
+            for k, one in enumerate(beside):
+                with suppress(np.linalg.LinAlgError):
+                    found[k] = np.linalg.solve(one, B)
+        return np.asarray(C @ found + self.D)
+
+
+@dataclass(frozen=True, eq=False)
+class LinearLoop:
+    """A plant y = P (v, r) + P_w w and its law (v, r) = F y: m inputs v, and readings r that held currents hang on.
+
+    plant : inputs v, r, w (m, some or none, d); outputs y, then the true outputs where sensors read late
+    law : inputs y; outputs v and r
+    command : what a unit reference adds, one column each: in the law's states, and in v and r
+    """
+
+    name: str
+    plant: System
+    law: System
+    command: tuple[FloatArray, FloatArray]
+    sample_time: float | None  # s; None: continuous
+    outputs: tuple[Signal, ...]
+    inputs: tuple[Signal, ...]
+    loads: tuple[Signal, ...]
+    cancelled: tuple[float, ...] = ()  # rad/s, poles of the law that its zeros cancel: of forecast voltages
+
+    def frequencies(self, w: FloatArray) -> ComplexArray:
+        """The complex frequencies of the systems at w, rad/s: jw, or (z - 1) / T."""
+        T, s = self.sample_time, 1j * np.asarray(w, dtype=float)
+        return np.asarray(s if T is None else np.expm1(s * T) / T)
+
+    def closed_loop(self, factors: FloatArray | None = None, at: Place = "forces") -> System:
+        """The closed loop from references and loads to the true outputs.
+
+        factors : of the loop gain, one for each channel at the sensors or at the forces; 0 opens a channel
+
+        Raises CheckError for a loop without a solution, 1 + L = 0 at infinite frequency.
+        """
+        (A, B_all, C_all, D_all), (F_A, F_B, F_C, F_D) = self.plant, self.law
+        p, u = len(self.outputs), len(F_C)
+        if factors is not None and at == "sensors":
+            F_B, F_D = F_B * factors, F_D * factors
+        elif factors is not None:
+            rows = np.append(factors, np.ones(u - len(factors)))[:, None]
+            F_C, F_D = rows * F_C, rows * F_D
+        B, B_w, C, D, D_w = B_all[:, :u], B_all[:, u:], C_all[:p], D_all[:p, :u], D_all[:p, u:]
+        try:
+            W = np.linalg.inv(np.eye(p) - D @ F_D)
+        except np.linalg.LinAlgError as error:
+            raise CheckError(f"{self.name}: 1 + L is singular at infinite frequency") from error
+        R_s, R_v = self.command
+        y = np.hstack([W @ C, W @ D @ F_C]), np.hstack([W @ D @ R_v, W @ D_w])  # of (x, s), of (r, w)
+        v = F_D @ y[0], F_D @ y[1] + np.hstack([R_v, np.zeros((u, B_w.shape[1]))])
+        v[0][:, len(A) :] += F_C
+        whole = np.vstack([B @ v[0], F_B @ y[0]])
+        whole[: len(A), : len(A)] += A
+        whole[len(A) :, len(A) :] += F_A
+        driven = np.vstack([B @ v[1], F_B @ y[1]])
+        driven[: len(A), R_v.shape[1] :] += B_w
+        driven[len(A) :, : R_v.shape[1]] += R_s
+        true, through = C_all[-p:], D_all[-p:]
+        out = through[:, :u] @ v[0]
+        out[:, : len(A)] += true
+        direct = through[:, :u] @ v[1]
+        direct[:, R_v.shape[1] :] += through[:, u:]
+        return System(whole, driven, out, direct)
+
+    def poles_of(self, A: FloatArray) -> ComplexArray:
+        """Eigenvalues in rad/s; of sampled systems ln(z) / T, without the poles of pure delay."""
+        found, T = eigenvalues(A) if len(A) else np.zeros(0, dtype=complex), self.sample_time
+        if T is None:
+            return found
+        z = 1 + T * found
+        found = found[np.abs(z) > GONE]
+        return np.asarray(np.log1p(T * found) / T)
+
+    def unstable_poles(self, factors: FloatArray, at: Place) -> int:
+        """How many poles grow with these factors of the loop gain.
+
+        A pole grows where its growth exceeds what rounding may have made of it, eps |A| times the condition of the
+        eigenvalue, and a millionth of its frequency. Integrators, which scatter about zero when several are in
+        series, and undamped oscillators count as stable.
+        """
+        system, T = self.closed_loop(factors, at), self.sample_time
+        A = system.A
+        found = eigenvalues(A) if len(A) else np.zeros(0, dtype=complex)
+        if not (self._growth(found) > 0).any():
+            return 0
+        t = balanced_units(A, system.B, system.C)
+        A = A * t / t[:, None]
+        vectors: Any = linalg.eig(A, left=True, right=True)
+        found, left, right = vectors
+        overlap = np.abs(np.einsum("ij,ij->j", left.conj(), right))  # of unit vectors: 1 / condition
+        size = float(np.linalg.norm(A, 2)) + (0.0 if T is None else 1 / T)
+        growth = self._growth(found)
+        return int(((growth * overlap > ROUNDING * size) & (growth > STILL * np.abs(found))).sum())
+
+    def _growth(self, poles: ComplexArray) -> FloatArray:
+        """Re of poles; of eigenvalues in differences (|z|^2 - 1) / 2 T."""
+        T = self.sample_time or 0.0
+        return np.asarray(poles.real + 0.5 * T * np.abs(poles) ** 2)
+
+    def closed_eigenvalues(self) -> ComplexArray:
+        """The eigenvalues of the closed loop, without those that the law cancels in itself."""
+        found, T = eigenvalues(self.closed_loop().A), self.sample_time
+        for pole in self.cancelled:
+            found = np.delete(found, np.abs(found - (pole if T is None else np.expm1(pole * T) / T)).argmin())
+        return found
+
+    @cached_property
+    def closed_poles(self) -> ComplexArray:
+        """The poles of the closed loop, rad/s, without those that the law cancels in itself."""
+        found = self.poles_of(self.closed_loop().A)
+        for pole in self.cancelled:
+            found = np.delete(found, np.abs(found - pole).argmin())
+        return found
+
+    @cached_property
+    def stable(self) -> bool:
+        """Whether all poles of the closed loop decay."""
+        return bool((self.closed_poles.real < 0).all())
+
+
+def linear_loop(
+    source: Any, controller: Any = None, *, name: str = "", position: float | None = None
+) -> LinearLoop:
+    """The matrices of a loop.
+
+    source, controller : a plant and its Controller; a Loop; LoopSystems; two systems of python-control, plant and
+        controller of the errors (L = P C, negative feedback); or one, the loop gain L. A pair may be one tuple
+    name : of the loop; "": that of the controller or of the system
+    position : of the stroke, m, of a plant; None: the controller's operating point
+
+    Raises InputError for anything else, and CheckError as `loop_systems`.
+
+    >>> import control
+    >>> linear_loop(control.tf([2], [1, 1])).closed_poles.real.round(6).tolist()
+    [-3.0]
+    """
+    if controller is None and isinstance(source, tuple) and len(source) == 2:
+        source, controller = source
+    if isinstance(source, LinearLoop):
+        return source
+    if isinstance(source, Plant) and isinstance(controller, Controller):
+        source, controller = loop_along(source, controller, position), None
+    if isinstance(source, Loop) and controller is None and position is None:
+        return _of_machine(source, name or source.controller.name)
+    if isinstance(source, LoopSystems) and controller is None:
+        return linear_loop(source.plant, source.controller, name=name)
+    if _is_system(source) and (controller is None or _is_system(controller)):
+        return _of_systems(source, controller, name)
+    found = " and ".join(type(one).__name__ for one in (source, controller) if one is not None)
+    raise InputError(
+        CALLER, "", f"a {found}", "a loop, a plant and its controller, or control systems: L, or P and C"
+    )
+
+
+def _of_machine(whole: Loop, name: str) -> LinearLoop:
+    loop, plant, controller = whole.sampled_forces, whole.plant, whole.controller
+    law, T = loop.control, loop.sample_time
+    assert loop.pushed is not None
+    driven, command = _commanded_system(controller, law)
+    outputs = loop.Cd if loop.true is None else np.vstack([loop.Cd, loop.true])
+    into = np.hstack([loop.Bd, loop.pushed]) / T
+    return LinearLoop(
+        name,
+        System((loop.Ad - np.eye(len(loop.Ad))) / T, into, outputs, np.zeros((len(outputs), into.shape[1]))),
+        driven,
+        command,
+        T,
+        plant.outputs,
+        plant.inputs,
+        plant.disturbances,
+        cancelled=tuple((np.log(np.diag(law.A)[len(linear_law(controller).A) :]) / T).tolist()),
+    )
+
+
+def _commanded_system(c: Controller, law: LinearLaw) -> tuple[System, tuple[FloatArray, FloatArray]]:
+    """The law from readings, and what a unit reference adds to its states and to its outputs.
+
+    The reference of a stored force is as old as the force: the law gets the references of the last samples as states
+    where that matters. No reading reaches them, so that the loop stays the same.
+    """
+    T, R, p, m = c.sample_time, set_point(c), len(c.measurements), len(c.forces)
+    A, B_y, C = (law.A - np.eye(len(law.A))) / T, law.B_y / T, law.C
+    first = p + len(c.A) + m * c.lagging  # of the stored forces in r, the oldest first
+    stored = R[first : first + m * c.delay].copy()
+    if not stored.any():
+        return System(A, B_y, C, law.D_y), (law.B_r @ R / T, law.D_r @ R)
+    R[first : first + m * c.delay] = 0
+    rows = np.arange(m * c.delay).reshape(c.delay, m)[::-1]  # of the newest, one sample old, first
+    of_stored = slice(first, first + m * c.delay)
+    B_old = np.hstack([law.B_r[:, of_stored][:, r] @ stored[r] for r in rows]) / T
+    D_old = np.hstack([law.D_r[:, of_stored][:, r] @ stored[r] for r in rows])
+    size = p * c.delay
+    shift = (np.eye(size, k=-p) - np.eye(size)) / T
+    whole = np.block([[A, B_old], [np.zeros((size, len(A))), shift]])
+    newest = np.vstack([np.eye(p), np.zeros((size - p, p))]) / T
+    driven = System(whole, np.vstack([B_y, np.zeros((size, p))]), np.hstack([C, D_old]), law.D_y)
+    return driven, (np.vstack([law.B_r @ R / T, newest]), law.D_r @ R)
+
+
+def _is_system(source: Any) -> bool:
+    """Whether this is a linear system of python-control."""
+    return all(hasattr(source, key) for key in ("ninputs", "noutputs", "dt", "input_labels", "poles"))
+
+
+def _of_systems(plant: Any, controller: Any, name: str) -> LinearLoop:
+    """A loop of control systems: P and C of the errors, or L alone."""
+    known = [one.dt for one in (plant, controller) if one is not None and one.dt is not None]
+    dt = known[0] if known else 0
+    if any(other != dt for other in known):
+        raise InputError(CALLER, "dt", " and ".join(map(str, known)), "the same of plant and controller")
+    T = (1.0 if dt is True else float(dt)) or None
+    P = _matrices(plant, T)
+    p, m = P.D.shape
+    if controller is None:
+        F = System(np.zeros((0, 0)), np.zeros((0, p)), np.zeros((p, 0)), -np.eye(p))
+    else:
+        C = _matrices(controller, T)
+        F = System(C.A, -C.B, C.C, -C.D)
+    if F.D.shape != (m, p):
+        who, (rows, columns) = ("L", P.D.shape) if controller is None else ("C", F.D.shape)
+        wanted = "as many of both" if controller is None else f"{p} inputs and {m} outputs"
+        raise InputError(CALLER, who, f"{columns} inputs and {rows} outputs", wanted)
+    outputs = tuple(Signal(label, "1") for label in plant.output_labels)
+    inputs = tuple(Signal(label, "1") for label in plant.input_labels)
+    loads = inputs if controller is not None else ()
+    driven = System(P.A, np.hstack([P.B, P.B[:, : len(loads)]]), P.C, np.hstack([P.D, P.D[:, : len(loads)]]))
+    own = name or (plant.name if controller is None else controller.name)
+    return LinearLoop(own, driven, F, (-F.B, -F.D), T, outputs, inputs, loads)
+
+
+def _matrices(system: Any, T: float | None) -> System:
+    """A, B, C and D of a control system, in differences where it is sampled. Raises InputError."""
+    import control  # imports matplotlib and takes a second: only where it is used
+
+    try:
+        found = control.ss(system)
+    except Exception as error:  # many kinds: an improper function, a frequency response without states
+        wanted = "a system with states, or a proper transfer function"
+        raise InputError(CALLER, system.name, f"a {type(system).__name__}", wanted) from error
+    if isinstance(system, control.TransferFunction) and _lost(system, found):
+        if system.ninputs * system.noutputs > 1:
+            wanted = "a system with states: the digits of its coefficients do not suffice for one"
+            raise InputError(CALLER, system.name, "a TransferFunction", wanted)
+        found = control.ss(*_companion(system.num[0][0], system.den[0][0]), system.dt)
+    A, B, C, D = (np.array(M, dtype=float) for M in (found.A, found.B, found.C, found.D))
+    if not all(np.isfinite(M).all() for M in (A, B, C, D)):
+        raise InputError(CALLER, system.name, "NaN or infinity", "finite numbers")
+    return System(A, B, C, D) if T is None else System((A - np.eye(len(A))) / T, B / T, C, D)
+
+
+def _lost(system: Any, found: Any) -> bool:
+    """Whether the states of a transfer function have lost its response, as those of very slow poles or small gains."""
+    poles = np.concatenate([np.roots(den) for row in system.den for den in row]).astype(complex)
+    sampled = system.isdtime(strict=True)
+    sizes = np.abs(np.log(poles[poles != 0]) if sampled else poles)
+    w = np.outer(np.append(sizes[sizes > 0], 1.0), [1e-2, 0.3, 1.7, 1e2]).ravel()
+    points = np.exp(1j * w[w < np.pi]) if sampled else 1j * w
+    wanted, made = (np.atleast_1d(np.asarray(one(points))) for one in (system, found))
+    return not bool((np.abs(made - wanted) <= SAME * np.abs(wanted)).all())
+
+
+def _companion(num: FloatArray, den: FloatArray) -> System:
+    """States of a proper transfer function, in units of time and of the output in which its coefficients are near 1."""
+    n = len(den) - 1
+    a = np.asarray(den[1:] / den[0], dtype=float)
+    b = np.append(np.zeros(n + 1 - len(num)), num) / den[0]
+    orders = np.arange(1, n + 1)
+    rate = float((np.abs(a) ** (1 / orders)).max(initial=0.0)) or 1.0
+    A = np.eye(n, k=-1) * rate
+    A[:1] = -a / rate ** (orders - 1.0)
+    c = (b[1:] - b[0] * a) / rate ** (orders - 1.0)
+    return System(A, np.eye(n, 1), c[None, :], np.array([[b[0]]]))

@@ -1,0 +1,258 @@
+"""The loop of a machine: machine x law x operating point x parameters, from which everything linear is derived."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property, lru_cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from malta.display import Description, display, quantity
+from malta.errors import InputError
+from malta.loops.classical import Classical, Nominal, classical_margins
+from malta.loops.sampled_loops import (
+    LAST,
+    SampledLoop,
+    continuous_poles,
+    disturbance_map,
+    loaded_loop,
+    loaded_model,
+    machine_loop,
+    machine_system,
+    push_through,
+)
+from malta.model.parameters import units_of
+from malta.model.plant import position_at
+from malta.proof.machine.windings import CurrentLoops, chosen_loops, left_out
+from malta.proof.robust import Margin, Progress, Ranges, robust_margin
+from malta.synthesis.riccati import eigenvalues
+from malta.threads import on_one_thread
+
+if TYPE_CHECKING:
+    from malta.model.linearize import LinearModel
+    from malta.model.plant import ComplexArray, FloatArray, Plant
+    from malta.proof.uncertain import Compensator, UncertainSystem
+    from malta.synthesis.controller import Controller
+
+
+@display
+@dataclass(frozen=True, eq=False)
+class Loop:
+    """A machine and its controller at an operating point: the derivative of the control period that simulations fly.
+
+        xi+ = Ad xi + Bd (v, r) + G w,   y = Cd xi,   (v, r) = F y        one sample, negative feedback inside F
+
+    xi holds the machine's states, the windings' currents, the link's voltage under load, stored forces and readings;
+    r are readings on which held currents hang, w disturbances. Hold, delay, current loops, sensors and loads are exact.
+    What is not in it is named by `left_out`.
+
+    plant : the machine, with its parameters
+    controller : its controller
+    at : states that are not zero, SI, by name
+    current_loops : "pi", the controllers of the gain file on the windings, where a machine has some; or "lag"
+
+    >>> import malta
+    >>> controller = malta.gains.read("design/gains/calibrated.json")
+    >>> loop = malta.loop(malta.plant_of(controller.parameters), controller, z=5e-3)
+    >>> loop.stable, loop.matrix.shape
+    (True, (41, 41))
+    >>> found = loop.margin({"m": 0.2, "K_A": 0.2, "K_B": 0.2, "K_D": 0.2})
+    >>> f"{found.lower:.2f} times the box"
+    '1.62 times the box'
+    """
+
+    plant: Plant
+    controller: Controller
+    at: Mapping[str, float] = field(default_factory=dict)
+    current_loops: CurrentLoops = LAST
+
+    @cached_property
+    def model(self) -> LinearModel:
+        """The machine's linear model at rest under its loads. Raises CheckError where no command holds it."""
+        along = {name: value for name, value in self.at.items() if name != self.plant.stroke}
+        return loaded_model(self.plant, self.at.get(self.plant.stroke, 0.0), tuple(along.items()))
+
+    @cached_property
+    def sampled(self) -> SampledLoop:
+        """The sampled matrices; voltages that the law forecasts are inputs beside the forces."""
+        return self._sampled(forces_alone=False)
+
+    @cached_property
+    def sampled_forces(self) -> SampledLoop:
+        """The same loop, with the forecast voltages as part of the law's forces."""
+        return self._sampled(forces_alone=True)
+
+    def _sampled(self, *, forces_alone: bool) -> SampledLoop:
+        found = machine_loop(self.model, self.controller, self.current_loops, forces_alone=forces_alone)
+        assert found.continuous is not None
+        pushed = push_through(
+            found.continuous, disturbance_map(self.model), self.controller.sample_time, len(found.Ad)
+        )
+        return replace(found, pushed=pushed)
+
+    @property
+    def sample_time(self) -> float:
+        """Of the law, s."""
+        return self.controller.sample_time
+
+    @property
+    def matrix(self) -> FloatArray:
+        """The state matrix of the closed loop over one sample, the machine's states first."""
+        return self.sampled.closed
+
+    @cached_property
+    def poles(self) -> ComplexArray:
+        """Of the closed loop, ln(z) / Ts in rad/s, without those of pure delay."""
+        return continuous_poles(self._eigenvalues, self.sample_time)
+
+    @cached_property
+    def _eigenvalues(self) -> ComplexArray:
+        return eigenvalues(self.matrix)
+
+    @cached_property
+    def stable(self) -> bool:
+        """Whether all poles decay."""
+        return bool(np.abs(self._eigenvalues).max() < 1)
+
+    @property
+    def left_out(self) -> str:
+        """What the machine has and this loop has not, in words; "": nothing."""
+        return left_out(self.plant, self.controller, self.current_loops)
+
+    def loop_gain(self, w: FloatArray) -> ComplexArray:
+        """L = -P F at the sensors: k x p x p.
+
+        w : k frequencies, rad/s
+        """
+        P, F = self.nominal.response(np.asarray(w, dtype=float))
+        return np.asarray(-P @ F)
+
+    def sensitivity(self, w: FloatArray) -> ComplexArray:
+        """S = (I + L)^-1 at the sensors: k x p x p.
+
+        w : k frequencies, rad/s
+        """
+        L = self.loop_gain(w)
+        return np.asarray(np.linalg.inv(np.eye(L.shape[-1]) + L))
+
+    @cached_property
+    def nominal(self) -> Nominal:
+        """The responses P and F of the loop, in differences, which classical margins take."""
+        return loaded_loop(self.plant, self.controller, self.at, self.current_loops)
+
+    @cached_property
+    def classical(self) -> Classical:
+        """Disk margins, delay margins and the gang of four."""
+        return classical_margins(self.nominal, [s.name for s in self.plant.outputs])
+
+    def uncertain(self, names: Sequence[str]) -> tuple[UncertainSystem, Compensator]:
+        """The loop without loads in parameters by name: the arguments of malta.robust_margin and its like.
+
+        names : of the machine's parameters
+        """
+        return machine_system(self.plant, self.controller, list(names), self.at, self.current_loops)
+
+    @on_one_thread
+    def margin(
+        self, ranges: Ranges, *, time: float | None = None, progress: Progress | None = None
+    ) -> Margin:
+        """The proven margin of the parameters at this operating point, in multiples of their ranges.
+
+        ranges : by parameter: 0.2 is +-20 %, (low, high) an interval in SI
+        time : s, longest search
+        progress : called with the lower and the upper bound so far
+
+        Raises InputError for unknown parameters.
+        """
+        return robust_margin(*self.uncertain(tuple(ranges)), ranges, time=time, progress=progress)
+
+    @property
+    def description(self) -> Description:
+        """Where it stands, its size and its poles."""
+        place = ", ".join(f"{name} = {value:g}" for name, value in self.at.items() if value) or "the centre"
+        rate = np.abs(self.poles)
+        rows = (
+            ("machine", f"{self.plant.name!r}, preset {self.plant.parameters.preset!r}, at {place}"),
+            ("law", f"{self.controller.name!r}, every {quantity(self.sample_time, 's')}"),
+            ("closed loop", f"{len(self.matrix)} states, {'stable' if self.stable else 'UNSTABLE'}"),
+            ("poles", f"{rate.min():.4g} .. {rate.max():.4g} rad/s"),
+            ("left out", self.left_out or "nothing"),
+        )
+        return Description(f"Loop of {self.controller.name!r} at {place}", rows)
+
+
+def loop(
+    plant: Plant,
+    controller: Controller,
+    /,
+    *,
+    parameters: Mapping[str, float] | None = None,
+    current_loops: CurrentLoops = LAST,
+    **at: float,
+) -> Loop:
+    """Make the loop of a machine and a controller at an operating point.
+
+    plant : the machine
+    controller : its controller
+    parameters : of the machine that differ, by name, SI; the controller keeps what it believes
+    current_loops : "pi", the controllers of the gain file on the windings, where a machine has some; or "lag",
+        first-order lags at their crossover
+    at : states that are not zero, SI; none: the controller's operating point
+
+    Returns a Loop.
+
+    Raises InputError for unknown states or parameters, and for values that the machine cannot have.
+
+    >>> import malta
+    >>> controller = malta.gains.read("design/gains/calibrated.json")
+    >>> plant = malta.plant_of(controller.parameters)
+    >>> heavy = malta.loop(plant, controller, parameters={"m": 0.6})
+    >>> f"slowest pole {heavy.poles.real.max():.2f} rad/s"
+    'slowest pole -6.61 rad/s'
+    """
+    chosen_loops(plant, controller, current_loops)
+    known = units_of(plant.parameters)
+    for name in parameters or {}:
+        if name not in known:
+            raise InputError("loop", name, "an unknown parameter", "one of " + " ".join(known))
+    machine = plant.variant(replace(plant.parameters, **parameters)) if parameters else plant
+    names = [s.name for s in controller.measurements]
+    if names != [s.name for s in plant.outputs]:
+        raise InputError("loop", "controller", f"one of {' '.join(names)}", f"one of the {plant.name}")
+    x = plant.state(at) if at else plant.point(controller.operating_point[0]).x
+    return _remembered(machine, controller, tuple(position_at(plant, x).items()), current_loops)
+
+
+def loop_of_model(model: LinearModel, controller: Controller, current_loops: CurrentLoops = LAST) -> Loop:
+    """The loop of a linear model's machine at the model's operating point."""
+    at = position_at(model.plant, model.operating_point.x)
+    return _remembered(model.plant, controller, tuple(at.items()), current_loops)
+
+
+def loop_along(
+    plant: Plant, controller: Controller, position: float | None = None, current_loops: CurrentLoops = LAST
+) -> Loop:
+    """The loop at a position of the stroke, m; None: at the controller's operating point."""
+    at = position_at(plant, plant.point(controller.operating_point[0]).x)
+    if position is not None and plant.has_stroke:
+        at[plant.stroke] = position
+    return _remembered(plant, controller, tuple(at.items()), current_loops)
+
+
+def loop_from(source: Plant | Loop, controller: Controller | None, position: float | None = None) -> Loop:
+    """The loop that a function was given: as it is, or of a plant and its controller. Raises InputError."""
+    if isinstance(source, Loop) and controller is None and position is None:
+        return source
+    if isinstance(source, Loop) or controller is None:
+        found = "none" if controller is None else "one beside a Loop"
+        raise InputError("loop", "controller", found, "a Loop, or a plant and its controller")
+    return loop_along(source, controller, position)
+
+
+@lru_cache(maxsize=32)  # what is asked of a loop is computed once; plants and controllers compare by identity
+def _remembered(
+    plant: Plant, controller: Controller, at: tuple[tuple[str, float], ...], current_loops: CurrentLoops
+) -> Loop:
+    return Loop(plant, controller, dict(at), current_loops)

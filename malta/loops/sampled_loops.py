@@ -1,0 +1,405 @@
+"""The loop of a machine and a controller, sampled; and the machine's loop with uncertain parameters.
+
+P is the machine from forces to measurements under a zero-order hold, exactly; F is the control law from measurements
+to forces (v = F y), as in the block diagram of synthesis/controller.py. At the sensors
+
+    S = (I - P F)^-1,   T = I - S,   L = -P F.
+
+Coil currents are commutated for the last reading and held for a sample. Where the machine moves on meanwhile, the
+reading is a further input of P, and F passes it on.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING
+
+import casadi as ca
+import numpy as np
+
+from malta.loops.classical import Nominal, remembered
+from malta.loops.machine_laws import ReadingUse, sampled_law
+from malta.model.data import plant_of
+from malta.model.equilibrium import trim
+from malta.model.linearize import LinearModel, linearize
+from malta.model.plant import off_stroke, position_in, readonly
+from malta.model.sensors import whole_samples, with_lags
+from malta.proof.machine.parametric_plants import of_plant
+from malta.proof.machine.windings import (
+    CurrentLoops,
+    axis_map,
+    chosen_loops,
+    current_control,
+    force_modes,
+    forecast_as_forces,
+    link_at_rest,
+    sample_driven,
+    windings_of,
+    with_estimated_emf,
+    with_windings,
+)
+from malta.proof.uncertain import Compensator, UncertainSystem, held_gain, is_commutated
+from malta.synthesis.controller import Controller, LinearLaw, linear_law, with_readings, with_slope
+from malta.synthesis.riccati import add_lags, delay_inputs, eigenvalues, sample
+from malta.synthesis.step_response import StepResponse, step_response
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from malta.model.plant import ComplexArray, FloatArray, OperatingPoint, Plant
+
+LAST: CurrentLoops = "pi"  # the last stage: the loop that simulations fly by default
+ROUNDING = 1e-9  # of the largest entry
+DELAYED = 1e-6  # |z| below which a pole is one of pure delay
+
+
+@dataclass(frozen=True, eq=False)
+class SampledLoop:
+    """Sampled machine x+ = Ad x + Bd v, y = Cd x, closed by the linear control law v = F y."""
+
+    Ad: FloatArray
+    Bd: FloatArray
+    Cd: FloatArray
+    control: LinearLaw
+    sample_time: float  # s
+    true: FloatArray | None = None  # outputs of the states, where sensors read them late; None: Cd
+    continuous: FloatArray | None = None  # of the first states, between samples
+    pushed: FloatArray | None = None  # what unit disturbances leave in the states in one sample, n x w
+
+    @property
+    def outputs(self) -> FloatArray:
+        """The matrix of the true outputs, which Cd reads."""
+        return self.Cd if self.true is None else self.true
+
+    @property
+    def closed(self) -> FloatArray:
+        """State matrix of the closed loop, states of the machine first."""
+        c = self.control
+        return np.block(
+            [
+                [self.Ad + self.Bd @ c.D_y @ self.Cd, self.Bd @ c.C],
+                [c.B_y @ self.Cd, c.A],
+            ]
+        )
+
+    def loop_gain(self, w: FloatArray) -> ComplexArray:
+        """The loop gain at the sensors, L = -P F, at the frequencies w (rad/s): k x p x p."""
+        z = np.exp(1j * np.asarray(w) * self.sample_time)[:, None, None]
+        P = self.Cd @ np.linalg.solve(z * np.eye(len(self.Ad)) - self.Ad, self.Bd)
+        c = self.control
+        F = c.C @ np.linalg.solve(z * np.eye(len(c.A)) - c.A, c.B_y) + c.D_y
+        return np.asarray(-P @ F)
+
+    def sensitivity(self, w: FloatArray) -> ComplexArray:
+        """The sensitivity S = (I + L)^-1 at the sensors, k x p x p; it also takes noise to the outputs."""
+        return np.asarray(np.linalg.inv(np.eye(len(self.Cd)) + self.loop_gain(w)))
+
+    def answer(self) -> StepResponse:
+        """The true outputs after a unit step of every disturbance. Raises CheckError for an unstable loop."""
+        assert self.pushed is not None
+        k = len(self.control.A)
+        g = np.vstack([self.pushed, np.zeros((k, self.pushed.shape[1]))])
+        C = np.hstack([self.outputs, np.zeros((len(self.Cd), k))])
+        return step_response(self.closed, g, C, self.sample_time)
+
+    def compliance(self, w: FloatArray, load: FloatArray) -> ComplexArray:
+        """True outputs per load at frequencies w, rad/s, of a load that is constant throughout each sample: k x p."""
+        assert self.pushed is not None
+        z = np.exp(1j * np.asarray(w) * self.sample_time)[:, None, None]
+        law, into = self.control, np.hstack([self.Bd, self.pushed @ load[:, None]])
+        P = np.linalg.solve(z * np.eye(len(self.Ad)) - self.Ad, into)
+        P, true = self.Cd @ P, self.outputs @ P
+        F = law.C @ np.linalg.solve(z * np.eye(len(law.A)) - law.A, law.B_y) + law.D_y
+        m = self.Bd.shape[1]
+        read = np.linalg.solve(np.eye(len(self.Cd)) - P[..., :m] @ F, P[..., m:])
+        if self.true is None:
+            return np.asarray(read[..., 0])
+        return np.asarray((true[..., m:] + true[..., :m] @ F @ read)[..., 0])
+
+
+def sampled_loop(
+    model: LinearModel,
+    controller: Controller,
+    *,
+    delay: int = 0,
+    current_loops: CurrentLoops | None = None,
+    feedforward: bool = False,
+    sensors: bool = False,
+    forces_alone: bool = False,
+) -> SampledLoop:
+    """The sampled loop of a machine and a controller.
+
+    delay : samples between measurement and force
+    current_loops : "lag" or "pi" (windings.py); None: forces follow their commands at once
+    feedforward : whether the slope of v0(z) acts, for models at their trim, where the slope of the loads acts
+    sensors : whether the machine's sensors read late; their readings are states after the machine's
+    forces_alone : whether voltages that the law forecasts are part of its forces, not outputs beside them
+
+    The controller commutates with its own parameters, and the currents produce forces with the machine's parameters.
+    """
+    model, law = commanded_model(model, controller), linear_law(controller)
+    A, B, C = model.A, model.B, model.C
+    if model.E.any():
+        A, B = A - model.E @ C, np.hstack([B, model.E])
+    plant, true, late = model.plant, None, 0
+    if sensors and plant.sensors is not None:
+        true, late = C, whole_samples(plant, controller.sample_time)
+        A, B, C = (np.array(ca.DM(M)) for M in with_lags(plant.sensors, A, B, C))
+    if feedforward:
+        law = with_slope(law, feedforward_slope(model, controller))
+    if current_loops == "pi":
+        A, Ad, Bd, law = _driven(model, controller, (A, B, C), delay, law, forces_alone=forces_alone)
+        continuous = A
+    else:
+        continuous = A
+        if current_loops == "lag" and math.isfinite(plant.actuator.crossover):
+            A, B = add_lags(A, B, plant.actuator.crossover)
+        Ad, Bd = delay_inputs(*sample(A, B, controller.sample_time), delay)
+    Cd, true = _pad(C, len(Ad)), None if true is None else _pad(true, len(Ad))
+    if late:
+        Ad, Bd, Cd = _stored_readings(Ad, Bd, Cd, late)
+        true = None if true is None else _pad(true, len(Ad))
+    if model.E.any():
+        law = with_readings(law)
+    return SampledLoop(Ad, Bd, Cd, law, controller.sample_time, true, continuous)
+
+
+def _driven(
+    model: LinearModel,
+    controller: Controller,
+    abc: tuple[FloatArray, FloatArray, FloatArray],
+    delay: int,
+    law: LinearLaw,
+    *,
+    forces_alone: bool,
+) -> tuple[FloatArray, FloatArray, FloatArray, LinearLaw]:
+    """The machine with its windings between samples; behind its current controllers, from the law's outputs; the law.
+
+    Under load the link's voltage is a state. The voltages that the law forecasts, M^+ emf(x_hat), are outputs of the
+    law beside its forces, or with `forces_alone` part of these.
+    """
+    plant, point, m, Ts = model.plant, model.operating_point, len(controller.forces), controller.sample_time
+    believed = plant_of(controller.parameters)
+    windings = windings_of(plant, believed, point, np.eye(m))
+    control = current_control(controller, windings, point)
+    A, B, C = (np.array(ca.DM(M)) for M in with_windings(plant, windings, point.x, *abc))
+    phi, share = C[-m:], None
+    link = link_at_rest(plant, windings, point, axis_map(believed, point)) if point.loaded else None
+    if link is not None:
+        A = np.block([[A, B @ link.share[:, None]], [link.by_phi @ phi, np.array([[link.rate]])]])
+        B, phi, share = np.vstack([B, link.by_w[None]]), _pad(phi, len(A)), link.share
+    Ad, Bd = sample_driven((A, B, phi), control.loop, windings.R, Ts, delay, share)
+    if forces_alone or not len(control.emf[0]):
+        return A, Ad, Bd[:, :m], forecast_as_forces(law, control, Ts)
+    return A, Ad, Bd, with_estimated_emf(law, control.emf)
+
+
+def _stored_readings(
+    A: FloatArray, B: FloatArray, C: FloatArray, late: int
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """The sampled machine whose outputs are read `late` samples old: stored readings follow its states."""
+    n, p = len(A), len(C)
+    whole = np.zeros((n + p * late,) * 2)
+    whole[:n, :n], whole[n : n + p, :n] = A, C
+    whole[n:, n:] = np.eye(p * late, k=-p)
+    return whole, np.vstack([B, np.zeros((p * late, B.shape[1]))]), np.eye(len(whole))[-p:]
+
+
+def _pad(C: FloatArray, n: int) -> FloatArray:
+    """C of the first states as a matrix of all n."""
+    return np.hstack([C, np.zeros((len(C), n - C.shape[1]))])
+
+
+def machine_loop(
+    model: LinearModel,
+    controller: Controller,
+    current_loops: CurrentLoops = LAST,
+    *,
+    forces_alone: bool = False,
+) -> SampledLoop:
+    """The loop as the machine runs it: hold, delay, current loops, late sensors, loads against v0(z) at the trim.
+
+    current_loops : "pi", the controllers of the gain file on the windings, where a machine has some; or "lag"
+    forces_alone : see `sampled_loop`
+
+    Raises CheckError when no input holds the machine at the model's operating point, and InputError for a dead time of
+    its sensors that is not whole samples.
+    """
+    plant = model.plant
+    x = model.operating_point.x
+    loaded = loaded_model(plant, position_in(plant, x), tuple(off_stroke(plant, x).items()))
+    chosen = chosen_loops(plant, controller, current_loops)
+    delay = plant.actuator.delay(controller.sample_time)
+    return sampled_loop(
+        loaded, controller,
+        delay=delay, current_loops=chosen, feedforward=True, sensors=True, forces_alone=forces_alone,
+    )  # fmt: skip
+
+
+@lru_cache(maxsize=16)  # every controller of a machine has it; models compare by identity
+def disturbance_map(model: LinearModel) -> FloatArray:
+    """B_w of xi' = A xi + B v + B_w w: n states of the design model x disturbances."""
+    plant, point = model.plant, model.operating_point
+    kind = ca.MX if plant.tabulated else ca.SX
+    x, w = kind.sym("x", len(plant.states)), kind.sym("w", len(plant.disturbances))
+    acting = w + plant.load(x) if point.loaded else w
+    rate = plant.f(x, kind(ca.DM(point.u)), acting)
+    found = ca.Function("B_w", [x, w], [ca.densify(ca.jacobian(rate, w))])(point.x, 0)
+    return readonly(np.array(found)[list(plant.controlled)])
+
+
+def push_through(A: FloatArray, B_w: FloatArray, Ts: float, size: int) -> FloatArray:
+    """What x' = A x + B_w w leaves in `size` states in one sample; states behind those of B_w take nothing from w."""
+    _, pushed = sample(A, np.vstack([B_w, np.zeros((len(A) - len(B_w), B_w.shape[1]))]), Ts)
+    return np.vstack([pushed, np.zeros((size - len(pushed), B_w.shape[1]))])
+
+
+@lru_cache(maxsize=8)  # every stage needs it; records compare by identity, so no entry is stale
+def commanded_model(model: LinearModel, controller: Controller) -> LinearModel:
+    """The model with the forces as inputs that the controller commands with its own parameters."""
+    believed = plant_of(controller.parameters)
+    if believed is model.plant:
+        return model
+    return linearize(model.plant, model.operating_point, believed)
+
+
+def machine_law(
+    plant: Plant,
+    controller: Controller,
+    current_loops: CurrentLoops = LAST,
+    *,
+    use: ReadingUse | None = None,
+    point: OperatingPoint | None = None,
+) -> Compensator:
+    """The control law with the machine's hold, delay and current loops.
+
+    current_loops : "pi", the controllers of the gain file on the windings, where a machine has some; "lag", first-order
+        lags at the crossover
+    use : of the reading besides the law
+    point : where the windings are at rest; None: at the centre
+
+    Raises InputError for other current loops, and for a dead time of the sensors that is not whole samples.
+    """
+    a, late = plant.actuator, whole_samples(plant, controller.sample_time)
+    delay = a.delay(controller.sample_time)
+    if chosen_loops(plant, controller, current_loops) == "lag":
+        return sampled_law(controller, delay + late, a.crossover, use=use)
+    believed = plant_of(controller.parameters)
+    point = plant.at() if point is None else point
+    windings = windings_of(plant, believed, point, force_modes(believed))
+    control = current_control(controller, windings, point)
+    return sampled_law(controller, delay, a.crossover, control, late=late, use=use)
+
+
+def machine_system(
+    plant: Plant,
+    controller: Controller,
+    names: Sequence[str],
+    at: Mapping[str, float],
+    current_loops: CurrentLoops = LAST,
+) -> tuple[UncertainSystem, Compensator]:
+    """The machine at the states `at` in parameters by name, and its control law: the arguments of robust_margin."""
+    believed = plant_of(controller.parameters)
+    driven = chosen_loops(plant, controller, current_loops) == "pi"
+    system, H = _commanded_system(plant, believed, tuple(names), tuple(at.items()), driven)
+    handed = H is not None and system.matrices.size2_out(1) > len(H)
+    use = ReadingUse(H, handed)
+    return system, machine_law(plant, controller, current_loops, use=use, point=plant.at(**at))
+
+
+@lru_cache(maxsize=16)  # every controller of a machine has it; plants compare by identity
+def _commanded_system(
+    plant: Plant, believed: Plant, names: tuple[str, ...], at: tuple[tuple[str, float], ...], driven: bool
+) -> tuple[UncertainSystem, FloatArray | None]:
+    """The machine at the states `at` in parameters by name, and the gain of currents that are held; None: none are.
+
+    driven : whether the windings are states
+    """
+    states = dict(at)
+    H = held_gain(believed, states) if is_commutated(believed) else None
+    windings = windings_of(plant, believed, plant.at(**states), force_modes(believed)) if driven else None
+    system = of_plant(plant, names, at=states, believed=believed, held=H, late=True, windings=windings)
+    return system, H
+
+
+@lru_cache(maxsize=16)  # every loop of a machine needs it; plants compare by identity
+def loaded_model(plant: Plant, position: float, others: tuple[tuple[str, float], ...] = ()) -> LinearModel:
+    """The machine at rest under its loads at a position of the stroke, m; 0 for a machine without a stroke.
+
+    others : further states that are not zero
+
+    Raises CheckError when no input holds the machine there.
+    """
+    along = {plant.stroke: position} if plant.has_stroke else {}
+    return linearize(plant, trim(plant, **along, **dict(others)))
+
+
+def loaded_loop(
+    plant: Plant, controller: Controller, at: Mapping[str, float], current_loops: CurrentLoops = LAST
+) -> Nominal:
+    """The responses of `machine_loop` at the states `at` (SI), from forces to sensors and back.
+
+    Currents that are held hang on the reading: as far as forces make the same, H y is part of the law's forces.
+
+    Raises CheckError when no input holds the machine there.
+    """
+    others = tuple((name, x) for name, x in at.items() if name != plant.stroke)
+    model = loaded_model(plant, at.get(plant.stroke, 0.0), others)
+    loop = machine_loop(model, controller, current_loops, forces_alone=True)
+    m, B, law = len(controller.forces), loop.Bd, loop.control
+    into, rest = B[:, :m], B[:, m:]
+    H = np.linalg.lstsq(into, rest, rcond=None)[0]
+    left = rest - into @ H
+    law = law._replace(
+        C=law.C + _on_top(H @ law.C[m:], law.C), D_y=law.D_y + _on_top(H @ law.D_y[m:], law.D_y)
+    )
+    if np.abs(left).max(initial=0.0) <= ROUNDING * np.abs(rest).max(initial=0.0):
+        B, law = into, law._replace(C=law.C[:m], D_y=law.D_y[:m])
+    else:
+        B = np.hstack([into, left])
+    T = loop.sample_time
+
+    @remembered
+    def response(w: FloatArray) -> tuple[ComplexArray, ComplexArray]:
+        # In differences: slow poles lie close to 1, where z - A has lost their digits.
+        s = (np.expm1(1j * np.asarray(w) * T) / T)[:, None, None]
+        return _response(s, loop.Ad, B, loop.Cd, T), _response(s, law.A, law.B_y, law.C, T) + law.D_y
+
+    return Nominal(response, bool(np.abs(eigenvalues(loop.closed)).max() < 1), T)
+
+
+def _response(s: ComplexArray, A: FloatArray, B: FloatArray, C: FloatArray, T: float) -> ComplexArray:
+    """C (s - (A - 1) / T)^-1 B / T at s = (z - 1) / T."""
+    eye = np.eye(len(A))
+    return np.asarray(C @ np.linalg.solve(s * eye - (A - eye) / T, (B / T).astype(complex)))
+
+
+def _on_top(rows: FloatArray, of: FloatArray) -> FloatArray:
+    """These rows over zeros, in the shape of another matrix."""
+    return np.vstack([rows, np.zeros((len(of) - len(rows), of.shape[1]))])
+
+
+def feedforward_slope(model: LinearModel, controller: Controller) -> FloatArray:
+    """dv0/dy at a model's position, m x p: v0(z) follows the reading of the stroke."""
+    plant = model.plant
+    slope = np.zeros((len(controller.forces), len(model.C)))
+    if plant.has_stroke:
+        position = float(model.operating_point.x[plant.stroke_state])
+        slope[:, plant.stroke_output] = controller.feedforward.slope(position)
+    return slope
+
+
+def continuous_poles(sampled: ComplexArray, Ts: float) -> ComplexArray:
+    """Poles in rad/s of a sampled system, ln(lambda) / Ts, in order; poles of pure delay are left out."""
+    return sorted_poles(np.asarray(np.log(sampled[np.abs(sampled) > DELAYED].astype(complex)) / Ts))
+
+
+def sorted_poles(poles: ComplexArray) -> ComplexArray:
+    """The same poles in order of their real parts, then of their imaginary ones; read-only."""
+    poles = np.asarray(poles, dtype=complex)
+    order = np.lexsort((poles.imag.round(6), poles.real.round(6)))
+    frozen: ComplexArray = poles[order]
+    frozen.flags.writeable = False
+    return frozen

@@ -1,0 +1,1 @@
+"""Complex blocks beside real parameters: dynamic margins and worst-case gains."""

@@ -1,0 +1,229 @@
+"""Proofs that a characteristic polynomial has no zero for complex blocks up to a size, on boxes of parameters.
+
+With M of blocks.py, f is affine in each of the scalar blocks delta_1 .. delta_K:
+
+    f(delta) = sum over sets S of the blocks: (-1)^|S| delta^S a_S,    a_S = f times the minor of M of S.
+
+It is not zero for all |delta_k| <= r_k if, for every k in turn, with the first k - 1 of them anywhere on the circles
+|delta_i| = r_i and the later ones zero,
+
+    |sum_S (-1)^|S| delta^S a_S|  >  r_k |sum_S (-1)^|S| delta^S a_{S + k}|:
+
+by induction the left side has no zero in the polydisc, so that the quotient is largest on its circles. Phases are cut
+like parameters. A full block comes last: its critical values have rank one, so that r |a_{S + k}| is r times the
+largest singular value of the matrix that its entries give.
+"""
+
+from __future__ import annotations
+
+import math
+import time as clock
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from malta.proof.blocks.complex_block_families import Matrix, Part
+from malta.proof.blocks.weight import Expanded
+from malta.proof.exclusion.exclusion import (
+    CellBounds,
+    Growth,
+    advance,
+    on_boxes,
+    start,
+)
+from malta.proof.polynomial.family import Family
+
+if TYPE_CHECKING:
+    from malta.model.plant import ComplexArray, FloatArray
+
+MOST_CELLS = 200_000
+Size = Callable[["FloatArray", int], Expanded]  # of a block, on cells of a scale
+
+
+def is_zero_free(
+    parts: Sequence[Part], target: float, sizes: Sequence[Size], until: float
+) -> tuple[bool, int]:
+    """Whether no polynomial has a zero on box(target) with blocks of these radii, and the number of cells."""
+    count = 0
+    for part in parts:
+        levels = range(max(1, len(part.scalars) + (part.full is not None)))
+        for level in levels:
+            done, cells = _level(part, level, target, sizes, until)
+            count += cells
+            if not done:
+                return False, count
+    return True, count
+
+
+def _level(part: Part, level: int, target: float, sizes: Sequence[Size], until: float) -> tuple[bool, int]:
+    """One step of the induction: blocks before `level` on circles, block `level` in its disc, the later ones zero."""
+    growth = part.growth
+    axes = len(growth.low) - len(part.scalars)
+    keep = axes + level
+    growth = Growth(
+        growth.low[:keep], growth.high[:keep], growth.inverted[:keep],
+        growth.nominal[:keep], growth.down[:keep], growth.up[:keep],
+    )  # fmt: skip
+    search = start(part.sets[0], growth, target if growth.grows.any() else 1.0)
+    if part.scalars or part.full is not None:
+        search = replace(search, around=_Circles(part, level, axes, sizes).on)
+    while not search.finished:
+        if search.count > MOST_CELLS or clock.monotonic() > until:
+            return False, search.count
+        advance(search)
+    return True, search.count
+
+
+@dataclass(frozen=True, eq=False)
+class _Circles:
+    """f on cells with the blocks before `level` on circles and block `level` in a disc; phases follow `axes`."""
+
+    part: Part
+    level: int
+    axes: int
+    sizes: Sequence[Size]
+
+    def on(self, cells: FloatArray, boxes: FloatArray) -> CellBounds:
+        part, level = self.part, self.level
+        phases = boxes[:, self.axes :]
+        on_circles = [self.sizes[k](cells, part.scale) for k in part.scalars[:level]]
+        circle = _circle(on_circles, phases, None)
+        f = _sum_over(part.sets[: 2**level], circle, cells, boxes, part.sets[0])
+        if level < len(part.scalars):
+            k = part.scalars[level]
+            matrix: Matrix = ((part.sets[2**level : 2 ** (level + 1)],),)
+        else:
+            assert part.full is not None
+            k, matrix = part.full, part.entries
+        within = _circle(on_circles, phases, self.sizes[k](cells, part.scale))
+        g = [[_sum_over(families, within, cells, boxes, part.sets[0]) for families in row] for row in matrix]
+        discs = f.disc + sum(np.abs(x) for x in f.slopes) + _largest(g)
+        moves = [
+            2 * (np.abs(x) + sum(np.abs(entry.slopes[n]) for row in g for entry in row)).sum(axis=1)
+            for n, x in enumerate(f.slopes)
+        ]
+        sure = _half_plane(f, g[0][0]) if len(g) == len(g[0]) == 1 else None
+        none = np.zeros(len(cells))
+        return CellBounds(f.terms, f.radius, none, discs.astype(complex), moves, sure)
+
+
+def _half_plane(f: _Sum, g: _Sum) -> ComplexArray:
+    """The direction c of f in the middle if Re(conj(c) f) > |g| on the whole cell, else zero.
+
+    All of g lies within an angle e of d, so that |g| <= Re(conj(d) g) / cos(e): the condition is linear in f and g.
+    """
+    c, d = (x / np.maximum(np.abs(x), 1e-300) for x in (f.terms[0].mean(axis=1), g.terms[0].mean(axis=1)))
+    beside = sum(np.abs(x) for x in (*g.terms[1:], *g.slopes)) + g.disc + g.radius[:, None]
+    size = np.abs(g.terms[0])
+    close = (size > beside).all(axis=1) & np.isfinite(beside).all(axis=1)
+    turned = np.abs(np.angle(g.terms[0] * np.conj(d)[:, None]))
+    angle = (turned + np.arcsin(np.where(size > beside, beside / np.maximum(size, 1e-300), 1))).max(axis=1)
+    close &= angle < 1.2
+    rate = (1 + 1e-12) / np.cos(np.where(close, angle, 0))
+
+    def along(x: ComplexArray, y: ComplexArray) -> FloatArray:
+        return np.asarray((np.conj(c)[:, None] * x).real - rate[:, None] * (np.conj(d)[:, None] * y).real)
+
+    left = along(f.terms[0], g.terms[0]) - np.abs(along(f.terms[1], g.terms[1]))
+    for x, y in zip(f.slopes, g.slopes, strict=True):
+        left = left - np.abs(along(x, y))
+    for x, y in zip(f.terms[2:], g.terms[2:], strict=True):
+        left = left - np.abs(along(x, y))
+    rounding = 1e-13 * (np.abs(f.terms[0]) + rate[:, None] * size).max(axis=1)
+    left = left - f.disc - rate[:, None] * g.disc - (f.radius + rate * g.radius + rounding)[:, None]
+    with np.errstate(invalid="ignore"):
+        return np.where(close & (left > 0).all(axis=1), c, 0)
+
+
+class _Circle(NamedTuple):
+    """Products of (-delta) over sets of blocks on circles, on cells; rows are sets, in binary order."""
+
+    value: ComplexArray  # sets x cells: in the middle of the cell
+    slope: ComplexArray  # sets x cells: along the cell's frequencies
+    rest: FloatArray  # sets x cells: bounds of the error
+    spread: FloatArray  # sets x blocks x cells: half the interval of each phase that the set holds, rad
+
+
+def _circle(sizes: list[Expanded], phases: FloatArray, last: Expanded | None) -> _Circle:
+    """The products on cells.
+
+    sizes : of the blocks on circles; phases : cells x blocks x 2, in turns; last : a factor of all sets
+
+    W may replace |W|, because a circle contains every phase.
+    """
+    cells = len(phases)
+    middle = np.exp(1j * math.pi * phases.sum(axis=2))
+    arc = math.pi * (phases[:, :, 1] - phases[:, :, 0]) * (1 + 1e-12)
+    none = np.zeros(cells)
+    found = []
+    for S in range(2 ** len(sizes)):
+        inside = [n for n in range(len(sizes)) if S >> n & 1]
+        value, slope, rest = last or Expanded(none + 1 + 0j, none + 0j, none)
+        for n in inside:
+            one = sizes[n].times(1.0)
+            rest = (
+                rest * (np.abs(one.value) + np.abs(one.slope) + one.rest)
+                + one.rest * (np.abs(value) + np.abs(slope))
+                + np.abs(slope * one.slope)
+            )
+            turn = -middle[:, n]
+            value, slope = turn * value * one.value, turn * (slope * one.value + value * one.slope)
+        found.append((value, slope, rest, [arc[:, n] * (n in inside) for n in range(len(sizes))]))
+    values, slopes, rests, spreads = zip(*found, strict=True)
+    shape = (2 ** len(sizes), len(sizes), cells)
+    return _Circle(
+        np.array(values), np.array(slopes), np.array(rests) * (1 + 1e-12), np.array(spreads).reshape(shape)
+    )
+
+
+class _Sum(NamedTuple):
+    """A sum over sets of blocks, on cells: expansions in frequency and in phases, and bounds of their errors."""
+
+    terms: list[ComplexArray]  # in frequency: cells x nodes
+    slopes: list[ComplexArray]  # in each phase
+    disc: FloatArray  # cells x nodes
+    radius: FloatArray  # cells
+
+
+def _sum_over(
+    families: Sequence[Family], circle: _Circle, cells: FloatArray, boxes: FloatArray, like: Family
+) -> _Sum:
+    """The sum, by e^(j x) = 1 + j x + rest, |rest| <= x^2 / 2, x the sum of a set's phases minus their middles."""
+    terms: list[Any] = [0.0] * 4
+    slopes: list[Any] = [0.0] * circle.spread.shape[1]
+    disc: Any = 0.0
+    radius: Any = 0.0
+    for family, value, slope, left, spread in zip(families, *circle, strict=True):
+        found, rest, _ = on_boxes(family, cells, boxes, None if family is like else like)
+        high = sum(np.abs(x) for x in found[1:]) + rest[:, None]
+        x, steep = spread.sum(axis=0), np.abs(slope)
+        size = np.abs(value) + steep + left  # of the factor
+        moved = [np.zeros_like(found[0]), *found]
+        for m, (y, before) in enumerate(zip(found, moved, strict=False)):
+            terms[m] = terms[m] + value[:, None] * y + slope[:, None] * before
+        slopes = [m + (1j * value * s)[:, None] * found[0] for m, s in zip(slopes, spread, strict=True)]
+        # errors of the products of expansions in frequency, weights and phases
+        beyond = size * np.minimum(x**2 / 2, x + 2) + left * (1 + x) + steep * x
+        disc = disc + beyond[:, None] * (np.abs(found[0]) + high) + (np.abs(value) * x)[:, None] * high
+        disc = disc + steep[:, None] * np.abs(found[-1])
+        radius = radius + size * (rest + 1e-14 * (np.abs(found[0]) + high).max(axis=1))  # rounded products
+    return _Sum(terms, slopes, np.asarray(disc), np.asarray(radius))
+
+
+def _largest(matrix: list[list[_Sum]]) -> FloatArray:
+    """An upper bound of the largest singular value of the matrix at each node: cells x nodes."""
+    if len(matrix) == len(matrix[0]) == 1:
+        (one,) = matrix[0]
+        return np.asarray(sum(np.abs(t) for t in (*one.terms, *one.slopes)) + one.disc + one.radius[:, None])
+    total: Any = 0.0
+    for m in range(4):
+        stacked = np.array([[g.terms[m] for g in row] for row in matrix]).transpose(2, 3, 0, 1)
+        finite = np.isfinite(stacked).all(axis=(2, 3))
+        size = np.linalg.norm(np.where(finite[..., None, None], stacked, 0), ord=2, axis=(2, 3))
+        total = total + np.where(finite, size, np.inf) * (1 + 1e-12)
+    rest = sum(
+        (g.disc + sum(np.abs(x) for x in g.slopes) + g.radius[:, None]) ** 2 for row in matrix for g in row
+    )
+    return np.asarray(total + np.sqrt(rest), dtype=float)

@@ -1,0 +1,185 @@
+"""The transfer M from the outputs of complex blocks to their inputs, and the smallest blocks that destabilize it.
+
+With F the compensator, G_y and G_d the plant from commands (lag, hold and delay included) and from forces on it, H the
+commands behind lag, hold and delay, and S = (1 - G_y F)^-1, outputs and commands follow from what is added to sensors
+(w_y), to commands (w_u) and to forces on the plant (w_d):
+
+    y = S (G_y F w_y + G_y w_u + G_d w_d),        u = (1 - F G_y)^-1 F (w_y + G_y w_u + G_d w_d)
+
+It is computed from frequency responses, a route of its own beside the polynomials that the proofs use.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from malta.proof.blocks.blocks import Block
+from malta.proof.responses import Responses
+
+if TYPE_CHECKING:
+    from malta.model.plant import ComplexArray, FloatArray
+
+STEPS = 24  # of the power iteration
+STARTS = 3
+ROUNDS = 40
+ZOOMS = 7
+
+
+def transfer(r: Responses, blocks: Sequence[Block]) -> ComplexArray:
+    """M from the outputs of the blocks, in their order, to their inputs: frequencies x columns x rows."""
+    q, m = r.G_y.shape[1:]
+    # solved for on either side: about integrators G and F are huge, and an inverse times them has lost all digits
+    y = np.linalg.solve(np.eye(q) - r.G_y @ r.F, np.concatenate([r.G_y @ r.F, r.G_y, r.G_d], axis=2))
+    u = _inputs(r) if any(_acts_at_inputs(b) for b in blocks) else y
+    total = sum(len(b.rows) for b in blocks)
+    into = np.zeros((q + 2 * m, total))
+    passed = {0: np.zeros((q, total)), q: np.zeros((m, total))}  # additions to a signal by earlier blocks
+    found, k = [], 0
+    for b in blocks:
+        own, rows, columns = slice(k, k + len(b.rows)), list(b.rows), list(b.columns)
+        k += len(rows)
+        first = q + m if b.kind == "compliance" else q if b.kind in _LOOPS and b.at == "forces" else 0
+        into[[first + i for i in rows], own] = np.eye(len(rows))
+        if b.kind == "feedback":  # it reads its own addition
+            passed[first][rows, own] += np.eye(len(rows))
+        signal = u if _acts_at_inputs(b) else y
+        if b.kind == "additive":
+            signal = r.H @ signal
+        beside = passed[first][columns].copy() if b.kind in _LOOPS else 0.0
+        found.append((signal[:, columns], beside))
+        if b.kind in ("multiplicative", "additive"):
+            passed[first][rows, own] += np.eye(len(rows))
+    return np.concatenate([z @ into + d for z, d in found], axis=1)
+
+
+_LOOPS = ("multiplicative", "feedback")
+
+
+def _acts_at_inputs(b: Block) -> bool:
+    """Whether a block reads u, and not y."""
+    return b.kind in ("additive", "effort") or (b.kind in _LOOPS and b.at == "forces")
+
+
+def _inputs(r: Responses) -> ComplexArray:
+    """u from additions to y, to u and from the disturbances: (1 - F G)^-1 F (1, G_y, G_d)."""
+    q, m = r.G_y.shape[1:]
+    law_reads = np.concatenate([np.broadcast_to(np.eye(q), (len(r.F), q, q)), r.G_y, r.G_d], axis=2)
+    return np.asarray(np.linalg.solve(np.eye(m) - r.F @ r.G_y, r.F @ law_reads))
+
+
+def mu_bound(M: ComplexArray, blocks: Sequence[Block]) -> tuple[FloatArray, ComplexArray]:
+    """A lower bound of mu, and Delta of size one that has it: det(1 - M Delta / mu) = 0.
+
+    M: k x columns x rows; Delta: k x rows x columns, of blocks on the diagonal. One block has the largest singular
+    value. Several have the spectral radius of M Delta, Delta of dyads of norm one, which never exceeds mu, after the
+    power iteration of Packard, Fan and Doyle (1988) from a few starts.
+    """
+    finite = np.asarray(np.isfinite(M).all(axis=(1, 2)))
+    M = np.where(finite[:, None, None], M, 0)
+    if len(blocks) == 1:
+        u, s, vh = np.linalg.svd(M, full_matrices=False)
+        return np.where(finite, s[:, 0], np.inf), _adjoint(vh[:, :1]) @ _adjoint(u[:, :, :1])
+    if M.shape[1:] == (2, 2) and len(blocks) == 2:
+        of_two, delta = _of_two(M)
+        return np.where(finite, of_two, np.inf), delta
+    starts = np.exp(2j * np.pi * np.random.default_rng(0).random((STARTS, 1, M.shape[2], 1)))
+    starts[0] = 1
+    b = (starts * np.ones((1, len(M), 1, 1))).reshape(-1, M.shape[2], 1)  # all starts side by side
+    tiled = np.tile(M, (STARTS, 1, 1))
+    back, w = _adjoint(tiled), np.ones_like(b)
+    for _ in range(STEPS):
+        a = _unit(tiled @ b)
+        w = _unit(back @ _balanced(a, w, blocks)[0])
+        b = _balanced(a, w, blocks)[1]
+    made = _dyads(a, w, blocks)
+    size = np.abs(np.linalg.eigvals(tiled @ made)).max(axis=1).reshape(STARTS, -1)
+    best = size.argmax(axis=0), np.arange(len(M))
+    return np.where(finite, size[best], np.inf), made.reshape(STARTS, len(M), *made.shape[1:])[best]
+
+
+def _of_two(M: ComplexArray) -> tuple[FloatArray, ComplexArray]:
+    """Two scalar blocks 1 and e^(j x): the largest eigenvalue of M Delta, by a grid of x that is narrowed."""
+    middle, half = np.zeros(len(M)), np.pi
+    a, d, det = M[:, :1, 0], M[:, 1:, 1], np.linalg.det(M)[:, None]
+    for _ in range(ZOOMS):
+        x = middle[:, None] + half * np.linspace(-1, 1, 33)
+        turn = np.exp(1j * x)
+        trace = (a + d * turn) / 2
+        root = np.sqrt(trace**2 - det * turn)
+        size = np.maximum(np.abs(trace + root), np.abs(trace - root))
+        at = size.argmax(axis=1)[:, None]
+        middle, half = np.take_along_axis(x, at, axis=1)[:, 0], half / 12
+    delta = np.zeros_like(M)
+    delta[:, 0, 0], delta[:, 1, 1] = 1, np.exp(1j * middle)
+    return np.take_along_axis(size, at, axis=1)[:, 0], delta
+
+
+def _adjoint(M: ComplexArray) -> ComplexArray:
+    return np.asarray(M.conj().swapaxes(1, 2))
+
+
+def _unit(v: ComplexArray) -> ComplexArray:
+    return np.asarray(v / np.maximum(np.linalg.norm(v, axis=1, keepdims=True), 1e-300))
+
+
+def _parts(blocks: Sequence[Block]) -> list[tuple[slice, slice]]:
+    """The rows and columns of each block, as slices."""
+    rows = np.cumsum([0, *(len(b.rows) for b in blocks)]).tolist()
+    columns = np.cumsum([0, *(len(b.columns) for b in blocks)]).tolist()
+    return [(slice(*i), slice(*j)) for i, j in zip(pairwise(rows), pairwise(columns), strict=True)]
+
+
+def _balanced(a: ComplexArray, w: ComplexArray, blocks: Sequence[Block]) -> tuple[ComplexArray, ComplexArray]:
+    """Scale a to the norms of w block by block, and w to those of a."""
+    rows, columns = [len(b.rows) for b in blocks], [len(b.columns) for b in blocks]
+    read, given = _norms(a, columns), _norms(w, rows)
+    return a * np.repeat(given / read, columns, axis=1), w * np.repeat(read / given, rows, axis=1)
+
+
+def _norms(v: ComplexArray, counts: list[int]) -> FloatArray:
+    """Norms of the parts of a vector, `counts` entries each."""
+    first = np.cumsum([0, *counts[:-1]])
+    return np.maximum(np.sqrt(np.add.reduceat(np.abs(v) ** 2, first, axis=1)), 1e-300)
+
+
+def _dyads(a: ComplexArray, w: ComplexArray, blocks: Sequence[Block]) -> ComplexArray:
+    """Delta_k = w_k a_k^* of norm one."""
+    made = np.zeros((len(a), w.shape[1], a.shape[1]), dtype=complex)
+    for i, j in _parts(blocks):
+        made[:, i, j] = _unit(w[:, i]) @ _adjoint(_unit(a[:, j]))
+    return made
+
+
+def performance(M: ComplexArray, blocks: Sequence[Block]) -> FloatArray:
+    """A lower bound of the last block's gain, the others of size one: g where mu of M with the last rows over g is one.
+
+    g mu(g) rises to it; it is infinite where the others close a loop by themselves.
+    """
+    if len(blocks) == 1:
+        return mu_bound(M, blocks)[0]
+    if M.shape[1:] == (2, 2) and len(blocks) == 2:
+        return _behind_one(M)
+    _, last = _parts(blocks)[-1]
+    without = M[:, : last.start, : _parts(blocks)[-1][0].start]
+    g = mu_bound(M[:, last, _parts(blocks)[-1][0]], blocks[-1:])[0]
+    for _ in range(ROUNDS):
+        scaled = M.copy()
+        scaled[:, last] /= np.maximum(g, 1e-300)[:, None, None]
+        grown = mu_bound(scaled, blocks)[0]
+        g = g * np.maximum(grown, 1.0)
+        if (grown < 1 + 1e-10).all():
+            break
+    return np.where(mu_bound(without, blocks[:-1])[0] >= 1, np.inf, g)
+
+
+def _behind_one(M: ComplexArray) -> FloatArray:
+    """The largest |M_22 + M_21 M_12 delta / (1 - M_11 delta)| with |delta| <= 1: a disc, from that of delta."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        room = 1 - np.abs(M[:, 0, 0]) ** 2
+        joined = M[:, 1, 0] * M[:, 0, 1] / room
+        size = np.abs(M[:, 1, 1] + joined * np.conj(M[:, 0, 0])) + np.abs(joined)
+    return np.where((room > 0) & np.isfinite(size), size, np.inf)

@@ -1,0 +1,178 @@
+"""Boxes of parameters: ranges that grow with the margin t, and intervals that do not.
+
+What is claimed of a box is about the numbers that were asked for, so that its ends are rounded outwards, from exact
+rationals. Rounding outwards crosses neither zero nor a limit, which are doubles themselves.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from malta.errors import InputError
+from malta.proof.arguments import (
+    LARGEST,
+    by_name,
+    describe,
+    is_number,
+    is_pair,
+)
+from malta.proof.expressions import exact
+
+if TYPE_CHECKING:
+    from malta.model.plant import FloatArray
+
+
+FAR = 1e2  # search limit, in multiples of the modelled box
+EDGE = 1e-4  # relative distance of the search from the limits of parameters
+
+
+def smallest_t(p: FloatArray, nominal: FloatArray, down: FloatArray, up: FloatArray) -> FloatArray:
+    """The smallest t with nominal - t down <= p <= nominal + t up on the axes that grow: ... x P -> ..."""
+    moved = p - nominal
+    with np.errstate(divide="ignore", invalid="ignore"):
+        t = np.where(moved > 0, moved / up, np.where(moved < 0, -moved / down, 0))
+    return np.asarray(np.where(down + up > 0, t, 0).max(axis=-1, initial=0.0))
+
+
+@dataclass(frozen=True, eq=False)
+class Box:
+    """Nominal values, how far each parameter moves down and up per unit of t, and intervals that do not grow."""
+
+    names: tuple[str, ...]
+    nominal: FloatArray
+    down: FloatArray  # at least what was asked for, by less than a digit
+    up: FloatArray
+    over: FloatArray  # P x 2, ends of the intervals that do not grow; nominal values of the other parameters
+    most: float  # t at which a parameter reaches its limit
+    ends: str = ""  # what happens at `most`
+
+    @property
+    def limit(self) -> float:
+        """The largest t that a search tries: close to the limit of a parameter, FAR at most."""
+        return min(self.most * (1 - EDGE), FAR)
+
+    @property
+    def searched(self) -> str:
+        """How far a search goes, in words."""
+        if self.most * (1 - EDGE) > FAR:
+            return f"up to t = {FAR:g}"
+        return f"up to t = {self.most:.4g}, where {self.ends}"
+
+    def margin(self, p: FloatArray) -> FloatArray:
+        """The smallest t with p in box(t): ... -> ..."""
+        return smallest_t(p, self.nominal, self.down, self.up)
+
+    def sides(self, t: float) -> FloatArray:
+        """The ends (low, high) of every parameter in box(t), rounded outwards: P x 2, for proofs."""
+        rows, t = zip(self.nominal.tolist(), self.down.tolist(), self.up.tolist(), strict=True), exact(t)
+        grown = [
+            (below(exact(c) - t * exact(down)), -below(-exact(c) - t * exact(up))) for c, down, up in rows
+        ]
+        return np.where((self.down + self.up > 0)[:, None], np.array(grown).reshape(-1, 2), self.over)
+
+    def near_sides(self, t: float) -> FloatArray:
+        """The sides of box(t) to a digit, for the search of a witness: plain numbers stay plain."""
+        grown = np.column_stack([self.nominal - t * self.down, self.nominal + t * self.up])
+        return np.where((self.down + self.up > 0)[:, None], grown, self.over)
+
+    def nominal_places(self) -> FloatArray:
+        """The nominal values at the ends and the middle of the intervals that do not grow; rows, nominal first."""
+        sides = (
+            np.unique([c, low, (low + high) / 2, high])
+            for c, (low, high) in zip(self.nominal, self.over, strict=True)
+        )
+        places = np.array(list(itertools.islice(itertools.product(*sides), 4096)))
+        order = np.argsort(np.abs(places - self.nominal).sum(axis=1), kind="stable")
+        return np.asarray(places[order])
+
+    def stretch(self, p: FloatArray, share: float) -> FloatArray:
+        """The parameters p with `share` times their deviation on the axes that grow."""
+        return np.where(self.down + self.up > 0, self.nominal + share * (p - self.nominal), p)
+
+
+def box_of(
+    names: tuple[str, ...],
+    at: FloatArray,
+    limits: Sequence[tuple[float, float]],
+    ranges: Mapping[str, float | tuple[float, float] | list[float]],
+    over: Mapping[str, tuple[float, float]],
+    *,
+    empty: bool = False,
+    caller: str = "robust_margin",
+) -> Box:
+    """The box of ranges that grow with t and of intervals `over` that do not, about the nominal values `at`.
+
+    empty : whether `ranges` may be empty
+    caller : the function that an error names
+
+    Raises InputError for unknown names and invalid ranges.
+    """
+    by_name(caller, "ranges", ranges, '{"k": 0.2} or {"k": (1, 2)}')
+    by_name(caller, "over", over, '{"k": (1, 2)}')
+    k = len(names)
+    down, up, fixed = np.zeros(k), np.zeros(k), np.column_stack([at, at])
+    most, ends = math.inf, ""
+    for name, value in (*ranges.items(), *over.items()):
+        if name not in names:
+            raise InputError(caller, name, "an unknown parameter", "one of " + " ".join(names))
+        if name in ranges and name in over:
+            raise InputError(caller, name, "in ranges and in over", "in one of them")
+        i = names.index(name)
+        nominal = float(at[i])
+        pair = _checked_sides(caller, name, value, nominal)
+        low, high = limits[i] if limits else (-math.inf, math.inf)
+        if not low < nominal < high or (name in over and not low < pair[0] < pair[1] < high):
+            raise InputError(caller, name, f"{pair}", f"values within its limits ({low:g}, {high:g})")
+        if name in over:
+            fixed[i] = pair
+            continue
+        down[i], up[i] = (-below(-away) for away in rates_of(nominal, value))
+        for limit, rate in ((low, down[i]), (high, up[i])):
+            if rate > 0 and abs(limit - nominal) / rate < most:
+                most, ends = abs(limit - nominal) / rate, f"{name} reaches its limit {limit:g}"
+    if not ranges and not empty:
+        raise InputError(caller, "ranges", "no parameters", "at least one uncertain parameter")
+    return Box(names, at, down, up, fixed, most, ends=ends)
+
+
+def sides_of(nominal: float, value: float | Sequence[float]) -> tuple[Any, Any]:
+    """The exact ends of a range about a nominal value: a share of that, or an interval (low, high), SI."""
+    middle = exact(nominal)
+    if not is_number(value):
+        low, high = value  # type: ignore[misc]
+        return exact(low), exact(high)
+    width = abs(middle) * exact(value)
+    return middle - width, middle + width
+
+
+def rates_of(nominal: float, value: float | Sequence[float]) -> tuple[Any, Any]:
+    """How far a range reaches below and above the nominal value, exactly."""
+    low, high = sides_of(nominal, value)
+    return exact(nominal) - low, high - exact(nominal)
+
+
+def below(x: Any) -> float:
+    """The largest double at or below an exact number."""
+    found = int(x.p) / int(x.q)
+    return found if exact(found) <= x else math.nextafter(found, -math.inf)
+
+
+def _checked_sides(caller: str, name: str, value: Any, nominal: float) -> tuple[float, float]:
+    """(low, high) of a range about the nominal value: a share of that, or an interval. Raises InputError."""
+    low = high = math.nan
+    if is_pair(value) and all(is_number(v) for v in value):
+        low, high = (float(v) for v in value)
+    elif is_number(value) and value > 0:
+        low, high = nominal - abs(nominal) * float(value), nominal + abs(nominal) * float(value)
+    if not (low <= nominal <= high and low < high):
+        wanted = f"a share above 0, or (low, high) about the nominal {nominal:g}"
+        raise InputError(caller, name, describe(value), wanted)
+    if max(-low, high) > LARGEST:
+        raise InputError(caller, name, describe(value), f"values between -{LARGEST:g} and {LARGEST:g}")
+    return low, high

@@ -1,0 +1,359 @@
+"""The proof of a margin as a file, which `check` confirms: matrices, parameters, claim, and the cells of each group.
+
+The cells come from the same branch and bound as the margin, for the polynomial that check.py builds by itself. The
+claim is a little below the lower bound of the margin: the largest of a few shares that is proven.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from flint import arb, ctx
+
+from malta.errors import CheckError, InputError
+from malta.files import replace_files
+from malta.proof.box import Box, below, box_of
+from malta.proof.certificate import checked_file
+from malta.proof.certificate.certificate_groups import divides, groups_of, units_of
+from malta.proof.certificate.check import BITS, MOST_NODES, balls, bernstein, interpolated, within
+from malta.proof.certificate.checked_file import double
+from malta.proof.certificate.checked_loop import Polynomial, Refused, expressions, height, split
+from malta.proof.exclusion.exclusion import Growth, advance, start
+from malta.proof.expressions import FIELD, exact
+from malta.proof.groups import E, UncertainLoop, loop_of
+from malta.proof.polynomial.family import Family, binary
+from malta.proof.systems import compensator_of
+
+if TYPE_CHECKING:
+    from malta.model.plant import FloatArray
+    from malta.proof.robust import Margin, Ranges
+    from malta.proof.uncertain import Compensator, UncertainSystem
+
+SHARES = (
+    0.999,
+    0.97,
+    0.9,
+    0.75,
+    0.5,
+    0.25,
+)  # of the margin's lower bound: the first that is proven is claimed
+MOST_CELLS = 20_000  # cells of one group at most
+MOST_PARTS = 64
+HIGHEST = 24  # degree of an interpolant along one parameter
+TAIL = -26.0  # log2 of what interpolation should leave out, relative to each coefficient
+RADII = (1.5, 2.0, 3.0, 4.0, 6.0, 8.0, *(2.0**k for k in (4, 5, 6, 8, 10, 14, 20, 30, 50, 99)))
+
+Places = Sequence[tuple["UncertainSystem", "Compensator"]]
+
+
+@dataclass(frozen=True)
+class Origin:
+    """The machine and the law that loops are of, as the claim names them."""
+
+    named: checked_file.Origin
+    units: Mapping[str, str]  # SI, of the parameters and of the travel
+    places: checked_file.Places | None  # of the loops, where they are several
+
+
+def write(
+    path: str | Path,
+    places: Places,
+    ranges: Ranges,
+    over: Mapping[str, tuple[float, float]] | None,
+    margin: Margin,
+    origin: Origin | None = None,
+) -> Path:
+    """Write the certificate of a margin.
+
+    places : its loops, one, or one for each place at which it holds
+    ranges, over : the box and the intervals that do not grow, as for `robust_margin`
+    origin : the machine and the law, from `malta.gains.certified.origin_of`; None: matrices of no machine
+
+    Raises InputError for loops that certificates do not cover, CheckError when nothing is proven.
+    """
+    content = certificate_of(places, ranges, over, margin, origin)
+    replace_files({Path(path): (json.dumps(content, separators=(",", ":")) + "\n").encode()})
+    return Path(path)
+
+
+def certificate_of(
+    places: Places,
+    ranges: Ranges,
+    over: Mapping[str, tuple[float, float]] | None,
+    margin: Margin,
+    origin: Origin | None = None,
+) -> dict[str, Any]:
+    """The certificate of a margin as a JSON document."""
+    if margin.lower is None:
+        raise CheckError(f"no certificate: nothing is proven ({margin.reason})")
+    if any(system.positive is not None for system, _ in places):
+        found = "a model that holds on one branch of its currents alone"
+        raise InputError("certificate", "places", found, "a model without branches and roots")
+    system = places[0][0]
+    box = box_of(system.names, system.nominal, system.limits, ranges, over or {})
+    lower, proven = _prove(places, box, margin.lower)
+    T = proven[0]["sample_time"]
+    content: dict[str, Any] = {
+        "format": checked_file.FORMAT,
+        "version": checked_file.VERSION,
+        "malta": version("malta"),
+        "claim": {
+            "lower": lower,
+            **_origin(origin),
+            "sample_time": None if T is None else float.fromhex(T),
+            "parameters": _parameters(box, lower, origin.units if origin else {}),
+        },
+        "loops": proven,
+    }
+    return content | {"sha256": checked_file.digest(content)}
+
+
+def _origin(origin: Origin | None) -> dict[str, Any]:
+    """What a claim says of machine, law, stage and places."""
+    if origin is None:
+        return dict.fromkeys(("machine", "law", "current_loops", "places"))
+    named, places = origin.named, origin.places
+    return {
+        "machine": {"name": named.machine, "preset": named.preset},
+        "law": {"name": named.law, "sha256": named.sha256},
+        "current_loops": named.current_loops,
+        "places": None
+        if places is None
+        else {"name": places.name, "unit": places.unit, "at": [double(x) for x in places.at]},
+    }
+
+
+def _parameters(box: Box, lower: float, units: Mapping[str, str]) -> list[dict[str, Any]]:
+    """The box of a claim: of each parameter what it is at first, how it grows, and where it is at `lower`."""
+    ends = _ends(box, lower)
+    return [
+        {
+            "name": name, "unit": units.get(name), "nominal": nominal, "down": down, "up": up, "over": over,
+            "interval": list(checked_file.inside(*sides)),
+        }
+        for name, nominal, down, up, over, sides in zip(
+            box.names, *(x.tolist() for x in (box.nominal, box.down, box.up)), _over(box), ends, strict=True
+        )
+    ]  # fmt: skip
+
+
+def _over(box: Box) -> list[list[float]]:
+    """The intervals that do not grow, less the nominal values, rounded outwards."""
+    return [
+        [below(exact(low) - exact(c)) + 0.0, -below(exact(c) - exact(high)) + 0.0]
+        for c, (low, high) in zip(box.nominal.tolist(), box.over.tolist(), strict=True)
+    ]
+
+
+def _ends(box: Box, lower: float) -> list[tuple[Any, Any]]:
+    """The ends of each parameter's interval at `lower`, from the numbers that the claim has: exact."""
+    rows, t = (
+        zip(*(x.tolist() for x in (box.nominal, box.down, box.up)), _over(box), strict=True),
+        exact(lower),
+    )
+    return [
+        (exact(c) - t * exact(down) + exact(over[0]), exact(c) + t * exact(up) + exact(over[1]))
+        for c, down, up, over in rows
+    ]
+
+
+def _prove(places: Places, box: Box, margin: float) -> tuple[float, list[dict[str, Any]]]:
+    """The claim, and the loops with their proofs. Raises CheckError, InputError."""
+    for share in SHARES:
+        try:
+            return share * margin, [_loop(*place, box, share * margin) for place in places]
+        except CheckError as error:
+            last = error
+    raise last
+
+
+def loops_of(places: Places) -> tuple[checked_file.Loop, ...]:
+    """Loops as a certificate has them, without their groups. Raises InputError for those that it cannot have."""
+    found = []
+    for system, law in places:
+        described = _description(loop_of(system, _law(system, law)))
+        states = len(described["compensator"]["A"]) + described["shape"][0]
+        field = checked_file.Field(Path("certificate"), "", described | {"groups": [], "units": [0] * states})
+        found.append(checked_file.loop(field, len(system.names)))
+    return tuple(found)
+
+
+def _law(system: UncertainSystem, law: Any) -> Compensator:
+    return compensator_of(law, system.matrices.size1_out(2), system.matrices.size2_out(1))
+
+
+def _description(loop: UncertainLoop) -> dict[str, Any]:
+    """The description of a loop in a certificate, without its groups."""
+    law, program = loop.law, loop.program
+    n = loop.states
+    if loop.direct:
+        raise InputError("certificate", "system", "a matrix D", "outputs y = C x alone")
+    if loop.descriptor and sorted((i, j) for i, j, _ in program.entries[E]) != [(i, i) for i in range(n)]:
+        raise InputError("certificate", "system", "a matrix E that couples states", "a diagonal E, or none")
+    if not program.rational:
+        foreign = sorted({name for name, *_ in program.steps} - {*FIELD, "const", "input", "constpow"})
+        raise InputError("certificate", "system", " ".join(foreign) or "a power", "+ - * / and whole powers")
+    matrices = "ABCE" if loop.descriptor else "ABC"
+    T = law.sample_time if loop.system.sample_time is None else loop.system.sample_time
+    return {
+        "shape": [n, program.shapes[1][1], program.shapes[2][0]],
+        "steps": [[name, target, list(on), float(value).hex()] for name, target, on, value in program.steps],
+        **{key: [list(e) for e in program.entries[i]] for i, key in enumerate("ABCDE") if key in matrices},
+        "compensator": {
+            key: [[float(x).hex() for x in row] for row in getattr(law, key).tolist()] for key in "ABCD"
+        },
+        "sample_time": None if T is None else float(T).hex(),
+        "discrete": loop.system.sample_time is not None,
+        "delay": law.delay,
+        "lag": None if law.lag is None else float(law.lag).hex(),
+    }
+
+
+def _loop(system: UncertainSystem, law: Any, box: Box, lower: float) -> dict[str, Any]:
+    """One loop with the proof of each of its groups. Raises InputError, CheckError."""
+    described = _description(loop_of(system, _law(system, law)))
+    count, before = len(box.names), ctx.prec
+
+    def read() -> checked_file.Loop:
+        return checked_file.loop(checked_file.Field(Path("certificate"), "", described), count)
+
+    try:
+        described |= {
+            "groups": [],
+            "units": [0] * (len(described["compensator"]["A"]) + described["shape"][0]),
+        }
+        groups = described["groups"] = groups_of(read(), expressions(read(), (False,) * count, math.inf), box)
+        for g, f in zip(groups, split(read()), strict=True):
+            g["inverted"] = [divides(f, i) for i in range(count)]
+        described["units"] = units_of(read, described, box)
+        for g, f in zip(groups, split(read()), strict=True):
+            g["parts"] = _parts(f, box, lower)
+    except Refused as error:
+        raise CheckError(f"no certificate: {error}") from error
+    finally:
+        ctx.prec = before
+    return described
+
+
+def _parts(f: Polynomial, box: Box, lower: float) -> list[dict[str, Any]]:
+    """The parts of the box with their cells, cut where it is too wide. Raises InputError, CheckError, Refused."""
+    todo = [np.array([(below(low), -below(-high)) for low, high in _ends(box, lower)])]
+    moving = len(f.used & set(np.flatnonzero(todo[0][:, 0] < todo[0][:, 1]).tolist()))
+    if 2**moving > MOST_NODES:
+        most = math.floor(math.log2(MOST_NODES))
+        raise InputError("certificate", "parameters", f"{moving} that act on one group", f"at most {most}")
+    if any(
+        low <= 0 <= high for (low, high), inv in zip(todo[0].tolist(), f.group.inverted, strict=True) if inv
+    ):
+        raise Refused("a parameter that divides reaches zero")
+    made: list[dict[str, Any]] = []
+    while todo:
+        sides = todo.pop()
+        v = [(exact(a), exact(b)) for a, b in sides.tolist()]
+        v = [(1 / b, 1 / a) if inv else (a, b) for (a, b), inv in zip(v, f.group.inverted, strict=True)]
+        try:
+            proof = _enclosed(f, v, box, lower)
+        except Refused:
+            if len(todo) + len(made) >= MOST_PARTS:
+                raise
+            axis = _widest(f, sides)
+            middle = float(sides[axis].mean())
+            for k in (0, 1):
+                half = sides.copy()
+                half[axis, 1 - k] = middle
+                todo.append(half)
+            continue
+        made.append({"box": [[a.hex(), b.hex()] for a, b in sides.tolist()]} | proof)
+    return made
+
+
+def _widest(f: Polynomial, sides: FloatArray) -> int:
+    """The parameter to cut: the widest beside its middle."""
+    width = sides[:, 1] - sides[:, 0]
+    share = width / np.maximum(np.abs(sides.sum(axis=1)), width)
+    return int(np.argmax([s if i in f.used else -1.0 for i, s in enumerate(share)]))
+
+
+def _enclosed(f: Polynomial, v: list[tuple[Any, Any]], box: Box, lower: float) -> dict[str, Any]:
+    """The enclosure of one part, and its cells.
+
+    Raises Refused when it cannot be enclosed, CheckError when zero is not excluded.
+    """
+    ctx.prec = BITS
+    size = [height(x) for x in f.at([arb((a + b) / 2) for a, b in v])]
+    axes = [_axis(f, v, i, size) for i in range(len(v))]
+    values, left = interpolated(f, v, axes)
+    heights = np.array([height(x) for x in values]).reshape(f.count, *(axis.degree + 1 for axis in axes))
+    matters = heights > heights.reshape(f.count, -1).max(axis=1).reshape(-1, *[1] * len(axes)) + TAIL
+    kept = [max(np.nonzero(matters)[i + 1].tolist(), default=0) for i in range(len(axes))]
+    axes = [replace(axis, kept=k) for axis, k in zip(axes, kept, strict=True)]
+    family = _family(*bernstein(values, left, axes), f.moved(balls(v)))
+    return {
+        "axes": [[axis.degree, double(axis.rho).hex(), axis.kept] for axis in axes],
+        "scale": family.scale,
+        "cells": _cells(family, v, f.group.inverted, box, lower),
+    }
+
+
+def _axis(f: Polynomial, v: list[tuple[Any, Any]], i: int, size: list[float]) -> checked_file.Axis:
+    """The ellipse along v_i that takes the lowest degree. Raises Refused."""
+    if i not in f.used or v[i][0] == v[i][1]:
+        return checked_file.Axis(0, exact(RADII[0]), 0)
+    best: tuple[float, int, float] | None = None
+    for rho in RADII:
+        try:
+            most = within(f, v, i, exact(rho))
+        except (Refused, OverflowError):
+            break
+        share = max((height(m) - s for m, s in zip(most, size, strict=True) if s > -math.inf), default=0.0)
+        rate, start = math.log2(rho), share + 1 - math.log2(rho - 1)
+        degree = min(max(math.ceil((start - TAIL) / rate), 0), HIGHEST)
+        rank = (max(start - degree * rate - TAIL, 0.0), degree, rho)
+        best = rank if best is None else min(best, rank)
+    if best is None or best[0] > 16:
+        raise Refused(f"parameter {i + 1} varies too much for one interpolation")
+    return checked_file.Axis(best[1], exact(best[2]), best[1])
+
+
+def _cells(
+    family: Family, v: list[tuple[Any, Any]], inverted: Sequence[bool], box: Box, lower: float
+) -> list[list[Any]]:
+    """Cells from which zero is excluded. Raises CheckError."""
+    low, high = (np.array([double(x) for x in ends]) for ends in zip(*v, strict=True))
+    growth = Growth(low, high, tuple(inverted), box.nominal, box.down, box.up)
+    search = start(family, growth, 2 * lower + 1)
+    while not search.finished:
+        if search.count > MOST_CELLS or search.blocked < search.target:
+            raise CheckError(f"no certificate: not proven within {search.count} cells")
+        advance(search)
+    cells, boxes, c = search.excluded(len(v))
+    return [
+        [int(branch), a, b, own, z.real, z.imag]
+        for (branch, a, b), own, z in zip(cells.tolist(), boxes.tolist(), c.tolist(), strict=True)
+    ]
+
+
+def _family(bernstein: list[Any], shape: tuple[int, ...], dust: list[Any]) -> Family:
+    """An enclosure in doubles; bounds of the couplings between groups are part of its radius."""
+    each = math.prod(shape)
+    count = len(bernstein) // each
+    beside = [arb(0, x.upper()) for x in dust] + [arb(0)] * (count - len(dust))
+    parts = np.array([binary(x + beside[k // each]) for k, x in enumerate(bernstein)]).reshape(count, each, 3)
+    mantissas, radii, powers = parts[..., 0], parts[..., 1], parts[..., 2].astype(int)
+    with np.errstate(divide="ignore"):
+        sizes = np.where(mantissas == 0, -np.inf, powers + np.log2(np.abs(mantissas)))
+    top = sizes.max(axis=1)
+    known = np.flatnonzero(np.isfinite(top))
+    scale = round((top[known[0]] - top[known[-1]]) / (known[-1] - known[0])) if len(known) > 1 else 0
+    exponents = np.where(np.isfinite(top), np.ceil(np.where(np.isfinite(top), top, 0)), 0).astype(int)
+    shift = np.clip(powers - exponents[:, None], -1020, 1020)
+    values, radius = np.ldexp(mantissas, shift), np.ldexp(radii, shift).max(axis=1)
+    moved = tuple(int(x) + scale * k for k, x in enumerate(exponents))
+    return Family(shape, values, radius, moved, scale)

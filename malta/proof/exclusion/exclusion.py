@@ -1,0 +1,346 @@
+"""Branch and bound: a characteristic polynomial has no zero at any frequency on the box.
+
+A cell is an interval of frequency and a part of the box. On it f lies in the convex hull of the Bernstein coefficients
+of its expansion, widened by radii; where all of that lies in an open half plane Re(conj(c) f) > 0, zero is excluded,
+c is the cell's witness. Other cells are split. Cells are taken in the order of the smallest margin t of any point in
+them, so that `lower`, the smallest t of a cell that is still open, only grows: it is true whenever the clock stops.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from malta.proof.box import Box, smallest_t
+from malta.proof.exclusion.frequency import Expansion, cover, expand
+from malta.proof.polynomial.family import EPS, Family, restrict
+
+if TYPE_CHECKING:
+    from malta.model.plant import ComplexArray, FloatArray
+
+GUARD = 1e-9  # rad that a half plane must have to spare
+BATCH = 1024
+NARROW = 1e-4  # of an interval of frequency, whose expansion leaves out less than rounding
+HOPELESS = 0.1  # variation of f on a cell, in radii, below which smaller cells exclude no more
+FEW, MANY = 24, 96  # cells up to which they are cut thrice, and twice, at once
+STUCK = 14  # splits beyond the first of a cell that holds a candidate for the witness
+
+
+@dataclass(frozen=True, eq=False)
+class Growth:
+    """The map between u in [0, 1]^P and the boxes that grow with t: nominal - t down <= p <= nominal + t up.
+
+    p = v or 1 / v (inverted), v = low + (high - low) u. Axes with neither down nor up do not grow.
+
+    Rounding moves p by EPS (|p| + high - low) and t down by EPS (|p| + |nominal|) or less. A box may be as narrow as a
+    few digits of its parameters, so that sides and t are bounded with these budgets.
+    """
+
+    low: FloatArray
+    high: FloatArray
+    inverted: tuple[bool, ...]
+    nominal: FloatArray
+    down: FloatArray
+    up: FloatArray
+
+    @property
+    def grows(self) -> FloatArray:
+        return np.asarray(self.down + self.up > 0)
+
+    def parameters(self, u: FloatArray) -> FloatArray:
+        """p at u: ... x P."""
+        v = self.low + (self.high - self.low) * u
+        return np.asarray(np.where(self.inverted, 1 / np.where(self.inverted, v, 1), v))
+
+    def slopes(self, u: FloatArray) -> FloatArray:
+        """dp / du at u: P."""
+        v = self.low + (self.high - self.low) * u
+        return np.asarray(
+            (self.high - self.low) * np.where(self.inverted, -1 / np.where(self.inverted, v, 1) ** 2, 1)
+        )
+
+    def shares(self, p: FloatArray) -> FloatArray:
+        """u at p, within the box."""
+        v = np.where(self.inverted, 1 / np.where(self.inverted, p, 1), p)
+        width = np.where(self.high > self.low, self.high - self.low, 1)
+        return np.asarray(np.clip(np.where(self.high > self.low, (v - self.low) / width, 0.5), 0, 1))
+
+    @cached_property
+    def _rounding(self) -> FloatArray:
+        """A bound of the error of p at u, and of 1 / p where inverted."""
+        largest = np.maximum(np.abs(self.low), np.abs(self.high))
+        return np.asarray(EPS * (largest + (self.high - self.low)))
+
+    def inside(self, t: float) -> FloatArray:
+        """The sides of box(t) in u, not too small for any rounding, clipped to [0, 1]: P x 2."""
+        with np.errstate(all="ignore"):
+            ends = np.array([self.nominal - t * self.down, self.nominal + t * self.up])
+            wide = ends + 2 * EPS * (np.abs(self.nominal) + np.abs(ends)) * np.array([[-1], [1]])
+            divides = self.inverted & (wide[0] * wide[1] <= 0)
+            width = np.where(self.high > self.low, self.high - self.low, 1)
+            slack = 1e-9 + 2 * self._rounding / width
+            sides = np.sort([self.shares(p) for p in wide], axis=0).T + slack[:, None] * np.array([-1, 1])
+        known = self.grows & ~divides & np.isfinite(sides).all(axis=1) & np.isfinite(t)
+        return np.asarray(np.clip(np.where(known[:, None], sides, [0.0, 1.0]), 0, 1))
+
+    def margin(self, p: FloatArray) -> FloatArray:
+        """The smallest t with p in box(t): ... -> ..."""
+        return smallest_t(p, self.nominal, self.down, self.up)
+
+    def smallest(self, boxes: FloatArray) -> FloatArray:
+        """The smallest t of any point of each box (cells x P x 2), not too large for any rounding."""
+        a, b = self.parameters(boxes[..., 0]), self.parameters(boxes[..., 1])
+        low, high = np.minimum(a, b), np.maximum(a, b)
+        largest = np.maximum(np.abs(low), np.abs(high))
+        share = largest * self._rounding  # of 1 / v: |1 / (v - r) - 1 / v| <= 2 r / v^2 for r <= |v| / 2
+        moved = np.where(self.inverted, np.where(share < 0.5, 2 * share * largest, np.inf), self._rounding)
+        moved = moved + EPS * largest
+        low, high = low - moved, high + moved
+        return self.margin(np.clip(self.nominal, low, high)) * (1 - 2 * EPS)
+
+
+def growth_over(sides: FloatArray, inverted: tuple[bool, ...], box: Box) -> Growth:
+    """The growth of a box in the coordinates of a part of it with these sides of p (P x 2)."""
+    low, high = sides[:, 0], sides[:, 1]
+    v_low = np.where(inverted, 1 / np.where(inverted, high, 1), low)
+    v_high = np.where(inverted, 1 / np.where(inverted, low, 1), high)
+    return Growth(v_low, v_high, inverted, box.nominal, box.down, box.up)
+
+
+@dataclass(frozen=True, eq=False)
+class Cell:
+    """A cell from which zero is not excluded: an interval of frequency and a part of the box."""
+
+    branch: int
+    interval: tuple[float, float]
+    box: FloatArray  # P x 2
+    smallest: float
+
+
+class CellBounds(NamedTuple):
+    """f on cells with more than its family: expansions, discs around them, and terms of further axes."""
+
+    terms: list[ComplexArray]
+    radius: FloatArray
+    lasting: FloatArray  # what of the radius narrower intervals of frequency leave
+    discs: ComplexArray  # cells x nodes
+    moves: list[FloatArray]
+    sure: ComplexArray | None = (
+        None  # directions of cells that are excluded for reasons of their own, zero elsewhere
+    )
+
+
+@dataclass(eq=False)
+class Search:
+    """Open and finished cells of one family. `lower`: zero is excluded on every box(t) with t below it."""
+
+    family: Family
+    growth: Growth
+    cells: FloatArray
+    boxes: FloatArray
+    smallest: FloatArray
+    depth: FloatArray
+    target: float
+    count: int = 0
+    around: Callable[[FloatArray, FloatArray], CellBounds] | None = (
+        None  # f by more than its family, on cells and boxes
+    )
+    hasty: bool = False  # whether few cells are cut several times at once
+    # the smallest t of a cell that no splitting frees of zero, as the radius is larger than f
+    blocked: float = np.inf
+    done: list[tuple[FloatArray, FloatArray, ComplexArray]] = field(default_factory=list)
+
+    @property
+    def lower(self) -> float:
+        return float(min(self.smallest.min(initial=np.inf), self.target))
+
+    @property
+    def finished(self) -> bool:
+        return not (self.smallest < self.target).any()
+
+    def excluded(self, axes: int) -> tuple[FloatArray, FloatArray, ComplexArray]:
+        """Cells from which zero is excluded: intervals, boxes, directions."""
+        if not self.done:
+            return np.zeros((0, 3)), np.zeros((0, axes, 2)), np.zeros(0, dtype=complex)
+        cells, boxes, c = zip(*self.done, strict=True)
+        return np.vstack(cells), np.vstack(boxes), np.concatenate(c)
+
+    def first(self) -> Cell | None:
+        """The open cell of smallest t."""
+        if not len(self.cells):
+            return None
+        k = int(self.smallest.argmin())
+        b, lo, hi = self.cells[k]
+        return Cell(int(b), (float(lo), float(hi)), self.boxes[k], float(self.smallest[k]))
+
+    def hardest(self) -> Cell | None:
+        """The open cell of smallest t that was split most often, if further splits seem useless."""
+        stuck = (self.depth >= STUCK) & (self.smallest < self.target)
+        if not stuck.any():
+            return None
+        k = int(np.lexsort((-self.depth, np.where(stuck, self.smallest, np.inf)))[0])
+        b, lo, hi = self.cells[k]
+        return Cell(int(b), (float(lo), float(hi)), self.boxes[k], float(self.smallest[k]))
+
+
+def start(family: Family, growth: Growth, target: float, until: float = np.inf) -> Search:
+    """A search up to `target`, which may later rise to `until`."""
+    cells = cover(family)
+    boxes = np.tile(growth.inside(max(target, until)), (len(cells), 1, 1))
+    zero = np.zeros(len(cells))
+    return Search(family, growth, cells, boxes, growth.smallest(boxes), zero, target)
+
+
+def advance(s: Search) -> None:
+    """Take a batch of open cells of the smallest t: exclude zero from them, or split them."""
+    batch = s.smallest < s.target
+    if not batch.any():
+        return
+    most = max(16, min(BATCH, 4_000_000 // max(1, s.family.values.shape[1] * 8)))
+    if batch.sum() > most:
+        order = np.argpartition(s.smallest, most)
+        batch = np.zeros(len(s.cells), dtype=bool)
+        batch[order[:most]] = True
+    cells, boxes, depth = s.cells[batch], s.boxes[batch], s.depth[batch]
+    s.cells, s.boxes, s.smallest, s.depth = (
+        s.cells[~batch],
+        s.boxes[~batch],
+        s.smallest[~batch],
+        s.depth[~batch],
+    )
+    s.count += len(cells)
+    found = _expanded(s, cells, boxes)
+    terms, radius = found.terms, found.radius
+    c = half_plane([*terms, found.discs], radius)
+    if found.sure is not None:
+        c = np.where(c == 0, found.sure, c)
+    good = c != 0
+    if good.any():
+        s.done.append((cells[good], boxes[good], c[good]))
+    bad = ~good
+    if bad.any():
+        narrow = cells[:, 2] - cells[:, 1] < NARROW * cells[:, 2]  # the radius is not the expansion's
+        spread = _spread(terms)
+        hopeless = bad & (
+            narrow & (spread < HOPELESS * radius) | (spread < HOPELESS * found.discs.real.max(axis=1))
+        )
+        s.blocked = min(s.blocked, float(s.growth.smallest(boxes[hopeless]).min(initial=np.inf)))
+        moves = [m[bad] for m in found.moves]
+        kept = CellBounds([t[bad] for t in terms], radius[bad], found.lasting[bad], found.discs[bad], moves)
+        _split(s, cells[bad], boxes[bad], depth[bad], kept)
+
+
+def _spread(terms: list[ComplexArray]) -> FloatArray:
+    """The approximate variation of f on each cell."""
+    b0 = terms[0]
+    return np.asarray(np.abs(b0 - b0[:, :1]).max(axis=1) + sum(np.abs(t).max(axis=1) for t in terms[1:]))
+
+
+def on_boxes(f: Family, cells: FloatArray, boxes: FloatArray, like: Family | None = None) -> Expansion:
+    """The expansion of each cell with its coefficients over the cell's own box."""
+    unique, index = np.unique(cells, axis=0, return_inverse=True)
+    with np.errstate(over="ignore", invalid="ignore"):
+        e: Expansion = expand(f, unique, like)
+        index, count = index.ravel(), len(e.terms)
+        together = np.stack(e.terms, axis=1)[index].reshape(len(index), -1)  # one more axis, which is not cut
+        whole = np.concatenate([np.broadcast_to([0.0, 1.0], (len(index), 1, 2)), boxes], axis=1)
+        cut = restrict(together, (count, *f.shape), whole).reshape(len(index), count, -1)
+    return Expansion(tuple(np.moveaxis(cut, 1, 0)), e.radius[index], e.lasting[index])
+
+
+def _expanded(s: Search, cells: FloatArray, boxes: FloatArray) -> CellBounds:
+    if s.around is not None:
+        return s.around(cells, boxes)
+    e = on_boxes(s.family, cells, boxes)
+    return CellBounds(list(e.terms), e.radius, e.lasting, np.zeros((len(cells), 1), dtype=complex), [])
+
+
+def half_plane(terms: list[ComplexArray], radius: FloatArray) -> ComplexArray:
+    """c of unit size with Re(conj(c) f) > 0 on the cell; zero when none was found.
+
+    Rounding: a disc that takes nearly half the plane lets all centres be nearly parallel, so that |b_1| < |b_0| and a
+    centre's size is below 2 |b_0|; then 1e-14 |b_0| is more than the rounding of size and radius, the half angle is not
+    too small for it although arcsin is steep at one, and other angles are off by a few units of 1e-16, far below GUARD.
+    """
+    b0, b1 = terms[:2]
+    beside = (
+        radius[:, None] + sum(np.abs(b) for b in terms[2:]) + 1e-14 * np.abs(b0).max(axis=1, keepdims=True)
+    )
+    points = np.concatenate([b0 - b1, b0 + b1], axis=1)
+    radii = np.concatenate([beside, beside], axis=1)
+    size = np.abs(points)
+    fine = np.isfinite(radii).all(axis=1) & (size > radii).all(axis=1)
+    c = np.zeros(len(points), dtype=complex)
+    if not fine.any():
+        return c
+    points, radii, size = points[fine], radii[fine], size[fine]
+    middle = (points / size).mean(axis=1, keepdims=True)
+    middle = np.where(np.abs(middle) > 1e-3, middle / np.maximum(np.abs(middle), 1e-3), 1)
+    angle = np.angle(points * np.conj(middle))
+    half = np.arcsin(radii / size)
+    high, low = (angle + half).max(axis=1), (angle - half).min(axis=1)
+    c[fine] = np.where(high - low < np.pi - GUARD, np.exp(0.5j * (high + low)) * middle[:, 0], 0)
+    c[fine] = np.where(np.abs(c[fine]) > 0, c[fine] / np.maximum(np.abs(c[fine]), 0.5), 0)
+    return c
+
+
+def _split(
+    s: Search,
+    cells: FloatArray,
+    boxes: FloatArray,
+    depth: FloatArray,
+    found: CellBounds,
+) -> None:
+    """Split each cell in two across the axis that moves f most: frequency, a parameter or a further axis."""
+    shape, terms, radius = s.family.shape, found.terms, found.radius
+    count = terms[0].shape[1]
+    width = np.abs(terms[1]).sum(axis=1) + sum(2 * np.abs(t).sum(axis=1) for t in terms[2:])
+    width = width + 2 * np.maximum(radius - found.lasting, 0) * count
+    moves = [np.where(np.isfinite(width), width, np.inf)]
+    values = terms[0].reshape(-1, *shape)
+    for axis, size in enumerate(shape):
+        if size == 1:
+            moves.append(np.zeros(len(cells)))
+            continue
+        ends = np.take(values, size - 1, axis=axis + 1) - np.take(values, 0, axis=axis + 1)
+        inner = np.abs(np.diff(values, axis=axis + 1)).reshape(len(cells), -1).sum(axis=1) * (
+            1.0 if size > 2 else 0
+        )
+        moves.append(
+            0.5 * np.maximum(np.abs(ends).reshape(len(cells), -1).sum(axis=1) * size, inner * size / 2)
+        )
+    moves += [np.where(np.isfinite(m), m, 0.0) for m in found.moves]
+    sizes = np.array(moves)
+    for _ in range(_rounds(len(cells)) if s.hasty else 1):
+        choice, k = np.argmax(sizes, axis=0), np.arange(len(cells))
+        middles = np.concatenate([cells[:, 1:].mean(axis=1)[None], _middles(boxes, s.growth)])[choice, k]
+        sizes[choice, k] /= 2
+        wide, far = choice == 0, (k[choice > 0], choice[choice > 0] - 1)
+        halves = []
+        for side in (0, 1):
+            c, b = cells.copy(), boxes.copy()
+            c[wide, 2 - side] = middles[wide]
+            b[far[0], far[1], 1 - side] = middles[~wide]
+            halves.append((c, b))
+        cells, boxes = (np.vstack(pair) for pair in zip(*halves, strict=True))
+        sizes, depth = np.hstack([sizes, sizes]), np.tile(depth + 1, 2)
+    s.cells, s.boxes = np.vstack([s.cells, cells]), np.vstack([s.boxes, boxes])
+    s.smallest = np.concatenate([s.smallest, s.growth.smallest(boxes)])
+    s.depth = np.concatenate([s.depth, depth])
+
+
+def _rounds(count: int) -> int:
+    """The number of cuts at once: a few cells take as much time as one."""
+    return 1 if count > MANY else 2 if count > FEW else 3
+
+
+def _middles(boxes: FloatArray, growth: Growth) -> FloatArray:
+    """The places of splits (axes x cells): first the nominal value, as parts beside it need no proof at small t."""
+    low, high = boxes[..., 0], boxes[..., 1]
+    c = growth.shares(growth.nominal)
+    inside = (low < c) & (c < high) & (high - low == (high - low).max(axis=0)) & growth.grows
+    return np.asarray(np.where(inside, c, (low + high) / 2).T)

@@ -1,0 +1,326 @@
+"""A proof without frequencies: a polynomial with roots on the boundary of stability has a zero in one of three places.
+
+    a(s; p) = sum of a_k(p) s^k:    a_0 = 0 (a root at zero),  a_n = 0 (at infinity),  H(p) = 0 (a pair +-jw)
+
+H is Hurwitz's determinant of order n - 1: a_n^(n-1) times the product of all sums of two roots (Orlando). A loop
+that is stable at the nominal values stays stable on a box on which none of the three is zero. They are polynomials of
+p, or close to one: their Bernstein coefficients over parts of the box decide, in exact numbers or balls. The damping of
+a mode, however light, is a factor of H and no width that cells of frequency must resolve.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import time as clock
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from flint import arb, arb_mat, fmpq, fmpq_mat
+from scipy.optimize import linear_sum_assignment
+
+from malta.proof.expressions import NotAnalytic, exact
+from malta.proof.polynomial.characteristic import pair
+from malta.proof.polynomial.enclosure import Disc, TooWide, Unproven, discs_of, ends_of
+from malta.proof.polynomial.family import nodes, scale_of
+
+if TYPE_CHECKING:
+    from malta.model.plant import FloatArray
+    from malta.proof.box import Box
+    from malta.proof.problem import Polynomial
+
+BITS = 640  # of balls: Bernstein coefficients of degree d lose about 2 d of them
+LARGEST = 14  # degree in s
+MOST_PLACES = 4000  # at which a_k, or H, is evaluated
+HIGHEST = 40  # degree of an interpolation along one parameter
+TAIL = -70.0  # log2 of what an interpolation may leave out, relative to each coefficient
+SNAP = 1e-4  # of a range: parameters nearer to zero than that are tried at zero
+FEW_PARTS = 16  # of a box
+
+
+class Tensor(NamedTuple):
+    """A polynomial on [0, 1]^P by its Bernstein coefficients, or another basis: one axis for each parameter."""
+
+    shape: tuple[int, ...]
+    values: list[Any]
+
+    def along(self, axis: int, M: Any) -> Tensor:
+        """The tensor with M, an exact matrix, applied along one axis."""
+        n, m = self.shape[axis], M.nrows()
+        after = math.prod(self.shape[axis + 1 :])
+        before = len(self.values) // (n * after)
+        rows = [
+            self.values[(b * n + i) * after + a]
+            for i in range(n)
+            for b in range(before)
+            for a in range(after)
+        ]
+        exactly = isinstance(M, fmpq_mat) and all(isinstance(x, fmpq) for x in rows)
+        kind = fmpq_mat if exactly else arb_mat
+        made = (kind(M) * kind(n, before * after, rows)).entries()
+        shape = (*self.shape[:axis], m, *self.shape[axis + 1 :])
+        return Tensor(
+            shape,
+            [
+                made[(i * before + b) * after + a]
+                for b in range(before)
+                for i in range(m)
+                for a in range(after)
+            ],
+        )
+
+    def corner(self, at: Sequence[int]) -> Any:
+        """The value at a corner of the cell; at: 0 or 1 on each axis."""
+        k = 0
+        for n, side in zip(self.shape, at, strict=True):
+            k = k * n + (n - 1) * side
+        return self.values[k]
+
+
+@dataclass(frozen=True, eq=False)
+class Axes:
+    """A box in exact numbers: v = low + (high - low) u; p = v, or 1 / v where inverted."""
+
+    low: list[Any]
+    high: list[Any]
+    inverted: tuple[bool, ...]
+    nominal: list[Any]
+    down: list[Any]
+    up: list[Any]
+
+    def place(self, u: Sequence[Any]) -> list[Any]:
+        """v at u."""
+        return [a + (b - a) * x for a, b, x in zip(self.low, self.high, u, strict=True)]
+
+    def middle(self, i: int) -> Any:
+        """The nominal value of v_i."""
+        return 1 / self.nominal[i] if self.inverted[i] else self.nominal[i]
+
+    def smallest(self, cell: Sequence[tuple[Any, Any]]) -> Any:
+        """The smallest t of any point of a cell in u; None where no box(t) reaches it."""
+        t = fmpq(0)
+        for i, (a, b) in enumerate(cell):
+            if not self.down[i] and not self.up[i]:
+                continue
+            width = self.high[i] - self.low[i]
+            low, high = self.low[i] + width * a, self.low[i] + width * b
+            if self.inverted[i]:
+                low, high = 1 / high, 1 / low
+            for away, rate in ((self.nominal[i] - high, self.down[i]), (low - self.nominal[i], self.up[i])):
+                if away > 0:
+                    if not rate:
+                        return None
+                    t = max(t, away / rate)
+        return t
+
+
+@dataclass(frozen=True, eq=False)
+class Function:
+    """a_0, a_n or H over a part of the box, positive at the nominal values; of: the polynomial in s."""
+
+    of: Polynomial
+    axes: Axes
+    tensor: Tensor  # Bernstein coefficients
+    slack: Any  # bound of what these leave out
+
+    def is_positive(self, tensor: Tensor) -> bool:
+        return all(x > self.slack for x in tensor.values)
+
+
+def determinant(a: Sequence[Any]) -> Any:
+    """Hurwitz's determinant of order n - 1 of a_0 + a_1 s + ... + a_n s^n, as a ball.
+
+    >>> from flint import arb
+    >>> print(determinant([arb(6), arb(11), arb(6), arb(1)]))  # (s + 1)(s + 2)(s + 3): 3 x 4 x 5
+    60.0000000000000
+    """
+    n = len(a) - 1
+    at = [[n - 2 * j + i for j in range(1, n)] for i in range(1, n)]
+    entries = [arb(a[k]) if 0 <= k <= n else arb(0) for row in at for k in row]
+    return arb_mat(n - 1, n - 1, entries).det() if n > 1 else arb(1)
+
+
+def functions_over(
+    f: Polynomial, box: Box, moves: Sequence[Any], until: float, sides: FloatArray
+) -> list[Function]:
+    """a_0, a_n and H of a polynomial over a part of the box (P x 2, of p).
+
+    Raises Unproven where they are too large, or one of them is zero at the nominal values.
+    """
+    low, high = ends_of(f, sides)
+    nominal = [exact(x) for x in box.nominal.tolist()]
+    rates = [[exact(x) for x in rate.tolist()] for rate in (box.down, box.up)]
+    axes = Axes(low, high, f.inverted, nominal, *rates)
+    here = _values(f, [axes.middle(i) for i in range(len(nominal))])
+    if len(here) - 1 > LARGEST:
+        raise Unproven(f"a polynomial of degree {len(here) - 1} in s")
+    powers, tails = _enclose(f, axes, until)
+    for k, bound in enumerate(f.coupling_bounds(moves, [(arb(a), arb(b)) for a, b in sides.tolist()]) or ()):
+        tails[k] += arb(bound[0]) * arb(2) ** bound[1]
+    while len(powers) > 1 and all(x == 0 for x in powers[-1].values) and tails[len(powers) - 1] == 0:
+        powers.pop()  # a power of s that the polynomial does not have
+        here.pop()
+    units = _balance([_to_bernstein(tensor) for tensor in powers])
+    powers = [Tensor(t.shape, [x * unit for x in t.values]) for t, unit in zip(powers, units, strict=True)]
+    tails = [x * unit for x, unit in zip(tails, units, strict=False)]
+    ends = [_to_bernstein(tensor) for tensor in powers]
+    found = [(here[0], ends[0], tails[0]), (here[-1], ends[-1], tails[-1])]
+    if len(powers) > 2:
+        slack = _determinant_slack([_largest(tensor) for tensor in ends], tails)
+        found.append((determinant(here), _to_bernstein(_expand(powers, until)), slack))
+    made = []
+    for value, tensor, slack in found:
+        sign = 1 if value > 0 else -1 if value < 0 else 0
+        if not sign:
+            raise Unproven("the nominal loop is not proven stable")
+        values = [arb(x) * sign for x in tensor.values]
+        made.append(Function(f, axes, Tensor(tensor.shape, values), slack))
+    return made
+
+
+def _values(f: Polynomial, v: list[Any]) -> list[Any]:
+    try:
+        return list(f.at(v))
+    except (NotAnalytic, ZeroDivisionError) as error:
+        raise Unproven(f"the matrices have no value on the box: {error}") from error
+
+
+def _enclose(f: Polynomial, axes: Axes, until: float) -> tuple[list[Tensor], list[Any]]:
+    """The coefficients a_k as polynomials of u, by powers, and bounds of what these leave out."""
+    known = f.degrees
+    free = [i for i, d in enumerate(known) if d is None and axes.low[i] < axes.high[i]]
+    degrees = [0 if axes.low[i] == axes.high[i] else d or 0 for i, d in enumerate(known)]
+    tails: list[Any] = []
+    if free:
+        middle = _values(f, axes.place([fmpq(1, 2)] * len(known)))
+        tails = [arb(0)] * len(middle)
+        size = [pair(arb(c)) for c in middle]
+        for order, i in enumerate(free):
+            degrees[i], left = _sampling(f.names[i], i, discs_of(f, i, axes.low, axes.high, size))
+            tails = [one + two * 4**order for one, two in zip(tails, left, strict=True)]
+    if math.prod(d + 1 for d in degrees) > MOST_PLACES:
+        raise Unproven("too many coefficients")
+    grids = [
+        [exact(x) if i in free else fmpq(k, max(d, 1)) for k, x in enumerate(nodes(d, chebyshev=i in free))]
+        for i, d in enumerate(degrees)
+    ]
+    places = []
+    for u in itertools.product(*grids):
+        if clock.monotonic() > until:
+            raise Unproven("time was up before the coefficients were found")
+        places.append(_values(f, axes.place(u)))
+    shape = tuple(d + 1 for d in degrees)
+    found = [Tensor(shape, [a[k] for a in places]) for k in range(len(places[0]))]
+    for i, grid in enumerate(grids):
+        M = _powers_at(grid, len(grid) - 1)
+        M = arb_mat(M).inv() if i in free else M.inv()
+        found = [tensor.along(i, M) for tensor in found]
+    return found, tails or [arb(0)] * len(found)
+
+
+def _sampling(name: str, axis: int, discs: list[Disc]) -> tuple[int, list[Any]]:
+    """The lowest degree of an interpolation at Chebyshev nodes that leaves out little enough, and what it leaves out.
+
+    Lebesgue's constant is below 4. Raises TooWide when the degree is too high.
+    """
+    best = HIGHEST + 1, discs[0]
+    for disc in discs:
+        rest = disc.share + 3 - math.log2(disc.radius - 1) - TAIL
+        best = min(best, (max(1, math.ceil(rest / math.log2(disc.radius))), disc), key=lambda pair: pair[0])
+    degree, disc = best
+    if degree > HIGHEST:
+        raise TooWide(axis, f"{name}: its range is too wide for one expansion")
+    radius = arb(disc.radius)
+    scale = 5 / (radius**degree * (radius - 1))
+    return degree, [arb(m) * arb(2) ** e * scale for m, e in disc.most]
+
+
+def _powers_at(grid: list[Any], degree: int) -> Any:
+    return fmpq_mat([[u**k for k in range(degree + 1)] for u in grid])
+
+
+def _to_bernstein(tensor: Tensor) -> Tensor:
+    """Powers of u -> Bernstein coefficients."""
+    for axis, n in enumerate(tensor.shape):
+        M = [
+            [fmpq(math.comb(i, k), math.comb(n - 1, k)) if k <= i else fmpq(0) for k in range(n)]
+            for i in range(n)
+        ]
+        tensor = tensor.along(axis, fmpq_mat(M))
+    return tensor
+
+
+def _balance(bernstein: list[Tensor]) -> list[Any]:
+    """Factors of the coefficients, which count s in a power of two that makes them alike; signs stay."""
+    sizes = [pair(_largest(tensor)) for tensor in bernstein]
+    top = np.array([math.log2(m) + e if m else -math.inf for m, e in sizes])
+    scale = scale_of(top)
+    common = round(float(np.max(top + scale * np.arange(len(top)), initial=-math.inf)))
+    return [fmpq(2) ** (scale * k - common) for k in range(len(top))]
+
+
+def _largest(bernstein: Tensor) -> Any:
+    """A bound of |polynomial|, by its Bernstein coefficients."""
+    top = arb(0)
+    for x in bernstein.values:
+        top = top.max(abs(arb(x)))
+    return top
+
+
+def _expand(powers: list[Tensor], until: float) -> Tensor:
+    """H by powers of u: evaluated on a grid."""
+    orders = [_degrees(tensor) for tensor in powers]
+    axes = range(len(powers[0].shape))
+    degrees = [_determinant_degree([order[i] for order in orders]) for i in axes]
+    if math.prod(d + 1 for d in degrees) > MOST_PLACES:
+        raise Unproven("too many coefficients of Hurwitz's determinant")
+    grids = [[fmpq(k, max(d, 1)) for k in range(d + 1)] for d in degrees]
+    values = []
+    for tensor in powers:
+        for i, grid in enumerate(grids):
+            tensor = tensor.along(i, _powers_at(grid, tensor.shape[i] - 1))
+        values.append(tensor.values)
+    found = []
+    for a in zip(*values, strict=True):
+        if clock.monotonic() > until:
+            raise Unproven("time was up before the coefficients were found")
+        found.append(determinant(a))
+    made = Tensor(tuple(d + 1 for d in degrees), found)
+    for i, grid in enumerate(grids):
+        made = made.along(i, arb_mat(_powers_at(grid, len(grid) - 1)).inv())
+    return made
+
+
+def _degrees(tensor: Tensor) -> list[int]:
+    """The degree along each axis of a polynomial by powers of u; -1 for zero."""
+    # a ball about zero is neither zero nor known to be another number
+    table = ~np.array([bool(x == 0) for x in tensor.values]).reshape(tensor.shape)
+    return [int(max(np.nonzero(table)[i], default=-1)) for i in range(table.ndim)]
+
+
+def _determinant_degree(degrees: list[int]) -> int:
+    """An upper bound of the degree of H, by the heaviest of its products."""
+    n = len(degrees) - 1
+    weight = np.full((n - 1, n - 1), -1e6)
+    for i, j in itertools.product(range(1, n), repeat=2):
+        k = n - 2 * j + i
+        if 0 <= k <= n and degrees[k] >= 0:
+            weight[i - 1, j - 1] = degrees[k]
+    rows, columns = linear_sum_assignment(weight, maximize=True)
+    return max(0, round(float(weight[rows, columns].sum())))
+
+
+def _determinant_slack(sizes: list[Any], tails: list[Any]) -> Any:
+    """A bound of the change of H when each a_k moves by its tail: Hadamard's inequality, row by row."""
+    n = len(sizes) - 1
+    if all(x == 0 for x in tails):
+        return arb(0)
+    large, small = arb(1), arb(1)
+    for i in range(1, n):
+        picked = [n - 2 * j + i for j in range(1, n) if 0 <= n - 2 * j + i <= n]
+        row = sum((sizes[k] ** 2 for k in picked), arb(0)).sqrt()
+        move = sum((tails[k] ** 2 for k in picked), arb(0)).sqrt()
+        small, large = small * row, large * (row + move)
+    return abs(large - small)

@@ -1,0 +1,1 @@
+"""Proofs for many parameters: a pencil that stays regular, shown by multipliers."""

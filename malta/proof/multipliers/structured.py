@@ -1,0 +1,419 @@
+"""Margins of many parameters: a loop's pencil is not singular, shown by multipliers, cell by cell.
+
+A cell is an interval of frequency and a part of box(t). Where multipliers show that no parameters of it reach the
+boundary of stability there it is done; else it is split, across frequency where they do in its middle, across the
+parameter that matters most where they do not. Multipliers take real parameters as they are, all at once: their effort
+grows as a power of the number of parameters, not exponentially, and a box is seldom split at all. Along frequency the
+multipliers of one interval are continued to the next, by their slopes.
+"""
+
+from __future__ import annotations
+
+import math
+import time as clock
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from scipy import linalg
+
+from malta.proof.groups import groups
+from malta.proof.multipliers.multipliers import Blocks, Multiplier, multiplier
+from malta.proof.multipliers.pencil import TERMS, Rows
+from malta.proof.multipliers.pencil_response import Branch, excludes_zero, response
+from malta.proof.polynomial.rational import TooLarge
+from malta.proof.problem import OfLoop, OfPolynomial, OfSeveral, Problem
+from malta.proof.time_limit import check_time
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from malta.model.plant import FloatArray
+    from malta.proof.box import Box
+    from malta.proof.multipliers.pencil import Pencil
+
+NEAR = 0.98  # beta up to which splitting frequency is expected to do
+NARROWEST = 1e-9  # of an interval of frequency, relative; of a part of a box, in sides of box(1)
+LOWEST = 1e-5  # end of the one from zero, relative to the octave that it was cut from
+REMEMBERED = 64  # pencils
+LARGEST = 40  # rows of a group's pencil, beyond which families of its smaller groups are cheaper
+ROUGH = 0.1  # how close the first beta is to the smallest, relative
+SMALLEST = 1e-6  # of the target: boxes below that are not tried
+FIRST_STEP, LAST_STEP = 1.2, 1.003  # from one box to the next
+NOT_FAR = 1.3  # times what stands: boxes up to that are tried at once
+WIDER = 1.3  # the next interval of frequency than the last one
+HASTY = 0.4  # share of the last interval's width from which on a failure means that it was too wide
+PATIENCE = 0.4  # share of the time that is left for one box
+
+
+@dataclass(frozen=True, eq=False)
+class Cell:
+    """An interval of frequency of a branch, and a part of the box, with a multiplier to begin with."""
+
+    rows: int
+    sides: FloatArray
+    branch: int
+    low: float
+    high: float
+    top: float  # end of the interval that rows and columns are scaled for
+    near: Multiplier | None = None
+
+
+class Shown(NamedTuple):
+    """A cell of a proof and the multiplier that excludes it; None where it lies in the layer before, or is empty."""
+
+    cell: Cell
+    multiplier: Multiplier | None
+
+
+class Layer(NamedTuple):
+    """The cells that tile all frequencies x box(t)."""
+
+    t: float
+    cells: tuple[Shown, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Proof:
+    """A proof by multipliers, which `checked_multipliers.refusal` checks again: boxes, the smallest first."""
+
+    rows: tuple[Rows, ...]
+    box: Box
+    layers: tuple[Layer, ...]
+
+
+class Attempt(NamedTuple):
+    """The result for cells: beta of one that was not excluded, if any, and the cells left when time was up."""
+
+    beta: float
+    cell: Cell | None
+    left: list[Cell]
+
+
+class Step(NamedTuple):
+    """The width of the next interval of frequency on a part of the box, relative to its end."""
+
+    sides: FloatArray | None = None
+    share: float = math.inf
+    good: float = math.inf  # width of the last excluded interval
+
+    def hasty(self, cell: Cell) -> bool:
+        """Whether the interval is about as wide as an excluded neighbour, so that a narrower one will be excluded."""
+        wide = cell.high - cell.low > HASTY * self.good * cell.high
+        return cell.sides is self.sides and cell.low > 0 and wide
+
+    def cut(self, cell: Cell) -> tuple[Cell, list[Cell]]:
+        """The first part of the cell of that width, and the rest, if any."""
+        width = self.share * cell.high
+        if cell.sides is not self.sides or cell.low == 0 or not cell.low + 1.2 * width < cell.high:
+            return cell, []
+        return replace(cell, high=cell.low + width), [replace(cell, low=cell.low + width)]
+
+    def after(self, cell: Cell, done: bool) -> Step:
+        if not cell.low:
+            return self
+        share = (cell.high - cell.low) / cell.high
+        good = share if done else self.good if cell.sides is self.sides else math.inf
+        return Step(cell.sides, (WIDER if done else 0.5) * share, good)
+
+
+@dataclass(eq=False)
+class Structured:
+    """The groups of loops, and the largest t for which box(t) is proven as stable as the nominal values."""
+
+    rows: list[Rows]
+    box: Box
+    until: float
+    most: int = 1_000_000  # cells
+    report: Callable[[float], None] | None = None  # of each t that is proven
+    lower: float = 0.0
+    count: int = 0
+    layers: list[Layer] = field(default_factory=list, repr=False)
+    _shown: dict[float, list[Shown]] = field(
+        default_factory=dict, repr=False
+    )  # by the t of boxes that were begun
+    _order: list[Cell] = field(default_factory=list, repr=False)  # those that resist first
+    # t of the largest box that was begun, and its cells that are left
+    _open: tuple[float, list[Cell]] | None = None
+    _branches: dict[Any, tuple[Pencil | None, dict[Any, Branch]]] = field(default_factory=dict, repr=False)
+
+    def late(self, until: float = math.inf) -> bool:
+        return clock.monotonic() > min(until, self.until) or self.count >= self.most
+
+    def raise_bound(self, target: float) -> float:
+        """Prove box(target), or smaller boxes when that takes too long; a further call continues the work.
+
+        Raises TimeUp within a time_limit.
+        """
+        if not self.lower:
+            self._order = self._prove_whole(target)
+        t, begun = self._next(target), self._open
+        while self.lower < t and (t == target or t > LAST_STEP * self.lower) and not self.late():
+            if begun is not None and self.lower < begun[0] <= target:
+                t, cells = begun
+            else:
+                cells = self._begin(self._order or self.cover(t), t)
+            begun, now = None, clock.monotonic()
+            found = self._prove(cells, now + PATIENCE * (self.until - now), self._shown[t], split=True)
+            if found.cell is None:
+                self._raise_to(t)
+                t = self._next(target)
+            elif not self.lower:
+                break
+            else:
+                if found.left and (self._open is None or t >= self._open[0]):
+                    self._open = t, found.left
+                t = math.sqrt(t * self.lower)
+        return self.lower
+
+    def _next(self, target: float) -> float:
+        """The next box to be tried: the target if it is near, else one a little larger than the proven one."""
+        if not self.lower:
+            return target / 64
+        return target if target <= NOT_FAR * self.lower else FIRST_STEP * self.lower
+
+    def _raise_to(self, t: float) -> None:
+        if t > self.lower:
+            self.lower = t
+            self.layers.append(Layer(t, tuple(self._shown.pop(t))))
+        if self.report is not None:
+            self.report(self.lower)
+
+    def proof(self) -> Proof:
+        """What shows that box(lower) is stable when the nominal loop is."""
+        return Proof(tuple(self.rows), self.box, tuple(self.layers))
+
+    def _begin(self, cells: list[Cell], t: float) -> list[Cell]:
+        """The cells on box(t), of which none is shown yet."""
+        kept = self._open[0] if self._open is not None else t
+        self._shown = {u: shown for u, shown in self._shown.items() if u == kept} | {t: []}
+        sides = self.box.sides(t)
+        return [replace(cell, sides=sides) for cell in cells]
+
+    def _prove_whole(self, target: float) -> list[Cell]:
+        """Prove the largest box possible without a cut, and return the cells of all frequencies, the hardest first."""
+        t, (beta, cells) = target, self._survey(target)
+        while not cells and not self.late() and t > SMALLEST * target:
+            t /= 2
+            beta, cells = self._survey(t)
+        t *= min(1.0, 0.95 / max(beta, 1e-9)) if math.isfinite(beta) else 0.1
+        now = clock.monotonic()
+        last = now + 0.7 * (self.until - now)
+        while cells and not self.late(last) and t > SMALLEST * target:
+            found = self._prove(self._begin(cells, t), last, self._shown[t], split=False)
+            if found.cell is None:
+                self._raise_to(t)
+                break
+            cells = _first(cells, found.cell)
+            t *= min(0.9, max(0.9 / found.beta, 0.6))
+        return cells
+
+    def _survey(self, t: float) -> tuple[float, list[Cell]]:
+        """The largest beta on box(t) at a grid of frequencies, and the cells by falling beta; none: t is too large."""
+        found, near = [], None
+        for cell in self.cover(t):
+            for part in [cell] if cell.low == 0 else across_frequency(cell):
+                check_time()
+                own = self._branch(part)
+                if own is None:
+                    return math.inf, []
+                at = math.sqrt(part.low * part.high) if part.low else part.high / 2
+                r, beta = response(own, at, at), math.inf
+                if r is not None and own.channels[0].blocks.real and not self.late():
+                    try:
+                        # slopes alone: higher terms are slow, and matter in large boxes only
+                        blocks = Blocks(own.channels[0].blocks.real)
+                        N = r.terms[0][: blocks.size, : blocks.size]
+                        near, beta = multiplier(N, blocks, near, 0.0, ROUGH)
+                    except (np.linalg.LinAlgError, ValueError):
+                        near = None
+                found.append((beta, replace(part, near=near)))
+        found.sort(key=lambda pair: -pair[0])
+        return max((beta for beta, _ in found if math.isfinite(beta)), default=math.inf), [
+            c for _, c in found
+        ]
+
+    def _prove(self, cells: list[Cell], last: float, shown: list[Shown], *, split: bool) -> Attempt:
+        """Exclude all cells in order of frequency, by intervals as wide as the last excluded ones, into `shown`."""
+        todo, step = list(reversed(cells)), Step()
+        inner = self.box.sides(self.lower) if self.lower else None
+        while todo:
+            cell = todo.pop()
+            if self.late(last):
+                return Attempt(math.inf, cell, [cell, *reversed(todo)])
+            if inner is not None and split and _within(cell.sides, inner):
+                shown.append(Shown(replace(cell, near=None), None))
+                continue
+            cell, rest = step.cut(cell)
+            todo += rest
+            beta, m, done = self._level(cell, hasty=step.hasty(cell))
+            if done:
+                shown.append(Shown(replace(cell, near=None), m))
+                step = step.after(cell, True)
+                if todo and (todo[-1].near is None or _is_next(cell, todo[-1])):
+                    todo[-1] = replace(todo[-1], near=m)
+            elif beta < NEAR:
+                if cell.high - cell.low < NARROWEST * cell.high or cell.high < LOWEST * cell.top:
+                    return Attempt(1.0, cell, [])
+                step = step.after(cell, False)
+                todo += [replace(half, near=m) for half in reversed(across_frequency(cell))]
+            elif split and self._width(cell.sides).max() > NARROWEST:
+                todo += self._across_box(cell, m)
+            else:
+                return Attempt(beta, cell, [])
+        return Attempt(0.0, None, [])
+
+    def _branch(self, cell: Cell) -> Branch | None:
+        key = (cell.rows, cell.sides.tobytes())
+        if key not in self._branches:
+            while len(self._branches) >= REMEMBERED:
+                self._branches.pop(next(iter(self._branches)))
+            self._branches[key] = self.rows[cell.rows].over(cell.sides), {}
+        pencil, known = self._branches[key]
+        if pencil is None:
+            return None
+        if (cell.branch, cell.top) not in known:
+            known[cell.branch, cell.top] = Branch(pencil, cell.branch, cell.top)
+        found = known[cell.branch, cell.top]
+        return found if found.finite else None
+
+    def cover(self, t: float) -> list[Cell]:
+        """The cells of all frequencies and all groups on box(t)."""
+        found, sides = [], self.box.sides(t)
+        for k, rows in enumerate(self.rows):
+            for branch, low, high in intervals(rows, self.box.nominal):
+                found.append(Cell(k, sides, branch, low, high, high))
+        return found
+
+    def _level(self, cell: Cell, *, hasty: bool = False) -> tuple[float, Multiplier | None, bool]:
+        """The beta in the middle of a cell, its multiplier, and whether the cell is excluded."""
+        self.count += 1
+        own = self._branch(cell)
+        if own is None:
+            return math.inf, None, False
+        found = response(own, cell.low, cell.high)
+        if found is None:
+            return 0.0, cell.near, False
+        blocks = own.channels[0].blocks
+        if not blocks.size:
+            return 0.0, None, True
+        x, half = (cell.low + cell.high) / 2, (cell.high - cell.low) / 2
+        near = cell.near.at(x) if cell.near is not None and cell.near.blocks == blocks else None
+        if near is not None and excludes_zero(found, near, half):
+            return 0.0, near, True
+        along = found.terms[1] / half if half > 0 else None
+        try:
+            m, beta = multiplier(found.terms[0], blocks, near, 1.0, along=along, hasty=hasty)
+            if hasty and beta >= 1 and near is not None:
+                return 0.0, near, False
+            done = beta < 1 and excludes_zero(found, m := m._replace(x=x), half)
+            if NEAR <= beta < 1 and not done:
+                narrow = response(own, x, x)
+                if narrow is not None and excludes_zero(narrow, m):
+                    return 0.0, m, False
+                m, beta = multiplier(found.terms[0], blocks, m, NEAR)
+        except (np.linalg.LinAlgError, ValueError):
+            return math.inf, None, False
+        return beta, m, done
+
+    def _width(self, sides: FloatArray) -> FloatArray:
+        """The widths of a part of a box, in those of box(1)."""
+        return np.asarray((sides[:, 1] - sides[:, 0]) / np.maximum(self.box.up + self.box.down, 1e-300))
+
+    def _across_box(self, cell: Cell, m: Multiplier | None) -> list[Cell]:
+        sides = cell.sides
+        axis = int(self._width(sides).argmax())
+        own = self._branch(cell)
+        if own is not None and m is not None:
+            found = response(own, cell.low, cell.high)
+            if found is not None:
+                axis = worst(found.terms[0], m, own.channels[0].owners, len(sides), axis)
+        made = []
+        for side in (0, 1):
+            half = sides.copy()
+            half[axis, 1 - side] = sides[axis].mean()
+            made.append(replace(cell, sides=half, near=m))
+        return made
+
+
+def _first(cells: list[Cell], hard: Cell) -> list[Cell]:
+    """The cells with the one that a part of resisted in front, each once."""
+
+    def holds(c: Cell) -> bool:
+        return (c.rows, c.branch) == (hard.rows, hard.branch) and c.low <= hard.low and hard.high <= c.high
+
+    return sorted(cells, key=lambda c: not holds(c))
+
+
+def _within(sides: FloatArray, outer: FloatArray) -> bool:
+    return bool((sides[:, 0] >= outer[:, 0]).all() and (sides[:, 1] <= outer[:, 1]).all())
+
+
+def _is_next(cell: Cell, other: Cell) -> bool:
+    """Whether the other cell is the next one along frequency."""
+    return cell.sides is other.sides and cell.branch == other.branch and cell.high == other.low
+
+
+def across_frequency(cell: Cell) -> list[Cell]:
+    low, high = cell.low, cell.high
+    middle = math.sqrt(low * high) if low > 0 and high > 4 * low else low + 0.5 * (high - low)
+    if low == 0:
+        middle = high / 8
+    return [replace(cell, high=middle), replace(cell, low=middle)]
+
+
+def worst(N: Any, m: Multiplier, owners: Any, count: int, other: int) -> int:
+    """The parameter with the largest effect in the direction that is excluded least."""
+    D, G = m.D, m.G
+    H = N.conj().T
+    S = H @ D @ N + 1j * (G @ N - H @ G)
+    try:
+        _, vectors = linalg.eigh((S + S.conj().T) / 2, (D + D.conj().T) / 2)
+    except (np.linalg.LinAlgError, ValueError):  # numbers that overflow
+        return other
+    w = vectors[:, -1]
+    each = (w.conj() * (D @ w)).real
+    shares = np.zeros(count)
+    np.add.at(shares, owners[owners >= 0], each[owners >= 0])
+    return int(shares.argmax()) if shares.max(initial=0) > 0 else other
+
+
+def intervals(rows: Rows, nominal: FloatArray) -> list[tuple[int, float, float]]:
+    """Intervals of frequency from zero to infinity, octaves around the poles."""
+    pencil = rows.over(np.column_stack([nominal, nominal]))
+    known = np.ones(1)
+    if pencil is not None:
+        with np.errstate(all="ignore"):
+            poles = np.abs(linalg.eigvals(-pencil.constant.middle, pencil.linear.middle, check_finite=False))
+        poles = poles[np.isfinite(poles) & (poles > 0)]
+        if len(poles):
+            typical = np.exp(np.median(np.log(poles)))
+            known = poles[(poles < 1e12 * typical) & (poles > 1e-12 * typical)]
+    low, high = math.floor(math.log2(known.min())) - 3, math.ceil(math.log2(known.max())) + 3
+    edges = [2.0**k for k in range(low, high + 1)]
+    inner = [(0, a, b) for a, b in pairwise(edges)]
+    return [(0, 0.0, edges[0]), *inner, (1, 0.0, 1 / edges[-1])]
+
+
+def rows_of(problem: Problem) -> list[Rows] | None:
+    """The rows of all groups of the loops; None when they are too large or no rational functions of p."""
+    if isinstance(problem, OfSeveral):
+        parts = [rows_of(part) for part in problem.problems]
+        return None if any(part is None for part in parts) else [r for part in parts for r in part or []]
+    if not isinstance(problem, OfLoop | OfPolynomial):
+        return None
+    loop = problem.loop if isinstance(problem, OfLoop) else problem.polynomial.companion
+    if (
+        loop is None
+        or loop.symbolic is None
+        or not loop.program.rational
+        or (loop.descriptor and loop.sampled)
+    ):
+        return None
+    try:
+        found = [Rows(loop, group) for group in groups(loop)]
+    except TooLarge:
+        return None
+    small = sum(rows.cost for rows in found) <= TERMS and max(rows.size for rows in found) <= LARGEST
+    return found if small else None

@@ -1,0 +1,1 @@
+"""Characteristic polynomials over boxes of parameters: exact, in balls, bounded and enclosed."""

@@ -1,0 +1,413 @@
+"""The characteristic polynomial of a group of states, at given parameters and bounded over complex balls of them.
+
+Continuous loops:           a(s; p) = det(s I - A_cl(p)), times the denominators of the entries
+Sampled and discrete ones:  a(v; p) = (1 - v)^N det(g I - (A_cl(p) - I)),  g = z - 1 = 2 v / (1 - v)
+
+The bilinear map takes the unit circle to the imaginary axis, v = j tan(w T / 2), so that both are zero-free on
+s = jw, w from 0 to infinity, or they are not. A continuous system under a hold is sampled exactly, by the exponential.
+At given p the coefficients are exact rationals, or balls as narrow as wanted.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from typing import Any
+
+import numpy as np
+from flint import acb, acb_mat, arb, arb_mat, ctx, fmpq, fmpq_mat
+
+from malta.proof.expressions import (
+    BALLS,
+    EXACT,
+    POINTS,
+    NotAnalytic,
+    Program,
+    finite,
+)
+from malta.proof.groups import A, B, C, D, E, Group, UncertainLoop, divide_by_descriptor, rational
+from malta.proof.polynomial.closed_loop import closed_loop, coefficients, dense, driven_group, majorant_matrix
+from malta.proof.polynomial.degrees import (
+    clear_denominators,
+    degree,
+    depends,
+    determinant_degree,
+    sole_power,
+)
+from malta.proof.polynomial.majorant import coefficient_bounds
+from malta.proof.polynomial.minors import Minors, Resolvent, minors
+from malta.proof.polynomial.rational import Symbolic, value
+
+MOST = 20_000  # places that are remembered
+
+
+@dataclass(frozen=True, eq=False)
+class Characteristic:
+    """The characteristic polynomial of one group of a loop."""
+
+    loop: UncertainLoop
+    group: Group
+    names: tuple[str, ...]
+
+    @property
+    def foreign(self) -> tuple[str, ...]:
+        """The operations of the model without an enclosure."""
+        return self.loop.program.foreign
+
+    @property
+    def discrete(self) -> bool:
+        return self.loop.law.sample_time is not None
+
+    @cached_property
+    def exact(self) -> bool:
+        """Whether the coefficients are rational in p, so that their degrees are known."""
+        return self.loop.symbolic is not None and self.loop.program.rational and not self.loop.sampled
+
+    @property
+    def _coupled_descriptor(self) -> bool:
+        s = self.loop.symbolic
+        return self.loop.descriptor and s is not None and any(i != j for i, j in s.entries[E])
+
+    @cached_property
+    def inverted(self) -> tuple[bool, ...]:
+        """Whether a parameter enters a sampled loop as a polynomial of 1 / p, as a mass does."""
+        s = self.loop.symbolic
+        if self.exact or s is None:
+            return (False,) * len(self.names)
+        found, entries, g = [], divide_by_descriptor(self.loop, s), set(self.group.states)
+        own = [r for (k, j), r in entries[A].items() if k in g and j in g]
+        own += [r for (k, _), r in entries[B].items() if k in g]
+        own += [r for (_, j), r in entries[C].items() if j in g]
+        own += list(entries[D].values()) if self.loop.direct else []
+        for i in range(len(self.names)):
+            powers: list[tuple[int, int | None]] = [(degree(r.num, i), sole_power(r.den, i)) for r in own]
+            below = any(den not in (0, None) for _, den in powers)
+            hidden = any(depends(s, k, i) for k in range(len(s.atoms)))
+            polynomial = all(den is not None and num <= den for num, den in powers)
+            found.append(below and polynomial and not hidden and not self._coupled_descriptor)
+        return tuple(found)
+
+    @cached_property
+    def degrees(self) -> tuple[int | None, ...]:
+        """An upper bound of the degree in each parameter, read from the entries; None for no polynomial."""
+        if self.exact:
+            assert self.loop.symbolic is not None
+            rows = clear_denominators(self.loop, self.group, self.loop.symbolic)
+            return tuple(determinant_degree(rows, i) for i in range(len(self.names)))
+        return tuple(self._degree_by_minors(i) for i in range(len(self.names)))
+
+    def _degree_by_minors(self, i: int) -> int | None:
+        """The degree in a parameter of B and C alone, by minors (Cauchy, Binet); 0 when it enters no matrix."""
+        s, g, program = self.loop.symbolic, self.group, self.loop.program
+        if not any(i in on for on in program.depends):
+            return 0
+        if s is None or i in program.depends[A] or self.loop.direct or self.loop.descriptor:
+            return None if s is None or self._depends_on(s, i) else 0
+        if any(depends(s, k, i) for k in range(len(s.atoms))):
+            return None
+        into = {at: r for at, r in s.entries[B].items() if at[0] in g.states}
+        out = {at: r for at, r in s.entries[C].items() if at[1] in g.states}
+        if any(r.den is not None and degree(r.den, i) for r in (*into.values(), *out.values())):
+            return None
+        total = 0
+        for matrix in (into, out):
+            rows = [[(degree(r.num, i), at) for at, r in matrix.items() if degree(r.num, i)]]
+            if rows[0]:
+                order = min(len({at[0] for _, at in rows[0]}), len({at[1] for _, at in rows[0]}))
+                total += order * max(d for d, _ in rows[0])
+        return total
+
+    def _depends_on(self, s: Symbolic, i: int) -> bool:
+        """Whether the group's own entries depend on a parameter, atoms included."""
+        g = set(self.group.states)
+        rows: list[tuple[int, int | None]] = [(A, 0), (B, 0), (C, 1)]
+        if len(s.entries) > D:
+            rows += [(which, None) for which in range(D, len(s.entries))]
+        hidden = [s.inputs + k for k in range(len(s.atoms)) if depends(s, k, i)]
+        for which, side in rows:
+            for at, r in s.entries[which].items():
+                if side is None or at[side] in g:
+                    for var in (i, *hidden):
+                        if degree(r.num, var) or (r.den is not None and degree(r.den, var)):
+                            return True
+        return False
+
+    @cached_property
+    def minors(self) -> Minors | None:
+        return minors(self.loop, self.group)
+
+    # values
+
+    def at(self, v: Sequence[Any]) -> list[Any]:
+        """a_0 ... a_N at p = v (1 / v of inverted parameters), as exact rationals or balls.
+
+        Raises NotAnalytic when the matrices have no value there.
+        """
+        p = [1 / x if inverted else x for x, inverted in zip(v, self.inverted, strict=True)]
+        a = self._map_to_v(self._coefficients(p, fmpq_mat if self.exact else arb_mat))
+        if not self.exact:
+            return a
+        scale = _multiplier(self.loop, self.group, p)
+        return [c * scale for c in a]
+
+    def _coefficients(self, p: list[Any], matrix: Any) -> list[Any]:
+        if self.minors is None:
+            driven = driven_group(self.loop, self.group, self._entries(p), matrix)
+            return [c * driven.det_E for c in coefficients(closed_loop(driven))]
+        terms = [(x.p, x.q) for x in p]  # of which a hash takes an eighth of that of the quotient's
+        known, place = self.minors.known, (ctx.prec, tuple(terms))
+        if place not in known:
+            for one in (known, self.minors.resolvents):
+                if len(one) > MOST:
+                    one.clear()
+            known[place] = self._minors_at(p, terms, matrix)
+        pi, beta = known[place]
+        found = self.minors.combine(pi, beta, matrix)
+        zero = 0 * found[0]
+        return found + [zero] * (self.minors.degree + 1 - len(found))
+
+    def _minors_at(self, p: list[Any], terms: list[Any], matrix: Any) -> tuple[Any, Any]:
+        """pi and beta at given p, each remembered for the parameters that it depends on."""
+        minors = self.minors
+        assert minors is not None
+
+        def remembered(known: dict[Any, Any], on: tuple[int, ...], made: Callable[[], Any]) -> Any:
+            at = (ctx.prec, on, *(terms[i] for i in _parameters_of(self.loop.program, *on)))
+            if at not in known:
+                known[at] = made()
+            return known[at]
+
+        def resolvent() -> Resolvent:
+            return minors.resolvent(self._entries(p, (A, E)), matrix)
+
+        def plant() -> Any:
+            made = remembered(minors.resolvents, (A, E), resolvent)
+            return minors.plant(made, self._entries(p, (C,)), matrix)
+
+        pi = remembered(minors.known, (A, C, E), plant)
+        return pi, remembered(minors.known, (B, E), lambda: minors.forces(self._entries(p, (B, E)), matrix))
+
+    def _entries(self, p: list[Any], matrices: tuple[int, ...] = (A, B, C, D, E)) -> list[Any]:
+        """The entries of these matrices at given p; none of the others."""
+        program = self.loop.program.only(matrices)
+        if not (self.exact or (self.loop.program.rational and self.loop.program.short)):
+            return program.run([arb(x) for x in p], POINTS)
+        entries = program.run(p, EXACT)
+        return entries if self.exact else [[(i, j, arb(x)) for i, j, x in matrix] for matrix in entries]
+
+    def _map_to_v(self, a: list[Any]) -> list[Any]:
+        return map_bilinear(a) if self.discrete else a
+
+    # bounds
+
+    @cached_property
+    def _polynomials(self) -> tuple[dict[tuple[int, int], tuple[dict[Any, Any], dict[Any, Any] | None]], ...]:
+        """The entries as polynomials of v over polynomials without the inverted parameters."""
+        assert self.loop.symbolic is not None
+        picked = [i for i, inverted in enumerate(self.inverted) if inverted]
+        found, g = [], set(self.group.states)
+        for which, matrix in enumerate(divide_by_descriptor(self.loop, self.loop.symbolic)[: D + 1]):
+            turned = {}
+            for at, r in matrix.items():
+                if (which in (A, B) and at[0] not in g) or (which in (A, C) and at[1] not in g):
+                    continue
+                powers = {i: sole_power(r.den, i) or 0 for i in picked}
+
+                def flip(polynomial: Any, powers: dict[int, int]) -> dict[Any, Any]:
+                    return {
+                        tuple(powers[i] - e if i in powers else e for i, e in enumerate(m)): c
+                        for m, c in polynomial.to_dict().items()
+                    }
+
+                den = None if r.den is None else flip(r.den, powers)
+                turned[at] = flip(r.num, powers), den
+            found.append(turned)
+        return tuple(found)
+
+    def _balls(self, v: Sequence[Any]) -> list[list[tuple[int, int, Any]]]:
+        """The entries of the matrices over balls of v."""
+        if not any(self.inverted):
+            return self.loop.program.run(v, BALLS)
+        s = self.loop.symbolic
+        assert s is not None
+        values = list(v)
+        if s.atoms:  # none of them depends on an inverted parameter
+            p = [acb(1) if inverted else x for x, inverted in zip(v, self.inverted, strict=True)]
+            steps = self.loop.program.cells(p, BALLS)
+            values += [steps[k] for k in s.atoms]
+        powers: dict[tuple[int, int], Any] = {}
+
+        def value(polynomial: dict[Any, Any]) -> Any:
+            total = acb(0)
+            for monomial, c in polynomial.items():
+                term = acb(c)
+                for i, e in enumerate(monomial):
+                    if e:
+                        if (i, e) not in powers:
+                            powers[i, e] = values[i] ** int(e)
+                        term *= powers[i, e]
+                total += term
+            return total
+
+        return [
+            [
+                (*at, value(num) if den is None else finite(value(num) / value(den)))
+                for at, (num, den) in matrix.items()
+            ]
+            for matrix in self._polynomials
+        ]
+
+    def coupling_bounds(
+        self, moves: Sequence[Any], sides: Sequence[tuple[Any, Any]]
+    ) -> list[tuple[float, int]] | None:
+        """Bounds of the change of each coefficient by neglected couplings (rounding.py): (mantissa, exponent).
+
+        moves : bounds by powers of s or g; sides : the box, ends of each parameter
+        """
+        if not moves:
+            return None
+        law, total = self.loop.law, list(moves)
+        degree = len(self.group.states) + len(self.group.own)
+        acting = self.minors.rows if self.minors is not None else self._acting
+        lags = len(acting) if law.lag is not None else 0
+        if self.discrete:  # |z - a| <= 2 of a lag, |z| = 1 of stored inputs
+            degree += lags + law.delay * (self.minors.order if self.minors is not None else len(acting))
+            scale = self._row_factors(sides)
+            total = [c * 2**lags * scale for c in total] + [arb(0)] * (degree + 1 - len(total))
+            return [pair(c) for c in map_bounds(total)]
+        for _ in range(lags):
+            rate = arb(law.lag)
+            total = [
+                (total[j - 1] if j else 0) + (total[j] * rate if j < len(total) else 0)
+                for j in range(len(total) + 1)
+            ]
+        scale = self._row_factors(sides)
+        total += [arb(0)] * (degree + lags + 1 - len(total))
+        return [pair(c * scale) for c in total]
+
+    def _row_factors(self, sides: Sequence[tuple[Any, Any]]) -> Any:
+        """A bound of what multiplies the coefficients beside those of the divided matrices: denominators, and det E."""
+        scale, p = arb(1), [acb(low).union(acb(high)) for low, high in sides]
+        if self.exact:
+            for den in _denominators(self.loop, self.group):
+                scale *= abs(value(den, p))
+        if self.loop.descriptor:
+            scale *= self._descriptor_size(self.loop.program.run(p, BALLS)[E])
+        return scale
+
+    def _descriptor_size(self, entries: Sequence[tuple[int, int, Any]]) -> Any:
+        """A bound of |det E| of the group."""
+        x = {state: k for k, state in enumerate(self.group.states)}
+        own = [(x[i], x[j], z) for i, j, z in entries if i in x and j in x]
+        return abs(dense(acb_mat, len(x), len(x), own).det())
+
+    def _factors(self, v: Sequence[Any]) -> Any:
+        """A bound of the factors that `at` gives the coefficients beside the charpoly: det E, det(I - D_c D), and the
+        denominators of exact rows."""
+        size, p_of_v = (
+            arb(1),
+            [1 / x if inverted else x for x, inverted in zip(v, self.inverted, strict=True)],
+        )
+        entries = self.loop.program.run(p_of_v, BALLS) if self.loop.descriptor or self.loop.direct else []
+        if self.loop.descriptor:
+            size *= self._descriptor_size(entries[E])
+        if self.loop.direct:
+            m, p = self.loop.program.shapes[B][1], self.loop.program.shapes[C][0]
+            w = acb_mat(rational(self.loop.law.D)) * dense(acb_mat, p, m, entries[D])
+            size *= abs((dense(acb_mat, m, m, ((i, i, 1) for i in range(m))) - w).det()).max(arb(1))
+        if self.exact and self.loop.symbolic is not None:
+            for den in _denominators(self.loop, self.group):
+                size *= abs(value(den, p_of_v)).max(arb(1))
+        return size
+
+    @property
+    def _acting(self) -> tuple[int, ...]:
+        """The inputs of the group's own matrix."""
+        inputs = self.group.inputs
+        return tuple(range(self.loop.program.shapes[B][1])) if inputs is None else inputs
+
+    @np.errstate(over="ignore", invalid="ignore")  # bounds that overflow are refused
+    def majorant(self, v: Sequence[Any]) -> list[tuple[float, int]]:
+        """Upper bounds of |a_k| for all complex v in these balls: (mantissa, exponent) of each.
+
+        Raises NotAnalytic when the matrices are not analytic on them.
+        """
+        if self.minors is None:
+            size = majorant_matrix(self.loop, self.group, self._balls(v))
+            product = coefficient_bounds(size, np.ones(len(size)))
+        else:
+            known, where = self.minors.known, tuple(_ends_of(x) for x in v)
+            if where not in known:
+                known[where] = self.minors.sizes(self._balls(v))
+            product = self.minors.majorant(known[where])
+        size = self._factors(v)
+        product = [c * size for c in product]
+        return [pair(c) for c in (map_bounds(product) if self.discrete else product)]
+
+
+def map_bounds(product: list[Any]) -> list[Any]:
+    """Bounds of the coefficients of v from those of g."""
+    n = len(product) - 1
+    turned = [arb(0)] * (n + 1)
+    for k, c in enumerate(product):
+        for j in range(n - k + 1):
+            turned[k + j] += c * (2**k * math.comb(n - k, j))
+    return turned
+
+
+def _ends_of(x: Any) -> tuple[Any, ...]:
+    """A complex ball as exact numbers, which can be compared and hashed."""
+    return tuple(part.man_exp() for one in (x.real, x.imag) for part in (one.mid(), one.rad()))
+
+
+def pair(c: Any) -> tuple[float, int]:
+    """An upper bound of |c|: mantissa and exponent. Raises NotAnalytic when c is not finite."""
+    if not c.is_finite():
+        raise NotAnalytic("numbers that overflow")
+    m, e = (int(i) for i in c.abs_upper().man_exp())
+    if m == 0:
+        return 0.0, 0
+    shift = max(m.bit_length() - 50, 0)
+    return float((m >> shift) + 1), e + shift
+
+
+@lru_cache(maxsize=256)
+def _parameters_of(program: Program, *matrices: int) -> tuple[int, ...]:
+    return tuple(sorted(frozenset().union(*(on for k, on in enumerate(program.depends) if k in matrices))))
+
+
+@lru_cache(maxsize=64)
+def _denominators(loop: UncertainLoop, g: Group) -> tuple[Any, ...]:
+    assert loop.symbolic is not None
+    return tuple(row[None] for row in clear_denominators(loop, g, loop.symbolic) if None in row)
+
+
+def _multiplier(loop: UncertainLoop, g: Group, p: Sequence[Any]) -> Any:
+    found = fmpq(1)
+    for den in _denominators(loop, g):
+        found *= den(*p)
+    return found
+
+
+@lru_cache(maxsize=64)
+def _bilinear(n: int) -> Any:
+    """The matrix from the coefficients a_k of sum a_k g^k to those of (1 - v)^n sum a_k (2 v / (1 - v))^k."""
+    table = [[fmpq(0)] * (n + 1) for _ in range(n + 1)]
+    for k in range(n + 1):
+        for j in range(n - k + 1):
+            table[k + j][k] += fmpq(2**k * math.comb(n - k, j) * (-1) ** j)
+    return fmpq_mat(table)
+
+
+def bilinear_table(n: int) -> Any:
+    """The matrix from coefficients of g to those of v, as balls."""
+    return arb_mat(_bilinear(n))
+
+
+def map_bilinear(a: list[Any]) -> list[Any]:
+    table = _bilinear(len(a) - 1)
+    if isinstance(a[-1], fmpq) or isinstance(a[0], fmpq):
+        return list((table * fmpq_mat(len(a), 1, a)).entries())
+    return list((arb_mat(table) * arb_mat(len(a), 1, a)).entries())

@@ -1,0 +1,269 @@
+"""A characteristic polynomial enclosed over a box of parameters: an interpolation and a bound of its error.
+
+With |a_k| <= M on the disc of radius R about the middle of a side (of half width 1), interpolation of degree d at
+Chebyshev nodes has an error of at most (1 + Lambda_d) M R^-d / (R - 1): Cauchy's estimate with the Lebesgue constant
+Lambda_d.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from flint import acb, arb, ctx, fmpq
+
+from malta.proof.expressions import NotAnalytic, exact
+from malta.proof.polynomial.characteristic import pair
+from malta.proof.polynomial.family import Family, family, nodes
+from malta.proof.time_limit import check_time
+
+if TYPE_CHECKING:
+    from malta.model.plant import FloatArray
+    from malta.proof.problem import Polynomial
+
+MOST_NODES = 20_000  # places of exact coefficients, at most
+MOST_BALLS = 6000  # places where they take an exponential
+PLENTY = 1500  # places beyond which more may be left out
+TAILS = (1e-9, 1e-7, 3e-6)  # what interpolation may leave out, relative to each coefficient
+WORST = 1e-5  # beyond which the box is cut
+HIGHEST = 16  # degree of an interpolation along one parameter
+LEBESGUE = 4.0  # 1 + Lambda up to that degree: Lambda <= 1 + 2 / pi log(d + 1), below 2.81
+RADII = tuple(2.0**k for k in (0.5, 1, 1.5, 2, 3, 4, 5, 6, 8, 10, 12, 14, 17, 20))
+BITS = 128  # of ball arithmetic, in which numbers of up to 128 bits take the least time
+MOST_BITS = 640  # beyond which a coefficient is taken as the ball that it is
+HOPE = 0.4  # of what the first place took, at least, the others take
+
+
+class Unproven(Exception):
+    """No enclosure of the characteristic polynomial was found; the message says why."""
+
+
+class TooWide(Unproven):
+    """The box is too wide along this axis for one enclosure; a narrower box may have one."""
+
+    def __init__(self, axis: int, reason: str) -> None:
+        super().__init__(reason)
+        self.axis = axis
+
+
+@contextmanager
+def precision(bits: int) -> Iterator[None]:
+    before, ctx.prec = ctx.prec, bits
+    try:
+        yield
+    finally:
+        ctx.prec = before
+
+
+@dataclass(frozen=True, eq=False)
+class Side:
+    """The sampling of one parameter's side: degree, Chebyshev or uniform nodes, and bounds of the error."""
+
+    degree: int
+    chebyshev: bool
+    tails: tuple[tuple[float, int], ...] | None
+
+
+def over_box(f: Polynomial, sides: FloatArray, moves: Sequence[Any] = (), until: float = math.inf) -> Family:
+    """The family over a box (P x 2, of p); moves: bounds of the effect of neglected couplings (rounding.py).
+
+    Raises TooWide when a narrower box may have an enclosure, else Unproven.
+    """
+    if f.foreign:
+        raise Unproven(f"the model has {f.foreign[0]}, which has no enclosure")
+    low, high = ends_of(f, sides)
+    with precision(BITS):
+        known = f.degrees
+        plan = _plan(f, low, high, known)
+        count = math.prod(side.degree + 1 for side in plan)
+        if count > (MOST_NODES if f.exact else MOST_BALLS):
+            axis = max(range(len(plan)), key=lambda i: plan[i].degree)
+            if plan[axis].chebyshev:
+                raise TooWide(axis, f"{count} places are too many to interpolate at")
+            raise Unproven(f"{f.names[axis]} enters with degree {plan[axis].degree}: {count} coefficients")
+    grid = [
+        [low[i] + (high[i] - low[i]) * _share(side, k) for k in range(side.degree + 1)]
+        for i, side in enumerate(plan)
+    ]
+    points = _values(f, list(itertools.product(*grid)), until)
+    tails = _add_bounds(_sum_tails(plan), f.coupling_bounds(moves, _real(sides)))
+    return family([s.degree + 1 for s in plan], [s.chebyshev for s in plan], points, tails)
+
+
+def _real(sides: FloatArray) -> list[tuple[Any, Any]]:
+    return [(arb(a), arb(b)) for a, b in sides.tolist()]
+
+
+def _add_bounds(
+    one: list[tuple[float, int]] | None, two: list[tuple[float, int]] | None
+) -> list[tuple[float, int]] | None:
+    """The sums of two lists of bounds."""
+    if one is None or two is None:
+        return one if two is None else two
+    total = []
+    for (a, i), (b, j) in zip(one, two, strict=True):
+        top = max(i, j)
+        total.append((math.ldexp(a, max(i - top, -1000)) + math.ldexp(b, max(j - top, -1000)), top))
+    return total
+
+
+def ends_of(f: Polynomial, sides: FloatArray) -> tuple[list[Any], list[Any]]:
+    """The ends of the box in v, exactly."""
+    low, high = [], []
+    for (a, b), inverted in zip(sides.tolist(), f.inverted, strict=True):
+        if inverted and a <= 0 <= b:
+            raise Unproven("a parameter that divides reaches zero")
+        ends = [exact(a), exact(b)]
+        low.append(1 / ends[1] if inverted else ends[0])
+        high.append(1 / ends[0] if inverted else ends[1])
+    return low, high
+
+
+def _share(side: Side, k: int) -> Any:
+    if side.degree == 0:
+        return fmpq(1, 2)
+    return exact(nodes(side.degree, chebyshev=True)[k]) if side.chebyshev else fmpq(k, side.degree)
+
+
+def _values(f: Polynomial, places: list[tuple[Any, ...]], until: float = math.inf) -> list[list[Any]]:
+    """The coefficients at the places, as balls accurate to 60 bits."""
+
+    def evaluate(place: tuple[Any, ...]) -> list[Any]:
+        if time.monotonic() > until:
+            raise Unproven("time was up before the coefficients were found")
+        return f.at(place)
+
+    bits = BITS
+    while True:
+        try:
+            with precision(bits):
+                begun = time.monotonic()
+                first = f.at(places[len(places) // 2])
+                spent = time.monotonic() - begun
+                if time.monotonic() + HOPE * spent * len(places) > until:
+                    raise Unproven("time would be up before the coefficients were found")
+                if f.exact or bits >= MOST_BITS or all(_is_accurate(c) for c in first):
+                    return [evaluate(place) for place in places]
+        except NotAnalytic as error:
+            raise Unproven(f"the matrices have no value on the box: {error}") from error
+        bits *= 2
+
+
+def _is_accurate(c: Any) -> bool:
+    return bool(c.rel_accuracy_bits() >= 66) if hasattr(c, "rel_accuracy_bits") else True
+
+
+def _plan(f: Polynomial, low: list[Any], high: list[Any], known: tuple[int | None, ...]) -> list[Side]:
+    """The sampling of each side; the error is smaller when that needs few places."""
+    free = [i for i, d in enumerate(known) if d is None and low[i] < high[i]]
+    discs: dict[int, list[Disc]] = {}
+    if free:
+        middle = [(a + b) / 2 for a, b in zip(low, high, strict=True)]
+        (nominal,) = _values(f, [tuple(middle)])
+        size = [pair(c if hasattr(c, "abs_upper") else arb(c)) for c in nominal]
+        discs = {i: discs_of(f, i, low, high, size) for i in free}
+    plan: list[Side] = []
+    for tail in TAILS:
+        plan = [
+            _interpolation_side(f.names[i], i, discs[i], tail) if i in discs
+            else Side(0 if low[i] == high[i] else d or 0, False, None)
+            for i, d in enumerate(known)
+        ]  # fmt: skip
+        if math.prod(side.degree + 1 for side in plan) <= PLENTY:
+            break
+    return plan
+
+
+class Disc(NamedTuple):
+    """Bounds of the coefficients on a disc about the middle of a side."""
+
+    radius: float  # in half widths of the side
+    share: float  # log2 of the largest bound over the coefficient in the middle
+    most: list[tuple[float, int]]
+
+
+def discs_of(
+    f: Polynomial, i: int, low: list[Any], high: list[Any], size: list[tuple[float, int]]
+) -> list[Disc]:
+    """Bounds on discs along one parameter on which the matrices are analytic, the largest disc first.
+
+    Raises TooWide when they are not analytic a little beyond the side.
+    """
+    found: list[Disc] = []
+    refused = NotAnalytic("no disc about its range")
+    for radius in reversed(RADII):  # the largest that there is leaves out the least, mostly
+        check_time()
+        balls = []
+        for k, (a, b) in enumerate(zip(low, high, strict=True)):
+            middle, half = arb((a + b) / 2), arb((b - a) / 2)
+            if k == i:
+                room = arb(0, float((half * radius).upper()) * (1 + 1e-12))
+                balls.append(acb(middle + room, room))
+            else:
+                balls.append(acb(middle + arb(0, float(half.upper()) * (1 + 1e-12))))
+        try:
+            most = f.majorant(balls)
+        except NotAnalytic as error:
+            refused = error
+            continue
+        share = max(_log2(m) - _log2(s) for m, s in zip(most, size, strict=True) if s[0] > 0)
+        found.append(Disc(radius, share, most))
+        if len(found) > 2 and _degree(found[-1], TAILS[0]) > _degree(found[-3], TAILS[0]):
+            break
+    if not found:
+        raise TooWide(i, f"{f.names[i]}: {refused}") from refused
+    return found
+
+
+def _degree(disc: Disc, tail: float) -> int:
+    """The lowest degree with an error of at most `tail` by the bound of a disc."""
+    return math.ceil((disc.share + 3 - math.log2(disc.radius - 1) - math.log2(tail)) / math.log2(disc.radius))
+
+
+def _interpolation_side(name: str, axis: int, discs: list[Disc], tail: float) -> Side:
+    """The sampling of the lowest degree with an error of at most `tail` by any disc; else the one of least error."""
+    best, best_rank = None, (True, 0, math.inf)
+    for disc in discs:
+        radius, share, most = disc
+        rest = share + 3 - math.log2(radius - 1)
+        degree = max(1, min(_degree(disc, tail), HIGHEST))
+        left = rest - degree * math.log2(radius)
+        enough = left <= math.log2(tail)
+        rank = (not enough, degree if enough else 0, left)
+        if best is None or rank < best_rank:
+            scale = LEBESGUE * radius**-degree / (radius - 1)
+            best = Side(degree, True, tuple((m * scale, e) for m, e in most))
+            best_rank = rank
+    assert best is not None
+    if best_rank[2] > math.log2(WORST):
+        raise TooWide(axis, f"{name}: its range is too wide for one expansion")
+    return best
+
+
+def _log2(pair: tuple[float, int]) -> float:
+    return math.log2(pair[0]) + pair[1] if pair[0] > 0 else -math.inf
+
+
+def _sum_tails(plan: list[Side]) -> list[tuple[float, int]] | None:
+    """The sum of the errors of all axes, each times the Lebesgue constants (below 3) of the axes before it."""
+    parts = [(side.tails, 3.0**k) for k, side in enumerate(s for s in plan if s.tails is not None)]
+    if not parts:
+        return None
+    total = []
+    for pairs in zip(*(tails for tails, _ in parts if tails is not None), strict=True):
+        top = max(e for _, e in pairs)
+        total.append(
+            (
+                sum(
+                    math.ldexp(m * growth, max(e - top, -1000))
+                    for (m, e), (_, growth) in zip(pairs, parts, strict=True)
+                ),
+                top,
+            )
+        )
+    return total

@@ -1,0 +1,384 @@
+"""The characteristic polynomial by minors (Cauchy, Binet): factors that do not depend on p are computed once.
+
+    d_P d_F det(I - F P) = sum_k (-1)^k sum_(S, R, T) pi_SR  beta_RT  kappa_TS        |S| = |R| = |T| = k
+
+P = X B, X from forces on the rows R of the state equations to the outputs S; pi_SR = d_P det X[S, R] and
+kappa_TS = d_F det F[T, S] are polynomials, beta_RT = det B[R, T] numbers. A delay of d samples is z^-d of P.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from flint import acb_mat, arb, arb_mat, arb_poly, fmpq_mat, fmpq_poly
+
+from malta.proof.expressions import NotAnalytic, Program, exact
+from malta.proof.groups import A, B, C, E, Group, UncertainLoop, rational, upper
+from malta.proof.polynomial.closed_loop import (
+    add_lag,
+    dense,
+    driven_bounds,
+    hold,
+    join_columns,
+    solve,
+    zeros,
+)
+from malta.proof.polynomial.majorant import all_bounds, coefficient_bounds
+from malta.proof.polynomial.mirrors import Image, Places, first_alike
+
+if TYPE_CHECKING:
+    from malta.model.plant import FloatArray
+
+MOST = 24  # minors beyond which the closed loop's own matrix is cheaper
+
+Pair = tuple[tuple[int, ...], tuple[int, ...]]
+
+
+@dataclass(frozen=True, eq=False)
+class Minors:
+    """The minors of a group: its rows with inputs, its inputs and outputs, and the compensator between these.
+
+    R, S and T count in the group. Its resolvent is that of its first mirror image.
+    """
+
+    loop: UncertainLoop
+    group: Group
+    rows: tuple[int, ...]  # states, by their number in the group
+    inputs: tuple[int, ...]
+    outputs: tuple[int, ...]
+
+    @cached_property
+    def image(self) -> Image:
+        """This group as an image of the one whose resolvent stands for its own (mirrors.py)."""
+        own = Places(self.group.states, self.rows)
+        return first_alike(self.loop.program, self.loop.symbolic, own)
+
+    @property
+    def order(self) -> int:
+        return min(len(self.rows), len(self.inputs), len(self.outputs))
+
+    @property
+    def count(self) -> int:
+        """The number of polynomials to be computed at each place."""
+        return sum(
+            math.comb(len(self.rows), k) * math.comb(len(self.outputs), k) for k in range(self.order + 1)
+        )
+
+    @cached_property
+    def kappa(self) -> dict[Pair, Any]:
+        """d_F det F[T, S] of the compensator's own states, in s or g = z - 1: exact."""
+        law, own = self.loop.law, list(self.group.own)
+        a = law.A[np.ix_(own, own)]
+        table = rational(a)
+        if law.sample_time is not None:
+            table = [[v - (i == j) for j, v in enumerate(row)] for i, row in enumerate(table)]
+        n = len(own)
+        f = fmpq_mat(table) if n else None
+        d = fmpq_poly([1]) if f is None else fmpq_poly(f.charpoly())
+        entries: dict[tuple[int, int], Any] = {}
+        for i, t in enumerate(self.inputs):
+            for j, s in enumerate(self.outputs):
+                entry = d * exact(float(law.D[t, s]))
+                if f is not None:
+                    b = fmpq_mat(rational(law.B[own][:, [s]]))
+                    c = fmpq_mat(rational(law.C[[t]][:, own]))
+                    entry += fmpq_poly((f - b * c).charpoly()) - d
+                entries[i, j] = entry
+        found: dict[Pair, Any] = {((), ()): d}
+        for k in range(1, self.order + 1):
+            for T in itertools.combinations(range(len(self.inputs)), k):
+                for S in itertools.combinations(range(len(self.outputs)), k):
+                    det = _determinant([[entries[t, s] for s in S] for t in T])
+                    found[T, S] = det if k == 1 else _quotient(det, d, k - 1)
+        return found
+
+    @cached_property
+    def late(self) -> tuple[Any, ...]:
+        """z^(d (K - k)) for k = 0 .. K."""
+        z = fmpq_poly([1, 1])
+        return tuple(z ** (self.loop.law.delay * (self.order - k)) for k in range(self.order + 1))
+
+    @cached_property
+    def balls(self) -> tuple[dict[Pair, Any], dict[Pair, Any]]:
+        """kappa times the delay's power, signed, as exact polynomials and as balls."""
+        signed = {pair: p * self.late[len(pair[0])] * (-1) ** len(pair[0]) for pair, p in self.kappa.items()}
+        return signed, {pair: arb_poly(p) for pair, p in signed.items()}
+
+    def resolvent(self, entries: list[list[tuple[int, int, Any]]], matrix: Any) -> Resolvent:
+        """That of the first group of which this one is an image, at given p."""
+        a, law = self._square(entries[A], matrix, self.image.of.states), self.loop.law
+        b = dense(matrix, a.nrows(), len(self.rows), ((i, k, 1) for k, i in enumerate(self.rows)))
+        factor: Any = 1
+        if self.loop.descriptor:
+            e = self._square(entries[E], matrix, self.image.of.states)
+            factor, a = e.det(), solve(e, a)
+        rate = None if law.lag is None else arb(law.lag) if self.loop.sampled else exact(law.lag)
+        if rate is not None:
+            a, b, _, _ = add_lag(matrix, a, b, zeros(matrix, 0, a.nrows()), None, rate)
+        if self.loop.sampled:
+            a, b = hold(matrix, a, b, arb(law.sample_time))
+        elif law.sample_time is not None:
+            a = a - dense(matrix, a.nrows(), a.nrows(), ((i, i, 1) for i in range(a.nrows())))
+        return _resolvent(a, b, factor)
+
+    def plant(
+        self, resolvent: Resolvent, entries: list[list[tuple[int, int, Any]]], matrix: Any
+    ) -> dict[Pair, Any]:
+        """pi_SR at given p, rows by their number in the group; signs of images are those of C and of `forces`."""
+        x = {state: k for k, state in enumerate(self.group.states)}
+        y, signs = {output: k for k, output in enumerate(self.outputs)}, self.image.signs
+        own = [(y[i], x[j], r * signs[x[j]]) for i, j, r in entries[C] if i in y and j in x]
+        found = _minors(resolvent, dense(matrix, len(y), resolvent.powers.nrows(), own), self.order)
+        return {pair: p * resolvent.det_E for pair, p in found.items()}
+
+    def _square(self, entries: list[tuple[int, int, Any]], matrix: Any, states: tuple[int, ...]) -> Any:
+        """The entries of A or E between states."""
+        x = {state: k for k, state in enumerate(states)}
+        return dense(matrix, len(x), len(x), ((x[i], x[j], r) for i, j, r in entries if i in x and j in x))
+
+    def forces(self, entries: list[list[tuple[int, int, Any]]], matrix: Any) -> dict[Pair, Any]:
+        """beta_RT at given p, without structural zeros."""
+        x, signs = {state: k for k, state in enumerate(self.group.states)}, self.image.signs
+        n, u = len(x), {t: k for k, t in enumerate(self.inputs)}
+        own = {(x[i], u[j]): r for i, j, r in entries[B] if i in x and j in u}
+        if self.loop.descriptor:
+            e = self._square(entries[E], matrix, self.group.states)
+            b = solve(e, dense(matrix, n, len(u), ((*at, r) for at, r in own.items())))
+            own = {(i, j): b[i, j] for i in range(n) for j in range(len(u))}
+        own = {(i, j): r * signs[i] for (i, j), r in own.items()}
+        found: dict[Pair, Any] = {}
+        for k in range(1, self.order + 1):
+            for R in itertools.combinations(range(len(self.rows)), k):
+                for T in itertools.combinations(range(len(u)), k):
+                    part = [[own.get((self.rows[i], t)) for t in T] for i in R]
+                    det = _determinant(part)
+                    if det is not None:
+                        found[R, T] = det
+        return found
+
+    def combine(self, pi: dict[Pair, Any], beta: dict[Pair, Any], matrix: Any) -> list[Any]:
+        """The coefficients a_0 ... a_N from the minors."""
+        kappa = self.balls[0 if matrix is fmpq_mat else 1]
+        total = pi[(), ()] * kappa[(), ()]
+        for (S, R), p in pi.items():
+            if not R:
+                continue
+            part = None
+            for T in itertools.combinations(range(len(self.inputs)), len(R)):
+                if (R, T) in beta:
+                    term = kappa[T, S] * beta[R, T]
+                    part = term if part is None else part + term
+            if part is not None:
+                total = total + p * part
+        return list(total.coeffs())
+
+    @property
+    def degree(self) -> int:
+        law = self.loop.law
+        return (
+            len(self.group.states) + len(self.group.own)
+            + (len(self.rows) if law.lag is not None else 0) + self.order * law.delay
+        )  # fmt: skip
+
+    def sizes(self, entries: list[list[tuple[int, int, Any]]]) -> Sizes:
+        """Bounds of the system's minors from balls of the entries.
+
+        Raises NotAnalytic when numbers overflow.
+        """
+        a, b, c, diagonal = _sizes(self, entries)
+        a, into, c, _ = driven_bounds(self.loop, (a, np.eye(len(a))[:, list(self.rows)], c, None), diagonal)
+        pi: dict[Pair, Any] = {((), ()): coefficient_bounds(a, np.ones(len(a)))}
+        for k in range(1, self.order + 1):
+            places = [
+                (S, R)
+                for S in itertools.combinations(range(len(self.outputs)), k)
+                for R in itertools.combinations(range(len(self.rows)), k)
+            ]
+            pi |= zip(places, _bounds(a, [(into[:, list(R)], c[list(S)]) for S, R in places]), strict=True)
+        beta = {
+            (R, T): float(np.prod(b[np.ix_(R, T)].sum(axis=1))) * (1 + 1e-9)
+            for k in range(1, self.order + 1)
+            for R in itertools.combinations(range(len(self.rows)), k)
+            for T in itertools.combinations(range(len(self.inputs)), k)
+        }
+        if not all(math.isfinite(size) for size in beta.values()):
+            raise NotAnalytic("numbers that overflow")
+        return Sizes(pi, beta)
+
+    def majorant(self, sizes: Sizes) -> list[Any]:
+        """Upper bounds of the coefficients of s or g."""
+        result: list[Any] = []
+        for (S, R), pi in sizes.pi.items():
+            weight = [] if R else self._absolute_kappa[(), ()]
+            for T in itertools.combinations(range(len(self.inputs)), len(R)) if R else ():
+                if sizes.beta[R, T]:
+                    weight = _sum(weight, [arb(sizes.beta[R, T]) * x for x in self._absolute_kappa[T, S]])
+            if weight:
+                result = _sum(result, _product(pi, weight))
+        return result
+
+    @cached_property
+    def _absolute_kappa(self) -> dict[Pair, list[Any]]:
+        return {pair: [arb(abs(x)) for x in p.coeffs()] for pair, p in self.balls[0].items()}
+
+    @property
+    def known(self) -> dict[Any, Any]:
+        """The remembered minors of the system at places and on discs, which do not depend on the compensator."""
+        return _known(self.loop.program, self._kind, self.group.states, self.rows, self.inputs, self.outputs)
+
+    @property
+    def resolvents(self) -> dict[Any, Any]:
+        """The remembered resolvents at places, those of images too."""
+        return _known(self.loop.program, self._kind, self.image.of)
+
+    @property
+    def _kind(self) -> tuple[Any, ...]:
+        law = self.loop.law
+        return law.sample_time, law.lag, self.loop.sampled
+
+
+@lru_cache(maxsize=64)  # laws change, the system stays
+def _known(program: Program, *of: Any) -> dict[Any, Any]:
+    del program, of
+    return {}
+
+
+class Resolvent(NamedTuple):
+    """(g - A)^-1 B as adj(g - A) B / d, d = det(g - A): the matrices of its powers of g side by side, lowest first."""
+
+    d: Any
+    powers: Any
+    det_E: Any
+
+
+class Sizes(NamedTuple):
+    """Bounds of the coefficients of pi_SR, and of beta_RT."""
+
+    pi: dict[Pair, Any]
+    beta: dict[Pair, float]
+
+
+def minors(loop: UncertainLoop, g: Group) -> Minors | None:
+    """The minors of a group; None for direct feedthrough or too many minors, where the matrix itself is cheaper."""
+    if loop.direct or not g.states:
+        return None
+    x = {state: k for k, state in enumerate(g.states)}
+    own = list(g.own)
+    rows = sorted({x[i] for i, _, _ in loop.program.entries[B] if i in x})
+    inputs = sorted({j for i, j, _ in loop.program.entries[B] if i in x})
+    if loop.descriptor:
+        rows = list(range(len(x)))
+    outputs = sorted({i for i, j, _ in loop.program.entries[C] if j in x})
+    law = loop.law
+    inputs = [t for t in inputs if law.C[t, own].any() or law.D[t, outputs].any()]
+    outputs = [s for s in outputs if law.B[own, s].any() or law.D[inputs, s].any()]
+    found = Minors(loop, g, tuple(rows), tuple(inputs), tuple(outputs))
+    return found if found.count <= MOST else None
+
+
+def _determinant_by_row(row: list[Any], rest: list[Any]) -> Any:
+    """The determinant from a first row and the minors of the others."""
+    total = row[0] * rest[0]
+    for n in range(1, len(row)):
+        total = total - row[n] * rest[n] if n % 2 else total + row[n] * rest[n]
+    return total
+
+
+def _determinant(m: list[list[Any]]) -> Any:
+    """The determinant by its first row; None stands for zero."""
+    if len(m) == 1:
+        return m[0][0]
+    total = None
+    for j, entry in enumerate(m[0]):
+        rest = None if entry is None else _determinant([row[:j] + row[j + 1 :] for row in m[1:]])
+        if rest is None:
+            continue
+        part = -(entry * rest) if j % 2 else entry * rest
+        total = part if total is None else total + part
+    return total
+
+
+def _quotient(p: Any, d: Any, k: int) -> Any:
+    for _ in range(k):
+        q, rest = divmod(p, d)
+        assert rest == 0
+        p = q
+    return p
+
+
+def _resolvent(a: Any, b: Any, det_E: Any) -> Resolvent:
+    """The resolvent by Horner's scheme (Leverrier, Faddeev), which loses few digits to cancellation."""
+    own = a.charpoly()
+    powers = [b]
+    for k in range(a.nrows() - 1, 0, -1):
+        powers.append(a * powers[-1] + b * own[k])
+    kind = arb_poly if isinstance(a, arb_mat) else fmpq_poly
+    return Resolvent(kind(own), join_columns(type(a), *powers[::-1]), det_E)
+
+
+def _minors(resolvent: Resolvent, c: Any, order: int) -> dict[Pair, Any]:
+    """d det X[S, R], X = C (g - A)^-1 B: d X has entries of C adj(g - A) B, and larger minors are their determinants
+    by the first row, each divided by d."""
+    d, p, wide = resolvent.d, c.nrows(), resolvent.powers.ncols()
+    values, r = (c * resolvent.powers).entries(), wide // resolvent.powers.nrows()
+    found: dict[Pair, Any] = {((), ()): d}
+    for i, j in itertools.product(range(p), range(r)):
+        found[(i,), (j,)] = type(d)(values[i * wide + j : (i + 1) * wide : r])
+    for k in range(2, order + 1):
+        for S in itertools.combinations(range(p), k):
+            for R in itertools.combinations(range(r), k):
+                minor = _determinant_by_row(
+                    [found[S[:1], (j,)] for j in R], [found[S[1:], R[:n] + R[n + 1 :]] for n in range(k)]
+                )
+                found[S, R] = minor // d
+    return found
+
+
+def _sizes(
+    m: Minors, entries: list[list[tuple[int, int, Any]]]
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    x = {state: k for k, state in enumerate(m.group.states)}
+    u, y = ({j: k for k, j in enumerate(own)} for own in (m.inputs, m.outputs))
+    n = len(x)
+    a_balls = [(x[i], x[j], z) for i, j, z in entries[A] if i in x and j in x]
+    b_balls = [(x[i], u[j], z) for i, j, z in entries[B] if i in x and j in u]
+    if len(entries) > E:
+        e = dense(acb_mat, n, n, ((x[i], x[j], z) for i, j, z in entries[E] if i in x and j in x))
+        both = join_columns(acb_mat, dense(acb_mat, n, n, a_balls), dense(acb_mat, n, len(u), b_balls))
+        ab = solve(e, both)
+        a_balls = [(i, j, ab[i, j]) for i in range(n) for j in range(n)]
+        b_balls = [(i, j, ab[i, n + j]) for i in range(n) for j in range(len(u))]
+
+    def size(rows: int, count: int, values: Any) -> FloatArray:
+        found = np.zeros((rows, count))
+        for i, j, z in values:
+            found[i, j] = float(abs(z).upper()) * (1 + 1e-9)
+        return found
+
+    c = size(len(y), n, ((y[i], x[j], z) for i, j, z in entries[C] if i in y and j in x))
+    diagonal = np.zeros(n)
+    for i, j, z in a_balls:
+        if i == j:
+            diagonal[i] = upper(z)
+    return size(n, n, a_balls), size(n, len(u), b_balls)[list(m.rows)], c, diagonal
+
+
+def _bounds(a: FloatArray, sides: list[tuple[FloatArray, FloatArray]]) -> list[list[Any]]:
+    """Upper bounds of the coefficients of det [[g - A, B], [C, 0]], from entrywise bounds of A and of each B and C."""
+    k = len(sides[0][1])
+    m = np.array([np.block([[a, b], [c, np.zeros((k, k))]]) for b, c in sides])
+    return all_bounds(m, np.where(np.arange(m.shape[1]) < len(a), 1.0, 0.0))
+
+
+def _product(one: list[Any], two: list[Any]) -> list[Any]:
+    return list((arb_poly(one) * arb_poly(two)).coeffs()) if one and two else []
+
+
+def _sum(one: list[Any], two: list[Any]) -> list[Any]:
+    long, short = (one, two) if len(one) >= len(two) else (two, one)
+    return [x + short[k] if k < len(short) else x for k, x in enumerate(long)]

@@ -1,0 +1,365 @@
+"""The problems of a margin, a loop or a polynomial with coefficients in p: both have characteristic polynomials."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+from flint import acb, arb, arb_mat, fmpq
+
+from malta.proof.companion import companion
+from malta.proof.expressions import (
+    BALLS,
+    EXACT,
+    POINTS,
+    NotAnalytic,
+    Program,
+    exact,
+)
+from malta.proof.groups import Group, UncertainLoop
+from malta.proof.polynomial import rounding
+from malta.proof.polynomial.characteristic import (
+    Characteristic,
+    map_bilinear,
+    map_bounds,
+    pair,
+)
+from malta.proof.polynomial.closed_loop import closed_loop, driven_group
+from malta.proof.polynomial.family import binary
+from malta.proof.polynomial.rational import Symbolic, TooLarge, symbolic
+from malta.proof.uncertain import closed_loop as closed_matrices
+from malta.proof.uncertain import critical_frequency, instability
+
+if TYPE_CHECKING:
+    from malta.model.plant import FloatArray
+
+
+class Polynomial(Protocol):
+    """A characteristic polynomial: `Characteristic`, or `OfCoefficients`."""
+
+    @property
+    def names(self) -> tuple[str, ...]: ...
+    @property
+    def exact(self) -> bool: ...
+    @property
+    def foreign(self) -> tuple[str, ...]: ...
+    @property
+    def inverted(self) -> tuple[bool, ...]: ...
+    @property
+    def degrees(self) -> tuple[int | None, ...]: ...
+    def at(self, v: Sequence[Any]) -> list[Any]: ...
+    def majorant(self, v: Sequence[Any]) -> list[tuple[float, int]]: ...
+    def coupling_bounds(
+        self, moves: Sequence[Any], sides: Sequence[tuple[Any, Any]]
+    ) -> list[tuple[float, int]] | None: ...
+
+
+class Problem(Protocol):
+    """The interface of a problem that has a margin."""
+
+    def parts(self, p: Sequence[Any]) -> list[tuple[Polynomial, tuple[Any, ...]]]:
+        """The characteristic polynomials over real balls p, each with bounds of the effect of neglected couplings."""
+
+    def instability(self, rows: FloatArray) -> FloatArray:
+        """The distance of the worst root beyond the boundary at rows of parameters, in floating point."""
+
+    def critical_frequency(self, p: FloatArray) -> float:
+        """The frequency of the worst root at parameters p, rad/s."""
+
+    def physical(self, x: float) -> float:
+        """s / j of the polynomials -> rad/s."""
+
+
+@dataclass(frozen=True, eq=False)
+class OfLoop:
+    """A closed loop."""
+
+    loop: UncertainLoop
+    names: tuple[str, ...]
+    known: dict[Any, Characteristic] = field(default_factory=dict)
+    neglect: bool = True  # whether couplings of the size of rounding are taken as zero and bounded
+
+    @cached_property
+    def couplings(self) -> rounding.Couplings | None:
+        if self.loop.symbolic is None or not self.neglect:
+            return None
+        return rounding.Couplings(self.loop, self.loop.symbolic)
+
+    def parts(self, p: Sequence[Any]) -> list[tuple[Polynomial, tuple[Any, ...]]]:
+        found: list[tuple[Polynomial, tuple[Any, ...]]] = []
+        for part in rounding.parts(self.loop, self.couplings, p):
+            key = (part.group.states, part.group.own)
+            if key not in self.known:
+                self.known[key] = Characteristic(self.loop, part.group, self.names)
+            found.append((self.known[key], part.moves))
+        return found
+
+    @property
+    def _plain(self) -> bool:
+        """Whether the loop is A, B, C alone, in continuous time or sampled."""
+        return not (self.loop.direct or self.loop.descriptor or self.loop.system.sample_time)
+
+    def _poles(self, p: FloatArray) -> Any:
+        """The poles of x' = A x, or of differences x+ - x; empty when the matrices have no value."""
+        n, k = self.loop.states, len(self.loop.law.A)
+        whole = Group(tuple(range(n)), tuple(range(k)), None)
+        try:
+            entries = self.loop.program.run([arb(x) for x in p.tolist()], POINTS)
+            matrix, _ = closed_loop(driven_group(self.loop, whole, entries, arb_mat))
+        except NotAnalytic:
+            return np.zeros(0)
+        found = np.array(
+            [[float(matrix[i, j].mid()) for j in range(matrix.ncols())] for i in range(matrix.nrows())]
+        )
+        return np.linalg.eigvals(found) if np.isfinite(found).all() else np.zeros(0)
+
+    def instability(self, rows: FloatArray) -> FloatArray:
+        if self._plain:
+            with suppress(np.linalg.LinAlgError):  # numbers that overflow at some row: each by itself
+                return instability(self.loop.system, self.loop.law, rows)
+        worst = []
+        for p in np.atleast_2d(rows):
+            poles = self._poles(p)
+            sizes = poles.real if self.loop.law.sample_time is None else 2 * poles.real + np.abs(poles) ** 2
+            worst.append(float(sizes.max(initial=-math.inf)))
+        return np.array(worst)
+
+    def poles(self, p: FloatArray) -> Any:
+        """The closed loop's poles in s; of sampled loops ln z / T."""
+        T = self.loop.law.sample_time
+        if self._plain:
+            (found,) = np.linalg.eigvals(closed_matrices(self.loop.system, self.loop.law, p))
+            found = found if T is None else T * found
+        else:
+            found = self._poles(p)
+        if T is None:
+            return found
+        with np.errstate(divide="ignore"):
+            return np.log(1 + found.astype(complex)) / T
+
+    def critical_frequency(self, p: FloatArray) -> float:
+        if self._plain:
+            return critical_frequency(self.loop.system, self.loop.law, p)
+        poles, T = self._poles(p), self.loop.law.sample_time
+        if T is None:
+            return float(abs(poles[poles.real.argmax()].imag))
+        z = 1 + poles
+        return float(abs(np.angle(z[np.abs(z).argmax()])) / T)
+
+    def physical(self, x: float) -> float:
+        return physical(x, self.loop.law.sample_time)
+
+
+@dataclass(frozen=True, eq=False)
+class OfSeveral:
+    """Several loops in the same parameters, with equal sample times, which must all be stable."""
+
+    problems: tuple[Problem, ...]
+
+    def parts(self, p: Sequence[Any]) -> list[tuple[Polynomial, tuple[Any, ...]]]:
+        return [part for problem in self.problems for part in problem.parts(p)]
+
+    def instability(self, rows: FloatArray) -> FloatArray:
+        return np.asarray(np.max([problem.instability(rows) for problem in self.problems], axis=0))
+
+    def critical_frequency(self, p: FloatArray) -> float:
+        rows = p[None]
+        return max(self.problems, key=lambda problem: float(problem.instability(rows)[0])).critical_frequency(
+            p
+        )
+
+    def physical(self, x: float) -> float:
+        return self.problems[0].physical(x)
+
+
+def approximation(problem: Problem) -> str:
+    """Why a problem's matrices are no exact functions of p, so that nothing is proven of them; "" where they are."""
+    if isinstance(problem, OfSeveral):
+        return next(filter(None, map(approximation, problem.problems)), "")
+    return problem.loop.system.approximate if isinstance(problem, OfLoop) else ""
+
+
+def physical(x: float, T: float | None) -> float:
+    """v = j x -> rad/s."""
+    return x if T is None else 2 * math.atan(x) / T
+
+
+@dataclass(frozen=True, eq=False)
+class OfCoefficients:
+    """A polynomial in s (or z) whose coefficients, lowest first, are a program of p."""
+
+    program: Program
+    names: tuple[str, ...]
+    discrete: bool
+
+    @cached_property
+    def _symbolic(self) -> Symbolic | None:
+        try:
+            return symbolic(self.program)
+        except (TooLarge, NotAnalytic):
+            return None
+
+    @property
+    def count(self) -> int:
+        return self.program.shapes[0][0]
+
+    @cached_property
+    def exact(self) -> bool:
+        return self.program.rational and self._symbolic is not None
+
+    @property
+    def foreign(self) -> tuple[str, ...]:
+        return self.program.foreign
+
+    @property
+    def inverted(self) -> tuple[bool, ...]:
+        return (False,) * len(self.names)
+
+    @cached_property
+    def _common(self) -> Any:
+        """The common denominator of the coefficients; None for one."""
+        assert self._symbolic is not None
+        found = None
+        for r in self._symbolic.entries[0].values():
+            if r.den is not None:
+                found = r.den if found is None else found * (r.den / found.gcd(r.den))
+        return found
+
+    @cached_property
+    def degrees(self) -> tuple[int | None, ...]:
+        s = self._symbolic
+        if not self.exact or s is None:
+            used = self.program.depends[0]
+            return tuple(None if i in used else 0 for i in range(len(self.names)))
+        found = np.zeros(len(self.names), dtype=int)
+        for num in self._scaled.values():
+            found = np.maximum(found, num.degrees()[: len(self.names)])
+        if self._common is not None:
+            found = np.maximum(found, self._common.degrees()[: len(self.names)])
+        return tuple(int(d) for d in found)
+
+    @cached_property
+    def _scaled(self) -> dict[int, Any]:
+        """The coefficients as polynomials of p, multiplied by the common denominator."""
+        assert self._symbolic is not None
+        common = self._common
+        return {
+            i: r.num if common is None else r.num * (common if r.den is None else common / r.den)
+            for (i, _), r in self._symbolic.entries[0].items()
+        }
+
+    @cached_property
+    def companion(self) -> UncertainLoop | None:
+        """A loop with this polynomial, linear in p; None where there is no short one."""
+        if not self.exact:
+            return None
+        a = [self._scaled[i].to_dict() if i in self._scaled else {} for i in range(self.count)]
+        return companion(self.names, a, 1.0 if self.discrete else None)
+
+    def values(self, v: Sequence[Any]) -> list[Any]:
+        """The coefficients as they are given."""
+        rational = self.program.rational
+        (entries,) = self.program.run(v if rational else [arb(x) for x in v], EXACT if rational else POINTS)
+        a: list[Any] = [fmpq(0) if rational else arb(0)] * self.count
+        for i, _, x in entries:
+            a[i] = x
+        return a
+
+    def at(self, v: Sequence[Any]) -> list[Any]:
+        scale = self._common(*v) if self.exact and self._common is not None else 1
+        a = [x * scale for x in self.values(v)]
+        return map_bilinear(_about_one(a)) if self.discrete else a
+
+    def majorant(self, v: Sequence[Any]) -> list[tuple[float, int]]:
+        (entries,) = self.program.run([acb(x) for x in v], BALLS)
+        a = [arb(0)] * self.count
+        for i, _, x in entries:
+            a[i] = abs(x)
+        if self.discrete:  # z = 1 + g
+            a = map_bounds(
+                [sum((c * math.comb(k, j) for k, c in enumerate(a) if k >= j), arb(0)) for j in range(len(a))]
+            )
+        return [pair(x) for x in a]
+
+    def coupling_bounds(
+        self, moves: Sequence[Any], sides: Sequence[tuple[Any, Any]]
+    ) -> list[tuple[float, int]] | None:
+        del moves, sides
+        return None
+
+
+def _about_one(a: list[Any]) -> list[Any]:
+    """The coefficients of g = z - 1 from those of z."""
+    return [sum((c * math.comb(k, j) for k, c in enumerate(a) if k >= j), 0 * a[0]) for j in range(len(a))]
+
+
+@dataclass(frozen=True, eq=False)
+class OfPolynomial:
+    """A given characteristic polynomial."""
+
+    polynomial: OfCoefficients
+
+    def parts(self, p: Sequence[Any]) -> list[tuple[Polynomial, tuple[Any, ...]]]:
+        del p
+        return [(self.polynomial, ())]
+
+    def _roots(self, p: FloatArray) -> Any:
+        """The roots, computed on a scale that the coefficients determine."""
+        a = [binary(x) for x in self._values([exact(x) for x in p.tolist()])]
+        logs = {k: math.log2(abs(m)) + e for k, (m, _, e) in enumerate(a) if m}
+        if not logs:  # zero, whatever s
+            return np.ones(1)
+        first, last = min(logs), max(logs)
+        step = round((logs[first] - logs[last]) / max(last - first, 1))
+        step = max(min(step, 1000), -1000)  # that roots are numbers
+        top = max(log + k * step for k, log in logs.items())
+        scaled = [
+            math.copysign(2.0 ** (logs[k] + k * step - top), a[k][0]) if k in logs else 0.0
+            for k in range(last + 1)
+        ]
+        return np.roots(scaled[::-1]) * 2.0**step
+
+    def _values(self, v: list[Any]) -> list[Any]:
+        return self.polynomial.values(v)
+
+    def instability(self, rows: FloatArray) -> FloatArray:
+        found = []
+        for row in np.atleast_2d(rows):
+            roots = self._roots(row)
+            sizes = np.abs(roots) - 1 if self.polynomial.discrete else roots.real
+            found.append(float(sizes.max(initial=-math.inf)))
+        return np.array(found)
+
+    def critical_frequency(self, p: FloatArray) -> float:
+        roots = self._roots(p)
+        if self.polynomial.discrete:
+            return float(abs(np.angle(roots[np.abs(roots).argmax()])))
+        return float(abs(roots[roots.real.argmax()].imag))
+
+    def physical(self, x: float) -> float:
+        return physical(x, 1.0 if self.polynomial.discrete else None)
+
+
+def hurwitz(a: Sequence[Any]) -> bool | None:
+    """Whether all roots of a_0 + a_1 s + ... lie left of the axis, by Routh's scheme in exact numbers or balls.
+
+    None when the balls are too wide to decide.
+    """
+    rows = [list(reversed(a))[::2], list(reversed(a))[1::2]]
+    lead = rows[0][0]
+    if not (lead > 0 or lead < 0):
+        return None if lead == 0 or hasattr(lead, "rad") else False
+    positive = lead > 0
+    while rows[1]:
+        one, two = rows
+        if not (two[0] > 0 if positive else two[0] < 0):
+            return False if (two[0] < 0 if positive else two[0] > 0) or not hasattr(two[0], "rad") else None
+        q = one[0] / two[0]
+        rest = [x - q * (two[k + 1] if k + 1 < len(two) else 0) for k, x in enumerate(one[1:])]
+        rows = [two, rest]
+    return True

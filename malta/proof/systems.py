@@ -1,0 +1,306 @@
+"""Uncertain systems and compensators from functions, matrices and control.StateSpace.
+
+      +---------+  u  +-----------+
++---->|    F    |---->|   P(p)    |----+--> y        u = F y: positive feedback, so that
+|     +---------+     +-----------+    |             u = -K y is the compensator -K
++--------------------------------------+
+"""
+
+from __future__ import annotations
+
+import inspect
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import casadi as ca
+import numpy as np
+
+from malta.errors import InputError
+from malta.model.plant import Plant, readonly
+from malta.proof.algebraic import eliminate_algebraic
+from malta.proof.arguments import (
+    by_name,
+    describe,
+    interval,
+    is_number,
+    matrix,
+    number,
+    plural,
+    positive,
+)
+
+if TYPE_CHECKING:
+    from malta.proof.uncertain import Compensator, UncertainSystem
+
+LETTERS = "ABCDE"
+
+
+def uncertain(source: Any, names: Any, **options: Any) -> UncertainSystem:
+    """Make a linear system that depends on parameters by name.
+
+        E(p) x' = A(p) x + B(p) u,  y = C(p) x + D(p) u
+
+    source : a Plant, which is linearized with these parameters; a function of the parameters by name (or of one array
+        p), of numpy and CasADi operations, that returns A, B, C, or with D, or with D and E; a casadi.Function of p; or
+        matrices A0, B0, C0[, D0[, E0]]
+    names : of a Plant the names of its parameters; else their nominal values by name, SI
+    options : of a Plant `x`, the states to linearize at; of the others `terms`, the factors of each parameter beside
+        matrices, as {"k": (A1, B1, C1)}; `limits` (above, below) of parameters; `sample_time` (s) of matrices that give
+        x+ in place of x'
+
+    Returns an UncertainSystem.
+
+    Raises InputError for unknown options, and for names, shapes and values that do not fit.
+
+    >>> import malta
+    >>> def motor(J, b):
+    ...     return [[0, 1], [0, -b / J]], [[0], [1 / J]], [[1, 0]]
+    >>> system = malta.uncertain(motor, {"J": 2e-3, "b": 0.1})
+    >>> system.names
+    ('J', 'b')
+    """
+    from malta.proof.machine.parametric_plants import of_plant
+
+    made = of_plant if isinstance(source, Plant) else from_source
+    known = [q.name for q in inspect.signature(made).parameters.values() if q.kind is q.KEYWORD_ONLY]
+    for option in options:
+        if option not in known:
+            raise InputError("uncertain", option, "an unknown option", "one of " + " ".join(known))
+    return made(source, names, **options)
+
+
+def from_source(
+    source: Any,
+    nominal: Mapping[str, float],
+    *,
+    terms: Mapping[str, Sequence[Any]] | None = None,
+    limits: Mapping[str, tuple[float, float]] | None = None,
+    sample_time: float | None = None,
+) -> UncertainSystem:
+    """E(p) x' = A(p) x + B(p) u, y = C(p) x + D(p) u from a function, a CasADi function, or matrices.
+
+    Parameters
+    ----------
+    source : a function of the parameters by name (or of one array p), of numpy and CasADi operations, that returns
+        A, B, C, or with D, or with D and E (rows of zeros in E are algebraic equations); a casadi.Function of the
+        vector p; or matrices A0, B0, C0[, D0[, E0]]
+    nominal : values of the parameters by name
+    terms : with matrices, the factors of each parameter: {"k": (A1, B1, C1)}, None for zeros; A0 + sum p_i A_i
+    limits : of a parameter, (above, below), exclusive; infinite for parameters without
+    sample_time : s, of matrices that give x+ in place of x'
+
+    Raises InputError for names, shapes and values that do not fit.
+    """
+    from malta.proof.uncertain import UncertainSystem
+
+    names = tuple(by_name("uncertain", "nominal", nominal, '{"k": 1.5}'))
+    if not names:
+        raise InputError("uncertain", "nominal", "no parameters", 'values by name, as {"k": 1.5}')
+    values = np.array([number("uncertain", name, value) for name, value in nominal.items()])
+    bounds = _limits(names, {} if limits is None else limits)
+    period = None if sample_time is None else positive("uncertain", "sample_time", sample_time)
+    p = ca.SX.sym("p", len(names))
+    if not callable(source):
+        found = _affine_matrices(source, p, names, {} if terms is None else terms)
+    elif terms:
+        raise InputError("uncertain", "terms", "beside a function", "matrices A0, B0, C0 as the source")
+    else:
+        found = _as_list(_evaluate(source, p, names, "uncertain"))
+    matrices = ca.Function("matrices", [p], _check_matrices(found))
+    return UncertainSystem(names, readonly(values), matrices, limits=bounds, sample_time=period)
+
+
+def _limits(names: tuple[str, ...], limits: Mapping[str, Any]) -> tuple[tuple[float, float], ...]:
+    for name in by_name("uncertain", "limits", limits, '{"k": (0, 2)}'):
+        _check_name("limits", name, names)
+    free = (-math.inf, math.inf)
+    return tuple(interval("uncertain", f"limits.{name}", limits.get(name, free)) for name in names)
+
+
+def _check_name(field: str, name: str, names: tuple[str, ...]) -> None:
+    if name not in names:
+        raise InputError("uncertain", f"{field}.{name}", "an unknown parameter", "one of " + " ".join(names))
+
+
+def _evaluate(source: Callable[..., Any], p: Any, names: tuple[str, ...], caller: str) -> Any:
+    """Call a function of the parameters with symbols. Raises InputError when it cannot be traced."""
+    return (_call if isinstance(source, ca.Function) else _trace)(source, p, names, caller)
+
+
+def _call(source: ca.Function, p: Any, names: tuple[str, ...], caller: str) -> Any:
+    if source.n_in() == 1 and source.numel_in(0) == len(names):
+        return source(p)
+    if source.n_in() == len(names) and all(source.numel_in(i) == 1 for i in range(len(names))):
+        return source(*ca.vertsplit(p))
+    found = " ".join(f"{source.name_in(i)} ({source.numel_in(i)})" for i in range(source.n_in()))
+    wanted = f"one vector of {plural(len(names), 'parameter')}"
+    raise InputError(caller, source.name(), f"inputs {found}" if found else "no inputs", wanted)
+
+
+def _as_list(found: Any) -> list[Any]:
+    if found is None or isinstance(found, str):
+        raise InputError("uncertain", "source", f"a function that returns {describe(found)}", "A, B, C")
+    return list(found) if isinstance(found, tuple | list) else [found]
+
+
+def _trace(source: Callable[..., Any], p: Any, names: tuple[str, ...], caller: str) -> Any:
+    symbols = dict(zip(names, ca.vertsplit(p), strict=True))
+    try:
+        own = inspect.signature(source).parameters.values()
+    except (TypeError, ValueError) as error:
+        found = "a function whose parameters cannot be read"
+        raise InputError(caller, "source", found, "one of the parameters " + " ".join(names)) from error
+    wanted = [q.name for q in own if q.kind in (q.POSITIONAL_OR_KEYWORD, q.KEYWORD_ONLY)]
+    try:
+        if set(wanted) == set(names):
+            return source(**symbols)
+        if len(wanted) == 1:
+            return source(np.array(list(symbols.values()), dtype=object))
+    except Exception as error:  # a function of numbers may raise anything for symbols
+        first = f"{type(error).__name__}: {error}".strip().split("\n")[0]
+        found = f"a function that cannot be traced ({first})"
+        raise InputError(caller, "source", found, "numpy and CasADi operations") from error
+    found = "a function of " + " ".join(wanted) if wanted else "a function without named parameters"
+    raise InputError(caller, "source", found, "the parameters " + " ".join(names))
+
+
+def _affine_matrices(source: Any, p: Any, names: tuple[str, ...], terms: Mapping[str, Any]) -> list[Any]:
+    if not isinstance(source, Iterable) or isinstance(source, str | Mapping):
+        raise InputError("uncertain", "source", describe(source), "a function, or matrices A, B, C")
+    base = [
+        matrix("uncertain", letter, M) for letter, M in zip(LETTERS, _check_count(list(source)), strict=False)
+    ]
+    found = [ca.SX(ca.DM(M)) for M in base]
+    for name, parts in by_name("uncertain", "terms", terms, '{"k": (A1, B1, C1)}').items():
+        _check_name("terms", name, names)
+        if not isinstance(parts, tuple | list):
+            raise InputError("uncertain", f"terms.{name}", describe(parts), "matrices (A1, B1, C1)")
+        if len(parts) > len(base):
+            most = f"at most {len(base)}"
+            raise InputError("uncertain", f"terms.{name}", plural(len(parts), "matrix", "matrices"), most)
+        for k, part in enumerate(parts):
+            if part is None:
+                continue
+            M = matrix("uncertain", f"terms.{name}", part)
+            if M.shape != base[k].shape:
+                raise InputError(
+                    "uncertain", f"terms.{name}", f"{LETTERS[k]} of shape {M.shape}", f"{base[k].shape}"
+                )
+            found[k] = found[k] + p[names.index(name)] * ca.sparsify(ca.DM(M))
+    return found
+
+
+def _check_count(found: list[Any]) -> list[Any]:
+    if not 3 <= len(found) <= len(LETTERS):
+        count = plural(len(found), "matrix", "matrices")
+        raise InputError("uncertain", "source", count, "A, B, C, or with D, or with D and E")
+    return found
+
+
+def _check_matrices(found: list[Any]) -> list[Any]:
+    """The matrices as SX. Raises InputError for shapes that do not fit."""
+    matrices = [_matrix(M, LETTERS[k]) for k, M in enumerate(_check_count(found))]
+    n, m, q = matrices[0].shape[0], matrices[1].shape[1], matrices[2].shape[0]
+    shapes = [(n, n), (n, m), (q, n), (q, m), (n, n)]
+    for letter, M, shape in zip(LETTERS, matrices, shapes, strict=False):
+        if M.shape != shape:
+            raise InputError("uncertain", letter, f"shape {M.shape}", f"{shape}")
+    return eliminate_algebraic(matrices)
+
+
+def _matrix(M: Any, letter: str) -> Any:
+    if isinstance(M, ca.SX | ca.DM):
+        return _check_finite(ca.SX(M), "uncertain", letter)
+    try:
+        array = np.array(M, dtype=object)
+    except ValueError as error:
+        raise InputError("uncertain", letter, "rows of different lengths", "a matrix") from error
+    if array.ndim < 2:
+        array = np.atleast_2d(array)
+    if array.ndim != 2:
+        raise InputError("uncertain", letter, plural(array.ndim, "dimension"), "a matrix")
+    if any(isinstance(x, tuple | list) for x in array.flat):
+        raise InputError("uncertain", letter, "rows of different lengths", "a matrix")
+    rows = [ca.horzcat(*(_entry(x, "uncertain", letter) for x in row)) for row in array.tolist()]
+    return ca.vertcat(*rows) if rows else ca.SX(*array.shape)
+
+
+def _entry(x: Any, caller: str, field: str) -> Any:
+    """One number or expression of the parameters as SX. Raises InputError."""
+    if isinstance(x, ca.MX):
+        raise InputError(caller, field, "a CasADi MX", "SX expressions, numbers, or a casadi.Function")
+    if isinstance(x, ca.SX | ca.DM):
+        return _check_finite(ca.SX(x), caller, field)
+    if isinstance(x, bool | np.bool_) or is_number(x):
+        return ca.SX(float(x))
+    raise InputError(caller, field, describe(x), "finite numbers, and expressions of the parameters")
+
+
+def _check_finite(M: Any, caller: str, field: str) -> Any:
+    """The same matrix. Raises InputError when a constant entry is NaN or infinite."""
+    for x in M.nonzeros():
+        if x.is_constant() and not math.isfinite(float(x)):
+            raise InputError(caller, field, "NaN or infinity", "finite numbers")
+    return M
+
+
+def compensator_of(law: Any, outputs: int, inputs: int) -> Compensator:
+    """A compensator as a record, from a Compensator, a control.StateSpace or TransferFunction, or a gain matrix.
+
+    Raises InputError when its inputs and outputs do not fit the system, or its sample time is unspecified.
+    """
+    from malta.proof.uncertain import Compensator
+
+    if isinstance(law, Compensator):
+        return law
+    wanted = "a Compensator, a proper control.StateSpace or TransferFunction, or a gain matrix"
+    if hasattr(law, "num_list") or hasattr(law, "num_array"):
+        import control
+
+        try:
+            law = control.ss(law)
+        except Exception as error:  # improper, or of several inputs and outputs
+            first = str(error).strip().split("\n")[0]
+            raise InputError("compensator", "law", f"a TransferFunction ({first})", wanted) from error
+    if all(hasattr(law, name) for name in ("A", "B", "C", "D", "dt")):
+        if law.dt is True:
+            raise InputError("compensator", "dt", "True", "0, or a sample time in seconds")
+        T = None if not law.dt else float(law.dt)
+        A, B, C, D = (np.asarray(M, dtype=float) for M in (law.A, law.B, law.C, law.D))
+        found = Compensator(A, B.reshape(len(A), -1), C.reshape(-1, len(A)), D, sample_time=T)
+    elif hasattr(law, "ninputs") or isinstance(law, bool | None):  # a response, which has no states
+        raise InputError("compensator", "law", describe(law), wanted)
+    else:
+        D = matrix("compensator", "law", law, wanted)
+        found = Compensator(np.zeros((0, 0)), np.zeros((0, D.shape[1])), np.zeros((len(D), 0)), D)
+    if found.D.shape != (inputs, outputs):
+        raise InputError(
+            "compensator",
+            "D",
+            f"shape {found.D.shape}",
+            f"{(inputs, outputs)}: {plural(inputs, 'input')} u from {plural(outputs, 'output')} y",
+        )
+    return found
+
+
+def polynomial_system(coefficients: Callable[..., Any], names: tuple[str, ...]) -> tuple[ca.Function, int]:
+    """The coefficients of s, lowest first, as a CasADi function of p; and the degree.
+
+    Raises InputError for anything but a function of the parameters that returns expressions of them.
+    """
+    caller, field = "margin_of_polynomial", "coefficients"
+    if not callable(coefficients):
+        raise InputError(caller, field, describe(coefficients), "a function of the parameters")
+    p = ca.SX.sym("p", len(names))
+    found = _evaluate(coefficients, p, names, caller)
+    flat: list[Any] = []
+    for entry in found if isinstance(found, tuple | list | np.ndarray) else [found]:
+        for x in entry.flat if isinstance(entry, np.ndarray) else [entry]:
+            flat += ca.vertsplit(ca.vec(ca.densify(_entry(x, caller, field))))
+    while flat and flat[0].is_constant() and float(flat[0]) == 0:
+        flat = flat[1:]
+    if len(flat) < 2:
+        found = plural(len(flat), "coefficient")
+        raise InputError(caller, field, found, "a polynomial of degree 1 or more")
+    return ca.Function("coefficients", [p], [ca.vertcat(*reversed(flat))]), len(flat) - 1
