@@ -84,7 +84,7 @@ def package_of(module: str) -> str | None:
 
 
 def test_packages_import_one_way() -> None:
-    """In the order of the sentence: model, synthesis, proof, loops, margins, gains, simulation, campaigns, tuning, report."""
+    """In the order of the sentence: model, synthesis, proof, loops, margins, gains, simulation, campaigns, report."""
     upwards = []
     for path in SOURCES:
         own = package_of(module_of(path))
