@@ -5,7 +5,9 @@ data -> plant -> linearize -> synthesize -> verify -> export -> simulate -> repo
 
 from __future__ import annotations
 
+import re
 from importlib import import_module
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # the contents page, as type checkers and readers see it
@@ -92,72 +94,23 @@ if TYPE_CHECKING:  # the contents page, as type checkers and readers see it
     from malta.tuning.tune import tune as tune
     from malta.units import in_unit as in_unit
 
-_NAMES = {  # the same, for the first use of each name
-    "app.notebook": ("app_widget",),
-    "campaigns.limits": ("limit_of",),
-    "campaigns.plan": ("Plan",),
-    "campaigns.rare": ("rare_event",),
-    "campaigns.result": ("Campaign",),
-    "campaigns.run": ("campaign",),
-    "campaigns.sensitivity": ("sensitivity",),
-    "campaigns.summary": ("Summary",),
-    "campaigns.survey": ("summarize",),
-    "campaigns.tolerance": ("tolerances",),
-    "margins.stages": ("Robustness", "robustness"),
-    "firmware.flight": ("engine_of_c",),
-    "firmware.exports": ("export_c", "export_fmu"),
-    "report.ledger": ("ledger",),
-    "synthesis.controller": ("Controller",),
-    "model.data": ("plant_of", "read"),
-    "model.published": ("published",),
-    "units": ("in_unit",),
-    "errors": ("CheckError", "InputError"),
-    "simulation.catalogue": ("experiment",),
-    "simulation.experiments": ("Experiment",),
-    "simulation.time_optimal": ("fastest_stroke",),
-    "model.linear": ("linear_machine",),
-    "model.linearize": ("LinearModel", "linearize"),
-    "simulation.batch": ("replayed", "simulate_many"),
-    "simulation.digest": ("Batch",),
-    "model.machines": ("machine",),
-    "model.parameters": ("check_parameters", "si"),
-    "model.equilibrium": ("trim",),
-    "model.inverse": ("InverseCheck",),
-    "model.plant": ("Actuator", "OperatingPoint", "Plant", "Signal"),
-    "proof.blocks.blocks": ("Dynamic",),
-    "loops.curves": ("LoopCurves", "loop_curves"),
-    "proof.blocks.dynamic": ("dynamic_margin",),
-    "proof.blocks.gain": ("Gain", "worst_case_gain"),
-    "loops.loop": ("Loop", "loop"),
-    "loops.loop_systems": ("LoopSystems", "loop_systems"),
-    "loops.recovery": ("Recovery", "recovery"),
-    "proof.robust": ("Margin", "margin_of_polynomial", "robust_margin"),
-    "proof.systems": ("uncertain",),
-    "simulation.scenario": ("Fault", "Scenario"),
-    "simulation.simulate": ("simulate",),
-    "simulation.trajectory": ("Trajectory", "stroke_figures"),
-    "synthesis.design_file": ("read_design",),
-    "synthesis.spec": ("Spec", "Weights"),
-    "synthesis.calibrate": ("calibrate",),
-    "synthesis.lqg": ("kalman", "lqg", "lqi", "lqr", "synthesize", "weights"),
-    "synthesis.state_space": ("controller_of",),
-    "tuning.tune": ("tune",),
-    "proof.uncertain": ("Compensator", "UncertainSystem"),
-    "margins.verify": ("Margins", "verify"),
+# The lines above are the one list: a name is looked for where they say, at its first use.
+_PLACES = {
+    name: module
+    for module, name in re.findall(
+        r"^    from (\S+) import (\w+) as", Path(__file__).read_text("utf-8"), re.M
+    )
 }
-_MODULES = {"gains": "gains", "references": "simulation.references", "report": "report", "schemas": "schemas"}
-_MODULE_OF = {name: module for module, names in _NAMES.items() for name in names}
+_MODULES = ("gains", "references", "report", "schemas")
 
-__all__ = [*_MODULE_OF, *_MODULES]
+__all__ = [*_PLACES]
 
 
 def __getattr__(name: str) -> Any:
-    if name in _MODULE_OF:
-        value = getattr(import_module(f"malta.{_MODULE_OF[name]}"), name)
-    elif name in _MODULES:
-        value = import_module(f"malta.{_MODULES[name]}")
-    else:
+    if name not in _PLACES:
         raise AttributeError(f"module 'malta' has no attribute {name!r}")
+    place = _PLACES[name]
+    value = import_module(f"{place}.{name}") if name in _MODULES else getattr(import_module(place), name)
     globals()[name] = value
     return value
 
