@@ -137,6 +137,19 @@ class Scenario:
     electronics: Any = None
     changes: tuple[tuple[float, Mapping[str, float]], ...] = ()
 
+    def replace(self, **fields: Any) -> Scenario:
+        """Return the scenario with other fields. Raises InputError for an unknown field, and as Scenario does.
+
+        >>> import malta
+        >>> malta.Scenario.stroke(10e-3).replace(noise=1.0, seed=3).seed
+        3
+        """
+        for name in fields:
+            if name not in self.__dataclass_fields__:
+                expected = "one of " + " ".join(self.__dataclass_fields__)
+                raise InputError(f"scenario {self.name}", name, "a field that a scenario lacks", expected)
+        return replace(self, **fields)
+
     def __post_init__(self) -> None:
         where = f"scenario {self.name}"
         for name, low, whole in (

@@ -8,6 +8,7 @@ one sample. All numbers are in SI units.
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -306,14 +307,46 @@ class Spec:
         >>> float(spec.vary([50.0, 5.0, 0.1]).weights.q_base[0])  # 50 um
         5e-05
         """
-        numbers = [name for name in self.law.__dataclass_fields__ if name not in ("axes", "coordinates")]
-        fields: dict[str, Any] = {name: np.array(getattr(self.law, name)) for name in numbers}
+        found = {}
         for variable, value in zip(self.search, values, strict=True):
             for entry in variable.entries:
-                field, index, unit, squared = self.place_of(entry)
-                si = value if unit == "1" else to_si(value, variable.unit, unit, self.path, entry)
-                fields[field][index] = si * si if squared else si
-        return replace(self, law=replace(self.law, **fields))
+                unit = self.place_of(entry)[2]
+                found[entry] = value if unit == "1" else to_si(value, variable.unit, unit, self.path, entry)
+        return replace(self, law=self._law_with(found, "search"))
+
+    def replace(self, numbers: Mapping[str, float] | None = None, **fields: Any) -> Spec:
+        """Return the design with other numbers or fields; its sha256 is another one, so that gain files differ.
+
+        numbers : of the law, SI, by their place in the design file, as {"bases.state.x": 50e-6}
+        fields : of this record, by name
+
+        Raises InputError for a place that no design file has, a number that the law cannot have, and an unknown field.
+
+        >>> import malta
+        >>> spec = malta.read_design("examples/ball/design/ball.toml")
+        >>> stiffer = spec.replace({"bases.state.q": 50e-6}, name="stiffer")
+        >>> stiffer.name, float(stiffer.weights.q_base[0]), stiffer.sha256 == spec.sha256
+        ('stiffer', 5e-05, False)
+        """
+        known = [name for name in self.__dataclass_fields__ if name not in ("sha256", "path", "machine_file")]
+        for name in fields:
+            if name not in known:
+                raise InputError(self.path, name, "a field that a design lacks", "one of " + " ".join(known))
+        law = self._law_with(numbers, "numbers") if numbers else self.law
+        change = repr((self.sha256, sorted((numbers or {}).items()), sorted(fields.items())))
+        own = hashlib.sha256(change.encode()).hexdigest()
+        return replace(self, **({"law": law, "sha256": own} | fields))
+
+    def _law_with(self, numbers: Mapping[str, float], field: str) -> Weights | Pid:
+        """The law with other numbers, SI, by their place in the file. Raises InputError as `place_of` does."""
+        names = [name for name in self.law.__dataclass_fields__ if name not in ("axes", "coordinates")]
+        fields: dict[str, Any] = {name: np.array(getattr(self.law, name)) for name in names}
+        for entry, si in numbers.items():
+            place, index, _, squared = self.place_of(entry, field)
+            if not fields[place].size:
+                raise InputError(self.path, entry, "an entry that this design leaves out", "one that it has")
+            fields[place][index] = si * si if squared else si
+        return replace(self.law, **fields)
 
     def value_of(self, variable: Variable) -> float:
         """Return the number that the file holds for a variable of the search, in the variable's unit.
