@@ -138,7 +138,11 @@ class Scenario:
     changes: tuple[tuple[float, Mapping[str, float]], ...] = ()
 
     def replace(self, **fields: Any) -> Scenario:
-        """Return the scenario with other fields. Raises InputError for an unknown field, and as Scenario does.
+        """Return the scenario with other fields.
+
+        fields : of this record, by name
+
+        Raises InputError for an unknown field, and as Scenario does.
 
         >>> import malta
         >>> malta.Scenario.stroke(10e-3).replace(noise=1.0, seed=3).seed
