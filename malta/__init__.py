@@ -60,7 +60,7 @@ if TYPE_CHECKING:  # the contents page, as type checkers and readers see it
     from malta.proof.blocks.dynamic import dynamic_margin as dynamic_margin
     from malta.proof.blocks.gain import Gain as Gain
     from malta.proof.blocks.gain import worst_case_gain as worst_case_gain
-    from malta.proof.robust import Margin as Margin
+    from malta.proof.margin import Margin as Margin
     from malta.proof.robust import margin_of_polynomial as margin_of_polynomial
     from malta.proof.robust import robust_margin as robust_margin
     from malta.proof.systems import uncertain as uncertain

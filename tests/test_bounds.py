@@ -25,11 +25,11 @@ from malta.proof.box import below
 from malta.proof.certificate import certificate, check, checked_file, checked_loop
 from malta.proof.exclusion import exclusion
 from malta.proof.groups import loop_of
+from malta.proof.margin import Margin
 from malta.proof.polynomial import degrees, enclosure
 from malta.proof.polynomial.family import nodes, restrict, restriction_rounding
 from malta.proof.polynomial.rounding import parts
 from malta.proof.problem import OfLoop
-from malta.proof.robust import Margin
 from malta.proof.uncertain import Compensator, closed_loop
 
 RANGES = {"m": 0.3, "k": 0.3}

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from malta.model.plant import FloatArray, Plant
-    from malta.proof.robust import Certificate, Margin
+    from malta.proof.margin import Certificate, Margin
     from malta.synthesis.controller import Controller
 
 SHIPPED = ("table2", "calibrated", "robust")

@@ -31,7 +31,7 @@ from malta.model.checks import check_plant
 from malta.model.machines import machine
 from malta.model.plant import Plant
 from malta.proof.blocks.gain import Gain
-from malta.proof.robust import Margin
+from malta.proof.margin import Margin
 from malta.proof.uncertain import instability
 from malta.simulation.catalogue import cases_of
 

@@ -17,7 +17,7 @@ from malta.simulation.simulate import simulate
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
-    from malta.proof.robust import Margin
+    from malta.proof.margin import Margin
     from malta.synthesis.controller import Controller
 
 ROUNDED = ("Ad", "Bd", "Cd", "K", "Ki", "L")

@@ -36,7 +36,7 @@ from malta.proof.machine.windings import chosen_loops
 if TYPE_CHECKING:
     from malta.model.plant import Plant
     from malta.proof.machine.windings import CurrentLoops
-    from malta.proof.robust import Ranges
+    from malta.proof.margin import Ranges
     from malta.synthesis.controller import Controller
 
 

@@ -54,7 +54,8 @@ from malta.model.parameters import units_of
 from malta.model.plant import Plant, position_at
 from malta.proof.machine.parametric_plants import of_plant
 from malta.proof.machine.windings import CurrentLoops, chosen_loops
-from malta.proof.robust import NOT_PROVEN, Margin, Progress, Ranges, robust_margin
+from malta.proof.margin import NOT_PROVEN, Margin, Progress, Ranges
+from malta.proof.robust import robust_margin
 from malta.proof.uncertain import Compensator
 from malta.synthesis.controller import Controller
 from malta.synthesis.lqg import kalman, lqi, lqr, weights_of

@@ -22,13 +22,11 @@ from malta.proof.box import Box, box_of
 from malta.proof.expressions import NotAnalytic
 from malta.proof.machine.parametric_plants import LONGEST
 from malta.proof.machine.windings import CurrentLoops
+from malta.proof.margin import Margin, Progress, Ranges
 from malta.proof.problem import OfSeveral
 from malta.proof.robust import (
     TOLERANCE,
     Effort,
-    Margin,
-    Progress,
-    Ranges,
     common_margin,
     deadline,
     margin_at,

@@ -24,8 +24,8 @@ from malta.margins.extent import NOWHERE, Extent, extent_of
 from malta.margins.travel import NOT_BETWEEN, travel_margin
 from malta.model.data import plant_of
 from malta.model.linearize import LinearModel, linearize
+from malta.proof.margin import Margin
 from malta.proof.responses import crossing, find_peaks
-from malta.proof.robust import Margin
 from malta.synthesis.controller import Controller
 from malta.synthesis.riccati import add_integrals, eigenvalues
 from malta.synthesis.sampled import gain_at_rest

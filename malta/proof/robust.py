@@ -14,14 +14,13 @@ from __future__ import annotations
 
 import math
 import time as clock
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from malta.display import Description, display, quantity
 from malta.errors import InputError
 from malta.proof.arguments import (
     by_name,
@@ -37,6 +36,7 @@ from malta.proof.branches import within_branches
 from malta.proof.expressions import program
 from malta.proof.groups import loop_of
 from malta.proof.loss import first_loss
+from malta.proof.margin import Margin, Progress, Ranges
 from malta.proof.problem import (
     OfCoefficients,
     OfLoop,
@@ -45,114 +45,18 @@ from malta.proof.problem import (
     Problem,
     approximation,
 )
+from malta.proof.search import Job
 from malta.proof.systems import compensator_of, polynomial_system
 from malta.proof.uncertain import Compensator, UncertainSystem
 from malta.threads import on_one_thread
 
 if TYPE_CHECKING:
-    from malta.model.plant import FloatArray
-    from malta.proof.multipliers.structured import Proof
+    pass
 
 TOLERANCE = 9e-4  # relative distance between the proven bound and the witness
 MOST_CELLS = 300_000
 LONGEST = 120.0  # s, default time of a search
 PLACES = 64  # nominal places of a box whose poles are computed at once
-
-Ranges = Mapping[str, "float | tuple[float, float] | list[float]"]
-Progress = Callable[[float, float], None]  # called with the lower and upper bound so far
-
-
-@dataclass(frozen=True, eq=False)
-class Certificate:
-    """The proof of the lower bound for one group of states on one part of the box: zero is excluded on each cell."""
-
-    cells: int  # number of cells that were searched
-    frequencies: tuple[float, float]  # rad/s, covered without a gap
-    intervals: FloatArray  # of each cell: branch (0: of x, 1: of 1 / x), from, to; s = j x 2^scale
-    boxes: FloatArray  # of each cell: ends of the parameters, as shares of the part of the box
-    directions: FloatArray  # angle of c, rad: Re(conj(c) f) > 0 on the cell
-    sides: FloatArray  # the part of the box: parameters x 2
-    inverted: tuple[bool, ...]  # parameters whose shares are of 1 / p
-    scale: int
-    multipliers: Proof | None = None  # what a proof by multipliers is, without cells of the kind above
-
-
-@display
-@dataclass(frozen=True, eq=False)
-class Margin:
-    """A robust stability margin in multiples of the modelled box of parameters.
-
-    lower : proven: no parameters within `lower` times the box make the loop unstable; None when nothing is proven, and
-        `reason` says why
-    upper : reached by `witness`; infinite when no admissible parameters make the loop unstable
-    frequency : rad/s, of the loss of stability at the witness; None without one
-    witness : parameters with which the loop is at its limit of stability, SI; None without one
-    moved : the witness minus the nominal values, SI
-    sensitivity : share of each parameter in the margin; the shares add up to 1
-    certificate : cells and directions of the proof, which `malta.proof.certificate.check` checks again; or multipliers,
-        of which `malta.proof.certificate.checked_multipliers` does
-    seconds : s, time of the search
-    reason : why nothing, or less than asked for, is proven
-    searched : how far no unstable parameters were found, where `upper` is infinite
-
-    >>> import malta
-    >>> def cubic(k):  # stable from -1 to 8
-    ...     return [1, 3, 3, 1 + k]
-    >>> found = malta.margin_of_polynomial(cubic, {"k": 0.5}, {"k": 1})
-    >>> f"proven {found.lower:.2f}, lost at k = {found.witness['k']:.2f}"
-    'proven 4.00, lost at k = -1.00'
-    """
-
-    lower: float | None
-    upper: float
-    frequency: float | None
-    witness: Mapping[str, float] | None
-    moved: Mapping[str, float]
-    sensitivity: Mapping[str, float]
-    certificate: tuple[Certificate, ...] = field(repr=False)
-    seconds: float
-    reason: str = ""
-    searched: str = ""
-
-    @property
-    def time_up(self) -> bool:
-        """Whether the search ended as its time was up, before anything was proven: more time may prove more."""
-        return self.lower is None and self.reason.rpartition("; ")[2].startswith(TIME_UP)
-
-    @property
-    def exhausted(self) -> bool:
-        """Whether no loss of stability was found within the limits of the parameters (a mass above zero)."""
-        return math.isinf(self.upper)
-
-    def __str__(self) -> str:
-        low = f"proven {100 * self.lower:.2f} %" if self.lower else unproven(self.reason)
-        if self.exhausted:
-            return f"{low}; no unstable machine found {self.searched}".rstrip()
-        where = "" if self.frequency is None else f" at {self.frequency:.4g} rad/s"
-        return f"{low}, lost at {100 * self.upper:.2f} %{where}"
-
-    @property
-    def description(self) -> Description:
-        """The proven and the reached bound, and the witness."""
-        rows = [("searched in", quantity(self.seconds, "s"))]
-        if self.witness is not None:
-            rows.insert(
-                0, ("lost at", ", ".join(f"{name} = {value:.4g}" for name, value in self.witness.items()))
-            )
-        if self.sensitivity:
-            rows.insert(
-                1, ("shares", ", ".join(f"{name} {100 * x:.0f} %" for name, x in self.sensitivity.items()))
-            )
-        return Description(f"Margin: {self}", tuple(rows))
-
-
-def unproven(reason: str) -> str:
-    """The words for a bound that is not proven."""
-    return f"nothing proven ({reason})" if reason else "nothing proven"
-
-
-TIME_UP = "time w"  # begins reasons of a search that was or would be too long
-NOT_PROVEN = Margin(None, math.inf, None, None, {}, {}, (), 0.0, "not asked")
 
 
 @on_one_thread
@@ -369,8 +273,6 @@ def deadline(begun: float, time: float | None) -> float:
 
 def margin_of(problem: Problem, box: Box, effort: Effort) -> Margin:
     """The margin of a problem over a box; zero when the nominal loop is unstable."""
-    from malta.proof.search import Job
-
     begun = clock.monotonic()
     until = deadline(begun, effort.time)
     if not box.most > 0:

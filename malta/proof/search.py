@@ -21,10 +21,10 @@ from malta.proof.exclusion.signs import Signs, raise_bound, signs_over
 from malta.proof.exclusion.witness import Zero, starts
 from malta.proof.families import is_nominal_stable, parts_over
 from malta.proof.loss import corner_loss, first_loss
+from malta.proof.margin import TIME_UP, Certificate, Margin, Progress
 from malta.proof.multipliers.structured import Proof, Structured, rows_of
 from malta.proof.polynomial.enclosure import Unproven
 from malta.proof.problem import OfLoop, OfPolynomial, Problem
-from malta.proof.robust import TIME_UP, Certificate, Margin, Progress
 from malta.proof.time_limit import TimeUp, time_limit
 from malta.proof.weak_coupling.weak_coupling import HeldLoop
 

@@ -36,7 +36,7 @@ from malta.synthesis.lqg import synthesize
 from malta.units import in_unit
 
 if TYPE_CHECKING:
-    from malta.proof.robust import Margin
+    from malta.proof.margin import Margin
     from malta.synthesis.controller import Controller
     from malta.synthesis.spec import Spec
 

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from malta.margins.stages import Robustness
     from malta.margins.verify import Margins
     from malta.proof.blocks.gain import Gain
-    from malta.proof.robust import Margin
+    from malta.proof.margin import Margin
     from malta.simulation.payload import Payload
 
 Poles = list[tuple[float, float]]

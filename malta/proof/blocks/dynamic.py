@@ -43,22 +43,18 @@ from malta.proof.branches import within_branches
 from malta.proof.families import is_nominal_stable
 from malta.proof.groups import loop_of
 from malta.proof.loss import first_loss
+from malta.proof.margin import Margin
 from malta.proof.polynomial.enclosure import Unproven
 from malta.proof.problem import OfLoop
 from malta.proof.responses import Responses, responses
-from malta.proof.robust import (
-    Margin,
-    deadline,
-    law_of,
-    problem_of,
-)
+from malta.proof.robust import deadline, law_of, problem_of
 from malta.proof.time_limit import TimeUp, time_limit
 from malta.proof.uncertain import Compensator, UncertainSystem
 from malta.threads import on_one_thread
 
 if TYPE_CHECKING:
     from malta.model.plant import ComplexArray, FloatArray
-    from malta.proof.robust import Ranges
+    from malta.proof.margin import Ranges
 
 TOLERANCE = 1e-3
 STEPS = (1, 3, 10, 30, 100, 300, 1000, 3000, 10_000)  # bounds that are tried, in multiples of the tolerance

@@ -35,14 +35,15 @@ from malta.proof.blocks.peaks import Peak, climb, patterns
 from malta.proof.blocks.polydisc import is_zero_free
 from malta.proof.blocks.transfer import performance
 from malta.proof.blocks.weight import weight_of
+from malta.proof.margin import unproven
 from malta.proof.polynomial.enclosure import Unproven
-from malta.proof.robust import deadline, unproven
+from malta.proof.robust import deadline
 from malta.proof.uncertain import Compensator, UncertainSystem
 from malta.threads import on_one_thread
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
-    from malta.proof.robust import Ranges
+    from malta.proof.margin import Ranges
 
 Of = Literal["sensitivity", "complementary", "compliance", "effort"]
 

@@ -33,7 +33,7 @@ from malta.proof.systems import compensator_of
 
 if TYPE_CHECKING:
     from malta.model.plant import FloatArray
-    from malta.proof.robust import Margin, Ranges
+    from malta.proof.margin import Margin, Ranges
     from malta.proof.uncertain import Compensator, UncertainSystem
 
 SHARES = (

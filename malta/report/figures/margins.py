@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
     from malta.margins.stages import Robustness
     from malta.proof.blocks.gain import Gain
-    from malta.proof.robust import Margin
+    from malta.proof.margin import Margin
 
 
 LOOKS: tuple[dict[str, Any], dict[str, Any]] = ({"color": "#c9c9c9"}, {"color": "#5a5a5a"})  # stages, machine

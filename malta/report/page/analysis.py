@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from malta.model.plant import Parameters, Plant
     from malta.proof.blocks.gain import Gain
     from malta.proof.machine.windings import CurrentLoops
-    from malta.proof.robust import Margin
+    from malta.proof.margin import Margin
     from malta.simulation.experiments import Experiment
     from malta.simulation.payload import Payload
     from malta.synthesis.controller import Controller

@@ -14,7 +14,7 @@ import numpy as np
 from malta.model.plant import Signal
 from malta.model.published import published_figures
 from malta.model.signals import FINE
-from malta.proof.robust import NOT_PROVEN
+from malta.proof.margin import NOT_PROVEN
 from malta.report.figures.parts import UNITS
 from malta.report.page.channels import distinct_channels
 from malta.report.page.design import design_entries, display_unit

@@ -11,7 +11,7 @@ from rich.table import Table
 from malta.margins.travel import NOT_BETWEEN
 from malta.margins.verify import zone
 from malta.model.signals import axis_units
-from malta.proof.robust import NOT_PROVEN, unproven
+from malta.proof.margin import NOT_PROVEN, unproven
 from malta.report.tables.parts import add_row, new_table
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from malta.margins.stages import Robustness
     from malta.model.plant import Plant
     from malta.proof.blocks.gain import Gain
-    from malta.proof.robust import Margin
+    from malta.proof.margin import Margin
     from malta.simulation.payload import Payload
 
 WAYS = ("down", "up")
