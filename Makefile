@@ -9,6 +9,8 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
+# By its path, not by a finder: a script beside a checkout that is called malta imports the package, not that folder.
+EDITABLE := --config-settings editable_mode=compat --editable
 export PIP_CONSTRAINT := $(CURDIR)/constraints.txt
 # Small matrices: threads of the linear algebra only get into each other's way, the more so beside parallel tests.
 export OPENBLAS_NUM_THREADS ?= 1
@@ -76,15 +78,15 @@ $(BIN)/python:
 	$(PYTHON) -m venv $(VENV) || { rm -rf $(VENV); exit 1; }
 
 $(VENV)/runtime: $(BIN)/python pyproject.toml constraints.txt
-	$(PIP) install --quiet --editable .
+	$(PIP) install --quiet $(EDITABLE) .
 	touch $@
 
 $(VENV)/dev: $(BIN)/python pyproject.toml constraints.txt
-	$(PIP) install --quiet --editable '.[dev]'
+	$(PIP) install --quiet $(EDITABLE) '.[dev]'
 	touch $@ $(VENV)/runtime $(VENV)/docs
 
 $(VENV)/docs: $(BIN)/python pyproject.toml constraints.txt
-	$(PIP) install --quiet --editable '.[docs]'
+	$(PIP) install --quiet $(EDITABLE) '.[docs]'
 	touch $@ $(VENV)/runtime
 
 clean:

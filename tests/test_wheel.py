@@ -162,3 +162,14 @@ def test_the_rotor_of_the_examples(program: Path, tmp_path: Path) -> None:
     for command in (("verify", *gains, "--no-proof"), ("simulate", *gains, "--scenario", "step")):
         done = run(program, folder, "malta", *command)
         assert (done.returncode, without_progress(done.stderr)) == (0, "")
+
+
+def test_a_script_beside_a_checkout_imports_the_package(tmp_path: Path) -> None:
+    """A folder malta beside a script, as a checkout is, would be a package without files of its own."""
+    (tmp_path / "malta").mkdir()
+    script = tmp_path / "script.py"
+    script.write_text("import malta; print(malta.read_design.__name__)")
+    ended = subprocess.run(
+        [sys.executable, script], capture_output=True, text=True, check=False, cwd=tmp_path
+    )
+    assert (ended.stdout, ended.stderr) == ("read_design\n", "")
