@@ -22,7 +22,9 @@ from typer.testing import CliRunner
 import malta
 from malta import gains
 from malta.cli import main as cli
+from malta.cli.assignments import GENERAL, add_own_options
 from malta.errors import InputError
+from malta.model.plant import Plant
 from malta.report.ledger import Ledger
 from malta.synthesis.spec import Spec
 
@@ -586,8 +588,47 @@ def test_the_scenarios_of_the_machine_are_listed(run: Run) -> None:
         code, out, err = run(command, CALIBRATED, "--scenario", "help")
         assert (code, err) == (0, "")
         assert max(map(len, out.splitlines())) <= WIDTH
-        assert [line.split()[0] for line in out.splitlines()[4:] if line[:2].strip()] == list(names)
+        own, _, general = out.partition("Every scenario takes")
+        assert [line.split()[0] for line in own.splitlines()[4:] if line[:2].strip()] == list(names)
+        assert [line.split()[0] for line in general.splitlines()[1:]] == list(GENERAL)
     assert "radius=0.0002 m" in out
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", GENERAL)
+def test_a_general_option_is_that_of_its_old_flag(run: Run, name: str) -> None:
+    """--option delay=2 for --delay 2; flags that the help no longer lists work as before."""
+    value = {"feedforward": "attraction", "bearing_axes": "turning", "delay": "2", "substeps": "3"}.get(name)
+    flag = f"--{name.replace('_', '-')}"
+    case = ("--fidelity", "phase" if name == "real_pwm" else "force")
+    old = (flag,) if value is None else (flag, value)
+    new = ("--option", f"{name}={value or 'true'}")
+    command = ("simulate", CALIBRATED, "--json", "--scenario", "hold", *case)
+    found = [run(*command, *given) for given in (old, new)]
+    assert found[0] == found[1]
+    assert found[0].code == 0
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [("delay=2", 2), ("substeps=3", 3), ("quantize=true", True), ("bearing=false", False),
+     ("feedforward=attraction", "attraction"), ("bearing_axes=turning", "turning")],
+)  # fmt: skip
+def test_every_scenario_takes_general_options(plant: Plant, text: str, value: object) -> None:
+    assert add_own_options({}, [text], "hold", plant) == {text.partition("=")[0]: value}
+    for wrong in (text, f"{text.partition('=')[0]}="):
+        with pytest.raises(InputError):
+            add_own_options({text.partition("=")[0]: value}, [wrong], "hold", plant)
+
+
+@pytest.mark.parametrize("command", [c.__name__ for group in cli.GROUPS.values() for c in group])
+def test_help_has_less_than_fifty_lines_of_eighty_columns(
+    command: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    lines = CliRunner().invoke(cli.app, [command, "--help"]).output.splitlines()
+    assert len(lines) < 50
+    assert max(map(len, lines)) <= 80
 
 
 @pytest.mark.slow

@@ -6,13 +6,34 @@ import math
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from malta.errors import InputError
 
 if TYPE_CHECKING:
     from malta.model.plant import Parameters, Plant
 
+
+class GeneralOption(NamedTuple):
+    """An option that every scenario takes."""
+
+    default: Any  # of the type that is read
+    meaning: str
+
+
+# Fields of Scenario; each may be given as `--option NAME=VALUE`.
+GENERAL: Mapping[str, GeneralOption] = {
+    "quantize": GeneralOption(False, "sensors with the machine's resolution"),
+    "bearing": GeneralOption(False, "touchdown bearings push back, or a touchdown ends the run"),
+    "scheduled": GeneralOption(False, "C(z) of the measured z in the filter"),
+    "feedforward": GeneralOption("own", "axial, as printed, or attraction: also what holds it off centre"),
+    "bearing_axes": GeneralOption(
+        "fixed", "current controllers fixed, or turning with the force, as printed"
+    ),
+    "real_pwm": GeneralOption(False, "in phase: duty cycles in steps, dead time of the half-bridges"),
+    "delay": GeneralOption(0, "samples between measurement and command"),
+    "substeps": GeneralOption(0, "Runge-Kutta steps a sample; the error is estimated"),
+}
 NUMBER = r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)"  # a number, and the unit that may follow it
 EXAMPLES = {"--set": "m=0.56 or l_B=45mm", "--spread": "20% or m=10%"}  # in the errors of these options
 EXAMPLE = "gain_x1=0.02 or offset_y2=5um"  # of the others
@@ -125,7 +146,7 @@ def scenario_options(distance: float | None, rise: float | None, **others: Any) 
 def add_own_options(
     options: Mapping[str, Any], texts: list[str] | None, scenario: str, plant: Plant
 ) -> dict[str, Any]:
-    """Add the scenario's own options, `--option NAME=VALUE`, in SI and of the type of their defaults.
+    """Add the scenario's own options and general ones, `--option NAME=VALUE`, in SI and of the type of their defaults.
 
     Raises InputError for an unknown option, one that is given twice, or a value of another type.
     """
@@ -138,7 +159,7 @@ def add_own_options(
         name, value = _split(text)
         if not (name and value):
             raise InputError("--option", "", repr(text), "NAME=VALUE")
-        default = option_of(scenario, plant, name)
+        default = GENERAL[name].default if name in GENERAL else option_of(scenario, plant, name)
         _require_once("--option", name, value, merged)
         merged[name] = _read_like(default, value, units.get(name, "1"), name)
     return merged

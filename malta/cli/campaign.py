@@ -56,22 +56,19 @@ def campaign(
     scenario: Annotated[
         str | None, typer.Option(help=f"What each one does: {SCENARIOS}", autocompletion=scenarios)
     ] = None,
-    case: Annotated[
-        str | None, typer.Option(help="Of a scenario with several runs: which one. [the first]")
-    ] = None,
+    case: Annotated[str | None, typer.Option(help="Of a scenario of several runs. [the first]")] = None,
     spread: Annotated[
         list[str] | None,
         typer.Option(
             metavar="[NAME=]SHARE",
-            help="How far parameters vary, either way: 20% (those of the gain file's uncertainty), m=10%, ... "
-            "[the gain file's own]",
+            help="Of parameters: 20%, m=10%. [the gain file's]",
         ),
     ] = None,
     sensor: Annotated[
         list[str] | None,
         typer.Option(
             metavar="NAME=VALUE",
-            help="How far an error of the sensors varies, either way: gain_x1=2%, offset_y2=5um, hall_phase=2deg, ...",
+            help="How far sensors err: gain_x1=2%, offset_y2=5um, ...",
         ),
     ] = None,
     sampler: Annotated[str, typer.Option(help="latin-hypercube or sobol.")] = "latin-hypercube",
@@ -81,7 +78,7 @@ def campaign(
     profile: ProfileName = None,
     option: OwnOptions = None,
     fidelity: FidelityName = None,
-    noise: Annotated[float, typer.Option(help="Sensor noise in multiples of the machine's.")] = 1.0,
+    noise: Annotated[float, typer.Option(help="Of the sensors, in multiples.")] = 1.0,
     quantize: Quantize = None,
     bearing: Bearing = None,
     scheduled: Scheduled = None,
@@ -93,46 +90,41 @@ def campaign(
     seed: Annotated[int, typer.Option(help="Seed of machines and noise.")] = 0,
     law: Annotated[
         str,
-        typer.Option(
-            "--controller", help="own; or c, c-float: the exported C flies, one machine after another."
-        ),
+        typer.Option("--controller", help="own; or c, c-float: the exported C flies."),
     ] = "own",
     workers: Annotated[int | None, typer.Option(help="Threads. [one for each core]")] = None,
     cluster: Annotated[
         str | None,
-        typer.Option(metavar="ADDRESS", help="Fly on the workers of a Dask scheduler: tcp://host:8786."),
+        typer.Option(metavar="ADDRESS", help="Workers of a Dask scheduler: tcp://host:8786."),
     ] = None,
     rare: Annotated[
         str | None,
         typer.Option(
             metavar="LIMIT",
-            help="Probability of a rare event, by subset simulation: touchdown, published, specification, or a merit "
-            "above a bound, as deviation-y1=40um. `help` lists them.",
+            help="Probability of a rare event: touchdown, deviation-y1=40um; `help` lists them.",
         ),
     ] = None,
     sobol: Annotated[
-        bool, typer.Option("--sobol", help="Which parameter costs yield: Sobol indices (needs SALib).")
+        bool, typer.Option("--sobol", help="Which parameter costs yield (needs SALib).")
     ] = False,
     tolerance: Annotated[
         str | None,
-        typer.Option(metavar="YIELD", help="The largest spread of each parameter that keeps a yield: 99%."),
+        typer.Option(metavar="YIELD", help="The largest spreads that keep a yield: 99%."),
     ] = None,
     limit: Annotated[
         str | None,
-        typer.Option(
-            metavar="LIMIT", help="What ends the yield of --sobol and --tolerance, as in --rare. [touchdown]"
-        ),
+        typer.Option(metavar="LIMIT", help="Of --sobol and --tolerance, as in --rare. [touchdown]"),
     ] = None,
-    worst: Annotated[int, typer.Option(min=0, max=1000, help="How many of the worst runs to list.")] = 5,
+    worst: Annotated[int, typer.Option(min=0, max=1000, help="Runs to list.")] = 5,
     out: Annotated[
         Path | None,
-        typer.Option(help="Folder of blocks and figures. [build/campaigns/, one for each campaign]"),
+        typer.Option(help="Folder of blocks and figures. [build/campaigns/]"),
     ] = None,
     design: Annotated[
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="Design file whose [specification] bounds the runs too. [NAME.toml beside the gain file's folder]",
+            help="Design file whose [specification] counts too.",
         ),
     ] = None,
     machine: MachineFile = None,
@@ -141,21 +133,15 @@ def campaign(
         Path | None,
         typer.Option(
             metavar="FOLDER",
-            help="Fly nothing: show how far the campaign in a folder is, also while another process flies it.",
+            help="Show how far the campaign in a folder is.",
         ),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Simulate many machines that differ, each with noise of its own: the yield, and what goes wrong where.
 
-    Every block of runs is kept in the folder. The same command goes on where it was ended, and reads what is done;
-    `malta simulate GAINS --replay FOLDER:RUN` shows one of the runs. Whatever the yield is, the exit code is 0.
-
-    Three yields: runs that were completed, those within what the machine's paper prints, and those within what
-    [specification] asks of the same motion.
-
-    --rare, --sobol and --tolerance study the same box in place of plain runs, and write into the same folder.
-    Memory does not grow with the machines: beyond 100 000 of them percentiles are counted, to 0.006 % of their values.
+    The folder keeps every block of runs: the same command goes on where it was ended. Whatever the yield is, the exit
+    code is 0. --rare, --sobol and --tolerance study the same box in place of plain runs.
 
     \b
     Example:  malta campaign design/gains/calibrated.json --spread 20%

@@ -7,7 +7,7 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from malta.cli.assignments import read_assignments, read_entries
+from malta.cli.assignments import GENERAL, read_assignments, read_entries
 from malta.cli.output import make_console
 from malta.errors import CheckError, InputError
 from malta.files import locate, shipped_path
@@ -148,4 +148,8 @@ def print_scenarios(plant: Plant, *, campaigns: bool = False) -> None:
     from malta import report
     from malta.simulation.catalogue import series_of
 
-    make_console().print(report.scenarios_table(plant, series_of(plant) if campaigns else None))
+    console = make_console()
+    console.print(report.scenarios_table(plant, series_of(plant) if campaigns else None))
+    console.print("Every scenario takes, as --option NAME=VALUE:")
+    for name, option in GENERAL.items():
+        console.print(f"  {name:12}  {option.meaning}", highlight=False)

@@ -16,7 +16,7 @@ Changes = Annotated[
     typer.Option(
         "--set",
         metavar="NAME=VALUE",
-        help="Change a parameter of the machine: m=0.56 (SI) or l_B=45mm.",
+        help="Change a parameter: m=0.56 (SI) or l_B=45mm.",
         autocompletion=parameters,
     ),
 ]
@@ -38,54 +38,30 @@ Uncertain = Annotated[
         "[the gain file's]",
     ),
 ]
-SCENARIOS = "one of the machine's own, which `--scenario help` lists. [its first]"
+SCENARIOS = "`--scenario help` lists them. [the first]"
 # Options of a run, in `simulate` and in `campaign`.
 Distance = Annotated[float | None, typer.Option(help="Length of a stroke [mm]. [the scenario's]")]
-Rise = Annotated[float | None, typer.Option(help="Rise of its reference, 10-90 % [ms]. [the scenario's]")]
-ProfileName = Annotated[str | None, typer.Option(help="Its reference: logistic or quintic. [the scenario's]")]
+Rise = Annotated[float | None, typer.Option(help="Its rise, 10-90 % [ms]. [the scenario's]")]
 OwnOptions = Annotated[
     list[str] | None,
     typer.Option(
         "--option",
         metavar="NAME=VALUE",
-        help="Any other option that `--scenario help` lists: radius=0.1mm, masses=50g,100g, during=hold, ...",
+        help="Others that `--scenario help` lists: delay=2.",
     ),
 ]
-FidelityName = Annotated[
-    str | None,
-    typer.Option(
-        help="What makes the forces: force (first-order lags), dq (PI loops), phase. [the scenario's]"
-    ),
-]
-Noise = Annotated[
-    float | None, typer.Option(help="Sensor noise in multiples of the machine's. [the scenario's]")
-]
-Quantize = Annotated[
-    bool | None, typer.Option(help="Sensors with the machine's resolution. [the scenario's]")
-]
-Bearing = Annotated[
-    bool | None,
-    typer.Option(help="Touchdown bearings push back, or a touchdown ends the run. [the scenario's]"),
-]
-Scheduled = Annotated[bool | None, typer.Option(help="C(z) of the measured z in the filter.")]
-Feedforward = Annotated[
-    str | None,
-    typer.Option(help="axial, as printed, or attraction: also what holds it off centre. [axial]"),
-]
-BearingAxes = Annotated[
-    str | None,
-    typer.Option(
-        help="dq, phase: current controllers in fixed axes, or turning with the force as printed. [fixed]"
-    ),
-]
-RealPwm = Annotated[
-    bool | None, typer.Option(help="phase: duty cycles in steps, dead time of the half-bridges.")
-]
-Delay = Annotated[int | None, typer.Option(help="Samples between measurement and command. [the machine's]")]
-Substeps = Annotated[
-    int | None,
-    typer.Option(help="Runge-Kutta steps a sample; the error is estimated. [4, more for slow samples]"),
-]
+FidelityName = Annotated[str | None, typer.Option(help="force, dq (PI loops), phase. [the scenario's]")]
+Noise = Annotated[float | None, typer.Option(help="Of the sensors, in multiples. [the scenario's]")]
+# What `--option` takes too, and the help leaves to `--scenario help`.
+ProfileName = Annotated[str | None, typer.Option(hidden=True)]
+Quantize = Annotated[bool | None, typer.Option(hidden=True)]
+Bearing = Annotated[bool | None, typer.Option(hidden=True)]
+Scheduled = Annotated[bool | None, typer.Option(hidden=True)]
+Feedforward = Annotated[str | None, typer.Option(hidden=True)]
+BearingAxes = Annotated[str | None, typer.Option(hidden=True)]
+RealPwm = Annotated[bool | None, typer.Option(hidden=True)]
+Delay = Annotated[int | None, typer.Option(hidden=True)]
+Substeps = Annotated[int | None, typer.Option(hidden=True)]
 Yes = Annotated[bool, typer.Option("--yes", help="Start work of more than ten minutes too.")]
 Seed = Annotated[int | None, typer.Option(help="Seed of the noise. [0]")]
 GainFile = Annotated[
@@ -98,7 +74,7 @@ GainFileOrNone = Annotated[
     Path | None,
     typer.Argument(
         metavar="[GAINS]",
-        help="A gain file: .json, .npz or .mat. With --status: [the campaign's own]",
+        help="A gain file. With --status: [the campaign's own]",
         callback=lambda path: None if path is None else locate(path),
         autocompletion=gain_files,
         show_default=False,
@@ -110,7 +86,7 @@ MachineFile = Annotated[
         "--machine",
         metavar="FILE",
         envvar="MALTA_MACHINE",
-        help="The module of a machine of your own, as rotor.py, where a gain file names one.",
+        help="Module of a machine of your own, as rotor.py.",
         show_envvar=True,
     ),
 ]
