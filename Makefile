@@ -4,6 +4,7 @@
 # make fuzz     damaged input of every kind, for FUZZ_SECONDS (600): see tests/fuzz
 # make mutants  faults in the code that refuses, proves, seals and limits: tests have to notice each; see tests/mutants
 # make docs     the pages of docs/ to docs/_build: warnings are errors; `make links` asks the addresses they point to
+# make architecture, make coverage   who imports whom; which lines the tests run
 # make check    what CI runs: lint, format, types, pages, both kinds of tests
 PYTHON ?= python3
 VENV := .venv
@@ -16,7 +17,7 @@ export PIP_CONSTRAINT := $(CURDIR)/constraints.txt
 export OPENBLAS_NUM_THREADS ?= 1
 export MPLCONFIGDIR ?= $(CURDIR)/$(VENV)/matplotlib
 
-.PHONY: design test slow fuzz mutants check lint types notebooks docs links bench figures clean
+.PHONY: design test slow fuzz mutants check lint types notebooks docs links bench figures architecture coverage clean
 
 design: $(VENV)/runtime
 	$(BIN)/malta design
@@ -44,6 +45,15 @@ lint: $(VENV)/dev
 
 types: $(VENV)/dev
 	$(BIN)/mypy
+
+architecture: $(VENV)/runtime  # packages, their sizes and who imports whom, as the picture of CONTRIBUTING.md
+	$(BIN)/python docs/house.py
+
+coverage: $(VENV)/dev  # lines that `make test` runs; the report is in build/coverage
+	$(PIP) install --quiet coverage
+	$(BIN)/python -m coverage run --source malta --data-file build/.coverage -m pytest -q -n 0 -m "not slow"
+	$(BIN)/python -m coverage html --data-file build/.coverage -d build/coverage
+	$(BIN)/python -m coverage report --data-file build/.coverage | tail -1
 
 notebooks: $(VENV)/dev
 	mkdir -p build
