@@ -120,8 +120,6 @@ def test_claims(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     ],
 )
 def test_studies(run: Run, tmp_path: Path, name: str, arguments: list[str]) -> None:
-    if name == "sobol-output":
-        pytest.importorskip("SALib")
     found = document(run("campaign", TABLE2, *arguments, "--out", tmp_path, "--json"), name)
     assert found["gains"] == TABLE2
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,7 +18,7 @@ from malta.campaigns.limits import limit_of
 from malta.campaigns.plan import Plan
 from malta.campaigns.result import Rate, rate
 from malta.campaigns.run import campaign
-from malta.campaigns.sensitivity import Index, Sensitivity, sensitivity
+from malta.campaigns.sensitivity import Index, Sensitivity, _indices, _points, sensitivity
 from malta.campaigns.tolerance import ALL, Tolerances, spread_of, tolerances
 
 BOX = ("m", "K_A", "K_B")
@@ -79,13 +78,8 @@ def test_a_yield_that_comes_back_is_reported(gap: tuple[float, float], monotone:
     assert spread.monotone is monotone
 
 
-def _salib() -> None:
-    pytest.importorskip("SALib", reason="SALib is an extra")
-
-
 @pytest.fixture(scope="module")
 def indices() -> Sensitivity:
-    _salib()
     plan = shaky(2048, 0.02, noise=0.0)
     return sensitivity(plan, limit_of(plan, "deviation-y1", 20e-6))
 
@@ -110,9 +104,20 @@ def test_indices_are_shares(indices: Sensitivity) -> None:
     assert len(indices.of_yield) == 3
 
 
+def test_indices_of_the_ishigami_function() -> None:
+    """sin x1 + 7 sin^2 x2 + 0.1 x3^4 sin x1 over -pi .. pi, about a mean of 1e6: its indices in closed form."""
+    x = 2 * math.pi * _points(3, 2**13, 1) - math.pi
+    values = 1e6 + np.sin(x[:, 0]) + 7 * np.sin(x[:, 1]) ** 2 + 0.1 * x[:, 2] ** 4 * np.sin(x[:, 0])
+    found = _indices(values, 2**13, 1)
+    for index, first, total in zip(found, (0.3139, 0.4424, 0.0), (0.5576, 0.4424, 0.2437), strict=True):
+        assert index.first == pytest.approx(first, abs=0.02)
+        assert index.total == pytest.approx(total, abs=0.01)
+        assert 0 < index.first_half < 0.06
+    assert _indices(np.ones_like(values), 2**13, 1) == ()
+
+
 def test_noise_is_a_factor() -> None:
     """Held still, where the machine barely matters, the noise of a run decides its largest deviation."""
-    _salib()
     options = {"fidelity": "force", "duration": 0.02}
     plan = Plan(gains.read(SHAKY), "hold", {"m": 0.001}, samples=4096, options=options)
     found = sensitivity(plan, limit_of(plan, "touchdown"))
@@ -125,7 +130,6 @@ def test_noise_is_a_factor() -> None:
 
 
 def test_the_commands(run: Run, tmp_path: Path) -> None:
-    _salib()
     common = ("campaign", SHAKY, *QUICK, "--out", tmp_path)
     code, out, err = run(*common, "--samples", "512", "--sobol")
     assert code == 0
@@ -153,14 +157,6 @@ def test_a_tolerance_by_command(run: Run, tmp_path: Path) -> None:
     assert {name.replace(" ", "_"): spread for name, spread in stored.items()} == document["spreads"]
 
 
-def test_salib_is_an_extra(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "SALib.analyze", None)
-    code, out, err = run("campaign", SHAKY, *QUICK, "--out", tmp_path, "--sobol")
-    assert (code, out) == (2, "")
-    assert "pip install 'malta[sensitivity]'" in err
-    assert err.count("\n") == 1
-
-
 def test_studies_of_nothing_are_refused() -> None:
     plan = shaky(64, 0.0)
     limit = limit_of(plan, "touchdown")
@@ -168,7 +164,6 @@ def test_studies_of_nothing_are_refused() -> None:
         tolerances(plan, limit, 0.9)
     with pytest.raises(malta.InputError, match="a yield above 0"):
         tolerances(shaky(64), limit, 1.2)
-    _salib()
     with pytest.raises(malta.InputError, match="nothing that varies"):
         sensitivity(plan, limit)
     with pytest.raises(malta.InputError, match="at least 80 for 3 factors"):

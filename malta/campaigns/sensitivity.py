@@ -1,4 +1,4 @@
-"""Which parameter costs yield: Sobol indices over the box of a campaign, by SALib, which is an extra.
+"""Which parameter costs yield: Sobol indices over the box of a campaign, by the design of Saltelli and others.
 
     first-order index   Var(E[Y | x_i]) / Var(Y)       what fixing x_i alone would take away of Y's variance
     total index         E[Var(Y | x_not i)] / Var(Y)   what is left when everything but x_i is fixed
@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from scipy.stats import qmc, sobol_indices
 
 from malta.campaigns.block import simulate_machines
 from malta.campaigns.limits import Limit, findings_of
@@ -29,6 +30,8 @@ if TYPE_CHECKING:
 
 NOISE = "noise"  # the name of its factor
 LEAST = 16  # points of each of the two samples
+RESAMPLES = 100
+NORMAL = 1.96  # standard deviations of a 95 % interval, either way
 DRAWS = 2**40  # of the noise, among which its factor chooses
 
 
@@ -78,8 +81,8 @@ def sensitivity(
         total index         E[Var(Y | x_not i)] / Var(Y)
 
     The design takes n (factors + 2) runs, n the largest power of two with which they are at most plan.samples.
-    plan.seed decides machines and noise; plan.sampler does not count. SALib, an extra, draws and evaluates. Source:
-    A. Saltelli et al., Computer Physics Communications 181 (2010) 259-270.
+    plan.seed decides machines and noise; plan.sampler does not count. The estimators are those of
+    `scipy.stats.sobol_indices`. Source: A. Saltelli et al., Computer Physics Communications 181 (2010) 259-270.
 
     plan : the plan of the runs
     limit : from `malta.limit_of`; a run within it counts for the yield
@@ -88,7 +91,7 @@ def sensitivity(
 
     Returns a Sensitivity: indices with 95 % intervals by factor, of the yield and of each figure of merit.
 
-    Raises InputError where SALib is not installed, for a box in which nothing varies, and for too few samples.
+    Raises InputError for a box in which nothing varies, and for too few samples.
 
     >>> import malta
     >>> spec = malta.read_design("examples/ball/design/ball.toml")
@@ -100,7 +103,6 @@ def sensitivity(
     >>> found.factors, constant.total > mass.total  # magnets matter more
     (('m', 'C'), True)
     """
-    sampling, analysis = _salib()
     names = [varied_names(plan)[k] for k in varying_columns(plan)]
     if not names:
         raise InputError("campaign", "spread", "nothing that varies", "parameters that vary")
@@ -110,43 +112,46 @@ def sensitivity(
     if size < LEAST:
         expected = f"at least {LEAST * (len(factors) + 2)} for {len(factors)} factors"
         raise InputError("campaign", "samples", str(plan.samples), expected)
-    problem = {"num_vars": len(factors), "names": list(factors), "bounds": [[0.0, 1.0]] * len(factors)}
-    points = sampling.sample(problem, size, calc_second_order=False, seed=plan.seed)
+    points = _points(len(factors), size, plan.seed)
     machines = machines_in_box(plan, points[:, : len(names)])
     draws = (points[:, -1] * DRAWS).astype(np.int64) if noisy else np.zeros(len(points), np.int64)
     batch = simulate_machines(plan, machines, noise=draws[:, None], workers=workers, progress=progress)
     within = limit.severity(batch) < 1
 
-    def indices(values: FloatArray) -> tuple[Index, ...]:
-        if not np.isfinite(values).all() or np.ptp(values) == 0:
-            return ()
-        found = analysis.analyze(problem, values, calc_second_order=False, seed=plan.seed + 1)
-        columns = (found[name].tolist() for name in ("S1", "S1_conf", "ST", "ST_conf"))
-        return tuple(Index(*row) for row in zip(*columns, strict=True))
-
-    independent = within.reshape(size, -1)[
-        :, [0, -1]
-    ]  # the other columns differ from the first in one factor
+    independent = within[: 2 * size]  # the other points differ from the first sample in one factor
     return Sensitivity(
         plan,
         limit,
         factors,
         len(points),
         rate(int(independent.sum()), independent.size),
-        indices(within.astype(float)),
-        {f.label: indices(f.values) for f in findings_of(plan, batch)},
+        _indices(within.astype(float), size, plan.seed),
+        {f.label: _indices(f.values, size, plan.seed) for f in findings_of(plan, batch)},
     )
 
 
-def _salib() -> tuple[Any, Any]:
-    """SALib's modules for sampling and analysis. Raises InputError where it is not installed."""
-    try:
-        from SALib.analyze import sobol as analysis
-        from SALib.sample import sobol as sampling
-    except ImportError as error:
-        expected = "it installed: pip install 'malta[sensitivity]'"
-        raise InputError("--sobol", "", f"no SALib here ({error})", expected) from error
-    return sampling, analysis
+def _points(factors: int, size: int, seed: int) -> FloatArray:
+    """Saltelli's design in the unit box: samples A and B, then A with each column from B in turn."""
+    both = qmc.Sobol(2 * factors, rng=np.random.default_rng(seed)).random(size)
+    A, B = both[:, :factors], both[:, factors:]
+    mixed = [np.where(np.arange(factors) == i, B, A) for i in range(factors)]
+    return np.concatenate([A, B, *mixed])
+
+
+def _indices(values: FloatArray, size: int, seed: int) -> tuple[Index, ...]:
+    """The indices of each factor, with half 95 % intervals by resampling; none where the values have no variance."""
+    if not np.isfinite(values).all() or np.ptp(values) == 0:
+        return ()
+    rows = np.random.default_rng(seed + 1).integers(0, size, (RESAMPLES + 1, size))
+    rows[0] = np.arange(size)
+    A, B, *mixed = (values - values.mean()).reshape(-1, size)  # the estimators lose digits to a mean
+    with np.errstate(all="ignore"):  # a resample without variance has no indices
+        found = sobol_indices(
+            func={"f_A": A[rows], "f_B": B[rows], "f_AB": np.array([one[rows] for one in mixed])}, n=size
+        )
+    first, total = (np.reshape(x, (RESAMPLES + 1, -1)) for x in (found.first_order, found.total_order))
+    half = [NORMAL * np.nanstd(x[1:], axis=0, ddof=1) for x in (first, total)]
+    return tuple(Index(*map(float, row)) for row in zip(first[0], half[0], total[0], half[1], strict=True))
 
 
 def sensitivity_document(found: Sensitivity) -> dict[str, Any]:

@@ -105,7 +105,7 @@ def campaign(
         ),
     ] = None,
     sobol: Annotated[
-        bool, typer.Option("--sobol", help="Which parameter costs yield (needs SALib).")
+        bool, typer.Option("--sobol", help="Which parameter costs yield: Sobol indices.")
     ] = False,
     tolerance: Annotated[
         str | None,
