@@ -180,8 +180,9 @@ def read_file(
         raise InputError(path, "", "no such file", f"a {kind}") from error
     except UnicodeDecodeError as error:
         raise InputError(path, "", "bytes that are not UTF-8 text", f"a {kind}") from error
-    except (OSError, ValueError) as error:  # ValueError: a null byte in the name
-        found = getattr(error, "strerror", None) or str(error)
+    except (OSError, ValueError) as error:
+        words = getattr(error, "strerror", None) or str(error)
+        found = "a null byte in its name" if "\0" in str(path) else words
         raise InputError(path, "", found, f"a readable {kind}") from error
 
 

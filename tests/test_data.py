@@ -381,7 +381,7 @@ def test_missing_file_folder_and_path_through_a_file_are_refused(tmp_path: Path)
 
 
 def test_name_with_a_null_byte_is_refused(tmp_path: Path) -> None:
-    expected = r"found embedded null byte, expected a readable TOML file$"
+    expected = r"found a null byte in its name, expected a readable TOML file$"
     for read in (malta.read, malta.read_design):
         with pytest.raises(malta.InputError, match=expected):
             read("a\0b")
