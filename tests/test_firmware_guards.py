@@ -152,26 +152,3 @@ def started(folder: Path, precision: Precision, cc: str, *flags: str, contracts:
     command = [cc, *flags, "-Wall", "-Wextra", "-Werror", "tells.c", *names, "-o", "tells"]
     done = run(command, folder)
     return done.stderr if done.returncode else run(["./tells"], folder).stdout
-
-
-def test_the_test_flies_the_supervisor(tmp_path: Path) -> None:
-    """Through all states, over 94 % of its lines; a transition that goes elsewhere is named."""
-    require("gcc", "gcov")
-    folder = write_folder("halbach", "double", tmp_path)
-    files = [f"halbach{of}.c" for of in ("", "_parts", "_supervisor", "_test")]
-    done = run(["gcc", "-std=c99", "-O0", "--coverage", *files, "-o", "t"], folder)
-    assert done.returncode == 0, done.stderr
-    assert run(["./t"], folder).returncode == 0
-    printed = run(["gcov", "-n", "t-halbach_supervisor.gcda"], folder).stdout
-    share = re.search(r"halbach_supervisor\.c'\nLines executed:([0-9.]+)%", printed)
-    assert share, printed
-    assert float(share[1]) > 94
-    path = folder / "halbach_supervisor.c"
-    text = path.read_text(encoding="utf-8")
-    wrong = text.replace(
-        "HALBACH_OPERATE, EVENT_HOLD, HALBACH_HOLD", "HALBACH_OPERATE, EVENT_HOLD, HALBACH_FAULT"
-    )
-    assert wrong != text
-    path.write_text(wrong, encoding="utf-8")
-    done = run_test(HERE, folder)
-    assert (done.returncode, done.stdout) == (1, "supervisor: wish 1 ends in state 8, expected 6\n")

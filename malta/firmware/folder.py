@@ -24,6 +24,7 @@ from malta.firmware.signals import (
 from malta.firmware.stand_in import example_stroke, stand_in_context
 from malta.firmware.step import programs_of
 from malta.firmware.supervisor_text import monitor_lines, supervisor_sources
+from malta.firmware.trials import trial_context
 from malta.firmware.vectors import FNV_FACTOR, FNV_START, SAMPLES, Vector, record_vectors
 
 EXAMPLE_SAMPLES = 10_000  # of the example's main program, beside its stroke
@@ -51,7 +52,7 @@ def folder_files(
         **_example_context(t),
     }
     files |= {
-        f"{name}_test.c": render("test.c", context | _test_context(t)),
+        f"{name}_test.c": render("test.c", context | _test_context(t) | trial_context(t, name)),
         f"{name}_example.c": render("example.c", context),
         "Makefile": render("Makefile", context),
         "CMakeLists.txt": render("CMakeLists.txt", context),

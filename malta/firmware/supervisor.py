@@ -233,29 +233,29 @@ def monitors_of(t: Target) -> tuple[Monitor, ...]:
         Monitor("UNSETTLED", "samples without settling", 20.0 * TIMES.settle, 1, "LAND", ("SETTLE",)),
         Monitor("UNREADY", "samples without good readings", 8.0 * TIMES.check, 1, "FAULT", ("SENSORS",)),
     ]
-    return tuple(row for row in listed if not _absent_monitors(t).get(row.key, False))
+    absent = absent_monitors(t)
+    return tuple(row for row in listed if row.key not in absent)
 
 
-def _absent_monitors(t: Target) -> dict[str, bool]:
-    """Whether a monitor makes no sense for a target's machine; those that are not named always do."""
+def absent_monitors(t: Target) -> dict[str, str]:
+    """The monitors that make no sense for a target's machine, each with the reason."""
     b = bounds_of(t)
-    return {
-        "TOUCH": not np.isfinite(b.touch).any(),
-        "RATE": not np.isfinite(b.jump).any(),
-        "INNOVATION": not np.isfinite(b.sigma).any(),
-        "STUCK": min(b.stuck) >= LONG,
-        "STALE": b.stale >= LONG,
-        "CURRENT": not t.driven,
-        "OFFSET": not t.driven,
-        "CURRENT_LOST": not t.driven,
-        "CURRENT_SUM": not stars_of(t),
-        "CURRENT_FROZEN": not stars_of(t),
-        "CURRENT_ERROR": not t.driven,
-        "OVERVOLTAGE": not t.driven,
-        "LINK": not t.driven,
-        "HELPLESS": not np.isfinite(t.controller.limits.force).any(),
-        "SATURATION": not np.isfinite(t.controller.limits.force).any(),
-    }
+    unlimited = not np.isfinite(t.controller.limits.force).any()
+    listed = (
+        (not np.isfinite(b.touch).any(), "nothing is met", ("TOUCH",)),
+        (not np.isfinite(b.jump).any(), "no speed is too large", ("RATE",)),
+        (not np.isfinite(b.sigma).any(), "no noise of the sensors is known", ("INNOVATION",)),
+        (min(b.stuck) >= LONG, "readings of a sensor that works repeat", ("STUCK",)),
+        (b.stale >= LONG, "readings of sensors that work repeat", ("STALE",)),
+        (
+            not t.driven,
+            "the drive has the current loops",
+            ("CURRENT", "OFFSET", "CURRENT_LOST", "CURRENT_ERROR", "OVERVOLTAGE", "LINK"),
+        ),
+        (not stars_of(t), "no phases of a star are read", ("CURRENT_SUM", "CURRENT_FROZEN")),
+        (unlimited, "forces have no limits", ("HELPLESS", "SATURATION")),
+    )
+    return {key: reason for absent, reason, keys in listed if absent for key in keys}
 
 
 def reading_deviations(plant: Plant) -> FloatArray:

@@ -465,27 +465,30 @@ static int32_t is_near({{ name }}_real y, {{ name }}_real place, int32_t k) {
 /* Samples in a row at which a machine that lands without one of its sensors is where it rested, by the others. */
 static void count_landed({{ name }}_supervisor *sup, const {{ name }}_inputs *in) {
   int32_t ignored = 0;
+{% if not only_stroke %}
+  int32_t there = 0;
+  int32_t away = 0;
+{% endif %}
   int32_t k;
-  sup->steady = one_more(sup->steady);
   for (k = 0; k < OUTPUTS; k++) {
     if (sup->unbelieved[k] > 0) {
       ignored = 1;
 {% if only_stroke %}
     }
 {% else %}
-    } else if ((is_near(in->y[k], sup->rest[k], k) == 0){{ except_stroke }}) {
-      sup->steady = 0;
+    } else if (is_near(in->y[k], sup->rest[k], k) == 1) {
+      there{{ " = (k != %d) ? 1 : there"|format(stroke_output) if stroke_output >= 0 else " = 1" }};
     } else {
-      /* there */
+      away{{ " = (k != %d) ? 1 : away"|format(stroke_output) if stroke_output >= 0 else " = 1" }};
     }
 {% endif %}
   }
 {% if only_stroke %}
   (void)in; /* a stroke may rest anywhere */
+  sup->steady = (ignored == 1) ? one_more(sup->steady) : 0;
+{% else %}
+  sup->steady = ((ignored == 1) && (there == 1) && (away == 0)) ? one_more(sup->steady) : 0; /* none that is left tells nothing */
 {% endif %}
-  if (ignored == 0) {
-    sup->steady = 0;
-  }
 }
 
 /* Samples in a row with errors of a machine that has settled. */
@@ -500,6 +503,17 @@ static void count_settled({{ name }}_supervisor *sup, const {{ name }}_state *s,
   if (sup->steady >= sup->times.settle) {
     sup->samples = 0; /* it has settled, and waits for its request */
   }
+}
+
+/* Whether the reference has reached its place: at rest. */
+static bool is_at_rest(const {{ name }}_supervisor *sup) {
+  const {{ name }}_real t = ({{ name }}_real)sup->samples * {{ NAME }}_SAMPLE_TIME;
+  bool rests = true;
+  int32_t k;
+  for (k = 0; k < OUTPUTS; k++) {
+    rests = rests && (t >= sup->lasts[k]);
+  }
+  return rests;
 }
 
 /* What a state waits for. */
@@ -519,7 +533,7 @@ static bool is_done(const {{ name }}_supervisor *sup, const {{ name }}_request *
     done = (sup->steady >= sup->times.settle) && (request->operate != 0) && (is_reference(sup, request) == 1);
     break;
   case {{ NAME }}_HOLD:
-    done = sup->steady >= sup->times.calm;
+    done = (sup->steady >= sup->times.calm) && is_at_rest(sup); /* one that moves would go on beyond its end */
     break;
   case {{ NAME }}_LANDING:
     done = (sup->samples >= (sup->times.landing + sup->times.settle)) || (sup->steady > 0);
@@ -570,12 +584,15 @@ static void stop_output({{ name }}_supervisor *sup, int32_t k, {{ name }}_real p
   const {{ name }}_real speed = size_of(dp);
   const {{ name }}_real ahead = (dp > {{ zero }}) ? (near_touch[k] - p) : (near_touch[k] + p);
   const {{ name }}_real shortest = {{ shortest }} * {{ NAME }}_SAMPLE_TIME;
+  const {{ name }}_real least = ({{ three_halves }} * speed) / steepest[k];
   {{ name }}_real lasts = ({{ three_halves }} * speed) / stopping[k];
-  if ((ahead > {{ zero }}) && ((speed * lasts) > ({{ three_halves }} * ahead))) {
-    lasts = ({{ three_halves }} * ahead) / speed; /* it needs three quarters of the way that is left */
-  }
   if (lasts < shortest) {
     lasts = shortest;
+  }
+  if ((ahead > {{ zero }}) && ((speed * lasts) > ({{ three_halves }} * ahead))) {
+    lasts = ({{ three_halves }} * ahead) / speed; /* it needs three quarters of the way that is left */
+    lasts = (lasts > least) ? lasts : least; /* with all the acceleration that there is */
+    lasts = (lasts > {{ NAME }}_SAMPLE_TIME) ? lasts : {{ NAME }}_SAMPLE_TIME;
   }
   sup->lasts[k] = lasts;
   sup->place[k] = p + ({{ half }} * (dp * lasts));
@@ -802,15 +819,14 @@ static int32_t place_of(const {{ name }}_real expected[OUTPUTS]) {
 }
 
 {% endif %}
+{% if fallback %}
 /* The filter without the sensors that are not believed: one of them by a gain for the others, where there is one. */
 static int32_t leave_out(const {{ name }}_supervisor *sup, {{ name }}_state *s, const {{ name }}_real expected[OUTPUTS],
                       {{ name }}_inputs *seen) {
-{% if fallback %}
   static const int32_t has_gain[OUTPUTS] = { {{ has_gain }} };
   static const {{ name }}_real gain_without[OUTPUTS][{{ places }}][STATES][OUTPUTS] = { /* of the filter, without one sensor each */
 {{ gain_rows }}
   };
-{% endif %}
   int32_t without = -1;
   int32_t number = 0;
   int32_t estimated = 0;
@@ -822,7 +838,6 @@ static int32_t leave_out(const {{ name }}_supervisor *sup, {{ name }}_state *s, 
       number++;
     }
   }
-{% if fallback %}
   if ((number == 1) && (has_gain[without] == 1)) {
     const int32_t place = place_of(expected);
     int32_t i;
@@ -841,30 +856,33 @@ static int32_t leave_out(const {{ name }}_supervisor *sup, {{ name }}_state *s, 
     }
     estimated = 1;
   }
-{% else %}
-  (void)s;
-  (void)expected;
-  (void)without;
-  (void)number;
-{% endif %}
   return estimated;
 }
 
+{% else %}
+/* The filter without the sensors that are not believed. */
+static void leave_out(const {{ name }}_supervisor *sup, {{ name }}_inputs *seen) {
+  int32_t k;
+  for (k = 0; k < OUTPUTS; k++) {
+    if (sup->unbelieved[k] > 0) {
+      seen->y_valid[k] = {{ zero }};
+    }
+  }
+}
+
+{% endif %}
+{% if fallback %}
 /* What the machine's equations add to the linear prediction: two unstable modes seen by one sensor leave no room. */
 static void predict({{ name }}_state *s, const {{ name }}_outputs *out) {
-{% if fallback %}
   {{ name }}_real more[STATES];
   int32_t k;
   {{ name }}_correction(out->xi_hat, more);
   for (k = 0; k < STATES; k++) {
     s->xi_pred[k] = s->xi_pred[k] + more[k];
   }
-{% else %}
-  (void)s;
-  (void)out;
-{% endif %}
 }
 
+{% endif %}
 /* Outputs of bridges at zero voltage. */
 static void rest_bridges(const {{ name }}_inputs *in, {{ name }}_outputs *out) {
 {% if command %}
@@ -930,13 +948,20 @@ void {{ name }}_supervisor_step({{ name }}_supervisor *sup, {{ name }}_state *s,
   sup->acknowledged = request->acknowledge;
   sup->enable = is_flying(sup->state);
   if (is_flying(sup->state) == 1) {
+{% if fallback %}
     int32_t estimated;
+{% endif %}
     guide(sup, s, request);
+{% if fallback %}
     estimated = leave_out(sup, s, expected, &seen);
     {{ name }}_step(s, &seen, out);
     if (estimated == 1) {
       predict(s, out);
     }
+{% else %}
+    leave_out(sup, &seen);
+    {{ name }}_step(s, &seen, out);
+{% endif %}
     for (k = 0; k < OUTPUTS; k++) {
       sup->limited[k] = out->saturated[k];
     }

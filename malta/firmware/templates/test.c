@@ -11,7 +11,6 @@
 
 {% include "stand_in.c" %}
 
-#define WISHES 11
 #define VECTORS {{ vectors|length }}
 #define SAMPLES {{ samples }}
 #define READINGS {{ readings }}
@@ -117,63 +116,9 @@ static int32_t run(const vector *v, uint32_t *total) {
   return failed;
 }
 
-/* What is asked for until a state is reached. */
-typedef struct {
-  {{ name }}_request request;
-  int32_t until;
-} wish;
+{% include "trials.c" %}
 
-/* Fly a stand-in with the supervisor, in short times: states in order, and a checksum of every sample. */
-static int32_t fly(uint32_t *total) {
-  static {{ name }}_supervisor sup;
-  static {{ name }}_state s;
-  static {{ name }}_inputs in;
-  static {{ name }}_outputs out;
-  static stand_in machine;
-  static const wish wishes[WISHES] = {
-    { { .start = 1, .operate = 1 }, {{ NAME }}_OPERATE }, { { .missed = 3 }, {{ NAME }}_HOLD },
-    { { .operate = 1 }, {{ NAME }}_OPERATE },             { { .land = 1 }, {{ NAME }}_OFF },
-    { { .operate = 1, .start = 1 }, {{ NAME }}_SETTLE },  { { .land = 1 }, {{ NAME }}_OFF },
-    { { .start = 1 }, {{ NAME }}_LIFT },                  { { .stop = 1 }, {{ NAME }}_FAULT },
-    { { .acknowledge = 1 }, {{ NAME }}_OFF },             { { .start = 1 }, {{ NAME }}_SENSORS },
-    { { .sto = 1 }, {{ NAME }}_FAULT }
-  };
-  int32_t failed = 0;
-  int32_t k;
-  {{ name }}_init(&s);
-  {{ name }}_supervisor_init(&sup);
-  sup.times.lift = 100;
-  sup.times.settle = 10;
-  sup.times.fade = 100;
-  sup.times.landing = 100;
-  sup.times.calm = 10;
-  sup.started = 0;
-  for (k = 0; (failed == 0) && (k < WISHES); k++) {
-    int32_t samples = 0;
-    while ((sup.state != wishes[k].until) && (samples < 2000)) {
-      int32_t j;
-      samples++;
-{% if driven %}
-      read_stand_in(&machine, sup.enable, &s, &out, &in);
-{% else %}
-      read_stand_in(&machine, sup.enable, &s, &in);
-{% endif %}
-      {{ name }}_supervisor_step(&sup, &s, &in, &wishes[k].request, &out);
-      *total = (*total ^ (uint32_t)sup.state) * {{ fnv_factor }}u;
-{% for f in output_all %}
-      *total = add_all(*total, out.{{ f.name }}, {{ f.size }});
-{% endfor %}
-      for (j = 0; j < {{ outputs }}; j++) {
-        *total = add_bits(*total, s.reference.p[j]);
-      }
-    }
-    if (sup.state != wishes[k].until) {
-      failed = 1;
-      (void)printf("supervisor: wish %ld ends in state %ld, expected %ld\n", (long)k, (long)sup.state, (long)wishes[k].until);
-    }
-  }
-  return failed;
-}
+{% include "calls.c" %}
 
 int main(void) {
   static const vector vectors[VECTORS] = {
@@ -193,7 +138,12 @@ int main(void) {
   for (k = 0; k < VECTORS; k++) {
     failed += run(&vectors[k], &total);
   }
-  failed += fly(&total);
+  failed += try_tables();
+{% if stroke %}
+  failed += try_strokes(&total);
+{% endif %}
+  failed += try_pieces(&total);
+  failed += try_supervisor(&total);
   if ({{ name }}_self_test() == 0) {
     failed++;
     (void)printf("the arithmetic of {{ name }}.c or {{ name }}_parts.c is not that of their text: look at the compiler's options\n");
