@@ -229,6 +229,31 @@ def test_without_any_sensor_it_switches_off_until_acknowledged() -> None:
     assert bench.step(start=1) == "OFFSETS"
 
 
+def test_a_landing_goes_on_where_no_sensor_is_believed_for_a_sample() -> None:
+    """Off is a fall from wherever it is: only sensors that are believed tell that it rests."""
+    bench = Bench().fly()
+    bench.step(300)
+    bench.step(100, land=1)
+    bench.step(y=dict.fromkeys(range(5), math.nan))
+    assert list(bench.supervisor.unbelieved) == [1] * 5
+    assert bench.step(20) == "LANDING"
+
+
+def test_a_reference_reaches_its_place_before_operation_goes_on() -> None:
+    """One that moves would fade to its request beyond the end of the travel."""
+    bench = Bench().fly()
+    view(bench.state.reference, "p")[4], view(bench.state.reference, "dp")[4] = 8e-3, 0.5
+    bench._call("start", bench.state)
+    seen = []
+    for k in range(3000):
+        bench.ask("p", 4, math.nan if k == 0 else -8e-3)
+        seen.append((bench.now, *(float(view(bench.state.reference, name)[4]) for name in ("p", "dp"))))
+    first = next(k for k, row in enumerate(seen) if row[0] == "OPERATE")
+    assert first > TIMES.calm
+    assert abs(seen[first - 1][2]) < 1e-3 * 0.5
+    assert max(row[1] for row in seen) < 15e-3
+
+
 def test_stuck_sensors_are_told_from_quiet_ones() -> None:
     """91 equal readings of a radial sensor, of all sensors two: an hour of noise at rest has no such row."""
     b = bounds_of(STUCK)

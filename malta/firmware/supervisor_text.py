@@ -118,6 +118,7 @@ def supervisor_members(t: Target) -> list[Member]:
         Member("real", "asked_rate", p, "its rate"),
         Member("real", "place", p, "where the references go"),
         Member("real", "lasts", p, "s, how long they take"),
+        Member("real", "stops", p, "s, in which the rate fades that they had"),
         Member("real", "d0", p, "by how much they differed at first, with two derivatives"),
         Member("real", "d1", p, ""),
         Member("real", "d2", p, ""),
@@ -275,6 +276,7 @@ _NUMBERS = {
     "most_rate": MOST_RATE,
     "sagging": SAGGING,
     "rounding": 1e-5,  # of a limit, by which references of two samples may differ beyond it
+    "fade_rate": 3.95,  # at least the largest second derivative of (1 - u)^3 (u + 3 u^2)
     "fade_speed": 15 / 8 / 0.75,
     "fade_acceleration": 10 / math.sqrt(3) / 0.75,
 }

@@ -105,6 +105,7 @@ void {{ name }}_supervisor_init({{ name }}_supervisor *sup) {
     sup->d1[k] = {{ zero }};
     sup->d2[k] = {{ zero }};
     sup->lasts[k] = {{ NAME }}_SAMPLE_TIME;
+    sup->stops[k] = {{ NAME }}_SAMPLE_TIME;
   }
 {% if currents %}
   for (k = 0; k < {{ currents }}; k++) {
@@ -598,18 +599,19 @@ static void stop_output({{ name }}_supervisor *sup, int32_t k, {{ name }}_real p
   sup->place[k] = p + ({{ half }} * (dp * lasts));
 }
 
-{% if stroke_output >= 0 %}
-/* Less time for a stroke that moves on its way back: it goes on by {{ passing }} of its speed times this time. */
+/* Less time for the rate of an output that moves on its way back: it goes on by {{ passing }} of its rate times this time. */
 static void return_output({{ name }}_supervisor *sup, int32_t k, {{ name }}_real p, {{ name }}_real dp) {
+  const {{ name }}_real speed = size_of(dp);
   const {{ name }}_real ahead = (dp > {{ zero }}) ? (near_touch[k] - p) : (near_touch[k] + p);
   const {{ name }}_real most = {{ half }} * ahead;
-  const {{ name }}_real passed = {{ passing }} * (size_of(dp) * sup->lasts[k]);
-  if ((most > {{ zero }}) && (passed > most)) {
-    sup->lasts[k] = most / ({{ passing }} * size_of(dp));
+  if (({{ passing }} * (speed * sup->stops[k])) > most) {
+    const {{ name }}_real least = ({{ fade_rate }} * speed) / steepest[k]; /* with all the acceleration that there is */
+    const {{ name }}_real room = most / ({{ passing }} * speed);
+    sup->stops[k] = (room > least) ? room : least;
+    sup->stops[k] = (sup->stops[k] > {{ NAME }}_SAMPLE_TIME) ? sup->stops[k] : {{ NAME }}_SAMPLE_TIME;
   }
 }
 
-{% endif %}
 /* The goal of an output's reference in a state: p, dp, ddp. */
 static void goal_of(const {{ name }}_supervisor *sup, const {{ name }}_request *request, int32_t k,
                     {{ name }}_real goal[3]) {
@@ -669,12 +671,13 @@ static void begin({{ name }}_supervisor *sup, const {{ name }}_state *s, const {
     if ((k == {{ stroke_output }}) && (sup->state == {{ NAME }}_LIFT)) {
       sup->place[k] = sup->rest[k]; /* the stroke begins in operation */
     }
-    if ((k == {{ stroke_output }}) && (sup->state == {{ NAME }}_LANDING)) {
-      return_output(sup, k, p, dp);
-    }
 {% endif %}
     if (sup->state == {{ NAME }}_HOLD) {
       stop_output(sup, k, p, dp);
+    }
+    sup->stops[k] = sup->lasts[k];
+    if (sup->state == {{ NAME }}_LANDING) {
+      return_output(sup, k, p, dp);
     }
     goal_of(sup, request, k, goal);
     sup->d0[k] = p - goal[0];
@@ -776,14 +779,14 @@ static void guide({{ name }}_supervisor *sup, {{ name }}_state *s, const {{ name
   {{ name }}_reference next;
   int32_t k;
   for (k = 0; k < OUTPUTS; k++) {
-    const {{ name }}_real T = sup->lasts[k];
     {{ name }}_real goal[3];
     goal_of(sup, request, k, goal);
     next.p[k] = goal[0];
     next.dp[k] = goal[1];
     next.ddp[k] = goal[2];
     if (sup->state != {{ NAME }}_SETTLE) {
-      fade(t, sup->d0[k], sup->d1[k], T, &next, k);
+      fade(t, sup->d0[k], {{ zero }}, sup->lasts[k], &next, k);
+      fade(t, {{ zero }}, sup->d1[k], sup->stops[k], &next, k);
       fade_acceleration(t, sup->d2[k], &next, k);
     }
   }
