@@ -625,18 +625,18 @@ static void goal_of(const {{ name }}_supervisor *sup, const {{ name }}_request *
   }
 }
 
-/* More time for a reference that is far away: within three quarters of its limits, v = 15/8 d / T, a = 5.8 d / T^2. */
-static void fade_slowly({{ name }}_supervisor *sup, const {{ name }}_request *request, int32_t k, {{ name }}_real p) {
-  const {{ name }}_real way = size_of(request->reference.p[k] - p);
-  const {{ name }}_real by_speed = ({{ fade_speed }} * way) / fastest[k];
+/* The time of a way within three quarters of its limits, v = 15/8 d / T, a = 5.8 d / T^2. */
+static {{ name }}_real time_of({{ name }}_real way, int32_t k) {
+  {{ name }}_real T = ({{ fade_speed }} * way) / fastest[k];
   int32_t doublings = 0;
-  if (by_speed > sup->lasts[k]) {
-    sup->lasts[k] = by_speed;
+  if (T < ({{ shortest }} * {{ NAME }}_SAMPLE_TIME)) {
+    T = {{ shortest }} * {{ NAME }}_SAMPLE_TIME;
   }
-  while ((({{ fade_acceleration }} * way) > (steepest[k] * (sup->lasts[k] * sup->lasts[k]))) && (doublings < 8)) {
-    sup->lasts[k] = {{ two }} * sup->lasts[k];
+  while ((({{ fade_acceleration }} * way) > (steepest[k] * (T * T))) && (doublings < 8)) {
+    T = {{ two }} * T;
     doublings++;
   }
+  return T;
 }
 
 /* Where a state's references go, and the time that this takes; what they differ by at first fades. */
@@ -665,7 +665,8 @@ static void begin({{ name }}_supervisor *sup, const {{ name }}_state *s, const {
     }
     sup->lasts[k] = ({{ name }}_real)samples * {{ NAME }}_SAMPLE_TIME;
     if (sup->state == {{ NAME }}_OPERATE) {
-      fade_slowly(sup, request, k, p);
+      const {{ name }}_real soonest = time_of(size_of(request->reference.p[k] - p), k);
+      sup->lasts[k] = (soonest > sup->lasts[k]) ? soonest : sup->lasts[k];
     }
 {% if stroke_output >= 0 %}
     if ((k == {{ stroke_output }}) && (sup->state == {{ NAME }}_LIFT)) {
@@ -679,6 +680,12 @@ static void begin({{ name }}_supervisor *sup, const {{ name }}_state *s, const {
     if (sup->state == {{ NAME }}_LANDING) {
       return_output(sup, k, p, dp);
     }
+{% if stroke_output >= 0 %}
+    if ((k == {{ stroke_output }}) && (sup->stops[k] < sup->lasts[k])) { /* a stroke that turns is soon back */
+      const {{ name }}_real soonest = time_of(size_of(sup->rest[k] - p), k);
+      sup->lasts[k] = (sup->stops[k] > soonest) ? sup->stops[k] : soonest;
+    }
+{% endif %}
     goal_of(sup, request, k, goal);
     sup->d0[k] = p - goal[0];
     sup->d1[k] = dp - goal[1];
