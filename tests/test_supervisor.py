@@ -39,7 +39,7 @@ from malta.firmware.supervisor import (
 )
 from malta.firmware.supervisor_text import monitor_lines, supervisor_members, supervisor_sources
 from malta.firmware.watch import UNWATCHED, watch_lines, watch_table
-from malta.machines.tubular.experiments.commissioning import SOFT
+from malta.machines.tubular.experiments.contact import SOFT
 from malta.simulation.compiled import compiler
 
 
@@ -244,7 +244,7 @@ def test_a_reference_reaches_its_place_before_operation_goes_on() -> None:
     bench = Bench().fly()
     view(bench.state.reference, "p")[4], view(bench.state.reference, "dp")[4] = 8e-3, 0.5
     bench._call("start", bench.state)
-    seen = []
+    seen: list[tuple[Any, ...]] = []
     for k in range(3000):
         bench.ask("p", 4, math.nan if k == 0 else -8e-3)
         seen.append((bench.now, *(float(view(bench.state.reference, name)[4]) for name in ("p", "dp"))))

@@ -16,7 +16,7 @@ from malta.firmware.export import sources
 from malta.firmware.flight import Step, engine_of_c
 from malta.firmware.native import REALS, Native, compile_controller, compile_files, view
 from malta.firmware.signals import Target
-from malta.firmware.supervisor import STATES, State
+from malta.firmware.supervisor import FLYING, STATES, State
 from malta.firmware.supervisor_text import (
     Member,
     request_members,
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from malta.simulation.engines import Engine
     from malta.simulation.prepared import Prepared
 
+OFF_COMMAND = 0.5  # duty cycles of half-bridges that make no voltage
 NUMBERS: dict[State, int] = {state: k for k, state in enumerate(STATES)}
 
 
@@ -83,6 +84,16 @@ class Requests(NamedTuple):
     take_over: tuple[float, ...] = ()
 
 
+class Interference(NamedTuple):
+    """What faults do to a sample: to readings and requests before the step, to commands after it.
+
+    before : (t in s, inputs, request or None) -> nothing;  after : (t, outputs) -> nothing
+    """
+
+    before: Callable[[float, Any, Any], None]
+    after: Callable[[float, Any], None]
+
+
 @dataclass(eq=False)
 class Flown:
     """What a supervisor did in a run, a row for each step that it made."""
@@ -91,6 +102,7 @@ class Flown:
     state: list[int] = field(default_factory=list)  # index in STATES
     monitor: list[int] = field(default_factory=list)  # index in MONITORS, or -1
     reference: list[FloatArray] = field(default_factory=list)  # that the controller followed
+    motion: list[Any] = field(default_factory=list)  # the same with its rates, as records of the C
     v: list[FloatArray] = field(default_factory=list)  # commanded forces
 
     def states(self, t: FloatArray) -> FloatArray:
@@ -106,7 +118,10 @@ class Flown:
 
 
 def supervised_engine(
-    flights: list[Flown], requests: Requests, precision: Precision = "double"
+    flights: list[Flown],
+    requests: Requests,
+    precision: Precision = "double",
+    faults: Interference | None = None,
 ) -> Callable[[Prepared, Plant, float], Engine]:
     """What `malta.simulate` takes as its engine to fly controller and supervisor; each run adds a record to `flights`.
 
@@ -127,11 +142,11 @@ def supervised_engine(
             getattr(s.native.lib, f"{native.name}_supervisor_take_over")(ctypes.byref(supervisor), rest)
         else:
             getattr(s.native.lib, f"{native.name}_supervisor_init")(ctypes.byref(supervisor))
-        last = native.Reference()
-        ctypes.pointer(last)[0] = state.reference
+        last = _copy(native, state.reference)
         Ts = native.target.controller.sample_time
 
         def fly(inputs: Any, outputs: Any, sample: int, missed: int) -> None:
+            nonlocal last
             t = sample * Ts
             request.reference = state.reference
             state.reference = last
@@ -140,14 +155,72 @@ def supervised_engine(
             request.operate = int(t >= requests.operate)
             request.land = int(t >= requests.land)
             request.missed = missed
+            if faults:
+                _call_valid(inputs)
+                faults.before(t, inputs, request)
             step(*(ctypes.byref(r) for r in (supervisor, state, inputs, request, outputs)))
-            ctypes.pointer(last)[0] = state.reference
+            if faults and supervisor.enable:  # gates that are off obey no command
+                faults.after(t, outputs)
+            last = _copy(native, state.reference)
             flown.t.append(t)
             flown.state.append(int(supervisor.state))
             flown.monitor.append(int(supervisor.monitor))
             flown.reference.append(view(state.reference, "p").copy())
+            flown.motion.append(last)
             flown.v.append(view(outputs, "v").copy())
 
         return fly
 
     return engine_of_c(precision, stepped)
+
+
+def unsupervised_engine(
+    healthy: Flown, faults: Interference, precision: Precision = "double"
+) -> Callable[[Prepared, Plant, float], Engine]:
+    """As supervised_engine, without the supervisor: the controller alone follows what it followed in a healthy flight.
+
+    It is off where it was off in that flight, and starts where it started.
+    """
+
+    def stepped(native: Native, state: Any) -> Step:
+        Ts = native.target.controller.sample_time
+        step, start = (getattr(native.lib, f"{native.name}_{key}") for key in ("step", "start"))
+        flying = [NUMBERS[key] for key in FLYING]
+        was_on = healthy.state[0] in flying
+        index = {round(t / Ts): k for k, t in enumerate(healthy.t)}
+
+        def fly(inputs: Any, outputs: Any, sample: int, _: int) -> None:
+            nonlocal was_on
+            t = sample * Ts
+            k = index.get(sample, len(healthy.t) - 1)
+            on = healthy.state[k] in flying
+            state.reference = healthy.motion[k]
+            if on and not was_on:
+                start(ctypes.byref(state))
+            was_on = on
+            _call_valid(inputs)
+            faults.before(t, inputs, None)
+            step(*(ctypes.byref(r) for r in (state, inputs, outputs)))
+            if on:
+                faults.after(t, outputs)
+            else:
+                for name, value in (("v", 0.0), ("current", 0.0), ("command", OFF_COMMAND)):
+                    view(outputs, name)[:] = value
+
+        return fly
+
+    return engine_of_c(precision, stepped)
+
+
+def _copy(native: Native, reference: Any) -> Any:
+    """A reference of its own: a record's member is a view."""
+    found = native.Reference()
+    ctypes.pointer(found)[0] = reference
+    return found
+
+
+def _call_valid(inputs: Any) -> None:
+    """No sensor calls its reading invalid: the faults of the sample before are over."""
+    for name in ("y_valid", "i_valid"):
+        if hasattr(inputs, name):
+            view(inputs, name)[:] = 1

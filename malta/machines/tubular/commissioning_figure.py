@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from malta.firmware.supervisor import STATES
+from malta.firmware.supervisor import MONITORS, STATES
 from malta.machines.tubular.experiments.commissioning import WITH
+from malta.machines.tubular.experiments.fault_moments import Outcome
 from malta.report.figures.marks import draw_group, draw_largest
 from malta.report.figures.parts import (
     CROSS,
@@ -87,6 +89,8 @@ def _mark_states(axes: Axes, ms: FloatArray, state: FloatArray, *, named: bool) 
 
 def supervised_faults_figure(e: Experiment, _: Published | None = None) -> Figure:
     """The speed at which a bearing is met after each fault, with and without the supervisor; deviations over time."""
+    if any(merit.label == "moments" for merit in e.merits):
+        return _moments_figure(e)
     found = "; ".join(f"{merit.label}: {merit.value:.0f}" for merit in e.merits)
     places = {"left": 0.245, "wspace": 0.24, "top": 0.8}
     figure = new_page(runs_of(e), "faults with and without the supervisor", found, **places)
@@ -122,6 +126,65 @@ def _draw_speeds(axes: Axes, e: Experiment) -> None:
     axes.set_xlim(0, 1.9 * max([speed for speed in speeds if speed >= 0], default=1.0))
 
 
+def _moments_figure(e: Experiment) -> Figure:
+    """Contact speeds, currents and times until it is off of each class of faults, a mark for each moment."""
+    merits = {merit.label: merit for merit in e.merits}
+    alone, supervised = (
+        merit_phrase(merits[f"fastest contact {who}"]) for who in ("alone", "with supervisor")
+    )
+    found = (
+        f"{merits['moments'].value:.0f} moments; fastest contact alone {alone}, with supervisor {supervised}"
+    )
+    places = {"left": 0.24, "right": 0.98, "wspace": 0.12, "top": 0.87}
+    title = "faults at random moments of lift, operation, stroke and landing"
+    figure = new_page(runs_of(e), title, found, **places)
+    panels = figure.subplots(1, 3, sharey=True)
+    classes = {label: [Outcome(*row) for row in rows] for label, rows in e.curves.items()}
+    for n, rows in enumerate(classes.values()):
+        shown: tuple[tuple[list[float], list[float]], ...] = (
+            ([row.speed_alone * 1e3 for row in rows], [row.speed * 1e3 for row in rows]),
+            ([row.current_alone for row in rows], [row.current for row in rows]),
+            ([], [max(row.safe * 1e3, SOONEST) for row in rows]),
+        )
+        for axes, values in zip(panels, shown, strict=True):
+            for supervised_run, marks in zip((False, True), values, strict=True):
+                place = n + (0.18 if supervised_run else -0.18)
+                label = ("with supervisor" if supervised_run else "alone") if n == 0 else None
+                axes.plot(marks, [place] * len(marks), label=label, **MARKS[supervised_run])
+    limit = e.run.plant.actuator.current_limit
+    dashes: dict[str, Any] = {"color": "#2b2b2b", "linewidth": 0.8, "linestyle": "--"}
+    panels[1].axvline(limit, label=f"limit of an axis, {limit:g} A", **dashes)
+    panels[2].set_xscale("log")
+    panels[0].set_yticks(range(len(classes)), [_named(*one) for one in classes.items()], fontsize=7)
+    panels[0].set_ylim(len(classes) - 0.4, -0.6)
+    for axes, label in zip(panels, ("fastest contact [mm/s]", "current of an axis [A]"), strict=False):
+        finish_axes(axes, label, "")
+        axes.set_xlim(-0.03 * axes.get_xlim()[1], 1.05 * axes.get_xlim()[1])
+    panels[2].set_xlim(SOONEST / 1.5, LATEST)
+    finish_axes(panels[2], "off or landed after [ms]", "")
+    panels[2].set_xlim(SOONEST / 1.5, LATEST)
+    add_shared_legend(figure)
+    return figure
+
+
+def _named(label: str, rows: Sequence[Outcome]) -> str:
+    """A class of faults, and below it the monitors that acted last, the most frequent first."""
+    acted = [MONITORS[int(row.monitor)].lower().replace("_", " ") for row in rows if row.monitor >= 0]
+    names = sorted(set(acted), key=lambda name: (-acted.count(name), name))
+    return f"{micro(label)}\n({', '.join(names[:3]) or 'no monitor'})"
+
+
+SOONEST, LATEST = 1e-2, 1e3  # ms, of the axis of times
+MARKS: dict[bool, dict[str, Any]] = {
+    False: {"color": "#2b2b2b", "marker": "x", "markersize": 4, "linestyle": "none"},
+    True: {
+        "color": "#2b2b2b",
+        "marker": "o",
+        "markersize": 4,
+        "linestyle": "none",
+        "markerfacecolor": "#ffffff",
+    },
+}
 LOOKS: dict[bool, dict[str, Any]] = {
     False: {"color": "#2b2b2b"},
     True: {"color": "#ffffff", "edgecolor": "#2b2b2b", "hatch": "////"},

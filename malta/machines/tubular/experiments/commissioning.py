@@ -14,7 +14,9 @@ import numpy as np
 from malta.errors import InputError
 from malta.firmware.supervised import NUMBERS, Flown, Requests, require_compiler, supervised_engine
 from malta.firmware.supervisor import FLYING, State
+from malta.machines.tubular.experiments.contact import SOFT, contact_of
 from malta.machines.tubular.experiments.failures import AT, planned_faults
+from malta.machines.tubular.experiments.fault_moments import fly_moments
 from malta.machines.tubular.experiments.lifting import rest_on_bearing
 from malta.machines.tubular.experiments.strokes import DISTANCE, RISE
 from malta.model.plant import Plant
@@ -37,7 +39,6 @@ if TYPE_CHECKING:
     from malta.model.plant import FloatArray
 
 STROKE, LAND, END = 0.4, 0.5, 0.75  # s: middle of the stroke, request to land, end
-SOFT = 0.05  # m/s: a landing that meets its bearing faster is a touchdown; a fall by 33 um, pulled by the magnets
 LASTING = 0.4  # s, of a run with a fault: room for a landing
 WITH = " (s)"  # in the label of a run with the supervisor
 
@@ -77,14 +78,25 @@ def supervised_faults(
     *,
     during: str = "stroke",
     only: str = "all",
+    moments: int = 0,
     progress: Progress | None = None,
     **options: Any,
 ) -> Experiment:
     """The faults of `faults`, each with the supervisor and without it; `only`: those with this word in their names.
 
     A supervised run has no touchdown where it stays off its bearings, or meets them at the end of a landing, slowly.
+
+    moments : in place of those faults, all classes of fault_moments.py, each at so many random moments of lift,
+        operation, stroke and landing
     """
     _require_own_engine("supervised-faults", options)
+    if moments:
+        if during != "stroke":
+            found = f"{during!r} and {moments} moments"
+            raise InputError(
+                "simulate", "supervised-faults: during", found, "all phases of a flight: without it"
+            )
+        return fly_moments(plant, controller, moments, only, progress, options)
     wanted = planned_faults("supervised-faults", plant, controller, during, options, LASTING)
     chosen = [one for one in wanted if only in ("all", *one.label.split())]
     if not chosen:
@@ -126,23 +138,6 @@ def _require_own_engine(name: str, options: Mapping[str, Any]) -> None:
     if callable(engine) or engine == "virtual machine":
         found = "the exported C" if callable(engine) else repr(engine)
         raise InputError("simulate", f"{name}: engine", found, "auto: the C flies, with its supervisor")
-
-
-def contact_of(run: Trajectory) -> tuple[float, float]:
-    """When a touchdown bearing is met first, s, and how fast at worst, m/s; NaN where it is not. Not at the start.
-
-    Every contact counts, also after a bounce; its speed is that of the sensor planes over the three samples before.
-    """
-    touching = np.atleast_1d((run.contact[:, np.array(run.plant.cushioned)] >= 1).any(axis=1))
-    met = np.flatnonzero(touching[1:] & ~touching[:-1]) + 1
-    if not len(met):
-        return math.nan, math.nan
-    others = [i for i in range(run.p.shape[1]) if i != run.plant.stroke_output]
-    before = np.maximum(met - 3, 0)
-    speeds = np.abs(run.p[met][:, others] - run.p[before][:, others]).max(axis=1) / (
-        run.t[met] - run.t[before]
-    )
-    return float(run.t[met[0]]), float(speeds.max())
 
 
 def _judged(run: Trajectory, flown: Flown, *, from_rest: bool) -> Trajectory:
