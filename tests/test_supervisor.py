@@ -416,7 +416,9 @@ def test_counts_end_where_samples_stand_for_ever() -> None:
 def test_machines_have_the_monitors_that_make_sense() -> None:
     robust, halbach = ({row.key for row in monitors_of(TARGETS[name])} for name in ("robust", "halbach"))
     assert robust == set(MONITORS)
-    currents = {"CURRENT", "OFFSET"} | {f"CURRENT_{key}" for key in ("LOST", "SUM", "FROZEN", "ERROR")}
+    currents = {"CURRENT", "OFFSET"} | {
+        f"CURRENT_{key}" for key in ("LOST", "INFERRED", "SUM", "FROZEN", "ERROR", "EXCESS")
+    }
     assert robust - halbach == currents | {"LINK", "OVERVOLTAGE"}
     assert len(monitor_lines(TARGETS["robust"])) == 1 + len(monitors_of(TARGETS["robust"]))
     assert {state for state, _, _ in TRANSITIONS} == set(STATES)
@@ -671,7 +673,53 @@ def test_one_wrong_current_shows_in_the_sum_of_its_star() -> None:
     bench.step(4, i=i)
     assert bench.now == "OPERATE"
     bench.step(1, i=i)
+    assert (bench.monitor, bench.now) == ("CURRENT_SUM", "LANDING")
+    i[4] += 4.0
+    bench.step(5, i=i)
     assert (bench.monitor, bench.now) == ("CURRENT_SUM", "FAULT")
+
+
+def test_a_current_without_a_reading_is_known_by_its_star() -> None:
+    """The step is that with the reading, to rounding; it lands. Two of a star are unknown: gates off."""
+    for value, valid in ((math.nan, 1.0), (7.0, 0.0)):
+        bench, whole = Bench().fly(), Bench().fly()
+        for one in (bench, whole):
+            one.step(300)
+        i = np.array(bench.currents(view(bench.state.reference, "p")))
+        i[4] = -i[3] - i[5]
+        read, flags = i.copy(), np.ones(18)
+        read[4], flags[4] = value, valid
+        for k in range(4):
+            bench.step(i=read, i_valid=flags)
+            whole.step(i=i)
+            command, expected = (view(b.outputs, "command") for b in (bench, whole))
+            assert command == pytest.approx(expected, abs=1e-9), k
+        assert bench.now == "OPERATE"
+        bench.step(i=read, i_valid=flags)
+        assert (bench.monitor, bench.now) == ("CURRENT_INFERRED", "LANDING")
+        read[5], flags[5] = value, valid
+        bench.step(5, i=read, i_valid=flags)
+        assert (bench.monitor, bench.now) == ("CURRENT_LOST", "FAULT")
+
+
+@pytest.mark.parametrize(("read", "least", "state"), [(0.0, 100, "LANDING"), (7.0, 50, "FAULT")])
+def test_a_current_below_its_command_lands_and_one_beyond_it_is_off(
+    read: float, least: int, state: str
+) -> None:
+    """Without the 3.5 A that are commanded it lands after 100 samples; 3.5 A more turn it off."""
+    bench = Bench().fly()
+    bench.step(300)
+    samples = 0
+    while bench.now == "OPERATE":
+        wanted = np.zeros(len(bench.outputs.current))
+        wanted[0] = 3.5
+        view(bench.supervisor, "current")[:] = wanted
+        noise = 1e-4 * (samples % 2)  # A; currents are not frozen
+        bench.step(i=np.array(bench.phases(np.zeros(5), wanted * read / 3.5 + noise)).ravel())
+        samples += 1
+        assert samples < 200
+    assert (bench.now, bench.monitor) == (state, "CURRENT_ERROR" if read < 3.5 else "CURRENT_EXCESS")
+    assert samples >= least
 
 
 def test_nothing_starts_without_a_link_or_with_too_much() -> None:

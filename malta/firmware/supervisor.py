@@ -74,9 +74,11 @@ MONITORS = (
         "UNSETTLED",
         "UNREADY",
         "CURRENT_LOST",
+        "CURRENT_INFERRED",
         "CURRENT_SUM",
         "CURRENT_FROZEN",
         "CURRENT_ERROR",
+        "CURRENT_EXCESS",
         "OVERVOLTAGE",
         "OVERRUN",
     ),
@@ -96,8 +98,9 @@ OFFSET = 0.02  # largest offset of a current sensor as a share of the current li
 OVERVOLTAGE = 0.2  # share of the link's voltage that is too much
 LOST_CURRENT = 5  # samples without a reading of a current: a loop that acts on an old one drives it away
 UNEVEN = 0.04  # share of the current limit that the currents of a star may add up to, offsets of its sensors included
-# Shares of the current limit by which a current may miss its command on average over MEAN samples: land after MISSING
-# samples, or off at once. Of the faults in `supervised-faults` an open phase alone reaches the first.
+# Shares of the current limit, on average over MEAN samples: by the first a current may miss its command, else it lands
+# after MISSING samples; by the second it may exceed it, else it is off at once. What stays below its command pushes no
+# harder than was meant, and a landing with it is slower than a fall.
 ASTRAY_CURRENT, LOST_CONTROL = 0.1, 0.6
 MEAN = 32.0
 MISSING = 100
@@ -192,6 +195,7 @@ def monitors_of(t: Target) -> tuple[Monitor, ...]:
     b = bounds_of(t)
     checked: tuple[State, ...] = ("SENSORS", *FLYING)
     moving: tuple[State, ...] = ("OPERATE", "HOLD")
+    ground: tuple[State, ...] = ("OFFSETS", "SENSORS")
     off = LOST_CONTROL / ASTRAY_CURRENT * b.deviation
     listed = [
         Monitor("TOUCH", "reading over the bound of a touchdown", 1.0, 5, "LAND", READY),
@@ -216,12 +220,18 @@ def monitors_of(t: Target) -> tuple[Monitor, ...]:
         Monitor("CURRENT", "largest reading of a current, A", b.current, 3, "FAULT", AWAKE),
         Monitor("OFFSET", "largest offset of a current sensor, A", b.offset, 1, "FAULT", ("OFFSETS",)),
         Monitor("CURRENT_LOST", "a current without a reading", 0.5, LOST_CURRENT, "FAULT", AWAKE),
-        Monitor("CURRENT_SUM", "currents of a star together, A", b.uneven, LOST_CURRENT, "FAULT", checked),
+        Monitor("CURRENT_INFERRED", "currents known by their stars", 0.5, LOST_CURRENT, "FAULT", ground),
+        Monitor("CURRENT_INFERRED", "currents known by their stars", 0.5, LOST_CURRENT, "LAND", FLYING),
+        Monitor(
+            "CURRENT_SUM", "currents of a star together, A", b.uneven, LOST_CURRENT, "FAULT", ("SENSORS",)
+        ),
+        Monitor("CURRENT_SUM", "currents of a star together, A", b.uneven, LOST_CURRENT, "LAND", FLYING),
+        Monitor("CURRENT_SUM", "currents of a star together, A", off, LOST_CURRENT, "FAULT", checked),
         Monitor("CURRENT_FROZEN", "samples without change, commands move", FROZEN - 0.5, 1, "FAULT", FLYING),
         Monitor(
             "CURRENT_ERROR", "mean of a current off its command, A", b.deviation, MISSING, "LAND", FLYING
         ),
-        Monitor("CURRENT_ERROR", "mean of a current off its command, A", off, 1, "FAULT", checked),
+        Monitor("CURRENT_EXCESS", "mean of a current beyond its command, A", off, 1, "FAULT", checked),
         Monitor("OVERVOLTAGE", "surplus share of the link voltage", OVERVOLTAGE, 3, "FAULT", AWAKE),
         Monitor("LINK", "missing share of the link voltage", SAGGING, 3, "FAULT", ("OFFSETS", "SENSORS")),
         Monitor("LINK", "missing share of the link voltage", SAGGING, 3, "LAND", ("LIFT",)),
@@ -250,9 +260,13 @@ def absent_monitors(t: Target) -> dict[str, str]:
         (
             not t.driven,
             "the drive has the current loops",
-            ("CURRENT", "OFFSET", "CURRENT_LOST", "CURRENT_ERROR", "OVERVOLTAGE", "LINK"),
+            ("CURRENT", "OFFSET", "CURRENT_LOST", "CURRENT_ERROR", "CURRENT_EXCESS", "OVERVOLTAGE", "LINK"),
         ),
-        (not stars_of(t), "no phases of a star are read", ("CURRENT_SUM", "CURRENT_FROZEN")),
+        (
+            not stars_of(t),
+            "no phases of a star are read",
+            ("CURRENT_INFERRED", "CURRENT_SUM", "CURRENT_FROZEN"),
+        ),
         (unlimited, "forces have no limits", ("HELPLESS", "SATURATION")),
     )
     return {key: reason for absent, reason, keys in listed if absent for key in keys}
@@ -330,7 +344,7 @@ def stars_of(t: Target) -> tuple[tuple[int, ...], ...]:
 
 
 def current_deviations(t: Target) -> ca.Function:
-    """(i, expected readings, commanded currents of the coils) -> how far the currents of the axes are off, A.
+    """(i, expected readings, commanded currents of the coils) -> currents of the axes off their commands and beyond, A.
 
     Readings of phases are turned to axes where the filter expects the machine.
     """
@@ -338,8 +352,10 @@ def current_deviations(t: Target) -> ca.Function:
     i, current = ca.SX.sym("i", len(current_readings(t))), ca.SX.sym("current", len(plant.actuator.coils))
     y = ca.SX.sym("expected", len(plant.outputs))
     axes = drive.to_axes(place_of_readings(plant, y)) @ i if t.fidelity == "phase" else i
-    off = ca.densify(drive.command(current) - axes)
-    return ca.Function("deviation", [i, y, current], [off], ["i", "expected", "current"], ["off"])
+    command = drive.command(current)
+    off, beyond = ca.densify(command - axes), ca.densify(ca.fabs(axes) - ca.fabs(command))
+    names = ["i", "expected", "current"], ["off", "beyond"]
+    return ca.Function("deviation", [i, y, current], [off, beyond], *names)
 
 
 class ReferenceLimits(NamedTuple):

@@ -131,8 +131,10 @@ def supervisor_members(t: Target) -> list[Member]:
         members.append(
             Member("real", "off_mean", len(t.believed.drive.axes), "A, of axes off their commands")
         )
+        members.append(Member("real", "beyond_mean", len(t.believed.drive.axes), "A, of axes beyond them"))
         if stars_of(t):
             members.append(Member("int32_t", "still", len(stars_of(t)), "samples without change of a star"))
+            members.append(Member("int32_t", "inferred", 0, "currents that the others of their stars tell"))
     return members
 
 

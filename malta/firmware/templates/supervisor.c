@@ -119,11 +119,15 @@ void {{ name }}_supervisor_init({{ name }}_supervisor *sup) {
   }
   for (k = 0; k < {{ axes }}; k++) {
     sup->off_mean[k] = {{ zero }};
+    sup->beyond_mean[k] = {{ zero }};
   }
 {% for _ in stars %}
   sup->still[{{ loop.index0 }}] = 0;
 {% endfor %}
   sup->commanded = 0;
+{% endif %}
+{% if stars %}
+  sup->inferred = 0;
 {% endif %}
   forget_sensors(sup);
 }
@@ -277,16 +281,44 @@ static void remember({{ name }}_supervisor *sup, const {{ name }}_reference *r) 
     }
   }
 }
+{% if stars %}
+
+static const int32_t stars[{{ stars | length }}][{{ stars[0] | length }}] = { {% for star in stars %}{ {{ star | join(", ") }} }{{ ", " if not loop.last }}{% endfor %} };
+
+/* A current without a reading is known by the others of its star, which add up to zero with it. */
+static void infer_currents({{ name }}_supervisor *sup, {{ name }}_inputs *seen) {
+  int32_t s;
+  sup->inferred = 0;
+  for (s = 0; s < {{ stars | length }}; s++) {
+    {{ name }}_real sum = {{ zero }};
+    int32_t lost = 0;
+    int32_t which = 0;
+    int32_t j;
+    for (j = 0; j < {{ stars[0] | length }}; j++) {
+      const int32_t k = stars[s][j];
+      if ((is_within(seen->i[k], {{ most }}) == 1) && (seen->i_valid[k] > {{ half }})) {
+        sum = sum + seen->i[k];
+      } else {
+        lost++;
+        which = k;
+      }
+    }
+    if (lost == 1) {
+      seen->i[which] = -sum;
+      seen->i_valid[which] = {{ one }};
+      sup->inferred++;
+    }
+  }
+}
+{% endif %}
 {% if currents %}
 
 /* Levels of the monitors of currents and of the link; no reading of a current is used that is no number. */
 static void look_at_currents({{ name }}_supervisor *sup, const {{ name }}_inputs *in,
                              const {{ name }}_real expected[OUTPUTS],
                              {{ name }}_real level[{{ monitors | length }}][OUTPUTS]) {
-{% if stars %}
-  static const int32_t stars[{{ stars | length }}][{{ stars[0] | length }}] = { {% for star in stars %}{ {{ star | join(", ") }} }{{ ", " if not loop.last }}{% endfor %} };
-{% endif %}
   {{ name }}_real off[{{ axes }}];
+  {{ name }}_real beyond[{{ axes }}];
   int32_t k;
   for (k = 0; k < {{ currents }}; k++) {
     if ((is_within(in->i[k], {{ most }}) == 0) || !(in->i_valid[k] > {{ half }})) {
@@ -300,6 +332,9 @@ static void look_at_currents({{ name }}_supervisor *sup, const {{ name }}_inputs
       level[{{ NAME }}_MONITOR_OFFSET][0] = size_of(sup->offset[k]);
     }
   }
+{% if stars %}
+  level[{{ NAME }}_MONITOR_CURRENT_INFERRED][0] = ({{ name }}_real)sup->inferred;
+{% endif %}
   level[{{ NAME }}_MONITOR_LINK][0] = {{ one }};
   if (is_within(in->link[0], {{ most }}) == 1) {
     level[{{ NAME }}_MONITOR_LINK][0] = {{ one }} - (in->link[0] / {{ link }});
@@ -324,13 +359,19 @@ static void look_at_currents({{ name }}_supervisor *sup, const {{ name }}_inputs
       }
     }
 {% endif %}
-    {{ name }}_deviation(in->i, expected, sup->current, off);
+    {{ name }}_deviation(in->i, expected, sup->current, off, beyond);
     for (k = 0; k < {{ axes }}; k++) {
       /* a link without voltage is told by its own monitor */
-      const {{ name }}_real now = (level[{{ NAME }}_MONITOR_LINK][0] <= {{ sagging }}) ? off[k] : {{ zero }};
+      const bool told = level[{{ NAME }}_MONITOR_LINK][0] <= {{ sagging }};
+      const {{ name }}_real now = told ? off[k] : {{ zero }};
+      const {{ name }}_real more = told ? beyond[k] : {{ zero }};
       sup->off_mean[k] = sup->off_mean[k] + ({{ mean_share }} * (now - sup->off_mean[k]));
+      sup->beyond_mean[k] = sup->beyond_mean[k] + ({{ mean_share }} * (more - sup->beyond_mean[k]));
       if (size_of(sup->off_mean[k]) > level[{{ NAME }}_MONITOR_CURRENT_ERROR][0]) {
         level[{{ NAME }}_MONITOR_CURRENT_ERROR][0] = size_of(sup->off_mean[k]);
+      }
+      if (sup->beyond_mean[k] > level[{{ NAME }}_MONITOR_CURRENT_EXCESS][0]) {
+        level[{{ NAME }}_MONITOR_CURRENT_EXCESS][0] = sup->beyond_mean[k];
       }
     }
     for (k = 0; k < {{ currents }}; k++) {
@@ -939,6 +980,9 @@ void {{ name }}_supervisor_step({{ name }}_supervisor *sup, {{ name }}_state *s,
       seen.i[k] = in->i[k] - sup->offset[k];
     }
   }
+{% endif %}
+{% if stars %}
+  infer_currents(sup, &seen);
 {% endif %}
   expect(sup, s, in, expected);
   look(sup, &seen, request, expected, level);

@@ -182,10 +182,10 @@ static void take_over(record *all) {
 
 {% if driven %}
 /* Faults of currents and of the link; n: samples since the fault began. */
-static void disturb_currents(flight *f, int32_t monitor, int32_t n) {
+static void disturb_currents(flight *f, const {{ name }}_monitor *row, int32_t n) {
   static {{ name }}_real held[{{ currents }}];
   int32_t k;
-  switch (monitor) {
+  switch (row->monitor) {
   case {{ NAME }}_MONITOR_CURRENT:
     f->in.i[n % {{ currents }}] = {{ over.current }};
     break;
@@ -193,6 +193,15 @@ static void disturb_currents(flight *f, int32_t monitor, int32_t n) {
     f->in.i[0] = {{ over.offset }};
     break;
   case {{ NAME }}_MONITOR_CURRENT_LOST:
+    for (k = 0; k < {{ currents }}; k++) {
+      if ((n % 2) == 0) {
+        f->in.i[k] = ({{ name }}_real)NAN;
+      } else {
+        f->in.i_valid[k] = {{ zero }};
+      }
+    }
+    break;
+  case {{ NAME }}_MONITOR_CURRENT_INFERRED:
     if ((n % 2) == 0) {
       f->in.i[0] = ({{ name }}_real)NAN;
     } else {
@@ -200,7 +209,7 @@ static void disturb_currents(flight *f, int32_t monitor, int32_t n) {
     }
     break;
   case {{ NAME }}_MONITOR_CURRENT_SUM:
-    f->in.i[0] = f->in.i[0] + {{ over.uneven }};
+    f->in.i[0] = f->in.i[0] + ((row->threshold > {{ over.uneven }}) ? {{ over.leaking }} : {{ over.uneven }});
     break;
   case {{ NAME }}_MONITOR_CURRENT_FROZEN:
     for (k = 0; k < {{ currents }}; k++) {
@@ -338,13 +347,15 @@ static void fly_with_fault(record *all, flight *f, const {{ name }}_monitor *row
   {{ name }}_request request = nothing;
 {% if driven %}
   if (row->monitor == {{ NAME }}_MONITOR_CURRENT_ERROR) { /* currents that are not those of the command */
-    const bool slight = row->reaction == {{ NAME }}_REACTION_LAND;
-    f->out.current[0] = f->out.current[0] + (slight ? {{ over.astray_current }} : {{ over.lost_control }});
+    f->out.current[0] = f->out.current[0] + {{ over.astray_current }};
+  }
+  if (row->monitor == {{ NAME }}_MONITOR_CURRENT_EXCESS) {
+    f->out.current[0] = f->out.current[0] + {{ over.lost_control }};
   }
 {% endif %}
   read_machine(f);
 {% if driven %}
-  disturb_currents(f, row->monitor, n);
+  disturb_currents(f, row, n);
 {% endif %}
   disturb_sensors(f, row->monitor, k, n);
   disturb_states(f, row->monitor, k);
