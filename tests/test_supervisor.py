@@ -722,6 +722,30 @@ def test_a_current_below_its_command_lands_and_one_beyond_it_is_off(
     assert samples >= least
 
 
+def test_a_sensor_that_sticks_in_a_lift_is_found_while_the_reference_goes_16_deviations() -> None:
+    """And none is ignored in a lift and a landing without a fault."""
+    bench = Bench()
+    while bench.now != "LIFT":
+        bench.step(start=1)
+        bench.step()
+    bench.step(450)
+    held, began = float(view(bench.inputs, "y")[1]), float(view(bench.state.reference, "p")[1])
+    for _ in range(40):
+        bench.step(y={1: held})
+        if bench.supervisor.unbelieved[1] > 0:
+            break
+    gone = abs(float(view(bench.state.reference, "p")[1]) - began)
+    assert 15e-6 > gone > 16 * bounds_of(bench.t).sigma[1] > 8e-6
+    healthy = Bench(seed=2)
+    stuck = [row.key for row in monitors_of(healthy.t)].index("STUCK")
+    while healthy.now != "OPERATE":
+        healthy.step(start=1, operate=1)
+        healthy.step(operate=1)
+    healthy.step(6000, land=1)
+    assert healthy.seen[-2:] == ["LANDING", "OFF"]
+    assert healthy.supervisor.acted[stuck] == 0
+
+
 def test_nothing_starts_without_a_link_or_with_too_much() -> None:
     for link, monitor in ((0.0, "LINK"), (30.0, "LINK"), (math.nan, "LINK"), (60.0, "OVERVOLTAGE")):
         bench = Bench()

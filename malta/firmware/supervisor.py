@@ -88,6 +88,9 @@ MONITORS = (
 MOST_RATE = 1e6  # of a reference, per s and s^2: beyond, single precision has no room
 TOUCH = 0.7  # share of a clearance: two outputs at it are not beyond the clearance of a round bearing
 JUMP = 8.0  # standard deviations of readings that a jump, an innovation or a returning reading may have
+# A reading that repeats so often while the reference of a lift or a landing goes so many of its standard deviations is
+# stuck: within the time that noise allows, a law that follows such a reading throws the machine against its bearing.
+REPEATS, UNMOVED = 12, 16.0
 FALSE_ALARM = 1e-15  # probability at a sample that working sensors repeat a value as long as a stuck one
 DISTURBED = 0.05  # share of the largest acceleration by which a machine may leave what the filter expects
 STOPPING = 0.2  # share of the largest acceleration with which references stop
@@ -144,6 +147,7 @@ class Bounds:
     range: FloatArray  # p, of readings: see signals.reading_ranges
     jump: FloatArray  # p, of readings from sample to sample
     sigma: FloatArray  # p, standard deviation of a reading, with its resolution
+    unmoved: FloatArray  # p, of references while a reading repeats
     settled: FloatArray  # p, of errors
     drift: FloatArray  # p, of what the filter expects without readings, per sample^2
     stopping: FloatArray  # p, per s^2, of a reference that stops
@@ -172,6 +176,7 @@ def bounds_of(t: Target) -> Bounds:
     known = np.where(sigma > 0, sigma, np.inf)
     quiet = np.where(np.isfinite(touch), 0.01 * touch, np.minimum(reading_ranges(plant), 1.0) / 100)
     stopping = np.where(np.isfinite(acceleration), STOPPING * acceleration, np.inf)
+    stuck = tuple(_repetitions([p]) for p in repetition_probabilities(plant))
     return Bounds(
         touch=touch,
         range=reading_ranges(plant),
@@ -180,7 +185,8 @@ def bounds_of(t: Target) -> Bounds:
         settled=np.where(sigma > 0, SETTLED * sigma, quiet),
         drift=np.where(np.isfinite(acceleration), DISTURBED / 2 * acceleration * c.sample_time**2, np.inf),
         stopping=stopping,
-        stuck=tuple(_repetitions([p]) for p in repetition_probabilities(plant)),
+        unmoved=np.where(np.array(stuck) < LONG, UNMOVED * known, np.inf),
+        stuck=stuck,
         stale=_repetitions(repetition_probabilities(plant)),
         unbelieved=_samples_without_reading(c),
         current=OVER * largest_reading(t),
@@ -203,7 +209,7 @@ def monitors_of(t: Target) -> tuple[Monitor, ...]:
         Monitor("RATE", "jump of a reading over what the machine can do", 1.0, 1, "IGNORE", FLYING),
         Monitor("INNOVATION", "|y - h(xi_pred)| over sigma", JUMP, 20, "HOLD", moving),
         Monitor("INNOVATION", "|y - h(xi_pred)| over sigma", JUMP, 400, "LAND", moving),
-        Monitor("STUCK", "repetitions over what noise allows", 1.0, 1, "IGNORE", checked),
+        Monitor("STUCK", "repetitions over what noise or motion allow", 1.0, 1, "IGNORE", checked),
         Monitor("STALE", "repetitions of all sensors at once", b.stale - 0.5, 1, "IGNORE", checked),
         Monitor("NAN", "no number, or called invalid", 0.5, 1, "IGNORE", checked),
         Monitor("UNBELIEVED", "a sensor is ignored", 0.5, BRIDGED, "HOLD", moving),

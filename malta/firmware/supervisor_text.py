@@ -24,6 +24,7 @@ from malta.firmware.supervisor import (
     MONITORS,
     MOST_RATE,
     REACTIONS,
+    REPEATS,
     SAGGING,
     STATES,
     TIMES,
@@ -108,6 +109,7 @@ def supervisor_members(t: Target) -> list[Member]:
         Member("int32_t", "steady", 0, "samples in a row of what the state waits for"),
         Member("int32_t", "count", rows * p, "samples in a row over the threshold, of each row and output"),
         Member("int32_t", "repeated", p, "samples for which a reading has been the same"),
+        Member("real", "since", p, "references when readings changed last"),
         Member("int32_t", "unchanged", 0, "the same of all readings"),
         Member("real", "rest", p, "readings of the machine at rest"),
         Member("real", "last", p, "last readings"),
@@ -206,8 +208,9 @@ def _context(t: Target, name: str) -> dict[str, Any]:
 def _bounds(t: Target) -> dict[str, str]:
     """The limits of the outputs."""
     b = bounds_of(t)
-    names = ("touch", "range", "jump", "sigma", "settled", "drift", "stopping")
-    return {name: _vector(getattr(b, name), t) for name in names} | {"stuck": ", ".join(map(str, b.stuck))}
+    names = ("touch", "range", "jump", "sigma", "unmoved", "settled", "drift", "stopping")
+    stuck = {"stuck": ", ".join(map(str, b.stuck)), "repeats": str(REPEATS)}
+    return {name: _vector(getattr(b, name), t) for name in names} | stuck
 
 
 def _filters(t: Target, name: str) -> dict[str, Any]:

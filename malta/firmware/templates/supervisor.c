@@ -66,6 +66,7 @@ static void forget_sensors({{ name }}_supervisor *sup) {
   for (k = 0; k < OUTPUTS; k++) {
     sup->unbelieved[k] = 0;
     sup->repeated[k] = 0;
+    sup->since[k] = {{ zero }};
     sup->limited[k] = {{ zero }};
     sup->noise[k] = {{ zero }};
   }
@@ -177,13 +178,28 @@ static void expect(const {{ name }}_supervisor *sup, const {{ name }}_state *s, 
   }
 }
 
+/* A sensor that repeats a reading, as a share of what noise allows; or of the way that its reference has gone since. */
+static {{ name }}_real stuck_level({{ name }}_supervisor *sup, {{ name }}_real reference, int32_t k) {
+  static const int32_t same_values[OUTPUTS] = { {{ stuck }} }; /* in a row, from which on a sensor is stuck */
+  static const {{ name }}_real unmoved[OUTPUTS] = { {{ unmoved }} };
+  {{ name }}_real level = ({{ name }}_real)sup->repeated[k] / ({{ name }}_real)same_values[k];
+  if (sup->repeated[k] == 0) {
+    sup->since[k] = reference;
+  }
+  if (((sup->state == {{ NAME }}_LIFT) || (sup->state == {{ NAME }}_LANDING)) && (sup->repeated[k] >= {{ repeats }})) {
+    const {{ name }}_real gone = size_of(reference - sup->since[k]) / unmoved[k];
+    level = (gone > level) ? gone : level;
+  }
+  return level;
+}
+
 /* Levels of the monitors of each position sensor. */
 static void look_at_sensor({{ name }}_supervisor *sup, const {{ name }}_inputs *in, int32_t missed, int32_t k,
-                           {{ name }}_real expected, {{ name }}_real level[{{ monitors | length }}][OUTPUTS]) {
+                           {{ name }}_real expected, {{ name }}_real reference,
+                           {{ name }}_real level[{{ monitors | length }}][OUTPUTS]) {
   static const {{ name }}_real jump[OUTPUTS] = { {{ jump }} }; /* from sample to sample */
   static const {{ name }}_real sigma[OUTPUTS] = { {{ sigma }} }; /* of a reading */
   static const {{ name }}_real drift[OUTPUTS] = { {{ drift }} }; /* of what the filter expects alone, per sample^2 */
-  static const int32_t same_values[OUTPUTS] = { {{ stuck }} }; /* in a row, from which on a sensor is stuck */
   const {{ name }}_real y = in->y[k];
   const int32_t is_number = is_within(y, {{ most }});
   if ((is_number == 1) && (in->y_valid[k] > {{ half }})) { /* a NaN is no yes */
@@ -200,7 +216,7 @@ static void look_at_sensor({{ name }}_supervisor *sup, const {{ name }}_inputs *
     near_expected = ({{ believed }} * (sigma[k] * more)) + grown;
     sup->repeated[k] = (y == sup->last[k]) ? one_more(sup->repeated[k]) : 0;
     level[{{ NAME }}_MONITOR_RANGE][k] = size_of(y) / range[k];
-    level[{{ NAME }}_MONITOR_STUCK][k] = ({{ name }}_real)sup->repeated[k] / ({{ name }}_real)same_values[k];
+    level[{{ NAME }}_MONITOR_STUCK][k] = stuck_level(sup, reference, k);
     if (sup->unbelieved[k] == 0) {
       const int32_t steps = missed + 1;
       level[{{ NAME }}_MONITOR_TOUCH][k] = size_of(y) / near_touch[k];
@@ -216,6 +232,7 @@ static void look_at_sensor({{ name }}_supervisor *sup, const {{ name }}_inputs *
   } else {
     level[{{ NAME }}_MONITOR_NAN][k] = {{ one }};
     sup->repeated[k] = 0;
+    sup->since[k] = reference;
   }
 }
 
@@ -382,8 +399,9 @@ static void look_at_currents({{ name }}_supervisor *sup, const {{ name }}_inputs
 {% endif %}
 
 /* Levels of all monitors at a sample. */
-static void look({{ name }}_supervisor *sup, const {{ name }}_inputs *in, const {{ name }}_request *request,
-                 const {{ name }}_real expected[OUTPUTS], {{ name }}_real level[{{ monitors | length }}][OUTPUTS]) {
+static void look({{ name }}_supervisor *sup, const {{ name }}_state *s, const {{ name }}_inputs *in,
+                 const {{ name }}_request *request, const {{ name }}_real expected[OUTPUTS],
+                 {{ name }}_real level[{{ monitors | length }}][OUTPUTS]) {
   const int32_t missed = missed_of(request);
   int32_t k;
   int32_t m;
@@ -393,7 +411,7 @@ static void look({{ name }}_supervisor *sup, const {{ name }}_inputs *in, const 
     }
   }
   for (k = 0; k < OUTPUTS; k++) {
-    look_at_sensor(sup, in, missed, k, expected[k], level);
+    look_at_sensor(sup, in, missed, k, expected[k], s->reference.p[k], level);
     level[{{ NAME }}_MONITOR_SATURATION][k] = sup->limited[k];
     if (is_flying(sup->state) == 1) {
       level[{{ NAME }}_MONITOR_ASTRAY][k] = (is_within(expected[k], range[k]) == 1) ? {{ zero }} : {{ two }};
@@ -774,6 +792,7 @@ static void change_state({{ name }}_supervisor *sup, {{ name }}_state *s, const 
       int32_t k;
       for (k = 0; k < OUTPUTS; k++) {
         s->reference.p[k] = sup->rest[k];
+        sup->since[k] = sup->rest[k];
         s->reference.dp[k] = {{ zero }};
         s->reference.ddp[k] = {{ zero }};
       }
@@ -985,7 +1004,7 @@ void {{ name }}_supervisor_step({{ name }}_supervisor *sup, {{ name }}_state *s,
   infer_currents(sup, &seen);
 {% endif %}
   expect(sup, s, in, expected);
-  look(sup, &seen, request, expected, level);
+  look(sup, s, &seen, request, expected, level);
   reaction = judge(sup, level);
   if ((sup->state == {{ NAME }}_SENSORS) && (sup->steady > 0)) {
     average_rest(sup);
