@@ -674,9 +674,6 @@ def test_one_wrong_current_shows_in_the_sum_of_its_star() -> None:
     assert bench.now == "OPERATE"
     bench.step(1, i=i)
     assert (bench.monitor, bench.now) == ("CURRENT_SUM", "LANDING")
-    i[4] += 4.0
-    bench.step(5, i=i)
-    assert (bench.monitor, bench.now) == ("CURRENT_SUM", "FAULT")
 
 
 def test_a_current_without_a_reading_is_known_by_its_star() -> None:

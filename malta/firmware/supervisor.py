@@ -232,7 +232,6 @@ def monitors_of(t: Target) -> tuple[Monitor, ...]:
             "CURRENT_SUM", "currents of a star together, A", b.uneven, LOST_CURRENT, "FAULT", ("SENSORS",)
         ),
         Monitor("CURRENT_SUM", "currents of a star together, A", b.uneven, LOST_CURRENT, "LAND", FLYING),
-        Monitor("CURRENT_SUM", "currents of a star together, A", off, LOST_CURRENT, "FAULT", checked),
         Monitor("CURRENT_FROZEN", "samples without change, commands move", FROZEN - 0.5, 1, "FAULT", FLYING),
         Monitor(
             "CURRENT_ERROR", "mean of a current off its command, A", b.deviation, MISSING, "LAND", FLYING

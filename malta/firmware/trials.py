@@ -120,7 +120,6 @@ def _faults(t: Target, per_unit: FloatArray) -> dict[str, str]:
             "current": [1.5 * b.current],
             "offset": [3 * b.offset],
             "uneven": [3 * b.uneven],
-            "leaking": [0.9 * largest],
             "link": [1.5 * t.believed.drive.link_voltage],
             "astray_current": [0.3 * largest],
             "lost_control": [0.9 * largest],

@@ -182,10 +182,10 @@ static void take_over(record *all) {
 
 {% if driven %}
 /* Faults of currents and of the link; n: samples since the fault began. */
-static void disturb_currents(flight *f, const {{ name }}_monitor *row, int32_t n) {
+static void disturb_currents(flight *f, int32_t monitor, int32_t n) {
   static {{ name }}_real held[{{ currents }}];
   int32_t k;
-  switch (row->monitor) {
+  switch (monitor) {
   case {{ NAME }}_MONITOR_CURRENT:
     f->in.i[n % {{ currents }}] = {{ over.current }};
     break;
@@ -209,7 +209,7 @@ static void disturb_currents(flight *f, const {{ name }}_monitor *row, int32_t n
     }
     break;
   case {{ NAME }}_MONITOR_CURRENT_SUM:
-    f->in.i[0] = f->in.i[0] + ((row->threshold > {{ over.uneven }}) ? {{ over.leaking }} : {{ over.uneven }});
+    f->in.i[0] = f->in.i[0] + {{ over.uneven }};
     break;
   case {{ NAME }}_MONITOR_CURRENT_FROZEN:
     for (k = 0; k < {{ currents }}; k++) {
@@ -355,7 +355,7 @@ static void fly_with_fault(record *all, flight *f, const {{ name }}_monitor *row
 {% endif %}
   read_machine(f);
 {% if driven %}
-  disturb_currents(f, row, n);
+  disturb_currents(f, row->monitor, n);
 {% endif %}
   disturb_sensors(f, row->monitor, k, n);
   disturb_states(f, row->monitor, k);
