@@ -9,14 +9,16 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import ROOT
+from figure_checks import defects, texts_of
 
 import malta
 from malta.errors import InputError
 from malta.firmware.supervisor import MONITORS
+from malta.machines.tubular.commissioning_figure import supervised_faults_figure
 from malta.machines.tubular.experiments.contact import SOFT
-from malta.machines.tubular.experiments.fault_moments import KINDS, PHASES, Outcome, draw_blows
+from malta.machines.tubular.experiments.fault_moments import KINDS, PHASES, Outcome, draw_blows, totals_of
 from malta.simulation.compiled import compiler
-from malta.simulation.experiments import Experiment
+from malta.simulation.experiments import Case, Experiment
 from malta.synthesis.controller import Controller
 
 OVER = 1.02  # a current loop passes its limit by that while it settles
@@ -74,6 +76,25 @@ def test_moments_are_in_turn_in_all_phases_and_do_not_depend_on_other_classes() 
     assert all(PHASES[b.phase][0] <= b.at <= PHASES[b.phase][1] for b in drawn)
     assert {b.scale for b in drawn if b.sensor == plant.stroke_output} == {10.0}
     assert [b.at for _, b in draw_blows(plant, KINDS[:1], 5, seed=4)] != [b.at for b in drawn[:5]]
+
+
+def test_its_figure_has_a_mark_for_each_moment_and_no_defects() -> None:
+    plant, rng = malta.plant_of(robust().parameters), np.random.default_rng(1)
+    hold = malta.Scenario("hold", 2e-3, malta.references.hold)
+    run = malta.simulate(plant, robust(), hold)
+    rows = {kind.label: rng.uniform(0.01, 0.3, (5, len(Outcome._fields))) for kind in KINDS}
+    for n, found in enumerate(rows.values()):
+        found[:, -1] = n
+        found[0, -2] = math.nan  # it flies on
+    merits = totals_of(rows)
+    e = Experiment("supervised-faults", "?", (Case("worst", run, merits[:1]),), merits, rows)
+    figure = supervised_faults_figure(e)
+    assert defects(figure) == []
+    for panel, of_class in zip(figure.axes, (2, 2, 1), strict=True):
+        marks = [line for line in panel.lines if line.get_linestyle() == "None" and np.size(line.get_xdata())]
+        assert len(marks) == of_class * len(KINDS)
+    assert "sensor lost\n(touch)" in texts_of(figure)
+    assert f"fastest contact alone {1e3 * merits[3].value:.0f} mm/s" in " ".join(texts_of(figure))
 
 
 @pytest.mark.slow

@@ -213,7 +213,7 @@ def fly_moments(
     cases = tuple(Case(label, run, _merits(rows[label])) for label, run in worst.items())
     curves = {label: np.array(found, dtype=float) for label, found in rows.items()}
     question = "How fast does it touch down, which currents flow, when is it off? (s): supervised"
-    return Experiment("supervised-faults", question, cases, _totals(curves), curves, interrupted=cut)
+    return Experiment("supervised-faults", question, cases, totals_of(curves), curves, interrupted=cut)
 
 
 def _chosen(only: str, moments: int, options: Mapping[str, Any]) -> list[Kind]:
@@ -371,7 +371,7 @@ def _merits(rows: Sequence[Outcome]) -> tuple[Merit, ...]:
     )
 
 
-def _totals(curves: Mapping[str, FloatArray]) -> tuple[Merit, ...]:
+def totals_of(curves: Mapping[str, FloatArray]) -> tuple[Merit, ...]:
     """Of all classes together."""
     rows = [Outcome(*row) for found in curves.values() for row in found]
     alone, supervised = (
