@@ -665,7 +665,9 @@ def test_missing_file_and_folder_are_refused(tmp_path: Path, suffix: str) -> Non
 
 
 def test_name_with_a_null_byte_is_refused() -> None:
-    with pytest.raises(malta.InputError, match=r"found a null byte in its name, expected a readable gain file$"):
+    with pytest.raises(
+        malta.InputError, match=r"found a null byte in its name, expected a readable gain file$"
+    ):
         gains.read("a\0.json")
 
 
