@@ -4,7 +4,7 @@
 #if defined(__clang__)
 #pragma STDC FP_CONTRACT OFF
 #elif defined(__GNUC__)
-#pragma GCC optimize("fp-contract=off", "no-math-errno")
+#pragma GCC optimize("fp-contract=off")
 #if defined(__FMA__) || defined(__FMA4__) /* gcc 12 fuses products and alternating sums of vectors all the same */
 #pragma GCC optimize("no-tree-vectorize")
 #endif

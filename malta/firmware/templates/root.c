@@ -1,7 +1,8 @@
 #ifndef {{ NAME }}_ROOT
 #define {{ NAME }}_ROOT
-/* The square root, correctly rounded: by the processor where it has one, else bit by bit; 0 of all that is not positive. */
-#if defined(__SSE2__) || defined(__aarch64__) || defined(__riscv_flen){{ arm_fpu }}
+/* The square root, correctly rounded; 0 of all that is not positive. By the processor where it has one and -fno-math-errno
+   says that nobody asks for errno: else compilers add a call of the library. Otherwise bit by bit: the same result. */
+#if defined(__NO_MATH_ERRNO__) && (defined(__SSE2__) || defined(__aarch64__) || defined(__riscv_flen){{ arm_fpu }})
 static {{ name }}_real {{ name }}_root({{ name }}_real x) { return (x > {{ zero }}) ? {{ builtin_root }}(x) : {{ zero }}; }
 #else
 static {{ name }}_real {{ name }}_root({{ name }}_real x) {
