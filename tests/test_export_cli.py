@@ -252,3 +252,28 @@ def test_every_shipped_design_exports_in_both_precisions(name: str, tmp_path: Pa
     report = (out / "REPORT.md").read_text(encoding="utf-8")
     assert "With the coefficients that single precision holds" in report
     assert "% is proven" in report
+
+
+def test_the_report_counts_by_the_clock_of_the_processor(tmp_path: Path, run: Run) -> None:
+    """The share of a sample is that of instructions over the clock: a tenth of the clock, ten times the share."""
+    found = []
+    for clock in ("2MHz", "0.2 MHz", None):
+        out = tmp_path / str(clock)
+        options = () if clock is None else ("--clock", clock)
+        code, _, err = run("export", "design/gains/halbach.json", "--no-proof", "--out", out, *options)
+        assert (code, err) == (0, "")
+        text = (out / "REPORT.md").read_text(encoding="utf-8")
+        found.append(re.findall(r"at ([\d.]+) MHz, one a clock|([\d.]+) % \|$", text, re.MULTILINE))
+    assert [rows[0][0] for rows in found] == ["2", "0.2", "667"]
+    for slow, slower in zip(found[0][1:], found[1][1:], strict=True):
+        assert float(slower[1]) == pytest.approx(10 * float(slow[1]), abs=0.6)
+
+
+@pytest.mark.parametrize("clock", ["fast", "0MHz", "nanHz", "5kg", "2000GHz", "-3Hz"])
+def test_a_clock_that_is_none_is_one_sentence(tmp_path: Path, run: Run, clock: str) -> None:
+    code, out, err = run("export", "design/gains/halbach.json", "--out", tmp_path / "c", "--clock", clock)
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert "clock" in err
+    assert not (tmp_path / "c").exists()
+    code, _, err = run("export", "design/gains/halbach.json", "--to", "fmu", "--clock", "1MHz")
+    assert (code, "1MHz of an FMU" in err) == (2, True)

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Annotated, Any, cast, get_args
 
 import typer
 
+from malta.cli.assignments import NUMBER
 from malta.cli.inputs import read_controller
 from malta.cli.options import AsJson, GainFile, MachineFile
 from malta.cli.output import make_console, print_document, print_note, print_written, working
 from malta.errors import InputError
+from malta.units import to_si
 
 
 def export(
@@ -35,6 +38,10 @@ def export(
     proof: Annotated[
         bool, typer.Option(help="Prove the margin again with the coefficients that float holds.")
     ] = True,
+    clock: Annotated[
+        str | None,
+        typer.Option(help="Of the processor, for the report's share of a sample: 168MHz. [667MHz]"),
+    ] = None,
     machine: MachineFile = None,
     as_json: AsJson = False,
 ) -> None:
@@ -49,7 +56,8 @@ def export(
     """
     from malta.firmware.exports import export_c, export_fmu
 
-    _require_known(to, precision, until, part, fmi)
+    _require_known(to, precision, until, part, fmi, clock)
+    hertz = None if clock is None else _frequency(clock)
     controller = read_controller(gains, machine)
     chosen: Any = {"until": until}
     if to == "fmu":
@@ -65,7 +73,9 @@ def export(
             print_note("proving the margin with the coefficients that float holds; --no-proof leaves it out")
         folder = out or Path("build") / f"{controller.name}_c"
         with working("exporting"):
-            files = export_c(gains, folder, precision=cast("Any", precision), proof=proof, **chosen)
+            files = export_c(
+                gains, folder, precision=cast("Any", precision), proof=proof, clock=hertz, **chosen
+            )
     if as_json:
         from malta.cli.documents.others import ExportOutput
 
@@ -75,7 +85,17 @@ def export(
         print_written(make_console(), files)
 
 
-def _require_known(to: str, precision: str, until: str | None, part: str | None, fmi: int | None) -> None:
+def _frequency(text: str) -> float:
+    """A clock in Hz. Raises InputError for another text."""
+    number = re.fullmatch(NUMBER, text.strip())
+    if number is None:
+        raise InputError("--clock", "", repr(text), "a frequency, as 168MHz")
+    return to_si(float(number[1]), number[2] or "Hz", "Hz", "--clock", "clock")
+
+
+def _require_known(
+    to: str, precision: str, until: str | None, part: str | None, fmi: int | None, clock: str | None
+) -> None:
     """Raise InputError for an option with a value that there is not, or that the form does not have."""
     from malta.firmware.elementary import Precision
     from malta.firmware.exports import Until
@@ -91,6 +111,8 @@ def _require_known(to: str, precision: str, until: str | None, part: str | None,
         if value not in known:
             expected = " or ".join(str(one) for one in known if one is not None)
             raise InputError(name, "", repr(value), expected)
+    if to == "fmu" and clock is not None:
+        raise InputError("--clock", "", f"{clock} of an FMU", "--to c")
     if to == "fmu" and precision != "double":
         raise InputError("--precision", "", f"{precision} of an FMU", "double")
     for name, given in (("--part", part), ("--fmi", fmi)):

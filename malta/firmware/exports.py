@@ -14,9 +14,11 @@ from malta.firmware.signals import Target, fidelity_of
 from malta.firmware.unit import Part
 from malta.gains.file import content_of, read
 from malta.model.data import plant_of
+from malta.proof.arguments import positive
 from malta.simulation.layout import Fidelity
 from malta.synthesis.controller import Controller
 
+FASTEST = 1e12  # Hz, of a clock
 Until = Literal["currents", "duty-cycles"]
 
 
@@ -27,6 +29,7 @@ def export_c(
     precision: Precision = "double",
     until: Until | None = None,
     proof: bool = True,
+    clock: float | None = None,
 ) -> list[Path]:
     """Write the controller of a gain file as a folder of C99 with its test and a report.
 
@@ -35,10 +38,12 @@ def export_c(
     precision : of all numbers, "double" or "float"
     until : how far down the C goes: "currents" or "duty-cycles"; None: as far as the machine is modelled
     proof : prove the margin again with the coefficients that single precision holds
+    clock : of the processor, Hz, with which the report turns instructions into a share of the sample; None: 667 MHz
 
     Returns the files.
 
-    Raises InputError for a folder that has files, an unknown precision, and duty cycles of a machine without windings.
+    Raises InputError for a clock that is not above 0, a folder that has files, an unknown precision, and duty cycles of
+    a machine without windings.
 
     >>> import malta
     >>> gains = "design/gains/tubular_pid.json"
@@ -47,10 +52,13 @@ def export_c(
     ['tubular_pid.h', 'tubular_pid_supervisor.h']
     """
     path = locate(gains)
+    if clock is not None:
+        positive("export", "clock", clock, below=FASTEST)
     target = _target(read(path), precision, until)
     folder, content = require_empty(Path(out)), content_of(path)[0]
     robust = content.verification.robust
-    texts = folder_files(target, content.sha256, {} if robust is None else robust.uncertainty, proof=proof)
+    uncertainty = {} if robust is None else robust.uncertainty
+    texts = folder_files(target, content.sha256, uncertainty, proof=proof, clock=clock)
     files = {folder / name: text.encode() for name, text in sorted(texts.items())}
     replace_files(files)
     return list(files)

@@ -31,12 +31,18 @@ EXAMPLE_SAMPLES = 10_000  # of the example's main program, beside its stroke
 
 
 def folder_files(
-    t: Target, sha256: str, uncertainty: Mapping[str, float] | None = None, *, proof: bool = True
+    t: Target,
+    sha256: str,
+    uncertainty: Mapping[str, float] | None = None,
+    *,
+    proof: bool = True,
+    clock: float | None = None,
 ) -> dict[str, str]:
     """Every file of an export by its name.
 
     sha256 : of the gain file
     uncertainty : of the gain file's margin; proof : whether the report proves it again with rounded coefficients
+    clock : Hz, of the processor that the report thinks of; None: that of the paper
 
         files = folder_files(Target(controller, "float"), sha256)
     """
@@ -58,7 +64,7 @@ def folder_files(
         "CMakeLists.txt": render("CMakeLists.txt", context),
     }
     context["monitors"] = monitor_lines(t)
-    report = report_text(t, context, list(files), dict(uncertainty or {}), proof=proof)
+    report = report_text(t, context, list(files), dict(uncertainty or {}), proof=proof, clock=clock)
     return files | {"REPORT.md": report}
 
 

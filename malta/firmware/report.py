@@ -30,11 +30,18 @@ FILES = {
 
 
 def report_text(
-    t: Target, context: Mapping[str, Any], files: list[str], uncertainty: dict[str, float], *, proof: bool
+    t: Target,
+    context: Mapping[str, Any],
+    files: list[str],
+    uncertainty: dict[str, float],
+    *,
+    proof: bool,
+    clock: float | None = None,
 ) -> str:
     """The text of REPORT.md.
 
-    files : names of the folder's files; uncertainty : of the gain file's margin; proof : whether to prove it again
+    files : names of the folder's files; uncertainty : of the gain file's margin; proof : whether to prove it again;
+        clock : Hz, of the processor; None: CLOCK
     """
     found = costs(t)
     missing = [p.prefix.rstrip("-") for p in PROCESSORS if p.name not in {c.processor for c in found}]
@@ -46,7 +53,7 @@ def report_text(
             "file_list": [(f, FILES.get(f.removeprefix(name), "")) for f in sorted(files)],
             "operations": operations(t),
             "costs": found,
-            "clock": CLOCK,
+            "clock": clock or CLOCK,
             "sample_seconds": t.controller.sample_time,
             "missing": f"Not found here, so not counted: {', '.join(missing)}." if missing else "",
             "rounding_text": _rounding_text(t),
