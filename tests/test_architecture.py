@@ -12,34 +12,13 @@ from graphlib import TopologicalSorter
 from pathlib import Path
 
 from conftest import ROOT
+from house import ORDER as PACKAGES
 
 import malta
 
 # Each may import those before it; machines stand where nobody generic imports them.
-ORDER = (
-    *(
-        "errors",
-        "identifiers",
-        "units",
-        "interrupts",
-        "files",
-        "archives",
-        "tables",
-        "threads",
-        "display",
-        "model",
-        "synthesis",
-        "proof",
-        "loops",
-        "margins",
-        "gains",
-        "schemas",
-        "simulation",
-        "firmware",
-        "campaigns",
-    ),
-    *("tuning", "report", "app", "machines", "cli"),
-)
+GROUND = ("errors", "identifiers", "units", "interrupts", "files", "archives", "tables", "threads", "display")
+ORDER = (*GROUND, *PACKAGES[1:])
 MACHINES = {"tubular", "halbach", "planar"}
 SOURCES = sorted((ROOT / "malta").rglob("*.py"))
 
