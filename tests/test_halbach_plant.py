@@ -191,7 +191,10 @@ def _random(
 def _period(e: Electronics) -> ca.Function:
     """`move_reference` as a function of flat vectors: (x, i, states, told, w, noise) -> (x, i, states)."""
     x, i, w, noise = (ca.SX.sym(n, k) for n, k in (("x", 2), ("i", 3), ("w", 1), ("noise", e.noises)))
-    told, s = ca.SX.sym("told", e.held_size), {name: ca.SX.sym(name, size) for name, size in e.state.items()}
+    told, s = (
+        ca.SX.sym("told", len(e.set_points)),
+        {name: ca.SX.sym(name, size) for name, size in e.state.items()},
+    )
     after_x, after_i, after = e.move(x, i, s, told, w, noise)
     assert list(after) == list(e.state)
     states = ca.vertcat(*(after[name] for name in e.state))

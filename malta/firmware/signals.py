@@ -195,14 +195,8 @@ def output_fields(t: Target) -> list[Field]:
     ]
     if t.has_set_points:
         electronics = electronics_of(plant, t.setup)
-        size = 0 if electronics is None else electronics.held_size
-        fields.append(
-            Field(
-                "command",
-                tuple(Signal(f"set point {k}", "SI") for k in range(size)),
-                "set points of the electronics",
-            )
-        )
+        points = () if electronics is None else electronics.set_points
+        fields.append(Field("command", points, "set points of the electronics"))
     elif t.driven:
         phases = plant.drive.phases if t.fidelity == "phase" else plant.drive.axes
         sign = "d_" if t.fidelity == "phase" else "m_"

@@ -62,8 +62,8 @@ class Electronics:
     state: Mapping[str, int]  # names and sizes
     noises: int  # standard normal numbers that one period uses
     flags: tuple[str, ...]  # names of limits that a simulation may reach
-    held_size: int
-    held: CasadiFn  # (currents commanded, y) -> set points of the loops until the next sample
+    set_points: tuple[Signal, ...]  # of the loops, until the next sample
+    held: CasadiFn  # (currents commanded, y) -> these set points
     start: CasadiFn  # (x, i) -> state by name at rest
     move: CasadiFn  # (x, i, state by name, held, w, noise) -> x, i, state by name one period later
     met: CasadiFn  # state by name -> 1 for each flag whose limit was reached

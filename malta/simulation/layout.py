@@ -236,6 +236,6 @@ def command_size(plant: Plant, s: Setup) -> int:
     """How many numbers are held between samples: currents, voltages, duty cycles, or those of the electronics."""
     fast = electronics_of(plant, s)
     if fast is not None:
-        return fast.held_size
+        return len(fast.set_points)
     axes, phases = _winding_counts(plant)
     return {"force": len(plant.actuator.coils), "dq": axes, "phase": phases}[s.fidelity]

@@ -24,6 +24,7 @@ from malta.machines.halbach.motor import (
     resistive_drop,
 )
 from malta.model.drive import Electronics
+from malta.model.plant import Signal
 
 if TYPE_CHECKING:
     from malta.machines.halbach.plant import Parameters
@@ -246,13 +247,17 @@ def electronics(par: Parameters, options: Options | None = None) -> Electronics:
         state=_state_sizes(o),
         noises=2 if o.current_loops and o.adc_noise else 0,
         flags=FLAGS,
-        held_size=4,
+        set_points=SET_POINTS,
         held=partial(_references, parts),
         start=partial(_start, parts),
         move=partial(_move, parts),
         met=lambda state: state["met"],
         duty=lambda state: state["duty"],
     )
+
+
+# Wanted currents along and across the field, and the angle of the last reading for Park's transformation.
+SET_POINTS = (Signal("Id_ref", "A"), Signal("Iq_ref", "A"), Signal("cos_kx", "1"), Signal("sin_kx", "1"))
 
 
 class _Parts(NamedTuple):
