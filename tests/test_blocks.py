@@ -315,6 +315,7 @@ def test_a_pole_at_zero_and_a_single_block_of_dynamics() -> None:
     assert g.upper < 1.005 * g.lower
 
 
+@pytest.mark.slow
 def test_the_time_is_kept() -> None:
     """A loop of six states and six parameters with three blocks, sampled with lag and delay, within the time asked."""
     rng = np.random.default_rng(0)

@@ -57,6 +57,7 @@ def test_a_whole_campaign_has_the_tables_that_it_ended_with(run: Run, tmp_path: 
     assert {path: path.stat().st_mtime_ns for path in tmp_path.iterdir()} == before
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("undrawn")
 def test_half_a_campaign_that_runs_and_one_that_does_not(run: Run, tmp_path: Path) -> None:
     """Two blocks of five, one of them damaged later: 4 s apart, and young or old."""

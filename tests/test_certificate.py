@@ -163,6 +163,7 @@ def test_a_diagonal_descriptor(tmp_path: Path) -> None:
         check(written(content, tmp_path))
 
 
+@pytest.mark.slow
 def test_a_mass_that_may_vanish_is_refused(tmp_path: Path) -> None:
     # (p s + p) x: stable, but at p = 0 it is no equation at all; E and A cancel in E^-1 A
     system = malta.uncertain(lambda p: ([[-p]], [[p]], [[1]], [[0]], [[p]]), {"p": 1.0})

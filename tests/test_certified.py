@@ -322,6 +322,7 @@ def two_places(monkeypatch: pytest.MonkeyPatch) -> Any:
     travel._along.cache_clear()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("two_places")
 def test_places_are_those_of_the_machine(tmp_path: Path, run: Run) -> None:
     path = certified(HALBACH, BOX, 2.0, tmp_path / "c.json")
@@ -482,6 +483,7 @@ def test_the_stage_of_a_claim_is_the_one_that_is_rebuilt(tmp_path: Path) -> None
 # the command line
 
 
+@pytest.mark.slow
 def test_check_prints_the_box_and_whose_it_is(run: Run, document: Content, tmp_path: Path) -> None:
     path = written(document, tmp_path)
     code, out, err = run("check", str(path))

@@ -450,6 +450,7 @@ def test_verify_prints_one_json_document() -> None:
     assert "nan" not in out.stdout.lower()
 
 
+@pytest.mark.slow
 def test_verify_of_an_unstable_machine_prints_and_fails(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

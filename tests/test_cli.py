@@ -213,6 +213,7 @@ def test_long_texts_are_wrapped_and_paths_are_not(run: Run, tmp_path: Path, summ
     assert max(len(line) for line in lines if line not in wrote) <= WIDTH
 
 
+@pytest.mark.slow
 def test_design_as_json_holds_finite_numbers(run: Run, tmp_path: Path) -> None:
     code, out, err = run(
         "design", "design/calibrated.toml", "--json", "--out", tmp_path / "g", "--figures", tmp_path / "f"
@@ -327,6 +328,7 @@ def test_gains_that_cannot_be_written_leave_the_old_figure(run: Run, tmp_path: P
     assert [path.name for path in (tmp_path / "gains").iterdir()] == ["table2.mat"]
 
 
+@pytest.mark.slow
 def test_numbers_that_no_gain_file_may_have_are_those_of_the_design(
     run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -440,6 +442,7 @@ def test_verify_of_a_machine_beyond_computing_is_one_sentence(run: Run, change: 
     assert re.search("overflow|not finite|no input holds|no command makes", one_sentence(err))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "arguments", [("verify", ROOT / TABLE2, "--no-proof"), ("design", "design/table2.toml")]
 )

@@ -392,6 +392,7 @@ def test_name_with_a_null_byte_is_refused(tmp_path: Path) -> None:
         malta.read_design(design)
 
 
+@pytest.mark.slow
 def test_truncated_file_is_refused_or_complete(tmp_path: Path) -> None:
     content, path, whole = DATA.read_bytes(), tmp_path / "machine.toml", malta.read(DATA)
     accepted = []

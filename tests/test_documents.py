@@ -90,6 +90,7 @@ def test_simulate(run: Run) -> None:
     assert document(heavy, "simulate-output")["stroke"]["rise_s"] is None
 
 
+@pytest.mark.slow
 def test_campaign_and_its_status(run: Run, tmp_path: Path) -> None:
     common = ("campaign", TABLE2, "--out", tmp_path, "--json")
     found = document(run(*common, "--samples", "4", "--spread", "5%"), "campaign-output")

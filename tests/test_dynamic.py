@@ -54,6 +54,7 @@ def test_feedback_dynamics_are_one_over_the_peak_of_s() -> None:
     assert 0.99 / peak * 2 <= m.lower <= m.upper
 
 
+@pytest.mark.slow
 def test_a_weight_that_rises_with_frequency() -> None:
     """|W T| on a fine grid, over the values of k that the margin allows; the smallest loss is the bound's."""
     s, C, W = robstab(), pid(2.3, 3, 0.38, 0.001), control.tf([0.5, 0.1], [0.1, 1])

@@ -102,6 +102,7 @@ def test_the_axial_gain_settles_too(calibrated: Design) -> None:
     assert found == pytest.approx(c.L[[2, 7], 4], rel=1e-6)
 
 
+@pytest.mark.slow
 def test_the_extended_filter_is_the_linear_one_where_the_machine_is_linear(calibrated: Design) -> None:
     """In x and beta, which neither gravity nor cogging moves, at the centre: the same gain to 1e-8."""
     expected = _steady(calibrated.controller)

@@ -105,6 +105,7 @@ def shooting(par: tubular.Parameters, distance: float) -> float:
     return T
 
 
+@pytest.mark.slow
 def test_malta_against_the_sigmoid_of_the_same_current(
     plant: Plant, par: tubular.Parameters, stroke: FastestStroke
 ) -> None:
@@ -294,6 +295,7 @@ def test_a_stroke_and_its_reference_pickle(plant: Plant, stroke: FastestStroke) 
         stroke.z[0] = 0.0
 
 
+@pytest.mark.slow
 def test_the_sigmoid_without_cogging_is_the_closed_form(smooth: Plant, par: tubular.Parameters) -> None:
     kappa = math.sqrt(2 * par.K_D * par.I_max / par.m * 6 * math.sqrt(3) / DISTANCE)
     sigmoid = sigmoid_at_peak_current(smooth, DISTANCE, par.K_ind)

@@ -140,6 +140,7 @@ def test_it_flies_to_the_bit_where_nothing_is_contracted(fidelity: Any) -> None:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "distance"),
     [

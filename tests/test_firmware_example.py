@@ -29,6 +29,7 @@ def test_it_moves_and_lands(name: str, precision: Precision, tmp_path: Path) -> 
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 
 
+@pytest.mark.slow
 def test_valgrind_finds_nothing_that_is_not_set(tmp_path: Path) -> None:
     if shutil.which("valgrind") is None:
         pytest.skip("valgrind not installed")
@@ -37,6 +38,7 @@ def test_valgrind_finds_nothing_that_is_not_set(tmp_path: Path) -> None:
     assert (done.returncode, done.stderr) == (0, "")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("old", "new"),
     [

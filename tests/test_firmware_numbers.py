@@ -97,6 +97,7 @@ def moved(precision: Precision, samples: int) -> Any:
     return view(r.state, "e").astype(float) - begin
 
 
+@pytest.mark.slow
 def test_sums_of_single_precision_do_not_stand_still() -> None:
     """Over 1 s they follow those of double precision within 1e-3; a plain sum would not move at all."""
     Ts = controller("robust").sample_time

@@ -54,6 +54,7 @@ def test_optimization_changes_no_bit(level: str, precision: Precision, tmp_path:
     assert checksum(run_test(HERE, folder, level).stdout) == checksum(run_test(HERE, folder, "-O2").stdout)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("precision", SOME)
 def test_contraction_is_noticed(precision: Precision, tmp_path: Path) -> None:
     """A multiplication and an addition in one instruction round once. The files forbid it, whatever the flags."""
@@ -85,6 +86,7 @@ def test_a_changed_vector_is_named(tmp_path: Path) -> None:
     assert found[1] == "4"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("precision", SOME)
 @pytest.mark.parametrize("name", NAMES)
 def test_no_library_is_called(name: str, precision: Precision, tmp_path: Path) -> None:

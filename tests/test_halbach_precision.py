@@ -172,6 +172,7 @@ def test_bits_of_the_rolling_mean(paper: Any) -> None:
     assert math.log2(ratio) == pytest.approx(2.78, abs=0.01)
 
 
+@pytest.mark.slow
 def test_rows_of_the_ledger(paper: Any) -> None:
     """The new rows that need no flight, by their subjects."""
     rows = {row.subject: row for row in claims.rows()}

@@ -505,6 +505,7 @@ def _slow() -> Controller:
     return lqg(_model("planar"), slow, 200e-6, "sampled-data", 1)
 
 
+@pytest.mark.slow
 def test_currents_carry_the_weight_that_there_is() -> None:
     """A lighter mover is held by smaller currents, which tilt it less: proofs and the exact loop agree on that."""
     plant, c = _plant("planar"), _slow()

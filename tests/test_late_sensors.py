@@ -102,6 +102,7 @@ def test_no_lag_is_the_limit(controller: Any, fidelity: Any) -> None:
         assert (almost.p != prompt.p).any()
 
 
+@pytest.mark.slow
 def test_lanes_of_different_lags_are_the_runs_alone(controller: Any) -> None:
     lags = np.array([0.0, 1e-5, 2e-5, 5e-5, 1e-4])
     scenario = Scenario("hold", 0.02, malta.references.hold, noise=1.0, fidelity="force")

@@ -61,6 +61,7 @@ def test_moments_are_those_of_the_normal_distribution(drawn: FloatArray) -> None
     assert np.abs(stats.kurtosis(drawn)).max() < 5 * math.sqrt(24 / n)
 
 
+@pytest.mark.slow
 def test_the_distribution_is_normal_into_its_tails(drawn: FloatArray) -> None:
     """Kolmogorov and Smirnov's distance of a million numbers, and what lies beyond 2, 3, 4 and 4.5 sigma."""
     values = drawn.ravel()

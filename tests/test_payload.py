@@ -32,6 +32,7 @@ def test_statics_by_hand() -> None:
     assert held_payload(plant_of(replace(par, g=0.0))) == math.inf
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "low", "high"), [("table2", 0.1, 0.15), ("calibrated", 0.7, 0.9), ("robust", 2.5, 3.0)]
 )

@@ -564,6 +564,7 @@ def test_linear_model(par: planar.Parameters, exact: Series) -> None:
     assert np.linalg.eigvals(A).real.max() == pytest.approx(31.2, abs=0.1)
 
 
+@pytest.mark.slow
 def test_tilt_stiffness_against_tilted_coils(par: planar.Parameters, exact: Series) -> None:
     """What `wrench_matrix` leaves out: 5 % of the stiffness in tilt, 2 % in yaw, of coils that turn in the field."""
     i, step = commutation.hover(par, exact, AT), 1e-5

@@ -73,6 +73,7 @@ def test_several_strokes_are_averaged(plant: Plant) -> None:
     assert np.abs(found.v0 - wanted)[late].max() < 0.02
 
 
+@pytest.mark.slow
 def test_the_simulated_record_is_the_machines_statics() -> None:
     """Sensors as built; cogging displaced by 0.5 rad. Inertia and noise leave less than a tenth of the cogging."""
     controller = malta.gains.read(ROBUST)

@@ -234,6 +234,7 @@ def _put_everywhere(name: str, value: float, arrays: dict[str, Any]) -> None:
     arrays[name] = np.full_like(arrays[name], value)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "damaged"),
     [

@@ -215,8 +215,12 @@ def test_every_experiment_has_a_figure_that_says_what_drew_it(
     )  # its bars have names
 
 
+LONG = ("commissioning", "supervised-faults", "record-v0", "lift-off", "capture")  # of many flights each
+FLOWN = [pytest.param(name, marks=pytest.mark.slow if name in LONG else ()) for name in EXPERIMENTS]
+
+
 @pytest.mark.parametrize("design", ["table2", "calibrated"])
-@pytest.mark.parametrize("name", EXPERIMENTS)
+@pytest.mark.parametrize("name", FLOWN)
 def test_nothing_in_a_figure_overlaps_or_is_cut_off(name: str, design: str, pictured: Pictured) -> None:
     """Panels, axis labels, titles and legends: none lies on another, none leaves the page."""
     figure, _ = pictured(design, name)
@@ -313,7 +317,7 @@ def test_touchdowns_are_marked(flown: Flown, published: dict[str, Any]) -> None:
     assert {"touchdown", "axial end stop"} <= set(marked)
 
 
-@pytest.mark.parametrize("name", [name for name in EXPERIMENTS if name != "drive-limits"])
+@pytest.mark.parametrize("name", [one for one in FLOWN if one.values != ("drive-limits",)])
 def test_runs_that_end_early_are_drawn(
     name: str, designs: dict[str, Design], published: dict[str, Any], tmp_path: Path
 ) -> None:
@@ -382,6 +386,7 @@ def test_experiments_are_saved_where_a_path_is_given(
         report.experiment(unknown)
 
 
+@pytest.mark.slow
 def test_importing_the_report_does_not_wait_for_matplotlib() -> None:
     code = "import sys, malta.report; sys.exit('matplotlib' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

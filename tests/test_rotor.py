@@ -234,6 +234,7 @@ def test_words_say_what_a_proof_covers(plant: Plant, controllers: dict[str, Cont
     assert "robust: proven 440." in str(nowhere)
 
 
+@pytest.mark.slow
 def test_tables_of_a_machine_without_a_travel(
     plant: Plant, controllers: dict[str, Controller], par: Any, tmp_path: Path
 ) -> None:

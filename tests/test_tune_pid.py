@@ -291,6 +291,7 @@ def test_a_tighter_bound_on_motion_costs_load_error(motor: Spec, found: Tuned) -
     assert calm.trial.figures["load_error x"] > 1.1 * found.trial.figures["load_error x"]
 
 
+@pytest.mark.slow
 def test_a_search_that_was_interrupted_ends_where_it_would_have(motor: Spec, tmp_path: Path) -> None:
     quick = Effort(generations=2, polish=10)
     whole = tuned(motor, tmp_path / "whole.jsonl", effort=quick)

@@ -140,6 +140,7 @@ def test_poles_are_sorted_and_read_only(design: Design) -> None:
             values[0] = 0
 
 
+@pytest.mark.slow
 def test_the_machine_has_its_own_delay(designs: dict[str, Design]) -> None:
     """T_d counts the hold's half sample: 75 us at 20 kHz is one whole sample more; a slower machine has more."""
     design = designs["calibrated"]

@@ -129,6 +129,7 @@ def test_motion_is_lagranges_of_the_energy(seed: int) -> None:
     assert abs(found[:6]).max() < 1e-11 * max(1.0, abs(found[6:]).max())
 
 
+@pytest.mark.slow
 @settings(deadline=None, max_examples=25)
 @given(seed=seeds)
 def test_forces_feed_in_their_power_where_they_act(seed: int) -> None:
@@ -168,6 +169,7 @@ def test_swapped_modules_are_the_mirror_image(seed: int) -> None:
     np.testing.assert_allclose(across * there, here, rtol=0, atol=1e-11 * abs(here).max())
 
 
+@pytest.mark.slow
 @settings(deadline=None, max_examples=20)
 @given(seed=seeds)
 def test_linear_model_equals_finite_differences(seed: int) -> None:
