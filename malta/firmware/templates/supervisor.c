@@ -687,13 +687,14 @@ static void goal_of(const {{ name }}_supervisor *sup, const {{ name }}_request *
 /* The time of a way within three quarters of its limits, v = 15/8 d / T, a = 5.8 d / T^2. */
 static {{ name }}_real time_of({{ name }}_real way, int32_t k) {
   {{ name }}_real T = ({{ fade_speed }} * way) / fastest[k];
-  int32_t doublings = 0;
+  int32_t doubling;
   if (T < ({{ shortest }} * {{ NAME }}_SAMPLE_TIME)) {
     T = {{ shortest }} * {{ NAME }}_SAMPLE_TIME;
   }
-  while ((({{ fade_acceleration }} * way) > (steepest[k] * (T * T))) && (doublings < 8)) {
-    T = {{ two }} * T;
-    doublings++;
+  for (doubling = 0; doubling < 8; doubling++) {
+    if (({{ fade_acceleration }} * way) > (steepest[k] * (T * T))) {
+      T = {{ two }} * T;
+    }
   }
   return T;
 }
