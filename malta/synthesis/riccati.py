@@ -67,16 +67,25 @@ class _Found(NamedTuple):
     residual: float
 
 
-def care(A: FloatArray, B: FloatArray, Q: FloatArray, R: FloatArray, what: str = "CARE") -> Solution:
-    """Solve A'X + XA - X B R^-1 B' X + Q = 0 for the stabilizing X >= 0; K = R^-1 B' X.
+def care(
+    A: FloatArray,
+    B: FloatArray,
+    Q: FloatArray,
+    R: FloatArray,
+    what: str = "CARE",
+    *,
+    N: FloatArray | None = None,
+) -> Solution:
+    """Solve A'X + XA - (XB + N) R^-1 (B'X + N') + Q = 0 for the stabilizing X; K = R^-1 (B'X + N').
 
-    The Kalman filter is the dual: care(A.T, C.T, W, V).K.T with intensities W, V.
+    The Kalman filter is the dual: care(A.T, C.T, W, V).K.T with intensities W, V. X >= 0 where [Q N; N' R] >= 0; other
+    weights, as of games and of passive systems, may have a stabilizing X, which may then be indefinite.
 
-    A, Q : n x n, B : n x m, R : m x m
-    Raises InputError (shapes, NaN, Q not >= 0, R not > 0) and CheckError (no stabilizing solution, residual
-    above 1e-9, X not >= 0); `what` opens the message.
+    A, Q : n x n, B, N : n x m, R : m x m
+    Raises InputError (shapes, NaN, R not > 0) and CheckError (no stabilizing solution, residual above 1e-9, X not >= 0
+    where the weights are); `what` opens the message.
     """
-    return _by_parts(A, B, Q, R, np.zeros_like(B), what, discrete=False)
+    return _by_parts(A, B, Q, R, np.zeros_like(B) if N is None else N, what, discrete=False)
 
 
 def dare(
@@ -87,11 +96,41 @@ def dare(
     N: FloatArray | None = None,
     what: str = "DARE",
 ) -> Solution:
-    """Solve the discrete Riccati equation for the cost sum x'Qx + 2 x'Nu + u'Ru; u = -Kx.
+    """Solve the discrete Riccati equation for the cost sum x'Qx + 2 x'Nu + u'Ru; u = -Kx, the stabilizing one.
+
+    R may be singular, as what an input moves costs, too: R + B'XB > 0.
 
     A, Q : n x n, B, N : n x m, R : m x m. Raises as `care`.
     """
-    return _by_parts(A, B, Q, R, np.zeros_like(B) if N is None else N, what, discrete=True)
+    S = np.zeros_like(B) if N is None else N
+    _check_shapes(A, B, Q, R, S, what)
+    if not _is_definite(R):
+        return _with_known_cost(A, B, Q, R, S, what)
+    return _by_parts(A, B, Q, R, S, what, discrete=True)
+
+
+def _with_known_cost(
+    A: FloatArray, B: FloatArray, Q: FloatArray, R: FloatArray, N: FloatArray, what: str
+) -> Solution:
+    """The solution as X0 + Y, with X0 such that R + B'X0B > 0: the equation of Y has this as its weight of inputs.
+
+    x+'X0 x+ - x'X0 x is a sum that ends at rest, so it changes no optimum.
+    """
+    with np.errstate(all="ignore"):
+        t = _balance(A - np.eye(len(A)), B @ B.T, Q)
+    one = np.diag(1 / t**2)
+    size = np.abs(B.T @ one @ B).max()
+    X0 = one * ((np.abs(R).max() or np.abs(Q * np.outer(t, t)).max()) / size if size else 1.0)
+    R1 = _symmetric(R + B.T @ X0 @ B)
+    if not _is_definite(R1):
+        raise InputError(what, "R", "a matrix that is not positive definite", "R > 0, or R + B'XB > 0")
+    Y = _by_parts(A, B, _symmetric(Q + A.T @ X0 @ A - X0), R1, N + A.T @ X0 @ B, what, discrete=True)
+    X = X0 + Y.X
+    terms = [A.T @ X @ A, -X, -(A.T @ X @ B + N) @ Y.K, Q]
+    residual = float(np.linalg.norm(sum(terms)) / sum(np.linalg.norm(term) for term in terms))
+    if not residual <= RESIDUAL:
+        raise CheckError(f"{what}: the relative residual is {residual:.1e}, allowed {RESIDUAL:.0e}")
+    return Solution(X, Y.K, residual)
 
 
 @np.errstate(all="ignore")  # what overflows fails its check below
@@ -136,7 +175,7 @@ def _solve(A: FloatArray, B: FloatArray, Q: FloatArray, what: str, *, discrete: 
     if not candidates:
         raise CheckError(f"{what}: no stabilizing solution ({_first_sentence(failures[0])})") from failures[0]
     found = min(candidates, key=lambda candidate: candidate.residual)
-    _check(found, what)
+    _check(found, what, definite=np.linalg.eigvalsh(Q).min() >= -1e-12 * np.abs(Q).max())
     return found
 
 
@@ -250,7 +289,21 @@ def _evaluate(equation: _Equation, X: FloatArray) -> _Found:
 def _parts(
     A: FloatArray, B: FloatArray, Q: FloatArray, R: FloatArray, N: FloatArray, what: str
 ) -> list[tuple[NDArray[np.int_], NDArray[np.int_]]]:
-    """Check the arguments; the states and inputs of each subsystem that nothing joins to the others."""
+    """The states and inputs of each subsystem that nothing joins to the others, once the arguments are checked."""
+    _check_shapes(A, B, Q, R, N, what)
+    if not _is_definite(R):
+        raise InputError(what, "R", "a matrix that is not positive definite", "R > 0")
+    n, m = B.shape
+    count, label = sparse.csgraph.connected_components(_touch(A, B, Q, R, N), directed=False)
+    parts = [(np.flatnonzero(label[:n] == k), np.flatnonzero(label[n:] == k)) for k in range(count)]
+    if any(not len(i) or not len(j) for i, j in parts):  # a state without input, an input without state
+        return [(np.arange(n), np.arange(m))]
+    return parts
+
+
+def _check_shapes(
+    A: FloatArray, B: FloatArray, Q: FloatArray, R: FloatArray, N: FloatArray, what: str
+) -> None:
     n, m = B.shape
     named = {"A": (A, (n, n)), "B": (B, (n, m)), "Q": (Q, (n, n)), "R": (R, (m, m)), "N": (N, (n, m))}
     for name, (M, shape) in named.items():
@@ -261,16 +314,12 @@ def _parts(
     for name, M in (("Q", Q), ("R", R)):
         if np.abs(M - M.T).max() > 1e-12 * np.abs(M).max():
             raise InputError(what, name, "an unsymmetric matrix", "a symmetric one")
-    if np.linalg.eigvalsh(Q).min() < -1e-12 * np.abs(Q).max():
-        raise InputError(what, "Q", "a negative eigenvalue", "a positive semidefinite matrix")
-    r = np.sqrt(np.where(np.diag(R) > 0, np.diag(R), 1))  # units of the inputs
-    if np.linalg.eigvalsh(R / np.outer(r, r)).min() <= 0:
-        raise InputError(what, "R", "a matrix that is not positive definite", "R > 0")
-    count, label = sparse.csgraph.connected_components(_touch(A, B, Q, R, N), directed=False)
-    parts = [(np.flatnonzero(label[:n] == k), np.flatnonzero(label[n:] == k)) for k in range(count)]
-    if any(not len(i) or not len(j) for i, j in parts):  # a state without input, an input without state
-        return [(np.arange(n), np.arange(m))]
-    return parts
+
+
+def _is_definite(R: FloatArray) -> bool:
+    """Whether R > 0, its inputs in any units."""
+    r = np.sqrt(np.where(np.diag(R) > 0, np.diag(R), 1))
+    return bool(np.linalg.eigvalsh(R / np.outer(r, r)).min() > 0)
 
 
 def _touch(A: FloatArray, B: FloatArray, Q: FloatArray, R: FloatArray, N: FloatArray) -> NDArray[np.bool_]:
@@ -285,7 +334,7 @@ def _touch(A: FloatArray, B: FloatArray, Q: FloatArray, R: FloatArray, N: FloatA
         np.block([[A * t / t[:, None], B / r / t[:, None]], [N.T * t / r[:, None], np.zeros((m, m))]])
     )
     weights = np.abs(linalg.block_diag(Q, R))
-    own = np.sqrt(np.diag(weights))
+    own = np.sqrt(np.diag(weights))  # zero beside an entry: indefinite, and joined
     large = np.sqrt(np.outer(scaled.max(axis=1, initial=0), scaled.max(axis=0, initial=0)))
     return np.asarray((scaled > ROUNDING * large) | (weights > ROUNDING * np.outer(own, own)))
 
@@ -323,7 +372,7 @@ def _powers_of_two(t: FloatArray) -> FloatArray:
     return np.asarray(np.exp2(np.round(np.log2(t))))  # scaling by them adds no rounding
 
 
-def _check(found: _Found, what: str) -> None:
+def _check(found: _Found, what: str, *, definite: bool) -> None:
     poles = eigenvalues(found.closed)
     discrete = found.equation.discrete
     excess = np.abs(poles).max() - 1 if discrete else poles.real.max()
@@ -334,7 +383,7 @@ def _check(found: _Found, what: str) -> None:
         raise CheckError(f"{what}: the relative residual is {found.residual:.1e}, allowed {RESIDUAL:.0e}")
     if not excess < -rounding:
         raise CheckError(f"{what}: the closed loop is not stable (excess {excess:.1e})")
-    if np.linalg.eigvalsh(found.X).min() < -1e-9 * np.abs(found.X).max():
+    if definite and np.linalg.eigvalsh(found.X).min() < -1e-9 * np.abs(found.X).max():
         raise CheckError(f"{what}: the solution is not positive semidefinite")
 
 
