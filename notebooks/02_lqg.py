@@ -11,11 +11,16 @@ import os
 from pathlib import Path
 from typing import Any
 
+import control
 import matplotlib.pyplot as plt
 import numpy as np
+from filterpy.kalman import KalmanFilter
 from IPython.display import display
+from scipy.linalg import block_diag
 
 import malta
+from malta.synthesis.lqg import integral_weight
+from malta.synthesis.riccati import add_integrals, sample, sample_cost, sample_noise
 
 # The project's root, wherever Jupyter was started.
 os.chdir(next(p for p in (Path.cwd(), *Path.cwd().parents) if (p / "design").is_dir()))
@@ -71,6 +76,36 @@ controllers = {name: malta.synthesize(spec, model) for name, spec in specs.items
 margins = {name: malta.verify(model, controller) for name, controller in controllers.items()}
 for name in specs:
     print(f"--- {name}\n{margins[name]}\n")
+
+# %% [markdown]
+# ## Check: the same gains by python-control and filterpy
+# The gain file holds the regulator of the cost's integral over each sample (Van Loan) and the filter in which the
+# covariance of the prediction settles. `control.dlqr` and filterpy's `KalmanFilter`, iterated until its gain stands
+# still, give the same numbers.
+
+# %%
+saved, weights = malta.gains.read("design/gains/calibrated.json"), specs["calibrated"].weights
+Ts, m = saved.sample_time, model.B.shape[1]
+A, B = add_integrals(*sample(model.A, model.B, Ts), model.C, Ts)
+Q, N, R = sample_cost(model.A, model.B, weights.Q, weights.R, Ts)
+Q = block_diag(Q, integral_weight(model, weights) * Ts)
+K = control.dlqr(A, B, Q, R, np.vstack([N, np.zeros((m, m))]), method="scipy")[0]
+expected = np.hstack([saved.K, -saved.Ki])
+off_K = np.abs(K - expected).max() / np.abs(expected).max()
+
+kalman = KalmanFilter(dim_x=len(model.A), dim_z=len(model.C))
+kalman.F, kalman.H, kalman.R = saved.Ad, model.C, np.diag(weights.sensor_variance)
+kalman.Q = sample_noise(model.A, model.B * (weights.process_variance * Ts) @ model.B.T, Ts)
+kalman.P = np.diag([1e-8] * 5 + [1e-4] * 5)
+steps, before = 0, np.inf
+while np.abs(kalman.K - before).max() > 1e-14 * np.abs(kalman.K).max():
+    steps, before = steps + 1, kalman.K.copy()
+    kalman.predict()
+    kalman.update(np.zeros(len(model.C)))
+off_L = np.abs(kalman.K - saved.L).max() / np.abs(saved.L).max()
+print(f"K: apart by {off_K:.1e}; L after {steps} steps ({steps * Ts * 1e3:.0f} ms): apart by {off_L:.1e}")
+assert off_K < 1e-7
+assert off_L < 1e-9
 
 # %% [markdown]
 # ## Check: stability and sensitivity
