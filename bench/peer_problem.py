@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from malta.machines.tubular.plant import Parameters
+from malta.machines.tubular.plant import Parameters, plant
 from malta.simulation.compiled import feedforward_table
 from malta.synthesis.controller import Controller
 
@@ -38,7 +38,7 @@ class Workload(NamedTuple):
 
     @property
     def sigma(self) -> FloatArray:
-        return self.noise * np.array([self.par.s_r] * 4 + [self.par.s_z])
+        return self.noise * np.array(plant(self.par).noise)
 
     @property
     def varied(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:

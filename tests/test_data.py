@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     pass
 
 DATA = Path("data/tubular.toml")
-ASSUMED = {"l_S", "g", "F_c", "phi_c", "V_max", "I_max", "T_d", "s_r", "s_z"} | {  # where the paper is silent
+ASSUMED = {"l_S", "g", "F_c", "phi_c", "V_max", "I_max", "T_d", "s_z"} | {  # where the paper is silent
     "k_t", "d_t", "R_dc", "f_clk", "t_dead",
     "dK_A", "dK_B", "kappa", "e_x", "e_y", "c_x", "c_y",
     "s_i", "d_i", "q_i", "tau_s", "T_s",
@@ -89,7 +89,7 @@ def test_assumptions_are_tagged_assumed() -> None:
 
 def test_shipped_values_in_SI(par: tubular.Parameters) -> None:
     expected = {"l_S": 0.09375, "L_p": 0.015, "L": 2.8e-3, "Psi": 8.3e-3, "C_dc": 0.088, "f_pwm": 1e5}
-    expected |= {"T_cc": 5e-5, "T_d": 7.5e-5, "r_max": 6e-4, "s_r": 5e-7, "dp": 1e-6, "l_B": 0.04456}
+    expected |= {"T_cc": 5e-5, "T_d": 7.5e-5, "r_max": 6e-4, "s_r": 3.6e-7, "n_y1": 1.26, "dp": 1e-6, "l_B": 0.04456}
     assert {name: getattr(par, name) for name in expected} == expected
     assert par.pm_cc == pytest.approx(math.pi / 3, rel=1e-15)
 

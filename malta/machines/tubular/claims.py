@@ -298,8 +298,8 @@ REST: tuple[Row, ...] = (
             partial(merit, "hold", f"measured {name}, std"),
             f"table_III.std.{name}",
             "about",
-            "noise of that size is put in",
-            "noise of 0.5 µm is assumed and steps of 1 µm add 0.29 µm",
+            "the sensors' noise is what this leaves beside steps and motion",
+            "the sensors' noise is what this leaves beside steps and motion",
             by_construction=True,
         )
         for name in ("x1", "y1", "x2", "y2", "z")

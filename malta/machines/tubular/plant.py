@@ -78,7 +78,7 @@ class Parameters:
     T_d: float = si("s", at_least=0, shapes=True)  # dead time of computation and hold
     z_max: float = si("m", above=0)  # axial travel, either way
     r_max: float = si("m", above=0)  # radial travel, either way: touchdown
-    s_r: float = si("m", at_least=0)  # radial sensor noise, rms of a sample
+    s_r: float = si("m", at_least=0)  # radial sensors' noise, rms of a sample and of the four
     s_z: float = si("m", at_least=0)  # axial sensor noise, rms of a sample
     dp: float = si("m", at_least=0)  # radial sensor resolution
     k_t: float = si("N/m", above=0)  # touchdown bearing, each
@@ -98,6 +98,10 @@ class Parameters:
     q_i: float = si("A", at_least=0, default=0)  # steps of a current sensor
     tau_s: float = si("s", at_least=0, default=0)  # lag of the radial sensors and their demodulation
     T_s: float = si("s", at_least=0, shapes=True, default=0)  # dead time of all position sensors
+    n_x1: float = si("1", at_least=0, default=1)  # noise of a radial sensor, over s_r
+    n_y1: float = si("1", at_least=0, default=1)
+    n_x2: float = si("1", at_least=0, default=1)
+    n_y2: float = si("1", at_least=0, default=1)
     preset: str = "custom"
 
     def __post_init__(self) -> None:
@@ -158,7 +162,7 @@ def plant(par: Parameters, *, small_angle: bool = False) -> Plant:
         sensor_errors=SENSOR_ERRORS,
         sensors=late_sensors((*[par.tau_s] * 4, 0.0), par.T_s),
         travel=par.z_max,
-        noise=(par.s_r, par.s_r, par.s_r, par.s_r, par.s_z),
+        noise=(*(par.s_r * n for n in (par.n_x1, par.n_y1, par.n_x2, par.n_y2)), par.s_z),
         uniform=False,
         resolution=(par.dp, par.dp, par.dp, par.dp, 0.0),
         inertia=(0.0, 0.0, 0.0, 0.0, par.m),
