@@ -98,7 +98,7 @@ print(
 )
 print(f"noise of rounding in the forces: at most {share:.0e} of what the sensors' noise makes")
 print(f"a plain sum at 1e-4 m s stands still for errors below {1e9 * smallest_error(c, 1e-4):.0f} nm")
-assert margin.lower > 2.89
+assert margin.lower > 3.5
 assert share < 1e-5
 
 # %% [markdown]

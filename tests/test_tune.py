@@ -83,7 +83,7 @@ def small(spec: Spec) -> Spec:
 
 
 @pytest.mark.slow
-def test_the_flagship_misses_three_requirements_with_pi_loops(
+def test_the_flagship_holds_all_that_is_asked_for(
     spec: Spec, requirements: dict[tuple[str, str], Outcome]
 ) -> None:
     names = {name for name, _ in requirements}
@@ -95,20 +95,15 @@ def test_the_flagship_misses_three_requirements_with_pi_loops(
     loads = {name for name in spec.specification if name.startswith("recovery ")}
     assert {name.split()[1] for name in loads} == {"F_x", "F_y", "bearing_x", "bearing_y", "F_z"}
     assert names == {*linear, *loads, "tracking_error", "radial_deviation", "payload", "lift_off"}
-    # It was tuned for first-order lags in place of the PI current loops, with which all of these hold.
-    beyond = {name: r.ratio for (name, _), r in requirements.items() if not r.holds}
-    assert set(beyond) == {"margin", "radial_motion", "recovery F_z left 0.1 s"}
-    assert beyond["margin"] == pytest.approx(3.5 / 2.894, abs=2e-3)
-    assert beyond["radial_motion"] < 1.08
-    assert beyond["recovery F_z left 0.1 s"] < 1.03
+    assert [name for (name, _), r in requirements.items() if not r.holds] == []
 
 
 def test_its_margin_is_proven_over_the_travel(flagship: tuple[LinearModel, Controller, Margins]) -> None:
-    """289 % of the 20 % box on m, K_A, K_D and K_B: they all may vary by 57 %."""
+    """350 % of the 20 % box on m, K_A, K_D and K_B: they all may vary by 70 %."""
     robust = flagship[2].robust
     assert robust is not None
     assert robust.lower is not None
-    assert 2.89 <= robust.lower <= robust.upper <= 1.002 * robust.lower
+    assert 3.5 <= robust.lower <= robust.upper <= 1.002 * robust.lower
 
 
 @pytest.mark.parametrize("z", [-15e-3, -7e-3, 0.0, 4e-3, 15e-3])

@@ -121,9 +121,8 @@ def test_the_readmes_lines_and_all_commands(program: Path, tmp_path: Path) -> No
             assert_serves(program, tmp_path, *line.split())
             continue
         done = run(program, tmp_path, *SHORTER.get(line, line).split())
-        missed = line == "malta tune design/robust.toml" and "not reached: margin is 2.89" in done.stderr
         apart = "--sobol" in line and "pip install 'malta[sensitivity]'" in done.stderr  # an extra
-        assert done.returncode == (2 if apart else int(missed)), (line, done.stderr)
+        assert done.returncode == (2 if apart else 0), (line, done.stderr)
         assert "Traceback" not in done.stderr
     assert (tmp_path / "design" / "gains" / "table2.json").is_file()
     assert (tmp_path / "build" / "robust_margins.png").is_file()
