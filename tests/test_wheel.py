@@ -39,8 +39,8 @@ SHORTER = {  # commands of the page that take minutes, as the same commands with
     "malta campaign --status FOLDER": "malta campaign --status campaign",
     "malta campaign design/gains/table2.json --spread 5.5% --rare touchdown": "malta campaign design/gains/table2.json "
     "--spread 10% --rare touchdown --samples 400",
-    "malta campaign design/gains/robust.json --tolerance 95% --limit published": "malta campaign "
-    "design/gains/robust.json --tolerance 95% --limit published --samples 64",
+    "malta campaign design/gains/robust.json --tolerance 99% --limit published": "malta campaign "
+    "design/gains/robust.json --tolerance 99% --limit published --samples 64",
     "malta claims": "malta claims design/table2.toml",
 }
 
