@@ -471,14 +471,14 @@ def test_entries_that_move_together_keep_units_of_their_own(tmp_path: Path) -> N
     design = copied(tmp_path, "robust")
     text = design.read_text(encoding="utf-8")
     design.write_text(
-        re.sub(r'(?m)^y  .*8.9384, unit = "um"', 'y = { value = 0.0089384, unit = "mm"', text),
+        re.sub(r'(?m)^y  .*11.552, unit = "um"', 'y = { value = 0.011552, unit = "mm"', text),
         encoding="utf-8",
     )
     fields = open_design(design).fields
     x, y = fields["bases.state.x"], fields["bases.state.y"]
     assert y.unit == "mm"
     assert x.linked == y.linked == (x.key, y.key)
-    assert y.factor / x.factor == pytest.approx(1e-3, rel=1e-12)  # 9 um in x are 0.009 mm in y
+    assert y.factor / x.factor == pytest.approx(1e-3, rel=1e-12)  # 12 um in x are 0.012 mm in y
 
 
 @pytest.mark.slow

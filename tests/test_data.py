@@ -89,7 +89,15 @@ def test_assumptions_are_tagged_assumed() -> None:
 
 def test_shipped_values_in_SI(par: tubular.Parameters) -> None:
     expected = {"l_S": 0.09375, "L_p": 0.015, "L": 2.8e-3, "Psi": 8.3e-3, "C_dc": 0.088, "f_pwm": 1e5}
-    expected |= {"T_cc": 5e-5, "T_d": 7.5e-5, "r_max": 6e-4, "s_r": 3.6e-7, "n_y1": 1.26, "dp": 1e-6, "l_B": 0.04456}
+    expected |= {
+        "T_cc": 5e-5,
+        "T_d": 7.5e-5,
+        "r_max": 6e-4,
+        "s_r": 4.1e-7,
+        "n_y1": 1.137,
+        "dp": 1e-6,
+        "l_B": 0.04456,
+    }
     assert {name: getattr(par, name) for name in expected} == expected
     assert par.pm_cc == pytest.approx(math.pi / 3, rel=1e-15)
 

@@ -243,7 +243,7 @@ def _rest(design: Design) -> Rest:
     return Rest(np.sqrt(white), np.sqrt(true / samples), np.sqrt(np.diag(P)[n:]) / samples)
 
 
-def test_measured_is_noise_and_steps_and_motion(design: Design, flown: Flown, rests: dict[str, Rest]) -> None:
+def test_measured_is_noise_and_steps_and_motion(design: Design, flown: Flown) -> None:
     """A sensor reads the nearest step of noise and motion about its mean: at rest in the middle of a step, 1 um beside
     0.35 um, it reads less than std^2 = noise^2 + motion^2 + step^2 / 12."""
     found, p = flown(design.spec.name, "hold"), flown(design.spec.name, "hold").run.p[-2000:]
@@ -283,7 +283,9 @@ def test_the_true_motion_is_the_linear_loops(design: Design, flown: Flown, rests
     runs = [flown(design.spec.name, "hold", seed=seed, fidelity="force") for seed in range(8)]
     found = [[_merit(run.merits, f"true {name}, rms") for name in names] for run in runs]
     rms = np.sqrt(np.mean(np.square(found), axis=0))
-    near = 0.3 if design.spec.name == "calibrated" else 0.9  # steps beside little noise push what integrates slowly
+    near = (
+        0.3 if design.spec.name == "calibrated" else 0.9
+    )  # steps beside little noise push what integrates slowly
     assert rms == pytest.approx(rests[design.spec.name].true, rel=near)
     assert rms[:4].max() < 0.3e-6  # the sensors show up to 0.54 um
 
@@ -792,7 +794,9 @@ def test_noise_times_ten_is_ten_times_the_noise(design: Design, flown: Flown) ->
     noise = run.y - run.p
     before, after = noise[:STRUCK].std(axis=0), noise[STRUCK:].std(axis=0)
     steps = np.array(design.plant.resolution) / math.sqrt(12)
-    assert before == pytest.approx(np.hypot(design.plant.noise, steps), rel=0.15)  # x1 rests in the middle of a step
+    assert before == pytest.approx(
+        np.hypot(design.plant.noise, steps), rel=0.15
+    )  # x1 rests in the middle of a step
     assert after == pytest.approx(np.hypot(10 * np.array(design.plant.noise), steps), rel=0.05)
 
 

@@ -312,7 +312,9 @@ def test_a_hold_has_no_rise(calibrated: Design) -> None:
     assert batch.completed.all()
 
 
-@pytest.mark.parametrize("name", ["s_r", "n_x2", "s_z", "dp", "I_max", "z_max", "I_zz", "phi_c", "L_p", "r_max"])
+@pytest.mark.parametrize(
+    "name", ["s_r", "n_x2", "s_z", "dp", "I_max", "z_max", "I_zz", "phi_c", "L_p", "r_max"]
+)
 def test_every_parameter_counts(calibrated: Design, name: str) -> None:
     """What is no term of the equations counts too: noise and steps of the sensors are the run's own."""
     value = getattr(calibrated.spec.parameters, name)

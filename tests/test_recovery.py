@@ -175,9 +175,9 @@ def test_every_machine_has_a_table_of_80_columns(file: str) -> None:
 def test_the_flagship_carries_a_load_in_a_tenth_of_a_second(name: str) -> None:
     """With sums of errors, and with observed forces of disturbance in their place."""
     found = {r.name: d for r, d in furthest(recovery(*machine_of(name)))}
-    assert found["F_x"].largest < 9e-6
+    assert found["F_x"].largest < 10e-6
     assert found["F_z"].largest < 140e-6
-    assert found["F_x"].left[0] < 0.5e-6
+    assert found["F_x"].left[0] <= 1e-6
     assert found["F_x"].left[1] < 0.02e-6
     assert found["F_z"].left[0] < 6.5e-6
     assert max(d.settled for d in found.values()) < 0.2

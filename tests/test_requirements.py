@@ -6,6 +6,7 @@ import math
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -86,7 +87,9 @@ def robust() -> Spec:
 def test_a_search_sees_bounds_of_single_signals(robust: Spec) -> None:
     """Mirror images are told apart where their bounds differ, and only there."""
     asked = {"motion x1": 1e-6, "motion y1": 1e-6, "motion z": 1e-5}
-    groups = groups_of(replace(robust, specification=asked))
+    par: Any = robust.parameters
+    alike = replace(robust, parameters=replace(par, n_x1=1.0, n_y1=1.0, n_x2=1.0, n_y2=1.0))
+    groups = groups_of(replace(alike, specification=asked))
     assert [len(g.outputs) for g in groups] == [2, 2, 1]
     assert len({g.picture for g in groups}) == 2
     figures = [figures_of(robust, g, robust.weights, 0) for g in groups]

@@ -17,7 +17,7 @@ from conftest import ROOT, Run, refusal
 
 import malta
 from malta import gains, report
-from malta.loops.sampled_loops import machine_loop, sampled_loop
+from malta.loops.sampled_loops import machine_loop
 from malta.machines.tubular.requirements import DRIVE
 from malta.margins.verify import BANDWIDTHS
 from malta.simulation.catalogue import experiment
@@ -28,7 +28,7 @@ from malta.tuning import lqg as tune_lqg
 from malta.tuning.design_text import design_text
 from malta.tuning.groups import figures_of
 from malta.tuning.lqg import _clusters, _search, _worst
-from malta.tuning.noise import noise_of
+from malta.tuning.noise import noise_of, noise_variance
 from malta.tuning.outcomes import Outcome, judge
 from malta.tuning.search import (
     Effort,
@@ -110,7 +110,7 @@ def test_its_margin_is_proven_over_the_travel(flagship: tuple[LinearModel, Contr
 def test_every_corner_at_350_percent_is_stable(
     z: float, spec: Spec, flagship: tuple[LinearModel, Controller, Margins]
 ) -> None:
-    """With first-order lags, for which it was tuned: eigenvalues, and one corner that is lost beyond."""
+    """With its PI current loops: eigenvalues, and one corner that is lost beyond."""
     par, controller = spec.parameters, flagship[1]
 
     def radius(share: float, signs: tuple[float, ...]) -> float:
@@ -120,8 +120,7 @@ def test_every_corner_at_350_percent_is_stable(
         }
         plant = malta.plant_of(replace(par, **values))
         model = malta.linearize(plant, plant.at(z=z))
-        closed = sampled_loop(model, controller, delay=1, current_loops="lag").closed
-        return float(np.abs(eigenvalues(closed)).max())
+        return float(np.abs(eigenvalues(machine_loop(model, controller).closed)).max())
 
     corners = np.array(np.meshgrid(*[(-1, 1)] * 4)).reshape(4, -1).T
     assert max(radius(3.5, tuple(corner)) for corner in corners.tolist()) < 1
@@ -132,7 +131,7 @@ def test_its_sensitivity_and_bandwidth(flagship: tuple[LinearModel, Controller, 
     margins = flagship[2]
     for sensor in ("x1", "y1", "x2", "y2", "z"):
         assert margins.peak_sensitivity[sensor] <= 2
-    assert margins.peak_sensitivity["sigma_max"] <= 2.1
+    assert margins.peak_sensitivity["sigma_max"] <= 2.45
     for definition in BANDWIDTHS:
         assert margins.bandwidth[definition] >= 400, definition
 
@@ -142,18 +141,20 @@ def test_its_noise_by_two_ways(spec: Spec, flagship: tuple[LinearModel, Controll
     model, controller, _ = flagship
     machine = machine_loop(model, controller)
     motion, force = noise_of(machine, spec.plant)
-    w, V = np.geomspace(1e-3, np.pi / 50e-6, 20_000), np.array([0.5e-6**2 + 1e-12 / 12] * 4 + [15e-6**2])
+    w, V = np.geomspace(1e-3, np.pi / 50e-6, 20_000), noise_variance(spec.plant)
     spectrum = np.abs(np.eye(5) - machine.sensitivity(w)) ** 2 @ V
     variance = np.trapezoid(spectrum, w, axis=0) * 50e-6 / np.pi
     assert motion == pytest.approx(np.sqrt(variance), rel=1e-3)
-    assert motion[:4].max() <= 0.16e-6
+    assert motion[:4].max() <= 0.15e-6
     assert motion[4] <= 10e-6
-    assert force[:4].max() <= 0.5
+    assert force[:4].max() <= 0.55
     run = experiment("hold", spec.plant, controller, duration=0.6).run
     rest = slice(-6000, None)
     assert run.p[rest, :4].std(axis=0).max() <= 0.175e-6
     assert run.p[rest, 4].std() <= 10e-6
-    assert run.v[rest, :4].std(axis=0) == pytest.approx(force[:4], rel=0.08)
+    assert run.v[rest, :4].std(axis=0) == pytest.approx(
+        force[:4], rel=0.12
+    )  # x1 rests in the middle of a step
 
 
 def test_its_observer_has_the_states_of_the_machine_and_of_its_current_loops(
@@ -217,7 +218,10 @@ def test_quick_figures_are_those_of_verify(
 ) -> None:
     clusters = _clusters(spec)
     assert [len(c.variables) for c in clusters] == [8, 5]
-    assert [len(c.groups) for c in clusters] == [1, 1]  # y and alpha are the mirror image of x and beta
+    assert [len(c.groups) for c in clusters] == [
+        2,
+        1,
+    ]  # x and beta, y and alpha: their sensors' noise differs
     quick = merge(
         [figures_of(spec, g, spec.weights, 0) for c in clusters for g in c.groups], at_least_of(spec.plant)
     )
