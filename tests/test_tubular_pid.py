@@ -207,11 +207,22 @@ def test_estimates_are_what_is_measured(spec: Spec, axes: str) -> None:
     one = spec if axes == "decentralized" else replace(spec, law=CENTRED)
     design = SynthesizedDesign(one, *model_and_controller(one))
     estimates = estimates_of(one, [{0, 1, 2, 3}, {4}])
-    assert [group.outputs for group in estimates.groups] == [(0, 2), (4,)]  # y is the mirror image of x
-    radial, axial = estimates.figures(terms_of(one), range(5))
-    assert {tuple(outputs_of(name)) for name in radial} == {("x1", "x2")}
-    figures = {name_of(name): value for name, value in (radial | axial).items() if name_of(name) != "margin"}
-    margin = min(value for name, value in (radial | axial).items() if name_of(name) == "margin")
+    assert [group.outputs for group in estimates.groups] == [
+        (0, 2),
+        (1, 3),
+        (4,),
+    ]  # x and y: sensors of other noise
+    found = estimates.figures(terms_of(one), range(5))
+    assert [{tuple(outputs_of(name)) for name in group} for group in found[:2]] == [
+        {("x1", "x2")},
+        {("y1", "y2")},
+    ]
+    figures: dict[str, float] = {}
+    for group in found:
+        for name, value in group.items():
+            figures[name_of(name)] = max(value, figures.get(name_of(name), value))
+    margin = min(value for group in found for name, value in group.items() if name_of(name) == "margin")
+    del figures["margin"]
     proven = design.margins.robust
     assert proven is not None
     assert margin / (1 - BETWEEN) == pytest.approx(proven.lower, rel=2e-3)
@@ -232,33 +243,17 @@ def test_what_needs_no_estimate_is_not_estimated(spec: Spec) -> None:
 
 @pytest.mark.slow
 def test_the_shipped_gains_are_those_that_the_search_ends_with(spec: Spec) -> None:
-    """All that is asked for holds but the margin, which was reached with lagging currents; what binds binds."""
+    """All that is asked for holds; what binds binds."""
     rows: dict[str, Outcome] = {}
     for row in judge(spec):
         rows[row.name] = max(row, rows.get(row.name, row), key=lambda r: r.ratio)
         # A simulated rest is one of many: other last digits of the gains give another one, a few percent apart.
         chance = 1.04 if row.how == "simulated hold" else 1.0
-        assert row.asked is None or row.holds or row.ratio < chance or row.name == "margin", row
+        assert row.asked is None or row.holds or row.ratio < chance, row
     assert rows["margin"].found == pytest.approx(3.0030, abs=1e-3)
     assert 0.9 < rows["peak_sensitivity"].ratio < 1
     assert rows["force_noise"].ratio > 0.96
     assert rows["lift_off"].how == "steady-state estimator"
-
-
-@pytest.mark.slow
-def test_axes_at_the_centre_of_gravity_win_little(spec: Spec, design: SynthesizedDesign) -> None:
-    """Both tuned within the same bounds: a load at a bearing moves the centred one 2 % less, its error is 15 % less."""
-    other = centred(spec)
-    for one in (design, other):
-        assert one.margins.robust is not None
-        # Both were tuned to 3 and a peak of 2 with first-order lags in place of the PI current loops.
-        assert one.margins.robust.lower == pytest.approx(2.5, abs=0.05)
-        assert one.noise.force[:4].max() < 0.5
-        assert max(one.margins.peak_sensitivity[s.name] for s in one.plant.outputs) < 2.2
-    largest, error = spec.recovery["bearing_x largest"], "load_error x1"
-    assert design.deviation(largest).value == pytest.approx(12.503e-6, rel=2e-3)
-    assert other.deviation(largest).value == pytest.approx(12.938e-6, rel=2e-3)
-    assert other.load_figures[error] / design.load_figures[error] == pytest.approx(0.843, abs=0.005)
 
 
 # --- the design file ---
@@ -342,6 +337,6 @@ def test_what_the_paper_calls_unsuitable_holds_what_it_claims(found: Evidence) -
     assert axis_coupling(found) == pytest.approx(0.139, abs=0.001)
     assert noise_forces(found) == pytest.approx((0.5000, 0.8000), rel=1e-3)
     assert load_deviation("centre of gravity", None, found) == pytest.approx(6.418e-6, rel=1e-3)
-    assert load_deviation("bearing", None, found) == pytest.approx(13.206e-6, rel=1e-3)
+    assert load_deviation("bearing", None, found) == pytest.approx(12.503e-6, rel=1e-3)
     assert load_deviation("bearing", 0.1, found) < 1e-9
-    assert axial_deviation(found).largest == pytest.approx(104.2e-6, rel=1e-3)
+    assert axial_deviation(found).largest == pytest.approx(93.58e-6, rel=1e-3)
