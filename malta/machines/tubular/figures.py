@@ -320,7 +320,7 @@ def faults_figure(e: Experiment, _: Published | None = None) -> Figure:
     edge = clearance(e.run.plant) * 1e6
     survived = f"{e.merits[0].value:.0f} of {len(e.cases)} survived"
     during = "stroke" if e.run.scenario.reference is not hold else "hold"
-    figure = new_page(runs_of(e), f"faults during a {during}", survived, left=0.245, wspace=0.24)
+    figure = new_page(runs_of(e), f"faults during a {during}", survived, left=0.245, wspace=0.24, top=0.835)
     dots, traces = figure.subplots(1, 2, width_ratios=(1, 1.25))
     down, deviations = (
         [ended_early(run) for run in runs_of(e)],
