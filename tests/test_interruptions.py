@@ -89,7 +89,7 @@ def test_a_piped_proof_says_how_far_it_is_and_prints_one_document() -> None:
     lines = done.stderr.splitlines()
     assert len(lines) >= 2
     assert all(PROGRESS.fullmatch(line) for line in lines)
-    assert any("proven 2" in line for line in lines)
+    assert any("proven 3" in line for line in lines)
     assert done.stdout.startswith("{")
 
 

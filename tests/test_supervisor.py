@@ -832,17 +832,20 @@ def test_commissioning_completes(name: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("during", "alone"), [("stroke", 2), ("hold", 1)])
-def test_it_prevents_touchdowns(during: str, alone: int) -> None:
-    """A stuck sensor, and a link that sags by 90 % in a stroke: crashes at over 0.1 m/s become landings."""
+@pytest.mark.parametrize(("during", "counts"), [("stroke", (2, 1, 2)), ("hold", (1, 0, 3))])
+def test_it_prevents_touchdowns(during: str, counts: tuple[int, int, int]) -> None:
+    """Crashes at over 0.1 m/s become landings, but for a sensor that sticks in a stroke: that lands at half the speed.
+
+    A link that sags by 90 % in a stroke is flown through.
+    """
     c = TARGETS["robust"].controller
     e = malta.experiment("supervised-faults", malta.plant_of(c.parameters), c, during=during)
-    without, with_, landed = (merit.value for merit in e.merits)
-    assert (without, with_, landed) == (alone, 0, 4)
+    assert tuple(merit.value for merit in e.merits) == counts
     speeds = {case.label: case.merits[2].value for case in e.cases}
     assert speeds["y1 stuck"] > 0.1
-    assert speeds["y1 stuck (s)"] < SOFT
+    assert speeds["y1 stuck (s)"] < (0.07 if during == "stroke" else SOFT)
     assert speeds["y1 biased by 50 um (s)"] < 0.005
+    assert math.isnan(speeds["DC link sags by 90 % for 50 ms (s)"])
     assert not e.failed
 
 

@@ -93,7 +93,9 @@ JUMP = 8.0  # standard deviations of readings that a jump, an innovation or a re
 REPEATS, UNMOVED = 12, 16.0
 FALSE_ALARM = 1e-15  # probability at a sample that working sensors repeat a value as long as a stuck one
 DISTURBED = 0.05  # share of the largest acceleration by which a machine may leave what the filter expects
-STOPPING = 0.2  # share of the largest acceleration with which references stop
+# Share of the largest acceleration with which references stop. Twice as much takes the voltage that the bearings need
+# when the link sags by 90 %, and ends in a touchdown.
+STOPPING = 0.1
 BRIDGED = 10  # samples for which a sensor is ignored before the reference stops
 SETTLED = 12.0  # standard deviations of readings that errors may have
 SAGGING = 0.3  # share of the link's voltage that is missing

@@ -14,7 +14,7 @@ import numpy as np
 from malta.errors import InputError
 from malta.firmware.supervised import NUMBERS, Flown, Requests, require_compiler, supervised_engine
 from malta.firmware.supervisor import FLYING, State
-from malta.machines.tubular.experiments.contact import SOFT, contact_of
+from malta.machines.tubular.experiments.contact import SOFT, contact_of, contacts_of
 from malta.machines.tubular.experiments.failures import AT, planned_faults
 from malta.machines.tubular.experiments.fault_moments import fly_moments
 from malta.machines.tubular.experiments.lifting import rest_on_bearing
@@ -141,20 +141,21 @@ def _require_own_engine(name: str, options: Mapping[str, Any]) -> None:
 
 
 def _judged(run: Trajectory, flown: Flown, *, from_rest: bool) -> Trajectory:
-    """The run with the verdict of a supervised flight: contact at the end of a slow landing is none."""
+    """The run with the verdict of a supervised flight: slow contact in a lift-off or at a landing's end is none."""
     if run.verdict.name in ("interrupted", "diverged", run.plant.contacts[-1]):
         return run
     states = flown.states(run.t)
     if from_rest and not (states == NUMBERS["OPERATE"]).any():
         return replace(run, verdict=Verdict("not lifted", float(run.t[-1])))
     flying = np.isin(states, [NUMBERS[state] for state in FLYING if state != "LIFT"])
-    at, speed = contact_of(run)
-    k = int(np.searchsorted(run.t, at)) if math.isfinite(at) else -1
-    landed = k < 0 or (states[k] in (NUMBERS["LANDING"], NUMBERS["OFF"]) and speed <= SOFT)
-    if landed or not flying.any():
+    met, speeds = contacts_of(run)
+    low = np.isin(states[met], [NUMBERS[state] for state in ("LIFT", "LANDING", "OFF")])
+    hard = met[~low | (speeds > SOFT)]
+    if not len(hard) or not flying.any():
         return replace(run, verdict=Verdict("completed", run.scenario.duration))
+    k = hard[0]
     shares = run.contact[k, : len(run.plant.contacts)]
-    return replace(run, verdict=Verdict(run.plant.contacts[int(shares.argmax())], at))
+    return replace(run, verdict=Verdict(run.plant.contacts[int(shares.argmax())], float(run.t[k])))
 
 
 def _commissioning_merits(run: Trajectory, flown: Flown) -> tuple[Merit, ...]:
