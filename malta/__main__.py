@@ -19,6 +19,11 @@ def main() -> None:
         run()
     except KeyboardInterrupt:
         _leave()
+    except (ImportError, RuntimeError, SystemError) as error:
+        # what C code makes of Ctrl-C, while modules are read
+        if isinstance(error.__cause__, KeyboardInterrupt):
+            _leave()
+        raise
     except SystemExit as ended:
         if ended.code == INTERRUPTED:
             _leave()

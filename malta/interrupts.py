@@ -44,6 +44,16 @@ def press_again() -> None:
         signal.raise_signal(signal.SIGINT)
 
 
+def is_interrupt(error: BaseException) -> bool:
+    """Whether an error is Ctrl-C: KeyboardInterrupt, or what C code makes of it, such as SystemError with that cause.
+
+    Example: `is_interrupt(KeyboardInterrupt())` is True.
+    """
+    while error.__cause__ is not None:
+        error = error.__cause__
+    return isinstance(error, KeyboardInterrupt)
+
+
 @contextmanager
 def put_off_interrupts() -> Iterator[None]:
     """Put Ctrl-C off to the end of a block."""

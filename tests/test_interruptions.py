@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import typer
 from conftest import PROGRESS, ROOT, Run
 
 from malta.cli import output
@@ -128,6 +129,23 @@ def test_ctrl_c_that_a_library_drops_is_pressed_again(monkeypatch: pytest.Monkey
         wait(5, insists=True)
     wait(0.4, insists=False)
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_ctrl_c_in_the_c_code_of_a_library_is_an_interruption(capsys: pytest.CaptureFixture[str]) -> None:
+    """CasADi ends with SystemError, "returned a result with an exception set", whose cause is Ctrl-C."""
+
+    def margins(cause: BaseException | None) -> None:
+        with output.margin_progress("margins") as (_, bound):
+            bound(2.5, 3.5)
+            raise SystemError from cause
+
+    with pytest.raises(typer.Exit) as ended:
+        margins(KeyboardInterrupt())
+    assert ended.value.exit_code == 130
+    assert capsys.readouterr().err == "malta: interrupted; proven 250.00 %, lost at 350.00 %\n"
+    for cause in (None, ValueError()):
+        with pytest.raises(SystemError):
+            margins(cause)
 
 
 def test_an_interruption_waits_until_all_files_are_in_place(

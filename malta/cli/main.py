@@ -34,6 +34,7 @@ from malta.cli.tune import tune
 from malta.cli.verify import verify
 from malta.errors import CheckError, InputError, shorten
 from malta.files import noting_files
+from malta.interrupts import is_interrupt
 
 UsageError: Any = (
     typer.BadParameter.__base__
@@ -48,7 +49,9 @@ class Grouped(TyperGroup):
         with noting_files() as written:
             try:
                 return super().invoke(ctx)
-            except KeyboardInterrupt:
+            except (KeyboardInterrupt, RuntimeError, SystemError) as error:
+                if not is_interrupt(error):
+                    raise
                 raise interruption(_files_text(written)) from None
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:

@@ -18,7 +18,7 @@ import typer
 from malta.cli.patience import duration_text
 from malta.errors import CheckError, InputError, shorten
 from malta.files import json_text
-from malta.interrupts import press_again, watch_interrupts
+from malta.interrupts import is_interrupt, press_again, watch_interrupts
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -209,7 +209,9 @@ def margin_progress(what: str) -> Iterator[tuple[Callable[[float], None], Callab
     with working(what) as work:
         try:
             yield work.report, work.bound
-        except KeyboardInterrupt:
+        except (KeyboardInterrupt, RuntimeError, SystemError) as error:
+            if not is_interrupt(error):
+                raise
             raise interruption(work.found or "nothing proven") from None
 
 
