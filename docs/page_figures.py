@@ -302,6 +302,7 @@ def stages() -> Figure:
     axes.set_xticks(
         range(len(chain)), [link.name.replace("all of the travel", "travel") for link in chain], fontsize=8
     )
+    axes.margins(y=0.2)  # room for the legend
     finish(axes, "", "proven [% of the box]")
     return figure
 

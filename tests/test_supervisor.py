@@ -439,7 +439,7 @@ def test_bounds_follow_from_the_machine() -> None:
     sigma = [math.hypot(0.41e-6 * share, 1e-6 / math.sqrt(12)) for share in (0.815, 1.137, 0.993, 1.022)]
     assert b.sigma[:4] == pytest.approx(sigma)
     assert b.jump[1] == pytest.approx(math.sqrt(4 * a * 0.42e-3) * Ts + 8 * math.sqrt(2) * sigma[1], rel=1e-4)
-    assert b.stopping[4] == pytest.approx(0.2 * 2 * force / m)
+    assert b.stopping[4] == pytest.approx(0.1 * 2 * force / m)
     assert math.log(2) / (218.92 * Ts) == pytest.approx(LOST, abs=1)
 
 

@@ -92,14 +92,14 @@ def supervised_faults_figure(e: Experiment, _: Published | None = None) -> Figur
     if any(merit.label == "moments" for merit in e.merits):
         return _moments_figure(e)
     found = "; ".join(f"{merit.label}: {merit.value:.0f}" for merit in e.merits)
-    places = {"left": 0.245, "wspace": 0.24, "top": 0.8}
+    places = {"left": 0.245, "wspace": 0.24, "top": 0.75}
     figure = new_page(runs_of(e), "faults with and without the supervisor", found, **places)
     bars, deviations = figure.subplots(1, 2, width_ratios=(1, 1.25))
     _draw_speeds(bars, e)
     _draw_deviations(deviations, e)
     finish_axes(bars, "speed at the first contact [mm/s]", "", legend=2)
     finish_axes(
-        deviations, "time after the fault [ms]", "largest radial deviation [µm]", legend=2, side="right"
+        deviations, "time after the fault [ms]", "largest radial deviation [µm]", legend=1, side="right"
     )
     return figure
 
