@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -16,13 +17,23 @@ from malta.app.worker import outcome_document
 from malta.gains.file import read
 from malta.report.page.headline import _requirements as headline
 from malta.report.tables.tuning import found_text, requirements_table
-from malta.synthesis.requirements import SEEDS, Figure, Verdict, judge_figure, mean_over_seeds
-from malta.tuning.outcomes import Outcome, SynthesizedDesign, judge, outcomes_of
+from malta.synthesis.requirements import (
+    SEEDS,
+    Figure,
+    Verdict,
+    judge_figure,
+    mean_over_seeds,
+    reached_with_every_seed,
+)
+from malta.tuning.outcomes import Outcome, SynthesizedDesign, judge, outcomes_of, unflown
 from malta.tuning.search import model_and_controller
 
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from conftest import Run
+
+ROBUST = "design/gains/robust.json"
 OPEN = Outcome("error", 1.0, 0.99, "1", "flights", interval=(0.95, 1.03))
 
 
@@ -62,6 +73,48 @@ def test_seeds_are_drawn_until_the_interval_decides_and_no_longer() -> None:
     assert judge_figure(exact, 1.0, at_least=False) == "holds"
     lost = mean_over_seeds(lambda seed: math.inf if seed == 2 else 1.0, 2.0, "runs")
     assert judge_figure(lost, 2.0, at_least=False) == "fails"
+
+
+def test_a_flight_that_fails_with_one_seed_reaches_nothing() -> None:
+    asked: list[int] = []
+
+    def ends_well(seed: int) -> bool:
+        asked.append(seed)
+        return True
+
+    found = reached_with_every_seed(ends_well, 0.2, "stroke")
+    assert (found.value, found.source, asked) == (0.2, "stroke, 4 seeds", list(range(SEEDS[0])))
+    found = reached_with_every_seed(lambda seed: seed != 1, 0.2, "stroke")
+    assert (found.value, found.source) == (0.0, "stroke, 3 of 4 seeds")
+
+
+def test_verify_judges_what_no_flight_measures(run: Run) -> None:
+    """The figures are those of `malta tune --check`; the margin of the proof that is printed is not proven again."""
+    spec = malta.read_design(ROOT / "design" / "robust.toml")
+    flown = {"tracking_error", "radial_deviation", "tilt_deviation", "payload", "lift_off"}
+    names = unflown(spec)
+    assert set(names) == set(spec.specification) - flown
+    names.remove("margin")
+    rows = {one.name: one for one in judge(spec, names=names)}
+    said = run("verify", ROBUST, "--no-proof", "--json")
+    found = {one["name"]: one["found"] for one in json.loads(said.out)["requirements"]}
+    assert found.keys() == set(names)
+    assert found == pytest.approx({name: one.found for name, one in rows.items()}, rel=1e-9)
+
+
+def test_a_changed_machine_is_judged_and_fails_in_verify(run: Run) -> None:
+    said = run("verify", ROBUST, "--no-proof", "--set", "m=0.6", "--set", "K_B=2.5")
+    text = " ".join(said.out.split())
+    assert said.code == 0
+    assert "FAILS" in text
+    assert re.search(r"\d+ of 25 hold; nearest their limits .* Not judged here: margin, tracking error", text)
+    assert "25 of 25" not in text
+
+
+def test_a_named_design_of_another_machine_is_refused(run: Run) -> None:
+    said = run("verify", ROBUST, "--no-proof", "--design", "design/planar.toml")
+    assert said.code == 2
+    assert "machine" in said.err
 
 
 def test_undecided_is_no_pass_anywhere() -> None:

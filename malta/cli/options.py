@@ -64,6 +64,14 @@ Delay = Annotated[int | None, typer.Option(hidden=True)]
 Substeps = Annotated[int | None, typer.Option(hidden=True)]
 Yes = Annotated[bool, typer.Option("--yes", help="Start work of more than ten minutes too.")]
 Seed = Annotated[int | None, typer.Option(help="Seed of the noise. [0]")]
+DesignFile = Annotated[
+    Path | None,
+    typer.Option(
+        "--design",
+        metavar="FILE",
+        help="Design file whose [specification] is judged. [NAME.toml beside the gain file's folder]",
+    ),
+]
 GainFile = Annotated[
     Path,
     typer.Argument(

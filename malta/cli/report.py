@@ -11,7 +11,7 @@ import typer
 
 from malta.cli.assignments import read_uncertainty
 from malta.cli.inputs import change_machine, design_of, read_controller
-from malta.cli.options import AsJson, Changes, GainFile, MachineFile, Uncertain
+from malta.cli.options import AsJson, Changes, DesignFile, GainFile, MachineFile, Uncertain
 from malta.cli.output import (
     interruption,
     make_console,
@@ -46,13 +46,7 @@ def report(
             metavar="FOLDER", help="A campaign of these gains. [those in build/campaigns/ that are of them]"
         ),
     ] = None,
-    design: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="Design file whose [specification] is judged. [NAME.toml beside the gain file's folder]",
-        ),
-    ] = None,
+    design: DesignFile = None,
     uncertain: Uncertain = None,
     change: Changes = None,
     no_proof: Annotated[

@@ -93,7 +93,8 @@ def _judge(spec: Spec, file: Path, *, as_json: bool) -> None:
     with working(f"judging {spec.name}"):
         requirements = judge(spec)
     if as_json:
-        from malta.cli.documents.others import TuneOutput, requirement_part
+        from malta.cli.documents.loops import requirement_part
+        from malta.cli.documents.others import TuneOutput
 
         parts = [requirement_part(one) for one in requirements]
         print_document(TuneOutput(design=spec.name, requirements=parts))

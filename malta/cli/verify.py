@@ -3,19 +3,29 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, cast
 
 import typer
 
 from malta.cli.assignments import read_uncertainty
-from malta.cli.inputs import change_machine, read_controller
-from malta.cli.options import AsJson, Changes, GainFile, MachineFile, Uncertain
-from malta.cli.output import make_console, margin_progress, print_document, print_text, print_written
+from malta.cli.inputs import change_machine, design_of, read_controller
+from malta.cli.options import AsJson, Changes, DesignFile, GainFile, MachineFile, Uncertain
+from malta.cli.output import (
+    make_console,
+    margin_progress,
+    print_document,
+    print_note,
+    print_text,
+    print_written,
+)
 from malta.errors import CheckError, InputError
 
 if TYPE_CHECKING:
+    from rich.table import Table
+
     from malta.cli.documents.loops import VerifyOutput
     from malta.loops.recovery import Recovery
     from malta.margins.stages import Robustness
@@ -25,11 +35,15 @@ if TYPE_CHECKING:
     from malta.proof.blocks.gain import Gain
     from malta.proof.machine.windings import CurrentLoops
     from malta.proof.margin import Margin
+    from malta.report.tables.layout import Paragraph
     from malta.simulation.payload import Payload
     from malta.synthesis.controller import Controller
+    from malta.synthesis.spec import Spec
+    from malta.tuning.outcomes import Outcome
 
 
 MOST = 0.5  # of the time of a verification, which the margins take
+NEAREST = 3  # requirements that are named though they hold
 
 
 class Subject(NamedTuple):
@@ -41,6 +55,7 @@ class Subject(NamedTuple):
     model: LinearModel
     box: Mapping[str, float]  # parameter -> share, either way, at margin 1
     current_loops: CurrentLoops
+    spec: Spec | None  # of the machine with its changes; None: no design file
 
 
 class Analysis(NamedTuple):
@@ -53,6 +68,7 @@ class Analysis(NamedTuple):
         Recovery
     ]  # of each disturbance; none of an unstable loop, or where no load acts from outside
     payload: Payload | None  # None for an unstable loop, and for a machine without a mass m
+    outcomes: Sequence[Outcome]  # of the requirements that no flight measures; none without a design file
 
 
 def verify(
@@ -80,6 +96,7 @@ def verify(
         Path | None, typer.Option(metavar="FILE", help="Write the proof of the margin, for `malta check`.")
     ] = None,
     out: Annotated[Path | None, typer.Option(help="Folder for the figures (.png).")] = None,
+    design: DesignFile = None,
     machine: MachineFile = None,
     as_json: AsJson = False,
 ) -> None:
@@ -88,7 +105,7 @@ def verify(
     Poles, bandwidths by definition, peak sensitivities with their ISO 14839-3 zones; real parametric margins with
     their proof, from full state feedback to the sampled loop, and over the travel; disk and delay margins, gang of
     four, tolerance of each parameter; what a constant load of 1 N or 1 N m from outside does; the payload that the
-    forces hold and the mover carries in flight.
+    forces hold and the mover carries in flight. Last, what the design file asks for, but for what has to be flown.
 
     The machine is the one in the file, with the changes given by --set, as far as they shape the linear loop (on MALTA
     also windings and DC link; the current controllers are those of the gain file). What it leaves out is said.
@@ -107,7 +124,8 @@ def verify(
     published = published_figures(plant.name)
     box = read_uncertainty(gains, uncertain, plant.parameters, published)
     _require_options(time, certificate, proof=not no_proof)
-    subject = Subject(gains, controller, plant, model, box, cast("CurrentLoops", current_loops))
+    spec = _spec_of(gains, controller, design, plant)
+    subject = Subject(gains, controller, plant, model, box, cast("CurrentLoops", current_loops), spec)
     analysis = _analyse(subject, time, proof=not no_proof, worst_case=worst_case)
     files: list[Path] = []
     refusal: InputError | CheckError | None = None
@@ -171,9 +189,33 @@ def _analyse(subject: Subject, time: float | None, *, proof: bool, worst_case: b
             progress(0.5 * (1 + MOST))
             recovered = recovery(plant, controller) if margins.stable and plant.disturbances else ()
             carried = payload(plant, controller) if margins.stable and proof else None
+            outcomes = _judge(subject, margins, robust, proof=proof)
     except CheckError as error:
         raise CheckError(f"{subject.gains}: {error}") from error
-    return Analysis(margins, robust, worst, recovered, carried)
+    return Analysis(margins, robust, worst, recovered, carried, outcomes)
+
+
+def _spec_of(gains: Path, controller: Controller, named: Path | None, plant: Plant) -> Spec | None:
+    """The design file of a gain file, on the machine that is verified; None where there is none."""
+    spec = design_of(gains, controller, named)
+    return None if spec is None else replace(spec, parameters=plant.parameters)
+
+
+def _judge(subject: Subject, margins: Margins, robust: Robustness, *, proof: bool) -> Sequence[Outcome]:
+    """Judge the requirements that no flight measures, by the margins that are known; a margin if it is proven."""
+    from malta.tuning.outcomes import judge, unflown
+
+    spec = subject.spec
+    if spec is None:
+        return ()
+    names = [name for name in unflown(spec) if proof or name != "margin"]
+    same = subject.current_loops == "pi" and dict(subject.box) == dict(spec.uncertainty)
+    verified = replace(margins, robust=robust.travel) if same or "margin" not in names else None
+    try:
+        return judge(spec, subject.controller, names=names, verified=verified)
+    except InputError as error:
+        print_note(f"the requirements were not judged: {error}")
+        return ()
 
 
 def _write_certificate(path: Path, subject: Subject, margin: Margin) -> Path:
@@ -203,7 +245,14 @@ def _draw(subject: Subject, analysis: Analysis, folder: Path) -> list[Path]:
 
 def _document(subject: Subject, analysis: Analysis, files: Sequence[Path]) -> VerifyOutput:
     """The JSON document of a verification."""
-    from malta.cli.documents.loops import VerifyOutput, loop_fields, payload_part, recovery_part, robust_part
+    from malta.cli.documents.loops import (
+        VerifyOutput,
+        loop_fields,
+        payload_part,
+        recovery_part,
+        requirement_part,
+        robust_part,
+    )
     from malta.proof.machine.windings import left_out
 
     units = {signal.name: signal.unit for signal in subject.plant.outputs}
@@ -215,6 +264,7 @@ def _document(subject: Subject, analysis: Analysis, files: Sequence[Path]) -> Ve
         robust=robust_part(analysis.robustness, subject.box, analysis.worst, units),
         payload=payload_part(analysis.payload),
         left_out=left_out(subject.plant, subject.controller, subject.current_loops),
+        requirements=[requirement_part(one) for one in analysis.outcomes],
         **loop_fields(analysis.margins),
     )
 
@@ -252,6 +302,31 @@ def _print_tables(
         report.tolerance_table(robust, subject.box, analysis.payload),
         report.places_table(robust, controller.sample_time),
         *([report.worst_case_table(analysis.worst)] if analysis.worst else []),
+        *_requirements(subject, analysis),
     ):
         console.print(table)
     print_written(console, files)
+
+
+def _requirements(subject: Subject, analysis: Analysis) -> Iterator[Table | Paragraph]:
+    """The requirements of the design file that do not hold, then how many do; nothing without a design file."""
+    from malta import report
+
+    spec, asked = subject.spec, [one for one in analysis.outcomes if one.asked is not None]
+    if spec is None or not asked:
+        return
+    failed = [one for one in asked if not one.holds]
+    if failed:
+        yield report.requirements_table(failed)
+    held = sorted((one for one in asked if one.holds), key=lambda one: -one.ratio)
+    near = ", ".join(f"{one.name.replace('_', ' ')} {100 * one.ratio:.1f} %" for one in held[:NEAREST])
+    text = f"Requirements of {spec.path}: {len(held)} of {len(asked)} hold"
+    if held:
+        text += f"; nearest their limits {near}"
+    judged = {one.name for one in analysis.outcomes}
+    others = [name.replace("_", " ") for name in spec.specification if name not in judged]
+    if others:
+        text += f". Not judged here: {', '.join(others)} (malta tune {spec.path} --check)"
+    if spec.sha256 != subject.controller.spec_sha256:
+        text += ". The design file was changed after the gain file was written"
+    yield report.Paragraph(f"{text}.\n")

@@ -161,6 +161,7 @@ class Requirement:
     above : numbers without a unit must be larger
     estimate : (loop, signal) -> figure of a trial; None: the search does not look at it
     needs_stability : an unstable loop has no such figure, and fails
+    flown : measured on flights of the simulated machine, not on its linear loop
     trade : what the Pareto front shows it as, against the margin: noise of the force, or motion
     heading : its words in the Pareto front, without "motion"; none: not shown, or by the signal's name
     meaning : what is bounded, in words, for schemas and pages
@@ -175,6 +176,7 @@ class Requirement:
     above: float = 0.0
     estimate: Estimate | None = None
     needs_stability: bool = True
+    flown: bool = False
     trade: Trade | None = None
     heading: str = ""
     meaning: str = ""
@@ -251,6 +253,22 @@ def mean_over_seeds(
         if judge_figure(figure, asked, at_least=at_least) != "undecided":
             break
     return figure
+
+
+def reached_with_every_seed(draw: Callable[[int], bool], reached: float, source: str) -> Figure:
+    """Judge a flight that ends well or does not: the figure where it does with each of SEEDS[0] seeds, else 0.
+
+    A yes or no has no mean that an interval could separate from a bound; the source says how many flights it was.
+
+    draw : seed -> whether the flight ends well
+    reached : the figure of flights that do
+
+    >>> reached_with_every_seed(lambda seed: seed < 3, 0.2, "stroke")
+    Figure(value=0.0, source='stroke, 3 of 4 seeds', interval=None)
+    """
+    count = sum(draw(seed) for seed in range(SEEDS[0]))
+    well = count == SEEDS[0]
+    return Figure(reached if well else 0.0, f"{source}, {'' if well else f'{count} of '}{SEEDS[0]} seeds")
 
 
 # --- requirements that machines make of their outputs, inputs and experiments ---

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -79,6 +79,7 @@ class SynthesizedDesign:
     spec: Spec
     model: LinearModel
     controller: Controller
+    verified: Margins | None = None  # where it is known: with the margin over the spec's own uncertainty
 
     @property
     def plant(self) -> Plant:
@@ -93,6 +94,8 @@ class SynthesizedDesign:
     @cached_property
     def margins(self) -> Margins:
         """The verified loop, with the proven robust margin where one is asked for."""
+        if self.verified is not None:
+            return self.verified
         box = self.spec.uncertainty if "margin" in self.spec.specification else None
         return verify(self.model, self.controller, box)
 
@@ -136,10 +139,18 @@ class SynthesizedDesign:
         return run
 
 
-def judge(spec: Spec, controller: Controller | None = None) -> tuple[Outcome, ...]:
-    """Measure every requirement of a design: proven margin, verified loop, covariance, simulated experiments.
+def judge(
+    spec: Spec,
+    controller: Controller | None = None,
+    *,
+    names: Collection[str] | None = None,
+    verified: Margins | None = None,
+) -> tuple[Outcome, ...]:
+    """Measure requirements of a design: proven margin, verified loop, covariance, simulated experiments.
 
     controller : of a gain file, in place of the one that the design file is synthesized to
+    names : entries of the specification; None: all
+    verified : what `malta.verify` found of the controller, with the margin where one is asked for; None: computed
 
     A PID's load errors come first, which no bound is asked of. What an unstable loop does not have fails.
 
@@ -149,11 +160,17 @@ def judge(spec: Spec, controller: Controller | None = None) -> tuple[Outcome, ..
         model, controller = model_and_controller(spec)
     else:
         model = linearize(spec.plant, spec.plant.at(**spec.operating_point))
-    design = SynthesizedDesign(spec, model, controller)
+    design = SynthesizedDesign(spec, model, controller, verified)
     outcomes = _load_errors(design) if spec.pid else []
-    for name in spec.specification:
+    for name in spec.specification if names is None else names:
         outcomes += outcomes_of(design, name)
     return tuple(outcomes)
+
+
+def unflown(spec: Spec) -> list[str]:
+    """List the entries of a specification that are measured on the linear loop, without flights of the machine."""
+    known = requirements_for(spec.plant)
+    return [name for name in spec.specification if base_of(name) in known and not known[base_of(name)].flown]
 
 
 def outcomes_of(design: SynthesizedDesign, name: str) -> list[Outcome]:

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from malta.proof.blocks.gain import Gain
     from malta.proof.margin import Margin
     from malta.simulation.payload import Payload
+    from malta.tuning.outcomes import Outcome
 
 Poles = list[tuple[float, float]]
 
@@ -166,6 +167,22 @@ class PayloadPart(Part):
     dropped_kg: Number
 
 
+class RequirementPart(Part):
+    """A requirement on a design, and what the design reaches; SI."""
+
+    name: str
+    asked: Number = Field(description="null: as little as the others leave")
+    found: Number
+    unit: str
+    how: str = Field(description="where the figure comes from")
+    ratio: Number = Field(description="how near its limit: at most 1 where it holds; null: infinite")
+    holds: bool = Field(description="false where the verdict is undecided, too")
+    verdict: Literal["holds", "fails", "undecided"]
+    interval: tuple[float, float] | None = Field(
+        description="95 % confidence of a mean over seeds; null: a figure without chance"
+    )
+
+
 class VerifyOutput(LoopPart):
     """What `malta verify --json` prints."""
 
@@ -178,6 +195,24 @@ class VerifyOutput(LoopPart):
     robust: RobustPart
     payload: PayloadPart | None
     left_out: str = ""  # of the machine, by the loop of the last stage; "": nothing
+    requirements: list[RequirementPart] = Field(
+        default=[], description="of the design file, those that no flight measures; empty: no design file"
+    )
+
+
+def requirement_part(outcome: Outcome) -> RequirementPart:
+    """A requirement and what is reached of it."""
+    return RequirementPart(
+        name=outcome.name,
+        asked=outcome.asked,
+        found=outcome.found,
+        unit=outcome.unit,
+        how=outcome.how,
+        ratio=outcome.ratio,
+        holds=outcome.holds,
+        verdict=outcome.verdict,
+        interval=outcome.interval,
+    )
 
 
 def loop_fields(margins: Margins) -> dict[str, Any]:

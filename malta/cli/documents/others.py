@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Literal
 
 from pydantic import Field
 
+from malta.cli.documents.loops import RequirementPart, requirement_part
 from malta.cli.documents.parts import Files, Number, Part
 from malta.identifiers import identifier
 
@@ -16,7 +17,6 @@ if TYPE_CHECKING:
     from malta.proof.certificate.checked_file import Claim
     from malta.report.ledger import Ledger
     from malta.synthesis.spec import Spec
-    from malta.tuning.outcomes import Outcome
     from malta.tuning.tune import Tuned
 
 
@@ -89,22 +89,6 @@ def certified_part(claim: Claim) -> CertifiedPart:
     )
 
 
-class RequirementPart(Part):
-    """A requirement on a design, and what the design reaches; SI."""
-
-    name: str
-    asked: Number = Field(description="null: as little as the others leave")
-    found: Number
-    unit: str
-    how: str = Field(description="where the figure comes from")
-    ratio: Number = Field(description="how near its limit: at most 1 where it holds; null: infinite")
-    holds: bool = Field(description="false where the verdict is undecided, too")
-    verdict: Literal["holds", "fails", "undecided"]
-    interval: tuple[float, float] | None = Field(
-        description="95 % confidence of a mean over seeds; null: a figure without chance"
-    )
-
-
 class SearchPart(Part):
     """How a design was found."""
 
@@ -159,21 +143,6 @@ class ExportOutput(Part):
     gains: str
     to: Literal["c", "fmu"]
     files: Files
-
-
-def requirement_part(outcome: Outcome) -> RequirementPart:
-    """A requirement and what is reached of it."""
-    return RequirementPart(
-        name=outcome.name,
-        asked=outcome.asked,
-        found=outcome.found,
-        unit=outcome.unit,
-        how=outcome.how,
-        ratio=outcome.ratio,
-        holds=outcome.holds,
-        verdict=outcome.verdict,
-        interval=outcome.interval,
-    )
 
 
 def tune_output(spec: Spec, tuned: Tuned, files: Sequence[Path]) -> TuneOutput:

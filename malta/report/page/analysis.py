@@ -140,7 +140,8 @@ def analyse(
     steps.reach(0.7)
     notes: list[str] = []
     job = _main_job(subject, notes, steps.part(0.7, 0.8))
-    outcomes = _outcomes(subject, notes)
+    margin = margins.robust if robust is None or not stages else robust.travel if proof else None
+    outcomes = _outcomes(subject, replace(margins, robust=margin), notes)
     steps.reach(1.0)
     return Analysis(
         subject,
@@ -148,7 +149,7 @@ def analyse(
         model,
         margins,
         robust,
-        margin=margins.robust if robust is None or not stages else robust.travel if proof else None,
+        margin=margin,
         classical=subject.loop.classical if margins.stable else None,
         worst=worst,
         recovered=recovery(plant, controller) if margins.stable and plant.disturbances else (),
@@ -200,13 +201,18 @@ def _main_job(subject: Subject, notes: list[str], progress: Share) -> Experiment
     return found
 
 
-def _outcomes(subject: Subject, notes: list[str]) -> tuple[Outcome, ...]:
-    """What the design file asks for, measured with the gains of the gain file; none without a design file."""
+def _outcomes(subject: Subject, margins: Margins, notes: list[str]) -> tuple[Outcome, ...]:
+    """What the design file asks for, measured with the gains of the gain file; none without a design file.
+
+    margins : of the subject, with the margin over its uncertainty where that is proven
+    """
     if subject.spec is None:
         return ()
     spec = replace(subject.spec, parameters=subject.parameters)
+    same = subject.current_loops == LAST and dict(subject.box) == dict(spec.uncertainty)
+    verified = margins if same and margins.robust is not None else None
     try:
-        return judge(spec, subject.controller)
+        return judge(spec, subject.controller, verified=verified)
     except (InputError, CheckError) as error:
         notes.append(f"the requirements were not judged: {error}")
         return ()
