@@ -23,7 +23,8 @@ if TYPE_CHECKING:
 
 # Of the process noise's variance, for a filter that does without a sensor. For none at all the Kalman filter is the one
 # of least gain that is stable: two unstable modes seen by one sensor take large gains, which noise and errors grow by.
-TRUST = 1e-6
+# One that keeps its estimates of disturbances has to follow new ones by its other states, and so has to be faster.
+TRUST, TRUST_KEPT = 2e-6, 5e-5
 PLACES = 9  # along the stroke, for which there are such gains
 
 
@@ -38,8 +39,9 @@ class Gains(NamedTuple):
 def gains_without(t: Target) -> Gains:
     """Gains of Kalman filters that do without one sensor, for the prediction of prediction_correction at each place.
 
-    The process noise is TRUST of the gain file's. A sensor is left out of the answer where no filter of the others is
-    stable, and all are without a record of the noise.
+    The process noise is TRUST, or TRUST_KEPT, of the gain file's. Where the other sensors cannot see the disturbances
+    that a design estimates, the filter of all other states is used and keeps the estimates of the disturbances. A
+    sensor is left out of the answer where no filter of the others is stable, and all are without a record of the noise.
     """
     c, plant = t.controller, t.believed
     places = np.zeros(1)
@@ -62,27 +64,36 @@ def gains_without(t: Target) -> Gains:
         more, C = (np.array(value) for value in derivatives(at))
         models.append((c.Ad + more, C))
     found = {}
+    sizes = [(len(W), TRUST)]  # of what is filtered
+    if c.observed:
+        sizes.append((len(W) - len(c.forces), TRUST_KEPT))
     for k in range(len(c.measurements)):
-        gains = [_gain_without(k, A, C, W, V) for A, C in models if _sees_instability(k, A, C)]
-        if len(gains) == len(models) and all(L is not None for L in gains):
-            found[k] = np.array(gains)
+        for n, trust in sizes:
+            seen = [(A[:n, :n], C[:, :n]) for A, C in models]
+            gains = [
+                _gain_without(k, A, C, trust * W[:n, :n], V) for A, C in seen if _sees_instability(k, A, C)
+            ]
+            stable = [np.vstack([L, np.zeros((len(W) - n, len(V)))]) for L in gains if L is not None]
+            if len(stable) == len(models):
+                found[k] = np.array(stable)
+                break
     return Gains(places, found)
 
 
 def _process_noise(c: Controller) -> FloatArray:
-    """TRUST of the process noise's covariance over a sample, of all states of the filter."""
+    """The process noise's covariance over a sample, of all states of the filter."""
     assert c.noise is not None
     assert c.cost is not None
     n, size = len(c.A), len(c.Ad)
     G = sample(c.A, noise_input(c.B, c.cost.coordinates), c.sample_time)[1]
     W = np.zeros((size, size))
-    W[:n, :n] = TRUST * (G * c.noise.process @ G.T)
+    W[:n, :n] = G * c.noise.process @ G.T
     if c.observed:
         drift = np.diag(c.noise.drift)
         if c.cost.coordinates == "positions":
             back = np.linalg.inv(c.B[n // 2 :])
             drift = back @ drift @ back.T
-        W[-len(c.forces) :, -len(c.forces) :] = TRUST * drift
+        W[-len(c.forces) :, -len(c.forces) :] = drift
     return W
 
 

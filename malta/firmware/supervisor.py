@@ -19,6 +19,7 @@ import casadi as ca
 import numpy as np
 
 from malta.errors import InputError
+from malta.firmware.sensor_loss import gains_without
 from malta.firmware.signals import (
     Target,
     current_readings,
@@ -205,6 +206,8 @@ def monitors_of(t: Target) -> tuple[Monitor, ...]:
     moving: tuple[State, ...] = ("OPERATE", "HOLD")
     ground: tuple[State, ...] = ("OFFSETS", "SENSORS")
     off = LOST_CONTROL / ASTRAY_CURRENT * b.deviation
+    # Without a filter that does without the sensor, a fall is softer than a landing by prediction alone.
+    without: Reaction = "LAND" if gains_without(t).L else "FAULT"
     listed = [
         Monitor("TOUCH", "reading over the bound of a touchdown", 1.0, 5, "LAND", READY),
         Monitor("RANGE", "reading over what can be read", 1.0, 1, "IGNORE", checked),
@@ -215,9 +218,9 @@ def monitors_of(t: Target) -> tuple[Monitor, ...]:
         Monitor("STALE", "repetitions of all sensors at once", b.stale - 0.5, 1, "IGNORE", checked),
         Monitor("NAN", "no number, or called invalid", 0.5, 1, "IGNORE", checked),
         Monitor("UNBELIEVED", "a sensor is ignored", 0.5, BRIDGED, "HOLD", moving),
-        Monitor("UNBELIEVED", "a sensor is ignored", 0.5, b.unbelieved, "LAND", FLYING),
+        Monitor("UNBELIEVED", "a sensor is ignored", 0.5, b.unbelieved, without, FLYING),
         Monitor("BLIND", "all sensors are ignored", 0.5, b.unbelieved, "FAULT", FLYING),
-        Monitor("ASTRAY", "expected reading over what can be read", 1.0, 5, "FAULT", FLYING),
+        Monitor("ASTRAY", "expected reading where none can be, or no reference is", 1.0, 5, "FAULT", FLYING),
         Monitor("HELPLESS", "a force at its limit, a sensor ignored", 0.5, 10, "FAULT", FLYING),
         Monitor("MISSED", "missed steps before this one", 2.5, 1, "HOLD", moving),
         Monitor("MISSED", "missed steps before this one", b.unbelieved + 0.5, 1, "LAND", FLYING),

@@ -398,6 +398,19 @@ static void look_at_currents({{ name }}_supervisor *sup, const {{ name }}_inputs
 }
 {% endif %}
 
+/* Whether the filter lost its way: it expects what cannot be read or, without a sensor, to be where no reference is. */
+static int32_t is_astray(const {{ name }}_supervisor *sup, {{ name }}_real expected, {{ name }}_real reference, int32_t k) {
+  int32_t ignored = 0;
+  int32_t j;
+  for (j = 0; j < OUTPUTS; j++) {
+    ignored = (sup->unbelieved[j] > 0) ? (ignored + 1) : ignored;
+  }
+  if (is_within(expected, range[k]) == 0) {
+    return 1;
+  }
+  return ((ignored > 0) && (size_of(expected - reference) > near_touch[k])) ? 1 : 0;
+}
+
 /* Levels of all monitors at a sample. */
 static void look({{ name }}_supervisor *sup, const {{ name }}_state *s, const {{ name }}_inputs *in,
                  const {{ name }}_request *request, const {{ name }}_real expected[OUTPUTS],
@@ -414,7 +427,8 @@ static void look({{ name }}_supervisor *sup, const {{ name }}_state *s, const {{
     look_at_sensor(sup, in, missed, k, expected[k], s->reference.p[k], level);
     level[{{ NAME }}_MONITOR_SATURATION][k] = sup->limited[k];
     if (is_flying(sup->state) == 1) {
-      level[{{ NAME }}_MONITOR_ASTRAY][k] = (is_within(expected[k], range[k]) == 1) ? {{ zero }} : {{ two }};
+      const int32_t astray = is_astray(sup, expected[k], s->reference.p[k], k);
+      level[{{ NAME }}_MONITOR_ASTRAY][k] = (astray == 1) ? {{ two }} : {{ zero }};
     }
   }
   look_at_sensors(sup, level);
