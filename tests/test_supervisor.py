@@ -468,7 +468,7 @@ def test_one_sensor_less_leaves_a_stable_filter() -> None:
 
 
 def test_a_filter_without_a_sensor_keeps_what_it_knows_of_disturbances() -> None:
-    """One radial sensor of a plane cannot see two forces: their estimates stay, and the rest of the filter is stable."""
+    """One radial sensor of a plane cannot see two forces: their estimates stay, the rest of the filter is stable."""
     t = Target(malta.gains.read(ROOT / "design" / "gains" / "robust_observer.json"))
     gains, c = gains_without(t), t.controller
     assert sorted(gains.L) == [0, 1, 2, 3]
