@@ -29,6 +29,7 @@ from malta.loops.classical import (
 )
 from malta.loops.sampled_loops import loaded_loop, machine_law, machine_system
 from malta.margins.stages import MACHINE, SAMPLED, Robustness, compensators, robustness
+from malta.margins.travel import place_margin
 from malta.model.data import plant_of
 from malta.proof.blocks.gain import Gain
 from malta.proof.responses import responses
@@ -104,6 +105,20 @@ def test_places_stand_for_both_sides_of_the_travel(name: str) -> None:
         there = robust_margin(*machine_system(plant, c, list(BOX), {"z": z}), BOX)
         assert there.upper >= places[-1].margin.upper * (1 - 1e-9)
     assert places[-1].margin.upper >= (chain_of(name).travel.lower or 0)
+
+
+def test_what_is_proven_over_the_travel_is_proven_at_its_places() -> None:
+    """The loss that is found beside the travel's witness is that of a search at the place alone."""
+    c = gains.read("design/gains/calibrated.json")
+    plant, travel = plant_of(c.parameters), chain_of("calibrated").travel
+    alone = place_margin(plant, c, BOX, -10e-3)
+    beside = place_margin(plant, c, BOX, -10e-3, travel=replace(travel, lower=alone.lower))
+    assert beside.certificate == ()  # no search of its own
+    assert beside.lower == alone.lower
+    assert beside.upper == pytest.approx(alone.upper, rel=1e-6)
+    assert beside.witness == pytest.approx(alone.witness, rel=1e-3)
+    wrong = place_margin(plant, c, BOX, -10e-3, travel=replace(travel, lower=1.5 * (travel.lower or 0)))
+    assert wrong.lower == pytest.approx(alone.lower, rel=1e-3)
 
 
 @pytest.mark.parametrize("name", DESIGNS)

@@ -240,14 +240,18 @@ class _Question:
         """The margin at a position along the course; computed once if the loop does not depend on the position."""
         z, known = position if self._moves else 0.0, self._place_margins
         if z not in known:
+            travel = self._travel_margins.get(self._key(self.uncertainty, self.time))
             known[z] = place_margin(
-                self.plant, self.controller, self.uncertainty, z, self.current_loops, self.names
+                self.plant, self.controller, self.uncertainty, z, self.current_loops, self.names, travel
             )
         return known[z]
 
+    def _key(self, ranges: Ranges, time: float | None) -> tuple[object, float | None]:
+        return tuple(ranges.items()), time
+
     def margin_over(self, ranges: Ranges, time: float | None, progress: Progress | None = None) -> Margin:
         """The margin anywhere in the extent; computed once for equal ranges: +1 kg may be the range of the mass."""
-        known, key = self._travel_margins, (tuple(ranges.items()), time)
+        known, key = self._travel_margins, self._key(ranges, time)
         if key not in known:
             known[key] = travel_margin(
                 self.plant, self.controller, ranges, self.current_loops, self.names,
@@ -305,8 +309,8 @@ def robustness(
             progress(min(1.0, next(steps) / total))
 
     question = _Question(plant, controller, uncertainty, current_loops, time, proof, report)
-    links = _links(question)
     travel = question.margin_over(uncertainty, time, bounds) if proof else NOT_PROVEN
+    links = _links(question)
     tolerance, mass = _tolerances(question) if proof else ({}, None)
     places, worst = _places(question)
     sensors = [s.name for s in plant.outputs]

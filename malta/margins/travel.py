@@ -182,17 +182,19 @@ def place_margin(
     position: float,
     current_loops: CurrentLoops = LAST,
     names: Sequence[str] = (),
+    travel: Margin | None = None,
 ) -> Margin:
     """The margin of the machine's loop at a position along its course (`Extent.course`), SI.
 
-    The other arguments are those of travel_margin. Without a proof along the travel the search takes EACH at most.
+    The other arguments are those of travel_margin; travel is its answer, where it is known. Without a proof along the
+    travel the search takes EACH at most.
     """
     names = tuple(names or ranges)
     if not plant.has_stroke:
         return robust_margin(*loop_at(plant, controller, names, position, current_loops), ranges)
     along, over = travel_loops(plant, controller, names, current_loops)
     if plant.stroke in over:
-        return margin_at(*along[0], ranges, {plant.stroke: position}, tolerance=TOLERANCE)
+        return margin_at(*along[0], ranges, {plant.stroke: position}, tolerance=TOLERANCE, wider=travel)
     loop = loop_at(plant, controller, names, position, current_loops)
     if (problem := _anywhere(plant, controller, names, current_loops, position)) is not None:
         found = margin_of(problem, _box(loop[0], ranges), Effort(time=EACH))

@@ -79,6 +79,14 @@ def first_loss(problem: Problem, box: Box, reach: float) -> Loss:
     return best
 
 
+def loss_beside(problem: Problem, box: Box, witness: FloatArray, reach: float) -> Loss:
+    """The first loss up to `reach` towards the witness of another loop, or at a corner near it; else infinity."""
+    place = box.nominal_places()[0]
+    d = (witness - place) / max(float(box.margin(witness)), 1e-300)
+    found = _nearer(problem, place, d, reach, (math.inf, None, None))
+    return _improve_corner(problem, box, place, found)
+
+
 def _nearer(problem: Problem, place: FloatArray, d: FloatArray, reach: float, best: Loss) -> Loss:
     """The first loss along a direction if it is nearer than the best one, else that one."""
     t = _along(problem, place, d, min(reach, best[0]))

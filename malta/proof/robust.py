@@ -35,7 +35,7 @@ from malta.proof.box import Box, box_of
 from malta.proof.branches import within_branches
 from malta.proof.expressions import program
 from malta.proof.groups import loop_of
-from malta.proof.loss import first_loss
+from malta.proof.loss import first_loss, loss_beside
 from malta.proof.margin import Margin, Progress, Ranges
 from malta.proof.problem import (
     OfCoefficients,
@@ -156,13 +156,28 @@ def margin_at(
     *,
     tolerance: float | None = None,
     time: float | None = None,
+    wider: Margin | None = None,
 ) -> Margin:
-    """The margin with some parameters fixed at the values `at` in place of the nominal ones."""
+    """The margin with some parameters fixed at the values `at` in place of the nominal ones.
+
+    wider : the margin of the same ranges over intervals that hold these values: what it proves is proven here too, and
+        a loss as near in the direction of its witness ends the search
+    """
     nominal = system.nominal.copy()
     for name, value in at.items():
         nominal[system.names.index(name)] = value
     box = within_branches(box_of(system.names, nominal, system.limits, ranges, {}), system.positive)
-    return margin_of(problem_of(system, compensator), box, Effort(tolerance, time))
+    problem = problem_of(system, compensator)
+    if wider is not None and wider.lower and wider.witness is not None:
+        begun, reach = clock.monotonic(), wider.lower * (1 + (tolerance or TOLERANCE))
+        witness = np.array([at.get(name, wider.witness[name]) for name in box.names])
+        t, frequency, p = loss_beside(problem, box, witness, min(reach, box.limit))
+        if p is not None and t >= wider.lower:
+            named = dict(zip(box.names, p.tolist(), strict=True))
+            moved = dict(zip(box.names, (p - box.nominal).tolist(), strict=True))
+            spent = clock.monotonic() - begun
+            return Margin(wider.lower, t, frequency, named, moved, wider.sensitivity, (), spent)
+    return margin_of(problem, box, Effort(tolerance, time))
 
 
 def law_of(system: UncertainSystem, compensator: Any, caller: str = "robust_margin") -> Compensator:

@@ -35,7 +35,7 @@ FIRST = 3.97  # the first box that is searched, in multiples of the modelled one
 CHEAP = 4000  # cells below which the proof is brought closer to the witness than the tolerance
 FINEST = 3e-7  # how close, relative
 DEAR = 3.0  # s that families take beyond which their boxes grow in small steps
-BRIEF = 0.5  # s that a wider box may take at least
+BRIEF, SMALL = 0.5, 0.015  # s, and share of the time, that a wider box may take at least
 PATIENCE = 20_000  # cells without progress after which the proof is given up
 HARD = 4000  # cells after which smaller boxes are proven first
 FEW = 100  # cells of many parameters, of which each is dear, before multipliers take their turn
@@ -121,7 +121,7 @@ class Job:
             hurried = why.startswith(TIME_UP)  # a smaller box takes as long
             last = now + (1.0 if hurried else 0.3) * (self.end - now)
             if done or FIRST < reach >= self.limit:
-                last = min(last, now + max(BRIEF, 2 * spent))
+                last = min(last, now + max(BRIEF, SMALL * (self.end - self.begun), 2 * spent))
             try:
                 found = parts_over(self.problem, self.box, reach, min(self.until, last))
             except Unproven as error:
