@@ -376,15 +376,24 @@ def _check(found: _Found, what: str, *, definite: bool) -> None:
     poles = eigenvalues(found.closed)
     discrete = found.equation.discrete
     excess = np.abs(poles).max() - 1 if discrete else poles.real.max()
-    rounding = (
-        4 * EPS * (1.0 if discrete else float(np.abs(poles).max()))
-    )  # a pole this close may be on either side
+    rounding = 4 * EPS if discrete else _rounding_of_poles(found)  # a pole this close may be on either side
     if not found.residual <= RESIDUAL:
         raise CheckError(f"{what}: the relative residual is {found.residual:.1e}, allowed {RESIDUAL:.0e}")
     if not excess < -rounding:
         raise CheckError(f"{what}: the closed loop is not stable (excess {excess:.1e})")
     if definite and np.linalg.eigvalsh(found.X).min() < -1e-9 * np.abs(found.X).max():
         raise CheckError(f"{what}: the solution is not positive semidefinite")
+
+
+def _rounding_of_poles(found: _Found) -> float:
+    """How far rounding of A and B K may move the slowest pole of A - B K: |y'| (|A| + |B| |K|) |x| / |y'x|; a double
+    pole at most."""
+    A, B = found.equation[:2]
+    poles, left, right = linalg.eig(found.closed, left=True)
+    k = int(poles.real.argmax())
+    y, x = left[:, k], right[:, k]
+    size = np.abs(A) + np.abs(B) @ np.abs(found.K)
+    return float(4 * EPS * (np.abs(y) @ size @ np.abs(x)) / max(abs(y.conj() @ x), EPS**0.5))
 
 
 def _first_sentence(error: Exception) -> str:
