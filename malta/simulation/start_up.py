@@ -10,12 +10,14 @@ measurements would have. Covariances of forces and sensors are those of the gain
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import casadi as ca
 import numpy as np
+from scipy.linalg import LinAlgWarning
 
 from malta.errors import InputError
 from malta.model.data import plant_of
@@ -77,10 +79,7 @@ def observer(simulation: Simulation, substeps: int) -> Observer:
             if not started:
                 _start_filter(filter_, c, y)
                 started = True
-            try:
-                filter_.update(y, jacobian, output)
-            except (np.linalg.LinAlgError, ValueError):  # NaN in the estimate or its covariance
-                filter_.x = np.full(n, np.nan)
+            _update(filter_, y, jacobian, output)
             now = given[k : k + 1].copy()
             now[0, -len(c.states) :] = np.concatenate([filter_.x, under_way])
             state, row = engine.run(0, state, now, noise[k : k + 1], none)
@@ -97,6 +96,16 @@ def observer(simulation: Simulation, substeps: int) -> Observer:
         return state, np.concatenate(rows)
 
     return run
+
+
+def _update(filter_: Any, y: FloatArray, jacobian: Any, output: Any) -> None:
+    """The estimate with the readings y; NaN where estimate or covariance are no numbers, without a word of scipy's."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", LinAlgWarning)  # of a covariance that is nearly singular
+        try:
+            filter_.update(y, jacobian, output)
+        except (np.linalg.LinAlgError, ValueError):
+            filter_.x = np.full(len(filter_.x), np.nan)
 
 
 def fits_kalman_filter(c: Controller) -> bool:
