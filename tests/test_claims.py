@@ -21,11 +21,13 @@ from malta import references
 from malta.loops.sampled_loops import machine_loop
 from malta.machines.tubular import claims as tubular
 from malta.machines.tubular import evidence as tubular_evidence
-from malta.machines.tubular.evidence import EXPERIMENT_NAMES, Evidence, is_solved_for_ratio
+from malta.machines.tubular.evidence import EXPERIMENT_NAMES, SEEDS, Evidence, is_solved_for_ratio
+from malta.machines.tubular.experiments.rest import RESTING
 from malta.model.data import plant_of
 from malta.model.published import published_value
 from malta.report import ledger as claims
 from malta.report.ledger import Claim, Ledger, Row
+from malta.simulation.experiments import REAL
 from malta.simulation.responses import step_wrench
 from malta.simulation.scenario import Scenario
 from malta.simulation.simulate import simulate
@@ -656,7 +658,6 @@ def test_figures_are_those_of_the_experiments(found: Found) -> None:
             ("stroke: overshoot", "stroke", "overshoot"),
             ("stroke: axial error", "stroke", "axial error"),
             ("the same without touchdown", "payload", "largest of these carried and moved"),
-            ("at rest: z", "hold", "measured z, std"),
         ):
             merit = next(m for m in evidence.experiments[experiment].merits if m.label == label)
             assert found.value(start, name) == pytest.approx(in_unit(merit.value, merit.unit), rel=1e-12)
@@ -670,6 +671,22 @@ def test_figures_are_those_of_the_experiments(found: Found) -> None:
             assert found.value(start, name) == pytest.approx(case.merits[0].value * 1e6)
         assert "largest deviation" in evidence.experiments["thermal"].cases[0].merits[0].label
         assert evidence.experiments["tilt"].cases[0].merits[0].label == "SP2: largest deviation, true"
+
+
+def test_rests_are_those_of_many_seeds(found: Found) -> None:
+    """The mean square over seeds, of runs made one by one."""
+    for name, e in zip(NAMES, found.evidence, strict=True):
+        y = [
+            malta.simulate(e.spec.plant, e.controller, rest_scenario(seed)).y[-RESTING:].std(axis=0)
+            for seed in range(SEEDS)
+        ]
+        for k, output in enumerate(("x1", "y1", "x2", "y2", "z")):
+            expected = np.sqrt(np.mean(np.square(y), axis=0))[k]
+            assert found.value(f"at rest: {output}", name) == pytest.approx(1e6 * expected, rel=1e-9)
+
+
+def rest_scenario(seed: int) -> Scenario:
+    return replace(Scenario("hold", (RESTING + 6000) * 50e-6, references.hold), seed=seed, **REAL)
 
 
 def test_the_rule_of_thumb_by_hand(found: Found) -> None:

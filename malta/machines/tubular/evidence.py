@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -14,6 +14,7 @@ from scipy.optimize import brentq
 from malta.campaigns.yields import Yields, main_yields
 from malta.loops.loop import loop_of_model
 from malta.loops.recovery import PLACES, Deviation, recovery
+from malta.machines.tubular.experiments.rest import hold
 from malta.machines.tubular.experiments.strokes import delayed_stroke
 from malta.margins.stages import compensators
 from malta.margins.verify import Margins
@@ -22,7 +23,6 @@ from malta.model.published import published_value
 from malta.proof.machine.parametric_plants import of_plant
 from malta.proof.robust import robust_margin
 from malta.report.ledger import (
-    merit,
     proven_share,
     run_design,
 )
@@ -41,10 +41,11 @@ from malta.tuning.noise import noise_of
 
 if TYPE_CHECKING:
     from malta.campaigns.result import Rate
-    from malta.model.plant import FloatArray
+    from malta.model.plant import FloatArray, Plant
 
 EXPERIMENT_NAMES = ("stroke", "hold", "tilt", "payload", "thermal")
 MACHINES, FEW = 10_000, 200  # of the yields, with and without a C compiler
+SEEDS = 16  # of rests: the motion of a slow design moves by a fifth from one to the next
 IMPLIED_RATIO = 4.0  # K1 / k at which the LQR stands the published 300 % of a 20 % box
 
 
@@ -63,6 +64,7 @@ class Evidence:
     growth: float  # m, thermal growth of the published arm
     published: Mapping[str, Any]
     yields: Yields  # of MACHINES that differ, in the stroke
+    rests: Mapping[str, float]  # figures of merit of the hold, SI: root mean squares over SEEDS
 
 
 def evidence(spec: Spec, published: Mapping[str, Any], progress: Progress | None = None) -> Evidence:
@@ -85,7 +87,14 @@ def evidence(spec: Spec, published: Mapping[str, Any], progress: Progress | None
         published_value(published, "thermal.length") * published_value(published, "thermal.strain"),
         published,
         main_yields(controller, spec, published, machines=MACHINES if compiler() else FEW),
+        rests_of_seeds(plant, controller, range(SEEDS)),
     )
+
+
+def rests_of_seeds(plant: Plant, controller: Controller, seeds: Sequence[int]) -> dict[str, float]:
+    """The figures of merit of rests with other noise, by their labels, SI: root mean squares over the seeds."""
+    each = [{m.label: m.value for m in hold(plant, controller, seed=seed).merits} for seed in seeds]
+    return {label: math.sqrt(sum(one[label] ** 2 for one in each) / len(each)) for label in each[0]}
 
 
 def pole(name: str, e: Evidence) -> float:
@@ -205,7 +214,12 @@ def precise_payload(e: Evidence) -> float:
 
 def true_radial(e: Evidence) -> float:
     """Largest rms of the true radial motion at rest, m."""
-    return max(merit("hold", f"true {name}, rms", e) for name in ("x1", "y1", "x2", "y2"))
+    return max(e.rests[f"true {name}, rms"] for name in ("x1", "y1", "x2", "y2"))
+
+
+def measured_at_rest(name: str, e: Evidence) -> float:
+    """Standard deviation of an output's measurements at rest, m."""
+    return e.rests[f"measured {name}, std"]
 
 
 def noise_forces(e: Evidence) -> tuple[float, float]:
