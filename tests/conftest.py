@@ -16,6 +16,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import hypothesis
 import pytest
 from rich.console import Console
 
@@ -39,6 +40,9 @@ if TYPE_CHECKING:
 
 # As in the program: numeric libraries make many lasting objects, and going through them again and again costs time.
 gc.set_threshold(200_000, 50, 50)
+
+hypothesis.settings.register_profile("untimed", deadline=None)  # a loaded computer fails no test
+hypothesis.settings.load_profile("untimed")
 
 os.environ.pop("COLUMNS", None)  # which workers of pytest may have: tables have the width of a file
 ROOT = Path(__file__).parents[1]

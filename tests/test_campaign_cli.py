@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import Run
+from conftest import Run, without_progress
 from typer.testing import CliRunner
 
 from malta.cli import main as cli
@@ -33,6 +33,7 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def _sentence(err: str) -> str:
     assert "Traceback" not in err
+    err = without_progress(err)
     assert err.count("\n") == 1
     return err.removeprefix("malta: ").rstrip("\n")
 

