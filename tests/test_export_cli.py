@@ -84,7 +84,7 @@ def test_json_lists_the_files(run: Run, tmp_path: Path) -> None:
     code, out, err = run("export", GAINS, "--out", tmp_path / "c", "--json")
     assert (code, err) == (0, "")
     found = json.loads(out)
-    assert (found["gains"], found["to"], len(found["files"])) == (GAINS, "c", 10)
+    assert (found["gains"], found["to"], len(found["files"])) == (GAINS, "c", 11)
 
 
 @pytest.mark.parametrize(
