@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from conftest import ROOT, one_sentence
 from exported import HERE, PROCESSORS, Processor, build, texts
+from test_documents import document
 
 import malta
 from malta.errors import InputError
@@ -118,8 +119,8 @@ def test_a_target_with_the_same_bits_passes(
     assert f"({precision}) against the recorded vectors" in " ".join(out.split())
     assert re.search(r"^ stroke +60 +0 *$", out, re.MULTILINE), out
     assert re.search(r"^\d+ samples / s with the line\npass: all bits agree\n\Z", out, re.MULTILINE), out
-    code, out, _ = run("pil", GAINS, "--port", port, "--json")
-    found = json.loads(out)
+    said = run("pil", GAINS, "--port", port, "--json")
+    code, found = said[0], document(said, "pil-output")
     assert (code, found["agrees"], found["precision"]) == (0, True, precision)
     assert [v["name"] for v in found["vectors"]] == ["stroke", "saturation", "invalid", "lift_off"]
     assert {v["first_that_differs"] for v in found["vectors"]} == {None}
