@@ -41,7 +41,8 @@ static uint32_t {{ name }}_pil_count(void) { return 0u; }
 #define READINGS {{ readings }}
 #define ANSWERS {{ answers }}
 #define REAL_BYTES {{ real_bytes }}u
-#define MOST (READINGS * REAL_BYTES) /* bytes of a request */
+#define MOST {{ readings * real_bytes }}u /* bytes of a request */
+#define STEP_BYTES {{ 9 + answers * real_bytes }}u /* of the answer to a step */
 #define CRC_START 0xFFFFFFFFu
 #define CRC_GOOD 0xDEBB20E3u /* of bytes with their CRC behind them */
 
@@ -118,7 +119,9 @@ static int32_t receive(pil_frame *f) {
         f->bytes[k] = (uint_least8_t)byte;
       }
     }
-    found = (sum == CRC_GOOD) ? 1 : 0;
+    if (sum == CRC_GOOD) {
+      found = 1;
+    }
   }
   return (there == 1) ? found : -1;
 }
@@ -218,7 +221,7 @@ static void step(pil_run *run, const pil_frame *f) {
 
 static void answer_step(const pil_run *run, uint32_t number) {
   uint32_t total = {{ fnv_start }}u;
-  uint32_t sum = begin_answer(131u, number, 1u + (ANSWERS * REAL_BYTES) + 8u);
+  uint32_t sum = begin_answer(131u, number, STEP_BYTES);
 {% for f in output_all %}
   total = add_all(total, run->out.{{ f.name }}, {{ f.size }});
 {% endfor %}
