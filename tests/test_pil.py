@@ -18,13 +18,15 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from conftest import ROOT, one_sentence
 from exported import HERE, PROCESSORS, Processor, build, texts
+from hypothesis import given
+from hypothesis import strategies as st
 from test_documents import document
 
 import malta
 from malta.errors import InputError
 from malta.firmware import serial_line
 from malta.firmware.elementary import Precision
-from malta.firmware.serial_line import Frame, frame_bytes
+from malta.firmware.serial_line import START, Frame, frame_bytes
 
 if TYPE_CHECKING:
     from conftest import Run
@@ -190,6 +192,21 @@ def test_a_line_that_garbles_some_costs_time_only(target: str) -> None:
     assert replay.agrees
     assert replay.repeated > 5
     assert [v.largest for v in replay.vectors] == [0.0] * 4
+
+
+@given(st.lists(st.sampled_from([START, b"\0\0", b"\1", frame_bytes(Frame(1, 2, b"abc"))]), max_size=12))
+def test_whatever_comes_is_read_in_frames(pieces: list[bytes]) -> None:
+    """A whole frame behind bytes that look like one is found, or they are told as garbled; reading goes on."""
+    data = b"".join(pieces) + bytes(70_000) + frame_bytes(Frame(3, 4, b"end"))
+    at, found = 0, []
+    while True:
+        frame, behind = serial_line.next_frame(data, at)
+        if frame is None:
+            break
+        assert behind > at
+        at = behind
+        found.append(frame)
+    assert found[-1] == Frame(3, 4, b"end")
 
 
 def hear(port: serial_line.Port) -> Frame:
