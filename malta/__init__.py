@@ -29,6 +29,8 @@ if TYPE_CHECKING:  # the contents page, as type checkers and readers see it
     from malta.firmware.exports import export_c as export_c
     from malta.firmware.exports import export_fmu as export_fmu
     from malta.firmware.flight import engine_of_c as engine_of_c
+    from malta.firmware.pil import Replay as Replay
+    from malta.firmware.pil import replay_on_target as replay_on_target
     from malta.loops.curves import LoopCurves as LoopCurves
     from malta.loops.curves import loop_curves as loop_curves
     from malta.loops.loop import Loop as Loop

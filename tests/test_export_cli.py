@@ -84,7 +84,7 @@ def test_json_lists_the_files(run: Run, tmp_path: Path) -> None:
     code, out, err = run("export", GAINS, "--out", tmp_path / "c", "--json")
     assert (code, err) == (0, "")
     found = json.loads(out)
-    assert (found["gains"], found["to"], len(found["files"])) == (GAINS, "c", 10)
+    assert (found["gains"], found["to"], len(found["files"])) == (GAINS, "c", 11)
 
 
 @pytest.mark.parametrize(
@@ -242,13 +242,15 @@ def test_names_of_other_files_and_targets_are_left_to_them(tmp_path: Path) -> No
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [file.stem for file in sorted((ROOT / "design" / "gains").glob("*.json"))])
 def test_every_shipped_design_exports_in_both_precisions(name: str, tmp_path: Path) -> None:
-    """Its vectors pass; in single precision the margin of its rounded coefficients is proven."""
+    """Vectors pass, the example moves and lands; in single precision the margin of rounded coefficients is proven."""
     gains = ROOT / "design" / "gains" / f"{name}.json"
     for precision in ("double", "float"):
         out = tmp_path / precision
         malta.export_c(gains, out, precision=precision, proof=precision == "float")
         if compiled.compiler() is not None:
             assert build_and_test(out).splitlines()[-1].startswith("pass: ")
+            example = subprocess.run([str(out / f"{name}_example")], check=False, timeout=60)
+            assert example.returncode == 0  # it has moved and landed
     report = (out / "REPORT.md").read_text(encoding="utf-8")
     assert "With the coefficients that single precision holds" in report
     assert "% is proven" in report

@@ -96,7 +96,7 @@ def test_no_file_has_a_fused_instruction(name: str, precision: Precision, cc: st
     compiler, *options = COMPILERS[cc]
     require(compiler)
     paths = write_files(files_of(name, precision), tmp_path)
-    assert len(paths) == (5 if precision == "float" else 9)
+    assert len(paths) == (6 if precision == "float" else 10)
     bare = 0
     for path in paths:
         text = path.read_text(encoding="utf-8")

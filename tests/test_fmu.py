@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 import shutil
 import subprocess
 import zipfile
@@ -24,7 +25,7 @@ from malta.firmware.fmu import build_fmu
 from malta.firmware.machine import Machine, command_field
 from malta.firmware.native import FLAGS
 from malta.firmware.signals import Target, fidelity_of
-from malta.firmware.unit import PARTS, Part
+from malta.firmware.unit import PARTS, Part, unit_of
 from malta.simulation import references
 from malta.simulation.compiled import compiler
 
@@ -535,3 +536,13 @@ def test_bad_input_gets_a_sentence() -> None:
 def test_a_machine_takes_as_many_substeps_as_a_simulation() -> None:
     assert Machine(target("robust")).substeps == 4
     assert Machine(target("halbach")).substeps == pytest.approx(805.664, abs=1e-3)
+
+
+@pytest.mark.parametrize("part", PARTS)
+@pytest.mark.parametrize("name", ["halbach", "planar_pid", "robust", "tubular_pid"])
+def test_every_signal_has_a_name_and_a_unit_to_wire(name: str, part: Part) -> None:
+    """Words in place of numbers, as `command.cos_kx`; a number without a dimension says so."""
+    for v in unit_of(target(name), part).variables:
+        assert re.fullmatch(r"[A-Za-z]\w*(\.[A-Za-z]\w*)?", v.name), v.name
+        assert v.unit, v.name
+        assert "set point" not in v.name

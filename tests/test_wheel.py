@@ -29,7 +29,7 @@ SOURCES = (
     "MANIFEST.in",
     "README.md",
 )
-SHORTER = {  # commands of the page that take minutes, as the same commands with less to do
+SHORTER = {  # commands of the page that take minutes, or a target, as the same commands with less to do
     "malta tune design/robust.toml": "malta tune design/robust.toml --check",
     "malta tune design/halbach_pid.toml": "malta tune design/halbach_pid.toml --generations 0 --front 0",
     "malta campaign design/gains/calibrated.json --spread 20%": "malta campaign design/gains/calibrated.json "
@@ -41,6 +41,8 @@ SHORTER = {  # commands of the page that take minutes, as the same commands with
     "--spread 10% --rare touchdown --samples 400",
     "malta campaign design/gains/robust.json --tolerance 99% --limit published": "malta campaign "
     "design/gains/robust.json --tolerance 99% --limit published --samples 64",
+    "malta export design/gains/robust.json --to fmu --platforms all": "malta export design/gains/robust.json --to fmu",
+    "malta pil design/gains/robust.json --port /dev/ttyUSB0": "malta pil --help",
     "malta claims": "malta claims design/table2.toml",
 }
 

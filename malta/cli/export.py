@@ -31,6 +31,10 @@ def export(
         typer.Option(help="Of an FMU: controller, machine, or loop, which has both. [controller]"),
     ] = None,
     fmi: Annotated[int | None, typer.Option(help="Version of an FMU's interface: 2 or 3. [2]")] = None,
+    platforms: Annotated[
+        str | None,
+        typer.Option(help="Binaries of an FMU, by ziglang: all, or win64,aarch64-linux... [this computer]"),
+    ] = None,
     out: Annotated[
         Path | None,
         typer.Option(help="The folder, new or empty, or the .fmu file. [build/NAME_c, build/NAME_PART.fmu]"),
@@ -56,7 +60,7 @@ def export(
     """
     from malta.firmware.exports import export_c, export_fmu
 
-    _require_known(to, precision, until, part, fmi, clock)
+    _require_known(to, precision, until, part, fmi, platforms, clock)
     hertz = None if clock is None else _frequency(clock)
     controller = read_controller(gains, machine)
     chosen: Any = {"until": until}
@@ -64,6 +68,7 @@ def export(
         own = part or "controller"
         file = out or Path("build") / f"{controller.name}_{own}.fmu"
         with working("exporting"):
+            chosen["platforms"] = None if platforms is None else platforms.replace(" ", "").split(",")
             note = export_fmu(gains, file, part=cast("Any", own), fmi=fmi or 2, **chosen)
         if note:
             print_note(f"{file}: {note}")
@@ -94,7 +99,13 @@ def _frequency(text: str) -> float:
 
 
 def _require_known(
-    to: str, precision: str, until: str | None, part: str | None, fmi: int | None, clock: str | None
+    to: str,
+    precision: str,
+    until: str | None,
+    part: str | None,
+    fmi: int | None,
+    platforms: str | None,
+    clock: str | None,
 ) -> None:
     """Raise InputError for an option with a value that there is not, or that the form does not have."""
     from malta.firmware.elementary import Precision
@@ -115,6 +126,6 @@ def _require_known(
         raise InputError("--clock", "", f"{clock} of an FMU", "--to c")
     if to == "fmu" and precision != "double":
         raise InputError("--precision", "", f"{precision} of an FMU", "double")
-    for name, given in (("--part", part), ("--fmi", fmi)):
+    for name, given in (("--part", part), ("--fmi", fmi), ("--platforms", platforms)):
         if to == "c" and given is not None:
             raise InputError(name, "", f"{given} of a folder of C", "--to fmu")

@@ -26,6 +26,7 @@ from malta.cli.design import design
 from malta.cli.export import export
 from malta.cli.new import new
 from malta.cli.output import interruption, print_error, print_note, silence
+from malta.cli.pil import pil
 from malta.cli.plot import plot
 from malta.cli.report import report
 from malta.cli.schema import schema
@@ -79,7 +80,7 @@ def _first_line(command: Callable[..., None]) -> str:
 GROUPS: dict[str, tuple[Callable[..., None], ...]] = {  # the order of the help
     "Commands": (design, verify, check, simulate, campaign, tune),
     "Pages and pictures": (plot, report, compare, live_page, claims),
-    "For other programs": (export, schema),
+    "For other programs": (export, pil, schema),
     "A machine of your own": (new,),
 }
 app = typer.Typer(

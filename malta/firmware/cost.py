@@ -13,9 +13,12 @@ from typing import NamedTuple
 
 from malta.firmware.ctext import c_name
 from malta.firmware.export import sources
+from malta.firmware.longest_path import FLAGS as APART
+from malta.firmware.longest_path import LISTING, longest_path
 from malta.firmware.program import TRUTHS
 from malta.firmware.signals import Target
 from malta.firmware.step import programs_of
+from malta.firmware.supervisor_text import supervisor_sources
 
 CLOCK = 667e6  # Hz, of the Cortex-A9 of the paper's Zynq 7000
 SECONDS = 120.0  # a compiler may take at most
@@ -63,6 +66,9 @@ class Cost(NamedTuple):
     stack: int  # bytes, the deepest of a step
     instructions: int  # of a step, in a straight line
     calls: int  # of these, calls of arithmetic that the processor does not have
+    supervised: (
+        int  # instructions of the supervisor's step with the controller's, at most: see longest_path.py
+    )
 
 
 def operations(t: Target) -> dict[str, int]:
@@ -75,8 +81,9 @@ def operations(t: Target) -> dict[str, int]:
 
 def costs(t: Target) -> list[Cost]:
     """The costs on every processor whose compiler is installed."""
-    files = sources(t, "")
-    return [cost for p in PROCESSORS if (cost := cost_on(p, files, c_name(t.controller.name))) is not None]
+    name = c_name(t.controller.name)
+    files = sources(t, "") | supervisor_sources(t, name)
+    return [cost for p in PROCESSORS if (cost := cost_on(p, files, name)) is not None]
 
 
 def cost_on(p: Processor, files: Mapping[str, str], name: str) -> Cost | None:
@@ -99,6 +106,7 @@ def cost_on(p: Processor, files: Mapping[str, str], name: str) -> Cost | None:
         sizes = (_run([size, f"{name}.o"], folder) or "").splitlines()[-1].split()
         state = (_run([size, "state.o"], folder) or "").splitlines()[-1].split()
         listing = _run([objdump, "-d", "--no-show-raw-insn", f"{name}.o"], folder) or ""
+        supervised = _supervised(p, files, name, folder)
         stacks = _stacks((folder / f"{name}.su").read_text(encoding="utf-8"))
     own = {f"{name}_{function}" for function in STEP} | {"look_up"}
     lines = _instructions(listing, own)
@@ -110,7 +118,19 @@ def cost_on(p: Processor, files: Mapping[str, str], name: str) -> Cost | None:
         stacks.get(f"{name}_step", 0) + max((stacks.get(f, 0) for f in own - {f"{name}_step"}), default=0),
         len(lines),
         sum("__aeabi_" in line for line in lines),
+        supervised,
     )
+
+
+def _supervised(p: Processor, files: Mapping[str, str], name: str, folder: Path) -> int:
+    """The instructions on the longest path of the supervisor's step; 0 where a tool fails."""
+    listings = {}
+    for file in (f"{name}.c", f"{name}_supervisor.c"):
+        listed = Path(file).with_suffix(".apart").name
+        if _run([f"{p.prefix}gcc", *FLAGS, *APART, *p.options, "-c", file, "-o", listed], folder) is None:
+            return 0
+        listings[file] = _run([f"{p.prefix}objdump", *LISTING, listed], folder) or ""
+    return longest_path(listings, files, f"{name}_supervisor_step")
 
 
 def _run(command: list[str], folder: Path) -> str | None:

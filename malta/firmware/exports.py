@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -65,7 +66,13 @@ def export_c(
 
 
 def export_fmu(
-    gains: str | Path, out: str | Path, *, part: Part = "controller", fmi: int = 2, until: Until | None = None
+    gains: str | Path,
+    out: str | Path,
+    *,
+    part: Part = "controller",
+    fmi: int = 2,
+    until: Until | None = None,
+    platforms: Sequence[str] | None = None,
 ) -> str:
     """Write a part of a gain file's loop as an FMU, for co-simulation.
 
@@ -74,10 +81,13 @@ def export_fmu(
     part : "controller", "machine" or "loop"
     fmi : version of the interface, 2 or 3
     until : how far down the controller goes: "currents" or "duty-cycles"; None: as far as the machine is modelled
+    platforms : what it has binaries of, by the names of FMI 2 or 3, as "win64" or "aarch64-linux", or "all",
+        compiled by ziglang (the extra malta[platforms]); None: this computer
 
     Returns "", or a sentence that says why the FMU has sources but no binary.
 
-    Raises InputError for another part or version, and for duty cycles of a machine without windings.
+    Raises InputError for another part, version or platform, without ziglang where it is asked for, and for
+    duty cycles of a machine without windings; CheckError where ziglang fails.
 
     >>> import malta
     >>> from zipfile import ZipFile
@@ -88,7 +98,7 @@ def export_fmu(
     """
     path = locate(gains)
     target = _target(read(path), "double", until)
-    fmu = build_fmu(target, content_of(path)[0].sha256, part=part, fmi=fmi)
+    fmu = build_fmu(target, content_of(path)[0].sha256, part=part, fmi=fmi, platforms=platforms)
     replace_files({Path(out): fmu.content})
     return fmu.note
 

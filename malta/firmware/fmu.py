@@ -1,8 +1,9 @@
 """FMUs of the controller, its machine, or the loop of both: C for co-simulation by FMI 2.0 and 3.0, in one archive.
 
-The archive has the sources, this computer's binary where there is a C compiler, and a model description with units and
-start values. The same gain file gives the same bytes: dates are fixed, and the token that ties binary and description
-together is the SHA-256 of the sources and the description. Python is not needed where an FMU runs.
+The archive has the sources, this computer's binary where there is a C compiler or those of other platforms, and a
+model description with units and start values. The same gain file gives the same bytes: dates are fixed, and the token
+that ties binary and description together is the SHA-256 of the sources and the description. Python is not needed where
+an FMU runs.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import io
 import platform
 import sys
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from importlib.resources import files as resources
 from typing import Any, NamedTuple
@@ -21,6 +22,7 @@ from xml.sax.saxutils import quoteattr
 from malta.errors import InputError
 from malta.firmware.export import comment, render
 from malta.firmware.native import FLAGS
+from malta.firmware.platforms import cross_compile, platforms_named
 from malta.firmware.signals import Target
 from malta.firmware.unit import Part, Unit, unit_of, unit_sources
 from malta.simulation.compiled import shared_library
@@ -47,20 +49,29 @@ class Fmu(NamedTuple):
     note: str
 
 
-def build_fmu(t: Target, sha256: str, *, part: Part = "controller", fmi: int = 2) -> Fmu:
+def build_fmu(
+    t: Target,
+    sha256: str,
+    *,
+    part: Part = "controller",
+    fmi: int = 2,
+    platforms: Sequence[str] | None = None,
+) -> Fmu:
     """An FMU.
 
     sha256 : of the gain file
     part : "controller", "machine" or "loop"
     fmi : version of the interface, 2 or 3
+    platforms : names of those that it has binaries of, or "all", by ziglang; None: this computer's, by its compiler
 
-    Raises InputError for another part or version, and for a machine that cannot be exported.
+    Raises InputError for another part, version or platform, and for a machine that cannot be exported.
 
         c = malta.gains.read("design/gains/robust.json")
         build_fmu(Target(c), "0" * 64, part="loop", fmi=3).content
     """
     if fmi not in VERSIONS:
         raise InputError("export", "fmi", repr(fmi), "2 or 3")
+    chosen = None if platforms is None else platforms_named(platforms)
     unit = unit_of(t, part)
     texts = _texts(unit, sha256, fmi)
     whole = "".join(f"{name}\n{text}\n" for name, text in sorted(texts.items()))
@@ -69,6 +80,8 @@ def build_fmu(t: Target, sha256: str, *, part: Part = "controller", fmi: int = 2
     own = {
         name.removeprefix("sources/"): data for name, data in members.items() if name.endswith((".c", ".h"))
     }
+    if chosen is not None:
+        return Fmu(_archive(members | cross_compile(own, chosen, identifier_of(unit), fmi)), "")
     binary = shared_library(own, (*FLAGS, "-fvisibility=hidden"))
     if binary is not None:
         members[f"binaries/{platform_of(fmi)}/{identifier_of(unit)}{_ending()}"] = binary

@@ -57,8 +57,10 @@ def folder_files(
         **stand_in_context(t, name),
         **_example_context(t),
     }
+    tested = context | _test_context(t)
     files |= {
-        f"{name}_test.c": render("test.c", context | _test_context(t) | trial_context(t, name)),
+        f"{name}_test.c": render("test.c", tested | trial_context(t, name)),
+        f"{name}_pil.c": render("pil.c", tested),
         f"{name}_example.c": render("example.c", context),
         "Makefile": render("Makefile", context),
         "CMakeLists.txt": render("CMakeLists.txt", context),
@@ -85,6 +87,8 @@ def _test_context(t: Target) -> dict[str, Any]:
     vectors = record_vectors(t)
     return {
         "samples": SAMPLES,
+        "real_bytes": 8 if t.precision == "double" else 4,
+        "word": "uint64_t" if t.precision == "double" else "uint32_t",
         "readings": vectors[0].readings.shape[1],
         "answers": vectors[0].expected.shape[1],
         "last": "commands" if t.driven or t.has_set_points else "currents",

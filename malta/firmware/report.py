@@ -20,6 +20,7 @@ FILES = {
     ".c": "the controller: one step of the control period",
     "_parts.c": "its pieces, each usable alone",
     "_test.c": "recorded vectors",
+    "_pil.c": "a main program that `malta pil` asks over a serial line",
     "_example.c": "a main program with a timer loop, to be filled with hardware",
     "Makefile": "build and test with make",
     "CMakeLists.txt": "the same with CMake",

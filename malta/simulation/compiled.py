@@ -77,8 +77,8 @@ def _version(cc: tuple[str, ...]) -> str | None:
     return None if found is None else found[1]
 
 
-def _answer(command: list[str]) -> tuple[int, str] | None:
-    """A compiler's exit code and what it prints; None where it cannot be started, or is stopped after PATIENCE."""
+def _answer(command: list[str], seconds: float = PATIENCE) -> tuple[int, str] | None:
+    """A compiler's exit code and what it prints; None where it cannot be started, or is stopped after so long."""
     try:
         process = subprocess.Popen(
             command,
@@ -91,13 +91,13 @@ def _answer(command: list[str]) -> tuple[int, str] | None:
         return None
     with process:
         try:
-            printed, _ = process.communicate(timeout=PATIENCE)
+            printed, _ = process.communicate(timeout=seconds)
         except BaseException as error:  # also Ctrl-C, which does not reach a session of its own
             with suppress(OSError):
                 os.killpg(process.pid, signal.SIGKILL)  # with the programs that it started
             if not isinstance(error, subprocess.TimeoutExpired):
                 raise
-            found = f"{command[0]} without an answer for {PATIENCE:g} s"
+            found = f"{command[0]} without an answer for {seconds:g} s"
             logging.getLogger("malta").warning(f"malta: found {found}, expected a C compiler")
             return None
     return process.returncode, str(printed)
@@ -166,9 +166,17 @@ def _compile(cc: tuple[str, ...], text: str, lanes: int, path: Path, flags: tupl
     return False
 
 
-def shared_library(files: Mapping[str, bytes], flags: tuple[str, ...]) -> bytes | None:
-    """The shared library of C files by name, for all processors of this kind; None where no compiler can make it."""
-    cc = compiler()
+def shared_library(
+    files: Mapping[str, bytes],
+    flags: tuple[str, ...],
+    cc: tuple[str, ...] | None = None,
+    seconds: float = PATIENCE,
+) -> bytes | None:
+    """The shared library of C files by name, for all processors of a kind; None where no compiler can make it.
+
+    cc : the compiler as a command; None: this system's, for its own kind
+    """
+    cc = cc or compiler()
     if cc is None:
         return None
     with tempfile.TemporaryDirectory() as folder:
@@ -176,7 +184,7 @@ def shared_library(files: Mapping[str, bytes], flags: tuple[str, ...]) -> bytes 
             (Path(folder) / name).write_bytes(content)
         texts = [str(Path(folder) / name) for name in sorted(files) if name.endswith(".c")]
         made = Path(folder) / "library"
-        found = _answer([*cc, *flags, *texts, "-o", str(made), "-lm"])
+        found = _answer([*cc, *flags, *texts, "-o", str(made), "-lm"], seconds)
         return made.read_bytes() if found is not None and found[0] == 0 else None
 
 

@@ -1,4 +1,4 @@
-"""The documents of `malta check`, `malta tune`, `malta claims` and `malta export`."""
+"""The documents of `malta check`, `malta tune`, `malta claims`, `malta export` and `malta pil`."""
 
 from __future__ import annotations
 
@@ -143,6 +143,30 @@ class ExportOutput(Part):
     gains: str
     to: Literal["c", "fmu"]
     files: Files
+
+
+class VectorPart(Part):
+    """What a target made of a recorded vector."""
+
+    name: str
+    samples: int
+    first_that_differs: int | None = Field(description="a sample; null where all bits agree")
+    largest_difference: Number = Field(description="of a force, N or N m, or of a command")
+
+
+class PilOutput(Part):
+    """What `malta pil --json` prints."""
+
+    kind: Literal["malta-pil-output"] = Field(default="malta-pil-output", alias="schema")
+    version: Literal[1] = 1
+    gains: str
+    port: str
+    precision: Literal["double", "float"]
+    agrees: bool
+    vectors: list[VectorPart]
+    samples_per_s: float = Field(description="with the line")
+    requests_sent_again: int
+    slowest_step_counts: int | None = Field(description="of the target's timer; null where it has none")
 
 
 def tune_output(spec: Spec, tuned: Tuned, files: Sequence[Path]) -> TuneOutput:

@@ -14,7 +14,7 @@ from malta.cli.documents.campaigns import (
     ToleranceOutput,
 )
 from malta.cli.documents.loops import VerifyOutput
-from malta.cli.documents.others import CheckOutput, ClaimsOutput, ExportOutput, TuneOutput
+from malta.cli.documents.others import CheckOutput, ClaimsOutput, ExportOutput, PilOutput, TuneOutput
 from malta.cli.documents.pages import CompareOutput, ReportOutput
 from malta.cli.documents.parts import Part
 from malta.cli.documents.plots import PlotOutput
@@ -38,6 +38,7 @@ MODELS: dict[str, type[Part]] = {
     "report-output": ReportOutput,
     "compare-output": CompareOutput,
     "export-output": ExportOutput,
+    "pil-output": PilOutput,
     "claims-output": ClaimsOutput,
 }
 
