@@ -28,7 +28,9 @@ def export(
     ] = None,
     part: Annotated[
         str | None,
-        typer.Option(help="Of an FMU: controller, machine, or loop, which has both. [controller]"),
+        typer.Option(
+            help="Of an FMU: controller, supervised, machine, or loop of controller and machine. [controller]"
+        ),
     ] = None,
     fmi: Annotated[int | None, typer.Option(help="Version of an FMU's interface: 2 or 3. [2]")] = None,
     out: Annotated[
@@ -48,7 +50,7 @@ def export(
     """Write the controller as C that computes the same bits on every processor, or as an FMU.
 
     The folder of C has a test with recorded vectors and a report of cost, rounding and margin. An FMU is of the
-    controller, of its machine, or of the loop of both, for co-simulation.
+    controller, alone or supervised, of its machine, or of the loop of both, for co-simulation.
 
     \b
     Example:  malta export design/gains/robust.json --precision float

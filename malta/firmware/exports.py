@@ -71,7 +71,7 @@ def export_fmu(
 
     gains : the gain file
     out : the file
-    part : "controller", "machine" or "loop"
+    part : "controller", "supervised" (with its supervisor), "machine" or "loop" (controller and machine)
     fmi : version of the interface, 2 or 3
     until : how far down the controller goes: "currents" or "duty-cycles"; None: as far as the machine is modelled
 

@@ -51,7 +51,7 @@ def build_fmu(t: Target, sha256: str, *, part: Part = "controller", fmi: int = 2
     """An FMU.
 
     sha256 : of the gain file
-    part : "controller", "machine" or "loop"
+    part : "controller", "supervised", "machine" or "loop"
     fmi : version of the interface, 2 or 3
 
     Raises InputError for another part or version, and for a machine that cannot be exported.
@@ -113,6 +113,7 @@ def _context(u: Unit, sha256: str) -> dict[str, Any]:
     t, c = u.target, u.target.controller
     words = {
         "controller": "The controller",
+        "supervised": "The controller with its supervisor",
         "machine": "The machine",
         "loop": "The controller and the machine",
     }
