@@ -44,6 +44,9 @@ def export(
         str | None,
         typer.Option(help="Of the processor, for the report's share of a sample: 168MHz. [667MHz]"),
     ] = None,
+    tunable: Annotated[
+        bool, typer.Option("--tunable", help="Gains, limits and monitors as parameters, with an A2L file.")
+    ] = False,
     machine: MachineFile = None,
     as_json: AsJson = False,
 ) -> None:
@@ -61,7 +64,7 @@ def export(
     _require_known(to, precision, until, part, fmi, clock)
     hertz = None if clock is None else _frequency(clock)
     controller = read_controller(gains, machine)
-    chosen: Any = {"until": until}
+    chosen: Any = {"until": until, "tunable": tunable}
     if to == "fmu":
         own = part or "controller"
         file = out or Path("build") / f"{controller.name}_{own}.fmu"

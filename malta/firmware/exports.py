@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -30,6 +31,7 @@ def export_c(
     until: Until | None = None,
     proof: bool = True,
     clock: float | None = None,
+    tunable: bool = False,
 ) -> list[Path]:
     """Write the controller of a gain file as a folder of C99 with its test and a report.
 
@@ -39,6 +41,7 @@ def export_c(
     until : how far down the C goes: "currents" or "duty-cycles"; None: as far as the machine is modelled
     proof : prove the margin again with the coefficients that single precision holds
     clock : of the processor, Hz, with which the report turns instructions into a share of the sample; None: 667 MHz
+    tunable : gains, limits, references and monitors are in a record that the target may change, with an ASAP2 file
 
     Returns the files.
 
@@ -54,7 +57,7 @@ def export_c(
     path = locate(gains)
     if clock is not None:
         positive("export", "clock", clock, below=FASTEST)
-    target = _target(read(path), precision, until)
+    target = replace(_target(read(path), precision, until), tunable=tunable)
     folder, content = require_empty(Path(out)), content_of(path)[0]
     robust = content.verification.robust
     uncertainty = {} if robust is None else robust.uncertainty
@@ -65,7 +68,13 @@ def export_c(
 
 
 def export_fmu(
-    gains: str | Path, out: str | Path, *, part: Part = "controller", fmi: int = 2, until: Until | None = None
+    gains: str | Path,
+    out: str | Path,
+    *,
+    part: Part = "controller",
+    fmi: int = 2,
+    until: Until | None = None,
+    tunable: bool = False,
 ) -> str:
     """Write a part of a gain file's loop as an FMU, for co-simulation.
 
@@ -74,6 +83,7 @@ def export_fmu(
     part : "controller", "supervised" (with its supervisor), "machine" or "loop" (controller and machine)
     fmi : version of the interface, 2 or 3
     until : how far down the controller goes: "currents" or "duty-cycles"; None: as far as the machine is modelled
+    tunable : the controller's gains, limits, references and monitors are parameters of the FMU
 
     Returns "", or a sentence that says why the FMU has sources but no binary.
 
@@ -87,7 +97,7 @@ def export_fmu(
     True
     """
     path = locate(gains)
-    target = _target(read(path), "double", until)
+    target = replace(_target(read(path), "double", until), tunable=tunable and part != "machine")
     fmu = build_fmu(target, content_of(path)[0].sha256, part=part, fmi=fmi)
     replace_files({Path(out): fmu.content})
     return fmu.note

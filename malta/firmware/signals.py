@@ -50,6 +50,7 @@ class Target:
     fidelity: Fidelity = (
         "phase"  # "force" ends with currents, "dq" with voltages of axes, "phase" with duty cycles
     )
+    tunable: bool = False  # gains, limits, references and monitors from a record that the target may change
 
     def __post_init__(self) -> None:
         if self.precision not in ("double", "float"):

@@ -17,6 +17,7 @@ import casadi as ca
 import numpy as np
 
 from malta.errors import InputError, on_one_line
+from malta.firmware.calibration import parameters_of
 from malta.firmware.ctext import c_name, c_number
 from malta.firmware.export import comment, render, sources
 from malta.firmware.machine import (
@@ -164,6 +165,8 @@ def _groups(t: Target, part: Part, m: Machine | None) -> Iterator[Group]:
         yield Group(rest, "parameter", "fixed", 0.0)
     if m is not None:
         yield from _machine_parameters(m, part)
+    for p in parameters_of(t):
+        yield Group(p.field, "parameter", "tunable", p.values, p.least, p.most)
     if part != "machine":
         for f in output_fields(t):
             yield Group(f, "output", "discrete")
@@ -284,6 +287,9 @@ def _context(u: Unit, token: str) -> dict[str, Any]:
         "NAME": f"{u.name}_controller".upper(),
         "controller": u.has_controller,
         "supervised": u.is_supervised,
+        "tunable": t.tunable,
+        "tuned": places([p.field for p in parameters_of(t)]),
+        "default_record": f"{u.name}_controller_default_parameters",
         "requests": [signal.name for signal in request_field().signals],
         "supervision": [signal.name for signal in supervision_field().signals],
         "limits": [(v.reference, v.least, v.most) for v in u.variables if v.least is not None],

@@ -40,6 +40,19 @@ static int refuse(const char **message, const char *text) {
   *message = text;
   return UNIT_ERROR;
 }
+{% if tunable %}
+
+/* The controller's parameters as they are set: each has its range, and the checksum is that of all. */
+static void tune(unit_data *u) {
+  int32_t k;
+  u->parameters = {{ default_record }};
+{% for f in tuned %}
+{{ copy("u->parameters." ~ f.field, "u->value[" ~ f.at ~ " + k]", f.size, name ~ "_real") }}
+{%- endfor %}
+  u->parameters.checksum = {{ name }}_checksum(&u->parameters);
+  (void){{ name }}_set_parameters(&u->controller, &u->parameters);
+}
+{% endif %}
 {% if controller %}
 
 {% if supervised %}
@@ -137,6 +150,9 @@ static int start(unit_data *u, const char **message) {
   {{ name }}_state trial;
   {{ name }}_supervisor watching;
   {{ name }}_init(&u->controller);
+{% if tunable %}
+  tune(u);
+{% endif %}
   {{ name }}_supervisor_init(&u->supervisor);
   if (u->value[{{ at.flying }}] > 0.5) {
     {{ name }}_real rest[{{ rests }}];
@@ -158,6 +174,9 @@ static int start(unit_data *u, const char **message) {
 {% elif controller %}
   {{ name }}_state trial;
   {{ name }}_init(&u->controller);
+{% if tunable %}
+  tune(u);
+{% endif %}
   status = refer(u, message);
   {{ name }}_start(&u->controller);
 {% if machine %}
@@ -258,6 +277,13 @@ int unit_set(unit_data *u, uint32_t reference, double value, const char **messag
 /* One sample. */
 static int sample(unit_data *u, const char **message) {
   int status = UNIT_OK;
+{% if tunable %}
+  if (u->changed == 1) {
+    tune(u);
+    u->changed = 0;
+  }
+  u->controller.parameters = &u->parameters; /* also where the state came from elsewhere */
+{% endif %}
 {% if supervised %}
   (void)message;
   control(u, &u->supervisor, &u->controller);

@@ -27,6 +27,9 @@ typedef struct {
   double value[UNIT_VARIABLES]; /* value[0]: time, s */
 {% if controller %}
   {{ name }}_state controller;
+{% if tunable %}
+  {{ name }}_parameters parameters; /* of the controller */
+{% endif %}
 {% if supervised %}
   {{ name }}_supervisor supervisor;
 {% endif %}
