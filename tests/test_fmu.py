@@ -614,6 +614,28 @@ def test_what_cannot_be_is_refused_with_a_message(
         impostor.instantiate()
 
 
+@BOTH
+def test_gains_are_parameters_of_a_tunable_controller(fmi: int, instance: Callable[..., Unit]) -> None:
+    """Set before the start and between two steps; the force is that of the estimate by these gains."""
+    from fmpy.fmi1 import FMICallException
+
+    t = replace(target("halbach"), tunable=True)
+    unit = instance(t, "controller", fmi)
+    K = unit.get("K")
+    assert list(K) == [v for v in np.ravel(t.controller.K) if abs(v) != 1]
+    unit.set("K.F_x_x", [1.05 * K[0]])
+    unit.begin()
+    unit.start()
+    for scale in (1.05, 0.95):
+        unit.set("K", [scale * K[0], K[1]])
+        unit.set("y", [1e-4])
+        unit.advance()
+        x, rate, disturbance = unit.get("xi_hat")
+        assert unit.get("v")[0] == pytest.approx(-(scale * K[0] * x + K[1] * rate + disturbance), rel=1e-12)
+    with pytest.raises(FMICallException):
+        unit.set("K", [1.2 * K[0], K[1]])
+
+
 def test_no_reading_poisons_the_controller(instance: Callable[..., Unit]) -> None:
     """NaN as a reading and as a reference: a step on it commands finite forces, and the next readings count again."""
     t = target("halbach")
