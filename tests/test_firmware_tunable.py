@@ -16,13 +16,21 @@ from exported import EXACT, HERE, PRECISIONS, controller, require, run_test, tar
 
 import malta
 from malta.firmware.a2l import a2l_text
-from malta.firmware.calibration import checksum_of, counts_of, is_tunable, parameters_of
+from malta.firmware.calibration import (
+    checksum_of,
+    counts_of,
+    gain_lines,
+    is_tunable,
+    parameters_of,
+    proven_share,
+)
 from malta.firmware.elementary import Precision
 from malta.firmware.folder import folder_files
 from malta.firmware.native import Native, compile_controller, view
 from malta.firmware.signals import Target
 from malta.firmware.supervised import NUMBERS, compile_supervised
 from malta.firmware.vectors import record_vectors
+from malta.margins.tuned_gains import GainBox
 from malta.simulation.compiled import compiler
 from malta.synthesis.controller import gains_of
 
@@ -60,7 +68,7 @@ def test_the_folder_compiles_without_a_warning_and_passes(
     assert (done.returncode, done.stderr) == (0, "")
     assert "pass: 4 vectors" in done.stdout
     report = (tmp_path / "REPORT.md").read_text(encoding="utf-8")
-    assert "No margin is proven for gains within their 10 %" in report
+    assert "No margin is proven for other gains than the default ones (it was not asked for)" in report
     (more,) = re.findall(r"this computer \d+ in place of \d+ \(([+-][\d.]+) %\)", report)
     assert abs(float(more)) < 4
 
@@ -150,6 +158,44 @@ def test_a_number_out_of_its_range_changes_nothing(member: str, entry: int, chan
     assert state.parameters == before == ctypes.addressof(record(native))
 
 
+@pytest.mark.parametrize(
+    ("K", "L", "accepted"),
+    [
+        ((1.19, 1.19), 1.0, 1),
+        ((0.81, 0.81), 1.0, 1),
+        ((1.01, 1.0), 1.0, 0),
+        ((1.21, 1.21), 1.0, 0),
+        ((1.0, 1.0), 1.001, 0),
+    ],
+)
+def test_gains_within_a_proven_box_share_a_factor(K: tuple[float, float], L: float, accepted: int) -> None:
+    """What is proven is a factor of each axis on K and Ki: one entry alone, or another filter, is refused."""
+    if compiler() is None:
+        pytest.skip("no C compiler")
+    native = compile_controller(proven())
+    state, p = begun(native), copy(native)
+    p.K[:] = [factor * value for factor, value in zip(K, p.K, strict=True)]
+    p.L[0] *= L
+    seal(native, p)
+    call = getattr(native.lib, f"{native.name}_set_parameters")
+    assert call(ctypes.byref(state), ctypes.byref(p)) == accepted
+
+
+@cache
+def proven() -> Target:
+    return replace(tunable("halbach"), gains=GainBox(0.2, ((0,),)))
+
+
+def test_what_is_proven_of_gains_is_said() -> None:
+    assert gain_lines(proven())[1:] == [
+        "Ki for the forces (F_x) are those of the gain file times a factor for each of these",
+        "axes within 20 % of 1; L and the gains of the current loops stay.",
+    ]
+    asked = replace(tunable("halbach"), gains=GainBox(None, (), "time was up"))
+    assert gain_lines(asked)[0].endswith("(time was up); they may differ by")
+    assert proven_share(replace(proven(), gains=GainBox(0.12345, ((0,),)))) == 0.123
+
+
 def test_a_checksum_that_does_not_fit_is_refused() -> None:
     native = compiled()
     state, p = begun(native), copy(native)
@@ -192,6 +238,7 @@ def test_parameters_that_change_in_their_memory_keep_the_supervisor_off() -> Non
         assert supervisor.state == NUMBERS["OFF" if touched else "OFFSETS"]
 
 
+@pytest.mark.slow
 def test_the_description_names_every_number_of_the_record_at_its_place() -> None:
     t = tunable("robust", "float")
     text = a2l_text(t, "robust")
@@ -219,6 +266,7 @@ def test_the_description_names_every_number_of_the_record_at_its_place() -> None
     assert text.count("/begin ") == text.count("/end ")
 
 
+@pytest.mark.slow
 def test_gains_of_one_take_a_signal_as_it_is() -> None:
     """A PID's filter takes positions as measured: no number of that is tuned, as its multiplication is none."""
     L = gains_of(controller("tubular_pid"))["L"]
@@ -238,6 +286,7 @@ def test_single_precision_is_summed_as_it_is_stored() -> None:
     assert checksum_of(t) == found
 
 
+@pytest.mark.slow
 def test_the_command_writes_the_files(tmp_path: Path) -> None:
     gains = Path(malta.__file__).parents[1] / "design" / "gains" / "halbach.json"
     files = malta.export_c(gains, tmp_path / "c", proof=False, tunable=True)

@@ -38,7 +38,7 @@ def export(
         typer.Option(help="The folder, new or empty, or the .fmu file. [build/NAME_c, build/NAME_PART.fmu]"),
     ] = None,
     proof: Annotated[
-        bool, typer.Option(help="Prove the margin again with the coefficients that float holds.")
+        bool, typer.Option(help="Prove the margin again with the coefficients of float, and other gains.")
     ] = True,
     clock: Annotated[
         str | None,
@@ -76,6 +76,10 @@ def export(
     else:
         if proof and precision == "float" and not as_json:
             print_note("proving the margin with the coefficients that float holds; --no-proof leaves it out")
+        if proof and tunable and not as_json:
+            print_note(
+                "proving the margin with other gains, minutes for some designs; --no-proof leaves it out"
+            )
         folder = out or Path("build") / f"{controller.name}_c"
         with working("exporting"):
             files = export_c(

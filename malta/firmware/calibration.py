@@ -1,12 +1,14 @@
 """Parameters of an exported controller that its target may change: gains, limits, references and monitors.
 
 They are members of one constant record, which the C reads from a pointer in the state. A record counts when its
-checksum fits and every number is in its range: gains within SCATTER of those of the gain file, limits and references at
-most what they are there, monitors at least as strict.
+checksum fits and every number is in its range: limits and references at most what they are in the gain file, monitors
+at least as strict, and gains those for which the margin stays proven: rows of K and Ki times a factor for each axis.
+Where nothing is proven, gains are within SCATTER of those of the gain file.
 """
 
 from __future__ import annotations
 
+import math
 import textwrap
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -27,6 +29,7 @@ if TYPE_CHECKING:
     from malta.model.plant import FloatArray
 
 SCATTER = 0.1  # share of each gain by which it may differ, either way
+SAME = {"double": 1e-9, "float": 1e-6}  # of a gain, by which entries with one factor may differ: rounding
 LEAST = 0.01  # share of a limit or of a reference that is left at least
 FNV_START, FNV_FACTOR = 0x811C9DC5, 0x01000193
 GAINS = ("K", "Ki", "L")
@@ -52,6 +55,22 @@ def parameters_of(t: Target) -> tuple[Parameter, ...]:
     parameters_of(Target(controller, tunable=True))[0].field.name
     """
     return (*_law_parameters(t), *_reference_parameters(t), _thresholds(t)) if t.tunable else ()
+
+
+def proven_share(t: Target) -> float | None:
+    """The share by which the factors of the axes' gains may differ from 1, in whole per mille; None: nothing proven."""
+    if t.gains is None or t.gains.share is None:
+        return None
+    return math.floor(1000 * t.gains.share + 1e-9) / 1000
+
+
+def axes_of_rows(t: Target, name: str) -> list[int]:
+    """The axis whose factor each entry of K or Ki takes, in the order of the record."""
+    assert t.gains is not None
+    axis = {force: k for k, forces in enumerate(t.gains.axes) for force in forces}
+    gain = gains_of(t.controller)[name]
+    rows = gain.sparsity().get_triplet()[0]
+    return [axis[row] for row, yes in zip(rows, is_tunable(gain), strict=True) if yes]
 
 
 def law_fields(t: Target) -> list[Field]:
@@ -99,11 +118,14 @@ def is_tunable(gain: ca.DM) -> list[bool]:
 
 def _law_parameters(t: Target) -> list[Parameter]:
     c = t.controller
-    gains = gains_of(c)
+    gains, proven = gains_of(c), proven_share(t)
+    share, others = (SCATTER, SCATTER) if proven is None else (proven, 0.0)
     found = [
-        _gain("K", gains["K"], c.forces, c.states, "feedback of the states"),
-        _gain("Ki", gains["Ki"], c.forces, c.measurements, "feedback of the sums of errors", over=" s"),
-        _gain("L", gains["L"], c.states, c.measurements, "gain of the filter"),
+        _gain("K", gains["K"], c.forces, c.states, "feedback of the states", share),
+        _gain(
+            "Ki", gains["Ki"], c.forces, c.measurements, "feedback of the sums of errors", share, over=" s"
+        ),
+        _gain("L", gains["L"], c.states, c.measurements, "gain of the filter", others),
     ]
     if np.isfinite(c.limits.force).all():
         found.append(_shrinking("force_limit", c.forces, "limit of a force", c.limits.force))
@@ -113,12 +135,13 @@ def _law_parameters(t: Target) -> list[Parameter]:
         found.append(_shrinking("current_limit", coils, "limit of a current", limits))
     if t.driven and c.current_loop is not None:
         loop = c.current_loop
-        found.append(_scattered("Kp", (Signal("", "V/A"),), "of the current loops", [loop.Kp]))
+        found.append(_scattered("Kp", (Signal("", "V/A"),), "of the current loops", [loop.Kp], others))
         step = _scattered(
             "Ki_current",
             (Signal("", "V/A"),),
             "integral gain of the current loops, times the sample time",
             [loop.Ki * c.sample_time],
+            others,
         )
         found.append(step._replace(shown=(1 / c.sample_time, "V / (A s)")))
     return [p for p in found if p.field.size]
@@ -130,6 +153,8 @@ def _gain(
     rows: tuple[Signal, ...],
     columns: tuple[Signal, ...],
     meaning: str,
+    share: float,
+    *,
     over: str = "",
 ) -> Parameter:
     """The entries of a gain that may be tuned, column by column."""
@@ -141,7 +166,7 @@ def _gain(
         Signal(f"{rows[i].name} {columns[j].name}", _quotient(rows[i].unit, columns[j].unit + over))
         for i, j in places
     )
-    return _scattered(name, signals, meaning, np.array(matrix.nonzeros())[kept])
+    return _scattered(name, signals, meaning, np.array(matrix.nonzeros())[kept], share)
 
 
 def _quotient(unit: str, by: str) -> str:
@@ -154,9 +179,9 @@ def _quotient(unit: str, by: str) -> str:
     return "1" if unit == by else text
 
 
-def _scattered(name: str, signals: tuple[Signal, ...], meaning: str, values: Any) -> Parameter:
+def _scattered(name: str, signals: tuple[Signal, ...], meaning: str, values: Any, share: float) -> Parameter:
     numbers = np.asarray(values, dtype=float)
-    around = SCATTER * np.abs(numbers)
+    around = share * np.abs(numbers)
     return Parameter(Field(name, signals, meaning), numbers, numbers - around, numbers + around)
 
 
@@ -243,6 +268,46 @@ def parameter_context(t: Target) -> dict[str, Any]:
         "counts": ", ".join(map(str, counts_of(t))),
         "parameter_checksum": f"0x{checksum_of(t):08x}u",
         "fnv": {"start": f"0x{FNV_START:08x}u", "factor": f"0x{FNV_FACTOR:08x}u"},
-        "scatter": f"{100 * SCATTER:g}",
+        **_factors(t),
         "unity": c_number(1.0, t.precision),
+    }
+
+
+def gain_lines(t: Target) -> list[str]:
+    """What is proven of other gains, for readers."""
+    share = proven_share(t)
+    if share is None:
+        reason = "it was not asked for" if t.gains is None else t.gains.reason
+        return [
+            f"No margin is proven for other gains than the default ones ({reason}); they may differ by",
+            f"{100 * SCATTER:g} % each, for trials.",
+        ]
+    axes = ", ".join(
+        "(" + " ".join(t.controller.forces[k].name for k in forces) + ")"
+        for forces in (() if t.gains is None else t.gains.axes)
+    )
+    searched = t.gains is not None and t.gains.searched
+    end = "" if searched else ", and nothing beyond was looked at"
+    return [
+        "Proven stable for the whole uncertainty of the gain file, anywhere in the travel, while the rows of K and",
+        f"Ki for the forces {axes} are those of the gain file times a factor for each of these",
+        f"axes within {100 * share:g} % of 1{end}; L and the gains of the current loops stay.",
+    ]
+
+
+def _factors(t: Target) -> dict[str, Any]:
+    """Which entries of gains share a factor, and the first entry of K of each axis; none where nothing is proven."""
+    if proven_share(t) is None:
+        return {"factors": []}
+    names = [f.name for f in law_fields(t) if f.name in ("K", "Ki")]
+    axes = {name: axes_of_rows(t, name) for name in names}
+    count = 0 if t.gains is None else len(t.gains.axes)
+    return {
+        "factors": [
+            {"name": name, "size": len(of), "axes": ", ".join(map(str, of))} for name, of in axes.items()
+        ],
+        "first_entries": ", ".join(str(axes["K"].index(k)) for k in range(count)),
+        "axis_count": count,
+        "same": c_number(SAME[t.precision], t.precision),
+        "nought": c_number(0.0, t.precision),
     }

@@ -10,7 +10,7 @@ from typing import Any
 import jinja2
 import numpy as np
 
-from malta.firmware.calibration import counts_of, law_fields, parameter_context, parameters_of
+from malta.firmware.calibration import counts_of, gain_lines, law_fields, parameter_context, parameters_of
 from malta.firmware.ctext import c_name, c_number, function_text, signature
 from malta.firmware.elementary import Precision
 from malta.firmware.program import TYPES, Program
@@ -100,6 +100,7 @@ def context_of(t: Target, programs: Mapping[str, Program], name: str, sha256: st
         **root_context(t.precision),
         "arithmetic": arithmetic_context(t.precision),
         **parameter_context(t),
+        "gain_lines": [comment(line) for line in gain_lines(t)] if t.tunable else [],
     }
 
 

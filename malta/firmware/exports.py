@@ -11,6 +11,7 @@ from malta.files import file_exists, locate, replace_files
 from malta.firmware.elementary import Precision
 from malta.firmware.fmu import build_fmu
 from malta.firmware.folder import folder_files
+from malta.firmware.rounding import rounded
 from malta.firmware.signals import Target, fidelity_of
 from malta.firmware.unit import Part
 from malta.gains.file import content_of, read
@@ -39,7 +40,7 @@ def export_c(
     out : the folder, new or empty
     precision : of all numbers, "double" or "float"
     until : how far down the C goes: "currents" or "duty-cycles"; None: as far as the machine is modelled
-    proof : prove the margin again with the coefficients that single precision holds
+    proof : prove the margin again with the coefficients that single precision holds, and with other gains if tunable
     clock : of the processor, Hz, with which the report turns instructions into a share of the sample; None: 667 MHz
     tunable : gains, limits, references and monitors are in a record that the target may change, with an ASAP2 file
 
@@ -61,6 +62,11 @@ def export_c(
     folder, content = require_empty(Path(out)), content_of(path)[0]
     robust = content.verification.robust
     uncertainty = {} if robust is None else robust.uncertainty
+    if tunable and proof:
+        from malta.margins.tuned_gains import gain_box  # flint, which no other export needs
+
+        held = rounded(target.controller) if precision == "float" else target.controller
+        target = replace(target, gains=gain_box(target.believed, held, uncertainty))
     texts = folder_files(target, content.sha256, uncertainty, proof=proof, clock=clock)
     files = {folder / name: text.encode() for name, text in sorted(texts.items())}
     replace_files(files)

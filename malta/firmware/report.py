@@ -7,7 +7,9 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from malta.firmware.calibration import LEAST, SCATTER, parameters_of
+import numpy as np
+
+from malta.firmware.calibration import LEAST, Parameter, gain_lines, parameters_of
 from malta.firmware.cost import CLOCK, PROCESSORS, Cost, costs, operations
 from malta.firmware.export import comment, render
 from malta.firmware.misra import DEVIATIONS
@@ -31,12 +33,6 @@ FILES = {
     ".a2l": "their names, units and ranges for a calibration tool, ASAP2 1.7",
     "_supervisor_test.c": "a walk through its states",
 }
-
-
-GAINS_UNPROVEN = (
-    f"No margin is proven for gains within their {100 * SCATTER:g} %: gains are no parameters of the proof, and the "
-    "margin above is that of the default ones. `malta design` proves anew; a record with other gains is for trials."
-)
 
 
 def report_text(
@@ -89,17 +85,23 @@ def report_text(
 def _tunable_context(t: Target, found: list[Cost]) -> dict[str, Any]:
     """The section about parameters that the target may change."""
     plain = {c.processor: c for c in costs(replace(t, tunable=False))}
-    scatter, limit = f"{100 * SCATTER:g} % either way", f"{100 * LEAST:g} % of the design's to all of it"
+    limit = f"{100 * LEAST:g} % of the design's to all of it"
     words = dict.fromkeys(("force_limit", "current_limit", *ReferenceLimits._fields), limit)
     words["threshold"] = "0 to those of the table of monitors"
     return {
         "tuned": [
-            {"name": p.field.name, "size": p.field.size, "range": words.get(p.field.name, scatter)}
+            {"name": p.field.name, "size": p.field.size, "range": words.get(p.field.name, _scatter(p))}
             for p in parameters_of(t)
         ],
-        "gain_text": GAINS_UNPROVEN,
+        "gain_text": comment(" ".join(gain_lines(t))),
         "tunable_costs": [(c, plain[c.processor]) for c in found if c.processor in plain],
     }
+
+
+def _scatter(p: Parameter) -> str:
+    """By how much a gain may differ."""
+    share = float(np.max(p.most - p.values) / np.max(np.abs(p.values)))
+    return f"{100 * share:.3g} % either way" if share else "that of the design"
 
 
 def _rounding_text(t: Target) -> str:

@@ -48,8 +48,11 @@ extern const {{ name }}_parameters {{ name }}_default_parameters;
 /* The checksum that belongs to a record of parameters, to be written into its member `checksum`. */
 uint32_t {{ name }}_checksum(const {{ name }}_parameters *p);
 
-/* 1 where the checksum of a record fits and every number is in its range: gains within {{ scatter }} % of those of the gain
-   file, limits and references within theirs, monitors at least as strict. Margins under such gains: see REPORT.md. */
+/* 1 where the checksum of a record fits and every number is in its range: limits and references at most those of the gain
+   file, monitors at least as strict, and gains as follows.
+{% for line in gain_lines %}
+   {{ line }}
+{% endfor %} */
 int32_t {{ name }}_accepts_parameters(const {{ name }}_parameters *p);
 
 /* Another record, in memory of the caller, from the next step on; 1, or 0 and nothing changes where it is not accepted.

@@ -73,6 +73,30 @@ static bool are_between(const {{ name }}_real values[], const {{ name }}_real lo
   return inside;
 }
 
+{% if factors %}
+/* Whether gains are those of the gain file times one factor for each axis, which the first entry of K tells. */
+static bool have_factors(const {{ name }}_parameters *p) {
+  static const int32_t firsts[{{ axis_count }}] = { {{ first_entries }} };
+{% for f in factors %}
+  static const int32_t axes_of_{{ f.name }}[{{ f.size }}] = { {{ f.axes }} };
+{% endfor %}
+  bool same = true;
+  int32_t k;
+{% for f in factors %}
+  for (k = 0; k < {{ f.size }}; k++) {
+    const int32_t first = firsts[axes_of_{{ f.name }}[k]];
+    const {{ name }}_real own = {{ name }}_default_parameters.{{ f.name }}[k];
+    const {{ name }}_real factor = p->K[first] / {{ name }}_default_parameters.K[first];
+    const {{ name }}_real wanted = factor * own;
+    const {{ name }}_real apart = p->{{ f.name }}[k] - wanted;
+    const {{ name }}_real most = {{ same }} * ((own < {{ nought }}) ? -own : own);
+    same = same && (apart <= most) && (apart >= -most);
+  }
+{% endfor %}
+  return same;
+}
+
+{% endif %}
 int32_t {{ name }}_accepts_parameters(const {{ name }}_parameters *p) {
   bool accepted = p->checksum == {{ name }}_checksum(p);
   int32_t k;
@@ -82,6 +106,9 @@ int32_t {{ name }}_accepts_parameters(const {{ name }}_parameters *p) {
   for (k = 0; k < ROWS; k++) {
     accepted = accepted && (p->samples[k] >= least.samples[k]) && (p->samples[k] <= most.samples[k]);
   }
+{% if factors %}
+  accepted = accepted && have_factors(p);
+{% endif %}
   return accepted ? 1 : 0;
 }
 
