@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 FACTOR = "gain factor"  # the name of the further parameter
 MOST = 0.2  # share by which gains may scatter at most: nothing beyond is looked at
 FAST = 50.0  # a Ts
-TIME = 300.0  # s, longest search
+TIME = 600.0  # s, longest search
 TOLERANCE = 0.02  # relative distance between the proven bound and the witness
 
 
@@ -93,7 +93,7 @@ def gain_box(plant: Plant, controller: Controller, uncertainty: Ranges) -> GainB
     forces, first = len(controller.forces), system.matrices.size1_out(0) - len(controller.forces)
     split = (tuple(j for j in range(forces) if first + j in g.states) for g in groups(loop_of(system, law)))
     axes = tuple(axis for axis in split if axis)
-    return GainBox(min(found.lower, 1.0) * MOST, axes, searched=found.lower < 1)
+    return GainBox(min(found.lower, 1.0) * MOST, axes, searched=found.lower < 1 and not found.reason)
 
 
 def _unfit(plant: Plant, c: Controller, uncertainty: Ranges) -> str:
