@@ -75,7 +75,8 @@ def test_gains_of_a_pid_may_scatter_while_the_loop_stays_stable() -> None:
     (system, _), *_ = travel_loops(plant, c, tuple(BOX))[0]
     rng = np.random.default_rng(1)
     for _ in range(40):
-        share = np.sign(rng.uniform(-1, 1, 3)) * MOST if rng.uniform() < 0.5 else rng.uniform(-MOST, MOST, 3)
+        share = found.share * rng.uniform(-1, 1, 3)
+        share = np.sign(share) * found.share if rng.uniform() < 0.5 else share
         factors = np.ones(5)
         for axis, value in zip(found.axes, share, strict=True):
             factors[list(axis)] += value
