@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from exported import EXACT, HERE, PRECISIONS, controller, require, run_test, target
+from exported import EXACT, HERE, PRECISIONS, controller, require, run, run_test, target
 
 import malta
 from malta.firmware.a2l import a2l_text
@@ -25,6 +25,7 @@ from malta.firmware.calibration import (
     proven_share,
 )
 from malta.firmware.elementary import Precision
+from malta.firmware.export import sources
 from malta.firmware.folder import folder_files
 from malta.firmware.native import Native, compile_controller, view
 from malta.firmware.signals import Target
@@ -184,6 +185,15 @@ def test_gains_within_a_proven_box_share_a_factor(K: tuple[float, float], L: flo
 @cache
 def proven() -> Target:
     return replace(tunable("halbach"), gains=GainBox(0.2, ((0,),)))
+
+
+def test_the_record_of_proven_gains_compiles_without_a_warning(tmp_path: Path) -> None:
+    require("gcc")
+    for file, text in sources(proven(), "0" * 64).items():
+        (tmp_path / file).write_text(text, encoding="utf-8")
+    warnings = ("-Werror", "-Wall", "-Wextra", "-Wpedantic", "-Wshadow", "-Wconversion", "-Wundef")
+    done = run(["gcc", *EXACT, *warnings, "-c", "halbach_parameters.c"], tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
 
 
 def test_what_is_proven_of_gains_is_said() -> None:

@@ -89,8 +89,8 @@ static bool have_factors(const {{ name }}_parameters *p) {
     const {{ name }}_real factor = p->K[first] / {{ name }}_default_parameters.K[first];
     const {{ name }}_real wanted = factor * own;
     const {{ name }}_real apart = p->{{ f.name }}[k] - wanted;
-    const {{ name }}_real most = {{ same }} * ((own < {{ nought }}) ? -own : own);
-    same = same && (apart <= most) && (apart >= -most);
+    const {{ name }}_real rounding = {{ same }} * ((own < {{ nought }}) ? -own : own);
+    same = same && (apart <= rounding) && (apart >= -rounding);
   }
 {% endfor %}
   return same;
